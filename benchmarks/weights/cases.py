@@ -1,8 +1,8 @@
 """Draw cases: which logs, which references, which effect at which size, all from one seed.
 
-A *split* is a choice of diagnosed logs and references of one pack; its cases inject one effect each
-into those logs. The size of an effect is the RMS change of voltage that it makes, in floors: a floor
-is the RMS error of left-out references. Healthy cases are the logs as they are.
+A *split* is a choice of diagnosed logs and references of one pack. Its cases inject one effect each
+into those logs. The size of an effect is the RMS change of voltage that it makes, in floors; a
+floor is the RMS error of left-out references. Healthy cases are the logs as they are.
 """
 
 from __future__ import annotations
@@ -15,15 +15,15 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-
 from benchmarks.weights import engine, packs
-from cangauge.logs.log import Log
+
 from cangauge.extras.validation.twin.drive import draw_drive
 from cangauge.extras.validation.twin.faults import Fault, fault_kind, fault_kinds
 from cangauge.extras.validation.twin.injection import fit_surrogate_pack, inject
 from cangauge.extras.validation.twin.pack import Pack
 from cangauge.extras.validation.twin.recording import record_drive, rms
 from cangauge.extras.validation.twin.simulation import draw_plant
+from cangauge.logs.log import Log
 
 FLOORS = (0.4, 5.0)
 """Sizes are drawn uniformly in the logarithm between these [floors]."""
@@ -33,10 +33,15 @@ EFFECTS = tuple(kind.id for kind in fault_kinds())
 OUTSIDE = tuple(kind.id for kind in fault_kinds(outside=True))
 PER_SPLIT = 5
 NUMBERS = {
-    "weights": dict(i3=(80, 24, 8), i3_winter=(40, 8, 2), lg_25=(40, 8, 4), lg_cold=(60, 10, 6),
-                    car1=(60, 20, 6), a123=(40, 9, 4), leaf=(20, 4, 0), simulated=(80, 20, 8), pybamm=(40, 10, 4)),
-    "frozen": dict(i3=(60, 24, 6), i3_winter=(20, 8, 0), lg_25=(20, 8, 3), lg_cold=(20, 10, 0), lg_40=(20, 8, 0),
-                   car1=(40, 18, 3), simulated=(60, 18, 8), pybamm=(20, 8, 2)),
+    "weights": {
+        "i3": (80, 24, 8), "i3_winter": (40, 8, 2), "lg_25": (40, 8, 4), "lg_cold": (40, 6, 4),
+        "car1": (40, 12, 4), "a123": (20, 6, 2), "leaf": (14, 4, 0), "simulated": (60, 16, 8),
+        "pybamm": (30, 8, 4),
+    },
+    "frozen": {
+        "i3": (60, 24, 6), "i3_winter": (20, 8, 0), "lg_25": (20, 8, 3), "lg_cold": (20, 10, 0),
+        "lg_40": (20, 8, 0), "car1": (40, 18, 3), "simulated": (60, 18, 8), "pybamm": (20, 8, 2),
+    },
 }  # fmt: skip
 """Cases of each data set: with an effect of the library, healthy, with an effect outside it."""
 
@@ -76,7 +81,12 @@ def _case(cause: str | None, rng: np.random.Generator) -> dict[str, Any]:
     if cause is None:
         return {"effect": None}
     sign = sign if fault_kind(cause).signed else 1.0
-    return {"effect": cause, "floors": round(floors, 3), "sign": sign, "seed": int(rng.integers(2**31))}
+    return {
+        "effect": cause,
+        "floors": round(floors, 3),
+        "sign": sign,
+        "seed": int(rng.integers(2**31)),
+    }
 
 
 @dataclass
@@ -101,7 +111,9 @@ class Split:
     cases: list[Drawn]
 
 
-def _sized(gap_of: Callable[[float], float], limits: tuple[float, float], target_v: float) -> tuple[float, float]:
+def _sized(
+    gap_of: Callable[[float], float], limits: tuple[float, float], target_v: float
+) -> tuple[float, float]:
     """Return size and gap [V]: secants in the logarithm, within limits, to 10 %."""
     low, high = limits
     size = float(np.sqrt(low * high))
@@ -116,9 +128,13 @@ def _sized(gap_of: Callable[[float], float], limits: tuple[float, float], target
             break
         found = gap_of(new)
         if np.isfinite(found) and abs(np.log(new / at)) > 1e-3:
-            slope = float(np.clip(np.log(max(found, 1e-9) / max(gap, 1e-9)) / np.log(new / at), 0.3, 4.0))
+            slope = float(
+                np.clip(np.log(max(found, 1e-9) / max(gap, 1e-9)) / np.log(new / at), 0.3, 4.0)
+            )
         last = (new, found) if np.isfinite(found) else (float(np.sqrt(new * low)), gap)
-        if np.isfinite(found) and abs(np.log(max(found, 1e-9) / target_v)) < abs(np.log(max(best[1], 1e-9) / target_v)):
+        if np.isfinite(found) and abs(np.log(max(found, 1e-9) / target_v)) < abs(
+            np.log(max(best[1], 1e-9) / target_v)
+        ):
             best = (new, found)
     return best
 
@@ -141,7 +157,9 @@ def draw_recorded(item: dict[str, Any], pack: packs.PackLogs, own: Pack | None =
     """Inject the effects of a split into recorded logs."""
     by_name = {log.name: log for log in pack.logs}
     logs, references = ([by_name[x] for x in item[key]] for key in ("logs", "references"))
-    surrogate = own or fit_surrogate_pack(pack.logs, capacity_ah=pack.capacity_ah, cells=pack.cells, name=pack.name)
+    surrogate = own or fit_surrogate_pack(
+        pack.logs, capacity_ah=pack.capacity_ah, cells=pack.cells, name=pack.name
+    )
     floor_v = engine.floor_v(references, pack.capacity_ah)
     cases = []
     for case in item["cases"]:
@@ -160,7 +178,9 @@ def draw_recorded(item: dict[str, Any], pack: packs.PackLogs, own: Pack | None =
             changed = [inject(x, [fault], surrogate).log for x in logs]
             truth |= {"size": fault.size, "unit": fault.kind.unit, "reached": gap / floor_v}
         cases.append(Drawn(pack.name, pack.world, [_thin(x) for x in changed], truth))
-    return Split(pack.name, pack.world, pack.capacity_ah, floor_v, [_thin(x) for x in references], cases)
+    return Split(
+        pack.name, pack.world, pack.capacity_ah, floor_v, [_thin(x) for x in references], cases
+    )
 
 
 def _thin(log: Log) -> Log:
@@ -178,10 +198,28 @@ def made_pack(plant_name: str, seed: int, folder: Path) -> tuple[packs.PackLogs,
         plant = draw_plant(rng, name="twin" if plant_name == "simulated" else "pybamm")
         middle = 16.0 if plant_name == "pybamm" else rng.uniform(8.0, 25.0)
         ambient = rng.permutation(np.linspace(middle - 9.0, middle + 9.0, 9))
-        drives = [draw_drive(rng, plant.pack, hours=2.0, ambient_c=float(middle), start_soc=1.0, end_soc=0.05, discharge=True)]
-        drives += [draw_drive(rng, plant.pack, hours=float(rng.uniform(0.5, 1.2)), ambient_c=float(c)) for c in ambient]
-        logs = [packs.thinned(record_drive(plant, x, (), name=f"drive_{k}").log, 0.5) for k, x in enumerate(drives)]
-        exact = replace(plant.pack.sensors, current_step_a=0.0, voltage_step_v=0.0, temperature_step_k=0.0)
+        drives = [
+            draw_drive(
+                rng,
+                plant.pack,
+                hours=2.0,
+                ambient_c=float(middle),
+                start_soc=1.0,
+                end_soc=0.05,
+                discharge=True,
+            )
+        ]
+        drives += [
+            draw_drive(rng, plant.pack, hours=float(rng.uniform(0.5, 1.2)), ambient_c=float(c))
+            for c in ambient
+        ]
+        logs = [
+            packs.thinned(record_drive(plant, x, (), name=f"drive_{k}").log, 0.5)
+            for k, x in enumerate(drives)
+        ]
+        exact = replace(
+            plant.pack.sensors, current_step_a=0.0, voltage_step_v=0.0, temperature_step_k=0.0
+        )
         own = replace(plant.pack, sensors=exact) if plant_name == "simulated" else None
         file.write_bytes(pickle.dumps((logs, plant.pack.capacity_ah, plant.pack.cells, own)))
     logs, capacity_ah, cells, own = pickle.loads(file.read_bytes())
@@ -202,7 +240,14 @@ def draw_one(items: list[dict[str, Any]], number: int, part: str, data: Path, fo
         else:
             pack, own = made_pack(item["pack"], item["plant"], folder)
             rng = np.random.default_rng([item["seed"], 3])
-            names = [pack.logs[0].name, *(pack.logs[k].name for k in 1 + rng.permutation(len(pack.logs) - 1))]
+            names = [
+                pack.logs[0].name,
+                *(pack.logs[k].name for k in 1 + rng.permutation(len(pack.logs) - 1)),
+            ]
             few = item["references"]
-            split = draw_recorded({**item, "references": names[:few], "logs": names[few : few + item["logs"]]}, pack, own)
+            split = draw_recorded(
+                {**item, "references": names[:few], "logs": names[few : few + item["logs"]]},
+                pack,
+                own,
+            )
         file.write_bytes(pickle.dumps(split))

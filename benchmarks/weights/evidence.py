@@ -31,7 +31,19 @@ def examples_of(split: Split) -> list[Example]:
             f = engine.features_of(known, found, case.logs, without)
             of = "unknown" if without else truth
             floors = case.truth.get("reached", 0.0)
-            out.append(Example(split.pack, split.world, f.names, f.inner, f.outer, of, floors, bool(without), more=more))
+            out.append(
+                Example(
+                    split.pack,
+                    split.world,
+                    f.names,
+                    f.inner,
+                    f.outer,
+                    of,
+                    floors,
+                    bool(without),
+                    more=more,
+                )
+            )
     return out
 
 

@@ -7,19 +7,18 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
+from benchmarks.weights.engine import GROUP_OF
 from scipy.optimize import minimize
 from scipy.special import logsumexp
 
-from benchmarks.weights.engine import GROUP_OF, GROUPS
-
-START = np.array([2.051, 2.107, 4.0, 0.926, 0.3038, -2.1324, -0.421, 0.1766, -1.0014, -0.9682, 0.5264, 0.0353, 0.4589, -2.0301])
-"""nats, volts, cold, group; library; none; unknown. The optimiser's start."""
-CENTRE = np.array([1.5, 1.5, 4.0, 1.0, 0.5, 0, 0, 0, 0, 0, 0, 0, 0, 0.0])
-SPREAD = np.array([1.5, 1.5, 0.01, 0.1, 0.5, 3, 1, 1, 1, 3, 1, 1, 1, 3])
+INNER, LIBRARY, NONE, UNKNOWN = slice(0, 4), slice(4, 6), slice(6, 10), slice(10, 14)
+"""Places of the numbers in one array: nats, volts, shapes, cold; library; none; unknown."""
+CENTRE = np.array([1.5, 1.5, 0.0, 4.0, 0.5, *[0.0] * 9])
+SPREAD = np.array([1.5, 1.5, 1.0, 0.01, 0.5, 3, 1, 1, 1, 3, 1, 1, 1, 3])
 """Ridge: prior mean and deviation of each number. The cold is held: few cases lie outside the
 references' temperatures."""
 CAUSE_OUT = 0.1
-"""Weight of a case whose own effect was taken out of the library. It moves the outer numbers alone."""
+"""Weight of a case whose own effect was taken out of the library; it moves the outer numbers."""
 
 
 @dataclass
@@ -43,41 +42,37 @@ class Stack:
     """Examples as arrays: effects of the library in one order, absent ones masked."""
 
     def __init__(self, examples: Sequence[Example]) -> None:
-        order = list(GROUP_OF)
-        n, k = len(examples), len(order)
-        self.inner, self.absent = np.zeros((n, k, 3)), np.zeros((n, k))
+        self.order = list(GROUP_OF)
+        n, k = len(examples), len(self.order)
+        self.inner, self.absent = np.zeros((n, k, 4)), np.zeros((n, k))
         self.outer = np.array([x.outer for x in examples])
         for row, x in enumerate(examples):
-            at = [order.index(name) for name in x.names]
+            at = [self.order.index(name) for name in x.names]
             self.inner[row, at] = x.inner
             self.absent[row, np.setdiff1d(np.arange(k), at)] = -1e9
-        self.order = order
-        self.groups = [np.array([GROUP_OF[x] == g for x in order]) for g in GROUPS]
 
-    def names(self, w: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def names(self, inner: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return ln P(name | library), shape (n, k), and the library's inclusive value, (n,)."""
-        u = self.inner @ w[:3] + self.absent
-        inside = np.column_stack([logsumexp(u[:, g], axis=1) for g in self.groups])
-        value = logsumexp(w[3] * inside, axis=1)
-        out = np.empty_like(u)
-        for j, g in enumerate(self.groups):
-            out[:, g] = u[:, g] + ((w[3] - 1) * inside[:, j] - value)[:, None]
-        return out, value
+        u = self.inner @ inner + self.absent
+        value = logsumexp(u, axis=1)
+        return u - value[:, None], value
 
     def parts(self, w: np.ndarray, value: np.ndarray) -> np.ndarray:
         """Return ln P of library, none, unknown, shape (n, 3)."""
-        z = np.column_stack([w[4] * value + w[5], self.outer @ w[6:10], self.outer @ w[10:14]])
+        library = value * w[LIBRARY][0] + w[LIBRARY][1]
+        z = np.column_stack([library, self.outer @ w[NONE], self.outer @ w[UNKNOWN]])
         return z - logsumexp(z, axis=1)[:, None]
 
 
 def probabilities(w: np.ndarray, examples: Sequence[Example]) -> list[dict[str, float]]:
     """Return the probability of none, unknown and every effect, for each example."""
     stack = Stack(examples)
-    names, value = stack.names(w)
+    names, value = stack.names(w[INNER])
     outer = stack.parts(w, value)
     every = np.exp(outer[:, :1] + names)
     return [
-        {"none": float(o[1]), "unknown": float(o[2])} | {k: float(v) for k, v in zip(stack.order, row, strict=True) if k in x.names}
+        {"none": float(o[1]), "unknown": float(o[2])}
+        | {k: float(v) for k, v in zip(stack.order, row, strict=True) if k in x.names}
         for o, row, x in zip(np.exp(outer), every, examples, strict=True)
     ]
 
@@ -106,7 +101,9 @@ def fit(examples: Sequence[Example], cause_out: float = CAUSE_OUT) -> np.ndarray
 
     inner = minimize(name_loss, CENTRE[:4], method="L-BFGS-B", bounds=[(0, None)] * 4).x
     value = stack.names(inner)[1]
-    target = np.array([1 if x.truth == "none" else 2 if x.truth == "unknown" else 0 for x in examples])
+    target = np.array(
+        [1 if x.truth == "none" else 2 if x.truth == "unknown" else 0 for x in examples]
+    )
     b, rows = alike(np.ones(len(pack), bool)), np.arange(len(pack))
 
     def outer_loss(v: np.ndarray) -> float:

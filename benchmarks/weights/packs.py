@@ -1,8 +1,8 @@
 """Packs whose logs take faults: recorded and simulated, in two parts that share no log.
 
-The part "weights" is what `diagnosis/weights.json` is fitted to; the part "frozen" is drawn once and
-scored once (`frozen.json`). Both hold logs of the same real packs, except `a123` and `leaf`, which
-are in "weights" alone: the scores of `--held-out` leave a whole pack out instead.
+`diagnosis/weights.json` is fitted to the part "weights". The part "frozen" is scored once
+(`frozen.json`). Both hold logs of the same real packs, except `a123` and `leaf`, which are in
+"weights" alone; the held-out scores of the fit leave a whole data set out instead.
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -87,7 +88,10 @@ def thinned(log: Log, step_s: float) -> Log:
     """Return means over steps of time, so that a log of 10 Hz takes a fault quickly."""
     at = np.floor((log.time_s - log.time_s[0]) / step_s).astype(int)
     _, first, number = np.unique(at, return_index=True, return_counts=True)
-    mean = [np.add.reduceat(x, first) / number for x in (log.current_a, log.voltage_v, log.temperature_c)]
+    mean = [
+        np.add.reduceat(x, first) / number
+        for x in (log.current_a, log.voltage_v, log.temperature_c)
+    ]
     soc = None if log.soc_pct is None else log.soc_pct[first]
     time_s = (at[first] + 0.5) * step_s
     return Log(time_s, *mean, soc, name=log.name, source=log.source)
@@ -119,7 +123,7 @@ def pieces(log: Log) -> list[Log]:
     bounds = [0, *np.searchsorted(log.time_s, edges).tolist(), len(log.time_s)]
     return [
         replace(log.rows(slice(a, b)), name=f"{log.name}_{k}")
-        for k, (a, b) in enumerate(zip(bounds, bounds[1:], strict=False))
+        for k, (a, b) in enumerate(pairwise(bounds))
     ]
 
 
@@ -131,29 +135,38 @@ def _i3(data: Path, names: Sequence[str], name: str, references: tuple[int, int]
 
 def _lg(data: Path, part: str, name: str) -> PackLogs:
     logs = [
-        as_pack(thinned(read_log(data / "lg_hg2" / f"{x}.parquet"), 0.5), LG_SERIES, LG_PARALLEL, 100.0)
+        as_pack(
+            thinned(read_log(data / "lg_hg2" / f"{x}.parquet"), 0.5), LG_SERIES, LG_PARALLEL, 100.0
+        )
         for x in LG[part][name].split()
     ]
-    return PackLogs(name, "cells", logs, LG_AH * LG_PARALLEL, LG_SERIES, (3, 3 if name == "lg_25" else 4))
+    return PackLogs(
+        name, "cells", logs, LG_AH * LG_PARALLEL, LG_SERIES, (3, 3 if name == "lg_25" else 4)
+    )
 
 
 def _car1(data: Path, stretches: Sequence[str]) -> PackLogs:
     every = [read_log(data / "batic_car1" / f"car1_{x}.csv.gz") for x in stretches]
     logs = [first_finite(x) for log in every for x in pieces(log)]
-    charge = sum(float(np.trapezoid(np.abs(x.current_a), x.time_s)) for x in every) / 3600
-    del charge
     return PackLogs("car1", "trips", logs, 110.0, 96, (4, 8))
 
 
 def _a123(data: Path) -> PackLogs:
     logs = []
     for at in ("45_P05", "50_P25", "50_P45"):
-        log = as_pack(read_log(data / "a123_lfp" / f"A123_DYN_{at}_s1.csv.gz"), LG_SERIES, A123_PARALLEL, 100.0)
-        soc = 100 - np.cumsum(np.diff(log.time_s, prepend=log.time_s[0]) * log.current_a) / 36 / (A123_AH * A123_PARALLEL)
+        log = as_pack(
+            read_log(data / "a123_lfp" / f"A123_DYN_{at}_s1.csv.gz"),
+            LG_SERIES,
+            A123_PARALLEL,
+            100.0,
+        )
+        soc = 100 - np.cumsum(np.diff(log.time_s, prepend=log.time_s[0]) * log.current_a) / 36 / (
+            A123_AH * A123_PARALLEL
+        )
         edges = [0, len(soc) // 3, 2 * len(soc) // 3, len(soc)]
         logs += [
             replace(started(log.rows(slice(a, b)), float(soc[a])), name=f"{log.name}_{k}")
-            for k, (a, b) in enumerate(zip(edges, edges[1:], strict=False))
+            for k, (a, b) in enumerate(pairwise(edges))
         ]
     return PackLogs("a123", "cells", logs, A123_AH * A123_PARALLEL, LG_SERIES, (5, 7))
 

@@ -21,7 +21,7 @@ from cangauge.cli.options import (
     within,
 )
 from cangauge.cli.output import emit_json, note, print_table, progress_shown
-from cangauge.cli.shown import ALARM_BELOW
+from cangauge.cli.shown import ALARM
 from cangauge.cli.simulator import SimulatorOptions
 from cangauge.errors import InputError
 
@@ -101,7 +101,7 @@ def gap_command(  # noqa: PLR0917 - typer passes options by name
             metavar="P",
             help="Report a fault where the probability of none is at most this.",
         ),
-    ] = ALARM_BELOW,
+    ] = ALARM,
     plan: Annotated[
         bool,
         typer.Option(
@@ -164,10 +164,18 @@ def gap_command(  # noqa: PLR0917 - typer passes options by name
         capacity = capacity_ah if model_file is None else model_file.capacity_ah
         diagnosed[: len(logs)] = _started(diagnosed[: len(logs)], initial_soc, capacity)
     with progress_shown("cangauge.diagnosis"):
-        found = diagnose(diagnosed, model_file, references, alarm=alarm)
+        found = diagnose(
+            diagnosed,
+            model_file,
+            references,
+            simulation=options.simulation([*diagnosed, *references], [*paths, *given]),
+            capacity_ah=capacity_ah,
+            alarm=alarm,
+        )
         before = None
         if added:
-            before = diagnose(diagnosed[: len(logs)], model_file, found.known, alarm=alarm)
+            first = found.logs[: len(logs)]
+            before = diagnose(first, found.model, found.known, alarm=alarm)
         steps = (
             plan_next(found.known, found.columns, found.evidence, found.posterior) if plan else None
         )
@@ -179,17 +187,17 @@ def gap_command(  # noqa: PLR0917 - typer passes options by name
     write_texts_atomic(texts)
     if json_output:
         result = found.to_json(None if extended is None else str(extended))
-        result |= {} if before is None else {"before_added_test": _posterior(before)}
+        if before is not None:
+            result["added_test"] = {
+                "logs": [log.name for log in diagnosed[len(logs) :]],
+                "before": dict(before.posterior.probabilities),
+            }
         result |= {} if steps is None else {"plan": steps.to_dict()}
         emit_json(result | {"assumed": assumed_of([*diagnosed, *references])})
         return
     _show(found, before, steps)
     for written in texts:
         note(f"wrote {written}")
-
-
-def _posterior(found: Diagnosis) -> dict[str, float]:
-    return dict(found.posterior.probabilities)
 
 
 def _started(logs: list[Log], initial_soc_pct: float, capacity_ah: float | None) -> list[Log]:
@@ -257,7 +265,8 @@ def _long_enough(log: Log) -> Log:
 def _show(found: Diagnosis, before: Diagnosis | None, steps: Plan | None) -> None:
     from cangauge.extras.report.summary import SHOWN, candidate_rows, plan_rows
 
-    typer.echo(printable(found.summary))
+    for line in found.summary.splitlines():
+        typer.echo(printable(line))
     if before is not None:
         typer.echo(f"Without the added test: {printable(before.headline)}")
     result = found.to_json(soc_error=False)

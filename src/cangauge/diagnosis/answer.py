@@ -1,17 +1,19 @@
 """The answer: one posterior of `none`, `unknown` and the library, from which everything follows.
 
-    u_k = w₁ ln(1 + n_k / o_k) + w₂ ln((v + V) / (v + V_k)) + w₃ [resistance in the cold]
+    u_k = w₁ ln(1 + n_k / o_k) + w₂ ln((v + V) / (v + V_k)) − w₃ ln m_k + w₄ [in the cold]
 
-with n_k / o_k the evidence of effect k over what healthy logs show of it, and V, V_k, v the mean
-square errors without it, with it, and of a healthy log. Effects compete within groups within the
-library, which competes with `none` and `unknown` (nested logit: Train, Discrete Choice Methods with
-Simulation, 2nd ed., 2009, ch. 4). The group is what a user acts on, so groups are stated first.
+with n_k / o_k the evidence of effect k over what healthy logs show of it, V, V_k, v the mean square
+errors without it, with it, and of a healthy log, and m_k its number of shapes. Effects compete
+within the library, which competes with `none` and `unknown` (nested logit: Train, Discrete Choice
+Methods with Simulation, 2nd ed., 2009, ch. 4). The group is what a user acts on, so groups, sums of
+their effects, are stated first.
 """
 
 from __future__ import annotations
 
 import json
 import math
+from collections import Counter
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from functools import cache
@@ -22,7 +24,8 @@ import numpy as np
 from scipy.special import logsumexp
 
 from cangauge._typing import FloatArray
-from cangauge.diagnosis.evidence import Evidence, References
+from cangauge.diagnosis.evidence import PLACES, Evidence, References
+from cangauge.diagnosis.trials import STEP
 
 NONE: Final = "none"
 UNKNOWN: Final = "unknown"
@@ -101,10 +104,10 @@ class Weights:
     """w₁."""
     volts: float
     """w₂."""
+    shapes: float
+    """w₃."""
     cold: float
-    """w₃, for resistance_temperature beyond the references' temperatures."""
-    group: float
-    """Exponent of a group within the library."""
+    """w₄, for resistance_temperature beyond the references' temperatures."""
     library: tuple[float, float]
     """Slope and offset of the library's inclusive value."""
     none: tuple[float, float, float, float]
@@ -140,7 +143,7 @@ class Features:
     names: tuple[str, ...]
     """Effects of the library, k of them."""
     inner: FloatArray
-    """Per effect: ln(1 + n_k/o_k), ln((v + V)/(v + V_k)), cold; shape (k, 3)."""
+    """Per effect: ln(1 + n_k/o_k), ln((v + V)/(v + V_k)), −ln m_k, cold; shape (k, 4)."""
     outer: FloatArray
     """ln(V_best/v + 0.1), ln(1 + max n/o), the same less that of healthy logs, 1; shape (4,)."""
 
@@ -160,11 +163,13 @@ def features(
         Effects taken out of the library.
     """
     effects = {name: e for name, e in evidence.effects.items() if name not in without}
-    v = known.healthy_v2
+    v, shapes = known.healthy_v2, Counter(trial.effect for trial in known.trials)
+    shapes[STEP.effect] = len(PLACES)
     inner = np.array([
         [
             np.log1p(max(e.nats, 0.0)),
             np.log((v + evidence.gap_v2) / (v + e.left_v2)),
+            -math.log(shapes[name]),
             min(colder_k / COLDER_K, 1.0) * (name == "resistance_temperature"),
         ]
         for name, e in effects.items()
@@ -184,19 +189,14 @@ def probabilities(case: Features, by: Weights) -> dict[str, float]:
     case : Features
     by : Weights
     """
-    u = dict(zip(case.names, case.inner @ [by.nats, by.volts, by.cold], strict=True))
-    members = {g: [k for k in effects if k in u] for g, effects in GROUPS.items()}
-    inside = {g: float(logsumexp([u[k] for k in ks])) for g, ks in members.items() if ks}
-    library = float(logsumexp([by.group * value for value in inside.values()]))
+    u = case.inner @ [by.nats, by.volts, by.shapes, by.cold]
+    library = float(logsumexp(u))
     outer = np.array([
         case.outer @ by.none, case.outer @ by.unknown, by.library[0] * library + by.library[1]
     ])  # fmt: skip
     none, unknown, any_effect = np.exp(outer - logsumexp(outer)).tolist()
-    stated = {NONE: none, UNKNOWN: unknown}
-    for group, value in inside.items():
-        of_group = any_effect * math.exp(by.group * value - library)
-        stated |= {k: of_group * math.exp(u[k] - value) for k in members[group]}
-    return stated
+    effects = any_effect * np.exp(u - library)
+    return {NONE: none, UNKNOWN: unknown} | dict(zip(case.names, effects.tolist(), strict=True))
 
 
 @dataclass(frozen=True, eq=False)

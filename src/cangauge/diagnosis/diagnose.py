@@ -6,7 +6,7 @@ import hashlib
 import logging
 import math
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cache, cached_property
 from typing import Any
 
@@ -15,27 +15,18 @@ from threadpoolctl import ThreadpoolController
 
 from cangauge._display import figure, html
 from cangauge._io import file_sha256
-from cangauge._typing import BoolArray, FloatArray
 from cangauge.diagnosis import sentences
 from cangauge.diagnosis.answer import ALARM, GROUP_OF, UNKNOWN, Posterior, answer
 from cangauge.diagnosis.checks import check_logs
-from cangauge.diagnosis.evidence import (
-    Columns,
-    Evidence,
-    References,
-    analyse,
-    columns,
-    learn,
-)
-from cangauge.diagnosis.extended import Extension, JudgedRows, Quantity, residual_v
+from cangauge.diagnosis.evidence import Columns, Evidence, References, analyse, columns, learn
+from cangauge.diagnosis.extended import Extension, Quantity, residual_v
 from cangauge.diagnosis.pack_fit import Trace, trace
 from cangauge.diagnosis.simulator import Simulation, SimulatorGap, correction, simulator_gap
-from cangauge.diagnosis.where import ErrorShare, LogErrors, drawn_sums, error_shares, pieces
+from cangauge.diagnosis.where import ErrorShare, LogErrors, drawn_sums, error_shares, pieces, rms
 from cangauge.errors import InputError
 from cangauge.estimation.offline import estimate
 from cangauge.identify.starts import start_by_model
 from cangauge.logs.log import Log
-from cangauge.logs.resample import resample
 from cangauge.model.model_file import Model
 
 _LOG = logging.getLogger(__name__)
@@ -52,6 +43,7 @@ class Candidate:
     """One effect of the library as a cause of these logs."""
 
     effect: str
+    group: str
     probability: float
     rmse_v: float | None
     """RMS error with it on held-out rows [V]; None for effects of little probability."""
@@ -60,19 +52,9 @@ class Candidate:
     """95 % interval of the closed fraction."""
     parameters: dict[str, Quantity]
 
-    @property
-    def group(self) -> str:
-        """Its group."""
-        return GROUP_OF[self.effect]
-
     def to_dict(self) -> dict[str, Any]:
         """Return the entry of `cause.candidates` in `gap --json`."""
-        return {
-            "effect": self.effect,
-            "group": self.group,
-            "probability": self.probability,
-            "rmse_v": self.rmse_v,
-            "closed_fraction": self.closed_fraction,
+        return vars(self) | {
             "ci": self.ci and list(self.ci),
             "parameters": {name: item.to_dict() for name, item in self.parameters.items()},
         }
@@ -111,6 +93,53 @@ class Diagnosis:
     simulator: SimulatorGap | None = None
     """The simulator whose gap it is; None: the gap of `model`."""
 
+    @property
+    def colder_k(self) -> float:
+        """Distance of the logs from the temperatures of the references [K]."""
+        return self.known.colder_k([of.log for of in self.columns])
+
+    @cached_property
+    def _extensions(self) -> dict[str, Extension]:
+        model, before = self.model.extended_model(), [log.before_v for log in self._without]
+        return {
+            name: Extension(model, self.known, self.columns, before, self.evidence.effects[name])
+            for name in self.posterior.effects
+        }
+
+    @cached_property
+    def _without(self) -> tuple[LogErrors, ...]:
+        """Errors of each log without a cause."""
+        errors, model = [], self.model.extended_model()
+        for log, of in zip(self.logs, self.columns, strict=True):
+            at, signals = of.rows, of.log
+            before = residual_v(model, signals)[at]
+            errors.append(
+                LogErrors(
+                    log.name,
+                    at.astype(np.float64),
+                    signals.current_a[at],
+                    signals.temperature_c[at],
+                    self.known.pack.soc(signals)[at],
+                    before,
+                    before,
+                    np.ones(len(at), dtype=bool),
+                )
+            )
+        return tuple(errors)
+
+    @cached_property
+    def _with(self) -> dict[str, tuple[LogErrors, ...]]:
+        """Errors of each log with each of the most probable effects."""
+        return {
+            name: tuple(
+                replace(log, after_v=after, judged=judged)
+                for log, after, judged in zip(
+                    self._without, *self._extensions[name].judge(), strict=True
+                )
+            )
+            for name in list(self.posterior.effects)[:CROSS_VALIDATED]
+        }
+
     @cached_property
     def accepted(self) -> str | None:
         """The effect that the extended model has; None without one.
@@ -122,69 +151,30 @@ class Diagnosis:
             return None
         group = self.posterior.stated_groups[0]
         effect = next(name for name in self.posterior.effects if GROUP_OF[name] == group)
-        rows = self._judged[effect]
-        before, after = _rms_of(rows, judged_only=True)
-        before_all, after_all = _rms_of(rows, judged_only=False)
-        return effect if after < before and after_all < before_all else None
+        errors = self._with.get(effect, self._without)
+        better = rms(errors, after=True) < rms(errors)
+        every = [replace(log, judged=np.ones_like(log.judged)) for log in errors]
+        return effect if better and rms(every, after=True) < rms(every) else None
 
     @property
-    def colder_k(self) -> float:
-        """Distance of the logs from the temperatures of the references [K]."""
-        return self.known.colder_k([of.log for of in self.columns])
-
-    @cached_property
-    def _extensions(self) -> dict[str, Extension]:
-        return {
-            name: Extension(self.model, self.known, self.columns, self.evidence.effects[name])
-            for name in self.posterior.effects
-        }
-
-    @cached_property
-    def _judged(self) -> dict[str, list[JudgedRows]]:
-        """Held-out errors of the most probable effects."""
-        likely = list(self.posterior.effects)[:CROSS_VALIDATED]
-        return {name: self._extensions[name].judge() for name in likely}
-
-    @cached_property
     def log_errors(self) -> tuple[LogErrors, ...]:
         """Errors of each diagnosed log at 1 Hz, before and after."""
-        rows = None if self.accepted is None else self._judged[self.accepted]
-        errors = []
-        for k, (log, of) in enumerate(zip(self.logs, self.columns, strict=True)):
-            at, signals = of.rows, of.log
-            before = self._before_v[k] if rows is None else rows[k].before_v
-            errors.append(
-                LogErrors(
-                    log.name,
-                    at.astype(np.float64),
-                    signals.current_a[at],
-                    signals.temperature_c[at],
-                    self.known.pack.soc(signals)[at],
-                    before,
-                    before if rows is None else rows[k].after_v,
-                    np.ones(len(at), dtype=bool) if rows is None else rows[k].judged,
-                )
-            )
-        return tuple(errors)
-
-    @cached_property
-    def _before_v(self) -> list[FloatArray]:
-        return [residual_v(self.model, of.log)[of.rows] for of in self.columns]
+        return self._without if self.accepted is None else self._with[self.accepted]
 
     @property
     def baseline_rmse_v(self) -> float:
         """Error of the given model [V]."""
-        return _rms([log.before_v[log.judged] for log in self.log_errors])
+        return rms(self.log_errors)
 
     @property
     def extended_rmse_v(self) -> float:
         """Error of the extended model on held-out rows [V]."""
-        return _rms([log.after_v[log.judged] for log in self.log_errors])
+        return rms(self.log_errors, after=True)
 
     @property
-    def judged_part(self) -> float:
-        """Part of the rows that the cause can change."""
-        return float(np.concatenate([log.judged for log in self.log_errors]).mean())
+    def expected_rmse_v(self) -> float:
+        """Error with what the references show of this pack, no cause sought [V]."""
+        return math.sqrt(self.evidence.gap_v2)
 
     @property
     def healthy_rmse_v(self) -> float:
@@ -196,27 +186,42 @@ class Diagnosis:
         """Error of the given model on each reference [V]."""
         names = [log.name for log in self.references]
         names = names or [f"reference {k + 1}" for k in range(len(self.known.logs))]
+        model = self.model.extended_model()
         return {
-            name: _rms([residual_v(self.model, log)[log.measured]])
+            name: float(np.sqrt(np.mean(residual_v(model, log)[log.measured] ** 2)))
             for name, log in zip(names, self.known.logs, strict=True)
         }
 
     @property
-    def expected_rmse_v(self) -> float:
-        """Error with what the references show of this pack, no cause sought [V]."""
-        return math.sqrt(self.evidence.gap_v2)
-
-    @property
     def closed_fraction(self) -> float | None:
         """Closed part of the squared error above a healthy log's; None without a gap above it."""
-        if self.accepted is None:
-            return None
-        return closed_fraction(self.baseline_rmse_v, self.extended_rmse_v, self.healthy_rmse_v)
+        return None if self.accepted is None else self._closed(self.log_errors)
 
     @property
     def closed_fraction_ci(self) -> tuple[float, float] | None:
         """95 % interval of the closed fraction."""
-        return None if self.accepted is None else self._closed_interval(self._judged[self.accepted])
+        return None if self.accepted is None else self._closed_interval(self.log_errors)
+
+    def _closed(self, errors: Sequence[LogErrors]) -> float | None:
+        gap = rms(errors) ** 2 - self.known.healthy_v2
+        if not gap > 0.0:
+            return None
+        return min((rms(errors) ** 2 - rms(errors, after=True) ** 2) / gap, 1.0)
+
+    def _closed_interval(self, errors: Sequence[LogErrors]) -> tuple[float, float] | None:
+        """Return the 95 % interval of the closed fraction, by a bootstrap over pieces."""
+        weight = np.concatenate([log.judged for log in errors]).astype(np.float64)
+        before = np.concatenate([log.before_v for log in errors]) ** 2 * weight
+        after = np.concatenate([log.after_v for log in errors]) ** 2 * weight
+        sums = drawn_sums(pieces(errors), before, after, weight)
+        rows = np.maximum(sums[2], 1.0)
+        gap = sums[0] / rows - self.known.healthy_v2
+        usable = gap > 0.0
+        if usable.mean() < 0.9:
+            return None
+        closed = np.minimum(((sums[0] - sums[1]) / rows)[usable] / gap[usable], 1.0)
+        low, high = np.quantile(closed, [0.025, 0.975])
+        return float(low), float(high)
 
     @cached_property
     def where(self) -> list[ErrorShare]:
@@ -229,30 +234,14 @@ class Diagnosis:
         return tuple(self._candidate(name, p) for name, p in self.posterior.effects.items())
 
     def _candidate(self, effect: str, probability: float) -> Candidate:
-        rmse_v, closed, ci = None, None, None
-        if effect in self._judged:
-            rows = self._judged[effect]
-            before_v, rmse_v = _rms_of(rows, judged_only=True)
-            closed = closed_fraction(before_v, rmse_v, self.healthy_rmse_v)
-            ci = self._closed_interval(rows)
+        judged: tuple[Any, ...] = (None, None, None)
+        if effect in self._with:
+            errors = self._with[effect]
+            judged = rms(errors, after=True), self._closed(errors), self._closed_interval(errors)
         parameters = self._extensions[effect].parameters
-        return Candidate(effect, probability, rmse_v, closed, ci, parameters)
-
-    def _closed_interval(self, logs: Sequence[JudgedRows]) -> tuple[float, float] | None:
-        """Return the 95 % interval of the closed fraction, by a bootstrap over pieces."""
-        weight = np.concatenate([of.judged for of in logs]).astype(np.float64)
-        before = np.concatenate([of.before_v for of in logs]) ** 2 * weight
-        after = np.concatenate([of.after_v for of in logs]) ** 2 * weight
-        piece = pieces([of.log.rows for of in logs])
-        sums = drawn_sums(piece, before, after, weight)
-        rows = np.maximum(sums[2], 1.0)
-        gap = sums[0] / rows - self.known.healthy_v2
-        usable = gap > 0.0
-        if usable.mean() < 0.9:
-            return None
-        closed = np.minimum(((sums[0] - sums[1]) / rows)[usable] / gap[usable], 1.0)
-        low, high = np.quantile(closed, [0.025, 0.975])
-        return float(low), float(high)
+        rmse_v, closed, ci = judged
+        group = GROUP_OF[effect]
+        return Candidate(effect, group, probability, rmse_v, closed, ci, parameters)
 
     @cached_property
     def parameters(self) -> dict[str, dict[str, Quantity]]:
@@ -263,12 +252,11 @@ class Diagnosis:
     def visible_from(self) -> list[dict[str, Any]]:
         """Smallest size of each effect that these logs would have shown; size None: none."""
         sizes: list[dict[str, Any]] = []
-        for name, size in self.posterior.visible_from.items():
+        for name, least in self.posterior.visible_from.items():
             unit = self.evidence.effects[name].trial.unit
             unit, factor = ("%", 100.0) if unit == "1" else (unit, 1.0)
-            sizes.append(
-                {"effect": name, "size": None if size is None else factor * size, "unit": unit}
-            )
+            size = None if least is None else factor * least
+            sizes.append({"effect": name, "size": size, "unit": unit})
         return sizes
 
     @property
@@ -284,19 +272,35 @@ class Diagnosis:
         """The model with the accepted cause, ready to save and run; the given one without."""
         if self.accepted is None:
             return self.model
-        return self._extensions[self.accepted].model_file(self.extended_rmse_v)
+        return self._extensions[self.accepted].model_file(self.model, self.extended_rmse_v)
 
     @cached_property
     def baseline_soc_mae_pct(self) -> float | None:
         """SoC error of the estimator with the given model, initial SoC withheld [%]; or None."""
-        return soc_error_pct(self.logs, self.model)
+        return self._soc_error_pct(self.model)
 
     @cached_property
     def extended_soc_mae_pct(self) -> float | None:
         """The same with the extended model [%]."""
         if self.accepted is None:
             return self.baseline_soc_mae_pct
-        return soc_error_pct(self.logs, self.extended_model)
+        return self._soc_error_pct(self.extended_model)
+
+    def _soc_error_pct(self, model: Model) -> float | None:
+        """Return the mean absolute SoC error at 1 Hz of logs with reference SoC [%]; or None."""
+        errors = []
+        for log, of in zip(self.logs, self.columns, strict=True):
+            if log.soc_pct is None or np.isfinite(log.soc_pct).mean() < 0.5:
+                continue
+            signals, finite = of.log, np.isfinite(log.soc_pct)
+            time_s = np.arange(len(signals.current_a), dtype=np.float64)
+            at_1_hz = Log(time_s, signals.current_a, signals.voltage_v, signals.temperature_c)
+            table = estimate(at_1_hz, model, initial_soc_pct="auto")
+            own = np.interp(table.time_s, log.time_s[finite] - log.time_s[0], log.soc_pct[finite])
+            kept = np.isfinite(table.soc_pct) & (table.time_s >= SETTLING_S) & of.log.measured
+            errors.append(np.abs(table.soc_pct - own)[kept])
+        together = np.concatenate(errors) if errors else np.zeros(0)
+        return float(together.mean()) if together.size else None
 
     @property
     def headline(self) -> str:
@@ -338,24 +342,25 @@ class Diagnosis:
         soc_error : bool
             Run the estimator for the SoC error with either model; otherwise these are None.
         """
-        found = self.posterior
-        closed, ci = self.closed_fraction, self.closed_fraction_ci
-        accepted = [
-            {
-                "effect": item.effect,
-                "parameters": {name: each.value for name, each in item.parameters.items()},
-                "closed_fraction": closed,
-            }
-            for item in self.candidates
-            if item.effect == self.accepted
-        ]
+        found, ci = self.posterior, self.closed_fraction_ci
+        accepted = []
+        if self.accepted is not None:
+            values = {name: item.value for name, item in self.parameters[self.accepted].items()}
+            accepted = [
+                {
+                    "effect": self.accepted,
+                    "parameters": values,
+                    "closed_fraction": self.closed_fraction,
+                }
+            ]
+        model = self.model.to_json().encode()
         return {
             "schema": 3,
             "gap": {
                 "baseline_rmse_v": self.baseline_rmse_v,
                 "extended_rmse_v": self.extended_rmse_v,
                 "healthy_rmse_v": self.healthy_rmse_v,
-                "closed_fraction": closed,
+                "closed_fraction": self.closed_fraction,
                 "closed_fraction_ci": ci and list(ci),
                 "baseline_soc_mae_pct": self.baseline_soc_mae_pct if soc_error else None,
                 "extended_soc_mae_pct": self.extended_soc_mae_pct if soc_error else None,
@@ -365,7 +370,7 @@ class Diagnosis:
                 "detected": found.detected,
                 "probability_none": found.probabilities["none"],
                 "probability_unknown": found.probabilities["unknown"],
-                "groups": [{"group": group, "probability": p} for group, p in found.groups.items()],
+                "groups": [{"group": g, "probability": p} for g, p in found.groups.items()],
                 "check_first": found.check_first,
                 "named": found.named,
                 "verdict": found.verdict,
@@ -379,20 +384,17 @@ class Diagnosis:
             "visible_from": self.visible_from,
             "summary": self.summary,
             "limits": self.caveats,
-            "inputs": self._inputs(),
+            "inputs": {
+                "model": {"name": self.model.name, "sha256": hashlib.sha256(model).hexdigest()},
+                "logs": _files(self.logs),
+                "references": _files(self.references),
+            },
             "extended_model": extended_model,
         }
 
-    def _inputs(self) -> dict[str, Any]:
-        def described(logs: Sequence[Log]) -> list[dict[str, Any]]:
-            return [{"name": log.name, "sha256": file_sha256(log.source)} for log in logs]
 
-        text = self.model.to_json().encode()
-        return {
-            "model": {"name": self.model.name, "sha256": hashlib.sha256(text).hexdigest()},
-            "logs": described(self.logs),
-            "references": described(self.references),
-        }
+def _files(logs: Sequence[Log]) -> list[dict[str, Any]]:
+    return [{"name": log.name, "sha256": file_sha256(log.source)} for log in logs]
 
 
 def diagnose(
@@ -444,7 +446,7 @@ def diagnose(
     ...     model=Model.load("pack.json"),
     ...     references=[read_log(f"reference{k}.csv") for k in (1, 2, 3)],
     ... )  # doctest: +SKIP
-    >>> print(found.summary)  # doctest: +SKIP
+    >>> print(found.headline)  # doctest: +SKIP
     The current reads 3.0 A (2.7 … 3.3) too high (current_offset, 71 %).
     """
     with _one_thread():
@@ -459,16 +461,14 @@ def diagnose(
         _LOG.info("reading the references")
         traces, remarks = _traces(logs, model, initial_soc_pct)
         if isinstance(references, References):
-            known, has_references = references, True
+            known = references
         else:
-            reference_traces, more = _traces(own, model)
+            healthy, more = _traces(own, model)
             remarks += more
-            has_references = bool(own)
-            known = _learn(reference_traces or [_of_model(model, log) for log in traces], model)
+            known = _learn(healthy or [_of_model(model, log) for log in traces], model)
         _LOG.info("comparing the effects")
         of_logs = tuple(columns(known, log) for log in traces)
         evidence = analyse(known, of_logs)
-        posterior = answer(known, evidence, known.colder_k(traces), without=without, alarm=alarm)
         found = Diagnosis(
             logs=tuple(logs),
             references=own,
@@ -476,9 +476,9 @@ def diagnose(
             known=known,
             columns=of_logs,
             evidence=evidence,
-            posterior=posterior,
+            posterior=answer(known, evidence, known.colder_k(traces), without=without, alarm=alarm),
             remarks=tuple(remarks),
-            has_references=has_references,
+            has_references=bool(own) or known is references,
             simulator=simulator,
         )
         _LOG.info("judging on held-out rows")
@@ -525,57 +525,7 @@ def _traces(
 
 def _of_model(model: Model, log: Trace) -> Trace:
     """Return a log with the model's voltage: the reference where none is given."""
-    return Trace(
-        log.current_a,
-        log.voltage_v - residual_v(model, log),
-        log.temperature_c,
-        log.start_pct,
-        log.measured,
-    )
-
-
-def closed_fraction(baseline_v: float, extended_v: float, healthy_v: float) -> float | None:
-    """Return the closed part of the squared gap above the healthy error; None without a gap."""
-    gap = baseline_v**2 - healthy_v**2
-    return min((baseline_v**2 - extended_v**2) / gap, 1.0) if gap > 0.0 else None
-
-
-def soc_error_pct(logs: Sequence[Log], model: Model) -> float | None:
-    """Return the estimator's mean absolute SoC error, initial SoC withheld [%]; or None.
-
-    Parameters
-    ----------
-    logs : sequence of Log
-        At the model's rate; those without a reference SoC throughout are skipped.
-    model : Model
-    """
-    errors = []
-    for log in (resample(log, model.rate_hz) for log in logs):
-        if log.soc_pct is None or np.isfinite(log.soc_pct).mean() < 0.5:
-            continue
-        table = estimate(log, model, initial_soc_pct="auto")
-        error = np.abs(table.soc_pct - log.soc_pct)
-        errors.append(error[np.isfinite(error) & (log.time_s - log.time_s[0] >= SETTLING_S)])
-    together = np.concatenate(errors) if errors else np.zeros(0)
-    return float(together.mean()) if together.size else None
-
-
-def _rms(parts: Sequence[FloatArray]) -> float:
-    """Return the root mean square of arrays together; NaN of nothing."""
-    whole = np.concatenate(parts)
-    return math.sqrt(float(np.mean(whole**2))) if whole.size else math.nan
-
-
-def _rms_of(rows: Sequence[JudgedRows], *, judged_only: bool) -> tuple[float, float]:
-    """Return RMS errors before and after [V]."""
-
-    def kept(of: JudgedRows) -> BoolArray:
-        return of.judged if judged_only else np.ones(len(of.before_v), dtype=bool)
-
-    return (
-        _rms([of.before_v[kept(of)] for of in rows]),
-        _rms([of.after_v[kept(of)] for of in rows]),
-    )
+    return replace(log, voltage_v=log.voltage_v - residual_v(model.extended_model(), log))
 
 
 @cache

@@ -24,10 +24,10 @@ from cangauge.diagnosis.evidence import (
 )
 from cangauge.diagnosis.pack_fit import Trace
 from cangauge.diagnosis.trials import additive_column, undone
-from cangauge.logs.log import Log
-from cangauge.model.effects.base import BOUND_MARGIN, Pack, Values
+from cangauge.model.effects.base import BOUND_MARGIN, Signals, Values
 from cangauge.model.effects.library import LIBRARY, effect_entries, shape_key
-from cangauge.model.model_file import Made, Model
+from cangauge.model.extended import ExtendedModel
+from cangauge.model.model_file import Model
 
 LOG_EFFECTS: Final = frozenset({"initial_soc"})
 """Effects of one log, which a model for later drives does not have."""
@@ -96,38 +96,17 @@ class Quantity:
         return {"value": self.value, "ci": ci, "unit": self.unit}
 
 
-@dataclass(frozen=True, eq=False)
-class JudgedRows:
-    """Errors of one log at 1 Hz; m rows that count."""
-
-    log: Columns
-    before_v: FloatArray
-    """Measured less given model, shape (m,) [V]."""
-    after_v: FloatArray
-    """With the cause, sized without these rows, shape (m,) [V]."""
-    judged: BoolArray
-    """Rows that the cause can change, shape (m,)."""
-
-
 def interval(evidence: EffectEvidence) -> tuple[float, float]:
     """Return the 95 % interval of an effect's size [unit of the trial]."""
     half = TWO_SIDED * float(np.hypot(evidence.std, TANGENT_STD * evidence.size))
     return evidence.size - half, evidence.size + half
 
 
-def at_1_hz(log: Trace) -> Log:
-    """Return a trace as a log, for the model."""
-    return Log(
-        np.arange(len(log.current_a), dtype=np.float64),
-        log.current_a,
-        log.voltage_v,
-        log.temperature_c,
-    )
-
-
-def residual_v(model: Model, log: Trace) -> FloatArray:
+def residual_v(model: ExtendedModel, log: Trace) -> FloatArray:
     """Return corrected measured less predicted voltage of a model at 1 Hz [V], shape (n,)."""
-    return model.predict(at_1_hz(log), initial_soc_pct=log.start_pct).residual_v
+    rows = np.arange(len(log.current_a))
+    signals = Signals(rows.astype(np.float64), log.current_a, log.voltage_v, log.temperature_c)
+    return model.predict(signals, log.start_pct, rows).residual_v
 
 
 class Extension:
@@ -135,184 +114,183 @@ class Extension:
 
     Parameters
     ----------
-    model : Model
+    model : ExtendedModel
         As given.
     known : References
     logs : sequence of Columns
         The diagnosed logs.
+    before_v : sequence of array of shape (m,)
+        Errors of the given model on the rows that count of each [V].
     evidence : EffectEvidence
         Of the cause.
     """
 
     def __init__(
-        self, model: Model, known: References, logs: Sequence[Columns], evidence: EffectEvidence
+        self,
+        model: ExtendedModel,
+        known: References,
+        logs: Sequence[Columns],
+        before_v: Sequence[FloatArray],
+        evidence: EffectEvidence,
     ) -> None:
-        self.model, self.known, self.logs, self.evidence = model, known, logs, evidence
-        self.effect = LIBRARY[evidence.trial.effect]
-        self._values = self._at_the_size()
+        self.model, self.known, self.logs, self.before_v = model, known, logs, before_v
+        self.evidence, self.effect = evidence, LIBRARY[evidence.trial.effect]
+        self._neutral = self.effect.neutral(model.pack)
+        self._values = {} if evidence.trial.effect in _SIGNAL else self._nearest()
 
-    def values(self, size: float, log: int = -1) -> Values | None:
-        """Return the effect's parameters at a size; None in a log before a step of resistance.
+    def values(self, size: float, place: float | None = 0.0, duration_s: float = 0.0) -> Values:
+        """Return the effect's parameters at a size.
 
         Parameters
         ----------
         size : float
             [unit of the trial].
-        log : int
-            Number of the diagnosed log; −1: for later drives.
+        place, duration_s : float
+            Place of a resistance step in a log, and the log's duration; None: later.
         """
-        trial, pack = self.evidence.trial, self._pack
+        trial = self.evidence.trial
         if trial.effect in _SIGNAL:
-            return self.effect.clipped(
-                self.effect.neutral(pack) | _SIGNAL[trial.effect](size, trial.number), pack
-            )
+            return self._neutral | _SIGNAL[trial.effect](size, trial.number)
         part = size / self.evidence.size if self.evidence.size else 0.0
         names = {item.name for item in self.effect.amplitudes}
         values = {k: part * v if k in names else v for k, v in self._values.items()}
         if self.evidence.in_logs:
-            place = 0.0 if log < 0 else self.evidence.in_logs[log]
-            if place is None:
-                return None
-            duration_s = 0.0 if log < 0 else len(self.logs[log].log.current_a)
-            values["start_s"] = place * duration_s
-        return self.effect.clipped(values, pack)
+            values["start_s"] = 1e7 if place is None else place * duration_s
+        return values
 
     @property
     def parameters(self) -> dict[str, Quantity]:
         """The effect's parameters with 95 % intervals of its amplitudes."""
-        low, high = (self.values(size) or {} for size in interval(self.evidence))
-        values = self.values(self.evidence.size) or {}
-        step = [k for k, place in enumerate(self.evidence.in_logs) if place is not None]
-        if step:
-            values = {**values, **(self.values(self.evidence.size, step[0]) or {})}
-        amplitudes = {item.name for item in self.effect.amplitudes}
-        amplitudes |= {"skew_s"} & {item.name for item in self.effect.parameters}
+        places = [
+            (place, float(len(log.log.current_a)))
+            for place, log in zip(self.evidence.in_logs, self.logs, strict=False)
+            if place is not None
+        ]
+        values, *ends = (
+            self.values(size, *(places or [(0.0, 0.0)])[0])
+            for size in (self.evidence.size, *interval(self.evidence))
+        )
+        shapes = {item.name for item in self.effect.parameters if item.neutral is None}
         return {
             item.name: Quantity(
                 values[item.name],
                 item.unit,
-                (min(low[item.name], high[item.name]), max(low[item.name], high[item.name]))
-                if item.name in amplitudes
-                else None,
+                None
+                if item.name in shapes
+                else (min(x[item.name] for x in ends), max(x[item.name] for x in ends)),
             )
             for item in self.effect.parameters
         }
 
-    def judge(self) -> list[JudgedRows]:
-        """Return the errors of each log, with the cause sized without the rows judged."""
-        sizes = held_out_sizes(self.known, self.logs, self.evidence)
-        judged = []
-        for k, (log, of_rows) in enumerate(zip(self.logs, sizes, strict=True)):
-            before = residual_v(self.model, log.log)[log.rows]
-            after = np.empty_like(before)
-            for size in np.unique(of_rows):
-                at = of_rows == size
-                after[at] = self._residual_v(log.log, float(size), k)[log.rows][at]
-            change = np.abs(after - before)
-            usual = float(np.quantile(change, 0.95)) if change.size else 0.0
-            rows = (change >= CHANGED_PART * usual) & self._covered_after(log)
-            judged.append(JudgedRows(log, before, after, rows))
-        return judged
+    def judge(self) -> tuple[list[FloatArray], list[BoolArray]]:
+        """Return the errors of each log with the cause, sized without the rows judged [V].
 
-    def model_file(self, rmse_v: float) -> Model:
+        Returns
+        -------
+        after_v : list of array of shape (m,)
+        judged : list of array of shape (m,)
+            Rows that the cause can change, at SoC that references visit with it undone.
+        """
+        sizes = held_out_sizes(self.known, self.logs, self.evidence)
+        after, judged = [], []
+        for k, (log, before) in enumerate(zip(self.logs, self.before_v, strict=True)):
+            errors = np.empty_like(before)
+            for size in np.unique(sizes[k]):
+                at = sizes[k] == size
+                values = self._in_log(self.values, float(size), k)
+                errors[at] = residual_v(self._with(values), log.log)[log.rows][at]
+            change = np.abs(errors - before)
+            usual = float(np.quantile(change, 0.95)) if change.size else 0.0
+            judged.append((change >= CHANGED_PART * usual) & self._covered_after(log))
+            after.append(errors)
+        return after, judged
+
+    def model_file(self, given: Model, rmse_v: float) -> Model:
         """Return the extended model, ready to save and run.
 
         Parameters
         ----------
+        given : Model
         rmse_v : float
             Its RMS error on held-out rows [V].
         """
-        values = None if self.effect.id in LOG_EFFECTS else self.values(self.evidence.size)
-        made = Made(
-            by=f"cangauge {__version__} gap",
-            options=self.model.made.options,
-            logs=self.model.made.logs,
-            fingerprint=self.model.made.fingerprint,
-        )
-        noise = self.model.noise.model_copy(
-            update={"voltage_rmse_v": rmse_v, "judged_on": "logs left out by `cangauge gap`"}
-        )
-        return self._with(values).model_copy(
+        extended = self.model
+        if self.effect.id not in LOG_EFFECTS:
+            extended = self._with(self.values(self.evidence.size))
+        made = given.made.model_copy(update={"by": f"cangauge {__version__} gap"})
+        judged = {"voltage_rmse_v": rmse_v, "judged_on": "logs left out by `cangauge gap`"}
+        return given.model_copy(
             update={
-                "name": f"{self.model.name}, extended",
-                "noise": noise,
+                "name": f"{given.name}, extended",
+                "effects": effect_entries(extended.effects),
+                "noise": given.noise.model_copy(update=judged),
                 "information": None,
                 "made": made,
             }
         )
 
-    @property
-    def _pack(self) -> Pack:
-        return self.model.extended_model().pack
+    def _in_log(self, of: Callable[..., Values], size: float, number: int) -> Values:
+        """Return the parameters at a size in one of the diagnosed logs."""
+        if not self.evidence.in_logs:
+            return of(size)
+        duration_s = float(len(self.logs[number].log.current_a))
+        return of(size, self.evidence.in_logs[number], duration_s)
 
     def _covered_after(self, log: Columns) -> BoolArray:
-        """Return the rows at SoC that references visit with the cause undone; all if few."""
-        trial = self.evidence.trial
-        if not trial.changes_signal:
-            return np.ones(len(log.rows), dtype=bool)
-        without = undone(self.known.pack, log.log, trial, self.evidence.size)
-        covered = soc_covered(self.known.pack, without, self.known.logs)[log.rows]
-        return covered if covered.any() else np.ones(len(log.rows), dtype=bool)
+        """Return the rows at SoC that references visit with the cause undone; all if none."""
+        covered = np.ones(len(log.rows), dtype=bool)
+        if self.evidence.trial.changes_signal:
+            without = undone(self.known.pack, log.log, self.evidence.trial, self.evidence.size)
+            after = soc_covered(self.known.pack, without, self.known.logs)[log.rows]
+            covered = after if after.any() else covered
+        return covered
 
-    def _with(self, values: Values | None) -> Model:
+    def _with(self, values: Values) -> ExtendedModel:
         """Return the given model with the effect, added to one of the same shape."""
-        if values is None:
-            return self.model
-        extended = self.model.extended_model()
-        key, neutral = shape_key(self.effect, values), self.effect.neutral(extended.pack)
-        effects = [item for item in extended.effects if shape_key(*item) != key]
+        key = shape_key(self.effect, values)
+        effects = tuple(item for item in self.model.effects if shape_key(*item) != key)
         total = dict(values)
-        for _, known in (item for item in extended.effects if shape_key(*item) == key):
+        for _, known in (item for item in self.model.effects if shape_key(*item) == key):
             for item in self.effect.amplitudes:
-                total[item.name] += known[item.name] - neutral[item.name]
-        added = self.effect, self.effect.clipped(total, extended.pack)
-        return self.model.model_copy(update={"effects": effect_entries([*effects, added])})
+                total[item.name] += known[item.name] - self._neutral[item.name]
+        added = self.effect, self.effect.clipped(total, self.model.pack)
+        return replace(self.model, effects=(*effects, added))
 
-    def _residual_v(self, log: Trace, size: float, number: int) -> FloatArray:
-        return residual_v(self._with(self.values(size, number)), log)
-
-    def _at_the_size(self) -> dict[str, float]:
+    def _nearest(self) -> dict[str, float]:
         """Return the parameters whose voltage is nearest to the evidence's, at its size."""
-        trial = self.evidence.trial
-        pack, effect = self._pack, self.effect
-        if trial.effect in _SIGNAL:
-            return effect.neutral(pack) | _SIGNAL[trial.effect](self.evidence.size, trial.number)
-        logs = [
-            k
-            for k in range(len(self.logs))
-            if not self.evidence.in_logs or self.evidence.in_logs[k] is not None
+        trial, in_logs = self.evidence.trial, self.evidence.in_logs
+        places = in_logs or (trial.shape,) * len(self.logs)
+        chosen = [
+            item
+            for item in zip(self.logs, self.before_v, places, strict=True)
+            if not in_logs or item[2] is not None
         ]
-        target = np.concatenate([self._added_v(k) for k in logs])
-        best: tuple[float, dict[str, float]] = (np.inf, effect.neutral(pack))
+        target = self.evidence.size * np.concatenate([
+            additive_column(self.known.pack, log.log, replace(trial, shape=place))[log.rows]
+            for log, _, place in chosen
+        ])  # fmt: skip
+        units = {
+            item.name: 0.1 * max(map(abs, item.bounds(self.model.pack, BOUND_MARGIN)))
+            for item in self.effect.amplitudes
+        }
+        best: tuple[float, dict[str, float]] = (np.inf, self._neutral)
         for shape in _SHAPES[trial.effect](trial.number, self.known):
-            neutral = effect.neutral(pack) | shape
-            bounds = {item.name: item.bounds(pack, BOUND_MARGIN) for item in effect.amplitudes}
-            units = {name: 0.1 * max(abs(low), abs(high)) for name, (low, high) in bounds.items()}
-            columns = np.column_stack([
-                np.concatenate([self._change_v(k, neutral | {name: unit}) for k in logs]) / unit
-                for name, unit in units.items()
-            ])  # fmt: skip
-            solution, *_ = np.linalg.lstsq(columns, target, rcond=None)
+            neutral = self._neutral | shape
+            columns = []
+            for name, unit in units.items():
+                changes = []
+                for log, before, place in chosen:
+                    values = neutral | {name: unit}
+                    if in_logs:
+                        values["start_s"] = float(place or 0.0) * len(log.log.current_a)
+                    after = residual_v(self._with(values), log.log)[log.rows]
+                    changes.append((before - after) / unit)
+                columns.append(np.concatenate(changes))
+            design = np.column_stack(columns)
+            solution, *_ = np.linalg.lstsq(design, target, rcond=None)
             values = neutral | dict(zip(units, solution.tolist(), strict=True))
-            values = effect.clipped(values, pack)
-            amplitude = np.array([values[name] for name in units])
-            left = float(np.sum((target - columns @ amplitude) ** 2))
+            values = self.effect.clipped(values, self.model.pack)
+            left = float(np.sum((target - design @ [values[name] for name in units]) ** 2))
             if left < best[0]:
                 best = left, values
         return best[1]
-
-    def _added_v(self, number: int) -> FloatArray:
-        """Return the evidence's voltage on the rows that count of a log [V]."""
-        log, trial = self.logs[number], self.evidence.trial
-        if self.evidence.in_logs:
-            trial = replace(trial, shape=self.evidence.in_logs[number])
-        return self.evidence.size * additive_column(self.known.pack, log.log, trial)[log.rows]
-
-    def _change_v(self, number: int, values: Values) -> FloatArray:
-        """Return the voltage that the model's effect adds on the same rows [V]."""
-        log = self.logs[number]
-        if self.evidence.in_logs:
-            place = self.evidence.in_logs[number] or 0.0
-            values = {**values, "start_s": place * len(log.log.current_a)}
-        with_effect = residual_v(self._with(values), log.log)
-        return np.asarray((residual_v(self.model, log.log) - with_effect)[log.rows])

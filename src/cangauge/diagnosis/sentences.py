@@ -129,7 +129,11 @@ def size_text(found: Diagnosis) -> str:
         text += f" ({expected} with what the references show of this pack)"
     text += f"; {healthy} {significant(found.healthy_rmse_v, 2, 'V')}."
     if found.accepted is not None:
-        rows = "" if found.judged_part > 0.99 else ", on the rows that it can change"
+        rows = (
+            ""
+            if all(log.judged.all() for log in found.log_errors)
+            else ", on the rows that it can change"
+        )
         text += f" With {found.accepted}: {significant(found.extended_rmse_v, 2, 'V')}{rows}."
     return text
 

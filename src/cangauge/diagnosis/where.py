@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from cangauge._typing import BoolArray, FloatArray, IntArray
 
@@ -70,11 +69,17 @@ class ErrorShare:
         }
 
 
-def pieces(seconds: Sequence[NDArray[np.number]]) -> IntArray:
+def rms(logs: Sequence[LogErrors], *, after: bool = False) -> float:
+    """Return the RMS error of the judged rows of all logs, before or after [V]."""
+    errors = [(log.after_v if after else log.before_v)[log.judged] for log in logs]
+    return float(np.sqrt(np.mean(np.concatenate(errors) ** 2)))
+
+
+def pieces(logs: Sequence[LogErrors]) -> IntArray:
     """Return the number of each row's piece of `PIECE_S`, over all logs in order."""
     numbers, first = [], 0
-    for time_s in seconds:
-        piece = (time_s // PIECE_S).astype(np.intp)
+    for log in logs:
+        piece = (log.time_s // PIECE_S).astype(np.intp)
         numbers.append(piece + first)
         first += int(piece.max(initial=-1)) + 1
     return np.concatenate(numbers)
@@ -96,38 +101,28 @@ def error_shares(logs: Sequence[LogErrors], capacity_ah: float) -> list[ErrorSha
     capacity_ah : float
         Defines rest [Ah].
     """
-    square, piece = (
-        np.concatenate([log.before_v for log in logs]) ** 2,
-        pieces([log.time_s for log in logs]),
-    )
+    square, piece = np.concatenate([log.before_v for log in logs]) ** 2, pieces(logs)
     shares = []
+
+    def add(  # noqa: PLR0917
+        axis: str, limits: tuple[float, float], unit: str, part: FloatArray, whole: FloatArray,
+        rows: int,
+    ) -> None:  # fmt: skip
+        drawn_part, drawn_whole = drawn_sums(piece, part, whole)
+        low, high = np.quantile(drawn_part / np.maximum(drawn_whole, 1e-12), [0.025, 0.975])
+        share = float(part.sum() / max(float(whole.sum()), 1e-12))
+        rms_v = float(np.sqrt(part.sum() / rows))
+        shares.append(ErrorShare(axis, *limits, unit, share, rms_v, (float(low), float(high))))
+
     for axis, unit, values, edges in _axes(logs, capacity_ah):
         for low, high in itertools.pairwise(edges.tolist()):
             inside = (values >= low) & ((values < high) | (high >= edges[-1]))
             if inside.any():
-                rms = float(np.sqrt(square[inside].mean()))
-                shares.append(_share(axis, (low, high), unit, square * inside, square, piece, rms))
+                add(axis, (low, high), unit, square * inside, square, int(inside.sum()))
     bands = [np.concatenate(parts) ** 2 for parts in zip(*map(_bands, logs), strict=True)]
-    whole = np.sum(bands, axis=0)
     for limits, band in zip(itertools.pairwise(TIME_SCALES_S), bands, strict=True):
-        rms = float(np.sqrt(band.mean()))
-        shares.append(_share("timescale", limits, "s", band, whole, piece, rms))
+        add("timescale", limits, "s", band, np.sum(bands, axis=0), band.size)
     return shares
-
-
-def _share(  # noqa: PLR0917 - one row of the table
-    axis: str,
-    limits: tuple[float, float],
-    unit: str,
-    part: FloatArray,
-    whole: FloatArray,
-    piece: IntArray,
-    rmse_v: float,
-) -> ErrorShare:
-    drawn_part, drawn_whole = drawn_sums(piece, part, whole)
-    low, high = np.quantile(drawn_part / np.maximum(drawn_whole, 1e-12), [0.025, 0.975])
-    share = float(part.sum() / max(float(whole.sum()), 1e-12))
-    return ErrorShare(axis, *limits, unit, share, rmse_v, (float(low), float(high)))
 
 
 def _axes(

@@ -24,7 +24,7 @@ from cangauge.cli.options import (
     within,
 )
 from cangauge.cli.output import console, emit_json, note, print_table, progress_shown
-from cangauge.cli.shown import ALARM_BELOW, FLEET_LOGS, FLEET_REFERENCES, LOCAL, VEHICLE_PATTERN
+from cangauge.cli.shown import ALARM, FLEET_LOGS, FLEET_REFERENCES, LOCAL, VEHICLE_PATTERN
 from cangauge.errors import InputError
 
 if TYPE_CHECKING:
@@ -344,7 +344,7 @@ def gap_fleet_command(  # noqa: PLR0917 - typer passes options by name
         typer.Option(
             metavar="P", help="Report a fault where the probability of none is at most this."
         ),
-    ] = ALARM_BELOW,
+    ] = ALARM,
     *,
     cluster: Cluster,
     reading: Reading,
