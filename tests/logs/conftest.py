@@ -1,178 +1,66 @@
-"""Small files of every format, as their makers write them."""
+"""One drive of 60 rows, as every kind of file of `cases.toml` holds it."""
 
 from __future__ import annotations
 
-import gzip
-import io
-import zipfile
-from collections.abc import Callable
+import datetime as dt
+import tomllib
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
-from cangauge.logs.canonical import write_log
 from cangauge.logs.log import Log
 
-D3_HEADERS = {
-    "2012": [
-        "Timestamp [sec]",
-        "Dyno Speed [mph]",
-        "Dyno Tractive Effort [N]",
-        "Cell Temp [C]",
-        "Phase #",
-        "HV Battery Voltage w/500A max clamp [V]",
-        "HV Battery Current w/500A max clamp [A]",
-        "HV Battery Voltage w/200A max clamp [V]",
-        "HV Battery Current w/200A max clamp [A]",
-    ],
-    "2013": [
-        "Time[sec]",
-        "Dyno_Speed[mph]",
-        "Test_Cell_Temp[C]",
-        "HV_Battery_SOC[%]",
-        "HV_Battery_Current[A]",
-        "HV_Battery_Voltage[V]",
-    ],
-    "later": [
-        "DAQ_Time[s]",
-        "Time[s]",
-        "Dyno_Spd[mph]",
-        "Cell_Temp[C]",
-        "HVBatt_voltage_CAN5__V",
-        "HVBatt_current_wide_CAN5__A",
-        "HVBatt_SOC_CAN5__per",
-        "HVBatt_Volt_Hioki_U1__V",
-        "HVBatt_Curr_Hioki_I1__A",
-    ],
-}
+ROWS = 60
+TIME_S = np.arange(ROWS, dtype=float)
+CURRENT_A = np.where(TIME_S % 2 == 1.0, 40.0, -10.0)
+"""Steps every second, so that the data show the sign; positive = discharge."""
+VOLTAGE_V = 380.0 - 0.1 * CURRENT_A
+SOC_PCT = 80.0 - 0.1 * TIME_S
+START = dt.datetime(2024, 3, 13, 23, 59, 30, tzinfo=dt.UTC)
 
-
-def current_at(time_s: float) -> float:
-    """A current [A] that steps every second, positive = discharge."""
-    return 40.0 if int(np.floor(time_s)) % 2 else -10.0
-
-
-def voltage_at(time_s: float) -> float:
-    return 380.0 - 0.1 * current_at(time_s)
-
-
-def d3_text(header: list[str], *, start_s: float = -1.0, end_s: float = 40.0) -> str:
-    """A D3 file; the 200 A clamp saturates at 20 A, copies from CAN have the sign inverted."""
-    lines = ["\t".join(header)]
-    for tick in range(round(start_s * 10), round(end_s * 10)):
-        time = tick / 10
-        lines.append("\t".join(f"{_d3_value(name, time):.4f}" for name in header))
-    return "\r\n".join(lines) + "\r\n"
-
-
-def _d3_value(name: str, time: float) -> float:
-    lower = name.lower()
-    if "current" in lower or "curr_" in lower:
-        current = current_at(time)
-        if "200a" in lower:
-            return min(current, 20.0)
-        return -current if "can" in lower else current
-    if "volt" in lower:
-        return voltage_at(time)
-    if "time" in lower:
-        return time
-    if "soc" in lower:
-        return 90.0 - time / 100.0
-    return 23.5 if "temp" in lower else 0.0
-
-
-@pytest.fixture(scope="session")
-def d3_headers() -> dict[str, list[str]]:
-    return D3_HEADERS
-
-
-@pytest.fixture(scope="session")
-def build_d3() -> Callable[..., str]:
-    return d3_text
+HERE = Path(__file__).parent
+CASES: dict[str, dict[str, Any]] = tomllib.loads((HERE / "cases.toml").read_text("utf-8"))
 
 
 @pytest.fixture
-def small_log() -> Log:
-    rows = 8
-    time = np.arange(rows) * 0.1
-    soc = np.linspace(80.0, 79.0, rows)
-    soc[3] = np.nan
-    return Log(
-        time_s=time,
-        current_a=np.linspace(-10.0, 55.5, rows),
-        voltage_v=380.0 - time,
-        temperature_c=np.full(rows, 21.0),
-        soc_pct=soc,
-        temperature_source="pack",
-    )
+def drive() -> Log:
+    """The drive itself."""
+    return Log(TIME_S, CURRENT_A, VOLTAGE_V, np.full(ROWS, 21.5), SOC_PCT, name="drive")
 
 
-I3_HEADER = (
-    "Time [s];Velocity [km/h];Regenerative Braking Signal ;Battery Voltage [V];"
-    "Battery Current [A];Battery Temperature [°C];max. Battery Temperature [°C];SoC [%];"
-    "displayed SoC [%];max. SoC [%)"
-)
+def row_of(case: dict[str, Any], k: int) -> str:
+    """Return a row of a case."""
+    i, u, soc = float(CURRENT_A[k]), float(VOLTAGE_V[k]), round(float(SOC_PCT[k]), 1)
+    when = START + dt.timedelta(seconds=k)
+    template = case["row"]
+    if k >= case.get("rows_with_second", ROWS):
+        template = template.partition("\n")[0]
+    if "decimal" in case:
+        template = template.replace("21.5", "21,5")
+    values = {
+        "t": float(k), "t_ms": 1e3 * k, "h": k / 3600.0, "minutes": k / 60.0, "c": -i, "i": i,
+        "i_ma": 1e3 * i, "i_ka": i / 1e3, "c_ma": -1e3 * i, "u": u, "u_mv": 1e3 * u, "soc": soc,
+        "f": soc / 100.0, "soc_1e4": 1e4 * soc, "days": 45_364.0 + k / 86_400.0,
+        "epoch_s": START.timestamp() + k, "epoch_ms": 1e3 * (START.timestamp() + k),
+    }  # fmt: skip
+    if "decimal" in case:
+        values = {name: str(value).replace(".", ",") for name, value in values.items()}
+    german_ma = f"{1e3 * i:,.1f}".translate(str.maketrans(",.", ".,"))
+    hms = f"00:00:{k:02d}"
+    return template.format(k=k, hms=hms, when=when, german_ma=german_ma, **values)
 
 
-def i3_text(rows: list[str]) -> bytes:
-    return "\r\n".join([I3_HEADER, *rows, ""]).encode("latin-1")
+def content_of(case: dict[str, Any]) -> bytes:
+    """Return the file of a case."""
+    lines = [case["head"]] if "head" in case else []
+    text = "\n".join([*lines, *(row_of(case, k) for k in range(ROWS)), case.get("foot", "")])
+    return text.replace("\n", case.get("ends", "\n")).encode(case.get("encoding", "utf-8"))
 
 
-@pytest.fixture(scope="session")
-def build_i3() -> Callable[[list[str]], bytes]:
-    return i3_text
-
-
-@pytest.fixture
-def every_format(tmp_path: Path, small_log: Log) -> dict[str, bytes]:
-    """Content of a small valid file of every format, by file name."""
-    for name in ("log.parquet", "log.csv"):
-        write_log(small_log, tmp_path / name)
-    csv = (tmp_path / "log.csv").read_bytes()
-    files = {
-        "log.parquet": (tmp_path / "log.parquet").read_bytes(),
-        "log.csv": csv,
-        "log.csv.gz": gzip.compress(csv, mtime=0),
-        "log;.csv": csv.replace(b",", b";").replace(b".", b","),
-    }
-    for spelling, header in D3_HEADERS.items():
-        files[f"{spelling} Test Data.txt"] = d3_text(header, start_s=-0.2, end_s=0.3).encode()
-    packed = io.BytesIO()
-    with zipfile.ZipFile(packed, "w", zipfile.ZIP_DEFLATED) as archive:
-        archive.writestr("61201019 Test Data.txt", files["2012 Test Data.txt"])
-        archive.writestr("readme.pdf", b"%PDF")
-    files["leaf.zip"] = packed.getvalue()
-    files["TripA01.csv.gz"] = gzip.compress(
-        i3_text([f"{k / 10};0;0;391.4;-{k}.2;21;22;86.9;100;90" for k in range(6)]), mtime=0
-    )
-    files["A123_OCV_P25_S1.csv"] = (
-        "Data_Point,Test_Time(s),Date_Time,Step_Index,Current(A),Voltage(V)\n"
-        + "".join(f"{k},{k * 60.01:.2f},09/23/2013 16:21:09,1,-0.1,3.5\n" for k in range(4))
-    ).encode()
-    files["A123_DYN_50_P25_s1.csv"] = (
-        "time, step, current, voltage, chgAh, disAh\n"
-        + "".join(f"{k + 60.01:.4f}, 1.0000, -0.0000, 3.5764, 0.0, 0.0\n" for k in range(4))
-    ).encode()
-    files["Cell-HPPC-10C.csv"] = "".join(
-        f"No,{k}.0,1,1,1,1,1,{k}.0,-{k}.00,3.09{k},0.0,0.00,0.00,DCHG, ,\r\n" for k in range(1, 5)
-    ).encode()
-    files["module.csv"] = (
-        "Test Name,170410\nNotes, 5.25b\n\n"
-        "Total Time,Cycle,Current,Voltage,Amp-Hours,Temperature A1,Temperature A2,Mode,\n"
-        + "".join(f"{k}.0,1,-{k},24.9,0,22,23,DCHG,\n" for k in range(1, 5))
-        + "Total Number of Data Lines in the Database: 0000000004\n"
-    ).encode()
-    files["logger.csv"] = (
-        "Zeit;Strom;Spannung;Temperatur\n;mA;V;°C\n"
-        + "".join(f"13.03.2024 10:00:0{k},5;{k}000,5;38{k},25;21,5\n" for k in range(6))
-    ).encode("latin-1")
-    files["history.csv"] = (
-        "entity_id,state,last_changed\n"
-        + "".join(
-            f"sensor.battery_{name},{value},2024-03-13T23:59:3{k}.000Z\n"
-            for k in range(6)
-            for name, value in (("current", k), ("voltage", 380 + k), ("temperature", 21))
-        )
-    ).encode()
-    return files
+def options_of(case: dict[str, Any]) -> dict[str, Any]:
+    """Return what the user of a case states."""
+    names = {"columns": "columns", "sign": "sign", "temperature": "temperature_c",
+             "temperature_source": "temperature_source"}  # fmt: skip
+    return {name: case[key] for key, name in names.items() if key in case}

@@ -33,7 +33,8 @@ from cangauge.errors import InputError
 from cangauge.identify.starts import with_start
 from cangauge.logs.column_map import ColumnMap
 from cangauge.logs.draft import Sign
-from cangauge.logs.file_content import as_utf8, delimiter_of, split_cells
+from cangauge._files import as_utf8
+from cangauge.logs.text import delimiter_of, split_cells
 from cangauge.logs.log import Log
 from cangauge.logs.read import LogFile
 from cangauge.logs.sign import require_discharge_positive
