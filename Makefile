@@ -9,11 +9,12 @@ SOCKETCAN ?= $(wildcard ../shared/tools/with-socketcan)
 # Folder of the recorded logs (see README for their sources).
 DATA ?= $(wildcard ../shared/data)
 
-.PHONY: help demo test lint coverage check data faults trips bench bench-check lowest site wheel clean
+.PHONY: help demo test nightly lint coverage check data faults trips bench bench-check lowest site wheel clean
 
 help:
 	@echo "make demo      the whole job on the shipped log: fit, bus, service, report"
 	@echo "make test      the whole test suite"
+	@echo "make nightly   what is too long for the suite (PART=fuzz|faults|grade|long, DATA=FOLDER)"
 	@echo "make lint      ruff and mypy"
 	@echo "make coverage  the test suite with coverage"
 	@echo "make check     a small part of the withheld check of the diagnosis"
@@ -47,6 +48,9 @@ test: export OMP_NUM_THREADS := 1
 test: export OPENBLAS_NUM_THREADS := 1
 test: $(VENV)/installed-dev
 	$(BIN)/python -m pytest -n auto --dist loadfile --no-loadscope-reorder
+
+nightly: $(VENV)/installed-dev
+	$(BIN)/python benchmarks/nightly.py $(PART) $(if $(DATA),--data "$(DATA)") $(if $(SOCKETCAN),--socketcan "$(SOCKETCAN) -t 3600 -m 2G")
 
 lint: $(VENV)/installed-dev
 	$(BIN)/ruff check

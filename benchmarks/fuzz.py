@@ -9,7 +9,7 @@ files, configurations, maps, DBC files, speed traces). Each must be accepted, or
 warning, more than 2 s of CPU time, more than 128 MB of memory, a SoC outside 0–100 %, a process
 that dies or hangs. Exit status 1 on a finding. The same seed gives the same inputs.
 
-Bombs, devices and pipes are tested by name in `tests/fuzz`.
+Bombs, devices and pipes are tested by name in `tests/nightly/fuzz`.
 """
 
 from __future__ import annotations

@@ -5,28 +5,38 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
-from importlib import import_module
+from pathlib import Path
 
 import pytest
 import typer
 
 from cangauge._resources import THREADS
-from cangauge.cli.app import COMMANDS, app
+from cangauge.cli.app import COMMANDS, app, help_line
 from live import in_process
 
 
 @pytest.mark.parametrize("name", COMMANDS)
-def test_each_command_loads_and_has_help(name: str) -> None:
+def test_each_command_loads_and_the_listing_has_its_first_line(name: str) -> None:
     command = typer.main.get_command(app).get_command(None, name)  # type: ignore[attr-defined, arg-type] # a group, which needs no context
     assert command.name == name
-    assert command.help
+    assert (command.help or "").splitlines()[0] == help_line(COMMANDS[name])
 
 
-@pytest.mark.parametrize("name", COMMANDS)
-def test_the_listing_repeats_the_first_line_of_each_docstring(name: str) -> None:
-    module = name.replace("-", "_")
-    command = getattr(import_module(f"cangauge.cli.{module}"), f"{module}_command")
-    assert command.__doc__.partition("\n")[0] == COMMANDS[name]
+def test_another_package_adds_a_command(tmp_path: Path) -> None:
+    (tmp_path / "other.py").write_text(
+        'def hello_command() -> None:\n    """Greet the pack."""\n    print("hello")\n'
+    )
+    info = tmp_path / "other-1.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: other\nVersion: 1\n")
+    (info / "entry_points.txt").write_text("[cangauge.commands]\nhello = other:hello_command\n")
+    for words, expected in ((["hello"], "hello"), (["--help"], "Greet the pack.")):
+        done = subprocess.run(
+            [sys.executable, "-m", "cangauge", *words],
+            capture_output=True, text=True, check=True, timeout=60,
+            env=os.environ | {"PYTHONPATH": str(tmp_path)},
+        )  # fmt: skip
+        assert expected in done.stdout
 
 
 def test_the_root_page_and_completion_import_no_command() -> None:

@@ -206,7 +206,7 @@ def test_logs_and_results_live_in_object_storage(
 
 def test_help_imports_no_engine() -> None:
     code = (
-        "import sys; import cangauge, cangauge.cli.fleet\n"
+        "import sys; import cangauge, cangauge.extras.fleet.command\n"
         "print([m for m in sys.modules if m.split('.')[0] in {'dask', 'distributed', 'fsspec'}])"
     )
     done = subprocess.run(

@@ -11,13 +11,13 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
-from cangauge.cli.twin import twin_command
 from cangauge.errors import InputError
 from cangauge.extras.validation import simulate
 from cangauge.extras.validation.twin import simulation
 from cangauge.extras.validation.twin.drive import read_speed
 from cangauge.extras.validation.twin.faults import parse_effect
 from cangauge.extras.validation.twin.pack import Pack
+from cangauge.extras.validation.twin_command import twin_command
 from cangauge.logs.read import read_log
 from cangauge.model.coulomb_counting import capacity_from_full_discharge
 

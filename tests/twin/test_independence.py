@@ -71,8 +71,7 @@ def test_twin_loads_nothing_under_test(project: Path) -> None:
 @pytest.mark.slow
 def test_importing_validation_loads_nothing_heavy() -> None:
     code = (
-        "import sys, cangauge.extras.validation;"
-        "print(any('numpy' in name for name in sys.modules))"
+        "import sys, cangauge.extras.validation;print(any('numpy' in name for name in sys.modules))"
     )
     done = subprocess.run(
         [sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=60

@@ -5,10 +5,13 @@ Exit codes: 0 success, 1 failure, 2 bad usage or input, 130 stopped by Ctrl-C.
 
 from __future__ import annotations
 
+import ast
 import os
 import sys
 from collections.abc import Iterable, Mapping
-from importlib import import_module
+from importlib.metadata import EntryPoint, entry_points
+from importlib.util import find_spec
+from pathlib import Path
 from typing import Any, Final
 
 import typer
@@ -21,28 +24,30 @@ from cangauge._version import __version__
 from cangauge.cli.output import emit_json, note
 from cangauge.errors import CangaugeError, closest
 
-COMMANDS: Final = {
-    "demo": "Fit a model, replay a log on a bus, estimate its SoC live, and report the errors.",
-    "init": "Find the car's signals, prove them against each other, and write a map and a"
-    " configuration.",
-    "fit": "Identify the voltage model of a pack from recorded logs.",
-    "estimate": "Estimate the state of charge of a recorded log or capture, offline.",
-    "gap": "Diagnose the gap between a model and logs: size, place, probable cause.",
-    "gap-check": "Measure how often `gap` finds the right cause, on withheld causes.",
-    "packs-check": "Measure the SoC errors, and their σ, on recorded packs.",
-    "export-c": "Write a model and the estimator as C sources, with tests, for a microcontroller.",
-    "run": "Estimate the state of charge from a bus, and publish it there.",
-    "status": "Show the state of a running service: SoC ± standard deviation [%], frames, delays.",
-    "monitor": "Watch a running service in the terminal: values, charts, status with its reasons.",
-    "fleet": "Fit, estimate, diagnose and watch the health of a fleet's logs, on Dask.",
-    "replay": "Play a recorded log or capture on a bus.",
-    "inspect": "Show what a log or capture holds, and the sign of its current.",
-    "twin": "Simulate a pack, a drive, the weather and the sensors: a log whose truth is known.",
-    "export-ecm": "Write a model as an equivalent circuit: open-circuit voltage, R0 and RC pairs as"
-    " tables.",
-    "export-fmu": "Write a model as a functional mock-up unit (FMI 2.0 or 3.0, co-simulation).",
-}
-"""Help line of each command: the first of its docstring, so that listing needs no imports."""
+FIRST: Final = ("demo", "init", "inspect", "fit", "estimate", "gap", "run", "status", "replay")
+"""Commands of the main job, in its order; the others follow by name."""
+
+
+def _entry_points() -> dict[str, EntryPoint]:
+    """Return the installed commands by name: entry points of the group `cangauge.commands`."""
+    found = {each.name: each for each in entry_points(group="cangauge.commands")}
+    order = [name for name in FIRST if name in found]
+    return {name: found[name] for name in [*order, *sorted(found.keys() - set(order))]}
+
+
+COMMANDS: Final = _entry_points()
+
+
+def help_line(command: EntryPoint) -> str:
+    """Return the first line of a command's docstring, read without importing its module."""
+    spec = find_spec(command.module)
+    if spec is None or spec.origin is None:
+        return ""
+    for node in ast.parse(Path(spec.origin).read_bytes()).body:
+        if isinstance(node, ast.FunctionDef) and node.name == command.attr:
+            return (ast.get_docstring(node) or "").partition("\n")[0]
+    return ""
+
 
 _CONTEXT: Final = {"help_option_names": ["-h", "--help"]}
 
@@ -84,7 +89,10 @@ class _Listing(TyperGroup):
 
     def __init__(self, group: LazyGroup) -> None:
         super().__init__(
-            commands={name: TyperCommand(name, help=text) for name, text in COMMANDS.items()},
+            commands={
+                name: TyperCommand(name, help=help_line(command))
+                for name, command in COMMANDS.items()
+            },
             rich_markup_mode=group.rich_markup_mode,
         )
         self.__dict__.update(
@@ -93,14 +101,12 @@ class _Listing(TyperGroup):
 
 
 def _command(name: str) -> Any:
-    module = name.replace("-", "_")
-    found = import_module(f"cangauge.cli.{module}")
-    if (group := getattr(found, f"{module}_app", None)) is not None:
+    function = COMMANDS[name].load()
+    if (group := getattr(function, "group", None)) is not None:
         return build_command(group)
     alone = typer.Typer(
         rich_markup_mode="markdown", add_completion=False, context_settings=_CONTEXT
     )
-    function = getattr(found, f"{module}_command")
     alone.command(name, cls=getattr(function, "command_class", None))(function)
     return build_command(alone)
 

@@ -127,6 +127,9 @@ def fleet_command() -> None:
     """
 
 
+fleet_command.group = fleet_app  # type: ignore[attr-defined] # read by the app
+
+
 @fleet_app.command("fit")
 @option_groups()
 def fit_fleet_command(

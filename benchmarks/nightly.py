@@ -1,0 +1,111 @@
+"""Run what is too long for the suite, in parts of at most 35 minutes.
+
+    python benchmarks/nightly.py [PART…] [--data FOLDER] [--socketcan COMMAND]
+
+fuzz     every reader on 300,000 mutants of small valid files, and the tests of `tests/nightly`
+faults   the table of faults on a live bus
+grade    the estimator on recorded packs, and the diagnosis on its frozen cases (need --data)
+long     restarts by SIGKILL, and load, timing and memory of the live service
+
+Each part writes `out/nightly/PART.json`: state (passed, failed, skipped), reason, seconds and the
+last lines of each of its commands. Exit status 1 if a part failed.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+
+ROOT = Path(__file__).resolve().parents[1]
+LIMIT_S = 35 * 60.0
+"""Longest part [s]."""
+SHOWN_LINES = 60
+
+console = Console(highlight=False)
+
+
+def commands(data: Path | None, socketcan: str) -> dict[str, list[list[str]] | str]:
+    """Return the commands of each part, or the reason for which it cannot run."""
+    python = sys.executable
+    bus = ["--socketcan", socketcan] if socketcan else []
+    missing = "no folder of recorded logs: --data FOLDER"
+    return {
+        "fuzz": [
+            [python, "-m", "pytest", "tests/nightly"],
+            [python, "benchmarks/fuzz.py", "--inputs", "300000"],
+        ],
+        "faults": [[python, "-m", "faults", *bus]],
+        "grade": [
+            [python, "-m", "packs", "--data", str(data)],
+            [python, "-m", "diagnosis_check", "--data", str(data)],
+        ]
+        if data is not None
+        else missing,
+        "long": [
+            [python, "benchmarks/restarts.py"],
+            [python, "benchmarks/bus_load.py"],
+        ],
+    }
+
+
+def run(part: str, lines: list[list[str]] | str) -> dict[str, Any]:
+    """Run the commands of a part until one fails; return what is written of it."""
+    if isinstance(lines, str):
+        return {"part": part, "state": "skipped", "reason": lines, "seconds": 0.0, "commands": []}
+    environment = os.environ | {
+        "PYTHONPATH": str(ROOT / "benchmarks"),
+        "OMP_NUM_THREADS": "1",
+        "OPENBLAS_NUM_THREADS": "1",
+    }
+    began, done, reason = time.monotonic(), [], ""
+    for command in lines:
+        left_s = LIMIT_S - (time.monotonic() - began)
+        try:
+            ended = subprocess.run(
+                command, cwd=ROOT, env=environment, capture_output=True, text=True, check=False,
+                timeout=max(left_s, 1.0),
+            )  # fmt: skip
+            code, text = ended.returncode, ended.stdout + ended.stderr
+        except subprocess.TimeoutExpired as error:
+            code, text = -1, (error.stdout or b"").decode(errors="replace")
+            reason = f"longer than {LIMIT_S / 60:.0f} min"
+        done.append({"command": command[1:], "exit": code, "end": text.splitlines()[-SHOWN_LINES:]})
+        if code:
+            reason = reason or f"exit status {code}"
+            break
+    state = "failed" if reason else "passed"
+    seconds = time.monotonic() - began
+    return {"part": part, "state": state, "reason": reason, "seconds": seconds, "commands": done}
+
+
+def main() -> int:
+    """Run the chosen parts."""
+    known = tuple(commands(None, ""))
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("parts", nargs="*", choices=[[], *known], metavar="PART")
+    parser.add_argument("--data", type=Path, help="folder of the recorded logs")
+    parser.add_argument("--socketcan", default="", help="command that provides vcan0")
+    options = parser.parse_args()
+    data = options.data if options.data is not None and options.data.is_dir() else None
+    folder = ROOT / "out" / "nightly"
+    folder.mkdir(parents=True, exist_ok=True)
+    failed = 0
+    for part in options.parts or known:
+        console.print(f"{part}: at most {LIMIT_S / 60:.0f} min …")
+        result = run(part, commands(data, options.socketcan)[part])
+        (folder / f"{part}.json").write_text(json.dumps(result, indent=1), encoding="utf-8")
+        console.print(f"{part}: {result['state']} in {result['seconds']:.0f} s {result['reason']}")
+        failed += result["state"] == "failed"
+    return 1 if failed else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
