@@ -1,4 +1,4 @@
-"""Files of `cases.toml` read to one drive, packed in any way; those of `errors.toml` are refused."""
+"""Files of `cases.toml` read to one drive, however packed; those of `errors.toml` are refused."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from conftest import (
+from log_cases import (
     CASES,
     CURRENT_A,
     HERE,

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from conftest import CASES, CURRENT_A, START, TIME_S, VOLTAGE_V, content_of
+from log_cases import CASES, CURRENT_A, START, TIME_S, VOLTAGE_V, content_of
 
 from cangauge.errors import InputError
 from cangauge.logs.log import Log
@@ -188,14 +188,16 @@ def test_mf4_signals_of_several_rasters_become_a_log(tmp_path: Path) -> None:
     packed = tmp_path / "trip.mf4.gz"
     packed.write_bytes(gzip.compress(path.read_bytes()))
     assert set(read_log(packed, columns="voltage=LowVoltage_12V").voltage_v) == {12.6}
-    with pytest.raises(InputError, match="BMS_Voltag.*did you mean BMS_PackVoltage"):
+    with pytest.raises(InputError, match=r"BMS_Voltag.*did you mean BMS_PackVoltage"):
         read_log(path, columns="voltage=BMS_Voltag")
     path.write_bytes(path.read_bytes()[:3000])
     with pytest.raises(InputError, match=r"trip\.mf4: "):
         read_log(path)
 
 
-def write_mcap(path: Path, schema: str, topic: str, rows: list[dict[str, Any]], step_ns: int = 10**9) -> None:
+def write_mcap(
+    path: Path, schema: str, topic: str, rows: list[dict[str, Any]], step_ns: int = 10**9
+) -> None:
     module = pytest.importorskip("mcap.writer")
     with path.open("wb") as file:
         writer = module.Writer(file)

@@ -9,10 +9,10 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
-from conftest import CURRENT_A, SOC_PCT, TIME_S, VOLTAGE_V
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
+from log_cases import CURRENT_A, SOC_PCT, TIME_S, VOLTAGE_V
 
 from cangauge.errors import InputError
 from cangauge.logs.canonical import write_log, write_table
@@ -102,8 +102,7 @@ def test_columns_are_shared_and_nobody_can_change_them(drive: Log) -> None:
 
 def test_repr_of_a_log_is_a_line_of_what_it_holds(drive: Log) -> None:
     assert repr(drive) == (
-        "<Log 'drive': 60 rows in 59 s; -10 … 40 A, 376 … 381 V, 21.5 … 21.5 °C,"
-        " SoC 80 … 74.1 %>"
+        "<Log 'drive': 60 rows in 59 s; -10 … 40 A, 376 … 381 V, 21.5 … 21.5 °C, SoC 80 … 74.1 %>"
     )
 
 
@@ -129,9 +128,7 @@ def test_dataframes_give_the_log_back(drive: Log, package: str) -> None:
 
 
 @pytest.mark.parametrize("package", ["pandas", "polars"])
-def test_absent_package_is_named(
-    drive: Log, package: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_absent_package_is_named(drive: Log, package: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(__import__("sys").modules, package, None)
     with pytest.raises(InputError, match=f"{package} is not installed.*pip install {package}"):
         getattr(drive, f"to_{package}")()
@@ -297,7 +294,7 @@ def test_cells_beside_a_log(
     np.testing.assert_allclose(found.voltage_v, cells[3:])
     del columns[headings.format(5)]
     write_table(columns, path)
-    with pytest.raises(InputError, match="cell 5 is missing"):
+    with pytest.raises(InputError, match="cell_5_v: the cells must be numbered"):
         read_cells(path, log.time_s)
 
 

@@ -60,15 +60,7 @@ def _is_temperature(name: str) -> bool:
 def canonical_draft(
     table: ArrowTable | TextTable, *, name: str, source: str, word: str = ""
 ) -> DraftLog:
-    """Return the draft of a table with canonical names.
-
-    Parameters
-    ----------
-    table : ArrowTable or TextTable
-    name, source : str
-        Of the log.
-    word : str
-        Temperature source as the table's metadata state it.
+    """Return the draft of a table with canonical names; `word` is its stated temperature source.
 
     Raises
     ------
@@ -170,14 +162,7 @@ def _validated(file: Any, names: list[str]) -> Any:
 def build_table(
     columns: Mapping[str, Any], temperature_source: TemperatureSource = "unknown"
 ) -> Any:
-    """Return a pyarrow.Table; NaN becomes null, a known temperature source becomes metadata.
-
-    Parameters
-    ----------
-    columns : mapping of str to array of shape (n,)
-        numpy or pyarrow arrays of one length.
-    temperature_source : str
-    """
+    """Return a pyarrow.Table; NaN becomes null, a known temperature source becomes metadata."""
     arrays = {
         name: pa.array(values, from_pandas=True)
         if isinstance(values, np.ndarray) and np.issubdtype(values.dtype, np.floating)
@@ -216,20 +201,7 @@ def write_log(log: Log, path: str | PathLike[str]) -> None:
 
 
 def write_table(columns: Mapping[str, Any], path: str | PathLike[str]) -> None:
-    """Write columns as `.parquet` or `.csv` by suffix, all or nothing; NaN becomes missing.
-
-    Parameters
-    ----------
-    columns : mapping of str to array of shape (n,)
-        numpy or pyarrow arrays of one length.
-    path : path-like
-        `.parquet` or `.csv`.
-
-    Raises
-    ------
-    InputError
-        If the suffix is another one, or the folder is absent or not writable.
-    """
+    """Write arrays of one length as `.parquet` or `.csv`, all or nothing; NaN becomes missing."""
     _write(build_table(columns), path)
 
 

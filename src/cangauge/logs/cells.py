@@ -9,12 +9,11 @@ from typing import Final
 
 import numpy as np
 
-from cangauge._files import Head
 from cangauge._typing import FloatArray
 from cangauge.errors import InputError
 from cangauge.logs.column_map import ColumnMap
 from cangauge.logs.headings import cell_number
-from cangauge.logs.read import draft_of_table, open_table
+from cangauge.logs.read import TableReader, draft_of_table, open_log, open_table
 from cangauge.logs.table import numbers_of
 
 _LEAST: Final = 2
@@ -65,11 +64,10 @@ def read_cells(
     InputError
         If the numbers of the cells have gaps, or a cell holds anything but a number.
     """
-    head = Head(path)
-    with open_table(head, columns) as found:
-        if found is None:
-            return None
-        table, _ = found
+    file = open_log(path, columns=columns)
+    if not isinstance(file.reader, TableReader):
+        return None
+    with open_table(file.head, columns) as (table, _):
         places = _places(table.headings, str(path))
         if len(places) < _LEAST:
             return None
@@ -82,7 +80,7 @@ def read_cells(
                 for place, scale in places.values()
             ]
         )
-        file_s = draft_of_table(table, columns, name=head.name, source=source).values["time_s"]
+        file_s = draft_of_table(table, columns, name=file.head.name, source=source).values["time_s"]
     if file_s.size != values.shape[0]:
         return None  # rows that hold only what changed
     return CellColumns(min(places), _at_rows(file_s, values, time_s))
@@ -98,12 +96,8 @@ def _places(headings: Sequence[str], source: str) -> dict[int, tuple[int, float]
     numbers = sorted(found)
     missing = [k for k in range(numbers[0], numbers[-1]) if k not in found] if numbers else []
     if missing:
-        raise InputError(
-            f"the cells must be numbered without gaps: cell {missing[0]} is missing",
-            source=source,
-            field=headings[found[numbers[0]][0]],
-            cure="export all cells",
-        )
+        problem, field = "the cells must be numbered without gaps", f"cell_{missing[0]}_v"
+        raise InputError(problem, source=source, field=field, cure="export all cells")
     return {number: found[number] for number in numbers}
 
 

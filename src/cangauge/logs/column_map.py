@@ -150,19 +150,9 @@ def _spec_of(name: str, value: Any, where: str) -> ColumnSpec:
 class ChosenColumn:
     """Columns of a table that hold one quantity.
 
-    Parameters
-    ----------
-    places : tuple of int
-        Indices; several: a date and its time, or temperatures of which the mean is taken.
-    unit : str
-        As stated by the user, the heading or the row of units; "" if none states it.
-    factor : float
-    given : bool
-        Whether the user named the column.
-    source : str
-        Where a temperature is measured, if its heading defines it.
-    others : tuple of int
-        Further time columns, in case that the first does not increase.
+    Several places are a date and its time, or temperatures of which the mean is taken. The unit is
+    the user's, the heading's or that of the row of units. `others` are further times, in case that
+    the first does not increase.
     """
 
     places: tuple[int, ...]
@@ -175,14 +165,7 @@ class ChosenColumn:
 
 @dataclass(frozen=True, slots=True)
 class Choice:
-    """Columns of a table by quantity, and what hinders the rest.
-
-    Parameters
-    ----------
-    chosen : dict of str to ChosenColumn
-    guesses : dict of str to int
-        Index of the likeliest column of each quantity that is not plain.
-    """
+    """Columns of a table by quantity, and the likeliest column of each that is not plain."""
 
     chosen: dict[str, ChosenColumn] = field(default_factory=dict)
     guesses: dict[str, int] = field(default_factory=dict)
@@ -197,14 +180,6 @@ def choose_columns(
     headings: Sequence[str], units_below: Sequence[str] = (), given: ColumnMap | None = None
 ) -> Choice:
     """Choose the columns of a table: the user's first, then plain headings.
-
-    Parameters
-    ----------
-    headings : sequence of str
-    units_below : sequence of str
-        Row of units below the header, where there is one.
-    given : ColumnMap, optional
-        The user's columns.
 
     Raises
     ------

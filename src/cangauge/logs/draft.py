@@ -28,29 +28,20 @@ invalid values are -40, 127 or 215 °C."""
 
 @dataclass(slots=True)
 class DraftLog:
-    """Columns of a log as a reader found them.
+    """Columns of a log as a reader found them, by canonical field; NaN where missing.
 
     Parameters
     ----------
-    name : str
-        Short name of the log.
-    source : str
-        Path of the file; "" for a table in memory.
-    values : dict of str to array of shape (n,)
-        `time_s`, `current_a` (positive = discharge), `voltage_v`, `temperature_c` and optionally
-        `soc_pct`, in canonical units, NaN where missing.
-    labels : dict of str to str
-        Heading in the file by field, for messages.
+    name, source : str
+        Short name, and path of the file ("" for a table in memory).
+    values, labels : dict
+        Arrays of shape (n,) in canonical units (positive current discharges), and headings.
     temperature_source : str
         Location of the temperature sensor.
-    sign_unknown : bool
-        The format does not define the sign of current.
-    negated : bool
-        The file stores discharge as negative, and the values here are inverted.
-    assumed : list of str
-        How the columns of an arbitrary table were understood, a phrase each.
-    remarks : list of str
-        Changes and findings of the reader.
+    sign_unknown, negated : bool
+        The format does not define the sign; the file stores discharge as negative.
+    assumed, remarks : list of str
+        How the columns were understood; changes and findings.
     headings, ignored : tuple of str
         All columns of the file, and those that hold no quantity of the log, for messages.
     """
@@ -88,17 +79,8 @@ class DraftLog:
     ) -> FloatArray:
         """Return the mean of temperature probes, shape (n,); remark on those that are far off.
 
-        A value further from the median of its row is left out where most of three or more agree
-        with the median. Else none is known to be the good one.
-
-        Parameters
-        ----------
-        names : sequence of str
-            Headings.
-        parts : sequence of arrays of shape (n,)
-            Temperatures, NaN where missing.
-        apart : float
-            `PROBES_APART_K` in the unit of `parts`.
+        A value further than `apart` from the median of its row is left out where most of three or
+        more agree with the median. Else none is known to be the good one.
         """
         values = np.vstack(parts)
         known = np.isfinite(values)
@@ -131,22 +113,10 @@ class DraftLog:
     def checked(
         self, temperature_c: float | None = None, used: Sequence[str] = ()
     ) -> dict[str, Any]:
-        """Check all values and return the arguments of `Log`.
+        """Check all values and return the arguments of `Log`; see `read_log` for errors.
 
         Rows that lack a value or repeat the time stamp of the row before are dropped, with a
-        remark.
-
-        Parameters
-        ----------
-        temperature_c : float, optional
-            Constant temperature [°C], in place of the file's.
-        used : sequence of str
-            Columns that the caller reads besides.
-
-        Raises
-        ------
-        InputError
-            No temperature, too many missing values, wrong units, time that runs backwards.
+        remark. `used` are columns that the caller reads besides.
         """
         ignored = [name for name in self.ignored if name not in used]
         if ignored:

@@ -102,20 +102,9 @@ GUESS: Final = 10
 
 
 class Meaning(NamedTuple):
-    """Meaning of a heading.
+    """Meaning of a heading: its quantity, the unit that it states ("" if none) and how direct.
 
-    Parameters
-    ----------
-    quantity : str
-        time, current, voltage, temperature or soc.
-    unit : str
-        "" if not stated.
-    rank : int
-        0: the pack's; higher: less direct; `GUESS` or more: not plain.
-    numbered : bool
-        One of several sensors (`T1`, `Temp 3`).
-    source : str
-        Where a temperature is measured.
+    `rank` is 0 for the pack's and higher for less direct ones; from `GUESS` on it is not plain.
     """
 
     quantity: str
@@ -127,14 +116,7 @@ class Meaning(NamedTuple):
 
 @lru_cache(maxsize=4096)
 def meaning_of(heading: str, unit_below: str = "") -> Meaning | None:
-    """Return the most direct meaning of a heading, or None.
-
-    Parameters
-    ----------
-    heading : str
-    unit_below : str
-        Cell of a row of units below the header; "" without one.
-    """
+    """Return the most direct meaning of a heading with the cell of a row of units, or None."""
     if not heading.strip() or len(heading) > MAX_HEADING or cell_number(heading) is not None:
         return None
     # Measurement tools qualify a signal: `Bus::Message::Signal`, `Signal\\Device:1`.

@@ -61,10 +61,7 @@ class TableReader:
 
     def read(self, head: Head, columns: ColumnMap | None = None) -> DraftLog:
         """Read a log; see `LogReader`."""
-        with open_table(head, columns) as found:
-            if found is None:
-                raise unknown_columns(str(head.path), *text.likely_header(head))
-            of_file, word = found
+        with open_table(head, columns) as (of_file, word):
             return draft_of_table(
                 of_file, columns, name=head.name, source=str(head.path), word=word
             )
@@ -77,7 +74,7 @@ def _is_parquet(head: Head) -> bool:
 @contextmanager
 def open_table(
     head: Head, columns: ColumnMap | None
-) -> Iterator[tuple[text.TextTable | table.ArrowTable, str] | None]:
+) -> Iterator[tuple[text.TextTable | table.ArrowTable, str]]:
     """Open Parquet or a text as a table, with the temperature source that its metadata state."""
     if _is_parquet(head):
         with canonical.open_parquet(head) as found:
@@ -85,7 +82,9 @@ def open_table(
         return
     of_text = _canonical_text(head) if columns is None else None
     of_text = of_text or text.find_table(head, columns)
-    yield None if of_text is None else (of_text, "")
+    if of_text is None:
+        raise unknown_columns(str(head.path), *text.likely_header(head))
+    yield of_text, ""
 
 
 def _canonical_text(head: Head) -> text.TextTable | None:
@@ -122,17 +121,8 @@ def _readers() -> tuple[LogReader, ...]:
 class LogFile:
     """A file that may be a log, recognised by its beginning.
 
-    Parameters
-    ----------
-    head : Head
-    reader : LogReader or None
-        Of its format; None if it is not a log.
-    columns : ColumnMap, optional
-        Columns that the user names.
-    sign : {"charge", "discharge"}, optional
-        What a positive current in the file does, as the user states it.
-    used : tuple of str
-        Columns that the caller reads besides those of a log.
+    `reader` is None if it is not a log. `columns` and `sign` are the user's; `used` are columns
+    that the caller reads besides.
     """
 
     head: Head
@@ -223,15 +213,7 @@ def open_log(
     columns: ColumnMap | Mapping[str, Any] | str | None = None,
     sign: Sign | None = None,
 ) -> LogFile:
-    """Read the beginning of a file and find its format.
-
-    Parameters
-    ----------
-    path : path-like
-    columns : ColumnMap, mapping or str, optional
-        Columns of a table; formats that define their own are then not looked for.
-    sign : {"charge", "discharge"}, optional
-        What a positive current in the file does.
+    """Read the beginning of a file and find its format; parameters as of `read_log`.
 
     Raises
     ------

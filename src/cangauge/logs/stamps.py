@@ -70,14 +70,7 @@ def _zone_of(name: str) -> ZoneInfo | None:
 
 
 def seconds_of_numbers(values: FloatArray, unit: str) -> tuple[FloatArray, str]:
-    """Return numbers as seconds, and their unit as found: the epoch's size shows an unstated one.
-
-    Parameters
-    ----------
-    values : array of shape (n,)
-    unit : str
-        As stated; "" if unknown.
-    """
+    """Return numbers as seconds, and their unit as stated or as the size of an epoch shows."""
     if unit:
         factor, _ = unit_of("time_s", unit) or (1.0, 0.0)
         return values * factor, unit
@@ -92,15 +85,8 @@ def seconds_of_numbers(values: FloatArray, unit: str) -> tuple[FloatArray, str]:
 def seconds_of_text(cells: Any, unit: str, source: str, label: str) -> tuple[FloatArray, str]:
     """Return stamps of text as seconds, NaN where empty, and how they were read.
 
-    Parameters
-    ----------
-    cells : pyarrow string array of shape (n,)
-        Trimmed; null where missing. All clock times (`1:02:03.5`, `2d 01:02:03`), or all dates with
-        or without a time of day.
-    unit : str
-        Order of dates (`dmy`, `mdy`), or the zone of dates without one (`Europe/Berlin`).
-    source, label : str
-        File and heading, for messages.
+    All cells are clock times (`1:02:03.5`, `2d 01:02:03`), or dates with or without a time of day.
+    `unit` is an order of dates (`dmy`, `mdy`), or the zone of dates without one (`Europe/Berlin`).
 
     Raises
     ------

@@ -153,20 +153,8 @@ def _seconds(
 # --- Draft of a log
 
 
-def draft_of(
-    table: Table, choice: Choice, *, name: str, source: str, hold_s: float = HOLD_S
-) -> DraftLog:
+def draft_of(table: Table, choice: Choice, *, name: str, source: str) -> DraftLog:
     """Return the draft of a log from the chosen columns of a table, with what was assumed.
-
-    Parameters
-    ----------
-    table : Table
-    choice : Choice
-        Complete.
-    name, source : str
-        Of the log.
-    hold_s : float
-        Longest time that a voltage is held where rows hold only what changed [s].
 
     Raises
     ------
@@ -180,9 +168,10 @@ def draft_of(
     columns = table.columns([*dict.fromkeys([*places, *time.others, *_dates_beside(table, time)])])
     draft = DraftLog(name, source, headings=tuple(headings))
     used = set(places)
-    for quantity, column in choice.chosen.items():
+    for quantity, chosen in choice.chosen.items():
+        column = chosen
         if quantity == "time":
-            values, unit, column = _time(columns, column, headings, where)
+            values, unit, column = _time(columns, chosen, headings, where)
             used.update(column.places)
         else:
             values, unit = _values(draft, quantity, column, columns, where)
@@ -199,7 +188,7 @@ def draft_of(
     if "temperature" in choice.chosen:
         draft.temperature_source = choice.chosen["temperature"].source
     _leaf_spy(draft)
-    _hold_changes(draft, hold_s)
+    _hold_changes(draft)
     return draft
 
 
@@ -300,7 +289,7 @@ def _leaf_spy(draft: DraftLog) -> None:
         draft.remarks.append("LeafSpy log: SoC in 0.0001 %")
 
 
-def _hold_changes(draft: DraftLog, hold_s: float) -> None:
+def _hold_changes(draft: DraftLog) -> None:
     """Hold the latest voltage and temperature at each current, if rows hold only what changed."""
     values = draft.values
     time, current, voltage = (values[name] for name in ("time_s", "current_a", "voltage_v"))
@@ -310,7 +299,7 @@ def _hold_changes(draft: DraftLog, hold_s: float) -> None:
     if np.mean(whole & np.isfinite(temperature)) >= 1.0 - MAX_INCOMPLETE or not at.size:
         return
     latest_v, age_s = held(time, voltage, at)
-    near = age_s <= hold_s
+    near = age_s <= HOLD_S
     if np.mean(near) < 0.5:
         return
     at = at[near]
@@ -346,15 +335,7 @@ def held(time: FloatArray, values: FloatArray, at: IntArray) -> tuple[FloatArray
 
 @dataclass(frozen=True, slots=True)
 class ArrowTable:
-    """Columns of an Arrow table, or of a file that is read by column.
-
-    Parameters
-    ----------
-    headings : sequence of str
-    read : callable
-        Returns a pyarrow.Table of some columns by their names.
-    units : sequence of str
-    """
+    """Columns of an Arrow table, or of a file; `read` returns a pyarrow.Table of some of them."""
 
     headings: Sequence[str]
     read: Callable[[list[str]], Any]

@@ -30,7 +30,8 @@ from cangauge.logs.headings import meaning_of
 MAX_ROWS: Final = 20_000_000
 """Rows of a log: 23 days at 10 Hz, 0.8 GB as float64."""
 MAX_COLUMNS: Final = 10_000
-MISSING: Final = "nan na n/a #n/a null none - -- 1.#qnan -1.#ind unknown unavailable n.a.".split()
+_NO_VALUE: Final = "nan na n/a #n/a null none - -- 1.#qnan -1.#ind unknown unavailable n.a."
+MISSING: Final = tuple(_NO_VALUE.split())
 """Cells without a value, in lower case."""
 _NULLS: Final = ["", *{s for text in MISSING for s in (text, text.upper(), text.title(), "NaN")}]
 _DELIMITERS: Final = ("\t", ";", ",", "|")
@@ -40,19 +41,7 @@ _FRAME_WORDS: Final = frozenset({"id", "can id", "identifier", "dlc", "len", "da
 
 
 class TextTable(NamedTuple):
-    """Where a text holds its table.
-
-    Parameters
-    ----------
-    head : Head
-    delimiter : str
-    headings, units : sequence of str
-        Cells of the header, and of the row of units () if there is one.
-    skip_lines : int
-        Lines before the first row of data.
-    remarks : list of str
-        Lines that were left out.
-    """
+    """Where a text holds its table; `remarks` are on lines that were left out."""
 
     head: Head
     delimiter: str
@@ -193,12 +182,6 @@ def _is_value(cell: str) -> bool:
 
 def find_table(head: Head, given: ColumnMap | None = None) -> TextTable | None:
     """Return the table of a text in which time, current and voltage are known, or None.
-
-    Parameters
-    ----------
-    head : Head
-    given : ColumnMap, optional
-        Columns of the user.
 
     Raises
     ------

@@ -58,10 +58,11 @@ _UNITS: Final[dict[str, dict[str, tuple[float, float]]]] = {
     | _spelled(100.0, 0.0, "1", "-", "0-1", "0..1", "fraction", "ratio", "pu"),
 }  # fmt: skip
 
-FOREIGN_UNITS: Final = frozenset(
+_FOREIGN: Final = (
     "w kw wh kwh ah mah as nm rpm km/h kmh mph hz khz pa bar mbar ohm mohm ω mω v/s a/s k/s wh/kg"
-    " ah/kg mah/g m m/s kg l deg".split()
+    " ah/kg mah/g m m/s kg l deg"
 )
+FOREIGN_UNITS: Final = frozenset(_FOREIGN.split())
 """Units of quantities that no log holds; a heading with one of them is none of its columns."""
 
 # Plausible values, from a cell of 2 V to a truck's pack of 1000 V.
@@ -114,16 +115,7 @@ def unit_of(field: str, unit: str) -> tuple[float, float] | None:
 def convert(
     values: FloatArray, field: str, unit: str, *, source: object, label: str
 ) -> tuple[FloatArray, str | None]:
-    """Convert values from the unit that the header states to the canonical one.
-
-    Parameters
-    ----------
-    values : array of shape (n,)
-    field : {"time_s", "current_a", "voltage_v", "temperature_c", "soc_pct"}
-    unit : str
-        As in the header; "" means the canonical unit.
-    source, label : object, str
-        File and heading, for messages.
+    """Convert values from the unit that the header states ("": the canonical one).
 
     Returns
     -------
@@ -234,7 +226,7 @@ class _Check(NamedTuple):
     source: str
     labels: dict[str, str]
 
-    def refuse_if(
+    def refuse_if(  # noqa: PLR0917 - as the sentence has it
         self, wrong: object, field: str, problem: str, value: float, cure: str, unit: str = ""
     ) -> None:
         if not wrong:
