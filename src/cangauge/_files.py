@@ -81,10 +81,10 @@ def open_unpacked(path: str | PathLike[str]) -> io.BufferedReader:
     """
     file = cast("io.BufferedReader", open_regular(path))
     begin = file.peek(3)
-    if begin.startswith(_GZIP):
-        return io.BufferedReader(cast("io.RawIOBase", gzip.GzipFile(fileobj=file)))
-    if begin.startswith(_BZIP2):
-        return io.BufferedReader(cast("io.RawIOBase", bz2.BZ2File(file)))
+    for mark, module in ((_GZIP, gzip), (_BZIP2, bz2)):
+        if begin.startswith(mark):
+            file.close()
+            return cast("io.BufferedReader", module.open(path))
     return file
 
 
@@ -188,7 +188,7 @@ class Head:
         kind = ""
         try:
             with open_unpacked(self.path) as file:
-                kind = "" if isinstance(file.raw, io.FileIO) else "packed "
+                kind = "" if isinstance(file, io.BufferedReader) else "packed "
                 if not file.peek(len(_ZIP)).startswith(_ZIP):
                     yield file
                     return
@@ -197,12 +197,12 @@ class Head:
             with zipfile.ZipFile(packed) as archive:
                 if "xl/workbook.xml" in archive.namelist():
                     packed.seek(0)
-                    yield io.BufferedReader(cast("io.RawIOBase", packed))
+                    yield cast("io.BufferedReader", packed)
                     return
                 member = _only_member(archive, self.path)
                 self.name = _stem(Path(member.filename).name)
                 with archive.open(member) as content:
-                    yield io.BufferedReader(cast("io.RawIOBase", content))
+                    yield cast("io.BufferedReader", content)
         except _DAMAGE as error:
             raise InputError(
                 f"the {kind}file is cut off or damaged ({error})",
