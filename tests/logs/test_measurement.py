@@ -12,10 +12,10 @@ import numpy as np
 import pytest
 
 from cangauge._mcap import ESTIMATE, SAMPLE, SCHEMAS, McapTopics
-from cangauge.bus.captures.capture import Capture
-from cangauge.bus.captures.mcap import McapWriter
+from cangauge.bus.captures import Capture
 from cangauge.bus.recording import open_recording, read_recording
 from cangauge.errors import InputError
+from cangauge.extras.formats.mcap import McapWriter
 from cangauge.logs.log import Log
 from cangauge.logs.read import read_log
 

@@ -1,0 +1,1 @@
+"""Capture formats beyond those of python-can; they join by entry points."""
