@@ -336,7 +336,7 @@ class OnlineModel:
             if drive is not None and not math.isnan(drive[0]):
                 self._drives[place] += float(drive[0])
 
-    def load_at(self, temperature_c: float, currents_a: Sequence[float]) -> FloatArray:
+    def load_at(self, temperature_c: float, currents_a: Sequence[float] | FloatArray) -> FloatArray:
         """Return the load columns of given delayed and low-passed currents [A], shape (k,)."""
         return np.asarray(self.model.load_columns([temperature_c], np.array([currents_a]))[0])
 
@@ -410,7 +410,9 @@ class OnlineModel:
         """
         effects = zip(self.extended.effects, drives, strict=True)
         self._row, self._beside_v = load, beside_v
-        self._over_soc = [(*of, drive) for of, drive in effects if of[0].uses_soc]
+        self._over_soc = [
+            (effect, values, drive) for (effect, values), drive in effects if effect.uses_soc
+        ]
 
     def state(self) -> list[list[float]]:
         """Return the low-passed currents' state, then that of each effect, for `restore`."""
