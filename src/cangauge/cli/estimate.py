@@ -125,7 +125,7 @@ def estimate_command(  # noqa: PLR0917 - typer passes options by name
 
     `cangauge estimate drive.log --vehicle leaf_ze0 -m leaf.json -o soc.csv --method newton`
     """
-    from cangauge.bus.captures.capture import Capture
+    from cangauge.bus.captures import Capture
     from cangauge.bus.recording import capture_without_vehicle
     from cangauge.estimation.settings import EstimatorSettings
     from cangauge.logs.cells import read_cells
@@ -166,7 +166,7 @@ def estimate_command(  # noqa: PLR0917 - typer passes options by name
         assumed = assumed_of([log])
         if settings.initial_soc_pct is not None:
             note_starts([log], settings.initial_soc_pct, capacity_ah or model.capacity_ah)
-        cells = read_cells(log_path, log.time_s)
+        cells = read_cells(log_path, log.time_s, reading.given_columns())
         with _progress(len(log)) as progress:
             done = estimate_recorded_log(
                 log,

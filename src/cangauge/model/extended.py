@@ -410,9 +410,11 @@ class OnlineModel:
         """
         effects = zip(self.extended.effects, drives, strict=True)
         self._row, self._beside_v = load, beside_v
-        self._over_soc = [
-            (effect, values, drive) for (effect, values), drive in effects if effect.uses_soc
-        ]
+        over_soc: list[tuple[Effect, Values, float]] = []
+        for (effect, values), drive in effects:
+            if effect.uses_soc:
+                over_soc.append((effect, values, drive))
+        self._over_soc = over_soc
 
     def state(self) -> list[list[float]]:
         """Return the low-passed currents' state, then that of each effect, for `restore`."""

@@ -1,4 +1,4 @@
-"""Atomic writing: the old file or the new one, and clear errors where writing fails."""
+"""Files are written all or nothing, with clear errors, by one process at a time."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from cangauge._io import atomic_path, check_writable, write_text_atomic
+from cangauge._files import atomic_path, check_writable, write_text_atomic
 from cangauge.errors import CangaugeError, InputError
 
 

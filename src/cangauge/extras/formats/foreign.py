@@ -7,10 +7,7 @@ from __future__ import annotations
 
 from typing import Final
 
-_NEWARE_CURE: Final = "convert it with NewareNDA: NewareNDA.read(file).to_csv('log.csv')"
-NDAX_CURE: Final = f"a Neware .ndax: {_NEWARE_CURE}"
 _READ_PACKED: Final = "; .gz, .bz2 and .zip are read as they are"
-
 _FORMATS: Final = (
     (0, b"ARROW1", "a Feather file",
      "store it as Parquet: pandas.read_feather(file).to_parquet('log.parquet')"),
@@ -23,13 +20,13 @@ _FORMATS: Final = (
      " by python-can: can_logconvert FILE drive.asc"),
     (0, b"BIO-LOGIC MODULAR FILE", "a BioLogic .mpr",
      "export it as text (.mpt) in EC-Lab, or by galvani: BioLogic.MPRfile(file).data"),
-    (0, b"NEWARE", "a Neware .nda", _NEWARE_CURE),
+    (0, b"NEWARE", "a Neware .nda",
+     "convert it with NewareNDA: NewareNDA.read(file).to_csv('log.csv')"),
     (4, b"Standard Jet DB", "an Access database, as Arbin's .res",
      "export it as CSV in MITS Pro, or by mdb-export of mdbtools"),
     (0, b"\xd0\xcf\x11\xe0", "an old Excel workbook (.xls)", "save it as .xlsx or CSV"),
     (0, b"\xfd7zXZ", "packed by xz", f"unpack it (unxz FILE){_READ_PACKED}"),
-    (0, b"\x28\xb5\x2f\xfd", "packed by zstd",
-     f"unpack it (unzstd FILE){_READ_PACKED}"),
+    (0, b"\x28\xb5\x2f\xfd", "packed by zstd", f"unpack it (unzstd FILE){_READ_PACKED}"),
     (0, b"7z\xbc\xaf", "a 7z archive", f"unpack it{_READ_PACKED}"),
     (0, b"Rar!", "a RAR archive", f"unpack it{_READ_PACKED}"),
     (0, b'{"', "JSON, a record a line",
@@ -37,9 +34,9 @@ _FORMATS: Final = (
 )  # fmt: skip
 
 
-def foreign_format(magic: bytes) -> tuple[str, str] | None:
+def foreign_format(data: bytes) -> tuple[str, str] | None:
     """Return what a file is by its first bytes, and the cure; None if it is not known."""
     for at, mark, name, cure in _FORMATS:
-        if magic[at : at + len(mark)] == mark:
+        if data[at : at + len(mark)] == mark:
             return name, cure
     return None
