@@ -409,12 +409,8 @@ class OnlineModel:
             `Effect.drive` of every effect there.
         """
         effects = zip(self.extended.effects, drives, strict=True)
-        self._row, self._beside_v = load, beside_v
-        over_soc: list[tuple[Effect, Values, float]] = []
-        for (effect, values), drive in effects:
-            if effect.uses_soc:
-                over_soc.append((effect, values, drive))
-        self._over_soc = over_soc
+        self._row = load
+        self._drives = np.array([beside_v, *(v for (effect, _), v in effects if effect.uses_soc)])
 
     def state(self) -> list[list[float]]:
         """Return the low-passed currents' state, then that of each effect, for `restore`."""
