@@ -15,7 +15,6 @@ from cangauge.logs.canonical import write_log
 from cangauge.logs.read import read_log
 from cangauge.model.model_file import Model
 from cangauge.model.published import CAPACITY_AH
-from report_html import drawn_figures
 from synthetic import synthetic_log
 
 Run = Callable[..., object]
@@ -101,23 +100,17 @@ def test_delays_by_search(run: Run, made: Path, tmp_path: Path) -> None:
     assert Model.load(tmp_path / "m.json").delays_s == found["delays_s"]
 
 
-def test_several_logs_a_report_and_its_figures(
-    run: Run, made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(
-        "cangauge.extras.report.export._PNG_DPI", 20
-    )  # what is drawn, not how finely
+def test_several_logs_and_a_report(run: Run, made: Path, tmp_path: Path) -> None:
     logs = (made / "full.parquet", made / "part.csv")
     out = ("-o", tmp_path / "m.json", "--report", tmp_path / "m.html")
-    figures = ("--figures", tmp_path / "figures")
-    ran = run("fit", *logs, *out, *figures, "--capacity-ah", "from-soc", "--json")
+    ran = run("fit", *logs, *out, "--capacity-ah", "from-soc", "--json")
     assert ran.code == 0, ran.err
     found = json.loads(ran.out)
     assert [item["name"] for item in found["logs"]] == ["full", "part"]
     assert found["report"] == str(tmp_path / "m.html")
     text = (tmp_path / "m.html").read_text(encoding="utf-8")
-    assert drawn_figures(tmp_path / "figures") == text.count("<figure ") > 5
-    assert files(tmp_path) == ["figures", "m.html", "m.json"]
+    assert text.count("<figure ") > 5
+    assert files(tmp_path) == ["m.html", "m.json"]
 
 
 def test_effects_go_into_model_json_tables_and_report(run: Run, made: Path, tmp_path: Path) -> None:
