@@ -131,7 +131,10 @@ def test_nothing_is_learned_without_charge_or_voltage() -> None:
 def test_a_full_charge_counts_as_a_known_soc() -> None:
     rule = FullCharge(voltage_v=390.0, current_a=1.0, hold_s=60.0, soc_pct=96.0)
     samples = samples_of_pack(4)
-    plain, ruled = Estimator(MODEL, settings(1.1)), Estimator(MODEL, settings(1.1, full_charge=rule))
+    plain, ruled = (
+        Estimator(MODEL, settings(1.1)),
+        Estimator(MODEL, settings(1.1, full_charge=rule)),
+    )
     for sample in samples:
         plain.update(sample)
         ruled.update(sample)

@@ -125,7 +125,7 @@ def estimate_command(  # noqa: PLR0917 - typer passes options by name
 
     `cangauge estimate drive.log --vehicle leaf_ze0 -m leaf.json -o soc.csv --method newton`
     """
-    from cangauge.bus.captures.capture import Capture
+    from cangauge.bus.captures import Capture
     from cangauge.bus.recording import capture_without_vehicle
     from cangauge.estimation.settings import EstimatorSettings
     from cangauge.logs.cells import read_cells
