@@ -38,7 +38,7 @@ from cangauge.replay.steps import LogSource, quantization_bound
 from cangauge.service.loop import LoopSettings, Outputs, serve
 from cangauge.service.offline import estimate_capture
 from cangauge.service.pipeline import Pipeline, PipelineSettings
-from cangauge.service.recording import Recorder
+from cangauge.service.record import Recorder
 from cangauge.types import Estimate
 from real_trips import DATA, JUDGED_S, TEST, TRAINING, identify, read_trips
 

@@ -17,7 +17,7 @@ from cangauge.bus.protection import Protection
 from cangauge.bus.recording import capture_samples, open_vehicle_capture
 from cangauge.bus.vehicle import Vehicle
 from cangauge.inspect.capture import inspect_capture
-from cangauge.service.recording import Recorder
+from cangauge.service.record import Recorder
 from cangauge.types import Reason, Sample
 
 LEAF, GENERIC = Vehicle.load("leaf_aze0"), Vehicle.load("generic")

@@ -266,7 +266,7 @@ def test_the_schemas_name_every_field_of_a_message(tmp_path: Path) -> None:
 
 
 def test_estimates_written_as_mcap_are_a_log_again(tmp_path: Path) -> None:
-    from cangauge.service.estimate_mcap import write_estimates_mcap  # noqa: PLC0415
+    from cangauge.extras.formats.estimate_mcap import write_estimates_mcap  # noqa: PLC0415
 
     times = raster(1.0)
     log = Log(times, current_a(times), voltage_v(times), np.full(times.size, 21.0))

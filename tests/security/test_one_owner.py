@@ -101,7 +101,7 @@ def test_files_of_a_service_are_not_for_others(tmp_path: Path) -> None:
 
 def test_an_existing_part_is_never_replaced(tmp_path: Path) -> None:
     """A name that another program takes between the choice of the name and the writing."""
-    from cangauge.service.recording import _created  # noqa: PLC0415
+    from cangauge.service.record import _created  # noqa: PLC0415
 
     path = tmp_path / "drive-0001-0001.log"
     path.write_text("precious")

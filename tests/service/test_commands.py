@@ -21,7 +21,7 @@ from cangauge.bus.vehicle import Vehicle
 from cangauge.estimation.offline import samples_of
 from cangauge.logs.canonical import write_log
 from cangauge.service.offline import estimate_capture
-from cangauge.service.recording import Recorder
+from cangauge.service.record import Recorder
 from live import Command, in_process, leaf_model, leaf_model_path, run_to_end, short_log
 
 pytestmark = pytest.mark.slow

@@ -23,7 +23,7 @@ from cangauge.service.lifecycle import Notifier
 from cangauge.service.loop import DUPLICATE_WARN_EVERY_S, DuplicateSenderDetector
 from cangauge.service.offline import estimate_capture
 from cangauge.service.pipeline import Pipeline, PipelineSettings
-from cangauge.service.recording import Recorder
+from cangauge.service.record import Recorder
 from cangauge.service.status import Identity, Monitor, as_json
 from cangauge.types import Reason, Status
 from live import (

@@ -16,7 +16,7 @@ from cangauge.estimation.offline import samples_of
 from cangauge.service import recording as record
 from cangauge.service.offline import estimate_capture
 from cangauge.service.pipeline import Pipeline, PipelineSettings
-from cangauge.service.recording import Recorder
+from cangauge.service.record import Recorder
 from cangauge.types import Estimate
 from live import leaf_model, short_log
 

@@ -27,7 +27,7 @@ from cangauge.replay.steps import CaptureSource
 from cangauge.service import recording
 from cangauge.service.offline import estimate_capture
 from cangauge.service.pipeline import Pipeline
-from cangauge.service.recording import RecordBuffer, Recorder, RecordLimits
+from cangauge.service.record import RecordBuffer, Recorder, RecordLimits
 from live import in_process, leaf_model, leaf_model_path, short_log, waits
 
 FORMATS = [".log", ".csv", ".log.gz", ".blf", ".mf4", ".mcap"]
@@ -314,7 +314,7 @@ def test_a_hanging_disk_delays_neither_loop_nor_end(
 
 CHILD = """
 import sys, time, can
-from cangauge.service.recording import Recorder
+from cangauge.service.record import Recorder
 with Recorder(sys.argv[1]) as recorder:
     for number in range(100_000):
         recorder.write(can.Message(

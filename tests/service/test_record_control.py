@@ -11,7 +11,7 @@ import pytest
 from cangauge.bus.captures.capture import open_capture
 from cangauge.bus.captures.files import all_parts
 from cangauge.service.record_control import RecordControl
-from cangauge.service.recording import RecordLimits
+from cangauge.service.record import RecordLimits
 from live import waits
 
 

@@ -21,7 +21,7 @@ from cangauge.service.lifecycle import Notifier
 from cangauge.service.loop import LoopSettings, Outputs, serve
 from cangauge.service.offline import estimate_capture
 from cangauge.service.pipeline import Pipeline
-from cangauge.service.recording import Recorder, RecordLimits
+from cangauge.service.record import Recorder, RecordLimits
 from cangauge.service.status import Identity, Monitor
 from live import leaf_model, short_log, waits
 

@@ -106,8 +106,8 @@ def _plain(value: Any) -> Any:
     return value
 
 
-def print_table(title: str, head: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
-    """Print a table of plain text on stdout; its first column is left-aligned.
+def text_table(title: str, head: Sequence[str], rows: Sequence[Sequence[str]]) -> Table:
+    """Return a table of plain text; its first column is left-aligned.
 
     Parameters
     ----------
@@ -125,7 +125,12 @@ def print_table(title: str, head: Sequence[str], rows: Sequence[Sequence[str]]) 
     for row in rows:
         # Text: brackets in names are not markup.
         table.add_row(*(Text(printable(cell)) for cell in row))
-    PlainConsole(highlight=False).print(table)
+    return table
+
+
+def print_table(title: str, head: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
+    """Print a table of plain text on stdout; arguments as of `text_table`."""
+    PlainConsole(highlight=False).print(text_table(title, head, rows))
 
 
 def save_figures(folder: Path | None, page: str, *result: Any) -> None:
