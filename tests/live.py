@@ -84,6 +84,10 @@ class LoggedLines(logging.Handler):
     def __exit__(self, *_: object) -> None:
         self._logger.removeHandler(self)
         self._logger.setLevel(self._level)
+        self.release_all()
+
+    def release_all(self) -> None:
+        """Add the lines that the rate limit holds back."""
         self._limiter.release_due(everything=True)
 
     def emit(self, record: logging.LogRecord) -> None:
@@ -316,7 +320,7 @@ def in_process(*arguments: object) -> Ended:
     return Ended(code, out.getvalue(), err.getvalue())
 
 
-def waits(condition: Callable[[], bool], seconds: float = 5.0) -> bool:
+def waits(condition: Callable[[], bool], seconds: float = 60.0) -> bool:
     """Return whether a condition becomes true in time."""
     until = time.monotonic() + seconds
     while not condition():

@@ -249,6 +249,7 @@ class RateLimitFilter(logging.Filter):
         for record in sorted(due, key=lambda each: each.created):
             self._release(record)
 
+
 def _pass(seen: _Repetitions, record: logging.LogRecord, now_s: float) -> None:
     if seen.suppressed:
         record.suppressed = seen.suppressed

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
+from contextlib import ExitStack
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, Final
 
@@ -80,19 +83,28 @@ def _rows(status: dict[str, Any], place: str) -> list[tuple[str, str]]:
 
 
 def _watch(endpoint: str | None, token_file: Path | None) -> None:
-    """Show the status until stopped; a service that does not answer is a line."""
-    shown = PlainConsole()
-    with Live(console=shown, auto_refresh=False, screen=shown.is_terminal) as live:
+    """Show the status until stopped, in lines where stdout is no terminal."""
+    from cangauge.cli.live_line import live_text
+
+    shown = PlainConsole(highlight=False)
+    with ExitStack() as stack:
+        show: Callable[[RenderableType], None] = shown.print
+        if shown.is_terminal:
+            live = stack.enter_context(Live(console=shown, auto_refresh=False, screen=True))
+            show = partial(live.update, refresh=True)
         while True:
+            content: RenderableType
             try:
                 place, status = _ask(endpoint, token_file)
                 rows = _rows(status, place)
-                content: RenderableType = text_table(f"cangauge at {place}", ("", "<"), rows)
+                content = text_table(f"cangauge at {place}", ("", "<"), rows)
+                if not shown.is_terminal:
+                    content = live_text(status)
             except InputError:
                 raise  # waiting does not mend it
             except CangaugeError as error:
                 content = Text(f"NO ANSWER: {error}", style="bold red")
-            live.update(content, refresh=True)
+            show(content)
             time.sleep(WATCH_EVERY_S)
 
 

@@ -17,6 +17,7 @@ import os
 import shutil
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from functools import partial
@@ -331,8 +332,9 @@ class _File:
             while left:
                 left = left[os.write(self._descriptor, left) :]
         except OSError:
-            os.ftruncate(self._descriptor, self._bytes)
-            os.lseek(self._descriptor, self._bytes, os.SEEK_SET)
+            with suppress(OSError):  # a device has no length
+                os.ftruncate(self._descriptor, self._bytes)
+                os.lseek(self._descriptor, self._bytes, os.SEEK_SET)
             raise
         self._bytes += len(data)
         self.written_bytes += len(data)

@@ -146,7 +146,7 @@ class StateKeeper:
         self._pipeline = pipeline
         self._wall_s = wall_s
         self._boot_id = _boot_id()
-        self._worker = Worker("cangauge-state", self._failed, jobs_at_most=2)
+        self._worker = Worker("cangauge-state", self._failed, jobs_at_most=3)
         self._hashed = (pipeline.model, text_sha256(pipeline.model.to_json()))
         self._samples_kept = 0
         self._restored_pct: float | None = None
@@ -181,6 +181,10 @@ class StateKeeper:
         )
         if self._worker.submit(partial(self._write, content)):
             self._samples_kept = pipeline.samples
+
+    def flush(self, within_s: float) -> bool:
+        """Wait until the state is written; return False if that takes longer [s]."""
+        return self._worker.flush(within_s)
 
     def _model_hash(self) -> str:
         model = self._pipeline.model

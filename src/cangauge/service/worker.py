@@ -36,6 +36,11 @@ class Worker:
             return False
         return True
 
+    def flush(self, within_s: float) -> bool:
+        """Wait until the jobs so far are done; return False if that takes longer [s]."""
+        done = threading.Event()
+        return self.submit(done.set) and done.wait(within_s)
+
     def close(self, within_s: float) -> bool:
         """Run the jobs that wait and end the thread; return False if that takes longer [s]."""
         try:

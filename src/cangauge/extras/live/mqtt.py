@@ -38,6 +38,7 @@ except ImportError as error:
     ) from error
 
 if TYPE_CHECKING:
+    from cangauge.service.config import MqttConfig
     from cangauge.service.run import Service
 
 _LOG = logging.getLogger(__name__)
@@ -325,18 +326,23 @@ def _tls_context(ca_file: str | None) -> ssl.SSLContext:
         ) from error
 
 
-def make_output(service: Service) -> MqttPublisher:
-    """Return the publisher that a service's configuration asks for; may raise InputError."""
-    config = service.config.mqtt
-    if config is None:
-        raise ValueError("no [mqtt]")
+def mqtt_settings(config: MqttConfig, bus: str) -> MqttSettings:
+    """Return the broker of a configuration for a bus of this name; may raise InputError."""
     given = config.model_dump(exclude={"password_file"})
     given["port"] = config.port or (8883 if config.tls else 1883)
-    name = f"cangauge_{socket.gethostname()}_{service.bus}"
+    name = f"cangauge_{socket.gethostname()}_{bus}"
     given["device"] = config.device or re.sub(r"[^A-Za-z0-9_-]+", "_", name)
     password = read_mqtt_password(config.password_file, os.environ)
     if password is not None and config.user is None:
         raise InputError(
             "is missing", field="mqtt.user", cure="name the user whose password is given"
         )
-    return MqttPublisher(MqttSettings(**given, password=password))
+    return MqttSettings(**given, password=password)
+
+
+def make_output(service: Service) -> MqttPublisher:
+    """Return the publisher that a service's configuration asks for; may raise InputError."""
+    config = service.config.mqtt
+    if config is None:
+        raise ValueError("no [mqtt]")
+    return MqttPublisher(mqtt_settings(config, service.bus))
