@@ -13,10 +13,11 @@ from pathlib import Path
 import can
 import pytest
 
-from cangauge.bus.captures.capture import open_capture
+from cangauge.bus.captures import open_capture
 from cangauge.bus.open import bus_address, open_bus
 from cangauge.bus.recording import capture_to_log
 from cangauge.bus.vehicle import Vehicle
+from cangauge.logs.sign import sign_of_current
 from cangauge.service.config import load_config
 from cangauge.service.setup import load_vehicle
 from drive_captures import CARS, capture
@@ -87,6 +88,36 @@ def test_a_dbc_gives_signals_by_name(mitsubishi: Path, tmp_path: Path) -> None:
     assert chosen["voltage"][0]["signal"] == "PackVoltage"
     car = Vehicle.load(map=tmp_path / "map.toml")
     assert car.current.codec.name == "PackCurrent"
+
+
+@pytest.mark.parametrize(("scale", "sign"), [("(0.01,-327.68)", 1), ("(-0.01,327.68)", -1)])
+def test_the_sign_of_a_dbc_s_current_is_proven(
+    mitsubishi: Path, tmp_path: Path, scale: str, sign: int
+) -> None:
+    (tmp_path / "car.dbc").write_text(
+        'VERSION "1"\nNS_ :\nBS_:\nBU_: V\nBO_ 883 BMS_Status: 8 V\n'
+        f' SG_ PackCurrent : 23|16@0+ {scale} [0|0] "A" V\n'
+        ' SG_ PackVoltage : 39|16@0+ (0.1,0) [0|0] "V" V\n'
+    )
+    maps = ("--map", tmp_path / "map.toml", "--config", tmp_path / "run.toml")
+    done = init(mitsubishi, "--dbc", tmp_path / "car.dbc", *maps)
+    assert done.returncode == 0, done.stderr
+    assert f"The map has sign = {sign}." in done.stderr
+    assert ("positive values charge on this bus" in done.stderr) == (sign < 0)
+    log = capture_to_log(mitsubishi, Vehicle.load(map=tmp_path / "map.toml"))
+    assert sign_of_current(log).sign == 1
+
+
+def test_an_open_scale_is_listed_and_not_ticked(mitsubishi: Path, tmp_path: Path) -> None:
+    choice = ("--choose", "current=1", "--choose", "voltage=1")
+    done = init(mitsubishi, "-o", tmp_path / "open", *choice)
+    assert "1 ?" in done.stdout
+    assert "1 ✓" not in done.stdout.partition("soc")[0]
+    assert "V at 0.1 V a step (about" in done.stderr
+    stated = init(mitsubishi, "-o", tmp_path / "stated", *choice, "--nominal-voltage", 330)
+    voltage = stated.stdout.partition("voltage")[2]
+    assert "1 ✓" in voltage
+    assert "do not tell the scale" not in stated.stderr
 
 
 def test_nothing_to_look_at_is_refused(tmp_path: Path) -> None:

@@ -11,10 +11,9 @@ from pathlib import Path
 import can
 import pytest
 
-from cangauge.bus.backend import backend_capabilities
 from cangauge.bus.connection import BusConnection, BusError
 from cangauge.bus.encoder import FrameEncoder
-from cangauge.bus.open import bus_address, open_bus
+from cangauge.bus.open import backend_capabilities, bus_address, open_bus
 from cangauge.bus.publish import SocDetail, SocEstimate, SocReader
 from cangauge.bus.time_source import ClockFrames
 from cangauge.bus.vehicle import Vehicle

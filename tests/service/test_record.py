@@ -15,8 +15,7 @@ import can
 import numpy as np
 import pytest
 
-from cangauge.bus.captures.capture import open_capture
-from cangauge.bus.captures.files import all_parts, parts_of_run
+from cangauge.bus.captures import all_parts, open_capture, parts_of_run
 from cangauge.bus.encoder import FrameEncoder
 from cangauge.bus.vehicle import Vehicle
 from cangauge.errors import InputError

@@ -6,6 +6,7 @@ import shutil
 import socket
 import struct
 import subprocess
+import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -14,8 +15,7 @@ import can
 import numpy as np
 import pytest
 
-from cangauge.bus.backend import NoPendingFrameError, pending_frames
-from cangauge.bus.connection import BusConnection
+from cangauge.bus.connection import BusConnection, NoPendingFrameError, pending_frames
 from cangauge.bus.encoder import FrameEncoder
 from cangauge.bus.open import BusAddress, bus_address, has_socketcan, open_bus
 from cangauge.bus.publish import (
@@ -206,17 +206,29 @@ def test_unwanted_traffic_costs_no_wanted_frame(replay_port: BusConnection, tmp_
 
 def test_others_can_read_the_published_frames(replay_port: BusConnection) -> None:
     wanted = [standard_filter(each) for each in FrameIds().published]
-    listener = can.Bus("vcan0", interface="socketcan", ignore_config=True, can_filters=wanted)
+    frames: list[can.Message] = []
+    done = threading.Event()
+
+    def listen() -> None:
+        # Read while the service sends: the kernel buffers fewer frames than a replay publishes.
+        bus = can.Bus("vcan0", interface="socketcan", ignore_config=True, can_filters=wanted)
+        with bus:
+            opened.set()
+            while (message := bus.recv(0.2)) is not None or not done.is_set():
+                if message is not None:
+                    frames.append(message)
+
+    opened, listener = threading.Event(), threading.Thread(target=listen)
+    listener.start()
+    assert opened.wait(30.0)
     with service("generic", PipelineSettings(time_source="replay-clock")) as live:
         log = short_log(20.0)
         play(replay_port, LogSource(log, Vehicle.load("generic")), MAX, stop=never)
         assert waits(lambda: live.pipeline.samples == len(log))
         time.sleep(0.3)
+    done.set()
+    listener.join()
     reader = SocReader(FrameIds())
-    frames = []
-    while (message := listener.recv(0.1)) is not None:
-        frames.append(message)
-    listener.shutdown()
     published = [each for each in map(reader.read, frames) if isinstance(each, SocEstimate)]
     assert reader.refused == 0
     assert len(published) >= len(log)  # every 100 ms of bus time

@@ -40,7 +40,13 @@ from cangauge.logs.log import Log
 from cangauge.model.coulomb_counting import difference_from_reference
 from cangauge.model.model_file import Model
 from cangauge.service.pipeline import FrameCounts, Pipeline, PipelineSettings
-from cangauge.types import Estimate, Reason, Sample, reason_name, reason_names
+from cangauge.types import (
+    Estimate,
+    Reason,
+    Sample,
+    reason_name,
+    reason_names,
+)
 
 PROGRESS_EVERY: Final = 50_000
 """Frames between two calls of the progress callback."""
@@ -287,7 +293,6 @@ def estimate_recorded_log(
     gap_from_log: bool = True,
     pack: PackHistory | None = None,
     progress: Callable[[int], None] | None = None,
-    smooth: bool = False,
 ) -> RecordedEstimate:
     """Estimate a log.
 
@@ -305,8 +310,6 @@ def estimate_recorded_log(
         Collects health, power and cells.
     progress : callable, optional
         Called with the number of samples done.
-    smooth : bool
-        Add the smoothed SoC.
 
     Raises
     ------
@@ -325,7 +328,7 @@ def estimate_recorded_log(
     history = PackHistory() if pack is None else pack
     observe = history.observe if history.takes_samples else None
     table, scores = estimate_log(
-        log, model, settings, progress, observe, smooth=smooth, at_end=history.take
+        log, model, settings, progress=progress, observe=observe, at_end=history.take
     )
     return RecordedEstimate(log, table, scores, model, settings, origin, pack=history)
 

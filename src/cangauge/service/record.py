@@ -28,7 +28,7 @@ import can
 
 from cangauge._io import FOR_GROUP, FULL, check_writable
 from cangauge._logging import emit
-from cangauge.bus.captures.files import all_parts, part_path, run_path
+from cangauge.bus.captures import all_parts, part_path, run_path
 from cangauge.bus.time_source import whole_us
 from cangauge.errors import CangaugeError, InputError
 from cangauge.service.output import Output

@@ -1,6 +1,6 @@
 """The service's state across restarts: restored at the start, saved while it runs.
 
-    {"format": "cangauge-state", "version": 2, "sha256": "…", "content": {…}}
+    {"format": "cangauge-state", "version": 3, "sha256": "…", "content": {…}}
 
 The hash is that of the content, written without spaces and with sorted keys. A file is checked
 before use: size, JSON, format, version, hash, then the type and range of every field. A file that
@@ -32,7 +32,7 @@ from cangauge.service.pipeline import Pipeline
 from cangauge.service.worker import Worker
 
 STATE_FORMAT: Final = "cangauge-state"
-STATE_VERSION: Final = 2
+STATE_VERSION: Final = 3
 """To be increased with every change of the estimator's state."""
 LARGEST_BYTES: Final = 8 << 20
 """Largest state file that is read [bytes]; a full delay line takes 0.3 MB."""

@@ -41,6 +41,8 @@ NEEDED: Final = ("current", "voltage")
 CLEARLY_NAMED: Final = 1.0
 """Distance in score of the first signal of a DBC that makes it clear: one matching word."""
 LONGEST_PAIR_S: Final = 1.0
+NOMINAL_CELL_V: Final = 3.7
+"""Nominal voltage of an oxide cell [V]: tells how many cells a scale would mean."""
 
 
 def init_command(  # noqa: PLR0917 - typer fills the arguments by name
@@ -140,8 +142,14 @@ def init_command(  # noqa: PLR0917 - typer fills the arguments by name
             quiet=json_output,
             nominal_v=nominal_voltage,
         )
-        files = found.files(targets, interface, channel, parse_bus_options(bus_option or []))
+        bus_options = parse_bus_options(bus_option or [])
+        files = found.files(targets, interface, channel, bus_options)
         found.proof = _prove(files, targets, paths, Path(folder), found)
+        if found.proof.get("sign", {}).get("sign") == -1 and found.method == "dbc":
+            found.sign = -1
+        if found.method == "dbc":  # the map says how its sign was found
+            files = found.files(targets, interface, channel, bus_options)
+            found.proof |= {"sign": found.proof.get("sign", {}) | {"in_map": found.sign}}
     targets.map.parent.mkdir(exist_ok=True)
     write_texts_atomic(files)
     if json_output:
@@ -201,7 +209,28 @@ class _Found:
     chosen: dict[str, int] = field(default_factory=dict)
     dbc: Path | None = None
     nominal_v: float | None = None
+    sign: int = 1
+    """Sign of the current in the map, where the DBC names it: -1 where positive values charge."""
     proof: dict[str, Any] = field(default_factory=dict)
+
+    def levels(self) -> list[tuple[float, float]]:
+        """Return usual scales of the chosen voltage and the pack's voltage [V] by each.
+
+        One pair where the scale is known: by a DBC, a preset or the nominal voltage.
+        """
+        from cangauge.extras.discovery.proposal import voltage_levels
+
+        if self.findings is None or self.nominal_v is not None or "voltage" not in self.chosen:
+            return []
+        return voltage_levels(self.findings.voltage[self.chosen["voltage"]])
+
+    def is_proven(self, role: str) -> bool:
+        """Whether nothing that the data leave open changes the values of a chosen signal."""
+        if role == "voltage":
+            return len(self.levels()) < 2
+        if role == "current":
+            return self.findings is None and self.proof.get("sign", {}).get("sign", 0) != 0
+        return True
 
     def candidates(self, role: str) -> Sequence[Candidate | NamedSignal]:
         """Return the candidates of a role."""
@@ -219,6 +248,9 @@ class _Found:
                 role: [each.to_dict() for each in self.candidates(role)] for role in ROLES.values()
             },
             "remarks": [] if self.findings is None else list(self.findings.remarks),
+            "voltage_levels": [
+                {"scale": scale, "voltage_v": volts} for scale, volts in self.levels()
+            ],
             "proof": self.proof,
         }
 
@@ -258,6 +290,16 @@ class _Found:
         )
         return texts
 
+    @property
+    def sign_line(self) -> str:
+        """How the sign of the current was found, or what is left to do."""
+        sign = self.proof.get("sign", {})
+        if sign.get("sign", 0) == 0:
+            return "Sign of the current: not proven; `cangauge inspect DRIVE --map FILE` proves it."
+        if self.sign < 0:
+            return f"Sign of the current: positive values charge on this bus ({sign['text']})."
+        return f"Sign of the current: positive discharges ({sign['text']})."
+
     def _by_name(self, targets: _Targets) -> Proposal:
         from cangauge.extras.discovery.proposal import Assignment, Proposal
 
@@ -271,15 +313,15 @@ class _Found:
             lines = [f"By name and unit: {seen}."]
             if others:
                 lines.append(f"Else: {', '.join(others)}.")
-            roles[role] = Assignment(each.message, each.signal, 1, tuple(lines))
+            sign = self.sign if role == "current" else 1
+            roles[role] = Assignment(each.message, each.signal, sign, tuple(lines))
         dbc = Path() if self.dbc is None else self.dbc.resolve()
         same = dbc.parent == targets.map.parent.resolve()
         return Proposal(
             name=dbc.stem,
             dbc=dbc.name if same else str(dbc),
             roles=roles,
-            comments=("Signals found by their names and units in the DBC. The sign of the current",
-                      "is to be checked: `cangauge inspect DRIVE --map THIS_FILE`."),
+            comments=("Signals found by their names and units in the DBC.", self.sign_line),
             pair_within_s=0.1,
         )  # fmt: skip
 
@@ -385,7 +427,7 @@ def _listen(address: Any, seconds: float, path: Path) -> Path:
 
 def _joined(paths: Sequence[Path]) -> Iterator[can.Message]:
     """Yield the frames of captures, one after the other in time."""
-    from cangauge.bus.captures.capture import open_capture
+    from cangauge.bus.captures import open_capture
     from cangauge.extras.discovery.search import BETWEEN_S
 
     end_s = None
@@ -411,7 +453,7 @@ def _find(
     quiet: bool,
     nominal_v: float | None,
 ) -> _Found:
-    from cangauge.bus.captures.capture import open_capture
+    from cangauge.bus.captures import open_capture
     from cangauge.extras.discovery.by_name import named_signals
     from cangauge.extras.discovery.search import search
 
@@ -426,7 +468,17 @@ def _find(
             findings = search(_joined(paths), nominal_v)
             found = _Found("physics", findings=findings, nominal_v=nominal_v)
     _choose(found, picks, targets, quiet=quiet)
+    if len(levels := found.levels()) > 1 and _asks(quiet=quiet):
+        note(f"The bits do not tell the scale of the voltage: {_level_texts(levels)}.")
+        volts = typer.prompt("Voltage of the pack [V]?", type=float, default=levels[0][1], err=True)
+        within(volts, 10.0, 1500.0, option="--nominal-voltage", unit="V")
+        return _find(paths, dbc, picks, targets, presets=presets, quiet=quiet, nominal_v=volts)
     return found
+
+
+def _asks(*, quiet: bool) -> bool:
+    """Whether a user at a terminal can be asked."""
+    return sys.stdin is not None and sys.stdin.isatty() and not quiet
 
 
 def _known(paths: Sequence[Path]) -> str | None:
@@ -444,7 +496,7 @@ def _choose(  # noqa: C901 - one rule after the other
     found: _Found, picks: dict[str, int], targets: _Targets, *, quiet: bool
 ) -> None:
     """Choose a candidate for each role: the user's, the clear one, or by asking."""
-    asks = sys.stdin is not None and sys.stdin.isatty() and not quiet
+    asks = _asks(quiet=quiet)
     unclear = []
     for name, role in ROLES.items():
         candidates = found.candidates(role)
@@ -519,7 +571,11 @@ def _prove(
     car = Vehicle.load(map=folder / targets.map.name)
     if not paths:
         return {}
+    import numpy as np
+
     from cangauge.bus.recording import capture_samples
+    from cangauge.logs.log import Log
+    from cangauge.logs.sign import sign_of_current
 
     samples = capture_samples(paths[0], car)
     if len(samples) < 2:
@@ -528,12 +584,24 @@ def _prove(
             source=paths[0],
             cure="choose others by --choose",
         )
-    volts = samples.voltage_v[samples.voltage_v == samples.voltage_v]
-    return {
+    good = np.isfinite(samples.voltage_v)
+    good &= np.diff(samples.time_s, prepend=-np.inf) > 0.0
+    volts = samples.voltage_v[good]
+    proof: dict[str, Any] = {
         "samples": len(samples),
         "current_a": [float(samples.current_a.min()), float(samples.current_a.max())],
         "voltage_v": [float(volts.min()), float(volts.max())] if len(volts) else None,
     }
+    if len(volts):
+        log = Log(  # the sign needs no temperature
+            samples.time_s[good], samples.current_a[good], volts, np.zeros(len(volts)),
+            soc_pct=samples.soc_pct[good],
+        )  # fmt: skip
+        finding = sign_of_current(log)
+        proof["sign"] = {
+            "sign": finding.sign, "confidence": finding.confidence, "text": finding.strongest.text,
+        }  # fmt: skip
+    return proof
 
 
 def _show(found: _Found) -> None:
@@ -548,10 +616,36 @@ def _show(found: _Found) -> None:
     if found.findings is not None:
         for remark in found.findings.remarks:
             note(f"note: {remark}")
-    if found.proof:
+    if found.proof.get("samples"):
         amps, volts = found.proof["current_a"], found.proof["voltage_v"]
         shown = "no voltage" if volts is None else f"{volts[0]:g} … {volts[1]:g} V"
         note(f"decoded: {found.proof['samples']} samples, {amps[0]:g} … {amps[1]:g} A, {shown}")
+    if found.findings is None:
+        note(_sign_note(found))
+    if len(levels := found.levels()) > 1:
+        note(
+            f"note: the bits do not tell the scale of the voltage: {_level_texts(levels)}."
+            " Give --nominal-voltage V (type plate, or a meter)."
+        )
+
+
+def _sign_note(found: _Found) -> str:
+    sign = found.proof.get("sign", {})
+    if found.method == "preset" and sign.get("sign") == -1:
+        return (
+            f"warning: by this preset positive current charges ({sign['text']}): is it another car,"
+            " or a converter that turns the sign? Set sign under [current] of the map."
+        )
+    if sign.get("sign", 0) == 0:
+        return f"warning: {found.sign_line[0].lower()}{found.sign_line[1:]}"
+    return f"{found.sign_line} The map has sign = {found.sign}."
+
+
+def _level_texts(levels: Sequence[tuple[float, float]]) -> str:
+    return ", ".join(
+        f"{volts:.0f} V at {scale:g} V a step (about {round(volts / NOMINAL_CELL_V)} cells)"
+        for scale, volts in levels
+    )
 
 
 def _show_role(found: _Found, role: str) -> None:
@@ -560,7 +654,8 @@ def _show_role(found: _Found, role: str) -> None:
 
     rows = []
     for number, each in enumerate(found.candidates(role), 1):
-        mark = f"{number}{' ✓' if found.chosen.get(role) == number - 1 else ''}"
+        taken = "✓" if found.is_proven(role) else "?"
+        mark = f"{number} {taken}" if found.chosen.get(role) == number - 1 else str(number)
         if isinstance(each, Candidate):
             rows.append([
                 mark, each.name, f"{each.scale:g}",

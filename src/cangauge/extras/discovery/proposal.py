@@ -115,6 +115,17 @@ def dbc_text(chosen: Mapping[str, Candidate]) -> str:
     return "\n".join([*lines, *cycles, "", *values, ""])
 
 
+def voltage_levels(candidate: Candidate) -> list[tuple[float, float]]:
+    """Return usual scales [V] of a voltage and the pack's voltage by each [V], its own first.
+
+    Bits and the relation to the current are the same by every scale.
+    """
+    middle = (candidate.low + candidate.high) / 2.0 / candidate.scale
+    own = (candidate.scale, candidate.scale * middle)
+    others = [(each, each * middle) for each in sorted(VOLTAGE_SCALES) if each != candidate.scale]
+    return [own, *((scale, volts) for scale, volts in others if 60.0 < volts < 1000.0)]
+
+
 def scale_line(role: str, candidate: Candidate, nominal_v: float | None) -> str:
     """Return how the scale of a current or a voltage was determined, and which others may be."""
     usual = VOLTAGE_SCALES if role == "voltage" else CURRENT_SCALES
@@ -126,8 +137,7 @@ def scale_line(role: str, candidate: Candidate, nominal_v: float | None) -> str:
             f" well with {', '.join(f'{each:g}' for each in others)}. No current at raw {zero}:"
             f" {'signed' if candidate.place.is_signed else 'a round number near the most common'}."
         )
-    middle = (candidate.low + candidate.high) / 2.0 / candidate.scale
-    shown = [f"{each:g} ({each * middle:.0f} V)" for each in others if 60 < each * middle < 1000]
+    shown = [f"{scale:g} ({volts:.0f} V)" for scale, volts in voltage_levels(candidate)[1:]]
     if nominal_v is not None:
         return f"Factor {candidate.scale:g} is the usual one nearest to the stated {nominal_v:g} V."
     return (

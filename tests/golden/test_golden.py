@@ -1,0 +1,52 @@
+"""What the program gives equals the golden records; see `make.py`."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+HERE = Path(__file__).resolve().parent
+_spec = importlib.util.spec_from_file_location("golden_make", HERE / "make.py")
+assert _spec is not None
+assert _spec.loader is not None
+make = importlib.util.module_from_spec(_spec)
+_spec.loader.exec_module(make)
+
+NAMES = [path.name for path in make.captures()] or ["absent"]
+
+
+def recorded(name: str) -> dict[str, Any]:
+    return json.loads((HERE / f"{name}.json").read_text())
+
+
+def plain(found: Any) -> Any:
+    return json.loads(json.dumps(found))
+
+
+@pytest.mark.real
+@pytest.mark.parametrize("name", NAMES)
+def test_a_capture_gives_the_same_samples(name: str, shared_data: Path) -> None:
+    found = plain(make.capture_records(next(shared_data.glob(f"*/{name}"))))
+    assert found == recorded("captures")["captures"][name]
+
+
+@pytest.mark.real
+def test_every_capture_has_a_record(shared_data: Path) -> None:
+    assert sorted(recorded("captures")["captures"]) == sorted(NAMES)
+
+
+def test_bad_inputs_have_the_same_errors() -> None:
+    assert plain(make.bad_inputs()) == recorded("captures")["bad_inputs"]
+
+
+def test_json_of_commands_has_the_same_keys() -> None:
+    assert plain(make.command_records()) == recorded("commands")
+
+
+@pytest.mark.parametrize("name", list(make.FROZEN))
+def test_a_frozen_model_gives_the_same_frames(name: str) -> None:
+    assert plain(make.model_record(name)) == recorded("models")[name]
