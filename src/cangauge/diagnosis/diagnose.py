@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from threadpoolctl import ThreadpoolController
 
-from cangauge._display import figure, html
+from cangauge._extras import extra
 from cangauge._io import file_sha256
 from cangauge.diagnosis import sentences
 from cangauge.diagnosis.answer import ALARM, GROUP_OF, UNKNOWN, Posterior, answer
@@ -324,11 +324,11 @@ class Diagnosis:
 
     def plot(self) -> Any:
         """Return the probabilities of the causes as bars, for `bokeh.plotting.show`."""
-        return figure("diagnosis_figure", self)
+        return extra("report.figures:diagnosis_figure")(self)
 
     def _repr_html_(self) -> str:
         """Return the answer for a notebook."""
-        return html("diagnosis_html", self)
+        return diagnosis_html(self)
 
     def to_json(
         self, extended_model: str | None = None, *, soc_error: bool = True
