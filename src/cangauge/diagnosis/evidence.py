@@ -261,9 +261,6 @@ def learn(
 ) -> References:
     """Learn structure, noise and healthy evidence from reference logs.
 
-    The structure is linearised twice, the second time about what the references show: an effect
-    that moves the SoC would meet the correction of another SoC otherwise.
-
     Parameters
     ----------
     references : sequence of Trace
@@ -273,14 +270,10 @@ def learn(
         Error that the model file states [V]: the floor with fewer than two references.
     """
     pack = fit_pack(references, capacity_ah)
-    full, out = _of_references(pack, references, ())
-    s2 = _noise_v2(pack, full)
-    p = _prior(pack, full, out, s2)
-    pack = pack.moved(np.linalg.solve(*_normal(pack, p, _marginal(full, s2))))
-
     trials = library(pack)
     full, out = _of_references(pack, references, trials)
     s2 = _noise_v2(pack, full)
+    p = _prior(pack, full, out, s2)
     if len(references) < 2:
         s2 = max(s2, stated_rmse_v**2)
     else:
@@ -453,8 +446,10 @@ def analyse(known: References, logs: Sequence[Columns], *, exact: bool = True) -
         places = tuple(_place(known, place[top]) for place in at) if name == STEP.effect else ()
         if exact and gain[top] > RESIMULATED_PART * gain.max():
             if _needs_resimulation(trial):
-                start = trial.number / trial.bound if trial.effect == "time_skew" else 0.0
-                amplitude, nats, left_v2 = _resimulated(known, logs, trial, start or amplitude)
+                starts = [amplitude, low[top] / 3.0, high[top] / 3.0]
+                if trial.effect == "time_skew" and trial.shape:
+                    starts = [trial.number / trial.bound]
+                amplitude, nats, left_v2 = _resimulated(known, logs, trial, starts)
             elif places:
                 places, amplitude, nats, left_v2 = _step_refined(known, logs, places)
         if left_v2 is None:
@@ -596,29 +591,38 @@ class _OneEffect:
 
 
 def _resimulated(
-    known: References, logs: Sequence[Columns], trial: Trial, start: float
+    known: References, logs: Sequence[Columns], trial: Trial, starts: Sequence[float]
 ) -> tuple[float, float, float | None]:
-    """Return size [bounds], gain [nats] and remaining error [V²] of an effect, re-simulated."""
+    """Return size [bounds], gain [nats] and remaining error [V²] of an effect, re-simulated.
+
+    From the best of several sizes, since a large one may lie beyond a bend of the curve.
+    """
     low, high = trial.low / trial.bound, trial.high / trial.bound
-    zero = _OneEffect.of(known, logs, [at_size(known, log, trial, 0.0).sum(axis=0) for log in logs])
-    size, gain, left_v2, step = 0.0, 0.0, None, start
+    rows = sum(len(log.rows) for log in logs)
+
+    def fitted(size: float) -> tuple[_OneEffect, float]:
+        products = [at_size(known, log, trial, size).sum(axis=0) for log in logs]
+        one = _OneEffect.of(known, logs, products)
+        w = np.concatenate([-one.theta, np.zeros(logs[0].b.shape[1] + 1), [1.0]])
+        return one, float(sum(w @ z @ w for z in products)) / rows
+
+    size, (here, _) = 0.0, fitted(0.0)
+    chi2_without, left_v2 = here.chi2, None
+    tried = {start: fitted(start) for start in starts if abs(start) >= MIN_STEP}
+    step = min(tried, key=lambda start: tried[start][0].chi2, default=0.0)
     for _ in range(STEPS):
         if abs(step) < MIN_STEP:
             break
-        products = [at_size(known, log, trial, size + step).sum(axis=0) for log in logs]
-        here = _OneEffect.of(known, logs, products)
-        better = 0.5 * (zero.chi2 - here.chi2)
-        if better <= gain:
+        there, left_there = tried.get(size + step) or fitted(size + step)
+        if there.chi2 >= here.chi2:
             step *= SHRINK
             continue
-        size, gain = size + step, better
-        w = np.concatenate([-here.theta, np.zeros(logs[0].b.shape[1] + 1), [1.0]])
-        left_v2 = float(sum(w @ z @ w for z in products)) / sum(len(log.rows) for log in logs)
+        size, here, left_v2 = size + step, there, left_there
         change = (here.gradient - RIDGE * size) / (here.curvature + RIDGE)
         step = float(np.clip(size + change, low, high)) - size
         if abs(step) < MIN_CHANGE * abs(size):
             break
-    return size, gain, left_v2
+    return size, 0.5 * (chi2_without - here.chi2), left_v2
 
 
 def held_out_sizes(
