@@ -53,7 +53,9 @@ def assert_same(found: Any, expected: Any, at: str = "", scale: float = 1.0) -> 
             assert_same(one, other, f"{at}[{number}]", max([scale, *sizes]))
     elif isinstance(expected, float):
         close = abs(found - expected) <= TOLERANCE * max(1.0, scale, abs(expected))
-        assert close or found == expected or (math.isnan(found) and math.isnan(expected)), f"{at}: {found} {expected}"
+        assert close or found == expected or (math.isnan(found) and math.isnan(expected)), (
+            f"{at}: {found} {expected}"
+        )
     else:
         assert found == expected, at
 
