@@ -54,6 +54,9 @@ class Clock:
     wall_s: float = EPOCH_S
 
 
+FROM_80 = PipelineSettings(EstimatorSettings(initial_soc_pct=80.0))
+
+
 @dataclass
 class Machine:
     """Services one after another on the same file."""
@@ -62,7 +65,7 @@ class Machine:
     clock: Clock = field(default_factory=Clock)
     logged: LoggedLines = field(default_factory=lambda: LoggedLines("cangauge.service.state"))
     model: Model = MODEL
-    settings: PipelineSettings = PipelineSettings(EstimatorSettings(initial_soc_pct=80.0))
+    settings: PipelineSettings = FROM_80
     max_age_s: float = 86400.0
 
     def start(self) -> Service:
