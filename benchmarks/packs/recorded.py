@@ -145,9 +145,7 @@ def _a123(folder: Path) -> Pack:
         for path in sorted(folder.glob(f"A123_DYN_*_{script}.csv.gz"))
     ]
     capacity_ah = A123_CELL_AH * A123_PARALLEL
-    return Pack(
-        "", "", "judged", "lfp", A123_CELLS, logs, _judged(logs), capacity_ah, (1, 2, 3, 5)
-    )
+    return Pack("", "", "judged", "lfp", A123_CELLS, logs, _judged(logs), capacity_ah, (1, 2, 3, 5))
 
 
 def _as_pack(

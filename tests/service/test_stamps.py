@@ -11,10 +11,9 @@ from random import Random
 import can
 import pytest
 
-from cangauge.bus.backend import BackendCapabilities
 from cangauge.bus.connection import BusConnection
 from cangauge.bus.encoder import FrameEncoder
-from cangauge.bus.open import BusAddress, open_bus
+from cangauge.bus.open import BackendCapabilities, BusAddress, open_bus
 from cangauge.bus.publish import SocEstimate, SocReader
 from cangauge.bus.recording import capture_samples
 from cangauge.bus.time_source import ClockFrames, ReceiveTime
@@ -23,7 +22,7 @@ from cangauge.estimation.offline import samples_of
 from cangauge.service.loop import LoopSettings
 from cangauge.service.offline import estimate_capture
 from cangauge.service.pipeline import Pipeline, PipelineSettings
-from cangauge.service.recording import Recorder
+from cangauge.service.record import Recorder
 from cangauge.types import Reason, Sample, Status
 from live import Service, leaf_model, short_log, virtual_port, virtual_service, waits
 

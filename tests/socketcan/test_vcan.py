@@ -15,8 +15,7 @@ import can
 import numpy as np
 import pytest
 
-from cangauge.bus.backend import NoPendingFrameError, pending_frames
-from cangauge.bus.connection import BusConnection
+from cangauge.bus.connection import BusConnection, NoPendingFrameError, pending_frames
 from cangauge.bus.encoder import FrameEncoder
 from cangauge.bus.open import BusAddress, bus_address, has_socketcan, open_bus
 from cangauge.bus.publish import (
@@ -36,7 +35,7 @@ from cangauge.replay.steps import CaptureSource, LogSource, quantization_bound
 from cangauge.service.loop import LoopSettings
 from cangauge.service.offline import estimate_capture
 from cangauge.service.pipeline import Pipeline, PipelineSettings
-from cangauge.service.recording import Recorder
+from cangauge.service.record import Recorder
 from live import (
     Command,
     Service,

@@ -283,10 +283,7 @@ class SocPublisher:
         return frames
 
     def publish(
-        self,
-        estimate: Estimate,
-        samples: int,
-        report: Callable[[], PackReport] | None = None,
+        self, estimate: Estimate, samples: int, report: Callable[[], PackReport] | None = None
     ) -> list[can.Message]:
         """Return the frames due with a sample of a replayed log; arguments as in `beat`."""
         now_s = estimate.time_s

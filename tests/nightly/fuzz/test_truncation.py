@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from cangauge.bus.captures.capture import read_capture
+from cangauge.bus.captures import open_capture
 from cangauge.bus.database import load_dbc
 from cangauge.bus.recording import capture_to_log
 from cangauge.bus.vehicle import Vehicle
@@ -21,6 +21,7 @@ from cangauge.extras.validation.twin.drive import read_speed
 from cangauge.logs.read import read_log
 from cangauge.model.model_file import Model
 from cangauge.service.config import load_config
+from cangauge.service.setup import load_vehicle
 from fuzzing import corpus
 
 LOGS = ("log.parquet", "checked.parquet", "leaf.zip", "log.csv.gz", "utf16.csv")
@@ -56,7 +57,7 @@ def test_captures(tmp_path: Path, name: str) -> None:
     data = corpus.capture_files()[name]
     # Each MF4 costs a process and a second.
     step = len(data) // 8 if name == "x.mf4" else 1
-    found = outcomes(tmp_path / name, data, lambda path: len(list(read_capture(path))), step)
+    found = outcomes(tmp_path / name, data, lambda path: len(list(open_capture(path))), step)
     assert max(found) <= len(corpus.leaf_frames())
 
 
@@ -72,7 +73,7 @@ def test_captures_as_logs(tmp_path: Path, name: str) -> None:
 
 TEXTS: dict[str, tuple[str, Callable[[Path], object]]] = {
     "car.dbc": (corpus.DBC, load_dbc),
-    "config.toml": (corpus.CONFIG, lambda path: load_config(path).load_vehicle()),
+    "config.toml": (corpus.CONFIG, lambda path: load_vehicle(load_config(path))),
     "map.toml": (
         corpus.MAP.replace('dbc = "car.dbc"', 'dbc = "whole.dbc"'),
         lambda path: Vehicle.load(map=path),

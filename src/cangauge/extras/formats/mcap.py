@@ -10,9 +10,8 @@ import can
 from can.io.generic import BinaryIOMessageWriter
 from can.typechecking import StringPathLike
 
-from cangauge._io import MAX_IDLE_LINES
 from cangauge._mcap import FRAME, MAGIC, McapTopics, read_messages
-from cangauge.bus.captures.reader import MAX_ID, BinaryReader, idle_error
+from cangauge.bus.captures import MAX_ID, BinaryReader
 from cangauge.errors import InputError
 
 _TOPIC: Final = "/can/"
@@ -25,20 +24,17 @@ class McapReader(BinaryReader):
     unit = "messages"
 
     @classmethod
-    def matches(cls, head: bytes) -> int:
-        """Return 1 for an MCAP file, else 0."""
-        return int(head.startswith(MAGIC))
+    def matches(cls, head: bytes) -> bool:
+        """Return whether it is an MCAP file."""
+        return head.startswith(MAGIC)
 
     def read(self) -> Iterator[can.Message]:
         """Yield the frames."""
-        other = idle = 0
+        other = 0
         for message in read_messages(self.raw, self.source):
             if message.schema != FRAME:
-                other, idle = other + 1, idle + 1
-                if idle > MAX_IDLE_LINES:
-                    raise idle_error(self, "messages", f"up to message {self.frames + other}")
+                other += 1
                 continue
-            idle = 0
             try:
                 frame = _frame(message.fields())
             except (ValueError, KeyError, TypeError, RecursionError):

@@ -8,15 +8,7 @@ from typing import ClassVar, Final
 
 import can
 
-from cangauge.bus.captures.files import Stamps
-from cangauge.bus.captures.reader import (
-    ERROR_FLAG,
-    MAX_ID,
-    LineReader,
-    blank,
-    data_of,
-    id_of,
-)
+from cangauge.bus.captures import ERROR_FLAG, MAX_ID, LineReader, Stamps, blank, data_of, id_of
 
 # 0000.004429 000001DB 8 FD A0 BA AA 00 00 01 A8
 _SPACED = re.compile(r"(\d+\.\d+) ++([0-9A-Fa-f]{8}) ++(\d{1,2})((?: [0-9A-Fa-f]{2})*)\s*$")
@@ -155,44 +147,6 @@ class UnstampedCandumpReader(CandumpReader):
     name = "candump without stamps"
     stamps: Stamps = "none"
     has_stamps = False
-
-
-# (1436509052.249713) vcan0 044#2A366C2BBA
-_CANDUMP_LOG = re.compile(
-    r"\((\d+\.\d+)\) (\S+) ([0-9A-Fa-f]{3}|[0-9A-Fa-f]{8})#"
-    r"(?:(#[0-9A-Fa-f])?((?:[0-9A-Fa-f]{2}\.?)*)|R(\d?))(?: ([RT]))?\s*$"
-)
-
-
-class CandumpLogReader(LineReader):
-    """Log file of candump -l; python-can's reader stops at a malformed line."""
-
-    name = "candump log"
-    states_length = False
-
-    def parse(self, line: str) -> can.Message | None:
-        """Return the frame of a line."""
-        match = _CANDUMP_LOG.match(line)
-        if match is None:
-            return blank(line)
-        number, extended = int(match[3], 16), len(match[3]) == 8
-        remote = match[6] is not None
-        data = b"" if remote else bytes.fromhex(match[5].replace(".", ""))
-        fd_flags = int(match[4][1], 16) if match[4] else 0
-        return can.Message(
-            timestamp=float(match[1]),
-            arbitration_id=number & MAX_ID,
-            is_extended_id=extended,
-            channel=match[2],
-            is_remote_frame=remote,
-            is_error_frame=extended and bool(number & ERROR_FLAG),
-            is_fd=match[4] is not None,
-            bitrate_switch=bool(fd_flags & 1),
-            error_state_indicator=bool(fd_flags & 2),
-            is_rx=match[7] != "T",
-            dlc=int(match[6] or 0) if remote else None,
-            data=None if remote else data_of(data.hex(), len(data)),
-        )
 
 
 # Time Stamp,ID,Extended,Dir,Bus,LEN,D1,D2,D3,D4,D5,D6,D7,D8

@@ -16,8 +16,7 @@ from typing import Final, NamedTuple
 
 import can
 
-from cangauge._io import MAX_IDLE_LINES
-from cangauge.bus.captures.reader import ERROR_FLAG, MAX_ID, BinaryReader, idle_error
+from cangauge.bus.captures import ERROR_FLAG, MAX_ID, BinaryReader
 from cangauge.errors import InputError
 
 _CAN, _SLL, _SLL2 = 227, 113, 276
@@ -51,25 +50,22 @@ class PcapReader(BinaryReader):
     unit = "packets"
 
     @classmethod
-    def matches(cls, head: bytes) -> int:
-        """Return 1 for a PCAP or PCAPNG file, else 0."""
-        return int(head[:4] in _MAGICS or head.startswith(_SECTION_MARK))
+    def matches(cls, head: bytes) -> bool:
+        """Return whether it is a PCAP or PCAPNG file."""
+        return head[:4] in _MAGICS or head.startswith(_SECTION_MARK)
 
     def read(self) -> Iterator[can.Message]:
         """Yield the frames; other packets are counted in a remark."""
         self._order = "<"
         self._place = 0
-        other = idle = 0
+        other = 0
         magic = self._exactly(4)
         packets = self._blocks() if magic == _SECTION_MARK else self._records(magic)
         for interface, time_s, packet in packets:
             message = self._message(interface, packet)
             if message is None:
-                other, idle = other + 1, idle + 1
-                if idle > MAX_IDLE_LINES:
-                    raise idle_error(self, "packets", f"up to packet {self.frames + other}")
+                other += 1
                 continue
-            idle = 0
             message.timestamp = time_s
             yield message
         if other and not self.frames:
