@@ -107,7 +107,7 @@ class SeparateBias:
     @property
     def relative(self) -> FloatArray:
         """Both in standard deviations of their prior, shape (2,)."""
-        return self.b / np.sqrt(np.diag(PRIOR))
+        return np.asarray(self.b / np.sqrt(np.diag(PRIOR)))
 
     def take_over(self, before: SeparateBias, ratio: float) -> None:
         """Keep the capacity learned with another reference capacity, `ratio` times as large."""
