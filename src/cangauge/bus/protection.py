@@ -15,7 +15,7 @@ import enum
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Any, Final, Literal, NamedTuple, Protocol
+from typing import Any, Final, Literal, NamedTuple
 
 from e2e import p01, p02, p04, p05, p06, p07, p11
 
@@ -34,30 +34,6 @@ class Verdict(enum.IntEnum):
     """Refused: damaged."""
     REPEATED = 3
     """Refused: the counter did not change, so this is not a new frame."""
-
-
-class Protection(Protocol):
-    """CRC and alive counter of a message."""
-
-    @property
-    def name(self) -> str:
-        """Name in a map file."""
-
-    @property
-    def modulus(self) -> int:
-        """Number of counter values; 0 without a counter."""
-
-    def fits(self, length: int) -> bool:
-        """Return whether a payload of `length` bytes has room for CRC and counter."""
-
-    def is_whole(self, data: bytes | bytearray) -> bool:
-        """Return whether the CRC agrees and the counter value is a possible one."""
-
-    def counter(self, data: bytes | bytearray) -> int:
-        """Return the counter of a payload; 0 without a counter."""
-
-    def protect(self, data: bytes | bytearray, counter: int) -> bytes:
-        """Return the payload with counter (modulo `modulus`) and CRC set."""
 
 
 def _require(holds: bool, name: str, value: object, problem: str) -> None:
@@ -338,13 +314,10 @@ class E2eRule:
         return length >= max(self.header_byte + self._profile.header, self.protected_bytes)
 
     def is_whole(self, data: bytes | bytearray) -> bool:
-        """Return whether header and CRC agree and the counter value is a possible one."""
+        """Return whether header and CRC agree; the library refuses impossible counters."""
         if isinstance(data, bytes):
             data = bytearray(data)  # some checks of the library accept bytearray only
-        return (
-            self._profile.check(data, self.data_ids or self.data_id, **self._arguments)
-            and self.counter(data) < self._profile.modulus
-        )
+        return self._profile.check(data, self.data_ids or self.data_id, **self._arguments)
 
     def counter(self, data: bytes | bytearray) -> int:
         """Return the counter of a payload."""
@@ -369,6 +342,10 @@ class E2eRule:
         )
         return bytes(out)
 
+
+Protection = ProtectionRule | CounterRule | E2eRule
+"""CRC and alive counter of a message: `name`, `modulus` (0 without a counter), `fits`, `is_whole`,
+`counter`, `protect`."""
 
 SILENCE_S: Final = 2.0
 """Silence after which a sender may have restarted, with any counter value [s]."""
