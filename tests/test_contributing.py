@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import can
 import numpy as np
 import pytest
@@ -15,9 +13,6 @@ from cangauge.bus.mapping import SignalMap, TemperatureMap, VehicleMap
 from cangauge.bus.vehicle import PRESETS, Preset, Vehicle
 from cangauge.extras.report.charts import new_figure
 from cangauge.extras.report.page import Figure, Page, Paragraph, Section, Tile, render
-from cangauge.logs import read
-from cangauge.logs.draft import DraftLog
-from cangauge.logs.file_content import FileContent
 from cangauge.model.effects.base import Effect, OnlineEffect, Pack, PackState, Parameter, Values
 from cangauge.model.effects.library import LIBRARY
 from cangauge.model.voltage_model import VoltageModel
@@ -55,34 +50,6 @@ def test_an_effect_of_your_own_is_identified(monkeypatch: pytest.MonkeyPatch) ->
     worse = model.model_copy(update={"effects": [entry]})
     difference = model.predict(log).voltage_v - worse.predict(log).voltage_v
     assert difference == pytest.approx(2.0)
-
-
-def test_a_reader_of_your_own_reads(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    def is_mine(content: FileContent) -> bool:
-        return content.first_line.startswith("MYLOGGER")
-
-    def read_mine(content: FileContent) -> DraftLog:
-        rows = [line.split() for line in content.read().decode().splitlines()[1:]]
-        time_s, current_a, voltage_v = np.array(rows, dtype=float).T
-        return DraftLog(
-            name="mine",
-            source=str(content.path),
-            values={
-                "time_s": time_s,
-                "current_a": current_a,
-                "voltage_v": voltage_v,
-                "temperature_c": np.full(time_s.size, 21.0),
-            },
-        )
-
-    monkeypatch.setattr(read, "_TEXT_FORMATS", ((is_mine, read_mine), *read._TEXT_FORMATS))
-    path = tmp_path / "mine.txt"
-    path.write_text(
-        "MYLOGGER 1\n" + "".join(f"{k} {10 + k % 3} {380 - k % 3}\n" for k in range(60))
-    )
-    log = cangauge.read_log(path)
-    assert len(log) == 60
-    assert log.current_a[1] == 11.0
 
 
 def test_a_preset_of_your_own_decodes(monkeypatch: pytest.MonkeyPatch) -> None:

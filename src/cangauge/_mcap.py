@@ -7,20 +7,20 @@ Foxglove and PlotJuggler show them without a plug-in. Specification: mcap.dev/sp
 
 from __future__ import annotations
 
-import io
 import json
 import math
-import struct
-import zlib
 from collections.abc import Iterator, Mapping
 from os import PathLike
 from typing import Any, Final, NamedTuple
 
-from cangauge._io import MAX_MCAP_RECORD, MIB
+from cangauge._files import MIB
 from cangauge.errors import InputError
 
 MAGIC: Final = b"\x89MCAP0\r\n"
 FRAME, SAMPLE, ESTIMATE = "cangauge.CanFrame", "cangauge.Sample", "cangauge.SocEstimate"
+
+MAX_RECORD_BYTES: Final = 64 * MIB
+"""One record, packed: writers fill chunks of 1–4 MiB."""
 
 _FLAG: Final = {"type": "boolean"}
 
@@ -99,20 +99,21 @@ def read_messages(file: Any, path: str | PathLike[str] | None) -> Iterator[McapM
     InputError
         If the package mcap is not installed.
     ValueError, EOFError
-        Where the file is damaged or cut off, or an element exceeds its bound.
+        Where the file is damaged or cut off.
     """
     mcap = _need_mcap(path)
     schemas: dict[int, str] = {0: ""}
     channels: dict[int, Any] = {}
-    if file.read(len(MAGIC)) != MAGIC:
-        raise ValueError("it does not begin as an MCAP file")
+    reader = mcap.stream_reader.StreamReader(
+        file, validate_crcs=True, record_size_limit=MAX_RECORD_BYTES
+    )
     try:
-        for record in _records(mcap, file):
+        for record in reader.records:
             if isinstance(record, mcap.records.Schema):
                 schemas[record.id] = record.name
             elif isinstance(record, mcap.records.Channel):
                 channels[record.id] = record
-            else:
+            elif isinstance(record, mcap.records.Message):
                 channel = channels[record.channel_id]
                 yield McapMessage(
                     channel.topic,
@@ -121,87 +122,12 @@ def read_messages(file: Any, path: str | PathLike[str] | None) -> Iterator[McapM
                     record.log_time,
                     record.data,
                 )
-    except mcap.exceptions.McapError as error:
+            elif isinstance(record, mcap.records.DataEnd):
+                return
+    except mcap.exceptions.EndOfFile as error:
         raise EOFError("it ends in a record") from error
-    except (RuntimeError, MemoryError, struct.error) as error:
+    except Exception as error:  # the packages of its compressions raise errors of their own
         raise ValueError(str(error) or type(error).__name__) from error
-
-
-def _records(mcap: Any, file: Any, *, is_chunk: bool = False) -> Iterator[Any]:
-    """Yield schemas, channels and messages; chunks are opened, other records passed over.
-
-    Read here, not by the package's StreamReader, which loads any record whole, such as an index of
-    a stated length without bound.
-    """
-    kinds = mcap.opcode.Opcode
-    while head := file.read(_HEAD.size):
-        if len(head) < _HEAD.size:
-            raise EOFError("it ends in a record")
-        kind, size = _HEAD.unpack(head)
-        if kind in {kinds.DATA_END, kinds.FOOTER} and not is_chunk:
-            return
-        if kind == kinds.CHUNK and not is_chunk:
-            content = _unpacked(mcap.records.Chunk.read(_body(mcap, file, size)))
-            yield from _records(mcap, io.BytesIO(content), is_chunk=True)
-        elif kind == kinds.SCHEMA:
-            yield mcap.records.Schema.read(_body(mcap, file, size))
-        elif kind == kinds.CHANNEL:
-            yield mcap.records.Channel.read(_body(mcap, file, size))
-        elif kind == kinds.MESSAGE:
-            yield mcap.records.Message.read(_body(mcap, file, size, _MESSAGE_HEAD), size)
-        else:
-            _pass_over(file, size)
-    if not is_chunk:
-        raise EOFError("it ends before its footer")
-
-
-_HEAD: Final = struct.Struct("<BQ")
-"""Kind of a record, and the number of bytes that follow."""
-_MESSAGE_HEAD: Final = 22
-
-
-def _body(mcap: Any, file: Any, size: int, least: int = 0) -> Any:
-    """Return the content of a record as the stream that the package reads."""
-    if not least <= size <= MAX_MCAP_RECORD:
-        raise ValueError(f"a record of {size} bytes")
-    body = file.read(size)
-    if len(body) < size:
-        raise EOFError("it ends in a record")
-    return mcap.data_stream.ReadDataStream(io.BytesIO(body))
-
-
-def _pass_over(file: Any, size: int) -> None:
-    while size > 0:
-        part = file.read(min(size, MIB))
-        if not part:
-            raise EOFError("it ends in a record")
-        size -= len(part)
-
-
-def _unpacked(chunk: Any) -> bytes:
-    """Return the content of a chunk, which cannot exceed its bound."""
-    limit = MAX_MCAP_RECORD
-    if chunk.compression == "zstd":
-        import zstandard  # noqa: PLC0415 - comes with mcap
-
-        try:
-            with zstandard.ZstdDecompressor().stream_reader(chunk.data) as stream:
-                content = bytes(stream.read(limit + 1))
-        except zstandard.ZstdError as error:
-            raise ValueError(str(error)) from error
-    elif chunk.compression == "lz4":
-        import lz4.frame  # noqa: PLC0415 - comes with mcap
-
-        content = lz4.frame.LZ4FrameDecompressor().decompress(chunk.data, limit + 1)
-    elif chunk.compression:
-        raise ValueError(f"an unknown compression {chunk.compression[:20]!r}")
-    else:
-        content = chunk.data
-    if len(content) > limit:
-        raise ValueError(f"a chunk that unpacks to more than {limit} bytes")
-    if chunk.uncompressed_crc and zlib.crc32(content) != chunk.uncompressed_crc:
-        raise ValueError("a chunk with a wrong checksum")
-    return content
 
 
 class McapTopics:
@@ -280,10 +206,9 @@ class _Sink:
 
 def _need_mcap(path: str | PathLike[str] | None) -> Any:
     try:
-        import mcap.data_stream  # noqa: PLC0415 - an extra
-        import mcap.exceptions  # noqa: PLC0415
-        import mcap.opcode  # noqa: PLC0415
+        import mcap.exceptions  # noqa: PLC0415 - an extra
         import mcap.records  # noqa: PLC0415
+        import mcap.stream_reader  # noqa: PLC0415
         import mcap.writer  # noqa: PLC0415
     except ImportError as error:
         raise InputError(

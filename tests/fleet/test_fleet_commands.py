@@ -115,8 +115,8 @@ def test_the_vehicle_nearest_to_an_alarm_is_named(
     row = {
         "logs": [log.url for log in logs[3:4]], "references": 1, "detected": False,
         "verdict": "voltage_gain", "probability": 0.41, "probability_none": 0.088,
-        "family": "voltage_sensing", "family_probability": 0.82, "credible_set": [],
-        "baseline_rmse_v": 3.4, "floor_v": 1.04,
+        "group": "sensors_and_count", "group_probability": 0.82, "credible_set": [],
+        "baseline_rmse_v": 3.4, "healthy_rmse_v": 1.04,
     }  # fmt: skip
     monkeypatch.setattr(GapJob, "row", lambda *_: row)
     arguments = (
@@ -125,7 +125,7 @@ def test_the_vehicle_nearest_to_an_alarm_is_named(
     )  # fmt: skip
     ended = in_process(*arguments)
     assert "Vehicles with a gap" not in ended.out
-    shown = "nearest: car1 (P(no fault) 9 %, voltage_sensing 82 %)"
+    shown = "nearest: car1 (P(no fault) 9 %, sensors_and_count 82 %)"
     assert shown in ended.out
     assert shown in Html((tmp_path / "fleet.html").read_text(encoding="utf-8")).text
     found = json.loads(in_process(*arguments, "--json").out)
@@ -144,14 +144,14 @@ def test_a_log_that_does_not_fit_the_others_is_named(
     assert f"--leave-out '{wrong}'" in ended.err
     assert "wrong.parquet" in ended.out
     text = Html(page.read_text(encoding="utf-8")).text
-    assert f"of {len(logs) + 1} logs do not fit the others: {wrong}" in text
+    assert f"1 of {len(logs) + 1} logs does not fit the others: {wrong}" in text
     found = json.loads(fit("--json").out)
     misfit = found["misfits"][0]
     assert (misfit["log"], misfit["vehicle"]) == (str(wrong), "car1")
     assert misfit["mean_v"] > 0.0
     without = json.loads(fit("--leave-out", wrong, "--json").out)
     assert (without["logs"], without["misfits"]) == (len(logs), [])
-    assert without["voltage_mae_pct"] < found["voltage_mae_pct"]
+    assert without["voltage_rmse_v"] < found["voltage_rmse_v"]
     assert fit("--leave-out", logs[0].url).code == 2
 
 
@@ -184,9 +184,7 @@ def test_a_log_set_aside_as_another_vehicle_is_no_longer_listed(
     recorded, changed = read_log(logs[4].url), fit.folder / "car1" / "changed.parquet"
     write_log(replace(recorded, soc_pct=None), changed)
     first = json.loads(fit("--json").out)
-    assert [(each["log"], each["table"]) for each in first["bad"]] == [
-        (str(changed), "information")
-    ]
+    assert [(each["log"], each["table"]) for each in first["bad"]] == [(str(changed), "sums")]
     assert json.loads(fit("--json").out)["bad"] == first["bad"]
     write_log(replace(recorded, voltage_v=recorded.voltage_v + 0.01), changed)
     again = json.loads(fit("--vehicle-pattern", "/(logs)/", "--json").out)

@@ -147,7 +147,9 @@ def test_health_passes_from_log_to_log(logs: list[FleetLog], model: Model) -> No
     rows: list[dict[str, Any]] = []
     state = None
     for log in trips:
-        rows.append(perform(job, log, "", state).row or {})
+        done = perform(job, log, "", state)
+        assert done.row, done.reason
+        rows.append(done.row)
         state = rows[-1]["state"]
     alone = perform(job, trips[1], "", None).row or {}
     assert rows[1]["capacity_std_ah"] < alone["capacity_std_ah"]
@@ -232,8 +234,8 @@ def test_nothing_is_learned_for_vehicles_with_own_references(
 def test_the_page_says_which_vehicle_has_which_gap() -> None:
     gap = {
         "detected": True, "verdict": "voltage_offset", "probability": 0.9, "probability_none": 0.01,
-        "baseline_rmse_v": 2.0, "floor_v": 0.5, "closed_fraction": 0.8,
-        "credible_set": ["voltage_offset"], "family": "voltage_sensing", "family_probability": 0.9,
+        "baseline_rmse_v": 2.0, "healthy_rmse_v": 0.5, "closed_fraction": 0.8,
+        "credible_set": ["voltage_offset"], "group": "sensors_and_count", "group_probability": 0.9,
     }  # fmt: skip
     healthy = {
         "end_s": 3600.0, "capacity_ah": 60.0, "capacity_std_ah": 1.0, "resistance_ratio": 1.0,

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -161,53 +160,3 @@ def test_inspect_never_overwrites_its_log(log: Log, tmp_path: Path) -> None:
     done = CliRunner().invoke(app, ["inspect", str(path), "--report", str(path)])
     assert isinstance(done.exception, InputError)
     assert path.read_text(encoding="utf-8").startswith("time_s")
-
-
-def test_figures_are_written_as_png_and_svg(log: Log, tmp_path: Path) -> None:
-    image = pytest.importorskip("matplotlib.image")
-    path, folder = tmp_path / "drive.csv", tmp_path / "figures"
-    write_log(log, path)
-    folder.mkdir()
-    (folder / "05-own.png").write_bytes(b"\x89PNG of the user")
-    (folder / "06-own.png").mkdir()
-    (folder / "07-own.svg").symlink_to("absent")
-    done = CliRunner().invoke(app, ["inspect", str(path), "--figures", str(folder)])
-    assert done.exit_code == 0, done.output
-    # As an earlier run with more figures left them.
-    shutil.copy(folder / "02-voltage.svg", folder / "06-cells.svg")
-    shutil.copy(folder / "02-voltage.png", folder / "06-cells.png")
-    assert CliRunner().invoke(app, ["inspect", str(path), "--figures", str(folder)]).exit_code == 0
-    assert not list(folder.glob("06-cells*"))
-    (folder / "05-own.png").unlink()  # kept until now
-    (folder / "06-own.png").rmdir()
-    assert (folder / "07-own.svg").is_symlink()
-    names = ["01-current", "02-voltage", "03-temperature", "04-state-of-charge"]
-    assert sorted(each.stem for each in folder.glob("*.png")) == names
-    for name in names:
-        pixels = image.imread(folder / f"{name}.png")
-        assert pixels.shape[1] == 2000
-        assert 0.005 < np.mean(pixels[:, :, 0] < 0.9) < 0.5  # lines on white
-        assert "<svg" in (folder / f"{name}.svg").read_text(encoding="utf-8")
-
-
-def test_figures_leave_a_file_of_the_same_name(log: Log, tmp_path: Path) -> None:
-    pytest.importorskip("matplotlib")
-    path, own = tmp_path / "drive.csv", tmp_path / "02-voltage.svg"
-    write_log(log, path)
-    own.write_text("of the user")
-    done = CliRunner().invoke(app, ["inspect", str(path), "--figures", str(tmp_path)])
-    assert isinstance(done.exception, InputError)
-    assert own.read_text() == "of the user"
-    assert not (tmp_path / "01-current.png").exists()
-
-
-def test_figures_name_the_extra_they_need(
-    log: Log, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    write_log(log, tmp_path / "drive.csv")
-    monkeypatch.setattr("cangauge.cli.options.find_spec", lambda _name: None)
-    arguments = ["inspect", str(tmp_path / "drive.csv"), "--figures", str(tmp_path / "figures")]
-    done = CliRunner().invoke(app, arguments)
-    assert isinstance(done.exception, InputError)
-    assert "pip install 'cangauge[figures]'" in str(done.exception)
-    assert not (tmp_path / "figures").exists()

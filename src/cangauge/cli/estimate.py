@@ -14,7 +14,6 @@ from rich.progress import Progress
 from cangauge._formatting import number
 from cangauge._io import atomic_path
 from cangauge.cli.options import (
-    FiguresOption,
     JsonOption,
     Reading,
     ReportOption,
@@ -27,13 +26,13 @@ from cangauge.cli.options import (
     suffixed,
     within,
 )
-from cangauge.cli.output import console, emit_json, note, print_table, save_figures
+from cangauge.cli.output import console, emit_json, note, print_table
 from cangauge.cli.shown import VALID_STD_PCT
 from cangauge.errors import InputError
 
 if TYPE_CHECKING:
     from cangauge.bus.publish import PackReport
-    from cangauge.estimation.settings import Filter, Method
+    from cangauge.estimation.settings import Method
     from cangauge.model.model_file import Model
     from cangauge.service.offline import RecordedEstimate
 
@@ -64,23 +63,6 @@ def estimate_command(  # noqa: PLR0917 - typer passes options by name
             " (newton), or counting alone (coulomb).",
         ),
     ] = "ekf",
-    filter_: Annotated[
-        str,
-        typer.Option(
-            "--filter",
-            metavar="own|reference",
-            help="Arithmetic of the Kalman filter: our own, or filterpy's (reference), slower, to"
-            " check it.",
-        ),
-    ] = "own",
-    smooth: Annotated[
-        bool,
-        typer.Option(
-            "--smooth",
-            help="Add soc_smooth_pct and soc_smooth_std_pct: the best SoC given the whole log"
-            " (Rauch–Tung–Striebel), and its standard deviation [%].",
-        ),
-    ] = False,
     initial_soc: Annotated[
         str | None,
         typer.Option(
@@ -120,7 +102,6 @@ def estimate_command(  # noqa: PLR0917 - typer passes options by name
         ),
     ] = None,
     report: ReportOption = None,
-    figures: FiguresOption = None,
     json_output: JsonOption = False,
 ) -> None:
     """Estimate the state of charge of a recorded log or capture, offline.
@@ -156,7 +137,6 @@ def estimate_command(  # noqa: PLR0917 - typer passes options by name
 
     settings = EstimatorSettings(
         method=_method(method),
-        filter=_filter(filter_, smooth=smooth),
         initial_soc_pct=_initial_soc(initial_soc),
         initial_soc_std_pct=within(
             initial_soc_std, 0.0, 100.0, option="--initial-soc-std", unit="%"
@@ -171,7 +151,6 @@ def estimate_command(  # noqa: PLR0917 - typer passes options by name
     if isinstance(reading.open(log_path), Capture):
         if not reading.names_vehicle:
             raise capture_without_vehicle(log_path)
-        _refuse_smoothing(log_path, smooth=smooth)
         car = reading.car()
         source = known_temperature_source(reading.temperature_source) or "unknown"
         settings = replace(settings, temperature_source=source)
@@ -185,7 +164,7 @@ def estimate_command(  # noqa: PLR0917 - typer passes options by name
         assumed = assumed_of([log])
         if settings.initial_soc_pct is not None:
             note_starts([log], settings.initial_soc_pct, capacity_ah or model.capacity_ah)
-        cells = read_cells(log_path, log.time_s)
+        cells = read_cells(log_path, log.time_s, reading.given_columns())
         with _progress(len(log)) as progress:
             done = estimate_recorded_log(
                 log,
@@ -195,7 +174,6 @@ def estimate_command(  # noqa: PLR0917 - typer passes options by name
                 gap_from_log=max_gap_s is None,
                 pack=PackHistory(keeps_rows=pack is not None, cells=cells),
                 progress=progress,
-                smooth=smooth,
             )
         if max_gap_s is None and done.settings.gap_s > GAP_S:
             note(
@@ -204,7 +182,6 @@ def estimate_command(  # noqa: PLR0917 - typer passes options by name
             )
     _write_pack(done, pack)
     _write_output(done, output, report, model_path)
-    save_figures(figures, "estimate.estimate_page", done, model_path)
     for warning in done.warnings:
         note(f"warning: {done.recorded.source}: {warning}")
     if json_output:
@@ -251,27 +228,6 @@ def _write_pack(done: RecordedEstimate, pack: Path | None) -> None:
 
     if pack is not None:
         write_table(done.pack.columns, pack)
-
-
-def _refuse_smoothing(capture: Path, *, smooth: bool) -> None:
-    if smooth:
-        raise InputError(
-            "smooths a log, not a capture", field="--smooth", value=capture,
-            cure="give a log: the capture's samples are written by `-o samples.mcap`",
-        )  # fmt: skip
-
-
-def _filter(given: str, *, smooth: bool) -> Filter:
-    from cangauge.estimation.settings import Filter
-
-    for name in get_args(Filter):
-        if given == name:
-            if smooth and given != "own":
-                raise InputError("is not smoothed", field="--filter", cure="leave it out")
-            return name  # type: ignore[no-any-return]
-    raise InputError(
-        "not a known filter", field="--filter", value=given, cure="use own or reference"
-    )
 
 
 def _method(given: str) -> Method:

@@ -13,7 +13,6 @@ from rich.table import Table
 
 from cangauge._io import write_texts_atomic
 from cangauge.cli.options import (
-    FiguresOption,
     JsonOption,
     Reading,
     ReportOption,
@@ -21,7 +20,7 @@ from cangauge.cli.options import (
     check_outputs,
     option_groups,
 )
-from cangauge.cli.output import PlainConsole, emit_json, note, save_figures
+from cangauge.cli.output import PlainConsole, emit_json, note
 from cangauge.errors import InputError
 
 if TYPE_CHECKING:
@@ -49,7 +48,6 @@ def inspect_command(
     *,
     reading: Reading,
     report: ReportOption = None,
-    figures: FiguresOption = None,
     json_output: JsonOption = False,
 ) -> None:
     """Show what a log or capture holds, and the sign of its current.
@@ -100,14 +98,13 @@ def inspect_command(
         found: LogInspection | CaptureInspection
         found = of_log = inspect_log(log)
         _write_report(report, of_log, log)
-        save_figures(figures, "inspection.inspect_page", of_log, log)
     else:
-        if report is not None or figures is not None:
+        if report is not None:
             raise InputError(
                 "shows a log, and this is a capture",
                 source=path,
-                field="--report" if report is not None else "--figures",
-                value=str(report or figures),
+                field="--report",
+                value=str(report),
                 cure="omit it, or use cangauge estimate --report",
             )
         found = inspect_capture(path, reading.car() if given else None)

@@ -8,8 +8,6 @@ import math
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from importlib import import_module
-from pathlib import Path
 from typing import Any
 
 from rich import box
@@ -126,25 +124,3 @@ def print_table(title: str, head: Sequence[str], rows: Sequence[Sequence[str]]) 
         # Text: brackets in names are not markup.
         table.add_row(*(Text(printable(cell)) for cell in row))
     PlainConsole(highlight=False).print(table)
-
-
-def save_figures(folder: Path | None, page: str, *result: Any) -> None:
-    """Write the figures of a result's page as PNG and SVG, unless `folder` is None.
-
-    Parameters
-    ----------
-    folder : Path, optional
-    page : str
-        Module of `cangauge.extras.report` and function that makes the page, such as "fit.fit_page".
-    *result
-        Arguments of the function.
-    """
-    if folder is None:
-        return
-    # bokeh and matplotlib take a second to import.
-    from cangauge.extras.report.export import write_figures
-
-    module, function = page.split(".")
-    make_page = getattr(import_module(f"cangauge.extras.report.{module}"), function)
-    write_figures(make_page(*result), folder, page)
-    note(f"figures: {folder}")

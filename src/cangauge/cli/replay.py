@@ -76,14 +76,6 @@ def replay_command(  # noqa: PLR0917 - typer passes options by name
             help="Longest wait for `cangauge run` before the first frame [s].",
         ),
     ] = None,
-    acknowledge_s: Annotated[
-        float,
-        typer.Option(
-            "--acknowledge-within",
-            metavar="S",
-            help="Longest wait for an acknowledgement at full speed [s].",
-        ),
-    ] = 10.0,
     soc_estimate_id: EstimateIdOption = None,
     soc_detail_id: DetailIdOption = None,
     replay_clock_id: ClockIdOption = None,
@@ -119,7 +111,6 @@ def replay_command(  # noqa: PLR0917 - typer passes options by name
         speed=_speed(speed),
         loop=loop,
         wait_s=_seconds(wait_s, "--wait"),
-        acknowledge_s=_seconds(acknowledge_s, "--acknowledge-within") or 0.0,
         ids=ids,
     )
     reading = Reading(vehicle, dbc, map_file, columns, sign, temperature)

@@ -9,51 +9,8 @@ from typing import Final
 
 TEMPERATURE_SOURCES: Final = ("cell", "pack", "coolant", "room", "unknown")
 VALID_STD_PCT: Final = 1.5
-ALARM_BELOW: Final = 0.02
+ALARM: Final = 0.05
 LOCAL: Final = "local"
 VEHICLE_PATTERN: Final = r"(?:vehicle=)?([^/]+)/[^/]+$"
 FLEET_LOGS: Final = 3
 FLEET_REFERENCES: Final = 30
-PROTOCOLS: Final = (
-    "simulated",
-    "outside",
-    "two-effects",
-    "equation",
-    "published",
-    "pybamm",
-    "real-bmw_i3",
-    "real-lg_hg2",
-    "cold-bmw_i3",
-    "cold-lg_hg2",
-    "hysteresis-a123_lfp",
-    "open-set",
-)
-PACKS: Final = (
-    "i3_dev",
-    "car1_dev",
-    "lg_hg2_dev",
-    "i3",
-    "i3_winter",
-    "car1",
-    "lg_hg2",
-    "lg_hg2_cold",
-    "lg_hg2_from_25c",
-    "leaf_module",
-    "a123_lfp",
-)
-CASES: Final = (
-    "withheld",
-    "given",
-    "start 20 % low",
-    "start 20 % high",
-    "+2 A",
-    "-2 A",
-    "capacity +10 %",
-    "capacity -10 %",
-    "voltage +0.5 %",
-    "charges, capacity +10 %",
-    "charges, capacity -10 %",
-    "weak cell of 6",
-    "weak cell of 96",
-    "another pack's model",
-)

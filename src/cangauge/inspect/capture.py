@@ -14,7 +14,7 @@ from can.typechecking import Channel
 
 from cangauge.bus.captures import CaptureInfo, open_capture
 from cangauge.bus.decoder import SampleDecoder
-from cangauge.bus.protection import GENERIC_RULE, LEAF_RULE, FrameChecker, Verdict
+from cangauge.bus.protection import GENERIC_RULE, LEAF_RULE, FrameChecker, ProtectionRule, Verdict
 from cangauge.bus.recording import capture_to_log, open_vehicle_capture
 from cangauge.bus.vehicle import PRESETS, Vehicle
 from cangauge.inspect.log import LogInspection, inspect_log
@@ -24,10 +24,10 @@ GAP_S: Final = 1.0
 LISTED_GAPS: Final = 20
 MAX_IDS: Final = 4096
 """Most ids to describe, more than any car has; frames of others are only counted."""
-INTERVALS: Final = 2000
-"""First intervals of an id whose median is its period."""
 LEARN_FRAMES: Final = 50
 """First frames of an id, from which the period of its alive counter is learned."""
+INTERVALS: Final = 2000
+"""First intervals of an id, whose median is its period."""
 AGREEING: Final = 0.9
 """Least share of frames with a correct CRC for an id to be protected by a rule, …"""
 PAYLOADS: Final = 4
@@ -41,30 +41,16 @@ PERIOD_TOLERANCE: Final = 0.3
 LONG_ENOUGH_S: Final = 2.0
 """Length of a capture from which slow signals are expected [s]."""
 
+Span = tuple[float, float] | None
+"""Lowest and highest value; None without any."""
+
 
 @dataclass(frozen=True, slots=True)
 class IdSummary:
     """Frames of one id on one bus.
 
-    Parameters
-    ----------
-    id : str
-        Hexadecimal; 8 digits for an extended id.
-    bus : str
-        As in the capture; "" where it names none.
-    frames : int
-    bytes : str
-        Data lengths ("8", "5, 8").
-    period_s : float or None
-        Median interval [s].
-    longest_s : float or None
-        Longest interval [s].
-    protection : str
-        "leaf" or "generic" where CRCs of that rule agree, else "".
-    crc_errors, counter_jumps, frames_lost, counter_repeats : int or None
-        By that rule; None without one, the last three also where its counter is elsewhere.
-    two_senders : bool
-        Whether the counters are those of two senders at times.
+    `protection` is the rule whose CRCs agree, or "". Counts by it are None without one, those of
+    the counter also where the counter is elsewhere in the frame.
     """
 
     id: str
@@ -73,12 +59,12 @@ class IdSummary:
     bytes: str
     period_s: float | None
     longest_s: float | None
-    protection: str
-    crc_errors: int | None
-    counter_jumps: int | None
-    frames_lost: int | None
-    counter_repeats: int | None
-    two_senders: bool
+    protection: str = ""
+    crc_errors: int | None = None
+    counter_jumps: int | None = None
+    frames_lost: int | None = None
+    counter_repeats: int | None = None
+    two_senders: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,51 +77,25 @@ class Silence:
 
 @dataclass(frozen=True, slots=True)
 class PresetMatch:
-    """Whether a preset decodes the capture.
-
-    Parameters
-    ----------
-    preset, about : str
-    matches : bool
-    because : str
-        Why, or why not.
-    samples : int
-    current_a, voltage_v, temperature_c, soc_pct : tuple of float, or None
-        Lowest and highest value decoded, [A] (positive = discharge), [V], [°C], [%].
-    """
+    """Whether a preset decodes the capture, why, and the range of each value that it decodes."""
 
     preset: str
     about: str
     matches: bool
     because: str
-    samples: int
-    current_a: tuple[float, float] | None
-    voltage_v: tuple[float, float] | None
-    temperature_c: tuple[float, float] | None
-    soc_pct: tuple[float, float] | None
+    samples: int = 0
+    current_a: Span = None
+    voltage_v: Span = None
+    temperature_c: Span = None
+    soc_pct: Span = None
 
 
 @dataclass(frozen=True, slots=True)
 class CaptureInspection:
-    """Findings of `inspect_capture`.
+    """Findings of `inspect_capture`; `log` is the decoded one, with a vehicle.
 
-    Parameters
-    ----------
-    name, source : str
-    info : CaptureInfo
-    start_s, duration_s : float
-        Stamp of the first frame, time to the last [s].
-    error_frames, remote_frames : int
-    time_reversals : int
-        Frames stamped earlier than the one before.
-    ids : tuple of IdSummary
-    other_ids : int
-        Frames of ids beyond the first `MAX_IDS`.
-    gaps : tuple of Silence
-        The first `LISTED_GAPS` silences longer than `GAP_S`.
-    presets : tuple of PresetMatch
-    log : LogInspection or None
-        With a vehicle: of the decoded log.
+    `time_reversals` are frames stamped earlier than the one before. `other_ids` are frames of ids
+    beyond the first `MAX_IDS`.
     """
 
     name: str
@@ -160,10 +120,9 @@ class CaptureInspection:
     def to_dict(self) -> dict[str, Any]:
         """Return plain values for JSON."""
         plain = asdict(self)
-        info = plain.pop("info")
         return {
             "kind": "capture",
-            **info,
+            **plain.pop("info"),
             **plain,
             "matching_presets": ", ".join(self.matching),
             "log": None if self.log is None else self.log.to_dict(),
@@ -182,9 +141,8 @@ def inspect_capture(path: str | PathLike[str], vehicle: Vehicle | None = None) -
     capture = open_capture(path) if vehicle is None else open_vehicle_capture(path, vehicle)
     survey, attempts = _Survey(), _Attempts()
     for message in capture:
-        survey.take(message)
-        attempts.take(message)
-    log = None if vehicle is None else inspect_log(capture_to_log(path, vehicle))
+        survey.add(message)
+        attempts.add(message)
     return CaptureInspection(
         name=path.name,
         source=str(path),
@@ -198,7 +156,7 @@ def inspect_capture(path: str | PathLike[str], vehicle: Vehicle | None = None) -
         other_ids=survey.other_ids,
         gaps=tuple(survey.gaps),
         presets=attempts.matches(survey),
-        log=log,
+        log=None if vehicle is None else inspect_log(capture_to_log(path, vehicle)),
     )
 
 
@@ -209,18 +167,13 @@ class _Survey:
     """Statistics of the frames of a capture; attributes as of `CaptureInspection`."""
 
     def __init__(self) -> None:
-        self.first_s = math.nan
-        self.last_s = math.nan
-        self.error_frames = 0
-        self.remote_frames = 0
-        self.time_reversals = 0
-        self.other_ids = 0
+        self.first_s = self.last_s = math.nan
+        self.error_frames = self.remote_frames = self.time_reversals = self.other_ids = 0
         self.gaps: list[Silence] = []
         self._records: dict[tuple[Channel | None, int, bool], _IdRecord] = {}
 
-    def take(self, message: can.Message) -> None:
-        """Take one frame."""
-        self._take_time(message.timestamp)
+    def add(self, message: can.Message) -> None:
+        self._add_time(message.timestamp)
         if message.is_error_frame:
             self.error_frames += 1
             return
@@ -228,18 +181,14 @@ class _Survey:
             self.remote_frames += 1
             return
         key = (message.channel, message.arbitration_id, message.is_extended_id)
-        record = self._records.get(key)
-        if record is None:
-            if len(self._records) >= MAX_IDS:
-                self.other_ids += 1
-                return
-            record = self._records[key] = _IdRecord()
-        record.take(message.data, message.timestamp)
+        if key not in self._records and len(self._records) >= MAX_IDS:
+            self.other_ids += 1
+        else:
+            self._records.setdefault(key, _IdRecord()).add(bytes(message.data), message.timestamp)
 
-    def _take_time(self, time_s: float) -> None:
+    def _add_time(self, time_s: float) -> None:
         if math.isnan(self.first_s):
             self.first_s = self.last_s = time_s
-            return
         if time_s < self.last_s:
             self.time_reversals += 1
             self.first_s = min(self.first_s, time_s)
@@ -250,11 +199,8 @@ class _Survey:
 
     def period_s(self, number: int) -> float | None:
         """Return the median interval of a standard id [s], on the bus that has most of it."""
-        found = [
-            record
-            for (_, each, extended), record in self._records.items()
-            if each == number and not extended
-        ]
+        found = [r for (_, each, extended), r in self._records.items()
+                 if each == number and not extended]  # fmt: skip
         return max(found, key=lambda record: record.frames).period_s if found else None
 
     def summaries(self) -> tuple[IdSummary, ...]:
@@ -266,30 +212,27 @@ class _Survey:
         )
 
 
-@dataclass(slots=True)
 class _Trial:
     """A protection rule tried on the frames of one id."""
 
-    checker: FrameChecker
-    good: int = 0
-    crc_errors: int = 0
-    counter_jumps: int = 0
-    frames_lost: int = 0
-    counter_repeats: int = 0
-    two_senders: bool = False
+    def __init__(self, rule: ProtectionRule, period_s: float | None) -> None:
+        self.rule, self.checker = rule, FrameChecker(rule, period_s)
+        self.good = self.crc_errors = self.counter_jumps = self.frames_lost = 0
+        self.counter_repeats, self.two_senders = 0, False
 
-    def take(self, data: bytes | bytearray, time_s: float) -> None:
+    def add(self, data: bytes, time_s: float) -> None:
         verdict = self.checker.check(data, time_s)
         self.two_senders |= self.checker.suspects_second_sender
-        if verdict is Verdict.CRC_WRONG:
-            self.crc_errors += 1
-            return
-        self.good += 1
-        if verdict is Verdict.REPEATED:
-            self.counter_repeats += 1
-        elif verdict is Verdict.AFTER_LOSS:
+        self.crc_errors += verdict is Verdict.CRC_WRONG
+        self.good += verdict is not Verdict.CRC_WRONG
+        self.counter_repeats += verdict is Verdict.REPEATED
+        if verdict is Verdict.AFTER_LOSS:
             self.counter_jumps += 1
             self.frames_lost += self.checker.lost
+
+    @property
+    def is_hopeless(self) -> bool:
+        return self.crc_errors > 20 and self.good < self.crc_errors
 
 
 @dataclass(slots=True)
@@ -304,120 +247,94 @@ class _IdRecord:
     payloads: set[bytes] = field(default_factory=set)
     waiting: list[tuple[bytes, float]] = field(default_factory=list)
     """First frames, until the period is known."""
-    trials: dict[str, _Trial] = field(default_factory=dict)
-    """Rules that may still apply, by name."""
+    trials: list[_Trial] = field(default_factory=list)
+    """Rules that may still apply."""
 
-    def take(self, data: bytearray, time_s: float) -> None:
+    def add(self, data: bytes, time_s: float) -> None:
         if self.frames:
-            interval = time_s - self.last_s
-            self.longest_s = max(self.longest_s, interval)
+            self.longest_s = max(self.longest_s, time_s - self.last_s)
             if len(self.intervals) < INTERVALS:
-                self.intervals.append(interval)
-        self.frames += 1
-        self.last_s = time_s
+                self.intervals.append(time_s - self.last_s)
+        self.frames, self.last_s = self.frames + 1, time_s
         self.lengths.add(len(data))
         if len(self.payloads) < PAYLOADS:
-            self.payloads.add(bytes(data))
+            self.payloads.add(data)
         if self.frames < LEARN_FRAMES:
-            self.waiting.append((bytes(data), time_s))
+            self.waiting.append((data, time_s))
             return
-        if self.waiting:
-            self._start_trials()
+        self._start_trials()
         self._try_rules(data, time_s)
 
     def _start_trials(self) -> None:
+        if not self.waiting:
+            return
         # Lost frames lengthen intervals, so the lower quartile is the period; 0 for equal stamps.
         period_s = sorted(self.intervals)[len(self.intervals) // 4] if self.intervals else None
-        for rule in (LEAF_RULE, GENERIC_RULE):
-            self.trials[rule.name] = _Trial(FrameChecker(rule, period_s or None))
+        self.trials = [_Trial(rule, period_s or None) for rule in (LEAF_RULE, GENERIC_RULE)]
         for data, time_s in self.waiting:
             self._try_rules(data, time_s)
         self.waiting = []
 
-    def _try_rules(self, data: bytes | bytearray, time_s: float) -> None:
+    def _try_rules(self, data: bytes, time_s: float) -> None:
         if len(data) < 3 or len(self.lengths) > 1:
-            self.trials.clear()
-        hopeless = []
-        for name, trial in self.trials.items():
-            trial.take(data, time_s)
-            if trial.crc_errors > 20 and trial.good < trial.crc_errors:
-                hopeless.append(name)
-        for name in hopeless:
-            del self.trials[name]
+            self.trials = []
+        for trial in self.trials:
+            trial.add(data, time_s)
+        if any(trial.is_hopeless for trial in self.trials):
+            self.trials = [trial for trial in self.trials if not trial.is_hopeless]
 
     @property
     def period_s(self) -> float | None:
         return median(self.intervals) if self.intervals else None
 
-    def _protection(self) -> tuple[str, _Trial | None]:
-        if self.waiting:
-            self._start_trials()
-        if len(self.payloads) >= PAYLOADS:
-            for name, trial in self.trials.items():
-                if trial.good >= AGREEING * self.frames:
-                    return name, trial
-        return "", None
-
     def summary(self, name: str, channel: Channel | None) -> IdSummary:
-        rule, trial = self._protection()
-        counter = trial
-        if trial is not None and trial.counter_repeats > REPEATED_SHARE * self.frames:
-            # The CRC is correct; the counter is not where the rule expects it, or there are two.
-            is_mixed = trial.two_senders and trial.counter_repeats <= MIXED_SHARE * self.frames
-            counter = trial if is_mixed else None
-        return IdSummary(
+        self._start_trials()
+        found = IdSummary(
             id=name,
             bus="" if channel is None else str(channel),
             frames=self.frames,
             bytes=", ".join(str(length) for length in sorted(self.lengths)),
             period_s=self.period_s,
             longest_s=self.longest_s if self.intervals else None,
-            protection=rule,
-            crc_errors=None if trial is None else trial.crc_errors,
-            counter_jumps=None if counter is None else counter.counter_jumps,
-            frames_lost=None if counter is None else counter.frames_lost,
-            counter_repeats=None if counter is None else counter.counter_repeats,
-            two_senders=counter is not None and counter.two_senders,
+        )
+        agreeing = (trial for trial in self.trials if trial.good >= AGREEING * self.frames)
+        trial = next(agreeing, None) if len(self.payloads) >= PAYLOADS else None
+        if trial is None:
+            return found
+        found = replace(found, protection=trial.rule.name, crc_errors=trial.crc_errors)
+        # Many repetitions: the counter is not where the rule expects it, or there are two senders.
+        limit = MIXED_SHARE if trial.two_senders else REPEATED_SHARE
+        if trial.counter_repeats > limit * self.frames:
+            return found
+        return replace(
+            found,
+            counter_jumps=trial.counter_jumps,
+            frames_lost=trial.frames_lost,
+            counter_repeats=trial.counter_repeats,
+            two_senders=trial.two_senders,
         )
 
 
 # --- Match of the presets
 
 
-@dataclass(slots=True)
-class _Range:
-    low: float = math.inf
-    high: float = -math.inf
-
-    def take(self, value: float) -> None:
-        if not math.isnan(value):
-            self.low = min(self.low, value)
-            self.high = max(self.high, value)
-
-    @property
-    def ends(self) -> tuple[float, float] | None:
-        return (self.low, self.high) if self.low <= self.high else None
-
-
 class _Attempt:
-    """A preset tried on one bus of the capture."""
+    """A preset tried on one bus of the capture: its samples, and the range of each value."""
 
     def __init__(self, vehicle: Vehicle) -> None:
-        self.decoder = SampleDecoder(vehicle)
-        self.samples = 0
-        self.current = _Range()
-        self.voltage = _Range()
-        self.temperature = _Range()
-        self.soc = _Range()
+        self.decoder, self.samples = SampleDecoder(vehicle), 0
+        self.spans: dict[str, Span] = {}
 
-    def take(self, message: can.Message) -> None:
+    def add(self, message: can.Message) -> None:
         sample = self.decoder.handle(message)
-        if sample is not None:
-            self.samples += 1
-            self.current.take(sample.current_a)
-            self.voltage.take(sample.voltage_v)
-            self.temperature.take(sample.temperature_c)
-            self.soc.take(self.decoder.reference_soc_pct)
+        if sample is None:
+            return
+        self.samples += 1
+        names = ("current_a", "voltage_v", "temperature_c", "soc_pct")
+        for name, value in zip(names, (*sample[1:], self.decoder.reference_soc_pct), strict=True):
+            if not math.isnan(value):
+                low, high = self.spans.get(name) or (value, value)
+                self.spans[name] = (min(low, value), max(high, value))
 
 
 class _Attempts:
@@ -428,53 +345,38 @@ class _Attempts:
         self._wanted = {key for car in self._vehicles.values() for key in car.wanted_ids}
         self._buses: dict[Channel | None, dict[str, _Attempt]] = {}
 
-    def take(self, message: can.Message) -> None:
+    def add(self, message: can.Message) -> None:
         if message.arbitration_id not in self._wanted:
             return
-        attempts = self._buses.get(message.channel)
-        if attempts is None:
-            attempts = {name: _Attempt(vehicle) for name, vehicle in self._vehicles.items()}
-            self._buses[message.channel] = attempts
-        for attempt in attempts.values():
-            attempt.take(message)
+        if message.channel not in self._buses:
+            cars = self._vehicles.items()
+            self._buses[message.channel] = {name: _Attempt(car) for name, car in cars}
+        for attempt in self._buses[message.channel].values():
+            attempt.add(message)
 
     def matches(self, survey: _Survey) -> tuple[PresetMatch, ...]:
         """Return the match of every preset, on the bus with most of its samples."""
-        found: dict[str, PresetMatch] = {}
-        for name in PRESETS:
-            tries = [attempts[name] for attempts in self._buses.values()]
-            best = max(tries, key=lambda attempt: attempt.samples, default=None)
-            found[name] = self._match(name, best, survey)
+        found = [self._match(name, survey) for name in PRESETS]
         # A related preset that also finds its temperature explains more of the capture.
-        with_temperature = {
-            PRESETS[name].dbc for name, match in found.items() if match.temperature_c is not None
-        }
+        warm = {PRESETS[match.preset].dbc for match in found if match.temperature_c is not None}
         return tuple(
             replace(match, matches=False, because="the pack temperature is on this bus")
             if match.matches
-            and PRESETS[name].lacks_temperature
-            and PRESETS[name].dbc in with_temperature
+            and PRESETS[match.preset].lacks_temperature
+            and PRESETS[match.preset].dbc in warm
             else match
-            for name, match in found.items()
+            for match in found
         )
 
-    def _match(self, name: str, attempt: _Attempt | None, survey: _Survey) -> PresetMatch:
-        problem = (
-            "none of its frames"
-            if attempt is None
-            else _problem(name, attempt, self._vehicles[name], survey)
-        )
-        return PresetMatch(
-            preset=name,
-            about=PRESETS[name].about,
-            matches=not problem,
-            because=problem or "all its signals decode",
-            samples=0 if attempt is None else attempt.samples,
-            current_a=None if attempt is None else attempt.current.ends,
-            voltage_v=None if attempt is None else attempt.voltage.ends,
-            temperature_c=None if attempt is None else attempt.temperature.ends,
-            soc_pct=None if attempt is None else attempt.soc.ends,
-        )
+    def _match(self, name: str, survey: _Survey) -> PresetMatch:
+        about = PRESETS[name].about
+        tries = [attempts[name] for attempts in self._buses.values()]
+        if not tries:
+            return PresetMatch(name, about, matches=False, because="none of its frames")
+        best = max(tries, key=lambda attempt: attempt.samples)
+        problem = _problem(name, best, self._vehicles[name], survey)
+        because = problem or "all its signals decode"
+        return PresetMatch(name, about, not problem, because, best.samples, **best.spans)
 
 
 def _problem(name: str, attempt: _Attempt, vehicle: Vehicle, survey: _Survey) -> str:
@@ -484,10 +386,10 @@ def _problem(name: str, attempt: _Attempt, vehicle: Vehicle, survey: _Survey) ->
         return "no current in its frames" if statistics.wanted else "none of its frames"
     if statistics.crc_errors > 0.1 * statistics.wanted:
         return f"{statistics.crc_errors} of {statistics.wanted} CRCs are wrong"
-    if attempt.voltage.ends is None:
+    if "voltage_v" not in attempt.spans:
         return "no voltage"
     long_enough = survey.last_s - survey.first_s >= LONG_ENOUGH_S
-    if long_enough and vehicle.temperature is not None and attempt.temperature.ends is None:
+    if long_enough and vehicle.temperature is not None and "temperature_c" not in attempt.spans:
         return "no temperature"
     return _period_problem(name, survey, long_enough=long_enough)
 

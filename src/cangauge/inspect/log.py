@@ -1,4 +1,4 @@
-"""Inspect a log: its channels, its sign of current, and what it can identify."""
+"""Inspect a log: timing, channels, charge, sign of current, and what it can identify."""
 
 from __future__ import annotations
 
@@ -9,48 +9,34 @@ import numpy as np
 
 from cangauge._formatting import counted, duration
 from cangauge.errors import InputError
-from cangauge.identify.voltage_fit import SOC_SPAN_AT_LEAST_PCT
-from cangauge.inference.rows import DELAYS_S as FIT_DELAYS_S
-from cangauge.inference.rows import usable_delays, usable_rows
-from cangauge.inspect.channels import (
-    GAP_S,
-    Channel,
-    Charge,
-    Resistance,
-    Soc,
-    Timing,
-    describe_channel,
-    describe_charge,
-    describe_resistance,
-    describe_soc,
-    describe_timing,
-    find_stuck,
-)
-from cangauge.logs.gaps import usual_gap_s
+from cangauge.identify.rows import SOC_SPAN_AT_LEAST_PCT, usable_delays, usable_rows
+from cangauge.inspect.channels import Channel, describe_channels
+from cangauge.logs.gaps import uncounted_gaps, usual_gap_s
 from cangauge.logs.log import Log
-from cangauge.logs.sign import SignFinding, charge_ah, correlation, sign_of_current, spaced_rows
-from cangauge.model.coulomb_counting import capacity_from_full_discharge
-from cangauge.model.voltage_model import BASIS_NAMES
+from cangauge.logs.sign import (
+    SignFinding,
+    charge_ah,
+    correlation,
+    current_steps,
+    sign_of_current,
+    spaced_rows,
+)
+from cangauge.model.coulomb_counting import capacity_from_full_discharge, capacity_from_reference
+from cangauge.model.prior import DELAYS_S
 
 Verdict = Literal["yes", "partly", "no"]
 
-# Smallest jumps of current and voltage for the search of stuck channels.
-CURRENT_JUMP_SHARE: Final = 0.05
-"""Of the range of current [-]."""
-VOLTAGE_QUANTA: Final = 4.0
-"""Of voltage, in quanta; a jump of current must move the voltage by as much."""
-VOLTAGE_SHARE: Final = 0.002
-"""Of voltage, relative to its median [-]."""
-LISTED_INTERVALS: Final = 5
-"""Most stuck intervals of a channel to list in the warnings."""
-
-# Limits of the abilities.
-DELAYS_S: Final = (10.0, 30.0, 70.0)
-"""Delays of the published model [s]."""
-SLOW_S: Final = 2.0
-"""Median interval from which a log is slow [s]: the delay line bridges as much."""
+GAP_S: Final = 2.0
+"""Longest interval that the delay line of the model bridges [s]; longer ones are gaps."""
+LISTED: Final = 10
 FIT_RATE_HZ: Final = 1.0
 """Rate of a fit by default [Hz]."""
+LEAST_ROWS: Final = 52
+"""Fewest rows for a fit: four for each of the 13 coefficients of the published equation."""
+MIN_SOC_SPAN_PCT: Final = 5.0
+"""Least span of the reference SoC for a capacity [%]: below, its quantization dominates."""
+MIN_STEPS: Final = 8
+"""Fewest clear steps of current for a resistance."""
 CORRELATED: Final = 0.9
 """Correlation above which two influences are hard to separate [-]."""
 TEMPERATURE_SPAN_K: Final = 3.0
@@ -64,16 +50,79 @@ WIDE_SOC_PCT: Final = 60.0
 
 
 @dataclass(frozen=True, slots=True)
-class Ability:
-    """Whether a log can identify something.
+class Gap:
+    """Time without rows: time of the last row before it, and its length [s]."""
 
-    Parameters
-    ----------
-    topic : str
-    verdict : {"yes", "partly", "no"}
-    text : str
-        The reason, with figures.
+    start_s: float
+    length_s: float
+
+
+@dataclass(frozen=True, slots=True)
+class Timing:
+    """Timing of the rows: intervals [s] (None for a single row), and gaps above `gap_limit_s`.
+
+    `regular`: 99 % of the intervals are within 10 % of the median. `longest_gaps` are at most ten.
     """
+
+    start_s: float
+    duration_s: float
+    interval_median_s: float | None
+    interval_min_s: float | None
+    interval_max_s: float | None
+    rate_hz: float | None
+    regular: bool
+    gap_limit_s: float
+    gap_count: int
+    gap_total_s: float
+    longest_gaps: tuple[Gap, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Charge:
+    """Charge [Ah] by the trapezoidal rule; nothing is counted over a gap beyond `bridge_s`.
+
+    `span_ah` is the range of the charge state, `in_gaps_ah` what is interpolated over gaps.
+    """
+
+    discharged_ah: float
+    charged_ah: float
+    net_ah: float
+    span_ah: float
+    in_gaps_ah: float
+    uncounted_gaps: int
+    uncounted_s: float
+
+
+@dataclass(frozen=True, slots=True)
+class Soc:
+    """The reference SoC: share of rows with a value [-], values [%], times [s].
+
+    `implied_capacity_ah` is the charge per 100 %, by least squares; None below a span of 5 %.
+    """
+
+    coverage: float
+    first_pct: float
+    last_pct: float
+    minimum_pct: float
+    maximum_pct: float
+    last_at_s: float
+    longest_hole_s: float
+    implied_capacity_ah: float | None
+
+
+@dataclass(frozen=True, slots=True)
+class Resistance:
+    """Median and quartiles of −ΔU/ΔI over steps of current [Ω]; negative at an inverted sign."""
+
+    median_ohm: float
+    lower_ohm: float
+    upper_ohm: float
+    steps: int
+
+
+@dataclass(frozen=True, slots=True)
+class Ability:
+    """Whether a log can identify something, and the reason with its figures."""
 
     topic: str
     verdict: Verdict
@@ -82,27 +131,7 @@ class Ability:
 
 @dataclass(frozen=True, slots=True)
 class LogInspection:
-    """Findings of `inspect_log`.
-
-    Parameters
-    ----------
-    name, source, temperature_source : str
-    rows : int
-    timing : Timing
-    channels : dict of str to Channel
-        `current_a`, `voltage_v`, `temperature_c`, and `soc_pct` where there is one.
-    charge : Charge
-    soc : Soc or None
-        None without any finite reference.
-    resistance : Resistance or None
-        None without clear steps.
-    sign : SignFinding
-    abilities : tuple of Ability
-    remarks : tuple of str
-        Of the reader.
-    warnings : tuple of str
-        Problems to check.
-    """
+    """Findings of `inspect_log`; `soc` is None without a reference, `resistance` without steps."""
 
     name: str
     source: str
@@ -127,12 +156,9 @@ class LogInspection:
 
 def inspect_log(log: Log) -> LogInspection:
     """Inspect a log; the sign of its current is one of the findings."""
-    timing = describe_timing(log.time_s, usual_gap_s(log.time_s, GAP_S))
-    resistance = describe_resistance(log)
-    channels = _channels(log, resistance)
-    charge = describe_charge(log, timing.gap_limit_s)
-    soc = describe_soc(log)
-    sign = sign_of_current(log)
+    timing, charge, soc, sign = _timing(log), _charge(log), _soc(log), sign_of_current(log)
+    resistance = _resistance(log)
+    channels = describe_channels(log, None if resistance is None else resistance.median_ohm)
     return LogInspection(
         name=log.name,
         source=log.source,
@@ -146,44 +172,84 @@ def inspect_log(log: Log) -> LogInspection:
         sign=sign,
         abilities=(
             Ability("sign of current", "yes" if sign.sign else "no", sign.sentence),
-            _voltage_curve(charge, soc),
-            _capacity(log, charge, soc),
-            _resistance(resistance),
-            _delays(log, timing),
-            _rows(log),
-            _temperature(log),
-            _start(log),
-            _rests(log),
+            _curve_ability(charge, soc),
+            _capacity_ability(log, charge, soc),
+            _resistance_ability(resistance),
+            _delay_ability(log, timing),
+            _row_ability(log, timing),
+            _temperature_ability(log),
+            _start_ability(log, timing),
+            _rest_ability(log),
         ),
         remarks=log.remarks,
         warnings=tuple(_warnings(log, timing, channels, charge, sign)),
     )
 
 
-def _channels(log: Log, resistance: Resistance | None) -> dict[str, Channel]:
-    current = describe_channel(log.current_a, "A")
-    voltage = describe_channel(log.voltage_v, "V")
-    if resistance is not None and resistance.median_ohm != 0.0:
-        noticeable = max(
-            VOLTAGE_QUANTA * (voltage.quantum or 0.0), VOLTAGE_SHARE * abs(voltage.median)
-        )
-        jump_a = max(
-            noticeable / abs(resistance.median_ohm),
-            CURRENT_JUMP_SHARE * (current.maximum - current.minimum),
-        )
-        jump_v = max(noticeable, jump_a * abs(resistance.median_ohm))
-        stuck_v = find_stuck(log, log.voltage_v, log.current_a, jump_a, "A")
-        stuck_a = find_stuck(log, log.current_a, log.voltage_v, jump_v, "V")
-        voltage = describe_channel(log.voltage_v, "V", stuck_v)
-        current = describe_channel(log.current_a, "A", stuck_a)
-    channels = {
-        "current_a": current,
-        "voltage_v": voltage,
-        "temperature_c": describe_channel(log.temperature_c, "°C"),
-    }
-    if log.soc_pct is not None and np.isfinite(log.soc_pct).any():
-        channels["soc_pct"] = describe_channel(log.soc_pct, "%")
-    return channels
+def _timing(log: Log) -> Timing:
+    time_s, step = log.time_s, np.diff(log.time_s)
+    limit_s = usual_gap_s(time_s, GAP_S)
+    gaps = np.flatnonzero(step > limit_s)
+    longest = gaps[np.argsort(-step[gaps], kind="stable")][:LISTED]
+    median = float(np.median(step)) if step.size else None
+    return Timing(
+        start_s=float(time_s[0]),
+        duration_s=log.duration_s,
+        interval_median_s=median,
+        interval_min_s=float(step.min()) if step.size else None,
+        interval_max_s=float(step.max()) if step.size else None,
+        rate_hz=1.0 / median if median else None,
+        regular=bool(median and np.mean(np.abs(step - median) <= 0.1 * median) >= 0.99),
+        gap_limit_s=limit_s,
+        gap_count=int(gaps.size),
+        gap_total_s=float(step[gaps].sum()),
+        longest_gaps=tuple(Gap(float(time_s[i]), float(step[i])) for i in longest),
+    )
+
+
+def _charge(log: Log) -> Charge:
+    state, step = charge_ah(log), np.diff(log.time_s)
+    part, uncounted = np.diff(state), uncounted_gaps(log.time_s)
+    in_gaps = part[step > usual_gap_s(log.time_s, GAP_S)]
+    return Charge(
+        discharged_ah=float(part[part > 0.0].sum()),
+        charged_ah=float(np.abs(part[part < 0.0]).sum()),
+        net_ah=float(state[-1]),
+        span_ah=float(np.ptp(state)),
+        in_gaps_ah=float(np.abs(in_gaps).sum()),
+        uncounted_gaps=int(uncounted.size),
+        uncounted_s=float(step[uncounted].sum()),
+    )
+
+
+def _soc(log: Log) -> Soc | None:
+    if log.soc_pct is None or not np.isfinite(log.soc_pct).any():
+        return None
+    known = np.flatnonzero(np.isfinite(log.soc_pct))
+    soc, holes = log.soc_pct[known], np.diff(log.time_s[known])
+    is_wide = np.ptp(soc) >= MIN_SOC_SPAN_PCT
+    return Soc(
+        coverage=float(known.size / len(log)),
+        first_pct=float(soc[0]),
+        last_pct=float(soc[-1]),
+        minimum_pct=float(soc.min()),
+        maximum_pct=float(soc.max()),
+        last_at_s=float(log.time_s[known[-1]]),
+        longest_hole_s=float(holes.max()) if holes.size else 0.0,
+        implied_capacity_ah=abs(capacity_from_reference([log])) if is_wide else None,
+    )
+
+
+def _resistance(log: Log) -> Resistance | None:
+    steps = current_steps(log)
+    if steps.current_a.size < MIN_STEPS:
+        return None
+    ohm = -steps.voltage_v / steps.current_a
+    lower, median, upper = np.quantile(ohm, [0.25, 0.5, 0.75])
+    return Resistance(float(median), float(lower), float(upper), int(ohm.size))
+
+
+# --- Warnings
 
 
 def _warnings(
@@ -198,23 +264,10 @@ def _warnings(
         found.append("the sign of current is inverted: multiply current_a by -1")
     elif sign.sign == 0:
         found.append("the sign of current could not be confirmed: make sure that discharge is > 0")
-    found.extend(_gap_warnings(timing, charge))
-    for name, channel in channels.items():
-        found.extend(_stuck_warnings(name, channel))
-    found.extend(
-        f"{name} never changes" for name in ("current_a", "voltage_v") if channels[name].levels == 1
-    )
-    if log.temperature_source == "room":
-        found.append("the temperature is the room's: the battery may be colder or hotter")
-    return found
-
-
-def _gap_warnings(timing: Timing, charge: Charge) -> list[str]:
-    found = []
-    if (timing.interval_median_s or 0.0) > SLOW_S:
+    if (timing.interval_median_s or 0.0) > GAP_S:
         found.append(
-            f"rows are {timing.interval_median_s:.3g} s apart: shorter delays of the current cannot"
-            " be identified, and quick changes of voltage not be followed"
+            f"rows are {_interval(timing)} apart: shorter delays of the current cannot be"
+            " identified, and quick changes of voltage not be followed"
         )
     if timing.gap_count:
         longest = timing.longest_gaps[0]
@@ -229,20 +282,29 @@ def _gap_warnings(timing: Timing, charge: Charge) -> list[str]:
             f" {duration(charge.uncounted_s)} in all: the pack is assumed to rest; where the log's"
             " own SoC moves over one, a fit splits the log there"
         )
+    for name, channel in channels.items():
+        found += [
+            f"{name} stuck at {each.value:g} {channel.unit} for {each.duration_s:.0f} s from"
+            f" {each.start_s:.1f} s: {each.why}"
+            for each in channel.stuck[: LISTED // 2]
+        ]
+        more = len(channel.stuck) - LISTED // 2
+        found += [f"{name}: {more} more stuck intervals"] if more > 0 else []
+    constant = (name for name in ("current_a", "voltage_v") if channels[name].levels == 1)
+    found += [f"{name} never changes" for name in constant]
+    if log.temperature_source == "room":
+        found.append("the temperature is the room's: the battery may be colder or hotter")
     return found
 
 
-def _stuck_warnings(name: str, channel: Channel) -> list[str]:
-    found = [
-        f"{name} stuck at {stretch.value:g} {channel.unit} for {stretch.duration_s:.0f} s"
-        f" from {stretch.start_s:.1f} s: {stretch.why}"
-        for stretch in channel.stuck[:LISTED_INTERVALS]
-    ]
-    more = len(channel.stuck) - LISTED_INTERVALS
-    return [*found, f"{name}: {more} more stuck intervals"] if more > 0 else found
+def _interval(timing: Timing) -> str:
+    return f"{timing.interval_median_s or 0.0:.3g} s"
 
 
-def _voltage_curve(charge: Charge, soc: Soc | None) -> Ability:
+# --- Abilities
+
+
+def _curve_ability(charge: Charge, soc: Soc | None) -> Ability:
     topic = "voltage curve over SoC"
     if soc is None:
         text = (
@@ -259,11 +321,11 @@ def _voltage_curve(charge: Charge, soc: Soc | None) -> Ability:
     return Ability(topic, "no", f"{covered}: too little for a curve")
 
 
-def _capacity(log: Log, charge: Charge, soc: Soc | None) -> Ability:
+def _capacity_ability(log: Log, charge: Charge, soc: Soc | None) -> Ability:
     if soc is None or soc.implied_capacity_ah is None:
         text = (
-            f"no reference SoC that spans 5 %; at least {charge.span_ah:.3g} Ah, the capacity if"
-            " the log runs from full to empty"
+            f"no reference SoC that spans {MIN_SOC_SPAN_PCT:g} %; at least {charge.span_ah:.3g} Ah,"
+            " the capacity if the log runs from full to empty"
         )
         return Ability("capacity", "no", text)
     span = soc.maximum_pct - soc.minimum_pct
@@ -275,72 +337,61 @@ def _capacity(log: Log, charge: Charge, soc: Soc | None) -> Ability:
     return Ability("capacity", "yes", f"{whole_ah:.4g} Ah: the log runs from full to empty")
 
 
-def _resistance(resistance: Resistance | None) -> Ability:
+def _resistance_ability(resistance: Resistance | None) -> Ability:
+    topic = "ohmic resistance"
     if resistance is None:
-        return Ability("ohmic resistance", "no", "fewer than eight clear steps of current")
+        return Ability(topic, "no", f"fewer than {MIN_STEPS} clear steps of current")
     text = (
         f"{resistance.median_ohm:.4g} Ω (quartiles {resistance.lower_ohm:.4g} …"
         f" {resistance.upper_ohm:.4g}) from {resistance.steps} steps of current over about a second"
     )
     spread = abs(resistance.upper_ohm - resistance.lower_ohm)
-    steady = spread <= 0.5 * abs(resistance.median_ohm)
-    return Ability("ohmic resistance", "yes" if steady else "partly", text)
+    is_steady = spread <= 0.5 * abs(resistance.median_ohm)
+    return Ability(topic, "yes" if is_steady else "partly", text)
 
 
-def _delays(log: Log, timing: Timing) -> Ability:
+def _delay_ability(log: Log, timing: Timing) -> Ability:
     topic = "delayed current terms"
-    longest = DELAYS_S[-1]
-    if timing.interval_median_s is None or timing.duration_s < 10.0 * longest:
-        text = f"{timing.duration_s:.0f} s is too short for delays up to {longest:.0f} s"
+    if timing.interval_median_s is None or timing.duration_s < 10.0 * DELAYS_S[-1]:
+        text = f"{timing.duration_s:.0f} s is too short for delays up to {DELAYS_S[-1]:.0f} s"
         return Ability(topic, "no", text)
-    usable = usable_delays([log], FIT_DELAYS_S)
-    if len(usable) < len(FIT_DELAYS_S):
-        step = f"rows every {timing.interval_median_s:.3g} s"
-        if len(usable) == 1:
-            return Ability(topic, "no", f"{step} are too slow for any delay")
+    usable = usable_delays([log], DELAYS_S)
+    step = f"rows every {_interval(timing)}"
+    if len(usable) == 1:
+        return Ability(topic, "no", f"{step} are too slow for any delay")
+    if len(usable) < len(DELAYS_S):
         kept = ", ".join(f"{delay:g}" for delay in usable)
         return Ability(topic, "partly", f"{step} identify delays of {kept} s only")
-    correlated = _autocorrelation(log)
-    if correlated is None:
+    # At rows about a second apart, not on a grid: a gap may last months.
+    rows = spaced_rows(log.time_s, 1.0)
+    rows = rows[log.time_s[rows] >= log.time_s[0] + DELAYS_S[1]]
+    before = np.interp(log.time_s[rows] - DELAYS_S[1], log.time_s, log.current_a)
+    if rows.size <= 2 or np.ptp(log.current_a[rows]) == 0.0 or np.ptp(before) == 0.0:
         return Ability(topic, "no", "current does not vary")
-    text = f"currents {DELAYS_S[0]:.0f} s apart correlate by {correlated:.2f}"
-    if correlated > CORRELATED:
+    alike = correlation(log.current_a[rows], before)
+    text = f"currents {DELAYS_S[1]:.0f} s apart correlate by {alike:.2f}"
+    if alike > CORRELATED:
         return Ability(topic, "partly", f"{text}: the terms are hard to separate")
     return Ability(topic, "yes", text)
 
 
-def _rows(log: Log) -> Ability:
+def _row_ability(log: Log, timing: Timing) -> Ability:
     """Assess how many rows a fit would use: those behind a filled delay line."""
-    topic = "rows for a fit"
-    delay_s = usable_delays([log], FIT_DELAYS_S) if len(log) > 1 else FIT_DELAYS_S
+    delay_s = usable_delays([log], DELAYS_S) if len(log) > 1 else DELAYS_S
     kept, removed = usable_rows(log, delay_s, FIT_RATE_HZ)
     total = kept.size + removed["start_up_or_shut_down"] + removed["delay_line_filling"]
-    needed = 4 * (len(BASIS_NAMES) + 1 + len(delay_s))
+    is_slow = (timing.interval_median_s or 0.0) * FIT_RATE_HZ > 1.0
+    rate = f"rows every {_interval(timing)}" if is_slow else f"rows at {FIT_RATE_HZ:g} Hz"
     text = (
-        f"{kept.size} of {total} at {FIT_RATE_HZ:g} Hz; the first {max(delay_s):.0f} s, and as long"
-        f" after each gap, fill the delay line; {needed} are needed"
+        f"{kept.size} of {total} {rate}; the first {max(delay_s):.0f} s, and as long after each"
+        f" gap, fill the delay line; {LEAST_ROWS} are needed"
     )
-    verdict: Verdict = "no" if kept.size < needed else "partly"
-    if verdict == "partly" and kept.size > 0.5 * total:
-        verdict = "yes"
-    return Ability(topic, verdict, text)
+    verdict: Verdict = "yes" if kept.size > 0.5 * total else "partly"
+    return Ability("rows for a fit", verdict if kept.size >= LEAST_ROWS else "no", text)
 
 
-def _autocorrelation(log: Log) -> float | None:
-    """Return the correlation of current with itself ten seconds before."""
-    # At rows about a second apart, not on a grid: a gap may last months.
-    rows = spaced_rows(log.time_s, 1.0)
-    rows = rows[log.time_s[rows] >= log.time_s[0] + DELAYS_S[0]]
-    now = log.current_a[rows]
-    before = np.interp(log.time_s[rows] - DELAYS_S[0], log.time_s, log.current_a)
-    if now.size <= 2 or np.ptp(now) == 0.0 or np.ptp(before) == 0.0:
-        return None
-    return correlation(now, before)
-
-
-def _temperature(log: Log) -> Ability:
-    topic = "temperature coefficient"
-    span = float(np.ptp(log.temperature_c))
+def _temperature_ability(log: Log) -> Ability:
+    topic, span = "temperature coefficient", float(np.ptp(log.temperature_c))
     where = {
         "room": "; it is the ROOM's temperature, not the battery's",
         "unknown": "; where it was measured is not known",
@@ -349,32 +400,29 @@ def _temperature(log: Log) -> Ability:
         return Ability(topic, "no", f"temperature never changes{where}")
     if span < TEMPERATURE_SPAN_K:
         return Ability(topic, "no", f"temperature spans only {span:.1f} K{where}")
-    with_charge = correlation(charge_ah(log), log.temperature_c)
-    text = f"temperature spans {span:.1f} K, correlated with charge by {with_charge:+.2f}{where}"
-    doubtful = abs(with_charge) > CORRELATED or where.startswith(";")
-    verdict: Verdict = "partly" if doubtful else "yes"
-    return Ability(topic, verdict, text)
+    alike = correlation(charge_ah(log), log.temperature_c)
+    text = f"temperature spans {span:.1f} K, correlated with charge by {alike:+.2f}{where}"
+    is_doubtful = abs(alike) > CORRELATED or where.startswith(";")
+    return Ability(topic, "partly" if is_doubtful else "yes", text)
 
 
-def _start(log: Log) -> Ability:
-    limit = REST_SHARE * float(np.max(np.abs(log.current_a)))
-    first = log.current_a[log.time_s - log.time_s[0] <= DELAYS_S[0]]
+def _start_ability(log: Log, timing: Timing) -> Ability:
+    within_s = max(DELAYS_S[1], timing.interval_median_s or 0.0)
+    first = log.current_a[log.time_s - log.time_s[0] <= within_s]
     at_start = float(np.max(np.abs(first)))
-    if at_start <= limit:
-        text = f"at most {at_start:.3g} A in the first 10 s: the first voltages are near rest"
+    what = f"the first {within_s:.3g} s" if first.size > 1 else "the first row"
+    if at_start <= REST_SHARE * float(np.max(np.abs(log.current_a))):
+        text = f"at most {at_start:.3g} A in {what}: the first voltages are near rest"
         return Ability("start from rest", "yes", text)
-    return Ability("start from rest", "no", f"up to {at_start:.3g} A in the first 10 s")
+    return Ability("start from rest", "no", f"up to {at_start:.3g} A in {what}")
 
 
-def _rests(log: Log) -> Ability:
+def _rest_ability(log: Log) -> Ability:
     """Assess the rests, which show the rest voltage and an offset of the current sensor."""
-    topic = "rest voltage"
-    peak = float(np.max(np.abs(log.current_a)))
-    still = np.abs(log.current_a) <= REST_SHARE * peak
+    still = np.abs(log.current_a) <= REST_SHARE * float(np.max(np.abs(log.current_a)))
     edges = np.flatnonzero(np.diff(np.concatenate(([False], still, [False])).astype(np.int8)))
-    first, last = edges[::2], edges[1::2] - 1
-    length = log.time_s[last] - log.time_s[first]
+    length = log.time_s[edges[1::2] - 1] - log.time_s[edges[::2]]
     rests = int((length >= REST_S).sum())
     longest = float(length.max()) if length.size else 0.0
-    text = f"{rests} rests of 5 min or more, the longest {longest / 60.0:.1f} min"
-    return Ability(topic, "yes" if rests >= 3 else "partly" if rests else "no", text)
+    text = f"{counted(rests, 'rest')} of 5 min or more, the longest {duration(longest)}"
+    return Ability("rest voltage", "yes" if rests >= 3 else "partly" if rests else "no", text)

@@ -1,7 +1,8 @@
-"""Read and write the canonical log as Parquet or CSV (see `cangauge.logs.arrow` for its columns).
+"""The canonical log as Parquet, CSV and Arrow table; cell voltages beside it.
 
-The temperature source is metadata of the schema in Parquet and a column in CSV; both are read in
-both.
+Columns in any case and order: `time_s`, `current_a` (positive = discharge), `voltage_v`,
+`temperature_c`, optional `soc_pct`. `temperature_source`, the location of the temperature sensor,
+is metadata of the schema or a column that repeats the word; it is omitted when unknown.
 """
 
 from __future__ import annotations
@@ -10,175 +11,166 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from os import PathLike
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
+import numpy as np
 import pyarrow as pa
+import pyarrow.compute as pc
 import pyarrow.csv as pacsv
 import pyarrow.parquet as pq
 
-from cangauge._io import MAX_LOG_COLUMNS, MAX_LOG_ROWS, MAX_PARQUET_NAMES, atomic_path
+from cangauge._files import Head, atomic_path
 from cangauge.errors import InputError
-from cangauge.logs.arrow import (
-    SOURCE,
-    build_table,
-    check_types,
-    describe,
-    draft_from_table,
-    find_fields,
-    is_canonical,
-    is_text,
-)
-from cangauge.logs.column_map import ColumnMap
-from cangauge.logs.columns import read_columns, read_plain_numbers
-from cangauge.logs.draft import DraftLog
-from cangauge.logs.file_content import FileContent, delimiter_of, split_cells
-from cangauge.logs.formats import BDF_LABELS
+from cangauge.logs.draft import DraftLog, shown_headings
+from cangauge.logs.headings import meaning_of
 from cangauge.logs.log import Log
-from cangauge.logs.table_columns import draft_of_arrow
+from cangauge.logs.table import ArrowTable, numbers_of
+from cangauge.logs.text import MAX_COLUMNS, MAX_ROWS, TextTable
+from cangauge.logs.units import REQUIRED, TemperatureSource, known_temperature_source
+
+SOURCE: Final = "temperature_source"
+_FIELDS: Final = (*REQUIRED, "soc_pct", SOURCE)
+_METADATA_KEY: Final = b"cangauge.temperature_source"
+_BDF_COLUMNS: Final = {
+    "time_s": "Test Time / s",
+    "current_a": "Current / A",
+    "voltage_v": "Voltage / V",
+    "cell": "Surface Temperature T1 / degC",
+    "room": "Ambient Temperature / degC",
+}
 
 
-def read_parquet(content: FileContent) -> DraftLog:
-    """Read a canonical log from Parquet.
+def is_canonical(names: Sequence[str]) -> bool:
+    """Return whether columns have the names of a canonical log's, possibly an incomplete one.
+
+    A temperature of another name is not a missing one: such a table is a logger's own.
+    """
+    spelled = {name.strip().lower() for name in names}
+    others = spelled - {*_FIELDS}
+    if "temperature_c" not in spelled and any(map(_is_temperature, others)):
+        return False
+    return len(spelled & set(REQUIRED)) >= 2
+
+
+def _is_temperature(name: str) -> bool:
+    meaning = meaning_of(name)
+    return "temperature" in name or (meaning is not None and meaning.quantity == "temperature")
+
+
+def canonical_draft(
+    table: ArrowTable | TextTable, *, name: str, source: str, word: str = ""
+) -> DraftLog:
+    """Return the draft of a table with canonical names; `word` is its stated temperature source.
 
     Raises
     ------
     InputError
-        If it is damaged, lacks a column or holds anything but numbers.
+        If a column is missing (a temperature may be given), occurs twice, or does not hold numbers.
     """
-    source = str(content.path)
-    with content.open_seekable() as data, _damage_as_input_error(source):
-        file = _open_parquet(data)
-        schema = file.schema_arrow
-        names = schema.names
-        if not is_canonical(names):
-            return read_any_parquet(content, None)
-        places = find_fields(names, source)
-        _check_size(file.metadata, source)
-        check_types(schema, places, source)
-        texts = [names[index] for index in places.values() if is_text(schema.field(index).type)]
-        if texts:
-            # As dictionaries: a long text repeated in millions of rows is small in the file only.
-            file = _open_parquet(data, *texts)
-        columns = _ParquetColumns(file)
-        return draft_from_table(columns, places, names, name=content.name, source=source)
+    where = source or name
+    names = list(table.headings)
+    lower = [each.strip().lower() for each in names]
+    places = {field: lower.index(field) for field in _FIELDS if field in lower}
+    for field in _FIELDS:
+        if lower.count(field) > 1:
+            problem = f"{lower.count(field)} columns have this name"
+            cure = "rename or drop all but one"
+            raise InputError(problem, source=where, field=field, cure=cure)
+        if field in REQUIRED[:3] and field not in places:
+            raise InputError(
+                f"this column is missing (found: {shown_headings(names)})",
+                source=where,
+                field=field,
+                cure="a log needs time_s, current_a (positive = discharge), voltage_v,"
+                " temperature_c [s, A, V, °C]",
+            )
+    columns = table.columns(list(places.values()))
+    draft = DraftLog(name, source, headings=tuple(names))
+    for field, place in places.items():
+        draft.labels[field] = names[place]
+        if field != SOURCE:
+            draft.values[field], _ = numbers_of(columns[place], where, names[place])
+    if not draft.values["time_s"].size:
+        raise InputError("the log holds no rows", source=where, cure="check the export")
+    if SOURCE in places:
+        word = _only_word(columns[places[SOURCE]], where)
+    draft.temperature_source = known_temperature_source(
+        word or "unknown", source=where, field=SOURCE
+    )
+    draft.ignored = tuple(each for each in names if each and each.strip().lower() not in _FIELDS)
+    draft.remarks += getattr(table, "remarks", [])
+    return draft
+
+
+def _only_word(column: Any, where: str) -> str:
+    words = {str(word).strip().lower() for word in pc.unique(column.cast(pa.string())).to_pylist()}
+    words -= {"", "none"}
+    if len(words) > 1:
+        problem = "the column must hold one word throughout"
+        raise InputError(problem, source=where, field=SOURCE, value=sorted(words)[:3])
+    return words.pop() if words else ""
+
+
+# --- Parquet
 
 
 @contextmanager
-def _damage_as_input_error(source: str) -> Iterator[None]:
-    try:
-        yield
-    except (pa.ArrowException, OSError, ValueError) as error:
-        reason = (str(error) or type(error).__name__).splitlines()[0]
-        raise InputError(
-            f"the Parquet file is cut off or damaged ({reason})", source=source, cure="export again"
-        ) from error
-
-
-class _ParquetColumns:
-    """The part of a pyarrow.Table that a canonical log needs: one column is held at a time."""
-
-    def __init__(self, file: Any) -> None:
-        self._file = file
-        self.num_rows, self.schema = file.metadata.num_rows, file.schema_arrow
-
-    def column(self, name: str) -> Any:
-        """Read a column.
-
-        Raises
-        ------
-        ValueError
-            If it is damaged.
-        """
-        table = self._file.read(columns=[name])
-        table.validate(full=True)  # damaged indices may exceed a dictionary
-        return table.column(0)
-
-
-def read_any_parquet(content: FileContent, given: ColumnMap | None) -> DraftLog:
-    """Read a Parquet file with plain headings, or with the columns of the user.
+def open_parquet(head: Head) -> Iterator[tuple[ArrowTable, str]]:
+    """Open a Parquet file as a table that is read by column, with its word of the metadata.
 
     Raises
     ------
     InputError
-        If it is damaged, or a column is not found or does not hold its quantity.
+        If it is damaged, or larger than a log may be.
     """
-    source = str(content.path)
-    with content.open_seekable() as data, _damage_as_input_error(source):
-        file = _open_parquet(data)
-        _check_size(file.metadata, source)
-        schema = file.schema_arrow
-        texts = [each.name for each in schema if is_text(each.type)]
-
-        def read(names: Sequence[str]) -> Any:
-            wanted = [name for name in texts if name in names]
-            table = _open_parquet(data, *wanted).read(columns=list(names))
-            table.validate(full=True)
-            return table
-
-        return draft_of_arrow(schema.names, given, name=content.name, source=source, read=read)
-
-
-def _open_parquet(data: Any, *dictionaries: str) -> Any:
-    return pq.ParquetFile(
-        data,
-        # Files of `write_log` have checksums; others are read without.
-        page_checksum_verification=True,
-        thrift_string_size_limit=MAX_PARQUET_NAMES,
-        thrift_container_size_limit=MAX_PARQUET_NAMES,
-        read_dictionary=dictionaries or None,
-    )
-
-
-def _check_size(metadata: Any, source: str) -> None:
-    """Raise InputError for a small file of huge content: Parquet compresses runs of one value."""
-    for what, count, limit in (
-        ("rows", metadata.num_rows, MAX_LOG_ROWS),
-        ("columns", metadata.num_columns, MAX_LOG_COLUMNS),
-    ):
-        if count > limit:
+    with head.open() as unpacked:
+        stream = unpacked if unpacked.seekable() else pa.BufferReader(unpacked.read())
+        try:
+            file = pq.ParquetFile(stream, page_checksum_verification=True)
+            rows, columns = file.metadata.num_rows, file.metadata.num_columns
+            for what, count, limit in (("rows", rows, MAX_ROWS), ("columns", columns, MAX_COLUMNS)):
+                if count > limit:
+                    problem = f"more than the {limit} {what} that a log may have"
+                    raise InputError(problem, source=head.path, value=count, cure="split it")
+            schema = file.schema_arrow
+            table = ArrowTable(schema.names, lambda names: _validated(file, names))
+            yield table, word_of(schema)
+        except (pa.ArrowException, OSError, ValueError) as error:
+            reason = (str(error) or type(error).__name__).splitlines()[0]
             raise InputError(
-                f"more than the {limit} {what} that a log may have",
-                source=source,
-                value=count,
-                cure="split it",
-            )
+                f"the Parquet file is cut off or damaged ({reason})",
+                source=head.path,
+                cure="export again",
+            ) from error
 
 
-def is_canonical_csv(content: FileContent) -> bool:
-    """Return whether the header is a canonical log's, possibly an incomplete one."""
-    line = content.first_line
-    return is_canonical(split_cells(line, delimiter_of(line) or ","))
+def word_of(schema: Any) -> str:
+    """Return the temperature source of a schema's metadata; "" if it states none."""
+    metadata: dict[bytes, bytes] = schema.metadata or {}
+    return metadata.get(_METADATA_KEY, b"").decode("utf-8", errors="replace")
 
 
-def read_csv(content: FileContent) -> DraftLog:
-    """Read a canonical log from text with `,`, `;` or tab between the columns.
+def _validated(file: Any, names: list[str]) -> Any:
+    table = file.read(columns=names)
+    table.validate(full=True)  # damaged indices may exceed a dictionary
+    return table
 
-    Raises
-    ------
-    InputError
-        If it lacks a column or holds anything but numbers.
-    """
-    line = content.first_line
-    delimiter = delimiter_of(line) or ","
-    header = split_cells(line, delimiter)
-    places = find_fields(header, str(content.path))
-    layout: dict[str, Any] = {
-        "header": header,
-        "delimiter": delimiter,
-        "skip_lines": content.head.index(line) + 1,
+
+# --- Writing
+
+
+def build_table(
+    columns: Mapping[str, Any], temperature_source: TemperatureSource = "unknown"
+) -> Any:
+    """Return a pyarrow.Table; NaN becomes null, a known temperature source becomes metadata."""
+    arrays = {
+        name: pa.array(values, from_pandas=True)
+        if isinstance(values, np.ndarray) and np.issubdtype(values.dtype, np.floating)
+        else values
+        for name, values in columns.items()
     }
-    plain = None if SOURCE in places else read_plain_numbers(content, places, **layout)
-    if plain is not None:
-        labels = {field: header[index] for field, index in places.items()}
-        draft = DraftLog(content.name, str(content.path), plain, labels)
-        describe(draft, pa.array([], pa.string()), header)
-        return draft
-    columns = read_columns(content, places, **layout)
-    values = {field: columns.numbers(field) for field in places if field != SOURCE}
-    draft = DraftLog(content.name, str(content.path), values, columns.label)
-    describe(draft, columns.text.get(SOURCE, pa.array([], pa.string())), header)
-    draft.remarks.extend(columns.remarks)
-    return draft
+    metadata = {_METADATA_KEY: temperature_source} if temperature_source != "unknown" else None
+    return pa.table(arrays, metadata=metadata)
 
 
 def write_log(log: Log, path: str | PathLike[str]) -> None:
@@ -197,7 +189,10 @@ def write_log(log: Log, path: str | PathLike[str]) -> None:
         If the suffix is another one, or the folder is absent or not writable.
     """
     if ".bdf" in Path(path).suffixes[-2:]:
-        _write(_bdf_table(log), path)
+        place = "room" if log.temperature_source == "room" else "cell"
+        columns = {"time_s": log.time_s, "voltage_v": log.voltage_v}
+        columns |= {"current_a": 0.0 - log.current_a, place: log.temperature_c}  # positive charges
+        write_table({_BDF_COLUMNS[name]: values for name, values in columns.items()}, path)
         return
     table = log.to_arrow()
     if Path(path).suffix.lower() == ".csv" and log.temperature_source != "unknown":
@@ -205,41 +200,16 @@ def write_log(log: Log, path: str | PathLike[str]) -> None:
     _write(table, path)
 
 
-def _bdf_table(log: Log) -> Any:
-    place = "ambient" if log.temperature_source == "room" else "sensor"
-    columns = {
-        "time_s": log.time_s,
-        "voltage_v": log.voltage_v,
-        "current_a": 0.0 - log.current_a,  # positive charges
-        place: log.temperature_c,
-    }
-    return build_table({BDF_LABELS[name]: values for name, values in columns.items()})
-
-
 def write_table(columns: Mapping[str, Any], path: str | PathLike[str]) -> None:
-    """Write columns as `.parquet` or `.csv` by suffix, all or nothing; NaN becomes missing.
-
-    Parameters
-    ----------
-    columns : mapping of str to array of shape (n,)
-        numpy or pyarrow arrays of one length.
-    path : path-like
-        `.parquet` or `.csv`.
-
-    Raises
-    ------
-    InputError
-        If the suffix is another one, or the folder is absent or not writable.
-    """
+    """Write arrays of one length as `.parquet` or `.csv`, all or nothing; NaN becomes missing."""
     _write(build_table(columns), path)
 
 
 def _write(table: Any, path: str | PathLike[str]) -> None:
     suffix = Path(path).suffix.lower()
     if suffix not in {".parquet", ".pq", ".csv", ".bdf"}:
-        raise InputError(
-            "unknown suffix for a table", source=path, value=suffix, cure="use .parquet or .csv"
-        )
+        cure = "use .parquet or .csv"
+        raise InputError("unknown suffix for a table", source=path, value=suffix, cure=cure)
     with atomic_path(path) as part:
         if suffix in {".csv", ".bdf"}:
             with part.open("wb") as file:

@@ -1,23 +1,21 @@
-"""Cell voltages beside a canonical log: the columns `cell_1_v`, `cell_2_v`, … [V]."""
+"""Cell voltages beside a log: the columns `cell_1_v`, `cell_2_v`, …, `Cell 1 [mV]`, … ."""
 
 from __future__ import annotations
 
-import re
+from collections.abc import Sequence
 from dataclasses import dataclass
 from os import PathLike
 from typing import Final
 
 import numpy as np
-import pyarrow as pa
-import pyarrow.parquet as pq
 
 from cangauge._typing import FloatArray
 from cangauge.errors import InputError
-from cangauge.logs.canonical import is_canonical_csv
-from cangauge.logs.columns import read_columns
-from cangauge.logs.file_content import FileContent, delimiter_of, split_cells
+from cangauge.logs.column_map import ColumnMap
+from cangauge.logs.headings import cell_number
+from cangauge.logs.read import TableReader, draft_of_table, open_log, open_table
+from cangauge.logs.table import numbers_of
 
-_NAME: Final = re.compile(r"cell_0*(\d{1,4})_v", re.IGNORECASE)
 _LEAST: Final = 2
 """A single cell is its pack."""
 
@@ -43,14 +41,18 @@ class CellColumns:
         return int(self.voltage_v.shape[1])
 
 
-def read_cells(path: str | PathLike[str], time_s: FloatArray) -> CellColumns | None:
-    """Read the cell voltages of a canonical log's file.
+def read_cells(
+    path: str | PathLike[str], time_s: FloatArray, columns: ColumnMap | None = None
+) -> CellColumns | None:
+    """Read the cell voltages of a log's file.
 
     Parameters
     ----------
     path : path-like
     time_s : array of shape (n,)
         Times of the log's rows, which the reader may have dropped some of [s].
+    columns : ColumnMap, optional
+        The user's columns of the log.
 
     Returns
     -------
@@ -62,58 +64,41 @@ def read_cells(path: str | PathLike[str], time_s: FloatArray) -> CellColumns | N
     InputError
         If the numbers of the cells have gaps, or a cell holds anything but a number.
     """
-    content = FileContent(path)
-    if content.is_parquet:
-        table = pq.ParquetFile(pa.BufferReader(content.read()))
-        header = table.schema_arrow.names
-    elif is_canonical_csv(content):
-        delimiter = delimiter_of(content.first_line) or ","
-        header = split_cells(content.first_line, delimiter)
-    else:
+    file = open_log(path, columns=columns)
+    if not isinstance(file.reader, TableReader):
         return None
-    places = _places(header, str(path))
-    clock = next((at for at, name in enumerate(header) if name.strip().lower() == "time_s"), None)
-    if len(places) < _LEAST or clock is None:
-        return None
-    wanted = {"time_s": clock, **{str(number): at for number, at in places.items()}}
-    if content.is_parquet:
-        columns = table.read(columns=[header[at] for at in wanted.values()])
-        try:
-            values = {
-                name: np.asarray(columns.column(header[at]).cast(pa.float64()).to_numpy())
-                for name, at in wanted.items()
-            }
-        except pa.ArrowException as error:
-            raise InputError(
-                f"the columns of the cells do not hold numbers ({error})", source=path
-            ) from error
-    else:
-        found = read_columns(
-            content,
-            wanted,
-            header=header,
-            delimiter=delimiter,
-            skip_lines=content.head.index(content.first_line) + 1,
+    with open_table(file.head, columns) as (table, _):
+        places = _places(table.headings, str(path))
+        if len(places) < _LEAST:
+            return None
+        at = [place for place, _ in places.values()]
+        volts = table.columns(at)
+        source = str(path)
+        values = np.column_stack(
+            [
+                scale * numbers_of(volts[place], source, table.headings[place])[0]
+                for place, scale in places.values()
+            ]
         )
-        values = {name: found.numbers(name) for name in wanted}
-    volts = np.column_stack([values[str(number)] for number in places])
-    return CellColumns(min(places), _at_rows(values["time_s"], volts, time_s))
+        file_s = draft_of_table(table, columns, name=file.head.name, source=source).values["time_s"]
+    if file_s.size != values.shape[0]:
+        return None  # rows that hold only what changed
+    return CellColumns(min(places), _at_rows(file_s, values, time_s))
 
 
-def _places(header: list[str], source: str) -> dict[int, int]:
-    """Return the column of each cell by its number, in order."""
-    places: dict[int, int] = {}
-    for at, name in enumerate(header):
-        match = _NAME.fullmatch(name.strip())
-        if match is not None and int(match[1]) not in places:
-            places[int(match[1])] = at
-    numbers = sorted(places)
-    if numbers and numbers != list(range(numbers[0], numbers[0] + len(numbers))):
-        missing = next(n for n in range(numbers[0], numbers[-1]) if n not in places)
-        raise InputError(
-            "the cells must be numbered without gaps", source=source, field=f"cell_{missing}_v"
-        )
-    return {number: places[number] for number in numbers}
+def _places(headings: Sequence[str], source: str) -> dict[int, tuple[int, float]]:
+    """Return the column and scale of each cell by its number, in order."""
+    found: dict[int, tuple[int, float]] = {}
+    for at, heading in enumerate(headings):
+        cell = cell_number(heading)
+        if cell is not None:
+            found.setdefault(cell[0], (at, cell[1]))
+    numbers = sorted(found)
+    missing = [k for k in range(numbers[0], numbers[-1]) if k not in found] if numbers else []
+    if missing:
+        problem, field = "the cells must be numbered without gaps", f"cell_{missing[0]}_v"
+        raise InputError(problem, source=source, field=field, cure="export all cells")
+    return {number: found[number] for number in numbers}
 
 
 def _at_rows(file_s: FloatArray, volts: FloatArray, time_s: FloatArray) -> FloatArray:

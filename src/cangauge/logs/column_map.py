@@ -8,25 +8,28 @@ from dataclasses import dataclass, field, replace
 from typing import Any, Final
 
 from cangauge.errors import InputError, closest
-from cangauge.logs.headings import (
-    FIELDS,
-    GUESS,
-    Meaning,
-    bare_name,
-    meaning_of,
-    stated_unit,
-)
-from cangauge.logs.units import TemperatureSource, unit_of
+from cangauge.logs.draft import shown_headings
+from cangauge.logs.headings import GUESS, Meaning, bare_name, meaning_of, stated_unit
+from cangauge.logs.units import FIELDS, TemperatureSource, unit_of
 
+DOCS: Final = "docs/logs.md"
+"""Page that explains the columns of a log."""
 SYNTAX: Final = (
     "give NAME=HEADING, NAME=HEADING[UNIT] or NAME=HEADING[UNIT]:FACTOR, separated by commas, for"
     " time, current, voltage, temperature, soc"
 )
-
+_NEEDED: Final = ("time", "current", "voltage")
 _SPLIT: Final = re.compile(rf",\s*(?=(?:{'|'.join(FIELDS)})\s*=)", re.IGNORECASE)
-_FACTOR: Final = re.compile(r"^(?P<rest>.*\S)\s*:\s*(?P<factor>[-+]?[\d.]+(?:[eE][-+]?\d+)?)$")
-_UNIT: Final = re.compile(r"^(?P<rest>.*\S)\s*\[(?P<unit>[^\[\]]*)\]$")
-_NUMBER: Final = re.compile(r"^#(?P<number>\d{1,5})$")
+_FACTOR: Final = re.compile(r"^(?P<text>.*\S)\s*:\s*(?P<factor>[-+]?[\d.]+(?:[eE][-+]?\d+)?)$")
+_UNIT: Final = re.compile(r"^(?P<text>.*\S)\s*\[(?P<unit>[^\[\]]*)\]$")
+_STEMS: Final = {
+    "time": "time|zeit|stamp|date|stemp",
+    "current": "curr|amp|strom|ibat",
+    "voltage": "volt|spann|ubat|vbat",
+    "temperature": "temp",
+    "soc": "soc",
+}
+"""Beginnings of words by which a command is suggested."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,22 +51,17 @@ class ColumnSpec:
     unit: str | None = None
     factor: float = 1.0
 
-    def variants(self) -> list[ColumnSpec]:
+    def readings(self) -> list[ColumnSpec]:
         """Return the readings of the text: the whole, then without factor, without unit."""
         found = [self]
-        for pattern in (_FACTOR, _UNIT):
-            for item in list(found):
-                match = pattern.match(item.text)
-                if match is None or (pattern is _UNIT and item.unit is not None):
-                    continue
-                if pattern is _FACTOR:
-                    try:
-                        factor = self.factor * float(match["factor"])
-                    except ValueError:
-                        continue
-                    found.append(ColumnSpec(match["rest"], item.unit, factor))
-                else:
-                    found.append(ColumnSpec(match["rest"], match["unit"].strip(), item.factor))
+        if match := _FACTOR.match(self.text):
+            found.append(ColumnSpec(match["text"], self.unit, self.factor * float(match["factor"])))
+        if self.unit is None:
+            found += [
+                ColumnSpec(match["text"], match["unit"].strip(), item.factor)
+                for item in list(found)
+                if (match := _UNIT.match(item.text))
+            ]
         return found
 
 
@@ -106,38 +104,39 @@ class ColumnMap:
         """
         if isinstance(given, ColumnMap):
             return given
-        pairs: dict[str, Any] = {}
-        if isinstance(given, str):
-            for part in _SPLIT.split(given):
-                name, equals, text = part.partition("=")
-                if not equals or not text.strip():
-                    raise InputError("not a column", field=where, value=part, cure=SYNTAX)
-                if name.strip().lower() in pairs:
-                    raise InputError("is given twice", field=where, value=name.strip())
-                pairs[name.strip().lower()] = text.strip()
+        if isinstance(given, Mapping):
+            pairs = [(str(name), value) for name, value in given.items()]
         else:
-            pairs = {str(name).lower(): value for name, value in given.items()}
-        return cls({name: _spec_of(name, value, where) for name, value in pairs.items()}, where)
+            pairs = [_pair(part, where) for part in _SPLIT.split(given)]
+        specs: dict[str, ColumnSpec] = {}
+        for name, value in pairs:
+            if name.lower() in specs:
+                raise InputError("is given twice", field=where, value=name)
+            specs[name.lower()] = _spec_of(name.lower(), value, where)
+        return cls(specs, where)
+
+
+def _pair(part: str, where: str) -> tuple[str, str]:
+    name, equals, text = part.partition("=")
+    if not equals or not text.strip():
+        raise InputError("not a column", field=where, value=part, cure=SYNTAX)
+    return name.strip(), text.strip()
 
 
 def _spec_of(name: str, value: Any, where: str) -> ColumnSpec:
     if name not in FIELDS:
-        raise InputError(
-            "not a quantity of a log",
-            field=where,
-            value=name,
-            cure=f"known are {', '.join(FIELDS)}",
-        )
+        cure = f"known are {', '.join(FIELDS)}"
+        raise InputError("not a quantity of a log", field=where, value=name, cure=cure)
+    if isinstance(value, ColumnSpec):
+        return value
     if isinstance(value, str) and value.strip():
         return ColumnSpec(value.strip())
     if isinstance(value, Mapping) and isinstance(value.get("heading"), str):
-        unknown = set(value) - {"heading", "unit", "sign", "scale"}
-        sign, scale = value.get("sign", 1), value.get("scale", 1.0)
-        is_number = isinstance(scale, int | float) and not isinstance(scale, bool)
-        if not unknown and sign in {1, -1} and is_number and scale > 0.0:
-            unit = value.get("unit")
-            if unit is None or isinstance(unit, str):
-                return ColumnSpec(value["heading"], unit, float(sign * scale))
+        unit, sign, scale = value.get("unit"), value.get("sign", 1), value.get("scale", 1.0)
+        is_number = isinstance(scale, int | float) and not isinstance(scale, bool) and scale > 0.0
+        known = set(value) <= {"heading", "unit", "sign", "scale"}
+        if known and is_number and sign in {1, -1} and isinstance(unit, str | None):
+            return ColumnSpec(value["heading"], unit, float(sign * scale))
     raise InputError(
         "not a column",
         field=f"{where}.{name}",
@@ -151,19 +150,9 @@ def _spec_of(name: str, value: Any, where: str) -> ColumnSpec:
 class ChosenColumn:
     """Columns of a table that hold one quantity.
 
-    Parameters
-    ----------
-    places : tuple of int
-        Indices; several: a date and its time, or temperatures of which the mean is taken.
-    unit : str
-        As stated by the user, the heading or the row of units; "" if none states it.
-    factor : float
-    given : bool
-        Whether the user named the column.
-    source : str
-        Where a temperature is measured, if its heading defines it.
-    others : tuple of int
-        Further time columns, in case that the first does not increase.
+    Several places are a date and its time, or temperatures of which the mean is taken. The unit is
+    the user's, the heading's or that of the row of units. `others` are further times, in case that
+    the first does not increase.
     """
 
     places: tuple[int, ...]
@@ -174,48 +163,23 @@ class ChosenColumn:
     others: tuple[int, ...] = ()
 
 
-_STEMS: Final = {
-    "time": ("time", "zeit", "stamp", "date"),
-    "current": ("curr", "amp", "strom", "ibat"),
-    "voltage": ("volt", "spann", "ubat", "vbat"),
-    "temperature": ("temp",),
-    "soc": ("soc",),
-}
-_GUESSED_AT_MOST: Final = 500
-
-
 @dataclass(frozen=True, slots=True)
 class Choice:
-    """Columns of a table by quantity, and what hinders the rest.
+    """Columns of a table by quantity, and the likeliest column of each that is not plain."""
 
-    Parameters
-    ----------
-    chosen : dict of str to ChosenColumn
-    guesses : dict of str to int
-        Index of the likeliest column of each quantity that is not plain.
-    """
-
-    chosen: dict[str, ChosenColumn]
-    guesses: dict[str, int]
+    chosen: dict[str, ChosenColumn] = field(default_factory=dict)
+    guesses: dict[str, int] = field(default_factory=dict)
 
     @property
     def is_complete(self) -> bool:
         """Whether time, current and voltage are known (a temperature may be given)."""
-        return {"time", "current", "voltage"} <= set(self.chosen)
+        return set(_NEEDED) <= set(self.chosen)
 
 
 def choose_columns(
     headings: Sequence[str], units_below: Sequence[str] = (), given: ColumnMap | None = None
 ) -> Choice:
     """Choose the columns of a table: the user's first, then plain headings.
-
-    Parameters
-    ----------
-    headings : sequence of str
-    units_below : sequence of str
-        Row of units below the header, where there is one.
-    given : ColumnMap, optional
-        The user's columns.
 
     Raises
     ------
@@ -224,84 +188,71 @@ def choose_columns(
     """
     below = [*units_below, *[""] * (len(headings) - len(units_below))]
     meanings = [meaning_of(text, unit) for text, unit in zip(headings, below, strict=False)]
-    chosen: dict[str, ChosenColumn] = {}
-    for quantity, spec in (given.specs if given else {}).items():
-        where = given.where if given else ""
-        found = _given_column(quantity, spec, headings, meanings, where)
-        for other, before in chosen.items():
+    choice = Choice()
+    for quantity, spec in (given or ColumnMap()).specs.items():
+        found = _given_column(quantity, spec, headings, meanings, given)
+        for other, before in choice.chosen.items():
             if set(before.places) & set(found.places):
                 raise InputError(
                     f"is the column of {other} too",
-                    field=f"{where} {quantity}".strip(),
+                    field=f"{given.where if given else ''} {quantity}".strip(),
                     value=spec.text,
                     cure="give each quantity a column of its own, as headings or as #1, #2, …",
                 )
-        chosen[quantity] = found
-    taken = {place for item in chosen.values() for place in item.places}
-    guesses: dict[str, int] = {}
+        choice.chosen[quantity] = found
+    taken = {place for item in choice.chosen.values() for place in item.places}
     for quantity in FIELDS:
-        if quantity in chosen:
-            continue
-        of_it = [
-            (meaning.rank, place, meaning)
-            for place, meaning in enumerate(meanings)
-            if meaning is not None and meaning.quantity == quantity and place not in taken
-        ]
-        if not of_it:
-            continue
-        of_it.sort(key=lambda item: item[:2])
-        best = [item for item in of_it if item[0] == of_it[0][0]]
-        column = _plain_column(quantity, [(place, meaning) for _, place, meaning in best])
-        if column is not None and quantity == "time":
-            others = tuple(place for rank, place, _ in of_it[1:] if rank < GUESS)
-            column = replace(column, others=others)
-        if column is None or best[0][0] >= GUESS or _has_siblings(quantity, of_it):
-            guesses[quantity] = of_it[0][1]
-        else:
-            chosen[quantity] = column
-    _guess_by_stem(headings, chosen, guesses)
-    return Choice(chosen, guesses)
+        if quantity not in choice.chosen:
+            of_it = [
+                (place, meaning)
+                for place, meaning in enumerate(meanings)
+                if meaning is not None and meaning.quantity == quantity and place not in taken
+            ]
+            if of_it:
+                _choose(quantity, sorted(of_it, key=lambda item: item[1].rank), choice)
+    _guess_by_stem(headings, choice)
+    return choice
 
 
-def _has_siblings(quantity: str, of_it: Sequence[tuple[int, int, Meaning]]) -> bool:
-    """Whether the first column is one of several numbered ones, such as `Current 1`."""
-    numbered = [meaning.numbered for rank, _, meaning in of_it if rank <= GUESS]
-    return quantity in {"current", "voltage"} and numbered[0] and sum(numbered) > 1
+def _choose(quantity: str, of_it: list[tuple[int, Meaning]], choice: Choice) -> None:
+    """Choose among the columns of a quantity, the most direct first; or guess one."""
+    place, first = of_it[0]
+    best = [item for item in of_it if item[1].rank == first.rank]
+    numbered = [meaning.numbered for _, meaning in of_it if meaning.rank <= GUESS]
+    siblings = quantity in {"current", "voltage"} and first.numbered and sum(numbered) > 1
+    if quantity == "temperature" and len(best) > 1:
+        best = _temperatures(best)
+    one_of_many = len(best) > 1 and not (
+        quantity == "time" or (quantity == "temperature" and all(m.numbered for _, m in best))
+    )
+    if first.rank >= GUESS or siblings or one_of_many:
+        choice.guesses[quantity] = place
+    elif quantity == "time":
+        others = tuple(other for other, meaning in of_it[1:] if meaning.rank < GUESS)
+        choice.chosen[quantity] = ChosenColumn((place,), first.unit, others=others)
+    else:
+        unit, source = best[0][1].unit, best[0][1].source
+        choice.chosen[quantity] = ChosenColumn(tuple(p for p, _ in best), unit, source=source)
 
 
-def _guess_by_stem(
-    headings: Sequence[str], chosen: dict[str, ChosenColumn], guesses: dict[str, int]
-) -> None:
-    """Guess what no word names by parts of words, for the command that is suggested."""
-    taken = {place for item in chosen.values() for place in item.places} | set(guesses.values())
+def _temperatures(best: list[tuple[int, Meaning]]) -> list[tuple[int, Meaning]]:
+    """Return the temperatures to take the mean of: one unit, °C first; T beside T1, T2 is it."""
+    celsius = [item for item in best if unit_of("temperature_c", item[1].unit) == (1.0, 0.0)]
+    best = celsius or [item for item in best if item[1].unit == best[0][1].unit]
+    return [item for item in best if not item[1].numbered] or best
+
+
+def _guess_by_stem(headings: Sequence[str], choice: Choice) -> None:
+    """Guess what no word names by beginnings of words, for the command that is suggested."""
+    taken = {place for item in choice.chosen.values() for place in item.places}
     for quantity, stems in _STEMS.items():
-        if quantity in chosen or quantity in guesses:
+        if quantity in choice.chosen or quantity in choice.guesses:
             continue
-        for place, heading in enumerate(headings[:_GUESSED_AT_MOST]):
-            if place not in taken and any(
-                re.search(rf"(?:^|[^a-z]){stem}", heading.lower()) for stem in stems
-            ):
-                guesses[quantity] = place
-                taken.add(place)
+        for place, heading in enumerate(headings[:500]):
+            is_free = place not in taken and place not in choice.guesses.values()
+            if is_free and re.search(rf"(?:^|[^a-z])(?:{stems})", heading.lower()):
+                choice.guesses[quantity] = place
                 break
-
-
-def _plain_column(quantity: str, best: list[tuple[int, Meaning]]) -> ChosenColumn | None:
-    """Return the column of the best meanings; None if they are several and cannot be combined."""
-    place, first = best[0]
-    if quantity == "time":
-        return ChosenColumn((place,), first.unit)
-    if len(best) > 1 and quantity == "temperature":
-        celsius = [item for item in best if unit_of("temperature_c", item[1].unit) == (1.0, 0.0)]
-        best = celsius or [item for item in best if item[1].unit == first.unit]
-        numbered = [item for item in best if item[1].numbered]
-        if len(best) > 1 and len(numbered) < len(best):
-            best = [item for item in best if not item[1].numbered]  # T beside T1, T2: their mean
-    if len(best) > 1 and quantity != "temperature":
-        return None
-    if len(best) > 1 and not all(meaning.numbered for _, meaning in best):
-        return None
-    return ChosenColumn(tuple(each for each, _ in best), best[0][1].unit, source=best[0][1].source)
 
 
 def _given_column(
@@ -309,51 +260,54 @@ def _given_column(
     spec: ColumnSpec,
     headings: Sequence[str],
     meanings: Sequence[Meaning | None],
-    where: str,
+    given: ColumnMap | None,
 ) -> ChosenColumn:
-    for variant in spec.variants():
-        places = _places(variant.text, headings)
+    for reading in spec.readings():
+        places = _places(reading.text, headings)
         if places is None:
             continue
-        unit = variant.unit
-        if unit is None:
-            stated = {
-                meaning.unit if (meaning := meanings[place]) and meaning.quantity == quantity
-                else stated_unit(headings[place], quantity)
-                for place in places
-            }  # fmt: skip
-            unit = stated.pop() if len(stated) == 1 else ""
-        source: TemperatureSource = "unknown"
-        if quantity == "temperature" and (meaning := meanings[places[0]]):
-            source = meaning.source
-        return ChosenColumn(places, unit, variant.factor, given=True, source=source)
+        plain = [meanings[place] for place in places]
+        units = {
+            meaning.unit
+            if meaning is not None and meaning.quantity == quantity
+            else stated_unit(headings[place], quantity)
+            for place, meaning in zip(places, plain, strict=True)
+        }
+        unit = units.pop() if len(units) == 1 else ""
+        column = ChosenColumn(places, unit, reading.factor, given=True)
+        if reading.unit is not None:
+            column = replace(column, unit=reading.unit)
+        if quantity == "temperature" and plain[0] is not None:
+            column = replace(column, source=plain[0].source)
+        return column
     near = closest(spec.text, headings)
     raise InputError(
         f"no column has this heading (found: {shown_headings(headings)})",
-        field=f"{where} {quantity}".strip(),
+        field=f"{given.where if given else ''} {quantity}".strip(),
         value=spec.text,
         cure=f"did you mean {near}?" if near else SYNTAX,
     )
 
 
 def _places(text: str, headings: Sequence[str]) -> tuple[int, ...] | None:
-    whole = _one_place(text, headings)
+    whole = _place(text, headings)
     if whole is not None:
         return (whole,)
-    parts = [_one_place(part, headings) for part in text.split("+")]
+    parts = [_place(part, headings) for part in text.split("+")]
     found = tuple(place for place in parts if place is not None)
     return found if len(found) == len(parts) > 1 else None
 
 
-def _one_place(text: str, headings: Sequence[str]) -> int | None:
+def _place(text: str, headings: Sequence[str]) -> int | None:
     if text in headings:  # `t` beside `T`
         return headings.index(text)
     wanted = _simple(text)
     names = [_simple(heading) for heading in headings]
     if wanted in names:
         return names.index(wanted)
-    if (match := _NUMBER.match(text.strip())) and 1 <= int(match["number"]) <= len(headings):
-        return int(match["number"]) - 1
+    number = re.fullmatch(r"#(\d{1,5})", text.strip())
+    if number and 1 <= int(number[1]) <= len(headings):
+        return int(number[1]) - 1
     bare = [_simple(bare_name(heading)) for heading in headings]
     return bare.index(wanted) if bare.count(wanted) == 1 else None
 
@@ -362,15 +316,18 @@ def _simple(text: str) -> str:
     return " ".join(text.split()).casefold()
 
 
-def shown_headings(headings: Sequence[str]) -> str:
-    """Return the first headings of a table for a message."""
-    names = [name for name in headings if name]
-    return ", ".join(names[:12]) + (f", … ({len(names)} in all)" if len(names) > 12 else "")
+def unknown_columns(source: str, headings: Sequence[str], choice: Choice) -> InputError:
+    """Return the error for a table whose columns are not plain, with the option to paste."""
+    return InputError(
+        f"no plain heading of {missing_quantities(choice)} (found: {shown_headings(headings)})",
+        source=source,
+        cure=f"name the columns, e.g. {suggestion(headings, choice)} ({DOCS})",
+    )
 
 
 def missing_quantities(choice: Choice) -> str:
     """Return the quantities that every log needs and this table lacks, for a message."""
-    names = [name for name in ("time", "current", "voltage") if name not in choice.chosen]
+    names = [name for name in _NEEDED if name not in choice.chosen]
     return " and ".join(part for part in (", ".join(names[:-1]), *names[-1:]) if part)
 
 
@@ -378,11 +335,11 @@ def suggestion(headings: Sequence[str], choice: Choice) -> str:
     """Return the likeliest `--columns` option to paste; `?` where nothing is likely."""
     parts = []
     for quantity in FIELDS:
-        column = choice.chosen.get(quantity)
-        if column is not None:
-            parts.append(f"{quantity}={'+'.join(headings[place] for place in column.places)}")
+        if quantity in choice.chosen:
+            places = choice.chosen[quantity].places
+            parts.append(f"{quantity}={'+'.join(headings[place] for place in places)}")
         elif quantity in choice.guesses:
             parts.append(f"{quantity}={headings[choice.guesses[quantity]]}")
-        elif quantity in {"time", "current", "voltage"}:
+        elif quantity in _NEEDED:
             parts.append(f"{quantity}=?")
     return "--columns '" + ",".join(parts).replace("'", "'\\''") + "'"

@@ -1,4 +1,4 @@
-"""Columns found by a reader, and the checks that turn them into a log."""
+"""Columns that a reader found, and the checks that make a log of them."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ import numpy as np
 from cangauge._formatting import counted
 from cangauge._typing import BoolArray, FloatArray
 from cangauge.errors import InputError
-from cangauge.logs.column_map import shown_headings
 from cangauge.logs.units import REQUIRED, TemperatureSource, refuse_wrong_units
 
 Sign = Literal["charge", "discharge"]
 """What a positive current in the file does."""
 
 MAX_INCOMPLETE: Final = 0.05
-"""Largest fraction of incomplete rows to drop, in formats that allow it [-]."""
+"""Largest fraction of incomplete rows that are dropped [-]: beyond it the export is damaged, or its
+rows hold only what changed."""
 
 PROBES_APART_K: Final = 20.0
 """Distance from the median of its row beyond which a temperature probe fails [K]: packs are cooled
@@ -28,35 +28,22 @@ invalid values are -40, 127 or 215 °C."""
 
 @dataclass(slots=True)
 class DraftLog:
-    """Columns of a log as found in a file or table.
+    """Columns of a log as a reader found them, by canonical field; NaN where missing.
 
     Parameters
     ----------
-    name : str
-        Short name of the log.
-    source : str
-        Path of the file; "" for a table in memory.
-    values : dict of str to array of shape (n,)
-        `time_s`, `current_a` (positive = discharge), `voltage_v`, `temperature_c` and optionally
-        `soc_pct`, in canonical units, NaN where missing.
-    labels : dict of str to str
-        Heading in the file by field, for messages.
+    name, source : str
+        Short name, and path of the file ("" for a table in memory).
+    values, labels : dict
+        Arrays of shape (n,) in canonical units (positive current discharges), and headings.
     temperature_source : str
         Location of the temperature sensor.
-    drop_incomplete : bool
-        Drop rows that lack a required value, with a remark, instead of raising.
-    sign_unknown : bool
-        The format does not define the sign of current.
-    negated : bool
-        The file stores discharge as negative, and the values here are inverted.
-    assumed : list of str
-        How the columns of an arbitrary table were understood, a phrase each.
-    remarks : list of str
-        Changes and findings of the reader.
-    headings : tuple of str
-        All columns of the file, for messages.
-    ignored : tuple of str
-        Those that hold no quantity of the log.
+    sign_unknown, negated : bool
+        The format does not define the sign; the file stores discharge as negative.
+    assumed, remarks : list of str
+        How the columns were understood; changes and findings.
+    headings, ignored : tuple of str
+        All columns of the file, and those that hold no quantity of the log, for messages.
     """
 
     name: str
@@ -64,23 +51,12 @@ class DraftLog:
     values: dict[str, FloatArray] = field(default_factory=dict)
     labels: dict[str, str] = field(default_factory=dict)
     temperature_source: TemperatureSource = "unknown"
-    drop_incomplete: bool = False
     sign_unknown: bool = False
     negated: bool = False
     assumed: list[str] = field(default_factory=list)
     remarks: list[str] = field(default_factory=list)
     headings: tuple[str, ...] = ()
     ignored: tuple[str, ...] = ()
-
-    def require(self, *fields: str, headings: Sequence[str]) -> None:
-        """Raise InputError if one of these fields was not found under any heading."""
-        for name in fields:
-            if name not in self.values:
-                raise self._error(
-                    name,
-                    f"no column of this file holds it (found: {shown_headings(headings)})",
-                    cure="check the export, or convert it to a canonical log",
-                )
 
     def keep(self, rows: BoolArray) -> None:
         """Keep only the rows of a mask of shape (n,)."""
@@ -93,7 +69,7 @@ class DraftLog:
         self.remarks.append(f"current negated: {because}")
 
     def state_sign(self, sign: Sign) -> None:
-        """Apply the sign that the user states: whether positive current in the file discharges."""
+        """Apply the sign that the user states: what positive current in the file does."""
         if (sign == "charge") is not self.negated:
             self.negate_current(f"positive {sign}s in the file, as stated")
         self.sign_unknown = False
@@ -103,84 +79,58 @@ class DraftLog:
     ) -> FloatArray:
         """Return the mean of temperature probes, shape (n,); remark on those that are far off.
 
-        A value further from the median of its row is left out where more than half of three or
+        A value further than `apart` from the median of its row is left out where most of three or
         more agree with the median. Else none is known to be the good one.
-
-        Parameters
-        ----------
-        names : sequence of str
-            Headings.
-        parts : sequence of arrays of shape (n,)
-            Temperatures, NaN where missing.
-        apart : float
-            `PROBES_APART_K` in the unit of `parts`; infinity for other quantities.
         """
-        stacked = np.vstack(parts)
-        known = np.isfinite(stacked)
-        if np.isfinite(apart):
-            known &= ~self._failing(names, stacked, known, apart)
+        values = np.vstack(parts)
+        known = np.isfinite(values)
         count = np.sum(known, axis=0)
-        total = np.sum(np.where(known, stacked, 0.0), axis=0)
-        return np.where(count > 0, total / np.maximum(count, 1), np.nan)
-
-    def _failing(
-        self, names: Sequence[str], stacked: FloatArray, known: BoolArray, apart: float
-    ) -> BoolArray:
-        """Return which values of probes are to be left out, with a remark on all that are far."""
-        blank = ~known.any(axis=0)
-        median = np.nanmedian(np.where(blank, 0.0, stacked), axis=0)
-        near = known & (np.abs(stacked - median) <= apart)
-        count = np.sum(known, axis=0)
-        is_decided = (count > 2) & (2 * np.sum(near, axis=0) > count)
-        far: BoolArray = known & ~near & is_decided
-        for name, rows, values in zip(names, far, stacked, strict=True):
+        median = np.nanmedian(np.where(count > 0, values, 0.0), axis=0)
+        near = known & (np.abs(values - median) <= apart)
+        decided = (count > 2) & (2 * np.sum(near, axis=0) > count)
+        far = known & ~near & decided
+        for name, rows, of_probe in zip(names, far, values, strict=True):
             if rows.any():
                 self.remarks.append(
-                    f"temperature: {name} left out in {counted(int(rows.sum()), 'row')}, where"
-                    f" it is over {PROBES_APART_K:g} K from the other probes (first"
-                    f" {values[rows][0]:g})"
+                    f"temperature: {name} left out in {counted(int(rows.sum()), 'row')}, where it"
+                    f" is over {PROBES_APART_K:g} K from the other probes (first"
+                    f" {of_probe[rows][0]:g})"
                 )
-        lowest = np.min(np.where(known, stacked, np.inf), axis=0)
-        highest = np.max(np.where(known, stacked, -np.inf), axis=0)
-        undecided = ~blank & ~is_decided & (highest - lowest > apart)
+        lowest = np.min(np.where(known, values, np.inf), axis=0)
+        highest = np.max(np.where(known, values, -np.inf), axis=0)
+        undecided = ~decided & (highest - lowest > apart)
         if undecided.any():
             row = int(np.argmax(undecided))
-            shown = " and ".join(f"{values[row]:g}" for values in stacked)
+            shown = " and ".join(f"{of_probe[row]:g}" for of_probe in values)
             self.remarks.append(
                 f"temperature: {' and '.join(names)} are {shown} in row {row + 1}: one of the"
                 " probes fails; name the good one with --columns temperature=…"
             )
-        return far
+        used = known & ~far
+        total = np.sum(np.where(used, values, 0.0), axis=0)
+        return np.where(count > 0, total / np.maximum(np.sum(used, axis=0), 1), np.nan)
 
     def checked(
         self, temperature_c: float | None = None, used: Sequence[str] = ()
     ) -> dict[str, Any]:
-        """Check all values and return the arguments of `Log`.
+        """Check all values and return the arguments of `Log`; see `read_log` for errors.
 
-        Rows that repeat the time stamp of the row before are dropped, with a remark.
-
-        Parameters
-        ----------
-        temperature_c : float, optional
-            Constant temperature [°C], in place of the file's.
-        used : sequence of str
-            Columns that the caller reads besides.
-
-        Raises
-        ------
-        InputError
-            No temperature, missing or infinite values, wrong units, time that runs backwards.
+        Rows that lack a value or repeat the time stamp of the row before are dropped, with a
+        remark. `used` are columns that the caller reads besides.
         """
         ignored = [name for name in self.ignored if name not in used]
         if ignored:
             shown = ", ".join(ignored[:6]) + (", …" if len(ignored) > 6 else "")
             self.remarks.append(f"{counted(len(ignored), 'other column')} ignored: {shown}")
         self._set_temperature(temperature_c)
-        self._check_missing()
-        self._check_time()
+        if "soc_pct" in self.values:
+            self.values["soc_pct"][np.isinf(self.values["soc_pct"])] = np.nan
+        self._drop_incomplete()
+        self._drop_repeated()
         for values in self.values.values():
             values.flags.writeable = False  # the log need not copy them
-        self.remarks.extend(refuse_wrong_units(self.values, source=self._where, labels=self.labels))
+        where = self.source or self.name
+        self.remarks.extend(refuse_wrong_units(self.values, source=where, labels=self.labels))
         return {
             **self.values,
             "name": self.name,
@@ -191,59 +141,43 @@ class DraftLog:
         }
 
     def _set_temperature(self, given_c: float | None) -> None:
+        kind = "file" if self.source else "table"
         if given_c is not None:
-            replaced = f" in place of the {self._kind}'s" if "temperature_c" in self.values else ""
+            replaced = f" in place of the {kind}'s" if "temperature_c" in self.values else ""
             self.remarks.append(f"temperature {given_c:g} °C as given{replaced}")
             self.values["temperature_c"] = np.full(self.values["time_s"].size, given_c)
             self.temperature_source = "unknown"
         elif "temperature_c" not in self.values:
             found = f" (found: {shown_headings(self.headings)})" if self.headings else ""
             named = "name its column with --columns temperature=…" if found else "add this column"
-            raise self._error(
-                "temperature_c",
-                f"the {self._kind} holds no temperature{found}",
-                cure=f"{named} [°C], or give a constant with "
-                + ("--temperature" if self.source else "temperature_c"),
-            )
+            option = "--temperature" if self.source else "temperature_c"
+            cure = f"{named} [°C], or give a constant with {option}"
+            raise self._error("temperature_c", f"the {kind} holds no temperature{found}", cure)
 
-    def _check_missing(self) -> None:
+    def _drop_incomplete(self) -> None:
         incomplete = np.zeros(self.values["time_s"].size, dtype=bool)
         for name in REQUIRED:
-            missing = np.isnan(self.values[name])
-            self._refuse_rows(name, np.isinf(self.values[name]))
-            if not self.drop_incomplete:
-                self._refuse_rows(name, missing)
+            missing = ~np.isfinite(self.values[name])
             if missing.all():
-                raise self._error(name, "the column is empty", cure="check the export")
+                raise self._error(name, "the column is empty", "check the export")
             incomplete |= missing
-        if "soc_pct" in self.values:
-            self._refuse_rows("soc_pct", np.isinf(self.values["soc_pct"]))
         count = int(incomplete.sum())
         if not count:
             return
+        lacking = "time, current, voltage or temperature"
         if count > MAX_INCOMPLETE * incomplete.size:
-            raise self._error(
-                None,
-                f"{count} of {incomplete.size} rows lack time, current, voltage or temperature",
-                cure="check the export",
-            )
+            problem = f"{count} of {incomplete.size} rows lack {lacking}"
+            row = int(np.argmax(incomplete))
+            name = next(name for name in REQUIRED if not np.isfinite(self.values[name][row]))
+            cure = f"check the export: the first is row {row + 1}"
+            raise self._error(name, problem, cure)
         self.remarks.append(
-            f"{counted(count, 'row')} without time, current, voltage or temperature dropped"
+            f"{counted(count, 'row')} without {lacking} dropped"
             f" (the first is row {int(np.argmax(incomplete)) + 1})"
         )
         self.keep(~incomplete)
 
-    def _refuse_rows(self, name: str, bad: BoolArray) -> None:
-        if bad.any():
-            row = int(np.argmax(bad))
-            raise self._error(
-                name,
-                f"row {row + 1} holds no number ({bad.sum()} such rows of {bad.size})",
-                float(self.values[name][row]),
-                cure=f"fill or drop these rows in the {self._kind}",
-            )
-
-    def _check_time(self) -> None:
+    def _drop_repeated(self) -> None:
         time = self.values["time_s"]
         step = np.diff(time)
         back = np.flatnonzero(step < 0.0)
@@ -253,8 +187,8 @@ class DraftLog:
                 "time_s",
                 f"time runs backwards at row {row + 1} ({back.size} such rows;"
                 f" the row before has {time[row - 1]:.6f} s)",
+                "sort the rows by time, or split the file into one log each",
                 float(time[row]),
-                cure="sort the rows by time, or split the file into one log each",
             )
         same = np.concatenate(([False], step == 0.0))
         if same.any():
@@ -264,21 +198,17 @@ class DraftLog:
             )
             self.keep(~same)
 
-    @property
-    def _kind(self) -> str:
-        return "file" if self.source else "table"
-
-    @property
-    def _where(self) -> str:
-        return self.source or self.name
-
-    def _error(
-        self, name: str | None, problem: str, value: float | None = None, *, cure: str
-    ) -> InputError:
+    def _error(self, name: str, problem: str, cure: str, value: float | None = None) -> InputError:
         return InputError(
             problem,
-            source=self._where,
-            field=None if name is None else self.labels.get(name, name),
+            source=self.source or self.name,
+            field=self.labels.get(name, name),
             value=value,
             cure=cure,
         )
+
+
+def shown_headings(headings: Sequence[str]) -> str:
+    """Return the first headings of a table for a message."""
+    names = [name for name in headings if name]
+    return ", ".join(names[:12]) + (f", … ({len(names)} in all)" if len(names) > 12 else "")

@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike
 
 from cangauge._dataframes import ArrowExport
 from cangauge._display import figure
+from cangauge._formatting import duration
 from cangauge._typing import BoolArray, FloatArray, IntArray
 from cangauge.errors import InputError
 from cangauge.logs.units import (
@@ -22,7 +23,7 @@ from cangauge.logs.units import (
 __all__ = ["TEMPERATURE_SOURCES", "Log", "TemperatureSource"]
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
 class Log(ArrowExport):
     """One drive or test.
 
@@ -196,12 +197,28 @@ class Log(ArrowExport):
 
         The temperature source, where known, is metadata of the schema.
         """
-        from cangauge.logs.arrow import build_table  # noqa: PLC0415 - pyarrow, as above
+        from cangauge.logs.canonical import build_table  # noqa: PLC0415 - pyarrow, as above
 
         columns = {channel: getattr(self, channel) for channel in REQUIRED}
         if self.soc_pct is not None:
             columns["soc_pct"] = self.soc_pct
         return build_table(columns, self.temperature_source)
+
+    def __repr__(self) -> str:
+        """Return one line of what the log holds."""
+        spans = [
+            f"{values.min():.4g} … {values.max():.4g} {unit}"
+            for values, unit in (
+                (self.current_a, "A"),
+                (self.voltage_v, "V"),
+                (self.temperature_c, "°C"),
+            )
+        ]
+        text = f"{self.name!r}: {len(self):,} rows in {duration(self.duration_s)}"
+        soc = np.empty(0) if self.soc_pct is None else self.soc_pct[np.isfinite(self.soc_pct)]
+        if soc.size:
+            spans.append(f"SoC {soc[0]:.4g} … {soc[-1]:.4g} %")
+        return f"<Log {text}; {', '.join(spans)}>"
 
     def plot(self) -> Any:
         """Return current, voltage, temperature and SoC over time, for `bokeh.plotting.show`."""

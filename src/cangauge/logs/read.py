@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from functools import cache
+from importlib import import_module
+from importlib.metadata import entry_points
 from os import PathLike
-from typing import Any, Final
+from typing import Any, Final, Protocol
 
+import pyarrow as pa
+
+from cangauge._files import Head
 from cangauge.errors import InputError
-from cangauge.logs import arrow, canonical, formats, measurement, table, table_columns
-from cangauge.logs.column_map import ColumnMap, missing_quantities, shown_headings, suggestion
+from cangauge.logs import canonical, table, text
+from cangauge.logs.column_map import DOCS, ColumnMap, unknown_columns
 from cangauge.logs.draft import DraftLog, Sign
-from cangauge.logs.file_content import FileContent
-from cangauge.logs.foreign import foreign_format
 from cangauge.logs.log import Log, TemperatureSource
 from cangauge.logs.sign import resolve_sign
 from cangauge.logs.units import COLDEST_C, HOTTEST_C, known_temperature_source
@@ -22,42 +27,118 @@ KNOWN_LOGS: Final = (
     " tests, BMW i3 trips, Arbin, Bitrode and VisuaLCN exports, Battery Data Format, MF4"
     " signals, MCAP samples, any table with plain headings"
 )
-
-_Reader = Callable[[FileContent], DraftLog]
-_TEXT_FORMATS: Final[tuple[tuple[Callable[[FileContent], bool], _Reader], ...]] = (
-    (formats.is_bmw_i3, formats.read_bmw_i3),
-    (formats.is_d3, formats.read_d3),
-    # Before the canonical log, whose names battery-data-standard partly shares.
-    (formats.is_cycler, formats.read_cycler),
-    (canonical.is_canonical_csv, canonical.read_csv),
-    (table.is_table, table.read_table),
+FORMATS: Final = tuple(
+    f"cangauge.extras.formats.{module}" for module in ("exports", "tables", "measurement")
 )
+"""Modules with further readers, each in its tuple `READERS`; loaded when a log is opened."""
+GROUP: Final = "cangauge.readers"
+"""Entry points of readers of other packages: a `LogReader`."""
+
+
+class LogReader(Protocol):
+    """Reader of one format of logs; a `cangauge._files.Reader`."""
+
+    name: str
+    takes_columns: bool
+    """Whether the user may name the columns of this format."""
+
+    def matches(self, head: Head) -> bool:
+        """Return whether a file begins as this format does."""
+
+    def read(self, head: Head, columns: ColumnMap | None = None, /) -> DraftLog:
+        """Read the file; raise InputError where it is damaged or lacks something."""
+
+
+class TableReader:
+    """Canonical Parquet or CSV, or any such table with plain headings or the user's columns."""
+
+    name = "table"
+    takes_columns = True
+
+    def matches(self, head: Head) -> bool:
+        """Return whether the file is Parquet, or a text with time, current and voltage."""
+        return _is_parquet(head) or bool(_canonical_text(head) or text.find_table(head))
+
+    def read(self, head: Head, columns: ColumnMap | None = None) -> DraftLog:
+        """Read a log; see `LogReader`."""
+        with open_table(head, columns) as (of_file, word):
+            return draft_of_table(
+                of_file, columns, name=head.name, source=str(head.path), word=word
+            )
+
+
+def _is_parquet(head: Head) -> bool:
+    return head.data.startswith(b"PAR1")
+
+
+@contextmanager
+def open_table(
+    head: Head, columns: ColumnMap | None
+) -> Iterator[tuple[text.TextTable | table.ArrowTable, str]]:
+    """Open Parquet or a text as a table, with the temperature source that its metadata state."""
+    if _is_parquet(head):
+        with canonical.open_parquet(head) as found:
+            yield found
+        return
+    of_text = _canonical_text(head) if columns is None else None
+    of_text = of_text or text.find_table(head, columns)
+    if of_text is None:
+        raise unknown_columns(str(head.path), *text.likely_header(head))
+    yield of_text, ""
+
+
+def _canonical_text(head: Head) -> text.TextTable | None:
+    mark = text.delimiter_of(head.first_line) or ","
+    names = text.split_cells(head.first_line, mark)
+    if not canonical.is_canonical(names):
+        return None
+    return text.TextTable(head, mark, names, (), head.lines.index(head.first_line) + 1, [])
+
+
+def draft_of_table(
+    found: text.TextTable | table.ArrowTable,
+    columns: ColumnMap | None,
+    *,
+    name: str,
+    source: str,
+    word: str = "",
+) -> DraftLog:
+    """Return the draft of a table: canonical, by plain headings or by the user's columns."""
+    if columns is None and canonical.is_canonical(found.headings):
+        return canonical.canonical_draft(found, name=name, source=source, word=word)
+    return table.draft_by_headings(found, columns, name=name, source=source)
+
+
+@cache
+def _readers() -> tuple[LogReader, ...]:
+    """Return all readers, in the order in which a file is offered to them."""
+    others = [entry.load()() for entry in entry_points(group=GROUP)]
+    formats = [reader for name in FORMATS for reader in import_module(name).READERS]
+    return (*others, *formats, TableReader())
 
 
 @dataclass(frozen=True, slots=True)
 class LogFile:
     """A file that may be a log, recognised by its beginning.
 
-    Parameters
-    ----------
-    content : FileContent
-    reader : callable or None
-        Of its format; None if it is not a log.
-    sign : {"charge", "discharge"}, optional
-        What a positive current in the file does, as the user states it.
-    used : tuple of str
-        Columns that the caller reads besides those of a log.
+    `reader` is None if it is not a log. `columns` and `sign` are the user's; `used` are columns
+    that the caller reads besides.
     """
 
-    content: FileContent
-    reader: _Reader | None
+    head: Head
+    reader: LogReader | None
+    columns: ColumnMap | None = None
     sign: Sign | None = None
     used: tuple[str, ...] = ()
 
     @property
     def is_any_table(self) -> bool:
         """Whether the file is a table of plain headings, not of a format that defines them."""
-        return self.reader is table.read_table
+        return (
+            isinstance(self.reader, TableReader)
+            and not _is_parquet(self.head)
+            and _canonical_text(self.head) is None
+        )
 
     def read(
         self,
@@ -68,57 +149,61 @@ class LogFile:
         """Read the log; see `read_log`."""
         if self.reader is None:
             raise not_recognised(self, "not a known kind of log", f"known are: {KNOWN_LOGS}")
-        if self.sign is not None and self.sign not in {"charge", "discharge"}:
-            raise InputError(
-                "not a sign",
-                field="--sign",
-                value=self.sign,
-                cure="say what a positive current does: charge or discharge",
-            )
-        if temperature_source is not None:
-            known_temperature_source(temperature_source)
-        if temperature_c is not None and not COLDEST_C <= temperature_c <= HOTTEST_C:
-            raise InputError(
-                f"must lie within {COLDEST_C:g} … {HOTTEST_C:g} °C",
-                field="--temperature",
-                value=temperature_c,
-            )
-        draft = self.reader(self.content)
-        if self.sign is not None:
-            draft.state_sign(self.sign)
-        log = Log(**draft.checked(temperature_c, self.used))
-        if temperature_source is not None:
-            log = replace(log, temperature_source=temperature_source)
-        is_stated = self.sign is not None
-        log = resolve_sign(log, stored_sign_unknown=draft.sign_unknown, is_stated=is_stated)
-        arrow.free_unused()
+        _refuse_options(temperature_c, temperature_source, self.sign)
+        draft = self.reader.read(self.head, self.columns)
+        log = _log_of(draft, temperature_c, temperature_source, self.sign, self.used)
+        pa.default_memory_pool().release_unused()
         return log
+
+
+def _refuse_options(
+    temperature_c: float | None, temperature_source: str | None, sign: str | None
+) -> None:
+    if temperature_source is not None:
+        known_temperature_source(temperature_source)
+    if temperature_c is not None and not COLDEST_C <= temperature_c <= HOTTEST_C:
+        problem = f"must lie within {COLDEST_C:g} … {HOTTEST_C:g} °C"
+        raise InputError(problem, field="--temperature", value=temperature_c)
+    if sign not in {None, "charge", "discharge"}:
+        cure = "say what a positive current does: charge or discharge"
+        raise InputError("not a sign", field="--sign", value=sign, cure=cure)
+
+
+def _log_of(
+    draft: DraftLog,
+    temperature_c: float | None,
+    temperature_source: TemperatureSource | None,
+    sign: Sign | None,
+    used: tuple[str, ...] = (),
+) -> Log:
+    """Return the checked log of a draft, with its sign of current."""
+    if sign is not None:
+        draft.state_sign(sign)
+    log = Log(**draft.checked(temperature_c, used))
+    if temperature_source is not None:
+        log = replace(log, temperature_source=temperature_source)
+    is_stated = sign is not None
+    return resolve_sign(log, stored_sign_unknown=draft.sign_unknown, is_stated=is_stated)
 
 
 def not_recognised(file: LogFile, problem: str, cure: str) -> InputError:
     """Return the error for a file of unknown format: its columns if it is a table."""
-    foreign = foreign_format(file.content.magic)
+    head = file.head
+    foreign = import_module("cangauge.extras.formats.foreign").foreign_format(head.data)
     if foreign is not None:
-        return InputError(
-            f"{problem}: it is {foreign[0]}", source=file.content.path, cure=foreign[1]
-        )
-    headings, choice = table.likely_table(file.content, None)
-    if len(headings) >= 3 and not table.is_of_frames(headings):
-        return InputError(
-            f"{problem}: no plain heading of {missing_quantities(choice)}"
-            f" (found: {shown_headings(headings)})",
-            source=file.content.path,
-            cure=f"name the columns, e.g. {suggestion(headings, choice)}"
-            f" (see {table_columns.DOCS})",
-        )
-    shown = file.content.first_line.strip()
+        return InputError(f"{problem}: it is {foreign[0]}", source=head.path, cure=foreign[1])
+    headings, choice = text.likely_header(head)
+    if len(headings) >= 3 and not text.is_of_frames(headings):
+        error = unknown_columns(str(head.path), headings, choice)
+        return InputError(f"{problem}: {error.problem}", source=head.path, cure=error.cure)
+    shown = head.first_line.strip()
     is_text = bool(shown) and shown.isprintable()
     return InputError(
         problem,
-        source=file.content.path,
+        source=head.path,
         field="first line" if is_text else None,
         value=shown[:80] if is_text else None,
-        cure=f"{cure}; other tables: --columns ({table_columns.DOCS})",
+        cure=f"{cure}; other tables: --columns ({DOCS})",
     )
 
 
@@ -128,45 +213,25 @@ def open_log(
     columns: ColumnMap | Mapping[str, Any] | str | None = None,
     sign: Sign | None = None,
 ) -> LogFile:
-    """Read the beginning of a file and find its format.
-
-    Parameters
-    ----------
-    path : path-like
-    columns : ColumnMap, mapping or str, optional
-        Columns of a table; its format is then not looked for.
-    sign : {"charge", "discharge"}, optional
-        What a positive current in the file does.
+    """Read the beginning of a file and find its format; parameters as of `read_log`.
 
     Raises
     ------
     InputError
         If the file is absent, empty, damaged or not a regular file.
     """
-    content = FileContent(path)
-    if columns is not None:
-        given = ColumnMap.of(columns)
-        read_any = _reader_by_columns(content)
-        return LogFile(content, lambda file: read_any(file, given), sign)
-    if content.is_parquet:
-        return LogFile(content, canonical.read_parquet, sign)
-    # With CAN frames they are captures.
-    if content.is_mf4:
-        is_capture = measurement.has_mf4_frames(content.path)
-        return LogFile(content, None if is_capture else measurement.read_mf4, sign)
-    if content.is_mcap:
-        is_capture = measurement.has_mcap_frames(content.path)
-        return LogFile(content, None if is_capture else measurement.read_mcap, sign)
-    readers = (reader for matches, reader in _TEXT_FORMATS if matches(content))
-    return LogFile(content, next(readers, None) if content.first_line else None, sign)
+    head = Head(path)
+    given = None if columns is None else ColumnMap.of(columns)
+    return LogFile(head, next(_offered(head, given), None), given, sign)
 
 
-def _reader_by_columns(content: FileContent) -> Callable[[FileContent, ColumnMap], DraftLog]:
-    if content.is_parquet:
-        return canonical.read_any_parquet
-    if content.is_mf4:
-        return measurement.read_mf4
-    return measurement.read_mcap if content.is_mcap else table.read_table
+def _offered(head: Head, given: ColumnMap | None) -> Iterator[LogReader]:
+    for reader in _readers():
+        if given is None:
+            if reader.matches(head):
+                yield reader
+        elif reader.takes_columns and (isinstance(reader, TableReader) or reader.matches(head)):
+            yield reader
 
 
 def read_log(
@@ -177,7 +242,7 @@ def read_log(
     columns: ColumnMap | Mapping[str, Any] | str | None = None,
     sign: Sign | None = None,
 ) -> Log:
-    """Read a log of any known format, plain, gzipped or in a zip.
+    """Read a log of any known format, plain, packed by gzip or bzip2, or in a zip.
 
     `Log.remarks` lists what was dropped, converted or assumed.
 
@@ -203,24 +268,23 @@ def read_log(
     ------
     InputError
         File absent, empty, damaged or of no known format; missing column; wrong unit; time that
-        runs backwards; missing values where no rule drops them.
+        runs backwards; too many missing values.
     """
     file = open_log(path, columns=columns, sign=sign)
     return file.read(temperature_c=temperature_c, temperature_source=temperature_source)
 
 
+def as_log(log: Any) -> Log:
+    """Return a log for a `Log`, a path, or a data frame (`Log.from_dataframe`)."""
+    if isinstance(log, Log):
+        return log
+    if isinstance(log, str | PathLike):
+        return read_log(log)
+    return Log.from_dataframe(log)
+
+
 _INDEX: Final = "__index_level_"
 """Beginning of the column name of an unnamed pandas index."""
-
-
-def _with_time_index(frame: Any) -> Any:
-    """Return the table with an unnamed index of times as its column `time`."""
-    names = frame.column_names
-    kinds = {each.name: str(each.type) for each in frame.schema}
-    times = [name for name in names if name.startswith(_INDEX) and "timestamp" in kinds[name]]
-    if len(times) != 1 or "time" in names or "time_s" in {name.lower() for name in names}:
-        return frame
-    return frame.rename_columns(["time" if name == times[0] else name for name in names])
 
 
 def log_of_arrow(
@@ -233,21 +297,17 @@ def log_of_arrow(
     sign: Sign | None = None,
 ) -> Log:
     """Return the log of an Arrow table; see `Log.from_dataframe`."""
-    frame = _with_time_index(frame)
-    names = [each for each in frame.column_names if not each.startswith(_INDEX)]
-    frame = frame.select(names)
-    if columns is None and arrow.is_canonical(names):
-        places = arrow.find_fields(names, name)
-        arrow.check_types(frame.schema, places, name)
-        draft = arrow.draft_from_table(frame, places, names, name=name, source="")
-    else:
-        given = None if columns is None else ColumnMap.of(columns)
-        draft = table_columns.draft_of_arrow(frame, given, name=name, source="")
-    if temperature_source is not None:
-        draft.temperature_source = known_temperature_source(temperature_source)
-    if sign is not None:
-        draft.state_sign(sign)
-    log = Log(**draft.checked(temperature_c))
-    if columns is None and sign is None and not draft.sign_unknown:
-        return log
-    return resolve_sign(log, stored_sign_unknown=draft.sign_unknown, is_stated=sign is not None)
+    _refuse_options(temperature_c, temperature_source, sign)
+    indices = [each for each in frame.schema if each.name.startswith(_INDEX)]
+    times = [each.name for each in indices if pa.types.is_timestamp(each.type)]
+    has_time = {"time", "time_s"} & {each.lower() for each in frame.column_names}
+    if len(times) == 1 and not has_time:  # an index of times
+        names = ["time" if each == times[0] else each for each in frame.column_names]
+        frame = frame.rename_columns(names)
+    kept = [k for k, each in enumerate(frame.column_names) if not each.startswith(_INDEX)]
+    frame = frame.select(kept)
+    word = canonical.word_of(frame.schema)
+    found = table.ArrowTable(frame.column_names, frame.select)
+    given = None if columns is None else ColumnMap.of(columns)
+    draft = draft_of_table(found, given, name=name, source="", word=word)
+    return _log_of(draft, temperature_c, temperature_source, sign)

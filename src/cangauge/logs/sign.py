@@ -15,7 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
-from typing import Any, Final, Literal
+from typing import Any, Final, Literal, NamedTuple
 
 import numpy as np
 from scipy import special
@@ -43,17 +43,8 @@ SURE_WEIGHT: Final = 2.0
 """Least weight for a sign (confidence 0.99); below it the sign stays open."""
 
 
-@dataclass(frozen=True, slots=True)
-class Steps:
-    """Differences of current and voltage between rows about a second apart.
-
-    Parameters
-    ----------
-    row : array of shape (k,)
-        Row of the later sample.
-    current_a, voltage_v : arrays of shape (k,)
-        Changes [A], [V].
-    """
+class Steps(NamedTuple):
+    """Rows of the later samples, and changes of current [A] and voltage [V], shape (k,) each."""
 
     row: IntArray
     current_a: FloatArray
@@ -62,16 +53,7 @@ class Steps:
 
 @dataclass(frozen=True, slots=True)
 class Evidence:
-    """One kind of evidence for the sign.
-
-    Parameters
-    ----------
-    kind : {"steps", "charge", "soc"}
-    weight : float
-        Decades of odds, positive when positive current discharges [-].
-    text : str
-        The figures as a phrase.
-    """
+    """One kind of evidence: decades of odds (positive: discharges), and the figures as a phrase."""
 
     kind: Kind
     weight: float
@@ -131,32 +113,19 @@ def _finding(evidence: Sequence[Evidence]) -> SignFinding:
     opposed = any(item.weight * weight < 0.0 and abs(item.weight) >= 1.0 for item in evidence)
     sure = abs(weight) >= SURE_WEIGHT and not opposed
     odds = 10.0 ** abs(weight)
-    return SignFinding(
-        sign=(1 if weight > 0.0 else -1) if sure else 0,
-        confidence=min(float(odds / (1.0 + odds)), MOST_CONFIDENT),
-        evidence=tuple(evidence),
-    )
-
-
-def _by_voltage_against_soc(finding: SignFinding) -> SignFinding | None:
-    """Return the finding by voltage alone where that is sure and the SoC contradicts it."""
-    voltage = [item for item in finding.evidence if item.kind != "soc"]
-    soc = finding.by_kind("soc")
-    alone = _finding(voltage)
-    contradicts = abs(soc.weight) >= 1.0 and soc.weight * alone.sign < 0.0
-    return alone if finding.sign == 0 and contradicts else None
+    sign: Literal[1, -1, 0] = (1 if weight > 0.0 else -1) if sure else 0
+    return SignFinding(sign, min(float(odds / (1.0 + odds)), MOST_CONFIDENT), tuple(evidence))
 
 
 def require_discharge_positive(log: Log) -> None:
     """Raise InputError if the data show clearly that positive current charges."""
     finding = sign_of_current(log)
     if finding.sign < 0:
-        evidence = finding.strongest
         cure = "multiply the column by -1: positive current discharges (or give --sign charge)"
-        if evidence.kind == "soc":
+        if finding.strongest.kind == "soc":
             cure += "; or, if the current is right, correct soc_pct or leave it out"
         raise InputError(
-            f"the sign of current is inverted: {evidence.text}",
+            f"the sign of current is inverted: {finding.strongest.text}",
             source=log.source or log.name,
             field="current_a",
             cure=cure,
@@ -168,68 +137,55 @@ def current_steps(log: Log) -> Steps:
     rows = spaced_rows(log.time_s, STEP_SPACING_S)
     change = np.diff(log.current_a[rows])
     near = np.diff(log.time_s[rows]) <= STEP_LIMIT_S
-    span = float(np.ptp(log.current_a))
-    chosen = np.flatnonzero(near & (np.abs(change) >= STEP_SHARE * span) & (change != 0.0))
+    clear = np.abs(change) >= STEP_SHARE * np.ptp(log.current_a)
+    chosen = np.flatnonzero(near & clear & (change != 0.0))
     if chosen.size > MAX_STEPS:
-        order = np.argpartition(-np.abs(change[chosen]), MAX_STEPS)[:MAX_STEPS]
-        chosen = np.sort(chosen[order])
-    return Steps(
-        row=rows[chosen + 1],
-        current_a=change[chosen],
-        voltage_v=np.diff(log.voltage_v[rows])[chosen],
-    )
+        largest = np.argpartition(-np.abs(change[chosen]), MAX_STEPS)[:MAX_STEPS]
+        chosen = np.sort(chosen[largest])
+    return Steps(rows[chosen + 1], change[chosen], np.diff(log.voltage_v[rows])[chosen])
 
 
 def _from_steps(log: Log) -> Evidence:
     steps = current_steps(log)
     votes = -np.sign(steps.current_a * steps.voltage_v)
     fell, rose = int((votes > 0).sum()), int((votes < 0).sum())
-    cast = fell + rose
-    if cast == 0:
+    if not fell + rose:
         return Evidence("steps", 0.0, "no clear step of current")
-    larger = max(fell, rose)
-    text = (
-        f"voltage moved against current in {fell} of {cast} steps"
-        if fell >= rose
-        else f"voltage moved with current in {rose} of {cast} steps"
-    )
-    share = larger / cast
+    way, larger = ("against", fell) if fell >= rose else ("with", rose)
+    share = larger / (fell + rose)
     # Successive steps share slow voltage changes: they are fewer independent votes.
-    free = max(1, round(cast / VOTES_PER_FREE_ONE))
+    free = max(1, round((fell + rose) / VOTES_PER_FREE_ONE))
     chance = 2.0 * float(special.bdtrc(round(share * free) - 1, free, 0.5))
     weight = min(6.0, -float(np.log10(chance))) if share >= CLEAR_SHARE and chance < 1.0 else 0.0
+    text = f"voltage moved {way} current in {larger} of {fell + rose} steps"
     return Evidence("steps", weight if fell >= rose else -weight, text)
 
 
 def _from_charge(log: Log) -> Evidence:
-    charge = charge_ah(log)
     rows = spaced_rows(log.time_s, log.duration_s / 200.0)
-    voltage, taken = log.voltage_v[rows], charge[rows]
-    typical = float(np.median(log.voltage_v))
+    voltage, taken = log.voltage_v[rows], charge_ah(log)[rows]
     span = float(np.ptp(voltage))
     if rows.size < 20 or np.ptp(taken) <= 0.0 or span <= 0.0:
         return Evidence("charge", 0.0, "no voltage trend over charge")
     rank = correlation(_ranks(taken), _ranks(voltage))
+    clear = span >= 0.05 * float(np.median(log.voltage_v))
+    weight = 3.0 if abs(rank) >= 0.9 else 1.5 if abs(rank) >= 0.7 else 0.0
     text = f"voltage against charge taken out: rank correlation {rank:+.2f}"
-    weight = 0.0
-    if span >= 0.05 * typical and abs(rank) >= 0.7:
-        weight = 3.0 if abs(rank) >= 0.9 else 1.5
-    return Evidence("charge", -float(np.sign(rank)) * weight, text)
+    return Evidence("charge", -float(np.sign(rank)) * (weight if clear else 0.0), text)
 
 
 def _from_soc(log: Log) -> Evidence:
     if log.soc_pct is None:
         return Evidence("soc", 0.0, "no reference SoC")
     known = np.flatnonzero(np.isfinite(log.soc_pct))
-    soc = log.soc_pct[known]
+    soc, taken = log.soc_pct[known], charge_ah(log)[known]
     span = float(np.ptp(soc)) if known.size > 10 else 0.0
-    taken = charge_ah(log)[known]
     if span < 1.0 or np.ptp(taken) <= 0.0:
         return Evidence("soc", 0.0, f"reference SoC moves by only {span:.1f} %")
     alike = correlation(taken, soc)
+    weight = 4.0 if abs(alike) >= 0.95 else 1.0 if abs(alike) >= 0.8 else 0.0
     way = "rises" if alike > 0.0 else "falls"
     text = f"reference SoC {way} as charge is taken out (correlation {alike:+.3f})"
-    weight = 4.0 if abs(alike) >= 0.95 else 1.0 if abs(alike) >= 0.8 else 0.0
     return Evidence("soc", -float(np.sign(alike)) * weight, text)
 
 
@@ -244,8 +200,7 @@ def correlation(a: FloatArray, b: FloatArray) -> float:
 def _ranks(values: FloatArray) -> FloatArray:
     """Return ranks from 0; equal values share their mean rank."""
     _, place, count = np.unique(values, return_inverse=True, return_counts=True)
-    mean_rank = np.cumsum(count) - (count + 1) / 2.0
-    return np.asarray(mean_rank[place], dtype=np.float64)
+    return np.asarray((np.cumsum(count) - (count + 1) / 2.0)[place], dtype=np.float64)
 
 
 def charge_ah(log: Log) -> FloatArray:
@@ -278,38 +233,40 @@ def resolve_sign(log: Log, *, stored_sign_unknown: bool, is_stated: bool = False
         With a remark where the data disagree with the sign, or cannot confirm an unknown one.
     """
     finding = sign_of_current(log)
-    by_voltage = _by_voltage_against_soc(finding)
-    if by_voltage is not None and log.soc_pct is not None:
-        known = log.soc_pct[np.isfinite(log.soc_pct)]
-        text = (
-            f"SoC left out: it moves from {known[0]:.4g} to {known[-1]:.4g} % against the charge,"
-            f" by the sign of current that the voltage proves ({by_voltage.strongest.text}); is it"
-            " a depth of discharge?"
-        )
-        log = replace(log, soc_pct=None, remarks=(*log.remarks, text))
-        finding = by_voltage
+    log, finding = _without_wrong_soc(log, finding)
+    remark, assumed = "", ""
     if stored_sign_unknown and finding.sign < 0:
-        because = finding.strongest.text
-        text = f"current negated, sign found from the data: {because}"
-        log = replace(log, current_a=0.0 - log.current_a, remarks=(*log.remarks, text))
-        return _with_assumption(log, "positive current charges, found from the data")
-    if stored_sign_unknown and finding.sign > 0:
-        return _with_assumption(log, "positive current discharges, found from the data")
-    if stored_sign_unknown:
-        text = (
-            "sign of current unknown and undetermined by the data: kept as stored (--sign charge"
-            " inverts it)"
-        )
-        log = _with_assumption(log, "positive current discharges, not confirmed by the data")
+        log = replace(log, current_a=0.0 - log.current_a)
+        remark = f"current negated, sign found from the data: {finding.strongest.text}"
+        assumed = "positive current charges, found from the data"
+    elif stored_sign_unknown and finding.sign > 0:
+        assumed = "positive current discharges, found from the data"
+    elif stored_sign_unknown:
+        remark = "sign of current unknown and undetermined by the data: kept as stored"
+        remark += " (--sign charge inverts it)"
+        assumed = "positive current discharges, not confirmed by the data"
     elif finding.sign < 0:
         stated = "the stated sign of current" if is_stated else "current"
-        text = f"{stated} looks inverted and was kept as {'stated' if is_stated else 'stored'}:"
-        text = f"{text} {finding.sentence}"
-    else:
-        return log
-    return replace(log, remarks=(*log.remarks, text))
+        kept = "stated" if is_stated else "stored"
+        remark = f"{stated} looks inverted and was kept as {kept}: {finding.sentence}"
+    return replace(
+        log,
+        remarks=(*log.remarks, *([remark] if remark else [])),
+        assumed=(*log.assumed, *([assumed] if assumed and log.assumed else [])),
+    )
 
 
-def _with_assumption(log: Log, text: str) -> Log:
-    """Add an assumption to those of a table's columns."""
-    return replace(log, assumed=(*log.assumed, text)) if log.assumed else log
+def _without_wrong_soc(log: Log, finding: SignFinding) -> tuple[Log, SignFinding]:
+    """Leave a SoC out that contradicts a sign which the voltage alone proves."""
+    soc = finding.by_kind("soc")
+    alone = _finding([item for item in finding.evidence if item.kind != "soc"])
+    contradicts = abs(soc.weight) >= 1.0 and soc.weight * alone.sign < 0.0
+    if finding.sign != 0 or not contradicts or log.soc_pct is None:
+        return log, finding
+    known = log.soc_pct[np.isfinite(log.soc_pct)]
+    remark = (
+        f"SoC left out: it moves from {known[0]:.4g} to {known[-1]:.4g} % against the charge, by"
+        f" the sign of current that the voltage proves ({alone.strongest.text}); is it a depth of"
+        " discharge?"
+    )
+    return replace(log, soc_pct=None, remarks=(*log.remarks, remark)), alone

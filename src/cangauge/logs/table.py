@@ -1,378 +1,365 @@
-"""Read any table with plain headings, or with columns named by the user.
+"""Any table, of text or Arrow, by plain headings or the columns of the user.
 
-The text may have a preamble, a second row of units, `,`, `;`, tab or `|` between the columns and
-decimal commas. What the headings leave open is assumed, and stated in `DraftLog.assumed`; the sign
-of current is then found from the data. A row holds one time, or one entity at a time (exports of
-Home Assistant).
+What the headings leave open is assumed, and stated in `DraftLog.assumed`; the sign of current is
+then found from the data. Rows may hold all channels, or only those that changed.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from itertools import pairwise
-from typing import Any, Final
+from typing import Any, Final, Protocol
 
 import numpy as np
+import pyarrow as pa
 import pyarrow.compute as pc
 
-from cangauge._typing import FloatArray
+from cangauge._typing import FloatArray, IntArray
 from cangauge.errors import InputError
+from cangauge.logs import stamps
 from cangauge.logs.column_map import (
     Choice,
+    ChosenColumn,
     ColumnMap,
     choose_columns,
-    missing_quantities,
-    shown_headings,
-    suggestion,
-)
-from cangauge.logs.columns import is_number, read_columns
-from cangauge.logs.draft import DraftLog
-from cangauge.logs.file_content import FileContent, split_cells
-from cangauge.logs.headings import FIELDS, meaning_of
-from cangauge.logs.stamps import is_clock, is_stamp
-from cangauge.logs.table_columns import (
-    DOCS,
-    HOLD_ENTITY_S,
-    drop_or_hold,
-    fill_draft,
-    held,
-    quantity_values,
-    read_stamps,
-    temperature_source_of,
     unknown_columns,
-    wanted_places,
 )
+from cangauge.logs.draft import MAX_INCOMPLETE, PROBES_APART_K, DraftLog
+from cangauge.logs.headings import meaning_of
+from cangauge.logs.text import MISSING, TextTable, is_number
+from cangauge.logs.units import FIELDS, convert, unit_of
 
-_DELIMITERS: Final = ("\t", ";", ",", "|")
-_HEADER_LINES: Final = 160
-_CELLS_TRIED: Final = 60_000
-"""Cells to search for a header, over all lines and delimiters: bounds the time of a search."""
-_SUB_HEADERS: Final = 4
-_ROWS_TRIED: Final = 20
-"""Rows that a guess of the time looks at."""
-_FRAME_WORDS: Final = frozenset({"id", "can id", "identifier", "dlc", "len", "data", "d1"})
-_LONG_FORMAT: Final = ("entity_id", "state", "last_changed")
+HOLD_S: Final = 1.0
+"""Longest time that a voltage is held to the next row with a current [s], where rows hold only the
+channels that changed: a bus repeats both within it."""
+LEAF_SPY_SOC: Final = 1e-4
+"""LeafSpy writes SoC in ten-thousandths of a percent."""
 
-
-@dataclass(frozen=True, slots=True)
-class Layout:
-    """Where a text holds its table.
-
-    Parameters
-    ----------
-    delimiter : str
-    headings, units : list of str
-        Cells of the header and of the row of units ([] if there is none).
-    skip_lines : int
-        Lines before the first row of data.
-    choice : Choice
-    """
-
-    delimiter: str
-    headings: list[str]
-    units: list[str]
-    skip_lines: int
-    choice: Choice
+_SHOWN_HEADING: Final = 80
+"""Longest heading in the line of assumptions [characters]."""
+_ASSUMED_UNIT: Final = dict(zip(FIELDS, ("s", "A", "V", "°C", "%"), strict=True))
 
 
-def find_layout(content: FileContent, given: ColumnMap | None = None) -> Layout | None:
-    """Return where a text holds a table of which time, current and voltage are known, or None.
+class Table(Protocol):
+    """A table whose columns are read by their place."""
 
-    Parameters
-    ----------
-    content : FileContent
-    given : ColumnMap, optional
-        Columns of the user.
+    @property
+    def headings(self) -> Sequence[str]:
+        """Name of each column."""
+
+    def columns(self, places: Sequence[int]) -> dict[int, Any]:
+        """Return pyarrow columns by place."""
+
+
+def is_text(kind: Any) -> bool:
+    """Return whether an Arrow type is text, dictionary-encoded or not."""
+    kind = kind.value_type if pa.types.is_dictionary(kind) else kind
+    return str(kind) in {"string", "large_string", "string_view"}
+
+
+def _present(column: Any) -> Any:
+    """Return the trimmed cells of a column of text, null where there is no value."""
+    trimmed = pc.utf8_trim_whitespace(column.cast(pa.string()))
+    missing = pc.is_in(pc.utf8_lower(trimmed), value_set=pa.array(["", *MISSING]))
+    return pc.if_else(missing, pa.scalar(None, pa.string()), trimmed)
+
+
+def numbers_of(column: Any, source: str, label: str) -> tuple[FloatArray, str]:
+    """Return a column as numbers, NaN where missing, and the unit in its cells (`53.2 V`).
 
     Raises
     ------
     InputError
-        If a column of the user is in no line.
+        If a cell holds anything but a number, or the column has another type.
     """
-    if given is not None and given.specs and all(_is_number_spec(each) for each in _texts(given)):
-        found = _without_header(content, given)
-        if found is not None:
-            return found
-    budget = _CELLS_TRIED
-    for joined in (False, True):
-        for number, line in enumerate(content.head[:_HEADER_LINES]):
-            if not any(char.isalpha() for char in line):
-                continue
-            for delimiter in _DELIMITERS:
-                cells = _cells(content, number, delimiter, joined=joined)
-                budget -= len(cells)
-                if len(cells) < 3 or budget < 0:
-                    continue
-                layout = _layout_at(content, number + joined, delimiter, cells, given)
-                if layout is not None and layout.choice.is_complete:
-                    return layout
-    if given is not None and given.specs:
-        headings, _ = likely_table(content, None)
-        choice = choose_columns(headings, (), given)  # names a heading that is missing
+    kind, unit = column.type, ""
+    is_numeric = any(
+        of(kind)
+        for of in (pa.types.is_integer, pa.types.is_floating, pa.types.is_decimal, pa.types.is_null)
+    )
+    if not is_text(kind) and not is_numeric:
+        cure = "store it as floating point"
         raise InputError(
-            f"no plain heading of {missing_quantities(choice)} (found: {shown_headings(headings)})",
-            source=content.path,
-            field=given.where,
-            cure=f"name it too: {suggestion(headings, choice)} ({DOCS})",
-        )
-    return None
-
-
-def _texts(given: ColumnMap) -> list[str]:
-    return [spec.text for spec in given.specs.values()]
-
-
-def _is_number_spec(text: str) -> bool:
-    return text.startswith("#")
-
-
-def _without_header(content: FileContent, given: ColumnMap) -> Layout | None:
-    """Return the layout of a table whose columns are given by number, if it has no header."""
-    for number, line in enumerate(content.head[:_HEADER_LINES]):
-        for delimiter in _DELIMITERS:
-            cells = split_cells(line, delimiter)
-            if len(cells) >= 3 and sum(_is_value(cell) for cell in cells) > len(cells) / 2:
-                before = split_cells(content.head[number - 1], delimiter) if number else []
-                if len(before) == len(cells):
-                    return None  # a header
-                headings = [f"column {k}" for k in range(1, len(cells) + 1)]
-                choice = choose_columns(headings, (), given)
-                return Layout(delimiter, headings, [], number, choice)
-    return None
-
-
-def _cells(content: FileContent, number: int, delimiter: str, *, joined: bool) -> list[str]:
-    line = content.head[number]
-    if delimiter not in line:
-        return []
-    cells = split_cells(line, delimiter)
-    if not joined:
-        return cells
-    if number + 1 >= len(content.head):
-        return []
-    below = split_cells(content.head[number + 1], delimiter)
-    if len(below) != len(cells) or any(_is_value(cell) for cell in below[1:]):
-        return []
-    return [f"{one} {other}".strip() for one, other in zip(cells, below, strict=True)]
-
-
-def _layout_at(
-    content: FileContent, number: int, delimiter: str, cells: list[str], given: ColumnMap | None
-) -> Layout | None:
-    """Return the layout if the header is at this line and its columns are complete."""
+            "the column does not hold numbers", source=source, field=label, value=str(kind)[:60],
+            cure=cure,
+        )  # fmt: skip
+    cells = _present(column) if is_text(kind) else column
     try:
-        choice = choose_columns(cells, (), given)
-    except InputError:
-        return None
-    if "time" not in choice.chosen:
-        return None
-    place = choice.chosen["time"].places[-1]
-    units: list[str] = []
-    first = number + 1
-    for below in range(number + 1, min(number + 1 + _SUB_HEADERS, len(content.head))):
-        row = split_cells(content.head[below], delimiter)
-        if not any(row):
-            continue
-        if place < len(row) and _is_value(row[place]):
-            first = below
-            break
-        again = choose_columns(cells, row, given)
-        if len(again.chosen) >= len(choice.chosen) and any(
-            again.chosen[name].unit != column.unit for name, column in choice.chosen.items()
-        ):
-            units, choice = row, again
-    data = split_cells(content.head[first], delimiter) if first < len(content.head) else []
-    return Layout(delimiter, cells, units, first, _with_date(choice, cells, data))
+        try:
+            numbers = pc.cast(cells, pa.float64(), safe=False)
+        except pa.ArrowInvalid:
+            cells = _with_decimal_point(cells)
+            bare, unit = _without_unit(cells)
+            numbers = pc.cast(bare, pa.float64())
+    except pa.ArrowInvalid as error:
+        shown = enumerate(_present(column).to_pylist(), start=1)
+        wrong = ((k, text) for k, text in shown if text and not is_number(text.replace(",", ".")))
+        row, value = next(wrong, (1, None))
+        raise InputError(
+            f"row {row} is not a number",
+            source=source,
+            field=label,
+            value=value,
+            cure="correct the cell, or leave it empty where the value is unknown",
+        ) from error
+    return np.array(numbers.to_numpy(), dtype=np.float64), unit
 
 
-def _with_date(choice: Choice, headings: Sequence[str], data: Sequence[str]) -> Choice:
-    """Return the choice with a column of dates before a column of clock times."""
+def _with_decimal_point(cells: Any) -> Any:
+    """Return cells with `.` as the decimal mark; the other mark separates thousands."""
+    both = pc.and_(pc.match_substring(cells, ","), pc.match_substring(cells, "."))
+    if pc.any(both).as_py():
+        german = r"^[^,]*,[^,.]*$"  # 1.234,5
+        is_comma = pc.any(pc.match_substring_regex(pc.filter(cells, both), german)).as_py()
+        cells = pc.replace_substring(cells, "." if is_comma else ",", "")
+    return pc.replace_substring(cells, ",", ".")
+
+
+def _without_unit(cells: Any) -> tuple[Any, str]:
+    """Return cells without a unit that all of them carry (`53.2 V`), and the unit."""
+    pattern = r"^(?P<number>[-+]?[\d.]+(?:[eE][-+]?\d+)?)\s*(?P<unit>\D{1,4})$"
+    parts = pc.extract_regex(cells, pattern)
+    if pc.any(pc.and_(pc.is_null(parts), pc.is_valid(cells))).as_py():
+        return cells, ""
+    parts = parts.combine_chunks() if isinstance(parts, pa.ChunkedArray) else parts
+    units = pc.drop_null(pc.unique(parts.field("unit"))).to_pylist()
+    return (parts.field("number"), units[0].strip()) if len(units) == 1 else (cells, "")
+
+
+def _seconds(
+    parts: Sequence[Any], column: ChosenColumn, source: str, label: str
+) -> tuple[FloatArray, str]:
+    """Return a time column, or a date and its time, as seconds, and how it was read."""
+    kind = parts[0].type
+    unit = "" if stamps.is_time_format(column.unit) else column.unit
+    if pa.types.is_timestamp(kind) or pa.types.is_duration(kind):
+        per_second = {"s": 1.0, "ms": 1e3, "us": 1e6, "ns": 1e9}[kind.unit]
+        counts = parts[0].cast(pa.int64()).cast(pa.float64(), safe=False).to_numpy()
+        return np.asarray(counts, dtype=np.float64) / per_second, unit or str(kind)
+    if pa.types.is_date(kind):
+        parts = [parts[0].cast(pa.string()), *parts[1:]]
+    if len(parts) == 1:
+        cells = _present(parts[0]) if is_text(kind) else None
+        first = "" if cells is None else next((c.as_py() for c in cells if c.is_valid), "")
+        if cells is None or is_number(first.replace(",", ".")):
+            values, _ = numbers_of(parts[0], source, label)
+            return stamps.seconds_of_numbers(values * column.factor, unit)
+    else:
+        cells = pc.binary_join_element_wise(*(each.cast(pa.string()) for each in parts), " ")
+    form = column.unit if stamps.is_time_format(column.unit) else ""
+    return stamps.seconds_of_text(cells, form, source, label)
+
+
+# --- Draft of a log
+
+
+def draft_of(table: Table, choice: Choice, *, name: str, source: str) -> DraftLog:
+    """Return the draft of a log from the chosen columns of a table, with what was assumed.
+
+    Raises
+    ------
+    InputError
+        If a column holds anything but values of its quantity.
+    """
+    where = source or name
+    headings = table.headings
     time = choice.chosen["time"]
-    place = time.places[0]
-    if time.given or place >= len(data) or not is_clock(data[place]):
-        return choice
-    for k, heading in enumerate(headings[: len(data)]):
-        meaning = meaning_of(heading)
-        is_date = meaning is not None and meaning.quantity == "time" and ":" not in data[k]
-        if k != place and is_date and is_stamp(data[k]) and not is_number(data[k]):
-            both = replace(time, places=(k, place), others=())
-            return Choice({**choice.chosen, "time": both}, choice.guesses)
-    return choice
-
-
-def _is_value(cell: str) -> bool:
-    return is_number(cell.replace(",", ".")) or is_stamp(cell)
-
-
-def likely_table(content: FileContent, given: ColumnMap | None) -> tuple[list[str], Choice]:
-    """Return the likeliest header of a text and its incomplete choice, for messages."""
-    for number, line in enumerate(content.head[:_HEADER_LINES]):
-        for delimiter in _DELIMITERS:
-            if delimiter not in line or not number:
-                continue
-            if sum(_is_value(cell) for cell in split_cells(line, delimiter)) < 2:
-                continue
-            cells = _header_above(content, number, delimiter)
-            if cells:
-                choice = choose_columns(cells, (), given)
-                return cells, _with_guess_of_time(choice, content, number, delimiter)
-    return [], Choice({}, {})
-
-
-def _header_above(content: FileContent, number: int, delimiter: str) -> list[str]:
-    """Return the cells of the header above a first row of data, [] if there is none."""
-    for above in range(number - 1, max(number - 1 - _SUB_HEADERS, -1), -1):
-        cells = split_cells(content.head[above], delimiter)
-        if len(cells) >= 3 and sum(meaning_of(cell) is not None for cell in cells) >= 2:
-            return cells
-    cells = split_cells(content.head[number - 1], delimiter)
-    is_header = sum(_is_value(cell) for cell in cells) < 0.5 * len(cells)
-    return cells if len(cells) >= 2 and is_header else []
-
-
-def _with_guess_of_time(
-    choice: Choice, content: FileContent, number: int, delimiter: str
-) -> Choice:
-    """Return the choice with the first column that increases as a guess of the time."""
-    if "time" in choice.chosen or "time" in choice.guesses:
-        return choice
-    lines = content.head[number : number + _ROWS_TRIED]
-    rows = [
-        [cell.replace(",", ".") for cell in split_cells(line, delimiter)]
-        for line in lines
-        if line.strip()
-    ]
-    taken = {place for column in choice.chosen.values() for place in column.places}
-    for place in range(min(map(len, rows), default=0)):
-        values = [float(row[place]) for row in rows if is_number(row[place])]
-        increases = all(low < high for low, high in pairwise(values))
-        if place not in taken and len(values) == len(rows) > 2 and increases:
-            return Choice(choice.chosen, {**choice.guesses, "time": place})
-    return choice
-
-
-def is_of_frames(headings: Sequence[str]) -> bool:
-    """Return whether headings are those of CAN frames: an id, a length or bytes."""
-    return bool(_FRAME_WORDS & {heading.strip().lower() for heading in headings})
-
-
-def is_table(content: FileContent) -> bool:
-    """Return whether a text holds a table with plain headings."""
-    return is_long_format(content) or find_layout(content) is not None
-
-
-def read_table(content: FileContent, given: ColumnMap | None = None) -> DraftLog:
-    """Read a table with plain headings, or with the columns of the user.
-
-    Raises
-    ------
-    InputError
-        If a column is not found, or holds anything but values of its quantity.
-    """
-    if is_long_format(content):
-        return read_long_format(content, given)
-    layout = find_layout(content, given)
-    if layout is None:
-        raise unknown_columns(str(content.path), *likely_table(content, given))
-    columns = read_columns(
-        content,
-        wanted_places(layout.choice),
-        header=layout.headings,
-        delimiter=layout.delimiter,
-        skip_lines=layout.skip_lines,
-    )
-    draft = DraftLog(content.name, str(content.path), remarks=[*columns.remarks])
-    fill_draft(draft, layout.choice, layout.headings, columns)
-    return draft
-
-
-# --- A row per entity and time
-
-
-def is_long_format(content: FileContent) -> bool:
-    """Return whether the header is that of a history of entities."""
-    names = [cell.lower() for cell in split_cells(content.first_line, ",")]
-    return set(_LONG_FORMAT) <= set(names)
-
-
-def read_long_format(content: FileContent, given: ColumnMap | None) -> DraftLog:
-    """Read a history of entities: the entity is the heading, a row is a change.
-
-    Raises
-    ------
-    InputError
-        If no entity is plainly the current or the voltage.
-    """
-    header = split_cells(content.first_line, ",")
-    names = [cell.lower() for cell in header]
-    columns = read_columns(
-        content,
-        {name: names.index(name) for name in _LONG_FORMAT},
-        header=header,
-        delimiter=",",
-        skip_lines=content.head.index(content.first_line) + 1,
-    )
-    entities = np.asarray(columns.text["entity_id"].to_pylist(), dtype=object)
-    headings = ["time", *dict.fromkeys(entities.tolist())]
-    choice = choose_columns(headings, (), given)
-    if not choice.is_complete:
-        raise unknown_columns(str(content.path), headings, choice)
-    draft = DraftLog(content.name, str(content.path), remarks=[*columns.remarks])
-    draft.headings = tuple(headings)
-    cells = pc.utf8_trim_whitespace(columns.text["last_changed"])
-    stamps, how = read_stamps(cells, "", columns.source, "last_changed")
-    order = np.argsort(stamps, kind="stable")
-    stamps, entities = stamps[order], entities[order]
-    states = columns.text["state"].to_pylist()
-    of_rows = [states[row] for row in order.tolist()]
-    draft.values["time_s"], draft.labels["time_s"] = stamps, "last_changed"
-    draft.assumed.append(f'time = "last_changed" [{how}]')
-    pivot = _Pivot(entities, of_rows, columns.source)
-    for name, column in choice.chosen.items():
-        if name == "time":
-            continue
-        wanted = [headings[place] for place in column.places]
-        draft.labels[FIELDS[name]] = " + ".join(wanted)
-        pivot.wanted = dict(zip([f"{name} {k}" for k in range(len(wanted))], wanted, strict=True))
-        draft.values[FIELDS[name]], unit = quantity_values(draft, name, column, pivot)
-        draft.assumed.append(f'{name} = "{draft.labels[FIELDS[name]]}" [{unit}]')
+    places = [place for column in choice.chosen.values() for place in column.places]
+    columns = table.columns([*dict.fromkeys([*places, *time.others, *_dates_beside(table, time)])])
+    draft = DraftLog(name, source, headings=tuple(headings))
+    used = set(places)
+    for quantity, chosen in choice.chosen.items():
+        column = chosen
+        if quantity == "time":
+            values, unit, column = _time(columns, chosen, headings, where)
+            used.update(column.places)
+        else:
+            values, unit = _values(draft, quantity, column, columns, where)
+        label = " + ".join(headings[place] for place in column.places)
+        draft.labels[FIELDS[quantity]] = label
+        draft.values[FIELDS[quantity]] = values
+        factor = "" if column.factor == 1.0 else f" × {column.factor:g}"
+        shown = label if len(label) <= _SHOWN_HEADING else f"{label[:_SHOWN_HEADING]}…"
+        draft.assumed.append(f'{quantity} = "{shown}"{factor} [{unit}]')
+    if not draft.values["time_s"].size:
+        raise InputError("the log holds no rows", source=where, cure="check the export")
+    draft.ignored = tuple(h for k, h in enumerate(headings) if h and k not in used)
     draft.sign_unknown = choice.chosen["current"].factor > 0.0
-    draft.temperature_source = temperature_source_of(choice)
-    # A recorder stores changes: between them current and voltage are the latest values. A row for
-    # every time at which one of them changed.
-    current, voltage = draft.values["current_a"], draft.values["voltage_v"]
-    last = np.append(np.flatnonzero(np.diff(stamps) > 0.0), stamps.size - 1)
-    changed = np.isin(stamps[last], stamps[np.isfinite(current) | np.isfinite(voltage)])
-    at = last[changed]
-    latest, age_s = held(stamps, current, at)
-    draft.values["current_a"] = np.full(stamps.size, np.nan)
-    draft.values["current_a"][at] = np.where(age_s <= HOLD_ENTITY_S, latest, np.nan)
-    drop_or_hold(draft, HOLD_ENTITY_S)
+    if "temperature" in choice.chosen:
+        draft.temperature_source = choice.chosen["temperature"].source
+    _leaf_spy(draft)
+    _hold_changes(draft)
     return draft
 
 
-@dataclass(slots=True)
-class _Pivot:
-    """States of entities as columns."""
+def _dates_beside(table: Table, time: ChosenColumn) -> list[int]:
+    """Return the columns of dates that may belong to a column of clock times."""
+    if time.given:
+        return []
+    meanings = ((k, meaning_of(heading)) for k, heading in enumerate(table.headings))
+    return [k for k, m in meanings if m and m.quantity == "time" and k not in time.places]
 
-    entities: Any
-    cells: list[Any]
-    source: str
-    wanted: dict[str, str] = None  # type: ignore[assignment] # set before each use
-    units: dict[str, str] = field(default_factory=dict)
 
-    def numbers(self, name: str) -> FloatArray:
-        entity = self.wanted[name]
-        return np.array(
-            [
-                float(cell) if of == entity and cell is not None and is_number(cell) else np.nan
-                for of, cell in zip(self.entities.tolist(), self.cells, strict=True)
-            ]
+def _time(
+    columns: dict[int, Any], column: ChosenColumn, headings: Sequence[str], where: str
+) -> tuple[FloatArray, str, ChosenColumn]:
+    """Return time [s], how it was read, and its column; of several, the first that increases."""
+    column = _with_date(column, columns)
+    label = " + ".join(headings[place] for place in column.places)
+    first = _seconds([columns[place] for place in column.places], column, where, label)
+    for place in () if _increases(first[0]) else column.others:
+        other = replace(column, places=(place,), unit="")
+        meaning = meaning_of(headings[place])
+        other = replace(other, unit=meaning.unit if meaning else "")
+        try:
+            values, how = _seconds([columns[place]], other, where, headings[place])
+        except InputError:
+            continue
+        if _increases(values):
+            return values, how, other
+    return *first, column
+
+
+def _with_date(column: ChosenColumn, columns: dict[int, Any]) -> ChosenColumn:
+    """Return a column of clock times with the column of dates beside it."""
+    place = column.places[0]
+    if (
+        column.given
+        or not is_text(columns[place].type)
+        or not stamps.is_clock(_first(columns[place]))
+    ):
+        return column
+    for other in sorted(set(columns) - {place}):
+        text = _first(columns[other]) if is_text(columns[other].type) else ""
+        if ":" not in text and stamps.is_stamp(text) and not is_number(text):
+            return replace(column, places=(other, place), others=())
+    return column
+
+
+def _first(column: Any) -> str:
+    return next((str(cell.as_py()) for cell in column if cell.is_valid), "")
+
+
+def _increases(time_s: FloatArray) -> bool:
+    finite = time_s[np.isfinite(time_s)]
+    return finite.size > 1 and bool(np.all(np.diff(finite) >= 0.0)) and finite[-1] > finite[0]
+
+
+def _values(
+    draft: DraftLog, quantity: str, column: ChosenColumn, columns: dict[int, Any], where: str
+) -> tuple[FloatArray, str]:
+    """Return a quantity in its canonical unit, and the unit that was read or assumed."""
+    canonical = FIELDS[quantity]
+    label = " + ".join(draft.headings[place] for place in column.places)
+    parts = [numbers_of(columns[place], where, draft.headings[place]) for place in column.places]
+    unit = column.unit
+    for in_cells in sorted({each for _, each in parts} - {""}):
+        if unit and unit_of(canonical, in_cells) != unit_of(canonical, unit):
+            raise InputError(
+                "the cells have another unit than the heading",
+                source=where,
+                field=label,
+                value=f"{in_cells}, heading {unit}",
+                cure=f"state the right one: --columns '{quantity}=HEADING[UNIT]'",
+            )
+        unit = unit or in_cells
+    values = parts[0][0]
+    if len(parts) > 1:
+        draft.remarks.append(f"{quantity}: mean of {len(parts)} columns")
+        names = [draft.headings[place] for place in column.places]
+        per_kelvin = abs((unit_of(canonical, unit) or (1.0, 0.0))[0] * column.factor)
+        probes = [numbers for numbers, _ in parts]
+        values = draft.mean_of_probes(names, probes, PROBES_APART_K / per_kelvin)
+    values = values * column.factor
+    if quantity == "soc" and not unit:
+        finite = values[np.isfinite(values)]
+        if finite.size and finite.min() >= 0.0 and 0.0 < finite.max() <= 1.0:
+            return 100.0 * values, "0–1, from its range"
+    values, _ = convert(values, canonical, unit, source=where, label=label)
+    return values, unit or f"{_ASSUMED_UNIT[quantity]}, assumed"
+
+
+def _leaf_spy(draft: DraftLog) -> None:
+    """Rescale the SoC of LeafSpy, known by its other headings."""
+    soc = draft.values.get("soc_pct")
+    if soc is None or not {"Gids", "AHr", "Pack Volts"} <= set(draft.headings):
+        return
+    if np.nanmedian(soc) > 110.0:
+        draft.values["soc_pct"] = soc * LEAF_SPY_SOC
+        draft.remarks.append("LeafSpy log: SoC in 0.0001 %")
+
+
+def _hold_changes(draft: DraftLog) -> None:
+    """Hold the latest voltage and temperature at each current, if rows hold only what changed."""
+    values = draft.values
+    time, current, voltage = (values[name] for name in ("time_s", "current_a", "voltage_v"))
+    temperature = values.get("temperature_c", time)
+    whole = np.isfinite(time) & np.isfinite(current) & np.isfinite(voltage)
+    at = np.flatnonzero(np.isfinite(time) & np.isfinite(current))
+    if np.mean(whole & np.isfinite(temperature)) >= 1.0 - MAX_INCOMPLETE or not at.size:
+        return
+    latest_v, age_s = held(time, voltage, at)
+    near = age_s <= HOLD_S
+    if np.mean(near) < 0.5:
+        return
+    at = at[near]
+    found = {"time_s": time[at], "current_a": current[at], "voltage_v": latest_v[near]}
+    for name in ("temperature_c", "soc_pct"):
+        if name in values:
+            found[name], _ = held(time, values[name], at)
+    if "temperature_c" in found:
+        known = found["temperature_c"][np.isfinite(found["temperature_c"])]
+        found["temperature_c"] = np.nan_to_num(
+            found["temperature_c"], nan=known[0] if known.size else np.nan
         )
+    draft.values = found
+    draft.remarks.append(
+        f"rows hold only what changed: {at.size} rows with a current kept, with the latest voltage"
+        f" (at most {float(age_s[near].max()):.2g} s old) and temperature"
+    )
 
-    def stamps(self, name: str) -> Any:
-        raise NotImplementedError(name)
+
+def held(time: FloatArray, values: FloatArray, at: IntArray) -> tuple[FloatArray, FloatArray]:
+    """Return the latest known value at some rows, and its age [s]; NaN and infinity before any."""
+    known = np.flatnonzero(np.isfinite(values) & np.isfinite(time))
+    latest = np.searchsorted(known, at, side="right") - 1
+    if not known.size:
+        return np.full(at.size, np.nan), np.full(at.size, np.inf)
+    row = known[np.maximum(latest, 0)]
+    before = latest < 0
+    return np.where(before, np.nan, values[row]), np.where(before, np.inf, time[at] - time[row])
 
 
 # --- Tables in memory
+
+
+@dataclass(frozen=True, slots=True)
+class ArrowTable:
+    """Columns of an Arrow table, or of a file; `read` returns a pyarrow.Table of some of them."""
+
+    headings: Sequence[str]
+    read: Callable[[list[str]], Any]
+    units: Sequence[str] = field(default=())
+
+    def columns(self, places: Sequence[int]) -> dict[int, Any]:
+        """Return columns by place."""
+        table = self.read([self.headings[place] for place in places])
+        return {place: table.column(self.headings[place]) for place in places}
+
+
+def draft_by_headings(
+    table: TextTable | ArrowTable, given: ColumnMap | None, *, name: str, source: str
+) -> DraftLog:
+    """Return the draft of a table by plain headings and the columns of the user.
+
+    Raises
+    ------
+    InputError
+        If a column is not found or does not hold its quantity.
+    """
+    choice = choose_columns(table.headings, table.units, given)
+    if not choice.is_complete:
+        raise unknown_columns(source or name, table.headings, choice)
+    draft = draft_of(table, choice, name=name, source=source)
+    draft.remarks[:0] = getattr(table, "remarks", ())
+    return draft

@@ -37,7 +37,6 @@ AHEAD_S: Final = 0.0002
 """Frames due within this time are sent at once: sleeping is less precise [s]."""
 REST_AT_MOST_S: Final = 0.2
 """Longest uninterrupted wait, so that a stop is noticed [s]."""
-
 WINDOW_SAMPLES: Final = 40
 """Most samples in flight."""
 WINDOW_FRAMES: Final = 160
@@ -46,15 +45,13 @@ SAMPLES_AT_LEAST: Final = 2 * ACKNOWLEDGE_EVERY
 """Samples that may always be in flight: fewer would not trigger an acknowledgement."""
 SLOW_S: Final = 0.5
 """Wait for an acknowledgement above which to warn [s]."""
-_POLL_S: Final = 0.05
-
+POLL_S: Final = 0.05
 SHOW_EVERY_S: Final = 0.2
 LISTEN_S: Final = 0.001
 """Time to listen at each display update, for replays without pauses [s]."""
 LISTEN_AT_END_S: Final = 0.15
 """Time to listen for the estimate after the last frame [s]."""
-
-_HINT = (
+_HINT: Final = (
     "is `cangauge run --time-source replay-clock` listening on this bus, for the same --vehicle?"
 )
 
@@ -91,21 +88,19 @@ class ReplaySettings:
 
 @dataclass
 class ReplayState:
-    """Progress of a replay."""
+    """Progress of a replay.
+
+    `samples` are those that a receiver makes of the frames, where known; `acknowledged` those that
+    it has processed (None below full speed); `soc` its latest estimate.
+    """
 
     frames: int = 0
-    """Frames sent, without REPLAY_CLOCK."""
     clocks: int = 0
-    """REPLAY_CLOCK frames sent."""
     samples: int = 0
-    """Samples that a receiver makes of them, where known."""
     acknowledged: int | None = None
-    """Samples acknowledged by the receiver; None below full speed."""
     log_seconds: float = 0.0
     seconds: float = 0.0
-    """Since the first frame [s]."""
     soc: SocEstimate | None = None
-    """Latest estimate published by the receiver."""
 
     @property
     def speed(self) -> float | None:
@@ -134,10 +129,6 @@ def play(
     show : callable, optional
         Called a few times a second, and at the end.
 
-    Returns
-    -------
-    ReplayState
-
     Raises
     ------
     InputError
@@ -155,16 +146,17 @@ def play(
             cure="give --vehicle, or --dbc and --map, or another speed",
         )
     player = _Player(bus, settings, stop, show)
-    player.begin()
     for step in source.steps(loop=settings.loop):
         if stop():
             break
         player.send(step)
-    player.end()
+    player.finish()
     return player.state
 
 
 class _Player:
+    """Sends steps when they are due, with the clock, and keeps the state."""
+
     def __init__(
         self,
         bus: BusConnection,
@@ -172,73 +164,49 @@ class _Player:
         stop: Callable[[], bool],
         show: Callable[[ReplayState], None] | None,
     ) -> None:
-        self._bus = bus
-        self._settings = settings
-        self._stop = stop
-        self._show = show
-        self._receiver = _Receiver(bus, settings.ids, stop)
-        # Listen during pauses.
-        self._pacer = None if settings.is_max else Pacer(settings.speed, stop, self._receiver.take)
+        self._bus, self._settings, self._stop, self._show = bus, settings, stop, show
+        self._receiver = _Receiver(bus, settings, stop)
+        rest = self._receiver.listen_once
+        self._pacer = None if settings.is_max else Pacer(settings.speed, stop, rest)
         self._clock = None if settings.speed == 1.0 else ClockFrames(settings.ids.replay_clock)
-        self._clock_us: int | None = None
         self._first_us: int | None = None
-        self._began_s = 0.0
-        self._show_s = 0.0
+        self._clock_us: int | None = None
+        self._began_s = self._show_s = 0.0
         self.state = ReplayState(acknowledged=0 if settings.is_max else None)
-
-    def begin(self) -> None:
-        settings = self._settings
-        wait_s = settings.wait_s
-        if wait_s is None and settings.is_max:
-            wait_s = settings.acknowledge_s
+        wait_s = settings.acknowledge_s if settings.is_max else None
+        wait_s = wait_s if settings.wait_s is None else settings.wait_s
         if wait_s is not None:
             self._receiver.wait_until_ready(wait_s)
 
     def send(self, step: Step) -> None:
-        state = self.state
+        """Send a step when it is due, or when the receiver has room."""
         if self._pacer is None:
-            self._receiver.wait_for_room(self._settings.acknowledge_s)
+            self._receiver.wait_for_room()
         else:
             self._pacer.wait(step.time_us)
         if self._first_us is None:
-            self._first_us = step.time_us
-            self._began_s = time.monotonic()
+            self._first_us, self._began_s = step.time_us, time.monotonic()
+        state = self.state
         if self._clock is not None and step.is_wanted and step.time_us != self._clock_us:
             self._clock_us = step.time_us
-            self._send_frame(self._clock.at(step.time_us))
+            _send(self._bus, self._clock.at(step.time_us), self._settings)
             state.clocks += 1
         for frame in step.frames:
-            if frame.is_fd and not self._bus.carries_fd:
-                raise InputError(
-                    "holds CAN FD frames, and the bus is not open for them",
-                    field="--bus-option",
-                    cure="give --bus-option fd=true",
-                )
-            self._send_frame(frame)
-        state.frames += len(step.frames)
-        state.samples = step.samples
+            _send(self._bus, frame, self._settings)
+        state.frames, state.samples = state.frames + len(step.frames), step.samples
         state.log_seconds = (step.time_us - self._first_us) / MICROSECONDS
-        if self._pacer is None:
-            self._receiver.note_sent(step.samples, state.frames + state.clocks)
-        now_s = time.monotonic()
-        if now_s >= self._show_s:
-            self._show_s = now_s + SHOW_EVERY_S
+        self._receiver.sent(step, state.frames + state.clocks)
+        if time.monotonic() >= self._show_s:
+            self._show_s = time.monotonic() + SHOW_EVERY_S
             self._update(LISTEN_S)
 
-    def end(self) -> None:
+    def finish(self) -> None:
+        """Wait for the last acknowledgements and the last estimate."""
         if self._pacer is None and not self._stop():
-            self._receiver.wait_for_all(self._settings.acknowledge_s)
+            self._receiver.wait_for_all()
         self._update(LISTEN_AT_END_S)
 
-    def _send_frame(self, frame: can.Message) -> None:
-        if not self._bus.send(frame) and self._pacer is None:
-            raise CangaugeError(
-                f"{self._bus.name}: the transmit queue stays full; is the bus up, with another node"
-                " that acknowledges frames?"
-            )
-
     def _update(self, listen_s: float) -> None:
-        """Listen, update the state and show it."""
         state = self.state
         if self._first_us is not None:
             state.seconds = time.monotonic() - self._began_s
@@ -248,6 +216,20 @@ class _Player:
             state.acknowledged = self._receiver.acknowledged
         if self._show is not None:
             self._show(state)
+
+
+def _send(bus: BusConnection, frame: can.Message, settings: ReplaySettings) -> None:
+    if frame.is_fd and not bus.carries_fd:
+        raise InputError(
+            "holds CAN FD frames, and the bus is not open for them",
+            field="--bus-option",
+            cure="give --bus-option fd=true",
+        )
+    if not bus.send(frame) and settings.is_max:
+        raise CangaugeError(
+            f"{bus.name}: the transmit queue stays full; is the bus up, with another node that"
+            " acknowledges frames?"
+        )
 
 
 class Pacer:
@@ -273,8 +255,7 @@ class Pacer:
         rest: Callable[[float], object] = time.sleep,
     ) -> None:
         self._us_per_s = MICROSECONDS * speed
-        self._stop = stop
-        self._rest = rest
+        self._stop, self._rest = stop, rest
         self._origin: tuple[int, float] | None = None
 
     def wait(self, time_us: int) -> None:
@@ -288,28 +269,19 @@ class Pacer:
 
 
 class _Receiver:
-    """The receiver as seen by the player: acknowledged samples and published SoC.
+    """The receiver as seen by the player: samples acknowledged since it was ready, its SoC."""
 
-    Attributes
-    ----------
-    soc : SocEstimate or None
-        Latest estimate with a SoC.
-    acknowledged : int
-        Samples processed since `wait_until_ready`.
-    """
-
-    def __init__(self, bus: BusConnection, ids: FrameIds, stop: Callable[[], bool]) -> None:
-        self._bus = bus
-        self._reader = SocReader(ids)
-        self._stop = stop
+    def __init__(
+        self, bus: BusConnection, settings: ReplaySettings, stop: Callable[[], bool]
+    ) -> None:
+        self._bus, self._within_s, self._stop = bus, settings.acknowledge_s, stop
+        self._reader = SocReader(settings.ids)
         self.soc: SocEstimate | None = None
         self.acknowledged = 0
         self._count: int | None = None  # latest sample count in SOC_DETAIL
-        self._sent = 0
-        self._frames_sent = 0
+        self._samples = self._frames = self._frames_acknowledged = 0
         # Frames sent when a sample was complete: (sample, frames).
         self._marks: deque[tuple[int, int]] = deque()
-        self._frames_acknowledged = 0
         self._has_warned = False
 
     def listen(self, within_s: float) -> None:
@@ -318,97 +290,79 @@ class _Receiver:
         Not with a timeout of 0: where Python filters, own frames must be skipped first.
         """
         until_s = time.monotonic() + within_s
-        while (left_s := until_s - time.monotonic()) > 0.0 and self.take(left_s):
+        while (left_s := until_s - time.monotonic()) > 0.0 and self.listen_once(left_s):
             pass
 
-    def wait_until_ready(self, within_s: float) -> None:
-        """Wait for the first SOC_DETAIL; samples are counted from there.
+    def listen_once(self, timeout_s: float) -> bool:
+        """Receive one frame; return whether one came in time [s]."""
+        message = self._bus.receive(timeout_s)
+        if message is None:
+            return False
+        content = self._reader.read(message)
+        if isinstance(content, SocEstimate) and math.isfinite(content.soc_pct):
+            self.soc = content
+        elif isinstance(content, SocDetail):
+            self._acknowledge(content.samples)
+        return True
 
-        Raises
-        ------
-        CangaugeError
-            If none comes within `within_s` [s].
-        """
+    def wait_until_ready(self, within_s: float) -> None:
+        """Wait for the first SOC_DETAIL, from which samples are counted; raise CangaugeError."""
         give_up_s = time.monotonic() + within_s
         while self._count is None and not self._stop():
             if time.monotonic() > give_up_s:
                 raise CangaugeError(
                     f"{self._bus.name}: no receiver: no SOC_DETAIL in {within_s:g} s; {_HINT}"
                 )
-            self.take(_POLL_S)
+            self.listen_once(POLL_S)
 
-    def note_sent(self, samples: int, frames: int) -> None:
+    def sent(self, step: Step, frames: int) -> None:
         """Record the samples and frames sent so far."""
-        if samples != self._sent:
-            self._marks.append((samples, frames))
-        self._sent, self._frames_sent = samples, frames
+        if step.samples != self._samples:
+            self._marks.append((step.samples, frames))
+        self._samples, self._frames = step.samples, frames
 
-    def wait_for_room(self, within_s: float) -> None:
-        """Wait until the window has room.
+    def wait_for_room(self) -> None:
+        """Wait until the window has room; raise CangaugeError without an acknowledgement."""
+        if self._is_full():  # drain to half, so that both sides work in batches
+            self._wait(lambda: self._in_flight <= WINDOW_SAMPLES // 2 and not self._is_full())
 
-        Raises
-        ------
-        CangaugeError
-            If no acknowledgement comes within `within_s` [s].
-        """
-        if self._is_full():
-            # Drain to half, so that both sides work in batches.
-            self._wait(
-                within_s, lambda: self._in_flight <= WINDOW_SAMPLES // 2 and not self._is_full()
-            )
-
-    def wait_for_all(self, within_s: float) -> None:
-        """Wait until all samples are acknowledged; raises like `wait_for_room`."""
-        self._wait(within_s, lambda: self._in_flight == 0)
+    def wait_for_all(self) -> None:
+        """Wait until all samples are acknowledged; raise like `wait_for_room`."""
+        self._wait(lambda: self._in_flight == 0)
 
     @property
     def _in_flight(self) -> int:
-        return self._sent - self.acknowledged
+        return self._samples - self.acknowledged
 
     def _is_full(self) -> bool:
-        if self._in_flight < SAMPLES_AT_LEAST:
-            return False
-        frames = self._frames_sent - self._frames_acknowledged
-        return self._in_flight >= WINDOW_SAMPLES or frames >= WINDOW_FRAMES
+        frames = self._frames - self._frames_acknowledged
+        is_large = self._in_flight >= WINDOW_SAMPLES or frames >= WINDOW_FRAMES
+        return is_large and self._in_flight >= SAMPLES_AT_LEAST
 
-    def _wait(self, within_s: float, is_enough: Callable[[], bool]) -> None:
+    def _wait(self, is_enough: Callable[[], bool]) -> None:
         began_s = last_s = time.monotonic()
         before = self.acknowledged
         while not is_enough() and not self._stop():
-            self.take(_POLL_S)
+            self.listen_once(POLL_S)
             now_s = time.monotonic()
             if self.acknowledged != before:
                 before, last_s = self.acknowledged, now_s
-            elif now_s - last_s > within_s:
+            elif now_s - last_s > self._within_s:
                 raise CangaugeError(
-                    f"{self._bus.name}: no acknowledgement in {within_s:g} s: {self.acknowledged}"
-                    f" of {self._sent} samples sent have been processed; {_HINT}"
+                    f"{self._bus.name}: no acknowledgement in {self._within_s:g} s:"
+                    f" {self.acknowledged} of {self._samples} samples sent have been processed;"
+                    f" {_HINT}"
                 )
             if now_s - began_s > SLOW_S and not self._has_warned:
                 self._has_warned = True
                 text = f"the receiver acknowledges slowly; {_HINT}"
                 emit(_LOG, logging.WARNING, "replay.slow", text)
 
-    def take(self, timeout_s: float) -> bool:
-        """Receive one frame; return whether one came in time [s]."""
-        message = self._bus.receive(timeout_s)
-        if message is None:
-            return False
-        content = self._reader.read(message)
-        if isinstance(content, SocEstimate):
-            if math.isfinite(content.soc_pct):
-                self.soc = content
-        elif isinstance(content, SocDetail):
-            self._acknowledge(content.samples)
-        return True
-
     def _acknowledge(self, count: int) -> None:
-        if self._count is None or not self._sent:
+        if self._count is None or not self._samples:
             self._count = count
             return
         more = (count - self._count) % SAMPLES_MODULO
-        if more == 0:
-            return
         if more > self._in_flight:
             raise CangaugeError(
                 f"{self._bus.name}: the receiver has processed {more} samples where"

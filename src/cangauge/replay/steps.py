@@ -6,6 +6,7 @@ import math
 from collections import defaultdict
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
+from itertools import count
 from pathlib import Path
 from typing import NamedTuple, Protocol
 
@@ -21,6 +22,7 @@ from cangauge.bus.recording import open_vehicle_capture
 from cangauge.bus.time_source import MICROSECONDS, ReceiveTime, ReplayClock, is_clock, whole_us
 from cangauge.bus.vehicle import EXTENDED, Vehicle
 from cangauge.errors import InputError
+from cangauge.logs.gaps import usual_step_s
 from cangauge.logs.log import Log
 from cangauge.model.model_file import Model
 from cangauge.types import Sample
@@ -30,15 +32,16 @@ _CAPTURE_LOOP_GAP_US = 10_000
 
 
 class Step(NamedTuple):
-    """Frames of one moment."""
+    """Frames of one moment.
+
+    `time_us` is the log time [µs], which keeps increasing when the log is repeated. `samples` are
+    those that a receiver has completed after these frames. Frames that it uses need the clock.
+    """
 
     time_us: int
-    """Log time [µs]; keeps increasing when the log is repeated."""
     frames: list[can.Message]
     samples: int
-    """Samples that a receiver has completed after these frames, since the first step."""
     is_wanted: bool
-    """Whether a receiver uses these frames, so that they need the clock."""
 
 
 class Source(Protocol):
@@ -59,25 +62,12 @@ class Source(Protocol):
 
 
 class LogSource:
-    """A log as the frames of a vehicle.
-
-    Parameters
-    ----------
-    log : Log
-    vehicle : Vehicle
-
-    Raises
-    ------
-    InputError
-        If a value does not fit into its signal.
-    """
+    """A log as the frames of a vehicle; raises InputError if a value does not fit its signal."""
 
     counts_samples = True
 
     def __init__(self, log: Log, vehicle: Vehicle) -> None:
-        self.name = log.name
-        self.log = log
-        self.vehicle = vehicle
+        self.name, self.log, self.vehicle = log.name, log, vehicle
         FrameEncoder(vehicle).check_range(log)
 
     @property
@@ -91,19 +81,16 @@ class LogSource:
         soc_pct = np.full(len(log), math.nan) if log.soc_pct is None else log.soc_pct
         columns = (log.time_s, log.current_a, log.voltage_v, log.temperature_c, soc_pct)
         rows = list(zip(*(column.tolist() for column in columns), strict=True))
-        again_s = log.duration_s + (float(np.median(np.diff(log.time_s))) if len(log) > 1 else 1.0)
-        encoder = FrameEncoder(self.vehicle)
-        counter = _SampleCounter(self.vehicle)
-        shift_us = 0
-        while True:
+        again_us = whole_us(log.duration_s + (usual_step_s(log.time_s) or 1.0))
+        encoder, decoder = FrameEncoder(self.vehicle), SampleDecoder(self.vehicle)
+        for turn in count() if loop else (0,):
             for time_s, current_a, voltage_v, temperature_c, soc in rows:
-                time_us = whole_us(time_s) + shift_us
+                time_us = whole_us(time_s) + turn * again_us
                 sample = Sample(time_us / MICROSECONDS, current_a, voltage_v, temperature_c)
                 frames = encoder.encode(sample, soc)
-                yield Step(time_us, frames, counter.after(frames), is_wanted=True)
-            if not loop:
-                return
-            shift_us += whole_us(again_s)
+                for frame in frames:
+                    decoder.handle(frame)
+                yield Step(time_us, frames, decoder.statistics.samples, is_wanted=True)
 
 
 class CaptureSource:
@@ -125,9 +112,7 @@ class CaptureSource:
     def __init__(
         self, path: str | Path, vehicle: Vehicle | None = None, ids: FrameIds | None = None
     ) -> None:
-        self._path = Path(path)
-        self._vehicle = vehicle
-        self._ids = ids or FrameIds()
+        self._path, self._vehicle, self._ids = Path(path), vehicle, ids or FrameIds()
         self.name = self._path.name
         self.dropped = 0
         """Frames dropped in the latest pass: those of cangauge itself, and error frames."""
@@ -139,9 +124,9 @@ class CaptureSource:
 
     def steps(self, *, loop: bool) -> Iterator[Step]:
         """Yield a step per frame; repetitions follow 10 ms later."""
-        counter = None if self._vehicle is None else _SampleCounter(self._vehicle)
+        decoder = None if self._vehicle is None else SampleDecoder(self._vehicle)
         wanted = None if self._vehicle is None else self._vehicle.messages.keys()
-        shift_us = 0
+        samples = shift_us = 0
         while True:
             first_us: int | None = None
             last_us = 0
@@ -150,7 +135,9 @@ class CaptureSource:
                 first_us = time_us if first_us is None else first_us
                 last_us = max(last_us, time_us)
                 message.timestamp = (time_us + shift_us) / MICROSECONDS
-                samples = 0 if counter is None else counter.after([message])
+                if decoder is not None:
+                    decoder.handle(message)
+                    samples = decoder.statistics.samples
                 key = message.arbitration_id | (EXTENDED if message.is_extended_id else 0)
                 is_wanted = wanted is None or key in wanted
                 yield Step(time_us + shift_us, [message], samples, is_wanted)
@@ -161,13 +148,12 @@ class CaptureSource:
     def _timed(self) -> Iterator[can.Message]:
         """Yield the frames to send, stamped with log time."""
         self.dropped = 0
-        ids = self._ids
-        clock: ReplayClock | None = None
-        if any(is_clock(message, ids.replay_clock) for message in self._messages()):
-            clock = ReplayClock(ids.replay_clock)
+        clock_id = self._ids.replay_clock
+        has_clock = any(is_clock(message, clock_id) for message in self._messages())
+        clock = ReplayClock(clock_id) if has_clock else None
         # The stamps of two buses can be of two adapters.
         stamps: defaultdict[Channel | None, ReceiveTime] = defaultdict(ReceiveTime)
-        own = {*ids.published, ids.replay_clock}
+        own = {*self._ids.published, clock_id}
         for message in self._messages():
             time_s = (clock or stamps[message.channel]).time_of(message)
             is_own = message.arbitration_id in own and not message.is_extended_id
@@ -175,32 +161,15 @@ class CaptureSource:
                 self.dropped += 1
                 continue
             if clock is not None and clock.beginnings:
-                raise InputError(
-                    "holds several consecutive replays",
-                    source=self._path,
-                    cure="cut it into one capture each",
-                )
-            message.timestamp = time_s
-            message.channel = None  # the recorded channel has no meaning on this bus
+                cure = "cut it into one capture each"
+                raise InputError("holds several consecutive replays", source=self._path, cure=cure)
+            message.timestamp, message.channel = time_s, None  # the channel was another bus's
             yield message
 
     def _messages(self) -> Iterable[can.Message]:
         if self._vehicle is None:
             return open_capture(self._path)
         return open_vehicle_capture(self._path, self._vehicle)
-
-
-class _SampleCounter:
-    """Count the samples that a receiver makes, by decoding the frames."""
-
-    def __init__(self, vehicle: Vehicle) -> None:
-        self._decoder = SampleDecoder(vehicle)
-
-    def after(self, frames: Iterable[can.Message]) -> int:
-        """Return the number of samples after these frames."""
-        for frame in frames:
-            self._decoder.handle(frame)
-        return self._decoder.statistics.samples
 
 
 @dataclass(frozen=True)
@@ -231,16 +200,7 @@ class QuantizationBound:
 def quantization_bound(
     vehicle: Vehicle, model: Model, log: Log, capacity_ah: float | None = None
 ) -> QuantizationBound:
-    """Return the bound for a log replayed as a vehicle's frames with REPLAY_CLOCK.
-
-    Parameters
-    ----------
-    vehicle : Vehicle
-    model : Model
-    log : Log
-    capacity_ah : float, optional
-        Instead of the model's [Ah].
-    """
+    """Return the bound for a log replayed as a vehicle's frames with REPLAY_CLOCK."""
     step = FrameEncoder(vehicle).quantization()
     voltage_model = model.voltage_model()
     current_a = step["current_a"]

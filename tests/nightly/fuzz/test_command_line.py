@@ -173,7 +173,7 @@ NUMBERS = {
     "gap": ("--initial-soc", "--capacity-ah", "--temperature"),
     "run": ("--temperature", "--initial-soc", "--initial-soc-std", "--capacity-ah", "--max-gap-s",
             "--pair-within-s", "--timeout-s", "--duration", "--until-idle"),
-    "replay": ("--speed", "--wait", "--acknowledge-within", "--temperature"),
+    "replay": ("--speed", "--wait", "--temperature"),
     "inspect": ("--temperature",),
     "twin": ("--hours", "--ambient-c", "--start-soc", "--end-soc"),
 }  # fmt: skip

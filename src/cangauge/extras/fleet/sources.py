@@ -20,6 +20,7 @@ from datetime import UTC, datetime
 from pathlib import Path, PurePosixPath
 from typing import Any, Final
 
+from cangauge._files import as_utf8
 from cangauge._io import MAX_LOG_BYTES, text_sha256
 from cangauge.bus.captures import Capture
 from cangauge.bus.recording import (
@@ -33,10 +34,10 @@ from cangauge.errors import InputError
 from cangauge.identify.starts import with_start
 from cangauge.logs.column_map import ColumnMap
 from cangauge.logs.draft import Sign
-from cangauge.logs.file_content import as_utf8, delimiter_of, split_cells
 from cangauge.logs.log import Log
 from cangauge.logs.read import LogFile
 from cangauge.logs.sign import require_discharge_positive
+from cangauge.logs.text import delimiter_of, split_cells
 from cangauge.logs.units import TemperatureSource
 
 VEHICLE_PATTERN: Final = r"(?:vehicle=)?([^/]+)/[^/]+$"

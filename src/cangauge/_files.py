@@ -1,0 +1,481 @@
+"""Files: recognise them by their beginning, read them unpacked, write them all or nothing.
+
+A file that the user names may be damaged, huge or mislabelled. It meets a limit of its size and
+one clear error; nothing is lost when writing fails.
+"""
+
+from __future__ import annotations
+
+import bz2
+import errno
+import gzip
+import hashlib
+import io
+import os
+import secrets
+import stat
+import zipfile
+import zlib
+from collections.abc import Iterator, Mapping
+from contextlib import ExitStack, contextmanager, suppress
+from os import PathLike
+from pathlib import Path
+from typing import BinaryIO, Final, Protocol, TypeVar, cast
+
+from cangauge.errors import CangaugeError, InputError
+
+try:
+    import fcntl
+except ImportError:  # Windows
+    fcntl = None  # type: ignore[assignment] # checked before use
+
+MIB: Final = 1 << 20
+MAX_LOG_BYTES: Final = 1024 * MIB
+"""A log, unpacked: it is held in memory."""
+HEAD_BYTES: Final = 64 * 1024
+_HEAD_LINES: Final = 160
+
+# --- Reading
+
+_DAMAGE: Final = (EOFError, OSError, ValueError, zlib.error, zipfile.BadZipFile)
+_GZIP, _BZIP2, _ZIP = b"\x1f\x8b", b"BZh", b"PK\x03\x04"
+_UTF16: Final = (b"\xff\xfe", b"\xfe\xff")
+_D3_MEMBER: Final = "test data.txt"
+_SUFFIXES: Final = frozenset(
+    f".{suffix}"
+    for suffix in ("gz", "bz2", "zip", "csv", "txt", "tsv", "parquet", "pq", "dat", "xlsx", "mpt",
+                   "bdf", "mf4", "mcap")
+)  # fmt: skip
+
+
+def open_regular(path: str | PathLike[str]) -> BinaryIO:
+    """Open a file for reading.
+
+    Raises
+    ------
+    InputError
+        If it is absent, no regular file, or cannot be read.
+    """
+    path = Path(path)
+    try:
+        mode = path.stat().st_mode
+        if stat.S_ISDIR(mode):
+            raise InputError("this is a folder, not a file", source=path, cure="name a file in it")
+        if not stat.S_ISREG(mode):
+            kind = "a pipe (FIFO)" if stat.S_ISFIFO(mode) else "a device"
+            raise InputError(
+                f"this is {kind}, not a file", source=path, cure="save its content as a file"
+            )
+        return path.open("rb")
+    except (OSError, ValueError) as error:  # ValueError: a null byte in the path
+        raise _unreadable(error, path) from error
+
+
+def _unreadable(error: OSError | ValueError, path: str | PathLike[str]) -> InputError:
+    if isinstance(error, FileNotFoundError | NotADirectoryError):
+        return InputError("no such file", source=path, cure="check the path")
+    reason = getattr(error, "strerror", None) or str(error)
+    cure = "change its rights" if isinstance(error, PermissionError) else "check the path"
+    return InputError(f"cannot be read: {reason}", source=path, cure=cure)
+
+
+def open_unpacked(path: str | PathLike[str]) -> io.BufferedReader:
+    """Open a file for reading; gzip and bzip2 are recognised by content and unpacked.
+
+    A damaged packed file raises `EOFError`, `OSError` or `zlib.error` while it is read.
+    """
+    file = cast("io.BufferedReader", open_regular(path))
+    begin = file.peek(3)
+    for mark, module in ((_GZIP, gzip), (_BZIP2, bz2)):
+        if begin.startswith(mark):
+            file.close()
+            return cast("io.BufferedReader", module.open(path))
+    return file
+
+
+def read_beginning(file: io.BufferedReader, size: int) -> bytes:
+    """Return at most `size` bytes from an open file; fewer where it is damaged or ends."""
+    beginning = bytearray()
+    with suppress(*_DAMAGE):
+        while len(beginning) < size and (part := file.read1(size - len(beginning))):
+            beginning += part
+    return bytes(beginning)
+
+
+def read_all(file: BinaryIO, path: str | PathLike[str], limit: int, what: str) -> bytes:
+    """Return the rest of an open file; raise InputError if it has more than `limit` bytes."""
+    data = bytearray()
+    while len(data) <= limit and (piece := file.read(MIB)):
+        data += piece
+    if len(data) > limit:
+        size = f"{limit // MIB} MB" if limit >= MIB else f"{limit // 1024} kB"
+        raise InputError(
+            f"larger than the {size} that {what} may have",
+            source=path,
+            cure="check that this is the right file, or split it",
+        )
+    return bytes(data)
+
+
+def read_bounded(path: str | PathLike[str], limit: int, what: str) -> bytes:
+    """Return the content of a file of at most `limit` bytes; `what` names its kind in errors."""
+    try:
+        with open_regular(path) as file:
+            return read_all(file, path, limit, what)
+    except OSError as error:
+        raise _unreadable(error, path) from error
+
+
+def as_utf8(data: bytes) -> bytes:
+    """Return text of UTF-8, UTF-16 or latin-1 as UTF-8 without a byte order mark."""
+    data = data.removeprefix(b"\xef\xbb\xbf")
+    if data[:2] in _UTF16:
+        return data.decode("utf-16", errors="replace").encode()
+    for first, codec in ((1, "utf-16-le"), (0, "utf-16-be")):  # without a mark: every second byte
+        halves = data[first:HEAD_BYTES:2]
+        zeros = halves.count(0)
+        if 2 * zeros > len(halves) and data[:HEAD_BYTES].count(0) == zeros:
+            return data.decode(codec, errors="replace").encode()
+    try:
+        data.decode("utf-8")
+    except UnicodeDecodeError:
+        return data.decode("latin-1").encode()
+    return data
+
+
+class Head:
+    """The beginning of a file, by which readers recognise it; the rest on demand.
+
+    gzip, bzip2 and the only file of a zip are unpacked.
+
+    Parameters
+    ----------
+    path : path-like
+
+    Attributes
+    ----------
+    path : Path
+        As given.
+    name : str
+        File name without folder and suffixes (of the member, for a zip).
+    data : bytes
+        The first 64 KiB.
+    lines : tuple of str
+        The first lines of a text, without line ends; empty for binary content.
+
+    Raises
+    ------
+    InputError
+        If the file is absent, unreadable, empty or damaged from its start, or if a zip holds
+        several files.
+    """
+
+    def __init__(self, path: str | PathLike[str]) -> None:
+        self.path = Path(path)
+        self.name = _stem(self.path.name)
+        with self.open() as file:
+            self.data = read_beginning(file, HEAD_BYTES)
+        if not self.data:
+            with self.open() as file:
+                file.read(1)  # raises if the file is damaged, not empty
+        if not self.data.strip():
+            raise InputError("the file is empty", source=self.path, cure="check the export")
+        self.lines = _lines(self.data)
+
+    @property
+    def first_line(self) -> str:
+        """The first line that is not blank; "" for binary content."""
+        return next((line for line in self.lines if line.strip()), "")
+
+    @contextmanager
+    def open(self) -> Iterator[io.BufferedReader]:
+        """Open the unpacked content; damage met while reading is an `InputError`."""
+        kind = ""
+        try:
+            with open_unpacked(self.path) as file:
+                kind = "" if isinstance(file, io.BufferedReader) else "packed "
+                if not file.peek(len(_ZIP)).startswith(_ZIP):
+                    yield file
+                    return
+                kind = "zip "
+                packed = io.BytesIO(read_all(file, self.path, MAX_LOG_BYTES, "a log"))
+            with zipfile.ZipFile(packed) as archive:
+                if "xl/workbook.xml" in archive.namelist():
+                    packed.seek(0)
+                    yield cast("io.BufferedReader", packed)
+                    return
+                member = _only_member(archive, self.path)
+                self.name = _stem(Path(member.filename).name)
+                with archive.open(member) as content:
+                    yield cast("io.BufferedReader", content)
+        except _DAMAGE as error:
+            raise InputError(
+                f"the {kind}file is cut off or damaged ({error})",
+                source=self.path,
+                cure="fetch it again",
+            ) from error
+        except (RuntimeError, NotImplementedError) as error:  # encrypted; unknown compression
+            raise InputError(f"the zip cannot be unpacked: {error}", source=self.path) from error
+
+    def read(self) -> bytes:
+        """Return the whole unpacked content.
+
+        Raises
+        ------
+        InputError
+            If the file is damaged, or larger than a log may be.
+        """
+        with self.open() as file:
+            return read_all(file, self.path, MAX_LOG_BYTES, "a log")
+
+
+Content_co = TypeVar("Content_co", covariant=True)
+
+
+class Reader(Protocol[Content_co]):
+    """Reader of one format of logs or captures."""
+
+    @property
+    def name(self) -> str:
+        """Name of the format, for messages."""
+
+    def matches(self, head: Head) -> bool:
+        """Return whether a file begins as this format does."""
+
+    def read(self, head: Head) -> Content_co:
+        """Read the file; raise InputError where it is damaged or lacks something."""
+
+
+def _only_member(archive: zipfile.ZipFile, path: Path) -> zipfile.ZipInfo:
+    files = [
+        info
+        for info in archive.infolist()
+        if info.filename and not info.is_dir() and not info.filename.startswith("__MACOSX")
+    ]
+    # A vehicle's zip of the ANL D3 data base holds documents beside the test data.
+    chosen = [info for info in files if info.filename.lower().endswith(_D3_MEMBER)] or files
+    if len(chosen) != 1:
+        names = ", ".join(info.filename for info in chosen[:4])
+        more = ", …" if len(chosen) > 4 else ""
+        is_neware = any(info.filename == "data.ndc" for info in chosen)
+        raise InputError(
+            f"the zip holds {len(chosen)} files ({names}{more})" if chosen else "the zip is empty",
+            source=path,
+            cure="a Neware .ndax: convert it with NewareNDA: NewareNDA.read(file).to_csv('log.csv')"
+            if is_neware
+            else "unpack it and name one of them",
+        )
+    return chosen[0]
+
+
+def _lines(data: bytes) -> tuple[str, ...]:
+    if len(data) >= HEAD_BYTES:
+        # The last line may be cut within a character, which would make it look like latin-1.
+        data = data[: data.rfind(b"\n") + 1] or data
+    text = as_utf8(data).decode("utf-8", errors="ignore")
+    return () if "\x00" in text else tuple(text.splitlines()[:_HEAD_LINES])
+
+
+def _stem(name: str) -> str:
+    while (suffix := Path(name).suffix.lower()) in _SUFFIXES:
+        name = name[: -len(suffix)]
+    return name.removesuffix(" Test Data")
+
+
+# --- Writing
+
+FULL: Final = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO}
+"""Errors of a full or failing disk, which can be temporary."""
+_WRITE_ERRORS: Final[dict[int, tuple[str, str]]] = {
+    errno.ENOENT: ("the folder of this file does not exist", "create it or name another one"),
+    errno.ENOTDIR: ("a part of this path is a file, not a folder", "name another path"),
+    errno.EACCES: ("the folder of this file is not writable", "change its rights or name another"),
+    errno.EPERM: ("the folder of this file is not writable", "change its rights or name another"),
+    errno.EROFS: ("the file system is read-only", "name another folder"),
+    errno.ENAMETOOLONG: ("the file name is too long", "use a shorter one"),
+}
+PRIVATE: Final = 0o600
+"""Rights of a state: for its owner only."""
+FOR_GROUP: Final = 0o640
+"""Rights of a recording: the group may read where and how the car was driven, others not."""
+
+
+@contextmanager
+def atomic_path(path: str | PathLike[str], rights: int | None = None) -> Iterator[Path]:
+    """Yield a temporary path beside `path` and rename it to `path` when the block succeeds.
+
+    If the block raises, `path` is unchanged. The content is synced to disk before the rename: a
+    power cut leaves the old file or the new one. A device or pipe (`/dev/stdout`) cannot be
+    replaced and is yielded itself.
+
+    Parameters
+    ----------
+    path : path-like
+        The file to write; a symbolic link is followed.
+    rights : int, optional
+        Its permissions. By default those of the file that is replaced, or the umask's.
+
+    Yields
+    ------
+    Path
+        Where to write.
+
+    Raises
+    ------
+    InputError
+        If the folder does not exist or is not writable, or `path` is a folder.
+    CangaugeError
+        If the disk is full or fails while writing.
+    """
+    if _is_device(Path(path)):
+        yield Path(path)
+        return
+    target = Path(os.path.realpath(path))
+    part = _create_beside(target, path, 0o666 if rights is None else rights)
+    try:
+        yield part
+        with part.open("rb") as written:
+            os.fsync(written.fileno())
+        if rights is None and target.exists():
+            part.chmod(stat.S_IMODE(target.stat().st_mode))
+        part.replace(target)
+    except OSError as error:
+        if error.errno not in FULL:
+            raise
+        problem = f"{path}: writing failed: {error.strerror}; free some space"
+        raise CangaugeError(problem) from error
+    finally:
+        part.unlink(missing_ok=True)
+
+
+def _create_beside(target: Path, shown: str | PathLike[str], rights: int = 0o666) -> Path:
+    if target.is_dir():
+        raise InputError("this is a folder", source=shown, cure="name a file in it")
+    # The suffix stays last: writers such as pyarrow and bokeh choose the format by it.
+    part = target.with_name(f".{target.stem[:200]}.{secrets.token_hex(4)}{target.suffix}")
+    try:
+        with suppress(FileNotFoundError):
+            target.lstat()  # its name can be too long where that of `part` is not
+        part.touch(rights, exist_ok=False)
+    except OSError as error:
+        problem, cure = _WRITE_ERRORS.get(
+            error.errno or 0, (f"cannot be written: {error.strerror}", "name another path")
+        )
+        raise InputError(problem, source=shown, cure=cure) from error
+    return part
+
+
+def _is_device(path: Path) -> bool:
+    try:
+        mode = path.stat().st_mode
+    except (OSError, ValueError):  # absent, or an impossible path: creating it reports which
+        return False
+    return not stat.S_ISREG(mode) and not stat.S_ISDIR(mode)
+
+
+def write_text_atomic(path: str | PathLike[str], text: str, rights: int | None = None) -> None:
+    """Write `text` as UTF-8 to `path`, all or nothing (see `atomic_path`)."""
+    with atomic_path(path, rights) as part:
+        part.write_text(text, encoding="utf-8", newline="\n")
+
+
+def write_texts_atomic(texts: Mapping[Path, str]) -> None:
+    """Write several files as UTF-8, all or none (see `atomic_path`)."""
+    with ExitStack() as stack:
+        for path, text in texts.items():
+            part = stack.enter_context(atomic_path(path))
+            part.write_text(text, encoding="utf-8", newline="\n")
+
+
+def check_writable(path: str | PathLike[str]) -> None:
+    """Raise the InputError that writing `path` would raise, before any long work is done."""
+    if not _is_device(Path(path)):
+        _create_beside(Path(os.path.realpath(path)), path).unlink()
+
+
+def require_suffix(path: str | PathLike[str], *suffixes: str, field: str) -> None:
+    """Raise InputError unless a file to write has one of these suffixes, or is a device.
+
+    Parameters
+    ----------
+    path : path-like
+    *suffixes : str
+        With their dot, in lower case.
+    field : str
+        Option or field that names it, for the message.
+    """
+    output = Path(path)
+    if output.suffix.lower() in suffixes or _is_device(output):
+        return
+    names = " or ".join(part for part in (", ".join(suffixes[:-1]), suffixes[-1]) if part)
+    raise InputError(
+        f"the suffix is not {names}",
+        source=output,
+        field=field,
+        value=output.suffix,
+        cure=f"name a {names} file",
+    )
+
+
+@contextmanager
+def sole_writer(path: str | PathLike[str]) -> Iterator[None]:
+    """Hold a file for this process while the block runs, by a lock on a file beside it.
+
+    The kernel releases the lock at the latest when the process ends. Where there can be no lock (a
+    read-only disk, a network file system without locks, Windows) the block runs without.
+
+    Raises
+    ------
+    InputError
+        If another process holds it; names that process.
+    """
+    target = Path(os.path.realpath(path))
+    lock = target.with_name(f".{target.name[:200]}.lock")
+    held = None
+    with suppress(OSError):  # no lock here; where nothing can be written, writing reports it
+        held = _locked(lock, path) if fcntl is not None else None
+    try:
+        yield
+    finally:
+        if held is not None:
+            lock.unlink(missing_ok=True)
+            os.close(held)
+
+
+def _locked(lock: Path, shown: str | PathLike[str]) -> int:
+    """Return the descriptor of a locked file."""
+    while True:
+        held = os.open(lock, os.O_RDWR | os.O_CREAT, PRIVATE)
+        try:
+            fcntl.flock(held, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            if os.path.samestat(os.fstat(held), lock.stat()):  # not just removed by its holder
+                os.ftruncate(held, 0)
+                os.write(held, f"{os.getpid()}\n".encode())
+                return held
+        except FileNotFoundError:
+            pass
+        except BlockingIOError as error:
+            holder = os.read(held, 20).decode("ascii", "replace").strip()
+            os.close(held)
+            raise InputError(
+                f"another service{f' (process {holder})' if holder else ''} writes this file",
+                source=shown,
+                cure="stop that one, or name another file",
+            ) from error
+        except OSError:
+            os.close(held)
+            raise
+        os.close(held)
+
+
+def text_sha256(text: str) -> str:
+    """Return the SHA-256 of a text in UTF-8, in hexadecimal."""
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+def file_sha256(path: str | Path) -> str | None:
+    """Return the SHA-256 of a file's bytes in hexadecimal; None if it is not a file."""
+    if not path or not Path(path).is_file():
+        return None
+    with Path(path).open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()

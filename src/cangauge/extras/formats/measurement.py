@@ -1,0 +1,286 @@
+"""Measurement files with channels on several rasters: MF4 signals, MCAP messages.
+
+Channels are chosen by name and unit as the columns of a table. The log's rows are those of the
+current: voltage is interpolated to them, temperature and SoC are held, as for captures.
+"""
+
+from __future__ import annotations
+
+from array import array
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+
+from cangauge._files import MIB, Head
+from cangauge._mcap import FRAME, MAGIC, SAMPLE, McapMessage, read_messages
+from cangauge._typing import FloatArray
+from cangauge.errors import InputError
+from cangauge.logs.canonical import build_table
+from cangauge.logs.column_map import ColumnMap, choose_columns, unknown_columns
+from cangauge.logs.draft import DraftLog
+from cangauge.logs.table import ArrowTable, draft_by_headings
+from cangauge.logs.text import MAX_COLUMNS, MAX_ROWS
+from cangauge.logs.units import FIELDS
+
+VOLTAGE_FILL_S: Final = 1.0
+"""Longest time between two values of a channel for interpolation [s], as in captures."""
+_TIME: Final = "time [s]"
+"""Heading of the rasters' own time."""
+
+
+class Channel(NamedTuple):
+    """Times [s] and values of a channel, shape (n,) each."""
+
+    time_s: FloatArray
+    values: FloatArray
+
+
+def _draft_of_channels(
+    head: Head,
+    headings: Sequence[str],
+    given: ColumnMap | None,
+    read: Callable[[list[str]], Mapping[str, Channel]],
+) -> DraftLog:
+    """Return the draft of the chosen channels on the raster of the current.
+
+    Parameters
+    ----------
+    head : Head
+    headings : sequence of str
+        `name [unit]` of the channels.
+    given : ColumnMap, optional
+        The user's choice.
+    read : callable
+        Returns channels by heading.
+    """
+    source = str(head.path)
+    names = [_TIME, *(name for name in headings if name != _TIME)]
+    choice = choose_columns(names, (), given)
+    if not choice.is_complete:
+        raise unknown_columns(source, names, choice)
+    held = {names[p] for q in ("temperature", "soc") if q in choice.chosen
+            for p in choice.chosen[q].places}  # fmt: skip
+    current = names[choice.chosen["current"].places[0]]
+    notes: list[str] = []
+
+    def table(wanted: list[str]) -> Any:
+        found = read([name for name in wanted if name != _TIME])
+        time_s = found[current].time_s
+        if not time_s.size:
+            raise InputError("the channel holds no values", source=source, field=current)
+        columns = {_TIME: time_s} if _TIME in wanted else {}
+        for name in wanted:
+            if name != _TIME:
+                columns[name], note = _on_raster(time_s, found[name], name, is_held=name in held)
+                notes.extend([note] if note else [])
+        return build_table(columns)
+
+    draft = draft_by_headings(ArrowTable(names, table), given, name=head.name, source=source)
+    draft.remarks.extend(notes)
+    return draft
+
+
+def _on_raster(
+    time_s: FloatArray, channel: Channel, name: str, *, is_held: bool
+) -> tuple[FloatArray, str]:
+    """Return a channel at the times of the current, and a remark on what was done."""
+    if np.array_equal(channel.time_s, time_s):
+        return channel.values, ""
+    known = np.isfinite(channel.values) & np.isfinite(channel.time_s)
+    order = np.argsort(channel.time_s[known], kind="stable")
+    own_s, values = channel.time_s[known][order], channel.values[known][order]
+    if not own_s.size:
+        return np.full(time_s.size, np.nan), f"{name}: the channel holds no values"
+    right = np.searchsorted(own_s, time_s, side="right")
+    if is_held:  # before the first value, the first
+        return values[np.maximum(right - 1, 0)], f"{name}: latest of its {own_s.size} values"
+    filled = np.interp(time_s, own_s, values, left=np.nan, right=np.nan)
+    before = own_s[np.clip(right - 1, 0, own_s.size - 1)]
+    after = own_s[np.clip(right, 0, own_s.size - 1)]
+    filled[(after - before > VOLTAGE_FILL_S) & (before != time_s)] = np.nan
+    return filled, f"{name}: interpolated between its {own_s.size} values"
+
+
+class Mf4Signals:
+    """MF4 with signals, as CANape and INCA write them; one with bus logging is a capture."""
+
+    name = "MF4 signals"
+    takes_columns = True
+    _BUS_LOGGING: Final = b"CAN_DataFrame"
+    """Channel name of the standard for bus logging, stored uncompressed."""
+
+    def matches(self, head: Head) -> bool:
+        """Return whether the file is an MF4 without bus logging."""
+        if not head.data.startswith((b"MDF     ", b"UnFinMF ")):
+            return False
+        tail = b""
+        with head.open() as file:
+            while part := file.read(MIB):
+                if self._BUS_LOGGING in tail + part:
+                    return False
+                tail = part[-len(self._BUS_LOGGING) :]
+        return True
+
+    def read(self, head: Head, columns: ColumnMap | None = None) -> DraftLog:
+        """Read the chosen signals.
+
+        Raises
+        ------
+        InputError
+            If a channel is not found, the file is damaged, or asammdf is not installed.
+        """
+        try:
+            from asammdf import MDF  # noqa: PLC0415 - an extra
+        except ImportError as error:
+            raise InputError(
+                "reading MF4 needs asammdf", source=head.path, cure="pip install 'cangauge[mf4]'"
+            ) from error
+        try:
+            with head.open() as unpacked, MDF(unpacked) as file:
+                places = self._places(file)
+
+                def read(names: list[str]) -> dict[str, Channel]:
+                    return {name: _signal(file, *places[name]) for name in names}
+
+                draft = _draft_of_channels(head, list(places), columns, read)
+        except InputError:
+            raise
+        except Exception as error:  # asammdf raises whatever a damaged block provokes
+            raise InputError(
+                f"the MF4 file is damaged ({type(error).__name__}: {error})"[:300],
+                source=head.path,
+                cure="export it again",
+            ) from error
+        draft.remarks.insert(0, f"MF4 with {len(places)} channels")
+        return draft
+
+    @staticmethod
+    def _places(file: Any) -> dict[str, tuple[int, int]]:
+        """Return group and index by heading; of channels with one name, that of most values."""
+        places: dict[str, tuple[int, int]] = {}
+        counts: dict[str, int] = {}
+        for number, group in enumerate(file.groups):
+            count = int(group.channel_group.cycles_nr)
+            master = file.masters_db.get(number)
+            for index, channel in enumerate(group.channels):
+                if index == master or len(places) >= MAX_COLUMNS or not 0 < count <= MAX_ROWS:
+                    continue
+                unit = channel.unit or getattr(channel.conversion, "unit", "") or ""
+                heading = f"{channel.name} [{unit}]" if unit else channel.name
+                if count > counts.get(heading, 0):
+                    places[heading], counts[heading] = (number, index), count
+        return places
+
+
+def _signal(file: Any, group: int, index: int) -> Channel:
+    signal = file.get(group=group, index=index)
+    values = np.asarray(signal.samples)
+    numbers = values.astype(np.float64) if values.dtype.kind in "iufb" else np.empty(0)
+    return Channel(np.asarray(signal.timestamps, dtype=np.float64)[: numbers.size], numbers)
+
+
+class McapSamples:
+    """The samples of an MCAP recording, or the numbers in JSON messages of any schema."""
+
+    name = "MCAP samples"
+    takes_columns = True
+    _DAMAGE: Final = (ValueError, LookupError, ArithmeticError, EOFError, OSError, RecursionError)
+    _FIRST_MESSAGES: Final = 1000
+    """Messages among which a file with CAN frames shows one."""
+
+    def matches(self, head: Head) -> bool:
+        """Return whether the file is an MCAP without CAN frames."""
+        if not head.data.startswith(MAGIC):
+            return False
+        with head.open() as file:
+            try:
+                for number, message in enumerate(read_messages(file, head.path)):
+                    if message.schema == FRAME:
+                        return False
+                    if number > self._FIRST_MESSAGES:
+                        break
+            except self._DAMAGE:
+                return True
+        return True
+
+    def read(self, head: Head, columns: ColumnMap | None = None) -> DraftLog:
+        """Read the samples or numbers; a column is `TOPIC FIELD`.
+
+        Raises
+        ------
+        InputError
+            If it is damaged before its end, a field is not found, or mcap is not installed.
+        """
+        channels: dict[str, tuple[array[float], array[float]]] = {}
+        damage, has_samples = "", False
+        with head.open() as file:
+            try:
+                for message in read_messages(file, head.path):
+                    is_sample = message.schema == SAMPLE
+                    if message.encoding != "json" or message.schema == FRAME:
+                        continue
+                    if is_sample and not has_samples:
+                        has_samples, channels = True, {}
+                    if is_sample or not has_samples:
+                        _collect(channels, message, head, "" if is_sample else message.topic)
+            except self._DAMAGE as error:
+                damage = f"{type(error).__name__}: {error}".splitlines()[0][:200]
+        if not channels:
+            problem = f"the MCAP file is damaged ({damage})" if damage else ""
+            problem = problem or "the MCAP file holds no numbers"
+            raise InputError(problem, source=head.path, cure="record it again")
+        found = {name: Channel(np.array(t), np.array(v)) for name, (t, v) in channels.items()}
+        if has_samples:
+            draft = _draft_of_samples(head, found)
+        else:
+            draft = _draft_of_channels(head, list(found), columns, lambda _: found)
+        if damage:
+            draft.remarks.append(f"the file is cut off or damaged ({damage})")
+        return draft
+
+
+def _collect(
+    channels: dict[str, tuple[array[float], array[float]]],
+    message: McapMessage,
+    head: Head,
+    topic: str,
+) -> None:
+    for field, value in _numbers(message.fields(), ""):
+        name = f"{topic} {field}".strip()
+        if name not in channels and len(channels) >= MAX_COLUMNS:
+            continue
+        times, values = channels.setdefault(name, (array("d"), array("d")))
+        if len(times) >= MAX_ROWS:
+            problem = f"more than the {MAX_ROWS} rows that a log may have"
+            raise InputError(problem, source=head.path, cure="split it")
+        times.append(message.time_ns / 1_000_000_000)
+        values.append(value)
+
+
+def _numbers(fields: Mapping[str, Any], before: str) -> Iterator[tuple[str, float]]:
+    """Yield the numbers of an object and of objects in it, by their dotted names."""
+    for name, value in fields.items():
+        if isinstance(value, dict):
+            yield from _numbers(value, f"{before}{name}.")
+        elif isinstance(value, int | float) and not isinstance(value, bool):
+            yield f"{before}{name}", float(value)
+
+
+def _draft_of_samples(head: Head, found: Mapping[str, Channel]) -> DraftLog:
+    """Return the samples of a recording; a value that one lacks is filled from its neighbours."""
+    draft = DraftLog(head.name, str(head.path))
+    rows = found.get("time_s")
+    if rows is None or "current_a" not in found or "voltage_v" not in found:
+        problem = "the samples lack time, current or voltage"
+        raise InputError(problem, source=head.path, cure="record it again")
+    draft.values["time_s"] = rows.values
+    for field in FIELDS.values():
+        if field in found and field != "time_s":
+            is_held = field in {"temperature_c", "soc_pct"}
+            draft.values[field], _ = _on_raster(rows.time_s, found[field], field, is_held=is_held)
+        draft.labels[field] = f"/sample {field}"
+    return draft
+
+
+READERS: Final = (Mf4Signals(), McapSamples())

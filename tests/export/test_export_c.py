@@ -1,0 +1,210 @@
+"""`cangauge export-c`: the exported sources compile cleanly and give the package's numbers."""
+
+from __future__ import annotations
+
+import re
+import shutil
+import subprocess
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from cangauge.cli.app import app
+from cangauge.errors import InputError
+from cangauge.estimation.offline import run_estimator, samples_of
+from cangauge.estimation.settings import EstimatorSettings
+from cangauge.extras.embedded.c_source import CORE_HEADERS, CORE_SOURCES
+from cangauge.extras.embedded.embedded import drive_with_events, export_c
+from cangauge.identify.fit import fit
+from cangauge.logs.read import read_log
+from cangauge.model.model_file import Model
+from cangauge.model.published import leaf_2012_model_file
+from cangauge.types import Sample
+from estimation.test_snapshot import extended_by
+
+PLAIN = leaf_2012_model_file()
+EFFECTS = [
+    "current_offset", "voltage_gain", "time_skew", "core_temperature", "resistance_temperature",
+    "resistance_soc", "charge_transfer", "slow_diffusion", "hysteresis", "ocv_shape",
+]  # fmt: skip
+STRICT = ["-std=c99", "-Wall", "-Wextra", "-Wconversion", "-Werror", "-ffp-contract=off"]
+
+needs_make = pytest.mark.skipif(
+    not (shutil.which("make") and shutil.which("cc")), reason="no make or no C compiler"
+)
+
+
+@pytest.fixture(scope="module")
+def folders(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """Exports of the published model, of a curve of knots, and of that with effects."""
+    knots = Model.prior("oxide", 96, 60.0)
+    effects = knots.model_copy(update={"effects": extended_by(EFFECTS).effects})
+    made = {}
+    for name, model in (("plain", PLAIN), ("knots", knots), ("effects", effects)):
+        made[name] = tmp_path_factory.mktemp(name)
+        export_c(model, made[name])
+    return made
+
+
+def run(folder: Path, *command: str) -> str:
+    done = subprocess.run(
+        command, check=False, cwd=folder, capture_output=True, text=True, timeout=300
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    return done.stdout
+
+
+@needs_make
+@pytest.mark.parametrize("which", ["plain", "knots", "effects"])
+def test_exported_tests_pass(folders: dict[str, Path], which: str) -> None:
+    output = run(folders[which], "make", "test")
+    doubles, _, floats = output.partition("./test-float")
+    assert doubles.count("PASSED") == floats.count("PASSED") == 1
+
+
+@needs_make
+@pytest.mark.parametrize("real", ["double", "float"])
+def test_core_compiles_without_a_warning(folders: dict[str, Path], real: str) -> None:
+    for folder, config in ((folders["effects"], "-DCANGAUGE_CONFIG"), (folders["plain"], "-DX")):
+        run(
+            folder, "cc", *STRICT, config, f"-DCANGAUGE_REAL={real}", "-fsyntax-only", *CORE_SOURCES
+        )
+
+
+@needs_make
+def test_sanitizers_find_nothing(folders: dict[str, Path]) -> None:
+    flags = [*STRICT, "-g", "-fsanitize=address,undefined", "-fno-sanitize-recover=all"]
+    own = ["pack_model.c", "frames.c", "soc_frames.c", "test.c"]
+    folder = folders["effects"]
+    flags.remove("-Wconversion")  # cantools' frames
+    run(folder, "cc", *flags, "-DCANGAUGE_CONFIG", *CORE_SOURCES, *own, "-lm", "-o", "sanitized")
+    assert "PASSED" in run(folder, "./sanitized")
+
+
+@pytest.mark.skipif(not shutil.which("cppcheck"), reason="no cppcheck")
+def test_cppcheck_finds_nothing(folders: dict[str, Path]) -> None:
+    run(
+        folders["effects"], "cppcheck", "--std=c99", "--quiet", "--error-exitcode=1",
+        "--enable=warning,style,performance,portability",
+        *CORE_SOURCES,
+    )  # fmt: skip
+
+
+@pytest.mark.skipif(
+    not (shutil.which("arm-none-eabi-gcc") and shutil.which("qemu-system-arm")),
+    reason="no gcc-arm-none-eabi or no qemu-system-arm",
+)
+def test_cortex_m4f_gives_the_numbers_in_qemu(folders: dict[str, Path]) -> None:
+    output = run(folders["effects"], "make", "arm")
+    assert "PASSED" in output
+    assert re.search(r"instructions: \d+ a sample, \d+ where its voltage is used", output)
+
+
+@needs_make
+@pytest.mark.parametrize("text", ["", "time,current\n", "0,1,385,23\nlast line\n"])
+def test_example_tells_what_is_no_sample(folders: dict[str, Path], text: str) -> None:
+    run(folders["plain"], "make", "example")
+    done = subprocess.run(
+        ["./example"], check=False, cwd=folders["plain"], input=text, capture_output=True,
+        text=True, timeout=60,
+    )  # fmt: skip
+    assert done.returncode == 1
+    assert "time,current,voltage,temperature" in done.stderr
+
+
+@needs_make
+def test_example_writes_a_frame_for_each_sample(folders: dict[str, Path]) -> None:
+    run(folders["plain"], "make", "example")
+    rows = "time_s,current_a,voltage_v,temperature_c\n"
+    rows += "".join(f"{k},{10.0},{385.0},{23.0}\n" for k in range(20))
+    done = subprocess.run(
+        ["./example"], check=True, cwd=folders["plain"], input=rows, capture_output=True, text=True,
+        timeout=60,
+    )  # fmt: skip
+    lines = done.stdout.splitlines()
+    assert len(lines) == 20
+    assert all(re.search(r"reasons [0-9a-f]{5},( [0-9A-F]{2}){8}$", line) for line in lines)
+
+
+@needs_make
+@pytest.mark.real
+def test_floats_estimate_a_held_out_trip_as_python(shared_data: Path, tmp_path: Path) -> None:
+    trips = [read_log(shared_data / "bmw_i3" / f"TripA0{k}.csv.gz") for k in (1, 3, 5, 6)]
+    *training, held_out = trips
+    model, log = fit(training, capacity_ah=60.0).model, held_out.rows(slice(None, None, 10))
+    export_c(model, tmp_path, period_s=1.0)
+    run(tmp_path, "make", "example", "CC=cc -DCANGAUGE_REAL=float")
+    rows = "".join(",".join(map(repr, sample)) + "\n" for sample in samples_of(log))
+    done = subprocess.run(
+        ["./example"], check=True, cwd=tmp_path, input=rows, capture_output=True, text=True,
+        timeout=60,
+    )  # fmt: skip
+    found = [float(line.split()[1]) for line in done.stdout.splitlines()]
+    expected = run_estimator(log, model, EstimatorSettings()).soc_pct
+    np.testing.assert_allclose(found, expected, atol=0.02)
+
+
+def test_core_calls_nothing_but_mathematics(folders: dict[str, Path]) -> None:
+    for name in CORE_HEADERS + CORE_SOURCES:
+        text = (folders["plain"] / name).read_text(encoding="utf-8")
+        included = set(re.findall(r'#include [<"]([^>"]+)', text))
+        assert included <= {
+            "math.h", "stdbool.h", "stddef.h", "stdint.h", "cangauge.h", "cangauge_internal.h",
+            "cangauge_config.h",
+        }  # fmt: skip
+        assert not re.search(r"\b(malloc|calloc|free|goto|setjmp)\b", text)
+
+
+def test_drive_of_the_tests_has_its_events() -> None:
+    samples = list(drive_with_events(PLAIN, 0.1))
+    steps = [b.time_s - a.time_s for a, b in pairwise(samples)]
+    assert min(steps) < 0.2
+    assert sum(step > 2.0 for step in steps) == 2
+    assert any(sample.voltage_v != sample.voltage_v for sample in samples)
+    assert all(isinstance(sample, Sample) for sample in samples)
+
+
+def test_command_names_what_it_wrote(tmp_path: Path) -> None:
+    PLAIN.save(tmp_path / "pack.json")
+    done = CliRunner().invoke(
+        app, ["export-c", str(tmp_path / "pack.json"), "-o", str(tmp_path / "c"), "--json"]
+    )
+    assert done.exit_code == 0, done.output
+    assert (tmp_path / "c" / "pack_model.c").is_file()
+    assert '"delay_line_bytes"' in done.output
+
+
+def test_a_file_in_place_of_the_folder_is_refused(tmp_path: Path) -> None:
+    PLAIN.save(tmp_path / "pack.json")
+    (tmp_path / "ecm.py").write_text("kept")
+    arguments = ["export-c", str(tmp_path / "pack.json"), "-o", str(tmp_path / "ecm.py")]
+    with pytest.raises(InputError, match="is a file"):
+        CliRunner().invoke(app, arguments, catch_exceptions=False)
+    assert (tmp_path / "ecm.py").read_text() == "kept"
+
+
+@pytest.mark.parametrize("name", ["x" * 300, "x" * 300 + "/new"])
+def test_a_folder_that_cannot_be_made_is_refused(tmp_path: Path, name: str) -> None:
+    PLAIN.save(tmp_path / "pack.json")
+    arguments = ["export-c", str(tmp_path / "pack.json"), "-o", str(tmp_path / name)]
+    with pytest.raises(InputError, match="too long"):
+        CliRunner().invoke(app, arguments, catch_exceptions=False)
+
+
+def test_own_files_are_kept_and_an_export_is_renewed(tmp_path: Path) -> None:
+    (tmp_path / "Makefile").write_text("kept")
+    with pytest.raises(InputError, match="not from an export") as error:
+        export_c(PLAIN, tmp_path)
+    assert error.value.value == ["Makefile"]
+    assert [each.name for each in tmp_path.iterdir()] == ["Makefile"]
+    assert (tmp_path / "Makefile").read_text() == "kept"
+    export_c(PLAIN, tmp_path / "new")
+    export_c(PLAIN, tmp_path / "new", period_s=1.0)
+
+
+def test_period_out_of_range_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"0\.001"):
+        export_c(PLAIN, tmp_path, period_s=0.0)

@@ -1,0 +1,277 @@
+"""What single formats define: instruments, set points, excluded rows, rasters, probes."""
+
+from __future__ import annotations
+
+import datetime as dt
+import gzip
+import json
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from log_cases import CASES, CURRENT_A, START, TIME_S, VOLTAGE_V, content_of
+
+from cangauge.errors import InputError
+from cangauge.logs.log import Log
+from cangauge.logs.read import read_log
+
+
+def changed(folder: Path, name: str, old: str, new: str, file_name: str = "") -> Log:
+    """Read a case with a text replaced in it."""
+    text = content_of(CASES[name]).decode("latin-1")
+    assert re.search(old, text)
+    path = folder / (file_name or CASES[name].get("name", "x.csv"))
+    path.write_text(re.sub(old, new, text), encoding="latin-1")
+    return read_log(path)
+
+
+# ---- D3, cyclers, probes
+
+
+def test_200_a_clamp_is_the_second_choice(tmp_path: Path) -> None:
+    name = "d3-2012"
+    assert changed(tmp_path, name, "w/500A", "w/9A").current_a[3] == 20.0  # that clamp saturates
+    log = changed(tmp_path, name, r"\t-?\d+\.0(\t[\d.]+\t20)\b", r"\t\1")
+    assert any("500A max clamp [A] is empty and was not used" in text for text in log.remarks)
+    assert "current_a from the 200 A clamp" in log.remarks
+    assert "1 row before time 0 (the wait before the test) dropped" in log.remarks
+
+
+def test_instrument_is_never_turned_a_can_copy_may_be(tmp_path: Path) -> None:
+    log = changed(tmp_path, "d3-can-copy", "current_wide_CAN5", "Curr_Hioki_I1")
+    np.testing.assert_array_equal(log.current_a, -CURRENT_A)
+    assert {"current_a from the power analyser", "voltage_v from the car's CAN"} <= set(log.remarks)
+    assert any(text.startswith("current looks inverted and was kept") for text in log.remarks)
+
+
+def test_rate_in_a_file_name_is_no_set_point(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="the file holds no temperature"):
+        changed(tmp_path, "bitrode-without-a-header", "No", "No", "2C-Discharge.csv")
+
+
+def test_rows_that_bitrode_excludes_are_dropped(tmp_path: Path) -> None:
+    log = changed(tmp_path, "bitrode-without-a-header", "No,5.0", "Yes,5.0")
+    assert log.time_s[:7].tolist() == [0.0, 1.0, 2.0, 3.0, 4.0, 6.0, 7.0]
+    assert "1 row that the cycler excludes dropped" in log.remarks
+
+
+def test_rows_without_a_value_are_dropped_with_a_remark(tmp_path: Path) -> None:
+    log = changed(tmp_path, "bmw-i3", r"\n5\.0;0;[\d.]*;", "\n5.0;0;;")
+    assert len(log) == 59
+    assert any(text.startswith("1 row without time, current, volt") for text in log.remarks)
+
+
+@pytest.mark.parametrize(
+    ("head", "row", "mean_c", "words"),
+    [
+        ("T1,T2,T3", "21,22,-40", 21.5, "T3 left out in 60 rows, .*20 K.*first -40"),
+        ("T1 [°F],T2 [°F],T3 [°F]", "69.8,71.6,419", 21.5, r"T3 \[°F\] left out"),
+        ("T1,T2,T3", "15,21,27", 21.0, ""),
+        ("T1,T2", "31,-40", -4.5, "T1 and T2 are 31 and -40 in row 1: one of the probes fails"),
+        ("T1,T2,T3", "20,127,", 73.5, "one of the probes fails"),
+        ("T,T1,T2", "20,21,22", 20.0, ""),
+    ],
+)
+def test_probe_far_from_the_others_has_a_remark(
+    tmp_path: Path, head: str, row: str, mean_c: float, words: str
+) -> None:
+    rows = zip(TIME_S, CURRENT_A, VOLTAGE_V, strict=True)
+    lines = [f"time,current,voltage,{head}", *(f"{t},{i},{u},{row}" for t, i, u in rows)]
+    (tmp_path / "x.csv").write_text("\n".join(lines) + "\n")
+    log = read_log(tmp_path / "x.csv")
+    assert log.temperature_c == pytest.approx(mean_c, abs=0.01)
+    told = [text for text in log.remarks if "probe" in text]
+    assert len(told) == bool(words)
+    assert re.search(words, "".join(told))
+
+
+# ---- what the user states, and what was assumed
+
+
+def test_what_was_assumed_and_ignored_is_told(tmp_path: Path) -> None:
+    log = changed(tmp_path, "plain-without-units", "soc", "driver")
+    assert log.assumed == (
+        'time = "time" [s, assumed]',
+        'current = "current" [A, assumed]',
+        'voltage = "voltage" [V, assumed]',
+        'temperature = "temperature" [°C, assumed]',
+        "positive current discharges, found from the data",
+    )
+    assert "1 other column ignored: driver" in log.remarks
+
+
+def test_stated_sign_that_the_data_contradict_warns(tmp_path: Path) -> None:
+    path = tmp_path / "x.csv"
+    path.write_bytes(content_of(CASES["plain-with-brackets"]))
+    log = read_log(path, sign="charge")
+    np.testing.assert_array_equal(log.current_a, -CURRENT_A)
+    assert any("the stated sign of current looks inverted" in text for text in log.remarks)
+
+
+def test_stated_sign_agrees_with_a_format_that_defines_it(tmp_path: Path) -> None:
+    path = tmp_path / "TripA01.csv"
+    path.write_bytes(content_of(CASES["bmw-i3"]))
+    np.testing.assert_array_equal(read_log(path, sign="charge").current_a, CURRENT_A)
+    np.testing.assert_array_equal(read_log(path, sign="discharge").current_a, -CURRENT_A)
+
+
+def test_soc_against_the_charge_is_left_out(tmp_path: Path) -> None:
+    rows = (
+        f"{k},{40.0 if k % 4 < 2 else -4.0},{380.0 - (4.0 if k % 4 < 2 else -0.4)},21,{10 + k / 50}"
+        for k in range(200)
+    )
+    path = tmp_path / "x.csv"
+    path.write_text("\n".join(["time,current,voltage,temp,soc", *rows]) + "\n")
+    log = read_log(path)
+    assert log.soc_pct is None
+    assert log.current_a[0] == 40.0
+    assert any(text.startswith("SoC left out: it moves from 10") for text in log.remarks)
+
+
+def test_constant_temperature_in_place_of_the_files(tmp_path: Path) -> None:
+    path = tmp_path / "x.csv"
+    path.write_bytes(content_of(CASES["canonical"]))
+    log = read_log(path, temperature_c=-5.0, temperature_source="pack")
+    assert set(log.temperature_c) == {-5.0}
+    assert log.temperature_source == "pack"
+    assert "temperature -5 °C as given in place of the file's" in log.remarks
+
+
+# ---- workbooks, MF4, MCAP
+
+
+def test_workbook_reads_as_its_longest_sheet(tmp_path: Path) -> None:
+    openpyxl = pytest.importorskip("openpyxl")
+    book = openpyxl.Workbook()
+    book.active.append(["Global info"])
+    sheet = book.create_sheet("Channel_1")
+    sheet.append(["Date_Time", "Current (A)", "Voltage (V)", "Temp (°C)"])
+    for k in range(60):
+        when = (START + dt.timedelta(seconds=k)).replace(tzinfo=None)
+        sheet.append([when, float(CURRENT_A[k]), float(VOLTAGE_V[k]), 21.5])
+    path = tmp_path / "log.xlsx"
+    book.save(path)
+    log = read_log(path)
+    np.testing.assert_allclose(log.time_s - log.time_s[0], TIME_S)
+    np.testing.assert_array_equal(log.current_a, CURRENT_A)
+    path.write_bytes(path.read_bytes()[:-300])
+    with pytest.raises(InputError, match=r"log\.xlsx: the zip file is cut off or damaged"):
+        read_log(path)
+
+
+def test_mf4_signals_of_several_rasters_become_a_log(tmp_path: Path) -> None:
+    asammdf = pytest.importorskip("asammdf")
+    fast, slow = np.arange(0.0, 60.0, 0.1), np.arange(0.0, 60.0)
+    current = np.where(fast % 10.0 < 5.0, 40.0, -10.0)
+    path = tmp_path / "trip.mf4"
+    with asammdf.MDF(version="4.10") as file:
+        signal = asammdf.Signal
+        file.append([signal(current, fast, unit="A", name="BMS_PackCurrent")])
+        file.append(
+            [
+                signal(380.0 + slow, slow, unit="V", name="BMS_PackVoltage"),
+                signal(np.full(60, 12.6), slow, unit="V", name="LowVoltage_12V"),
+            ]
+        )
+        file.append([signal(20.0 + slow // 30, slow, unit="°C", name="BMS_PackTemp")])
+        file.save(path, overwrite=True)
+    log = read_log(path)
+    whole = log.time_s <= 59.0
+    np.testing.assert_allclose(log.time_s, fast[: len(log)])
+    np.testing.assert_array_equal(log.current_a, current[: len(log)])
+    np.testing.assert_allclose(log.voltage_v[whole], 380.0 + log.time_s[whole])
+    assert set(log.temperature_c) == {20.0, 21.0}
+    assert log.remarks[0] == "MF4 with 4 channels"
+    assert "BMS_PackVoltage [V]: interpolated between its 60 values" in log.remarks
+    packed = tmp_path / "trip.mf4.gz"
+    packed.write_bytes(gzip.compress(path.read_bytes()))
+    assert set(read_log(packed, columns="voltage=LowVoltage_12V").voltage_v) == {12.6}
+    with pytest.raises(InputError, match=r"BMS_Voltag.*did you mean BMS_PackVoltage"):
+        read_log(path, columns="voltage=BMS_Voltag")
+    path.write_bytes(path.read_bytes()[:3000])
+    with pytest.raises(InputError, match=r"trip\.mf4: "):
+        read_log(path)
+
+
+def write_mcap(
+    path: Path, schema: str, topic: str, rows: list[dict[str, Any]], step_ns: int = 10**9
+) -> None:
+    module = pytest.importorskip("mcap.writer")
+    with path.open("wb") as file:
+        writer = module.Writer(file)
+        writer.start()
+        number = writer.register_schema(schema, "jsonschema", b'{"type":"object"}')
+        channel = writer.register_channel(topic, "json", number)
+        for k, row in enumerate(rows):
+            writer.add_message(channel, k * step_ns, json.dumps(row).encode(), k * step_ns)
+        writer.finish()
+
+
+def test_mcap_samples_are_a_log_up_to_a_cut(tmp_path: Path) -> None:
+    rows: list[dict[str, Any]] = [
+        {"time_s": 7.0 + t, "current_a": i} | ({"voltage_v": 380.0 + t} if k % 4 != 1 else {})
+        for k, (t, i) in enumerate(zip(0.4 * TIME_S, CURRENT_A, strict=True))
+    ]
+    rows[5]["temperature_c"] = 21.5
+    path = tmp_path / "x.mcap"
+    write_mcap(path, "cangauge.Sample", "/sample", rows, 400_000_000)
+    log = read_log(path)
+    np.testing.assert_allclose(log.time_s, 7.0 + 0.4 * TIME_S)
+    np.testing.assert_allclose(log.voltage_v, 380.0 + 0.4 * TIME_S)  # filled over 0.8 s
+    assert set(log.temperature_c) == {21.5}
+    path.write_bytes(path.read_bytes()[:400])
+    with pytest.raises(InputError, match=r"x\.mcap: the MCAP file is damaged"):
+        read_log(path)  # its only chunk is cut
+
+
+def test_numbers_of_any_mcap_are_channels(tmp_path: Path) -> None:
+    rows = [
+        {"pack": {"current_A": i, "voltage_V": u}, "temperature_C": 20.0, "state": "drive"}
+        for i, u in zip(CURRENT_A, VOLTAGE_V, strict=True)
+    ]
+    path = tmp_path / "robot.mcap"
+    write_mcap(path, "Battery", "/battery", rows)
+    columns = "current=/battery pack.current_A,voltage=/battery pack.voltage_V"
+    log = read_log(path, columns=columns)
+    np.testing.assert_array_equal(log.time_s, TIME_S)
+    np.testing.assert_array_equal(log.current_a, CURRENT_A)
+    assert log.temperature_c[0] == 20.0
+    path.write_bytes(path.read_bytes()[:60])
+    with pytest.raises(InputError, match="the MCAP file is damaged"):
+        read_log(path)
+
+
+# ---- a reader of another package
+
+
+def test_reader_of_another_package_is_offered_files_first(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from cangauge.logs import read  # noqa: PLC0415
+    from cangauge.logs.draft import DraftLog  # noqa: PLC0415
+
+    class MyLogger:
+        name = "my logger"
+        takes_columns = False
+
+        def matches(self, head: Any) -> bool:
+            return bool(head.first_line.startswith("MYLOGGER"))
+
+        def read(self, head: Any, _columns: object = None, /) -> DraftLog:
+            rows = [line.split() for line in head.read().decode().splitlines()[1:]]
+            time_s, current_a, voltage_v = np.array(rows, dtype=float).T
+            values = {"time_s": time_s, "current_a": current_a, "voltage_v": voltage_v}
+            return DraftLog(head.name, str(head.path), values)
+
+    class EntryPoint:
+        def load(self) -> type[MyLogger]:
+            return MyLogger
+
+    monkeypatch.setattr(read, "entry_points", lambda group: [EntryPoint()] * (group == read.GROUP))
+    monkeypatch.setattr(read, "_readers", read._readers.__wrapped__)
+    rows = (f"{t} {i} {u}\n" for t, i, u in zip(TIME_S, CURRENT_A, VOLTAGE_V, strict=True))
+    (tmp_path / "mine.txt").write_text("MYLOGGER 1\n" + "".join(rows))
+    log = read_log(tmp_path / "mine.txt", temperature_c=20.0)
+    np.testing.assert_array_equal(log.current_a, CURRENT_A)
