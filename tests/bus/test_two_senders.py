@@ -76,7 +76,7 @@ def decoded(vehicle: Vehicle, frames: list[can.Message]) -> tuple[SampleDecoder,
 
 
 @pytest.mark.parametrize("ahead", [0, 1, 2, 3])
-@pytest.mark.parametrize("later", [0.3, 0.5, 0.7])
+@pytest.mark.parametrize("later", [-0.1, 0.2, 0.5, 0.7])
 def test_a_second_sender_is_reported_whatever_its_counter(ahead: int, later: float) -> None:
     decoder, first = decoded(LEAF, attacked(LEAF, ahead, later))
     assert FROM <= first <= FROM + 30
@@ -86,8 +86,9 @@ def test_a_second_sender_is_reported_whatever_its_counter(ahead: int, later: flo
     assert math.isnan(decoder.health["current"].value_at(decoder.now_s))
 
 
-def test_without_a_stated_period_it_is_learned() -> None:
-    decoder, first = decoded(GENERIC, attacked(GENERIC, 2, 0.3))
+@pytest.mark.parametrize(("ahead", "later"), [(0, -0.1), (1, 0.2), (2, 0.3), (7, 0.3)])
+def test_without_a_stated_period_it_is_learned(ahead: int, later: float) -> None:
+    decoder, first = decoded(GENERIC, attacked(GENERIC, ahead, later))
     assert FROM <= first <= FROM + 60
     assert decoder.two_sender_messages == (GENERIC.current.message,)
 
@@ -132,6 +133,14 @@ def restarted(frames: list[can.Message], rng: Random) -> Iterator[can.Message]:
             yield forged(frame, rule_of(LEAF), rng.randrange(4), 0.0)
 
 
+def stuck(frames: list[can.Message], _rng: Random) -> Iterator[can.Message]:
+    for frame in frames:
+        if frame.arbitration_id == LEAF.current.arbitration_id:
+            data = rule_of(LEAF).protect(bytearray(frame.data), 2)
+            frame.data[:] = data
+        yield frame
+
+
 def in_bursts(seconds: float) -> Callable[[list[can.Message], Random], Iterator[can.Message]]:
     def change(frames: list[can.Message], rng: Random) -> Iterator[can.Message]:
         for frame in frames:
@@ -147,6 +156,7 @@ LAWFUL = {
     "40 % lost": lossy,
     "damaged frames between": damaged,
     "restarted": restarted,
+    "stuck counter": stuck,
     "bursts of 20 ms": in_bursts(0.02),
     "bursts of 0.5 s": in_bursts(0.5),
 }

@@ -357,8 +357,8 @@ SOON: Final = 0.8
 """A frame this soon after the one before [periods] is not the next one of the same sender: senders
 keep their period within some percent."""
 SUSPECTED_AT: Final = 8.0
-"""Frames out of sequence and too soon, from which a second sender is suspected: a sender that
-restarts makes one or two."""
+"""Frames out of sequence, repeated or too soon, from which a second sender is suspected: a sender
+that restarts makes one or two."""
 FORGIVEN: Final = 1.0 / 3.0
 """Such frames forgiven by each frame in sequence: of two senders at least every second frame is out
 of sequence, of lost frames in bursts (stamps of a batch are equal) one in four or fewer."""
@@ -368,9 +368,9 @@ class FrameChecker:
     """Check the frames of one message in order of time.
 
     A repeated counter is no new frame, unless enough time has passed for the counter to wrap: on a
-    lossy bus one in `modulus` of the surviving frames looks like a repetition. Frames that come
-    out of sequence and too soon are those of a second sender; CAN itself repeats some frames after
-    an error, which are identical.
+    lossy bus one in `modulus` of the surviving frames looks like a repetition. Frames that repeat a
+    counter with another content, or come out of sequence too soon, are those of a second sender;
+    CAN itself repeats some frames after an error, which are identical.
 
     Parameters
     ----------
@@ -398,6 +398,7 @@ class FrameChecker:
         self._last_s = 0.0
         self._refused = 0
         self._content: bytes | bytearray = b""
+        self._is_repeated = False
         self._odd = 0.0
         self.lost = 0
         self.learned_period_s: Callable[[], float] = lambda: math.nan
@@ -420,15 +421,20 @@ class FrameChecker:
         steps = (counter - last) % modulus
         if steps == 1 or last < 0:
             self._last, self._refused, self._content = counter, 0, data
+            self._is_repeated = False
             if self._odd:
                 self._odd = max(self._odd - FORGIVEN, 0.0)
             return Verdict.GOOD
         period_s = self.learned_period_s() if self._period_s is None else self._period_s
-        if 0.0 <= elapsed_s < SOON * period_s and data != self._content:
+        is_soon = 0.0 <= elapsed_s < SOON * period_s
+        is_repeated, was_repeated = steps == 0 and elapsed_s <= self._half_wrap_s, self._is_repeated
+        self._is_repeated = is_repeated
+        # The second repetition in a row is a stuck counter.
+        if (is_soon or (is_repeated and not was_repeated)) and data != self._content:
             self._odd = min(self._odd + 1.0, 2.0 * SUSPECTED_AT)
+        if is_repeated:
+            return Verdict.REPEATED
         if steps == 0:
-            if elapsed_s <= self._half_wrap_s:
-                return Verdict.REPEATED
             steps = min(modulus, WIDE)
         elif (
             modulus >= WIDE
