@@ -14,7 +14,7 @@ import pytest
 from cangauge.bus.decoder import SUSPECTED_FOR_S, SampleDecoder
 from cangauge.bus.encoder import FrameEncoder
 from cangauge.bus.protection import Protection
-from cangauge.bus.recording import capture_samples
+from cangauge.bus.recording import capture_samples, open_vehicle_capture
 from cangauge.bus.vehicle import Vehicle
 from cangauge.types import Reason, Sample
 
@@ -177,3 +177,16 @@ def test_remarks_of_a_capture_name_it(tmp_path: Path) -> None:
             frame.channel = "can0"
             writer.on_message_received(frame)
     assert any("two senders" in remark for remark in capture_samples(path, LEAF).remarks)
+
+
+@pytest.mark.real
+@pytest.mark.parametrize("batch_s", [0.01, 0.1])
+def test_a_lossy_capture_in_batches_has_one_sender(shared_data: Path, batch_s: float) -> None:
+    name = "env200-2015-with-40kWh-startup-nobridge.crtd.gz"  # 887 frames lost of 2,800
+    decoder = SampleDecoder(LEAF)
+    for frame in open_vehicle_capture(shared_data / "leaf_can" / name, LEAF):
+        if frame.channel == 1:
+            frame.timestamp = math.ceil(frame.timestamp / batch_s) * batch_s
+            decoder.handle(frame)
+    assert decoder.statistics.counter_jumps > 100
+    assert decoder.statistics.two_senders == 0
