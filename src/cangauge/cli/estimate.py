@@ -204,7 +204,7 @@ def _write_output(
     done: RecordedEstimate, output: Path, report: Path | None, model_path: Path
 ) -> None:
     """Write table and report, or neither."""
-    from cangauge.service.estimate_mcap import write_estimates_mcap
+    from cangauge.extras.formats.estimate_mcap import write_estimates_mcap
     from cangauge.service.estimate_table import write_estimates
 
     page = None

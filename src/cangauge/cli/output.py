@@ -104,8 +104,8 @@ def _plain(value: Any) -> Any:
     return value
 
 
-def print_table(title: str, head: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
-    """Print a table of plain text on stdout; its first column is left-aligned.
+def text_table(title: str, head: Sequence[str], rows: Sequence[Sequence[str]]) -> Table:
+    """Return a table of plain text; its first column is left-aligned.
 
     Parameters
     ----------
@@ -123,4 +123,9 @@ def print_table(title: str, head: Sequence[str], rows: Sequence[Sequence[str]]) 
     for row in rows:
         # Text: brackets in names are not markup.
         table.add_row(*(Text(printable(cell)) for cell in row))
-    PlainConsole(highlight=False).print(table)
+    return table
+
+
+def print_table(title: str, head: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
+    """Print a table of plain text on stdout; arguments as of `text_table`."""
+    PlainConsole(highlight=False).print(text_table(title, head, rows))

@@ -50,9 +50,8 @@ def _load(root: Path) -> Any:
         core: Any = import_module("cangauge._core")
     except ImportError:  # no compiler at installation
         return None
-    sizes: dict[str, int] = getattr(core, "SIZES", {})  # one of an older layout has none
-    types = {name: getattr(layout, name.upper()) for name in sizes}
-    is_alike = bool(sizes) and all(types[name].itemsize == size for name, size in sizes.items())
+    types = {name: getattr(layout, name.upper()) for name in core.SIZES}
+    is_alike = all(types[name].itemsize == size for name, size in core.SIZES.items())
     folder = root / "core"
     is_stale = (folder / "cangauge.h").is_file() and sources_digest(folder) != core.SOURCES
     if is_stale or not is_alike:
@@ -226,6 +225,7 @@ class CompiledEstimator(Estimator):
         self._counter.restore(CounterState(**counter), is_restored=is_restored)
         used = 5 + len(self._online.load_coefficients)
         block["sums"] = block["sums"][:used] if block["rows"] else []
+        block["columns"] = used - 5 if block["rows"] else 0
         self._block.restore(BlockState(**block))
         memory = _plain(record["memory"])
         memory["doubt"] = layout.DOUBTS[memory["doubt"]]
@@ -290,7 +290,7 @@ class CompiledEstimator(Estimator):
         record["memory"]["innovation2"][: len(squares)] = squares
         _set(record["memory"], memory | {"innovations": len(squares)})
         block = asdict(self._block.snapshot())
-        sums = block.pop("sums")
+        sums = block.pop("sums")[: 5 + block.pop("columns")]  # the core sums no drives
         record["block"]["sums"] = 0.0
         record["block"]["sums"][: len(sums)] = sums
         _set(record["block"], block)
