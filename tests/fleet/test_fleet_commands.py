@@ -151,7 +151,7 @@ def test_a_log_that_does_not_fit_the_others_is_named(
     assert misfit["mean_v"] > 0.0
     without = json.loads(fit("--leave-out", wrong, "--json").out)
     assert (without["logs"], without["misfits"]) == (len(logs), [])
-    assert without["voltage_mae_pct"] < found["voltage_mae_pct"]
+    assert without["voltage_rmse_v"] < found["voltage_rmse_v"]
     assert fit("--leave-out", logs[0].url).code == 2
 
 

@@ -10,7 +10,7 @@ import pytest
 
 from cangauge._io import atomic_path, check_writable
 from cangauge.errors import InputError
-from cangauge.service.recording import Recorder
+from cangauge.service.record import Recorder
 from live import in_process, leaf_model_path
 
 needs_root = pytest.mark.skipif(

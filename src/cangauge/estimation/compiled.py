@@ -52,12 +52,11 @@ def _load(root: Path) -> Any:
         core: Any = import_module("cangauge._core")
     except ImportError:  # no compiler at installation
         return None
-    sizes: dict[str, int] = getattr(core, "SIZES", {})  # one of an older layout has none
-    types = {name: getattr(layout, name.upper()) for name in sizes}
-    is_alike = bool(sizes) and all(types[name].itemsize == size for name, size in sizes.items())
     folder = root / "core"
     is_stale = (folder / "cangauge.h").is_file() and sources_digest(folder) != core.SOURCES
-    if is_stale or not is_alike:
+    if is_stale or any(
+        getattr(layout, name.upper()).itemsize != size for name, size in core.SIZES.items()
+    ):
         emit(
             _LOG, logging.WARNING, "core.stale",
             "the compiled core is not of these sources: continuing in Python; "
