@@ -189,9 +189,7 @@ def test_an_interrupted_replay_says_how_far_it_came(bus: list[str], log_path: Pa
 
 
 def test_full_speed_with_nobody_listening(bus: list[str], log_path: Path) -> None:
-    ended = run_to_end(
-        "replay", log_path, *bus, "--speed", "max", "--wait", "0.5", "--json"
-    )
+    ended = run_to_end("replay", log_path, *bus, "--speed", "max", "--wait", "0.5", "--json")
     assert ended.code == 1
     assert "--time-source replay-clock" in ended.json["error"]["message"]
     assert "--time-source replay-clock" in ended.err.splitlines()[-1]
