@@ -14,6 +14,8 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
+from cangauge.identify.passes import fit_voltage_model
+from cangauge.inference.rows import FitOptions, fit_rows
 from rich.console import Console
 from rich.table import Table
 
@@ -27,8 +29,6 @@ from cangauge.extras.validation.recordings import (
     summer_training,
 )
 from cangauge.extras.validation.twin.injection import scaled_to_pack, with_initial_soc
-from cangauge.identify.passes import fit_voltage_model
-from cangauge.inference.rows import FitOptions, fit_rows
 from cangauge.logs.log import Log
 from cangauge.logs.read import read_log
 from cangauge.model.coulomb_counting import capacity_from_reference

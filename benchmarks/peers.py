@@ -25,6 +25,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from cangauge.inference.rows import decimate
 from rich.console import Console
 from rich.table import Table
 
@@ -36,7 +37,6 @@ from cangauge.estimation.settings import EstimatorSettings
 from cangauge.extras.embedded.equivalent_circuit import equivalent_circuit
 from cangauge.extras.validation.packs import RATE_HZ, load
 from cangauge.identify.fit import fit
-from cangauge.inference.rows import decimate
 from cangauge.logs.log import Log
 from cangauge.logs.read import read_log
 from cangauge.model.coulomb_counting import capacity_from_reference

@@ -24,6 +24,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
+from cangauge.inference.rows import FitOptions, fit_rows, sample_log
 from rich.console import Console
 from rich.table import Table
 
@@ -31,7 +32,6 @@ from cangauge.estimation.offline import EstimateTable, run_estimator, samples_of
 from cangauge.estimation.settings import EstimatorSettings
 from cangauge.identify.evaluate import LogFit, evaluate, evaluate_extended
 from cangauge.identify.fit import Identification, fit
-from cangauge.inference.rows import FitOptions, fit_rows, sample_log
 from cangauge.logs.log import Log
 from cangauge.logs.read import read_log
 from cangauge.model.coulomb_counting import capacity_from_reference

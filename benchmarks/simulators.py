@@ -24,20 +24,19 @@ from rich.console import Console
 from rich.progress import track
 from rich.table import Table
 
-from cangauge.diagnosis.cross_validation import rms
-from cangauge.diagnosis.simulator import Run, diagnose_simulator
-from cangauge.extras.validation.recordings import LG_CAPACITY_AH, LG_PARALLEL, LG_SERIES
+from cangauge.diagnosis import diagnose
 from cangauge.extras.validation.twin.injection import scaled_to_pack, with_initial_soc
 from cangauge.identify.fit import fit
 from cangauge.identify.starts import with_start
-from cangauge.inference.rows import decimate
 from cangauge.logs.log import Log
 from cangauge.logs.read import read_log
 
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 REFERENCES = ("551_LA92", "551_US06", "552_Mixed3", "552_Mixed5")
 DIAGNOSED = ("551_Mixed1", "552_Mixed7")
-CAPACITY_AH = LG_CAPACITY_AH * LG_PARALLEL
+LG_SERIES, LG_PARALLEL = 96, 17
+CAPACITY_AH = 2.78 * LG_PARALLEL
+"""By full discharges of a cell at 25 °C [Ah]."""
 START_PCT = 100.0
 RC_TIME_S = 40.0
 """Time constant of the RC element [s]: between the model's delays."""
@@ -147,13 +146,15 @@ FAULTS = (
 )  # fmt: skip
 
 
-def simulated(log: Log, simulator: Simulator, fault: Injected = FAULTS[0]) -> Run:
-    """Return the run of a drive with a fault."""
+def simulated(
+    log: Log, simulator: Simulator, fault: Injected = FAULTS[0]
+) -> tuple[Log, np.ndarray]:
+    """Return a drive with a fault, and what the simulator made of it [V]."""
     given = fault.change(log)
     start_pct = START_PCT + fault.start_pct
     volts = simulator(given, start_pct, fault.capacity_factor)
     keep = np.isfinite(volts)
-    return Run(with_start(given.rows(keep), start_pct), volts[keep])
+    return with_start(given.rows(keep), start_pct), volts[keep]
 
 
 @dataclass(frozen=True)
@@ -181,25 +182,37 @@ def rows(folder: Path) -> Iterator[Row]:
         healthy = [simulated(log, simulator) for log in references]
         for fault in track(FAULTS, description=name, console=Console(stderr=True)):
             runs = [simulated(log, simulator, fault) for log in drives]
-            found = diagnose_simulator(runs, healthy, capacity_ah=CAPACITY_AH)
-            verdict = found.diagnosis.verdict
+            found = diagnose(
+                [log for log, _ in runs],
+                references=[log for log, _ in healthy],
+                simulation={log.source or log.name: volts for log, volts in [*runs, *healthy]},
+                capacity_ah=CAPACITY_AH,
+            )
+            extended = found.extended_model
+            answer = found.posterior
+            corrected = [found.simulator.corrected_v(k, extended) for k in range(len(runs))]
             yield Row(
                 name,
                 fault.effect,
                 fault.size,
-                verdict.cause,
-                verdict.probability,
-                verdict.probabilities[fault.effect],
-                list(verdict.ambiguous_with),
-                rms(np.concatenate([run.log.voltage_v - run.simulated_v for run in runs])),
-                rms(np.concatenate([run.log.voltage_v - found.corrected_v(run) for run in runs])),
-                found.correction,
+                answer.verdict,
+                answer.probability,
+                answer.probabilities[fault.effect],
+                list(answer.ambiguous_with),
+                rms([log.voltage_v - volts for log, volts in runs]),
+                rms([log.voltage_v - v for (log, _), v in zip(runs, corrected, strict=True)]),
+                found.summary.splitlines()[0],
             )
+
+
+def rms(parts: list[np.ndarray]) -> float:
+    """Return the root mean square of arrays together."""
+    return float(np.sqrt(np.mean(np.concatenate(parts) ** 2)))
 
 
 def _drive(folder: Path, name: str) -> Log:
     log = read_log(folder / "lg_hg2" / f"25degC__{name}.parquet")
-    log = log.rows(decimate(log.time_s, 1.0))
+    log = log.rows(np.searchsorted(log.time_s, np.arange(log.time_s[0], log.time_s[-1])))
     pack = scaled_to_pack(log, series=LG_SERIES, parallel=LG_PARALLEL)
     return _above(with_initial_soc(pack, START_PCT))
 

@@ -1,7 +1,7 @@
 /* cangauge.c - clock, counting, and the step from sample to estimate.
  *
- * Follows the Python modules estimation.counting and estimation.estimator operation by operation;
- * their docstrings state equations and sources.
+ * Follows the Python modules estimation.counting, estimation.blocks and estimation.estimator; their
+ * docstrings state equations and sources.
  */
 #include "cangauge_internal.h"
 
@@ -11,7 +11,12 @@
 #define DRAIN_PCT_PER_HOUR 0.05
 #define DRAIN_AT_MOST_PCT 5.0
 #define AWAY_PCT_PER_HOUR 20.0
-#define AWAY_AT_MOST_PCT 30.0
+#define MOVED_AT_MOST 0.3
+#define MOVED_TIME_S 1800.0
+#define SHORTEST_S 1.0
+#define FASTEST_PCT_PER_HOUR 150.0
+#define OFFSET_STD_PER_AH 0.025
+#define CAPACITY_STD 0.05
 #define MEAN_SQUARE_MEMORY_S 300.0
 #define HELD_S 5.0
 #define MEAN_MEMORY_S 60.0
@@ -30,10 +35,8 @@
 #define REST_CURRENT_C_RATE 0.02
 #define REST_S 600.0
 #define CONTRADICTED_S 300.0
-#define MISMATCH_SIGMAS 3.0
-#define LEVEL_MEMORY_S 30.0
+#define MISMATCH_S 600.0
 #define CURRENT_AT_MOST_A 5000.0
-#define TEMPERATURE_MARGIN_K 5.0
 #define SOC_MARGIN_PCT 1.0
 #define OUTSIDE_MARGIN_K 1.0
 #define CURRENT_MARGIN 1.1
@@ -107,8 +110,6 @@ static bool clock_time(cg_clock *clock, cg_time stamp_s, cg_time *time_s)
 
 typedef struct {
     cg_real seconds;
-    cg_real discharged_pct;
-    cg_real gap_std_pct;
     cg_real away_s;
     cg_real parked_std_pct;
 } charge_step;
@@ -129,7 +130,7 @@ static charge_step count(cg_estimator *self, cg_time time_s, cg_real current_a)
     const cg_real gap_s = self->settings.gap_s;
     const cg_time last_s = counter->time_s;
     const cg_real last_a = counter->current_a;
-    charge_step step = {R(0.0), R(0.0), R(0.0), R(0.0), R(0.0)};
+    charge_step step = {R(0.0), R(0.0), R(0.0)};
     counter->time_s = time_s;
     counter->current_a = current_a;
     if (isnan(last_s)) {
@@ -153,18 +154,18 @@ static charge_step count(cg_estimator *self, cg_time time_s, cg_real current_a)
     const cg_real per_as = cg_pct_per_as(model);
     if (seconds > cg_max(R(BRIDGE_S), gap_s)) {
         const cg_real rms_a = cg_sqrt(cg_max(square_a2, last_a * last_a));
-        step.gap_std_pct = cg_min(R(AWAY_PCT_PER_HOUR) * seconds / R(3600.0), R(AWAY_AT_MOST_PCT));
         step.away_s = seconds;
         step.parked_std_pct = parked_std_pct(seconds, rms_a * per_as);
         return step;
     }
     counter->counted_s += (cg_sum)seconds;
-    step.discharged_pct = across_a * seconds * per_as;
-    counter->discharged_pct += (cg_sum)step.discharged_pct;
-    counter->moved_pct += (cg_sum)cg_fabs(step.discharged_pct);
+    const cg_real out_pct = across_a * seconds * per_as;
+    counter->discharged_pct += (cg_sum)out_pct;
+    counter->moved_pct += (cg_sum)cg_fabs(out_pct);
     if (seconds > gap_s) {
         const cg_real ends_a2 = R(0.5) * ((current_a * current_a) + (last_a * last_a));
-        step.gap_std_pct = cg_sqrt(cg_max(square_a2, ends_a2)) * seconds * per_as;
+        const cg_real gap_pct = cg_sqrt(cg_max(square_a2, ends_a2)) * seconds * per_as;
+        counter->gap_var_pct2 += (cg_sum)cg_square(gap_pct);
     }
     return step;
 }
@@ -179,28 +180,59 @@ cg_real cg_uncounted_std_pct(const cg_estimator *self, cg_real seconds)
     return cg_min(rms_a * seconds * cg_pct_per_as(self->model), R(CG_MOVED_STD_AT_MOST_PCT));
 }
 
-/* ------------------------------------------------------------------ SoC of each method */
-
-static cg_sum coulomb_pct(const cg_state *state)
+static cg_real moved_std_pct(cg_real seconds)
 {
-    return state->memory.coulomb_start_pct - state->counter.discharged_pct;
+    return cg_min(R(FASTEST_PCT_PER_HOUR) * seconds / R(3600.0), R(CG_MOVED_STD_AT_MOST_PCT));
 }
 
-static cg_real coulomb_std_pct(const cg_estimator *self)
+static cg_real moved_probability(cg_real seconds)
 {
-    const cg_memory *memory = &self->state.memory;
-    const cg_counter *counter = &self->state.counter;
-    const cg_model *model = self->model;
-    const cg_real hours = (cg_real)(counter->counted_s - memory->coulomb_counted_s) / R(3600.0);
+    return R(-MOVED_AT_MOST) * cg_expm1(-cg_max(seconds, R(SHORTEST_S)) / R(MOVED_TIME_S));
+}
+
+/* ------------------------------------------------------------------ SoC of each method */
+
+static cg_real coulomb_pct(const cg_state *state)
+{
+    return (cg_real)(state->memory.coulomb_start_pct - state->counter.discharged_pct);
+}
+
+static cg_real coulomb_std_pct(const cg_state *state)
+{
+    const cg_memory *memory = &state->memory;
+    const cg_counter *counter = &state->counter;
+    const cg_real seconds = (cg_real)(counter->counted_s - memory->coulomb_counted_s);
     const cg_real moved_pct = (cg_real)(counter->moved_pct - memory->coulomb_moved_pct);
-    const cg_real offset_pct = R(CG_OFFSET_STD_PER_AH) * model->capacity_ah * R(3600.0) * hours *
-                               cg_pct_per_as(model);
-    const cg_real scale_pct = R(CG_CAPACITY_STD) * moved_pct;
-    return cg_sqrt(memory->coulomb_var_pct2 + cg_square(offset_pct) + cg_square(scale_pct));
+    const cg_real gap_pct2 = (cg_real)(counter->gap_var_pct2 - memory->coulomb_gap_var_pct2);
+    const cg_real offset_pct = R(OFFSET_STD_PER_AH) * seconds * R(100.0) / R(3600.0);
+    const cg_real capacity_pct = R(CAPACITY_STD) * moved_pct;
+    return cg_sqrt(memory->coulomb_var_pct2 + gap_pct2 + cg_square(offset_pct) +
+                   cg_square(capacity_pct));
+}
+
+/* Charge and time since the filter's state, up to a count. */
+static cg_passed since_filter(const cg_state *state, cg_sum counted_s, cg_sum discharged_pct)
+{
+    const cg_memory *memory = &state->memory;
+    const cg_passed passed = {
+        (cg_real)(counted_s - memory->filter_counted_s),
+        (cg_real)(discharged_pct - memory->filter_discharged_pct),
+        (cg_real)(state->counter.gap_var_pct2 - memory->filter_gap_var_pct2),
+        R(0.0),
+    };
+    return passed;
+}
+
+static cg_real filter_soc(const cg_estimator *self, cg_real *std_pct)
+{
+    const cg_state *state = &self->state;
+    const cg_passed passed =
+        since_filter(state, state->counter.counted_s, state->counter.discharged_pct);
+    return cg_clip_soc(cg_filter_soc(&state->filter, self->model, &passed, std_pct));
 }
 
 /* SoC of the chosen method, and its standard deviation; NAN until known. */
-static cg_real soc_now(cg_estimator *self, cg_real *std_pct)
+static cg_real soc_now(const cg_estimator *self, cg_real *std_pct)
 {
     const cg_memory *memory = &self->state.memory;
     const int32_t method = self->settings.method;
@@ -208,164 +240,132 @@ static cg_real soc_now(cg_estimator *self, cg_real *std_pct)
         *std_pct = memory->newton_std_pct;
         return memory->newton_pct;
     }
-    if (isnan(memory->coulomb_start_pct)) {
+    if (!memory->is_known) {
         *std_pct = CG_NAN;
         return CG_NAN;
     }
-    const cg_real counted_pct = cg_clip_soc((cg_real)coulomb_pct(&self->state));
     if (method == (int32_t)CG_COULOMB) {
-        *std_pct = coulomb_std_pct(self);
-        return counted_pct;
+        *std_pct = coulomb_std_pct(&self->state);
+        return cg_clip_soc(coulomb_pct(&self->state));
     }
-    const cg_real soc_pct = cg_filter_soc(self, std_pct);
-    if (self->state.counter.time_s < memory->mismatch_until_s) {
-        *std_pct = cg_sqrt(cg_square(*std_pct) + cg_square(memory->bias_pct) +
-                           cg_square(counted_pct - soc_pct));
-    }
-    return soc_pct;
+    return filter_soc(self, std_pct);
 }
 
-static void start_count(cg_state *state, cg_sum soc_pct, cg_real var_pct2)
+static void start_count(cg_state *state, cg_real soc_pct, cg_real std_pct)
 {
-    state->memory.coulomb_start_pct = soc_pct + state->counter.discharged_pct;
-    state->memory.coulomb_var_pct2 = var_pct2;
+    state->memory.coulomb_start_pct = (cg_sum)soc_pct + state->counter.discharged_pct;
+    state->memory.coulomb_var_pct2 = cg_square(std_pct);
     state->memory.coulomb_counted_s = state->counter.counted_s;
     state->memory.coulomb_moved_pct = state->counter.moved_pct;
-}
-
-static void start(cg_estimator *self, cg_real soc_pct, cg_real std_pct)
-{
-    cg_state *state = &self->state;
-    start_count(state, (cg_sum)soc_pct, cg_square(std_pct));
-    if (self->settings.method == (int32_t)CG_EKF) {
-        cg_filter_start(&state->filter, self->model, soc_pct, std_pct);
-        state->is_filtering = true;
-        state->since = (cg_since){0};
-    }
+    state->memory.coulomb_gap_var_pct2 = state->counter.gap_var_pct2;
 }
 
 /* ------------------------------------------------------------------ step */
 
-/* Model's voltage less the pseudo-OCV at the latest sample. */
-static cg_real without_ocv_v(cg_estimator *self)
+static void propagate(cg_estimator *self, cg_sum counted_s, cg_sum discharged_pct)
 {
-    if (isnan(self->without_ocv_v)) {
-        const cg_model *model = self->model;
-        cg_real temperature_c = self->state.memory.temperature_c;
-        if (isnan(temperature_c)) {
-            temperature_c = model->t_ref_c;
-        }
-        for (int32_t j = 0; j < model->delays; ++j) {
-            self->delayed_a[j] = cg_line_at(&self->line, (cg_time)model->delay_s[j]);
-        }
-        self->without_ocv_v = cg_offset_v(model, temperature_c, self->delayed_a);
-    }
-    return self->without_ocv_v;
+    cg_state *state = &self->state;
+    const cg_passed passed = since_filter(state, counted_s, discharged_pct);
+    cg_filter_predict(&state->filter, self->model, &passed);
+    state->memory.filter_counted_s = counted_s;
+    state->memory.filter_discharged_pct = discharged_pct;
+    state->memory.filter_gap_var_pct2 = state->counter.gap_var_pct2;
 }
 
-/* Hand the voltage to the hook, and follow the levels of residual and predicted drop. */
-static void after_voltage(cg_estimator *self, const cg_sample *sample, cg_tick *tick)
+/* The open block then lies in part before the filter's state. */
+static void propagate_to_now(cg_estimator *self)
+{
+    propagate(self, self->state.counter.counted_s, self->state.counter.discharged_pct);
+    self->state.block.is_broken = true;
+}
+
+/* Test the innovations of the last minutes, and what the filter has learned. */
+static void test_model(cg_estimator *self, cg_time time_s)
 {
     const cg_model *model = self->model;
     cg_memory *memory = &self->state.memory;
-    const cg_real cold = model->temperature_range_c[0] - R(TEMPERATURE_MARGIN_K);
-    const cg_real hot = model->temperature_range_c[1] + R(TEMPERATURE_MARGIN_K);
-    tick->has_voltage = true;
-    tick->voltage_v = sample->voltage_v;
-    tick->without_ocv_v = self->without_ocv_v;
-    tick->drop_v = cg_dot(model->resistance_ohm, self->delayed_a, 0, model->delays);
-    tick->soc_newton_pct = memory->newton_inside ? memory->newton_pct : CG_NAN;
-    tick->soc_counted_pct = cg_clip_soc((cg_real)coulomb_pct(&self->state));
-    tick->is_filled =
-        cg_line_filled_s(&self->line) >= (cg_time)model->delay_s[model->delays - 1];
-    tick->is_inside = (cold <= memory->temperature_c) && (memory->temperature_c <= hot);
-    if (self->hook.tick != NULL) {
-        self->state.has_other_capacity = self->hook.tick(self->hook.context, tick);
+    const cg_ekf *likelier = cg_likelier(&self->state.filter);
+    if (memory->innovations == model->tested_blocks) {
+        memory->innovations -= 1;
+        for (int32_t k = 0; k < memory->innovations; ++k) {
+            memory->innovation2[k] = memory->innovation2[k + 1];
+        }
     }
-    cg_real std_pct;
-    cg_real slope;
-    const cg_real soc_pct = soc_now(self, &std_pct);
-    const cg_real ocv_v = cg_pseudo_ocv(self, soc_pct, &slope);
-    const cg_real residual_v = tick->voltage_v - tick->without_ocv_v - ocv_v;
-    cg_real weight = R(1.0);
-    if ((sample->time_s - memory->level_s) < LEVEL_MEMORY_S) {
-        weight = -cg_expm1((cg_real)(memory->level_s - sample->time_s) / R(LEVEL_MEMORY_S));
+    memory->innovation2[memory->innovations] = likelier->innovation2;
+    memory->innovations += 1;
+    cg_real total = R(0.0);
+    for (int32_t k = 0; k < memory->innovations; ++k) {
+        total += memory->innovation2[k];
     }
-    memory->level_residual_v += weight * (residual_v - memory->level_residual_v);
-    memory->level_drop_v += weight * (tick->drop_v - memory->level_drop_v);
-    memory->level_s = sample->time_s;
+    const bool is_lasting = total > model->innovations_at_most;
+    if (is_lasting || (cg_strain(likelier, model) > model->strain_at_most)) {
+        memory->mismatch_until_s = time_s + MISMATCH_S;
+    }
+    if (is_lasting) {
+        memory->innovations = 0;
+        memory->doubt = (int32_t)CG_MISMATCH;
+        cg_filter_doubt(&self->state.filter, model, R(CG_WRONG_PRIOR), R(CG_WRONG_STD_PCT),
+                        R(0.0), R(0.0));
+    }
 }
 
-static void update_with_voltage(cg_estimator *self, const cg_sample *sample, cg_tick *tick,
-                                const cg_since *since)
+/* Correct the filter by the open block, and test its innovation. */
+static void close_block(cg_estimator *self, cg_time time_s)
 {
     const cg_model *model = self->model;
     cg_memory *memory = &self->state.memory;
-    cg_measurement seen;
-    cg_real functions_v[CG_STATES];
-    cg_real slope;
-    seen.voltage_v = sample->voltage_v;
-    seen.without_ocv_v = without_ocv_v(self);
-    const cg_real guess_pct = isnan(memory->newton_pct) ? R(50.0) : memory->newton_pct;
-    memory->newton_pct =
-        cg_newton(self, seen.voltage_v - seen.without_ocv_v, guess_pct, &memory->newton_inside);
-    seen.soc_pct = memory->newton_pct;
-    seen.std_v = cg_fast_std_v(self, memory->temperature_c, &seen.kt_std_v);
-    cg_real mean_a = R(0.0);
-    for (int32_t j = 0; j < model->delays; ++j) {
-        mean_a += self->delayed_a[j];
+    cg_filter *filter = &self->state.filter;
+    const cg_block *block = &self->state.block;
+    const cg_sum rows = (cg_sum)block->rows;
+    cg_means means;
+    if (block->is_broken || (block->rows == 0)) {
+        return;
     }
-    mean_a = mean_a / (cg_real)model->delays;
-    seen.resistance_std_v =
-        cg_resistance_std(model, memory->temperature_c) * (mean_a * model->steady_ohm);
-    (void)cg_pseudo_ocv(self, memory->newton_pct, &slope);
-    cg_curve_functions(model, memory->newton_pct, functions_v);
-    const cg_real part_v[5] = {
-        seen.std_v,
-        cg_sqrt(cg_square(model->slow_std_v) + cg_square(model->lasting_std_v)),
-        cg_sqrt(cg_dot(functions_v, functions_v, 0, model->functions)),
-        seen.kt_std_v,
-        seen.resistance_std_v,
-    };
-    const cg_real error_v = cg_sqrt(cg_dot(part_v, part_v, 0, 5));
-    memory->newton_std_pct = cg_min(error_v / slope, R(CG_UNKNOWN_SOC_STD_PCT));
+    means.counted_s = block->sums[0] / rows;
+    means.discharged_pct = block->sums[1] / rows;
+    means.voltage_v = (cg_real)(block->sums[2] / rows);
+    means.temperature_c = (cg_real)(block->sums[3] / rows);
+    means.drop_v = (cg_real)(block->sums[4] / rows);
+    for (int32_t k = 0; k < cg_loads(model); ++k) {
+        means.load[k] = (cg_real)(block->sums[5 + k] / rows);
+    }
+    propagate(self, means.counted_s, means.discharged_pct);
+    const bool was_rejected = cg_filter_is_rejected(filter);
+    cg_filter_update(self, &means);
+    if (!cg_filter_is_valid(filter, model)) {
+        cg_filter_start(filter, model, CG_NAN, R(0.0), false);
+        memory->resets += 1;
+        memory->contradicted_until_s = time_s + CONTRADICTED_S;
+    } else if (cg_filter_is_rejected(filter) && !was_rejected) {
+        memory->contradicted_until_s = time_s + CONTRADICTED_S;
+    } else {
+        /* as before */
+    }
+    memory->is_known = true;
+    test_model(self, time_s);
     if (isnan(memory->coulomb_start_pct)) {
-        start(self, memory->newton_pct, R(CG_UNKNOWN_SOC_STD_PCT));
-        memory->coulomb_var_pct2 = cg_square(memory->newton_std_pct);
+        cg_real std_pct;
+        const cg_real soc_pct = filter_soc(self, &std_pct);
+        start_count(&self->state, soc_pct, std_pct);
     }
-    if (self->state.is_filtering) {
-        if (cg_filter_update(self, &seen, since)) {
-            memory->contradicted_until_s = sample->time_s + CONTRADICTED_S;
-        }
-        const cg_ekf *ekf = cg_likelier(&self->state.filter);
-        const cg_real bias_v = ekf->x[CG_X_SLOW] + ekf->x[CG_X_LASTING];
-        memory->bias_pct = cg_min(cg_fabs(bias_v) / slope, R(CG_UNKNOWN_SOC_STD_PCT));
-        if ((cg_strain(ekf, model) > R(MISMATCH_SIGMAS)) || self->state.has_other_capacity) {
-            memory->mismatch_until_s = sample->time_s + CONTRADICTED_S;
-        }
-    }
-    after_voltage(self, sample, tick);
 }
 
 /* Fuse a SoC that is known otherwise into count and filter. */
-static void fuse_reference(cg_estimator *self, cg_real soc_pct, cg_real std_pct, bool is_by_voltage)
+static void correct(cg_estimator *self, cg_real soc_pct, cg_real std_pct)
 {
     cg_state *state = &self->state;
+    propagate_to_now(self);
+    cg_filter_correct(&state->filter, self->model, soc_pct, std_pct);
+    state->memory.is_known = true;
     if (isnan(state->memory.coulomb_start_pct)) {
-        start(self, soc_pct, std_pct);
+        start_count(state, soc_pct, std_pct);
         return;
     }
-    if (!is_by_voltage && (self->hook.correct != NULL)) {
-        state->has_other_capacity = self->hook.correct(self->hook.context, soc_pct, std_pct);
-    }
-    const cg_real counted_pct = cg_clip_soc((cg_real)coulomb_pct(state));
-    const cg_real var_pct2 = cg_square(coulomb_std_pct(self));
+    const cg_real counted_pct = cg_clip_soc(coulomb_pct(state));
+    const cg_real var_pct2 = cg_square(coulomb_std_pct(state));
     const cg_real gain = var_pct2 / (var_pct2 + cg_square(std_pct));
-    start_count(state, (cg_sum)(counted_pct + (gain * (soc_pct - counted_pct))),
-                (R(1.0) - gain) * var_pct2);
-    if (state->is_filtering) {
-        cg_filter_set_soc(&state->filter, self->model, soc_pct, std_pct);
-    }
+    start_count(state, counted_pct + (gain * (soc_pct - counted_pct)),
+                cg_sqrt((R(1.0) - gain) * var_pct2));
 }
 
 static bool becomes_full(cg_estimator *self, const cg_sample *sample)
@@ -388,100 +388,102 @@ static bool becomes_full(cg_estimator *self, const cg_sample *sample)
     return memory->is_full && !was_full;
 }
 
-static void use_references(cg_estimator *self, const cg_sample *sample, cg_time rest_s)
+static void use_references(cg_estimator *self, const cg_sample *sample)
 {
     const cg_settings *rule = &self->settings;
     cg_memory *memory = &self->state.memory;
     const bool is_full = !isnan(rule->full_voltage_v) && becomes_full(self, sample);
     const cg_real newton_pct = memory->newton_pct;
     bool becomes_rested = false;
-    if (!isnan(rule->rest_after_s) && (isfinite(newton_pct) != 0)) {
+    if (!isnan(rule->rest_after_s) && !isnan(newton_pct)) {
         const bool was_rested = memory->is_rested;
-        memory->is_rested = rest_s >= (cg_time)rule->rest_after_s;
+        memory->is_rested =
+            (sample->time_s - memory->rest_since_s) >= (cg_time)rule->rest_after_s;
         becomes_rested = memory->is_rested && !was_rested;
     }
     if (is_full) {
-        fuse_reference(self, rule->full_soc_pct, rule->full_soc_std_pct, false);
+        correct(self, rule->full_soc_pct, rule->full_soc_std_pct);
     }
     if (becomes_rested) {
-        fuse_reference(self, newton_pct, rule->rest_soc_std_pct, true);
+        correct(self, newton_pct, rule->rest_soc_std_pct);
     }
 }
 
-/* Restart a filter that is lost from the voltage, or from the count. */
-static void restart_if_lost(cg_estimator *self, cg_time time_s)
+/* Standard deviation of the SoC by inverse of one row's voltage. */
+static cg_real inverse_std_pct(const cg_estimator *self, cg_real soc_pct, cg_real temperature_c)
 {
-    cg_state *state = &self->state;
-    if (state->is_filtering && cg_filter_is_lost(&state->filter)) {
-        cg_real soc_pct = state->memory.newton_pct;
-        if (isnan(soc_pct)) {
-            soc_pct = cg_clip_soc((cg_real)coulomb_pct(state));
-        }
-        if (isnan(soc_pct)) {
-            soc_pct = R(50.0);
-        }
-        cg_filter_start(&state->filter, self->model, soc_pct, R(CG_UNKNOWN_SOC_STD_PCT));
-        state->memory.contradicted_until_s = time_s + CONTRADICTED_S;
-        state->memory.resets += 1;
-    }
+    const cg_model *model = self->model;
+    cg_real row[CG_FUNCTIONS];
+    cg_real slope;
+    (void)cg_pseudo_ocv(self, soc_pct, &slope);
+    slope = cg_max(slope, R(CG_LEAST_SLOPE));
+    cg_functions_row(model, soc_pct, self->state.load, row);
+    const cg_real variance =
+        cg_dot(row, row, model->functions) +
+        (cg_square(cg_cold(model, temperature_c)) *
+         (cg_square(model->level_std_v) + cg_square(model->slow_std_v) +
+          cg_square(model->residual_std_v)));
+    const cg_real std_pct = cg_sqrt(variance) / slope;
+    return cg_min(cg_sqrt(cg_square(std_pct) + cg_square(model->soc_std_pct)),
+                  cg_sqrt(R(CG_UNKNOWN_VAR_PCT2)));
 }
 
-static void use_voltage(cg_estimator *self, const cg_sample *sample)
+/* Compare a row's voltage with the model, and add it to the open block. */
+static void use_row(cg_estimator *self, const cg_sample *sample)
 {
     cg_state *state = &self->state;
     cg_memory *memory = &state->memory;
-    const cg_time rest_s = sample->time_s - memory->rest_since_s;
-    const cg_since since = state->since;
-    cg_tick tick = {0};
-    state->since = (cg_since){0};
-    if (state->is_filtering) {
-        cg_filter_predict(&state->filter, self->model, &since);
-        if (rest_s > REST_S) {
-            cg_filter_shrink_bias(&state->filter, self->model);
+    const cg_model *model = self->model;
+    cg_real std_pct;
+    cg_real slope;
+    const cg_real soc_pct = soc_now(self, &std_pct);
+    const cg_real guess_pct = isnan(memory->newton_pct) ? R(50.0) : memory->newton_pct;
+    memory->voltage_model_v = CG_NAN;
+    if (!isnan(soc_pct)) {
+        memory->voltage_model_v = cg_pseudo_ocv(self, soc_pct, &slope) + state->load_v;
+    }
+    memory->residual_v = sample->voltage_v - memory->voltage_model_v;
+    memory->newton_pct = CG_NAN;
+    memory->newton_std_pct = CG_NAN;
+    memory->newton_inside = true;
+    if (!isnan(sample->voltage_v)) {
+        const cg_real temperature_c =
+            isnan(memory->temperature_c) ? model->t_ref_c : memory->temperature_c;
+        cg_sum *sums = state->block.sums;
+        memory->newton_pct = cg_newton(self, sample->voltage_v - state->load_v, guess_pct,
+                                       &memory->newton_inside);
+        memory->newton_std_pct = inverse_std_pct(self, memory->newton_pct, temperature_c);
+        sums[0] += state->counter.counted_s;
+        sums[1] += state->counter.discharged_pct;
+        sums[2] += (cg_sum)sample->voltage_v;
+        sums[3] += (cg_sum)temperature_c;
+        sums[4] += (cg_sum)state->drop_v;
+        for (int32_t k = 0; k < cg_loads(model); ++k) {
+            sums[5 + k] += (cg_sum)state->load[k];
         }
+        state->block.rows += 1;
     }
-    tick.since = since;
-    tick.seconds = since.seconds;
-    if ((since.away_s != R(0.0)) && (self->hook.count != NULL)) {
-        state->has_other_capacity = self->hook.count(self->hook.context, &since);
-        tick.since = (cg_since){0};
-    }
-    if (isnan(sample->voltage_v)) {
-        memory->newton_pct = CG_NAN;
-        memory->newton_inside = true;
-        memory->newton_std_pct = CG_NAN;
-        if (self->hook.tick != NULL) {
-            state->has_other_capacity = self->hook.tick(self->hook.context, &tick);
-        }
-    } else {
-        update_with_voltage(self, sample, &tick, &since);
-    }
-    use_references(self, sample, rest_s);
-    restart_if_lost(self, sample->time_s);
+    use_references(self, sample);
 }
 
-/* Add a sample's charge to what the next voltage uses. */
-static void add_charge(cg_estimator *self, const cg_sample *sample, const charge_step *charge)
+/* Follow gaps, unobserved intervals and rests. */
+static void follow(cg_estimator *self, const cg_sample *sample, const charge_step *charge)
 {
+    const cg_model *model = self->model;
     cg_memory *memory = &self->state.memory;
-    cg_since *since = &self->state.since;
-    since->seconds += charge->seconds;
-    since->discharged_pct += charge->discharged_pct;
-    since->moved_pct += cg_fabs(charge->discharged_pct);
-    if (charge->away_s != R(0.0)) {
-        since->away_s += charge->away_s;
-        since->unseen_var_pct2 += cg_square(charge->parked_std_pct);
-    } else {
-        since->gap_var_pct2 += cg_square(charge->gap_std_pct);
-    }
     if (charge->seconds > self->settings.gap_s) {
-        const cg_model *model = self->model;
+        self->state.block.is_broken = true;
         memory->gap_until_s = sample->time_s + (cg_time)model->delay_s[model->delays - 1];
     }
-    if ((charge->gap_std_pct != R(0.0)) && !isnan(memory->coulomb_var_pct2)) {
-        memory->coulomb_var_pct2 += cg_square(charge->gap_std_pct);
+    if (charge->away_s != R(0.0)) {
+        const cg_real away_pct = R(AWAY_PCT_PER_HOUR) * charge->away_s / R(3600.0);
+        propagate_to_now(self);
+        cg_filter_doubt(&self->state.filter, model, moved_probability(charge->away_s),
+                        moved_std_pct(charge->away_s), charge->away_s, charge->parked_std_pct);
+        memory->doubt = (int32_t)CG_INTERVAL;
+        memory->coulomb_var_pct2 += cg_square(cg_min(away_pct, R(CG_MOVED_STD_AT_MOST_PCT)));
     }
-    if (cg_fabs(sample->current_a) > (R(REST_CURRENT_C_RATE) * self->model->capacity_ah)) {
+    if (cg_fabs(sample->current_a) > (R(REST_CURRENT_C_RATE) * model->capacity_ah)) {
         memory->rest_since_s = (cg_time)NAN;
     } else if (isnan(memory->rest_since_s)) {
         memory->rest_since_s = sample->time_s;
@@ -497,26 +499,28 @@ static void process(cg_estimator *self, const cg_sample *sample)
 {
     const cg_model *model = self->model;
     cg_memory *memory = &self->state.memory;
+    cg_block *block = &self->state.block;
+    const cg_time since_s = sample->time_s - memory->first_s;
+    const int64_t number = (int64_t)floor((since_s / (cg_time)model->block_s) + 1e-9);
+    if (number > block->number) {
+        close_block(self, sample->time_s);
+        *block = (cg_block){0};
+        block->number = number;
+    }
     cg_real counted_a = sample->current_a;
-    if ((model->effects > 0) && (counted_a < R(0.0))) {
+    if (counted_a < R(0.0)) {
         counted_a = model->charge_efficiency * counted_a;
     }
     const charge_step charge = count(self, sample->time_s, counted_a);
-    cg_line_push(&self->line, model->delay_s[model->delays - 1], self->settings.gap_s,
-                 sample->time_s, sample->current_a);
-    self->without_ocv_v = CG_NAN;
-    add_charge(self, sample, &charge);
     if (!isnan(sample->temperature_c)) {
         memory->temperature_c = sample->temperature_c;
     }
-    if (model->effects > 0) {
-        cg_advance(self, sample, memory->temperature_c);
-    }
-    const cg_time ticks = (sample->time_s - memory->first_s) * (cg_time)model->rate_hz;
-    const int64_t tick = (int64_t)floor(ticks + 1e-6);
+    cg_advance(self, sample, memory->temperature_c);
+    follow(self, sample, &charge);
+    const int64_t tick = (int64_t)floor((since_s * (cg_time)model->rate_hz) + 1e-6);
     if (tick > memory->tick) {
         memory->tick = tick;
-        use_voltage(self, sample);
+        use_row(self, sample);
     }
 }
 
@@ -543,13 +547,14 @@ bool cg_update(cg_estimator *self, const cg_sample *sample)
     cg_state *state = &self->state;
     const cg_time stamp_s = sample->time_s;
     cg_sample now = *sample;
+    const int32_t skew = cg_skew_of(model);
     state->is_refused = !((cg_fabs(sample->current_a) <= R(CURRENT_AT_MOST_A)) &&
                           clock_time(&state->clock, stamp_s, &now.time_s));
     if (state->is_refused) {
         return false;
     }
-    if (model->effects > 0) {
-        (void)cg_evaluate(self); /* effects may hold this sample back, which keeps the last one */
+    if (skew < model->effects) {
+        (void)cg_evaluate(self); /* this sample may be held back, which keeps the last estimate */
     }
     state->implausible = drop_implausible(&now, model->nominal_v);
     if (state->memory.samples == 0) {
@@ -557,7 +562,6 @@ bool cg_update(cg_estimator *self, const cg_sample *sample)
     }
     state->memory.samples += 1;
     const cg_time newest_s = now.time_s;
-    const int32_t skew = cg_skew_of(model);
     bool is_ready = true;
     cg_correct(self, &now, 0, skew);
     if (skew < model->effects) {
@@ -633,7 +637,7 @@ static int32_t status_of(uint32_t reasons)
     if ((reasons & CG_NO_INITIAL_SOC) != 0U) {
         return (int32_t)CG_INITIALISING;
     }
-    if ((reasons & (CG_INPUT_STALE | CG_CURRENT_MISSING)) != 0U) {
+    if ((reasons & (CG_INPUT_STALE | CG_CURRENT_MISSING | CG_MODEL_MISMATCH)) != 0U) {
         return (int32_t)CG_INVALID;
     }
     return (int32_t)CG_DEGRADED;
@@ -644,23 +648,17 @@ cg_estimate cg_evaluate(cg_estimator *self)
     cg_state *state = &self->state;
     cg_estimate *latest = &state->latest;
     if (state->is_pending) {
-        const cg_sample *sample = &state->pending;
         cg_real std_pct;
-        cg_real slope;
         const cg_real soc_pct = soc_now(self, &std_pct);
         state->is_pending = false;
         latest->time_s = state->pending_stamp_s;
         latest->soc_pct = soc_pct;
         latest->soc_std_pct = std_pct;
         latest->soc_newton_pct = state->memory.newton_pct;
-        latest->soc_coulomb_pct = cg_clip_soc((cg_real)coulomb_pct(state));
-        latest->voltage_model_v = CG_NAN;
-        if (!isnan(soc_pct)) {
-            const cg_real ocv_v = cg_pseudo_ocv(self, soc_pct, &slope);
-            latest->voltage_model_v = ocv_v + without_ocv_v(self);
-        }
-        latest->residual_v = sample->voltage_v - latest->voltage_model_v;
-        latest->reasons = reasons_now(self, sample, soc_pct, std_pct);
+        latest->soc_coulomb_pct = cg_clip_soc(coulomb_pct(state));
+        latest->voltage_model_v = state->memory.voltage_model_v;
+        latest->residual_v = state->memory.residual_v;
+        latest->reasons = reasons_now(self, &state->pending, soc_pct, std_pct);
         latest->status = status_of(latest->reasons);
         latest->samples = state->memory.samples;
     }
@@ -680,7 +678,7 @@ cg_settings cg_default_settings(void)
     settings.method = (int32_t)CG_EKF;
     settings.initial_soc_pct = CG_NAN;
     settings.initial_soc_std_pct = R(1.0);
-    settings.valid_std_pct = R(1.5);
+    settings.valid_std_pct = R(3.0);
     settings.gap_s = R(2.0);
     settings.full_voltage_v = CG_NAN;
     settings.rest_after_s = CG_NAN;
@@ -694,21 +692,20 @@ static void forget(cg_state *state)
     state->clock.last_s = (cg_time)NAN;
     state->clock.behind_s = (cg_time)NAN;
     state->counter.time_s = (cg_time)NAN;
-    state->filter.hypotheses = 1;
-    state->filter.wide_std_pct = R(CG_UNKNOWN_SOC_STD_PCT);
-    state->filter.stated_pct = nan;
+    state->memory.first_s = (cg_time)NAN;
     state->memory.tick = -1;
     state->memory.temperature_c = nan;
     state->memory.newton_pct = nan;
     state->memory.newton_inside = true;
     state->memory.newton_std_pct = nan;
+    state->memory.voltage_model_v = nan;
+    state->memory.residual_v = nan;
     state->memory.coulomb_start_pct = (cg_sum)NAN;
     state->memory.coulomb_var_pct2 = nan;
     state->memory.gap_until_s = (cg_time)NAN;
     state->memory.contradicted_until_s = (cg_time)NAN;
     state->memory.mismatch_until_s = (cg_time)NAN;
     state->memory.rest_since_s = (cg_time)NAN;
-    state->memory.level_s = (cg_time)NAN;
     state->memory.full_since_s = (cg_time)NAN;
     state->latest = (cg_estimate){(cg_time)NAN, nan, nan, nan, nan, nan, nan,
                                   (int32_t)CG_INITIALISING, CG_NO_INITIAL_SOC, 0};
@@ -717,67 +714,38 @@ static void forget(cg_state *state)
 void cg_init(cg_estimator *self, const cg_model *model, const cg_settings *settings,
              const cg_line *line, cg_skew *skew)
 {
+    const cg_real given_pct = settings->initial_soc_pct;
+    cg_state *state = &self->state;
     self->model = model;
     self->settings = *settings;
     self->line = *line;
     self->line.first = 0;
     self->line.count = 0;
     self->skew = skew;
-    self->hook = (cg_hook){NULL, NULL, NULL, NULL};
-    self->without_ocv_v = CG_NAN;
     if (skew != NULL) {
         skew->first = 0;
         skew->count = 0;
         skew->waiting_first = 0;
         skew->waiting_count = 0;
     }
-    forget(&self->state);
-    if (!isnan(settings->initial_soc_pct)) {
-        start(self, cg_clip_soc(settings->initial_soc_pct + model->initial_offset_pct),
-              settings->initial_soc_std_pct);
+    forget(state);
+    cg_filter_start(&state->filter, model, CG_NAN, R(0.0), false);
+    if (!isnan(given_pct)) {
+        const cg_real soc_pct = cg_clip_soc(given_pct + model->initial_offset_pct);
+        cg_filter_start(&state->filter, model, soc_pct, settings->initial_soc_std_pct, true);
+        state->memory.is_known = true;
+        state->memory.doubt = (int32_t)CG_START;
+        start_count(state, soc_pct, settings->initial_soc_std_pct);
     }
 }
 
-static bool is_filter_plausible(const cg_filter *filter, const cg_model *model)
-{
-    if ((filter->hypotheses < 1) || (filter->hypotheses > 2) ||
-        (filter->verdict < (int32_t)CG_NO_TEST) || (filter->verdict > (int32_t)CG_UNCLEAR) ||
-        !isfinite(filter->log_odds) || !isfinite(filter->prior_log_odds) ||
-        !isfinite(filter->wide_std_pct) || !isfinite(filter->outlier_s)) {
-        return false;
-    }
-    const int32_t size = cg_states(model);
-    for (int32_t i = 0; i < filter->hypotheses; ++i) {
-        const cg_ekf *ekf = &filter->ekf[i];
-        bool is_finite = isfinite(ekf->mean_innovation_v) && isfinite(ekf->mean_seconds);
-        for (int32_t k = 0; k < size; ++k) {
-            is_finite = is_finite && isfinite(ekf->x[k]);
-            for (int32_t j = 0; j < CG_LEARNED; ++j) {
-                is_finite = is_finite && isfinite(ekf->p[j][k]);
-            }
-        }
-        if (!is_finite) {
-            return false;
-        }
-        for (int32_t j = 0; j < CG_LEARNED; ++j) {
-            if (ekf->p[j][j] < R(0.0)) {
-                return false;
-            }
-        }
-    }
-    return true;
-}
-
-static bool are_effects_plausible(const cg_state *state, const cg_model *model)
+static bool are_lags_plausible(const cg_lag *lag, int32_t count)
 {
     bool is_finite = true;
-    for (int32_t k = 0; k < model->effects; ++k) {
-        for (int32_t j = 0; j < model->effect[k].lags; ++j) {
-            const cg_lag *lag = &state->effect[k].lag[j];
-            is_finite = is_finite &&
-                        (!lag->is_started || (isfinite(lag->time_s) && isfinite(lag->input) &&
-                                              isfinite(lag->value)));
-        }
+    for (int32_t k = 0; k < count; ++k) {
+        is_finite = is_finite && (!lag[k].is_started ||
+                                  (isfinite(lag[k].time_s) && isfinite(lag[k].input) &&
+                                   isfinite(lag[k].value)));
     }
     return is_finite;
 }
@@ -787,17 +755,26 @@ static bool is_plausible(const cg_state *state, const cg_model *model)
     const cg_clock *clock = &state->clock;
     const cg_counter *counter = &state->counter;
     const cg_memory *memory = &state->memory;
+    const cg_filter *filter = &state->filter;
     const bool are_counts = (clock->behind >= 0) && (memory->samples >= 0) &&
-                            (memory->resets >= 0) && (memory->tick >= -1);
+                            (memory->resets >= 0) && (memory->tick >= -1) &&
+                            (memory->innovations >= 0) &&
+                            (memory->innovations <= model->tested_blocks) &&
+                            (filter->hypotheses >= 1) && (filter->hypotheses <= 2);
     const bool are_times = (isnan(clock->last_s) || (fabs(clock->last_s) <= (2.0 * LATEST_S))) &&
                            isfinite(clock->shift_s) && !isinf(counter->time_s);
     const bool is_charge = isfinite(counter->current_a) && isfinite(counter->mean_square_a2) &&
                            isfinite(counter->mean_a) && isfinite(counter->discharged_pct) &&
                            isfinite(counter->moved_pct) && isfinite(counter->counted_s) &&
+                           isfinite(counter->gap_var_pct2) &&
+                           isfinite(filter->prior_log_odds) &&
                            !isinf(memory->coulomb_start_pct) && !isinf(memory->newton_pct) &&
                            !isinf(memory->temperature_c);
-    return are_counts && are_times && is_charge && are_effects_plausible(state, model) &&
-           (!state->is_filtering || is_filter_plausible(&state->filter, model));
+    bool are_lags = are_lags_plausible(state->low_pass, model->low_passes);
+    for (int32_t k = 0; k < model->effects; ++k) {
+        are_lags = are_lags && are_lags_plausible(state->effect[k].lag, model->effect[k].lags);
+    }
+    return are_counts && are_times && is_charge && are_lags && cg_filter_is_valid(filter, model);
 }
 
 bool cg_restore(cg_estimator *self, const cg_state *state, cg_time age_s)
@@ -811,8 +788,12 @@ bool cg_restore(cg_estimator *self, const cg_state *state, cg_time age_s)
     self->state.clock.is_restored = true;
     self->state.counter.is_restored = true;
     self->line.count = 0;
-    self->without_ocv_v = CG_NAN;
     return true;
+}
+
+cg_real cg_offset_a(const cg_estimator *self)
+{
+    return cg_likelier(&self->state.filter)->x[CG_X_OFFSET];
 }
 
 cg_real cg_current_at(const cg_estimator *self, cg_time ago_s)

@@ -5,8 +5,8 @@
  *     cg_update(&pack, &sample);                     at every sample of the current
  *     cg_estimate soc = cg_evaluate(&pack);          whenever an estimate is wanted
  *
- * The same operations in the same order as the Python package `cangauge`, and with doubles
- * (and -ffp-contract=off) the same bits. One sign: positive current discharges. NAN is a value that
+ * The same equations as the Python package `cangauge`; with doubles both agree within 1e-9.
+ * One sign: positive current discharges. NAN is a value that
  * is missing. The time is that of the samples, never a clock: the same samples give the same
  * numbers. Every function returns after a bounded number of operations; none calls itself.
  */
@@ -34,6 +34,7 @@ typedef double cg_wide;
 #include "cangauge_config.h"
 #else
 #define CG_DELAYS 64
+#define CG_LOW_PASSES 4
 #define CG_KNOTS 201
 #define CG_FUNCTIONS 16
 #define CG_EFFECTS 32
@@ -42,9 +43,11 @@ typedef double cg_wide;
 #define CG_OCV 8
 #define CG_LAGS 5
 #define CG_VALUES 12
-#define CG_LEARNED 5 /* states that a voltage corrects: SoC, offset, slow, lasting, capacity */
-#define CG_STATES (CG_LEARNED + 1 + CG_FUNCTIONS)
-#define CG_MEMORIES (CG_EFFECTS * CG_LAGS)
+#define CG_TESTED 64 /* innovations that are tested together, at most */
+#define CG_CURRENTS (CG_DELAYS + CG_LOW_PASSES)
+#define CG_LOADS (CG_CURRENTS + 2)
+#define CG_STATES (CG_FUNCTIONS + 4)
+#define CG_SUMS (CG_LOADS + 5)
 
 /* ------------------------------------------------------------------ constants of a model */
 
@@ -75,50 +78,64 @@ typedef struct {
     cg_real tau_s[CG_LAGS];
 } cg_effect;
 
-/* What `cangauge fit` found. Constant: it may stay in flash. */
+/* What `cangauge fit` found. Constant: it may stay in flash.
+ *
+ *     U = g(S) + kt (T - T_r) + sum Rm Im + b (a(T)/a(mean) - 1) sum R0m Im + errors
+ *
+ * g is the published equation (knots = 0), or a cubic Hermite curve. Im: the delayed, then the
+ * low-passed currents. Load columns: T - T_r, I1 ... IM and, with Arrhenius, (a(T)/a(mean) - 1) sum. */
 typedef struct {
-    /* U = k0 + k1/s + k2/s^2 + k3/s^3 + k4/s^4 + k5 s + k6 ln s + k7 ln(1 - s)
-     *     + kt (T - T_r) + sum Rj I(t - dj),  s = SoC scaled into [epsilon, 1 - epsilon] */
     cg_wide ocv_v[CG_OCV];
     cg_wide epsilon;
-    cg_real slope_beyond[2]; /* dU/dS below and above the identified SoC [V per %] */
-    cg_real kt_v_per_k;
+    cg_real slope_beyond[2]; /* of the published equation outside the identified SoC [V per %] */
+    int32_t knots;
+    cg_real knot_pct[CG_KNOTS];
+    cg_real knot_v[CG_KNOTS];
+    cg_real knot_slope[CG_KNOTS]; /* [V per %] */
     cg_real t_ref_c;
+    cg_real temperature_limits_c[2]; /* beyond which the load columns are constant */
+    int32_t delays;
+    cg_real delay_s[CG_DELAYS];
+    int32_t low_passes;
+    cg_real low_pass_s[CG_LOW_PASSES];
+    int32_t has_arrhenius;
+    cg_real arrhenius_ohm[CG_CURRENTS]; /* R0m */
+    cg_real arrhenius_mean; /* a(mean) */
+    cg_real load[CG_LOADS]; /* coefficients of the load columns: kt, R1 ... RM and b */
     cg_real soc_range_pct[2]; /* identified ranges */
     cg_real temperature_range_c[2];
     cg_real current_range_a[2];
-    int32_t delays;
-    cg_real delay_s[CG_DELAYS];
-    cg_real resistance_ohm[CG_DELAYS];
-    cg_real rate_hz; /* voltages used per second */
+    cg_real rate_hz; /* rows per second: inverse and residual */
     cg_real capacity_ah;
     cg_real charge_efficiency;
     cg_real initial_offset_pct; /* error of a given initial SoC */
-    cg_real steady_ohm; /* change of the voltage with a lasting current [V/A] */
     cg_real nominal_v; /* voltage at half charge [V] */
 
-    /* error of the model: standard deviations */
-    cg_real fast_std_v;
+    /* Errors of the voltage: standard deviations; of the SoC against the voltage [%]. */
+    cg_real level_std_v;
     cg_real slow_std_v;
     cg_real slow_time_s;
-    cg_real lasting_std_v;
-    cg_real lasting_time_s;
-    cg_real lasting_soc_pct;
-    cg_real mean_c; /* temperature of the logs [degC] */
-    cg_real kt_std_v_per_k;
-    cg_real resistance_std_per_k;
-    int32_t knots; /* functions of the curve's error over SoC */
+    cg_real fast_std_v;
+    cg_real soc_std_pct;
+    cg_real cold_exponent;
+    cg_real residual_std_v;
+    cg_real block_s;
+    int32_t tested_blocks; /* limits of the tests for a model that the pack contradicts */
+    cg_real innovations_at_most;
+    cg_real strain_at_most;
+
+    /* Principal functions of the coefficients' covariance: over SoC, and of the load columns. */
     int32_t functions;
-    cg_real knot_pct[CG_KNOTS];
+    int32_t function_knots;
+    cg_real function_pct[CG_KNOTS];
     cg_real function_v[CG_KNOTS][CG_FUNCTIONS];
+    cg_real function_slope[CG_KNOTS][CG_FUNCTIONS];
+    cg_real function_load[CG_LOADS][CG_FUNCTIONS];
 
     /* effects, in the order of their application */
     int32_t effects;
     cg_effect effect[CG_EFFECTS];
     cg_time skew_s; /* of CG_TIME_SKEW: how late the time stamps of the current are */
-    int32_t memories; /* RC elements of effects: what currents before the first sample left */
-    cg_real memory_ohm[CG_MEMORIES];
-    cg_real memory_tau_s[CG_MEMORIES];
 } cg_model;
 
 /* ------------------------------------------------------------------ settings */
@@ -127,7 +144,7 @@ typedef enum { CG_EKF = 0, CG_NEWTON, CG_COULOMB } cg_method;
 
 typedef struct {
     int32_t method; /* cg_method: whose SoC is the estimate */
-    cg_real initial_soc_pct; /* NAN: found from the first voltage */
+    cg_real initial_soc_pct; /* NAN: found from the first voltages */
     cg_real initial_soc_std_pct;
     cg_real valid_std_pct; /* a larger standard deviation is degraded */
     cg_real gap_s; /* a longer step between samples is a gap in the current */
@@ -143,7 +160,7 @@ typedef struct {
     cg_real rest_soc_std_pct;
 } cg_settings;
 
-/* 2 s, 1 %, 1.5 %, extended Kalman filter, no rules. */
+/* 2 s, 1 %, 3 %, extended Kalman filter, no rules. */
 cg_settings cg_default_settings(void);
 
 /* ------------------------------------------------------------------ samples and estimates */
@@ -212,41 +229,38 @@ typedef struct {
     cg_sum discharged_pct;
     cg_sum moved_pct;
     cg_sum counted_s;
+    cg_sum gap_var_pct2;
     bool is_restored;
 } cg_counter;
 
+/* Sums of the rows of the open block: counted time, charge, voltage, temperature, drop, loads. */
 typedef struct {
-    cg_real seconds;
-    cg_real away_s;
-    cg_real discharged_pct;
-    cg_real moved_pct;
-    cg_real gap_var_pct2;
-    cg_real unseen_var_pct2;
-} cg_since;
+    int64_t number;
+    int32_t rows;
+    bool is_broken;
+    cg_sum sums[CG_SUMS];
+} cg_block;
 
-/* SoC, current offset, slow and lasting error, capacity, and the curve's errors. Covariance of the
- * learned states with all; the others have variance 1 and no covariance among each other. */
+/* State x = (SoC, current offset, slow error, level, functions) with its covariance, and beside it
+ * the biases b = (capacity, resistance) with their covariance and their influence v on x. */
 typedef struct {
     cg_real x[CG_STATES];
-    cg_real p[CG_LEARNED][CG_STATES];
-    cg_real mean_innovation_v;
-    cg_real mean_seconds;
-    bool was_outlier;
+    cg_real p[CG_STATES][CG_STATES];
+    cg_sum evidence; /* log-likelihood of all voltages */
+    cg_real b[2];
+    cg_real b_p[2][2];
+    cg_real b_v[CG_STATES][2];
+    cg_real innovation2; /* of the last voltage, over its variance */
 } cg_ekf;
 
-typedef enum { CG_NO_TEST = 0, CG_OPEN, CG_PARKED, CG_MOVED, CG_UNCLEAR } cg_verdict;
+typedef enum { CG_NO_DOUBT = 0, CG_START, CG_INTERVAL, CG_MISMATCH } cg_doubt;
 
-/* One or two hypotheses: parked or moved while unobserved; a given SoC right or wrong. */
+/* One or two hypotheses: the SoC is the stated one, or another. */
 typedef struct {
-    cg_ekf ekf[2];
+    cg_ekf ekf[2]; /* narrow, wide */
     int32_t hypotheses;
-    int32_t verdict; /* cg_verdict */
-    cg_real log_odds;
-    cg_real prior_log_odds;
-    cg_real wide_std_pct;
-    cg_real stated_pct; /* standard deviation of two hypotheses; NAN until it is needed */
-    cg_real outlier_s;
-    bool is_untested;
+    int32_t decision; /* -1 narrow, 0 open, 1 wide */
+    cg_sum prior_log_odds;
 } cg_filter;
 
 typedef struct {
@@ -268,20 +282,26 @@ typedef struct {
     int64_t tick;
     cg_real temperature_c;
     cg_real newton_pct;
-    bool newton_inside;
     cg_real newton_std_pct;
+    bool newton_inside;
+    cg_real voltage_model_v;
+    cg_real residual_v;
+    bool is_known; /* a start was given, or a block was used */
+    cg_sum filter_discharged_pct;
+    cg_sum filter_counted_s;
+    cg_sum filter_gap_var_pct2;
     cg_sum coulomb_start_pct;
     cg_real coulomb_var_pct2;
     cg_sum coulomb_counted_s;
     cg_sum coulomb_moved_pct;
+    cg_sum coulomb_gap_var_pct2;
     cg_time gap_until_s;
     cg_time contradicted_until_s;
     cg_time mismatch_until_s;
-    cg_real bias_pct;
+    int32_t doubt; /* cg_doubt */
+    int32_t innovations;
+    cg_real innovation2[CG_TESTED]; /* the oldest first */
     cg_time rest_since_s;
-    cg_time level_s;
-    cg_real level_residual_v;
-    cg_real level_drop_v;
     cg_time full_since_s;
     bool is_full;
     bool is_rested;
@@ -293,18 +313,20 @@ typedef struct {
 typedef struct {
     cg_clock clock;
     cg_counter counter;
-    cg_since since;
+    cg_block block;
     cg_filter filter;
     cg_memory memory;
+    cg_lag low_pass[CG_LOW_PASSES];
     cg_effect_state effect[CG_EFFECTS];
     cg_estimate latest;
     cg_sample pending; /* sample that `latest` is not computed for yet */
     cg_time pending_stamp_s;
     bool is_pending;
-    bool is_filtering;
     bool is_refused; /* the latest sample: without a plausible current, or not later */
-    bool has_other_capacity; /* what the hook returned last */
     uint32_t implausible;
+    cg_real load[CG_LOADS]; /* load columns at the latest sample */
+    cg_real load_v; /* their voltage, and its part over the resistances */
+    cg_real drop_v;
     cg_real beside_soc_v; /* voltage of the effects that do not depend on the SoC */
 } cg_state;
 
@@ -335,37 +357,12 @@ typedef struct {
     int32_t count;
 } cg_skew;
 
-/* A voltage that was used, for whoever learns the pack's health from it. */
-typedef struct {
-    cg_since since; /* charge and time since the last one */
-    cg_real seconds; /* time since the last one */
-    bool has_voltage; /* else nothing follows */
-    cg_real voltage_v;
-    cg_real without_ocv_v; /* predicted voltage less the pseudo-OCV */
-    cg_real drop_v; /* part of it over the resistances */
-    cg_real soc_newton_pct; /* NAN: outside the model */
-    cg_real soc_counted_pct;
-    bool is_filled; /* the delay line */
-    bool is_inside; /* the temperature, of the identified range */
-} cg_tick;
-
-/* Optional: who learns the capacity. Each returns whether it is surely another than the model's. */
-typedef struct {
-    void *context;
-    bool (*count)(void *context, const cg_since *since); /* after an unobserved interval */
-    bool (*tick)(void *context, const cg_tick *tick); /* at the model's rate */
-    bool (*correct)(void *context, cg_real soc_pct, cg_real std_pct); /* a SoC became known */
-} cg_hook;
-
 typedef struct {
     const cg_model *model;
     cg_settings settings;
     cg_state state;
     cg_line line;
     cg_skew *skew; /* memory of the caller; NULL: the model has no `time_skew` */
-    cg_hook hook; /* functions NULL: none */
-    cg_real without_ocv_v; /* at the latest sample; NAN: not computed yet */
-    cg_real delayed_a[CG_DELAYS];
 } cg_estimator;
 
 /* ------------------------------------------------------------------ functions */
@@ -394,7 +391,7 @@ cg_real cg_offset_a(const cg_estimator *self);
 /* Return the standard deviation that the SoC lacks after a time without samples [%]. */
 cg_real cg_uncounted_std_pct(const cg_estimator *self, cg_real seconds);
 
-/* Return the voltage without the model's drop and kt [V], and its slope [V per %]. */
+/* Return the voltage without the load's [V], with effects, and its slope [V per %]. */
 cg_real cg_pseudo_ocv(const cg_estimator *self, cg_real soc_pct, cg_real *slope);
 
 /* Return the current some time before the latest sample [A]. */

@@ -1,4 +1,4 @@
-/* cangauge_internal.h - what the two files of the core share; see cangauge.h. */
+/* cangauge_internal.h - what the files of the core share; see cangauge.h. */
 #ifndef CANGAUGE_INTERNAL_H
 #define CANGAUGE_INTERNAL_H
 
@@ -13,26 +13,19 @@
 #define CG_JOIN(a, b) CG_JOIN_(a, b)
 
 #if CG_JOIN(CG_REAL_IS_, CANGAUGE_REAL)
-/* Where an iteration on a SoC, and on a standard deviation, stops. */
-#define CG_CLOSE_PCT 1e-4
-#define CG_LAST_STEP_PCT 1e-4
+#define CG_CLOSE_PCT 1e-4 /* where an iteration on a SoC stops */
 #define cg_exp expf
 #define cg_expm1 expm1f
-#define cg_log logf
-#define cg_log1p log1pf
+#define cg_pow powf
 #define cg_sqrt sqrtf
-#define cg_erf erff
 #define cg_asinh asinhf
 #define cg_fabs fabsf
 #else
 #define CG_CLOSE_PCT 1e-9
-#define CG_LAST_STEP_PCT 1e-6
 #define cg_exp exp
 #define cg_expm1 expm1
-#define cg_log log
-#define cg_log1p log1p
+#define cg_pow pow
 #define cg_sqrt sqrt
-#define cg_erf erf
 #define cg_asinh asinh
 #define cg_fabs fabs
 #endif
@@ -50,32 +43,40 @@ static inline cg_real cg_clip(cg_real value, cg_real low, cg_real high)
 }
 static inline cg_real cg_square(cg_real value) { return value * value; }
 
-/* States of the filter; the curve's functions follow. */
+/* States of the filter; the functions follow. Biases. */
 #define CG_X_SOC 0
 #define CG_X_OFFSET 1
 #define CG_X_SLOW 2
-#define CG_X_LASTING 3
-#define CG_X_CAPACITY 4
-#define CG_X_KT 5
+#define CG_X_LEVEL 3
+#define CG_X_FUNCTIONS 4
+#define CG_B_CAPACITY 0
+#define CG_B_RESISTANCE 1
 
-/* Standard deviations: of the current's offset [A/Ah], of the capacity (relative), of a SoC that is
- * unknown and of one that may have moved unobserved [%]. */
-#define CG_OFFSET_STD_PER_AH 0.025
-#define CG_CAPACITY_STD 0.05
-#define CG_UNKNOWN_SOC_STD_PCT 30.0
+#define CG_UNKNOWN_VAR_PCT2 2000.0 /* of an unknown SoC */
+#define CG_WRONG_STD_PCT 25.0 /* of a given start that is wrong */
+#define CG_WRONG_PRIOR 0.3
 #define CG_MOVED_STD_AT_MOST_PCT 30.0
+#define CG_LEAST_SLOPE 1e-3
 
 static inline cg_real cg_pct_per_as(const cg_model *model)
 {
     return R(100.0) / (R(3600.0) * model->capacity_ah);
 }
-static inline int32_t cg_states(const cg_model *model) { return CG_X_KT + 1 + model->functions; }
+static inline int32_t cg_states(const cg_model *model) { return CG_X_FUNCTIONS + model->functions; }
+static inline int32_t cg_currents(const cg_model *model)
+{
+    return model->delays + model->low_passes;
+}
+static inline int32_t cg_loads(const cg_model *model)
+{
+    return 1 + cg_currents(model) + ((model->has_arrhenius != 0) ? 1 : 0);
+}
 /* SoC within 0-100 %; NAN stays. */
 static inline cg_real cg_clip_soc(cg_real soc_pct) { return cg_clip(soc_pct, R(0.0), R(100.0)); }
-static inline cg_real cg_dot(const cg_real *a, const cg_real *b, int32_t from, int32_t to)
+static inline cg_real cg_dot(const cg_real *a, const cg_real *b, int32_t size)
 {
     cg_real total = R(0.0);
-    for (int32_t k = from; k < to; ++k) {
+    for (int32_t k = 0; k < size; ++k) {
         total += a[k] * b[k];
     }
     return total;
@@ -88,40 +89,47 @@ cg_real cg_line_at(const cg_line *line, cg_time ago_s);
 cg_time cg_line_filled_s(const cg_line *line);
 
 /* voltage model */
-cg_real cg_ocv(const cg_model *model, cg_real soc_pct, cg_real *slope);
-cg_real cg_offset_v(const cg_model *model, cg_real temperature_c, const cg_real *delayed_a);
+cg_real cg_cold(const cg_model *model, cg_real temperature_c);
+void cg_functions_row(const cg_model *model, cg_real soc_pct, const cg_real *load, cg_real *row);
 cg_real cg_newton(const cg_estimator *self, cg_real ocv_v, cg_real guess_pct, bool *inside);
 
-/* effects: corrections of a sample, then the extra voltages */
+/* effects: corrections of a sample, then the load columns and the extra voltages */
 int32_t cg_skew_of(const cg_model *model);
 void cg_correct(cg_estimator *self, cg_sample *sample, int32_t from, int32_t to);
 void cg_skew_push(cg_skew *skew, const cg_sample *sample);
 bool cg_skew_pop(cg_skew *skew, cg_time skew_s, cg_time now_s, cg_sample *sample);
 void cg_advance(cg_estimator *self, const cg_sample *sample, cg_real temperature_c);
 
-/* noise of a voltage */
-cg_real cg_fast_std_v(const cg_estimator *self, cg_real temperature_c, cg_real *kt_std_v);
-cg_real cg_resistance_std(const cg_model *model, cg_real temperature_c);
-void cg_curve_functions(const cg_model *model, cg_real soc_pct, cg_real *values);
-
-/* One voltage, with the terms of its prediction. */
+/* Means over the rows of a block. */
 typedef struct {
+    cg_sum counted_s;
+    cg_sum discharged_pct;
     cg_real voltage_v;
-    cg_real without_ocv_v;
-    cg_real soc_pct;
-    cg_real std_v;
-    cg_real kt_std_v;
-    cg_real resistance_std_v;
-} cg_measurement;
+    cg_real temperature_c;
+    cg_real drop_v;
+    cg_real load[CG_LOADS];
+} cg_means;
+
+/* Time in which charge was counted [s], the charge, its variance, further time without samples. */
+typedef struct {
+    cg_real seconds;
+    cg_real discharged_pct;
+    cg_real variance_pct2;
+    cg_real away_s;
+} cg_passed;
 
 /* filter */
-void cg_filter_start(cg_filter *filter, const cg_model *model, cg_real soc_pct, cg_real std_pct);
-void cg_filter_predict(cg_filter *filter, const cg_model *model, const cg_since *since);
-bool cg_filter_update(cg_estimator *self, const cg_measurement *seen, const cg_since *since);
-void cg_filter_set_soc(cg_filter *filter, const cg_model *model, cg_real soc_pct, cg_real std_pct);
-void cg_filter_shrink_bias(cg_filter *filter, const cg_model *model);
-bool cg_filter_is_lost(const cg_filter *filter);
-cg_real cg_filter_soc(cg_estimator *self, cg_real *std_pct);
+void cg_filter_start(cg_filter *filter, const cg_model *model, cg_real soc_pct, cg_real std_pct,
+                     bool is_doubtful);
+void cg_filter_predict(cg_filter *filter, const cg_model *model, const cg_passed *passed);
+void cg_filter_update(cg_estimator *self, const cg_means *block);
+void cg_filter_correct(cg_filter *filter, const cg_model *model, cg_real soc_pct, cg_real std_pct);
+void cg_filter_doubt(cg_filter *filter, const cg_model *model, cg_real probability,
+                     cg_real std_pct, cg_real away_s, cg_real parked_std_pct);
+bool cg_filter_is_valid(const cg_filter *filter, const cg_model *model);
+bool cg_filter_is_rejected(const cg_filter *filter);
+cg_real cg_filter_soc(const cg_filter *filter, const cg_model *model, const cg_passed *passed,
+                      cg_real *std_pct);
 const cg_ekf *cg_likelier(const cg_filter *filter);
 cg_real cg_strain(const cg_ekf *ekf, const cg_model *model);
 

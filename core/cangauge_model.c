@@ -1,7 +1,7 @@
-/* cangauge_model.c - delay line, voltage model, its effects and the noise of a voltage.
+/* cangauge_model.c - delay line, voltage model and its effects.
  *
- * Follows the Python modules model.delay_line, model.voltage_model, model.extended, model.effects
- * and estimation.measurement_noise operation by operation.
+ * Follows the Python modules model.delay_line, model.first_order, model.voltage_model,
+ * model.extended and model.effects; their docstrings state equations and sources.
  */
 #include "cangauge_internal.h"
 
@@ -9,21 +9,17 @@
 #define NO_LAG_S 1e-3
 #define SLOPE_STEP_PCT 0.05
 #define SLOPE_AT_LEAST 2e-5
-#define TEMPERATURE_MARGIN_K 5.0
 #define STEPS_AT_MOST 80
 #define COLDEST_C (-60.0)
 #define HOTTEST_C 120.0
 #define ZERO_C_IN_K 273.15
 #define REFERENCE_C 25.0
 #define STEEPNESS_AT_MOST 5.0
-#define SMOOTHING_S 200.0
 #define STALE_AT_MOST 64
 #define BUMPS 11
 
-#define USUAL_CURRENT_C_RATE (1.0 / 3.0)
-#define MEMORY_TIMES 10.0
-#define TEMPERATURE_STD_K 10.0
-#define OUTSIDE_TEMPERATURE_V_PER_K 1e-3
+#define ACTIVATION_K 3000.0
+#define RESISTANCE_REFERENCE_C 20.0
 
 static const cg_real CENTRES_PCT[BUMPS] = {
     R(3.0), R(8.0), R(14.0), R(22.0), R(32.0), R(43.0), R(54.0), R(65.0), R(76.0), R(86.0), R(94.0),
@@ -121,7 +117,43 @@ cg_real cg_line_at(const cg_line *line, cg_time ago_s)
 
 /* ------------------------------------------------------------------ voltage model */
 
-cg_real cg_ocv(const cg_model *model, cg_real soc_pct, cg_real *slope)
+/* Of one SoC: the knot to the left, and weights of value and slope there and to the right. */
+typedef struct {
+    int32_t left;
+    cg_real value[4];
+    cg_real slope[4];
+} cg_place;
+
+static cg_place place_of(const cg_real *knots, int32_t count, cg_real soc_pct)
+{
+    const int32_t last = count - 1;
+    if (soc_pct < knots[0]) {
+        const cg_place below = {0, {R(1.0), soc_pct - knots[0]}, {R(0.0), R(1.0)}};
+        return below;
+    }
+    if (soc_pct > knots[last]) {
+        const cg_place above = {last - 1, {R(0.0), R(0.0), R(1.0), soc_pct - knots[last]},
+                                {R(0.0), R(0.0), R(0.0), R(1.0)}};
+        return above;
+    }
+    int32_t left = 0;
+    while ((left < (last - 1)) && !(soc_pct < knots[left + 1])) {
+        ++left;
+    }
+    const cg_real width = knots[left + 1] - knots[left];
+    const cg_real f = (soc_pct - knots[left]) / width;
+    const cg_real back = R(1.0) - f;
+    const cg_real turn = R(6.0) * f * back / width;
+    const cg_place inside = {
+        left,
+        {(R(1.0) + (R(2.0) * f)) * back * back, width * f * back * back,
+         f * f * (R(3.0) - (R(2.0) * f)), -width * f * f * back},
+        {-turn, back * (R(1.0) - (R(3.0) * f)), turn, f * ((R(3.0) * f) - R(2.0))},
+    };
+    return inside;
+}
+
+static cg_real published_ocv(const cg_model *model, cg_real soc_pct, cg_real *slope)
 {
     const cg_wide *k = model->ocv_v;
     const cg_real at = cg_clip(soc_pct, model->soc_range_pct[0], model->soc_range_pct[1]);
@@ -141,15 +173,47 @@ cg_real cg_ocv(const cg_model *model, cg_real soc_pct, cg_real *slope)
     return volts + (*slope * (soc_pct - at));
 }
 
-cg_real cg_offset_v(const cg_model *model, cg_real temperature_c, const cg_real *delayed_a)
+/* The curve of the model, and its slope. */
+static cg_real curve_v(const cg_model *model, cg_real soc_pct, cg_real *slope)
 {
-    const cg_real low = model->temperature_range_c[0] - R(TEMPERATURE_MARGIN_K);
-    const cg_real high = model->temperature_range_c[1] + R(TEMPERATURE_MARGIN_K);
-    cg_real volts = model->kt_v_per_k * (cg_clip(temperature_c, low, high) - model->t_ref_c);
-    for (int32_t j = 0; j < model->delays; ++j) {
-        volts += model->resistance_ohm[j] * delayed_a[j];
+    if (model->knots == 0) {
+        return published_ocv(model, soc_pct, slope);
     }
-    return volts;
+    const cg_place at = place_of(model->knot_pct, model->knots, soc_pct);
+    const cg_real knot[4] = {model->knot_v[at.left], model->knot_slope[at.left],
+                             model->knot_v[at.left + 1], model->knot_slope[at.left + 1]};
+    *slope = cg_dot(at.slope, knot, 4);
+    return cg_dot(at.value, knot, 4);
+}
+
+static cg_real resistance_factor(cg_real temperature_c)
+{
+    const cg_real kelvin = cg_clip(temperature_c, R(COLDEST_C), R(HOTTEST_C)) + R(ZERO_C_IN_K);
+    const cg_real reference = R(RESISTANCE_REFERENCE_C) + R(ZERO_C_IN_K);
+    return cg_exp(R(ACTIVATION_K) * ((R(1.0) / kelvin) - (R(1.0) / reference)));
+}
+
+/* Growth of the voltage errors in the cold, 1 or more. */
+cg_real cg_cold(const cg_model *model, cg_real temperature_c)
+{
+    return cg_pow(cg_max(R(1.0), resistance_factor(temperature_c)), model->cold_exponent);
+}
+
+/* Change of the voltage by each principal function. */
+void cg_functions_row(const cg_model *model, cg_real soc_pct, const cg_real *load, cg_real *row)
+{
+    if (model->functions > 0) {
+        const cg_place at = place_of(model->function_pct, model->function_knots, soc_pct);
+        for (int32_t j = 0; j < model->functions; ++j) {
+            row[j] = (at.value[0] * model->function_v[at.left][j]) +
+                     (at.value[1] * model->function_slope[at.left][j]) +
+                     (at.value[2] * model->function_v[at.left + 1][j]) +
+                     (at.value[3] * model->function_slope[at.left + 1][j]);
+            for (int32_t k = 0; k < cg_loads(model); ++k) {
+                row[j] += load[k] * model->function_load[k][j];
+            }
+        }
+    }
 }
 
 /* ------------------------------------------------------------------ effects */
@@ -253,7 +317,7 @@ void cg_correct(cg_estimator *self, cg_sample *sample, int32_t from, int32_t to)
             break;
         case CG_TEMPERATURE_LAG:
             if (!isnan(sample->temperature_c)) {
-                const cg_real smooth = lag_from(&state->lag[0], R(SMOOTHING_S), sample->time_s,
+                const cg_real smooth = lag_from(&state->lag[0], effect->tau_s[0], sample->time_s,
                                                 sample->temperature_c);
                 sample->temperature_c += effect->value[0] * (sample->temperature_c - smooth);
             }
@@ -438,27 +502,51 @@ static bool depends_on_soc(const cg_effect *effect)
            ((kind == (int32_t)CG_RC) && (effect->value[1] != R(0.0)));
 }
 
+/* Load columns at the latest sample, their voltage, and its part over the resistances. */
+static void advance_load(cg_estimator *self, const cg_sample *sample, cg_real temperature_c)
+{
+    const cg_model *model = self->model;
+    cg_state *state = &self->state;
+    const int32_t currents = cg_currents(model);
+    cg_real *load = state->load;
+    const cg_real bounded =
+        cg_clip(temperature_c, model->temperature_limits_c[0], model->temperature_limits_c[1]);
+    load[0] = bounded - model->t_ref_c;
+    for (int32_t j = 0; j < model->delays; ++j) {
+        load[1 + j] = cg_line_at(&self->line, (cg_time)model->delay_s[j]);
+    }
+    for (int32_t j = 0; j < model->low_passes; ++j) {
+        load[1 + model->delays + j] = lag_from_rest(&state->low_pass[j], model->low_pass_s[j],
+                                                    sample->time_s, sample->current_a);
+    }
+    if (model->has_arrhenius != 0) {
+        const cg_real colder = (resistance_factor(bounded) / model->arrhenius_mean) - R(1.0);
+        load[1 + currents] = colder * cg_dot(&load[1], model->arrhenius_ohm, currents);
+    }
+    state->load_v = cg_dot(load, model->load, cg_loads(model));
+    state->drop_v = cg_dot(&load[1], &model->load[1], cg_loads(model) - 1);
+}
+
+/* Advance the voltage model to a corrected sample. */
 void cg_advance(cg_estimator *self, const cg_sample *sample, cg_real temperature_c)
 {
     const cg_model *model = self->model;
-    cg_real drop_v = R(0.0);
-    for (int32_t j = 0; j < model->delays; ++j) {
-        drop_v += model->resistance_ohm[j] * cg_line_at(&self->line, (cg_time)model->delay_s[j]);
-    }
+    cg_state *state = &self->state;
     const bool is_known = isfinite(temperature_c) != 0;
-    cg_real beside_v = R(0.0);
+    const cg_real known_c = is_known ? temperature_c : model->t_ref_c;
+    cg_line_push(&self->line, model->delay_s[model->delays - 1], self->settings.gap_s,
+                 sample->time_s, sample->current_a);
+    advance_load(self, sample, known_c);
+    state->beside_soc_v = R(0.0);
     for (int32_t k = 0; k < model->effects; ++k) {
         const cg_effect *effect = &model->effect[k];
-        cg_effect_state *state = &self->state.effect[k];
         if (is_known || !follows_temperature(effect)) {
-            advance_effect(effect, state, sample, is_known ? temperature_c : model->t_ref_c,
-                           drop_v);
+            advance_effect(effect, &state->effect[k], sample, known_c, state->drop_v);
         }
         if (!depends_on_soc(effect)) {
-            beside_v += state->volts;
+            state->beside_soc_v += state->effect[k].volts;
         }
     }
-    self->state.beside_soc_v = beside_v;
 }
 
 static cg_real ocv_shape_v(const cg_real *height_v, cg_real soc_pct)
@@ -497,12 +585,12 @@ static cg_real effect_v(const cg_model *model, const cg_effect *effect,
         break;
     case CG_WEAK_CELL: {
         const cg_real weak_v =
-            cg_ocv(model, R(100.0) - ((R(100.0) - soc_pct) * value[1]), &slope);
-        volts = value[0] * (weak_v - cg_ocv(model, soc_pct, &slope));
+            curve_v(model, R(100.0) - ((R(100.0) - soc_pct) * value[1]), &slope);
+        volts = value[0] * (weak_v - curve_v(model, soc_pct, &slope));
         break;
     }
     default: /* CG_RC along the slope */
-        (void)cg_ocv(model, soc_pct, &slope);
+        (void)curve_v(model, soc_pct, &slope);
         slope = cg_clip(slope / value[2], R(0.0), R(STEEPNESS_AT_MOST));
         volts = (R(1.0) + (value[1] * (slope - R(1.0)))) * state->volts;
         break;
@@ -525,14 +613,12 @@ static cg_real over_soc_v(const cg_estimator *self, cg_real soc_pct)
 cg_real cg_pseudo_ocv(const cg_estimator *self, cg_real soc_pct, cg_real *slope)
 {
     const cg_model *model = self->model;
-    cg_real volts = cg_ocv(model, soc_pct, slope);
+    cg_real volts = curve_v(model, soc_pct, slope);
     bool is_over_soc = false;
     for (int32_t k = 0; k < model->effects; ++k) {
         is_over_soc = is_over_soc || depends_on_soc(&model->effect[k]);
     }
-    if (model->effects > 0) {
-        volts += self->state.beside_soc_v;
-    }
+    volts += self->state.beside_soc_v;
     if (is_over_soc) {
         volts += over_soc_v(self, soc_pct);
         const cg_real above_v = over_soc_v(self, soc_pct + R(SLOPE_STEP_PCT));
@@ -568,103 +654,12 @@ cg_real cg_newton(const cg_estimator *self, cg_real ocv_v, cg_real guess_pct, bo
         } else {
             low = soc;
         }
-        cg_real following = soc - (error / slope);
-        if (!((low < following) && (following < high))) {
-            following = R(0.5) * (low + high);
-        }
+        const cg_real following = soc - (error / slope);
         if (cg_fabs(following - soc) < R(CG_CLOSE_PCT)) {
             return following;
         }
-        soc = following;
+        const bool is_between = (low < following) && (following < high);
+        soc = is_between ? following : (R(0.5) * (low + high));
     }
     return soc;
-}
-
-/* ------------------------------------------------------------------ noise of a voltage */
-
-/* Variance while the delay line fills: that of all samples that share the unknown currents. */
-static cg_real filling_var_v2(const cg_model *model, cg_real filled_var_v2, cg_time filled_s)
-{
-    const cg_real usual_a = R(USUAL_CURRENT_C_RATE) * model->capacity_ah;
-    const cg_real shared_by = cg_max(model->delay_s[model->delays - 1] * model->rate_hz, R(1.0));
-    cg_real unknown_ohm = R(0.0);
-    for (int32_t j = 0; j < model->delays; ++j) {
-        if ((cg_time)model->delay_s[j] > filled_s) {
-            unknown_ohm += cg_fabs(model->resistance_ohm[j]);
-        }
-    }
-    return (filled_var_v2 + cg_square(unknown_ohm * usual_a)) * shared_by;
-}
-
-/* Variance from currents before the first, in the memory of effects. */
-static cg_real start_var_v2(const cg_model *model, cg_real known_s)
-{
-    const cg_real usual_a = R(USUAL_CURRENT_C_RATE) * model->capacity_ah;
-    cg_real variance = R(0.0);
-    for (int32_t k = 0; k < model->memories; ++k) {
-        const cg_real tau_s = model->memory_tau_s[k];
-        variance += cg_square(model->memory_ohm[k] * usual_a) *
-                    cg_exp(R(-2.0) * known_s / tau_s) * cg_max(tau_s * model->rate_hz, R(1.0));
-    }
-    return variance;
-}
-
-cg_real cg_fast_std_v(const cg_estimator *self, cg_real temperature_c, cg_real *kt_std_v)
-{
-    const cg_model *model = self->model;
-    const cg_time filled_s = cg_line_filled_s(&self->line);
-    cg_real variance = cg_square(model->fast_std_v);
-    cg_real memory_s = R(0.0);
-    for (int32_t k = 0; k < model->memories; ++k) {
-        memory_s = cg_max(memory_s, model->memory_tau_s[k]);
-    }
-    memory_s = R(MEMORY_TIMES) * memory_s;
-    if (!(filled_s >= (cg_time)model->delay_s[model->delays - 1])) {
-        variance = filling_var_v2(model, variance, filled_s);
-    }
-    if (filled_s < (cg_time)memory_s) {
-        variance += start_var_v2(model, (cg_real)filled_s);
-    }
-    if (isnan(temperature_c)) {
-        *kt_std_v = cg_fabs(model->kt_v_per_k) * R(TEMPERATURE_STD_K);
-    } else {
-        const cg_real outside = R(OUTSIDE_TEMPERATURE_V_PER_K) * model->nominal_v;
-        const cg_real colder = cg_min(temperature_c - model->temperature_range_c[0], R(0.0));
-        const cg_real hotter = cg_max(temperature_c - model->temperature_range_c[1], R(0.0));
-        *kt_std_v = (model->kt_std_v_per_k * (temperature_c - model->mean_c)) +
-                    (outside * (colder + hotter));
-    }
-    return cg_sqrt(variance);
-}
-
-cg_real cg_resistance_std(const cg_model *model, cg_real temperature_c)
-{
-    if (isnan(temperature_c)) {
-        return model->resistance_std_per_k * R(TEMPERATURE_STD_K);
-    }
-    return model->resistance_std_per_k * (temperature_c - model->mean_c);
-}
-
-/* Values of the functions of the curve's error at a SoC. */
-void cg_curve_functions(const cg_model *model, cg_real soc_pct, cg_real *values)
-{
-    if (model->functions > 0) {
-        int32_t k = 0;
-        while ((k < model->knots) && !(soc_pct < model->knot_pct[k])) {
-            ++k;
-        }
-        if (k < 1) {
-            k = 1;
-        }
-        if (k > (model->knots - 1)) {
-            k = model->knots - 1;
-        }
-        const cg_real low = model->knot_pct[k - 1];
-        const cg_real high = model->knot_pct[k];
-        const cg_real part = cg_clip((soc_pct - low) / (high - low), R(0.0), R(1.0));
-        const cg_real rest = R(1.0) - part;
-        for (int32_t j = 0; j < model->functions; ++j) {
-            values[j] = (rest * model->function_v[k - 1][j]) + (part * model->function_v[k][j]);
-        }
-    }
 }

@@ -8,9 +8,8 @@ from typing import Self
 
 import can
 
-from cangauge.bus.backend import backend_capabilities
 from cangauge.bus.connection import BusConnection
-from cangauge.bus.open import BusAddress, open_bus
+from cangauge.bus.open import BusAddress, backend_capabilities, open_bus
 from cangauge.bus.vehicle import Vehicle
 from cangauge.service.loop import LoopSettings
 from cangauge.service.pipeline import Pipeline

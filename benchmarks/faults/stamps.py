@@ -25,10 +25,10 @@ StampChange = Callable[[float, float, Random], float]
 
 def _run(change: StampChange, arguments: list[str], *, lasts: bool = False) -> None:
     """Run the service with stamps changed during the fault, or from its start on."""
-    from cangauge.bus import backend  # noqa: PLC0415 - in the service's process alone
+    from cangauge.bus import connection  # noqa: PLC0415 - in the service's process alone
 
     begin_s, end_s = REAL.fault_s
-    make, rng, first_s = backend.as_message, Random(1), math.nan  # noqa: S311 - repeatable
+    make, rng, first_s = connection.as_message, Random(1), math.nan  # noqa: S311 - repeatable
 
     def restamped(fields: dict[str, Any], stamp_s: float) -> can.Message:
         nonlocal first_s
@@ -38,7 +38,7 @@ def _run(change: StampChange, arguments: list[str], *, lasts: bool = False) -> N
             stamp_s = change(stamp_s, first_s + begin_s, rng)
         return make(fields, stamp_s)
 
-    backend.as_message = restamped
+    connection.as_message = restamped
     cangauge(arguments)
 
 

@@ -18,7 +18,7 @@ from random import Random
 import can
 
 from cangauge._resources import shared_file
-from cangauge.bus.captures.capture import is_capture, open_capture
+from cangauge.bus.captures import is_capture, open_capture
 from cangauge.bus.database import load_dbc
 from cangauge.bus.encoder import FrameEncoder
 from cangauge.bus.protection import GENERIC_RULE

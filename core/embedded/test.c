@@ -66,7 +66,7 @@ static void test_reset(const cg_settings *settings, const cg_line *line)
     check("refused: one evaluated", cg_restore(&pack, &evaluated, 1.0) ? 0.0 : 1.0, 0.0);
     check("SoC after a reset [%]", apart(before_pct, (double)cg_evaluate(&pack).soc_pct), 0.0);
     update(&golden_samples[at]);
-    /* Charge between the two samples, and a step of the filter whose delay line is empty. */
+    /* Charge between the two samples. */
     check("SoC goes on [%]", apart(before_pct, (double)cg_evaluate(&pack).soc_pct), 2.0);
     broken = evaluated;
     broken.filter.hypotheses = 1000;

@@ -41,17 +41,11 @@ void fmu_sample(fmu *self, double time_s)
     }
     self->last.time_s = time_s;
     self->last.current_a = counted;
-    cg_line_push(&core->line, model->delay_s[model->delays - 1], core->settings.gap_s, time_s,
-                 now.current_a);
-    for (int32_t j = 0; j < model->delays; ++j) {
-        core->delayed_a[j] = cg_line_at(&core->line, (cg_time)model->delay_s[j]);
-    }
     cg_advance(core, &now, now.temperature_c);
     const double soc_pct =
         value[FMU_INITIAL_SOC_PCT] - (100.0 * self->discharged_ah / model->capacity_ah);
     cg_real slope;
     value[FMU_TIME_S] = time_s;
     value[FMU_SOC_PCT] = soc_pct;
-    value[FMU_VOLTAGE_V] = cg_pseudo_ocv(core, soc_pct, &slope) +
-                           cg_offset_v(model, now.temperature_c, core->delayed_a);
+    value[FMU_VOLTAGE_V] = cg_pseudo_ocv(core, soc_pct, &slope) + core->state.load_v;
 }

@@ -76,7 +76,7 @@ class Reason(enum.IntFlag):
     SOC_UNCERTAIN = 1 << 16
     DUPLICATE_SENDER = 1 << 17
     MODEL_MISMATCH = 1 << 18
-    """Offset, bias or capacity are beyond what was assumed for them."""
+    """Voltages contradict the model for longer than its stated errors last."""
     TIME_UNCERTAIN = 1 << 19
 
 
@@ -99,7 +99,7 @@ REASON_WORDS: Final = {
     Reason.CURRENT_MISSING: "no plausible current within its time-out: charge is not counted",
     Reason.SOC_UNCERTAIN: "the standard deviation exceeds the limit of a valid SoC",
     Reason.DUPLICATE_SENDER: "another node sends frames with an id that is read or published here",
-    Reason.MODEL_MISMATCH: "offset, bias or capacity do not fit the model: run `cangauge gap`",
+    Reason.MODEL_MISMATCH: "the pack does not behave as its model: run `cangauge gap` on a log",
     Reason.TIME_UNCERTAIN: "time stamps are irregular, or contradict the monotonic clock",
 }
 """Description of each reason, for pages and messages."""
@@ -115,7 +115,7 @@ class _Reasons(dict[int, Reason]):
 REASONS: Final = _Reasons()
 """Sets of reasons by their bits: slow to combine, and read for every sample."""
 _UNKNOWN_BITS: Final = int(Reason.NO_INITIAL_SOC)
-_INVALID_BITS: Final = int(Reason.INPUT_STALE | Reason.CURRENT_MISSING)
+_INVALID_BITS: Final = int(Reason.INPUT_STALE | Reason.CURRENT_MISSING | Reason.MODEL_MISMATCH)
 
 
 def reason_name(reason: Reason) -> str:
@@ -154,6 +154,53 @@ class Estimate(NamedTuple):
     def unknown(cls, reasons: Reason) -> Estimate:
         """Return the estimate before the first sample."""
         return cls(*(math.nan,) * 7, status_of(reasons), reasons, 0)
+
+
+class Health(NamedTuple):
+    """Health of the pack, with standard deviations."""
+
+    capacity_ah: float
+    """Charge from 100 to 0 % SoC [Ah]."""
+    capacity_std_ah: float
+    resistance_ratio: float
+    """Resistance relative to the model's [-]; 1 where nothing is known."""
+    resistance_std: float
+    offset_a: float
+    """Offset of the current sensor, measured minus true [A]."""
+    offset_std_a: float = math.nan
+
+
+class Power(NamedTuple):
+    """Possible currents, both positive, and the energy left; NaN where not known."""
+
+    discharge_a: float = math.nan
+    """Discharge current possible for 10 s [A]."""
+    discharge_std_a: float = math.nan
+    charge_a: float = math.nan
+    """Charge current possible for 10 s [A]."""
+    charge_std_a: float = math.nan
+    energy_wh: float = math.nan
+    """Energy left to the cut-off [Wh]."""
+    energy_std_wh: float = math.nan
+
+
+class CellReport(NamedTuple):
+    """The cells as a whole; NaN where not known."""
+
+    cells: int
+    """Number of cells known."""
+    weakest: int
+    """Number of the cell with the least SoC; −1: not known."""
+    soc_pct: float
+    """Its SoC [%]."""
+    soc_std_pct: float
+    spread_pct: float
+    """SoC of the strongest cell less that of the weakest [%]."""
+    sum_error_v: float
+    """Pack voltage less the sum of the cells [V]."""
+    sum_std_v: float
+    is_sum_wrong: bool
+    """Whether that is more than both sensors' errors allow."""
 
 
 def status_of(reasons: Reason) -> Status:

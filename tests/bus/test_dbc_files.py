@@ -58,16 +58,6 @@ def test_leaf_frame_as_recorded() -> None:
     assert soc == pytest.approx(86.6, abs=1e-9)
 
 
-def test_leaf_energy_field_alternates() -> None:
-    leaf = database("nissan_leaf.dbc")
-    present = leaf.decode_message("BATTERY_5BC", bytes.fromhex("9F40CE64C003FFFF"))
-    maximum = leaf.decode_message("BATTERY_5BC", bytes.fromhex("BB80CE64C013FFFF"))
-    assert present["remaining_energy_wh"] == 637 * 80
-    assert maximum["maximum_energy_wh"] == 750 * 80
-    assert "remaining_energy_wh" not in maximum
-    assert present["state_of_health_pct"] == 96
-
-
 def test_leaf_temperatures_are_multiplexed() -> None:
     leaf = database("nissan_leaf.dbc")
     for payload, name in (

@@ -5,7 +5,7 @@ from __future__ import annotations
 import can
 import pytest
 
-from cangauge.bus.backend import error_kinds
+from cangauge.bus.connection import error_kinds
 
 
 @pytest.mark.parametrize(

@@ -191,7 +191,7 @@ def test_the_check_accepts_exactly_what_can_be_sent(value: float) -> None:
 @pytest.mark.parametrize(("value", "fits"), [(-0.2, True), (-0.3, False), (511.2, True)])
 def test_values_that_round_into_the_range_fit(value: float, fits: bool) -> None:
     voltage = VEHICLES["leaf_ze0"].voltage
-    assert bool(voltage.fits(np.array([value]))[0]) is fits
+    assert bool(voltage.codec.fits(np.array([value]))[0]) is fits
 
 
 def test_a_single_sample_that_does_not_fit_names_its_signal() -> None:

@@ -11,11 +11,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from cangauge._resources import shared_file
-from cangauge.bus.captures.capture import open_capture
+from cangauge.bus.captures import open_capture
 from cangauge.bus.database import load_dbc
 from cangauge.bus.decoder import SampleDecoder
 from cangauge.bus.encoder import FrameEncoder
-from cangauge.bus.isotp import Reassembler, reply_key
+from cangauge.bus.polling import Reassembler, reply_key
 from cangauge.bus.recording import capture_to_log
 from cangauge.bus.vehicle import Vehicle
 from cangauge.errors import InputError

@@ -2,18 +2,13 @@
 
 from __future__ import annotations
 
-import json
 import re
-import time
-from pathlib import Path
 
 import cantools.database
 import pytest
 from cantools.database.can import Database
 
 from cangauge._resources import shared_file
-from live import waits
-from running import RunningService
 
 NAMES = sorted(path.name for path in shared_file("dbc", "soc_estimate.dbc").parent.glob("*.dbc"))
 
@@ -76,35 +71,3 @@ def test_canmatrix_and_cantools_read_the_same_signals(name: str) -> None:
         for signal in message.signals
     }
     assert found == expected
-
-
-def test_an_mcap_recording_is_complete_for_its_own_reader(tmp_path: Path) -> None:
-    """Foxglove and PlotJuggler read channels of "json" with a schema of "jsonschema"."""
-    reader_of = pytest.importorskip("mcap.reader", reason="needs the extra cangauge[mcap]")
-    jsonschema = pytest.importorskip("jsonschema")
-    with RunningService(tmp_path, 'record = "drive.mcap"\n') as running:
-        assert waits(lambda: running.service.pipeline.samples > 30)
-        time.sleep(0.2)
-    [path] = tmp_path.glob("drive*.mcap")
-    with path.open("rb") as file:
-        reader = reader_of.make_reader(file, validate_crcs=True)
-        summary = reader.get_summary()
-        assert summary is not None
-        assert summary.chunk_indexes  # what a player seeks by
-        validators = {}
-        for schema in summary.schemas.values():
-            assert schema.encoding == "jsonschema"
-            content = json.loads(schema.data)
-            assert content["type"] == "object"  # Foxglove takes no other root
-            jsonschema.Draft202012Validator.check_schema(content)
-            validators[schema.id] = jsonschema.Draft202012Validator(content)
-        assert {each.message_encoding for each in summary.channels.values()} == {"json"}
-        topics = {each.topic for each in summary.channels.values()}
-        assert {"/sample", "/soc_estimate"} < topics
-        count, latest = 0, 0
-        for schema, _, message in reader.iter_messages(log_time_order=True):
-            validators[schema.id].validate(json.loads(message.data))
-            assert message.log_time >= latest
-            count, latest = count + 1, message.log_time
-        assert count == summary.statistics.message_count
-        assert count > 100

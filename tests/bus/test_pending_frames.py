@@ -11,8 +11,13 @@ from pathlib import Path
 import can
 import pytest
 
-from cangauge.bus.backend import NoPendingFrameError, pending_frames
-from cangauge.bus.connection import AT_ONCE, BusConnection, BusError
+from cangauge.bus.connection import (
+    AT_ONCE,
+    BusConnection,
+    BusError,
+    NoPendingFrameError,
+    pending_frames,
+)
 from cangauge.bus.open import BusAddress, bus_address, open_bus
 from cangauge.bus.publish import standard_filter
 from live import BrokenBus, network_down, same_frames, unpack_error
@@ -122,7 +127,6 @@ def test_packets_that_are_no_frames_are_counted() -> None:
     junk = [b"", b"\xff", b"\x01", b"\x90", b"\x81\xa1x\x01", bytes(5000)]
     good = can.Message(arbitration_id=0x123, is_extended_id=False, data=b"1")
     with (
-        BusConnection(open_bus(address), "theirs") as theirs,
         BusConnection(open_bus(address), "ours") as ours,
         open_bus(address) as sender,
         socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as raw,
@@ -131,10 +135,8 @@ def test_packets_that_are_no_frames_are_counted() -> None:
         for each in junk:
             raw.sendto(each, (address.channel, int(address.options["port"])))
         sender.send(good)
-        for _ in junk:
-            assert theirs.receive(0.2) is None
         assert len(ours.receive_pending(0.2)) == 1
-        assert ours.garbled == theirs.garbled == len(junk)
+        assert ours.garbled == len(junk)
 
 
 @linux_only
@@ -174,7 +176,7 @@ def test_other_interfaces_are_read_until_they_are_empty() -> None:
     port = BusConnection(BrokenBus(script), "x")  # type: ignore[arg-type] # what is used of one
     assert len(port.receive_pending(0.0)) == 2
     assert port.is_drained
-    assert [len(port.receive_pending(0.0)) for _ in range(2)] == [0, 1]
+    assert len(port.receive_pending(0.0)) == 1
     assert port.garbled == 1
     assert not port.is_drained
     with pytest.raises(BusError):

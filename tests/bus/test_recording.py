@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import gzip
-import math
 from pathlib import Path
 
 import can
@@ -12,7 +11,6 @@ import pytest
 
 from cangauge.bus.decoder import SampleDecoder
 from cangauge.bus.encoder import FrameEncoder
-from cangauge.bus.protection import LEAF_RULE
 from cangauge.bus.recording import (
     capture_samples,
     capture_to_log,
@@ -22,7 +20,6 @@ from cangauge.bus.recording import (
 from cangauge.bus.time_source import ClockFrames, ReceiveTime
 from cangauge.bus.vehicle import Vehicle
 from cangauge.errors import InputError
-from cangauge.inspect.capture import inspect_capture
 from cangauge.logs.canonical import write_log
 from cangauge.logs.log import Log
 from cangauge.logs.read import LogFile
@@ -114,15 +111,6 @@ def test_neither_log_nor_capture_names_both_kinds(tmp_path: Path) -> None:
     assert "candump" in str(caught.value.cure)
 
 
-@pytest.mark.real
-def test_every_real_capture_needs_a_vehicle(shared_data: Path) -> None:
-    paths = sorted((shared_data / "leaf_can").glob("*.gz"))
-    assert len(paths) == 9
-    for path in paths:
-        with pytest.raises(InputError, match="this is a CAN capture, not a log"):
-            read_recording(path)
-
-
 def test_a_recorded_drive_becomes_a_log(tmp_path: Path, generic: Vehicle) -> None:
     log = capture_to_log(record(tmp_path / "drive.log", drive(generic)), generic)
     assert len(log) == 200
@@ -183,17 +171,6 @@ def test_missing_voltage_is_interpolated_or_dropped(tmp_path: Path, generic: Veh
     assert "43 samples without voltage dropped" in log.remarks
     assert log.voltage_v[log.time_s > 1005.0][0] == 380.0
     assert log.time_s[0] == pytest.approx(1000.3)
-
-
-def test_slow_voltage_keeps_every_current(tmp_path: Path, generic: Vehicle) -> None:
-    frames = [
-        frame
-        for frame in drive(generic)
-        if frame.arbitration_id != VOLTAGE_ID or round(10 * frame.timestamp) % 5 == 0
-    ]
-    log = capture_to_log(record(tmp_path / "x.log", frames), generic)
-    assert len(log) >= 195
-    assert np.isfinite(log.voltage_v).all()
 
 
 def test_temperature_before_the_first_is_the_first(tmp_path: Path, generic: Vehicle) -> None:
@@ -292,74 +269,3 @@ def test_late_stamps_are_dropped_until_time_advances(tmp_path: Path, generic: Ve
     log = capture_to_log(record(tmp_path / "x.log", frames), generic)
     assert len(log) == 195
     assert "5 samples dropped whose time does not advance" in log.remarks
-
-
-def test_inspection_lists_frames_protection_and_vehicle(tmp_path: Path, generic: Vehicle) -> None:
-    frames = drive(generic)
-    frames = [f for f in frames if not 1005.0 < f.timestamp < 1007.95]
-    frames.append(can.Message(timestamp=1021.0, is_error_frame=True, channel="can0"))
-    frames.append(
-        can.Message(
-            timestamp=1021.0,
-            arbitration_id=5,
-            is_remote_frame=True,
-            is_extended_id=False,
-            dlc=1,
-            channel="can0",
-        )
-    )
-    path = record(tmp_path / "x.log", frames)
-    found = inspect_capture(path)
-    assert found.matching == ("generic",)
-    assert found.duration_s == pytest.approx(21.0, abs=0.01)
-    assert (found.error_frames, found.remote_frames) == (1, 1)
-    assert [(g.start_s, round(g.length_s, 3)) for g in found.gaps] == [(1005.0, 3.0), (1019.9, 1.1)]
-    current = next(each for each in found.ids if each.id == "400")
-    assert (current.protection, current.bytes, current.bus) == ("generic", "6", "can0")
-    assert current.period_s == pytest.approx(0.1)
-    assert current.longest_s == pytest.approx(3.0)
-    assert (current.crc_errors, current.counter_jumps) == (0, 1)
-    assert current.frames_lost == 29 % 16
-    match = next(each for each in found.presets if each.preset == "generic")
-    assert match.current_a == (0.0, 40.0)
-    assert match.voltage_v == (376.0, 380.0)
-    assert found.log is None
-    assert found.to_dict()["matching_presets"] == "generic"
-
-
-def test_inspection_with_a_vehicle_has_the_log_too(tmp_path: Path, generic: Vehicle) -> None:
-    path = record(tmp_path / "x.log", drive(generic))
-    found = inspect_capture(path, generic)
-    assert found.log is not None
-    assert found.log.rows == 200
-    assert found.to_dict()["log"]["rows"] == 200
-
-
-def test_inspection_of_unknown_frames(tmp_path: Path) -> None:
-    frames = [
-        can.Message(
-            timestamp=n / 10,
-            arbitration_id=0x100 + n % 3,
-            is_extended_id=n % 3 == 0,
-            data=bytes([n % 256, n // 256]),
-            channel="can0",
-        )
-        for n in range(300)
-    ]
-    constant = LEAF_RULE.protect(bytes(8), 0)  # a CRC that is right by chance
-    frames += [
-        can.Message(
-            timestamp=30.0 + n,
-            arbitration_id=7,
-            is_extended_id=False,
-            data=constant,
-            channel="can0",
-        )
-        for n in range(100)
-    ]
-    found = inspect_capture(record(tmp_path / "x.log", frames))
-    assert found.matching == ()
-    assert [each.id for each in found.ids] == ["007", "00000100", "101", "102"]
-    assert all(each.protection == "" for each in found.ids)
-    assert all(not match.because.startswith("all") for match in found.presets)
-    assert not math.isnan(found.duration_s)

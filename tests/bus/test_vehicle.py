@@ -123,8 +123,8 @@ def test_a_dbc_with_a_map_file_gives_a_vehicle(own: Path) -> None:
     assert vehicle.name == "my car"
     assert vehicle.wanted_ids == (256, 0x18FF0B7E)
     payload = bytes.fromhex("FF380FA000000000")
-    assert vehicle.current.decode(payload) == pytest.approx(20.0)  # −20 A on the bus
-    assert vehicle.voltage.decode(payload) == pytest.approx(400.0)
+    assert vehicle.current.codec.decode(payload) == pytest.approx(20.0)  # −20 A on the bus
+    assert vehicle.voltage.codec.decode(payload) == pytest.approx(400.0)
     assert vehicle.temperature is not None
     assert vehicle.temperature.is_extended
     assert vehicle.messages[256].period_s == 0.020  # as the DBC says
@@ -147,9 +147,9 @@ def test_signals_may_come_from_two_dbc_files(own: Path) -> None:
 def test_units_of_the_dbc_are_converted(own: Path) -> None:
     text = MAP.replace("PackVoltage", "CellMilliVolts").replace("PackTemperature", "CoolantKelvin")
     vehicle = load(own, text)
-    assert vehicle.voltage.decode(bytes([0, 0, 0, 0, 0x0E, 0x74, 0, 0])) == pytest.approx(3.7)
+    assert vehicle.voltage.codec.decode(bytes([0, 0, 0, 0, 0x0E, 0x74, 0, 0])) == pytest.approx(3.7)
     assert vehicle.temperature is not None
-    assert vehicle.temperature.decode(
+    assert vehicle.temperature.codec.decode(
         bytes([0]) + (2931).to_bytes(2, "little") + bytes(5)
     ) == pytest.approx(19.95)
 
@@ -159,7 +159,7 @@ def test_the_sign_applies_after_conversion(own: Path) -> None:
     temperature = load(own, text).temperature
     assert temperature is not None
     payload = bytes([0]) + (2931).to_bytes(2, "little") + bytes(5)
-    assert temperature.decode(payload) == pytest.approx(-19.95)
+    assert temperature.codec.decode(payload) == pytest.approx(-19.95)
 
 
 def test_an_unknown_unit_is_refused(own: Path) -> None:
@@ -173,7 +173,7 @@ def test_an_unknown_unit_is_refused(own: Path) -> None:
 def test_the_map_file_corrects_sign_and_scale(own: Path) -> None:
     text = MAP.replace("sign = -1", "sign = -1\nscale = 0.5\noffset = 3.0")
     payload = bytes.fromhex("FF380FA000000000")
-    assert load(own, text).current.decode(payload) == pytest.approx(0.5 * 20.0 + 3.0)
+    assert load(own, text).current.codec.decode(payload) == pytest.approx(0.5 * 20.0 + 3.0)
 
 
 def test_the_map_file_may_fix_the_temperature(own: Path) -> None:

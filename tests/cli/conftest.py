@@ -14,8 +14,8 @@ from cangauge.cli.app import main
 from cangauge.cli.estimate import estimate_command
 from cangauge.cli.fit import fit_command
 from cangauge.cli.gap import gap_command
-from cangauge.cli.gap_check import gap_check_command
 from cangauge.cli.inspect import inspect_command
+from cangauge.extras.validation.gap_check_command import gap_check_command
 from cangauge.identify.fit import fit
 from cangauge.logs.canonical import write_log
 from synthetic import synthetic_log

@@ -9,12 +9,10 @@ from pathlib import Path
 
 from cangauge.cli import config_options, shown
 from cangauge.cli.app import COMMANDS
-from cangauge.diagnosis import ALARM_BELOW
+from cangauge.diagnosis import ALARM
 from cangauge.estimation.settings import VALID_STD_PCT
 from cangauge.extras.fleet import gap, run, sources
 from cangauge.extras.validation import packs, packs_run
-from cangauge.extras.validation.check import OPEN_SET
-from cangauge.extras.validation.plan import FULL
 from cangauge.logs.units import TEMPERATURE_SOURCES
 
 SLOW_TO_IMPORT = {
@@ -54,10 +52,9 @@ def test_no_help_page_imports_what_computes() -> None:
 def test_help_pages_repeat_names_and_defaults_truly() -> None:
     assert shown.TEMPERATURE_SOURCES == TEMPERATURE_SOURCES
     assert shown.VALID_STD_PCT == VALID_STD_PCT
-    assert shown.ALARM_BELOW == ALARM_BELOW
+    assert shown.ALARM == ALARM
     assert (run.LOCAL, sources.VEHICLE_PATTERN) == (shown.LOCAL, shown.VEHICLE_PATTERN)
     assert (gap.LOGS, gap.REFERENCES) == (shown.FLEET_LOGS, shown.FLEET_REFERENCES)
-    assert (*FULL, OPEN_SET) == shown.PROTOCOLS
     assert tuple(packs.PACKS) == shown.PACKS
     assert tuple(each.name for each in packs_run.CASES) == shown.CASES
 

@@ -13,7 +13,7 @@ from pathlib import Path
 import can
 import pytest
 
-from cangauge.bus.captures.capture import open_capture
+from cangauge.bus.captures import open_capture
 from cangauge.bus.open import bus_address, open_bus
 from cangauge.bus.recording import capture_to_log
 from cangauge.bus.vehicle import Vehicle

@@ -1,272 +1,163 @@
-"""Diagnosis: the cause of a known fault, `none` or `unknown`, and an extended model that runs."""
+"""The public face: faults are named, sized and undone, and no sentence contradicts the alarm."""
 
 from __future__ import annotations
 
 import json
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
-from days import asymmetric, day, late, more_amperes, more_volts, resistance_step
+from days import FAULTS, day, more_amperes, more_volts
 
-from cangauge.diagnosis import LIKELY, Diagnosis, diagnose
-from cangauge.diagnosis.cross_validation import soc_error_pct
-from cangauge.diagnosis.extended_model import extended_model_file
-from cangauge.diagnosis.problem import build_problem
-from cangauge.diagnosis.verdict import decide
+from cangauge.diagnosis import GROUP_OF, Diagnosis, References, diagnose
+from cangauge.diagnosis.answer import CHECKS, TITLES
 from cangauge.errors import InputError
-from cangauge.estimation.offline import estimate_log
-from cangauge.estimation.settings import EstimatorSettings
-from cangauge.extras.report.diagnosis import gap_report
 from cangauge.logs.log import Log
 from cangauge.model.model_file import Model
-from synthetic import synthetic_log
-
-FAULTS = {
-    "current_offset": lambda log: more_amperes(log, 4.0),
-    "voltage_offset": lambda log: more_volts(log, 2.5),
-    "resistance_asymmetry": asymmetric,
-    "resistance_step": resistance_step,
-    "initial_soc": lambda log: replace(log, soc_pct=log.soc_pct + 5.0),
-    "time_skew": late,
-}
 
 
 @pytest.fixture(scope="module")
-def offset(model: Model, references: list[Log]) -> Diagnosis:
-    return diagnose([more_amperes(day(21), 4.0)], model, references)
+def healthy(known: References, model: Model) -> Diagnosis:
+    return diagnose([day(20)], model, known)
 
 
-@pytest.fixture(scope="module")
-def without_references(model: Model) -> Diagnosis:
-    return diagnose([day(21)], model)
+@pytest.fixture(scope="module", params=FAULTS)
+def faulty(request: pytest.FixtureRequest, known: References, model: Model) -> Diagnosis:
+    fault, size = FAULTS[request.param]
+    return diagnose([replace(fault(day(20), size), name=request.param)], model, known)
 
 
-@pytest.mark.parametrize("effect", FAULTS)
-def test_a_clear_fault_is_named_or_ambiguous(
-    effect: str, model: Model, references: list[Log]
+def test_a_fault_of_two_floors_is_in_the_stated_groups(faulty: Diagnosis) -> None:
+    effect = faulty.logs[0].name
+    assert faulty.posterior.detected
+    assert GROUP_OF[effect] in faulty.posterior.stated_groups
+    assert effect in faulty.posterior.credible_set
+
+
+def test_the_extended_model_is_better_on_held_out_rows(faulty: Diagnosis) -> None:
+    assert faulty.accepted is not None
+    assert faulty.extended_rmse_v < faulty.baseline_rmse_v
+    closed, ci = faulty.closed_fraction, faulty.closed_fraction_ci
+    assert closed is not None
+    assert closed > 0.5
+    assert ci is not None
+    assert ci[0] <= closed <= ci[1] or closed == pytest.approx(ci[1], abs=0.05)
+
+
+def test_the_extended_model_runs_as_a_file(
+    faulty: Diagnosis, tmp_path: pytest.TempPathFactory
 ) -> None:
-    found = diagnose([FAULTS[effect](day(21)), FAULTS[effect](day(22))], model, references)
-    assert effect in {found.verdict.cause, *found.verdict.ambiguous_with}
-    assert len(found.verdict.ambiguous_with) <= 2
-    assert found.extended_rmse_v < found.baseline_rmse_v
-
-
-def test_healthy_logs_have_no_cause(model: Model, references: list[Log]) -> None:
-    for seed in range(30, 35):
-        assert decide(build_problem([day(seed)], model, references)).cause == "none"
-    found = diagnose([day(35)], model, references)
-    assert found.verdict.cause == "none"
-    assert found.closed_fraction is None
-
-
-@pytest.mark.parametrize("fitted_from_pct", [55.0, None])
-def test_a_gap_outside_the_references_soc_has_no_clear_cause(
-    fitted_from_pct: float | None, model: Model, references: list[Log]
-) -> None:
-    if fitted_from_pct is not None:
-        soc_pct = (fitted_from_pct, model.range.soc_pct[1])
-        narrow = model.range.model_copy(update={"soc_pct": soc_pct})
-        model = model.model_copy(update={"range": narrow})
-    log = synthetic_log(hours=1.2, start_pct=85.0, end_pct=40.0, noise_v=0.5, seed=21)
-    assert log.soc_pct is not None
-    beyond = np.maximum(55.0 - log.soc_pct, 0.0)
-    found = diagnose([replace(log, voltage_v=log.voltage_v + 0.5 * beyond)], model, references)
-    assert found.baseline_rmse_v > 2.0 * found.floor_v
-    if fitted_from_pct is None:
-        # The model's own logs cover this SoC: there is a gap, but hardly of a known effect.
-        assert found.verdict.cause == "unknown"
-        assert found.verdict.detected
-        probabilities = found.verdict.probabilities
-        assert max(probabilities[item["effect"]] for item in found.candidates) < LIKELY
-    else:
-        # No log covers it: the pseudo-OCV extrapolates.
-        assert found.verdict.cause == "none"
-
-
-def test_a_gap_unlike_any_effect_is_unknown(model: Model, references: list[Log]) -> None:
-    log = day(21)
-    wave = 6.0 * np.sin(2.0 * np.pi * log.time_s / 240.0)
-    found = diagnose([replace(log, voltage_v=log.voltage_v + wave)], model, references)
-    assert found.verdict.cause == "unknown"
-
-
-def test_two_causes_are_both_accepted(model: Model, references: list[Log]) -> None:
-    logs = [asymmetric(more_amperes(day(seed), 4.0)) for seed in (21, 22)]
-    found = diagnose(logs, model, references)
-    assert set(found.extension.cause) == {score.effect_id for score in found.verdict.accepted}
-    assert set(found.extension.cause) == {
-        "current_offset",
-        "resistance_asymmetry",
-    }
-
-
-def test_the_misfit_of_a_large_cause_is_no_second_cause(
-    model: Model, references: list[Log]
-) -> None:
-    def rising(log: Log) -> Log:  # within a quarter of an hour instead of at once
-        part = np.clip((log.time_s - 900.0) / 900.0, 0.0, 1.0)
-        return replace(log, voltage_v=log.voltage_v - 0.08 * log.current_a * part)
-
-    verdict = decide(build_problem([rising(day(21)), rising(day(22))], model, references))
-    assert [score.effect_id for score in verdict.accepted] == ["resistance_step"]
-
-
-def test_the_onset_of_a_step_is_found(model: Model, references: list[Log]) -> None:
-    short = synthetic_log(
-        hours=0.55, start_pct=80.0, end_pct=62.0, noise_v=0.5, seed=22, name="short"
+    path = f"{tmp_path}/extended.json"
+    faulty.extended_model.save(path)
+    loaded = Model.load(path)
+    assert [entry["id"] for entry in loaded.effects] == (
+        [] if faulty.accepted == "initial_soc" else [faulty.accepted]
     )
-    logs = [resistance_step(log) for log in (day(21), short)]
-    found = diagnose(logs, model, references)
-    assert found.verdict.cause == "resistance_step"
-    assert found.extension.cause["resistance_step"]["start_s"] == pytest.approx(1400.0, abs=20.0)
-    parameter = found.candidates[0]["parameters"]["step_ohm"]
-    assert parameter["value"] == pytest.approx(0.05, rel=0.1)
-    assert parameter["ci"][0] < 0.05 < parameter["ci"][1]
 
 
-def test_parameter_and_closed_fraction_match_the_fault(offset: Diagnosis) -> None:
-    parameters = offset.candidates[0]["parameters"]["offset_a"]
-    low, high = parameters["ci"]
-    assert low < 4.0 < high
-    assert offset.closed_fraction is not None
-    assert offset.closed_fraction > 0.9
-    assert offset.extension.cause["current_offset"]["offset_a"] == pytest.approx(4.0, abs=0.6)
+def test_no_sentence_contradicts_the_alarm(faulty: Diagnosis, healthy: Diagnosis) -> None:
+    for found in (faulty, healthy):
+        quiet = "No significant gap" in found.summary
+        assert quiet is not found.posterior.detected
+        assert (CHECKS["none"] in found.summary) is False
+        assert "worse" not in found.summary
+    assert TITLES[faulty.posterior.stated_groups[0]].split(",")[0] in faulty.summary
 
 
-def test_the_extended_model_runs_in_the_estimator(
-    offset: Diagnosis, model: Model, tmp_path: Path
+def test_a_healthy_log_gives_no_alarm(healthy: Diagnosis, model: Model) -> None:
+    assert not healthy.posterior.detected
+    assert healthy.accepted is None
+    assert healthy.extended_model == model
+    assert healthy.closed_fraction is None
+    assert "would have shown" in healthy.summary
+
+
+def test_a_size_has_an_interval_that_covers(known: References, model: Model) -> None:
+    held = []
+    for seed in range(20, 26):
+        for amperes in (4.0, -6.0):
+            found = diagnose([more_amperes(day(seed), amperes)], model, known)
+            ci = found.parameters["current_offset"]["offset_a"].ci
+            assert ci is not None
+            held.append(ci[0] <= amperes <= ci[1])
+    assert np.mean(held) >= 0.8
+
+
+def test_json_is_schema_3(faulty: Diagnosis) -> None:
+    found = faulty.to_json("x.json")
+    again = json.loads(json.dumps(found, allow_nan=False))
+    assert again["schema"] == 3
+    cause = again["cause"]
+    assert sum(item["probability"] for item in cause["groups"]) == pytest.approx(1.0)
+    assert len(cause["candidates"]) == len(GROUP_OF)
+    assert {item["effect"] for item in again["visible_from"]} == set(GROUP_OF)
+    assert again["gap"]["healthy_rmse_v"] == faulty.healthy_rmse_v
+    for axis in ("soc", "current", "temperature", "rest", "time", "timescale"):
+        assert sum(x["share"] for x in again["where"] if x["axis"] == axis) == pytest.approx(1.0)
+    assert again["extended_model"] == "x.json"
+
+
+def test_several_logs_share_one_cause(known: References, model: Model) -> None:
+    found = diagnose([more_volts(day(seed), 4.0) for seed in (20, 21)], model, known)
+    assert "sensors_and_count" in found.posterior.stated_groups
+    assert len(found.log_errors) == 2
+
+
+def test_references_learned_before_give_the_same(
+    references: list[Log], known: References, model: Model
 ) -> None:
-    path = tmp_path / "better.json"
-    offset.extended_model.save(path)
-    log = more_amperes(day(40), 4.0)
-    settings = EstimatorSettings(initial_soc_pct=85.0, method="coulomb")
-    _, plain = estimate_log(log, model, settings)
-    _, better = estimate_log(log, Model.load(path), settings)
-    assert plain.soc_mae_pct is not None
-    assert better.soc_mae_pct is not None
-    assert better.soc_mae_pct < 0.25 * plain.soc_mae_pct
+    log = more_volts(day(20), 3.0)
+    one, other = diagnose([log], model, references), diagnose([log], model, known)
+    assert one.posterior.probabilities == other.posterior.probabilities
+    assert one.extended_rmse_v == other.extended_rmse_v
 
 
-def test_json_has_the_keys_of_the_contract(offset: Diagnosis) -> None:
-    found = json.loads(json.dumps(offset.to_dict("better.json")))
-    assert found["schema"] == 2
-    assert {
-        "baseline_rmse_v", "extended_rmse_v", "floor_sensor_v", "floor_explainable_v",
-        "closed_fraction", "closed_fraction_ci", "baseline_soc_mae_pct", "extended_soc_mae_pct",
-    } == set(found["gap"])  # fmt: skip
-    cause = found["cause"]
-    assert {
-        "detected", "verdict", "probability", "probability_none", "probability_unknown", "family",
-        "family_probability", "credible_set", "ambiguous_with", "accepted", "candidates",
-    } <= set(cause)  # fmt: skip
-    assert cause["detected"] is (cause["probability_none"] <= 0.02)
-    assert cause["credible_set"][0] == cause["verdict"]
-    assert cause["family_probability"] >= cause["probability"]
-    assert set(found["ceiling"]) == {"isolable_from", "probability_of_best"}
-    assert set(found["ceiling"]["isolable_from"]) == {
-        item["effect"] for item in cause["candidates"]
-    } - {cause["verdict"]}
-    assert len(found["inputs"]["references"]) == 3
-    assert len(found["inputs"]["model"]["sha256"]) == 64
-    probabilities = [item["probability"] for item in cause["candidates"]]
-    answers = [*probabilities, cause["probability_unknown"], cause["probability_none"]]
-    assert sum(answers) == pytest.approx(1.0)
-    assert {item["axis"] for item in found["where"]} == {
-        "soc", "temperature", "current", "rest", "time", "timescale",
-    }  # fmt: skip
-    for axis in ("soc", "current", "time", "timescale"):
-        shares = [item["share"] for item in found["where"] if item["axis"] == axis]
-        assert sum(shares) == pytest.approx(1.0, abs=1e-6)
-    assert len(found["observability"]) == 20
-    assert found["extended_model"] == "better.json"
+def test_an_effect_can_be_taken_out_of_the_library(known: References, model: Model) -> None:
+    found = diagnose([more_volts(day(20), 5.0)], model, known, without=["voltage_offset"])
+    assert "voltage_offset" not in found.posterior.probabilities
+    assert sum(found.posterior.probabilities.values()) == pytest.approx(1.0)
 
 
-def test_the_page_has_the_verdict_and_loads_nothing(offset: Diagnosis) -> None:
-    page = gap_report(offset)
-    assert "current_offset" in page
-    assert offset.summary.split(":")[0] in page
-    assert "default-src 'none'" in page
+def test_the_model_is_the_reference_where_none_is_given(model: Model) -> None:
+    found = diagnose([more_volts(day(20), 12.0)], model)
+    assert "No reference log" in found.summary
+    assert found.posterior.groups["sensors_and_count"] == max(
+        p for group, p in found.posterior.groups.items() if group in TITLES
+    )
+    assert not diagnose([day(20)], model).posterior.detected
 
 
-def test_without_references_the_models_noise_is_the_floor(
-    without_references: Diagnosis, model: Model
+def test_a_start_is_found_from_the_voltage_and_said(known: References, model: Model) -> None:
+    found = diagnose([replace(day(20), soc_pct=None)], model, known)
+    assert "states no SoC" in " ".join(found.caveats)
+    assert not found.posterior.detected
+    given = diagnose([replace(day(20), soc_pct=None)], model, known, initial_soc_pct=85.0)
+    assert "states no SoC" not in " ".join(given.caveats)
+
+
+@pytest.mark.parametrize(
+    ("change", "word"),
+    [
+        (lambda log: log.rows(log.time_s < 200.0), "too short"),
+        (lambda log: replace(log, voltage_v=2.0 * log.voltage_v), "another pack"),
+        (lambda log: replace(log, current_a=0.0 * log.current_a), "constant"),
+        (lambda log: replace(log, current_a=12.0 * log.current_a), "no start explains it"),
+    ],
+)
+def test_what_cannot_be_diagnosed_is_refused(
+    known: References, model: Model, change: object, word: str
 ) -> None:
-    assert without_references.floor_v == model.noise.voltage_rmse_v
-    assert without_references.verdict.cause == "none"
+    with pytest.raises(InputError, match=word):
+        diagnose([change(day(20))], model, known)  # type: ignore[operator]
 
 
-def test_without_references_the_summary_names_the_model_file(
-    without_references: Diagnosis,
-) -> None:
-    expected = "No significant gap beyond the error stated in the model file ("
-    assert without_references.summary.startswith(expected)
+def test_a_log_is_not_its_own_reference(references: list[Log], model: Model) -> None:
+    with pytest.raises(InputError, match="same rows"):
+        diagnose([references[0]], model, references)
 
 
-def test_the_soc_error_is_computed_on_request(
-    without_references: Diagnosis, offset: Diagnosis, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def fail(*_: object) -> None:
-        pytest.fail("the estimator ran")
-
-    with monkeypatch.context() as patch:
-        patch.setattr("cangauge.diagnosis.cross_validation.run_estimator", fail)
-        gap = without_references.to_dict(soc_error=False)["gap"]
-        assert gap["baseline_soc_mae_pct"] is gap["extended_soc_mae_pct"] is None
-    gap = offset.to_dict()["gap"]
-    assert gap["extended_soc_mae_pct"] < gap["baseline_soc_mae_pct"] < 5.0
-
-
-def test_refuses_without_references_and_information(model: Model) -> None:
-    with pytest.raises(InputError, match="--reference"):
-        diagnose([day(21)], model.model_copy(update={"information": None}), [])
-
-
-def test_coefficients_are_assigned_by_name(offset: Diagnosis, model: Model) -> None:
-    shuffled = model.model_copy(update={"coefficients": dict(sorted(model.coefficients.items()))})
-    assert list(shuffled.coefficients) != list(model.coefficients)
-    one, other = (extended_model_file(offset.extension, given, 0.5) for given in (model, shuffled))
-    assert one.coefficients == other.coefficients
-
-
-def test_the_extended_models_noise_is_scaled_as_a_whole(offset: Diagnosis, model: Model) -> None:
-    for times in (0.5, 8.0):
-        rmse_v = times * model.noise.voltage_rmse_v
-        noise = extended_model_file(offset.extension, model, rmse_v).noise
-        assert noise.fast_std_v == pytest.approx(times * model.noise.fast_std_v)
-        assert noise.voltage_mae_pct == pytest.approx(times * model.noise.voltage_mae_pct)
-
-
-def test_the_soc_error_needs_a_reference_soc_throughout(model: Model) -> None:
-    log = day(40)
-    assert log.soc_pct is not None
-    rows = np.arange(len(log))
-    slow, first = (np.where(keep, log.soc_pct, np.nan) for keep in (rows % 30 == 7, rows < 900))
-    sparse, whole = (soc_error_pct([each], model) for each in (replace(log, soc_pct=slow), log))
-    assert sparse == pytest.approx(whole, rel=0.1)
-    assert soc_error_pct([replace(log, soc_pct=first)], model) is None
-
-
-def test_temperature_steps_of_a_fast_log_are_interpolated(model: Model) -> None:
-    """Before resampling, whose means would blur the steps."""
-    fast = synthetic_log(hours=1.0, rate_hz=100.0, start_pct=80.0, end_pct=70.0)
-    warming_c = 20.0 + 3.0 * (1.0 - np.exp(-fast.time_s / 1500.0)) + 0.2 * np.sin(fast.time_s / 400)
-    coarse = replace(fast, temperature_c=np.floor(warming_c + 0.5))
-    problem = build_problem([coarse], model, [])
-    seen = problem.diagnosed[0].sampled.log
-    error_k = seen.temperature_c - np.interp(seen.time_s, fast.time_s, warming_c)
-    assert np.sqrt(np.mean(error_k**2)) < 0.13
-    assert problem.temperature_step_k == 1.0
-
-
-def test_refuses_a_log_of_another_pack(model: Model, references: list[Log]) -> None:
-    log = day(21)
-    with pytest.raises(InputError, match="another pack"):
-        diagnose([replace(log, voltage_v=log.voltage_v / 4.0)], model, references)
-
-
-def test_refuses_a_current_of_the_wrong_sign(model: Model, references: list[Log]) -> None:
-    log = day(21)
-    with pytest.raises(InputError, match="sign of current"):
-        diagnose([replace(log, current_a=-log.current_a)], model, references)
+def test_a_single_wrong_row_is_no_fault(known: References, model: Model) -> None:
+    log = day(20)
+    volts = log.voltage_v.copy()
+    volts[500] = 700.0
+    assert not diagnose([replace(log, voltage_v=volts)], model, known).posterior.detected

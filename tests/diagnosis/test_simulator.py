@@ -1,4 +1,4 @@
-"""Any simulator in the model's place: the cause of its gap, and its voltage with a correction."""
+"""A simulator in the place of the model."""
 
 from __future__ import annotations
 
@@ -6,89 +6,77 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from days import day, more_amperes
+from days import day
 
-from cangauge.diagnosis.simulator import Run, SimulatorDiagnosis, diagnose_simulator
+from cangauge.diagnosis import diagnose
+from cangauge.diagnosis.simulator import simulated_v
 from cangauge.errors import InputError
 from cangauge.logs.log import Log
-from cangauge.model.published import CAPACITY_AH
+from cangauge.model.effects.base import Signals
+from cangauge.model.extended import ExtendedModel
+from cangauge.model.model_file import Model
+from cangauge.model.published import CAPACITY_AH, leaf_2012_model
 
 
-def one_rc(log: Log, initial_soc_pct: float) -> np.ndarray:
-    """A simulator of another form than the voltage model: a curve and one RC element."""
-    step_s = np.diff(log.time_s, prepend=log.time_s[0])
-    out_ah = np.cumsum(log.current_a * step_s) / 3600.0
-    soc = initial_soc_pct - 100.0 * out_ah / CAPACITY_AH
-    polarization_v = np.zeros(len(log))
-    for k in range(1, len(log)):
-        kept = np.exp(-step_s[k] / 25.0)
-        polarization_v[k] = kept * polarization_v[k - 1] + 0.03 * (1.0 - kept) * log.current_a[k]
-    curve_v = 330.0 + 0.55 * soc + 12.0 * np.tanh((soc - 8.0) / 10.0)
-    return curve_v - 0.09 * log.current_a - polarization_v
+class Simulator:
+    """The published equation, with an error of its voltage."""
 
+    def __init__(self, volts: float = 0.0, capacity: float = 1.0) -> None:
+        self.volts, self.capacity = volts, capacity
 
-def measured(seed: int) -> Run:
-    """A drive on which the simulator is right but for the noise of the sensor."""
-    log = day(seed)
-    assert log.soc_pct is not None
-    volts = one_rc(log, float(log.soc_pct[0]))
-    noise_v = np.random.default_rng(seed).normal(0.0, 0.3, len(log))
-    return Run(replace(log, voltage_v=volts + noise_v), volts)
-
-
-def with_offset(seed: int, amperes: float) -> Run:
-    """The simulator is given a current that reads too high."""
-    right = measured(seed)
-    log = more_amperes(right.log, amperes)
-    assert log.soc_pct is not None
-    return Run(log, one_rc(log, float(log.soc_pct[0])))
+    def __call__(
+        self, time_s: np.ndarray, current_a: np.ndarray, temperature_c: np.ndarray, start: float
+    ) -> np.ndarray:
+        model = ExtendedModel(leaf_2012_model(), CAPACITY_AH * self.capacity)
+        signals = Signals(time_s, current_a, current_a, temperature_c)
+        return model.predict(signals, start, np.arange(time_s.size)).voltage_v + self.volts
 
 
 @pytest.fixture(scope="module")
-def offset() -> SimulatorDiagnosis:
-    references = [measured(seed) for seed in (11, 12, 13)]
-    runs = [with_offset(21, 4.0), with_offset(22, 4.0)]
-    return diagnose_simulator(runs, references, capacity_ah=CAPACITY_AH)
+def logs() -> list[Log]:
+    return [day(seed) for seed in (31, 32)]
 
 
-def test_the_cause_is_named_in_the_simulators_terms(offset: SimulatorDiagnosis) -> None:
-    verdict = offset.diagnosis.verdict
-    assert "current_offset" in {verdict.cause, *verdict.ambiguous_with}
-    assert offset.correction.startswith("To correct the simulator: ")
-    if verdict.cause == "current_offset":
-        amperes = offset.diagnosis.extension.cause["current_offset"]["offset_a"]
-        assert amperes == pytest.approx(4.0, abs=0.5)
-        assert f"subtract {amperes:.3g} A from the current" in offset.correction
+def test_a_simulator_that_is_off_everywhere_is_told_first(logs: list[Log], model: Model) -> None:
+    found = diagnose(logs, model, simulation=Simulator(volts=6.0))
+    first = found.summary.splitlines()[0]
+    assert "6.0 V too high everywhere" in first
+    assert "Correct its level first" in first
 
 
-def test_the_error_diagnosed_is_measured_less_simulated(offset: SimulatorDiagnosis) -> None:
-    model = offset.diagnosis.model
-    for run in offset.runs:
-        gap_v = run.log.voltage_v - run.simulated_v
-        assert model.predict(run.on(model)).residual_v == pytest.approx(gap_v, abs=1e-9)
+def test_a_corrected_simulator_is_better(logs: list[Log], model: Model) -> None:
+    references = [day(seed) for seed in (33, 34, 35)]
+    faulty = [replace(log, voltage_v=log.voltage_v + 4.0) for log in logs]
+    found = diagnose(faulty, model, references, simulation=Simulator())
+    assert found.accepted in {"voltage_offset", "voltage_gain"}
+    assert "To correct the simulator" in found.summary
+    assert found.simulator is not None
+    for k, log in enumerate(faulty):
+        before = log.voltage_v - found.simulator.simulated_v[k]
+        after = log.voltage_v - found.simulator.corrected_v(k, found.extended_model)
+        assert np.sqrt(np.mean(after**2)) < 0.5 * np.sqrt(np.mean(before**2))
 
 
-def test_the_correction_closes_the_gap_of_each_run(offset: SimulatorDiagnosis) -> None:
-    for each in offset.errors():
-        assert each["corrected_rmse_v"] < 0.5
-        assert each["simulated_rmse_v"] > 1.5 * each["corrected_rmse_v"]
+def test_the_gap_is_the_difference_to_the_simulator(logs: list[Log], model: Model) -> None:
+    found = diagnose(logs, model, simulation=Simulator(volts=0.8))
+    difference = np.concatenate([log.voltage_v - Simulator(0.8)(
+        log.time_s, log.current_a, log.temperature_c, 85.0) for log in logs])  # fmt: skip
+    assert found.baseline_rmse_v == pytest.approx(np.sqrt(np.mean(difference**2)), rel=1e-3)
 
 
-def test_a_good_simulator_has_no_gap() -> None:
-    references = [measured(seed) for seed in (11, 12, 13)]
-    found = diagnose_simulator([measured(21)], references, capacity_ah=CAPACITY_AH)
-    assert found.diagnosis.verdict.cause == "none"
-    assert found.correction == ""
+def test_voltages_of_a_table_are_a_simulator(logs: list[Log]) -> None:
+    volts = {log.name: log.voltage_v + 1.0 for log in logs}
+    assert simulated_v(volts, logs[0]) == pytest.approx(logs[0].voltage_v + 1.0)
 
 
 @pytest.mark.parametrize(
-    ("change", "problem"),
+    ("simulation", "word"),
     [
-        (lambda run: Run(run.log, run.simulated_v[:-1]), "shape"),
-        (lambda run: Run(run.log, np.full(len(run.log), np.nan)), "not finite"),
-        (lambda run: Run(replace(run.log, soc_pct=None), run.simulated_v), "unknown SoC"),
+        (lambda *_: [1.0], "shape"),
+        (lambda time_s, *_: np.nan * time_s, "not finite"),
+        (lambda *_: 1 / 0, "ZeroDivisionError"),
     ],
 )
-def test_unusable_simulations_are_refused(change, problem: str) -> None:  # type: ignore[no-untyped-def]
-    with pytest.raises(InputError, match=problem):
-        change(measured(21))
+def test_a_failing_simulation_is_one_line(logs: list[Log], simulation: object, word: str) -> None:
+    with pytest.raises(InputError, match=word):
+        simulated_v(simulation, logs[0])

@@ -9,7 +9,7 @@ import can
 import numpy as np
 import pytest
 
-from cangauge.bus.captures.capture import open_capture
+from cangauge.bus.captures import open_capture
 from cangauge.extras.discovery.fields import collect
 from cangauge.extras.discovery.pairs import Candidate
 from cangauge.extras.discovery.search import search

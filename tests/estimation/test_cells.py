@@ -11,13 +11,13 @@ import numpy as np
 import pytest
 
 import cangauge
-from cangauge.estimation.cells import CellEstimator, CellReport
+from cangauge.estimation.cells import CellEstimator
 from cangauge.estimation.estimator import Estimator
 from cangauge.logs.log import Log
 from cangauge.model.delay_line import delayed_currents
 from cangauge.model.model_file import Model
 from cangauge.model.published import CAPACITY_AH, leaf_2012_model, leaf_2012_model_file
-from cangauge.types import Sample
+from cangauge.types import CellReport, Sample
 from synthetic import drive_current
 
 PACK = leaf_2012_model()

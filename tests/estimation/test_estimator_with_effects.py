@@ -7,7 +7,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from cangauge.estimation.ekf import OFFSET_STD_PER_AH
 from cangauge.estimation.estimator import Estimator
 from cangauge.estimation.offline import estimate_log, samples_of
 from cangauge.estimation.settings import EstimatorSettings
@@ -79,25 +78,6 @@ def test_effect_improves_soc_over_plain_model(effect: Effect) -> None:
     assert extended.voltage_mae_pct < missed.voltage_mae_pct
 
 
-@pytest.mark.parametrize("effect_id", ["fast_polarization", "slow_diffusion"])
-def test_steady_resistance_includes_polarisation(effect_id: str) -> None:
-    effect = LIBRARY[effect_id]
-    values = upper_half(effect) | {"activation_k": 0.0}
-    model = leaf_2012_model_file().extended_model().with_effect(effect, values)
-    expected = sum(model.model.resistance_ohm) - values["ohm"]
-    assert model.steady_ohm() == pytest.approx(expected, rel=1e-3)
-    assert model.online().steady_ohm == model.steady_ohm()
-
-
-@each_effect
-def test_steady_resistance_is_negative_with_each_effect(effect: Effect) -> None:
-    model = log_and_model(effect)[1].extended_model()
-    plain = sum(model.model.resistance_ohm)
-    assert 3.0 * plain < model.steady_ohm() < 0.0
-    if effect.id in {"hysteresis", "current_offset", "entropic_coefficient"}:
-        assert model.steady_ohm() == pytest.approx(plain, rel=1e-3)
-
-
 def test_offset_is_found_with_polarisation_effect() -> None:
     """After a rest, as what currents before the log left in the effect is not known."""
     log, model = log_and_model(LIBRARY["slow_diffusion"])
@@ -125,6 +105,6 @@ def test_offset_is_found_with_polarisation_effect() -> None:
         found = estimator.step(sample)
         assert abs(found.soc_pct - soc_pct) < 2.0 * found.soc_std_pct
     assert abs(found.soc_coulomb_pct - soc_pct) > 5.0
-    offset_a, std_a = estimator.filter.offset_a, estimator.filter.offset_std_a
-    assert abs(offset_a - 3.0) < 2.0 * std_a
-    assert std_a < 0.5 * OFFSET_STD_PER_AH * model.capacity_ah
+    health = estimator.health
+    assert abs(health.offset_a - 3.0) < 2.0 * health.offset_std_a
+    assert health.offset_std_a < 0.9

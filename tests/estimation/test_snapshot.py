@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import functools
 import json
 import math
 from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from cangauge.errors import InputError
 from cangauge.estimation.estimator import Estimator
@@ -75,21 +72,6 @@ def same(first: list[Estimate], again: list[Estimate]) -> bool:
     return np.array_equal(np.array(first, float), np.array(again, float), equal_nan=True)
 
 
-def inner_state(thing: Any, depth: int = 0) -> Any:
-    """Return all values of an object, recursively, with NaN as a string."""
-    if isinstance(thing, float) and math.isnan(thing):
-        return "nan"
-    if isinstance(thing, np.ndarray):
-        return thing.tolist()
-    if isinstance(thing, list | tuple) or type(thing).__name__ == "deque":
-        return [inner_state(each, depth + 1) for each in thing]
-    if hasattr(thing, "__dict__") and not callable(thing) and depth < 8:
-        # The rest of filterpy's attributes is derived.
-        names = {"x", "P"} if type(thing).__name__ == "ExtendedKalmanFilter" else vars(thing)
-        return {name: inner_state(vars(thing)[name], depth + 1) for name in sorted(names)}
-    return thing if isinstance(thing, int | float | str | bool | None) else type(thing).__name__
-
-
 def check_continues(model: Model, chosen: EstimatorSettings, at: int) -> None:
     whole = Estimator(model, chosen)
     for sample in EVENTFUL[:at]:
@@ -98,10 +80,8 @@ def check_continues(model: Model, chosen: EstimatorSettings, at: int) -> None:
     after = Estimator(model, chosen)
     after.restore(state)
     rest = EVENTFUL[at:]
-    # The next voltage is used within a second; after it the inner states must agree as well.
-    assert same([after.step(each) for each in rest[:8]], [whole.step(each) for each in rest[:8]])
-    assert inner_state(after) == inner_state(whole)
-    assert same([after.step(each) for each in rest[8:]], [whole.step(each) for each in rest[8:]])
+    assert same([after.step(each) for each in rest], [whole.step(each) for each in rest])
+    assert after.snapshot().model_dump_json() == whole.snapshot().model_dump_json()
 
 
 MOMENTS = [0, 1, 3, 201, 310, 455, 850, 910]
@@ -183,120 +163,29 @@ def test_state_of_another_model_is_refused() -> None:
         Estimator(extended_by(["current_offset", "fast_polarization"])).restore(state)
 
 
-@functools.cache
-def _state_after(samples: int) -> str:
-    estimator = Estimator(extended_by(["time_skew", "hysteresis", "slow_diffusion"]))
-    for sample in EVENTFUL[:samples]:
+@pytest.mark.parametrize(
+    ("part", "value"),
+    [
+        (("hypotheses", "filters", 0, "x"), [50.0, 0.0]),
+        (("hypotheses", "filters", 0, "p"), [[1.0]]),
+        (("hypotheses", "filters", 0, "bias", "v"), [[0.0, 0.0]]),
+        (("hypotheses", "filters", 0, "x", 0), "nan"),
+        (("counter", "discharged_pct"), None),
+        (("memory", "doubt"), "weather"),
+        (("line", "current_a"), [1.0]),
+        (("reasons",), -1),
+        (("estimate",), [0.0]),
+        (("more",), 1),
+    ],
+)
+def test_state_of_another_shape_is_refused(part: tuple[Any, ...], value: object) -> None:
+    estimator = Estimator(PLAIN, EstimatorSettings(initial_soc_pct=80.0))
+    for sample in EVENTFUL[:300]:
         estimator.step(sample)
-    return json.dumps(estimator.snapshot().model_dump(mode="json"))
-
-
-def state_of_a_drive(samples: int = 465) -> dict[str, Any]:
-    """Return the state with two hypotheses; with one before the unobserved interval at 451."""
-    return json.loads(_state_after(samples))
-
-
-def places(data: Any, here: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
-    """Return the paths of all values."""
-    items = (
-        data.items()
-        if isinstance(data, dict)
-        else enumerate(data)
-        if isinstance(data, list)
-        else ()
-    )
-    found = [place for key, value in items for place in places(value, (*here, key))]
-    return found or [here]
-
-
-PLACES = [place for place in places(state_of_a_drive()) if "line" not in place]
-
-
-@settings(max_examples=150, deadline=None)
-@given(
-    st.lists(
-        st.tuples(
-            st.sampled_from(PLACES),
-            st.one_of(st.none(), st.booleans(), st.integers(), st.text(max_size=3),
-                      st.floats(allow_nan=False, allow_infinity=False), st.just([]),
-                      st.floats(-1e12, 1e12)),
-        ),
-        min_size=1,
-        max_size=6,
-    )
-)  # fmt: skip
-def test_damaged_state_is_refused_or_harmless(changes: list[tuple[Any, Any]]) -> None:
-    data = state_of_a_drive()
-    for place, value in changes:
-        at = data
-        for key in place[:-1]:
-            at = at[key]
-        at[place[-1]] = value
-    estimator = Estimator(extended_by(["time_skew", "hysteresis", "slow_diffusion"]))
-    try:
-        estimator.restore(EstimatorState.model_validate(data))
-    except (InputError, ValueError):  # pydantic's ValidationError is one
-        return
-    for sample in EVENTFUL[465:495]:
-        found = estimator.step(sample)
-        assert 0.0 <= found.soc_pct <= 100.0 or math.isnan(found.soc_pct)
-        assert found.soc_std_pct >= 0.0 or math.isnan(found.soc_std_pct)
-        assert math.isnan(found.soc_pct) == math.isnan(found.soc_std_pct)
-
-
-@pytest.mark.parametrize(
-    "place",
-    [
-        ("filter", "hypotheses", 0, "x", 0),
-        ("filter", "hypotheses", 0, "p", 0, 0),
-        ("filter", "log_odds"),
-        ("since", "discharged_pct"),
-        ("since", "gap_var_pct2"),
-    ],
-)
-def test_state_contradicting_its_estimate_is_refused(place: tuple[Any, ...]) -> None:
-    # Beside a wider hypothesis the standard deviation of the narrow one does not show.
-    data = state_of_a_drive(440 if "p" in place else 465)
+    data = json.loads(estimator.snapshot().model_dump_json())
     at = data
-    for key in place[:-1]:
+    for key in part[:-1]:
         at = at[key]
-    at[place[-1]] += 0.001
-    with pytest.raises(InputError, match="the last estimate"):
-        Estimator(extended_by(["time_skew", "hysteresis", "slow_diffusion"])).restore(
-            EstimatorState.model_validate(data)
-        )
-
-
-@pytest.mark.parametrize(
-    ("place", "later_s"),
-    [
-        (("counter", "time_s"), -0.9),
-        (("line", "since_s"), 1e5),
-        (("memory", "first_s"), 1e5),
-        (("memory", "rest_since_s"), 1e5),
-    ],
-)
-def test_inconsistent_times_are_refused(place: tuple[str, ...], later_s: float) -> None:
-    data = state_of_a_drive()
-    at = data
-    for key in place[:-1]:
-        at = at[key]
-    at[place[-1]] = data["clock"]["last_s"] + later_s
-    with pytest.raises(ValueError, match=r"different times|later than the latest sample"):
-        EstimatorState.model_validate(data)
-
-
-def test_effect_memory_after_latest_sample_is_refused() -> None:
-    ids = ["time_skew", "slow_diffusion", "hysteresis", "resistance_step", "core_temperature"]
-    whole = Estimator(extended_by(ids))
-    for sample in EVENTFUL[:465]:
-        whole.step(sample)
-    state = through_json(whole.snapshot())
-    Estimator(extended_by(ids)).restore(state)
-    for number in range(len(ids)):
-        # The memory of `time_skew` starts with the number of waiting samples, then their times.
-        at = 1 if number == ids.index("time_skew") else 0
-        effects = [list(each) for each in state.effects]
-        effects[number][at] = state.clock.last_s + 10.0
-        with pytest.raises(InputError, match=rf"effects\.{number}"):
-            Estimator(extended_by(ids)).restore(state.model_copy(update={"effects": effects}))
+    at[part[-1]] = value
+    with pytest.raises((InputError, ValueError)):
+        Estimator(PLAIN).restore(EstimatorState.model_validate(data))

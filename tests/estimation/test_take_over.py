@@ -23,10 +23,9 @@ def stepped(estimator: Estimator, samples: list[Sample]) -> Estimate:
 
 
 def other_model() -> Model:
-    model = leaf_model()
-    k0 = model.coefficients["k0"]
-    shifted = {**model.coefficients, "k0": k0.model_copy(update={"value": k0.value + 2.0})}
-    return model.model_copy(update={"coefficients": shifted})
+    data = leaf_model().model_dump()
+    data["published"]["coefficients"]["k0"]["value"] += 2.0
+    return Model.model_validate(data)
 
 
 @pytest.mark.parametrize("method", ["ekf", "coulomb"])
@@ -63,8 +62,9 @@ def test_no_charge_is_lost() -> None:
 
 def test_longer_delay_line_must_fill_first() -> None:
     samples = drive()
-    short = leaf_model()
-    short = short.model_copy(update={"delays_s": [0.0, 1.0, 2.0, 3.0]})
+    data = leaf_model().model_dump()
+    data["published"]["delays_s"] = [0.0, 1.0, 2.0, 3.0]
+    short = Model.model_validate(data)
     settings = EstimatorSettings(initial_soc_pct=80.0)
     before = Estimator(short, settings)
     stepped(before, samples[:1900])

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from cangauge.errors import InputError
-from cangauge.estimation.counting import SET_BACK_SAMPLES, moved_log_odds
+from cangauge.estimation.counting import SET_BACK_SAMPLES, moved_probability
 from cangauge.estimation.estimator import Estimator
 from cangauge.estimation.offline import samples_of
 from cangauge.estimation.settings import EstimatorSettings, FullCharge, LongRest
@@ -80,7 +80,7 @@ def test_unobserved_charge_is_found_within_minutes(
     assert sum(inside[70:]) > 0.97 * len(inside[70:])
     assert max(map(abs, wrong[180:])) < 4.0
     if abs(after_pct - before_pct) > 20.0:
-        assert estimator.filter.verdict == "moved"
+        assert estimator.verdict == "moved"
 
 
 def test_small_unobserved_charge_stays_within_uncertainty() -> None:
@@ -97,7 +97,7 @@ def test_offset_does_not_accumulate_while_unobserved() -> None:
     samples = drive(95.0, 45.0, 0.0, hours=2.0)
     for sample in samples:
         last = estimator.step(sample._replace(current_a=sample.current_a + 1.0))
-    assert estimator.filter.offset_a > 0.5
+    assert estimator.health.offset_a > 0.5
     after = estimator.step(Sample(last.time_s + 36000.0, 1.0, math.nan, 23.0))
     assert after.soc_pct == pytest.approx(last.soc_pct, abs=0.05)
 
@@ -246,6 +246,6 @@ def test_reference_rules_validate_their_ranges() -> None:
 
 
 def test_moved_odds_are_finite_and_grow_with_time() -> None:
-    odds = [moved_log_odds(seconds) for seconds in (5e-324, 1e-9, 2.0, 60.0, 7200.0, 1e300)]
+    odds = [moved_probability(seconds) for seconds in (5e-324, 1e-9, 2.0, 60.0, 7200.0, 1e300)]
     assert all(math.isfinite(each) for each in odds)
     assert odds == sorted(odds)

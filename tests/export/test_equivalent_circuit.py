@@ -10,13 +10,13 @@ from typing import Any
 
 import numpy as np
 import pytest
+from cangauge.model.effects.first_order import low_passed
 from typer.testing import CliRunner
 
 from cangauge.cli.app import app
 from cangauge.errors import InputError
 from cangauge.extras.embedded.equivalent_circuit import equivalent_circuit
 from cangauge.logs.log import Log
-from cangauge.model.effects.first_order import low_passed
 from cangauge.model.model_file import Model
 from cangauge.model.published import leaf_2012_model_file
 from synthetic import synthetic_log

@@ -115,8 +115,8 @@ def test_the_vehicle_nearest_to_an_alarm_is_named(
     row = {
         "logs": [log.url for log in logs[3:4]], "references": 1, "detected": False,
         "verdict": "voltage_gain", "probability": 0.41, "probability_none": 0.088,
-        "family": "voltage_sensing", "family_probability": 0.82, "credible_set": [],
-        "baseline_rmse_v": 3.4, "floor_v": 1.04,
+        "group": "sensors_and_count", "group_probability": 0.82, "credible_set": [],
+        "baseline_rmse_v": 3.4, "healthy_rmse_v": 1.04,
     }  # fmt: skip
     monkeypatch.setattr(GapJob, "row", lambda *_: row)
     arguments = (
@@ -125,7 +125,7 @@ def test_the_vehicle_nearest_to_an_alarm_is_named(
     )  # fmt: skip
     ended = in_process(*arguments)
     assert "Vehicles with a gap" not in ended.out
-    shown = "nearest: car1 (P(no fault) 9 %, voltage_sensing 82 %)"
+    shown = "nearest: car1 (P(no fault) 9 %, sensors_and_count 82 %)"
     assert shown in ended.out
     assert shown in Html((tmp_path / "fleet.html").read_text(encoding="utf-8")).text
     found = json.loads(in_process(*arguments, "--json").out)

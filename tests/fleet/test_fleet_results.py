@@ -232,8 +232,8 @@ def test_nothing_is_learned_for_vehicles_with_own_references(
 def test_the_page_says_which_vehicle_has_which_gap() -> None:
     gap = {
         "detected": True, "verdict": "voltage_offset", "probability": 0.9, "probability_none": 0.01,
-        "baseline_rmse_v": 2.0, "floor_v": 0.5, "closed_fraction": 0.8,
-        "credible_set": ["voltage_offset"], "family": "voltage_sensing", "family_probability": 0.9,
+        "baseline_rmse_v": 2.0, "healthy_rmse_v": 0.5, "closed_fraction": 0.8,
+        "credible_set": ["voltage_offset"], "group": "sensors_and_count", "group_probability": 0.9,
     }  # fmt: skip
     healthy = {
         "end_s": 3600.0, "capacity_ah": 60.0, "capacity_std_ah": 1.0, "resistance_ratio": 1.0,

@@ -9,6 +9,7 @@ from types import SimpleNamespace
 from typing import Any, ClassVar, Self
 
 import pytest
+from cangauge.inference.rows import FitOptions
 
 from cangauge.errors import CangaugeError, InputError
 from cangauge.extras.fleet import run as fleet_run
@@ -19,7 +20,6 @@ from cangauge.extras.fleet.passes import ErrorsJob
 from cangauge.extras.fleet.run import Summary, run_id, run_job
 from cangauge.extras.fleet.sources import FleetLog, ReadOptions, find_logs
 from cangauge.extras.validation.cases import Scenario
-from cangauge.inference.rows import FitOptions
 from fleet_here import ChainedJob, Done, Here, NotingJob
 
 

@@ -34,7 +34,7 @@ import numpy as np
 
 import cangauge
 from cangauge.__main__ import main
-from cangauge.bus.captures.capture import open_capture
+from cangauge.bus.captures import open_capture
 from cangauge.bus.encoder import FrameEncoder
 from cangauge.bus.recording import capture_samples
 from cangauge.bus.vehicle import PRESETS

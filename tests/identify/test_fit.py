@@ -3,64 +3,222 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+import cangauge
 from cangauge.errors import InputError
-from cangauge.identify.delays import search_delays
 from cangauge.identify.fit import common_name, fit
-from cangauge.inference.least_squares import solve
-from cangauge.inference.rows import FitOptions
+from cangauge.identify.least_squares import (
+    ADDED_STD,
+    B_LEFT_STD,
+    SECONDS_PER_DATUM,
+    log_sums,
+    row_features,
+    row_weights,
+    solve,
+    solve_scaled,
+)
+from cangauge.identify.rows import FitRows, fit_rows
 from cangauge.logs.log import Log
 from cangauge.model.coulomb_counting import (
     capacity_from_full_discharge,
     capacity_from_reference,
     discharged_ah,
 )
+from cangauge.model.prior import CHEMISTRIES, prior_of
 from cangauge.model.published import CAPACITY_AH, leaf_2012_model
-from cangauge.model.voltage_model import VoltageModel
+from cangauge.model.voltage_model import KNOTS_PCT, HermiteCurve, VoltageModel
 from synthetic import synthetic_log
 
 TRUTH = leaf_2012_model()
+OXIDE = CHEMISTRIES["oxide"]
+
+CELLS = VoltageModel(
+    HermiteCurve.rising(KNOTS_PCT, 96.0 * OXIDE.curve_v), kt_v_per_k=-0.02,
+    resistance_ohm=(-0.07, -0.01, -0.01, -0.005), delay_s=(0.0, 10.0, 30.0, 70.0),
+)  # fmt: skip
+"""A pack of typical cells."""
 
 
-def test_recovers_the_coefficients_of_a_noiseless_log() -> None:
-    found = fit([synthetic_log()])
+def trips(number: int, *, model: VoltageModel = CELLS, noise_v: float = 0.3) -> list[Log]:
+    return [
+        synthetic_log(
+            start_pct=95.0 - 6.0 * k, end_pct=60.0 - 6.0 * k, hours=0.6, noise_v=noise_v,
+            seed=k + 1, model=model, name=f"trip{k + 1}",
+        )
+        for k in range(number)
+    ]  # fmt: skip
+
+
+def test_recovers_curve_and_resistance_of_a_pack() -> None:
+    found = fit(trips(4), capacity_ah=CAPACITY_AH)
+    soc = np.linspace(45.0, 92.0, 50)
+    assert found.voltage_model.pseudo_ocv(soc) == pytest.approx(CELLS.pseudo_ocv(soc), abs=0.3)
+    assert sum(found.voltage_model.resistance_ohm) == pytest.approx(-0.095, rel=0.05)
+    assert found.voltage_rmse_v == pytest.approx(0.3, rel=0.05)
+    assert found.model.noise.judged_on == "whole logs left out in turn"
+    assert found.model.noise.voltage_rmse_v == pytest.approx(0.3, rel=0.1)
+
+
+def test_beyond_its_logs_the_curve_follows_the_typical_cell() -> None:
+    found = fit(trips(1), capacity_ah=CAPACITY_AH)
+    soc = np.linspace(5.0, 50.0, 20)
+    error_v = found.voltage_model.pseudo_ocv(soc) - CELLS.pseudo_ocv(soc)
+    assert np.abs(error_v).max() < 5.0
+    functions = found.model.principal_functions()
+    zero = np.zeros(len(found.voltage_model.load_coefficients))
+    std_v = [float(np.sqrt(np.sum(functions.row(s, zero) ** 2))) for s in soc.tolist()]
+    assert np.all(np.abs(error_v) < 3.0 * np.array(std_v))
+    assert any("beyond, the curve follows the typical cell" in text for text in found.remarks)
+
+
+def test_is_the_weighted_least_squares_of_all_rows() -> None:
+    """The sums of the logs against one dense system with a column for the level of each log."""
+    rows = [fit_rows(log, CAPACITY_AH) for log in trips(3)]
+    found = solve([log_sums(item, OXIDE) for item in rows], CAPACITY_AH, OXIDE)
+    size, logs = found.coefficients.size, len(rows)
+    weight = np.concatenate([row_weights(r.soc_pct, r.seconds, OXIDE) for r in rows])
+    columns = np.concatenate([row_features(r) @ found.select.T for r in rows])
+    owner = np.repeat(np.arange(logs), [len(r) for r in rows])
+    table = np.column_stack([columns, owner[:, None] == np.arange(logs)])
+    volts = np.concatenate([r.voltage_v for r in rows])
+    soc = np.concatenate([r.soc_pct for r in rows])
+    prior = prior_of(OXIDE, found.mean_v, float(weight @ soc / weight.sum()), CAPACITY_AH)
+    precision = np.zeros((size + logs, size + logs))
+    precision[:size, :size] = np.linalg.inv(prior.covariance)
+    precision[size:, size:] = np.eye(logs) / (OXIDE.level_std * found.mean_v) ** 2
+    datum = (found.residual_v**2 + (ADDED_STD * found.mean_v) ** 2) * SECONDS_PER_DATUM
+    mean = np.r_[prior.mean, np.zeros(logs)]
+    normal = (table * weight[:, None]).T @ table / datum + precision
+    right = (table * weight[:, None]).T @ (volts - table @ mean) / datum
+    expected = mean + np.linalg.solve(normal, right)
+    # The noise variance of the last step is within 1e-3 of its fixed point.
+    std = np.sqrt(np.diag(found.covariance))
+    assert np.abs(found.coefficients - expected[:size]).max() < 2e-3 * std.max()
+    covariance = np.linalg.inv(normal)[:size, :size]
+    covariance[-1, -1] += B_LEFT_STD**2
+    assert np.diag(found.covariance) == pytest.approx(np.diag(covariance), rel=5e-3)
+
+
+def test_left_out_logs_widen_the_covariance() -> None:
+    logs = trips(6)
+    rows = [fit_rows(log, CAPACITY_AH) for log in logs]
+
+    def scale(levels_v: float) -> float:
+        moved = [
+            replace(item, voltage_v=item.voltage_v + levels_v * (-1.0) ** k)
+            for k, item in enumerate(rows)
+        ]
+        sums = [log_sums(item, OXIDE) for item in moved]
+        return solve_scaled(sums, CAPACITY_AH, OXIDE)[0].scale
+
+    assert scale(0.0) == 1.0
+    assert scale(10.0) > 3.0
+
+
+def test_a_slow_log_weighs_by_its_time() -> None:
+    log = synthetic_log(hours=2.0, start_pct=90.0, end_pct=40.0, model=CELLS, noise_v=0.2)
+    fast = fit_rows(log, CAPACITY_AH)
+    slow = fit_rows(log.rows(slice(None, None, 10)), CAPACITY_AH)
+    assert slow.seconds[0] == 10.0
+
+    def total(rows: FitRows) -> float:
+        return float(row_weights(rows.soc_pct, rows.seconds, OXIDE).sum())
+
+    assert total(slow) == pytest.approx(total(fast), rel=0.02)
+
+
+def test_takes_a_path_a_frame_and_a_log(tmp_path: Path) -> None:
+    pandas = pytest.importorskip("pandas")
+    logs = trips(3)
+    frame = pandas.DataFrame(
+        {
+            name: getattr(logs[1], name)
+            for name in ("time_s", "current_a", "voltage_v", "temperature_c", "soc_pct")
+        }
+    )
+    path = tmp_path / "trip.csv"
+    frame.to_csv(path, index=False)
+    source = {"temperature_source": "unknown"}
+    found = cangauge.fit([replace(logs[0], **source), path], capacity_ah=CAPACITY_AH)
+    again = cangauge.fit([replace(logs[0], **source), frame], capacity_ah=CAPACITY_AH)
+    assert found.voltage_rmse_v == pytest.approx(again.voltage_rmse_v)
+    assert cangauge.fit(logs[0], capacity_ah=CAPACITY_AH).model.name == "trip1"
+
+
+def test_chemistry_is_given_guessed_or_assumed_and_said() -> None:
+    log = trips(1)[0]
+    assert fit(log, capacity_ah=50.0, chemistry="lfp").model.chemistry == "lfp"
+    guessed = fit(log, capacity_ah=CAPACITY_AH, cells=96)
+    assert (guessed.model.chemistry, guessed.model.cells) == ("oxide", 96)
+    assert any("chemistry oxide by 3.9" in text for text in guessed.remarks)
+    flat = fit(log, capacity_ah=CAPACITY_AH, cells=115)
+    assert flat.model.chemistry == "lfp"
+    assumed = fit(log, capacity_ah=CAPACITY_AH)
+    assert assumed.model.chemistry == "oxide"
+    assert any("--chemistry lfp" in text for text in assumed.remarks)
+
+
+def test_published_equation_recovers_its_coefficients() -> None:
+    found = fit([synthetic_log()], equation="published")
     model = found.voltage_model
     soc = np.linspace(*model.soc_range_pct, 200)
-    assert model.pseudo_ocv(soc) == pytest.approx(TRUTH.pseudo_ocv(soc), abs=1e-5)
-    assert model.resistance_ohm == pytest.approx(TRUTH.resistance_ohm, abs=1e-7)
-    assert model.kt_v_per_k == pytest.approx(TRUTH.kt_v_per_k, abs=1e-6)
-    assert found.voltage_mae_pct < 1e-6
-    assert found.soc_newton_mae_pct < 1e-4
+    assert model.pseudo_ocv(soc) == pytest.approx(TRUTH.pseudo_ocv(soc), abs=1e-4)
+    assert model.resistance_ohm == pytest.approx(TRUTH.resistance_ohm, abs=1e-6)
+    assert model.kt_v_per_k == pytest.approx(TRUTH.kt_v_per_k, abs=1e-5)
+    assert found.soc_newton_mae_pct < 1e-3
     assert found.model.capacity_ah == pytest.approx(CAPACITY_AH, rel=1e-3)
 
 
-def test_irregular_time_stamps_give_the_same_model() -> None:
-    log = synthetic_log(rate_hz=10.0, hours=1.0, end_pct=50.0)
-    rng = np.random.default_rng(3)
-    keep = np.sort(rng.choice(len(log), len(log) // 2, replace=False))
-    # The current between the kept samples is unknown, but piecewise constant except for the steps.
-    found = fit([log.rows(keep)], capacity_ah=CAPACITY_AH)
-    soc = np.linspace(55.0, 98.0, 50)
-    assert found.voltage_model.pseudo_ocv(soc) == pytest.approx(TRUTH.pseudo_ocv(soc), abs=0.1)
+def test_published_coefficients_come_with_every_fit_that_identifies_them() -> None:
+    log = synthetic_log(noise_v=0.5)
+    knots, published = fit([log]), fit([log], equation="published")
+    assert knots.model.equation == "knots"
+    assert knots.model.coefficients == published.model.coefficients
+    coefficients = knots.to_dict()["coefficients"]
+    assert isinstance(coefficients, dict)
+    assert coefficients["R1"]["value"] == pytest.approx(-0.1032, rel=0.02)
+    flat = synthetic_log(hours=0.5, start_pct=80.0, end_pct=79.0)
+    assert fit([flat], capacity_ah=CAPACITY_AH).model.coefficients == {}
 
 
 def test_standard_errors_cover_the_truth() -> None:
-    truth = np.array([*TRUTH.ocv_v, TRUTH.kt_v_per_k, *TRUTH.resistance_ohm])
+    truth = np.array([TRUTH.kt_v_per_k, *TRUTH.resistance_ohm])
     inside = []
-    for seed in range(30):
+    for seed in range(10):
         log = synthetic_log(noise_v=1.0, seed=seed, hours=1.5)
-        found = fit([log], capacity_ah=CAPACITY_AH)
-        error = found.solution.coefficients - truth
-        inside.append(np.abs(error[-5:]) < 2.0 * found.solution.std_error[-5:])
-    # 150 draws of kt and R1…R4: 2 standard errors must hold about 95 % of them.
-    assert 0.88 <= np.mean(inside) <= 1.0
+        found = fit([log], capacity_ah=CAPACITY_AH, equation="published").model.coefficients
+        values = [found[name] for name in ("kt", "R1", "R2", "R3", "R4")]
+        error = np.array([item.value for item in values]) - truth
+        inside += (np.abs(error) < 2.0 * np.array([item.std_error for item in values])).tolist()
+    # Rows of a minute count as one, so that white noise is more than covered.
+    assert np.mean(inside) >= 0.95
+
+
+def test_published_options_move_with_the_equation() -> None:
+    truth = replace(TRUTH, resistance_ohm=(-0.1, -0.03, -0.03), delay_s=(0.0, 20.0, 100.0))
+    log = synthetic_log(model=truth, noise_v=0.1)
+    found = fit([log], equation="published", delay_s=(0.0, 20.0, 100.0), t_ref_c=15.0)
+    assert found.voltage_model.resistance_ohm == pytest.approx((-0.1, -0.03, -0.03), rel=0.02)
+    assert found.voltage_model.t_ref_c == 15.0
+
+
+def test_falling_published_curve_is_refused() -> None:
+    log = synthetic_log(hours=0.6, start_pct=80.0, end_pct=72.0)
+    slow = 6.0 * np.sin(np.linspace(0.0, 9.0, len(log)))
+    moved = replace(log, voltage_v=log.voltage_v + slow)
+    with pytest.raises(InputError, match="do not identify the published equation"):
+        fit([moved], capacity_ah=CAPACITY_AH, equation="published")
+    found = fit([moved], capacity_ah=CAPACITY_AH)
+    volts = found.voltage_model.pseudo_ocv(np.linspace(0.0, 100.0, 500))
+    assert np.all(np.diff(volts) > 0.0)
 
 
 def test_removes_start_up_and_shut_down_rows() -> None:
-    log = synthetic_log(noise_v=0.2)
+    log = synthetic_log(noise_v=0.2, model=CELLS)
     voltage = log.voltage_v.copy()
     voltage[3000:3020] = np.linspace(150.0, 2.0, 20)
     broken = fit([replace(log, voltage_v=voltage)], capacity_ah=CAPACITY_AH)
@@ -69,31 +227,9 @@ def test_removes_start_up_and_shut_down_rows() -> None:
     assert broken.voltage_mae_pct == pytest.approx(whole.voltage_mae_pct, rel=0.02)
 
 
-def test_pseudo_ocv_rises_where_the_plain_fit_would_fall() -> None:
-    rng = np.random.default_rng(0)
-    log = synthetic_log(hours=0.6, start_pct=80.0, end_pct=72.0)
-    slow = 3.0 * np.sin(np.linspace(0.0, 9.0, len(log))) + rng.normal(0.0, 0.3, len(log))
-    found = fit([replace(log, voltage_v=log.voltage_v + slow)], capacity_ah=CAPACITY_AH)
-    assert found.solution.constrained
-    soc = np.linspace(0.0, 100.0, 500)
-    assert np.all(np.diff(found.voltage_model.pseudo_ocv(soc)) > 0.0)
-    assert np.ptp(found.voltage_model.pseudo_ocv(soc)) < 300.0
-
-
-def test_slope_resistance_agrees_with_the_autocorrelation() -> None:
-    found = fit([synthetic_log(noise_v=0.9)])
-    assert found.slope_ohm == pytest.approx(found.slope_expected_ohm, rel=0.01)
-
-
-def test_several_logs_cover_more_soc_than_each() -> None:
-    logs = [
-        synthetic_log(start_pct=start, end_pct=start - 30.0, hours=1.0, noise_v=0.3, seed=start)
-        for start in (95, 70, 45)
-    ]
-    found = fit(logs, capacity_ah=CAPACITY_AH)
-    soc = np.linspace(20.0, 90.0, 50)
-    assert found.voltage_model.pseudo_ocv(soc) == pytest.approx(TRUTH.pseudo_ocv(soc), abs=0.3)
-    assert found.model.noise.judged_on == "whole logs left out in turn"
+def test_slope_resistance_agrees_with_the_coefficients() -> None:
+    found = fit([synthetic_log(noise_v=0.9, model=CELLS)])
+    assert found.slope_ohm == pytest.approx(found.slope_expected_ohm, rel=0.02)
 
 
 def test_capacity_needs_a_log_from_full_to_empty() -> None:
@@ -112,8 +248,6 @@ def test_capacity_needs_a_log_from_full_to_empty() -> None:
     ("log", "words"),
     [
         (synthetic_log(hours=0.015, end_pct=99.0), "no rows are left"),
-        (synthetic_log(hours=0.5, start_pct=80.0, end_pct=79.5), "too little for a voltage model"),
-        (replace(synthetic_log(), current_a=np.full(9000, 20.0)), "current is constant"),
         (replace(synthetic_log(), current_a=-synthetic_log().current_a), "sign of current"),
     ],
 )
@@ -129,39 +263,19 @@ def test_refuses_logs_with_different_temperature_sources() -> None:
         fit([log, other], capacity_ah=CAPACITY_AH)
 
 
-def test_information_reproduces_the_solution() -> None:
-    found = fit([synthetic_log(noise_v=0.5)])
-    information = found.model.information
-    assert information is not None
-    x = np.linalg.solve(np.array(information.root), np.array(information.projected))
-    x /= np.array(information.scale)
-    assert not found.solution.constrained
-    assert x == pytest.approx(found.solution.coefficients, rel=1e-6)
-
-
-def test_delay_search_finds_the_true_delays() -> None:
-    truth = VoltageModel(TRUTH.ocv_v, TRUTH.kt_v_per_k, (-0.1, -0.03, -0.03), (0.0, 20.0, 100.0))
-    log = synthetic_log(model=truth, noise_v=0.3)
-    found = search_delays([log], FitOptions(capacity_ah=CAPACITY_AH))
-    assert found.delay_s == (0.0, 20.0, 100.0)
-    assert found.held_out_rmse_v == pytest.approx(0.3, rel=0.1)
-
-
-def test_an_indispensable_log_is_not_held_out() -> None:
+def test_left_out_errors_are_missing_where_only_that_log_has_the_soc() -> None:
     long = synthetic_log(hours=1.1, start_pct=95.0, end_pct=10.0, noise_v=0.5, name="long")
     short = [
         synthetic_log(hours=0.05, start_pct=60.0, end_pct=59.0, noise_v=0.5, seed=seed)
         for seed in (2, 3)
     ]
-    found = fit([long, *short], capacity_ah=CAPACITY_AH)
-    of_long, *of_short = found.held_out_error_v
-    assert np.isnan(of_long).all()
-    assert all(np.isfinite(errors).any() for errors in of_short)
+    of_long, *of_short = fit([long, *short], capacity_ah=CAPACITY_AH).held_out_error_v
+    assert np.isnan(of_long).mean() > 0.9
+    assert all(np.isfinite(errors).all() for errors in of_short)
 
 
 def test_capacity_counts_from_the_first_known_soc() -> None:
     whole = synthetic_log(hours=1.5, end_pct=0.5)
-    assert whole.soc_pct is not None
     at = 300
     reference = np.full(len(whole), np.nan)
     reference[at] = 100.0
@@ -176,29 +290,12 @@ def test_trapezoidal_charge_on_irregular_steps() -> None:
     assert discharged_ah(time_s, current_a)[-1] * 3600.0 == pytest.approx(1.0 + 15.0 + 48.0)
 
 
-def test_constrained_least_squares_is_optimal() -> None:
-    rng = np.random.default_rng(2)
-    columns, target = rng.normal(size=(200, 5)), rng.normal(size=200)
-    bounds = rng.normal(size=(8, 5))
-    block = np.arange(200) // 10
-    found = solve(columns, target, block, bounds, 0.2)
-    assert found.constrained
-    assert np.all(bounds @ found.coefficients >= 0.2 - 1e-6)
-    best = np.sum((columns @ found.coefficients - target) ** 2)
-    for _ in range(500):
-        other = found.coefficients + rng.normal(0.0, 0.05, 5)
-        if np.all(bounds @ other >= 0.2):
-            assert np.sum((columns @ other - target) ** 2) >= best - 1e-6
-
-
-def test_keyword_arguments_suffice_for_a_fit_with_effects() -> None:
-    logs = [
-        synthetic_log(start_pct=start, end_pct=start - 30.0, hours=0.6, noise_v=0.3, seed=start)
-        for start in (95, 85, 75)
-    ]
-    found = fit(logs, capacity_ah=CAPACITY_AH, delay_s=[0.0, 10.0, 30.0, 70.0], effects="auto")
-    assert found.effects is not None
-    assert found.model.made.options["effects"] == "auto"
+@pytest.mark.parametrize("step_k", [0.25, 1.0])
+def test_quantized_temperature_is_interpolated(step_k: float) -> None:
+    log = synthetic_log(hours=1.0, end_pct=60.0)
+    slow_c = 20.0 + 3.0 * np.sin(log.time_s / 1500.0)
+    rows = fit_rows(replace(log, temperature_c=np.round(slow_c / step_k) * step_k), CAPACITY_AH)
+    assert np.abs(rows.dequantized_c - slow_c[rows.at]).mean() < 0.1 * step_k
 
 
 @pytest.mark.parametrize(
@@ -221,9 +318,12 @@ def test_a_model_is_named_after_the_common_part_of_its_logs(
     assert common_name(names) == expected
 
 
-def test_a_given_name_is_kept() -> None:
-    log = synthetic_log(hours=0.5, name="day")
-    assert fit([log], capacity_ah=CAPACITY_AH).model.name == "day"
-    other = synthetic_log(hours=0.5, seed=2, name="day")
-    assert fit([log, other], capacity_ah=CAPACITY_AH).model.name == "day (2 logs)"
-    assert fit([log], capacity_ah=CAPACITY_AH, name="pack").model.name == "pack"
+@pytest.mark.real
+def test_unseen_trips_are_predicted_better_than_by_the_published_equation(
+    shared_data: Path,
+) -> None:
+    paths = sorted((shared_data / "bmw_i3").glob("TripA*.csv.gz"))[:11]
+    knots = cangauge.fit(paths, capacity_ah=61.75, effects="none")
+    published = cangauge.fit(paths, capacity_ah=61.75, equation="published")
+    assert knots.model.noise.voltage_mae_pct < 0.15
+    assert knots.model.noise.voltage_mae_pct < 0.7 * published.model.noise.voltage_mae_pct

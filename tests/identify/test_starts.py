@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from test_fit import CELLS
 
-import cangauge
 from cangauge.errors import InputError
 from cangauge.identify.fit import fit
 from cangauge.identify.starts import start_by_model
@@ -30,7 +30,13 @@ def without_soc(log: Log) -> Log:
 
 def trip(start_pct: float, end_pct: float, seed: int, hours: float = 0.5) -> Log:
     return synthetic_log(
-        hours=hours, start_pct=start_pct, end_pct=end_pct, noise_v=0.3, seed=seed, name=f"t{seed}"
+        hours=hours,
+        start_pct=start_pct,
+        end_pct=end_pct,
+        noise_v=0.3,
+        seed=seed,
+        model=CELLS,
+        name=f"t{seed}",
     )
 
 
@@ -49,11 +55,11 @@ def test_unknown_start_is_estimated_with_the_curve() -> None:
     assert start.origin == "estimated"
     assert start.std_pct is not None
     assert abs(start.soc_pct - 75.0) < 3.0 * start.std_pct
-    assert start.std_pct < 1.0
+    assert start.std_pct < 3.0
     exact = fit([known, other], capacity_ah=CAPACITY_AH)
     assert found.voltage_mae_pct == pytest.approx(exact.voltage_mae_pct, rel=0.05)
-    assert found.model.coefficients["R1"].value == pytest.approx(
-        exact.model.coefficients["R1"].value, rel=0.02
+    assert sum(found.voltage_model.resistance_ohm) == pytest.approx(
+        sum(exact.voltage_model.resistance_ohm), rel=0.05
     )
     assert any("start estimated together with the curve: t2 starts" in r for r in found.remarks)
     of_logs = found.to_dict()["logs"]
@@ -107,15 +113,12 @@ def test_same_log_twice_is_refused() -> None:
         fit([log, trip(90.0, 30.0, 2), replace(log, name="copy")], capacity_ah=CAPACITY_AH)
 
 
-def test_diagnosis_finds_an_unknown_start_from_the_voltage() -> None:
+def test_a_model_finds_the_start_of_a_log_from_its_voltage() -> None:
     references = [trip(90.0, 40.0, seed, hours=1.0) for seed in (1, 2, 3)]
     model = fit(references, capacity_ah=CAPACITY_AH).model
-    log = without_soc(trip(70.0, 45.0, 4, hours=0.7))
-    start = start_by_model(log, model)
-    assert start.soc_pct == pytest.approx(70.0, abs=0.5)
-    found = cangauge.diagnose([log], model, references)
-    assert found.verdict.cause == "none"
-    assert any("t4 states no SoC: its start of 7" in caveat for caveat in found.caveats)
+    start = start_by_model(without_soc(trip(70.0, 45.0, 4, hours=0.7)), model)
+    assert start.std_pct is not None
+    assert abs(start.soc_pct - 70.0) < 2.0 * start.std_pct < 6.0
 
 
 @pytest.mark.real
@@ -123,13 +126,13 @@ def test_trips_without_soc_attach_to_one_that_has_it(shared_data: Path) -> None:
     names = ("A05", "A06", "A07", "A08", "A09", "A11", "A12")
     trips = [read_log(shared_data / "bmw_i3" / f"Trip{name}.csv.gz") for name in names]
     logs = [*trips[:5], *(without_soc(log) for log in trips[5:])]
-    found = fit(logs, capacity_ah=61.75)
+    found = fit(logs, capacity_ah=61.75, effects="none")
     for log, start in zip(trips[5:], found.starts[5:], strict=True):
         assert log.soc_pct is not None
         assert start.std_pct is not None
         error = start.soc_pct - float(log.soc_pct[np.isfinite(log.soc_pct)][0])
-        assert abs(error) < 3.0 * start.std_pct < 6.0
-    exact = fit(trips, capacity_ah=61.75)
+        assert abs(error) < 2.0 * start.std_pct < 6.0
+    exact = fit(trips, capacity_ah=61.75, effects="none")
     assert found.voltage_mae_pct == pytest.approx(exact.voltage_mae_pct, rel=0.1)
 
 

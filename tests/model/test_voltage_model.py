@@ -12,7 +12,16 @@ from hypothesis import strategies as st
 from cangauge.errors import InputError
 from cangauge.model.delay_line import DelayLine, delayed_currents, filled_at
 from cangauge.model.published import leaf_2012_model
-from cangauge.model.voltage_model import VoltageModel, soc_from_ocv, socs_from_ocv
+from cangauge.model.voltage_model import (
+    KNOTS_PCT,
+    Arrhenius,
+    HermiteCurve,
+    PublishedCurve,
+    VoltageModel,
+    hermite_basis,
+    soc_from_ocv,
+    socs_from_ocv,
+)
 
 MODEL = leaf_2012_model()
 K = (394.4, 48.89, -4.769, 0.2158, -0.003718, -54.59, 109.3, -3.141)
@@ -52,22 +61,12 @@ def test_slope_is_the_derivative(soc: float) -> None:
 
 
 def test_rises_and_stays_bounded_outside_the_identified_soc() -> None:
-    narrow = VoltageModel(K, -0.74, (-0.1,), (0.0,), soc_range_pct=(40.0, 80.0))
+    narrow = VoltageModel(PublishedCurve(K, soc_range_pct=(40.0, 80.0)), -0.74, (-0.1,), (0.0,))
     soc = np.linspace(-10.0, 110.0, 500)
     volts = narrow.pseudo_ocv(soc)
     assert np.all(np.diff(volts) > 0.0)
     # Three times the range at about its slope; the formula itself falls by hundreds of volts.
     assert np.ptp(volts) < 4.0 * np.ptp(narrow.pseudo_ocv([40.0, 80.0]))
-
-
-@given(st.floats(0.0, 100.0), st.integers(0, 7))
-def test_columns_are_derivatives_inside_and_outside(soc: float, k: int) -> None:
-    narrow = VoltageModel(K, -0.74, (-0.1,), (0.0,), soc_range_pct=(40.0, 80.0))
-    coefficients = narrow.coefficients
-    coefficients[k] += 1e-3
-    moved = narrow.with_coefficients(coefficients)
-    change = moved.pseudo_ocv([soc])[0] - narrow.pseudo_ocv([soc])[0]
-    assert 1e-3 * narrow.pseudo_ocv_columns([soc])[0, k] == pytest.approx(change, abs=1e-8)
 
 
 def test_temperature_is_limited_to_its_range() -> None:
@@ -77,23 +76,22 @@ def test_temperature_is_limited_to_its_range() -> None:
 
 def test_refuses_a_falling_pseudo_ocv() -> None:
     with pytest.raises(InputError, match="falls with SoC"):
-        VoltageModel((350.0, 0, 0, 0, 0, -20.0, 0, 0), 0.0, (-0.1,), (0.0,))
+        PublishedCurve((350.0, 0, 0, 0, 0, -20.0, 0, 0))
 
 
 @pytest.mark.parametrize(
     ("change", "field"),
     [
-        ({"epsilon": 0.0}, "epsilon"),
-        ({"delay_s": (0.0, 30.0, 10.0, 70.0)}, "delays"),
+        ({"delay_s": (0.0, 30.0, 10.0, 70.0)}, "delays_s"),
         ({"resistance_ohm": (-0.1,)}, "resistance_ohm"),
+        ({"low_pass_s": (10.0,)}, "resistance_ohm"),
         ({"kt_v_per_k": math.nan}, "coefficients"),
-        ({"soc_range_pct": (50.0, 50.0)}, "soc_range_pct"),
-        ({"soc_range_pct": (0.0, 5e-324)}, "soc_range_pct"),
+        ({"temperature_range_c": (50.0, 20.0)}, "temperature_range_c"),
     ],
 )
 def test_names_the_invalid_field(change: dict[str, object], field: str) -> None:
     good = {
-        "ocv_v": K,
+        "curve": PublishedCurve(K),
         "kt_v_per_k": -0.74,
         "resistance_ohm": (-0.1, -0.01, -0.01, -0.01),
         "delay_s": (0.0, 10.0, 30.0, 70.0),
@@ -101,6 +99,74 @@ def test_names_the_invalid_field(change: dict[str, object], field: str) -> None:
     with pytest.raises(InputError) as error:
         VoltageModel(**(good | change))
     assert error.value.field == field
+
+
+@pytest.mark.parametrize(
+    ("change", "field"),
+    [
+        ({"epsilon": 0.0}, "epsilon"),
+        ({"soc_range_pct": (50.0, 50.0)}, "soc_range_pct"),
+        ({"soc_range_pct": (0.0, 5e-324)}, "soc_range_pct"),
+    ],
+)
+def test_published_curve_names_the_invalid_field(change: dict[str, object], field: str) -> None:
+    with pytest.raises(InputError) as error:
+        PublishedCurve(**({"ocv_v": K} | change))
+    assert error.value.field == field
+
+
+VOLTS = 300.0 + 80.0 * np.sort(np.random.default_rng(3).uniform(0.0, 1.0, KNOTS_PCT.size))
+
+
+@given(st.floats(-20.0, 120.0))
+def test_forms_of_a_curve_of_knots_agree(soc: float) -> None:
+    curve = HermiteCurve.rising(KNOTS_PCT, VOLTS)
+    volts, slope = curve.at(soc)
+    at = np.array([soc])
+    assert volts == pytest.approx(curve.values(at)[0], abs=1e-9)
+    assert slope == pytest.approx(curve.slopes(at)[0], abs=1e-9)
+    assert slope > 0.0
+    above, below = curve.at(soc + 1e-4)[0], curve.at(soc - 1e-4)[0]
+    assert slope == pytest.approx((above - below) / 2e-4, rel=1e-3, abs=1e-3)
+
+
+@given(st.floats(-20.0, 120.0))
+def test_curve_of_knots_is_linear_in_its_values(soc: float) -> None:
+    smooth = 300.0 + KNOTS_PCT * 0.8
+    curve = HermiteCurve.rising(KNOTS_PCT, smooth)
+    row = hermite_basis(np.array([soc]))[0]
+    assert row @ smooth == pytest.approx(curve.at(soc)[0], abs=1e-9)
+
+
+def test_curve_passes_its_knots_and_falling_values_are_raised() -> None:
+    curve = HermiteCurve.rising(KNOTS_PCT, VOLTS)
+    assert [curve.at(soc)[0] for soc in KNOTS_PCT.tolist()] == pytest.approx(VOLTS, abs=0.6)
+    falling = VOLTS.copy()
+    falling[10] -= 30.0
+    raised = HermiteCurve.rising(KNOTS_PCT, falling)
+    volts = raised.values(np.linspace(-10.0, 110.0, 2401))
+    assert np.all(np.diff(volts) > 0.0)
+
+
+def test_load_columns_are_the_equation() -> None:
+    model = VoltageModel(
+        HermiteCurve.rising(KNOTS_PCT, VOLTS), -0.02, (-0.06, -0.01, -0.02), (0.0, 10.0), (140.0,),
+        Arrhenius(0.9, (-0.05, -0.01, -0.02), 15.0),
+    )  # fmt: skip
+    current, celsius = np.array([[40.0, 30.0, 12.0]]), -5.0
+    factor = math.exp(3000.0 * (1.0 / 268.15 - 1.0 / 288.15)) - 1.0
+    expected = -0.02 * (celsius - 20.0) + current[0] @ [-0.06, -0.01, -0.02]
+    expected += 0.9 * factor * (current[0] @ [-0.05, -0.01, -0.02])
+    found = model.voltage([37.0], [celsius], current)[0] - model.pseudo_ocv([37.0])[0]
+    assert found == pytest.approx(expected, abs=1e-9)
+
+
+def test_low_passed_currents_start_at_rest() -> None:
+    model = VoltageModel(PublishedCurve(K), 0.0, (-0.1, -0.1), (0.0,), (10.0,))
+    time_s = np.arange(0.0, 100.0)
+    currents = model.currents(time_s, np.full(100, 50.0), slice(None))
+    assert currents[:, 0].tolist() == [50.0] * 100
+    assert currents[:, 1] == pytest.approx(50.0 * -np.expm1(-time_s / 10.0), abs=1e-9)
 
 
 @given(st.lists(st.tuples(st.floats(0.02, 1.9), st.floats(-100, 200)), min_size=2, max_size=300))
@@ -142,5 +208,6 @@ def test_memory_is_bounded_at_any_rate() -> None:
 
 @given(st.lists(st.floats(200.0, 500.0), max_size=40))
 def test_voltages_are_inverted_together_as_one_by_one(volts: list[float]) -> None:
-    expected = [soc_from_ocv(MODEL, value).soc_pct for value in volts]
-    assert socs_from_ocv(MODEL, np.array(volts)) == pytest.approx(expected, abs=1e-9)
+    for model in (MODEL, VoltageModel(HermiteCurve.rising(KNOTS_PCT, VOLTS), 0.0, (0.0,), (0.0,))):
+        expected = [soc_from_ocv(model, value).soc_pct for value in volts]
+        assert socs_from_ocv(model, np.array(volts)) == pytest.approx(expected, abs=1e-6)

@@ -18,7 +18,7 @@ MODEL = published.leaf_2012_model()
 @cache
 def fitted(variant: str) -> Identification:
     log = read_log(shared_file("replay", f"leaf2012_reconstruction_{variant}.parquet"))
-    return fit([log])
+    return fit([log], equation="published")
 
 
 def curve_deviation_pct(found: Identification) -> float:
@@ -29,6 +29,11 @@ def curve_deviation_pct(found: Identification) -> float:
 
 def test_white_reproduces_the_voltage_curve() -> None:
     assert curve_deviation_pct(fitted("white")) < 0.1
+
+
+def test_fit_of_knots_prints_the_same_coefficients() -> None:
+    log = read_log(shared_file("replay", "leaf2012_reconstruction_white.parquet"))
+    assert fit([log]).model.coefficients == fitted("white").model.coefficients
 
 
 def test_white_reproduces_r1() -> None:

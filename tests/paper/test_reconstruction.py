@@ -13,7 +13,7 @@ import pytest
 
 from cangauge._resources import shared_file
 from cangauge.identify.evaluate import energy_balance
-from cangauge.inference.rows import FitOptions, FitRows, decimate, fit_rows
+from cangauge.identify.rows import FitRows, decimate, fit_rows
 from cangauge.logs.log import Log
 from cangauge.logs.read import read_log
 from cangauge.model import published
@@ -31,18 +31,18 @@ def shipped(variant: str) -> Log:
 
 @cache
 def rows_of(variant: str) -> FitRows:
-    return fit_rows(shipped(variant), FitOptions(published.CAPACITY_AH, delay_s=MODEL.delay_s))
+    return fit_rows(shipped(variant), published.CAPACITY_AH, low_pass_s=())
 
 
 def error_of(rows: FitRows) -> np.ndarray:
-    truth = MODEL.voltage(rows.soc_pct, rows.temperature_c, rows.delayed_current_a)
+    truth = MODEL.voltage(rows.soc_pct, rows.temperature_c, rows.currents_a)
     return np.asarray(rows.voltage_v - truth)
 
 
 def slope_and_expected(rows: FitRows) -> tuple[float, float]:
     """Slope of (U − pseudo-OCV) on I, and R1 + Σ Rj·ρj, with the published coefficients [Ω]."""
     drop = rows.voltage_v - MODEL.pseudo_ocv(rows.soc_pct, rows.temperature_c)
-    current = rows.delayed_current_a
+    current = rows.currents_a
     covariance = np.cov(np.column_stack([current, drop]), rowvar=False)[0]
     rho = covariance[:-1] / covariance[0]
     return covariance[-1] / covariance[0], float(np.dot(MODEL.resistance_ohm, rho))

@@ -15,7 +15,6 @@ import msgpack
 import pytest
 
 from cangauge.bus import open as open_module
-from cangauge.bus import udp
 from cangauge.bus.connection import BusConnection
 from cangauge.bus.open import BusAddress, bus_address, open_bus
 from cangauge.bus.publish import standard_filter
@@ -94,8 +93,8 @@ def test_malformed_packets_count_as_garbled(sender: socket.socket) -> None:
     ):
         for hostile in HOSTILE:
             send(sender, hostile, packet(), hostile)
-            frames = [single.receive(1.0) for _ in range(3)]
-            assert [each is None for each in frames] == [True, False, True], hostile
+            frames = [single.receive(0.1) for _ in range(2)]
+            assert [each is None for each in frames] == [False, True], hostile
             assert len(pending.receive_pending(1.0)) == 1, hostile
         assert single.garbled == pending.garbled == 2 * len(HOSTILE)
 
@@ -125,7 +124,7 @@ def test_the_default_bus_drops_what_other_machines_send(
         assert len(pending.receive_pending(1.0)) == 1
         with monkeypatch.context() as elsewhere:
             # No packet from another machine can be had here: this machine disowns its address.
-            elsewhere.setattr(udp, "_is_own_address", lambda _: False)
+            elsewhere.setattr(open_module, "_is_own_address", lambda _: False)
             for port in (single, pending):
                 port._bus._local_host = ""
             send(sender, packet())
@@ -133,9 +132,9 @@ def test_the_default_bus_drops_what_other_machines_send(
             assert pending.receive_pending(0.2) == []
         assert single.garbled == pending.garbled == 0
         assert len(named.receive_pending(1.0)) == 2
-    assert udp._is_own_address("127.0.0.1")
-    assert not udp._is_own_address("192.0.2.1")  # reserved for documentation
-    assert not udp._is_own_address("2001:db8::1")
+    assert open_module._is_own_address("127.0.0.1")
+    assert not open_module._is_own_address("192.0.2.1")  # reserved for documentation
+    assert not open_module._is_own_address("2001:db8::1")
 
 
 def test_hangups_at_the_start_and_malformed_packets_do_not_end_the_service(

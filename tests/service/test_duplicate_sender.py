@@ -9,11 +9,10 @@ from pathlib import Path
 import can
 import pytest
 
-from cangauge.bus.backend import backend_capabilities
 from cangauge.bus.connection import BusConnection
 from cangauge.bus.decoder import SUSPECTED_FOR_S
 from cangauge.bus.encoder import FrameEncoder
-from cangauge.bus.open import bus_address, open_bus
+from cangauge.bus.open import backend_capabilities, bus_address, open_bus
 from cangauge.bus.publish import FrameIds
 from cangauge.bus.vehicle import Vehicle
 from cangauge.estimation.offline import samples_of

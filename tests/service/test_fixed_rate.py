@@ -9,8 +9,8 @@ from types import SimpleNamespace
 import can
 import pytest
 
-from cangauge.bus.backend import UNKNOWN_INTERFACE, BackendCapabilities, Stamps
 from cangauge.bus.encoder import FrameEncoder
+from cangauge.bus.open import UNKNOWN_INTERFACE, BackendCapabilities, Stamps
 from cangauge.bus.publish import SocDetail, SocEstimate, SocReader
 from cangauge.bus.vehicle import Vehicle
 from cangauge.estimation.settings import EstimatorSettings

@@ -51,7 +51,7 @@ def with_value(value: float) -> Fault:
 
     def fault(frame: can.Message) -> None:
         counter = GENERIC_RULE.counter(frame.data)
-        SIGNALS[frame.arbitration_id].encode_into(frame.data, value)
+        SIGNALS[frame.arbitration_id].codec.encode_into(frame.data, value)
         frame.data = bytearray(GENERIC_RULE.protect(frame.data, counter))
 
     return fault
@@ -227,7 +227,7 @@ def test_stuck_voltage_is_found_and_charge_still_counted() -> None:
 
     def freeze(frame: can.Message) -> None:
         signal = SIGNALS[VOLTAGE]
-        seen.append(signal.decode(frame.data))
+        seen.append(signal.codec.decode(frame.data))
         with_value(seen[0])(frame)
 
     result = run(with_fault(VOLTAGE, freeze, begins_s=30.0, ends_s=120.0))

@@ -17,8 +17,14 @@ import can
 import numpy as np
 import pytest
 
-from cangauge.bus.captures.capture import is_capture, open_capture
-from cangauge.bus.captures.files import all_parts, part_path, parts_of_run, run_path
+from cangauge.bus.captures import (
+    all_parts,
+    is_capture,
+    open_capture,
+    part_path,
+    parts_of_run,
+    run_path,
+)
 from cangauge.bus.encoder import FrameEncoder
 from cangauge.bus.vehicle import Vehicle
 from cangauge.errors import InputError

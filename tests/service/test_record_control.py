@@ -8,8 +8,7 @@ from pathlib import Path
 import can
 import pytest
 
-from cangauge.bus.captures.capture import open_capture
-from cangauge.bus.captures.files import all_parts
+from cangauge.bus.captures import all_parts, open_capture
 from cangauge.service.record_control import RecordControl
 from cangauge.service.recording import RecordLimits
 from live import waits

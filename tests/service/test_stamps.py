@@ -11,10 +11,9 @@ from random import Random
 import can
 import pytest
 
-from cangauge.bus.backend import BackendCapabilities
 from cangauge.bus.connection import BusConnection
 from cangauge.bus.encoder import FrameEncoder
-from cangauge.bus.open import BusAddress, open_bus
+from cangauge.bus.open import BackendCapabilities, BusAddress, open_bus
 from cangauge.bus.publish import SocEstimate, SocReader
 from cangauge.bus.recording import capture_samples
 from cangauge.bus.time_source import ClockFrames, ReceiveTime

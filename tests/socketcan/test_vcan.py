@@ -15,8 +15,7 @@ import can
 import numpy as np
 import pytest
 
-from cangauge.bus.backend import NoPendingFrameError, pending_frames
-from cangauge.bus.connection import BusConnection
+from cangauge.bus.connection import BusConnection, NoPendingFrameError, pending_frames
 from cangauge.bus.encoder import FrameEncoder
 from cangauge.bus.open import BusAddress, bus_address, has_socketcan, open_bus
 from cangauge.bus.publish import (

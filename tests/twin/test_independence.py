@@ -9,11 +9,7 @@ from pathlib import Path
 
 import pytest
 
-import cangauge.diagnosis
-
 UNDER_TEST = ("cangauge.model", "cangauge.diagnosis", "cangauge.identify", "cangauge.estimation")
-FACE = {f"cangauge.diagnosis.{name}" for name in cangauge.diagnosis.__all__}
-"""Public names of the diagnosis."""
 
 
 def modules(project: Path, folder: str) -> list[Path]:
@@ -36,12 +32,6 @@ def imported(path: Path) -> set[str]:
 def test_twin_imports_nothing_under_test(project: Path) -> None:
     for path in modules(project, "extras/validation/twin"):
         bad = {name for name in imported(path) if name.startswith(UNDER_TEST)}
-        assert not bad, f"{path.name} imports {bad}"
-
-
-def test_validation_imports_only_the_face_of_diagnosis(project: Path) -> None:
-    for path in modules(project, "extras/validation"):
-        bad = {name for name in imported(path) if name.startswith("cangauge.diagnosis")} - FACE
         assert not bad, f"{path.name} imports {bad}"
 
 

@@ -9,8 +9,6 @@ from typing import ClassVar, Final, NamedTuple
 
 import can
 
-from cangauge.bus.cells import CellVoltages
-from cangauge.bus.isotp import Reassembler, reply_id, reply_key
 from cangauge.bus.plausibility import (
     ConstantDetector,
     Fault,
@@ -19,8 +17,9 @@ from cangauge.bus.plausibility import (
     SignalHealth,
     stuck_detectors,
 )
-from cangauge.bus.protection import SUSPECTED_AT, FrameChecker, Verdict
-from cangauge.bus.vehicle import EXTENDED, Vehicle, VehicleSignal, pgn_mask
+from cangauge.bus.polling import Reassembler, reply_id, reply_key
+from cangauge.bus.protection import FrameChecker, Verdict
+from cangauge.bus.vehicle import EXTENDED, CellGroup, CellSignals, Vehicle, VehicleSignal, pgn_mask
 from cangauge.types import Reason, Sample
 
 _MISSING: Final = {
@@ -28,9 +27,6 @@ _MISSING: Final = {
     "voltage": Reason.VOLTAGE_MISSING,
     "temperature": Reason.TEMPERATURE_MISSING,
 }
-# Read for every sample; enum members are slow to look up.
-_DUPLICATE: Final = Reason.DUPLICATE_SENDER
-_NO_REASON: Final = Reason.NONE
 _REASONS: Final = {
     Fault.NONE: Reason.NONE,
     Fault.PROTECTION: Reason.PROTECTION_FAILED,
@@ -41,24 +37,14 @@ _REASONS: Final = {
     Fault.STUCK: Reason.SIGNAL_STUCK,
     Fault.TWO_SENDERS: Reason.DUPLICATE_SENDER,
 }
+# Looked up for every frame or sample; enum members are slow to look up.
+_DUPLICATE: Final = Reason.DUPLICATE_SENDER
+_NO_REASON: Final = Reason.NONE
+_GOOD: Final = Verdict.GOOD
 
 SUSPECTED_FOR_S: Final = 10.0
 """Time after the last sign of a second sender for which a message is refused [s]: longer than an
 attacker's pause between two tries, well below the longest gap over which charge is counted."""
-
-COUNTED: Final = 64
-"""Frames over which the rate of a message is measured: a few loop periods of a sender's jitter, or
-an adapter's batch, are a small part of them."""
-TOO_MANY: Final = 1.5
-"""Rate of a message, relative to the stated one, above which frames are surplus."""
-KEPT: Final = 5
-"""Times in a row that the stated rate was kept, from which it is known to be right."""
-HELD_UP_S: Final = 10.0
-SURPLUS_S: Final = 6.0
-"""Time over which the frames due are counted [s], and surplus frames, as time at the stated rate,
-that prove a second sender [s]: longer than frames are held up and then delivered at once."""
-
-_GOOD: Final = Verdict.GOOD  # looked up for every frame; enum members are slow to look up
 
 
 class _Total:
@@ -127,16 +113,6 @@ class Pairing:
         Counts the values left unpaired.
     """
 
-    __slots__ = (
-        "_current_a",
-        "_current_s",
-        "_temperature_c",
-        "_voltage_s",
-        "_voltage_v",
-        "_within_s",
-        "statistics",
-    )
-
     def __init__(self, within_s: float, statistics: FrameStatistics | None = None) -> None:
         # Slightly more than stated: stamps 20 ms apart must pair in spite of rounding.
         self._within_s = within_s + 1e-6
@@ -150,9 +126,7 @@ class Pairing:
             # No current can be waiting next to this voltage: they would have been paired.
             self._voltage_s = math.nan
             return Sample(time_s, current_a, self._voltage_v, temperature_c)
-        if not math.isnan(self._voltage_s):
-            self.statistics.voltage_unpaired += 1
-            self._voltage_s = math.nan
+        self._drop_voltage()
         unpaired = self.flush()
         self._current_s, self._current_a = time_s, current_a
         self._temperature_c = temperature_c
@@ -164,8 +138,7 @@ class Pairing:
             sample = Sample(self._current_s, self._current_a, voltage_v, self._temperature_c)
             self._current_s = math.nan
             return sample
-        if not math.isnan(self._voltage_s):
-            self.statistics.voltage_unpaired += 1
+        self._drop_voltage()
         self._voltage_s, self._voltage_v = time_s, voltage_v
         return self.flush()
 
@@ -178,15 +151,80 @@ class Pairing:
         self.statistics.current_unpaired += 1
         return sample
 
+    def _drop_voltage(self) -> None:
+        self.statistics.voltage_unpaired += not math.isnan(self._voltage_s)
+        self._voltage_s = math.nan
+
+
+class CellVoltages:
+    """Latest voltage of each cell, with its bus time.
+
+    Parameters
+    ----------
+    signals : CellSignals
+
+    Attributes
+    ----------
+    voltage_v, time_s : list of float
+        By cell; NaN before the first plausible value.
+    refused : int
+        Values out of range.
+    """
+
+    def __init__(self, signals: CellSignals) -> None:
+        self.signals = signals
+        self.voltage_v = [math.nan] * signals.count
+        self.time_s = [math.nan] * signals.count
+        self.refused = 0
+        self._taken_s = [math.nan] * signals.count
+
+    def reader(self, key: int) -> Callable[[bytes | bytearray, float], None]:
+        """Return what takes the payloads of a message with their time [s]."""
+        groups = [group for group in self.signals.groups if group.key == key]
+
+        def read(payload: bytes | bytearray, time_s: float) -> None:
+            for group in groups:
+                if all(each.field.get(payload) in each.values for each in group.conditions):
+                    self._read(group, payload, time_s)
+
+        return read
+
+    def take(self, now_s: float) -> tuple[list[float], list[float]]:
+        """Return voltages [V] and bus times [s] that are new since the last call, NaN for others.
+
+        A voltage older than the time-out at `now_s` [s] is not returned.
+        """
+        oldest_s, taken = now_s - self.signals.timeout_s, self._taken_s
+        is_new = [
+            time_s >= oldest_s and time_s != before
+            for time_s, before in zip(self.time_s, taken, strict=True)
+        ]
+        taken[:] = self.time_s
+        return (
+            [v if new else math.nan for v, new in zip(self.voltage_v, is_new, strict=True)],
+            [t if new else math.nan for t, new in zip(self.time_s, is_new, strict=True)],
+        )
+
+    def _read(self, group: CellGroup, payload: bytes | bytearray, time_s: float) -> None:
+        shift, signals = 0, self.signals
+        if group.index is not None:
+            shift = (group.index.get(payload) - group.first_index) * len(group.decoders)
+        for place, decode in zip(group.places, group.decoders, strict=True):
+            at, volts = place + shift, decode(payload)
+            if not 0 <= at < signals.count or math.isnan(volts):
+                continue  # the last group may be filled up, and a cell be not available
+            if not signals.lowest_v <= volts <= signals.highest_v:
+                self.refused += 1
+                continue
+            self.voltage_v[at], self.time_s[at] = volts, time_s
+
 
 class _Input(NamedTuple):
-    """A signal of a message: its decoder and its health, unpacked for every frame."""
+    """A signal of a message: its decoder and its health."""
 
     decode: Callable[[bytes | bytearray], float]
     is_present: Callable[[bytes | bytearray], bool] | None
     """Multiplexed signals only."""
-    check: Callable[[float, float], float]
-    """`SignalHealth.update`."""
     health: SignalHealth
     is_current: bool
     is_voltage: bool
@@ -200,100 +238,12 @@ class _Route:
     length: int
     checker: FrameChecker | None
     statistics: MessageStatistics
-    rate: _RateCheck
     inputs: list[_Input] = field(default_factory=list)
-    has_both: bool = False
-    """Current and voltage: each frame is a sample by itself."""
     read_cells: Callable[[bytes | bytearray, float], None] | None = None
     """Takes a payload with cell voltages, and its time [s]."""
     last_s: float = -math.inf
     suspected_until_s: float = -math.inf
     """Until then its frames may be of two senders."""
-
-
-class _RateCheck:
-    """Detect more frames of a message than its stated period allows; learn one that is not stated.
-
-    Parameters
-    ----------
-    stated_s : float, optional
-        Stated period [s].
-
-    Attributes
-    ----------
-    learned_s : float
-        Longest period of the last `HELD_UP_S` to twice that [s], so that a second sender does not
-        shorten it soon; NaN while it is not known, or where one is stated.
-    held_until_s : float
-        Nothing is learned until then [s].
-    """
-
-    __slots__ = ("_before", "_frames", "_is_stated", "_kept", "_most", "_period_s", "_seen_s",
-                 "_since_s", "_spare_s", "held_until_s", "learned_s")  # fmt: skip
-
-    def __init__(self, stated_s: float | None) -> None:
-        self._is_stated = stated_s is not None
-        self._period_s = math.nan if stated_s is None else stated_s
-        self._seen_s = self._since_s = -math.inf
-        self._frames = self._kept = 0
-        self._spare_s = 0.0
-        # Frames beyond those due, or periods [s]: largest number so far in this interval of
-        # `HELD_UP_S`, and in the one before.
-        self._most = self._before = math.inf if self._is_stated else 0.0
-        self.learned_s = math.nan
-        self.held_until_s = -math.inf
-
-    def _learn(self, time_s: float) -> None:
-        took_s, self._seen_s = time_s - self._seen_s, time_s
-        if not 0.0 < took_s < math.inf or time_s < self.held_until_s:
-            return
-        if time_s - self._since_s >= HELD_UP_S:
-            self._since_s, self._most, self._before = time_s, 0.0, self._most
-        self._most = max(self._most, took_s / COUNTED)
-        self.learned_s = max(self._most, self._before)
-
-    def is_exceeded(self, time_s: float, statistics: MessageStatistics) -> bool:
-        """Return whether a lasting surplus proves two senders; called every `COUNTED` frames.
-
-        A message is judged once it has kept its period for a while: the stated one may be wrong.
-        """
-        if not self._is_stated:
-            self._learn(time_s)
-            return False
-        surplus = self._surplus(time_s, statistics)
-        # A repeated frame is refused anyway; CAN itself repeats some after an error.
-        frames = _whole(statistics) - statistics.counter_repeats
-        due_s, self._frames = (frames - self._frames) * self._period_s, frames
-        took_s, self._seen_s = time_s - self._seen_s, time_s
-        if took_s > HELD_UP_S + due_s:
-            self._since_s, self._most, self._before = time_s, surplus, surplus
-            return False
-        if time_s - self._since_s >= HELD_UP_S:
-            self._since_s, self._most, self._before = time_s, surplus, self._most
-        self._most = max(self._most, surplus)
-        if self._kept < KEPT:
-            is_kept = due_s / TOO_MANY <= took_s <= TOO_MANY * due_s
-            self._kept = self._kept + 1 if is_kept else 0
-            return False
-        self._spare_s = min(max(self._spare_s + TOO_MANY * took_s - due_s, -SURPLUS_S), 0.0)
-        return self._spare_s <= -SURPLUS_S
-
-    def has_surplus(self, time_s: float, statistics: MessageStatistics) -> bool:
-        """Return whether frames came that were not due; False while that is not known.
-
-        Frames that were lost, and delivered in bursts, can look like those of two senders.
-        """
-        if not self._is_stated:
-            return True
-        return self._surplus(time_s, statistics) - self._before >= SUSPECTED_AT / 2
-
-    def _surplus(self, time_s: float, statistics: MessageStatistics) -> float:
-        return _whole(statistics) - time_s / self._period_s
-
-
-def _whole(statistics: MessageStatistics) -> int:
-    """Return the number of frames that were neither damaged nor too short."""
-    return statistics.wanted - statistics.crc_errors - statistics.short
 
 
 class SampleDecoder:
@@ -331,6 +281,8 @@ class SampleDecoder:
         self.now_s = -math.inf
         self._suspected_until_s = -math.inf
         self._pairing = Pairing(vehicle.pair_within_s, self.statistics)
+        # In one frame: each is a sample by itself.
+        self._is_paired = vehicle.current.key == vehicle.voltage.key
         self._routes: dict[int, _Route] = {}
         self._by_pgn = {
             key & pgn_mask(key): key for key, each in vehicle.messages.items() if each.by_pgn
@@ -363,117 +315,64 @@ class SampleDecoder:
         pack: Pack | None,
         is_stuck: Callable[[float, float], bool] | None,
     ) -> None:
-        message = self.vehicle.messages[signal.key]
         route = self._route(signal.key, signal.message, signal.length)
-        is_fast = signal.role in {"current", "voltage"}
         is_multiplexed = bool(signal.codec.conditions)
         health = self.health[signal.role] = SignalHealth(
             signal.checks if pack is None else signal.checks.within_pack(signal.role, pack),
             # A multiplexed signal is not in every frame of its message: its period is learned.
-            None if is_multiplexed else message.period_s,
-            is_cyclic=is_fast,
+            None if is_multiplexed else self.vehicle.messages[signal.key].period_s,
+            is_cyclic=signal.role in {"current", "voltage"},
             is_stuck=is_stuck,
             statistics=route.statistics,
         )
         if route.checker is not None and not is_multiplexed:
-            rate = route.rate
-            route.checker.learned_period_s = lambda: (
-                health.period_s if math.isnan(rate.learned_s) else rate.learned_s
-            )
-        route.inputs.append(
-            _Input(
-                signal.decode,
-                signal.codec.is_in if is_multiplexed else None,
-                health.update,
-                health,
-                is_current=signal.role == "current",
-                is_voltage=signal.role == "voltage",
-            )
-        )
-        route.has_both = self.vehicle.current.key == self.vehicle.voltage.key == signal.key
+            route.checker.learned_period_s = lambda: health.period_s
+        is_present = signal.codec.is_in if is_multiplexed else None
+        is_current, is_voltage = signal.role == "current", signal.role == "voltage"
+        route.inputs.append(_Input(signal.codec.decode, is_present, health, is_current, is_voltage))
 
     def _route(self, key: int, name: str, length: int) -> _Route:
-        route = self._routes.get(key)
-        if route is None:
+        if key not in self._routes:
             message = self.vehicle.messages[key]
             statistics = self.statistics.messages[key] = MessageStatistics()
             checker = None if message.rule is None else FrameChecker(message.rule, message.period_s)
-            route = self._routes[key] = _Route(
-                name, length, checker, statistics, _RateCheck(message.period_s)
-            )
-        return route
+            self._routes[key] = _Route(name, length, checker, statistics)
+        return self._routes[key]
 
-    def handle(self, message: can.Message) -> Sample | None:  # noqa: C901, PLR0912 - one pass
+    def handle(self, message: can.Message) -> Sample | None:
         """Decode one frame; return the sample that it completes, if any.
 
         `voltage_v` and `temperature_c` of a sample may be NaN. Samples keep the order of their
         currents.
         """
-        statistics = self.statistics
-        statistics.frames += 1
+        self.statistics.frames += 1
         if message.is_error_frame or message.is_remote_frame:
-            statistics.ignored += 1
+            self.statistics.ignored += 1
             return None
-        key = message.arbitration_id
+        key, time_s, data = message.arbitration_id, message.timestamp, message.data
         if message.is_extended_id:
             key |= EXTENDED
         route = self._routes.get(key)
-        if route is None and self._by_pgn and key & EXTENDED:
-            route = self._routes.get(self._by_pgn.get(key & pgn_mask(key), -1))
-        if route is None and key in self._replies:
-            route, message = self._reply(key, message)
-        payload = None if route is None else self._accept(route, message)
-        if route is None or payload is None:
+        if route is None:
+            if self._by_pgn and key & EXTENDED:
+                route = self._routes.get(self._by_pgn.get(key & pgn_mask(key), -1))
+            elif key in self._replies:
+                reply = self._replies[key].take(data, time_s)
+                if reply is not None and len(reply) >= 2:
+                    route = self._routes.get(reply_key(key, reply) | EXTENDED)
+                    data = bytearray(reply)
+        if route is None:
             return None
-        time_s = message.timestamp
-        if route.read_cells is not None:
-            route.read_cells(payload, time_s)
-        current_a = voltage_v = math.nan
-        for decode, is_present, check, _, is_current, is_voltage in route.inputs:
-            if is_present is not None and not is_present(payload):
-                continue
-            value = check(decode(payload), time_s)
-            if is_current:
-                current_a = value
-            elif is_voltage:
-                voltage_v = value
-        sample = None
-        if not math.isnan(current_a):
-            temperature_c = (
-                self.vehicle.fixed_temperature_c
-                if self._temperature is None
-                else self._temperature.value_at(time_s)
-            )
-            if route.has_both:
-                statistics.current_unpaired += math.isnan(voltage_v)
-                sample = Sample(time_s, current_a, voltage_v, temperature_c)
-            else:
-                sample = self._pairing.current(time_s, current_a, temperature_c)
-        elif not math.isnan(voltage_v) and not route.has_both:
-            sample = self._pairing.voltage(time_s, voltage_v)
-        if sample is not None:
-            statistics.samples += 1
-        return sample
+        payload = self._accept(route, data, time_s)
+        return None if payload is None else self._values(route, payload, time_s)
 
-    def _reply(self, key: int, message: can.Message) -> tuple[_Route | None, can.Message]:
-        """Return the route and content of the reply (ISO-TP) that a frame completes, if any."""
-        reply = self._replies[key].take(message.data, message.timestamp)
-        if reply is None or len(reply) < 2:
-            return None, message
-        route = self._routes.get(reply_key(key, reply) | EXTENDED)
-        return route, can.Message(timestamp=message.timestamp, data=reply)
-
-    def _accept(  # noqa: C901 - one pass, in order
-        self, route: _Route, message: can.Message
-    ) -> bytearray | None:
+    def _accept(self, route: _Route, payload: bytearray, time_s: float) -> bytearray | None:
         """Return the payload, cut to the message's length; None for a refused frame."""
-        statistics, time_s, payload = route.statistics, message.timestamp, message.data
+        statistics = route.statistics
         statistics.wanted += 1
         if time_s < route.last_s:
             self._rewind(route.last_s, time_s)
         self.now_s = time_s
-        if not statistics.wanted % COUNTED and route.rate.is_exceeded(time_s, statistics):
-            self._suspect(route, time_s)
         if len(payload) != route.length:
             if len(payload) < route.length:
                 statistics.short += 1
@@ -486,8 +385,9 @@ class SampleDecoder:
                 if verdict is Verdict.CRC_WRONG:
                     statistics.crc_errors += 1
                     return _refuse(route, Fault.PROTECTION)
-                if checker.suspects_second_sender and route.rate.has_surplus(time_s, statistics):
-                    self._suspect(route, time_s)
+                if checker.suspects_second_sender:
+                    until_s = time_s + SUSPECTED_FOR_S
+                    route.suspected_until_s = self._suspected_until_s = until_s
                 if verdict is Verdict.REPEATED:
                     statistics.counter_repeats += 1
                     return _refuse(route, Fault.REPEATED)
@@ -499,10 +399,35 @@ class SampleDecoder:
         route.last_s = time_s
         return payload
 
-    def _suspect(self, route: _Route, time_s: float) -> None:
-        """Refuse a message for a while: its frames may be of two senders."""
-        route.suspected_until_s = self._suspected_until_s = time_s + SUSPECTED_FOR_S
-        route.rate.held_until_s = route.suspected_until_s
+    def _values(self, route: _Route, payload: bytearray, time_s: float) -> Sample | None:
+        """Check the values of an accepted payload; return the sample that they complete."""
+        if route.read_cells is not None:
+            route.read_cells(payload, time_s)
+        current_a = voltage_v = math.nan
+        for decode, is_present, health, is_current, is_voltage in route.inputs:
+            if is_present is not None and not is_present(payload):
+                continue
+            value = health.update(decode(payload), time_s)
+            if is_current:
+                current_a = value
+            elif is_voltage:
+                voltage_v = value
+        sample = None
+        if not math.isnan(current_a):
+            temperature_c = (
+                self.vehicle.fixed_temperature_c
+                if self._temperature is None
+                else self._temperature.value_at(time_s)
+            )
+            if self._is_paired:
+                self.statistics.current_unpaired += math.isnan(voltage_v)
+                sample = Sample(time_s, current_a, voltage_v, temperature_c)
+            else:
+                sample = self._pairing.current(time_s, current_a, temperature_c)
+        elif not (math.isnan(voltage_v) or self._is_paired):
+            sample = self._pairing.voltage(time_s, voltage_v)
+        self.statistics.samples += sample is not None
+        return sample
 
     @property
     def two_sender_messages(self) -> tuple[str, ...]:
@@ -514,8 +439,7 @@ class SampleDecoder:
     def flush(self) -> Sample | None:
         """Return the last current, if it is unpaired, as a sample without voltage."""
         sample = self._pairing.flush()
-        if sample is not None:
-            self.statistics.samples += 1
+        self.statistics.samples += sample is not None
         return sample
 
     def reasons(self, now_s: float) -> Reason:
@@ -562,8 +486,8 @@ def _detectors(vehicle: Vehicle, pack: Pack | None) -> dict[str, Callable[[float
     if pack is not None:
         current, voltage = stuck_detectors(
             pack,
-            current_step_a=2.0 * vehicle.current.half_step,
-            voltage_step_v=2.0 * vehicle.voltage.half_step,
+            current_step_a=2.0 * vehicle.current.codec.half_step,
+            voltage_step_v=2.0 * vehicle.voltage.codec.half_step,
             current_after_s=vehicle.current.checks.stuck_after_s,
             voltage_after_s=vehicle.voltage.checks.stuck_after_s,
         )

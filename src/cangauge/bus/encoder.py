@@ -98,7 +98,7 @@ class FrameEncoder:
         first = frame.signals[0]
         payload = bytearray(first.length)
         for signal, value in zip(frame.signals, values, strict=True):
-            signal.encode_into(payload, value)
+            signal.codec.encode_into(payload, value)
         if frame.is_slow:
             if payload == frame.last and 0.0 <= time_s - frame.last_s < SLOW_EVERY_S:
                 return None
@@ -124,10 +124,10 @@ class FrameEncoder:
             Names the first signal that is too narrow, its range, the value and its row.
         """
         for signal, field, values in self._columns(log):
-            bad = np.flatnonzero(~signal.fits(values))
+            bad = np.flatnonzero(~signal.codec.fits(values))
             if bad.size:
                 row = int(bad[0])
-                low, high = signal.range
+                low, high = signal.codec.range
                 unit = _UNITS[signal.role]
                 raise InputError(
                     f"does not fit into signal {signal.codec.name} of {signal.message}, which"
@@ -147,7 +147,9 @@ class FrameEncoder:
             `current_a` [A], `voltage_v` [V], `temperature_c` [°C], `soc_pct` [%], where the
             vehicle sends them, and `time_s` [s] for REPLAY_CLOCK.
         """
-        steps = {LOG_COLUMNS[signal.role]: signal.half_step for signal in self.vehicle.signals}
+        steps = {
+            LOG_COLUMNS[signal.role]: signal.codec.half_step for signal in self.vehicle.signals
+        }
         return {**steps, "time_s": 0.5 / MICROSECONDS}
 
     def quantize(self, log: Log) -> Log:
@@ -156,7 +158,9 @@ class FrameEncoder:
         A vehicle without a temperature signal gives its fixed temperature, or the log's if it has
         none.
         """
-        sent = {field: signal.quantize(values) for signal, field, values in self._columns(log)}
+        sent = {
+            field: signal.codec.quantize(values) for signal, field, values in self._columns(log)
+        }
         if not math.isnan(self.vehicle.fixed_temperature_c):
             sent["temperature_c"] = np.full(len(log), self.vehicle.fixed_temperature_c)
         return replace(

@@ -1,80 +1,6 @@
 """The map file: which signals of a DBC are current, voltage and temperature; their conversion.
 
-A map file in TOML, for any car with a DBC::
-
-    name = "my car"
-    dbc = "my_car.dbc"              # optional: or give --dbc
-    temperature_source = "pack"     # cell, pack, coolant, room, unknown
-    pair_within_s = 0.020
-
-    [current]
-    message = "BMS_Status"          # name or id ("0x1DB"); optional where the signal is unique
-    signal = "PackCurrent"
-    sign = -1                       # -1: on the bus, negative current discharges
-    lowest = -400                   # optional, like all below: [A], [V], [°C], sign of cangauge
-    highest = 400
-    max_jump = 300                  # largest change between two values …
-    max_rate_per_s = 5000           # … plus this for every second between them
-    invalid_after = 5               # consecutive failures until the signal is invalid
-    valid_after = 3                 # consecutive good values until it is valid again
-    timeout_s = 0.5                 # default: from the period of the message
-
-    [voltage]
-    signal = "PackVoltage"
-
-    [temperature]
-    signal = "PackTemperature"      # or: fixed_c = 21.5
-    when = { Selector = 2 }         # only in frames where this signal has this raw value
-
-    [soc]                           # optional: the car's own, to begin from and to compare with
-    signal = "DisplaySoc"
-
-    [columns]                       # optional: columns of this car's logs that are tables
-    time = "Timestamp"
-    current = "PackCurrent[mA]:-1"  # heading, unit, factor; or { heading = …, unit = …, sign = -1 }
-
-    [cells]                         # optional: cell voltages
-    signal = "CELL_{n}_VOLTAGE"     # one signal a cell; {n}: its number, {n:02d} with zeros
-    count = 96
-    first = 1                       # number of the first cell
-    # or groups of cells, numbered by a signal of the frame:
-    # message = "BMS_Cells"
-    # index = "GroupNumber"         # its raw value; the first group has first_index
-    # first_index = 0
-    # signals = ["CellA", "CellB", "CellC"]
-
-    [messages.BMS_Status]           # optional
-    protection = "my_rule"          # leaf, generic, crc_only, counter, e2e_01, e2e_02, e2e_04,
-                                    # e2e_05, e2e_06, e2e_07, e2e_11, or one of [rules]
-    period_s = 0.01                 # default: from the DBC, or learned from the frames
-
-    [messages.BMS_Temps]
-    protection = "e2e_05"           # AUTOSAR end-to-end protection
-    data_id = 0x1234                # e2e_02: data_id_list = [16 numbers of 0-255]
-    # data_id_mode = "nibble"       # e2e_01, e2e_11: both (default), alternating, low, nibble
-    # header_byte = 0               # first byte of the header
-    # protected_bytes = 8           # default: all bytes of the message
-
-    [messages.BMS_Limits]
-    protection = "counter"          # no known CRC
-    counter = "AliveCounter"        # signal of the DBC
-    counter_modulus = 15            # number of values; default: all that its bits can hold
-
-    [messages.HVESSD1]
-    j1939 = true                    # by its PGN: any source address and priority
-
-    [messages.Reply_6104]
-    isotp = true                    # a reply over ISO-TP; its id in the DBC is 0x7BB6104 for a
-                                    # reply 61 04 … on 0x7BB. Others poll it: nothing is sent
-    request_id = 0x79B              # … unless the service's configuration has [poll]
-
-    [rules.my_rule]
-    polynomial = 0x2F
-    initial = 0xFF
-    xor_out = 0xFF
-    crc_byte = 0
-    counter_byte = 1
-    counter_bits = 4
+A TOML file, for any car with a DBC; `docs/map-file.md` shows each key.
 """
 
 from __future__ import annotations
@@ -89,7 +15,7 @@ from cantools.database.can import Message
 from pydantic import AliasChoices, BaseModel, ConfigDict, Field, FiniteFloat, model_validator
 
 from cangauge._config import read_toml
-from cangauge.bus import database
+from cangauge.bus.database import Field as BitField
 from cangauge.bus.protection import (
     LIST_LENGTH,
     PROFILES,
@@ -106,22 +32,15 @@ from cangauge.logs.column_map import ColumnMap
 from cangauge.logs.log import TemperatureSource
 
 PAIR_WITHIN_S: Final = 0.020
-"""Largest distance in bus time between paired current and voltage [s]."""
+"""Largest distance in bus time between paired current and voltage [s] (DESIGN: configurable)."""
 
 COUNTER: Final = "counter"
 """Protection by a counter alone."""
-_COUNTER_FIELDS: Final = ("counter", "counter_modulus")
-_PROFILE_FIELDS: Final = (
-    "data_id",
-    "data_id_list",
-    "data_id_mode",
-    "header_byte",
-    "protected_bytes",
-)
 
 _Byte = Annotated[int, Field(ge=0, le=255)]
 _Place = Annotated[int, Field(ge=-64, le=63)]
 _Positive = Annotated[FiniteFloat, Field(gt=0.0)]
+_Count = Annotated[int, Field(ge=1, le=1000)]
 
 
 class _Strict(BaseModel):
@@ -151,8 +70,8 @@ class CheckMap(_Strict):
     highest: FiniteFloat | None = None
     max_jump: _Positive | None = None
     max_rate_per_s: _Positive | None = None
-    invalid_after: Annotated[int, Field(ge=1, le=1000)] | None = None
-    valid_after: Annotated[int, Field(ge=1, le=1000)] | None = None
+    invalid_after: _Count | None = None
+    valid_after: _Count | None = None
     stuck_after_s: _Positive | None = None
     timeout_s: _Positive | None = None
 
@@ -204,7 +123,7 @@ class TemperatureMap(SignalMap):
     fixed_c: Annotated[FiniteFloat, Field(ge=-60.0, le=120.0)] | None = None
 
     @model_validator(mode="after")
-    def _one_of_both(self) -> TemperatureMap:
+    def _one_of_both(self) -> Self:
         if bool(self.signal) == (self.fixed_c is not None):
             raise ValueError("give either signal or fixed_c")
         return self
@@ -227,10 +146,8 @@ class CellsMap(_Strict):
         Signals of a group, in the order of the cells.
     first_index : int
         Number of the first group.
-    scale, offset : float
-        For a DBC with a wrong or unknown unit: V = scale × (DBC value) + offset.
-    not_available : tuple of int
-        Raw codes without a value, besides those named so in the DBC's value table.
+    scale, offset, not_available
+        As in `SignalMap` [V].
     lowest, highest : float, optional
         Plausible voltages [V].
     timeout_s : float, optional
@@ -262,32 +179,27 @@ class CellsMap(_Strict):
         if self.signal is not None and self.signals:
             raise ValueError("signals belongs to index")
         for name in (self.signal, self.message):
-            if isinstance(name, str):
-                try:
-                    name.format(n=1)
-                except (KeyError, IndexError, ValueError, AttributeError) as error:
-                    raise ValueError(f"{name!r} is not a name with {{n}}") from error
+            try:
+                _numbered(name, 1)
+            except (KeyError, IndexError, ValueError, AttributeError) as error:
+                raise ValueError(f"{name!r} is not a name with {{n}}") from error
         return self
 
     def signal_maps(self) -> list[SignalMap]:
         """Return the map of each cell's signal, or of each signal of a group."""
-        names: list[tuple[str, str | int | None]]
-        if self.signal is None:
-            names = [(name, self.message) for name in self.signals]
-        else:
+        names = [(name, self.message) for name in self.signals]
+        if self.signal is not None:
             numbers = range(self.first, self.first + self.count)
-            names = [
-                (
-                    self.signal.format(n=n),
-                    self.message.format(n=n) if isinstance(self.message, str) else self.message,
-                )
-                for n in numbers
-            ]
+            names = [(self.signal.format(n=n), _numbered(self.message, n)) for n in numbers]
         stated = {name: getattr(self, name) for name in {"scale", "offset"} & self.model_fields_set}
         return [
             SignalMap(message=message, signal=name, not_available=self.not_available, **stated)
             for name, message in names
         ]
+
+
+def _numbered(name: str | int | None, number: int) -> str | int | None:
+    return name.format(n=number) if isinstance(name, str) else name
 
 
 class MessageMap(_Strict):
@@ -300,7 +212,7 @@ class MessageMap(_Strict):
     j1939 : bool
         Whether its PGN identifies it: from any source address, at any priority.
     isotp : bool
-        Whether it is a reply over ISO-TP, with the id of `isotp.reply_key` in the DBC.
+        Whether it is a reply over ISO-TP, with the id of `polling.reply_key` in the DBC.
     request_id : int, optional
         Standard id on which the service may ask for this reply.
     period_s : float, optional
@@ -347,7 +259,7 @@ class MessageMap(_Strict):
             If the rule is unknown, does not fit, lacks a field or has one of another protection.
         """
         try:
-            rule = self._rule(message, rules)
+            return self._rule(message, rules)
         except InputError as error:
             name = (error.field or "").rpartition(".")[2]
             raise InputError(
@@ -357,19 +269,19 @@ class MessageMap(_Strict):
                 value=error.value,
                 cure=error.cure,
             ) from error
-        return rule
 
     def _rule(self, message: Message, rules: Mapping[str, RuleMap]) -> Protection | None:
         name = self.protection
         if name != COUNTER:
-            self._refuse_fields(_COUNTER_FIELDS, f'"{COUNTER}"')
+            self._refuse(f'"{COUNTER}"', "counter", "counter_modulus")
         if name not in PROFILES:
-            self._refuse_fields(_PROFILE_FIELDS, "an e2e profile")
+            self._refuse("an e2e profile", "data_id", "data_id_list", "data_id_mode",
+                         "header_byte", "protected_bytes")  # fmt: skip
         if name is None:
             return None
         rule: Protection
         if name in rules:
-            rule = rules[name].rule(name)
+            rule = ProtectionRule(name, **rules[name].model_dump())
         elif name == COUNTER:
             rule = self._counter_rule(message)
         elif name in PROFILES:
@@ -402,7 +314,7 @@ class MessageMap(_Strict):
             raise InputError(
                 f"message {message.name} has no such signal", field="counter", value=self.counter
             )
-        bits = database.Field.of(signal, message.length)
+        bits = BitField.of(signal, message.length)
         return CounterRule(COUNTER, bits, message.length, self.counter_modulus or 1 << bits.width)
 
     def _profile_rule(self, name: str) -> E2eRule:
@@ -422,7 +334,7 @@ class MessageMap(_Strict):
             protected_bytes=self.protected_bytes or 0,
         )
 
-    def _refuse_fields(self, names: tuple[str, ...], protection: str) -> None:
+    def _refuse(self, protection: str, *names: str) -> None:
         """Raise InputError for fields that belong to another protection only."""
         for name in names:
             if getattr(self, name) is not None:
@@ -443,10 +355,6 @@ class RuleMap(_Strict):
     counter_bits: Annotated[int, Field(ge=0, le=8)] = 4
     counter_byte: _Place = -2
     counter_shift: Annotated[int, Field(ge=0, le=7)] = 0
-
-    def rule(self, name: str) -> ProtectionRule:
-        """Return the rule under a name."""
-        return ProtectionRule(name, **self.model_dump())
 
 
 class VehicleMap(_Strict):
@@ -491,12 +399,12 @@ class VehicleMap(_Strict):
 
     @model_validator(mode="before")
     @classmethod
-    def _single_dbc(cls, data: object) -> object:
+    def _short_forms(cls, data: object) -> object:
+        """Accept `dbc = "a.dbc"`, and `soc = "DisplaySoc"` for a table with the signal alone."""
         if not isinstance(data, dict):
             return data
         if isinstance(data.get("dbc"), str):
             data = {**data, "dbc": (data["dbc"],)}
-        # `soc = "DisplaySoc"` is short for a table with the signal alone.
         roles = ("current", "voltage", "temperature", "soc", "soc_reference")
         short = {name: {"signal": data[name]} for name in roles if isinstance(data.get(name), str)}
         return {**data, **short}
@@ -522,16 +430,6 @@ def columns_of_map(path: Path | str) -> ColumnMap | None:
 @dataclass(frozen=True, slots=True)
 class Overrides:
     """Protection and checks of a service configuration, which override the car's map file.
-
-    For one vehicle or bus that differs from its map file. Properties of the model of car belong in
-    the map file, which `estimate` reads too::
-
-        [messages.BATTERY_1DB]
-        protection = "leaf"
-
-        [checks.voltage]
-        lowest = 240
-        highest = 410
 
     Parameters
     ----------

@@ -14,16 +14,21 @@ import logging
 import os
 import socket
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
-from typing import Any, Final
+from typing import Any, Final, Literal
 
 import can
+from can.interfaces.udp_multicast import UdpMulticastBus
 from can.typechecking import CanFilter
 
-from cangauge.bus.udp import CheckedUdpBus
 from cangauge.errors import InputError
+
+try:
+    import msgpack
+except ImportError:  # then there is no UDP bus either
+    msgpack = None
 
 BusOption = str | int | float | bool
 
@@ -128,17 +133,17 @@ def bus_address(
         channel = _DEFAULT_CHANNELS.get(interface)
     if channel is None:
         raise InputError(f"{interface} needs a channel", field="--channel", cure="name one")
-    if interface == "udp_multicast":
-        if not _is_multicast(channel):
-            raise InputError(
-                "no multicast address",
-                field="--channel",
-                value=channel,
-                cure=f"use one such as {MULTICAST_CHANNEL}",
-            )
-        options.setdefault("hop_limit", MULTICAST_HOPS)
-        return BusAddress(interface, channel, options, local_only)
-    return BusAddress(interface, channel, options)
+    if interface != "udp_multicast":
+        return BusAddress(interface, channel, options)
+    if not _is_multicast(channel):
+        raise InputError(
+            "no multicast address",
+            field="--channel",
+            value=channel,
+            cure=f"use one such as {MULTICAST_CHANNEL}",
+        )
+    options.setdefault("hop_limit", MULTICAST_HOPS)
+    return BusAddress(interface, channel, options, local_only)
 
 
 def open_bus(address: BusAddress, filters: Sequence[CanFilter] | None = None) -> can.BusABC:
@@ -164,16 +169,16 @@ def open_bus(address: BusAddress, filters: Sequence[CanFilter] | None = None) ->
     arguments: dict[str, Any] = dict(address.options)
     if filters is not None:
         arguments["can_filters"] = list(filters)
+    channel: str | int = address.channel
+    if address.interface not in _ON_SOCKETS and address.channel.isdigit():
+        channel = int(channel)  # as python-can's own configuration
     try:
         bus: can.BusABC
         if address.interface == "udp_multicast":
-            bus = CheckedUdpBus(address.channel, local_only=address.local_only, **arguments)
+            bus = CheckedUdpBus(channel, local_only=address.local_only, **arguments)
         else:
             bus = can.Bus(
-                channel=_as_driver_channel(address),
-                interface=address.interface,
-                ignore_config=True,
-                **arguments,
+                channel=channel, interface=address.interface, ignore_config=True, **arguments
             )
     except _DRIVER_ERRORS as error:
         raise _refusal(address, error) from error
@@ -216,17 +221,12 @@ def parse_bus_options(given: Sequence[str]) -> dict[str, BusOption]:
             raise InputError(
                 "not of the form K=V", field="--bus-option", value=text, cure="e.g. bitrate=500000"
             )
-        options[key] = _as_option(value)
+        options[key] = {"true": True, "false": False}.get(value.lower(), value)
+        if options[key] is value:
+            for kind in (float, lambda word: int(word, 0)):
+                with suppress(ValueError):
+                    options[key] = kind(value)
     return options
-
-
-def _as_option(text: str) -> BusOption:
-    if text.lower() in {"true", "false"}:
-        return text.lower() == "true"
-    for kind in (lambda word: int(word, 0), float):
-        with suppress(ValueError):
-            return kind(text)
-    return text
 
 
 def _guess_interface(channel: str | None) -> str:
@@ -250,13 +250,6 @@ def _is_multicast(channel: str) -> bool:
         return False
 
 
-def _as_driver_channel(address: BusAddress) -> str | int:
-    # As python-can's own configuration: whole numbers as integers.
-    if address.interface not in _ON_SOCKETS and address.channel.isdigit():
-        return int(address.channel)
-    return address.channel
-
-
 def _widen_receive_buffer(bus: can.BusABC) -> None:
     if sys.platform == "win32":
         return
@@ -274,18 +267,10 @@ def _check_up(bus: can.BusABC, address: BusAddress) -> None:
     # SocketCAN opens an interface that is down; the error comes with the next call.
     with socket.socket(fileno=os.dup(bus.fileno())) as own:
         code = own.getsockopt(socket.SOL_SOCKET, socket.SO_ERROR)
-    if not code:
-        return
-    bus.shutdown()
-    if code != errno.ENETDOWN:
+    if code:
+        bus.shutdown()
         error = OSError(code, os.strerror(code))
         raise _refusal(address, error) from error
-    raise InputError(
-        "this bus is down",
-        field="--channel",
-        value=address.channel,
-        cure=f"bring it up: sudo ip link set {address.channel} up",
-    )
 
 
 def _refusal(address: BusAddress, error: BaseException) -> InputError:
@@ -294,7 +279,7 @@ def _refusal(address: BusAddress, error: BaseException) -> InputError:
     while not isinstance(cause, OSError) and cause.__cause__ is not None:
         cause = cause.__cause__
     code = cause.errno if isinstance(cause, OSError) else None
-    interface = address.interface
+    interface, channel = address.interface, address.channel
     reason = " ".join(str(cause).split()) or type(cause).__name__
     if code in {errno.EAFNOSUPPORT, errno.EPROTONOSUPPORT} and interface == "socketcan":
         problem = "this machine has no SocketCAN"
@@ -304,7 +289,9 @@ def _refusal(address: BusAddress, error: BaseException) -> InputError:
         problem = "no network interface of this machine carries multicast"
         cure = "bring a network interface up, or use SocketCAN"
         return InputError(problem, field="--interface", value=interface, cure=cure)
-    if code in {errno.ENODEV, errno.ENXIO, errno.ENOENT}:
+    if code == errno.ENETDOWN:
+        problem, cure = "this bus is down", f"bring it up: sudo ip link set {channel} up"
+    elif code in {errno.ENODEV, errno.ENXIO, errno.ENOENT}:
         problem = f"{interface} has no such bus"
         cure = f"check the name{_socketcan_names()}" if interface == "socketcan" else "check it"
     elif code in {errno.EPERM, errno.EACCES}:
@@ -321,7 +308,7 @@ def _refusal(address: BusAddress, error: BaseException) -> InputError:
     else:
         problem = f"{interface} cannot open this bus ({reason})"
         cure = "check channel and --bus-option"
-    return InputError(problem, field="--channel", value=address.channel, cure=cure)
+    return InputError(problem, field="--channel", value=channel, cure=cure)
 
 
 def _socketcan_names() -> str:
@@ -331,3 +318,167 @@ def _socketcan_names() -> str:
         if names:
             return f"; existing: {', '.join(names)}"
     return "; none is up: sudo ip link add dev vcan0 type vcan && sudo ip link set vcan0 up"
+
+
+# --- Capabilities
+
+Stamps = Literal["kernel", "sender", "driver"]
+
+
+@dataclass(frozen=True)
+class BackendCapabilities:
+    """Properties of an interface.
+
+    Parameters
+    ----------
+    stamps : {"kernel", "sender", "driver"}
+        Origin of the time stamps. "kernel": arrival, however late the frame is read
+        (SO_TIMESTAMPNS). "sender": sending (within one process). "driver": depends on the driver,
+        the adapter's clock or the moment of reading.
+    echoes : bool
+        Whether own frames are received too.
+    has_error_classes : bool
+        Whether error frames have SocketCAN's error classes.
+    """
+
+    stamps: Stamps
+    echoes: bool
+    has_error_classes: bool
+
+
+UNKNOWN_INTERFACE: Final = BackendCapabilities("driver", echoes=False, has_error_classes=False)
+
+
+def backend_capabilities(address: BusAddress) -> BackendCapabilities:
+    """Return the capabilities of the interface of an address."""
+    is_udp = address.interface == "udp_multicast"
+    echoes = is_udp or bool(address.options.get("receive_own_messages", False))
+    stamps: Stamps = "sender" if address.interface == "virtual" else "driver"
+    # On systems other than Linux, python-can stamps UDP packets when it reads them.
+    if address.interface == "socketcan" or (is_udp and sys.platform == "linux"):
+        stamps = "kernel"
+    return BackendCapabilities(stamps, echoes, address.interface == "socketcan")
+
+
+# --- UDP multicast. Anybody who reaches the port may send: the socket is bound to all network
+# interfaces and takes unicast too. python-can's bus makes a message of any fields, whose wrong
+# types then fail later, in the filters.
+
+_MAX_CHANNEL: Final = 64
+"""Longest name of a channel in a packet [characters]: it is recorded with every frame."""
+
+
+def _is_flag(value: object) -> bool:
+    return isinstance(value, bool)
+
+
+def _is_whole(value: object) -> bool:
+    return isinstance(value, int) and not isinstance(value, bool)
+
+
+def _is_channel(value: object) -> bool:
+    """Return whether a value is a channel that a line of a recording can hold as one word."""
+    if isinstance(value, str):
+        return 0 < len(value) <= _MAX_CHANNEL and value.isprintable() and " " not in value
+    return value is None or _is_whole(value)
+
+
+_FIELDS: Final[dict[str, Callable[[object], bool]]] = {
+    "timestamp": lambda _: True,  # replaced
+    "arbitration_id": _is_whole,
+    "is_extended_id": _is_flag,
+    "is_remote_frame": _is_flag,
+    "is_error_frame": _is_flag,
+    "channel": _is_channel,
+    "dlc": _is_whole,
+    "data": lambda value: isinstance(value, bytes),
+    "is_fd": _is_flag,
+    "bitrate_switch": _is_flag,
+    "error_state_indicator": _is_flag,
+}
+
+
+def unpack_fields(packet: bytes) -> dict[str, Any]:
+    """Return the fields of a packet, each of its type.
+
+    Raises
+    ------
+    can.CanOperationError
+        If it is no frame; it has a cause, and so counts as one garbled packet.
+    """
+    try:
+        fields = msgpack.unpackb(packet, raw=False)
+        wrong = [name for name, value in fields.items() if not _FIELDS[name](value)]
+        _require_none(wrong)
+    except Exception as error:  # the packet's, whatever it is
+        raise can.CanOperationError("could not unpack received message") from error
+    return dict(fields)
+
+
+def _require_none(wrong: list[str]) -> None:
+    if wrong:
+        raise TypeError(f"of a wrong type: {', '.join(wrong)}")
+
+
+def as_message(fields: dict[str, Any], stamp_s: float) -> can.Message:
+    """Return the message of checked fields, with the time of its arrival [s since 1970].
+
+    Raises
+    ------
+    can.CanOperationError
+        If the values do not fit together.
+    """
+    fields["timestamp"] = stamp_s
+    try:
+        return can.Message(check=True, **fields)
+    except Exception as error:
+        raise can.CanOperationError("could not unpack received message") from error
+
+
+class CheckedUdpBus(UdpMulticastBus):
+    """python-can's bus, with checked packets.
+
+    Parameters
+    ----------
+    *args, **kwargs
+        Those of `UdpMulticastBus`.
+    local_only : bool
+        Drop packets whose sender is not an address of this machine. (The kernel drops packets
+        from the network that pretend to be.)
+    """
+
+    def __init__(self, *args: Any, local_only: bool = False, **kwargs: Any) -> None:
+        self._local_only = local_only
+        self._local_host = ""
+        super().__init__(*args, **kwargs)
+
+    def is_accepted(self, sender: Any) -> bool:
+        """Return whether a packet from this socket address is to be read."""
+        host = str(sender[0])
+        if not self._local_only or host == self._local_host:
+            return True
+        if _is_own_address(host):
+            self._local_host = host
+        return host == self._local_host
+
+    def _recv_internal(self, timeout: float | None) -> tuple[can.Message | None, bool]:
+        received = self._multicast.recv(timeout)
+        if not received:
+            return None, False
+        packet, sender, stamp_s = received
+        if not self.is_accepted(sender):
+            return None, False
+        message = as_message(unpack_fields(packet), stamp_s)
+        carries_fd = self.protocol is can.CanProtocol.CAN_FD
+        return (message if carries_fd or not message.is_fd else None), False
+
+
+def _is_own_address(host: str) -> bool:
+    """Return whether this machine has an address: only then a socket can be bound to it."""
+    family = socket.AF_INET6 if ":" in host else socket.AF_INET
+    try:
+        with socket.socket(family, socket.SOCK_DGRAM) as probe:
+            probe.bind((host, 0))
+    except OSError:
+        return False
+    return True

@@ -30,7 +30,9 @@ from cangauge.types import CURRENT_AT_MOST_A, TEMPERATURE_WITHIN_C, VOLTAGE_WITH
 
 INVALID_AFTER: Final = 5
 VALID_AFTER: Final = 3
+"""Consecutive values of the debouncing: short beside a time-out, longer than a disturbed frame."""
 STUCK_AFTER_S: Final = 10.0
+"""Least time of a constant value [s]: a pack at rest between two pulses is constant for less."""
 
 TEMPERATURE_JUMP_K: Final = 5.0
 TEMPERATURE_RATE_K_PER_S: Final = 1.0
@@ -78,17 +80,8 @@ class SignalChecks:
 
     Parameters
     ----------
-    lowest, highest : float
-        Range [A, positive = discharge; V; °C; %].
-    max_jump, max_rate_per_s : float
-        Largest distance from the latest good value: the first, plus the second for every second
-        since then [A, V, K, %].
-    invalid_after, valid_after : int
-        Consecutive failures until invalid; consecutive good values until valid again.
-    stuck_after_s : float
-        Least duration of a constant value that can count as stuck [s]; see `CheckMap`.
-    timeout_s : float, optional
-        Stated time-out [s].
+    lowest, highest, max_jump, max_rate_per_s, invalid_after, valid_after, stuck_after_s, timeout_s
+        As in `mapping.CheckMap`; without limit by default.
     usual_timeout_s : float
         Time-out while the period is not known [s].
     """
@@ -133,12 +126,8 @@ class SignalChecks:
         )
 
 
-DEFAULTS: Final = {
-    "current": SignalChecks(stuck_after_s=STUCK_AFTER_S, usual_timeout_s=2.0),
-    "voltage": SignalChecks(stuck_after_s=STUCK_AFTER_S, usual_timeout_s=2.0),
-    "temperature": SignalChecks(),
-    "soc_reference": SignalChecks(),
-}
+_FAST: Final = SignalChecks(stuck_after_s=STUCK_AFTER_S, usual_timeout_s=2.0)
+DEFAULTS: Final = {"current": _FAST, "voltage": _FAST}
 """By role. Physical limits need the pack's model; see `SignalChecks.within_pack`."""
 
 
@@ -225,24 +214,6 @@ class SignalHealth:
         Latest good value and its bus time [s]; NaN before the first.
     """
 
-    __slots__ = (
-        "_arrived_s",
-        "_checks",
-        "_failures",
-        "_intervals",
-        "_is_cyclic",
-        "_is_stuck",
-        "_learned_s",
-        "_passes",
-        "_period_s",
-        "_shortest_timeout_s",
-        "_statistics",
-        "fault",
-        "latest",
-        "latest_s",
-        "state",
-    )
-
     def __init__(
         self,
         checks: SignalChecks,
@@ -257,18 +228,11 @@ class SignalHealth:
         self._is_cyclic = is_cyclic
         self._is_stuck = is_stuck
         self._statistics = statistics or MessageStatistics()
-        # Lower bound of `timeout_s`, which usually decides alone: the same for a known period.
-        self._shortest_timeout_s = (
-            min(checks.usual_timeout_s, TIMEOUT_AT_LEAST_S)
-            if checks.timeout_s is None and period_s is None
-            else self.timeout_s
-        )
         self.state = SignalState.UNKNOWN
         self.fault = Fault.NONE
         self.latest = self.latest_s = math.nan
         self._failures = self._passes = 0
-        self._arrived_s = math.nan
-        self._learned_s = math.nan
+        self._arrived_s = self._learned_s = math.nan
         self._intervals = 0
 
     def update(self, value: float, time_s: float) -> float:
@@ -284,14 +248,8 @@ class SignalHealth:
         checks = self._checks
         interval_s, self._arrived_s = time_s - self._arrived_s, time_s
         if interval_s > 0.0:
-            self._intervals += 1
-            learned_s = self._learned_s
-            if math.isnan(learned_s):
-                self._learned_s = interval_s
-            else:
-                interval_s = min(interval_s, _LONGEST_INTERVAL * learned_s)
-                self._learned_s = learned_s + _LEARN_WEIGHT * (interval_s - learned_s)
-        if math.isnan(value):
+            self._learn(interval_s)
+        if value != value:  # noqa: PLR0124 - NaN; this runs for every value
             self._statistics.not_available += 1
             return self.fail(Fault.NOT_AVAILABLE)
         if not checks.lowest <= value <= checks.highest:
@@ -315,6 +273,15 @@ class SignalHealth:
         self.latest, self.latest_s = value, time_s
         return value
 
+    def _learn(self, interval_s: float) -> None:
+        self._intervals += 1
+        learned_s = self._learned_s
+        if self._intervals == 1:
+            self._learned_s = interval_s
+        else:
+            interval_s = min(interval_s, _LONGEST_INTERVAL * learned_s)
+            self._learned_s = learned_s + _LEARN_WEIGHT * (interval_s - learned_s)
+
     def fail(self, fault: Fault) -> float:
         """Record a failed value or a refused frame; return NaN."""
         self.fault = fault
@@ -331,10 +298,7 @@ class SignalHealth:
 
     def is_usable(self, now_s: float) -> bool:
         """Return whether the latest good value is valid and not old at `now_s` [s]."""
-        if self.state is not _VALID:
-            return False
-        age_s = now_s - self.latest_s
-        return age_s <= self._shortest_timeout_s or age_s <= self.timeout_s
+        return self.state is _VALID and now_s - self.latest_s <= self.timeout_s
 
     def value_at(self, now_s: float) -> float:
         """Return the latest good value if usable at `now_s` [s], else NaN."""
@@ -375,15 +339,14 @@ STEPS: Final = 8.0
 ERRORS: Final = 8.0
 """Least swing of the voltage [standard deviations of the fast voltage error]."""
 SWING_C_RATE: Final = 0.1
-"""Least swing of the current [1/h]: 5 A at 50 Ah."""
+"""Least swing of the current [1/h]: 5 A at 50 Ah, above a pack at rest with its consumers."""
 UNKNOWN_STEP: Final = 0.0025
-"""Assumed quantization step of a voltage that has not changed yet, relative to its value."""
+"""Assumed quantization step of a voltage that has not changed yet, relative to its value: 1 V of a
+car's pack, the coarsest in use."""
 
 
 class StuckDetector:
-    """Detect a signal that is constant while its partner swings.
-
-    Made by `stuck_detectors`.
+    """Detect a signal that is constant while its partner swings; made by `stuck_detectors`.
 
     Parameters
     ----------
@@ -398,23 +361,6 @@ class StuckDetector:
         Takes the quantization step of this signal; returns the least swing of the partner.
     """
 
-    __slots__ = (
-        "_after_s",
-        "_frame_step",
-        "_partner_swing",
-        "_repeats",
-        "_seen_step",
-        "_since_s",
-        "_unknown_step",
-        "_value",
-        "direction",
-        "high",
-        "low",
-        "partner",
-        "swing",
-        "turns",
-    )
-
     partner: StuckDetector
 
     def __init__(
@@ -428,7 +374,7 @@ class StuckDetector:
         self._unknown_step = unknown_step
         self._after_s = after_s
         self._partner_swing = partner_swing
-        self._seen_step = math.inf
+        self._smallest = math.inf
         self._value = self._since_s = math.nan
         self._repeats = 0
         # Turning points at least `swing` apart (zigzag) since the partner changed; it resets them.
@@ -447,12 +393,9 @@ class StuckDetector:
             self.low = value
         if value > self.high:  # noqa: PLR1730
             self.high = value
-        if self.direction <= 0 and value - self.low >= self.swing:
-            self.direction = 1
-            self.low = self.high = value
-            self.turns += 1
-        elif self.direction >= 0 and self.high - value >= self.swing:
-            self.direction = -1
+        rises = self.direction <= 0 and value - self.low >= self.swing
+        if rises or (self.direction >= 0 and self.high - value >= self.swing):
+            self.direction = 1 if rises else -1
             self.low = self.high = value
             self.turns += 1
         return (
@@ -464,10 +407,10 @@ class StuckDetector:
     def _change(self, value: float, time_s: float) -> None:
         """Restart the count of equal values, and with it the partner's turning points."""
         change, partner = abs(value - self._value), self.partner
-        if 0.0 < change < self._seen_step:
-            self._seen_step = change
+        if 0.0 < change < self._smallest:
+            self._smallest = change
             partner.swing = self._partner_swing(max(self._frame_step, change))
-        elif math.isinf(self._seen_step):
+        elif math.isinf(self._smallest):
             step = max(self._frame_step, self._unknown_step * abs(value))
             partner.swing = self._partner_swing(step)
         self._value, self._since_s, self._repeats = value, time_s, 1
@@ -486,10 +429,10 @@ def stuck_detectors(
     """Return coupled stuck detectors for current and voltage of one pack.
 
     A change of the current by ΔI changes the voltage by R·ΔI at once. A voltage whose code stays
-    constant while the current swings, by R·ΔI of several quantization steps, is stuck;
-    and vice versa. Turning points are counted, not drift, so that these are not called stuck: a
-    pack at rest; a charge at constant current; a current of exactly 0 next to a noisy voltage (a
-    swing must be a multiple of the model's voltage error).
+    constant while the current swings, by R·ΔI of several quantization steps, is stuck; and vice
+    versa. Turning points are counted, not drift, so that these are not called stuck: a pack at
+    rest; a charge at constant current; a current of exactly 0 next to a noisy voltage (a swing must
+    be a multiple of the model's voltage error).
 
     Parameters
     ----------

@@ -1,8 +1,10 @@
-"""Ask a battery controller for its replies over ISO-TP: requests and flow control, one at a time.
+"""Replies over ISO-TP (ISO 15765-2): reassembly, and requests for them one at a time.
 
-A state machine without a bus or a clock: `due` returns the request to send, `take` what a reply's
-first frame must be answered with. The replies themselves become signals as those that others poll
-(`isotp`). Requests stop while another tester asks: two of them spoil each other's replies.
+Replies become signals as any frame. Bus time drives the `Reassembler`, not a clock, so that a
+recorded exchange gives the same replies as a live one; the stacks of libraries answer with flow
+control and time out by the clock. `Poller` is a state machine without a bus or a clock: `due`
+returns the request to send, `take` the answer to a reply's first frame. Requests stop while another
+tester asks: two of them spoil each other's replies.
 """
 
 from __future__ import annotations
@@ -14,7 +16,8 @@ from typing import Final
 
 import can
 
-from cangauge.bus.isotp import Reassembler
+LONGEST_GAP_S: Final = 1.0
+"""Longest time between frames of one reply [s]: N_Cr of ISO 15765-2."""
 
 REPLY_WITHIN_S: Final = 1.0
 """Longest wait for a reply's next frame [s]: N_Cr of ISO 15765-2; a request without one failed."""
@@ -23,20 +26,81 @@ PENDING_WITHIN_S: Final = 5.0
 """Longest wait after "response pending" [s]: P2* of ISO 14229-2."""
 
 SLOWEST_S: Final = 60.0
-"""Longest interval between requests for a reply that does not come [s]."""
+"""Longest interval between requests for a reply that does not come [s]: one a minute burdens no
+bus."""
 
 OTHER_TESTER_S: Final = 30.0
 """Silence of another tester after which requests are sent again [s]: applications of drivers ask
 every few seconds."""
 
 BETWEEN_S: Final = 0.05
-"""Shortest time from the end of one exchange to the next request [s]."""
+"""Shortest time from the end of one exchange to the next request [s]: P2 of ISO 14229-2."""
 
+_SINGLE, _FIRST, _CONSECUTIVE = range(3)
 _NEGATIVE, _RESPONSE_PENDING = 0x7F, 0x78
 _REPLY_OFFSET: Final = 0x40
-_PADDING: Final = 0x00
 _CONTINUE: Final = bytes([0x30, 0x00, 0x00])
 """Flow control: continue to send, all frames, without a pause."""
+
+
+def reply_key(reply_id: int, payload: bytes | bytearray) -> int:
+    """Return the id of a reply's message in a DBC: the frames' id, then two bytes of the payload.
+
+    A reply `61 04 …` on 0x7BB is the message 0x7BB6104.
+    """
+    return reply_id << 16 | payload[0] << 8 | payload[1]
+
+
+def reply_id(key: int) -> int:
+    """Return the id of the frames that carry a reply; see `reply_key`."""
+    return key >> 16 & 0x7FF
+
+
+class Reassembler:
+    """Replies of one sender, from its frames.
+
+    Attributes
+    ----------
+    lost : int
+        Replies given up: a frame missing, out of order or late.
+    """
+
+    def __init__(self) -> None:
+        self.lost = 0
+        self._payload = bytearray()
+        self._length = 0
+        self._sequence = 0
+        self._last_s = 0.0
+
+    def take(self, data: bytes | bytearray, time_s: float) -> bytes | None:
+        """Take a frame at bus time `time_s` [s]; return the reply that it completes, if any."""
+        if not data:
+            return None
+        kind, low = data[0] >> 4, data[0] & 0x0F
+        if kind == _SINGLE:
+            self._give_up()
+            # CAN FD: the length is in the second byte.
+            start, length = (2, data[1]) if low == 0 and len(data) > 8 else (1, low)
+            return bytes(data[start : start + length]) if 0 < length <= len(data) - start else None
+        if kind == _FIRST and len(data) >= 2:
+            self._give_up()
+            self._payload, length = bytearray(data[2:]), low << 8 | data[1]
+            self._length = length if length > len(self._payload) else 0
+            self._sequence, self._last_s = 1, time_s
+        elif kind == _CONSECUTIVE and self._length:
+            if low != self._sequence & 0x0F or not 0.0 <= time_s - self._last_s <= LONGEST_GAP_S:
+                self._give_up()
+                return None
+            self._sequence, self._last_s = self._sequence + 1, time_s
+            self._payload += data[1:]
+            if len(self._payload) >= self._length:
+                reply, self._length = bytes(self._payload[: self._length]), 0
+                return reply
+        return None
+
+    def _give_up(self) -> None:
+        self.lost += self._length > 0
+        self._length = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,21 +127,15 @@ class PollTarget:
 
 @dataclass(slots=True)
 class PollCounts:
-    """What came of the requests.
-
-    Parameters
-    ----------
-    requests, answers, negative, unanswered : int
-        Requests sent; their replies; negative ones among these; requests without a reply.
-    other_tester : int
-        Frames of another tester.
-    """
+    """Outcomes of requests."""
 
     requests: int = 0
     answers: int = 0
     negative: int = 0
+    """Negative ones among the answers."""
     unanswered: int = 0
     other_tester: int = 0
+    """Frames of another tester."""
 
     def to_dict(self) -> dict[str, int]:
         """Return the counts by name."""
@@ -128,11 +186,9 @@ class Poller:
             if now_s < self._give_up_s:
                 return None
             self.counts.unanswered += 1
-            self._end(now_s, failed=True)
-        if now_s < self._quiet_until_s:
-            return None
+            self._end(self._waiting, now_s, failed=True)
         turn = min(self._turns, key=lambda each: each.due_s)
-        if now_s < turn.due_s:
+        if now_s < max(turn.due_s, self._quiet_until_s):
             return None
         self._waiting, self._give_up_s = turn, now_s + REPLY_WITHIN_S
         self._reassembler = Reassembler()
@@ -145,15 +201,22 @@ class Poller:
         turn = self._waiting
         if turn is None or message.arbitration_id != turn.target.reply_id or not message.data:
             return None
+        target = turn.target
         reply = self._reassembler.take(message.data, now_s)
-        if reply is not None:
-            self._answered(turn, reply, now_s)
-            return None
-        kind = message.data[0] >> 4
-        if kind in {1, 2}:
-            self._give_up_s = now_s + REPLY_WITHIN_S
-        if kind == 1 and tuple(message.data[2:4]) == turn.target.reply:
-            return _frame(turn.target.request_id, _CONTINUE)
+        if reply is None:
+            kind = message.data[0] >> 4
+            if kind in {_FIRST, _CONSECUTIVE}:
+                self._give_up_s = now_s + REPLY_WITHIN_S
+            if kind == _FIRST and tuple(message.data[2:4]) == target.reply:
+                return _frame(target.request_id, _CONTINUE)
+        elif reply[:2] == bytes(target.reply):
+            self.counts.answers += 1
+            self._end(turn, now_s, failed=False)
+        elif reply[:3] == bytes([_NEGATIVE, target.request[0], _RESPONSE_PENDING]):
+            self._give_up_s = now_s + PENDING_WITHIN_S
+        elif reply[:2] == bytes([_NEGATIVE, target.request[0]]):
+            self.counts.negative += 1
+            self._end(turn, now_s, failed=True)
         return None
 
     def note_other_tester(self, now_s: float) -> None:
@@ -161,24 +224,10 @@ class Poller:
         self.counts.other_tester += 1
         self._quiet_until_s = now_s + OTHER_TESTER_S
         if self._waiting is not None:
-            self._end(now_s, failed=False)
+            self._end(self._waiting, now_s, failed=False)
 
-    def _answered(self, turn: _Turn, reply: bytes, now_s: float) -> None:
-        if reply[:2] == bytes(turn.target.reply):
-            self.counts.answers += 1
-            self._end(now_s, failed=False)
-        elif reply[:2] == bytes([_NEGATIVE, turn.target.request[0]]):
-            if reply[2:3] == bytes([_RESPONSE_PENDING]):
-                self._give_up_s = now_s + PENDING_WITHIN_S
-                return
-            self.counts.negative += 1
-            self._end(now_s, failed=True)
-
-    def _end(self, now_s: float, *, failed: bool) -> None:
-        turn = self._waiting
+    def _end(self, turn: _Turn, now_s: float, *, failed: bool) -> None:
         self._waiting = None
-        if turn is None:
-            return
         turn.failures = turn.failures + 1 if failed else 0
         # The exponent is bounded: 2 to the number of failures of a week is no float.
         wait_s = self._every_s * 2.0 ** min(turn.failures, 16)
@@ -188,5 +237,6 @@ class Poller:
 
 
 def _frame(request_id: int, payload: bytes) -> can.Message:
-    data = payload + bytes([_PADDING] * (8 - len(payload)))
-    return can.Message(arbitration_id=request_id, is_extended_id=False, data=data)
+    return can.Message(
+        arbitration_id=request_id, is_extended_id=False, data=payload.ljust(8, b"\0")
+    )

@@ -3,11 +3,10 @@
 A frame with a wrong CRC or a repeated counter is refused. A counter that jumps while the CRC
 agrees means that frames were lost; the frame is used.
 
-`ProtectionRule` describes a CRC-8 with a counter, as in known cars and in a user's own rules.
-`CounterRule` is a counter alone. `E2eRule` is a profile of AUTOSAR's end-to-end protection,
-computed by the library `autosar-e2e`. Layouts and CRCs: AUTOSAR FO, "Specification of SW-C
-End-to-End Communication Protection Library" and "E2E Protocol Specification". Profiles 1, 2, 5, 6
-and 11 fit into 8 bytes; 4 (12-byte header) and 7 (20-byte header) need CAN FD.
+`ProtectionRule` is a CRC-8 with a counter, as in known cars and in a user's own rules,
+`CounterRule` a counter alone, `E2eRule` a profile of AUTOSAR's end-to-end protection, computed by
+the library `autosar-e2e`. Layouts and CRCs: AUTOSAR FO, "Specification of SW-C End-to-End
+Communication Protection Library" and "E2E Protocol Specification".
 """
 
 from __future__ import annotations
@@ -37,10 +36,6 @@ class Verdict(enum.IntEnum):
     """Refused: the counter did not change, so this is not a new frame."""
 
 
-# Looked up for every frame; enum members are slow to look up.
-_GOOD: Final = Verdict.GOOD
-
-
 class Protection(Protocol):
     """CRC and alive counter of a message."""
 
@@ -68,16 +63,6 @@ class Protection(Protocol):
 def _require(holds: bool, name: str, value: object, problem: str) -> None:
     if not holds:
         raise InputError(problem, field=name, value=value)
-
-
-def _crc8_table(polynomial: int) -> bytes:
-    table = bytearray(256)
-    for value in range(256):
-        crc = value
-        for _ in range(8):
-            crc = ((crc << 1) ^ polynomial if crc & 0x80 else crc << 1) & 0xFF
-        table[value] = crc
-    return bytes(table)
 
 
 @dataclass(frozen=True, slots=True)
@@ -114,26 +99,24 @@ class ProtectionRule:
     _table: bytes = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
-        for name, high in (
-            ("polynomial", 255),
-            ("initial", 255),
-            ("xor_out", 255),
-            ("counter_shift", 7),
-            ("counter_bits", 8 - self.counter_shift),
-        ):
+        ranges = {"polynomial": 255, "initial": 255, "xor_out": 255, "counter_shift": 7,
+                  "counter_bits": 8 - self.counter_shift}  # fmt: skip
+        for name, high in ranges.items():
             value = getattr(self, name)
             _require(0 <= value <= high, f"{self.name}.{name}", value, f"must be within 0–{high}")
-        _require(
-            self.counter_bits != 1, f"{self.name}.counter", None, "a 1-bit counter is too short"
-        )
-        _require(
-            not self.counter_bits or self.counter_byte != self.crc_byte,
-            f"{self.name}.counter_byte",
-            self.counter_byte,
-            "counter and CRC cannot share a byte",
-        )
+        _require(self.counter_bits != 1, f"{self.name}.counter", None,
+                 "a 1-bit counter is too short")  # fmt: skip
+        _require(not self.counter_bits or self.counter_byte != self.crc_byte,
+                 f"{self.name}.counter_byte", self.counter_byte,
+                 "counter and CRC cannot share a byte")  # fmt: skip
+        table = bytearray(256)
+        for value in range(256):
+            crc = value
+            for _ in range(8):
+                crc = ((crc << 1) ^ self.polynomial if crc & 0x80 else crc << 1) & 0xFF
+            table[value] = crc
         object.__setattr__(self, "_mask", (1 << self.counter_bits) - 1)
-        object.__setattr__(self, "_table", _crc8_table(self.polynomial))
+        object.__setattr__(self, "_table", bytes(table))
 
     @property
     def modulus(self) -> int:
@@ -148,24 +131,14 @@ class ProtectionRule:
 
     def crc(self, data: bytes | bytearray) -> int:
         """Return the CRC of a payload, independent of its CRC byte."""
-        table, crc = self._table, self.initial
-        if self.crc_byte == -1:
-            covered = data[:-1]
-        else:
-            covered = data[: self.crc_byte] + data[self.crc_byte :][1:]
-        for byte in covered:
+        table, crc, place = self._table, self.initial, self.crc_byte
+        for byte in data[:-1] if place == -1 else data[:place] + data[place:][1:]:
             crc = table[crc ^ byte]
         return crc ^ self.xor_out
 
     def is_whole(self, data: bytes | bytearray) -> bool:
         """Return whether the CRC agrees."""
-        if self.crc_byte != -1:
-            return self.crc(data) == data[self.crc_byte]
-        # As `crc`, without a call: this runs for every frame.
-        table, crc = self._table, self.initial
-        for byte in data[:-1]:
-            crc = table[crc ^ byte]
-        return crc ^ self.xor_out == data[-1]
+        return self.crc(data) == data[self.crc_byte]
 
     def counter(self, data: bytes | bytearray) -> int:
         """Return the counter of a payload; 0 without a counter."""
@@ -226,15 +199,10 @@ class CounterRule:
     modulus: int
 
     def __post_init__(self) -> None:
-        most = 1 << self.field.width
-        _require(
-            3 <= self.modulus <= most,
-            f"{self.name}.counter_modulus",
-            self.modulus,
-            f"a counter of {self.field.width} bits has 3 to {most} values"
-            if most >= 3
-            else "a 1-bit counter is too short",
-        )
+        width, most = self.field.width, 1 << self.field.width
+        problem = f"a counter of {width} bits has 3 to {most} values"
+        _require(3 <= self.modulus <= most, f"{self.name}.counter_modulus", self.modulus,
+                 problem if most >= 3 else "a 1-bit counter is too short")  # fmt: skip
 
     def fits(self, length: int) -> bool:
         """Return whether a payload has the length of the message."""
@@ -280,12 +248,8 @@ class Profile(NamedTuple):
     protect: Callable[..., None]
 
 
-_MODES_01: Final = {
-    "both": p01.E2E_P01_DATAID_BOTH,
-    "alternating": p01.E2E_P01_DATAID_ALT,
-    "low": p01.E2E_P01_DATAID_LOW,
-    "nibble": p01.E2E_P01_DATAID_NIBBLE,
-}
+_MODES_01: Final = {"both": p01.E2E_P01_DATAID_BOTH, "alternating": p01.E2E_P01_DATAID_ALT,
+                    "low": p01.E2E_P01_DATAID_LOW, "nibble": p01.E2E_P01_DATAID_NIBBLE}  # fmt: skip
 _MODES_11: Final = {"both": p11.E2E_P11_DATAID_BOTH, "nibble": p11.E2E_P11_DATAID_NIBBLE}
 PROFILES: Final = {
     "e2e_01": Profile(2, 1, 0, 15, 16, _MODES_01, p01.e2e_p01_check, p01.e2e_p01_protect),
@@ -296,7 +260,7 @@ PROFILES: Final = {
     "e2e_07": Profile(20, 12, 4, 1 << 32, 32, {}, p07.e2e_p07_check, p07.e2e_p07_protect),
     "e2e_11": Profile(2, 1, 0, 15, 16, _MODES_11, p11.e2e_p11_check, p11.e2e_p11_protect),
 }
-"""By name in a map file."""
+"""By name in a map file. Profiles 4 and 7 need CAN FD, the others fit into 8 bytes."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -338,22 +302,8 @@ class E2eRule:
     def __post_init__(self) -> None:
         profile = PROFILES.get(self.name)
         if profile is None:
-            raise InputError(
-                "unknown profile",
-                field="protection",
-                value=self.name,
-                cure=f"known are {', '.join(PROFILES)}",
-            )
-        self._check(profile)
-        arguments: dict[str, Any] = {"length": self.protected_bytes}
-        if profile.id_bits:
-            arguments["offset"] = self.header_byte
-        if profile.modes:
-            arguments["data_id_mode"] = profile.modes[self.data_id_mode]
-        object.__setattr__(self, "_profile", profile)
-        object.__setattr__(self, "_arguments", arguments)
-
-    def _check(self, profile: Profile) -> None:
+            raise InputError("unknown profile", field="protection", value=self.name,
+                             cure=f"known are {', '.join(PROFILES)}")  # fmt: skip
         if profile.id_bits:
             _require(0 <= self.data_id < 1 << profile.id_bits, "data_id", self.data_id,
                      f"{self.name} has a data id of {profile.id_bits} bits")  # fmt: skip
@@ -370,6 +320,13 @@ class E2eRule:
         least = self.header_byte + profile.header
         _require(self.protected_bytes == 0 or self.protected_bytes >= least, "protected_bytes",
                  self.protected_bytes, f"must hold the header: at least {least}")  # fmt: skip
+        arguments: dict[str, Any] = {"length": self.protected_bytes}
+        if profile.id_bits:
+            arguments["offset"] = self.header_byte
+        if profile.modes:
+            arguments["data_id_mode"] = profile.modes[self.data_id_mode]
+        object.__setattr__(self, "_profile", profile)
+        object.__setattr__(self, "_arguments", arguments)
 
     @property
     def modulus(self) -> int:
@@ -399,8 +356,7 @@ class E2eRule:
 
     def protect(self, data: bytes | bytearray, counter: int) -> bytes:
         """Return the payload with header, counter (modulo its width) and CRC set."""
-        profile = self._profile
-        out = bytearray(data)
+        profile, out = self._profile, bytearray(data)
         place = self.header_byte + profile.counter_at
         counter %= profile.modulus
         if profile.counter_bytes:
@@ -416,30 +372,28 @@ class E2eRule:
 
 SILENCE_S: Final = 2.0
 """Silence after which a sender may have restarted, with any counter value [s]."""
-
-SUSPECTED_AT: Final = 8.0
-"""Frames that fit no single sender, from which a second one is suspected: a sender that restarts
-makes one or two, and a frame that CAN repeats after an error is identical."""
-FORGOTTEN_AFTER: Final = 50.0
-"""Periods after which one such frame is forgotten."""
-SOON: Final = 1.5
-"""Two frames closer than this have no third between them [periods]: none was lost."""
-
 WIDE: Final = 256
 """A counter with at least this many values does not wrap within a normal loss. If it steps back
 sooner, the sender restarted or frames came out of order: no loss is proven."""
+
+SOON: Final = 0.8
+"""A frame this soon after the one before [periods] is not the next one of the same sender: senders
+keep their period within some percent."""
+SUSPECTED_AT: Final = 8.0
+"""Frames out of sequence and too soon, from which a second sender is suspected: a sender that
+restarts makes one or two."""
+FORGIVEN: Final = 1.0 / 3.0
+"""Such frames forgiven by each frame in sequence: of two senders at least every second frame is out
+of sequence, of lost frames in bursts (stamps of a batch are equal) one in four or fewer."""
 
 
 class FrameChecker:
     """Check the frames of one message in order of time.
 
     A repeated counter is no new frame, unless enough time has passed for the counter to wrap: on a
-    lossy bus one in `modulus` of the surviving frames looks like a repetition.
-
-    Two senders of one message are recognised by frames that were *inserted* into a sequence: the
-    counter of the frame before comes again at once, with another content, or the sequence continues
-    after one frame as if that had not been. A sender with wrong counters replaces frames instead,
-    and losses leave time; neither counts.
+    lossy bus one in `modulus` of the surviving frames looks like a repetition. Frames that come
+    out of sequence and too soon are those of a second sender; CAN itself repeats some frames after
+    an error, which are identical.
 
     Parameters
     ----------
@@ -453,55 +407,28 @@ class FrameChecker:
     lost : int
         Frames missing right before the latest accepted one, at least: whole wraps of the counter
         are not visible.
-    inserted : float
-        Recent frames that fit no single sender, as evidence of a second one.
     learned_period_s : callable
         Returns the frame period [s] where none is stated; NaN while it is not known.
     """
 
-    __slots__ = (
-        "_content",
-        "_continues",
-        "_counted_s",
-        "_counter",
-        "_half_wrap_s",
-        "_is_whole",
-        "_last",
-        "_last_s",
-        "_modulus",
-        "_odd",
-        "_period_s",
-        "_refused",
-        "_was_repeated",
-        "inserted",
-        "learned_period_s",
-        "lost",
-    )
-
     def __init__(self, rule: Protection, period_s: float | None = None) -> None:
-        self._is_whole, self._counter = rule.is_whole, rule.counter
-        self._modulus = rule.modulus
-        self._period_s = math.inf if period_s is None else period_s
+        self._is_whole, self._counter, self._modulus = rule.is_whole, rule.counter, rule.modulus
+        self._period_s = period_s
         self._half_wrap_s = (
             SILENCE_S if period_s is None else period_s * min(rule.modulus, WIDE) / 2
         )
         self._last = -1
         self._last_s = 0.0
         self._refused = 0
-        self.lost = 0
-        self.inserted = 0.0
-        self.learned_period_s: Callable[[], float] = lambda: math.nan
-        self._counted_s = -math.inf
-        self._continues = -1
-        # Payloads of the latest accepted frame, and of the latest one out of sequence.
         self._content: bytes | bytearray = b""
-        self._odd: bytes | bytearray = b""
-        self._was_repeated = False
+        self._odd = 0.0
+        self.lost = 0
+        self.learned_period_s: Callable[[], float] = lambda: math.nan
 
     @property
     def suspects_second_sender(self) -> bool:
         """Whether the latest frames came from two senders."""
-        return self.inserted >= SUSPECTED_AT
+        return self._odd >= SUSPECTED_AT
 
     def check(self, data: bytes | bytearray, time_s: float) -> Verdict:
         """Check a payload of the message's own length, received at bus time `time_s` [s]."""
@@ -510,45 +437,29 @@ class FrameChecker:
             self._refused += 1
             return Verdict.CRC_WRONG
         if not modulus:
-            return _GOOD
+            return Verdict.GOOD
         last, counter = self._last, self._counter(data)
         elapsed_s, self._last_s = time_s - self._last_s, time_s
         steps = (counter - last) % modulus
         if steps == 1 or last < 0:
             self._last, self._refused, self._content = counter, 0, data
-            self._was_repeated = False
-            return _GOOD
-        self._look_for_insertion(steps, counter, data, elapsed_s)
-        self._was_repeated = steps == 0
+            if self._odd:
+                self._odd = max(self._odd - FORGIVEN, 0.0)
+            return Verdict.GOOD
+        period_s = self.learned_period_s() if self._period_s is None else self._period_s
+        if 0.0 <= elapsed_s < SOON * period_s and data != self._content:
+            self._odd = min(self._odd + 1.0, 2.0 * SUSPECTED_AT)
         if steps == 0:
             if elapsed_s <= self._half_wrap_s:
                 return Verdict.REPEATED
             steps = min(modulus, WIDE)
-        elif modulus >= WIDE and steps > modulus // 2 and elapsed_s < self._period_s * steps / 2:
+        elif (
+            modulus >= WIDE
+            and steps > modulus // 2
+            and (self._period_s is None or elapsed_s < self._period_s * steps / 2)
+        ):
             steps = 1
         # Damaged frames are counted as damaged, not as lost.
         self.lost = max(steps - 1 - self._refused, 0)
         self._last, self._refused, self._content = counter, 0, data
         return Verdict.AFTER_LOSS if self.lost else Verdict.GOOD
-
-    def _look_for_insertion(
-        self, steps: int, counter: int, data: bytes | bytearray, elapsed_s: float
-    ) -> None:
-        """Count a frame whose counter does not follow the one before it."""
-        continues, self._continues = self._continues, (self._last + 1) % self._modulus
-        is_next, self._odd = self._content is self._odd, data
-        period_s = self._period_s if math.isfinite(self._period_s) else self.learned_period_s()
-        if not 0.0 <= elapsed_s <= SOON * period_s:  # false for NaN
-            return
-        forgotten = (self._last_s - self._counted_s) / (FORGOTTEN_AFTER * period_s)
-        self.inserted = max(self.inserted - forgotten, 0.0)
-        self._counted_s = self._last_s
-        if steps == 0:
-            self._continues, self._odd = continues, b""
-            # The second repetition in a row is a stuck counter.
-            self.inserted += not self._was_repeated and data != self._content
-        elif counter == continues:
-            self.inserted += 1.0
-        elif is_next and counter == (continues + 1) % self._modulus:  # it replaced a frame
-            self.inserted = max(self.inserted - 2.0, 0.0)
-        self.inserted = min(self.inserted, 2.0 * SUSPECTED_AT)

@@ -29,10 +29,7 @@ from cangauge.bus.database import SignalCodec, load_dbc, signal_codec
 from cangauge.bus.protection import E2eRule
 from cangauge.bus.time_source import REPLAY_CLOCK_ID
 from cangauge.errors import InputError
-from cangauge.estimation.cells import CellReport
-from cangauge.estimation.health import Health
-from cangauge.estimation.power import Power
-from cangauge.types import Estimate, Reason, Status
+from cangauge.types import CellReport, Estimate, Health, Power, Reason, Status
 
 ESTIMATE_EVERY_S: Final = 0.1
 DETAIL_EVERY_S: Final = 1.0
@@ -286,10 +283,7 @@ class SocPublisher:
         return frames
 
     def publish(
-        self,
-        estimate: Estimate,
-        samples: int,
-        report: Callable[[], PackReport] | None = None,
+        self, estimate: Estimate, samples: int, report: Callable[[], PackReport] | None = None
     ) -> list[can.Message]:
         """Return the frames due with a sample of a replayed log; arguments as in `beat`."""
         now_s = estimate.time_s

@@ -16,16 +16,17 @@ from typing import Any, Final
 import numpy as np
 from can.typechecking import Channel
 
-from cangauge._typing import BoolArray, FloatArray
-from cangauge.bus.captures.capture import (
+from cangauge._typing import FloatArray
+from cangauge.bus.captures import (
     CLOCK_ID,
     CLOCK_PERIOD_S,
     KNOWN_CAPTURES,
     Capture,
+    CaptureInfo,
     find_capture,
     open_capture,
+    parts_of_run,
 )
-from cangauge.bus.captures.files import CaptureInfo, parts_of_run
 from cangauge.bus.decoder import FrameStatistics, SampleDecoder
 from cangauge.bus.time_source import ReceiveTime, TimeSource, TimeSourceName, time_source
 from cangauge.bus.vehicle import Vehicle
@@ -39,7 +40,8 @@ from cangauge.logs.units import known_temperature_source, refuse_wrong_units
 from cangauge.types import Sample
 
 VOLTAGE_FILL_S: Final = 1.0
-"""Longest time between two voltages for interpolation [s]; rows further from one are dropped."""
+"""Longest time between two voltages for interpolation [s], the step of identification; rows further
+from one are dropped."""
 
 
 def read_recording(
@@ -192,8 +194,9 @@ def open_with_columns(
     if columns is not None:
         return open_log(path, columns=columns, sign=sign)
     if mapped is not None and path.is_file():  # not the name of a recording's parts
-        found = open_log(path)
-        if found.is_any_table or (found.reader is None and find_capture(path) is None):
+        log_file = open_log(path)
+        is_unknown = log_file.reader is None and find_capture(path) is None
+        if log_file.is_any_table or is_unknown:
             return open_log(path, columns=mapped, sign=sign)
     recording = open_recording(path)
     return replace(recording, sign=sign) if isinstance(recording, LogFile) else recording
@@ -224,10 +227,11 @@ def refuse_sign_of_capture(recording: LogFile | Capture, sign: str | None) -> No
 def capture_without_vehicle(path: str | PathLike[str]) -> InputError:
     """Return the error for a capture whose vehicle is not given."""
     return InputError(
-        "this is a CAN capture, not a log",
-        source=path,
-        cure="give --vehicle, or --dbc and --map",
+        "this is a CAN capture, not a log", source=path, cure="give --vehicle, or --dbc and --map"
     )
+
+
+# --- Captures by a vehicle
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -280,6 +284,22 @@ def open_vehicle_capture(path: str | PathLike[str], vehicle: Vehicle) -> Capture
     return open_capture(path, clock=(vehicle.current.arbitration_id, period_s))
 
 
+class _Bus:
+    """One bus of a capture: its time, its decoder and the decoded values."""
+
+    def __init__(self, vehicle: Vehicle, clock: TimeSource) -> None:
+        # The stamps of two buses can be of two adapters.
+        self.clock = ReceiveTime() if isinstance(clock, ReceiveTime) else clock
+        self.decoder = SampleDecoder(vehicle)
+        # Time, current, voltage, temperature and the car's SoC of each sample in turn.
+        self.values = array("d")
+
+    def add(self, sample: Sample | None) -> None:
+        if sample is not None:
+            self.values.extend(sample)
+            self.values.append(self.decoder.reference_soc_pct)
+
+
 def capture_samples(
     path: str | PathLike[str], vehicle: Vehicle, *, source: TimeSourceName = "receive"
 ) -> CaptureSamples:
@@ -301,75 +321,41 @@ def capture_samples(
     """
     capture = open_vehicle_capture(path, vehicle)
     clock = time_source(source)
-    buses = _decode(capture, vehicle, clock)
-    channel, bus = max(buses.items(), key=lambda item: len(item[1].values), default=(None, None))
-    if bus is None or not bus.values:
-        raise _no_samples(path, vehicle, bus)
-    time_s, current_a, voltage_v, temperature_c, soc_pct = np.array(bus.values).reshape(-1, 5).T
-    remarks = [*capture.info.remarks, *_losses(bus.decoder.statistics)]
+    buses: dict[Channel | None, _Bus] = {}
+    for message in capture:
+        if message.channel not in buses:
+            buses[message.channel] = _Bus(vehicle, clock)
+        bus = buses[message.channel]
+        now_s = bus.clock.time_of(message)
+        if now_s is not None:
+            message.timestamp = now_s
+            bus.add(bus.decoder.handle(message))
+    for bus in buses.values():
+        bus.add(bus.decoder.flush())
+    channel, bus = max(buses.items(), key=lambda item: len(item[1].values))
+    statistics = bus.decoder.statistics
+    if not bus.values:
+        name = f"0x{vehicle.current.arbitration_id:X} ({vehicle.current.message})"
+        problem = f"the frames of {name} give no current ({'; '.join(_losses(statistics))})"
+        if not statistics.messages[vehicle.current.key].wanted:
+            problem = f"the capture holds no frames of {name}, which carries the current"
+        raise InputError(
+            problem,
+            source=path,
+            cure="check the vehicle; `cangauge inspect` lists the frames of a capture",
+        )
+    remarks = [*capture.info.remarks, *_losses(statistics)]
     if sum(bool(other.values) for other in buses.values()) > 1:
         remarks.append(f"several buses carry the frames; bus {channel} is used: most samples")
     if isinstance(bus.clock, ReceiveTime) and bus.clock.irregular:
         remarks.append(f"{bus.clock.irregular} time stamps step back: they are irregular")
     if clock.beginnings:
         remarks.append(f"the replay clock starts again {clock.beginnings} times")
+    time_s, current_a, voltage_v, temperature_c, soc_pct = np.array(bus.values).reshape(-1, 5).T
     return CaptureSamples(
-        time_s=time_s,
-        current_a=current_a,
-        voltage_v=voltage_v,
-        temperature_c=temperature_c,
-        soc_pct=soc_pct,
-        statistics=bus.decoder.statistics,
-        info=capture.info,
-        remarks=tuple(remarks),
-    )
-
-
-class _Bus:
-    """One bus of a capture: its time, its decoder and the decoded values."""
-
-    def __init__(self, vehicle: Vehicle, clock: TimeSource) -> None:
-        self.clock = clock
-        self.decoder = SampleDecoder(vehicle)
-        # Time, current, voltage, temperature and the car's SoC of each sample in turn.
-        self.values = array("d")
-
-    def add(self, sample: Sample | None) -> None:
-        if sample is not None:
-            self.values.extend(sample)
-            self.values.append(self.decoder.reference_soc_pct)
-
-
-def _decode(capture: Capture, vehicle: Vehicle, clock: TimeSource) -> dict[Channel | None, _Bus]:
-    buses: dict[Channel | None, _Bus] = {}
-    for message in capture:
-        bus = buses.get(message.channel)
-        if bus is None:
-            # The stamps of two buses can be of two adapters.
-            own = ReceiveTime() if isinstance(clock, ReceiveTime) else clock
-            bus = buses[message.channel] = _Bus(vehicle, own)
-        time_s = bus.clock.time_of(message)
-        if time_s is None:
-            continue
-        message.timestamp = time_s
-        bus.add(bus.decoder.handle(message))
-    for bus in buses.values():
-        bus.add(bus.decoder.flush())
-    return buses
-
-
-def _no_samples(path: str | PathLike[str], vehicle: Vehicle, bus: _Bus | None) -> InputError:
-    name = f"0x{vehicle.current.arbitration_id:X} ({vehicle.current.message})"
-    statistics = None if bus is None else bus.decoder.statistics
-    if statistics is None or not statistics.messages[vehicle.current.key].wanted:
-        problem = f"the capture holds no frames of {name}, which carries the current"
-    else:
-        problem = f"the frames of {name} give no current ({'; '.join(_losses(statistics))})"
-    return InputError(
-        problem,
-        source=path,
-        cure="check the vehicle; `cangauge inspect` lists the frames of a capture",
-    )
+        time_s, current_a, voltage_v, temperature_c, soc_pct,
+        statistics, capture.info, tuple(remarks),
+    )  # fmt: skip
 
 
 def _losses(statistics: FrameStatistics) -> list[str]:
@@ -403,10 +389,8 @@ def capture_to_log(
 
     Parameters
     ----------
-    path : path-like
-    vehicle : Vehicle
-    source : {"receive", "replay-clock"}
-        Bus time: the recorded stamps, or the log time in REPLAY_CLOCK frames.
+    path, vehicle, source
+        As of `capture_samples`.
 
     Raises
     ------
@@ -430,18 +414,20 @@ def capture_to_log(
         )
     if dropped:
         remarks.append(f"{dropped} samples dropped whose time does not advance")
-    time_s, soc_pct = samples.time_s[keep], samples.soc_pct[keep]
-    voltage_v = _filled_voltage(time_s, samples.voltage_v[keep], path, vehicle, remarks)
-    temperature_c = _filled_temperature(samples.temperature_c[keep], path, vehicle, remarks)
-    complete = np.isfinite(voltage_v)
+    voltage_v = _filled_voltage(
+        samples.time_s[keep], samples.voltage_v[keep], path, vehicle, remarks
+    )
     values: dict[str, Any] = {
-        "time_s": time_s[complete],
-        "current_a": samples.current_a[keep][complete],
-        "voltage_v": voltage_v[complete],
-        "temperature_c": temperature_c[complete],
+        "time_s": samples.time_s[keep],
+        "current_a": samples.current_a[keep],
+        "voltage_v": voltage_v,
+        "temperature_c": _filled_temperature(samples.temperature_c[keep], path, vehicle, remarks),
+        "soc_pct": samples.soc_pct[keep],
     }
-    if np.isfinite(soc_pct[complete]).any():
-        values["soc_pct"] = soc_pct[complete]
+    complete = np.isfinite(voltage_v)
+    values = {name: column[complete] for name, column in values.items()}
+    if not np.isfinite(values["soc_pct"]).any():
+        del values["soc_pct"]
     log = Log(
         **values,
         name=path.name.split(".")[0],
@@ -449,7 +435,15 @@ def capture_to_log(
         temperature_source=vehicle.temperature_source,
         remarks=tuple(remarks),
     )
-    refuse_wrong_units(values, source=path, labels=_labels(vehicle), in_seconds=True)
+    signals = {
+        "current_a": vehicle.current,
+        "voltage_v": vehicle.voltage,
+        "temperature_c": vehicle.temperature,
+        "soc_pct": vehicle.soc_reference,
+    }
+    names = {field: each.codec.name for field, each in signals.items() if each is not None}
+    labels = {"time_s": "time stamps", **names}
+    refuse_wrong_units(values, source=path, labels=labels, in_seconds=True)
     return resolve_sign(log, stored_sign_unknown=False)
 
 
@@ -457,6 +451,7 @@ def _filled_voltage(
     time_s: FloatArray, voltage_v: FloatArray, path: Path, vehicle: Vehicle, remarks: list[str]
 ) -> FloatArray:
     known = np.flatnonzero(np.isfinite(voltage_v))
+    missing = np.flatnonzero(~np.isfinite(voltage_v))
     if not known.size:
         raise InputError(
             "the capture gives no voltage that pairs with a current",
@@ -464,15 +459,14 @@ def _filled_voltage(
             field=vehicle.voltage.message,
             cure="check the mapping, and pair_within_s",
         )
-    missing = np.flatnonzero(~np.isfinite(voltage_v))
     if not missing.size:
         return voltage_v
-    filled = voltage_v.copy()
     right = np.searchsorted(known, missing)
     inside = (right > 0) & (right < known.size)
-    left_row, right_row = known[right[inside] - 1], known[right[inside]]
-    near = time_s[right_row] - time_s[left_row] <= VOLTAGE_FILL_S
+    right_row = known[right[inside]]
+    near = time_s[right_row] - time_s[known[right[inside] - 1]] <= VOLTAGE_FILL_S
     rows = missing[inside][near]
+    filled = voltage_v.copy()
     filled[rows] = np.interp(time_s[rows], time_s[known], voltage_v[known])
     if rows.size:
         remarks.append(f"{rows.size} samples without voltage: interpolated")
@@ -484,28 +478,17 @@ def _filled_voltage(
 def _filled_temperature(
     temperature_c: FloatArray, path: Path, vehicle: Vehicle, remarks: list[str]
 ) -> FloatArray:
-    known: BoolArray = np.isfinite(temperature_c)
-    if not known.any():
+    rows = np.flatnonzero(np.isfinite(temperature_c))
+    if not rows.size:
         raise InputError(
             "the capture gives no temperature",
             source=path,
             field=None if vehicle.temperature is None else vehicle.temperature.message,
             cure="give --temperature °C",
         )
-    if known.all():
+    if rows.size == temperature_c.size:
         return temperature_c
-    rows = np.flatnonzero(known)
-    latest = np.searchsorted(rows, np.arange(known.size), side="right") - 1
-    remarks.append(f"{np.count_nonzero(~known)} samples without temperature: the nearest is used")
+    latest = np.searchsorted(rows, np.arange(temperature_c.size), side="right") - 1
+    missing = temperature_c.size - rows.size
+    remarks.append(f"{missing} samples without temperature: the nearest is used")
     return np.asarray(temperature_c[rows[np.maximum(latest, 0)]])
-
-
-def _labels(vehicle: Vehicle) -> dict[str, str]:
-    signals = {
-        "current_a": vehicle.current,
-        "voltage_v": vehicle.voltage,
-        "temperature_c": vehicle.temperature,
-        "soc_pct": vehicle.soc_reference,
-    }
-    names = {field: each.codec.name for field, each in signals.items() if each is not None}
-    return {"time_s": "time stamps", **names}

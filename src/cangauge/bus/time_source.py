@@ -115,9 +115,8 @@ class ReceiveTime:
         reversals = self._reversals
         reversals.append((latest_us, self._shift_us))
         within_us = latest_us - reversals[0][0]
-        if self.is_uncertain or (
-            len(reversals) == IRREGULAR_REVERSALS and within_us <= IRREGULAR_WITHIN_S * MICROSECONDS
-        ):
+        are_many = len(reversals) == IRREGULAR_REVERSALS
+        if self.is_uncertain or (are_many and within_us <= whole_us(IRREGULAR_WITHIN_S)):
             if not self.is_uncertain:
                 now_us -= self._shift_us - reversals[0][1]
                 self._shift_us = reversals[0][1]
@@ -241,12 +240,12 @@ class StampLimiter:
         return stamp_s if since_s + self.offset_s <= stamp_s <= received_s else received_s
 
 
+_STEADY: Final[int | None] = getattr(time, "CLOCK_BOOTTIME", None)
+
+
 def steady_s() -> float:
     """Return a monotonic time that counts a suspended machine too, where the system has one [s]."""
     return time.clock_gettime(_STEADY) if _STEADY is not None else time.monotonic()
-
-
-_STEADY: Final[int | None] = getattr(time, "CLOCK_BOOTTIME", None)
 
 
 class ReplayClock:
@@ -273,24 +272,21 @@ class ReplayClock:
 
     def time_of(self, message: can.Message) -> float | None:
         """Return the log time of the latest REPLAY_CLOCK [s]; None before, and for the clock."""
-        if is_clock(message, self._id):
-            self._take(message)
-            return None
-        return None if self._now_us is None else self._now_us / MICROSECONDS
-
-    def resume(self, time_s: float) -> None:
-        """Continue from a log time [s] after a restart: an earlier one begins a new log."""
-        self._now_us = whole_us(time_s)
-
-    def _take(self, message: can.Message) -> None:
+        if not is_clock(message, self._id):
+            return None if self._now_us is None else self._now_us / MICROSECONDS
         data = message.data
         if len(data) != 8 or not CRC_ONLY_RULE.is_whole(data):
             self.refused += 1
-            return
+            return None
         now_us = int(self._codec.decode(data))
         if self._now_us is not None and now_us < self._now_us - STEP_BACK_S * MICROSECONDS:
             self.beginnings += 1
         self._now_us = now_us
+        return None
+
+    def resume(self, time_s: float) -> None:
+        """Continue from a log time [s] after a restart: an earlier one begins a new log."""
+        self._now_us = whole_us(time_s)
 
 
 def time_source(name: TimeSourceName, clock_id: int = REPLAY_CLOCK_ID) -> TimeSource:
@@ -300,11 +296,8 @@ def time_source(name: TimeSourceName, clock_id: int = REPLAY_CLOCK_ID) -> TimeSo
 
 def is_clock(message: can.Message, clock_id: int = REPLAY_CLOCK_ID) -> bool:
     """Return whether a frame is a REPLAY_CLOCK."""
-    return (
-        message.arbitration_id == clock_id
-        and not message.is_extended_id
-        and not message.is_error_frame
-        and not message.is_remote_frame
+    return message.arbitration_id == clock_id and not (
+        message.is_extended_id or message.is_error_frame or message.is_remote_frame
     )
 
 
@@ -324,11 +317,8 @@ class ClockFrames:
         """Return the frame of a log time [µs]."""
         payload = bytearray(8)
         self._codec.encode_into(payload, float(time_us))
-        return can.Message(
-            arbitration_id=self._id,
-            is_extended_id=False,
-            data=CRC_ONLY_RULE.protect(payload, 0),
-        )
+        data = CRC_ONLY_RULE.protect(payload, 0)
+        return can.Message(arbitration_id=self._id, is_extended_id=False, data=data)
 
 
 @lru_cache(maxsize=1)

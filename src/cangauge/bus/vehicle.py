@@ -7,25 +7,18 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
-from typing import Final, Literal, NamedTuple
+from typing import Any, Final, Literal, NamedTuple, TypeVar
 
 import numpy as np
 from can.typechecking import CanFilter
-from cantools.database.can import Message
-from numpy.typing import NDArray
+from cantools.database.can import Database, Message
 
 from cangauge._config import read_toml, validated
 from cangauge._resources import shared_file
-from cangauge._typing import FloatArray
-from cangauge.bus.cells import (
-    CELL_TIMEOUT_S,
-    CELL_WITHIN_V,
-    CellGroup,
-    CellSignals,
-)
 from cangauge.bus.database import (
     Condition,
     Decode,
@@ -36,7 +29,6 @@ from cangauge.bus.database import (
     signal_codec,
 )
 from cangauge.bus.database import Field as BitField
-from cangauge.bus.isotp import reply_id
 from cangauge.bus.mapping import (
     NO_OVERRIDES,
     CellsMap,
@@ -49,12 +41,13 @@ from cangauge.bus.mapping import (
     VehicleMap,
 )
 from cangauge.bus.plausibility import DEFAULTS, SignalChecks
-from cangauge.bus.polling import PollTarget
+from cangauge.bus.polling import PollTarget, reply_id
 from cangauge.bus.protection import Protection
 from cangauge.errors import InputError, closest
 from cangauge.logs.log import TemperatureSource
 from cangauge.logs.units import convert
 
+_T = TypeVar("_T")
 Role = Literal["current", "voltage", "temperature", "soc_reference", "cells"]
 LOG_COLUMNS: Final = {
     "current": "current_a",
@@ -68,7 +61,13 @@ LOG_COLUMNS: Final = {
 EXTENDED: Final = 1 << 31
 """Flag of an extended id in a message key, as in SocketCAN."""
 
-_LONGEST_CYCLE_MS: Final = 1e9
+CELL_TIMEOUT_S: Final = 10.0
+"""Age of a cell's voltage above which it is not known [s]: large packs send a round of cells in
+some seconds."""
+CELL_WITHIN_V: Final = (0.2, 6.0)
+"""Plausible voltages of a cell [V], where none are stated: below and above any lithium cell."""
+POLLED_TIMEOUT_S: Final = 60.0
+"""Age at which a polled value is old [s]: a few rounds of a tester that asks every 10 to 20 s."""
 
 
 def pgn_mask(key: int) -> int:
@@ -85,7 +84,7 @@ class VehicleSignal:
 
     Parameters
     ----------
-    role : {"current", "voltage", "temperature", "soc_reference"}
+    role : {"current", "voltage", "temperature", "soc_reference", "cells"}
     key : int
         Arbitration id, plus `EXTENDED` for an extended one.
     message : str
@@ -93,15 +92,8 @@ class VehicleSignal:
     length : int
         Bytes of the message.
     codec : SignalCodec
-    gain, offset : float
-        value = gain × (value in the DBC's unit) + offset, in A (positive = discharge), V, °C, %.
+        In A (positive = discharge), V, °C or %.
     checks : SignalChecks
-
-    Attributes
-    ----------
-    decode : callable
-        Takes a payload of `length` bytes; returns the value in A, V, °C or %, NaN for "not
-        available".
     """
 
     role: Role
@@ -109,48 +101,7 @@ class VehicleSignal:
     message: str
     length: int
     codec: SignalCodec
-    gain: float
-    offset: float
     checks: SignalChecks = dataclasses.field(default_factory=SignalChecks)
-    decode: Decode = dataclasses.field(init=False, repr=False, compare=False)
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "decode", self.codec.decoder(self.gain, self.offset))
-
-    def __reduce__(self) -> tuple[object, ...]:
-        """Pickle without `decode`, which is made again."""
-        given = [getattr(self, each.name) for each in dataclasses.fields(self) if each.init]
-        return type(self), tuple(given)
-
-    def encode_into(self, payload: bytearray, value: float) -> None:
-        """Set the value in A, V, °C or %; NaN becomes "not available".
-
-        Raises
-        ------
-        InputError
-            If it does not fit.
-        """
-        self.codec.encode_into(payload, (value - self.offset) / self.gain)
-
-    def quantize(self, values: FloatArray) -> FloatArray:
-        """Return what `decode` gives after `encode_into`, for each value."""
-        dbc_values = self.codec.quantize((np.asarray(values) - self.offset) / self.gain)
-        return np.asarray(self.gain * dbc_values + self.offset)
-
-    def fits(self, values: FloatArray) -> NDArray[np.bool_]:
-        """Return which values `encode_into` accepts; NaN counts as accepted."""
-        return self.codec.fits((np.asarray(values) - self.offset) / self.gain)
-
-    @property
-    def half_step(self) -> float:
-        """Largest quantization error in a frame, in A, V, °C or %; 0 for floats."""
-        return abs(self.gain) * self.codec.half_step
-
-    @property
-    def range(self) -> tuple[float, float]:
-        """Smallest and largest value that a frame can carry, in A, V, °C or %."""
-        ends = [self.gain * end + self.offset for end in self.codec.range]
-        return min(ends), max(ends)
 
     @property
     def arbitration_id(self) -> int:
@@ -161,6 +112,64 @@ class VehicleSignal:
     def is_extended(self) -> bool:
         """Whether the id has 29 bits."""
         return bool(self.key & EXTENDED)
+
+
+@dataclass(frozen=True, slots=True)
+class CellGroup:
+    """Cells whose voltages are together in a frame.
+
+    Parameters
+    ----------
+    key, message, length
+        As in `VehicleSignal`.
+    conditions : tuple of Condition
+        All must hold for the group to be in a frame.
+    places : tuple of int
+        Index of each cell, from 0.
+    decoders : tuple of callable
+        Decoder of each cell's voltage [V].
+    index : Field, optional
+        Raw number of the group; it times `len(decoders)` is added to the places.
+    first_index : int
+        Number of the first group.
+    """
+
+    key: int
+    message: str
+    length: int
+    conditions: tuple[Condition, ...]
+    places: tuple[int, ...]
+    decoders: tuple[Decode, ...]
+    index: BitField | None = None
+    first_index: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class CellSignals:
+    """All cells of a vehicle.
+
+    Parameters
+    ----------
+    count, first : int
+        Number of cells in series; number of the first.
+    groups : tuple of CellGroup
+    lowest_v, highest_v : float
+        Plausible voltages [V].
+    timeout_s : float
+        Age above which a voltage is not known [s].
+    """
+
+    count: int
+    first: int
+    groups: tuple[CellGroup, ...]
+    lowest_v: float = CELL_WITHIN_V[0]
+    highest_v: float = CELL_WITHIN_V[1]
+    timeout_s: float = CELL_TIMEOUT_S
+
+    @property
+    def keys(self) -> tuple[int, ...]:
+        """Keys of the messages, each once."""
+        return tuple(dict.fromkeys(group.key for group in self.groups))
 
 
 class MessageProtection(NamedTuple):
@@ -260,24 +269,24 @@ class Vehicle:
                     value=preset,
                     cure="give one or the other",
                 )
-            found = _find_preset(preset)
-            if found.lacks_temperature and temperature_c is None:
+            known = _find_preset(preset)
+            if known.lacks_temperature and temperature_c is None:
                 raise InputError(
                     "no pack temperature is known on the bus of this car",
                     field="--vehicle",
                     value=preset,
                     cure="give --temperature °C",
                 )
-            return found.vehicle(
+            return known.vehicle(
                 temperature_c=temperature_c, pair_within_s=pair_within_s, overrides=overrides
             )
+        if map is None and dbc is None:
+            raise InputError(
+                "no vehicle is given",
+                field="--vehicle",
+                cure=f"give --vehicle ({', '.join(PRESETS)}), or --dbc FILE --map FILE",
+            )
         if map is None:
-            if dbc is None:
-                raise InputError(
-                    "no vehicle is given",
-                    field="--vehicle",
-                    cure=f"give --vehicle ({', '.join(PRESETS)}), or --dbc FILE --map FILE",
-                )
             raise InputError(
                 "a DBC alone does not name the signals",
                 source=str(dbc),
@@ -291,41 +300,34 @@ class Vehicle:
             raise InputError(
                 "is missing", source=map, field="dbc", cure="add it, or give --dbc FILE"
             )
-        binder = _Binder(mapping, files, str(map), overrides)
-        vehicle = binder.vehicle(temperature_c, pair_within_s)
-        if vehicle.temperature is None and math.isnan(vehicle.fixed_temperature_c):
+        if mapping.temperature is None and temperature_c is None:
             raise InputError(
                 "is missing",
                 source=map,
                 field="temperature",
                 cure="name its signal, or give --temperature °C",
             )
-        return vehicle
+        return _Binder(mapping, files, str(map), overrides).vehicle(temperature_c, pair_within_s)
 
     @property
     def signals(self) -> tuple[VehicleSignal, ...]:
         """The signals that exist: current, voltage, temperature, reference SoC."""
-        found = (self.current, self.voltage, self.temperature, self.soc_reference)
-        return tuple(signal for signal in found if signal is not None)
+        signals = (self.current, self.voltage, self.temperature, self.soc_reference)
+        return tuple(signal for signal in signals if signal is not None)
+
+    @property
+    def frame_keys(self) -> tuple[int, ...]:
+        """Ids of the frames with a wanted signal, plus `EXTENDED`, each once."""
+        keys = [signal.key for signal in self.signals]
+        keys += () if self.cells is None else self.cells.keys
+        return tuple(
+            dict.fromkeys(reply_id(key) if self.messages[key].is_reply else key for key in keys)
+        )
 
     @property
     def wanted_ids(self) -> tuple[int, ...]:
         """Arbitration ids with a wanted signal, each once."""
         return tuple(dict.fromkeys(key & ~EXTENDED for key in self.frame_keys))
-
-    def _mask(self, key: int) -> int:
-        if not key & EXTENDED:
-            return 0x7FF
-        known = self.messages.get(key)
-        return pgn_mask(key) if known is not None and known.by_pgn else 0x1FFFFFFF
-
-    @property
-    def frame_keys(self) -> tuple[int, ...]:
-        """Ids of the frames with a wanted signal, plus `EXTENDED`, each once."""
-        cells = () if self.cells is None else self.cells.keys
-        keys = dict.fromkeys((*(signal.key for signal in self.signals), *cells))
-        replies = {key for key in keys if self.messages[key].is_reply}
-        return tuple(dict.fromkeys(reply_id(key) if key in replies else key for key in keys))
 
     @property
     def poll_targets(self) -> list[PollTarget]:
@@ -339,14 +341,14 @@ class Vehicle:
     @property
     def filters(self) -> list[CanFilter]:
         """The wanted ids as filters of python-can (`bus.set_filters`)."""
-        return [
-            {
-                "can_id": key & ~EXTENDED,
-                "can_mask": self._mask(key),
-                "extended": bool(key & EXTENDED),
-            }
-            for key in self.frame_keys
-        ]
+        filters: list[CanFilter] = []
+        for key in self.frame_keys:
+            mask = 0x1FFFFFFF if key & EXTENDED else 0x7FF
+            if key in self.messages and self.messages[key].by_pgn:
+                mask = pgn_mask(key)
+            is_extended = bool(key & EXTENDED)
+            filters.append({"can_id": key & ~EXTENDED, "can_mask": mask, "extended": is_extended})
+        return filters
 
 
 class _Binder:
@@ -369,7 +371,7 @@ class _Binder:
         self._databases = [(load_dbc(path), path) for path in files]
         self._source = source
         self._overrides = overrides
-        self._found: dict[int, Message] = {}
+        self._messages: dict[int, Message] = {}
 
     def vehicle(self, temperature_c: float | None, pair_within_s: float | None) -> Vehicle:
         """Return the vehicle; arguments as in `Vehicle.load`."""
@@ -380,25 +382,22 @@ class _Binder:
         fixed_c = temperature_c
         if fixed_c is None and temperature is not None:
             fixed_c = temperature.fixed_c
-        current = self._signal("current", mapping.current)
-        voltage = self._signal("voltage", mapping.voltage)
-        cells = None if mapping.cells is None else self._cells(mapping.cells)
+        is_sent = fixed_c is None and temperature is not None
+        soc = mapping.soc_reference
         return Vehicle(
             name=mapping.name,
-            current=current,
-            voltage=voltage,
-            temperature=None
-            if fixed_c is not None or temperature is None
-            else self._signal("temperature", temperature),
-            soc_reference=None
-            if mapping.soc_reference is None
-            else self._signal("soc_reference", mapping.soc_reference),
+            current=self._signal("current", mapping.current),
+            voltage=self._signal("voltage", mapping.voltage),
+            cells=None if mapping.cells is None else self._cells(mapping.cells),
+            temperature=self._signal("temperature", temperature)
+            if is_sent and temperature is not None
+            else None,
+            soc_reference=None if soc is None else self._signal("soc_reference", soc),
             fixed_temperature_c=math.nan if fixed_c is None else float(fixed_c),
             temperature_source=mapping.temperature_source if temperature_c is None else "unknown",
             pair_within_s=within_s,
-            messages=self._messages(),
+            messages=self._protections(),
             dbc_files=tuple(str(path) for _, path in self._databases),
-            cells=cells,
         )
 
     def _cells(self, wanted: CellsMap) -> CellSignals:
@@ -427,7 +426,7 @@ class _Binder:
                     length=signals[places[0]].length,
                     conditions=conditions,
                     places=tuple(places),
-                    decoders=tuple(signals[place].decode for place in places),
+                    decoders=tuple(signals[place].codec.decode for place in places),
                     index=index,
                     first_index=wanted.first_index,
                 )
@@ -438,18 +437,23 @@ class _Binder:
             timeout_s=wanted.timeout_s or CELL_TIMEOUT_S,
         )
 
-    def _signal(self, role: Role, wanted: SignalMap) -> VehicleSignal:
+    def _in_first(self, find: Callable[[Database, Path], _T]) -> tuple[_T, Path]:
+        """Return what `find` gives in the first DBC that has it; raise the first DBC's error."""
         first: InputError | None = None
         for database, file in self._databases:
             try:
-                message, signal = find_signal(
-                    database, wanted.message, wanted.signal, source=file, field=role
-                )
-                break
+                return find(database, file), file
             except InputError as error:
                 first = first or error
-        else:
-            raise first or InputError("no DBC is given", field=role)
+        assert first is not None  # noqa: S101 - there is at least one DBC
+        raise first
+
+    def _signal(self, role: Role, wanted: SignalMap) -> VehicleSignal:
+        (message, signal), file = self._in_first(
+            lambda database, file: find_signal(
+                database, wanted.message, wanted.signal, source=file, field=role
+            )
+        )
         codec = signal_codec(
             message,
             signal,
@@ -458,7 +462,8 @@ class _Binder:
             not_available=wanted.not_available,
             when=wanted.when,
         )
-        self._found[_key(message)] = message
+        key = _key(message)
+        self._messages[key] = message
         factor, offset = self._unit(role, wanted, codec)
         checks = DEFAULTS.get(role, SignalChecks()).updated(
             wanted, self._overrides.checks.get(role, CheckMap())
@@ -472,13 +477,15 @@ class _Binder:
             )
         return VehicleSignal(
             role=role,
-            key=_key(message),
+            key=key,
             message=message.name,
             length=message.length,
-            codec=codec,
-            gain=wanted.sign * wanted.scale * factor,
-            # A stated offset is in the canonical unit and keeps its sign.
-            offset=wanted.offset + wanted.sign * offset,
+            codec=dataclasses.replace(
+                codec,
+                gain=wanted.sign * wanted.scale * factor,
+                # A stated offset is in the canonical unit and keeps its sign.
+                shift=wanted.offset + wanted.sign * offset,
+            ),
             checks=checks,
         )
 
@@ -502,39 +509,40 @@ class _Binder:
             ) from error
         return float(ends[1] - ends[0]), float(ends[0])
 
-    def _messages(self) -> dict[int, MessageProtection]:
-        """Return protection and period of the messages found."""
+    def _protections(self) -> dict[int, MessageProtection]:
+        """Return protection and period of the messages with a signal."""
         stated = self._overrides.merged_messages(self._mapping, self._source, self._message_key)
         rules: dict[str, RuleMap] = {**self._mapping.rules, **self._overrides.rules}
-        found: dict[int, MessageProtection] = {}
-        for key, message in self._found.items():
+        protections = {}
+        for key, message in self._messages.items():
             each, source = stated.get(key, (MessageMap(), self._source))
-            period_s = _cycle_s(message) if each.period_s is None else each.period_s
-            rule = each.rule(message, rules, source=source)
-            found[key] = MessageProtection(rule, period_s, each.isotp, each.j1939, each.request_id)
-        return found
+            cycle_ms: object = message.cycle_time  # not a number in some DBC files
+            is_known = isinstance(cycle_ms, int | float) and 0.0 < cycle_ms < math.inf
+            dbc_s = float(str(cycle_ms)) / 1000.0 if is_known else None
+            protections[key] = MessageProtection(
+                each.rule(message, rules, source=source),
+                dbc_s if each.period_s is None else each.period_s,
+                each.isotp,
+                each.j1939,
+                each.request_id,
+            )
+        return protections
 
     def _message_key(self, name: str) -> int:
         """Return the key of the message for a name or id in [messages]."""
-        first: InputError | None = None
-        for database, file in self._databases:
-            try:
-                return _key(find_message(database, name, source=file, field=f"messages.{name}"))
-            except InputError as error:
-                first = first or error
-        raise first or InputError("no DBC is given", field=f"messages.{name}")
+        message, _ = self._in_first(
+            lambda database, file: find_message(
+                database, name, source=file, field=f"messages.{name}"
+            )
+        )
+        return _key(message)
 
 
 def _key(message: Message) -> int:
     return message.frame_id | (EXTENDED if message.is_extended_frame else 0)
 
 
-def _cycle_s(message: Message) -> float | None:
-    """Return the cycle time of the DBC [s]; None where it is none or not plausible."""
-    stated: object = message.cycle_time
-    if not isinstance(stated, int | float) or not 0.0 < stated <= _LONGEST_CYCLE_MS:
-        return None
-    return stated / 1000.0
+# --- Presets
 
 
 @dataclass(frozen=True, slots=True)
@@ -575,60 +583,28 @@ class Preset:
         return binder.vehicle(temperature_c, pair_within_s)
 
 
-POLLED_TIMEOUT_S: Final = 60.0
-"""Age at which a polled value is old [s]: a few rounds of a tester that asks every 10 to 20 s."""
-
-
-def _polled(leaf: Preset) -> Preset:
-    """Return a Leaf whose temperature comes in replies of its battery that a tester polls."""
-    temperature = TemperatureMap(message="LBC_04", signal="probe_1_c", timeout_s=POLLED_TIMEOUT_S)
-    reply = MessageMap(isotp=True, request_id=0x79B)
-    messages = {**leaf.mapping.messages, "LBC_04": reply, "LBC_02": reply}
-    mapping = leaf.mapping.model_copy(
-        update={
-            "temperature": temperature,
-            "temperature_source": "pack",
-            "messages": messages,
-            "cells": CellsMap(
-                count=96, signal="CELL_{n:02d}", message="LBC_02", timeout_s=POLLED_TIMEOUT_S
-            ),
-        }
-    )
-    about = (
-        "Nissan Leaf 40/62 kWh whose battery a tester polls: temperature and cells from its replies"
-    )
-    return dataclasses.replace(leaf, about=about, mapping=mapping)
-
-
-def _leaf(name: str, about: str, period_5bc_s: float, *, has_temperature: bool = True) -> Preset:
-    temperature = TemperatureMap(
-        message="BATTERY_5C0", signal="temperature_average_c", timeout_s=10.0
-    )
-    return Preset(
-        dbc="nissan_leaf.dbc",
-        about=about,
-        mapping=VehicleMap(
-            name=name,
-            current=SignalMap(message="BATTERY_1DB", signal="current_a", sign=-1),
-            voltage=SignalMap(message="BATTERY_1DB", signal="voltage_v"),
-            temperature=temperature if has_temperature else None,
-            soc_reference=SignalMap(message="BATTERY_55B", signal="soc_pct"),
-            temperature_source="pack" if has_temperature else "unknown",
-            messages={
-                "BATTERY_1DB": MessageMap(protection="leaf", period_s=0.010),
-                "BATTERY_55B": MessageMap(protection="leaf", period_s=0.100),
-            },
+def _leaf(name: str, about: str, period_5bc_s: float, **other: Any) -> Preset:
+    """Return a Leaf; `other` are fields of its map that differ."""
+    mapping = VehicleMap(
+        name=name,
+        current=SignalMap(message="BATTERY_1DB", signal="current_a", sign=-1),
+        voltage=SignalMap(message="BATTERY_1DB", signal="voltage_v"),
+        temperature=TemperatureMap(
+            message="BATTERY_5C0", signal="temperature_average_c", timeout_s=10.0
         ),
-        periods_s={0x5BC: period_5bc_s},
+        soc_reference=SignalMap(message="BATTERY_55B", signal="soc_pct"),
+        temperature_source="pack",
+        messages={
+            "BATTERY_1DB": MessageMap(protection="leaf", period_s=0.010),
+            "BATTERY_55B": MessageMap(protection="leaf", period_s=0.100),
+        },
     )
+    mapping = mapping.model_copy(update=other)
+    return Preset("nissan_leaf.dbc", mapping, about, {0x5BC: period_5bc_s})
 
 
-_LEAF_ZE1: Final = _leaf(
-    "Nissan Leaf ZE1",
-    "Nissan Leaf 40/62 kWh, from 2018; needs --temperature",
-    0.100,
-    has_temperature=False,
-)
+_POLLED: Final = MessageMap(isotp=True, request_id=0x79B)
+_ZE1_MESSAGES: Final = _leaf("", "", 0.1).mapping.messages | {"LBC_04": _POLLED, "LBC_02": _POLLED}
 
 PRESETS: Final[dict[str, Preset]] = {
     "generic": Preset(
@@ -652,8 +628,26 @@ PRESETS: Final[dict[str, Preset]] = {
         "Nissan Leaf 24/30 kWh, 2013-17; e-NV200; 40 kWh pack in such a car",
         0.100,
     ),
-    "leaf_ze1": _LEAF_ZE1,
-    "leaf_ze1_polled": _polled(_LEAF_ZE1),
+    "leaf_ze1": _leaf(
+        "Nissan Leaf ZE1",
+        "Nissan Leaf 40/62 kWh, from 2018; needs --temperature",
+        0.100,
+        temperature=None,
+        temperature_source="unknown",
+    ),
+    "leaf_ze1_polled": _leaf(
+        "Nissan Leaf ZE1",
+        "Nissan Leaf 40/62 kWh whose battery a tester polls: temperature and cells from its"
+        " replies",
+        0.100,
+        temperature=TemperatureMap(
+            message="LBC_04", signal="probe_1_c", timeout_s=POLLED_TIMEOUT_S
+        ),
+        messages=_ZE1_MESSAGES,
+        cells=CellsMap(
+            count=96, signal="CELL_{n:02d}", message="LBC_02", timeout_s=POLLED_TIMEOUT_S
+        ),
+    ),
     "bmw_i3": Preset(
         dbc="bmw_i3.dbc",
         about="BMW i3 60/94/120 Ah; needs --temperature",
@@ -671,21 +665,15 @@ PRESETS: Final[dict[str, Preset]] = {
 
 
 def _find_preset(name: str) -> Preset:
-    """Return the preset of that name; case does not matter, nor does `-` for `_`.
-
-    Raises
-    ------
-    InputError
-        If there is none.
-    """
-    try:
-        return PRESETS[name.strip().lower().replace("-", "_")]
-    except KeyError:
-        near = closest(name, PRESETS)
-        known = f"known are {', '.join(PRESETS)}; for another car give --dbc FILE --map FILE"
-        raise InputError(
-            "unknown vehicle",
-            field="--vehicle",
-            value=name,
-            cure=f"did you mean {near}?" if near else known,
-        ) from None
+    """Return the preset of that name; case does not matter, nor does `-` for `_`."""
+    preset = PRESETS.get(name.strip().lower().replace("-", "_"))
+    if preset is not None:
+        return preset
+    near = closest(name, PRESETS)
+    known = f"known are {', '.join(PRESETS)}; for another car give --dbc FILE --map FILE"
+    raise InputError(
+        "unknown vehicle",
+        field="--vehicle",
+        value=name,
+        cure=f"did you mean {near}?" if near else known,
+    )

@@ -33,7 +33,7 @@ from cangauge.errors import InputError
 
 if TYPE_CHECKING:
     from cangauge.bus.publish import PackReport
-    from cangauge.estimation.settings import Filter, Method
+    from cangauge.estimation.settings import Method
     from cangauge.model.model_file import Model
     from cangauge.service.offline import RecordedEstimate
 
@@ -64,23 +64,6 @@ def estimate_command(  # noqa: PLR0917 - typer passes options by name
             " (newton), or counting alone (coulomb).",
         ),
     ] = "ekf",
-    filter_: Annotated[
-        str,
-        typer.Option(
-            "--filter",
-            metavar="own|reference",
-            help="Arithmetic of the Kalman filter: our own, or filterpy's (reference), slower, to"
-            " check it.",
-        ),
-    ] = "own",
-    smooth: Annotated[
-        bool,
-        typer.Option(
-            "--smooth",
-            help="Add soc_smooth_pct and soc_smooth_std_pct: the best SoC given the whole log"
-            " (Rauch–Tung–Striebel), and its standard deviation [%].",
-        ),
-    ] = False,
     initial_soc: Annotated[
         str | None,
         typer.Option(
@@ -142,7 +125,7 @@ def estimate_command(  # noqa: PLR0917 - typer passes options by name
 
     `cangauge estimate drive.log --vehicle leaf_ze0 -m leaf.json -o soc.csv --method newton`
     """
-    from cangauge.bus.captures.capture import Capture
+    from cangauge.bus.captures import Capture
     from cangauge.bus.recording import capture_without_vehicle
     from cangauge.estimation.settings import EstimatorSettings
     from cangauge.logs.cells import read_cells
@@ -156,7 +139,6 @@ def estimate_command(  # noqa: PLR0917 - typer passes options by name
 
     settings = EstimatorSettings(
         method=_method(method),
-        filter=_filter(filter_, smooth=smooth),
         initial_soc_pct=_initial_soc(initial_soc),
         initial_soc_std_pct=within(
             initial_soc_std, 0.0, 100.0, option="--initial-soc-std", unit="%"
@@ -171,7 +153,6 @@ def estimate_command(  # noqa: PLR0917 - typer passes options by name
     if isinstance(reading.open(log_path), Capture):
         if not reading.names_vehicle:
             raise capture_without_vehicle(log_path)
-        _refuse_smoothing(log_path, smooth=smooth)
         car = reading.car()
         source = known_temperature_source(reading.temperature_source) or "unknown"
         settings = replace(settings, temperature_source=source)
@@ -195,7 +176,6 @@ def estimate_command(  # noqa: PLR0917 - typer passes options by name
                 gap_from_log=max_gap_s is None,
                 pack=PackHistory(keeps_rows=pack is not None, cells=cells),
                 progress=progress,
-                smooth=smooth,
             )
         if max_gap_s is None and done.settings.gap_s > GAP_S:
             note(
@@ -251,27 +231,6 @@ def _write_pack(done: RecordedEstimate, pack: Path | None) -> None:
 
     if pack is not None:
         write_table(done.pack.columns, pack)
-
-
-def _refuse_smoothing(capture: Path, *, smooth: bool) -> None:
-    if smooth:
-        raise InputError(
-            "smooths a log, not a capture", field="--smooth", value=capture,
-            cure="give a log: the capture's samples are written by `-o samples.mcap`",
-        )  # fmt: skip
-
-
-def _filter(given: str, *, smooth: bool) -> Filter:
-    from cangauge.estimation.settings import Filter
-
-    for name in get_args(Filter):
-        if given == name:
-            if smooth and given != "own":
-                raise InputError("is not smoothed", field="--filter", cure="leave it out")
-            return name  # type: ignore[no-any-return]
-    raise InputError(
-        "not a known filter", field="--filter", value=given, cure="use own or reference"
-    )
 
 
 def _method(given: str) -> Method:

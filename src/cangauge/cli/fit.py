@@ -4,14 +4,13 @@ from __future__ import annotations
 
 from itertools import pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
 from cangauge._formatting import number, significant, span
 from cangauge._io import write_texts_atomic
 from cangauge.cli.options import (
-    FiguresOption,
     JsonOption,
     Reading,
     ReportOption,
@@ -21,17 +20,15 @@ from cangauge.cli.options import (
     suffixed,
     within,
 )
-from cangauge.cli.output import console, emit_json, note, print_table, progress_shown, save_figures
+from cangauge.cli.output import console, emit_json, note, print_table, progress_shown
 from cangauge.errors import InputError
 
 if TYPE_CHECKING:
-    from cangauge.identify.delays import DelaySearch
     from cangauge.identify.fit import Identification
 
 FROM_SOC = "from-soc"
 AUTO = "auto"
-SHOWN_CHOICES = 8
-"""Number of delay sets shown, the best first."""
+PUBLISHED_DELAYS = "0,10,30,70"
 
 
 @option_groups()
@@ -67,38 +64,55 @@ def fit_command(  # noqa: PLR0917 - typer passes options by name
             " if another log pins it.",
         ),
     ] = None,
+    equation: Annotated[
+        Literal["knots", "published"],
+        typer.Option(
+            help="knots: a curve around the typical cell of the chemistry; published: the published"
+            " equation by plain least squares."
+        ),
+    ] = "knots",
+    chemistry: Annotated[
+        Literal["oxide", "lfp"] | None,
+        typer.Option(
+            help="Chemistry of the cells: layered oxides or manganese spinel, or iron phosphate."
+            " Default: from the volts per cell where --cells is given, else oxide."
+        ),
+    ] = None,
+    cells: Annotated[
+        int | None, typer.Option(metavar="N", min=1, max=2000, help="Cells in series.")
+    ] = None,
     rate_hz: Annotated[
         float, typer.Option(metavar="HZ", help="Rate of the fit [Hz]; faster logs are decimated.")
     ] = 1.0,
     delays: Annotated[
         str,
-        typer.Option(
-            metavar="S,S,…|auto",
-            help="Delays of the current [s]; `auto` searches those with the smallest error on"
-            " held-out data.",
-        ),
-    ] = "0,10,30,70",
+        typer.Option(metavar="S,S,…", help="Delays of the current [s]; with --equation published."),
+    ] = PUBLISHED_DELAYS,
     epsilon: Annotated[
-        float, typer.Option(metavar="E", help="Margin ε of the scaled SoC [-], 0 < ε < 0.5.")
+        float,
+        typer.Option(
+            metavar="E",
+            help="Margin ε of the scaled SoC [-], 0 < ε < 0.5; with --equation published.",
+        ),
     ] = 0.05,
     t_ref: Annotated[
-        float, typer.Option(metavar="C", help="Reference temperature T_r [°C].")
+        float,
+        typer.Option(
+            metavar="C", help="Reference temperature T_r [°C]; with --equation published."
+        ),
     ] = 20.0,
     effects: Annotated[
         list[str] | None,
         typer.Option(
-            metavar="ID…|auto",
+            metavar="ID…|auto|none",
             help="Effects to add to the model, separated by commas, e.g. hysteresis; `auto` adds"
-            " those that lower the error on held-out data significantly.",
+            " those that lower the error of left-out logs significantly. Default: auto from five"
+            " logs on.",
         ),
-    ] = None,
-    name: Annotated[
-        str | None, typer.Option(help="Name of the model. Default: from the logs' names.")
     ] = None,
     *,
     reading: Reading,
     report: ReportOption = None,
-    figures: FiguresOption = None,
     json_output: JsonOption = False,
 ) -> None:
     """Identify the voltage model of a pack from recorded logs.
@@ -111,34 +125,30 @@ def fit_command(  # noqa: PLR0917 - typer passes options by name
     --------
     `cangauge fit full_discharge.parquet -o pack.json --report pack.html`
 
-    `cangauge fit trip1.csv trip2.csv trip3.csv -o pack.json --capacity-ah from-soc`
+    `cangauge fit trip1.csv trip2.csv trip3.csv -o pack.json --capacity-ah from-soc --cells 96`
 
     `cangauge fit drive.log --vehicle leaf_ze0 -o pack.json --capacity-ah 51.5 --initial-soc 92`
 
-    `cangauge fit trip1.csv trip2.csv trip3.csv -o pack.json --capacity-ah from-soc --effects auto`
+    `cangauge fit trip*.csv -o pack.json --capacity-ah from-soc --effects auto`
 
     `cangauge fit known.csv other.csv -o pack.json --capacity-ah 60 --initial-soc 92 --initial-soc
     auto`
 
     Model file and report are written together, or neither.
     """
-    from cangauge.identify.delays import search_delays
     from cangauge.identify.effect_search import parse_effect_ids
     from cangauge.identify.fit import fit
-    from cangauge.identify.starts import find_starts, given_starts
-    from cangauge.inference.rows import DELAYS_S, FitOptions
-    from cangauge.model.coulomb_counting import (
-        capacity_from_full_discharge,
-        capacity_from_reference,
-    )
+    from cangauge.model.coulomb_counting import capacity_from_reference
 
     capacity = _capacity(capacity_ah)
     initial = _initial_soc(initial_soc, len(logs))
     within(rate_hz, 0.01, 1000.0, option="--rate-hz", unit="Hz")
     within(epsilon, 1e-4, 0.49, option="--epsilon", unit="")
     within(t_ref, -60.0, 120.0, option="--t-ref", unit="°C")
-    effect_ids = parse_effect_ids(effects) if effects else ()
-    delay_s = DELAYS_S if delays == AUTO else parse_delays(delays)
+    effect_ids = parse_effect_ids(effects) if effects else None
+    delay_s = parse_delays(delays)
+    if equation == "knots":
+        _refuse_published_options(delays, epsilon, t_ref)
     check_outputs([output, report], logs)
     with console.status("reading") as status:
         recorded = []
@@ -147,25 +157,19 @@ def fit_command(  # noqa: PLR0917 - typer passes options by name
             recorded.append(reading.load(path))
         if capacity_ah == FROM_SOC:
             capacity = capacity_from_reference(recorded)
-        search = None
         with progress_shown("cangauge.identify", status.update):
-            if delays == AUTO:
-                given = given_starts(initial, len(recorded))
-                if capacity is None:
-                    capacity = capacity_from_full_discharge(recorded, given)
-                options = FitOptions(capacity, None, rate_hz, epsilon=epsilon, t_ref_c=t_ref)
-                search = search_delays(find_starts(recorded, given, options).logs, options)
-                delay_s = search.delay_s
             result = fit(
                 recorded,
                 capacity_ah=capacity,
                 initial_soc_pct=initial,
+                equation=equation,
+                chemistry=chemistry,
+                cells=cells,
                 rate_hz=rate_hz,
                 delay_s=delay_s,
                 epsilon=epsilon,
                 t_ref_c=t_ref,
                 effects=effect_ids,
-                name=name,
             )
         page = None
         if report is not None:
@@ -177,23 +181,33 @@ def fit_command(  # noqa: PLR0917 - typer passes options by name
     write_texts_atomic(
         {output: result.model.to_json()} | ({report: page} if report and page else {})
     )
-    save_figures(figures, "fit.fit_page", result)
     if json_output:
         extra: dict[str, object] = {
             "model": str(output),
             "report": report and str(report),
             "assumed": assumed_of(recorded),
         }
-        if search is not None:
-            extra["delay_search"] = [
-                {"delays_s": tried, "held_out_rmse_v": error} for tried, error in _best(search)
-            ]
         emit_json(result.to_dict() | extra)
         return
-    _show(result, search)
+    _show(result)
     for remark in result.remarks:
         note(f"note: {remark}")
     note(f"model: {output}" + (f"\nreport: {report}" if report else ""))
+
+
+def _refuse_published_options(delays: str, epsilon: float, t_ref: float) -> None:
+    for option, value, default in (
+        ("--delays", delays, PUBLISHED_DELAYS),
+        ("--epsilon", epsilon, 0.05),
+        ("--t-ref", t_ref, 20.0),
+    ):
+        if value != default:
+            raise InputError(
+                "belongs to the published equation",
+                field=option,
+                value=value,
+                cure="add --equation published, or leave it out",
+            )
 
 
 def _capacity(given: str | None) -> float | None:
@@ -234,7 +248,7 @@ def _initial_soc(given: list[str] | None, number: int) -> float | list[float | N
 
 def parse_delays(given: str) -> tuple[float, ...]:
     """Return the value of `--delays` [s]; raise InputError if it is none."""
-    cure = "give increasing seconds from 0, such as 0,10,30,70, or auto"
+    cure = "give increasing seconds from 0, such as 0,10,30,70"
     try:
         delays = tuple(float(text) for text in given.split(","))
     except ValueError as error:
@@ -253,20 +267,10 @@ def parse_delays(given: str) -> tuple[float, ...]:
     return delays
 
 
-def _best(search: DelaySearch) -> list[tuple[tuple[float, ...], float]]:
-    return sorted(search.tried, key=lambda choice: choice[1])[:SHOWN_CHOICES]
-
-
-def _show(result: Identification, search: DelaySearch | None) -> None:
-    from cangauge.extras.report.summary import effect_rows, rounded, search_rows
+def _show(result: Identification) -> None:
+    from cangauge.identify.tables import effect_rows, rounded, search_rows
 
     model, energy = result.model, result.energy
-    if search is not None:
-        print_table(
-            "Delays tried (the best)",
-            ["delays [s]", "held-out RMSE [V]"],
-            [[", ".join(f"{d:g}" for d in tried), significant(e, 4)] for tried, e in _best(search)],
-        )
     print_table(
         f"Model {model.name}",
         ["", "value", "<unit"],
@@ -277,23 +281,24 @@ def _show(result: Identification, search: DelaySearch | None) -> None:
             ["SoC from voltage, MAE", number(result.soc_newton_mae_pct, 2), "%"],
             ["capacity", number(model.capacity_ah, 2), "Ah"],
             ["slope resistance", significant(result.slope_ohm, 3), "Ω"],
-            ["  expected (R1 + Σ Rj·ρj)", significant(result.slope_expected_ohm, 3), "Ω"],
-            ["condition number", significant(result.solution.condition_number, 2), ""],
+            ["  expected by the model", significant(result.slope_expected_ohm, 3), "Ω"],
+            ["condition number", significant(result.published.condition_number, 2), ""],
             ["identified at SoC", span(*model.range.soc_pct, 1), "%"],
             ["identified at temperature", span(*model.range.temperature_c, 1), "°C"],
             ["rows used", str(sum(item.rows for item in result.figures)), ""],
         ],
     )
-    print_table(
-        "Coefficients",
-        ["", "value", "std. error", "<unit"],
-        [
-            [name, *rounded(item.value, item.std_error), item.unit.replace("ohm", "Ω")]
-            for name, item in model.coefficients.items()
-        ],
-    )  # fmt: skip
-    if result.effects is not None:
-        print_table("Effects", *effect_rows(result.effects))
+    if model.coefficients:
+        print_table(
+            "Published equation",
+            ["", "value", "std. error", "<unit"],
+            [
+                [name, *rounded(item.value, item.std_error), item.unit.replace("ohm", "Ω")]
+                for name, item in model.coefficients.items()
+            ],
+        )
+    if result.effects is not None and result.effects.steps:
+        print_table("Effects", *effect_rows(result))
         print_table("Search for effects", *search_rows(result.effects))
     print_table(
         "Energy at the terminals",

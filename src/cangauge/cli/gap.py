@@ -2,41 +2,35 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from cangauge._formatting import NONE_KNOWN, number, printable
+from cangauge._formatting import printable
 from cangauge._io import write_texts_atomic
-from cangauge.cli.next_test import NextTestOptions, show_tests
 from cangauge.cli.options import (
-    FiguresOption,
     JsonOption,
     Reading,
     ReportOption,
     assumed_of,
     check_outputs,
-    folder_to_write,
     note_starts,
     option_groups,
     suffixed,
     within,
 )
-from cangauge.cli.output import emit_json, note, print_table, progress_shown, save_figures
-from cangauge.cli.shown import ALARM_BELOW
-from cangauge.cli.simulator import SimulatorOptions, corrected_paths, write_corrected
+from cangauge.cli.output import emit_json, note, print_table, progress_shown
+from cangauge.cli.shown import ALARM
+from cangauge.cli.simulator import SimulatorOptions
 from cangauge.errors import InputError
 
 if TYPE_CHECKING:
     from cangauge.diagnosis import Diagnosis
-    from cangauge.diagnosis.next_test import NextSteps
-    from cangauge.diagnosis.simulator import SimulatorDiagnosis
+    from cangauge.diagnosis.planner import Plan
     from cangauge.logs.log import Log
     from cangauge.model.model_file import Model
 
-SHOWN_CANDIDATES = 5
 SHORTEST_S = 300.0
 """Shortest log to diagnose [s]; a shorter one is mostly transient."""
 
@@ -100,15 +94,6 @@ def gap_command(  # noqa: PLR0917 - typer passes options by name
             " returns the voltage [V].",
         ),
     ] = None,
-    corrected: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="FOLDER",
-            callback=folder_to_write,
-            help="With a simulator: write each LOG with its simulated and corrected voltage to"
-            " FOLDER/NAME.corrected.csv.",
-        ),
-    ] = None,
     alarm: Annotated[
         float,
         typer.Option(
@@ -116,30 +101,14 @@ def gap_command(  # noqa: PLR0917 - typer passes options by name
             metavar="P",
             help="Report a fault where the probability of none is at most this.",
         ),
-    ] = ALARM_BELOW,
+    ] = ALARM,
     plan: Annotated[
         bool,
         typer.Option(
-            "--plan", help="Propose the next test: the one that separates the likely causes best."
+            "--plan",
+            help="Propose the drive or measurement that tells the likeliest two causes apart.",
         ),
     ] = False,
-    plan_file: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="FILE.csv",
-            callback=suffixed(".csv"),
-            help="Write the current profile of that test: time_s, current_a.",
-        ),
-    ] = None,
-    limits: Annotated[
-        str | None,
-        typer.Option(
-            metavar="NAME=LOW:HIGH,…",
-            help="Limits of that test: current=-60:120 (A), soc=20:90 (%), temperature=5:30 (°C at"
-            " the start), minutes=20. Default: what the references usually show, and 20"
-            " minutes.",
-        ),
-    ] = None,
     add_test: Annotated[
         list[Path] | None,
         typer.Option(
@@ -151,17 +120,15 @@ def gap_command(  # noqa: PLR0917 - typer passes options by name
     *,
     reading: Reading,
     report: ReportOption = None,
-    figures: FiguresOption = None,
     json_output: JsonOption = False,
 ) -> None:
-    """Diagnose the gap between a model and logs: size, place, probable cause.
+    """Diagnose the gap between a model and logs: how large, where, what to check first.
 
-    The verdict is the most probable of `none`, the effects and `unknown` (a gap without a likely
-    cause in the library); the alarm is the probability of `none` alone, and the 90 % set names the
-    answers to reckon with. The documentation states how often each is right. Give at
-    least three references, better more; without any, the error stated in the model file counts as
-    normal. A log needs 10 minutes, better an hour, with changing load and SoC. Positive current
-    discharges.
+    The answer begins with the group of causes to look at, and names a single cause only where one
+    stands out. A gap is reported where the probability of none is at most --alarm. The
+    documentation states how often each answer is right. Give at least three references, better
+    more; without any, the error stated in the model file counts as normal. A log needs 10
+    minutes, better an hour, with changing load and SoC. Positive current discharges.
 
     Examples
     --------
@@ -169,98 +136,68 @@ def gap_command(  # noqa: PLR0917 - typer passes options by name
     --reference mild3.csv --report gap.html --extended cold.json`
 
     `cangauge gap cold1.csv -m pack.json --reference mild1.csv --reference mild2.csv --reference
-    mild3.csv --plan-file test.csv --limits current=-40:100,soc=30:80`, then the same with
-    `--add-test test_as_driven.csv`
+    mild3.csv --plan`, then the same with `--add-test test_as_driven.csv`
 
     `cangauge gap day1.csv --simulated "V sim [V]" --capacity-ah 60 --reference good1.csv
-    --reference good2.csv --reference good3.csv --corrected .`
+    --reference good2.csv --reference good3.csv`
     """
-    from cangauge.extras.report.summary import next_step
+    from cangauge.diagnosis import diagnose
+    from cangauge.diagnosis.planner import plan as plan_next
 
-    given, added = list(reference or []), list(add_test or [])
+    added, given = list(add_test or []), list(reference or [])
     paths = [*logs, *added]
     options = SimulatorOptions(
         simulated, simulator, reading.columns, reading.temperature, capacity_ah
     )
-    next_test = NextTestOptions(plan, plan_file, limits)
     _refuse_common(paths, given)
     within(initial_soc, 0.0, 100.0, option="--initial-soc", unit="%")
     within(alarm, 0.0, 1.0, option="--alarm", unit="")
     within(capacity_ah, 1e-3, 1e5, option="--capacity-ah", unit="Ah")
-    model_file = _model(model, options, corrected)
-    outputs = corrected_paths(paths, corrected)
-    check_outputs(
-        [report, extended, plan_file, *outputs],
-        [*paths, *given, *([model] if model else [])],
-        made=corrected,
-    )
+    model_file = _model(model, options)
+    check_outputs([report, extended], [*paths, *given, *([model] if model else [])])
     used = [] if simulated is None else [simulated]
     diagnosed = [_long_enough(reading.load(path, used)) for path in paths]
     references = [reading.load(path, used) for path in given]
     if model_file is not None:
         _note_differences([*diagnosed, *references], model_file.capacity_ah)
-        options.note_model(model)
     if initial_soc is not None:  # an added test has its own start
         capacity = capacity_ah if model_file is None else model_file.capacity_ah
         diagnosed[: len(logs)] = _started(diagnosed[: len(logs)], initial_soc, capacity)
-    task = _Task(diagnosed, paths, references, given, alarm)
     with progress_shown("cangauge.diagnosis"):
-        first = task.run(len(logs), model_file, options)[0].verdict if added else None
-        found, of_simulator = task.run(len(paths), model_file, options)
-        steps = next_test.steps(found, first, [log.name for log in diagnosed[len(logs) :]])
-    texts = next_test.texts(steps)
+        found = diagnose(
+            diagnosed,
+            model_file,
+            references,
+            simulation=options.simulation([*diagnosed, *references], [*paths, *given]),
+            capacity_ah=capacity_ah,
+            alarm=alarm,
+        )
+        before = None
+        if added:
+            first = found.logs[: len(logs)]
+            before = diagnose(first, found.model, found.known, alarm=alarm)
+        steps = (
+            plan_next(found.known, found.columns, found.evidence, found.posterior) if plan else None
+        )
+    texts = {}
     if extended is not None:
         texts[extended] = found.extended_model.to_json()
-        if found.extended_soc_caveat:
-            note(f"warning: {found.extended_soc_caveat}")
     if report is not None:
         texts[report] = _page(found, model, steps)
     write_texts_atomic(texts)
-    save_figures(figures, "diagnosis.gap_page", found, None, steps)
-    if of_simulator is not None and corrected is not None:
-        write_corrected(of_simulator, paths, corrected)
     if json_output:
-        result = found.to_dict(None if extended is None else str(extended))
-        result |= {} if of_simulator is None else {"simulator": of_simulator.to_dict()}
-        result |= next_test.to_dict(steps)
+        result = found.to_json(None if extended is None else str(extended))
+        if before is not None:
+            result["added_test"] = {
+                "logs": [log.name for log in diagnosed[len(logs) :]],
+                "before": dict(before.posterior.probabilities),
+            }
+        result |= {} if steps is None else {"plan": steps.to_dict()}
         emit_json(result | {"assumed": assumed_of([*diagnosed, *references])})
         return
-    _show(found, "" if steps.plan else next_step(found))
-    if of_simulator is not None:
-        _show_simulator(of_simulator)
-    show_tests(steps)
-    for written in (*texts, *outputs):
+    _show(found, before, steps)
+    for written in texts:
         note(f"wrote {written}")
-
-
-@dataclass(frozen=True, slots=True)
-class _Task:
-    """Logs to diagnose, with their files."""
-
-    logs: list[Log]
-    paths: list[Path]
-    references: list[Log]
-    reference_paths: list[Path]
-    alarm_below: float
-
-    def run(
-        self, number: int, model: Model | None, options: SimulatorOptions
-    ) -> tuple[Diagnosis, SimulatorDiagnosis | None]:
-        """Diagnose the first logs, that many."""
-        from cangauge.diagnosis import diagnose
-        from cangauge.diagnosis.simulator import diagnose_simulator
-
-        logs, references = self.logs[:number], self.references
-        if model is not None and not options.are_given:
-            return diagnose(logs, model, references, alarm_below=self.alarm_below), None
-        found = diagnose_simulator(
-            [options.run(*each) for each in zip(logs, self.paths, strict=False)],
-            [options.run(*each) for each in zip(references, self.reference_paths, strict=True)],
-            model=model,
-            capacity_ah=options.capacity_ah,
-            alarm_below=self.alarm_below,
-        )
-        return found.diagnosis, found
 
 
 def _started(logs: list[Log], initial_soc_pct: float, capacity_ah: float | None) -> list[Log]:
@@ -278,7 +215,7 @@ def _note_differences(logs: list[Log], capacity_ah: float) -> None:
             note(f"warning: {difference}")
 
 
-def _page(found: Diagnosis, model: Path | None, steps: NextSteps) -> str:
+def _page(found: Diagnosis, model: Path | None, steps: Plan | None) -> str:
     # bokeh takes half a second to import.
     from cangauge.extras.report.diagnosis import gap_report
     from cangauge.extras.report.page import InputFile
@@ -286,15 +223,10 @@ def _page(found: Diagnosis, model: Path | None, steps: NextSteps) -> str:
     return gap_report(found, InputFile.of_model(found.model, model), steps)
 
 
-def _model(path: Path | None, options: SimulatorOptions, corrected: Path | None) -> Model | None:
+def _model(path: Path | None, options: SimulatorOptions) -> Model | None:
     """Return the given model; None for a simulator without one."""
     from cangauge.model.model_file import Model
 
-    if corrected is not None and not options.are_given:
-        raise InputError(
-            "needs a simulator", field="--corrected", value=str(corrected),
-            cure="give --simulated or --simulator; a model is corrected by --extended",
-        )  # fmt: skip
     if path is None and not options.are_given:
         raise InputError(
             "no model", field="--model", cure="give the model file, or --simulated or --simulator"
@@ -330,55 +262,20 @@ def _long_enough(log: Log) -> Log:
     return log
 
 
-def _show(found: Diagnosis, next_words: str) -> None:
-    from cangauge.diagnosis import NONE, UNKNOWN
-    from cangauge.extras.report.summary import headline, open_question, parameters_text
+def _show(found: Diagnosis, before: Diagnosis | None, steps: Plan | None) -> None:
+    from cangauge.extras.report.summary import SHOWN, candidate_rows, plan_rows
 
-    for sentence in (
-        headline(found),
-        found.summary,
-        open_question(found),
-        next_words,
-    ):
-        if sentence:
-            typer.echo(printable(sentence))
-    rows = []
-    for item in found.candidates[:SHOWN_CANDIDATES]:
-        closed = item["closed_fraction"]
-        rows.append(
-            [
-                str(item["effect"]),
-                number(item["probability"], 2),
-                number(item["log_bayes_factor"], 1),
-                number(item["rmse_v"], 2),
-                NONE_KNOWN if closed is None else number(100.0 * closed, 0, "%"),
-            ]
-        )
-    for answer in (UNKNOWN, NONE):
-        probability = number(found.verdict.probabilities[answer], 2)
-        rows.append([answer, probability, NONE_KNOWN, NONE_KNOWN, NONE_KNOWN])
-    headings = ["cause", "probability", "evidence", "RMSE [V]", "closed"]
-    print_table("Candidates, judged on held-out rows", headings, rows)
-    for item in found.candidates:
-        if item["effect"] in found.extension.cause:
-            typer.echo(f"{item['effect']}: {parameters_text(item['parameters'])}")
+    for line in found.summary.splitlines():
+        typer.echo(printable(line))
+    if before is not None:
+        typer.echo(f"Without the added test: {printable(before.headline)}")
+    result = found.to_json(soc_error=False)
+    print_table("Causes", *candidate_rows(result, SHOWN))
     if found.caveats:
         typer.echo("What these logs cannot show:")
     for sentence in found.caveats:
         typer.echo(printable(f"- {sentence}"))
-
-
-def _show_simulator(found: SimulatorDiagnosis) -> None:
-    if found.correction:
-        typer.echo(found.correction)
-    rows = [
-        [
-            str(each["name"]),
-            number(each["simulated_rmse_v"], 3),
-            number(each["corrected_rmse_v"], 3),
-        ]
-        for each in found.errors()
-    ]
-    print_table(
-        "Measured less simulated voltage", ["<log", "RMS as it is [V]", "corrected [V]"], rows
-    )
+    if steps is not None:
+        typer.echo(printable(steps.sentence))
+        if steps.steps:
+            print_table("Possible next steps, best first", *plan_rows(steps))

@@ -18,7 +18,7 @@ from cangauge.cli.shown import TEMPERATURE_SOURCES
 from cangauge.errors import InputError
 
 if TYPE_CHECKING:
-    from cangauge.bus.captures.capture import Capture
+    from cangauge.bus.captures import Capture
     from cangauge.bus.vehicle import Vehicle
     from cangauge.logs.column_map import ColumnMap
     from cangauge.logs.draft import Sign

@@ -9,25 +9,11 @@ from typing import Final
 
 TEMPERATURE_SOURCES: Final = ("cell", "pack", "coolant", "room", "unknown")
 VALID_STD_PCT: Final = 1.5
-ALARM_BELOW: Final = 0.02
+ALARM: Final = 0.05
 LOCAL: Final = "local"
 VEHICLE_PATTERN: Final = r"(?:vehicle=)?([^/]+)/[^/]+$"
 FLEET_LOGS: Final = 3
 FLEET_REFERENCES: Final = 30
-PROTOCOLS: Final = (
-    "simulated",
-    "outside",
-    "two-effects",
-    "equation",
-    "published",
-    "pybamm",
-    "real-bmw_i3",
-    "real-lg_hg2",
-    "cold-bmw_i3",
-    "cold-lg_hg2",
-    "hysteresis-a123_lfp",
-    "open-set",
-)
 PACKS: Final = (
     "i3_dev",
     "car1_dev",

@@ -11,11 +11,9 @@ from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
-from cangauge.cli.output import note
 from cangauge.errors import InputError
 
 if TYPE_CHECKING:
-    from cangauge.diagnosis.simulator import Run, SimulatorDiagnosis
     from cangauge.logs.log import Log
 
 SYNTAX = "give MODULE:FUNCTION or path/to/file.py:FUNCTION"
@@ -63,33 +61,29 @@ class SimulatorOptions:
         """Whether a simulator takes the model's place."""
         return self.column is not None or self.function is not None
 
-    def note_model(self, model: Path | None) -> None:
-        """Print on stderr what a model is for, beside a simulator."""
-        if self.are_given:
-            note(
-                f"note: the simulator is diagnosed; {model} is taken as the voltage model of its"
-                " output, in place of one identified on it"
-            )
-
-    def run(self, log: Log, path: Path) -> Run:
-        """Return a log with its simulated voltage.
+    def simulation(self, logs: Sequence[Log], paths: Sequence[Path]) -> Any:
+        """Return the simulation for `diagnose`, None without one.
 
         Parameters
         ----------
-        log : Log
-        path : Path
-            File of the log.
+        logs : sequence of Log
+            All logs and references.
+        paths : sequence of Path
+            Their files.
 
         Raises
         ------
         InputError
             If the column or function is missing, or the voltages do not fit the log.
         """
-        from cangauge.diagnosis.simulator import Run, start_of
-
-        if self.column is not None:
-            return Run(log, self._of_column(log, path))
-        return Run(log, self._of_function(log, start_of(log)))
+        if self.function is not None:
+            return load_function(self.function)
+        if self.column is None:
+            return None
+        return {
+            log.source or log.name: self._of_column(log, path)
+            for log, path in zip(logs, paths, strict=True)
+        }
 
     def _of_column(self, log: Log, path: Path) -> Any:
         import numpy as np
@@ -108,20 +102,6 @@ class SimulatorOptions:
                 cure="give both for every row",
             )  # fmt: skip
         return simulated.voltage_v
-
-    def _of_function(self, log: Log, start_pct: float) -> Any:
-        import numpy as np
-
-        function = load_function(str(self.function))
-        try:
-            volts = function(log.time_s, log.current_a, log.temperature_c, start_pct)
-            return np.asarray(volts, dtype=np.float64)
-        except (Exception, SystemExit) as error:
-            raise InputError(
-                f"raised {type(error).__name__}: {error}",
-                source=log.source or log.name, field="--simulator", value=self.function,
-                cure="call it with (time_s, current_a, temperature_c, initial_soc_pct)",
-            ) from error  # fmt: skip
 
 
 def load_function(text: str) -> Callable[..., Any]:
@@ -168,30 +148,3 @@ def _file(path: Path) -> ModuleType:
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     return module
-
-
-def corrected_paths(logs: Sequence[Path], folder: Path | None) -> list[Path]:
-    """Return where `--corrected` writes each log, `FOLDER/NAME.corrected.csv`."""
-    if folder is None:
-        return []
-    return [folder / f"{log.stem}.corrected.csv" for log in logs]
-
-
-def write_corrected(found: SimulatorDiagnosis, logs: list[Path], folder: Path) -> list[Path]:
-    """Write each diagnosed log with the simulated and the corrected voltage; return the files."""
-    from cangauge.logs.canonical import write_table
-
-    folder.mkdir(parents=True, exist_ok=True)
-    written = corrected_paths(logs, folder)
-    for run, path in zip(found.runs, written, strict=True):
-        columns = {
-            "time_s": run.log.time_s,
-            "current_a": run.log.current_a,
-            "voltage_v": run.log.voltage_v,
-            "temperature_c": run.log.temperature_c,
-            "soc_pct": run.log.soc_pct,
-            "simulated_v": run.simulated_v,
-            "corrected_v": found.corrected_v(run),
-        }
-        write_table({name: values for name, values in columns.items() if values is not None}, path)
-    return written

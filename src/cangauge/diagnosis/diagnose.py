@@ -1,252 +1,339 @@
-"""Diagnosis of the gap between a model and logs: size, place, cause, and closed fraction."""
+"""Diagnosis of the gap between a model and logs: size, place, cause, and what to do."""
 
 from __future__ import annotations
 
 import hashlib
 import logging
-from collections.abc import Sequence
-from dataclasses import dataclass
-from functools import cached_property
+import math
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cache, cached_property
 from typing import Any
 
 import numpy as np
+from threadpoolctl import ThreadpoolController
 
 from cangauge._display import figure, html
 from cangauge._io import file_sha256
-from cangauge._typing import FloatArray
-from cangauge.diagnosis.caveats import (
-    extended_soc_caveat,
-    extension_caveat,
-    log_caveats,
-    reference_fit_caveat,
-    temperature_step_caveat,
-)
-from cangauge.diagnosis.cross_validation import (
-    Fold,
-    HeldOutErrors,
-    closed_fraction,
-    closed_fraction_interval,
-    folds,
-    held_out_errors,
-    rms,
-    soc_error_pct,
-)
-from cangauge.diagnosis.error_breakdown import (
-    ErrorShare,
-    LogErrors,
-    WorstSegment,
-    error_shares,
-    worst_segments,
-)
-from cangauge.diagnosis.extended_model import (
-    Extension,
-    extend,
-    extended_model_file,
-    parameters_of,
-)
-from cangauge.diagnosis.posterior import (
-    EXPECTED_BEYOND,
-    MIN_LOG_BAYES,
-    NONE,
-    UNKNOWN,
-)
-from cangauge.diagnosis.problem import DiagnosisProblem, build_problem
-from cangauge.diagnosis.references import LearnedReferences
-from cangauge.diagnosis.verdict import ALARM_BELOW, Verdict, decide
+from cangauge.diagnosis import sentences
+from cangauge.diagnosis.answer import ALARM, GROUP_OF, UNKNOWN, Posterior, answer
+from cangauge.diagnosis.checks import check_logs
+from cangauge.diagnosis.evidence import Columns, Evidence, References, analyse, columns, learn
+from cangauge.diagnosis.extended import Extension, Quantity, residual_v
+from cangauge.diagnosis.pack_fit import Trace, trace
+from cangauge.diagnosis.simulator import Simulation, SimulatorGap, correction, simulator_gap
+from cangauge.diagnosis.where import ErrorShare, LogErrors, drawn_sums, error_shares, pieces, rms
 from cangauge.errors import InputError
-from cangauge.inference.linearized import residual
-from cangauge.inference.rows import SampledLog
+from cangauge.estimation.offline import estimate
+from cangauge.identify.starts import start_by_model
 from cangauge.logs.log import Log
 from cangauge.model.model_file import Model
 
 _LOG = logging.getLogger(__name__)
 
-LIKELY = 0.5
-"""A verdict with less probability is more likely wrong than right."""
+CROSS_VALIDATED = 5
+"""Number of effects, the most probable ones, whose errors are found on held-out rows."""
 
-CROSS_VALIDATED = 6
-"""Number of candidates with errors on held-out rows."""
+SETTLING_S = 300.0
+"""Start of a log, with withheld initial SoC, that the SoC error leaves out [s]."""
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """One effect of the library as a cause of these logs."""
+
+    effect: str
+    group: str
+    probability: float
+    rmse_v: float | None
+    """RMS error with it on held-out rows [V]; None for effects of little probability."""
+    closed_fraction: float | None
+    ci: tuple[float, float] | None
+    """95 % interval of the closed fraction."""
+    parameters: dict[str, Quantity]
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the entry of `cause.candidates` in `gap --json`."""
+        return vars(self) | {
+            "ci": self.ci and list(self.ci),
+            "parameters": {name: item.to_dict() for name, item in self.parameters.items()},
+        }
 
 
 @dataclass(frozen=True, eq=False)
 class Diagnosis:
     """Result of `diagnose`.
 
-    Errors are RMS errors of the voltage on the diagnosed logs, on rows that the fit of the effect
-    did not see.
+    Errors are RMS errors of the voltage at 1 Hz, on rows that did not size the cause, where the
+    references cover the SoC; with a cause, on the rows among them that it can change.
 
     See Also
     --------
-    Diagnosis.summary : The verdict in one or two sentences.
-    Diagnosis.to_dict : All results as one JSON object.
+    Diagnosis.summary : The answer in a few lines.
+    Diagnosis.to_json : All results as one JSON object.
     """
 
     logs: tuple[Log, ...]
     """Diagnosed logs, as given."""
+    references: tuple[Log, ...]
+    """Reference logs, as given; empty where they were learned before."""
     model: Model
     """Diagnosed model."""
-    problem: DiagnosisProblem
-    """Basis of the verdict: error model, hypotheses, design matrices."""
-    verdict: Verdict
-    """Cause (an effect, `none` or `unknown`) with probabilities."""
-    extension: Extension
-    """Parameters of the accepted effects, and the extended model's equations."""
-    baseline_rmse_v: float
-    """Error of the given model [V]."""
-    extended_rmse_v: float
-    """Error of the extended model [V]."""
-    floor_v: float
-    """Error of the given model on the references, or that stated in the model file without any
-    [V]."""
-    explainable_v: float | None
-    """Error on a left-out reference with the structure of the others [V]; None below two
-    references."""
-    closed_fraction: float | None
-    """Closed part of the squared error above the floor; None without a gap."""
-    closed_fraction_ci: tuple[float, float] | None
-    """95 % interval of the closed fraction."""
-    error_breakdown: tuple[ErrorShare, ...]
-    """Shares of the squared error over SoC, temperature, current, rest, time and time scale."""
-    worst_segments: tuple[WorstSegment, ...]
-    """Segments with the largest errors, worst first."""
-    candidates: tuple[dict[str, Any], ...]
-    """Every effect, most probable first: probability, log Bayes factor, error, parameters."""
-    observability: tuple[dict[str, object], ...]
-    """Visible part of each effect's physical range (0–1), and what would separate the effect."""
+    known: References = field(repr=False)
+    """What the references show."""
+    columns: tuple[Columns, ...] = field(repr=False)
+    """Of each diagnosed log."""
+    evidence: Evidence = field(repr=False)
+    """Of every effect."""
+    posterior: Posterior
+    """Probabilities of `none`, `unknown` and every effect, and what follows from them."""
+    remarks: tuple[str, ...] = ()
+    """What was assumed to diagnose these logs."""
+    has_references: bool = True
+    simulator: SimulatorGap | None = None
+    """The simulator whose gap it is; None: the gap of `model`."""
+
+    @property
+    def colder_k(self) -> float:
+        """Distance of the logs from the temperatures of the references [K]."""
+        return self.known.colder_k([of.log for of in self.columns])
+
+    @cached_property
+    def _extensions(self) -> dict[str, Extension]:
+        model, before = self.model.extended_model(), [log.before_v for log in self._without]
+        return {
+            name: Extension(model, self.known, self.columns, before, self.evidence.effects[name])
+            for name in self.posterior.effects
+        }
+
+    @cached_property
+    def _without(self) -> tuple[LogErrors, ...]:
+        """Errors of each log without a cause."""
+        errors, model = [], self.model.extended_model()
+        for log, of in zip(self.logs, self.columns, strict=True):
+            at, signals = of.rows, of.log
+            before = residual_v(model, signals)[at]
+            errors.append(
+                LogErrors(
+                    log.name,
+                    at.astype(np.float64),
+                    signals.current_a[at],
+                    signals.temperature_c[at],
+                    self.known.pack.soc(signals)[at],
+                    before,
+                    before,
+                    np.ones(len(at), dtype=bool),
+                )
+            )
+        return tuple(errors)
+
+    @cached_property
+    def _with(self) -> dict[str, tuple[LogErrors, ...]]:
+        """Errors of each log with each of the most probable effects."""
+        return {
+            name: tuple(
+                replace(log, after_v=after, judged=judged)
+                for log, after, judged in zip(
+                    self._without, *self._extensions[name].judge(), strict=True
+                )
+            )
+            for name in list(self.posterior.effects)[:CROSS_VALIDATED]
+        }
+
+    @cached_property
+    def accepted(self) -> str | None:
+        """The effect that the extended model has; None without one.
+
+        A gap is reported, its cause is likelier in the library than outside, and the effect makes
+        the voltage of held-out rows better: of those that it can change, and of all.
+        """
+        if not self.posterior.detected or self.posterior.leading_group == UNKNOWN:
+            return None
+        group = self.posterior.stated_groups[0]
+        effect = next(name for name in self.posterior.effects if GROUP_OF[name] == group)
+        errors = self._with.get(effect, self._without)
+        better = rms(errors, after=True) < rms(errors)
+        every = [replace(log, judged=np.ones_like(log.judged)) for log in errors]
+        return effect if better and rms(every, after=True) < rms(every) else None
+
+    @property
+    def log_errors(self) -> tuple[LogErrors, ...]:
+        """Errors of each diagnosed log at 1 Hz, before and after."""
+        return self._without if self.accepted is None else self._with[self.accepted]
+
+    @property
+    def baseline_rmse_v(self) -> float:
+        """Error of the given model [V]."""
+        return rms(self.log_errors)
+
+    @property
+    def extended_rmse_v(self) -> float:
+        """Error of the extended model on held-out rows [V]."""
+        return rms(self.log_errors, after=True)
+
+    @property
+    def expected_rmse_v(self) -> float:
+        """Error with what the references show of this pack, no cause sought [V]."""
+        return math.sqrt(self.evidence.gap_v2)
+
+    @property
+    def healthy_rmse_v(self) -> float:
+        """Error of a left-out reference log; without references, what the model file states [V]."""
+        return self.known.healthy_rmse_v
+
+    @cached_property
+    def reference_rmse_v(self) -> dict[str, float]:
+        """Error of the given model on each reference [V]."""
+        names = [log.name for log in self.references]
+        names = names or [f"reference {k + 1}" for k in range(len(self.known.logs))]
+        model = self.model.extended_model()
+        return {
+            name: float(np.sqrt(np.mean(residual_v(model, log)[log.measured] ** 2)))
+            for name, log in zip(names, self.known.logs, strict=True)
+        }
+
+    @property
+    def closed_fraction(self) -> float | None:
+        """Closed part of the squared error above a healthy log's; None without a gap above it."""
+        return None if self.accepted is None else self._closed(self.log_errors)
+
+    @property
+    def closed_fraction_ci(self) -> tuple[float, float] | None:
+        """95 % interval of the closed fraction."""
+        return None if self.accepted is None else self._closed_interval(self.log_errors)
+
+    def _closed(self, errors: Sequence[LogErrors]) -> float | None:
+        gap = rms(errors) ** 2 - self.known.healthy_v2
+        if not gap > 0.0:
+            return None
+        return min((rms(errors) ** 2 - rms(errors, after=True) ** 2) / gap, 1.0)
+
+    def _closed_interval(self, errors: Sequence[LogErrors]) -> tuple[float, float] | None:
+        """Return the 95 % interval of the closed fraction, by a bootstrap over pieces."""
+        weight = np.concatenate([log.judged for log in errors]).astype(np.float64)
+        before = np.concatenate([log.before_v for log in errors]) ** 2 * weight
+        after = np.concatenate([log.after_v for log in errors]) ** 2 * weight
+        sums = drawn_sums(pieces(errors), before, after, weight)
+        rows = np.maximum(sums[2], 1.0)
+        gap = sums[0] / rows - self.known.healthy_v2
+        usable = gap > 0.0
+        if usable.mean() < 0.9:
+            return None
+        closed = np.minimum(((sums[0] - sums[1]) / rows)[usable] / gap[usable], 1.0)
+        low, high = np.quantile(closed, [0.025, 0.975])
+        return float(low), float(high)
+
+    @cached_property
+    def where(self) -> list[ErrorShare]:
+        """Shares of the given model's squared error over each axis."""
+        return error_shares(self.log_errors, self.known.pack.capacity_ah)
+
+    @cached_property
+    def candidates(self) -> tuple[Candidate, ...]:
+        """Every effect, most probable first."""
+        return tuple(self._candidate(name, p) for name, p in self.posterior.effects.items())
+
+    def _candidate(self, effect: str, probability: float) -> Candidate:
+        judged: tuple[Any, ...] = (None, None, None)
+        if effect in self._with:
+            errors = self._with[effect]
+            judged = rms(errors, after=True), self._closed(errors), self._closed_interval(errors)
+        parameters = self._extensions[effect].parameters
+        rmse_v, closed, ci = judged
+        group = GROUP_OF[effect]
+        return Candidate(effect, group, probability, rmse_v, closed, ci, parameters)
+
+    @cached_property
+    def parameters(self) -> dict[str, dict[str, Quantity]]:
+        """Parameters of each effect with 95 % intervals."""
+        return {item.effect: item.parameters for item in self.candidates}
+
+    @cached_property
+    def visible_from(self) -> list[dict[str, Any]]:
+        """Smallest size of each effect that these logs would have shown; size None: none."""
+        sizes: list[dict[str, Any]] = []
+        for name, least in self.posterior.visible_from.items():
+            unit = self.evidence.effects[name].trial.unit
+            unit, factor = ("%", 100.0) if unit == "1" else (unit, 1.0)
+            size = None if least is None else factor * least
+            sizes.append({"effect": name, "size": size, "unit": unit})
+        return sizes
+
+    @property
+    def correction(self) -> str:
+        """What to change in the simulator, in one sentence; "" without an accepted cause."""
+        if self.simulator is None or self.accepted is None:
+            return ""
+        values = self.parameters[self.accepted]
+        return correction(self.accepted, {name: item.value for name, item in values.items()})
 
     @cached_property
     def extended_model(self) -> Model:
-        """Model with the references' structure and the accepted effects, ready to save and run."""
-        return extended_model_file(self.extension, self.model, self.extended_rmse_v)
+        """The model with the accepted cause, ready to save and run; the given one without."""
+        if self.accepted is None:
+            return self.model
+        return self._extensions[self.accepted].model_file(self.model, self.extended_rmse_v)
 
-    @property
+    @cached_property
     def baseline_soc_mae_pct(self) -> float | None:
-        """Mean absolute SoC error of the estimator with the given model [%].
+        """SoC error of the estimator with the given model, initial SoC withheld [%]; or None."""
+        return self._soc_error_pct(self.model)
 
-        Runs the estimator over the diagnosed logs at the model's rate, with the initial SoC
-        withheld; None if no log has a reference SoC.
-        """
-        return None if self._given_soc_error is None else self._given_soc_error[0]
-
-    @property
+    @cached_property
     def extended_soc_mae_pct(self) -> float | None:
         """The same with the extended model [%]."""
-        return None if self._extended_soc_error is None else self._extended_soc_error[0]
+        if self.accepted is None:
+            return self.baseline_soc_mae_pct
+        return self._soc_error_pct(self.extended_model)
+
+    def _soc_error_pct(self, model: Model) -> float | None:
+        """Return the mean absolute SoC error at 1 Hz of logs with reference SoC [%]; or None."""
+        errors = []
+        for log, of in zip(self.logs, self.columns, strict=True):
+            if log.soc_pct is None or np.isfinite(log.soc_pct).mean() < 0.5:
+                continue
+            signals, finite = of.log, np.isfinite(log.soc_pct)
+            time_s = np.arange(len(signals.current_a), dtype=np.float64)
+            at_1_hz = Log(time_s, signals.current_a, signals.voltage_v, signals.temperature_c)
+            table = estimate(at_1_hz, model, initial_soc_pct="auto")
+            own = np.interp(table.time_s, log.time_s[finite] - log.time_s[0], log.soc_pct[finite])
+            kept = np.isfinite(table.soc_pct) & (table.time_s >= SETTLING_S) & of.log.measured
+            errors.append(np.abs(table.soc_pct - own)[kept])
+        together = np.concatenate(errors) if errors else np.zeros(0)
+        return float(together.mean()) if together.size else None
 
     @property
-    def extended_soc_caveat(self) -> str:
-        """Caveat of an extended model with a larger SoC error; "" without. Runs the estimator."""
-        if self._given_soc_error is None or self._extended_soc_error is None:
-            return ""
-        return extended_soc_caveat(self._given_soc_error[0], *self._extended_soc_error)
-
-    @cached_property
-    def _given_soc_error(self) -> tuple[float, float] | None:
-        return soc_error_pct(self.logs, self.model)
-
-    @cached_property
-    def _extended_soc_error(self) -> tuple[float, float] | None:
-        return soc_error_pct(self.logs, self.extended_model)
+    def headline(self) -> str:
+        """Size, place and cause of the gap in one sentence."""
+        return sentences.headline(self)
 
     @property
     def summary(self) -> str:
-        """Verdict in one or two sentences."""
-        verdict, has_references = self.verdict, bool(self.problem.references)
-        floor = "references" if has_references else "stated in the model file"
-        sizes = f"{self.baseline_rmse_v:.2f} V; {floor} {self.floor_v:.2f} V"
-        if verdict.cause == NONE:
-            if has_references and self.baseline_rmse_v > self.floor_v:
-                sizes += f"; {self.extended_rmse_v:.2f} V with the structure of the references"
-            error = "reference error" if has_references else "error stated in the model file"
-            if verdict.detected:
-                return f"A fault is likely, though no single cause is more so than none ({sizes})."
-            return (
-                f"No significant gap beyond the {error} ({sizes})."
-                f" P(no fault) = {verdict.probability:.2f}."
-            )
-        if verdict.cause == UNKNOWN:
-            return (
-                f"Gap of unknown cause ({sizes}): no effect of the library is likely."
-                f" P(unknown cause) = {verdict.probability:.2f}."
-            )
-        ambiguous = ""
-        if verdict.ambiguous_with:
-            ambiguous = f", with {', '.join(verdict.ambiguous_with)} in the 90 % set"
-        worse = ", worse than without it" if self.extended_rmse_v > self.baseline_rmse_v else ""
-        text = (
-            f"{verdict.cause} (probability {verdict.probability:.2f}{ambiguous}): gap of {sizes};"
-            f" {self.extended_rmse_v:.2f} V with it on held-out rows{worse}."
-        )
-        if not self.problem.covered and verdict.cause in EXPECTED_BEYOND:
-            text += (
-                " No reference covers these temperatures, where healthy cells behave like that:"
-                " this does not indicate a fault."
-            )
-        return text
+        """The answer in a few lines: what it is, how large, what to do, what is left open."""
+        return sentences.summary(self)
 
     @property
     def caveats(self) -> list[str]:
-        """Limits of what these logs can show, whatever the verdict; one or two sentences each."""
-        problem = self.problem
-        fits = [
-            (sampled.log.name, rms(errors))
-            for sampled, errors in zip(problem.references, problem.reference_errors_v, strict=True)
-        ]
-        stated_v = self.model.noise.voltage_rmse_v
-        worse = ""
-        if self.extension.cause:
-            worse = extension_caveat(self.baseline_rmse_v, self.extended_rmse_v)
-        found = [
-            *problem.outliers,
-            worse,
-            reference_fit_caveat(fits, stated_v, problem.given.pack.voltage_v),
-            *log_caveats(
-                [matrix.sampled for matrix in problem.diagnosed],
-                problem.references,
-                problem.model.capacity_ah,
-                problem.temperature_source,
-            ),
-            temperature_step_caveat(
-                problem.temperature_step_k, problem.model.model.kt_v_per_k, self.floor_v
-            ),
-        ]
-        return [sentence for sentence in found if sentence]
+        """What limits the answer, a sentence each."""
+        return sentences.caveats(self)
+
+    def __repr__(self) -> str:
+        """Return the answer, and the logs."""
+        names = ", ".join(log.name for log in self.logs)
+        return f"<Diagnosis of {names}>\n{self.summary}"
 
     def plot(self) -> Any:
         """Return the probabilities of the causes as bars, for `bokeh.plotting.show`."""
         return figure("diagnosis_figure", self)
 
     def _repr_html_(self) -> str:
-        """Return verdict, sizes, probabilities and caveats for a notebook."""
+        """Return the answer for a notebook."""
         return html("diagnosis_html", self)
 
-    def log_errors(self) -> list[LogErrors]:
-        """Return the errors of each diagnosed log with the given and the extended model."""
-        return [
-            LogErrors(matrix.sampled, before_v, residual(matrix.sampled, self.extension.model))
-            for matrix, before_v in zip(
-                self.problem.diagnosed, self.problem.diagnosed_errors_v, strict=True
-            )
-        ]
-
-    def _inputs(self) -> dict[str, Any]:
-        """Return what was compared: model, logs and references, with the hashes of their files."""
-
-        def described(sampled: Sequence[SampledLog]) -> list[dict[str, Any]]:
-            logs = [each.log for each in sampled]
-            return [{"name": log.name, "sha256": file_sha256(log.source)} for log in logs]
-
-        text = self.model.to_json().encode()
-        return {
-            "model": {"name": self.model.name, "sha256": hashlib.sha256(text).hexdigest()},
-            "logs": described([matrix.sampled for matrix in self.problem.diagnosed]),
-            "references": described(self.problem.references),
-        }
-
-    def to_dict(
+    def to_json(
         self, extended_model: str | None = None, *, soc_error: bool = True
     ) -> dict[str, Any]:
-        """Return the object that `cangauge gap --json` prints.
+        """Return the object that `cangauge gap --json` prints (schema 3).
 
         Parameters
         ----------
@@ -255,217 +342,197 @@ class Diagnosis:
         soc_error : bool
             Run the estimator for the SoC error with either model; otherwise these are None.
         """
-        verdict = self.verdict
+        found, ci = self.posterior, self.closed_fraction_ci
+        accepted = []
+        if self.accepted is not None:
+            values = {name: item.value for name, item in self.parameters[self.accepted].items()}
+            accepted = [
+                {
+                    "effect": self.accepted,
+                    "parameters": values,
+                    "closed_fraction": self.closed_fraction,
+                }
+            ]
+        model = self.model.to_json().encode()
         return {
-            "schema": 2,
+            "schema": 3,
             "gap": {
                 "baseline_rmse_v": self.baseline_rmse_v,
                 "extended_rmse_v": self.extended_rmse_v,
-                "floor_sensor_v": self.floor_v,
-                "floor_explainable_v": self.explainable_v,
+                "healthy_rmse_v": self.healthy_rmse_v,
                 "closed_fraction": self.closed_fraction,
-                "closed_fraction_ci": self.closed_fraction_ci and list(self.closed_fraction_ci),
+                "closed_fraction_ci": ci and list(ci),
                 "baseline_soc_mae_pct": self.baseline_soc_mae_pct if soc_error else None,
                 "extended_soc_mae_pct": self.extended_soc_mae_pct if soc_error else None,
             },
-            "where": [share.to_dict() for share in self.error_breakdown],
-            "worst_moments": [segment.to_dict() for segment in self.worst_segments],
+            "where": [share.to_dict() for share in self.where],
             "cause": {
-                "detected": verdict.detected,
-                "verdict": verdict.cause,
-                "probability": verdict.probability,
-                "probability_none": verdict.probabilities[NONE],
-                "probability_unknown": verdict.probabilities[UNKNOWN],
-                "family": verdict.family,
-                "family_probability": verdict.family_probability,
-                "credible_set": list(verdict.credible_set),
-                "ambiguous_with": list(verdict.ambiguous_with),
-                "explained_fraction": verdict.explained,
-                "accepted": [
-                    {
-                        "effect": effect_id,
-                        "parameters": values,
-                        "closed_fraction": self.closed_fraction,
-                    }
-                    for effect_id, values in self.extension.cause.items()
-                ],
-                "candidates": list(self.candidates),
+                "detected": found.detected,
+                "probability_none": found.probabilities["none"],
+                "probability_unknown": found.probabilities["unknown"],
+                "groups": [{"group": g, "probability": p} for g, p in found.groups.items()],
+                "check_first": found.check_first,
+                "named": found.named,
+                "verdict": found.verdict,
+                "probability": found.probability,
+                "credible_set": list(found.credible_set),
+                "ambiguous_with": list(found.ambiguous_with),
+                "accepted": accepted,
+                "candidates": [item.to_dict() for item in self.candidates],
+                "left_over": found.left_over,
             },
-            "ceiling": None if verdict.ceiling is None else verdict.ceiling.to_dict(),
-            "observability": list(self.observability),
-            "inputs": self._inputs(),
+            "visible_from": self.visible_from,
+            "summary": self.summary,
             "limits": self.caveats,
+            "inputs": {
+                "model": {"name": self.model.name, "sha256": hashlib.sha256(model).hexdigest()},
+                "logs": _files(self.logs),
+                "references": _files(self.references),
+            },
             "extended_model": extended_model,
         }
 
 
+def _files(logs: Sequence[Log]) -> list[dict[str, Any]]:
+    return [{"name": log.name, "sha256": file_sha256(log.source)} for log in logs]
+
+
 def diagnose(
     logs: Sequence[Log],
-    model: Model,
-    references: Sequence[Log] | LearnedReferences = (),
+    model: Model | None = None,
+    references: Sequence[Log] | References = (),
     *,
-    leave_out: Sequence[str] = (),
+    simulation: Simulation | None = None,
+    capacity_ah: float | None = None,
+    without: Collection[str] = (),
     initial_soc_pct: float | None = None,
-    alarm_below: float = ALARM_BELOW,
+    alarm: float = ALARM,
 ) -> Diagnosis:
     """Diagnose the gap between a model and logs.
 
     Parameters
     ----------
     logs : sequence of Log
-        Logs with a gap, which share one cause; at least 10 min each.
-    model : Model
-        Model of this pack, from `fit` or a model file.
-    references : sequence of Log, or LearnedReferences
-        Logs on which the model is good, at least three for reliable probabilities. They show the
-        error to expect without a cause. The start of one without SoC is found from its voltage.
-        For many diagnoses with the same references: what `learn_references` returns.
-    leave_out : sequence of str
-        Effects to leave out of the library.
+        Logs with a gap, which share one cause; at least 5 min each, better half an hour.
+    model : Model, optional
+        Model of this pack, from `fit` or a model file; not needed for a simulation.
+    references : sequence of Log, or References
+        Logs without the fault, at least three for reliable probabilities. For many diagnoses with
+        the same references: what `learn_references` returns.
+    simulation : function or pybamm.Simulation, optional
+        Diagnose the gap of a simulator instead: a function of time [s], current [A], temperature
+        [°C] and SoC of the first row [%] that returns the voltage [V].
+    capacity_ah : float, optional
+        The simulator's charge from 100 to 0 % [Ah]; by default from a log from full to empty.
+    without : collection of str
+        Effects taken out of the library.
     initial_soc_pct : float, optional
         SoC at the first row of each diagnosed log, instead of the log's own [%]; where neither is
         known it is found from the voltage.
-    alarm_below : float
-        A fault is reported where `none` is at most this probable (0–1).
-
-    Returns
-    -------
-    Diagnosis
-        Sizes of gap and floor [V], the verdict with probabilities, parameters of the cause with
-        95 % intervals, where the error lies, caveats, and the extended model.
+    alarm : float
+        A gap is reported where `none` is at most this probable (0–1).
 
     Raises
     ------
     InputError
-        If a log is too short, of another pack, given twice, has a dead channel, or has no SoC
-        within 0–100 % that explains it; or without references and an information matrix in `model`.
+        If a log is too short, of another pack, given twice, has a dead channel, or if no SoC within
+        the pack's range explains it.
 
     Examples
     --------
-    >>> from cangauge.diagnosis import diagnose
-    >>> from cangauge.logs.read import read_log
-    >>> from cangauge.model.model_file import Model
+    >>> from cangauge import Model, diagnose, read_log
     >>> found = diagnose(
     ...     logs=[read_log("monday.csv")],
     ...     model=Model.load("pack.json"),
     ...     references=[read_log(f"reference{k}.csv") for k in (1, 2, 3)],
     ... )  # doctest: +SKIP
-    >>> print(found.summary)  # doctest: +SKIP
-    current_offset (probability 0.93): gap of 1.32 V; references 0.50 V; 0.51 V with it on …
-    >>> found.extended_soc_mae_pct  # doctest: +SKIP
-    0.8
+    >>> print(found.headline)  # doctest: +SKIP
+    The current reads 3.0 A (2.7 … 3.3) too high (current_offset, 71 %).
     """
-    problem = build_problem(
-        logs,
-        model,
-        references,
-        leave_out=leave_out,
-        initial_soc_pct=initial_soc_pct,
-    )
-    held_out = folds(problem)
-    if not held_out:
-        raise InputError(
-            f"{logs[0].duration_s:.0f} s are too short to hold rows out: nothing can be concluded",
-            source=logs[0].source or logs[0].name,
-            cure="give a log of at least 10 min, better half an hour with changing load and SoC",
+    with _one_thread():
+        own = () if isinstance(references, References) else tuple(references)
+        simulator = None
+        if simulation is not None:
+            simulator = simulator_gap(logs, own, simulation, model, capacity_ah)
+            logs, own, model = simulator.logs, simulator.references, simulator.model
+        if model is None:
+            raise InputError("no model", field="model", cure="give a model, or a simulation")
+        check_logs(logs, own, model)
+        _LOG.info("reading the references")
+        traces, remarks = _traces(logs, model, initial_soc_pct)
+        if isinstance(references, References):
+            known = references
+        else:
+            healthy, more = _traces(own, model)
+            remarks += more
+            known = _learn(healthy or [_of_model(model, log) for log in traces], model)
+        _LOG.info("comparing the effects")
+        of_logs = tuple(columns(known, log) for log in traces)
+        evidence = analyse(known, of_logs)
+        found = Diagnosis(
+            logs=tuple(logs),
+            references=own,
+            model=model,
+            known=known,
+            columns=of_logs,
+            evidence=evidence,
+            posterior=answer(known, evidence, known.colder_k(traces), without=without, alarm=alarm),
+            remarks=tuple(remarks),
+            has_references=bool(own) or known is references,
+            simulator=simulator,
         )
-    _LOG.info("comparing the effects")
-    verdict = decide(problem, alarm_below)
-    _LOG.info("cross-validating")
-    errors = held_out_errors(problem, held_out, [score.effect_id for score in verdict.accepted])
-    _LOG.info("refining the extended model")
-    extension = extend(problem, verdict.accepted)
-    floor_v = model.noise.voltage_rmse_v
-    if problem.references:
-        floor_v = rms(np.concatenate(problem.reference_errors_v))
-    baseline_v, extended_v, closed, interval = _closed(errors, floor_v)
-    is_gap = verdict.cause != NONE
-    reference_v2 = problem.error.reference_v2
-    return Diagnosis(
-        logs=tuple(logs),
-        model=model,
-        problem=problem,
-        verdict=verdict,
-        extension=extension,
-        baseline_rmse_v=baseline_v,
-        extended_rmse_v=extended_v,
-        floor_v=floor_v,
-        explainable_v=float(np.sqrt(reference_v2)) if reference_v2 > 0.0 else None,
-        closed_fraction=closed if is_gap else None,
-        closed_fraction_ci=interval if is_gap else None,
-        error_breakdown=tuple(
-            error_shares(problem.diagnosed, problem.diagnosed_errors_v, model.capacity_ah)
-        ),
-        worst_segments=tuple(worst_segments(problem.diagnosed, problem.diagnosed_errors_v)),
-        candidates=tuple(_candidates(problem, held_out, verdict, floor_v, extension)),
-        observability=tuple(_observability(problem)),
-    )
+        _LOG.info("judging on held-out rows")
+        found.candidates  # noqa: B018 - computed here, on one thread
+        return found
 
 
-def _closed(
-    errors: Sequence[HeldOutErrors], floor_v: float
-) -> tuple[float, float, float | None, tuple[float, float] | None]:
-    """Return RMS errors before and after [V], the closed fraction and its 95 % interval."""
+def learn_references(references: Sequence[Log], model: Model) -> References:
+    """Learn what references show once, for any number of diagnoses.
 
-    def together(parts: Sequence[FloatArray]) -> float:
-        return rms(np.concatenate(parts))
-
-    baseline_v = together([item.baseline_v for item in errors])
-    extended_v = together([item.extended_v for item in errors])
-    fraction = closed_fraction(baseline_v, extended_v, floor_v)
-    return baseline_v, extended_v, fraction, closed_fraction_interval(errors, floor_v)
-
-
-def _candidates(
-    problem: DiagnosisProblem,
-    held_out: Sequence[Fold],
-    verdict: Verdict,
-    floor_v: float,
-    extension: Extension,
-) -> list[dict[str, Any]]:
-    """Return one JSON object for each effect; the first ones are cross-validated."""
-    result = []
-    for number, score in enumerate(verdict.candidates):
-        rmse_v, closed, interval = None, None, None
-        if number < CROSS_VALIDATED:
-            errors = held_out_errors(problem, held_out, [score.effect_id])
-            _, rmse_v, closed, interval = _closed(errors, floor_v)
-        result.append(
-            {
-                "effect": score.effect_id,
-                "probability": verdict.probabilities[score.effect_id],
-                "log_bayes_factor": score.log_bayes_factor,
-                "rmse_v": rmse_v,
-                "closed_fraction": closed,
-                "ci": None if interval is None else list(interval),
-                "parameters": parameters_of(score, problem, extension),
-            }
-        )
-    return result
-
-
-def _observability(problem: DiagnosisProblem) -> list[dict[str, object]]:
-    """Return the part of each effect's physical range that these logs could show.
-
-    `visible` is 1 minus the smallest amplitude, in parts of the bounds, whose evidence would reach
-    `MIN_LOG_BAYES` with the references' overdispersion.
+    Parameters
+    ----------
+    references : sequence of Log
+        Logs without a fault, at least one.
+    model : Model
     """
-    hypotheses, error = problem.hypotheses, problem.error
-    best: dict[str, float] = {}
-    needs: dict[str, str] = {}
-    for k, candidate in enumerate(hypotheses.candidates):
-        effect = candidate.effect
-        if not effect.is_cause:
-            continue
-        at = problem.posterior.slice_of(k)
-        overdispersion = error.overdispersion_of(effect.id)
-        information = np.diag(problem.posterior.curvature[at, at]) / overdispersion
-        largest = np.abs(candidate.bounds).max(axis=1)
-        smallest = np.sqrt(2.0 * (MIN_LOG_BAYES + 2.0) / np.maximum(information, 1e-30)) / largest
-        visible = float(np.clip(1.0 - smallest.min(), 0.0, 1.0))
-        best[effect.id] = max(best.get(effect.id, 0.0), visible)
-        needs[effect.id] = effect.separated_by
-    return [
-        {"effect": effect_id, "visible": visible, "needs": needs[effect_id]}
-        for effect_id, visible in sorted(best.items(), key=lambda item: -item[1])
-    ]
+    with _one_thread():
+        check_logs(references, (), model)
+        return _learn(_traces(references, model)[0], model)
+
+
+def _learn(references: Sequence[Trace], model: Model) -> References:
+    return learn(references, model.capacity_ah, model.noise.voltage_rmse_v)
+
+
+def _traces(
+    logs: Sequence[Log], model: Model, start_pct: float | None = None
+) -> tuple[list[Trace], list[str]]:
+    """Return the logs at 1 Hz, and a sentence for each start found from the voltage."""
+    traces, remarks = [], []
+    for log in logs:
+        start = start_pct
+        if start is None and log.first_soc() is None:
+            by_voltage = start_by_model(log, model)
+            start = by_voltage.soc_pct
+            remarks.append(
+                f"{log.name} states no SoC: its start of {start:.1f} ±"
+                f" {by_voltage.std_pct or 0.0:.1f} % was found from the voltage. A cause that"
+                " shifts the voltage as a whole may hide in it; --initial-soc states the start."
+            )
+        traces.append(trace(log, model.capacity_ah, start))
+    return traces, remarks
+
+
+def _of_model(model: Model, log: Trace) -> Trace:
+    """Return a log with the model's voltage: the reference where none is given."""
+    return replace(log, voltage_v=log.voltage_v - residual_v(model.extended_model(), log))
+
+
+@cache
+def _threads() -> ThreadpoolController:
+    return ThreadpoolController()
+
+
+def _one_thread() -> Any:
+    """Return a context of one thread: systems of fifty unknowns gain nothing from more."""
+    return _threads().limit(limits=1)

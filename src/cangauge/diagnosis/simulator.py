@@ -1,27 +1,33 @@
 """The gap between measured voltages and those of any simulator.
 
-The voltage model is identified on the simulator's own output and gives the effects' columns. The
-diagnosed logs carry the model's voltage plus the difference of measured and simulated voltage, so
-that the diagnosed error is exactly that difference, however well the model repeats the simulator.
-The extended model's change of that error is the correction of the simulator's voltage.
+A model is identified on the simulator's own output and gives the effects' columns. The diagnosed
+logs carry the model's voltage plus the difference of measured and simulated voltage, so that the
+diagnosed error is exactly that difference, however well the model repeats the simulator.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import importlib
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Final
 
 import numpy as np
 
+from cangauge._formatting import significant
 from cangauge._typing import FloatArray
-from cangauge.diagnosis.cross_validation import rms
-from cangauge.diagnosis.diagnose import Diagnosis, diagnose
-from cangauge.diagnosis.verdict import ALARM_BELOW
 from cangauge.errors import InputError
 from cangauge.identify.fit import fit
 from cangauge.logs.log import Log
 from cangauge.model.model_file import Model
+
+Simulation = Callable[[FloatArray, FloatArray, FloatArray, float], Any] | Mapping[str, Any] | Any
+"""Function of time [s], current [A], temperature [°C] and SoC of the first row [%] that returns the
+voltage [V]; voltages by file or name of each log; or a `pybamm.Simulation`."""
+
+LEVEL_PART: Final = 0.01
+"""A simulator is off everywhere where the mean difference is more than this part of the voltage,
+and more than what varies about it."""
 
 CORRECTIONS: Final = {
     "capacity": "change the simulator's capacity by {change_pct:+.3g} %",
@@ -29,185 +35,176 @@ CORRECTIONS: Final = {
     "coulombic_efficiency": "let the simulator count {efficiency:.4g} of the charging current",
     "current_offset": "subtract {offset_a:.3g} A from the current that the simulator is given",
     "current_gain": "divide the current that the simulator is given by {factor:.4g}",
-    "voltage_offset": "subtract {offset_v:.3g} V from the measured voltage, not the simulator's",
-    "voltage_gain": "divide the measured voltage, not the simulator's, by {factor:.4g}",
+    "voltage_offset": "subtract {offset_v:.3g} V from the measured voltage, or add it to the"
+    " simulated one",
+    "voltage_gain": "divide the measured voltage by {factor:.4g}, or multiply the simulated one",
     "time_skew": "shift the current that the simulator is given by {skew_s:+.3g} s",
 }
-"""Effect → what to change in the simulator's inputs or parameters, or in the measurement. The
-others add a voltage, by the equation in the model file."""
+"""Effect → what to change in the simulator's inputs, or in the measurement. The others add a
+voltage, by the equation in the model file."""
 
 
-def start_of(log: Log) -> float:
-    """Return the SoC that a simulation of a log starts from [%].
+def simulated_v(simulation: Simulation, log: Log) -> FloatArray:
+    """Return the simulated voltage of every row of a log [V].
 
     Raises
     ------
     InputError
-        If the log has no reference SoC.
+        If the log has no SoC to start from, the simulation fails, or it does not return one finite
+        number for each row.
     """
-    first = log.first_soc()
+    where, first = log.source or log.name, log.first_soc()
     if first is None:
         raise InputError(
             "unknown SoC at the start of the simulation",
-            source=log.source or log.name,
+            source=where,
             field="soc_pct",
             cure="give a log with soc_pct, or the initial SoC",
         )
-    return first[1]
+    try:
+        if isinstance(simulation, Mapping):
+            volts = simulation[where]
+        elif callable(simulation):
+            volts = simulation(log.time_s, log.current_a, log.temperature_c, first[1])
+        else:
+            volts = _pybamm_v(simulation, log, first[1])
+    except (Exception, SystemExit) as error:
+        raise InputError(
+            f"the simulation raised {type(error).__name__}: {error}",
+            source=where,
+            cure="give a pybamm.Simulation, or a function of (time_s, current_a, temperature_c,"
+            " initial_soc_pct)",
+        ) from error
+    volts = np.asarray(volts, dtype=np.float64)
+    if volts.shape != log.time_s.shape:
+        raise InputError(
+            f"the simulator returned shape {volts.shape} for {len(log)} rows",
+            source=where,
+            cure="return one voltage [V] for each time",
+        )
+    bad = np.flatnonzero(~np.isfinite(volts))
+    if bad.size:
+        raise InputError(
+            f"{bad.size} of {volts.size} simulated voltages are not finite, the first in row"
+            f" {bad[0] + 1}",
+            source=where,
+            value=float(volts[bad[0]]),
+            cure="end the log before the simulator stops, or simulate it whole",
+        )
+    return volts
+
+
+def _pybamm_v(simulation: Any, log: Log, start_pct: float) -> FloatArray:
+    """Return the pack's voltage of a `pybamm.Simulation` driven with a log's current [V]."""
+    pybamm: Any = importlib.import_module("pybamm")  # only where a simulation of it is given
+    time_s = log.time_s - log.time_s[0]
+    after_s = np.append(time_s, time_s[-1] + 60.0)  # where the solver may evaluate it
+    values = simulation.parameter_values.copy()
+    amperes = np.append(log.current_a, log.current_a[-1])
+    values["Current function [A]"] = pybamm.Interpolant(after_s, amperes, pybamm.t)
+    kelvin = np.append(log.temperature_c, log.temperature_c[-1]) + 273.15
+    values["Ambient temperature [K]"] = lambda _y, _z, t: pybamm.Interpolant(after_s, kelvin, t)
+    driven = pybamm.Simulation(simulation.model, parameter_values=values)
+    solution = driven.solve([0.0, float(time_s[-1])], t_interp=time_s, initial_soc=0.01 * start_pct)
+    return np.asarray(solution["Battery voltage [V]"](t=time_s))
 
 
 @dataclass(frozen=True, eq=False)
-class Run:
-    """A measured log and what a simulator made of its current and temperature.
+class SimulatorGap:
+    """Measured logs and what a simulator made of their current and temperature."""
 
-    Parameters
-    ----------
-    log : Log
-        With the SoC that the simulator started from as the first finite value of `soc_pct`.
-    simulated_v : array of shape (n,)
-        Simulated voltage of each row [V].
+    logs: tuple[Log, ...]
+    """Diagnosed logs with the voltage of `model` plus the simulator's difference."""
+    references: tuple[Log, ...]
+    model: Model
+    """Identified on the simulator's output."""
+    measured: tuple[Log, ...]
+    """Diagnosed logs, as given."""
+    simulated_v: tuple[FloatArray, ...]
+    """Of each diagnosed log [V]."""
+    remark: str
+    """Where the simulator is off everywhere; "" else."""
 
-    Raises
-    ------
-    InputError
-        If the voltages are not one finite number for each row, or the SoC is unknown.
-    """
+    def corrected_v(self, number: int, extended: Model, offset_pct: float = 0.0) -> FloatArray:
+        """Return the simulated voltage of a log with the correction of an extended model [V].
 
-    log: Log
-    simulated_v: FloatArray
-
-    def __post_init__(self) -> None:
-        volts = np.asarray(self.simulated_v, dtype=np.float64)
-        where = self.log.source or self.log.name
-        if volts.shape != self.log.time_s.shape:
-            raise InputError(
-                f"the simulator returned shape {volts.shape} for {len(self.log)} rows",
-                source=where,
-                cure="return one voltage [V] for each time",
-            )
-        bad = np.flatnonzero(~np.isfinite(volts))
-        if bad.size:
-            raise InputError(
-                f"{bad.size} of {volts.size} simulated voltages are not finite, the first in row"
-                f" {bad[0] + 1}",
-                source=where,
-                value=float(volts[bad[0]]),
-                cure="end the log before the simulator stops, or simulate it whole",
-            )
-        start_of(self.log)
-        object.__setattr__(self, "simulated_v", volts)
-
-    @property
-    def simulated(self) -> Log:
-        """Log with the simulated voltage in place of the measured one."""
-        return replace(self.log, voltage_v=self.simulated_v)
-
-    def on(self, model: Model) -> Log:
-        """Return the log with the voltage of `model` plus the difference of the simulator."""
-        predicted = model.predict(self.log)
-        gap_v = self.log.voltage_v - self.simulated_v
-        return replace(self.log, voltage_v=predicted.voltage_v + gap_v)
-
-
-@dataclass(frozen=True, eq=False)
-class SimulatorDiagnosis:
-    """Result of `diagnose_simulator`."""
-
-    diagnosis: Diagnosis
-    """Diagnosis of the difference; its model is the one identified on the simulator."""
-    runs: tuple[Run, ...]
-    """Diagnosed runs."""
-    fit_rmse_v: float
-    """RMS error of the identified model of the simulator's voltage [V]; it does not enter the gap,
-    only the columns."""
-
-    @property
-    def correction(self) -> str:
-        """What to change in the simulator, in one sentence; "" without a named cause."""
-        sentences = []
-        for effect_id, values in self.diagnosis.extension.cause.items():
-            sentence = CORRECTIONS.get(effect_id, "add the voltage of {effect}")
-            factor = 1.0 + values.get("gain_pct", 0.0) / 100.0
-            sentences.append(sentence.format(effect=effect_id, factor=factor, **values))
-        text = "; ".join(sentences)
-        return text and f"To correct the simulator: {text}."
-
-    def corrected_v(self, run: Run) -> FloatArray:
-        """Return the simulated voltage with the correction [V], shape (n,).
-
-        A cause in the measured voltage is added to the simulated one, so that the result is to be
-        compared with the voltage as measured.
+        Parameters
+        ----------
+        number : int
+            Of the diagnosed log.
+        extended : Model
+            `Diagnosis.extended_model`.
+        offset_pct : float
+            Change of the log's start, which is no part of the model [%].
         """
-        found = self.diagnosis
-        log = run.on(found.model)
-        before = found.model.predict(log).residual_v
-        start = found.extension.cause.get("initial_soc", {})  # of the log, not of the model
-        soc_pct = None if log.soc_pct is None else log.soc_pct + start.get("offset_pct", 0.0)
-        after = found.extended_model.predict(replace(log, soc_pct=soc_pct)).residual_v
-        return run.simulated_v + (before - after)
-
-    def errors(self) -> list[dict[str, Any]]:
-        """Return the RMS error of each diagnosed log, as simulated and corrected [V]."""
-        return [
-            {
-                "name": run.log.name,
-                "simulated_rmse_v": rms(run.log.voltage_v - run.simulated_v),
-                "corrected_rmse_v": rms(run.log.voltage_v - self.corrected_v(run)),
-            }
-            for run in self.runs
-        ]
-
-    def to_dict(self) -> dict[str, object]:
-        """Return what `cangauge gap --json` adds for a simulator."""
-        return {
-            "fit_rmse_v": self.fit_rmse_v,
-            "correction": self.correction,
-            "logs": self.errors(),
-        }
+        log = self.logs[number]
+        before = self.model.predict(log).residual_v
+        soc_pct = None if log.soc_pct is None else log.soc_pct + offset_pct
+        after = extended.predict(replace(log, soc_pct=soc_pct)).residual_v
+        return np.asarray(self.simulated_v[number] + (before - after))
 
 
-def diagnose_simulator(
-    runs: Sequence[Run],
-    references: Sequence[Run] = (),
-    *,
+def correction(effect: str, values: Mapping[str, float]) -> str:
+    """Return what to change in a simulator for an effect, in one sentence."""
+    factor = 1.0 + values.get("gain_pct", 0.0) / 100.0
+    sentence = CORRECTIONS.get(effect, "add the voltage of {effect}")
+    return f"To correct the simulator: {sentence.format(effect=effect, factor=factor, **values)}."
+
+
+def simulator_gap(
+    logs: Sequence[Log],
+    references: Sequence[Log],
+    simulation: Simulation,
     model: Model | None = None,
     capacity_ah: float | None = None,
-    alarm_below: float = ALARM_BELOW,
-) -> SimulatorDiagnosis:
-    """Diagnose the difference between measured voltages and those of a simulator.
+) -> SimulatorGap:
+    """Return the gap of a simulator as that of a model.
 
     Parameters
     ----------
-    runs : sequence of Run
-        Runs with a gap, which share one cause.
-    references : sequence of Run
-        Runs in which the simulator is good.
+    logs, references : sequence of Log
+        Logs with a gap, and logs in which the simulator is good.
+    simulation : Simulation
     model : Model, optional
-        Voltage model of the simulator; by default identified on its output in all runs.
+        Voltage model of the simulator; by default identified on its output in all logs.
     capacity_ah : float, optional
-        The simulator's charge from 100 to 0 % [Ah]; by default from a run from full to empty.
-    alarm_below : float
-        As of `diagnose`.
-
-    Returns
-    -------
-    SimulatorDiagnosis
-
-    Raises
-    ------
-    InputError
-        As `fit` on the simulated voltages, and as `diagnose`.
+        The simulator's charge from 100 to 0 % [Ah]; by default from a log from full to empty.
     """
+    volts = [simulated_v(simulation, log) for log in (*logs, *references)]
+    outputs = [
+        replace(log, voltage_v=each) for log, each in zip((*logs, *references), volts, strict=True)
+    ]
     if model is None:
-        found = fit([run.simulated for run in (*references, *runs)], capacity_ah=capacity_ah)
-        model = found.model
-    elif capacity_ah is not None:
-        model = model.model_copy(update={"capacity_ah": capacity_ah})
-    errors = [run.simulated.voltage_v - model.predict(run.log).voltage_v for run in runs]
-    diagnosis = diagnose(
-        [run.on(model) for run in runs],
-        model,
-        [run.on(model) for run in references],
-        alarm_below=alarm_below,
+        model = fit(outputs, capacity_ah=capacity_ah).model
+    on_model = [
+        replace(log, voltage_v=model.predict(output).voltage_v + log.voltage_v - output.voltage_v)
+        for log, output in zip((*logs, *references), outputs, strict=True)
+    ]
+    number = len(logs)
+    return SimulatorGap(
+        logs=tuple(on_model[:number]),
+        references=tuple(on_model[number:]),
+        model=model,
+        measured=tuple(logs),
+        simulated_v=tuple(volts[:number]),
+        remark=_level_remark((*logs, *references), volts, number),
     )
-    return SimulatorDiagnosis(diagnosis, tuple(runs), rms(np.concatenate(errors)))
+
+
+def _level_remark(logs: Sequence[Log], volts: Sequence[FloatArray], number: int) -> str:
+    """Return where a simulator is off everywhere, which comes before any cause; "" else."""
+    gaps = [log.voltage_v - each for log, each in zip(logs, volts, strict=True)]
+    text = ""
+    for some, where in ((gaps[number:], "on the references too"), (gaps[:number], "")):
+        if not some or text:
+            continue
+        whole = np.concatenate(some)
+        mean, varies = float(whole.mean()), float(whole.std())
+        if abs(mean) > max(LEVEL_PART * float(np.mean(logs[0].voltage_v)), varies):
+            text = (
+                f"The simulator is {significant(abs(mean), 2, 'V')}"
+                f" {'too low' if mean > 0.0 else 'too high'} everywhere{where and f', {where}'};"
+                f" only {significant(varies, 2, 'V')} vary about that. Correct its level first: the"
+                " open-circuit voltage, the number of cells or the initial SoC."
+            )
+    return text

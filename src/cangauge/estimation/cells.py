@@ -23,6 +23,7 @@ import numpy as np
 
 from cangauge._typing import FloatArray
 from cangauge.model.voltage_model import VoltageModel
+from cangauge.types import CellReport
 
 CELLS_AT_MOST: Final = 1022
 """Largest number of a cell in SOC_CELLS."""
@@ -57,25 +58,6 @@ SUM_AT_LEAST_S: Final = 30.0
 
 SUM_WITHIN: Final = 0.005
 """Relative difference that both sensors' data sheets allow: ±0.5 % is usual for pack sensors."""
-
-
-class CellReport(NamedTuple):
-    """The cells as a whole; NaN where not known."""
-
-    cells: int
-    """Number of cells known."""
-    weakest: int
-    """Number of the cell with the least SoC; −1: not known."""
-    soc_pct: float
-    """Its SoC [%]."""
-    soc_std_pct: float
-    spread_pct: float
-    """SoC of the strongest cell less that of the weakest [%]."""
-    sum_error_v: float
-    """Pack voltage less the sum of the cells [V]."""
-    sum_std_v: float
-    is_sum_wrong: bool
-    """Whether that is more than both sensors' errors allow."""
 
 
 UNKNOWN: Final = CellReport(

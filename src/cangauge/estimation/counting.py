@@ -9,13 +9,13 @@ A longer step is an *unobserved interval*: the bus was asleep, or the service no
 is counted, and there are two hypotheses. *Parked*: self-discharge and small consumers only, so the
 SoC has hardly changed. *Moved*: the car was charged or driven, by at most the rate of a fast
 charger. The prior probability of *moved* grows with the length of the interval; the voltages after
-it test both (see `hypothesis_filter`).
+it test both (see `start`).
 """
 
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
 from cangauge.estimation.state import ClockState, CounterState
 from cangauge.model.coulomb_counting import BRIDGE_S
@@ -45,9 +45,6 @@ MOVED_STD_AT_MOST_PCT = 30.0
 
 AWAY_PCT_PER_HOUR = 20.0
 """Change of SoC in an unobserved interval, for counting alone [% per hour]: a slow charger."""
-
-AWAY_AT_MOST_PCT = 30.0
-"""Upper bound of that change [%]."""
 
 MEAN_SQUARE_MEMORY_S = 300.0
 """Memory of the mean square current, from which a gap's uncertainty follows [s]."""
@@ -79,10 +76,35 @@ def moved_std_pct(seconds: float) -> float:
     return min(FASTEST_PCT_PER_HOUR * seconds / 3600.0, MOVED_STD_AT_MOST_PCT)
 
 
-def moved_log_odds(seconds: float) -> float:
-    """Return the prior ln(p / (1 − p)), p the probability that the car was charged or driven."""
-    probability = -MOVED_AT_MOST * math.expm1(-max(seconds, SHORTEST_S) / MOVED_TIME_S)
-    return math.log(probability / (1.0 - probability))
+def away_std_pct(seconds: float) -> float:
+    """Return the standard deviation of the SoC by counting alone after an interval [%]."""
+    return min(AWAY_PCT_PER_HOUR * seconds / 3600.0, MOVED_STD_AT_MOST_PCT)
+
+
+def moved_probability(seconds: float) -> float:
+    """Return the prior probability that the car was charged or driven in an interval [s]."""
+    return -MOVED_AT_MOST * math.expm1(-max(seconds, SHORTEST_S) / MOVED_TIME_S)
+
+
+OFFSET_STD_PER_AH: Final = 0.025
+CAPACITY_STD: Final = 0.05
+"""Standard deviations of the sensor's offset [A/Ah] and of the capacity [relative], for counting
+alone."""
+
+
+def count_std_pct(start_var_pct2: float, seconds: float, moved_pct: float) -> float:
+    """Return the standard deviation of the SoC by counting alone [%].
+
+    Parameters
+    ----------
+    start_var_pct2 : float
+        Variance of the SoC that counting started from, and of gaps [%²].
+    seconds, moved_pct : float
+        Time [s] and charge moved in either direction [%] since.
+    """
+    offset_pct = OFFSET_STD_PER_AH * seconds * 100.0 / 3600.0
+    capacity_pct = CAPACITY_STD * moved_pct
+    return math.sqrt(start_var_pct2 + offset_pct * offset_pct + capacity_pct * capacity_pct)
 
 
 class ChargeStep(NamedTuple):
@@ -92,8 +114,6 @@ class ChargeStep(NamedTuple):
     """Time since the last sample [s]."""
     discharged_pct: float
     """Charge taken out since the last sample [% of capacity]."""
-    gap_std_pct: float
-    """Standard deviation of that charge across a gap, else 0 [%]."""
     away_s: float = 0.0
     """Length of an unobserved interval [s], else 0."""
     parked_std_pct: float = 0.0
@@ -134,7 +154,7 @@ class CoulombCounter:
         if math.isnan(last_s):
             state.mean_square_a2 = current_a * current_a
             state.mean_a = current_a
-            return ChargeStep(0.0, 0.0, 0.0)
+            return ChargeStep(0.0, 0.0)
         seconds = time_s - last_s
         across_a = 0.5 * (current_a + last_a)
         if self.is_restored and seconds > self._gap_s:
@@ -149,18 +169,18 @@ class CoulombCounter:
         mean_square_a2 = state.mean_square_a2
         state.mean_square_a2 = kept * state.mean_square_a2 + (1.0 - kept) * (current_a * current_a)
         if seconds > self._bridge_s:
-            away_pct = min(AWAY_PCT_PER_HOUR * seconds / 3600.0, AWAY_AT_MOST_PCT)
             rms_a = math.sqrt(max(mean_square_a2, last_a * last_a))
             parked_pct = parked_std_pct(seconds, rms_a * self._pct_per_as)
-            return ChargeStep(seconds, 0.0, away_pct, seconds, parked_pct)
+            return ChargeStep(seconds, 0.0, seconds, parked_pct)
         state.counted_s += seconds
         out_pct = across_a * seconds * self._pct_per_as
         state.discharged_pct += out_pct
         state.moved_pct += abs(out_pct)
-        if seconds <= self._gap_s:
-            return ChargeStep(seconds, out_pct, 0.0)
-        rms_a = math.sqrt(max(mean_square_a2, 0.5 * (current_a * current_a + last_a * last_a)))
-        return ChargeStep(seconds, out_pct, rms_a * seconds * self._pct_per_as)
+        if seconds > self._gap_s:
+            across_a2 = 0.5 * (current_a * current_a + last_a * last_a)
+            gap_pct = math.sqrt(max(mean_square_a2, across_a2)) * seconds * self._pct_per_as
+            state.gap_var_pct2 += gap_pct * gap_pct
+        return ChargeStep(seconds, out_pct)
 
     def uncounted_std_pct(self, seconds: float) -> float:
         """Return the standard deviation of the charge since the last sample [%]."""

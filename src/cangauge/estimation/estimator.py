@@ -1,7 +1,9 @@
 """The estimator: samples → estimates. Pure: no clock, no files, no bus.
 
-Charge is counted on every sample. The voltage is used at the model's rate, on the first sample at
-or after each tick of bus time. The same samples give the same numbers, live or offline.
+Charge is counted on every sample. The voltage is compared with the model at the model's rate (1 Hz
+rows: inverse and residual), and corrects the filter once per block with the mean of its rows.
+Between blocks the filter's SoC is counted on. The same samples give the same numbers, live or
+offline.
 """
 
 from __future__ import annotations
@@ -9,36 +11,36 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import ClassVar
+from typing import ClassVar, Final
 
-from cangauge._arithmetic import dot, total
-from cangauge.errors import InputError
+from scipy.special import chdtri
+
+from cangauge._typing import FloatArray
+from cangauge.estimation.blocks import OpenBlock
 from cangauge.estimation.cells import PackTick
-from cangauge.estimation.counting import CoulombCounter, EstimatorClock
-from cangauge.estimation.ekf import CAPACITY_STD, UNKNOWN_SOC_STD_PCT, SocEkf, count_std_pct
-from cangauge.estimation.health import Health, HealthEstimator, VoltageTick
-from cangauge.estimation.hypothesis_filter import HypothesisFilter
-from cangauge.estimation.measurement_noise import CurveFunctions, Measurement, MeasurementNoise
-from cangauge.estimation.power import LEVEL_MEMORY_S, PackNow, Power, PowerModel
-from cangauge.estimation.settings import (
-    EstimatorSettings,
-    SocReference,
-    SocReferenceDetector,
+from cangauge.estimation.counting import (
+    CoulombCounter,
+    EstimatorClock,
+    away_std_pct,
+    count_std_pct,
+    moved_probability,
+    moved_std_pct,
 )
-from cangauge.estimation.state import (
-    ChargeSinceUpdate,
-    DelayLineState,
-    EstimatorMemory,
-    EstimatorState,
-)
-from cangauge.model.delay_line import DelayLine
+from cangauge.estimation.ekf import Block, inverse_std_pct
+from cangauge.estimation.health import health_of
+from cangauge.estimation.power import PowerModel
+from cangauge.estimation.settings import EstimatorSettings, SocReference, detect_references
+from cangauge.estimation.start import UNKNOWN_STD_PCT, WRONG_PRIOR, WRONG_STD_PCT, Hypotheses
+from cangauge.estimation.state import DelayLineState, EstimatorMemory, EstimatorState
 from cangauge.model.effects.base import Reading
-from cangauge.model.model_file import Model, effective_error_std_v
-from cangauge.model.voltage_model import TEMPERATURE_MARGIN_K, Curve, VoltageModel, soc_from_ocv
+from cangauge.model.model_file import Model
+from cangauge.model.voltage_model import VoltageModel, soc_from_ocv
 from cangauge.types import (
     CURRENT_AT_MOST_A,
     REASONS,
     Estimate,
+    Health,
+    Power,
     Reason,
     Sample,
     drop_implausible,
@@ -49,32 +51,30 @@ from cangauge.types import (
 
 __all__ = ["Estimator", "EstimatorSettings"]
 
-REST_CURRENT_C_RATE = 0.02
+REST_CURRENT_C_RATE: Final = 0.02
 """Below this current the pack is at rest [1/h]: 1.2 A at 60 Ah."""
 
-REST_S = 600.0
-"""Time at rest after which slow polarisation has decayed [s]."""
+REST_S: Final = 600.0
+"""Interval without samples that counts as rest [s]: slow polarisation has decayed."""
 
-CONTRADICTED_S = 300.0
-"""How long a lasting contradiction, or a restart of the filter, degrades the estimate [s]."""
+CONTRADICTED_S: Final = 300.0
+"""How long a rejected hypothesis, or a restart of the filter, degrades the estimate [s]."""
 
-MISMATCH_SIGMAS = 3.0
-"""Offset, bias or learned capacity beyond this many of the standard deviations assumed for them:
-model and pack disagree. By chance one pack in 400 is beyond."""
+MISMATCH_S: Final = 600.0
+"""Time over which innovations are tested against the model, and for which a failed test makes the
+estimate invalid [s]: twice the memory of the voltage's slow error."""
 
-AGREES_PCT = 1e-6
-"""Rounding error allowed between a state's last estimate and its filter or count [%]."""
+MISMATCH_ALARM: Final = 1e-6
+"""Probability of a failed test on a pack that agrees with its model."""
 
 
 class Estimator:
-    """SoC estimator: voltage model, delay line, Coulomb counter and hypothesis filter.
+    """SoC estimator: voltage model, delay line, Coulomb counter and Kalman filter.
 
     Parameters
     ----------
     model : Model
     settings : EstimatorSettings, optional
-    ekf_type : type, optional
-        Implementation of the Kalman filter; by default that of `settings.filter`.
 
     Attributes
     ----------
@@ -82,15 +82,15 @@ class Estimator:
     settings : EstimatorSettings
     capacity_ah : float
         Charge from 100 to 0 % [Ah].
-    filter : HypothesisFilter
-        Offset of the current sensor, and the verdict on the last unobserved interval.
+    hypotheses : Hypotheses
+        The filter, or two while a start is in doubt.
     is_refused : bool
         Whether the latest sample was refused: without a plausible current, or not later.
 
     Examples
     --------
-    >>> from cangauge.estimation.estimator import Estimator, EstimatorSettings
-    >>> from cangauge.types import Sample
+    >>> from cangauge import Estimator, Sample
+    >>> from cangauge.estimation.settings import EstimatorSettings
     >>> from cangauge.model.published import leaf_2012_model_file
     >>> estimator = Estimator(leaf_2012_model_file(), EstimatorSettings(initial_soc_pct=80.0))
     >>> estimate = estimator.step(
@@ -103,57 +103,24 @@ class Estimator:
     core: ClassVar[str] = "python"
     """Implementation of the step: "python", or "compiled" (`compiled`)."""
 
-    def __init__(
-        self,
-        model: Model,
-        settings: EstimatorSettings | None = None,
-        ekf_type: type[SocEkf] | None = None,
-    ) -> None:
+    def __init__(self, model: Model, settings: EstimatorSettings | None = None) -> None:
         self.model = model
         self.settings = settings or EstimatorSettings()
-        make_ekf = ekf_type or _ekf_type(self.settings)
-        extended = model.extended_model()
-        self._voltage_model = extended.model
-        self._online = extended.online(self.settings.capacity_ah)
-        self._has_effects = not self._online.plain
-        self._curve = self._make_curve()
+        self._online = model.online(self.settings.capacity_ah, self.settings.gap_s)
         self.capacity_ah = self._online.capacity_ah
-        self.filter = HypothesisFilter(
-            lambda: make_ekf(self._curve, self._online.steady_ohm, self.capacity_ah, model.noise)
-        )
+        self.voltage_model: VoltageModel = self._online.model
+        self.hypotheses = Hypotheses(self._online)
+        self._block = OpenBlock()
         self._counter = CoulombCounter(self.capacity_ah, self.settings.gap_s)
         self._clock = EstimatorClock()
-        self._line = DelayLine(self._voltage_model.delay_s, gap_s=self.settings.gap_s)
-        self._references = SocReferenceDetector(self.settings.full_charge, self.settings.long_rest)
-        self._noise = MeasurementNoise(model, self._online)
-        slow_v, lasting_v = model.noise.slow_std_v, model.noise.lasting_std_v
-        self._bias_std_v = math.sqrt(slow_v * slow_v + lasting_v * lasting_v)
-        self._functions = CurveFunctions(model.noise)
-        self._nominal_v = self._voltage_model.pseudo_ocv_at(50.0)[0]
-        self._health = HealthEstimator(
-            self._curve,
-            steady_ohm=self._online.steady_ohm,
-            noise=model.noise,
-            fast_std_v=effective_error_std_v(model.noise, 1.0 / model.rate_hz),
-            nominal_v=self._nominal_v,
-            capacity_ah=self.capacity_ah,
-        )
-        self._power = PowerModel(
-            self._curve,
-            self._voltage_model,
-            model.noise,
-            self.settings.limits.of_model(self._voltage_model),
-        )
+        self._power = PowerModel(self._online, self.settings.limits)
         self._permanent_reasons = temperature_mismatch(
             model.temperature_source, self.settings.temperature_source
         )
+        self._tested_blocks = max(round(MISMATCH_S / model.noise.block_s), 1)
+        self._innovations_at_most = float(chdtri(self._tested_blocks, MISMATCH_ALARM))
+        self._strain_at_most = float(chdtri(self._online.functions.number + 4, MISMATCH_ALARM))
         self._memory = EstimatorMemory()
-        self._since = ChargeSinceUpdate()
-        self._is_filtering = False
-        # Voltage less the pseudo-OCV at the latest sample [V], NaN until it is needed, and the
-        # delayed currents [A] that it was computed from.
-        self._without_ocv_v = math.nan
-        self._delayed_a: Sequence[float] = ()
         self._implausible = Reason.NONE
         self.is_refused = False
         self._latest = Estimate.unknown(Reason.NO_INITIAL_SOC)
@@ -161,12 +128,7 @@ class Estimator:
         self._pending: tuple[Sample, float] | None = None
         if self.settings.initial_soc_pct is not None:
             soc_pct = self._online.initial_soc_pct(self.settings.initial_soc_pct)
-            self._start(soc_pct, self.settings.initial_soc_std_pct)
-
-    def _make_curve(self) -> Curve:
-        """Return the pseudo-OCV with effects; the compiled estimator has its own."""
-        # Without effects the voltage model gives the same numbers with half the calls.
-        return self._online if self._has_effects else self._voltage_model
+            self._start(soc_pct, self.settings.initial_soc_std_pct, is_doubtful=True)
 
     def step(self, sample: Sample) -> Estimate:
         """Process one sample and return the estimate after it; see `update`."""
@@ -195,26 +157,20 @@ class Estimator:
         if time_s is None:
             return
         stamp_s = sample.time_s
-        if time_s != stamp_s:
-            sample = sample._replace(time_s=time_s)
-        if self._has_effects:
-            self._evaluate()  # effects may hold this sample back, which keeps the last estimate
-        sample, self._implausible = drop_implausible(sample, self._nominal_v)
+        sample, self._implausible = drop_implausible(
+            sample._replace(time_s=time_s), self.voltage_model.nominal_v
+        )
         memory = self._memory
         if memory.samples == 0:
             memory.first_s = time_s
         memory.samples += 1
-        if not self._has_effects:
-            self._process(sample)
-            self._pending = sample, stamp_s
-            return
-        corrected = [Sample(*reading) for reading in self._online.correct(Reading(*sample))]
-        for each in corrected:
-            self._process(each)
+        corrected = self._online.correct(Reading(*sample))
+        for reading in corrected:
+            self._process(Sample(*reading))
         if corrected:
-            self._pending = corrected[-1], stamp_s
+            self._pending = Sample(*corrected[-1]), stamp_s
         else:
-            self._latest = self._latest._replace(time_s=stamp_s, samples=memory.samples)
+            self._latest = self._evaluate()._replace(time_s=stamp_s, samples=memory.samples)
 
     def uncounted_std_pct(self, seconds: float) -> float:
         """Return what the SoC's standard deviation lacks [%] when no sample came for a time [s]."""
@@ -232,26 +188,41 @@ class Estimator:
     @property
     def health(self) -> Health:
         """Capacity, resistance and current offset, with standard deviations."""
-        health = self._health.health
-        return health._replace(offset_a=self.filter.offset_a) if self._is_filtering else health
+        return health_of(self.hypotheses.likelier, self._temperature_c)
 
     @property
-    def voltage_model(self) -> VoltageModel:
-        """The voltage model without effects."""
-        return self._voltage_model
+    def verdict(self) -> str:
+        """What the voltage says of the last interval without samples.
+
+        "open", "parked" or "moved"; empty without an interval.
+        """
+        if self._memory.doubt != "interval":
+            return ""
+        return {-1: "parked", 0: "open", 1: "moved"}[self.hypotheses.decision]
+
+    @property
+    def tests(self) -> tuple[int, float, float]:
+        """Blocks that are tested together, and the limits of innovations and strain."""
+        return self._tested_blocks, self._innovations_at_most, self._strain_at_most
+
+    @property
+    def time_s(self) -> float:
+        """The estimator's own time at the latest sample [s]: it always increases."""
+        return self._clock.state.last_s
 
     def pack_tick(self, sample: Sample) -> PackTick:
         """Return what is known of the pack after its latest sample, for its cells."""
         soc_pct, std_pct = self._soc_and_std_pct()
-        is_known = self._memory.samples > 0 and not math.isnan(self._counter.state.time_s)
-        without_ocv_v = self._voltage_without_ocv_v() if is_known else math.nan
+        load_v = drop_v = math.nan
+        if not math.isnan(self._counter.state.time_s):
+            _, load_v, drop_v = self._load()
         return PackTick(
             sample.time_s,
             soc_pct,
             std_pct,
             sample.voltage_v,
-            without_ocv_v,
-            dot(self._voltage_model.resistance_ohm, self._delayed_a),
+            load_v,
+            drop_v,
             self._counter.state.moved_pct,
         )
 
@@ -259,223 +230,189 @@ class Estimator:
         """Return the current at a sample's time less that at other stamps [A]; NaN for NaN."""
         if math.isnan(self._counter.state.time_s):
             return [math.nan] * len(stamps_s)
-        known = {each for each in stamps_s if not math.isnan(each)}
-        at = {each: self._line.current_at(time_s - each) for each in known}
-        now_a = self._line.current_at(0.0)
-        return [now_a - at[each] if each in at else math.nan for each in stamps_s]
+        at = self._online.delay_line.current_at
+        known = {each: at(time_s - each) for each in set(stamps_s) if not math.isnan(each)}
+        return [at(0.0) - known[each] if each in known else math.nan for each in stamps_s]
 
     def power(self) -> Power:
         """Return the currents possible for 10 s and the energy left, after the latest sample."""
-        return self._power.at(self._pack_now(), self._line)
-
-    def _pack_now(self) -> PackNow:
-        memory = self._memory
         soc_pct, std_pct = self._soc_and_std_pct()
-        is_level = self._counter.state.time_s - memory.level_s <= LEVEL_MEMORY_S
-        return PackNow(
-            soc_pct,
-            std_pct,
-            memory.temperature_c,
-            memory.level_residual_v if is_level else math.nan,
-            memory.level_drop_v,
-            self.health,
-        )
-
-    @property
-    def time_s(self) -> float:
-        """The estimator's own time at the latest sample [s]: it always increases."""
-        return self._clock.state.last_s
+        if math.isnan(soc_pct) or math.isnan(self._counter.state.time_s):
+            return Power()
+        return self._power.at(self.hypotheses.likelier, soc_pct, std_pct, self._temperature_c)
 
     def _process(self, sample: Sample) -> None:
         """Count the charge of a corrected sample, and use its voltage where that is due."""
-        memory, since = self._memory, self._since
+        memory = self._memory
         time_s, current_a, _, temperature_c = sample
-        counted_a = self._online.counted(current_a) if self._has_effects else current_a
-        charge = self._counter.step(time_s, counted_a)
-        self._line.push(time_s, current_a)
-        self._without_ocv_v = math.nan
-
-        since.seconds += charge.seconds
-        since.discharged_pct += charge.discharged_pct
-        since.moved_pct += abs(charge.discharged_pct)
-        if charge.away_s:
-            since.away_s += charge.away_s
-            since.unseen_var_pct2 += charge.parked_std_pct * charge.parked_std_pct
-        else:
-            since.gap_var_pct2 += charge.gap_std_pct * charge.gap_std_pct
+        number = math.floor((time_s - memory.first_s) / self.model.noise.block_s + 1e-9)
+        if number > self._block.state.number:
+            self._close_block(time_s)
+            self._block.begin(number)
+        charge = self._counter.step(time_s, self._online.counted(current_a))
+        if not math.isnan(temperature_c):
+            memory.temperature_c = temperature_c
+        self._online.advance(time_s, current_a, memory.temperature_c)
         if charge.seconds > self.settings.gap_s:
-            memory.gap_until_s = time_s + self._voltage_model.delay_s[-1]
-        if charge.gap_std_pct and not math.isnan(memory.coulomb_var_pct2):
-            memory.coulomb_var_pct2 += charge.gap_std_pct * charge.gap_std_pct
-
+            self._block.state.is_broken = True
+            memory.gap_until_s = time_s + self._online.delay_line.longest_s
+        if charge.away_s:
+            self._propagate_to_now()
+            self.hypotheses.doubt(
+                moved_probability(charge.away_s),
+                moved_std_pct(charge.away_s),
+                charge.away_s,
+                charge.parked_std_pct,
+            )
+            memory.doubt = "interval"
+            memory.coulomb_var_pct2 += away_std_pct(charge.away_s) ** 2
         if abs(current_a) > REST_CURRENT_C_RATE * self.capacity_ah:
             memory.rest_since_s = math.nan
         elif math.isnan(memory.rest_since_s):
             memory.rest_since_s = time_s
-        if charge.seconds > REST_S:  # an unobserved interval counts as rest
+        if charge.seconds > REST_S:
             memory.rest_since_s = time_s - charge.seconds
-
-        if not math.isnan(temperature_c):
-            memory.temperature_c = temperature_c
-        if self._has_effects:
-            self._online.advance(time_s, current_a, memory.temperature_c, self._line.currents())
         tick = math.floor((time_s - memory.first_s) * self.model.rate_hz + 1e-6)
         if tick > memory.tick:
             memory.tick = tick
-            self._use_voltage(sample)
+            self._use_row(sample)
 
-    def _use_voltage(self, sample: Sample) -> None:
-        memory = self._memory
-        rest_s = sample.time_s - memory.rest_since_s
-        since, self._since = self._since, ChargeSinceUpdate()
-        if self._is_filtering:
-            self.filter.predict(since)
-            if rest_s > REST_S:
-                self.filter.shrink_bias()
-        self._health.count(since)
-        if math.isnan(sample.voltage_v):
-            memory.newton_pct, memory.newton_inside = math.nan, True
-            memory.newton_std_pct = math.nan
-        else:
-            self._update_with_voltage(sample, since)
-        if self.settings.full_charge is not None or self.settings.long_rest is not None:
-            for reference in self._references.detect(sample, rest_s, memory.newton_pct):
-                self._correct(reference)
-        if self._is_filtering and self.filter.is_lost():
-            # Restart from the voltage if there is one, and forget the offset.
-            known = (memory.newton_pct, _clip(self._coulomb_pct()), 50.0)
-            soc_pct = next(soc for soc in known if not math.isnan(soc))
-            self.filter.start(soc_pct, UNKNOWN_SOC_STD_PCT)
-            memory.contradicted_until_s = sample.time_s + CONTRADICTED_S
-            memory.resets += 1
-
-    def _update_with_voltage(self, sample: Sample, since: ChargeSinceUpdate) -> None:
-        memory = self._memory
-        without_ocv_v = self._voltage_without_ocv_v()
+    def _use_row(self, sample: Sample) -> None:
+        """Compare a row's voltage with the model, and add it to the open block."""
+        memory, online, counter = self._memory, self._online, self._counter.state
+        load, load_v, drop_v = self._load()
         guess_pct = 50.0 if math.isnan(memory.newton_pct) else memory.newton_pct
-        newton = soc_from_ocv(self._curve, sample.voltage_v - without_ocv_v, guess_pct)
-        memory.newton_pct, memory.newton_inside = newton
-        std_v, kt_std_v = self._noise.at(memory.temperature_c, self._line)
-        drop_v = total(self._delayed_a) / len(self._delayed_a) * self._online.steady_ohm
-        resistance_std_v = self._noise.resistance_std(memory.temperature_c) * drop_v
-        slope = self._curve.pseudo_ocv_at(memory.newton_pct)[1]
-        curve_std_v = self._functions.std_v(memory.newton_pct)
-        parts_v = (std_v, self._bias_std_v, curve_std_v, kt_std_v, resistance_std_v)
-        error_v = math.sqrt(dot(parts_v, parts_v))
-        memory.newton_std_pct = min(error_v / slope, UNKNOWN_SOC_STD_PCT)
-        if math.isnan(memory.coulomb_start_pct):
-            # No initial SoC: start from the voltage's with a wide prior, from which the filter
-            # learns how SoC and bias share what the voltage cannot separate.
-            self._start(memory.newton_pct, UNKNOWN_SOC_STD_PCT)
-            memory.coulomb_var_pct2 = memory.newton_std_pct * memory.newton_std_pct
-        if self._is_filtering:
-            measurement = Measurement(
-                sample.voltage_v,
-                without_ocv_v,
-                memory.newton_pct,
-                std_v,
-                kt_std_v,
-                resistance_std_v,
-            )
-            if self.filter.update(measurement, since):
-                memory.contradicted_until_s = sample.time_s + CONTRADICTED_S
-            ekf = self.filter.likelier
-            memory.bias_pct = min(abs(ekf.bias_v) / slope, UNKNOWN_SOC_STD_PCT)
-            if ekf.strain > MISMATCH_SIGMAS or self._has_other_capacity():
-                memory.mismatch_until_s = sample.time_s + CONTRADICTED_S
-        tick = self._voltage_tick(sample, without_ocv_v)
-        self._health.use(tick, since.seconds)
-        self._follow_level(tick, sample.time_s)
-
-    def _follow_level(self, tick: VoltageTick, time_s: float) -> None:
-        """Follow the levels of the residual and of the predicted drop."""
-        memory = self._memory
+        memory.newton_pct = memory.newton_std_pct = math.nan
+        memory.newton_inside = True
+        if not math.isnan(sample.voltage_v):
+            newton = soc_from_ocv(online, sample.voltage_v - load_v, guess_pct)
+            memory.newton_pct, memory.newton_inside = newton
+            temperature_c = self._temperature_c
+            memory.newton_std_pct = inverse_std_pct(online, newton.soc_pct, temperature_c, load)
+            charge = counter.counted_s, counter.discharged_pct
+            volts = sample.voltage_v, temperature_c, drop_v
+            self._block.add(Block(*charge, *volts, load, online.drives()))
         soc_pct = self._soc_and_std_pct()[0]
-        residual_v = tick.voltage_v - tick.without_ocv_v - self._curve.pseudo_ocv_at(soc_pct)[0]
-        weight = 1.0
-        if time_s - memory.level_s < LEVEL_MEMORY_S:
-            weight = -math.expm1((memory.level_s - time_s) / LEVEL_MEMORY_S)
-        memory.level_residual_v += weight * (residual_v - memory.level_residual_v)
-        memory.level_drop_v += weight * (tick.drop_v - memory.level_drop_v)
-        memory.level_s = time_s
+        memory.voltage_model_v = math.nan
+        if not math.isnan(soc_pct):
+            memory.voltage_model_v = online.curve(soc_pct)[0] + load_v
+        memory.residual_v = sample.voltage_v - memory.voltage_model_v
+        for reference in detect_references(self.settings, memory, sample):
+            self._correct(reference)
 
-    def _voltage_tick(self, sample: Sample, without_ocv_v: float) -> VoltageTick:
-        memory, model = self._memory, self._voltage_model
-        cold, hot = model.temperature_range_c
-        margin_k = TEMPERATURE_MARGIN_K
-        drop_v = dot(model.resistance_ohm, self._delayed_a)
-        return VoltageTick(
-            sample.voltage_v,
-            without_ocv_v,
-            drop_v,
-            memory.newton_pct if memory.newton_inside else math.nan,
-            _clip(self._coulomb_pct()),
-            is_filled=self._line.full,
-            is_inside=cold - margin_k <= memory.temperature_c <= hot + margin_k,
+    def _close_block(self, time_s: float) -> None:
+        """Correct the filter by the open block, and test its innovation."""
+        block = self._block.close()
+        if block is None:
+            return
+        memory, hypotheses = self._memory, self.hypotheses
+        self._propagate(block.counted_s, block.discharged_pct)
+        was_rejected = hypotheses.is_rejected
+        hypotheses.update(block)
+        if not hypotheses.is_valid():
+            hypotheses = self.hypotheses = Hypotheses(self._online)
+            memory.resets += 1
+            memory.contradicted_until_s = time_s + CONTRADICTED_S
+        elif hypotheses.is_rejected and not was_rejected:
+            memory.contradicted_until_s = time_s + CONTRADICTED_S
+        memory.is_known = True
+        self._test(time_s)
+        if math.isnan(memory.coulomb_start_pct):
+            self._start_count(*self._filter_soc())
+
+    def _test(self, time_s: float) -> None:
+        """Test the innovations of the last ten minutes, and what the filter has learned.
+
+        Under the model the normalised innovations are independent standard normal, and what is
+        learned of a constant is at most as far from its prior mean as the prior allows.
+        """
+        memory, likelier = self._memory, self.hypotheses.likelier
+        memory.innovations = [*memory.innovations, likelier.normalised_innovation_squared]
+        memory.innovations = memory.innovations[-self._tested_blocks :]
+        is_lasting = sum(memory.innovations) > self._innovations_at_most
+        if is_lasting or likelier.strain() > self._strain_at_most:
+            memory.mismatch_until_s = time_s + MISMATCH_S
+        if is_lasting:
+            # The model may be right and the SoC wrong: charge that was not seen.
+            memory.innovations = []
+            memory.doubt = "mismatch"
+            self.hypotheses.doubt(WRONG_PRIOR, WRONG_STD_PCT)
+
+    def _propagate(self, counted_s: float, discharged_pct: float) -> None:
+        """Predict the filter to a count of time [s] and charge [%]."""
+        memory, gap_var_pct2 = self._memory, self._counter.state.gap_var_pct2
+        self.hypotheses.predict(
+            counted_s - memory.filter_counted_s,
+            discharged_pct - memory.filter_discharged_pct,
+            gap_var_pct2 - memory.filter_gap_var_pct2,
         )
+        memory.filter_counted_s = counted_s
+        memory.filter_discharged_pct = discharged_pct
+        memory.filter_gap_var_pct2 = gap_var_pct2
 
-    def _voltage_without_ocv_v(self) -> float:
-        """Return the model's voltage less the pseudo-OCV at the latest sample [V]."""
-        if math.isnan(self._without_ocv_v):
-            temperature_c = self._memory.temperature_c
-            if math.isnan(temperature_c):
-                temperature_c = self._voltage_model.t_ref_c
-            self._delayed_a = self._line.currents()
-            self._without_ocv_v = self._voltage_model.offset_at(temperature_c, self._delayed_a)
-        return self._without_ocv_v
-
-    def _start(self, soc_pct: float, std_pct: float) -> None:
-        """Start counting, and the filter where it is used, from a SoC [%]."""
-        self._start_count(soc_pct, std_pct * std_pct)
-        if self.settings.method == "ekf":
-            self.filter.start(soc_pct, std_pct)
-            self._is_filtering = True
-            self._since = ChargeSinceUpdate()
-
-    def _start_count(self, soc_pct: float, var_pct2: float) -> None:
-        memory, counter = self._memory, self._counter.state
-        memory.coulomb_start_pct = soc_pct + counter.discharged_pct
-        memory.coulomb_var_pct2 = var_pct2
-        memory.coulomb_counted_s = counter.counted_s
-        memory.coulomb_moved_pct = counter.moved_pct
+    def _propagate_to_now(self) -> None:
+        """Predict the filter to the latest sample; the open block lies in part before it."""
+        self._propagate(self._counter.state.counted_s, self._counter.state.discharged_pct)
+        self._block.state.is_broken = True
 
     def _correct(self, reference: SocReference) -> None:
         """Fuse an external SoC reference into count and filter, weighted by the variances."""
+        self._propagate_to_now()
+        self.hypotheses.correct(reference.soc_pct, reference.soc_std_pct)
+        self._memory.is_known = True
         if math.isnan(self._memory.coulomb_start_pct):
-            self._start(reference.soc_pct, reference.soc_std_pct)
+            self._start_count(reference.soc_pct, reference.soc_std_pct)
             return
-        if not reference.is_by_voltage:
-            self._health.correct(reference.soc_pct, reference.soc_std_pct)
-        soc_pct = _clip(self._coulomb_pct())
-        std_pct, reference_std_pct = self._coulomb_std_pct(), reference.soc_std_pct
-        var_pct2, reference_var_pct2 = std_pct * std_pct, reference_std_pct * reference_std_pct
-        gain = var_pct2 / (var_pct2 + reference_var_pct2)
-        self._start_count(soc_pct + gain * (reference.soc_pct - soc_pct), (1.0 - gain) * var_pct2)
-        if self._is_filtering:
-            self.filter.correct(reference.soc_pct, reference.soc_std_pct)
+        soc_pct, var_pct2 = _clip(self._coulomb_pct()), self._coulomb_std_pct() ** 2
+        gain = var_pct2 / (var_pct2 + reference.soc_std_pct**2)
+        soc_pct += gain * (reference.soc_pct - soc_pct)
+        self._start_count(soc_pct, math.sqrt((1.0 - gain) * var_pct2))
+
+    def _start(self, soc_pct: float, std_pct: float, *, is_doubtful: bool) -> None:
+        """Start filter and count from a SoC and its standard deviation [%]."""
+        self.hypotheses = Hypotheses(self._online, soc_pct, std_pct, is_doubtful=is_doubtful)
+        self._memory.is_known = True
+        self._memory.doubt = "start" if is_doubtful else ""
+        self._start_count(soc_pct, std_pct)
+
+    def _start_count(self, soc_pct: float, std_pct: float) -> None:
+        memory, counter = self._memory, self._counter.state
+        memory.coulomb_start_pct = soc_pct + counter.discharged_pct
+        memory.coulomb_var_pct2 = std_pct**2
+        memory.coulomb_counted_s = counter.counted_s
+        memory.coulomb_moved_pct = counter.moved_pct
+        memory.coulomb_gap_var_pct2 = counter.gap_var_pct2
+
+    @property
+    def _temperature_c(self) -> float:
+        """Latest known temperature [°C]; the model's reference before the first."""
+        known_c = self._memory.temperature_c
+        return self.voltage_model.t_ref_c if math.isnan(known_c) else known_c
+
+    def _load(self) -> tuple[FloatArray, float, float]:
+        """Return the load row at the latest sample, its voltage, and the resistances' part [V]."""
+        load, theta = self._online.load(), self._online.load_coefficients
+        return load, float(load @ theta), float(load[1:] @ theta[1:])
 
     def _evaluate(self) -> Estimate:
         """Return the estimate after the latest accepted sample."""
         if self._pending is None:
             return self._latest
         (sample, stamp_s), self._pending = self._pending, None
+        memory = self._memory
         soc_pct, std_pct = self._soc_and_std_pct()
-        voltage_model_v = math.nan
-        if not math.isnan(soc_pct):
-            ocv_v = self._curve.pseudo_ocv_at(soc_pct)[0]
-            voltage_model_v = ocv_v + self._voltage_without_ocv_v()
         reasons = self._reasons(sample, soc_pct, std_pct)
         self._latest = Estimate(
             stamp_s,
             soc_pct,
             std_pct,
-            self._memory.newton_pct,
+            memory.newton_pct,
             _clip(self._coulomb_pct()),
-            voltage_model_v,
-            sample.voltage_v - voltage_model_v,
+            memory.voltage_model_v,
+            memory.residual_v,
             status_of(reasons),
             reasons,
-            self._memory.samples,
+            memory.samples,
         )
         return self._latest
 
@@ -484,24 +421,21 @@ class Estimator:
         memory, method = self._memory, self.settings.method
         if method == "newton":
             return memory.newton_pct, memory.newton_std_pct
-        if math.isnan(memory.coulomb_start_pct):
+        if not memory.is_known:
             return math.nan, math.nan
         if method == "coulomb":
             return _clip(self._coulomb_pct()), self._coulomb_std_pct()
-        soc_pct, std_pct = self.filter.soc_after(self._since)
-        if self._counter.state.time_s < memory.mismatch_until_s:
-            # A model that does not fit: as uncertain as its inputs disagree.
-            counted_pct = _clip(self._coulomb_pct()) - soc_pct
-            parts_pct = (std_pct, memory.bias_pct, counted_pct)
-            std_pct = math.sqrt(dot(parts_pct, parts_pct))
-        return soc_pct, std_pct
+        return self._filter_soc()
 
-    def _has_other_capacity(self) -> bool:
-        """Return whether the learned capacity is beyond what the filter allows for, surely."""
-        capacity_ah, std_ah = self._health.capacity
-        difference_ah = abs(capacity_ah - self.capacity_ah)
-        allowed_ah = max(std_ah, CAPACITY_STD * self.capacity_ah)
-        return difference_ah > MISMATCH_SIGMAS * allowed_ah
+    def _filter_soc(self) -> tuple[float, float]:
+        """Return SoC and standard deviation of the filter, counted to the latest sample [%]."""
+        memory, counter = self._memory, self._counter.state
+        soc_pct, std_pct = self.hypotheses.soc_after(
+            counter.counted_s - memory.filter_counted_s,
+            counter.discharged_pct - memory.filter_discharged_pct,
+            counter.gap_var_pct2 - memory.filter_gap_var_pct2,
+        )
+        return _clip(soc_pct), std_pct
 
     def _coulomb_pct(self) -> float:
         """Return the SoC by counting alone [%], not clipped; NaN until counting has started."""
@@ -509,38 +443,30 @@ class Estimator:
 
     def _coulomb_std_pct(self) -> float:
         memory, counter = self._memory, self._counter.state
-        hours = (counter.counted_s - memory.coulomb_counted_s) / 3600.0
-        moved_pct = counter.moved_pct - memory.coulomb_moved_pct
-        return count_std_pct(self.capacity_ah, memory.coulomb_var_pct2, hours, moved_pct)
+        return count_std_pct(
+            memory.coulomb_var_pct2 + counter.gap_var_pct2 - memory.coulomb_gap_var_pct2,
+            counter.counted_s - memory.coulomb_counted_s,
+            counter.moved_pct - memory.coulomb_moved_pct,
+        )
 
-    def _reasons(  # noqa: C901 - one line a reason
-        self, sample: Sample, soc_pct: float, std_pct: float
-    ) -> Reason:
+    def _reasons(self, sample: Sample, soc_pct: float, std_pct: float) -> Reason:
         # In plain bits: operations on flags are slow. Comparisons with NaN are false.
-        memory = self._memory
-        bits = int(self._permanent_reasons)
-        if self._implausible:
-            bits |= int(self._implausible)
-        if math.isnan(soc_pct):
-            bits |= int(Reason.NO_INITIAL_SOC)
-        if std_pct > self.settings.valid_std_pct:
-            bits |= int(Reason.SOC_UNCERTAIN)
-        if self._line.filled_s < self._voltage_model.delay_s[-1]:
-            bits |= int(Reason.DELAY_LINE_FILLING)
-        if sample.time_s < memory.gap_until_s:
-            bits |= int(Reason.CURRENT_GAP)
-        if math.isnan(sample.voltage_v):
-            bits |= int(Reason.VOLTAGE_MISSING)
-        if math.isnan(sample.temperature_c):
-            bits |= int(Reason.TEMPERATURE_MISSING)
-        if not memory.newton_inside:
-            bits |= int(Reason.VOLTAGE_OUTSIDE_MODEL)
-        if sample.time_s < memory.contradicted_until_s:
-            bits |= int(Reason.INNOVATION_LARGE)
-        if sample.time_s < memory.mismatch_until_s:
-            bits |= int(Reason.MODEL_MISMATCH)
-        outside = outside_model(self._voltage_model, soc_pct, sample)
-        return REASONS[bits | int(outside) if outside else bits]
+        memory, line = self._memory, self._online.delay_line
+        bits = int(self._permanent_reasons) | int(self._implausible)
+        for is_set, reason in (
+            (math.isnan(soc_pct), Reason.NO_INITIAL_SOC),
+            (std_pct > self.settings.valid_std_pct, Reason.SOC_UNCERTAIN),
+            (line.filled_s < line.longest_s, Reason.DELAY_LINE_FILLING),
+            (sample.time_s < memory.gap_until_s, Reason.CURRENT_GAP),
+            (math.isnan(sample.voltage_v), Reason.VOLTAGE_MISSING),
+            (math.isnan(sample.temperature_c), Reason.TEMPERATURE_MISSING),
+            (not memory.newton_inside, Reason.VOLTAGE_OUTSIDE_MODEL),
+            (sample.time_s < memory.contradicted_until_s, Reason.INNOVATION_LARGE),
+            (sample.time_s < memory.mismatch_until_s, Reason.MODEL_MISMATCH),
+        ):
+            if is_set:
+                bits |= int(reason)
+        return REASONS[bits | int(outside_model(self.voltage_model, soc_pct, sample))]
 
     def snapshot(self) -> EstimatorState:
         """Return a copy of everything needed to continue as if not interrupted."""
@@ -550,13 +476,11 @@ class Estimator:
             capacity_ah=self.capacity_ah,
             clock=replace(self._clock.state),
             counter=replace(self._counter.state),
-            line=DelayLineState(*self._line.contents),
-            effects=self._online.state(),
-            filter=self.filter.snapshot(),
-            since=replace(self._since),
-            references=replace(self._references.state),
-            memory=replace(self._memory),
-            health=self._health.snapshot(),
+            line=DelayLineState(*self._online.delay_line.contents),
+            online=self._online.state(),
+            block=self._block.snapshot(),
+            hypotheses=self.hypotheses.snapshot(),
+            memory=replace(self._memory, innovations=list(self._memory.innovations)),
             estimate=list(latest[:7]),
             reasons=int(latest.reasons),
         )
@@ -565,7 +489,7 @@ class Estimator:
         """Continue from a state of the same model, and return its last estimate.
 
         With the state's method and capacity, the next sample continues bit for bit. With another
-        method or capacity, only the SoC and its uncertainty are taken over.
+        method or capacity, the filter starts from the state's SoC and standard deviation.
 
         Parameters
         ----------
@@ -584,86 +508,56 @@ class Estimator:
             If the state does not fit the model; the estimator must then not be used.
         """
         self._resume(state, age_s)
-        self._online.restore(state.effects, state.clock.last_s)
-        self._references.state = replace(state.references)
-        self._health.restore(state.health)
-        if (state.method, state.capacity_ah) != (self.settings.method, self.capacity_ah):
+        line = state.line
+        self._online.delay_line.fill(line.time_s, line.current_a, line.since_s)
+        self._online.restore(state.online)
+        if (state.method, state.capacity_ah) == (self.settings.method, self.capacity_ah):
+            self._block.restore(state.block)
+            self.hypotheses.restore(state.hypotheses)
+        else:
             self._start_from(state)
-            return self._latest
-        if self.settings.method == "ekf" and not math.isnan(self._memory.coulomb_start_pct):
-            self.filter.restore(state.filter)
-            self._is_filtering = True
-        if self.settings.method != "newton":
-            self._check_agreement(state)
         return self._latest
 
     def take_over(self, before: Estimator) -> None:
         """Continue from another estimator, of another model or with other settings.
 
-        SoC and standard deviation, the delay line, the last sample (so that counting continues) and
-        the ends of gaps are carried over. The current's offset, the model's biases and the states
-        of effects belong to the other model and are estimated again. An unknown SoC stays unknown.
+        SoC and standard deviation, the delay line, the last sample (so that counting continues),
+        the ends of gaps, the learned capacity and the current's offset are carried over. What the
+        filter has learned of the other model's voltage is not. An unknown SoC stays unknown.
         """
         state = before.snapshot()
         self._resume(state, before._clock.age_s)
-        line = state.line
-        if line.time_s and self._line.longest_s > before._line.longest_s:
-            # The other delay line has dropped what this longer one needs.
-            self._line.fill(line.time_s, line.current_a, max(line.since_s, line.time_s[0]))
-        self._memory.tick = -1
-        self._memory.level_s = math.nan
-        self._health.take_over(before._health)
+        self._online.take_over(before._online)
         self._start_from(state)
+        self.hypotheses.take_over(before.hypotheses)
 
     def _resume(self, state: EstimatorState, age_s: float | None) -> None:
         """Copy from a state what depends on neither model nor settings."""
         self._clock.restore(replace(state.clock), age_s)
         self._counter.restore(replace(state.counter))
-        self._line.fill(state.line.time_s, state.line.current_a, state.line.since_s)
-        self._since = replace(state.since)
-        self._memory = replace(state.memory)
+        self._memory = replace(state.memory, innovations=list(state.memory.innovations))
         reasons = Reason(state.reasons)
         self._latest = Estimate._make(
             [*state.estimate, status_of(reasons), reasons, state.memory.samples]
         )
         self._pending, self.is_refused = None, False
-        self._is_filtering = False
 
     def _start_from(self, state: EstimatorState) -> None:
         """Start from the SoC of another estimator, if it knew one."""
-        coulomb_pct = state.estimate[4]
-        self._memory.mismatch_until_s, self._memory.bias_pct = math.nan, 0.0
-        if not (math.isnan(state.soc_pct) or math.isnan(state.soc_std_pct)):
-            self._start(state.soc_pct, min(state.soc_std_pct, UNKNOWN_SOC_STD_PCT))
-        elif not math.isnan(coulomb_pct):
+        memory, counter = self._memory, self._counter.state
+        memory.mismatch_until_s, memory.innovations = math.nan, []
+        memory.filter_counted_s = counter.counted_s
+        memory.filter_discharged_pct = counter.discharged_pct
+        memory.filter_gap_var_pct2 = counter.gap_var_pct2
+        self._block.begin(state.block.number)
+        self._block.state.is_broken = True
+        memory.is_known, memory.coulomb_start_pct = False, math.nan
+        if math.isnan(state.soc_pct):
             # The inverse has no SoC without a voltage; counting has.
-            self._start(coulomb_pct, UNKNOWN_SOC_STD_PCT)
+            if not math.isnan(state.estimate[4]):
+                self._start(state.estimate[4], UNKNOWN_STD_PCT, is_doubtful=False)
         else:
-            self._memory.coulomb_start_pct = math.nan
-
-    def _check_agreement(self, state: EstimatorState) -> None:
-        """Refuse a state whose filter or count contradicts its last estimate."""
-        soc_pct, std_pct = self._soc_and_std_pct()
-        kept_std_pct = state.soc_std_pct
-        # `take_over` limits the standard deviation that an estimator starts from.
-        apart_pct = min(
-            abs(std_pct - kept_std_pct), abs(std_pct - min(kept_std_pct, UNKNOWN_SOC_STD_PCT))
-        )
-        if abs(soc_pct - state.soc_pct) > AGREES_PCT or apart_pct > AGREES_PCT:
-            raise InputError(
-                f"the last estimate, {state.soc_pct:g} ± {kept_std_pct:g} %, contradicts filter"
-                f" and count, {soc_pct:g} ± {std_pct:g} %",
-                field="estimate",
-            )
-
-
-def _ekf_type(settings: EstimatorSettings) -> type[SocEkf]:
-    if settings.filter == "reference":
-        # filterpy is slow to import, and only a check needs it.
-        from cangauge.estimation.reference_filter import ReferenceEkf  # noqa: PLC0415
-
-        return ReferenceEkf
-    return SocEkf
+            self._start(state.soc_pct, state.soc_std_pct, is_doubtful=False)
 
 
 def _clip(soc_pct: float) -> float:

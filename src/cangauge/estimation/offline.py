@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import itertools
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
@@ -23,7 +22,6 @@ from cangauge.estimation.settings import (
     LongRest,
     Method,
 )
-from cangauge.estimation.smoothing import RecordingEkf, Smoother
 from cangauge.logs.gaps import usual_gap_s
 from cangauge.logs.log import Log
 from cangauge.model.coulomb_counting import counted_soc_pct
@@ -39,9 +37,6 @@ LONGEST_GAP_S = 3600.0
 
 NUMBERS = Estimate._fields[:7]
 """Columns of numbers, from `time_s` to `residual_v`."""
-
-SMOOTH_NUMBERS = ("soc_smooth_pct", "soc_smooth_std_pct")
-"""Further columns of a smoothed log."""
 
 
 @dataclass(frozen=True)
@@ -82,8 +77,6 @@ class EstimateTable(ArrowExport):
         `Status` and `Reason` bits.
     scores : Scores, optional
         Errors against the log's reference SoC, from `estimate`.
-    soc_smooth_pct, soc_smooth_std_pct : array of shape (n,), optional
-        State of charge given the whole log, and its standard deviation [%], if asked for.
     """
 
     time_s: FloatArray
@@ -96,8 +89,6 @@ class EstimateTable(ArrowExport):
     status: NDArray[np.int64]
     reasons: NDArray[np.int64]
     scores: Scores | None = None
-    soc_smooth_pct: FloatArray | None = None
-    soc_smooth_std_pct: FloatArray | None = None
 
     @classmethod
     def of(cls, estimates: Iterable[Estimate]) -> EstimateTable:
@@ -109,12 +100,6 @@ class EstimateTable(ArrowExport):
         }
         numbers: dict[str, Any] = {name: np.array(by_name[name], np.float64) for name in NUMBERS}
         return cls(**numbers, **flags)
-
-    @classmethod
-    def joined(cls, blocks: Sequence[Sequence[NDArray[Any]]]) -> EstimateTable:
-        """Join blocks of columns, from `time_s` to `reasons`."""
-        columns: Any = map(np.concatenate, zip(*blocks, strict=True))
-        return cls(*columns) if blocks else cls.of([])
 
     def plot(self, log: Log | None = None) -> Any:
         """Return SoC with ±2σ and voltage residual over time, for `bokeh.plotting.show`.
@@ -130,10 +115,6 @@ class EstimateTable(ArrowExport):
         """Return the number of samples."""
         return int(self.time_s.size)
 
-    @property
-    def _numbers(self) -> tuple[str, ...]:
-        return NUMBERS if self.soc_smooth_pct is None else (*NUMBERS, *SMOOTH_NUMBERS)
-
     def to_arrow(self) -> Any:
         """Return a pyarrow.Table of the columns; unknown is null, status and reasons are words."""
         import pyarrow as pa  # noqa: PLC0415 - slow to import, and not needed to estimate
@@ -141,7 +122,7 @@ class EstimateTable(ArrowExport):
         words = {code: reason_names(code) for code in np.unique(self.reasons).tolist()}
         return pa.table(
             {
-                **{name: pa.array(getattr(self, name), from_pandas=True) for name in self._numbers},
+                **{name: pa.array(getattr(self, name), from_pandas=True) for name in NUMBERS},
                 "status": [Status(code).name.lower() for code in self.status.tolist()],
                 "reasons": [words[code] for code in self.reasons.tolist()],
             }
@@ -160,7 +141,6 @@ def estimate(
     gap_s: float | None = None,
     full_charge: FullCharge | None = None,
     long_rest: LongRest | None = None,
-    smooth: bool = False,
 ) -> EstimateTable:
     """Estimate the state of charge at every sample of a log.
 
@@ -185,8 +165,6 @@ def estimate(
     full_charge : FullCharge, optional
     long_rest : LongRest, optional
         Rules for an external SoC reference.
-    smooth : bool
-        Add the best SoC given the whole log, with its standard deviation.
 
     Returns
     -------
@@ -223,7 +201,7 @@ def estimate(
         full_charge=full_charge,
         long_rest=long_rest,
     )
-    table, scores = estimate_log(log, model, settings, smooth=smooth)
+    table, scores = estimate_log(log, model, settings)
     return replace(table, scores=scores)
 
 
@@ -249,15 +227,14 @@ def estimate_log(
     log: Log,
     model: Model,
     settings: EstimatorSettings,
+    *,
     progress: Callable[[int], None] | None = None,
     observe: Callable[[Estimator, Sample], None] | None = None,
-    *,
-    smooth: bool = False,
     at_end: Callable[[Estimator], None] | None = None,
 ) -> tuple[EstimateTable, Scores]:
     """Estimate a log with given settings, and score it; see `run_estimator` and `score`."""
     began = time.perf_counter()
-    table = run_estimator(log, model, settings, progress, observe, smooth=smooth, at_end=at_end)
+    table = run_estimator(log, model, settings, progress=progress, observe=observe, at_end=at_end)
     return table, score(table, log, time.perf_counter() - began)
 
 
@@ -267,46 +244,32 @@ def samples_of(log: Log) -> Iterator[Sample]:
     yield from map(Sample._make, zip(*(each.tolist() for each in columns), strict=True))
 
 
-def update_all(estimator: Estimator, log: Log) -> None:
-    """Let an estimator process all rows of a log, by its compiled loop if it has one."""
-    if isinstance(estimator, CompiledEstimator):
-        _run_compiled(estimator, _blocks(log))
-        return
-    for sample in samples_of(log):
-        estimator.update(sample)
-
-
 def run_estimator(
     samples: Iterable[Sample] | Log,
     model: Model,
     settings: EstimatorSettings,
+    *,
     progress: Callable[[int], None] | None = None,
     observe: Callable[[Estimator, Sample], None] | None = None,
-    *,
-    smooth: bool = False,
     at_end: Callable[[Estimator], None] | None = None,
 ) -> EstimateTable:
-    """Return the estimates of all samples, in order.
+    """Return the estimates of all samples, in order: the same step as live.
 
     Parameters
     ----------
     samples : iterable of Sample, or Log
-        A log is the fastest.
     model : Model
     settings : EstimatorSettings
     progress : callable, optional
         Called with the number of samples done, every `PROGRESS_EVERY`.
     observe : callable, optional
         Called with estimator and sample after each sample.
-    smooth : bool
-        Add the smoothed SoC (`smoothing`), which takes a few kB of memory for each voltage used.
     at_end : callable, optional
         Called with the estimator after the last sample.
     """
-    smoother = Smoother() if smooth else None
-    estimator = make_estimator(model, settings, None if smoother is None else RecordingEkf)
-    if isinstance(estimator, CompiledEstimator) and observe is None:
-        table = _run_compiled(estimator, _blocks(samples), progress)
+    estimator = make_estimator(model, settings)
+    if isinstance(estimator, CompiledEstimator) and isinstance(samples, Log) and observe is None:
+        table = _run_columns(estimator, samples, progress)
     else:
         estimates = []
         rows = samples_of(samples) if isinstance(samples, Log) else samples
@@ -314,43 +277,27 @@ def run_estimator(
             estimates.append(estimator.step(sample))
             if observe is not None:
                 observe(estimator, sample)
-            if smoother is not None:
-                smoother.observe(estimator)
             if progress is not None and done % PROGRESS_EVERY == 0:
                 progress(done)
         table = EstimateTable.of(estimates)
     if at_end is not None:
         at_end(estimator)
-    if smoother is None:
-        return table
-    soc_pct, std_pct = smoother.soc(estimator, table.soc_pct, table.soc_std_pct)
-    return replace(table, soc_smooth_pct=soc_pct, soc_smooth_std_pct=std_pct)
+    return table
 
 
-def _blocks(samples: Iterable[Sample] | Log) -> Iterator[list[FloatArray]]:
-    """Yield blocks of up to `PROGRESS_EVERY` samples as columns."""
-    if isinstance(samples, Log):
-        columns = (samples.time_s, samples.current_a, samples.voltage_v, samples.temperature_c)
-        for row in range(0, len(samples), PROGRESS_EVERY):
-            yield [each[row : row + PROGRESS_EVERY] for each in columns]
-        return
-    rest = iter(samples)
-    while block := list(itertools.islice(rest, PROGRESS_EVERY)):
-        yield list(np.array(block, dtype=np.float64).T)
-
-
-def _run_compiled(
-    estimator: CompiledEstimator,
-    blocks: Iterable[Sequence[FloatArray]],
-    progress: Callable[[int], None] | None = None,
+def _run_columns(
+    estimator: CompiledEstimator, log: Log, progress: Callable[[int], None] | None
 ) -> EstimateTable:
-    found, done = [], 0
-    for block in blocks:
-        found.append(estimator.run(block))
-        done += len(block[0])
-        if progress is not None and done % PROGRESS_EVERY == 0:
-            progress(done)
-    return EstimateTable.joined(found)
+    """Return the estimates of a log, in the compiled loop."""
+    parts = []
+    for first in range(0, len(log), PROGRESS_EVERY):
+        part = log.rows(slice(first, first + PROGRESS_EVERY))
+        columns = (part.time_s, part.current_a, part.voltage_v, part.temperature_c)
+        parts.append(estimator.run(columns))
+        if progress is not None and len(part) == PROGRESS_EVERY:
+            progress(first + PROGRESS_EVERY)
+    joined: list[Any] = [np.concatenate(column) for column in zip(*parts, strict=True)]
+    return EstimateTable(*joined)
 
 
 def score(table: EstimateTable, log: Log, seconds: float = 0.0) -> Scores:

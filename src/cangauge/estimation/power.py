@@ -1,18 +1,10 @@
 """Power and energy: the current possible for 10 s within limits, and the energy left.
 
-The voltage after h seconds of a constant current I from now on is
-
-    U(h) = OCV(S − a·I·h) + kt·(T − T_r) + ρ·(Σ Rj·I [dj ≤ h] + Σ Rj·I(t + h − dj) [dj > h]) + level
-
-with the currents of the delay line for what lies before now, the learned resistance ratio ρ, and
-the present level of the residual, so that an error of the model's level or of the SoC does not
-count twice. The smallest current that meets a limit of the voltage within the horizon is the
-possible one.
-
-The standard deviation of the current is that of U at the limit over |dU/dI|: the error of the
-resistance on the change of the drop, the voltage's fast error, the wander of its bias, and the
-curvature of the OCV within the SoC's standard deviation. Effects with dynamics of their own are
-held at their present voltage.
+The voltage after h seconds of a constant current I from now on is that of the filter's measurement
+equation, with the currents of the delay line for what lies before now, at S − 100·I·h/(3600 C). It
+is solved for the current that meets a limit of the voltage; the smallest one within the horizon is
+the possible one. Its standard deviation is that of the voltage, H P Hᵀ + R, over |dU/dI|. State and
+covariance include what is learned of capacity and resistance.
 
 The energy is that of a discharge at a third of the capacity per hour, as in the standard energy
 test of traction cells (IEC 62660-1), to a SoC or to the lowest voltage, whichever comes first.
@@ -21,24 +13,24 @@ test of traction cells (IEC 62660-1), to a SoC or to the lowest voltage, whichev
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Final, NamedTuple
 
+import numpy as np
+
+from cangauge._typing import FloatArray
 from cangauge.errors import InputError
-from cangauge.estimation.health import Health
-from cangauge.model.delay_line import DelayLine
-from cangauge.model.model_file import ModelNoise
-from cangauge.model.voltage_model import Curve, VoltageModel
+from cangauge.estimation.ekf import FUNCTIONS, LEAST_SLOPE, LEVEL, SLOW, SocFilter
+from cangauge.estimation.health import health_of
+from cangauge.model.extended import OnlineModel
+from cangauge.model.voltage_model import VoltageModel
+from cangauge.types import Health, Power
 
 HORIZON_S: Final = 10.0
 """Time for which the current is possible [s]."""
 
-STEPS: Final = 10
+STEPS: Final = 5
 """Moments within the horizon at which the voltage must lie within the limits."""
-
-LEVEL_MEMORY_S: Final = 30.0
-"""Memory of the residual's level [s]: several of the fast error's time constants."""
 
 ENERGY_C_RATE: Final = 1.0 / 3.0
 """Discharge for the energy [1/h] (IEC 62660-1)."""
@@ -48,7 +40,6 @@ ENERGY_STEPS: Final = 40
 
 _ITERATIONS: Final = 6
 _CLOSE_A: Final = 1e-3
-_NAN: Final = math.nan
 
 
 @dataclass(frozen=True)
@@ -132,206 +123,156 @@ class KnownLimits(NamedTuple):
     cutoff_soc_pct: float
 
 
-class Power(NamedTuple):
-    """Possible currents, both positive, and the energy left; NaN where not known."""
-
-    discharge_a: float = _NAN
-    """Discharge current possible for 10 s [A]."""
-    discharge_std_a: float = _NAN
-    charge_a: float = _NAN
-    """Charge current possible for 10 s [A]."""
-    charge_std_a: float = _NAN
-    energy_wh: float = _NAN
-    """Energy left to the cut-off [Wh]."""
-    energy_std_wh: float = _NAN
-
-
-class PackNow(NamedTuple):
-    """What the estimator knows at a sample."""
-
-    soc_pct: float
-    soc_std_pct: float
-    temperature_c: float
-    """[°C]; NaN: not known."""
-    residual_v: float
-    """Level of measured minus predicted voltage [V]; NaN: no voltage lately."""
-    drop_v: float
-    """Level of the predicted drop, over the same time [V]."""
-    health: Health
-
-
 class PowerModel:
     """Predict the voltage of a constant current, and find the possible one.
 
     Parameters
     ----------
-    curve : Curve
-        Pseudo-OCV, effects included.
-    model : VoltageModel
-    noise : ModelNoise
-    limits : KnownLimits
+    model : OnlineModel
+    limits : PackLimits
     """
 
-    def __init__(
-        self, curve: Curve, model: VoltageModel, noise: ModelNoise, limits: KnownLimits
-    ) -> None:
-        self.limits = limits
-        self._curve = curve
+    def __init__(self, model: OnlineModel, limits: PackLimits) -> None:
+        self.limits = limits.of_model(model.model)
         self._model = model
-        self._fast_var = noise.fast_std_v**2
-        wander = -math.expm1(-2.0 * (HORIZON_S + LEVEL_MEMORY_S) / noise.slow_time_s)
-        self._wander_var = noise.slow_std_v**2 * wander
-        self._bias_var = noise.slow_std_v**2 + noise.lasting_std_v**2
 
-    def at(self, now: PackNow, line: DelayLine) -> Power:
+    def at(
+        self, filter_: SocFilter, soc_pct: float, soc_std_pct: float, temperature_c: float
+    ) -> Power:
         """Return the possible currents and the energy left.
 
         Parameters
         ----------
-        now : PackNow
-        line : DelayLine
-            Currents up to now.
+        filter_ : SocFilter
+        soc_pct, soc_std_pct : float
+            The estimate now [%].
+        temperature_c : float
         """
-        # A learned resistance of the wrong sign: those of the model are not the pack's.
-        if math.isnan(now.soc_pct) or not line.filled_s > 0.0 or now.health.resistance_ratio <= 0.0:
+        ahead = _Ahead(self._model, filter_, soc_pct, temperature_c)
+        if 1.0 + ahead.resistance <= 0.0:  # learned of the wrong sign: not the pack's
             return Power()
-        level = self._level(now)
-        moments = self._moments(now, line)
         limits = self.limits
-        out = self._possible(now, level, moments, limits.min_voltage_v, min)
-        into = self._possible(now, level, moments, limits.max_voltage_v, max)
-        energy = self._energy(now, level)
+        moments = [HORIZON_S * step / STEPS for step in range(1, STEPS + 1)]
+        out = [ahead.current_at(limits.min_voltage_v, each) for each in moments]
+        into = [ahead.current_at(limits.max_voltage_v, each) for each in moments]
+        discharge = min(filter(None, out), default=(math.nan, math.nan))
+        charge = max(filter(None, into), default=(math.nan, math.nan))
         return Power(
-            *_within(out[0], out[1], limits.max_discharge_a),
-            *_within(-into[0], into[1], limits.max_charge_a),
-            *energy,
+            *_within(discharge[0], discharge[1], limits.max_discharge_a),
+            *_within(-charge[0], charge[1], limits.max_charge_a),
+            *self._energy(ahead, soc_std_pct),
         )
 
-    def voltage_after(self, now: PackNow, line: DelayLine, current_a: float) -> float:
-        """Return the voltage at the end of the horizon with a constant current [V]."""
-        _, resistance_ohm, past_v, seconds = self._moments(now, line)[-1]
-        offset_v = self._level(now)[0]
-        soc_pct = now.soc_pct - self._pct_per_as(now) * current_a * seconds
-        ocv_v = self._curve.pseudo_ocv_at(soc_pct)[0]
-        return ocv_v + offset_v + past_v + resistance_ohm * current_a
-
-    def _level(self, now: PackNow) -> tuple[float, float]:
-        """Return the voltage without OCV and drop [V], and its variance [V²]."""
-        model, ratio = self._model, now.health.resistance_ratio
-        temperature_c = model.t_ref_c if math.isnan(now.temperature_c) else now.temperature_c
-        base_v = model.offset_at(temperature_c, (0.0,) * len(model.delay_s))
-        if math.isnan(now.residual_v):
-            slope = self._curve.pseudo_ocv_at(now.soc_pct)[1]
-            return base_v, self._bias_var + (slope * now.soc_std_pct) ** 2
-        return base_v + now.residual_v - (ratio - 1.0) * now.drop_v, self._wander_var
-
-    def _pct_per_as(self, now: PackNow) -> float:
-        return 100.0 / (3600.0 * now.health.capacity_ah)
-
-    def _moments(self, now: PackNow, line: DelayLine) -> list[tuple[float, float, float, float]]:
-        """Return the terms of the drop at each moment of the horizon.
-
-        Unknown past [V], resistance of the current to come [Ω], drop of the past currents [V], and
-        time from now [s].
-        """
-        model, ratio = self._model, now.health.resistance_ratio
-        usual_a = ENERGY_C_RATE * now.health.capacity_ah
-        filled_s, found = line.filled_s, []
-        for step in range(1, STEPS + 1):
-            seconds = HORIZON_S * step / STEPS
-            ohm = past_v = unknown_v = 0.0
-            for resistance, delay in zip(model.resistance_ohm, model.delay_s, strict=True):
-                if delay <= seconds:
-                    ohm += resistance
-                    continue
-                past_v += resistance * line.current_at(delay - seconds)
-                if delay - seconds > filled_s:
-                    unknown_v += abs(resistance) * usual_a
-            found.append((unknown_v, ratio * ohm, ratio * past_v, seconds))
-        return found
-
-    def _possible(
-        self,
-        now: PackNow,
-        level: tuple[float, float],
-        moments: list[tuple[float, float, float, float]],
-        limit_v: float,
-        nearest: Callable[..., tuple[float, float]],
-    ) -> tuple[float, float]:
-        """Return the current that meets a voltage first within the horizon, and its std [A].
-
-        A model of constant currents knows the sum of its resistances, but not when each acts: at a
-        moment at which its voltage would rise with the current, it knows no limit. NaN: at none.
-        """
-        per_as = self._pct_per_as(now)
-        found = []
-        for unknown_v, ohm, past_v, seconds in moments:
-            fixed_v = level[0] + past_v - limit_v
-            per_a = per_as * seconds
-            current_a, slope = 0.0, 0.0
-            for _ in range(_ITERATIONS):
-                ocv_v, slope = self._curve.pseudo_ocv_at(now.soc_pct - per_a * current_a)
-                step_a = (ocv_v + fixed_v + ohm * current_a) / (slope * per_a - ohm)
-                current_a += step_a
-                if abs(step_a) < _CLOSE_A:
-                    break
-            volt_per_a = slope * per_a - ohm
-            if volt_per_a <= 0.0:
-                continue
-            drop_v = past_v + ohm * current_a - now.health.resistance_ratio * now.drop_v
-            error_v = now.health.resistance_std / now.health.resistance_ratio * drop_v
-            variance = self._fast_var + level[1] + error_v**2 + unknown_v**2
-            variance += self._curvature_v(now, per_a * current_a) ** 2
-            found.append((current_a, math.sqrt(variance) / volt_per_a))
-        return nearest(found) if found else (_NAN, _NAN)
-
-    def _curvature_v(self, now: PackNow, taken_pct: float) -> float:
-        """Return how much the fall of the OCV differs one standard deviation lower [V]."""
-        at = self._curve.pseudo_ocv_at
-        lower = now.soc_pct - now.soc_std_pct
-        here_v = at(now.soc_pct)[0] - at(now.soc_pct - taken_pct)[0]
-        return at(lower)[0] - at(lower - taken_pct)[0] - here_v
-
-    def _energy(self, now: PackNow, level: tuple[float, float]) -> tuple[float, float]:
+    def _energy(self, ahead: _Ahead, soc_std_pct: float) -> tuple[float, float]:
         """Return the energy left and its standard deviation [Wh]."""
-        health, limits = now.health, self.limits
-        ohm = health.resistance_ratio * sum(self._model.resistance_ohm)
-        drop_v = ohm * ENERGY_C_RATE * health.capacity_ah
-        span_pct = now.soc_pct - limits.cutoff_soc_pct
-        if span_pct <= 0.0:
-            return 0.0, _energy_std_wh(now, 0.0, self._volts(now.soc_pct, level, drop_v), 0.0)
-        step_pct = span_pct / ENERGY_STEPS
-        energy_wh, soc_pct, end_pct = 0.0, now.soc_pct, 0.0
-        volts = self._volts(soc_pct, level, drop_v)
+        health, limits, soc_pct = ahead.health, self.limits, ahead.soc_pct
+        lowest_v, end_pct, energy_wh = limits.min_voltage_v, 0.0, 0.0
+        usual_a = ENERGY_C_RATE * health.capacity_ah
+        step_pct = max(soc_pct - limits.cutoff_soc_pct, 0.0) / ENERGY_STEPS
+        first_v = volts = ahead.lasting_v(soc_pct, usual_a)
         for _ in range(ENERGY_STEPS):
-            if volts <= limits.min_voltage_v:
-                slope = self._curve.pseudo_ocv_at(soc_pct)[1]
-                end_pct = math.sqrt(level[1]) / slope
+            if volts <= lowest_v:
+                end_pct = ahead.std_v / max(self._model.curve(soc_pct)[1], LEAST_SLOPE)
                 break
             soc_pct -= step_pct
-            below_v = self._volts(soc_pct, level, drop_v)
-            part = 1.0
-            if below_v < limits.min_voltage_v:
-                part = (volts - limits.min_voltage_v) / (volts - below_v)
+            below_v = ahead.lasting_v(soc_pct, usual_a)
+            part = 1.0 if below_v >= lowest_v else (volts - lowest_v) / (volts - below_v)
             mean_v = volts - 0.5 * part * (volts - below_v)
             energy_wh += mean_v * part * step_pct / 100.0 * health.capacity_ah
             volts = below_v
-        return energy_wh, _energy_std_wh(
-            now, energy_wh, self._volts(now.soc_pct, level, drop_v), end_pct
+        return energy_wh, math.hypot(
+            first_v * math.hypot(soc_std_pct, end_pct) / 100.0 * health.capacity_ah,
+            energy_wh * health.capacity_std_ah / health.capacity_ah,
         )
 
-    def _volts(self, soc_pct: float, level: tuple[float, float], drop_v: float) -> float:
-        return self._curve.pseudo_ocv_at(soc_pct)[0] + level[0] + drop_v
 
+class _Ahead:
+    """The filter's prediction from one moment on."""
 
-def _energy_std_wh(now: PackNow, energy_wh: float, volts: float, end_pct: float) -> float:
-    """Return the energy's standard deviation from SoC, its end [%] and capacity [Wh]."""
-    health = now.health
-    ends_pct = math.hypot(now.soc_std_pct, end_pct)
-    return math.hypot(
-        volts * ends_pct / 100.0 * health.capacity_ah,
-        energy_wh * health.capacity_std_ah / health.capacity_ah,
-    )
+    def __init__(
+        self, model: OnlineModel, filter_: SocFilter, soc_pct: float, temperature_c: float
+    ) -> None:
+        self.soc_pct = soc_pct
+        self.health: Health = health_of(filter_, temperature_c)
+        x, self._P = filter_.joint()
+        self._x, self.resistance = x[:-2], float(x[-1])
+        self._model, self._temperature_c = model, temperature_c
+        noise, self._A = model.noise, model.noise.cold(temperature_c)
+        slope = max(model.curve(soc_pct)[1], LEAST_SLOPE)
+        self._level_v = math.hypot(self._A * noise.level_std_v, noise.soc_std_pct * slope)
+        self.std_v = math.hypot(self._level_v, self._A * noise.slow_std_v)
+        self._fixed_v = self._level_v * float(self._x[LEVEL]) + self._A * float(self._x[SLOW])
+        self._no_load = np.zeros_like(model.load_coefficients)
+
+    def current_at(self, limit_v: float, seconds: float) -> tuple[float, float] | None:
+        """Return the current that meets a voltage after a time [s], and its deviation [A].
+
+        None: the voltage rises with the current, so it is no limit.
+        """
+        model = self._model
+        base, per_a, unknown_v = self._loads(seconds)
+        pct_per_a = seconds / (36.0 * self.health.capacity_ah)
+        fixed_v = self._fixed_v + self._learned_v(self.soc_pct) + self._volts(base) - limit_v
+        ohm = self._volts(per_a)
+        current_a, slope = 0.0, 0.0
+        for _ in range(_ITERATIONS):
+            volts, slope = model.curve(self.soc_pct - pct_per_a * current_a)
+            step_a = (volts + fixed_v + ohm * current_a) / (slope * pct_per_a - ohm)
+            current_a += step_a
+            if abs(step_a) < _CLOSE_A:
+                break
+        volt_per_a = slope * pct_per_a - ohm
+        if volt_per_a <= 0.0:
+            return None
+        load = base + current_a * per_a
+        after_pct = self.soc_pct - pct_per_a * current_a
+        H = np.concatenate((
+            [slope, 0.0, self._A, self._level_v],
+            model.row(after_pct, load),
+            [0.0, load[1:] @ model.load_coefficients[1:]],
+        ))  # fmt: skip
+        variance = H @ self._P @ H + (self._A * model.noise.residual_std_v) ** 2 + unknown_v**2
+        return current_a, math.sqrt(variance) / volt_per_a
+
+    def lasting_v(self, soc_pct: float, current_a: float) -> float:
+        """Return the voltage under a lasting current [V]."""
+        model = self._model
+        lasting = np.full(len(model.model.resistance_ohm), current_a)
+        load = model.load_at(self._temperature_c, lasting)
+        curve_v = model.curve(soc_pct)[0] + self._learned_v(soc_pct)
+        return curve_v + self._volts(load) + self._fixed_v
+
+    def _learned_v(self, soc_pct: float) -> float:
+        """Return the learned change of the curve [V]."""
+        return float(self._model.row(soc_pct, self._no_load) @ self._x[FUNCTIONS:])
+
+    def _volts(self, load: FloatArray) -> float:
+        """Return the voltage of a load row with what is learned of it [V]."""
+        theta, x = self._model.load_coefficients, self._x[FUNCTIONS:]
+        learned_v = float(self._model.row(self.soc_pct, load) @ x) - self._learned_v(self.soc_pct)
+        return float(load @ theta) + self.resistance * float(load[1:] @ theta[1:]) + learned_v
+
+    def _loads(self, seconds: float) -> tuple[FloatArray, FloatArray, float]:
+        """Return the load row after a time [s] without current, and its change by a current [1/A].
+
+        The third is the drop of currents that were not observed [V].
+        """
+        model = self._model
+        voltage, line = model.model, model.delay_line
+        past, share, unknown_v = [], [], 0.0
+        for delay_s, ohm in zip(voltage.delay_s, voltage.resistance_ohm, strict=False):
+            is_ahead = delay_s <= seconds
+            past.append(0.0 if is_ahead else line.current_at(delay_s - seconds))
+            share.append(1.0 if is_ahead else 0.0)
+            if delay_s - seconds > line.filled_s:
+                unknown_v += abs(ohm) * ENERGY_C_RATE * self.health.capacity_ah
+        for tau_s, lag in zip(voltage.low_pass_s, model.lags, strict=True):
+            keep = math.exp(-seconds / tau_s)
+            past.append(keep * lag.value)
+            share.append(1.0 - keep)
+        base = model.load_at(self._temperature_c, np.array(past))
+        ones = model.load_at(self._temperature_c, np.array(past) + np.array(share))
+        return base, ones - base, unknown_v
 
 
 def _within(current_a: float, std_a: float, most_a: float) -> tuple[float, float]:

@@ -12,17 +12,14 @@ from typing import Literal, NamedTuple
 
 from cangauge.errors import InputError
 from cangauge.estimation.power import PackLimits
-from cangauge.estimation.state import ReferenceState
+from cangauge.estimation.state import EstimatorMemory
 from cangauge.logs.log import TemperatureSource
 from cangauge.model.delay_line import GAP_S
 from cangauge.types import Sample
 
 Method = Literal["ekf", "newton", "coulomb"]
 
-Filter = Literal["own", "reference"]
-"""Arithmetic of the Kalman filter: our plain floats, or filterpy's to check them."""
-
-VALID_STD_PCT = 1.5
+VALID_STD_PCT = 3.0
 """Largest standard deviation of a valid SoC [%]: 19 of 20 such SoC lie within 3 %.
 
 On real trips of a vehicle with a fitted model (noise 1.4 V, a third of it lasting) the filter
@@ -99,8 +96,6 @@ class EstimatorSettings:
     ----------
     method : {"ekf", "newton", "coulomb"}
         Method whose SoC is published.
-    filter : {"own", "reference"}
-        Arithmetic of the Kalman filter: our plain floats, or filterpy's, slower, to check them.
     initial_soc_pct : float, optional
         SoC at the first sample [%]; by default found from the first voltages.
     initial_soc_std_pct : float
@@ -126,7 +121,6 @@ class EstimatorSettings:
     """
 
     method: Method = "ekf"
-    filter: Filter = "own"
     initial_soc_pct: float | None = None
     initial_soc_std_pct: float = 1.0
     valid_std_pct: float = VALID_STD_PCT
@@ -155,63 +149,37 @@ class SocReference(NamedTuple):
 
     soc_pct: float
     soc_std_pct: float
-    is_by_voltage: bool = False
-    """Whether it is the inverse of the voltage model, and shares its errors."""
 
 
-class SocReferenceDetector:
-    """Applies the rules, once each time that a condition becomes true.
+def detect_references(
+    settings: EstimatorSettings, memory: EstimatorMemory, sample: Sample
+) -> list[SocReference]:
+    """Return the references that a row establishes, once each time that a rule becomes true.
 
     Parameters
     ----------
-    full_charge : FullCharge, optional
-    long_rest : LongRest, optional
-        None is off.
-
-    Attributes
-    ----------
-    state : ReferenceState
+    settings : EstimatorSettings
+    memory : EstimatorMemory
+        Of the estimator; the state of the rules in it is updated.
+    sample : Sample
+        Its voltage may be NaN.
     """
-
-    def __init__(self, full_charge: FullCharge | None, long_rest: LongRest | None) -> None:
-        self._full_charge = full_charge
-        self._long_rest = long_rest
-        self.state = ReferenceState()
-
-    def detect(self, sample: Sample, rest_s: float, newton_pct: float) -> list[SocReference]:
-        """Return the references that a sample establishes.
-
-        Parameters
-        ----------
-        sample : Sample
-            Its voltage may be NaN.
-        rest_s : float
-            Time at rest [s]; NaN while not at rest.
-        newton_pct : float
-            SoC by inverse of the voltage model [%]; NaN without a voltage.
-        """
-        found = []
-        rule = self._full_charge
-        if rule is not None and self._becomes_full(rule, sample):
-            found.append(SocReference(rule.soc_pct, rule.soc_std_pct))
-        rest = self._long_rest
-        if rest is not None and math.isfinite(newton_pct):
-            was, self.state.is_rested = self.state.is_rested, rest_s >= rest.after_s
-            if self.state.is_rested and not was:
-                found.append(SocReference(newton_pct, rest.soc_std_pct, is_by_voltage=True))
-        return found
-
-    def _becomes_full(self, rule: FullCharge, sample: Sample) -> bool:
-        state = self.state
-        if not (sample.voltage_v >= rule.voltage_v and abs(sample.current_a) <= rule.current_a):
-            if not math.isnan(sample.voltage_v):  # a missing voltage proves nothing
-                state.full_since_s, state.is_full = math.nan, False
-            return False
-        if math.isnan(state.full_since_s):
-            state.full_since_s = sample.time_s
-        was = state.is_full
-        state.is_full = sample.time_s - state.full_since_s >= rule.hold_s
-        return state.is_full and not was
+    found = []
+    full, rest = settings.full_charge, settings.long_rest
+    if full is not None and not math.isnan(sample.voltage_v):  # a missing voltage proves nothing
+        if sample.voltage_v < full.voltage_v or abs(sample.current_a) > full.current_a:
+            memory.full_since_s = math.nan
+        elif math.isnan(memory.full_since_s):
+            memory.full_since_s = sample.time_s
+        was, memory.is_full = memory.is_full, sample.time_s - memory.full_since_s >= full.hold_s
+        if memory.is_full and not was:
+            found.append(SocReference(full.soc_pct, full.soc_std_pct))
+    if rest is not None and not math.isnan(memory.newton_pct):
+        was = memory.is_rested
+        memory.is_rested = sample.time_s - memory.rest_since_s >= rest.after_s
+        if memory.is_rested and not was:
+            found.append(SocReference(memory.newton_pct, rest.soc_std_pct))
+    return found
 
 
 def _check_range(field: str, value: float, low: float, high: float) -> None:

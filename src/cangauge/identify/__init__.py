@@ -1,6 +1,6 @@
-"""Identification: recorded logs → model. See `fit`."""
+"""Identification: recorded logs → model.
 
-from cangauge.identify.delays import DelaySearch, search_delays
-from cangauge.identify.fit import Identification, fit
-
-__all__ = ["DelaySearch", "Identification", "fit", "search_delays"]
+`rows` picks the rows of a log, `least_squares` sums and solves the curve of knots with its prior,
+`published` the published equation, `starts` estimates unknown starts, `effect_search` selects
+effects; `fit` is the face.
+"""

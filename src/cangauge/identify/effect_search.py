@@ -1,105 +1,102 @@
-"""Selection of effects by forward selection and backward elimination, and their joint fit.
+"""Selection of effects as further columns of the same least squares, by logs left out in turn.
 
-Forward: every effect with every trial value of its shapes is screened by a linear step on the
-folds. The most promising are fitted jointly with the present model, through its own equations, and
-the better one is added if it is significantly better (`cross_validation`). Backward: the effect
-whose removal costs least is removed if the cost is not significant; otherwise each effect is
-compared with the best replacement.
+Every effect with every trial value of its shapes gives columns: the change of the model's voltage
+with each amplitude. The sums of all columns are made once; selection then needs no row any more. In
+each round the columns that fit best are compared on left-out logs, and the best is added if its
+gain is significant and worthwhile.
 """
 
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import product
+from typing import Any, Final
 
 import numpy as np
 
 from cangauge._typing import FloatArray
-from cangauge.errors import CangaugeError, InputError
-from cangauge.identify.cross_validation import Comparison, CrossValidation, HeldOutErrors, compare
-from cangauge.inference.least_squares import CLUSTER_S, Solution
-from cangauge.inference.linearized import (
-    ROUGHLY_CONVERGED,
-    Linearization,
-    effect_columns,
-    fit_extended,
-    linearize,
-    residual,
-    solution_at,
-    with_modelled_voltage,
+from cangauge.errors import InputError
+from cangauge.identify.least_squares import (
+    BASE,
+    LOGS_AT_LEAST,
+    LogSums,
+    P,
+    Solution,
+    load_features,
+    log_sums,
+    row_features,
+    solve,
+    solve_without,
 )
-from cangauge.inference.rows import LOGS_AT_LEAST, SampledLog, block_numbers
-from cangauge.model.effects.base import Effect, Values
-from cangauge.model.effects.library import (
-    LIBRARY,
-    Candidate,
-    candidates,
-    effect_entries,
-    effect_of,
-    parse_effects,
-    shape_key,
-)
-from cangauge.model.extended import ExtendedModel
+from cangauge.identify.rows import FitRows
+from cangauge.logs.log import Log
+from cangauge.logs.resample import dequantize
+from cangauge.model.effects.base import Effect, Load, Signals, Values
+from cangauge.model.effects.library import LIBRARY, Candidate, candidates, effect_of
+from cangauge.model.extended import ExtendedModel, Prediction
+from cangauge.model.prior import LOW_PASS_S, Chemistry
 
 _LOG = logging.getLogger(__name__)
 
 AUTO = "auto"
+NONE = "none"
 
-SEARCHED = (
-    "resistance_temperature", "resistance_soc", "resistance_asymmetry", "charge_transfer",
-    "fast_polarization", "slow_diffusion", "hysteresis", "entropic_coefficient",
-    "temperature_lag", "core_temperature",
+SEARCHED: Final = (
+    "resistance_soc", "resistance_asymmetry", "charge_transfer", "fast_polarization",
+    "slow_diffusion", "hysteresis", "entropic_coefficient", "temperature_lag", "core_temperature",
 )  # fmt: skip
-"""Effects that `auto` tries: structure of a healthy pack that the coefficients lack."""
+"""Effects that `auto` tries: structure of a healthy pack that the equation lacks."""
 
-NOT_IDENTIFIABLE = {
+NOT_IDENTIFIABLE: Final[Mapping[str, str]] = {
     "initial_soc": "it belongs to one log: give --initial-soc",
     "resistance_step": "it belongs to one log, not to a healthy pack",
     "capacity": "give --capacity-ah; the curve over SoC follows it",
     "current_gain": "resistances and capacity absorb it: give --capacity-ah",
-    "voltage_offset": "k0 absorbs it",
+    "voltage_offset": "the curve absorbs it",
     "voltage_gain": "the coefficients absorb it",
+    "ocv_shape": "the curve's knots express it",
+    "resistance_temperature": "the equation has it (b)",
 }
 """Effects that a fit cannot separate from its own coefficients, and why."""
 
-COPIES_AT_MOST = 2
-"""Copies of one effect with different shapes in a model: a chain of RC elements."""
-
-EFFECTS_AT_MOST = 8
-
-TAU_RATIO_AT_LEAST = 2.0
-"""Ratio of the time constants of two copies of one effect."""
-
-FITTED_PER_ROUND = 2
-"""Number of the most promising effects of a round that are fitted in full."""
-
-FEW_LOGS = 5
-"""With fewer whole logs the standard error of the mean gain is unreliable: a remark is added."""
-
-AT_BOUND = 1e-6
-"""Distance of a parameter from its bound, relative to their width, at which the bound is active."""
+AUTO_LOGS: Final = 5
+"""Logs from which on `auto` is the default: with fewer the error of the mean gain is unknown."""
+EFFECTS_AT_MOST: Final = 6
+COMPARED: Final = 4
+"""Candidates of a round that are compared on left-out logs, the best fits first."""
+T_AT_LEAST: Final = 2.0
+"""Mean gain over its standard error [-]: 3 % by chance with nineteen logs, 6 % with five."""
+GAIN_AT_LEAST: Final = 0.03
+"""Least mean relative decrease of a left-out log's mean square error [-]: an effect costs
+understanding."""
+TAU_RATIO: Final = 2.0
+"""Ratio of time constants within which an effect repeats a low-passed current of the equation."""
 
 
 def parse_effect_ids(given: Sequence[str]) -> tuple[str, ...]:
-    """Return effect ids from texts that may hold several, separated by commas.
+    """Return effect ids from texts that may hold several, separated by commas; () for "none".
 
     Raises
     ------
     InputError
-        If an id is unknown, not identifiable by a fit, repeated too often, or combined with
-        `auto`.
+        If an id is unknown, not identifiable by a fit, repeated, or combined with `auto`.
     """
     ids = [part.strip() for text in given for part in text.split(",")]
+    if ids == [NONE]:
+        return ()
     if ids == [AUTO]:
         return (AUTO,)
-    if AUTO in ids:
-        raise InputError(
-            "auto selects effects itself", field="--effects", value=", ".join(ids),
-            cure="give auto alone, or ids alone",
-        )  # fmt: skip
     for effect_id in ids:
-        effect = effect_of(effect_id, "--effects")
+        if effect_id in {AUTO, NONE} or ids.count(effect_id) > 1:
+            raise InputError(
+                "given together with others" if effect_id in {AUTO, NONE} else "given twice",
+                field="--effects",
+                value=", ".join(ids),
+                cure="give auto alone, none alone, or each id once",
+            )
+        effect_of(effect_id, "--effects")
         if effect_id in NOT_IDENTIFIABLE:
             raise InputError(
                 "not identifiable by a fit",
@@ -107,356 +104,347 @@ def parse_effect_ids(given: Sequence[str]) -> tuple[str, ...]:
                 value=effect_id,
                 cure=NOT_IDENTIFIABLE[effect_id],
             )
-        copies = COPIES_AT_MOST if effect.shapes and effect.amplitudes else 1
-        if ids.count(effect_id) > copies:
-            raise InputError(
-                f"may be given {'twice' if copies == COPIES_AT_MOST else 'once'} at most",
-                field="--effects",
-                value=", ".join(ids),
-            )
     return tuple(ids)
 
 
 @dataclass(frozen=True)
 class SearchStep:
-    """One effect added or removed, or a decision against it."""
+    """One effect added, or the best one that was not.
+
+    Parameters
+    ----------
+    what : {"added", "not added"}
+    effect_id : str
+    before_rmse_v, after_rmse_v : float
+        Error of left-out logs [V].
+    gain : float
+        Mean of ln(mean square error without / with) of the left-out logs.
+    t_value : float
+        Gain over its standard error.
+    """
 
     what: str
-    """`added`, `not added`, `removed`, or `in place of` another."""
     effect_id: str
-    comparison: Comparison
-    """With the model without it (or with the other effect, where it replaces one)."""
+    before_rmse_v: float
+    after_rmse_v: float
+    gain: float
+    t_value: float
+
+    @property
+    def is_worth(self) -> bool:
+        """Whether the gain is significant and worthwhile."""
+        return self.t_value >= T_AT_LEAST and self.gain >= GAIN_AT_LEAST
 
     def to_dict(self) -> dict[str, object]:
         """Return the step for `fit --json`."""
         return {
             "step": self.what,
             "effect": self.effect_id,
-            "held_out_rmse_without_v": self.comparison.before_rmse_v,
-            "held_out_rmse_with_v": self.comparison.after_rmse_v,
-            "t_value": self.comparison.t_value,
-            "t_needed": self.comparison.t_critical,
+            "held_out_rmse_without_v": self.before_rmse_v,
+            "held_out_rmse_with_v": self.after_rmse_v,
+            "t_value": self.t_value,
+            "t_needed": T_AT_LEAST,
         }
-
-
-@dataclass(frozen=True)
-class ParameterEstimate:
-    """One parameter of an effect."""
-
-    name: str
-    value: float
-    std_error: float | None
-    """None for a discrete choice and for a constant."""
-    unit: str
-
-    def to_dict(self) -> dict[str, object]:
-        """Return value, standard error and unit."""
-        return {"value": self.value, "std_error": self.std_error, "unit": self.unit}
 
 
 @dataclass(frozen=True, eq=False)
-class FittedEffects:
-    """A model with effects, fitted to logs, and the search that selected them."""
-
-    model: ExtendedModel
-    linear: Linearization
-    """At the model."""
-    solution: Solution
-    """Of the voltage model's coefficients; the effects' parameters are free too."""
-    estimates: tuple[tuple[str, tuple[ParameterEstimate, ...]], ...]
-    """Id and parameters of each effect, in the model's order."""
-    held_out_error_v: tuple[FloatArray, ...]
-    """Held-out errors of each log's rows [V]; NaN where no fold holds the row out."""
-    held_out_rmse_v: tuple[float, float]
-    """Without any effect, and with all of them [V]."""
-    steps: tuple[SearchStep, ...]
-
-    def remarks(self) -> list[str]:
-        """Return remarks for the user on the selection and on active bounds."""
-        before, after = self.held_out_rmse_v
-        if not self.model.effects:
-            return ["no effect reduces the held-out error significantly: none taken"]
-        found = ["the slope resistance expected from the coefficients excludes the effects' part"]
-        if LOGS_AT_LEAST <= len(self.held_out_error_v) < FEW_LOGS:
-            found.append(
-                f"the effects were selected on only {len(self.held_out_error_v)} logs held out in"
-                " turn: give five or more for a reliable selection"
-            )
-        if after > before:
-            found.append("the effects increase the held-out error: omit them")
-        for item in self.linear.free:
-            reach = AT_BOUND * (item.high - item.low)
-            edge = {item.low: item.value - item.low, item.high: item.high - item.value}
-            for bound, distance in edge.items():
-                if distance <= reach:
-                    effect = self.model.effects[item.effect][0]
-                    found.append(f"{effect.id}: {item.name} lies at its bound of {bound:.4g}")
-        return found
-
-    def to_dict(self) -> dict[str, object]:
-        """Return the part of `cangauge fit --json` on effects."""
-        return {
-            "effects": [
-                {"id": effect_id, "parameters": {item.name: item.to_dict() for item in parameters}}
-                for effect_id, parameters in self.estimates
-            ],
-            "effect_search": {
-                "held_out_rmse_without_v": self.held_out_rmse_v[0],
-                "held_out_rmse_with_v": self.held_out_rmse_v[1],
-                "steps": [step.to_dict() for step in self.steps],
-            },
-        }
-
-
-def fit_effects(
-    plain: ExtendedModel, logs: Sequence[SampledLog], ids: Sequence[str]
-) -> FittedEffects:
-    """Select effects and fit them jointly with the coefficients.
+class Selected:
+    """Effects of a fit, and how they were found.
 
     Parameters
     ----------
-    plain : ExtendedModel
-        The fitted voltage model, without effects.
-    logs : sequence of SampledLog
-    ids : sequence of str
-        From `parse_effect_ids`: `auto` alone, or effects that are all taken.
-
-    Raises
-    ------
-    InputError
-        If the logs are too short to hold rows out.
+    chosen : tuple of Candidate
+    steps : tuple of SearchStep
     """
-    search = _Search(CrossValidation(logs))
-    plain_errors = search.validation.errors(plain)
-    if tuple(ids) == (AUTO,):
-        model, errors = search.backward(*search.forward(plain, plain_errors))
-    else:
-        model, errors = search.named(plain, plain_errors, ids)
-    if model.effects:
-        _LOG.debug("effects: final joint fit")
-        model = fit_extended(model, logs)
-        errors = search.validation.errors(model)
-    linear = linearize(model, logs)
-    rows = [item.rows for item in logs]
-    whole = solution_at(linear, block_numbers(rows, CLUSTER_S))
-    n = model.model.coefficients.size
-    ends = np.cumsum([len(item) for item in rows])[:-1]
-    return FittedEffects(
-        model=model,
-        linear=linear,
-        solution=whole.first(n),
-        estimates=tuple(_estimates(linear, whole.std_error[n:])),
-        held_out_error_v=tuple(np.split(errors.error_v, ends)),
-        held_out_rmse_v=(plain_errors.rmse_v, errors.rmse_v),
-        steps=tuple(search.steps),
-    )
 
-
-def _estimates(
-    linear: Linearization, std_error: FloatArray
-) -> list[tuple[str, tuple[ParameterEstimate, ...]]]:
-    known = {
-        (item.effect, item.name): float(error)
-        for item, error in zip(linear.free, std_error, strict=True)
-    }
-    return [
-        (
-            effect.id,
-            tuple(
-                ParameterEstimate(
-                    parameter.name,
-                    float(values[parameter.name]),
-                    known.get((number, parameter.name)),
-                    parameter.unit,
-                )
-                for parameter in effect.parameters
-            ),
-        )
-        for number, (effect, values) in enumerate(linear.model.effects)
-    ]
-
-
-@dataclass(eq=False)
-class _Trial:
-    model: ExtendedModel
-    errors: HeldOutErrors
-    comparison: Comparison
+    chosen: tuple[Candidate, ...]
+    steps: tuple[SearchStep, ...]
 
     @property
-    def rank(self) -> tuple[bool, float]:
-        """The better the smaller."""
-        return not self.comparison.is_significant, self.errors.rmse_v
+    def amplitude_std(self) -> FloatArray:
+        """Prior standard deviation of each amplitude: its widest bound."""
+        return np.array([float(np.abs(b).max()) for c in self.chosen for b in c.bounds])
 
+    def clipped(self, solution: Solution) -> Solution:
+        """Return the solution with the amplitudes within their physical bounds."""
+        low, high = np.concatenate([item.bounds for item in self.chosen]).T
+        amplitudes = np.clip(solution.coefficients[P:], low, high)
+        return replace(solution, coefficients=np.r_[solution.coefficients[:P], amplitudes])
 
-class _Search:
-    """Selection on one cross-validation; every decision goes into `steps`."""
+    def at_bound(self, solution: Solution) -> list[Candidate]:
+        """Return the effects with an amplitude at or beyond a bound other than neutral."""
+        found = []
+        parts = _parts(self.chosen, solution.coefficients[P:])
+        for item, part in zip(self.chosen, parts, strict=True):
+            low, high = item.bounds.T
+            if np.any(((part <= low) & (low < 0.0)) | (part < low) | (part >= high)):
+                found.append(item)
+        return found
 
-    def __init__(self, validation: CrossValidation) -> None:
-        self.validation = validation
-        self.steps: list[SearchStep] = []
-
-    def forward(
-        self, model: ExtendedModel, errors: HeldOutErrors
-    ) -> tuple[ExtendedModel, HeldOutErrors]:
-        """Add effects as long as one is significantly better."""
-        pool = [LIBRARY[effect_id] for effect_id in SEARCHED]
-        while len(model.effects) < EFFECTS_AT_MOST:
-            trials = [
-                (trial, choice.effect.id)
-                for choice in self._promising(model, pool)[:FITTED_PER_ROUND]
-                if (trial := self._with(model, errors, choice)) is not None
-            ]
-            if not trials:
-                break
-            best, effect_id = min(trials, key=lambda item: item[0].rank)
-            added = best.comparison.is_significant
-            self._note("added" if added else "not added", effect_id, best.comparison)
-            if not added:
-                break
-            model, errors = best.model, best.errors
-        return model, errors
-
-    def named(
-        self, model: ExtendedModel, errors: HeldOutErrors, ids: Sequence[str]
-    ) -> tuple[ExtendedModel, HeldOutErrors]:
-        """Add all named effects, the most helpful first."""
-        left = list(ids)
-        while left:
-            pool = [LIBRARY[effect_id] for effect_id in dict.fromkeys(left)]
-            for choice in self._promising(model, pool):
-                trial = self._with(model, errors, choice)
-                if trial is not None:
-                    break
-            else:
-                raise InputError(
-                    "the model cannot be fitted with it", field="--effects", value=", ".join(left)
-                )
-            self._note("added", choice.effect.id, trial.comparison)
-            model, errors = trial.model, trial.errors
-            left.remove(choice.effect.id)
-        return model, errors
-
-    def backward(
-        self, model: ExtendedModel, errors: HeldOutErrors
-    ) -> tuple[ExtendedModel, HeldOutErrors]:
-        """Remove effects without a significant contribution; try to replace the others."""
-        for _ in range(EFFECTS_AT_MOST):
-            if len(model.effects) < 2:
-                break
-            fewer = [self._without(model, errors, k) for k in range(len(model.effects))]
-            least = min(fewer, key=lambda item: item.errors.rmse_v)
-            if not least.comparison.is_significant:
-                removed = model.effects[fewer.index(least)][0].id
-                self._note("removed", removed, least.comparison)
-                model, errors = least.model, least.errors
-                continue
-            exchanged = self._exchanged(model, errors, fewer)
-            if exchanged is None:
-                break
-            model, errors = exchanged.model, exchanged.errors
-        return model, errors
-
-    def _without(self, model: ExtendedModel, errors: HeldOutErrors, number: int) -> _Trial:
-        effect = model.effects[number][0]
-        _LOG.debug("effects: fitting without %s", effect.id)
-        kept = tuple(item for k, item in enumerate(model.effects) if k != number)
-        without = fit_extended(
-            replace(model, effects=kept), self.validation.logs, ROUGHLY_CONVERGED
+    def effects(self, solution: Solution) -> tuple[tuple[Effect, Values], ...]:
+        """Return the effects with the amplitudes of a solution."""
+        parts = _parts(self.chosen, solution.coefficients[P:])
+        return tuple(
+            (item.effect, item.values(part)) for item, part in zip(self.chosen, parts, strict=True)
         )
-        without_errors = self.validation.errors(without)
-        amplitudes = max(len(effect.amplitudes), 1)
-        return _Trial(without, without_errors, compare(without_errors, errors, amplitudes))
 
-    def _exchanged(
-        self, model: ExtendedModel, errors: HeldOutErrors, fewer: Sequence[_Trial]
-    ) -> _Trial | None:
-        """Return the model with one effect replaced by a better one, or None.
 
-        An effect added early may have represented later ones and need not be the best with them.
+def _parts(chosen: Sequence[Candidate], amplitudes: FloatArray) -> list[FloatArray]:
+    ends = np.cumsum([len(item.amplitudes) for item in chosen]).tolist()
+    return [amplitudes[end - len(c.amplitudes) : end] for c, end in zip(chosen, ends, strict=True)]
+
+
+@dataclass(frozen=True, eq=False)
+class Linearized:
+    """A model with effects on the rows of one log, to first order.
+
+    Parameters
+    ----------
+    rows : FitRows
+        With the effects' signals and SoC; the voltage is that of the linear part plus the residual
+        once `with_voltage` has set it.
+    features : array of shape (m, BASE)
+        dU/d of knots, kt, resistances and their Arrhenius parts.
+    columns : array of shape (m, e)
+        dU/d(amplitude).
+    residual_v : array of shape (m,)
+    """
+
+    rows: FitRows
+    features: FloatArray
+    columns: FloatArray
+    residual_v: FloatArray
+
+    def with_voltage(self, coefficients: FloatArray, amplitudes: FloatArray) -> Linearized:
+        """Return the same with the voltage that the linear equation has to explain.
+
+        Parameters
+        ----------
+        coefficients : array of shape (BASE,)
+            Of `features`, and …
+        amplitudes : array of shape (e,)
+            … of `columns`, about which the model is linearized.
         """
-        for (removed, _), without in zip(model.effects, fewer, strict=True):
-            pool = [LIBRARY[effect_id] for effect_id in SEARCHED if effect_id != removed.id]
-            for choice in self._promising(without.model, pool)[:1]:
-                trial = self._with(without.model, errors, choice)
-                if trial is not None and trial.comparison.is_worthwhile:
-                    self._note(f"in place of {removed.id}", choice.effect.id, trial.comparison)
-                    return trial
-        return None
-
-    def _note(self, what: str, effect_id: str, comparison: Comparison) -> None:
-        self.steps.append(SearchStep(what, effect_id, comparison))
-        _LOG.info(
-            "effects: %s %s, held out %.3f V without, %.3f V with it",
-            effect_id, what, comparison.before_rmse_v, comparison.after_rmse_v,
-        )  # fmt: skip
-
-    def _promising(self, model: ExtendedModel, pool: Sequence[Effect]) -> list[Candidate]:
-        """Return each effect with its best shape, the most promising effect first."""
-        _LOG.debug("effects: screening %d with %d taken", len(pool), len(model.effects))
-        logs = self.validation.logs
-        choices = [
-            choice
-            for choice in candidates(pool, model.pack, logs[0].log.time_s)
-            if _is_addable(choice, model)
-        ]
-        if not choices:
-            return []
-        linear = linearize(model, logs)
-        columns = _columns(linear, logs, choices)
-        gains = self.validation.screen(linear, columns, [choice.bounds for choice in choices])
-        best: dict[str, tuple[float, Candidate]] = {}
-        for gain, choice in zip(gains, choices, strict=True):
-            if choice.effect.id not in best or gain > best[choice.effect.id][0]:
-                best[choice.effect.id] = gain, choice
-        return [choice for _, choice in sorted(best.values(), key=lambda item: -item[0])]
-
-    def _with(
-        self, model: ExtendedModel, errors: HeldOutErrors, choice: Candidate
-    ) -> _Trial | None:
-        """Return the model fitted with one more effect; None if the fit fails."""
-        _LOG.debug("effects: fitting with %s", choice.effect.id)
-        start = choice.values(choice.steps)  # small amplitudes, so that the shapes matter
-        try:
-            extended = model.with_effect(choice.effect, start)
-            extended = fit_extended(extended, self.validation.logs, ROUGHLY_CONVERGED)
-            # Two copies may have merged, or bounds relative to the resistance have been left.
-            parse_effects(effect_entries(extended.effects), extended.pack)
-        except CangaugeError:
-            return None
-        with_errors = self.validation.errors(extended)
-        return _Trial(extended, with_errors, compare(errors, with_errors, len(choice.amplitudes)))
+        linear_v = self.features @ coefficients + self.columns @ amplitudes
+        return replace(self, rows=replace(self.rows, voltage_v=linear_v + self.residual_v))
 
 
-def _columns(
-    linear: Linearization, logs: Sequence[SampledLog], choices: Sequence[Candidate]
-) -> list[FloatArray]:
-    smooth = [with_modelled_voltage(item, linear.model) for item in logs]
-    residuals = [residual(item, linear.model) for item in smooth]
+def linearize(
+    model: ExtendedModel,
+    log: Log,
+    rows: FitRows,
+    chosen: Sequence[Candidate],
+    amplitudes: FloatArray | None = None,
+) -> Linearized:
+    """Return the model's prediction of a log and its derivatives on the rows of the fit.
+
+    Parameters
+    ----------
+    model : ExtendedModel
+        Without effects, or with those of `chosen`.
+    log : Log
+    rows : FitRows
+    chosen : sequence of Candidate
+    amplitudes : array of shape (e,), optional
+        Of the model's effects, relative to neutral; neutral by default.
+    """
+    voltage, pack = model.model, model.pack
+    first = log.first_soc()
+    if first is None:
+        raise ValueError("a log of a fit has a start")
+    row, start_pct = first
+    signals = Signals(log.time_s, log.current_a, log.voltage_v, dequantize(log).temperature_c)
+    currents = voltage.currents(log.time_s, log.current_a, slice(None))
+    # Added voltages are linear in their amplitudes, so their columns give them too.
+    correcting = replace(
+        model, effects=tuple(item for item in model.effects if not item[0].adds_voltage)
+    )
+
+    def predict(changed: ExtendedModel) -> Prediction:
+        return changed.predict(signals, start_pct, rows.at, initial_row=row, currents_a=currents)
+
+    plain = predict(correcting)
+    true = plain.signals
+    load_columns = voltage.load_columns(true.temperature_c, currents)
+    drop_v = load_columns[:, 1:] @ voltage.load_coefficients[1:]
+    load = Load(true.time_s, true.current_a, true.temperature_c, drop_v)
+    soc = plain.soc_pct[rows.at]
+
+    def added_v(effect: Effect, values: Values, at_load: Load = load) -> FloatArray:
+        drive = effect.drive(at_load, values, voltage, pack, effect.memory(values, pack))
+        if drive is None:
+            raise ValueError("an effect of the voltage has a drive")
+        return np.asarray(drive[rows.at] * effect.over_soc(soc, values, voltage, pack))
+
+    at = replace(
+        rows,
+        soc_pct=soc,
+        currents_a=plain.currents_a,
+        dequantized_c=true.temperature_c[rows.at],
+    )
+    features, residual_v = row_features(at), plain.residual_v
+    parts = None if amplitudes is None else _parts(chosen, amplitudes)
+    columns = []
+    for place, item in enumerate(chosen):
+        effect = item.effect
+        about = np.zeros(len(item.steps)) if parts is None else parts[place]
+        if parts is not None and effect.adds_voltage:
+            features = features + _by_drop(effect, item.values(about), added_v, load, currents)
+        for number, step in enumerate(item.steps.tolist()):
+            one = step * (np.arange(about.size) == number)
+            if effect.adds_voltage:
+                change_v = added_v(effect, item.values(one))
+                residual_v = residual_v - change_v * (about[number] / step)
+            else:
+                others = tuple(other for other in correcting.effects if other[0] is not effect)
+                changed = (*others, (effect, item.values(about + one)))
+                change_v = plain.residual_v - predict(replace(model, effects=changed)).residual_v
+            columns.append(change_v / step)
+    table = np.column_stack(columns) if columns else np.empty((len(rows), 0))
+    return Linearized(at, features, table, residual_v)
+
+
+def _by_drop(
+    effect: Effect,
+    values: Values,
+    added_v: Callable[[Effect, Values, Load], FloatArray],
+    load: Load,
+    currents: FloatArray,
+) -> FloatArray:
+    """Return what an effect adds to the derivatives by the resistances, shape (m, BASE).
+
+    An effect of the drop is linear in it: its response to each current is that to a drop of 1 Ω.
+    """
+    if not effect.scales_drop:
+        return np.zeros((1, BASE))
+    nothing = added_v(effect, values, load._replace(drop_v=np.zeros_like(load.drop_v)))
+    added = np.zeros((nothing.size, BASE))
+    both = load_features(load.temperature_c, currents)[:, 1:]
+    for place, drop_v in enumerate(both.T):
+        response = added_v(effect, values, load._replace(drop_v=drop_v))
+        added[:, BASE - both.shape[1] + place] = response - nothing
+    return added
+
+
+def offered(effect_ids: Sequence[str], model: ExtendedModel, time_s: FloatArray) -> list[Candidate]:
+    """Return the candidates of some effects, without those whose column the equation has."""
+    effects = [LIBRARY[effect_id] for effect_id in effect_ids]
     return [
-        np.vstack(
-            [
-                effect_columns(item, linear.model, choice, residual_v)
-                for item, residual_v in zip(smooth, residuals, strict=True)
-            ]
+        item
+        for item in candidates(effects, model.pack, time_s)
+        if not any(
+            max(tau_s / of_model, of_model / tau_s) <= TAU_RATIO
+            for (_, tau_s), of_model in product(
+                item.effect.rc_elements(item.values(item.steps)), LOW_PASS_S
+            )
         )
-        for choice in choices
     ]
 
 
-def _is_addable(choice: Candidate, model: ExtendedModel) -> bool:
-    """Return whether a candidate differs enough from the effects in the model."""
-    values = choice.values(choice.steps)
-    copies = [taken for effect, taken in model.effects if effect.id == choice.effect.id]
-    if len(copies) >= COPIES_AT_MOST or (copies and not choice.shape):
-        return False
-    key = shape_key(choice.effect, values)
-    return all(
-        key != shape_key(choice.effect, taken) and _has_other_tau(values, taken) for taken in copies
-    )
+class Search:
+    """Forward selection.
 
+    Parameters
+    ----------
+    model : ExtendedModel
+        Fitted without effects.
+    logs, rows : sequences of Log and FitRows
+    chemistry : Chemistry
+    effect_ids : sequence of str
+        Ids to add in their best shape, or `AUTO`.
+    """
 
-def _has_other_tau(one: Values, other: Values) -> bool:
-    if "tau_s" not in one:
-        return True
-    ratio = one["tau_s"] / other["tau_s"]
-    return max(ratio, 1.0 / ratio) >= TAU_RATIO_AT_LEAST
+    def __init__(
+        self,
+        model: ExtendedModel,
+        logs: Sequence[Log],
+        rows: Sequence[FitRows],
+        chemistry: Chemistry,
+        effect_ids: Sequence[str],
+    ) -> None:
+        self._is_auto = tuple(effect_ids) == (AUTO,)
+        self._capacity_ah, self._chemistry = model.capacity_ah, chemistry
+        ids = SEARCHED if self._is_auto else effect_ids
+        self._wanted = list(ids)
+        self._offered = offered(ids, model, logs[0].time_s)
+        widths = [len(item.amplitudes) for item in self._offered]
+        ends = np.cumsum(widths)
+        self._places = [
+            list(range(end - width, end)) for end, width in zip(ends.tolist(), widths, strict=True)
+        ]
+        self.refused: list[Candidate] = []
+        """Candidates that are not offered any more."""
+        self._sums: list[LogSums] = []
+        for number, (log, of_log) in enumerate(zip(logs, rows, strict=True), start=1):
+            _LOG.debug("columns of the effects: log %d of %d", number, len(logs))
+            linear = linearize(model, log, of_log, self._offered)
+            self._sums.append(log_sums(of_log, chemistry, linear.columns))
+
+    def select(self) -> Selected:
+        """Return the effects; those asked for by id are all taken, in their best shapes."""
+        chosen: list[int] = []
+        steps: list[SearchStep] = []
+        at_most = EFFECTS_AT_MOST if self._is_auto else len(self._wanted)
+        if self._is_auto and len(self._sums) < LOGS_AT_LEAST:
+            return Selected((), ())
+        before = self._left_out(chosen)
+        while len(chosen) < at_most:
+            compared = self._compared(chosen, before)
+            worth = [item for item in compared if item[1].is_worth] if self._is_auto else compared
+            if not worth:
+                steps += [step for _, step, _ in compared[:1]]
+                break
+            number, step, before = worth[0]
+            steps.append(replace(step, what="added"))
+            _LOG.info("effect %s: left-out error %.4g V", step.effect_id, step.after_rmse_v)
+            chosen.append(number)
+        return Selected(tuple(self._offered[number] for number in chosen), tuple(steps))
+
+    def _solved(self, chosen: Sequence[int]) -> tuple[list[LogSums], dict[str, Any]]:
+        columns = [place for number in chosen for place in self._places[number]]
+        items = [self._offered[number] for number in chosen]
+        std = Selected(tuple(items), ()).amplitude_std if items else None
+        sums = [item.with_columns(columns) for item in self._sums]
+        return sums, {
+            "capacity_ah": self._capacity_ah,
+            "chemistry": self._chemistry,
+            "amplitude_std": std,
+        }
+
+    def _left_out(self, chosen: Sequence[int]) -> FloatArray:
+        """Return the mean square error of each left-out log [V²]; of the fit for too few logs."""
+        sums, options = self._solved(chosen)
+        without = solve_without(sums, **options) or [solve(sums, **options)] * len(sums)
+        return np.array(
+            [other.square_error(item) for item, other in zip(sums, without, strict=True)]
+        )
+
+    def _compared(
+        self, chosen: list[int], before: FloatArray
+    ) -> list[tuple[int, SearchStep, FloatArray]]:
+        """Return the best candidates, the largest gain on left-out logs first."""
+        taken = {self._offered[number].effect.id for number in chosen}
+        fits: list[tuple[float, int]] = []
+        for number, item in enumerate(self._offered):
+            if item.effect.id in taken or item in self.refused:
+                continue
+            sums, options = self._solved([*chosen, number])
+            solution = solve(sums, **options)
+            chosen_now = tuple(self._offered[place] for place in [*chosen, number])
+            if not Selected(chosen_now, ()).at_bound(solution):
+                fits.append((solution.residual_v, number))
+        found = []
+        for _, number in sorted(fits)[:COMPARED]:
+            after = self._left_out([*chosen, number])
+            gain = np.log(before / after)
+            spread = float(gain.std(ddof=1)) / gain.size**0.5 if gain.size > 1 else float("inf")
+            step = SearchStep(
+                "not added",
+                self._offered[number].effect.id,
+                float(before.mean()) ** 0.5,
+                float(after.mean()) ** 0.5,
+                float(gain.mean()),
+                float(gain.mean()) / max(spread, 1e-12),
+            )
+            found.append((number, step, after))
+        return sorted(found, key=lambda item: -item[1].gain)

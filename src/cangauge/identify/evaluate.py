@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from cangauge._typing import FloatArray
-from cangauge.inference.rows import FitRows, SampledLog
+from cangauge.identify.rows import FitRows
+from cangauge.logs.gaps import BRIDGE_S
 from cangauge.logs.log import Log
-from cangauge.model.coulomb_counting import BRIDGE_S
-from cangauge.model.delay_line import delayed_currents
-from cangauge.model.extended import ExtendedModel, Prediction
-from cangauge.model.voltage_model import VoltageModel, soc_from_ocv, socs_from_ocv
+from cangauge.model.effects.base import Signals
+from cangauge.model.extended import ExtendedModel, newton_soc
 
 JOULE_PER_KWH = 3.6e6
 
@@ -74,15 +73,6 @@ class LogFit:
     voltage_model_v: FloatArray
     soc_newton_pct: FloatArray
 
-    def part(self, keep: slice) -> LogFit:
-        """Return some of the rows."""
-        return LogFit(
-            self.rows.part(keep),
-            self.pseudo_ocv_v[keep],
-            self.voltage_model_v[keep],
-            self.soc_newton_pct[keep],
-        )
-
     @property
     def residual_v(self) -> FloatArray:
         """Measured minus modelled voltage [V]."""
@@ -99,55 +89,44 @@ class LogFit:
         return float(np.mean(np.abs(self.soc_newton_pct - self.rows.soc_pct)))
 
 
-def evaluate(model: VoltageModel, rows: FitRows) -> LogFit:
-    """Return the fit of a voltage model to the rows of a log."""
-    at_reference_v = model.pseudo_ocv(rows.soc_pct)
-    pseudo_ocv_v = model.pseudo_ocv(rows.soc_pct, rows.temperature_c)
-    voltage_v = pseudo_ocv_v + rows.delayed_current_a @ np.array(model.resistance_ohm)
+def evaluate(model: ExtendedModel, log: Log, rows: FitRows) -> LogFit:
+    """Return the voltages and Newton inverse of a model on the rows of a log."""
+    first = log.first_soc()
+    if first is None:
+        raise ValueError("a log of a fit has a start")
+    signals = Signals(log.time_s, log.current_a, log.voltage_v, log.temperature_c)
+    row, soc_pct = first
+    prediction = model.predict(signals, soc_pct, rows.at, initial_row=row)
+    temperature_c = prediction.signals.temperature_c[rows.at]
     return LogFit(
         rows=rows,
-        pseudo_ocv_v=pseudo_ocv_v,
-        voltage_model_v=voltage_v,
-        soc_newton_pct=socs_from_ocv(model, rows.voltage_v - (voltage_v - at_reference_v)),
-    )
-
-
-def evaluate_extended(model: ExtendedModel, log: SampledLog) -> LogFit:
-    """Return the fit of a model with effects to a log; its rows hold the corrected signals."""
-    prediction = model.predict(log.signals, log.initial_soc_pct, log.at)
-    signals = prediction.signals
-    delayed = delayed_currents(
-        signals.time_s, signals.current_a, model.model.delay_s, signals.time_s
-    )
-    rows = replace(
-        log.rows,
-        voltage_v=signals.voltage_v[log.at],
-        temperature_c=signals.temperature_c[log.at],
-        soc_pct=prediction.soc_pct[log.at],
-        delayed_current_a=delayed[log.at],
-    )
-    return LogFit(
-        rows=rows,
-        pseudo_ocv_v=model.model.pseudo_ocv(rows.soc_pct, rows.temperature_c),
+        pseudo_ocv_v=model.model.pseudo_ocv(prediction.soc_pct[rows.at], temperature_c),
         voltage_model_v=prediction.voltage_v,
-        soc_newton_pct=_newton(model, prediction, delayed),
+        soc_newton_pct=newton_soc(model, prediction),
     )
 
 
-def _newton(model: ExtendedModel, prediction: Prediction, delayed_a: FloatArray) -> FloatArray:
-    """Return the Newton inverse on the rows, with the effects advanced over every sample [%]."""
-    online, signals = model.online(), prediction.signals
-    wanted = dict(zip(prediction.rows.tolist(), range(prediction.rows.size), strict=True))
-    newton = np.empty(prediction.rows.size)
-    guess = 50.0
-    samples = zip(
-        signals.time_s.tolist(), signals.current_a.tolist(), signals.temperature_c.tolist(),
-        signals.voltage_v.tolist(), delayed_a.tolist(), strict=True,
-    )  # fmt: skip
-    for k, (time_s, current_a, temperature_c, voltage_v, delayed) in enumerate(samples):
-        online.advance(time_s, current_a, temperature_c, delayed)
-        if k in wanted:
-            offset_v = model.model.offset_at(temperature_c, delayed)
-            guess = soc_from_ocv(online, voltage_v - offset_v, guess).soc_pct
-            newton[wanted[k]] = guess
-    return newton
+def slope_resistances(
+    fits: Sequence[LogFit], resistance_ohm: Sequence[float]
+) -> tuple[float, float]:
+    """Return the regression of U − pseudo-OCV on the current, and what the model expects of it [Ω].
+
+    Both are positive. The expected one is −Σ Rm·ρm, ρm being the regression of the m-th current on
+    the present one.
+
+    Parameters
+    ----------
+    fits : sequence of LogFit
+    resistance_ohm : sequence of float
+        Rm of the first currents of the rows [Ω], negative.
+    """
+    table = np.concatenate([
+        np.column_stack([
+            item.rows.currents_a[:, : len(resistance_ohm)],
+            item.rows.voltage_v - item.pseudo_ocv_v,
+        ])
+        for item in fits
+    ])  # fmt: skip
+    away = table - table.mean(axis=0)
+    slopes = away[:, 0] @ away / max(float(away[:, 0] @ away[:, 0]), 1e-300)
+    return -float(slopes[-1]), -float(slopes[:-1] @ np.array(resistance_ohm))

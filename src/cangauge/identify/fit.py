@@ -2,76 +2,114 @@
 
 from __future__ import annotations
 
+import hashlib
 import logging
-from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+import os
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any
+from typing import Any, Final, Literal
 
 import numpy as np
+from threadpoolctl import threadpool_limits
 
 from cangauge._display import figure
-from cangauge._formatting import counted, duration
+from cangauge._formatting import counted, duration, significant
+from cangauge._io import text_sha256
 from cangauge._typing import FloatArray
+from cangauge._version import __version__
 from cangauge.errors import InputError
-from cangauge.identify.assemble import (
-    coefficient_names,
-    common_name,
-    common_temperature_source,
-    information_of_rows,
-    log_sha256,
-    made_of,
-    model_file_of,
-    noise_of,
+from cangauge.identify.effect_search import (
+    AUTO,
+    AUTO_LOGS,
+    Linearized,
+    Search,
+    Selected,
+    linearize,
+    parse_effect_ids,
 )
-from cangauge.identify.effect_search import FittedEffects, fit_effects, parse_effect_ids
-from cangauge.identify.evaluate import (
-    Energy,
-    LogFit,
-    energy_balance,
-    evaluate,
-    evaluate_extended,
+from cangauge.identify.evaluate import Energy, LogFit, energy_balance, evaluate, slope_resistances
+from cangauge.identify.least_squares import (
+    BASE,
+    LOGS_AT_LEAST,
+    LogSums,
+    N,
+    P,
+    Solution,
+    log_sums,
+    row_features,
+    solve_scaled,
 )
-from cangauge.identify.log_errors import (
-    HeldOut,
-    LogFigures,
-    errors_of_fit,
-    held_out_error,
-    slope_resistances,
-    summed,
+from cangauge.identify.published import (
+    PublishedFit,
+    factor_of,
+    pooled,
+    published_columns,
+    solve_published,
 )
-from cangauge.identify.passes import RowsFit, RowsOfLogs, fit_logs, fit_voltage_model
-from cangauge.identify.starts import Start, find_starts, given_starts
-from cangauge.inference.least_squares import Solution
-from cangauge.inference.rows import (
-    DELAYS_S,
-    FitOptions,
-    FitRows,
-    SampledLog,
-    row_blocks,
-    sample_log,
-    usable_delays,
-)
+from cangauge.identify.rows import FitRows, fit_rows, usable_delays
+from cangauge.identify.starts import Start, Starts, find_starts, given_starts
 from cangauge.logs.gaps import bridge_s, uncounted_gaps, usual_step_s
-from cangauge.logs.log import Log
+from cangauge.logs.log import Log, TemperatureSource
+from cangauge.logs.read import as_log
 from cangauge.model.coulomb_counting import (
     capacity_from_full_discharge,
     difference_from_reference,
 )
-from cangauge.model.effects.library import effect_entries
+from cangauge.model.effects.library import Candidate, effect_entries
 from cangauge.model.extended import ExtendedModel
 from cangauge.model.model_file import (
     Information,
     Made,
     Model,
+    Ranges,
     SourceLog,
+    function_fields,
+    knots_model,
+    noise_of,
 )
-from cangauge.model.voltage_model import VoltageModel
+from cangauge.model.prior import (
+    CHEMISTRIES,
+    DELAYS_S,
+    REFERENCE_C,
+    Chemistry,
+    ChemistryName,
+    usual_loads,
+)
+from cangauge.model.voltage_model import KNOTS_PCT, VoltageModel
 
 _LOG = logging.getLogger(__name__)
 
-SHRINKAGE_REMARK = 0.8
-"""Shrinkage of kt by its prior below which a remark is added."""
+Equation = Literal["knots", "published"]
+
+EPSILON: Final = 0.05
+"""Published margin of the scaled SoC [-]."""
+
+FITTED_ROWS: Final = "the rows of the fit itself (too few logs to leave one out)"
+WHOLE_LOGS: Final = "whole logs left out in turn"
+
+LISTED_LOGS: Final = 4096
+"""Source logs that a model file names; of more, it states the number."""
+
+
+@dataclass(frozen=True)
+class LogFigures:
+    """Figures of one log.
+
+    Parameters
+    ----------
+    name : str
+    rows : int
+    voltage_mae_pct, soc_newton_mae_pct : float
+    removed : dict
+        Rows removed by each rule.
+    """
+
+    name: str
+    rows: int
+    voltage_mae_pct: float
+    soc_newton_mae_pct: float
+    removed: dict[str, int]
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,45 +117,62 @@ class Identification:
     """A fitted model with its figures."""
 
     model: Model
-    voltage_model: VoltageModel
     logs: tuple[Log, ...]
-    figures: tuple[LogFigures, ...]
-    """Of each log."""
-    rows: Sequence[FitRows] = field(repr=False)
-    """Rows of each log, made at each access."""
-    held_out: tuple[HeldOut, ...] = field(repr=False)
-    """Models that hold rows of each log out; () with effects."""
-    solution: Solution
+    fits: tuple[LogFit, ...] = field(repr=False)
+    """Model and measurement of each log, on the rows of the fit."""
+    held_out_error_v: tuple[FloatArray, ...] = field(repr=False)
+    """Measured minus predicted voltage of each log's rows by fits without the log [V]; () for
+    fewer than three logs."""
+    published: PublishedFit
+    """The published equation on the same rows."""
     energy: Energy
     slope_ohm: float
     """Regression of U − pseudo-OCV on the current, as a positive resistance [Ω]."""
     slope_expected_ohm: float
-    """−(R1 + Σ Rj·ρj), ρj the current's autocorrelation at the delays [Ω]."""
-    voltage_mae_pct: float
-    voltage_rmse_v: float
-    soc_newton_mae_pct: float
+    """What the model's resistances expect of it [Ω]."""
     remarks: tuple[str, ...] = ()
-    effects: FittedEffects | None = None
-    """Fitted effects; None if none were requested."""
+    effects: Selected | None = None
+    """Selected effects; None if none were asked for."""
     starts: tuple[Start, ...] = ()
     """SoC at the start of each log, and how it is known."""
-    extended_fits: tuple[LogFit, ...] = field(default=(), repr=False)
-    """`fits` of a model with effects."""
 
     @cached_property
-    def fits(self) -> tuple[LogFit, ...]:
-        """Model and measurement of each log, on the rows of the fit."""
-        return self.extended_fits or tuple(evaluate(self.voltage_model, each) for each in self.rows)
+    def voltage_model(self) -> VoltageModel:
+        """The model's equation, without effects."""
+        return self.model.voltage_model()
 
     @cached_property
-    def held_out_error_v(self) -> tuple[FloatArray, ...]:
-        """Measured minus predicted voltage of each log's rows, by fits without the row [V].
+    def figures(self) -> tuple[LogFigures, ...]:
+        """Figures of each log."""
+        return tuple(
+            LogFigures(
+                item.rows.name,
+                len(item.rows),
+                item.voltage_mae_pct,
+                item.soc_newton_mae_pct,
+                item.rows.removed,
+            )
+            for item in self.fits
+        )
 
-        NaN where no fold holds the row out.
-        """
-        if self.effects is not None and self.extended_fits:
-            return self.effects.held_out_error_v
-        return tuple(map(held_out_error, self.rows, self.held_out))
+    def _mean(self, values: Iterable[FloatArray]) -> float:
+        return float(np.mean(np.concatenate(list(values))))
+
+    @property
+    def voltage_mae_pct(self) -> float:
+        """Mean absolute voltage error on the rows of the fit [%]."""
+        errors = (np.abs(item.residual_v) / item.rows.voltage_v for item in self.fits)
+        return 100.0 * self._mean(errors)
+
+    @property
+    def voltage_rmse_v(self) -> float:
+        """Root mean square of it [V]."""
+        return float(self._mean(item.residual_v**2 for item in self.fits) ** 0.5)
+
+    @property
+    def soc_newton_mae_pct(self) -> float:
+        """Mean absolute error of the SoC from voltage on the rows of the fit [%]."""
+        return self._mean(np.abs(f.soc_newton_pct - f.rows.soc_pct) for f in self.fits)
 
     def plot(self) -> Any:
         """Return pseudo-OCV and residuals, for `bokeh.plotting.show`."""
@@ -125,26 +180,26 @@ class Identification:
 
     def to_dict(self) -> dict[str, object]:
         """Return the object that `cangauge fit --json` prints."""
-        noise = self.model.noise
+        model, noise = self.model, self.model.noise
         return {
             "voltage_mae_pct": self.voltage_mae_pct,
             "voltage_rmse_v": self.voltage_rmse_v,
             "soc_newton_mae_pct": self.soc_newton_mae_pct,
-            "capacity_ah": self.model.capacity_ah,
+            "capacity_ah": model.capacity_ah,
             "slope_ohm": self.slope_ohm,
             "slope_expected_ohm": self.slope_expected_ohm,
-            "condition_number": self.solution.condition_number,
-            "constrained": self.solution.constrained,
-            "coefficients": {
-                name: item.model_dump() for name, item in self.model.coefficients.items()
-            },
+            "condition_number": self.published.condition_number,
+            "coefficients": {name: item.model_dump() for name, item in model.coefficients.items()},
             "energy": vars(self.energy),
+            "equation": model.equation,
+            "chemistry": model.chemistry,
+            "cells": model.cells,
             "held_out": {
                 "voltage_mae_pct": noise.voltage_mae_pct,
                 "voltage_rmse_v": noise.voltage_rmse_v,
                 "judged_on": noise.judged_on,
+                "scale": noise.left_out_scale,
             },
-            "delays_s": list(self.model.delays_s),
             "rows": sum(item.rows for item in self.figures),
             "logs": [
                 {
@@ -159,21 +214,27 @@ class Identification:
                 }
                 for item, start in zip(self.figures, self.starts, strict=True)
             ],
+            "effects": model.effects,
+            "effect_search": [step.to_dict() for step in self.effects.steps]
+            if self.effects
+            else [],
             "remarks": list(self.remarks),
-        } | ({} if self.effects is None else self.effects.to_dict())
+        }
 
 
 def fit(
-    logs: Sequence[Log],
+    logs: Any,
     *,
     capacity_ah: float | None = None,
     initial_soc_pct: float | Sequence[float | None] | None = None,
+    equation: Equation = "knots",
+    chemistry: ChemistryName | None = None,
+    cells: int | None = None,
     rate_hz: float = 1.0,
     delay_s: Sequence[float] = DELAYS_S,
-    epsilon: float = 0.05,
-    t_ref_c: float = 20.0,
-    effects: str | Sequence[str] = (),
-    name: str | None = None,
+    epsilon: float = EPSILON,
+    t_ref_c: float = REFERENCE_C,
+    effects: str | Sequence[str] | None = None,
 ) -> Identification:
     """Identify the model of a pack from one or more logs.
 
@@ -181,24 +242,27 @@ def fit(
 
     Parameters
     ----------
-    logs : sequence of Log
+    logs : Log, path or DataFrame, or a sequence of them
     capacity_ah : float, optional
         Charge from 100 to 0 % [Ah]; by default from a log that runs from full to empty.
     initial_soc_pct : float, or sequence of float or None, optional
         SoC at the first row [%], of all logs or of each; by default the log's reference SoC. Where
         neither is known it is estimated together with the curve, if another log pins it.
+    equation : {"knots", "published"}
+        A curve of knots with the chemistry's prior, or the published equation by plain least
+        squares.
+    chemistry : {"oxide", "lfp"}, optional
+        By default from the volts per cell where `cells` is given, else oxide.
+    cells : int, optional
+        Cells in series.
     rate_hz : float
         Rate of the fit and of the model [Hz]; logs are decimated to it.
-    delay_s : sequence of float
-        Delays of the current [s], increasing.
-    epsilon : float
-        Margin ε of the scaled SoC, in (0, 0.5).
-    t_ref_c : float
-        Reference temperature T_r [°C].
-    effects : str or sequence of str
-        Effect ids, or "auto": those that reduce the held-out error significantly.
-    name : str, optional
-        Name of the model; by default the common part of the logs' names.
+    delay_s, epsilon, t_ref_c
+        Delays of the current [s], margin ε of the scaled SoC and reference temperature T_r [°C] of
+        the published equation.
+    effects : str or sequence of str, optional
+        Effect ids; "auto": those that reduce the error of left-out logs significantly; "none". By
+        default auto from five logs on. Only for knots.
 
     Returns
     -------
@@ -208,123 +272,410 @@ def fit(
     Raises
     ------
     InputError
-        If the logs cannot identify the model: unknown capacity, too little SoC, a pseudo-OCV
-        that does not rise, temperatures of different sources.
+        If the logs cannot identify the model: unknown capacity or start, no usable row,
+        temperatures of different sources.
 
     Examples
     --------
-    >>> found = fit([read_log("trip.csv")], capacity_ah=60.0, effects="auto")  # doctest: +SKIP
-    >>> found.model.save("pack.json")  # doctest: +SKIP
+    >>> fitted = fit("trip.csv", capacity_ah=60.0, cells=96)  # doctest: +SKIP
+    >>> fitted.model.save("pack.json")  # doctest: +SKIP
     """
-    effect_ids = parse_effect_ids([effects] if isinstance(effects, str) else effects)
-    _check_logs(logs)
-    given = given_starts(initial_soc_pct, len(logs))
+    recorded = [as_log(log) for log in (logs if isinstance(logs, list | tuple) else [logs])]
+    _check_logs(recorded)
+    given = given_starts(initial_soc_pct, len(recorded))
     if capacity_ah is None:
-        capacity_ah = capacity_from_full_discharge(logs, given)
+        capacity_ah = capacity_from_full_discharge(recorded, given)
     if not capacity_ah > 0.0:
         raise InputError(
             "the capacity must be positive", field="capacity_ah", value=capacity_ah,
             cure="check the sign of current: positive must discharge",
         )  # fmt: skip
-    usable = usable_delays(logs, delay_s)
-    options = FitOptions(capacity_ah, None, rate_hz, usable, epsilon, t_ref_c)
-    found_starts = find_starts(logs, given, options)
-    logs = found_starts.logs
-    rows = RowsOfLogs(logs, options)
-    found = None
-    if effect_ids:
-        # With effects, cross-validation tests kt too, so its tight prior is not used.
-        plain, _ = fit_voltage_model(rows, options, with_kt_prior=False)
-        sampled = [sample_log(log, options) for log in logs]
-        found = fit_effects(ExtendedModel(plain, capacity_ah), sampled, effect_ids)
-    if found is not None and found.model.effects:
-        fitted, extended_fits = _with_effects(found, sampled, options)
-    else:
-        fitted, extended_fits = fit_logs(rows, options), ()
-        if found_starts.std_error is not None:
-            wider = np.maximum(fitted.solution.std_error, found_starts.std_error)
-            fitted = replace(fitted, solution=replace(fitted.solution, std_error=wider))
-    voltage_model, solution, sums = fitted.model, fitted.solution, fitted.errors.sums
-    slope, expected = slope_resistances(fitted.errors, voltage_model.resistance_ohm)
-    model = model_file_of(
-        voltage_model,
-        solution,
-        options,
-        name=name or common_name([log.name for log in logs]),
-        temperature_source=logs[0].temperature_source,
-        noise=noise_of(
-            fitted.errors,
-            voltage_model,
-            rate_hz=rate_hz,
-            mean_c=fitted.mean_c,
-            spans=fitted.spans,
-        ),
-        effects=[] if found is None else effect_entries(found.model.effects),
-        information=_information(fitted, options, found),
-        made=_made(logs, options, effect_ids, fitted.figures, initial_soc_pct),
-    )
+    ids = _effect_ids(effects, equation, len(recorded))
+    known, said = resolve_chemistry(recorded, chemistry, cells)
+    with threadpool_limits(limits=1):  # 40 columns: threads only wait for each other
+        starts = find_starts(recorded, given, capacity_ah, known)
+        knots = equation == "knots"
+        delays = DELAYS_S if knots else usable_delays(starts.logs, delay_s)
+        rows = [fit_rows(log, capacity_ah, rate_hz=rate_hz, delay_s=delays) for log in starts.logs]
+        options = {
+            "capacity_ah": capacity_ah,
+            "rate_hz": rate_hz,
+            "chemistry": known.name,
+            "equation": equation,
+            "initial_soc_pct": initial_soc_pct if isinstance(initial_soc_pct, float) else None,
+            "effects": ", ".join(ids) or None,
+        }
+        fields: dict[str, Any] = {
+            "name": common_name([log.name for log in recorded]),
+            "chemistry": known.name,
+            "cells": cells,
+            "capacity_ah": capacity_ah,
+            "rate_hz": rate_hz,
+            "temperature_source": recorded[0].temperature_source,
+            "range": ranges_of(rows),
+            "made": made_of(starts.logs, rows, options),
+        }
+        if knots:
+            found = _fit_knots(starts.logs, rows, known, ids, fields)
+        else:
+            equation_of = (epsilon, t_ref_c, tuple(delays))
+            found = _fit_published(rows, known, equation_of, fields)
+        model = found.model
+        extended = model.extended_model()
+        fits = tuple(
+            evaluate(extended, log, of_log) for log, of_log in zip(starts.logs, rows, strict=True)
+        )
+    slope, expected = slope_resistances(fits, extended.model.resistance_ohm)
     return Identification(
         model=model,
-        voltage_model=voltage_model,
-        logs=tuple(logs),
-        figures=fitted.figures,
-        rows=rows,
-        held_out=fitted.held_out,
-        solution=solution,
-        energy=energy_balance(logs, slope),
+        logs=starts.logs,
+        fits=fits,
+        held_out_error_v=found.held_out_error_v,
+        published=found.published,
+        energy=energy_balance(starts.logs, slope),
         slope_ohm=slope,
         slope_expected_ohm=expected,
-        voltage_mae_pct=sums["voltage_pct"] / sums["rows"],
-        voltage_rmse_v=float(np.sqrt(sums["square_v2"] / sums["rows"])),
-        soc_newton_mae_pct=sums["newton_pct"] / sums["rows"],
         remarks=(
-            *_remarks(voltage_model, solution, fitted.figures),
-            *_remarks_on_time(logs, delay_s, usable),
-            *found_starts.remarks(),
-            *(
-                text
-                for log in found_starts.pieces
-                if (text := difference_from_reference(log, capacity_ah)) is not None
-            ),
-            *(found.remarks() if found is not None else ()),
+            *said,
+            *_remarks(rows, starts, recorded, delay_s, capacity_ah, knots=knots),
+            *_remarks_on_effects(found.effects, model),
         ),
-        effects=found,
-        starts=found_starts.starts,
-        extended_fits=extended_fits,
+        effects=found.effects,
+        starts=starts.starts,
     )
 
 
-def _with_effects(
-    found: FittedEffects, logs: Sequence[SampledLog], options: FitOptions
-) -> tuple[RowsFit, tuple[LogFit, ...]]:
-    """Return figures of a model with effects, and its fit of each log."""
-    model = found.model.model
-    fits = tuple(evaluate_extended(found.model, item) for item in logs)
-    mean_c = float(np.mean(np.concatenate([item.rows.temperature_c for item in fits])))
-    errors = [
-        errors_of_fit(
-            item.rows,
-            ((item.part(block), error_v[block]) for block in row_blocks(len(item.rows))),
-            model.resistance_ohm,
-            options.rate_hz,
-            mean_c=mean_c,
+def _effect_ids(
+    effects: str | Sequence[str] | None, equation: Equation, logs: int
+) -> tuple[str, ...]:
+    if effects is None:
+        return (AUTO,) if equation == "knots" and logs >= AUTO_LOGS else ()
+    ids = parse_effect_ids([effects] if isinstance(effects, str) else effects) if effects else ()
+    if ids and equation == "published":
+        raise InputError(
+            "the published equation is fitted without effects",
+            field="--effects",
+            value=", ".join(ids),
+            cure="leave out --equation published",
         )
-        for item, error_v in zip(fits, found.held_out_error_v, strict=True)
-    ]
-    spans = [(np.ptp(item.rows.time_s), np.ptp(item.rows.soc_pct)) for item in fits]
-    figures = tuple(
-        LogFigures(item.rows.name, item.rows.removed, each.sums)
-        for item, each in zip(fits, errors, strict=True)
+    return ids
+
+
+def resolve_chemistry(
+    logs: Sequence[Log], chemistry: ChemistryName | None, cells: int | None
+) -> tuple[Chemistry, list[str]]:
+    """Return the chemistry, and what is to be said about how it is known.
+
+    Parameters
+    ----------
+    logs : sequence of Log
+    chemistry : {"oxide", "lfp"}, optional
+    cells : int, optional
+        Cells in series.
+    """
+    if chemistry is not None:
+        return CHEMISTRIES[chemistry], []
+    if cells is None:
+        return CHEMISTRIES["oxide"], [
+            "chemistry taken as oxide: --chemistry lfp for iron phosphate, or --cells N to take it"
+            " from the volts per cell"
+        ]
+    volts = float(np.median(np.concatenate([log.voltage_v for log in logs]))) / cells
+    socs = [pct for log in logs if (first := log.first_soc()) for pct in (first[1],)]
+    middle = float(np.mean(socs)) if socs else 50.0
+    name = min(
+        CHEMISTRIES,
+        key=lambda name: abs(
+            volts - float(np.interp(middle, KNOTS_PCT, CHEMISTRIES[name].curve_v))
+        ),
     )
-    fitted = RowsFit(
-        model, found.solution, None, mean_c, np.mean(spans, axis=0), (), summed(errors), figures
+    return CHEMISTRIES[name], [f"chemistry {name} by {volts:.2f} V per cell"]
+
+
+@dataclass(frozen=True, eq=False)
+class _Fitted:
+    model: Model
+    published: PublishedFit
+    held_out_error_v: tuple[FloatArray, ...]
+    effects: Selected | None
+
+
+def _fit_knots(
+    logs: Sequence[Log],
+    rows: Sequence[FitRows],
+    chemistry: Chemistry,
+    effect_ids: Sequence[str],
+    fields: dict[str, Any],
+) -> _Fitted:
+    capacity_ah = fields["capacity_ah"]
+    factors = [factor_of(item, len(DELAYS_S), EPSILON, REFERENCE_C) for item in rows]
+    published = solve_published(pooled(factors), EPSILON)
+    if usable_delays(logs, DELAYS_S) == DELAYS_S and published.identified:
+        fields = fields | {"published": published.fields(EPSILON, REFERENCE_C, DELAYS_S)}
+    columns = [row_features(item) for item in rows]
+    sums = [log_sums(item, chemistry) for item in rows]
+    solution, without = solve_scaled(sums, capacity_ah, chemistry)
+    selected: Selected | None = None
+    if effect_ids:
+        plain = knots_file(solution, chemistry, fields).extended_model()
+        search = Search(plain, logs, rows, chemistry, effect_ids)
+        joint: _WithEffects | None = None
+        selected = search.select()
+        while selected.chosen and joint is None:
+            start = solution, fields
+            joint = _fit_with_effects(logs, rows, chemistry, selected, start, search.refused)
+            selected = selected if joint is not None else search.select()
+        if joint is not None:
+            about, solution, without, fields = joint
+            rows = [item.rows for item in about]
+            columns = [np.column_stack([item.features, item.columns]) for item in about]
+    errors = tuple(
+        _where_covered(number, rows, other.residual_v_of(columns[number], rows[number].voltage_v))
+        for number, other in enumerate(without)
     )
-    return fitted, fits
+    return _Fitted(
+        knots_file(solution, chemistry, fields, errors, rows), published, errors, selected
+    )
+
+
+RELINEARIZED: Final = 4
+"""Linearizations about the fitted effects: products of effects and resistances have converged."""
+
+
+_WithEffects = tuple[list[Linearized], Solution, list[Solution], dict[str, Any]]
+
+
+def _fit_with_effects(  # noqa: PLR0917
+    logs: Sequence[Log],
+    rows: Sequence[FitRows],
+    chemistry: Chemistry,
+    selected: Selected,
+    first: tuple[Solution, dict[str, Any]],
+    refused: list[Candidate],
+) -> _WithEffects | None:
+    """Return the rows about the fitted effects, the solutions there, and the file's fields.
+
+    Gauss–Newton from the solution without effects. None where amplitudes end at their physical
+    bounds; the effects that do are appended to `refused`.
+    """
+    solution, fields = first
+    std = selected.amplitude_std
+    amplitudes: FloatArray | None = None
+    model = knots_file(solution, chemistry, fields).extended_model()
+    for _ in range(RELINEARIZED):
+        coefficients = solution.select[:P, :BASE].T @ solution.coefficients[:P]
+        of_effects = np.zeros(std.size) if amplitudes is None else amplitudes
+        about = [
+            linearize(model, log, item, selected.chosen, amplitudes).with_voltage(
+                coefficients, of_effects
+            )
+            for log, item in zip(logs, rows, strict=True)
+        ]
+        sums = [log_sums(item.rows, chemistry, item.columns, item.features) for item in about]
+        solution, without = solve_scaled(sums, fields["capacity_ah"], chemistry, std)
+        solution = selected.clipped(solution)
+        amplitudes = solution.coefficients[P:]
+        effects = selected.effects(solution)
+        voltage = knots_file(solution, chemistry, fields).voltage_model()
+        model = ExtendedModel(voltage, fields["capacity_ah"], effects)
+    if at_bound := selected.at_bound(solution):
+        refused += at_bound
+        return None
+    return about, solution, without, fields | {"effects": effect_entries(effects)}
+
+
+def _where_covered(number: int, rows: Sequence[FitRows], error_v: FloatArray) -> FloatArray:
+    """Return the errors of a log, NaN where the other logs have no SoC."""
+    others = [item.soc_pct for k, item in enumerate(rows) if k != number]
+    low = min(float(soc.min()) for soc in others)
+    high = max(float(soc.max()) for soc in others)
+    soc = rows[number].soc_pct
+    return np.where((soc >= low) & (soc <= high), error_v, np.nan)
+
+
+def knots_file(
+    solution: Solution,
+    chemistry: Chemistry,
+    fields: dict[str, Any],
+    held_out_error_v: Sequence[FloatArray] = (),
+    rows: Sequence[FitRows] = (),
+) -> Model:
+    """Return the model file of a solution.
+
+    Parameters
+    ----------
+    solution : Solution
+        Its covariance and scale are final.
+    chemistry : Chemistry
+    fields : dict
+        The other fields of `Model`.
+    held_out_error_v : sequence of array
+        Errors of left-out logs [V].
+    rows : sequence of FitRows
+        Of the same logs.
+    """
+    noise = noise_of(
+        chemistry,
+        solution.mean_v,
+        solution.residual_v,
+        scale=solution.scale,
+        **_judged(held_out_error_v, rows, solution.residual_v, solution.mean_v),
+    )
+    return knots_model(
+        solution.coefficients[:P],
+        solution.covariance[:P, :P],
+        arrhenius_ohm=solution.arrhenius_ohm,
+        mean_c=solution.mean_c,
+        noise=noise,
+        information=_information(solution),
+        **fields,
+    )
+
+
+def model_rmse(solutions: Sequence[Solution], sums: Sequence[LogSums]) -> float:
+    """Return the rms error of logs [V], each by a solution, weighted by their time."""
+    weight = sum(item.weight for item in sums)
+    pairs = zip(solutions, sums, strict=True)
+    square = sum(a.square_error(item) * item.weight for a, item in pairs)
+    return float((square / weight) ** 0.5)
+
+
+def _judged(
+    held_out_error_v: Sequence[FloatArray],
+    rows: Sequence[FitRows],
+    residual_v: float,
+    mean_v: float,
+) -> dict[str, Any]:
+    error_v = np.concatenate([*held_out_error_v, np.empty(0)])
+    if not np.isfinite(error_v).any():
+        return {
+            "voltage_mae_pct": 100.0 * (2.0 / np.pi) ** 0.5 * residual_v / mean_v,
+            "voltage_rmse_v": residual_v,
+            "judged_on": FITTED_ROWS,
+        }
+    volts = np.concatenate([item.voltage_v for item in rows])
+    return {
+        "voltage_mae_pct": 100.0 * float(np.nanmean(np.abs(error_v) / volts)),
+        "voltage_rmse_v": float(np.sqrt(np.nanmean(error_v**2))),
+        "judged_on": WHOLE_LOGS,
+    }
+
+
+def _information(solution: Solution) -> Information:
+    """Return the posterior of all coefficients as square root of its precision."""
+    root = np.linalg.cholesky(np.linalg.inv(solution.covariance)).T
+    names = [f"knot_{soc:g}" for soc in KNOTS_PCT.tolist()]
+    names += ["kt", *(f"R{k}" for k in range(1, P - N - 1)), "b"]
+    names += [f"amplitude_{k}" for k in range(1, solution.coefficients.size - P + 1)]
+    return Information(
+        columns=names,
+        root=np.triu(root).tolist(),
+        projected=(root @ solution.coefficients).tolist(),
+    )
+
+
+def _fit_published(
+    rows: Sequence[FitRows],
+    chemistry: Chemistry,
+    equation: tuple[float, float, tuple[float, ...]],
+    fields: dict[str, Any],
+) -> _Fitted:
+    epsilon, t_ref_c, delays = equation
+    factors = [factor_of(item, len(delays), epsilon, t_ref_c) for item in rows]
+    published = solve_published(pooled(factors), epsilon)
+    if not published.identified:
+        raise InputError(
+            "the logs do not identify the published equation: too little SoC, too few rows, or a"
+            " pseudo-OCV that falls with SoC",
+            field="equation",
+            value="published",
+            cure="leave out --equation published, or give logs over more SoC",
+        )
+    volts = np.concatenate([item.voltage_v for item in rows])
+    mean_v = float(volts.mean())
+    errors: tuple[FloatArray, ...] = ()
+    if len(rows) >= LOGS_AT_LEAST:
+        errors = tuple(
+            _where_covered(number, rows, item.voltage_v - columns @ other.coefficients)
+            for number, item in enumerate(rows)
+            for columns in (published_columns(item, len(delays), epsilon, t_ref_c),)
+            for other in (
+                solve_published(pooled(factors[:number] + factors[number + 1 :]), epsilon),
+            )
+        )
+    jacobian = published.jacobian(epsilon)
+    model = Model(
+        equation="published",
+        published=published.fields(epsilon, t_ref_c, delays),
+        functions=function_fields(
+            jacobian @ published.covariance @ jacobian.T,
+            usual_loads(fields["capacity_ah"], len(delays)),
+        ),
+        noise=noise_of(
+            chemistry, mean_v, published.residual_v,
+            **_judged(errors, rows, published.residual_v, mean_v),
+        ),
+        **fields,
+    )  # fmt: skip
+    return _Fitted(model, published, errors, None)
+
+
+COVERED_PCT: Final = 50.0
+"""SoC span of the logs below which a remark says that the curve beyond is the prior's [%]."""
+
+
+def _remarks(
+    rows: Sequence[FitRows],
+    starts: Starts,
+    recorded: Sequence[Log],
+    delay_s: Sequence[float],
+    capacity_ah: float,
+    *,
+    knots: bool,
+) -> list[str]:
+    found = []
+    ranges = ranges_of(rows)
+    low, high = ranges.soc_pct
+    if high - low < COVERED_PCT:
+        beyond = "follows the typical cell" if knots else "is extrapolated linearly"
+        found.append(f"the logs cover {low:.0f}–{high:.0f} % SoC; beyond, the curve {beyond}")
+    removed = sum(item.removed["start_up_or_shut_down"] for item in rows)
+    if removed:
+        found.append(f"{counted(removed, 'row')} of start-up and shut-down left out")
+    usable = usable_delays(recorded, delay_s)
+    if len(usable) < len(delay_s):
+        left_out = ", ".join(f"{delay:g}" for delay in delay_s if delay not in usable)
+        step_s = min(usual_step_s(log.time_s) for log in recorded)
+        found.append(f"rows every {step_s:.3g} s do not resolve a delay of {left_out} s")
+    for log in recorded:
+        gaps = uncounted_gaps(log.time_s)
+        if gaps.size:
+            longest = float(np.max(np.diff(log.time_s)[gaps]))
+            found.append(
+                f"{log.name}: {counted(gaps.size, 'gap')} of more than"
+                f" {bridge_s(log.time_s):.0f} s, the longest {duration(longest)}: no charge is"
+                " counted over them (a rest); split the log there if the pack was used"
+            )
+    differences = (difference_from_reference(log, capacity_ah) for log in starts.pieces)
+    return [*found, *starts.remarks(), *(text for text in differences if text is not None)]
+
+
+def _remarks_on_effects(selected: Selected | None, model: Model) -> list[str]:
+    if selected is None:
+        return []
+    if not selected.steps and not selected.chosen:
+        return ["effects need three logs, so that each can be left out"]
+    error_v = significant(model.noise.voltage_rmse_v, 3)
+    names = ", ".join(item.effect.id for item in selected.chosen)
+    if not names:
+        return [f"no effect lowers the error of left-out logs ({error_v} V) significantly"]
+    return [f"effects: {names}; error of left-out logs {error_v} V"]
 
 
 def _check_logs(logs: Sequence[Log]) -> None:
     if not logs:
         raise InputError("no log given", cure="give at least one recorded log")
+    first: dict[str, Log] = {}
     for log in logs:
         if len(log) < 2:
             raise InputError(
@@ -332,113 +683,90 @@ def _check_logs(logs: Sequence[Log]) -> None:
                 source=log.source or log.name,
                 cure="give a log of minutes or hours",
             )
-    by_sums: dict[tuple[float, ...], list[Log]] = {}
-    for log in logs:
-        sums = (float(len(log)), float(log.current_a.sum()), float(log.voltage_v.sum()))
-        for other in by_sums.setdefault(sums, []):
-            if _has_rows_of(log, other):
-                raise InputError(
-                    f"same rows as {other.source or other.name}: they would count twice",
-                    source=log.source or log.name,
-                    cure="give each log once",
-                )
-        by_sums[sums].append(log)
+        other = first.setdefault(signals_sha256(log), log)
+        if other is not log:
+            raise InputError(
+                f"same rows as {other.source or other.name}: they would count twice",
+                source=log.source or log.name,
+                cure="give each log once",
+            )
     common_temperature_source(log.temperature_source for log in logs)
 
 
-def _has_rows_of(log: Log, other: Log) -> bool:
-    """Return whether two logs have the same current and voltage."""
-    same = np.array_equal
-    return same(log.current_a, other.current_a) and same(log.voltage_v, other.voltage_v)
+def common_temperature_source(sources: Iterable[TemperatureSource]) -> TemperatureSource:
+    """Return the source of all logs' temperatures; raise InputError if they differ."""
+    found = sorted(set(sources))
+    if len(found) > 1:
+        raise InputError(
+            "the temperatures of the logs have different sources",
+            field="temperature_source",
+            value=found,
+            cure="state it for the logs that do not (--temperature-source), or fit logs of one"
+            " source together",
+        )
+    return found[0]
 
 
-def _information(fitted: RowsFit, options: FitOptions, found: FittedEffects | None) -> Information:
-    """Return the square root of the information of the rows on the coefficients."""
-    names, prior = coefficient_names(options), fitted.solution.kt_prior
-    if fitted.information is not None:
-        root = fitted.information.root
-        columns, volts = root[:, :-1], root[:, -1]
-        effect_columns = np.empty((volts.size, 0))
-    elif found is not None:
-        n = len(names)
-        columns, effect_columns = found.linear.columns[:, :n], found.linear.columns[:, n:]
-        volts = found.linear.residual_v + columns @ found.linear.model.model.coefficients
-    kt_weight = 0.0
-    if prior is not None:
-        kt_weight = prior.row_weight
-    elif found is not None:
-        kt_weight = found.linear.kt_weight
-    return information_of_rows(columns, effect_columns, volts, names, kt_weight)
+def ranges_of(rows: Sequence[FitRows]) -> Ranges:
+    """Return the ranges of SoC, temperature and current of some logs' rows."""
+
+    def span(values: Iterable[FloatArray]) -> tuple[float, float]:
+        ends = [(float(item.min()), float(item.max())) for item in values]
+        return min(low for low, _ in ends), max(high for _, high in ends)
+
+    return Ranges(
+        soc_pct=span(item.soc_pct for item in rows),
+        temperature_c=span(item.temperature_c for item in rows),
+        current_a=span(item.currents_a[:, 0] for item in rows),
+    )
 
 
-def _made(
-    logs: Sequence[Log],
-    options: FitOptions,
-    effect_ids: Sequence[str],
-    figures: Sequence[LogFigures],
-    initial_soc_pct: float | Sequence[float | None] | None,
-) -> Made:
+def made_of(logs: Sequence[Log], rows: Sequence[FitRows], options: dict[str, Any]) -> Made:
+    """Return how a model file was made."""
     hashes = [log_sha256(log) for log in logs]
     listed = [
-        SourceLog(name=log.name, rows=item.rows, sha256=digest)
-        for log, item, digest in zip(logs, figures, hashes, strict=True)
+        SourceLog(name=log.name, rows=len(item), sha256=digest)
+        for log, item, digest in zip(logs, rows, hashes, strict=True)
     ]
-    given = initial_soc_pct if isinstance(initial_soc_pct, float) else None
-    effects = {"effects": ", ".join(effect_ids)} if effect_ids else {}
-    return made_of(options, listed, hashes, initial_soc_pct=given, **effects)
+    return Made(
+        by=f"cangauge {__version__}",
+        options=options,
+        logs=listed[:LISTED_LOGS],
+        fingerprint=text_sha256("".join(hashes)),
+    )
 
 
-def _remarks_on_time(
-    logs: Sequence[Log], delay_s: Sequence[float], usable: Sequence[float]
-) -> list[str]:
-    remarks = []
-    if len(usable) < len(delay_s):
-        left_out = ", ".join(f"{delay:g}" for delay in delay_s if delay not in usable)
-        step_s = min(usual_step_s(log.time_s) for log in logs)
-        remarks.append(
-            f"rows every {step_s:.3g} s do not resolve a delay of {left_out} s: left out"
-        )
-    for log in logs:
-        gaps = uncounted_gaps(log.time_s)
-        if gaps.size:
-            longest = float(np.max(np.diff(log.time_s)[gaps]))
-            remarks.append(
-                f"{log.name}: {counted(gaps.size, 'gap')} of more than"
-                f" {bridge_s(log.time_s):.0f} s, the longest {duration(longest)}: no charge is"
-                " counted over them (a rest); split the log there if the pack was used"
-            )
-    return remarks
+def signals_sha256(log: Log) -> str:
+    """Return what identifies the rows of a log: the SHA-256 of its current and voltage."""
+    return _sha256(log.current_a, log.voltage_v)
 
 
-def _remarks(model: VoltageModel, solution: Solution, figures: Sequence[LogFigures]) -> list[str]:
-    remarks = []
-    lo, hi = model.soc_range_pct
-    if hi - lo < 50.0:
-        remarks.append(
-            f"the logs cover {lo:.0f}–{hi:.0f} % SoC; outside, the pseudo-OCV is extrapolated"
-            " linearly"
-        )
-    t_lo, t_hi = model.temperature_range_c
-    prior = solution.kt_prior
-    if prior is not None and prior.shrinkage < SHRINKAGE_REMARK:
-        remarks.append(
-            f"the logs ({t_lo:.1f} … {t_hi:.1f} °C) determine kt to ±{prior.data_std_v_per_k:.2g}"
-            f" V/K only: it is {model.kt_v_per_k:.3f} V/K, held by its prior of"
-            f" ±{prior.prior_std_v_per_k:.2g}; add a log at another temperature"
-        )
-    elif t_hi - t_lo < 3.0:
-        remarks.append(
-            f"the temperature varies by only {t_hi - t_lo:.1f} K: kt = {model.kt_v_per_k:.3f} V/K"
-            " is hardly identified"
-        )
-    if solution.constrained:
-        remarks.append("the pseudo-OCV of the plain fit would fall somewhere: constrained to rise")
-    removed = sum(item.removed["start_up_or_shut_down"] for item in figures)
-    if removed:
-        remarks.append(f"{removed} start-up or shut-down rows removed")
-    if any(resistance > 0.0 for resistance in model.resistance_ohm[:1]):
-        remarks.append(
-            "R1 is positive: the voltage rises under load, so the sign of current is likely"
-            " inverted"
-        )
-    return remarks
+def log_sha256(log: Log) -> str:
+    """Return the SHA-256 of a log's channels in hexadecimal."""
+    return _sha256(log.time_s, log.current_a, log.voltage_v, log.temperature_c)
+
+
+def _sha256(*channels: FloatArray) -> str:
+    digest = hashlib.sha256()
+    for channel in channels:
+        digest.update(np.ascontiguousarray(channel).data)
+    return digest.hexdigest()
+
+
+def common_name(names: Sequence[str]) -> str:
+    """Return a name for several logs: their common prefix and their number.
+
+    Examples
+    --------
+    >>> common_name(["TripA01", "TripA03", "TripA05"])
+    'TripA (3 logs)'
+    """
+    if len(names) == 1:
+        return names[0]
+    prefix = os.path.commonprefix(list(names))  # noqa: RUF071 - of strings, not of paths
+    if any(name[len(prefix) : len(prefix) + 1].isdigit() for name in names):
+        prefix = prefix.rstrip("0123456789")  # of a number that differs
+    prefix = prefix.rstrip(" _-.,(")
+    if not prefix:
+        return f"{names[0]} and {len(names) - 1} more"
+    return f"{prefix} ({len(names)} logs)"

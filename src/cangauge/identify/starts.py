@@ -1,18 +1,15 @@
 """SoC at the start of each log: stated, from the log, or estimated together with the curve.
 
-Where a log states no SoC, its start S₀ is a further unknown of the least squares. With the charge
-counted from it, S(t) = S₀ − ΔS(t), a change of S₀ shifts the voltage of the whole log by dU/dS, so
-
-    U ≈ X(S)·k + dU/dS·δ,
-
-solved for the coefficients k and δ = ΔS₀ in turn (Gauss–Newton) until δ vanishes. At least one log
-must pin the curve along the SoC axis; the others attach to it where their voltages overlap.
+Where a log states no SoC, its start is the one at which the model fits its voltage best, its level
+being unknown within the prior. Models and starts are found in turn until the starts stay: at least
+one log must pin the curve along the SoC axis, and the others attach to it where their voltages
+overlap.
 """
 
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Final, Literal
 
@@ -20,29 +17,30 @@ import numpy as np
 from scipy import optimize
 
 from cangauge._formatting import significant
-from cangauge._typing import FloatArray
 from cangauge.errors import InputError
-from cangauge.identify.log_errors import score_sums, summed_scores, with_std_errors
-from cangauge.identify.passes import fit_voltage_model
-from cangauge.identify.voltage_fit import information_of, pooled, solve_information, table_of
-from cangauge.inference.least_squares import CLUSTER_S, Solution
-from cangauge.inference.rows import FitOptions, FitRows, block_numbers, fit_rows, row_blocks
-from cangauge.logs.gaps import split_where_moved
+from cangauge.identify.least_squares import (
+    LogSums,
+    N,
+    Solution,
+    load_features,
+    log_sums,
+    row_weights,
+    solve,
+)
+from cangauge.identify.rows import FitRows, fit_rows
+from cangauge.logs.gaps import discharged_ah, split_where_moved
 from cangauge.logs.log import Log
-from cangauge.model.coulomb_counting import discharged_ah
 from cangauge.model.effects.base import Signals
 from cangauge.model.model_file import Model
-from cangauge.model.voltage_model import VoltageModel, ocv_basis_slope
+from cangauge.model.prior import CHEMISTRIES, Chemistry
+from cangauge.model.voltage_model import KNOTS_PCT, HermiteCurve
 
 _LOG = logging.getLogger(__name__)
 
 Origin = Literal["given", "log", "estimated"]
 
-STEP_AT_MOST_PCT: Final = 5.0
-"""Largest change of a start in one step [%]: the curve is bent."""
-
-STEPS_AT_MOST: Final = 40
-CONVERGED_PCT: Final = 0.005
+STEPS_AT_MOST: Final = 20
+CONVERGED_PCT: Final = 0.05
 """Change of every start below which the steps end [%]: half the resolution of published SoC."""
 
 STD_AT_MOST_PCT: Final = 5.0
@@ -51,10 +49,10 @@ log is worth as much as its start, and a start that is worse than this is read o
 rest voltages."""
 
 SEARCH_STEP_PCT: Final = 1.0
-"""Grid of the first search for a start [%]."""
+"""Grid of the search for a start [%]."""
 
-SEARCH_ROWS: Final = 400
-"""Rows of a log that the first search uses, evenly spaced."""
+SLOPE_AT_LEAST: Final = 1e-5
+"""Least mean slope of a curve relative to its voltage [1/%]: a flat curve tells nothing."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,17 +93,14 @@ class Starts:
     pieces : tuple of Log
         The same with their own SoC.
     starts : tuple of Start
-    std_error : array of shape (p,) or None
-        Standard errors of the coefficients with the uncertainty of the estimated starts.
     """
 
     logs: tuple[Log, ...]
     pieces: tuple[Log, ...]
     starts: tuple[Start, ...]
-    std_error: FloatArray | None = None
 
     def remarks(self) -> list[str]:
-        """Return a remark on the starts that were estimated."""
+        """Return remarks on starts that were estimated, and logs that were split."""
         found = [str(start) for start in self.starts if start.origin == "estimated"]
         remarks = [f"start estimated together with the curve: {'; '.join(found)}"] if found else []
         parts = [log.name for log in self.logs if " part " in log.name]
@@ -147,7 +142,9 @@ def given_starts(
     return given
 
 
-def find_starts(logs: Sequence[Log], given: Sequence[float | None], options: FitOptions) -> Starts:
+def find_starts(
+    logs: Sequence[Log], given: Sequence[float | None], capacity_ah: float, chemistry: Chemistry
+) -> Starts:
     """Return the logs with a known start: given, their own, or estimated with the curve.
 
     Parameters
@@ -155,7 +152,9 @@ def find_starts(logs: Sequence[Log], given: Sequence[float | None], options: Fit
     logs : sequence of Log
     given : sequence of float or None
         SoC at the first row of each log [%].
-    options : FitOptions
+    capacity_ah : float
+        [Ah].
+    chemistry : Chemistry
 
     Raises
     ------
@@ -168,42 +167,39 @@ def find_starts(logs: Sequence[Log], given: Sequence[float | None], options: Fit
         for value, of_log in zip(given, split, strict=True)
         for k in range(len(of_log))
     ]
-    logs = [piece for of_log in split for piece in of_log]
-    known, starts = list(logs), []
+    pieces = [piece for of_log in split for piece in of_log]
+    known, starts = list(pieces), []
     unknown: list[int] = []
-    for k, (log, value) in enumerate(zip(logs, given, strict=True)):
+    for k, (log, value) in enumerate(zip(pieces, given, strict=True)):
         first = log.first_soc()
         if value is not None:
             known[k] = with_start(log, value)
             starts.append(Start(log.name, value, None, "given"))
         elif first is not None:
             counted = discharged_ah(log.time_s, log.current_a)[first[0]]
-            at_first_row = first[1] + 100.0 * float(counted) / options.capacity_ah
+            at_first_row = first[1] + 100.0 * float(counted) / capacity_ah
             starts.append(Start(log.name, at_first_row, None, "log"))
         else:
             unknown.append(k)
             starts.append(Start(log.name, float("nan"), None, "estimated"))
-    if not unknown:
-        return Starts(tuple(known), tuple(logs), tuple(starts))
-    if len(unknown) == len(logs):
-        raise unknown_start(logs[0], others=len(logs) > 1)
-    pinned = [fit_rows(log, options) for k, log in enumerate(known) if k not in unknown]
-    model, _ = fit_voltage_model(pinned, options)
-    search = _JointFit(known, unknown, options, model)
-    values, std_pct, std_error = search.solve()
-    for k, value, std in zip(unknown, values.tolist(), std_pct.tolist(), strict=True):
-        starts[k] = Start(logs[k].name, value, std, "estimated")
-        if not std <= STD_AT_MOST_PCT:
-            raise InputError(
-                f"the SoC at the start is unknown, and the voltage determines it to ±{std:.0f} %"
-                " only",
-                source=logs[k].source or logs[k].name,
-                field="soc_pct",
-                cure="give --initial-soc for this log, or logs whose SoC overlaps with it",
-            )
-        known[k] = with_start(logs[k], value)
-        _LOG.info("%s", starts[k])
-    return Starts(tuple(known), tuple(logs), tuple(starts), std_error)
+    if len(unknown) == len(pieces):
+        raise unknown_start(pieces[0], others=len(pieces) > 1)
+    if unknown:
+        pinned = [log for k, log in enumerate(known) if k not in unknown]
+        joint = _JointFit(pinned, [pieces[k] for k in unknown], capacity_ah, chemistry)
+        for k, start in zip(unknown, joint.solve(), strict=True):
+            starts[k] = start
+            if start.std_pct is None or not start.std_pct <= STD_AT_MOST_PCT:
+                raise InputError(
+                    "the SoC at the start is unknown, and the voltage determines it to"
+                    f" ±{start.std_pct:.0f} % only",
+                    source=pieces[k].source or pieces[k].name,
+                    field="soc_pct",
+                    cure="give --initial-soc for this log, or logs whose SoC overlaps with it",
+                )
+            known[k] = with_start(pieces[k], start.soc_pct)
+            _LOG.info("%s", start)
+    return Starts(tuple(known), tuple(pieces), tuple(starts))
 
 
 def unknown_start(log: Log, *, others: bool) -> InputError:
@@ -220,75 +216,80 @@ def unknown_start(log: Log, *, others: bool) -> InputError:
 
 
 class _JointFit:
-    """Least squares over the coefficients and the unknown starts."""
+    """Fit of the curve and of unknown starts in turn."""
 
     def __init__(
-        self, logs: Sequence[Log], unknown: Sequence[int], options: FitOptions, model: VoltageModel
-    ) -> None:
-        self._logs, self._unknown, self._options = list(logs), list(unknown), options
-        self._limits = [_limits(logs[k], options.capacity_ah) for k in unknown]
-        values = [
-            _search(logs[k], limits, options, model)
-            for k, limits in zip(unknown, self._limits, strict=True)
+        self, pinned: Sequence[Log], unknown: Sequence[Log], capacity_ah: float,
+        chemistry: Chemistry,
+    ) -> None:  # fmt: skip
+        self._capacity_ah, self._chemistry = capacity_ah, chemistry
+        self._pinned = [log_sums(fit_rows(log, capacity_ah), chemistry) for log in pinned]
+        self._logs = unknown
+        self._limits = [_limits(log, capacity_ah) for log in unknown]
+        self._rows = [
+            fit_rows(with_start(log, 0.5 * sum(limits)), capacity_ah)
+            for log, limits in zip(unknown, self._limits, strict=True)
         ]
-        self._values = np.array(values)
 
-    def solve(self) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return starts and standard deviations [%], and the coefficients' standard errors."""
+    def solve(self) -> list[Start]:
+        sums = self._pinned
+        values = [float("nan")] * len(self._logs)
         for _ in range(STEPS_AT_MOST):
-            step, std_pct, std_error = self._step()
-            bounded = np.clip(step, -STEP_AT_MOST_PCT, STEP_AT_MOST_PCT)
-            low, high = np.array(self._limits).T
-            moved = np.clip(self._values + bounded, low, high) - self._values
-            self._values = self._values + moved
-            if np.all(np.abs(moved) < CONVERGED_PCT):
+            solution = solve(sums, self._capacity_ah, self._chemistry)
+            before = values
+            values = [self._best(number, solution) for number in range(len(self._logs))]
+            sums = self._pinned + [
+                log_sums(self._at(number, value), self._chemistry)
+                for number, value in enumerate(values)
+            ]
+            moved = np.abs(np.array(values) - before)
+            if np.all(moved < CONVERGED_PCT):
                 break
-        return self._values, std_pct, std_error
-
-    def _rows(self) -> list[FitRows]:
-        logs = list(self._logs)
-        for k, value in zip(self._unknown, self._values.tolist(), strict=True):
-            logs[k] = with_start(logs[k], value)
-        return [fit_rows(log, self._options) for log in logs]
-
-    def _step(self) -> tuple[FloatArray, FloatArray, FloatArray]:
-        options, rows = self._options, self._rows()
-        model, _ = fit_voltage_model(rows, options)
-        slopes = [
-            ocv_basis_slope(item.soc_pct, options.epsilon) @ np.array(model.ocv_v) for item in rows
+        pinned = solve(self._pinned, self._capacity_ah, self._chemistry)
+        return [
+            Start(log.name, value, self._std_pct(of_log, pinned), "estimated")
+            for log, value, of_log in zip(
+                self._logs, values, sums[len(self._pinned) :], strict=True
+            )
         ]
-        extra = [
-            np.outer(slope, np.array(self._unknown) == k) for k, slope in enumerate(slopes)
-        ]  # one column for each unknown start
-        each = list(zip(rows, extra, strict=True))
-        parts = [information_of(item, options, extra=of_log) for item, of_log in each]
-        volts = np.concatenate([item.voltage_v for item in rows])
-        solution = solve_information(
-            pooled(parts), options.epsilon, nominal_v=float(np.median(volts))
-        )
-        scores = [score_sums(item, options, solution, of_log) for item, of_log in each]
-        solution = with_std_errors(solution, *summed_scores(scores))
-        # The least squares does not model an error that lasts as long as a log and shifts its whole
-        # voltage. Residuals averaged over five minutes show how large those that last are.
-        means_v = np.concatenate([_cluster_means(*of_log, options, solution) for of_log in each])
-        lasting_v = float(np.sqrt(np.mean(means_v**2)))
-        mean_slopes = np.array([float(np.mean(slopes[k])) for k in self._unknown])
-        n = len(solution.coefficients) - len(self._unknown)
-        std_pct = np.hypot(solution.std_error[n:], lasting_v / np.maximum(mean_slopes, 1e-9))
-        return solution.coefficients[n:], std_pct, solution.std_error[:n]
+
+    def _at(self, number: int, start_pct: float) -> FitRows:
+        rows = self._rows[number]
+        return replace(rows, soc_pct=rows.soc_pct + start_pct - 0.5 * sum(self._limits[number]))
+
+    def _best(self, number: int, solution: Solution) -> float:
+        rows = self._rows[number]
+        curve = HermiteCurve.rising(KNOTS_PCT, solution.coefficients[:N])
+        loads = load_features(rows.dequantized_c, rows.currents_a) @ solution.select[N:, N:].T
+        open_v = rows.voltage_v - loads @ solution.coefficients[N:]
+        level2 = (self._chemistry.level_std * solution.mean_v) ** 2
+
+        def misfit(start_pct: float) -> float:
+            at = self._at(number, start_pct)
+            error = open_v - curve.values(at.soc_pct)
+            weight = row_weights(at.soc_pct, at.seconds, self._chemistry) + 1e-9
+            mean = float(weight @ error / weight.sum())
+            square = float(weight @ (error - mean) ** 2 / weight.sum())
+            return square / (solution.residual_v**2 + 1e-12) + mean**2 / level2
+
+        return _minimum(misfit, *self._limits[number])
+
+    def _std_pct(self, sums: LogSums, solution: Solution) -> float:
+        variance = float(solution.mean_error(sums)[1])
+        variance += (self._chemistry.level_std * solution.mean_v) ** 2
+        mean_pct = np.array([sums.mean_soc_pct])
+        slope = float(HermiteCurve.rising(KNOTS_PCT, solution.coefficients[:N]).slopes(mean_pct)[0])
+        return float(variance**0.5) / max(slope, SLOPE_AT_LEAST * solution.mean_v)
 
 
-def _cluster_means(
-    rows: FitRows, extra: FloatArray, options: FitOptions, solution: Solution
-) -> FloatArray:
-    """Return the mean error of each cluster of a log's rows [V]."""
-    blocks = row_blocks(len(rows))
-    tables = (table_of(rows.part(block), options, extra[block]) for block in blocks)
-    error_v = np.concatenate(
-        [each[:, -1] - each[:, :-1] @ solution.coefficients for each in tables]
-    )
-    first = np.flatnonzero(np.diff(block_numbers([rows], CLUSTER_S), prepend=-1))
-    return np.asarray(np.add.reduceat(error_v, first) / np.diff(first, append=len(rows)))
+def _minimum(misfit: Callable[[float], float], low: float, high: float) -> float:
+    """Return the argument of the least value between two bounds: a grid, then Brent's method."""
+    grid = np.linspace(low, high, max(2, int((high - low) / SEARCH_STEP_PCT) + 1)).tolist()
+    best = float(min(grid, key=misfit))
+    bounds = max(low, best - SEARCH_STEP_PCT), min(high, best + SEARCH_STEP_PCT)
+    if bounds[0] >= bounds[1]:
+        return best
+    return float(optimize.minimize_scalar(misfit, bounds=bounds, method="bounded").x)
 
 
 def _limits(log: Log, capacity_ah: float) -> tuple[float, float]:
@@ -297,27 +298,6 @@ def _limits(log: Log, capacity_ah: float) -> tuple[float, float]:
     low, high = float(np.max(out_pct)), 100.0 + float(np.min(out_pct))
     middle = 0.5 * (low + high)
     return (low, high) if low <= high else (middle, middle)
-
-
-def _search(
-    log: Log, limits: tuple[float, float], options: FitOptions, model: VoltageModel
-) -> float:
-    """Return the start of the smallest error with a given model, on a grid [%]."""
-    low, high = limits
-    rows = fit_rows(with_start(log, 0.5 * (low + high)), options)
-    some = np.linspace(0, len(rows) - 1, min(len(rows), SEARCH_ROWS)).astype(np.intp)
-    soc = rows.soc_pct[some] - 0.5 * (low + high)
-    grid = np.linspace(low, high, max(2, int((high - low) / SEARCH_STEP_PCT) + 1))
-    errors = [
-        np.mean(
-            np.abs(
-                model.voltage(soc + start, rows.dequantized_c[some], rows.delayed_current_a[some])
-                - rows.voltage_v[some]
-            )
-        )
-        for start in grid
-    ]
-    return float(grid[int(np.argmin(errors))])
 
 
 def start_by_model(log: Log, model: Model) -> Start:
@@ -331,26 +311,27 @@ def start_by_model(log: Log, model: Model) -> Start:
     Returns
     -------
     Start
-        Its standard deviation follows from the lasting part of the model's error.
+        Its standard deviation follows from the model's lasting error.
     """
     extended = model.extended_model()
-    options = FitOptions.of_model(model)
     low, high = _limits(log, model.capacity_ah)
-    rows = fit_rows(with_start(log, 0.5 * (low + high)), options)
-    some = np.linspace(0, len(rows) - 1, min(len(rows), SEARCH_ROWS)).astype(np.intp)
-    at = np.searchsorted(log.time_s, rows.time_s[some])
+    voltage = extended.model
+    rows = fit_rows(
+        with_start(log, 0.5 * (low + high)), model.capacity_ah,
+        delay_s=voltage.delay_s, low_pass_s=voltage.low_pass_s,
+    )  # fmt: skip
     signals = Signals(log.time_s, log.current_a, log.voltage_v, log.temperature_c)
 
     def error_v(start: float) -> float:
-        return float(np.mean(np.abs(extended.predict(signals, start, at).residual_v)))
+        return float(np.mean(np.abs(extended.predict(signals, start, rows.at).residual_v)))
 
-    grid = np.linspace(low, high, max(2, int((high - low) / (2.0 * SEARCH_STEP_PCT)) + 1))
-    best = float(min(grid.tolist(), key=error_v))
-    bounds = max(low, best - 2.0 * SEARCH_STEP_PCT), min(high, best + 2.0 * SEARCH_STEP_PCT)
-    if bounds[0] < bounds[1]:
-        best = float(optimize.minimize_scalar(error_v, bounds=bounds, method="bounded").x)
+    best = _minimum(error_v, low, high)
+    functions, noise = model.principal_functions(), model.noise
     soc = rows.soc_pct - 0.5 * (low + high) + best
-    slope = float(np.mean(extended.model.pseudo_ocv_slope(soc)))
-    noise = model.noise
-    std_v = float(np.hypot(noise.lasting_std_v, 0.25 * noise.voltage_rmse_v))
-    return Start(log.name, best, std_v / max(slope, 1e-9), "estimated")
+    columns = voltage.load_columns(rows.temperature_c, rows.currents_a).mean(axis=0)
+    middle = float(np.mean(soc))
+    chemistry = CHEMISTRIES[model.chemistry]
+    variance = float(np.sum(functions.row(middle, columns) ** 2)) + noise.level_std_v**2
+    slope = max(float(np.mean(voltage.pseudo_ocv_slope(soc))), SLOPE_AT_LEAST * voltage.nominal_v)
+    std_pct = float(np.hypot(variance**0.5 / slope, chemistry.soc_std_pct))
+    return Start(log.name, best, std_pct, "estimated")

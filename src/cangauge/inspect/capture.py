@@ -12,8 +12,7 @@ from typing import Any, Final
 import can
 from can.typechecking import Channel
 
-from cangauge.bus.captures.capture import open_capture
-from cangauge.bus.captures.files import CaptureInfo
+from cangauge.bus.captures import CaptureInfo, open_capture
 from cangauge.bus.decoder import SampleDecoder
 from cangauge.bus.protection import GENERIC_RULE, LEAF_RULE, FrameChecker, ProtectionRule, Verdict
 from cangauge.bus.recording import capture_to_log, open_vehicle_capture

@@ -9,8 +9,7 @@ import numpy as np
 
 from cangauge._formatting import counted, duration
 from cangauge.errors import InputError
-from cangauge.identify.voltage_fit import SOC_SPAN_AT_LEAST_PCT
-from cangauge.inference.rows import DELAYS_S, usable_delays, usable_rows
+from cangauge.identify.rows import SOC_SPAN_AT_LEAST_PCT, usable_delays, usable_rows
 from cangauge.inspect.channels import Channel, describe_channels
 from cangauge.logs.gaps import uncounted_gaps, usual_gap_s
 from cangauge.logs.log import Log
@@ -23,6 +22,7 @@ from cangauge.logs.sign import (
     spaced_rows,
 )
 from cangauge.model.coulomb_counting import capacity_from_full_discharge, capacity_from_reference
+from cangauge.model.prior import DELAYS_S
 
 Verdict = Literal["yes", "partly", "no"]
 

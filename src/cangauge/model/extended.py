@@ -1,38 +1,47 @@
 """Extended model: the voltage model with effects, over whole logs and one sample at a time.
 
-Both forms apply the same steps in the same order: correct the signals, count charge, delay the
-current, add the effects' voltages to the voltage model's. Without effects they equal the voltage
-model bit for bit.
+Both apply the same steps in the same order: correct the signals, count charge, delay and low-pass
+the current, add the effects' voltages to the voltage model's. `OnlineModel` calls the array form
+with one row and carries the effects' memories. Without effects both equal the voltage model.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from itertools import islice
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from cangauge._arithmetic import total
 from cangauge._typing import FloatArray
 from cangauge.errors import InputError
-from cangauge.model.coulomb_counting import discharged_ah
-from cangauge.model.effects.base import Counting, Effect, Pack, PackState, Reading, Signals, Values
+from cangauge.logs.gaps import BRIDGE_S, discharged_ah
+from cangauge.model.delay_line import GAP_S, DelayLine
+from cangauge.model.effects.base import (
+    Counting,
+    Effect,
+    Load,
+    Pack,
+    Reading,
+    Signals,
+    Values,
+)
 from cangauge.model.effects.library import LIBRARY
-from cangauge.model.voltage_model import SLOPE_AT_LEAST, VoltageModel
+from cangauge.model.first_order import Lag
+from cangauge.model.voltage_model import SLOPE_AT_LEAST, Functions, VoltageModel, socs_from_ocv
+
+if TYPE_CHECKING:
+    from cangauge.model.model_file import Noise
+
+LAG_NUMBERS = 3
+"""Numbers of the state of a lag that has started."""
 
 SLOPE_STEP_PCT = 0.05
 """Half step of the finite difference of the effects' voltage over SoC [%]."""
-
-STEADY_S, STEADY_STEP_S = 4.0 * 3600.0, 10.0
-"""Duration of a constant current until the voltage counts as steady, and its time step [s]."""
-
-STEADY_C_RATE = 1.0 / 3.0
-STEADY_CHANGE = 0.05
-"""Current at which the change of the steady voltage is taken, in both directions [1/h] (20 A at
-60 Ah, as in driving), and the relative change of current."""
 
 _ORDER = {effect_id: number for number, effect_id in enumerate(LIBRARY)}
 
@@ -49,6 +58,12 @@ class Prediction:
     """All rows as ideal sensors would have shown them, shape (n,)."""
     soc_pct: FloatArray
     """Counted SoC of all rows [%], shape (n,)."""
+    currents_a: FloatArray = field(repr=False)
+    """Delayed and low-passed currents at `rows` [A], shape (m, M)."""
+    beside_v: FloatArray = field(repr=False)
+    """Part of the voltage at `rows` that does not depend on SoC [V], shape (m,)."""
+    over_soc: list[tuple[Effect, Values, FloatArray]] = field(repr=False)
+    """Effects whose voltage depends on SoC, and their drive at `rows` [V], shape (m,)."""
 
     @property
     def residual_v(self) -> FloatArray:
@@ -87,16 +102,6 @@ class ExtendedModel:
         """Return the model with one more effect."""
         return replace(self, effects=(*self.effects, (effect, values)))
 
-    def online(self, capacity_ah: float | None = None) -> OnlineExtendedModel:
-        """Return the sample-by-sample form, before the first sample.
-
-        Parameters
-        ----------
-        capacity_ah : float, optional
-            Capacity set by the user [Ah]; effects do not change it.
-        """
-        return OnlineExtendedModel(self, capacity_ah)
-
     def predict(
         self,
         signals: Signals,
@@ -104,6 +109,7 @@ class ExtendedModel:
         at_rows: NDArray[np.intp],
         *,
         initial_row: int = 0,
+        currents_a: FloatArray | None = None,
     ) -> Prediction:
         """Predict voltage and SoC of a log.
 
@@ -117,21 +123,71 @@ class ExtendedModel:
             Rows at which to predict the voltage.
         initial_row : int
             Row at which the initial SoC holds.
+        currents_a : array of shape (n, M), optional
+            `VoltageModel.currents` of the measured current at every row, where it is known.
         """
-        corrected = self.corrected(signals)
-        soc = self.counted_soc(corrected, initial_soc_pct, initial_row=initial_row)
-        # A fast log has far more samples than rows.
-        delayed = corrected.history.at(at_rows).delayed_a(self.model.delay_s)
-        volts = self.model.voltage(soc[at_rows], corrected.temperature_c[at_rows], delayed)
-        if self.effects:
-            volts = volts + self.extra_voltage(self.state(corrected, soc, at_rows))
-        return Prediction(at_rows, volts, corrected, soc)
+        model, effects, pack = self.model, self.effects, self.pack
+        measured_a = signals.current_a
+        for effect, values in effects:
+            memory = effect.memory(values, pack)
+            for item in memory:
+                item.whole = True
+            signals = effect.correct(signals, values, pack, memory)
+        soc = self.counted_soc(signals, initial_soc_pct, initial_row=initial_row)
+        every = any(effect.adds_voltage for effect, _ in effects)
+        rows = slice(None) if every else at_rows
+        if currents_a is not None and signals.current_a is measured_a:
+            currents = currents_a[rows]
+        else:
+            currents = model.currents(signals.time_s, signals.current_a, rows)
+        temperature_c = signals.temperature_c[rows]
+        columns = model.load_columns(temperature_c, currents)
+        volts = columns @ model.load_coefficients
+        drop_v = columns[:, 1:] @ model.load_coefficients[1:]
+        load = Load(signals.time_s[rows], signals.current_a[rows], temperature_c, drop_v)
+        over_soc = []
+        for effect, values in effects:
+            drive = effect.drive(load, values, model, pack, effect.memory(values, pack))
+            if drive is None:
+                continue
+            if effect.uses_soc:
+                over_soc.append((effect, values, drive[at_rows]))
+            else:
+                volts = volts + drive
+        if every:
+            volts, currents = volts[at_rows], currents[at_rows]
+        prediction = Prediction(at_rows, volts, signals, soc, currents, volts, over_soc)
+        return replace(prediction, voltage_v=self.voltage_at(soc[at_rows], prediction))
 
-    def corrected(self, signals: Signals) -> Signals:
-        """Return the signals as ideal sensors would have shown them."""
+    def voltage_at(self, soc_pct: FloatArray, prediction: Prediction) -> FloatArray:
+        """Return the voltages at the rows of a prediction if the SoC were another [V].
+
+        Parameters
+        ----------
+        soc_pct : array of shape (m,)
+        prediction : Prediction
+        """
+        volts = self.model.pseudo_ocv(soc_pct) + prediction.beside_v
+        for effect, values, drive in prediction.over_soc:
+            volts = volts + drive * effect.over_soc(soc_pct, values, self.model, self.pack)
+        return np.asarray(volts)
+
+    def added_v(self, load: Load, soc_pct: FloatArray) -> FloatArray:
+        """Return the sum of the effects' voltages from the first sample on [V], shape (n,).
+
+        Parameters
+        ----------
+        load : Load
+            Of n samples in order.
+        soc_pct : array of shape (n,)
+        """
+        volts = np.zeros_like(soc_pct)
         for effect, values in self.effects:
-            signals = effect.correct(signals, values, self.pack)
-        return signals
+            memory = effect.memory(values, self.pack)
+            drive = effect.drive(load, values, self.model, self.pack, memory)
+            if drive is not None:
+                volts += drive * effect.over_soc(soc_pct, values, self.model, self.pack)
+        return volts
 
     def counting(self, initial_soc_pct: float) -> Counting:
         """Return how charge is counted from an assumed initial SoC [%]."""
@@ -145,206 +201,243 @@ class ExtendedModel:
     ) -> FloatArray:
         """Return the SoC counted from corrected signals [%], shape (n,)."""
         counting = self.counting(initial_soc_pct)
-        counted = counting.counted(corrected.current_a)
-        if counted is corrected.current_a:
-            out = corrected.history.out_ah
-        else:
-            steps_s = corrected.history.counted_s
-            out = discharged_ah(corrected.time_s, counted, steps_s)
+        out = discharged_ah(corrected.time_s, counting.counted(corrected.current_a))
         moved = 100.0 * (out - out[initial_row]) / counting.capacity_ah
         return np.asarray(counting.initial_soc_pct - moved)
 
-    def state(
-        self, corrected: Signals, soc_pct: FloatArray, rows: NDArray[np.intp] | None = None
-    ) -> PackState:
-        """Return the inputs of the extra voltages, for some or all rows of corrected signals."""
-        history = corrected.history
-        kept = slice(None) if rows is None else rows
-        at_rows = history if rows is None else history.at(rows)
-        return PackState(
-            time_s=corrected.time_s[kept],
-            current_a=corrected.current_a[kept],
-            temperature_c=corrected.temperature_c[kept],
-            soc_pct=soc_pct[kept],
-            drop_v=at_rows.delayed_a(self.model.delay_s) @ np.array(self.model.resistance_ohm),
-            cached_history=at_rows,
-            rows=rows,
-            log=None if rows is None else corrected,
-            of_log=None if rows is None else partial(self.state, corrected, soc_pct),
-        )
 
-    def extra_voltage(self, state: PackState) -> FloatArray:
-        """Return the sum of the effects' voltages [V], shape (n,)."""
-        volts = np.zeros_like(state.time_s)
-        for effect, values in self.effects:
-            extra = effect.extra_voltage_at(state, values, self.model, self.pack)
-            if extra is not None:
-                volts += extra
-        return volts
-
-    def steady_ohm(self) -> float:
-        """Return dU/dI for a lasting current, negative [Ω].
-
-        Polarisation counts in full; effects of the sign of the current alone, such as hysteresis,
-        do not.
-        """
-        ohm = total(self.model.resistance_ohm)
-        if not self.effects:
-            return ohm
-        usual_a = STEADY_C_RATE * self.capacity_ah
-        change_a = STEADY_CHANGE * usual_a
-        steady_v = [
-            self._steady_extra_v(sign * usual_a + change)
-            for sign in (1.0, -1.0)
-            for change in (change_a, -change_a)
-        ]
-        return ohm + (steady_v[0] - steady_v[1] + steady_v[2] - steady_v[3]) / (4.0 * change_a)
-
-    def _steady_extra_v(self, current_a: float) -> float:
-        """Return the effects' voltage after a long constant current, at 50 % SoC [V]."""
-        time_s = np.arange(0.0, STEADY_S, STEADY_STEP_S)
-        constant = np.ones_like(time_s)
-        state = PackState(
-            time_s=time_s,
-            current_a=current_a * constant,
-            temperature_c=self.model.t_ref_c * constant,
-            soc_pct=50.0 * constant,
-            drop_v=current_a * total(self.model.resistance_ohm) * constant,
-        )
-        return float(self.extra_voltage(state)[-1])
+BISECTIONS = 45
+"""Halvings of 0–100 % down to 3e-12 %."""
 
 
-class OnlineExtendedModel:
-    """Sample-by-sample form of the extended model, for the estimator.
+def newton_soc(model: ExtendedModel, prediction: Prediction) -> FloatArray:
+    """Return the SoC at which the model has the measured voltage at each row [%], shape (m,).
 
-    Call `correct`, then `advance` for each reading it returns; `pseudo_ocv_at` then includes
-    the effects' voltages.
+    Newton's method where the curve alone depends on SoC; bisection with effects, whose slope is not
+    at hand.
+    """
+    measured = prediction.signals.voltage_v[prediction.rows]
+    if not prediction.over_soc:
+        return socs_from_ocv(model.model, measured - prediction.beside_v)
+    low, high = np.zeros_like(measured), np.full_like(measured, 100.0)
+    for _ in range(BISECTIONS):
+        middle = 0.5 * (low + high)
+        above = model.voltage_at(middle, prediction) > measured
+        low, high = np.where(above, low, middle), np.where(above, middle, high)
+    return 0.5 * (low + high)
+
+
+class OnlineModel:
+    """The extended model one sample at a time, for the estimator.
+
+    Call `correct`, then `advance` for each reading it returns. The other methods then describe the
+    voltage at that reading.
 
     Parameters
     ----------
     extended : ExtendedModel
+    functions : Functions
+        Covariance of the coefficients.
+    noise : Noise
+        Errors of the voltage.
     capacity_ah : float, optional
         Capacity set by the user [Ah].
+    gap_s : float
+        A longer step between two samples empties the delay line [s].
     """
 
-    def __init__(self, extended: ExtendedModel, capacity_ah: float | None = None) -> None:
+    def __init__(
+        self,
+        extended: ExtendedModel,
+        functions: Functions,
+        noise: Noise,
+        capacity_ah: float | None = None,
+        gap_s: float = GAP_S,
+    ) -> None:
+        self.extended = extended
         self.model = extended.model
-        self._extended = extended
+        self.functions = functions
+        self.noise = noise
         # Capacity and efficiency do not depend on the SoC.
         self._counting = extended.counting(50.0)
         self.capacity_ah = capacity_ah or self._counting.capacity_ah
         """Capacity for the Coulomb counter [Ah]."""
-        self._effects = [
-            effect.online(values, extended.model, extended.pack)
-            for effect, values in extended.effects
+        self.delay_line = DelayLine(self.model.delay_s, gap_s=gap_s)
+        self.lags = [Lag(tau_s, 0.0, rest_s=BRIDGE_S) for tau_s in self.model.low_pass_s]
+        self._memory = [effect.memory(values, extended.pack) for effect, values in extended.effects]
+        self._corrects = [
+            type(effect).correct is not Effect.correct for effect, _ in extended.effects
         ]
-        self._over_soc = [effect for effect in self._effects if effect.uses_soc]
-        self._beside_soc = [effect for effect in self._effects if not effect.uses_soc]
-        self._beside_soc_v = 0.0
-        self._slope_at_least = SLOPE_AT_LEAST * extended.pack.voltage_v
-
-    @cached_property
-    def steady_ohm(self) -> float:
-        """`ExtendedModel.steady_ohm`, computed once [Ω]."""
-        return self._extended.steady_ohm()
+        self._row = np.empty(0)
+        self._over_soc = [each for each in extended.effects if each[0].uses_soc]
+        self._drives = np.zeros(1 + len(self._over_soc))
+        self._slope_at_least = SLOPE_AT_LEAST * self.model.nominal_v
 
     @property
-    def plain(self) -> bool:
-        """Whether there are no effects, so that nothing needs correcting or advancing."""
-        return not self._effects
-
-    @property
-    def memory(self) -> list[tuple[float, float]]:
-        """Resistance [Ω] and time constant [s] of the effects' voltages from earlier currents."""
-        return [element for effect in self._effects for element in effect.memory]
+    def load_coefficients(self) -> FloatArray:
+        """Coefficients of the load columns, shape (k,)."""
+        return self.model.load_coefficients
 
     def initial_soc_pct(self, assumed_pct: float) -> float:
         """Return the SoC at which to start for an assumed one, within 0–100 [%]."""
-        return min(max(self._extended.counting(assumed_pct).initial_soc_pct, 0.0), 100.0)
+        return min(max(self.extended.counting(assumed_pct).initial_soc_pct, 0.0), 100.0)
 
     def counted(self, current_a: float) -> float:
         """Return the counted part of a corrected current [A]."""
         return self._counting.counted_at(current_a)
 
+    @property
+    def memory(self) -> list[tuple[float, float]]:
+        """Resistance [Ω] and time constant [s] of the effects' voltages from earlier currents."""
+        return [
+            item for effect, values in self.extended.effects for item in effect.rc_elements(values)
+        ]
+
     def correct(self, reading: Reading) -> Sequence[Reading]:
         """Return the corrected readings that are ready, usually one, in order."""
-        readings: Sequence[Reading] = (reading,)
-        for effect in self._effects:
-            if len(readings) == 1:
-                readings = effect.correct(readings[0])
-            else:
-                readings = [done for item in readings for done in effect.correct(item)]
-        return readings
+        if not any(self._corrects):
+            return (reading,)
+        signals = Signals(*(np.array([value]) for value in reading))
+        for (effect, values), memory in zip(self.extended.effects, self._memory, strict=True):
+            if signals.time_s.size:
+                signals = effect.correct(signals, values, self.extended.pack, memory)
+        return [Reading(*row) for row in np.stack(signals, axis=1).tolist()]
 
-    def advance(
-        self, time_s: float, current_a: float, temperature_c: float,
-        delayed_current_a: Sequence[float],
-    ) -> None:  # fmt: skip
-        """Advance the effects' states to a corrected reading (every one, in order).
+    def advance(self, time_s: float, current_a: float, temperature_c: float) -> None:
+        """Advance to a corrected reading (every one, in order).
 
         Parameters
         ----------
         time_s, current_a : float
             Time [s] and current [A].
         temperature_c : float
-            Latest known temperature [°C]; NaN before the first. Effects then use the reference
-            temperature, but those that lag behind the temperature wait for the first known one.
-        delayed_current_a : sequence of floats
-            Current at each delay, from the delay line of corrected currents [A].
+            Latest known temperature [°C]; NaN before the first. Until then the reference
+            temperature holds, and effects of the temperature's history are zero.
         """
-        drop_v = 0.0
-        for resistance, current in zip(self.model.resistance_ohm, delayed_current_a, strict=True):
-            drop_v += resistance * current
-        is_known = math.isfinite(temperature_c)
-        for effect in self._effects:
-            if is_known:
-                effect.advance(time_s, current_a, temperature_c, drop_v)
-            elif not effect.follows_temperature:
-                effect.advance(time_s, current_a, self.model.t_ref_c, drop_v)
-        self._beside_soc_v = total(item.extra_voltage(0.0) for item in self._beside_soc)
+        self.delay_line.push(time_s, current_a)
+        at, now = np.array([time_s]), np.array([current_a])
+        smooth = [float(lag.step(at, now)[0]) for lag in self.lags]
+        currents = [*self.delay_line.currents(), *smooth]
+        known_c = self.model.t_ref_c if math.isnan(temperature_c) else temperature_c
+        self._row = self.load_at(known_c, currents)
+        self._drives = np.zeros_like(self._drives)
+        if not self.extended.effects:
+            return
+        drop_v = self._row[1:] @ self.load_coefficients[1:]
+        over = 0
+        for (effect, values), memory in zip(self.extended.effects, self._memory, strict=True):
+            of_history = any(isinstance(lag, Lag) and lag.is_lagging for lag in memory)
+            follows = of_history and not effect.rc_elements(values)
+            celsius = np.array([temperature_c if follows else known_c])
+            load = Load(at, now, celsius, np.array([drop_v]))
+            drive = effect.drive(load, values, self.model, self.extended.pack, memory)
+            place = 1 + over if effect.uses_soc else 0
+            over += effect.uses_soc
+            if drive is not None and not math.isnan(drive[0]):
+                self._drives[place] += float(drive[0])
 
-    def state(self) -> list[list[float]]:
-        """Return the state of each effect, for `restore`."""
-        return [effect.state() for effect in self._effects]
+    def load_at(self, temperature_c: float, currents_a: Sequence[float] | FloatArray) -> FloatArray:
+        """Return the load columns of given delayed and low-passed currents [A], shape (k,)."""
+        return np.asarray(self.model.load_columns([temperature_c], np.array([currents_a]))[0])
 
-    def restore(self, state: Sequence[Sequence[float]], latest_s: float) -> None:
-        """Continue from a saved state of the same effects.
+    def load(self) -> FloatArray:
+        """Return the load columns at the latest reading, shape (k,)."""
+        return self._row
+
+    def offset_v(self) -> float:
+        """Return the part of the voltage model that does not depend on SoC, without effects [V]."""
+        return float(self._row @ self.load_coefficients)
+
+    def drives(self) -> FloatArray:
+        """Return the effects' drives at the latest reading, shape (1 + effects over SoC,).
+
+        The first is the voltage of effects that do not depend on the SoC [V]. The effects' voltage
+        is linear in the drives, so that a mean of readings has the mean of their drives.
+        """
+        return self._drives
+
+    def pseudo_ocv_at(
+        self, soc_pct: float, drives: FloatArray | None = None
+    ) -> tuple[float, float]:
+        """Return curve and effects [V] at one SoC [%], and the slope [V per %].
+
+        The effects are those of given drives, by default of the latest reading.
+
+        The slope is limited to positive values, for Newton's method and the filter: with an effect
+        the voltage may fall over a few per cent of SoC (resistance that rises toward empty, while
+        charging).
+        """
+        volts, slope = self.model.curve.at(soc_pct)
+        drives = self._drives if drives is None else drives
+        volts += float(drives[0])
+        if self._over_soc:
+            at = soc_pct + SLOPE_STEP_PCT * np.array([-1.0, 0.0, 1.0])
+            extra = np.zeros(3)
+            for (effect, values), drive in zip(self._over_soc, drives[1:], strict=True):
+                extra += drive * effect.over_soc(at, values, self.model, self.extended.pack)
+            volts += float(extra[1])
+            slope += float(extra[2] - extra[0]) / (2.0 * SLOPE_STEP_PCT)
+            slope = max(slope, self._slope_at_least)
+        return volts, slope
+
+    curve = pseudo_ocv_at
+
+    def row(self, soc_pct: float, load: FloatArray) -> FloatArray:
+        """Return the change of voltage by each principal function [V], shape (n,)."""
+        return self.functions.row(soc_pct, load)
+
+    def take_over(self, before: OnlineModel) -> None:
+        """Take over the currents of another model's form; low-passed ones where τ is the same."""
+        times, currents, since_s = before.delay_line.contents
+        if times and self.delay_line.longest_s > before.delay_line.longest_s:
+            since_s = max(since_s, times[0])  # the other line has dropped what this one needs
+        self.delay_line.fill(times, currents, since_s)
+        known = {lag.tau_s: lag.state() for lag in before.lags}
+        for lag in self.lags:
+            lag.restore(known.get(lag.tau_s, []))
+
+    def resume(self, load: FloatArray, beside_v: float, drives: Sequence[float]) -> None:
+        """Continue after a reading that was advanced to elsewhere (the compiled step).
 
         Parameters
         ----------
-        state : sequence of sequences
-        latest_s : float
-            Time of the latest sample before [s]; NaN if there was none. No time in the state may
-            be later.
+        load : array of shape (k,)
+            Load columns there.
+        beside_v : float
+            Voltage of the effects that do not depend on the SoC [V].
+        drives : sequence of float
+            `Effect.drive` of every effect there.
+        """
+        effects = zip(self.extended.effects, drives, strict=True)
+        self._row, self._beside_v = load, beside_v
+        self._over_soc = [
+            (effect, values, drive) for (effect, values), drive in effects if effect.uses_soc
+        ]
+
+    def state(self) -> list[list[float]]:
+        """Return the low-passed currents' state, then that of each effect, for `restore`."""
+        lags = [number for lag in self.lags for number in lag.state()]
+        return [lags, *([x for item in memory for x in item.state()] for memory in self._memory)]
+
+    def restore(self, state: Sequence[Sequence[float]]) -> None:
+        """Continue from a saved state of the same model; the delay line is filled separately.
 
         Raises
         ------
         InputError
-            If the state does not belong to these effects or is malformed; names the effect.
+            If the state does not belong to this model or is malformed; names the effect.
         """
-        if len(state) != len(self._effects):
-            raise InputError(f"the model has {len(self._effects)} effects", field="effects")
-        for number, (effect, of_effect) in enumerate(zip(self._effects, state, strict=True)):
+        if len(state) != 1 + len(self._memory):
+            raise InputError(f"the model has {len(self._memory)} effects", field="effects")
+        for number, (memory, saved) in enumerate(
+            zip([self.lags, *self._memory], state, strict=True)
+        ):
+            size = LAG_NUMBERS if len(memory) > 1 else len(saved)  # several are lags
+            numbers = iter(saved)
             try:
-                effect.restore(of_effect, latest_s)
-            except ValueError as error:
-                raise InputError(str(error), field=f"effects.{number}") from error
-
-    def pseudo_ocv_at(self, soc_pct: float) -> tuple[float, float]:
-        """Return the voltage without the model's drop and kt [V], and its slope [V per %].
-
-        The effects' voltages at the latest reading are included. The slope is limited to positive
-        values, for Newton's method and the filter: with an effect the voltage may fall over a few
-        per cent of SoC (resistance that rises toward empty, while charging).
-        """
-        volts, slope = self.model.pseudo_ocv_at(soc_pct)
-        volts += self._beside_soc_v
-        if self._over_soc:
-            volts += self._over_soc_v(soc_pct)
-            above = self._over_soc_v(soc_pct + SLOPE_STEP_PCT)
-            slope += (above - self._over_soc_v(soc_pct - SLOPE_STEP_PCT)) / (2.0 * SLOPE_STEP_PCT)
-            slope = max(slope, self._slope_at_least)
-        return volts, slope
-
-    def _over_soc_v(self, soc_pct: float) -> float:
-        return total(effect.extra_voltage(soc_pct) for effect in self._over_soc)
+                for item in memory:
+                    item.restore(list(islice(numbers, size)))
+                if next(numbers, None) is not None:
+                    raise InputError("longer than the state of this effect", field="effects")
+            except (ValueError, TypeError) as error:
+                raise InputError(str(error), field=f"effects.{number - 1}") from error

@@ -3,56 +3,63 @@
 from __future__ import annotations
 
 import json
-import math
 from itertools import pairwise
 from pathlib import Path
-from typing import Annotated, Final, Literal, Self
+from typing import Annotated, Any, Final, Literal, Self
 
 import numpy as np
-from pydantic import (
-    BaseModel,
-    ConfigDict,
-    Field,
-    ValidationError,
-    field_validator,
-    model_validator,
-)
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
-from cangauge._arithmetic import total
 from cangauge._config import schema_error
-from cangauge._io import (
-    MAX_MODEL_BYTES,
-    MAX_MODEL_COLUMNS,
-    MAX_MODEL_EFFECTS,
-    MAX_MODEL_ITEMS,
-    read_bounded,
-    time_limit,
-    write_text_atomic,
-)
+from cangauge._io import MAX_MODEL_BYTES, read_bounded, write_text_atomic
+from cangauge._typing import FloatArray
 from cangauge.errors import InputError
 from cangauge.logs.log import Log, TemperatureSource
+from cangauge.model.delay_line import GAP_S
 from cangauge.model.effects.base import RESISTANCE_AT_LEAST, Pack, Signals
 from cangauge.model.effects.library import parse_effects
-from cangauge.model.extended import ExtendedModel, Prediction
-from cangauge.model.voltage_model import BASIS_NAMES, VoltageModel
+from cangauge.model.extended import ExtendedModel, OnlineModel, Prediction
+from cangauge.model.prior import (
+    CHEMISTRIES,
+    DELAYS_S,
+    LOW_PASS_S,
+    REFERENCE_C,
+    Chemistry,
+    ChemistryName,
+    principal_functions,
+    prior_of,
+    usual_loads,
+)
+from cangauge.model.voltage_model import (
+    BASIS_NAMES,
+    KNOTS_PCT,
+    Arrhenius,
+    Functions,
+    HermiteCurve,
+    PublishedCurve,
+    VoltageModel,
+    hermite_slopes,
+    resistance_factor,
+)
 
 MODEL_FORMAT = "cangauge-model"
-MODEL_VERSION = 1
-MAX_CURVE_KNOTS, MAX_CURVE_FUNCTIONS = 201, 16
+MODEL_VERSION = 2
+BLOCK_S = 30.0
+"""Time over which voltages are averaged for one update of a filter [s]."""
+SLOW_S = 300.0
+"""Time constant of the slow voltage error [s]: residuals of recorded trips correlate by 0.3–0.5 at
+60 s and 0.1 at 300 s."""
 _CURE = "create the file with `cangauge fit`"
 
 _NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 # Wider than any pack needs, narrow enough that no voltage overflows.
 _Value = Annotated[float, Field(ge=-1e12, le=1e12)]
-_Scale = Annotated[float, Field(ge=1e-12, le=1e12)]
 _Soc = Annotated[float, Field(ge=-10, le=110)]
 _Celsius = Annotated[float, Field(ge=-273.15, le=1000)]
 _Ampere = Annotated[float, Field(ge=-1e6, le=1e6)]
 _Volts = Annotated[float, Field(ge=0, le=1e6)]
-_Delay = Annotated[float, Field(ge=0, le=3600)]
-_Seconds = Annotated[float, Field(ge=0, le=1e9)]
-_Columns = Field(max_length=MAX_MODEL_COLUMNS)
-_Items = Field(max_length=MAX_MODEL_ITEMS)
+_Seconds = Annotated[float, Field(gt=0, le=1e5)]
+_Delays = Annotated[list[Annotated[float, Field(ge=0, le=3600)]], Field(min_length=1)]
 
 
 class _Strict(BaseModel):
@@ -60,85 +67,144 @@ class _Strict(BaseModel):
 
 
 class Coefficient(_Strict):
-    """One coefficient of the voltage model."""
+    """One coefficient of the published equation."""
 
     value: _Value
     std_error: _NotNegative | None = None
     unit: Literal["V", "V/K", "ohm"]
 
 
+class Published(_Strict):
+    """The published equation: k0 … k7, kt, R1 … Rn."""
+
+    coefficients: dict[str, Coefficient]
+    epsilon: Annotated[float, Field(ge=1e-4, lt=0.5)]
+    t_ref_c: _Celsius
+    delays_s: _Delays
+
+    @model_validator(mode="after")
+    def _complete(self) -> Self:
+        _check_increasing(self.delays_s, "delays_s")
+        wanted, given = set(published_names(len(self.delays_s))), set(self.coefficients)
+        if given != wanted:
+            missing, extra = sorted(wanted - given), sorted(given - wanted)
+            words = [f"missing are {', '.join(missing)}"] if missing else []
+            words += [f"unknown are {', '.join(extra)}"] if extra else []
+            raise ValueError(f"coefficients: {'; '.join(words)}")
+        return self
+
+
+class CurveKnots(_Strict):
+    """Curve of a `knots` model."""
+
+    soc_pct: Annotated[list[_Soc], Field(min_length=2)]
+    voltage_v: list[_Value]
+
+    @model_validator(mode="after")
+    def _shapes(self) -> Self:
+        _check_increasing(self.soc_pct, "soc_pct")
+        _check_length(self.voltage_v, len(self.soc_pct), "voltage_v")
+        return self
+
+
+class ArrheniusFields(_Strict):
+    """Change of the resistances with temperature (`voltage_model.Arrhenius`)."""
+
+    factor: _Value
+    resistance_ohm: list[_Value]
+    mean_c: _Celsius
+
+
+class Loads(_Strict):
+    """Temperature coefficient and resistances of a `knots` model."""
+
+    t_ref_c: _Celsius
+    kt_v_per_k: _Value
+    delays_s: _Delays
+    low_pass_s: list[_Seconds]
+    resistance_ohm: list[_Value]
+    arrhenius: ArrheniusFields
+
+    @model_validator(mode="after")
+    def _shapes(self) -> Self:
+        _check_increasing(self.delays_s, "delays_s")
+        number = len(self.delays_s) + len(self.low_pass_s)
+        _check_length(self.resistance_ohm, number, "resistance_ohm")
+        _check_length(self.arrhenius.resistance_ohm, number, "arrhenius.resistance_ohm")
+        return self
+
+
+class FunctionFields(_Strict):
+    """Joint principal functions of the coefficients' covariance, of standard deviation 1."""
+
+    soc_pct: Annotated[list[_Soc], Field(min_length=2)]
+    curve_v: list[list[_Value]]
+    """Part of each function in the curve at `soc_pct` [V]."""
+    load: list[list[_Value]]
+    """Part of each function in the coefficients of the load columns."""
+
+    @model_validator(mode="after")
+    def _shapes(self) -> Self:
+        _check_increasing(self.soc_pct, "soc_pct")
+        _check_length(self.load, len(self.curve_v), "load")
+        for function in self.curve_v:
+            _check_length(function, len(self.soc_pct), "curve_v: each function")
+        return self
+
+
+class Noise(_Strict):
+    """Errors of the voltage that the coefficients do not explain, scaled by left-out logs."""
+
+    level_std_v: _Volts
+    """Lasts a whole log."""
+    slow_std_v: _Volts
+    slow_time_s: _Seconds = SLOW_S
+    fast_std_v: _Volts
+    """Of the mean of a block."""
+    block_s: _Seconds = BLOCK_S
+    soc_std_pct: Annotated[float, Field(ge=0, le=50)]
+    """δ: SoC against voltage (surface, hysteresis, reference), for a log and in each block."""
+    cold_exponent: Annotated[float, Field(ge=0, le=4)]
+    """The voltage errors grow with a(T) to this power below 20 °C."""
+    residual_std_v: _Volts
+    """Rms residual of the rows of the fit."""
+    left_out_scale: Annotated[float, Field(ge=1, le=1e6)] = 1.0
+    """κ²: the variances above and of the coefficients are already multiplied by it."""
+    voltage_mae_pct: _NotNegative
+    voltage_rmse_v: _Volts
+    """Errors of left-out logs."""
+    judged_on: str
+
+    def cold(self, temperature_c: float) -> float:
+        """Return the growth of the voltage errors in the cold [-], 1 or more."""
+        return float(max(1.0, float(resistance_factor(temperature_c))) ** self.cold_exponent)
+
+
 class Ranges(_Strict):
-    """Identified ranges; an estimate outside is flagged and its extrapolation bounded."""
+    """Identified ranges; an estimate outside is flagged."""
 
     soc_pct: tuple[_Soc, _Soc]
     temperature_c: tuple[_Celsius, _Celsius]
     current_a: tuple[_Ampere, _Ampere]
 
 
-class CurveNoise(_Strict):
-    """Error of pseudo-OCV and temperature coefficient (`inference.error_model`)."""
-
-    soc_pct: Annotated[list[_Soc], Field(min_length=2, max_length=MAX_CURVE_KNOTS)]
-    """Increasing knots."""
-    functions_v: Annotated[
-        list[Annotated[list[_Value], Field(max_length=MAX_CURVE_KNOTS)]],
-        Field(max_length=MAX_CURVE_FUNCTIONS),
-    ]
-    """Independent functions of the curve's error, of standard deviation 1, at the knots."""
-    temperature_c: _Celsius
-    """Mean temperature of the logs."""
-    kt_std_v_per_k: _Volts
-    """Standard deviation of kt."""
-    resistance_std_per_k: _NotNegative
-    """Standard deviation of the resistance's relative change with temperature."""
-
-    @model_validator(mode="after")
-    def _shapes(self) -> Self:
-        if any(high <= low for low, high in pairwise(self.soc_pct)):
-            raise ValueError("soc_pct must increase")
-        if any(len(function) != len(self.soc_pct) for function in self.functions_v):
-            raise ValueError(f"each function needs {len(self.soc_pct)} values, one per soc_pct")
-        return self
-
-
-class ModelNoise(_Strict):
-    """Voltage error of the model, in parts of different duration, and the error of the curve."""
-
-    fast_std_v: _Volts
-    fast_time_s: _Seconds
-    slow_std_v: _Volts
-    slow_time_s: Annotated[float, Field(gt=0, le=1e9)]
-    lasting_std_v: _Volts
-    lasting_time_s: Annotated[float, Field(gt=0, le=1e9)] = 7200.0
-    lasting_soc_pct: Annotated[float, Field(gt=0, le=1e3)] = 8.0
-    """Mean duration and SoC span of the logs: beyond, the lasting error may be another."""
-    curve: CurveNoise | None = None
-    """None: not known, so only the lasting part covers it."""
-    voltage_mae_pct: _NotNegative
-    voltage_rmse_v: _Volts
-    judged_on: str
-
-
 class Information(_Strict):
-    """Square root of the identification data's information matrix, in scaled columns.
+    """Posterior of all coefficients: RᵀR is its precision, R·θ = `projected` its mean.
 
-    With X the columns divided by `scale` and y the voltage, `root` is R and `projected` is Qᵀy of
-    X = QR. The information matrix is RᵀR and the least-squares solution R⁻¹Qᵀy / scale; rows of
-    another log can be stacked below, for joint identification without the original logs.
+    The prior and the scale of left-out logs are in it. Rows of another log, divided by their noise,
+    can be stacked below it: a joint fit without the original logs.
     """
 
-    columns: Annotated[list[str], _Columns]
-    scale: Annotated[list[_Scale], _Columns]
-    root: Annotated[list[Annotated[list[_Value], _Columns]], _Columns]
-    projected: Annotated[list[_Value], _Columns]
+    columns: list[str]
+    root: list[list[_Value]]
+    projected: list[_Value]
 
     @model_validator(mode="after")
     def _shapes(self) -> Self:
-        n = len(self.columns)
-        lengths = [len(self.scale), len(self.projected), len(self.root), *map(len, self.root)]
-        if any(length != n for length in lengths):
-            raise ValueError(f"shapes differ: {n} columns need {n} × {n} numbers")
-        # RᵀR is symmetric and semidefinite for any R; R is triangular if it is a QR's.
+        _check_length(self.projected, len(self.columns), "projected")
+        _check_length(self.root, len(self.columns), "root")
+        for row in self.root:
+            _check_length(row, len(self.columns), "root: each row")
         if any(any(row[:place]) for place, row in enumerate(self.root)):
             raise ValueError("root: must be upper triangular")
         return self
@@ -156,13 +222,13 @@ class Made(_Strict):
     """How the model was made."""
 
     by: str
-    options: Annotated[dict[str, str | float | int | bool | list[float] | None], _Items]
-    logs: Annotated[list[SourceLog], _Items]
+    options: dict[str, str | float | int | bool | list[float] | None]
+    logs: list[SourceLog]
     fingerprint: str
 
 
 class Model(_Strict):
-    """A pack's identified model: coefficients, effects, ranges, noise and origin.
+    """A pack's identified model: coefficients, their covariance, effects, ranges and origin.
 
     Examples
     --------
@@ -171,49 +237,40 @@ class Model(_Strict):
     """
 
     format: Literal["cangauge-model"] = "cangauge-model"
-    version: Literal[1] = 1
+    version: Literal[2] = 2
     name: str
-    coefficients: Annotated[dict[str, Coefficient], _Items]
-    epsilon: Annotated[float, Field(ge=1e-4, lt=0.5)]
-    t_ref_c: _Celsius
-    delays_s: Annotated[list[_Delay], Field(min_length=1, max_length=64)]
-    rate_hz: Annotated[float, Field(ge=1e-3, le=1e4)]
+    equation: Literal["knots", "published"]
+    chemistry: ChemistryName
+    cells: Annotated[int, Field(ge=1, le=2000)] | None = None
+    """Cells in series; None where it is not known."""
     capacity_ah: Annotated[float, Field(ge=1e-3, le=1e5)]
-    effects: Annotated[list[dict[str, object]], Field(max_length=MAX_MODEL_EFFECTS)] = []
+    rate_hz: Annotated[float, Field(ge=1e-3, le=1e4)] = 1.0
     temperature_source: TemperatureSource
+    curve: CurveKnots | None = None
+    loads: Loads | None = None
+    published: Published | None = None
+    functions: FunctionFields
+    noise: Noise
+    effects: list[dict[str, object]] = []
     range: Ranges
-    noise: ModelNoise
     information: Information | None = None
     made: Made
 
-    @field_validator("delays_s")
-    @classmethod
-    def _increasing(cls, delays_s: list[float]) -> list[float]:
-        if any(high <= low for low, high in pairwise(delays_s)):
-            raise ValueError(f"must increase, with R1 … R{len(delays_s)} in the same order")
-        return delays_s
-
     @model_validator(mode="after")
     def _consistent(self) -> Self:
-        wanted = set(self.coefficient_names)
-        given = set(self.coefficients)
-        if given != wanted:
-            missing, extra = sorted(wanted - given), sorted(given - wanted)
-            words = [f"missing are {', '.join(missing)}"] if missing else []
-            words += [f"unknown are {', '.join(extra)}"] if extra else []
-            count = len(self.delays_s)
-            raise ValueError(
-                f"coefficients: {'; '.join(words)} ({count} delays_s need R1 … R{count})"
-            )
-        if self.information is not None and self.information.columns != self.coefficient_names:
-            names = ", ".join(self.coefficient_names)
-            raise ValueError(f"information: the columns must be {names}, in this order")
+        if self.equation == "published" and self.published is None:
+            raise ValueError("published: missing, though the equation is published")
+        if self.equation == "knots" and (self.curve is None or self.loads is None):
+            raise ValueError("curve, loads: missing, though the equation is knots")
+        columns = len(self.voltage_model().load_coefficients)
+        for function in self.functions.load:
+            _check_length(function, columns, "functions.load: each function")
         return self
 
     @property
-    def coefficient_names(self) -> list[str]:
-        """Coefficient names in the order of a solution: k0 … k7, kt, R1 … Rn."""
-        return [*BASIS_NAMES, "kt", *resistance_names(len(self.delays_s))]
+    def coefficients(self) -> dict[str, Coefficient]:
+        """The published equation's coefficients; none where the logs do not identify them."""
+        return {} if self.published is None else self.published.coefficients
 
     def voltage_model(self) -> VoltageModel:
         """Return the voltage model without effects.
@@ -221,20 +278,49 @@ class Model(_Strict):
         Raises
         ------
         InputError
-            If the pseudo-OCV does not rise with SoC.
+            If the pseudo-OCV of a published equation does not rise with SoC.
         """
-        value = {name: item.value for name, item in self.coefficients.items()}
+        ranges: dict[str, Any] = {
+            "soc_range_pct": self.range.soc_pct,
+            "temperature_range_c": self.range.temperature_c,
+            "current_range_a": self.range.current_a,
+        }
+        if self.equation == "knots" and self.curve is not None and self.loads is not None:
+            soc_pct, volts = np.array(self.curve.soc_pct), np.array(self.curve.voltage_v)
+            colder = self.loads.arrhenius
+            return VoltageModel(
+                HermiteCurve.rising(soc_pct, volts),
+                kt_v_per_k=self.loads.kt_v_per_k,
+                resistance_ohm=tuple(self.loads.resistance_ohm),
+                delay_s=tuple(self.loads.delays_s),
+                low_pass_s=tuple(self.loads.low_pass_s),
+                arrhenius=Arrhenius(colder.factor, tuple(colder.resistance_ohm), colder.mean_c),
+                t_ref_c=self.loads.t_ref_c,
+                **ranges,
+            )
+        fields = self.published
+        if fields is None:
+            raise ValueError("no published equation")
+        value = {name: item.value for name, item in fields.coefficients.items()}
+        names = published_names(len(fields.delays_s))
+        ocv_v = tuple(value[name] for name in BASIS_NAMES)
         return VoltageModel(
-            ocv_v=tuple(value[name] for name in BASIS_NAMES),
+            PublishedCurve(ocv_v, fields.epsilon, self.range.soc_pct),
             kt_v_per_k=value["kt"],
-            resistance_ohm=tuple(value[name] for name in resistance_names(len(self.delays_s))),
-            delay_s=tuple(self.delays_s),
-            epsilon=self.epsilon,
-            t_ref_c=self.t_ref_c,
-            soc_range_pct=self.range.soc_pct,
-            temperature_range_c=self.range.temperature_c,
-            current_range_a=self.range.current_a,
+            resistance_ohm=tuple(value[name] for name in names[len(BASIS_NAMES) + 1 :]),
+            delay_s=tuple(fields.delays_s),
+            t_ref_c=fields.t_ref_c,
+            **ranges,
         )
+
+    def principal_functions(self) -> Functions:
+        """Return the covariance of the coefficients in reduced form."""
+        number = len(self.functions.curve_v)
+        soc_pct = np.array(self.functions.soc_pct)
+        value = np.array(self.functions.curve_v).reshape(number, soc_pct.size).T
+        columns = len(self.voltage_model().load_coefficients)
+        load = np.array(self.functions.load).reshape(number, columns).T
+        return Functions(soc_pct, value, hermite_slopes(soc_pct, value), load)
 
     def extended_model(self) -> ExtendedModel:
         """Return the voltage model with the effects.
@@ -246,26 +332,62 @@ class Model(_Strict):
             parameter is out of bounds.
         """
         model = self.voltage_model()
-        _check_voltage(model)
-        _check_coefficients(model, self.capacity_ah)
-        self._check_noise(model)
+        _check_physics(model, self)
         effects = parse_effects(self.effects, Pack.of(model, self.capacity_ah))
         return ExtendedModel(model, self.capacity_ah, tuple(effects))
 
-    def _check_noise(self, model: VoltageModel) -> None:
-        volts = model.pseudo_ocv_at(50.0)[0]
-        for name in ("fast_std_v", "slow_std_v", "lasting_std_v"):
-            if getattr(self.noise, name) > volts:
-                raise InputError(
-                    f"is more than the {volts:.4g} V of the pack",
-                    field=f"noise.{name}",
-                    value=getattr(self.noise, name),
-                    cure="check the value and its unit",
-                )
+    def online(self, capacity_ah: float | None = None, gap_s: float = GAP_S) -> OnlineModel:
+        """Return the model one sample at a time, before the first sample.
+
+        Parameters
+        ----------
+        capacity_ah : float, optional
+            Capacity set by the user [Ah]; effects do not change it.
+        gap_s : float
+            A longer step between two samples empties the delay line [s].
+        """
+        functions = self.principal_functions()
+        return OnlineModel(self.extended_model(), functions, self.noise, capacity_ah, gap_s)
+
+    @classmethod
+    def prior(cls, chemistry: ChemistryName, cells: int, capacity_ah: float) -> Model:
+        """Return a model of a pack without logs: the typical cell, with its honest uncertainty.
+
+        Parameters
+        ----------
+        chemistry : {"oxide", "lfp"}
+        cells : int
+            Cells in series.
+        capacity_ah : float
+            [Ah].
+
+        Examples
+        --------
+        >>> Model.prior("oxide", cells=96, capacity_ah=60.0).equation
+        'knots'
+        """
+        known = CHEMISTRIES[chemistry]
+        volts = cells * float(np.interp(50.0, KNOTS_PCT, known.curve_v))
+        prior = prior_of(known, volts, 50.0, capacity_ah)
+        return knots_model(
+            prior.mean,
+            prior.covariance,
+            arrhenius_ohm=prior.resistance_ohm,
+            mean_c=REFERENCE_C,
+            name=f"{cells} {chemistry} cells of {capacity_ah:g} Ah",
+            chemistry=chemistry,
+            cells=cells,
+            capacity_ah=capacity_ah,
+            noise=noise_of(known, volts, prior.residual_v),
+            temperature_source="unknown",
+            range=Ranges(soc_pct=(0.0, 100.0), temperature_c=PRIOR_RANGE_C,
+                         current_a=(-PRIOR_C_RATE * capacity_ah, PRIOR_C_RATE * capacity_ah)),
+            made=Made(by="prior of the chemistry", options={}, logs=[], fingerprint="prior"),
+        )  # fmt: skip
 
     @classmethod
     def load(cls, path: Path | str) -> Model:
-        """Read and validate a model file.
+        """Read and validate a model file, of this version or version 1.
 
         Raises
         ------
@@ -273,11 +395,6 @@ class Model(_Strict):
             If the file cannot be read or does not describe a usable model; names the field.
         """
         path = Path(path)
-        with time_limit(path):
-            return cls._load(path)
-
-    @classmethod
-    def _load(cls, path: Path) -> Model:
         data = read_bounded(path, MAX_MODEL_BYTES, "a model file")
         try:
             raw = json.loads(data, parse_constant=_refuse_constant)
@@ -291,19 +408,22 @@ class Model(_Strict):
                 value=raw.get("format") if isinstance(raw, dict) else type(raw).__name__,
                 cure=_CURE,
             )
-        if raw.get("version") != MODEL_VERSION:
+        if raw.get("version") not in {1, MODEL_VERSION}:
             raise InputError(
-                f"this release reads version {MODEL_VERSION}",
+                f"this release reads versions 1 and {MODEL_VERSION}",
                 source=path,
                 field="version",
                 value=raw.get("version"),
                 cure=_CURE,
             )
         try:
+            if raw["version"] == 1:
+                return Version1.model_validate(raw).upgraded()
             model = cls.model_validate(raw)
             model.extended_model()
         except ValidationError as error:
-            raise schema_error(error, cls, path, _CURE) from error
+            schema = Version1 if raw["version"] == 1 else cls
+            raise schema_error(error, schema, path, _CURE) from error
         except InputError as error:
             raise InputError(
                 error.problem, source=path, field=error.field, value=error.value, cure=error.cure
@@ -352,6 +472,106 @@ class Model(_Strict):
         return self.extended_model().predict(signals, soc_pct, rows, initial_row=row)
 
 
+PRIOR_RANGE_C = (-20.0, 50.0)
+"""Temperatures that the prior's cells are specified for, in typical data sheets [°C]."""
+PRIOR_C_RATE = 3.0
+"""Current that they are specified for [1/h]."""
+
+
+def noise_of(
+    chemistry: Chemistry, volts: float, residual_v: float, *, scale: float = 1.0, **judged: Any
+) -> Noise:
+    """Return the errors of a fitted or prior model.
+
+    Parameters
+    ----------
+    chemistry : Chemistry
+    volts : float
+        Mean voltage V0 [V].
+    residual_v : float
+        Rms residual of the fit [V].
+    scale : float
+        κ² of left-out logs.
+    judged
+        `voltage_mae_pct`, `voltage_rmse_v` and `judged_on`; the residual if left out.
+    """
+    fields: dict[str, Any] = {
+        "voltage_mae_pct": 100.0 * residual_v / volts,
+        "voltage_rmse_v": residual_v,
+        "judged_on": "prior of the chemistry",
+    }
+    return Noise(
+        level_std_v=chemistry.level_std * volts * scale**0.5,
+        slow_std_v=float(np.hypot(chemistry.slow_std * volts, SLOW_SHARE * residual_v)),
+        fast_std_v=float(np.hypot(chemistry.fast_factor * residual_v, FAST_FLOOR * volts)),
+        soc_std_pct=chemistry.soc_std_pct,
+        cold_exponent=chemistry.cold_exponent,
+        residual_std_v=residual_v,
+        left_out_scale=scale,
+        **(fields | judged),
+    )
+
+
+SLOW_SHARE, FAST_FLOOR = 0.4, 0.0003
+"""Share of the residuals that is slow [-], and least noise of a block's mean relative to the mean
+voltage [-]: development packs."""
+
+
+def knots_model(
+    coefficients: FloatArray,
+    covariance: FloatArray,
+    *,
+    arrhenius_ohm: FloatArray,
+    mean_c: float,
+    **fields: Any,
+) -> Model:
+    """Return the model file of fitted or prior coefficients of the curve of knots.
+
+    Parameters
+    ----------
+    coefficients : array of shape (p,)
+        Knots [V], kt [V/K], resistances [Ω], b [-].
+    covariance : array of shape (p, p)
+        Theirs.
+    arrhenius_ohm : array of shape (M,)
+        Resistances that b scales [Ω].
+    mean_c : float
+        Temperature at which the resistances hold [°C].
+    fields
+        The other fields of `Model`.
+    """
+    n = KNOTS_PCT.size
+    kt, *ohm, factor = coefficients[n:].tolist()
+    loads = usual_loads(fields["capacity_ah"], len(ohm), arrhenius_ohm)
+    return Model(
+        equation="knots",
+        curve=CurveKnots(soc_pct=KNOTS_PCT.tolist(), voltage_v=coefficients[:n].tolist()),
+        loads=Loads(
+            t_ref_c=REFERENCE_C,
+            kt_v_per_k=kt,
+            delays_s=list(DELAYS_S),
+            low_pass_s=list(LOW_PASS_S),
+            resistance_ohm=ohm,
+            arrhenius=ArrheniusFields(
+                factor=factor, resistance_ohm=arrhenius_ohm.tolist(), mean_c=mean_c
+            ),
+        ),
+        functions=function_fields(covariance, loads),
+        **fields,
+    )
+
+
+def function_fields(covariance: FloatArray, loads: FloatArray) -> FunctionFields:
+    """Return a covariance in reduced form (`prior.principal_functions`)."""
+    functions = principal_functions(covariance, loads)
+    n = KNOTS_PCT.size
+    return FunctionFields(
+        soc_pct=KNOTS_PCT.tolist(),
+        curve_v=functions[:, :n].tolist(),
+        load=functions[:, n:].tolist(),
+    )
+
+
 HIGHEST_VOLTS: Final = 1e4
 """Largest pseudo-OCV [V]: electrical systems of vehicles and stores stay below 1.5 kV."""
 VOLTAGE_RATIO: Final = 3.0
@@ -365,66 +585,159 @@ SLOPE_BY_TEMPERATURE: Final = 0.01
 0.0003 by the entropy of the cells."""
 
 
-def _check_voltage(model: VoltageModel) -> None:
-    """Raise InputError for a pseudo-OCV that no pack has; it rises, so its ends suffice."""
-    (low, high), middle = model.pseudo_ocv([*model.soc_range_pct]), model.pseudo_ocv_at(50.0)[0]
-    low, high = min(low, middle), max(high, middle)
+def _check_physics(model: VoltageModel, file: Model) -> None:
+    """Raise InputError for voltages, resistances, kt or noise that no pack has."""
+    knots = file.equation == "knots"
+    prefix = "loads" if knots else "published.coefficients"
+    middle = model.nominal_v
+    ends = model.pseudo_ocv([*model.soc_range_pct]).tolist()
+    low, high = min(*ends, middle), max(*ends, middle)
     if not (low > 0.0 and high <= min(HIGHEST_VOLTS, VOLTAGE_RATIO * low)):
         raise InputError(
             f"the pseudo-OCV of {low:.5g} … {high:.5g} V is not that of a battery",
-            field="coefficients",
-            cure="check k0 … k7 and their unit (V), or create the file with `cangauge fit`",
+            field="curve.voltage_v" if knots else prefix,
+            cure="check its values and their unit (V), or create the file with `cangauge fit`",
         )
-
-
-def _check_coefficients(model: VoltageModel, capacity_ah: float) -> None:
-    """Raise InputError for a resistance or temperature coefficient beyond the size of the pack."""
-    pack = Pack.of(model, capacity_ah)
-    largest = DROP_AT_1C * pack.voltage_v / capacity_ah
-    for name, value in zip(
-        resistance_names(len(model.resistance_ohm)), model.resistance_ohm, strict=True
-    ):
+    largest = DROP_AT_1C * middle / file.capacity_ah
+    for number, value in enumerate(model.resistance_ohm):
         if abs(value) > largest:
             raise InputError(
-                f"must lie within ±{largest:.3g} ohm for a pack of {pack.voltage_v:.4g} V and"
-                f" {capacity_ah:.4g} Ah",
-                field=f"coefficients.{name}.value",
+                f"must lie within ±{largest:.3g} ohm for a pack of {middle:.4g} V and"
+                f" {file.capacity_ah:.4g} Ah",
+                field=f"{prefix}.resistance_ohm.{number}" if knots else f"{prefix}.R{number + 1}",
                 value=value,
                 cure="check the value and its unit, or the capacity",
             )
     # A log of constant current leaves the sign open, and there the resistances cancel.
-    (low_a, high_a), lasting_ohm = model.current_range_a, total(model.resistance_ohm)
-    if lasting_ohm * (high_a - low_a) > RESISTANCE_AT_LEAST * pack.voltage_v:
+    (low_a, high_a), lasting_ohm = model.current_range_a, sum(model.resistance_ohm)
+    if lasting_ohm * (high_a - low_a) > RESISTANCE_AT_LEAST * middle:
         raise InputError(
             "the sum of the resistances is positive, so that discharging would raise the voltage",
-            field="coefficients",
+            field=f"{prefix}.resistance_ohm" if knots else prefix,
             value=lasting_ohm,
             cure="positive current discharges, so resistances are negative",
         )
-    steepest = SLOPE_BY_TEMPERATURE * pack.voltage_v
+    steepest = SLOPE_BY_TEMPERATURE * middle
     if abs(model.kt_v_per_k) > steepest:
         raise InputError(
-            f"must lie within ±{steepest:.3g} V/K for a pack of {pack.voltage_v:.4g} V",
-            field="coefficients.kt.value",
+            f"must lie within ±{steepest:.3g} V/K for a pack of {middle:.4g} V",
+            field=f"{prefix}.kt_v_per_k" if knots else f"{prefix}.kt",
             value=model.kt_v_per_k,
             cure="check the value and its unit",
         )
+    for name in ("level_std_v", "slow_std_v", "fast_std_v"):
+        if getattr(file.noise, name) > middle:
+            raise InputError(
+                f"is more than the {middle:.4g} V of the pack",
+                field=f"noise.{name}",
+                value=getattr(file.noise, name),
+                cure="check the value and its unit",
+            )
 
 
-def resistance_names(number: int) -> list[str]:
-    """Return R1 … Rn."""
-    return [f"R{k}" for k in range(1, number + 1)]
+def published_names(delays: int) -> list[str]:
+    """Return k0 … k7, kt, R1 … Rn."""
+    return [*BASIS_NAMES, "kt", *(f"R{k}" for k in range(1, delays + 1))]
+
+
+def _check_increasing(values: list[float], name: str) -> None:
+    if any(high <= low for low, high in pairwise(values)):
+        raise ValueError(f"{name} must increase")
+
+
+def _check_length(values: list[Any], number: int, name: str) -> None:
+    if len(values) != number:
+        raise ValueError(f"{name} needs {number} values, not {len(values)}")
 
 
 def _refuse_constant(name: str) -> float:
     raise ValueError(f"{name} is not a finite number")
 
 
-def effective_error_std_v(noise: ModelNoise, interval_s: float) -> float:
-    """Return the equivalent white-noise standard deviation of a voltage every `interval_s` [V].
+class Version1Curve(_Strict):
+    """Error of pseudo-OCV and temperature coefficient in version 1."""
 
-    The fast error is correlated over τ = `fast_time_s`: n samples carry the information of
-    n / (1 + 2·τ/Δt) independent ones.
-    """
-    inflation = 1.0 + 2.0 * noise.fast_time_s / interval_s
-    return math.sqrt(inflation) * noise.fast_std_v
+    soc_pct: list[_Soc]
+    functions_v: list[list[_Value]]
+    temperature_c: _Celsius
+    kt_std_v_per_k: _Volts
+    resistance_std_per_k: _NotNegative
+
+
+class Version1Noise(_Strict):
+    """Voltage error in version 1: parts of different duration."""
+
+    fast_std_v: _Volts
+    fast_time_s: _NotNegative
+    slow_std_v: _Volts
+    slow_time_s: _Seconds
+    lasting_std_v: _Volts
+    lasting_time_s: _Value = 7200.0
+    lasting_soc_pct: _Value = 8.0
+    curve: Version1Curve | None = None
+    voltage_mae_pct: _NotNegative
+    voltage_rmse_v: _Volts
+    judged_on: str
+
+
+class Version1(Published):
+    """Model file of version 1: the published equation alone."""
+
+    format: Literal["cangauge-model"]
+    version: Literal[1]
+    name: str
+    rate_hz: Annotated[float, Field(ge=1e-3, le=1e4)]
+    capacity_ah: Annotated[float, Field(ge=1e-3, le=1e5)]
+    effects: list[dict[str, object]] = []
+    temperature_source: TemperatureSource
+    range: Ranges
+    noise: Version1Noise
+    information: dict[str, Any] | None = None
+    made: Made
+
+    def upgraded(self) -> Model:
+        """Return the model in the present form; its information is of another kind and left out."""
+        noise, functions, loads = self.noise, [], []
+        zero = [0.0] * len(self.delays_s)
+        if noise.curve is not None:
+            knots = np.array(noise.curve.soc_pct)
+            for function in noise.curve.functions_v:
+                functions.append(np.interp(KNOTS_PCT, knots, function).tolist())
+                loads.append([0.0, *zero])
+            std = noise.curve.kt_std_v_per_k
+            at_mean = std * (self.t_ref_c - noise.curve.temperature_c)
+            functions.append([at_mean] * KNOTS_PCT.size)
+            loads.append([std, *zero])
+        block_share = min(1.0, (1.0 + 2.0 * noise.fast_time_s) / BLOCK_S) ** 0.5
+        model = Model(
+            name=self.name,
+            equation="published",
+            chemistry="oxide",
+            capacity_ah=self.capacity_ah,
+            rate_hz=self.rate_hz,
+            temperature_source=self.temperature_source,
+            published=Published(
+                coefficients=self.coefficients,
+                epsilon=self.epsilon,
+                t_ref_c=self.t_ref_c,
+                delays_s=self.delays_s,
+            ),
+            functions=FunctionFields(soc_pct=KNOTS_PCT.tolist(), curve_v=functions, load=loads),
+            noise=Noise(
+                level_std_v=noise.lasting_std_v,
+                slow_std_v=noise.slow_std_v,
+                slow_time_s=noise.slow_time_s,
+                fast_std_v=block_share * noise.fast_std_v,
+                soc_std_pct=0.0,
+                cold_exponent=0.0,
+                residual_std_v=noise.voltage_rmse_v,
+                voltage_mae_pct=noise.voltage_mae_pct,
+                voltage_rmse_v=noise.voltage_rmse_v,
+                judged_on=noise.judged_on,
+            ),
+            effects=self.effects,
+            range=self.range,
+            made=self.made,
+        )
+        model.extended_model()
+        return model

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import math
 
-from cangauge.model.model_file import Model, resistance_names
-from cangauge.model.voltage_model import BASIS_NAMES, VoltageModel
+from cangauge.model.model_file import Model, Version1, published_names
+from cangauge.model.voltage_model import PublishedCurve, VoltageModel
 
 CAPACITY_AH = 51.5
 """Charge from 100 to 0 % [Ah]."""
@@ -26,13 +26,11 @@ EFFICIENCY_PCT = 98.0
 def leaf_2012_model() -> VoltageModel:
     """Return the published voltage model; temperatures are those of the test room, 20–26 °C."""
     return VoltageModel(
-        ocv_v=(394.4, 48.89, -4.769, 0.2158, -0.003718, -54.59, 109.3, -3.141),
+        PublishedCurve((394.4, 48.89, -4.769, 0.2158, -0.003718, -54.59, 109.3, -3.141)),
         kt_v_per_k=-0.7428,
         resistance_ohm=(-0.1032, -0.01501, -0.009697, -0.004652),
         delay_s=(0.0, 10.0, 30.0, 70.0),
-        epsilon=0.05,
         t_ref_c=20.0,
-        soc_range_pct=(0.0, 100.0),
         temperature_range_c=(20.0, 26.0),
         current_range_a=(-50.0, 200.0),
     )
@@ -47,17 +45,23 @@ def leaf_2012_model_file() -> Model:
     model = leaf_2012_model()
     rmse_v = VOLTAGE_MAE_PCT / 100.0 * MEAN_VOLTAGE_V * math.sqrt(math.pi / 2.0)
     part_v = rmse_v / math.sqrt(3.0)
-    names = [*BASIS_NAMES, "kt", *resistance_names(len(model.delay_s))]
-    values = [*model.ocv_v, model.kt_v_per_k, *model.resistance_ohm]
-    units = {"kt": "V/K"} | dict.fromkeys(resistance_names(len(model.delay_s)), "ohm")
-    return Model.model_validate(
+    curve = model.curve
+    if not isinstance(curve, PublishedCurve):
+        raise TypeError("the published model has the published curve")
+    values = [*curve.ocv_v, model.kt_v_per_k, *model.resistance_ohm]
+    return Version1.model_validate(
         {
+            "format": "cangauge-model",
+            "version": 1,
             "name": "2012 Nissan Leaf, published coefficients",
             "coefficients": {
-                name: {"value": value, "unit": units.get(name, "V")}
-                for name, value in zip(names, values, strict=True)
+                name: {
+                    "value": value,
+                    "unit": {"k": "V", "R": "ohm"}[name[0]] if name != "kt" else "V/K",
+                }
+                for name, value in zip(published_names(4), values, strict=True)
             },
-            "epsilon": model.epsilon,
+            "epsilon": curve.epsilon,
             "t_ref_c": model.t_ref_c,
             "delays_s": list(model.delay_s),
             "rate_hz": 1.0,
@@ -85,4 +89,4 @@ def leaf_2012_model_file() -> Model:
                 "fingerprint": "published",
             },
         }
-    )
+    ).upgraded()

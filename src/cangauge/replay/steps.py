@@ -14,7 +14,7 @@ import can
 import numpy as np
 from can.typechecking import Channel
 
-from cangauge.bus.captures.capture import open_capture
+from cangauge.bus.captures import open_capture
 from cangauge.bus.decoder import SampleDecoder
 from cangauge.bus.encoder import FrameEncoder
 from cangauge.bus.publish import FrameIds

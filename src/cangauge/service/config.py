@@ -49,7 +49,6 @@ from cangauge.estimation.power import PackLimits
 from cangauge.estimation.settings import (
     VALID_STD_PCT,
     EstimatorSettings,
-    Filter,
     FullCharge,
     LongRest,
     Method,
@@ -155,11 +154,6 @@ class RunConfig(Strict):
         "Published SoC: fusion (ekf), the inverse of the voltage model (newton), or Coulomb"
         " counting (coulomb).",
         "ekf|newton|coulomb",
-    )
-    filter: Filter = key(
-        "own",
-        "Arithmetic of the Kalman filter: our own, or filterpy's (reference), slower, to check it.",
-        "own|reference",
     )
     initial_soc: Annotated[FiniteFloat | None, BeforeValidator(_none_for_auto)] = key(
         None,
@@ -380,7 +374,6 @@ class RunConfig(Strict):
         return PipelineSettings(
             estimator=EstimatorSettings(
                 method=self.method,
-                filter=self.filter,
                 initial_soc_pct=self.initial_soc,
                 initial_soc_std_pct=self.initial_soc_std,
                 valid_std_pct=self.valid_std,

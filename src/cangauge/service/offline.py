@@ -25,9 +25,8 @@ from cangauge.bus.recording import open_vehicle_capture
 from cangauge.bus.time_source import REPLAY_CLOCK_ID, TimeSourceName, is_clock
 from cangauge.bus.vehicle import Vehicle
 from cangauge.errors import InputError
-from cangauge.estimation.cells import CellEstimator, CellReport
+from cangauge.estimation.cells import CellEstimator
 from cangauge.estimation.estimator import Estimator
-from cangauge.estimation.health import Health
 from cangauge.estimation.offline import (
     EstimateTable,
     Scores,
@@ -36,14 +35,22 @@ from cangauge.estimation.offline import (
     initial_soc_of,
     score,
 )
-from cangauge.estimation.power import Power
 from cangauge.estimation.settings import EstimatorSettings
 from cangauge.logs.cells import CellColumns
 from cangauge.logs.log import Log
 from cangauge.model.coulomb_counting import difference_from_reference
 from cangauge.model.model_file import Model
 from cangauge.service.pipeline import FrameCounts, Pipeline, PipelineSettings
-from cangauge.types import Estimate, Reason, Sample, reason_name, reason_names
+from cangauge.types import (
+    CellReport,
+    Estimate,
+    Health,
+    Power,
+    Reason,
+    Sample,
+    reason_name,
+    reason_names,
+)
 
 PROGRESS_EVERY: Final = 50_000
 """Frames between two calls of the progress callback."""
@@ -302,7 +309,6 @@ def estimate_recorded_log(
     gap_from_log: bool = True,
     pack: PackHistory | None = None,
     progress: Callable[[int], None] | None = None,
-    smooth: bool = False,
 ) -> RecordedEstimate:
     """Estimate a log.
 
@@ -320,8 +326,6 @@ def estimate_recorded_log(
         Collects health, power and cells.
     progress : callable, optional
         Called with the number of samples done.
-    smooth : bool
-        Add the smoothed SoC.
 
     Raises
     ------
@@ -340,7 +344,7 @@ def estimate_recorded_log(
     history = PackHistory() if pack is None else pack
     observe = history.observe if history.takes_samples else None
     table, scores = estimate_log(
-        log, model, settings, progress, observe, smooth=smooth, at_end=history.take
+        log, model, settings, progress=progress, observe=observe, at_end=history.take
     )
     return RecordedEstimate(log, table, scores, model, settings, origin, pack=history.finish())
 

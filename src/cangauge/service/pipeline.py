@@ -29,7 +29,7 @@ from cangauge.estimation.cells import CellEstimator
 from cangauge.estimation.compiled import make_estimator
 from cangauge.estimation.settings import EstimatorSettings
 from cangauge.estimation.state import EstimatorState
-from cangauge.model.model_file import Model, effective_error_std_v
+from cangauge.model.model_file import Model
 from cangauge.types import Estimate, Reason, Sample, Status, status_of
 
 NOTHING_YET: Final = Estimate.unknown(Reason.NO_INITIAL_SOC | Reason.INPUT_STALE)
@@ -468,7 +468,7 @@ def _pack_of(model: Model, capacity_ah: float | None = None) -> Pack:
     voltage = model.extended_model().model
     return Pack(
         resistance_ohm=abs(voltage.resistance_ohm[0]) if voltage.resistance_ohm else 0.0,
-        error_std_v=effective_error_std_v(model.noise, 1.0 / model.rate_hz),
+        error_std_v=model.noise.residual_std_v,
         capacity_ah=model.capacity_ah if capacity_ah is None else capacity_ah,
         usual_v=voltage.pseudo_ocv_at(50.0)[0],
     )

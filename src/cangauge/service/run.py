@@ -17,8 +17,8 @@ from typing import TYPE_CHECKING, Any
 from cangauge._formatting import number
 from cangauge._io import READ_WITHIN_S, check_writable, refuse_pipe, sole_writer
 from cangauge._logging import emit
+from cangauge.bus.connection import ReconnectingBus
 from cangauge.bus.publish import NO_REPORT
-from cangauge.bus.reconnect import ReconnectingBus
 from cangauge.errors import InputError
 from cangauge.service.addresses import default_path, has_unix_sockets
 from cangauge.service.config import RunConfig, config_keys, load_config

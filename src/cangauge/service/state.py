@@ -1,6 +1,6 @@
 """The service's state across restarts: restored at the start, saved while it runs.
 
-    {"format": "cangauge-state", "version": 2, "sha256": "…", "content": {…}}
+    {"format": "cangauge-state", "version": 3, "sha256": "…", "content": {…}}
 
 The hash is that of the content, written without spaces and with sorted keys. Everything is checked
 before use: size, JSON, format, version, hash, then the type and range of every field. A file that
@@ -37,7 +37,7 @@ from cangauge.service.loop import CHECKPOINT_EVERY_S
 from cangauge.service.pipeline import Pipeline
 
 STATE_FORMAT: Final = "cangauge-state"
-STATE_VERSION: Final = 2
+STATE_VERSION: Final = 3
 """To be increased with every change of the estimator's state."""
 
 LARGEST_BYTES: Final = 8 << 20
@@ -317,7 +317,7 @@ class StateKeeper:
         write_text_atomic(self.settings.path, state_text(content), PRIVATE)
 
     def _log_decision(self) -> None:
-        verdict = self._pipeline.estimator.filter.verdict
+        verdict = self._pipeline.estimator.verdict
         if self._restored_pct is None or verdict in {"", "open"}:
             return
         before, self._restored_pct = self._restored_pct, None

@@ -11,13 +11,14 @@ from cangauge.estimation.counting import CoulombCounter
 from cangauge.model.delay_line import DelayLine
 from cangauge.model.effects.base import Effect, Pack, Parameter, Reading, Signals
 from cangauge.model.effects.library import LIBRARY
-from cangauge.model.extended import ExtendedModel
-from cangauge.model.published import CAPACITY_AH, leaf_2012_model
+from cangauge.model.extended import ExtendedModel, OnlineModel
+from cangauge.model.published import CAPACITY_AH, leaf_2012_model, leaf_2012_model_file
 from synthetic import drive_current
 
 MODEL = leaf_2012_model()
 PACK = Pack.of(MODEL, CAPACITY_AH)
 EFFECTS = list(LIBRARY.values())
+FILE = leaf_2012_model_file()
 
 
 def irregular_signals(rows: int = 3000, seed: int = 1, *, gaps: bool = True) -> Signals:
@@ -57,6 +58,13 @@ def within(parameter: Parameter, part: float, pack: Pack = PACK) -> float:
     return min(max(low + part * (high - low), low), high)
 
 
+def online_of(extended: ExtendedModel, capacity_ah: float | None = None) -> OnlineModel:
+    """The sample-by-sample form with a delay line that keeps every sample."""
+    online = OnlineModel(extended, FILE.principal_functions(), FILE.noise, capacity_ah)
+    online.delay_line = DelayLine(extended.model.delay_s, gap_s=math.inf, spacing_s=0.0)
+    return online
+
+
 @dataclass
 class Stepped:
     """Results of the sample-by-sample form."""
@@ -75,8 +83,7 @@ def step_through(
     asked_soc_pct: np.ndarray | None = None,
 ) -> Stepped:
     """Run a log through online model, delay line and counter, as the estimator does."""
-    online = extended.online()
-    line = DelayLine(extended.model.delay_s, gap_s=math.inf, spacing_s=0.0)
+    online = online_of(extended)
     counter = CoulombCounter(online.capacity_ah, gap_s=2.0)
     start = online.initial_soc_pct(initial_soc_pct)
     readings, soc, volts = [], [], []
@@ -84,13 +91,10 @@ def step_through(
     for row in zip(*(column.tolist() for column in columns), strict=True):
         for reading in online.correct(Reading(*row)):
             counter.step(reading.time_s, online.counted(reading.current_a))
-            line.push(reading.time_s, reading.current_a)
-            delayed = line.currents()
-            online.advance(reading.time_s, reading.current_a, reading.temperature_c, delayed)
+            online.advance(reading.time_s, reading.current_a, reading.temperature_c)
             counted = start - counter.state.discharged_pct
             asked = counted if asked_soc_pct is None else float(asked_soc_pct[len(readings)])
-            beside = extended.model.offset_at(reading.temperature_c, delayed)
             readings.append(reading)
             soc.append(counted)
-            volts.append(online.pseudo_ocv_at(asked)[0] + beside)
+            volts.append(online.pseudo_ocv_at(asked)[0] + online.offset_v())
     return Stepped(readings, np.array(soc), np.array(volts))

@@ -22,10 +22,9 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from cangauge.bus.captures.capture import read_capture
+from cangauge.bus.captures import open_capture
 from cangauge.bus.vehicle import Vehicle
 from cangauge.errors import InputError
-from cangauge.inspect.capture import inspect_capture
 from cangauge.logs.read import read_log
 from cangauge.model.effects.library import LIBRARY
 from cangauge.model.model_file import Model
@@ -182,39 +181,6 @@ def test_logs(tmp_path: Path, name: str) -> None:
     assert refused(lambda: read_log(path))
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("name", list(CAPTURES))
-def test_captures(tmp_path: Path, name: str) -> None:
-    path = tmp_path / "bomb"
-    path.write_bytes(CAPTURES[name]())
-    message = refused(lambda: sum(1 for _ in read_capture(path)))
-    assert message or name in {"blanks", "ids"}
-    if name == "ids":
-        assert not refused(lambda: inspect_capture(path))
-
-
-def test_an_object_without_length_is_damage(tmp_path: Path) -> None:
-    path = tmp_path / "x.blf"
-    path.write_bytes(CAPTURES["object of no length"]())
-    with pytest.raises(InputError, match=r"Vector BLF file is damaged .*an object of 0 bytes"):
-        list(read_capture(path))
-
-
-def test_the_same_objects_with_a_length_are_read(tmp_path: Path) -> None:
-    """In one container, over several, packed or not, with other objects between."""
-    path = tmp_path / "x.blf"
-    content = (frame_object() + struct.pack("<4sHHLL8x", b"LOBJ", 16, 1, 24, 99)) * 5
-    for data in (
-        blf(container(content)),
-        blf(container(content, 0)),
-        blf(*(container(content[at : at + 50]) for at in range(0, len(content), 50))),
-        blf(container(content[:1]), container(content[1:])),
-    ):
-        path.write_bytes(data)
-        frames = list(read_capture(path))
-        assert [frame.arbitration_id for frame in frames] == [0x1DB] * 5
-
-
 @pytest.mark.parametrize(
     "text",
     [
@@ -289,10 +255,10 @@ def test_stamps_that_are_no_time_are_malformed(tmp_path: Path) -> None:
     path = tmp_path / "x.log"
     for stamp in (b"9" * 400 + b".0", b"9" * 12 + b".0"):
         path.write_bytes(FRAME * 3 + FRAME.replace(b"1436509052.249713", stamp))
-        assert sum(1 for _ in read_capture(path)) == 3
+        assert sum(1 for _ in open_capture(path)) == 3
     table = corpus.capture_files()["table.csv"]
     path.write_bytes(table + table.splitlines()[-1].replace(b"1001100", b"9" * 400) + b"\n")
-    assert sum(1 for _ in read_capture(path)) == len(corpus.leaf_frames())
+    assert sum(1 for _ in open_capture(path)) == len(corpus.leaf_frames())
 
 
 def test_python_cans_log_lines_are_not_printed(tmp_path: Path) -> None:
@@ -300,8 +266,8 @@ def test_python_cans_log_lines_are_not_printed(tmp_path: Path) -> None:
     odd = struct.pack("<4sHHLL", b"LOBJ", 16, 7, 32, 1) + bytes(16)
     (tmp_path / "x.blf").write_bytes(blf(container(odd * 1000 + frame_object())))
     code = (
-        "import sys; from cangauge.bus.captures import read_capture;"
-        "print(len(list(read_capture(sys.argv[1]))))"
+        "import sys; from cangauge.bus.captures import open_capture;"
+        "print(len(list(open_capture(sys.argv[1]))))"
     )
     done = subprocess.run(
         [sys.executable, "-c", code, str(tmp_path / "x.blf")],

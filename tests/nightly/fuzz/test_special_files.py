@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from cangauge.bus.captures.capture import is_capture, open_capture
+from cangauge.bus.captures import is_capture, open_capture
 from cangauge.bus.database import load_dbc
 from cangauge.bus.vehicle import Vehicle
 from cangauge.errors import InputError

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from cangauge.bus.captures.capture import read_capture
+from cangauge.bus.captures import open_capture
 from cangauge.bus.database import load_dbc
 from cangauge.bus.recording import capture_to_log
 from cangauge.bus.vehicle import Vehicle
@@ -56,7 +56,7 @@ def test_captures(tmp_path: Path, name: str) -> None:
     data = corpus.capture_files()[name]
     # Each MF4 costs a process and a second.
     step = len(data) // 8 if name == "x.mf4" else 1
-    found = outcomes(tmp_path / name, data, lambda path: len(list(read_capture(path))), step)
+    found = outcomes(tmp_path / name, data, lambda path: len(list(open_capture(path))), step)
     assert max(found) <= len(corpus.leaf_frames())
 
 

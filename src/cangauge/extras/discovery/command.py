@@ -427,7 +427,7 @@ def _listen(address: Any, seconds: float, path: Path) -> Path:
 
 def _joined(paths: Sequence[Path]) -> Iterator[can.Message]:
     """Yield the frames of captures, one after the other in time."""
-    from cangauge.bus.captures.capture import open_capture
+    from cangauge.bus.captures import open_capture
     from cangauge.extras.discovery.search import BETWEEN_S
 
     end_s = None
@@ -453,7 +453,7 @@ def _find(
     quiet: bool,
     nominal_v: float | None,
 ) -> _Found:
-    from cangauge.bus.captures.capture import open_capture
+    from cangauge.bus.captures import open_capture
     from cangauge.extras.discovery.by_name import named_signals
     from cangauge.extras.discovery.search import search
 

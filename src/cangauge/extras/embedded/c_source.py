@@ -3,18 +3,41 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from dataclasses import dataclass
 from typing import Any, Final
 
+import numpy as np
+
 from cangauge.errors import InputError
-from cangauge.estimation.core_constants import CoreConstants, core_constants, effect_fields
+from cangauge.estimation import core_layout as layout
+from cangauge.estimation.estimator import Estimator
 from cangauge.estimation.settings import EstimatorSettings
+from cangauge.model.effects.base import CoreForm
 from cangauge.model.model_file import Model
 
 CORE_SOURCES: Final = ("cangauge.c", "cangauge_filter.c", "cangauge_model.c")
 CORE_HEADERS: Final = ("cangauge.h", "cangauge_internal.h")
 WIDE: Final = ("ocv_v", "epsilon", "skew_s")
 """Fields that are doubles where the others are floats."""
+
+
+@dataclass(frozen=True)
+class CoreConstants:
+    """What the core is started with.
+
+    Parameters
+    ----------
+    model, settings : records
+        A `cg_model` and a `cg_settings`.
+    effects : list of CoreForm
+    longest_s : float
+        Longest delay [s].
+    """
+
+    model: layout.Record
+    settings: layout.Record
+    effects: list[CoreForm]
+    longest_s: float
 
 
 def exported_constants(model: Model) -> CoreConstants:
@@ -25,15 +48,21 @@ def exported_constants(model: Model) -> CoreConstants:
     InputError
         If the core lacks one of the model's effects.
     """
-    constants = core_constants(model, EstimatorSettings())
-    if constants is None:
+    online = model.online()
+    forms = layout.core_forms(online)
+    if forms is None:
         raise InputError(
             "the core has no form of an effect, or the model has time_skew twice",
             field="effects",
             value=[entry["id"] for entry in model.effects],
             cure="fit the model without it",
         )
-    return constants
+    return CoreConstants(
+        layout.model_constants(model, online, forms, Estimator(model).tests),
+        layout.settings_constants(model, EstimatorSettings()),
+        forms,
+        online.delay_line.longest_s,
+    )
 
 
 def line_size(longest_s: float, spacing_s: float) -> int:
@@ -46,39 +75,51 @@ def initialiser(value: Any, field: str = "") -> str:
 
     Parameters
     ----------
-    value : number, str, list, tuple or dict
-        A string is an expression in C, a dict a structure.
+    value : number, record, array, list or tuple
     field : str
         Field that the value is of.
     """
-    if isinstance(value, dict):
-        return "{" + ", ".join(_fields(value)) + "}"
-    if isinstance(value, list | tuple):
-        is_nested = any(isinstance(item, list | tuple | dict) for item in value)
-        joined = (",\n        " if is_nested else ", ").join(
-            initialiser(item, field) for item in value
-        )
-        return "{" + (joined or "0") + "}"
+    if isinstance(value, np.void):
+        names = value.dtype.names or ()
+        fields = (f".{name} = {initialiser(value[name], name)}" for name in names)
+        return "{" + ", ".join(fields) + "}"
+    if isinstance(value, np.ndarray | list | tuple):
+        return "{" + (", ".join(initialiser(item, field) for item in value) or "0") + "}"
     if isinstance(value, float):
         if not math.isfinite(value):
             return "NAN" if math.isnan(value) else ("-" * (value < 0.0) + "INFINITY")
         return ("" if field in WIDE else "(cg_real)") + repr(float(value))
-    return str(int(value) if isinstance(value, bool) else value)
+    return str(int(value))
 
 
 def model_definition(name: str, constants: CoreConstants) -> str:
     """Return the definition of a model's constants, a `cg_model`."""
-    fields = constants.model | {
-        "function_v": constants.functions,
-        "effect": [
-            effect_fields(form) | {"kind": f"CG_{form.kind.upper()}"} for form in constants.effects
-        ],
+    of, used = constants.model, used_sizes(constants)
+    lines = []
+    for field in layout.MODEL.names or ():
+        value = of[field]
+        if 0 in used.get(field, ()):
+            continue
+        if field in used:
+            value = value[tuple(slice(size) for size in used[field])]
+        lines.append(f"    .{field} = {initialiser(value, field)},\n")
+    return f"const cg_model {name} = {{\n{''.join(lines)}}};\n"
+
+
+def used_sizes(constants: CoreConstants) -> dict[str, tuple[int, ...]]:
+    """Return the used part of the arrays whose length depends on the model."""
+    of = constants.model
+    currents = int(of["delays"] + of["low_passes"])
+    loads, knots = currents + 1 + int(of["has_arrhenius"]), int(of["knots"])
+    functions, function_knots = int(of["functions"]), int(of["function_knots"])
+    return {
+        "delay_s": (int(of["delays"]),),
+        "low_pass_s": (int(of["low_passes"]),),
+        "arrhenius_ohm": (currents,),
+        "load": (loads,),
+        **dict.fromkeys(("knot_pct", "knot_v", "knot_slope"), (knots,)),
+        "function_pct": (function_knots,),
+        **dict.fromkeys(("function_v", "function_slope"), (function_knots, functions)),
+        "function_load": (loads if functions else 0, functions),
+        "effect": (int(of["effects"]),),
     }
-    body = "".join(f"    {field},\n" for field in _fields(fields))
-    return f"const cg_model {name} = {{\n{body}}};\n"
-
-
-def _fields(structure: dict[str, Any]) -> Iterator[str]:
-    for name, value in structure.items():
-        if value != []:
-            yield f".{name} = {initialiser(value, name)}"

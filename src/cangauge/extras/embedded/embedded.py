@@ -22,12 +22,12 @@ from cangauge._version import __version__
 from cangauge.bus.database import load_dbc, signal_codec
 from cangauge.bus.publish import SocPublisher
 from cangauge.errors import InputError
-from cangauge.estimation.core_constants import CoreConstants
 from cangauge.estimation.estimator import Estimator
 from cangauge.estimation.settings import EstimatorSettings
 from cangauge.extras.embedded.c_source import (
     CORE_HEADERS,
     CORE_SOURCES,
+    CoreConstants,
     exported_constants,
     line_size,
     model_definition,
@@ -138,12 +138,12 @@ def _comment(text: str) -> str:
 
 def _config(constants: CoreConstants, period_s: float) -> str:
     """Return the sizes of the structures."""
-    model = constants.model
+    of = constants.model
     skews = [abs(form.values[0]) for form in constants.effects if form.kind == "time_skew"]
     waiting = math.ceil(max(skews) / period_s) + 130 if skews else 1
-    sizes = {name: model[name] for name in ("delays", "knots", "functions", "effects")}
-    sizes["waiting"] = waiting
-    lines = [f"#define CG_{name.upper()} {max(int(str(sizes[name])), 1)}" for name in sizes]
+    sizes = {name: int(of[name]) for name in ("delays", "low_passes", "functions", "effects")}
+    sizes["knots"], sizes["waiting"] = max(of["knots"], of["function_knots"]), waiting
+    lines = [f"#define CG_{name.upper()} {max(size, 1)}" for name, size in sizes.items()]
     return "\n".join(lines) + "\n"
 
 
@@ -339,7 +339,7 @@ def drive_with_events(model: Model, period_s: float) -> Iterator[Sample]:
         rate = (0.2, 0.9, -0.25, 0.4, 0.0)[int(time_s / 20.0) % 5]
         current_a = rate * capacity_ah
         soc_pct -= 100.0 * current_a * spacing_s / (3600.0 * capacity_ah)
-        error_v = 5e-4 * voltage.pseudo_ocv_at(50.0)[0] * math.sin(0.7 * k)
+        error_v = 5e-4 * voltage.nominal_v * math.sin(0.7 * k)
         volts = voltage.pseudo_ocv_at(soc_pct)[0] + error_v
         volts += sum(voltage.resistance_ohm) * current_a
         temperature_c = voltage.t_ref_c + 3.0 * math.sin(k / 400.0)

@@ -27,7 +27,7 @@ import numpy as np
 from scipy.optimize import nnls
 
 from cangauge._typing import FloatArray
-from cangauge.model.effects.base import PackState
+from cangauge.model.effects.base import Load
 from cangauge.model.extended import ExtendedModel
 from cangauge.model.model_file import Model
 
@@ -107,7 +107,8 @@ def equivalent_circuit(model: Model) -> EquivalentCircuit:
     low_c, high_c = model.range.temperature_c
     half_c = max(0.5 * (high_c - low_c), 0.5 * NARROWEST_C)
     temperatures = 0.5 * (low_c + high_c) + half_c * np.linspace(-1.0, 1.0, TEMPERATURES)
-    if not extended.effects:
+    is_plain = not extended.effects
+    if is_plain and extended.model.arrhenius is None:
         temperatures = temperatures[[0, -1]]
     curve_soc = np.linspace(0.0, 100.0, CURVE_POINTS)
     response = _StepResponse(extended)
@@ -115,7 +116,7 @@ def equivalent_circuit(model: Model) -> EquivalentCircuit:
     tau_s = response.time_constants(usual)
     _, error_ohm = response.resistances(usual, tau_s)
     amperes, socs = np.array(C_RATES) * extended.capacity_ah, np.array(RESISTANCE_SOC_PCT)
-    if not extended.effects:
+    if is_plain:
         amperes, socs = amperes[[0, -1]], socs[[0, -1]]
     ohm = np.array(
         [
@@ -147,8 +148,8 @@ def _rest_v(extended: ExtendedModel, soc_pct: FloatArray, temperature_c: float) 
     """Return the voltage after a long rest [V], shape (n,)."""
     celsius = np.full_like(soc_pct, temperature_c)
     zero = np.zeros_like(soc_pct)
-    state = PackState(np.arange(soc_pct.size, dtype=float), zero, celsius, soc_pct, zero)
-    return extended.model.pseudo_ocv(soc_pct, celsius) + extended.extra_voltage(state)
+    load = Load(np.arange(soc_pct.size, dtype=np.float64), zero, celsius, zero)
+    return np.asarray(extended.model.pseudo_ocv(soc_pct, celsius) + extended.added_v(load, soc_pct))
 
 
 class _StepResponse:
@@ -156,7 +157,11 @@ class _StepResponse:
 
     def __init__(self, extended: ExtendedModel) -> None:
         self._extended = extended
-        self._own_tau_s = sorted({tau for _, tau in extended.online().memory if tau >= FASTEST_S})
+        elements = [
+            tau for effect, values in extended.effects for _, tau in effect.rc_elements(values)
+        ]
+        own = {*elements, *extended.model.low_pass_s}
+        self._own_tau_s = sorted(tau for tau in own if tau >= FASTEST_S)
         delays = [delay for delay in extended.model.delay_s if delay > 0.0]
         self._last_s = LASTING * max([FASTEST_S, *delays, *self._own_tau_s])
         edges = np.union1d([0.0, *delays], np.geomspace(0.1 * FASTEST_S, self._last_s, TIMES))
@@ -168,14 +173,16 @@ class _StepResponse:
         time_s = np.concatenate(([0.0], self.time_s))
         one = np.ones_like(time_s)
         model = self._extended.model
-        flows = time_s[:, None] >= np.array(model.delay_s)
-        unit_v = flows @ np.array(model.resistance_ohm)
+        flows = [time_s >= delay for delay in model.delay_s]
+        smooth = [-np.expm1(-time_s / tau) for tau in model.low_pass_s]
+        currents = np.column_stack([*flows, *smooth]).astype(np.float64)
+        columns = model.load_columns(temperature_c * one, currents)[:, 1:]
+        unit_v = columns @ model.load_coefficients[1:]
 
         def volts(amperes: float) -> FloatArray:
-            state = PackState(
-                time_s, amperes * one, temperature_c * one, soc_pct * one, amperes * unit_v
-            )
-            return np.asarray(amperes * unit_v + self._extended.extra_voltage(state))
+            load = Load(time_s, amperes * one, temperature_c * one, amperes * unit_v)
+            added_v = self._extended.added_v(load, soc_pct * one)
+            return np.asarray(amperes * unit_v + added_v)
 
         return np.asarray((volts(0.0) - volts(current_a))[1:] / current_a)
 

@@ -31,10 +31,11 @@ from cangauge._io import atomic_path
 from cangauge._resources import shared_file
 from cangauge._version import __version__
 from cangauge.errors import CangaugeError, InputError
-from cangauge.estimation.core_constants import CoreConstants
+from cangauge.estimation import core_layout as layout
 from cangauge.extras.embedded.c_source import (
     CORE_HEADERS,
     CORE_SOURCES,
+    CoreConstants,
     exported_constants,
     initialiser,
     line_size,
@@ -173,7 +174,10 @@ class _Unit:
                 CoreForm("no_effect") if form.kind in SENSORS else form
                 for form in constants.effects
             ]
-            constants = replace(constants, effects=forms)
+            of = constants.model.copy()
+            for effect, form in zip(of["effect"], forms, strict=False):
+                effect["kind"] = layout.KINDS.index(form.kind)
+            constants = replace(constants, model=of, effects=forms)
             names, parameters = _effect_parameters(forms)
             variables = (*_pack_variables(model), *names)
         else:
@@ -296,7 +300,9 @@ def _pack_variables(model: Model) -> tuple[Variable, ...]:
     return (
         Variable("time", "independent", "s", None, "time"),
         Variable("current_a", "input", "A", 0.0, "current, positive = discharge"),
-        Variable("temperature_c", "input", "degC", model.t_ref_c, "measured temperature"),
+        Variable(
+            "temperature_c", "input", "degC", model.voltage_model().t_ref_c, "measured temperature"
+        ),
         Variable("voltage_v", "output", "V", None, "voltage at the terminals"),
         Variable("soc_pct", "output", "%", None, "state of charge"),
         Variable(

@@ -7,13 +7,12 @@ from collections.abc import Callable, Iterable, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Final, cast
+from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, cast
 
 import typer
 
 from cangauge._formatting import counted, number, significant
 from cangauge._io import file_sha256, write_texts_atomic
-from cangauge.cli.fit import parse_delays
 from cangauge.cli.options import (
     JsonOption,
     Reading,
@@ -25,7 +24,7 @@ from cangauge.cli.options import (
     within,
 )
 from cangauge.cli.output import console, emit_json, note, print_table, progress_shown
-from cangauge.cli.shown import ALARM_BELOW, FLEET_LOGS, FLEET_REFERENCES, LOCAL, VEHICLE_PATTERN
+from cangauge.cli.shown import ALARM, FLEET_LOGS, FLEET_REFERENCES, LOCAL, VEHICLE_PATTERN
 from cangauge.errors import InputError
 
 if TYPE_CHECKING:
@@ -153,12 +152,10 @@ def fit_fleet_command(
     rate_hz: Annotated[
         float, typer.Option(metavar="HZ", help="Rate of the fit [Hz]; faster logs are decimated.")
     ] = 1.0,
-    delays: Annotated[
-        str, typer.Option(metavar="S,S,…", help="Delays of the current [s].")
-    ] = "0,10,30,70",
-    epsilon: Annotated[float, typer.Option(metavar="E", help="Margin ε of the scaled SoC.")] = 0.05,
-    t_ref: Annotated[float, typer.Option(metavar="C", help="Reference temperature [°C].")] = 20.0,
-    name: Annotated[str | None, typer.Option(help="Name of the model.")] = None,
+    chemistry: Annotated[
+        Literal["oxide", "lfp"], typer.Option(help="Chemistry of the cells.")
+    ] = "oxide",
+    cells: Annotated[int | None, typer.Option(metavar="N", min=1, help="Cells in series.")] = None,
     leave_out: Annotated[
         list[str] | None,
         typer.Option(
@@ -171,7 +168,7 @@ def fit_fleet_command(
 ) -> None:
     """Identify one model from all logs: the fit of `cangauge fit`, out of core.
 
-    Each log is reduced to its information matrix, and these add up. Every log needs its SoC, or
+    Each log is reduced to its sums, and these add up. Every log needs its SoC, or
     initial_soc_pct in the manifest. Logs that do not fit the others are named.
 
     Examples
@@ -182,17 +179,15 @@ def fit_fleet_command(
     logs/A17/trip4.parquet`
     """
     from cangauge.extras.fleet.fit import fit_fleet
-    from cangauge.inference.rows import FitOptions
+    from cangauge.extras.fleet.passes import FleetFitOptions
 
     within(capacity_ah, 1e-3, 1e5, option="--capacity-ah", unit="Ah")
     within(rate_hz, 0.01, 1000.0, option="--rate-hz", unit="Hz")
-    within(epsilon, 1e-4, 0.49, option="--epsilon", unit="")
-    within(t_ref, -60.0, 120.0, option="--t-ref", unit="°C")
-    options = FitOptions(capacity_ah, None, rate_hz, parse_delays(delays), epsilon, t_ref)
+    options = FleetFitOptions(capacity_ah, chemistry, cells, rate_hz)
     how, found = _read_options(reading), cluster.find(logs)
     _check_outputs([output, report], found, *map(Path, logs))
     fitted = _without(found, cluster.find(leave_out or []))
-    result = cluster.run(lambda client: fit_fleet(fitted, how, options, out, client, name=name))
+    result = cluster.run(lambda client: fit_fleet(fitted, how, options, out, client))
     texts = {output: result.model.to_json()}
     if report is not None:
         from cangauge.extras.report.fleet_fit import fleet_fit_report
@@ -228,12 +223,14 @@ def _show_fit(result: FleetFit) -> None:
         f"Model {result.model.name}",
         ["", "value", "<unit"],
         [
-            ["voltage error, MAE", number(figures["voltage_mae_pct"], 3), "%"],
             ["voltage error, RMSE", significant(figures["voltage_rmse_v"], 3), "V"],
-            ["voltage error held out, MAE", number(result.model.noise.voltage_mae_pct, 3), "%"],
-            ["SoC from voltage, MAE", number(figures["soc_newton_mae_pct"], 2), "%"],
+            [
+                "voltage error of left-out logs, RMSE",
+                significant(result.model.noise.voltage_rmse_v, 3),
+                "V",
+            ],
             ["slope resistance", significant(result.slope_ohm, 3), "Ω"],
-            ["condition number", significant(result.solution.condition_number, 2), ""],
+            ["condition number", significant(result.published.condition_number, 2), ""],
             ["rows used", str(figures["rows"]), ""],
             ["logs that do not fit", by_log.count_text, ""],
         ],
@@ -347,7 +344,7 @@ def gap_fleet_command(  # noqa: PLR0917 - typer passes options by name
         typer.Option(
             metavar="P", help="Report a fault where the probability of none is at most this."
         ),
-    ] = ALARM_BELOW,
+    ] = ALARM,
     *,
     cluster: Cluster,
     reading: Reading,

@@ -1,59 +1,38 @@
-"""`fleet fit`: one model from all logs, by two passes over them (`identify.voltage_fit`).
+"""`fleet fit`: one model from all logs, by one pass that reduces each log to its sums.
 
-The rows of both passes are kept. A further log costs the reading of itself in the first pass; the
-second pass is computed again for all, since each log changes the model.
+The rows of the pass are kept, so that a further log costs the reading of itself. The sums give the
+model, the models without some of the logs, and the error of each log, as in `cangauge fit`.
 """
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
-from typing import Any, Final
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from cangauge._formatting import counted
+from cangauge._io import text_sha256
+from cangauge._version import __version__
 from cangauge.errors import InputError
 from cangauge.extras.fleet.dataset import Dataset, by_kind
 from cangauge.extras.fleet.outliers import ErrorsByLog
 from cangauge.extras.fleet.passes import (
-    ErrorsJob,
-    InformationJob,
-    errors_of_row,
-    information_of_row,
+    FleetFitOptions,
+    SumsJob,
+    factor_of_row,
+    ranges_of_rows,
+    sums_of_row,
 )
 from cangauge.extras.fleet.run import Summary, run_id, run_job
 from cangauge.extras.fleet.sources import FleetLog, ReadOptions
-from cangauge.identify.assemble import (
-    coefficient_names,
-    common_name,
-    information_of_rows,
-    made_of,
-    model_file_of,
-    noise_of,
-)
-from cangauge.identify.log_errors import LogErrors, slope_resistances, summed, with_std_errors
-from cangauge.identify.voltage_fit import (
-    LogInformation,
-    fit_information,
-    models_without,
-    pooled,
-)
-from cangauge.inference.least_squares import Solution
-from cangauge.inference.rows import (
-    FOLDS_AT_MOST,
-    LOGS_AT_LEAST,
-    FitOptions,
-)
+from cangauge.identify.fit import EPSILON, LISTED_LOGS, common_name, knots_file, model_rmse
+from cangauge.identify.least_squares import LOGS_AT_LEAST, LogSums, Solution, solve_scaled
+from cangauge.identify.published import PublishedFit, pooled, solve_published
 from cangauge.model.model_file import Made, Model, SourceLog
-from cangauge.model.voltage_model import VoltageModel
-
-LISTED_LOGS: Final = 4096
-"""Source logs that a model file names; of more, it states the number."""
-
-POOLED_AT_ONCE: Final = 256
-"""Logs of which the factors are stacked for one QR decomposition."""
+from cangauge.model.prior import CHEMISTRIES, DELAYS_S, REFERENCE_C
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,12 +43,16 @@ class FleetFit:
     ----------
     model : Model
     solution : Solution
-    errors : LogErrors
-        Of all logs.
-    slope_ohm, slope_expected_ohm : float
-        As of `cangauge.Identification` [Ω].
-    summaries : tuple of Summary
-        Of both passes.
+    published : PublishedFit
+        The published equation on the same rows.
+    voltage_rmse_v : float
+        Rms error of all logs under the model [V], weighted as in the fit.
+    slope_ohm : float
+        As of `cangauge.Identification` [Ω], weighted as in the fit.
+    rows : int
+    logs_used : int
+    summary : Summary
+        Of the pass.
     by_log : ErrorsByLog
     left_out : list of dict
         Logs that could be read but are not of the fit, each with `log`, `reason` and its `kind`.
@@ -79,42 +62,35 @@ class FleetFit:
 
     model: Model
     solution: Solution
-    errors: LogErrors
+    published: PublishedFit
+    voltage_rmse_v: float
     slope_ohm: float
-    slope_expected_ohm: float
-    summaries: tuple[Summary, ...]
+    rows: int
+    logs_used: int
+    summary: Summary
     by_log: ErrorsByLog
     left_out: list[dict[str, Any]]
     bad: list[dict[str, Any]]
 
-    @property
-    def logs_used(self) -> int:
-        """Number of logs of the fit."""
-        return len(self.errors.equations.rows)
-
     def to_dict(self) -> dict[str, Any]:
         """Return the object that `cangauge fleet fit --json` prints."""
-        sums, noise = self.errors.sums, self.model.noise
+        model, noise = self.model, self.model.noise
         return {
-            "voltage_mae_pct": sums["voltage_pct"] / sums["rows"],
-            "voltage_rmse_v": float(np.sqrt(sums["square_v2"] / sums["rows"])),
-            "soc_newton_mae_pct": sums["newton_pct"] / sums["rows"],
-            "capacity_ah": self.model.capacity_ah,
+            "voltage_rmse_v": self.voltage_rmse_v,
+            "voltage_rmse_pct": 100.0 * self.voltage_rmse_v / self.solution.mean_v,
+            "capacity_ah": model.capacity_ah,
             "slope_ohm": self.slope_ohm,
-            "slope_expected_ohm": self.slope_expected_ohm,
-            "condition_number": self.solution.condition_number,
-            "constrained": self.solution.constrained,
-            "coefficients": {
-                name: item.model_dump() for name, item in self.model.coefficients.items()
-            },
+            "condition_number": self.published.condition_number,
+            "coefficients": {name: item.model_dump() for name, item in model.coefficients.items()},
+            "chemistry": model.chemistry,
             "held_out": {
-                "voltage_mae_pct": noise.voltage_mae_pct,
                 "voltage_rmse_v": noise.voltage_rmse_v,
                 "judged_on": noise.judged_on,
+                "scale": noise.left_out_scale,
             },
             **self.by_log.to_dict(),
-            "rows": int(sums["rows"]),
-            "passes": [summary.to_dict() for summary in self.summaries],
+            "rows": self.rows,
+            "pass": self.summary.to_dict(),
             "logs": self.logs_used,
             "left_out": self.left_out,
             "bad": self.bad,
@@ -124,11 +100,9 @@ class FleetFit:
 def fit_fleet(
     logs: Sequence[FleetLog],
     options: ReadOptions,
-    fit: FitOptions,
+    fit: FleetFitOptions,
     out: str,
     client: Any,
-    *,
-    name: str | None = None,
 ) -> FleetFit:
     """Identify the model of a type of pack from all logs of a fleet.
 
@@ -136,64 +110,89 @@ def fit_fleet(
     ----------
     logs : sequence of FleetLog
     options : ReadOptions
-    fit : FitOptions
+    fit : FleetFitOptions
     out : str
-        Folder or URL of the data sets of both passes.
+        Folder or URL of the data set.
     client : distributed.Client
-    name : str, optional
-        Name of the model.
 
     Raises
     ------
     InputError
-        If fewer than three logs can be used, or they do not identify a model.
+        If fewer than three logs can be used.
     """
-    first = InformationJob(options, fit)
-    dataset = Dataset(out, first.kind, first.columns)
-    summary = run_job(first, logs, dataset, client)
-    used, left_out = _usable(logs, dataset, run_id(first))
-    by_fold = _pooled_by_fold(used, dataset, run_id(first))
-    whole = pooled(by_fold)
-    model, solution = fit_information(whole, fit, source=out)
-    second = ErrorsJob(options, fit, model, solution, models_without(by_fold, fit), whole.mean_c)
-    errors_set = Dataset(out, second.kind, second.columns)
-    later = run_job(second, [log for log, _ in used.values()], errors_set, client)
-    errors = _summed(errors_set.rows(run_id(second)), used, solution)
-    if errors is None or errors.sums["rows"] < whole.rows:
-        raise InputError(
-            f"{counted(later.bad + later.bad_before, 'log')} of the first pass failed in the"
-            " second",
-            source=out,
-            cure=f"see {second.kind}-bad in it, and run the same command again",
-        )
-    if not errors.sums["held_out"]:
-        raise InputError(
-            "no log has rows in the SoC range of the others, so that none can be held out",
-            source=out,
-            cure="give logs that overlap in SoC",
-        )
-    solution = with_std_errors(solution, errors.sums, errors.scores)
-    slope, expected = slope_resistances(errors, model.resistance_ohm)
-    rows = errors_set.rows(run_id(second), without=_NOT_BY_LOG)
-    found = _model_file(whole, model, solution, errors=errors, fit=fit, used=used, name=name)
+    job = SumsJob(options, fit)
+    dataset = Dataset(out, job.kind, job.columns)
+    summary = run_job(job, logs, dataset, client)
+    used, left_out = _usable(logs, dataset, run_id(job))
+    found = {row["log"]: row for row in dataset.rows(run_id(job)) if _is_of(row, used)}
+    rows = [found[url] for url in used]
+    sums = [sums_of_row(row) for row in rows]
+    chemistry = CHEMISTRIES[fit.chemistry]
+    solution, without = solve_scaled(sums, fit.capacity_ah, chemistry)
+    published = solve_published(pooled([factor_of_row(row) for row in rows]), EPSILON)
+    fields: dict[str, Any] = {
+        "name": common_name([row["name"] for row in rows]),
+        "chemistry": fit.chemistry,
+        "cells": fit.cells,
+        "capacity_ah": fit.capacity_ah,
+        "rate_hz": fit.rate_hz,
+        "temperature_source": rows[0]["temperature_source"],
+        "range": ranges_of_rows(rows),
+        "made": _made(rows, fit),
+    }
+    if published.identified:
+        fields["published"] = published.fields(EPSILON, REFERENCE_C, DELAYS_S)
+    model = knots_file(solution, chemistry, fields)
+    held_out_v = model_rmse(without, sums)
+    noise = model.noise.model_copy(
+        update={
+            "voltage_rmse_v": held_out_v,
+            "voltage_mae_pct": 100.0 * (2.0 / np.pi) ** 0.5 * held_out_v / solution.mean_v,
+            "judged_on": "logs left out in turn",
+        }
+    )
+    errors = [(item, solution.mean_error(item)[0], solution.square_error(item)) for item in sums]
     return FleetFit(
-        found,
-        solution,
-        errors,
-        slope,
-        expected,
-        (summary, later),
-        by_log=ErrorsByLog.of_rows((row for row in rows if _is_of(row, used)), found),
+        model=model.model_copy(update={"noise": noise}),
+        solution=solution,
+        published=published,
+        voltage_rmse_v=model_rmse([solution] * len(sums), sums),
+        slope_ohm=_slope_ohm(sums, solution),
+        rows=sum(row["rows"] for row in rows),
+        logs_used=len(rows),
+        summary=summary,
+        by_log=ErrorsByLog.of_logs(
+            [
+                (row["log"], row["vehicle"], mean_v, square_v2**0.5, item.weight)
+                for row, (item, mean_v, square_v2) in zip(rows, errors, strict=True)
+            ],
+            noise,
+        ),
         left_out=left_out,
-        bad=_bad(logs, dataset, run_id(first)),
+        bad=_bad(logs, dataset, run_id(job)),
     )
 
 
+def _slope_ohm(sums: Sequence[LogSums], solution: Solution) -> float:
+    """Return the regression of U − pseudo-OCV on the current, as a positive resistance [Ω]."""
+    total = np.sum([item.moments for item in sums], axis=0)
+    weight = sum(item.weight for item in sums)
+    coefficients = solution.select.T @ solution.coefficients
+    first = len(solution.arrhenius_ohm)
+    curve = np.zeros(len(total))
+    kt = len(coefficients) - 2 * first  # knots and kt come before the currents
+    curve[:kt] = -coefficients[:kt]
+    curve[-1] = 1.0
+    current = np.zeros(len(total))
+    current[kt] = 1.0
+    one = np.zeros(len(total))
+    one[-2] = 1.0
+    spread = current @ total @ current - (one @ total @ current) ** 2 / weight
+    shared = current @ total @ curve - (one @ total @ current) * (one @ total @ curve) / weight
+    return -float(shared / spread)
+
+
 _Used = dict[str, tuple[FleetLog, Mapping[str, Any]]]
-
-
-_NOT_BY_LOG: Final = ("scores", "means", "counts", "products")
-"""Columns of `ErrorsJob` that the errors by log do not need."""
 
 
 def _is_of(row: Mapping[str, Any], used: _Used) -> bool:
@@ -214,7 +213,7 @@ def _bad(logs: Sequence[FleetLog], dataset: Dataset, run: str) -> list[dict[str,
 def _usable(
     logs: Sequence[FleetLog], dataset: Dataset, run: str
 ) -> tuple[_Used, list[dict[str, Any]]]:
-    """Return the logs with information, by URL in their order, each with a fold; and the others.
+    """Return the logs with sums, by URL in their order; and the others.
 
     The others have temperatures measured elsewhere, or the same rows as one before.
     """
@@ -234,9 +233,6 @@ def _usable(
                 ]
             ),
         )
-    number = min(len(used), FOLDS_AT_MOST)
-    for k, (url, (log, found)) in enumerate(used.items()):
-        used[url] = (replace(log, fold=k % number), found)
     return used, left_out
 
 
@@ -281,67 +277,20 @@ def _twins(used: _Used) -> list[dict[str, Any]]:
     ]
 
 
-def _pooled_by_fold(used: _Used, dataset: Dataset, run: str) -> list[LogInformation]:
-    waiting: dict[int, list[LogInformation]] = {}
-    for row in dataset.rows(run):
-        if not _is_of(row, used):
-            continue
-        parts = waiting.setdefault(used[row["log"]][0].fold, [])
-        parts.append(information_of_row(row))
-        if len(parts) >= POOLED_AT_ONCE:
-            parts[:] = [pooled(parts)]
-    return [pooled(waiting[fold]) for fold in sorted(waiting)]
-
-
-def _summed(rows: Iterable[Mapping[str, Any]], used: _Used, solution: Solution) -> LogErrors | None:
-    """Return the errors of all used logs together; None if there is no row."""
-    kept = solution.back.shape[1]
-    waiting: list[LogErrors] = []
-    for row in rows:
-        if _is_of(row, used):
-            waiting.append(errors_of_row(row, kept))
-        if len(waiting) >= POOLED_AT_ONCE:
-            waiting = [summed(waiting)]
-    return summed(waiting) if waiting else None
-
-
-def _model_file(
-    whole: LogInformation,
-    model: VoltageModel,
-    solution: Solution,
-    *,
-    errors: LogErrors,
-    fit: FitOptions,
-    used: _Used,
-    name: str | None,
-) -> Model:
-    prior, root = solution.kt_prior, whole.root
-    rows = [row for _, row in used.values()]
-    return model_file_of(
-        model,
-        solution,
-        fit,
-        name=name or common_name([row["name"] for row in rows]),
-        temperature_source=rows[0]["temperature_source"],
-        noise=noise_of(
-            errors,
-            model,
-            rate_hz=fit.rate_hz,
-            mean_c=whole.mean_c,
-            spans=whole.spans / whole.logs,
-        ),
-        effects=[],
-        information=information_of_rows(
-            root[:, :-1], np.empty((len(root), 0)), root[:, -1], coefficient_names(fit),
-            0.0 if prior is None else prior.row_weight,
-        ),
-        made=_made(rows, fit),
-    )  # fmt: skip
-
-
-def _made(rows: Sequence[Mapping[str, Any]], fit: FitOptions) -> Made:
-    listed = [
-        SourceLog(name=row["name"], rows=row["rows"], sha256=row["data_sha256"])
-        for row in (rows if len(rows) <= LISTED_LOGS else [])
-    ]
-    return made_of(fit, listed, [row["data_sha256"] for row in rows], fleet_logs=len(rows))
+def _made(rows: Sequence[Mapping[str, Any]], fit: FleetFitOptions) -> Made:
+    listed = rows if len(rows) <= LISTED_LOGS else []
+    return Made(
+        by=f"cangauge {__version__}",
+        options={
+            "capacity_ah": fit.capacity_ah,
+            "rate_hz": fit.rate_hz,
+            "chemistry": fit.chemistry,
+            "equation": "knots",
+            "fleet_logs": len(rows),
+        },
+        logs=[
+            SourceLog(name=row["name"], rows=row["rows"], sha256=row["data_sha256"])
+            for row in listed
+        ],
+        fingerprint=text_sha256("".join(row["data_sha256"] for row in rows)),
+    )

@@ -19,11 +19,11 @@ import pyarrow as pa
 
 from cangauge._io import text_sha256
 from cangauge.diagnosis import (
-    ALARM_BELOW,
+    ALARM,
     NONE,
     UNKNOWN,
     Diagnosis,
-    LearnedReferences,
+    References,
     diagnose,
     learn_references,
 )
@@ -73,11 +73,11 @@ class GapJob(Job):
         Of the vehicles' type, such as from `fleet fit`.
     references : int
         Largest number of references of a diagnosis.
-    alarm_below : float
+    alarm : float
         Probability of `none` up to which a fault is reported.
     common : tuple of FleetLog
         References of every vehicle without healthy logs of its own.
-    learned : LearnedReferences, optional
+    learned : References, optional
         From these.
     unread : tuple of str
         Those that could not be used, with the reason.
@@ -85,9 +85,9 @@ class GapJob(Job):
 
     model: Model
     references: int = REFERENCES
-    alarm_below: float = ALARM_BELOW
+    alarm: float = ALARM
     common: tuple[FleetLog, ...] = ()
-    learned: LearnedReferences | None = None
+    learned: References | None = None
     unread: tuple[str, ...] = ()
 
     kind: ClassVar[str] = "gap"
@@ -96,16 +96,16 @@ class GapJob(Job):
     columns: ClassVar[Mapping[str, Any]] = {
         "logs": _NAMES, "references": COUNT, "reference_vehicles": COUNT, "unread": _NAMES,
         "detected": pa.bool_(), "verdict": TEXT, "probability": REAL, "probability_none": REAL,
-        "probability_unknown": REAL, "family": TEXT, "family_probability": REAL,
-        "credible_set": _NAMES, "baseline_rmse_v": REAL, "extended_rmse_v": REAL, "floor_v": REAL,
-        "closed_fraction": REAL, "parameters": TEXT, "smallest": TEXT, "summary": TEXT,
-        "limits": _NAMES,
+        "probability_unknown": REAL, "group": TEXT, "group_probability": REAL,
+        "check_first": TEXT, "credible_set": _NAMES, "baseline_rmse_v": REAL,
+        "extended_rmse_v": REAL, "healthy_rmse_v": REAL, "closed_fraction": REAL,
+        "parameters": TEXT, "visible_from": TEXT, "summary": TEXT, "limits": _NAMES,
     }  # fmt: skip
 
     def identity(self) -> dict[str, Any]:
         """Return model, references and alarm."""
         model = self.model.to_json()
-        return {"model": model, "references": self.references, "alarm": self.alarm_below}
+        return {"model": model, "references": self.references, "alarm": self.alarm}
 
     def with_common(
         self,
@@ -177,19 +177,21 @@ class GapJob(Job):
         if not logs:
             raise InputError("none of its logs can be read", cure=f"the first: {unread[0]}")
         of = vehicle.references or self.common
-        references: list[Log] | LearnedReferences
-        if not vehicle.references and self.learned is not None and self.learned.covers(logs):
+        references: list[Log] | References
+        if not vehicle.references and self.learned is not None:
             references = self.learned
             unread += self.unread
+            unusable = {text.partition(": ")[0] for text in self.unread}
         else:
             of = of[:WITH_OWN]
+            before = len(unread)
             references = list(self._read(of, unread))
-        found = diagnose(logs, self.model, references, alarm_below=self.alarm_below)
-        used = {item.log.source for item in found.problem.references}
+            unusable = {text.partition(": ")[0] for text in unread[before:]}
+        found = diagnose(logs, self.model, references, alarm=self.alarm)
         return {
             "logs": [each.url for each in vehicle.logs],
-            "references": len(found.problem.references),
-            "reference_vehicles": len({each.vehicle for each in of if each.url in used}),
+            "references": len(found.known.logs),
+            "reference_vehicles": len({each.vehicle for each in of if each.url not in unusable}),
             "unread": unread,
             **_columns_of(found),
         }
@@ -207,30 +209,31 @@ class GapJob(Job):
 
 
 def _columns_of(found: Diagnosis) -> dict[str, Any]:
-    verdict = found.verdict
+    answer = found.posterior
+    group, probability = next(iter(answer.groups.items()))
     return {
-        "detected": verdict.detected,
-        "verdict": verdict.cause,
-        "probability": verdict.probability,
-        "probability_none": verdict.probabilities[NONE],
-        "probability_unknown": verdict.probabilities[UNKNOWN],
-        "family": verdict.family,
-        "family_probability": verdict.family_probability,
-        "credible_set": list(verdict.credible_set),
+        "detected": answer.detected,
+        "verdict": answer.verdict,
+        "probability": answer.probability,
+        "probability_none": answer.probabilities[NONE],
+        "probability_unknown": answer.probabilities[UNKNOWN],
+        "group": group,
+        "group_probability": probability,
+        "check_first": answer.check_first,
+        "credible_set": list(answer.credible_set),
         "baseline_rmse_v": found.baseline_rmse_v,
         "extended_rmse_v": found.extended_rmse_v,
-        "floor_v": found.floor_v,
+        "healthy_rmse_v": found.healthy_rmse_v,
         "closed_fraction": found.closed_fraction,
         "parameters": json.dumps(
             {
-                item["effect"]: item["parameters"]
-                for item in found.candidates
-                if item["effect"] == verdict.cause
+                answer.verdict: {
+                    name: item.to_dict()
+                    for name, item in found.parameters.get(answer.verdict, {}).items()
+                }
             }
         ),
-        "smallest": json.dumps(
-            {str(item["effect"]): 1.0 - float(str(item["visible"])) for item in found.observability}
-        ),
+        "visible_from": json.dumps(found.visible_from),
         "summary": found.summary,
         "limits": found.caveats,
     }

@@ -13,7 +13,7 @@ import numpy as np
 from cangauge.errors import InputError
 from cangauge.estimation.compiled import make_estimator
 from cangauge.estimation.estimator import Estimator
-from cangauge.estimation.offline import gap_of, initial_soc_of, update_all
+from cangauge.estimation.offline import gap_of, initial_soc_of, samples_of
 from cangauge.estimation.settings import EstimatorSettings
 from cangauge.estimation.state import EstimatorState
 from cangauge.extras.fleet.jobs import COUNT, REAL, TEXT, Job, known, required
@@ -70,7 +70,8 @@ class HealthJob(Job):
         before = None if state is None else EstimatorState.model_validate_json(state)
         shift_s = self._shift_s(log, recorded, before)
         estimator = self._estimator(recorded, before)
-        update_all(estimator, replace(recorded, time_s=recorded.time_s + shift_s))
+        for sample in samples_of(replace(recorded, time_s=recorded.time_s + shift_s)):
+            estimator.update(sample)
         estimate = estimator.estimate
         return {
             "start": log.start,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, Final
@@ -11,8 +11,7 @@ import numpy as np
 
 from cangauge._formatting import NONE_KNOWN
 from cangauge._typing import FloatArray
-from cangauge.inference.error_model import variance_of_sum
-from cangauge.model.model_file import Model
+from cangauge.model.model_file import Noise
 
 OUTLIER_Z: Final = 3.5
 """Robust z from which a value is an outlier (Iglewicz, Hoaglin, How to Detect and Handle Outliers,
@@ -67,31 +66,16 @@ class ErrorsByLog:
     rmse_v: FloatArray
 
     @classmethod
-    def of_rows(cls, rows: Iterable[Mapping[str, Any]], model: Model) -> ErrorsByLog:
-        """Collect the errors of rows of `ErrorsJob` under a model."""
-        resistance_ohm = model.voltage_model().resistance_ohm
-        logs, vehicles, numbers, mean_v, rmse_v = zip(
-            *sorted(
-                (
-                    row["log"],
-                    row["vehicle"],
-                    row["rows"],
-                    _mean_v(row["currents"], resistance_ohm),
-                    float(np.sqrt(row["square_v2"] / row["rows"])),
-                )
-                for row in rows
-            ),
-            strict=True,
-        )
-        number, noise = np.array(numbers), model.noise
-        variance_v2 = sum(
-            std_v**2 * variance_of_sum(number, time_s * model.rate_hz) / number**2
-            for std_v, time_s in (
-                (noise.fast_std_v, noise.fast_time_s),
-                (noise.slow_std_v, noise.slow_time_s),
-            )
-        )
-        return cls(logs, vehicles, np.array(mean_v), np.sqrt(variance_v2), np.array(rmse_v))
+    def of_logs(
+        cls, logs: Iterable[tuple[str, str, float, float, float]], noise: Noise
+    ) -> ErrorsByLog:
+        """Collect errors: log, vehicle, mean and RMS error [V], and weight [s] of each log."""
+        names, vehicles, mean_v, rmse_v, seconds = zip(*sorted(logs), strict=True)
+        duration_s = np.maximum(np.array(seconds), noise.block_s)
+        blocks, stretches = duration_s / noise.block_s, duration_s / (2.0 * noise.slow_time_s)
+        variance_v2 = noise.fast_std_v**2 / blocks
+        variance_v2 += noise.slow_std_v**2 / np.maximum(1.0, stretches)
+        return cls(names, vehicles, np.array(mean_v), np.sqrt(variance_v2), np.array(rmse_v))
 
     @property
     def is_known(self) -> bool:
@@ -155,9 +139,3 @@ class ErrorsByLog:
                 for k in self.misfits
             ]
         }
-
-
-def _mean_v(currents: Sequence[float], resistance_ohm: Sequence[float]) -> float:
-    """Return the mean error of a log from its flattened `LogErrors.currents` [V]."""
-    number, drop_v, *amperes = currents[: len(resistance_ohm) + 2]
-    return float(drop_v - np.dot(amperes, resistance_ohm)) / number

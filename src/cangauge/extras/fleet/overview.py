@@ -137,8 +137,8 @@ class FleetOverview:
         text = (
             f"nearest: {self.nearest} (P(no fault) {number(100.0 * row['probability_none'], 0)} %"
         )
-        if row["family"] != NONE:
-            text += f", {row['family']} {number(100.0 * row['family_probability'], 0)} %"
+        if row["group"] != NONE:
+            text += f", {row['group']} {number(100.0 * row['group_probability'], 0)} %"
         return f"{text})"
 
     @property
@@ -185,7 +185,7 @@ class FleetOverview:
         }
 
     def _alarm(self, name: str) -> dict[str, Any]:
-        shown = ("verdict", "probability", "probability_none", "family", "family_probability")
+        shown = ("verdict", "probability", "probability_none", "group", "group_probability")
         return {"vehicle": name, **{key: self.gaps[name][key] for key in shown}}
 
 

@@ -22,7 +22,7 @@ from typing import Any, Final
 
 from cangauge._files import as_utf8
 from cangauge._io import MAX_LOG_BYTES, text_sha256
-from cangauge.bus.captures.capture import Capture
+from cangauge.bus.captures import Capture
 from cangauge.bus.recording import (
     log_of,
     open_with_columns,

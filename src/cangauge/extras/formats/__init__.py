@@ -1,1 +1,4 @@
-"""Readers of logs beyond the canonical log and plain tables; the core loads them by name."""
+"""Logs and captures beyond the canonical log, plain tables and python-can's formats.
+
+The core loads them by name: readers of captures join by entry points.
+"""

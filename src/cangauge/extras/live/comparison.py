@@ -13,8 +13,7 @@ import numpy as np
 from cangauge._typing import FloatArray
 from cangauge.errors import CangaugeError
 from cangauge.extras.live.history import History, column
-from cangauge.inference.time_scales import SCALES, haar_transform, scale_variances
-from cangauge.model.model_file import Model, ModelNoise
+from cangauge.model.model_file import Model, Noise
 from cangauge.types import Status
 
 SIGNIFICANT: Final = 3.0
@@ -82,34 +81,29 @@ def _model(path: str, changed_ns: int) -> Model:  # noqa: ARG001 - read again on
     return Model.load(path)
 
 
-def _scales(residual_mv: FloatArray, noise: ModelNoise) -> list[dict[str, Any]]:
-    stated = 1e6 * scale_variances(
-        noise.fast_std_v**2, noise.fast_time_s, noise.slow_std_v**2, noise.slow_time_s
-    )
-    split = 2 * residual_mv.size // 3
-    parts = [
-        haar_transform(part[:, np.newaxis])
-        for part in (residual_mv, residual_mv[:split], residual_mv[split:])
-    ]
+def _scales(residual_mv: FloatArray, noise: Noise) -> list[dict[str, Any]]:
+    """Return RMS and stated error of the residual's means over a block and over the slow error."""
+    stated_v = {
+        int(noise.block_s): (noise.fast_std_v, noise.slow_std_v, noise.level_std_v),
+        int(noise.slow_time_s): (noise.slow_std_v, noise.level_std_v),
+    }
     found = []
-    for scale in range(SCALES - 1):  # the last pools all longer stretches
-        whole, early, late = (part[scale][:, 0] for part in parts)
+    for seconds, parts_v in stated_v.items():
+        number = residual_mv.size // seconds
+        means = residual_mv[: number * seconds].reshape(number, seconds).mean(axis=1)
+        split = 2 * number // 3
+        early, late = means[:split], means[split:]
         if min(early.size, late.size) < 2:
             break
-        half_s = 2**scale
-        # An orthonormal coefficient over the difference of the two means that it stands for.
-        gain = math.sqrt(0.5 * half_s)
-        rms_mv, floor_mv = (
-            math.sqrt(v) / gain for v in (float(np.mean(whole**2)), float(stated[scale]))
-        )
+        rms_mv, floor_mv = math.sqrt(float(np.mean(means**2))), 1000.0 * math.hypot(*parts_v)
         growth = float(np.mean(late**2)) / max(float(np.mean(early**2)), 1e-12)
         found.append(
             {
-                "seconds": half_s,
+                "seconds": seconds,
                 "rms_mv": rms_mv,
                 "floor_mv": floor_mv,
                 "growth": math.sqrt(growth),
-                "above": _is_larger((rms_mv / max(floor_mv, 1e-9)) ** 2, 2.0 / whole.size),
+                "above": _is_larger((rms_mv / max(floor_mv, 1e-9)) ** 2, 2.0 / number),
                 "growing": _is_larger(growth, 2.0 / early.size + 2.0 / late.size),
             }
         )

@@ -43,7 +43,7 @@ from cangauge.extras.report.page import (
     render,
 )
 from cangauge.extras.report.verdict import Period, estimate_verdict, periods
-from cangauge.inference.rows import running_rows
+from cangauge.identify.rows import running_rows
 from cangauge.service.offline import Recorded, RecordedEstimate
 from cangauge.types import REASON_WORDS, Reason, Status, reason_name
 

@@ -124,7 +124,7 @@ def fit_figure(found: Identification, *, height: int = 240) -> Plot:
     pieces = [(item.rows.time_s, item.residual_v) for item in found.fits]
     time.line(residual, "measured − model", pieces, Pen(BLUE, in_legend=False))
     errors = np.concatenate([item.residual_v for item in found.fits])
-    held_out = np.concatenate(found.held_out_error_v)
+    held_out = np.concatenate([*found.held_out_error_v, np.empty(0)])
     shares = histogram(
         "measured − model", "V", [("fitted", errors, BLUE), ("held out", held_out, ORANGE)]
     )
@@ -138,9 +138,10 @@ def diagnosis_figure(found: Diagnosis) -> Plot:
     ----------
     found : Diagnosis
     """
-    ordered = sorted(found.verdict.probabilities.items(), key=lambda item: -item[1])
+    answer = found.posterior
+    ordered = sorted(answer.probabilities.items(), key=lambda item: -item[1])
     entries = [
-        (name, float(probability), BLUE if name == found.verdict.cause else GREY)
+        (name, float(probability), BLUE if name == answer.verdict else GREY)
         for name, probability in ordered[:SHOWN_CAUSES]
     ]
     return bars("probability", "", entries, decimals=2)

@@ -45,15 +45,14 @@ from cangauge.extras.report.page import (
     reconstruction_banners,
     render,
 )
-from cangauge.extras.report.summary import effect_rows, rounded, search_rows
 from cangauge.extras.report.verdict import fit_verdict
 from cangauge.identify.evaluate import LogFit
 from cangauge.identify.fit import Identification
-from cangauge.inference.least_squares import Solution
-from cangauge.inference.rows import running_rows
+from cangauge.identify.rows import running_rows
+from cangauge.identify.tables import effect_rows, rounded, search_rows
 from cangauge.model.coulomb_counting import discharged_ah
 from cangauge.model.effects.library import LIBRARY
-from cangauge.model.model_file import Model
+from cangauge.model.model_file import Model, Published
 from cangauge.model.voltage_model import VoltageModel
 
 _UNITS: Final = {"V": "V", "V/K": "V/K", "ohm": "Ω"}
@@ -80,7 +79,7 @@ def fit_page(result: Identification) -> Page:
         Section("State of charge from voltage", _newton_figures(result, time)),
         Section("Resistance", [_resistance_figure(result)]),
         Section("Energy", _energy(result)),
-        Section("Coefficients", [coefficient_table(result.model, result.solution)]),
+        Section("Coefficients", coefficient_tables(result.model, _condition(result))),
         *([Section("Effects", _effects(result))] if result.effects is not None else []),
         Section("Recorded data", _recorded_figures(result, time)),
         Section("How the model was made", _method(result)),
@@ -129,7 +128,7 @@ def _fit_figures(result: Identification, time: TimeFigures) -> list[Block]:
     ):
         time.line(over_time, name, _over_time(result, values), pen, gap_s=_gap_s(result))
     low, high = result.voltage_model.soc_range_pct
-    has_effects = result.effects is not None and result.effects.model.effects
+    has_effects = bool(result.model.effects)
     return [
         Figure(
             "Measured voltage, model and pseudo-OCV",
@@ -144,8 +143,8 @@ def _fit_figures(result: Identification, time: TimeFigures) -> list[Block]:
                     _ocv_plot(result),
                     "Dots: the measured voltage minus the model's resistances"
                     f"{', effects' if has_effects else ''} and temperature term."
-                    f" The logs cover {span(low, high, 1, '%')}; the curve is extrapolated linearly"
-                    " into the shaded part.",
+                    f" The logs cover {span(low, high, 1, '%')}; in the shaded part the curve"
+                    f" {_beyond(result.model)}.",
                 ),
                 Figure(
                     "Slope of the pseudo-OCV",
@@ -215,7 +214,7 @@ def _voltage_error(result: Identification, time: TimeFigures) -> list[Block]:
     parts = [("fit", np.concatenate([values for _, values in fitted]), BLUE)]
     held_out = [
         (item.rows.time_s, values)
-        for item, values in zip(result.fits, result.held_out_error_v, strict=True)
+        for item, values in zip(result.fits, result.held_out_error_v, strict=False)
     ]
     if any(np.isfinite(values).any() for _, values in held_out):
         pen = Pen(ORANGE, width=1.0, alpha=0.75, visible=False)
@@ -250,15 +249,16 @@ def _error_table(result: Identification) -> Table:
             ["largest of the fit", significant(largest_v, 3), "V", ""],
             ["MAE held out", number(noise.voltage_mae_pct), "%", noise.judged_on],
             ["RMSE held out", significant(noise.voltage_rmse_v, 3), "V", noise.judged_on],
-            ["fast part (σ)", significant(noise.fast_std_v, 3), "V",
-             f"correlated over {number(noise.fast_time_s, 1, 's')}: averages out"],
+            ["of a 30 s mean (σ)", significant(noise.fast_std_v, 3), "V", "another in each block"],
             ["slow part (σ)", significant(noise.slow_std_v, 3), "V",
-             f"correlated over {number(noise.slow_time_s, 0, 's')}: averages out in longer times"],
-            ["lasting part (σ)", significant(noise.lasting_std_v, 3), "V",
+             f"correlated over {number(noise.slow_time_s, 0, 's')}"],
+            ["level (σ)", significant(noise.level_std_v, 3), "V",
              "constant over a log: does not average out"],
+            ["SoC against voltage (σ)", number(noise.soc_std_pct, 1), "%",
+             "times the slope of the curve, another error of the voltage"],
         ],
-        "The three parts are estimated from the error at each time scale, for a log to come, and"
-        " need not add up to the RMSE. The filter takes its measurement noise from them.",
+        "The filter takes its measurement noise from the last four. Level and coefficients are"
+        f" scaled by the errors of left-out logs (κ² = {number(noise.left_out_scale, 2)}).",
     )  # fmt: skip
 
 
@@ -293,9 +293,9 @@ def _newton_figures(result: Identification, time: TimeFigures) -> list[Block]:
 
 
 def _resistance_figure(result: Identification) -> Figure:
-    current = np.concatenate([item.rows.delayed_current_a[:, 0] for item in result.fits])
+    current = np.concatenate([item.rows.currents_a[:, 0] for item in result.fits])
     drop = np.concatenate([item.rows.voltage_v - item.pseudo_ocv_v for item in result.fits])
-    delay_s = result.model.delays_s[0]
+    delay_s = result.voltage_model.delay_s[0]
     plot = new_figure(
         (f"current {delay_s:g} s ago" if delay_s else "current", "voltage − pseudo-OCV"),
         "$name<br>@x{0.0} A, @y{0.00} V",
@@ -311,8 +311,8 @@ def _resistance_figure(result: Identification) -> Figure:
         "Voltage drop against current",
         plot,
         f"The slope is the resistance at the terminals, {slope}. The coefficients expect"
-        f" {significant(result.slope_expected_ohm, 3, 'Ω')}: R1 + Σ Rj·ρj with ρj the"
-        " autocorrelation of the current at the delays.",
+        f" {significant(result.slope_expected_ohm, 3, 'Ω')}: Σ Rm·ρm with ρm the regression of the"
+        " m-th delayed or low-passed current on the present one.",
     )
 
 
@@ -351,8 +351,46 @@ def _energy(result: Identification) -> list[Block]:
     ]
 
 
-def coefficient_table(model: Model, solution: Solution) -> Table:
-    """Return the coefficients of a model with their standard errors."""
+def _condition(result: Identification) -> float:
+    return result.published.condition_number
+
+
+def _beyond(model: Model) -> str:
+    return (
+        "follows the typical cell of the chemistry"
+        if model.equation == "knots"
+        else "is extrapolated linearly"
+    )
+
+
+def coefficient_tables(model: Model, condition_number: float) -> list[Block]:
+    """Return the coefficients of a model: loads, and the published equation where identified."""
+    blocks: list[Block] = []
+    if model.loads is not None:
+        loads = model.loads
+        names = [f"current {d:g} s ago" if d else "current" for d in loads.delays_s]
+        names += [f"current low-passed with {tau:g} s" for tau in loads.low_pass_s]
+        rows = [["temperature coefficient", significant(loads.kt_v_per_k, 3), "V/K"]]
+        rows += [
+            [f"resistance: {name}", significant(ohm, 3), "Ω"]
+            for name, ohm in zip(names, loads.resistance_ohm, strict=True)
+        ]
+        rows.append(["part of the resistance that follows Arrhenius",
+                     number(loads.arrhenius.factor, 2), ""])  # fmt: skip
+        blocks.append(
+            Table(
+                ["coefficient", "value", "unit"],
+                rows,
+                "U = g(S) + kt·(T − Tr) + Σ Rm·Im + b·(a(T)/a(mean T) − 1)·Σ Rm·Im, with g the"
+                " curve through knots.",
+            )
+        )
+    if model.published is not None:
+        blocks.append(_published_table(model.published, condition_number))
+    return blocks
+
+
+def _published_table(model: Published, condition_number: float) -> Table:
     factors = {
         "k0": "1", "k1": "1/s", "k2": "1/s²", "k3": "1/s³", "k4": "1/s⁴", "k5": "s",
         "k6": "ln s", "k7": "ln(1 − s)", "kt": f"T − {model.t_ref_c:g} °C",
@@ -371,19 +409,14 @@ def coefficient_table(model: Model, solution: Solution) -> Table:
                 factors[name],
             ]
         )
-    bounded = (
-        " The bounds that keep the pseudo-OCV rising are active; the standard errors ignore them."
-        if solution.constrained
-        else ""
-    )
     return Table(
-        ["coefficient", "value", "std. error", "|value| / error", "unit", "multiplies"],
+        ["published coefficient", "value", "std. error", "|value| / error", "unit", "multiplies"],
         rows,
         "U = k0 + k1/s + k2/s² + k3/s³ + k4/s⁴ + k5·s + k6·ln s + k7·ln(1 − s) + kt·(T − Tr)"
-        " + Σ Rj·I(t − dj),  s = S/100·(1 − 2ε) + ε. Standard errors allow for residuals that are"
-        " correlated within 300 s. k0 … k7 are strongly correlated (condition number"
-        f" {significant(solution.condition_number, 2)}): use their sum, the curve, not"
-        f" single values.{bounded}",
+        f" + Σ Rj·I(t − dj),  s = S/100·(1 − 2ε) + ε, ε = {model.epsilon:g}: the published equation"
+        " by plain least squares of the same rows. Rows of a minute count as one in the standard"
+        " errors. k0 … k7 are strongly correlated (condition number"
+        f" {significant(condition_number, 2)}): use their sum, the curve, not single values.",
     )
 
 
@@ -391,23 +424,20 @@ def _effects(result: Identification) -> list[Block]:
     found = result.effects
     if found is None:
         return []
-    ids = dict.fromkeys(effect_id for effect_id, _ in found.estimates)
+    ids = dict.fromkeys(str(entry["id"]) for entry in result.model.effects)
     equations = "; ".join(f"{effect_id}: {LIBRARY[effect_id].equation}" for effect_id in ids)
-    without_v, with_v = (significant(rmse_v, 3, "V") for rmse_v in found.held_out_rmse_v)
     return [
         _as_table(
-            *effect_rows(found),
+            *effect_rows(result),
             f"{equations}. An effect is a signature at the terminals, not proof of a mechanism."
             if ids
             else "No effect is significant in these logs.",
         ),
         _as_table(
             *search_rows(found),
-            f"RMSE on held-out data: {without_v} without effects, {with_v} with the effects above."
-            " An effect is added if the mean logarithm of the error ratio, log by log (or by half"
-            " logs), is significantly above zero (t above the value needed) and the error falls by"
-            " at least 1 %. The same data selected the effects, so the last figure is slightly"
-            " optimistic.",
+            "Errors of left-out logs. An effect is added if the mean logarithm of the error ratio,"
+            " log by log, is significantly above zero (t of 2 or more) and worth at least 3 %. The"
+            " same data selected the effects, so the last figure is slightly optimistic.",
         ),
     ]
 
@@ -458,7 +488,7 @@ def _recorded_figures(result: Identification, time: TimeFigures) -> list[Block]:
 
 def _method(result: Identification) -> list[Block]:
     blocks: list[Block] = [
-        settings_table(result.model, result.solution),
+        settings_table(result.model),
         _logs(result),
         _removed(result),
     ]
@@ -472,22 +502,20 @@ def _method(result: Identification) -> list[Block]:
     return blocks
 
 
-def settings_table(model: Model, solution: Solution) -> Table:
+def settings_table(model: Model) -> Table:
     """Return how a model was made, and the range that it is known in."""
+    cells = "" if model.cells is None else f", {model.cells} cells in series"
     return Table(
         ["model", ""],
         [
+            ["equation", model.equation],
+            ["chemistry", f"{model.chemistry}{cells}"],
             ["capacity", number(model.capacity_ah, 2, "Ah")],
-            ["delays", ", ".join(f"{delay:g}" for delay in model.delays_s) + " s"],
             ["rate", f"{model.rate_hz:g} Hz"],
-            ["ε", f"{model.epsilon:g}"],
-            ["Tr", f"{model.t_ref_c:g} °C"],
             ["temperature measured on", model.temperature_source],
             ["identified at SoC", span(*model.range.soc_pct, 1, "%")],
             ["identified at temperature", span(*model.range.temperature_c, 1, "°C")],
             ["identified at current", span(*model.range.current_a, 0, "A")],
-            ["condition number", significant(solution.condition_number, 2)],
-            ["rising pseudo-OCV", "enforced" if solution.constrained else "by itself"],
             ["made by", model.made.by],
         ],
     )
@@ -495,7 +523,8 @@ def settings_table(model: Model, solution: Solution) -> Table:
 
 def _logs(result: Identification) -> Table:
     rows = []
-    for log, item, held_out in zip(result.logs, result.fits, result.held_out_error_v, strict=True):
+    errors = result.held_out_error_v or [np.full(len(item.rows), np.nan) for item in result.fits]
+    for log, item, held_out in zip(result.logs, result.fits, errors, strict=True):
         judged = np.isfinite(held_out)
         relative = np.abs(held_out[judged]) / item.rows.voltage_v[judged]
         rows.append(

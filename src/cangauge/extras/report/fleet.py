@@ -126,7 +126,7 @@ def _gaps(found: FleetOverview) -> list[Block]:
                 number(row["probability"], 2),
                 number(row["probability_none"], 3),
                 number(row["baseline_rmse_v"], 2),
-                number(row["floor_v"], 2),
+                number(row["healthy_rmse_v"], 2),
                 number(None if closed is None else 100.0 * closed, 0),
                 ", ".join(row["credible_set"]),
             ]
@@ -136,7 +136,10 @@ def _gaps(found: FleetOverview) -> list[Block]:
         "of references [V]", "closed [%]", "90 % set",
     ]  # fmt: skip
     ratio = sorted(
-        ((name, row["baseline_rmse_v"] / row["floor_v"]) for name, row in found.gaps.items()),
+        (
+            (name, row["baseline_rmse_v"] / row["healthy_rmse_v"])
+            for name, row in found.gaps.items()
+        ),
         key=lambda item: -item[1],
     )[:BARS]
     colors = [ORANGE if found.gaps[name]["detected"] else GREY for name, _ in ratio]

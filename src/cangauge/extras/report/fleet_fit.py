@@ -19,7 +19,7 @@ from cangauge.extras.report.charts import (
     new_figure,
     shade_outside,
 )
-from cangauge.extras.report.fit import coefficient_table, settings_table, slope_plot
+from cangauge.extras.report.fit import coefficient_tables, settings_table, slope_plot
 from cangauge.extras.report.fleet import BARS, SHOWN, bad_table
 from cangauge.extras.report.page import (
     Beside,
@@ -56,9 +56,9 @@ def fleet_fit_page(result: FleetFit) -> Page:
     sections = [
         Section("Logs that do not fit the others", _misfits(result)),
         Section("Pseudo-OCV", [_curves(result)]),
-        Section("Coefficients", [coefficient_table(model, result.solution)]),
+        Section("Coefficients", coefficient_tables(model, result.published.condition_number)),
         *([Section("Logs set aside and left out", aside)] if aside else []),
-        Section("How the model was made", [settings_table(model, result.solution)]),
+        Section("How the model was made", [settings_table(model)]),
     ]
     return Page(
         title=f"Voltage model {model.name}",
@@ -82,12 +82,10 @@ def _lead(result: FleetFit) -> str:
 def _tiles(result: FleetFit) -> list[Tile]:
     figures, noise = result.to_dict(), result.model.noise
     return [
-        Tile("Voltage error (MAE)", number(figures["voltage_mae_pct"], 3, "%"),
-             f"RMSE {significant(figures['voltage_rmse_v'], 3, 'V')}"),
-        Tile("Held out (MAE)", number(noise.voltage_mae_pct, 3, "%"),
-             f"RMSE {significant(noise.voltage_rmse_v, 3, 'V')}"),
-        Tile("SoC by Newton (MAE)", number(figures["soc_newton_mae_pct"], 2, "%"),
-             "against counting"),
+        Tile("Voltage error (RMSE)", significant(figures["voltage_rmse_v"], 3, "V"),
+             f"{number(figures['voltage_rmse_pct'], 3, '%')} of the voltage"),
+        Tile("Logs left out (RMSE)", significant(noise.voltage_rmse_v, 3, "V"),
+             "each by the model of the others"),
         Tile("Logs used", str(result.logs_used), f"{figures['rows']:,} rows"),
         Tile("Do not fit the others", result.by_log.count_text, "used all the same"),
         Tile("Logs set aside", str(len(result.bad) + len(result.left_out)), "not used"),
@@ -142,8 +140,8 @@ def _curves(result: FleetFit) -> Beside:
         [
             Figure(
                 "Pseudo-OCV against SoC", plot,
-                f"The logs cover {span(*model.soc_range_pct, 1, '%')}; the curve is extrapolated"
-                " linearly into the shaded part.",
+                f"The logs cover {span(*model.soc_range_pct, 1, '%')}; in the"
+                " shaded part it follows the typical cell of the chemistry.",
             ),
             Figure(
                 "Slope of the pseudo-OCV", slope_plot(model),

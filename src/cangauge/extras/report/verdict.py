@@ -7,7 +7,6 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from cangauge._formatting import NONE_KNOWN, number
-from cangauge.diagnosis import MIN_BIN_ROWS
 from cangauge.estimation.offline import EstimateTable
 from cangauge.identify.fit import Identification
 from cangauge.inspect.log import TEMPERATURE_SPAN_K, LogInspection
@@ -16,6 +15,10 @@ from cangauge.types import REASON_WORDS, Reason, Status
 
 SOC_STEP_PCT: Final = 10.0
 """Width of the ranges of SoC that a verdict names [%]."""
+
+
+MIN_BIN_ROWS: Final = 10
+"""Rows below which a range of SoC counts as sparse."""
 
 
 class Period(NamedTuple):

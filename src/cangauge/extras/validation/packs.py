@@ -28,7 +28,7 @@ from cangauge.extras.validation.recordings import (
     is_folder,
 )
 from cangauge.extras.validation.twin.injection import scaled_to_pack
-from cangauge.inference.rows import decimate
+from cangauge.identify.rows import decimate
 from cangauge.logs.log import Log
 from cangauge.logs.read import read_log
 from cangauge.model.coulomb_counting import counted_soc_pct

@@ -17,10 +17,10 @@ from cangauge._formatting import number
 from cangauge._typing import FloatArray
 from cangauge.estimation.cells import CellEstimator
 from cangauge.estimation.estimator import Estimator
-from cangauge.estimation.power import ENERGY_C_RATE, HORIZON_S, PackLimits, Power
+from cangauge.estimation.power import ENERGY_C_RATE, HORIZON_S, PackLimits
 from cangauge.logs.log import Log
 from cangauge.model.model_file import Model
-from cangauge.types import Sample
+from cangauge.types import Power, Sample
 
 OFFSET_AT_S: Final = 1200.0
 """When the estimated offset of the current sensor is read [s]."""
@@ -71,7 +71,7 @@ class Questions:
 
         def found(name: str) -> Question:
             return lambda estimator: Quantity(
-                name, estimator.filter.offset_a, estimator.filter.offset_std_a, offset_a
+                name, estimator.health.offset_a, estimator.health.offset_std_a, offset_a
             )
 
         row = int(np.searchsorted(self._since_s, OFFSET_AT_S))

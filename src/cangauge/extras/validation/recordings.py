@@ -29,7 +29,7 @@ from cangauge.extras.validation.twin.injection import (
 from cangauge.extras.validation.twin.pack import Pack
 from cangauge.extras.validation.twin.recording import rms
 from cangauge.identify.fit import Identification, fit
-from cangauge.inference.rows import FitOptions, fit_rows
+from cangauge.identify.rows import fit_rows
 from cangauge.logs.log import Log
 from cangauge.logs.read import read_log
 from cangauge.model.coulomb_counting import capacity_from_reference
@@ -304,10 +304,8 @@ def model_rmse_v(known: Identification, logs: Sequence[Log]) -> float:
 
     The SoC is counted from the initial SoC of each log.
     """
-    model = known.voltage_model
-    options = FitOptions.of_model(known.model)
-    errors = [
-        rows.voltage_v - model.voltage(rows.soc_pct, rows.temperature_c, rows.delayed_current_a)
-        for rows in (fit_rows(log, options) for log in logs)
-    ]
+    errors = []
+    for log in logs:
+        rows = fit_rows(log, known.model.capacity_ah)
+        errors.append(known.model.predict(log).residual_v[rows.at])
     return rms(np.concatenate(errors))

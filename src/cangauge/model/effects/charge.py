@@ -19,7 +19,6 @@ class Capacity(Effect):
     signature = "OCV′·(Ah since the start): a slope over charge, steep in the knee near empty"
     equation = "S = S₀ − 100·∫I dt / (C·(1 + x))"
     source = "Plett, Battery Management Systems vol. II, Artech House 2015, ch. 4"
-    secant_points = (-0.6, -0.2, 0.2, 0.5)
     separated_by = (
         "a discharge from full to the knee at steady temperature; from current_offset by"
         " alternating driving and resting, from current_gain by the drop over the resistance"
@@ -44,7 +43,6 @@ class InitialSoc(Effect):
     signature = "OCV′(S): larger where the OCV is steep, at any current and time"
     equation = "S₀ = S₀_assumed + x"
     source = "definition"
-    secant_points = (-0.7, -0.3, 0.3, 0.7)
     separated_by = (
         "a long rest before the start (the first voltage is then the OCV), or a log that reaches"
         " the steep ends of the OCV, where it grows and voltage_offset does not"

@@ -8,21 +8,20 @@ from typing import ClassVar, Final
 
 import numpy as np
 
-from cangauge._arithmetic import total
 from cangauge._typing import FloatArray
-from cangauge.model.coulomb_counting import BRIDGE_S
+from cangauge.logs.gaps import BRIDGE_S
 from cangauge.model.effects.base import (
     LAG,
     WITHIN_C,
     CoreForm,
     Effect,
-    OnlineEffect,
-    OnlineInteriorEffect,
+    Load,
+    Memories,
     Pack,
-    PackState,
     Parameter,
     Values,
 )
+from cangauge.model.first_order import Lag, Memory, decaying_sum
 from cangauge.model.voltage_model import VoltageModel
 
 
@@ -34,8 +33,6 @@ class Hysteresis(Effect):
 
     id = "hysteresis"
     family = "equilibrium"
-    is_pointwise: ClassVar[bool] = True
-    is_structure: ClassVar[bool] = True
     parameters = (
         Parameter("half_width_v", "V", 0.0, 0.01, scale="voltage"),
         Parameter("travel_pct", "%", 0.5, 12.0, neutral=None, grid=(1.0, 2.0, 4.0, 7.0, 11.0)),
@@ -50,51 +47,49 @@ class Hysteresis(Effect):
         " slow_diffusion decays, this persists"
     )
 
-    def extra_voltage(
-        self, state: PackState, values: Values, model: VoltageModel, pack: Pack
+    def memory(self, values: Values, pack: Pack) -> Memories:
+        return (_Turned(36.0 * pack.capacity_ah * values["travel_pct"]),)
+
+    def drive(
+        self, load: Load, values: Values, model: VoltageModel, pack: Pack, memory: Memories
     ) -> FloatArray:
+        return np.asarray(values["half_width_v"] * memory[0].step(load.time_s, load.current_a))
+
+    def core_form(self, values: Values, model: VoltageModel, pack: Pack) -> CoreForm:
         travel_as = 36.0 * pack.capacity_ah * values["travel_pct"]
-        return values["half_width_v"] * state.history.turned(travel_as)
-
-    def online(self, values: Values, model: VoltageModel, pack: Pack) -> OnlineEffect:
-        return _HysteresisOnline(
-            values["half_width_v"], 36.0 * pack.capacity_ah * values["travel_pct"]
-        )
+        return CoreForm("hysteresis", (values["half_width_v"], travel_as))
 
 
-class _HysteresisOnline(OnlineEffect):
-    def __init__(self, half_width_v: float, travel_as: float) -> None:
-        self._half_width_v = half_width_v
+class _Turned(Memory):
+    """Memory of the current's sign over a charge [As]; 0 at the start, unchanged over gaps."""
+
+    def __init__(self, travel_as: float) -> None:
         self._travel_as = travel_as
-        self._last: tuple[float, float] | None = None
-        self._state = 0.0
+        self._last: tuple[float, float, float] | None = None
 
-    def core_form(self) -> CoreForm:
-        return CoreForm("hysteresis", (self._half_width_v, self._travel_as))
-
-    def advance(self, time_s: float, current_a: float, temperature_c: float, drop_v: float) -> None:
-        if self._last is not None and time_s - self._last[0] <= BRIDGE_S:
-            mean = 0.5 * (current_a + self._last[1])
-            decay = abs(mean) * (time_s - self._last[0]) / self._travel_as
-            toward = math.copysign(1.0, mean)
-            self._state = math.exp(-decay) * self._state + toward * math.expm1(-decay)
-        self._last = (time_s, current_a)
-
-    def extra_voltage(self, soc_pct: float) -> float:
-        return self._half_width_v * self._state
+    def step(self, time_s: FloatArray, current_a: FloatArray) -> FloatArray:
+        """Advance to samples of shape (n,) and return h there."""
+        times, currents, first, skip = time_s, current_a, 0.0, 0
+        if self._last is not None:
+            latest_s, latest_a, first = self._last
+            times, currents, skip = np.r_[latest_s, time_s], np.r_[latest_a, current_a], 1
+        seconds = np.diff(times)
+        mean = 0.5 * (currents[1:] + currents[:-1])
+        decay = np.where(seconds > BRIDGE_S, 0.0, np.abs(mean) * seconds / self._travel_as)
+        turned = decaying_sum(decay, np.sign(mean) * np.expm1(-decay), first)[skip:]
+        self._last = (float(times[-1]), float(currents[-1]), float(turned[-1]))
+        return turned
 
     def state(self) -> list[float]:
-        return [] if self._last is None else [*self._last, self._state]
+        return [] if self._last is None else [*self._last]
 
-    def restore(self, state: Sequence[float], latest_s: float) -> None:
+    def restore(self, state: Sequence[float]) -> None:
         self._last = None
         if state:
-            time_s, current_a, self._state = state
-            self._last = (time_s, current_a)
-            if not (all(map(math.isfinite, state)) and abs(self._state) <= 1.0):
+            time_s, current_a, turned = state
+            if not (all(map(math.isfinite, state)) and abs(turned) <= 1.0):
                 raise ValueError("the state lies within ±1")
-            if not time_s <= latest_s:
-                raise ValueError("later than the latest sample")
+            self._last = (time_s, current_a, turned)
 
 
 class EntropicCoefficient(Effect):
@@ -106,8 +101,6 @@ class EntropicCoefficient(Effect):
 
     id = "entropic_coefficient"
     family = "equilibrium"
-    is_pointwise: ClassVar[bool] = True
-    is_structure: ClassVar[bool] = True
     parameters = (
         Parameter("level_v_per_k", "V/K", -1.1e-4, 1.1e-4, scale="voltage"),
         Parameter("slope_v_per_k", "V/K", -1.1e-4, 1.1e-4, scale="voltage"),
@@ -125,42 +118,26 @@ class EntropicCoefficient(Effect):
         " any other change of the OCV with SoC"
     )
 
-    def extra_voltage(
-        self, state: PackState, values: Values, model: VoltageModel, pack: Pack
+    def memory(self, values: Values, pack: Pack) -> Memories:
+        return (Lag(values["lag_s"]),)
+
+    def drive(
+        self, load: Load, values: Values, model: VoltageModel, pack: Pack, memory: Memories
     ) -> FloatArray:
-        warmer = np.clip(state.lagged_temperature_c(values["lag_s"]), *WITHIN_C) - model.t_ref_c
-        x = np.clip(state.soc_pct, 0.0, 100.0) / 50.0 - 1.0
+        interior_c = memory[0].step(load.time_s, load.temperature_c)
+        return np.asarray(np.clip(interior_c, *WITHIN_C) - model.t_ref_c)
+
+    def over_soc(
+        self, soc_pct: FloatArray, values: Values, model: VoltageModel, pack: Pack
+    ) -> FloatArray:
+        x = np.clip(soc_pct, 0.0, 100.0) / 50.0 - 1.0
         shape = values["level_v_per_k"] + values["slope_v_per_k"] * x
-        shape += values["curve_v_per_k"] * (1.5 * x * x - 0.5)
-        return np.asarray(warmer * shape)
+        return np.asarray(shape + values["curve_v_per_k"] * (1.5 * x * x - 0.5))
 
-    def online(self, values: Values, model: VoltageModel, pack: Pack) -> OnlineEffect:
-        return _EntropicCoefficientOnline(values, model.t_ref_c)
-
-
-class _EntropicCoefficientOnline(OnlineInteriorEffect):
-    uses_soc = True
-
-    def __init__(self, values: Values, t_ref_c: float) -> None:
-        super().__init__(values["lag_s"])
-        self._level = values["level_v_per_k"]
-        self._slope = values["slope_v_per_k"]
-        self._curve = values["curve_v_per_k"]
-        self._t_ref_c = t_ref_c
-        self._warmer = 0.0
-
-    def core_form(self) -> CoreForm:
-        values = (self._level, self._slope, self._curve, self._t_ref_c)
-        return CoreForm("entropic", values, (self.interior.tau_s,))
-
-    def advance(self, time_s: float, current_a: float, temperature_c: float, drop_v: float) -> None:
-        low, high = WITHIN_C
-        interior_c = self.interior.step(time_s, temperature_c)
-        self._warmer = min(max(interior_c, low), high) - self._t_ref_c
-
-    def extra_voltage(self, soc_pct: float) -> float:
-        x = min(max(soc_pct, 0.0), 100.0) / 50.0 - 1.0
-        return self._warmer * (self._level + self._slope * x + self._curve * (1.5 * x * x - 0.5))
+    def core_form(self, values: Values, model: VoltageModel, pack: Pack) -> CoreForm:
+        names = ("level_v_per_k", "slope_v_per_k", "curve_v_per_k")
+        constants = (*(values[name] for name in names), model.t_ref_c)
+        return CoreForm("entropic", constants, (values["lag_s"],))
 
 
 CENTRES_PCT: Final = (3.0, 8.0, 14.0, 22.0, 32.0, 43.0, 54.0, 65.0, 76.0, 86.0, 94.0)
@@ -177,8 +154,6 @@ class OcvShape(Effect):
 
     id = "ocv_shape"
     family = "equilibrium"
-    is_pointwise: ClassVar[bool] = True
-    is_structure: ClassVar[bool] = True
     is_cause: ClassVar[bool] = False
     parameters = tuple(
         Parameter(f"at_{centre:.0f}_pct_v", "V", -0.01, 0.01, scale="voltage")
@@ -189,37 +164,20 @@ class OcvShape(Effect):
     source = "radial basis functions, Broomhead, Lowe, Complex Systems 2 (1988) 321"
     separated_by = "other logs over the same SoC: what all of them share belongs to the chemistry"
 
-    def extra_voltage(
-        self, state: PackState, values: Values, model: VoltageModel, pack: Pack
+    def drive(
+        self, load: Load, values: Values, model: VoltageModel, pack: Pack, memory: Memories
     ) -> FloatArray:
-        soc = np.clip(state.soc_pct, 0.0, 100.0)
-        volts = np.zeros_like(soc)
-        for parameter, centre, width in zip(self.parameters, CENTRES_PCT, WIDTHS_PCT, strict=True):
-            height = values[parameter.name]
-            if height:
-                volts += height * np.exp(-0.5 * ((soc - centre) / width) ** 2)
-        return volts
+        return np.ones_like(load.current_a)
 
-    def online(self, values: Values, model: VoltageModel, pack: Pack) -> OnlineEffect:
-        return _OcvShapeOnline([values[parameter.name] for parameter in self.parameters])
+    def over_soc(
+        self, soc_pct: FloatArray, values: Values, model: VoltageModel, pack: Pack
+    ) -> FloatArray:
+        away = (np.clip(soc_pct, 0.0, 100.0)[:, None] - CENTRES_PCT) / WIDTHS_PCT
+        heights = np.array([values[parameter.name] for parameter in self.parameters])
+        return np.asarray(np.exp(-0.5 * away * away) @ heights)
 
-
-class _OcvShapeOnline(OnlineEffect):
-    uses_soc = True
-
-    def __init__(self, heights_v: list[float]) -> None:
-        self._bumps = tuple(zip(heights_v, CENTRES_PCT, WIDTHS_PCT, strict=True))
-
-    def core_form(self) -> CoreForm:
-        return CoreForm("ocv_shape", tuple(height for height, _, _ in self._bumps))
-
-    def extra_voltage(self, soc_pct: float) -> float:
-        soc = min(max(soc_pct, 0.0), 100.0)
-        return total(
-            height * math.exp(-0.5 * away * away)
-            for height, centre, width in self._bumps
-            for away in ((soc - centre) / width,)
-        )
+    def core_form(self, values: Values, model: VoltageModel, pack: Pack) -> CoreForm:
+        return CoreForm("ocv_shape", tuple(values[item.name] for item in self.parameters))
 
 
 class WeakCell(Effect):
@@ -231,7 +189,6 @@ class WeakCell(Effect):
 
     id = "weak_cell"
     family = "imbalance"
-    is_pointwise: ClassVar[bool] = True
     parameters = (
         Parameter("fraction", "1", 0.0, 0.15),
         Parameter(
@@ -251,30 +208,18 @@ class WeakCell(Effect):
         " weak cells a small one; or the cells' own voltages"
     )
 
-    def extra_voltage(
-        self, state: PackState, values: Values, model: VoltageModel, pack: Pack
+    def drive(
+        self, load: Load, values: Values, model: VoltageModel, pack: Pack, memory: Memories
+    ) -> FloatArray:
+        return np.full_like(load.current_a, values["fraction"])
+
+    def over_soc(
+        self, soc_pct: FloatArray, values: Values, model: VoltageModel, pack: Pack
     ) -> FloatArray:
         ahead = 1.0 / (1.0 - values["deficit_pct"] / 100.0)
-        weak = 100.0 - (100.0 - state.soc_pct) * ahead
-        lack = model.pseudo_ocv(weak) - model.pseudo_ocv(state.soc_pct)
-        return np.asarray(values["fraction"] * lack)
+        weak = 100.0 - (100.0 - soc_pct) * ahead
+        return model.pseudo_ocv(weak) - model.pseudo_ocv(soc_pct)
 
-    def online(self, values: Values, model: VoltageModel, pack: Pack) -> OnlineEffect:
-        return _WeakCellOnline(values["fraction"], values["deficit_pct"], model)
-
-
-class _WeakCellOnline(OnlineEffect):
-    uses_soc = True
-
-    def __init__(self, fraction: float, deficit_pct: float, model: VoltageModel) -> None:
-        self._fraction = fraction
-        self._ahead = 1.0 / (1.0 - deficit_pct / 100.0)
-        self._model = model
-
-    def core_form(self) -> CoreForm:
-        return CoreForm("weak_cell", (self._fraction, self._ahead))
-
-    def extra_voltage(self, soc_pct: float) -> float:
-        weak = 100.0 - (100.0 - soc_pct) * self._ahead
-        lack = self._model.pseudo_ocv_at(weak)[0] - self._model.pseudo_ocv_at(soc_pct)[0]
-        return self._fraction * lack
+    def core_form(self, values: Values, model: VoltageModel, pack: Pack) -> CoreForm:
+        ahead = 1.0 / (1.0 - values["deficit_pct"] / 100.0)
+        return CoreForm("weak_cell", (values["fraction"], ahead))

@@ -178,8 +178,6 @@ class Candidate:
     """Physical bounds of the amplitudes, relative to `neutral`, shape (k, 2)."""
     steps: FloatArray
     """Finite-difference step of each amplitude, shape (k,)."""
-    is_for_fit: bool = True
-    """Whether a fit tries it too (else see `Parameter.diagnosis_values`)."""
 
     def values(self, amplitude: FloatArray) -> dict[str, float]:
         """Return the effect's parameters for amplitudes relative to `neutral`, shape (k,)."""
@@ -187,9 +185,7 @@ class Candidate:
         return {**dict(zip(self.amplitudes, total, strict=True)), **self.shape}
 
 
-def candidates(
-    effects: Sequence[Effect], pack: Pack, time_s: FloatArray, *, for_diagnosis: bool = False
-) -> list[Candidate]:
+def candidates(effects: Sequence[Effect], pack: Pack, time_s: FloatArray) -> list[Candidate]:
     """Return every effect with every combination of trial values of its shapes.
 
     Parameters
@@ -198,8 +194,6 @@ def candidates(
     pack : Pack
     time_s : array
         Times of a log [s]; the k-th shape has the same meaning on every log of a group.
-    for_diagnosis : bool
-        Whether to include `Parameter.diagnosis_values`.
     """
     result = []
     for effect in effects:
@@ -208,33 +202,12 @@ def candidates(
         names = tuple(parameter.name for parameter in amplitudes)
         centre = np.array([neutral[name] for name in names])
         bounds = np.array([parameter.bounds(pack) for parameter in amplitudes]) - centre[:, None]
+        small = STEP * (bounds[:, 1] - bounds[:, 0])
+        steps = np.where(small > bounds[:, 1], -small, small)
         shapes = effect.shapes if effect.amplitudes else ()
-        grids = [
-            (
-                *effect.trials(parameter, pack, time_s),
-                *(parameter.diagnosis_values if for_diagnosis else ()),
-            )
-            for parameter in shapes
-        ]
-        constants = effect.trial_constants(pack) if for_diagnosis else [effect.constants(pack)]
-        for constant, choice in itertools.product(constants, itertools.product(*grids)):
-            shape = dict(zip((p.name for p in shapes), choice, strict=True)) | constant
-            is_for_fit = constant == constants[0] and not any(
-                value in parameter.diagnosis_values
-                for parameter, value in zip(shapes, choice, strict=True)
-            )
-            result += [
-                Candidate(effect, shape, names, centre, bounds, steps, is_for_fit)
-                for steps in _steps(effect, bounds)
-            ]
+        grids = [effect.trials(parameter, pack, time_s) for parameter in shapes]
+        for choice in itertools.product(*grids):
+            shape = dict(zip((item.name for item in shapes), choice, strict=True))
+            shape |= effect.constants(pack)
+            result.append(Candidate(effect, shape, names, centre, bounds, steps))
     return result
-
-
-def _steps(effect: Effect, bounds: FloatArray) -> list[FloatArray]:
-    """Return the finite-difference steps of the amplitudes: a small one, then the secants."""
-    small = STEP * (bounds[:, 1] - bounds[:, 0])
-    widest = float(np.abs(bounds).max())
-    return [
-        np.where(small > bounds[:, 1], -small, small),
-        *(np.array([fraction * widest]) for fraction in effect.secant_points),
-    ]

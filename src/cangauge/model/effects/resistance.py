@@ -15,42 +15,27 @@ from cangauge.model.effects.base import (
     WITHIN_C,
     CoreForm,
     Effect,
-    OnlineEffect,
-    OnlineInteriorEffect,
+    Load,
+    Memories,
     Pack,
-    PackState,
     Parameter,
     Values,
-    scaled_drop_at,
 )
+from cangauge.model.first_order import Lag, Memory
 from cangauge.model.voltage_model import VoltageModel
-
-ZERO_C_IN_K: Final = 273.15
-COLDEST_C, HOTTEST_C = WITHIN_C
 
 REFERENCE_C: Final = 25.0
 """Temperature at which Arrhenius factors are 1 [°C]."""
 
 
-def _inverse_k(temperature_c: FloatArray) -> FloatArray:
-    """Return 1/T [1/K], shape (n,)."""
-    return np.asarray(1.0 / (np.clip(temperature_c, COLDEST_C, HOTTEST_C) + ZERO_C_IN_K))
-
-
-def _inverse_k_at(temperature_c: float) -> float:
-    """Return 1/T [1/K] of one temperature."""
-    return 1.0 / (min(max(temperature_c, COLDEST_C), HOTTEST_C) + ZERO_C_IN_K)
+def inverse_k(temperature_c: FloatArray | float) -> FloatArray:
+    """Return 1/T [1/K]."""
+    return np.asarray(1.0 / (np.clip(temperature_c, *WITHIN_C) + 273.15))
 
 
 def arrhenius(temperature_c: FloatArray, activation_k: float) -> FloatArray:
     """Return exp(B·(1/T − 1/T₂₅)), shape (n,): greater than 1 below 25 °C."""
-    return np.exp(activation_k * (_inverse_k(temperature_c) - 1.0 / (REFERENCE_C + ZERO_C_IN_K)))
-
-
-def arrhenius_at(temperature_c: float, activation_k: float) -> float:
-    """Return `arrhenius` of one temperature."""
-    inverse = _inverse_k_at(temperature_c)
-    return math.exp(activation_k * (inverse - 1.0 / (REFERENCE_C + ZERO_C_IN_K)))
+    return np.asarray(np.exp(activation_k * (inverse_k(temperature_c) - inverse_k(REFERENCE_C))))
 
 
 class ResistanceTemperature(Effect):
@@ -62,18 +47,14 @@ class ResistanceTemperature(Effect):
 
     id = "resistance_temperature"
     family = "resistance"
-    is_pointwise: ClassVar[bool] = True
-    is_structure: ClassVar[bool] = True
+    scales_drop: ClassVar[bool] = True
     parameters = (
         Parameter("share", "1", 0.0, 3.0),
         Parameter("activation_k", "K", 100.0, 8000.0, neutral=None, grid=(1000.0, 2500.0, 4500.0)),
         DELAYED,
-        Parameter(
-            "reference_c", "°C", *WITHIN_C, neutral=None, from_pack="temperature_c",
-            diagnosis_values=(-15.0, 15.0),
-        ),
+        Parameter("reference_c", "°C", *WITHIN_C, neutral=None, from_pack="temperature_c"),
         LAG,
-    )  # fmt: skip
+    )
     signature = "the drop over the resistance, growing with (T₀ − T)"
     equation = (
         "ΔU = a·ΣRj·I(t − dj)·(exp(B·(1/T − 1/T₀)) − 1), T₀ = reference_c;"
@@ -85,38 +66,26 @@ class ResistanceTemperature(Effect):
         " together it is not separable from resistance_soc"
     )
 
-    def extra_voltage(
-        self, state: PackState, values: Values, model: VoltageModel, pack: Pack
+    def memory(self, values: Values, pack: Pack) -> Memories:
+        return (Lag(values["lag_s"]),)
+
+    def drive(
+        self, load: Load, values: Values, model: VoltageModel, pack: Pack, memory: Memories
     ) -> FloatArray:
-        drop_v = state.scaled_drop_v(values["delayed"], pack)
-        colder = _inverse_k(state.lagged_temperature_c(values["lag_s"]))
-        colder = colder - _inverse_k_at(values["reference_c"])
-        return values["share"] * drop_v * np.expm1(values["activation_k"] * colder)
+        interior_c = memory[0].step(load.time_s, load.temperature_c)
+        colder = inverse_k(interior_c) - inverse_k(values["reference_c"])
+        scaled_v = load.scaled_drop_v(values["delayed"], pack)
+        return np.asarray(values["share"] * scaled_v * np.expm1(values["activation_k"] * colder))
 
-    def online(self, values: Values, model: VoltageModel, pack: Pack) -> OnlineEffect:
-        return _ResistanceTemperatureOnline(values, pack.resistance_ohm)
-
-
-class _ResistanceTemperatureOnline(OnlineInteriorEffect):
-    def __init__(self, values: Values, resistance_ohm: float) -> None:
-        super().__init__(values["lag_s"])
-        self._share = values["share"]
-        self._activation_k = values["activation_k"]
-        self._delayed = values["delayed"]
-        self._reference_per_k = _inverse_k_at(values["reference_c"])
-        self._resistance_ohm = resistance_ohm
-
-    def core_form(self) -> CoreForm:
-        values = (
-            self._share, self._activation_k, self._delayed, self._reference_per_k,
-            self._resistance_ohm,
-        )  # fmt: skip
-        return CoreForm("resistance_temperature", values, (self.interior.tau_s,))
-
-    def advance(self, time_s: float, current_a: float, temperature_c: float, drop_v: float) -> None:
-        scaled_v = scaled_drop_at(drop_v, current_a, self._delayed, self._resistance_ohm)
-        colder = _inverse_k_at(self.interior.step(time_s, temperature_c)) - self._reference_per_k
-        self.volts = self._share * scaled_v * math.expm1(self._activation_k * colder)
+    def core_form(self, values: Values, model: VoltageModel, pack: Pack) -> CoreForm:
+        constants = (
+            values["share"],
+            values["activation_k"],
+            values["delayed"],
+            float(inverse_k(values["reference_c"])),
+            pack.resistance_ohm,
+        )
+        return CoreForm("resistance_temperature", constants, (values["lag_s"],))
 
 
 class ResistanceSoc(Effect):
@@ -124,8 +93,7 @@ class ResistanceSoc(Effect):
 
     id = "resistance_soc"
     family = "resistance"
-    is_pointwise: ClassVar[bool] = True
-    is_structure: ClassVar[bool] = True
+    scales_drop: ClassVar[bool] = True
     parameters = (
         Parameter("at_empty", "1", -0.4, 3.0),
         Parameter("at_full", "1", -0.4, 1.5),
@@ -140,43 +108,22 @@ class ResistanceSoc(Effect):
         " and it is not separable from resistance_temperature"
     )
 
-    def extra_voltage(
-        self, state: PackState, values: Values, model: VoltageModel, pack: Pack
+    def drive(
+        self, load: Load, values: Values, model: VoltageModel, pack: Pack, memory: Memories
     ) -> FloatArray:
-        soc, width = np.clip(state.soc_pct, 0.0, 100.0), values["width_pct"]
+        return load.scaled_drop_v(values["delayed"], pack)
+
+    def over_soc(
+        self, soc_pct: FloatArray, values: Values, model: VoltageModel, pack: Pack
+    ) -> FloatArray:
+        soc, width = np.clip(soc_pct, 0.0, 100.0), values["width_pct"]
         rise = values["at_empty"] * np.exp(-soc / width)
-        rise += values["at_full"] * np.exp((soc - 100.0) / width)
-        return np.asarray(state.scaled_drop_v(values["delayed"], pack) * rise)
+        return np.asarray(rise + values["at_full"] * np.exp((soc - 100.0) / width))
 
-    def online(self, values: Values, model: VoltageModel, pack: Pack) -> OnlineEffect:
-        return _ResistanceSocOnline(values, pack.resistance_ohm)
-
-
-class _ResistanceSocOnline(OnlineEffect):
-    uses_soc = True
-
-    def __init__(self, values: Values, resistance_ohm: float) -> None:
-        self._at_empty = values["at_empty"]
-        self._at_full = values["at_full"]
-        self._width_pct = values["width_pct"]
-        self._delayed = values["delayed"]
-        self._resistance_ohm = resistance_ohm
-        self._drop_v = 0.0
-
-    def core_form(self) -> CoreForm:
-        values = (
-            self._at_empty, self._at_full, self._width_pct, self._delayed, self._resistance_ohm,
-        )  # fmt: skip
-        return CoreForm("resistance_soc", values)
-
-    def advance(self, time_s: float, current_a: float, temperature_c: float, drop_v: float) -> None:
-        self._drop_v = scaled_drop_at(drop_v, current_a, self._delayed, self._resistance_ohm)
-
-    def extra_voltage(self, soc_pct: float) -> float:
-        soc = min(max(soc_pct, 0.0), 100.0)
-        rise = self._at_empty * math.exp(-soc / self._width_pct)
-        rise += self._at_full * math.exp((soc - 100.0) / self._width_pct)
-        return self._drop_v * rise
+    def core_form(self, values: Values, model: VoltageModel, pack: Pack) -> CoreForm:
+        names = ("at_empty", "at_full", "width_pct", "delayed")
+        constants = (*(values[name] for name in names), pack.resistance_ohm)
+        return CoreForm("resistance_soc", constants)
 
 
 class ResistanceAsymmetry(Effect):
@@ -184,8 +131,6 @@ class ResistanceAsymmetry(Effect):
 
     id = "resistance_asymmetry"
     family = "resistance"
-    is_pointwise: ClassVar[bool] = True
-    is_structure: ClassVar[bool] = True
     parameters = (Parameter("charging_ohm", "ohm", -0.6, 1.5, scale="resistance"),)
     signature = "min(I, 0): only while charging, in step with the current"
     equation = "ΔU = −r·min(I, 0)"
@@ -195,24 +140,13 @@ class ResistanceAsymmetry(Effect):
         " of the current, equally in both directions"
     )
 
-    def extra_voltage(
-        self, state: PackState, values: Values, model: VoltageModel, pack: Pack
+    def drive(
+        self, load: Load, values: Values, model: VoltageModel, pack: Pack, memory: Memories
     ) -> FloatArray:
-        return np.asarray(-values["charging_ohm"] * np.minimum(state.current_a, 0.0))
+        return np.asarray(-values["charging_ohm"] * np.minimum(load.current_a, 0.0))
 
-    def online(self, values: Values, model: VoltageModel, pack: Pack) -> OnlineEffect:
-        return _ResistanceAsymmetryOnline(values["charging_ohm"])
-
-
-class _ResistanceAsymmetryOnline(OnlineEffect):
-    def __init__(self, charging_ohm: float) -> None:
-        self._charging_ohm = charging_ohm
-
-    def core_form(self) -> CoreForm:
-        return CoreForm("resistance_asymmetry", (self._charging_ohm,))
-
-    def advance(self, time_s: float, current_a: float, temperature_c: float, drop_v: float) -> None:
-        self.volts = -self._charging_ohm * min(current_a, 0.0)
+    def core_form(self, values: Values, model: VoltageModel, pack: Pack) -> CoreForm:
+        return CoreForm("resistance_asymmetry", (values["charging_ohm"],))
 
 
 class ResistanceStep(Effect):
@@ -246,37 +180,37 @@ class ResistanceStep(Effect):
         duration = float(time_s[-1] - time_s[0])
         return tuple(duration * part / 20.0 for part in range(1, 20))
 
-    def extra_voltage(
-        self, state: PackState, values: Values, model: VoltageModel, pack: Pack
+    def memory(self, values: Values, pack: Pack) -> Memories:
+        return (_First(),)
+
+    def drive(
+        self, load: Load, values: Values, model: VoltageModel, pack: Pack, memory: Memories
     ) -> FloatArray:
-        after = state.time_s - state.time_s[0] >= values["start_s"]
-        return np.where(after, -values["step_ohm"] * state.current_a, 0.0)
+        after = load.time_s - memory[0].of(load.time_s) >= values["start_s"]
+        return np.where(after, -values["step_ohm"] * load.current_a, 0.0)
 
-    def online(self, values: Values, model: VoltageModel, pack: Pack) -> OnlineEffect:
-        return _ResistanceStepOnline(values["step_ohm"], values["start_s"])
+    def core_form(self, values: Values, model: VoltageModel, pack: Pack) -> CoreForm:
+        return CoreForm("resistance_step", (values["step_ohm"], values["start_s"]))
 
 
-class _ResistanceStepOnline(OnlineEffect):
-    def __init__(self, step_ohm: float, start_s: float) -> None:
-        self._step_ohm = step_ohm
-        self._start_s = start_s
+class _First(Memory):
+    """Time of the first sample."""
+
+    def __init__(self) -> None:
         self._first_s: float | None = None
 
-    def core_form(self) -> CoreForm:
-        return CoreForm("resistance_step", (self._step_ohm, self._start_s))
-
-    def advance(self, time_s: float, current_a: float, temperature_c: float, drop_v: float) -> None:
+    def of(self, time_s: FloatArray) -> float:
+        """Return the time of the first sample ever [s], given the times of the next ones."""
         if self._first_s is None:
-            self._first_s = time_s
-        after = time_s - self._first_s >= self._start_s
-        self.volts = -self._step_ohm * current_a if after else 0.0
+            self._first_s = float(time_s[0])
+        return self._first_s
 
     def state(self) -> list[float]:
         return [] if self._first_s is None else [self._first_s]
 
-    def restore(self, state: Sequence[float], latest_s: float) -> None:
+    def restore(self, state: Sequence[float]) -> None:
         self._first_s = None
         if state:
             (self._first_s,) = state
-            if not self._first_s <= latest_s:
-                raise ValueError("later than the latest sample")
+            if not math.isfinite(self._first_s):
+                raise ValueError("not finite")

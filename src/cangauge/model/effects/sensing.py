@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import replace
 from typing import ClassVar, Literal
 
 from cangauge.model.effects.base import (
     CoreForm,
     Effect,
-    OnlineEffect,
+    Memories,
     Pack,
     Parameter,
-    Reading,
     Signals,
     Values,
 )
@@ -30,34 +27,14 @@ class _LinearSensor(Effect):
         value = values[parameter.name]
         return (0.0, 1.0 + value / 100.0) if parameter.unit == "%" else (value, 1.0)
 
-    def correct(self, signals: Signals, values: Values, pack: Pack) -> Signals:
+    def correct(self, signals: Signals, values: Values, pack: Pack, memory: Memories) -> Signals:
         offset, gain = self.offset_and_gain(values)
-        if self.signal == "current_a":
-            return replace(signals, current_a=(signals.current_a - offset) / gain)
-        return replace(signals, voltage_v=(signals.voltage_v - offset) / gain)
+        true = (getattr(signals, self.signal) - offset) / gain
+        return signals._replace(**{self.signal: true})
 
-    def online(self, values: Values, model: VoltageModel, pack: Pack) -> OnlineEffect:
-        offset, gain = self.offset_and_gain(values)
-        return _OnlineLinear(offset, gain, is_current=self.signal == "current_a")
-
-
-class _OnlineLinear(OnlineEffect):
-    def __init__(self, offset: float, gain: float, *, is_current: bool) -> None:
-        self._offset = offset
-        self._gain = gain
-        self._is_current = is_current
-
-    def core_form(self) -> CoreForm:
-        kind = "current_sensor" if self._is_current else "voltage_sensor"
-        return CoreForm(kind, (self._offset, self._gain))
-
-    def correct(self, reading: Reading) -> Sequence[Reading]:
-        time_s, current_a, voltage_v, temperature_c = reading
-        if self._is_current:
-            current_a = (current_a - self._offset) / self._gain
-        else:
-            voltage_v = (voltage_v - self._offset) / self._gain
-        return (Reading(time_s, current_a, voltage_v, temperature_c),)
+    def core_form(self, values: Values, model: VoltageModel, pack: Pack) -> CoreForm:
+        kind = "current_sensor" if self.signal == "current_a" else "voltage_sensor"
+        return CoreForm(kind, self.offset_and_gain(values))
 
 
 class CurrentOffset(_LinearSensor):
@@ -70,7 +47,6 @@ class CurrentOffset(_LinearSensor):
     signature = "a constant R·b, and a slope over time as the count drifts: OCV′·b·t/C"
     equation = "I = I_measured − b"
     source = "zero error, JCGM 200:2012 (VIM)"
-    secant_points = (-0.3, 0.3)
     separated_by = (
         "a long rest with the bus awake: the count drifts while no current flows. Not separable"
         " from a load that bypasses the sensor; from capacity by alternating driving and resting"

@@ -2,26 +2,23 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Sequence
-from dataclasses import replace
 from typing import ClassVar
 
+import numpy as np
+
 from cangauge._typing import FloatArray
-from cangauge.model.coulomb_counting import BRIDGE_S
+from cangauge.logs.gaps import BRIDGE_S
 from cangauge.model.effects.base import (
     CoreForm,
     Effect,
-    OnlineEffect,
-    OnlineInteriorEffect,
+    Load,
+    Memories,
     Pack,
-    PackState,
     Parameter,
-    Reading,
     Signals,
     Values,
 )
-from cangauge.model.effects.first_order import LowPass
+from cangauge.model.first_order import Lag
 from cangauge.model.voltage_model import VoltageModel
 
 SMOOTHING_S = 200.0
@@ -35,40 +32,23 @@ class TemperatureLag(Effect):
 
     id = "temperature_lag"
     family = "thermal"
-    is_structure: ClassVar[bool] = True
     parameters = (Parameter("tau_s", "s", 0.0, 2000.0),)
     signature = "kt·τ·dT/dt: while the pack warms or cools, zero at constant temperature"
     equation = "T = T_measured + τ·dT_measured/dt, the derivative smoothed over 200 s"
     source = "first-order response of a sensor; Michalski et al., Temperature Measurement, 2001"
     separated_by = "warming or cooling from outside without current: core_temperature needs current"
 
-    def correct(self, signals: Signals, values: Values, pack: Pack) -> Signals:
+    def memory(self, values: Values, pack: Pack) -> Memories:
+        return (Lag(SMOOTHING_S),)
+
+    def correct(self, signals: Signals, values: Values, pack: Pack, memory: Memories) -> Signals:
         measured = signals.temperature_c
-        smooth = signals.history.lagged_c(measured, SMOOTHING_S)
+        smooth = memory[0].step(signals.time_s, measured)
         ahead = values["tau_s"] / SMOOTHING_S
-        return replace(signals, temperature_c=measured + ahead * (measured - smooth))
+        return signals._replace(temperature_c=measured + ahead * (measured - smooth))
 
-    def online(self, values: Values, model: VoltageModel, pack: Pack) -> OnlineEffect:
-        return _TemperatureLagOnline(values["tau_s"] / SMOOTHING_S)
-
-
-class _TemperatureLagOnline(OnlineEffect):
-    def __init__(self, ahead: float) -> None:
-        self._ahead = ahead
-        self._smooth = LowPass(SMOOTHING_S)
-        self.lags = (self._smooth,)
-
-    def core_form(self) -> CoreForm:
-        return CoreForm("temperature_lag", (self._ahead,), (SMOOTHING_S,))
-
-    def correct(self, reading: Reading) -> Sequence[Reading]:
-        time_s, current_a, voltage_v, measured = reading
-        if math.isnan(measured):
-            return (reading,)
-        smooth = self._smooth.step(time_s, measured)
-        return (
-            Reading(time_s, current_a, voltage_v, measured + self._ahead * (measured - smooth)),
-        )
+    def core_form(self, values: Values, model: VoltageModel, pack: Pack) -> CoreForm:
+        return CoreForm("temperature_lag", (values["tau_s"] / SMOOTHING_S,), (SMOOTHING_S,))
 
 
 class CoreTemperature(Effect):
@@ -82,7 +62,6 @@ class CoreTemperature(Effect):
 
     id = "core_temperature"
     family = "thermal"
-    is_structure: ClassVar[bool] = True
     parameters = (
         Parameter("rise_k", "K", 0.0, 25.0),
         Parameter("late", "1", 0.0, 1.0),
@@ -104,40 +83,22 @@ class CoreTemperature(Effect):
         " temperature_lag follows the sensor and not the current"
     )
 
-    def correct(self, signals: Signals, values: Values, pack: Pack) -> Signals:
-        above = signals.history.lagged_a2(values["tau_s"]) / pack.capacity_ah**2
-        outside = signals.temperature_c
-        core = outside + values["rise_k"] * above
+    def memory(self, values: Values, pack: Pack) -> Memories:
+        above = Lag(values["tau_s"], 0.0, rest_s=BRIDGE_S)
+        return (above, Lag(values["tau_s"])) if values["late"] else (above,)
+
+    def correct(self, signals: Signals, values: Values, pack: Pack, memory: Memories) -> Signals:
+        time_s, current_a, _, outside = signals
+        core = outside + values["rise_k"] * memory[0].step(
+            time_s, (current_a / pack.capacity_ah) ** 2
+        )
         if values["late"]:
-            followed = signals.history.lagged_c(outside, values["tau_s"])
-            core = core + values["late"] * (followed - outside)
-        return replace(signals, temperature_c=core)
+            core = core + values["late"] * (memory[1].step(time_s, outside) - outside)
+        return signals._replace(temperature_c=core)
 
-    def online(self, values: Values, model: VoltageModel, pack: Pack) -> OnlineEffect:
-        return _CoreTemperatureOnline(values, pack.capacity_ah)
-
-
-class _CoreTemperatureOnline(OnlineEffect):
-    def __init__(self, values: Values, capacity_ah: float) -> None:
-        self._rise_k = values["rise_k"]
-        self._late = values["late"]
-        self._capacity_ah = capacity_ah
-        self._above = LowPass(values["tau_s"], 0.0, rest_s=BRIDGE_S)
-        self._followed = LowPass(values["tau_s"])
-        self.lags = (self._above, self._followed) if self._late else (self._above,)
-
-    def core_form(self) -> CoreForm:
-        values = (self._rise_k, self._late, self._capacity_ah)
-        return CoreForm("core_temperature", values, (self._above.tau_s, self._followed.tau_s))
-
-    def correct(self, reading: Reading) -> Sequence[Reading]:
-        time_s, current_a, voltage_v, temperature_c = reading
-        rate = current_a / self._capacity_ah
-        above = self._above.step(time_s, rate * rate)
-        core = temperature_c + self._rise_k * above
-        if self._late and not math.isnan(temperature_c):
-            core += self._late * (self._followed.step(time_s, temperature_c) - temperature_c)
-        return (Reading(time_s, current_a, voltage_v, core),)
+    def core_form(self, values: Values, model: VoltageModel, pack: Pack) -> CoreForm:
+        constants = (values["rise_k"], values["late"], pack.capacity_ah)
+        return CoreForm("core_temperature", constants, (values["tau_s"],) * 2)
 
 
 class InnerTemperature(Effect):
@@ -149,8 +110,7 @@ class InnerTemperature(Effect):
 
     id = "inner_temperature"
     family = "thermal"
-    is_pointwise: ClassVar[bool] = True
-    is_structure: ClassVar[bool] = True
+    scales_drop: ClassVar[bool] = True
     is_cause: ClassVar[bool] = False
     parameters = (
         Parameter("voltage_v_per_k", "V/K", -5e-4, 5e-4, scale="voltage"),
@@ -162,26 +122,16 @@ class InnerTemperature(Effect):
     source = "two-state thermal model, Forgez et al., J. Power Sources 195 (2010) 2961"
     separated_by = "other logs that warm or cool: what all of them share belongs to the pack"
 
-    def extra_voltage(
-        self, state: PackState, values: Values, model: VoltageModel, pack: Pack
+    def memory(self, values: Values, pack: Pack) -> Memories:
+        return (Lag(values["tau_s"]),)
+
+    def drive(
+        self, load: Load, values: Values, model: VoltageModel, pack: Pack, memory: Memories
     ) -> FloatArray:
-        per_k = values["voltage_v_per_k"] + values["drop_per_k"] * state.drop_v
-        return per_k * (state.lagged_temperature_c(values["tau_s"]) - state.temperature_c)
+        per_k = values["voltage_v_per_k"] + values["drop_per_k"] * load.drop_v
+        away = memory[0].step(load.time_s, load.temperature_c) - load.temperature_c
+        return np.asarray(per_k * away)
 
-    def online(self, values: Values, model: VoltageModel, pack: Pack) -> OnlineEffect:
-        return _InnerTemperatureOnline(values)
-
-
-class _InnerTemperatureOnline(OnlineInteriorEffect):
-    def __init__(self, values: Values) -> None:
-        super().__init__(values["tau_s"])
-        self._voltage_v_per_k = values["voltage_v_per_k"]
-        self._drop_per_k = values["drop_per_k"]
-
-    def core_form(self) -> CoreForm:
-        values = (self._voltage_v_per_k, self._drop_per_k)
-        return CoreForm("inner_temperature", values, (self.interior.tau_s,))
-
-    def advance(self, time_s: float, current_a: float, temperature_c: float, drop_v: float) -> None:
-        away = self.interior.step(time_s, temperature_c) - temperature_c
-        self.volts = (self._voltage_v_per_k + self._drop_per_k * drop_v) * away
+    def core_form(self, values: Values, model: VoltageModel, pack: Pack) -> CoreForm:
+        constants = (values["voltage_v_per_k"], values["drop_per_k"])
+        return CoreForm("inner_temperature", constants, (values["tau_s"],))

@@ -1,0 +1,1 @@
+"""SoC errors on recorded packs, with models from few logs: see `python -m packs --help`."""

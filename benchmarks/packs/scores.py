@@ -1,0 +1,130 @@
+"""Errors of SoC estimates: scored log by log, pooled to rows, judged by targets.
+
+A log counts by its samples. Errors are of the SoC [%] against the log's reference.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import asdict, dataclass, field
+
+import numpy as np
+
+SETTLED_S = 300.0
+"""An unknown start is scored after five minutes [s]."""
+LATE_S = 600.0
+"""A wrong start is scored after ten minutes; a log is astray by what follows [s]."""
+ASTRAY_PCT, ASTRAY_STD = 3.0, 3.0
+"""A sample is wrong if off by more than this [% SoC] and by more than so many σ."""
+
+
+@dataclass(frozen=True)
+class LogScore:
+    """Sums over the scored samples of one log in one case, by one draw's model."""
+
+    log: str
+    samples: int
+    error: float
+    square: float
+    std: float
+    covered: float
+    newton: float
+    counting: float
+    late_wrong: float
+    mismatch: bool
+
+
+def score(log, soc_pct, std_pct, newton_pct, counted_pct, after_s, mismatch) -> LogScore:
+    """Compare an estimate with the log's reference; the arrays have a value per row [%]."""
+    since_s = log.time_s - log.time_s[0]
+    error = np.abs(soc_pct - log.soc_pct)
+    known = np.isfinite(error)
+    use, late = known & (since_s >= after_s), known & (since_s >= LATE_S)
+    wrong = (error > ASTRAY_PCT) & (error > ASTRAY_STD * std_pct)
+
+    def total(values) -> float:
+        return float(np.nansum(values[use]))
+
+    return LogScore(
+        log.name, int(use.sum()), total(error), total(error**2), total(std_pct),
+        total((error <= 2.0 * std_pct).astype(float)),
+        total(np.abs(newton_pct - log.soc_pct)), total(np.abs(counted_pct - log.soc_pct)),
+        float(wrong[late].mean()) if late.any() else 0.0, bool(mismatch),
+    )  # fmt: skip
+
+
+@dataclass
+class Row:
+    """Errors of a pack in one case by models of one number of logs, over all draws [% SoC]."""
+
+    estimator: str
+    pack: str
+    role: str
+    chemistry: str
+    size: int
+    case: str
+    draws: int
+    logs: int
+    mae: float
+    rmse: float
+    cover: float
+    std: float
+    newton: float
+    counting: float
+    astray: int
+    mismatches: int
+    failures: int = 0
+    seconds: float = 0.0
+    targets: dict[str, bool] = field(default_factory=dict)
+
+    def to_dict(self) -> dict:
+        """Return the row for JSON."""
+        return asdict(self)
+
+
+def pool(scores: Iterable[LogScore], **names) -> Row:
+    """Return the row of some logs' scores."""
+    scores = list(scores)
+    samples = max(sum(one.samples for one in scores), 1)
+
+    def mean(name: str) -> float:
+        return sum(getattr(one, name) for one in scores) / samples
+
+    return Row(
+        **names, logs=len(scores), mae=mean("error"), rmse=mean("square") ** 0.5,
+        cover=mean("covered"), std=mean("std"), newton=mean("newton"), counting=mean("counting"),
+        astray=sum(one.late_wrong > 0.5 for one in scores),
+        mismatches=sum(one.mismatch for one in scores),
+    )  # fmt: skip
+
+
+LIMITS_PCT = {
+    "i3": {3: 1.1, 5: 1.0, 10: 0.8},
+    "i3_winter": {3: 3.0, 5: 3.0, 10: 3.0},
+    "car1": {3: 2.1, 5: 1.1, 10: 0.85},
+    "lg_hg2": {3: 0.55, 5: 0.45},
+    "a123_lfp": {3: 2.0, 5: 2.2},
+    "lg_split_25c": {19: 0.7},
+    "lg_split_40c": {19: 0.7},
+    "lg_split_0c": {19: 1.2},
+    "lg_split_10c": {19: 1.2},
+}
+"""Pack and number of logs → largest MAE with the start withheld [% SoC]; the split given too."""
+COVER, STD_RATIO = 0.88, (0.7, 2.0)
+
+
+def judge(row: Row, *, counting_is_reference: bool) -> None:
+    """Enter the targets that apply to a row."""
+    if row.case == "foreign model":
+        return
+    best = row.newton if counting_is_reference else min(row.newton, row.counting)
+    row.targets["inputs"] = row.mae <= 1.1 * best + 0.3
+    row.targets["2σ ≥ 88 %"] = row.cover >= COVER
+    row.targets["2σ ≥ 90 %"] = row.cover >= 0.9
+    row.targets["2σ 90–99 %"] = 0.9 <= row.cover <= 0.99
+    row.targets["σ/RMSE .7–1.5"] = 0.7 <= row.std / max(row.rmse, 1e-9) <= 1.5
+    if row.case == "withheld":
+        row.targets["σ/RMSE .7–2"] = STD_RATIO[0] <= row.std / max(row.rmse, 1e-9) <= STD_RATIO[1]
+    limit = LIMITS_PCT.get(row.pack, {}).get(row.size)
+    if limit and (row.case == "withheld" or (row.case == "given" and row.size == 19)):
+        row.targets["limit"] = row.mae <= limit

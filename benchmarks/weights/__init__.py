@@ -1,0 +1,1 @@
+"""Weights of the diagnosis: drawn cases, their evidence, maximum likelihood, scores."""

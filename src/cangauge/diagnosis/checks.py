@@ -1,0 +1,99 @@
+"""Checks of what is to be diagnosed: logs of another pack, dead channels, duplicates, wrong counts.
+
+A wrong start, capacity or sensor is a cause to find. A log is refused only where no cause within
+its physical bounds can explain it.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+from typing import Final
+
+import numpy as np
+
+from cangauge.errors import InputError
+from cangauge.logs.gaps import discharged_ah
+from cangauge.logs.log import Log
+from cangauge.model.model_file import Model
+
+SHORTEST_S: Final = 300.0
+"""Shortest log to diagnose [s]; a shorter one is mostly transient."""
+
+LEAST_PART, MOST_PART = 0.7, 1.4
+"""Limits of a log's median voltage relative to the pack's usual voltage."""
+
+MOST_COUNTED_PCT: Final = 150.0
+"""Span of the counted SoC that a wrong capacity or current gain explains at most [%]: their
+physical bounds are a third of the value."""
+
+COUNT_TOLERANCE_PCT: Final = 5.0
+"""A count this far beyond 0–100 % is no contradiction [%]."""
+
+
+def check_logs(logs: Sequence[Log], references: Sequence[Log], model: Model) -> None:
+    """Raise InputError for logs that cannot be diagnosed, or not with these references."""
+    if not logs:
+        raise InputError("no log to diagnose", field="logs", cure="give at least one log")
+    for log in (*logs, *references):
+        where = log.source or log.name
+        if log.duration_s < SHORTEST_S:
+            raise InputError(
+                f"{log.duration_s:.0f} s are too short for a diagnosis",
+                source=where,
+                cure=f"give a log of at least {SHORTEST_S / 60.0:.0f} min, better half an hour with"
+                " changing load and SoC",
+            )
+        for channel, unit in (("current_a", "A"), ("voltage_v", "V")):
+            values = getattr(log, channel)
+            if np.ptp(values) == 0.0:
+                raise InputError(
+                    f"constant for {log.duration_s / 60.0:.0f} min: no diagnosis is possible",
+                    source=where,
+                    field=channel,
+                    value=f"{values[0]:g} {unit}",
+                    cure="check the signal, or give a log in which the pack is used",
+                )
+        usual = model.extended_model().pack.voltage_v
+        median = float(np.median(log.voltage_v))
+        if not LEAST_PART * usual <= median <= MOST_PART * usual:
+            raise InputError(
+                f"this log is of another pack: the model's has about {usual:.3g} V",
+                source=where,
+                field="voltage_v",
+                value=round(median, 1),
+                cure="use the model of this pack",
+            )
+        _check_count(log, model.capacity_ah)
+    for one, other in itertools.combinations((*logs, *references), 2):
+        if np.array_equal(one.current_a, other.current_a) and np.array_equal(
+            one.voltage_v, other.voltage_v
+        ):
+            raise InputError(
+                f"same rows as {other.source or other.name}: they would count twice",
+                source=one.source or one.name,
+                cure="give each log once, either as LOG or as reference",
+            )
+
+
+def _check_count(log: Log, capacity_ah: float) -> None:
+    """Raise InputError if no start explains a log whose counted SoC leaves 0–100 %."""
+    out = 100.0 * discharged_ah(log.time_s, log.current_a) / capacity_ah
+    first = log.first_soc()
+    start = 50.0 if first is None else first[1] + float(out[first[0]])
+    soc, span = start - out, float(np.ptp(out))
+    beyond = soc.min() < -COUNT_TOLERANCE_PCT or soc.max() > 100.0 + COUNT_TOLERANCE_PCT
+    if not beyond or (first is None and span <= MOST_COUNTED_PCT):
+        return
+    # As the SoC rises so does the voltage, whatever the start.
+    backwards = np.corrcoef(soc, log.voltage_v)[0, 1] < 0.0
+    if span > MOST_COUNTED_PCT or backwards:
+        reason = "the voltage moves the other way" if backwards else "no start explains it"
+        raise InputError(
+            f"the SoC counted with {capacity_ah:.2f} Ah runs from {soc.max():.1f} to"
+            f" {soc.min():.1f} %: {reason}",
+            source=log.source or log.name,
+            field="soc_pct",
+            cure="check --capacity-ah and the sign of current (positive must discharge; see"
+            " `cangauge inspect`)",
+        )

@@ -1,0 +1,603 @@
+"""Evidence of every effect in logs, against what reference logs show.
+
+One linear model of all logs about a ridge fit of the references:
+
+    r_l = X_l θ + B_l b_l + [l diagnosed] (r_l(0) − r_l(a_k)) + ε,   ε ~ N(0, s²) white
+
+with r [V] the measured minus the modelled voltage, θ the structure that all logs share (OCV curve,
+resistances, lags), b_l ~ N(0, 1) what one healthy log may differ by, and a_k the size of effect k,
+which is re-simulated where it changes a signal.
+
+The references give θ. Left out one at a time they give s², the error that a healthy log shows, and
+the excess o_k ≥ 1 by which their evidence of effect k goes beyond chance. The noise is white and as
+large as everything that left-out references show: a model error is a function of current and does
+not average out over thousands of rows.
+
+    known = learn([trace(log, capacity_ah) for log in references], capacity_ah)
+    evidence = analyse(known, [columns(known, trace(log, capacity_ah)) for log in logs])
+
+All functions are pure. Current > 0 discharges.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import log_ndtr, logsumexp
+
+from cangauge._typing import BoolArray, FloatArray, IntArray
+from cangauge.diagnosis.pack_fit import PackFit, Trace, fit_pack, hats
+from cangauge.diagnosis.trials import (
+    STEP,
+    Trial,
+    additive_column,
+    healthy_columns,
+    library,
+    residual,
+    slope,
+)
+
+FOLDS, BLOCK_S = 4, 240
+"""Interleaved blocks of a log that are held out in turn, and their length [s] (../docs)."""
+
+PLACES = tuple(float(part) for part in np.arange(10) / 10)
+"""Places of a resistance step, in parts of a log."""
+
+WIDTHS = np.array([1.0, 0.3, 0.1, 0.03])
+"""Equally probable widths of an amplitude's prior, in half bounds."""
+
+RIDGE = 4.0
+"""Prior precision of an amplitude in units of its largest bound, for its best value."""
+
+VISIBLE_NATS = 6.0
+"""Evidence from which an effect counts as visible [nats]: 400 to 1 for one effect."""
+
+COVER_PCT = 2.0
+"""References cover SoC this far beyond their own [%]."""
+
+COVER_K = 3.0
+"""References cover temperatures this far beyond their own [K]."""
+
+MAX_OUTLIERS, OUTLIER = 5, 0.1
+"""At most so many single rows, off by this part of the voltage, are faults of a bus and left out;
+more are diagnosed."""
+
+MIN_COVERED = 0.2
+"""A log with less of its rows at SoC that references visit is judged on all of them."""
+
+UNTESTED_EXCESS = 8.0
+"""Excess of an effect's evidence where fewer than two references are there to show it."""
+
+STEPS, SHRINK, MIN_STEP, MIN_CHANGE = 5, 0.35, 1e-3, 0.03
+"""Gauss–Newton steps of a re-simulated effect, the factor after one that lost evidence, and the
+steps at which it ends: in units of the bound, and relative to the size."""
+
+RESIMULATED_PART = 0.15
+"""An effect with less than this part of the best one's evidence is not re-simulated."""
+
+
+@dataclass(frozen=True, eq=False)
+class Columns:
+    """Columns of one log on the rows that count, and their products."""
+
+    log: Trace
+    rows: IntArray
+    """Rows of the trace that count, shape (m,)."""
+    x: FloatArray
+    """Shared structure, shape (m, p)."""
+    b: FloatArray
+    """What a healthy log may differ by, shape (m, 12)."""
+    r: FloatArray
+    """Measured minus modelled voltage [V], shape (m,)."""
+    parts: FloatArray
+    """Products of (x, b, effects, r) in each set of blocks, shape (folds, k, k)."""
+
+    @property
+    def products(self) -> FloatArray:
+        """Products on all rows, shape (k, k)."""
+        return np.asarray(self.parts.sum(axis=0))
+
+    @property
+    def fold(self) -> IntArray:
+        """Set of blocks of each row that counts, shape (m,)."""
+        return self.rows // BLOCK_S % FOLDS
+
+
+def soc_covered(pack: PackFit, log: Trace, others: Sequence[Trace]) -> BoolArray:
+    """Return the rows whose SoC other logs visit, all without other logs, shape (n,)."""
+    s, covered = pack.soc(log), np.full(len(log.current_a), not others)
+    for other in others:
+        visited = pack.soc(other)
+        covered |= (s >= visited.min() - COVER_PCT) & (s <= visited.max() + COVER_PCT)
+    return covered
+
+
+def rows_that_count(pack: PackFit, log: Trace, others: Sequence[Trace], r: FloatArray) -> IntArray:
+    """Return measured rows whose SoC other logs visit; all measured rows if those are few.
+
+    Parameters
+    ----------
+    pack : PackFit
+    log : Trace
+    others : sequence of Trace
+    r : array of shape (n,)
+        Residual, for single rows that no pack can have produced [V].
+    """
+    covered = log.measured & soc_covered(pack, log, others)
+    if covered.sum() < MIN_COVERED * log.measured.sum():
+        covered = log.measured.copy()
+    outliers = np.flatnonzero(np.abs(r - np.median(r)) > OUTLIER * pack.volts)
+    if 0 < outliers.size <= MAX_OUTLIERS:
+        covered[outliers] = False
+    return np.flatnonzero(covered)
+
+
+def _all_columns(pack: PackFit, log: Trace, trials: Sequence[Trial]) -> list[FloatArray]:
+    """Return x, b, effects in units of their bounds, and r on all rows of a log."""
+    s, r = pack.soc(log), residual(pack, log)
+    effects = [slope(pack, log, trial, 0.0, r) * trial.bound for trial in trials]
+    effects += [
+        additive_column(pack, log, replace(STEP, shape=place)) * STEP.bound for place in PLACES
+    ]
+    x = np.column_stack([hats(s), pack.structure(log.current_a, s, log.temperature_c)])
+    return [x, healthy_columns(pack, log, r), np.column_stack(effects), r[:, None]]
+
+
+def _on_rows(
+    log: Trace, columns: Sequence[FloatArray], rows: IntArray, folds: int = FOLDS
+) -> Columns:
+    """Return the columns of a log on some rows; in one part for a reference, never held out."""
+    x, b, _, r = (part[rows] for part in columns)
+    every, fold = np.concatenate(columns, axis=1)[rows], rows // BLOCK_S % folds
+    blocks = [every[fold == k] for k in range(folds)] if folds > 1 else [every]
+    return Columns(log, rows, x, b, r[:, 0], np.array([block.T @ block for block in blocks]))
+
+
+@dataclass(frozen=True)
+class EffectEvidence:
+    """Evidence of one effect at its best shape and size."""
+
+    trial: Trial
+    nats: float
+    """Gain of log likelihood over the excess o_k that references show of this effect [nats]."""
+    left_v2: float
+    """Mean square error that remains [V²]."""
+    size: float
+    """Amplitude [unit of the trial]."""
+    std: float
+    """Standard deviation of the amplitude by noise and excess [unit of the trial]."""
+    visible: float
+    """Smallest size that would have been visible [unit of the trial]; infinite: none."""
+    chance: float
+    """Largest χ² of its shapes: about 1 without the effect."""
+    in_logs: tuple[float | None, ...]
+    """Resistance step: its place in each log, in parts of it; None before it."""
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """Evidence of every effect in logs that share one cause."""
+
+    effects: dict[str, EffectEvidence]
+    gap_v2: float
+    """Mean square error with the structure of the references [V²]."""
+    rows: int
+    logs: int
+
+
+@dataclass(frozen=True, eq=False)
+class References:
+    """What reference logs show."""
+
+    pack: PackFit
+    trials: list[Trial]
+    logs: list[Trace]
+    s2: float
+    """Noise: mean square error of left-out references [V²]."""
+    a: FloatArray
+    """Precision of θ, shape (p, p)."""
+    b: FloatArray
+    """Precision times mean of θ's change, shape (p,)."""
+    left_out: tuple[Evidence, ...] = ()
+    """Each reference as analysed by the others; empty below two."""
+    excess: dict[str, float] = field(default_factory=dict)
+    """o_k: by how much healthy evidence of an effect exceeds chance, 1 at least."""
+    stated_v2: float = 0.0
+    """Mean square error that the model file states, for fewer than two references [V²]."""
+
+    @property
+    def healthy_v2(self) -> float:
+        """Mean square error of a healthy log [V²]."""
+        if not self.left_out:
+            return max(self.s2, self.stated_v2)
+        return float(np.mean([one.gap_v2 for one in self.left_out]))
+
+    @property
+    def healthy_rmse_v(self) -> float:
+        """RMS error of a healthy log [V]."""
+        return float(np.sqrt(self.healthy_v2))
+
+    @property
+    def healthy_nats(self) -> FloatArray:
+        """Most evidence of any effect in each left-out reference [nats]."""
+        most = [
+            max(float(e.nats) / self.excess_of(name) for name, e in one.effects.items())
+            for one in self.left_out
+        ]
+        return np.asarray(np.maximum(most or [3.0], 0.0), dtype=np.float64)
+
+    def colder_k(self, logs: Sequence[Trace]) -> float:
+        """Return how far logs lie beyond the temperatures of the references [K]."""
+        low = min(float(log.temperature_c.min()) for log in self.logs)
+        high = max(float(log.temperature_c.max()) for log in self.logs)
+        lowest = min(float(log.temperature_c.min()) for log in logs)
+        highest = max(float(log.temperature_c.max()) for log in logs)
+        return max(0.0, low - COVER_K - lowest, highest - high - COVER_K)
+
+    def excess_of(self, effect: str) -> float:
+        """Return o_k of an effect."""
+        return self.excess.get(effect, 1.0 if self.excess else UNTESTED_EXCESS)
+
+
+def learn(
+    references: Sequence[Trace], capacity_ah: float, stated_rmse_v: float = 0.0
+) -> References:
+    """Learn structure, noise and healthy evidence from reference logs.
+
+    The structure is linearised twice, the second time about what the references show: an effect
+    that moves the SoC would meet the correction of another SoC otherwise.
+
+    Parameters
+    ----------
+    references : sequence of Trace
+        At least one.
+    capacity_ah : float
+    stated_rmse_v : float
+        Error that the model file states [V]: the floor with fewer than two references.
+    """
+    pack = fit_pack(references, capacity_ah)
+    full, out = _of_references(pack, references, ())
+    s2 = _noise_v2(pack, full)
+    p = _prior(pack, full, out, s2)
+    pack = pack.moved(np.linalg.solve(*_normal(pack, p, _marginal(full, s2))))
+
+    trials = library(pack)
+    full, out = _of_references(pack, references, trials)
+    s2 = _noise_v2(pack, full)
+    if len(references) < 2:
+        s2 = max(s2, stated_rmse_v**2)
+    else:
+        s2 = max(s2, float(np.mean(_left_out_v2(pack, p, _marginal(full, s2), out))))
+    q = _marginal(full, s2)
+    a, b = _normal(pack, p, q)
+    known = References(pack, trials, list(references), s2, a, b, stated_v2=stated_rmse_v**2)
+    if len(references) < 2:
+        return known
+    plain, nx = replace(known, excess={"": 1.0}), len(b)
+    left_out = tuple(
+        analyse(replace(plain, a=a - x[:nx, :nx], b=b - x[:nx, -1]), [log], exact=False)
+        for x, log in zip(q, out, strict=True)
+    )
+    chance = {k: np.array([one.effects[k].chance for one in left_out]) for k in left_out[0].effects}
+    usual = max(1.0, float(np.median([x.mean() for x in chance.values()])))
+    excess = {k: max((x.sum() + 2.0 * usual) / (len(x) + 2.0), usual) for k, x in chance.items()}
+    return replace(known, left_out=left_out, excess=excess)
+
+
+def _of_references(
+    pack: PackFit, references: Sequence[Trace], trials: Sequence[Trial]
+) -> tuple[list[Columns], list[Columns]]:
+    """Return each reference on all its rows, and on those whose SoC the others visit."""
+    full, out = [], []
+    for k, log in enumerate(references):
+        every = _all_columns(pack, log, trials)
+        others, r = [*references[:k], *references[k + 1 :]], every[-1][:, 0]
+        own, covered = (rows_that_count(pack, log, some, r) for some in ([], others))
+        full.append(_on_rows(log, every, own, folds=1))
+        same = len(own) == len(covered)
+        out.append(full[-1] if same else _on_rows(log, every, covered, folds=1))
+    return full, out
+
+
+def _marginal(logs: Sequence[Columns], s2: float) -> list[FloatArray]:
+    return [without_own(log.products, log, s2) for log in logs]
+
+
+def _normal(pack: PackFit, p: FloatArray, q: Sequence[FloatArray]) -> tuple[FloatArray, FloatArray]:
+    """Return precision and right side of θ's change, the prior's precision being p about zero."""
+    nx, total = len(pack.theta), np.sum(q, axis=0)
+    return p + total[:nx, :nx], total[:nx, -1] - p @ pack.theta
+
+
+def _noise_v2(pack: PackFit, full: Sequence[Columns]) -> float:
+    """Return the mean square error of all references together [V²]."""
+    s2, p, rows = (0.003 * pack.volts) ** 2, pack.precision(), sum(len(log.rows) for log in full)
+    for _ in range(3):
+        q = _marginal(full, s2)
+        a, b = _normal(pack, p, q)
+        chi2 = sum(x[-1, -1] for x in q) + pack.theta @ p @ pack.theta - b @ np.linalg.solve(a, b)
+        s2 *= float(chi2) / rows
+    return max(s2, (1e-5 * pack.volts) ** 2)
+
+
+def _left_out_v2(
+    pack: PackFit, p: FloatArray, q: Sequence[FloatArray], out: Sequence[Columns]
+) -> FloatArray:
+    """Return the mean square error of each reference by the others [V²]."""
+    (a, b), nx = _normal(pack, p, q), len(pack.theta)
+    return np.array([
+        squares(log, np.linalg.solve(a - x[:nx, :nx], b - x[:nx, -1])) / len(log.rows)
+        for x, log in zip(q, out, strict=True)
+    ])  # fmt: skip
+
+
+def _prior(pack: PackFit, full: Sequence[Columns], out: Sequence[Columns], s2: float) -> FloatArray:
+    """Return the prior precision of θ that predicts left-out references best."""
+    if len(out) < 2:
+        return pack.precision()
+    q, floor_v2 = _marginal(full, s2), (5e-4 * pack.volts) ** 2
+    grid = [
+        pack.precision(size, rough) for size in (0.03, 0.1, 0.3, 1.0) for rough in (0.2, 0.5, 1.5)
+    ]
+    return min(grid, key=lambda p: np.sum(np.log(_left_out_v2(pack, p, q, out) + floor_v2)))
+
+
+def columns(known: References, log: Trace) -> Columns:
+    """Return the columns of a log on the rows whose SoC the references visit."""
+    every = _all_columns(known.pack, log, known.trials)
+    r = every[-1][:, 0]
+    return _on_rows(log, every, rows_that_count(known.pack, log, known.logs, r))
+
+
+def without_own(products: FloatArray, log: Columns, s2: float) -> FloatArray:
+    """Return products / s² of (x, effects, r) with the log's own deviations integrated out."""
+    nx, nb = log.x.shape[1], log.b.shape[1]
+    g, own = products / s2, slice(nx, nx + nb)
+    others = np.r_[0:nx, nx + nb : len(g)]
+    z = np.linalg.solve(np.linalg.cholesky(g[own, own] + np.eye(nb)), g[own][:, others])
+    return np.asarray(g[np.ix_(others, others)] - z.T @ z, dtype=np.float64)
+
+
+def squares(
+    log: Columns, theta: NDArray[np.floating], column: int | None = None, a: float = 0.0
+) -> float:
+    """Return a log's sum of squares [V²] with θ and an effect's column; b remains in it."""
+    w = np.zeros(log.parts.shape[1])
+    w[: len(theta)], w[-1] = -theta, 1.0
+    if column is not None:
+        w[len(theta) + log.b.shape[1] + column] = -a
+    return float(w @ log.products @ w)
+
+
+def bounded_evidence(g: FloatArray, s: FloatArray, low: FloatArray, high: FloatArray) -> FloatArray:
+    """Return ln Bayes factors of amplitudes within bounds against none, shape (k,).
+
+    The mean over normal priors of `WIDTHS`, cut off at the bounds, of exp(g·a − s·a²/2).
+
+    Parameters
+    ----------
+    g, s : array of shape (k,)
+        Gradient at 0 and curvature of the log likelihood.
+    low, high : array of shape (k,)
+        Bounds, low ≤ 0 ≤ high.
+    """
+    std = 0.5 * WIDTHS[:, None]
+    precision = s + std**-2.0
+    mode, root = g / precision, np.sqrt(precision)
+
+    def mass(a: FloatArray, b: FloatArray) -> FloatArray:
+        a, b = np.where(a > 0.0, -b, a), np.where(a > 0.0, -a, b)
+        upper, lower = log_ndtr(b), log_ndtr(a)
+        return np.asarray(upper + np.log1p(-np.exp(np.minimum(lower - upper, -1e-12))))
+
+    free = 0.5 * g * mode - 0.5 * np.log(precision * std**2)
+    inside = mass((low - mode) * root, (high - mode) * root) - mass(low / std, high / std)
+    return np.asarray(logsumexp(free + inside, axis=0) - np.log(len(WIDTHS)))
+
+
+def analyse(known: References, logs: Sequence[Columns], *, exact: bool = True) -> Evidence:
+    """Return the evidence of every effect in logs that share one cause.
+
+    Parameters
+    ----------
+    known : References
+    logs : sequence of Columns
+    exact : bool
+        Re-simulate effects that change a signal at the size found (Gauss–Newton).
+    """
+    tried, at = _tried(known, len(logs))
+    effects = np.array([trial.effect for trial in tried])
+    bound = np.array([trial.bound for trial in tried])
+    low = np.array([trial.low for trial in tried]) / bound
+    high = np.array([trial.high for trial in tried]) / bound
+    over = np.array([known.excess_of(name) for name in effects])
+    nx, rows = len(known.b), sum(len(log.rows) for log in logs)
+    q = [without_own(log.products, log, known.s2) for log in logs]
+    a = known.a + sum(x[:nx, :nx] for x in q)
+    b = known.b + sum(x[:nx, -1] for x in q)
+    inverse = np.linalg.inv(a)
+    theta = inverse @ b
+    u, s, g = np.zeros((nx, len(tried))), np.zeros(len(tried)), np.zeros(len(tried))
+    for x, place in zip(q, at, strict=True):
+        on, column = place >= 0, nx + place[place >= 0]
+        u[:, on] += x[:nx, column]
+        s[on] += x[column, column]
+        g[on] += x[column, -1]
+    g = g - u.T @ theta
+    s = np.maximum(s - np.sum(u * (inverse @ u), axis=0), 1e-9)
+    size = np.clip(g / (s + RIDGE), low, high)
+    gain = g * size - 0.5 * s * size**2
+    evidence = bounded_evidence(g, s, low, high)
+    result = {}
+    for name in dict.fromkeys(effects.tolist()):
+        k = np.flatnonzero(effects == name)
+        top = int(k[np.argmax(evidence[k])])
+        trial, amplitude, nats, left_v2 = tried[top], float(size[top]), float(gain[top]), None
+        if exact and _needs_resimulation(trial) and gain[top] > RESIMULATED_PART * gain.max():
+            start = trial.number / trial.bound if trial.effect == "time_skew" else 0.0
+            amplitude, nats, left_v2 = _resimulated(known, logs, trial, start or amplitude)
+        if left_v2 is None:
+            moved = theta - inverse @ u[:, top] * amplitude
+            left_v2 = (
+                sum(
+                    squares(log, moved, None if place[top] < 0 else int(place[top]), amplitude)
+                    for log, place in zip(logs, at, strict=True)
+                )
+                / rows
+            )
+        result[name] = EffectEvidence(
+            trial=trial,
+            nats=nats / over[top],
+            left_v2=left_v2,
+            size=amplitude * trial.bound,
+            std=float(np.sqrt(over[top] / (s[top] + RIDGE))) * trial.bound,
+            visible=float(np.min(np.sqrt(2.0 * VISIBLE_NATS * over[k] / s[k]) * bound[k])),
+            chance=float(np.max(g[k] ** 2 / (s[k] + RIDGE))),
+            in_logs=tuple(
+                None if place[top] < 0 else PLACES[int(place[top]) - len(known.trials)]
+                for place in at
+            ) if name == STEP.effect else (),
+        )  # fmt: skip
+    before = np.linalg.solve(known.a, known.b)
+    return Evidence(result, sum(squares(log, before) for log in logs) / rows, rows, len(logs))
+
+
+def _tried(known: References, logs: int) -> tuple[list[Trial], list[IntArray]]:
+    """Return what is tried, and for each log the column of each trial, −1 for none.
+
+    A step of resistance happens at one place of one log and lasts through the later ones.
+    """
+    n = len(known.trials)
+    tried, at = list(known.trials), [list(range(n)) for _ in range(logs)]
+    for j in range(logs):
+        for k in range(len(PLACES)):
+            if j or k:
+                tried.append(replace(STEP, shape=PLACES[k]))
+                for log in range(logs):
+                    at[log].append(-1 if log < j else n + (k if log == j else 0))
+    return tried, [np.array(place, dtype=np.intp) for place in at]
+
+
+def _needs_resimulation(trial: Trial) -> bool:
+    return trial.changes_signal and trial.effect != "voltage_offset"
+
+
+def at_size(known: References, log: Columns, trial: Trial, a: float) -> FloatArray:
+    """Return products of (x, b, slope, r) with an effect undone, by blocks, shape (folds, k, k).
+
+    Parameters
+    ----------
+    known : References
+    log : Columns
+    trial : Trial
+    a : float
+        Amplitude in units of its bound, as the slope.
+    """
+    pack, n = known.pack, log.x.shape[1] + log.b.shape[1]
+    r = residual(pack, log.log, trial, a * trial.bound)
+    column = slope(pack, log.log, trial, a * trial.bound, r) * trial.bound
+    y = np.column_stack([column, r])[log.rows]
+    parts = np.zeros((FOLDS, n + 2, n + 2))
+    parts[:, :n, :n] = log.parts[:, :n, :n]
+    for k in range(FOLDS):
+        of = log.fold == k
+        parts[k, :n, n:] = np.concatenate([log.x[of].T @ y[of], log.b[of].T @ y[of]])
+        parts[k, n:, :n] = parts[k, :n, n:].T
+        parts[k, n:, n:] = y[of].T @ y[of]
+    return parts
+
+
+@dataclass(frozen=True)
+class _OneEffect:
+    """Likelihood of one effect about a size, everything else integrated out."""
+
+    gradient: float
+    curvature: float
+    chi2: float
+    theta: FloatArray
+
+    @classmethod
+    def of(
+        cls, known: References, logs: Sequence[Columns], products: Sequence[FloatArray]
+    ) -> _OneEffect:
+        nx = len(known.b)
+        q = [without_own(z, log, known.s2) for log, z in zip(logs, products, strict=True)]
+        total = np.sum(q, axis=0) if q else np.zeros((nx + 2, nx + 2))
+        a, b, u = known.a + total[:nx, :nx], known.b + total[:nx, -1], total[:nx, -2]
+        theta, changed = np.linalg.solve(a, np.column_stack([b, u])).T
+        return cls(
+            gradient=float(total[-2, -1] - u @ theta),
+            curvature=max(float(total[-2, -2] - u @ changed), 1e-9),
+            chi2=float(total[-1, -1] - b @ theta),
+            theta=theta,
+        )
+
+
+def _resimulated(
+    known: References, logs: Sequence[Columns], trial: Trial, start: float
+) -> tuple[float, float, float | None]:
+    """Return size [bounds], gain [nats] and remaining error [V²] of an effect, re-simulated."""
+    low, high = trial.low / trial.bound, trial.high / trial.bound
+    zero = _OneEffect.of(known, logs, [at_size(known, log, trial, 0.0).sum(axis=0) for log in logs])
+    size, gain, left_v2, step = 0.0, 0.0, None, start
+    for _ in range(STEPS):
+        if abs(step) < MIN_STEP:
+            break
+        products = [at_size(known, log, trial, size + step).sum(axis=0) for log in logs]
+        here = _OneEffect.of(known, logs, products)
+        better = 0.5 * (zero.chi2 - here.chi2)
+        if better <= gain:
+            step *= SHRINK
+            continue
+        size, gain = size + step, better
+        w = np.concatenate([-here.theta, np.zeros(logs[0].b.shape[1] + 1), [1.0]])
+        left_v2 = float(sum(w @ z @ w for z in products)) / sum(len(log.rows) for log in logs)
+        change = (here.gradient - RIDGE * size) / (here.curvature + RIDGE)
+        step = float(np.clip(size + change, low, high)) - size
+        if abs(step) < MIN_CHANGE * abs(size):
+            break
+    return size, gain, left_v2
+
+
+def held_out_sizes(
+    known: References, logs: Sequence[Columns], evidence: EffectEvidence
+) -> list[FloatArray]:
+    """Return the size of an effect for each row, found without that row's part of the data.
+
+    The part is the row's log; a set of blocks, where there is only one log or the effect happens
+    at one moment.
+
+    Returns
+    -------
+    list of array of shape (m,)
+        One for each log [unit of the trial].
+    """
+    trial, size = evidence.trial, evidence.size / evidence.trial.bound
+    low, high = trial.low / trial.bound, trial.high / trial.bound
+    places = evidence.in_logs or (trial.shape,) * len(logs)
+    parts = [
+        at_size(known, log, replace(trial, shape=1.0 if place is None else place), size)
+        if evidence.in_logs
+        else at_size(known, log, trial, size)
+        for log, place in zip(logs, places, strict=True)
+    ]
+
+    def size_of(kept: Sequence[FloatArray], of: Sequence[Columns]) -> float:
+        one = _OneEffect.of(known, of, kept)
+        change = (one.gradient - RIDGE * size) / (one.curvature + RIDGE)
+        return float(np.clip(size + change, low, high)) * trial.bound
+
+    whole = [z.sum(axis=0) for z in parts]
+    if len(logs) > 1 and not evidence.in_logs:
+        return [
+            np.full(len(log.rows), size_of(whole[:k] + whole[k + 1 :], [*logs[:k], *logs[k + 1 :]]))
+            for k, log in enumerate(logs)
+        ]
+    sizes = np.array([
+        size_of([z - z_part[k] for z, z_part in zip(whole, parts, strict=True)], logs)
+        for k in range(FOLDS)
+    ])  # fmt: skip
+    return [sizes[log.fold] for log in logs]

@@ -1,0 +1,296 @@
+"""The extended model: the given model with the cause, as a file that the service runs.
+
+The size of the cause is that of the evidence. The voltage that it adds there is expressed by the
+parameters of the effect's own equation (`cangauge.model.effects`), and the model with it is judged
+on rows that did not size it, among those that the cause can change.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Final
+
+import numpy as np
+
+from cangauge._typing import BoolArray, FloatArray
+from cangauge._version import __version__
+from cangauge.diagnosis.evidence import (
+    Columns,
+    EffectEvidence,
+    References,
+    held_out_sizes,
+    soc_covered,
+)
+from cangauge.diagnosis.pack_fit import Trace
+from cangauge.diagnosis.trials import additive_column, undone
+from cangauge.model.effects.base import BOUND_MARGIN, Signals, Values
+from cangauge.model.effects.library import LIBRARY, effect_entries, shape_key
+from cangauge.model.extended import ExtendedModel
+from cangauge.model.model_file import Model
+
+LOG_EFFECTS: Final = frozenset({"initial_soc"})
+"""Effects of one log, which a model for later drives does not have."""
+
+CHANGED_PART: Final = 0.1
+"""A cause can change a row where its voltage is at least this part of its usual largest (95 %)."""
+
+TWO_SIDED: Final = 1.96
+"""Standard deviations of a 95 % interval."""
+
+TANGENT_STD: Final = 0.05
+"""Relative uncertainty of a size by the cause's shape, which is the library's and not the pack's.
+On development cases with much evidence sizes were off by 1 to 15 %."""
+
+_SIGNAL: Final[dict[str, Callable[[float, float], dict[str, float]]]] = {
+    "current_offset": lambda a, _: {"offset_a": a},
+    "current_gain": lambda a, _: {"gain_pct": 100.0 * a},
+    "voltage_offset": lambda a, _: {"offset_v": a},
+    "voltage_gain": lambda a, _: {"gain_pct": 100.0 * a},
+    "time_skew": lambda a, _: {"skew_s": a},
+    "temperature_lag": lambda a, _: {"tau_s": a},
+    "core_temperature": lambda a, tau_s: {"rise_k": a, "late": 0.0, "tau_s": tau_s},
+    "capacity": lambda a, _: {"change_pct": 100.0 * a},
+    "initial_soc": lambda a, _: {"offset_pct": -a},
+    "coulombic_efficiency": lambda a, _: {"efficiency": 1.0 - a},
+}
+"""Effect that changes a signal → its parameters at an amplitude and a shape of the evidence."""
+
+_SHAPES: Final[dict[str, Callable[[float, References], list[dict[str, float]]]]] = {
+    "resistance_temperature": lambda b, known: [
+        {"activation_k": b, "delayed": 1.0, "reference_c": known.pack.mean_c, "lag_s": 0.0}
+    ],
+    "resistance_soc": lambda _, __: [
+        {"width_pct": width, "delayed": 1.0} for width in (5.0, 10.0, 20.0, 40.0)
+    ],
+    "resistance_asymmetry": lambda _, __: [{}],
+    "resistance_step": lambda _, __: [{}],
+    "charge_transfer": lambda x, known: [
+        {"exchange_a": x * known.pack.capacity_ah, "bend_only": 1.0, "activation_k": 0.0}
+    ],
+    "fast_polarization": lambda tau_s, _: [{"tau_s": min(tau_s, 9.0), "activation_k": 0.0}],
+    "slow_diffusion": lambda tau_s, _: [
+        {"tau_s": max(tau_s, 70.0), "spread": 0.0, "activation_k": 0.0, "by_slope": 0.0}
+    ],
+    "hysteresis": lambda part, _: [{"travel_pct": 100.0 * part}],
+    "entropic_coefficient": lambda _, __: [{"lag_s": 0.0}],
+    "weak_cell": lambda _, __: [
+        {"deficit_pct": deficit} for deficit in (4.0, 7.0, 11.0, 16.0, 23.0, 33.0, 48.0)
+    ],
+}
+"""Effect that adds a voltage → the shapes that are tried for a shape of the evidence."""
+
+
+@dataclass(frozen=True)
+class Quantity:
+    """Value of a parameter with its 95 % interval."""
+
+    value: float
+    unit: str
+    ci: tuple[float, float] | None
+    """None for a shape."""
+
+    def to_dict(self) -> dict[str, object]:
+        """Return the object of `gap --json`."""
+        ci = None if self.ci is None else list(self.ci)
+        return {"value": self.value, "ci": ci, "unit": self.unit}
+
+
+def interval(evidence: EffectEvidence) -> tuple[float, float]:
+    """Return the 95 % interval of an effect's size [unit of the trial]."""
+    half = TWO_SIDED * float(np.hypot(evidence.std, TANGENT_STD * evidence.size))
+    return evidence.size - half, evidence.size + half
+
+
+def residual_v(model: ExtendedModel, log: Trace) -> FloatArray:
+    """Return corrected measured less predicted voltage of a model at 1 Hz [V], shape (n,)."""
+    rows = np.arange(len(log.current_a))
+    signals = Signals(rows.astype(np.float64), log.current_a, log.voltage_v, log.temperature_c)
+    return model.predict(signals, log.start_pct, rows).residual_v
+
+
+class Extension:
+    """The given model with one cause.
+
+    Parameters
+    ----------
+    model : ExtendedModel
+        As given.
+    known : References
+    logs : sequence of Columns
+        The diagnosed logs.
+    before_v : sequence of array of shape (m,)
+        Errors of the given model on the rows that count of each [V].
+    evidence : EffectEvidence
+        Of the cause.
+    """
+
+    def __init__(
+        self,
+        model: ExtendedModel,
+        known: References,
+        logs: Sequence[Columns],
+        before_v: Sequence[FloatArray],
+        evidence: EffectEvidence,
+    ) -> None:
+        self.model, self.known, self.logs, self.before_v = model, known, logs, before_v
+        self.evidence, self.effect = evidence, LIBRARY[evidence.trial.effect]
+        self._neutral = self.effect.neutral(model.pack)
+        self._values = {} if evidence.trial.effect in _SIGNAL else self._nearest()
+
+    def values(self, size: float, place: float | None = 0.0, duration_s: float = 0.0) -> Values:
+        """Return the effect's parameters at a size.
+
+        Parameters
+        ----------
+        size : float
+            [unit of the trial].
+        place, duration_s : float
+            Place of a resistance step in a log, and the log's duration; None: later.
+        """
+        trial = self.evidence.trial
+        if trial.effect in _SIGNAL:
+            return self._neutral | _SIGNAL[trial.effect](size, trial.number)
+        part = size / self.evidence.size if self.evidence.size else 0.0
+        names = {item.name for item in self.effect.amplitudes}
+        values = {k: part * v if k in names else v for k, v in self._values.items()}
+        if self.evidence.in_logs:
+            values["start_s"] = 1e7 if place is None else place * duration_s
+        return values
+
+    @property
+    def parameters(self) -> dict[str, Quantity]:
+        """The effect's parameters with 95 % intervals of its amplitudes."""
+        places = [
+            (place, float(len(log.log.current_a)))
+            for place, log in zip(self.evidence.in_logs, self.logs, strict=False)
+            if place is not None
+        ]
+        values, *ends = (
+            self.values(size, *(places or [(0.0, 0.0)])[0])
+            for size in (self.evidence.size, *interval(self.evidence))
+        )
+        shapes = {item.name for item in self.effect.parameters if item.neutral is None}
+        return {
+            item.name: Quantity(
+                values[item.name],
+                item.unit,
+                None
+                if item.name in shapes
+                else (min(x[item.name] for x in ends), max(x[item.name] for x in ends)),
+            )
+            for item in self.effect.parameters
+        }
+
+    def judge(self) -> tuple[list[FloatArray], list[BoolArray]]:
+        """Return the errors of each log with the cause, sized without the rows judged [V].
+
+        Returns
+        -------
+        after_v : list of array of shape (m,)
+        judged : list of array of shape (m,)
+            Rows that the cause can change, at SoC that references visit with it undone.
+        """
+        sizes = held_out_sizes(self.known, self.logs, self.evidence)
+        after, judged = [], []
+        for k, (log, before) in enumerate(zip(self.logs, self.before_v, strict=True)):
+            errors = np.empty_like(before)
+            for size in np.unique(sizes[k]):
+                at = sizes[k] == size
+                values = self._in_log(self.values, float(size), k)
+                errors[at] = residual_v(self._with(values), log.log)[log.rows][at]
+            change = np.abs(errors - before)
+            usual = float(np.quantile(change, 0.95)) if change.size else 0.0
+            judged.append((change >= CHANGED_PART * usual) & self._covered_after(log))
+            after.append(errors)
+        return after, judged
+
+    def model_file(self, given: Model, rmse_v: float) -> Model:
+        """Return the extended model, ready to save and run.
+
+        Parameters
+        ----------
+        given : Model
+        rmse_v : float
+            Its RMS error on held-out rows [V].
+        """
+        extended = self.model
+        if self.effect.id not in LOG_EFFECTS:
+            extended = self._with(self.values(self.evidence.size))
+        made = given.made.model_copy(update={"by": f"cangauge {__version__} gap"})
+        judged = {"voltage_rmse_v": rmse_v, "judged_on": "logs left out by `cangauge gap`"}
+        return given.model_copy(
+            update={
+                "name": f"{given.name}, extended",
+                "effects": effect_entries(extended.effects),
+                "noise": given.noise.model_copy(update=judged),
+                "information": None,
+                "made": made,
+            }
+        )
+
+    def _in_log(self, of: Callable[..., Values], size: float, number: int) -> Values:
+        """Return the parameters at a size in one of the diagnosed logs."""
+        if not self.evidence.in_logs:
+            return of(size)
+        duration_s = float(len(self.logs[number].log.current_a))
+        return of(size, self.evidence.in_logs[number], duration_s)
+
+    def _covered_after(self, log: Columns) -> BoolArray:
+        """Return the rows at SoC that references visit with the cause undone; all if none."""
+        covered = np.ones(len(log.rows), dtype=bool)
+        if self.evidence.trial.changes_signal:
+            without = undone(self.known.pack, log.log, self.evidence.trial, self.evidence.size)
+            after = soc_covered(self.known.pack, without, self.known.logs)[log.rows]
+            covered = after if after.any() else covered
+        return covered
+
+    def _with(self, values: Values) -> ExtendedModel:
+        """Return the given model with the effect, added to one of the same shape."""
+        key = shape_key(self.effect, values)
+        effects = tuple(item for item in self.model.effects if shape_key(*item) != key)
+        total = dict(values)
+        for _, known in (item for item in self.model.effects if shape_key(*item) == key):
+            for item in self.effect.amplitudes:
+                total[item.name] += known[item.name] - self._neutral[item.name]
+        added = self.effect, self.effect.clipped(total, self.model.pack)
+        return replace(self.model, effects=(*effects, added))
+
+    def _nearest(self) -> dict[str, float]:
+        """Return the parameters whose voltage is nearest to the evidence's, at its size."""
+        trial, in_logs = self.evidence.trial, self.evidence.in_logs
+        places = in_logs or (trial.shape,) * len(self.logs)
+        chosen = [
+            item
+            for item in zip(self.logs, self.before_v, places, strict=True)
+            if not in_logs or item[2] is not None
+        ]
+        target = self.evidence.size * np.concatenate([
+            additive_column(self.known.pack, log.log, replace(trial, shape=place))[log.rows]
+            for log, _, place in chosen
+        ])  # fmt: skip
+        units = {
+            item.name: 0.1 * max(map(abs, item.bounds(self.model.pack, BOUND_MARGIN)))
+            for item in self.effect.amplitudes
+        }
+        best: tuple[float, dict[str, float]] = (np.inf, self._neutral)
+        for shape in _SHAPES[trial.effect](trial.number, self.known):
+            neutral = self._neutral | shape
+            columns = []
+            for name, unit in units.items():
+                changes = []
+                for log, before, place in chosen:
+                    values = neutral | {name: unit}
+                    if in_logs:
+                        values["start_s"] = float(place or 0.0) * len(log.log.current_a)
+                    after = residual_v(self._with(values), log.log)[log.rows]
+                    changes.append((before - after) / unit)
+                columns.append(np.concatenate(changes))
+            design = np.column_stack(columns)
+            solution, *_ = np.linalg.lstsq(design, target, rcond=None)
+            values = neutral | dict(zip(units, solution.tolist(), strict=True))
+            values = self.effect.clipped(values, self.model.pack)
+            left = float(np.sum((target - design @ [values[name] for name in units]) ** 2))
+            if left < best[0]:
+                best = left, values
+        return best[1]

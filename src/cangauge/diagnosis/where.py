@@ -1,0 +1,165 @@
+"""Where the error lies: its shares over SoC, temperature, current, rest, time and time scale."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from cangauge._typing import BoolArray, FloatArray, IntArray
+
+TIME_SCALES_S: Final = (0.0, 10.0, 100.0, 1000.0, 1e6)
+"""Edges of the time scales [s]: faster than 10 s, 10–100 s, …, slower than 1000 s."""
+
+REST_C_RATE: Final = 0.02
+"""Current below which the pack rests [1/h]."""
+
+PIECE_S: Final = 300
+"""Length of the pieces that a bootstrap draws, beyond the correlation of errors [s]."""
+
+DRAWS: Final = 400
+"""Draws of a bootstrap; its quantiles vary by one per cent."""
+
+
+@dataclass(frozen=True, eq=False)
+class LogErrors:
+    """Errors of one diagnosed log at 1 Hz; m rows that count."""
+
+    name: str
+    time_s: FloatArray
+    """Since the first row of the log, shape (m,) [s]."""
+    current_a: FloatArray
+    temperature_c: FloatArray
+    soc_pct: FloatArray
+    """As counted."""
+    before_v: FloatArray
+    """Measured less given model [V]."""
+    after_v: FloatArray
+    """With the cause, sized without these rows; equal to `before_v` without a cause [V]."""
+    judged: BoolArray
+    """Rows that the cause can change; all without a cause."""
+
+
+@dataclass(frozen=True)
+class ErrorShare:
+    """Share of the squared error in one interval of an axis."""
+
+    axis: str
+    low: float
+    high: float
+    unit: str
+    share: float
+    rmse_v: float
+    """Within the interval [V]."""
+    ci: tuple[float, float]
+    """95 % interval of the share."""
+
+    def to_dict(self) -> dict[str, object]:
+        """Return the entry of `where` in `gap --json`."""
+        return {
+            "axis": self.axis,
+            "range": [self.low, self.high],
+            "unit": self.unit,
+            "share": self.share,
+            "rmse_v": self.rmse_v,
+            "ci": list(self.ci),
+        }
+
+
+def rms(logs: Sequence[LogErrors], *, after: bool = False) -> float:
+    """Return the RMS error of the judged rows of all logs, before or after [V]."""
+    errors = [(log.after_v if after else log.before_v)[log.judged] for log in logs]
+    return float(np.sqrt(np.mean(np.concatenate(errors) ** 2)))
+
+
+def pieces(logs: Sequence[LogErrors]) -> IntArray:
+    """Return the number of each row's piece of `PIECE_S`, over all logs in order."""
+    numbers, first = [], 0
+    for log in logs:
+        piece = (log.time_s // PIECE_S).astype(np.intp)
+        numbers.append(piece + first)
+        first += int(piece.max(initial=-1)) + 1
+    return np.concatenate(numbers)
+
+
+def drawn_sums(piece: IntArray, *values: FloatArray) -> list[FloatArray]:
+    """Return sums of values over pieces drawn with replacement, shape (draws,) each."""
+    sums = [np.bincount(piece, weights=each) for each in values]
+    draw = np.random.default_rng(0).integers(0, sums[0].size, (DRAWS, sums[0].size))
+    return [np.asarray(each[draw].sum(axis=1)) for each in sums]
+
+
+def error_shares(logs: Sequence[LogErrors], capacity_ah: float) -> list[ErrorShare]:
+    """Return the shares of the given model's squared error; on each axis they sum to one.
+
+    Parameters
+    ----------
+    logs : sequence of LogErrors
+    capacity_ah : float
+        Defines rest [Ah].
+    """
+    square, piece = np.concatenate([log.before_v for log in logs]) ** 2, pieces(logs)
+    shares = []
+
+    def add(  # noqa: PLR0917
+        axis: str, limits: tuple[float, float], unit: str, part: FloatArray, whole: FloatArray,
+        rows: int,
+    ) -> None:  # fmt: skip
+        drawn_part, drawn_whole = drawn_sums(piece, part, whole)
+        low, high = np.quantile(drawn_part / np.maximum(drawn_whole, 1e-12), [0.025, 0.975])
+        share = float(part.sum() / max(float(whole.sum()), 1e-12))
+        rms_v = float(np.sqrt(part.sum() / rows))
+        shares.append(ErrorShare(axis, *limits, unit, share, rms_v, (float(low), float(high))))
+
+    for axis, unit, values, edges in _axes(logs, capacity_ah):
+        for low, high in itertools.pairwise(edges.tolist()):
+            inside = (values >= low) & ((values < high) | (high >= edges[-1]))
+            if inside.any():
+                add(axis, (low, high), unit, square * inside, square, int(inside.sum()))
+    bands = [np.concatenate(parts) ** 2 for parts in zip(*map(_bands, logs), strict=True)]
+    for limits, band in zip(itertools.pairwise(TIME_SCALES_S), bands, strict=True):
+        add("timescale", limits, "s", band, np.sum(bands, axis=0), band.size)
+    return shares
+
+
+def _axes(
+    logs: Sequence[LogErrors], capacity_ah: float
+) -> Iterator[tuple[str, str, FloatArray, FloatArray]]:
+    """Yield name, unit, values of all rows and edges of each axis."""
+    current = np.concatenate([log.current_a for log in logs])
+    yield "soc", "%", np.concatenate([log.soc_pct for log in logs]), np.linspace(-5, 105, 12)
+    temperature = np.concatenate([log.temperature_c for log in logs])
+    low = 5.0 * np.floor(temperature.min() / 5.0)
+    yield "temperature", "°C", temperature, np.arange(low, max(temperature.max(), low + 0.1) + 5, 5)
+    ends = float(current.min()), float(current.max()) + 1e-9
+    inner = capacity_ah * np.array([-0.5, -REST_C_RATE, REST_C_RATE, 0.5, 1.0, 2.0])
+    inside = inner[(inner > ends[0]) & (inner < ends[1])]
+    yield "current", "A", current, np.array([ends[0], *inside, ends[1]])
+    resting = (np.abs(current) < REST_C_RATE * capacity_ah).astype(np.float64)
+    yield "rest", "1 = rest", resting, np.array([0.0, 0.5, 1.0])
+    elapsed = np.concatenate([log.time_s for log in logs])
+    yield "time", "s", elapsed, np.linspace(0.0, float(elapsed.max()) + 1e-9, 6)
+
+
+def _bands(log: LogErrors) -> list[FloatArray]:
+    """Return a log's error in each band of time scales, by moving averages of its rows."""
+    bands, left = [], log.before_v
+    for width in TIME_SCALES_S[1:-1]:
+        smooth = _moving_average(left, int(width))
+        bands.append(left - smooth)
+        left = smooth
+    return [*bands, left]
+
+
+def _moving_average(values: FloatArray, width: int) -> FloatArray:
+    """Return the mean over `width` rows around each row, fewer at the ends."""
+    sums = np.concatenate([[0.0], np.cumsum(values)])
+    row = np.arange(values.size)
+    first, after = (
+        np.maximum(row - width // 2, 0),
+        np.minimum(row + width - width // 2, values.size),
+    )
+    return np.asarray((sums[after] - sums[first]) / (after - first))

@@ -1,0 +1,218 @@
+"""The C core's structures (`core/cangauge.h`) as NumPy data types, and a model as its constants.
+
+Names, order and types are those of the header; `compiled` proves that sizes agree.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any, Final
+
+import numpy as np
+
+from cangauge.estimation.settings import EstimatorSettings
+from cangauge.model.effects.base import CoreForm
+from cangauge.model.extended import OnlineModel
+from cangauge.model.model_file import Model
+from cangauge.model.voltage_model import HermiteCurve, PublishedCurve, resistance_factor
+from cangauge.types import temperature_mismatch
+
+DELAYS, LOW_PASSES, KNOTS, FUNCTIONS, EFFECTS, WAITING = 64, 4, 201, 16, 32, 8192
+OCV, LAGS, VALUES, TESTED = 8, 5, 12, 64
+CURRENTS: Final = DELAYS + LOW_PASSES
+LOADS: Final = CURRENTS + 2
+STATES: Final = FUNCTIONS + 4
+SUMS: Final = LOADS + 5
+"""Upper limits of a model, as in the header."""
+
+KINDS: Final = (
+    "no_effect", "current_sensor", "voltage_sensor", "time_skew", "temperature_lag",
+    "core_temperature", "resistance_temperature", "resistance_soc", "resistance_asymmetry",
+    "resistance_step", "charge_transfer", "rc", "hysteresis", "entropic", "inner_temperature",
+    "ocv_shape", "weak_cell",
+)  # fmt: skip
+"""Kinds of effects, in the order of `cg_effect_kind`."""
+METHODS: Final = ("ekf", "newton", "coulomb")
+"""Methods, in the order of `cg_method`."""
+DOUBTS: Final = ("", "start", "interval", "mismatch")
+"""Doubts, in the order of `cg_doubt`."""
+
+
+_TYPES: Final = {"d": "f8", "i": "i4", "u": "u4", "l": "i8", "b": "?"}
+_SIZES: Final = {name: value for name, value in globals().items() if isinstance(value, int)}
+
+
+def _structure(fields: str, **nested: np.dtype[Any]) -> np.dtype[Any]:
+    """Return the type of a C structure from items `type:name[shape]`."""
+    found: list[tuple[Any, ...]] = []
+    for item in fields.split():
+        kind, _, rest = item.partition(":")
+        name, _, shape = rest.partition("[")
+        of = nested[kind] if kind in nested else np.dtype(_TYPES[kind])
+        numbers = [each for each in shape.rstrip("]").split(",") if each]
+        found.append((name, of, tuple(_SIZES.get(each) or int(each) for each in numbers)))
+    return np.dtype(found, align=True)
+
+
+EFFECT: Final = _structure("i:kind i:lags d:value[VALUES] d:tau_s[LAGS]")
+MODEL: Final = _structure(
+    "d:ocv_v[OCV] d:epsilon d:slope_beyond[2] i:knots d:knot_pct[KNOTS] d:knot_v[KNOTS]"
+    " d:knot_slope[KNOTS] d:t_ref_c d:temperature_limits_c[2] i:delays d:delay_s[DELAYS]"
+    " i:low_passes d:low_pass_s[LOW_PASSES] i:has_arrhenius d:arrhenius_ohm[CURRENTS]"
+    " d:arrhenius_mean d:load[LOADS] d:soc_range_pct[2] d:temperature_range_c[2]"
+    " d:current_range_a[2] d:rate_hz d:capacity_ah d:charge_efficiency d:initial_offset_pct"
+    " d:nominal_v d:level_std_v d:slow_std_v d:slow_time_s d:fast_std_v d:soc_std_pct"
+    " d:cold_exponent d:residual_std_v d:block_s i:tested_blocks d:innovations_at_most"
+    " d:strain_at_most i:functions i:function_knots d:function_pct[KNOTS]"
+    " d:function_v[KNOTS,FUNCTIONS] d:function_slope[KNOTS,FUNCTIONS]"
+    " d:function_load[LOADS,FUNCTIONS] i:effects effect:effect[EFFECTS] d:skew_s",
+    effect=EFFECT,
+)
+SETTINGS: Final = _structure(
+    "i:method d:initial_soc_pct d:initial_soc_std_pct d:valid_std_pct d:gap_s u:reasons"
+    " d:full_voltage_v d:full_current_a d:full_hold_s d:full_soc_pct d:full_soc_std_pct"
+    " d:rest_after_s d:rest_soc_std_pct"
+)
+SAMPLE: Final = _structure("d:time_s d:current_a d:voltage_v d:temperature_c")
+CURRENT: Final = _structure("d:time_s d:current_a")
+LINE: Final = _structure("l:at i:size i:first i:count i:block d:spacing_s d:since_s")
+SKEW: Final = _structure(
+    "sample:waiting[WAITING] current:at[WAITING] i:waiting_first i:waiting_count i:first i:count",
+    sample=SAMPLE, current=CURRENT,
+)  # fmt: skip
+LAG: Final = _structure("d:time_s d:input d:value b:is_started")
+_EKF: Final = _structure(
+    "d:x[STATES] d:p[STATES,STATES] d:evidence d:b[2] d:b_p[2,2] d:b_v[STATES,2] d:innovation2"
+)
+STATE: Final = _structure(
+    "clock:clock counter:counter block:block filter:filter memory:memory lag:low_pass[LOW_PASSES]"
+    " effect:effect[EFFECTS] latest:latest sample:pending d:pending_stamp_s b:is_pending"
+    " b:is_refused u:implausible d:load[LOADS] d:load_v d:drop_v d:beside_soc_v",
+    clock=_structure("d:last_s d:shift_s l:behind d:behind_s d:age_s b:is_restored"),
+    counter=_structure(
+        "d:time_s d:current_a d:mean_square_a2 d:mean_a d:discharged_pct d:moved_pct d:counted_s"
+        " d:gap_var_pct2 b:is_restored"
+    ),
+    block=_structure("l:number i:rows b:is_broken d:sums[SUMS]"),
+    filter=_structure("ekf:ekf[2] i:hypotheses i:decision d:prior_log_odds", ekf=_EKF),
+    memory=_structure(
+        "l:samples l:resets d:first_s l:tick d:temperature_c d:newton_pct d:newton_std_pct"
+        " b:newton_inside d:voltage_model_v d:residual_v b:is_known d:filter_discharged_pct"
+        " d:filter_counted_s d:filter_gap_var_pct2 d:coulomb_start_pct d:coulomb_var_pct2"
+        " d:coulomb_counted_s d:coulomb_moved_pct d:coulomb_gap_var_pct2 d:gap_until_s"
+        " d:contradicted_until_s d:mismatch_until_s i:doubt i:innovations d:innovation2[TESTED]"
+        " d:rest_since_s d:full_since_s b:is_full b:is_rested"
+    ),
+    lag=LAG,
+    effect=_structure("d:volts lag:lag[LAGS]", lag=LAG),
+    latest=_structure(
+        "d:time_s d:soc_pct d:soc_std_pct d:soc_newton_pct d:soc_coulomb_pct d:voltage_model_v"
+        " d:residual_v i:status u:reasons l:samples"
+    ),
+    sample=SAMPLE,
+)
+
+Record = Any
+"""A NumPy record of one of these types."""
+
+
+def core_forms(model: OnlineModel) -> list[CoreForm] | None:
+    """Return the model's effects as the core has them; None if it lacks one, or memory for one."""
+    forms = [
+        effect.core_form(values, model.model, model.extended.pack)
+        for effect, values in model.extended.effects
+    ]
+    known = [form for form in forms if form is not None]
+    voltage = model.model
+    sizes = (
+        (len(known), EFFECTS),
+        (len(voltage.delay_s), DELAYS),
+        (len(voltage.low_pass_s), LOW_PASSES),
+        (model.functions.number, FUNCTIONS),
+        (model.functions.soc_pct.size, KNOTS),
+    )
+    skews = sum(form.kind == "time_skew" for form in known)
+    if len(known) < len(forms) or skews > 1 or any(number > most for number, most in sizes):
+        return None
+    return known
+
+
+def model_constants(
+    model: Model, online: OnlineModel, forms: list[CoreForm], tests: tuple[int, float, float]
+) -> Record:
+    """Return a `cg_model`.
+
+    Parameters
+    ----------
+    model : Model
+    online : OnlineModel
+        Of this model.
+    forms : list of CoreForm
+        From `core_forms`.
+    tests : tuple
+        Number of blocks that are tested together, and the limits of innovations and strain.
+    """
+    voltage, noise, functions = online.model, model.noise, online.functions
+    counting, arrhenius = online.extended.counting(0.0), online.model.arrhenius
+    record = np.zeros(1, MODEL)
+    of = record[0]
+    curve = voltage.curve
+    if isinstance(curve, PublishedCurve):
+        of["ocv_v"], of["epsilon"], of["slope_beyond"] = curve.ocv_v, curve.epsilon, curve.beyond
+    elif isinstance(curve, HermiteCurve):
+        of["knots"] = curve.soc_pct.size
+        _fill(of, knot_pct=curve.soc_pct, knot_v=curve.value, knot_slope=curve.slope)
+    if arrhenius is not None:
+        of["has_arrhenius"] = 1
+        of["arrhenius_mean"] = resistance_factor(arrhenius.mean_c)
+        _fill(of, arrhenius_ohm=arrhenius.resistance_ohm)
+    of["delays"], of["low_passes"] = len(voltage.delay_s), len(voltage.low_pass_s)
+    _fill(
+        of, delay_s=voltage.delay_s, low_pass_s=voltage.low_pass_s,
+        load=voltage.load_coefficients, function_pct=functions.soc_pct,
+        function_v=functions.value, function_slope=functions.slope, function_load=functions.load,
+    )  # fmt: skip
+    for name in ("t_ref_c", "temperature_limits_c", "soc_range_pct", "temperature_range_c",
+                 "current_range_a", "nominal_v"):  # fmt: skip
+        of[name] = getattr(voltage, name)
+    for name in ("level_std_v", "slow_std_v", "slow_time_s", "fast_std_v", "soc_std_pct",
+                 "cold_exponent", "residual_std_v", "block_s"):  # fmt: skip
+        of[name] = getattr(noise, name)
+    of["rate_hz"], of["capacity_ah"] = model.rate_hz, online.capacity_ah
+    of["charge_efficiency"] = counting.charge_efficiency
+    of["initial_offset_pct"] = counting.initial_soc_pct
+    of["tested_blocks"], of["innovations_at_most"], of["strain_at_most"] = tests
+    of["functions"], of["function_knots"] = functions.number, functions.soc_pct.size
+    of["effects"] = len(forms)
+    for effect, form in zip(of["effect"], forms, strict=False):
+        effect["kind"], effect["lags"] = KINDS.index(form.kind), len(form.tau_s)
+        _fill(effect, value=form.values, tau_s=form.tau_s)
+        if form.kind == "time_skew":
+            of["skew_s"] = form.values[0]
+    return of
+
+
+def settings_constants(model: Model, settings: EstimatorSettings) -> Record:
+    """Return a `cg_settings`."""
+    full, rest, start = settings.full_charge, settings.long_rest, settings.initial_soc_pct
+    of = np.zeros(1, SETTINGS)[0]
+    of["method"] = METHODS.index(settings.method)
+    of["initial_soc_pct"] = math.nan if start is None else start
+    for name in ("initial_soc_std_pct", "valid_std_pct", "gap_s"):
+        of[name] = getattr(settings, name)
+    mismatch = temperature_mismatch(model.temperature_source, settings.temperature_source)
+    of["reasons"] = int(mismatch)
+    of["full_voltage_v"] = of["rest_after_s"] = math.nan
+    if full is not None:
+        for name in ("voltage_v", "current_a", "hold_s", "soc_pct", "soc_std_pct"):
+            of[f"full_{name}"] = getattr(full, name)
+    if rest is not None:
+        of["rest_after_s"], of["rest_soc_std_pct"] = rest.after_s, rest.soc_std_pct
+    return of
+
+
+def _fill(record: Record, **values: Any) -> None:
+    """Copy arrays into the beginning of a record's arrays."""
+    for name, value in values.items():
+        array = np.asarray(value, dtype=np.float64)
+        record[name][tuple(slice(size) for size in array.shape)] = array

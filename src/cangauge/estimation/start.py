@@ -1,0 +1,206 @@
+"""Which start is right: one or two Kalman filters, weighed by their likelihoods.
+
+A start that was given may be wrong, and after an interval without samples the car may have been
+charged or driven. Both are the same question: a narrow hypothesis (the SoC is the stated one) and a
+wide one (it is not), each with a filter of its own that uses every voltage. With the log-odds
+
+    ln p(wide)/p(narrow) = ln prior odds + Σ ln N(y; 0, S) of the wide − of the narrow one
+
+the result is the mean weighted by both probabilities, and its variance includes the spread between
+them (static multiple model; Bar-Shalom, Li, Kirubarajan, Estimation with Applications to Tracking
+and Navigation, 2001, ch. 11.6). A hypothesis is dropped once its probability no longer counts.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Final
+
+import numpy as np
+
+from cangauge.errors import InputError
+from cangauge.estimation.ekf import UNKNOWN_STD_PCT, Block, SocFilter
+from cangauge.estimation.state import HypothesesState
+from cangauge.model.extended import OnlineModel
+
+UNKNOWN_PCT: Final = 50.0
+"""Mean of an unknown start [%]."""
+
+WRONG_STD_PCT: Final = 25.0
+"""Standard deviation of a given start that is wrong [%]: about that of any SoC."""
+
+WRONG_PRIOR: Final = 0.3
+"""Prior probability that a given start is wrong (development packs)."""
+
+DROPPED_LOG_ODDS: Final = 20.0
+"""A hypothesis is dropped at these odds: one in 5·10⁸ moves no result by 1e-6 %."""
+
+CLEAR_LOG_ODDS: Final = math.log(100.0)
+"""Odds from which a hypothesis counts as decided, in messages."""
+
+
+class Hypotheses:
+    """One or two filters of the same model, and their odds.
+
+    Parameters
+    ----------
+    model : OnlineModel
+    soc_pct : float, optional
+        Start [%]; None: unknown.
+    soc_std_pct : float
+        Standard deviation of a given start, if it is right [%].
+    is_doubtful : bool
+        Whether a given start may be wrong.
+
+    Attributes
+    ----------
+    filters : list of SocFilter
+        The narrow hypothesis first.
+    decision : int
+        −1: the narrow hypothesis is right, 1: the wide one, 0: not decided.
+    """
+
+    def __init__(
+        self,
+        model: OnlineModel,
+        soc_pct: float | None = None,
+        soc_std_pct: float = 1.0,
+        *,
+        is_doubtful: bool = True,
+    ) -> None:
+        self.model = model
+        self.prior_log_odds = 0.0
+        self.decision = 0
+        if soc_pct is None:
+            self.filters = [SocFilter(model, UNKNOWN_PCT, UNKNOWN_STD_PCT)]
+            return
+        self.filters = [SocFilter(model, soc_pct, soc_std_pct)]
+        if is_doubtful and soc_std_pct < WRONG_STD_PCT:
+            self.filters.append(SocFilter(model, soc_pct, WRONG_STD_PCT))
+            self.prior_log_odds = _log_odds(WRONG_PRIOR)
+
+    @property
+    def log_odds(self) -> float:
+        """Log-odds of the wide hypothesis; −∞ with one filter only."""
+        if len(self.filters) == 1:
+            return -math.inf
+        narrow, wide = self.filters
+        return self.prior_log_odds + wide.evidence - narrow.evidence
+
+    @property
+    def is_rejected(self) -> bool:
+        """Whether the narrow hypothesis is the less likely one."""
+        return self.log_odds > 0.0 if len(self.filters) == 2 else self.decision > 0
+
+    @property
+    def likelier(self) -> SocFilter:
+        """The filter of the likelier hypothesis."""
+        return self.filters[-1 if self.log_odds > 0.0 else 0]
+
+    def predict(self, seconds: float, discharged_pct: float, variance_pct2: float = 0.0) -> None:
+        """Propagate all filters; see `SocFilter.predict`."""
+        for each in self.filters:
+            each.predict(seconds, discharged_pct, variance_pct2)
+
+    def update(self, block: Block) -> None:
+        """Update all filters with a block, and drop a hypothesis that no longer counts."""
+        for each in self.filters:
+            each.update(block)
+        if len(self.filters) == 2 and abs(self.log_odds) > CLEAR_LOG_ODDS:
+            self.decision = 1 if self.log_odds > 0.0 else -1
+            if abs(self.log_odds) > DROPPED_LOG_ODDS:
+                self.filters = [self.likelier]
+
+    def correct(self, soc_pct: float, soc_std_pct: float) -> None:
+        """Continue with the likelier filter alone, corrected by a SoC that is known [%]."""
+        self.filters = [self.likelier]
+        self.filters[0].correct(soc_pct, soc_std_pct)
+
+    def doubt(
+        self, probability: float, std_pct: float, away_s: float = 0.0, parked_std_pct: float = 0.0
+    ) -> None:
+        """Allow for the hypothesis that the SoC has become another one.
+
+        An older question that the voltage has not decided stays open: its wide hypothesis takes
+        the new one in.
+
+        Parameters
+        ----------
+        probability : float
+            Its prior probability.
+        std_pct : float
+            Standard deviation of the SoC under it [%].
+        away_s : float
+            Time without samples [s].
+        parked_std_pct : float
+            Standard deviation of the SoC if it has not [%].
+        """
+        if len(self.filters) == 2 and abs(self.log_odds) < CLEAR_LOG_ODDS:
+            before = 1.0 / (1.0 + math.exp(-self.log_odds))
+            odds = _log_odds(1.0 - (1.0 - before) * (1.0 - probability))
+            self.prior_log_odds += odds - self.log_odds
+        else:
+            wide = SocFilter(self.model, UNKNOWN_PCT, UNKNOWN_STD_PCT)
+            self.filters = [self.likelier, wide.restore(self.likelier.snapshot())]
+            self.prior_log_odds = _log_odds(probability)
+        self.decision = 0
+        narrow, wide = self.filters
+        narrow.predict(0.0, 0.0, parked_std_pct**2, away_s)
+        wide.predict(0.0, 0.0, std_pct**2, away_s)
+
+    def soc_after(
+        self, seconds: float, discharged_pct: float, variance_pct2: float = 0.0
+    ) -> tuple[float, float]:
+        """Return the predicted SoC and its standard deviation [%], both hypotheses weighed."""
+        soc_pct, variance = self.filters[0].soc_after(seconds, discharged_pct, variance_pct2)
+        if len(self.filters) == 2:
+            wide_pct, wide_var = self.filters[1].soc_after(seconds, discharged_pct, variance_pct2)
+            p = 1.0 / (1.0 + math.exp(-self.log_odds))
+            mean_pct = (1.0 - p) * soc_pct + p * wide_pct
+            variance = (1.0 - p) * (variance + (soc_pct - mean_pct) ** 2) + p * (
+                wide_var + (wide_pct - mean_pct) ** 2
+            )
+            soc_pct = mean_pct
+        return soc_pct, math.sqrt(max(variance, LEAST_VAR_PCT2))
+
+    def is_valid(self) -> bool:
+        """Return whether all filters hold usable numbers."""
+        return all(each.is_valid() for each in self.filters)
+
+    def snapshot(self) -> HypothesesState:
+        """Return a copy of everything needed to continue."""
+        filters = [each.snapshot() for each in self.filters]
+        return HypothesesState(filters, self.prior_log_odds, self.decision)
+
+    def restore(self, state: HypothesesState) -> None:
+        """Continue from a state of the same model.
+
+        Raises
+        ------
+        InputError
+            If it has another number of states.
+        """
+        n = self.filters[0].x.size
+        for each in state.filters:
+            bias = each.bias
+            shapes = [np.shape(part) for part in (each.x, each.p, bias.b, bias.p, bias.v)]
+            if shapes != [(n,), (n, n), (2,), (2, 2), (n, 2)]:
+                raise InputError(f"the model's filter has {n} states", field="hypotheses.filters")
+        self.filters = [
+            SocFilter(self.model, UNKNOWN_PCT, UNKNOWN_STD_PCT).restore(each)
+            for each in state.filters
+        ]
+        self.prior_log_odds, self.decision = state.prior_log_odds, state.decision
+
+    def take_over(self, before: Hypotheses) -> None:
+        """Take over offset and capacity from the filter of another model, before any update."""
+        for each in self.filters:
+            each.take_over(before.likelier)
+
+
+LEAST_VAR_PCT2: Final = 1e-6
+"""Least variance of the SoC [%²]: the resolution of its frame is 0.001 %."""
+
+
+def _log_odds(probability: float) -> float:
+    return math.log(probability / (1.0 - probability))

@@ -1,0 +1,237 @@
+"""What the diagnosis would find on a pack: every effect injected into healthy logs of it.
+
+Each log is left out in turn and diagnosed with the others as references: as recorded, and with
+every effect of the twin at three sizes. A size is the RMS change of voltage that it makes, in
+floors: a floor is the RMS error of left-out references. The logs are one's own, or those of a
+simulated pack.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any, Final
+
+import numpy as np
+
+from cangauge._formatting import NONE_KNOWN, number, significant
+from cangauge.diagnosis.answer import GROUP_OF, NONE, Posterior, answer
+from cangauge.diagnosis.evidence import References, analyse, columns, learn
+from cangauge.diagnosis.pack_fit import trace
+from cangauge.errors import InputError
+from cangauge.extras.validation.twin.drive import draw_drive
+from cangauge.extras.validation.twin.faults import Fault, fault_kind, fault_kinds
+from cangauge.extras.validation.twin.injection import fit_surrogate_pack, inject, scale_injection
+from cangauge.extras.validation.twin.pack import Pack
+from cangauge.extras.validation.twin.recording import record_drive
+from cangauge.extras.validation.twin.simulation import draw_plant
+from cangauge.logs.log import Log
+
+FLOORS: Final = (1.0, 2.0, 4.0)
+"""Injected sizes [floors]."""
+LEAST_LOGS: Final = 4
+"""One is diagnosed, three are its references, as `gap` asks for."""
+SIMULATED_LOGS: Final = 6
+SCHEMA: Final = 2
+_REACHED: Final = 0.8
+"""Part of the wanted size below which the physical limits of an effect count as reached."""
+
+
+@dataclass(frozen=True)
+class Finding:
+    """The diagnosis of one log."""
+
+    log: str
+    effect: str | None
+    """Injected effect; None: the log as recorded."""
+    floors: float
+    """Size reached [floors]."""
+    size: float
+    unit: str
+    group_right: bool
+    """Whether the likeliest group is that of the effect."""
+    name_right: bool
+    """Whether the most probable answer is the effect, or `none`."""
+    detected: bool
+    probability: float
+    """Of the truth."""
+
+
+@dataclass(frozen=True, eq=False)
+class CheckedPack:
+    """Healthy logs of one pack.
+
+    Parameters
+    ----------
+    logs : tuple of Log
+        At least four, each with its start in `soc_pct`.
+    capacity_ah : float
+    pack : Pack
+        Its physics, for the injected effects.
+    """
+
+    logs: tuple[Log, ...]
+    capacity_ah: float
+    pack: Pack
+
+    @classmethod
+    def of_logs(cls, logs: Sequence[Log], capacity_ah: float, cells: int) -> CheckedPack:
+        """Return one's own pack, whose physics is fitted to the logs.
+
+        Raises
+        ------
+        InputError
+            If there are too few logs, or one has no SoC.
+        """
+        if len(logs) < LEAST_LOGS:
+            raise InputError(
+                f"{len(logs)} healthy logs are too few: one is diagnosed, the others are its"
+                " references",
+                field="--logs",
+                cure=f"give at least {LEAST_LOGS}",
+            )
+        pack = fit_surrogate_pack(logs, capacity_ah=capacity_ah, cells=cells)
+        return cls(tuple(logs), capacity_ah, pack)
+
+    @classmethod
+    def simulated(cls, seed: int) -> CheckedPack:
+        """Return a simulated pack with a discharge and five drives."""
+        plant, rng = draw_plant(np.random.default_rng([seed, 1])), np.random.default_rng([seed, 2])
+        pack, ambient_c = plant.pack, rng.uniform(8.0, 25.0)
+        drives = [
+            draw_drive(
+                rng, pack, hours=2.0, ambient_c=float(ambient_c), start_soc=1.0, end_soc=0.05,
+                discharge=True,
+            ),
+            *[
+                draw_drive(rng, pack, hours=0.8, ambient_c=float(ambient_c + away))
+                for away in np.linspace(-7.0, 7.0, SIMULATED_LOGS - 1)
+            ],
+        ]  # fmt: skip
+        logs = tuple(
+            record_drive(plant, drive, (), name=f"drive_{k}").log
+            for k, drive in enumerate(drives, start=1)
+        )
+        return cls(logs, pack.capacity_ah, pack)
+
+    def findings(self, at_most: int | None = None) -> Iterator[Finding]:
+        """Yield the diagnoses of each log left out: as it is, then with every effect.
+
+        Parameters
+        ----------
+        at_most : int, optional
+            Leave out at most this many logs, evenly among them.
+        """
+        count = len(self.logs) if at_most is None else min(at_most, len(self.logs))
+        for place in np.linspace(0.0, len(self.logs) - 1.0, count):
+            k = round(float(place))
+            others = [*self.logs[:k], *self.logs[k + 1 :]]
+            known = learn([trace(log, self.capacity_ah) for log in others], self.capacity_ah)
+            yield self._finding(known, self.logs[k], None)
+            for kind in fault_kinds():
+                for floors in FLOORS:
+                    found = self._injected(known, self.logs[k], kind.id, floors)
+                    if found is None:
+                        break  # no larger size is possible
+                    yield found
+
+    def _injected(self, known: References, log: Log, effect: str, floors: float) -> Finding | None:
+        kind, sign = fault_kind(effect), -1.0 if effect == "initial_soc" else 1.0
+        shape = {"at_s": 0.4 * log.duration_s} if "at_s" in kind.shape else {}
+        floor_v = known.healthy_v2**0.5
+        fault = Fault(effect, sign, shape, seed=0)
+        scaled = scale_injection([log], fault, floors * floor_v, self.pack)
+        if scaled.reached_v < _REACHED * floors * floor_v:
+            return None
+        injected = inject(log, [scaled.fault], self.pack).log
+        return self._finding(known, injected, scaled.fault, scaled.reached_v / floor_v)
+
+    def _finding(
+        self, known: References, log: Log, fault: Fault | None, floors: float = 0.0
+    ) -> Finding:
+        evidence = analyse(known, [columns(known, trace(log, self.capacity_ah))])
+        found: Posterior = answer(known, evidence)
+        truth = NONE if fault is None else fault.id
+        first = next(iter(found.group_shares))
+        return Finding(
+            log=log.name,
+            effect=None if fault is None else fault.id,
+            floors=floors,
+            size=0.0 if fault is None else fault.size,
+            unit="" if fault is None else fault.kind.unit,
+            group_right=first == GROUP_OF.get(truth),
+            name_right=found.verdict == truth,
+            detected=found.detected,
+            probability=found.probabilities[truth],
+        )
+
+
+PER_LOG: Final = 1 + len(fault_kinds()) * len(FLOORS)
+"""Diagnoses of each log left out, at most."""
+
+
+def summarize(findings: Sequence[Finding]) -> dict[str, Any]:
+    """Return the result as one JSON object."""
+    healthy = [item for item in findings if item.effect is None]
+    effects = []
+    for kind in fault_kinds():
+        mine = [item for item in findings if item.effect == kind.id]
+        sizes = [
+            {
+                "floors": floors,
+                "size": float(np.mean([abs(item.size) for item in of])),
+                "of": len(of),
+                "group_right": sum(item.group_right for item in of),
+                "named": sum(item.name_right for item in of),
+                "detected": sum(item.detected for item in of),
+                "probability": float(np.mean([item.probability for item in of])),
+            }
+            for floors in FLOORS
+            if (of := [x for x in mine if _REACHED * floors <= x.floors < floors / _REACHED])
+        ]
+        effects.append(
+            {"effect": kind.id, "group": GROUP_OF[kind.id], "unit": kind.unit, "sizes": sizes}
+        )
+    return {
+        "schema": SCHEMA,
+        "healthy": {
+            "logs": len(healthy),
+            "alarms": sum(item.detected for item in healthy),
+            "probability_none": float(np.mean([item.probability for item in healthy])),
+        },
+        "effects": effects,
+        "cases": [asdict(item) for item in findings],
+    }
+
+
+def table(result: dict[str, Any]) -> tuple[list[str], list[list[str]]]:
+    """Return headings and rows: how often the group and the name of each effect are right."""
+    rows = []
+    for item in result["effects"]:
+        cells = []
+        for floors in FLOORS:
+            of = next((each for each in item["sizes"] if each["floors"] == floors), None)
+            if of is None:
+                cells.append(NONE_KNOWN)
+                continue
+            unit = "" if item["unit"] == "-" else item["unit"]
+            cells.append(
+                f"{significant(of['size'], 2, unit)}: {of['group_right']}/{of['of']},"
+                f" {of['named']}/{of['of']}"
+            )
+        rows.append([item["effect"], *cells])
+    return ["<effect", *(f"{floors:g} floor{'s' * (floors > 1)}" for floors in FLOORS)], rows
+
+
+def summary(result: dict[str, Any]) -> str:
+    """Return what this diagnosis would find, in a sentence or two."""
+    sizes = [each for item in result["effects"] for each in item["sizes"]]
+    of = max(sum(each["of"] for each in sizes), 1)
+    group = sum(each["group_right"] for each in sizes) / of
+    name = sum(each["named"] for each in sizes) / of
+    healthy = result["healthy"]
+    return (
+        f"The right group came first in {number(100.0 * group, 0, '%')} of {of} injected effects,"
+        f" the right name in {number(100.0 * name, 0, '%')}. False alarms:"
+        f" {healthy['alarms']} of {healthy['logs']} healthy logs."
+    )

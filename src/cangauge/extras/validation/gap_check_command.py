@@ -1,0 +1,80 @@
+"""`cangauge gap-check`: what the diagnosis would find on a pack."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from cangauge.cli.options import JsonOption, Reading, assumed_of, option_groups, within
+from cangauge.cli.output import emit_json, note, print_table, progress_shown
+from cangauge.errors import InputError
+
+
+@option_groups("temperature_source")
+def gap_check_command(
+    logs: Annotated[
+        list[Path] | None,
+        typer.Argument(
+            metavar="[LOG]…",
+            help="Your own logs without a fault, four at least. Default: a simulated pack.",
+        ),
+    ] = None,
+    capacity_ah: Annotated[
+        float | None,
+        typer.Option(
+            metavar="A", help="Charge of the logs' pack from 100 to 0 % [Ah]; needed with LOGs."
+        ),
+    ] = None,
+    cells: Annotated[
+        int, typer.Option(metavar="N", min=1, help="Cells in series of the logs' pack.")
+    ] = 96,
+    at_most: Annotated[
+        int | None, typer.Option(metavar="N", min=1, help="Leave out at most this many logs.")
+    ] = None,
+    seed: Annotated[int, typer.Option(metavar="N", min=0, help="Of the simulated pack.")] = 1,
+    *,
+    reading: Reading,
+    json_output: JsonOption = False,
+) -> None:
+    """Measure what `gap` would find: every effect injected into healthy logs of a pack.
+
+    Each log is left out in turn and diagnosed with the others as references: as it is, and with
+    every effect at one, two and four times the error of left-out references. The table has the
+    injected size, how often the right group came first, and how often the right name did.
+
+    Examples
+    --------
+    `cangauge gap-check mine/*.csv --capacity-ah 60 --cells 96`
+
+    `cangauge gap-check --seed 3 --at-most 2`
+    """
+    from cangauge.extras.validation.gap_check import (
+        PER_LOG,
+        CheckedPack,
+        summarize,
+        summary,
+        table,
+    )
+
+    within(capacity_ah, 1e-3, 1e5, option="--capacity-ah", unit="Ah")
+    if logs:
+        if capacity_ah is None:
+            raise InputError(
+                "unknown capacity of the pack", field="--capacity-ah", cure="give it in Ah"
+            )
+        read = [reading.load(path) for path in logs]
+        pack = CheckedPack.of_logs(read, capacity_ah, cells)
+    else:
+        read, pack = [], CheckedPack.simulated(seed)
+    left_out = min(at_most or len(pack.logs), len(pack.logs))
+    note(f"at most {left_out * PER_LOG} diagnoses, about half a second each")
+    with progress_shown("cangauge.validation"):
+        result = summarize(list(pack.findings(at_most)))
+    if json_output:
+        emit_json(result | {"assumed": assumed_of(read)})
+        return
+    typer.echo(summary(result))
+    headings, rows = table(result)
+    print_table("Injected size: right group first, right name first", headings, rows)

@@ -1,0 +1,317 @@
+"""Weighted least squares of the curve of knots, from sums of each log, with the prior's rows.
+
+    U = g(S) + kt·(T − T_r) + Σm Rm·Im + b·(a(T)/a(T̄) − 1)·Σm R⁰m·Im + Σe αe·xe + level + noise
+
+The fit needs of a log only its second moments (`LogSums`), so that logs left out and logs pooled
+are sums. A row counts for its time, less where its percent of SoC is full of rows or where the
+curve is so steep that the error of SoC dominates. Rows of a minute count as one independent datum.
+The level of each log is eliminated. R⁰ are the resistances of the fit before, so the equation is
+linear; the noise variance is a fixed point.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Final
+
+import numpy as np
+
+from cangauge._typing import FloatArray
+from cangauge.identify.rows import FitRows
+from cangauge.model.prior import REFERENCE_C, RESISTANCE_H, Chemistry, prior_of
+from cangauge.model.voltage_model import KNOTS_PCT, hermite_basis, resistance_factor
+
+N: Final = KNOTS_PCT.size
+"""Knots of the curve."""
+M: Final = len(RESISTANCE_H)
+"""Currents: delayed and low-passed."""
+P: Final = N + 1 + M + 1
+"""Coefficients: knots, kt, resistances, b."""
+BASE: Final = N + 1 + 2 * M
+"""Columns of the moments before those of effects: curve, T − T_r, currents, a(T)·currents."""
+
+SECONDS_PER_DATUM: Final = 60.0
+"""Time that counts as one independent datum [s]: residuals of recorded trips correlate by 0.8 at
+1 s and 0.3–0.5 at 60 s."""
+SECONDS_PER_PERCENT: Final = 600.0
+"""Most time that one log may count within one percent of SoC [s]: rests and charging at constant
+voltage repeat themselves."""
+SLOPE_NOISE: Final = 0.003
+"""Voltage noise relative to the mean voltage against which an uncertain SoC is weighed: the
+published model leaves 0.25 %."""
+ADDED_STD: Final = 0.0015
+"""Error of the model added to the residuals, relative to the mean voltage: residuals of few logs
+are too small (development packs)."""
+B_LEFT_STD: Final = 0.25
+"""Spread of b that no log settles [-]: the activation energy differs between cells."""
+LEFT_OUT_PRIOR: Final = 2.0
+"""Logs that the prior counts as when left-out logs scale the covariance."""
+LOGS_AT_LEAST: Final = 3
+"""Logs from which on they are left out in turn."""
+FOLDS_AT_MOST: Final = 40
+"""Groups of logs that are left out; with more logs several are left out together."""
+ITERATIONS: Final = 12
+CONVERGED: Final = 1e-3
+"""Steps of the noise variance at most, and its relative change that ends them."""
+
+
+@dataclass(frozen=True, eq=False)
+class LogSums:
+    """Weighted second moments of one log: all that the fit needs of it.
+
+    Parameters
+    ----------
+    moments : array of shape (q, q)
+        Of curve, T − T_r, currents, a(T)·currents, effects' columns, 1 and voltage.
+    weight : float
+        Sum of the rows' weights [s].
+    mean_soc_pct : float
+        Their mean SoC [%].
+    """
+
+    moments: FloatArray
+    weight: float
+    mean_soc_pct: float
+
+    @property
+    def mean_c(self) -> float:
+        """Mean temperature [°C]."""
+        return REFERENCE_C + float(self.moments[-2, N]) / self.weight
+
+    def with_columns(self, columns: Sequence[int]) -> LogSums:
+        """Return the sums with some of the effects' columns only."""
+        q = len(self.moments)
+        kept = [*range(BASE), *(BASE + column for column in columns), q - 2, q - 1]
+        return replace(self, moments=self.moments[np.ix_(kept, kept)])
+
+
+def load_features(temperature_c: FloatArray, currents_a: FloatArray) -> FloatArray:
+    """Return T − T_r [K], Im [A] and a(T)·Im [A], shape (n, 1 + 2M)."""
+    colder = resistance_factor(temperature_c)[:, None]
+    above = (temperature_c - REFERENCE_C)[:, None]
+    return np.concatenate([above, currents_a, colder * currents_a], axis=1)
+
+
+def row_weights(soc_pct: FloatArray, seconds: FloatArray, chemistry: Chemistry) -> FloatArray:
+    """Return the weight of each row of a log [s], shape (n,); 0 far outside 0–100 %."""
+    percent = np.clip(np.floor(soc_pct).astype(np.intp) + 1, 0, 102)
+    counted = np.minimum(seconds, SECONDS_PER_DATUM)
+    full = np.bincount(percent, counted, minlength=103)[percent]
+    curve = chemistry.curve_v / np.interp(50.0, KNOTS_PCT, chemistry.curve_v)
+    slope = np.interp(soc_pct, KNOTS_PCT, np.gradient(curve, KNOTS_PCT))
+    steep = 1.0 + (chemistry.soc_std_pct * slope / SLOPE_NOISE) ** 2
+    weight = counted * np.minimum(1.0, SECONDS_PER_PERCENT / full) / steep
+    return np.where((soc_pct > -1.0) & (soc_pct < 101.0), weight, 0.0)
+
+
+def row_features(rows: FitRows) -> FloatArray:
+    """Return the columns of the moments before those of effects, shape (m, BASE)."""
+    loads = load_features(rows.dequantized_c, rows.currents_a)
+    return np.concatenate([hermite_basis(rows.soc_pct), loads], axis=1)
+
+
+def log_sums(
+    rows: FitRows,
+    chemistry: Chemistry,
+    extra: FloatArray | None = None,
+    features: FloatArray | None = None,
+) -> LogSums:
+    """Return the sums of a log.
+
+    Parameters
+    ----------
+    rows : FitRows
+    chemistry : Chemistry
+    extra : array of shape (m, e), optional
+        Columns of effects.
+    features : array of shape (m, BASE), optional
+        Instead of `row_features`.
+    """
+    weight = row_weights(rows.soc_pct, rows.seconds, chemistry)
+    columns = [row_features(rows) if features is None else features]
+    if extra is not None:
+        columns.append(extra)
+    table = np.column_stack([*columns, np.ones(len(rows)), rows.voltage_v])
+    total = float(weight.sum())
+    mean_soc = float(weight @ rows.soc_pct) / max(total, 1e-9)
+    return LogSums(table.T @ (table * weight[:, None]), total, mean_soc)
+
+
+@dataclass(frozen=True, eq=False)
+class Solution:
+    """Posterior of the coefficients.
+
+    Parameters
+    ----------
+    coefficients : array of shape (p,)
+        Knots [V], kt [V/K], resistances [Ω], b [-], amplitudes of effects.
+    covariance : array of shape (p, p)
+        Theirs; scaled by left-out logs where `scale` says so.
+    select : array of shape (p, q − 2)
+        Maps the columns of the moments to the coefficients' columns.
+    arrhenius_ohm : array of shape (M,)
+        Resistances R⁰ that b scales [Ω].
+    residual_v : float
+        Rms residual [V].
+    mean_v, mean_c : float
+        Mean voltage V0 [V] and temperature T̄ [°C] of the logs.
+    scale : float
+        κ²: how much larger than stated the errors of left-out logs are.
+    """
+
+    coefficients: FloatArray
+    covariance: FloatArray
+    select: FloatArray
+    arrhenius_ohm: FloatArray
+    residual_v: float
+    mean_v: float
+    mean_c: float
+    scale: float = 1.0
+
+    def mean_error(self, sums: LogSums) -> tuple[float, float]:
+        """Return the mean residual of a log [V], and its variance by the coefficients [V²]."""
+        row = self.select @ (sums.moments[:-2, -2] / sums.weight)
+        error = float(sums.moments[-2, -1]) / sums.weight - float(row @ self.coefficients)
+        return error, float(row @ self.covariance @ row)
+
+    def residual_v_of(self, columns: FloatArray, voltage_v: FloatArray) -> FloatArray:
+        """Return measured minus predicted voltage of rows [V], shape (m,).
+
+        Parameters
+        ----------
+        columns : array of shape (m, q − 2)
+            Those of the moments.
+        voltage_v : array of shape (m,)
+        """
+        return np.asarray(voltage_v - columns @ (self.select.T @ self.coefficients))
+
+    def square_error(self, sums: LogSums) -> float:
+        """Return the mean square residual of a log, its level included [V²]."""
+        back = np.r_[self.select.T @ self.coefficients, 0.0, -1.0]
+        return float(back @ sums.moments @ back) / sums.weight
+
+
+def solve(
+    sums: Sequence[LogSums],
+    capacity_ah: float,
+    chemistry: Chemistry,
+    amplitude_std: FloatArray | None = None,
+) -> Solution:
+    """Return the posterior of the coefficients for some logs.
+
+    Parameters
+    ----------
+    sums : sequence of LogSums, one or more
+    capacity_ah : float
+        [Ah].
+    chemistry : Chemistry
+    amplitude_std : array of shape (e,), optional
+        Prior standard deviations of the effects' amplitudes, of mean 0.
+    """
+    moments = np.array([item.moments for item in sums])
+    total, weights = moments.sum(axis=0), np.array([item.weight for item in sums])
+    weight = float(weights.sum())
+    mean_v = float(total[-2, -1]) / weight
+    mean_c = REFERENCE_C + float(total[-2, N]) / weight
+    mean_soc = float(weights @ [item.mean_soc_pct for item in sums]) / weight
+    prior = prior_of(chemistry, mean_v, mean_soc, capacity_ah)
+    extra = np.zeros(0) if amplitude_std is None else amplitude_std
+    size = P + extra.size
+    mean = np.r_[prior.mean, np.zeros(extra.size)]
+    precision = np.zeros((size, size))
+    precision[:N, :N] = np.linalg.inv(prior.covariance[:N, :N])
+    rest = np.arange(N, size)
+    precision[rest, rest] = np.r_[1.0 / np.diag(prior.covariance)[N:], extra**-2.0]
+    colder = np.maximum(1.0, resistance_factor(np.array([item.mean_c for item in sums])))
+    level_std = chemistry.level_std * mean_v * colder**chemistry.cold_exponent
+    warm, ohm = float(resistance_factor(mean_c)), prior.resistance_ohm
+    for _ in range(2):  # the column of b needs the resistances: twice
+        select = np.zeros((size, len(total) - 2))
+        at = np.arange(N + 1 + M)
+        select[at, at] = 1.0
+        select[P - 1, N + 1 : N + 1 + M] = -ohm
+        select[P - 1, N + 1 + M : BASE] = ohm / warm
+        select[np.arange(P, size), np.arange(BASE, BASE + extra.size)] = 1.0
+        normal = select @ total[:-2, :-2] @ select.T
+        right = select @ total[:-2, -1] - normal @ mean
+        of_log = moments[:, :-2, -2] @ select.T
+        log_right = moments[:, -2, -1] - of_log @ mean
+        square = float(total[-1, -1] - mean @ (select @ total[:-2, -1] + right))
+        variance = prior.residual_v**2
+        for _ in range(ITERATIONS):
+            datum = variance * SECONDS_PER_DATUM
+            share = 1.0 / (weights + datum / level_std**2)  # of a log's level, eliminated
+            reduced = (normal - (of_log * share[:, None]).T @ of_log) / datum + precision
+            step = np.linalg.solve(reduced, (right - of_log.T @ (share * log_right)) / datum)
+            level = share * (log_right - of_log @ step)
+            left = square - 2.0 * float(step @ right) + float(step @ normal @ step)
+            left += float(level @ (weights * level - 2.0 * (log_right - of_log @ step)))
+            residual2 = max(left, 0.0) / weight
+            following = residual2 + (ADDED_STD * mean_v) ** 2
+            if abs(following / variance - 1.0) < CONVERGED:
+                break
+            variance = following
+        coefficients = mean + step
+        fitted = coefficients[N + 1 : N + 1 + M]
+        arrhenius_ohm = ohm
+        ohm = fitted if fitted.sum() < 0.0 else prior.resistance_ohm
+    covariance = np.linalg.inv(reduced)
+    covariance = 0.5 * (covariance + covariance.T)
+    covariance[P - 1, P - 1] += B_LEFT_STD**2
+    return Solution(
+        coefficients, covariance, select, arrhenius_ohm, float(np.sqrt(residual2)), mean_v, mean_c
+    )
+
+
+def folds(number: int) -> list[list[int]]:
+    """Return the logs of each fold that is left out; none for fewer than `LOGS_AT_LEAST`."""
+    if number < LOGS_AT_LEAST:
+        return []
+    count = min(number, FOLDS_AT_MOST)
+    return [list(range(fold, number, count)) for fold in range(count)]
+
+
+def solve_without(
+    sums: Sequence[LogSums],
+    capacity_ah: float,
+    chemistry: Chemistry,
+    amplitude_std: FloatArray | None = None,
+) -> list[Solution]:
+    """Return for each log the posterior of the logs outside its fold; [] for too few logs."""
+    found: dict[int, Solution] = {}
+    for left_out in folds(len(sums)):
+        others = [item for number, item in enumerate(sums) if number not in left_out]
+        solution = solve(others, capacity_ah, chemistry, amplitude_std)
+        found.update(dict.fromkeys(left_out, solution))
+    return [found[number] for number in sorted(found)]
+
+
+def left_out_scale(
+    sums: Sequence[LogSums], without: Sequence[Solution], chemistry: Chemistry
+) -> float:
+    """Return κ²: mean squares of left-out logs' errors over those stated, 1 at least."""
+    squares = []
+    for item, other in zip(sums, without, strict=False):
+        if item.weight < SECONDS_PER_DATUM:
+            continue
+        error, variance = other.mean_error(item)
+        colder = max(1.0, float(resistance_factor(item.mean_c))) ** chemistry.cold_exponent
+        level2 = (chemistry.level_std * other.mean_v * colder) ** 2
+        fast2 = other.residual_v**2 + (ADDED_STD * other.mean_v) ** 2
+        fast2 *= SECONDS_PER_DATUM / item.weight
+        squares.append(error**2 / (variance + level2 + fast2))
+    return max(1.0, (LEFT_OUT_PRIOR + float(np.sum(squares))) / (LEFT_OUT_PRIOR + len(squares)))
+
+
+def solve_scaled(
+    sums: Sequence[LogSums],
+    capacity_ah: float,
+    chemistry: Chemistry,
+    amplitude_std: FloatArray | None = None,
+) -> tuple[Solution, list[Solution]]:
+    """Return the posterior scaled by left-out logs, and those of `solve_without`."""
+    solution = solve(sums, capacity_ah, chemistry, amplitude_std)
+    without = solve_without(sums, capacity_ah, chemistry, amplitude_std)
+    scale = left_out_scale(sums, without, chemistry)
+    return replace(solution, covariance=solution.covariance * scale, scale=scale), without

@@ -1,0 +1,187 @@
+"""Rows of a log that take part in a fit, at the model's rate.
+
+A row passes these rules, in this order:
+
+1. Decimation: the first sample at or after each tick of `rate_hz`; a slower log is kept whole.
+2. Start-up and shut-down: rows with a voltage below half the log's median (contactor open,
+   pre-charge) are removed, and rows within `GUARD_S` of one.
+3. Delay line: rows within the longest delay (70 s) of the log's start, or of the end of a gap in
+   the current longer than `gap_s`, are removed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cangauge._typing import FloatArray
+from cangauge.errors import InputError
+from cangauge.logs.gaps import BRIDGE_S, usual_gap_s, usual_step_s
+from cangauge.logs.log import Log
+from cangauge.logs.resample import dequantize
+from cangauge.model.coulomb_counting import counted_soc_pct
+from cangauge.model.delay_line import GAP_S, delayed_currents, filled_at
+from cangauge.model.first_order import low_passed
+from cangauge.model.prior import DELAYS_S, LOW_PASS_S
+
+LOW_VOLTAGE = 0.5
+"""Rows below this fraction of the log's median voltage are start-up or shut-down."""
+
+GUARD_S = 2.0
+"""Distance of a row from start-up and shut-down rows, at least [s]."""
+
+SOC_TOLERANCE_PCT = 3.0
+"""Excess of a counted SoC over 0–100 % from which the capacity or the start must be wrong [%]."""
+
+SOC_SPAN_AT_LEAST_PCT = 2.0
+"""Least SoC span of the logs from which a published curve is printed [%]: below, its eight terms
+share one level and one slope."""
+
+
+@dataclass(frozen=True, eq=False)
+class FitRows:
+    """Rows of one log, shape (m,) each; currents (m, M)."""
+
+    name: str
+    at: NDArray[np.intp]
+    """Index of the rows in the log."""
+    time_s: FloatArray
+    seconds: FloatArray
+    """Time that each row stands for [s]."""
+    voltage_v: FloatArray
+    temperature_c: FloatArray
+    """As reported [°C]: the input of an estimator."""
+    dequantized_c: FloatArray
+    """Interpolated between the steps of the reports [°C] (`logs.resample.dequantize`)."""
+    soc_pct: FloatArray
+    """Counted SoC [%]."""
+    currents_a: FloatArray
+    """I(t − dj), then the low-passed currents [A]; positive = discharge."""
+    removed: dict[str, int]
+    """Number of rows removed by each rule."""
+
+    def __len__(self) -> int:
+        """Return the number of rows."""
+        return int(self.time_s.size)
+
+
+def fit_rows(
+    log: Log,
+    capacity_ah: float,
+    *,
+    rate_hz: float = 1.0,
+    delay_s: Sequence[float] = DELAYS_S,
+    low_pass_s: Sequence[float] = LOW_PASS_S,
+    soc_tolerance_pct: float = SOC_TOLERANCE_PCT,
+) -> FitRows:
+    """Return the rows of a log that take part in a fit.
+
+    Parameters
+    ----------
+    log : Log
+        Counting starts from its first finite `soc_pct`.
+    capacity_ah : float
+        Charge from 100 to 0 % [Ah].
+    rate_hz : float
+    delay_s, low_pass_s : sequence of float
+        Columns of `currents_a` [s].
+    soc_tolerance_pct : float
+        Excess of the counted SoC over 0–100 % that is accepted [%].
+
+    Raises
+    ------
+    InputError
+        If no row is left, the SoC is known nowhere, or the counted SoC leaves 0–100 % by more than
+        the tolerance.
+    """
+    source = log.source or log.name
+    soc = counted_soc_pct(log, capacity_ah, None)
+    low, high = float(soc.min()), float(soc.max())
+    if low < -soc_tolerance_pct or high > 100.0 + soc_tolerance_pct:
+        raise InputError(
+            f"the SoC counted with {capacity_ah:.2f} Ah runs from {high:.1f} to {low:.1f} %",
+            source=source,
+            field="soc_pct",
+            cure="check --capacity-ah, the SoC at the start (soc_pct, --initial-soc) and the sign"
+            " of current (positive must discharge; see `cangauge inspect`)",
+        )
+    at, removed = usable_rows(log, delay_s, rate_hz)
+    if at.size < 2:
+        raise InputError(
+            f"no rows are left for the fit: the log lasts {log.duration_s:.0f} s, and the first"
+            f" {max(delay_s):.0f} s, and as long after each gap, fill the delay line",
+            source=source,
+            cure="give a longer log",
+        )
+    time_s, current_a = log.time_s, log.current_a
+    smooth = [low_passed(time_s, current_a, tau, 0.0, rest_s=BRIDGE_S)[at] for tau in low_pass_s]
+    delayed = delayed_currents(time_s, current_a, delay_s, time_s[at])
+    usual_s = usual_step_s(time_s[at])
+    return FitRows(
+        name=log.name,
+        at=at,
+        time_s=time_s[at],
+        seconds=np.full(at.size, usual_s),
+        voltage_v=log.voltage_v[at],
+        temperature_c=log.temperature_c[at],
+        dequantized_c=dequantize(log).temperature_c[at],
+        soc_pct=soc[at],
+        currents_a=np.column_stack([delayed, *smooth]),
+        removed=removed,
+    )
+
+
+def decimate(time_s: FloatArray, rate_hz: float) -> NDArray[np.intp]:
+    """Return the index of the first sample at or after each tick of `rate_hz`."""
+    tick = np.floor((time_s - time_s[0]) * rate_hz + 1e-6)
+    return np.flatnonzero(np.concatenate(([True], np.diff(tick) > 0.0)))
+
+
+def running_rows(time_s: FloatArray, voltage_v: FloatArray) -> NDArray[np.bool_]:
+    """Return the mask of rows that are neither start-up nor shut-down (rule 2), shape (n,)."""
+    down = voltage_v < LOW_VOLTAGE * float(np.median(voltage_v))
+    if not down.any():
+        return ~down
+    at = time_s[down]
+    right = np.searchsorted(at, time_s)
+    to_next = np.where(right < at.size, at[np.minimum(right, at.size - 1)] - time_s, np.inf)
+    to_last = np.where(right > 0, time_s - at[np.maximum(right - 1, 0)], np.inf)
+    return np.asarray(np.minimum(to_next, to_last) > GUARD_S) & ~down
+
+
+def usable_delays(logs: Sequence[Log], delay_s: Sequence[float]) -> tuple[float, ...]:
+    """Return the delays that the fastest of some logs resolves [s].
+
+    Between rows the current is interpolated, so that the columns of delays closer together than a
+    row depend on each other.
+
+    Parameters
+    ----------
+    logs : sequence of Log
+    delay_s : sequence of float
+        Increasing from 0 [s].
+    """
+    step_s = min(usual_step_s(log.time_s) for log in logs)
+    kept = [delay_s[0]]
+    for delay in delay_s[1:]:
+        if step_s <= delay - kept[-1] + 1e-9:
+            kept.append(delay)
+    return tuple(kept)
+
+
+def usable_rows(
+    log: Log, delay_s: Sequence[float], rate_hz: float
+) -> tuple[NDArray[np.intp], dict[str, int]]:
+    """Return the indices of the rows of a log that take part in a fit, and the numbers removed."""
+    ticks = decimate(log.time_s, rate_hz)
+    running = running_rows(log.time_s, log.voltage_v)[ticks]
+    full = filled_at(log.time_s, max(delay_s), log.time_s[ticks], usual_gap_s(log.time_s, GAP_S))
+    removed = {
+        "decimation": len(log) - ticks.size,
+        "start_up_or_shut_down": int(np.sum(~running)),
+        "delay_line_filling": int(np.sum(running & ~full)),
+    }
+    return ticks[running & full], removed

@@ -1,0 +1,151 @@
+"""First-order lag on irregular samples: τ·dy/dt = x − y, with x linear between samples.
+
+    y_k = a·y_{k−1} + (1 − a)·x_k + b·(x_{k−1} − x_k),   a = e^(−Δ/τ),   b = (1 − a)·τ/Δ − a
+
+Over a step longer than `rest_s` the input is unknown and counts as zero: y_k = a·y_{k−1}. The
+Coulomb counter uses the same rule: the pack is assumed to have rested. A missing input (NaN)
+changes nothing, and has no output.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Sequence
+
+import numpy as np
+
+from cangauge._typing import FloatArray
+
+NO_LAG_S = 1e-3
+"""A time constant up to this is no lag: output = input [s]."""
+
+BLOCK_TIME_CONSTANTS = 300.0
+"""Time constants summed in one block: e³⁰⁰, times e⁵⁰ for a last step, does not overflow."""
+
+FULL_DECAY = 50.0
+"""Time constants after which a state has decayed completely (2·10⁻²²)."""
+
+
+def decaying_sum(decay: FloatArray, drive: FloatArray, start: float) -> FloatArray:
+    """Return y_k = e^(−decay_k)·y_{k−1} + drive_k with y_0 = start, shape (n + 1,).
+
+    Parameters
+    ----------
+    decay, drive : array of shape (n,)
+        Decay over each step (≥ 0) and the increment of each step.
+    start : float
+        Value before the first step.
+    """
+    result = np.empty(decay.size + 1)
+    result[0] = start
+    # Limiting each step to `FULL_DECAY` keeps e^elapsed finite.
+    elapsed = np.zeros(decay.size + 1)
+    np.cumsum(np.minimum(decay, FULL_DECAY), out=elapsed[1:])
+    blocks = np.arange(BLOCK_TIME_CONSTANTS, elapsed[-1], BLOCK_TIME_CONSTANTS)
+    edges = np.concatenate(([0], np.searchsorted(elapsed[1:], blocks), [decay.size]))
+    last = start
+    for first, after in itertools.pairwise(edges.tolist()):
+        grown = np.exp(elapsed[first + 1 : after + 1] - elapsed[first])
+        part = result[first + 1 : after + 1]
+        np.cumsum(drive[first:after] * grown, out=part)
+        part += last
+        part /= grown
+        last = float(result[after])
+    return result
+
+
+class Memory:
+    """State that is carried from sample to sample, as numbers; see `Lag`."""
+
+    whole = False
+    """Whether a call gets a whole log, after which no sample comes."""
+
+    def state(self) -> list[float]:
+        """Return the state, beginning with a time [s]; empty before the first sample."""
+        raise NotImplementedError
+
+    def restore(self, state: Sequence[float]) -> None:
+        """Continue from a saved state; raise ValueError if it is malformed."""
+        raise NotImplementedError
+
+
+class Lag(Memory):
+    """A first-order lag; consecutive calls continue it.
+
+    Parameters
+    ----------
+    tau_s : float
+        Time constant [s]; up to `NO_LAG_S` the output is the input.
+    start : float, optional
+        Output at the first sample; the first input by default.
+    rest_s : float
+        Over a longer step the input counts as zero [s].
+    """
+
+    def __init__(self, tau_s: float, start: float | None = None, rest_s: float = math.inf) -> None:
+        self.tau_s = tau_s
+        self._start = start
+        self._rest_s = rest_s
+        self._last: tuple[float, float, float] | None = None
+
+    @property
+    def is_lagging(self) -> bool:
+        """Whether the output differs from the input."""
+        return self.tau_s > NO_LAG_S
+
+    @property
+    def value(self) -> float:
+        """Latest output."""
+        return 0.0 if self._last is None else self._last[2]
+
+    def step(self, time_s: FloatArray, values: FloatArray) -> FloatArray:
+        """Advance to samples of shape (n,) and return the outputs there."""
+        if not self.is_lagging:
+            return values
+        missing = np.isnan(values)
+        if missing.any():
+            result = np.full(values.size, math.nan)
+            result[~missing] = self.step(time_s[~missing], values[~missing])
+            return result
+        if not values.size:
+            return values
+        if self._last is None:
+            first = float(values[0]) if self._start is None else self._start
+            times, inputs, skip = time_s, values, 0
+        else:
+            latest_s, latest, first = self._last
+            times, inputs, skip = np.r_[latest_s, time_s], np.r_[latest, values], 1
+        seconds = np.diff(times)
+        step = seconds / self.tau_s
+        gone = -np.expm1(-step)  # 1 − a
+        drive = gone * inputs[1:] + (gone / step - (1.0 - gone)) * (inputs[:-1] - inputs[1:])
+        drive[seconds > self._rest_s] = 0.0
+        result = decaying_sum(step, drive, first)[skip:]
+        self._last = (float(times[-1]), float(inputs[-1]), float(result[-1]))
+        return result
+
+    def state(self) -> list[float]:
+        """Return time [s], input and output at the latest sample; empty before the first."""
+        return [] if self._last is None else [*self._last]
+
+    def restore(self, state: Sequence[float]) -> None:
+        """Continue from a saved state; raise ValueError if it is malformed."""
+        if not state:
+            self._last = None
+            return
+        time_s, latest, value = state
+        if not all(map(math.isfinite, state)):
+            raise ValueError("not finite")
+        self._last = (time_s, latest, value)
+
+
+def low_passed(
+    time_s: FloatArray,
+    values: FloatArray,
+    tau_s: float,
+    start: float | None = None,
+    rest_s: float = math.inf,
+) -> FloatArray:
+    """Return the outputs of a `Lag` over a whole log, shape (n,)."""
+    return Lag(tau_s, start, rest_s).step(time_s, values)

@@ -1,0 +1,253 @@
+"""Prior of a model's coefficients: the typical cell of a chemistry, and how far packs differ.
+
+    knots of the curve   N(V0·m(S)/m(S0), V0²·K)
+        K = 0.05² + ∫∫ from S0 of slope errors + (0.06·e^(−S/5 %))² + (3·10⁻⁴)²·1
+    kt                   N(0, (2.5·10⁻⁴·V0)²)
+    resistances          N(h·V0/C, …), as in `RESISTANCE_H`
+    factor b             N(1, 0.5²)
+
+V0 and S0 are mean voltage and SoC of the logs, m is the voltage of a typical cell, C the capacity.
+Everything scales with the pack, so that one prior serves a cell and an 800 V pack. Constants
+without another source were chosen on recorded development trips and kept for all others.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Final, Literal
+
+import numpy as np
+
+from cangauge._typing import FloatArray
+from cangauge.model.voltage_model import KNOTS_PCT, hermite_basis
+
+ChemistryName = Literal["oxide", "lfp"]
+
+REFERENCE_C: Final = 20.0
+"""Reference temperature of the curve [°C]."""
+DELAYS_S: Final = (0.0, 10.0, 30.0, 70.0)
+"""The published delays of the current [s]."""
+LOW_PASS_S: Final = (10.0, 140.0)
+"""Time constants of the low-passed currents [s]: the polarization of a drive has seconds to
+minutes, and 70 s of delays cannot express it."""
+
+LEVEL_STD: Final = 0.05
+"""Standard deviation of the curve's level relative to V0: cells of one chemistry differ by 5 %."""
+SLOPE_SPAN_PCT: Final = 20.0
+"""Span of the slope error of `Chemistry.slope_std` [% SoC]: a phase of the electrodes."""
+ROUGH_STD: Final = 2e-4
+"""Second slope error [V0/%], …"""
+ROUGH_SPAN_PCT: Final = 5.0
+"""… of this span [% SoC]: features within a phase."""
+KNEE_STD: Final = 0.06
+"""Error of the knee near empty relative to V0: the cut-off voltage differs by 0.2 V per cell."""
+KNEE_SPAN_PCT: Final = 5.0
+"""SoC over which it decays [%]."""
+NUGGET_STD: Final = 3e-4
+"""Error of each knot on its own, relative to V0."""
+GRID_PCT: Final = 0.5
+"""Step of the integral over slope errors [% SoC]."""
+KT_STD: Final = 2.5e-4
+"""Standard deviation of kt [V0/K]: entropy of the cells (0.4 mV/K of 3.7 V), and self-heating that
+the sensor does not see; Reynier, Yazami, Fultz, J. Power Sources 119–121 (2003) 850."""
+RESISTANCE_H: Final = ((0.012, 0.012), *((0.002, 0.004),) * (len(DELAYS_S) + len(LOW_PASS_S) - 1))
+"""Mean and standard deviation of each resistance [h], times V0/C in ohms: a cell of energy type
+drops 2 % of its voltage at 1 C, half of it at once."""
+B_MEAN: Final = 1.0
+"""Factor on the Arrhenius change: all of the resistance follows a(T)."""
+B_STD: Final = 0.5
+"""Its standard deviation: contacts and leads do not follow a(T)."""
+RESIDUAL_STD: Final = 0.003
+"""Rms residual of a pack without logs, relative to V0; also the voltage noise against which an
+uncertain SoC is weighed: the published model leaves 0.25 %."""
+
+FUNCTIONS: Final = 12
+"""Principal functions that a filter carries; eight leave 2.5 times as many starts astray."""
+TYPICAL_C_RATE: Final = 1.0 / 3.0
+"""Current of a drive [1/h] by which the functions weigh errors of resistances: 20 A at 60 Ah."""
+TYPICAL_K: Final = 10.0
+"""Temperature difference by which they weigh errors of kt [K]: a season's change within a day."""
+TYPICAL_COLDER: Final = 0.5
+"""Arrhenius change a(T)/a(T̄) − 1 by which they weigh errors of b [-]: 12 K colder."""
+
+
+@dataclass(frozen=True, eq=False)
+class Chemistry:
+    """Typical cell of a chemistry, and the errors of its voltage.
+
+    Parameters
+    ----------
+    name : {"oxide", "lfp"}
+    curve_v : array of shape (knots,)
+        Open-circuit voltage of a typical cell at `KNOTS_PCT` [V]; only its shape is used.
+    slope_std : float
+        Standard deviation of the curve's slope error [V0/%].
+    soc_std_pct : float
+        Lasting uncertainty of SoC against voltage [% SoC]: surface, hysteresis, reference.
+    level_std, slow_std : float
+        Voltage error that lasts a log, and 300 s, relative to V0.
+    fast_factor : float
+        Noise of a block's mean in units of the residuals of the fit.
+    cold_exponent : float
+        Level, slow and fast noise grow as max(1, a(T)) to this power below 20 °C: model errors are
+        polarization, so they grow with the resistance.
+    """
+
+    name: ChemistryName
+    curve_v: FloatArray
+    slope_std: float
+    soc_std_pct: float
+    level_std: float
+    slow_std: float
+    fast_factor: float
+    cold_exponent: float
+
+
+CHEMISTRIES: Final[Mapping[ChemistryName, Chemistry]] = {
+    "oxide": Chemistry(
+        "oxide",
+        np.interp(
+            KNOTS_PCT,
+            [0, 2.5, 5, 10, 20, 30, 40, 50, 60, 70, 80, 90, 100],
+            [3.08, 3.255, 3.36, 3.465, 3.565, 3.625, 3.675, 3.735, 3.815, 3.895, 3.975, 4.055,
+             4.14],
+        ),
+        slope_std=5e-4,
+        soc_std_pct=0.3,
+        level_std=0.0025,
+        slow_std=0.002,
+        fast_factor=1.0,
+        cold_exponent=1.0,
+    ),
+    "lfp": Chemistry(
+        "lfp",
+        np.interp(
+            KNOTS_PCT,
+            [0, 1, 2.5, 5, 10, 20, 30, 40, 50, 60, 70, 80, 90, 95, 97.5, 99, 100],
+            [2.70, 2.90, 3.05, 3.13, 3.20, 3.25, 3.28, 3.29, 3.295, 3.305, 3.325, 3.333, 3.337,
+             3.342, 3.35, 3.37, 3.45],
+        ),
+        slope_std=2e-4,
+        soc_std_pct=3.0,
+        level_std=0.008,
+        slow_std=0.006,
+        fast_factor=6.0,
+        cold_exponent=0.0,
+    ),
+}  # fmt: skip
+"""The chemistries that differ in shape: layered oxides and manganese spinel against graphite, and
+iron phosphate against graphite, whose plateau is flat. Sources of the typical cells:
+
+oxide
+    A smooth curve. Its shape is within 19 mV (1–100 %) of the mean open-circuit voltage of three
+    published graphite cells between 3.0 and 4.15 V: NMC811 (Chen et al. 2020,
+    doi 10.1149/1945-7111/ab9050), NMC532 (Mohtat et al. 2020, doi 10.1149/1945-7111/aba5d1) and a
+    nickel-cobalt oxide (Ecker et al. 2015, doi 10.1149/2.0551509jes).
+lfp
+    Within 12 mV (10–97.5 %) of LiFePO4 (Afshar et al. 2017, arXiv 1709.03970) against graphite
+    (Mohtat et al. 2020) at stoichiometries 0.97–0.03 and 0.01–0.80.
+"""
+
+
+@dataclass(frozen=True, eq=False)
+class Prior:
+    """Normal distribution of the coefficients: knots [V], kt [V/K], resistances [Ω], b [-]."""
+
+    mean: FloatArray
+    covariance: FloatArray
+    resistance_ohm: FloatArray
+    """Typical resistances [Ω], negative."""
+    residual_v: float
+    """Rms residual before any log [V]."""
+
+
+@lru_cache(maxsize=256)
+def curve_covariance(start: float, chemistry: Chemistry) -> FloatArray:
+    """Return the covariance K of the knots relative to V0²: an integrated process of the slope.
+
+    Parameters
+    ----------
+    start : float
+        S0, a multiple of `GRID_PCT` [%].
+    chemistry : Chemistry
+    """
+    grid = np.arange(0.5 * GRID_PCT, 100.0, GRID_PCT)
+    gap = grid[:, None] - grid
+    slope = chemistry.slope_std**2 * np.exp(-0.5 * (gap / SLOPE_SPAN_PCT) ** 2)
+    slope += ROUGH_STD**2 * np.exp(-0.5 * (gap / ROUGH_SPAN_PCT) ** 2)
+    above = (grid > start) & (grid < KNOTS_PCT[:, None])
+    below = (grid < start) & (grid > KNOTS_PCT[:, None])
+    integral = GRID_PCT * (above.astype(np.float64) - below)
+    knee = KNEE_STD * np.exp(-KNOTS_PCT / KNEE_SPAN_PCT)
+    nugget = np.eye(KNOTS_PCT.size) * NUGGET_STD**2
+    return np.asarray(integral @ slope @ integral.T + LEVEL_STD**2 + np.outer(knee, knee) + nugget)
+
+
+def prior_of(chemistry: Chemistry, mean_v: float, mean_soc_pct: float, capacity_ah: float) -> Prior:
+    """Return the prior of a pack's coefficients.
+
+    Parameters
+    ----------
+    chemistry : Chemistry
+    mean_v, mean_soc_pct : float
+        Mean voltage V0 [V] and SoC S0 [%] of the logs.
+    capacity_ah : float
+        [Ah].
+    """
+    typical = mean_v / np.interp(mean_soc_pct, KNOTS_PCT, chemistry.curve_v) * chemistry.curve_v
+    h_mean, h_std = np.array(RESISTANCE_H).T * mean_v / capacity_ah
+    n = KNOTS_PCT.size
+    std = np.r_[KT_STD * mean_v, h_std, B_STD]
+    covariance = np.zeros((n + std.size, n + std.size))
+    start = round(mean_soc_pct / GRID_PCT) * GRID_PCT
+    covariance[:n, :n] = curve_covariance(start, chemistry) * mean_v**2
+    covariance[n:, n:] = np.diag(std**2)
+    mean = np.r_[typical, 0.0, -h_mean, B_MEAN]
+    return Prior(mean, covariance, -h_mean, RESIDUAL_STD * mean_v)
+
+
+def principal_functions(covariance: FloatArray, loads: FloatArray) -> FloatArray:
+    """Return the joint principal functions of the coefficients' covariance, shape (n, p).
+
+    They explain most of the variance of the voltage, over all SoC and the loads of a usual drive.
+
+    Parameters
+    ----------
+    covariance : array of shape (p, p)
+        Of the knots and the coefficients of the load columns.
+    loads : array of shape (k,)
+        Usual sizes of the load columns (`usual_loads`).
+    """
+    basis = hermite_basis(np.linspace(0.0, 100.0, 401))
+    n = KNOTS_PCT.size
+    weight = np.zeros_like(covariance)
+    weight[:n, :n] = basis.T @ basis / len(basis)
+    weight[n:, n:] = np.diag(loads**2)
+    root = np.linalg.cholesky(weight)
+    variance, direction = np.linalg.eigh(root.T @ covariance @ root)
+    first = np.argsort(variance)[::-1][:FUNCTIONS]
+    scaled = direction[:, first] * np.sqrt(np.maximum(variance[first], 0.0))
+    return np.asarray(np.linalg.solve(root.T, scaled).T)
+
+
+def usual_loads(
+    capacity_ah: float, currents: int, arrhenius_ohm: FloatArray | None = None
+) -> FloatArray:
+    """Return the usual sizes of the load columns: T − T_r, currents, and the Arrhenius change.
+
+    Parameters
+    ----------
+    capacity_ah : float
+        [Ah].
+    currents : int
+        Number of delayed and low-passed currents.
+    arrhenius_ohm : array of shape (M,), optional
+        Resistances that b scales [Ω]; None where the model has no b.
+    """
+    usual_a = TYPICAL_C_RATE * capacity_ah
+    loads = [TYPICAL_K, *[usual_a] * currents]
+    if arrhenius_ohm is not None:
+        loads.append(TYPICAL_COLDER * usual_a * abs(float(np.sum(arrhenius_ohm))))
+    return np.array(loads)

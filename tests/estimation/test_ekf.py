@@ -1,0 +1,267 @@
+"""The Kalman filter: identities of a linear problem, and the prototype that it follows."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from cangauge.estimation.ekf import OFFSET_STD_A, Block, SocFilter
+from cangauge.estimation.health import CAPACITY_STD, RESISTANCE_STD
+from cangauge.estimation.start import WRONG_PRIOR, WRONG_STD_PCT, Hypotheses
+
+CAPACITY_AH = 60.0
+LOAD = np.array([1.0, -40.0])
+NO_EFFECTS = np.zeros(1)
+
+
+class LinearModel:
+    """A voltage model that is linear in the SoC and in two functions."""
+
+    capacity_ah, functions = CAPACITY_AH, SimpleNamespace(number=2)
+    load_coefficients = np.array([0.3, 0.1])
+    noise = SimpleNamespace(
+        level_std_v=0.8, slow_std_v=0.6, slow_time_s=300.0, fast_std_v=0.3, soc_std_pct=0.3,
+        cold=lambda temperature_c: 1.0 if temperature_c > 10.0 else 1.4,
+    )  # fmt: skip
+
+    def curve(self, soc_pct: float, drives: Any = None) -> tuple[float, float]:
+        return 300.0 + 0.7 * soc_pct, 0.7
+
+    def row(self, soc_pct: float, load: np.ndarray) -> np.ndarray:
+        return np.array([0.9, 0.01 * load[1]])
+
+
+def block(number: int, voltage_v: float, discharged_pct: float, load_a: float = 40.0) -> Block:
+    load = np.array([1.0, -load_a])
+    return Block(30.0 * number, discharged_pct, voltage_v, 20.0, 0.1 * load[1], load, NO_EFFECTS)
+
+
+def voltages(count: int, seed: int) -> list[tuple[float, float, float]]:
+    """Voltage [V], charge since the last block [%] and current [A] of some blocks."""
+    rng = np.random.default_rng(seed)
+    current_a = rng.normal(20.0, 30.0, count)
+    volts = 340.0 + 4.0 * rng.normal(size=count)
+    return list(zip(volts, current_a * 30.0 / 36.0 / CAPACITY_AH, current_a, strict=True))
+
+
+def run(filter_: Any, rows: list[tuple[float, float, float]]) -> None:
+    for number, (volts, charge_pct, current_a) in enumerate(rows):
+        filter_.predict(30.0, charge_pct)
+        filter_.update(block(number, volts, 0.0, current_a))
+
+
+def augmented(
+    rows: list[tuple[float, float, float]], start_pct: float, *, with_biases: bool
+) -> tuple[np.ndarray, np.ndarray, float]:
+    """State, covariance and log-likelihood of the whole problem at once, by dense conditioning.
+
+    The unknowns are those of the start, (S, o, w, c, c, g, r), and z at each block.
+    """
+    noise, count = LinearModel.noise, len(rows)
+    prior = np.array([20.0, OFFSET_STD_A, 1.0, 1.0, 1.0, CAPACITY_STD, RESISTANCE_STD])
+    if not with_biases:
+        prior[-2:] = 0.0
+    gap = np.abs(np.subtract.outer(np.arange(count), np.arange(count)))
+    slow = noise.slow_std_v**2 * np.exp(-30.0 / noise.slow_time_s * gap)
+    drift = 1e-6 * 30.0 * (np.minimum.outer(np.arange(count), np.arange(count)) + 1)
+    rate = 100.0 * 30.0 / 3600.0 / CAPACITY_AH
+    A = np.zeros((count, 7))
+    expected, charge = np.empty(count), 0.0
+    for k, (_, charge_pct, current_a) in enumerate(rows):
+        charge += charge_pct
+        load = np.array([1.0, -current_a])
+        slope = 0.7
+        level = np.hypot(noise.level_std_v, noise.soc_std_pct * slope)
+        A[k] = [slope, slope * rate * (k + 1), level, 0.9, 0.01 * load[1], -slope * charge,
+                0.1 * load[1]]  # fmt: skip
+        expected[k] = 300.0 + slope * (start_pct - charge) + load @ LinearModel.load_coefficients
+    fast = noise.fast_std_v**2 + (noise.soc_std_pct * 0.7) ** 2
+    covariance = (A * prior**2) @ A.T + slow + 0.7**2 * drift + fast * np.eye(count)
+    gain = (A * prior**2).T @ np.linalg.inv(covariance)
+    error = np.array([volts for volts, _, _ in rows]) - expected
+    posterior = np.diag(prior**2) - gain @ (A * prior**2)
+    logdet = np.linalg.slogdet(covariance)[1]
+    return gain @ error, posterior, -0.5 * (error @ np.linalg.solve(covariance, error) + logdet)
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_linear_filter_equals_the_batch_solution(seed: int) -> None:
+    rows = voltages(25, seed)
+    filter_ = SocFilter(LinearModel(), 60.0, 20.0)
+    run(filter_, rows)
+    mean, covariance, evidence = augmented(rows, 60.0, with_biases=False)
+    found = filter_.x[[1, 3, 4, 5]]
+    np.testing.assert_allclose(found, mean[[1, 2, 3, 4]], atol=1e-8)
+    np.testing.assert_allclose(
+        np.sqrt(np.diag(filter_.P))[[1, 3, 4, 5]], np.sqrt(np.diag(covariance))[1:5], rtol=1e-6
+    )
+    assert filter_.evidence == pytest.approx(evidence, rel=1e-9)
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_separate_biases_equal_the_augmented_problem(seed: int) -> None:
+    rows = voltages(25, seed)
+    filter_ = SocFilter(LinearModel(), 60.0, 20.0)
+    run(filter_, rows)
+    mean, covariance, _ = augmented(rows, 60.0, with_biases=True)
+    x, P = filter_.joint()
+    np.testing.assert_allclose(x[[1, 3, 4, 5, 6, 7]], mean[1:], rtol=1e-3, atol=1e-4)
+    np.testing.assert_allclose(
+        np.sqrt(np.diag(P))[[1, 3, 4, 5, 6, 7]], np.sqrt(np.diag(covariance))[1:], rtol=1e-3
+    )
+
+
+@given(st.integers(0, 10_000), st.floats(1.0, 40.0))
+def test_covariance_stays_positive_and_shrinks(seed: int, start_std_pct: float) -> None:
+    filter_ = SocFilter(LinearModel(), 50.0, start_std_pct)
+    for number, (volts, charge_pct, current_a) in enumerate(voltages(12, seed)):
+        filter_.predict(30.0, charge_pct)
+        before = np.diag(filter_.P).copy()
+        filter_.update(block(number, volts, 0.0, current_a))
+        assert np.array_equal(filter_.P, filter_.P.T)
+        assert np.linalg.eigvalsh(filter_.P).min() > -1e-12
+        assert np.all(np.diag(filter_.P) <= before + 1e-12)
+        assert np.all(np.linalg.eigvalsh(filter_.bias.P) > 0.0)
+
+
+def test_prediction_between_blocks_equals_the_filters_own() -> None:
+    filter_ = SocFilter(LinearModel(), 60.0, 5.0)
+    run(filter_, voltages(5, 4))
+    soc_pct, variance = filter_.soc_after(17.0, 0.4, 0.02)
+    filter_.predict(17.0, 0.4, 0.02)
+    assert soc_pct == pytest.approx(filter_.x[0], abs=1e-12)
+    assert variance == pytest.approx(filter_.P[0, 0], abs=1e-12)
+
+
+@pytest.mark.parametrize("wrong_pct", [0.0, 3.0, 30.0])
+def test_odds_of_a_given_start_are_those_of_all_voltages_at_once(wrong_pct: float) -> None:
+    rows = [
+        (300.0 + 0.7 * (60.0 - 0.2 * k) + LOAD @ LinearModel.load_coefficients, 0.2, 40.0)
+        for k in range(1, 5)
+    ]
+    hypotheses = Hypotheses(LinearModel(), 60.0 + wrong_pct, 20.0)
+    run(hypotheses, rows)
+    narrow = augmented(rows, 60.0 + wrong_pct, with_biases=False)[2]
+    wide = SocFilter(LinearModel(), 60.0 + wrong_pct, WRONG_STD_PCT)
+    run(wide, rows)
+    expected = np.log(WRONG_PRIOR / (1.0 - WRONG_PRIOR)) + wide.evidence - narrow
+    assert hypotheses.log_odds == pytest.approx(expected, abs=1e-9)
+    p = 1.0 / (1.0 + np.exp(-expected))
+    means = [each.x[0] for each in hypotheses.filters]
+    assert hypotheses.soc_after(0.0, 0.0)[0] == pytest.approx((1.0 - p) * means[0] + p * means[1])
+
+
+def test_a_rejected_start_leaves_only_the_wide_hypothesis() -> None:
+    rows = [(300.0 + 0.7 * 80.0, 0.0, 0.0)] * 20
+    hypotheses = Hypotheses(LinearModel(), 20.0, 1.0)
+    run(hypotheses, rows)
+    assert (len(hypotheses.filters), hypotheses.decision) == (1, 1)
+    assert abs(hypotheses.soc_after(0.0, 0.0)[0] - 80.0) < 3.0
+
+
+def test_doubt_keeps_the_odds_of_an_open_question() -> None:
+    hypotheses = Hypotheses(LinearModel(), 60.0, 1.0)
+    hypotheses.doubt(0.2, 10.0, 3600.0, 0.1)
+    p = 1.0 / (1.0 + np.exp(-hypotheses.log_odds))
+    assert p == pytest.approx(1.0 - 0.8 * (1.0 - WRONG_PRIOR))
+    narrow, wide = hypotheses.filters
+    assert narrow.P[0, 0] == pytest.approx(1.0 + 0.01)
+    assert wide.P[0, 0] == pytest.approx(WRONG_STD_PCT**2 + 100.0)
+
+
+class PrototypeModel:
+    """The prototype's model with all its coefficients, behind the face of `OnlineModel`."""
+
+    def __init__(self, fit: Any, model: Any) -> None:
+        self.capacity_ah = model.capacity_ah
+        small = 1e-14 * np.diag(np.diag(model.covariance))
+        root = np.linalg.cholesky(model.covariance * (1.0 + 1e-9) + small)
+        self._of_curve, self._of_load = fit.BASIS @ root[: fit.N_KNOTS], root[fit.N_KNOTS :]
+        self.functions = SimpleNamespace(number=root.shape[1])
+        self.load_coefficients = model.coefficients[fit.N_KNOTS :]
+        self._table = fit.curve_table(model)
+        self.noise = SimpleNamespace(
+            level_std_v=model.level_v, slow_std_v=model.slow_v, slow_time_s=300.0,
+            fast_std_v=model.fast_v, soc_std_pct=model.chemistry.soc_std_pct,
+            cold=lambda celsius: float(fit.noise_factor(celsius, model.chemistry)),
+        )  # fmt: skip
+
+    def _place(self, soc_pct: float) -> tuple[int, float]:
+        place = (min(max(soc_pct, -20.0), 119.9) + 20.0) * 4.0
+        return int(place), place - int(place)
+
+    def curve(self, soc_pct: float, drives: Any = None) -> tuple[float, float]:
+        i, f = self._place(soc_pct)
+        step = self._table[i + 1] - self._table[i]
+        return self._table[i] + f * step, step * 4.0
+
+    def row(self, soc_pct: float, load: np.ndarray) -> np.ndarray:
+        i, f = self._place(soc_pct)
+        curve = self._of_curve[i] * (1.0 - f) + self._of_curve[i + 1] * f
+        return np.asarray(curve + load @ self._of_load)
+
+
+def drive(fit: Any, seed: int, start_pct: float, capacity_ah: float) -> dict[str, Any]:
+    """A simulated drive of an hour on another curve than the typical one."""
+    rng = np.random.default_rng(seed)
+    time_s = np.arange(3600.0)
+    current_a = np.repeat(rng.normal(25.0, 30.0, 360), 10)
+    soc_pct = start_pct - np.cumsum(current_a) / 36.0 / capacity_ah
+    temperature_c = 12.0 + 4.0 * np.sin(time_s / 900.0)
+    load = fit.load_features(current_a, temperature_c)
+    volts = 96.0 * (np.interp(soc_pct, fit.KNOTS_PCT, fit.OXIDE.curve_v) + 1e-4 * soc_pct)
+    volts += load[:, 1:5] @ [0.06, 0.02, 0.02, 0.03] + rng.normal(0.0, 0.3, time_s.size)
+    return {
+        "time_s": time_s, "current_a": current_a, "voltage_v": volts, "soc_pct": soc_pct,
+        "temperature_c": temperature_c, "usable": np.ones(time_s.size, bool),
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize("given_pct", [None, 70.0, 50.0])
+def test_filter_equals_the_prototype(
+    given_pct: float | None, shared_data: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = shared_data.parent / "prototypes"
+    if not (folder / "estimator_filter.py").is_file():
+        pytest.skip("the prototype (../shared/prototypes) is not beside the project")
+    monkeypatch.setattr(sys, "path", [*sys.path, str(folder)])
+    import estimator_filter as prototype  # noqa: PLC0415
+    import estimator_fit as fit  # noqa: PLC0415
+
+    sums = [fit.log_sums(drive(fit, k, 90.0 - 5.0 * k, CAPACITY_AH), fit.OXIDE) for k in (1, 2, 3)]
+    model = fit.fit(sums, CAPACITY_AH, fit.OXIDE)
+    log = drive(fit, 9, 70.0, CAPACITY_AH)
+    online = PrototypeModel(fit, model)
+    ours = Hypotheses(online, given_pct)
+    theirs = (
+        prototype.unknown_start(model)
+        if given_pct is None
+        else prototype.GivenStart(model, given_pct)
+    )
+    time_s, charge_ah = None, 0.0
+    for each in prototype.blocks(model, log, np.cumsum(log["current_a"]) / 3600.0):
+        theirs.update(each)
+        seconds = 0.0 if time_s is None else each.time_s - time_s
+        ours.predict(seconds, (each.charge_ah - charge_ah) / CAPACITY_AH * 100.0)
+        volts = each.voltage_v, each.temperature_c, 0.0
+        ours.update(Block(each.time_s, 0.0, *volts, each.load, NO_EFFECTS))
+        time_s, charge_ah = each.time_s, each.charge_ah
+        if given_pct is None:
+            expected = theirs.soc_pct, theirs.soc_std_pct
+        else:
+            a, b = theirs.given, theirs.wrong
+            ratio = prototype.WRONG_PRIOR / (1.0 - prototype.WRONG_PRIOR)
+            odds = ratio * np.exp(np.clip(b.log_likelihood - a.log_likelihood, -50.0, 50.0))
+            weight = 1.0 / (1.0 + odds)
+            mean = weight * a.soc_pct + (1.0 - weight) * b.soc_pct
+            spread = weight * (a.soc_std_pct**2 + (a.soc_pct - mean) ** 2)
+            spread += (1.0 - weight) * (b.soc_std_pct**2 + (b.soc_pct - mean) ** 2)
+            expected = mean, np.sqrt(spread)
+        assert ours.soc_after(0.0, 0.0) == pytest.approx(expected, abs=1e-6)
