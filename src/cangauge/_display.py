@@ -1,13 +1,15 @@
-"""Figures and HTML of results in a notebook, made by `cangauge.extras.report`.
+"""Results as data frames, and as figures and HTML in a notebook.
 
-The one place where a lower layer calls the report: by name and on use, so that neither the import
-nor bokeh is needed before.
+Optional packages, bokeh and `cangauge.extras.report` are imported by name and on use.
 """
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from importlib import import_module
 from typing import Any
+
+from cangauge.errors import InputError
 
 
 def figure(function: str, result: object, **options: Any) -> Any:
@@ -19,3 +21,50 @@ def html(function: str, result: object) -> str:
     """Return the HTML that a function of `report.summary` makes of a result."""
     text: str = getattr(import_module("cangauge.extras.report.summary"), function)(result)
     return text
+
+
+class ArrowExport:
+    """Base of tables that convert to data frames through Arrow.
+
+    pandas and polars are optional: each is imported by its own method.
+    """
+
+    __slots__ = ()
+
+    @abstractmethod
+    def to_arrow(self) -> Any:
+        """Return a pyarrow.Table."""
+
+    def to_pandas(self) -> Any:
+        """Return a pandas.DataFrame of the columns; unknown numbers are NaN.
+
+        Raises
+        ------
+        InputError
+            If pandas is not installed.
+        """
+        _import("pandas")
+        return self.to_arrow().to_pandas()
+
+    def to_polars(self) -> Any:
+        """Return a polars.DataFrame of the columns; unknown numbers are null.
+
+        Raises
+        ------
+        InputError
+            If polars is not installed.
+        """
+        return _import("polars").from_arrow(self.to_arrow())
+
+    def __arrow_c_stream__(self, requested_schema: Any = None) -> Any:
+        """Export the columns through the Arrow PyCapsule interface."""
+        return self.to_arrow().__arrow_c_stream__(requested_schema)
+
+
+def _import(package: str) -> Any:
+    try:
+        return import_module(package)
+    except ImportError as error:
+        raise InputError(
+            f"{package} is not installed", cure=f"install it: pip install {package}"
+        ) from error

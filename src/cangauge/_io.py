@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import os
 import signal
 import stat
@@ -33,7 +32,6 @@ from cangauge._files import (
     write_text_atomic,
     write_texts_atomic,
 )
-from cangauge._files import open_unpacked as _open_unpacked
 from cangauge.errors import InputError
 
 __all__ = [
@@ -55,55 +53,11 @@ __all__ = [
     "write_texts_atomic",
 ]
 
-# Captures
-MAX_CAPTURE_BYTES: Final = 64 * 1024 * MIB
-"""A capture, unpacked: it is read as a stream."""
-MAX_LINE: Final = 16 * 1024
-"""Longest line of a text capture [characters]."""
-MAX_IDLE_LINES: Final = 1_000_000
-"""Consecutive lines without a frame."""
-MAX_BLF_OBJECT: Final = 16 * MIB
-"""One object of a BLF file, packed or unpacked (writers fill 128 KiB)."""
-MAX_MCAP_RECORD: Final = 64 * MIB
-"""One record of an MCAP file, packed or unpacked (writers fill chunks of 1–4 MiB)."""
-MAX_MF4_MEMORY: Final = 4096 * MIB
-"""Memory of the process that reads an MF4 file."""
-MF4_SILENCE_S: Final = 60.0
-"""Longest wait for the next frames of that process [s], plus …"""
-MF4_SILENCE_S_PER_MIB: Final = 0.5
-"""… this for each MiB of the file [s]."""
-MAX_BUSES: Final = 64
-"""Buses in one capture: each has its own decoder."""
-
-# DBC, TOML and model files
-MAX_DBC_BYTES: Final = 4 * MIB
-"""Parsing takes 1–6 s a megabyte; the largest files in use are smaller."""
-MAX_TOML_BYTES: Final = 64 * 1024
-MAX_TOML_KEY: Final = 32
-"""Parts of a dotted key: parsing takes time and memory with their square."""
-MAX_MODEL_BYTES: Final = 4 * MIB
-"""A model with 64 delays has 0.2 MB."""
-MAX_MODEL_COLUMNS: Final = 256
-"""Columns of the information matrix in a model file."""
-MAX_MODEL_ITEMS: Final = 4096
-"""Source logs, options and coefficients in a model file, each."""
-MAX_MODEL_EFFECTS: Final = 32
-"""Effects in a model file: each costs time at every sample, and the library has 22 kinds."""
-MAX_SPEED_TRACE_BYTES: Final = 64 * MIB
 READ_WITHIN_S: Final = 120.0
 """Time for reading a configuration with its model, map and DBC [s]: the largest DBC takes up to
 24 s (see `MAX_DBC_BYTES`), on a machine five times slower 120 s."""
 MAX_READING_MEMORY: Final = 2048 * MIB
 """Memory of the process that does so; the largest DBC takes 0.3 GB."""
-
-
-MAX_STAMP_S: Final = 1e11
-"""Largest time stamp of a frame or row [s]: the year 5138, counted from 1970."""
-
-
-def open_unpacked(path: str | PathLike[str], _limit: int) -> io.BufferedReader:
-    """Open a file, unpacked; a stream costs no memory, whatever its length."""
-    return _open_unpacked(path)
 
 
 class _OutOfTime(BaseException):

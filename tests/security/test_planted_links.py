@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from cangauge._io import atomic_path, check_writable
+from cangauge._files import atomic_path, check_writable
 from cangauge.errors import InputError
 from cangauge.service.recording import Recorder
 from live import in_process, leaf_model_path

@@ -15,10 +15,10 @@ import pyarrow.csv
 import pyarrow.parquet
 import pytest
 
-from cangauge._mcap import read_messages
 from cangauge.bus.encoder import FrameEncoder
 from cangauge.bus.vehicle import Vehicle
 from cangauge.estimation.offline import samples_of
+from cangauge.extras.formats.mcap_messages import read_messages
 from cangauge.logs.canonical import write_log
 from cangauge.service.offline import estimate_capture
 from cangauge.service.recording import Recorder

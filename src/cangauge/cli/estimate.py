@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Annotated, get_args
 import typer
 from rich.progress import Progress
 
-from cangauge._formatting import number
-from cangauge._io import atomic_path
+from cangauge._files import atomic_path
+from cangauge._text import number
 from cangauge.cli.options import (
     FiguresOption,
     JsonOption,

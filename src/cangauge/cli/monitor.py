@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
 
-from cangauge._formatting import number, printable
+from cangauge._text import number, printable
 from cangauge.cli.options import EndpointOption, TokenFileOption
 from cangauge.cli.output import print_table
 from cangauge.cli.status import USABLE, status_rows

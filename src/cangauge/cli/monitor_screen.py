@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Final
 
 from rich.text import Text
 
-from cangauge._formatting import NONE_KNOWN, duration, number, printable
+from cangauge._text import NONE_KNOWN, duration, number, printable
 from cangauge.cli.status import with_std
 from cangauge.errors import InputError
 from cangauge.types import REASON_WORDS, reason_name

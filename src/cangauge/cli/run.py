@@ -14,8 +14,8 @@ from rich.console import Console
 from rich.live import Live
 from rich.text import Text
 
-from cangauge._formatting import number
 from cangauge._logging import LogFormat, emit, logging_to, takes_text
+from cangauge._text import number
 from cangauge.cli.config_options import config_options, config_values
 from cangauge.cli.options import JsonOption
 from cangauge.cli.output import console, emit_json

@@ -6,7 +6,7 @@ from typing import Any, Final
 
 import typer
 
-from cangauge._formatting import NONE_KNOWN, duration, number
+from cangauge._text import NONE_KNOWN, duration, number
 from cangauge.cli.options import EndpointOption, JsonOption, TokenFileOption
 from cangauge.cli.output import emit_json, print_table
 from cangauge.errors import CangaugeError

@@ -10,8 +10,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from cangauge._dataframes import ArrowExport
-from cangauge._display import figure
+from cangauge._display import ArrowExport, figure
 from cangauge._typing import FloatArray
 from cangauge.estimation.compiled import CompiledEstimator, make_estimator
 from cangauge.estimation.estimator import Estimator

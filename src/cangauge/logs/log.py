@@ -9,9 +9,8 @@ from typing import Any, Literal, Self
 import numpy as np
 from numpy.typing import ArrayLike
 
-from cangauge._dataframes import ArrowExport
-from cangauge._display import figure
-from cangauge._formatting import duration
+from cangauge._display import ArrowExport, figure
+from cangauge._text import duration
 from cangauge._typing import BoolArray, FloatArray, IntArray
 from cangauge.errors import InputError
 from cangauge.logs.units import (

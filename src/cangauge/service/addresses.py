@@ -19,7 +19,7 @@ from os import PathLike
 from pathlib import Path
 from typing import Final
 
-from cangauge._io import open_regular
+from cangauge._files import open_regular
 from cangauge._logging import emit
 from cangauge.errors import InputError
 

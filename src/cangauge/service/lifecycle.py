@@ -18,8 +18,8 @@ from contextlib import contextmanager
 from types import FrameType
 from typing import Final, Self
 
-from cangauge._formatting import printable
 from cangauge._logging import emit
+from cangauge._text import printable
 
 NOTIFY_SOCKET: Final = "NOTIFY_SOCKET"
 PINGS_PER_TIMEOUT: Final = 4

@@ -30,11 +30,11 @@ import can
 
 from cangauge._io import FOR_GROUP, FULL, check_writable, refuse_foreign
 from cangauge._logging import emit
-from cangauge._mcap import FRAME, McapTopics
 from cangauge.bus.captures import all_parts, part_path, run_path
 from cangauge.bus.time_source import whole_us
 from cangauge.errors import InputError
 from cangauge.extras.formats.mcap import frame_content, frame_topic
+from cangauge.extras.formats.mcap_messages import FRAME, McapTopics
 from cangauge.service.async_writer import AsyncWriter
 from cangauge.service.estimate_mcap import write_estimate
 from cangauge.types import Estimate, Sample

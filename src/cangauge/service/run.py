@@ -14,9 +14,9 @@ from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from cangauge._formatting import number
 from cangauge._io import READ_WITHIN_S, check_writable, refuse_pipe, sole_writer
 from cangauge._logging import emit
+from cangauge._text import number
 from cangauge.bus.connection import ReconnectingBus
 from cangauge.bus.publish import NO_REPORT
 from cangauge.errors import InputError

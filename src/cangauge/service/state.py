@@ -26,9 +26,9 @@ from typing import Annotated, Any, Final, Self
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from cangauge._formatting import duration, number
 from cangauge._io import PRIVATE, open_regular, refuse_foreign, text_sha256, write_text_atomic
 from cangauge._logging import emit
+from cangauge._text import duration, number
 from cangauge.errors import CangaugeError, InputError
 from cangauge.estimation.state import EstimatorState
 from cangauge.model.model_file import Model

@@ -12,7 +12,7 @@ from typing import Any, Final
 import numpy as np
 from bokeh.models import BoxAnnotation, ColorBar, FactorRange, Label, Span, Whisker
 
-from cangauge._io import atomic_path, open_regular
+from cangauge._files import atomic_path, open_regular
 from cangauge.errors import InputError
 from cangauge.extras.report.page import Page
 

@@ -13,7 +13,7 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from cangauge._formatting import number
+from cangauge._text import number
 from cangauge._typing import FloatArray
 from cangauge.estimation.cells import CellEstimator
 from cangauge.estimation.estimator import Estimator

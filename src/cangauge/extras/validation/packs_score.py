@@ -16,7 +16,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from cangauge._formatting import duration, number, printable
+from cangauge._text import duration, number, printable
 from cangauge._typing import FloatArray
 from cangauge.estimation.offline import EstimateTable
 from cangauge.extras.validation.packs_quantities import COLUMNS as QUANTITY_COLUMNS
