@@ -119,7 +119,8 @@ def _score(estimator, model, told: Told, case: Case, log):
         start_pct = _start(log) + case.start_error_pct
     capacity_ah = told.capacity_ah * case.capacity_factor
     found = estimator.estimate(seen, model, start_pct, capacity_ah)
-    begin_pct = found.newton_pct[0] if start_pct is None else start_pct
+    known = found.newton_pct[np.isfinite(found.newton_pct)]
+    begin_pct = known[0] if start_pct is None else start_pct
     counted = begin_pct - 100.0 * counted_ah(seen) / capacity_ah
     return score(
         log, found.soc_pct, found.std_pct, found.newton_pct, counted, case.after_s, found.mismatch

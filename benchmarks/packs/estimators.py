@@ -41,15 +41,19 @@ class Estimator(Protocol):
         """Estimate a log from a given start, or from an unknown one, with a capacity [Ah]."""
 
 
+MODEL_MISMATCH = 1 << 18
+"""Bit of the published reasons."""
+
+
 class Cangauge:
     """cangauge through its public face."""
 
-    effects: Any = ()
+    effects = "none"
 
-    def fit(self, logs: Sequence[cangauge.Log], told: Told) -> Any:
+    def fit(self, logs: Sequence[cangauge.Log], told: Told) -> cangauge.Model:
         """Return the identified model."""
         return cangauge.fit(
-            logs,
+            list(logs),
             capacity_ah=told.capacity_ah,
             chemistry=told.chemistry,
             cells=told.cells,
@@ -57,15 +61,13 @@ class Cangauge:
         ).model
 
     def estimate(
-        self, log: cangauge.Log, model: Any, start_pct: float | None, capacity_ah: float
+        self, log: cangauge.Log, model: cangauge.Model, start_pct: float | None, capacity_ah: float
     ) -> Estimated:
         """Run `cangauge.estimate`."""
-        table = cangauge.estimate(log, model, initial_soc=start_pct, capacity_ah=capacity_ah)
-        mismatch = any(
-            reason.name == "MODEL_MISMATCH"
-            for reason in type(table.reasons_seen)
-        ) if hasattr(table, "reasons_seen") else False  # fmt: skip
-        return Estimated(table.soc_pct, table.soc_std_pct, table.soc_newton_pct, mismatch)
+        start = "auto" if start_pct is None else start_pct
+        table = cangauge.estimate(log, model, initial_soc_pct=start, capacity_ah=capacity_ah)
+        is_mismatch = bool(np.any(table.reasons & MODEL_MISMATCH))
+        return Estimated(table.soc_pct, table.soc_std_pct, table.soc_newton_pct, is_mismatch)
 
 
 class CangaugeEffects(Cangauge):

@@ -10,13 +10,13 @@ from typing import Any
 
 import numpy as np
 import pytest
-from cangauge.model.effects.first_order import low_passed
 from typer.testing import CliRunner
 
 from cangauge.cli.app import app
 from cangauge.errors import InputError
 from cangauge.extras.embedded.equivalent_circuit import equivalent_circuit
 from cangauge.logs.log import Log
+from cangauge.model.first_order import low_passed
 from cangauge.model.model_file import Model
 from cangauge.model.published import leaf_2012_model_file
 from synthetic import synthetic_log
@@ -73,12 +73,10 @@ def test_resistances_add_up_to_the_lasting_one() -> None:
 def test_an_rc_effect_is_a_pair_of_the_circuit() -> None:
     parameters = {"ohm": 0.02, "tau_s": 6.0, "activation_k": 0.0}
     model = with_effect("fast_polarization", **parameters)
-    model = model.model_copy(
-        update={
-            "delays_s": [0.0],
-            "coefficients": {k: v for k, v in model.coefficients.items() if k not in "R2R3R4"},
-        }
-    )
+    assert model.published is not None
+    kept = {name: of for name, of in model.coefficients.items() if name not in "R2R3R4"}
+    published = model.published.model_copy(update={"delays_s": [0.0], "coefficients": kept})
+    model = model.model_copy(update={"published": published})
     circuit = equivalent_circuit(model)
     assert circuit.pair_tau_s == pytest.approx([6.0])
     assert np.array(circuit.pair_ohm) == pytest.approx(0.02, rel=1e-6)
