@@ -45,7 +45,7 @@ from cangauge.logs.read import read_log
 from cangauge.model.model_file import Model
 from cangauge.replay.player import Pacer
 from cangauge.service.pipeline import Pipeline, PipelineSettings
-from cangauge.service.recording import Recorder
+from cangauge.service.record import Recorder
 from cangauge.types import Sample
 from live_service import MODEL, command, service
 

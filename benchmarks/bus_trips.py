@@ -35,11 +35,12 @@ from cangauge.logs.log import Log
 from cangauge.model.model_file import Model
 from cangauge.replay.player import ReplaySettings, play
 from cangauge.replay.steps import LogSource, quantization_bound
-from cangauge.service.loop import LoopSettings, Outputs, serve
+from cangauge.service.loop import Loop
 from cangauge.service.offline import estimate_capture
+from cangauge.service.output import Output
 from cangauge.service.pipeline import Pipeline, PipelineSettings
-from cangauge.service.recording import Recorder
-from cangauge.types import Estimate
+from cangauge.service.record import Recorder
+from cangauge.types import Estimate, Sample
 from real_trips import DATA, JUDGED_S, TEST, TRAINING, identify, read_trips
 
 NUMBERS = ("soc_pct", "soc_std_pct", "soc_newton_pct", "soc_coulomb_pct", "residual_v")
@@ -61,6 +62,17 @@ class Comparison:
     is_bit_for_bit: bool
 
 
+class _Rows(Output):
+    """Collect the estimate of each sample."""
+
+    def __init__(self, rows: list[Estimate]) -> None:
+        self._rows = rows
+
+    def on_sample(self, sample: Sample, estimate: Estimate) -> None:
+        del sample
+        self._rows.append(estimate)
+
+
 def over_bus(
     log: Log, vehicle: Vehicle, model: Model, address: BusAddress, record: Path
 ) -> tuple[list[Estimate], Pipeline, float]:
@@ -73,10 +85,9 @@ def over_bus(
         BusConnection(open_bus(address, [standard_filter(0x5A1)]), str(address)) as sender,
         Recorder(record) as recorder,
     ):
-        outputs = Outputs(record=recorder, table=lambda _, estimate: rows.append(estimate))
-        service = threading.Thread(
-            target=serve, args=(receiver, pipeline, LoopSettings(), outputs, done.is_set)
-        )
+        outputs = [_Rows(rows), recorder]
+        loop = Loop(receiver, pipeline, outputs=outputs, record=recorder)
+        service = threading.Thread(target=loop.run, args=(done.is_set,))
         service.start()
         began = time.monotonic()
         try:

@@ -134,7 +134,7 @@ class ServiceRun:
         self.keeper: StateKeeper | None = None
         if path is not None:
             self.keeper = StateKeeper(
-                StateSettings(path, every_s=EVERY_S), self.pipeline,
+                StateSettings(path), self.pipeline,
                 wall_s=lambda: self.now_s,
             )  # fmt: skip
 

@@ -13,7 +13,7 @@ from cangauge.bus.vehicle import Vehicle
 from cangauge.service.loop import LoopSettings
 from cangauge.service.offline import estimate_capture
 from cangauge.service.pipeline import Pipeline, PipelineSettings
-from cangauge.service.recording import Recorder
+from cangauge.service.record import Recorder
 from live import Service, leaf_model, waits
 
 DBC = """VERSION "1"

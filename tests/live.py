@@ -28,9 +28,10 @@ from cangauge.bus.vehicle import Vehicle
 from cangauge.cli.app import main
 from cangauge.logs.log import Log
 from cangauge.model.model_file import Model
-from cangauge.service.loop import LoopSettings, Outputs, RunSummary, serve
+from cangauge.service.loop import Loop, LoopSettings, RunSummary
+from cangauge.service.output import Output
 from cangauge.service.pipeline import Pipeline, PipelineSettings
-from cangauge.types import Estimate
+from cangauge.types import Estimate, Sample
 from synthetic import synthetic_log
 
 COMMAND = "from cangauge.__main__ import main; main()"
@@ -83,7 +84,11 @@ class LoggedLines(logging.Handler):
     def __exit__(self, *_: object) -> None:
         self._logger.removeHandler(self)
         self._logger.setLevel(self._level)
-        self._limiter.close()
+        self.release_all()
+
+    def release_all(self) -> None:
+        """Add the lines that the rate limit holds back."""
+        self._limiter.release_due(everything=True)
 
     def emit(self, record: logging.LogRecord) -> None:
         if self._thread is None or record.thread == self._thread.ident:
@@ -92,8 +97,18 @@ class LoggedLines(logging.Handler):
 
 
 @dataclass
+class Rows(Output):
+    """Collects times and estimates of samples."""
+
+    rows: list[tuple[float, Estimate]]
+
+    def on_sample(self, sample: Sample, estimate: Estimate) -> None:
+        self.rows.append((sample.time_s, estimate))
+
+
+@dataclass
 class Service:
-    """`serve` in a thread; collects estimates and warnings."""
+    """The loop in a thread; collects estimates and warnings."""
 
     port: BusConnection
     pipeline: Pipeline
@@ -132,15 +147,16 @@ class Service:
         assert not self._thread.is_alive()
 
     def _run(self) -> None:
-        outputs = Outputs(
-            record=self.record,
-            table=lambda time_s, estimate: self.rows.append((time_s, estimate)),
-            checkpoint=self.checkpoint,
-        )
         try:
-            self.summary = serve(
-                self.port, self.pipeline, self.settings, outputs, self._stop.is_set
+            loop = Loop(
+                self.port,
+                self.pipeline,
+                self.settings,
+                outputs=[Rows(self.rows), *([self.record] if self.record else [])],
+                record=self.record,
+                checkpoint=self.checkpoint,
             )
+            self.summary = loop.run(self._stop.is_set)
         except Exception as error:  # noqa: BLE001 - for the test to look at
             self.error = error
 
@@ -304,7 +320,7 @@ def in_process(*arguments: object) -> Ended:
     return Ended(code, out.getvalue(), err.getvalue())
 
 
-def waits(condition: Callable[[], bool], seconds: float = 5.0) -> bool:
+def waits(condition: Callable[[], bool], seconds: float = 60.0) -> bool:
     """Return whether a condition becomes true in time."""
     until = time.monotonic() + seconds
     while not condition():

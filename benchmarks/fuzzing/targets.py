@@ -17,6 +17,7 @@ from random import Random
 
 import can
 
+from cangauge._files import text_sha256
 from cangauge._resources import shared_file
 from cangauge.bus.captures import is_capture, open_capture
 from cangauge.bus.database import load_dbc
@@ -38,6 +39,7 @@ from cangauge.model.model_file import Model
 from cangauge.service import state as state_file
 from cangauge.service.config import load_config
 from cangauge.service.pipeline import Pipeline, PipelineSettings
+from cangauge.service.setup import address_of, load_vehicle, pipeline_settings
 from cangauge.types import Estimate, Sample
 from fuzzing import corpus
 from fuzzing.mutate import json_bytes, mutate, mutate_json
@@ -338,10 +340,9 @@ def _make_config(rng: Random) -> bytes:
 def _run_config(data: bytes) -> bool:
     with _file(data, "config.toml") as path:
         config = load_config(path, {"timeout_s": 3.0} if data[:1] == b"m" else None)
-        config.address()
-        config.pipeline_settings()
-        config.loop_settings()
-        config.load_vehicle()
+        address_of(config)
+        pipeline_settings(config)
+        load_vehicle(config)
     return True
 
 
@@ -386,7 +387,7 @@ def _state_text() -> str:
         estimator.step(Sample(t, i, u, temp))
     return state_file.state_text(
         state_file.StateContent(
-            saved_s=1.7e9, boot_id="x", model=state_file.model_fingerprint(_model()),
+            saved_s=1.7e9, boot_id="x", model=text_sha256(_model().to_json()),
             model_name="x", bus="can0", vehicle="x", time_source="receive",
             estimator=estimator.snapshot(),
         )

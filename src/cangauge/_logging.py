@@ -87,6 +87,7 @@ def logging_to(
     handler.setFormatter(JsonFormatter() if log_format == "json" else TextFormatter())
     limiter = RateLimitFilter(handler.write)
     handler.addFilter(limiter)
+    _LIMITERS.append(limiter)
     root, own = logging.getLogger(), logging.getLogger("cangauge")
     bus = logging.getLogger("can")
     before = root.handlers[:], root.level, own.level, bus.level
@@ -98,11 +99,21 @@ def logging_to(
     try:
         yield
     finally:
-        limiter.close()
+        _LIMITERS.remove(limiter)
+        limiter.release_due(everything=True)
         root.handlers[:] = before[0]
         root.setLevel(before[1])
         own.setLevel(before[2])
         bus.setLevel(before[3])
+
+
+_LIMITERS: Final[list[RateLimitFilter]] = []
+
+
+def release_held() -> None:
+    """Write the suppressed records whose interval has ended; the receive loop calls this."""
+    for limiter in _LIMITERS:
+        limiter.release_due()
 
 
 def takes_text(stream: IO[str]) -> bool:
@@ -182,8 +193,8 @@ class RateLimitFilter(logging.Filter):
     Parameters
     ----------
     release : callable, optional
-        Writes a suppressed record when its interval ends, from a timer thread. Without it,
-        suppressed records are only counted.
+        Writes a suppressed record once its interval has ended, when `release_due` is called: no
+        thread is started for it, which could fail. Without it, suppressed records are only counted.
     clock : callable
         Monotonic time [s].
     """
@@ -198,8 +209,6 @@ class RateLimitFilter(logging.Filter):
         self._clock = clock
         self._lock = threading.Lock()
         self._events: dict[tuple[str, str], _Repetitions] = {}
-        self._timer: threading.Timer | None = None
-        self._timer_s = math.inf
 
     def filter(self, record: logging.LogRecord) -> bool:
         """Return whether to write the record now; its `suppressed` counts those before it."""
@@ -216,7 +225,6 @@ class RateLimitFilter(logging.Filter):
                 seen.latest_s = now_s
                 seen.suppressed += 1
                 seen.held = record
-                self._set_timer(seen.next_s, now_s)
                 return False
             else:
                 seen.interval_s = min(2.0 * seen.interval_s, LONGEST_INTERVAL_S)
@@ -231,12 +239,8 @@ class RateLimitFilter(logging.Filter):
         with self._lock:
             now_s = self._clock()
             due: list[logging.LogRecord] = []
-            self._timer_s = math.inf
             for seen in self._events.values():
-                if seen.held is None:
-                    continue
-                if now_s < seen.next_s and not everything:
-                    self._set_timer(seen.next_s, now_s)
+                if seen.held is None or (now_s < seen.next_s and not everything):
                     continue
                 due.append(seen.held)
                 seen.suppressed -= 1
@@ -244,22 +248,6 @@ class RateLimitFilter(logging.Filter):
                 _pass(seen, seen.held, now_s)
         for record in sorted(due, key=lambda each: each.created):
             self._release(record)
-
-    def close(self) -> None:
-        """Write all suppressed records and stop the timer."""
-        self.release_due(everything=True)
-        if self._timer is not None:
-            self._timer.cancel()
-
-    def _set_timer(self, due_s: float, now_s: float) -> None:
-        if self._release is None or due_s >= self._timer_s:
-            return
-        if self._timer is not None:
-            self._timer.cancel()
-        self._timer_s = due_s
-        self._timer = threading.Timer(due_s - now_s, self.release_due)
-        self._timer.daemon = True
-        self._timer.start()
 
 
 def _pass(seen: _Repetitions, record: logging.LogRecord, now_s: float) -> None:

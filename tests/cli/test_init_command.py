@@ -19,6 +19,7 @@ from cangauge.bus.recording import capture_to_log
 from cangauge.bus.vehicle import Vehicle
 from cangauge.logs.sign import sign_of_current
 from cangauge.service.config import load_config
+from cangauge.service.setup import load_vehicle
 from drive_captures import CARS, capture
 
 
@@ -145,7 +146,7 @@ def test_known_vehicles_are_recognised(
     assert done.returncode == 0, done.stderr
     assert json.loads(done.stdout)["vehicle"] == preset
     config = load_config(tmp_path / "run.toml")
-    assert config.load_vehicle().name == Vehicle.load(preset, temperature_c=20.0).name
+    assert load_vehicle(config).name == Vehicle.load(preset, temperature_c=20.0).name
 
 
 def test_a_live_bus_is_listened_to(mitsubishi: Path, tmp_path: Path) -> None:

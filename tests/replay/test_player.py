@@ -25,7 +25,7 @@ from cangauge.estimation.settings import EstimatorSettings
 from cangauge.replay.player import ReplaySettings, ReplayState, play
 from cangauge.replay.steps import CaptureSource, LogSource, quantization_bound
 from cangauge.service.pipeline import NOTHING_YET, PipelineSettings
-from cangauge.service.recording import Recorder
+from cangauge.service.record import Recorder
 from live import (
     Service,
     leaf_model,

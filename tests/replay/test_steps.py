@@ -14,7 +14,7 @@ from cangauge.bus.vehicle import Vehicle
 from cangauge.errors import InputError
 from cangauge.replay.steps import CaptureSource, LogSource
 from cangauge.service.pipeline import NOTHING_YET
-from cangauge.service.recording import Recorder
+from cangauge.service.record import Recorder
 from live import short_log
 
 

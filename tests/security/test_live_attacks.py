@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import shutil
 import signal
@@ -20,7 +19,6 @@ import pytest
 
 from cangauge.bus.encoder import FrameEncoder
 from cangauge.bus.vehicle import Vehicle
-from cangauge.errors import CangaugeError
 from cangauge.service.state import FILE_NAME
 from cangauge.service.status_client import fetch_status
 from cangauge.types import Sample
@@ -91,10 +89,6 @@ class Target:
     def status(self) -> dict[str, Any]:
         return fetch_status(str(self.socket))
 
-    def children(self) -> list[int]:
-        text = Path(f"/proc/{self.service.process.pid}/task").glob("*/children")
-        return [int(each) for path in text for each in path.read_text().split()]
-
 
 @pytest.fixture
 def target(tmp_path: Path) -> Iterator[Target]:
@@ -123,16 +117,6 @@ SWAPS: dict[str, Callable[[Path], object]] = {
     "10 GB": sparse,
     "nothing": lambda _: None,
     "a text": lambda path: path.write_text("x = 1\n"),
-}
-CONFIGS = {
-    "deep": "x = " + "[" * 30_000,
-    "deep tables": "".join("[" + ".".join("a" * n) + "]\n" for n in range(2, 30)) * 30,
-    "long key": "a" + ".a" * 20_000 + " = 1\n",
-    "many keys": "".join(f"k{n} = 1\n" for n in range(6_000)),
-    "a million keys": "".join(f"k{n} = 1\n" for n in range(1_000_000)),
-    "long number": "timeout_s = " + "9" * 60_000,
-    "escapes": 'vehicle = "\\u001b[2J\\u0000\\n"\n',
-    "binary": "\x00\x01",
 }
 JUNK = {
     "endless headers": b"GET /status HTTP/1.1\r\n" + b"X: y\r\n" * 200_000,
@@ -190,44 +174,14 @@ def test_frames_go_on_under_attack(target: Target, tmp_path: Path) -> None:
         target.service.process.send_signal(signal.SIGHUP)
         time.sleep(0.002)
     target.holds("hangups", 0.3)
-    assert len(target.children()) <= 1
     assert waits(lambda: not target.status()["config"]["reloading"], 20.0)
-
-    target.service.process.send_signal(signal.SIGHUP)
-    assert waits(lambda: bool(target.children()), 5.0)
-    for child in target.children():
-        os.kill(child, signal.SIGKILL)
-    assert waits(lambda: bool(target.status()["config"]["problem"]), 10.0)
-    assert "status -9" in target.status()["config"]["problem"]
-    target.holds("killed while it reads", 0.1)
 
     write_large_dbc(tmp_path, 3.0)
     large = 'dbc = "large.dbc"\nmap = "map.toml"\n[bus_options]'
     target.config.write_text(target.good.replace("[bus_options]", large))
     target.service.process.send_signal(signal.SIGHUP)
-    assert waits(lambda: bool(target.children()), 5.0)
     target.holds("a large DBC", 0.3)
-    left = target.children()
     target.service.process.terminate()
     ended = target.service.end(5.0)
     assert ended.code == 0, ended.err
     assert "Traceback" not in ended.err
-    assert waits(lambda: not any(Path(f"/proc/{each}").exists() for each in left), 5.0)
-
-
-@pytest.mark.parametrize("name", [*SWAPS, *CONFIGS])
-def test_a_hostile_configuration_is_refused_in_bounds(tmp_path: Path, name: str) -> None:
-    """As the process of a reload reads it."""
-    from cangauge.service.config import load_config  # noqa: PLC0415
-
-    path = tmp_path / "run.toml"
-    if name in SWAPS:
-        SWAPS[name](path)
-    else:
-        path.write_text(CONFIGS[name])
-    began_s = time.process_time()
-    with pytest.raises(CangaugeError) as caught:
-        load_config(path, {"model": "m.json"}).load_vehicle()
-    assert time.process_time() - began_s < 2.0
-    assert str(caught.value).isprintable()
-    json.dumps(caught.value.to_dict())

@@ -65,17 +65,13 @@ def test_a_lock_file_that_is_a_link_is_refused(tmp_path: Path) -> None:
 
 def test_a_second_service_with_a_file_of_the_first_is_refused(tmp_path: Path) -> None:
     record, state, table = tmp_path / "r.log", tmp_path / "s.json", tmp_path / "t.csv"
-    socket = tmp_path / "status.sock"
-    first = Command(
-        *RUN, "--record", record, "--state", state, "-o", table, "--status-socket", socket
-    )
+    first = Command(*RUN, "--record", record, "--state", state, "-o", table)
     first.wait_for("service.ready")
     try:
         for options in (
             ("--record", record),
             ("--state", state),
             ("-o", table),
-            ("--status-socket", socket),
         ):
             second = in_process(*RUN, *options, "--duration", "0.1")
             assert second.code == 2, options
@@ -99,28 +95,14 @@ def test_files_of_a_service_are_not_for_others(tmp_path: Path) -> None:
     assert stat.S_IMODE((tmp_path / "r.log").stat().st_mode) == 0o640
 
 
-def test_an_existing_part_is_never_replaced(tmp_path: Path) -> None:
-    """A name that another program takes between the choice of the name and the writing."""
-    from cangauge.service.recording import _created  # noqa: PLC0415
-
-    path = tmp_path / "drive-0001-0001.log"
-    path.write_text("precious")
-    with pytest.raises(FileExistsError):
-        _created(path)
-    os.mkfifo(tmp_path / "pipe.log")
-    with pytest.raises(OSError):  # noqa: PT011 - no reader, or a pipe
-        _created(tmp_path / "pipe.log")
-    assert path.read_text() == "precious"
-
-
 @pytest.mark.parametrize("rights", [0o600, 0o644, 0o666])
 def test_a_token_that_others_can_read_is_reported(tmp_path: Path, rights: int) -> None:
     token = tmp_path / "token"
     token.write_text("a-token-of-some-length")
     token.chmod(rights)
-    ended = in_process(
-        *RUN, "--http", "127.0.0.1:0", "--http-token-file", token, "--duration", "0.1"
-    )
+    config = tmp_path / "run.toml"
+    config.write_text('http_token_file = "token"\n')
+    ended = in_process(*RUN, "--http", "127.0.0.1:0", "--config", config, "--duration", "0.1")
     assert ended.code == 0
     assert ("http.token_exposed" in ended.err) == (rights != 0o600)
 

@@ -2,17 +2,13 @@
 
 from __future__ import annotations
 
-import os
 import subprocess
 import sys
-from functools import partial
 from pathlib import Path
 
 import pytest
 
-from cangauge.service.config import RunConfig
-from cangauge.service.reading import BackgroundReader, Reading
-from live import COMMAND, leaf_model_path, waits
+from live import COMMAND, leaf_model_path
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="needs a Unix shell")
 RUN = ("run", "-m", leaf_model_path(), "--interface", "virtual", "--channel", "a", "--duration",
@@ -70,23 +66,3 @@ def test_odd_environments(tmp_path: Path) -> None:
     helped = shell(("status", "--help"), "", environment)
     assert helped.returncode == 0, helped.stderr
     assert "\\xb1" in helped.stdout  # "±" in words that this locale has
-
-
-def test_modules_in_the_working_folder_are_not_imported(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Whoever supplies a folder of logs must not supply code."""
-    trap = f"open({str(tmp_path / 'taken')!r}, 'w').close()\nraise SystemExit(9)\n"
-    folder = tmp_path / "downloads"
-    folder.mkdir()
-    for name in ("struct", "numpy", "can", "asammdf", "pickle", "cangauge", "contextlib"):
-        (folder / f"{name}.py").write_text(trap)
-    (folder / "x.mf4").write_bytes(b"MDF     4.10    " + bytes(1000))
-    monkeypatch.chdir(folder)
-    reader = BackgroundReader(partial(RunConfig, model=str(leaf_model_path())))
-    reader.request()
-    results: list[object] = []
-    assert waits(lambda: bool(results.append(reader.poll()) or results[-1]), 30.0)  # type: ignore[func-returns-value] # collects
-    assert isinstance(results[-1], Reading), results[-1]
-    assert not (tmp_path / "taken").exists()
-    assert os.listdir(folder)  # noqa: PTH208 - it is still there

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import os
 import re
 import signal
@@ -18,10 +17,9 @@ import pytest
 from cangauge.bus.encoder import FrameEncoder
 from cangauge.bus.vehicle import Vehicle
 from cangauge.estimation.offline import samples_of
-from cangauge.extras.formats.mcap_messages import read_messages
 from cangauge.logs.canonical import write_log
 from cangauge.service.offline import estimate_capture
-from cangauge.service.recording import Recorder
+from cangauge.service.record import Recorder
 from live import Command, in_process, leaf_model, leaf_model_path, run_to_end, short_log
 
 pytestmark = pytest.mark.slow
@@ -71,33 +69,6 @@ def test_a_log_at_full_speed_from_one_process_to_the_other(
     for name in names[:-2]:
         assert np.array_equal(live[name].to_numpy(), getattr(offline, name), equal_nan=True), name
     assert "samples, 0 lost, 0 CRC errors; last SoC" in ended.err
-
-
-def test_an_mcap_holds_frames_samples_and_estimates(
-    bus: list[str], log_path: Path, tmp_path: Path
-) -> None:
-    record = tmp_path / "drive.mcap"
-    service = Command(
-        "run", *bus, *MODEL, "--time-source", "replay-clock", "--until-idle", "1", "--json",
-        "--record", record,
-    )  # fmt: skip
-    replayed = run_to_end("replay", log_path, *bus, "--speed", "max", "--json")
-    ended = service.end()
-    assert (replayed.code, ended.code) == (0, 0), replayed.err + ended.err
-    offline = estimate_capture(record, Vehicle.load("generic"), leaf_model()).table
-    assert offline.soc_pct[-1] == ended.json["estimate"]["soc_pct"]
-    with record.open("rb") as file:
-        messages = list(read_messages(file, record))
-    estimates = [each.fields() for each in messages if each.topic == "/soc_estimate"]
-    samples = [each.fields() for each in messages if each.topic == "/sample"]
-    assert len(estimates) == len(samples) == 1200
-    assert [each["time_s"] for each in estimates] == offline.time_s.tolist()
-    assert [each.get("soc_pct", math.nan) for each in estimates] == pytest.approx(
-        offline.soc_pct.tolist(), abs=0.0, nan_ok=True
-    )
-    times = [each.time_ns for each in messages]
-    assert max(np.diff(times)) < 5e9  # one time for frames and estimates: that of the bus
-    assert min(times) > 1.6e18
 
 
 def test_a_capture_in_real_time(bus: list[str], tmp_path: Path) -> None:

@@ -10,6 +10,7 @@ import pytest
 from cangauge.bus.protection import GENERIC_RULE, E2eRule
 from cangauge.errors import InputError
 from cangauge.service.config import config_keys, load_config, reference
+from cangauge.service.setup import address_of, load_vehicle, pipeline_settings
 
 
 def write(tmp_path: Path, text: str) -> Path:
@@ -42,17 +43,17 @@ def test_a_whole_file(tmp_path: Path) -> None:
     config = load_config(path)
     assert config.model == str(tmp_path / "leaf.json")
     assert config.record == str(tmp_path / "out" / "drive.log")
-    address = config.address()
+    address = address_of(config)
     assert (address.interface, address.channel) == ("socketcan", "can3")
     assert dict(address.options) == {"bitrate": 500000, "fd": False}
-    settings = config.pipeline_settings()
+    settings = pipeline_settings(config)
     assert settings.ids.soc_estimate == 0x123
     assert settings.ids.soc_detail == 0x5A1
     assert settings.time_source == "replay-clock"
     assert settings.estimator.method == "newton"
     assert settings.estimator.initial_soc_pct == 81.5
-    assert config.loop_settings().timeout_s == 0.5
-    assert config.load_vehicle().name == "Nissan Leaf AZE0"
+    assert config.timeout_s == 0.5
+    assert load_vehicle(config).name == "Nissan Leaf AZE0"
 
 
 def test_options_take_precedence_over_the_file(tmp_path: Path) -> None:
@@ -112,7 +113,7 @@ def test_errors_name_file_field_and_value(
     [
         ({"model": "m", "method": "magic"}, "--method"),
         ({"model": "m", "initial_soc": "x"}, "--initial-soc"),
-        ({"model": "m", "ids": {"soc_estimate": -1}}, "--soc-estimate-id"),
+        ({"model": "m", "ids": {"soc_estimate": -1}}, "ids.soc_estimate"),
         ({}, "-m/--model"),
     ],
 )
@@ -125,7 +126,7 @@ def test_errors_of_the_command_line_name_the_option(options: dict[str, object], 
 def test_equal_ids_are_refused(tmp_path: Path) -> None:
     config = load_config(write(tmp_path, 'model = "m"\n[ids]\nsoc_detail = 0x5A0\n'))
     with pytest.raises(InputError, match="same id"):
-        config.pipeline_settings()
+        pipeline_settings(config)
 
 
 def test_no_such_file() -> None:
@@ -157,7 +158,7 @@ def test_protection_and_checks_precede_the_vehicles(tmp_path: Path) -> None:
         timeout_s = 3.5
         """,
     )
-    vehicle = load_config(path).load_vehicle()
+    vehicle = load_vehicle(load_config(path))
     assert vehicle.messages[0x400].rule == E2eRule("e2e_05", data_id=0x1234)
     assert vehicle.messages[0x400].period_s == 0.05
     rule = vehicle.messages[0x401].rule
@@ -188,30 +189,33 @@ def test_errors_in_protection_and_checks_name_file_and_field(
 ) -> None:
     path = write(tmp_path, f'model = "leaf.json"\n{text}\n')
     with pytest.raises(InputError) as caught:
-        load_config(path).load_vehicle()
+        load_vehicle(load_config(path))
     assert caught.value.field == field
     assert field == "messages.PACK_CURENT" or caught.value.source == str(path)
 
 
 def test_the_interface_of_a_missing_bus_follows_from_its_name() -> None:
     waiting = load_config(None, {"model": "a.json", "channel": "can7", "wait_for_bus": True})
-    assert str(waiting.address()) == "socketcan can7"
+    assert str(address_of(waiting)) == "socketcan can7"
     group = load_config(None, {"model": "a.json", "channel": "239.1.1.1", "wait_for_bus": True})
-    assert group.address().interface == "udp_multicast"
+    assert address_of(group).interface == "udp_multicast"
     with pytest.raises(InputError, match="can7"):
-        load_config(None, {"model": "a.json", "channel": "can7"}).address()
+        address_of(load_config(None, {"model": "a.json", "channel": "can7"}))
 
 
 def test_each_key_is_described_and_each_option_declared_once() -> None:
     keys = {key.name: key for key in config_keys()}
     assert set(keys) > {"model", "ids.soc_estimate", "full_charge.voltage_v", "checks.voltage"}
     assert all(key.text for key in keys.values())
-    flags = [flag for key in keys.values() for flag in re.split("[,/] ?", key.option) if flag]
+    flags = [flag for key in keys.values() for flag in re.split(", ", key.info.option) if flag]
     assert len(flags) == len(set(flags))
-    timeout = keys["timeout_s"]
-    assert (timeout.option, timeout.default, timeout.unit) == ("--timeout-s", "2", "s")
-    assert timeout.bounds == "> 0, ≤ 1e+09"
-    assert "| `ids.soc_detail` | `--soc-detail-id` | whole number | 0x5A1 |" in reference()
+    until = keys["until_idle_s"]
+    assert (until.info.option, until.info.unit, until.bounds) == (
+        "--until-idle",
+        "s",
+        "> 0, ≤ 1e+09",
+    )
+    assert "| `ids.soc_detail` |  | whole number | 0x5A1 |" in reference()
 
 
 def test_an_error_of_an_option_names_it_as_it_is_written() -> None:

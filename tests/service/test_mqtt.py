@@ -15,6 +15,7 @@ from typing import Any
 import pytest
 
 from cangauge.errors import InputError
+from cangauge.extras.live.mqtt import MqttSettings, mqtt_settings
 from cangauge.service.config import load_config
 from live import Command, leaf_model_path, waits
 from running import RunningService, free_port
@@ -218,6 +219,12 @@ def test_password_and_tls_are_used(tmp_path: Path) -> None:
         broker.end()
 
 
+def settings_in(path: Path) -> MqttSettings:
+    config = load_config(path).mqtt
+    assert config is not None
+    return mqtt_settings(config, "can0")
+
+
 @pytest.mark.parametrize(
     ("lines", "field"),
     [
@@ -235,7 +242,7 @@ def test_a_wrong_section_is_refused_by_key(tmp_path: Path, lines: str, field: st
     path = tmp_path / "run.toml"
     path.write_text(f'model = "{leaf_model_path()}"\n[mqtt]\n{lines}')
     with pytest.raises(InputError) as caught:
-        load_config(path).mqtt_settings("can0")
+        settings_in(path)
     assert caught.value.field == field
 
 
@@ -244,7 +251,6 @@ def test_a_password_is_in_no_repr(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     path = tmp_path / "run.toml"
     path.write_text(f'model = "{leaf_model_path()}"\n[mqtt]\nbroker = "b"\nuser = "u"\n')
     config = load_config(path)
-    settings = config.mqtt_settings("can0")
-    assert settings is not None
+    settings = settings_in(path)
     assert settings.password == PASSWORD
     assert PASSWORD not in repr(settings) + repr(config)

@@ -33,6 +33,7 @@ from cangauge.estimation.settings import EstimatorSettings
 from cangauge.logs.log import Log
 from cangauge.service.config import load_config
 from cangauge.service.pipeline import Pipeline, PipelineSettings
+from cangauge.service.setup import pipeline_settings
 from cangauge.types import Estimate, Reason, Status
 from cells_bus import ALL_CELLS, CAR, CELLS_DBC, CELLS_ON_BUS, all_cell_frames
 from live import collect, leaf_model, short_log, virtual_port, virtual_service
@@ -146,7 +147,7 @@ def test_pack_frames_are_sent_every_second_by_both_clocks() -> None:
 def test_ids_of_pack_frames_are_configured(tmp_path: Path) -> None:
     file = tmp_path / "run.toml"
     file.write_text('model = "m"\n[ids]\nsoc_health = 0x10\nsoc_power = 0x11\nsoc_cells = 0x12\n')
-    ids = load_config(file).pipeline_settings().ids
+    ids = pipeline_settings(load_config(file)).ids
     frames = SocPublisher(ids).report_frames(REPORT)
     assert [each.arbitration_id for each in frames] == [0x10, 0x11, 0x12]
     with pytest.raises(InputError, match=r"ids\.soc_health"):
@@ -156,7 +157,7 @@ def test_ids_of_pack_frames_are_configured(tmp_path: Path) -> None:
 def test_limits_are_configured(tmp_path: Path) -> None:
     file = tmp_path / "run.toml"
     file.write_text('model = "m"\n[limits]\nmin_voltage_v = 300\nmax_charge_a = 40\n')
-    limits = load_config(file).pipeline_settings().estimator.limits
+    limits = pipeline_settings(load_config(file)).estimator.limits
     assert limits == PackLimits(min_voltage_v=300.0, max_charge_a=40.0)
     file.write_text('model = "m"\n[limits]\nmin_voltage_v = -3\n')
     with pytest.raises(InputError, match=r"limits\.min_voltage_v"):

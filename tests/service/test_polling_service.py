@@ -11,7 +11,7 @@ import pytest
 from cangauge.bus.open import BusAddress, bus_address
 from cangauge.errors import InputError
 from cangauge.service.config import load_config
-from cangauge.service.reading import Reading
+from cangauge.service.setup import Setup
 from live import leaf_model_path, waits
 from polled_battery import (
     NEGATIVE,
@@ -59,16 +59,14 @@ def test_another_tester_pauses_the_requests() -> None:
         assert service.pipeline.decoder.health["temperature"].value_at(time.time()) == 20.0
 
 
-def read(tmp_path: Path, text: str) -> Reading:
+def read(tmp_path: Path, text: str) -> Setup:
     path = tmp_path / "service.toml"
     path.write_text(f'model = "{leaf_model_path()}"\n{text}', encoding="utf-8")
-    return Reading.of(lambda: load_config(path))
+    return Setup.of(load_config(path))
 
 
 def test_polling_is_off_unless_configured(tmp_path: Path) -> None:
-    assert read(tmp_path, 'vehicle = "leaf_ze1_polled"').config.loop_settings().poll_every_s is None
-    found = read(tmp_path, 'vehicle = "leaf_ze1_polled"\n[poll]\nevery_s = 20\n')
-    assert found.config.loop_settings().poll_every_s == 20.0
+    assert read(tmp_path, 'vehicle = "leaf_ze1_polled"').config.poll is None
     assert read(tmp_path, 'vehicle = "leaf_ze1_polled"\n[poll]').config.poll is not None
 
 

@@ -22,7 +22,7 @@ from cangauge.estimation.offline import samples_of
 from cangauge.service.loop import LoopSettings
 from cangauge.service.offline import estimate_capture
 from cangauge.service.pipeline import Pipeline, PipelineSettings
-from cangauge.service.recording import Recorder
+from cangauge.service.record import Recorder
 from cangauge.types import Reason, Sample, Status
 from live import Service, leaf_model, short_log, virtual_port, virtual_service, waits
 

@@ -43,7 +43,9 @@ def drive(port: BusConnection, first: int, after: int) -> None:
 
 
 def run(path: Path) -> Command:
-    service = Command("run", *BUS, *MODEL, "--state", path, "--state-every", "0.2", "--json",
+    config = path.parent.with_suffix(".toml")
+    config.write_text("state_every_s = 0.2\n")
+    service = Command("run", *BUS, *MODEL, "--state", path, "--config", config, "--json",
                       "--initial-soc", "80")  # fmt: skip
     service.wait_for("service.ready")
     return service

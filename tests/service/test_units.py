@@ -5,12 +5,12 @@ from __future__ import annotations
 import re
 import shutil
 import subprocess
-import time
 from pathlib import Path
 
 import pytest
 
 from cangauge.errors import InputError
+from cangauge.service.addresses import http_address
 from cangauge.service.config import load_config
 
 NAME = "cangauge@.service"
@@ -79,15 +79,8 @@ def test_the_unit_names_options_that_there_are(project: Path) -> None:
 def test_the_example_configuration_is_one(project: Path) -> None:
     config = load_config(project / "contrib" / "systemd" / "example.toml")
     assert config.record == "/var/lib/cangauge/can0/drive.log.gz"
-    limits = config.record_limits()
-    assert (limits.part_bytes, limits.part_s, limits.keep_bytes) == (
-        64_000_000,
-        3600,
-        2_000_000_000,
-    )
-    address = config.http_address()
-    assert address is not None
-    assert address.host == "127.0.0.1"
+    assert (config.record_part_mb, config.record_part_s, config.record_keep_mb) == (64, 3600, 2000)
+    assert http_address(str(config.http), None, {}).host == "127.0.0.1"
 
 
 @pytest.mark.parametrize(
@@ -105,12 +98,8 @@ def test_the_example_configuration_is_one(project: Path) -> None:
         (b"\xff\xfe\x00", "not TOML"),
     ],
 )
-def test_a_hostile_configuration_is_refused_in_no_time(
-    tmp_path: Path, text: str | bytes, say: str
-) -> None:
+def test_a_hostile_configuration_is_refused(tmp_path: Path, text: str | bytes, say: str) -> None:
     path = tmp_path / "car.toml"
     path.write_bytes(text.encode() if isinstance(text, str) else text)
-    began = time.perf_counter()
     with pytest.raises(InputError, match=say):
         load_config(path)
-    assert time.perf_counter() - began < 5.0

@@ -11,23 +11,15 @@ from cangauge.estimation.offline import samples_of
 from cangauge.estimation.settings import EstimatorSettings
 from cangauge.service.lifecycle import Notifier
 from cangauge.service.pipeline import Pipeline, PipelineSettings
-from cangauge.service.status import Identity, Monitor
+from cangauge.service.status import Monitor
 from live import leaf_model, short_log
-
-IDENTITY = Identity(
-    bus="virtual x",
-    vehicle="generic",
-    model="leaf.json",
-    method="ekf",
-    time_source="receive",
-    began_s=1.7e9,
-)
 
 
 @dataclass
 class StandInPort:
     """The counts of a port."""
 
+    name: str = "virtual x"
     garbled: int = 1
     error_frames: int = 2
     unsent: int = 3
@@ -40,7 +32,6 @@ class Watched:
     now_s: float = 100.0
     port: Any = field(default_factory=StandInPort)
     notifier: Notifier = field(default_factory=Notifier)
-    record: Any = None
 
     def __post_init__(self) -> None:
         known = PipelineSettings(EstimatorSettings(initial_soc_pct=80.0))
@@ -48,20 +39,21 @@ class Watched:
         self.monitor = Monitor(
             self.pipeline,
             self.port,
-            identity=IDENTITY,
+            "leaf.json",
             notifier=self.notifier,
-            record=self.record,
             clock=lambda: self.now_s,
         )
+
+    @property
+    def status(self) -> dict[str, Any]:
+        return self.monitor.latest.at(self.now_s)
 
     def drive(self, seconds: float) -> None:
         """Handle the frames of a drive, publishing as the loop does."""
         encoder = FrameEncoder(Vehicle.load("generic"))
         for sample in samples_of(short_log(seconds)):
             for frame in encoder.encode(sample):
-                before = self.pipeline.samples
-                self.pipeline.handle(frame)
-                if self.pipeline.samples != before:
+                if self.pipeline.handle(frame):
                     self.monitor.stepped(frame.timestamp, 30e-6, self.now_s)
         self.pipeline.heartbeat(is_stale=False)
 

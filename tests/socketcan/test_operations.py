@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 import time
 import urllib.request
+from contextlib import closing
 from pathlib import Path
 
 import numpy as np
@@ -15,20 +16,19 @@ from cangauge.bus.encoder import FrameEncoder
 from cangauge.bus.open import BusAddress, has_socketcan, open_bus
 from cangauge.bus.vehicle import Vehicle
 from cangauge.estimation.offline import samples_of
+from cangauge.extras.live.http import HttpServer
 from cangauge.service.addresses import http_address
-from cangauge.service.http import Endpoint
-from cangauge.service.lifecycle import Notifier
-from cangauge.service.loop import LoopSettings, Outputs, serve
+from cangauge.service.loop import Loop
 from cangauge.service.offline import estimate_capture
 from cangauge.service.pipeline import Pipeline
-from cangauge.service.recording import Recorder, RecordLimits
-from cangauge.service.status import Identity, Monitor
-from live import leaf_model, short_log, waits
+from cangauge.service.record import Recorder, RecordLimits
+from cangauge.service.status import Monitor
+from cangauge.types import Estimate
+from live import Rows, leaf_model, short_log, waits
 
 pytestmark = pytest.mark.socketcan
 
 VCAN = BusAddress("socketcan", "vcan0")
-IDENTITY = Identity("vcan0", "generic", "leaf.json", "ekf", "receive", 0.0)
 
 
 @pytest.fixture(autouse=True)
@@ -39,33 +39,22 @@ def _vcan0() -> None:
 
 def test_scraped_and_recorded_by_kernel_stamps(tmp_path: Path) -> None:
     pipeline = Pipeline(Vehicle.load("generic"), leaf_model())
-    rows = []
+    rows: list[tuple[float, Estimate]] = []
     stop = threading.Event()
     encoder = FrameEncoder(Vehicle.load("generic"))
     frames = [encoder.encode(sample) for sample in samples_of(short_log(50.0))]
     with (
         BusConnection(open_bus(VCAN, pipeline.filters), "vcan0") as port,
         BusConnection(open_bus(VCAN, []), "sender") as sender,
-        Recorder(tmp_path / "seen.blf", RecordLimits(part_bytes=5_000)) as recorder,
+        Recorder(tmp_path / "seen.log", RecordLimits(part_bytes=5_000)) as recorder,
     ):
-        monitor = Monitor(pipeline, port, identity=IDENTITY, notifier=Notifier(), record=recorder)
-
-        def turn(now_s: float) -> None:
-            monitor.turn(now_s)
-            recorder.tick(now_s)
-
-        outputs = Outputs(
-            record=recorder,
-            table=lambda _, estimate: rows.append(estimate),
-            show=turn,
-            stepped=monitor.stepped,
-            sent=monitor.sent,
-        )
-        loop = threading.Thread(
-            target=serve, args=(port, pipeline, LoopSettings(), outputs, stop.is_set)
-        )
-        loop.start()
-        with Endpoint(lambda: monitor.latest, http=http_address("127.0.0.1:0")) as endpoint:
+        monitor = Monitor(pipeline, port, record=lambda: recorder.state)
+        server = HttpServer(http_address("127.0.0.1:0"))
+        outputs = [Rows(rows), recorder, server]
+        loop = Loop(port, pipeline, outputs=outputs, record=recorder, monitor=monitor)
+        thread = threading.Thread(target=loop.run, args=(stop.is_set,))
+        thread.start()
+        with closing(server):
             scrapes = 0
             for number, group in enumerate(frames, start=1):
                 for frame in group:
@@ -76,21 +65,22 @@ def test_scraped_and_recorded_by_kernel_stamps(tmp_path: Path) -> None:
                     assert waits(lambda done=number: pipeline.samples >= done, 20.0), (
                         pipeline.counters
                     )
-                    url = f"http://127.0.0.1:{endpoint.port}/metrics"
+                    url = f"http://127.0.0.1:{server.port}/metrics"
                     with urllib.request.urlopen(url, timeout=10.0) as answer:
                         scrapes += b"cangauge_samples_total" in answer.read()
         time.sleep(0.6)
         stop.set()
-        loop.join(5.0)
-    snapshot = monitor.latest
+        thread.join(30.0)
+    status = monitor.latest.status
     assert scrapes == len(frames) // 50
-    assert snapshot.samples == len(frames) == 500
-    assert snapshot.lost == snapshot.rejected == 0
+    assert status["samples"] == len(frames) == 500
+    assert status["frames"]["lost"] == 0
+    assert status["frames"]["used"] == status["frames"]["wanted"]
     # Relative to the kernel's stamps, the arrival.
-    assert snapshot.latency.count >= 10
-    assert 0.0 < snapshot.latency.total_s / snapshot.latency.count < 1.0
+    assert status["latency"]["count"] >= 10
+    assert 0.0 < status["latency"]["mean_s"] < 1.0
     recorded = estimate_capture(recorder.path, Vehicle.load("generic"), leaf_model())
     assert len(list(tmp_path.iterdir())) > 1
-    assert recorded.table.soc_pct.tolist() == [each.soc_pct for each in rows]
-    residual = np.array([each.residual_v for each in rows])
+    assert recorded.table.soc_pct.tolist() == [each.soc_pct for _, each in rows]
+    residual = np.array([each.residual_v for _, each in rows])
     assert np.array_equal(recorded.table.residual_v, residual, equal_nan=True)

@@ -35,7 +35,7 @@ from cangauge.replay.steps import CaptureSource, LogSource, quantization_bound
 from cangauge.service.loop import LoopSettings
 from cangauge.service.offline import estimate_capture
 from cangauge.service.pipeline import Pipeline, PipelineSettings
-from cangauge.service.recording import Recorder
+from cangauge.service.record import Recorder
 from live import (
     Command,
     Service,

@@ -14,7 +14,6 @@ from rich.progress import Progress
 from cangauge._files import atomic_path
 from cangauge._text import number
 from cangauge.cli.options import (
-    FiguresOption,
     JsonOption,
     Reading,
     ReportOption,
@@ -27,7 +26,7 @@ from cangauge.cli.options import (
     suffixed,
     within,
 )
-from cangauge.cli.output import console, emit_json, note, print_table, save_figures
+from cangauge.cli.output import console, emit_json, note, print_table
 from cangauge.cli.shown import VALID_STD_PCT
 from cangauge.errors import InputError
 
@@ -103,7 +102,6 @@ def estimate_command(  # noqa: PLR0917 - typer passes options by name
         ),
     ] = None,
     report: ReportOption = None,
-    figures: FiguresOption = None,
     json_output: JsonOption = False,
 ) -> None:
     """Estimate the state of charge of a recorded log or capture, offline.
@@ -184,7 +182,6 @@ def estimate_command(  # noqa: PLR0917 - typer passes options by name
             )
     _write_pack(done, pack)
     _write_output(done, output, report, model_path)
-    save_figures(figures, "estimate.estimate_page", done, model_path)
     for warning in done.warnings:
         note(f"warning: {done.recorded.source}: {warning}")
     if json_output:
@@ -207,7 +204,7 @@ def _write_output(
     done: RecordedEstimate, output: Path, report: Path | None, model_path: Path
 ) -> None:
     """Write table and report, or neither."""
-    from cangauge.service.estimate_mcap import write_estimates_mcap
+    from cangauge.extras.formats.estimate_mcap import write_estimates_mcap
     from cangauge.service.estimate_table import write_estimates
 
     page = None

@@ -2,41 +2,57 @@
 
 from __future__ import annotations
 
-from typing import Any, Final
+import time
+from collections.abc import Callable
+from contextlib import ExitStack
+from functools import partial
+from pathlib import Path
+from typing import Annotated, Any, Final
 
 import typer
+from rich.console import RenderableType
+from rich.live import Live
+from rich.text import Text
 
 from cangauge._text import NONE_KNOWN, duration, number
 from cangauge.cli.options import EndpointOption, JsonOption, TokenFileOption
-from cangauge.cli.output import emit_json, print_table
-from cangauge.errors import CangaugeError
+from cangauge.cli.output import PlainConsole, emit_json, print_table, text_table
+from cangauge.errors import CangaugeError, InputError
 
+WATCH_EVERY_S: Final = 0.5
+"""Interval of `--watch` [s]."""
 USABLE: Final = frozenset({"valid", "degraded"})
 
 
 def status_command(
     endpoint: EndpointOption = None,
     token_file: TokenFileOption = None,
+    watch: Annotated[
+        bool, typer.Option("--watch", help="Show it again every half second, until Ctrl-C.")
+    ] = False,
     json_output: JsonOption = False,
 ) -> None:
     """Show the state of a running service: SoC ± standard deviation [%], frames, delays.
 
     Exit code 0: the SoC is valid or degraded. 1: it is invalid or unknown, or no service runs.
-    2: bad usage. With `--json` the object is printed with exit codes 0 and 1.
+    2: bad usage. With `--json` the object is printed with exit codes 0 and 1. `--watch` may be
+    started before the service, and waits for it.
 
     Examples
     --------
     `cangauge status`
 
+    `cangauge status --watch --endpoint http://127.0.0.1:9464`
+
     `cangauge status --endpoint /run/cangauge/can0/status.sock --json`
-
-    `cangauge status --endpoint http://127.0.0.1:9464`
     """
-    from cangauge.service.status_client import NotRunningError, fetch_status, find_socket
+    from cangauge.service.status_client import NotRunningError
 
+    if watch:
+        _watch(endpoint, token_file)
+        return
     try:
-        place = endpoint or str(find_socket())
-        status = fetch_status(place, token_file)
+        place, status = _ask(endpoint, token_file)
     except NotRunningError as error:
         if json_output:
             emit_json({"running": False, "status": None, "problem": str(error)})
@@ -45,9 +61,51 @@ def status_command(
     if json_output:
         emit_json(status)
     else:
-        print_table(f"cangauge at {place}", ("", "<"), status_rows(status))
+        print_table(f"cangauge at {place}", ("", "<"), _rows(status, place))
     if status.get("status") not in USABLE:
         raise typer.Exit(1)
+
+
+def _ask(endpoint: str | None, token_file: Path | None) -> tuple[str, dict[str, Any]]:
+    from cangauge.service.status_client import fetch_status, find_socket
+
+    place = endpoint or str(find_socket())
+    return place, fetch_status(place, token_file)
+
+
+def _rows(status: dict[str, Any], place: str) -> list[tuple[str, str]]:
+    """Return the rows; raise CangaugeError for an answer of another shape."""
+    try:
+        return status_rows(status)
+    except (AttributeError, KeyError, TypeError, ValueError) as error:
+        text = f"{place}: the answer is not a status of this release of cangauge"
+        raise CangaugeError(text) from error
+
+
+def _watch(endpoint: str | None, token_file: Path | None) -> None:
+    """Show the status until stopped, in lines where stdout is no terminal."""
+    from cangauge.cli.live_line import live_text
+
+    shown = PlainConsole(highlight=False)
+    with ExitStack() as stack:
+        show: Callable[[RenderableType], None] = shown.print
+        if shown.is_terminal:
+            live = stack.enter_context(Live(console=shown, auto_refresh=False, screen=True))
+            show = partial(live.update, refresh=True)
+        while True:
+            content: RenderableType
+            try:
+                place, status = _ask(endpoint, token_file)
+                rows = _rows(status, place)
+                content = text_table(f"cangauge at {place}", ("", "<"), rows)
+                if not shown.is_terminal:
+                    content = live_text(status)
+            except InputError:
+                raise  # waiting does not mend it
+            except CangaugeError as error:
+                content = Text(f"NO ANSWER: {error}", style="bold red")
+            show(content)
+            time.sleep(WATCH_EVERY_S)
 
 
 def status_rows(status: dict[str, Any]) -> list[tuple[str, str]]:

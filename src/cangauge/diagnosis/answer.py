@@ -48,8 +48,8 @@ GROUPS: Final[Mapping[str, tuple[str, ...]]] = {
 GROUP_OF: Final = {effect: group for group, effects in GROUPS.items() for effect in effects}
 
 TITLES: Final[Mapping[str, str]] = {
-    "sensors_and_count": "a current or voltage sensor, or the count of charge",
-    "overpotential": "resistance or polarization of the cells",
+    "sensors_and_count": "the sensors and the count of charge",
+    "overpotential": "resistance and polarization of the cells",
     "clock": "the time stamps of current and voltage",
     "thermal": "the temperature",
     "weak_cell": "a weak cell",

@@ -38,6 +38,7 @@ from cangauge.diagnosis.trials import (
     library,
     residual,
     slope,
+    undone,
 )
 
 FOLDS, BLOCK_S = 4, 240
@@ -74,6 +75,9 @@ UNTESTED_EXCESS = 8.0
 STEPS, SHRINK, MIN_STEP, MIN_CHANGE = 5, 0.35, 1e-3, 0.03
 """Gauss–Newton steps of a re-simulated effect, the factor after one that lost evidence, and the
 steps at which it ends: in units of the bound, and relative to the size."""
+
+MIN_PLACE = 0.01
+"""A step of resistance is placed this closely, in parts of its log."""
 
 RESIMULATED_PART = 0.15
 """An effect with less than this part of the best one's evidence is not re-simulated."""
@@ -135,15 +139,25 @@ def rows_that_count(pack: PackFit, log: Trace, others: Sequence[Trace], r: Float
     return np.flatnonzero(covered)
 
 
+def shared_columns(pack: PackFit, log: Trace) -> FloatArray:
+    """Return the columns of θ on all rows of a log, shape (n, p)."""
+    s = pack.soc(log)
+    return np.column_stack([hats(s), pack.structure(log.current_a, s, log.temperature_c)])
+
+
 def _all_columns(pack: PackFit, log: Trace, trials: Sequence[Trial]) -> list[FloatArray]:
     """Return x, b, effects in units of their bounds, and r on all rows of a log."""
-    s, r = pack.soc(log), residual(pack, log)
+    r = residual(pack, log)
     effects = [slope(pack, log, trial, 0.0, r) * trial.bound for trial in trials]
     effects += [
         additive_column(pack, log, replace(STEP, shape=place)) * STEP.bound for place in PLACES
     ]
-    x = np.column_stack([hats(s), pack.structure(log.current_a, s, log.temperature_c)])
-    return [x, healthy_columns(pack, log, r), np.column_stack(effects), r[:, None]]
+    return [
+        shared_columns(pack, log),
+        healthy_columns(pack, log, r),
+        np.column_stack(effects),
+        r[:, None],
+    ]
 
 
 def _on_rows(
@@ -436,15 +450,20 @@ def analyse(known: References, logs: Sequence[Columns], *, exact: bool = True) -
         k = np.flatnonzero(effects == name)
         top = int(k[np.argmax(evidence[k])])
         trial, amplitude, nats, left_v2 = tried[top], float(size[top]), float(gain[top]), None
-        if exact and _needs_resimulation(trial) and gain[top] > RESIMULATED_PART * gain.max():
-            start = trial.number / trial.bound if trial.effect == "time_skew" else 0.0
-            amplitude, nats, left_v2 = _resimulated(known, logs, trial, start or amplitude)
+        places = tuple(_place(known, place[top]) for place in at) if name == STEP.effect else ()
+        if exact and gain[top] > RESIMULATED_PART * gain.max():
+            if _needs_resimulation(trial):
+                start = trial.number / trial.bound if trial.effect == "time_skew" else 0.0
+                amplitude, nats, left_v2 = _resimulated(known, logs, trial, start or amplitude)
+            elif places:
+                places, amplitude, nats, left_v2 = _step_refined(known, logs, places)
         if left_v2 is None:
             moved = theta - inverse @ u[:, top] * amplitude
+            columns_of = [None if place[top] < 0 else int(place[top]) for place in at]
             left_v2 = (
                 sum(
-                    squares(log, moved, None if place[top] < 0 else int(place[top]), amplitude)
-                    for log, place in zip(logs, at, strict=True)
+                    squares(log, moved, column, amplitude)
+                    for log, column in zip(logs, columns_of, strict=True)
                 )
                 / rows
             )
@@ -456,10 +475,7 @@ def analyse(known: References, logs: Sequence[Columns], *, exact: bool = True) -
             std=float(np.sqrt(over[top] / (s[top] + RIDGE))) * trial.bound,
             visible=float(np.min(np.sqrt(2.0 * VISIBLE_NATS * over[k] / s[k]) * bound[k])),
             chance=float(np.max(g[k] ** 2 / (s[k] + RIDGE))),
-            in_logs=tuple(
-                None if place[top] < 0 else PLACES[int(place[top]) - len(known.trials)]
-                for place in at
-            ) if name == STEP.effect else (),
+            in_logs=places,
         )  # fmt: skip
     before = np.linalg.solve(known.a, known.b)
     return Evidence(result, sum(squares(log, before) for log in logs) / rows, rows, len(logs))
@@ -481,6 +497,48 @@ def _tried(known: References, logs: int) -> tuple[list[Trial], list[IntArray]]:
     return tried, [np.array(place, dtype=np.intp) for place in at]
 
 
+def _place(known: References, column: int) -> float | None:
+    """Return the place of a step of resistance in a log, by its column; None before it."""
+    return None if column < 0 else PLACES[int(column) - len(known.trials)]
+
+
+def _step_refined(
+    known: References, logs: Sequence[Columns], places: tuple[float | None, ...]
+) -> tuple[tuple[float | None, ...], float, float, float]:
+    """Return the places of a step found more closely, its size, gain [nats] and error [V²].
+
+    The log in which it happens is the first that has it; halving the distance between the places
+    that were tried, down to a hundredth of that log.
+    """
+    first = next(k for k, place in enumerate(places) if place is not None)
+
+    def fitted(place: float) -> tuple[float, float, float]:
+        tried = [None if k < first else place if k == first else 0.0 for k in range(len(logs))]
+        products = [
+            at_size(known, log, replace(STEP, shape=2.0 if x is None else x), 0.0).sum(axis=0)
+            for log, x in zip(logs, tried, strict=True)
+        ]
+        one = _OneEffect.of(known, logs, products)
+        low, high = STEP.low / STEP.bound, STEP.high / STEP.bound
+        size = float(np.clip(one.gradient / (one.curvature + RIDGE), low, high))
+        gain = one.gradient * size - 0.5 * one.curvature * size**2
+        theta = one.theta - size * one.changed
+        w = np.concatenate([-theta, np.zeros(logs[0].b.shape[1]), [-size, 1.0]])
+        left_v2 = sum(w @ z @ w for z in products) / sum(len(log.rows) for log in logs)
+        return float(gain), size, float(left_v2)
+
+    best, step = float(places[first] or 0.0), 0.5 * (PLACES[1] - PLACES[0])
+    found = fitted(best)
+    while step > MIN_PLACE:
+        for place in (best - step, best + step):
+            trial = fitted(place) if 0.0 < place < 1.0 else found
+            if trial[0] > found[0]:
+                best, found = place, trial
+        step *= 0.5
+    refined = tuple(best if k == first else place for k, place in enumerate(places))
+    return refined, found[1], found[0], found[2]
+
+
 def _needs_resimulation(trial: Trial) -> bool:
     return trial.changes_signal and trial.effect != "voltage_offset"
 
@@ -496,18 +554,16 @@ def at_size(known: References, log: Columns, trial: Trial, a: float) -> FloatArr
     a : float
         Amplitude in units of its bound, as the slope.
     """
-    pack, n = known.pack, log.x.shape[1] + log.b.shape[1]
-    r = residual(pack, log.log, trial, a * trial.bound)
-    column = slope(pack, log.log, trial, a * trial.bound, r) * trial.bound
-    y = np.column_stack([column, r])[log.rows]
-    parts = np.zeros((FOLDS, n + 2, n + 2))
-    parts[:, :n, :n] = log.parts[:, :n, :n]
-    for k in range(FOLDS):
-        of = log.fold == k
-        parts[k, :n, n:] = np.concatenate([log.x[of].T @ y[of], log.b[of].T @ y[of]])
-        parts[k, n:, :n] = parts[k, :n, n:].T
-        parts[k, n:, n:] = y[of].T @ y[of]
-    return parts
+    pack, trace = known.pack, log.log
+    r = residual(pack, trace, trial, a * trial.bound)
+    column = slope(pack, trace, trial, a * trial.bound, r) * trial.bound
+    x = log.x
+    if trial.changes_signal:  # θ is uncertain at the SoC, current and temperature without it
+        healthy = undone(pack, trace, trial, a * trial.bound)
+        x = shared_columns(pack, healthy)[log.rows]
+    every = np.column_stack([x, log.b, column[log.rows], r[log.rows]])
+    blocks = [every[log.fold == k] for k in range(FOLDS)]
+    return np.array([block.T @ block for block in blocks])
 
 
 @dataclass(frozen=True)
@@ -518,6 +574,8 @@ class _OneEffect:
     curvature: float
     chi2: float
     theta: FloatArray
+    changed: FloatArray
+    """Change of θ for each unit of the effect, with the opposite sign."""
 
     @classmethod
     def of(
@@ -533,6 +591,7 @@ class _OneEffect:
             curvature=max(float(total[-2, -2] - u @ changed), 1e-9),
             chi2=float(total[-1, -1] - b @ theta),
             theta=theta,
+            changed=changed,
         )
 
 

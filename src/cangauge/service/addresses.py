@@ -1,8 +1,7 @@
-"""Addresses that serve a service's status: HTTP with tokens, and unix sockets.
+"""Addresses reachable over the network, and their secrets.
 
-HTTP beyond loopback requires a bearer token. The token comes from a file or the environment, never
-from the command line, which other users of the machine can read. Unix sockets are open to their
-owner and group.
+An address beyond loopback requires a bearer token. Secrets come from a file or the environment,
+never from the command line, which other users of the machine can read.
 """
 
 from __future__ import annotations
@@ -10,13 +9,10 @@ from __future__ import annotations
 import ipaddress
 import logging
 import os
-import re
-import socket
 import stat
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from os import PathLike
-from pathlib import Path
 from typing import Final
 
 from cangauge._files import open_regular
@@ -86,7 +82,7 @@ def http_address(
             "this address is reachable from the network, and there is no token",
             field=field,
             value=text,
-            cure=f"put a token into a file for --http-token-file or into {TOKEN_VARIABLE},"
+            cure=f"put a token into a file for http_token_file or into {TOKEN_VARIABLE},"
             f" or listen on {LOOPBACK}:{port}",
         )
     return HttpAddress(host, port, token)
@@ -105,9 +101,7 @@ def is_loopback_name(host: str) -> bool:
 
 def _host_and_port(text: str, field: str) -> tuple[str, int]:
     host, colon, port = text.strip().rpartition(":")
-    if not colon:
-        host = LOOPBACK
-    host = host.removeprefix("[").removesuffix("]")
+    host = host.removeprefix("[").removesuffix("]") if colon else LOOPBACK
     try:
         if host.lower() != "localhost":
             ipaddress.ip_address(host)
@@ -132,11 +126,21 @@ def read_token(path: str | PathLike[str] | None, environment: Mapping[str, str])
     InputError
         If it cannot be read, is too short, or is not printable text.
     """
-    if path is None:
-        given = environment.get(TOKEN_VARIABLE)
-        return None if given is None else _checked(given, TOKEN_VARIABLE)
-    text = _read_secret(path, "http.token_exposed", "token", "http_token_file")
-    return _checked(text, str(path))
+    text = environment.get(TOKEN_VARIABLE)
+    if path is not None:
+        text = _read_secret(path, "http.token_exposed", "token", "http_token_file")
+    if text is None:
+        return None
+    token = text.strip()
+    if not SHORTEST_TOKEN <= len(token) <= LONGEST_TOKEN or not token.isascii() or " " in token:
+        # The value is not quoted: it may be a secret.
+        raise InputError(
+            f"a token is {SHORTEST_TOKEN} to {LONGEST_TOKEN} printable characters without spaces",
+            source=path or TOKEN_VARIABLE,
+            field="http_token",
+            cure="make one: python -c 'import secrets; print(secrets.token_urlsafe())'",
+        )
+    return token
 
 
 def read_mqtt_password(
@@ -167,177 +171,9 @@ def _read_secret(path: str | PathLike[str], event: str, kind: str, key: str) -> 
         rights = os.fstat(file.fileno()).st_mode
         data = file.read(LONGEST_TOKEN + 2)
     if rights & (stat.S_IROTH | stat.S_IWOTH):
-        emit(
-            _LOG,
-            logging.WARNING,
-            event,
-            f"{path}: every user of this machine can read or change this {kind}: chmod 600 it",
-            path=str(path),
-        )
+        text = f"{path}: every user of this machine can read or change this {kind}: chmod 600 it"
+        emit(_LOG, logging.WARNING, event, text, path=str(path))
     try:
         return data.decode("utf-8")
     except UnicodeDecodeError as error:
         raise InputError("not UTF-8 text", source=path, field=key) from error
-
-
-def _checked(content: str, source: str) -> str:
-    token = content.strip()
-    if not SHORTEST_TOKEN <= len(token) <= LONGEST_TOKEN or not token.isascii() or " " in token:
-        # The value is not quoted: it may be a secret.
-        raise InputError(
-            f"a token is {SHORTEST_TOKEN} to {LONGEST_TOKEN} printable characters without spaces",
-            source=source,
-            field="http_token",
-            cure="make one: python -c 'import secrets; print(secrets.token_urlsafe())'",
-        )
-    return token
-
-
-# --- Unix sockets
-
-SOCKET_MODE: Final = 0o660
-LONGEST_NAME: Final = 40
-SYSTEM_FOLDER: Final = Path("/run/cangauge")
-"""Folder of the systemd units, one subfolder for each service."""
-
-_PROBE_S: Final = 1.0
-
-
-def has_unix_sockets() -> bool:
-    """Return whether Python has unix sockets here (not on Windows)."""
-    return hasattr(socket, "AF_UNIX")
-
-
-def open_unix(path: Path) -> socket.socket:
-    """Return a listening unix socket; a stale one is replaced.
-
-    Raises
-    ------
-    InputError
-        If another service uses it, a file or another user's socket has this name, or it cannot be
-        created.
-    """
-    if not has_unix_sockets():
-        raise _bad(path, "this system has no unix sockets in Python", "use --http, or off")
-    if is_served(path):
-        raise _bad(path, "another service uses this socket", "name another one")
-    try:
-        if path.is_socket():
-            if path.lstat().st_uid != os.geteuid():
-                raise _bad(path, "this socket belongs to another user", "name another one")
-            path.unlink()
-        server = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
-        try:
-            server.setblocking(False)
-            server.bind(str(path))
-            path.chmod(SOCKET_MODE)
-            server.listen(16)
-        except (OSError, ValueError):
-            server.close()
-            raise
-    except (OSError, ValueError) as error:
-        reason = getattr(error, "strerror", None) or str(error)
-        raise _bad(
-            path, f"cannot be created: {reason}", "name a writable folder, or off"
-        ) from error
-    return server
-
-
-def is_served(path: Path) -> bool:
-    """Return whether a process listens on a unix socket."""
-    try:
-        if not path.is_socket():
-            return False
-        with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as probe:
-            probe.settimeout(_PROBE_S)
-            probe.connect(str(path))
-    except (ConnectionRefusedError, FileNotFoundError):
-        return False
-    except (OSError, ValueError):  # busy, or of another user
-        return True
-    return True
-
-
-def default_path(bus: str) -> Path:
-    """Return the default socket of a service on a bus.
-
-    The folder is created, and stale sockets in it are removed.
-
-    Raises
-    ------
-    InputError
-        If the folder cannot be created, or is not private to this user.
-    """
-    folder = _own_folder()
-    for left in folder.glob("*.sock"):
-        if left.is_socket() and not is_served(left):
-            left.unlink(missing_ok=True)
-    name = re.sub(r"[^A-Za-z0-9.]+", "-", bus).strip("-.")[:LONGEST_NAME]
-    return folder / f"{name or 'bus'}-{os.getpid()}.sock"
-
-
-def served_sockets() -> list[Path]:
-    """Return the sockets of running services that this user can see.
-
-    In a folder that anybody could have made (in `/tmp`), only those of this user or root.
-    """
-    return [path for path in _candidates() if _is_trusted(path) and is_served(path)]
-
-
-def _is_trusted(path: Path) -> bool:
-    """Return whether a socket is of this user or root, unless only they could have made it."""
-    folder = path.parent
-    try:
-        if not folder.parent.stat().st_mode & stat.S_IWOTH:
-            return True
-        return all(
-            each.st_uid in {os.getuid(), 0} and not each.st_mode & unwanted
-            for each, unwanted in (
-                (folder.lstat(), stat.S_IWGRP | stat.S_IWOTH),
-                (path.lstat(), stat.S_IWOTH),
-            )
-        ) and stat.S_ISDIR(folder.lstat().st_mode)
-    except OSError:  # gone, or in a folder that this user may not read
-        return False
-
-
-def _candidates() -> Iterator[Path]:
-    if not has_unix_sockets():
-        return
-    seen = set()
-    for folder in (*_folders(), SYSTEM_FOLDER, *sorted(SYSTEM_FOLDER.glob("*"))):
-        try:
-            found = sorted(folder.glob("*.sock"))
-        except OSError:  # a folder that this user may not read
-            continue
-        for path in found:
-            if path not in seen:
-                seen.add(path)
-                yield path
-
-
-def _folders() -> list[Path]:
-    """Return the folders for sockets, the preferred one first."""
-    runtime = os.environ.get("RUNTIME_DIRECTORY", "").split(":")[0]
-    session = os.environ.get("XDG_RUNTIME_DIR", "")
-    folders = [Path(runtime)] if runtime else []
-    folders += [Path(session) / "cangauge"] if session else []
-    # World-writable, so the folder is used only if it is private to this user.
-    return [*folders, Path("/tmp") / f"cangauge-{os.getuid()}"]  # noqa: S108 - see above
-
-
-def _own_folder() -> Path:
-    folder = _folders()[0]
-    try:
-        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-        state = folder.lstat()
-    except OSError as error:
-        raise _bad(folder, f"cannot be created: {error.strerror}", "name a socket") from error
-    others_write = stat.S_IMODE(state.st_mode) & 0o022
-    if not stat.S_ISDIR(state.st_mode) or state.st_uid != os.getuid() or others_write:
-        raise _bad(folder, "this folder is not private to this user", "name a socket elsewhere")
-    return folder
-
-
-def _bad(path: Path, problem: str, cure: str) -> InputError:
-    return InputError(problem, source=path, field="status_socket", cure=cure)

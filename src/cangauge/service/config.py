@@ -1,9 +1,9 @@
-"""Configuration of the service: one model for the TOML file, the command line and the reference.
+"""Configuration of the service: one declaration for the TOML file, the options and the reference.
 
-Each key is declared once, as a field of `RunConfig` with its type, bounds, default, unit and help.
-The TOML file has the same keys; `cangauge.cli.config_options` makes the options of the command
-line from them, which take precedence over the file; `python -m cangauge.service.config` prints the
-reference of all keys as Markdown. Paths in a file are relative to it::
+Each key is declared once, as a field with its type, bounds, default, unit and help. The command
+line makes its options from the same fields (`cangauge.cli.config_options`), and
+`python -m cangauge.service.config` prints the reference of all keys as Markdown. Options take
+precedence over the file; paths in a file are relative to it::
 
     model = "leaf.json"
     channel = "can0"
@@ -12,75 +12,206 @@ reference of all keys as Markdown. Paths in a file are relative to it::
 
     [bus_options]
     bitrate = 500000
-
-    [checks.voltage]                # as in a map file, and before it
-    lowest = 240
-    highest = 410
 """
 
 from __future__ import annotations
 
-import os
-import re
-import socket
 import sys
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Final, Self
+from typing import Annotated, Any, Final, Literal, Self, get_args, get_origin
 
 from pydantic import (
     BaseModel,
     BeforeValidator,
+    ConfigDict,
+    Field,
     FiniteFloat,
     PrivateAttr,
     StrictBool,
 )
+from pydantic.fields import FieldInfo
 
 from cangauge._config import read_toml, validated
 from cangauge._logging import LogFormat, LogLevel
-from cangauge.bus.mapping import MessageMap, Overrides, RuleMap
-from cangauge.bus.open import BusAddress, bus_address, is_interface_name
-from cangauge.bus.publish import FrameIds
+from cangauge.bus.mapping import CheckMap, MessageMap, RuleMap
 from cangauge.bus.time_source import TimeSourceName
-from cangauge.bus.vehicle import PRESETS, Vehicle
+from cangauge.bus.vehicle import PRESETS
 from cangauge.errors import InputError
-from cangauge.estimation.power import PackLimits
-from cangauge.estimation.settings import (
-    VALID_STD_PCT,
-    EstimatorSettings,
-    FullCharge,
-    LongRest,
-    Method,
-)
+from cangauge.estimation.settings import VALID_STD_PCT, Method
 from cangauge.logs.log import TEMPERATURE_SOURCES, TemperatureSource
 from cangauge.model.delay_line import GAP_S
-from cangauge.service.addresses import HttpAddress, http_address, read_mqtt_password
-from cangauge.service.config_tables import (
-    ChecksConfig,
-    ConfigKey,
-    FullChargeConfig,
-    IdsConfig,
-    LimitsConfig,
-    LongRestConfig,
-    MqttConfig,
-    PollConfig,
-    Strict,
-    key,
-    keys_of,
-    option_info,
-    own_model,
-)
-from cangauge.service.loop import CHECKPOINT_EVERY_S, LoopSettings
-from cangauge.service.pipeline import PipelineSettings
-from cangauge.service.recording import RecordLimits
-from cangauge.service.state import StateSettings, state_path
-
-if TYPE_CHECKING:
-    from cangauge.extras.live.mqtt import MqttSettings
 
 DEFAULT_VEHICLE: Final = "generic"
 """Default of `replay` as well, so that both commands work together without options."""
+DASHBOARD: Final = "127.0.0.1:8642"
+"""Address of the live page where the option stands without one."""
+
+
+@dataclass(frozen=True)
+class KeyInfo:
+    """What a key has beside its type, bounds and help.
+
+    Parameters
+    ----------
+    option : str
+        Options of `cangauge run`, such as "-m, --model"; "" for a key of the file only.
+    metavar : str
+        Placeholder of the option's value.
+    unit : str
+    default_text : str
+        Default in words, where the field's own default is not enough.
+    restart : bool
+        A reload does not apply a change of this key.
+    is_path : bool
+        A path, relative to the file that it is in.
+    bare : str
+        Value of the option where none follows it; "" if one must.
+    """
+
+    option: str = ""
+    metavar: str = ""
+    unit: str = ""
+    default_text: str = ""
+    restart: bool = False
+    is_path: bool = False
+    bare: str = ""
+
+
+def key(default: Any, text: str, option: str = "", metavar: str = "", **more: Any) -> Any:
+    """Return the field of a key; further arguments are those of `KeyInfo`, or pydantic's bounds."""
+    info = {name: more.pop(name) for name in KeyInfo.__dataclass_fields__ if name in more}
+    field: FieldInfo = Field(default, description=text, **more)
+    field.metadata.append(KeyInfo(option, metavar, **info))
+    return field
+
+
+class Strict(BaseModel):
+    """A table that refuses unknown keys."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+def _id(default: int, name: str, *, restart: bool = False) -> Any:
+    return key(default, f"Id of {name}.", metavar="ID", ge=0, le=0x7FF, restart=restart)
+
+
+class IdsConfig(Strict):
+    """Standard ids of the published frames and of the replay clock."""
+
+    soc_estimate: int = _id(0x5A0, "SOC_ESTIMATE")
+    soc_detail: int = _id(0x5A1, "SOC_DETAIL")
+    replay_clock: int = _id(0x5AF, "REPLAY_CLOCK", restart=True)
+    soc_health: int = _id(0x5A2, "SOC_HEALTH")
+    soc_power: int = _id(0x5A3, "SOC_POWER")
+    soc_cells: int = _id(0x5A4, "SOC_CELLS, sent where the vehicle gives cell voltages")
+
+
+class ChecksConfig(Strict):
+    """Plausibility checks by signal, as in a map file; see `CheckMap`."""
+
+    current: CheckMap = key(CheckMap(), "Plausibility check of the current.")
+    voltage: CheckMap = key(CheckMap(), "Plausibility check of the voltage.")
+    temperature: CheckMap = key(CheckMap(), "Plausibility check of the temperature.")
+    soc_reference: CheckMap = key(CheckMap(), "Plausibility check of the vehicle's own SoC.")
+
+
+class FullChargeConfig(Strict):
+    """Condition of a full pack; see `FullCharge`."""
+
+    voltage_v: FiniteFloat = key(..., "Least voltage.", unit="V", gt=0.0, le=1e4)
+    current_a: FiniteFloat = key(..., "Largest absolute current.", unit="A", ge=0.0, le=5e3)
+    hold_s: FiniteFloat = key(60.0, "Duration of both.", unit="s", ge=0.0, le=86400.0)
+    soc_pct: FiniteFloat = key(100.0, "SoC then.", unit="%", ge=0.0, le=100.0)
+    soc_std_pct: FiniteFloat = key(0.5, "Its standard deviation.", unit="%", ge=0.01, le=100.0)
+
+
+class LongRestConfig(Strict):
+    """Condition of an open-circuit voltage at rest; see `LongRest`."""
+
+    after_s: FiniteFloat = key(
+        7200.0, "Least duration of the rest.", unit="s", ge=60.0, le=30.0 * 86400.0
+    )
+    soc_std_pct: FiniteFloat = key(
+        2.0, "Standard deviation of the SoC by its voltage.", unit="%", ge=0.01, le=100.0
+    )
+
+
+class PollConfig(Strict):
+    """Requests for replies over ISO-TP; see `Poller`."""
+
+    every_s: FiniteFloat = key(
+        10.0,
+        "Interval between requests for the same reply. One is sent at a time; without an answer"
+        " the interval doubles, up to a minute; while another tester asks, none is sent.",
+        unit="s", ge=1.0, le=3600.0,
+    )  # fmt: skip
+
+
+def _limit(text: str, default: str, unit: str, le: float = 1e4) -> Any:
+    return key(None, text, unit=unit, default_text=default, ge=0.0, le=le)
+
+
+class LimitsConfig(Strict):
+    """Limits for the possible currents and the energy left; see `PackLimits`."""
+
+    min_voltage_v: FiniteFloat | None = _limit(
+        "Lowest pack voltage.", "the pseudo-OCV at the lower end of the identified SoC", "V"
+    )
+    max_voltage_v: FiniteFloat | None = _limit(
+        "Highest pack voltage.", "the pseudo-OCV at the upper end of the identified SoC", "V"
+    )
+    max_discharge_a: FiniteFloat | None = _limit(
+        "Largest discharge current.", "the largest that the model was identified on", "A"
+    )
+    max_charge_a: FiniteFloat | None = _limit(
+        "Largest charge current, positive.", "the largest that the model was identified on", "A"
+    )
+    cutoff_soc_pct: FiniteFloat | None = _limit(
+        "SoC at which the energy ends; it also ends at the lowest voltage.",
+        "the lower end of the identified SoC", "%", 100.0,
+    )  # fmt: skip
+
+
+_TOPIC: Final = r"^[^/+#\s\x00]+(/[^/+#\s\x00]+)*$"
+"""Topic of MQTT without wildcards and empty levels."""
+
+
+class MqttConfig(Strict):
+    """MQTT broker that takes the state."""
+
+    broker: str = key(
+        ..., "Host name or address of the MQTT broker.", restart=True, min_length=1
+    )  # fmt: skip
+    port: int | None = key(
+        None, "Its port.", default_text="1883, with TLS 8883", restart=True, ge=1, le=65535
+    )
+    tls: StrictBool = key(False, "Encrypt, and check its certificate.", restart=True)
+    ca_file: str | None = key(
+        None, "PEM file of the authority that signed it.",
+        default_text="the system's", restart=True, is_path=True,
+    )  # fmt: skip
+    user: str | None = key(None, "User name.", restart=True)
+    password_file: str | None = key(
+        None, "File with the password; or in CANGAUGE_MQTT_PASSWORD.", restart=True, is_path=True
+    )
+    topic_prefix: str = key(
+        "cangauge", "Topics are PREFIX/DEVICE/state and PREFIX/DEVICE/availability.",
+        restart=True, pattern=_TOPIC,
+    )  # fmt: skip
+    discovery_prefix: str = key(
+        "homeassistant", 'Home Assistant\'s prefix of discovery; "" without discovery.',
+        restart=True, pattern=f"{_TOPIC}|^$",
+    )  # fmt: skip
+    device: str | None = key(
+        None, "Name of this service among those of the broker.",
+        default_text="cangauge_HOST_CHANNEL", restart=True, pattern=r"^[A-Za-z0-9_-]{1,64}$",
+    )  # fmt: skip
+    every_s: FiniteFloat = key(
+        1.0, "Interval of the states.", unit="s", restart=True, ge=0.1, le=3600.0
+    )
 
 
 def _none_for_auto(value: object) -> object:
@@ -97,108 +228,84 @@ def _none_for_auto(value: object) -> object:
 class RunConfig(Strict):
     """Configuration of the service; each field describes itself."""
 
-    model: str = key(..., "Model file of `cangauge fit`.", "MODEL", "-m", "--model", is_path=True)
+    model: str = key(..., "Model file of `cangauge fit`.", "-m, --model", "MODEL", is_path=True)
     interface: str | None = key(
         None,
         "python-can interface: socketcan, udp_multicast, pcan, slcan and others. On udp_multicast"
         " whoever reaches its port may send; only the default bus drops what other machines send.",
-        "I",
+        "--interface", "I", restart=True,
         default_text="socketcan if there is a vcan0, else udp_multicast on this machine",
-        needs_restart=True,
-    )
+    )  # fmt: skip
     channel: str | None = key(
-        None,
-        "Channel, e.g. can0.",
-        "C",
-        default_text="vcan0, or 239.74.163.2",
-        needs_restart=True,
-    )
+        None, "Channel, e.g. can0.", "--channel", "C",
+        default_text="vcan0, or 239.74.163.2", restart=True,
+    )  # fmt: skip
     bus_options: dict[str, StrictBool | int | float | str] = key(
-        {},
-        "Further argument of the bus driver, e.g. bitrate=500000.",
-        "K=V",
-        "--bus-option",
-        needs_restart=True,
-    )
+        {}, "Further argument of the bus driver, e.g. bitrate=500000.",
+        "--bus-option", "K=V", restart=True,
+    )  # fmt: skip
     wait_for_bus: StrictBool = key(
         False,
         "Start even if the bus is not available yet. A bus lost later is always reconnected.",
-        "",
-        "--wait-for-bus/--need-bus",
-        needs_restart=True,
+        restart=True,
     )
     vehicle: str | None = key(
-        None,
-        f"Vehicle preset: {', '.join(PRESETS)}.",
-        "PRESET",
+        None, f"Vehicle preset: {', '.join(PRESETS)}.", "--vehicle", "PRESET",
         default_text=f"{DEFAULT_VEHICLE}, without --dbc and --map",
+    )  # fmt: skip
+    dbc: str | None = key(
+        None, "DBC file of another vehicle; needs --map.", "--dbc", "FILE", is_path=True
     )
-    dbc: str | None = key(None, "DBC file of another vehicle; needs --map.", "FILE", is_path=True)
     map: str | None = key(
         None,
         "TOML file: which signals are current, voltage and temperature, with sign and scale.",
-        "FILE",
-        is_path=True,
-    )
+        "--map", "FILE", is_path=True,
+    )  # fmt: skip
     temperature: FiniteFloat | None = key(
-        None, "Constant temperature, instead of the bus's.", "C", unit="°C", ge=-60.0, le=120.0
-    )
+        None, "Constant temperature, instead of the bus's.", "--temperature", "C",
+        unit="°C", ge=-60.0, le=120.0,
+    )  # fmt: skip
     temperature_source: TemperatureSource | None = key(
         None,
         "Location of the temperature sensor, if the vehicle does not define it:"
         f" {', '.join(TEMPERATURE_SOURCES)}.",
-        "SOURCE",
     )
     method: Method = key(
         "ekf",
         "Published SoC: fusion (ekf), the inverse of the voltage model (newton), or Coulomb"
         " counting (coulomb).",
-        "ekf|newton|coulomb",
-    )
+        "--method", "ekf|newton|coulomb",
+    )  # fmt: skip
     initial_soc: Annotated[FiniteFloat | None, BeforeValidator(_none_for_auto)] = key(
-        None,
-        "SoC at the first sample, or auto: by the first voltages.",
-        "P|auto",
-        unit="%",
-        default_text="auto",
-        ge=0.0,
-        le=100.0,
-    )
+        None, "SoC at the first sample, or auto: by the first voltages.",
+        "--initial-soc", "P|auto", unit="%", default_text="auto", ge=0.0, le=100.0,
+    )  # fmt: skip
     initial_soc_std: FiniteFloat = key(
-        1.0, "Standard deviation of the initial SoC.", "X", unit="%", ge=0.0, le=100.0
-    )
+        1.0, "Standard deviation of the initial SoC.",
+        "--initial-soc-std", "X", unit="%", ge=0.0, le=100.0,
+    )  # fmt: skip
     valid_std: FiniteFloat = key(
-        VALID_STD_PCT,
-        "Standard deviation above which the SoC is published as degraded.",
-        "X",
-        unit="%",
-        ge=0.01,
-        le=100.0,
-    )
+        VALID_STD_PCT, "Standard deviation above which the SoC is published as degraded.",
+        unit="%", ge=0.01, le=100.0,
+    )  # fmt: skip
     capacity_ah: FiniteFloat | None = key(
-        None, "Capacity.", "A", unit="Ah", default_text="the model's", ge=1e-3, le=1e5
+        None, "Capacity.", unit="Ah", default_text="the model's", ge=1e-3, le=1e5
     )
     max_gap_s: FiniteFloat = key(
-        GAP_S, "Longest step between samples that is not a gap.", "S", unit="s", ge=1e-3, le=3600.0
+        GAP_S, "Longest step between samples that is not a gap.", unit="s", ge=1e-3, le=3600.0
     )
     pair_within_s: FiniteFloat | None = key(
-        None,
-        "Largest time between current and voltage of one sample.",
-        "S",
-        unit="s",
-        default_text="0.02",
-        ge=0.0,
-        le=1.0,
-    )
+        None, "Largest time between current and voltage of one sample.",
+        unit="s", default_text="0.02", ge=0.0, le=1.0,
+    )  # fmt: skip
     time_source: TimeSourceName = key(
         "receive",
         "Bus time: the receive stamps of the frames, or the log time that `cangauge replay` sends"
         " at speeds other than 1.",
-        "receive|replay-clock",
-        needs_restart=True,
-    )
+        "--time-source", "receive|replay-clock", restart=True,
+    )  # fmt: skip
     timeout_s: FiniteFloat = key(
-        2.0, "Time without a sample after which the input is stale.", "S", unit="s", gt=0.0, le=1e9
+        2.0, "Time without a sample after which the input is stale.", unit="s", gt=0.0, le=1e9
     )
     ids: IdsConfig = key(IdsConfig(), "Ids of the published frames.")
     messages: dict[str, MessageMap] = key(
@@ -210,90 +317,47 @@ class RunConfig(Strict):
     )
     record: str | None = key(
         None,
-        "Record the received frames (.log, .csv, .blf, .mf4, .mcap): `cangauge estimate` on them"
-        " gives the live numbers, bit for bit; an .mcap also holds the estimates. A kill loses the"
-        " last half second, the last 64 KiB of an .mcap, or a whole part of an .mf4. A full disk"
-        " costs frames of the recording, never the estimate. An existing recording is kept: the"
-        " next run is FILE-0001, FILE-0002, …",
-        "FILE",
-        needs_restart=True,
-        is_path=True,
-    )
+        "Record the received frames (.log, .csv, either with .gz): `cangauge estimate` on them"
+        " gives the live numbers, bit for bit. A kill loses the last half second. A full disk costs"
+        " frames of the recording, never the estimate. An existing recording is kept: the next run"
+        " is FILE-0001, FILE-0002, …",
+        "--record", "FILE", restart=True, is_path=True,
+    )  # fmt: skip
     record_part_mb: FiniteFloat | None = key(
-        None,
-        "Size of a part of the recording: NAME-RUN-PART. NAME-RUN denotes all its parts.",
-        "MB",
-        unit="MB",
-        needs_restart=True,
-        gt=0.0,
-        le=1e9,
-    )
+        None, "Size of a part of the recording: NAME-RUN-PART. NAME-RUN denotes all its parts.",
+        unit="MB", restart=True, gt=0.0, le=1e9,
+    )  # fmt: skip
     record_part_s: FiniteFloat | None = key(
-        None,
-        "Duration of a part of the recording.",
-        "S",
-        unit="s",
-        needs_restart=True,
-        ge=1.0,
-        le=1e9,
+        None, "Duration of a part of the recording.", unit="s", restart=True, ge=1.0, le=1e9
     )
     record_keep_mb: FiniteFloat | None = key(
-        None,
-        "Total size of the recording; the oldest files are removed.",
-        "MB",
-        unit="MB",
-        needs_restart=True,
-        gt=0.0,
-        le=1e9,
-    )
+        None, "Total size of the recording; the oldest files are removed.",
+        unit="MB", restart=True, gt=0.0, le=1e9,
+    )  # fmt: skip
     output: str | None = key(
-        None,
-        "Table of the estimates, .csv or .parquet.",
-        "FILE",
-        "-o",
-        "--output",
-        needs_restart=True,
-        is_path=True,
-    )
+        None, "Table of the estimates, .csv or .parquet.",
+        "-o, --output", "FILE", restart=True, is_path=True,
+    )  # fmt: skip
     duration_s: FiniteFloat | None = key(
-        None, "Stop after this time.", "S", "--duration", unit="s", gt=0.0, le=1e9
+        None, "Stop after this time.", "--duration", "S", unit="s", gt=0.0, le=1e9
     )
     until_idle_s: FiniteFloat | None = key(
-        None,
-        "Stop when no sample came for this time, after the first.",
-        "S",
-        "--until-idle",
-        unit="s",
-        gt=0.0,
-        le=1e9,
-    )
+        None, "Stop when no sample came for this time, after the first.",
+        "--until-idle", "S", unit="s", gt=0.0, le=1e9,
+    )  # fmt: skip
     state: str | None = key(
         None,
         "Keep SoC, its uncertainty and the delay line over restarts in this file, or in a file in"
         " this folder.",
-        "FILE",
+        "--state", "FILE", restart=True, is_path=True,
         default_text="systemd's StateDirectory, if there is one",
-        needs_restart=True,
-        is_path=True,
-    )
+    )  # fmt: skip
     state_max_age_s: FiniteFloat = key(
-        7.0 * 86400.0,
-        "Age above which the state is refused.",
-        "S",
-        "--state-max-age",
-        unit="s",
-        needs_restart=True,
-        gt=0.0,
-        le=1e9,
-    )
+        7.0 * 86400.0, "Age above which the state is refused.",
+        unit="s", restart=True, gt=0.0, le=1e9,
+    )  # fmt: skip
     state_every_s: FiniteFloat = key(
-        CHECKPOINT_EVERY_S,
-        "Interval between writes of the state.",
-        "S",
-        "--state-every",
-        unit="s",
-        ge=0.1,
-        le=86400.0,
+        10.0, "Interval between writes of the state.", unit="s", ge=0.1, le=86400.0
     )
     full_charge: FullChargeConfig | None = key(None, "Set the SoC when the pack is full.")
     long_rest: LongRestConfig | None = key(None, "Correct the SoC by the voltage of long rests.")
@@ -305,182 +369,37 @@ class RunConfig(Strict):
         None,
         "Serve /status, /healthz and /metrics (extra `metrics`) there, e.g. 127.0.0.1:9464. An"
         " address beyond loopback needs a token.",
-        "HOST:PORT",
-        needs_restart=True,
-    )
+        "--http", "HOST:PORT", restart=True,
+    )  # fmt: skip
     http_token_file: str | None = key(
-        None,
-        "File with the bearer token that requests need; or in CANGAUGE_HTTP_TOKEN.",
-        "FILE",
-        needs_restart=True,
-        is_path=True,
-    )
+        None, "File with the bearer token that requests need; or in CANGAUGE_HTTP_TOKEN.",
+        restart=True, is_path=True,
+    )  # fmt: skip
     mqtt: MqttConfig | None = key(None, "MQTT broker that takes the state (extra `mqtt`).")
     dashboard: str | None = key(
         None,
         "Serve the live page there; on the command line alone: at 127.0.0.1:8642. An address beyond"
         " loopback needs a token, as with --http. The page can begin and end a recording: that of"
         " `record`, else candump files in the working folder.",
-        "HOST:PORT",
-        needs_restart=True,
-        bare="127.0.0.1:8642",
-    )
+        "--dashboard", "HOST:PORT", restart=True, bare=DASHBOARD,
+    )  # fmt: skip
     status_socket: str = key(
-        "auto",
-        "Unix socket for `cangauge status`; auto: in the user's runtime folder.",
-        "PATH|auto|off",
-        needs_restart=True,
-    )
-    log_format: LogFormat = key(
-        "text", "Format of the events on stderr, one a line.", "text|json", needs_restart=True
-    )
-    log_level: LogLevel = key(
-        "info",
-        "Lowest level of the events.",
-        "debug|info|warning|error",
-        needs_restart=True,
-    )
+        "auto", "Unix socket for `cangauge status`; auto: in the user's runtime folder.",
+        "--status-socket", "PATH|auto|off", restart=True,
+    )  # fmt: skip
+    log_format: LogFormat = key("text", "Format of the events on stderr, one a line.", restart=True)
+    log_level: LogLevel = key("info", "Lowest level of the events.", restart=True)
     _file: str = PrivateAttr("the configuration")
+
+    @property
+    def file(self) -> str:
+        """File that messages name."""
+        return self._file
 
     def named(self, file: str | PathLike[str]) -> Self:
         """Set the file that messages name; return self."""
         self._file = str(file)
         return self
-
-    def address(self) -> BusAddress:
-        """Return the bus address; may raise InputError."""
-        interface = self.interface
-        if interface is None and self.wait_for_bus and is_interface_name(self.channel):
-            interface = "socketcan"  # cannot be detected while the interface is missing
-        return bus_address(interface, self.channel, self.bus_options)
-
-    def load_vehicle(self) -> Vehicle:
-        """Return the vehicle; may raise InputError."""
-        preset = self.vehicle
-        if preset is None and self.dbc is None and self.map is None:
-            preset = DEFAULT_VEHICLE
-        return Vehicle.load(
-            preset,
-            self.dbc,
-            self.map,
-            temperature_c=self.temperature,
-            pair_within_s=self.pair_within_s,
-            overrides=Overrides(self._file, self.messages, self.rules, dict(self.checks)),
-        )
-
-    def pipeline_settings(self) -> PipelineSettings:
-        """Return the settings of the estimator and its frames; may raise InputError."""
-        full, rest = self.full_charge, self.long_rest
-        return PipelineSettings(
-            estimator=EstimatorSettings(
-                method=self.method,
-                initial_soc_pct=self.initial_soc,
-                initial_soc_std_pct=self.initial_soc_std,
-                valid_std_pct=self.valid_std,
-                capacity_ah=self.capacity_ah,
-                gap_s=self.max_gap_s,
-                temperature_source=self.temperature_source or "unknown",
-                full_charge=None if full is None else FullCharge(**full.model_dump()),
-                long_rest=None if rest is None else LongRest(**rest.model_dump()),
-                limits=PackLimits(**self.limits.model_dump()),
-            ),
-            time_source=self.time_source,
-            ids=FrameIds(**self.ids.model_dump()),
-        )
-
-    def http_address(self) -> HttpAddress | None:
-        """Return the address of HTTP, None without; may raise InputError."""
-        return None if self.http is None else http_address(self.http, self.http_token_file)
-
-    def mqtt_settings(self, bus: str) -> MqttSettings | None:
-        """Return the MQTT broker for a bus of this name, None without; may raise InputError."""
-        if self.mqtt is None:
-            return None
-        # An optional dependency: the import raises the error if it is missing.
-        from cangauge.extras.live.mqtt import MqttSettings  # noqa: PLC0415
-
-        given = self.mqtt.model_dump(exclude={"password_file"})
-        given["port"] = self.mqtt.port or (8883 if self.mqtt.tls else 1883)
-        given["device"] = self.mqtt.device or re.sub(
-            r"[^A-Za-z0-9_-]+", "_", f"cangauge_{socket.gethostname()}_{bus}"
-        )
-        password = read_mqtt_password(self.mqtt.password_file, os.environ)
-        if password is not None and self.mqtt.user is None:
-            raise InputError(
-                "is missing", field="mqtt.user", cure="name the user whose password is given"
-            )
-        return MqttSettings(**given, password=password)
-
-    def dashboard_address(self) -> HttpAddress | None:
-        """Return the address of the live page, None without; may raise InputError."""
-        if self.dashboard is None:
-            return None
-        return http_address(self.dashboard, self.http_token_file, field="dashboard")
-
-    def unix_path(self) -> Path | None:
-        """Return the path of the unix socket, if one is given."""
-        return None if self.status_socket in {"auto", "off"} else Path(self.status_socket)
-
-    def record_limits(self) -> RecordLimits:
-        """Return size and number of the recording's parts; may raise InputError."""
-        part_mb, keep_mb = self.record_part_mb, self.record_keep_mb
-        return RecordLimits(
-            part_bytes=None if part_mb is None else int(part_mb * 1e6),
-            part_s=self.record_part_s,
-            keep_bytes=None if keep_mb is None else int(keep_mb * 1e6),
-        )
-
-    def state_settings(self, environment: Mapping[str, str]) -> StateSettings | None:
-        """Return where the state is kept, None if it is not; may raise InputError."""
-        path = state_path(self.state, environment)
-        if path is None:
-            return None
-        for other in (self.model, self.record, self.output, self.dbc, self.map):
-            if other is not None and os.path.realpath(other) == os.path.realpath(path):
-                raise InputError("is another file of this service", field="--state", value=other)
-        return StateSettings(path, self.state_max_age_s, self.state_every_s)
-
-    def loop_settings(self) -> LoopSettings:
-        """Return time-outs, ends and intervals of the receive loop."""
-        return LoopSettings(
-            timeout_s=self.timeout_s,
-            duration_s=self.duration_s,
-            until_idle_s=self.until_idle_s,
-            checkpoint_every_s=self.state_every_s,
-            poll_every_s=None if self.poll is None else self.poll.every_s,
-        )
-
-    def check_poll(self, vehicle: Vehicle) -> None:
-        """Raise InputError if `[poll]` is given where nothing can be asked for."""
-        if self.poll is None:
-            return
-        problem = cure = ""
-        if not vehicle.poll_targets:
-            problem = f"no reply of the vehicle {vehicle.name} can be asked for"
-            cure = (
-                "use the preset leaf_ze1_polled for a Leaf of 40 or 62 kWh, or state isotp = true"
-                " and request_id for a message of the map file; or remove [poll]"
-            )
-        elif self.time_source == "replay-clock":
-            problem = "a replay has no battery that answers"
-            cure = "remove [poll], or time_source"
-        elif self.bus_options.get("listen_only"):
-            problem = "a bus that only listens sends no requests"
-            cure = "remove listen_only from [bus_options], or [poll]"
-        if problem:
-            raise InputError(problem, source=self._file, field="poll", cure=cure)
-
-
-def _in_folder(model: type[BaseModel], data: Mapping[str, Any], folder: Path) -> dict[str, Any]:
-    """Return data of a file with its paths relative to the file's folder."""
-    found = dict(data)
-    for name in data.keys() & model.model_fields.keys():
-        field, value = model.model_fields[name], data[name]
-        if option_info(field).is_path and isinstance(value, str):
-            found[name] = str(folder / value)
-        elif isinstance(value, Mapping) and (inner := own_model(field)) is not None:
-            found[name] = _in_folder(inner, value, folder)
-    return found
 
 
 def load_config(
@@ -493,16 +412,15 @@ def load_config(
     path : path-like, optional
         TOML file.
     overrides : mapping, optional
-        Values by key; None: not given. Ids and bus options are merged with those of the file.
+        Values by key; None: not given. Bus options are merged with those of the file.
 
     Raises
     ------
     InputError
         Names the file (or the option), the key and the value.
     """
-    given = {key: value for key, value in (overrides or {}).items() if value not in (None, {})}
-    # Checked separately, so that an error names the source of the value.
-    _check_options(given)
+    given = {name: value for name, value in (overrides or {}).items() if value not in (None, {})}
+    _check_options(given)  # separately, so that an error names the source of the value
     if path is None:
         if "model" not in given:
             raise InputError(
@@ -510,11 +428,13 @@ def load_config(
             )
         return RunConfig.model_validate(given)
     data = read_toml(path)
-    validated(RunConfig, _with_model(data), path)
+    validated(RunConfig, {"model": "-", **data}, path)
     data = _in_folder(RunConfig, data, Path(path).parent)
     if given.keys() & {"vehicle", "dbc", "map"}:
         # A vehicle given as an option replaces the file's as a whole.
-        data = {key: value for key, value in data.items() if key not in {"vehicle", "dbc", "map"}}
+        data = {
+            name: value for name, value in data.items() if name not in {"vehicle", "dbc", "map"}
+        }
     for name in ("ids", "bus_options"):
         if name in data and name in given:
             given[name] = {**data[name], **given[name]}
@@ -526,37 +446,130 @@ def load_config(
 
 def _check_options(given: Mapping[str, Any]) -> None:
     try:
-        validated(RunConfig, _with_model(given), "")
+        validated(RunConfig, {"model": "-", **given}, "")
     except InputError as error:
-        key = error.field or ""
-        option = f"--{key.replace('_', '-')}"
-        for each in config_keys():
-            if each.name == key and each.option:
-                option = each.option.rpartition(", ")[2].partition("/")[0]
+        field = error.field or ""
+        options = {each.name: each.info.option for each in config_keys() if each.info.option}
+        option = options.get(field, field).rpartition(", ")[2]
         raise InputError(error.problem, field=option, value=error.value, cure=error.cure) from error
 
 
-def _with_model(data: Mapping[str, Any]) -> dict[str, Any]:
-    """Return data with a model, which may come from elsewhere."""
-    return {"model": "-", **data}
+def _in_folder(model: type[BaseModel], data: Mapping[str, Any], folder: Path) -> dict[str, Any]:
+    """Return data of a file with its paths relative to the file's folder."""
+    found = dict(data)
+    for name in data.keys() & model.model_fields.keys():
+        field, value = model.model_fields[name], data[name]
+        if _info(field).is_path and isinstance(value, str):
+            found[name] = str(folder / value)
+        elif isinstance(value, Mapping) and (inner := _table(field)) is not None:
+            found[name] = _in_folder(inner, value, folder)
+    return found
 
 
-def config_keys() -> list[ConfigKey]:
-    """Return all keys of the configuration with option, type, default, unit, bounds and help."""
-    return list(keys_of(RunConfig))
+# --- Description of the keys
+
+
+@dataclass(frozen=True)
+class ConfigKey:
+    """A key of the configuration, for the reference and the command line.
+
+    Parameters
+    ----------
+    name : str
+        Dotted key of the TOML file, such as "ids.soc_detail".
+    kind : str
+        Type in words.
+    default, bounds, text : str
+    info : KeyInfo
+    """
+
+    name: str
+    kind: str
+    default: str
+    bounds: str
+    text: str
+    info: KeyInfo
+
+    @property
+    def help(self) -> str:
+        """Help text of the option, with unit and default."""
+        first, dot, more = self.text.partition(". ")
+        unit = f" [{self.info.unit}]" if self.info.unit else ""
+        text = f"{first}{unit}. {more}" if dot else f"{first.removesuffix('.')}{unit}."
+        return f"{text} Default: {self.default}." if self.default else text
+
+
+def config_keys(model: type[BaseModel] = RunConfig, prefix: str = "") -> Iterator[ConfigKey]:
+    """Yield the keys of a table and of its inner tables, with dotted names."""
+    for name, field in model.model_fields.items():
+        if (inner := _table(field)) is not None:
+            yield from config_keys(inner, f"{prefix}{name}.")
+            continue
+        info = _info(field)
+        yield ConfigKey(
+            prefix + name, _kind(field.annotation), info.default_text or _default(field, info),
+            _bounds(field), field.description or "", info,
+        )  # fmt: skip
 
 
 def reference() -> str:
     """Return the reference of all keys as a Markdown table."""
-    head = ("Key", "Option", "Type", "Default", "Unit", "Bounds", "Meaning")
-    rows: list[tuple[str, ...]] = [head, tuple("---" for _ in head)]
-    for item in config_keys():
-        option = ", ".join(f"`{each}`" for each in item.option.split(", ") if each)
-        cells = (
-            f"`{item.name}`", option, item.kind, item.default, item.unit, item.bounds, item.text,
+    rows = [("Key", "Option", "Type", "Default", "Unit", "Bounds", "Meaning"), ("---",) * 7]
+    for each in config_keys():
+        option = ", ".join(f"`{name}`" for name in each.info.option.split(", ") if name)
+        rows.append(
+            (f"`{each.name}`", option, each.kind, each.default, each.info.unit, each.bounds,
+             each.text)
         )  # fmt: skip
-        rows.append(tuple(each.replace("|", "\\|") for each in cells))
-    return "".join(f"| {' | '.join(row)} |\n" for row in rows)
+    cells = [[cell.replace("|", "\\|") for cell in row] for row in rows]
+    return "".join(f"| {' | '.join(row)} |\n" for row in cells)
+
+
+def _info(field: FieldInfo) -> KeyInfo:
+    return next((each for each in field.metadata if isinstance(each, KeyInfo)), KeyInfo())
+
+
+def _table(field: FieldInfo) -> type[BaseModel] | None:
+    """Return the model of a key that is a table of further keys."""
+    for each in (field.annotation, *get_args(field.annotation)):
+        if isinstance(each, type) and issubclass(each, Strict):
+            return each
+    return None
+
+
+def _kind(annotation: Any) -> str:
+    if get_origin(annotation) is Annotated:
+        return _kind(get_args(annotation)[0])
+    if get_origin(annotation) is Literal:
+        return "one of " + ", ".join(map(str, get_args(annotation)))
+    if get_origin(annotation) is dict:
+        return "table"
+    if isinstance(annotation, type):
+        names = {bool: "true or false", float: "number", int: "whole number", str: "text"}
+        return names.get(annotation, "table")
+    return next(_kind(each) for each in get_args(annotation) if each is not type(None))
+
+
+def _default(field: FieldInfo, info: KeyInfo) -> str:
+    value = field.default
+    if field.is_required() or value is None or isinstance(value, dict | BaseModel):
+        return ""
+    if isinstance(value, bool):
+        return str(value).lower()
+    if info.metavar == "ID":
+        return f"0x{value:X}"
+    return f"{value:.10g}" if isinstance(value, float) else str(value)
+
+
+def _bounds(field: FieldInfo) -> str:
+    signs = {"gt": ">", "ge": "≥", "lt": "<", "le": "≤"}
+    found = [
+        f"{sign} {getattr(part, name):g}"
+        for part in field.metadata
+        for name, sign in signs.items()
+        if isinstance(getattr(part, name, None), int | float)
+    ]
+    return ", ".join(found)
 
 
 if __name__ == "__main__":

@@ -12,8 +12,7 @@ from dataclasses import replace
 from functools import partial
 from os import PathLike
 from pathlib import Path
-from types import TracebackType
-from typing import Any, BinaryIO, Final, Self
+from typing import TYPE_CHECKING, Any, BinaryIO, Final, Self
 
 import numpy as np
 import pyarrow as pa
@@ -25,23 +24,23 @@ from cangauge._logging import emit
 from cangauge._typing import FloatArray
 from cangauge.errors import CangaugeError
 from cangauge.estimation.offline import NUMBERS, EstimateTable
-from cangauge.service.async_writer import AsyncWriter
-from cangauge.types import Estimate, Reason, Status, reason_name, reason_names
+from cangauge.service.output import Output
+from cangauge.service.worker import Worker
+from cangauge.types import Estimate, Reason, Sample, Status, reason_name, reason_names
+
+if TYPE_CHECKING:
+    from cangauge.service.run import Service
 
 _SCHEMA: Final = pa.schema(
-    [
-        *((name, pa.float64()) for name in NUMBERS),
-        ("status", pa.string()),
-        ("reasons", pa.string()),
-    ]
+    [*((name, pa.float64()) for name in NUMBERS), ("status", pa.string()), ("reasons", pa.string())]
 )
 _PLAIN_CSV: Final = pacsv.WriteOptions(include_header=False, quoting_style="none")
 """No cell needs quotes."""
 _BLOCK_ROWS: Final = 4096
-_ROW_BYTES: Final = 400
-"""Memory of a row in Python objects [bytes], roughly."""
+_BLOCKS_WAITING: Final = 40
+"""Blocks that wait for a slow disk: 64 MB as Python objects; beyond it the table is abandoned."""
 _CLOSE_WITHIN_S: Final = 3.0
-"""Time limit for writing the rest at the end [s]: blocks of rows are written while it runs."""
+"""Time limit for writing what is left at the end [s]."""
 _LOG = logging.getLogger(__name__)
 
 
@@ -95,11 +94,11 @@ def _write_header(file: BinaryIO) -> None:
     file.write((",".join(_SCHEMA.names) + "\n").encode())
 
 
-class EstimateWriter:
-    """Write one row per sample, as `cangauge estimate` does; use it in a `with` block.
+class EstimateWriter(Output):
+    """Write one row per sample, as `cangauge estimate` does.
 
-    All or nothing: the file appears when the block ends without an exception. If the disk is full
-    or fails, the table is abandoned with an event, and the service continues.
+    All or nothing: the file appears at the end. If the disk is full, fails or hangs, the table is
+    abandoned with an event, and the service continues.
 
     Parameters
     ----------
@@ -108,8 +107,6 @@ class EstimateWriter:
 
     Attributes
     ----------
-    rows : int
-        Number of rows added.
     failed : bool
         True once the table is abandoned; there is then no file.
 
@@ -124,51 +121,26 @@ class EstimateWriter:
         require_table_suffix(self._path)
         self._block: list[tuple[Any, ...]] = []
         self._names: dict[int, str] = {}
-        self._stack = ExitStack()
-        self._sink: Any = None
-        self._part = self._path
-        self._writer = AsyncWriter(
-            "cangauge-table", max_waiting_bytes=64 << 20, on_error=self._abandon
-        )
-        self.rows = 0
         self.failed = False
-
-    def __enter__(self) -> Self:
-        part = self._part = self._stack.enter_context(atomic_path(self._path))
+        self._stack = ExitStack()
+        self._part = part = self._stack.enter_context(atomic_path(self._path))
+        self._sink: Any
         if self._path.suffix.lower() == ".parquet":
             self._sink = pq.ParquetWriter(part, _SCHEMA)
         else:
             file = self._stack.enter_context(part.open("wb"))
             _write_header(file)
             self._sink = pacsv.CSVWriter(file, _SCHEMA, write_options=_PLAIN_CSV)
+        self._worker = Worker("cangauge-table", self._abandon, _BLOCKS_WAITING)
+
+    def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        if kind is None:
-            self._submit()
-            self._writer.submit(lambda: None if self.failed else self._sink.close())
-        if self._writer.close(_CLOSE_WITHIN_S):
-            # The thread may hang in the file, and whatever else closes it would hang as well.
-            self._abandon(TimeoutError("the disk is too slow"))
-            with suppress(OSError):
-                self._part.unlink()
-            return
-        if kind is None and not self.failed:
-            self._stack.__exit__(None, None, None)
-            return
-        # An exception makes `atomic_path` remove its temporary file.
-        with suppress(OSError):
-            self._sink.close()
-        with suppress(OSError, CangaugeError):
-            self._stack.__exit__(kind or OSError, error or OSError(), trace)
+    def __exit__(self, *_: object) -> None:
+        self.close()
 
-    def add(self, time_s: float, estimate: Estimate) -> None:
-        """Add the row of a sample: its time [s] and the estimate after it."""
+    def on_sample(self, sample: Sample, estimate: Estimate) -> None:
+        """Add the row of a sample and the estimate after it."""
         if self.failed:
             return
         reasons = int(estimate.reasons)
@@ -177,15 +149,23 @@ class EstimateWriter:
             words = self._names[reasons] = reason_names(reasons)
         # The fields of an estimate are in the table's order; its time is that of the sample.
         numbers = estimate[1 : len(NUMBERS)]
-        self._block.append((time_s, *numbers, estimate.status.name.lower(), words))
-        self.rows += 1
+        self._block.append((sample.time_s, *numbers, estimate.status.name.lower(), words))
         if len(self._block) >= _BLOCK_ROWS:
             self._submit()
 
+    def close(self) -> None:
+        """Write what is left, and give the file its name."""
+        self._submit()
+        self._worker.submit(self._finish)
+        if not self._worker.close(_CLOSE_WITHIN_S):
+            self._say(TimeoutError("the disk is too slow"))
+            with suppress(OSError):
+                self._part.unlink()
+
     def _submit(self) -> None:
         block, self._block = self._block, []
-        if block and not self._writer.submit(partial(self._write, block), _ROW_BYTES * len(block)):
-            self._abandon(TimeoutError("the disk is too slow"))
+        if block and not self.failed and not self._worker.submit(partial(self._write, block)):
+            self._say(TimeoutError("the disk is too slow"))
 
     def _write(self, block: list[tuple[Any, ...]]) -> None:
         if self.failed:
@@ -196,8 +176,29 @@ class EstimateWriter:
         ]
         self._sink.write_table(pa.Table.from_arrays(columns, schema=_SCHEMA))
 
+    def _finish(self) -> None:
+        if not self.failed:
+            self._sink.close()
+            self._stack.close()
+            return
+        # An exception makes `atomic_path` remove its temporary file.
+        with suppress(OSError):
+            self._sink.close()
+        with suppress(OSError, CangaugeError):
+            self._stack.__exit__(OSError, OSError(), None)
+
     def _abandon(self, error: Exception) -> None:
+        if not self.failed:
+            self._say(error)
+            self._finish()
+
+    def _say(self, error: Exception) -> None:
         if not self.failed:
             self.failed = True
             text = f"{self._path}: cannot be written ({error}); the table is abandoned"
             emit(_LOG, logging.WARNING, "file.failed", text)
+
+
+def make_output(service: Service) -> EstimateWriter:
+    """Return the table that a service's configuration asks for."""
+    return EstimateWriter(str(service.config.output))

@@ -6,7 +6,6 @@ the available packages need a C library or are unmaintained.
 
 from __future__ import annotations
 
-import logging
 import os
 import signal
 import socket
@@ -14,22 +13,17 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from types import FrameType
 from typing import Final, Self
 
-from cangauge._logging import emit
 from cangauge._text import printable
 
-NOTIFY_SOCKET: Final = "NOTIFY_SOCKET"
 PINGS_PER_TIMEOUT: Final = 4
 """Watchdog pings per time-out of systemd."""
 END_WITHIN_S: Final = 6.0
 """Longest time from SIGTERM to the end [s]: what is written at the end has 5 s, and the systemd
 unit kills after 10 s."""
-_MOST_DIGITS: Final = 20
-_LAST_LINE_S: Final = 0.2
-_LOG = logging.getLogger(__name__)
 
 
 @contextmanager
@@ -82,12 +76,9 @@ def deadline_after_signal(within_s: float = END_WITHIN_S) -> Iterator[None]:
             while (new := received.read(64)) and not {signal.SIGINT, signal.SIGTERM} & {*new}:
                 pass
         if not is_over.wait(within_s):
-            # Whatever hangs may hang this line as well.
-            line = f"ended after {within_s:g} s, although something still hangs"
-            args = (_LOG, logging.ERROR, "service.hanging", line)
-            last = threading.Thread(target=emit, args=args, daemon=True)
-            last.start()
-            last.join(_LAST_LINE_S)
+            with suppress(OSError):  # not by `logging`, whose lock may be what hangs
+                os.set_blocking(2, False)
+                os.write(2, b"error: ended, although something still hangs\n")
             os._exit(1)
 
     threading.Thread(target=watch, name="cangauge-deadline", daemon=True).start()
@@ -100,7 +91,7 @@ def deadline_after_signal(within_s: float = END_WITHIN_S) -> Iterator[None]:
 
 
 class _Hangups:
-    """Handler of SIGHUP that remembers it."""
+    """Handler of SIGHUP that remembers it; SIGHUP from a closing terminal becomes SIGTERM."""
 
     def __init__(self) -> None:
         self._received = False
@@ -132,8 +123,8 @@ def hold_hangups() -> None:
 def note_hangups() -> Iterator[Callable[[], bool]]:
     """Yield a function that returns whether SIGHUP was received since its last call.
 
-    One that `hold_hangups` remembered counts. SIGHUP from a closing terminal is turned into
-    SIGTERM. For the main thread only; without effect on Windows, which has no SIGHUP.
+    One that `hold_hangups` remembered counts. For the main thread only; without effect on Windows,
+    which has no SIGHUP.
     """
     if not hasattr(signal, "SIGHUP"):
         yield lambda: False
@@ -157,7 +148,7 @@ def _has_terminal() -> bool:
 
 
 class Notifier:
-    """Notify systemd; without effect where NOTIFY_SOCKET is not set.
+    """Notify systemd; without effect where there is no address.
 
     Parameters
     ----------
@@ -184,14 +175,13 @@ class Notifier:
     def from_environment(cls, environment: Mapping[str, str] | None = None) -> Self:
         """Create one from NOTIFY_SOCKET, WATCHDOG_USEC and WATCHDOG_PID."""
         given = os.environ if environment is None else environment
-        address = given.get(NOTIFY_SOCKET, "")
+        address = given.get("NOTIFY_SOCKET", "")
         if not address.startswith(("/", "@")) or not hasattr(socket, "AF_UNIX"):
             return cls()
         for_us = given.get("WATCHDOG_PID", str(os.getpid())) == str(os.getpid())
-        microseconds = given.get("WATCHDOG_USEC", "")
-        is_number = microseconds.isdecimal() and len(microseconds) < _MOST_DIGITS
-        watched = for_us and is_number and int(microseconds) > 0
-        return cls(address, int(microseconds) / 1e6 if watched else None)
+        text = given.get("WATCHDOG_USEC", "")
+        microseconds = int(text) if for_us and text.isdecimal() and len(text) < 20 else 0
+        return cls(address, microseconds / 1e6 if microseconds else None)
 
     @property
     def active(self) -> bool:
@@ -210,18 +200,13 @@ class Notifier:
         """Reset the watchdog; call it from the receive loop only, which it supervises."""
         self._send("WATCHDOG=1")
 
-    def reloading(self, within_s: float) -> None:
-        """Report the start of a reload, which may take this time [s]; `ready` ends it."""
-        began_us = time.monotonic_ns() // 1000
-        self._send("RELOADING=1", f"MONOTONIC_USEC={began_us}", _extension(within_s))
+    def reloading(self) -> None:
+        """Report the start of a reload; `ready` ends it."""
+        self._send("RELOADING=1", f"MONOTONIC_USEC={time.monotonic_ns() // 1000}")
 
-    def extend(self, within_s: float) -> None:
-        """Ask for this time until the next report [s], where systemd's own would be shorter."""
-        self._send(_extension(within_s))
-
-    def stopping(self, status: str = "stopping") -> None:
+    def stopping(self) -> None:
         """Report that the service stops."""
-        self._send("STOPPING=1", f"STATUS={_line(status)}")
+        self._send("STOPPING=1", "STATUS=stopping")
 
     def close(self) -> None:
         """Close the socket."""
@@ -230,18 +215,9 @@ class Notifier:
             self._socket = None
 
     def _send(self, *lines: str) -> None:
-        if self._socket is None or self._address is None:
-            return
-        try:
-            self._socket.sendto("\n".join(lines).encode(), self._address)
-        except OSError:
-            # systemd restarts, or its queue is full: later datagrams will arrive, or the watchdog
-            # acts.
-            return
-
-
-def _extension(within_s: float) -> str:
-    return f"EXTEND_TIMEOUT_USEC={round(1e6 * within_s)}"
+        if self._socket is not None and self._address is not None:
+            with suppress(OSError):  # systemd restarts, or its queue is full
+                self._socket.sendto("\n".join(lines).encode(), self._address)
 
 
 def _line(text: str) -> str:

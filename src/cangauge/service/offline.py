@@ -13,9 +13,8 @@ from collections.abc import Callable
 from dataclasses import asdict, dataclass, field, replace
 from os import PathLike
 from pathlib import Path
-from typing import Any, Final, Literal, Self, cast
+from typing import Any, Final, Literal, cast
 
-import can
 import numpy as np
 from can.typechecking import Channel
 
@@ -42,10 +41,7 @@ from cangauge.model.coulomb_counting import difference_from_reference
 from cangauge.model.model_file import Model
 from cangauge.service.pipeline import FrameCounts, Pipeline, PipelineSettings
 from cangauge.types import (
-    CellReport,
     Estimate,
-    Health,
-    Power,
     Reason,
     Sample,
     reason_name,
@@ -147,7 +143,6 @@ class PackHistory:
         self.report: PackReport | None = None
         self._keeps_rows = keeps_rows
         self._cells = cells
-        self._estimator: Estimator | None = None
         self._cell_estimator: CellEstimator | None = None
         self._row = 0
         self._due_s = -math.inf
@@ -158,13 +153,8 @@ class PackHistory:
         """Whether `observe` must be called for every sample."""
         return self._keeps_rows or self._cells is not None
 
-    def take(self, estimator: Estimator) -> None:
-        """Take the estimator after the last sample of a log."""
-        self._estimator = estimator
-
     def observe(self, estimator: Estimator, sample: Sample) -> None:
         """Take a sample of a log, and the estimator after it."""
-        self._estimator = estimator
         if self._cells is not None:
             if self._cell_estimator is None:
                 self._cell_estimator = CellEstimator(
@@ -175,7 +165,7 @@ class PackHistory:
                 tick = estimator.pack_tick(sample)
                 self._cell_estimator.update(tick, volts, [0.0] * len(volts))
         self._row += 1
-        self.add(sample.time_s, self._report)
+        self.add(sample.time_s, lambda: self._report_of(estimator))
 
     def add(self, time_s: float, report: Callable[[], PackReport]) -> None:
         """Keep the report of a sample's time [s], if its second has begun."""
@@ -183,37 +173,31 @@ class PackHistory:
             self._due_s = time_s + PACK_EVERY_S
             self._rows.append((time_s, report()))
 
-    def finish(self, report: Callable[[], PackReport] | None = None) -> Self:
-        """Take the report of the end; return self."""
-        if report is not None:
-            self.report = report()
-        elif self._estimator is not None:
-            self.report = self._report()
-        return self
+    def take(self, estimator: Estimator) -> None:
+        """Take the estimator after the last sample of a log."""
+        self.report = self._report_of(estimator)
 
     @property
     def columns(self) -> dict[str, FloatArray]:
         """The rows as columns: time_s, health, power and, where known, cells; NaN: unknown."""
-        found: dict[str, list[float]] = {"time_s": [time_s for time_s, _ in self._rows]}
         reports = [report for _, report in self._rows]
-        for place, name in enumerate(Health._fields):
-            found[name] = [report.health[place] for report in reports]
-        for place, name in enumerate(Power._fields):
-            found[name] = [report.power[place] for report in reports]
-        cells = [report.cells for report in reports if report.cells is not None]
-        if cells:
-            for place, name in enumerate(CellReport._fields):
-                found[f"cell_{name}"] = [float(each[place]) for each in cells]
-        columns = {name: np.array(values, dtype=np.float64) for name, values in found.items()}
+        columns = {"time_s": np.array([time_s for time_s, _ in self._rows], dtype=np.float64)}
+        parts: tuple[tuple[str, list[Any]], ...] = (
+            ("", [report.health for report in reports]),
+            ("", [report.power for report in reports]),
+            ("cell_", [report.cells for report in reports if report.cells is not None]),
+        )
+        for prefix, values in parts:
+            for name in values[0]._fields if values else ():
+                numbers = [float(getattr(each, name)) for each in values]
+                columns[prefix + name] = np.array(numbers, dtype=np.float64)
         if "cell_weakest" in columns:
             weakest = columns["cell_weakest"]
             columns["cell_weakest"] = np.where(weakest < 0.0, np.nan, weakest)
         return columns
 
-    def _report(self) -> PackReport:
-        estimator, cells = self._estimator, self._cell_estimator
-        if estimator is None:
-            raise ValueError("no sample yet")
+    def _report_of(self, estimator: Estimator) -> PackReport:
+        cells = self._cell_estimator
         return PackReport(
             estimator.health, estimator.power(), None if cells is None else cells.report
         )
@@ -346,7 +330,7 @@ def estimate_recorded_log(
     table, scores = estimate_log(
         log, model, settings, progress=progress, observe=observe, at_end=history.take
     )
-    return RecordedEstimate(log, table, scores, model, settings, origin, pack=history.finish())
+    return RecordedEstimate(log, table, scores, model, settings, origin, pack=history)
 
 
 def estimate_recorded_capture(
@@ -517,10 +501,10 @@ def estimate_capture(
         bus = buses.get(message.channel)
         if bus is None:
             chosen = PipelineSettings(settings or EstimatorSettings(), source, ids)
-            history = PackHistory(keeps_rows=keeps_pack)
             pipeline = Pipeline(vehicle, model, chosen, publishes=False)
-            bus = buses[message.channel] = _Bus(pipeline, history)
-        bus.handle(message)
+            bus = buses[message.channel] = _Bus(pipeline, PackHistory(keeps_rows=keeps_pack))
+        if bus.pipeline.handle(message):
+            bus.collect()
         if progress is not None and number % PROGRESS_EVERY == 0:
             progress(number)
     for each in buses.values():
@@ -547,7 +531,7 @@ def estimate_capture(
         time_source=source,
         seconds=time.perf_counter() - began,
         remarks=(*capture.info.remarks, *_remarks(source, counts, len(found))),
-        pack=best.pack.finish(best.pipeline.report),
+        pack=best.pack,
     )
 
 
@@ -561,22 +545,19 @@ class _Bus:
     # Time, current, voltage, temperature and the vehicle's own SoC of every sample.
     values: array[float] = field(default_factory=lambda: array("d"))
 
-    def handle(self, message: can.Message) -> None:
-        if self.pipeline.handle(message):
-            self._collect()
-
     def finish(self) -> None:
         before = self.pipeline.samples
         self.pipeline.finish()
         if self.pipeline.samples != before:
-            self._collect()
+            self.collect()
+        self.pack.report = self.pipeline.report()
 
-    def _collect(self) -> None:
-        if self.pipeline.latest_sample is not None:
+    def collect(self) -> None:
+        sample = self.pipeline.latest_sample
+        if sample is not None:
             self.estimates.append(self.pipeline.latest)
-            self.values.extend(self.pipeline.latest_sample)
-            self.values.append(self.pipeline.decoder.reference_soc_pct)
-            self.pack.add(self.pipeline.latest_sample.time_s, self.pipeline.report)
+            self.values.extend((*sample, self.pipeline.decoder.reference_soc_pct))
+            self.pack.add(sample.time_s, self.pipeline.report)
 
 
 def _remarks(time_source: TimeSourceName, counts: FrameCounts, buses: int) -> list[str]:

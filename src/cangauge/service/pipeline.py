@@ -7,7 +7,7 @@ the same stamps give the same numbers. `loop` runs it on a bus, `offline` over a
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from typing import Final
 
 import can
@@ -67,9 +67,8 @@ class FrameCounts:
 
     def __add__(self, other: FrameCounts) -> FrameCounts:
         """Return the sums."""
-        return FrameCounts(
-            *(getattr(self, name) + getattr(other, name) for name in self.__dataclass_fields__)
-        )
+        names = [each.name for each in fields(self)]
+        return FrameCounts(*(getattr(self, name) + getattr(other, name) for name in names))
 
 
 @dataclass(frozen=True)
@@ -148,13 +147,13 @@ class Pipeline:
             self._publisher = SocPublisher(ids, ACKNOWLEDGE_EVERY if self._is_replay else None)
         self._time = time_source(self.settings.time_source, ids.replay_clock)
         self._earlier_counts = FrameCounts()
-        self._untimed = 0
-        self._beginnings = 0
+        self._untimed = self._beginnings = 0
+        self._refused = 0  # in a row
         self._pack = _pack_of(model, self.settings.estimator.capacity_ah)
         self.decoder = SampleDecoder(vehicle, self._pack)
         self.estimator = make_estimator(model, _with_source(self.settings.estimator, vehicle))
+        self.cells = self._new_cells()
         self.samples = self.taken = 0
-        self._refused = 0  # in a row
         self.stamp_shift_s = 0.0
         self.latest_sample: Sample | None = None
         self.published = NOTHING_YET
@@ -163,7 +162,6 @@ class Pipeline:
         self._estimated: Estimate | None = None
         self._latest = NOTHING_YET
         self._is_behind = False
-        self.cells = self._new_cells()
         self._report: tuple[int, PackReport] | None = None
 
     # --- frames → estimates
@@ -175,8 +173,7 @@ class Pipeline:
         """
         time_s = self._time.time_of(message)
         if time_s is None:
-            if not is_clock(message, self.settings.ids.replay_clock):
-                self._untimed += 1
+            self._untimed += not is_clock(message, self.settings.ids.replay_clock)
             return False
         if self._time.beginnings != self._beginnings:
             self._begin_log()
@@ -200,15 +197,16 @@ class Pipeline:
 
     @property
     def latest(self) -> Estimate:
-        """The estimate of the latest sample, with the signal health at its time.
-
-        `NOTHING_YET` before the first sample.
-        """
-        return self._evaluate()
+        """The estimate of the latest sample, with the signal health at its time."""
+        if self._is_behind and self.latest_sample is not None:
+            self._is_behind = False
+            self._estimated = self.estimator.estimate
+            self._latest = self._with_health(self.latest_sample.time_s)
+        return self._latest
 
     def estimate_now(self) -> Estimate:
         """Return the latest estimate with the signal health at the latest wanted frame."""
-        self._evaluate()
+        _ = self.latest
         return self._with_health(self.decoder.now_s)
 
     def report(self) -> PackReport:
@@ -236,6 +234,65 @@ class Pipeline:
             held_back=now.held_back,
             untimed=self._untimed,
         )
+
+    def _estimate(self, sample: Sample) -> None:
+        self.samples += 1
+        self.latest_sample = sample
+        self.estimator.update(sample)
+        if self.estimator.is_refused:
+            self._refused += 1
+        else:
+            self.taken += 1
+            self._refused = 0
+        self._is_behind = True
+        if self.cells is not None and self.cells.is_due(sample.time_s):
+            self._update_cells(self.cells, sample)
+
+    def _update_cells(self, cells: CellEstimator, sample: Sample) -> None:
+        """Hand the cell voltages that came in since the last second to their estimator."""
+        if self.decoder.cells is not None:
+            volts, times = self.decoder.cells.take(sample.time_s)
+            changes = self.estimator.current_changes(sample.time_s, times)
+            cells.update(self.estimator.pack_tick(sample), volts, changes)
+
+    def _new_cells(self) -> CellEstimator | None:
+        signals = self.vehicle.cells
+        if signals is None:
+            return None
+        return CellEstimator(self.estimator.voltage_model, signals.count, signals.first)
+
+    def _with_health(self, now_s: float) -> Estimate:
+        """Return the latest estimate, marked by the health of the signals at bus time `now_s`.
+
+        A single voltage that failed or has not come yet is not missing; several consecutive ones
+        are, or one that is too old. Samples that are refused one after the other do not make an
+        estimate fresh.
+        """
+        estimate = self._latest if self._estimated is None else self._estimated
+        reasons = estimate.reasons
+        if self.latest_sample is not None and math.isnan(self.latest_sample.voltage_v):
+            reasons &= ~Reason.VOLTAGE_MISSING
+        reasons |= self.decoder.reasons(now_s)
+        if self._time.is_uncertain:
+            reasons |= Reason.TIME_UNCERTAIN
+        if self._refused >= MISSED_UNTIL_OLD:
+            reasons |= Reason.INPUT_STALE
+        if reasons == estimate.reasons:
+            return estimate
+        return estimate._replace(reasons=reasons, status=status_of(reasons))
+
+    def _begin_log(self) -> None:
+        """Restart decoder and estimator for the next log of a replay."""
+        _ = self.latest  # computed before its estimator is replaced
+        self._earlier_counts = replace(self.counts, beginnings=self._earlier_counts.beginnings + 1)
+        self._untimed = 0
+        self._beginnings = self._time.beginnings
+        if self._publisher is not None:
+            self._publisher.restart()
+        self.decoder = SampleDecoder(self.vehicle, self._pack)
+        self.estimator = make_estimator(self.model, self.estimator.settings)
+        self.cells = self._new_cells()
+        self._estimated = None
 
     # --- estimates → frames
 
@@ -310,28 +367,28 @@ class Pipeline:
             None: the same.
         model : Model
         settings : PipelineSettings
-            Initial SoC and its standard deviation are ignored; time source and REPLAY_CLOCK's id
-            must be the same.
+            Initial SoC, its standard deviation, the time source and REPLAY_CLOCK's id stay.
 
         Raises
         ------
         InputError
             If a frame to publish has the id of a vehicle's signal; the old configuration stays.
         """
+        old, started = self.settings, self.estimator.settings
+        ids = replace(settings.ids, replay_clock=old.ids.replay_clock)
         if self._publisher is not None:
-            _check_ids(vehicle or self.vehicle, settings.ids)
-        self._evaluate()
-        started = self.estimator.settings
+            _check_ids(vehicle or self.vehicle, ids)
+        _ = self.latest  # computed before its estimator is replaced
         estimator_settings = replace(
             _with_source(settings.estimator, vehicle or self.vehicle),
             initial_soc_pct=started.initial_soc_pct,
             initial_soc_std_pct=started.initial_soc_std_pct,
         )
-        pack = _pack_of(model, estimator_settings.capacity_ah)
         if (model, estimator_settings) != (self.model, started):
             before, self.estimator = self.estimator, make_estimator(model, estimator_settings)
             self.estimator.take_over(before)
             self.model = model
+        pack = _pack_of(model, estimator_settings.capacity_ah)
         if vehicle is not None or pack != self._pack:
             # The plausible range of a signal follows from both.
             self._earlier_counts, self._untimed = self.counts, 0
@@ -339,9 +396,9 @@ class Pipeline:
             self.decoder = SampleDecoder(self.vehicle, pack)
             self.cells = self._new_cells()
         self._report = None
-        self.settings = settings
+        self.settings = replace(settings, ids=ids, time_source=old.time_source)
         if self._publisher is not None:
-            self._publisher.ids = settings.ids
+            self._publisher.ids = ids
 
     def snapshot(self) -> EstimatorState | None:
         """Return the estimator's state; None while no SoC is known.
@@ -381,90 +438,19 @@ class Pipeline:
         settings = self.estimator.settings
         if settings.initial_soc_pct is None:
             return False
-        default_std_pct = EstimatorSettings().initial_soc_std_pct
-        settings = replace(settings, initial_soc_pct=None, initial_soc_std_pct=default_std_pct)
+        std_pct = EstimatorSettings().initial_soc_std_pct
+        settings = replace(settings, initial_soc_pct=None, initial_soc_std_pct=std_pct)
         self.estimator = make_estimator(self.model, settings)
         return True
 
-    def _estimate(self, sample: Sample) -> None:
-        self.samples += 1
-        self.latest_sample = sample
-        estimator = self.estimator
-        estimator.update(sample)
-        if estimator.is_refused:
-            self._refused += 1
-        else:
-            self.taken += 1
-            self._refused = 0
-        self._is_behind = True
-        if self.cells is not None and self.cells.is_due(sample.time_s):
-            self._follow_cells(self.cells, sample)
-
-    def _new_cells(self) -> CellEstimator | None:
-        signals = self.vehicle.cells
-        if signals is None:
-            return None
-        return CellEstimator(self.estimator.voltage_model, signals.count, signals.first)
-
-    def _follow_cells(self, cells: CellEstimator, sample: Sample) -> None:
-        """Hand the cell voltages that came in since the last second to their estimator."""
-        if self.decoder.cells is not None:
-            volts, times = self.decoder.cells.take(sample.time_s)
-            changes = self.estimator.current_changes(sample.time_s, times)
-            cells.update(self.estimator.pack_tick(sample), volts, changes)
-
-    def _evaluate(self) -> Estimate:
-        """Compute the estimate of the latest sample, unless that is done."""
-        if self._is_behind and self.latest_sample is not None:
-            self._is_behind = False
-            self._estimated = self.estimator.estimate
-            self._latest = self._with_health(self.latest_sample.time_s)
-        return self._latest
-
-    def _with_health(self, now_s: float) -> Estimate:
-        """Return the latest estimate, marked by the health of the signals at bus time `now_s`.
-
-        A single voltage that failed or has not come yet is not missing; several consecutive ones
-        are, or one that is too old. Samples that are refused one after the other do not make an
-        estimate fresh.
-        """
-        estimate = self._latest if self._estimated is None else self._estimated
-        reasons = estimate.reasons
-        if self.latest_sample is not None and math.isnan(self.latest_sample.voltage_v):
-            reasons &= ~Reason.VOLTAGE_MISSING
-        if missing := self.decoder.reasons(now_s):
-            reasons |= missing
-        if self._time.is_uncertain:
-            reasons |= Reason.TIME_UNCERTAIN
-        if self._refused >= MISSED_UNTIL_OLD:
-            reasons |= Reason.INPUT_STALE
-        if reasons == estimate.reasons:
-            return estimate
-        return estimate._replace(reasons=reasons, status=status_of(reasons))
-
-    def _begin_log(self) -> None:
-        """Restart decoder and estimator for the next log of a replay."""
-        self._evaluate()
-        self._earlier_counts = replace(self.counts, beginnings=self._earlier_counts.beginnings + 1)
-        self._untimed = 0
-        self._beginnings = self._time.beginnings
-        if self._publisher is not None:
-            self._publisher.restart()
-        self.decoder = SampleDecoder(self.vehicle, self._pack)
-        self.estimator = make_estimator(self.model, self.estimator.settings)
-        self.cells = self._new_cells()
-        self._estimated = None
+    @property
+    def verdict(self) -> str:
+        """What the voltage said of the restored SoC: "parked", "moved", …; "" or "open" before."""
+        return self.estimator.verdict
 
 
-def _pack_of(model: Model, capacity_ah: float | None = None) -> Pack:
-    """Return the pack's properties by which its signals are judged.
-
-    Parameters
-    ----------
-    model : Model
-    capacity_ah : float, optional
-        Overrides the model's [Ah].
-    """
+def _pack_of(model: Model, capacity_ah: float | None) -> Pack:
+    """Return the pack's properties by which its signals are judged."""
     voltage = model.extended_model().model
     return Pack(
         resistance_ohm=abs(voltage.resistance_ohm[0]) if voltage.resistance_ohm else 0.0,

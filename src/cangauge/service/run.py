@@ -6,35 +6,40 @@ import logging
 import os
 import threading
 import time
-from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
-from dataclasses import replace
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
 from functools import partial
+from importlib import import_module
 from os import PathLike
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any, Final
 
-from cangauge._io import READ_WITHIN_S, check_writable, refuse_pipe, sole_writer
+from cangauge._files import check_writable, sole_writer
 from cangauge._logging import emit
 from cangauge._text import number
 from cangauge.bus.connection import ReconnectingBus
 from cangauge.bus.publish import NO_REPORT
-from cangauge.errors import InputError
-from cangauge.service.addresses import default_path, has_unix_sockets
+from cangauge.errors import CangaugeError, InputError
 from cangauge.service.config import RunConfig, config_keys, load_config
-from cangauge.service.http import Endpoint
 from cangauge.service.lifecycle import Notifier, note_hangups, stop_on_signals
-from cangauge.service.loop import LoopSettings, Outputs, RunSummary, serve
+from cangauge.service.loop import Loop, LoopSettings, RunSummary
+from cangauge.service.output import Output
 from cangauge.service.pipeline import Pipeline
-from cangauge.service.reading import START_S, BackgroundReader, Reading
-from cangauge.service.record_control import RecordControl
-from cangauge.service.state import StateKeeper, check_state_path
-from cangauge.service.status import PAGE_EVERY_S, SHOW_EVERY_S, Identity, Monitor, Snapshot
-from cangauge.types import Estimate, reason_names
+from cangauge.service.record import Recorder, RecordLimits
+from cangauge.service.setup import Reloader, Setup, address_of
+from cangauge.service.state import StateKeeper, StateSettings, check_state_path, state_path
+from cangauge.service.status import PAGE_EVERY_S, SHOW_EVERY_S, Monitor
+from cangauge.service.status_client import StatusSocket, socket_path
+from cangauge.types import reason_names
 
-if TYPE_CHECKING:
-    from cangauge.service.estimate_table import EstimateWriter
-
+OUTPUTS: Final = {
+    "output": "cangauge.service.estimate_table",
+    "http": "cangauge.extras.live.http",
+    "mqtt": "cangauge.extras.live.mqtt",
+    "dashboard": "cangauge.extras.live.launch",
+}
+"""Modules with an output, by the key that asks for it; imported only then. Each has
+`make_output(service)`."""
 _LOG = logging.getLogger(__name__)
 
 
@@ -45,6 +50,8 @@ class Service:
     ----------
     config : RunConfig or path-like, optional
         Configuration, or its TOML file.
+    outputs : sequence of Output
+        Further consumers of the results.
     **options
         Keys of the configuration, which take precedence over the file.
 
@@ -54,8 +61,10 @@ class Service:
         The configuration in use, except for keys that need a restart.
     pipeline : Pipeline
         The estimator.
-    on_status : callable or None
-        Takes a `Snapshot` four times a second while the service runs; ten times with a live page.
+    recorder : Recorder
+        The recording.
+    bus : str
+        Interface and channel.
 
     Raises
     ------
@@ -72,6 +81,7 @@ class Service:
     def __init__(
         self,
         config: RunConfig | str | PathLike[str] | None = None,
+        outputs: Sequence[Output] = (),
         **options: Any,
     ) -> None:
         self._read = (
@@ -82,23 +92,16 @@ class Service:
         self.config = loaded = self._read()
         if loaded.output is not None:
             _check_output(Path(loaded.output), Path(loaded.model))
-        if loaded.record is not None:
-            refuse_pipe(loaded.record)
-        self._state = loaded.state_settings(os.environ)
-        if self._state is not None:
-            check_state_path(self._state.path)
-        self._reader = BackgroundReader(self._read)
-        notifier = Notifier.from_environment()
-        notifier.extend(READ_WITHIN_S)
-        notifier.close()
-        reading = Reading.of(partial(RunConfig.model_copy, loaded))
-        self._vehicle_key = reading.vehicle_key
-        self.pipeline = Pipeline(reading.vehicle, reading.model, loaded.pipeline_settings())
-        self._address = loaded.address()
+        self._state = _state_settings(loaded)
+        setup = Setup.of(loaded)
+        self._vehicle_key = setup.vehicle_key
+        self.pipeline = Pipeline(setup.vehicle, setup.model, setup.settings)
+        self._address = address_of(loaded)
+        self.bus = str(self._address)
+        self._outputs = list(outputs)
         self._stop = threading.Event()
         self._reload = threading.Event()
-        self._recording: RecordControl | None = None
-        self.on_status: Callable[[Snapshot], None] | None = None
+        self.recorder: Recorder | None = None
 
     def stop(self) -> None:
         """Make `run` return; from any thread."""
@@ -110,8 +113,8 @@ class Service:
 
     def record(self, *, active: bool) -> None:
         """Begin or end a recording while `run` runs; from any thread."""
-        if self._recording is not None:
-            self._recording.request(active=active)
+        if self.recorder is not None:
+            self.recorder.request(active=active)
 
     def run(self) -> dict[str, Any]:
         """Run until `stop`, a signal, or a configured end.
@@ -131,65 +134,71 @@ class Service:
         config, pipeline = self.config, self.pipeline
         with ExitStack() as stack:
             # Signals first: the service may be stopped at any moment from now on.
-            stop, hangup = self._stop.is_set, self._take_reload
+            signalled: Callable[[], bool] = self._stop.is_set
+            hung_up: Callable[[], bool] = self._reload.is_set
             if threading.current_thread() is threading.main_thread():
                 signalled = stack.enter_context(stop_on_signals())
                 hung_up = stack.enter_context(note_hangups())
-                stop = lambda: signalled() or self._stop.is_set()  # noqa: E731
-                hangup = lambda: hung_up() or self._take_reload()  # noqa: E731
-            for owned in self._written_while_running():
-                stack.enter_context(sole_writer(owned))
-            stack.callback(self._reader.close)
+            state = None if self._state is None else self._state.path
+            for owned in (state, config.record, config.output):
+                if owned is not None:
+                    stack.enter_context(sole_writer(owned))
+            reloader = Reloader(self._read)
+            stack.callback(reloader.close)
             port = stack.enter_context(ReconnectingBus(self._address, pipeline.filters))
             port.open(wait=config.wait_for_bus)
-            table = keeper = None
+            keeper = None
             if self._state is not None:
                 keeper = stack.enter_context(StateKeeper(self._state, pipeline, port.name))
-            record_path = None if config.record is None else Path(config.record)
-            recording = RecordControl(record_path, config.record_limits())
-            self._recording = stack.enter_context(recording)
-            if config.output is not None:
-                # pyarrow is slow to import, and few services write a table.
-                from cangauge.service.estimate_table import EstimateWriter  # noqa: PLC0415
-
-                table = stack.enter_context(EstimateWriter(config.output))
-            monitor = stack.enter_context(self._supervised(port, recording))
-            outputs = Outputs(
-                record=recording,
-                table=self._rows(table, recording),
-                show=self._each_turn(monitor, recording),
-                checkpoint=None if keeper is None else keeper.checkpoint,
-                reload=lambda: self._poll_reload(monitor, wanted=hangup()),
-                stepped=monitor.stepped,
-                sent=monitor.sent,
+            self.recorder = recorder = Recorder(config.record, _record_limits(config))
+            notifier = Notifier.from_environment()
+            stack.callback(notifier.close)
+            monitor = Monitor(
+                pipeline,
+                port,
+                config.model,
+                notifier=notifier,
+                record=lambda: recorder.state,
+                show_every_s=SHOW_EVERY_S if config.dashboard is None else PAGE_EVERY_S,
             )
-            summary = serve(port, pipeline, config.loop_settings(), outputs, stop)
-        emit(_LOG, logging.INFO, "service.stopped", _summary_line(pipeline, port, summary))
-        if not pipeline.counts.frames:
+            self._outputs.insert(0, recorder)
+            for output in self._outputs:
+                stack.callback(output.close)
+            for key, module in OUTPUTS.items():
+                if getattr(config, key) is not None:
+                    self._outputs.append(import_module(module).make_output(self))
+                    stack.callback(self._outputs[-1].close)
+            _serve_status(config, monitor, stack)
             emit(
                 _LOG,
-                logging.WARNING,
-                "bus.nothing_wanted",
-                f"{port.name}: no expected frame arrived; check channel, bit rate and vehicle"
-                " (--vehicle, or --dbc and --map)",
+                logging.INFO,
+                "service.ready",
+                f"listening on {port.name}; time source: {config.time_source}; Ctrl-C ends",
+                bus=port.name,
+                vehicle=pipeline.vehicle.name,
+                model=config.model,
             )
-        records = [str(path) for path in recording.written]
-        output = None if table is None or table.failed else config.output
-        for path in filter(None, (*records, output)):
-            emit(_LOG, logging.INFO, "file.written", f"written: {path}", limit=path, path=path)
-        return _summary_json(pipeline, port, summary) | {
-            "state": config.state,
-            "record": records[-1] if records else None,
-            "records": records,
-            "output": output,
-        }
+            notifier.ready(f"listening on {port.name}")
+            stack.callback(notifier.stopping)
+            loop = Loop(
+                port,
+                pipeline,
+                _loop_settings(config),
+                outputs=self._outputs,
+                record=recorder,
+                monitor=monitor,
+                checkpoint=None if keeper is None else keeper.checkpoint,
+                reload=lambda: self._poll_reload(reloader, monitor, wanted=hung_up()),
+            )
+            summary = loop.run(lambda: signalled() or self._stop.is_set())
+        return self._end(port, summary)
 
     def reconfigure(self) -> LoopSettings | None:
-        """Read the configuration again in this process and apply it; the SoC continues.
+        """Read the configuration again and apply it; the SoC continues.
 
-        `run` does the same on SIGHUP or `reload`, but reads in another process meanwhile. Model,
-        vehicle, method, capacity, gaps, time-outs and published ids change at once. The initial
-        SoC is ignored, since the SoC is known. Other keys need a restart, which is logged.
+        `run` does the same on SIGHUP or `reload`, but reads in a thread meanwhile. Model, vehicle,
+        method, capacity, gaps, time-outs and published ids change at once. The initial SoC is
+        ignored, since the SoC is known. Other keys need a restart, which is logged.
 
         Returns
         -------
@@ -197,127 +206,63 @@ class Service:
             Those of the new configuration; None if it is invalid, and the old one stays.
         """
         try:
-            return self._apply(Reading.of(self._read))
-        except InputError as error:
+            return self._apply(Setup.of(self._read()))
+        except CangaugeError as error:
             _log_refusal(error)
             return None
 
-    def _apply(self, new: Reading) -> LoopSettings:
+    def _apply(self, new: Setup) -> LoopSettings:
         """Use another configuration as a whole; raise InputError if it does not fit."""
-        settings, started = new.config.pipeline_settings(), self.pipeline.settings
-        ids = replace(settings.ids, replay_clock=started.ids.replay_clock)
-        self.pipeline.reconfigure(
-            None if new.vehicle_key == self._vehicle_key else new.vehicle,
-            new.model,
-            replace(settings, ids=ids, time_source=started.time_source),
-        )
+        is_same = new.vehicle_key == self._vehicle_key
+        self.pipeline.reconfigure(None if is_same else new.vehicle, new.model, new.settings)
         self._vehicle_key = new.vehicle_key
         _log_changes(self.config, new.config)
         self.config = new.config
-        return new.config.loop_settings()
+        return _loop_settings(new.config)
 
-    def _written_while_running(self) -> list[Path]:
-        """Return the files of which each belongs to one service only."""
-        state = None if self._state is None else self._state.path
-        given = (state, self.config.record, self.config.output, self.config.unix_path())
-        return [Path(path) for path in given if path is not None]
-
-    def _take_reload(self) -> bool:
-        wanted = self._reload.is_set()
-        self._reload.clear()
-        return wanted
-
-    def _poll_reload(self, monitor: Monitor, *, wanted: bool) -> LoopSettings | None:
+    def _poll_reload(
+        self, reloader: Reloader, monitor: Monitor, *, wanted: bool
+    ) -> LoopSettings | None:
         """Begin to read on request; apply what was read since the last call."""
-        if wanted:
-            self._reader.request()
-            monitor.reload_begins(READ_WITHIN_S + START_S)
-        result = self._reader.poll()
+        if wanted or self._reload.is_set():
+            self._reload.clear()
+            reloader.request()
+            monitor.reload_begins()
+        result, settings = reloader.poll(), None
         if result is None:
             return None
-        settings = None
-        if isinstance(result, Reading):
-            try:
-                settings = self._apply(result)
-            except InputError as error:
-                result = error
-        if isinstance(result, InputError):
-            _log_refusal(result)
-        else:
-            monitor.identity = replace(
-                monitor.identity,
-                vehicle=self.pipeline.vehicle.name,
-                model=self.config.model,
-                method=self.pipeline.settings.estimator.method,
-            )
-        if not self._reader.is_reading:
-            monitor.reload_ends(str(result) if isinstance(result, InputError) else "")
+        problem: CangaugeError | None = None
+        try:
+            if isinstance(result, CangaugeError):
+                raise result
+            settings = self._apply(result)
+            monitor.model = self.config.model
+        except CangaugeError as error:
+            problem = error
+            _log_refusal(error)
+        if not reloader.is_reading:
+            monitor.reload_ends(None if problem is None else str(problem))
         return settings
 
-    def _rows(
-        self, table: EstimateWriter | None, recording: RecordControl
-    ) -> Callable[[float, Estimate], None] | None:
-        """Return what takes each sample's estimate: the table, the recording, both or none."""
-        if not recording.keeps_estimates:
-            return None if table is None else table.add
-        pipeline = self.pipeline
-
-        def add(time_s: float, estimate: Estimate) -> None:
-            if table is not None:
-                table.add(time_s, estimate)
-            if pipeline.latest_sample is not None:
-                soc_pct = pipeline.decoder.reference_soc_pct
-                recording.write_estimate(pipeline.latest_sample, soc_pct, estimate)
-
-        return add
-
-    def _each_turn(self, monitor: Monitor, recording: RecordControl) -> Callable[[float], None]:
-        def turn(now_s: float) -> None:
-            is_new = monitor.turn(now_s)
-            recording.tick(now_s)
-            if is_new and self.on_status is not None:
-                self.on_status(monitor.latest)
-
-        return turn
-
-    @contextmanager
-    def _supervised(self, port: ReconnectingBus, recording: RecordControl) -> Iterator[Monitor]:
-        """Yield the monitor, with its status served and systemd notified."""
-        config, vehicle = self.config, self.pipeline.vehicle.name
-        identity = Identity(
-            bus=port.name,
-            vehicle=vehicle,
-            model=config.model,
-            method=config.method,
-            time_source=config.time_source,
-            began_s=time.time(),
-            core=self.pipeline.estimator.core,
-        )
-        with ExitStack() as stack:
-            notifier = Notifier.from_environment()
-            stack.callback(notifier.close)
-            monitor = Monitor(
-                self.pipeline,
-                port,
-                identity=identity,
-                notifier=notifier,
-                record=recording,
-                show_every_s=SHOW_EVERY_S if config.dashboard is None else PAGE_EVERY_S,
-            )
-            _serve_status(config, monitor, stack)
-            _publish_mqtt(config, monitor, stack)
-            emit(
-                _LOG,
-                logging.INFO,
-                "service.ready",
-                f"listening on {port.name}; time source: {config.time_source}; Ctrl-C ends",
-                bus=port.name,
-                vehicle=vehicle,
-                model=config.model,
-            )
-            notifier.ready(f"listening on {port.name}")
-            stack.callback(notifier.stopping)
-            yield monitor
+    def _end(self, port: ReconnectingBus, summary: RunSummary) -> dict[str, Any]:
+        """Log the end of a run; return its summary."""
+        pipeline, recorder = self.pipeline, self.recorder
+        emit(_LOG, logging.INFO, "service.stopped", _summary_line(pipeline, port, summary))
+        if not pipeline.counts.frames:
+            text = f"{port.name}: no expected frame arrived; check channel, bit rate and vehicle"
+            text += " (--vehicle, or --dbc and --map)"
+            emit(_LOG, logging.WARNING, "bus.nothing_wanted", text)
+        records = [] if recorder is None else [str(path) for path in recorder.written]
+        has_failed = any(getattr(each, "failed", False) for each in self._outputs)
+        output = None if has_failed else self.config.output
+        for path in filter(None, (*records, output)):
+            emit(_LOG, logging.INFO, "file.written", f"written: {path}", limit=path, path=path)
+        return _summary_json(pipeline, port, summary) | {
+            "state": self.config.state,
+            "record": records[-1] if records else None,
+            "records": records,
+            "output": output,
+        }
 
 
 def _check_output(output: Path, model: Path) -> None:
@@ -325,11 +270,55 @@ def _check_output(output: Path, model: Path) -> None:
         raise InputError(
             "this output is also an input", source=output, cure="name another file for it"
         )
-    refuse_pipe(output)
     check_writable(output)
 
 
-def _log_refusal(error: InputError) -> None:
+def _state_settings(config: RunConfig) -> StateSettings | None:
+    path = state_path(config.state, os.environ)
+    if path is None:
+        return None
+    for other in (config.model, config.record, config.output, config.dbc, config.map):
+        if other is not None and os.path.realpath(other) == os.path.realpath(path):
+            raise InputError("is another file of this service", field="--state", value=other)
+    check_state_path(path)
+    return StateSettings(path, config.state_max_age_s)
+
+
+def _record_limits(config: RunConfig) -> RecordLimits:
+    part_mb, keep_mb = config.record_part_mb, config.record_keep_mb
+    return RecordLimits(
+        part_bytes=None if part_mb is None else 1e6 * part_mb,
+        part_s=config.record_part_s,
+        keep_bytes=None if keep_mb is None else 1e6 * keep_mb,
+    )
+
+
+def _loop_settings(config: RunConfig) -> LoopSettings:
+    return LoopSettings(
+        timeout_s=config.timeout_s,
+        duration_s=config.duration_s,
+        until_idle_s=config.until_idle_s,
+        checkpoint_every_s=config.state_every_s,
+        poll_every_s=None if config.poll is None else config.poll.every_s,
+    )
+
+
+def _serve_status(config: RunConfig, monitor: Monitor, stack: ExitStack) -> None:
+    if config.status_socket == "off":
+        return
+    is_auto = config.status_socket == "auto"
+    path = socket_path(monitor.latest.status["bus"]) if is_auto else Path(config.status_socket)
+    try:
+        server = StatusSocket(path, lambda: monitor.latest.at(time.monotonic()))
+        stack.callback(server.close)
+    except InputError as error:
+        if not is_auto:
+            raise
+        # Not requested explicitly: the service runs without it.
+        emit(_LOG, logging.WARNING, "status.unavailable", f"no status socket: {error}")
+
+
+def _log_refusal(error: CangaugeError) -> None:
     text = f"new configuration refused, the old one stays: {error}"
     emit(_LOG, logging.WARNING, "config.refused", text)
 
@@ -342,7 +331,7 @@ def _log_changes(old: RunConfig, new: RunConfig) -> None:
     late = [
         key.name
         for key in config_keys()
-        if key.info.needs_restart and _value(before, key.name) != _value(after, key.name)
+        if key.info.restart and _value(before, key.name) != _value(after, key.name)
     ]
     if late:
         text = f"{', '.join(late)}: takes effect after a restart of the service"
@@ -355,64 +344,9 @@ def _value(content: Any, key: str) -> object:
     return content
 
 
-def _serve_status(config: RunConfig, monitor: Monitor, stack: ExitStack) -> None:
-    unix_path = config.unix_path()
-    if config.status_socket == "auto" and has_unix_sockets():
-        try:
-            unix_path = default_path(monitor.latest.identity.bus)
-        except InputError as error:
-            # Not requested explicitly: the service runs without it.
-            emit(_LOG, logging.WARNING, "status.unavailable", f"no status socket: {error}")
-    http = config.http_address()
-    if unix_path is None and http is None:
-        return
-    try:
-        endpoint = Endpoint(lambda: monitor.latest, unix_path=unix_path, http=http)
-    except InputError as error:
-        if config.status_socket != "auto" or error.field != "status_socket":
-            raise
-        emit(_LOG, logging.WARNING, "status.unavailable", f"no status socket: {error}")
-        if http is None:
-            return
-        unix_path = None
-        endpoint = Endpoint(lambda: monitor.latest, http=http)
-    stack.enter_context(endpoint)
-    if unix_path is not None:
-        emit(_LOG, logging.DEBUG, "status.listening", f"status at {unix_path}", path=str(unix_path))
-    if http is not None:
-        emit(
-            _LOG,
-            logging.INFO,
-            "http.listening",
-            f"http://{http.host}:{endpoint.port}/metrics"
-            + (", with a token" if http.token else ", without a token"),
-            port=endpoint.port,
-        )
-
-
-def _publish_mqtt(config: RunConfig, monitor: Monitor, stack: ExitStack) -> None:
-    settings = config.mqtt_settings(monitor.latest.identity.bus)
-    if settings is not None:
-        # An optional dependency.
-        from cangauge.extras.live.mqtt import MqttPublisher  # noqa: PLC0415
-
-        stack.enter_context(MqttPublisher(lambda: monitor.latest, settings))
-
-
 def _summary_line(pipeline: Pipeline, port: ReconnectingBus, summary: RunSummary) -> str:
     """Return a run's frames, losses and last SoC in one line."""
     counts, latest = pipeline.counts, pipeline.latest
-    soc = f"{number(latest.soc_pct, 2)} ± {number(latest.soc_std_pct, 2, '%')}"
-    step = number(summary.step_p50_us, 0, "µs")
-    return (
-        f"{summary.seconds:.1f} s, {counts.frames} frames, {counts.samples} samples,"
-        f" {counts.lost} lost, {counts.crc_errors} CRC errors{_bus_errors(port, summary)};"
-        f" last SoC {soc} ({latest.status.name.lower()}); step {step} (median)"
-    )
-
-
-def _bus_errors(port: ReconnectingBus, summary: RunSummary) -> str:
-    """Return the bus errors of a run, for its summary line."""
     kinds = ", ".join(f"{kind} {count}" for kind, count in port.error_kinds.most_common())
     found = {
         "dropped in the receive queue": port.queue_drops,
@@ -421,7 +355,21 @@ def _bus_errors(port: ReconnectingBus, summary: RunSummary) -> str:
         "from another service with these ids": summary.foreign_frames,
         f"bus losses ({port.away_s:.1f} s)": port.losses,
     }
-    return "".join(f", {count} {what}" for what, count in found.items() if count)
+    errors = "".join(f", {count} {what}" for what, count in found.items() if count)
+    soc = f"{number(latest.soc_pct, 2)} ± {number(latest.soc_std_pct, 2, '%')}"
+    return (
+        f"{summary.seconds:.1f} s, {counts.frames} frames, {counts.samples} samples,"
+        f" {counts.lost} lost, {counts.crc_errors} CRC errors{errors}; last SoC {soc}"
+        f" ({latest.status.name.lower()}); step {number(summary.step_p50_us, 0, 'µs')} (median)"
+    )
+
+
+_REFUSED: Final = (
+    "crc_errors", "repeated", "short", "not_available", "implausible", "stuck", "held_back",
+)  # fmt: skip
+_ESTIMATED: Final = (
+    "time_s", "soc_pct", "soc_std_pct", "soc_newton_pct", "soc_coulomb_pct", "residual_v",
+)  # fmt: skip
 
 
 def _summary_json(pipeline: Pipeline, port: ReconnectingBus, summary: RunSummary) -> dict[str, Any]:
@@ -435,15 +383,7 @@ def _summary_json(pipeline: Pipeline, port: ReconnectingBus, summary: RunSummary
         "samples": counts.samples,
         "lost": counts.lost,
         "crc_errors": counts.crc_errors,
-        "refused": {
-            "crc_errors": counts.crc_errors,
-            "repeated": counts.repeated,
-            "short": counts.short,
-            "not_available": counts.not_available,
-            "implausible": counts.implausible,
-            "stuck": counts.stuck,
-            "held_back": counts.held_back,
-        },
+        "refused": {name: getattr(counts, name) for name in _REFUSED},
         "untimed": counts.untimed,
         "restarts": counts.beginnings,
         "garbled": port.garbled,
@@ -457,12 +397,7 @@ def _summary_json(pipeline: Pipeline, port: ReconnectingBus, summary: RunSummary
         "stamps": port.capabilities.stamps,
         "step_p50_us": summary.step_p50_us,
         "estimate": {
-            "time_s": latest.time_s,
-            "soc_pct": latest.soc_pct,
-            "soc_std_pct": latest.soc_std_pct,
-            "soc_newton_pct": latest.soc_newton_pct,
-            "soc_coulomb_pct": latest.soc_coulomb_pct,
-            "residual_v": latest.residual_v,
+            **{name: getattr(latest, name) for name in _ESTIMATED},
             "status": latest.status.name.lower(),
             "reasons": reason_names(int(latest.reasons)),
         },

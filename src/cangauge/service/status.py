@@ -1,7 +1,7 @@
-"""Status of a running service: counts of the receive loop as snapshots for other threads.
+"""Status of a running service: the object of `/status`, made by the receive loop.
 
-`Monitor` replaces its `Snapshot` a few times a second; readers take the reference, without locks.
-It also notifies systemd and logs changes of the status.
+`Monitor` replaces its `Snapshot` a few times a second; other threads take the reference, without
+locks. It also notifies systemd and logs changes of the status.
 """
 
 from __future__ import annotations
@@ -11,22 +11,19 @@ import math
 import time
 from bisect import bisect_left
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, fields, replace
+from dataclasses import asdict, dataclass, fields
 from typing import Any, Final
 
-from cangauge._logging import emit
+from cangauge._logging import emit, release_held
 from cangauge._text import number
 from cangauge._version import __version__
 from cangauge.bus.connection import BusConnection
-from cangauge.bus.decoder import FrameStatistics
 from cangauge.bus.plausibility import MessageStatistics
-from cangauge.bus.publish import NO_REPORT, PackReport
+from cangauge.bus.publish import NO_REPORT
 from cangauge.service.lifecycle import Notifier
 from cangauge.service.pipeline import Pipeline
-from cangauge.service.record_control import RecordControl
-from cangauge.service.recording import RecordState
 from cangauge.service.status_client import SCHEMA
-from cangauge.types import Estimate, Reason, Sample, Status, reason_name, reason_names
+from cangauge.types import Estimate, Reason, Status, reason_name, reason_names
 
 _LOG = logging.getLogger(__name__)
 
@@ -42,62 +39,83 @@ RATE_OVER_S: Final = 2.0
 """Averaging time of the sample rate [s]."""
 CLOCKS_APART_S: Final = 60.0
 """A receive stamp further than this from the wall clock belongs to another clock [s]."""
-
 REPORT_EVERY_S: Final = 1.0
 """Interval of health, power and cells in the snapshots [s]."""
-
 BUS_COUNTS: Final = ("garbled", "error_frames", "unsent", "queue_drops", "losses", "foreign")
 """Counts of a bus to report, where it has them."""
 
-_NO_REJECTS: Final = frozenset({"wanted", "counter_jumps", "frames_lost"})
 _OF_VALUES: Final = frozenset({"not_available", "implausible", "stuck", "held_back"})
 """Reasons that concern values, not whole frames."""
 _REJECTS: Final = tuple(
-    each.name for each in fields(MessageStatistics) if each.name not in _NO_REJECTS
+    each.name
+    for each in fields(MessageStatistics)
+    if each.name not in {"wanted", "counter_jumps", "frames_lost"}
 )
-
-
 BOUNDS_S: Final = (
     5e-6, 1e-5, 2e-5, 5e-5, 1e-4, 2e-4, 5e-4,
     1e-3, 2e-3, 5e-3, 1e-2, 2e-2, 5e-2, 0.1, 0.2, 0.5, 1.0,
 )  # fmt: skip
-"""Upper bounds of the buckets [s]; one more bucket holds larger values."""
+"""Upper bounds of the buckets of a histogram [s]; one more bucket holds larger values."""
 
 
 @dataclass(frozen=True, slots=True)
-class HistogramCounts:
-    """Immutable copy of a histogram.
+class RecordState:
+    """Progress of a recording.
 
     Parameters
     ----------
-    counts : tuple of int
-        Per bucket of `BOUNDS_S`, and one for larger values.
-    total_s : float
-        Sum of all values [s].
+    path : str
+        The current file.
+    frames, lost_frames, written_bytes : int
+        Frames recorded, frames of these that could not be written, bytes written.
+    problem : str or None
+        Why the disk rejects data at present, or why the recording could not begin.
+    active : bool
+        False once it has ended.
     """
 
-    counts: tuple[int, ...]
-    total_s: float
+    path: str
+    frames: int
+    lost_frames: int
+    written_bytes: int
+    problem: str | None
+    active: bool = True
 
-    @property
-    def count(self) -> int:
-        """Number of values."""
-        return sum(self.counts)
 
-    def at_most_s(self, share: float) -> float | None:
-        """Return the upper bound of the bucket that holds the quantile of this share [s].
+@dataclass(frozen=True, slots=True)
+class Snapshot:
+    """The state of the service at one moment.
 
-        None without values; infinite if the quantile is above all bounds.
-        """
-        count = self.count
-        if not count:
-            return None
-        wanted, seen = share * count, 0
-        for bound, observed in zip((*BOUNDS_S, float("inf")), self.counts, strict=True):
-            seen += observed
-            if seen >= wanted:
-                return bound
-        return float("inf")
+    Parameters
+    ----------
+    made_s : float
+        Monotonic time [s].
+    status : dict
+        The object of `/status` at that time: finite numbers, text and None.
+    """
+
+    made_s: float
+    status: dict[str, Any]
+
+    def is_stuck(self, now_s: float) -> bool:
+        """Return whether the receive loop is stuck at a monotonic time [s]."""
+        return now_s - self.made_s > STUCK_S
+
+    def at(self, now_s: float) -> dict[str, Any]:
+        """Return the object of `/status` at a monotonic time [s]: older, stale once stuck."""
+        status, later_s = dict(self.status), max(now_s - self.made_s, 0.0)
+        status |= {"uptime_s": status["uptime_s"] + later_s, "loop_age_s": later_s}
+        if status["sample"] is not None and status["sample"]["age_s"] is not None:
+            status["sample"] = status["sample"] | {"age_s": status["sample"]["age_s"] + later_s}
+        if self.is_stuck(now_s):
+            status |= {"loop_stuck": True, "status": "invalid"}
+            status["reasons"] = sorted({*status["reasons"], *reason_ids(Reason.INPUT_STALE)})
+        return status
+
+
+def reason_ids(reasons: Reason) -> list[str]:
+    """Return the names of the reasons, such as "delay_line_filling"."""
+    return [reason_name(each).replace(" ", "_") for each in Reason if each and reasons & each]
 
 
 class Histogram:
@@ -112,233 +130,26 @@ class Histogram:
         self._counts[bisect_left(BOUNDS_S, value_s)] += 1
         self._total_s += value_s
 
-    def copy(self) -> HistogramCounts:
-        """Return the counts so far."""
-        return HistogramCounts(tuple(self._counts), self._total_s)
+    def to_dict(self) -> dict[str, Any]:
+        """Return count, mean, bounds of the quantiles, and the counts of the buckets."""
+        count = sum(self._counts)
+        return {
+            "count": count,
+            "mean_s": self._total_s / count if count else None,
+            "p50_at_most_s": self._at_most_s(0.5, count),
+            "p99_at_most_s": self._at_most_s(0.99, count),
+            "total_s": self._total_s,
+            "buckets": list(self._counts),
+        }
 
-
-@dataclass(frozen=True, slots=True)
-class Identity:
-    """Constant properties of a running service.
-
-    Parameters
-    ----------
-    bus, vehicle, model, method, time_source : str
-    began_s : float
-        Start, seconds since 1970.
-    core : {"python", "compiled"}
-        Which implementation of the estimator's step is used; both give the same numbers.
-    """
-
-    bus: str
-    vehicle: str
-    model: str
-    method: str
-    time_source: str
-    began_s: float
-    core: str = "python"
-
-
-@dataclass(frozen=True, slots=True)
-class ConfigState:
-    """Result of the latest reload of the configuration.
-
-    Parameters
-    ----------
-    reloading : bool
-        A new one is being read; the old one is in use meanwhile.
-    problem : str
-        Why the latest one was refused; "" if it is in use.
-    """
-
-    reloading: bool = False
-    problem: str = ""
-
-
-@dataclass(frozen=True, slots=True)
-class Snapshot:
-    """The state of the service at one moment.
-
-    Parameters
-    ----------
-    identity : Identity
-    made_s : float
-        Monotonic time [s].
-    uptime_s : float
-    estimate : Estimate
-        As last published.
-    sample : Sample or None
-        The latest.
-    sample_age_s : float
-        Age of the latest sample at `made_s` [s]; infinite before the first.
-    samples : int
-    samples_per_s : float
-    frames, wanted, rejected, lost : int
-        Frames received; those with an expected id; those of them rejected; those missing by
-        their alive counters.
-    rejects : mapping
-        Rejected frames and values by reason.
-    bus : mapping
-        Counts of the bus: error frames, unsent frames, …
-    bus_up : bool
-        False while the bus is lost or its controller is bus-off.
-    bus_trouble : str
-        Problem of the bus as a phrase; "" without one.
-    latency, step : HistogramCounts
-        Time from receive stamp to published SoC; processing time of the frame that completes a
-        sample.
-    record : RecordState or None
-        Of the recording that runs or has ended.
-    config : ConfigState
-    report : PackReport or None
-        Health, power and cells, of the last second; None before the first sample.
-    polls : mapping, optional
-        Requests over ISO-TP and what came of them; None if none are sent.
-    """
-
-    identity: Identity
-    made_s: float
-    uptime_s: float
-    estimate: Estimate
-    sample: Sample | None
-    sample_age_s: float
-    samples: int
-    samples_per_s: float
-    frames: int
-    wanted: int
-    rejected: int
-    lost: int
-    rejects: Mapping[str, int]
-    bus: Mapping[str, int]
-    bus_up: bool
-    bus_trouble: str
-    latency: HistogramCounts
-    step: HistogramCounts
-    record: RecordState | None
-    config: ConfigState
-    report: PackReport | None = None
-    polls: Mapping[str, int] | None = None
-
-    def is_stuck(self, now_s: float) -> bool:
-        """Return whether the receive loop is stuck at a monotonic time [s]."""
-        return now_s - self.made_s > STUCK_S
-
-    def age_s(self, now_s: float) -> float:
-        """Return the age of the latest sample [s] at a monotonic time [s]."""
-        return self.sample_age_s + max(now_s - self.made_s, 0.0)
-
-    def estimate_at(self, now_s: float) -> Estimate:
-        """Return the estimate at a monotonic time [s]: invalid once the loop is stuck.
-
-        Stale input is detected by the loop itself, while it runs.
-        """
-        estimate = self.estimate
-        if not self.is_stuck(now_s):
-            return estimate
-        return estimate._replace(
-            status=Status.INVALID, reasons=estimate.reasons | Reason.INPUT_STALE
-        )
-
-
-def reason_ids(reasons: Reason) -> list[str]:
-    """Return the names of the reasons, such as "delay_line_filling"."""
-    return [reason_name(each).replace(" ", "_") for each in Reason if each and reasons & each]
-
-
-def as_json(snapshot: Snapshot, now_s: float) -> dict[str, Any]:
-    """Return the object of `/status` and `cangauge status --json`.
-
-    Parameters
-    ----------
-    snapshot : Snapshot
-    now_s : float
-        Monotonic time [s].
-
-    Returns
-    -------
-    dict
-        Values are finite numbers, strings and None.
-    """
-    identity, estimate, sample = snapshot.identity, snapshot.estimate_at(now_s), snapshot.sample
-    record = snapshot.record
-    return {
-        "schema": SCHEMA,
-        "running": True,
-        "version": __version__,
-        "bus": identity.bus,
-        "vehicle": identity.vehicle,
-        "model": identity.model,
-        "method": identity.method,
-        "time_source": identity.time_source,
-        "core": identity.core,
-        "uptime_s": _finite(snapshot.uptime_s + max(now_s - snapshot.made_s, 0.0)),
-        "loop_stuck": snapshot.is_stuck(now_s),
-        "status": estimate.status.name.lower(),
-        "reasons": reason_ids(estimate.reasons),
-        "estimate": {
-            "time_s": _finite(estimate.time_s),
-            "soc_pct": _finite(estimate.soc_pct),
-            "soc_std_pct": _finite(estimate.soc_std_pct),
-            "soc_newton_pct": _finite(estimate.soc_newton_pct),
-            "soc_coulomb_pct": _finite(estimate.soc_coulomb_pct),
-            "voltage_model_v": _finite(estimate.voltage_model_v),
-            "residual_v": _finite(estimate.residual_v),
-        },
-        "sample": None
-        if sample is None
-        else {
-            "age_s": _finite(snapshot.age_s(now_s)),
-            "current_a": _finite(sample.current_a),
-            "voltage_v": _finite(sample.voltage_v),
-            "temperature_c": _finite(sample.temperature_c),
-        },
-        **NO_REPORT,
-        **({} if snapshot.report is None else snapshot.report.to_dict()),
-        "samples": snapshot.samples,
-        "samples_per_s": _finite(snapshot.samples_per_s),
-        "frames": {
-            "received": snapshot.frames,
-            "wanted": snapshot.wanted,
-            "used": snapshot.wanted - snapshot.rejected,
-            "lost": snapshot.lost,
-        },
-        "rejects": dict(snapshot.rejects),
-        "bus_up": snapshot.bus_up,
-        "bus_counts": dict(snapshot.bus),
-        "bus_trouble": snapshot.bus_trouble or None,
-        "polls": None if snapshot.polls is None else dict(snapshot.polls),
-        "config": {
-            "reloading": snapshot.config.reloading,
-            "problem": snapshot.config.problem or None,
-        },
-        "latency": _durations(snapshot.latency),
-        "step": _durations(snapshot.step),
-        "record": None
-        if record is None
-        else {
-            "path": record.path,
-            "frames": record.frames,
-            "lost_frames": record.lost_frames,
-            "written_bytes": record.written_bytes,
-            "problem": record.problem,
-            "active": record.is_active,
-        },
-    }
-
-
-def _durations(histogram: HistogramCounts) -> dict[str, Any]:
-    count = histogram.count
-    p50_s, p99_s = histogram.at_most_s(0.5), histogram.at_most_s(0.99)
-    return {
-        "count": count,
-        "mean_s": histogram.total_s / count if count else None,
-        "p50_at_most_s": _finite(p50_s),
-        "p99_at_most_s": _finite(p99_s),
-    }
-
-
-def _finite(value: float | None) -> float | None:
-    return None if value is None or not math.isfinite(value) else value
+    def _at_most_s(self, share: float, count: int) -> float | None:
+        """Return the upper bound of the bucket with this quantile [s]; None above all bounds."""
+        seen = 0
+        for bound, observed in zip(BOUNDS_S, self._counts, strict=False):
+            seen += observed
+            if seen and seen >= share * count:
+                return bound
+        return None
 
 
 class Monitor:
@@ -348,9 +159,11 @@ class Monitor:
     ----------
     pipeline : Pipeline
     port : BusConnection
-    identity : Identity
-    notifier : Notifier
-    record : RecordControl, optional
+    model : str
+        Name of the model's file.
+    notifier : Notifier, optional
+    record : callable, optional
+        Returns the state of the recording, if any.
     clock : callable
         Monotonic time [s].
     show_every_s : float
@@ -358,7 +171,7 @@ class Monitor:
 
     Attributes
     ----------
-    identity : Identity
+    model : str
         Replaced when the configuration changes.
     latest : Snapshot
         Immutable, hence readable from any thread.
@@ -368,34 +181,32 @@ class Monitor:
         self,
         pipeline: Pipeline,
         port: BusConnection,
+        model: str = "",
         *,
-        identity: Identity,
-        notifier: Notifier,
-        record: RecordControl | None = None,
+        notifier: Notifier | None = None,
+        record: Callable[[], RecordState | None] = lambda: None,
         clock: Callable[[], float] = time.monotonic,
         show_every_s: float = SHOW_EVERY_S,
     ) -> None:
-        self._show_every_s = show_every_s
+        self.model = model
         self._pipeline = pipeline
         self._port = port
-        self.identity = identity
-        self._notifier = notifier
+        self._notifier = notifier or Notifier()
         self._record = record
+        self._show_every_s = show_every_s
         self._began_s = now_s = clock()
         self._latency = Histogram()
         self._step = Histogram()
-        self._due_s = self._notify_s = now_s
-        self._ping_s = now_s
+        self._due_s = self._notify_s = self._ping_s = self._report_due_s = now_s
         self._sample_s = -math.inf
         self._unsent_stamp_s: float | None = None
         self._rate = 0.0
         self._rate_from = (now_s, 0)
         self._status: Status | None = None
-        self._config = ConfigState()
-        self._report: PackReport | None = None
-        self._report_due_s = now_s
+        self._config: dict[str, Any] = {"reloading": False, "problem": None}
+        self._report: Mapping[str, Any] = NO_REPORT
         self._had_notices = False
-        self.latest = self._snapshot(now_s)
+        self.latest = Snapshot(now_s, self._object(now_s))
 
     def stepped(self, stamp_s: float, step_s: float, came_s: float) -> None:
         """Count a step of the estimator.
@@ -416,97 +227,122 @@ class Monitor:
     def sent(self) -> None:
         """Count the latency of the latest sample, whose estimate was just sent."""
         stamp_s, self._unsent_stamp_s = self._unsent_stamp_s, None
-        if stamp_s is None:
-            return
-        latency_s = time.time() - stamp_s
         # Skip stamps of another clock, and those before the clock was set.
-        if 0.0 <= latency_s < CLOCKS_APART_S:
+        if stamp_s is not None and 0.0 <= (latency_s := time.time() - stamp_s) < CLOCKS_APART_S:
             self._latency.add(latency_s)
 
-    def reload_begins(self, within_s: float) -> None:
-        """Report a reload that may take this time [s]; `reload_ends` ends it."""
-        self._config = replace(self._config, reloading=True)
-        self._notifier.reloading(within_s)
+    def reload_begins(self) -> None:
+        """Report a reload; `reload_ends` ends it."""
+        self._config = self._config | {"reloading": True}
+        self._notifier.reloading()
 
-    def reload_ends(self, problem: str) -> None:
-        """Report the end of a reload; `problem` is why it was refused, "" if it was not."""
-        self._config = ConfigState(problem=problem)
-        refused = f"; new configuration REFUSED: {problem}" if problem else ""
-        self._notifier.ready(_status_line(self.latest) + refused)
+    def reload_ends(self, problem: str | None) -> None:
+        """Report the end of a reload, and why it was refused; None if it was not."""
+        self._config = {"reloading": False, "problem": problem}
+        refused = "" if problem is None else f"; new configuration REFUSED: {problem}"
+        self._notifier.ready(self._line() + refused)
 
     def turn(self, now_s: float) -> bool:
         """Record a turn of the loop (monotonic time [s]); return whether `latest` is new."""
         if now_s < self._due_s:
             return False
         self._due_s = now_s + self._show_every_s
-        self.latest = snapshot = self._snapshot(now_s)
-        self._log_status(snapshot)
-        self._log_notices(snapshot)
+        self.latest = Snapshot(now_s, self._object(now_s))
+        self._log_changes(self._pipeline.published)
+        release_held()
         ping_every_s = self._notifier.ping_every_s
         if ping_every_s is not None and now_s >= self._ping_s:
             self._ping_s = now_s + ping_every_s - self._show_every_s
             self._notifier.ping()
         if self._notifier.active and now_s >= self._notify_s:
             self._notify_s = now_s + NOTIFY_EVERY_S
-            self._notifier.status(_status_line(snapshot))
+            self._notifier.status(self._line())
         return True
 
-    def _snapshot(self, now_s: float) -> Snapshot:
-        pipeline = self._pipeline
-        samples = pipeline.samples
+    def _object(self, now_s: float) -> dict[str, Any]:
+        """Return the object of `/status`."""
+        pipeline, port = self._pipeline, self._port
+        estimate, sample, samples = pipeline.published, pipeline.latest_sample, pipeline.samples
         since_s, before = self._rate_from
         if now_s - since_s >= RATE_OVER_S:
             self._rate = (samples - before) / (now_s - since_s)
             self._rate_from = (now_s, samples)
         if samples and now_s >= self._report_due_s:
             self._report_due_s = now_s + REPORT_EVERY_S
-            self._report = pipeline.report()
-        statistics = pipeline.decoder.statistics
-        rejects = _rejects(statistics)
-        return Snapshot(
-            identity=self.identity,
-            made_s=now_s,
-            uptime_s=now_s - self._began_s,
-            estimate=pipeline.published,
-            sample=pipeline.latest_sample,
-            sample_age_s=now_s - self._sample_s,
-            samples=samples,
-            samples_per_s=self._rate,
-            frames=statistics.frames,
-            wanted=statistics.wanted,
-            rejected=sum(count for name, count in rejects.items() if name not in _OF_VALUES),
-            lost=statistics.frames_lost,
-            rejects=rejects,
-            bus=_bus_counts(self._port),
-            bus_up=not any(getattr(self._port, name, False) for name in ("is_away", "is_off")),
-            bus_trouble=str(getattr(self._port, "trouble", "")),
-            latency=self._latency.copy(),
-            step=self._step.copy(),
-            record=None if self._record is None else self._record.state,
-            config=self._config,
-            report=self._report,
-            polls=_poll_counts(self._port),
-        )
+            self._report = pipeline.report().to_dict()
+        statistics, settings = pipeline.decoder.statistics, pipeline.settings
+        rejects = {
+            name: sum(int(getattr(each, name)) for each in statistics.messages.values())
+            for name in _REJECTS
+        }
+        rejected = sum(count for name, count in rejects.items() if name not in _OF_VALUES)
+        counts = {name: getattr(port, name, None) for name in BUS_COUNTS}
+        polls, record = getattr(port, "polls", None), self._record()
+        return {
+            "schema": SCHEMA,
+            "running": True,
+            "version": __version__,
+            "bus": port.name,
+            "vehicle": pipeline.vehicle.name,
+            "model": self.model,
+            "method": settings.estimator.method,
+            "time_source": settings.time_source,
+            "core": pipeline.estimator.core,
+            "uptime_s": now_s - self._began_s,
+            "loop_stuck": False,
+            "loop_age_s": 0.0,
+            "status": estimate.status.name.lower(),
+            "reasons": reason_ids(estimate.reasons),
+            "estimate": _finite(
+                estimate, "time_s", "soc_pct", "soc_std_pct", "soc_newton_pct",
+                "soc_coulomb_pct", "voltage_model_v", "residual_v",
+            ),
+            "sample": None
+            if sample is None
+            else {"age_s": now_s - self._sample_s if self._sample_s > -math.inf else None}
+            | _finite(sample, "current_a", "voltage_v", "temperature_c"),
+            **self._report,
+            "samples": samples,
+            "samples_per_s": self._rate,
+            "frames": {
+                "received": statistics.frames,
+                "wanted": statistics.wanted,
+                "used": statistics.wanted - rejected,
+                "lost": statistics.frames_lost,
+            },
+            "rejects": rejects,
+            "bus_up": not any(getattr(port, name, False) for name in ("is_away", "is_off")),
+            "bus_counts": {name: int(n) for name, n in counts.items() if n is not None},
+            "bus_trouble": getattr(port, "trouble", "") or None,
+            "polls": None if polls is None else polls.to_dict(),
+            "config": self._config,
+            "latency": self._latency.to_dict(),
+            "step": self._step.to_dict(),
+            "record": None if record is None else asdict(record),
+        }  # fmt: skip
 
-    def _log_notices(self, snapshot: Snapshot) -> None:
-        """Log the notices once when they appear."""
-        notices = [] if snapshot.report is None else snapshot.report.notices
-        if notices and not self._had_notices:
-            for notice in notices:
-                emit(_LOG, logging.WARNING, "cells.sum_differs", notice)
+    def _line(self) -> str:
+        """Return the status in one line, such as "SoC 71.2 ± 0.8 %, valid, 10.0 samples/s"."""
+        estimate = self._pipeline.published
+        soc = f"SoC {number(estimate.soc_pct, 1)} ± {number(estimate.soc_std_pct, 1, '%')}"
+        why = reason_names(int(estimate.reasons))
+        status = estimate.status.name.lower() + (f" ({why})" if why else "")
+        return f"{soc}, {status}, {self._rate:.1f} samples/s"
+
+    def _log_changes(self, estimate: Estimate) -> None:
+        """Log a change of the status, and notices once when they appear."""
+        notices = self._report["notices"]
+        for notice in [] if self._had_notices else notices:
+            emit(_LOG, logging.WARNING, "cells.sum_differs", notice)
         self._had_notices = bool(notices)
-
-    def _log_status(self, snapshot: Snapshot) -> None:
-        estimate = snapshot.estimate
         if estimate.status is self._status:
             return
         before, self._status = self._status, estimate.status
-        is_worse = estimate.status is Status.INVALID
         emit(
             _LOG,
-            logging.WARNING if is_worse else logging.INFO,
+            logging.WARNING if estimate.status is Status.INVALID else logging.INFO,
             "status.changed",
-            _status_line(snapshot),
+            self._line(),
             status=estimate.status.name.lower(),
             before=None if before is None else before.name.lower(),
             reasons=reason_ids(estimate.reasons),
@@ -515,27 +351,6 @@ class Monitor:
         )
 
 
-def _status_line(snapshot: Snapshot) -> str:
-    """Return a snapshot in one line, such as "SoC 71.2 ± 0.8 %, valid, 10.0 samples/s"."""
-    estimate = snapshot.estimate
-    soc = f"SoC {number(estimate.soc_pct, 1)} ± {number(estimate.soc_std_pct, 1, '%')}"
-    why = reason_names(int(estimate.reasons))
-    status = estimate.status.name.lower() + (f" ({why})" if why else "")
-    return f"{soc}, {status}, {snapshot.samples_per_s:.1f} samples/s"
-
-
-def _rejects(statistics: FrameStatistics) -> dict[str, int]:
-    return {
-        name: sum(int(getattr(each, name)) for each in statistics.messages.values())
-        for name in _REJECTS
-    }
-
-
-def _poll_counts(port: BusConnection) -> dict[str, int] | None:
-    counts = getattr(port, "polls", None)
-    return None if counts is None else counts.to_dict()
-
-
-def _bus_counts(port: BusConnection) -> dict[str, int]:
-    found = {name: getattr(port, name, None) for name in BUS_COUNTS}
-    return {name: int(value) for name, value in found.items() if value is not None}
+def _finite(values: Any, *names: str) -> dict[str, float | None]:
+    found = {name: getattr(values, name) for name in names}
+    return {name: value if math.isfinite(value) else None for name, value in found.items()}

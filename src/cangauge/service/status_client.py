@@ -1,30 +1,138 @@
-"""Fetch the status of a running service by its unix socket or by HTTP."""
+"""The status of a running service: its unix socket, and clients of it and of HTTP.
+
+There is one path: BUS.sock in the runtime folder of the user or of systemd. A connection to it
+answers with one JSON object and ends, so `nc -U PATH` shows it.
+"""
 
 from __future__ import annotations
 
 import http.client
 import json
+import logging
 import os
+import re
 import socket
+import stat
 import threading
-from collections.abc import Iterator
+import time
+from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, Final, cast
 from urllib.parse import urlsplit
 
+from cangauge._logging import emit
 from cangauge.errors import CangaugeError, InputError
-from cangauge.service.addresses import read_token, served_sockets
+from cangauge.service.addresses import read_token
 
 SCHEMA: Final = 1
 """Version of the JSON object of `/status`. Defined here, so that a client need not import the
 estimator."""
 ANSWER_WITHIN_S: Final = 3.0
 LARGEST_ANSWER: Final = 1 << 20
+SEND_WITHIN_S: Final = 0.5
+"""Longest wait for a client that does not read [s]; the next one waits as long."""
+SOCKET_MODE: Final = 0o660
+SYSTEM_FOLDER: Final = Path("/run/cangauge")
+"""Folder of the systemd units, one subfolder for each service."""
+_LOG = logging.getLogger(__name__)
 
 
 class NotRunningError(CangaugeError):
     """No service answers."""
+
+
+def runtime_folders() -> list[Path]:
+    """Return the folders for sockets, the preferred one first."""
+    runtime = os.environ.get("RUNTIME_DIRECTORY", "").split(":")[0]
+    session = os.environ.get("XDG_RUNTIME_DIR", "")
+    folders = [Path(runtime)] if runtime else []
+    folders += [Path(session) / "cangauge"] if session else []
+    user = os.getuid() if hasattr(os, "getuid") else 0
+    return [*folders, Path("/tmp") / f"cangauge-{user}"]  # noqa: S108 - private: mode 0700
+
+
+def socket_path(bus: str) -> Path:
+    """Return the socket of a service on a bus, such as "socketcan can0"."""
+    name = re.sub(r"[^A-Za-z0-9.]+", "-", bus).strip("-.")[:40]
+    return runtime_folders()[0] / f"{name or 'bus'}.sock"
+
+
+class StatusSocket:
+    """Answer each connection with the status, from a thread; use it in a `with` block.
+
+    Parameters
+    ----------
+    path : Path
+        A socket that nobody serves is replaced.
+    status : callable
+        Returns the JSON object of `/status`.
+
+    Raises
+    ------
+    InputError
+        If another service uses it, another file has this name, or it cannot be created.
+    """
+
+    def __init__(self, path: Path, status: Callable[[], dict[str, Any]]) -> None:
+        self._path = path
+        self._status = status
+        try:
+            if not hasattr(socket, "AF_UNIX"):
+                raise OSError("this system has no unix sockets in Python")  # noqa: TRY301 - as below
+            path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+            if is_served(path):
+                raise OSError("another service uses this socket")  # noqa: TRY301 - as below
+            if path.is_socket():
+                path.unlink()
+            self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+            self._socket.bind(str(path))
+            path.chmod(SOCKET_MODE)
+            self._socket.listen(16)
+        except (OSError, ValueError) as error:
+            raise InputError(
+                f"cannot be created: {getattr(error, 'strerror', None) or error}",
+                source=path,
+                field="status_socket",
+                cure="name another one, or off",
+            ) from error
+        threading.Thread(target=self._serve, name="cangauge-status", daemon=True).start()
+
+    def close(self) -> None:
+        """Remove the socket; the thread ends."""
+        with suppress(OSError):
+            self._socket.shutdown(socket.SHUT_RDWR)
+        self._socket.close()
+        self._path.unlink(missing_ok=True)
+
+    def _serve(self) -> None:
+        while True:
+            try:
+                connection, _ = self._socket.accept()
+            except OSError as error:
+                if self._socket.fileno() < 0:
+                    return
+                emit(_LOG, logging.WARNING, "status.failed", f"no connection accepted: {error}")
+                time.sleep(SEND_WITHIN_S)
+                continue
+            with connection, suppress(OSError):
+                connection.settimeout(SEND_WITHIN_S)
+                connection.sendall(json.dumps(self._status(), ensure_ascii=False).encode() + b"\n")
+
+
+def is_served(path: Path) -> bool:
+    """Return whether a process listens on a unix socket."""
+    try:
+        if not stat.S_ISSOCK(path.stat().st_mode):
+            return False
+        with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as probe:
+            probe.settimeout(1.0)
+            probe.connect(str(path))
+    except (ConnectionRefusedError, FileNotFoundError, ValueError):
+        return False
+    except OSError:  # busy, or of another user
+        return True
+    return True
 
 
 def find_socket() -> Path:
@@ -37,7 +145,11 @@ def find_socket() -> Path:
     InputError
         If several services run.
     """
-    found = served_sockets()
+    found: list[Path] = []
+    with suppress(OSError):  # a folder that this user may not read
+        for folder in (*runtime_folders(), SYSTEM_FOLDER, *SYSTEM_FOLDER.glob("*")):
+            found += [each for each in sorted(folder.glob("*.sock")) if is_served(each)]
+    found = list(dict.fromkeys(found))
     if not found:
         raise NotRunningError(
             "no running service found: start `cangauge run`, or give --endpoint"
@@ -71,43 +183,37 @@ def fetch_status(endpoint: str, token_file: Path | None = None) -> dict[str, Any
     CangaugeError
         If the request is refused, or the answer is not a status.
     """
-    headers = {}
-    connection: http.client.HTTPConnection
-    if "://" in endpoint:
-        connection = _http(endpoint)
-        token = read_token(token_file, os.environ)
-        if token is not None:
-            headers["Authorization"] = f"Bearer {token}"
-    else:
-        connection = _UnixConnection(endpoint)
-    timer: threading.Timer | None = None
     try:
-        connection.connect()
-        # The time-out of the socket is one of each read: a server could answer byte by byte.
-        timer = threading.Timer(ANSWER_WITHIN_S, _shut_down, (connection.sock,))
-        timer.start()
-        connection.request("GET", "/status", headers=headers)
-        response = connection.getresponse()
-        body = response.read(LARGEST_ANSWER)
+        if "://" in endpoint:
+            body = _get(endpoint, read_token(token_file, os.environ))
+        else:
+            body = _read(endpoint)
     except (OSError, http.client.HTTPException) as error:
         reason = getattr(error, "strerror", None) or str(error) or type(error).__name__
         raise NotRunningError(f"{endpoint}: no service answers: {reason}") from error
-    finally:
-        if timer is not None:
-            timer.cancel()
-        connection.close()
-    if response.status != http.client.OK:
-        answer = " ".join(body[:200].decode("utf-8", "replace").split())
-        raise CangaugeError(f"{endpoint}: refused ({response.status}): {answer}")
-    return _content(body, endpoint)
+    try:
+        content = json.loads(body)
+    except (ValueError, RecursionError):
+        content = None
+    if not isinstance(content, dict) or content.get("schema") != SCHEMA:
+        text = f"{endpoint}: the answer is not a status of this release of cangauge"
+        raise CangaugeError(text)
+    return cast("dict[str, Any]", content)
 
 
-def _shut_down(connected: socket.socket) -> None:
-    with suppress(OSError):
-        connected.shutdown(socket.SHUT_RDWR)
+def _read(path: str) -> bytes:
+    until_s = time.monotonic() + ANSWER_WITHIN_S
+    answer = b""
+    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as connection:
+        connection.settimeout(ANSWER_WITHIN_S)
+        connection.connect(path)
+        while len(answer) < LARGEST_ANSWER and (part := connection.recv(1 << 16)):
+            answer += part
+            connection.settimeout(max(until_s - time.monotonic(), 1e-3))
+    return answer
 
 
-def _http(endpoint: str) -> http.client.HTTPConnection:
+def _get(endpoint: str, token: str | None) -> bytes:
     try:
         parts = urlsplit(endpoint)
         host, port = parts.hostname, parts.port
@@ -121,139 +227,22 @@ def _http(endpoint: str) -> http.client.HTTPConnection:
             cure="write it as http://127.0.0.1:9464",
         )
     kind = http.client.HTTPSConnection if parts.scheme == "https" else http.client.HTTPConnection
-    return kind(host, port, timeout=ANSWER_WITHIN_S)
-
-
-class _UnixConnection(http.client.HTTPConnection):
-    def __init__(self, path: str) -> None:
-        super().__init__("localhost", timeout=ANSWER_WITHIN_S)
-        self._path = path
-
-    def connect(self) -> None:
-        self.sock = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
-        self.sock.settimeout(ANSWER_WITHIN_S)
-        self.sock.connect(self._path)
-
-
-def _content(body: bytes, endpoint: str) -> dict[str, Any]:
+    connection = kind(host, port, timeout=ANSWER_WITHIN_S)
+    headers = {} if token is None else {"Authorization": f"Bearer {token}"}
+    timer: threading.Timer | None = None
     try:
-        content = json.loads(body)
-    except (ValueError, RecursionError) as error:
-        raise CangaugeError(f"{endpoint}: the answer is not a status of cangauge") from error
-    if not isinstance(content, dict) or content.get("schema") != SCHEMA:
-        raise CangaugeError(f"{endpoint}: the answer is not a status of this release of cangauge")
-    for problem in _misfits(content, _SHAPE, ""):
-        raise CangaugeError(f"{endpoint}: the answer is not a status of cangauge:{problem}")
-    return cast("dict[str, Any]", content)
-
-
-_Number = (int, float, type(None))
-_Durations: Final = {"count": int, "p50_at_most_s": _Number, "p99_at_most_s": _Number}
-_SHAPE: Final[dict[str, Any]] = {
-    **dict.fromkeys(("version", "bus", "vehicle", "model", "method"), str),
-    **dict.fromkeys(("time_source", "core", "status"), str),
-    "reasons": [str],
-    "uptime_s": (int, float),
-    "loop_stuck": bool,
-    "estimate": dict.fromkeys(
-        (
-            "soc_pct",
-            "soc_std_pct",
-            "soc_newton_pct",
-            "soc_coulomb_pct",
-            "voltage_model_v",
-            "residual_v",
-        ),
-        _Number,
-    ),
-    "sample": (
-        None,
-        dict.fromkeys(("age_s", "current_a", "voltage_v", "temperature_c"), _Number),
-    ),
-    "samples": int,
-    "samples_per_s": _Number,
-    "frames": {"received": int, "used": int, "lost": int},
-    "rejects": {"": int},
-    "bus_up": bool,
-    "bus_counts": {"": int},
-    "bus_trouble": (str, type(None)),
-    "config": {"reloading": bool, "problem": (str, type(None))},
-    "health": (
-        None,
-        dict.fromkeys(
-            ("capacity_ah", "capacity_std_ah", "resistance_ratio", "resistance_std", "offset_a"),
-            _Number,
-        ),
-    ),
-    "power": (
-        None,
-        dict.fromkeys(
-            (
-                "discharge_a",
-                "discharge_std_a",
-                "charge_a",
-                "charge_std_a",
-                "energy_wh",
-                "energy_std_wh",
-            ),
-            _Number,
-        ),
-    ),
-    "cells": (
-        None,
-        {
-            "weakest": (int, type(None)),
-            "cells": int,
-            **dict.fromkeys(
-                ("soc_pct", "soc_std_pct", "spread_pct", "sum_error_v", "sum_std_v"), _Number
-            ),
-        },
-    ),
-    "notices": [str],
-    "latency": _Durations,
-    "step": _Durations,
-    "record": (
-        None,
-        {
-            "path": str,
-            "frames": int,
-            "lost_frames": int,
-            "written_bytes": int,
-            "problem": (str, type(None)),
-            "active": bool,
-        },
-    ),
-}
-"""What `cangauge status` and `cangauge monitor` need of an answer: types by key, of every item of a
-list, of every value of an object whose keys may be any (""); a pair with None may be null."""
-_LARGEST: Final = 1e18
-
-
-def _misfits(value: Any, shape: Any, place: str) -> Iterator[str]:
-    """Yield where a value differs from a shape."""
-    if isinstance(shape, tuple) and shape[0] is None:
-        if value is not None:
-            yield from _misfits(value, shape[1], place)
-    elif isinstance(shape, list | dict):
-        if not isinstance(value, type(shape)):
-            yield f"{place} has a wrong type"
-            return
-        for key, of_key in _items(value, shape):
-            if isinstance(value, dict) and key not in value:
-                yield f"{place} {key} is missing"
-            else:
-                yield from _misfits(value[key], of_key, f"{place} {key}")
-    elif not isinstance(value, shape) or (isinstance(value, bool) and shape is not bool):
-        yield f"{place} has a wrong type"
-    elif isinstance(value, int) and abs(value) > _LARGEST:
-        yield f"{place} is too large"
-
-
-def _items(value: Any, shape: Any) -> Iterator[tuple[Any, Any]]:
-    """Yield each key or index that a list or an object must have, with its shape."""
-    if isinstance(shape, list):
-        yield from ((index, shape[0]) for index in range(len(value)))
-    elif "" in shape:
-        yield from ((key, shape[""]) for key in value)
-    else:
-        yield from shape.items()
+        connection.connect()
+        # The time-out of the socket is one of each read: a server could answer byte by byte.
+        timer = threading.Timer(ANSWER_WITHIN_S, connection.sock.shutdown, (socket.SHUT_RDWR,))
+        timer.start()
+        connection.request("GET", "/status", headers=headers)
+        response = connection.getresponse()
+        body = response.read(LARGEST_ANSWER)
+    finally:
+        if timer is not None:
+            timer.cancel()
+        connection.close()
+    if response.status != http.client.OK:
+        answer = " ".join(body[:200].decode("utf-8", "replace").split())
+        raise CangaugeError(f"{endpoint}: refused ({response.status}): {answer}")
+    return body

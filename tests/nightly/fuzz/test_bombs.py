@@ -29,6 +29,7 @@ from cangauge.logs.read import read_log
 from cangauge.model.effects.library import LIBRARY
 from cangauge.model.model_file import Model
 from cangauge.service.config import load_config
+from cangauge.service.setup import load_vehicle
 from fuzzing import corpus
 
 MIB = 1 << 20
@@ -208,7 +209,7 @@ def test_logs(tmp_path: Path, name: str) -> None:
 def test_configurations(tmp_path: Path, text: str) -> None:
     path = tmp_path / "x.toml"
     path.write_text(text)
-    message = refused(lambda: load_config(path).load_vehicle())
+    message = refused(lambda: load_vehicle(load_config(path)))
     assert message or text.startswith(('model = "x', "bus_options"))
     assert refused(lambda: Vehicle.load(map=path))
 

@@ -21,6 +21,7 @@ from cangauge.extras.validation.twin.drive import read_speed
 from cangauge.logs.read import read_log
 from cangauge.model.model_file import Model
 from cangauge.service.config import load_config
+from cangauge.service.setup import load_vehicle
 from fuzzing import corpus
 
 LOGS = ("log.parquet", "checked.parquet", "leaf.zip", "log.csv.gz", "utf16.csv")
@@ -72,7 +73,7 @@ def test_captures_as_logs(tmp_path: Path, name: str) -> None:
 
 TEXTS: dict[str, tuple[str, Callable[[Path], object]]] = {
     "car.dbc": (corpus.DBC, load_dbc),
-    "config.toml": (corpus.CONFIG, lambda path: load_config(path).load_vehicle()),
+    "config.toml": (corpus.CONFIG, lambda path: load_vehicle(load_config(path))),
     "map.toml": (
         corpus.MAP.replace('dbc = "car.dbc"', 'dbc = "whole.dbc"'),
         lambda path: Vehicle.load(map=path),

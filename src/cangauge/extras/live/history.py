@@ -54,6 +54,10 @@ REASONS: Final = {
 """Reasons in plain words, by their numbers."""
 
 
+LOG_NAME: Final = "cangauge-last-hour.csv"
+LOG_COLUMNS: Final = ("time_s", "current_a", "voltage_v", "temperature_c")
+
+
 class Span:
     """The latest rows at one rate, in an array of fixed size.
 
@@ -213,6 +217,23 @@ class History:
             "rejects_per_s": rejects / seconds,
             "latency_ms": 1e3 * latency_s / published if published else math.nan,
         }
+
+
+def last_hour(history: History) -> str:
+    """Return the last hour as a log that `cangauge gap` reads: CSV on bus time.
+
+    A row is kept where bus time has moved on; times begin at the first row after the latest jump
+    back, as after a restart.
+    """
+    rows = history.hour.rows()
+    values = np.stack([column(rows, name) for name in LOG_COLUMNS], axis=1)
+    values = values[np.isfinite(values[:, :2]).all(axis=1)]
+    back = np.flatnonzero(np.diff(values[:, 0]) < 0.0)
+    values = values[back[-1] + 1 :] if back.size else values
+    values = values[np.diff(values[:, 0], prepend=-math.inf) > 0.0]
+    lines = [",".join("" if math.isnan(v) else f"{v:.6g}" for v in row[1:]) for row in values]
+    stamps = [f"{time_s:.6f}" for time_s in values[:, 0]]
+    return "\n".join([",".join(LOG_COLUMNS), *map(",".join, zip(stamps, lines, strict=True)), ""])
 
 
 def column(rows: FloatArray, name: str) -> FloatArray:

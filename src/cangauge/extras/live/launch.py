@@ -10,14 +10,17 @@ import sys
 import threading
 import time
 from collections.abc import Callable
-from types import TracebackType
-from typing import Final, Self
+from typing import TYPE_CHECKING, Final
 
 from cangauge._logging import emit
 from cangauge.errors import InputError
-from cangauge.service.addresses import HttpAddress
-from cangauge.service.http import open_tcp
-from cangauge.service.status import Snapshot, as_json
+from cangauge.extras.live.http import open_tcp
+from cangauge.service.addresses import HttpAddress, http_address
+from cangauge.service.output import Output
+from cangauge.service.status import Snapshot
+
+if TYPE_CHECKING:
+    from cangauge.service.run import Service
 
 NICE: Final = 5
 """Lower priority of the page's process, so that the estimate comes first."""
@@ -27,11 +30,11 @@ END_WITHIN_S: Final = 0.5
 _LOG = logging.getLogger(__name__)
 
 
-class LivePage:
-    """The live page of a service; use it in a `with` block.
+class LivePage(Output):
+    """The live page of a service.
 
-    A thread sends the latest snapshot and drops those that come while it sends, so that `show`
-    never waits. The constructor opens the sockets, so that errors show at once.
+    A thread sends the latest snapshot and drops those that come while it sends, so that
+    `on_snapshot` never waits. The constructor opens the sockets, so that errors show at once.
 
     Parameters
     ----------
@@ -61,7 +64,9 @@ class LivePage:
         self._done = False
         self._thread = threading.Thread(target=self._run, name="cangauge-page", daemon=True)
 
-    def __enter__(self) -> Self:
+        self._start()
+
+    def _start(self) -> None:
         numbers = [each.fileno() for each in self._sockets]
         self._process = subprocess.Popen(
             [
@@ -87,14 +92,9 @@ class LivePage:
             + (", with a token" if self._address.token else ""),
             port=self.port,
         )
-        return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def close(self) -> None:
+        """End the page's process."""
         self._done = True
         self._new.set()
         self._thread.join(END_WITHIN_S)
@@ -106,7 +106,7 @@ class LivePage:
         for each in self._sockets:
             each.close()
 
-    def show(self, snapshot: Snapshot) -> None:
+    def on_snapshot(self, snapshot: Snapshot) -> None:
         """Make a snapshot the latest one; returns at once."""
         self._latest = snapshot
         self._new.set()
@@ -121,7 +121,7 @@ class LivePage:
                     self._new.wait()
                     self._new.clear()
                     if self._latest is not None and not self._done:
-                        self._send(pipe.fileno(), as_json(self._latest, time.monotonic()))
+                        self._send(pipe.fileno(), self._latest.at(time.monotonic()))
         except OSError as error:
             if not self._done:
                 text = f"the live page is no longer served: {error}; the estimate continues"
@@ -139,3 +139,10 @@ class LivePage:
         left = json.dumps(content, ensure_ascii=False).encode() + b"\n"
         while left:
             left = left[os.write(pipe, left) :]
+
+
+def make_output(service: Service) -> LivePage:
+    """Return the page that a service's configuration asks for; may raise InputError."""
+    config = service.config
+    address = http_address(str(config.dashboard), config.http_token_file, field="dashboard")
+    return LivePage(address, lambda active: service.record(active=active))

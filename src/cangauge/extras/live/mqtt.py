@@ -9,19 +9,22 @@ from __future__ import annotations
 
 import json
 import logging
+import os
+import re
+import socket
 import ssl
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Mapping
 from dataclasses import dataclass, field
-from types import TracebackType
-from typing import Any, Final, Self
+from typing import TYPE_CHECKING, Any, Final
 
 from cangauge._logging import emit
 from cangauge._version import __version__
 from cangauge.errors import InputError
-from cangauge.service.addresses import is_loopback_name
-from cangauge.service.status import Snapshot, as_json
+from cangauge.service.addresses import is_loopback_name, read_mqtt_password
+from cangauge.service.output import Output
+from cangauge.service.status import Snapshot
 from cangauge.types import Status
 
 try:
@@ -33,6 +36,10 @@ except ImportError as error:
         field="mqtt",
         cure="pip install 'cangauge[mqtt]'",
     ) from error
+
+if TYPE_CHECKING:
+    from cangauge.service.config import MqttConfig
+    from cangauge.service.run import Service
 
 _LOG = logging.getLogger(__name__)
 
@@ -121,9 +128,8 @@ _SENSORS: Final = (
 )
 
 
-def state(snapshot: Snapshot, now_s: float) -> dict[str, Any]:
-    """Return the state to publish at a monotonic time [s]: one flat JSON object."""
-    status = as_json(snapshot, now_s)
+def state(status: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the state to publish for a status: one flat JSON object."""
     estimate, sample = status["estimate"], status["sample"] or {}
     health, power = status["health"] or {}, status["power"] or {}
     cells = status["cells"] or {}
@@ -148,14 +154,13 @@ def state(snapshot: Snapshot, now_s: float) -> dict[str, Any]:
     }
 
 
-def discovery(settings: MqttSettings, snapshot: Snapshot) -> dict[str, dict[str, Any]]:
+def discovery(settings: MqttSettings, status: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
     """Return Home Assistant's configuration of each sensor by its topic."""
-    identity = snapshot.identity
     about = {
         "identifiers": [settings.device],
-        "name": f"Battery on {identity.bus}",
+        "name": f"Battery on {status['bus']}",
         "manufacturer": "cangauge",
-        "model": identity.vehicle,
+        "model": status["vehicle"],
         "sw_version": __version__,
     }
     online = {"topic": settings.availability_topic}
@@ -189,13 +194,11 @@ def discovery(settings: MqttSettings, snapshot: Snapshot) -> dict[str, dict[str,
     return found
 
 
-class MqttPublisher:
-    """Publish snapshots from a thread; use it in a `with` block.
+class MqttPublisher(Output):
+    """Publish the latest snapshot from a thread.
 
     Parameters
     ----------
-    latest : callable
-        Returns the latest snapshot.
     settings : MqttSettings
 
     Raises
@@ -204,8 +207,8 @@ class MqttPublisher:
         If the certificates cannot be read.
     """
 
-    def __init__(self, latest: Callable[[], Snapshot], settings: MqttSettings) -> None:
-        self._latest = latest
+    def __init__(self, settings: MqttSettings) -> None:
+        self._latest: Snapshot | None = None
         self._settings = settings
         self._done = threading.Event()
         self._is_new = threading.Event()
@@ -231,17 +234,14 @@ class MqttPublisher:
         client.on_disconnect = self._on_disconnect
         client.on_connect_fail = self._on_connect_fail
         self._thread = threading.Thread(target=self._run, name="cangauge-mqtt", daemon=True)
-
-    def __enter__(self) -> Self:
         self._thread.start()
-        return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def on_snapshot(self, snapshot: Snapshot) -> None:
+        """Make a snapshot the latest one."""
+        self._latest = snapshot
+
+    def close(self) -> None:
+        """Say goodbye to the broker, within a limited time."""
         self._done.set()
         self._thread.join(2.0 * LEAVE_WITHIN_S)
 
@@ -260,16 +260,16 @@ class MqttPublisher:
             emit(_LOG, logging.ERROR, "mqtt.failed", f"MQTT has ended: {error!r}")
 
     def _publish(self) -> None:
-        if not self._client.is_connected():
+        if self._latest is None or not self._client.is_connected():
             return
+        status = self._latest.at(time.monotonic())
         if self._is_new.is_set():
             self._is_new.clear()
             if self._settings.discovery_prefix:
-                for topic, content in discovery(self._settings, self._latest()).items():
+                for topic, content in discovery(self._settings, status).items():
                     self._send(topic, json.dumps(content, ensure_ascii=False))
             self._send(self._settings.availability_topic, "online")
-        content = state(self._latest(), time.monotonic())
-        self._send(self._settings.state_topic, json.dumps(content, ensure_ascii=False))
+        self._send(self._settings.state_topic, json.dumps(state(status), ensure_ascii=False))
 
     def _send(self, topic: str, text: str) -> MQTTMessageInfo:
         # QoS 0: unlike the others it is never queued for a broker that is away.
@@ -324,3 +324,25 @@ def _tls_context(ca_file: str | None) -> ssl.SSLContext:
             value=ca_file,
             cure="name a PEM file",
         ) from error
+
+
+def mqtt_settings(config: MqttConfig, bus: str) -> MqttSettings:
+    """Return the broker of a configuration for a bus of this name; may raise InputError."""
+    given = config.model_dump(exclude={"password_file"})
+    given["port"] = config.port or (8883 if config.tls else 1883)
+    name = f"cangauge_{socket.gethostname()}_{bus}"
+    given["device"] = config.device or re.sub(r"[^A-Za-z0-9_-]+", "_", name)
+    password = read_mqtt_password(config.password_file, os.environ)
+    if password is not None and config.user is None:
+        raise InputError(
+            "is missing", field="mqtt.user", cure="name the user whose password is given"
+        )
+    return MqttSettings(**given, password=password)
+
+
+def make_output(service: Service) -> MqttPublisher:
+    """Return the publisher that a service's configuration asks for; may raise InputError."""
+    config = service.config.mqtt
+    if config is None:
+        raise ValueError("no [mqtt]")
+    return MqttPublisher(mqtt_settings(config, service.bus))

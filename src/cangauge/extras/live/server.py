@@ -33,10 +33,17 @@ from tornado.websocket import WebSocketClosedError, WebSocketHandler
 
 from cangauge._typing import FloatArray
 from cangauge.extras.live.charts import CHARTS, STATUS_COLOURS, STATUS_NAMES, chart_parts
-from cangauge.extras.live.comparison import LOG_NAME, comparison, last_hour
-from cangauge.extras.live.history import COLUMNS, REASONS, History, column, shown_columns
+from cangauge.extras.live.history import (
+    COLUMNS,
+    LOG_NAME,
+    REASONS,
+    History,
+    column,
+    last_hour,
+    shown_columns,
+)
+from cangauge.extras.live.http import MAX_BODY_BYTES, MAX_HEADER_BYTES, has_token
 from cangauge.service.addresses import is_loopback_name
-from cangauge.service.http import MAX_BODY_BYTES, MAX_HEADER_BYTES, has_token
 
 COOKIE: Final = "cangauge"
 IDLE_S: Final = 30.0
@@ -145,7 +152,6 @@ class Site:
                 (r"/files/([a-z.]+)", _File, context),
                 ("/rows", _Rows, context),
                 ("/stream", _Stream, context),
-                ("/comparison", _Comparison, context),
                 ("/range.csv", _Range, context),
                 ("/recording", _Recording, context),
                 (f"/{LOG_NAME}", _LastHour, context),
@@ -293,11 +299,6 @@ class _Stream(_Page, WebSocketHandler):
                 self._question = question | {"key": answer.get("key"), "after": answer.get("added")}
                 await self.write_message(json.dumps(answer, ensure_ascii=False, allow_nan=False))
                 await self.site.news()
-
-
-class _Comparison(_Page):
-    def get(self) -> None:
-        self.send_json(comparison(self.site.history))
 
 
 class _Range(_Page):

@@ -72,6 +72,7 @@
     at("state").dataset.status = status.status;
     put(at("reasons"), words(latest.reasons).join("; "));
     showRecording(status);
+    put(at("command"), `cangauge gap cangauge-last-hour.csv -m '${status.model.replaceAll("'", "'\\''")}'`);
     const wanted = Object.entries(tiles(status, latest)), list = at("tiles");
     if (list.children.length !== wanted.length) {
       list.replaceChildren(...wanted.map(([name]) => {
@@ -266,27 +267,6 @@
     if (1e3 * seconds > ANSWER_MS && socket) { const old = socket; socket = null; old.close(); }
   }
 
-  async function compare() {
-    if (!at("gap").hidden) {
-      try {
-        const content = await (await fetch("/comparison")).json();
-        put(at("verdict"), content.verdict);
-        put(at("command"), content.command);
-        at("table").hidden = content.scales.length === 0;
-        at("scales").replaceChildren(...content.scales.map(scale => {
-          const row = document.createElement("tr");
-          const signs = [scale.above && "above", scale.growing && "growing"].filter(Boolean).join(", ");
-          for (const text of [scale.seconds, signs, num(scale.rms_mv, 0), num(scale.floor_mv, 0),
-            num(scale.rms_mv / scale.floor_mv, 2), num(scale.growth, 2)]) {
-            row.append(Object.assign(document.createElement("td"), { textContent: text }));
-          }
-          return row;
-        }));
-      } catch { put(at("verdict"), "The service does not answer."); }
-    }
-    setTimeout(compare, 2000);
-  }
-
   function paint() {
     const ink = dark.matches ? "#d5dce6" : "#333d4a", line = dark.matches ? "#333d49" : "#dfe4ea";
     const blue = dark.matches ? "#56b4e9" : "#0072b2";
@@ -384,7 +364,6 @@
     connect();
     setInterval(watch, WATCH_MS);
     document.addEventListener("visibilitychange", () => { if (document.hidden) socket?.close(); else connect(); });
-    compare();
   }
   begin();
 })();

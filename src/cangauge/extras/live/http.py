@@ -1,0 +1,252 @@
+"""Serve the status of a running service by HTTP: `/status`, `/healthz` and `/metrics`.
+
+All pages are read-only. A thread serves them from the latest snapshot and never blocks the receive
+loop. There is no encryption: beyond a trusted network, put a TLS proxy in front.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import hmac
+import json
+import logging
+import socket
+import threading
+import time
+from collections import Counter
+from contextlib import suppress
+from typing import TYPE_CHECKING, Any, Final
+
+from tornado.httpserver import HTTPServer
+from tornado.iostream import IOStream
+from tornado.netutil import bind_sockets
+from tornado.web import Application, RequestHandler
+
+from cangauge._logging import emit
+from cangauge.errors import InputError
+from cangauge.service.addresses import HttpAddress, http_address, is_loopback_name
+from cangauge.service.output import Output
+from cangauge.service.status import Snapshot
+
+if TYPE_CHECKING:
+    from cangauge.service.run import Service
+
+MAX_HEADER_BYTES: Final = 8192
+MAX_BODY_BYTES: Final = 1024
+MAX_CLIENTS: Final = 32
+"""Most simultaneous connections, to save file descriptors. A further one takes the place of the
+oldest of the peer that has most: a client with many connections cannot starve health checks."""
+REQUEST_WITHIN_S: Final = 3.0
+"""Time limit for receiving a request [s]."""
+CLOSE_WITHIN_S: Final = 0.3
+"""Time limit for the thread to end [s]; it is a daemon."""
+_LOG = logging.getLogger(__name__)
+
+
+class HttpServer(Output):
+    """Serve snapshots from a thread.
+
+    Parameters
+    ----------
+    address : HttpAddress
+
+    Attributes
+    ----------
+    port : int
+        TCP port.
+    latest : Snapshot or None
+        None before the first.
+
+    Raises
+    ------
+    InputError
+        If the address is in use or cannot be bound.
+    """
+
+    def __init__(self, address: HttpAddress) -> None:
+        self.address = address
+        self.latest: Snapshot | None = None
+        self._sockets = open_tcp(address)
+        self.port = int(self._sockets[0].getsockname()[1])
+        self._loop = asyncio.new_event_loop()
+        self._thread = threading.Thread(target=self._run, name="cangauge-http", daemon=True)
+        self._thread.start()
+        token = "with a token" if address.token else "without a token"
+        text = f"http://{address.host}:{self.port}/status, {token}"
+        emit(_LOG, logging.INFO, "http.listening", text, port=self.port)
+
+    def on_snapshot(self, snapshot: Snapshot) -> None:
+        """Make a snapshot the latest one."""
+        self.latest = snapshot
+
+    def close(self) -> None:
+        """End the thread."""
+        with suppress(RuntimeError):  # it has ended
+            self._loop.call_soon_threadsafe(self._loop.stop)
+        self._thread.join(CLOSE_WITHIN_S)
+        for each in self._sockets:
+            each.close()
+
+    def _run(self) -> None:
+        try:
+            asyncio.set_event_loop(self._loop)
+            self._loop.run_until_complete(self._serve())
+            self._loop.run_forever()
+        except Exception as error:  # noqa: BLE001 - an error here must not end the estimate
+            text = f"status and metrics are no longer served: {error!r}"
+            emit(_LOG, logging.ERROR, "http.failed", text)
+        finally:
+            self._loop.close()
+
+    async def _serve(self) -> None:
+        context = {"server": self}
+        pages = [("/status", _Status, context), ("/healthz", _Health, context),
+                 ("/metrics", _Metrics, context)]  # fmt: skip
+        application = Application(
+            pages,
+            default_handler_class=_Nothing,
+            default_handler_args=context,
+            log_function=_log_failure,
+        )
+        server = _Server(
+            application,
+            no_keep_alive=True,
+            max_header_size=MAX_HEADER_BYTES,
+            max_body_size=MAX_BODY_BYTES,
+            max_buffer_size=MAX_HEADER_BYTES + MAX_BODY_BYTES,
+            idle_connection_timeout=REQUEST_WITHIN_S,
+            body_timeout=REQUEST_WITHIN_S,
+        )
+        server.add_sockets(self._sockets)
+
+
+class _Server(HTTPServer):
+    """Limit the number of simultaneous connections."""
+
+    def initialize(self, *args: Any, **kwargs: Any) -> None:
+        self._clients: dict[IOStream, str] = {}  # with their peers, the oldest first
+        super().initialize(*args, **kwargs)
+
+    def handle_stream(self, stream: IOStream, address: Any) -> None:
+        if len(self._clients) >= MAX_CLIENTS:
+            [(crowd, _)] = Counter(self._clients.values()).most_common(1)
+            oldest = next(each for each, peer in self._clients.items() if peer == crowd)
+            del self._clients[oldest]
+            oldest.close()
+        self._clients[stream] = str(address[0]) if isinstance(address, tuple) else ""
+        super().handle_stream(stream, address)
+
+    def on_close(self, server_conn: Any) -> None:
+        self._clients.pop(server_conn.stream, None)
+        super().on_close(server_conn)
+
+
+def open_tcp(address: HttpAddress, field: str = "http") -> list[socket.socket]:
+    """Return listening sockets; raise InputError, with this field, if they cannot be bound."""
+    try:
+        return bind_sockets(address.port, address.host)
+    except (OSError, UnicodeError) as error:
+        raise InputError(
+            f"cannot listen: {getattr(error, 'strerror', None) or error}",
+            field=field,
+            value=str(address),
+            cure="choose another port",
+        ) from error
+
+
+def has_token(header: str, token: str) -> bool:
+    """Return whether an Authorization header bears the token; takes the same time for each."""
+    scheme, _, given = header.partition(" ")
+    same = hmac.compare_digest(given.strip().encode("utf-8", "replace"), token.encode("utf-8"))
+    return same and scheme.lower() == "bearer"
+
+
+def _log_failure(handler: RequestHandler) -> None:
+    if handler.get_status() >= 500:
+        _LOG.debug("%s: %s", handler.request.path, handler.get_status())
+
+
+class _Page(RequestHandler):
+    """Access control and plain-text errors of all pages."""
+
+    def initialize(self, server: HttpServer) -> None:
+        self.server = server
+
+    def set_default_headers(self) -> None:
+        self.clear_header("Server")
+        self.set_header("Cache-Control", "no-store")
+        self.set_header("X-Content-Type-Options", "nosniff")
+        self.set_header("Content-Type", "text/plain; charset=utf-8")
+
+    def prepare(self) -> None:
+        token = self.server.address.token
+        if token is None:
+            # Against DNS rebinding: a web page could otherwise read this under another name.
+            if not is_loopback_name(self.request.host_name):
+                self.refuse(403, "request this by a loopback address")
+        elif not has_token(self.request.headers.get("Authorization", ""), token):
+            self.set_header("WWW-Authenticate", "Bearer")
+            self.refuse(401, "a bearer token is required")
+            text = f"refused {self.request.remote_ip}: missing or wrong token"
+            emit(_LOG, logging.WARNING, "http.refused", text, remote=self.request.remote_ip)
+        if self.server.latest is None and not self._finished:
+            self.refuse(503, "the service has just started")
+
+    def refuse(self, code: int, text: str) -> None:
+        self.set_status(code)
+        self.finish(text + "\n")
+
+    def write_error(self, status_code: int, **_: Any) -> None:
+        self.finish(f"{status_code} {self._reason}\n")
+
+    def send_json(self, content: dict[str, Any]) -> None:
+        self.set_header("Content-Type", "application/json")
+        self.finish(json.dumps(content, ensure_ascii=False) + "\n")
+
+    @property
+    def status(self) -> dict[str, Any]:
+        """The status now."""
+        latest = self.server.latest
+        if latest is None:
+            raise LookupError("no snapshot yet")
+        return latest.at(time.monotonic())
+
+
+class _Status(_Page):
+    def get(self) -> None:
+        self.send_json(self.status)
+
+
+class _Health(_Page):
+    def get(self) -> None:
+        """Return whether the receive loop runs; `/status` has the validity of the SoC."""
+        status = self.status
+        if status["loop_stuck"]:
+            self.set_status(503)
+        self.send_json({"ok": not status["loop_stuck"], "status": status["status"]})
+
+
+class _Metrics(_Page):
+    def get(self) -> None:
+        try:
+            # An extra: only this page needs it.
+            from cangauge.extras.live.metrics import render  # noqa: PLC0415
+        except InputError as error:
+            self.refuse(404, str(error))
+            return
+        body, content_type = render(self.status, self.request.headers.get("Accept", ""))
+        self.set_header("Content-Type", content_type)
+        self.finish(body)
+
+
+class _Nothing(_Page):
+    def prepare(self) -> None:
+        super().prepare()
+        if not self._finished:
+            self.refuse(404, "available: /status, /healthz, /metrics")
+
+
+def make_output(service: Service) -> HttpServer:
+    """Return the server that a service's configuration asks for."""
+    config = service.config
+    return HttpServer(http_address(str(config.http), config.http_token_file))

@@ -1,0 +1,27 @@
+"""The seam between the service and whatever shows, stores or sends its results."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from cangauge.types import Estimate, Sample
+
+if TYPE_CHECKING:
+    from cangauge.service.status import Snapshot
+
+
+class Output:
+    """Takes the results of a service: table, recording, status, page, MQTT, metrics.
+
+    Its methods are called in the thread of the receive loop and must return at once. One that
+    raises is logged and told nothing more until `close`; the estimate continues.
+    """
+
+    def on_sample(self, sample: Sample, estimate: Estimate) -> None:
+        """Take a sample and the estimate after it."""
+
+    def on_snapshot(self, snapshot: Snapshot) -> None:
+        """Take the state of the service, four times a second; ten times with the live page."""
+
+    def close(self) -> None:
+        """Complete what was written, within a limited time."""

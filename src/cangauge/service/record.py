@@ -1,0 +1,389 @@
+"""Record the received frames, so that `estimate` on the recording reproduces the live numbers.
+
+Formats are the texts that keep whole microseconds: candump (.log) and python-can's .csv, either
+also gzipped. The receive loop only collects frames; a thread formats and writes them in batches, so
+a kill loses at most the frames since the last snapshot (0.25 s), and a power cut those of the last
+`SYNC_EVERY_S`. A batch that the disk refuses is cut off the file and counted: the file stays whole
+lines, and continues once there is space.
+"""
+
+from __future__ import annotations
+
+import copy
+import gzip
+import io
+import logging
+import os
+import shutil
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime
+from functools import partial
+from pathlib import Path
+from typing import Final, Self
+
+import can
+
+from cangauge._files import FOR_GROUP, FULL, check_writable
+from cangauge._logging import emit
+from cangauge.bus.captures import all_parts, part_path, run_path
+from cangauge.bus.time_source import whole_us
+from cangauge.errors import CangaugeError, InputError
+from cangauge.service.output import Output
+from cangauge.service.status import RecordState, Snapshot
+from cangauge.service.worker import Worker
+
+BATCH_FRAMES: Final = 256
+"""Frames formatted at once: the thread holds the interpreter for 1 ms."""
+BATCHES_WAITING: Final = 600
+"""Batches that wait for a slow disk: over a minute at 2,000 frames/s, 30 MB."""
+SYNC_EVERY_S: Final = 30.0
+"""Interval of fsync, against power cuts [s]."""
+CLOSE_WITHIN_S: Final = 0.6
+"""Time limit for writing what is left at the end [s]."""
+REQUESTED_BYTES: Final = 4 << 30
+"""Largest recording begun by a viewer [bytes]: half a day of a busy bus (2,000 frames/s of candump
+text), and what one file of FAT32 can hold."""
+FREE_BYTES: Final = 1 << 30
+"""Space that such a recording leaves free [bytes]: for state, table and logs on the same disk."""
+FORMATS: Final[dict[str, Callable[[io.StringIO], can.CanutilsLogWriter | can.CSVWriter]]] = {
+    ".log": can.CanutilsLogWriter,
+    ".csv": can.CSVWriter,
+}
+_LOG = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class RecordLimits:
+    """Limits of a recording: size and duration of its parts, and its total size.
+
+    Without limits it is one file. If that exists already (a restarted service must not overwrite
+    its predecessor's recording), or with any limit, runs and parts are numbered.
+
+    Parameters
+    ----------
+    part_bytes, part_s : float, optional
+        Size [bytes] and duration [s] at which a new part begins.
+    keep_bytes : float, optional
+        Total size above which the oldest parts are removed when a new one begins [bytes].
+
+    Raises
+    ------
+    InputError
+        If `keep_bytes` is given without parts.
+    """
+
+    part_bytes: float | None = None
+    part_s: float | None = None
+    keep_bytes: float | None = None
+
+    def __post_init__(self) -> None:
+        if self.keep_bytes is not None and not self.in_parts:
+            raise InputError(
+                "the recording is one file, which is never removed",
+                field="record_keep_mb",
+                cure="give record_part_mb or record_part_s as well",
+            )
+
+    @property
+    def in_parts(self) -> bool:
+        """Whether the recording is in parts."""
+        return self.part_bytes is not None or self.part_s is not None
+
+
+class Recorder(Output):
+    """The recording of a service: one file, or parts.
+
+    `request` is for any thread, everything else for the loop's. No method waits for the disk but
+    the constructor, and `close` for a limited time.
+
+    Parameters
+    ----------
+    path : path-like, optional
+        Recorded to from the start, and again after each request. Without it a request begins a
+        candump file in the working folder, named by its UTC time.
+    limits : RecordLimits, optional
+        By default one file. Without `keep_bytes` a recording begun by a request ends at
+        `REQUESTED_BYTES`, or when less than `FREE_BYTES` are free.
+    clock : callable
+        Monotonic time [s].
+
+    Raises
+    ------
+    InputError
+        If the suffix is unknown, or the folder is missing or not writable.
+    """
+
+    def __init__(
+        self,
+        path: str | os.PathLike[str] | None,
+        limits: RecordLimits | None = None,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self._path = None if path is None else Path(path)
+        self._limits = limits or RecordLimits()
+        self._clock = clock
+        self._is_wanted: bool | None = None
+        self._is_active = False
+        self._batch: list[can.Message] = []
+        self._file: _File | None = None
+        self._lost_frames = 0
+        self.state: RecordState | None = None
+        """Progress of the recording, or the end of the latest one; None before the first."""
+        self.written: list[Path] = []
+        """Paths of all recordings, for `estimate`, in order."""
+        self._worker = Worker("cangauge-record", self._failed, BATCHES_WAITING)
+        if self._path is not None:
+            _check_path(self._path)
+            self._begin(self._path, requested=False)
+            self._is_active = True
+
+    @property
+    def frames(self) -> int:
+        """Frames handed to the recording so far."""
+        return 0 if self.state is None else self.state.frames
+
+    @property
+    def path(self) -> Path:
+        """Name of the latest recording, for `estimate` and `replay`."""
+        return self.written[-1]
+
+    def request(self, *, active: bool) -> None:
+        """Ask for a recording, or for its end; it follows with the next snapshot."""
+        self._is_wanted = active
+
+    def write(self, message: can.Message) -> None:
+        """Record a received frame and round its stamp to the one that is written."""
+        if not self._is_active:
+            return
+        message.timestamp = whole_us(message.timestamp) / 1e6
+        self._batch.append(copy.copy(message))
+        if len(self._batch) >= BATCH_FRAMES:
+            self._hand_over()
+
+    def on_snapshot(self, snapshot: Snapshot) -> None:
+        """Hand the new frames to the thread, and do what a viewer asked for."""
+        del snapshot
+        self._hand_over()
+        wanted, self._is_wanted = self._is_wanted, None
+        if wanted and not self._is_active:
+            name = f"cangauge-{datetime.now(UTC):%Y%m%dT%H%M%SZ}.log"
+            path = self._path or Path.cwd() / name
+            self._is_active = self._worker.submit(partial(self._begin, path, requested=True))
+        elif wanted is False and self._is_active:
+            self._is_active = False
+            self._worker.submit(self._end)
+
+    def close(self) -> None:
+        """Complete the file; frames that are not written in time are lost."""
+        self._hand_over()
+        self._worker.submit(self._end)
+        if not self._worker.close(CLOSE_WITHIN_S) and self.state is not None:
+            text = f"{self.state.path}: the end of the recording is missing"
+            emit(_LOG, logging.ERROR, "record.incomplete", text)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def _hand_over(self) -> None:
+        batch, self._batch = self._batch, []
+        if batch and not self._worker.submit(partial(self._write, batch)):
+            self._lost_frames += len(batch)  # counted with the next batch that is taken
+
+    # --- In the thread
+
+    def _begin(self, path: Path, *, requested: bool) -> None:
+        endless = requested and self._limits.keep_bytes is None
+        try:
+            _check_path(path)
+            if endless and (problem := _full(path, 0)):
+                raise CangaugeError(problem)  # noqa: TRY301 - reported as any other
+            self._file = _File(path, self._limits, self._clock, ends=endless)
+        except (CangaugeError, OSError) as error:
+            self._is_active = False
+            self.state = RecordState(str(path), 0, 0, 0, str(error), active=False)
+            emit(_LOG, logging.WARNING, "record.refused", f"no recording: {error}")
+            return
+        self.state = RecordState(str(self._file.current), 0, 0, 0, None)
+        self.written.append(self._file.path)
+        if requested:
+            emit(_LOG, logging.INFO, "record.began", f"recording to {self._file.path}")
+
+    def _write(self, batch: list[can.Message]) -> None:
+        file, state = self._file, self.state
+        if file is None or state is None:
+            return
+        missed, self._lost_frames = self._lost_frames, 0
+        problem = None
+        try:
+            file.write(batch)
+        except OSError as error:
+            problem = error.strerror or str(error)
+            missed += len(batch)
+        lost = state.lost_frames + missed
+        self.state = RecordState(
+            str(file.current), state.frames + len(batch), lost, file.written_bytes, problem
+        )
+        if problem is not None:
+            text = f"recording: {problem}; the estimate continues, writing is retried"
+            self._say(logging.ERROR, "record.failed", text, lost)
+        elif state.problem is not None:
+            text = f"recording resumed; {lost} frames were lost"
+            self._say(logging.WARNING, "record.resumed", text, lost)
+        if file.ends and (full := _full(file.path, file.written_bytes)):
+            emit(_LOG, logging.WARNING, "record.full", f"{file.path}: {full}")
+            self._is_active = False
+            self._end(full)
+
+    def _end(self, problem: str | None = None) -> None:
+        if self._file is None or self.state is None:
+            return
+        file, self._file = self._file, None
+        self.state = replace(self.state, active=False, problem=problem or self.state.problem)
+        file.close()
+        if file.ends:
+            emit(_LOG, logging.INFO, "record.ended", f"recorded: {file.path}")
+
+    @staticmethod
+    def _failed(error: Exception) -> None:
+        emit(_LOG, logging.ERROR, "record.failed", f"recording: {error}", limit="record.state")
+
+    @staticmethod
+    def _say(level: int, event: str, text: str, lost_frames: int) -> None:
+        emit(_LOG, level, event, text, limit="record.state", lost_frames=lost_frames)
+
+
+class _File:
+    """The file or the parts of one recording, written batch by batch."""
+
+    def __init__(
+        self, base: Path, limits: RecordLimits, clock: Callable[[], float], *, ends: bool
+    ) -> None:
+        exists = base.is_file() and base.stat().st_size > 0
+        self._base = base
+        self._limits = limits
+        self._clock = clock
+        self._is_packed = base.suffix.lower() == ".gz"
+        self._in_parts = limits.in_parts or exists
+        self._run = max((each.run for each in all_parts(base)), default=0) + 1
+        self._part = 0
+        self.ends = ends
+        """Whether it ends by itself, at a size or where the disk is full."""
+        self.path = run_path(base, self._run) if self._in_parts else base
+        self.written_bytes = 0
+        self._synced_s = clock()
+        self._descriptor = -1
+        self._next_part()
+
+    def write(self, batch: list[can.Message]) -> None:
+        """Append frames as whole lines, or nothing of them; may raise OSError."""
+        if self._is_over():
+            self._next_part()
+        if self._clock() - self._synced_s >= SYNC_EVERY_S:
+            self._synced_s = self._clock()
+            self._sync()
+        for message in batch:
+            self._writer.on_message_received(message)
+        self._append()
+
+    def close(self) -> None:
+        """Close the file; may raise OSError."""
+        if self._descriptor >= 0:
+            descriptor, self._descriptor = self._descriptor, -1
+            os.close(descriptor)
+
+    def _is_over(self) -> bool:
+        limits = self._limits
+        return (limits.part_bytes is not None and self._bytes >= limits.part_bytes) or (
+            limits.part_s is not None and self._clock() - self._began_s >= limits.part_s
+        )
+
+    def _next_part(self) -> None:
+        self._remove_oldest()
+        self._part += 1
+        self.current = self._base
+        if self._in_parts:
+            self.current = part_path(self._base, self._run, self._part)
+        self.close()
+        flags = os.O_WRONLY | os.O_CREAT | os.O_CLOEXEC | (os.O_EXCL if self._in_parts else 0)
+        self._descriptor = os.open(self.current, flags, FOR_GROUP)
+        self._bytes, self._began_s = 0, self._clock()
+        self._text = io.StringIO(newline="")
+        kind = self.current.with_suffix("") if self._is_packed else self.current
+        self._writer = FORMATS[kind.suffix.lower()](self._text)
+        if isinstance(self._writer, can.CanutilsLogWriter):
+            # Otherwise it raises stamps below the first one, and hides a clock that was set back.
+            self._writer.last_timestamp = 0.0
+        self._append()
+
+    def _append(self) -> None:
+        data = self._text.getvalue().encode()
+        self._text.seek(0)
+        self._text.truncate()
+        if self._is_packed and data:
+            data = gzip.compress(data, 6)  # members of one file: gzip reads them as one
+        left = memoryview(data)
+        try:
+            while left:
+                left = left[os.write(self._descriptor, left) :]
+        except OSError:
+            with suppress(OSError):  # a device has no length
+                os.ftruncate(self._descriptor, self._bytes)
+                os.lseek(self._descriptor, self._bytes, os.SEEK_SET)
+            raise
+        self._bytes += len(data)
+        self.written_bytes += len(data)
+
+    def _sync(self) -> None:
+        os.fsync(self._descriptor)
+
+    def _remove_oldest(self) -> None:
+        if self._limits.keep_bytes is None:
+            return
+        parts = [(each.path, each.path.stat().st_size) for each in all_parts(self._base)]
+        total = sum(size for _, size in parts)
+        for path, size in parts:
+            if total <= self._limits.keep_bytes:
+                return
+            path.unlink(missing_ok=True)
+            total -= size
+            emit(_LOG, logging.INFO, "record.removed", f"removed the oldest part: {path}")
+
+
+def _check_path(path: Path) -> None:
+    """Raise InputError for an unknown format, or a folder that cannot be written."""
+    suffixes = [suffix.lower() for suffix in path.suffixes]
+    kind = "".join(suffixes[-2:] if suffixes[-1:] == [".gz"] else suffixes[-1:])
+    if kind.removesuffix(".gz") not in FORMATS:
+        raise InputError(
+            "this format is unknown, or does not keep time stamps to the microsecond",
+            source=path,
+            field="--record",
+            value=kind,
+            cure="name a .log (candump) or .csv file, or either with .gz; `python -m"
+            " can.logconvert` turns it into others",
+        )
+    try:
+        check_writable(path)
+    except InputError as error:
+        cause = error.__cause__  # a full disk is retried while the service runs
+        if not (isinstance(cause, OSError) and cause.errno in FULL):
+            raise
+
+
+def _full(path: Path, written_bytes: int) -> str | None:
+    """Return the reason to end a recording that a viewer began: size or free space; else None."""
+    if written_bytes >= REQUESTED_BYTES:
+        return f"ended at {REQUESTED_BYTES / 1e9:.1f} GB; record_keep_mb sets another limit"
+    try:
+        free_bytes = shutil.disk_usage(path.parent).free
+    except OSError:  # reported by the recording itself
+        return None
+    if free_bytes < FREE_BYTES:
+        return f"less than {FREE_BYTES / 1e9:.1f} GB free on its disk; free some space"
+    return None

@@ -1,0 +1,179 @@
+"""A configuration with its model and vehicle, read at the start and at reloads."""
+
+from __future__ import annotations
+
+import hashlib
+import queue
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Self
+
+from cangauge.bus.mapping import Overrides
+from cangauge.bus.open import BusAddress, bus_address, is_interface_name
+from cangauge.bus.publish import FrameIds
+from cangauge.bus.vehicle import Vehicle
+from cangauge.errors import CangaugeError, InputError
+from cangauge.estimation.power import PackLimits
+from cangauge.estimation.settings import EstimatorSettings, FullCharge, LongRest
+from cangauge.model.model_file import Model
+from cangauge.service.config import DEFAULT_VEHICLE, RunConfig
+from cangauge.service.pipeline import PipelineSettings
+
+ReadConfig = Callable[[], RunConfig]
+
+
+@dataclass(frozen=True)
+class Setup:
+    """A configuration with the files that it names.
+
+    Parameters
+    ----------
+    config : RunConfig
+    vehicle : Vehicle
+    model : Model
+    settings : PipelineSettings
+    vehicle_key : tuple
+        Identity of the vehicle: its options, and the content of its files.
+    """
+
+    config: RunConfig
+    vehicle: Vehicle
+    model: Model
+    settings: PipelineSettings
+    vehicle_key: tuple[object, ...]
+
+    @classmethod
+    def of(cls, config: RunConfig) -> Self:
+        """Read the model and the vehicle of a configuration.
+
+        Raises
+        ------
+        InputError
+            If something is invalid.
+        """
+        vehicle, model = load_vehicle(config), Model.load(config.model)
+        _check_poll(config, vehicle)
+        files = [*vehicle.dbc_files, *filter(None, [config.map])]
+        try:
+            contents = [hashlib.sha256(Path(file).read_bytes()).hexdigest() for file in files]
+        except OSError as error:  # it disappeared meanwhile
+            raise InputError(f"cannot be read: {error}", cure="try again") from error
+        named = (config.vehicle, config.temperature, config.pair_within_s)
+        chosen = (*named, config.messages, config.rules, config.checks)
+        return cls(config, vehicle, model, pipeline_settings(config), (*chosen, *contents))
+
+
+def load_vehicle(config: RunConfig) -> Vehicle:
+    """Return the vehicle of a configuration; may raise InputError."""
+    preset = config.vehicle
+    if preset is None and config.dbc is None and config.map is None:
+        preset = DEFAULT_VEHICLE
+    return Vehicle.load(
+        preset,
+        config.dbc,
+        config.map,
+        temperature_c=config.temperature,
+        pair_within_s=config.pair_within_s,
+        overrides=Overrides(config.file, config.messages, config.rules, dict(config.checks)),
+    )
+
+
+def pipeline_settings(config: RunConfig) -> PipelineSettings:
+    """Return the settings of the estimator and its frames; may raise InputError."""
+    full, rest = config.full_charge, config.long_rest
+    return PipelineSettings(
+        estimator=EstimatorSettings(
+            method=config.method,
+            initial_soc_pct=config.initial_soc,
+            initial_soc_std_pct=config.initial_soc_std,
+            valid_std_pct=config.valid_std,
+            capacity_ah=config.capacity_ah,
+            gap_s=config.max_gap_s,
+            temperature_source=config.temperature_source or "unknown",
+            full_charge=None if full is None else FullCharge(**full.model_dump()),
+            long_rest=None if rest is None else LongRest(**rest.model_dump()),
+            limits=PackLimits(**config.limits.model_dump()),
+        ),
+        time_source=config.time_source,
+        ids=FrameIds(**config.ids.model_dump()),
+    )
+
+
+def address_of(config: RunConfig) -> BusAddress:
+    """Return the bus address of a configuration; may raise InputError."""
+    interface = config.interface
+    if interface is None and config.wait_for_bus and is_interface_name(config.channel):
+        interface = "socketcan"  # cannot be detected while the interface is missing
+    return bus_address(interface, config.channel, config.bus_options)
+
+
+def _check_poll(config: RunConfig, vehicle: Vehicle) -> None:
+    """Raise InputError if `[poll]` is given where nothing can be asked for."""
+    if config.poll is None:
+        return
+    problem = cure = ""
+    if not vehicle.poll_targets:
+        problem = f"no reply of the vehicle {vehicle.name} can be asked for"
+        cure = (
+            "use the preset leaf_ze1_polled for a Leaf of 40 or 62 kWh, or state isotp = true"
+            " and request_id for a message of the map file; or remove [poll]"
+        )
+    elif config.time_source == "replay-clock":
+        problem, cure = "a replay has no battery that answers", "remove [poll], or time_source"
+    elif config.bus_options.get("listen_only"):
+        problem = "a bus that only listens sends no requests"
+        cure = "remove listen_only from [bus_options], or [poll]"
+    if problem:
+        raise InputError(problem, source=config.file, field="poll", cure=cure)
+
+
+class Reloader:
+    """Read the configuration in a thread, once for each request, while the old one is in use.
+
+    The thread waits from the start on: a request starts none, which could fail.
+
+    Parameters
+    ----------
+    read : callable
+        Returns the configuration.
+    """
+
+    def __init__(self, read: ReadConfig) -> None:
+        self._read = read
+        self._requests: queue.SimpleQueue[bool] = queue.SimpleQueue()
+        self._results: queue.SimpleQueue[Setup | CangaugeError] = queue.SimpleQueue()
+        self._pending = 0
+        threading.Thread(target=self._run, name="cangauge-reload", daemon=True).start()
+
+    @property
+    def is_reading(self) -> bool:
+        """Whether a result is still to come."""
+        return self._pending > 0
+
+    def request(self) -> None:
+        """Begin to read; once more at its end if it is under way, as files may have changed."""
+        if self._pending < 2:
+            self._pending += 1
+            self._requests.put(True)
+
+    def poll(self) -> Setup | CangaugeError | None:
+        """Return what was read, or why it is refused, once; None while there is nothing new."""
+        if self._results.empty():
+            return None
+        self._pending -= 1
+        return self._results.get()
+
+    def close(self) -> None:
+        """End the thread once it has nothing to read."""
+        self._requests.put(False)
+
+    def _run(self) -> None:
+        while self._requests.get():
+            try:
+                self._results.put(Setup.of(self._read()))
+            except CangaugeError as error:
+                self._results.put(error)
+            except Exception as error:  # noqa: BLE001 - of any library that reads a file
+                self._results.put(InputError(f"cannot be read: {error!r}", cure="check the files"))

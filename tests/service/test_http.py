@@ -1,0 +1,221 @@
+"""HTTP: pages, access, and limits of clients."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import socket
+import sys
+import threading
+import time
+import urllib.error
+import urllib.request
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from prometheus_client.parser import text_string_to_metric_families
+from watched import Watched
+
+from cangauge.errors import CangaugeError, InputError
+from cangauge.extras.live.http import MAX_CLIENTS, HttpServer
+from cangauge.model.published import CAPACITY_AH
+from cangauge.service.addresses import http_address, read_token
+from cangauge.service.status_client import fetch_status
+from live import in_process
+
+TOKEN = "a-token-of-some-length"  # noqa: S105 - made up
+
+
+@pytest.fixture(scope="module")
+def watched() -> Watched:
+    found = Watched()
+    found.now_s = time.monotonic()
+    found.drive(90.0)
+    found.turn(0.5)
+    return found
+
+
+@pytest.fixture
+def http(watched: Watched) -> Iterator[HttpServer]:
+    with contextlib.closing(HttpServer(http_address("127.0.0.1:0", None, {}))) as server:
+        server.on_snapshot(watched.monitor.latest)
+        yield server
+
+
+def get(port: int, path: str, **headers: str) -> tuple[int, bytes, Any]:
+    request = urllib.request.Request(f"http://127.0.0.1:{port}{path}", headers=headers)
+    try:
+        with urllib.request.urlopen(request, timeout=60.0) as answer:  # noqa: S310
+            return answer.status, answer.read(), answer.headers
+    except urllib.error.HTTPError as error:
+        return error.code, error.read(), error.headers
+
+
+def test_status_and_health(http: HttpServer, watched: Watched) -> None:
+    watched.monitor.latest = type(watched.monitor.latest)(
+        time.monotonic(), watched.monitor.latest.status
+    )
+    http.on_snapshot(watched.monitor.latest)
+    code, body, headers = get(http.port, "/status")
+    assert (code, headers["Content-Type"]) == (200, "application/json")
+    assert json.loads(body)["samples"] == 900
+    code, body, _ = get(http.port, "/healthz")
+    assert (code, json.loads(body)["ok"]) == (200, True)
+    for path in ("/", "/../etc/passwd"):
+        assert get(http.port, path)[0] == 404
+    assert in_process("status", "--endpoint", f"http://127.0.0.1:{http.port}", "--json").code == 0
+
+
+def test_a_loop_that_does_not_turn_is_not_healthy(http: HttpServer, watched: Watched) -> None:
+    latest = watched.monitor.latest
+    http.on_snapshot(type(latest)(time.monotonic() - 60.0, latest.status))
+    code, body, _ = get(http.port, "/healthz")
+    assert (code, json.loads(body)) == (503, {"ok": False, "status": "invalid"})
+    http.latest = None
+    assert get(http.port, "/status")[0] == 503
+
+
+def test_metrics_are_what_prometheus_reads(http: HttpServer) -> None:
+    code, body, headers = get(http.port, "/metrics")
+    assert code == 200
+    assert "text/plain" in headers["Content-Type"]
+    families = {each.name: each for each in text_string_to_metric_families(body.decode())}
+    value = {
+        (sample.name, *sample.labels.values()): sample.value
+        for family in families.values()
+        for sample in family.samples
+    }
+    assert value["cangauge_samples_total",] == 900
+    assert value["cangauge_status", "valid"] + value["cangauge_status", "invalid"] == 1
+    assert 70 < value["cangauge_soc_percent",] < 85
+    assert value["cangauge_capacity_ah",] == pytest.approx(CAPACITY_AH, rel=0.2)
+    assert 0 < value["cangauge_discharge_amperes",] <= 200
+    assert not any(name[0].startswith("cangauge_weakest") for name in value)
+    assert value["cangauge_rejects_total", "crc_errors"] == 0
+    assert value["cangauge_bus_queue_drops_total",] == 4
+    assert value["cangauge_bus_up",] == 1
+    assert value["cangauge_loop_age_seconds",] >= 0.0
+    assert value["cangauge_step_seconds_bucket", "+Inf"] == value["cangauge_step_seconds_count",]
+    assert value["cangauge_step_seconds_sum",] == pytest.approx(900 * 30e-6)
+    assert families["cangauge_latency_seconds"].type == "histogram"
+    open_metrics = get(http.port, "/metrics", Accept="application/openmetrics-text; version=1.0.0")
+    assert open_metrics[1].endswith(b"# EOF\n")
+
+
+def test_without_prometheus_client_the_page_says_so(
+    http: HttpServer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "prometheus_client", None)
+    monkeypatch.delitem(sys.modules, "cangauge.extras.live.metrics", raising=False)
+    code, body, _ = get(http.port, "/metrics")
+    assert code == 404
+    assert b"cangauge[metrics]" in body
+    assert get(http.port, "/status")[0] == 200
+
+
+def test_a_token_is_required_where_there_is_one(watched: Watched) -> None:
+    address = http_address("127.0.0.1:0", None, {"CANGAUGE_HTTP_TOKEN": TOKEN})
+    assert TOKEN not in repr(address)
+    with contextlib.closing(HttpServer(address)) as server:
+        server.on_snapshot(watched.monitor.latest)
+        for path in ("/status", "/healthz", "/metrics", "/nothing"):
+            code, body, headers = get(server.port, path)
+            assert (code, headers["WWW-Authenticate"]) == (401, "Bearer")
+            assert b"soc" not in body
+            for wrong in (TOKEN, f"Bearer {TOKEN}x", f"Basic {TOKEN}", "Bearer", "Bearer é"):
+                assert get(server.port, path, Authorization=wrong)[0] == 401, wrong
+        assert get(server.port, "/status", Authorization=f"Bearer {TOKEN}")[0] == 200
+
+
+def test_without_a_token_only_loopback_names_are_answered(http: HttpServer) -> None:
+    assert get(http.port, "/status", Host="evil.example")[0] == 403
+    assert get(http.port, "/status", Host="localhost:1")[0] == 200
+
+
+@pytest.mark.parametrize(
+    ("text", "say"),
+    [
+        ("0.0.0.0:9464", "reachable from the network"),
+        ("[::]:9464", "reachable from the network"),
+        ("192.168.1.7:9464", "http_token_file"),
+        ("example.org:9464", "HOST:PORT"),
+        ("127.0.0.1", "HOST:PORT"),
+        ("127.0.0.1:99999", "HOST:PORT"),
+        (":9464", "HOST:PORT"),
+    ],
+)
+def test_addresses_that_are_refused(text: str, say: str) -> None:
+    with pytest.raises(InputError, match=say) as caught:
+        http_address(text, None, {})
+    assert caught.value.field == "http"
+
+
+def test_addresses_and_tokens(tmp_path: Path, http: HttpServer) -> None:
+    assert str(http_address("9464", None, {})) == "127.0.0.1:9464"
+    assert str(http_address("[::1]:9464", None, {})) == "[::1]:9464"
+    path = tmp_path / "token"
+    path.write_text(TOKEN + "\n")
+    assert http_address("0.0.0.0:9464", path, {}).token == TOKEN
+    for content in ("", "short", "two words of a token", "x" * 2000, "ü" * 30):
+        path.write_text(content)
+        with pytest.raises(InputError, match="token") as caught:
+            read_token(path, {})
+        assert not content or content not in str(caught.value)
+    with pytest.raises(InputError, match="cannot listen"):
+        HttpServer(http_address(f"127.0.0.1:{http.port}", None, {}))
+
+
+@pytest.mark.parametrize(
+    "first", ["", "GET /healthz HTTP/1.1\r\nX: ", "POST / HTTP/1.1\r\nContent-Length: 9\r\n\r\n"]
+)
+def test_slow_clients_leave_a_place_for_a_probe(http: HttpServer, first: str) -> None:
+    slow = [socket.create_connection(("127.0.0.1", http.port)) for _ in range(2 * MAX_CLIENTS)]
+    for each in slow:
+        with contextlib.suppress(OSError):  # thrown out already
+            each.sendall(first.encode())
+    for _ in range(5):
+        assert get(http.port, "/healthz")[0] in {200, 503}
+    # The slow ones are thrown out after a few seconds.
+    for each in slow:
+        each.settimeout(60.0)
+        with contextlib.suppress(ConnectionResetError):
+            while each.recv(4096):
+                pass
+        each.close()
+
+
+def test_a_header_without_end_is_cut_off(http: HttpServer) -> None:
+    greedy = socket.create_connection(("127.0.0.1", http.port), 60.0)
+    with greedy, contextlib.suppress(OSError):
+        greedy.sendall(b"GET /status HTTP/1.1\r\nX: " + b"y" * 100_000)
+        assert b"200" not in greedy.recv(4096)
+    assert get(http.port, "/healthz")[0] in {200, 503}
+
+
+@pytest.mark.parametrize(
+    "answer",
+    [
+        b"",
+        b"nonsense\r\n\r\n",
+        b"HTTP/1.1 200 OK\r\n\r\n[[[",
+        b'HTTP/1.1 200 OK\r\n\r\n{"schema": 99}',
+        b"HTTP/1.1 200 OK\r\nContent-Length: 99999999999\r\n\r\n{}",
+        b"HTTP/1.1 500 No\r\n\r\noops",
+    ],
+)
+def test_answers_of_another_server(answer: bytes) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as server:
+
+        def serve() -> None:
+            peer, _ = server.accept()
+            with peer:
+                peer.recv(4096)
+                peer.sendall(answer)
+
+        thread = threading.Thread(target=serve)
+        thread.start()
+        with pytest.raises(CangaugeError):
+            fetch_status(f"http://127.0.0.1:{server.getsockname()[1]}")
+        thread.join()

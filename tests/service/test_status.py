@@ -1,0 +1,330 @@
+"""Status: the object of `/status`, signs of life, the unix socket, and its commands."""
+
+from __future__ import annotations
+
+import json
+import logging
+import os
+import socket
+import stat
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from watched import StandInPort, Watched
+
+from cangauge.errors import CangaugeError, InputError
+from cangauge.estimation.cells import CellReport
+from cangauge.service.lifecycle import Notifier
+from cangauge.service.status import BOUNDS_S, Histogram
+from cangauge.service.status_client import (
+    NotRunningError,
+    StatusSocket,
+    fetch_status,
+    find_socket,
+    socket_path,
+)
+from live import Command, in_process, waits
+
+KEYS = {
+    "": "schema running version bus vehicle model method time_source core uptime_s loop_stuck"
+    " loop_age_s status reasons estimate sample health power cells notices samples samples_per_s"
+    " frames rejects bus_up bus_counts bus_trouble polls config latency step record",
+    "estimate": "time_s soc_pct soc_std_pct soc_newton_pct soc_coulomb_pct voltage_model_v"
+    " residual_v",
+    "sample": "age_s current_a voltage_v temperature_c",
+    "frames": "received wanted used lost",
+    "config": "reloading problem",
+    "latency": "count mean_s p50_at_most_s p99_at_most_s total_s buckets",
+    "power": "discharge_a discharge_std_a charge_a charge_std_a energy_wh energy_std_wh",
+}
+
+
+@pytest.fixture
+def watched() -> Watched:
+    found = Watched()
+    found.now_s = time.monotonic()
+    found.drive(90.0)
+    found.turn(0.5)
+    return found
+
+
+def test_the_keys_of_a_status(watched: Watched) -> None:
+    status = json.loads(json.dumps(watched.status, allow_nan=False))
+    for name, keys in KEYS.items():
+        assert set(status[name] if name else status) == set(keys.split()), name
+    assert status["samples"] == 900
+    assert status["status"] == "valid"
+    assert status["estimate"]["soc_pct"] == watched.pipeline.latest.soc_pct
+    frames = watched.pipeline.counts.frames
+    assert status["frames"] == {"received": frames, "wanted": frames, "used": frames, "lost": 0}
+    assert status["bus_counts"] == {"garbled": 1, "error_frames": 2, "unsent": 3, "queue_drops": 4}
+    assert status["step"]["count"] == 900
+
+
+def test_a_status_before_the_first_frame() -> None:
+    status = Watched().status
+    json.dumps(status, allow_nan=False)
+    assert status["status"] == "initialising"
+    assert status["sample"] is status["health"] is status["cells"] is None
+    assert status["latency"]["p99_at_most_s"] is None
+
+
+def test_a_snapshot_grows_old_and_stale(watched: Watched) -> None:
+    snapshot, now_s = watched.monitor.latest, watched.now_s
+    before = json.dumps(snapshot.status)
+    assert snapshot.at(now_s + 1.9)["status"] == "valid"
+    assert snapshot.at(now_s + 1.5)["sample"]["age_s"] == pytest.approx(2.0)
+    old = snapshot.at(now_s + 2.1)
+    assert (old["status"], old["loop_stuck"]) == ("invalid", True)
+    assert "input_stale" in old["reasons"]
+    watched.drive(10.0)
+    watched.turn()
+    assert json.dumps(snapshot.status) == before  # it never changes
+    watched.pipeline.heartbeat(is_stale=True)
+    watched.turn()
+    assert watched.status["status"] == "invalid"
+
+
+def test_refused_frames_are_counted_by_reason(watched: Watched) -> None:
+    messages = watched.pipeline.decoder.statistics.messages.values()
+    for counters in messages:
+        counters.crc_errors += 2
+        counters.not_available += 1
+    watched.turn()
+    assert watched.status["rejects"]["crc_errors"] == 2 * len(messages)
+    frames = watched.status["frames"]
+    # A value that is not available refuses no frame.
+    assert frames["wanted"] - frames["used"] == 2 * len(messages)
+
+
+def test_a_wrong_sum_of_cells_is_logged_once(
+    watched: Watched, caplog: pytest.LogCaptureFixture
+) -> None:
+    cells = CellReport(96, 3, 50.0, 1.0, 2.0, -2.5, 0.1, is_sum_wrong=True)
+    report = watched.pipeline.report()._replace(cells=cells)
+    watched.pipeline.report = lambda: report  # type: ignore[method-assign] # a wrong sensor
+    with caplog.at_level(logging.WARNING, logger="cangauge"):
+        for _ in range(4):
+            watched.turn(1.0)
+    assert len([each for each in caplog.records if "-2.50 V" in each.getMessage()]) == 1
+    assert "-2.50 V" in watched.status["notices"][0]
+    assert watched.status["cells"]["weakest"] == 3
+
+
+def test_latency_is_that_of_the_latest_sample_once_it_is_sent() -> None:
+    watched = Watched()
+    watched.monitor.sent()  # no sample yet
+    watched.monitor.stepped(time.time() - 0.5, 1e-6, watched.now_s)
+    watched.monitor.stepped(time.time() - 0.0015, 1e-6, watched.now_s)
+    watched.monitor.sent()
+    watched.monitor.sent()  # counted already
+    for stamp_s in (time.time() + 5.0, 12.0):  # the clock was set; stamps of another clock
+        watched.monitor.stepped(stamp_s, 1e-6, watched.now_s)
+        watched.monitor.sent()
+    watched.turn()
+    latency = watched.status["latency"]
+    assert latency["count"] == 1
+    assert latency["total_s"] >= 0.0015
+
+
+def test_a_histogram_counts_every_value_once() -> None:
+    histogram = Histogram()
+    assert histogram.to_dict()["p50_at_most_s"] is None
+    values = [*BOUNDS_S, 1e-7, 3e-5, 7.0]
+    for value in values:
+        histogram.add(value)
+    found = histogram.to_dict()
+    assert found["count"] == sum(found["buckets"]) == len(values)
+    assert found["total_s"] == pytest.approx(sum(values))
+    assert (found["buckets"][0], found["buckets"][-1]) == (2, 1)  # a bound is in its bucket
+    assert found["p50_at_most_s"] == 1e-3  # the tenth of twenty
+    assert found["p99_at_most_s"] is None
+
+
+def test_watchdog_pings_come_with_turns_only() -> None:
+    class Counting(Notifier):
+        pings = 0
+
+        def ping(self) -> None:
+            self.pings += 1
+
+    notifier = Counting(None, 2.0)
+    watched = Watched(notifier=notifier)
+    for _ in range(100):
+        watched.turn(0.1)
+    assert 19 <= notifier.pings <= 50
+    before = notifier.pings
+    watched.now_s += 60.0
+    assert notifier.pings == before
+
+
+def test_status_changes_are_logged(caplog: pytest.LogCaptureFixture, watched: Watched) -> None:
+    caplog.set_level(logging.INFO, "cangauge")
+    for is_stale in (True, True, False):
+        watched.pipeline.heartbeat(is_stale=is_stale)
+        watched.turn(0.3)
+    changes = [each for each in caplog.records if getattr(each, "event", "") == "status.changed"]
+    fields = [each.fields for each in changes]  # type: ignore[attr-defined] # extra of `emit`
+    assert [(each["before"], each["status"]) for each in fields] == [
+        ("valid", "invalid"),
+        ("invalid", "valid"),
+    ]
+    assert changes[0].levelno == logging.WARNING
+
+
+def test_a_bus_that_is_off_is_shown() -> None:
+    status = Watched(port=StandInPort(is_off=True, queue_drops=None)).status
+    assert not status["bus_up"]
+    assert "queue_drops" not in status["bus_counts"]
+
+
+# --- The unix socket and the command
+
+
+@pytest.fixture
+def served(watched: Watched, tmp_path: Path) -> Iterator[Path]:
+    path = tmp_path / "status.sock"
+    server = StatusSocket(path, lambda: watched.status)
+    yield path
+    server.close()
+
+
+def test_the_socket_and_the_command(watched: Watched, served: Path) -> None:
+    assert stat.S_IMODE(served.stat().st_mode) == 0o660
+    assert fetch_status(str(served))["samples"] == 900
+    ended = in_process("status", "--endpoint", served, "--json")
+    assert (ended.code, ended.json["status"]) == (0, "valid")
+    ended = in_process("status", "--endpoint", served)
+    assert ended.code == 0
+    assert "± " in ended.out
+    watched.pipeline.heartbeat(is_stale=True)
+    watched.turn()
+    ended = in_process("status", "--endpoint", served, "--json")
+    assert (ended.code, ended.json["reasons"]) == (1, ["input_stale"])
+
+
+def test_watch_shows_the_status_and_a_silence(watched: Watched, tmp_path: Path) -> None:
+    path = tmp_path / "status.sock"
+    command = Command("status", "--watch", "--endpoint", path)
+    assert command.process.stdout is not None
+    lines = iter(command.process.stdout.readline, "")
+    assert any("NO ANSWER" in line for line in lines)
+    server = StatusSocket(path, lambda: watched.status)
+    assert any("valid" in line for line in lines)
+    server.close()
+    assert any("NO ANSWER" in line for line in lines)
+    command.process.terminate()
+    command.process.communicate(timeout=30.0)
+
+
+def test_no_service_is_one_line_and_exit_1(tmp_path: Path) -> None:
+    ended = in_process("status", "--endpoint", tmp_path / "no.sock", "--json")
+    assert (ended.code, ended.json["running"]) == (1, False)
+    ended = in_process("status", "--endpoint", tmp_path / "no.sock")
+    assert (ended.code, ended.out, len(ended.err.splitlines())) == (1, "", 1)
+    assert in_process("status", "--endpoint", "http://[::1").code == 2
+
+
+def test_a_socket_left_behind_is_replaced_and_a_file_is_not(
+    watched: Watched, tmp_path: Path, served: Path
+) -> None:
+    with pytest.raises(InputError, match="another service"):
+        StatusSocket(served, lambda: watched.status)
+    left = tmp_path / "left.sock"
+    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as dead:
+        dead.bind(str(left))
+    StatusSocket(left, lambda: watched.status).close()
+    assert not left.exists()
+    left.write_text("precious")
+    with pytest.raises(InputError, match="cannot be created"):
+        StatusSocket(left, lambda: watched.status)
+    assert left.read_text() == "precious"
+    with pytest.raises(InputError, match="cannot be created"):
+        StatusSocket(tmp_path / ("long" * 50), lambda: watched.status)
+
+
+def test_services_are_found_in_the_runtime_folder(
+    watched: Watched, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delenv("RUNTIME_DIRECTORY", raising=False)
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    path = socket_path("socketcan can0")
+    assert path == tmp_path / "cangauge" / "socketcan-can0.sock"
+    first = StatusSocket(path, lambda: watched.status)
+    assert find_socket() == path
+    assert stat.S_IMODE(path.parent.stat().st_mode) == 0o700
+    second = StatusSocket(socket_path("socketcan can1"), lambda: watched.status)
+    with pytest.raises(InputError, match="several services are running"):
+        find_socket()
+    first.close()
+    second.close()
+    with pytest.raises(NotRunningError):
+        find_socket()
+
+
+def test_a_client_that_does_not_read_holds_nobody(served: Path) -> None:
+    silent = [socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) for _ in range(3)]
+    for each in silent:
+        each.connect(str(served))
+    assert fetch_status(str(served))["samples"] == 900
+    for each in silent:
+        each.close()
+
+
+@pytest.mark.parametrize("answer", [b"", b"nonsense", b'{"schema": 99}', b"[" * 100_000])
+def test_an_answer_that_is_no_status(tmp_path: Path, answer: bytes) -> None:
+    path = tmp_path / "x.sock"
+    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as server:
+        server.bind(str(path))
+        server.listen()
+
+        def serve() -> None:
+            peer, _ = server.accept()
+            with peer:
+                peer.sendall(answer)
+
+        thread = threading.Thread(target=serve)
+        thread.start()
+        with pytest.raises(CangaugeError, match="not a status"):
+            fetch_status(str(path))
+        thread.join()
+
+
+def test_a_status_of_another_shape_is_one_line(tmp_path: Path) -> None:
+    answer: dict[str, Any] = {"schema": 1, "estimate": [], "status": "valid"}
+    server = StatusSocket(tmp_path / "x.sock", lambda: answer)
+    ended = in_process("status", "--endpoint", tmp_path / "x.sock")
+    server.close()
+    assert (ended.code, ended.out) == (1, "")
+    assert "not a status of this release" in ended.err
+
+
+def test_a_socket_survives_a_lack_of_descriptors(
+    served: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    real, failures = socket.socket.accept, []
+
+    def accept(self: socket.socket) -> Any:
+        found = real(self)
+        if not failures:
+            failures.append(1)
+            raise OSError(24, os.strerror(24))
+        return found
+
+    monkeypatch.setattr(socket.socket, "accept", accept)
+    fetch = fetch_status
+    first = []
+
+    def ask() -> bool:
+        try:
+            first.append(fetch(str(served))["samples"])
+        except CangaugeError:
+            return False
+        return True
+
+    assert waits(ask, 30.0)
+    assert first == [900]
