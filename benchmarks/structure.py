@@ -36,7 +36,7 @@ LAYERS = (
         "_logging",
         "_text",
         "_resources",
-        "_display",
+        "_dataframes",
     ),
     ("logs",),
     ("model",),

@@ -9,7 +9,8 @@ from typing import Any, Literal, Self
 import numpy as np
 from numpy.typing import ArrayLike
 
-from cangauge._display import ArrowExport, figure
+from cangauge._dataframes import ArrowExport
+from cangauge._extras import extra
 from cangauge._text import duration
 from cangauge._typing import BoolArray, FloatArray, IntArray
 from cangauge.errors import InputError
@@ -221,7 +222,7 @@ class Log(ArrowExport):
 
     def plot(self) -> Any:
         """Return current, voltage, temperature and SoC over time, for `bokeh.plotting.show`."""
-        return figure("log_figure", self)
+        return extra("report.figures:log_figure")(self)
 
     def __len__(self) -> int:
         """Return the number of rows."""

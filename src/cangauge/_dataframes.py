@@ -1,26 +1,12 @@
-"""Results as data frames, and as figures and HTML in a notebook.
-
-Optional packages, bokeh and `cangauge.extras.report` are imported by name and on use.
-"""
+"""Export of tables to pandas, polars and any library that reads the Arrow C interface."""
 
 from __future__ import annotations
 
+import importlib
 from abc import abstractmethod
-from importlib import import_module
 from typing import Any
 
 from cangauge.errors import InputError
-
-
-def figure(function: str, result: object, **options: Any) -> Any:
-    """Return the bokeh figure that a function of `report.figures` draws of a result."""
-    return getattr(import_module("cangauge.extras.report.figures"), function)(result, **options)
-
-
-def html(function: str, result: object) -> str:
-    """Return the HTML that a function of `report.summary` makes of a result."""
-    text: str = getattr(import_module("cangauge.extras.report.summary"), function)(result)
-    return text
 
 
 class ArrowExport:
@@ -63,7 +49,7 @@ class ArrowExport:
 
 def _import(package: str) -> Any:
     try:
-        return import_module(package)
+        return importlib.import_module(package)
     except ImportError as error:
         raise InputError(
             f"{package} is not installed", cure=f"install it: pip install {package}"
