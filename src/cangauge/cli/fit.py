@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import typer
 
 from cangauge._extras import extra
-from cangauge._formatting import number, significant, span
-from cangauge._io import write_texts_atomic
+from cangauge._files import write_texts_atomic
+from cangauge._text import number, significant, span
 from cangauge.cli.options import (
     JsonOption,
     Reading,

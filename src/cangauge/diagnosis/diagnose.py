@@ -15,7 +15,7 @@ import numpy as np
 from threadpoolctl import ThreadpoolController
 
 from cangauge._extras import extra
-from cangauge._io import file_sha256
+from cangauge._files import file_sha256
 from cangauge.diagnosis import sentences
 from cangauge.diagnosis.answer import ALARM, GROUP_OF, UNKNOWN, Posterior, answer
 from cangauge.diagnosis.checks import check_logs
@@ -332,6 +332,8 @@ class Diagnosis:
 
     def _repr_html_(self) -> str:
         """Return the answer for a notebook."""
+        from cangauge.diagnosis.summary import diagnosis_html  # noqa: PLC0415 - needs this module
+
         return diagnosis_html(self)
 
     def to_json(

@@ -14,8 +14,8 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from cangauge._extras import extra
-from cangauge._formatting import counted, duration, significant
-from cangauge._io import text_sha256
+from cangauge._files import text_sha256
+from cangauge._text import counted, duration, significant
 from cangauge._typing import FloatArray
 from cangauge._version import __version__
 from cangauge.errors import InputError
