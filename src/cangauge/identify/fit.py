@@ -291,7 +291,11 @@ def fit(
             cure="check the sign of current: positive must discharge",
         )  # fmt: skip
     ids = _effect_ids(effects, equation, len(recorded))
-    known, said = resolve_chemistry(recorded, chemistry, cells, capacity_ah)
+    stated = [
+        log if value is None else with_start(log, value)
+        for log, value in zip(recorded, given, strict=True)
+    ]
+    known, said = resolve_chemistry(stated, chemistry, cells, capacity_ah)
     with threadpool_limits(limits=1):  # 40 columns: threads only wait for each other
         starts = find_starts(recorded, given, capacity_ah, known)
         knots = equation == "knots"
