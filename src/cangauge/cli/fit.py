@@ -180,12 +180,12 @@ def fit_command(  # noqa: PLR0917 - typer passes options by name
         {output: result.model.to_json()} | ({report: page} if report and page else {})
     )
     if json_output:
-        extra: dict[str, object] = {
+        written: dict[str, object] = {
             "model": str(output),
             "report": report and str(report),
             "assumed": assumed_of(recorded),
         }
-        emit_json(result.to_dict() | extra)
+        emit_json(result.to_dict() | written)
         return
     _show(result)
     for remark in result.remarks:

@@ -11,6 +11,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from cangauge._extras import extra
 from cangauge._io import write_texts_atomic
 from cangauge.cli.options import (
     JsonOption,

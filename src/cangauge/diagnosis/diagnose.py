@@ -331,7 +331,7 @@ class Diagnosis:
 
     def _repr_html_(self) -> str:
         """Return the answer for a notebook."""
-        return diagnosis_html(self)
+        return str(extra("report.summary:diagnosis_html")(self))
 
     def to_json(
         self, extended_model: str | None = None, *, soc_error: bool = True
