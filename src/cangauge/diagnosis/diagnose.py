@@ -332,8 +332,6 @@ class Diagnosis:
 
     def _repr_html_(self) -> str:
         """Return the answer for a notebook."""
-        from cangauge.diagnosis.summary import diagnosis_html  # noqa: PLC0415 - needs this module
-
         return diagnosis_html(self)
 
     def to_json(
