@@ -225,6 +225,7 @@ class CompiledEstimator(Estimator):
         self._counter.restore(CounterState(**counter), is_restored=is_restored)
         used = 5 + len(self._online.load_coefficients)
         block["sums"] = block["sums"][:used] if block["rows"] else []
+        block["columns"] = used - 5 if block["rows"] else 0
         self._block.restore(BlockState(**block))
         memory = _plain(record["memory"])
         memory["doubt"] = layout.DOUBTS[memory["doubt"]]
@@ -289,7 +290,7 @@ class CompiledEstimator(Estimator):
         record["memory"]["innovation2"][: len(squares)] = squares
         _set(record["memory"], memory | {"innovations": len(squares)})
         block = asdict(self._block.snapshot())
-        sums = block.pop("sums")
+        sums = block.pop("sums")[: 5 + block.pop("columns")]  # the core sums no drives
         record["block"]["sums"] = 0.0
         record["block"]["sums"][: len(sums)] = sums
         _set(record["block"], block)
