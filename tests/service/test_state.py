@@ -270,9 +270,8 @@ DAMAGE: dict[str, tuple[Callable[[Path], object], str]] = {
     "hash": (lambda path: path.write_text(path.read_text().replace('"sha256": "', '"sha256": "0')),
              "damaged"),
     "unknown key": (edited("more", value=1), "more"),
-    "soc beyond": (edited("estimator", "estimate", 1, value=130.0), "outside 0–100"),
     "no soc": (edited("estimator", "estimate", 1, value=None), "has no SoC"),
-    "effects": (edited("estimator", "effects", value=[[1.0]]), "the model has 0 effects"),
+    "a word": (edited("estimator", "memory", value="many"), "estimator"),
 }  # fmt: skip
 
 
