@@ -35,11 +35,11 @@ from cangauge.estimation.estimator import Estimator
 from cangauge.estimation.offline import run_estimator, samples_of
 from cangauge.estimation.settings import EstimatorSettings
 from cangauge.extras.embedded.embedded import export_c
-from cangauge.extras.validation.packs import load
 from cangauge.identify.fit import fit
 from cangauge.model.coulomb_counting import capacity_from_reference
 from cangauge.model.published import leaf_2012_model_file
 from cangauge.types import Sample
+from packs.recorded import load
 
 MODEL: Final = leaf_2012_model_file()
 SETTINGS: Final = EstimatorSettings(initial_soc_pct=80.0)

@@ -25,7 +25,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from cangauge.inference.rows import decimate
 from rich.console import Console
 from rich.table import Table
 
@@ -35,12 +34,13 @@ from cangauge.estimation.estimator import Estimator
 from cangauge.estimation.offline import run_estimator, samples_of
 from cangauge.estimation.settings import EstimatorSettings
 from cangauge.extras.embedded.equivalent_circuit import equivalent_circuit
-from cangauge.extras.validation.packs import RATE_HZ, load
 from cangauge.identify.fit import fit
+from cangauge.identify.rows import decimate
 from cangauge.logs.log import Log
 from cangauge.logs.read import read_log
 from cangauge.model.coulomb_counting import capacity_from_reference
 from cangauge.model.model_file import Model
+from packs.recorded import load
 
 PACKS = ("i3", "car1")
 TRAINING_LOGS, SEED = 10, 0
@@ -73,13 +73,13 @@ def prepare(data: Path) -> tuple[Result, dict[str, list[Log]], dict[str, Model]]
     work: Result = {"packs": {}}
     judged, models = {}, {}
     for pack in load(data, PACKS):
-        training, judged[pack.name] = next(pack.splits(TRAINING_LOGS, 1, SEED))
+        _, training, judged[pack.name] = next(pack.draws(TRAINING_LOGS, 1, SEED))
         capacity_ah = pack.capacity_ah or capacity_from_reference(training)
-        models[pack.name] = fit(training, capacity_ah=capacity_ah).model
+        models[pack.name] = fit(training, capacity_ah=capacity_ah, chemistry="oxide").model
         tables = _tables(models[pack.name])
         work["packs"][pack.name] = {
             "tables": tables,
-            "training": [_columns(log.rows(decimate(log.time_s, RATE_HZ))) for log in training],
+            "training": [_columns(log.rows(decimate(log.time_s, 1.0))) for log in training],
             "judged": [_columns(log) for log in judged[pack.name]],
         }
     fast = read_log(data / "bmw_i3" / TIMED)

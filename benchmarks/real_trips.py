@@ -24,14 +24,14 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
-from cangauge.inference.rows import FitOptions, fit_rows, sample_log
 from rich.console import Console
 from rich.table import Table
 
 from cangauge.estimation.offline import EstimateTable, run_estimator, samples_of
 from cangauge.estimation.settings import EstimatorSettings
-from cangauge.identify.evaluate import LogFit, evaluate, evaluate_extended
+from cangauge.identify.evaluate import LogFit, evaluate
 from cangauge.identify.fit import Identification, fit
+from cangauge.identify.rows import fit_rows
 from cangauge.logs.log import Log
 from cangauge.logs.read import read_log
 from cangauge.model.coulomb_counting import capacity_from_reference
@@ -116,17 +116,17 @@ def identify(
     effects: tuple[str, ...] = (),
 ) -> Identification:
     """Fit model, capacity and effects to the training trips."""
-    return fit(training, capacity_ah=capacity_from_reference(training), effects=effects)
+    return fit(
+        training, capacity_ah=capacity_from_reference(training), chemistry="oxide",
+        effects=effects or "none",
+    )  # fmt: skip
 
 
 def predict(identification: Identification, tests: Sequence[Log]) -> tuple[LogFit, ...]:
     """Return the fit of other trips by the model, on the rows that a fit uses."""
-    options = _options(identification.model)
-    if identification.effects is None:
-        model = identification.voltage_model
-        return tuple(evaluate(model, fit_rows(trip, options)) for trip in tests)
-    extended = identification.effects.model
-    return tuple(evaluate_extended(extended, sample_log(trip, options)) for trip in tests)
+    model = identification.model
+    extended = model.extended_model()
+    return tuple(evaluate(extended, trip, fit_rows(trip, model.capacity_ah)) for trip in tests)
 
 
 def estimate(log: Log, model: Model, initial_pct: float | None) -> EstimateTable:
@@ -270,10 +270,6 @@ def judge(
 
 def _rms(values: np.ndarray) -> float:
     return float(np.sqrt(np.mean(values**2)))
-
-
-def _options(model: Model) -> FitOptions:
-    return FitOptions(capacity_ah=model.capacity_ah, delay_s=tuple(model.delays_s))
 
 
 TARGETS = (

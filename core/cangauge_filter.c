@@ -196,14 +196,16 @@ static void ekf_correct(cg_ekf *ekf, int32_t size, cg_real soc_pct, cg_real std_
     condition(ekf, &at, size, R(0.0));
 }
 
-/* SoC and its variance after charge, without a change of the state. */
+/* SoC and its variance after charge, without a change of the state; with the square of what the
+ * learned capacity and resistance imply. */
 static cg_real soc_after(const cg_ekf *ekf, const cg_model *model, const cg_passed *passed,
                          cg_real *var_pct2)
 {
     const cg_real a = offset_gain(model, passed->seconds);
     *var_pct2 = ekf->p[CG_X_SOC][CG_X_SOC] + (R(2.0) * a * ekf->p[CG_X_SOC][CG_X_OFFSET]) +
                 (a * a * ekf->p[CG_X_OFFSET][CG_X_OFFSET]) +
-                (R(DRIFT_PCT2_PER_S) * passed->seconds) + passed->variance_pct2;
+                (R(DRIFT_PCT2_PER_S) * passed->seconds) + passed->variance_pct2 +
+                cg_square(cg_dot(ekf->b_v[CG_X_SOC], ekf->b, 2));
     return ekf->x[CG_X_SOC] + (a * ekf->x[CG_X_OFFSET]) - passed->discharged_pct;
 }
 

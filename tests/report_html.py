@@ -9,7 +9,6 @@ from html.parser import HTMLParser
 from pathlib import Path
 
 import pytest
-from PIL import Image
 
 MAX_PAGE_BYTES = 3_000_000
 
@@ -69,14 +68,3 @@ def excess_width_px(page: str, folder: Path) -> int:
         "<script>addEventListener('message', e => document.title = e.data)</script>"
     )
     return int(title_after_scripts(outer, "1000,9000"))
-
-
-def drawn_figures(folder: Path) -> int:
-    """Return the number of figures in a folder, each as PNG and SVG with something in it."""
-    names = [path.stem for path in sorted(folder.glob("*.png"))]
-    assert names == [path.stem for path in sorted(folder.glob("*.svg"))]
-    for name in names:
-        shades = Image.open(folder / f"{name}.png").convert("L").getcolors()
-        assert len(shades or []) > 5, name
-        assert (folder / f"{name}.svg").read_text(encoding="utf-8").count("<path ") > 5, name
-    return len(names)

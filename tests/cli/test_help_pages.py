@@ -12,7 +12,6 @@ from cangauge.cli.app import COMMANDS
 from cangauge.diagnosis import ALARM
 from cangauge.estimation.settings import VALID_STD_PCT
 from cangauge.extras.fleet import gap, run, sources
-from cangauge.extras.validation import packs, packs_run
 from cangauge.logs.units import TEMPERATURE_SOURCES
 
 SLOW_TO_IMPORT = {
@@ -55,8 +54,6 @@ def test_help_pages_repeat_names_and_defaults_truly() -> None:
     assert shown.ALARM == ALARM
     assert (run.LOCAL, sources.VEHICLE_PATTERN) == (shown.LOCAL, shown.VEHICLE_PATTERN)
     assert (gap.LOGS, gap.REFERENCES) == (shown.FLEET_LOGS, shown.FLEET_REFERENCES)
-    assert tuple(packs.PACKS) == shown.PACKS
-    assert tuple(each.name for each in packs_run.CASES) == shown.CASES
 
 
 def test_the_options_of_a_bus_are_those_of_the_configuration(project: Path) -> None:

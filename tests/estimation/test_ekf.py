@@ -135,9 +135,10 @@ def test_prediction_between_blocks_equals_the_filters_own() -> None:
     filter_ = SocFilter(LinearModel(), 60.0, 5.0)
     run(filter_, voltages(5, 4))
     soc_pct, variance = filter_.soc_after(17.0, 0.4, 0.02)
+    by_biases_pct = filter_.bias.V[0] @ filter_.bias.b
     filter_.predict(17.0, 0.4, 0.02)
     assert soc_pct == pytest.approx(filter_.x[0], abs=1e-12)
-    assert variance == pytest.approx(filter_.P[0, 0], abs=1e-12)
+    assert variance == pytest.approx(filter_.P[0, 0] + by_biases_pct**2, abs=1e-12)
 
 
 @pytest.mark.parametrize("wrong_pct", [0.0, 3.0, 30.0])
@@ -240,6 +241,8 @@ def test_filter_equals_the_prototype(
     log = drive(fit, 9, 70.0, CAPACITY_AH)
     online = PrototypeModel(fit, model)
     ours = Hypotheses(online, given_pct)
+    for each in ours.filters:  # the prototype knows capacity and resistance
+        each.bias.P[:] = 0.0
     theirs = (
         prototype.unknown_start(model)
         if given_pct is None

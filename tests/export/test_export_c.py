@@ -18,8 +18,8 @@ from cangauge.estimation.offline import run_estimator, samples_of
 from cangauge.estimation.settings import EstimatorSettings
 from cangauge.extras.embedded.c_source import CORE_HEADERS, CORE_SOURCES
 from cangauge.extras.embedded.embedded import drive_with_events, export_c
-from cangauge.logs.read import read_log
 from cangauge.identify.fit import fit
+from cangauge.logs.read import read_log
 from cangauge.model.model_file import Model
 from cangauge.model.published import leaf_2012_model_file
 from cangauge.types import Sample

@@ -115,7 +115,9 @@ def drive() -> list[Row]:
 
 def test_module_publishes_pythons_estimate(driver: Path, drive: list[Row]) -> None:
     found, _ = run(driver, drive)
-    np.testing.assert_allclose(found, estimated(drive, MODEL, EstimatorSettings()), rtol=0.0, atol=1e-5)
+    np.testing.assert_allclose(
+        found, estimated(drive, MODEL, EstimatorSettings()), rtol=0.0, atol=1e-5
+    )
     assert np.ptp(found[:, 0]) > 1.0
 
 
@@ -124,7 +126,9 @@ def test_time_stamps_may_wrap(driver: Path, drive: list[Row]) -> None:
     later = [(first + stamp, *values) for stamp, *values in drive]
     wrapped = [(stamp % 2**32, *values) for stamp, *values in later]
     found, _ = run(driver, wrapped)
-    np.testing.assert_allclose(found, estimated(later, MODEL, EstimatorSettings()), rtol=0.0, atol=1e-5)
+    np.testing.assert_allclose(
+        found, estimated(later, MODEL, EstimatorSettings()), rtol=0.0, atol=1e-5
+    )
 
 
 def from_zero(rows: list[Row]) -> list[Row]:
@@ -175,7 +179,9 @@ def test_saved_state_of_another_model_is_not_used(drive: list[Row], tmp_path: Pa
     before, _ = run(old, drive[:1000], fram=fram)
     kept = fram.read_bytes()
     found, _ = run(new, drive, fram=fram)
-    np.testing.assert_allclose(found, estimated(drive, other, settings_after(before[-1])), rtol=0.0, atol=1e-5)
+    np.testing.assert_allclose(
+        found, estimated(drive, other, settings_after(before[-1])), rtol=0.0, atol=1e-5
+    )
     fram.write_bytes(kept)
     again, _ = run(old, drive, fram=fram)
     assert np.any(again != estimated(drive, MODEL, settings_after(before[-1])))
@@ -200,4 +206,6 @@ def test_recorded_trip_gives_pythons_estimate(shared_data: Path, tmp_path: Path)
     started = replace(log, time_s=log.time_s - log.time_s[0] + 1.0)
     rows = rounded(samples_of(started))
     found, _ = run(built(tmp_path, model, period_s=1.0), rows)
-    np.testing.assert_allclose(found, estimated(rows, model, EstimatorSettings()), rtol=0.0, atol=1e-5)
+    np.testing.assert_allclose(
+        found, estimated(rows, model, EstimatorSettings()), rtol=0.0, atol=1e-5
+    )

@@ -59,7 +59,8 @@ def logs(folder: Path) -> list[FleetLog]:
 
 @pytest.fixture(scope="session")
 def model(logs: list[FleetLog], scenario: Scenario) -> Model:
-    return fit([read_log(log.url) for log in logs], capacity_ah=scenario.pack.capacity_ah).model
+    recorded = [read_log(log.url) for log in logs]
+    return fit(recorded, capacity_ah=scenario.pack.capacity_ah, effects="none").model
 
 
 @pytest.fixture(scope="session")

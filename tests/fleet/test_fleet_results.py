@@ -147,7 +147,9 @@ def test_health_passes_from_log_to_log(logs: list[FleetLog], model: Model) -> No
     rows: list[dict[str, Any]] = []
     state = None
     for log in trips:
-        rows.append(perform(job, log, "", state).row or {})
+        done = perform(job, log, "", state)
+        assert done.row, done.reason
+        rows.append(done.row)
         state = rows[-1]["state"]
     alone = perform(job, trips[1], "", None).row or {}
     assert rows[1]["capacity_std_ah"] < alone["capacity_std_ah"]

@@ -9,17 +9,13 @@ from types import SimpleNamespace
 from typing import Any, ClassVar, Self
 
 import pytest
-from cangauge.inference.rows import FitOptions
 
 from cangauge.errors import CangaugeError, InputError
 from cangauge.extras.fleet import run as fleet_run
 from cangauge.extras.fleet.dataset import Dataset, by_kind
-from cangauge.extras.fleet.fit import fit_fleet
 from cangauge.extras.fleet.jobs import Job
-from cangauge.extras.fleet.passes import ErrorsJob
 from cangauge.extras.fleet.run import Summary, run_id, run_job
-from cangauge.extras.fleet.sources import FleetLog, ReadOptions, find_logs
-from cangauge.extras.validation.cases import Scenario
+from cangauge.extras.fleet.sources import FleetLog, find_logs
 from fleet_here import ChainedJob, Done, Here, NotingJob
 
 
@@ -171,33 +167,3 @@ def test_rows_are_written_while_a_task_takes_long(
     fleet.run(NotingJob())
     # a is done after 9 s, and due before b is done after 18 s.
     assert fleet.seen[3:6] == [[], [], ["a"]]
-
-
-def nothing_held_out(job: ErrorsJob, *given: Any) -> dict[str, Any]:
-    return compute_errors(job, *given) | {"held_out": 0.0}
-
-
-def connection_reset(*_: object) -> dict[str, Any]:
-    raise OSError("connection reset")
-
-
-compute_errors = ErrorsJob.row
-
-
-@pytest.mark.parametrize(
-    ("second_pass", "words"),
-    [(connection_reset, "9 logs of the first pass failed"), (nothing_held_out, "can be held out")],
-)
-def test_a_fit_without_held_out_errors_is_refused(
-    logs: list[FleetLog],
-    scenario: Scenario,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    *,
-    second_pass: Any,
-    words: str,
-) -> None:
-    monkeypatch.setattr(ErrorsJob, "row", second_pass)
-    client, options = Here(monkeypatch, lambda: None), FitOptions(scenario.pack.capacity_ah)
-    with pytest.raises(InputError, match=words):
-        fit_fleet(logs, ReadOptions(), options, str(tmp_path), client)

@@ -11,10 +11,10 @@ from typing import TYPE_CHECKING, Annotated, get_args
 import typer
 from rich.progress import Progress
 
+from cangauge._extras import extra
 from cangauge._formatting import number
 from cangauge._io import atomic_path
 from cangauge.cli.options import (
-    FiguresOption,
     JsonOption,
     Reading,
     ReportOption,
@@ -27,7 +27,7 @@ from cangauge.cli.options import (
     suffixed,
     within,
 )
-from cangauge.cli.output import console, emit_json, note, print_table, save_figures
+from cangauge.cli.output import console, emit_json, note, print_table
 from cangauge.cli.shown import VALID_STD_PCT
 from cangauge.errors import InputError
 
@@ -103,7 +103,6 @@ def estimate_command(  # noqa: PLR0917 - typer passes options by name
         ),
     ] = None,
     report: ReportOption = None,
-    figures: FiguresOption = None,
     json_output: JsonOption = False,
 ) -> None:
     """Estimate the state of charge of a recorded log or capture, offline.
@@ -184,7 +183,6 @@ def estimate_command(  # noqa: PLR0917 - typer passes options by name
             )
     _write_pack(done, pack)
     _write_output(done, output, report, model_path)
-    save_figures(figures, "estimate.estimate_page", done, model_path)
     for warning in done.warnings:
         note(f"warning: {done.recorded.source}: {warning}")
     if json_output:
@@ -207,19 +205,15 @@ def _write_output(
     done: RecordedEstimate, output: Path, report: Path | None, model_path: Path
 ) -> None:
     """Write table and report, or neither."""
-    from cangauge.extras.formats.estimate_mcap import write_estimates_mcap
     from cangauge.service.estimate_table import write_estimates
 
     page = None
     if report is not None:
-        # bokeh takes half a second to import.
-        from cangauge.extras.report.estimate import estimate_report
-
-        page = estimate_report(done, model_path)
+        page = extra("report.estimate:estimate_report")(done, model_path)
     with ExitStack() as both:
         part = both.enter_context(atomic_path(output))
         if _is_mcap(output):
-            write_estimates_mcap(part, done.recorded, done.table)
+            extra("formats.estimate_mcap:write_estimates_mcap")(part, done.recorded, done.table)
         else:
             write_estimates(part, done.recorded.time_s, done.table)
         if report is not None and page is not None:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
+from cangauge._extras import extra
 from cangauge._formatting import number, significant, span
 from cangauge._io import write_texts_atomic
 from cangauge.cli.options import (
@@ -174,10 +175,7 @@ def fit_command(  # noqa: PLR0917 - typer passes options by name
         page = None
         if report is not None:
             status.update("writing the report")
-            # bokeh takes half a second to import.
-            from cangauge.extras.report.fit import fit_report
-
-            page = fit_report(result)
+            page = extra("report.fit:fit_report")(result)
     write_texts_atomic(
         {output: result.model.to_json()} | ({report: page} if report and page else {})
     )

@@ -6,7 +6,6 @@ import inspect
 import os
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, fields, is_dataclass, replace
-from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, TypeVar, cast, get_type_hints
 
@@ -141,29 +140,6 @@ ReportOption = Annotated[
         metavar="FILE.html",
         callback=suffixed(".html", ".htm"),
         help="Write a report as one self-contained page.",
-    ),
-]
-
-
-def _drawable(param: typer.CallbackParam, folder: Path | None) -> Path | None:
-    """Refuse `--figures` before any long work if nothing could draw them."""
-    if folder is not None and find_spec("matplotlib") is None:
-        raise InputError(
-            "figures are drawn by matplotlib, which is not installed",
-            field="--figures",
-            value=str(folder),
-            cure="pip install 'cangauge[figures]'",
-        )
-    return folder_to_write(param, folder)
-
-
-FiguresOption = Annotated[
-    Path | None,
-    typer.Option(
-        "--figures",
-        metavar="DIR",
-        callback=_drawable,
-        help="Write each figure of the report as PNG and SVG (extra `figures`).",
     ),
 ]
 

@@ -8,8 +8,6 @@ import math
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from importlib import import_module
-from pathlib import Path
 from typing import Any
 
 from rich import box
@@ -131,25 +129,3 @@ def text_table(title: str, head: Sequence[str], rows: Sequence[Sequence[str]]) -
 def print_table(title: str, head: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
     """Print a table of plain text on stdout; arguments as of `text_table`."""
     PlainConsole(highlight=False).print(text_table(title, head, rows))
-
-
-def save_figures(folder: Path | None, page: str, *result: Any) -> None:
-    """Write the figures of a result's page as PNG and SVG, unless `folder` is None.
-
-    Parameters
-    ----------
-    folder : Path, optional
-    page : str
-        Module of `cangauge.extras.report` and function that makes the page, such as "fit.fit_page".
-    *result
-        Arguments of the function.
-    """
-    if folder is None:
-        return
-    # bokeh and matplotlib take a second to import.
-    from cangauge.extras.report.export import write_figures
-
-    module, function = page.split(".")
-    make_page = getattr(import_module(f"cangauge.extras.report.{module}"), function)
-    write_figures(make_page(*result), folder, page)
-    note(f"figures: {folder}")

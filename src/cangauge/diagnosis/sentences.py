@@ -2,20 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from cangauge._formatting import number, significant
+from cangauge._formatting import counted, number, significant
 from cangauge.diagnosis.answer import GROUP_OF, NONE, TITLES, UNKNOWN, Posterior
-from cangauge.diagnosis.evidence import COVER_K, COVER_PCT
+from cangauge.diagnosis.columns import COVER_PCT
+from cangauge.diagnosis.evidence import COVER_K
 from cangauge.logs.gaps import bridge_s
 
 if TYPE_CHECKING:
     from cangauge.diagnosis.diagnose import Diagnosis
     from cangauge.diagnosis.extended import Quantity
-    from cangauge.diagnosis.pack_fit import Trace
 
 SIZES: Final[Mapping[str, tuple[str, str, str, str]]] = {
     "current_offset": ("offset_a", "The current reads {size} A {sign}", "too high", "too low"),
@@ -44,9 +44,6 @@ MISFIT: Final = 1.2
 
 POOR_FIT: Final = 2.0
 """A model misfits its references with an error of more than this many healthy errors."""
-
-SHOWN_SIZES: Final = 4
-"""Visible sizes that the summary lists."""
 
 COMMON: Final = ("current_offset", "voltage_offset", "initial_soc", "time_skew")
 """Effects whose visible size the summary lists first: what a user suspects first."""
@@ -89,10 +86,10 @@ def headline(found: Diagnosis) -> str:
 
 
 def groups_text(answer: Posterior) -> str:
-    """Return the stated group, or two, with their probability."""
+    """Return the stated group, or two in order, with their probability."""
     stated = answer.stated_groups
     total = percent(sum(answer.groups[group] for group in stated))
-    words = " or ".join(TITLES[group] for group in stated)
+    words = ", then ".join(TITLES[group] for group in stated)
     return f"{words} ({'together ' if len(stated) > 1 else ''}{total})"
 
 
@@ -129,23 +126,20 @@ def size_text(found: Diagnosis) -> str:
         text += f" ({expected} with what the references show of this pack)"
     text += f"; {healthy} {significant(found.healthy_rmse_v, 2, 'V')}."
     if found.accepted is not None:
-        rows = (
-            ""
-            if all(log.judged.all() for log in found.log_errors)
-            else ", on the rows that it can change"
-        )
-        text += f" With {found.accepted}: {significant(found.extended_rmse_v, 2, 'V')}{rows}."
+        all_rows = all(log.judged.all() for log in found.log_errors)
+        text += f" With {found.accepted}: {significant(found.extended_rmse_v, 2, 'V')}"
+        text += "." if all_rows else ", on the rows that it can change."
     return text
 
 
 def visible_text(found: Diagnosis) -> str:
     """Return from which size the most usual effects would have been seen."""
     sizes = [
-        f"{item['effect']} from {significant(float(str(item['size'])), 2)} {item['unit']}"
+        f"{item['effect']} from {significant(item['size'], 2)} {item['unit']}"
         for item in found.visible_from
         if item["size"] is not None and item["effect"] in COMMON
     ]
-    return f"These logs would have shown {', '.join(sizes[:SHOWN_SIZES])}." if sizes else ""
+    return f"These logs would have shown {', '.join(sizes)}." if sizes else ""
 
 
 def percent(fraction: float) -> str:
@@ -160,70 +154,63 @@ def percent(fraction: float) -> str:
 
 def caveats(found: Diagnosis) -> list[str]:
     """Return what limits the answer, a sentence each."""
-    sentences = list(found.remarks)
-    traces, references = [log.log for log in found.columns], found.known.logs
+    said = list(found.remarks)
     for log in found.logs:
         if log.duration_s < SHORT_S:
-            sentences.append(
+            said.append(
                 f"{log.name} is shorter than {SHORT_S / 60.0:.0f} min: effects that develop over"
                 " minutes to hours can be neither named nor excluded."
             )
         step_s = float(np.diff(log.time_s).max())
         if step_s > bridge_s(log.time_s):
-            sentences.append(
+            said.append(
                 f"{log.name} has a gap of {step_s / 60.0:.0f} min. The pack is assumed to have"
                 " rested; charge moved meanwhile looks like initial_soc or capacity."
             )
     if found.has_references:
-        sentences += _beyond_references(found, traces, references)
-        if len(references) < 3:
-            sentences.append(
-                f"Only {len(references)} reference log{'s' * (len(references) > 1)}: differences"
-                " between healthy logs are hardly known, and probabilities are less reliable."
-            )
-        worst = max(found.reference_rmse_v.items(), key=lambda item: item[1])
-        usual = float(np.median(list(found.reference_rmse_v.values())))
-        if usual > POOR_FIT * found.healthy_rmse_v:
-            sentences.append(
-                f"The model misses its references by {significant(usual, 2, 'V')}, which a model"
-                f" of these logs would miss by {significant(found.healthy_rmse_v, 2, 'V')}: fit it"
-                " again with them."
-            )
-        elif len(references) > 2 and worst[1] > 3.0 * usual:
-            sentences.append(
-                f"The reference {worst[0]} is off by {significant(worst[1], 2, 'V')}, the others"
-                f" by {significant(usual, 2, 'V')}: check that it is without the fault."
-            )
-    sources = {log.temperature_source for log in found.logs} - {"unknown"}
-    if found.model.temperature_source != "unknown" and sources - {found.model.temperature_source}:
-        sentences.append(
-            f"The model's temperature was measured on {found.model.temperature_source}, that of"
-            f" these logs on {', '.join(sorted(sources))}: effects of temperature cannot be judged."
+        said += _of_references(found)
+    source = found.model.temperature_source
+    others = {log.temperature_source for log in found.logs} - {"unknown", source}
+    if source != "unknown" and others:
+        said.append(
+            f"The model's temperature was measured on {source}, that of these logs on"
+            f" {', '.join(sorted(others))}: effects of temperature cannot be judged."
         )
-    return sentences
+    return said
 
 
-def _beyond_references(
-    found: Diagnosis, traces: Sequence[Trace], references: Sequence[Trace]
-) -> list[str]:
-    """Return sentences on temperatures and SoC that no reference covers."""
-    sentences = []
-    soc = found.known.pack.soc
-    for quantity, unit, margin, (low, high), (least, most) in (
-        ("temperature", "°C", COVER_K, _ends([log.temperature_c for log in traces]),
-         _ends([log.temperature_c for log in references])),
-        ("SoC", "%", COVER_PCT, _ends([soc(log) for log in traces]),
-         _ends([soc(log) for log in references])),
-    ):  # fmt: skip
+def _of_references(found: Diagnosis) -> list[str]:
+    """Return sentences on what the references do not cover, or do not show."""
+    said, logs = [], [of.log for of in found.columns]
+    references, soc = found.known.logs, found.known.pack.soc
+    for quantity, unit, margin, of in (
+        ("temperature", "°C", COVER_K, lambda log: log.temperature_c),
+        ("SoC", "%", COVER_PCT, soc),
+    ):
+        (low, high), (least, most) = (
+            np.quantile(np.concatenate([of(log) for log in some]), [0.0, 1.0])
+            for some in (logs, references)
+        )
         if low < least - margin or high > most + margin:
-            sentences.append(
+            said.append(
                 f"The logs' {quantity} of {low:.0f} … {high:.0f} {unit} goes beyond the references'"
-                f" {least:.0f} … {most:.0f} {unit}, where the behaviour of a healthy pack is not"
-                " known."
+                f" {least:.0f} … {most:.0f} {unit}, where a healthy pack is not known."
             )
-    return sentences
-
-
-def _ends(values: Sequence[np.ndarray]) -> tuple[float, float]:
-    whole = np.concatenate(values)
-    return float(whole.min()), float(whole.max())
+    if len(references) < 3:
+        said.append(
+            f"Only {counted(len(references), 'reference log')}: differences between healthy logs"
+            " are hardly known, and probabilities are less reliable."
+        )
+    errors = found.reference_rmse_v
+    worst, usual = max(errors, key=lambda name: errors[name]), float(np.median([*errors.values()]))
+    if usual > POOR_FIT * found.healthy_rmse_v:
+        said.append(
+            f"The model misses its references by {significant(usual, 2, 'V')}, a model of these"
+            f" logs by {significant(found.healthy_rmse_v, 2, 'V')}: fit it again with them."
+        )
+    elif len(references) > 2 and errors[worst] > 3.0 * usual:
+        said.append(
+            f"The reference {worst} is off by {significant(errors[worst], 2, 'V')}, the others by"
+            f" {significant(usual, 2, 'V')}: check that it is without the fault."
+        )
+    return said

@@ -43,9 +43,8 @@ class OpenBlock:
         state = self.state
         if state.is_broken or not state.rows:
             return None
-        means = [each / state.rows for each in state.sums]
-        load, drives = np.split(np.array(means[5:]), [state.columns])
-        return Block(*means[:5], load, drives)
+        numbers, load, drives = np.split(np.array(state.sums) / state.rows, [5, 5 + state.columns])
+        return Block._make([*numbers.tolist(), load, drives])
 
     def snapshot(self) -> BlockState:
         """Return a copy of the state."""

@@ -1,13 +1,15 @@
 """The estimator with its step in C, some hundred times as fast and within 1e-9 of Python's.
 
-`Estimator` is the reference. `CompiledEstimator` hands each sample to the extension `_core`; what is
-rare (health, power, states to save) reads the core's state into the reference. It is used wherever
-the extension was built at installation, live and offline, unless `CANGAUGE_PURE_PYTHON` is set.
+`Estimator` is the reference. `CompiledEstimator` hands each sample to the extension `_core`; what
+is rare (health, power, states to save) reads the core's state into the reference. It is used
+wherever the extension was built at installation, live and offline, unless `CANGAUGE_PURE_PYTHON`
+is set.
 """
 
 from __future__ import annotations
 
 import logging
+import math
 import os
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -50,11 +52,11 @@ def _load(root: Path) -> Any:
         core: Any = import_module("cangauge._core")
     except ImportError:  # no compiler at installation
         return None
-    types = {name: getattr(layout, name.upper()) for name in core.SIZES}
-    is_alike = all(types[name].itemsize == size for name, size in core.SIZES.items())
     folder = root / "core"
     is_stale = (folder / "cangauge.h").is_file() and sources_digest(folder) != core.SOURCES
-    if is_stale or not is_alike:
+    if is_stale or any(
+        getattr(layout, name.upper()).itemsize != size for name, size in core.SIZES.items()
+    ):
         emit(
             _LOG, logging.WARNING, "core.stale",
             "the compiled core is not of these sources: continuing in Python; "
@@ -180,7 +182,9 @@ class CompiledEstimator(Estimator):
     def current_changes(self, time_s: float, stamps_s: Sequence[float]) -> list[float]:
         """Return the current at a sample's time less that at other stamps [A]; NaN for NaN."""
         now_a, at = self._core.current_at(0.0), self._core.current_at
-        return [now_a - at(time_s - each) if each == each else each for each in stamps_s]
+        return [
+            now_a - at(time_s - each) if not math.isnan(each) else math.nan for each in stamps_s
+        ]
 
     def power(self) -> Power:
         """Return the currents possible for 10 s and the energy left, after the latest sample."""

@@ -156,9 +156,9 @@ class SocFilter(ExtendedKalmanFilter):  # type: ignore[misc] # filterpy has no t
         for _ in range(iterations):
             voltage_v, self.H, self.R = self.measurement(x, block)
             PHt = self.P @ self.H
-            self.S = self.H @ PHt + self.R
+            self.S = float(self.H @ PHt) + self.R
             self.K = PHt / self.S
-            self.y = block.voltage_v - voltage_v - self.H @ (prior - x)
+            self.y = block.voltage_v - voltage_v - float(self.H @ (prior - x))
             before, x = x[SOC], prior + self.K * self.y
             x[SOC] = min(max(x[SOC], LOWEST_PCT), HIGHEST_PCT)
             if abs(x[SOC] - before) < CLOSE_PCT:
@@ -172,9 +172,9 @@ class SocFilter(ExtendedKalmanFilter):  # type: ignore[misc] # filterpy has no t
         self.H = np.zeros_like(self.x)
         self.H[SOC], self.R = 1.0, soc_std_pct**2
         PHt = self.P @ self.H
-        self.S = self.H @ PHt + self.R
+        self.S = float(self.H @ PHt) + self.R
         self.K = PHt / self.S
-        self.y = soc_pct - self.x[SOC]
+        self.y = soc_pct - float(self.x[SOC])
         self.x = self.x + self.K * self.y
         self._condition(PHt, 0.0)
 
@@ -189,17 +189,22 @@ class SocFilter(ExtendedKalmanFilter):  # type: ignore[misc] # filterpy has no t
         H[SOC], H[OFFSET], H[SLOW] = slope, 0.0, A
         H[LEVEL] = math.hypot(A * noise.level_std_v, axis_v)
         H[FUNCTIONS:] = model.row(float(x[SOC]), block.load)
-        volts += block.load @ model.load_coefficients + H[SLOW:] @ x[SLOW:]
-        return float(volts), H, (A * noise.fast_std_v) ** 2 + axis_v**2
+        volts += float(block.load @ model.load_coefficients + H[SLOW:] @ x[SLOW:])
+        return volts, H, (A * noise.fast_std_v) ** 2 + axis_v**2
 
     def soc_after(
         self, seconds: float, discharged_pct: float, variance_pct2: float = 0.0
     ) -> tuple[float, float]:
-        """Return the predicted SoC and its variance [%, %²] without changing the state."""
+        """Return the predicted SoC and its variance [%, %²] without changing the state.
+
+        The variance contains the square of the error that the learned capacity and resistance
+        imply for the SoC, which counts with those of the model.
+        """
         a = 100.0 * seconds / (3600.0 * self.model.capacity_ah)
         x, P = self.x, self.P
         variance = P[SOC, SOC] + 2.0 * a * P[SOC, OFFSET] + a * a * P[OFFSET, OFFSET]
         variance += DRIFT_PCT2_PER_S * seconds + variance_pct2
+        variance += (self.bias.V[SOC] @ self.bias.b) ** 2
         return float(x[SOC] + a * x[OFFSET] - discharged_pct), float(variance)
 
     @property

@@ -26,11 +26,11 @@ from cangauge.estimation.counting import (
     moved_probability,
     moved_std_pct,
 )
-from cangauge.estimation.ekf import Block, inverse_std_pct
+from cangauge.estimation.ekf import UNKNOWN_STD_PCT, Block, inverse_std_pct
 from cangauge.estimation.health import health_of
 from cangauge.estimation.power import PowerModel
 from cangauge.estimation.settings import EstimatorSettings, SocReference, detect_references
-from cangauge.estimation.start import UNKNOWN_STD_PCT, WRONG_PRIOR, WRONG_STD_PCT, Hypotheses
+from cangauge.estimation.start import WRONG_PRIOR, WRONG_STD_PCT, Hypotheses
 from cangauge.estimation.state import DelayLineState, EstimatorMemory, EstimatorState
 from cangauge.model.effects.base import Reading
 from cangauge.model.model_file import Model

@@ -10,7 +10,9 @@ changing its state: with V = ∂x/∂b, G = ∂(S counted)/∂b and D = ∂U/∂
     b ← b + Kb (y − T b),   Kb = Pb Tᵀ/(S + T Pb Tᵀ),   Pb ← Pb − Kb T Pb
 
 The optimal estimate of the augmented problem is x + V b with covariance P + V Pb Vᵀ. Health is read
-from it; the published SoC is x, which counts with the stated capacity.
+from it. The published SoC is x, which counts with the stated capacity; its variance contains the
+square of V b. The form is linear: where a reference capacity that is too small drives S beyond the
+ends of the curve, the capacity is learned with an error of some per cent.
 
 References
 ----------
@@ -105,7 +107,7 @@ class SeparateBias:
     @property
     def relative(self) -> FloatArray:
         """Both in standard deviations of their prior, shape (2,)."""
-        return self.b / np.sqrt(np.diag(PRIOR))
+        return np.asarray(self.b / np.sqrt(np.diag(PRIOR)))
 
     def take_over(self, before: SeparateBias, ratio: float) -> None:
         """Keep the capacity learned with another reference capacity, `ratio` times as large."""
@@ -142,6 +144,6 @@ def health_of(filter_: SocFilter, temperature_c: float) -> Health:
         capacity_ah / gain * math.sqrt(bias.P[G, G]),
         1.0 + float(row @ x),
         math.sqrt(max(float(row @ P @ row), 0.0)),
-        float(x[1]),
-        math.sqrt(P[1, 1]),
+        float(x[1]) / gain,  # the filter's o is g times the sensor's
+        math.sqrt(P[1, 1]) / gain,
     )

@@ -226,11 +226,9 @@ class _Ahead:
             return None
         load = base + current_a * per_a
         after_pct = self.soc_pct - pct_per_a * current_a
-        H = np.concatenate((
-            [slope, 0.0, self._A, self._level_v],
-            model.row(after_pct, load),
-            [0.0, load[1:] @ model.load_coefficients[1:]],
-        ))  # fmt: skip
+        drop_v = float(load[1:] @ model.load_coefficients[1:])
+        functions = model.row(after_pct, load).tolist()
+        H = np.array([slope, 0.0, self._A, self._level_v, *functions, 0.0, drop_v])
         variance = H @ self._P @ H + (self._A * model.noise.residual_std_v) ** 2 + unknown_v**2
         return current_a, math.sqrt(variance) / volt_per_a
 

@@ -409,10 +409,8 @@ class OnlineModel:
             `Effect.drive` of every effect there.
         """
         effects = zip(self.extended.effects, drives, strict=True)
-        self._row, self._beside_v = load, beside_v
-        self._over_soc = [
-            (effect, values, drive) for (effect, values), drive in effects if effect.uses_soc
-        ]
+        self._row = load
+        self._drives = np.array([beside_v, *(v for (effect, _), v in effects if effect.uses_soc)])
 
     def state(self) -> list[list[float]]:
         """Return the low-passed currents' state, then that of each effect, for `restore`."""
