@@ -61,7 +61,7 @@ coverage: $(VENV)/installed-dev
 	$(BIN)/python -m pytest --cov --cov-report=term-missing:skip-covered
 
 check: $(VENV)/installed
-	$(BIN)/cangauge gap-check --part small
+	$(BIN)/cangauge gap-check --at-most 1
 
 data:
 	@test -d "$(DATA)" || { echo "no folder '$(DATA)' of recorded logs: name it, make $(MAKECMDGOALS) DATA=FOLDER (see README for the sources)" >&2; exit 2; }

@@ -18,7 +18,8 @@ from typing import Any
 import numpy as np
 
 from cangauge.diagnosis.answer import GROUP_OF, answer
-from cangauge.diagnosis.evidence import Columns, analyse, columns, learn
+from cangauge.diagnosis.columns import Columns
+from cangauge.diagnosis.evidence import analyse, columns, learn
 from cangauge.diagnosis.pack_fit import Trace, trace
 from cangauge.diagnosis.planner import MEASUREMENTS, plan, proposed_drives, settled
 from cangauge.diagnosis.trials import STEP

@@ -13,7 +13,7 @@ from cangauge.bus.mapping import SignalMap, TemperatureMap, VehicleMap
 from cangauge.bus.vehicle import PRESETS, Preset, Vehicle
 from cangauge.extras.report.charts import new_figure
 from cangauge.extras.report.page import Figure, Page, Paragraph, Section, Tile, render
-from cangauge.model.effects.base import Effect, OnlineEffect, Pack, PackState, Parameter, Values
+from cangauge.model.effects.base import Effect, Load, Memories, Pack, Parameter, Values
 from cangauge.model.effects.library import LIBRARY
 from cangauge.model.voltage_model import VoltageModel
 from cangauge.types import Sample
@@ -31,15 +31,10 @@ class HeaterDrop(Effect):
     source = "an example"
     separated_by = "nothing"
 
-    def extra_voltage(
-        self, state: PackState, values: Values, model: VoltageModel, pack: Pack
+    def drive(
+        self, load: Load, values: Values, model: VoltageModel, pack: Pack, memory: Memories
     ) -> np.ndarray:
-        return np.full(state.soc_pct.size, -values["drop_v"])
-
-    def online(self, values: Values, model: VoltageModel, pack: Pack) -> OnlineEffect:
-        effect = OnlineEffect()
-        effect.volts = -values["drop_v"]
-        return effect
+        return np.full_like(load.current_a, -values["drop_v"])
 
 
 def test_an_effect_of_your_own_is_identified(monkeypatch: pytest.MonkeyPatch) -> None:

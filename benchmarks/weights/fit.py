@@ -13,10 +13,9 @@ from scipy.special import logsumexp
 
 INNER, LIBRARY, NONE, UNKNOWN = slice(0, 4), slice(4, 6), slice(6, 10), slice(10, 14)
 """Places of the numbers in one array: nats, volts, shapes, cold; library; none; unknown."""
-CENTRE = np.array([1.5, 1.5, 0.0, 4.0, 0.5, *[0.0] * 9])
-SPREAD = np.array([1.5, 1.5, 1.0, 0.01, 0.5, 3, 1, 1, 1, 3, 1, 1, 1, 3])
-"""Ridge: prior mean and deviation of each number. The cold is held: few cases lie outside the
-references' temperatures."""
+CENTRE = np.array([1.5, 1.5, 0.0, 2.0, 0.5, *[0.0] * 9])
+SPREAD = np.array([1.5, 1.5, 1.0, 2.0, 0.5, 3, 1, 1, 1, 3, 1, 1, 1, 3])
+"""Ridge: prior mean and deviation of each number."""
 CAUSE_OUT = 0.1
 """Weight of a case whose own effect was taken out of the library; it moves the outer numbers."""
 

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from cangauge._io import atomic_path
+from cangauge._files import atomic_path
 from cangauge.cli.app import COMMANDS, main
 from cangauge.errors import CangaugeError, InputError
 from live import Ended, in_process

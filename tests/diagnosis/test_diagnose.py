@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ from days import FAULTS, day, more_amperes, more_volts
 from cangauge.diagnosis import GROUP_OF, Diagnosis, References, diagnose
 from cangauge.diagnosis.answer import CHECKS, TITLES
 from cangauge.errors import InputError
+from cangauge.logs.canonical import write_log
 from cangauge.logs.log import Log
 from cangauge.model.model_file import Model
 
@@ -44,9 +46,7 @@ def test_the_extended_model_is_better_on_held_out_rows(faulty: Diagnosis) -> Non
     assert ci[0] <= closed <= ci[1] or closed == pytest.approx(ci[1], abs=0.05)
 
 
-def test_the_extended_model_runs_as_a_file(
-    faulty: Diagnosis, tmp_path: pytest.TempPathFactory
-) -> None:
+def test_the_extended_model_runs_as_a_file(faulty: Diagnosis, tmp_path: Path) -> None:
     path = f"{tmp_path}/extended.json"
     faulty.extended_model.save(path)
     loaded = Model.load(path)
@@ -110,6 +110,16 @@ def test_references_learned_before_give_the_same(
     one, other = diagnose([log], model, references), diagnose([log], model, known)
     assert one.posterior.probabilities == other.posterior.probabilities
     assert one.extended_rmse_v == other.extended_rmse_v
+
+
+def test_files_are_logs_and_models(
+    references: list[Log], known: References, model: Model, tmp_path: Path
+) -> None:
+    write_log(day(20), tmp_path / "monday.csv")
+    model.save(tmp_path / "pack.json")
+    found = diagnose(str(tmp_path / "monday.csv"), tmp_path / "pack.json", known)
+    assert found.logs[0].name == "monday"
+    assert found.model == model
 
 
 def test_an_effect_can_be_taken_out_of_the_library(known: References, model: Model) -> None:

@@ -8,9 +8,9 @@ import pytest
 
 from cangauge.diagnosis import Diagnosis, diagnose
 from cangauge.diagnosis.planner import plan
+from cangauge.diagnosis.summary import EXPLAINED
 from cangauge.extras.report.diagnosis import gap_page
 from cangauge.extras.report.page import Beside, Page, render
-from cangauge.extras.report.summary import EXPLAINED
 from cangauge.identify.fit import fit
 from cangauge.logs.log import Log
 from cangauge.model.effects.library import LIBRARY

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from cangauge.extras.report.summary import candidate_rows, size_text
+from cangauge.diagnosis.summary import candidate_rows, size_text
 
 
 def quantity(value: float, ci: list[float] | None, unit: str) -> dict[str, object]:

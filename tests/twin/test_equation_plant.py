@@ -23,14 +23,15 @@ def healthy(scenario: Scenario) -> GroundTruth:
 
 def test_healthy_log_is_fitted_to_the_sensor_floor(scenario: Scenario) -> None:
     training = scenario.training[0]
-    fitted = fit([training.log], capacity_ah=scenario.pack.capacity_ah)
+    fitted = fit([training.log], capacity_ah=scenario.pack.capacity_ah, equation="published")
     assert fitted.voltage_rmse_v < 1.3 * rms(training.sensor_error_v)
 
 
 def test_reported_core_fits_all_logs_to_the_floor() -> None:
     scenario = draw_scenario(8, kind="leaf40", plant_name="published")
     clean = (*scenario.training, *scenario.references)
-    fitted = fit([recording.log for recording in clean], capacity_ah=scenario.pack.capacity_ah)
+    logs = [recording.log for recording in clean]
+    fitted = fit(logs, capacity_ah=scenario.pack.capacity_ah, equation="published")
     sensor_floor_v = rms(np.concatenate([recording.sensor_error_v for recording in clean]))
     assert fitted.voltage_rmse_v < 1.05 * sensor_floor_v
 

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import ClassVar, Final, NamedTuple
+from typing import Final, NamedTuple
 
 import can
 
+from cangauge.bus.database import SignalCodec
 from cangauge.bus.plausibility import (
     ConstantDetector,
     Fault,
@@ -19,7 +20,7 @@ from cangauge.bus.plausibility import (
 )
 from cangauge.bus.polling import Reassembler, reply_id, reply_key
 from cangauge.bus.protection import FrameChecker, Verdict
-from cangauge.bus.vehicle import EXTENDED, CellGroup, CellSignals, Vehicle, VehicleSignal, pgn_mask
+from cangauge.bus.vehicle import EXTENDED, CellSignals, Vehicle, VehicleSignal, pgn_mask
 from cangauge.types import Reason, Sample
 
 _MISSING: Final = {
@@ -47,16 +48,6 @@ SUSPECTED_FOR_S: Final = 10.0
 attacker's pause between two tries, well below the longest gap over which charge is counted."""
 
 
-class _Total:
-    """A statistic summed over all messages."""
-
-    def __set_name__(self, owner: type, name: str) -> None:
-        self._name = name
-
-    def __get__(self, statistics: FrameStatistics, owner: type) -> int:
-        return sum(getattr(each, self._name) for each in statistics.messages.values())
-
-
 @dataclass(slots=True)
 class FrameStatistics:
     """Statistics of all frames; totals of `MessageStatistics` under the same names.
@@ -80,17 +71,11 @@ class FrameStatistics:
     time_reversals: int = 0
     """Wanted frames stamped earlier than the frame before."""
 
-    wanted: ClassVar[_Total] = _Total()
-    crc_errors: ClassVar[_Total] = _Total()
-    counter_repeats: ClassVar[_Total] = _Total()
-    counter_jumps: ClassVar[_Total] = _Total()
-    frames_lost: ClassVar[_Total] = _Total()
-    short: ClassVar[_Total] = _Total()
-    not_available: ClassVar[_Total] = _Total()
-    implausible: ClassVar[_Total] = _Total()
-    stuck: ClassVar[_Total] = _Total()
-    held_back: ClassVar[_Total] = _Total()
-    two_senders: ClassVar[_Total] = _Total()
+    def __getattr__(self, name: str) -> int:
+        """Return the total of a statistic of the messages."""
+        if name not in MessageStatistics.__dataclass_fields__:
+            raise AttributeError(name)
+        return sum(getattr(each, name) for each in self.messages.values())
 
 
 class Pairing:
@@ -178,17 +163,6 @@ class CellVoltages:
         self.refused = 0
         self._taken_s = [math.nan] * signals.count
 
-    def reader(self, key: int) -> Callable[[bytes | bytearray, float], None]:
-        """Return what takes the payloads of a message with their time [s]."""
-        groups = [group for group in self.signals.groups if group.key == key]
-
-        def read(payload: bytes | bytearray, time_s: float) -> None:
-            for group in groups:
-                if all(each.field.get(payload) in each.values for each in group.conditions):
-                    self._read(group, payload, time_s)
-
-        return read
-
     def take(self, now_s: float) -> tuple[list[float], list[float]]:
         """Return voltages [V] and bus times [s] that are new since the last call, NaN for others.
 
@@ -205,18 +179,22 @@ class CellVoltages:
             [t if new else math.nan for t, new in zip(self.time_s, is_new, strict=True)],
         )
 
-    def _read(self, group: CellGroup, payload: bytes | bytearray, time_s: float) -> None:
+    def read(
+        self, cells: Sequence[tuple[int, SignalCodec]], payload: bytearray, time_s: float
+    ) -> None:
+        """Take the voltages of a payload with cells (place and codec of each), at its time [s]."""
         shift, signals = 0, self.signals
-        if group.index is not None:
-            shift = (group.index.get(payload) - group.first_index) * len(group.decoders)
-        for place, decode in zip(group.places, group.decoders, strict=True):
-            at, volts = place + shift, decode(payload)
-            if not 0 <= at < signals.count or math.isnan(volts):
-                continue  # the last group may be filled up, and a cell be not available
-            if not signals.lowest_v <= volts <= signals.highest_v:
+        if signals.index is not None:
+            shift = (signals.index.get(payload) - signals.first_index) * len(signals.cells)
+        for place, codec in cells:
+            at = place + shift
+            if not (0 <= at < signals.count and codec.is_in(payload)):
+                continue  # the last group may be filled up
+            volts = codec.decode(payload)
+            if signals.lowest_v <= volts <= signals.highest_v:
+                self.voltage_v[at], self.time_s[at] = volts, time_s
+            elif not math.isnan(volts):
                 self.refused += 1
-                continue
-            self.voltage_v[at], self.time_s[at] = volts, time_s
 
 
 class _Input(NamedTuple):
@@ -239,8 +217,8 @@ class _Route:
     checker: FrameChecker | None
     statistics: MessageStatistics
     inputs: list[_Input] = field(default_factory=list)
-    read_cells: Callable[[bytes | bytearray, float], None] | None = None
-    """Takes a payload with cell voltages, and its time [s]."""
+    cells: list[tuple[int, SignalCodec]] = field(default_factory=list)
+    """Place and codec of the cells in it."""
     last_s: float = -math.inf
     suspected_until_s: float = -math.inf
     """Until then its frames may be of two senders."""
@@ -296,9 +274,9 @@ class SampleDecoder:
         self.cells: CellVoltages | None = None
         if vehicle.cells is not None:
             self.cells = CellVoltages(vehicle.cells)
-            for group in vehicle.cells.groups:
-                route = self._route(group.key, group.message, group.length)
-                route.read_cells = self.cells.reader(group.key)
+            for place, cell in enumerate(vehicle.cells.cells):
+                route = self._route(cell.key, cell.message, cell.length)
+                route.cells.append((place, cell.codec))
         for route in self._routes.values():
             # Slow signals first: a sample uses the temperature of its own frame.
             route.inputs.sort(key=lambda each: each.is_current + 2 * each.is_voltage)
@@ -401,8 +379,8 @@ class SampleDecoder:
 
     def _values(self, route: _Route, payload: bytearray, time_s: float) -> Sample | None:
         """Check the values of an accepted payload; return the sample that they complete."""
-        if route.read_cells is not None:
-            route.read_cells(payload, time_s)
+        if route.cells and self.cells is not None:
+            self.cells.read(route.cells, payload, time_s)
         current_a = voltage_v = math.nan
         for decode, is_present, health, is_current, is_voltage in route.inputs:
             if is_present is not None and not is_present(payload):

@@ -15,7 +15,7 @@ import enum
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Any, Final, Literal, NamedTuple, Protocol
+from typing import Any, Final, Literal, NamedTuple
 
 from e2e import p01, p02, p04, p05, p06, p07, p11
 
@@ -34,30 +34,6 @@ class Verdict(enum.IntEnum):
     """Refused: damaged."""
     REPEATED = 3
     """Refused: the counter did not change, so this is not a new frame."""
-
-
-class Protection(Protocol):
-    """CRC and alive counter of a message."""
-
-    @property
-    def name(self) -> str:
-        """Name in a map file."""
-
-    @property
-    def modulus(self) -> int:
-        """Number of counter values; 0 without a counter."""
-
-    def fits(self, length: int) -> bool:
-        """Return whether a payload of `length` bytes has room for CRC and counter."""
-
-    def is_whole(self, data: bytes | bytearray) -> bool:
-        """Return whether the CRC agrees and the counter value is a possible one."""
-
-    def counter(self, data: bytes | bytearray) -> int:
-        """Return the counter of a payload; 0 without a counter."""
-
-    def protect(self, data: bytes | bytearray, counter: int) -> bytes:
-        """Return the payload with counter (modulo `modulus`) and CRC set."""
 
 
 def _require(holds: bool, name: str, value: object, problem: str) -> None:
@@ -338,13 +314,10 @@ class E2eRule:
         return length >= max(self.header_byte + self._profile.header, self.protected_bytes)
 
     def is_whole(self, data: bytes | bytearray) -> bool:
-        """Return whether header and CRC agree and the counter value is a possible one."""
+        """Return whether header and CRC agree; the library refuses impossible counters."""
         if isinstance(data, bytes):
             data = bytearray(data)  # some checks of the library accept bytearray only
-        return (
-            self._profile.check(data, self.data_ids or self.data_id, **self._arguments)
-            and self.counter(data) < self._profile.modulus
-        )
+        return self._profile.check(data, self.data_ids or self.data_id, **self._arguments)
 
     def counter(self, data: bytes | bytearray) -> int:
         """Return the counter of a payload."""
@@ -370,6 +343,10 @@ class E2eRule:
         return bytes(out)
 
 
+Protection = ProtectionRule | CounterRule | E2eRule
+"""CRC and alive counter of a message: `name`, `modulus` (0 without a counter), `fits`, `is_whole`,
+`counter`, `protect`."""
+
 SILENCE_S: Final = 2.0
 """Silence after which a sender may have restarted, with any counter value [s]."""
 WIDE: Final = 256
@@ -380,8 +357,8 @@ SOON: Final = 0.8
 """A frame this soon after the one before [periods] is not the next one of the same sender: senders
 keep their period within some percent."""
 SUSPECTED_AT: Final = 8.0
-"""Frames out of sequence and too soon, from which a second sender is suspected: a sender that
-restarts makes one or two."""
+"""Frames out of sequence, repeated or too soon, from which a second sender is suspected: a sender
+that restarts makes one or two."""
 FORGIVEN: Final = 1.0 / 3.0
 """Such frames forgiven by each frame in sequence: of two senders at least every second frame is out
 of sequence, of lost frames in bursts (stamps of a batch are equal) one in four or fewer."""
@@ -391,9 +368,9 @@ class FrameChecker:
     """Check the frames of one message in order of time.
 
     A repeated counter is no new frame, unless enough time has passed for the counter to wrap: on a
-    lossy bus one in `modulus` of the surviving frames looks like a repetition. Frames that come
-    out of sequence and too soon are those of a second sender; CAN itself repeats some frames after
-    an error, which are identical.
+    lossy bus one in `modulus` of the surviving frames looks like a repetition. Frames that repeat a
+    counter with another content, or come out of sequence too soon, are those of a second sender;
+    CAN itself repeats some frames after an error, which are identical.
 
     Parameters
     ----------
@@ -421,6 +398,7 @@ class FrameChecker:
         self._last_s = 0.0
         self._refused = 0
         self._content: bytes | bytearray = b""
+        self._is_repeated = False
         self._odd = 0.0
         self.lost = 0
         self.learned_period_s: Callable[[], float] = lambda: math.nan
@@ -443,15 +421,20 @@ class FrameChecker:
         steps = (counter - last) % modulus
         if steps == 1 or last < 0:
             self._last, self._refused, self._content = counter, 0, data
+            self._is_repeated = False
             if self._odd:
                 self._odd = max(self._odd - FORGIVEN, 0.0)
             return Verdict.GOOD
         period_s = self.learned_period_s() if self._period_s is None else self._period_s
-        if 0.0 <= elapsed_s < SOON * period_s and data != self._content:
+        is_soon = 0.0 <= elapsed_s < SOON * period_s
+        is_repeated, was_repeated = steps == 0 and elapsed_s <= self._half_wrap_s, self._is_repeated
+        self._is_repeated = is_repeated
+        # The second repetition in a row is a stuck counter.
+        if (is_soon or (is_repeated and not was_repeated)) and data != self._content:
             self._odd = min(self._odd + 1.0, 2.0 * SUSPECTED_AT)
+        if is_repeated:
+            return Verdict.REPEATED
         if steps == 0:
-            if elapsed_s <= self._half_wrap_s:
-                return Verdict.REPEATED
             steps = min(modulus, WIDE)
         elif (
             modulus >= WIDE

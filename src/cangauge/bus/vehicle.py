@@ -19,16 +19,14 @@ from cantools.database.can import Database, Message
 
 from cangauge._config import read_toml, validated
 from cangauge._resources import shared_file
+from cangauge.bus.database import Field as BitField
 from cangauge.bus.database import (
-    Condition,
-    Decode,
     SignalCodec,
     find_message,
     find_signal,
     load_dbc,
     signal_codec,
 )
-from cangauge.bus.database import Field as BitField
 from cangauge.bus.mapping import (
     NO_OVERRIDES,
     CellsMap,
@@ -115,44 +113,19 @@ class VehicleSignal:
 
 
 @dataclass(frozen=True, slots=True)
-class CellGroup:
-    """Cells whose voltages are together in a frame.
-
-    Parameters
-    ----------
-    key, message, length
-        As in `VehicleSignal`.
-    conditions : tuple of Condition
-        All must hold for the group to be in a frame.
-    places : tuple of int
-        Index of each cell, from 0.
-    decoders : tuple of callable
-        Decoder of each cell's voltage [V].
-    index : Field, optional
-        Raw number of the group; it times `len(decoders)` is added to the places.
-    first_index : int
-        Number of the first group.
-    """
-
-    key: int
-    message: str
-    length: int
-    conditions: tuple[Condition, ...]
-    places: tuple[int, ...]
-    decoders: tuple[Decode, ...]
-    index: BitField | None = None
-    first_index: int = 0
-
-
-@dataclass(frozen=True, slots=True)
 class CellSignals:
-    """All cells of a vehicle.
+    """Voltages of all cells of a vehicle.
 
     Parameters
     ----------
     count, first : int
         Number of cells in series; number of the first.
-    groups : tuple of CellGroup
+    cells : tuple of VehicleSignal
+        One a cell, in order; with `index`, those of one group.
+    index : Field, optional
+        Raw number of the group in a frame.
+    first_index : int
+        Number of the first group.
     lowest_v, highest_v : float
         Plausible voltages [V].
     timeout_s : float
@@ -161,7 +134,9 @@ class CellSignals:
 
     count: int
     first: int
-    groups: tuple[CellGroup, ...]
+    cells: tuple[VehicleSignal, ...]
+    index: BitField | None = None
+    first_index: int = 0
     lowest_v: float = CELL_WITHIN_V[0]
     highest_v: float = CELL_WITHIN_V[1]
     timeout_s: float = CELL_TIMEOUT_S
@@ -169,7 +144,7 @@ class CellSignals:
     @property
     def keys(self) -> tuple[int, ...]:
         """Keys of the messages, each once."""
-        return tuple(dict.fromkeys(group.key for group in self.groups))
+        return tuple(dict.fromkeys(cell.key for cell in self.cells))
 
 
 class MessageProtection(NamedTuple):
@@ -401,13 +376,10 @@ class _Binder:
         )
 
     def _cells(self, wanted: CellsMap) -> CellSignals:
-        signals = [self._signal("cells", each) for each in wanted.signal_maps()]
-        groups: dict[tuple[int, tuple[Condition, ...]], list[int]] = {}
-        for place, signal in enumerate(signals):
-            groups.setdefault((signal.key, signal.codec.conditions), []).append(place)
+        cells = tuple(self._signal("cells", each) for each in wanted.signal_maps())
         index: BitField | None = None
         if wanted.index is not None:
-            if len(groups) > 1:
+            if len({(cell.key, cell.codec.conditions) for cell in cells}) > 1:
                 raise InputError(
                     "the signals of a group are not in the same frame",
                     source=self._source,
@@ -417,24 +389,14 @@ class _Binder:
             index = self._signal("cells", numbering).codec.field
         low, high = CELL_WITHIN_V
         return CellSignals(
-            count=wanted.count,
-            first=wanted.first,
-            groups=tuple(
-                CellGroup(
-                    key=key,
-                    message=signals[places[0]].message,
-                    length=signals[places[0]].length,
-                    conditions=conditions,
-                    places=tuple(places),
-                    decoders=tuple(signals[place].codec.decode for place in places),
-                    index=index,
-                    first_index=wanted.first_index,
-                )
-                for (key, conditions), places in groups.items()
-            ),
-            lowest_v=low if wanted.lowest is None else wanted.lowest,
-            highest_v=high if wanted.highest is None else wanted.highest,
-            timeout_s=wanted.timeout_s or CELL_TIMEOUT_S,
+            wanted.count,
+            wanted.first,
+            cells,
+            index,
+            wanted.first_index,
+            low if wanted.lowest is None else wanted.lowest,
+            high if wanted.highest is None else wanted.highest,
+            wanted.timeout_s or CELL_TIMEOUT_S,
         )
 
     def _in_first(self, find: Callable[[Database, Path], _T]) -> tuple[_T, Path]:

@@ -12,9 +12,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from cangauge._formatting import number, significant
-from cangauge._io import check_writable, write_text_atomic
+from cangauge._extras import extra
+from cangauge._files import check_writable, write_text_atomic
 from cangauge._resources import shared_file
+from cangauge._text import number, significant
 from cangauge.cli.options import JsonOption
 from cangauge.cli.output import emit_json, note, print_table
 from cangauge.errors import CangaugeError, InputError
@@ -52,8 +53,6 @@ def demo_command(
     from cangauge.bus.vehicle import Vehicle
     from cangauge.estimation.offline import estimate_log, score
     from cangauge.estimation.settings import EstimatorSettings
-    from cangauge.extras.report.estimate import estimate_report
-    from cangauge.extras.report.fit import fit_report
     from cangauge.identify.fit import fit
     from cangauge.logs.read import read_log
     from cangauge.replay.steps import quantization_bound
@@ -77,7 +76,7 @@ def demo_command(
     note("1/4  fit the voltage model to 2.6 h of the reconstructed Leaf test")
     identification = fit([read_log(shared_file("replay", TRAINED_ON))])
     identification.model.save(model_path)
-    write_text_atomic(fit_page, fit_report(identification))
+    write_text_atomic(fit_page, extra("report.fit:fit_report")(identification))
     note("2/4  replay another 2.6 h on the bus at full speed, and estimate its SoC live")
     port = _free_port() if os.name == "posix" else None
     if port is not None:
@@ -94,7 +93,7 @@ def demo_command(
     bound = quantization_bound(Vehicle.load("generic"), model, log).ekf_pct
     note("4/4  write the pages")
     estimate = RecordedEstimate(log, table, live, model, settings)
-    write_text_atomic(soc_page, estimate_report(estimate, model_path))
+    write_text_atomic(soc_page, extra("report.estimate:estimate_report")(estimate, model_path))
     result = _result(identification, live, difference, bound)
     result |= {
         "seconds": time.monotonic() - began,

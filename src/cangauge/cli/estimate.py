@@ -11,8 +11,9 @@ from typing import TYPE_CHECKING, Annotated, get_args
 import typer
 from rich.progress import Progress
 
-from cangauge._formatting import number
-from cangauge._io import atomic_path
+from cangauge._extras import extra
+from cangauge._files import atomic_path
+from cangauge._text import number
 from cangauge.cli.options import (
     JsonOption,
     Reading,
@@ -204,19 +205,15 @@ def _write_output(
     done: RecordedEstimate, output: Path, report: Path | None, model_path: Path
 ) -> None:
     """Write table and report, or neither."""
-    from cangauge.extras.formats.estimate_mcap import write_estimates_mcap
     from cangauge.service.estimate_table import write_estimates
 
     page = None
     if report is not None:
-        # bokeh takes half a second to import.
-        from cangauge.extras.report.estimate import estimate_report
-
-        page = estimate_report(done, model_path)
+        page = extra("report.estimate:estimate_report")(done, model_path)
     with ExitStack() as both:
         part = both.enter_context(atomic_path(output))
         if _is_mcap(output):
-            write_estimates_mcap(part, done.recorded, done.table)
+            extra("formats.estimate_mcap:write_estimates_mcap")(part, done.recorded, done.table)
         else:
             write_estimates(part, done.recorded.time_s, done.table)
         if report is not None and page is not None:

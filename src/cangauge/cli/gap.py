@@ -7,8 +7,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from cangauge._formatting import printable
-from cangauge._io import write_texts_atomic
+from cangauge._extras import extra
+from cangauge._files import write_texts_atomic
+from cangauge._text import printable
 from cangauge.cli.options import (
     JsonOption,
     Reading,
@@ -183,7 +184,7 @@ def gap_command(  # noqa: PLR0917 - typer passes options by name
     if extended is not None:
         texts[extended] = found.extended_model.to_json()
     if report is not None:
-        texts[report] = _page(found, model, steps)
+        texts[report] = extra("report.diagnosis:gap_report")(found, model, steps)
     write_texts_atomic(texts)
     if json_output:
         result = found.to_json(None if extended is None else str(extended))
@@ -213,14 +214,6 @@ def _note_differences(logs: list[Log], capacity_ah: float) -> None:
     for log in logs:
         if (difference := difference_from_reference(log, capacity_ah)) is not None:
             note(f"warning: {difference}")
-
-
-def _page(found: Diagnosis, model: Path | None, steps: Plan | None) -> str:
-    # bokeh takes half a second to import.
-    from cangauge.extras.report.diagnosis import gap_report
-    from cangauge.extras.report.page import InputFile
-
-    return gap_report(found, InputFile.of_model(found.model, model), steps)
 
 
 def _model(path: Path | None, options: SimulatorOptions) -> Model | None:
@@ -263,7 +256,7 @@ def _long_enough(log: Log) -> Log:
 
 
 def _show(found: Diagnosis, before: Diagnosis | None, steps: Plan | None) -> None:
-    from cangauge.extras.report.summary import SHOWN, candidate_rows, plan_rows
+    from cangauge.diagnosis.summary import SHOWN, candidate_rows, plan_rows
 
     for line in found.summary.splitlines():
         typer.echo(printable(line))

@@ -11,7 +11,8 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from cangauge._io import write_texts_atomic
+from cangauge._extras import extra
+from cangauge._files import write_texts_atomic
 from cangauge.cli.options import (
     JsonOption,
     Reading,
@@ -125,10 +126,7 @@ def inspect_command(
 def _write_report(path: Path | None, found: LogInspection, log: Log) -> None:
     if path is None:
         return
-    # bokeh takes half a second to import.
-    from cangauge.extras.report.inspection import inspect_report
-
-    write_texts_atomic({path: inspect_report(found, log)})
+    write_texts_atomic({path: extra("report.inspection:inspect_report")(found, log)})
     note(f"report: {path}")
 
 

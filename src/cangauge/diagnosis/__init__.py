@@ -9,6 +9,7 @@ Modules, from the bottom up:
 =========  ====================================================================================
 pack_fit   1 Hz signals; curve and structure of a pack by a ridge fit of the references
 trials     every effect: undone at a size, and as a column
+columns    columns of one log on the rows that count, and their products
 evidence   what references show; evidence, size and remaining error of every effect
 answer     one posterior of none, unknown and the library; groups, names, what to check
 extended   the cause as parameters of the model's effects; the extended model, judged

@@ -24,7 +24,8 @@ import numpy as np
 from scipy.special import logsumexp
 
 from cangauge._typing import FloatArray
-from cangauge.diagnosis.evidence import PLACES, Evidence, References
+from cangauge.diagnosis.columns import PLACES
+from cangauge.diagnosis.evidence import Evidence, References
 from cangauge.diagnosis.trials import STEP
 
 NONE: Final = "none"
@@ -80,7 +81,7 @@ CHECKS: Final[Mapping[str, str]] = {
 
 ALARM: Final = 0.05
 """Probability of `none` up to which a gap is reported. With every data set held out, 1 of 95
-healthy logs raised an alarm at it (../docs)."""
+healthy logs raised an alarm at it (docs/diagnosis.md)."""
 
 STATED: Final = 0.8
 """Part of the library from which one group is stated; else two. Groups with as much were right in

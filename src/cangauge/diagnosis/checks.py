@@ -35,6 +35,7 @@ def check_logs(logs: Sequence[Log], references: Sequence[Log], model: Model) -> 
     """Raise InputError for logs that cannot be diagnosed, or not with these references."""
     if not logs:
         raise InputError("no log to diagnose", field="logs", cure="give at least one log")
+    usual = model.extended_model().pack.voltage_v
     for log in (*logs, *references):
         where = log.source or log.name
         if log.duration_s < SHORTEST_S:
@@ -49,26 +50,19 @@ def check_logs(logs: Sequence[Log], references: Sequence[Log], model: Model) -> 
             if np.ptp(values) == 0.0:
                 raise InputError(
                     f"constant for {log.duration_s / 60.0:.0f} min: no diagnosis is possible",
-                    source=where,
-                    field=channel,
-                    value=f"{values[0]:g} {unit}",
+                    source=where, field=channel, value=f"{values[0]:g} {unit}",
                     cure="check the signal, or give a log in which the pack is used",
-                )
-        usual = model.extended_model().pack.voltage_v
+                )  # fmt: skip
         median = float(np.median(log.voltage_v))
         if not LEAST_PART * usual <= median <= MOST_PART * usual:
             raise InputError(
                 f"this log is of another pack: the model's has about {usual:.3g} V",
-                source=where,
-                field="voltage_v",
-                value=round(median, 1),
+                source=where, field="voltage_v", value=round(median, 1),
                 cure="use the model of this pack",
-            )
+            )  # fmt: skip
         _check_count(log, model.capacity_ah)
     for one, other in itertools.combinations((*logs, *references), 2):
-        if np.array_equal(one.current_a, other.current_a) and np.array_equal(
-            one.voltage_v, other.voltage_v
-        ):
+        if all(np.array_equal(getattr(one, k), getattr(other, k)) for k in _MEASURED):
             raise InputError(
                 f"same rows as {other.source or other.name}: they would count twice",
                 source=one.source or one.name,
@@ -76,22 +70,26 @@ def check_logs(logs: Sequence[Log], references: Sequence[Log], model: Model) -> 
             )
 
 
+_MEASURED: Final = ("current_a", "voltage_v")
+
+
 def _check_count(log: Log, capacity_ah: float) -> None:
     """Raise InputError if no start explains a log whose counted SoC leaves 0–100 %."""
     out = 100.0 * discharged_ah(log.time_s, log.current_a) / capacity_ah
     first = log.first_soc()
     start = 50.0 if first is None else first[1] + float(out[first[0]])
-    soc, span = start - out, float(np.ptp(out))
-    beyond = soc.min() < -COUNT_TOLERANCE_PCT or soc.max() > 100.0 + COUNT_TOLERANCE_PCT
-    if not beyond or (first is None and span <= MOST_COUNTED_PCT):
+    low, high = start - float(out.max()), start - float(out.min())
+    within = low >= -COUNT_TOLERANCE_PCT and high <= 100.0 + COUNT_TOLERANCE_PCT
+    too_much = high - low > MOST_COUNTED_PCT
+    if within or (first is None and not too_much):
         return
     # As the SoC rises so does the voltage, whatever the start.
-    backwards = np.corrcoef(soc, log.voltage_v)[0, 1] < 0.0
-    if span > MOST_COUNTED_PCT or backwards:
+    backwards = np.corrcoef(-out, log.voltage_v)[0, 1] < 0.0
+    if too_much or backwards:
         reason = "the voltage moves the other way" if backwards else "no start explains it"
         raise InputError(
-            f"the SoC counted with {capacity_ah:.2f} Ah runs from {soc.max():.1f} to"
-            f" {soc.min():.1f} %: {reason}",
+            f"the SoC counted with {capacity_ah:.2f} Ah runs from {high:.1f} to {low:.1f} %:"
+            f" {reason}",
             source=log.source or log.name,
             field="soc_pct",
             cure="check --capacity-ah and the sign of current (positive must discharge; see"

@@ -8,25 +8,29 @@ import math
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache, cached_property
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from threadpoolctl import ThreadpoolController
 
-from cangauge._display import figure, html
-from cangauge._io import file_sha256
+from cangauge._extras import extra
+from cangauge._files import file_sha256
 from cangauge.diagnosis import sentences
 from cangauge.diagnosis.answer import ALARM, GROUP_OF, UNKNOWN, Posterior, answer
 from cangauge.diagnosis.checks import check_logs
-from cangauge.diagnosis.evidence import Columns, Evidence, References, analyse, columns, learn
+from cangauge.diagnosis.columns import Columns
+from cangauge.diagnosis.evidence import Evidence, References, analyse, columns, learn
 from cangauge.diagnosis.extended import Extension, Quantity, residual_v
 from cangauge.diagnosis.pack_fit import Trace, trace
 from cangauge.diagnosis.simulator import Simulation, SimulatorGap, correction, simulator_gap
+from cangauge.diagnosis.summary import diagnosis_html
 from cangauge.diagnosis.where import ErrorShare, LogErrors, drawn_sums, error_shares, pieces, rms
 from cangauge.errors import InputError
 from cangauge.estimation.offline import estimate
 from cangauge.identify.starts import start_by_model
 from cangauge.logs.log import Log
+from cangauge.logs.read import as_log
 from cangauge.model.model_file import Model
 
 _LOG = logging.getLogger(__name__)
@@ -324,11 +328,13 @@ class Diagnosis:
 
     def plot(self) -> Any:
         """Return the probabilities of the causes as bars, for `bokeh.plotting.show`."""
-        return figure("diagnosis_figure", self)
+        return extra("report.figures:diagnosis_figure")(self)
 
     def _repr_html_(self) -> str:
         """Return the answer for a notebook."""
-        return html("diagnosis_html", self)
+        from cangauge.diagnosis.summary import diagnosis_html  # noqa: PLC0415 - needs this module
+
+        return diagnosis_html(self)
 
     def to_json(
         self, extended_model: str | None = None, *, soc_error: bool = True
@@ -398,9 +404,9 @@ def _files(logs: Sequence[Log]) -> list[dict[str, Any]]:
 
 
 def diagnose(
-    logs: Sequence[Log],
-    model: Model | None = None,
-    references: Sequence[Log] | References = (),
+    logs: Any,
+    model: Any = None,
+    references: Any = (),
     *,
     simulation: Simulation | None = None,
     capacity_ah: float | None = None,
@@ -412,11 +418,11 @@ def diagnose(
 
     Parameters
     ----------
-    logs : sequence of Log
+    logs : Log, path or DataFrame, or a sequence of these
         Logs with a gap, which share one cause; at least 5 min each, better half an hour.
-    model : Model, optional
-        Model of this pack, from `fit` or a model file; not needed for a simulation.
-    references : sequence of Log, or References
+    model : Model, path or result of `fit`, optional
+        Model of this pack; not needed for a simulation.
+    references : sequence of Log, path or DataFrame; or References
         Logs without the fault, at least three for reliable probabilities. For many diagnoses with
         the same references: what `learn_references` returns.
     simulation : function or pybamm.Simulation, optional
@@ -440,18 +446,18 @@ def diagnose(
 
     Examples
     --------
-    >>> from cangauge import Model, diagnose, read_log
+    >>> from cangauge import diagnose
     >>> found = diagnose(
-    ...     logs=[read_log("monday.csv")],
-    ...     model=Model.load("pack.json"),
-    ...     references=[read_log(f"reference{k}.csv") for k in (1, 2, 3)],
+    ...     logs=["monday.csv"],
+    ...     model="pack.json",
+    ...     references=["reference1.csv", "reference2.csv", "reference3.csv"],
     ... )  # doctest: +SKIP
     >>> print(found.headline)  # doctest: +SKIP
     The current reads 3.0 A (2.7 … 3.3) too high (current_offset, 71 %).
     """
     with _one_thread():
-        own = () if isinstance(references, References) else tuple(references)
-        simulator = None
+        logs, model, simulator = _as_logs(logs), _as_model(model), None
+        own = () if isinstance(references, References) else _as_logs(references)
         if simulation is not None:
             simulator = simulator_gap(logs, own, simulation, model, capacity_ah)
             logs, own, model = simulator.logs, simulator.references, simulator.model
@@ -470,7 +476,7 @@ def diagnose(
         of_logs = tuple(columns(known, log) for log in traces)
         evidence = analyse(known, of_logs)
         found = Diagnosis(
-            logs=tuple(logs),
+            logs=logs,
             references=own,
             model=model,
             known=known,
@@ -484,6 +490,16 @@ def diagnose(
         _LOG.info("judging on held-out rows")
         found.candidates  # noqa: B018 - computed here, on one thread
         return found
+
+
+def _as_logs(logs: Any) -> tuple[Log, ...]:
+    return tuple(as_log(log) for log in (logs if isinstance(logs, list | tuple) else [logs]))
+
+
+def _as_model(model: Any) -> Model | None:
+    """Return the model of a model, a path or the result of a fit; None of nothing."""
+    found = Model.load(model) if isinstance(model, str | Path) else model
+    return getattr(found, "model", found)
 
 
 def learn_references(references: Sequence[Log], model: Model) -> References:

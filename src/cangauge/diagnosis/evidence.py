@@ -25,27 +25,22 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import log_ndtr, logsumexp
 
-from cangauge._typing import BoolArray, FloatArray, IntArray
-from cangauge.diagnosis.pack_fit import PackFit, Trace, fit_pack, hats
-from cangauge.diagnosis.trials import (
-    STEP,
-    Trial,
-    additive_column,
-    healthy_columns,
-    library,
-    residual,
-    slope,
-    undone,
+from cangauge._typing import FloatArray, IntArray
+from cangauge.diagnosis.columns import (
+    FOLDS,
+    PLACES,
+    Columns,
+    all_columns,
+    on_rows,
+    rows_that_count,
+    shared_columns,
+    squares,
+    without_own,
 )
-
-FOLDS, BLOCK_S = 4, 240
-"""Interleaved blocks of a log that are held out in turn, and their length [s] (../docs)."""
-
-PLACES = tuple(float(part) for part in np.arange(10) / 10)
-"""Places of a resistance step, in parts of a log."""
+from cangauge.diagnosis.pack_fit import PackFit, Trace, fit_pack
+from cangauge.diagnosis.trials import STEP, Trial, library, residual, slope, undone
 
 WIDTHS = np.array([1.0, 0.3, 0.1, 0.03])
 """Equally probable widths of an amplitude's prior, in half bounds."""
@@ -56,18 +51,8 @@ RIDGE = 4.0
 VISIBLE_NATS = 6.0
 """Evidence from which an effect counts as visible [nats]: 400 to 1 for one effect."""
 
-COVER_PCT = 2.0
-"""References cover SoC this far beyond their own [%]."""
-
 COVER_K = 3.0
 """References cover temperatures this far beyond their own [K]."""
-
-MAX_OUTLIERS, OUTLIER = 5, 0.1
-"""At most so many single rows, off by this part of the voltage, are faults of a bus and left out;
-more are diagnosed."""
-
-MIN_COVERED = 0.2
-"""A log with less of its rows at SoC that references visit is judged on all of them."""
 
 UNTESTED_EXCESS = 8.0
 """Excess of an effect's evidence where fewer than two references are there to show it."""
@@ -76,98 +61,14 @@ STEPS, SHRINK, MIN_STEP, MIN_CHANGE = 5, 0.35, 1e-3, 0.03
 """Gauss–Newton steps of a re-simulated effect, the factor after one that lost evidence, and the
 steps at which it ends: in units of the bound, and relative to the size."""
 
+AFTER = 2.0
+"""A place beyond the end of a log, in parts of it: no step in it."""
+
 MIN_PLACE = 0.01
 """A step of resistance is placed this closely, in parts of its log."""
 
 RESIMULATED_PART = 0.15
 """An effect with less than this part of the best one's evidence is not re-simulated."""
-
-
-@dataclass(frozen=True, eq=False)
-class Columns:
-    """Columns of one log on the rows that count, and their products."""
-
-    log: Trace
-    rows: IntArray
-    """Rows of the trace that count, shape (m,)."""
-    x: FloatArray
-    """Shared structure, shape (m, p)."""
-    b: FloatArray
-    """What a healthy log may differ by, shape (m, 12)."""
-    r: FloatArray
-    """Measured minus modelled voltage [V], shape (m,)."""
-    parts: FloatArray
-    """Products of (x, b, effects, r) in each set of blocks, shape (folds, k, k)."""
-
-    @property
-    def products(self) -> FloatArray:
-        """Products on all rows, shape (k, k)."""
-        return np.asarray(self.parts.sum(axis=0))
-
-    @property
-    def fold(self) -> IntArray:
-        """Set of blocks of each row that counts, shape (m,)."""
-        return self.rows // BLOCK_S % FOLDS
-
-
-def soc_covered(pack: PackFit, log: Trace, others: Sequence[Trace]) -> BoolArray:
-    """Return the rows whose SoC other logs visit, all without other logs, shape (n,)."""
-    s, covered = pack.soc(log), np.full(len(log.current_a), not others)
-    for other in others:
-        visited = pack.soc(other)
-        covered |= (s >= visited.min() - COVER_PCT) & (s <= visited.max() + COVER_PCT)
-    return covered
-
-
-def rows_that_count(pack: PackFit, log: Trace, others: Sequence[Trace], r: FloatArray) -> IntArray:
-    """Return measured rows whose SoC other logs visit; all measured rows if those are few.
-
-    Parameters
-    ----------
-    pack : PackFit
-    log : Trace
-    others : sequence of Trace
-    r : array of shape (n,)
-        Residual, for single rows that no pack can have produced [V].
-    """
-    covered = log.measured & soc_covered(pack, log, others)
-    if covered.sum() < MIN_COVERED * log.measured.sum():
-        covered = log.measured.copy()
-    outliers = np.flatnonzero(np.abs(r - np.median(r)) > OUTLIER * pack.volts)
-    if 0 < outliers.size <= MAX_OUTLIERS:
-        covered[outliers] = False
-    return np.flatnonzero(covered)
-
-
-def shared_columns(pack: PackFit, log: Trace) -> FloatArray:
-    """Return the columns of θ on all rows of a log, shape (n, p)."""
-    s = pack.soc(log)
-    return np.column_stack([hats(s), pack.structure(log.current_a, s, log.temperature_c)])
-
-
-def _all_columns(pack: PackFit, log: Trace, trials: Sequence[Trial]) -> list[FloatArray]:
-    """Return x, b, effects in units of their bounds, and r on all rows of a log."""
-    r = residual(pack, log)
-    effects = [slope(pack, log, trial, 0.0, r) * trial.bound for trial in trials]
-    effects += [
-        additive_column(pack, log, replace(STEP, shape=place)) * STEP.bound for place in PLACES
-    ]
-    return [
-        shared_columns(pack, log),
-        healthy_columns(pack, log, r),
-        np.column_stack(effects),
-        r[:, None],
-    ]
-
-
-def _on_rows(
-    log: Trace, columns: Sequence[FloatArray], rows: IntArray, folds: int = FOLDS
-) -> Columns:
-    """Return the columns of a log on some rows; in one part for a reference, never held out."""
-    x, b, _, r = (part[rows] for part in columns)
-    every, fold = np.concatenate(columns, axis=1)[rows], rows // BLOCK_S % folds
-    blocks = [every[fold == k] for k in range(folds)] if folds > 1 else [every]
-    return Columns(log, rows, x, b, r[:, 0], np.array([block.T @ block for block in blocks]))
 
 
 @dataclass(frozen=True)
@@ -198,8 +99,6 @@ class Evidence:
     effects: dict[str, EffectEvidence]
     gap_v2: float
     """Mean square error with the structure of the references [V²]."""
-    rows: int
-    logs: int
 
 
 @dataclass(frozen=True, eq=False)
@@ -261,9 +160,6 @@ def learn(
 ) -> References:
     """Learn structure, noise and healthy evidence from reference logs.
 
-    The structure is linearised twice, the second time about what the references show: an effect
-    that moves the SoC would meet the correction of another SoC otherwise.
-
     Parameters
     ----------
     references : sequence of Trace
@@ -273,14 +169,10 @@ def learn(
         Error that the model file states [V]: the floor with fewer than two references.
     """
     pack = fit_pack(references, capacity_ah)
-    full, out = _of_references(pack, references, ())
-    s2 = _noise_v2(pack, full)
-    p = _prior(pack, full, out, s2)
-    pack = pack.moved(np.linalg.solve(*_normal(pack, p, _marginal(full, s2))))
-
     trials = library(pack)
     full, out = _of_references(pack, references, trials)
     s2 = _noise_v2(pack, full)
+    p = _prior(pack, full, out, s2)
     if len(references) < 2:
         s2 = max(s2, stated_rmse_v**2)
     else:
@@ -307,12 +199,12 @@ def _of_references(
     """Return each reference on all its rows, and on those whose SoC the others visit."""
     full, out = [], []
     for k, log in enumerate(references):
-        every = _all_columns(pack, log, trials)
+        every = all_columns(pack, log, trials)
         others, r = [*references[:k], *references[k + 1 :]], every[-1][:, 0]
         own, covered = (rows_that_count(pack, log, some, r) for some in ([], others))
-        full.append(_on_rows(log, every, own, folds=1))
+        full.append(on_rows(log, every, own, folds=1))
         same = len(own) == len(covered)
-        out.append(full[-1] if same else _on_rows(log, every, covered, folds=1))
+        out.append(full[-1] if same else on_rows(log, every, covered, folds=1))
     return full, out
 
 
@@ -361,29 +253,9 @@ def _prior(pack: PackFit, full: Sequence[Columns], out: Sequence[Columns], s2: f
 
 def columns(known: References, log: Trace) -> Columns:
     """Return the columns of a log on the rows whose SoC the references visit."""
-    every = _all_columns(known.pack, log, known.trials)
+    every = all_columns(known.pack, log, known.trials)
     r = every[-1][:, 0]
-    return _on_rows(log, every, rows_that_count(known.pack, log, known.logs, r))
-
-
-def without_own(products: FloatArray, log: Columns, s2: float) -> FloatArray:
-    """Return products / s² of (x, effects, r) with the log's own deviations integrated out."""
-    nx, nb = log.x.shape[1], log.b.shape[1]
-    g, own = products / s2, slice(nx, nx + nb)
-    others = np.r_[0:nx, nx + nb : len(g)]
-    z = np.linalg.solve(np.linalg.cholesky(g[own, own] + np.eye(nb)), g[own][:, others])
-    return np.asarray(g[np.ix_(others, others)] - z.T @ z, dtype=np.float64)
-
-
-def squares(
-    log: Columns, theta: NDArray[np.floating], column: int | None = None, a: float = 0.0
-) -> float:
-    """Return a log's sum of squares [V²] with θ and an effect's column; b remains in it."""
-    w = np.zeros(log.parts.shape[1])
-    w[: len(theta)], w[-1] = -theta, 1.0
-    if column is not None:
-        w[len(theta) + log.b.shape[1] + column] = -a
-    return float(w @ log.products @ w)
+    return on_rows(log, every, rows_that_count(known.pack, log, known.logs, r))
 
 
 def bounded_evidence(g: FloatArray, s: FloatArray, low: FloatArray, high: FloatArray) -> FloatArray:
@@ -453,8 +325,10 @@ def analyse(known: References, logs: Sequence[Columns], *, exact: bool = True) -
         places = tuple(_place(known, place[top]) for place in at) if name == STEP.effect else ()
         if exact and gain[top] > RESIMULATED_PART * gain.max():
             if _needs_resimulation(trial):
-                start = trial.number / trial.bound if trial.effect == "time_skew" else 0.0
-                amplitude, nats, left_v2 = _resimulated(known, logs, trial, start or amplitude)
+                starts = [amplitude, low[top] / 3.0, high[top] / 3.0]
+                if trial.effect == "time_skew" and trial.shape:
+                    starts = [trial.number / trial.bound]
+                amplitude, nats, left_v2 = _resimulated(known, logs, trial, starts)
             elif places:
                 places, amplitude, nats, left_v2 = _step_refined(known, logs, places)
         if left_v2 is None:
@@ -478,7 +352,7 @@ def analyse(known: References, logs: Sequence[Columns], *, exact: bool = True) -
             in_logs=places,
         )  # fmt: skip
     before = np.linalg.solve(known.a, known.b)
-    return Evidence(result, sum(squares(log, before) for log in logs) / rows, rows, len(logs))
+    return Evidence(result, sum(squares(log, before) for log in logs) / rows)
 
 
 def _tried(known: References, logs: int) -> tuple[list[Trial], list[IntArray]]:
@@ -515,7 +389,7 @@ def _step_refined(
     def fitted(place: float) -> tuple[float, float, float]:
         tried = [None if k < first else place if k == first else 0.0 for k in range(len(logs))]
         products = [
-            at_size(known, log, replace(STEP, shape=2.0 if x is None else x), 0.0).sum(axis=0)
+            at_size(known, log, replace(STEP, shape=AFTER if x is None else x), 0.0).sum(axis=0)
             for log, x in zip(logs, tried, strict=True)
         ]
         one = _OneEffect.of(known, logs, products)
@@ -596,38 +470,44 @@ class _OneEffect:
 
 
 def _resimulated(
-    known: References, logs: Sequence[Columns], trial: Trial, start: float
+    known: References, logs: Sequence[Columns], trial: Trial, starts: Sequence[float]
 ) -> tuple[float, float, float | None]:
-    """Return size [bounds], gain [nats] and remaining error [V²] of an effect, re-simulated."""
+    """Return size [bounds], gain [nats] and remaining error [V²] of an effect, re-simulated.
+
+    From the best of several sizes, since a large one may lie beyond a bend of the curve.
+    """
     low, high = trial.low / trial.bound, trial.high / trial.bound
-    zero = _OneEffect.of(known, logs, [at_size(known, log, trial, 0.0).sum(axis=0) for log in logs])
-    size, gain, left_v2, step = 0.0, 0.0, None, start
+    rows = sum(len(log.rows) for log in logs)
+
+    def fitted(size: float) -> tuple[_OneEffect, float]:
+        products = [at_size(known, log, trial, size).sum(axis=0) for log in logs]
+        one = _OneEffect.of(known, logs, products)
+        w = np.concatenate([-one.theta, np.zeros(logs[0].b.shape[1] + 1), [1.0]])
+        return one, float(sum(w @ z @ w for z in products)) / rows
+
+    size, (here, _) = 0.0, fitted(0.0)
+    chi2_without, left_v2 = here.chi2, None
+    tried = {start: fitted(start) for start in starts if abs(start) >= MIN_STEP}
+    step = min(tried, key=lambda start: tried[start][0].chi2, default=0.0)
     for _ in range(STEPS):
         if abs(step) < MIN_STEP:
             break
-        products = [at_size(known, log, trial, size + step).sum(axis=0) for log in logs]
-        here = _OneEffect.of(known, logs, products)
-        better = 0.5 * (zero.chi2 - here.chi2)
-        if better <= gain:
+        there, left_there = tried.get(size + step) or fitted(size + step)
+        if there.chi2 >= here.chi2:
             step *= SHRINK
             continue
-        size, gain = size + step, better
-        w = np.concatenate([-here.theta, np.zeros(logs[0].b.shape[1] + 1), [1.0]])
-        left_v2 = float(sum(w @ z @ w for z in products)) / sum(len(log.rows) for log in logs)
+        size, here, left_v2 = size + step, there, left_there
         change = (here.gradient - RIDGE * size) / (here.curvature + RIDGE)
         step = float(np.clip(size + change, low, high)) - size
         if abs(step) < MIN_CHANGE * abs(size):
             break
-    return size, gain, left_v2
+    return size, 0.5 * (chi2_without - here.chi2), left_v2
 
 
 def held_out_sizes(
     known: References, logs: Sequence[Columns], evidence: EffectEvidence
 ) -> list[FloatArray]:
-    """Return the size of an effect for each row, found without that row's part of the data.
-
-    The part is the row's log; a set of blocks, where there is only one log or the effect happens
-    at one moment.
+    """Return the size of an effect for each row, found without the row's set of blocks.
 
     Returns
     -------
@@ -636,27 +516,12 @@ def held_out_sizes(
     """
     trial, size = evidence.trial, evidence.size / evidence.trial.bound
     low, high = trial.low / trial.bound, trial.high / trial.bound
-    places = evidence.in_logs or (trial.shape,) * len(logs)
-    parts = [
-        at_size(known, log, replace(trial, shape=1.0 if place is None else place), size)
-        if evidence.in_logs
-        else at_size(known, log, trial, size)
-        for log, place in zip(logs, places, strict=True)
-    ]
-
-    def size_of(kept: Sequence[FloatArray], of: Sequence[Columns]) -> float:
-        one = _OneEffect.of(known, of, kept)
+    places = [AFTER if place is None else place for place in evidence.in_logs]
+    trials = [replace(trial, shape=place) for place in places] or [trial] * len(logs)
+    parts = [at_size(known, log, own, size) for log, own in zip(logs, trials, strict=True)]
+    sizes = []
+    for k in range(FOLDS):
+        one = _OneEffect.of(known, logs, [z.sum(axis=0) - z[k] for z in parts])
         change = (one.gradient - RIDGE * size) / (one.curvature + RIDGE)
-        return float(np.clip(size + change, low, high)) * trial.bound
-
-    whole = [z.sum(axis=0) for z in parts]
-    if len(logs) > 1 and not evidence.in_logs:
-        return [
-            np.full(len(log.rows), size_of(whole[:k] + whole[k + 1 :], [*logs[:k], *logs[k + 1 :]]))
-            for k, log in enumerate(logs)
-        ]
-    sizes = np.array([
-        size_of([z - z_part[k] for z, z_part in zip(whole, parts, strict=True)], logs)
-        for k in range(FOLDS)
-    ])  # fmt: skip
-    return [sizes[log.fold] for log in logs]
+        sizes.append(float(np.clip(size + change, low, high)) * trial.bound)
+    return [np.array(sizes)[log.fold] for log in logs]

@@ -15,13 +15,8 @@ import numpy as np
 
 from cangauge._typing import BoolArray, FloatArray
 from cangauge._version import __version__
-from cangauge.diagnosis.evidence import (
-    Columns,
-    EffectEvidence,
-    References,
-    held_out_sizes,
-    soc_covered,
-)
+from cangauge.diagnosis.columns import Columns, soc_covered
+from cangauge.diagnosis.evidence import EffectEvidence, References, held_out_sizes
 from cangauge.diagnosis.pack_fit import Trace
 from cangauge.diagnosis.trials import additive_column, undone
 from cangauge.model.effects.base import BOUND_MARGIN, Signals, Values

@@ -15,7 +15,8 @@ from typing import Any, Final
 import numpy as np
 
 from cangauge.diagnosis.answer import NONE, UNKNOWN, Posterior, answer
-from cangauge.diagnosis.evidence import Columns, Evidence, References, analyse, columns
+from cangauge.diagnosis.columns import Columns
+from cangauge.diagnosis.evidence import Evidence, References, analyse, columns
 from cangauge.diagnosis.pack_fit import PackFit, Trace, lagged
 from cangauge.diagnosis.trials import (
     STEP,

@@ -14,7 +14,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from cangauge._formatting import significant
+from cangauge._text import significant
 from cangauge._typing import FloatArray
 from cangauge.errors import InputError
 from cangauge.identify.fit import fit
@@ -76,20 +76,12 @@ def simulated_v(simulation: Simulation, log: Log) -> FloatArray:
             " initial_soc_pct)",
         ) from error
     volts = np.asarray(volts, dtype=np.float64)
-    if volts.shape != log.time_s.shape:
+    if volts.shape != log.time_s.shape or not np.isfinite(volts).all():
+        bad = "" if volts.shape != log.time_s.shape else " with values that are not finite"
         raise InputError(
-            f"the simulator returned shape {volts.shape} for {len(log)} rows",
+            f"the simulator returned shape {volts.shape}{bad} for {len(log)} rows",
             source=where,
-            cure="return one voltage [V] for each time",
-        )
-    bad = np.flatnonzero(~np.isfinite(volts))
-    if bad.size:
-        raise InputError(
-            f"{bad.size} of {volts.size} simulated voltages are not finite, the first in row"
-            f" {bad[0] + 1}",
-            source=where,
-            value=float(volts[bad[0]]),
-            cure="end the log before the simulator stops, or simulate it whole",
+            cure="return one voltage [V] for each time; end the log before the simulator stops",
         )
     return volts
 
@@ -194,17 +186,14 @@ def simulator_gap(
 def _level_remark(logs: Sequence[Log], volts: Sequence[FloatArray], number: int) -> str:
     """Return where a simulator is off everywhere, which comes before any cause; "" else."""
     gaps = [log.voltage_v - each for log, each in zip(logs, volts, strict=True)]
-    text = ""
-    for some, where in ((gaps[number:], "on the references too"), (gaps[:number], "")):
-        if not some or text:
-            continue
-        whole = np.concatenate(some)
+    for some, where in ((gaps[number:], ", on the references too"), (gaps[:number], "")):
+        whole = np.concatenate(some) if some else np.zeros(1)
         mean, varies = float(whole.mean()), float(whole.std())
         if abs(mean) > max(LEVEL_PART * float(np.mean(logs[0].voltage_v)), varies):
-            text = (
+            return (
                 f"The simulator is {significant(abs(mean), 2, 'V')}"
-                f" {'too low' if mean > 0.0 else 'too high'} everywhere{where and f', {where}'};"
-                f" only {significant(varies, 2, 'V')} vary about that. Correct its level first: the"
+                f" {'too low' if mean > 0.0 else 'too high'} everywhere{where}; only"
+                f" {significant(varies, 2, 'V')} vary about that. Correct its level first: the"
                 " open-circuit voltage, the number of cells or the initial SoC."
             )
-    return text
+    return ""

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
+from scipy.ndimage import uniform_filter1d
 
 from cangauge._typing import BoolArray, FloatArray, IntArray
 
@@ -59,14 +60,9 @@ class ErrorShare:
 
     def to_dict(self) -> dict[str, object]:
         """Return the entry of `where` in `gap --json`."""
-        return {
-            "axis": self.axis,
-            "range": [self.low, self.high],
-            "unit": self.unit,
-            "share": self.share,
-            "rmse_v": self.rmse_v,
-            "ci": list(self.ci),
-        }
+        ends, ci = [self.low, self.high], list(self.ci)
+        return {"axis": self.axis, "range": ends, "unit": self.unit, "share": self.share,
+                "rmse_v": self.rmse_v, "ci": ci}  # fmt: skip
 
 
 def rms(logs: Sequence[LogErrors], *, after: bool = False) -> float:
@@ -101,28 +97,31 @@ def error_shares(logs: Sequence[LogErrors], capacity_ah: float) -> list[ErrorSha
     capacity_ah : float
         Defines rest [Ah].
     """
-    square, piece = np.concatenate([log.before_v for log in logs]) ** 2, pieces(logs)
-    shares = []
-
-    def add(  # noqa: PLR0917
-        axis: str, limits: tuple[float, float], unit: str, part: FloatArray, whole: FloatArray,
-        rows: int,
-    ) -> None:  # fmt: skip
+    piece, shares = pieces(logs), []
+    square = np.concatenate([log.before_v for log in logs]) ** 2
+    parts = [
+        (axis, unit, limits, square * inside, square, inside)
+        for axis, unit, values, edges in _axes(logs, capacity_ah)
+        for limits in itertools.pairwise(edges.tolist())
+        if (inside := _inside(values, *limits, last=limits[1] >= edges[-1])).any()
+    ]
+    bands = [np.concatenate(each) ** 2 for each in zip(*map(_bands, logs), strict=True)]
+    every, total = np.ones(square.size, dtype=bool), np.sum(bands, axis=0)
+    parts += [
+        ("timescale", "s", limits, band, total, every)
+        for limits, band in zip(itertools.pairwise(TIME_SCALES_S), bands, strict=True)
+    ]
+    for axis, unit, limits, part, whole, rows in parts:
         drawn_part, drawn_whole = drawn_sums(piece, part, whole)
         low, high = np.quantile(drawn_part / np.maximum(drawn_whole, 1e-12), [0.025, 0.975])
         share = float(part.sum() / max(float(whole.sum()), 1e-12))
-        rms_v = float(np.sqrt(part.sum() / rows))
+        rms_v = float(np.sqrt(part.sum() / rows.sum()))
         shares.append(ErrorShare(axis, *limits, unit, share, rms_v, (float(low), float(high))))
-
-    for axis, unit, values, edges in _axes(logs, capacity_ah):
-        for low, high in itertools.pairwise(edges.tolist()):
-            inside = (values >= low) & ((values < high) | (high >= edges[-1]))
-            if inside.any():
-                add(axis, (low, high), unit, square * inside, square, int(inside.sum()))
-    bands = [np.concatenate(parts) ** 2 for parts in zip(*map(_bands, logs), strict=True)]
-    for limits, band in zip(itertools.pairwise(TIME_SCALES_S), bands, strict=True):
-        add("timescale", limits, "s", band, np.sum(bands, axis=0), band.size)
     return shares
+
+
+def _inside(values: FloatArray, low: float, high: float, *, last: bool) -> BoolArray:
+    return np.asarray((values >= low) & ((values < high) | last))
 
 
 def _axes(
@@ -130,17 +129,16 @@ def _axes(
 ) -> Iterator[tuple[str, str, FloatArray, FloatArray]]:
     """Yield name, unit, values of all rows and edges of each axis."""
     current = np.concatenate([log.current_a for log in logs])
-    yield "soc", "%", np.concatenate([log.soc_pct for log in logs]), np.linspace(-5, 105, 12)
     temperature = np.concatenate([log.temperature_c for log in logs])
+    elapsed = np.concatenate([log.time_s for log in logs])
+    yield "soc", "%", np.concatenate([log.soc_pct for log in logs]), np.linspace(-5, 105, 12)
     low = 5.0 * np.floor(temperature.min() / 5.0)
     yield "temperature", "°C", temperature, np.arange(low, max(temperature.max(), low + 0.1) + 5, 5)
-    ends = float(current.min()), float(current.max()) + 1e-9
-    inner = capacity_ah * np.array([-0.5, -REST_C_RATE, REST_C_RATE, 0.5, 1.0, 2.0])
-    inside = inner[(inner > ends[0]) & (inner < ends[1])]
-    yield "current", "A", current, np.array([ends[0], *inside, ends[1]])
+    edges = capacity_ah * np.array([-0.5, -REST_C_RATE, REST_C_RATE, 0.5, 1.0, 2.0])
+    inner = edges[(edges > current.min()) & (edges < current.max())]
+    yield "current", "A", current, np.array([current.min(), *inner, current.max()])
     resting = (np.abs(current) < REST_C_RATE * capacity_ah).astype(np.float64)
     yield "rest", "1 = rest", resting, np.array([0.0, 0.5, 1.0])
-    elapsed = np.concatenate([log.time_s for log in logs])
     yield "time", "s", elapsed, np.linspace(0.0, float(elapsed.max()) + 1e-9, 6)
 
 
@@ -148,18 +146,7 @@ def _bands(log: LogErrors) -> list[FloatArray]:
     """Return a log's error in each band of time scales, by moving averages of its rows."""
     bands, left = [], log.before_v
     for width in TIME_SCALES_S[1:-1]:
-        smooth = _moving_average(left, int(width))
+        smooth = uniform_filter1d(left, min(int(width), left.size), mode="nearest")
         bands.append(left - smooth)
         left = smooth
     return [*bands, left]
-
-
-def _moving_average(values: FloatArray, width: int) -> FloatArray:
-    """Return the mean over `width` rows around each row, fewer at the ends."""
-    sums = np.concatenate([[0.0], np.cumsum(values)])
-    row = np.arange(values.size)
-    first, after = (
-        np.maximum(row - width // 2, 0),
-        np.minimum(row + width - width // 2, values.size),
-    )
-    return np.asarray((sums[after] - sums[first]) / (after - first))

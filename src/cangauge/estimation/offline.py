@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cangauge._dataframes import ArrowExport
-from cangauge._display import figure
+from cangauge._extras import extra
 from cangauge._typing import FloatArray
 from cangauge.estimation.compiled import CompiledEstimator, make_estimator
 from cangauge.estimation.estimator import Estimator
@@ -109,7 +109,7 @@ class EstimateTable(ArrowExport):
         log : Log, optional
             Its reference SoC is drawn too.
         """
-        return figure("estimate_figure", self, log=log)
+        return extra("report.figures:estimate_figure")(self, log=log)
 
     def __len__(self) -> int:
         """Return the number of samples."""

@@ -13,9 +13,9 @@ from typing import Any, Final, Literal
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from cangauge._display import figure
-from cangauge._formatting import counted, duration, significant
-from cangauge._io import text_sha256
+from cangauge._extras import extra
+from cangauge._files import text_sha256
+from cangauge._text import counted, duration, significant
 from cangauge._typing import FloatArray
 from cangauge._version import __version__
 from cangauge.errors import InputError
@@ -176,7 +176,7 @@ class Identification:
 
     def plot(self) -> Any:
         """Return pseudo-OCV and residuals, for `bokeh.plotting.show`."""
-        return figure("fit_figure", self)
+        return extra("report.figures:fit_figure")(self)
 
     def to_dict(self) -> dict[str, object]:
         """Return the object that `cangauge fit --json` prints."""

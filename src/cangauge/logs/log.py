@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from cangauge._dataframes import ArrowExport
-from cangauge._display import figure
-from cangauge._formatting import duration
+from cangauge._extras import extra
+from cangauge._text import duration
 from cangauge._typing import BoolArray, FloatArray, IntArray
 from cangauge.errors import InputError
 from cangauge.logs.units import (
@@ -222,7 +222,7 @@ class Log(ArrowExport):
 
     def plot(self) -> Any:
         """Return current, voltage, temperature and SoC over time, for `bokeh.plotting.show`."""
-        return figure("log_figure", self)
+        return extra("report.figures:log_figure")(self)
 
     def __len__(self) -> int:
         """Return the number of rows."""

@@ -11,7 +11,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from cangauge._config import schema_error
-from cangauge._io import MAX_MODEL_BYTES, read_bounded, write_text_atomic
+from cangauge._files import MIB, read_bounded, write_text_atomic
 from cangauge._typing import FloatArray
 from cangauge.errors import InputError
 from cangauge.logs.log import Log, TemperatureSource
@@ -395,7 +395,7 @@ class Model(_Strict):
             If the file cannot be read or does not describe a usable model; names the field.
         """
         path = Path(path)
-        data = read_bounded(path, MAX_MODEL_BYTES, "a model file")
+        data = read_bounded(path, 4 * MIB, "a model file")
         try:
             raw = json.loads(data, parse_constant=_refuse_constant)
         except (ValueError, RecursionError) as error:

@@ -471,7 +471,7 @@ def _check_ids(vehicle: Vehicle, ids: FrameIds) -> None:
     published = ids.published | {ids.replay_clock: "replay_clock"}
     used = {signal.key: signal.message for signal in vehicle.signals}
     if vehicle.cells is not None:
-        used |= {group.key: group.message for group in vehicle.cells.groups}
+        used |= {cell.key: cell.message for cell in vehicle.cells.cells}
     for key, message in used.items():  # the key of an extended id is no standard id
         if key in published:
             raise InputError(

@@ -3,13 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 
-from cangauge._formatting import NONE_KNOWN, number, span
+from cangauge._text import NONE_KNOWN, number, span
 from cangauge.diagnosis import Diagnosis
 from cangauge.diagnosis.planner import Plan
+from cangauge.diagnosis.summary import (
+    EXPLAINED,
+    candidate_rows,
+    percent,
+    plan_rows,
+    visible_rows,
+)
 from cangauge.extras.report.charts import (
     BLUE,
     GREEN,
@@ -35,13 +43,6 @@ from cangauge.extras.report.page import (
     reconstruction_banners,
     render,
 )
-from cangauge.extras.report.summary import (
-    EXPLAINED,
-    candidate_rows,
-    percent,
-    plan_rows,
-    visible_rows,
-)
 
 _AXES: Final = {
     "soc": "state of charge",
@@ -56,18 +57,18 @@ _SHOWN_SHARE: Final = 0.005
 _TIMESCALES: Final = ("under 10 s", "10 to 100 s", "100 to 1000 s", "over 1000 s")
 
 
-def gap_report(found: Diagnosis, model: InputFile | None = None, plan: Plan | None = None) -> str:
+def gap_report(found: Diagnosis, model_path: Path | None = None, plan: Plan | None = None) -> str:
     """Return the diagnosis as one self-contained HTML page.
 
     Parameters
     ----------
     found : Diagnosis
-    model : InputFile, optional
-        The diagnosed model, to name it on the page.
+    model_path : Path, optional
+        The model's file, to name it by its SHA-256.
     plan : Plan, optional
         The next step.
     """
-    return render(gap_page(found, model, plan))
+    return render(gap_page(found, InputFile.of_model(found.model, model_path), plan))
 
 
 def gap_page(found: Diagnosis, model: InputFile | None = None, plan: Plan | None = None) -> Page:

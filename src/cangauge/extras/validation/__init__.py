@@ -1,27 +1,8 @@
-"""Validation: simulated truth (`twin`) and the withheld check of the diagnosis.
+"""Validation: simulated truth, and what the diagnosis finds of it.
 
-The check draws causes, withholds them, diagnoses in processes that get logs and model only, and
-scores the answers::
-
-    plan         protocols → planned cases, each with its seed
-    cases        a planned case → logs with a fault, in memory
-    recordings   recorded logs: healthy ones to inject faults into, laboratory ones with known cause
-    generation   cases → files for the diagnosis, labels for the scorer
-    worker       the diagnosing process; `worker_pool` runs several
-    check        draw, withhold, diagnose, evaluate
-    score        labels and answers → figures; `tables` prints them
-    final_seeds  seeds of the published figures
-
-The diagnosis on one's own healthy logs injects the same faults::
-
-    own_logs     every effect injected into logs of one pack, each left out in turn
-
-The estimator's bench on recorded packs is apart from it::
-
-    packs             recorded packs: logs that train models, logs that judge them
-    packs_run         models from few logs, and the other logs estimated by them in every case
-    packs_quantities  capacity, offset, power, energy and weakest cell beside what the log shows
-    packs_score       errors, σ and targets; the tables
+    twin        packs, drives and faults whose cause is known; shares nothing with what it validates
+    cases       a simulated pack with training logs and references
+    gap_check   every effect injected into healthy logs of a pack, each left out in turn
 
 The public names are those of the twin, loaded on first use.
 """

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from html import escape
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
-from cangauge._formatting import NONE_KNOWN, number, significant
-from cangauge.diagnosis import NONE, UNKNOWN, Diagnosis
-from cangauge.diagnosis.planner import Plan
+from cangauge._text import NONE_KNOWN, number, significant
+from cangauge.diagnosis.answer import NONE, UNKNOWN
+
+if TYPE_CHECKING:
+    from cangauge.diagnosis.diagnose import Diagnosis
+    from cangauge.diagnosis.planner import Plan
 
 Rows = list[list[str]]
 
