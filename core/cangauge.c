@@ -437,6 +437,8 @@ static void use_row(cg_estimator *self, const cg_sample *sample)
     cg_state *state = &self->state;
     cg_memory *memory = &state->memory;
     const cg_model *model = self->model;
+    cg_real std_pct;
+    cg_real slope;
     const cg_real guess_pct = isnan(memory->newton_pct) ? R(50.0) : memory->newton_pct;
     memory->newton_pct = CG_NAN;
     memory->newton_std_pct = CG_NAN;
@@ -461,8 +463,6 @@ static void use_row(cg_estimator *self, const cg_sample *sample)
         }
         state->block.rows += 1;
     }
-    cg_real std_pct;
-    cg_real slope;
     const cg_real soc_pct = soc_now(self, &std_pct);
     memory->voltage_model_v = CG_NAN;
     if (!isnan(soc_pct)) {
