@@ -15,6 +15,7 @@ from cangauge._files import MIB, read_bounded, write_text_atomic
 from cangauge._typing import FloatArray
 from cangauge.errors import InputError
 from cangauge.logs.log import Log, TemperatureSource
+from cangauge.logs.read import as_log
 from cangauge.model.delay_line import GAP_S
 from cangauge.model.effects.base import RESISTANCE_AT_LEAST, Pack, Signals
 from cangauge.model.effects.library import parse_effects
@@ -438,12 +439,14 @@ class Model(_Strict):
         """Write the model file; an existing file is replaced atomically."""
         write_text_atomic(Path(path), self.to_json())
 
-    def predict(self, log: Log, *, initial_soc_pct: float | None = None) -> Prediction:
+    def predict(
+        self, log: Log | Path | str | Any, *, initial_soc_pct: float | None = None
+    ) -> Prediction:
         """Predict the voltage of a log, with `residual_v` = measured − predicted.
 
         Parameters
         ----------
-        log : Log
+        log : Log, path or DataFrame
         initial_soc_pct : float, optional
             SoC at the first row [%]; by default the count starts from the first finite value of
             the log's reference SoC.
@@ -458,6 +461,7 @@ class Model(_Strict):
         InputError
             If the initial SoC is unknown.
         """
+        log = as_log(log)
         start = log.first_soc() if initial_soc_pct is None else (0, initial_soc_pct)
         if start is None:
             raise InputError(
