@@ -15,7 +15,7 @@ import numpy as np
 from threadpoolctl import ThreadpoolController
 
 from cangauge._extras import extra
-from cangauge._io import file_sha256
+from cangauge._files import file_sha256
 from cangauge.diagnosis import sentences
 from cangauge.diagnosis.answer import ALARM, GROUP_OF, UNKNOWN, Posterior, answer
 from cangauge.diagnosis.checks import check_logs
@@ -24,6 +24,7 @@ from cangauge.diagnosis.evidence import Evidence, References, analyse, columns, 
 from cangauge.diagnosis.extended import Extension, Quantity, residual_v
 from cangauge.diagnosis.pack_fit import Trace, trace
 from cangauge.diagnosis.simulator import Simulation, SimulatorGap, correction, simulator_gap
+from cangauge.diagnosis.summary import diagnosis_html
 from cangauge.diagnosis.where import ErrorShare, LogErrors, drawn_sums, error_shares, pieces, rms
 from cangauge.errors import InputError
 from cangauge.estimation.offline import estimate
