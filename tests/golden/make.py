@@ -281,10 +281,17 @@ def succeed(*arguments: object) -> dict[str, Any]:
     return found
 
 
+NAMED_BY_DATA = {"reasons"}
+"""Objects whose keys are what occurred; the shapes of their values are compared."""
+
+
 def shape(value: Any) -> Any:
     """Return keys and types of a JSON value; a list has the shapes of its items, each once."""
     if isinstance(value, dict):
-        return {key: shape(each) for key, each in sorted(value.items())}
+        return {
+            key: shape(list(each.values())) if key in NAMED_BY_DATA else shape(each)
+            for key, each in sorted(value.items())
+        }
     if isinstance(value, list):
         shapes = {json.dumps(shape(each), sort_keys=True) for each in value}
         return [json.loads(each) for each in sorted(shapes)]
