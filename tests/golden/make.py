@@ -289,7 +289,9 @@ def shape(value: Any) -> Any:
     """Return keys and types of a JSON value; a list has the shapes of its items, each once."""
     if isinstance(value, dict):
         return {
-            key: shape(list(each.values())) if key in NAMED_BY_DATA else shape(each)
+            key: shape(
+                list(each.values()) if key in NAMED_BY_DATA and isinstance(each, dict) else each
+            )
             for key, each in sorted(value.items())
         }
     if isinstance(value, list):
