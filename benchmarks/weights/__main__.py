@@ -68,6 +68,7 @@ def main() -> None:
     parser.add_argument("command", choices=["fit", "plan", "check"])
     parser.add_argument("--data", type=Path, default=ROOT / "../shared/data")
     parser.add_argument("--cases", type=Path, default=ROOT / "out/weights")
+    parser.add_argument("--half", type=int, default=1, help="half of the frozen splits")
     parser.add_argument("--only", nargs="*", help="data sets to draw")
     given = parser.parse_args()
     if given.command == "plan":
@@ -83,9 +84,11 @@ def main() -> None:
     )
     if given.only:
         items = [x if x["pack"] in given.only else {**x, "pack": ""} for x in items]
+    if part == "frozen":
+        items = [x if x["half"] == given.half else {**x, "pack": ""} for x in items]
     folder = given.cases / part
     draw_all(items, part, given.data, folder)
-    found = evidence.gather(folder)
+    found = evidence.gather(folder, [k for k, x in enumerate(items) if x["pack"]])
     if part == "frozen":
         print(score.table(found, fit.probabilities(shipped(), found)))
         return

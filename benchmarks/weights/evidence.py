@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pickle
 import time
+from collections.abc import Collection
 from pathlib import Path
 
 from benchmarks.weights import engine
@@ -47,12 +48,14 @@ def examples_of(split: Split) -> list[Example]:
     return out
 
 
-def gather(folder: Path, again: bool = False) -> list[Example]:
-    """Return the examples of all drawn splits of a folder, from its cache where it is current."""
+def gather(folder: Path, numbers: Collection[int]) -> list[Example]:
+    """Return the examples of drawn splits of a folder, from its cache where it is current."""
     out: list[Example] = []
     for file in sorted(folder.glob("[0-9]*.pkl")):
+        if int(file.name[:3]) not in numbers:
+            continue
         cache = file.with_suffix(".features")
-        if again or not cache.exists() or cache.stat().st_mtime < file.stat().st_mtime:
+        if not cache.exists() or cache.stat().st_mtime < file.stat().st_mtime:
             cache.write_bytes(pickle.dumps(examples_of(pickle.loads(file.read_bytes()))))
         out += pickle.loads(cache.read_bytes())
     return out
