@@ -24,6 +24,7 @@ from cangauge.diagnosis.evidence import Evidence, References, analyse, columns, 
 from cangauge.diagnosis.extended import Extension, Quantity, residual_v
 from cangauge.diagnosis.pack_fit import Trace, trace
 from cangauge.diagnosis.simulator import Simulation, SimulatorGap, correction, simulator_gap
+from cangauge.diagnosis.summary import diagnosis_html
 from cangauge.diagnosis.where import ErrorShare, LogErrors, drawn_sums, error_shares, pieces, rms
 from cangauge.errors import InputError
 from cangauge.estimation.offline import estimate
