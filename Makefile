@@ -9,7 +9,7 @@ SOCKETCAN ?= $(wildcard ../shared/tools/with-socketcan)
 # Folder of the recorded logs (see README for their sources).
 DATA ?= $(wildcard ../shared/data)
 
-.PHONY: help demo test nightly lint coverage check data faults trips bench bench-check lowest site wheel clean
+.PHONY: packs help demo test nightly lint coverage check data faults trips bench bench-check lowest site wheel clean
 
 help:
 	@echo "make demo      the whole job on the shipped log: fit, bus, service, report"
@@ -23,6 +23,7 @@ help:
 	@echo "make site      the documentation as a site, in out/site"
 	@echo "make wheel     build the wheel and run the job from it in an environment of its own"
 	@echo "make bench     time and accuracy beside other packages, and how the cost grows (DATA=FOLDER, see README)"
+	@echo "make packs     SoC errors on recorded packs, with models from few logs (DATA=FOLDER)"
 	@echo "make trips     the table on the real BMW i3 trips (DATA=FOLDER, see README)"
 
 $(VENV)/installed: pyproject.toml hatch_build.py $(wildcard core/*.[ch])
@@ -106,3 +107,6 @@ lowest:
 
 clean:
 	rm -rf $(VENV) .venv-lowest $(PEERS) out
+
+packs: $(VENV)/installed
+	cd benchmarks && $(abspath $(BIN))/python -m packs --data $(abspath $(DATA)) $(ARGS)

@@ -35,12 +35,10 @@ from cangauge.estimation.offline import run_estimator, samples_of
 from cangauge.estimation.settings import EstimatorSettings
 from cangauge.extras.embedded.equivalent_circuit import equivalent_circuit
 from cangauge.identify.fit import fit
-from cangauge.identify.rows import decimate
 from cangauge.logs.log import Log
 from cangauge.logs.read import read_log
-from cangauge.model.coulomb_counting import capacity_from_reference
 from cangauge.model.model_file import Model
-from packs.recorded import load
+from packs.recorded import load, one_hz
 
 PACKS = ("i3", "car1")
 TRAINING_LOGS, SEED = 10, 0
@@ -74,12 +72,17 @@ def prepare(data: Path) -> tuple[Result, dict[str, list[Log]], dict[str, Model]]
     judged, models = {}, {}
     for pack in load(data, PACKS):
         _, training, judged[pack.name] = next(pack.draws(TRAINING_LOGS, 1, SEED))
-        capacity_ah = pack.capacity_ah or capacity_from_reference(training)
-        models[pack.name] = fit(training, capacity_ah=capacity_ah, chemistry="oxide").model
+        models[pack.name] = fit(
+            training,
+            capacity_ah=pack.capacity_of(training),
+            chemistry=pack.chemistry,
+            cells=pack.cells,
+            effects="none",
+        ).model
         tables = _tables(models[pack.name])
         work["packs"][pack.name] = {
             "tables": tables,
-            "training": [_columns(log.rows(decimate(log.time_s, 1.0))) for log in training],
+            "training": [_columns(one_hz(log)) for log in training],
             "judged": [_columns(log) for log in judged[pack.name]],
         }
     fast = read_log(data / "bmw_i3" / TIMED)

@@ -329,9 +329,12 @@ static void close_block(cg_estimator *self, cg_time time_s)
     for (int32_t k = 0; k < cg_loads(model); ++k) {
         means.load[k] = (cg_real)(block->sums[5 + k] / rows);
     }
+    for (int32_t k = 0; k < model->effects; ++k) {
+        means.drive[k] = (cg_real)(block->drive[k] / rows);
+    }
     propagate(self, means.counted_s, means.discharged_pct);
     const bool was_rejected = cg_filter_is_rejected(filter);
-    cg_filter_update(self, &means);
+    cg_filter_update(filter, model, &means);
     if (!cg_filter_is_valid(filter, model)) {
         cg_filter_start(filter, model, CG_NAN, R(0.0), false);
         memory->resets += 1;
@@ -460,6 +463,9 @@ static void use_row(cg_estimator *self, const cg_sample *sample)
         sums[4] += (cg_sum)state->drop_v;
         for (int32_t k = 0; k < cg_loads(model); ++k) {
             sums[5 + k] += (cg_sum)state->load[k];
+        }
+        for (int32_t k = 0; k < model->effects; ++k) {
+            state->block.drive[k] += (cg_sum)state->drive[k];
         }
         state->block.rows += 1;
     }

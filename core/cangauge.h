@@ -233,12 +233,14 @@ typedef struct {
     bool is_restored;
 } cg_counter;
 
-/* Sums of the rows of the open block: counted time, charge, voltage, temperature, drop, loads. */
+/* Sums of the rows of the open block: counted time, charge, voltage, temperature, drop, loads; and
+ * of the effects' drives. */
 typedef struct {
     int64_t number;
     int32_t rows;
     bool is_broken;
     cg_sum sums[CG_SUMS];
+    cg_sum drive[CG_EFFECTS];
 } cg_block;
 
 /* State x = (SoC, current offset, slow error, level, functions) with its covariance, and beside it
@@ -271,7 +273,6 @@ typedef struct {
 } cg_lag;
 
 typedef struct {
-    cg_real volts; /* extra voltage, or what it is computed from over SoC */
     cg_lag lag[CG_LAGS]; /* resistance_step and hysteresis use the first for theirs */
 } cg_effect_state;
 
@@ -327,7 +328,7 @@ typedef struct {
     cg_real load[CG_LOADS]; /* load columns at the latest sample */
     cg_real load_v; /* their voltage, and its part over the resistances */
     cg_real drop_v;
-    cg_real beside_soc_v; /* voltage of the effects that do not depend on the SoC */
+    cg_real drive[CG_EFFECTS]; /* voltage of each effect, or what it is computed from over SoC */
 } cg_state;
 
 /* One sample of the current in the delay line. */

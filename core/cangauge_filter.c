@@ -130,14 +130,13 @@ static void condition(cg_ekf *ekf, const linear *at, int32_t size, cg_real drop_
 }
 
 /* Voltage at a state, its gradient and the variance of the measurement. */
-static cg_real measurement(const cg_estimator *self, const cg_real *x, const cg_means *block,
+static cg_real measurement(const cg_model *model, const cg_real *x, const cg_means *block,
                            cg_real *h, cg_real *noise)
 {
-    const cg_model *model = self->model;
     const cg_real cold = cg_cold(model, block->temperature_c);
     const int32_t size = cg_states(model);
     cg_real slope;
-    cg_real volts = cg_pseudo_ocv(self, x[CG_X_SOC], &slope);
+    cg_real volts = cg_curve_at(model, block->drive, x[CG_X_SOC], &slope);
     slope = cg_max(slope, R(CG_LEAST_SLOPE));
     const cg_real axis_v = model->soc_std_pct * slope;
     h[CG_X_SOC] = slope;
@@ -152,19 +151,19 @@ static cg_real measurement(const cg_estimator *self, const cg_real *x, const cg_
 }
 
 /* Update with the mean voltage of a block; iterated while the SoC is uncertain. */
-static void ekf_update(const cg_estimator *self, cg_ekf *ekf, const cg_means *block)
+static void ekf_update(const cg_model *model, cg_ekf *ekf, const cg_means *block)
 {
-    const int32_t size = cg_states(self->model);
+    const int32_t size = cg_states(model);
     const bool is_wide = ekf->p[CG_X_SOC][CG_X_SOC] > cg_square(R(LINEAR_PCT));
     cg_real x[CG_STATES];
-    linear at;
+    linear at = {{R(0.0)}, {R(0.0)}, {R(0.0)}, R(0.0), R(1.0)};
     for (int32_t k = 0; k < size; ++k) {
         x[k] = ekf->x[k];
     }
     bool is_close = false;
     for (int32_t step = 0; (step < (is_wide ? ITERATIONS_AT_MOST : 1)) && !is_close; ++step) {
         cg_real noise;
-        const cg_real voltage_v = measurement(self, x, block, at.h, &noise);
+        const cg_real voltage_v = measurement(model, x, block, at.h, &noise);
         weigh(&at, ekf, size, noise);
         at.innovation = block->voltage_v - voltage_v;
         for (int32_t k = 0; k < size; ++k) {
@@ -276,11 +275,10 @@ void cg_filter_predict(cg_filter *filter, const cg_model *model, const cg_passed
     }
 }
 
-void cg_filter_update(cg_estimator *self, const cg_means *block)
+void cg_filter_update(cg_filter *filter, const cg_model *model, const cg_means *block)
 {
-    cg_filter *filter = &self->state.filter;
     for (int32_t k = 0; k < filter->hypotheses; ++k) {
-        ekf_update(self, &filter->ekf[k], block);
+        ekf_update(model, &filter->ekf[k], block);
     }
     if ((filter->hypotheses == 2) && (fabs(log_odds(filter)) > CLEAR_LOG_ODDS)) {
         filter->decision = (log_odds(filter) > 0.0) ? 1 : -1;

@@ -91,6 +91,7 @@ cg_time cg_line_filled_s(const cg_line *line);
 /* voltage model */
 cg_real cg_cold(const cg_model *model, cg_real temperature_c);
 void cg_functions_row(const cg_model *model, cg_real soc_pct, const cg_real *load, cg_real *row);
+cg_real cg_curve_at(const cg_model *model, const cg_real *drive, cg_real soc_pct, cg_real *slope);
 cg_real cg_newton(const cg_estimator *self, cg_real ocv_v, cg_real guess_pct, bool *inside);
 
 /* effects: corrections of a sample, then the load columns and the extra voltages */
@@ -108,6 +109,7 @@ typedef struct {
     cg_real temperature_c;
     cg_real drop_v;
     cg_real load[CG_LOADS];
+    cg_real drive[CG_EFFECTS];
 } cg_means;
 
 /* Time in which charge was counted [s], the charge, its variance, further time without samples. */
@@ -122,7 +124,7 @@ typedef struct {
 void cg_filter_start(cg_filter *filter, const cg_model *model, cg_real soc_pct, cg_real std_pct,
                      bool is_doubtful);
 void cg_filter_predict(cg_filter *filter, const cg_model *model, const cg_passed *passed);
-void cg_filter_update(cg_estimator *self, const cg_means *block);
+void cg_filter_update(cg_filter *filter, const cg_model *model, const cg_means *block);
 void cg_filter_correct(cg_filter *filter, const cg_model *model, cg_real soc_pct, cg_real std_pct);
 void cg_filter_doubt(cg_filter *filter, const cg_model *model, cg_real probability,
                      cg_real std_pct, cg_real away_s, cg_real parked_std_pct);

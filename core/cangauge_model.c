@@ -435,55 +435,63 @@ static cg_real charge_transfer_v(const cg_effect *effect, cg_real current_a, cg_
 }
 
 /* Advance an effect to a corrected sample: its voltage, or what that over SoC is computed from. */
-static void advance_effect(const cg_effect *effect, cg_effect_state *state,
+static cg_real advance_effect(const cg_effect *effect, cg_effect_state *state,
                            const cg_sample *sample, cg_real temperature_c, cg_real drop_v)
 {
     const cg_real *value = effect->value;
     const cg_real current_a = sample->current_a;
     cg_lag *lag = &state->lag[0];
+    cg_real drive = R(0.0);
     cg_real at_c;
     switch (effect->kind) {
     case CG_RESISTANCE_TEMPERATURE:
         at_c = lag_from(lag, effect->tau_s[0], sample->time_s, temperature_c);
-        state->volts = value[0] * scaled_drop(drop_v, current_a, value[2], value[4]) *
+        drive = value[0] * scaled_drop(drop_v, current_a, value[2], value[4]) *
                        cg_expm1(value[1] * (inverse_k(at_c) - value[3]));
         break;
     case CG_RESISTANCE_SOC:
-        state->volts = scaled_drop(drop_v, current_a, value[3], value[4]);
+        drive = scaled_drop(drop_v, current_a, value[3], value[4]);
         break;
     case CG_RESISTANCE_ASYMMETRY:
-        state->volts = -value[0] * cg_min(current_a, R(0.0));
+        drive = -value[0] * cg_min(current_a, R(0.0));
         break;
     case CG_RESISTANCE_STEP:
         if (!lag->is_started) {
             lag->is_started = true;
             lag->time_s = sample->time_s;
         }
-        state->volts = ((sample->time_s - lag->time_s) >= (cg_time)value[1])
+        drive = ((sample->time_s - lag->time_s) >= (cg_time)value[1])
                            ? (-value[0] * current_a)
                            : R(0.0);
         break;
     case CG_CHARGE_TRANSFER:
-        state->volts = charge_transfer_v(effect, current_a, temperature_c);
+        drive = charge_transfer_v(effect, current_a, temperature_c);
         break;
     case CG_RC:
-        state->volts = rc_volts(effect, state, sample, temperature_c);
+        drive = rc_volts(effect, state, sample, temperature_c);
         break;
     case CG_HYSTERESIS:
         advance_hysteresis(effect, lag, sample);
-        state->volts = value[0] * lag->value;
+        drive = value[0] * lag->value;
         break;
     case CG_ENTROPIC:
         at_c = lag_from(lag, effect->tau_s[0], sample->time_s, temperature_c);
-        state->volts = cg_clip(at_c, R(COLDEST_C), R(HOTTEST_C)) - value[3];
+        drive = cg_clip(at_c, R(COLDEST_C), R(HOTTEST_C)) - value[3];
         break;
     case CG_INNER_TEMPERATURE:
         at_c = lag_from(lag, effect->tau_s[0], sample->time_s, temperature_c);
-        state->volts = (value[0] + (value[1] * drop_v)) * (at_c - temperature_c);
+        drive = (value[0] + (value[1] * drop_v)) * (at_c - temperature_c);
         break;
-    default: /* has no state */
+    case CG_OCV_SHAPE:
+        drive = R(1.0);
+        break;
+    case CG_WEAK_CELL:
+        drive = value[0];
+        break;
+    default: /* adds no voltage */
         break;
     }
+    return drive;
 }
 
 static bool follows_temperature(const cg_effect *effect)
@@ -537,14 +545,11 @@ void cg_advance(cg_estimator *self, const cg_sample *sample, cg_real temperature
     cg_line_push(&self->line, model->delay_s[model->delays - 1], self->settings.gap_s,
                  sample->time_s, sample->current_a);
     advance_load(self, sample, known_c);
-    state->beside_soc_v = R(0.0);
     for (int32_t k = 0; k < model->effects; ++k) {
         const cg_effect *effect = &model->effect[k];
         if (is_known || !follows_temperature(effect)) {
-            advance_effect(effect, &state->effect[k], sample, known_c, state->drop_v);
-        }
-        if (!depends_on_soc(effect)) {
-            state->beside_soc_v += state->effect[k].volts;
+            state->drive[k] =
+                advance_effect(effect, &state->effect[k], sample, known_c, state->drop_v);
         }
     }
 }
@@ -560,73 +565,75 @@ static cg_real ocv_shape_v(const cg_real *height_v, cg_real soc_pct)
     return volts;
 }
 
-/* The voltage of an effect that depends on the SoC, at one. */
-static cg_real effect_v(const cg_model *model, const cg_effect *effect,
-                        const cg_effect_state *state, cg_real soc_pct)
+/* Factor on the drive of an effect that depends on the SoC, at one. */
+static cg_real over_soc(const cg_model *model, const cg_effect *effect, cg_real soc_pct)
 {
     const cg_real *value = effect->value;
     const cg_real soc = cg_clip(soc_pct, R(0.0), R(100.0));
     cg_real slope;
-    cg_real volts;
+    cg_real factor;
     switch (effect->kind) {
     case CG_RESISTANCE_SOC:
-        volts = value[0] * cg_exp(-soc / value[2]);
-        volts += value[1] * cg_exp((soc - R(100.0)) / value[2]);
-        volts = state->volts * volts;
+        factor = (value[0] * cg_exp(-soc / value[2])) +
+                 (value[1] * cg_exp((soc - R(100.0)) / value[2]));
         break;
     case CG_ENTROPIC: {
         const cg_real x = (soc / R(50.0)) - R(1.0);
-        volts = state->volts *
-                (value[0] + (value[1] * x) + (value[2] * ((R(1.5) * x * x) - R(0.5))));
+        factor = value[0] + (value[1] * x) + (value[2] * ((R(1.5) * x * x) - R(0.5)));
         break;
     }
     case CG_OCV_SHAPE:
-        volts = ocv_shape_v(value, soc_pct);
+        factor = ocv_shape_v(value, soc_pct);
         break;
-    case CG_WEAK_CELL: {
-        const cg_real weak_v =
-            curve_v(model, R(100.0) - ((R(100.0) - soc_pct) * value[1]), &slope);
-        volts = value[0] * (weak_v - curve_v(model, soc_pct, &slope));
+    case CG_WEAK_CELL:
+        factor = curve_v(model, R(100.0) - ((R(100.0) - soc_pct) * value[1]), &slope) -
+                 curve_v(model, soc_pct, &slope);
         break;
-    }
     default: /* CG_RC along the slope */
         (void)curve_v(model, soc_pct, &slope);
         slope = cg_clip(slope / value[2], R(0.0), R(STEEPNESS_AT_MOST));
-        volts = (R(1.0) + (value[1] * (slope - R(1.0)))) * state->volts;
+        factor = R(1.0) + (value[1] * (slope - R(1.0)));
         break;
+    }
+    return factor;
+}
+
+static cg_real over_soc_v(const cg_model *model, const cg_real *drive, cg_real soc_pct)
+{
+    cg_real volts = R(0.0);
+    for (int32_t k = 0; k < model->effects; ++k) {
+        if (depends_on_soc(&model->effect[k])) {
+            volts += drive[k] * over_soc(model, &model->effect[k], soc_pct);
+        }
     }
     return volts;
 }
 
-static cg_real over_soc_v(const cg_estimator *self, cg_real soc_pct)
+/* Curve and effects of given drives at a SoC, and the slope. */
+cg_real cg_curve_at(const cg_model *model, const cg_real *drive, cg_real soc_pct, cg_real *slope)
 {
-    const cg_model *model = self->model;
-    cg_real volts = R(0.0);
+    cg_real volts = curve_v(model, soc_pct, slope);
+    bool is_over_soc = false;
     for (int32_t k = 0; k < model->effects; ++k) {
         if (depends_on_soc(&model->effect[k])) {
-            volts += effect_v(model, &model->effect[k], &self->state.effect[k], soc_pct);
+            is_over_soc = true;
+        } else {
+            volts += drive[k];
         }
+    }
+    if (is_over_soc) {
+        volts += over_soc_v(model, drive, soc_pct);
+        const cg_real above_v = over_soc_v(model, drive, soc_pct + R(SLOPE_STEP_PCT));
+        const cg_real below_v = over_soc_v(model, drive, soc_pct - R(SLOPE_STEP_PCT));
+        *slope += (above_v - below_v) / (R(2.0) * R(SLOPE_STEP_PCT));
+        *slope = cg_max(*slope, R(SLOPE_AT_LEAST) * model->nominal_v);
     }
     return volts;
 }
 
 cg_real cg_pseudo_ocv(const cg_estimator *self, cg_real soc_pct, cg_real *slope)
 {
-    const cg_model *model = self->model;
-    cg_real volts = curve_v(model, soc_pct, slope);
-    bool is_over_soc = false;
-    for (int32_t k = 0; k < model->effects; ++k) {
-        is_over_soc = is_over_soc || depends_on_soc(&model->effect[k]);
-    }
-    volts += self->state.beside_soc_v;
-    if (is_over_soc) {
-        volts += over_soc_v(self, soc_pct);
-        const cg_real above_v = over_soc_v(self, soc_pct + R(SLOPE_STEP_PCT));
-        const cg_real below_v = over_soc_v(self, soc_pct - R(SLOPE_STEP_PCT));
-        *slope += (above_v - below_v) / (R(2.0) * R(SLOPE_STEP_PCT));
-        *slope = cg_max(*slope, R(SLOPE_AT_LEAST) * model->nominal_v);
-    }
-    return volts;
+    return cg_curve_at(self->model, self->state.drive, soc_pct, slope);
 }
 
 /* Newton's method inside a bracket: the SoC whose pseudo-OCV is a voltage. */

@@ -25,7 +25,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from cangauge._io import atomic_path
+from cangauge._files import atomic_path
 from cangauge._typing import FloatArray
 from cangauge.errors import CangaugeError, InputError
 from cangauge.model.coulomb_counting import discharged_ah

@@ -6,7 +6,7 @@ import math
 
 import pytest
 
-from cangauge._formatting import counted, duration, number, significant, span
+from cangauge._text import counted, duration, number, significant, span
 from cangauge.types import REASON_WORDS, Reason, reason_names
 
 

@@ -17,7 +17,7 @@ from random import Random
 
 import can
 
-from cangauge._io import text_sha256
+from cangauge._files import text_sha256
 from cangauge._resources import shared_file
 from cangauge.bus.captures import is_capture, open_capture
 from cangauge.bus.database import load_dbc

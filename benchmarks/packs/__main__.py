@@ -24,7 +24,7 @@ import numpy as np
 
 from .estimators import ESTIMATORS, Told
 from .recorded import PACKS, counted_ah, load
-from .scores import LATE_S, SETTLED_S, judge, pool, score
+from .scores import LATE_S, SETTLED_S, Row, judge, pool, score
 
 
 @dataclass(frozen=True)
@@ -74,7 +74,7 @@ def _start(log) -> float:
     return float(log.soc_pct[np.isfinite(log.soc_pct)][0])
 
 
-def run(packs, estimators, cases, sizes, draws: int, seed: int) -> list:
+def run(packs, estimators, cases, *, sizes, draws: int, seed: int) -> list[Row]:
     """Return the rows of every estimator, pack, number of logs and case."""
     rows = []
     for pack in packs:
@@ -119,12 +119,13 @@ def _score(estimator, model, told: Told, case: Case, log):
         start_pct = _start(log) + case.start_error_pct
     capacity_ah = told.capacity_ah * case.capacity_factor
     found = estimator.estimate(seen, model, start_pct, capacity_ah)
-    known = found.newton_pct[np.isfinite(found.newton_pct)]
-    begin_pct = known[0] if start_pct is None else start_pct
+    by_voltage = found.newton_pct[np.isfinite(found.newton_pct)]
+    begin_pct = (by_voltage[0] if by_voltage.size else np.nan) if start_pct is None else start_pct
     counted = begin_pct - 100.0 * counted_ah(seen) / capacity_ah
     return score(
-        log, found.soc_pct, found.std_pct, found.newton_pct, counted, case.after_s, found.mismatch
-    )
+        log, found.soc_pct, found.std_pct, found.newton_pct, counted,
+        after_s=case.after_s, mismatch=found.mismatch,
+    )  # fmt: skip
 
 
 def _counts_reference(case: Case) -> bool:
@@ -195,11 +196,11 @@ def main() -> None:
     for name in options.estimator or ["cangauge"]:
         module, _, kind = name.rpartition(":")
         made = getattr(importlib.import_module(module), kind) if module else ESTIMATORS[name]
-        estimators[kind] = made()
+        estimators[name] = made()
     began = time.perf_counter()
     print(HEADING)
     packs = load(options.data, names)
-    rows = run(packs, estimators, cases, options.logs, options.draws, options.seed)
+    rows = run(packs, estimators, cases, sizes=options.logs, draws=options.draws, seed=options.seed)
     _summary(rows)
     if options.json:
         result = {

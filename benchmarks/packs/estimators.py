@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
 import cangauge
+import peer_filters
 
 
 class Estimated(NamedTuple):
@@ -76,4 +77,31 @@ class CangaugeEffects(Cangauge):
     effects = "auto"
 
 
-ESTIMATORS = {"cangauge": Cangauge, "cangauge-effects": CangaugeEffects}
+class BareEkf(Cangauge):
+    """filterpy's extended Kalman filter over the circuit that `export-ecm` makes of our model.
+
+    Nothing is tuned: noise of the voltage as the model states it, σ of a start 10 %, of the current
+    1 A. An unknown start is that of the first voltage. It states no σ here.
+    """
+
+    def estimate(
+        self, log: cangauge.Log, model: cangauge.Model, start_pct: float | None, capacity_ah: float
+    ) -> Estimated:
+        """Run it at every row."""
+        from cangauge.extras.embedded.equivalent_circuit import equivalent_circuit  # noqa: PLC0415
+
+        tables = asdict(equivalent_circuit(model)) | {"noise_v": model.noise.voltage_rmse_v}
+        circuit = peer_filters.Circuit(tables, float(np.mean(log.temperature_c)))
+        circuit.capacity_as = 3600.0 * capacity_ah
+        columns = {name: getattr(log, name) for name in ("time_s", "current_a", "voltage_v")}
+        start = circuit.start(columns) if start_pct is None else start_pct / 100.0
+        soc_pct, _ = peer_filters.run(peer_filters.bare_ekf(circuit, start), columns)
+        unknown = np.full(len(log), np.nan)
+        return Estimated(np.array(soc_pct), unknown, unknown)
+
+
+ESTIMATORS = {
+    "cangauge": Cangauge,
+    "cangauge-effects": CangaugeEffects,
+    "filterpy-ekf": BareEkf,
+}

@@ -8,7 +8,7 @@ of `leaf_module` and `a123_lfp` alone development knows no log at all.
 from __future__ import annotations
 
 import zlib
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
@@ -162,14 +162,15 @@ def _as_pack(
     )
 
 
-def _judged(logs) -> list[cangauge.Log]:
+def _judged(logs: Iterable[cangauge.Log]) -> list[cangauge.Log]:
     """Return the logs that are long enough: the first row of each second, as on a slow bus."""
-    found = []
-    for log in logs:
-        if log.time_s[-1] - log.time_s[0] >= MIN_S:
-            second = np.floor(log.time_s - log.time_s[0] + 1e-6)
-            found.append(log.rows(np.flatnonzero(np.diff(second, prepend=-1.0) > 0.0)))
-    return found
+    return [one_hz(log) for log in logs if log.time_s[-1] - log.time_s[0] >= MIN_S]
+
+
+def one_hz(log: cangauge.Log) -> cangauge.Log:
+    """Return the first row of each second."""
+    second = np.floor(log.time_s - log.time_s[0] + 1e-6)
+    return log.rows(np.flatnonzero(np.diff(second, prepend=-1.0) > 0.0))
 
 
 _ODD = [f"A{number:02d}" for number in range(1, 22, 2)]

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass, field
+from typing import Any
 
 import numpy as np
 
@@ -34,7 +35,16 @@ class LogScore:
     mismatch: bool
 
 
-def score(log, soc_pct, std_pct, newton_pct, counted_pct, after_s, mismatch) -> LogScore:
+def score(
+    log: Any,
+    soc_pct: np.ndarray,
+    std_pct: np.ndarray,
+    newton_pct: np.ndarray,
+    counted_pct: np.ndarray,
+    *,
+    after_s: float,
+    mismatch: bool,
+) -> LogScore:
     """Compare an estimate with the log's reference; the arrays have a value per row [%]."""
     since_s = log.time_s - log.time_s[0]
     error = np.abs(soc_pct - log.soc_pct)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 import tomllib
 from collections.abc import Iterator
 from os import PathLike
@@ -10,11 +9,10 @@ from typing import Any, Final, TypeVar, get_args
 
 from pydantic import BaseModel, ValidationError
 
-from cangauge._io import MAX_TOML_BYTES, MAX_TOML_KEY, read_bounded
+from cangauge._files import read_bounded
 from cangauge.errors import InputError, closest
 
-_KEY_PART: Final = r"""(?:[\w-]++|"[^"\n]*+"|'[^'\n]*+')[ \t]*+\.[ \t]*+"""
-_LONG_KEY: Final = re.compile(rf"(?<![\w-])(?:{_KEY_PART}){{{MAX_TOML_KEY}}}")
+MAX_TOML_BYTES: Final = 64 * 1024
 _UNION_TAGS: Final = {"bool", "int", "float", "str", "constrained-int", "constrained-float"}
 # Wording of pydantic, and the shorter one of our messages.
 _WORDING: Final = (
@@ -37,14 +35,11 @@ def read_toml(path: str | PathLike[str]) -> dict[str, Any]:
     """
     data = read_bounded(path, MAX_TOML_BYTES, "a TOML file")
     try:
-        text = data.decode("utf-8-sig")
-        if _LONG_KEY.search(text):
-            raise ValueError(f"a key of more than {MAX_TOML_KEY} parts")  # noqa: TRY301 - as tomllib
-        return tomllib.loads(text)
-    except ValueError as error:  # TOMLDecodeError; not UTF-8; an integer of 5,000 digits
-        raise InputError(f"not TOML: {error}", source=path) from error
-    except RecursionError as error:
-        raise InputError("not TOML: nested too deeply", source=path) from error
+        return tomllib.loads(data.decode("utf-8-sig"))
+    except (ValueError, RecursionError) as error:  # ValueError: also not UTF-8
+        is_deep = isinstance(error, RecursionError)
+        problem = "nested too deeply" if is_deep else str(error)
+        raise InputError(f"not TOML: {problem}", source=path) from error
 
 
 def validated(model: type[Model], data: object, source: str | PathLike[str]) -> Model:

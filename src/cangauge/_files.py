@@ -349,13 +349,13 @@ def atomic_path(path: str | PathLike[str], rights: int | None = None) -> Iterato
 
 
 def _create_beside(target: Path, shown: str | PathLike[str], rights: int = 0o666) -> Path:
-    if target.is_dir():
-        raise InputError("this is a folder", source=shown, cure="name a file in it")
     # The suffix stays last: writers such as pyarrow and bokeh choose the format by it.
     part = target.with_name(f".{target.stem[:200]}.{secrets.token_hex(4)}{target.suffix}")
     try:
         with suppress(FileNotFoundError):
             target.lstat()  # its name can be too long where that of `part` is not
+        if target.is_dir():
+            raise InputError("this is a folder", source=shown, cure="name a file in it")
         part.touch(rights, exist_ok=False)
     except OSError as error:
         problem, cure = _WRITE_ERRORS.get(

@@ -168,6 +168,7 @@ def test_one_sender_is_never_taken_for_two(name: str) -> None:
         rng = Random(seed)  # noqa: S311 - must be repeatable
         decoder, _ = decoded(LEAF, list(LAWFUL[name](true_frames(LEAF, 1500), rng)))
         assert decoder.statistics.two_senders == 0, f"seed {seed}"
+        assert decoder.two_sender_messages == (), f"seed {seed}"
 
 
 def test_remarks_of_a_capture_name_it(tmp_path: Path) -> None:

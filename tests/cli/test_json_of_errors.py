@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from cangauge._io import atomic_path
+from cangauge._files import atomic_path
 from cangauge.cli.app import COMMANDS, main
 from cangauge.errors import CangaugeError, InputError
 from live import Ended, in_process
@@ -112,12 +112,16 @@ def test_after_two_dashes_it_is_a_name(tmp_path: Path, monkeypatch: pytest.Monke
 
 
 @pytest.mark.parametrize("log_format", ["text", "json"])
-def test_a_service_that_fails(made: Path, monkeypatch: pytest.MonkeyPatch, log_format: str) -> None:
+def test_a_service_that_fails(
+    made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, log_format: str
+) -> None:
     def fail(*_: object) -> None:
         raise CangaugeError("the bus is on fire")
 
     monkeypatch.setattr("cangauge.service.run.Service.run", fail)
-    ended = in_process("run", "-m", made / "model.json", "--log-format", log_format, "--json")
+    config = tmp_path / "run.toml"
+    config.write_text(f'log_format = "{log_format}"\n')
+    ended = in_process("run", "-m", made / "model.json", "--config", config, "--json")
     assert error_of(ended, 1) == dict.fromkeys(PARTS) | {"message": "the bus is on fire"}
     (line,) = ended.err.splitlines()
     if log_format == "text":

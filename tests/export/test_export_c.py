@@ -39,11 +39,14 @@ needs_make = pytest.mark.skipif(
 
 @pytest.fixture(scope="module")
 def folders(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
-    """Exports of the published model, of a curve of knots, and of that with effects."""
-    knots = Model.prior("oxide", 96, 60.0)
-    effects = knots.model_copy(update={"effects": extended_by(EFFECTS).effects})
+    """Exports of the published model, of it with effects, and of a curve of knots."""
+    models = {
+        "plain": PLAIN,
+        "effects": extended_by(EFFECTS),
+        "knots": Model.prior("oxide", 96, 60.0),
+    }
     made = {}
-    for name, model in (("plain", PLAIN), ("knots", knots), ("effects", effects)):
+    for name, model in models.items():
         made[name] = tmp_path_factory.mktemp(name)
         export_c(model, made[name])
     return made

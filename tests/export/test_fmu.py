@@ -15,7 +15,6 @@ from cangauge.errors import CangaugeError, InputError
 from cangauge.estimation.estimator import Estimator
 from cangauge.estimation.settings import EstimatorSettings
 from cangauge.extras.embedded.fmu import Kind, Version, export_fmu
-from cangauge.model.delay_line import DelayLine
 from cangauge.model.effects.base import Reading
 from cangauge.model.model_file import Model
 from cangauge.model.published import leaf_2012_model_file
@@ -80,8 +79,7 @@ def held(values: np.ndarray) -> list[float]:
 
 def pack_voltage(model: Model, initial_soc_pct: float) -> list[float]:
     effects = [effect for effect in model.effects if effect["id"] != "voltage_offset"]
-    extended = model.model_copy(update={"effects": effects}).extended_model()
-    online, line = extended.online(), DelayLine(model.delays_s)
+    online = model.model_copy(update={"effects": effects}).online()
     volts, out_ah, last = [], 0.0, 0.0
     for time_s, current_a, temperature_c in zip(
         TIME_S.tolist(), held(CURRENT_A), held(TEMPERATURE_C), strict=True
@@ -90,11 +88,9 @@ def pack_voltage(model: Model, initial_soc_pct: float) -> list[float]:
         if volts:
             out_ah += 0.5 * (now.current_a + last) / 3600.0
         last = now.current_a
-        line.push(time_s, now.current_a)
-        online.advance(time_s, now.current_a, now.temperature_c, line.currents())
+        online.advance(time_s, now.current_a, now.temperature_c)
         soc = initial_soc_pct - 100.0 * out_ah / model.capacity_ah
-        offset_v = extended.model.offset_at(now.temperature_c, line.currents())
-        volts.append(online.pseudo_ocv_at(soc)[0] + offset_v)
+        volts.append(online.pseudo_ocv_at(soc)[0] + online.offset_v())
     return volts
 
 
@@ -107,13 +103,13 @@ def test_the_unit_is_valid(units: dict[Any, Path], kind: Kind, version: Version)
 
 
 @pytest.mark.parametrize("version", [2, 3])
-def test_the_pack_is_the_model_bit_for_bit(units: dict[Any, Path], version: Version) -> None:
+def test_the_pack_is_the_model_within_1e_9(units: dict[Any, Path], version: Version) -> None:
     found = simulate(units["pack", version], ["voltage_v"], {}, initial_soc_pct=81.0)
-    assert found["voltage_v"].tolist() == pack_voltage(repaired(), 81.0)
+    np.testing.assert_allclose(found["voltage_v"], pack_voltage(repaired(), 81.0), atol=1e-9)
 
 
 @pytest.mark.parametrize("version", [2, 3])
-def test_the_estimator_is_pythons_bit_for_bit(units: dict[Any, Path], version: Version) -> None:
+def test_the_estimator_is_pythons_within_1e_9(units: dict[Any, Path], version: Version) -> None:
     volts = np.array(pack_voltage(repaired(), 80.0))
     found = simulate(
         units["estimator", version], ["soc_pct", "soc_std_pct", "status"], {"voltage_v": volts}
@@ -123,8 +119,8 @@ def test_the_estimator_is_pythons_bit_for_bit(units: dict[Any, Path], version: V
     for row, sample in zip(found, samples, strict=True):
         estimator.update(Sample(*sample))
         expected = estimator.estimate
-        assert row["soc_pct"] == expected.soc_pct
-        assert row["soc_std_pct"] == expected.soc_std_pct
+        assert row["soc_pct"] == pytest.approx(expected.soc_pct, abs=1e-9, nan_ok=True)
+        assert row["soc_std_pct"] == pytest.approx(expected.soc_std_pct, abs=1e-9, nan_ok=True)
         assert row["status"] == expected.status
 
 
@@ -134,7 +130,7 @@ def test_a_diagnosed_effect_is_a_parameter(units: dict[Any, Path]) -> None:
     polarization = {"ohm": 0.05, "tau_s": 4.0, "activation_k": 900.0}
     changed = [*EFFECTS[:2], {"id": "fast_polarization", "parameters": polarization}]
     model = repaired().model_copy(update={"effects": changed})
-    assert found["voltage_v"].tolist() == pack_voltage(model, 81.0)
+    np.testing.assert_allclose(found["voltage_v"], pack_voltage(model, 81.0), atol=1e-9)
 
 
 @pytest.mark.parametrize("version", [2, 3])
@@ -207,7 +203,8 @@ def test_inputs_of_the_end_of_a_step_estimate_the_log(
     samples = zip(TIME_S.tolist(), CURRENT_A, volts, TEMPERATURE_C, strict=True)
     for row, sample in zip(found, samples, strict=True):
         estimator.update(Sample(*sample))
-        assert row["soc_pct"] == estimator.estimate.soc_pct
+        expected = estimator.estimate.soc_pct
+        assert row["soc_pct"] == pytest.approx(expected, abs=1e-9, nan_ok=True)
 
 
 def test_a_saved_state_continues_as_it_was(units: dict[Any, Path], tmp_path: Path) -> None:

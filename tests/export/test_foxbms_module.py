@@ -101,6 +101,11 @@ def estimated(rows: Sequence[Row], model: Model, settings: EstimatorSettings) ->
     return published(estimator.step(as_sample(row)) for row in rows)
 
 
+def assert_published(found: FloatArray, expected: FloatArray) -> None:
+    """Compare within the resolution of a float at 100 %."""
+    np.testing.assert_allclose(found, expected, rtol=0.0, atol=1e-5)
+
+
 @pytest.fixture(scope="module")
 def driver(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return built(tmp_path_factory.mktemp("foxbms"), MODEL)
@@ -115,9 +120,7 @@ def drive() -> list[Row]:
 
 def test_module_publishes_pythons_estimate(driver: Path, drive: list[Row]) -> None:
     found, _ = run(driver, drive)
-    np.testing.assert_allclose(
-        found, estimated(drive, MODEL, EstimatorSettings()), rtol=0.0, atol=1e-5
-    )
+    assert_published(found, estimated(drive, MODEL, EstimatorSettings()))
     assert np.ptp(found[:, 0]) > 1.0
 
 
@@ -126,9 +129,7 @@ def test_time_stamps_may_wrap(driver: Path, drive: list[Row]) -> None:
     later = [(first + stamp, *values) for stamp, *values in drive]
     wrapped = [(stamp % 2**32, *values) for stamp, *values in later]
     found, _ = run(driver, wrapped)
-    np.testing.assert_allclose(
-        found, estimated(later, MODEL, EstimatorSettings()), rtol=0.0, atol=1e-5
-    )
+    assert_published(found, estimated(later, MODEL, EstimatorSettings()))
 
 
 def from_zero(rows: list[Row]) -> list[Row]:
@@ -148,7 +149,7 @@ def test_reset_continues_from_the_soc_in_fram(driver: Path, drive: list[Row]) ->
     later = from_zero(drive[reset - 1 :])
     found, _ = run(driver, drive[: reset - 1] + later, reset)
     expected = estimated(later, MODEL, settings_after(found[reset - 2]))
-    np.testing.assert_allclose(found[reset - 1 :], expected, rtol=0.0, atol=1e-5)
+    assert_published(found[reset - 1 :], expected)
 
 
 def test_own_fram_block_keeps_the_whole_state(
@@ -169,7 +170,7 @@ def test_own_fram_block_keeps_the_whole_state(
     after = Estimator(MODEL, EstimatorSettings())
     after.restore(state.model_copy(update=without_line), math.nan)
     expected = published(after.step(as_sample(row)) for row in later)
-    np.testing.assert_allclose(found[reset - 1 :], expected, rtol=0.0, atol=1e-5)
+    assert_published(found[reset - 1 :], expected)
 
 
 def test_saved_state_of_another_model_is_not_used(drive: list[Row], tmp_path: Path) -> None:
@@ -179,9 +180,7 @@ def test_saved_state_of_another_model_is_not_used(drive: list[Row], tmp_path: Pa
     before, _ = run(old, drive[:1000], fram=fram)
     kept = fram.read_bytes()
     found, _ = run(new, drive, fram=fram)
-    np.testing.assert_allclose(
-        found, estimated(drive, other, settings_after(before[-1])), rtol=0.0, atol=1e-5
-    )
+    assert_published(found, estimated(drive, other, settings_after(before[-1])))
     fram.write_bytes(kept)
     again, _ = run(old, drive, fram=fram)
     assert np.any(again != estimated(drive, MODEL, settings_after(before[-1])))
@@ -206,6 +205,4 @@ def test_recorded_trip_gives_pythons_estimate(shared_data: Path, tmp_path: Path)
     started = replace(log, time_s=log.time_s - log.time_s[0] + 1.0)
     rows = rounded(samples_of(started))
     found, _ = run(built(tmp_path, model, period_s=1.0), rows)
-    np.testing.assert_allclose(
-        found, estimated(rows, model, EstimatorSettings()), rtol=0.0, atol=1e-5
-    )
+    assert_published(found, estimated(rows, model, EstimatorSettings()))

@@ -273,6 +273,14 @@ def command(*arguments: object) -> dict[str, Any]:
     return found
 
 
+def succeed(*arguments: object) -> dict[str, Any]:
+    """Run a command that must not fail."""
+    found = command(*arguments)
+    if "error" in found:
+        raise AssertionError(f"{arguments}: {found['error']}")
+    return found
+
+
 def shape(value: Any) -> Any:
     """Return keys and types of a JSON value; a list has the shapes of its items, each once."""
     if isinstance(value, dict):
@@ -296,8 +304,8 @@ def live(folder: Path, log: Path, model: Path) -> Iterator[tuple[str, dict[str, 
     until = time.monotonic() + 60.0
     while run.is_alive() and not socket.exists() and time.monotonic() < until:
         time.sleep(0.05)
-    yield "replay", command("replay", log, *bus, "--speed", "max")
-    yield "status", command("status", "--endpoint", socket)
+    yield "replay", succeed("replay", log, *bus, "--speed", "max")
+    yield "status", succeed("status", "--endpoint", socket)
     run.join()
     yield "run", json.loads((folder / "run.out").read_text())
 
@@ -323,7 +331,8 @@ def command_records() -> dict[str, Any]:
         reference, capture = folder / "reference.csv", HERE / "day.log.gz"
 
         def keep(label: str, *arguments: object) -> None:
-            found[label] = shape(command(*arguments))
+            run = command if label == "error" else succeed
+            found[label] = shape(run(*arguments))
 
         keep("twin", "twin", "--seed", 3, "--hours", 0.3, "-o", drive)
         keep("twin_effect", "twin", "--seed", 3, "--day", 2, "--hours", 0.3,
@@ -359,14 +368,16 @@ def make_models() -> None:
         for label, pack in FROZEN.items():
             drives = [folder / f"{label}{day}.csv" for day in (1, 2, 3)]
             for day, path in enumerate(drives, 1):
-                command("twin", "--seed", 7, "--day", day, "--pack", pack, "--hours", 1.5,
+                succeed("twin", "--seed", 7, "--day", day, "--pack", pack, "--hours", 1.5,
                         "--start-soc", 95, "--end-soc", 15, "-o", path)  # fmt: skip
             truth = cangauge.read_log(drives[0])
             capacity = truth.soc_pct[0] - truth.soc_pct[-1]
             charge = np.trapezoid(truth.current_a, truth.time_s) / 3600.0
-            command("fit", *drives, "--capacity-ah", round(100.0 * charge / capacity, 1),
-                    "-o", HERE / f"{label}.json", "--name", f"frozen {label}")  # fmt: skip
-        command("twin", "--seed", 7, "--day", 4, "--pack", "leaf24", "--hours", 0.25,
+            succeed("fit", *drives, "--capacity-ah", round(100.0 * charge / capacity, 1),
+                    "--chemistry", label, "-o", HERE / f"{label}.json")  # fmt: skip
+            plain = json.loads((HERE / f"{label}.json").read_text())
+            (HERE / f"{label}.json").write_text(json.dumps(plain, ensure_ascii=False) + "\n")
+        succeed("twin", "--seed", 7, "--day", 4, "--pack", "leaf24", "--hours", 0.25,
                 "--start-soc", 70, "-o", folder / "day.csv")  # fmt: skip
         write_day(folder / "day.csv")
 

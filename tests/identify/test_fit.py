@@ -157,6 +157,8 @@ def test_chemistry_is_given_guessed_or_assumed_and_said() -> None:
     assert any("chemistry oxide by 3.9" in text for text in guessed.remarks)
     flat = fit(log, capacity_ah=CAPACITY_AH, cells=115)
     assert flat.model.chemistry == "lfp"
+    whole = synthetic_log(model=CELLS, noise_v=0.3)  # from full, where both chemistries are high
+    assert fit(whole, capacity_ah=CAPACITY_AH, cells=96).model.chemistry == "oxide"
     assumed = fit(log, capacity_ah=CAPACITY_AH)
     assert assumed.model.chemistry == "oxide"
     assert any("--chemistry lfp" in text for text in assumed.remarks)

@@ -10,14 +10,14 @@ from pathlib import Path
 
 import pytest
 
-from cangauge._io import sole_writer
+from cangauge._files import sole_writer
 from cangauge.errors import InputError
 from live import Command, in_process, leaf_model_path, run_to_end
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="flock is Unix's")
 RUN = ("run", "-m", leaf_model_path(), "--interface", "virtual", "--channel", "a")
 HOLD = (
-    "import sys; from cangauge._io import sole_writer\n"
+    "import sys; from cangauge._files import sole_writer\n"
     "with sole_writer(sys.argv[1]): print('held', flush=True); sys.stdin.read()"
 )
 

@@ -9,6 +9,7 @@ import time
 from pathlib import Path
 
 import can
+import numpy as np
 import pytest
 
 from cangauge.bus.connection import BusConnection, BusError
@@ -18,6 +19,7 @@ from cangauge.bus.publish import SocDetail, SocEstimate, SocReader
 from cangauge.bus.time_source import ClockFrames
 from cangauge.bus.vehicle import Vehicle
 from cangauge.estimation.offline import samples_of
+from cangauge.estimation.settings import EstimatorSettings
 from cangauge.service.loop import Loop, LoopSettings, OwnFrames
 from cangauge.service.offline import estimate_capture
 from cangauge.service.output import Output
@@ -82,7 +84,8 @@ def collect_queue(port: BusConnection) -> list[can.Message]:
 def test_silence_is_stale_until_input_returns() -> None:
     loop = LoopSettings(timeout_s=0.3)
     reader = SocReader()
-    with virtual_port("stale") as port, virtual_service("stale", loop=loop) as service:
+    known = PipelineSettings(EstimatorSettings(initial_soc_pct=80.0))
+    with virtual_port("stale") as port, virtual_service("stale", known, loop) as service:
         send_log(port, 10.0)
         assert waits(lambda: service.pipeline.samples == 100)
         collect_queue(port)
@@ -108,8 +111,9 @@ def test_recording_and_table_equal_the_live_estimates(tmp_path: Path) -> None:
         send_log(port, 20.0)
         assert waits(lambda: service.pipeline.samples == 200)
     recorded = estimate_capture(path, Vehicle.load("generic"), leaf_model())
-    assert recorded.table.soc_pct.tolist() == [each.soc_pct for _, each in service.rows]
-    assert recorded.table.residual_v.tolist() == [each.residual_v for _, each in service.rows]
+    for name in ("soc_pct", "residual_v", "reasons"):
+        live = [getattr(each, name) for _, each in service.rows]
+        assert np.array_equal(getattr(recorded.table, name), live, equal_nan=True), name
     assert recorded.time_source == "receive"
 
 

@@ -28,8 +28,13 @@ from can.io.blf import BLFParseError
 from can.io.generic import BinaryIOMessageReader, MessageReader, TextIOMessageReader
 from can.typechecking import StringPathLike
 
-from cangauge._io import MAX_CAPTURE_BYTES, MAX_LINE, MAX_STAMP_S, open_unpacked, read_beginning
+from cangauge._files import open_unpacked, read_beginning
 from cangauge.errors import InputError
+
+MAX_LINE: Final = 16 * 1024
+"""Longest line of a text capture [characters]."""
+MAX_STAMP_S: Final = 1e11
+"""Largest time stamp of a frame [s]: the year 5138, counted from 1970."""
 
 GROUP: Final = "cangauge.capture_readers"
 """Entry points: classes derived from `CaptureReader`."""
@@ -145,7 +150,7 @@ class CaptureReader(MessageReader, ABC):
 
     def __init__(self, file: StringPathLike | IO[Any], **_options: object) -> None:
         self.source = Path(file) if isinstance(file, str | os.PathLike) else None
-        opened = file if self.source is None else open_unpacked(self.source, MAX_CAPTURE_BYTES)
+        opened = file if self.source is None else open_unpacked(self.source)
         self.raw = cast("io.BufferedIOBase", opened)
         self.frames = 0
         self.malformed = 0
@@ -714,7 +719,7 @@ def find_capture(
     path = Path(path)
     parts = parts_of_run(path)
     for part in parts or [path]:
-        with open_unpacked(part, MAX_CAPTURE_BYTES) as file:
+        with open_unpacked(part) as file:
             head = read_beginning(file, _HEAD_BYTES)
         for kind in capture_readers():
             if kind.matches(head):

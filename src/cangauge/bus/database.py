@@ -23,9 +23,12 @@ import numpy as np
 from cantools.database.can import Database, Message, Signal
 from numpy.typing import NDArray
 
-from cangauge._io import MAX_DBC_BYTES, read_bounded
+from cangauge._files import MIB, read_bounded
 from cangauge._typing import FloatArray
 from cangauge.errors import InputError, closest
+
+MAX_DBC_BYTES: Final = 4 * MIB
+"""Parsing takes 1–6 s a megabyte; the largest files in use are smaller."""
 
 Decode = Callable[[bytes | bytearray], float]
 

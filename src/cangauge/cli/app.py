@@ -18,7 +18,7 @@ import typer
 from typer.core import TyperCommand, TyperGroup
 from typer.main import get_command as build_command
 
-from cangauge._io import FULL
+from cangauge._files import FULL
 from cangauge._resources import one_thread
 from cangauge._version import __version__
 from cangauge.cli.output import emit_json, note

@@ -13,9 +13,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from cangauge._extras import extra
-from cangauge._formatting import number, significant
-from cangauge._io import check_writable, write_text_atomic
+from cangauge._files import check_writable, write_text_atomic
 from cangauge._resources import shared_file
+from cangauge._text import number, significant
 from cangauge.cli.options import JsonOption
 from cangauge.cli.output import emit_json, note, print_table
 from cangauge.errors import CangaugeError, InputError

@@ -12,8 +12,8 @@ import typer
 from rich.progress import Progress
 
 from cangauge._extras import extra
-from cangauge._formatting import number
-from cangauge._io import atomic_path
+from cangauge._files import atomic_path
+from cangauge._text import number
 from cangauge.cli.options import (
     JsonOption,
     Reading,

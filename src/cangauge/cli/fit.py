@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import typer
 
 from cangauge._extras import extra
-from cangauge._formatting import number, significant, span
-from cangauge._io import write_texts_atomic
+from cangauge._files import write_texts_atomic
+from cangauge._text import number, significant, span
 from cangauge.cli.options import (
     JsonOption,
     Reading,
@@ -180,12 +180,12 @@ def fit_command(  # noqa: PLR0917 - typer passes options by name
         {output: result.model.to_json()} | ({report: page} if report and page else {})
     )
     if json_output:
-        extra: dict[str, object] = {
+        more: dict[str, object] = {
             "model": str(output),
             "report": report and str(report),
             "assumed": assumed_of(recorded),
         }
-        emit_json(result.to_dict() | extra)
+        emit_json(result.to_dict() | more)
         return
     _show(result)
     for remark in result.remarks:

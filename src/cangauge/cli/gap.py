@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from cangauge._extras import extra
-from cangauge._formatting import printable
-from cangauge._io import write_texts_atomic
+from cangauge._files import write_texts_atomic
+from cangauge._text import printable
 from cangauge.cli.options import (
     JsonOption,
     Reading,

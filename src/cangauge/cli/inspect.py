@@ -11,7 +11,8 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from cangauge._io import write_texts_atomic
+from cangauge._extras import extra
+from cangauge._files import write_texts_atomic
 from cangauge.cli.options import (
     JsonOption,
     Reading,

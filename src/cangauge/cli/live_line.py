@@ -8,8 +8,8 @@ from rich.console import Console
 from rich.live import Live
 from rich.text import Text
 
-from cangauge._formatting import number
 from cangauge._logging import takes_text
+from cangauge._text import number
 from cangauge.service.output import Output
 from cangauge.service.status import Snapshot
 

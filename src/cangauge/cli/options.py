@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, TypeVar, cast, get_type_hints
 
 import typer
 
-from cangauge._io import check_writable, require_suffix
+from cangauge._files import check_writable, require_suffix
 from cangauge.cli.output import note
 from cangauge.cli.shown import TEMPERATURE_SOURCES
 from cangauge.errors import InputError

@@ -16,7 +16,7 @@ from rich.segment import Segment
 from rich.table import Table
 from rich.text import Text
 
-from cangauge._formatting import printable, printable_json
+from cangauge._text import printable, printable_json
 from cangauge.errors import CangaugeError
 
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Self
 import typer
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
 
-from cangauge._formatting import duration, number
+from cangauge._text import duration, number
 from cangauge.cli.config_options import (
     BusDbcOption,
     BusMapOption,

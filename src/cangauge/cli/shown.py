@@ -8,7 +8,7 @@ from __future__ import annotations
 from typing import Final
 
 TEMPERATURE_SOURCES: Final = ("cell", "pack", "coolant", "room", "unknown")
-VALID_STD_PCT: Final = 1.5
+VALID_STD_PCT: Final = 3.0
 ALARM: Final = 0.05
 LOCAL: Final = "local"
 VEHICLE_PATTERN: Final = r"(?:vehicle=)?([^/]+)/[^/]+$"

@@ -14,7 +14,7 @@ from rich.console import RenderableType
 from rich.live import Live
 from rich.text import Text
 
-from cangauge._formatting import NONE_KNOWN, duration, number
+from cangauge._text import NONE_KNOWN, duration, number
 from cangauge.cli.options import EndpointOption, JsonOption, TokenFileOption
 from cangauge.cli.output import PlainConsole, emit_json, print_table, text_table
 from cangauge.errors import CangaugeError, InputError

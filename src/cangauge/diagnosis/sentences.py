@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from cangauge._formatting import counted, number, significant
+from cangauge._text import counted, number, significant
 from cangauge.diagnosis.answer import GROUP_OF, NONE, TITLES, UNKNOWN, Posterior
 from cangauge.diagnosis.columns import COVER_PCT
 from cangauge.diagnosis.evidence import COVER_K

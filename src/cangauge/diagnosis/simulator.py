@@ -14,7 +14,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from cangauge._formatting import significant
+from cangauge._text import significant
 from cangauge._typing import FloatArray
 from cangauge.errors import InputError
 from cangauge.identify.fit import fit

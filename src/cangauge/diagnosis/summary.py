@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from html import escape
 from typing import TYPE_CHECKING, Any, Final
 
-from cangauge._formatting import NONE_KNOWN, number, significant
+from cangauge._text import NONE_KNOWN, number, significant
 from cangauge.diagnosis.answer import NONE, UNKNOWN
 
 if TYPE_CHECKING:

@@ -2,8 +2,8 @@
 
 `Estimator` is the reference. `CompiledEstimator` hands each sample to the extension `_core`; what
 is rare (health, power, states to save) reads the core's state into the reference. It is used
-wherever the extension was built at installation, live and offline, unless `CANGAUGE_PURE_PYTHON`
-is set.
+wherever the extension was built at installation, live and offline, unless `CANGAUGE_PURE_PYTHON` is
+set.
 """
 
 from __future__ import annotations
@@ -108,6 +108,7 @@ class CompiledEstimator(Estimator):
         super().__init__(model, settings)
         longest_s = self._online.delay_line.longest_s
         self._forms = forms
+        self._over_soc = [effect.uses_soc for effect, _ in self._online.extended.effects]
         self._core: Any = _core.Core(
             layout.model_constants(model, self._online, forms, self.tests).tobytes(),
             layout.settings_constants(model, settings).tobytes(),
@@ -182,9 +183,7 @@ class CompiledEstimator(Estimator):
     def current_changes(self, time_s: float, stamps_s: Sequence[float]) -> list[float]:
         """Return the current at a sample's time less that at other stamps [A]; NaN for NaN."""
         now_a, at = self._core.current_at(0.0), self._core.current_at
-        return [
-            now_a - at(time_s - each) if not math.isnan(each) else math.nan for each in stamps_s
-        ]
+        return [each if math.isnan(each) else now_a - at(time_s - each) for each in stamps_s]
 
     def power(self) -> Power:
         """Return the currents possible for 10 s and the energy left, after the latest sample."""
@@ -228,20 +227,26 @@ class CompiledEstimator(Estimator):
         is_restored = counter.pop("is_restored")
         self._counter.restore(CounterState(**counter), is_restored=is_restored)
         used = 5 + len(self._online.load_coefficients)
-        block["sums"] = block["sums"][:used] if block["rows"] else []
-        block["columns"] = used - 5 if block["rows"] else 0
+        beside, over = self._split(block.pop("drive"))
+        if block["rows"]:
+            block["columns"], block["sums"] = used - 5, [*block["sums"][:used], beside, *over]
+        else:
+            block["sums"] = []
         self._block.restore(BlockState(**block))
         memory = _plain(record["memory"])
         memory["doubt"] = layout.DOUBTS[memory["doubt"]]
         memory["innovations"] = memory.pop("innovation2")[: memory["innovations"]]
         self._memory = EstimatorMemory(**memory)
         self.hypotheses.restore(self._hypotheses_state())
-        drives = [
-            float(_drive_over_soc(form, state["volts"]))
-            for form, state in zip(self._forms, record["effect"], strict=False)
-        ]
-        beside_v = float(record["beside_soc_v"])
+        beside_v, _ = self._split(record["drive"].tolist())
+        drives = record["drive"][: len(self._forms)].tolist()
         self._online.resume(record["load"][: used - 5].copy(), beside_v, drives)
+
+    def _split(self, drives: Sequence[float]) -> tuple[float, list[float]]:
+        """Return the sum of the drives of effects beside the SoC, and those over it."""
+        pairs = list(zip(self._over_soc, drives, strict=False))
+        beside = sum(drive for is_over, drive in pairs if not is_over)
+        return beside, [drive for is_over, drive in pairs if is_over]
 
     def _hypotheses_state(self) -> HypothesesState:
         record, n = self._record["filter"], 4 + self._online.functions.number
@@ -294,9 +299,13 @@ class CompiledEstimator(Estimator):
         record["memory"]["innovation2"][: len(squares)] = squares
         _set(record["memory"], memory | {"innovations": len(squares)})
         block = asdict(self._block.snapshot())
-        sums = block.pop("sums")[: 5 + block.pop("columns")]  # the core sums no drives
-        record["block"]["sums"] = 0.0
-        record["block"]["sums"][: len(sums)] = sums
+        sums, columns = block.pop("sums"), block.pop("columns")
+        record["block"]["sums"] = record["block"]["drive"] = record["drive"] = 0.0
+        if sums:
+            used, over = 5 + columns, np.array(self._over_soc, dtype=bool)
+            record["block"]["sums"][:used] = sums[:used]
+            record["block"]["drive"][np.flatnonzero(over)] = sums[used + 1 :]
+            record["block"]["drive"][np.flatnonzero(~over)[:1]] = sums[used]
         _set(record["block"], block)
         _set(record["latest"], self._latest._asdict())
         record["is_pending"] = record["is_refused"] = False
@@ -335,15 +344,6 @@ class CompiledEstimator(Estimator):
             else:
                 lags = self._record["effect"][number]["lag"]
                 _set_lags(lags, state, 1 if kind == "resistance_step" else 3)
-
-
-def _drive_over_soc(form: CoreForm, drive: float) -> float:
-    """Return an effect's drive over SoC: the core keeps none where it is constant."""
-    if form.kind == "weak_cell":
-        return form.values[0]
-    if form.kind == "rc" and not form.values[1]:  # not by slope: with what is beside the SoC
-        return 0.0
-    return 1.0 if form.kind == "ocv_shape" else drive
 
 
 def _plain(record: Any) -> dict[str, Any]:

@@ -87,13 +87,13 @@ _EKF: Final = _structure(
 STATE: Final = _structure(
     "clock:clock counter:counter block:block filter:filter memory:memory lag:low_pass[LOW_PASSES]"
     " effect:effect[EFFECTS] latest:latest sample:pending d:pending_stamp_s b:is_pending"
-    " b:is_refused u:implausible d:load[LOADS] d:load_v d:drop_v d:beside_soc_v",
+    " b:is_refused u:implausible d:load[LOADS] d:load_v d:drop_v d:drive[EFFECTS]",
     clock=_structure("d:last_s d:shift_s l:behind d:behind_s d:age_s b:is_restored"),
     counter=_structure(
         "d:time_s d:current_a d:mean_square_a2 d:mean_a d:discharged_pct d:moved_pct d:counted_s"
         " d:gap_var_pct2 b:is_restored"
     ),
-    block=_structure("l:number i:rows b:is_broken d:sums[SUMS]"),
+    block=_structure("l:number i:rows b:is_broken d:sums[SUMS] d:drive[EFFECTS]"),
     filter=_structure("ekf:ekf[2] i:hypotheses i:decision d:prior_log_odds", ekf=_EKF),
     memory=_structure(
         "l:samples l:resets d:first_s l:tick d:temperature_c d:newton_pct d:newton_std_pct"
@@ -104,7 +104,7 @@ STATE: Final = _structure(
         " d:rest_since_s d:full_since_s b:is_full b:is_rested"
     ),
     lag=LAG,
-    effect=_structure("d:volts lag:lag[LAGS]", lag=LAG),
+    effect=_structure("lag:lag[LAGS]", lag=LAG),
     latest=_structure(
         "d:time_s d:soc_pct d:soc_std_pct d:soc_newton_pct d:soc_coulomb_pct d:voltage_model_v"
         " d:residual_v i:status u:reasons l:samples"

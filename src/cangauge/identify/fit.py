@@ -14,8 +14,8 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from cangauge._extras import extra
-from cangauge._formatting import counted, duration, significant
-from cangauge._io import text_sha256
+from cangauge._files import text_sha256
+from cangauge._text import counted, duration, significant
 from cangauge._typing import FloatArray
 from cangauge._version import __version__
 from cangauge.errors import InputError
@@ -48,8 +48,8 @@ from cangauge.identify.published import (
     solve_published,
 )
 from cangauge.identify.rows import FitRows, fit_rows, usable_delays
-from cangauge.identify.starts import Start, Starts, find_starts, given_starts
-from cangauge.logs.gaps import bridge_s, uncounted_gaps, usual_step_s
+from cangauge.identify.starts import Start, Starts, find_starts, given_starts, with_start
+from cangauge.logs.gaps import bridge_s, discharged_ah, uncounted_gaps, usual_step_s
 from cangauge.logs.log import Log, TemperatureSource
 from cangauge.logs.read import as_log
 from cangauge.model.coulomb_counting import (
@@ -291,7 +291,11 @@ def fit(
             cure="check the sign of current: positive must discharge",
         )  # fmt: skip
     ids = _effect_ids(effects, equation, len(recorded))
-    known, said = resolve_chemistry(recorded, chemistry, cells)
+    stated = [
+        log if value is None else with_start(log, value)
+        for log, value in zip(recorded, given, strict=True)
+    ]
+    known, said = resolve_chemistry(stated, chemistry, cells, capacity_ah)
     with threadpool_limits(limits=1):  # 40 columns: threads only wait for each other
         starts = find_starts(recorded, given, capacity_ah, known)
         knots = equation == "knots"
@@ -362,7 +366,7 @@ def _effect_ids(
 
 
 def resolve_chemistry(
-    logs: Sequence[Log], chemistry: ChemistryName | None, cells: int | None
+    logs: Sequence[Log], chemistry: ChemistryName | None, cells: int | None, capacity_ah: float
 ) -> tuple[Chemistry, list[str]]:
     """Return the chemistry, and what is to be said about how it is known.
 
@@ -372,6 +376,8 @@ def resolve_chemistry(
     chemistry : {"oxide", "lfp"}, optional
     cells : int, optional
         Cells in series.
+    capacity_ah : float
+        [Ah].
     """
     if chemistry is not None:
         return CHEMISTRIES[chemistry], []
@@ -380,15 +386,18 @@ def resolve_chemistry(
             "chemistry taken as oxide: --chemistry lfp for iron phosphate, or --cells N to take it"
             " from the volts per cell"
         ]
-    volts = float(np.median(np.concatenate([log.voltage_v for log in logs]))) / cells
-    socs = [pct for log in logs if (first := log.first_soc()) for pct in (first[1],)]
-    middle = float(np.mean(socs)) if socs else 50.0
-    name = min(
-        CHEMISTRIES,
-        key=lambda name: abs(
-            volts - float(np.interp(middle, KNOTS_PCT, CHEMISTRIES[name].curve_v))
-        ),
-    )
+    volts = float(np.mean(np.concatenate([log.voltage_v for log in logs]))) / cells
+    middles = []
+    for log in logs:
+        out_pct = 100.0 * discharged_ah(log.time_s, log.current_a) / capacity_ah
+        row, start_pct = log.first_soc() or (0, 50.0 + float(out_pct.mean()))
+        middles.append(np.clip(start_pct + out_pct[row] - out_pct, 0.0, 100.0))
+    middle = float(np.mean(np.concatenate(middles)))
+
+    def distance_v(name: ChemistryName) -> float:
+        return abs(volts - float(np.interp(middle, KNOTS_PCT, CHEMISTRIES[name].curve_v)))
+
+    name = min(CHEMISTRIES, key=distance_v)
     return CHEMISTRIES[name], [f"chemistry {name} by {volts:.2f} V per cell"]
 
 

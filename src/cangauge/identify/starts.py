@@ -16,7 +16,7 @@ from typing import Final, Literal
 import numpy as np
 from scipy import optimize
 
-from cangauge._formatting import significant
+from cangauge._text import significant
 from cangauge.errors import InputError
 from cangauge.identify.least_squares import (
     LogSums,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from cangauge._formatting import number, significant
+from cangauge._text import number, significant
 from cangauge.identify.effect_search import Selected
 from cangauge.identify.fit import Identification
 

@@ -7,7 +7,7 @@ from typing import Any, Final, Literal
 
 import numpy as np
 
-from cangauge._formatting import counted, duration
+from cangauge._text import counted, duration
 from cangauge.errors import InputError
 from cangauge.identify.rows import SOC_SPAN_AT_LEAST_PCT, usable_delays, usable_rows
 from cangauge.inspect.channels import Channel, describe_channels

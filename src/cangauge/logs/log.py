@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 
 from cangauge._dataframes import ArrowExport
 from cangauge._extras import extra
-from cangauge._formatting import duration
+from cangauge._text import duration
 from cangauge._typing import BoolArray, FloatArray, IntArray
 from cangauge.errors import InputError
 from cangauge.logs.units import (

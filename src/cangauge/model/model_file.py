@@ -11,10 +11,11 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from cangauge._config import schema_error
-from cangauge._io import MAX_MODEL_BYTES, read_bounded, write_text_atomic
+from cangauge._files import MIB, read_bounded, write_text_atomic
 from cangauge._typing import FloatArray
 from cangauge.errors import InputError
 from cangauge.logs.log import Log, TemperatureSource
+from cangauge.logs.read import as_log
 from cangauge.model.delay_line import GAP_S
 from cangauge.model.effects.base import RESISTANCE_AT_LEAST, Pack, Signals
 from cangauge.model.effects.library import parse_effects
@@ -395,7 +396,7 @@ class Model(_Strict):
             If the file cannot be read or does not describe a usable model; names the field.
         """
         path = Path(path)
-        data = read_bounded(path, MAX_MODEL_BYTES, "a model file")
+        data = read_bounded(path, 4 * MIB, "a model file")
         try:
             raw = json.loads(data, parse_constant=_refuse_constant)
         except (ValueError, RecursionError) as error:
@@ -438,12 +439,14 @@ class Model(_Strict):
         """Write the model file; an existing file is replaced atomically."""
         write_text_atomic(Path(path), self.to_json())
 
-    def predict(self, log: Log, *, initial_soc_pct: float | None = None) -> Prediction:
+    def predict(
+        self, log: Log | Path | str | Any, *, initial_soc_pct: float | None = None
+    ) -> Prediction:
         """Predict the voltage of a log, with `residual_v` = measured − predicted.
 
         Parameters
         ----------
-        log : Log
+        log : Log, path or DataFrame
         initial_soc_pct : float, optional
             SoC at the first row [%]; by default the count starts from the first finite value of
             the log's reference SoC.
@@ -458,6 +461,7 @@ class Model(_Strict):
         InputError
             If the initial SoC is unknown.
         """
+        log = as_log(log)
         start = log.first_soc() if initial_soc_pct is None else (0, initial_soc_pct)
         if start is None:
             raise InputError(

@@ -116,10 +116,10 @@ CHEMISTRIES: Final[Mapping[ChemistryName, Chemistry]] = {
         ),
         slope_std=5e-4,
         soc_std_pct=0.3,
-        level_std=0.0025,
-        slow_std=0.002,
+        level_std=0.0018,
+        slow_std=0.0014,
         fast_factor=1.0,
-        cold_exponent=1.0,
+        cold_exponent=1.5,
     ),
     "lfp": Chemistry(
         "lfp",

@@ -15,7 +15,7 @@ from dataclasses import dataclass, field
 from os import PathLike
 from typing import Final
 
-from cangauge._io import open_regular
+from cangauge._files import open_regular
 from cangauge._logging import emit
 from cangauge.errors import InputError
 

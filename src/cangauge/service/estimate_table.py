@@ -19,7 +19,7 @@ import pyarrow as pa
 import pyarrow.csv as pacsv
 import pyarrow.parquet as pq
 
-from cangauge._io import atomic_path, require_suffix
+from cangauge._files import atomic_path, require_suffix
 from cangauge._logging import emit
 from cangauge._typing import FloatArray
 from cangauge.errors import CangaugeError

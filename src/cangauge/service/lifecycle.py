@@ -17,7 +17,7 @@ from contextlib import contextmanager, suppress
 from types import FrameType
 from typing import Final, Self
 
-from cangauge._formatting import printable
+from cangauge._text import printable
 
 PINGS_PER_TIMEOUT: Final = 4
 """Watchdog pings per time-out of systemd."""

@@ -26,7 +26,7 @@ from typing import Final, Self
 
 import can
 
-from cangauge._io import FOR_GROUP, FULL, check_writable
+from cangauge._files import FOR_GROUP, FULL, check_writable
 from cangauge._logging import emit
 from cangauge.bus.captures import all_parts, part_path, run_path
 from cangauge.bus.time_source import whole_us

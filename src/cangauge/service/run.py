@@ -14,9 +14,9 @@ from os import PathLike
 from pathlib import Path
 from typing import Any, Final
 
-from cangauge._formatting import number
-from cangauge._io import check_writable, sole_writer
+from cangauge._files import check_writable, sole_writer
 from cangauge._logging import emit
+from cangauge._text import number
 from cangauge.bus.connection import ReconnectingBus
 from cangauge.bus.publish import NO_REPORT
 from cangauge.errors import CangaugeError, InputError

@@ -23,9 +23,9 @@ from typing import Annotated, Any, Final, Self
 from pydantic import BaseModel, ConfigDict, Field
 
 from cangauge._config import validated
-from cangauge._formatting import duration, number
-from cangauge._io import PRIVATE, open_regular, text_sha256
+from cangauge._files import PRIVATE, open_regular, text_sha256
 from cangauge._logging import emit
+from cangauge._text import duration, number
 from cangauge.errors import InputError
 from cangauge.estimation.state import EstimatorState
 from cangauge.service.pipeline import Pipeline

@@ -14,8 +14,8 @@ from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, fields
 from typing import Any, Final
 
-from cangauge._formatting import number
 from cangauge._logging import emit, release_held
+from cangauge._text import number
 from cangauge._version import __version__
 from cangauge.bus.connection import BusConnection
 from cangauge.bus.plausibility import MessageStatistics

@@ -37,7 +37,6 @@ VALID = {
     "replay": ["absent.csv"],
     "inspect": ["absent.csv"],
     "twin": ["-o", "absent/out.csv"],
-    "packs-check": ["--data", "absent"],
     "export-c": ["absent.json", "-o", "out"],
     "export-ecm": ["absent.json", "-o", "out.py"],
     "export-fmu": ["absent.json", "-o", "out.fmu"],

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Final
 
 import typer
 
-from cangauge._io import check_writable, write_texts_atomic
+from cangauge._files import check_writable, write_texts_atomic
 from cangauge._resources import shared_file
 from cangauge.cli.config_options import BusOptionOption, ChannelOption, InterfaceOption
 from cangauge.cli.options import JsonOption, within

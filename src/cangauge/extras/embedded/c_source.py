@@ -75,7 +75,8 @@ def initialiser(value: Any, field: str = "") -> str:
 
     Parameters
     ----------
-    value : number, record, array, list or tuple
+    value : number, record, array, list, tuple or str
+        A string is an expression in C.
     field : str
         Field that the value is of.
     """
@@ -89,7 +90,7 @@ def initialiser(value: Any, field: str = "") -> str:
         if not math.isfinite(value):
             return "NAN" if math.isnan(value) else ("-" * (value < 0.0) + "INFINITY")
         return ("" if field in WIDE else "(cg_real)") + repr(float(value))
-    return str(int(value))
+    return value if isinstance(value, str) else str(int(value))
 
 
 def model_definition(name: str, constants: CoreConstants) -> str:

@@ -8,8 +8,8 @@ from typing import Annotated
 
 import typer
 
-from cangauge._formatting import number, significant
-from cangauge._io import write_text_atomic
+from cangauge._files import write_text_atomic
+from cangauge._text import number, significant
 from cangauge.cli.options import JsonOption, check_outputs, suffixed
 from cangauge.cli.output import emit_json, note, print_table
 from cangauge.errors import InputError

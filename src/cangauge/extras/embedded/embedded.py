@@ -16,7 +16,7 @@ from typing import Final
 from cantools.database.can import Message
 from cantools.database.can.c_source import generate
 
-from cangauge._io import text_sha256, write_texts_atomic
+from cangauge._files import text_sha256, write_texts_atomic
 from cangauge._resources import shared_file
 from cangauge._version import __version__
 from cangauge.bus.database import load_dbc, signal_codec

@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, cast
 
 import typer
 
-from cangauge._formatting import counted, number, significant
-from cangauge._io import file_sha256, write_texts_atomic
+from cangauge._files import file_sha256, write_texts_atomic
+from cangauge._text import counted, number, significant
 from cangauge.cli.options import (
     JsonOption,
     Reading,

@@ -23,7 +23,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
-from cangauge._io import atomic_path, text_sha256
+from cangauge._files import atomic_path, text_sha256
 from cangauge.errors import InputError
 from cangauge.extras.fleet.sources import FleetLog, filesystem
 

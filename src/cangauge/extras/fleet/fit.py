@@ -13,8 +13,8 @@ from typing import Any
 
 import numpy as np
 
-from cangauge._formatting import counted
-from cangauge._io import text_sha256
+from cangauge._files import text_sha256
+from cangauge._text import counted
 from cangauge._version import __version__
 from cangauge.errors import InputError
 from cangauge.extras.fleet.dataset import Dataset, by_kind

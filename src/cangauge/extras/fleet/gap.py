@@ -17,7 +17,7 @@ from typing import Any, ClassVar, Final, Self, cast
 
 import pyarrow as pa
 
-from cangauge._io import text_sha256
+from cangauge._files import text_sha256
 from cangauge.diagnosis import (
     ALARM,
     NONE,

@@ -12,7 +12,7 @@ from typing import Any, ClassVar, Final, Self
 import numpy as np
 import pyarrow as pa
 
-from cangauge._io import text_sha256
+from cangauge._files import text_sha256
 from cangauge.errors import InputError
 from cangauge.estimation.settings import EstimatorSettings
 from cangauge.extras.fleet.sources import FleetLog, ReadOptions

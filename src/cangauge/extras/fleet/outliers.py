@@ -9,7 +9,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from cangauge._formatting import NONE_KNOWN
+from cangauge._text import NONE_KNOWN
 from cangauge._typing import FloatArray
 from cangauge.model.model_file import Noise
 

@@ -8,7 +8,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from cangauge._formatting import counted, number
+from cangauge._text import counted, number
 from cangauge.diagnosis import NONE
 from cangauge.extras.fleet.dataset import Dataset
 from cangauge.extras.fleet.gap import GapJob

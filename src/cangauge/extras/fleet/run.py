@@ -19,7 +19,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from typing import Any, Final
 
-from cangauge._io import file_sha256, text_sha256
+from cangauge._files import file_sha256, text_sha256
 from cangauge._version import __version__
 from cangauge.errors import CangaugeError, InputError
 from cangauge.extras.fleet.dataset import BAD, Dataset, keys_of, reason_of

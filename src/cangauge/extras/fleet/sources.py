@@ -20,8 +20,7 @@ from datetime import UTC, datetime
 from pathlib import Path, PurePosixPath
 from typing import Any, Final
 
-from cangauge._files import as_utf8
-from cangauge._io import MAX_LOG_BYTES, text_sha256
+from cangauge._files import MAX_LOG_BYTES, as_utf8, text_sha256
 from cangauge.bus.captures import Capture
 from cangauge.bus.recording import (
     log_of,

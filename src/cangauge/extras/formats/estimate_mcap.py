@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from cangauge._mcap import ESTIMATE, SAMPLE, McapTopics
+from cangauge.extras.formats.mcap_messages import ESTIMATE, SAMPLE, McapTopics
 from cangauge.types import Estimate, Sample, Status, reason_names
 
 if TYPE_CHECKING:

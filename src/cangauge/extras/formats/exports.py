@@ -10,7 +10,7 @@ from typing import Final
 import numpy as np
 
 from cangauge._files import Head
-from cangauge._formatting import counted
+from cangauge._text import counted
 from cangauge._typing import FloatArray
 from cangauge.errors import InputError
 from cangauge.logs.column_map import ColumnMap

@@ -10,9 +10,9 @@ import can
 from can.io.generic import BinaryIOMessageWriter
 from can.typechecking import StringPathLike
 
-from cangauge._mcap import FRAME, MAGIC, McapTopics, read_messages
 from cangauge.bus.captures import MAX_ID, BinaryReader
 from cangauge.errors import InputError
+from cangauge.extras.formats.mcap_messages import FRAME, MAGIC, McapTopics, read_messages
 
 _TOPIC: Final = "/can/"
 

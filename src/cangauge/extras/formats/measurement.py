@@ -13,9 +13,9 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 
 from cangauge._files import MIB, Head
-from cangauge._mcap import FRAME, MAGIC, SAMPLE, McapMessage, read_messages
 from cangauge._typing import FloatArray
 from cangauge.errors import InputError
+from cangauge.extras.formats.mcap_messages import FRAME, MAGIC, SAMPLE, McapMessage, read_messages
 from cangauge.logs.canonical import build_table
 from cangauge.logs.column_map import ColumnMap, choose_columns, unknown_columns
 from cangauge.logs.draft import DraftLog

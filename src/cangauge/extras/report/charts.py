@@ -31,7 +31,7 @@ from bokeh.models import (
 from bokeh.plotting import figure
 from numpy.typing import NDArray
 
-from cangauge._formatting import number, significant
+from cangauge._text import number, significant
 from cangauge._typing import FloatArray
 from cangauge.logs.gaps import usual_gap_s
 from cangauge.model.delay_line import GAP_S

@@ -8,7 +8,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from cangauge._formatting import NONE_KNOWN, number, span
+from cangauge._text import NONE_KNOWN, number, span
 from cangauge.diagnosis import Diagnosis
 from cangauge.diagnosis.planner import Plan
 from cangauge.diagnosis.summary import (

@@ -10,7 +10,7 @@ import numpy as np
 from bokeh.models import ColumnDataSource
 from numpy.typing import NDArray
 
-from cangauge._formatting import duration, number, span
+from cangauge._text import duration, number, span
 from cangauge._typing import FloatArray
 from cangauge.estimation.offline import EstimateTable
 from cangauge.extras.report.charts import (

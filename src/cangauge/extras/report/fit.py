@@ -9,7 +9,7 @@ from typing import Final
 
 import numpy as np
 
-from cangauge._formatting import duration, number, significant, span
+from cangauge._text import duration, number, significant, span
 from cangauge._typing import FloatArray
 from cangauge.extras.report.charts import (
     BLACK,

@@ -8,7 +8,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from cangauge._formatting import counted, number
+from cangauge._text import counted, number
 from cangauge.extras.fleet.dataset import by_kind, reason_of
 from cangauge.extras.fleet.health import QUANTITIES
 from cangauge.extras.fleet.outliers import OUTLIER_Z

@@ -6,7 +6,7 @@ from typing import Final
 
 import numpy as np
 
-from cangauge._formatting import number, significant, span
+from cangauge._text import number, significant, span
 from cangauge.extras.fleet.fit import FleetFit
 from cangauge.extras.fleet.sources import short_names
 from cangauge.extras.report.charts import (

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from cangauge._formatting import NONE_KNOWN, duration, significant
+from cangauge._text import NONE_KNOWN, duration, significant
 from cangauge.extras.report.charts import BLUE, GREEN, ORANGE, PURPLE, Pen, TimeFigures
 from cangauge.extras.report.page import (
     Block,

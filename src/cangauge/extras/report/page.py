@@ -19,7 +19,7 @@ from bokeh.resources import Resources
 from bokeh.themes import Theme
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
-from cangauge._io import file_sha256, text_sha256
+from cangauge._files import file_sha256, text_sha256
 from cangauge._version import __version__
 from cangauge.extras.report.charts import MAX_POINTS
 from cangauge.model.model_file import Model

@@ -6,7 +6,7 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from cangauge._formatting import NONE_KNOWN, number
+from cangauge._text import NONE_KNOWN, number
 from cangauge.estimation.offline import EstimateTable
 from cangauge.identify.fit import Identification
 from cangauge.inspect.log import TEMPERATURE_SPAN_K, LogInspection

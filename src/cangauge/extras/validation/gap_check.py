@@ -14,7 +14,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from cangauge._formatting import NONE_KNOWN, number, significant
+from cangauge._text import NONE_KNOWN, number, significant
 from cangauge.diagnosis.answer import GROUP_OF, NONE, Posterior, answer
 from cangauge.diagnosis.evidence import References, analyse, columns, learn
 from cangauge.diagnosis.pack_fit import trace

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, cast
 
 import typer
 
-from cangauge._io import write_text_atomic
+from cangauge._files import write_text_atomic
 from cangauge.cli.options import JsonOption, check_outputs, suffixed, within
 from cangauge.cli.output import console, emit_json, note, print_table
 from cangauge.errors import InputError

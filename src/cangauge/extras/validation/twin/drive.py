@@ -12,7 +12,7 @@ import pyarrow.csv as pacsv
 from scipy.ndimage import gaussian_filter1d
 from scipy.signal import lfilter
 
-from cangauge._io import MAX_SPEED_TRACE_BYTES, read_bounded
+from cangauge._files import MIB, read_bounded
 from cangauge._typing import FloatArray
 from cangauge.errors import InputError
 from cangauge.extras.validation.twin.pack import Pack
@@ -168,7 +168,7 @@ def read_speed(path: str | PathLike[str]) -> FloatArray:
     InputError
         If the file cannot be read, time does not increase, or a speed is negative or above 85 m/s.
     """
-    data = read_bounded(path, MAX_SPEED_TRACE_BYTES, "a speed trace")
+    data = read_bounded(path, 64 * MIB, "a speed trace")
     try:
         data.decode("utf-8")
         table = pacsv.read_csv(pa.BufferReader(data))
