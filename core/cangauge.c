@@ -439,13 +439,7 @@ static void use_row(cg_estimator *self, const cg_sample *sample)
     const cg_model *model = self->model;
     cg_real std_pct;
     cg_real slope;
-    const cg_real soc_pct = soc_now(self, &std_pct);
     const cg_real guess_pct = isnan(memory->newton_pct) ? R(50.0) : memory->newton_pct;
-    memory->voltage_model_v = CG_NAN;
-    if (!isnan(soc_pct)) {
-        memory->voltage_model_v = cg_pseudo_ocv(self, soc_pct, &slope) + state->load_v;
-    }
-    memory->residual_v = sample->voltage_v - memory->voltage_model_v;
     memory->newton_pct = CG_NAN;
     memory->newton_std_pct = CG_NAN;
     memory->newton_inside = true;
@@ -469,6 +463,12 @@ static void use_row(cg_estimator *self, const cg_sample *sample)
         }
         state->block.rows += 1;
     }
+    const cg_real soc_pct = soc_now(self, &std_pct);
+    memory->voltage_model_v = CG_NAN;
+    if (!isnan(soc_pct)) {
+        memory->voltage_model_v = cg_pseudo_ocv(self, soc_pct, &slope) + state->load_v;
+    }
+    memory->residual_v = sample->voltage_v - memory->voltage_model_v;
     use_references(self, sample);
 }
 

@@ -341,6 +341,7 @@ bool cg_filter_is_valid(const cg_filter *filter, const cg_model *model)
     bool is_valid = true;
     for (int32_t i = 0; i < filter->hypotheses; ++i) {
         const cg_ekf *ekf = &filter->ekf[i];
+        is_valid = is_valid && isfinite(ekf->evidence);
         for (int32_t k = 0; k < size; ++k) {
             is_valid = is_valid && isfinite(ekf->x[k]) && (ekf->p[k][k] > R(0.0));
             for (int32_t j = 0; j < size; ++j) {

@@ -22,6 +22,8 @@ from pathlib import Path
 
 import numpy as np
 
+import cangauge
+
 from .estimators import ESTIMATORS, Told
 from .recorded import PACKS, counted_ah, load
 from .scores import LATE_S, SETTLED_S, Row, judge, pool, score
@@ -91,7 +93,7 @@ def run(packs, estimators, cases, *, sizes, draws: int, seed: int) -> list[Row]:
                     told = Told(pack.chemistry, pack.cells, pack.capacity_of(training))
                     try:
                         model = estimator.fit(training, told)
-                    except ValueError as error:
+                    except cangauge.InputError as error:
                         sys.stderr.write(f"{pack.name} {size} {name}: {error}\n")
                         failures += 1
                         continue

@@ -83,7 +83,7 @@ def check(estimate: Estimate, method: str, was_known: bool) -> bool:
         assert known or not was_known
     for soc in (estimate.soc_newton_pct, estimate.soc_coulomb_pct):
         assert math.isnan(soc) or 0.0 <= soc <= 100.0
-    assert math.isfinite(estimate.voltage_model_v) == known
+    assert known or math.isnan(estimate.voltage_model_v)
     assert not math.isinf(estimate.residual_v)
     return known
 
@@ -93,7 +93,7 @@ def run(model: Model, chosen: EstimatorSettings, samples: list[Sample]) -> None:
     known = False
     for sample in samples:
         known = check(estimator.step(sample), chosen.method, known)
-        assert math.isfinite(estimator.filter.offset_a)
+        assert all(math.isfinite(each) for each in estimator.health)
     # Its state can be restored.
     again = Estimator(model, chosen)
     again.restore(EstimatorState.model_validate(estimator.snapshot().model_dump(mode="json")))
@@ -104,7 +104,7 @@ RULES = {"full_charge": FullCharge(380.0, 10.0, 2.0), "long_rest": LongRest(60.0
 
 @pytest.mark.parametrize("method", ["ekf", "newton", "coulomb"])
 @pytest.mark.parametrize("which", ["plain", "together"])
-@settings(max_examples=60, deadline=None, suppress_health_check=list(HealthCheck))
+@settings(max_examples=20, deadline=None, suppress_health_check=list(HealthCheck))
 @given(drawn=inputs, with_rules=st.booleans(), start=st.sampled_from([None, 0.0, 50.0, 100.0]))
 def test_estimates_stay_bounded_for_any_input(
     which: str, method: Any, drawn: Any, with_rules: bool, start: Any
@@ -116,23 +116,23 @@ def test_estimates_stay_bounded_for_any_input(
 
 
 @pytest.mark.parametrize("effect_id", LIBRARY)
-@settings(max_examples=12, deadline=None, suppress_health_check=list(HealthCheck))
+@settings(max_examples=6, deadline=None, suppress_health_check=list(HealthCheck))
 @given(drawn=inputs)
 def test_estimates_stay_bounded_with_each_effect(effect_id: str, drawn: Any) -> None:
     run(MODELS[effect_id], EstimatorSettings(), samples_of_rows(drawn))
 
 
 @pytest.mark.parametrize("which", ["plain", "together"])
-@settings(max_examples=60, deadline=None, suppress_health_check=list(HealthCheck))
+@settings(max_examples=20, deadline=None, suppress_health_check=list(HealthCheck))
 @given(drawn=st.lists(st.tuples(odd, odd, odd, odd), max_size=40))
 def test_estimates_stay_bounded_for_extreme_numbers(which: str, drawn: Any) -> None:
     run(MODELS[which], EstimatorSettings(), [Sample(*row) for row in drawn])
 
 
-@pytest.mark.parametrize("zero", ["fast_std_v", "slow_std_v", "lasting_std_v", "all"])
+@pytest.mark.parametrize("zero", ["fast_std_v", "slow_std_v", "level_std_v", "all"])
 def test_model_without_noise_is_accepted(zero: str) -> None:
     raw = PLAIN.model_dump()
-    names = ["fast_std_v", "slow_std_v", "lasting_std_v"] if zero == "all" else [zero]
+    names = ["fast_std_v", "slow_std_v", "level_std_v"] if zero == "all" else [zero]
     raw["noise"] |= dict.fromkeys(names, 0.0)
     model = Model.model_validate(raw)
     samples = [Sample(0.5 * k, 20.0, 370.0 + (k % 7), 23.0) for k in range(400)]
@@ -142,7 +142,7 @@ def test_model_without_noise_is_accepted(zero: str) -> None:
 
 @pytest.mark.parametrize("which", ["plain", "time_skew", "together"])
 @pytest.mark.parametrize("method", ["ekf", "newton", "coulomb"])
-@settings(max_examples=30, deadline=None, suppress_health_check=list(HealthCheck))
+@settings(max_examples=20, deadline=None, suppress_health_check=list(HealthCheck))
 @given(drawn=inputs, asked_every=st.sampled_from([2, 3, 17]))
 def test_reading_the_estimate_changes_nothing(
     which: str, method: Any, drawn: Any, asked_every: int

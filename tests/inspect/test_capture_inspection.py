@@ -110,3 +110,19 @@ def test_inspection_of_unknown_frames(tmp_path: Path) -> None:
     assert all(each.protection == "" for each in found.ids)
     assert all(not match.because.startswith("all") for match in found.presets)
     assert not math.isnan(found.duration_s)
+
+
+def test_repeated_and_damaged_frames_are_counted(tmp_path: Path, generic: Vehicle) -> None:
+    frames = drive(generic)
+    current = [frame for frame in frames if frame.arbitration_id == CURRENT_ID]
+    for k in (60, 90, 120):  # the same counter once more, with another value
+        again = can.Message(
+            timestamp=current[k].timestamp + 0.001, arbitration_id=CURRENT_ID,
+            is_extended_id=False, data=current[k].data, channel="can0",
+        )  # fmt: skip
+        frames.append(again)
+    current[150].data[0] ^= 1
+    frames.sort(key=lambda frame: frame.timestamp)
+    found = {each.id: each for each in inspect_capture(record(tmp_path / "x.log", frames)).ids}
+    assert (found["400"].counter_repeats, found["400"].crc_errors) == (3, 1)
+    assert (found["401"].counter_repeats, found["401"].crc_errors) == (0, 0)

@@ -123,6 +123,15 @@ def test_cc_and_cv_phases_are_not_stuck() -> None:
     assert found.channels["voltage_v"].stuck == ()
 
 
+def test_relaxation_at_no_current_is_not_stuck() -> None:
+    log = drive()
+    current, voltage = log.current_a.copy(), log.voltage_v.copy()
+    current[6000:7200] = 0.0
+    voltage[6000:7200] = 370.0 + 5.0 * np.floor(np.arange(1200) / 200.0)
+    found = inspect_log(replace(log, current_a=current, voltage_v=voltage))
+    assert found.channels["current_a"].stuck == ()
+
+
 def test_missing_soc_is_measured() -> None:
     log = drive()
     assert log.soc_pct is not None

@@ -105,3 +105,11 @@ def test_samples_of_a_real_capture_are_counted_as_the_receiver_does(shared_data:
     assert steps[-1].samples == len(capture_samples(path, vehicle))
     wanted = {each.frames[0].arbitration_id for each in steps if each.is_wanted}
     assert wanted == set(vehicle.wanted_ids)
+
+
+def test_a_captures_repetition_follows_10_ms_later(tmp_path: Path) -> None:
+    path = write(tmp_path / "a.log", [frame(1.7e9 + 0.5 * n) for n in range(3)])
+    times = [step.time_us for step in islice(CaptureSource(path).steps(loop=True), 6)]
+    assert [time_us - times[0] for time_us in times] == [
+        0, 500_000, 1_000_000, 1_010_000, 1_510_000, 2_010_000
+    ]  # fmt: skip

@@ -181,7 +181,7 @@ def _show(console: Console, found: Mapping[str, Any], title: str = "") -> None:
     """Print a nested result: plain values first, then tables and lists under their names."""
     plain = {key: value for key, value in found.items() if not isinstance(value, _NESTED)}
     if plain:
-        _show_rows(console, title, [{"": key, " ": value} for key, value in plain.items()])
+        _show_rows(console, title, [{"": _label(key), " ": value} for key, value in plain.items()])
     for key, value in found.items():
         if isinstance(value, Mapping):
             _show(console, value, f"{title} {key}".strip())
@@ -199,10 +199,31 @@ def _show_rows(console: Console, title: str, rows: Sequence[Mapping[str, Any]]) 
     named = any(heading.strip() for heading in headings)
     table = Table(title=title.replace("_", " "), title_justify="left", show_header=named)
     for heading in headings:
-        table.add_column(heading.replace("_", " "))
+        table.add_column(escape(_label(heading)))
     for row in rows:
         table.add_row(*(escape(_shown(row.get(heading))) for heading in headings))
     console.print(table)
+
+
+_UNITS = {"_s": "s", "_a": "A", "_v": "V", "_c": "°C", "_pct": "%"}
+_LABELS = {
+    "cut_off": "file is cut off",
+    "first_malformed": "first malformed line",
+    "malformed": "malformed lines",
+    "matching_presets": "presets that match",
+    "other_ids": "frames of further ids",
+    "time_reversals": "stamps that step back",
+}
+
+
+def _label(key: str) -> str:
+    """Return a key of the JSON as words with its unit."""
+    if key in _LABELS:
+        return _LABELS[key]
+    for suffix, unit in _UNITS.items():
+        if key.endswith(suffix):
+            return f"{key.removesuffix(suffix).replace('_', ' ')} [{unit}]"
+    return key.replace("_", " ")
 
 
 def _shown(value: Any) -> str:

@@ -117,6 +117,7 @@ class SocFilter(ExtendedKalmanFilter):  # type: ignore[misc] # filterpy has no t
         self.B[SOC] = -1.0
         self.Q = np.zeros((n, n))
         self.H = np.zeros(n)
+        self.y, self.S = 0.0, 1.0
         self.evidence = 0.0
         self.bias = SeparateBias(n)
 
@@ -165,7 +166,8 @@ class SocFilter(ExtendedKalmanFilter):  # type: ignore[misc] # filterpy has no t
                 break
         self.x = x
         self._condition(PHt, block.drop_v)
-        self.evidence -= 0.5 * (self.y**2 / self.S + math.log(self.S))
+        log_var = math.log(self.S) if self.S > 0.0 else math.nan  # `is_valid` tells
+        self.evidence -= 0.5 * (self.y**2 / self.S + log_var)
 
     def correct(self, soc_pct: float, soc_std_pct: float) -> None:
         """Correct the state by a SoC that is known otherwise, with its standard deviation [%]."""
@@ -214,7 +216,8 @@ class SocFilter(ExtendedKalmanFilter):  # type: ignore[misc] # filterpy has no t
 
     def is_valid(self) -> bool:
         """Return whether state and variances are usable numbers."""
-        is_finite = np.all(np.isfinite(self.x)) and np.all(np.isfinite(self.P))
+        is_finite = math.isfinite(self.evidence) and np.all(np.isfinite(self.x))
+        is_finite = is_finite and np.all(np.isfinite(self.P))
         return bool(is_finite and np.all(np.diag(self.P) > 0.0))
 
     def strain(self) -> float:
