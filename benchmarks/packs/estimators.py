@@ -84,14 +84,18 @@ class BareEkf(Cangauge):
     1 A. An unknown start is that of the first voltage. It states no σ here.
     """
 
-    def estimate(
-        self, log: cangauge.Log, model: cangauge.Model, start_pct: float | None, capacity_ah: float
-    ) -> Estimated:
-        """Run it at every row."""
+    def fit(self, logs: Sequence[cangauge.Log], told: Told) -> Any:
+        """Return the tables of the circuit."""
         from cangauge.extras.embedded.equivalent_circuit import equivalent_circuit  # noqa: PLC0415
 
-        tables = asdict(equivalent_circuit(model)) | {"noise_v": model.noise.voltage_rmse_v}
-        circuit = peer_filters.Circuit(tables, float(np.mean(log.temperature_c)))
+        model = super().fit(logs, told)
+        return asdict(equivalent_circuit(model)) | {"noise_v": model.noise.voltage_rmse_v}
+
+    def estimate(
+        self, log: cangauge.Log, model: Any, start_pct: float | None, capacity_ah: float
+    ) -> Estimated:
+        """Run it at every row."""
+        circuit = peer_filters.Circuit(model, float(np.mean(log.temperature_c)))
         circuit.capacity_as = 3600.0 * capacity_ah
         columns = {name: getattr(log, name) for name in ("time_s", "current_a", "voltage_v")}
         start = circuit.start(columns) if start_pct is None else start_pct / 100.0
