@@ -141,7 +141,9 @@ def test_initial_soc(
     )  # fmt: skip
     found = json.loads(ran.out)
     assert (found["initial_soc_pct"], found["initial_soc_from"]) == (start, origin)
-    counted = pa.parquet.read_table(tmp_path / "soc.parquet")["soc_coulomb_pct"].drop_null()[0].as_py()
+    counted = (
+        pa.parquet.read_table(tmp_path / "soc.parquet")["soc_coulomb_pct"].drop_null()[0].as_py()
+    )
     assert counted == pytest.approx(start or 80.0, abs=1e-9 if start else 10.0)
     assert doubt in ran.err
     assert ("the initial SoC is" in ran.err) is bool(doubt)

@@ -482,6 +482,15 @@ PRIOR_C_RATE = 3.0
 """Current that they are specified for [1/h]."""
 
 
+def as_model(model: Any) -> Model:
+    """Return a model for a `Model`, the path of its file, or the result of `fit`."""
+    if isinstance(model, Model):
+        return model
+    if isinstance(model, str | Path):
+        return Model.load(model)
+    return as_model(model.model)
+
+
 def noise_of(
     chemistry: Chemistry, volts: float, residual_v: float, *, scale: float = 1.0, **judged: Any
 ) -> Noise:
