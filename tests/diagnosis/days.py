@@ -65,7 +65,7 @@ def wrong_start(log: Log, percent: float) -> Log:
 FAULTS: dict[str, tuple[Fault, float]] = {
     "current_offset": (more_amperes, 6.0),
     "voltage_offset": (more_volts, 5.0),
-    "time_skew": (late, 1.0),
+    "time_skew": (late, 2.0),
     "resistance_step": (resistance_step, 0.08),
     "resistance_asymmetry": (asymmetric, 0.12),
     "initial_soc": (wrong_start, 8.0),

@@ -161,6 +161,17 @@ def test_what_cannot_be_diagnosed_is_refused(
         diagnose([change(day(20))], model, known)  # type: ignore[operator]
 
 
+def test_a_notebook_shows_the_answer(faulty: Diagnosis) -> None:
+    assert faulty.headline.split("(")[0] in faulty._repr_html_()
+    assert faulty.headline in repr(faulty)
+
+
+def test_no_log_starts_beyond_full(known: References, model: Model) -> None:
+    full = [replace(day(20), soc_pct=None)]
+    found = diagnose(full, model, known, initial_soc_pct=100.0)
+    assert found.evidence.effects["initial_soc"].size >= -2.0
+
+
 def test_a_log_is_not_its_own_reference(references: list[Log], model: Model) -> None:
     with pytest.raises(InputError, match="same rows"):
         diagnose([references[0]], model, references)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from pathlib import Path
 
 import numpy as np
 import pyarrow as pa
@@ -328,3 +329,12 @@ def test_table_converts_to_arrow_with_words_and_nulls(model: Model) -> None:
     assert row["residual_v"] is None
     assert row["status"] == "degraded"
     assert row["reasons"] == "delay line filling; voltage missing; soc uncertain"
+
+
+def test_paths_and_frames_are_taken_for_logs_and_models(model: Model, tmp_path: Path) -> None:
+    log = synthetic_log(start_pct=70.0, end_pct=68.0, noise_v=0.2, seed=4, hours=0.1)
+    model.save(tmp_path / "pack.json")
+    expected = estimate(log, model)
+    found = estimate(pa.table(log), tmp_path / "pack.json")
+    assert np.array_equal(found.soc_pct, expected.soc_pct)
+    assert Estimator(tmp_path / "pack.json").capacity_ah == model.capacity_ah

@@ -23,6 +23,7 @@ from cangauge.identify.least_squares import (
 )
 from cangauge.identify.rows import FitRows, fit_rows
 from cangauge.logs.log import Log
+from cangauge.logs.read import read_log
 from cangauge.model.coulomb_counting import (
     capacity_from_full_discharge,
     capacity_from_reference,
@@ -329,3 +330,17 @@ def test_unseen_trips_are_predicted_better_than_by_the_published_equation(
     published = cangauge.fit(paths, capacity_ah=61.75, equation="published")
     assert knots.model.noise.voltage_mae_pct < 0.15
     assert knots.model.noise.voltage_mae_pct < 0.7 * published.model.noise.voltage_mae_pct
+
+
+@pytest.mark.real
+def test_a_log_that_leaves_the_sign_of_the_resistance_open_is_fitted(
+    shared_data: Path, tmp_path: Path
+) -> None:
+    """A slow charge of LFP cells: rising polarization looks like a negative resistance."""
+    log = read_log(shared_data / "a123_lfp" / "A123_DYN_50_P25_s3.csv.gz")
+    capacity_ah = float(np.ptp(discharged_ah(log.time_s, log.current_a)))
+    found = cangauge.fit(log, capacity_ah=capacity_ah, initial_soc_pct=0.0, chemistry="lfp")
+    assert sum(found.voltage_model.resistance_ohm) > 0.0
+    found.model.save(tmp_path / "m.json")
+    table = cangauge.estimate(log, cangauge.Model.load(tmp_path / "m.json"))
+    assert table.soc_pct[-1] == pytest.approx(100.0, abs=5.0)

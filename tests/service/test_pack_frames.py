@@ -24,17 +24,15 @@ from cangauge.bus.publish import (
 )
 from cangauge.bus.vehicle import Vehicle
 from cangauge.errors import InputError
-from cangauge.estimation.cells import UNKNOWN, CellReport
-from cangauge.estimation.estimator import Estimator
-from cangauge.estimation.health import Health
+from cangauge.estimation.cells import UNKNOWN
+from cangauge.estimation.compiled import make_estimator
 from cangauge.estimation.offline import samples_of
-from cangauge.estimation.power import PackLimits, Power
-from cangauge.estimation.settings import EstimatorSettings
+from cangauge.estimation.power import PackLimits
 from cangauge.logs.log import Log
 from cangauge.service.config import load_config
 from cangauge.service.pipeline import Pipeline, PipelineSettings
 from cangauge.service.setup import pipeline_settings
-from cangauge.types import Estimate, Reason, Status
+from cangauge.types import CellReport, Estimate, Health, Power, Reason, Status
 from cells_bus import ALL_CELLS, CAR, CELLS_DBC, CELLS_ON_BUS, all_cell_frames
 from live import collect, leaf_model, short_log, virtual_port, virtual_service
 
@@ -181,7 +179,7 @@ def test_live_health_power_and_cells_equal_offline_ones(tmp_path: Path) -> None:
     log, car = short_log(120.0, rate_hz=2.0), car_with_cells(tmp_path)
     log = FrameEncoder(car).quantize(log)
     pipeline = Pipeline(car, leaf_model(), PipelineSettings())
-    offline = Estimator(leaf_model(), EstimatorSettings(temperature_source="unknown"))
+    offline = make_estimator(leaf_model())
     encoder, reports = FrameEncoder(car), []
     for row, sample in enumerate(samples_of(log)):
         frames = [*all_cell_frames(cells_of(log, row), sample.time_s), *encoder.encode(sample)]

@@ -312,9 +312,9 @@ def test_two_services_detect_each_other() -> None:
 def test_overflow_signals_and_a_bus_that_is_down(tmp_path: Path) -> None:
     """One process for all: processes start slowly in a guest."""
     config = tmp_path / "car.toml"
-    config.write_text(f'model = "{leaf_model_path()}"\nchannel = "vcan0"\n')
+    config.write_text(f'model = "{leaf_model_path()}"\nchannel = "vcan0"\nwait_for_bus = true\n')
     ip("set", "vcan0", "down")
-    live = Command("run", "--config", config, "--wait-for-bus", "--json")
+    live = Command("run", "--config", config, "--json")
     live.wait_for("bus.missing")
     ip("set", "vcan0", "up")
     live.wait_for("bus.back")

@@ -80,8 +80,8 @@ CHECKS: Final[Mapping[str, str]] = {
 """Group → what to check first, and what it settles."""
 
 ALARM: Final = 0.05
-"""Probability of `none` up to which a gap is reported. With every data set held out, 1 of 95
-healthy logs raised an alarm at it (docs/diagnosis.md)."""
+"""Probability of `none` up to which a gap is reported. With every data set held out, 3 of 92
+healthy logs raised an alarm at it (../docs)."""
 
 STATED: Final = 0.8
 """Part of the library from which one group is stated; else two. Groups with as much were right in

@@ -29,6 +29,7 @@ from scipy.special import log_ndtr, logsumexp
 
 from cangauge._typing import FloatArray, IntArray
 from cangauge.diagnosis.columns import (
+    COVER_PCT,
     FOLDS,
     PLACES,
     Columns,
@@ -39,7 +40,7 @@ from cangauge.diagnosis.columns import (
     squares,
     without_own,
 )
-from cangauge.diagnosis.pack_fit import PackFit, Trace, fit_pack
+from cangauge.diagnosis.pack_fit import KNOTS, PackFit, Trace, fit_pack
 from cangauge.diagnosis.trials import STEP, Trial, library, residual, slope, undone
 
 WIDTHS = np.array([1.0, 0.3, 0.1, 0.03])
@@ -294,7 +295,7 @@ def analyse(known: References, logs: Sequence[Columns], *, exact: bool = True) -
     exact : bool
         Re-simulate effects that change a signal at the size found (Gauss–Newton).
     """
-    tried, at = _tried(known, len(logs))
+    tried, at = _tried(known, [log.log for log in logs])
     effects = np.array([trial.effect for trial in tried])
     bound = np.array([trial.bound for trial in tried])
     low = np.array([trial.low for trial in tried]) / bound
@@ -355,18 +356,27 @@ def analyse(known: References, logs: Sequence[Columns], *, exact: bool = True) -
     return Evidence(result, sum(squares(log, before) for log in logs) / rows)
 
 
-def _tried(known: References, logs: int) -> tuple[list[Trial], list[IntArray]]:
+def _tried(known: References, logs: Sequence[Trace]) -> tuple[list[Trial], list[IntArray]]:
     """Return what is tried, and for each log the column of each trial, −1 for none.
 
-    A step of resistance happens at one place of one log and lasts through the later ones.
+    No log starts beyond full or empty. A step of resistance happens at one place of one log and
+    lasts through the later ones.
     """
-    n = len(known.trials)
-    tried, at = list(known.trials), [list(range(n)) for _ in range(logs)]
-    for j in range(logs):
+    n, starts = len(known.trials), [log.start_pct for log in logs]
+    least = min(max(starts) - 100.0 - COVER_PCT, 0.0)
+    most = max(min(starts) + COVER_PCT, 0.0)
+    tried = [
+        replace(trial, low=max(trial.low, least), high=min(trial.high, most), scale=trial.bound)
+        if trial.effect == "initial_soc"
+        else trial
+        for trial in known.trials
+    ]
+    at = [list(range(n)) for _ in logs]
+    for j in range(len(logs)):
         for k in range(len(PLACES)):
             if j or k:
                 tried.append(replace(STEP, shape=PLACES[k]))
-                for log in range(logs):
+                for log in range(len(logs)):
                     at[log].append(-1 if log < j else n + (k if log == j else 0))
     return tried, [np.array(place, dtype=np.intp) for place in at]
 
@@ -417,7 +427,7 @@ def _needs_resimulation(trial: Trial) -> bool:
     return trial.changes_signal and trial.effect != "voltage_offset"
 
 
-def at_size(known: References, log: Columns, trial: Trial, a: float) -> FloatArray:
+def at_size(known: References, log: Columns, trial: Trial, a: float, folds: int = 1) -> FloatArray:
     """Return products of (x, b, slope, r) with an effect undone, by blocks, shape (folds, k, k).
 
     Parameters
@@ -427,16 +437,21 @@ def at_size(known: References, log: Columns, trial: Trial, a: float) -> FloatArr
     trial : Trial
     a : float
         Amplitude in units of its bound, as the slope.
+    folds : int
+        Sets of blocks.
     """
-    pack, trace = known.pack, log.log
-    r = residual(pack, trace, trial, a * trial.bound)
-    column = slope(pack, trace, trial, a * trial.bound, r) * trial.bound
+    pack, trace, size = known.pack, log.log, a * trial.bound
     x = log.x
     if trial.changes_signal:  # θ is uncertain at the SoC, current and temperature without it
-        healthy = undone(pack, trace, trial, a * trial.bound)
-        x = shared_columns(pack, healthy)[log.rows]
+        healthy = undone(pack, trace, trial, size)
+        every = shared_columns(pack, healthy)
+        x, n = every[log.rows], len(KNOTS)
+        r = healthy.voltage_v - pack.ocv(pack.soc(healthy)) - every[:, n:] @ pack.theta[n:]
+    else:
+        r = residual(pack, trace, trial, size)
+    column = slope(pack, trace, trial, size, r) * trial.bound
     every = np.column_stack([x, log.b, column[log.rows], r[log.rows]])
-    blocks = [every[log.fold == k] for k in range(FOLDS)]
+    blocks = [every[log.fold == k] for k in range(folds)] if folds > 1 else [every]
     return np.array([block.T @ block for block in blocks])
 
 
@@ -518,7 +533,7 @@ def held_out_sizes(
     low, high = trial.low / trial.bound, trial.high / trial.bound
     places = [AFTER if place is None else place for place in evidence.in_logs]
     trials = [replace(trial, shape=place) for place in places] or [trial] * len(logs)
-    parts = [at_size(known, log, own, size) for log, own in zip(logs, trials, strict=True)]
+    parts = [at_size(known, log, own, size, FOLDS) for log, own in zip(logs, trials, strict=True)]
     sizes = []
     for k in range(FOLDS):
         one = _OneEffect.of(known, logs, [z.sum(axis=0) - z[k] for z in parts])

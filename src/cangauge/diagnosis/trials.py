@@ -28,11 +28,13 @@ class Trial:
     """Whether it changes a measured signal or the count; otherwise it adds a voltage."""
     unit: str
     """Unit of the amplitude."""
+    scale: float = 0.0
+    """Size in which columns are, where the bounds of a case are closer [unit]; 0: the bounds'."""
 
     @property
     def bound(self) -> float:
-        """The larger bound [unit]."""
-        return max(-self.low, self.high)
+        """The larger bound, or the scale [unit]."""
+        return self.scale or max(-self.low, self.high)
 
     @property
     def number(self) -> float:

@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import ClassVar, Final
+from typing import Any, ClassVar, Final
 
 from scipy.special import chdtri
 
@@ -33,7 +33,7 @@ from cangauge.estimation.settings import EstimatorSettings, SocReference, detect
 from cangauge.estimation.start import WRONG_PRIOR, WRONG_STD_PCT, Hypotheses
 from cangauge.estimation.state import DelayLineState, EstimatorMemory, EstimatorState
 from cangauge.model.effects.base import Reading
-from cangauge.model.model_file import Model
+from cangauge.model.model_file import Model, as_model
 from cangauge.model.voltage_model import VoltageModel, soc_from_ocv
 from cangauge.types import (
     CURRENT_AT_MOST_A,
@@ -73,7 +73,7 @@ class Estimator:
 
     Parameters
     ----------
-    model : Model
+    model : Model, path or result of `fit`
     settings : EstimatorSettings, optional
 
     Attributes
@@ -103,8 +103,9 @@ class Estimator:
     core: ClassVar[str] = "python"
     """Implementation of the step: "python", or "compiled" (`compiled`)."""
 
-    def __init__(self, model: Model, settings: EstimatorSettings | None = None) -> None:
-        self.model = model
+    def __init__(self, model: Model | Any, settings: EstimatorSettings | None = None) -> None:
+        model = as_model(model)
+        self.model: Model = model
         self.settings = settings or EstimatorSettings()
         self._online = model.online(self.settings.capacity_ah, self.settings.gap_s)
         self.capacity_ah = self._online.capacity_ah

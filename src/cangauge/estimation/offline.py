@@ -24,9 +24,10 @@ from cangauge.estimation.settings import (
 )
 from cangauge.logs.gaps import usual_gap_s
 from cangauge.logs.log import Log
+from cangauge.logs.read import as_log
 from cangauge.model.coulomb_counting import counted_soc_pct
 from cangauge.model.delay_line import GAP_S
-from cangauge.model.model_file import Model
+from cangauge.model.model_file import Model, as_model
 from cangauge.types import Estimate, Sample, Status, reason_names
 
 PROGRESS_EVERY = 5000
@@ -130,8 +131,8 @@ class EstimateTable(ArrowExport):
 
 
 def estimate(
-    log: Log,
-    model: Model,
+    log: Log | Any,
+    model: Model | Any,
     *,
     method: Method = "ekf",
     initial_soc_pct: float | Literal["auto"] | None = None,
@@ -146,8 +147,8 @@ def estimate(
 
     Parameters
     ----------
-    log : Log
-    model : Model
+    log : Log, path or DataFrame
+    model : Model, path or result of `fit`
     method : {"ekf", "newton", "coulomb"}
         Method whose SoC is `soc_pct`.
     initial_soc_pct : float or "auto", optional
@@ -188,6 +189,7 @@ def estimate(
     >>> len(table), round(float(table.soc_coulomb_pct[-1]), 1)
     (120, 80.0)
     """
+    log, model = as_log(log), as_model(model)
     if initial_soc_pct is None and log.first_soc() is not None:
         initial_soc_pct = initial_soc_of(log, capacity_ah or model.capacity_ah)
     settings = EstimatorSettings(

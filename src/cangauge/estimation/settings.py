@@ -20,11 +20,11 @@ from cangauge.types import Sample
 Method = Literal["ekf", "newton", "coulomb"]
 
 VALID_STD_PCT = 3.0
-"""Largest standard deviation of a valid SoC [%]: 19 of 20 such SoC lie within 3 %.
+"""Largest standard deviation of a valid SoC [%]: 19 of 20 such SoC lie within 6 %.
 
-On real trips of a vehicle with a fitted model (noise 1.4 V, a third of it lasting) the filter
-converges to 0.9–1.5 %. With a limit of 1 % most undisturbed driving would be degraded; 2 % would
-accept a SoC found from the voltage a few minutes after the start.
+With the start withheld the filter settles at 2.4–3 % in a trip of half an hour, limited by the error
+of a log's voltage level. A lower limit would make most such trips degraded. A higher one would
+accept a SoC found from the voltage in the first minutes.
 """
 
 

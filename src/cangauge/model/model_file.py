@@ -482,6 +482,15 @@ PRIOR_C_RATE = 3.0
 """Current that they are specified for [1/h]."""
 
 
+def as_model(model: Any) -> Model:
+    """Return a model for a `Model`, the path of its file, or the result of `fit`."""
+    if isinstance(model, Model):
+        return model
+    if isinstance(model, str | Path):
+        return Model.load(model)
+    return as_model(model.model)
+
+
 def noise_of(
     chemistry: Chemistry, volts: float, residual_v: float, *, scale: float = 1.0, **judged: Any
 ) -> Noise:
@@ -612,12 +621,13 @@ def _check_physics(model: VoltageModel, file: Model) -> None:
                 value=value,
                 cure="check the value and its unit, or the capacity",
             )
-    # A log of constant current leaves the sign open, and there the resistances cancel.
+    # A log of constant current leaves the sign open, and there the resistances cancel. Knots have
+    # the spread of their resistances in the covariance, so that a wrong sign is within it.
     (low_a, high_a), lasting_ohm = model.current_range_a, sum(model.resistance_ohm)
-    if lasting_ohm * (high_a - low_a) > RESISTANCE_AT_LEAST * middle:
+    if not knots and lasting_ohm * (high_a - low_a) > RESISTANCE_AT_LEAST * middle:
         raise InputError(
             "the sum of the resistances is positive, so that discharging would raise the voltage",
-            field=f"{prefix}.resistance_ohm" if knots else prefix,
+            field=prefix,
             value=lasting_ohm,
             cure="positive current discharges, so resistances are negative",
         )

@@ -59,7 +59,8 @@ FIRST_CHECKPOINT_S: Final = 1.0
 FOREIGN_FRAMES: Final = 3
 FOREIGN_WITHIN_S: Final = 5.0
 """Foreign frames with own ids within this time [s] that prove another sender."""
-_SENT_KEPT: Final = 64
+_SENT_KEPT: Final = 1024
+"""Own frames whose echoes are awaited: a replay at full speed has hundreds on the way."""
 
 
 @dataclass(frozen=True)

@@ -77,6 +77,7 @@ class StatusSocket:
     def __init__(self, path: Path, status: Callable[[], dict[str, Any]]) -> None:
         self._path = path
         self._status = status
+        self._is_closed = False
         try:
             if not hasattr(socket, "AF_UNIX"):
                 raise OSError("this system has no unix sockets in Python")  # noqa: TRY301 - as below
@@ -100,8 +101,9 @@ class StatusSocket:
 
     def close(self) -> None:
         """Remove the socket; the thread ends."""
+        self._is_closed = True
         with suppress(OSError):
-            self._socket.shutdown(socket.SHUT_RDWR)
+            self._socket.shutdown(socket.SHUT_RDWR)  # wakes the thread
         self._socket.close()
         self._path.unlink(missing_ok=True)
 
@@ -110,7 +112,7 @@ class StatusSocket:
             try:
                 connection, _ = self._socket.accept()
             except OSError as error:
-                if self._socket.fileno() < 0:
+                if self._is_closed:
                     return
                 emit(_LOG, logging.WARNING, "status.failed", f"no connection accepted: {error}")
                 time.sleep(SEND_WITHIN_S)
