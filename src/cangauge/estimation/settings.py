@@ -22,8 +22,8 @@ Method = Literal["ekf", "newton", "coulomb"]
 VALID_STD_PCT = 3.0
 """Largest standard deviation of a valid SoC [%]: 19 of 20 such SoC lie within 6 %.
 
-With the start withheld the filter settles at 2.4–3 % in a trip of half an hour, limited by the error
-of a log's voltage level. A lower limit would make most such trips degraded. A higher one would
+With the start withheld the filter settles at 2.4–3 % in a trip of half an hour. The error of the
+log's voltage level limits it. A lower limit would make most such trips degraded. A higher one would
 accept a SoC found from the voltage in the first minutes.
 """
 
