@@ -92,7 +92,7 @@ def test_pack_rows_are_those_of_the_estimator(run: Run, made: Path, tmp_path: Pa
     for place, name in enumerate([*HEALTH, *POWER]):
         expected = np.array([row[place] for row in rows], dtype=float)
         found = np.array(table[name].to_pylist(), dtype=float)
-        assert np.array_equal(found, expected, equal_nan=True)
+        np.testing.assert_allclose(found, expected, rtol=1e-9)
 
 
 def test_a_capture_with_cells_as_live(run: Run, made: Path, tmp_path: Path) -> None:

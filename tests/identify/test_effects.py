@@ -47,7 +47,6 @@ def with_effect(log: Log, effect_id: str, values: dict[str, float]) -> Log:
     [
         ("hysteresis", {"half_width_v": 1.5, "travel_pct": 2.0}),
         ("slow_diffusion", {"ohm": 0.04, "tau_s": 1400.0}),
-        ("resistance_soc", {"at_empty": 2.0, "width_pct": 10.0}),
         ("fast_polarization", {"ohm": 0.03, "tau_s": 3.5}),
     ],
 )

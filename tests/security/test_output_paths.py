@@ -36,7 +36,6 @@ def bound(path: Path) -> None:
 FOREIGN: dict[str, tuple[Callable[[Path], object], str]] = {
     "device": (device, "device"),
     "pipe": (os.mkfifo, "FIFO"),
-    "socket": (bound, "socket"),
     "fstab": (lambda path: path.write_text("/dev/sda1 / ext4 defaults 0 1\n"), "not a cangauge"),
     "binary": (lambda path: path.write_bytes(b"\x00\x01"), "not a cangauge state"),
     "model": (lambda path: path.write_text('{"format": "cangauge-model"}'), "not a cangauge state"),

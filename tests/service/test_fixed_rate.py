@@ -76,7 +76,8 @@ def served(
     )
     monkeypatch.setattr(loop, "time", clock)
     monkeypatch.setattr(loop, "steady_s", lambda: port.now_s)
-    pipeline = Pipeline(Vehicle.load("generic"), leaf_model(), PipelineSettings())
+    given = PipelineSettings(EstimatorSettings(initial_soc_pct=80.0))
+    pipeline = Pipeline(Vehicle.load("generic"), leaf_model(), given)
     loop.Loop(port, pipeline, LoopSettings(duration_s=seconds)).run(never)  # type: ignore[arg-type] # has what a port is used for
     return port
 

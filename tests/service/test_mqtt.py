@@ -111,7 +111,7 @@ def test_home_assistant_finds_sensors_and_states(
         state = listener.state()
         estimate = running.service.pipeline.latest
         assert state["soc_pct"] == pytest.approx(estimate.soc_pct, abs=0.5)
-        assert 0.0 < state["soc_std_pct"] < 5.0
+        assert 0.0 < state["soc_std_pct"] < 14.0  # a given start may be wrong
         assert 250.0 < state["voltage_v"] < 450.0
         assert listener.availability == "online"
         sensors = {

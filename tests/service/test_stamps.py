@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 from random import Random
@@ -19,6 +20,7 @@ from cangauge.bus.recording import capture_samples
 from cangauge.bus.time_source import ClockFrames, ReceiveTime
 from cangauge.bus.vehicle import Vehicle
 from cangauge.estimation.offline import samples_of
+from cangauge.estimation.settings import EstimatorSettings
 from cangauge.service.loop import LoopSettings
 from cangauge.service.offline import estimate_capture
 from cangauge.service.pipeline import Pipeline, PipelineSettings
@@ -28,6 +30,8 @@ from live import Service, leaf_model, short_log, virtual_port, virtual_service, 
 
 KERNEL = BackendCapabilities("kernel", echoes=False, has_error_classes=False)
 PACE_S = 0.02
+GIVEN = PipelineSettings(EstimatorSettings(initial_soc_pct=80.0))
+"""A start: drives of seconds have no block of voltages."""
 
 
 class RestampedBus:
@@ -56,7 +60,7 @@ def run(
 ) -> tuple[Service, list[SocEstimate]]:
     """Feed a service in real time; return it and its published estimates."""
     reader, found = SocReader(), []
-    pipeline = Pipeline(Vehicle.load("generic"), leaf_model())
+    pipeline = Pipeline(Vehicle.load("generic"), leaf_model(), GIVEN)
     bus = RestampedBus(channel, stamp)
     port = BusConnection(bus, "restamped", KERNEL)  # type: ignore[arg-type] # has what is used
     samples = iter(samples_of(short_log(seconds, 1.0 / PACE_S)))
@@ -78,7 +82,7 @@ def run(
 
 
 def assert_recording_agrees(path: Path, service: Service) -> None:
-    recorded = estimate_capture(path, Vehicle.load("generic"), leaf_model())
+    recorded = estimate_capture(path, Vehicle.load("generic"), leaf_model(), GIVEN.estimator)
     assert recorded.table.soc_pct.tolist() == [each.soc_pct for _, each in service.rows]
     assert recorded.table.reasons.tolist() == [int(each.reasons) for _, each in service.rows]
     assert recorded.time_s.tolist() == [time_s for time_s, _ in service.rows]
@@ -125,7 +129,7 @@ def test_clock_set_in_mid_drive_costs_nothing(tmp_path: Path) -> None:
     # A state refers to the stamps as they come after a restart.
     state = service.pipeline.snapshot()
     assert state is not None
-    later = Pipeline(Vehicle.load("generic"), leaf_model())
+    later = Pipeline(Vehicle.load("generic"), leaf_model(), GIVEN)
     later.restore(state, 1.0)
     later._estimate(Sample(time.time() + 86_401.0, 1.0, 380.0, 20.0))
     assert later.taken == 1
@@ -134,7 +138,7 @@ def test_clock_set_in_mid_drive_costs_nothing(tmp_path: Path) -> None:
 
 def test_samples_that_are_refused_do_not_make_it_fresh() -> None:
     reader = SocReader()
-    settings = PipelineSettings(time_source="replay-clock")
+    settings = replace(GIVEN, time_source="replay-clock")
     loop = LoopSettings(timeout_s=0.3)
     found: list[SocEstimate] = []
     with (
