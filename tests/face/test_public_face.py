@@ -55,7 +55,7 @@ def test_the_examples_of_the_package_run() -> None:
     ("example", "words"),
     [
         ("own_log_to_soc", "mean error of the SoC"),
-        ("read_a_diagnosis", "time_skew (probability"),
+        ("read_a_diagnosis", "late (time_skew"),
         ("live_bus", "SocEstimate(soc_pct="),
     ],
 )
