@@ -186,7 +186,7 @@ def test_table_of_any_types_and_columns() -> None:
     )
     with pytest.raises(InputError, match="no rows"):
         Log.from_dataframe(table().slice(0, 0))
-    with pytest.raises(TypeError):
+    with pytest.raises(InputError, match=r"not a log .got 'int'.; give a Log, the path of one"):
         Log.from_dataframe(7)
 
 

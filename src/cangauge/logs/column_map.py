@@ -1,20 +1,19 @@
-"""The columns of a table: those that the user names, and the rest by plain headings."""
+"""The columns of a table: those that the user names, and the others by plain headings."""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any, Final
 
 from cangauge.errors import InputError, closest
-from cangauge.logs.draft import shown_headings
-from cangauge.logs.headings import GUESS, Meaning, bare_name, meaning_of, stated_unit
+from cangauge.logs.headings import GUESS, Meaning, meaning_of, names_and_units
 from cangauge.logs.units import FIELDS, TemperatureSource, unit_of
 
 DOCS: Final = "docs/logs.md"
 """Page that explains the columns of a log."""
-SYNTAX: Final = (
+_SYNTAX: Final = (
     "give NAME=HEADING, NAME=HEADING[UNIT] or NAME=HEADING[UNIT]:FACTOR, separated by commas, for"
     " time, current, voltage, temperature, soc"
 )
@@ -67,14 +66,9 @@ class ColumnSpec:
 
 @dataclass(frozen=True, slots=True)
 class ColumnMap:
-    """The user's columns by quantity.
+    """The user's columns by quantity: time, current, voltage, temperature, soc.
 
-    Parameters
-    ----------
-    specs : mapping of str to ColumnSpec
-        By quantity: time, current, voltage, temperature, soc.
-    where : str
-        Option or file that states them, for messages.
+    `where` is the option or file that states them, for messages.
     """
 
     specs: Mapping[str, ColumnSpec] = field(default_factory=dict)
@@ -84,13 +78,8 @@ class ColumnMap:
     def of(cls, given: ColumnMap | Mapping[str, Any] | str, where: str = "columns") -> ColumnMap:
         """Return the map of a text (`time=t,current=I[mA]:-1`) or of a mapping.
 
-        Parameters
-        ----------
-        given : ColumnMap, str or mapping
-            Values of a mapping are texts, or mappings with `heading` and optionally `unit`, `sign`
-            and `scale`.
-        where : str
-            Option or file, for messages.
+        Values of a mapping are texts, or mappings with `heading` and optionally `unit`, `sign` and
+        `scale`.
 
         Raises
         ------
@@ -104,29 +93,30 @@ class ColumnMap:
         """
         if isinstance(given, ColumnMap):
             return given
-        if isinstance(given, Mapping):
-            pairs = [(str(name), value) for name, value in given.items()]
-        else:
-            pairs = [_pair(part, where) for part in _SPLIT.split(given)]
+        if not isinstance(given, Mapping | str):
+            raise InputError("not columns", field=where, value=given, cure=_SYNTAX)
+        pairs = given.items() if isinstance(given, Mapping) else _pairs(given, where)
         specs: dict[str, ColumnSpec] = {}
         for name, value in pairs:
-            if name.lower() in specs:
+            quantity = str(name).lower()
+            if quantity in specs:
                 raise InputError("is given twice", field=where, value=name)
-            specs[name.lower()] = _spec_of(name.lower(), value, where)
+            specs[quantity] = _spec_of(quantity, value, where)
         return cls(specs, where)
 
 
-def _pair(part: str, where: str) -> tuple[str, str]:
-    name, equals, text = part.partition("=")
-    if not equals or not text.strip():
-        raise InputError("not a column", field=where, value=part, cure=SYNTAX)
-    return name.strip(), text.strip()
+def _pairs(text: str, where: str) -> list[tuple[str, str]]:
+    parts = [(part, *part.partition("=")) for part in _SPLIT.split(text)]
+    for part, _, equals, value in parts:
+        if not equals or not value.strip():
+            raise InputError("not a column", field=where, value=part, cure=_SYNTAX)
+    return [(name.strip(), value.strip()) for _, name, _, value in parts]
 
 
-def _spec_of(name: str, value: Any, where: str) -> ColumnSpec:
-    if name not in FIELDS:
+def _spec_of(quantity: str, value: Any, where: str) -> ColumnSpec:
+    if quantity not in FIELDS:
         cure = f"known are {', '.join(FIELDS)}"
-        raise InputError("not a quantity of a log", field=where, value=name, cure=cure)
+        raise InputError("not a quantity of a log", field=where, value=quantity, cure=cure)
     if isinstance(value, ColumnSpec):
         return value
     if isinstance(value, str) and value.strip():
@@ -139,7 +129,7 @@ def _spec_of(name: str, value: Any, where: str) -> ColumnSpec:
             return ColumnSpec(value["heading"], unit, float(sign * scale))
     raise InputError(
         "not a column",
-        field=f"{where}.{name}",
+        field=f"{where}.{quantity}",
         value=value,
         cure='give a text such as "Pack Current[mA]:-1", or { heading = …, unit = …, sign = ±1,'
         " scale = … }",
@@ -150,9 +140,9 @@ def _spec_of(name: str, value: Any, where: str) -> ColumnSpec:
 class ChosenColumn:
     """Columns of a table that hold one quantity.
 
-    Several places are a date and its time, or temperatures of which the mean is taken. The unit is
-    the user's, the heading's or that of the row of units. `others` are further times, in case that
-    the first does not increase.
+    Several places are a date and its time, or temperatures whose median is taken. The unit is the
+    user's, the heading's or that of the row of units. `others` are further times, in case that the
+    first does not increase.
     """
 
     places: tuple[int, ...]
@@ -188,71 +178,64 @@ def choose_columns(
     """
     below = [*units_below, *[""] * (len(headings) - len(units_below))]
     meanings = [meaning_of(text, unit) for text, unit in zip(headings, below, strict=False)]
+    given = given or ColumnMap()
     choice = Choice()
-    for quantity, spec in (given or ColumnMap()).specs.items():
-        found = _given_column(quantity, spec, headings, meanings, given)
-        for other, before in choice.chosen.items():
-            if set(before.places) & set(found.places):
+    owner: dict[int, str] = {}
+    for quantity, spec in given.specs.items():
+        found = _given_column(quantity, spec, headings, meanings, given.where)
+        for place in found.places:
+            if place in owner:
                 raise InputError(
-                    f"is the column of {other} too",
-                    field=f"{given.where if given else ''} {quantity}".strip(),
+                    f"is the column of {owner[place]} too",
+                    field=f"{given.where} {quantity}",
                     value=spec.text,
                     cure="give each quantity a column of its own, as headings or as #1, #2, …",
                 )
+        owner |= dict.fromkeys(found.places, quantity)
         choice.chosen[quantity] = found
-    taken = {place for item in choice.chosen.values() for place in item.places}
     for quantity in FIELDS:
-        if quantity not in choice.chosen:
-            of_it = [
-                (place, meaning)
-                for place, meaning in enumerate(meanings)
-                if meaning is not None and meaning.quantity == quantity and place not in taken
-            ]
-            if of_it:
-                _choose(quantity, sorted(of_it, key=lambda item: item[1].rank), choice)
+        plain = [
+            (place, meaning)
+            for place, meaning in enumerate(meanings)
+            if meaning is not None and meaning.quantity == quantity and place not in owner
+        ]
+        if quantity not in given.specs and plain:
+            _choose(quantity, sorted(plain, key=lambda item: item[1].rank), choice)
     _guess_by_stem(headings, choice)
     return choice
 
 
-def _choose(quantity: str, of_it: list[tuple[int, Meaning]], choice: Choice) -> None:
+def _choose(quantity: str, plain: list[tuple[int, Meaning]], choice: Choice) -> None:
     """Choose among the columns of a quantity, the most direct first; or guess one."""
-    place, first = of_it[0]
-    best = [item for item in of_it if item[1].rank == first.rank]
-    numbered = [meaning.numbered for _, meaning in of_it if meaning.rank <= GUESS]
+    place, first = plain[0]
+    best = [item for item in plain if item[1].rank == first.rank]
+    numbered = [meaning.numbered for _, meaning in plain if meaning.rank <= GUESS]
     siblings = quantity in {"current", "voltage"} and first.numbered and sum(numbered) > 1
-    if quantity == "temperature" and len(best) > 1:
-        best = _temperatures(best)
-    one_of_many = len(best) > 1 and not (
-        quantity == "time" or (quantity == "temperature" and all(m.numbered for _, m in best))
-    )
+    if quantity == "temperature" and len(best) > 1:  # of one unit, °C first; T beside T1, T2 is it
+        celsius = [item for item in best if unit_of("temperature_c", item[1].unit) == (1.0, 0.0)]
+        best = celsius or [item for item in best if item[1].unit == first.unit]
+        best = [item for item in best if not item[1].numbered] or best
+    are_probes = quantity == "temperature" and all(meaning.numbered for _, meaning in best)
+    one_of_many = len(best) > 1 and quantity != "time" and not are_probes
     if first.rank >= GUESS or siblings or one_of_many:
         choice.guesses[quantity] = place
     elif quantity == "time":
-        others = tuple(other for other, meaning in of_it[1:] if meaning.rank < GUESS)
+        others = tuple(other for other, meaning in plain[1:] if meaning.rank < GUESS)
         choice.chosen[quantity] = ChosenColumn((place,), first.unit, others=others)
     else:
         unit, source = best[0][1].unit, best[0][1].source
         choice.chosen[quantity] = ChosenColumn(tuple(p for p, _ in best), unit, source=source)
 
 
-def _temperatures(best: list[tuple[int, Meaning]]) -> list[tuple[int, Meaning]]:
-    """Return the temperatures to take the mean of: one unit, °C first; T beside T1, T2 is it."""
-    celsius = [item for item in best if unit_of("temperature_c", item[1].unit) == (1.0, 0.0)]
-    best = celsius or [item for item in best if item[1].unit == best[0][1].unit]
-    return [item for item in best if not item[1].numbered] or best
-
-
 def _guess_by_stem(headings: Sequence[str], choice: Choice) -> None:
     """Guess what no word names by beginnings of words, for the command that is suggested."""
-    taken = {place for item in choice.chosen.values() for place in item.places}
-    for quantity, stems in _STEMS.items():
-        if quantity in choice.chosen or quantity in choice.guesses:
-            continue
-        for place, heading in enumerate(headings[:500]):
-            is_free = place not in taken and place not in choice.guesses.values()
-            if is_free and re.search(rf"(?:^|[^a-z])(?:{stems})", heading.lower()):
-                choice.guesses[quantity] = place
-                break
+    used = {place for item in choice.chosen.values() for place in item.places}
+    for quantity in _STEMS.keys() - choice.chosen.keys() - choice.guesses.keys():
+        free = (k for k in range(min(len(headings), 500)) if k not in used)
+        stem = re.compile(rf"(?:^|[^a-z])(?:{_STEMS[quantity]})")
+        place = next((k for k in free if stem.search(headings[k].lower())), None)
+        if place is not None:
+            choice.guesses[quantity] = place
 
 
 def _given_column(
@@ -260,56 +243,55 @@ def _given_column(
     spec: ColumnSpec,
     headings: Sequence[str],
     meanings: Sequence[Meaning | None],
-    given: ColumnMap | None,
+    where: str,
 ) -> ChosenColumn:
     for reading in spec.readings():
         places = _places(reading.text, headings)
-        if places is None:
+        if not places:
             continue
-        plain = [meanings[place] for place in places]
-        units = {
-            meaning.unit
-            if meaning is not None and meaning.quantity == quantity
-            else stated_unit(headings[place], quantity)
-            for place, meaning in zip(places, plain, strict=True)
-        }
-        unit = units.pop() if len(units) == 1 else ""
-        column = ChosenColumn(places, unit, reading.factor, given=True)
-        if reading.unit is not None:
-            column = replace(column, unit=reading.unit)
-        if quantity == "temperature" and plain[0] is not None:
-            column = replace(column, source=plain[0].source)
-        return column
+        units = {_stated_unit(headings[place], meanings[place], quantity) for place in places}
+        unit = reading.unit if reading.unit is not None else units.pop() if len(units) == 1 else ""
+        first = meanings[places[0]]
+        source = first.source if first is not None and quantity == "temperature" else "unknown"
+        return ChosenColumn(places, unit, reading.factor, given=True, source=source)
     near = closest(spec.text, headings)
     raise InputError(
         f"no column has this heading (found: {shown_headings(headings)})",
-        field=f"{given.where if given else ''} {quantity}".strip(),
+        field=f"{where} {quantity}",
         value=spec.text,
-        cure=f"did you mean {near}?" if near else SYNTAX,
+        cure=f"did you mean {near}?" if near else _SYNTAX,
     )
 
 
-def _places(text: str, headings: Sequence[str]) -> tuple[int, ...] | None:
+def _stated_unit(heading: str, meaning: Meaning | None, quantity: str) -> str:
+    """Return the unit of this quantity that a heading states, whatever its words; "" if none."""
+    if meaning is not None and meaning.quantity == quantity:
+        return meaning.unit
+    units = (unit for _, unit in names_and_units(heading)[:-1])
+    return next((unit for unit in units if unit_of(FIELDS[quantity], unit) is not None), "")
+
+
+def _places(text: str, headings: Sequence[str]) -> tuple[int, ...]:
+    """Return the columns that a text names; none where it names no column, or not all."""
     whole = _place(text, headings)
     if whole is not None:
         return (whole,)
-    parts = [_place(part, headings) for part in text.split("+")]
-    found = tuple(place for place in parts if place is not None)
-    return found if len(found) == len(parts) > 1 else None
+    places = [_place(part, headings) for part in text.split("+")]
+    found = tuple(place for place in places if place is not None)
+    return found if len(found) == len(places) > 1 else ()
 
 
 def _place(text: str, headings: Sequence[str]) -> int | None:
     if text in headings:  # `t` beside `T`
         return headings.index(text)
-    wanted = _simple(text)
     names = [_simple(heading) for heading in headings]
-    if wanted in names:
-        return names.index(wanted)
+    if _simple(text) in names:
+        return names.index(_simple(text))
     number = re.fullmatch(r"#(\d{1,5})", text.strip())
     if number and 1 <= int(number[1]) <= len(headings):
         return int(number[1]) - 1
-    bare = [_simple(bare_name(heading)) for heading in headings]
-    return bare.index(wanted) if bare.count(wanted) == 1 else None
+    bare = [_simple(names_and_units(heading)[0][0]) for heading in headings]
+    return bare.index(_simple(text)) if bare.count(_simple(text)) == 1 else None
 
 
 def _simple(text: str) -> str:
@@ -318,17 +300,13 @@ def _simple(text: str) -> str:
 
 def unknown_columns(source: str, headings: Sequence[str], choice: Choice) -> InputError:
     """Return the error for a table whose columns are not plain, with the option to paste."""
+    names = [name for name in _NEEDED if name not in choice.chosen]
+    missing = " and ".join(part for part in (", ".join(names[:-1]), *names[-1:]) if part)
     return InputError(
-        f"no plain heading of {missing_quantities(choice)} (found: {shown_headings(headings)})",
+        f"no plain heading of {missing} (found: {shown_headings(headings)})",
         source=source,
         cure=f"name the columns, e.g. {suggestion(headings, choice)} ({DOCS})",
     )
-
-
-def missing_quantities(choice: Choice) -> str:
-    """Return the quantities that every log needs and this table lacks, for a message."""
-    names = [name for name in _NEEDED if name not in choice.chosen]
-    return " and ".join(part for part in (", ".join(names[:-1]), *names[-1:]) if part)
 
 
 def suggestion(headings: Sequence[str], choice: Choice) -> str:
@@ -343,3 +321,9 @@ def suggestion(headings: Sequence[str], choice: Choice) -> str:
         elif quantity in _NEEDED:
             parts.append(f"{quantity}=?")
     return "--columns '" + ",".join(parts).replace("'", "'\\''") + "'"
+
+
+def shown_headings(headings: Sequence[str]) -> str:
+    """Return the first headings of a table for a message."""
+    names = [name for name in headings if name]
+    return ", ".join(names[:12]) + (f", … ({len(names)} in all)" if len(names) > 12 else "")

@@ -11,6 +11,7 @@ import numpy as np
 from cangauge._text import counted
 from cangauge._typing import BoolArray, FloatArray
 from cangauge.errors import InputError
+from cangauge.logs.column_map import shown_headings
 from cangauge.logs.units import REQUIRED, TemperatureSource, refuse_wrong_units
 
 Sign = Literal["charge", "discharge"]
@@ -19,11 +20,9 @@ Sign = Literal["charge", "discharge"]
 MAX_INCOMPLETE: Final = 0.05
 """Largest fraction of incomplete rows that are dropped [-]: beyond it the export is damaged, or its
 rows hold only what changed."""
-
-PROBES_APART_K: Final = 20.0
-"""Distance from the median of its row beyond which a temperature probe fails [K]: packs are cooled
-so that their cells differ by less than 5 K (Pesaran, J. Power Sources 110, 2002), and codes of
-invalid values are -40, 127 or 215 °C."""
+_PROBES_APART_K: Final = 20.0
+"""Difference of a pack's temperature probes from which one of them fails [K]: packs are cooled so
+that their cells differ by less than 5 K (Pesaran, J. Power Sources 110, 2002)."""
 
 
 @dataclass(slots=True)
@@ -58,9 +57,12 @@ class DraftLog:
     headings: tuple[str, ...] = ()
     ignored: tuple[str, ...] = ()
 
-    def keep(self, rows: BoolArray) -> None:
-        """Keep only the rows of a mask of shape (n,)."""
-        self.values = {name: values[rows] for name, values in self.values.items()}
+    def keep(self, rows: BoolArray, remark: str) -> None:
+        """Keep the rows of a mask of shape (n,); remark on the number of the others, if any."""
+        dropped = int(np.sum(~rows))
+        if dropped:
+            self.values = {name: values[rows] for name, values in self.values.items()}
+            self.remarks.append(f"{counted(dropped, 'row')} {remark}")
 
     def negate_current(self, because: str) -> None:
         """Invert the sign of the stored current, with a remark."""
@@ -74,41 +76,27 @@ class DraftLog:
             self.negate_current(f"positive {sign}s in the file, as stated")
         self.sign_unknown = False
 
-    def mean_of_probes(
-        self, names: Sequence[str], parts: Sequence[FloatArray], apart: float = PROBES_APART_K
-    ) -> FloatArray:
-        """Return the mean of temperature probes, shape (n,); remark on those that are far off.
-
-        A value further than `apart` from the median of its row is left out where most of three or
-        more agree with the median. Else none is known to be the good one.
-        """
-        values = np.vstack(parts)
+    def take_probes(self, names: Sequence[str], probes_c: Sequence[FloatArray]) -> None:
+        """Take the median of temperature probes [°C], shape (n,) each; remark where they differ."""
+        self.values["temperature_c"] = probes_c[0]
+        if len(probes_c) == 1:
+            return
+        values = np.vstack(probes_c)
         known = np.isfinite(values)
-        count = np.sum(known, axis=0)
-        median = np.nanmedian(np.where(count > 0, values, 0.0), axis=0)
-        near = known & (np.abs(values - median) <= apart)
-        decided = (count > 2) & (2 * np.sum(near, axis=0) > count)
-        far = known & ~near & decided
-        for name, rows, of_probe in zip(names, far, values, strict=True):
-            if rows.any():
-                self.remarks.append(
-                    f"temperature: {name} left out in {counted(int(rows.sum()), 'row')}, where it"
-                    f" is over {PROBES_APART_K:g} K from the other probes (first"
-                    f" {of_probe[rows][0]:g})"
-                )
-        lowest = np.min(np.where(known, values, np.inf), axis=0)
+        rows = known.any(axis=0)
+        median = np.full(rows.size, np.nan)
+        median[rows] = np.nanmedian(values[:, rows], axis=0)
+        self.values["temperature_c"] = median
+        self.remarks.append(f"temperature: median of {len(probes_c)} columns")
         highest = np.max(np.where(known, values, -np.inf), axis=0)
-        undecided = ~decided & (highest - lowest > apart)
-        if undecided.any():
-            row = int(np.argmax(undecided))
-            shown = " and ".join(f"{of_probe[row]:g}" for of_probe in values)
+        apart = highest - np.min(np.where(known, values, np.inf), axis=0) > _PROBES_APART_K
+        if apart.any():
+            row = int(np.argmax(apart))
+            shown = " and ".join(f"{value:.4g}" for value in values[:, row])
             self.remarks.append(
-                f"temperature: {' and '.join(names)} are {shown} in row {row + 1}: one of the"
-                " probes fails; name the good one with --columns temperature=…"
+                f"temperature: {' and '.join(names)} are {shown} °C in row {row + 1}: one of the"
+                " probes fails; name the good ones with --columns temperature=…"
             )
-        used = known & ~far
-        total = np.sum(np.where(used, values, 0.0), axis=0)
-        return np.where(count > 0, total / np.maximum(np.sum(used, axis=0), 1), np.nan)
 
     def checked(
         self, temperature_c: float | None = None, used: Sequence[str] = ()
@@ -118,6 +106,10 @@ class DraftLog:
         Rows that lack a value or repeat the time stamp of the row before are dropped, with a
         remark. `used` are columns that the caller reads besides.
         """
+        if not self.values["time_s"].size:
+            raise InputError(
+                "the log holds no rows", source=self.source or self.name, cure="check the export"
+            )
         ignored = [name for name in self.ignored if name not in used]
         if ignored:
             shown = ", ".join(ignored[:6]) + (", …" if len(ignored) > 6 else "")
@@ -145,7 +137,7 @@ class DraftLog:
         if given_c is not None:
             replaced = f" in place of the {kind}'s" if "temperature_c" in self.values else ""
             self.remarks.append(f"temperature {given_c:g} °C as given{replaced}")
-            self.values["temperature_c"] = np.full(self.values["time_s"].size, given_c)
+            self.values["temperature_c"] = np.full(self.values["time_s"].size, float(given_c))
             self.temperature_source = "unknown"
         elif "temperature_c" not in self.values:
             found = f" (found: {shown_headings(self.headings)})" if self.headings else ""
@@ -155,34 +147,25 @@ class DraftLog:
             raise self._error("temperature_c", f"the {kind} holds no temperature{found}", cure)
 
     def _drop_incomplete(self) -> None:
-        incomplete = np.zeros(self.values["time_s"].size, dtype=bool)
-        for name in REQUIRED:
-            missing = ~np.isfinite(self.values[name])
-            if missing.all():
+        lacks = {name: ~np.isfinite(self.values[name]) for name in REQUIRED}
+        incomplete = np.any([*lacks.values()], axis=0)
+        for name, rows in lacks.items():
+            if rows.all():
                 raise self._error(name, "the column is empty", "check the export")
-            incomplete |= missing
-        count = int(incomplete.sum())
-        if not count:
-            return
+        count, row = int(incomplete.sum()), int(np.argmax(incomplete))
         lacking = "time, current, voltage or temperature"
         if count > MAX_INCOMPLETE * incomplete.size:
+            name = next(name for name, rows in lacks.items() if rows[row])
             problem = f"{count} of {incomplete.size} rows lack {lacking}"
-            row = int(np.argmax(incomplete))
-            name = next(name for name in REQUIRED if not np.isfinite(self.values[name][row]))
-            cure = f"check the export: the first is row {row + 1}"
-            raise self._error(name, problem, cure)
-        self.remarks.append(
-            f"{counted(count, 'row')} without {lacking} dropped"
-            f" (the first is row {int(np.argmax(incomplete)) + 1})"
-        )
-        self.keep(~incomplete)
+            raise self._error(name, problem, f"check the export: the first is row {row + 1}")
+        self.keep(~incomplete, f"without {lacking} dropped (the first is row {row + 1})")
 
     def _drop_repeated(self) -> None:
         time = self.values["time_s"]
-        step = np.diff(time)
+        step = np.diff(time, prepend=-np.inf)
         back = np.flatnonzero(step < 0.0)
         if back.size:
-            row = int(back[0]) + 1
+            row = int(back[0])
             raise self._error(
                 "time_s",
                 f"time runs backwards at row {row + 1} ({back.size} such rows;"
@@ -190,13 +173,10 @@ class DraftLog:
                 "sort the rows by time, or split the file into one log each",
                 float(time[row]),
             )
-        same = np.concatenate(([False], step == 0.0))
-        if same.any():
-            self.remarks.append(
-                f"{counted(int(same.sum()), 'row')} with the time stamp of the row before dropped"
-                f" (the first is row {int(np.argmax(same)) + 1})"
-            )
-            self.keep(~same)
+        first = int(np.argmax(step == 0.0)) + 1
+        self.keep(
+            step != 0.0, f"with the time stamp of the row before dropped (the first is row {first})"
+        )
 
     def _error(self, name: str, problem: str, cure: str, value: float | None = None) -> InputError:
         return InputError(
@@ -206,9 +186,3 @@ class DraftLog:
             value=value,
             cure=cure,
         )
-
-
-def shown_headings(headings: Sequence[str]) -> str:
-    """Return the first headings of a table for a message."""
-    names = [name for name in headings if name]
-    return ", ".join(names[:12]) + (f", … ({len(names)} in all)" if len(names) > 12 else "")

@@ -15,9 +15,6 @@ from typing import Final, NamedTuple
 
 from cangauge.logs.units import FIELDS, FOREIGN_UNITS, TemperatureSource, unit_of
 
-MAX_HEADING: Final = 200
-"""Longest column heading that is parsed [characters]."""
-
 
 def _words(text: str) -> frozenset[str]:
     return frozenset(text.split())
@@ -117,11 +114,11 @@ class Meaning(NamedTuple):
 @lru_cache(maxsize=4096)
 def meaning_of(heading: str, unit_below: str = "") -> Meaning | None:
     """Return the most direct meaning of a heading with the cell of a row of units, or None."""
-    if not heading.strip() or len(heading) > MAX_HEADING or cell_number(heading) is not None:
+    if not heading.strip() or len(heading) > 200 or cell_number(heading) is not None:
         return None
     # Measurement tools qualify a signal: `Bus::Message::Signal`, `Signal\\Device:1`.
     heading = re.sub(r"\\[^\[(]*", "", heading.rpartition("::")[2])
-    readings = (_meaning(name, unit) for name, unit in _splits(heading, unit_below))
+    readings = (_meaning(name, unit) for name, unit in names_and_units(heading, unit_below))
     return next((found for found in readings if found is not None), None)
 
 
@@ -133,19 +130,8 @@ def cell_number(heading: str) -> tuple[int, float] | None:
     return int(match["number"]), 1e-3 if (match["unit"] or "").lower() == "mv" else 1.0
 
 
-def stated_unit(heading: str, quantity: str) -> str:
-    """Return the unit of this quantity that a heading states, whatever its words; "" if none."""
-    units = (unit for _, unit in _splits(heading, "")[:-1])
-    return next((unit for unit in units if unit_of(FIELDS[quantity], unit) is not None), "")
-
-
-def bare_name(heading: str) -> str:
-    """Return a heading without the unit that it states."""
-    return _splits(heading, "")[0][0]
-
-
-def _splits(heading: str, unit_below: str) -> list[tuple[str, str]]:
-    """Return (name, unit) as the heading may be meant, the most explicit first."""
+def names_and_units(heading: str, unit_below: str = "") -> list[tuple[str, str]]:
+    """Return (name, unit) as a heading may be meant, the most explicit first, the whole last."""
     heading = heading.strip()
     if heading.lower() in _DEGREES:
         return [("", heading)]
@@ -161,28 +147,28 @@ def _splits(heading: str, unit_below: str) -> list[tuple[str, str]]:
 def _is_unit(text: str) -> bool:
     if text.lower() in FOREIGN_UNITS:
         return True
-    return text not in {"1", "-", "d"} and any(unit_of(each, text) for each in FIELDS.values())
+    return text not in {"1", "-", "d"} and any(unit_of(field, text) for field in FIELDS.values())
 
 
 def _meaning(name: str, unit: str) -> Meaning | None:
     """Return the meaning of a name with this unit; None if the unit belongs to another quantity."""
     plain = unicodedata.normalize("NFKD", name.replace("SoC", "Soc").replace("SOC", "Soc"))
     plain = "".join(char for char in plain if not unicodedata.combining(char))
-    quantity, rest = _quantity([word.lower() for word in _TOKEN.findall(plain)], name, unit)
+    quantity, others = _quantity([word.lower() for word in _TOKEN.findall(plain)], name, unit)
     if quantity is None:
         return None
     if quantity == "time" and re.match(r"h+\s*:\s*m", unit, re.IGNORECASE):
         unit = ""
-    if quantity == "time" and not unit and rest and rest[-1] in {"us", "ms"}:  # TimeUS
-        unit, rest = rest[-1], rest[:-1]
+    if quantity == "time" and not unit and others and others[-1] in {"us", "ms"}:  # TimeUS
+        unit, others = others[-1], others[:-1]
     if unit and unit_of(FIELDS[quantity], unit) is None:
         return None
     in_brackets = re.findall(r"[\[(]([^\[\]()]*)[\])]", name) + name.split("/")[1:]
     if not unit and any(_is_unit(text.strip().lower()) for text in in_brackets if text.strip()):
         return None  # of another quantity
     if quantity == "time":
-        return Meaning(quantity, unit, _rank_of_time(set(rest)))
-    return Meaning(quantity, unit, *_rank(quantity, rest))
+        return Meaning(quantity, unit, _rank_of_time(set(others)))
+    return Meaning(quantity, unit, *_rank(quantity, others))
 
 
 def _quantity(words: list[str], name: str, unit: str) -> tuple[str | None, list[str]]:
@@ -194,9 +180,7 @@ def _quantity(words: list[str], name: str, unit: str) -> tuple[str | None, list[
     named = {quantity for quantity, known in _WORDS.items() if known.intersection(words)}
     for word, quantity in _BY_UNIT.items():
         if word in words and unit_of(FIELDS[quantity], unit):
-            return quantity, [
-                each for each in words if each != word and each not in _WORDS[quantity]
-            ]
+            named, words = {quantity}, [other for other in words if other != word]
     if len(named) > 1 and "current" in words:  # also an adjective
         named.discard("current")
     if len(named) > 1:
@@ -204,7 +188,7 @@ def _quantity(words: list[str], name: str, unit: str) -> tuple[str | None, list[
     if len(named) == 1:
         quantity = named.pop()
         others = [word for word in words if word not in _WORDS[quantity]]
-        return quantity, ["(date)"] if set(words) <= _DATES else others
+        return quantity, ["(date)"] if words and set(words) <= _DATES else others
     if named:
         return None, words
     if words and unit and unit_of("time_s", unit) and set(words) <= _ELAPSED:
@@ -227,23 +211,23 @@ def _symbol(words: list[str], name: str, unit: str) -> tuple[str | None, list[st
     return _SYMBOLS[symbols[0]], others
 
 
-def _rank(quantity: str, rest: list[str]) -> tuple[int, bool, TemperatureSource]:
+def _rank(quantity: str, others: list[str]) -> tuple[int, bool, TemperatureSource]:
     """Return rank, whether the sensor is numbered, and where a temperature is measured."""
-    words = {word for word in rest if not word.isdigit()}
-    numbered = len(words) < len(set(rest))
+    words = {word for word in others if not word.isdigit()}
+    numbered = len(words) < len(set(others))
     is_temperature = quantity == "temperature"
     source: TemperatureSource = "unknown"
     if is_temperature:
         source = "room" if words & _AMBIENT else "pack" if words & _PACK else "unknown"
-        source = "cell" if words & (_CELL) else source
+        source = "cell" if words & _CELL else source
         words -= {"t", "probe", "sensor", "ntc", "log"}
         if words & {"aux", "auxiliary"}:  # a cycler's thermocouple
             words, numbered = words - {"aux", "auxiliary"} | {"battery"}, True
-    is_one = not numbered or is_temperature or bool(words & _PACK) or "1" in rest
+    is_one = not numbered or is_temperature or bool(words & _PACK) or "1" in others
     unknown = words - _PACK - _NEUTRAL - _CELL - _DISPLAY - _AMBIENT
-    if words & _EXCLUDED or "12" in rest:
-        rank = GUESS + 1
-    elif words & _AMBIENT:
+    if words & _EXCLUDED or "12" in others:
+        return GUESS + 1, numbered, source
+    if words & _AMBIENT:
         rank = 4 if is_temperature else GUESS
     elif (unknown and not words & _PACK) or not is_one:
         rank = GUESS

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal, Self
 
 import numpy as np
@@ -137,7 +137,7 @@ class Log(ArrowExport):
         temperature_source: TemperatureSource | None = None,
         columns: Mapping[str, Any] | str | None = None,
         sign: Literal["charge", "discharge"] | None = None,
-    ) -> Self:
+    ) -> Log:
         """Return the log of a pandas, polars or pyarrow table.
 
         The values are checked as those of a file: missing values, wrong units and time that runs
@@ -146,51 +146,37 @@ class Log(ArrowExport):
         Parameters
         ----------
         table : DataFrame or Table
-            Anything with the Arrow PyCapsule interface (`__arrow_c_stream__`). Columns in any
-            order and case: `time_s` [s], `current_a` [A, positive = discharge], `voltage_v` [V],
-            `temperature_c` [°C], optionally `soc_pct` [%] and `temperature_source`; or any with
-            plain headings.
+            Anything with the Arrow PyCapsule interface (`__arrow_c_stream__`), or a mapping of
+            columns. Columns in any order and case: `time_s` [s], `current_a` [A, positive =
+            discharge], `voltage_v` [V], `temperature_c` [°C], optionally `soc_pct` [%] and
+            `temperature_source`; or any with plain headings.
         name : str
             Short name of the log.
-        temperature_c : float, optional
-            Constant temperature [°C], in place of a column.
-        temperature_source : {"cell", "pack", "coolant", "room", "unknown"}, optional
-            Location of the temperature sensor, in place of the table's own.
-        columns : mapping or str, optional
-            Columns of other names: {"current": "I[mA]:-1"} or "time=t,current=I[mA]:-1"; the
-            heading, its unit in brackets, a factor. What it leaves out is found by plain headings.
-        sign : {"charge", "discharge"}, optional
-            What a positive current in the table does.
+        temperature_c, temperature_source, columns, sign
+            As of `cangauge.read_log`.
 
         Raises
         ------
         InputError
             Names the column, the row (from 1) and the value.
-        TypeError
-            If the object is no table.
 
         Examples
         --------
-        >>> import pyarrow as pa
-        >>> table = pa.table({"Time_s": [0.0, 1.0], "current_A": [5.0, 6.0], "voltage_V": [380, 379]})
-        >>> log = Log.from_dataframe(table, temperature_c=21.0)
-        >>> log.voltage_v
+        >>> table = {"Time_s": [0, 1], "current_A": [5.0, 6.0], "voltage_V": [380, 379]}
+        >>> Log.from_dataframe(table, temperature_c=21.0).voltage_v
         array([380., 379.])
-        """  # noqa: E501 - an example to copy
+        """
         # Deferred: pyarrow takes 0.3 s to import, and the live service needs no tables.
-        import pyarrow as pa  # noqa: PLC0415
+        from cangauge.logs.read import log_of_dataframe  # noqa: PLC0415
 
-        from cangauge.logs.read import log_of_arrow  # noqa: PLC0415
-
-        log = log_of_arrow(
-            pa.table(table),
+        return log_of_dataframe(
+            table,
             name=name,
             temperature_c=temperature_c,
             temperature_source=temperature_source,
             columns=columns,
             sign=sign,
         )
-        return cls(**{each.name: getattr(log, each.name) for each in fields(log)})
 
     def to_arrow(self) -> Any:
         """Return a pyarrow.Table of the columns; missing SoC is null.

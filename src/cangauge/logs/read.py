@@ -15,11 +15,13 @@ import pyarrow as pa
 
 from cangauge._files import Head
 from cangauge.errors import InputError
-from cangauge.logs import canonical, table, text
+from cangauge.logs.canonical import arrow_table, open_parquet
 from cangauge.logs.column_map import DOCS, ColumnMap, unknown_columns
 from cangauge.logs.draft import DraftLog, Sign
 from cangauge.logs.log import Log, TemperatureSource
 from cangauge.logs.sign import resolve_sign
+from cangauge.logs.table import ArrowTable, draft_of_table, is_canonical
+from cangauge.logs.text import TextTable, find_table, is_of_frames, likely_header, table_below
 from cangauge.logs.units import COLDEST_C, HOTTEST_C, known_temperature_source
 
 KNOWN_LOGS: Final = (
@@ -27,7 +29,7 @@ KNOWN_LOGS: Final = (
     " tests, BMW i3 trips, Arbin, Bitrode and VisuaLCN exports, Battery Data Format, MF4"
     " signals, MCAP samples, any table with plain headings"
 )
-FORMATS: Final = tuple(
+_FORMATS: Final = tuple(
     f"cangauge.extras.formats.{module}" for module in ("exports", "tables", "measurement")
 )
 """Modules with further readers, each in its tuple `READERS`; loaded when a log is opened."""
@@ -57,63 +59,42 @@ class TableReader:
 
     def matches(self, head: Head) -> bool:
         """Return whether the file is Parquet, or a text with time, current and voltage."""
-        return _is_parquet(head) or bool(_canonical_text(head) or text.find_table(head))
+        return _is_parquet(head) or bool(_canonical_text(head) or find_table(head))
 
     def read(self, head: Head, columns: ColumnMap | None = None) -> DraftLog:
         """Read a log; see `LogReader`."""
-        with open_table(head, columns) as (of_file, word):
-            return draft_of_table(
-                of_file, columns, name=head.name, source=str(head.path), word=word
-            )
+        with open_table(head, columns) as table:
+            return draft_of_table(table, columns, name=head.name, source=str(head.path))
 
 
 def _is_parquet(head: Head) -> bool:
     return head.data.startswith(b"PAR1")
 
 
+def _canonical_text(head: Head) -> TextTable | None:
+    table = table_below(head, head.first_line) if head.first_line else None
+    return table if table is not None and is_canonical(table.headings) else None
+
+
 @contextmanager
-def open_table(
-    head: Head, columns: ColumnMap | None
-) -> Iterator[tuple[text.TextTable | table.ArrowTable, str]]:
-    """Open Parquet or a text as a table, with the temperature source that its metadata state."""
+def open_table(head: Head, columns: ColumnMap | None) -> Iterator[TextTable | ArrowTable]:
+    """Open Parquet or a text as a table."""
     if _is_parquet(head):
-        with canonical.open_parquet(head) as found:
+        with open_parquet(head) as found:
             yield found
         return
-    of_text = _canonical_text(head) if columns is None else None
-    of_text = of_text or text.find_table(head, columns)
-    if of_text is None:
-        raise unknown_columns(str(head.path), *text.likely_header(head))
-    yield of_text, ""
-
-
-def _canonical_text(head: Head) -> text.TextTable | None:
-    mark = text.delimiter_of(head.first_line) or ","
-    names = text.split_cells(head.first_line, mark)
-    if not canonical.is_canonical(names):
-        return None
-    return text.TextTable(head, mark, names, (), head.lines.index(head.first_line) + 1, [])
-
-
-def draft_of_table(
-    found: text.TextTable | table.ArrowTable,
-    columns: ColumnMap | None,
-    *,
-    name: str,
-    source: str,
-    word: str = "",
-) -> DraftLog:
-    """Return the draft of a table: canonical, by plain headings or by the user's columns."""
-    if columns is None and canonical.is_canonical(found.headings):
-        return canonical.canonical_draft(found, name=name, source=source, word=word)
-    return table.draft_by_headings(found, columns, name=name, source=source)
+    table = _canonical_text(head) if columns is None else None
+    table = table or find_table(head, columns)
+    if table is None:
+        raise unknown_columns(str(head.path), *likely_header(head))
+    yield table
 
 
 @cache
 def _readers() -> tuple[LogReader, ...]:
     """Return all readers, in the order in which a file is offered to them."""
     others = [entry.load()() for entry in entry_points(group=GROUP)]
-    formats = [reader for name in FORMATS for reader in import_module(name).READERS]
+    formats = [reader for name in _FORMATS for reader in import_module(name).READERS]
     return (*others, *formats, TableReader())
 
 
@@ -134,11 +115,8 @@ class LogFile:
     @property
     def is_any_table(self) -> bool:
         """Whether the file is a table of plain headings, not of a format that defines them."""
-        return (
-            isinstance(self.reader, TableReader)
-            and not _is_parquet(self.head)
-            and _canonical_text(self.head) is None
-        )
+        is_text = isinstance(self.reader, TableReader) and not _is_parquet(self.head)
+        return is_text and _canonical_text(self.head) is None
 
     def read(
         self,
@@ -192,8 +170,8 @@ def not_recognised(file: LogFile, problem: str, cure: str) -> InputError:
     foreign = import_module("cangauge.extras.formats.foreign").foreign_format(head.data)
     if foreign is not None:
         return InputError(f"{problem}: it is {foreign[0]}", source=head.path, cure=foreign[1])
-    headings, choice = text.likely_header(head)
-    if len(headings) >= 3 and not text.is_of_frames(headings):
+    headings, choice = likely_header(head)
+    if len(headings) >= 3 and not is_of_frames(headings):
         error = unknown_columns(str(head.path), headings, choice)
         return InputError(f"{problem}: {error.problem}", source=head.path, cure=error.cure)
     shown = head.first_line.strip()
@@ -222,16 +200,13 @@ def open_log(
     """
     head = Head(path)
     given = None if columns is None else ColumnMap.of(columns)
-    return LogFile(head, next(_offered(head, given), None), given, sign)
-
-
-def _offered(head: Head, given: ColumnMap | None) -> Iterator[LogReader]:
     for reader in _readers():
-        if given is None:
-            if reader.matches(head):
-                yield reader
-        elif reader.takes_columns and (isinstance(reader, TableReader) or reader.matches(head)):
-            yield reader
+        is_offered = given is None or reader.takes_columns
+        if is_offered and (
+            (given is not None and isinstance(reader, TableReader)) or reader.matches(head)
+        ):
+            return LogFile(head, reader, given, sign)
+    return LogFile(head, None, given, sign)
 
 
 def read_log(
@@ -283,31 +258,32 @@ def as_log(log: Any) -> Log:
     return Log.from_dataframe(log)
 
 
-_INDEX: Final = "__index_level_"
-"""Beginning of the column name of an unnamed pandas index."""
-
-
-def log_of_arrow(
+def log_of_dataframe(
     frame: Any,
     *,
     name: str,
     temperature_c: float | None,
     temperature_source: TemperatureSource | None,
-    columns: ColumnMap | Mapping[str, Any] | str | None = None,
-    sign: Sign | None = None,
+    columns: ColumnMap | Mapping[str, Any] | str | None,
+    sign: Sign | None,
 ) -> Log:
-    """Return the log of an Arrow table; see `Log.from_dataframe`."""
+    """Return the log of a data frame; see `Log.from_dataframe`."""
     _refuse_options(temperature_c, temperature_source, sign)
-    indices = [each for each in frame.schema if each.name.startswith(_INDEX)]
-    times = [each.name for each in indices if pa.types.is_timestamp(each.type)]
-    has_time = {"time", "time_s"} & {each.lower() for each in frame.column_names}
-    if len(times) == 1 and not has_time:  # an index of times
-        names = ["time" if each == times[0] else each for each in frame.column_names]
-        frame = frame.rename_columns(names)
-    kept = [k for k, each in enumerate(frame.column_names) if not each.startswith(_INDEX)]
-    frame = frame.select(kept)
-    word = canonical.word_of(frame.schema)
-    found = table.ArrowTable(frame.column_names, frame.select)
+    try:
+        table = pa.table(frame)
+    except (TypeError, ValueError, pa.ArrowException) as error:
+        raise InputError(
+            "not a log",
+            value=type(frame).__name__,
+            cure="give a Log, the path of one, or a DataFrame with time, current, voltage and"
+            " temperature",
+        ) from error
+    indices = [column for column in table.schema if column.name.startswith("__index_level_")]
+    times = [column.name for column in indices if pa.types.is_timestamp(column.type)]
+    if len(times) == 1 and not {"time", "time_s"} & {n.lower() for n in table.column_names}:
+        table = table.rename_columns({times[0]: "time"})  # an unnamed pandas index
+    table = table.drop_columns([c.name for c in indices if c.name in table.column_names])
     given = None if columns is None else ColumnMap.of(columns)
-    draft = draft_of_table(found, given, name=name, source="", word=word)
+    found = arrow_table(table.schema, table.select)
+    draft = draft_of_table(found, given, name=name, source="")
     return _log_of(draft, temperature_c, temperature_source, sign)

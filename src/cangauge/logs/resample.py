@@ -1,7 +1,4 @@
-"""Prepare a log for a fit or diagnosis: dequantize its temperature, average fast rows.
-
-Both are non-causal, hence for offline use only.
-"""
+"""Dequantize the temperature of a log for a fit or diagnosis; not causal, so offline only."""
 
 from __future__ import annotations
 
@@ -17,8 +14,6 @@ PLATEAU_S = 60.0
 plateaus are noise of a temperature between two steps."""
 STEPPED_SHARE = 0.5
 """A temperature that changes at this fraction of the rows or more is not quantized [-]."""
-ENOUGH_HZ = 20.0
-"""Rate of an averaged log [Hz]. A log below twice this rate is returned unchanged."""
 
 
 def dequantize(log: Log) -> Log:
@@ -58,41 +53,3 @@ def usual_step_k(log: Log) -> float:
 
 def _midpoints(values: FloatArray, change: IntArray) -> FloatArray:
     return np.asarray(0.5 * (values[change] + values[change + 1]))
-
-
-def resample(log: Log, rate_hz: float = ENOUGH_HZ) -> Log:
-    """Return a log averaged over bins of 1 / `rate_hz`.
-
-    A diagnosis evaluates hundreds of effects over all samples. The fastest act within a few tenths
-    of a second, while a car's bus gives a hundred samples per second.
-
-    Each row holds the means of all signals at the mean time of its bin: relative delays, charge and
-    unobserved intervals are preserved. The reference SoC is the first finite value
-    of each bin.
-    """
-    if len(log) < 2 or float(np.median(np.diff(log.time_s))) * 2.0 * rate_hz > 1.0:
-        return log
-    bins = np.floor((log.time_s - log.time_s[0]) * rate_hz)
-    first = np.flatnonzero(np.diff(bins, prepend=-1.0))
-    counts = np.diff(first, append=len(log))
-
-    def mean(values: FloatArray) -> FloatArray:
-        return np.asarray(np.add.reduceat(values, first) / counts)
-
-    return replace(
-        log,
-        time_s=log.time_s[0] + mean(log.time_s - log.time_s[0]),
-        current_a=mean(log.current_a),
-        voltage_v=mean(log.voltage_v),
-        temperature_c=mean(log.temperature_c),
-        soc_pct=None if log.soc_pct is None else _first_finite(log.soc_pct, first),
-    )
-
-
-def _first_finite(values: FloatArray, first: IntArray) -> FloatArray:
-    """Return the first finite value of each bin, NaN where there is none."""
-    known = np.flatnonzero(np.isfinite(values))
-    found = np.full(first.size, np.nan)
-    bins, at = np.unique(np.searchsorted(first, known, side="right") - 1, return_index=True)
-    found[bins] = values[known[at]]
-    return found

@@ -25,21 +25,18 @@ from cangauge.errors import InputError
 from cangauge.logs.gaps import discharged_ah
 from cangauge.logs.log import Log
 
-Kind = Literal["steps", "charge", "soc"]
-
 STEP_SPACING_S: Final = 1.0
 """Time between the rows whose difference is a step [s]."""
-STEP_LIMIT_S: Final = 90.0
+_STEP_LIMIT_S: Final = 90.0
 """Longest interval of a step [s]: the slowest logging of cyclers is 60 s."""
-STEP_SHARE: Final = 0.05
+_STEP_SHARE: Final = 0.05
 """Smallest step, relative to the range of current [-]."""
-MAX_STEPS: Final = 400
-VOTES_PER_FREE_ONE: Final = 3.0
+_MAX_STEPS: Final = 400
+_VOTES_PER_FREE_ONE: Final = 3.0
 """Votes that count as one independent vote; no wrong sign in random windows of real logs."""
-CLEAR_SHARE: Final = 0.75
+_CLEAR_SHARE: Final = 0.75
 """Least share of agreeing votes for steps to count [-]."""
-MOST_CONFIDENT: Final = 0.9999
-SURE_WEIGHT: Final = 2.0
+_SURE_WEIGHT: Final = 2.0
 """Least weight for a sign (confidence 0.99); below it the sign stays open."""
 
 
@@ -52,10 +49,10 @@ class Steps(NamedTuple):
 
 
 @dataclass(frozen=True, slots=True)
-class Evidence:
+class SignEvidence:
     """One kind of evidence: decades of odds (positive: discharges), and the figures as a phrase."""
 
-    kind: Kind
+    kind: Literal["steps", "charge", "soc"]
     weight: float
     text: str
 
@@ -70,21 +67,17 @@ class SignFinding:
         +1: positive current discharges (as it should); -1: it charges; 0: undetermined.
     confidence : float
         0.5 (no evidence) to 0.9999 [-]; see the module's docstring.
-    evidence : tuple of Evidence
+    evidence : tuple of SignEvidence
     """
 
     sign: Literal[1, -1, 0]
     confidence: float
-    evidence: tuple[Evidence, ...]
+    evidence: tuple[SignEvidence, ...]
 
     @property
-    def strongest(self) -> Evidence:
+    def strongest(self) -> SignEvidence:
         """The strongest evidence for the finding."""
         return max(self.evidence, key=lambda item: item.weight * (self.sign or 1))
-
-    def by_kind(self, kind: Kind) -> Evidence:
-        """Return the evidence of one kind."""
-        return next(item for item in self.evidence if item.kind == kind)
 
     @property
     def sentence(self) -> str:
@@ -107,14 +100,13 @@ def sign_of_current(log: Log) -> SignFinding:
     return _finding((_from_steps(log), _from_charge(log), _from_soc(log)))
 
 
-def _finding(evidence: Sequence[Evidence]) -> SignFinding:
-    """Return the sign that some evidence gives together."""
+def _finding(evidence: Sequence[SignEvidence]) -> SignFinding:
     weight = sum(item.weight for item in evidence)
     opposed = any(item.weight * weight < 0.0 and abs(item.weight) >= 1.0 for item in evidence)
-    sure = abs(weight) >= SURE_WEIGHT and not opposed
+    sure = abs(weight) >= _SURE_WEIGHT and not opposed
     odds = 10.0 ** abs(weight)
     sign: Literal[1, -1, 0] = (1 if weight > 0.0 else -1) if sure else 0
-    return SignFinding(sign, min(float(odds / (1.0 + odds)), MOST_CONFIDENT), tuple(evidence))
+    return SignFinding(sign, min(float(odds / (1.0 + odds)), 0.9999), tuple(evidence))
 
 
 def require_discharge_positive(log: Log) -> None:
@@ -133,60 +125,60 @@ def require_discharge_positive(log: Log) -> None:
 
 
 def current_steps(log: Log) -> Steps:
-    """Return the clear steps of current, at most `MAX_STEPS` of the largest ones."""
+    """Return the clear steps of current, at most 400 of the largest ones."""
     rows = spaced_rows(log.time_s, STEP_SPACING_S)
     change = np.diff(log.current_a[rows])
-    near = np.diff(log.time_s[rows]) <= STEP_LIMIT_S
-    clear = np.abs(change) >= STEP_SHARE * np.ptp(log.current_a)
+    near = np.diff(log.time_s[rows]) <= _STEP_LIMIT_S
+    clear = np.abs(change) >= _STEP_SHARE * np.ptp(log.current_a)
     chosen = np.flatnonzero(near & clear & (change != 0.0))
-    if chosen.size > MAX_STEPS:
-        largest = np.argpartition(-np.abs(change[chosen]), MAX_STEPS)[:MAX_STEPS]
+    if chosen.size > _MAX_STEPS:
+        largest = np.argpartition(-np.abs(change[chosen]), _MAX_STEPS)[:_MAX_STEPS]
         chosen = np.sort(chosen[largest])
     return Steps(rows[chosen + 1], change[chosen], np.diff(log.voltage_v[rows])[chosen])
 
 
-def _from_steps(log: Log) -> Evidence:
+def _from_steps(log: Log) -> SignEvidence:
     steps = current_steps(log)
     votes = -np.sign(steps.current_a * steps.voltage_v)
     fell, rose = int((votes > 0).sum()), int((votes < 0).sum())
     if not fell + rose:
-        return Evidence("steps", 0.0, "no clear step of current")
+        return SignEvidence("steps", 0.0, "no clear step of current")
     way, larger = ("against", fell) if fell >= rose else ("with", rose)
     share = larger / (fell + rose)
     # Successive steps share slow voltage changes: they are fewer independent votes.
-    free = max(1, round((fell + rose) / VOTES_PER_FREE_ONE))
+    free = max(1, round((fell + rose) / _VOTES_PER_FREE_ONE))
     chance = 2.0 * float(special.bdtrc(round(share * free) - 1, free, 0.5))
-    weight = min(6.0, -float(np.log10(chance))) if share >= CLEAR_SHARE and chance < 1.0 else 0.0
+    weight = min(6.0, -float(np.log10(chance))) if share >= _CLEAR_SHARE and chance < 1.0 else 0.0
     text = f"voltage moved {way} current in {larger} of {fell + rose} steps"
-    return Evidence("steps", weight if fell >= rose else -weight, text)
+    return SignEvidence("steps", weight if fell >= rose else -weight, text)
 
 
-def _from_charge(log: Log) -> Evidence:
+def _from_charge(log: Log) -> SignEvidence:
     rows = spaced_rows(log.time_s, log.duration_s / 200.0)
     voltage, taken = log.voltage_v[rows], charge_ah(log)[rows]
     span = float(np.ptp(voltage))
     if rows.size < 20 or np.ptp(taken) <= 0.0 or span <= 0.0:
-        return Evidence("charge", 0.0, "no voltage trend over charge")
+        return SignEvidence("charge", 0.0, "no voltage trend over charge")
     rank = correlation(_ranks(taken), _ranks(voltage))
     clear = span >= 0.05 * float(np.median(log.voltage_v))
     weight = 3.0 if abs(rank) >= 0.9 else 1.5 if abs(rank) >= 0.7 else 0.0
     text = f"voltage against charge taken out: rank correlation {rank:+.2f}"
-    return Evidence("charge", -float(np.sign(rank)) * (weight if clear else 0.0), text)
+    return SignEvidence("charge", -float(np.sign(rank)) * (weight if clear else 0.0), text)
 
 
-def _from_soc(log: Log) -> Evidence:
+def _from_soc(log: Log) -> SignEvidence:
     if log.soc_pct is None:
-        return Evidence("soc", 0.0, "no reference SoC")
+        return SignEvidence("soc", 0.0, "no reference SoC")
     known = np.flatnonzero(np.isfinite(log.soc_pct))
     soc, taken = log.soc_pct[known], charge_ah(log)[known]
     span = float(np.ptp(soc)) if known.size > 10 else 0.0
     if span < 1.0 or np.ptp(taken) <= 0.0:
-        return Evidence("soc", 0.0, f"reference SoC moves by only {span:.1f} %")
+        return SignEvidence("soc", 0.0, f"reference SoC moves by only {span:.1f} %")
     alike = correlation(taken, soc)
     weight = 4.0 if abs(alike) >= 0.95 else 1.0 if abs(alike) >= 0.8 else 0.0
     way = "rises" if alike > 0.0 else "falls"
     text = f"reference SoC {way} as charge is taken out (correlation {alike:+.3f})"
-    return Evidence("soc", -float(np.sign(alike)) * weight, text)
+    return SignEvidence("soc", -float(np.sign(alike)) * weight, text)
 
 
 def correlation(a: FloatArray, b: FloatArray) -> float:
@@ -230,43 +222,36 @@ def resolve_sign(log: Log, *, stored_sign_unknown: bool, is_stated: bool = False
     Returns
     -------
     Log
-        With a remark where the data disagree with the sign, or cannot confirm an unknown one.
+        With a remark where the data disagree with the sign, or cannot confirm an unknown one. A
+        SoC that contradicts the sign which the voltage alone proves is left out.
     """
     finding = sign_of_current(log)
-    log, finding = _without_wrong_soc(log, finding)
-    remark, assumed = "", ""
+    remarks, assumed = list(log.remarks), ""
+    voltage = _finding(finding.evidence[:2])
+    soc = finding.evidence[2]
+    if not finding.sign and abs(soc.weight) >= 1.0 and soc.weight * voltage.sign < 0.0:
+        _, first = log.first_soc() or (0, np.nan)
+        last = log.soc_pct[np.isfinite(log.soc_pct)][-1] if log.soc_pct is not None else np.nan
+        remarks.append(
+            f"SoC left out: it moves from {first:.4g} to {last:.4g} % against the charge, by the"
+            f" sign of current that the voltage proves ({voltage.strongest.text}); is it a depth of"
+            " discharge?"
+        )
+        log, finding = replace(log, soc_pct=None), voltage
     if stored_sign_unknown and finding.sign < 0:
         log = replace(log, current_a=0.0 - log.current_a)
-        remark = f"current negated, sign found from the data: {finding.strongest.text}"
+        remarks.append(f"current negated, sign found from the data: {finding.strongest.text}")
         assumed = "positive current charges, found from the data"
     elif stored_sign_unknown and finding.sign > 0:
         assumed = "positive current discharges, found from the data"
     elif stored_sign_unknown:
-        remark = "sign of current unknown and undetermined by the data: kept as stored"
-        remark += " (--sign charge inverts it)"
+        remarks.append(
+            "sign of current unknown and undetermined by the data: kept as stored (--sign charge"
+            " inverts it)"
+        )
         assumed = "positive current discharges, not confirmed by the data"
     elif finding.sign < 0:
-        stated = "the stated sign of current" if is_stated else "current"
-        kept = "stated" if is_stated else "stored"
-        remark = f"{stated} looks inverted and was kept as {kept}: {finding.sentence}"
-    return replace(
-        log,
-        remarks=(*log.remarks, *([remark] if remark else [])),
-        assumed=(*log.assumed, *([assumed] if assumed and log.assumed else [])),
-    )
-
-
-def _without_wrong_soc(log: Log, finding: SignFinding) -> tuple[Log, SignFinding]:
-    """Leave a SoC out that contradicts a sign which the voltage alone proves."""
-    soc = finding.by_kind("soc")
-    alone = _finding([item for item in finding.evidence if item.kind != "soc"])
-    contradicts = abs(soc.weight) >= 1.0 and soc.weight * alone.sign < 0.0
-    if finding.sign != 0 or not contradicts or log.soc_pct is None:
-        return log, finding
-    known = log.soc_pct[np.isfinite(log.soc_pct)]
-    remark = (
-        f"SoC left out: it moves from {known[0]:.4g} to {known[-1]:.4g} % against the charge, by"
-        f" the sign of current that the voltage proves ({alone.strongest.text}); is it a depth of"
-        " discharge?"
-    )
-    return replace(log, soc_pct=None, remarks=(*log.remarks, remark)), alone
+        what, how = ("the stated sign of current", "stated") if is_stated else ("current", "stored")
+        remarks.append(f"{what} looks inverted and was kept as {how}: {finding.sentence}")
+    stated = (assumed,) if assumed and log.assumed else ()
+    return replace(log, remarks=tuple(remarks), assumed=(*log.assumed, *stated))

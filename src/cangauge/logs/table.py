@@ -1,14 +1,17 @@
-"""Any table, of text or Arrow, by plain headings or the columns of the user.
+"""Any table, of text or Arrow, as a draft of a log.
 
-What the headings leave open is assumed, and stated in `DraftLog.assumed`; the sign of current is
-then found from the data. Rows may hold all channels, or only those that changed.
+A table with the names of the canonical log defines its columns. In any other they are found by
+plain headings or named by the user; what the headings leave open is assumed, and stated in
+`DraftLog.assumed`; the sign of current is then found from the data. Rows may hold all channels, or
+only those that changed.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
-from typing import Any, Final, Protocol
+from typing import Any, Final
 
 import numpy as np
 import pyarrow as pa
@@ -22,46 +25,197 @@ from cangauge.logs.column_map import (
     ChosenColumn,
     ColumnMap,
     choose_columns,
+    shown_headings,
     unknown_columns,
 )
-from cangauge.logs.draft import MAX_INCOMPLETE, PROBES_APART_K, DraftLog
+from cangauge.logs.draft import MAX_INCOMPLETE, DraftLog
 from cangauge.logs.headings import meaning_of
 from cangauge.logs.text import MISSING, TextTable, is_number
-from cangauge.logs.units import FIELDS, convert, unit_of
+from cangauge.logs.units import FIELDS, REQUIRED, convert, known_temperature_source, unit_of
 
-HOLD_S: Final = 1.0
+SOURCE: Final = "temperature_source"
+"""Column or metadata of a canonical log: the location of the temperature sensor."""
+_CANONICAL: Final = (*FIELDS.values(), SOURCE)
+_CANONICAL_UNIT: Final = dict(zip(FIELDS, ("s", "A", "V", "°C", "%"), strict=True))
+_HOLD_S: Final = 1.0
 """Longest time that a voltage is held to the next row with a current [s], where rows hold only the
 channels that changed: a bus repeats both within it."""
-LEAF_SPY_SOC: Final = 1e-4
+_LEAF_SPY_SOC: Final = 1e-4
 """LeafSpy writes SoC in ten-thousandths of a percent."""
 
-_SHOWN_HEADING: Final = 80
-"""Longest heading in the line of assumptions [characters]."""
-_ASSUMED_UNIT: Final = dict(zip(FIELDS, ("s", "A", "V", "°C", "%"), strict=True))
 
+@dataclass(frozen=True, slots=True)
+class ArrowTable:
+    """Columns of an Arrow table or file; `read` returns a pyarrow.Table of some of them.
 
-class Table(Protocol):
-    """A table whose columns are read by their place."""
+    `word` is the temperature source that the metadata state.
+    """
 
-    @property
-    def headings(self) -> Sequence[str]:
-        """Name of each column."""
+    headings: Sequence[str]
+    read: Callable[[list[str]], Any]
+    word: str = ""
+    units: Sequence[str] = ()
+    remarks: list[str] = field(default_factory=list)
 
     def columns(self, places: Sequence[int]) -> dict[int, Any]:
-        """Return pyarrow columns by place."""
+        """Return columns by place."""
+        table = self.read([self.headings[place] for place in places])
+        return {place: table.column(self.headings[place]) for place in places}
 
 
-def is_text(kind: Any) -> bool:
-    """Return whether an Arrow type is text, dictionary-encoded or not."""
-    kind = kind.value_type if pa.types.is_dictionary(kind) else kind
-    return str(kind) in {"string", "large_string", "string_view"}
+def is_canonical(headings: Sequence[str]) -> bool:
+    """Return whether columns have the names of a canonical log's, possibly an incomplete one.
+
+    A temperature of another name is not a missing one: such a table is a logger's own.
+    """
+    names = {name.strip().lower() for name in headings}
+    meanings = (meaning_of(name) for name in names - {*_CANONICAL})
+    others = any(meaning is not None and meaning.quantity == "temperature" for meaning in meanings)
+    others = others or any("temperature" in name for name in names - {*_CANONICAL})
+    return len(names & set(REQUIRED)) >= 2 and ("temperature_c" in names or not others)
 
 
-def _present(column: Any) -> Any:
-    """Return the trimmed cells of a column of text, null where there is no value."""
-    trimmed = pc.utf8_trim_whitespace(column.cast(pa.string()))
-    missing = pc.is_in(pc.utf8_lower(trimmed), value_set=pa.array(["", *MISSING]))
-    return pc.if_else(missing, pa.scalar(None, pa.string()), trimmed)
+def draft_of_table(
+    table: TextTable | ArrowTable, given: ColumnMap | None, *, name: str, source: str
+) -> DraftLog:
+    """Return the draft of a log from a table.
+
+    Parameters
+    ----------
+    table : TextTable or ArrowTable
+    given : ColumnMap, optional
+        The user's columns.
+    name, source : str
+        Of the log; for messages.
+
+    Raises
+    ------
+    InputError
+        If a column is not found, or holds anything but values of its quantity.
+    """
+    where = source or name
+    headings = list(table.headings)
+    draft = DraftLog(name, source, headings=tuple(headings))
+    defined = given is None and is_canonical(headings)
+    if defined:
+        choice = _canonical_choice(headings, where)
+    else:
+        choice = choose_columns(headings, table.units, given)
+        if not choice.is_complete:
+            raise unknown_columns(where, headings, choice)
+    wanted = [place for column in choice.chosen.values() for place in column.places]
+    time = choice.chosen["time"]
+    if not time.given:  # dates that may belong to a column of clock times
+        meanings = ((place, meaning_of(heading)) for place, heading in enumerate(headings))
+        wanted += [place for place, m in meanings if m and m.quantity == "time"]
+    lower = [heading.strip().lower() for heading in headings]
+    wanted += [lower.index(SOURCE)] if defined and SOURCE in lower else []
+    columns = table.columns([*dict.fromkeys(wanted)])
+    time_s, how, time = _time(columns, time, headings, where)
+    choice.chosen["time"] = time
+    draft.values["time_s"] = time_s
+    for quantity, column in choice.chosen.items():
+        label = " + ".join(headings[place] for place in column.places)
+        draft.labels[FIELDS[quantity]] = label
+        unit = how if quantity == "time" else _take(draft, quantity, column, columns)
+        factor = "" if column.factor == 1.0 else f" × {column.factor:g}"
+        shown = label if len(label) <= 80 else f"{label[:80]}…"
+        draft.assumed.append(f'{quantity} = "{shown}"{factor} [{unit}]')
+    used = {place for column in choice.chosen.values() for place in column.places}
+    draft.ignored = tuple(text for k, text in enumerate(headings) if text and k not in used)
+    draft.remarks[:0] = table.remarks
+    if defined:
+        draft.assumed = []
+        draft.ignored = tuple(n for n in headings if n and n.strip().lower() not in _CANONICAL)
+        word = _only_word(columns[lower.index(SOURCE)], where) if SOURCE in lower else ""
+        word = word or getattr(table, "word", "") or "unknown"
+        draft.temperature_source = known_temperature_source(word, source=where, field=SOURCE)
+    else:
+        draft.sign_unknown = choice.chosen["current"].factor > 0.0
+        if "temperature" in choice.chosen:
+            draft.temperature_source = choice.chosen["temperature"].source
+        _hold_changes(draft)
+    return draft
+
+
+def _canonical_choice(headings: Sequence[str], where: str) -> Choice:
+    """Return the columns of a canonical log by their names."""
+    names = [name.strip().lower() for name in headings]
+    for name in _CANONICAL:
+        if names.count(name) > 1:
+            raise InputError(
+                f"{names.count(name)} columns have this name",
+                source=where,
+                field=name,
+                cure="rename or drop all but one",
+            )
+        if name in REQUIRED[:3] and name not in names:
+            raise InputError(
+                f"this column is missing (found: {shown_headings(headings)})",
+                source=where,
+                field=name,
+                cure="a log needs time_s, current_a (positive = discharge), voltage_v,"
+                " temperature_c [s, A, V, °C]",
+            )
+    return Choice(
+        {
+            quantity: ChosenColumn((names.index(name),), _CANONICAL_UNIT[quantity], given=True)
+            for quantity, name in FIELDS.items()
+            if name in names
+        }
+    )
+
+
+def _only_word(column: Any, where: str) -> str:
+    words = {str(word).strip().lower() for word in pc.unique(column.cast(pa.string())).to_pylist()}
+    words -= {"", "none"}
+    if len(words) > 1:
+        problem = "the column must hold one word throughout"
+        raise InputError(problem, source=where, field=SOURCE, value=sorted(words)[:3])
+    return words.pop() if words else ""
+
+
+# --- Quantities
+
+
+def _take(draft: DraftLog, quantity: str, column: ChosenColumn, columns: dict[int, Any]) -> str:
+    """Take a quantity in its canonical unit; return the unit that was read or assumed."""
+    name, where = FIELDS[quantity], draft.source or draft.name
+    headings = [draft.headings[place] for place in column.places]
+    label = draft.labels[name]
+    parts = [
+        numbers_of(columns[place], where, heading)
+        for place, heading in zip(column.places, headings, strict=True)
+    ]
+    unit = column.unit
+    for in_cells in sorted({unit for _, unit in parts} - {""}):
+        if unit and unit_of(name, in_cells) != unit_of(name, unit):
+            raise InputError(
+                "the cells have another unit than the heading",
+                source=where,
+                field=label,
+                value=f"{in_cells}, heading {unit}",
+                cure=f"state the right one: --columns '{quantity}=HEADING[UNIT]'",
+            )
+        unit = unit or in_cells
+    values = parts[0][0] * column.factor
+    if quantity == "soc":
+        finite = values[np.isfinite(values)]
+        if not unit and finite.size and finite.min() >= 0.0 and 0.0 < finite.max() <= 1.0:
+            draft.values[name] = 100.0 * values
+            return "0–1, from its range"
+        if {"Gids", "AHr", "Pack Volts"} <= set(draft.headings) and np.nanmedian(values) > 110.0:
+            draft.remarks.append("LeafSpy log: SoC in 0.0001 %")
+            values = values * _LEAF_SPY_SOC
+    if quantity == "temperature":
+        probes = [
+            convert(part * column.factor, name, unit, source=where, label=label)[0]
+            for part, _ in parts
+        ]
+        draft.take_probes(headings, probes)
+    else:
+        draft.values[name], _ = convert(values, name, unit, source=where, label=label)
+    return unit or f"{_CANONICAL_UNIT[quantity]}, assumed"
 
 
 def numbers_of(column: Any, source: str, label: str) -> tuple[FloatArray, str]:
@@ -72,37 +226,43 @@ def numbers_of(column: Any, source: str, label: str) -> tuple[FloatArray, str]:
     InputError
         If a cell holds anything but a number, or the column has another type.
     """
-    kind, unit = column.type, ""
-    is_numeric = any(
-        of(kind)
-        for of in (pa.types.is_integer, pa.types.is_floating, pa.types.is_decimal, pa.types.is_null)
-    )
-    if not is_text(kind) and not is_numeric:
+
+    def error(problem: str, value: object, cure: str) -> InputError:
+        return InputError(problem, source=source, field=label, value=value, cure=cure)
+
+    kind, of = column.type, pa.types
+    is_text = _is_text(kind)
+    is_number_type = of.is_integer(kind) or of.is_floating(kind) or of.is_decimal(kind)
+    if not (is_text or is_number_type or of.is_null(kind)):
         cure = "store it as floating point"
-        raise InputError(
-            "the column does not hold numbers", source=source, field=label, value=str(kind)[:60],
-            cure=cure,
-        )  # fmt: skip
-    cells = _present(column) if is_text(kind) else column
+        raise error("the column does not hold numbers", str(kind)[:60], cure)
+    cells, unit = _present(column) if is_text else column, ""
     try:
         try:
             numbers = pc.cast(cells, pa.float64(), safe=False)
         except pa.ArrowInvalid:
-            cells = _with_decimal_point(cells)
-            bare, unit = _without_unit(cells)
+            bare, unit = _without_unit(_with_decimal_point(cells))
             numbers = pc.cast(bare, pa.float64())
-    except pa.ArrowInvalid as error:
-        shown = enumerate(_present(column).to_pylist(), start=1)
+    except pa.ArrowInvalid as problem:
+        shown = enumerate(cells.to_pylist(), start=1)
         wrong = ((k, text) for k, text in shown if text and not is_number(text.replace(",", ".")))
         row, value = next(wrong, (1, None))
-        raise InputError(
-            f"row {row} is not a number",
-            source=source,
-            field=label,
-            value=value,
-            cure="correct the cell, or leave it empty where the value is unknown",
-        ) from error
+        cure = "correct the cell, or leave it empty where the value is unknown"
+        raise error(f"row {row} is not a number", value, cure) from problem
     return np.array(numbers.to_numpy(), dtype=np.float64), unit
+
+
+def _is_text(kind: Any) -> bool:
+    """Return whether an Arrow type is text, dictionary-encoded or not."""
+    kind = kind.value_type if pa.types.is_dictionary(kind) else kind
+    return str(kind) in {"string", "large_string", "string_view"}
+
+
+def _present(column: Any) -> Any:
+    """Return the trimmed cells of a column of text, null where there is no value."""
+    trimmed = pc.utf8_trim_whitespace(column.cast(pa.string()))
+    missing = pc.is_in(pc.utf8_lower(trimmed), value_set=pa.array(["", *MISSING]))
+    return pc.if_else(missing, pa.scalar(None, pa.string()), trimmed)
 
 
 def _with_decimal_point(cells: Any) -> Any:
@@ -126,6 +286,43 @@ def _without_unit(cells: Any) -> tuple[Any, str]:
     return (parts.field("number"), units[0].strip()) if len(units) == 1 else (cells, "")
 
 
+# --- Time
+
+
+def _time(
+    columns: dict[int, Any], column: ChosenColumn, headings: Sequence[str], where: str
+) -> tuple[FloatArray, str, ChosenColumn]:
+    """Return time [s], how it was read, and its column; of several, the first that increases."""
+    place = column.places[0]
+    if not column.given and stamps.is_clock(_first(columns[place])):  # with the dates beside it
+        texts = {other: _first(columns[other]) for other in sorted(set(columns) - {place})}
+        dates = [k for k, text in texts.items() if ":" not in text and not is_number(text)]
+        date = next((k for k in dates if stamps.is_stamp(texts[k])), None)
+        column = column if date is None else replace(column, places=(date, place), others=())
+    label = " + ".join(headings[place] for place in column.places)
+    first = _seconds([columns[place] for place in column.places], column, where, label)
+    for place in () if _increases(first[0]) else column.others:
+        meaning = meaning_of(headings[place])
+        other = replace(column, places=(place,), unit=meaning.unit if meaning else "")
+        with suppress(InputError):
+            values, how = _seconds([columns[place]], other, where, headings[place])
+            if _increases(values):
+                return values, how, other
+    return *first, column
+
+
+def _first(column: Any) -> str:
+    """Return the first value of a column of text; "" of any other."""
+    if not _is_text(column.type):
+        return ""
+    return next((str(cell.as_py()) for cell in column if cell.is_valid), "")
+
+
+def _increases(time_s: FloatArray) -> bool:
+    finite = time_s[np.isfinite(time_s)]
+    return finite.size > 1 and bool(np.all(np.diff(finite) >= 0.0)) and finite[-1] > finite[0]
+
+
 def _seconds(
     parts: Sequence[Any], column: ChosenColumn, source: str, label: str
 ) -> tuple[FloatArray, str]:
@@ -139,180 +336,41 @@ def _seconds(
     if pa.types.is_date(kind):
         parts = [parts[0].cast(pa.string()), *parts[1:]]
     if len(parts) == 1:
-        cells = _present(parts[0]) if is_text(kind) else None
-        first = "" if cells is None else next((c.as_py() for c in cells if c.is_valid), "")
-        if cells is None or is_number(first.replace(",", ".")):
+        cells = _present(parts[0]) if _is_text(parts[0].type) else None
+        if cells is None or is_number(_first(cells).replace(",", ".") or "0"):
             values, _ = numbers_of(parts[0], source, label)
             return stamps.seconds_of_numbers(values * column.factor, unit)
     else:
-        cells = pc.binary_join_element_wise(*(each.cast(pa.string()) for each in parts), " ")
+        cells = pc.binary_join_element_wise(*(part.cast(pa.string()) for part in parts), " ")
     form = column.unit if stamps.is_time_format(column.unit) else ""
     return stamps.seconds_of_text(cells, form, source, label)
 
 
-# --- Draft of a log
-
-
-def draft_of(table: Table, choice: Choice, *, name: str, source: str) -> DraftLog:
-    """Return the draft of a log from the chosen columns of a table, with what was assumed.
-
-    Raises
-    ------
-    InputError
-        If a column holds anything but values of its quantity.
-    """
-    where = source or name
-    headings = table.headings
-    time = choice.chosen["time"]
-    places = [place for column in choice.chosen.values() for place in column.places]
-    columns = table.columns([*dict.fromkeys([*places, *time.others, *_dates_beside(table, time)])])
-    draft = DraftLog(name, source, headings=tuple(headings))
-    used = set(places)
-    for quantity, chosen in choice.chosen.items():
-        column = chosen
-        if quantity == "time":
-            values, unit, column = _time(columns, chosen, headings, where)
-            used.update(column.places)
-        else:
-            values, unit = _values(draft, quantity, column, columns, where)
-        label = " + ".join(headings[place] for place in column.places)
-        draft.labels[FIELDS[quantity]] = label
-        draft.values[FIELDS[quantity]] = values
-        factor = "" if column.factor == 1.0 else f" × {column.factor:g}"
-        shown = label if len(label) <= _SHOWN_HEADING else f"{label[:_SHOWN_HEADING]}…"
-        draft.assumed.append(f'{quantity} = "{shown}"{factor} [{unit}]')
-    if not draft.values["time_s"].size:
-        raise InputError("the log holds no rows", source=where, cure="check the export")
-    draft.ignored = tuple(h for k, h in enumerate(headings) if h and k not in used)
-    draft.sign_unknown = choice.chosen["current"].factor > 0.0
-    if "temperature" in choice.chosen:
-        draft.temperature_source = choice.chosen["temperature"].source
-    _leaf_spy(draft)
-    _hold_changes(draft)
-    return draft
-
-
-def _dates_beside(table: Table, time: ChosenColumn) -> list[int]:
-    """Return the columns of dates that may belong to a column of clock times."""
-    if time.given:
-        return []
-    meanings = ((k, meaning_of(heading)) for k, heading in enumerate(table.headings))
-    return [k for k, m in meanings if m and m.quantity == "time" and k not in time.places]
-
-
-def _time(
-    columns: dict[int, Any], column: ChosenColumn, headings: Sequence[str], where: str
-) -> tuple[FloatArray, str, ChosenColumn]:
-    """Return time [s], how it was read, and its column; of several, the first that increases."""
-    column = _with_date(column, columns)
-    label = " + ".join(headings[place] for place in column.places)
-    first = _seconds([columns[place] for place in column.places], column, where, label)
-    for place in () if _increases(first[0]) else column.others:
-        other = replace(column, places=(place,), unit="")
-        meaning = meaning_of(headings[place])
-        other = replace(other, unit=meaning.unit if meaning else "")
-        try:
-            values, how = _seconds([columns[place]], other, where, headings[place])
-        except InputError:
-            continue
-        if _increases(values):
-            return values, how, other
-    return *first, column
-
-
-def _with_date(column: ChosenColumn, columns: dict[int, Any]) -> ChosenColumn:
-    """Return a column of clock times with the column of dates beside it."""
-    place = column.places[0]
-    if (
-        column.given
-        or not is_text(columns[place].type)
-        or not stamps.is_clock(_first(columns[place]))
-    ):
-        return column
-    for other in sorted(set(columns) - {place}):
-        text = _first(columns[other]) if is_text(columns[other].type) else ""
-        if ":" not in text and stamps.is_stamp(text) and not is_number(text):
-            return replace(column, places=(other, place), others=())
-    return column
-
-
-def _first(column: Any) -> str:
-    return next((str(cell.as_py()) for cell in column if cell.is_valid), "")
-
-
-def _increases(time_s: FloatArray) -> bool:
-    finite = time_s[np.isfinite(time_s)]
-    return finite.size > 1 and bool(np.all(np.diff(finite) >= 0.0)) and finite[-1] > finite[0]
-
-
-def _values(
-    draft: DraftLog, quantity: str, column: ChosenColumn, columns: dict[int, Any], where: str
-) -> tuple[FloatArray, str]:
-    """Return a quantity in its canonical unit, and the unit that was read or assumed."""
-    canonical = FIELDS[quantity]
-    label = " + ".join(draft.headings[place] for place in column.places)
-    parts = [numbers_of(columns[place], where, draft.headings[place]) for place in column.places]
-    unit = column.unit
-    for in_cells in sorted({each for _, each in parts} - {""}):
-        if unit and unit_of(canonical, in_cells) != unit_of(canonical, unit):
-            raise InputError(
-                "the cells have another unit than the heading",
-                source=where,
-                field=label,
-                value=f"{in_cells}, heading {unit}",
-                cure=f"state the right one: --columns '{quantity}=HEADING[UNIT]'",
-            )
-        unit = unit or in_cells
-    values = parts[0][0]
-    if len(parts) > 1:
-        draft.remarks.append(f"{quantity}: mean of {len(parts)} columns")
-        names = [draft.headings[place] for place in column.places]
-        per_kelvin = abs((unit_of(canonical, unit) or (1.0, 0.0))[0] * column.factor)
-        probes = [numbers for numbers, _ in parts]
-        values = draft.mean_of_probes(names, probes, PROBES_APART_K / per_kelvin)
-    values = values * column.factor
-    if quantity == "soc" and not unit:
-        finite = values[np.isfinite(values)]
-        if finite.size and finite.min() >= 0.0 and 0.0 < finite.max() <= 1.0:
-            return 100.0 * values, "0–1, from its range"
-    values, _ = convert(values, canonical, unit, source=where, label=label)
-    return values, unit or f"{_ASSUMED_UNIT[quantity]}, assumed"
-
-
-def _leaf_spy(draft: DraftLog) -> None:
-    """Rescale the SoC of LeafSpy, known by its other headings."""
-    soc = draft.values.get("soc_pct")
-    if soc is None or not {"Gids", "AHr", "Pack Volts"} <= set(draft.headings):
-        return
-    if np.nanmedian(soc) > 110.0:
-        draft.values["soc_pct"] = soc * LEAF_SPY_SOC
-        draft.remarks.append("LeafSpy log: SoC in 0.0001 %")
+# --- Rows that hold only what changed
 
 
 def _hold_changes(draft: DraftLog) -> None:
     """Hold the latest voltage and temperature at each current, if rows hold only what changed."""
     values = draft.values
-    time, current, voltage = (values[name] for name in ("time_s", "current_a", "voltage_v"))
+    time, current, voltage = (values[name] for name in REQUIRED[:3])
     temperature = values.get("temperature_c", time)
-    whole = np.isfinite(time) & np.isfinite(current) & np.isfinite(voltage)
-    at = np.flatnonzero(np.isfinite(time) & np.isfinite(current))
-    if np.mean(whole & np.isfinite(temperature)) >= 1.0 - MAX_INCOMPLETE or not at.size:
+    whole = np.isfinite(time + current + voltage + temperature)
+    at = np.flatnonzero(np.isfinite(time + current))
+    if np.mean(whole) >= 1.0 - MAX_INCOMPLETE or not at.size:
         return
     latest_v, age_s = held(time, voltage, at)
-    near = age_s <= HOLD_S
+    near = age_s <= _HOLD_S
     if np.mean(near) < 0.5:
         return
     at = at[near]
-    found = {"time_s": time[at], "current_a": current[at], "voltage_v": latest_v[near]}
-    for name in ("temperature_c", "soc_pct"):
-        if name in values:
-            found[name], _ = held(time, values[name], at)
-    if "temperature_c" in found:
-        known = found["temperature_c"][np.isfinite(found["temperature_c"])]
-        found["temperature_c"] = np.nan_to_num(
-            found["temperature_c"], nan=known[0] if known.size else np.nan
+    draft.values = {"time_s": time[at], "current_a": current[at], "voltage_v": latest_v[near]}
+    for name in values.keys() - draft.values.keys():
+        draft.values[name], _ = held(time, values[name], at)
+    if "temperature_c" in values:  # before the first value, the first
+        known = draft.values["temperature_c"][np.isfinite(draft.values["temperature_c"])]
+        np.nan_to_num(
+            draft.values["temperature_c"], nan=known[0] if known.size else np.nan, copy=False
         )
-    draft.values = found
     draft.remarks.append(
         f"rows hold only what changed: {at.size} rows with a current kept, with the latest voltage"
         f" (at most {float(age_s[near].max()):.2g} s old) and temperature"
@@ -328,38 +386,3 @@ def held(time: FloatArray, values: FloatArray, at: IntArray) -> tuple[FloatArray
     row = known[np.maximum(latest, 0)]
     before = latest < 0
     return np.where(before, np.nan, values[row]), np.where(before, np.inf, time[at] - time[row])
-
-
-# --- Tables in memory
-
-
-@dataclass(frozen=True, slots=True)
-class ArrowTable:
-    """Columns of an Arrow table, or of a file; `read` returns a pyarrow.Table of some of them."""
-
-    headings: Sequence[str]
-    read: Callable[[list[str]], Any]
-    units: Sequence[str] = field(default=())
-
-    def columns(self, places: Sequence[int]) -> dict[int, Any]:
-        """Return columns by place."""
-        table = self.read([self.headings[place] for place in places])
-        return {place: table.column(self.headings[place]) for place in places}
-
-
-def draft_by_headings(
-    table: TextTable | ArrowTable, given: ColumnMap | None, *, name: str, source: str
-) -> DraftLog:
-    """Return the draft of a table by plain headings and the columns of the user.
-
-    Raises
-    ------
-    InputError
-        If a column is not found or does not hold its quantity.
-    """
-    choice = choose_columns(table.headings, table.units, given)
-    if not choice.is_complete:
-        raise unknown_columns(source or name, table.headings, choice)
-    draft = draft_of(table, choice, name=name, source=source)
-    draft.remarks[:0] = getattr(table, "remarks", ())
-    return draft

@@ -7,7 +7,8 @@ columns, and a last line that is cut off.
 from __future__ import annotations
 
 import csv
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import suppress
 from typing import Any, Final, NamedTuple
 
 import pyarrow as pa
@@ -16,22 +17,14 @@ import pyarrow.csv as pacsv
 from cangauge._files import Head, as_utf8
 from cangauge.errors import InputError
 from cangauge.logs import stamps
-from cangauge.logs.column_map import (
-    DOCS,
-    Choice,
-    ColumnMap,
-    choose_columns,
-    missing_quantities,
-    suggestion,
-)
-from cangauge.logs.draft import shown_headings
+from cangauge.logs.column_map import Choice, ColumnMap, choose_columns, unknown_columns
 from cangauge.logs.headings import meaning_of
 
 MAX_ROWS: Final = 20_000_000
 """Rows of a log: 23 days at 10 Hz, 0.8 GB as float64."""
 MAX_COLUMNS: Final = 10_000
-_NO_VALUE: Final = "nan na n/a #n/a null none - -- 1.#qnan -1.#ind unknown unavailable n.a."
-MISSING: Final = tuple(_NO_VALUE.split())
+_MISSING: Final = "nan na n/a #n/a null none - -- 1.#qnan -1.#ind unknown unavailable n.a."
+MISSING: Final = tuple(_MISSING.split())
 """Cells without a value, in lower case."""
 _NULLS: Final = ["", *{s for text in MISSING for s in (text, text.upper(), text.title(), "NaN")}]
 _DELIMITERS: Final = ("\t", ";", ",", "|")
@@ -69,28 +62,19 @@ class TextTable(NamedTuple):
             try:
                 table = self._parse(data, places, width, pa.string(), odd)
             except pa.ArrowInvalid as error:
-                raise InputError(
-                    f"the table cannot be read: {str(error).splitlines()[0]}",
-                    source=self.head.path,
-                ) from error
+                problem = f"the table cannot be read: {str(error).splitlines()[0]}"
+                raise self._error(problem, "export it again") from error
             self._remark_odd(odd, table.num_rows)
         if table.num_rows > MAX_ROWS:
-            raise InputError(
-                f"more than the {MAX_ROWS} rows that a log may have", source=self.head.path,
-                value=table.num_rows, cure="split it",
-            )  # fmt: skip
+            raise self._error(f"more than the {MAX_ROWS} rows that a log may have", "split it")
         if not table.num_rows:
-            raise self._no_rows()
+            raise self._error("there are no rows below the header", "check the export")
         if not data.endswith((b"\n", b"\r")):
             self.remarks.append(
                 "the last line has no line end: if the file was cut off, its last value may be"
                 " short"
             )
         return {place: table.column(f"c{place}") for place in places}
-
-    def label(self, place: int) -> str:
-        """Return the heading of a column for messages."""
-        return self.headings[place] if place < len(self.headings) else f"column {place + 1}"
 
     def _parse(
         self, data: bytes, places: Sequence[int], width: int, kind: Any, odd: list[Any]
@@ -100,7 +84,7 @@ class TextTable(NamedTuple):
             return "error" if kind == pa.float64() else "skip"
 
         names = [f"c{place}" for place in range(width)]
-        wanted = [names[place] for place in places]
+        wanted = list(dict.fromkeys(names[place] for place in places))
         return pacsv.read_csv(
             pa.BufferReader(data),
             # One thread: otherwise pyarrow does not number odd rows.
@@ -109,7 +93,7 @@ class TextTable(NamedTuple):
             ),
             parse_options=pacsv.ParseOptions(delimiter=self.delimiter, invalid_row_handler=collect),
             convert_options=pacsv.ConvertOptions(
-                include_columns=list(dict.fromkeys(wanted)),
+                include_columns=wanted,
                 column_types=dict.fromkeys(wanted, kind),
                 null_values=_NULLS,
                 strings_can_be_null=True,
@@ -118,18 +102,16 @@ class TextTable(NamedTuple):
 
     def _width(self) -> int:
         """Return the number of cells of the first row: headers can be shorter than rows."""
-        first = next((line for line in self.head.lines[self.skip_lines :] if line.strip()), None)
-        if first is None:
-            raise self._no_rows()
+        first = next((line for line in self.head.lines[self.skip_lines :] if line.strip()), "")
+        if not first:
+            raise self._error("there are no rows below the header", "check the export")
         width = len(split_cells(first, self.delimiter))
         named = max((k + 1 for k, name in enumerate(self.headings) if name), default=0)
-        if width > MAX_COLUMNS or width < named:
-            problem = f"row 1 has {width} cells where the header has {named}"
-            cure = "the file looks cut off or has another delimiter: export it again"
-            if width > MAX_COLUMNS:
-                problem = f"more than the {MAX_COLUMNS} columns that a log may have"
-                cure = "export only the columns that are needed"
-            raise InputError(problem, source=self.head.path, cure=cure)
+        if not named <= width <= MAX_COLUMNS:
+            raise self._error(
+                f"row 1 has {width} cells where the header has {named} (at most {MAX_COLUMNS})",
+                "the file looks cut off or has another delimiter: export it again",
+            )
         return width
 
     def _remark_odd(self, odd: list[Any], rows: int) -> None:
@@ -143,28 +125,20 @@ class TextTable(NamedTuple):
                     "the last line is cut off and was omitted: the file may be incomplete"
                 )
             else:
-                raise InputError(
+                raise self._error(
                     f"row {row.number - self.skip_lines} has {row.actual_columns} cells where the"
                     f" others have {row.expected_columns}",
-                    source=self.head.path,
-                    cure="export the file again",
+                    "export the file again",
                 )
 
-    def _no_rows(self) -> InputError:
-        return InputError(
-            "there are no rows below the header", source=self.head.path, cure="check the export"
-        )
+    def _error(self, problem: str, cure: str) -> InputError:
+        return InputError(problem, source=self.head.path, cure=cure)
 
 
 def split_cells(line: str, delimiter: str) -> list[str]:
     """Split a line into cells, without enclosing blanks and quotes."""
     reader = csv.reader([line], delimiter=delimiter, skipinitialspace=True)
     return [cell.strip() for cell in next(reader, [])]
-
-
-def delimiter_of(line: str) -> str | None:
-    """Return the delimiter of a line (tab before `;` before `,`), or None."""
-    return next((mark for mark in _DELIMITERS[:3] if mark in line), None)
 
 
 def is_number(text: str) -> bool:
@@ -180,6 +154,12 @@ def _is_value(cell: str) -> bool:
     return is_number(cell.replace(",", ".")) or stamps.is_stamp(cell)
 
 
+def table_below(head: Head, header: str) -> TextTable:
+    """Return the table below a known line, with the first delimiter of tab, `;` and `,` in it."""
+    mark = next((mark for mark in _DELIMITERS[:3] if mark in header), ",")
+    return TextTable(head, mark, split_cells(header, mark), (), head.lines.index(header) + 1, [])
+
+
 def find_table(head: Head, given: ColumnMap | None = None) -> TextTable | None:
     """Return the table of a text in which time, current and voltage are known, or None.
 
@@ -193,53 +173,43 @@ def find_table(head: Head, given: ColumnMap | None = None) -> TextTable | None:
         found = _without_header(head)
         if found is not None:
             return found
-    for joined in (False, True):  # the words of a header may be in two rows
-        for number, line in enumerate(head.lines):
-            for delimiter in _DELIMITERS:
-                cells = split_cells(line, delimiter) if delimiter in line else []
-                if joined and cells:
-                    cells = _joined(cells, head, number, delimiter)
-                if len(cells) >= 3 and _is_complete(cells, given):
-                    return _below(head, number + joined, delimiter, cells, given)
+    for rows in (1, 2):  # the words of a header may be in two rows
+        for number, delimiter, cells in _headers(head, rows):
+            with suppress(InputError):
+                if choose_columns(cells, (), given).is_complete:
+                    return _below(head, number + rows, delimiter, cells, given)
     if not specs:
         return None
     headings, _ = likely_header(head)
     choice = choose_columns(headings, (), given)  # names a heading that is missing
-    raise InputError(
-        f"no plain heading of {missing_quantities(choice)} (found: {shown_headings(headings)})",
-        source=head.path,
-        field=given.where if given else None,
-        cure=f"name it too: {suggestion(headings, choice)} ({DOCS})",
-    )
+    raise unknown_columns(str(head.path), headings, choice)
 
 
-def _is_complete(cells: Sequence[str], given: ColumnMap | None) -> bool:
-    try:
-        return choose_columns(cells, (), given).is_complete
-    except InputError:
-        return False
-
-
-def _joined(cells: list[str], head: Head, number: int, delimiter: str) -> list[str]:
-    below = [split_cells(line, delimiter) for line in head.lines[number + 1 : number + 2]]
-    if not below or len(below[0]) != len(cells) or any(map(_is_value, below[0][1:])):
-        return []
-    return [f"{one} {other}".strip() for one, other in zip(cells, below[0], strict=True)]
+def _headers(head: Head, rows: int = 1) -> Iterator[tuple[int, str, list[str]]]:
+    """Yield number, delimiter and cells of what may be a header of one or two rows."""
+    for number, line in enumerate(head.lines):
+        for delimiter in _DELIMITERS:
+            cells = split_cells(line, delimiter) if delimiter in line else []
+            for below in head.lines[number + 1 : number + rows]:
+                second = split_cells(below, delimiter)
+                is_words = len(second) == len(cells) and not any(map(_is_value, second[1:]))
+                pairs = zip(cells, second, strict=True) if is_words else ()
+                cells = [f"{one} {other}".strip() for one, other in pairs]
+            if len(cells) > 2:
+                yield number, delimiter, cells
 
 
 def _below(
-    head: Head, number: int, delimiter: str, cells: list[str], given: ColumnMap | None
+    head: Head, first: int, delimiter: str, cells: list[str], given: ColumnMap | None
 ) -> TextTable:
     """Return the table below a header, with its row of units where there is one."""
     choice = choose_columns(cells, (), given)
     place = choice.chosen["time"].places[-1]
     units: list[str] = []
-    first = number + 1
-    for k in range(first, min(first + _ROWS_ABOVE_DATA, len(head.lines))):
-        row = split_cells(head.lines[k], delimiter)
+    for number, line in enumerate(head.lines[first : first + _ROWS_ABOVE_DATA], start=first):
+        row = split_cells(line, delimiter)
         if place < len(row) and _is_value(row[place]):
-            first = k
-            break
+            return TextTable(head, delimiter, cells, units, number, [])
         again = choose_columns(cells, row, given).chosen if any(row) else {}
         if len(again) >= len(choice.chosen) and any(
             again[name].unit != column.unit for name, column in choice.chosen.items()
@@ -253,7 +223,7 @@ def _without_header(head: Head) -> TextTable | None:
     for number, line in enumerate(head.lines):
         for delimiter in _DELIMITERS:
             cells = split_cells(line, delimiter)
-            if len(cells) >= 3 and sum(map(_is_value, cells)) > len(cells) / 2:
+            if len(cells) > 2 and 2 * sum(map(_is_value, cells)) > len(cells):
                 above = split_cells(head.lines[number - 1], delimiter) if number else []
                 headings = [f"column {k}" for k in range(1, len(cells) + 1)]
                 is_header = len(above) == len(cells)
@@ -263,19 +233,16 @@ def _without_header(head: Head) -> TextTable | None:
 
 def likely_header(head: Head) -> tuple[list[str], Choice]:
     """Return the likeliest header of a text and its incomplete choice, for messages."""
-    for number, line in enumerate(head.lines):
-        for delimiter in _DELIMITERS:
-            if not number or sum(map(_is_value, split_cells(line, delimiter))) < 2:
-                continue
-            above = head.lines[max(number - _ROWS_ABOVE_DATA, 0) : number]
-            rows = [split_cells(each, delimiter) for each in reversed(above)]
-            words = [
-                row for row in rows if len(row) > 2 and sum(map(bool, map(meaning_of, row))) > 1
-            ]
-            cells = words[0] if words else rows[0]
-            if len(cells) > 1 and 2 * sum(map(_is_value, cells)) < len(cells):
-                return cells, choose_columns(cells)
-    return [], Choice()
+    best: list[str] = []
+    for number, delimiter, cells in _headers(head):
+        if sum(map(_is_value, cells)) > 1:
+            break
+        below = head.lines[number + 1 : number + 1 + _ROWS_ABOVE_DATA]
+        has_data = any(sum(map(_is_value, split_cells(row, delimiter))) > 1 for row in below)
+        known, most = (sum(map(bool, map(meaning_of, row))) for row in (cells, best))
+        if has_data and (not best or known > most):
+            best = cells
+    return best, choose_columns(best)
 
 
 def is_of_frames(headings: Iterable[str]) -> bool:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Final, Literal, NamedTuple, cast, get_args
+from typing import Any, Final, Literal, cast, get_args
 
 import numpy as np
 
@@ -23,67 +23,61 @@ FIELDS: Final[dict[str, str]] = {
 REQUIRED: Final = ("time_s", "current_a", "voltage_v", "temperature_c")
 """Columns of every log."""
 
-
-def _spelled(factor: float, offset: float, *names: str) -> dict[str, tuple[float, float]]:
-    return dict.fromkeys(names, (factor, offset))
-
-
-# Spelling (lower case, single blanks) -> factor and offset to the unit of the canonical log.
-_UNITS: Final[dict[str, dict[str, tuple[float, float]]]] = {
-    "time_s": _spelled(1.0, 0.0, "s", "sec", "secs", "second", "seconds", "sek", "sekunden")
-    | _spelled(1e-3, 0.0, "ms", "msec", "millis", "milliseconds")
-    | _spelled(1e-6, 0.0, "us", "µs", "μs", "usec", "microseconds")
-    | _spelled(1e-9, 0.0, "ns", "nanoseconds")
-    | _spelled(60.0, 0.0, "min", "mins", "minutes", "minuten")
-    | _spelled(3600.0, 0.0, "h", "hr", "hrs", "hours", "stunden")
-    | _spelled(86400.0, 0.0, "d", "days"),
-    "current_a": _spelled(1.0, 0.0, "a", "amp", "amps", "amper", "ampere", "adc")
-    | _spelled(1e-3, 0.0, "ma")
-    | _spelled(1e3, 0.0, "ka"),
-    "voltage_v": _spelled(1.0, 0.0, "v", "volt", "volts")
-    | _spelled(1e-3, 0.0, "mv")
-    | _spelled(1e3, 0.0, "kv")
-    | _spelled(1.0, 0.0, "vdc"),
-    # With the spellings that a wrong decoding of "°" leaves.
-    "temperature_c": _spelled(
-        1.0, 0.0, "c", "°c", "degc", "deg c", "deg. c", "deg_c", "celsius", "grad c",
-        "grad celsius", "℃", "º c", "ºc", "â°c", "\ufffdc",
-    )
-    | _spelled(1.0, -273.15, "k", "kelvin")
-    | _spelled(
-        5.0 / 9.0, -160.0 / 9.0, "f", "°f", "degf", "deg f", "fahrenheit", "℉", "ºf", "â°f",
-        "\ufffdf",
-    ),
-    "soc_pct": _spelled(1.0, 0.0, "%", "per", "pct", "percent", "prozent")
-    | _spelled(100.0, 0.0, "1", "-", "0-1", "0..1", "fraction", "ratio", "pu"),
-}  # fmt: skip
-
+_SPELLINGS: Final[dict[str, dict[tuple[float, float], str]]] = {
+    "time_s": {
+        (1.0, 0.0): "s|sec|secs|second|seconds|sek|sekunden",
+        (1e-3, 0.0): "ms|msec|millis|milliseconds",
+        (1e-6, 0.0): "us|µs|μs|usec|microseconds",
+        (1e-9, 0.0): "ns|nanoseconds",
+        (60.0, 0.0): "min|mins|minutes|minuten",
+        (3600.0, 0.0): "h|hr|hrs|hours|stunden",
+        (86400.0, 0.0): "d|days",
+    },
+    "current_a": {(1.0, 0.0): "a|amp|amps|amper|ampere|adc", (1e-3, 0.0): "ma", (1e3, 0.0): "ka"},
+    "voltage_v": {(1.0, 0.0): "v|volt|volts|vdc", (1e-3, 0.0): "mv", (1e3, 0.0): "kv"},
+    "temperature_c": {
+        (1.0, 0.0): "c|°c|degc|deg c|deg. c|deg_c|celsius|grad c|grad celsius|℃|º c|ºc|â°c|\ufffdc",
+        (1.0, -273.15): "k|kelvin",
+        (5.0 / 9.0, -160.0 / 9.0): "f|°f|degf|deg f|fahrenheit|℉|ºf|â°f|\ufffdf",
+    },
+    "soc_pct": {
+        (1.0, 0.0): "%|per|pct|percent|prozent",
+        (100.0, 0.0): "1|-|0-1|0..1|fraction|ratio|pu",
+    },
+}
+"""Spellings (lower case, single blanks) by factor and offset to the canonical unit; of degrees also
+those that a wrong decoding leaves."""
+_UNITS: Final = {
+    field: {name: unit for unit, names in units.items() for name in names.split("|")}
+    for field, units in _SPELLINGS.items()
+}
 _FOREIGN: Final = (
-    "w kw wh kwh ah mah as nm rpm km/h kmh mph hz khz pa bar mbar ohm mohm ω mω v/s a/s k/s wh/kg"
-    " ah/kg mah/g m m/s kg l deg"
+    "w|kw|wh|kwh|ah|mah|as|nm|rpm|km/h|kmh|mph|hz|khz|pa|bar|mbar|ohm|mohm|ω|mω|v/s|a/s|k/s|wh/kg"
+    "|ah/kg|mah/g|m|m/s|kg|l|deg"
 )
-FOREIGN_UNITS: Final = frozenset(_FOREIGN.split())
+FOREIGN_UNITS: Final = frozenset(_FOREIGN.split("|"))
 """Units of quantities that no log holds; a heading with one of them is none of its columns."""
 
 # Plausible values, from a cell of 2 V to a truck's pack of 1000 V.
-MAX_VOLTAGE_V: Final = 1500.0
-MAX_CURRENT_A: Final = 2000.0
-MAX_INTERVAL_S: Final = 90.0
+_MAX_VOLTAGE_V: Final = 1500.0
+_MAX_CURRENT_A: Final = 2000.0
+_MAX_INTERVAL_S: Final = 90.0
 """Usual time between rows of a log that counts charge [s]: cyclers log every 60 s at rest."""
-MAX_RATE_HZ: Final = 2000.0
-MAX_DAYS: Final = 366.0
+_MAX_RATE_HZ: Final = 2000.0
+_MAX_DAYS: Final = 366.0
 """First to last row [d]: setting the clock within a log can add decades."""
-MAX_STAMP_S: Final = 1e11
+_MAX_STAMP_S: Final = 1e11
 """Largest time of a row [s]: the year 5138, counted from 1970; in ms since 1970, 1973."""
 COLDEST_C: Final = -60.0
 HOTTEST_C: Final = 120.0
-UNUSUALLY_HOT_C: Final = 62.0
-MAX_HOURS_AT_PEAK: Final = 100.0
-"""Largest charge of a log, in hours of its largest current [h]."""
+_UNUSUALLY_HOT_C: Final = 62.0
 _EXCEL_1990: Final = 32_874.0
 """1990-01-01 as a spreadsheet's date [d since 1899-12-30]; as hours, nearly four years."""
 _RARE: Final = 1e-3
 """Fraction of impossible currents up to which they are codes, not another unit [-]."""
+
+_Check = tuple[Any, str, float, str, str, str]
+"""Whether a value is wrong; field, value, problem, cure, and the unit that the user may state."""
 
 
 def known_temperature_source(
@@ -115,23 +109,17 @@ def unit_of(field: str, unit: str) -> tuple[float, float] | None:
 def convert(
     values: FloatArray, field: str, unit: str, *, source: object, label: str
 ) -> tuple[FloatArray, str | None]:
-    """Convert values from the unit that the header states ("": the canonical one).
+    """Convert values of shape (n,) from a stated unit ("": the canonical one).
 
-    Returns
-    -------
-    array of shape (n,)
-    str or None
-        A remark if the values were converted.
+    Returns the values, and a remark where they were converted.
 
     Raises
     ------
     InputError
         If the unit is not known for this quantity.
     """
-    if not unit.strip():
-        return values, None
-    found = unit_of(field, unit)
-    if found is None:
+    factor, offset = (1.0, 0.0) if not unit.strip() else unit_of(field, unit) or (0.0, 0.0)
+    if not factor:
         raise InputError(
             f"the unit is not known for {field}",
             source=str(source),
@@ -139,9 +127,8 @@ def convert(
             value=unit,
             cure=f"convert it to one of: {', '.join(_UNITS[field])}",
         )
-    if found == (1.0, 0.0):
+    if (factor, offset) == (1.0, 0.0):
         return values, None
-    factor, offset = found
     return values * factor + offset, f"{label}: converted from {unit} to {field}"
 
 
@@ -171,121 +158,78 @@ def refuse_wrong_units(
     tuple of str
         Remarks on possible but unusual values.
     """
+
+    def odd_row(field: str, wrong: BoolArray, kind: str) -> _Check:
+        row = int(np.argmax(wrong))
+        cure = "remove the row: codes such as 255 and 65535 mean 'not available'"
+        return wrong.any(), field, values[field][row], f"row {row + 1} is not {kind}", cure, ""
+
     time, current = values["time_s"], values["current_a"]
     voltage, temperature = values["voltage_v"], values["temperature_c"]
-    check = _Check(str(source), labels)
-    _check_time(check, time, current, in_seconds=in_seconds)
-    middle, middle_c = float(np.median(voltage)), float(np.median(temperature))
-    cold_voltage = COLDEST_C <= middle <= UNUSUALLY_HOT_C
-    in_kelvin = 200.0 <= middle_c <= 400.0
-    # Before the voltage: a temperature in its place looks like kilovolts. A constant is a code.
-    check.refuse_if(
-        cold_voltage
-        and max(HOTTEST_C, 273.15 + UNUSUALLY_HOT_C) < middle_c <= MAX_VOLTAGE_V
-        and np.ptp(temperature) > 0.0,
-        "temperature_c",
-        f"it looks like a pack's voltage, and {labels.get('voltage_v', 'voltage_v')} like a"
-        " temperature",
-        middle_c,
-        "the two columns (or signals) look swapped: exchange them",
-    )
-    for wrong, problem, cure, unit in (
-        (middle > MAX_VOLTAGE_V, "voltage looks like millivolts", "divide it by 1000", "mV"),
-        (middle <= 0.0, "the median voltage is not positive", "check column and polarity", ""),
-        (middle < 1.0, "voltage looks like kilovolts", "convert it to volts", "kV"),
-    ):
-        check.refuse_if(wrong, "voltage_v", problem, middle, cure, unit)
-    check.refuse_row(np.abs(voltage) > MAX_VOLTAGE_V, "voltage_v", voltage, "a battery's voltage")
-    large = np.abs(current) > MAX_CURRENT_A
-    if np.mean(large) < _RARE and current.size > 1000:
-        check.refuse_row(large, "current_a", current, "a battery's current")
-    row = int(np.argmax(np.abs(current)))
-    problem = f"current exceeds {MAX_CURRENT_A:g} A in row {row + 1}: it looks like milliamperes"
-    check.refuse_if(large.any(), "current_a", problem, current[row], "divide it by 1000", "mA")
-    _check_soc(check, values.get("soc_pct", np.empty(0)))
-    swap = ", or exchange it with the voltage if the two are swapped" if cold_voltage else ""
-    problem = "temperature looks like kelvin"
-    check.refuse_if(in_kelvin, "temperature_c", problem, middle_c, f"subtract 273.15{swap}", "K")
-    problem = "this is not a battery's temperature in °C"
-    is_odd = not COLDEST_C <= middle_c <= HOTTEST_C
-    check.refuse_if(is_odd, "temperature_c", problem, middle_c, "convert it to °C")
-    odd = (temperature < COLDEST_C) | (temperature > HOTTEST_C)
-    check.refuse_row(odd, "temperature_c", temperature, "a battery's temperature in °C")
-    if middle_c <= UNUSUALLY_HOT_C:
-        return ()
-    label = labels.get("temperature_c", "temperature_c")
-    return (
-        f"temperature {middle_c:.0f} °C is unusually hot: if it is °F, state the unit:"
-        f" --columns 'temperature={label}[°F]'",
-    )
-
-
-class _Check(NamedTuple):
-    """Refusals of one log's values."""
-
-    source: str
-    labels: dict[str, str]
-
-    def refuse_if(  # noqa: PLR0917 - as the sentence has it
-        self, wrong: object, field: str, problem: str, value: float, cure: str, unit: str = ""
-    ) -> None:
-        if not wrong:
-            return
-        label = self.labels.get(field, field)
-        if unit and label.lower() != field:
-            cure += f" (or state the unit: --columns '{field.rpartition('_')[0]}={label}[{unit}]')"
-        raise InputError(problem, source=self.source, field=label, value=float(value), cure=cure)
-
-    def refuse_row(self, wrong: BoolArray, field: str, values: FloatArray, kind: str) -> None:
-        row = int(np.argmax(wrong))
-        problem = f"row {row + 1} is not {kind}"
-        cure = "remove the row: codes such as 255 and 65535 mean 'not available'"
-        self.refuse_if(wrong.any(), field, problem, values[row], cure)
-
-
-def _check_time(check: _Check, time: FloatArray, current: FloatArray, *, in_seconds: bool) -> None:
-    if time.size < 2:
-        return
-    step = np.diff(time)
-    interval = float(np.median(step))
-    by_1000 = "divide it by 1000"
-    problem = "time looks like milliseconds since 1970"
-    check.refuse_if(time[0] > MAX_STAMP_S, "time_s", problem, time[0], by_1000, "ms")
-    check.refuse_row(np.abs(time) > MAX_STAMP_S, "time_s", time, "a time in seconds")
-    row = int(np.argmax(step)) + 1
-    days = (time[-1] - time[0]) / 86400.0
-    problem = f"the log lasts {days:.0f} days; its longest step ends at row {row + 1}"
-    cure = "if the clock was set there, split the log there"
-    check.refuse_if(days > MAX_DAYS, "time_s", problem, time[row], cure)
-    problem = f"rows are {interval:g} apart: time looks like milliseconds"
-    cure = f"{by_1000} (a log with a row every 90 s or more cannot be used)"
-    check.refuse_if(interval > MAX_INTERVAL_S, "time_s", problem, interval, cure, "ms")
+    step = np.diff(time) if time.size > 1 else np.ones(1)
+    interval, days, last = float(np.median(step)), step.sum() / 86400.0, int(np.argmax(step)) + 1
+    too_close = not in_seconds and 0.0 < interval < 1.0 / _MAX_RATE_HZ
     in_days = time[0] > _EXCEL_1990
     looks = "days (dates of a spreadsheet)" if in_days else "hours or days"
-    problem = f"rows are {interval:g} apart: time looks like {looks}"
-    too_close = not in_seconds and 0.0 < interval < 1.0 / MAX_RATE_HZ
-    unit = "d" if in_days else "h"
-    check.refuse_if(too_close, "time_s", problem, interval, "convert it to seconds", unit)
-    # A fast log in milliseconds moves more charge than a battery holds. A steady drain can last for
-    # weeks; a drive that varies this much cannot.
-    peak = float(np.max(np.abs(current)))
-    if float(np.mean(np.abs(current))) < 0.5 * peak and interval >= 5.0:
-        hours = float(np.ptp(np.cumsum(current[:-1] * step))) / 3600.0 / peak
-        problem = f"the charge moved is {hours:.0f} h of the largest current: time looks like"
-        is_ms = hours > MAX_HOURS_AT_PEAK and np.all(time == np.rint(time))
-        check.refuse_if(is_ms, "time_s", f"{problem} milliseconds", interval, by_1000, "ms")
-
-
-def _check_soc(check: _Check, soc: FloatArray) -> None:
-    finite = soc[np.isfinite(soc)]
-    if not finite.size:
-        return
-    low, high = float(finite.min()), float(finite.max())
-    problem = "SoC looks like a fraction of 1"
-    cure = "multiply it by 100 (or leave it out if it stays below 1 %)"
-    check.refuse_if(0.0 < high <= 1.0 and low >= 0.0, "soc_pct", problem, high, cure, "-")
-    value = high if high > 110.0 else low
-    row = int(np.flatnonzero(soc == value)[0]) + 1
-    problem = f"SoC of row {row} is not within 0–100 %"
-    is_odd = high > 110.0 or low < -10.0
-    check.refuse_if(is_odd, "soc_pct", problem, value, "convert it to %")
+    apart = f"rows are {interval:g} apart: time looks like"
+    middle, middle_c = float(np.median(voltage)), float(np.median(temperature))
+    is_low = COLDEST_C <= middle <= _UNUSUALLY_HOT_C
+    # Before the voltage: a temperature in its place looks like kilovolts. A constant is a code.
+    hottest_k = max(HOTTEST_C, 273.15 + _UNUSUALLY_HOT_C)
+    swapped = is_low and hottest_k < middle_c <= _MAX_VOLTAGE_V and np.ptp(temperature) > 0.0
+    large = np.abs(current) > _MAX_CURRENT_A
+    peak = int(np.argmax(np.abs(current)))
+    are_codes = np.mean(large) < _RARE and current.size > 1000
+    soc = values.get("soc_pct", np.empty(0))
+    soc = soc[np.isfinite(soc)] if np.isfinite(soc).any() else np.full(1, 50.0)
+    most, least = float(np.max(soc)), float(np.min(soc))
+    odd_soc = most if most > 110.0 else least
+    soc_row = int(np.argmax(values.get("soc_pct", soc) == odd_soc))
+    celsius = (temperature >= COLDEST_C) & (temperature <= HOTTEST_C)
+    t, u, i, c, by_1000 = "time_s", "voltage_v", "current_a", "temperature_c", "divide it by 1000"
+    checks: tuple[_Check, ...] = (
+        (time[0] > _MAX_STAMP_S, t, time[0], "time looks like milliseconds since 1970", by_1000,
+         "ms"),
+        odd_row(t, np.abs(time) > _MAX_STAMP_S, "a time in seconds"),
+        (days > _MAX_DAYS, t, time[min(last, time.size - 1)],
+         f"the log lasts {days:.0f} days; its longest step ends at row {last + 1}",
+         "if the clock was set there, split the log there", ""),
+        (interval > _MAX_INTERVAL_S, t, interval, f"{apart} milliseconds",
+         f"{by_1000} (a log with a row every 90 s or more cannot be used)", "ms"),
+        (too_close, t, interval, f"{apart} {looks}", "convert it to seconds",
+         "d" if in_days else "h"),
+        (swapped, c, middle_c,
+         f"it looks like a pack's voltage, and {labels.get(u, u)} like a temperature",
+         "the two columns (or signals) look swapped: exchange them", ""),
+        (middle > _MAX_VOLTAGE_V, u, middle, "voltage looks like millivolts", by_1000, "mV"),
+        (middle <= 0.0, u, middle, "the median voltage is not positive",
+         "check column and polarity", ""),
+        (middle < 1.0, u, middle, "voltage looks like kilovolts", "convert it to volts", "kV"),
+        odd_row(u, np.abs(voltage) > _MAX_VOLTAGE_V, "a battery's voltage"),
+        odd_row(i, large & are_codes, "a battery's current"),
+        (large.any(), i, current[peak],
+         f"current exceeds {_MAX_CURRENT_A:g} A in row {peak + 1}: it looks like milliamperes",
+         by_1000, "mA"),
+        (least >= 0.0 and 0.0 < most <= 1.0, "soc_pct", most,
+         "SoC looks like a fraction of 1",
+         "multiply it by 100 (or leave it out if it stays below 1 %)", "-"),
+        (not -10.0 <= odd_soc <= 110.0, "soc_pct", odd_soc,
+         f"SoC of row {soc_row + 1} is not within 0–100 %", "convert it to %", ""),
+        (200.0 <= middle_c <= 400.0, c, middle_c, "temperature looks like kelvin",
+         "subtract 273.15"
+         + (", or exchange it with the voltage if the two are swapped" if is_low else ""), "K"),
+        (not COLDEST_C <= middle_c <= HOTTEST_C, c, middle_c,
+         "this is not a battery's temperature in °C", "convert it to °C", ""),
+        odd_row(c, ~celsius, "a battery's temperature in °C"),
+    )  # fmt: skip
+    for wrong, field, value, problem, cure, unit in checks:
+        if wrong:
+            label = labels.get(field, field)
+            option = f"--columns '{field.rpartition('_')[0]}={label}[{unit}]'"
+            also = f" (or state the unit: {option})" if unit and label.lower() != field else ""
+            raise InputError(
+                problem, source=str(source), field=label, value=float(value), cure=cure + also
+            )
+    remark = f"temperature {middle_c:.0f} °C is unusually hot: if it is °F, state the unit:"
+    remark += f" --columns 'temperature={labels.get(c, c)}[°F]'"
+    return (remark,) if middle_c > _UNUSUALLY_HOT_C else ()

@@ -36,7 +36,7 @@ from cangauge.logs.draft import Sign
 from cangauge.logs.log import Log
 from cangauge.logs.read import LogFile
 from cangauge.logs.sign import require_discharge_positive
-from cangauge.logs.text import delimiter_of, split_cells
+from cangauge.logs.text import split_cells
 from cangauge.logs.units import TemperatureSource
 
 VEHICLE_PATTERN: Final = r"(?:vehicle=)?([^/]+)/[^/]+$"
@@ -235,7 +235,7 @@ def _is_manifest(fs: Any, path: str) -> bool:
 def _headings(text: str) -> tuple[list[str], str]:
     """Return the headings of a table as spreadsheets write it, and its delimiter."""
     first = _lines(text).readline().rstrip("\r\n")
-    delimiter = delimiter_of(first) or ","
+    delimiter = next((mark for mark in "\t;," if mark in first), ",")
     return split_cells(first, delimiter), delimiter
 
 

@@ -10,11 +10,10 @@ from typing import Final
 import numpy as np
 
 from cangauge._files import Head
-from cangauge._text import counted
 from cangauge._typing import FloatArray
 from cangauge.errors import InputError
-from cangauge.logs.column_map import ColumnMap
-from cangauge.logs.draft import DraftLog, shown_headings
+from cangauge.logs.column_map import ColumnMap, shown_headings
+from cangauge.logs.draft import DraftLog
 from cangauge.logs.table import numbers_of
 from cangauge.logs.text import TextTable, split_cells
 from cangauge.logs.units import convert
@@ -64,7 +63,9 @@ class _Text:
         self.draft = DraftLog(head.name, str(head.path), remarks=[*self.table.remarks])
 
     def label(self, name: str) -> str:
-        return self.table.label(self._wanted[name][0])
+        place = self._wanted[name][0]
+        headings = self.table.headings
+        return headings[place] if place < len(headings) else f"column {place + 1}"
 
     def values(self, name: str, field: str) -> FloatArray:
         """Return a column in the canonical unit of a field, with a remark if it is converted."""
@@ -196,10 +197,7 @@ class D3Test:
             problem, cure = "all rows are before time 0", "check the export"
             label = draft.labels["time_s"]
             raise InputError(problem, source=draft.source, field=label, cure=cure)
-        if waiting.any():
-            rows = counted(int(waiting.sum()), "row")
-            draft.remarks.append(f"{rows} before time 0 (the wait before the test) dropped")
-            draft.keep(~waiting)
+        draft.keep(~waiting, "before time 0 (the wait before the test) dropped")
         return draft
 
     def _take_instrument(self, text: _Text, wanted: Mapping[str, object]) -> None:
@@ -246,7 +244,7 @@ class CyclerExport:
     set_point : str
         Regular expression of the temperature in the file name.
     sensors : str
-        Beginning of the headings of temperature sensors; their mean is taken.
+        Beginning of the headings of temperature sensors; their median is taken.
     ambient : str
         Heading of the room's temperature, taken where there is no sensor.
     bare : str
@@ -309,10 +307,7 @@ class CyclerExport:
             self._take_set_point(draft, head.path.name)
         if "exclude" in wanted:
             excluded = np.array([cell == "Yes" for cell in text.cells("exclude")])
-            if excluded.any():
-                rows = counted(int(excluded.sum()), "row")
-                draft.remarks.append(f"{rows} that the cycler excludes dropped")
-                draft.keep(~excluded)
+            draft.keep(~excluded, "that the cycler excludes dropped")
         return draft
 
     def _take_sensors(self, text: _Text, names: list[str], wanted: Mapping[str, object]) -> None:
@@ -322,9 +317,8 @@ class CyclerExport:
         values = {name: each for name, each in values.items() if np.isfinite(each).any()}
         if values:
             labels = [text.label(name) for name in values]
-            draft.values["temperature_c"] = draft.mean_of_probes(labels, list(values.values()))
+            draft.take_probes(labels, list(values.values()))
             draft.temperature_source = "cell"
-            draft.remarks.append(f"temperature: mean of {len(values)} sensors")
         elif "ambient" in wanted:
             text.take("temperature_c", "ambient")
             draft.temperature_source = "room"

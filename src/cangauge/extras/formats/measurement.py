@@ -19,7 +19,7 @@ from cangauge.extras.formats.mcap_messages import FRAME, MAGIC, SAMPLE, McapMess
 from cangauge.logs.canonical import build_table
 from cangauge.logs.column_map import ColumnMap, choose_columns, unknown_columns
 from cangauge.logs.draft import DraftLog
-from cangauge.logs.table import ArrowTable, draft_by_headings
+from cangauge.logs.table import ArrowTable, draft_of_table
 from cangauge.logs.text import MAX_COLUMNS, MAX_ROWS
 from cangauge.logs.units import FIELDS
 
@@ -76,7 +76,7 @@ def _draft_of_channels(
                 notes.extend([note] if note else [])
         return build_table(columns)
 
-    draft = draft_by_headings(ArrowTable(names, table), given, name=head.name, source=source)
+    draft = draft_of_table(ArrowTable(names, table), given, name=head.name, source=source)
     draft.remarks.extend(notes)
     return draft
 

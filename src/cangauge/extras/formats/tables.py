@@ -13,10 +13,9 @@ from cangauge._files import Head
 from cangauge.errors import InputError
 from cangauge.logs.column_map import ColumnMap, choose_columns, unknown_columns
 from cangauge.logs.draft import DraftLog
-from cangauge.logs.read import draft_of_table
 from cangauge.logs.stamps import seconds_of_text
-from cangauge.logs.table import ArrowTable, held
-from cangauge.logs.text import MAX_ROWS, TextTable, find_table, likely_header, split_cells
+from cangauge.logs.table import ArrowTable, draft_of_table, held
+from cangauge.logs.text import MAX_ROWS, find_table, likely_header, split_cells, table_below
 
 HOLD_ENTITY_S: Final = 60.0
 """Longest time that a stored value is held [s], as long as charge is counted over a gap: a recorder
@@ -105,9 +104,8 @@ class EntityHistory:
 
     def read(self, head: Head, columns: ColumnMap | None = None) -> DraftLog:
         """Read a history: a row for every time at which the current or the voltage changed."""
-        header = split_cells(head.first_line, ",")
-        lower = [cell.lower() for cell in header]
-        text = TextTable(head, ",", header, (), head.lines.index(head.first_line) + 1, [])
+        text = table_below(head, head.first_line)
+        lower = [cell.lower() for cell in text.headings]
         places = [lower.index(name) for name in self._NAMES]
         cells = text.columns(places)
         entity, state, changed = (cells[place].cast(pa.string()) for place in places)
