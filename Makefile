@@ -9,7 +9,7 @@ SOCKETCAN ?= $(wildcard ../shared/tools/with-socketcan)
 # Folder of the recorded logs (see README for their sources).
 DATA ?= $(wildcard ../shared/data)
 
-.PHONY: packs help demo test nightly lint coverage check data faults trips bench bench-check lowest site wheel clean
+.PHONY: packs help demo test nightly lint coverage check data faults bench bench-check lowest site wheel clean
 
 help:
 	@echo "make demo      the whole job on the shipped log: fit, bus, service, report"
@@ -24,7 +24,6 @@ help:
 	@echo "make wheel     build the wheel and run the job from it in an environment of its own"
 	@echo "make bench     time and accuracy beside other packages, and how the cost grows (DATA=FOLDER, see README)"
 	@echo "make packs     SoC errors on recorded packs, with models from few logs (DATA=FOLDER)"
-	@echo "make trips     the table on the real BMW i3 trips (DATA=FOLDER, see README)"
 
 $(VENV)/installed: pyproject.toml hatch_build.py $(wildcard core/*.[ch])
 	$(PYTHON) -c 'import sys; sys.exit("cangauge needs Python 3.11 or later (set PYTHON=…)" if sys.version_info < (3, 11) else 0)'
@@ -66,9 +65,6 @@ check: $(VENV)/installed
 
 data:
 	@test -d "$(DATA)" || { echo "no folder '$(DATA)' of recorded logs: name it, make $(MAKECMDGOALS) DATA=FOLDER (see README for the sources)" >&2; exit 2; }
-
-trips: data $(VENV)/installed
-	$(BIN)/python benchmarks/real_trips.py --data "$(DATA)/bmw_i3"
 
 # The other packages, in an environment of their own.
 PEERS := .venv-peers

@@ -2,8 +2,9 @@
 
     python benchmarks/bus_trips.py --data FOLDER [--trip A02]… [--vehicle generic] [--json]
 
-The model is that of `real_trips.py` (fitted on A01, A03 … A21). Each of A02, A04 … A22 longer than
-15 minutes is replayed at full speed on vcan0 (or udp_multicast) and estimated from the frames.
+FOLDER holds TripA01.csv.gz … TripA22.csv.gz of "Battery and Heating Data in Real Driving Cycles"
+(IEEE DataPort). The model is fitted on A01, A03 … A21. Each of A02, A04 … A22 longer than 15
+minutes is replayed at full speed on vcan0 (or udp_multicast) and estimated from the frames.
 Prints for each trip the largest difference from the estimate of the log, its bound by the
 quantization of the frames, and whether the estimate of the recorded frames equals the live one bit
 for bit.
@@ -31,7 +32,10 @@ from cangauge.bus.publish import standard_filter
 from cangauge.bus.vehicle import Vehicle
 from cangauge.estimation.offline import run_estimator, samples_of
 from cangauge.estimation.settings import EstimatorSettings
+from cangauge.identify.fit import fit
 from cangauge.logs.log import Log
+from cangauge.logs.read import read_log
+from cangauge.model.coulomb_counting import capacity_from_reference
 from cangauge.model.model_file import Model
 from cangauge.replay.player import ReplaySettings, play
 from cangauge.replay.steps import LogSource, quantization_bound
@@ -41,8 +45,12 @@ from cangauge.service.output import Output
 from cangauge.service.pipeline import Pipeline, PipelineSettings
 from cangauge.service.record import Recorder
 from cangauge.types import Estimate, Sample
-from real_trips import DATA, JUDGED_S, TEST, TRAINING, identify, read_trips
 
+DATA = Path(__file__).resolve().parents[2] / "shared" / "data" / "bmw_i3"
+TRAINING = [f"A{number:02d}" for number in range(1, 22, 2)]
+TEST = [f"A{number:02d}" for number in range(2, 23, 2)]
+PLAYED_S = 15 * 60.0
+"""Only longer trips are played [s]."""
 NUMBERS = ("soc_pct", "soc_std_pct", "soc_newton_pct", "soc_coulomb_pct", "residual_v")
 FULL_SPEED = ReplaySettings(speed=math.inf, acknowledge_s=20.0)
 
@@ -71,6 +79,16 @@ class _Rows(Output):
     def on_sample(self, sample: Sample, estimate: Estimate) -> None:
         del sample
         self._rows.append(estimate)
+
+
+def read_trips(folder: Path, names: list[str]) -> list[Log]:
+    """Read trips by name."""
+    return [read_log(folder / f"Trip{name}.csv.gz") for name in names]
+
+
+def identify(trips: list[Log]) -> Model:
+    """Fit model and capacity to trips."""
+    return fit(trips, capacity_ah=capacity_from_reference(trips), chemistry="oxide").model
 
 
 def over_bus(
@@ -158,11 +176,11 @@ def main() -> int:
         sys.stderr.write(f"{options.data}: no such folder; give the trips' with --data\n")
         return 2
     sys.stderr.write("fitting the model on the training trips …\n")
-    model = identify(read_trips(options.data, TRAINING)).model
+    model = identify(read_trips(options.data, TRAINING))
     address, vehicle = bus_address(), Vehicle.load(options.vehicle)
     rows = []
     for trip in read_trips(options.data, options.trip or TEST):
-        if trip.duration_s > JUDGED_S:
+        if trip.duration_s > PLAYED_S:
             sys.stderr.write(f"playing {trip.name} …\n")
             rows.append(compare(trip, vehicle, model, address))
     if options.json:

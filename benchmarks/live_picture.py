@@ -57,7 +57,7 @@ def main() -> None:
     parser.add_argument("-o", "--output", type=Path, default=Path("docs/live.gif"))
     parser.add_argument("--seconds", type=float, default=20.0)
     given = parser.parse_args()
-    arguments = ("--time-source", "replay-clock", "--temperature-source", "room")
+    arguments = ("--time-source", "replay-clock")
     page = ("--dashboard", str(PAGE_PORT), "--status-socket", "off")
     with service(BUS, *arguments, *page), chromium(PAGE_PORT) as browser:
         browser.set_window_size(SIZE[0], 1200)

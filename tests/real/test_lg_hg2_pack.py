@@ -18,7 +18,7 @@ from cangauge.logs.log import Log
 from cangauge.logs.read import read_log
 from cangauge.model.coulomb_counting import discharged_ah
 from cangauge.model.model_file import Model
-from real_trips import chain
+from chains import chain
 
 pytestmark = [pytest.mark.real, pytest.mark.slow]
 

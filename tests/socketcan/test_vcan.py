@@ -282,11 +282,10 @@ def test_both_commands_until_the_bus_goes_down(tmp_path: Path) -> None:
 @pytest.mark.slow
 def test_a_real_trip_within_the_bound_and_bit_for_bit(shared_data: Path) -> None:
     """One trip; `benchmarks/bus_trips.py` plays them all."""
-    from bus_trips import compare  # noqa: PLC0415 - needs the real data
-    from real_trips import identify, read_trips  # noqa: PLC0415
+    from bus_trips import compare, identify, read_trips  # noqa: PLC0415 - needs the real data
 
     folder = shared_data / "bmw_i3"
-    model = identify(read_trips(folder, ["A01", "A03", "A05"])).model
+    model = identify(read_trips(folder, ["A01", "A03", "A05"]))
     trip = read_trips(folder, ["A02"])[0].rows(slice(0, 6000))
     for preset in ("generic", "leaf_aze0"):
         result = compare(trip, Vehicle.load(preset), model, VCAN)
