@@ -513,6 +513,9 @@ static void process(cg_estimator *self, const cg_sample *sample)
         *block = (cg_block){0};
         block->number = number;
     }
+    if ((self->state.implausible != 0U) && isnan(sample->voltage_v)) {
+        block->is_broken = true; /* an open contactor; other rows may be of a voltage that falls */
+    }
     cg_real counted_a = sample->current_a;
     if (counted_a < R(0.0)) {
         counted_a = model->charge_efficiency * counted_a;

@@ -250,6 +250,9 @@ class Estimator:
         if number > self._block.state.number:
             self._close_block(time_s)
             self._block.begin(number)
+        if self._implausible and math.isnan(sample.voltage_v):
+            # Behind an open contactor; the block's other rows may be of a voltage that falls.
+            self._block.state.is_broken = True
         charge = self._counter.step(time_s, self._online.counted(current_a))
         if not math.isnan(temperature_c):
             memory.temperature_c = temperature_c
