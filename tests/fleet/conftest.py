@@ -1,9 +1,9 @@
-"""A small fleet of simulated vehicles, and a Dask cluster of two worker processes."""
+"""A small fleet of simulated vehicles, and a Dask client of this process."""
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -11,16 +11,15 @@ from typing import Any
 import numpy as np
 import pytest
 
+from cangauge.extras.fleet import run as fleet_run
 from cangauge.extras.fleet.sources import FleetLog, find_logs
 from cangauge.extras.validation.cases import Scenario, draw_scenario
 from cangauge.extras.validation.twin.recording import record_drive
 from cangauge.identify.fit import fit
 from cangauge.logs.canonical import write_log
-from cangauge.logs.log import Log
 from cangauge.logs.read import read_log
 from cangauge.model.coulomb_counting import counted_soc_pct
 from cangauge.model.model_file import Model
-from fleet_cluster import Cluster, free_port
 
 VEHICLES, LOGS = 4, 2
 
@@ -40,16 +39,13 @@ def folder(scenario: Scenario, tmp_path_factory: pytest.TempPathFactory) -> Path
         drives = scenario.draw_drives(np.random.default_rng([7, vehicle]), LOGS, 0.4)
         (root / f"car{vehicle}").mkdir(exist_ok=True)
         for number, drive in enumerate(drives):
-            recording = record_drive(scenario.plant, drive, (), name=f"trip{number}")
-            soc_pct = np.full(len(recording.log), np.nan)
-            soc_pct[::1200] = _true_soc(recording.log, scenario)[::1200]
-            log = replace(recording.log, soc_pct=soc_pct)
-            write_log(log, root / f"car{vehicle}" / f"trip{number}.parquet")
+            log = record_drive(scenario.plant, drive, (), name=f"trip{number}").log
+            soc_pct = np.full(len(log), np.nan)
+            true_pct = counted_soc_pct(log, scenario.pack.capacity_ah, None)
+            soc_pct[::1200] = np.clip(true_pct, 0.0, 100.0)[::1200]
+            path = root / f"car{vehicle}" / f"trip{number}.parquet"
+            write_log(replace(log, soc_pct=soc_pct), path)
     return root
-
-
-def _true_soc(log: Log, scenario: Scenario) -> Any:
-    return np.clip(counted_soc_pct(log, scenario.pack.capacity_ah, None), 0.0, 100.0)
 
 
 @pytest.fixture(scope="session")
@@ -64,33 +60,22 @@ def model(logs: list[FleetLog], scenario: Scenario) -> Model:
 
 
 @pytest.fixture(scope="session")
-def storage_port() -> int:
-    return free_port()
-
-
-@pytest.fixture(scope="session")
-def cluster(tmp_path_factory: pytest.TempPathFactory, storage_port: int) -> Iterator[Cluster]:
-    """Scheduler and two workers, which find object storage at `storage_port`."""
-    pytest.importorskip("distributed")
-    from distributed import Client  # noqa: PLC0415
-
-    port = free_port()
-    environment = {
-        **os.environ,
-        "OMP_NUM_THREADS": "1",
-        "AWS_ACCESS_KEY_ID": "test",
-        "AWS_SECRET_ACCESS_KEY": "test",
-        "FSSPEC_S3_ENDPOINT_URL": f"http://127.0.0.1:{storage_port}",
-    }
-    found = Cluster(f"tcp://127.0.0.1:{port}", environment, tmp_path_factory.mktemp("dask"))
-    found.start("scheduler", "--host", "127.0.0.1", "--port", str(port), "--no-dashboard")
-    found.add_worker()
-    found.add_worker()
-    try:
-        with Client(found.address, timeout=30, set_as_default=False) as client:
-            client.wait_for_workers(2, timeout=30)
+def client() -> Iterator[Any]:
+    """A scheduler and a worker as threads of this process, which share `memory://`."""
+    distributed = pytest.importorskip("distributed")
+    cluster = distributed.LocalCluster(
+        n_workers=1, threads_per_worker=1, processes=False, dashboard_address=None
+    )
+    with cluster, distributed.Client(cluster, set_as_default=False) as found:
         yield found
-    finally:
-        for process in found.processes:
-            process.kill()
-            process.wait()
+
+
+@pytest.fixture
+def here(client: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Take this process for the cluster of the commands."""
+
+    @contextmanager
+    def connected(*_: object) -> Any:
+        yield client
+
+    monkeypatch.setattr(fleet_run, "connected", connected)

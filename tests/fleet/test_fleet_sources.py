@@ -143,24 +143,22 @@ def test_the_stamp_changes_with_the_content(tmp_path: Path) -> None:
 
 def test_a_remote_log_is_read_as_a_local_one(logs: list[FleetLog]) -> None:
     remote = fsspec.filesystem("memory")
-    remote.pipe_file("/drives/car9/trip.parquet", Path(logs[0].url).read_bytes())
-    (found,) = find_logs(["memory://drives/*/*.parquet"])
+    remote.pipe_file("/remote/car9/trip.parquet", Path(logs[0].url).read_bytes())
+    (found,) = find_logs(["memory://remote/*/*.parquet"])
     assert found.vehicle == "car9"
+    local = Path(logs[0].url)
     with local_file(found.url) as path:
-        copied = ReadOptions().read(path, found.url)
+        copied = ReadOptions().read(found, path)
     assert not path.exists()
     assert copied.source == found.url
-    assert (
-        copied.voltage_v.tolist()
-        == ReadOptions().read(Path(logs[0].url), logs[0].url).voltage_v.tolist()
-    )
+    assert copied.voltage_v.tolist() == ReadOptions().read(logs[0], local).voltage_v.tolist()
 
 
 def test_a_log_begins_with_the_soc_of_the_manifest(logs: list[FleetLog]) -> None:
     stated = replace(logs[1], initial_soc_pct=42.0)
-    found = ReadOptions().read_log(stated, Path(stated.url))
-    assert found.first_soc() == (0, 42.0)
-    assert ReadOptions().read_log(logs[1], Path(logs[1].url)).first_soc() != (0, 42.0)
+    path = Path(stated.url)
+    assert ReadOptions().read(stated, path).first_soc() == (0, 42.0)
+    assert ReadOptions().read(logs[1], path).first_soc() != (0, 42.0)
 
 
 def test_a_table_of_other_headings_is_read_by_its_columns(tmp_path: Path) -> None:
@@ -168,5 +166,5 @@ def test_a_table_of_other_headings_is_read_by_its_columns(tmp_path: Path) -> Non
     rows = "\n".join(f"{k},{2 * k % 7 - 3},{380 - 0.1 * (2 * k % 7)},21" for k in range(20))
     path.write_text(f"t,I,U,Temp\n{rows}\n")
     columns = ColumnMap.of("time=t[s],current=I[A],voltage=U[V],temperature=Temp[°C]")
-    log = ReadOptions(columns=columns, sign="discharge").read(path, "x")
+    log = ReadOptions(columns=columns, sign="discharge").read(FleetLog("x", "v", "s"), path)
     assert len(log) == 20

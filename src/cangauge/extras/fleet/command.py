@@ -29,16 +29,15 @@ from cangauge.errors import InputError
 
 if TYPE_CHECKING:
     from cangauge.extras.fleet.fit import FleetFit
-    from cangauge.extras.fleet.jobs import Job
+    from cangauge.extras.fleet.jobs import Job, Task
     from cangauge.extras.fleet.overview import FleetOverview
     from cangauge.extras.fleet.run import Summary
     from cangauge.extras.fleet.sources import FleetLog, ReadOptions
     from cangauge.logs.draft import Sign
 
-SHOWN_REASONS: Final = 10
+_SHOWN_REASONS: Final = 10
 """Reasons that are printed, the most frequent first; a page has all."""
-
-SHOWN_LOGS: Final = 20
+_SHOWN_LOGS: Final = 20
 """Logs that are printed; a page and JSON have more."""
 
 fleet_app: Final = typer.Typer(
@@ -166,7 +165,7 @@ def fit_fleet_command(
     report: ReportOption = None,
     json_output: JsonOption = False,
 ) -> None:
-    """Identify one model from all logs: the fit of `cangauge fit`, out of core.
+    """Identify one model from all logs: the fit of `cangauge fit`.
 
     Each log is reduced to its sums, and these add up. Every log needs its SoC, or
     initial_soc_pct in the manifest. Logs that do not fit the others are named.
@@ -174,23 +173,24 @@ def fit_fleet_command(
     Examples
     --------
     `cangauge fleet fit 'logs/*/*.parquet' -m type.json -o results --capacity-ah 51.5`
-
-    `cangauge fleet fit 'logs/*/*.parquet' -m type.json -o results --capacity-ah 51.5 --leave-out
-    logs/A17/trip4.parquet`
     """
-    from cangauge.extras.fleet.fit import fit_fleet
-    from cangauge.extras.fleet.passes import FleetFitOptions
+    from cangauge.extras.fleet.fit import SumsJob, fit_fleet
 
     within(capacity_ah, 1e-3, 1e5, option="--capacity-ah", unit="Ah")
     within(rate_hz, 0.01, 1000.0, option="--rate-hz", unit="Hz")
-    options = FleetFitOptions(capacity_ah, chemistry, cells, rate_hz)
-    how, found = _read_options(reading), cluster.find(logs)
+    job = SumsJob(_read_options(reading), capacity_ah, chemistry, cells, rate_hz)
+    found, left_out = cluster.find(logs), cluster.find(leave_out or [])
     _check_outputs([output, report], found, *map(Path, logs))
-    fitted = _without(found, cluster.find(leave_out or []))
-    result = cluster.run(lambda client: fit_fleet(fitted, how, options, out, client))
+    for log in left_out:
+        if log.url not in {other.url for other in found}:
+            raise InputError(
+                "is not among LOGS", source=log.url, field="--leave-out", cure="check its path"
+            )
+    fitted = [log for log in found if log.url not in {other.url for other in left_out}]
+    result = cluster.run(lambda client: fit_fleet(job, fitted, out, client))
     texts = {output: result.model.to_json()}
     if report is not None:
-        from cangauge.extras.report.fleet_fit import fleet_fit_report
+        from cangauge.extras.report.fleet import fleet_fit_report
 
         texts[report] = fleet_fit_report(result)
     write_texts_atomic(texts)
@@ -202,20 +202,8 @@ def fit_fleet_command(
     note(f"model: {output}" + (f"\nreport: {report}" if report else ""))
 
 
-def _without(logs: Sequence[FleetLog], left_out: Sequence[FleetLog]) -> list[FleetLog]:
-    """Return the logs that are not left out; raise InputError for one that is not among them."""
-    among = {log.url for log in logs}
-    for log in left_out:
-        if log.url not in among:
-            raise InputError(
-                "is not among LOGS", source=log.url, field="--leave-out", cure="check its path"
-            )
-    names = {log.url for log in left_out}
-    return [log for log in logs if log.url not in names]
-
-
 def _show_fit(result: FleetFit) -> None:
-    from cangauge.extras.fleet.dataset import by_kind, reason_of
+    from cangauge.extras.fleet.results import by_kind, reason_of
     from cangauge.extras.fleet.sources import short_names
 
     figures, by_log = result.to_dict(), result.by_log
@@ -237,7 +225,7 @@ def _show_fit(result: FleetFit) -> None:
     )
     for what, rows in (("set aside", result.bad), ("left out", result.left_out)):
         _note_reasons(what, [(reason_of(row), count) for row, count in by_kind(rows)])
-    if misfits := by_log.misfits[:SHOWN_LOGS]:
+    if misfits := by_log.misfits[:_SHOWN_LOGS]:
         names = short_names([by_log.logs[k] for k in misfits])
         print_table(
             "Logs that do not fit the others",
@@ -276,15 +264,10 @@ def estimate_fleet_command(
     `cangauge fleet estimate 's3://drives/*/*.parquet' -m type.json -o s3://results/may
     --scheduler tcp://10.0.0.5:8786`
     """
-    from cangauge.estimation.settings import EstimatorSettings
-    from cangauge.extras.fleet.jobs import EstimateJob
-    from cangauge.model.model_file import Model
+    from cangauge.extras.fleet.jobs import EstimateJob, by_log
 
-    found = cluster.find(logs)
-    _check_outputs([report], found, model, *map(Path, logs))
-    settings = EstimatorSettings(capacity_ah=capacity_ah)
-    job = EstimateJob(_read_options(reading), Model.load(model), settings)
-    _run(job, found, out, cluster, report, json_output=json_output)
+    job, found = _job(EstimateJob, logs, model, cluster, reading, report, capacity_ah)
+    _run(job, by_log(found), found, out, cluster, report, json_output=json_output)
 
 
 @fleet_app.command("health")
@@ -308,15 +291,28 @@ def health_fleet_command(
     --------
     `cangauge fleet health manifest.csv -m type.json -o results --report fleet.html`
     """
+    from cangauge.extras.fleet.jobs import HealthJob, by_vehicle
+
+    job, found = _job(HealthJob, logs, model, cluster, reading, report, capacity_ah)
+    _run(job, by_vehicle(found), found, out, cluster, report, json_output=json_output)
+
+
+def _job(  # noqa: PLR0917 - as the two commands have them
+    kind: Callable[..., Job],
+    logs: Sequence[str],
+    model: Path,
+    cluster: Cluster,
+    reading: Reading,
+    report: Path | None,
+    capacity_ah: float | None,
+) -> tuple[Job, list[FleetLog]]:
     from cangauge.estimation.settings import EstimatorSettings
-    from cangauge.extras.fleet.health import HealthJob
     from cangauge.model.model_file import Model
 
     found = cluster.find(logs)
     _check_outputs([report], found, model, *map(Path, logs))
     settings = EstimatorSettings(capacity_ah=capacity_ah)
-    job = HealthJob(_read_options(reading), Model.load(model), settings)
-    _run(job, found, out, cluster, report, json_output=json_output)
+    return kind(_read_options(reading), Model.load(model), settings), found
 
 
 @fleet_app.command("gap")
@@ -361,23 +357,19 @@ def gap_fleet_command(  # noqa: PLR0917 - typer passes options by name
     `cangauge fleet gap 'may/*/*.parquet' --reference 'april/*/*.parquet' -m type.json -o results
     --report fleet.html`
     """
-    from cangauge.extras.fleet.gap import GapJob, suspect_and_healthy
+    from cangauge.extras.fleet.gap import GapJob
     from cangauge.model.model_file import Model
 
     within(float(references), 1, 1000, option="--references", unit="")
     within(float(latest), 1, 1000, option="--latest", unit="")
     within(alarm, 0.0, 1.0, option="--alarm", unit="")
-    known = cluster.find(reference or [])
-    healthy = {log.url for log in known}
-    found = [log for log in cluster.find(logs) if log.url not in healthy]
-    _check_outputs([report], [*found, *known], model, *map(Path, [*logs, *(reference or [])]))
-    suspect, good = suspect_and_healthy(
-        [*found, *(replace(log, healthy=True) for log in known)], latest
+    known = {log.url: replace(log, healthy=True) for log in cluster.find(reference or [])}
+    among = [known.pop(log.url, log) for log in cluster.find(logs)] + [*known.values()]
+    _check_outputs([report], among, model, *map(Path, [*logs, *(reference or [])]))
+    job, tasks = GapJob(_read_options(reading), Model.load(model), references, alarm).of_fleet(
+        [log for log in among if not log.healthy], [log for log in among if log.healthy], latest
     )
-    options = _read_options(reading)
-    job = GapJob(options, Model.load(model), references, alarm).with_common(suspect, good)
-    vehicles = job.vehicles(suspect, good)
-    _run(job, vehicles, out, cluster, report, among=[*found, *known], json_output=json_output)
+    _run(job, tasks, among, out, cluster, report, json_output=json_output)
 
 
 def _read_options(reading: Reading) -> ReadOptions:
@@ -406,48 +398,44 @@ def _read_options(reading: Reading) -> ReadOptions:
     )
 
 
-def _run(
+def _run(  # noqa: PLR0917 - as the commands have them
     job: Job,
-    logs: Sequence[FleetLog],
+    tasks: Sequence[Task],
+    among: Sequence[FleetLog],
     out: str,
     cluster: Cluster,
     report: Path | None,
     *,
-    among: Sequence[FleetLog] | None = None,
     json_output: bool,
 ) -> None:
-    """Run a job over the logs, and print and write what it found of the fleet.
-
-    Results are those of the logs in `among`; by default of all that the job reads.
-    """
-    from cangauge.extras.fleet.dataset import Dataset
+    """Run a job, and print and write what its results say of the logs in `among`."""
     from cangauge.extras.fleet.overview import FleetOverview
+    from cangauge.extras.fleet.results import Results
     from cangauge.extras.fleet.run import run_job
 
-    dataset = Dataset(out, job.kind, job.columns)
-    summary = cluster.run(lambda client: run_job(job, logs, dataset, client))
-    found = FleetOverview.read(out, logs if among is None else among)
+    results = Results(out, job.kind, job.columns)
+    summary = cluster.run(lambda client: run_job(job, tasks, results, client))
+    found = FleetOverview.read(out, among)
     if report is not None:
         from cangauge.extras.report.fleet import fleet_report
 
         write_texts_atomic({report: fleet_report(found)})
     if json_output:
-        emit_json(
-            summary.to_dict() | found.to_dict() | {"output": out, "report": report and str(report)}
-        )
+        written = {"output": out, "report": report and str(report)}
+        emit_json(vars(summary) | found.to_dict() | written)
     else:
         _show(summary, found)
     if not summary.done + summary.skipped:
-        note(f"error: no result; the reasons are in {out}/{dataset.tables[1]}")
+        note(f"error: no result; the reasons are in {out}/{job.kind}-bad")
         raise typer.Exit(1)
 
 
 def _note_reasons(what: str, reasons: Iterable[tuple[str, int]]) -> None:
     ordered = sorted(reasons, key=lambda item: -item[1])
-    for reason, count in ordered[:SHOWN_REASONS]:
+    for reason, count in ordered[:_SHOWN_REASONS]:
         note(f"{what}: {count} × {reason}")
-    if len(ordered) > SHOWN_REASONS:
-        note(f"{what}: {sum(n for _, n in ordered[SHOWN_REASONS:])} for other reasons")
+    if len(ordered) > _SHOWN_REASONS:
+        note(f"{what}: {sum(n for _, n in ordered[_SHOWN_REASONS:])} for other reasons")
 
 
 def _check_outputs(outputs: Sequence[Path | None], logs: Sequence[FleetLog], *files: Path) -> None:

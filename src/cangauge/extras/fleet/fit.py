@@ -1,7 +1,7 @@
-"""`fleet fit`: one model from all logs, by one pass that reduces each log to its sums.
+"""`fleet fit`: each log is reduced to its sums on a worker, and these add up to one model.
 
-The rows of the pass are kept, so that a further log costs the reading of itself. The sums give the
-model, the models without some of the logs, and the error of each log, as in `cangauge fit`.
+The sums are those of `identify`: moments of the knots' equation, and the triangular factor of the
+published one. Added over all logs, they give the coefficients of `cangauge fit` on the same logs.
 """
 
 from __future__ import annotations
@@ -9,30 +9,126 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar, Final
 
 import numpy as np
+import pyarrow as pa
 
 from cangauge._files import text_sha256
 from cangauge._text import counted
 from cangauge._version import __version__
 from cangauge.errors import InputError
-from cangauge.extras.fleet.dataset import Dataset, by_kind
+from cangauge.extras.fleet.jobs import COUNT, REAL, TEXT, LogJob, by_log
 from cangauge.extras.fleet.outliers import ErrorsByLog
-from cangauge.extras.fleet.passes import (
-    FleetFitOptions,
-    SumsJob,
-    factor_of_row,
-    ranges_of_rows,
-    sums_of_row,
-)
+from cangauge.extras.fleet.results import Results, by_kind
 from cangauge.extras.fleet.run import Summary, run_id, run_job
-from cangauge.extras.fleet.sources import FleetLog, ReadOptions
-from cangauge.identify.fit import EPSILON, LISTED_LOGS, common_name, knots_file, model_rmse
-from cangauge.identify.least_squares import LOGS_AT_LEAST, LogSums, Solution, solve_scaled
-from cangauge.identify.published import PublishedFit, pooled, solve_published
-from cangauge.model.model_file import Made, Model, SourceLog
-from cangauge.model.prior import CHEMISTRIES, DELAYS_S, REFERENCE_C
+from cangauge.extras.fleet.sources import FleetLog
+from cangauge.identify.fit import (
+    EPSILON,
+    LISTED_LOGS,
+    common_name,
+    knots_file,
+    log_sha256,
+    model_rmse,
+    ranges_of,
+    signals_sha256,
+)
+from cangauge.identify.least_squares import (
+    LOGS_AT_LEAST,
+    LogSums,
+    Solution,
+    log_sums,
+    solve_scaled,
+)
+from cangauge.identify.published import Factor, PublishedFit, factor_of, pooled, solve_published
+from cangauge.identify.rows import fit_rows
+from cangauge.identify.starts import unknown_start
+from cangauge.logs.gaps import split_where_moved
+from cangauge.model.model_file import Made, Model, Ranges, SourceLog
+from cangauge.model.prior import CHEMISTRIES, DELAYS_S, REFERENCE_C, ChemistryName
+
+_NUMBERS: Final = pa.list_(pa.float64())
+_RANGES: Final = ("soc_pct", "temperature_c", "current_a")
+
+Row = Mapping[str, Any]
+
+
+@dataclass(frozen=True, eq=False)
+class SumsJob(LogJob):
+    """Sums of each log.
+
+    Parameters
+    ----------
+    capacity_ah : float
+        Charge from 100 to 0 % [Ah].
+    chemistry : {"oxide", "lfp"}
+    cells : int or None
+        Cells in series.
+    rate_hz : float
+        Rate of the rows [Hz].
+    """
+
+    capacity_ah: float
+    chemistry: ChemistryName = "oxide"
+    cells: int | None = None
+    rate_hz: float = 1.0
+
+    kind: ClassVar[str] = "sums"
+    columns: ClassVar[Mapping[str, Any]] = {
+        "name": TEXT, "data_sha256": TEXT, "signals_sha256": TEXT, "temperature_source": TEXT,
+        "rows": COUNT, "row_s": REAL, "weight": REAL, "mean_soc_pct": REAL,
+        "moments": _NUMBERS, "root": _NUMBERS, **dict.fromkeys(_RANGES, _NUMBERS),
+    }  # fmt: skip
+
+    def identity(self) -> dict[str, Any]:
+        """Return the options of the fit."""
+        return {"fit": [self.capacity_ah, self.chemistry, self.cells, self.rate_hz]}
+
+    def row(self, log: FleetLog) -> dict[str, Any]:
+        """Return the log's sums, flattened.
+
+        Raises
+        ------
+        InputError
+            If the SoC at its start is unknown, or it was charged or driven in a gap.
+        """
+        recorded = self.read(log)
+        if recorded.first_soc() is None:
+            unknown = unknown_start(recorded, others=False)
+            cure = "state initial_soc_pct in a manifest, or name the SoC (--columns soc=…)"
+            raise InputError(unknown.problem, field=unknown.field, cure=cure)
+        if len(split_where_moved(recorded)) > 1:
+            raise InputError(
+                "the pack was charged or driven in a gap of this log",
+                field="time_s",
+                cure="split it there: each part begins with its own SoC",
+            )
+        rows = fit_rows(recorded, self.capacity_ah, rate_hz=self.rate_hz)
+        sums = log_sums(rows, CHEMISTRIES[self.chemistry])
+        factor = factor_of(rows, len(DELAYS_S), EPSILON, REFERENCE_C)
+        return {
+            "name": recorded.name,
+            "data_sha256": log_sha256(recorded),
+            "signals_sha256": signals_sha256(recorded),
+            "temperature_source": recorded.temperature_source,
+            "rows": len(rows),
+            "row_s": factor.row_s,
+            "weight": sums.weight,
+            "mean_soc_pct": sums.mean_soc_pct,
+            "moments": sums.moments.ravel().tolist(),
+            "root": factor.root.ravel().tolist(),
+            **{name: list(getattr(ranges_of([rows]), name)) for name in _RANGES},
+        }
+
+
+def _square(values: Sequence[float]) -> Any:
+    n = round(len(values) ** 0.5)
+    return np.array(values).reshape(n, n)
+
+
+def _factor(row: Row) -> Factor:
+    low, high = row["soc_pct"]
+    return Factor(_square(row["root"]), row["rows"], row["row_s"], (low, high))
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,15 +145,13 @@ class FleetFit:
         Rms error of all logs under the model [V], weighted as in the fit.
     slope_ohm : float
         As of `cangauge.Identification` [Ω], weighted as in the fit.
-    rows : int
-    logs_used : int
+    rows, logs_used : int
     summary : Summary
         Of the pass.
     by_log : ErrorsByLog
-    left_out : list of dict
-        Logs that could be read but are not of the fit, each with `log`, `reason` and its `kind`.
-    bad : list of dict
-        Logs set aside, each with `table`, `log`, `reason` and its `kind`.
+    left_out, bad : list of dict
+        Logs that could be read but are not of the fit, and those set aside, each with `log`,
+        `reason` and its `kind`.
     """
 
     model: Model
@@ -90,29 +184,22 @@ class FleetFit:
             },
             **self.by_log.to_dict(),
             "rows": self.rows,
-            "pass": self.summary.to_dict(),
+            "pass": vars(self.summary),
             "logs": self.logs_used,
             "left_out": self.left_out,
             "bad": self.bad,
         }
 
 
-def fit_fleet(
-    logs: Sequence[FleetLog],
-    options: ReadOptions,
-    fit: FleetFitOptions,
-    out: str,
-    client: Any,
-) -> FleetFit:
+def fit_fleet(job: SumsJob, logs: Sequence[FleetLog], out: str, client: Any) -> FleetFit:
     """Identify the model of a type of pack from all logs of a fleet.
 
     Parameters
     ----------
+    job : SumsJob
     logs : sequence of FleetLog
-    options : ReadOptions
-    fit : FleetFitOptions
     out : str
-        Folder or URL of the data set.
+        Folder or URL of the results.
     client : distributed.Client
 
     Raises
@@ -120,40 +207,37 @@ def fit_fleet(
     InputError
         If fewer than three logs can be used.
     """
-    job = SumsJob(options, fit)
-    dataset = Dataset(out, job.kind, job.columns)
-    summary = run_job(job, logs, dataset, client)
-    used, left_out = _usable(logs, dataset, run_id(job))
-    found = {row["log"]: row for row in dataset.rows(run_id(job)) if _is_of(row, used)}
-    rows = [found[url] for url in used]
-    sums = [sums_of_row(row) for row in rows]
-    chemistry = CHEMISTRIES[fit.chemistry]
-    solution, without = solve_scaled(sums, fit.capacity_ah, chemistry)
-    published = solve_published(pooled([factor_of_row(row) for row in rows]), EPSILON)
-    fields: dict[str, Any] = {
-        "name": common_name([row["name"] for row in rows]),
-        "chemistry": fit.chemistry,
-        "cells": fit.cells,
-        "capacity_ah": fit.capacity_ah,
-        "rate_hz": fit.rate_hz,
-        "temperature_source": rows[0]["temperature_source"],
-        "range": ranges_of_rows(rows),
-        "made": _made(rows, fit),
+    results = Results(out, job.kind, job.columns)
+    summary = run_job(job, by_log(logs), results, client)
+    among = {(log.url, log.vehicle): k for k, log in enumerate(logs)}
+    found = {
+        row["log"]: row
+        for row in results.rows()
+        if row["run"] == run_id(job) and (row["log"], row["vehicle"]) in among
     }
-    if published.identified:
-        fields["published"] = published.fields(EPSILON, REFERENCE_C, DELAYS_S)
-    model = knots_file(solution, chemistry, fields)
-    held_out_v = model_rmse(without, sums)
-    noise = model.noise.model_copy(
-        update={
-            "voltage_rmse_v": held_out_v,
-            "voltage_mae_pct": 100.0 * (2.0 / np.pi) ** 0.5 * held_out_v / solution.mean_v,
-            "judged_on": "logs left out in turn",
-        }
-    )
-    errors = [(item, solution.mean_error(item)[0], solution.square_error(item)) for item in sums]
+    read = sorted(found.values(), key=lambda row: among[row["log"], row["vehicle"]])
+    bad = [
+        {"table": job.kind, **{name: row[name] for name in ("log", "reason", "kind")}}
+        for row in results.rows(bad=True)
+        if (row["log"], row["vehicle"]) in among and row["log"] not in found
+    ]
+    reasons = _reasons_left_out(read)
+    rows = [row for row in read if row["log"] not in reasons]
+    left_out = [{"log": url, **reason} for url, reason in reasons.items()]
+    if len(rows) < LOGS_AT_LEAST:
+        most = [f"{n} left out: {row['reason']}" for row, n in by_kind(left_out)[:1]]
+        aside = f"see the reasons in {job.kind}-bad; one or two logs: `cangauge fit`"
+        raise InputError(
+            f"only {counted(len(rows), 'log')} can be used, {LOGS_AT_LEAST} are needed",
+            source=out,
+            cure="; ".join([aside, *most]),
+        )
+    sums = [LogSums(_square(r["moments"]), r["weight"], r["mean_soc_pct"]) for r in rows]
+    solution, without = solve_scaled(sums, job.capacity_ah, CHEMISTRIES[job.chemistry])
+    published = solve_published(pooled([_factor(row) for row in rows]), EPSILON)
+    model = _model(job, rows, solution, published, model_rmse(without, sums))
     return FleetFit(
-        model=model.model_copy(update={"noise": noise}),
+        model=model,
         solution=solution,
         published=published,
         voltage_rmse_v=model_rmse([solution] * len(sums), sums),
@@ -161,16 +245,87 @@ def fit_fleet(
         rows=sum(row["rows"] for row in rows),
         logs_used=len(rows),
         summary=summary,
-        by_log=ErrorsByLog.of_logs(
-            [
-                (row["log"], row["vehicle"], mean_v, square_v2**0.5, item.weight)
-                for row, (item, mean_v, square_v2) in zip(rows, errors, strict=True)
-            ],
-            noise,
+        by_log=ErrorsByLog(
+            [row["log"] for row in rows],
+            [row["vehicle"] for row in rows],
+            np.array([solution.mean_error(item)[0] for item in sums]),
+            np.sqrt([solution.square_error(item) for item in sums]),
+            np.array([item.weight for item in sums]),
+            model.noise,
         ),
         left_out=left_out,
-        bad=_bad(logs, dataset, run_id(job)),
+        bad=bad,
     )
+
+
+def _reasons_left_out(rows: Sequence[Row]) -> dict[str, dict[str, str]]:
+    """Return why logs are left out, by URL: temperatures measured elsewhere, the same rows."""
+    # The same rows count once.
+    distinct = {(row["signals_sha256"], row["temperature_source"]) for row in rows}
+    counts = Counter(source for _, source in distinct)
+    # A known place before "unknown" where both are as frequent.
+    most = max(counts, key=lambda name: (counts[name], name != "unknown"), default="")
+    found: dict[str, dict[str, str]] = {}
+    firsts: dict[str, str] = {}
+    for row in rows:
+        source, url = row["temperature_source"], row["log"]
+        if source != most:
+            found[url] = {
+                "reason": f"its temperature source is {source}, that of"
+                f" {counted(counts[most], 'other')} {most}; --temperature-source states it where"
+                " a log does not",
+                "kind": f"its temperature source is {source}",
+            }
+        elif (first := firsts.setdefault(row["signals_sha256"], url)) != url:
+            found[url] = {"reason": f"same rows as {first}", "kind": "same rows as another"}
+    return found
+
+
+def _model(
+    job: SumsJob,
+    rows: Sequence[Row],
+    solution: Solution,
+    published: PublishedFit,
+    held_out_v: float,
+) -> Model:
+    ends = {name: np.array([row[name] for row in rows]) for name in _RANGES}
+    ranges = {name: (float(v[:, 0].min()), float(v[:, 1].max())) for name, v in ends.items()}
+    listed = rows if len(rows) <= LISTED_LOGS else []
+    fields: dict[str, Any] = {
+        "name": common_name([row["name"] for row in rows]),
+        "chemistry": job.chemistry,
+        "cells": job.cells,
+        "capacity_ah": job.capacity_ah,
+        "rate_hz": job.rate_hz,
+        "temperature_source": rows[0]["temperature_source"],
+        "range": Ranges(**ranges),
+        "made": Made(
+            by=f"cangauge {__version__}",
+            options={
+                "capacity_ah": job.capacity_ah,
+                "rate_hz": job.rate_hz,
+                "chemistry": job.chemistry,
+                "equation": "knots",
+                "fleet_logs": len(rows),
+            },
+            logs=[
+                SourceLog(name=row["name"], rows=row["rows"], sha256=row["data_sha256"])
+                for row in listed
+            ],
+            fingerprint=text_sha256("".join(row["data_sha256"] for row in rows)),
+        ),
+    }
+    if published.identified:
+        fields["published"] = published.fields(EPSILON, REFERENCE_C, DELAYS_S)
+    model = knots_file(solution, CHEMISTRIES[job.chemistry], fields)
+    noise = model.noise.model_copy(
+        update={
+            "voltage_rmse_v": held_out_v,
+            "voltage_mae_pct": 100.0 * (2.0 / np.pi) ** 0.5 * held_out_v / solution.mean_v,
+            "judged_on": "logs left out in turn",
+        }
+    )
+    return model.model_copy(update={"noise": noise})
 
 
 def _slope_ohm(sums: Sequence[LogSums], solution: Solution) -> float:
@@ -178,119 +333,9 @@ def _slope_ohm(sums: Sequence[LogSums], solution: Solution) -> float:
     total = np.sum([item.moments for item in sums], axis=0)
     weight = sum(item.weight for item in sums)
     coefficients = solution.select.T @ solution.coefficients
-    first = len(solution.arrhenius_ohm)
-    curve = np.zeros(len(total))
-    kt = len(coefficients) - 2 * first  # knots and kt come before the currents
-    curve[:kt] = -coefficients[:kt]
-    curve[-1] = 1.0
-    current = np.zeros(len(total))
-    current[kt] = 1.0
-    one = np.zeros(len(total))
-    one[-2] = 1.0
+    kt = len(coefficients) - 2 * len(solution.arrhenius_ohm)  # knots and kt before the currents
+    curve, current, one = np.zeros((3, len(total)))
+    curve[:kt], curve[-1], current[kt], one[-2] = -coefficients[:kt], 1.0, 1.0, 1.0
     spread = current @ total @ current - (one @ total @ current) ** 2 / weight
     shared = current @ total @ curve - (one @ total @ current) * (one @ total @ curve) / weight
     return -float(shared / spread)
-
-
-_Used = dict[str, tuple[FleetLog, Mapping[str, Any]]]
-
-
-def _is_of(row: Mapping[str, Any], used: _Used) -> bool:
-    """Return whether a row is of a used log, and of the vehicle that it has now."""
-    found = used.get(row["log"])
-    return found is not None and found[0].vehicle == row["vehicle"]
-
-
-def _bad(logs: Sequence[FleetLog], dataset: Dataset, run: str) -> list[dict[str, Any]]:
-    among = {(log.url, log.vehicle) for log in logs}
-    return [
-        {"table": dataset.kind, **{name: row.get(name) for name in ("log", "reason", "kind")}}
-        for row in dataset.rows(run, bad=True)
-        if (row["log"], row["vehicle"]) in among
-    ]
-
-
-def _usable(
-    logs: Sequence[FleetLog], dataset: Dataset, run: str
-) -> tuple[_Used, list[dict[str, Any]]]:
-    """Return the logs with sums, by URL in their order; and the others.
-
-    The others have temperatures measured elsewhere, or the same rows as one before.
-    """
-    wanted = ("name", "rows", "data_sha256", "signals_sha256", "temperature_source")
-    known = {url: row for url, row in dataset.known(run, *wanted).items() if "data_sha256" in row}
-    used: _Used = {log.url: (log, known[log.url]) for log in logs if log.url in known}
-    left_out = [*_measured_elsewhere(used), *_twins(used)]
-    if len(used) < LOGS_AT_LEAST:
-        most = [f"{n} left out: {row['reason']}" for row, n in by_kind(left_out)[:1]]
-        raise InputError(
-            f"only {counted(len(used), 'log')} can be used, {LOGS_AT_LEAST} are needed",
-            source=dataset.out,
-            cure="; ".join(
-                [
-                    f"see the reasons in {dataset.tables[1]}; one or two logs: `cangauge fit`",
-                    *most,
-                ]
-            ),
-        )
-    return used, left_out
-
-
-def _measured_elsewhere(used: _Used) -> list[dict[str, Any]]:
-    """Take the logs out whose temperature source is not that of the most, and return them."""
-    # The same rows count once.
-    distinct = dict.fromkeys(
-        (row["signals_sha256"], row["temperature_source"]) for _, row in used.values()
-    )
-    counts = Counter(source for _, source in distinct)
-    # A known place before "unknown" where both are as frequent.
-    most = max(counts, key=lambda name: (counts[name], name != "unknown"), default="")
-    others = {url: row["temperature_source"] for url, (_, row) in used.items()}
-    others = {url: source for url, source in others.items() if source != most}
-    for url in others:
-        del used[url]
-    most_of_all = counted(counts[most], "other")
-    return [
-        {
-            "log": url,
-            "reason": f"its temperature source is {source}, that of {most_of_all} {most};"
-            " --temperature-source states it where a log does not",
-            "kind": f"its temperature source is {source}",
-        }
-        for url, source in others.items()
-    ]
-
-
-def _twins(used: _Used) -> list[dict[str, Any]]:
-    """Take the logs out that have the same rows as one before, and return them."""
-    firsts: dict[str, str] = {}
-    others = {
-        url: first
-        for url, (_, row) in used.items()
-        if (first := firsts.setdefault(row["signals_sha256"], url)) != url
-    }
-    for url in others:
-        del used[url]
-    return [
-        {"log": url, "reason": f"same rows as {first}", "kind": "same rows as another"}
-        for url, first in others.items()
-    ]
-
-
-def _made(rows: Sequence[Mapping[str, Any]], fit: FleetFitOptions) -> Made:
-    listed = rows if len(rows) <= LISTED_LOGS else []
-    return Made(
-        by=f"cangauge {__version__}",
-        options={
-            "capacity_ah": fit.capacity_ah,
-            "rate_hz": fit.rate_hz,
-            "chemistry": fit.chemistry,
-            "equation": "knots",
-            "fleet_logs": len(rows),
-        },
-        logs=[
-            SourceLog(name=row["name"], rows=row["rows"], sha256=row["data_sha256"])
-            for row in listed
-        ],
-        fingerprint=text_sha256("".join(row["data_sha256"] for row in rows)),
-    )

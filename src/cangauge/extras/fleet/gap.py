@@ -9,11 +9,10 @@ same references: what these show is learned once, and a diagnosis then takes no 
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import chain, islice, zip_longest
-from pathlib import Path
-from typing import Any, ClassVar, Final, Self, cast
+from typing import Any, ClassVar, Final, Self
 
 import pyarrow as pa
 
@@ -28,44 +27,25 @@ from cangauge.diagnosis import (
     learn_references,
 )
 from cangauge.errors import InputError
-from cangauge.extras.fleet.jobs import COUNT, REAL, TEXT, Job
-from cangauge.extras.fleet.sources import FleetLog, local_file
+from cangauge.extras.fleet.jobs import COUNT, REAL, TEXT, Job, Task, by_vehicle
+from cangauge.extras.fleet.sources import FleetLog
 from cangauge.logs.log import Log
 from cangauge.model.model_file import Model
 
 REFERENCES: Final = 30
 """References of a diagnosis by default; more gain little, and learning from a thousand takes 1.9 GB
 (see docs/fleet.md)."""
-
-WITH_OWN: Final = 30
-"""References at most of a vehicle that has healthy logs of its own, or whose logs lie beyond the
-common references: they are learned from for this vehicle alone, in half a second each."""
-
 LOGS: Final = 3
 """Latest logs of a vehicle that are diagnosed together by default."""
-
+_WITH_OWN: Final = 30
+"""References at most of a vehicle that has healthy logs of its own, or whose logs lie beyond the
+common references: they are learned from for this vehicle alone, in half a second each."""
 _NAMES: Final = pa.list_(pa.string())
-
-
-@dataclass(frozen=True, slots=True)
-class VehicleLogs(FleetLog):
-    """A vehicle with what its task reads.
-
-    Parameters
-    ----------
-    logs : tuple of FleetLog
-        Logs to diagnose.
-    references : tuple of FleetLog
-        Logs without a fault, its own first; empty: those of the job.
-    """
-
-    logs: tuple[FleetLog, ...] = ()
-    references: tuple[FleetLog, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
 class GapJob(Job):
-    """Verdict on each vehicle; its logs are `VehicleLogs`.
+    """Verdict on each vehicle.
 
     Parameters
     ----------
@@ -92,7 +72,6 @@ class GapJob(Job):
 
     kind: ClassVar[str] = "gap"
     of: ClassVar[str] = "vehicles"
-    reads_log: ClassVar[bool] = False
     columns: ClassVar[Mapping[str, Any]] = {
         "logs": _NAMES, "references": COUNT, "reference_vehicles": COUNT, "unread": _NAMES,
         "detected": pa.bool_(), "verdict": TEXT, "probability": REAL, "probability_none": REAL,
@@ -107,22 +86,56 @@ class GapJob(Job):
         model = self.model.to_json()
         return {"model": model, "references": self.references, "alarm": self.alarm}
 
-    def with_common(
-        self,
-        suspect: Mapping[str, tuple[FleetLog, ...]],
-        healthy: Mapping[str, tuple[FleetLog, ...]],
-    ) -> Self:
-        """Return the job with the references of vehicles without own ones, if there are any."""
-        if all(vehicle in healthy for vehicle in suspect):
-            return self
-        return replace(self, common=tuple(islice(_in_turn(healthy), self.references)))
+    def of_fleet(
+        self, logs: Iterable[FleetLog], healthy: Iterable[FleetLog], latest: int
+    ) -> tuple[Self, list[Task]]:
+        """Return the job with the common references, and a task for each vehicle.
+
+        References of a vehicle are its own healthy logs, at most half, then one of each other
+        vehicle in turn; or the common ones.
+
+        Parameters
+        ----------
+        logs, healthy : iterable of FleetLog
+            Logs to diagnose, and logs without a fault, each in order of time.
+        latest : int
+            Latest logs of a vehicle, diagnosed together.
+
+        Raises
+        ------
+        InputError
+            If no log is healthy, or all are.
+        """
+        good = {task.vehicle: sorted(task.logs, key=_order) for task in by_vehicle(healthy)}
+        suspect = by_vehicle(logs)
+        if not good:
+            cure = "give --reference, or a manifest with the column `healthy`"
+            raise InputError("no log is known to be healthy", field="--reference", cure=cure)
+        if not suspect:
+            raise InputError("every log is a reference", cure="give logs to diagnose")
+        groups = sorted(good.values(), key=lambda of_vehicle: _order(of_vehicle[0]))
+        in_turn = [log for log in chain(*zip_longest(*groups)) if log is not None]
+        most = min(self.references, _WITH_OWN)
+        needed = any(task.vehicle not in good for task in suspect)
+        common = tuple(in_turn[: self.references]) if needed else ()
+        tasks = []
+        for task in suspect:
+            own = good.get(task.vehicle, [])[: max(most // 2, 1)]
+            others = [log for log in in_turn if log.vehicle != task.vehicle] if own else []
+            tasks.append(
+                replace(
+                    task,
+                    logs=task.logs[-latest:],
+                    references=tuple(islice(chain(own, others), most)),
+                    common=() if own else common,
+                )
+            )
+        return replace(self, common=common), tasks
 
     def prepared(self) -> Self:
         """Return the job with what the common references show."""
-        if not self.common:
-            return self
         unread: list[str] = []
-        logs = list(self._read(self.common, unread))
+        logs = self._read_all(self.common, unread)
         while logs:
             try:
                 learned = learn_references(logs, self.model)
@@ -134,78 +147,43 @@ class GapJob(Job):
                 logs = left
             else:
                 return replace(self, learned=learned, unread=tuple(unread))
-        raise InputError(f"no reference can be used: {unread[0]}", field="--reference")
+        if self.common:
+            raise InputError(f"no reference can be used: {unread[0]}", field="--reference")
+        return self
 
-    def vehicles(
-        self,
-        suspect: Mapping[str, tuple[FleetLog, ...]],
-        healthy: Mapping[str, tuple[FleetLog, ...]],
-    ) -> list[VehicleLogs]:
-        """Return each vehicle with its logs and references; its stamp is that of all of these.
+    def parts(self, task: Task) -> Iterator[tuple[str, Callable[[], dict[str, Any]]]]:
+        """Yield the verdict on the vehicle."""
+        yield task.vehicle, lambda: self._row(task)
 
-        References are the vehicle's own healthy logs, at most half, then one of each other vehicle
-        in turn; or the common ones.
-
-        Parameters
-        ----------
-        suspect, healthy : mapping of str to tuple of FleetLog
-            Logs to diagnose, and logs without a fault, by vehicle.
-        """
-        most = min(self.references, WITH_OWN)
-        in_turn = list(_in_turn(healthy))
-        found = []
-        for vehicle, logs in sorted(suspect.items()):
-            chosen: tuple[FleetLog, ...] = ()
-            if vehicle in healthy:
-                tested = {log.url for log in logs}
-                own = sorted(healthy[vehicle], key=_order)[: max(most // 2, 1)]
-                others = (log for log in in_turn if log.vehicle != vehicle)
-                usable = (log for log in chain(own, others) if log.url not in tested)
-                chosen = tuple(islice(usable, most))
-            read = (*logs, *(chosen or self.common))
-            text = "".join(f"{each.url}{each.stamp}{each.stated}" for each in read)
-            stamp = text_sha256(text)[:16]
-            found.append(VehicleLogs(vehicle, vehicle, stamp, logs=logs, references=chosen))
-        return found
-
-    def row(self, log: FleetLog, path: Path | None, state: str | None) -> dict[str, Any]:
-        """Return the verdict on a vehicle."""
-        del path, state
-        vehicle = cast("VehicleLogs", log)
+    def _row(self, task: Task) -> dict[str, Any]:
         unread: list[str] = []
-        logs = list(self._read(vehicle.logs, unread))
+        logs = self._read_all(task.logs, unread)
         if not logs:
             raise InputError("none of its logs can be read", cure=f"the first: {unread[0]}")
-        of = vehicle.references or self.common
-        references: list[Log] | References
-        if not vehicle.references and self.learned is not None:
-            references = self.learned
-            unread += self.unread
-            unusable = {text.partition(": ")[0] for text in self.unread}
-        else:
-            of = of[:WITH_OWN]
-            before = len(unread)
-            references = list(self._read(of, unread))
-            unusable = {text.partition(": ")[0] for text in unread[before:]}
+        of, bad = task.references or self.common, list(self.unread)
+        references: References | list[Log] | None = self.learned
+        if task.references or references is None:
+            of, bad = of[:_WITH_OWN], []
+            references = self._read_all(of, bad)
         found = diagnose(logs, self.model, references, alarm=self.alarm)
+        unusable = {text.partition(": ")[0] for text in bad}
         return {
-            "logs": [each.url for each in vehicle.logs],
+            "logs": [log.url for log in task.logs],
             "references": len(found.known.logs),
-            "reference_vehicles": len({each.vehicle for each in of if each.url not in unusable}),
-            "unread": unread,
+            "reference_vehicles": len({log.vehicle for log in of if log.url not in unusable}),
+            "unread": [*unread, *bad],
             **_columns_of(found),
         }
 
-    def _read(self, logs: Sequence[FleetLog], unread: list[str]) -> Iterator[Log]:
+    def _read_all(self, logs: Sequence[FleetLog], unread: list[str]) -> list[Log]:
         """Read logs; those that cannot be read are named in `unread`."""
+        found = []
         for log in logs:
             try:
-                with local_file(log.url) as path:
-                    recorded = self.options.read_log(log, path)
+                found.append(self.read(log))
             except InputError as error:
                 unread.append(f"{log.url}: {error.problem}")
-            else:
-                yield recorded
+        return found
 
 
 def _columns_of(found: Diagnosis) -> dict[str, Any]:
@@ -239,47 +217,6 @@ def _columns_of(found: Diagnosis) -> dict[str, Any]:
     }
 
 
-def _in_turn(healthy: Mapping[str, tuple[FleetLog, ...]]) -> Iterator[FleetLog]:
-    """Yield one healthy log of each vehicle in turn; logs and vehicles are shuffled."""
-    shuffled = [sorted(logs, key=_order) for logs in healthy.values()]
-    by_order = sorted(shuffled, key=lambda logs: _order(logs[0]))
-    return (log for log in chain(*zip_longest(*by_order)) if log is not None)
-
-
 def _order(log: FleetLog) -> str:
     """Return a key that shuffles logs, by their names only."""
     return text_sha256(log.url)
-
-
-def suspect_and_healthy(
-    logs: Sequence[FleetLog], per_vehicle: int
-) -> tuple[dict[str, tuple[FleetLog, ...]], dict[str, tuple[FleetLog, ...]]]:
-    """Return the latest logs to diagnose, and the healthy ones, by vehicle.
-
-    Parameters
-    ----------
-    logs : sequence of FleetLog
-        In order of time for each vehicle.
-    per_vehicle : int
-        Largest number of logs to diagnose of each.
-
-    Raises
-    ------
-    InputError
-        If no log is healthy, or all are.
-    """
-    suspect: dict[str, list[FleetLog]] = {}
-    healthy: dict[str, list[FleetLog]] = {}
-    for log in logs:
-        (healthy if log.healthy else suspect).setdefault(log.vehicle, []).append(log)
-    if not healthy:
-        raise InputError(
-            "no log is known to be healthy", field="--reference",
-            cure="give --reference, or a manifest with the column `healthy`",
-        )  # fmt: skip
-    if not suspect:
-        raise InputError("every log is a reference", cure="give logs to diagnose")
-    return (
-        {name: tuple(found[-per_vehicle:]) for name, found in suspect.items()},
-        {name: tuple(found) for name, found in healthy.items()},
-    )

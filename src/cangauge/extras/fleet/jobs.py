@@ -1,22 +1,26 @@
-"""What is computed of each log of a fleet: one row of a data set."""
+"""What is computed of a fleet: tasks of one log or of a vehicle's logs, each with its rows."""
 
 from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any, ClassVar, Final, Self
 
 import numpy as np
 import pyarrow as pa
 
 from cangauge._files import text_sha256
+from cangauge._typing import FloatArray
 from cangauge.errors import InputError
+from cangauge.estimation.compiled import make_estimator
+from cangauge.estimation.offline import gap_of, initial_soc_of, samples_of
 from cangauge.estimation.settings import EstimatorSettings
-from cangauge.extras.fleet.sources import FleetLog, ReadOptions
+from cangauge.estimation.state import EstimatorState
+from cangauge.extras.fleet.sources import FleetLog, ReadOptions, local_file
 from cangauge.logs.gaps import discharged_ah
+from cangauge.logs.log import Log
 from cangauge.logs.read import LogFile
 from cangauge.model.model_file import Model
 from cangauge.service.offline import (
@@ -32,15 +36,32 @@ REAL: Final = pa.float64()
 COUNT: Final = pa.int64()
 TEXT: Final = pa.string()
 
+_PARKED_S: Final = 8.0 * 3600.0
+"""Time between two logs of a vehicle without a known start [s]: a car parked overnight."""
+
+
+@dataclass(frozen=True, slots=True)
+class Task:
+    """What one worker computes: a log, or the logs of a vehicle with their references."""
+
+    name: str
+    vehicle: str
+    logs: tuple[FleetLog, ...]
+    references: tuple[FleetLog, ...] = ()
+    common: tuple[FleetLog, ...] = ()
+    """References that it shares with other tasks."""
+
+    @property
+    def stamp(self) -> str:
+        """Changes with the content of any of its logs, and with what a manifest states of them."""
+        logs = (*self.logs, *self.references, *self.common)
+        told = (f"{log.url}{log.stamp}{log.start}{log.initial_soc_pct}" for log in logs)
+        return text_sha256("\n".join((self.vehicle, *told)))[:16]
+
 
 @dataclass(frozen=True, eq=False)
 class Job(ABC):
-    """What is computed of each log.
-
-    Parameters
-    ----------
-    options : ReadOptions
-    """
+    """What is computed of each task."""
 
     options: ReadOptions
 
@@ -48,24 +69,8 @@ class Job(ABC):
     """Name of the table."""
     columns: ClassVar[Mapping[str, Any]]
     """Columns of a row, with their Arrow types."""
-    is_chained: ClassVar[bool] = False
-    """Whether the column `state` of a log is the input of the vehicle's next one."""
     of: ClassVar[str] = "logs"
     """What its rows are about."""
-    reads_log: ClassVar[bool] = True
-    """Whether the log is one file."""
-
-    @property
-    def resumes_with(self) -> tuple[str, ...]:
-        """Columns of earlier rows that a resumed run needs."""
-        return ("state",) if self.is_chained else ()
-
-    def chained_stamp(self, before: str, log: FleetLog) -> str:
-        """Return the stamp of a log; of a chained job it also depends on the logs before."""
-        given = f"{log.stamp}{log.stated}"
-        if self.is_chained:
-            given = f"{before}{given}"
-        return text_sha256(given)[:16]
 
     def prepared(self) -> Self:
         """Return the job with what all its rows share, computed once on a worker."""
@@ -73,36 +78,53 @@ class Job(ABC):
 
     @abstractmethod
     def identity(self) -> dict[str, Any]:
-        """Return what the rows depend on beside the log and how it is read, as JSON."""
+        """Return what the rows depend on beside the logs and how they are read, as JSON."""
 
     @abstractmethod
-    def row(self, log: FleetLog, path: Path | None, state: str | None) -> dict[str, Any]:
-        """Return the columns of a log.
+    def parts(self, task: Task) -> Iterator[tuple[str, Callable[[], dict[str, Any]]]]:
+        """Yield the name of each row, and the function that computes its columns.
 
-        Parameters
-        ----------
-        log : FleetLog
-        path : Path or None
-            Local copy of the log; None if the job `reads_log` itself.
-        state : str, optional
-            Column `state` of the vehicle's log before, of a chained job.
-
-        Raises
-        ------
-        InputError
-            If the log cannot be used: it is set aside.
+        A function that raises sets its row aside; the others are computed all the same.
         """
+
+    def read(self, log: FleetLog) -> Log:
+        """Read a log of the fleet (`ReadOptions.read`)."""
+        with local_file(log.url) as path:
+            return self.options.read(log, path)
+
+
+class LogJob(Job):
+    """A job with one row for each log, independent of all others."""
+
+    def parts(self, task: Task) -> Iterator[tuple[str, Callable[[], dict[str, Any]]]]:
+        """Yield the row of each log."""
+        for log in task.logs:
+            yield log.url, lambda log=log: self.row(log)  # type: ignore[misc]
+
+    @abstractmethod
+    def row(self, log: FleetLog) -> dict[str, Any]:
+        """Return the columns of a log."""
+
+
+def by_log(logs: Iterable[FleetLog]) -> list[Task]:
+    """Return a task for each log."""
+    return [Task(log.url, log.vehicle, (log,)) for log in logs]
+
+
+def by_vehicle(logs: Iterable[FleetLog]) -> list[Task]:
+    """Return a task for each vehicle, with its logs in order."""
+    found: dict[str, tuple[FleetLog, ...]] = {}
+    for log in logs:
+        found[log.vehicle] = (*found.get(log.vehicle, ()), log)
+    return [Task(vehicle, vehicle, of_vehicle) for vehicle, of_vehicle in found.items()]
+
+
+# --- State of charge
 
 
 @dataclass(frozen=True, eq=False)
-class EstimateJob(Job):
-    """State of charge of each log, as `cangauge estimate` computes it.
-
-    Parameters
-    ----------
-    model : Model
-    settings : EstimatorSettings
-    """
+class EstimateJob(LogJob):
+    """State of charge of each log, as `cangauge estimate` computes it."""
 
     model: Model
     settings: EstimatorSettings
@@ -122,74 +144,125 @@ class EstimateJob(Job):
         """Return model and settings."""
         return {"model": self.model.to_json(), "settings": repr(self.settings)}
 
-    def row(self, log: FleetLog, path: Path | None, state: str | None) -> dict[str, Any]:
+    def row(self, log: FleetLog) -> dict[str, Any]:
         """Return SoC at both ends, errors where the log has SoC, and the shares of each status."""
-        del state
-        done = self._estimate(log, required(path, log))
-        table, scores, recorded = done.table, done.scores, done.recorded
-        std_pct = table.soc_std_pct[np.isfinite(table.soc_std_pct)]
-        temperature_c = recorded.temperature_c[np.isfinite(recorded.temperature_c)]
-        errors = {
-            name: value
-            for name, value in vars(scores).items()
-            if name in self.columns and name != "rows"
-        }
-        out_ah = discharged_ah(recorded.time_s, recorded.current_a)
+        done = self._estimate(log)
+        table, recorded = done.table, done.recorded
+        scores = {k: value for k, value in vars(done.scores).items() if k in self.columns}
+        shares = {f"{s.name.lower()}_share": float(np.mean(table.status == s)) for s in Status}
         return {
+            **scores,
+            **shares,
             "start": log.start,
-            "rows": scores.rows,
             "duration_s": recorded.duration_s,
-            "temperature_c": _mean(temperature_c),
+            "temperature_c": mean_of(recorded.temperature_c),
             "initial_soc_pct": done.settings.initial_soc_pct,
             "initial_soc_from": done.origin,
-            "end_soc_pct": known(table.soc_pct[-1]),
-            "end_soc_std_pct": known(table.soc_std_pct[-1]),
-            "mean_soc_std_pct": _mean(std_pct),
-            "discharged_ah": known(out_ah[-1]),
-            **errors,
-            **{
-                f"{status.name.lower()}_share": float(np.mean(table.status == status))
-                for status in Status
-            },
+            "end_soc_pct": _known(table.soc_pct[-1]),
+            "end_soc_std_pct": _known(table.soc_std_pct[-1]),
+            "mean_soc_std_pct": mean_of(table.soc_std_pct),
+            "discharged_ah": _known(discharged_ah(recorded.time_s, recorded.current_a)[-1]),
             "reasons": ", ".join(done.reason_shares),
             "warnings": " ".join(done.warnings),
         }
 
-    def _estimate(self, log: FleetLog, path: Path) -> RecordedEstimate:
+    def _estimate(self, log: FleetLog) -> RecordedEstimate:
         settings = self.settings
         if log.initial_soc_pct is not None:
             settings = replace(settings, initial_soc_pct=log.initial_soc_pct)
-        recording = self.options.open(path)
-        if not isinstance(recording, LogFile) and self.options.vehicle is not None:
-            done = estimate_recorded_capture(path, self.options.vehicle, self.model, settings)
-            require_same_pack(done.recorded, self.model)
-            return done
+        with local_file(log.url) as path:
+            is_log = isinstance(self.options.open(path), LogFile)
+            if not is_log and self.options.vehicle is not None:
+                done = estimate_recorded_capture(path, self.options.vehicle, self.model, settings)
+                require_same_pack(done.recorded, self.model)
+                return done
+            recorded = self.options.read(replace(log, initial_soc_pct=None), path)
+        unstated = settings.initial_soc_pct is None
         return estimate_recorded_log(
-            self.options.read(path, log.url),
-            self.model,
-            settings,
-            soc_from_log=settings.initial_soc_pct is None,
-            pack=PackHistory(),
+            recorded, self.model, settings, soc_from_log=unstated, pack=PackHistory()
         )
 
 
-def known(value: float) -> float | None:
-    """Return a number, or None if it is NaN."""
+def _known(value: float) -> float | None:
     return None if math.isnan(value) else float(value)
 
 
-def _mean(values: Any) -> float | None:
-    return float(values.mean()) if values.size else None
+def mean_of(values: FloatArray | Sequence[float | None]) -> float | None:
+    """Return the mean of the known values; None without any."""
+    known = np.array(values, dtype=np.float64)
+    known = known[np.isfinite(known)]
+    return float(known.mean()) if known.size else None
 
 
-def required(path: Path | None, log: FleetLog) -> Path:
-    """Return the local copy of a log.
+# --- Health
 
-    Raises
-    ------
-    InputError
-        If there is none.
+
+@dataclass(frozen=True, eq=False)
+class HealthJob(Job):
+    """Capacity and resistance of each vehicle after each of its logs.
+
+    The estimator's state passes from a log to the vehicle's next one, as over the restarts of a
+    service, so that the capacity is learned over the whole life that was recorded.
     """
-    if path is None:
-        raise InputError("no such file", source=log.url)
-    return path
+
+    model: Model
+    settings: EstimatorSettings
+
+    kind: ClassVar[str] = "health"
+    columns: ClassVar[Mapping[str, Any]] = {
+        "start": TEXT, "end_s": REAL, "rows": COUNT, "temperature_c": REAL,
+        "capacity_ah": REAL, "capacity_std_ah": REAL, "resistance_ratio": REAL,
+        "resistance_std": REAL, "offset_a": REAL, "offset_std_a": REAL, "soc_pct": REAL,
+    }  # fmt: skip
+
+    def identity(self) -> dict[str, Any]:
+        """Return model and settings."""
+        return {"model": self.model.to_json(), "settings": repr(self.settings)}
+
+    def parts(self, task: Task) -> Iterator[tuple[str, Callable[[], dict[str, Any]]]]:
+        """Yield the row of each log, in order of time."""
+        states: list[EstimatorState] = []
+        for log in task.logs:
+            yield log.url, lambda log=log: self._row(log, states)  # type: ignore[misc]
+
+    def _row(self, log: FleetLog, states: list[EstimatorState]) -> dict[str, Any]:
+        recorded = self.read(log)
+        require_same_pack(recorded, self.model)
+        before = states[-1] if states else None
+        shift_s = _shift_s(log, recorded, before)
+        settings = replace(
+            self.settings, gap_s=gap_of(recorded), temperature_source=recorded.temperature_source
+        )
+        if before is None and recorded.first_soc() is not None:
+            start = initial_soc_of(recorded, settings.capacity_ah or self.model.capacity_ah)
+            settings = replace(settings, initial_soc_pct=start)
+        estimator = make_estimator(self.model, settings)
+        if before is not None:
+            estimator.restore(before)
+        for sample in samples_of(replace(recorded, time_s=recorded.time_s + shift_s)):
+            estimator.update(sample)
+        states.append(estimator.snapshot())
+        return {
+            "start": log.start,
+            "end_s": float(recorded.time_s[-1]) + shift_s,
+            "rows": len(recorded),
+            "temperature_c": float(recorded.temperature_c.mean()),
+            **{name: _known(value) for name, value in estimator.health._asdict().items()},
+            "soc_pct": _known(estimator.estimate.soc_pct),
+        }
+
+
+def _shift_s(log: FleetLog, recorded: Log, before: EstimatorState | None) -> float:
+    """Return what is added to the log's time, so that it follows the log before [s]."""
+    first_s = float(recorded.time_s[0])
+    ended_s = -math.inf if before is None else before.clock.last_s
+    if log.start_s is None:
+        return 0.0 if before is None else ended_s + _PARKED_S - first_s
+    if log.start_s <= ended_s:
+        raise InputError(
+            "starts before the previous log of this vehicle ends",
+            field="start",
+            value=log.start,
+            cure="correct the dates of the manifest",
+        )
+    return log.start_s - first_s

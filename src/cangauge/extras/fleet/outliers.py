@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Any, Final
 
 import numpy as np
@@ -16,27 +15,23 @@ from cangauge.model.model_file import Noise
 OUTLIER_Z: Final = 3.5
 """Robust z from which a value is an outlier (Iglewicz, Hoaglin, How to Detect and Handle Outliers,
 1993)."""
-
-MAD_TO_STD: Final = 1.4826
-"""Standard deviation over median absolute deviation, of a normal distribution."""
-
 VALUES_AT_LEAST: Final = 5
 """Vehicles, or logs, from which the spread of a fleet is known."""
+_MAD_TO_STD: Final = 1.4826
+"""Standard deviation over median absolute deviation, of a normal distribution."""
 
 
-def robust_z(values: FloatArray, std: FloatArray | float = 0.0) -> FloatArray:
+def robust_z(values: FloatArray, std: FloatArray) -> FloatArray:
     """Return z = (x − median)/√(s² + σ²), with s the scaled median absolute deviation.
 
     Parameters
     ----------
     values : array of shape (n,)
-    std : array of shape (n,) or float
+    std : array of shape (n,)
         Own standard deviation σ of each value: one that is badly known is no outlier.
     """
     apart = values - np.median(values)
-    scale = np.hypot(
-        MAD_TO_STD * float(np.median(np.abs(apart))), np.broadcast_to(std, apart.shape)
-    )
+    scale = np.hypot(_MAD_TO_STD * float(np.median(np.abs(apart))), std)
     return np.asarray(np.divide(apart, scale, out=np.zeros_like(apart), where=scale > 0.0))
 
 
@@ -51,50 +46,43 @@ class ErrorsByLog:
     Parameters
     ----------
     logs, vehicles : sequence of n str
-    mean_v : array of shape (n,)
-        Mean of measured minus modelled voltage [V].
-    mean_std_v : array of shape (n,)
-        Its standard deviation by the fast and slow parts of the error model [V].
-    rmse_v : array of shape (n,)
-        Root mean square of the error [V].
+    mean_v, rmse_v : array of shape (n,)
+        Mean and root mean square of measured minus modelled voltage [V].
+    seconds : array of shape (n,)
+        Weight of each log [s].
+    noise : Noise
+        Error model, which gives the standard deviation of a mean by its fast and slow parts.
     """
 
     logs: Sequence[str]
     vehicles: Sequence[str]
     mean_v: FloatArray
-    mean_std_v: FloatArray
     rmse_v: FloatArray
-
-    @classmethod
-    def of_logs(
-        cls, logs: Iterable[tuple[str, str, float, float, float]], noise: Noise
-    ) -> ErrorsByLog:
-        """Collect errors: log, vehicle, mean and RMS error [V], and weight [s] of each log."""
-        names, vehicles, mean_v, rmse_v, seconds = zip(*sorted(logs), strict=True)
-        duration_s = np.maximum(np.array(seconds), noise.block_s)
-        blocks, stretches = duration_s / noise.block_s, duration_s / (2.0 * noise.slow_time_s)
-        variance_v2 = noise.fast_std_v**2 / blocks
-        variance_v2 += noise.slow_std_v**2 / np.maximum(1.0, stretches)
-        return cls(names, vehicles, np.array(mean_v), np.sqrt(variance_v2), np.array(rmse_v))
+    seconds: FloatArray
+    noise: Noise
 
     @property
     def is_known(self) -> bool:
         """Whether there are enough logs to show which one does not fit the others."""
         return len(self.logs) >= VALUES_AT_LEAST
 
-    @cached_property
+    @property
     def z(self) -> FloatArray:
         """Robust z of the mean error among the logs; 0 if their spread is not known."""
         if not self.is_known:
             return np.zeros(len(self.logs))
-        return robust_z(self.mean_v, self.mean_std_v)
+        seconds = np.maximum(self.seconds, self.noise.block_s)
+        variance_v2 = self.noise.fast_std_v**2 * self.noise.block_s / seconds
+        stretches = seconds / (2.0 * self.noise.slow_time_s)
+        variance_v2 += self.noise.slow_std_v**2 / np.maximum(1.0, stretches)
+        return robust_z(self.mean_v, np.sqrt(variance_v2))
 
-    @cached_property
+    @property
     def order(self) -> list[int]:
         """The logs, the farthest from the others first."""
         return [int(k) for k in np.argsort(-np.abs(self.z), kind="stable")]
 
-    @cached_property
+    @property
     def misfits(self) -> list[int]:
         """The logs that do not fit the others, the farthest first."""
         z = np.abs(self.z)
@@ -127,15 +115,12 @@ class ErrorsByLog:
     def to_dict(self) -> dict[str, Any]:
         """Return the logs that do not fit as JSON; None if that is not known."""
         numbers = {"mean_v": self.mean_v, "rmse_v": self.rmse_v, "z": self.z}
-        return {
-            "misfits": None
-            if not self.is_known
-            else [
-                {
-                    "log": self.logs[k],
-                    "vehicle": self.vehicles[k],
-                    **{name: float(values[k]) for name, values in numbers.items()},
-                }
-                for k in self.misfits
-            ]
-        }
+        misfits = [
+            {
+                "log": self.logs[k],
+                "vehicle": self.vehicles[k],
+                **{name: float(values[k]) for name, values in numbers.items()},
+            }
+            for k in self.misfits
+        ]
+        return {"misfits": misfits if self.is_known else None}
