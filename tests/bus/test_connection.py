@@ -175,7 +175,7 @@ def test_send_gives_up_when_the_queue_stays_full() -> None:
     assert not port.send(FRAME, within_s=0.01)
     assert port.unsent == 1
     down = BusConnection(BrokenBus([], sending=network_down()), "x")  # type: ignore[arg-type] # see above
-    with pytest.raises(BusError, match="sending failed: .*Network is down"):
+    with pytest.raises(BusError, match=r"sending failed: .*Network is down"):
         down.send(FRAME)
 
 
