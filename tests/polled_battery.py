@@ -96,6 +96,7 @@ def polling_service(address: BusAddress, every_s: float = 1.0) -> Service:
 def temperature_and_cells_come(address: BusAddress) -> None:
     """The service asks, and its signals are those of the replies."""
     with Battery(address) as battery, polling_service(address) as service:
+        assert waits(lambda: service.port.polls is not None)  # the loop begins in its thread
         polls = service.port.polls
         assert polls is not None
         assert waits(lambda: polls.answers >= 4)

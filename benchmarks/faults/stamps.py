@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from random import Random
-from typing import Any, Final
+from typing import Final
 
 import can
 
@@ -25,20 +25,20 @@ StampChange = Callable[[float, float, Random], float]
 
 def _run(change: StampChange, arguments: list[str], *, lasts: bool = False) -> None:
     """Run the service with stamps changed during the fault, or from its start on."""
-    from cangauge.bus import connection  # noqa: PLC0415 - in the service's process alone
+    from cangauge.bus import open as opening  # noqa: PLC0415 - in the service's process alone
 
     begin_s, end_s = REAL.fault_s
-    make, rng, first_s = connection.as_message, Random(1), math.nan  # noqa: S311 - repeatable
+    make, rng, first_s = opening.message_of, Random(1), math.nan  # noqa: S311 - repeatable
 
-    def restamped(fields: dict[str, Any], stamp_s: float) -> can.Message:
+    def restamped(packet: bytes, stamp_s: float) -> can.Message:
         nonlocal first_s
         if math.isnan(first_s):
             first_s = stamp_s
         if begin_s <= stamp_s - first_s and (lasts or stamp_s - first_s < end_s):
             stamp_s = change(stamp_s, first_s + begin_s, rng)
-        return make(fields, stamp_s)
+        return make(packet, stamp_s)
 
-    connection.as_message = restamped
+    opening.message_of = restamped
     cangauge(arguments)
 
 

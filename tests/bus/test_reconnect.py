@@ -12,10 +12,10 @@ import pytest
 from can.typechecking import CanFilter
 
 from bus_log import BusLog
-from cangauge.bus import connection
-from cangauge.bus.connection import FIRST_PAUSE_S, ReconnectingBus
+from cangauge.bus import reconnecting
 from cangauge.bus.open import BusAddress, DriverMissingError, open_bus
 from cangauge.bus.publish import standard_filter
+from cangauge.bus.reconnecting import FIRST_PAUSE_S, ReconnectingBus
 from cangauge.errors import InputError
 from live import BrokenBus, network_down, unpack_error
 
@@ -122,8 +122,8 @@ def test_a_bad_packet_is_no_loss() -> None:
 def test_pauses_grow_to_a_limit_and_reset_when_steady(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(connection, "LONGEST_PAUSE_S", 0.4)
-    monkeypatch.setattr(connection, "STEADY_S", 0.3)
+    monkeypatch.setattr(reconnecting, "LONGEST_PAUSE_S", 0.4)
+    monkeypatch.setattr(reconnecting, "STEADY_S", 0.3)
     last = BrokenBus([])
     opener = Opener(BrokenBus([network_down()]), *(missing() for _ in range(6)), last)
     port = port_on(opener)

@@ -9,7 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cangauge.bus.plausibility import Fault, SignalChecks, SignalHealth, SignalState
+from cangauge.bus.plausibility import SignalChecks, SignalHealth
+from cangauge.types import Reason
 
 NAN = math.nan
 
@@ -27,14 +28,14 @@ def same(left: list[float], right: list[float]) -> bool:
 def test_the_first_good_value_is_used_after_any_failures() -> None:
     health = SignalHealth(SignalChecks())
     assert same(passed(health, [NAN] * 20 + [1.0]), [NAN] * 20 + [1.0])
-    assert health.state is SignalState.VALID
+    assert not health.is_invalid
 
 
 def test_a_few_failures_cost_only_their_own_values() -> None:
     health = SignalHealth(SignalChecks(invalid_after=5))
     values = [1.0, NAN, NAN, NAN, NAN, 2.0, 3.0]
     assert same(passed(health, values), values)
-    assert health.state is SignalState.VALID
+    assert not health.is_invalid
 
 
 def test_recovery_needs_consecutive_good_values() -> None:
@@ -47,22 +48,22 @@ def test_recovery_needs_consecutive_good_values() -> None:
 def test_an_invalid_signal_is_not_usable_and_has_a_cause() -> None:
     health = SignalHealth(SignalChecks(invalid_after=2))
     health.update(1.0, 0.0)
-    health.fail(Fault.PROTECTION)
+    health.fail(Reason.PROTECTION_FAILED)
     assert health.is_usable(0.1)
-    health.fail(Fault.PROTECTION)
+    health.fail(Reason.PROTECTION_FAILED)
     assert not health.is_usable(0.1)
-    assert (health.is_failing, health.fault) == (True, Fault.PROTECTION)
+    assert (health.is_failing, health.reason) == (True, Reason.PROTECTION_FAILED)
 
 
 def test_repeated_frames_do_not_prevent_recovery() -> None:
     health = SignalHealth(SignalChecks(invalid_after=2, valid_after=3))
     health.update(1.0, 0.0)
-    health.fail(Fault.PROTECTION)
-    health.fail(Fault.PROTECTION)
+    health.fail(Reason.PROTECTION_FAILED)
+    health.fail(Reason.PROTECTION_FAILED)
     used = []
     for number in range(3):
         used.append(health.update(2.0, 0.1 * number))
-        health.fail(Fault.REPEATED)
+        health.fail(Reason.PROTECTION_FAILED, is_repeated=True)
     assert same(used, [NAN, NAN, 2.0])
 
 

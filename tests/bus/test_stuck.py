@@ -14,9 +14,7 @@ RATE_HZ = 10.0
 
 
 def pair(step: float = 0.5) -> tuple[StuckDetector, StuckDetector]:
-    return stuck_detectors(
-        PACK, current_step_a=step, voltage_step_v=step, current_after_s=10.0, voltage_after_s=10.0
-    )
+    return stuck_detectors(PACK, steps=(step, step), after_s=(10.0, 10.0))
 
 
 def rounded(value: float, step: float = 0.5) -> float:

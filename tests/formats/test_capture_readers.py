@@ -13,10 +13,12 @@ import can
 import pytest
 from can.io.generic import MessageWriter
 
-from cangauge.bus import captures as library
-from cangauge.bus.captures import CaptureReader, LineReader, capture_readers, open_capture
+from cangauge.bus import readers
+from cangauge.bus.captures import open_capture
+from cangauge.bus.readers import CandumpLogReader, CaptureReader, LineReader, capture_readers
 from cangauge.errors import InputError
 from cangauge.extras.formats import mcap, pcap, text
+from cangauge.extras.formats import python_can as library
 
 START_S = 1436509052.25
 FRAMES = 40
@@ -159,7 +161,7 @@ class TestCrtd(Lines):
 
 
 class TestCandumpLog(Lines):
-    reader = library.CandumpLogReader
+    reader = CandumpLogReader
     kinds: ClassVar = {"remote": True, "error": True, "fd": True}
 
     def write(self, path: Path, frames: Iterable[can.Message]) -> None:
@@ -443,7 +445,7 @@ def test_other_packages_add_readers(monkeypatch: pytest.MonkeyPatch, tmp_path: P
         def load(self) -> type:
             return MyReader
 
-    monkeypatch.setattr(library, "entry_points", lambda **_: [Entry()])
+    monkeypatch.setattr(readers, "entry_points", lambda **_: [Entry()])
     capture_readers.cache_clear()
     try:
         path = tmp_path / "mine"

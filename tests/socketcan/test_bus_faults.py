@@ -19,10 +19,11 @@ import can
 import pytest
 
 from bus_log import BusLog
-from cangauge.bus.connection import LONGEST_PAUSE_S, BusConnection, ReconnectingBus
+from cangauge.bus.connection import BusConnection
 from cangauge.bus.encoder import FrameEncoder
 from cangauge.bus.open import BusAddress, has_socketcan, open_bus
 from cangauge.bus.publish import SocDetail, SocEstimate, SocReader, standard_filter
+from cangauge.bus.reconnecting import LONGEST_PAUSE_S, ReconnectingBus
 from cangauge.bus.vehicle import Vehicle
 from cangauge.errors import InputError
 from cangauge.estimation.offline import samples_of

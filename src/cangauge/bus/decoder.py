@@ -12,7 +12,6 @@ import can
 from cangauge.bus.database import SignalCodec
 from cangauge.bus.plausibility import (
     ConstantDetector,
-    Fault,
     MessageStatistics,
     Pack,
     SignalHealth,
@@ -28,20 +27,8 @@ _MISSING: Final = {
     "voltage": Reason.VOLTAGE_MISSING,
     "temperature": Reason.TEMPERATURE_MISSING,
 }
-_REASONS: Final = {
-    Fault.NONE: Reason.NONE,
-    Fault.PROTECTION: Reason.PROTECTION_FAILED,
-    Fault.REPEATED: Reason.PROTECTION_FAILED,
-    Fault.NOT_AVAILABLE: Reason.NONE,
-    Fault.RANGE: Reason.IMPLAUSIBLE_INPUT,
-    Fault.RATE: Reason.IMPLAUSIBLE_INPUT,
-    Fault.STUCK: Reason.SIGNAL_STUCK,
-    Fault.TWO_SENDERS: Reason.DUPLICATE_SENDER,
-}
 # Looked up for every frame or sample; enum members are slow to look up.
-_DUPLICATE: Final = Reason.DUPLICATE_SENDER
-_NO_REASON: Final = Reason.NONE
-_GOOD: Final = Verdict.GOOD
+_DUPLICATE, _NO_REASON, _GOOD = Reason.DUPLICATE_SENDER, Reason.NONE, Verdict.GOOD
 
 SUSPECTED_FOR_S: Final = 10.0
 """Time after the last sign of a second sender for which a message is refused [s]: longer than an
@@ -50,26 +37,15 @@ attacker's pause between two tries, well below the longest gap over which charge
 
 @dataclass(slots=True)
 class FrameStatistics:
-    """Statistics of all frames; totals of `MessageStatistics` under the same names.
+    """Statistics of all frames; totals of `MessageStatistics` under the same names."""
 
-    Parameters
-    ----------
-    messages : dict of int to MessageStatistics
-        By key: arbitration id, plus `vehicle.EXTENDED` for an extended one.
-    """
-
-    messages: dict[int, MessageStatistics] = field(default_factory=dict)
-    frames: int = 0
-    """Frames received, wanted or not."""
-    ignored: int = 0
-    """Error frames and remote frames."""
+    messages: dict[int, MessageStatistics] = field(default_factory=dict)  # by key, see `vehicle`
+    frames: int = 0  # received, wanted or not
+    ignored: int = 0  # error frames and remote frames
     samples: int = 0
-    current_unpaired: int = 0
-    """Samples without a voltage (voltage NaN)."""
-    voltage_unpaired: int = 0
-    """Voltages dropped without a current."""
-    time_reversals: int = 0
-    """Wanted frames stamped earlier than the frame before."""
+    current_unpaired: int = 0  # samples without a voltage (NaN)
+    voltage_unpaired: int = 0  # voltages dropped without a current
+    time_reversals: int = 0  # wanted frames stamped earlier than the frame before
 
     def __getattr__(self, name: str) -> int:
         """Return the total of a statistic of the messages."""
@@ -88,14 +64,8 @@ class Pairing:
     - A voltage left without a current is dropped when the next voltage arrives.
     - When time runs backwards by more than `within_s`, waiting values are released likewise.
 
-    A value completes at most one sample. Samples keep the order of their currents.
-
-    Parameters
-    ----------
-    within_s : float
-        Largest distance in bus time [s].
-    statistics : FrameStatistics, optional
-        Counts the values left unpaired.
+    A value completes at most one sample. Samples keep the order of their currents. All times are
+    bus time [s]; `statistics` counts the values left unpaired.
     """
 
     def __init__(self, within_s: float, statistics: FrameStatistics | None = None) -> None:
@@ -142,16 +112,12 @@ class Pairing:
 
 
 class CellVoltages:
-    """Latest voltage of each cell, with its bus time.
-
-    Parameters
-    ----------
-    signals : CellSignals
+    """Latest voltage of each cell.
 
     Attributes
     ----------
     voltage_v, time_s : list of float
-        By cell; NaN before the first plausible value.
+        By cell, with its bus time [V, s]; NaN before the first plausible value.
     refused : int
         Values out of range.
     """
@@ -161,28 +127,25 @@ class CellVoltages:
         self.voltage_v = [math.nan] * signals.count
         self.time_s = [math.nan] * signals.count
         self.refused = 0
-        self._taken_s = [math.nan] * signals.count
+        self._before_s = [math.nan] * signals.count
 
     def take(self, now_s: float) -> tuple[list[float], list[float]]:
-        """Return voltages [V] and bus times [s] that are new since the last call, NaN for others.
+        """Return voltages [V] and bus times [s] that are new since the last call and not old.
 
-        A voltage older than the time-out at `now_s` [s] is not returned.
+        The others are NaN.
         """
-        oldest_s, taken = now_s - self.signals.timeout_s, self._taken_s
-        is_new = [
-            time_s >= oldest_s and time_s != before
-            for time_s, before in zip(self.time_s, taken, strict=True)
+        oldest_s, before_s = now_s - self.signals.timeout_s, self._before_s
+        self._before_s = list(self.time_s)
+        new = [
+            (v, t) if t >= oldest_s and t != before else (math.nan, math.nan)
+            for v, t, before in zip(self.voltage_v, self.time_s, before_s, strict=True)
         ]
-        taken[:] = self.time_s
-        return (
-            [v if new else math.nan for v, new in zip(self.voltage_v, is_new, strict=True)],
-            [t if new else math.nan for t, new in zip(self.time_s, is_new, strict=True)],
-        )
+        return [v for v, _ in new], [t for _, t in new]
 
     def read(
         self, cells: Sequence[tuple[int, SignalCodec]], payload: bytearray, time_s: float
     ) -> None:
-        """Take the voltages of a payload with cells (place and codec of each), at its time [s]."""
+        """Read the cells (place and codec of each) of a payload at bus time `time_s` [s]."""
         shift, signals = 0, self.signals
         if signals.index is not None:
             shift = (signals.index.get(payload) - signals.first_index) * len(signals.cells)
@@ -198,11 +161,10 @@ class CellVoltages:
 
 
 class _Input(NamedTuple):
-    """A signal of a message: its decoder and its health."""
+    """A signal of a message; `is_present` for multiplexed ones."""
 
     decode: Callable[[bytes | bytearray], float]
     is_present: Callable[[bytes | bytearray], bool] | None
-    """Multiplexed signals only."""
     health: SignalHealth
     is_current: bool
     is_voltage: bool
@@ -210,7 +172,7 @@ class _Input(NamedTuple):
 
 @dataclass(slots=True)
 class _Route:
-    """A wanted message: its checks and its signals."""
+    """A wanted message: its checks, its signals, and place and codec of the cells in it."""
 
     name: str
     length: int
@@ -218,10 +180,14 @@ class _Route:
     statistics: MessageStatistics
     inputs: list[_Input] = field(default_factory=list)
     cells: list[tuple[int, SignalCodec]] = field(default_factory=list)
-    """Place and codec of the cells in it."""
     last_s: float = -math.inf
     suspected_until_s: float = -math.inf
-    """Until then its frames may be of two senders."""
+
+    def refuse(self, reason: Reason, *, is_repeated: bool = False) -> bytearray | None:
+        """Record a refused frame as a failure of each of its signals; return no payload."""
+        for signal in self.inputs:
+            signal.health.fail(reason, is_repeated=is_repeated)
+        return None
 
 
 class SampleDecoder:
@@ -256,18 +222,14 @@ class SampleDecoder:
         self.vehicle = vehicle
         self.statistics = FrameStatistics()
         self.health: dict[str, SignalHealth] = {}
-        self.now_s = -math.inf
-        self._suspected_until_s = -math.inf
+        self.now_s = self._suspected_until_s = -math.inf
         self._pairing = Pairing(vehicle.pair_within_s, self.statistics)
         # In one frame: each is a sample by itself.
         self._is_paired = vehicle.current.key == vehicle.voltage.key
         self._routes: dict[int, _Route] = {}
-        self._by_pgn = {
-            key & pgn_mask(key): key for key, each in vehicle.messages.items() if each.by_pgn
-        }
-        self._replies = {
-            reply_id(key): Reassembler() for key, each in vehicle.messages.items() if each.is_reply
-        }
+        messages = vehicle.messages.items()
+        self._by_pgn = {key & pgn_mask(key): key for key, each in messages if each.by_pgn}
+        self._replies = {reply_id(key): Reassembler() for key, each in messages if each.is_reply}
         detectors = _detectors(vehicle, pack)
         for signal in vehicle.signals:
             self._add(signal, pack, detectors.get(signal.role))
@@ -275,8 +237,7 @@ class SampleDecoder:
         if vehicle.cells is not None:
             self.cells = CellVoltages(vehicle.cells)
             for place, cell in enumerate(vehicle.cells.cells):
-                route = self._route(cell.key, cell.message, cell.length)
-                route.cells.append((place, cell.codec))
+                self._route(cell).cells.append((place, cell.codec))
         for route in self._routes.values():
             # Slow signals first: a sample uses the temperature of its own frame.
             route.inputs.sort(key=lambda each: each.is_current + 2 * each.is_voltage)
@@ -293,28 +254,30 @@ class SampleDecoder:
         pack: Pack | None,
         is_stuck: Callable[[float, float], bool] | None,
     ) -> None:
-        route = self._route(signal.key, signal.message, signal.length)
+        route, role = self._route(signal), signal.role
         is_multiplexed = bool(signal.codec.conditions)
-        health = self.health[signal.role] = SignalHealth(
-            signal.checks if pack is None else signal.checks.within_pack(signal.role, pack),
+        health = self.health[role] = SignalHealth(
+            signal.checks if pack is None else signal.checks.within_pack(role, pack),
             # A multiplexed signal is not in every frame of its message: its period is learned.
             None if is_multiplexed else self.vehicle.messages[signal.key].period_s,
-            is_cyclic=signal.role in {"current", "voltage"},
+            is_cyclic=role in {"current", "voltage"},
             is_stuck=is_stuck,
             statistics=route.statistics,
         )
         if route.checker is not None and not is_multiplexed:
             route.checker.learned_period_s = lambda: health.period_s
         is_present = signal.codec.is_in if is_multiplexed else None
-        is_current, is_voltage = signal.role == "current", signal.role == "voltage"
-        route.inputs.append(_Input(signal.codec.decode, is_present, health, is_current, is_voltage))
+        route.inputs.append(
+            _Input(signal.codec.decode, is_present, health, role == "current", role == "voltage")
+        )
 
-    def _route(self, key: int, name: str, length: int) -> _Route:
+    def _route(self, signal: VehicleSignal) -> _Route:
+        key = signal.key
         if key not in self._routes:
             message = self.vehicle.messages[key]
             statistics = self.statistics.messages[key] = MessageStatistics()
             checker = None if message.rule is None else FrameChecker(message.rule, message.period_s)
-            self._routes[key] = _Route(name, length, checker, statistics)
+            self._routes[key] = _Route(signal.message, signal.length, checker, statistics)
         return self._routes[key]
 
     def handle(self, message: can.Message) -> Sample | None:
@@ -339,41 +302,38 @@ class SampleDecoder:
                 if reply is not None and len(reply) >= 2:
                     route = self._routes.get(reply_key(key, reply) | EXTENDED)
                     data = bytearray(reply)
-        if route is None:
-            return None
+            if route is None:
+                return None
         payload = self._accept(route, data, time_s)
         return None if payload is None else self._values(route, payload, time_s)
 
     def _accept(self, route: _Route, payload: bytearray, time_s: float) -> bytearray | None:
         """Return the payload, cut to the message's length; None for a refused frame."""
-        statistics = route.statistics
+        statistics, checker = route.statistics, route.checker
         statistics.wanted += 1
         if time_s < route.last_s:
             self._rewind(route.last_s, time_s)
         self.now_s = time_s
-        if len(payload) != route.length:
-            if len(payload) < route.length:
-                statistics.short += 1
-                return _refuse(route, Fault.PROTECTION)
+        if len(payload) < route.length:
+            statistics.short += 1
+            return route.refuse(Reason.PROTECTION_FAILED)
+        if len(payload) > route.length:
             payload = payload[: route.length]
-        checker = route.checker
-        if checker is not None:
-            verdict = checker.check(payload, time_s)
-            if verdict is not _GOOD:
-                if verdict is Verdict.CRC_WRONG:
-                    statistics.crc_errors += 1
-                    return _refuse(route, Fault.PROTECTION)
-                if checker.suspects_second_sender:
-                    until_s = time_s + SUSPECTED_FOR_S
-                    route.suspected_until_s = self._suspected_until_s = until_s
-                if verdict is Verdict.REPEATED:
-                    statistics.counter_repeats += 1
-                    return _refuse(route, Fault.REPEATED)
-                statistics.counter_jumps += 1
-                statistics.frames_lost += checker.lost
+        verdict = _GOOD if checker is None else checker.check(payload, time_s)
+        if verdict is not _GOOD and checker is not None:
+            if verdict is Verdict.CRC_WRONG:
+                statistics.crc_errors += 1
+                return route.refuse(Reason.PROTECTION_FAILED)
+            if checker.suspects_second_sender:
+                route.suspected_until_s = self._suspected_until_s = time_s + SUSPECTED_FOR_S
+            if verdict is Verdict.REPEATED:
+                statistics.counter_repeats += 1
+                return route.refuse(Reason.PROTECTION_FAILED, is_repeated=True)
+            statistics.counter_jumps += 1
+            statistics.frames_lost += checker.lost
         if time_s < route.suspected_until_s:
             statistics.two_senders += 1
-            return _refuse(route, Fault.TWO_SENDERS)
+            return route.refuse(_DUPLICATE)
         route.last_s = time_s
         return payload
 
@@ -392,11 +352,9 @@ class SampleDecoder:
                 voltage_v = value
         sample = None
         if not math.isnan(current_a):
-            temperature_c = (
-                self.vehicle.fixed_temperature_c
-                if self._temperature is None
-                else self._temperature.value_at(time_s)
-            )
+            temperature_c = self.vehicle.fixed_temperature_c
+            if self._temperature is not None:
+                temperature_c = self._temperature.value_at(time_s)
             if self._is_paired:
                 self.statistics.current_unpaired += math.isnan(voltage_v)
                 sample = Sample(time_s, current_a, voltage_v, temperature_c)
@@ -407,12 +365,12 @@ class SampleDecoder:
         self.statistics.samples += sample is not None
         return sample
 
-    @property
-    def two_sender_messages(self) -> tuple[str, ...]:
-        """Names of the messages that seem to have two senders at present."""
-        return tuple(
-            route.name for route in self._routes.values() if self.now_s < route.suspected_until_s
-        )
+    def _rewind(self, last_s: float, time_s: float) -> None:
+        """Handle time that runs backwards: a restarted log, or a clock that was set."""
+        self.statistics.time_reversals += 1
+        if last_s - time_s > self.vehicle.pair_within_s:
+            for health in self.health.values():
+                health.rewind(time_s)
 
     def flush(self) -> Sample | None:
         """Return the last current, if it is unpaired, as a sample without voltage."""
@@ -431,28 +389,20 @@ class SampleDecoder:
             if not health.is_usable(now_s):
                 reasons |= missing
                 if health.is_failing:
-                    reasons |= _REASONS[health.fault]
+                    reasons |= health.reason
         return reasons
+
+    @property
+    def two_sender_messages(self) -> tuple[str, ...]:
+        """Names of the messages that seem to have two senders at present."""
+        routes = self._routes.values()
+        return tuple(route.name for route in routes if self.now_s < route.suspected_until_s)
 
     @property
     def reference_soc_pct(self) -> float:
         """The car's own state of charge [%]; NaN without a usable one."""
         health = self.health.get("soc_reference")
         return math.nan if health is None else health.value_at(self.now_s)
-
-    def _rewind(self, last_s: float, time_s: float) -> None:
-        """Handle time that runs backwards: a restarted log, or a clock that was set."""
-        self.statistics.time_reversals += 1
-        if last_s - time_s > self.vehicle.pair_within_s:
-            for health in self.health.values():
-                health.rewind(time_s)
-
-
-def _refuse(route: _Route, fault: Fault) -> bytearray | None:
-    """Record a refused frame as a failure of each of its signals; return no payload."""
-    for signal in route.inputs:
-        signal.health.fail(fault)
-    return None
 
 
 def _detectors(vehicle: Vehicle, pack: Pack | None) -> dict[str, Callable[[float, float], bool]]:
@@ -462,12 +412,10 @@ def _detectors(vehicle: Vehicle, pack: Pack | None) -> dict[str, Callable[[float
     if temperature is not None and temperature.checks.stuck_after_s < math.inf:
         detectors["temperature"] = ConstantDetector(temperature.checks.stuck_after_s).update
     if pack is not None:
-        current, voltage = stuck_detectors(
-            pack,
-            current_step_a=2.0 * vehicle.current.codec.half_step,
-            voltage_step_v=2.0 * vehicle.voltage.codec.half_step,
-            current_after_s=vehicle.current.checks.stuck_after_s,
-            voltage_after_s=vehicle.voltage.checks.stuck_after_s,
+        both = vehicle.current, vehicle.voltage
+        steps, after_s = zip(
+            *((2.0 * each.codec.half_step, each.checks.stuck_after_s) for each in both), strict=True
         )
+        current, voltage = stuck_detectors(pack, steps=steps, after_s=after_s)
         detectors["current"], detectors["voltage"] = current.update, voltage.update
     return detectors

@@ -14,7 +14,7 @@ import logging
 import os
 import socket
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import Any, Final, Literal
@@ -32,39 +32,24 @@ except ImportError:  # then there is no UDP bus either
 
 BusOption = str | int | float | bool
 
-SOCKETCAN_CHANNEL: Final = "vcan0"
 MULTICAST_CHANNEL: Final = "239.74.163.2"
 """IPv4 group of python-can; its default is an IPv6 group, which some machines cannot reach."""
-
-MULTICAST_HOPS: Final = 0
-"""0: packets sent stay on this machine; 1 (`--bus-option hop_limit=1`): local network."""
-
 RECEIVE_BUFFER_BYTES: Final = 16 << 20
 """Requested receive buffer of sockets, for pauses: Linux's default holds about 270 frames. Without
 CAP_NET_ADMIN the system limits it to net.core.rmem_max."""
 
-_SO_RCVBUFFORCE: Final = 33
-"""Linux; not in Python's socket module."""
-
+_SO_RCVBUFFORCE: Final = 33  # Linux; not in Python's socket module
 _DEFAULT_CHANNELS: Final = {
-    "socketcan": SOCKETCAN_CHANNEL,
-    "udp_multicast": MULTICAST_CHANNEL,
-    "virtual": "cangauge",
-}
+    "socketcan": "vcan0", "udp_multicast": MULTICAST_CHANNEL, "virtual": "cangauge",
+}  # fmt: skip
 _ON_SOCKETS: Final = {"socketcan", "udp_multicast"}
 
 # Errors of python-can, of the operating system, and those that a missing library or a wrong option
 # causes in a driver (NameError: kvaser without canlib).
 _DRIVER_ERRORS: Final = (
-    can.CanError,
-    OSError,
-    ValueError,
-    TypeError,
-    NotImplementedError,
-    NameError,
-    AttributeError,
+    can.CanError, OSError, ValueError, TypeError, NotImplementedError, NameError, AttributeError,
     ImportError,
-)
+)  # fmt: skip
 
 # Drivers also log the errors that they raise; a program that sets up logging still sees them.
 logging.getLogger("can").addHandler(logging.NullHandler())
@@ -108,11 +93,6 @@ def bus_address(
     Default interface: SocketCAN if it has that channel (default vcan0), else `udp_multicast`, which
     is `local_only` if neither a channel nor `hop_limit` is given.
 
-    Parameters
-    ----------
-    interface, channel : str, optional
-    options : mapping, optional
-
     Raises
     ------
     InputError
@@ -120,8 +100,7 @@ def bus_address(
     """
     options = dict(options or {})
     local_only = interface is None and channel is None and "hop_limit" not in options
-    if interface is None:
-        interface = _guess_interface(channel)
+    interface = interface or _guess_interface(channel)
     if interface not in can.VALID_INTERFACES:
         raise InputError(
             "unknown interface",
@@ -129,8 +108,7 @@ def bus_address(
             value=interface,
             cure=f"use one of: {', '.join(sorted(can.VALID_INTERFACES))}",
         )
-    if channel is None:
-        channel = _DEFAULT_CHANNELS.get(interface)
+    channel = _DEFAULT_CHANNELS.get(interface) if channel is None else channel
     if channel is None:
         raise InputError(f"{interface} needs a channel", field="--channel", cure="name one")
     if interface != "udp_multicast":
@@ -142,51 +120,22 @@ def bus_address(
             value=channel,
             cure=f"use one such as {MULTICAST_CHANNEL}",
         )
-    options.setdefault("hop_limit", MULTICAST_HOPS)
-    return BusAddress(interface, channel, options, local_only)
+    # 0: packets sent stay on this machine; 1 (`--bus-option hop_limit=1`): local network.
+    return BusAddress(interface, channel, {"hop_limit": 0, **options}, local_only)
 
 
-def open_bus(address: BusAddress, filters: Sequence[CanFilter] | None = None) -> can.BusABC:
-    """Open a bus.
-
-    Parameters
-    ----------
-    address : BusAddress
-    filters : sequence of CanFilter, optional
-        As in `can.BusABC.set_filters`; applied in the kernel on SocketCAN, else in Python.
-
-    Returns
-    -------
-    can.BusABC
-
-    Raises
-    ------
-    InputError
-        If there is no such bus or it is down, an option is wrong, or a permission is missing.
-    DriverMissingError
-        If the driver or a library of it is missing.
-    """
-    arguments: dict[str, Any] = dict(address.options)
-    if filters is not None:
-        arguments["can_filters"] = list(filters)
-    channel: str | int = address.channel
-    if address.interface not in _ON_SOCKETS and address.channel.isdigit():
-        channel = int(channel)  # as python-can's own configuration
-    try:
-        bus: can.BusABC
-        if address.interface == "udp_multicast":
-            bus = CheckedUdpBus(channel, local_only=address.local_only, **arguments)
-        else:
-            bus = can.Bus(
-                channel=channel, interface=address.interface, ignore_config=True, **arguments
-            )
-    except _DRIVER_ERRORS as error:
-        raise _refusal(address, error) from error
-    if address.interface in _ON_SOCKETS:
-        _widen_receive_buffer(bus)
-    if address.interface == "socketcan":
-        _check_up(bus, address)
-    return bus
+def _guess_interface(channel: str | None) -> str:
+    if has_socketcan(channel or _DEFAULT_CHANNELS["socketcan"]):
+        return "socketcan"
+    if channel is None or _is_multicast(channel):
+        return "udp_multicast"
+    raise InputError(
+        "there is no such SocketCAN interface on this machine",
+        field="--channel",
+        value=channel,
+        cure="bring it up (sudo ip link add dev vcan0 type vcan; sudo ip link set vcan0 up),"
+        " or name the interface too, e.g. --interface udp_multicast",
+    )
 
 
 def has_socketcan(channel: str) -> bool:
@@ -204,6 +153,13 @@ def has_socketcan(channel: str) -> bool:
 def is_interface_name(channel: str | None) -> bool:
     """Return whether a channel is the name of a network interface, not a multicast address."""
     return channel is not None and not _is_multicast(channel)
+
+
+def _is_multicast(channel: str) -> bool:
+    try:
+        return ipaddress.ip_address(channel).is_multicast
+    except ValueError:
+        return False
 
 
 def parse_bus_options(given: Sequence[str]) -> dict[str, BusOption]:
@@ -229,48 +185,58 @@ def parse_bus_options(given: Sequence[str]) -> dict[str, BusOption]:
     return options
 
 
-def _guess_interface(channel: str | None) -> str:
-    if has_socketcan(channel if channel is not None else SOCKETCAN_CHANNEL):
-        return "socketcan"
-    if channel is None or _is_multicast(channel):
-        return "udp_multicast"
-    raise InputError(
-        "there is no such SocketCAN interface on this machine",
-        field="--channel",
-        value=channel,
-        cure="bring it up (sudo ip link add dev vcan0 type vcan; sudo ip link set vcan0 up),"
-        " or name the interface too, e.g. --interface udp_multicast",
-    )
+def open_bus(address: BusAddress, filters: Sequence[CanFilter] | None = None) -> can.BusABC:
+    """Open a bus.
 
+    Parameters
+    ----------
+    address : BusAddress
+    filters : sequence of CanFilter, optional
+        As in `can.BusABC.set_filters`; applied in the kernel on SocketCAN, else in Python.
 
-def _is_multicast(channel: str) -> bool:
+    Raises
+    ------
+    InputError
+        If there is no such bus or it is down, an option is wrong, or a permission is missing.
+    DriverMissingError
+        If the driver or a library of it is missing.
+    """
+    arguments: dict[str, Any] = dict(address.options)
+    if filters is not None:
+        arguments["can_filters"] = list(filters)
+    channel: str | int = address.channel
+    if address.interface not in _ON_SOCKETS and address.channel.isdigit():
+        channel = int(channel)  # as python-can's own configuration
     try:
-        return ipaddress.ip_address(channel).is_multicast
-    except ValueError:
-        return False
+        bus: can.BusABC
+        if address.interface == "udp_multicast":
+            bus = CheckedUdpBus(channel, local_only=address.local_only, **arguments)
+        else:
+            bus = can.Bus(
+                channel=channel, interface=address.interface, ignore_config=True, **arguments
+            )
+    except _DRIVER_ERRORS as error:
+        raise _refusal(address, error) from error
+    if address.interface in _ON_SOCKETS and sys.platform != "win32":
+        _widen_receive_buffer(bus)
+    if address.interface == "socketcan":
+        # SocketCAN opens an interface that is down; the error comes with the next call.
+        with socket.socket(fileno=os.dup(bus.fileno())) as own:
+            code = own.getsockopt(socket.SOL_SOCKET, socket.SO_ERROR)
+        if code:
+            bus.shutdown()
+            down = OSError(code, os.strerror(code))
+            raise _refusal(address, down) from down
+    return bus
 
 
 def _widen_receive_buffer(bus: can.BusABC) -> None:
-    if sys.platform == "win32":
-        return
     # The driver's socket is private; a duplicate descriptor refers to the same socket. Best effort:
     # the system may refuse, or cap the size silently.
-    options = [socket.SO_RCVBUF]
-    if sys.platform == "linux":
-        options.append(_SO_RCVBUFFORCE)
-    for option in options:
+    forced = [_SO_RCVBUFFORCE] if sys.platform == "linux" else []
+    for option in (socket.SO_RCVBUF, *forced):
         with suppress(OSError), socket.socket(fileno=os.dup(bus.fileno())) as own:
             own.setsockopt(socket.SOL_SOCKET, option, RECEIVE_BUFFER_BYTES)
-
-
-def _check_up(bus: can.BusABC, address: BusAddress) -> None:
-    # SocketCAN opens an interface that is down; the error comes with the next call.
-    with socket.socket(fileno=os.dup(bus.fileno())) as own:
-        code = own.getsockopt(socket.SOL_SOCKET, socket.SO_ERROR)
-    if code:
-        bus.shutdown()
-        error = OSError(code, os.strerror(code))
-        raise _refusal(address, error) from error
 
 
 def _refusal(address: BusAddress, error: BaseException) -> InputError:
@@ -281,15 +247,16 @@ def _refusal(address: BusAddress, error: BaseException) -> InputError:
     code = cause.errno if isinstance(cause, OSError) else None
     interface, channel = address.interface, address.channel
     reason = " ".join(str(cause).split()) or type(cause).__name__
+    kind, name, value = InputError, "--channel", channel
     if code in {errno.EAFNOSUPPORT, errno.EPROTONOSUPPORT} and interface == "socketcan":
         problem = "this machine has no SocketCAN"
         cure = "use another interface, e.g. --interface udp_multicast"
-        return InputError(problem, field="--interface", value=interface, cure=cure)
-    if code in {errno.ENETUNREACH, errno.EADDRNOTAVAIL} and interface == "udp_multicast":
+        name, value = "--interface", interface
+    elif code in {errno.ENETUNREACH, errno.EADDRNOTAVAIL} and interface == "udp_multicast":
         problem = "no network interface of this machine carries multicast"
         cure = "bring a network interface up, or use SocketCAN"
-        return InputError(problem, field="--interface", value=interface, cure=cure)
-    if code == errno.ENETDOWN:
+        name, value = "--interface", interface
+    elif code == errno.ENETDOWN:
         problem, cure = "this bus is down", f"bring it up: sudo ip link set {channel} up"
     elif code in {errno.ENODEV, errno.ENXIO, errno.ENOENT}:
         problem = f"{interface} has no such bus"
@@ -304,11 +271,11 @@ def _refusal(address: BusAddress, error: BaseException) -> InputError:
         cure = f"install the library that python-can's documentation names for {interface}"
         if interface == "udp_multicast":
             cure = "install msgpack (pip install 'python-can[multicast]')"
-        return DriverMissingError(problem, field="--interface", value=interface, cure=cure)
+        kind, name, value = DriverMissingError, "--interface", interface
     else:
         problem = f"{interface} cannot open this bus ({reason})"
         cure = "check channel and --bus-option"
-    return InputError(problem, field="--channel", value=channel, cure=cure)
+    return kind(problem, field=name, value=value, cure=cure)
 
 
 def _socketcan_names() -> str:
@@ -364,42 +331,19 @@ def backend_capabilities(address: BusAddress) -> BackendCapabilities:
 # interfaces and takes unicast too. python-can's bus makes a message of any fields, whose wrong
 # types then fail later, in the filters.
 
+_TYPES: Final[dict[str, type]] = {
+    "arbitration_id": int, "dlc": int, "data": bytes,
+    "is_extended_id": bool, "is_remote_frame": bool, "is_error_frame": bool, "is_fd": bool,
+    "bitrate_switch": bool, "error_state_indicator": bool,
+}  # fmt: skip
+MOST_UNWANTED: Final = 1024
+"""Most packets that are read for one frame: about 15 ms."""
 _MAX_CHANNEL: Final = 64
 """Longest name of a channel in a packet [characters]: it is recorded with every frame."""
 
 
-def _is_flag(value: object) -> bool:
-    return isinstance(value, bool)
-
-
-def _is_whole(value: object) -> bool:
-    return isinstance(value, int) and not isinstance(value, bool)
-
-
-def _is_channel(value: object) -> bool:
-    """Return whether a value is a channel that a line of a recording can hold as one word."""
-    if isinstance(value, str):
-        return 0 < len(value) <= _MAX_CHANNEL and value.isprintable() and " " not in value
-    return value is None or _is_whole(value)
-
-
-_FIELDS: Final[dict[str, Callable[[object], bool]]] = {
-    "timestamp": lambda _: True,  # replaced
-    "arbitration_id": _is_whole,
-    "is_extended_id": _is_flag,
-    "is_remote_frame": _is_flag,
-    "is_error_frame": _is_flag,
-    "channel": _is_channel,
-    "dlc": _is_whole,
-    "data": lambda value: isinstance(value, bytes),
-    "is_fd": _is_flag,
-    "bitrate_switch": _is_flag,
-    "error_state_indicator": _is_flag,
-}
-
-
-def unpack_fields(packet: bytes) -> dict[str, Any]:
-    """Return the fields of a packet, each of its type.
+def message_of(packet: bytes, stamp_s: float) -> can.Message:
+    """Return the frame of a packet, with the time of its arrival [s since 1970].
 
     Raises
     ------
@@ -408,40 +352,27 @@ def unpack_fields(packet: bytes) -> dict[str, Any]:
     """
     try:
         fields = msgpack.unpackb(packet, raw=False)
-        wrong = [name for name, value in fields.items() if not _FIELDS[name](value)]
-        _require_none(wrong)
+        fields["timestamp"] = stamp_s
+        wrong = [name for name, kind in _TYPES.items() if type(fields[name]) is not kind]
+        if wrong or not _is_channel(fields["channel"]):
+            raise TypeError(f"of a wrong type: {', '.join(wrong) or 'channel'}")  # noqa: TRY301
+        return can.Message(check=True, **fields)
     except Exception as error:  # the packet's, whatever it is
         raise can.CanOperationError("could not unpack received message") from error
-    return dict(fields)
 
 
-def _require_none(wrong: list[str]) -> None:
-    if wrong:
-        raise TypeError(f"of a wrong type: {', '.join(wrong)}")
-
-
-def as_message(fields: dict[str, Any], stamp_s: float) -> can.Message:
-    """Return the message of checked fields, with the time of its arrival [s since 1970].
-
-    Raises
-    ------
-    can.CanOperationError
-        If the values do not fit together.
-    """
-    fields["timestamp"] = stamp_s
-    try:
-        return can.Message(check=True, **fields)
-    except Exception as error:
-        raise can.CanOperationError("could not unpack received message") from error
+def _is_channel(value: object) -> bool:
+    """Return whether a value is a channel that a line of a recording can hold as one word."""
+    if isinstance(value, str):
+        return 0 < len(value) <= _MAX_CHANNEL and value.isprintable() and " " not in value
+    return value is None or type(value) is int
 
 
 class CheckedUdpBus(UdpMulticastBus):
-    """python-can's bus, with checked packets.
+    """python-can's bus, with checked packets; arguments as of `UdpMulticastBus`.
 
     Parameters
     ----------
-    *args, **kwargs
-        Those of `UdpMulticastBus`.
     local_only : bool
         Drop packets whose sender is not an address of this machine. (The kernel drops packets
         from the network that pretend to be.)
@@ -452,25 +383,27 @@ class CheckedUdpBus(UdpMulticastBus):
         self._local_host = ""
         super().__init__(*args, **kwargs)
 
-    def is_accepted(self, sender: Any) -> bool:
-        """Return whether a packet from this socket address is to be read."""
-        host = str(sender[0])
-        if not self._local_only or host == self._local_host:
-            return True
-        if _is_own_address(host):
+    def _recv_internal(self, timeout: float | None) -> tuple[can.Message | None, bool]:
+        carries_fd = self.protocol is can.CanProtocol.CAN_FD
+        # Until a frame passes or none is pending, so that no frame means an empty queue; a flood of
+        # other frames must not hold the caller.
+        for _ in range(MOST_UNWANTED):
+            received = self._multicast.recv(timeout)
+            if not received:
+                break
+            packet, sender, stamp_s = received
+            timeout = 0.0
+            if self._local_only and not self._is_local(str(sender[0])):
+                continue
+            message = message_of(packet, stamp_s)
+            if (carries_fd or not message.is_fd) and self._matches_filters(message):
+                return message, True
+        return None, False
+
+    def _is_local(self, host: str) -> bool:
+        if host != self._local_host and _is_own_address(host):
             self._local_host = host
         return host == self._local_host
-
-    def _recv_internal(self, timeout: float | None) -> tuple[can.Message | None, bool]:
-        received = self._multicast.recv(timeout)
-        if not received:
-            return None, False
-        packet, sender, stamp_s = received
-        if not self.is_accepted(sender):
-            return None, False
-        message = as_message(unpack_fields(packet), stamp_s)
-        carries_fd = self.protocol is can.CanProtocol.CAN_FD
-        return (message if carries_fd or not message.is_fd else None), False
 
 
 def _is_own_address(host: str) -> bool:

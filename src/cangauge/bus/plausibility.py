@@ -1,71 +1,51 @@
 """Plausibility of the signals of a pack: range, rate, stuck detection, debouncing, time-out.
 
-Rules of `SignalHealth`:
-
 - A value fails when its frame was refused, its code means "not available", it is out of range, it
   changed too fast, or the signal is stuck. A failed value is never used.
-- `invalid_after` consecutive failures make a valid signal invalid. It becomes valid again after
-  `valid_after` consecutive good values; repeated frames in between do not restart that count. The
-  first good value makes a new signal valid.
-- The rate limit applies to the distance from the latest good value. It widens with the time since
-  then, so that a lasting step is accepted in the end.
+- `invalid_after` consecutive failures make a valid signal invalid, and `valid_after` consecutive
+  good values make it valid again. The first good value makes a new signal valid.
+- The rate limit widens with the time since the latest good value: a lasting step is accepted.
 - A signal is old when its latest good value is older than the time-out. The time-out is stated, or
-  follows from the period p (stated or learned from the time stamps): 10·p, at least 0.5 s and at
-  most the usual time-out of the role, but never below 3·p. Temperature and SoC, often sent on
-  change only, keep at least their usual time-out.
+  follows from the period p, stated or learned: 10·p, at least 0.5 s and at most the usual time-out
+  of the role, but never below 3·p. Signals often sent on change keep at least the usual one.
 
 All times are bus time, so that a live run and its recording give the same result.
 """
 
 from __future__ import annotations
 
-import enum
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Final
 
 from cangauge.bus.mapping import CheckMap
-from cangauge.types import CURRENT_AT_MOST_A, TEMPERATURE_WITHIN_C, VOLTAGE_WITHIN
+from cangauge.types import CURRENT_AT_MOST_A, TEMPERATURE_WITHIN_C, VOLTAGE_WITHIN, Reason
 
 INVALID_AFTER: Final = 5
 VALID_AFTER: Final = 3
 """Consecutive values of the debouncing: short beside a time-out, longer than a disturbed frame."""
 STUCK_AFTER_S: Final = 10.0
 """Least time of a constant value [s]: a pack at rest between two pulses is constant for less."""
-
 TEMPERATURE_JUMP_K: Final = 5.0
 TEMPERATURE_RATE_K_PER_S: Final = 1.0
 """Above coarse quantization and alternating sensors, and above what a pack's heat capacity allows.
 Current and voltage have no default rate limit: contactors, fuses, short circuits."""
-
 MISSED_UNTIL_OLD: Final = 10.0
 MISSED_AT_LEAST: Final = 3.0
-"""Time-out of a cyclic signal, usual and least [periods]."""
 TIMEOUT_AT_LEAST_S: Final = 0.5
-"""Shortest time-out that is not stated: frames are lost in bursts [s]."""
-
+"""Time-out of a cyclic signal: usual and least [periods]; least [s], for bursts of lost frames."""
 LEARN_FROM: Final = 8
-"""Frame intervals from which a period counts as learned."""
-_LEARN_WEIGHT: Final = 1.0 / 16.0
-_LONGEST_INTERVAL: Final = 4.0
-"""Longer intervals enter the learned period as this many periods: a pause is not a period."""
+"""Frame intervals from which a period counts as learned, by a mean over about 16 of them; longer
+intervals than four periods enter as four: a pause is not a period."""
 
 
 @dataclass(frozen=True, slots=True)
 class Pack:
     """Pack properties used for plausibility, taken from its model.
 
-    Parameters
-    ----------
-    resistance_ohm : float
-        Instantaneous resistance, positive [Ω].
-    error_std_v : float
-        Standard deviation of the fast voltage error [V].
-    capacity_ah : float
-        [Ah].
-    usual_v : float
-        Voltage at 50 % SoC [V].
+    `resistance_ohm` is instantaneous and positive [Ω], `error_std_v` the standard deviation of the
+    fast voltage error [V], `capacity_ah` in Ah, `usual_v` the voltage at 50 % SoC [V].
     """
 
     resistance_ohm: float
@@ -76,14 +56,9 @@ class Pack:
 
 @dataclass(frozen=True, slots=True)
 class SignalChecks:
-    """Limits of one signal.
+    """Limits of one signal; as in `mapping.CheckMap`, without limit by default.
 
-    Parameters
-    ----------
-    lowest, highest, max_jump, max_rate_per_s, invalid_after, valid_after, stuck_after_s, timeout_s
-        As in `mapping.CheckMap`; without limit by default.
-    usual_timeout_s : float
-        Time-out while the period is not known [s].
+    `usual_timeout_s` is the time-out while the period is not known [s].
     """
 
     lowest: float = -math.inf
@@ -98,13 +73,8 @@ class SignalChecks:
 
     def updated(self, *stated: CheckMap) -> SignalChecks:
         """Return the checks with stated values replaced; the last mapping wins."""
-        given = {
-            name: value
-            for each in stated
-            for name in CheckMap.model_fields
-            if (value := getattr(each, name)) is not None
-        }
-        return replace(self, **given)
+        values = [(name, getattr(each, name)) for each in stated for name in CheckMap.model_fields]
+        return replace(self, **{name: value for name, value in values if value is not None})
 
     def within_pack(self, role: str, pack: Pack) -> SignalChecks:
         """Return the checks with the physical limits of a pack where none are stated."""
@@ -131,63 +101,26 @@ DEFAULTS: Final = {"current": _FAST, "voltage": _FAST}
 """By role. Physical limits need the pack's model; see `SignalChecks.within_pack`."""
 
 
-class Fault(enum.IntEnum):
-    """Cause of a refused value."""
+@dataclass(slots=True)
+class MessageStatistics:
+    """Statistics of one wanted message: frames and values, refused ones by cause."""
 
-    NONE = 0
-    PROTECTION = 1
-    """CRC wrong, or frame too short."""
-    REPEATED = 2
-    """The alive counter did not change."""
-    NOT_AVAILABLE = 3
-    RANGE = 4
-    RATE = 5
-    STUCK = 6
-    TWO_SENDERS = 7
-    """The frame may be another sender's."""
-
-
-class SignalState(enum.IntEnum):
-    """Debounced validity of a signal."""
-
-    UNKNOWN = 0
-    """No good value yet."""
-    VALID = 1
-    INVALID = 2
+    wanted: int = 0  # frames with its id
+    crc_errors: int = 0  # frames refused
+    counter_repeats: int = 0  # frames refused: repeated alive counter
+    counter_jumps: int = 0  # good frames after a loss
+    frames_lost: int = 0  # frames missing according to the alive counter
+    short: int = 0  # frames refused: shorter than in the DBC
+    not_available: int = 0  # values refused: the code means "not available"
+    implausible: int = 0  # values refused: out of range, or changed too fast
+    stuck: int = 0  # values refused: the signal is stuck
+    held_back: int = 0  # good values not used yet, while the signal recovers from failures
+    two_senders: int = 0  # frames refused: two senders use the id
 
 
 # Looked up for every value; enum members are slow to look up.
-_NO_FAULT: Final = Fault.NONE
-_VALID: Final = SignalState.VALID
-_INVALID: Final = SignalState.INVALID
-
-
-@dataclass(slots=True)
-class MessageStatistics:
-    """Frame and value statistics of one wanted message."""
-
-    wanted: int = 0
-    """Frames with its id."""
-    crc_errors: int = 0
-    """Frames refused: wrong CRC."""
-    counter_repeats: int = 0
-    """Frames refused: repeated alive counter."""
-    counter_jumps: int = 0
-    """Good frames after a loss."""
-    frames_lost: int = 0
-    """Frames missing according to the alive counter."""
-    short: int = 0
-    """Frames refused: shorter than in the DBC."""
-    not_available: int = 0
-    """Values refused: the code means "not available"."""
-    implausible: int = 0
-    """Values refused: out of range, or changed too fast."""
-    stuck: int = 0
-    """Values refused: the signal is stuck."""
-    held_back: int = 0
-    """Good values not used yet, while the signal recovers from failures."""
-    two_senders: int = 0
-    """Frames refused: two senders use the id."""
+_NO_REASON: Final = Reason.NONE
+_IMPLAUSIBLE: Final = Reason.IMPLAUSIBLE_INPUT
 
 
 class SignalHealth:
@@ -207,9 +140,8 @@ class SignalHealth:
 
     Attributes
     ----------
-    state : SignalState
-    fault : Fault
-        Latest failure; NONE after a good value that was used.
+    is_invalid, reason : bool, Reason
+        Whether it failed too often since its latest good value; why it failed last, if it did.
     latest, latest_s : float
         Latest good value and its bus time [s]; NaN before the first.
     """
@@ -228,48 +160,38 @@ class SignalHealth:
         self._is_cyclic = is_cyclic
         self._is_stuck = is_stuck
         self._statistics = statistics or MessageStatistics()
-        self.state = SignalState.UNKNOWN
-        self.fault = Fault.NONE
+        self.is_invalid = False
+        self.reason = Reason.NONE
         self.latest = self.latest_s = math.nan
-        self._failures = self._passes = 0
+        self._failures = self._passes = self._intervals = 0
         self._arrived_s = self._learned_s = math.nan
-        self._intervals = 0
 
     def update(self, value: float, time_s: float) -> float:
-        """Check a value; return it if it may be used, else NaN.
-
-        Parameters
-        ----------
-        value : float
-            [A], [V], [°C] or [%]; NaN: not available.
-        time_s : float
-            Bus time [s].
-        """
+        """Return a value [A, V, °C, %; NaN: not available] at bus time [s]; NaN if refused."""
         checks = self._checks
         interval_s, self._arrived_s = time_s - self._arrived_s, time_s
         if interval_s > 0.0:
             self._learn(interval_s)
         if value != value:  # noqa: PLR0124 - NaN; this runs for every value
             self._statistics.not_available += 1
-            return self.fail(Fault.NOT_AVAILABLE)
-        if not checks.lowest <= value <= checks.highest:
+            return self.fail(_NO_REASON)
+        most = checks.max_jump
+        if most < math.inf:
+            most += checks.max_rate_per_s * abs(time_s - self.latest_s)
+        # The second is false before the first good value (NaN).
+        if not checks.lowest <= value <= checks.highest or abs(value - self.latest) > most:
             self._statistics.implausible += 1
-            return self.fail(Fault.RANGE)
-        if checks.max_jump < math.inf:
-            most = checks.max_jump + checks.max_rate_per_s * abs(time_s - self.latest_s)
-            if abs(value - self.latest) > most:  # False before the first good value (NaN)
-                self._statistics.implausible += 1
-                return self.fail(Fault.RATE)
+            return self.fail(_IMPLAUSIBLE)
         if self._is_stuck is not None and self._is_stuck(value, time_s):
             self._statistics.stuck += 1
-            return self.fail(Fault.STUCK)
+            return self.fail(Reason.SIGNAL_STUCK)
         self._failures = 0
-        if self.state is _INVALID:
+        if self.is_invalid:
             self._passes += 1
             if self._passes < checks.valid_after:
                 self._statistics.held_back += 1
                 return math.nan
-        self.state, self.fault = _VALID, _NO_FAULT
+        self.is_invalid, self.reason = False, _NO_REASON
         self.latest, self.latest_s = value, time_s
         return value
 
@@ -279,17 +201,19 @@ class SignalHealth:
         if self._intervals == 1:
             self._learned_s = interval_s
         else:
-            interval_s = min(interval_s, _LONGEST_INTERVAL * learned_s)
-            self._learned_s = learned_s + _LEARN_WEIGHT * (interval_s - learned_s)
+            self._learned_s = learned_s + (min(interval_s, 4.0 * learned_s) - learned_s) / 16.0
 
-    def fail(self, fault: Fault) -> float:
-        """Record a failed value or a refused frame; return NaN."""
-        self.fault = fault
+    def fail(self, reason: Reason, *, is_repeated: bool = False) -> float:
+        """Record a failed value or a refused frame; return NaN.
+
+        A repeated frame does not invalidate the original, and so does not restart recovery.
+        """
+        self.reason = reason
         self._failures += 1
-        if fault is not Fault.REPEATED:  # a repeated frame does not invalidate the original
+        if not is_repeated:
             self._passes = 0
-        if self._failures >= self._checks.invalid_after and self.state is _VALID:
-            self.state = _INVALID
+        if self._failures >= self._checks.invalid_after and not math.isnan(self.latest_s):
+            self.is_invalid = True
         return math.nan
 
     def rewind(self, time_s: float) -> None:
@@ -298,7 +222,7 @@ class SignalHealth:
 
     def is_usable(self, now_s: float) -> bool:
         """Return whether the latest good value is valid and not old at `now_s` [s]."""
-        return self.state is _VALID and now_s - self.latest_s <= self.timeout_s
+        return not self.is_invalid and now_s - self.latest_s <= self.timeout_s
 
     def value_at(self, now_s: float) -> float:
         """Return the latest good value if usable at `now_s` [s], else NaN."""
@@ -307,7 +231,7 @@ class SignalHealth:
     @property
     def is_failing(self) -> bool:
         """Whether the signal is invalid, or failed too often in a row to become valid."""
-        return self.state is _INVALID or self._failures >= self._checks.invalid_after
+        return self.is_invalid or self._failures >= self._checks.invalid_after
 
     @property
     def period_s(self) -> float:
@@ -331,18 +255,17 @@ class SignalHealth:
 
 
 SWINGS: Final = 4
-"""Turning points that the partner must show."""
 FRAMES: Final = 10
-"""Equal values that a stuck signal must show."""
+"""Turning points that the partner, and equal values that a stuck signal must show."""
 STEPS: Final = 8.0
-"""Least swing of the partner, as an effect on the constant signal [quantization steps of it]."""
 ERRORS: Final = 8.0
-"""Least swing of the voltage [standard deviations of the fast voltage error]."""
 SWING_C_RATE: Final = 0.1
-"""Least swing of the current [1/h]: 5 A at 50 Ah, above a pack at rest with its consumers."""
-UNKNOWN_STEP: Final = 0.0025
-"""Assumed quantization step of a voltage that has not changed yet, relative to its value: 1 V of a
-car's pack, the coarsest in use."""
+"""Least swing of the partner, as an effect on the constant signal [quantization steps of it]; of
+the voltage [standard deviations of its fast error]; of the current [1/h]: 5 A at 50 Ah, above a
+pack at rest with its consumers."""
+COARSE_STEP: Final = 0.0025
+"""Assumed quantization of a voltage that has not changed yet, relative to the pack's: 1 V of a
+car's, the coarsest in use."""
 
 
 class StuckDetector:
@@ -350,53 +273,50 @@ class StuckDetector:
 
     Parameters
     ----------
-    frame_step : float
-        Quantization step of the signal in its frame [A, V]; 0 for floats. The smallest change
-        seen counts where it is larger.
-    unknown_step : float
-        Quantization step assumed before the first change, relative to the value.
-    after_s : float
-        Least duration of a constant value that counts as stuck [s].
+    after_s, step : float
+        Least duration of a constant value that counts as stuck [s]; quantization in the frame
+        [A, V], 0 for floats. The smallest change seen counts where it is larger.
     partner_swing : callable
-        Takes the quantization step of this signal; returns the least swing of the partner.
+        Takes the quantization of this signal; returns the least distance of the partner's turning
+        points that proves that this one should change.
     """
 
     partner: StuckDetector
 
     def __init__(
-        self,
-        frame_step: float,
-        unknown_step: float,
-        after_s: float,
-        partner_swing: Callable[[float], float],
+        self, after_s: float, step: float, partner_swing: Callable[[float], float]
     ) -> None:
-        self._frame_step = frame_step
-        self._unknown_step = unknown_step
-        self._after_s = after_s
-        self._partner_swing = partner_swing
-        self._smallest = math.inf
+        self._after_s, self._step, self._partner_swing = after_s, step, partner_swing
+        self._smallest = self.swing = math.inf
         self._value = self._since_s = math.nan
         self._repeats = 0
-        # Turning points at least `swing` apart (zigzag) since the partner changed; it resets them.
-        self.low, self.high = math.inf, -math.inf
-        self.direction = self.turns = 0
-        self.swing = math.inf
+        self.restart()
+
+    def restart(self) -> None:
+        """Count turning points (zigzag) anew, since the partner has changed."""
+        self._low, self._high = math.inf, -math.inf
+        self._direction = self.turns = 0
 
     def update(self, value: float, time_s: float) -> bool:
         """Add a value at bus time `time_s` [s]; return whether the signal is stuck."""
         if value == self._value and time_s >= self._since_s:
             self._repeats += 1
         else:
-            self._change(value, time_s)
+            change = abs(value - self._value)
+            if 0.0 < change < self._smallest:
+                self._smallest = change
+                self.partner.swing = self._partner_swing(max(self._step, change))
+            self._value, self._since_s, self._repeats = value, time_s, 1
+            self.partner.restart()
         # Branches instead of `min` and `max`: this runs for every value.
-        if value < self.low:  # noqa: PLR1730
-            self.low = value
-        if value > self.high:  # noqa: PLR1730
-            self.high = value
-        rises = self.direction <= 0 and value - self.low >= self.swing
-        if rises or (self.direction >= 0 and self.high - value >= self.swing):
-            self.direction = 1 if rises else -1
-            self.low = self.high = value
+        if value < self._low:  # noqa: PLR1730
+            self._low = value
+        if value > self._high:  # noqa: PLR1730
+            self._high = value
+        rises = self._direction <= 0 and value - self._low >= self.swing
+        if rises or (self._direction >= 0 and self._high - value >= self.swing):
+            self._direction = 1 if rises else -1
+            self._low = self._high = value
             self.turns += 1
         return (
             self.partner.turns >= SWINGS
@@ -404,72 +324,46 @@ class StuckDetector:
             and time_s - self._since_s >= self._after_s
         )
 
-    def _change(self, value: float, time_s: float) -> None:
-        """Restart the count of equal values, and with it the partner's turning points."""
-        change, partner = abs(value - self._value), self.partner
-        if 0.0 < change < self._smallest:
-            self._smallest = change
-            partner.swing = self._partner_swing(max(self._frame_step, change))
-        elif math.isinf(self._smallest):
-            step = max(self._frame_step, self._unknown_step * abs(value))
-            partner.swing = self._partner_swing(step)
-        self._value, self._since_s, self._repeats = value, time_s, 1
-        partner.low, partner.high = math.inf, -math.inf
-        partner.direction = partner.turns = 0
-
 
 def stuck_detectors(
-    pack: Pack,
-    *,
-    current_step_a: float,
-    voltage_step_v: float,
-    current_after_s: float,
-    voltage_after_s: float,
+    pack: Pack, *, steps: tuple[float, float], after_s: tuple[float, float]
 ) -> tuple[StuckDetector, StuckDetector]:
     """Return coupled stuck detectors for current and voltage of one pack.
 
     A change of the current by ΔI changes the voltage by R·ΔI at once. A voltage whose code stays
     constant while the current swings, by R·ΔI of several quantization steps, is stuck; and vice
     versa. Turning points are counted, not drift, so that these are not called stuck: a pack at
-    rest; a charge at constant current; a current of exactly 0 next to a noisy voltage (a swing must
-    be a multiple of the model's voltage error).
+    rest; a charge at constant current; a current of exactly 0 next to a noisy voltage.
 
     Parameters
     ----------
     pack : Pack
-    current_step_a, voltage_step_v : float
-        Quantization steps of the signals in their frames [A], [V]; 0 for floats.
-    current_after_s, voltage_after_s : float
-        Least duration of a constant value that counts as stuck [s].
+    steps, after_s : tuple of float
+        Of current and voltage: quantization in their frames [A, V], 0 for floats; least duration
+        of a constant value that counts as stuck [s].
     """
-    least_swing_a = SWING_C_RATE * pack.capacity_ah
+    ohm, least_a = pack.resistance_ohm, SWING_C_RATE * pack.capacity_ah
 
-    def current_swing_a(voltage_step_v: float) -> float:
-        if not (math.isfinite(pack.resistance_ohm) and pack.resistance_ohm > 0.0):
-            return math.inf
-        return max(STEPS * voltage_step_v / pack.resistance_ohm, least_swing_a)
+    def swing_a(step_v: float) -> float:
+        return max(STEPS * step_v / ohm, least_a) if 0.0 < ohm < math.inf else math.inf
 
-    def voltage_swing_v(current_step_a: float) -> float:
-        swing_a = max(STEPS * current_step_a, least_swing_a)
-        swing_v = max(swing_a * pack.resistance_ohm, ERRORS * pack.error_std_v)
-        return swing_v if swing_v > 0.0 else math.inf
+    def swing_v(step_a: float) -> float:
+        least_v = max(max(STEPS * step_a, least_a) * ohm, ERRORS * pack.error_std_v)
+        return least_v if least_v > 0.0 else math.inf
 
-    current = StuckDetector(current_step_a, 0.0, current_after_s, voltage_swing_v)
-    voltage = StuckDetector(voltage_step_v, UNKNOWN_STEP, voltage_after_s, current_swing_a)
+    current = StuckDetector(after_s[0], steps[0], swing_v)
+    voltage = StuckDetector(after_s[1], steps[1], swing_a)
+    current.swing = swing_a(max(steps[1], COARSE_STEP * pack.usual_v))
+    voltage.swing = swing_v(steps[0])
     current.partner, voltage.partner = voltage, current
     return current, voltage
 
 
 class ConstantDetector:
-    """Detect a signal that has been constant for a stated time.
+    """Detect a signal that has been constant for a stated time [s].
 
     For a temperature: slow, coarse and without a partner, it is constant for hours in a healthy
     car. Used only where the user states a time.
-
-    Parameters
-    ----------
-    after_s : float
-        [s].
     """
 
     def __init__(self, after_s: float) -> None:
@@ -480,5 +374,4 @@ class ConstantDetector:
         """Add a value at bus time `time_s` [s]; return whether the signal is stuck."""
         if value != self._value or time_s < self._since_s:
             self._value, self._since_s = value, time_s
-            return False
         return time_s - self._since_s >= self._after_s

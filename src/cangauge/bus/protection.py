@@ -23,19 +23,6 @@ from cangauge.bus.database import Field
 from cangauge.errors import InputError
 
 
-class Verdict(enum.IntEnum):
-    """Result of checking the CRC and the counter of a frame."""
-
-    GOOD = 0
-    """The expected frame."""
-    AFTER_LOSS = 1
-    """A good frame; frames before it are missing."""
-    CRC_WRONG = 2
-    """Refused: damaged."""
-    REPEATED = 3
-    """Refused: the counter did not change, so this is not a new frame."""
-
-
 def _require(holds: bool, name: str, value: object, problem: str) -> None:
     if not holds:
         raise InputError(problem, field=name, value=value)
@@ -71,7 +58,6 @@ class ProtectionRule:
     counter_bits: int = 4
     counter_byte: int = -2
     counter_shift: int = 0
-    _mask: int = field(init=False, repr=False, compare=False)
     _table: bytes = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
@@ -91,7 +77,6 @@ class ProtectionRule:
             for _ in range(8):
                 crc = ((crc << 1) ^ self.polynomial if crc & 0x80 else crc << 1) & 0xFF
             table[value] = crc
-        object.__setattr__(self, "_mask", (1 << self.counter_bits) - 1)
         object.__setattr__(self, "_table", bytes(table))
 
     @property
@@ -118,13 +103,13 @@ class ProtectionRule:
 
     def counter(self, data: bytes | bytearray) -> int:
         """Return the counter of a payload; 0 without a counter."""
-        return (data[self.counter_byte] >> self.counter_shift) & self._mask
+        return (data[self.counter_byte] >> self.counter_shift) & ((1 << self.counter_bits) - 1)
 
     def protect(self, data: bytes | bytearray, counter: int) -> bytes:
         """Return the payload with counter (modulo its width) and CRC set."""
         out = bytearray(data)
         if self.counter_bits:
-            mask = self._mask << self.counter_shift
+            mask = ((1 << self.counter_bits) - 1) << self.counter_shift
             place = self.counter_byte
             out[place] = (out[place] & ~mask) | ((counter << self.counter_shift) & mask)
         out[self.crc_byte] = self.crc(out)
@@ -161,12 +146,7 @@ class CounterRule:
     length : int
         Bytes of the message.
     modulus : int
-        Number of counter values: 0 … `modulus` − 1.
-
-    Raises
-    ------
-    InputError
-        If the counter's bits cannot hold `modulus` values.
+        Number of counter values: 0 … `modulus` − 1; InputError if the bits cannot hold them.
     """
 
     name: str
@@ -200,7 +180,6 @@ class CounterRule:
 
 
 DataIdMode = Literal["both", "alternating", "low", "nibble"]
-
 LIST_LENGTH: Final = 16
 """Data ids of profile 2, one per counter value."""
 
@@ -249,10 +228,8 @@ class E2eRule:
     ----------
     name : str
         One of `PROFILES`.
-    data_id : int
-        Every profile but 2.
-    data_ids : bytes
-        Profile 2: 16 data ids, one per counter value.
+    data_id, data_ids : int, bytes
+        Data id; in profile 2 a list of 16, one per counter value.
     data_id_mode : {"both", "alternating", "low", "nibble"}
         Mode of the data id in the CRC: profile 1; profile 11 has "both" and "nibble" only.
     header_byte : int
@@ -280,10 +257,12 @@ class E2eRule:
         if profile is None:
             raise InputError("unknown profile", field="protection", value=self.name,
                              cure=f"known are {', '.join(PROFILES)}")  # fmt: skip
+        arguments: dict[str, Any] = {"length": self.protected_bytes}
         if profile.id_bits:
             _require(0 <= self.data_id < 1 << profile.id_bits, "data_id", self.data_id,
                      f"{self.name} has a data id of {profile.id_bits} bits")  # fmt: skip
             _require(not self.data_ids, "data_id_list", None, f"{self.name} has one data id")
+            arguments["offset"] = self.header_byte
         else:
             _require(len(self.data_ids) == LIST_LENGTH, "data_id_list", len(self.data_ids),
                      f"{self.name} has a list of {LIST_LENGTH} data ids")  # fmt: skip
@@ -296,9 +275,6 @@ class E2eRule:
         least = self.header_byte + profile.header
         _require(self.protected_bytes == 0 or self.protected_bytes >= least, "protected_bytes",
                  self.protected_bytes, f"must hold the header: at least {least}")  # fmt: skip
-        arguments: dict[str, Any] = {"length": self.protected_bytes}
-        if profile.id_bits:
-            arguments["offset"] = self.header_byte
         if profile.modes:
             arguments["data_id_mode"] = profile.modes[self.data_id_mode]
         object.__setattr__(self, "_profile", profile)
@@ -347,6 +323,20 @@ Protection = ProtectionRule | CounterRule | E2eRule
 """CRC and alive counter of a message: `name`, `modulus` (0 without a counter), `fits`, `is_whole`,
 `counter`, `protect`."""
 
+
+class Verdict(enum.IntEnum):
+    """Result of checking the CRC and the counter of a frame."""
+
+    GOOD = 0
+    """The expected frame."""
+    AFTER_LOSS = 1
+    """A good frame; frames before it are missing."""
+    CRC_WRONG = 2
+    """Refused: damaged."""
+    REPEATED = 3
+    """Refused: the counter did not change, so this is not a new frame."""
+
+
 SILENCE_S: Final = 2.0
 """Silence after which a sender may have restarted, with any counter value [s]."""
 WIDE: Final = 256
@@ -394,12 +384,10 @@ class FrameChecker:
         self._half_wrap_s = (
             SILENCE_S if period_s is None else period_s * min(rule.modulus, WIDE) / 2
         )
-        self._last = -1
-        self._last_s = 0.0
-        self._refused = 0
+        self._last, self._last_s = -1, 0.0
+        self._refused, self._odd = 0, 0.0
         self._content: bytes | bytearray = b""
         self._is_repeated = False
-        self._odd = 0.0
         self.lost = 0
         self.learned_period_s: Callable[[], float] = lambda: math.nan
 
@@ -420,11 +408,10 @@ class FrameChecker:
         elapsed_s, self._last_s = time_s - self._last_s, time_s
         steps = (counter - last) % modulus
         if steps == 1 or last < 0:
-            self._last, self._refused, self._content = counter, 0, data
             self._is_repeated = False
             if self._odd:
                 self._odd = max(self._odd - FORGIVEN, 0.0)
-            return Verdict.GOOD
+            return self._accept(counter, data, lost=0)
         period_s = self.learned_period_s() if self._period_s is None else self._period_s
         is_soon = 0.0 <= elapsed_s < SOON * period_s
         is_repeated, was_repeated = steps == 0 and elapsed_s <= self._half_wrap_s, self._is_repeated
@@ -443,6 +430,8 @@ class FrameChecker:
         ):
             steps = 1
         # Damaged frames are counted as damaged, not as lost.
-        self.lost = max(steps - 1 - self._refused, 0)
-        self._last, self._refused, self._content = counter, 0, data
-        return Verdict.AFTER_LOSS if self.lost else Verdict.GOOD
+        return self._accept(counter, data, lost=max(steps - 1 - self._refused, 0))
+
+    def _accept(self, counter: int, data: bytes | bytearray, lost: int) -> Verdict:
+        self._last, self._refused, self._content, self.lost = counter, 0, data, lost
+        return Verdict.AFTER_LOSS if lost else Verdict.GOOD

@@ -14,12 +14,10 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-from can.typechecking import Channel
 
 from cangauge._typing import FloatArray
 from cangauge.bus.captures import (
-    CLOCK_ID,
-    CLOCK_PERIOD_S,
+    CLOCK,
     KNOWN_CAPTURES,
     Capture,
     CaptureInfo,
@@ -28,8 +26,8 @@ from cangauge.bus.captures import (
     parts_of_run,
 )
 from cangauge.bus.decoder import FrameStatistics, SampleDecoder
-from cangauge.bus.time_source import ReceiveTime, TimeSource, TimeSourceName, time_source
-from cangauge.bus.vehicle import Vehicle
+from cangauge.bus.time_source import ReceiveTime, TimeSourceName, time_source
+from cangauge.bus.vehicle import LOG_COLUMNS, Vehicle
 from cangauge.errors import InputError
 from cangauge.logs.column_map import ColumnMap
 from cangauge.logs.draft import Sign
@@ -103,12 +101,10 @@ def read_recording(
     >>> log.name, log.current_a
     ('drive', array([10., 30.]))
     """
-    tabular = columns is not None or sign is not None
+    is_table = columns is not None or sign is not None
+    recording = open_log(path, columns=columns, sign=sign) if is_table else open_recording(path)
     return log_of(
-        open_log(path, columns=columns, sign=sign) if tabular else open_recording(path),
-        vehicle,
-        temperature_c=temperature_c,
-        temperature_source=temperature_source,
+        recording, vehicle, temperature_c=temperature_c, temperature_source=temperature_source
     )
 
 
@@ -119,7 +115,7 @@ def log_of(
     temperature_c: float | None,
     temperature_source: TemperatureSource | None,
 ) -> Log:
-    """Read an opened recording; see `read_recording`."""
+    """Read an opened recording; arguments as in `read_recording`."""
     if temperature_source is not None:
         known_temperature_source(temperature_source)
     if isinstance(recording, LogFile):
@@ -137,19 +133,13 @@ def log_of(
             temperature_source="unknown",
         )
     log = capture_to_log(recording.path, vehicle)
-    if temperature_source is not None:
-        log = replace(log, temperature_source=temperature_source)
-    return log
+    return (
+        log if temperature_source is None else replace(log, temperature_source=temperature_source)
+    )
 
 
 def open_recording(path: str | PathLike[str]) -> LogFile | Capture:
-    """Open a file as a log or a capture, recognised by its beginning.
-
-    Raises
-    ------
-    InputError
-        If the file cannot be read, or is neither.
-    """
+    """Open a file as a log or a capture, recognised by its beginning; InputError if neither."""
     path = Path(path)
     if parts_of_run(path):
         return open_capture(path)
@@ -179,10 +169,8 @@ def open_with_columns(
     Parameters
     ----------
     path : Path
-    columns : ColumnMap, optional
-        The user's: the file is then a table.
-    mapped : ColumnMap, optional
-        A map file's, for tables of no known format.
+    columns, mapped : ColumnMap, optional
+        The user's: the file is then a table; a map file's, for tables of no known format.
     sign : {"charge", "discharge"}, optional
         What a positive current in a log does.
 
@@ -238,17 +226,14 @@ def capture_without_vehicle(path: str | PathLike[str]) -> InputError:
 class CaptureSamples:
     """All samples of a capture, as the live service makes them without a model.
 
-    With a model the service also drops values that are impossible for its pack; see
-    `plausibility`.
+    With a model the service also drops values that are impossible for its pack.
 
     Parameters
     ----------
     time_s, current_a : array of shape (n,)
         Bus time [s], current [A], positive = discharge.
-    voltage_v, temperature_c : array of shape (n,)
-        [V], [°C]; NaN where the sample has none.
-    soc_pct : array of shape (n,)
-        The car's own SoC when the sample was made [%]; NaN where there is none.
+    voltage_v, temperature_c, soc_pct : array of shape (n,)
+        [V], [°C]; the car's own SoC when the sample was made [%]. NaN where there is none.
     statistics : FrameStatistics
         Of the frames of the chosen bus.
     info : CaptureInfo
@@ -279,25 +264,8 @@ class CaptureSamples:
 def open_vehicle_capture(path: str | PathLike[str], vehicle: Vehicle) -> Capture:
     """Open a capture; without stamps, the vehicle's current message counts time."""
     period_s = vehicle.messages[vehicle.current.key].period_s
-    if period_s is None:
-        return open_capture(path, clock=(CLOCK_ID, CLOCK_PERIOD_S))
-    return open_capture(path, clock=(vehicle.current.arbitration_id, period_s))
-
-
-class _Bus:
-    """One bus of a capture: its time, its decoder and the decoded values."""
-
-    def __init__(self, vehicle: Vehicle, clock: TimeSource) -> None:
-        # The stamps of two buses can be of two adapters.
-        self.clock = ReceiveTime() if isinstance(clock, ReceiveTime) else clock
-        self.decoder = SampleDecoder(vehicle)
-        # Time, current, voltage, temperature and the car's SoC of each sample in turn.
-        self.values = array("d")
-
-    def add(self, sample: Sample | None) -> None:
-        if sample is not None:
-            self.values.extend(sample)
-            self.values.append(self.decoder.reference_soc_pct)
+    clock = CLOCK if period_s is None else (vehicle.current.arbitration_id, period_s)
+    return open_capture(path, clock=clock)
 
 
 def capture_samples(
@@ -319,63 +287,63 @@ def capture_samples(
     InputError
         If the capture cannot be read, or gives no sample.
     """
-    capture = open_vehicle_capture(path, vehicle)
-    clock = time_source(source)
-    buses: dict[Channel | None, _Bus] = {}
+    capture, clock = open_vehicle_capture(path, vehicle), time_source(source)
+    # Of each bus: its time (stamps of two buses can be of two adapters), decoder, and values.
+    buses: dict[Any, tuple[Any, SampleDecoder, array[float]]] = {}
     for message in capture:
         if message.channel not in buses:
-            buses[message.channel] = _Bus(vehicle, clock)
-        bus = buses[message.channel]
-        now_s = bus.clock.time_of(message)
-        if now_s is not None:
+            own = ReceiveTime() if isinstance(clock, ReceiveTime) else clock
+            buses[message.channel] = own, SampleDecoder(vehicle), array("d")
+        own, decoder, values = buses[message.channel]
+        if (now_s := own.time_of(message)) is not None:
             message.timestamp = now_s
-            bus.add(bus.decoder.handle(message))
-    for bus in buses.values():
-        bus.add(bus.decoder.flush())
-    channel, bus = max(buses.items(), key=lambda item: len(item[1].values))
-    statistics = bus.decoder.statistics
-    if not bus.values:
-        name = f"0x{vehicle.current.arbitration_id:X} ({vehicle.current.message})"
-        problem = f"the frames of {name} give no current ({'; '.join(_losses(statistics))})"
-        if not statistics.messages[vehicle.current.key].wanted:
-            problem = f"the capture holds no frames of {name}, which carries the current"
-        raise InputError(
-            problem,
-            source=path,
-            cure="check the vehicle; `cangauge inspect` lists the frames of a capture",
-        )
+            _keep(decoder.handle(message), decoder, values)
+    for _, decoder, values in buses.values():
+        _keep(decoder.flush(), decoder, values)
+    channel, (own, decoder, values) = max(buses.items(), key=lambda item: len(item[1][2]))
+    statistics = decoder.statistics
+    if not values:
+        raise _without_current(path, vehicle, statistics)
     remarks = [*capture.info.remarks, *_losses(statistics)]
-    if sum(bool(other.values) for other in buses.values()) > 1:
+    if sum(bool(each[2]) for each in buses.values()) > 1:
         remarks.append(f"several buses carry the frames; bus {channel} is used: most samples")
-    if isinstance(bus.clock, ReceiveTime) and bus.clock.irregular:
-        remarks.append(f"{bus.clock.irregular} time stamps step back: they are irregular")
+    if isinstance(own, ReceiveTime) and own.irregular:
+        remarks.append(f"{own.irregular} time stamps step back: they are irregular")
     if clock.beginnings:
         remarks.append(f"the replay clock starts again {clock.beginnings} times")
-    time_s, current_a, voltage_v, temperature_c, soc_pct = np.array(bus.values).reshape(-1, 5).T
+    time_s, current_a, voltage_v, temperature_c, soc_pct = np.array(values).reshape(-1, 5).T
     return CaptureSamples(
         time_s, current_a, voltage_v, temperature_c, soc_pct,
         statistics, capture.info, tuple(remarks),
     )  # fmt: skip
 
 
+def _keep(sample: Sample | None, decoder: SampleDecoder, values: array[float]) -> None:
+    if sample is not None:
+        values.extend((*sample, decoder.reference_soc_pct))
+
+
+def _without_current(
+    path: str | PathLike[str], vehicle: Vehicle, statistics: FrameStatistics
+) -> InputError:
+    name = f"0x{vehicle.current.arbitration_id:X} ({vehicle.current.message})"
+    problem = f"the frames of {name} give no current ({'; '.join(_losses(statistics))})"
+    if not statistics.messages[vehicle.current.key].wanted:
+        problem = f"the capture holds no frames of {name}, which carries the current"
+    cure = "check the vehicle; `cangauge inspect` lists the frames of a capture"
+    return InputError(problem, source=path, cure=cure)
+
+
 def _losses(statistics: FrameStatistics) -> list[str]:
-    losses = [
-        f"{count} {text}"
-        for count, text in (
-            (statistics.crc_errors, "frames refused: wrong CRC"),
-            (statistics.counter_repeats, "frames refused: repeated counter"),
-            (statistics.short, "frames refused: too short"),
-            (statistics.two_senders, "frames refused: two senders use their id"),
-            (statistics.not_available, "values refused: code for 'not available'"),
-        )
-        if count
-    ]
-    if statistics.counter_jumps:
-        losses.append(
-            f"{statistics.counter_jumps} counter jumps:"
-            f" at least {statistics.frames_lost} frames lost"
-        )
-    return losses
+    counts = {
+        "frames refused: wrong CRC": statistics.crc_errors,
+        "frames refused: repeated counter": statistics.counter_repeats,
+        "frames refused: too short": statistics.short,
+        "frames refused: two senders use their id": statistics.two_senders,
+        "values refused: code for 'not available'": statistics.not_available,
+        f"counter jumps: at least {statistics.frames_lost} frames lost": statistics.counter_jumps,
+    }
+    return [f"{count} {text}" for text, count in counts.items() if count]
 
 
 def capture_to_log(
@@ -385,12 +353,7 @@ def capture_to_log(
 
     A log has every value in every row. Time stamps that do not increase are dropped; voltage is
     interpolated over at most `VOLTAGE_FILL_S`; temperature is the latest one, before the first
-    the first. Remarks count these rows and the lost frames.
-
-    Parameters
-    ----------
-    path, vehicle, source
-        As of `capture_samples`.
+    the first. Remarks count these rows and the lost frames. Arguments as in `capture_samples`.
 
     Raises
     ------
@@ -398,12 +361,9 @@ def capture_to_log(
         If the capture cannot be read, gives no sample, no voltage or no temperature, holds
         several consecutive replays, or values that are not a battery's.
     """
-    samples = capture_samples(path, vehicle, source=source)
-    path = Path(path)
-    remarks = list(samples.remarks)
-    # Stamps larger than all before them.
-    latest_s = np.concatenate([[-np.inf], np.maximum.accumulate(samples.time_s)[:-1]])
-    keep = samples.time_s > latest_s
+    samples, path = capture_samples(path, vehicle, source=source), Path(path)
+    remarks, time_s = list(samples.remarks), samples.time_s
+    keep = time_s > np.concatenate([[-np.inf], np.maximum.accumulate(time_s)[:-1]])
     dropped = np.count_nonzero(~keep)
     if dropped > 0.5 * keep.size:
         raise InputError(
@@ -414,17 +374,10 @@ def capture_to_log(
         )
     if dropped:
         remarks.append(f"{dropped} samples dropped whose time does not advance")
-    voltage_v = _filled_voltage(
-        samples.time_s[keep], samples.voltage_v[keep], path, vehicle, remarks
-    )
-    values: dict[str, Any] = {
-        "time_s": samples.time_s[keep],
-        "current_a": samples.current_a[keep],
-        "voltage_v": voltage_v,
-        "temperature_c": _filled_temperature(samples.temperature_c[keep], path, vehicle, remarks),
-        "soc_pct": samples.soc_pct[keep],
-    }
-    complete = np.isfinite(voltage_v)
+    values = {name: getattr(samples, name)[keep] for name in ("time_s", *LOG_COLUMNS.values())}
+    _fill_voltage(values, path, vehicle, remarks)
+    _fill_temperature(values, path, vehicle, remarks)
+    complete = np.isfinite(values["voltage_v"])
     values = {name: column[complete] for name, column in values.items()}
     if not np.isfinite(values["soc_pct"]).any():
         del values["soc_pct"]
@@ -435,23 +388,18 @@ def capture_to_log(
         temperature_source=vehicle.temperature_source,
         remarks=tuple(remarks),
     )
-    signals = {
-        "current_a": vehicle.current,
-        "voltage_v": vehicle.voltage,
-        "temperature_c": vehicle.temperature,
-        "soc_pct": vehicle.soc_reference,
-    }
-    names = {field: each.codec.name for field, each in signals.items() if each is not None}
+    names = {LOG_COLUMNS[each.role]: each.codec.name for each in vehicle.signals}
     labels = {"time_s": "time stamps", **names}
     refuse_wrong_units(values, source=path, labels=labels, in_seconds=True)
     return resolve_sign(log, stored_sign_unknown=False)
 
 
-def _filled_voltage(
-    time_s: FloatArray, voltage_v: FloatArray, path: Path, vehicle: Vehicle, remarks: list[str]
-) -> FloatArray:
-    known = np.flatnonzero(np.isfinite(voltage_v))
-    missing = np.flatnonzero(~np.isfinite(voltage_v))
+def _fill_voltage(
+    values: dict[str, FloatArray], path: Path, vehicle: Vehicle, remarks: list[str]
+) -> None:
+    time_s, voltage_v = values["time_s"], values["voltage_v"]
+    is_known = np.isfinite(voltage_v)
+    known, missing = np.flatnonzero(is_known), np.flatnonzero(~is_known)
     if not known.size:
         raise InputError(
             "the capture gives no voltage that pairs with a current",
@@ -459,25 +407,22 @@ def _filled_voltage(
             field=vehicle.voltage.message,
             cure="check the mapping, and pair_within_s",
         )
-    if not missing.size:
-        return voltage_v
     right = np.searchsorted(known, missing)
     inside = (right > 0) & (right < known.size)
-    right_row = known[right[inside]]
-    near = time_s[right_row] - time_s[known[right[inside] - 1]] <= VOLTAGE_FILL_S
-    rows = missing[inside][near]
-    filled = voltage_v.copy()
-    filled[rows] = np.interp(time_s[rows], time_s[known], voltage_v[known])
+    missing, right = missing[inside], right[inside]
+    near = time_s[known[right]] - time_s[known[right - 1]] <= VOLTAGE_FILL_S
+    rows = missing[near]
+    voltage_v[rows] = np.interp(time_s[rows], time_s[known], voltage_v[known])
     if rows.size:
         remarks.append(f"{rows.size} samples without voltage: interpolated")
-    if missing.size > rows.size:
-        remarks.append(f"{missing.size - rows.size} samples without voltage dropped")
-    return filled
+    if dropped := voltage_v.size - known.size - rows.size:
+        remarks.append(f"{dropped} samples without voltage dropped")
 
 
-def _filled_temperature(
-    temperature_c: FloatArray, path: Path, vehicle: Vehicle, remarks: list[str]
-) -> FloatArray:
+def _fill_temperature(
+    values: dict[str, FloatArray], path: Path, vehicle: Vehicle, remarks: list[str]
+) -> None:
+    temperature_c = values["temperature_c"]
     rows = np.flatnonzero(np.isfinite(temperature_c))
     if not rows.size:
         raise InputError(
@@ -486,9 +431,7 @@ def _filled_temperature(
             field=None if vehicle.temperature is None else vehicle.temperature.message,
             cure="give --temperature °C",
         )
-    if rows.size == temperature_c.size:
-        return temperature_c
-    latest = np.searchsorted(rows, np.arange(temperature_c.size), side="right") - 1
-    missing = temperature_c.size - rows.size
-    remarks.append(f"{missing} samples without temperature: the nearest is used")
-    return np.asarray(temperature_c[rows[np.maximum(latest, 0)]])
+    if missing := temperature_c.size - rows.size:
+        latest = np.searchsorted(rows, np.arange(temperature_c.size), side="right") - 1
+        values["temperature_c"] = temperature_c[rows[np.maximum(latest, 0)]]
+        remarks.append(f"{missing} samples without temperature: the nearest is used")

@@ -17,8 +17,8 @@ from typing import Any, Final
 from cangauge._files import check_writable, sole_writer
 from cangauge._logging import emit
 from cangauge._text import number
-from cangauge.bus.connection import ReconnectingBus
 from cangauge.bus.publish import NO_REPORT
+from cangauge.bus.reconnecting import ReconnectingBus
 from cangauge.errors import CangaugeError, InputError
 from cangauge.service.config import RunConfig, config_keys, load_config
 from cangauge.service.lifecycle import Notifier, note_hangups, stop_on_signals

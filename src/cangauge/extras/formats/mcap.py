@@ -10,7 +10,7 @@ import can
 from can.io.generic import BinaryIOMessageWriter
 from can.typechecking import StringPathLike
 
-from cangauge.bus.captures import MAX_ID, BinaryReader
+from cangauge.bus.readers import MAX_ID, BinaryReader
 from cangauge.errors import InputError
 from cangauge.extras.formats.mcap_messages import FRAME, MAGIC, McapTopics, read_messages
 

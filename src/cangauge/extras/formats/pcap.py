@@ -16,7 +16,7 @@ from typing import Final, NamedTuple
 
 import can
 
-from cangauge.bus.captures import ERROR_FLAG, MAX_ID, BinaryReader
+from cangauge.bus.readers import ERROR_FLAG, MAX_ID, BinaryReader
 from cangauge.errors import InputError
 
 _CAN, _SLL, _SLL2 = 227, 113, 276

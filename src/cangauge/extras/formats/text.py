@@ -8,7 +8,24 @@ from typing import ClassVar, Final
 
 import can
 
-from cangauge.bus.captures import ERROR_FLAG, MAX_ID, LineReader, Stamps, blank, data_of, id_of
+from cangauge.bus.readers import ERROR_FLAG, MAX_ID, LineReader, Stamps, blank
+
+
+def data_of(text: str, length: int) -> bytes:
+    """Return the bytes of hex text; raise ValueError unless there are `length` of them."""
+    data = bytes.fromhex(text)
+    if len(data) != length or length > 64:
+        raise ValueError("length and bytes differ")
+    return data
+
+
+def id_of(text: str) -> tuple[int, bool]:
+    """Return id and whether it is extended, for formats that write all ids with 8 digits."""
+    number = int(text, 16)
+    if not 0 <= number <= MAX_ID:
+        raise ValueError("no such id")
+    return number, number > 0x7FF
+
 
 # 0000.004429 000001DB 8 FD A0 BA AA 00 00 01 A8
 _SPACED = re.compile(r"(\d+\.\d+) ++([0-9A-Fa-f]{8}) ++(\d{1,2})((?: [0-9A-Fa-f]{2})*)\s*$")

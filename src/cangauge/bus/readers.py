@@ -1,0 +1,308 @@
+"""Readers of captures: their contract, text formats, and candump's log.
+
+A format is a `CaptureReader`, recognised by the beginning of a file, not by its suffix. Others are
+in `cangauge.extras.formats`; those of other packages join by the entry point group
+`cangauge.capture_readers`.
+"""
+
+from __future__ import annotations
+
+import io
+import os
+import re
+import struct
+import zlib
+from abc import ABC, abstractmethod
+from collections.abc import Iterator, Sequence
+from functools import cache
+from importlib import import_module
+from importlib.metadata import entry_points
+from itertools import chain, islice
+from pathlib import Path
+from typing import IO, Any, ClassVar, Final, Literal, cast
+
+import can
+from can.io.blf import BLFParseError
+from can.io.generic import BinaryIOMessageReader, MessageReader, TextIOMessageReader
+from can.typechecking import StringPathLike
+
+from cangauge._files import open_unpacked
+from cangauge.errors import InputError
+
+PYTHON_CAN: Final = "cangauge.extras.formats.python_can"
+"""Module of the formats that python-can reads; loaded when a capture is opened."""
+MAX_LINE: Final = 16 * 1024
+"""Longest line of a text capture [characters]."""
+MAX_STAMP_S: Final = 1e11
+"""Largest time stamp of a frame [s]: the year 5138, counted from 1970."""
+HEAD_LINES: Final = 400
+"""First lines, by which a text format is recognised."""
+FEW_MALFORMED: Final = 100
+"""A file with more malformed lines than this, and than frames, is refused at once."""
+MAX_ID: Final = 0x1FFFFFFF
+ERROR_FLAG: Final = 0x20000000
+
+Stamps = Literal["us", "ms", "none"]
+"""Resolution of time stamps: microseconds or finer, whole milliseconds, or no stamps."""
+
+DAMAGE: Final = (
+    ValueError, LookupError, TypeError, ArithmeticError, EOFError, OSError, struct.error,
+    zlib.error, BLFParseError,
+)  # fmt: skip
+"""Errors of readers on damaged files."""
+
+
+class CaptureReader(MessageReader, ABC):
+    """Reader of one capture format, in the shape of python-can's readers.
+
+    Malformed lines or frames are skipped and counted, and a file that breaks off gives the frames
+    before. Subclasses state `name`, recognise their files in `matches`, and yield the frames in
+    `read`, which may raise any of `DAMAGE` where the file breaks off.
+
+    Parameters
+    ----------
+    file : path-like or file object
+        A path may be gzipped.
+    **_options : object
+        Ignored; python-can passes options of other readers too.
+
+    Attributes
+    ----------
+    name, unit : str
+        Of the format, and of what is malformed, for messages.
+    stamps : {"us", "ms", "none"}
+    frames, malformed : int
+        Frames read, and lines or frames skipped as malformed, so far.
+    first_malformed : int or None
+        Number of the first such line, from 1.
+    cut_off, damage : bool, str or None
+        Whether the file broke off within a line or frame, and the error there.
+    remarks : list of str
+        For the user.
+    raw : binary file object
+        The unpacked content.
+    """
+
+    name: ClassVar[str]
+    unit: ClassVar[str] = "frames"
+    stamps: Stamps = "us"
+
+    def __init__(self, file: StringPathLike | IO[Any], **_options: object) -> None:
+        self.source = Path(file) if isinstance(file, str | os.PathLike) else None
+        opened = file if self.source is None else open_unpacked(self.source)
+        self.raw = cast("io.BufferedIOBase", opened)
+        self.frames = self.malformed = 0
+        self.first_malformed: int | None = None
+        self.cut_off = False
+        self.damage: str | None = None
+        self.remarks: list[str] = []
+
+    def stop(self) -> None:
+        """Close the file."""
+        self.raw.close()
+
+    @classmethod
+    @abstractmethod
+    def matches(cls, head: bytes) -> bool:
+        """Return whether the unpacked beginning of a file, up to 64 KiB, is of this format."""
+
+    @abstractmethod
+    def read(self) -> Iterator[can.Message]:
+        """Yield the frames; raise one of `DAMAGE` where the file breaks off."""
+
+    def messages(self) -> Iterator[can.Message]:
+        """Yield the frames with usable stamps, as far as the file can be read.
+
+        Raises
+        ------
+        InputError
+            If most lines are malformed; names the first.
+        """
+        try:
+            for message in self.read():
+                if abs(message.timestamp) <= MAX_STAMP_S:  # false for NaN
+                    self.frames += 1
+                    yield message
+                else:
+                    self.skip(None)
+        except DAMAGE as error:
+            self.cut_off = True
+            self.damage = f"{type(error).__name__}: {error}"
+
+    def __iter__(self) -> Iterator[can.Message]:
+        """Yield the frames as `messages`; raise InputError for damage before the first one."""
+        yield from self.messages()
+        if self.damage is not None and not self.frames:
+            raise self.damaged()
+
+    def damaged(self) -> InputError:
+        """Return the error for a file that gives no frame."""
+        problem = f"the {self.name} file is damaged ({self.damage})"
+        return InputError(problem, source=self.source, cure="record or fetch it again")
+
+    def skip(self, line: int | None) -> None:
+        """Count a malformed line or frame; raise InputError if there are many."""
+        self.malformed += 1
+        if self.first_malformed is None:
+            self.first_malformed = line
+        if self.malformed > FEW_MALFORMED:
+            self.refuse_junk()
+
+    def refuse_junk(self) -> None:
+        """Raise InputError if more lines are malformed than are frames."""
+        if self.malformed > self.frames:
+            where = "" if self.first_malformed is None else f", the first is {self.first_malformed}"
+            raise InputError(
+                f"{self.malformed} {self.unit} are no frames of {self.name}{where},"
+                f" and only {self.frames} are",
+                source=self.source,
+                cure="record or export it again",
+            )
+
+
+class BinaryReader(CaptureReader, BinaryIOMessageReader):
+    """Reader of a binary format."""
+
+
+class LineReader(CaptureReader, TextIOMessageReader):
+    """Reader of a text format with one frame a line.
+
+    Attributes
+    ----------
+    states_length : bool
+        Whether a line states its number of bytes, so that a cut line is recognised.
+    """
+
+    states_length: ClassVar[bool] = True
+    unit: ClassVar[str] = "lines"
+
+    @classmethod
+    def matches(cls, head: bytes) -> bool:
+        """Return whether most lines are frames."""
+        reader = cls(io.BytesIO(head))
+        lines = list(islice(_lines(reader), HEAD_LINES))
+        if len(lines) > 1:
+            lines.pop()  # may be cut
+        if not lines or not reader.prepare(lines):
+            return False
+        frames = malformed = 0
+        for line in lines:
+            try:
+                frames += reader.parse(line) is not None
+            except (ValueError, OverflowError):
+                malformed += 1
+        return frames > malformed
+
+    def prepare(self, head: Sequence[str]) -> bool:
+        """Set up parsing by the first lines; return whether they are of this format."""
+        return bool(head)
+
+    @abstractmethod
+    def parse(self, line: str) -> can.Message | None:
+        """Return the frame of a line, None for a line without one.
+
+        Raises ValueError or OverflowError if the line is malformed.
+        """
+
+    def read(self) -> Iterator[can.Message]:
+        """Yield the frames of the lines."""
+        lines = _lines(self)
+        head = list(islice(lines, HEAD_LINES))
+        if head and not self.prepare(head):
+            raise InputError(f"the file is not a {self.name}", source=self.source)
+        for number, line in enumerate(chain(head, lines), start=1):
+            is_cut = not (line.endswith("\n") or self.states_length) and bool(line.strip())
+            self.cut_off |= is_cut
+            try:
+                message = None if is_cut else self.parse(line)
+            except (ValueError, OverflowError):
+                is_cut = True
+            if is_cut:
+                self.skip(number)
+            elif message is not None:
+                yield message
+
+
+def _lines(reader: CaptureReader) -> Iterator[str]:
+    """Yield the lines of a text as far as it can be read; a line beyond `MAX_LINE` in pieces."""
+    text: Any = reader.raw
+    if not isinstance(text, io.TextIOBase):
+        text = io.TextIOWrapper(io.BufferedReader(_Salvage(reader)), "latin-1", newline=None)
+    while line := text.readline(MAX_LINE):
+        yield line
+
+
+class _Salvage(io.RawIOBase):
+    """The content of a reader's file; it ends, instead of raising, where the file breaks off."""
+
+    def __init__(self, reader: CaptureReader) -> None:
+        self._reader = reader
+
+    def readable(self) -> bool:
+        return True
+
+    def readinto(self, buffer: Any, /) -> int:
+        view = memoryview(buffer)
+        try:
+            # `read1`: the content before the break is delivered before the error.
+            part = self._reader.raw.read1(view.nbytes)
+        except (EOFError, OSError, zlib.error):
+            self._reader.cut_off = True
+            return 0
+        view[: len(part)] = part
+        return len(part)
+
+
+def blank(line: str) -> can.Message | None:
+    """Return None for a blank line; raise ValueError for any other."""
+    if line.strip():
+        raise ValueError("not a frame")
+    return None
+
+
+# (1436509052.249713) vcan0 044#2A366C2BBA
+_CANDUMP_LOG = re.compile(
+    r"\((\d+\.\d+)\) (\S+) ([0-9A-Fa-f]{3}|[0-9A-Fa-f]{8})#"
+    r"(?:(#[0-9A-Fa-f])?((?:[0-9A-Fa-f]{2}\.?)*)|R(\d?))(?: ([RT]))?\s*$"
+)
+
+
+class CandumpLogReader(LineReader):
+    """Log file of candump -l; python-can's reader stops at a malformed line."""
+
+    name = "candump log"
+    states_length = False
+
+    def parse(self, line: str) -> can.Message | None:
+        """Return the frame of a line."""
+        match = _CANDUMP_LOG.match(line)
+        if match is None:
+            return blank(line)
+        number, extended = int(match[3], 16), len(match[3]) == 8
+        remote = match[6] is not None
+        data = b"" if remote else bytes.fromhex(match[5].replace(".", ""))
+        if len(data) > 64:
+            raise ValueError("longer than any frame")
+        fd_flags = int(match[4][1], 16) if match[4] else 0
+        return can.Message(
+            timestamp=float(match[1]),
+            arbitration_id=number & MAX_ID,
+            is_extended_id=extended,
+            channel=match[2],
+            is_remote_frame=remote,
+            is_error_frame=extended and bool(number & ERROR_FLAG),
+            is_fd=match[4] is not None,
+            bitrate_switch=bool(fd_flags & 1),
+            error_state_indicator=bool(fd_flags & 2),
+            is_rx=match[7] != "T",
+            dlc=int(match[6] or 0) if remote else None,
+            data=None if remote else data,
+        )
+
+
+@cache
+def capture_readers() -> tuple[type[CaptureReader], ...]:
+    """Return all readers of captures, in the order of their trial."""
+    library: tuple[type[CaptureReader], ...] = import_module(PYTHON_CAN).READERS
+    others = (each.load() for each in entry_points(group="cangauge.capture_readers"))
+    return (*library, CandumpLogReader, *others)

@@ -1,0 +1,200 @@
+"""A bus in use: pending frames, packets that are none, full queues, errors of drivers."""
+
+from __future__ import annotations
+
+import errno
+import os
+import socket
+import sys
+import time
+
+import can
+import pytest
+from can.typechecking import CanFilter
+
+from cangauge.bus.connection import AT_ONCE, BusConnection, BusError, error_kinds
+from cangauge.bus.open import BusAddress, backend_capabilities, bus_address, open_bus
+from cangauge.bus.publish import standard_filter
+from live import BrokenBus, network_down, unpack_error
+
+FILTERS: list[CanFilter] = [
+    standard_filter(0x123),
+    {"can_id": 0x1ABCDE00, "can_mask": 0x1FFFFF00, "extended": True},
+]
+linux_only = pytest.mark.skipif(sys.platform != "linux", reason="kernel stamps are Linux's")
+FRAME = can.Message(arbitration_id=1, is_extended_id=False)
+
+
+def multicast(**more: bool) -> BusAddress:
+    return bus_address("udp_multicast", options={"port": 20_000 + os.getpid() % 20_000, **more})
+
+
+def broken(*script: object) -> BusConnection:
+    return BusConnection(BrokenBus(list(script)), "x")  # type: ignore[arg-type] # what is used of it
+
+
+@linux_only
+@pytest.mark.parametrize("carries_fd", [True, False])
+def test_frames_that_pass_the_filters_are_received(carries_fd: bool) -> None:
+    standard = {"arbitration_id": 0x123, "is_extended_id": False}
+    wanted = [
+        can.Message(**standard, data=bytes(range(8))),
+        can.Message(**standard, is_remote_frame=True, dlc=3),
+        can.Message(**standard, data=b"1", channel="elsewhere"),
+        can.Message(arbitration_id=0x1ABCDE77, is_extended_id=True, data=b"123"),
+    ]
+    fd = can.Message(**standard, data=bytes(64), is_fd=True, bitrate_switch=True)
+    others = [
+        can.Message(arbitration_id=0x123, is_extended_id=True),
+        can.Message(arbitration_id=0x124, is_extended_id=False),
+    ]
+    with (
+        BusConnection(open_bus(multicast(fd=carries_fd), FILTERS), "rx") as port,
+        open_bus(multicast()) as sender,
+    ):
+        for frame in [*others, *wanted, fd, *others]:
+            sender.send(frame)
+        found = port.receive_pending(1.0)
+        expected = [*wanted, *([fd] if carries_fd else [])]
+        assert all(
+            one.equals(two, timestamp_delta=None, check_direction=False)
+            for one, two in zip(found, expected, strict=True)
+        )
+        assert port.is_drained
+        assert port.carries_fd is carries_fd
+        port.set_filters([standard_filter(0x124)])
+        sender.send(others[1])
+        sender.send(wanted[0])
+        assert [each.arbitration_id for each in port.receive_pending(1.0)] == [0x124]
+
+
+@linux_only
+def test_many_pending_frames_come_in_batches_in_order() -> None:
+    with BusConnection(open_bus(multicast()), "rx") as port, open_bus(multicast()) as sender:
+        for number in range(2 * AT_ONCE + 1):
+            sender.send(can.Message(arbitration_id=number, is_extended_id=False))
+        parts = [port.receive_pending(5.0) for _ in range(3)]
+        assert [len(each) for each in parts] == [AT_ONCE, AT_ONCE, 1]
+        numbers = [each.arbitration_id for part in parts for each in part]
+        assert numbers == list(range(2 * AT_ONCE + 1))
+        began_s = time.monotonic()
+        assert port.receive_pending(0.1) == []
+        assert time.monotonic() - began_s > 0.09
+
+
+@linux_only
+def test_packets_that_are_no_frames_are_counted() -> None:
+    address = multicast()
+    junk = [b"", b"\xff", b"\x01", b"\x90", b"\x81\xa1x\x01", bytes(5000)]
+    with (
+        BusConnection(open_bus(address), "ours") as ours,
+        open_bus(address) as sender,
+        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as raw,
+    ):
+        raw.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_TTL, 0)
+        for each in junk:
+            raw.sendto(each, (address.channel, int(address.options["port"])))
+        sender.send(FRAME)
+        assert len(ours.receive_pending(0.2)) == 1
+        assert ours.garbled == len(junk)
+
+
+@linux_only
+def test_every_frame_is_received_or_counted_as_dropped() -> None:
+    sent = 4000
+    with (
+        BusConnection(open_bus(multicast()), "receiver") as port,
+        BusConnection(open_bus(multicast()), "sender") as tx,
+    ):
+        with socket.socket(fileno=os.dup(port._bus.fileno())) as own:  # type: ignore[union-attr] # open
+            own.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 65536)
+        assert port.queue_drops == 0
+        for _ in range(sent):
+            tx.send(FRAME)
+        dropped, received = port.queue_drops, 0
+        while port.receive(0.1) is not None:
+            received += 1
+    assert dropped
+    assert received + dropped == sent
+    assert port.queue_drops == dropped  # also when it is closed
+
+
+@linux_only
+def test_the_kernel_stamps_multicast_on_arrival() -> None:
+    with (
+        BusConnection(open_bus(multicast()), "receiver") as port,
+        BusConnection(open_bus(multicast()), "sender") as tx,
+    ):
+        before_s = time.time()
+        tx.send(FRAME)
+        sent_s = time.time()
+        time.sleep(0.2)
+        message = port.receive(1.0)
+    assert message is not None
+    assert before_s - 0.001 <= message.timestamp <= sent_s + 0.1
+
+
+def test_a_bus_that_is_no_socket_counts_no_drops() -> None:
+    with BusConnection(open_bus(BusAddress("virtual", "drops")), "virtual") as port:
+        assert port.queue_drops is None
+
+
+def test_capabilities_by_interface() -> None:
+    virtual = backend_capabilities(BusAddress("virtual", "x"))
+    assert (virtual.stamps, virtual.echoes) == ("sender", False)
+    pcan = backend_capabilities(BusAddress("pcan", "PCAN_USBBUS1", {"receive_own_messages": True}))
+    assert (pcan.stamps, pcan.echoes, pcan.has_error_classes) == ("driver", True, False)
+    socketcan = backend_capabilities(BusAddress("socketcan", "can0"))
+    assert (socketcan.stamps, socketcan.echoes) == ("kernel", False)
+    assert socketcan.has_error_classes
+    assert backend_capabilities(multicast()).echoes
+    if sys.platform == "linux":
+        assert backend_capabilities(multicast()).stamps == "kernel"
+
+
+def test_frames_read_before_an_error_are_kept() -> None:
+    port = broken(FRAME, unpack_error(), FRAME, network_down())
+    assert port.receive_pending(0.0) == [FRAME, FRAME]
+    assert port.garbled == 1
+    assert not port.is_drained
+    for _ in range(2):
+        with pytest.raises(BusError, match="Network is down"):
+            port.receive_pending(0.0)
+
+
+def test_frames_after_an_error_frame_wait_for_the_next_call() -> None:
+    error = can.Message(is_error_frame=True)
+    port = broken(FRAME, error, error, FRAME, FRAME)
+    assert [len(port.receive_pending(0.0)) for _ in range(4)] == [1, 0, 2, 0]
+    assert port.error_frames == 2
+
+
+def test_send_gives_up_when_the_queue_stays_full() -> None:
+    full = can.CanOperationError("Failed to transmit: No buffer space", errno.ENOBUFS)
+    port = BusConnection(BrokenBus([], sending=full), "x")  # type: ignore[arg-type] # see above
+    assert not port.send(FRAME, within_s=0.01)
+    assert port.unsent == 1
+    down = BusConnection(BrokenBus([], sending=network_down()), "x")  # type: ignore[arg-type] # see above
+    with pytest.raises(BusError, match=r"sending failed: .*Network is down"):
+        down.send(FRAME)
+
+
+@pytest.mark.parametrize(
+    ("classes", "data", "kinds"),
+    [
+        (0x000, b"", ["unspecified"]),
+        (0x200, b"\0" * 8, ["unspecified"]),  # counters alone
+        (0x008 | 0x080, b"\0" * 8, ["protocol", "bus_error"]),
+        (0x100, b"\0" * 8, ["restarted"]),
+        (0x004, b"\x00\x30", ["receive_passive", "transmit_passive"]),
+        (0x004, b"", ["controller"]),
+        (0x044, b"\x00\x20", ["bus_off", "transmit_passive"]),
+    ],
+)
+def test_classes_of_an_error_frame_have_their_kinds(
+    classes: int, data: bytes, kinds: list[str]
+) -> None:
+    frame = can.Message(
+        arbitration_id=classes, is_extended_id=False, is_error_frame=True, data=data
+    )
+    assert error_kinds(frame) == kinds
