@@ -140,7 +140,6 @@ def test_model_without_noise_is_accepted(zero: str) -> None:
     run(model, EstimatorSettings(initial_soc_pct=50.0, initial_soc_std_pct=0.0), samples)
 
 
-@pytest.mark.xfail(strict=False, reason="open: a reading can change the reasons")
 @pytest.mark.parametrize("which", ["plain", "time_skew", "together"])
 @pytest.mark.parametrize("method", ["ekf", "newton", "coulomb"])
 @settings(max_examples=20, deadline=None, suppress_health_check=list(HealthCheck))
@@ -156,3 +155,12 @@ def test_reading_the_estimate_changes_nothing(
         if number % asked_every == 0:
             assert repr(seldom.estimate) == repr(estimate)  # NaN is NaN
     assert repr(seldom.snapshot()) == repr(often.snapshot())
+
+
+def test_reading_changes_no_reason_of_a_held_sample() -> None:
+    model = extended_by(["time_skew"])
+    often, seldom = Estimator(model), Estimator(model)
+    for time_s, voltage_v in [*((float(k), 370.0) for k in range(30)), (29.1, 9000.0)]:
+        often.step(Sample(time_s, 20.0, voltage_v, 23.0))
+        seldom.update(Sample(time_s, 20.0, voltage_v, 23.0))
+    assert seldom.estimate.reasons == often.estimate.reasons

@@ -122,11 +122,10 @@ class Estimator:
         self._innovations_at_most = float(chdtri(self._tested_blocks, MISMATCH_ALARM))
         self._strain_at_most = float(chdtri(self._online.functions.number + 4, MISMATCH_ALARM))
         self._memory = EstimatorMemory()
-        self._implausible = Reason.NONE
         self.is_refused = False
         self._latest = Estimate.unknown(Reason.NO_INITIAL_SOC)
-        # Sample and stamp of which the estimate is not computed yet; None: it is computed.
-        self._pending: tuple[Sample, float] | None = None
+        # Sample, stamp and reasons of an estimate that is not computed yet; None: it is computed.
+        self._pending: tuple[Sample, float, Reason] | None = None
         if self.settings.initial_soc_pct is not None:
             soc_pct = self._online.initial_soc_pct(self.settings.initial_soc_pct)
             self._start(soc_pct, self.settings.initial_soc_std_pct, is_doubtful=True)
@@ -158,7 +157,7 @@ class Estimator:
         if time_s is None:
             return
         stamp_s = sample.time_s
-        sample, self._implausible = drop_implausible(
+        sample, implausible = drop_implausible(
             sample._replace(time_s=time_s), self.voltage_model.nominal_v
         )
         memory = self._memory
@@ -169,7 +168,7 @@ class Estimator:
         for reading in corrected:
             self._process(Sample(*reading))
         if corrected:
-            self._pending = Sample(*corrected[-1]), stamp_s
+            self._pending = Sample(*corrected[-1]), stamp_s, implausible
         else:
             self._latest = self._evaluate()._replace(time_s=stamp_s, samples=memory.samples)
 
@@ -402,10 +401,10 @@ class Estimator:
         """Return the estimate after the latest accepted sample."""
         if self._pending is None:
             return self._latest
-        (sample, stamp_s), self._pending = self._pending, None
+        (sample, stamp_s, implausible), self._pending = self._pending, None
         memory = self._memory
         soc_pct, std_pct = self._soc_and_std_pct()
-        reasons = self._reasons(sample, soc_pct, std_pct)
+        reasons = self._reasons(sample, soc_pct, std_pct, implausible)
         self._latest = Estimate(
             stamp_s,
             soc_pct,
@@ -453,10 +452,12 @@ class Estimator:
             counter.moved_pct - memory.coulomb_moved_pct,
         )
 
-    def _reasons(self, sample: Sample, soc_pct: float, std_pct: float) -> Reason:
+    def _reasons(
+        self, sample: Sample, soc_pct: float, std_pct: float, implausible: Reason
+    ) -> Reason:
         # In plain bits: operations on flags are slow. Comparisons with NaN are false.
         memory, line = self._memory, self._online.delay_line
-        bits = int(self._permanent_reasons) | int(self._implausible)
+        bits = int(self._permanent_reasons) | int(implausible)
         for is_set, reason in (
             (math.isnan(soc_pct), Reason.NO_INITIAL_SOC),
             (std_pct > self.settings.valid_std_pct, Reason.SOC_UNCERTAIN),
