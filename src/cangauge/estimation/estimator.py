@@ -122,6 +122,7 @@ class Estimator:
         self._innovations_at_most = float(chdtri(self._tested_blocks, MISMATCH_ALARM))
         self._strain_at_most = float(chdtri(self._online.functions.number + 4, MISMATCH_ALARM))
         self._memory = EstimatorMemory()
+        self._implausible = Reason.NONE
         self.is_refused = False
         self._latest = Estimate.unknown(Reason.NO_INITIAL_SOC)
         # Sample, stamp and reasons of an estimate that is not computed yet; None: it is computed.
@@ -157,7 +158,7 @@ class Estimator:
         if time_s is None:
             return
         stamp_s = sample.time_s
-        sample, implausible = drop_implausible(
+        sample, self._implausible = drop_implausible(
             sample._replace(time_s=time_s), self.voltage_model.nominal_v
         )
         memory = self._memory
@@ -168,7 +169,7 @@ class Estimator:
         for reading in corrected:
             self._process(Sample(*reading))
         if corrected:
-            self._pending = Sample(*corrected[-1]), stamp_s, implausible
+            self._pending = Sample(*corrected[-1]), stamp_s, self._implausible
         else:
             self._latest = self._evaluate()._replace(time_s=stamp_s, samples=memory.samples)
 
