@@ -10,8 +10,8 @@
 #define LINEAR_PCT 1.0
 #define ITERATIONS_AT_MOST 8
 #define CLOSE_PCT 0.05
-#define LOWEST_PCT (-5.0)
-#define HIGHEST_PCT 105.0
+#define LOWEST_PCT (-25.0)
+#define HIGHEST_PCT 125.0
 
 #define CAPACITY_STD 0.1
 #define RESISTANCE_STD 0.3

@@ -60,20 +60,34 @@ def health_after_three_charges(
     return estimator.health
 
 
-@pytest.mark.xfail(reason="missed: capacity is 1.6 to 6 % wrong, with a σ that is too small")
-@pytest.mark.parametrize(("error", "offset_a"), [(0.1, 0.0), (-0.1, 0.0), (0.1, 0.07)])
-def test_three_charges_correct_the_capacity_of_a_real_cell(
-    model: Model, drives: list[Log], error: float, offset_a: float
-) -> None:
-    health = health_after_three_charges(model, drives, error, offset_a)
-    error_ah = health.capacity_ah - CAPACITY_AH
-    # Three quarters of the error, and what is left is covered. 2 % is met by two of the three.
-    assert abs(error_ah) < 0.025 * CAPACITY_AH
-    assert abs(error_ah) < 2.0 * health.capacity_std_ah
+@pytest.fixture(scope="module", params=[(0.1, 0.0), (-0.1, 0.0), (0.1, 0.07)])
+def learned(
+    request: pytest.FixtureRequest, model: Model, drives: list[Log]
+) -> tuple[Health, float]:
+    """Return the health after a wrong stated capacity and an offset [A], and the offset."""
+    error, offset_a = request.param
+    return health_after_three_charges(model, drives, error, offset_a), offset_a
+
+
+def test_three_charges_correct_the_capacity_of_a_real_cell(learned: tuple[Health, float]) -> None:
+    health, offset_a = learned
+    # Three quarters of the error; 2.3 A at 90 Ah.
+    assert abs(health.capacity_ah - CAPACITY_AH) < 0.025 * CAPACITY_AH
     assert health.capacity_std_ah < 0.03 * CAPACITY_AH
-    assert abs(health.resistance_ratio - 1.0) < 2.0 * health.resistance_std
-    # 2.3 A at 90 Ah.
     assert health.offset_a == pytest.approx(offset_a, abs=0.02)
+
+
+@pytest.mark.xfail(
+    strict=True,
+    reason="σ of capacity and resistance is 2.1 to 2.7 times too small: the filter takes the"
+    " voltage's level as one for all drives, so that drives average it",
+)
+def test_deviation_covers_capacity_and_resistance_of_a_real_cell(
+    learned: tuple[Health, float],
+) -> None:
+    health, _ = learned
+    assert abs(health.capacity_ah - CAPACITY_AH) < 2.0 * health.capacity_std_ah
+    assert abs(health.resistance_ratio - 1.0) < 2.0 * health.resistance_std
 
 
 def pulses(log: Log) -> list[tuple[int, int, float]]:

@@ -53,9 +53,11 @@ ITERATIONS_AT_MOST: Final = 8
 CLOSE_PCT: Final = 0.05
 """Iterations, and the change of the SoC that ends them [%]: less than any σ of the filter."""
 
-LOWEST_PCT: Final = -5.0
-HIGHEST_PCT: Final = 105.0
-"""Bounds of the SoC in the filter [%]: beyond the ends, so that errors stay symmetric there."""
+LOWEST_PCT: Final = -25.0
+HIGHEST_PCT: Final = 125.0
+"""Bounds of the SoC in the filter [%]. A stated capacity that is 20 % too small, two standard
+deviations of its prior, ends there. A state held back by a bound is not what the separate bias
+assumes: at −5 % a capacity stated 10 % too small was learned 6 % too small."""
 
 LEAST_SLOPE: Final = 1e-3
 """Least slope of the curve in the filter [V/%]: keeps the SoC observable in a plateau."""

@@ -15,6 +15,7 @@ from itertools import product
 from typing import Any, Final
 
 import numpy as np
+from scipy import stats
 
 from cangauge._typing import FloatArray
 from cangauge.errors import InputError
@@ -66,8 +67,10 @@ AUTO_LOGS: Final = 5
 EFFECTS_AT_MOST: Final = 6
 COMPARED: Final = 4
 """Candidates of a round that are compared on left-out logs, the best fits first."""
-T_AT_LEAST: Final = 2.5
-"""Mean gain over its standard error [-]: 1 % by chance with nineteen logs, 3 % with five."""
+SIGNIFICANCE: Final = 0.05
+"""Probability that any of the effects offered looks significant by chance [-]: the usual level.
+Divided by their number (Bonferroni), it asks for a mean gain of 4.5 standard errors with five logs
+and 2.8 with nineteen, by Student's t."""
 GAIN_AT_LEAST: Final = 0.03
 """Least mean relative decrease of a left-out log's mean square error [-]: an effect costs
 understanding."""
@@ -119,8 +122,8 @@ class SearchStep:
         Error of left-out logs [V].
     gain : float
         Mean of ln(mean square error without / with) of the left-out logs.
-    t_value : float
-        Gain over its standard error.
+    t_value, t_needed : float
+        Gain over its standard error, and what is significant for this many logs and effects.
     """
 
     what: str
@@ -129,11 +132,12 @@ class SearchStep:
     after_rmse_v: float
     gain: float
     t_value: float
+    t_needed: float
 
     @property
     def is_worth(self) -> bool:
         """Whether the gain is significant and worthwhile."""
-        return self.t_value >= T_AT_LEAST and self.gain >= GAIN_AT_LEAST
+        return self.t_value >= self.t_needed and self.gain >= GAIN_AT_LEAST
 
     def to_dict(self) -> dict[str, object]:
         """Return the step for `fit --json`."""
@@ -143,7 +147,7 @@ class SearchStep:
             "held_out_rmse_without_v": self.before_rmse_v,
             "held_out_rmse_with_v": self.after_rmse_v,
             "t_value": self.t_value,
-            "t_needed": T_AT_LEAST,
+            "t_needed": self.t_needed,
         }
 
 
@@ -367,6 +371,8 @@ class Search:
         ids = SEARCHED if self._is_auto else effect_ids
         self._wanted = list(ids)
         self._offered = offered(ids, model, logs[0].time_s)
+        chance = SIGNIFICANCE / max(len({item.effect.id for item in self._offered}), 1)
+        self._t_needed = float(stats.t.isf(chance, max(len(logs) - 1, 1)))
         widths = [len(item.amplitudes) for item in self._offered]
         ends = np.cumsum(widths)
         self._places = [
@@ -445,6 +451,7 @@ class Search:
                 float(after.mean()) ** 0.5,
                 float(gain.mean()),
                 float(gain.mean()) / max(spread, 1e-12),
+                self._t_needed,
             )
             found.append((number, step, after))
         return sorted(found, key=lambda item: -item[1].gain)
