@@ -44,7 +44,7 @@ def axis_labels(plot: Any) -> list[str]:
 
 
 def test_log_plots_its_channels(drive: Log) -> None:
-    labels = ["current [A]", "voltage [V]", "temperature [°C]", "SoC [%]"]
+    labels = ["current [A]", "voltage [V]", "temperature [°C]", "state of charge [%]"]
     assert axis_labels(drive.plot()) == labels
     assert axis_labels(replace(drive, soc_pct=None).plot()) == labels[:3]
     json_item(drive.plot())
@@ -55,7 +55,7 @@ def test_estimate_plots_band_and_reference(drive: Log, identified: Identificatio
     plot = table.plot(drive)
     soc = plot.children[0]
     legend = {item.label.value for item in soc.legend[0].items}
-    assert {"estimate", "±2σ", "by voltage alone", "by counting alone", "reference"} <= legend
+    assert {"estimate", "±2σ", "Newton", "Coulomb", "reference"} <= legend
     json_item(plot)
     json_item(table.plot())
 

@@ -14,7 +14,7 @@ from markupsafe import escape
 from cangauge._version import __version__
 from cangauge.estimation.offline import estimate_log
 from cangauge.estimation.settings import EstimatorSettings
-from cangauge.extras.report.charts import Timeline
+from cangauge.extras.report.charts import TimeFigures
 from cangauge.extras.report.estimate import estimate_page, estimate_report
 from cangauge.extras.report.fit import fit_page, fit_report
 from cangauge.extras.report.page import Bullets, Figure, Page, Section, Table, Tile, joined, render
@@ -32,17 +32,13 @@ FIT_FIGURES = [
     "Current",
     "Voltage",
     "Temperature",
-    "Power",
-    "Charge taken out",
     "Measured voltage, model and pseudo-OCV",
     "Pseudo-OCV against SoC",
     "Slope of the pseudo-OCV",
     "Measured minus modelled voltage",
     "Distribution of the error",
     "SoC from voltage alone",
-    "Error of the SoC from voltage",
     "Voltage drop against current",
-    "Energy at the terminals",
 ]
 ESTIMATE_FIGURES = [
     "Estimated state of charge",
@@ -103,7 +99,7 @@ def test_figures_have_units_on_their_axes_and_a_caption(found: Identification, l
 def test_time_figures_move_together_and_hide_by_legend(found: Identification) -> None:
     plots = [item.plot for item in fit_page(found).figures]
     over_time = [plot for plot in plots if plot.xaxis[0].axis_label.startswith("time")]
-    assert len(over_time) == 9
+    assert len(over_time) == 6
     assert len({plot.x_range.id for plot in over_time}) == 1
     assert all(legend.click_policy == "hide" for plot in plots for legend in plot.legend)
     assert all(any(type(tool).__name__ == "HoverTool" for tool in plot.tools) for plot in plots)
@@ -178,7 +174,6 @@ def test_estimate_report(found: Identification, log: Log) -> None:
 def test_without_reference_nothing_is_compared(found: Identification, log: Log) -> None:
     headings = Html(estimate_report(estimated(replace(log, soc_pct=None), found.model))).headings
     assert "Error against the reference" not in headings
-    assert "SoC error" not in headings
     assert "Uncertainty" in headings
 
 
@@ -229,14 +224,14 @@ def test_lines_break_over_gaps_and_between_logs() -> None:
         return Log(np.array(time_s), np.zeros(n), np.ones(n), np.ones(n))
 
     logs = [make([100.0, 101.0, 102.0, 110.0, 111.0]), make([5.0, 6.0, 7.0])]
-    timeline = Timeline(logs)
-    x, y = timeline.line([(item.time_s, item.time_s) for item in logs])
+    time = TimeFigures(logs)
+    x, y = time.joined([(item.time_s, item.time_s) for item in logs])
     nan = np.nan
     expected = [100.0, 101.0, 102.0, nan, 110.0, 111.0, nan, 5.0, 6.0, 7.0, nan]
     assert np.array_equal(y, expected, equal_nan=True)
     assert np.all(np.diff(x) >= 0.0)
     assert x[0] == 0.0
-    assert timeline.end == pytest.approx(x[-1])
+    assert time.end == pytest.approx(x[-1])
 
 
 def test_page_escapes_what_it_shows() -> None:

@@ -1,8 +1,7 @@
 """Figures of the report pages, drawn with bokeh.
 
 `new_figure` returns an empty figure with units and tools, `TimeFigures` makes figures over one time
-axis that zoom together. Long series are reduced to the extremes of buckets, so that no peak is
-lost.
+axis. Long series are reduced to the extremes of buckets, so that no peak is lost.
 """
 
 from __future__ import annotations
@@ -66,7 +65,6 @@ def new_figure(
     units: tuple[str, str],
     height: int = 300,
     x_range: Any = None,
-    hover_mode: str = "mouse",
     y_categories: Sequence[str] | None = None,
 ) -> Plot:
     """Return an empty figure with tools and labelled axes; its width follows the page.
@@ -80,7 +78,6 @@ def new_figure(
     height : int
         In pixels.
     x_range : bokeh range, optional
-    hover_mode : {"mouse", "vline"}
     y_categories : sequence of str, optional
         Names along the vertical axis instead of numbers.
     """
@@ -104,7 +101,6 @@ def new_figure(
             SaveTool(),
             HoverTool(
                 tooltips=f"<span style='font-size:12px'>{hover}</span>",
-                mode=hover_mode,
                 visible=False,  # always on: its button would only take room
             ),
         ],
@@ -263,16 +259,10 @@ def bars(
 
 _LOG_SPACING: Final = 0.004
 """Free space between two logs on the time axis, relative to its length."""
-_MAX_HORIZONTAL_NAMES: Final = 12
-"""With more logs their names are written vertically."""
-_AXIS_LETTERS: Final = 160
-"""Letters of 10 px that fit side by side over the whole time axis."""
-_HOVER_TIMES: Final = 2000
-"""Times along the axis at which the pointer shows the values of all lines."""
 
 
-class Timeline:
-    """A time axis from zero on which several logs follow one another.
+class TimeFigures:
+    """Figures over one time axis from zero, on which logs follow one another; they zoom together.
 
     Parameters
     ----------
@@ -280,12 +270,11 @@ class Timeline:
 
     Attributes
     ----------
-    names : list of str
+    unit : {"s", "min", "h"}
     start : array of shape (k,)
         Where each log begins on the axis, in `unit`.
-    unit : {"s", "min", "h"}
-    spacing, end : float
-        Free space between two logs, and end of the last one, in `unit`.
+    end : float
+        End of the last log, in `unit`.
     """
 
     def __init__(self, logs: Sequence[Recorded]) -> None:
@@ -293,34 +282,60 @@ class Timeline:
         spacing_s = _LOG_SPACING * float(durations_s.sum())
         ends_s = np.cumsum(durations_s + spacing_s)
         total_s = max(float(ends_s[-1]) - spacing_s, 1e-3)  # a single row needs an axis too
-        if total_s <= 300.0:
-            self._unit_s, self.unit = 1.0, "s"
-        elif total_s <= 6.0 * 3600.0:
-            self._unit_s, self.unit = 60.0, "min"
-        else:
-            self._unit_s, self.unit = 3600.0, "h"
-        self.names = [log.name for log in logs]
+        units = ((300.0, 1.0, "s"), (6.0 * 3600.0, 60.0, "min"), (np.inf, 3600.0, "h"))
+        _, self._unit_s, self.unit = next(unit for unit in units if total_s <= unit[0])
         self.start = np.concatenate(([0.0], ends_s[:-1])) / self._unit_s
-        self.spacing = spacing_s / self._unit_s
         self.end = total_s / self._unit_s
+        self._names = [log.name for log in logs]
         self._first_s = [float(log.time_s[0]) for log in logs]
         self._gap_s = [usual_gap_s(log.time_s, GAP_S) for log in logs]
+        self._boundaries = self.start[1:] - 0.5 * spacing_s / self._unit_s
+        pad = 0.01 * self.end
+        limits = (-pad, self.end + pad)
+        self.x_range = Range1d(*limits, bounds=limits, min_interval=pad / 50.0)
 
     @property
     def label(self) -> str:
         """Label of the axis."""
-        return f"{'time' if len(self.names) == 1 else 'time, logs in sequence'} [{self.unit}]"
+        return f"{'time' if len(self._names) == 1 else 'time, logs in sequence'} [{self.unit}]"
 
     def at(self, number: int, time_s: FloatArray) -> FloatArray:
         """Return the axis positions of times [s] of log `number`."""
         return np.asarray(self.start[number] + (time_s - self._first_s[number]) / self._unit_s)
 
-    def since_start(self, elapsed_s: FloatArray) -> FloatArray:
-        """Return the axis positions of times since the start of the first log [s]."""
-        return np.asarray(elapsed_s / self._unit_s)
+    def plot(self, quantity: str, unit: str, *, height: int = 240, names: bool = False) -> Plot:
+        """Return an empty figure of a quantity over time.
 
-    def line(
-        self, pieces: Sequence[tuple[FloatArray, FloatArray]], *, gap_s: float | None = None
+        Parameters
+        ----------
+        quantity, unit : str
+            For the vertical axis and the hover text.
+        height : int
+            In pixels.
+        names : bool
+            Whether to write the logs' names into it.
+        """
+        plot = new_figure(
+            (self.label, quantity),
+            f"$name: @y{{0.[000]}} {unit}<br>at @x{{0.[00]}} {self.unit}",
+            units=("", unit),
+            height=height,
+            x_range=self.x_range,
+        )
+        for boundary in self._boundaries:
+            plot.add_layout(
+                Span(location=boundary, dimension="height", line_color="#c3cad3", line_width=1)
+            )
+        if names and len(self._names) > 1:
+            for start, name in zip(self.start, self._names, strict=True):
+                text = name.replace("$", "")[:22]  # $…$ would be TeX
+                label = Label(x=float(start), y=6, y_units="screen", x_offset=12, text=text)
+                label.update(angle=1.5708, text_font_size="10px", text_color="#55606e")
+                plot.add_layout(label)
+        return plot
+
+    def joined(
+        self, pieces: Sequence[tuple[FloatArray, FloatArray]], gap_s: float | None = None
     ) -> tuple[FloatArray, FloatArray]:
         """Return one line through all logs, with NaN at gaps and between logs.
 
@@ -340,86 +355,6 @@ class Timeline:
             drawn.append(np.insert(values, breaks, np.nan))
         return np.concatenate(positions), np.concatenate(drawn)
 
-
-class _Hover:
-    """One box at the pointer with the values of all lines of a figure.
-
-    The lines are reduced independently and share no rows, so an invisible line that holds all
-    values at common times carries the box.
-    """
-
-    def __init__(self, plot: Plot, timeline: Timeline, unit: str) -> None:
-        self._plot = plot
-        self._unit = unit
-        self._at = np.linspace(0.0, timeline.end, _HOVER_TIMES)
-        self._source = _source(x=self._at)
-        self._text = [f"at @x{{0.[00]}} {timeline.unit}"]
-
-    def add(self, name: str, x: FloatArray, y: FloatArray) -> None:
-        """Add a line (x increasing, y may hold NaN)."""
-        right = np.clip(np.searchsorted(x, self._at), 1, max(x.size - 1, 1))
-        left = right - 1
-        right = np.minimum(right, x.size - 1)
-        nearest = np.where(self._at - x[left] < x[right] - self._at, left, right)
-        number = len(self._text)
-        self._source.add(y[nearest].astype(np.float32), f"y{number}")
-        self._text.append(f"{name}: @y{number}{{0.[000]}} {self._unit}")
-        hover = self._plot.select_one(HoverTool)
-        hover.tooltips = f"<div style='font-size:12px'>{'<br>'.join(self._text)}</div>"
-        if number == 1:
-            carrier = self._plot.line(x="x", y="y1", source=self._source, line_alpha=0.0)
-            hover.renderers = [carrier]
-            hover.point_policy = "follow_mouse"
-
-
-class TimeFigures:
-    """Figures over the same time axis; zooming one zooms all.
-
-    Parameters
-    ----------
-    logs : sequence of Recorded
-        Drawn one after another.
-    """
-
-    def __init__(self, logs: Sequence[Recorded]) -> None:
-        self.timeline = Timeline(logs)
-        self._hovers: dict[str, _Hover] = {}
-        pad = 0.01 * self.timeline.end
-        limits = (-pad, self.timeline.end + pad)
-        self.x_range = Range1d(*limits, bounds=limits, min_interval=pad / 50.0)
-
-    def plot(self, quantity: str, unit: str, *, height: int = 240, names: bool = False) -> Plot:
-        """Return an empty figure of a quantity over time.
-
-        Parameters
-        ----------
-        quantity, unit : str
-            For the vertical axis and the hover text.
-        height : int
-            In pixels.
-        names : bool
-            Whether to write the logs' names into it.
-        """
-        timeline = self.timeline
-        plot = new_figure(
-            (timeline.label, quantity),
-            "",
-            units=("", unit),
-            height=height,
-            x_range=self.x_range,
-            hover_mode="vline",
-        )
-        self._hovers[plot.id] = _Hover(plot, timeline, unit)
-        for start in timeline.start[1:]:
-            boundary = start - 0.5 * timeline.spacing
-            plot.add_layout(
-                Span(location=boundary, dimension="height", line_color="#c3cad3", line_width=1)
-            )
-        if names and len(timeline.names) > 1:
-            for number in range(len(timeline.names)):
-                plot.add_layout(self._name_label(number))
-        return plot
-
     def line(
         self,
         plot: Plot,
@@ -430,10 +365,9 @@ class TimeFigures:
         gap_s: float | None = None,
     ) -> None:
         """Draw one line through all logs: `pieces` holds (time_s, values) of each."""
-        x, y = self.timeline.line(pieces, gap_s=gap_s)
+        x, y = self.joined(pieces, gap_s)
         rows = extremes(y)
         add_line(plot, name, x[rows], y[rows], pen)
-        self._hovers[plot.id].add(name, x, y)
 
     def band(
         self,
@@ -443,8 +377,8 @@ class TimeFigures:
         color: str,
     ) -> None:
         """Draw a band: `pieces` holds (time_s, low, high) of each log."""
-        x, low = self.timeline.line([(time_s, low) for time_s, low, _ in pieces])
-        _, high = self.timeline.line([(time_s, high) for time_s, _, high in pieces])
+        x, low = self.joined([(time_s, low) for time_s, low, _ in pieces])
+        _, high = self.joined([(time_s, high) for time_s, _, high in pieces])
         rows, low, high = envelope(low, high)
         area = plot.varea(
             x="x",
@@ -456,27 +390,6 @@ class TimeFigures:
             name=name,
         )
         _add_to_legend(plot, name, area)
-
-    def _name_label(self, number: int) -> Label:
-        start = self.timeline.start
-        vertical = len(start) > _MAX_HORIZONTAL_NAMES
-        if vertical:
-            letters = 22
-        else:
-            end = self.timeline.end if number + 1 == len(start) else start[number + 1]
-            letters = max(3, int((end - start[number]) / self.timeline.end * _AXIS_LETTERS))
-        return Label(
-            x=float(start[number]),
-            y=6,
-            y_units="screen",
-            x_offset=12 if vertical else 3,
-            text=self.timeline.names[number].replace("$", "")[:letters],  # $…$ would be TeX
-            angle=1.5708 if vertical else 0.0,
-            text_font_size="10px",
-            text_color="#55606e",
-            background_fill_color="#ffffff",
-            background_fill_alpha=0.75,
-        )
 
 
 MAX_POINTS: Final = 4000

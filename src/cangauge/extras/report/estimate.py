@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from bokeh.models import ColumnDataSource
@@ -33,7 +33,6 @@ from cangauge.extras.report.page import (
     Bullets,
     Figure,
     InputFile,
-    Moment,
     Page,
     Paragraph,
     Section,
@@ -42,7 +41,6 @@ from cangauge.extras.report.page import (
     reconstruction_banners,
     render,
 )
-from cangauge.extras.report.verdict import Period, estimate_verdict, periods
 from cangauge.identify.rows import running_rows
 from cangauge.service.offline import Recorded, RecordedEstimate
 from cangauge.types import REASON_WORDS, Reason, Status, reason_name
@@ -78,32 +76,25 @@ def estimate_report(estimate: RecordedEstimate, model_path: Path | None = None) 
 
 def estimate_page(estimate: RecordedEstimate, model_path: Path | None = None) -> Page:
     """Return the report's content (see `estimate_report`); `figures` holds the bokeh figures."""
-    log, model, settings = estimate.recorded, estimate.model, estimate.settings
+    log, model, table = estimate.recorded, estimate.model, estimate.table
     time = TimeFigures([log])
-    found = periods(estimate.table)
-    soc = _soc(estimate, time)
-    sections = [
-        Section("State of charge", soc),
-        *_errors(estimate),
-        Section("Voltage", _voltage(log, estimate.table, time)),
-        Section("Input", _input(log, time)),
-        Section(
-            "Status",
-            [
-                _status_figure(log, estimate.table, time),
-                *_periods(found, soc[0], time),
-                _reasons(estimate.table),
-            ],
-        ),
-        Section("Model and settings", _settings(estimate)),
-    ]
+    found = periods(table)
+    reference = _reference(log)
+    status = [_status_figure(log, table, time), *_periods(found), _reasons(table)]
+    errors = [] if reference is None else [_error_table(estimate, reference)]
     return Page(
         title=f"State of charge of {log.name}",
         lead=estimate_verdict(estimate, found),
         subtitle=f"{duration(log.duration_s)}, {len(log):,} samples, estimated by"
-        f" {_METHODS[settings.method]} with the model {model.name}.",
+        f" {_METHODS[estimate.settings.method]} with the model {model.name}.",
         tiles=_tiles(estimate),
-        sections=sections,
+        sections=[
+            Section("State of charge", [*_soc(table, log.time_s, reference, time), *errors]),
+            Section("Voltage", _voltage(log, table, time)),
+            Section("Input", _input(log, time)),
+            Section("Status", status),
+            Section("Model and settings", _settings(estimate)),
+        ],
         inputs=[
             InputFile.of_model(model, model_path),
             InputFile.of_path("log", log.name, log.source),
@@ -113,6 +104,75 @@ def estimate_page(estimate: RecordedEstimate, model_path: Path | None = None) ->
             *estimate.warnings,
         ],
     )
+
+
+# --- The result in a sentence
+
+
+class Period(NamedTuple):
+    """A time without a valid estimate, since the start of the log [s]."""
+
+    start_s: float
+    end_s: float
+    status: Status
+    reason: Reason
+    """The reason that applied to most of its samples."""
+
+    def when(self, template: str = "{} … {}") -> str:
+        """Return the times as h:mm:ss."""
+        return template.format(_clock(self.start_s), _clock(self.end_s))
+
+
+def _clock(seconds: float) -> str:
+    minutes, rest = divmod(round(seconds), 60)
+    return f"{minutes // 60}:{minutes % 60:02d}:{rest:02d}"
+
+
+def periods(table: EstimateTable) -> list[Period]:
+    """Return the times that are degraded or invalid, in sequence."""
+    status, time_s = np.asarray(table.status), table.time_s
+    edges = np.flatnonzero(np.diff(status)) + 1
+    found = []
+    for begin, end in zip((0, *edges), (*edges, status.size), strict=True):
+        if begin == end or status[begin] not in {Status.DEGRADED, Status.INVALID}:
+            continue
+        reasons = np.asarray(table.reasons[begin:end]).astype(np.int64)
+        counts = {reason: int(np.count_nonzero(reasons & reason)) for reason in Reason}
+        most = max(counts, key=counts.__getitem__)
+        found.append(
+            Period(
+                float(time_s[begin] - time_s[0]),
+                float(time_s[min(end, status.size - 1)] - time_s[0]),
+                Status(int(status[begin])),
+                most if counts[most] else Reason.NONE,
+            )
+        )
+    return found
+
+
+def estimate_verdict(estimate: RecordedEstimate, found: Sequence[Period]) -> str:
+    """Return how far the SoC is from the log's own, and when and why it is not valid."""
+    table, scores = estimate.table, estimate.scores
+    known = np.flatnonzero(np.isfinite(table.soc_pct))
+    if not known.size:
+        return "No sample gives a state of charge."
+    if _reference(estimate.recorded) is not None and scores.soc_max_pct:
+        text = f"SoC within {number(scores.soc_max_pct, 1, '%')} of the log's own"
+        text += f" ({number(scores.soc_mae_pct, 1, '%')} on average)"
+    else:
+        first, last = table.soc_pct[known[0]], table.soc_pct[known[-1]]
+        std = number(2.0 * table.soc_std_pct[known[-1]], 1, "%")
+        text = f"SoC from {number(first, 1)} to {number(last, 1, '%')} (±{std} at the end, 2σ)"
+    # A share that is not whole must not round to 0 or 100 %.
+    share = number(min(max(100.0 * scores.valid_fraction, 0.1), 99.9), 1, "%")
+    whole = {0.0: "never valid", 1.0: "valid throughout"}
+    text += f"; {whole.get(scores.valid_fraction, f'valid in {share} of the samples')}"
+    if found:
+        longest = max(found, key=lambda period: period.end_s - period.start_s)
+        text += f"; {longest.status.name.lower()} {longest.when('from {} to {}')}"
+        text += f" because {REASON_WORDS[longest.reason]}" if longest.reason else ""
+        text += f", the longest of {len(found)} periods" if len(found) > 1 else ""
+    return f"{text}."
 
 
 def _tiles(estimate: RecordedEstimate) -> list[Tile]:
@@ -126,18 +186,18 @@ def _tiles(estimate: RecordedEstimate) -> list[Tile]:
     tiles = [Tile("SoC, start → end", ends, f"σ at the end {std}")]
     if _reference(estimate.recorded) is not None:
         cover = None if scores.cover_2sigma is None else 100.0 * scores.cover_2sigma
+        largest = f"largest {number(scores.soc_max_pct, 2, '%')}"
         tiles += [
-            Tile("SoC error (MAE)", number(scores.soc_mae_pct, 2, "%"),
-                 f"largest {number(scores.soc_max_pct, 2, '%')}"),
+            Tile("SoC error (MAE)", number(scores.soc_mae_pct, 2, "%"), largest),
             Tile("Newton alone (MAE)", number(scores.soc_newton_mae_pct, 2, "%"), "no counting"),
             Tile("Coulomb alone (MAE)", number(scores.soc_coulomb_mae_pct, 2, "%"), "no voltage"),
             Tile("Reference within ±2σ", number(cover, 1, "%"), "of compared samples"),
-        ]  # fmt: skip
-    tiles += [
+        ]
+    return [
+        *tiles,
         Tile("Voltage error (MAE)", number(scores.voltage_mae_pct, 2, "%"), "measured − model"),
         Tile("Valid", number(100.0 * scores.valid_fraction, 1, "%"), "of all samples"),
     ]
-    return tiles
 
 
 def _reference(log: Recorded) -> FloatArray | None:
@@ -147,94 +207,81 @@ def _reference(log: Recorded) -> FloatArray | None:
     return log.soc_pct
 
 
-def _soc(estimate: RecordedEstimate, time: TimeFigures) -> list[Figure]:
-    log, table = estimate.recorded, estimate.table
-    reference = _reference(log)
-    at = log.time_s
+# --- Figures
+
+
+def soc_plot(
+    table: EstimateTable, reference: tuple[FloatArray, FloatArray] | None, time: TimeFigures
+) -> Plot:
+    """Return the SoC with ±2σ, by voltage and by counting alone; `reference` is (time_s, SoC)."""
+    at = table.time_s
     plot = time.plot("state of charge", "%", height=380)
-    time.band(plot, "±2σ", [(at, *_band(table.soc_pct, table.soc_std_pct, 0.0))], BLUE)
-    time.line(plot, "Newton", [(at, table.soc_newton_pct)], Pen(AMBER, width=0.8, alpha=0.6))
+    low, high = table.soc_pct - 2.0 * table.soc_std_pct, table.soc_pct + 2.0 * table.soc_std_pct
+    time.band(plot, "±2σ", [(at, np.maximum(low, 0.0), np.minimum(high, 100.0))], BLUE)
+    time.line(plot, "Newton", [(at, table.soc_newton_pct)], Pen(AMBER, 0.8, 0.6, visible=False))
     time.line(plot, "Coulomb", [(at, table.soc_coulomb_pct)], Pen(GREEN, dash="dashed"))
     if reference is not None:
-        time.line(plot, "reference", [(at, reference)], Pen(BLACK, width=2.0))
+        time.line(plot, "reference", [reference], Pen(BLACK, width=2.0))
     time.line(plot, "estimate", [(at, table.soc_pct)], Pen(BLUE, width=2.0))
-    expected = (
-        "The estimate should follow the reference, which should lie inside the band."
-        if reference is not None
-        else "The log has no reference SoC."
-    )
-    figure = Figure(
-        "Estimated state of charge",
-        plot,
-        f"{expected} Newton scatters where the pseudo-OCV is flat; Coulomb counting drifts.",
-    )
+    return plot
+
+
+def _soc(
+    table: EstimateTable, at: FloatArray, reference: FloatArray | None, time: TimeFigures
+) -> list[Block]:
+    plot = soc_plot(table, None if reference is None else (at, reference), time)
+    caption = "Click “Newton” for the SoC by voltage alone; Coulomb counting drifts."
     if reference is None:
         std = time.plot("σ of SoC", "%", height=235)
         time.line(std, "σ", [(at, table.soc_std_pct)], Pen(BLUE, in_legend=False))
-        return [figure, Figure("Uncertainty", std, "Standard deviation of the estimated SoC.")]
+        return [
+            Figure("Estimated state of charge", plot, f"The log has no reference SoC. {caption}"),
+            Figure("Uncertainty", std, "Standard deviation of the estimated SoC."),
+        ]
     error = time.plot("SoC error", "%", height=280)
-    time.band(error, "±2σ", [(at, *_band(np.zeros_like(at), table.soc_std_pct, -100.0))], BLUE)
+    band = np.minimum(2.0 * table.soc_std_pct, 100.0)
+    time.band(error, "±2σ", [(at, -band, band)], BLUE)
+    sizes = [(2.0 * table.soc_std_pct, 0.9)]
     for name, soc_pct, pen in (
-        ("Newton", table.soc_newton_pct, Pen(AMBER, width=0.8, alpha=0.6)),
+        ("Newton", table.soc_newton_pct, Pen(AMBER, 0.8, 0.6, visible=False)),
         ("Coulomb", table.soc_coulomb_pct, Pen(GREEN, dash="dashed")),
         ("estimate", table.soc_pct, Pen(BLUE, width=1.8)),
     ):
         time.line(error, name, [(at, soc_pct - reference)], pen)
-    _limit_error(error, table, reference)
+        sizes += [(np.abs(soc_pct - reference), 0.99)] if pen.visible else []
+    # A wide start or a few outliers do not flatten the rest.
+    known = [(size[np.isfinite(size)], quantile) for size, quantile in sizes]
+    limit = max((float(np.quantile(size, q)) for size, q in known if size.size), default=1.0)
+    set_y_limits(error, -max(limit, 0.1), max(limit, 0.1))
     add_zero(error)
+    follow = "The estimate should follow the reference, which should lie inside the band."
     return [
-        figure,
+        Figure("Estimated state of charge", plot, f"{follow} {caption}"),
         Figure(
             "Error against the reference",
             error,
             "Each SoC minus the reference. An estimate that leaves the ±2σ band for long has an"
-            " error that its model does not expect. A wide band at the start may extend beyond the"
-            " figure.",
+            " error that its model does not expect.",
         ),
     ]
 
 
-def _band(center: FloatArray, std: FloatArray, lower_bound: float) -> tuple[FloatArray, FloatArray]:
-    """Return ±2σ around `center`, within `lower_bound` … 100."""
-    return np.maximum(center - 2.0 * std, lower_bound), np.minimum(center + 2.0 * std, 100.0)
-
-
-def _limit_error(plot: Plot, table: EstimateTable, reference: FloatArray) -> None:
-    """Set the vertical range so that a wide start or a few outliers do not flatten the rest."""
-    methods = (table.soc_newton_pct, table.soc_coulomb_pct, table.soc_pct)
-    sizes = [(np.abs(soc_pct - reference), 0.99) for soc_pct in methods]
-    sizes.append((2.0 * table.soc_std_pct, 0.9))
-    known = [(size[np.isfinite(size)], quantile) for size, quantile in sizes]
-    limit = max((float(np.quantile(size, q)) for size, q in known if size.size), default=1.0)
-    set_y_limits(plot, -max(limit, 0.1), max(limit, 0.1))
-
-
-def _errors(estimate: RecordedEstimate) -> list[Section]:
-    """Return the section with the error of each method; empty without a reference."""
+def _error_table(estimate: RecordedEstimate, reference: FloatArray) -> Table:
     table, scores = estimate.table, estimate.scores
-    reference = _reference(estimate.recorded)
-    if reference is None:
-        return []
     rows = []
     for name, soc_pct, mae_pct in (
         ("estimate", table.soc_pct, scores.soc_mae_pct),
         ("Newton alone", table.soc_newton_pct, scores.soc_newton_mae_pct),
         ("Coulomb alone", table.soc_coulomb_pct, scores.soc_coulomb_mae_pct),
     ):
-        error = soc_pct - reference
-        error = error[np.isfinite(error)]
-        rest: list[float | None] = [None] * 4
-        if error.size:
-            rest = [
-                float(np.sqrt(np.mean(error**2))),
-                float(error.mean()),
-                float(np.abs(error).max()),
-                float(error[-1]),
-            ]
-        rows.append([name, *(number(value, 2) for value in (mae_pct, *rest))])
+        error = (soc_pct - reference)[np.isfinite(soc_pct - reference)]
+        error = error if error.size else np.full(1, np.nan)
+        rms = float(np.sqrt(np.mean(error**2)))
+        values = (mae_pct, rms, float(error.mean()), float(np.abs(error).max()), float(error[-1]))
+        rows.append([name, *(number(value, 2) for value in values)])
     head = ["SoC by", "MAE [%]", "RMSE [%]", "mean [%]", "largest [%]", "at the end [%]"]
     note = f"Over {np.isfinite(reference).sum():,} samples with a reference; errors in % SoC."
-    return [Section("SoC error", [Table(head, rows, note)])]
+    return Table(head, rows, note)
 
 
 def _voltage(log: Recorded, table: EstimateTable, time: TimeFigures) -> list[Block]:
@@ -243,17 +290,24 @@ def _voltage(log: Recorded, table: EstimateTable, time: TimeFigures) -> list[Blo
     time.line(both, "measured", [(at, log.voltage_v)], Pen(BLACK, width=1.1))
     time.line(both, "model", [(at, table.voltage_model_v)], Pen(ORANGE, width=0.9, alpha=0.85))
     residual = time.plot("residual", "V", height=235)
-    pen = Pen(PURPLE, width=0.9, in_legend=False)
-    time.line(residual, "residual", [(at, table.residual_v)], pen)
+    time.line(residual, "residual", [(at, table.residual_v)], Pen(PURPLE, 0.9, in_legend=False))
     add_zero(residual)
-    is_limited = _limit_to_running(log, table, both, residual)
+    running = np.isfinite(log.voltage_v)
+    measured = int(running.sum())
+    if measured:
+        running[running] = running_rows(log.time_s[running], log.voltage_v[running])
+    error = np.abs(table.residual_v[running])
+    error = error[np.isfinite(error)]
+    below = ""
+    if int(running.sum()) < measured and error.size:
+        shown = np.concatenate([log.voltage_v[running], table.voltage_model_v[running]])
+        set_y_limits(both, float(np.nanmin(shown)), float(np.nanmax(shown)))
+        limit = float(np.quantile(error, 0.9995))
+        set_y_limits(residual, -limit, limit)
+        below = " Start-up and shut-down rows lie below the figure."
+    follow = "The model's voltage at the estimated SoC should lie on the measurement."
     return [
-        Figure(
-            "Measured and modelled voltage",
-            both,
-            "The model's voltage at the estimated SoC should lie on the measurement."
-            + (" Start-up and shut-down rows lie below the figure." if is_limited else ""),
-        ),
+        Figure("Measured and modelled voltage", both, f"{follow}{below}"),
         Figure(
             "Measured minus modelled voltage",
             residual,
@@ -263,84 +317,62 @@ def _voltage(log: Recorded, table: EstimateTable, time: TimeFigures) -> list[Blo
     ]
 
 
-def _limit_to_running(log: Recorded, table: EstimateTable, both: Plot, residual: Plot) -> bool:
-    """Limit the figures to the rows between start-up and shut-down; False if those are all."""
-    running = np.isfinite(log.voltage_v)
-    measured = int(running.sum())
-    if measured:
-        running[running] = running_rows(log.time_s[running], log.voltage_v[running])
-    error = np.abs(table.residual_v[running])
-    error = error[np.isfinite(error)]
-    if int(running.sum()) == measured or not error.size:
-        return False
-    shown = np.concatenate([log.voltage_v[running], table.voltage_model_v[running]])
-    set_y_limits(both, float(np.nanmin(shown)), float(np.nanmax(shown)))
-    limit = float(np.quantile(error, 0.9995))
-    set_y_limits(residual, -limit, limit)
-    return True
-
-
 def _input(log: Recorded, time: TimeFigures) -> list[Block]:
-    current = time.plot("current", "A", height=235)
-    pen = Pen(BLUE, width=0.9, in_legend=False)
-    time.line(current, "current", [(log.time_s, log.current_a)], pen)
-    temperature = time.plot("temperature", "°C", height=235)
-    pen = Pen(ORANGE, width=1.2, in_legend=False)
-    time.line(temperature, "temperature", [(log.time_s, log.temperature_c)], pen)
-    return [
-        Figure("Current", current, "Positive current discharges the pack, negative charges it."),
-        Figure(
-            "Temperature",
-            temperature,
-            f"Measured on: {log.temperature_source}. An estimate is valid only at temperatures that"
-            " the model was identified at.",
-        ),
-    ]
+    valid = "An estimate is valid only at temperatures that the model was identified at."
+    figures: list[Block] = []
+    for name, unit, values, color, caption in (
+        ("Current", "A", log.current_a, BLUE, "Positive current discharges the pack."),
+        ("Temperature", "°C", log.temperature_c, ORANGE,
+         f"Measured on: {log.temperature_source}. {valid}"),
+    ):  # fmt: skip
+        plot = time.plot(name.lower(), unit, height=235)
+        time.line(plot, name.lower(), [(log.time_s, values)], Pen(color, 1.0, in_legend=False))
+        figures.append(Figure(name, plot, caption))
+    return figures
+
+
+# --- Status
 
 
 def _status_figure(log: Recorded, table: EstimateTable, time: TimeFigures) -> Figure:
     """Return a row of bars for the status and one for each reason that occurs."""
-    reasons = _occurring(table)
-    names = ["status", *map(reason_name, reasons)]
-    timeline = time.timeline
+    at = time.at(0, log.time_s)
+    bars = [
+        ("status", status.name.lower(), table.status == status, _STATUS_COLORS[status])
+        for status in Status
+    ]
+    bars += [
+        (reason_name(reason), reason_name(reason), (table.reasons & reason) != 0, AMBER)
+        for reason in _occurring(table)
+    ]
+    names = list(dict.fromkeys(row for row, _, _, _ in bars))
     plot = new_figure(
-        (timeline.label, ""),
-        f"@what<br>@left{{0.[00]}} … @right{{0.[00]}} {timeline.unit}",
+        (time.label, ""),
+        f"@what<br>@left{{0.[00]}} … @right{{0.[00]}} {time.unit}",
         units=("", ""),
         height=76 + 30 * len(names),
         x_range=time.x_range,
         y_categories=names[::-1],
     )
-    at = timeline.at(0, log.time_s)
-    for status in Status:
-        intervals = _intervals(at, table.status == status)
-        _add_bars(plot, "status", status.name.lower(), intervals, _STATUS_COLORS[status])
-    for reason, name in zip(reasons, names[1:], strict=True):
-        _add_bars(plot, name, name, _intervals(at, (table.reasons & reason) != 0), AMBER)
+    for row, what, mask, color in bars:
+        left, right = _intervals(at, mask)
+        columns: dict[str, Any] = {"left": left, "right": right}
+        columns |= {"row": [row] * left.size, "what": [what] * left.size}
+        plot.hbar(
+            y="row",
+            left="left",
+            right="right",
+            height=0.62,
+            fill_color=color,
+            line_color=color,  # keeps a single sample visible
+            source=ColumnDataSource(columns),
+        )
     plot.ygrid.grid_line_color = None
     return Figure(
         "Status over time",
         plot,
         "Green: valid; amber: degraded; grey: initialising; black: invalid. Below: when each reason"
         " applied.",
-    )
-
-
-def _add_bars(
-    plot: Plot, row: str, hover: str, intervals: tuple[FloatArray, FloatArray], color: str
-) -> None:
-    left, right = intervals
-    if not left.size:
-        return
-    columns = {"left": left, "right": right, "row": [row] * left.size, "what": [hover] * left.size}
-    plot.hbar(
-        y="row",
-        left="left",
-        right="right",
-        height=0.62,
-        fill_color=color,
-        line_color=color,  # keeps a single sample visible
-        source=ColumnDataSource(columns),
     )
 
 
@@ -357,37 +389,34 @@ def _intervals(at: FloatArray, mask: NDArray[np.bool_]) -> tuple[FloatArray, Flo
 
 def _reasons(table: EstimateTable) -> Table:
     """Return the share of samples with each status and each reason, with its meaning."""
-    rows = [
-        [status.name.lower(), _share(table.status == status), ""]
-        for status in Status
-        if np.any(table.status == status)
-    ]
-    rows += [
-        [reason_name(reason), _share((table.reasons & reason) != 0), REASON_WORDS[reason]]
+    shares = [(status.name.lower(), table.status == status, "") for status in Status]
+    shares += [
+        (reason_name(reason), (table.reasons & reason) != 0, REASON_WORDS[reason])
         for reason in _occurring(table)
+    ]
+    rows = [
+        [name, number(100.0 * float(mask.mean()), 1, "%"), words]
+        for name, mask, words in shares
+        if mask.any()
     ]
     return Table(["status or reason", "share of samples", "meaning"], rows)
 
 
-def _periods(found: Sequence[Period], figure: Figure, time: TimeFigures) -> list[Block]:
-    """Return the table of the periods without a valid estimate, each leading to the figure."""
+def _periods(found: Sequence[Period]) -> list[Block]:
+    """Return the table of the periods without a valid estimate."""
     if not found:
         return []
     longest = sorted(found, key=lambda period: period.start_s - period.end_s)[:_LISTED_PERIODS]
-    rows: list[list[str | Moment]] = []
-    for period in sorted(longest):
-        margin_s = 0.25 * (period.end_s - period.start_s) + 1.0
-        first_s, last_s = period.start_s - margin_s, period.end_s + margin_s
-        start, end = time.timeline.since_start(np.array([first_s, last_s]))
-        rows.append(
-            [
-                Moment(period.when(), figure, float(start), float(end)),
-                duration(period.end_s - period.start_s),
-                period.status.name.lower(),
-                REASON_WORDS.get(period.reason, ""),
-            ]
-        )
-    note = "h:mm:ss since the start of the log. A link zooms the figures to the period."
+    rows = [
+        [
+            period.when(),
+            duration(period.end_s - period.start_s),
+            period.status.name.lower(),
+            REASON_WORDS.get(period.reason, ""),
+        ]
+        for period in sorted(longest)
+    ]
+    note = "h:mm:ss since the start of the log."
     if len(found) > len(rows):
         note += f" The longest {len(rows)} of {len(found):,} periods."
     return [Table(["period", "duration", "status", "main reason"], rows, note)]
@@ -397,35 +426,26 @@ def _occurring(table: EstimateTable) -> Sequence[Reason]:
     return [reason for reason in Reason if np.any(table.reasons & reason)]
 
 
-def _share(mask: NDArray[np.bool_]) -> str:
-    return number(100.0 * float(mask.mean()), 1, "%")
-
-
 def _settings(estimate: RecordedEstimate) -> list[Block]:
     log, model, settings = estimate.recorded, estimate.model, estimate.settings
     initial = "from the first voltages"
     if settings.initial_soc_pct is not None:
         std = number(settings.initial_soc_std_pct, 1, "%")
         initial = f"{number(settings.initial_soc_pct, 1)} ± {std}"
-    blocks: list[Block] = [
-        Table(
-            ["setting", ""],
-            [
-                ["method", settings.method],
-                ["initial SoC (±1σ)", initial],
-                ["capacity", number(settings.capacity_ah or model.capacity_ah, 2, "Ah")],
-                ["a gap is longer than", number(settings.gap_s, 1, "s")],
-                ["model", model.name],
-                ["voltage error (MAE) of the model",
-                 f"{number(model.noise.voltage_mae_pct, 2, '%')} on {model.noise.judged_on}"],
-                ["identified at SoC", span(*model.range.soc_pct, 1, "%")],
-                ["identified at temperature", span(*model.range.temperature_c, 1, "°C")],
-                ["identified at current", span(*model.range.current_a, 0, "A")],
-                ["temperature of model / log",
-                 f"{model.temperature_source} / {log.temperature_source}"],
-            ],
-        )
-    ]  # fmt: skip
+    error = number(model.noise.voltage_mae_pct, 2, "%")
+    rows = {
+        "method": settings.method,
+        "initial SoC (±1σ)": initial,
+        "capacity": number(settings.capacity_ah or model.capacity_ah, 2, "Ah"),
+        "a gap is longer than": number(settings.gap_s, 1, "s"),
+        "model": model.name,
+        "voltage error (MAE) of the model": f"{error} on {model.noise.judged_on}",
+        "identified at SoC": span(*model.range.soc_pct, 1, "%"),
+        "identified at temperature": span(*model.range.temperature_c, 1, "°C"),
+        "identified at current": span(*model.range.current_a, 0, "A"),
+        "temperature of model / log": f"{model.temperature_source} / {log.temperature_source}",
+    }
+    blocks: list[Block] = [Table(["setting", ""], [list(row) for row in rows.items()])]
     if log.remarks:
         blocks += [Paragraph("Remarks on the log:"), Bullets(log.remarks)]
     return blocks

@@ -4,27 +4,24 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Final
 
 import numpy as np
 
-from cangauge._text import duration, number, significant, span
+from cangauge._text import NONE_KNOWN, duration, number, significant, span
 from cangauge._typing import FloatArray
 from cangauge.extras.report.charts import (
     BLACK,
     BLUE,
-    GREEN,
     GREY,
     ORANGE,
-    PURPLE,
     Pen,
     Plot,
     TimeFigures,
     add_cloud,
     add_line,
     add_zero,
-    bars,
     histogram,
     new_figure,
     set_y_limits,
@@ -45,22 +42,23 @@ from cangauge.extras.report.page import (
     reconstruction_banners,
     render,
 )
-from cangauge.extras.report.verdict import fit_verdict
 from cangauge.identify.evaluate import LogFit
 from cangauge.identify.fit import Identification
 from cangauge.identify.rows import running_rows
 from cangauge.identify.tables import effect_rows, rounded, search_rows
-from cangauge.model.coulomb_counting import discharged_ah
+from cangauge.inspect.log import TEMPERATURE_SPAN_K
 from cangauge.model.effects.library import LIBRARY
 from cangauge.model.model_file import Model, Published
 from cangauge.model.voltage_model import VoltageModel
 
 _UNITS: Final = {"V": "V", "V/K": "V/K", "ohm": "Ω"}
 _REMOVED_BY: Final = {
-    "decimation": "not on the model's rate (decimation)",
-    "start_up_or_shut_down": "low voltage at start-up or shut-down, and 2 s around it",
-    "delay_line_filling": "delay line not yet full, at the start or after a gap",
+    "decimation": "not on the model's rate",
+    "start_up_or_shut_down": "at start-up or shut-down",
+    "delay_line_filling": "delay line not yet full",
 }
+_NEAR_AN_END_PCT: Final = 10.0
+"""Range of SoC at an end that a model may lack without a word [%]: cars keep as much unused."""
 
 
 def fit_report(result: Identification) -> str:
@@ -73,13 +71,13 @@ def fit_page(result: Identification) -> Page:
     logs, model = result.logs, result.model
     time = TimeFigures(logs)
     rows = sum(len(item.rows) for item in result.fits)
+    condition = result.published.condition_number
     sections = [
         Section("Fit and pseudo-OCV", _fit_figures(result, time)),
         Section("Voltage error", _voltage_error(result, time)),
-        Section("State of charge from voltage", _newton_figures(result, time)),
-        Section("Resistance", [_resistance_figure(result)]),
-        Section("Energy", _energy(result)),
-        Section("Coefficients", coefficient_tables(result.model, _condition(result))),
+        Section("State of charge from voltage", [_newton_figure(result, time)]),
+        Section("Resistance and energy", [_resistance_figure(result), _energy(result)]),
+        Section("Coefficients", coefficient_tables(model, condition)),
         *([Section("Effects", _effects(result))] if result.effects is not None else []),
         Section("Recorded data", _recorded_figures(result, time)),
         Section("How the model was made", _method(result)),
@@ -101,38 +99,73 @@ def fit_page(result: Identification) -> Page:
     )
 
 
+def fit_verdict(result: Identification) -> str:
+    """Return where the model holds, its error there, and which log would widen it."""
+    low, high = result.model.range.soc_pct
+    noise = result.model.noise
+    error, on = number(noise.voltage_mae_pct, 2, "%"), noise.judged_on
+    if error == NONE_KNOWN:
+        error, on = number(result.voltage_mae_pct, 2, "%"), "its own rows"
+    text = f"Good from {low:.0f} to {high:.0f} % SoC: mean voltage error {error} on {on}."
+    ends = [f"below {low:.0f} %"] if low > _NEAR_AN_END_PCT else []
+    ends += [f"above {high:.0f} %"] if high < 100.0 - _NEAR_AN_END_PCT else []
+    if ends:
+        text += f" Add a drive {' and '.join(ends)}: there the curve {_beyond(result.model)}."
+    temperatures = np.concatenate([item.rows.temperature_c for item in result.fits])
+    if (change_k := float(np.ptp(temperatures))) < TEMPERATURE_SPAN_K:
+        text += f" The temperature moves by {number(change_k, 1, 'K')}: kt is not identified."
+    return text
+
+
+def _beyond(model: Model) -> str:
+    knots = "follows the typical cell of the chemistry"
+    return knots if model.equation == "knots" else "is extrapolated linearly"
+
+
 def _tiles(result: Identification) -> list[Tile]:
     noise, energy = result.model.noise, result.energy
+    net = significant(energy.net_kwh, 3, "kWh")
     return [
-        Tile("Voltage error (MAE)", number(result.voltage_mae_pct, 3, "%"),
-             f"RMSE {significant(result.voltage_rmse_v, 3, 'V')}"),
-        Tile("Held out (MAE)", number(noise.voltage_mae_pct, 3, "%"),
-             f"RMSE {significant(noise.voltage_rmse_v, 3, 'V')}"),
-        Tile("SoC by Newton (MAE)", number(result.soc_newton_mae_pct, 2, "%"),
-             "against counting"),
-        Tile("Slope resistance", significant(result.slope_ohm, 3, "Ω"),
-             f"expected {significant(result.slope_expected_ohm, 3, 'Ω')}"),
+        Tile(
+            "Voltage error (MAE)",
+            number(result.voltage_mae_pct, 3, "%"),
+            f"RMSE {significant(result.voltage_rmse_v, 3, 'V')}",
+        ),
+        Tile(
+            "Held out (MAE)",
+            number(noise.voltage_mae_pct if result.held_out_error_v else None, 3, "%"),
+            f"RMSE {significant(noise.voltage_rmse_v, 3, 'V')}"
+            if result.held_out_error_v
+            else noise.judged_on,
+        ),
+        Tile("SoC by Newton (MAE)", number(result.soc_newton_mae_pct, 2, "%"), "against counting"),
+        Tile(
+            "Slope resistance",
+            significant(result.slope_ohm, 3, "Ω"),
+            f"expected {significant(result.slope_expected_ohm, 3, 'Ω')}",
+        ),
         Tile("Capacity", number(result.model.capacity_ah, 2, "Ah"), "100 → 0 %"),
-        Tile("Efficiency", number(energy.efficiency_pct, 1, "%"),
-             f"net {significant(energy.net_kwh, 3, 'kWh')},"
-             f" heat {significant(energy.heat_kwh, 3, 'kWh')}"),
-    ]  # fmt: skip
+        Tile("Efficiency", number(energy.efficiency_pct, 1, "%"), f"net {net}"),
+    ]
+
+
+# --- Figures
 
 
 def _fit_figures(result: Identification, time: TimeFigures) -> list[Block]:
-    over_time = time.plot("voltage", "V", height=320, names=True)
+    plot = time.plot("voltage", "V", height=320, names=True)
     for name, pen, values in (
         ("measured", Pen(BLACK, width=1.2), lambda item: item.rows.voltage_v),
         ("model", Pen(ORANGE, width=1.0, alpha=0.85), lambda item: item.voltage_model_v),
         ("pseudo-OCV", Pen(BLUE, width=1.8), lambda item: item.pseudo_ocv_v),
     ):
-        time.line(over_time, name, _over_time(result, values), pen, gap_s=_gap_s(result))
+        time.line(plot, name, _over_time(result, values), pen, gap_s=_gap_s(result))
     low, high = result.voltage_model.soc_range_pct
-    has_effects = bool(result.model.effects)
+    effects = ", effects" if result.model.effects else ""
     return [
         Figure(
             "Measured voltage, model and pseudo-OCV",
-            over_time,
+            plot,
             "The model should lie on the measurement. The pseudo-OCV is its part without current."
             " Rows that the fit did not use leave gaps.",
         ),
@@ -142,9 +175,8 @@ def _fit_figures(result: Identification, time: TimeFigures) -> list[Block]:
                     "Pseudo-OCV against SoC",
                     _ocv_plot(result),
                     "Dots: the measured voltage minus the model's resistances"
-                    f"{', effects' if has_effects else ''} and temperature term."
-                    f" The logs cover {span(low, high, 1, '%')}; in the shaded part the curve"
-                    f" {_beyond(result.model)}.",
+                    f"{effects} and temperature term. The logs cover {span(low, high, 1, '%')}; in"
+                    f" the shaded part the curve {_beyond(result.model)}.",
                 ),
                 Figure(
                     "Slope of the pseudo-OCV",
@@ -221,75 +253,60 @@ def _voltage_error(result: Identification, time: TimeFigures) -> list[Block]:
         time.line(plot, "held out", held_out, pen, gap_s=gap_s)
         parts.append(("held out", np.concatenate([values for _, values in held_out]), ORANGE))
     add_zero(plot)
+    noise = result.model.noise
+    hidden = expected = ""
+    if len(parts) > 1:
+        hidden = " “Held out” (click the legend) is the error on rows that the fit did not see:"
+        hidden += f" {noise.judged_on}."
+        expected = "Expect “held out” on a new log. Where it is much wider than “fit”, the model"
+        expected += " overfits its logs. "
     return [
         Figure(
             "Measured minus modelled voltage",
             plot,
-            "A good fit scatters about zero without lasting bias. “Held out” (click the legend) is"
-            f" the error on rows that the fit did not see: {result.model.noise.judged_on}.",
+            f"A good fit scatters about zero without lasting bias.{hidden}",
         ),
         Figure(
             "Distribution of the error",
             histogram("measured − model", "V", parts),
-            "Expect “held out” on a new log. Where it is much wider than “fit”, the model overfits"
-            " its logs. The outermost bars include everything beyond.",
+            f"{expected}The outermost bars include everything beyond.",
         ),
-        _error_table(result),
-    ]
+        Table(
+            ["voltage error", "value", "unit", "meaning"],
+            [
+                ["MAE of the fit", number(result.voltage_mae_pct), "%", "of the voltage"],
+                ["RMSE of the fit", significant(result.voltage_rmse_v, 3), "V", ""],
+                ["MAE of the error model", number(noise.voltage_mae_pct), "%", noise.judged_on],
+                ["RMSE of the error model", significant(noise.voltage_rmse_v, 3), "V",
+                 noise.judged_on],
+                ["of a 30 s mean (σ)", significant(noise.fast_std_v, 3), "V", "new in each block"],
+                ["slow part (σ)", significant(noise.slow_std_v, 3), "V",
+                 f"correlated over {number(noise.slow_time_s, 0, 's')}"],
+                ["level (σ)", significant(noise.level_std_v, 3), "V",
+                 "constant over a log: does not average out"],
+                ["SoC against voltage (σ)", number(noise.soc_std_pct, 1), "%",
+                 "times the slope of the curve, a further error of the voltage"],
+            ],
+            "The filter takes its measurement noise from the last four. Level and coefficients are"
+            f" scaled by the errors of left-out logs (κ² = {number(noise.left_out_scale, 2)}).",
+        ),
+    ]  # fmt: skip
 
 
-def _error_table(result: Identification) -> Table:
-    noise = result.model.noise
-    largest_v = max(float(np.abs(item.residual_v).max()) for item in result.fits)
-    return Table(
-        ["voltage error", "value", "unit", "meaning"],
-        [
-            ["MAE of the fit", number(result.voltage_mae_pct), "%", "relative to the voltage"],
-            ["RMSE of the fit", significant(result.voltage_rmse_v, 3), "V", ""],
-            ["largest of the fit", significant(largest_v, 3), "V", ""],
-            ["MAE held out", number(noise.voltage_mae_pct), "%", noise.judged_on],
-            ["RMSE held out", significant(noise.voltage_rmse_v, 3), "V", noise.judged_on],
-            ["of a 30 s mean (σ)", significant(noise.fast_std_v, 3), "V", "another in each block"],
-            ["slow part (σ)", significant(noise.slow_std_v, 3), "V",
-             f"correlated over {number(noise.slow_time_s, 0, 's')}"],
-            ["level (σ)", significant(noise.level_std_v, 3), "V",
-             "constant over a log: does not average out"],
-            ["SoC against voltage (σ)", number(noise.soc_std_pct, 1), "%",
-             "times the slope of the curve, another error of the voltage"],
-        ],
-        "The filter takes its measurement noise from the last four. Level and coefficients are"
-        f" scaled by the errors of left-out logs (κ² = {number(noise.left_out_scale, 2)}).",
-    )  # fmt: skip
-
-
-def _newton_figures(result: Identification, time: TimeFigures) -> list[Block]:
+def _newton_figure(result: Identification, time: TimeFigures) -> Figure:
     gap_s = _gap_s(result)
-    soc = time.plot("state of charge", "%", height=280, names=True)
+    plot = time.plot("state of charge", "%", height=280, names=True)
     newton = _over_time(result, lambda item: item.soc_newton_pct)
     counted = _over_time(result, lambda item: item.rows.soc_pct)
-    time.line(soc, "Newton", newton, Pen(ORANGE, width=0.9, alpha=0.8), gap_s=gap_s)
-    time.line(soc, "counted", counted, Pen(BLACK, width=2.0), gap_s=gap_s)
-    error = time.plot("SoC error", "%", height=235)
-    time.line(
-        error, "Newton − counted",
-        _over_time(result, lambda item: item.soc_newton_pct - item.rows.soc_pct),
-        Pen(ORANGE, width=0.9, in_legend=False), gap_s=gap_s,
-    )  # fmt: skip
-    add_zero(error)
-    return [
-        Figure(
-            "SoC from voltage alone",
-            soc,
-            "The voltage equation solved for SoC at each row by Newton's method, without counting."
-            " It should scatter about the counted SoC.",
-        ),
-        Figure(
-            "Error of the SoC from voltage",
-            error,
-            f"Mean absolute error {number(result.soc_newton_mae_pct, 2, '%')}: the voltage error"
-            " divided by the slope of the pseudo-OCV, so it is large where that is flat.",
-        ),
-    ]
+    time.line(plot, "Newton", newton, Pen(ORANGE, width=0.9, alpha=0.8), gap_s=gap_s)
+    time.line(plot, "counted", counted, Pen(BLACK, width=2.0), gap_s=gap_s)
+    return Figure(
+        "SoC from voltage alone",
+        plot,
+        "The voltage equation solved for SoC at each row by Newton's method, without counting. Mean"
+        f" absolute error {number(result.soc_newton_mae_pct, 2, '%')}: the voltage error divided by"
+        " the slope of the pseudo-OCV, so it is large where that is flat.",
+    )
 
 
 def _resistance_figure(result: Identification) -> Figure:
@@ -316,51 +333,50 @@ def _resistance_figure(result: Identification) -> Figure:
     )
 
 
-def _energy(result: Identification) -> list[Block]:
+def _energy(result: Identification) -> Table:
     energy = result.energy
 
     def share(part: float, whole: float) -> str:
         return number(100.0 * part / whole if whole > 0.0 else None, 1, "%")
 
-    entries = [
-        ("driven", energy.driven_kwh, BLUE, "", "∫U·I over I > 0"),
-        ("regenerated", energy.regenerated_kwh, GREEN,
-         share(energy.regenerated_kwh, energy.driven_kwh), "of driven; over I < 0"),
-        ("net", energy.net_kwh, BLACK, "", "driven − regenerated"),
-        ("Joule heat", energy.heat_kwh, ORANGE,
-         share(energy.heat_kwh, energy.net_kwh), "of net; slope resistance × ∫I²"),
+    regenerated = share(energy.regenerated_kwh, energy.driven_kwh)
+    rows = [
+        ["driven", significant(energy.driven_kwh, 3), "", "∫U·I over I > 0"],
+        ["regenerated", significant(energy.regenerated_kwh, 3), regenerated, "∫U·I over I < 0"],
+        ["net", significant(energy.net_kwh, 3), "", "driven − regenerated"],
+        ["Joule heat", significant(energy.heat_kwh, 3), share(energy.heat_kwh, energy.net_kwh),
+         "slope resistance × ∫I²"],
+        ["efficiency", "", number(energy.efficiency_pct, 1, "%"), "net / (net + heat)"],
     ]  # fmt: skip
-    return [
-        Figure(
-            "Energy at the terminals",
-            bars(
-                "energy",
-                "kWh",
-                [(name, kwh, color) for name, kwh, color, _, _ in entries],
-                decimals=2,
-            ),
-            "Net is driven minus regenerated energy; heat is the slope resistance times ∫I².",
-        ),
-        Table(
-            ["energy", "kWh", "share", "definition"],
-            [
-                *([name, significant(kwh, 3), part, of] for name, kwh, _, part, of in entries),
-                ["efficiency", "", number(energy.efficiency_pct, 1, "%"), "net / (net + heat)"],
-            ],
-        ),
-    ]
+    return Table(["energy at the terminals", "kWh", "share", "definition"], rows)
 
 
-def _condition(result: Identification) -> float:
-    return result.published.condition_number
+def _recorded_figures(result: Identification, time: TimeFigures) -> list[Block]:
+    """Return current, voltage and temperature of the whole logs."""
+    logs = result.logs
+    running = [log.voltage_v[running_rows(log.time_s, log.voltage_v)] for log in logs]
+    is_limited = sum(values.size for values in running) < sum(map(len, logs))
+    source = result.model.temperature_source
+    figures = []
+    for name, unit, color, caption in (
+        ("current", "A", BLUE, "Positive current discharges the pack, negative charges it."),
+        ("voltage", "V", BLACK, "The voltage falls with the charge and dips under load."
+         + (" Start-up and shut-down rows lie below the figure." if is_limited else "")),
+        ("temperature", "°C", ORANGE, f"Measured on: {source}. A temperature that hardly changes"
+         " does not identify kt."),
+    ):  # fmt: skip
+        plot = time.plot(name, unit, height=235, names=name == "current")
+        field = {"A": "current_a", "V": "voltage_v", "°C": "temperature_c"}[unit]
+        pieces = [(log.time_s, getattr(log, field)) for log in logs]
+        time.line(plot, name, pieces, Pen(color, width=1.0, in_legend=False))
+        if is_limited and unit == "V":
+            shown = np.concatenate(running)
+            set_y_limits(plot, float(shown.min()), float(shown.max()))
+        figures.append(Figure(name.capitalize(), plot, caption))
+    return list(figures)
 
 
-def _beyond(model: Model) -> str:
-    return (
-        "follows the typical cell of the chemistry"
-        if model.equation == "knots"
-        else "is extrapolated linearly"
-    )
+# --- Tables
 
 
 def coefficient_tables(model: Model, condition_number: float) -> list[Block]:
@@ -375,16 +391,13 @@ def coefficient_tables(model: Model, condition_number: float) -> list[Block]:
             [f"resistance: {name}", significant(ohm, 3), "Ω"]
             for name, ohm in zip(names, loads.resistance_ohm, strict=True)
         ]
-        rows.append(["part of the resistance that follows Arrhenius",
-                     number(loads.arrhenius.factor, 2), ""])  # fmt: skip
-        blocks.append(
-            Table(
-                ["coefficient", "value", "unit"],
-                rows,
-                "U = g(S) + kt·(T − Tr) + Σ Rm·Im + b·(a(T)/a(mean T) − 1)·Σ Rm·Im, with g the"
-                " curve through knots.",
-            )
+        arrhenius = number(loads.arrhenius.factor, 2)
+        rows.append(["part of the resistance that follows Arrhenius", arrhenius, ""])
+        note = (
+            "U = g(S) + kt·(T − Tr) + Σ Rm·Im + b·(a(T)/a(mean T) − 1)·Σ Rm·Im, with g the curve"
+            " through knots."
         )
+        blocks.append(Table(["coefficient", "value", "unit"], rows, note))
     if model.published is not None:
         blocks.append(_published_table(model.published, condition_number))
     return blocks
@@ -395,20 +408,13 @@ def _published_table(model: Published, condition_number: float) -> Table:
         "k0": "1", "k1": "1/s", "k2": "1/s²", "k3": "1/s³", "k4": "1/s⁴", "k5": "s",
         "k6": "ln s", "k7": "ln(1 − s)", "kt": f"T − {model.t_ref_c:g} °C",
     }  # fmt: skip
-    for number_, delay_s in enumerate(model.delays_s, start=1):
-        factors[f"R{number_}"] = f"current {delay_s:g} s ago" if delay_s else "current"
+    for place, delay_s in enumerate(model.delays_s, start=1):
+        factors[f"R{place}"] = f"current {delay_s:g} s ago" if delay_s else "current"
     rows = []
     for name, item in model.coefficients.items():
         ratio = abs(item.value) / item.std_error if item.std_error else math.nan
-        rows.append(
-            [
-                name,
-                *rounded(item.value, item.std_error),
-                number(ratio, 1),
-                _UNITS[item.unit],
-                factors[name],
-            ]
-        )
+        value = rounded(item.value, item.std_error)
+        rows.append([name, *value, number(ratio, 1), _UNITS[item.unit], factors[name]])
     return Table(
         ["published coefficient", "value", "std. error", "|value| / error", "unit", "multiplies"],
         rows,
@@ -426,102 +432,53 @@ def _effects(result: Identification) -> list[Block]:
         return []
     ids = dict.fromkeys(str(entry["id"]) for entry in result.model.effects)
     equations = "; ".join(f"{effect_id}: {LIBRARY[effect_id].equation}" for effect_id in ids)
-    return [
-        _as_table(
-            *effect_rows(result),
-            f"{equations}. An effect is a signature at the terminals, not proof of a mechanism."
-            if ids
-            else "No effect is significant in these logs.",
-        ),
-        _as_table(
-            *search_rows(found),
+    signature = f"{equations}. An effect is a signature at the terminals, not proof of a mechanism."
+    blocks: list[Block] = []
+    for (head, rows), note in (
+        (effect_rows(result), signature if ids else "No effect is significant in these logs."),
+        (
+            search_rows(found),
             "Errors of left-out logs. An effect is added if the mean logarithm of the error ratio,"
             " log by log, is significantly above zero (t of 2 or more) and worth at least 3 %. The"
             " same data selected the effects, so the last figure is slightly optimistic.",
         ),
-    ]
-
-
-def _as_table(headings: Sequence[str], rows: Sequence[Sequence[str]], note: str) -> Table:
-    return Table([heading.removeprefix("<") for heading in headings], rows, note)
-
-
-def _recorded_figures(result: Identification, time: TimeFigures) -> list[Block]:
-    """Return current, voltage, temperature, power and charge of the whole logs."""
-    logs = result.logs
-
-    def over_time(
-        quantity: str, unit: str, color: str, values: Sequence[FloatArray], caption: str
-    ) -> Figure:
-        plot = time.plot(quantity, unit, height=235, names=quantity == "current")
-        pieces = [(log.time_s, item) for log, item in zip(logs, values, strict=True)]
-        time.line(plot, quantity, pieces, Pen(color, width=1.0, in_legend=False))
-        return Figure(quantity.capitalize(), plot, caption)
-
-    running = [log.voltage_v[running_rows(log.time_s, log.voltage_v)] for log in logs]
-    is_limited = sum(values.size for values in running) < sum(map(len, logs))
-    voltage = over_time(
-        "voltage", "V", BLACK, [log.voltage_v for log in logs],
-        "The voltage falls with the charge and dips under load."
-        + (" Start-up and shut-down rows lie below the figure." if is_limited else ""),
-    )  # fmt: skip
-    if is_limited:
-        shown = np.concatenate(running)
-        set_y_limits(voltage.plot, float(shown.min()), float(shown.max()))
-    return [
-        over_time("current", "A", BLUE, [log.current_a for log in logs],
-                  "Positive current discharges the pack, negative charges it (regeneration)."),
-        voltage,
-        over_time("temperature", "°C", ORANGE, [log.temperature_c for log in logs],
-                  f"Measured on: {result.model.temperature_source}. A temperature that hardly"
-                  " changes does not identify kt."),
-        over_time("power", "kW", PURPLE,
-                  [log.voltage_v * log.current_a / 1000.0 for log in logs],
-                  "Voltage times current at the terminals; its integral is the energy."),
-        over_time("charge taken out", "Ah", GREEN,
-                  [discharged_ah(log.time_s, log.current_a) for log in logs],
-                  "Current integrated by the trapezoidal rule from the start"
-                  f"{' of each log' if len(logs) > 1 else ''};"
-                  f" {number(result.model.capacity_ah, 2, 'Ah')} are 100 %."),
-    ]  # fmt: skip
-
-
-def _method(result: Identification) -> list[Block]:
-    blocks: list[Block] = [
-        settings_table(result.model),
-        _logs(result),
-        _removed(result),
-    ]
-    by_text: dict[str, list[str]] = {}
-    for log in result.logs:
-        for remark in log.remarks:
-            by_text.setdefault(remark, []).append(log.name)
-    remarks = [*result.remarks, *(f"{', '.join(names)}: {text}" for text, names in by_text.items())]
-    if remarks:
-        blocks += [Paragraph("Remarks:"), Bullets(remarks)]
+    ):
+        blocks.append(Table([heading.removeprefix("<") for heading in head], rows, note))
     return blocks
 
 
 def settings_table(model: Model) -> Table:
     """Return how a model was made, and the range that it is known in."""
     cells = "" if model.cells is None else f", {model.cells} cells in series"
-    return Table(
-        ["model", ""],
-        [
-            ["equation", model.equation],
-            ["chemistry", f"{model.chemistry}{cells}"],
-            ["capacity", number(model.capacity_ah, 2, "Ah")],
-            ["rate", f"{model.rate_hz:g} Hz"],
-            ["temperature measured on", model.temperature_source],
-            ["identified at SoC", span(*model.range.soc_pct, 1, "%")],
-            ["identified at temperature", span(*model.range.temperature_c, 1, "°C")],
-            ["identified at current", span(*model.range.current_a, 0, "A")],
-            ["made by", model.made.by],
-        ],
-    )
+    rows = {
+        "equation": model.equation,
+        "chemistry": f"{model.chemistry}{cells}",
+        "capacity": number(model.capacity_ah, 2, "Ah"),
+        "rate": f"{model.rate_hz:g} Hz",
+        "temperature measured on": model.temperature_source,
+        "identified at SoC": span(*model.range.soc_pct, 1, "%"),
+        "identified at temperature": span(*model.range.temperature_c, 1, "°C"),
+        "identified at current": span(*model.range.current_a, 0, "A"),
+        "made by": model.made.by,
+    }
+    return Table(["model", ""], [list(row) for row in rows.items()])
 
 
-def _logs(result: Identification) -> Table:
+def _method(result: Identification) -> list[Block]:
+    removed: Counter[str] = Counter()
+    for item in result.fits:
+        removed.update(item.rows.removed)
+    unused = [f"{count:,} {_REMOVED_BY.get(rule, rule)}" for rule, count in removed.items()]
+    by_text: dict[str, list[str]] = {}
+    for log in result.logs:
+        for remark in log.remarks:
+            by_text.setdefault(remark, []).append(log.name)
+    remarks = [*result.remarks, *(f"{', '.join(names)}: {text}" for text, names in by_text.items())]
+    notes: list[Block] = [Paragraph("Remarks:"), Bullets(remarks)] if remarks else []
+    return [settings_table(result.model), _logs(result, "; ".join(unused)), *notes]
+
+
+def _logs(result: Identification, unused: str) -> Table:
     rows = []
     errors = result.held_out_error_v or [np.full(len(item.rows), np.nan) for item in result.fits]
     for log, item, held_out in zip(result.logs, result.fits, errors, strict=True):
@@ -541,19 +498,8 @@ def _logs(result: Identification) -> Table:
                 number(item.soc_newton_mae_pct, 2),
             ]
         )
-    return Table(
-        [
-            "log", "duration", "rows", "rows used", "SoC [%]", "temperature [°C]", "current [A]",
-            "U MAE [%]", "U MAE held out [%]", "SoC by Newton MAE [%]",
-        ],
-        rows,
-    )  # fmt: skip
-
-
-def _removed(result: Identification) -> Table:
-    totals: Counter[str] = Counter()
-    for item in result.fits:
-        totals.update(item.rows.removed)
-    rows = [[_REMOVED_BY.get(rule, rule), str(count)] for rule, count in totals.items()]
-    rows.append(["used", str(sum(len(item.rows) for item in result.fits))])
-    return Table(["rows", "count"], rows)
+    head = [
+        "log", "duration", "rows", "rows used", "SoC [%]", "temperature [°C]", "current [A]",
+        "U MAE [%]", "U MAE held out [%]", "SoC by Newton MAE [%]",
+    ]  # fmt: skip
+    return Table(head, rows, f"Rows not used: {unused}." if unused else "")

@@ -16,84 +16,69 @@ from cangauge.extras.report.page import (
     reconstruction_banners,
     render,
 )
-from cangauge.extras.report.verdict import inspect_verdict
 from cangauge.inspect.log import LogInspection
 from cangauge.logs.log import Log
 
 
 def inspect_report(found: LogInspection, log: Log) -> str:
-    """Return an inspection as one self-contained HTML page.
-
-    Parameters
-    ----------
-    found : LogInspection
-    log : Log
-        The inspected log.
-    """
-    return render(inspect_page(found, log))
-
-
-def inspect_page(found: LogInspection, log: Log) -> Page:
-    """Return the report's content (see `inspect_report`); `figures` holds the bokeh figures."""
+    """Return the inspection of a log as one self-contained HTML page."""
     rate = significant(found.timing.rate_hz, 4, "Hz") if found.timing.rate_hz else "one row"
-    notes = [
-        Section(title, [Bullets(lines)])
-        for title, lines in (("Warnings", found.warnings), ("Remarks", found.remarks))
-        if lines
-    ]
-    return Page(
-        title=f"Inspection of {found.name}",
-        lead=inspect_verdict(found),
-        subtitle=f"{duration(found.timing.duration_s)}, {found.rows:,} rows, {rate}"
-        f" ({'regular' if found.timing.regular else 'irregular'}).",
-        tiles=_tiles(found),
-        sections=[
-            Section("Recorded data", _channel_figures(log)),
-            Section("What this log can identify", [_abilities(found)]),
-            Section("Channels", [_channels(found)]),
-            *notes,
-        ],
-        inputs=[InputFile.of_path("log", found.name, found.source)],
-        banners=reconstruction_banners(found.name, found.source, *found.remarks),
-    )
-
-
-def _tiles(found: LogInspection) -> list[Tile]:
+    regular = "regular" if found.timing.regular else "irregular"
     charge, soc = found.charge, found.soc
     tiles = [
-        Tile("Discharged", significant(charge.discharged_ah, 4, "Ah"),
-             f"charged {significant(charge.charged_ah, 4, 'Ah')}"),
-    ]  # fmt: skip
+        Tile(
+            "Discharged",
+            significant(charge.discharged_ah, 4, "Ah"),
+            f"charged {significant(charge.charged_ah, 4, 'Ah')}",
+        )
+    ]
     if found.resistance is not None:
         median = significant(found.resistance.median_ohm, 3, "Ω")
         tiles.append(Tile("Resistance", median, "median of steps of current"))
     if soc is not None:
         ends = f"{soc.first_pct:.1f} → {soc.last_pct:.1f} %"
         tiles.append(Tile("The log's own SoC", ends, f"in {100.0 * soc.coverage:.1f} % of rows"))
-    return tiles
+    abilities = [[item.topic, item.verdict, item.text] for item in found.abilities]
+    parts: tuple[tuple[str, list[Block]], ...] = (
+        ("Recorded data", [*channel_figures(log)]),
+        (
+            "What this log can identify",
+            [Table(["quantity", "identifiable", "reason"], abilities)],
+        ),
+        ("Channels", [_channels(found)]),
+        ("Warnings", [Bullets(found.warnings)] if found.warnings else []),
+        ("Remarks", [Bullets(found.remarks)] if found.remarks else []),
+    )
+    return render(
+        Page(
+            title=f"Inspection of {found.name}",
+            lead=inspect_verdict(found),
+            subtitle=f"{duration(found.timing.duration_s)}, {found.rows:,} rows, {rate}"
+            f" ({regular}).",
+            tiles=tiles,
+            sections=[Section(title, blocks) for title, blocks in parts if blocks],
+            inputs=[InputFile.of_path("log", found.name, found.source)],
+            banners=reconstruction_banners(found.name, found.source, *found.remarks),
+        )
+    )
 
 
-def _channel_figures(log: Log) -> list[Block]:
+def channel_figures(log: Log) -> list[Figure]:
+    """Return current, voltage, temperature and, where known, SoC over time."""
     time = TimeFigures([log])
-    soc = () if log.soc_pct is None else (("State of charge", "%", log.soc_pct, GREEN, "the log"),)
-    figures: list[Block] = []
-    for name, unit, values, color, source in (
-        ("Current", "A", log.current_a, BLUE, ""),
-        ("Voltage", "V", log.voltage_v, ORANGE, ""),
-        ("Temperature", "°C", log.temperature_c, PURPLE, log.temperature_source),
-        *soc,
-    ):
+    channels = [
+        ("Current", "A", log.current_a, BLUE, "Positive current discharges."),
+        ("Voltage", "V", log.voltage_v, ORANGE, "At the terminals."),
+        ("Temperature", "°C", log.temperature_c, PURPLE, f"Measured on: {log.temperature_source}."),
+    ]
+    if log.first_soc() is not None and log.soc_pct is not None:
+        channels.append(("State of charge", "%", log.soc_pct, GREEN, "The log's own."))
+    figures = []
+    for name, unit, values, color, caption in channels:
         plot = time.plot(name.lower(), unit, height=235)
-        pen = Pen(color, width=1.0, in_legend=False)
-        time.line(plot, name.lower(), [(log.time_s, values)], pen)
-        caption = f"As given by: {source}." if source else "Positive current discharges."
-        figures.append(Figure(name, plot, caption if name != "Voltage" else "At the terminals."))
+        time.line(plot, name.lower(), [(log.time_s, values)], Pen(color, 1.0, in_legend=False))
+        figures.append(Figure(name, plot, caption))
     return figures
-
-
-def _abilities(found: LogInspection) -> Table:
-    rows = [[item.topic, item.verdict, item.text] for item in found.abilities]
-    return Table(["quantity", "identifiable", "reason"], rows)
 
 
 def _channels(found: LogInspection) -> Table:
@@ -107,7 +92,24 @@ def _channels(found: LogInspection) -> Table:
         ]
         for name, item in found.channels.items()
     ]
-    return Table(
-        ["channel", "minimum", "median", "maximum", "unit", "step", "missing rows"], rows,
-        "Step: the quantization; – for a constant channel.",
-    )  # fmt: skip
+    head = ["channel", "minimum", "median", "maximum", "unit", "step", "missing rows"]
+    return Table(head, rows, "Step: the quantization; – for a constant channel.")
+
+
+def inspect_verdict(found: LogInspection) -> str:
+    """Return what the log can identify and what it cannot, with the first reason."""
+    names: dict[str, list[str]] = {"yes": [], "partly": [], "no": []}
+    for ability in found.abilities:
+        names[ability.verdict].append(ability.topic)
+    parts = [
+        words + ", ".join(names[verdict])
+        for verdict, words in (("yes", ""), ("partly", "in part "), ("no", "not "))
+        if names[verdict]
+    ]
+    text = "This log can identify " + "; ".join(parts)
+    if names["no"] and not names["yes"] and not names["partly"]:
+        text = f"This log cannot identify {', '.join(names['no'])}"
+    lacking = next((ability for ability in found.abilities if ability.verdict == "no"), None)
+    if lacking is None:
+        return f"{text}."
+    return f"{text}. {lacking.topic.capitalize()}: {lacking.text.rstrip('.')}."

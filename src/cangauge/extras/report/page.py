@@ -7,7 +7,7 @@ no network and stays readable.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
@@ -106,36 +106,13 @@ class Tile:
     hint: str = ""
 
 
-@dataclass(frozen=True, eq=False)
-class Moment:
-    """A table cell that leads to a time in a figure: it zooms the figure's time axis there.
-
-    Parameters
-    ----------
-    text : str
-        Says the time: on paper nothing can be clicked.
-    figure : Figure
-    start, end : float
-        On the figure's horizontal axis.
-    """
-
-    text: str
-    figure: Figure
-    start: float
-    end: float
-
-    def __str__(self) -> str:
-        """Return its text."""
-        return self.text
-
-
 @dataclass(frozen=True)
 class Table:
     """A table of texts; columns of numbers are set flush right."""
 
     kind: ClassVar[str] = "table"
     head: Sequence[str]
-    rows: Sequence[Sequence[str | Moment]]
+    rows: Sequence[Sequence[str]]
     note: str = ""
 
     @property
@@ -143,8 +120,7 @@ class Table:
         """Whether each column holds nothing but numbers."""
         columns = list(zip(*self.rows, strict=True)) or [()] * len(self.head)
         return [
-            bool(column) and all(_NUMBER.fullmatch(str(cell)) for cell in column)
-            for column in columns
+            bool(column) and all(_NUMBER.fullmatch(cell) for cell in column) for column in columns
         ]
 
 
@@ -165,11 +141,6 @@ class Figure:
     title: str
     plot: Any
     caption: str
-
-    @property
-    def anchor(self) -> str:
-        """Name by which a link of the page leads to the figure."""
-        return re.sub(r"[^a-z0-9]+", "-", f"figure {self.title}".lower()).strip("-")
 
 
 @dataclass(frozen=True, eq=False)
@@ -239,15 +210,9 @@ class Page:
     @property
     def figures(self) -> list[Figure]:
         """All figures in the order of the page."""
-        return list(self._figures())
-
-    def _figures(self) -> Iterator[Figure]:
-        for section in self.sections:
-            for block in section.blocks:
-                if isinstance(block, Figure):
-                    yield block
-                elif isinstance(block, Beside):
-                    yield from block.figures
+        blocks = [block for section in self.sections for block in section.blocks]
+        beside = [block.figures if isinstance(block, Beside) else [block] for block in blocks]
+        return [item for items in beside for item in items if isinstance(item, Figure)]
 
 
 def render(page: Page) -> str:
