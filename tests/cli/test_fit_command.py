@@ -303,9 +303,9 @@ def test_a_count_that_differs_from_the_log_is_told(run: Run, made: Path, tmp_pat
     ran = run("fit", made / "part.csv", *options)
     assert ran.code == 0, ran.err
     remarks = json.loads(ran.out)["remarks"]
-    told = [text for text in remarks if "the log's own SoC changes by" in text]
+    told = [text for text in remarks if "imply a capacity of" in text]
     assert len(told) == 1
-    assert f"its capacity would be {CAPACITY_AH:.1f} Ah, not 45.0 Ah" in told[0]
+    assert f"imply a capacity of {CAPACITY_AH:.1f} Ah; 45.0 Ah is used" in told[0]
     out = ("-o", tmp_path / "soc.csv")
     ran = run("estimate", made / "part.csv", "-m", tmp_path / "m.json", *out)
-    assert "its capacity would be" in ran.err
+    assert "imply a capacity of" in ran.err

@@ -101,8 +101,9 @@ def test_counted_soc_that_differs_tells_the_capacity() -> None:
     assert difference_from_reference(log, CAPACITY_AH) is None
     told = difference_from_reference(log, 0.9 * CAPACITY_AH)
     assert told == (
-        "t1: counted 44.4 %, the log's own SoC changes by 40.0 %: its capacity would be"
-        f" {CAPACITY_AH:.1f} Ah, not {0.9 * CAPACITY_AH:.1f} Ah"
+        "t1: the counted charge and the log's own SoC imply a capacity of"
+        f" {CAPACITY_AH:.1f} Ah; {0.9 * CAPACITY_AH:.1f} Ah is used."
+        " Check the capacity and the current sensor"
     )
     assert told in fit([log], capacity_ah=0.9 * CAPACITY_AH).remarks
 
