@@ -113,7 +113,8 @@ def difference_from_reference(log: Log, capacity_ah: float) -> str | None:
     implied = 100.0 * float(out[ends[1]] - out[ends[0]]) / own
     return (
         f"{log.name}: the counted charge and the log's own SoC imply a capacity of"
-        f" {implied:.1f} Ah; {capacity_ah:.1f} Ah is used. Check the capacity and the current sensor"
+        f" {implied:.1f} Ah; {capacity_ah:.1f} Ah is used."
+        " Check the capacity and the current sensor"
     )
 
 
