@@ -156,10 +156,10 @@ def test_a_full_disk_costs_frames_of_the_recording_only(
     messages = frames(60.0)
     with Recorder(tmp_path / "drive.log") as recorder:
         write(recorder, messages[:400])
-        assert waits(lambda: recorder.frames == 400)
+        assert waits(lambda: recorder.state.frames == 400)
         is_full.set()
         write(recorder, messages[400:800])
-        assert waits(lambda: recorder.frames == 800)
+        assert waits(lambda: recorder.state.frames == 800)
         assert recorder.state is not None
         assert recorder.state.problem == "No space left on device"
         is_full.clear()
@@ -198,10 +198,10 @@ def test_a_folder_that_goes_and_comes_back(tmp_path: Path) -> None:
     messages = frames(20.0)
     with Recorder(folder / "drive.log", RecordLimits(part_bytes=2_000)) as recorder:
         write(recorder, messages[:100])
-        assert waits(lambda: recorder.frames == 100)
+        assert waits(lambda: recorder.state.frames == 100)
         folder.rename(tmp_path / "gone")
         write(recorder, messages[100:200])
-        assert waits(lambda: recorder.frames == 200)
+        assert waits(lambda: recorder.state.frames == 200)
         assert recorder.state is not None
         assert recorder.state.problem == "No such file or directory"
         (tmp_path / "gone").rename(folder)
@@ -222,7 +222,7 @@ with Recorder(sys.argv[1]) as recorder:
         ))
         if number % 50 == 49:
             recorder.on_snapshot(Snapshot(0.0, {}))
-            while recorder.frames <= number:
+            while recorder.state.frames <= number:
                 time.sleep(0.001)
             print(number, flush=True)
 """
@@ -328,6 +328,6 @@ def test_a_configured_recording_is_not_cut_short(
     monkeypatch.setattr(record, "FREE_BYTES", 1 << 60)
     with Recorder(tmp_path / "drive.log") as recorder:
         write(recorder, [frame(number) for number in range(100)])
-        assert waits(lambda: recorder.frames == 100)
+        assert waits(lambda: recorder.state.frames == 100)
         assert recorder.state is not None
         assert recorder.state.active

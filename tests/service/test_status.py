@@ -152,7 +152,8 @@ def test_watchdog_pings_come_with_turns_only() -> None:
         def ping(self) -> None:
             self.pings += 1
 
-    notifier = Counting(None, 2.0)
+    notifier = Counting()
+    notifier.ping_every_s = 0.5
     watched = Watched(notifier=notifier)
     for _ in range(100):
         watched.turn(0.1)

@@ -25,43 +25,10 @@ if TYPE_CHECKING:
     from cangauge.logs.read import LogFile
     from cangauge.logs.units import TemperatureSource
 
+# The service shares these options, but needs neither pyarrow nor the readers: imports are deferred.
+
 _Value = TypeVar("_Value", bound=float | None)
 
-VehicleOption = Annotated[
-    str | None,
-    typer.Option(
-        "--vehicle",
-        metavar="PRESET",
-        help="For a capture: the car's preset (a DBC and a map that ship with cangauge).",
-    ),
-]
-DbcOption = Annotated[
-    Path | None,
-    typer.Option("--dbc", metavar="FILE", help="For a capture: the bus's DBC; needs --map."),
-]
-MapOption = Annotated[
-    Path | None,
-    typer.Option(
-        "--map",
-        metavar="FILE",
-        help="For a capture: which signals of the DBC are current, voltage and temperature.",
-    ),
-]
-TemperatureOption = Annotated[
-    float | None,
-    typer.Option(
-        "--temperature", metavar="C", help="Constant temperature [°C], where the input has none."
-    ),
-]
-TemperatureSourceOption = Annotated[
-    str | None,
-    typer.Option(
-        "--temperature-source",
-        metavar="SOURCE",
-        help="Location of the temperature sensor, where the input does not state it: "
-        f"{', '.join(TEMPERATURE_SOURCES)}.",
-    ),
-]
 ColumnsOption = Annotated[
     str | None,
     typer.Option(
@@ -80,23 +47,6 @@ SignOption = Annotated[
         metavar="charge|discharge",
         help="What a positive current in the file does. Default: as its format defines it, else"
         " found from the data.",
-    ),
-]
-EndpointOption = Annotated[
-    str | None,
-    typer.Option(
-        "--endpoint",
-        metavar="PATH|URL",
-        help="Unix socket of the service, or http://HOST:PORT. Default: the service running on this"
-        " machine.",
-    ),
-]
-TokenFileOption = Annotated[
-    Path | None,
-    typer.Option(
-        "--token-file",
-        metavar="FILE",
-        help="File with the bearer token of an HTTP endpoint; or in CANGAUGE_HTTP_TOKEN.",
     ),
 ]
 JsonOption = Annotated[
@@ -146,30 +96,47 @@ ReportOption = Annotated[
 
 @dataclass(frozen=True, slots=True)
 class Reading:
-    """The options of every command that reads a log or a capture.
+    """The options of every command that reads a log or a capture."""
 
-    Parameters
-    ----------
-    vehicle : str, optional
-        Preset of the car (captures only).
-    dbc, map_file : Path, optional
-        DBC and map of signals, in place of a preset (captures only); `[columns]` of the map apply
-        to a log unless `columns` is given.
-    columns, sign : str, optional
-        Values of `--columns` and `--sign`.
-    temperature : float, optional
-        Constant temperature [°C].
-    temperature_source : str, optional
-        Location of the temperature sensor.
-    """
-
-    vehicle: VehicleOption = None
-    dbc: DbcOption = None
-    map_file: MapOption = None
+    vehicle: Annotated[
+        str | None,
+        typer.Option(
+            "--vehicle",
+            metavar="PRESET",
+            help="For a capture: the car's preset (a DBC and a map that ship with cangauge).",
+        ),
+    ] = None
+    dbc: Annotated[
+        Path | None,
+        typer.Option("--dbc", metavar="FILE", help="For a capture: the bus's DBC; needs --map."),
+    ] = None
+    map_file: Annotated[
+        Path | None,
+        typer.Option(
+            "--map",
+            metavar="FILE",
+            help="For a capture: which signals of the DBC are current, voltage and temperature.",
+        ),
+    ] = None
     columns: ColumnsOption = None
     sign: SignOption = None
-    temperature: TemperatureOption = None
-    temperature_source: TemperatureSourceOption = None
+    temperature: Annotated[
+        float | None,
+        typer.Option(
+            "--temperature",
+            metavar="C",
+            help="Constant temperature [°C], where the input has none.",
+        ),
+    ] = None
+    temperature_source: Annotated[
+        str | None,
+        typer.Option(
+            "--temperature-source",
+            metavar="SOURCE",
+            help="Location of the temperature sensor, where the input does not state it: "
+            f"{', '.join(TEMPERATURE_SOURCES)}.",
+        ),
+    ] = None
 
     @property
     def names_vehicle(self) -> bool:
@@ -178,7 +145,6 @@ class Reading:
 
     def car(self) -> Vehicle:
         """Return the vehicle that decodes a capture; may raise InputError."""
-        # Deferred: the service shares these options, but needs neither pyarrow nor the readers.
         from cangauge.bus.vehicle import Vehicle
 
         return Vehicle.load(self.vehicle, self.dbc, self.map_file, temperature_c=self.temperature)
@@ -196,13 +162,7 @@ class Reading:
         return None if self.map_file is None else columns_of_map(self.map_file)
 
     def open(self, path: Path) -> LogFile | Capture:
-        """Open a log by these columns, or any recording by its content.
-
-        Raises
-        ------
-        InputError
-            If the file cannot be read, or an option is wrong.
-        """
+        """Open a log by these columns, or any recording by its content; may raise InputError."""
         from cangauge.bus.recording import open_with_columns, refuse_sign_of_capture
 
         recording = open_with_columns(
@@ -283,12 +243,19 @@ def option_groups(*omitted: str) -> Callable[[Callable[..., None]], Callable[...
                 given[name] = kind(**{each: given.pop(each) for each in names})
             command(**given)
 
-        run.__doc__ = command.__doc__
-        run.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
-        run.__annotations__ = {each.name: each.annotation for each in parameters}
-        return run
+        return with_signature(run, command, parameters)
 
     return spread
+
+
+def with_signature(
+    run: Callable[..., None], command: Callable[..., None], parameters: list[inspect.Parameter]
+) -> Callable[..., None]:
+    """Give a function the help page of a command and the parameters that typer reads."""
+    run.__doc__ = command.__doc__
+    run.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
+    run.__annotations__ = {each.name: each.annotation for each in parameters}
+    return run
 
 
 def note_reading(log: Log) -> None:
@@ -332,19 +299,15 @@ def check_outputs(
     """
     read = {path.resolve() for path in inputs}
     written: set[Path] = set()
-    for output in outputs:
-        if output is None:
-            continue
-        place = output.resolve()
+    for output in filter(None, outputs):
+        place, problem, cure = output.resolve(), "", "name two different files"
         if place in read:
-            raise InputError(
-                "this output is also an input", source=output, cure="name another file for it"
-            )
+            problem, cure = "this output is also an input", "name another file for it"
         # /dev/null may be named twice.
-        if place in written and (place.is_file() or not place.exists()):
-            raise InputError(
-                "two outputs have this name", source=output, cure="name two different files"
-            )
+        elif place in written and (place.is_file() or not place.exists()):
+            problem = "two outputs have this name"
+        if problem:
+            raise InputError(problem, source=output, cure=cure)
         written.add(place)
         if output.parent != made or made.is_dir():
             check_writable(output)
@@ -361,7 +324,6 @@ def within(value: _Value, low: float, high: float, *, option: str, unit: str) ->
 
 def refuse_inverted_current(log: Log, *, is_capture: bool) -> None:
     """Raise InputError if the data show clearly that positive current charges."""
-    # Deferred as in `Reading`.
     from cangauge.logs.sign import require_discharge_positive
 
     try:

@@ -56,13 +56,11 @@ class KeyInfo:
 
     Parameters
     ----------
-    option : str
-        Options of `cangauge run`, such as "-m, --model"; "" for a key of the file only.
-    metavar : str
-        Placeholder of the option's value.
-    unit : str
-    default_text : str
-        Default in words, where the field's own default is not enough.
+    option, metavar : str
+        Options of `cangauge run`, such as "-m, --model" ("": a key of the file only), and the
+        placeholder of their value.
+    unit, default_text : str
+        Unit; default in words, where the field's own default is not enough.
     restart : bool
         A reload does not apply a change of this key.
     is_path : bool

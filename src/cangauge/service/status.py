@@ -44,7 +44,7 @@ REPORT_EVERY_S: Final = 1.0
 BUS_COUNTS: Final = ("garbled", "error_frames", "unsent", "queue_drops", "losses", "foreign")
 """Counts of a bus to report, where it has them."""
 
-_OF_VALUES: Final = frozenset({"not_available", "implausible", "stuck", "held_back"})
+_OF_VALUES: Final = {"not_available", "implausible", "stuck", "held_back"}
 """Reasons that concern values, not whole frames."""
 _REJECTS: Final = tuple(
     each.name
@@ -168,10 +168,12 @@ class Monitor:
         Monotonic time [s].
     show_every_s : float
         Interval of the snapshots [s].
+    sign_cure : str
+        What to change if the current has the wrong sign.
 
     Attributes
     ----------
-    model : str
+    model, sign_cure : str
         Replaced when the configuration changes.
     latest : Snapshot
         Immutable, hence readable from any thread.
@@ -187,8 +189,9 @@ class Monitor:
         record: Callable[[], RecordState | None] = lambda: None,
         clock: Callable[[], float] = time.monotonic,
         show_every_s: float = SHOW_EVERY_S,
+        sign_cure: str = "set the other sign under [current] of the map file",
     ) -> None:
-        self.model = model
+        self.model, self.sign_cure = model, sign_cure
         self._pipeline = pipeline
         self._port = port
         self._notifier = notifier or Notifier()
@@ -205,7 +208,7 @@ class Monitor:
         self._status: Status | None = None
         self._config: dict[str, Any] = {"reloading": False, "problem": None}
         self._report: Mapping[str, Any] = NO_REPORT
-        self._had_notices = False
+        self._notices: dict[str, str] = {}
         self.latest = Snapshot(now_s, self._object(now_s))
 
     def stepped(self, stamp_s: float, step_s: float, came_s: float) -> None:
@@ -302,6 +305,7 @@ class Monitor:
             else {"age_s": now_s - self._sample_s if self._sample_s > -math.inf else None}
             | _finite(sample, "current_a", "voltage_v", "temperature_c"),
             **self._report,
+            "notices": list(self._find_notices().values()),
             "samples": samples,
             "samples_per_s": self._rate,
             "frames": {
@@ -329,12 +333,22 @@ class Monitor:
         status = estimate.status.name.lower() + (f" ({why})" if why else "")
         return f"{soc}, {status}, {self._rate:.1f} samples/s"
 
+    def _find_notices(self) -> dict[str, str]:
+        """Return what the user should look after, by event: one sentence each."""
+        found = {"cells.sum_differs": " ".join(self._report["notices"])}
+        if evidence := self._pipeline.sign.evidence:
+            found["sign.suspect"] = (
+                f"the current has the wrong sign: {evidence}; the SoC is wrong. Positive current"
+                f" must discharge: {self.sign_cure}"
+            )
+        return {event: text for event, text in found.items() if text}
+
     def _log_changes(self, estimate: Estimate) -> None:
         """Log a change of the status, and notices once when they appear."""
-        notices = self._report["notices"]
-        for notice in [] if self._had_notices else notices:
-            emit(_LOG, logging.WARNING, "cells.sum_differs", notice)
-        self._had_notices = bool(notices)
+        notices = self._find_notices()
+        for event in notices.keys() - self._notices.keys():
+            emit(_LOG, logging.WARNING, event, notices[event])
+        self._notices = notices
         if estimate.status is self._status:
             return
         before, self._status = self._status, estimate.status
