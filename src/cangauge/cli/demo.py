@@ -8,7 +8,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
 
@@ -19,10 +19,6 @@ from cangauge._text import number, significant
 from cangauge.cli.options import JsonOption
 from cangauge.cli.output import emit_json, note, print_table
 from cangauge.errors import CangaugeError, InputError
-
-if TYPE_CHECKING:
-    from cangauge.estimation.offline import Scores
-    from cangauge.identify.fit import Identification
 
 TRAINED_ON = "leaf2012_reconstruction_white.parquet"
 PLAYED = "leaf2012_reconstruction_correlated.parquet"
@@ -104,8 +100,21 @@ def demo_command(
     note("4/4  write the pages")
     estimate = RecordedEstimate(log, table, live, model, settings)
     write_text_atomic(soc_page, extra("report.estimate:estimate_report")(estimate, model_path))
-    result = _result(identification, live, difference, bound)
-    result |= {
+    result = {
+        "log": "a reconstruction of the published 2012 Leaf test, no recording",
+        "current_offset_a": SENSOR_OFFSET_A,
+        "samples": live.rows,
+        "replay_seconds": live.seconds,
+        "fit_voltage_mae_pct": identification.voltage_mae_pct,
+        "fit_soc_newton_mae_pct": identification.soc_newton_mae_pct,
+        "live_voltage_mae_pct": live.voltage_mae_pct,
+        "live_soc_mae_pct": live.soc_mae_pct,
+        "live_soc_max_pct": live.soc_max_pct,
+        "live_soc_newton_mae_pct": live.soc_newton_mae_pct,
+        "live_soc_coulomb_mae_pct": live.soc_coulomb_mae_pct,
+        "live_cover_2sigma": live.cover_2sigma,
+        "live_minus_offline_pct": difference,
+        "quantisation_bound_pct": bound,
         "seconds": time.monotonic() - began,
         "model": str(model_path),
         "fit_page": str(fit_page),
@@ -163,27 +172,6 @@ def _play(config: Path, log: Path) -> float:
             f" {errors.strip()}"
         )
     return seconds
-
-
-def _result(
-    identification: Identification, live: Scores, difference_pct: float, bound_pct: float
-) -> dict[str, Any]:
-    return {
-        "log": "a reconstruction of the published 2012 Leaf test, no recording",
-        "current_offset_a": SENSOR_OFFSET_A,
-        "samples": live.rows,
-        "replay_seconds": live.seconds,
-        "fit_voltage_mae_pct": identification.voltage_mae_pct,
-        "fit_soc_newton_mae_pct": identification.soc_newton_mae_pct,
-        "live_voltage_mae_pct": live.voltage_mae_pct,
-        "live_soc_mae_pct": live.soc_mae_pct,
-        "live_soc_max_pct": live.soc_max_pct,
-        "live_soc_newton_mae_pct": live.soc_newton_mae_pct,
-        "live_soc_coulomb_mae_pct": live.soc_coulomb_mae_pct,
-        "live_cover_2sigma": live.cover_2sigma,
-        "live_minus_offline_pct": difference_pct,
-        "quantisation_bound_pct": bound_pct,
-    }
 
 
 def _show(result: dict[str, Any]) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import inspect
-import os
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, fields, is_dataclass, replace
 from pathlib import Path
@@ -64,23 +63,6 @@ def suffixed(*suffixes: str) -> Callable[[typer.CallbackParam, Path | None], Pat
         return value
 
     return check
-
-
-def folder_to_write(param: typer.CallbackParam, folder: Path | None) -> Path | None:
-    """Refuse, before any long work, a folder to write that is a file or cannot be made.
-
-    A callback of options; whoever writes into the folder makes it.
-    """
-    if folder is not None and not os.path.isdir(folder):  # noqa: PTH112 - False, not an error, for a name too long
-        if os.path.exists(folder):  # noqa: PTH110 - likewise
-            raise InputError(
-                "is a file", field=param.opts[-1], value=str(folder), cure="name a folder"
-            )
-        made = folder
-        while not os.path.exists(made.parent):  # noqa: PTH110 - likewise
-            made = made.parent
-        check_writable(made)
-    return folder
 
 
 ReportOption = Annotated[
@@ -290,7 +272,7 @@ def check_outputs(
     outputs, inputs : iterable of Path
         None stands for an output that is not wanted.
     made : Path, optional
-        A folder that the command makes, of outputs; see `folder_to_write`.
+        A folder that the command makes, of outputs; made after the check.
 
     Raises
     ------
