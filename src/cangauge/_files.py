@@ -49,13 +49,7 @@ _SUFFIXES: Final = frozenset(
 
 
 def open_regular(path: str | PathLike[str]) -> BinaryIO:
-    """Open a file for reading.
-
-    Raises
-    ------
-    InputError
-        If it is absent, no regular file, or cannot be read.
-    """
+    """Open a file for reading; InputError if it is absent, no regular file, or unreadable."""
     path = Path(path)
     try:
         mode = path.stat().st_mode
@@ -214,13 +208,7 @@ class Head:
             raise InputError(f"the zip cannot be unpacked: {error}", source=self.path) from error
 
     def read(self) -> bytes:
-        """Return the whole unpacked content.
-
-        Raises
-        ------
-        InputError
-            If the file is damaged, or larger than a log may be.
-        """
+        """Return the unpacked content; InputError if damaged, or larger than a log may be."""
         with self.open() as file:
             return read_all(file, self.path, MAX_LOG_BYTES, "a log")
 
@@ -301,18 +289,8 @@ def atomic_path(path: str | PathLike[str]) -> Iterator[Path]:
     """Yield a temporary path beside `path` and rename it to `path` when the block succeeds.
 
     If the block raises, `path` is unchanged. The content is synced to disk before the rename: a
-    power cut leaves the old file or the new one. A device or pipe (`/dev/stdout`) cannot be
-    replaced and is yielded itself.
-
-    Parameters
-    ----------
-    path : path-like
-        The file to write; a symbolic link is followed, and permissions are kept.
-
-    Yields
-    ------
-    Path
-        Where to write.
+    power cut leaves the old file or the new one. A symbolic link is followed, permissions are kept,
+    and a device or pipe (`/dev/stdout`), which cannot be replaced, is yielded itself.
 
     Raises
     ------
@@ -389,13 +367,7 @@ def check_writable(path: str | PathLike[str]) -> None:
 def require_suffix(path: str | PathLike[str], *suffixes: str, field: str) -> None:
     """Raise InputError unless a file to write has one of these suffixes, or is a device.
 
-    Parameters
-    ----------
-    path : path-like
-    *suffixes : str
-        With their dot, in lower case.
-    field : str
-        Option or field that names it, for the message.
+    Suffixes are in lower case, with their dot; `field` is the option that names the file.
     """
     output = Path(path)
     if output.suffix.lower() in suffixes or _is_device(output):

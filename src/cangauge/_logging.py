@@ -46,21 +46,10 @@ def emit(
     limit: str | None = None,
     **fields: object,
 ) -> None:
-    """Log one event.
+    """Log one event: its stable name, and one line for people.
 
-    Parameters
-    ----------
-    logger : logging.Logger
-    level : int
-        `logging.INFO`, `logging.WARNING`, …
-    event : str
-        Stable name, such as "bus.lost".
-    text : str
-        One line for people.
-    limit : str, optional
-        Share one rate limit among events that supersede each other, such as the states of a bus.
-    **fields
-        Further values, with units in their names; keys of the JSON object.
+    Events with the same `limit` share one rate limit, as they supersede each other (the states of
+    a bus). `fields` are further keys of the JSON object, with units in their names.
     """
     extra = {"event": event, "limit": limit or event, "fields": fields}
     logger.log(level, "%s", text, extra=extra)
@@ -70,15 +59,9 @@ def emit(
 def logging_to(
     log_format: LogFormat, level: LogLevel = "info", stream: TextIO | None = None
 ) -> Iterator[None]:
-    """Write log records to a stream while the block runs, then restore the previous set-up.
+    """Write log records to a stream (stderr) while the block runs, then restore the set-up.
 
-    Parameters
-    ----------
-    log_format : {"text", "json"}
-    level : {"debug", "info", "warning", "error"}
-        Lowest level written. Other libraries are limited to errors, unless it is "debug".
-    stream : file, optional
-        stderr by default.
+    `level` is the lowest one written; other libraries are limited to errors, unless it is "debug".
     """
     handler = _Handler(stream or sys.stderr)
     handler.setFormatter(_Json() if log_format == "json" else _Text())
@@ -215,13 +198,8 @@ class _Repetitions:
 class RateLimitFilter(logging.Filter):
     """Limit each event to one record per interval; the latest suppressed one follows at its end.
 
-    Parameters
-    ----------
-    release : callable, optional
-        Writes a suppressed record once its interval has ended, when `release_due` is called: no
-        thread is started for it, which could fail. Without it, suppressed records are only counted.
-    clock : callable
-        Monotonic time [s].
+    `release` writes it, when `release_due` is called: no thread is started for it, which could
+    fail. Without it, suppressed records are only counted. `clock` gives monotonic time [s].
     """
 
     def __init__(

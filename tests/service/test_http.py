@@ -19,9 +19,9 @@ from prometheus_client.parser import text_string_to_metric_families
 from watched import Watched
 
 from cangauge.errors import CangaugeError, InputError
+from cangauge.extras.live.addresses import http_address, read_token
 from cangauge.extras.live.http import MAX_CLIENTS, HttpServer
 from cangauge.model.published import CAPACITY_AH
-from cangauge.service.addresses import http_address, read_token
 from cangauge.service.status_client import fetch_status
 from live import in_process
 

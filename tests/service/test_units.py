@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from cangauge.errors import InputError
-from cangauge.service.addresses import http_address
+from cangauge.extras.live.addresses import http_address
 from cangauge.service.config import load_config
 
 NAME = "cangauge@.service"

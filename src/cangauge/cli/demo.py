@@ -59,7 +59,6 @@ def demo_command(
     from cangauge.logs.canonical import write_log
     from cangauge.logs.read import read_log
     from cangauge.replay.steps import quantization_bound
-    from cangauge.service.addresses import LOOPBACK
     from cangauge.service.estimate_table import read_estimates
     from cangauge.service.offline import RecordedEstimate
 
@@ -84,7 +83,7 @@ def demo_command(
     note("2/4  replay another 2.6 h on the bus at full speed, and estimate its SoC live")
     port = _free_port() if os.name == "posix" else None
     if port is not None:
-        note(f"     see it while it plays: http://{LOOPBACK}:{port}/")
+        note(f"     see it while it plays: http://127.0.0.1:{port}/")
     write_text_atomic(config_path, _configuration(port))
     log, model = read_log(shared_file("replay", PLAYED)), identification.model
     log = replace(log, current_a=log.current_a + SENSOR_OFFSET_A)
@@ -127,18 +126,14 @@ def demo_command(
 
 
 def _free_port() -> int:
-    from cangauge.service.addresses import LOOPBACK
-
     with socket.socket() as probe:
-        probe.bind((LOOPBACK, 0))
+        probe.bind(("127.0.0.1", 0))
         return int(probe.getsockname()[1])
 
 
 def _configuration(port: int | None) -> str:
     """Return the TOML configuration of the service; without a bus it takes the default one."""
-    from cangauge.service.addresses import LOOPBACK
-
-    page = "" if port is None else f'dashboard = "{LOOPBACK}:{port}"\n'
+    page = "" if port is None else f'dashboard = "127.0.0.1:{port}"\n'
     return (
         'model = "model.json"\n'
         'time_source = "replay-clock"\n'

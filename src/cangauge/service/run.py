@@ -178,7 +178,7 @@ class Service:
                 outputs=self._outputs,
                 record=recorder,
                 monitor=monitor,
-                checkpoint=None if keeper is None else keeper.checkpoint,
+                checkpoint=(lambda: None) if keeper is None else keeper.checkpoint,
                 reload=lambda: self._poll_reload(reloader, monitor, wanted=hung_up()),
             )
             summary = loop.run(lambda: stopped() or self._stop.is_set())

@@ -21,9 +21,9 @@ from pathlib import Path
 from typing import Any, Final, cast
 from urllib.parse import urlsplit
 
+from cangauge._files import read_bounded
 from cangauge._logging import emit
 from cangauge.errors import CangaugeError, InputError
-from cangauge.service.addresses import read_token
 
 SCHEMA: Final = 1
 """Version of the JSON object of `/status`. Defined here, so that a client need not import the
@@ -212,7 +212,9 @@ def _read(path: str) -> bytes:
 
 
 def _get(endpoint: str, token_file: Path | None) -> bytes:
-    token = read_token(token_file, os.environ)
+    token = os.environ.get("CANGAUGE_HTTP_TOKEN")
+    if token_file is not None:
+        token = read_bounded(token_file, 1024, "a token").decode("ascii", "replace").strip()
     headers = {} if token is None else {"Authorization": f"Bearer {token}"}
     try:
         parts = urlsplit(endpoint)
