@@ -117,7 +117,7 @@ class SignWatch:
     def _test(self) -> None:
         time_s, current_a, voltage_v = np.array(self._rows).T
         finding = sign_of_current(Log(time_s, current_a, voltage_v, np.zeros(time_s.size)))
-        steps = finding.by_kind("steps")
+        steps = next(each for each in finding.evidence if each.kind == "steps")
         if finding.sign < 0 and steps.weight <= -self.SURE_WEIGHT:
             self.evidence = steps.text
         elif finding.sign > 0:
