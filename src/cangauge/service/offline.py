@@ -58,18 +58,9 @@ Origin = Literal["given", "log", "voltage"]
 
 @dataclass(frozen=True, eq=False)
 class RecordedCapture:
-    """Samples of a capture: unlike a log's rows, they may lack voltage and temperature.
+    """Samples of a capture: unlike a log's rows, they may lack voltage and temperature (NaN).
 
-    Parameters
-    ----------
-    time_s : array of shape (n,)
-        Time [s], not decreasing.
-    current_a, voltage_v, temperature_c : array of shape (n,)
-        Current [A] (positive = discharge), voltage [V] and temperature [°C], NaN where missing.
-    soc_pct : array of shape (n,), optional
-        Reference SoC [%], NaN where missing.
-    name, source, temperature_source : str
-    remarks : tuple of str
+    Columns of shape (n,), as in a `Log`; time does not decrease.
     """
 
     time_s: FloatArray
@@ -115,19 +106,10 @@ Recorded = Log | RecordedCapture
 
 
 class PackHistory:
-    """Health, power and cells of a recording: once a second, and at the end.
+    """Health, power and cells of a recording: at the end, in `report` (None without a sample).
 
-    Parameters
-    ----------
-    keeps_rows : bool
-        Keep a row at the first sample of each second, for `columns`.
-    cells : CellColumns, optional
-        Cell voltages of a log, by its rows.
-
-    Attributes
-    ----------
-    report : PackReport or None
-        At the end; None without a sample.
+    With `keeps_rows` also at the first sample of each second, in `columns`. `cells` are the cell
+    voltages of a log, by its rows.
     """
 
     def __init__(self, *, keeps_rows: bool = False, cells: CellColumns | None = None) -> None:

@@ -44,20 +44,10 @@ NOTHING_YET: Final = Estimate.unknown(Reason.NO_INITIAL_SOC | Reason.INPUT_STALE
 class FrameCounts:
     """Frames and values by outcome, over all logs of a run.
 
-    Parameters
-    ----------
-    frames, samples : int
-        Frames handled, REPLAY_CLOCK excluded; samples made of them.
-    lost, crc_errors, repeated, short : int
-        Wanted frames missing by the alive counters, with a wrong CRC, with a counter that did not
-        advance, with too few bytes.
-    not_available, implausible, stuck, held_back : int
-        Values coded as "not available", out of range or changed too fast, of a signal that was
-        constant while it should change, good but not used until their signal has recovered.
-    untimed : int
-        Frames before the first REPLAY_CLOCK, where that is the time source.
-    beginnings : int
-        New logs, each of which restarted decoder and estimator.
+    Wanted frames are lost by their alive counters, have a wrong CRC, repeat a counter or are too
+    short. Values are coded as not available, implausible (out of range, or changed too fast), of a
+    stuck signal, or held back until their signal has recovered. Untimed frames came before the
+    first REPLAY_CLOCK, where that is the time source; each new log is a beginning.
     """
 
     frames: int = 0
@@ -128,14 +118,8 @@ class SignWatch:
 class PipelineSettings:
     """Settings of a pipeline.
 
-    Parameters
-    ----------
-    estimator : EstimatorSettings
-        An unknown temperature source is replaced by the vehicle's.
-    time_source : {"receive", "replay-clock"}
-        Bus time: the frames' receive stamps, or the log time that REPLAY_CLOCK sends.
-    ids : FrameIds
-        Ids of the published frames and of REPLAY_CLOCK.
+    An unknown temperature source of the estimator is replaced by the vehicle's. Bus time is the
+    frames' receive stamps, or the log time that REPLAY_CLOCK sends.
     """
 
     estimator: EstimatorSettings = field(default_factory=EstimatorSettings)
@@ -163,10 +147,9 @@ class Pipeline:
     decoder : SampleDecoder
         Frame statistics, signal health and the vehicle's own SoC, of the current log.
     estimator : Estimator
-    samples : int
-        Samples handed to the estimator, refused ones included, over all logs.
-    taken : int
-        Samples that the estimator took: only these make an estimate fresh.
+    samples, taken : int
+        Samples handed to the estimator, over all logs, and those of them that it took: only these
+        make an estimate fresh.
     stamp_shift_s : float
         Part of the frames' stamps that their clock does not have, since it was set [s].
     latest_sample : Sample or None
@@ -370,16 +353,9 @@ class Pipeline:
     ) -> list[can.Message]:
         """Return the frames due every `publish.ESTIMATE_EVERY_S`.
 
-        Parameters
-        ----------
-        is_stale : bool
-            No sample within the service's time-out: the latest estimate becomes invalid.
-        silent_s : float
-            Time since the latest sample that the estimator took came in, by the loop's monotonic
-            clock [s]. With receive stamps, a silence longer than the current's own time-out is
-            stale as well.
-        reasons : Reason
-            Findings of the loop itself, about time and other senders.
+        `is_stale`: no sample came within the service's time-out. `silent_s` is the time since the
+        latest sample that the estimator took [s]; with receive stamps a silence longer than the
+        current's own time-out is stale as well. `reasons` are the loop's own findings.
         """
         if self._publisher is None:
             return []
@@ -413,21 +389,10 @@ class Pipeline:
     ) -> None:
         """Continue with another configuration, from the SoC known so far.
 
-        Unchanged parts keep their state bit for bit. A changed model or estimator setting makes
-        a new estimator, which takes over SoC and delay line.
-
-        Parameters
-        ----------
-        vehicle : Vehicle, optional
-            None: the same.
-        model : Model
-        settings : PipelineSettings
-            Initial SoC, its standard deviation, the time source and REPLAY_CLOCK's id stay.
-
-        Raises
-        ------
-        InputError
-            If a frame to publish has the id of a vehicle's signal; the old configuration stays.
+        Unchanged parts (vehicle None: the same) keep their state bit for bit. A changed model or
+        estimator setting makes a new estimator, which takes over SoC and delay line. Initial SoC,
+        its standard deviation, the time source and REPLAY_CLOCK's id stay. InputError, and no
+        change, if a frame to publish has the id of a vehicle's signal.
         """
         old, started = self.settings, self.estimator.settings
         ids = replace(settings.ids, replay_clock=old.ids.replay_clock)
@@ -469,10 +434,7 @@ class Pipeline:
     def restore(self, state: EstimatorState, age_s: float = 0.0) -> Estimate:
         """Continue from a state (see `Estimator.restore`); it is stale until a sample comes.
 
-        Raises
-        ------
-        InputError
-            If the state does not fit the model; nothing is changed then.
+        InputError, and no change, if it does not fit the model.
         """
         estimator = make_estimator(self.model, self.estimator.settings)
         latest = estimator.restore(state, age_s)

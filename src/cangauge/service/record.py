@@ -55,22 +55,11 @@ _LOG = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class RecordLimits:
-    """Limits of a recording: size and duration of its parts, and its total size.
+    """Limits of a recording: size and duration at which a new part begins, and its total size.
 
     Without limits it is one file. If that exists already (a restarted service must not overwrite
-    its predecessor's recording), or with any limit, runs and parts are numbered.
-
-    Parameters
-    ----------
-    part_bytes, part_s : float, optional
-        Size [bytes] and duration [s] at which a new part begins.
-    keep_bytes : float, optional
-        Total size above which the oldest parts are removed when a new one begins [bytes].
-
-    Raises
-    ------
-    InputError
-        If `keep_bytes` is given without parts.
+    its predecessor's recording), or with any limit, runs and parts are numbered. The oldest parts
+    are removed above `keep_bytes` when a new one begins; InputError if there are no parts.
     """
 
     part_bytes: float | None = None
@@ -101,7 +90,8 @@ class Recorder(Output):
     ----------
     path : path-like, optional
         Recorded to from the start, and again after each request. Without it a request begins a
-        candump file in the working folder, named by its UTC time.
+        candump file in the working folder, named by its UTC time. InputError if its suffix is
+        unknown, or its folder missing or not writable.
     limits : RecordLimits, optional
         By default one file. Without `keep_bytes` a recording begun by a request ends at
         `REQUESTED_BYTES`.
@@ -114,11 +104,6 @@ class Recorder(Output):
         Progress of the recording, or the end of the latest one; None before the first.
     written : list of Path
         All recordings, for `estimate`, in order.
-
-    Raises
-    ------
-    InputError
-        If the suffix is unknown, or the folder is missing or not writable.
     """
 
     def __init__(

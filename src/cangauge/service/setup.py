@@ -27,16 +27,8 @@ from cangauge.service.pipeline import PipelineSettings
 class Setup:
     """A configuration with the files that it names.
 
-    Parameters
-    ----------
-    config : RunConfig
-    vehicle : Vehicle
-    model : Model
-    settings : PipelineSettings
-    vehicle_key : tuple
-        Identity of the vehicle: its options, and the content of its files.
-    sign_cure : str
-        What to change if the current has the wrong sign.
+    `vehicle_key` is the identity of the vehicle: its options, and the content of its files.
+    `sign_cure` is what to change if the current has the wrong sign.
     """
 
     config: RunConfig
@@ -136,11 +128,6 @@ class Reloader:
     """Read the configuration in a thread, once for each request, while the old one is in use.
 
     The thread waits from the start on: a request starts none, which could fail.
-
-    Parameters
-    ----------
-    read : callable
-        Returns the configuration.
     """
 
     def __init__(self, read: Callable[[], RunConfig]) -> None:

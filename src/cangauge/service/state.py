@@ -51,17 +51,8 @@ _Name = Annotated[str, Field(max_length=_LONGEST_NAME)]
 class StateContent(BaseModel):
     """Content of the file, without its hash.
 
-    Parameters
-    ----------
-    saved_s : float
-        Unix time of the state [s].
-    boot_id : str or None
-        Boot of the machine that it belongs to; None if unknown.
-    model : str
-        Hash of the model's content.
-    model_name, bus, vehicle, time_source : str
-        Owner of the state; a bus is interface and channel.
-    estimator : EstimatorState
+    `saved_s` is Unix time [s], `boot_id` the boot of the machine (None: unknown), `model` the hash
+    of the model's content; a bus is interface and channel.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
@@ -116,21 +107,8 @@ def state_path(given: str | None, environment: Mapping[str, str]) -> Path | None
 class StateKeeper:
     """Restore the state at the start, save it on request and at the end; use it in a `with` block.
 
-    Parameters
-    ----------
-    path : Path
-    pipeline : Pipeline
-    bus : str
-        Interface and channel: the state of another bus is refused.
-    max_age_s : float
-        Age above which a state is refused [s].
-    wall_s : callable
-        Unix time [s].
-
-    Attributes
-    ----------
-    restored : bool
-        Whether the estimator continued from the file.
+    The state of another bus (interface and channel), or one older than `max_age_s` [s], is refused.
+    `wall_s` gives Unix time [s]; `restored` is whether the estimator continued from the file.
     """
 
     def __init__(

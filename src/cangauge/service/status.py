@@ -60,18 +60,10 @@ BOUNDS_S: Final = (
 
 @dataclass(frozen=True, slots=True)
 class RecordState:
-    """Progress of a recording.
+    """Progress of a recording: its current file; frames, and those of them that were not written.
 
-    Parameters
-    ----------
-    path : str
-        The current file.
-    frames, lost_frames, written_bytes : int
-        Frames recorded, frames of these that could not be written, bytes written.
-    problem : str or None
-        Why the disk rejects data at present, or why the recording could not begin.
-    active : bool
-        False once it has ended.
+    `problem` is why the disk rejects data at present, or why the recording could not begin or has
+    ended; it is not active once it has ended.
     """
 
     path: str
@@ -84,15 +76,7 @@ class RecordState:
 
 @dataclass(frozen=True, slots=True)
 class Snapshot:
-    """The state of the service at one moment.
-
-    Parameters
-    ----------
-    made_s : float
-        Monotonic time [s].
-    status : dict
-        The object of `/status` at that time: finite numbers, text and None.
-    """
+    """The object of `/status` (finite numbers, text and None) at a monotonic time [s]."""
 
     made_s: float
     status: dict[str, Any]
@@ -155,28 +139,9 @@ class Histogram:
 class Monitor:
     """Collect counts in the receive loop; its methods are for the loop's thread.
 
-    Parameters
-    ----------
-    pipeline : Pipeline
-    port : BusConnection
-    model : str
-        Name of the model's file.
-    notifier : Notifier, optional
-    record : callable, optional
-        Returns the state of the recording, if any.
-    clock : callable
-        Monotonic time [s].
-    show_every_s : float
-        Interval of the snapshots [s].
-    sign_cure : str
-        What to change if the current has the wrong sign.
-
-    Attributes
-    ----------
-    model, sign_cure : str
-        Replaced when the configuration changes.
-    latest : Snapshot
-        Immutable, hence readable from any thread.
+    `latest` is immutable, hence readable from any thread. `model` (name of the file) and
+    `sign_cure` (what to change if the current has the wrong sign) follow the configuration.
+    `record` returns the state of the recording, `clock` monotonic time [s].
     """
 
     def __init__(
@@ -212,16 +177,10 @@ class Monitor:
         self.latest = Snapshot(now_s, self._object(now_s))
 
     def stepped(self, stamp_s: float, step_s: float, came_s: float) -> None:
-        """Count a step of the estimator.
+        """Count a step of the estimator, of `step_s` [s].
 
-        Parameters
-        ----------
-        stamp_s : float
-            Receive stamp of the frame that completed the sample, seconds since 1970.
-        step_s : float
-            Processing time of the sample [s].
-        came_s : float
-            Monotonic time at which that frame was received [s].
+        The frame that completed the sample has the stamp `stamp_s` (seconds since 1970), and was
+        received at the monotonic time `came_s` [s].
         """
         self._sample_s = came_s
         self._unsent_stamp_s = stamp_s
