@@ -223,11 +223,7 @@ def status_of(reasons: Reason) -> Status:
 def drop_implausible(sample: Sample, nominal_v: float) -> tuple[Sample, Reason]:
     """Return the sample with an implausible voltage or temperature replaced by NaN, and why.
 
-    Parameters
-    ----------
-    sample : Sample
-    nominal_v : float
-        Voltage of the pack at half charge [V]; behind open contactors it is close to 0.
+    `nominal_v` is the pack's voltage at half charge [V]; behind open contactors it is close to 0.
     """
     reason = _NO_REASON
     low, high = VOLTAGE_WITHIN[0] * nominal_v, VOLTAGE_WITHIN[1] * nominal_v

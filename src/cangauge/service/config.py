@@ -54,8 +54,8 @@ DASHBOARD: Final = "127.0.0.1:8642"
 class KeyInfo:
     """What a key has beside its type, bounds and help.
 
-    `option` is that of `cangauge run`, such as "-m, --model" ("": a key of the file only), `metavar`
-    the placeholder of its value, and `bare` its value where none follows ("" if one must).
+    `option` is that of `cangauge run`, such as "-m, --model" ("": a key of the file only),
+    `metavar` the placeholder of its value, `bare` its value where none follows ("": one must).
     `default_text` is the default in words, where the field's own is not enough. A reload does not
     apply a change of a key with `restart`; paths are relative to the file that they are in.
     """

@@ -51,15 +51,10 @@ def stop_on_signals() -> Iterator[Callable[[], bool]]:
 
 @contextmanager
 def deadline_after_signal(within_s: float = END_WITHIN_S) -> Iterator[None]:
-    """End the process with code 1 if the block still runs a while after SIGINT or SIGTERM.
+    """End the process with code 1 if the block still runs `within_s` after SIGINT or SIGTERM.
 
     Nothing that can hang (a disk, a pipe whose reader has stopped) must keep a service from ending.
     The signal wakes a thread by a pipe, since a main thread that hangs runs no handler.
-
-    Parameters
-    ----------
-    within_s : float
-        Time from the signal to that end [s].
     """
     if sys.platform == "win32":  # it has no wake-up by a pipe
         yield
@@ -145,18 +140,9 @@ def _has_terminal() -> bool:
 class Notifier:
     """Notify systemd by datagrams of `KEY=value` lines; without effect where it does not listen.
 
-    Parameters
-    ----------
-    environment : mapping, optional
-        With NOTIFY_SOCKET (a path; a leading "@" denotes the abstract namespace), WATCHDOG_USEC and
-        WATCHDOG_PID; by default none of them.
-
-    Attributes
-    ----------
-    active : bool
-        Whether systemd listens.
-    ping_every_s : float or None
-        Longest interval between calls of `ping` [s]; None without a watchdog.
+    The environment has NOTIFY_SOCKET (a path; a leading "@" denotes the abstract namespace; whether
+    it is there is `active`), WATCHDOG_USEC and WATCHDOG_PID. `ping_every_s` is the longest interval
+    between calls of `ping` [s]; None without a watchdog.
     """
 
     def __init__(self, environment: Mapping[str, str] | None = None) -> None:

@@ -60,19 +60,10 @@ def socket_path(bus: str) -> Path:
 
 
 class StatusSocket:
-    """Answer each connection with the status, from a thread, until `close`.
+    """Answer each connection with the JSON object that `status` returns, in a thread.
 
-    Parameters
-    ----------
-    path : Path
-        A socket that nobody serves is replaced.
-    status : callable
-        Returns the JSON object of `/status`.
-
-    Raises
-    ------
-    InputError
-        If another service uses it, another file has this name, or it cannot be created.
+    A socket that nobody serves is replaced. InputError if another service uses it, another file
+    has this name, or it cannot be created.
     """
 
     def __init__(self, path: Path, status: Callable[[], dict[str, Any]]) -> None:
@@ -138,15 +129,7 @@ def is_served(path: Path) -> bool:
 
 
 def find_socket() -> Path:
-    """Return the unix socket of the running service.
-
-    Raises
-    ------
-    NotRunningError
-        If no service runs.
-    InputError
-        If several services run.
-    """
+    """Return the socket of the running service; NotRunningError: none, InputError: several."""
     found: list[Path] = []
     with suppress(OSError):  # a folder that this user may not read
         for folder in (*runtime_folders(), SYSTEM_FOLDER, *SYSTEM_FOLDER.glob("*")):
