@@ -114,7 +114,7 @@ class Service:
     pipeline: Pipeline
     settings: LoopSettings = field(default_factory=LoopSettings)
     record: Any = None
-    checkpoint: Callable[[], None] | None = None
+    checkpoint: Callable[[], None] = lambda: None
     rows: list[tuple[float, Estimate]] = field(default_factory=list)
     summary: RunSummary | None = None
     error: BaseException | None = None

@@ -9,7 +9,11 @@ import sys
 
 def main() -> None:
     """Run the command line; a service holds SIGHUP before its imports, which take a second."""
-    _open_missing_streams()
+    for number in range(3):
+        try:
+            os.fstat(number)
+        except OSError:  # closed before the start: a bus or a recording would become stdout
+            os.open(os.devnull, os.O_RDWR)  # takes the lowest free number
     if isinstance(sys.stdout, io.TextIOWrapper):  # not what a test or a notebook has in its place
         # In a locale without "±" or "°C" the text is legible; otherwise it would be an error.
         sys.stdout.reconfigure(errors="backslashreplace")
@@ -20,15 +24,6 @@ def main() -> None:
     from cangauge.cli.app import main as command_line  # noqa: PLC0415 - as above
 
     command_line()
-
-
-def _open_missing_streams() -> None:
-    """Open what was closed before the start, or a bus or a recording would become stdout."""
-    for number in range(3):
-        try:
-            os.fstat(number)
-        except OSError:
-            os.open(os.devnull, os.O_RDWR)  # takes the lowest free number
 
 
 if __name__ == "__main__":

@@ -56,18 +56,10 @@ def schema_error(
     source: str | PathLike[str],
     cure: str | None = None,
 ) -> InputError:
-    """Return the first validation error as an InputError with file, field, value and cure.
+    """Return the first validation error of a schema's data, with file, field, value and cure.
 
-    An unknown key comes before a missing one: it is often that key, misspelt.
-
-    Parameters
-    ----------
-    error : pydantic.ValidationError
-    model : type of BaseModel
-        The schema of the data.
-    source : path-like
-    cure : str, optional
-        General advice, for errors without a better one.
+    An unknown key comes before a missing one: it is often that key, misspelt. `cure` is general
+    advice, for errors without a better one.
     """
     first = min(error.errors(include_url=False), key=lambda each: each["type"] != "extra_forbidden")
     place = list(first["loc"])

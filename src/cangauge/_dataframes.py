@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import importlib
 from abc import abstractmethod
+from importlib import import_module
 from typing import Any
 
 from cangauge.errors import InputError
@@ -22,24 +22,12 @@ class ArrowExport:
         """Return a pyarrow.Table."""
 
     def to_pandas(self) -> Any:
-        """Return a pandas.DataFrame of the columns; unknown numbers are NaN.
-
-        Raises
-        ------
-        InputError
-            If pandas is not installed.
-        """
+        """Return a pandas.DataFrame, unknown numbers NaN; InputError if pandas is missing."""
         _import("pandas")
         return self.to_arrow().to_pandas()
 
     def to_polars(self) -> Any:
-        """Return a polars.DataFrame of the columns; unknown numbers are null.
-
-        Raises
-        ------
-        InputError
-            If polars is not installed.
-        """
+        """Return a polars.DataFrame, unknown numbers null; InputError if polars is missing."""
         return _import("polars").from_arrow(self.to_arrow())
 
     def __arrow_c_stream__(self, requested_schema: Any = None) -> Any:
@@ -49,8 +37,7 @@ class ArrowExport:
 
 def _import(package: str) -> Any:
     try:
-        return importlib.import_module(package)
+        return import_module(package)
     except ImportError as error:
-        raise InputError(
-            f"{package} is not installed", cure=f"install it: pip install {package}"
-        ) from error
+        cure = f"install it: pip install {package}"
+        raise InputError(f"{package} is not installed", cure=cure) from error

@@ -49,13 +49,7 @@ _SUFFIXES: Final = frozenset(
 
 
 def open_regular(path: str | PathLike[str]) -> BinaryIO:
-    """Open a file for reading.
-
-    Raises
-    ------
-    InputError
-        If it is absent, no regular file, or cannot be read.
-    """
+    """Open a file for reading; InputError if it is absent, no regular file, or unreadable."""
     path = Path(path)
     try:
         mode = path.stat().st_mode
@@ -148,10 +142,6 @@ class Head:
 
     gzip, bzip2 and the only file of a zip are unpacked.
 
-    Parameters
-    ----------
-    path : path-like
-
     Attributes
     ----------
     path : Path
@@ -218,13 +208,7 @@ class Head:
             raise InputError(f"the zip cannot be unpacked: {error}", source=self.path) from error
 
     def read(self) -> bytes:
-        """Return the whole unpacked content.
-
-        Raises
-        ------
-        InputError
-            If the file is damaged, or larger than a log may be.
-        """
+        """Return the unpacked content; InputError if damaged, or larger than a log may be."""
         with self.open() as file:
             return read_all(file, self.path, MAX_LOG_BYTES, "a log")
 
@@ -301,24 +285,12 @@ FOR_GROUP: Final = 0o640
 
 
 @contextmanager
-def atomic_path(path: str | PathLike[str], rights: int | None = None) -> Iterator[Path]:
+def atomic_path(path: str | PathLike[str]) -> Iterator[Path]:
     """Yield a temporary path beside `path` and rename it to `path` when the block succeeds.
 
     If the block raises, `path` is unchanged. The content is synced to disk before the rename: a
-    power cut leaves the old file or the new one. A device or pipe (`/dev/stdout`) cannot be
-    replaced and is yielded itself.
-
-    Parameters
-    ----------
-    path : path-like
-        The file to write; a symbolic link is followed.
-    rights : int, optional
-        Its permissions. By default those of the file that is replaced, or the umask's.
-
-    Yields
-    ------
-    Path
-        Where to write.
+    power cut leaves the old file or the new one. A symbolic link is followed, permissions are kept,
+    and a device or pipe (`/dev/stdout`), which cannot be replaced, is yielded itself.
 
     Raises
     ------
@@ -331,12 +303,12 @@ def atomic_path(path: str | PathLike[str], rights: int | None = None) -> Iterato
         yield Path(path)
         return
     target = Path(os.path.realpath(path))
-    part = _create_beside(target, path, 0o666 if rights is None else rights)
+    part = _create_beside(target, path)
     try:
         yield part
         with part.open("rb") as written:
             os.fsync(written.fileno())
-        if rights is None and target.exists():
+        if target.exists():
             part.chmod(stat.S_IMODE(target.stat().st_mode))
         part.replace(target)
     except OSError as error:
@@ -348,7 +320,7 @@ def atomic_path(path: str | PathLike[str], rights: int | None = None) -> Iterato
         part.unlink(missing_ok=True)
 
 
-def _create_beside(target: Path, shown: str | PathLike[str], rights: int = 0o666) -> Path:
+def _create_beside(target: Path, shown: str | PathLike[str]) -> Path:
     # The suffix stays last: writers such as pyarrow and bokeh choose the format by it.
     part = target.with_name(f".{target.stem[:200]}.{secrets.token_hex(4)}{target.suffix}")
     try:
@@ -356,7 +328,7 @@ def _create_beside(target: Path, shown: str | PathLike[str], rights: int = 0o666
             target.lstat()  # its name can be too long where that of `part` is not
         if target.is_dir():
             raise InputError("this is a folder", source=shown, cure="name a file in it")
-        part.touch(rights, exist_ok=False)
+        part.touch(exist_ok=False)
     except OSError as error:
         problem, cure = _WRITE_ERRORS.get(
             error.errno or 0, (f"cannot be written: {error.strerror}", "name another path")
@@ -373,10 +345,9 @@ def _is_device(path: Path) -> bool:
     return not stat.S_ISREG(mode) and not stat.S_ISDIR(mode)
 
 
-def write_text_atomic(path: str | PathLike[str], text: str, rights: int | None = None) -> None:
+def write_text_atomic(path: str | PathLike[str], text: str) -> None:
     """Write `text` as UTF-8 to `path`, all or nothing (see `atomic_path`)."""
-    with atomic_path(path, rights) as part:
-        part.write_text(text, encoding="utf-8", newline="\n")
+    write_texts_atomic({Path(path): text})
 
 
 def write_texts_atomic(texts: Mapping[Path, str]) -> None:
@@ -396,13 +367,7 @@ def check_writable(path: str | PathLike[str]) -> None:
 def require_suffix(path: str | PathLike[str], *suffixes: str, field: str) -> None:
     """Raise InputError unless a file to write has one of these suffixes, or is a device.
 
-    Parameters
-    ----------
-    path : path-like
-    *suffixes : str
-        With their dot, in lower case.
-    field : str
-        Option or field that names it, for the message.
+    Suffixes are in lower case, with their dot; `field` is the option that names the file.
     """
     output = Path(path)
     if output.suffix.lower() in suffixes or _is_device(output):
@@ -433,7 +398,8 @@ def sole_writer(path: str | PathLike[str]) -> Iterator[None]:
     lock = target.with_name(f".{target.name[:200]}.lock")
     held = None
     with suppress(OSError):  # no lock here; where nothing can be written, writing reports it
-        held = _locked(lock, path) if fcntl is not None else None
+        while fcntl is not None and held is None:
+            held = _locked(lock, path)
     try:
         yield
     finally:
@@ -442,30 +408,28 @@ def sole_writer(path: str | PathLike[str]) -> Iterator[None]:
             os.close(held)
 
 
-def _locked(lock: Path, shown: str | PathLike[str]) -> int:
-    """Return the descriptor of a locked file."""
-    while True:
-        held = os.open(lock, os.O_RDWR | os.O_CREAT, PRIVATE)
-        try:
-            fcntl.flock(held, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            if os.path.samestat(os.fstat(held), lock.stat()):  # not just removed by its holder
-                os.ftruncate(held, 0)
-                os.write(held, f"{os.getpid()}\n".encode())
-                return held
-        except FileNotFoundError:
-            pass
-        except BlockingIOError as error:
-            holder = os.read(held, 20).decode("ascii", "replace").strip()
-            os.close(held)
-            raise InputError(
-                f"another service{f' (process {holder})' if holder else ''} writes this file",
-                source=shown,
-                cure="stop that one, or name another file",
-            ) from error
-        except OSError:
-            os.close(held)
-            raise
+def _locked(lock: Path, shown: str | PathLike[str]) -> int | None:
+    """Return the descriptor of a locked file; None if its holder removed it just now."""
+    held = os.open(lock, os.O_RDWR | os.O_CREAT, PRIVATE)
+    try:
+        fcntl.flock(held, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        if lock.exists() and os.path.samestat(os.fstat(held), lock.stat()):
+            os.ftruncate(held, 0)
+            os.write(held, f"{os.getpid()}\n".encode())
+            return held
+    except BlockingIOError as error:
+        holder = os.read(held, 20).decode("ascii", "replace").strip()
         os.close(held)
+        raise InputError(
+            f"another service{f' (process {holder})' if holder else ''} writes this file",
+            source=shown,
+            cure="stop that one, or name another file",
+        ) from error
+    except OSError:
+        os.close(held)
+        raise
+    os.close(held)
+    return None
 
 
 def text_sha256(text: str) -> str:

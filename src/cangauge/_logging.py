@@ -36,9 +36,6 @@ LONGEST_INTERVAL_S: Final = 60.0
 EVENTS_KEPT: Final = 256
 """Most events whose repetitions are tracked, to bound the memory."""
 
-_UNNAMED: Final = "log"
-"""Event name of records from other libraries."""
-
 
 def emit(
     logger: logging.Logger,
@@ -49,21 +46,10 @@ def emit(
     limit: str | None = None,
     **fields: object,
 ) -> None:
-    """Log one event.
+    """Log one event: its stable name, and one line for people.
 
-    Parameters
-    ----------
-    logger : logging.Logger
-    level : int
-        `logging.INFO`, `logging.WARNING`, …
-    event : str
-        Stable name, such as "bus.lost".
-    text : str
-        One line for people.
-    limit : str, optional
-        Share one rate limit among events that supersede each other, such as the states of a bus.
-    **fields
-        Further values, with units in their names; keys of the JSON object.
+    Events with the same `limit` share one rate limit, as they supersede each other (the states of
+    a bus). `fields` are further keys of the JSON object, with units in their names.
     """
     extra = {"event": event, "limit": limit or event, "fields": fields}
     logger.log(level, "%s", text, extra=extra)
@@ -73,38 +59,34 @@ def emit(
 def logging_to(
     log_format: LogFormat, level: LogLevel = "info", stream: TextIO | None = None
 ) -> Iterator[None]:
-    """Write log records to a stream while the block runs, then restore the previous set-up.
+    """Write log records to a stream (stderr) while the block runs, then restore the set-up.
 
-    Parameters
-    ----------
-    log_format : {"text", "json"}
-    level : {"debug", "info", "warning", "error"}
-        Lowest level written. Other libraries are limited to errors, unless it is "debug".
-    stream : file, optional
-        stderr by default.
+    `level` is the lowest one written; other libraries are limited to errors, unless it is "debug".
     """
     handler = _Handler(stream or sys.stderr)
-    handler.setFormatter(JsonFormatter() if log_format == "json" else TextFormatter())
+    handler.setFormatter(_Json() if log_format == "json" else _Text())
     limiter = RateLimitFilter(handler.write)
     handler.addFilter(limiter)
-    _LIMITERS.append(limiter)
-    root, own = logging.getLogger(), logging.getLogger("cangauge")
-    bus = logging.getLogger("can")
-    before = root.handlers[:], root.level, own.level, bus.level
-    root.handlers[:] = [handler]
-    root.setLevel(logging.DEBUG if level == "debug" else logging.ERROR)
-    own.setLevel(level.upper())
     # python-can logs and raises the same error, at each attempt to open a missing bus.
-    bus.setLevel(logging.NOTSET if level == "debug" else logging.CRITICAL)
+    levels: dict[str, int | str] = {
+        "": logging.ERROR, "cangauge": level.upper(), "can": logging.CRITICAL
+    }  # fmt: skip
+    if level == "debug":
+        levels |= {"": logging.DEBUG, "can": logging.NOTSET}
+    root = logging.getLogger()
+    before = root.handlers[:], {name: logging.getLogger(name).level for name in levels}
+    root.handlers[:] = [handler]
+    for name, least in levels.items():
+        logging.getLogger(name).setLevel(least)
+    _LIMITERS.append(limiter)
     try:
         yield
     finally:
         _LIMITERS.remove(limiter)
         limiter.release_due(everything=True)
         root.handlers[:] = before[0]
-        root.setLevel(before[1])
-        own.setLevel(before[2])
-        bus.setLevel(before[3])
+        for name, least in before[1].items():
+            logging.getLogger(name).setLevel(least)
 
 
 _LIMITERS: Final[list[RateLimitFilter]] = []
@@ -148,32 +130,52 @@ class _Handler(logging.StreamHandler[TextIO]):
         """Ignore errors: a closed stderr must not end the service, and cannot be reported."""
 
 
-class TextFormatter(logging.Formatter):
+class _Text(logging.Formatter):
     """`2026-10-17T08:30:00.123Z WARNING bus.lost: socketcan can0 is down (retry_s=1)`."""
 
     def format(self, record: logging.LogRecord) -> str:
-        """Return the line."""
+        time_text, event, message, fields = _parts(record)
         pairs = " ".join(
             f"{name}={value:.6g}" if isinstance(value, float) else f"{name}={value}"
-            for name, value in _fields(record).items()
+            for name, value in fields.items()
         )
-        line = f"{_time(record)} {record.levelname} {_event(record)}: {_message(record)}"
+        line = f"{time_text} {record.levelname} {event}: {message}"
         return printable(" ".join((f"{line} ({pairs})" if pairs else line).splitlines()))
 
 
-class JsonFormatter(logging.Formatter):
+class _Json(logging.Formatter):
     """One JSON object per line: `time`, `level`, `event`, `message`, `logger` and the fields."""
 
     def format(self, record: logging.LogRecord) -> str:
-        """Return the line."""
-        content = {name: _plain(value) for name, value in _fields(record).items()} | {
-            "time": _time(record),
+        time_text, event, message, fields = _parts(record)
+        content = {name: _plain(value) for name, value in fields.items()} | {
+            "time": time_text,
             "level": record.levelname.lower(),
-            "event": _event(record),
-            "message": _message(record),
+            "event": event,
+            "message": message,
             "logger": record.name,
         }
         return printable_json(json.dumps(content, ensure_ascii=False))
+
+
+def _parts(record: logging.LogRecord) -> tuple[str, str, str, dict[str, Any]]:
+    """Return time, event ("log" of other libraries), message and fields of a record."""
+    stamp = datetime.fromtimestamp(record.created, UTC).isoformat(timespec="milliseconds")
+    message = record.getMessage()
+    if record.exc_info is not None:
+        message = f"{message}: {record.exc_info[1]!r}"
+    fields = dict(getattr(record, "fields", {}))
+    if hasattr(record, "suppressed"):
+        fields["repeats_suppressed"] = record.suppressed
+    return stamp.replace("+00:00", "Z"), str(getattr(record, "event", "log")), message, fields
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if isinstance(value, list | tuple):
+        return [_plain(item) for item in value]
+    return value if isinstance(value, str | int | bool) or value is None else str(value)
 
 
 @dataclass(slots=True)
@@ -186,17 +188,18 @@ class _Repetitions:
     suppressed: int = 0
     held: logging.LogRecord | None = None
 
+    def write(self, record: logging.LogRecord, now_s: float) -> None:
+        """Note that a record is written."""
+        if self.suppressed:
+            record.suppressed = self.suppressed
+        self.suppressed, self.held, self.next_s = 0, None, now_s + self.interval_s
+
 
 class RateLimitFilter(logging.Filter):
     """Limit each event to one record per interval; the latest suppressed one follows at its end.
 
-    Parameters
-    ----------
-    release : callable, optional
-        Writes a suppressed record once its interval has ended, when `release_due` is called: no
-        thread is started for it, which could fail. Without it, suppressed records are only counted.
-    clock : callable
-        Monotonic time [s].
+    `release` writes it, when `release_due` is called: no thread is started for it, which could
+    fail. Without it, suppressed records are only counted. `clock` gives monotonic time [s].
     """
 
     def __init__(
@@ -215,8 +218,7 @@ class RateLimitFilter(logging.Filter):
         key = (record.name, str(getattr(record, "limit", record.msg)))
         with self._lock:
             now_s = self._clock()
-            seen = self._events.pop(key, None) or _Repetitions()
-            self._events[key] = seen
+            seen = self._events[key] = self._events.pop(key, _Repetitions())
             if len(self._events) > EVENTS_KEPT:
                 del self._events[next(iter(self._events))]  # the one quiet for longest
             if now_s - seen.latest_s > LONGEST_INTERVAL_S:
@@ -229,7 +231,7 @@ class RateLimitFilter(logging.Filter):
             else:
                 seen.interval_s = min(2.0 * seen.interval_s, LONGEST_INTERVAL_S)
             seen.latest_s = now_s
-            _pass(seen, record, now_s)
+            seen.write(record, now_s)
         return True
 
     def release_due(self, *, everything: bool = False) -> None:
@@ -240,48 +242,10 @@ class RateLimitFilter(logging.Filter):
             now_s = self._clock()
             due: list[logging.LogRecord] = []
             for seen in self._events.values():
-                if seen.held is None or (now_s < seen.next_s and not everything):
-                    continue
-                due.append(seen.held)
-                seen.suppressed -= 1
-                seen.interval_s = min(2.0 * seen.interval_s, LONGEST_INTERVAL_S)
-                _pass(seen, seen.held, now_s)
+                if seen.held is not None and (everything or now_s >= seen.next_s):
+                    due.append(seen.held)
+                    seen.suppressed -= 1
+                    seen.interval_s = min(2.0 * seen.interval_s, LONGEST_INTERVAL_S)
+                    seen.write(seen.held, now_s)
         for record in sorted(due, key=lambda each: each.created):
             self._release(record)
-
-
-def _pass(seen: _Repetitions, record: logging.LogRecord, now_s: float) -> None:
-    if seen.suppressed:
-        record.suppressed = seen.suppressed
-    seen.suppressed = 0
-    seen.held = None
-    seen.next_s = now_s + seen.interval_s
-
-
-def _time(record: logging.LogRecord) -> str:
-    stamp = datetime.fromtimestamp(record.created, UTC)
-    return stamp.isoformat(timespec="milliseconds").replace("+00:00", "Z")
-
-
-def _event(record: logging.LogRecord) -> str:
-    return str(getattr(record, "event", _UNNAMED))
-
-
-def _message(record: logging.LogRecord) -> str:
-    text = record.getMessage()
-    return text if record.exc_info is None else f"{text}: {record.exc_info[1]!r}"
-
-
-def _fields(record: logging.LogRecord) -> dict[str, Any]:
-    fields = dict(getattr(record, "fields", {}))
-    if hasattr(record, "suppressed"):
-        fields["repeats_suppressed"] = record.suppressed
-    return fields
-
-
-def _plain(value: Any) -> Any:
-    if isinstance(value, float):
-        return value if math.isfinite(value) else None
-    if isinstance(value, list | tuple):
-        return [_plain(item) for item in value]
-    return value if isinstance(value, str | int | bool) or value is None else str(value)

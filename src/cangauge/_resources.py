@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import os
-from collections.abc import Iterator, MutableMapping
-from contextlib import contextmanager
+from collections.abc import MutableMapping
 from pathlib import Path
 from typing import Final
 
@@ -41,11 +39,8 @@ def shared_file(folder: str, name: str) -> Path:
         path = root / folder / name
         if path.is_file():
             return path
-    raise InputError(
-        "this file of the installation is missing",
-        source=f"{folder}/{name}",
-        cure="reinstall cangauge",
-    )
+    problem = "this file of the installation is missing"
+    raise InputError(problem, source=f"{folder}/{name}", cure="reinstall cangauge")
 
 
 def one_thread(environment: MutableMapping[str, str]) -> None:
@@ -56,18 +51,3 @@ def one_thread(environment: MutableMapping[str, str]) -> None:
     """
     for name in THREADS:
         environment.setdefault(name, "1")
-
-
-@contextmanager
-def single_threaded() -> Iterator[None]:
-    """Start processes with one BLAS thread each: there is one process per core already."""
-    before = {name: os.environ.get(name) for name in THREADS}
-    os.environ.update(dict.fromkeys(THREADS, "1"))
-    try:
-        yield
-    finally:
-        for name, value in before.items():
-            if value is None:
-                del os.environ[name]
-            else:
-                os.environ[name] = value

@@ -60,50 +60,46 @@ class InputError(CangaugeError):
         self.field = field
         self.value = value
         self.cure = cure
-        super().__init__(self._line())
+        where = [_short(self.source or "", _LONGEST_PATH), _short(field or "", _LONGEST_VALUE)]
+        text = ": ".join(filter(None, [*where, _short(problem)]))
+        if value is not None:
+            text += f" (got {_quoted(value)})"
+        if cure:
+            text += f"; {_short(cure)}"
+        # Text quoted from a file or its name must neither break the line nor control a terminal.
+        super().__init__(
+            "".join(
+                char if char.isprintable() else char.encode("unicode_escape").decode()
+                for char in text
+            )
+        )
 
     def to_dict(self) -> dict[str, Any]:
         """Return the message and its parts for `--json`; unknown parts are None."""
         return {
             "message": str(self),
             "source": self.source,
-            "field": self.field and _short(self.field),
+            "field": self.field and _short(self.field, _LONGEST_VALUE),
             "value": _plain(self.value),
-            "cure": self.cure and _short(self.cure, _LONGEST_PROBLEM),
+            "cure": self.cure and _short(self.cure),
         }
-
-    def _line(self) -> str:
-        field = None if self.field is None else _short(self.field)
-        source = None if self.source is None else _short(self.source, _LONGEST_PATH)
-        where = ": ".join(part for part in (source, field) if part)
-        problem = _short(self.problem, _LONGEST_PROBLEM)
-        text = f"{where}: {problem}" if where else problem
-        if self.value is not None:
-            text += f" (got {_shown(self.value)})"
-        if self.cure:
-            text += f"; {_short(self.cure, _LONGEST_PROBLEM)}"
-        # Text quoted from a file or its name must neither break the line nor control a terminal.
-        return "".join(
-            char if char.isprintable() else char.encode("unicode_escape").decode() for char in text
-        )
 
 
 # Text quoted from a file may have any length [characters].
 _LONGEST_VALUE: Final = 160
-_LONGEST_PROBLEM: Final = 600
+_LONGEST_TEXT: Final = 600
 _LONGEST_PATH: Final = 1000
 
 
-def _short(text: str, longest: int = _LONGEST_VALUE) -> str:
+def _short(text: str, longest: int = _LONGEST_TEXT) -> str:
     return text if len(text) <= longest else text[:longest] + "…"
 
 
-def _shown(value: object) -> str:
+def _quoted(value: object) -> str:
     try:
-        text = repr(value)
+        return _short(repr(value), _LONGEST_VALUE)
     except (ValueError, RecursionError):  # a number of more than 4300 digits; deeply nested lists
         return f"a huge {type(value).__name__}"
-    return _short(text)
 
 
 def _plain(value: object) -> bool | float | str | None:
@@ -114,22 +110,17 @@ def _plain(value: object) -> bool | float | str | None:
         return value
     if isinstance(value, int) and value.bit_length() <= 64:
         return value
-    return _short(value) if isinstance(value, str) else _shown(value)
-
-
-# Bounds of the search, whose time grows with both [characters, names].
-_LONGEST_NAME: Final = 200
-_MOST_NAMES: Final = 20_000
+    return _short(value, _LONGEST_VALUE) if isinstance(value, str) else _quoted(value)
 
 
 def closest(word: str, names: Iterable[str]) -> str:
     """Return up to three names most similar to a word, joined by commas; "" if none is.
 
-    For "did you mean …?".
+    For "did you mean …?". The time of the search grows with length and number of the names, which
+    are therefore limited.
     """
-    if len(word) > _LONGEST_NAME:
+    if len(word) > 200:
         return ""
-    some = islice(names, _MOST_NAMES)
-    by_lower = {name.lower(): name for name in some if len(name) <= _LONGEST_NAME}
+    by_lower = {name.lower(): name for name in islice(names, 20_000) if len(name) <= 200}
     hits = difflib.get_close_matches(word.lower(), by_lower, n=3, cutoff=0.5)
     return ", ".join(by_lower[hit] for hit in hits)

@@ -50,7 +50,7 @@ class Status(enum.IntEnum):
 
 
 class Reason(enum.IntFlag):
-    """Reasons for a status other than valid; the bits are those of the published frame."""
+    """Reasons for a status other than valid; the first 20 bits are those of the published frame."""
 
     NONE = 0
     DELAY_LINE_FILLING = 1 << 0
@@ -78,6 +78,8 @@ class Reason(enum.IntFlag):
     MODEL_MISMATCH = 1 << 18
     """Voltages contradict the model for longer than its stated errors last."""
     TIME_UNCERTAIN = 1 << 19
+    SIGN_SUSPECT = 1 << 20
+    """The voltage proves that positive current charges. In the frame: `IMPLAUSIBLE_INPUT`."""
 
 
 REASON_WORDS: Final = {
@@ -101,6 +103,7 @@ REASON_WORDS: Final = {
     Reason.DUPLICATE_SENDER: "another node sends frames with an id that is read or published here",
     Reason.MODEL_MISMATCH: "the pack does not behave as its model: run `cangauge gap` on a log",
     Reason.TIME_UNCERTAIN: "time stamps are irregular, or contradict the monotonic clock",
+    Reason.SIGN_SUSPECT: "the current has the wrong sign: the voltage moves with it in its steps",
 }
 """Description of each reason, for pages and messages."""
 
@@ -115,7 +118,9 @@ class _Reasons(dict[int, Reason]):
 REASONS: Final = _Reasons()
 """Sets of reasons by their bits: slow to combine, and read for every sample."""
 _UNKNOWN_BITS: Final = int(Reason.NO_INITIAL_SOC)
-_INVALID_BITS: Final = int(Reason.INPUT_STALE | Reason.CURRENT_MISSING | Reason.MODEL_MISMATCH)
+_INVALID_BITS: Final = int(
+    Reason.INPUT_STALE | Reason.CURRENT_MISSING | Reason.MODEL_MISMATCH | Reason.SIGN_SUSPECT
+)
 
 
 def reason_name(reason: Reason) -> str:
@@ -218,11 +223,7 @@ def status_of(reasons: Reason) -> Status:
 def drop_implausible(sample: Sample, nominal_v: float) -> tuple[Sample, Reason]:
     """Return the sample with an implausible voltage or temperature replaced by NaN, and why.
 
-    Parameters
-    ----------
-    sample : Sample
-    nominal_v : float
-        Voltage of the pack at half charge [V]; behind open contactors it is close to 0.
+    `nominal_v` is the pack's voltage at half charge [V]; behind open contactors it is close to 0.
     """
     reason = _NO_REASON
     low, high = VOLTAGE_WITHIN[0] * nominal_v, VOLTAGE_WITHIN[1] * nominal_v

@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 from cangauge._resources import shared_file
 from cangauge.bus.database import signal_codec
 from cangauge.bus.protection import CRC_ONLY_RULE, GENERIC_RULE, LEAF_RULE, E2eRule
+from cangauge.bus.publish import reason_bits
 from cangauge.types import Reason, Status
 
 FILES = ("nissan_leaf.dbc", "generic_pack.dbc", "soc_estimate.dbc")
@@ -78,7 +79,9 @@ def test_status_and_reasons_agree_with_the_estimator() -> None:
     assert reason.length == 20
     for bit in range(20):
         assert f" {bit}: " in str(reason.comment)
-    assert max(Reason).bit_length() == 20
+    # What comes after the frame's bits shares one of them.
+    assert list(Reason)[20:] == [Reason.SIGN_SUSPECT]
+    assert reason_bits(Reason.SIGN_SUSPECT | Reason.CURRENT_GAP) == 1 << 12 | 1 << 1
     assert (message.frame_id, message.cycle_time) == (0x5A0, 100)
     detail = soc.get_message_by_name("SOC_DETAIL")
     assert (detail.frame_id, detail.cycle_time) == (0x5A1, 1000)

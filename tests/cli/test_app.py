@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import os
 import subprocess
 import sys
@@ -12,6 +13,7 @@ import typer
 
 from cangauge._resources import THREADS
 from cangauge.cli.app import COMMANDS, app, help_line
+from cangauge.cli.output import note
 from live import in_process
 
 
@@ -103,3 +105,19 @@ def test_blas_has_one_thread_unless_the_user_asks_for_more(
         capture_output=True, text=True, check=True, timeout=60, env=environment,
     )  # fmt: skip
     assert done.stdout.splitlines()[-1] == f"False {expected}"
+
+
+def test_lines_on_a_terminal_fit_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Between words: a path stays whole. What is piped stays one line."""
+    said, path = io.StringIO(), "/a/long/path-of-a/" + 60 * "x" + ".csv"
+    text = f"error: {path}: time_s: runs backwards in 17 rows; " + 12 * "sort the file "
+    monkeypatch.setattr(sys, "stderr", said)
+    monkeypatch.setenv("COLUMNS", "80")
+    note(text)
+    assert said.getvalue() == text.rstrip() + "\n"
+    monkeypatch.setattr(said, "isatty", lambda: True, raising=False)
+    said.truncate(0)
+    note(text)
+    lines = said.getvalue().strip("\0").splitlines()
+    assert all(len(line) <= 80 or path in line for line in lines)
+    assert " ".join(line.strip() for line in lines) == text.rstrip()

@@ -20,6 +20,7 @@ from cangauge.errors import InputError
 from cangauge.estimation.estimator import Estimator
 from cangauge.estimation.offline import samples_of
 from cangauge.estimation.settings import EstimatorSettings
+from cangauge.logs.canonical import write_log
 from cangauge.logs.cells import read_cells
 from cangauge.logs.log import Log
 from cangauge.logs.read import read_log
@@ -51,7 +52,7 @@ def table_with_cells(log: Log) -> pa.Table:
 
 @pytest.mark.parametrize("suffix", [".parquet", ".csv"])
 def test_a_log_with_cell_columns(run: Run, made: Path, tmp_path: Path, suffix: str) -> None:
-    log = read_log(made / "part.csv").rows(slice(0, 400))
+    log = read_log(made / "part.csv").rows(slice(0, 100))
     path, pack = tmp_path / f"cells{suffix}", tmp_path / "pack.parquet"
     if suffix == ".csv":
         pa.csv.write_csv(table_with_cells(log), path)
@@ -76,13 +77,14 @@ def test_a_log_with_cell_columns(run: Run, made: Path, tmp_path: Path, suffix: s
 
 def test_pack_rows_are_those_of_the_estimator(run: Run, made: Path, tmp_path: Path) -> None:
     pack = tmp_path / "pack.csv"
-    ran = run("estimate", made / "part.csv", "-m", made / "model.json", "-o",
+    log = read_log(made / "part.csv").rows(slice(0, 100))
+    write_log(log, tmp_path / "part.parquet")
+    ran = run("estimate", tmp_path / "part.parquet", "-m", made / "model.json", "-o",
               tmp_path / "soc.csv", "--pack", pack)  # fmt: skip
     assert ran.code == 0, ran.err
     assert "The pack at the end" in ran.out
     table = pa.csv.read_csv(pack)
     assert table.column_names == ["time_s", *HEALTH, *POWER]
-    log = read_log(made / "part.csv")
     settings = EstimatorSettings(initial_soc_pct=log.soc_pct[0], temperature_source="room")
     estimator = Estimator(Model.load(made / "model.json"), settings)
     rows = []
@@ -100,7 +102,7 @@ def test_a_capture_with_cells_as_live(run: Run, made: Path, tmp_path: Path) -> N
     (tmp_path / "car.toml").write_text(CAR + ALL_CELLS)
     dbc, map_file = shared_file("dbc", "generic_pack.dbc"), tmp_path / "car.toml"
     car = Vehicle.load(dbc=dbc, map=map_file)
-    log = read_log(made / "part.csv").rows(slice(0, 400))
+    log = read_log(made / "part.csv").rows(slice(0, 100))
     encoder, cells, frames = FrameEncoder(car), cells_of(log), []
     for row, sample in enumerate(samples_of(log)):
         stamped = sample._replace(time_s=1.7e9 + sample.time_s)

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import subprocess
-import sys
 import threading
 import time
 from pathlib import Path
@@ -21,16 +19,11 @@ from cangauge.logs.sign import sign_of_current
 from cangauge.service.config import load_config
 from cangauge.service.setup import load_vehicle
 from drive_captures import CARS, capture
+from live import Ended, in_process
 
 
-def init(*arguments: object) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [sys.executable, "-m", "cangauge", "init", *map(str, arguments)],
-        capture_output=True,
-        text=True,
-        check=False,
-        stdin=subprocess.DEVNULL,
-    )
+def init(*arguments: object) -> Ended:
+    return in_process("init", *arguments)
 
 
 @pytest.fixture(scope="module")
@@ -46,9 +39,9 @@ def mitsubishi(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_an_unclear_pair_exits_with_one_and_names_three(mitsubishi: Path, tmp_path: Path) -> None:
     done = init(mitsubishi, "-o", tmp_path / "car")
-    assert done.returncode == 1
-    assert "1) 0x373 23|16@0+" in done.stderr
-    assert "--choose current=1 --choose voltage=1" in done.stderr
+    assert done.code == 1
+    assert "1) 0x373 23|16@0+" in done.err
+    assert "--choose current=1 --choose voltage=1" in done.err
     assert not list((tmp_path / "car").glob("*"))
 
 
@@ -56,8 +49,8 @@ def test_chosen_candidates_make_files_that_decode(mitsubishi: Path, tmp_path: Pa
     folder = tmp_path / "car"
     choice = ("--choose", "current=1", "--choose", "voltage=1")
     done = init(mitsubishi, "-o", folder, *choice, "--json")
-    assert done.returncode == 0, done.stderr
-    result = json.loads(done.stdout)
+    assert done.code == 0, done.err
+    result = json.loads(done.out)
     assert result["method"] == "physics"
     assert len(result["candidates"]["current"]) == 3
     assert result["proof"]["samples"] > 5900
@@ -67,9 +60,9 @@ def test_chosen_candidates_make_files_that_decode(mitsubishi: Path, tmp_path: Pa
     config = load_config(folder / "run.toml")
     assert Path(str(config.map)).name == "car.toml"
     again = init(mitsubishi, "-o", folder, *choice)
-    assert again.returncode == 2
-    assert "--force" in again.stderr
-    assert init(mitsubishi, "-o", folder, *choice, "--force").returncode == 0
+    assert again.code == 2
+    assert "--force" in again.err
+    assert init(mitsubishi, "-o", folder, *choice, "--force").code == 0
 
 
 def test_a_dbc_gives_signals_by_name(mitsubishi: Path, tmp_path: Path) -> None:
@@ -82,8 +75,8 @@ def test_a_dbc_gives_signals_by_name(mitsubishi: Path, tmp_path: Path) -> None:
     )
     maps = ("--map", tmp_path / "map.toml", "--config", tmp_path / "run.toml")
     done = init(mitsubishi, "--dbc", tmp_path / "car.dbc", *maps, "--json")
-    assert done.returncode == 0, done.stderr
-    chosen = json.loads(done.stdout)["candidates"]
+    assert done.code == 0, done.err
+    chosen = json.loads(done.out)["candidates"]
     assert chosen["current"][0]["signal"] == "PackCurrent"
     assert chosen["voltage"][0]["signal"] == "PackVoltage"
     car = Vehicle.load(map=tmp_path / "map.toml")
@@ -101,9 +94,9 @@ def test_the_sign_of_a_dbc_s_current_is_proven(
     )
     maps = ("--map", tmp_path / "map.toml", "--config", tmp_path / "run.toml")
     done = init(mitsubishi, "--dbc", tmp_path / "car.dbc", *maps)
-    assert done.returncode == 0, done.stderr
-    assert f"The map has sign = {sign}." in done.stderr
-    assert ("positive values charge on this bus" in done.stderr) == (sign < 0)
+    assert done.code == 0, done.err
+    assert f"The map has sign = {sign}." in done.err
+    assert ("positive values charge on this bus" in done.err) == (sign < 0)
     log = capture_to_log(mitsubishi, Vehicle.load(map=tmp_path / "map.toml"))
     assert sign_of_current(log).sign == 1
 
@@ -111,22 +104,22 @@ def test_the_sign_of_a_dbc_s_current_is_proven(
 def test_an_open_scale_is_listed_and_not_ticked(mitsubishi: Path, tmp_path: Path) -> None:
     choice = ("--choose", "current=1", "--choose", "voltage=1")
     done = init(mitsubishi, "-o", tmp_path / "open", *choice)
-    assert "1 ?" in done.stdout
-    assert "1 ✓" not in done.stdout.partition("soc")[0]
-    assert "V at 0.1 V a step (about" in done.stderr
+    assert "1 ?" in done.out
+    assert "1 ✓" not in done.out.partition("soc")[0]
+    assert "V at 0.1 V a step (about" in done.err
     stated = init(mitsubishi, "-o", tmp_path / "stated", *choice, "--nominal-voltage", 330)
-    voltage = stated.stdout.partition("voltage")[2]
+    voltage = stated.out.partition("voltage")[2]
     assert "1 ✓" in voltage
-    assert "do not tell the scale" not in stated.stderr
+    assert "do not tell the scale" not in stated.err
 
 
 def test_nothing_to_look_at_is_refused(tmp_path: Path) -> None:
     done = init("-o", tmp_path)
-    assert done.returncode == 2
-    assert "give a capture" in done.stderr
-    assert init("x.log").returncode == 2
+    assert done.code == 2
+    assert "give a capture" in done.err
+    assert init("x.log").code == 2
     wrong = init("x.log", "-o", tmp_path, "--choose", "speed=1")
-    assert "not ROLE=N" in wrong.stderr
+    assert "not ROLE=N" in wrong.err
 
 
 @pytest.mark.real
@@ -143,8 +136,8 @@ def test_known_vehicles_are_recognised(
     shared_data: Path, tmp_path: Path, name: str, preset: str
 ) -> None:
     done = init(shared_data / name, "-o", tmp_path, "--json")
-    assert done.returncode == 0, done.stderr
-    assert json.loads(done.stdout)["vehicle"] == preset
+    assert done.code == 0, done.err
+    assert json.loads(done.out)["vehicle"] == preset
     config = load_config(tmp_path / "run.toml")
     assert load_vehicle(config).name == Vehicle.load(preset, temperature_c=20.0).name
 
@@ -152,34 +145,26 @@ def test_known_vehicles_are_recognised(
 def test_a_live_bus_is_listened_to(mitsubishi: Path, tmp_path: Path) -> None:
     port = 20_000 + (os.getpid() + 311) % 20_000
     bus = ("--interface", "udp_multicast", "--bus-option", f"port={port}")
-    options = ("-o", tmp_path / "car", "--seconds", "8", "--json")
     choice = ("--choose", "current=1", "--choose", "voltage=1")
-    arguments = [*bus, *options, *choice]
-    command = [sys.executable, "-m", "cangauge", "init", *map(str, arguments)]
     stop = threading.Event()
 
     def send() -> None:
         with open_bus(bus_address("udp_multicast", options={"port": port}), []) as sender:
-            began_s, frames = time.monotonic(), list(open_capture(mitsubishi))
-            while not stop.is_set():
-                for frame in frames:
-                    wait_s = began_s + frame.timestamp / 4.0 - time.monotonic()
-                    if stop.wait(max(wait_s, 0.0)):
-                        return
-                    sender.send(frame)
-                began_s = time.monotonic()
+            began_s = time.monotonic()
+            for frame in open_capture(mitsubishi):
+                if stop.wait(max(began_s + frame.timestamp / 12.0 - time.monotonic(), 0.0)):
+                    return
+                sender.send(frame)
 
     thread = threading.Thread(target=send)
     thread.start()
     try:
-        done = subprocess.run(
-            command, capture_output=True, text=True, check=False, stdin=subprocess.DEVNULL
-        )
+        done = init(*bus, "-o", tmp_path / "car", "--seconds", "3", "--json", *choice)
     finally:
         stop.set()
         thread.join()
-    assert done.returncode == 0, done.stderr
-    assert json.loads(done.stdout)["proof"]["samples"] > 500
+    assert done.code == 0, done.err
+    assert json.loads(done.out)["proof"]["samples"] > 500
     config = load_config(tmp_path / "car" / "run.toml")
     assert config.interface == "udp_multicast"
     assert config.bus_options == {"port": port}

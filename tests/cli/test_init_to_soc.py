@@ -2,11 +2,7 @@
 
 from __future__ import annotations
 
-import json
 import os
-import subprocess
-import sys
-import time
 from pathlib import Path
 
 import can
@@ -14,6 +10,7 @@ import numpy as np
 import pytest
 
 from frame_layouts import STEP_S, Bits, Frame, encode
+from live import Command, Ended, in_process
 
 PACK = Frame(
     0x100,
@@ -33,22 +30,17 @@ POWER = Frame(
 )
 
 
-def cangauge(
-    folder: Path, *arguments: str, codes: tuple[int, ...] = (0,)
-) -> subprocess.CompletedProcess[str]:
-    done = subprocess.run(
-        [sys.executable, "-m", "cangauge", *arguments],
-        cwd=folder, capture_output=True, text=True, check=False, stdin=subprocess.DEVNULL,
-    )  # fmt: skip
-    assert done.returncode in codes, done.stderr
+def cangauge(*arguments: object, codes: tuple[int, ...] = (0,)) -> Ended:
+    done = in_process(*arguments)
+    assert done.code in codes, done.err
     return done
 
 
 def drive(folder: Path, name: str, *arguments: str) -> None:
     """Write a capture NAME.log of a drive of the twin at 20 °C, and its truth as NAME.csv."""
-    table = f"{name}.csv"
-    cangauge(folder, "twin", "--seed", "5", "--ambient-c", "20", *arguments, "-o", table)
-    log = np.genfromtxt(folder / table, delimiter=",", names=True, usecols=range(5))
+    table = folder / f"{name}.csv"
+    cangauge("twin", "--seed", "5", "--ambient-c", "20", *arguments, "-o", table)
+    log = np.genfromtxt(table, delimiter=",", names=True, usecols=range(5))
     at = np.arange(log["time_s"][0], log["time_s"][-1], STEP_S)
     truth = {
         key: np.interp(at, log["time_s"], log[key]) for key in ("current_a", "voltage_v", "soc_pct")
@@ -67,8 +59,9 @@ def car(tmp_path_factory: pytest.TempPathFactory) -> Path:
     drive(folder, "full", "--discharge", "--hours", "1")
     drive(folder, "trip", "--day", "2", "--hours", "0.25")
     choice = ("--choose", "current=1", "--choose", "voltage=1", "--nominal-voltage", "420")
-    cangauge(folder, "init", "trip.log", "full.log", "--no-presets", "-o", "mycar", *choice)
-    cangauge(folder, "fit", "full.log", "--map", "mycar/car.toml", "-o", "mycar/model.json")
+    trips, mine = (folder / "trip.log", folder / "full.log"), folder / "mycar"
+    cangauge("init", *trips, "--no-presets", "-o", mine, *choice)
+    cangauge("fit", trips[1], "--map", mine / "car.toml", "-o", mine / "model.json")
     return folder
 
 
@@ -82,36 +75,18 @@ def test_the_files_hold_the_cars_own_scales(car: Path) -> None:
 def test_the_service_reaches_the_cars_soc(car: Path) -> None:
     bus = ("--interface", "udp_multicast", "--channel", "239.74.163.34",
            "--bus-option", f"port={22_000 + os.getpid() % 20_000}")  # fmt: skip
-    service = [sys.executable, "-m", "cangauge", "run", "--config", "mycar/run.toml", *bus]
-    service += ["--time-source", "replay-clock", "--status-socket", "run.sock"]
-    with (
-        (car / "run.err").open("w") as log,
-        subprocess.Popen(service, cwd=car, stdout=log, stderr=log) as running,
-    ):
-        try:
-            until_s = time.monotonic() + 60.0
-            while not (car / "run.sock").exists() and time.monotonic() < until_s:
-                time.sleep(0.1)
-            cangauge(
-                car,
-                "replay",
-                "trip.log",
-                "--map",
-                "mycar/car.toml",
-                "--speed",
-                "max",
-                "--wait",
-                "30",
-                *bus,
-            )
-            status = json.loads(
-                cangauge(
-                    car, "status", "--endpoint", "run.sock", "--json", codes=(0, 1)
-                ).stdout  # 1: the replay is over, its input stale
-            )
-        finally:
-            running.terminate()
-            running.wait(20.0)
+    socket = ("--status-socket", car / "run.sock")
+    service = Command("run", "--config", car / "mycar" / "run.toml", *bus,
+                      "--time-source", "replay-clock", *socket)  # fmt: skip
+    service.wait_for("service.ready")
+    try:
+        played = (car / "trip.log", "--map", car / "mycar" / "car.toml", "--speed", "max")
+        cangauge("replay", *played, "--wait", "30", *bus)
+        # 1: the replay is over, its input stale.
+        status = cangauge("status", "--endpoint", car / "run.sock", "--json", codes=(0, 1)).json
+    finally:
+        service.process.terminate()
+        service.end()
     truth = np.genfromtxt(car / "trip.csv", delimiter=",", names=True, usecols=range(5))
     estimate = status["estimate"]
     assert abs(estimate["soc_pct"] - truth["soc_pct"][-1]) < 3.0 * estimate["soc_std_pct"]

@@ -17,8 +17,8 @@ from tornado.websocket import websocket_connect
 
 from cangauge.bus.vehicle import Vehicle
 from cangauge.errors import InputError
+from cangauge.extras.live.addresses import http_address
 from cangauge.extras.live.launch import LivePage
-from cangauge.service.addresses import http_address
 from cangauge.service.pipeline import Pipeline
 from cangauge.service.run import Service
 from cangauge.service.status import Monitor, Snapshot

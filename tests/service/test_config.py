@@ -11,6 +11,7 @@ from cangauge.bus.protection import GENERIC_RULE, E2eRule
 from cangauge.errors import InputError
 from cangauge.service.config import config_keys, load_config, reference
 from cangauge.service.setup import address_of, load_vehicle, pipeline_settings
+from live import in_process, leaf_model_path
 
 
 def write(tmp_path: Path, text: str) -> Path:
@@ -229,3 +230,30 @@ def test_the_reference_page_is_generated_from_the_model(project: Path) -> None:
     assert page.rstrip().endswith(reference().rstrip()), (
         "python -m cangauge.service.config prints it"
     )
+
+
+def test_check_reads_what_run_would_read(tmp_path: Path) -> None:
+    """Without the bus, which need not be there."""
+    path = write(
+        tmp_path,
+        f'model = "{leaf_model_path()}"\ninterface = "socketcan"\nchannel = "can3"\n'
+        'vehicle = "leaf_aze0"\n[ids]\nsoc_estimate = 0x123\n',
+    )
+    found = in_process("check", path, "--json")
+    assert found.code == 0, found.err
+    assert (found.json["bus"], found.json["vehicle"]) == ("socketcan can3", "Nissan Leaf AZE0")
+    assert found.json["received"] == ["0x1DB", "0x55B", "0x5C0"]
+    assert found.json["published"][0] == "0x123 SOC_ESTIMATE"
+    shown = in_process("check", path)
+    assert (shown.code, "0x123 SOC_ESTIMATE" in shown.out) == (0, True)
+    for text, say in (
+        ('model = "none.json"', "none.json: no such file"),
+        (
+            f'model = "{leaf_model_path()}"\nvehicle = "leaf_aze0"\n[ids]\nsoc_power = 0x1DB',
+            "0x1DB",
+        ),
+        (f'model = "{leaf_model_path()}"\noutput = "no/x.csv"', "no/x.csv"),
+    ):
+        ended = in_process("check", write(tmp_path, text))
+        assert (ended.code, ended.out, len(ended.err.splitlines())) == (2, "", 1)
+        assert say in ended.err

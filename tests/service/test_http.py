@@ -19,9 +19,9 @@ from prometheus_client.parser import text_string_to_metric_families
 from watched import Watched
 
 from cangauge.errors import CangaugeError, InputError
+from cangauge.extras.live.addresses import http_address, read_token
 from cangauge.extras.live.http import MAX_CLIENTS, HttpServer
 from cangauge.model.published import CAPACITY_AH
-from cangauge.service.addresses import http_address, read_token
 from cangauge.service.status_client import fetch_status
 from live import in_process
 
@@ -195,15 +195,7 @@ def test_a_header_without_end_is_cut_off(http: HttpServer) -> None:
 
 
 @pytest.mark.parametrize(
-    "answer",
-    [
-        b"",
-        b"nonsense\r\n\r\n",
-        b"HTTP/1.1 200 OK\r\n\r\n[[[",
-        b'HTTP/1.1 200 OK\r\n\r\n{"schema": 99}',
-        b"HTTP/1.1 200 OK\r\nContent-Length: 99999999999\r\n\r\n{}",
-        b"HTTP/1.1 500 No\r\n\r\noops",
-    ],
+    "answer", [b"", b"HTTP/1.1 200 OK\r\n\r\n[[[", b"HTTP/1.1 500 No\r\n\r\noops"]
 )
 def test_answers_of_another_server(answer: bytes) -> None:
     with socket.create_server(("127.0.0.1", 0)) as server:

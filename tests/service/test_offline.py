@@ -105,7 +105,7 @@ def test_samples_without_voltage_are_estimated_too(tmp_path: Path) -> None:
     live, _ = live_and_recorded(frames, PipelineSettings(), path, "generic")
     assert_same(live, path, "generic")
     recorded = estimate_capture(path, Vehicle.load("generic"), leaf_model())
-    assert np.count_nonzero(np.isnan(recorded.voltage_v)) == 100
+    assert np.count_nonzero(np.isnan(recorded.recorded.voltage_v)) == 100
 
 
 def test_capture_of_another_bus_is_refused(tmp_path: Path) -> None:

@@ -2,29 +2,11 @@
 
 from __future__ import annotations
 
-import ast
 import subprocess
 import sys
 from importlib import import_module
-from pathlib import Path
 
-from cangauge import service
 from cangauge.service.run import OUTPUTS
-
-
-def imported(path: Path) -> set[str]:
-    found = set()
-    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-        if isinstance(node, ast.Import):
-            found |= {each.name for each in node.names}
-        elif isinstance(node, ast.ImportFrom):
-            found.add(str(node.module))
-    return found
-
-
-def test_the_service_imports_no_extra() -> None:
-    for path in Path(str(service.__file__)).parent.glob("*.py"):
-        assert not [each for each in imported(path) if each.startswith("cangauge.extras")], path
 
 
 def test_each_output_is_made_by_its_module() -> None:

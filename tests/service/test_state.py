@@ -29,8 +29,6 @@ from cangauge.service.state import (
     FILE_NAME,
     STATE_VERSION,
     StateKeeper,
-    StateSettings,
-    check_state_path,
     read_state,
     state_path,
 )
@@ -61,8 +59,7 @@ class Machine:
         self.logged.__exit__()
         self.logged = LoggedLines("cangauge.service.state").__enter__()
         pipeline = Pipeline(VEHICLE, self.model, self.settings)
-        settings = StateSettings(self.path, max_age_s=86400.0)
-        keeper = StateKeeper(settings, pipeline, self.bus, wall_s=lambda: self.wall_s)
+        keeper = StateKeeper(self.path, pipeline, self.bus, 86400.0, wall_s=lambda: self.wall_s)
         keeper.__enter__()
         return Service(self, pipeline, keeper)
 
@@ -315,21 +312,21 @@ def test_what_is_no_state_is_refused_at_the_start(tmp_path: Path) -> None:
     foreign = tmp_path / "notes.json"
     foreign.write_text("precious")
     with pytest.raises(InputError, match="not a cangauge state file"):
-        check_state_path(foreign)
+        state_path(str(foreign), {})
     os.mkfifo(tmp_path / "pipe")
     with pytest.raises(InputError, match="FIFO"):
-        check_state_path(tmp_path / "pipe")
+        state_path(str(tmp_path / "pipe"), {})
     with pytest.raises(InputError, match="does not exist"):
-        check_state_path(tmp_path / "no" / "state.json")
-    check_state_path(tmp_path / "new.json")
+        state_path(str(tmp_path / "no" / "state.json"), {})
+    assert state_path(str(tmp_path / "new.json"), {}) == tmp_path / "new.json"
 
 
 def test_where_the_file_is(tmp_path: Path) -> None:
     assert state_path(None, {}) is None
     assert state_path(str(tmp_path), {}) == tmp_path / FILE_NAME
     assert state_path("a.json", {"STATE_DIRECTORY": "/var/lib/x"}) == Path("a.json")
-    folders = {"STATE_DIRECTORY": "/var/lib/x:/var/lib/y"}
-    assert state_path(None, folders) == Path("/var/lib/x", FILE_NAME)
+    folders = {"STATE_DIRECTORY": f"{tmp_path}:/var/lib/y"}
+    assert state_path(None, folders) == tmp_path / FILE_NAME
 
 
 def test_a_full_disk_keeps_the_last_state(

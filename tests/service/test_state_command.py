@@ -15,7 +15,6 @@ from cangauge.bus.open import BusAddress, open_bus
 from cangauge.bus.publish import SocEstimate, SocReader, standard_filter
 from cangauge.bus.vehicle import Vehicle
 from cangauge.estimation.offline import samples_of
-from cangauge.service.loop import LoopSettings
 from cangauge.service.state import read_state
 from cangauge.types import Reason, Status
 from live import (
@@ -24,7 +23,6 @@ from live import (
     in_process,
     leaf_model_path,
     short_log,
-    virtual_service,
     waits,
 )
 
@@ -99,32 +97,11 @@ def test_stopped_killed_and_started_again(tmp_path: Path) -> None:
     assert [each.name for each in tmp_path.iterdir()] == ["state.json"]
 
 
-def test_the_state_is_saved_soon_periodically_and_at_the_end() -> None:
-    asked: list[float] = []
-    service = virtual_service("state", loop=LoopSettings(duration_s=2.6, checkpoint_every_s=1.2))
-    began = time.monotonic()
-    service.checkpoint = lambda: asked.append(time.monotonic() - began)
-    with service:
-        service.join(5.0)
-    first, second, last = asked
-    # A busy machine may be late, never early.
-    assert first > 0.95
-    assert second - first > 1.15
-    assert last > 2.55
-
-
 def test_the_state_is_no_other_file_of_the_service(tmp_path: Path) -> None:
-    model = tmp_path / "model.json"
+    model, record = tmp_path / "model.json", tmp_path / "x.log"
     model.write_bytes(leaf_model_path().read_bytes())
-    ended = in_process("run", "-m", model, "--state", model)
-    assert ended.code == 2
+    ended = in_process("run", "-m", model, "--state", record, "--record", record)
+    assert (ended.code, record.exists()) == (2, False)
     assert "--state: is another file of this service" in ended.err
+    assert in_process("run", "-m", model, "--state", model).code == 2
     assert json.loads(model.read_text())["format"] == "cangauge-model"
-
-
-def test_options_of_the_config(tmp_path: Path) -> None:
-    config = tmp_path / "run.toml"
-    config.write_text('model = "m"\n[full_charge]\nvoltage_v = 390\n')
-    ended = in_process("run", "--config", config)
-    assert ended.code == 2
-    assert f"{config}: full_charge.current_a: is missing" in ended.err

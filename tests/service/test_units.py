@@ -1,4 +1,4 @@
-"""The files for operators: systemd's units, the example configuration, bounds of hostile files."""
+"""The files for operators: systemd's units, the example configuration, damaged files."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from cangauge.errors import InputError
-from cangauge.service.addresses import http_address
+from cangauge.extras.live.addresses import http_address
 from cangauge.service.config import load_config
 
 NAME = "cangauge@.service"
@@ -87,17 +87,12 @@ def test_the_example_configuration_is_one(project: Path) -> None:
     ("text", "say"),
     [
         ("a = " + "[" * 60_000, "nested too deeply"),
-        ("a = " + "{a=" * 20_000, "nested too deeply"),
-        ("a = " + "9" * 60_000, "not TOML"),
         ("a = \0", "not TOML"),
-        ("[[a]]\n" * 10_000, "unknown key|valid|missing"),
-        ("[" + ".".join("a" * 150) + ".b]\n" + "x = 1\n", "unknown key|missing|parts"),
-        ("".join(f"a{number} = 1\n" for number in range(5_000)), "unknown key"),
         ("#" * 300_000, "larger than the 64 kB"),
         (b"\xff\xfe\x00", "not TOML"),
     ],
 )
-def test_a_hostile_configuration_is_refused(tmp_path: Path, text: str | bytes, say: str) -> None:
+def test_a_damaged_configuration_is_refused(tmp_path: Path, text: str | bytes, say: str) -> None:
     path = tmp_path / "car.toml"
     path.write_bytes(text.encode() if isinstance(text, str) else text)
     with pytest.raises(InputError, match=say):

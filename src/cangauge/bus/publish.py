@@ -311,7 +311,7 @@ class SocPublisher:
             soc_pct=estimate.soc_pct,
             soc_std_pct=estimate.soc_std_pct,
             age_s=age_s if math.isnan(age_s) else min(math.floor(age_s), AGE_AT_MOST_S),
-            reason=float(estimate.reasons),
+            reason=float(reason_bits(estimate.reasons)),
             status=float(estimate.status),
         )
 
@@ -424,6 +424,14 @@ _CONTENTS: Final[dict[str, Callable[[dict[str, float]], SocContent]]] = {
     "soc_power": lambda values: SocPower(**values),
     "soc_cells": lambda values: SocCells(**values),
 }
+
+
+def reason_bits(reasons: Reason) -> int:
+    """Return the 20 bits of the frame: a wrong sign of current is an implausible input there."""
+    bits = int(reasons)
+    if bits & Reason.SIGN_SUSPECT:
+        bits = bits & ~Reason.SIGN_SUSPECT | Reason.IMPLAUSIBLE_INPUT
+    return int(bits)
 
 
 def standard_filter(frame_id: int) -> CanFilter:

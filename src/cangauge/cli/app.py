@@ -8,7 +8,7 @@ from __future__ import annotations
 import ast
 import os
 import sys
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from importlib.metadata import EntryPoint, entry_points
 from importlib.util import find_spec
 from pathlib import Path
@@ -24,7 +24,9 @@ from cangauge._version import __version__
 from cangauge.cli.output import emit_json, note
 from cangauge.errors import CangaugeError, closest
 
-FIRST: Final = ("demo", "init", "inspect", "fit", "estimate", "gap", "run", "status", "replay")
+FIRST: Final = (
+    "demo", "init", "inspect", "fit", "estimate", "gap", "check", "run", "status", "replay",
+)  # fmt: skip
 """Commands of the main job, in its order; the others follow by name."""
 
 
@@ -149,9 +151,10 @@ def main() -> None:
         _emit_failure(error.to_dict(), error.exit_code)
         sys.exit(error.exit_code)
     except UsageError as error:
-        if line := _usage_line(error):
-            note(line)
-        _emit_failure(_usage_dict(error), 2)
+        line, field = _usage(error)
+        if line:
+            note(f"error: {line}")
+        _emit_failure({**CangaugeError(line).to_dict(), "field": field}, 2)
         sys.exit(2)
     except OSError as error:
         if error.errno not in FULL:
@@ -173,7 +176,7 @@ UsageError: Final[type[Any]] = typer.BadParameter.__mro__[1]
 
 
 def _emit_failure(error: Mapping[str, Any], exit_code: int) -> None:
-    """Print `{"error": {…}, "exit_code": …}` on stdout if the command line asks for `--json`.
+    """Print `{"error": …, "exit_code": …}` on stdout if the command line asks for `--json`.
 
     Parameters
     ----------
@@ -185,8 +188,7 @@ def _emit_failure(error: Mapping[str, Any], exit_code: int) -> None:
     arguments = sys.argv[1:]
     options = arguments[: arguments.index("--")] if "--" in arguments else arguments
     # Not from the parser: the error may be one of parsing.
-    wanted = any(word.partition("=")[0] == "--json" for word in options)
-    if not wanted or sys.stdout is None:
+    if sys.stdout is None or not any(word.partition("=")[0] == "--json" for word in options):
         return
     try:
         emit_json({"error": error, "exit_code": exit_code})
@@ -200,40 +202,27 @@ def _discard_stdout() -> None:
     os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
-def _usage_line(error: Any) -> str:
-    """Return a usage error in one line that names the help page; "" if help was shown.
+def _usage(error: Any) -> tuple[str, str | None]:
+    """Return a usage error in one line, which names the help page, and its option or argument.
+
+    The line is "" if the help page was shown.
 
     Parameters
     ----------
     error : UsageError
     """
-    text = " ".join(error.format_message().split()).replace("Input should be", "must be")
-    if options := getattr(error, "possibilities", None):
-        text = f"no such option: {error.option_name}{_did_you_mean(error.option_name, options)}"
-    if not text or type(error).__name__ == "NoArgsIsHelpError":
-        return ""
-    if not text[1:2].isupper():
-        text = text[0].lower() + text[1:]
-    command = "cangauge" if error.ctx is None else error.ctx.command_path
-    return f"error: {text.rstrip('.')}; see `{command} --help`"
-
-
-def _did_you_mean(word: str, names: Iterable[str]) -> str:
-    near = closest(word, names)
-    return f". Did you mean {near}?" if near else ""
-
-
-def _usage_dict(error: Any) -> dict[str, Any]:
-    """Return a usage error as `CangaugeError.to_dict` does; `field` is the option or argument.
-
-    Parameters
-    ----------
-    error : UsageError
-    """
-    field = getattr(error, "option_name", None)
-    parameter = getattr(error, "param", None)
+    field, parameter = getattr(error, "option_name", None), getattr(error, "param", None)
     if field is None and parameter is not None:
         # The help page shows an argument by its metavar.
         is_option = parameter.param_type_name == "option"
         field = "/".join(parameter.opts) if is_option else parameter.metavar or parameter.name
-    return {**CangaugeError(_usage_line(error).removeprefix("error: ")).to_dict(), "field": field}
+    text = " ".join(error.format_message().split()).replace("Input should be", "must be")
+    if options := getattr(error, "possibilities", None):
+        near = closest(error.option_name, options)
+        text = f"no such option: {error.option_name}" + f". Did you mean {near}?" * bool(near)
+    if not text or type(error).__name__ == "NoArgsIsHelpError":
+        return "", field
+    if not text[1:2].isupper():
+        text = text[0].lower() + text[1:]
+    command = "cangauge" if error.ctx is None else error.ctx.command_path
+    return f"{text.rstrip('.')}; see `{command} --help`", field

@@ -11,6 +11,7 @@ from typing import Annotated, Any, Final
 import typer
 from typer.core import TyperCommand
 
+from cangauge.cli.options import with_signature
 from cangauge.errors import InputError
 from cangauge.service.config import ConfigKey, config_keys
 
@@ -35,75 +36,11 @@ def _with_values(arguments: Sequence[str]) -> Iterator[str]:
             yield _BARE[word]
 
 
-def config_option(name: str, *flags: str) -> Any:
-    """Return the typer option of a key, such as "ids.soc_detail"; by default with its own flags."""
+def _option(name: str, *flags: str) -> Any:
+    """Return the option of a key, such as "ids.soc_detail"; by default with its own flags."""
     key = _KEYS[name]
     names = flags or key.info.option.split(", ")
     return typer.Option(*names, metavar=key.info.metavar or None, help=key.help)
-
-
-def config_options(command: Callable[..., None]) -> Callable[..., None]:
-    """Replace the `**options` of a command by the options that the configuration declares."""
-    signature = inspect.signature(command, eval_str=True)
-    own = [each for each in signature.parameters.values() if each.kind is not each.VAR_KEYWORD]
-    made = [
-        inspect.Parameter(
-            name,
-            inspect.Parameter.KEYWORD_ONLY,
-            default=None,
-            annotation=Annotated[_type(key) | None, config_option(name)],
-        )
-        for name, key in _OPTIONS.items()
-    ]
-
-    def with_options(**values: Any) -> None:
-        command(**values)
-
-    with_options.__doc__ = command.__doc__
-    with_options.command_class = ConfigCommand  # type: ignore[attr-defined] # read by the app
-    parameters = [each.replace(kind=inspect.Parameter.KEYWORD_ONLY) for each in own]
-    with_options.__signature__ = inspect.Signature(parameters + made)  # type: ignore[attr-defined] # read by typer
-    with_options.__annotations__ = {each.name: each.annotation for each in parameters + made}
-    return with_options
-
-
-def config_values(options: Mapping[str, Any]) -> dict[str, Any]:
-    """Return given options as the keys of a configuration, for `load_config`.
-
-    Raises
-    ------
-    InputError
-        If a bus option is not K=V.
-    """
-    from cangauge.bus.open import parse_bus_options
-
-    values = {name: options[name] for name in _OPTIONS}
-    values["bus_options"] = parse_bus_options(values["bus_options"] or [])
-    return {name: str(v) if isinstance(v, Path) else v for name, v in values.items()}
-
-
-def frame_ids(**given: str | None) -> dict[str, int]:
-    """Return the given ids by key; "0x…" is hexadecimal.
-
-    Raises
-    ------
-    InputError
-        If one is not a number.
-    """
-    ids = {}
-    for key, text in given.items():
-        if text is None:
-            continue
-        try:
-            ids[key] = int(text, 0)
-        except ValueError as error:
-            raise InputError(
-                "not a CAN id",
-                field=f"--{key.replace('_', '-')}-id",
-                value=text,
-                cure="write it as 0x5A0",
-            ) from error
-    return ids
 
 
 def _type(key: ConfigKey) -> Any:
@@ -115,13 +52,55 @@ def _type(key: ConfigKey) -> Any:
     return str if key.name == "initial_soc" else _TYPES.get(key.kind, str)
 
 
-InterfaceOption = Annotated[str | None, config_option("interface")]
-ChannelOption = Annotated[str | None, config_option("channel")]
-BusOptionOption = Annotated[list[str] | None, config_option("bus_options")]
-BusVehicleOption = Annotated[str | None, config_option("vehicle")]
-BusDbcOption = Annotated[Path | None, config_option("dbc")]
-BusMapOption = Annotated[Path | None, config_option("map")]
-BusTemperatureOption = Annotated[float | None, config_option("temperature")]
-EstimateIdOption = Annotated[str | None, config_option("ids.soc_estimate", "--soc-estimate-id")]
-DetailIdOption = Annotated[str | None, config_option("ids.soc_detail", "--soc-detail-id")]
-ClockIdOption = Annotated[str | None, config_option("ids.replay_clock", "--replay-clock-id")]
+def config_options(command: Callable[..., None]) -> Callable[..., None]:
+    """Replace the `**options` of a command by the options that the configuration declares."""
+    named = inspect.Parameter.KEYWORD_ONLY
+    given = inspect.signature(command, eval_str=True).parameters.values()
+    own = [each.replace(kind=named) for each in given if each.kind is not each.VAR_KEYWORD]
+    made = [
+        inspect.Parameter(
+            name, named, default=None, annotation=Annotated[_type(key) | None, _option(name)]
+        )
+        for name, key in _OPTIONS.items()
+    ]
+
+    def with_options(**values: Any) -> None:
+        command(**values)
+
+    with_options.command_class = ConfigCommand  # type: ignore[attr-defined] # read by the app
+    return with_signature(with_options, command, own + made)
+
+
+def config_values(options: Mapping[str, Any]) -> dict[str, Any]:
+    """Return given options as the keys of a configuration; InputError if a bus option is wrong."""
+    from cangauge.bus.open import parse_bus_options
+
+    values = {name: options[name] for name in _OPTIONS}
+    values["bus_options"] = parse_bus_options(values["bus_options"] or [])
+    return {name: str(v) if isinstance(v, Path) else v for name, v in values.items()}
+
+
+def frame_ids(**given: str | None) -> dict[str, int]:
+    """Return the given ids by key, "0x…" hexadecimal; InputError if one is not a number."""
+    ids: dict[str, int] = {}
+    for key, text in given.items():
+        try:
+            ids |= {} if text is None else {key: int(text, 0)}
+        except ValueError as error:
+            option = f"--{key.replace('_', '-')}-id"
+            raise InputError(
+                "not a CAN id", field=option, value=text, cure="write it as 0x5A0"
+            ) from error
+    return ids
+
+
+InterfaceOption = Annotated[str | None, _option("interface")]
+ChannelOption = Annotated[str | None, _option("channel")]
+BusOptionOption = Annotated[list[str] | None, _option("bus_options")]
+BusVehicleOption = Annotated[str | None, _option("vehicle")]
+BusDbcOption = Annotated[Path | None, _option("dbc")]
+BusMapOption = Annotated[Path | None, _option("map")]
+BusTemperatureOption = Annotated[float | None, _option("temperature")]
+EstimateIdOption = Annotated[str | None, _option("ids.soc_estimate", "--soc-estimate-id")]
+DetailIdOption = Annotated[str | None, _option("ids.soc_detail", "--soc-detail-id")]
+ClockIdOption = Annotated[str | None, _option("ids.replay_clock", "--replay-clock-id")]

@@ -8,7 +8,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
 
@@ -19,10 +19,6 @@ from cangauge._text import number, significant
 from cangauge.cli.options import JsonOption
 from cangauge.cli.output import emit_json, note, print_table
 from cangauge.errors import CangaugeError, InputError
-
-if TYPE_CHECKING:
-    from cangauge.estimation.offline import Scores
-    from cangauge.identify.fit import Identification
 
 TRAINED_ON = "leaf2012_reconstruction_white.parquet"
 PLAYED = "leaf2012_reconstruction_correlated.parquet"
@@ -63,7 +59,6 @@ def demo_command(
     from cangauge.logs.canonical import write_log
     from cangauge.logs.read import read_log
     from cangauge.replay.steps import quantization_bound
-    from cangauge.service.addresses import LOOPBACK
     from cangauge.service.estimate_table import read_estimates
     from cangauge.service.offline import RecordedEstimate
 
@@ -88,7 +83,7 @@ def demo_command(
     note("2/4  replay another 2.6 h on the bus at full speed, and estimate its SoC live")
     port = _free_port() if os.name == "posix" else None
     if port is not None:
-        note(f"     see it while it plays: http://{LOOPBACK}:{port}/")
+        note(f"     see it while it plays: http://127.0.0.1:{port}/")
     write_text_atomic(config_path, _configuration(port))
     log, model = read_log(shared_file("replay", PLAYED)), identification.model
     log = replace(log, current_a=log.current_a + SENSOR_OFFSET_A)
@@ -104,8 +99,21 @@ def demo_command(
     note("4/4  write the pages")
     estimate = RecordedEstimate(log, table, live, model, settings)
     write_text_atomic(soc_page, extra("report.estimate:estimate_report")(estimate, model_path))
-    result = _result(identification, live, difference, bound)
-    result |= {
+    result = {
+        "log": "a reconstruction of the published 2012 Leaf test, no recording",
+        "current_offset_a": SENSOR_OFFSET_A,
+        "samples": live.rows,
+        "replay_seconds": live.seconds,
+        "fit_voltage_mae_pct": identification.voltage_mae_pct,
+        "fit_soc_newton_mae_pct": identification.soc_newton_mae_pct,
+        "live_voltage_mae_pct": live.voltage_mae_pct,
+        "live_soc_mae_pct": live.soc_mae_pct,
+        "live_soc_max_pct": live.soc_max_pct,
+        "live_soc_newton_mae_pct": live.soc_newton_mae_pct,
+        "live_soc_coulomb_mae_pct": live.soc_coulomb_mae_pct,
+        "live_cover_2sigma": live.cover_2sigma,
+        "live_minus_offline_pct": difference,
+        "quantisation_bound_pct": bound,
         "seconds": time.monotonic() - began,
         "model": str(model_path),
         "fit_page": str(fit_page),
@@ -118,18 +126,14 @@ def demo_command(
 
 
 def _free_port() -> int:
-    from cangauge.service.addresses import LOOPBACK
-
     with socket.socket() as probe:
-        probe.bind((LOOPBACK, 0))
+        probe.bind(("127.0.0.1", 0))
         return int(probe.getsockname()[1])
 
 
 def _configuration(port: int | None) -> str:
     """Return the TOML configuration of the service; without a bus it takes the default one."""
-    from cangauge.service.addresses import LOOPBACK
-
-    page = "" if port is None else f'dashboard = "{LOOPBACK}:{port}"\n'
+    page = "" if port is None else f'dashboard = "127.0.0.1:{port}"\n'
     return (
         'model = "model.json"\n'
         'time_source = "replay-clock"\n'
@@ -163,27 +167,6 @@ def _play(config: Path, log: Path) -> float:
             f" {errors.strip()}"
         )
     return seconds
-
-
-def _result(
-    identification: Identification, live: Scores, difference_pct: float, bound_pct: float
-) -> dict[str, Any]:
-    return {
-        "log": "a reconstruction of the published 2012 Leaf test, no recording",
-        "current_offset_a": SENSOR_OFFSET_A,
-        "samples": live.rows,
-        "replay_seconds": live.seconds,
-        "fit_voltage_mae_pct": identification.voltage_mae_pct,
-        "fit_soc_newton_mae_pct": identification.soc_newton_mae_pct,
-        "live_voltage_mae_pct": live.voltage_mae_pct,
-        "live_soc_mae_pct": live.soc_mae_pct,
-        "live_soc_max_pct": live.soc_max_pct,
-        "live_soc_newton_mae_pct": live.soc_newton_mae_pct,
-        "live_soc_coulomb_mae_pct": live.soc_coulomb_mae_pct,
-        "live_cover_2sigma": live.cover_2sigma,
-        "live_minus_offline_pct": difference_pct,
-        "quantisation_bound_pct": bound_pct,
-    }
 
 
 def _show(result: dict[str, Any]) -> None:

@@ -132,7 +132,7 @@ def estimate_command(  # noqa: PLR0917 - typer passes options by name
     from cangauge.model.model_file import Model
     from cangauge.service.offline import (
         PackHistory,
-        estimate_recorded_capture,
+        estimate_capture,
         estimate_recorded_log,
     )
 
@@ -156,7 +156,7 @@ def estimate_command(  # noqa: PLR0917 - typer passes options by name
         source = known_temperature_source(reading.temperature_source) or "unknown"
         settings = replace(settings, temperature_source=source)
         with _progress(None) as progress:
-            done = estimate_recorded_capture(
+            done = estimate_capture(
                 log_path, car, model, settings, keeps_pack=pack is not None, progress=progress
             )
         _check_capture(done, model)

@@ -27,7 +27,6 @@ from cangauge.errors import InputError
 if TYPE_CHECKING:
     from cangauge.inspect.capture import CaptureInspection
     from cangauge.inspect.log import LogInspection
-    from cangauge.logs.log import Log
 
 PIPED_WIDTH = 140
 """Width of the tables where stdout is no terminal [characters]."""
@@ -80,25 +79,17 @@ def inspect_command(
     check_outputs([report], [path])
     recording = reading.open(path)
     assumed: dict[str, list[str]] = {}
-    options = {"--vehicle": reading.vehicle, "--dbc": reading.dbc, "--map": reading.map_file}
-    given = {option: str(value) for option, value in options.items() if value is not None}
+    found: LogInspection | CaptureInspection
     if isinstance(recording, LogFile):
-        if given and not (list(given) == ["--map"] and reading.mapped_columns() is not None):
-            option, value = next(iter(given.items()))
-            raise InputError(
-                "this is a log; the option is for captures",
-                source=path,
-                field=option,
-                value=value,
-                cure="omit it",
-            )
+        _refuse_options_of_captures(reading, path)
         log = recording.read(temperature_c=reading.temperature)
         assumed = assumed_of([log])
         if log.assumed:
             note(f"{path}: read as {', '.join(log.assumed)}")
-        found: LogInspection | CaptureInspection
         found = of_log = inspect_log(log)
-        _write_report(report, of_log, log)
+        if report is not None:
+            write_texts_atomic({report: extra("report.inspection:inspect_report")(of_log, log)})
+            note(f"report: {report}")
     else:
         if report is not None:
             raise InputError(
@@ -108,7 +99,7 @@ def inspect_command(
                 value=str(report),
                 cure="omit it, or use cangauge estimate --report",
             )
-        found = inspect_capture(path, reading.car() if given else None)
+        found = inspect_capture(path, reading.car() if reading.names_vehicle else None)
     if json_output:
         emit_json(found.to_dict() | {"assumed": assumed})
         return
@@ -123,11 +114,13 @@ def inspect_command(
             _show_log(console, found.log)
 
 
-def _write_report(path: Path | None, found: LogInspection, log: Log) -> None:
-    if path is None:
-        return
-    write_texts_atomic({path: extra("report.inspection:inspect_report")(found, log)})
-    note(f"report: {path}")
+def _refuse_options_of_captures(reading: Reading, path: Path) -> None:
+    options = {"--vehicle": reading.vehicle, "--dbc": reading.dbc, "--map": reading.map_file}
+    given = {option: str(value) for option, value in options.items() if value is not None}
+    if given and not (list(given) == ["--map"] and reading.mapped_columns() is not None):
+        option, value = next(iter(given.items()))
+        problem = "this is a log; the option is for captures"
+        raise InputError(problem, source=path, field=option, value=value, cure="omit it")
 
 
 def _show_log(console: Console, found: LogInspection) -> None:
@@ -142,13 +135,13 @@ def _show_log(console: Console, found: LogInspection) -> None:
     for heading in ("channel", "minimum", "median", "maximum", "unit", "step", "missing"):
         table.add_column(heading, justify="left" if heading in {"channel", "unit"} else "right")
     for name, channel in found.channels.items():
+        step = "none" if channel.quantum is None else f"{channel.quantum:.4g}"
+        values = (channel.minimum, channel.median, channel.maximum)
         table.add_row(
             escape(name),
-            f"{channel.minimum:.5g}",
-            f"{channel.median:.5g}",
-            f"{channel.maximum:.5g}",
+            *(f"{value:.5g}" for value in values),
             escape(channel.unit),
-            "constant" if channel.levels == 1 else _number(channel.quantum),
+            "constant" if channel.levels == 1 else step,
             str(channel.missing or ""),
         )
     console.print(table)
@@ -173,22 +166,18 @@ def _show_log(console: Console, found: LogInspection) -> None:
             console.print(f"{heading}: {line}", markup=False)
 
 
-def _number(value: float | None) -> str:
-    return "none" if value is None else f"{value:.4g}"
-
-
 def _show(console: Console, found: Mapping[str, Any], title: str = "") -> None:
     """Print a nested result: plain values first, then tables and lists under their names."""
     plain = {key: value for key, value in found.items() if not isinstance(value, _NESTED)}
     if plain:
         _show_rows(console, title, [{"": _label(key), " ": value} for key, value in plain.items()])
     for key, value in found.items():
+        name = f"{title} {key}".strip()
         if isinstance(value, Mapping):
-            _show(console, value, f"{title} {key}".strip())
+            _show(console, value, name)
         elif isinstance(value, list | tuple):
-            rows = [row for row in value if isinstance(row, Mapping)]
-            if rows:
-                _show_rows(console, f"{title} {key}".strip(), rows)
+            if rows := [row for row in value if isinstance(row, Mapping)]:
+                _show_rows(console, name, rows)
                 continue
             for line in value:
                 console.print(f"{key}: {line}", markup=False)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import inspect
-import os
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, fields, is_dataclass, replace
 from pathlib import Path
@@ -25,43 +24,10 @@ if TYPE_CHECKING:
     from cangauge.logs.read import LogFile
     from cangauge.logs.units import TemperatureSource
 
+# The service shares these options, but needs neither pyarrow nor the readers: imports are deferred.
+
 _Value = TypeVar("_Value", bound=float | None)
 
-VehicleOption = Annotated[
-    str | None,
-    typer.Option(
-        "--vehicle",
-        metavar="PRESET",
-        help="For a capture: the car's preset (a DBC and a map that ship with cangauge).",
-    ),
-]
-DbcOption = Annotated[
-    Path | None,
-    typer.Option("--dbc", metavar="FILE", help="For a capture: the bus's DBC; needs --map."),
-]
-MapOption = Annotated[
-    Path | None,
-    typer.Option(
-        "--map",
-        metavar="FILE",
-        help="For a capture: which signals of the DBC are current, voltage and temperature.",
-    ),
-]
-TemperatureOption = Annotated[
-    float | None,
-    typer.Option(
-        "--temperature", metavar="C", help="Constant temperature [°C], where the input has none."
-    ),
-]
-TemperatureSourceOption = Annotated[
-    str | None,
-    typer.Option(
-        "--temperature-source",
-        metavar="SOURCE",
-        help="Location of the temperature sensor, where the input does not state it: "
-        f"{', '.join(TEMPERATURE_SOURCES)}.",
-    ),
-]
 ColumnsOption = Annotated[
     str | None,
     typer.Option(
@@ -82,23 +48,6 @@ SignOption = Annotated[
         " found from the data.",
     ),
 ]
-EndpointOption = Annotated[
-    str | None,
-    typer.Option(
-        "--endpoint",
-        metavar="PATH|URL",
-        help="Unix socket of the service, or http://HOST:PORT. Default: the service running on this"
-        " machine.",
-    ),
-]
-TokenFileOption = Annotated[
-    Path | None,
-    typer.Option(
-        "--token-file",
-        metavar="FILE",
-        help="File with the bearer token of an HTTP endpoint; or in CANGAUGE_HTTP_TOKEN.",
-    ),
-]
 JsonOption = Annotated[
     bool,
     typer.Option("--json", help="Print exactly one JSON object on stdout, also for an error."),
@@ -116,23 +65,6 @@ def suffixed(*suffixes: str) -> Callable[[typer.CallbackParam, Path | None], Pat
     return check
 
 
-def folder_to_write(param: typer.CallbackParam, folder: Path | None) -> Path | None:
-    """Refuse, before any long work, a folder to write that is a file or cannot be made.
-
-    A callback of options; whoever writes into the folder makes it.
-    """
-    if folder is not None and not os.path.isdir(folder):  # noqa: PTH112 - False, not an error, for a name too long
-        if os.path.exists(folder):  # noqa: PTH110 - likewise
-            raise InputError(
-                "is a file", field=param.opts[-1], value=str(folder), cure="name a folder"
-            )
-        made = folder
-        while not os.path.exists(made.parent):  # noqa: PTH110 - likewise
-            made = made.parent
-        check_writable(made)
-    return folder
-
-
 ReportOption = Annotated[
     Path | None,
     typer.Option(
@@ -146,30 +78,47 @@ ReportOption = Annotated[
 
 @dataclass(frozen=True, slots=True)
 class Reading:
-    """The options of every command that reads a log or a capture.
+    """The options of every command that reads a log or a capture."""
 
-    Parameters
-    ----------
-    vehicle : str, optional
-        Preset of the car (captures only).
-    dbc, map_file : Path, optional
-        DBC and map of signals, in place of a preset (captures only); `[columns]` of the map apply
-        to a log unless `columns` is given.
-    columns, sign : str, optional
-        Values of `--columns` and `--sign`.
-    temperature : float, optional
-        Constant temperature [°C].
-    temperature_source : str, optional
-        Location of the temperature sensor.
-    """
-
-    vehicle: VehicleOption = None
-    dbc: DbcOption = None
-    map_file: MapOption = None
+    vehicle: Annotated[
+        str | None,
+        typer.Option(
+            "--vehicle",
+            metavar="PRESET",
+            help="For a capture: the car's preset (a DBC and a map that ship with cangauge).",
+        ),
+    ] = None
+    dbc: Annotated[
+        Path | None,
+        typer.Option("--dbc", metavar="FILE", help="For a capture: the bus's DBC; needs --map."),
+    ] = None
+    map_file: Annotated[
+        Path | None,
+        typer.Option(
+            "--map",
+            metavar="FILE",
+            help="For a capture: which signals of the DBC are current, voltage and temperature.",
+        ),
+    ] = None
     columns: ColumnsOption = None
     sign: SignOption = None
-    temperature: TemperatureOption = None
-    temperature_source: TemperatureSourceOption = None
+    temperature: Annotated[
+        float | None,
+        typer.Option(
+            "--temperature",
+            metavar="C",
+            help="Constant temperature [°C], where the input has none.",
+        ),
+    ] = None
+    temperature_source: Annotated[
+        str | None,
+        typer.Option(
+            "--temperature-source",
+            metavar="SOURCE",
+            help="Location of the temperature sensor, where the input does not state it: "
+            f"{', '.join(TEMPERATURE_SOURCES)}.",
+        ),
+    ] = None
 
     @property
     def names_vehicle(self) -> bool:
@@ -178,7 +127,6 @@ class Reading:
 
     def car(self) -> Vehicle:
         """Return the vehicle that decodes a capture; may raise InputError."""
-        # Deferred: the service shares these options, but needs neither pyarrow nor the readers.
         from cangauge.bus.vehicle import Vehicle
 
         return Vehicle.load(self.vehicle, self.dbc, self.map_file, temperature_c=self.temperature)
@@ -196,13 +144,7 @@ class Reading:
         return None if self.map_file is None else columns_of_map(self.map_file)
 
     def open(self, path: Path) -> LogFile | Capture:
-        """Open a log by these columns, or any recording by its content.
-
-        Raises
-        ------
-        InputError
-            If the file cannot be read, or an option is wrong.
-        """
+        """Open a log by these columns, or any recording by its content; may raise InputError."""
         from cangauge.bus.recording import open_with_columns, refuse_sign_of_capture
 
         recording = open_with_columns(
@@ -283,12 +225,19 @@ def option_groups(*omitted: str) -> Callable[[Callable[..., None]], Callable[...
                 given[name] = kind(**{each: given.pop(each) for each in names})
             command(**given)
 
-        run.__doc__ = command.__doc__
-        run.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
-        run.__annotations__ = {each.name: each.annotation for each in parameters}
-        return run
+        return with_signature(run, command, parameters)
 
     return spread
+
+
+def with_signature(
+    run: Callable[..., None], command: Callable[..., None], parameters: list[inspect.Parameter]
+) -> Callable[..., None]:
+    """Give a function the help page of a command and the parameters that typer reads."""
+    run.__doc__ = command.__doc__
+    run.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
+    run.__annotations__ = {each.name: each.annotation for each in parameters}
+    return run
 
 
 def note_reading(log: Log) -> None:
@@ -323,7 +272,7 @@ def check_outputs(
     outputs, inputs : iterable of Path
         None stands for an output that is not wanted.
     made : Path, optional
-        A folder that the command makes, of outputs; see `folder_to_write`.
+        A folder that the command makes, of outputs; made after the check.
 
     Raises
     ------
@@ -332,19 +281,15 @@ def check_outputs(
     """
     read = {path.resolve() for path in inputs}
     written: set[Path] = set()
-    for output in outputs:
-        if output is None:
-            continue
-        place = output.resolve()
+    for output in filter(None, outputs):
+        place, problem, cure = output.resolve(), "", "name two different files"
         if place in read:
-            raise InputError(
-                "this output is also an input", source=output, cure="name another file for it"
-            )
+            problem, cure = "this output is also an input", "name another file for it"
         # /dev/null may be named twice.
-        if place in written and (place.is_file() or not place.exists()):
-            raise InputError(
-                "two outputs have this name", source=output, cure="name two different files"
-            )
+        elif place in written and (place.is_file() or not place.exists()):
+            problem = "two outputs have this name"
+        if problem:
+            raise InputError(problem, source=output, cure=cure)
         written.add(place)
         if output.parent != made or made.is_dir():
             check_writable(output)
@@ -361,7 +306,6 @@ def within(value: _Value, low: float, high: float, *, option: str, unit: str) ->
 
 def refuse_inverted_current(log: Log, *, is_capture: bool) -> None:
     """Raise InputError if the data show clearly that positive current charges."""
-    # Deferred as in `Reading`.
     from cangauge.logs.sign import require_discharge_positive
 
     try:

@@ -5,10 +5,12 @@ from __future__ import annotations
 import json
 import logging
 import math
+import shutil
 import sys
+import textwrap
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from typing import Any
+from typing import Any, Final
 
 from rich import box
 from rich.console import Console, ConsoleOptions, RenderableType
@@ -36,11 +38,26 @@ console = PlainConsole(stderr=True, highlight=False)
 
 
 def note(text: str) -> None:
-    """Print one line on stderr."""
-    if sys.stderr is not None:
-        with suppress(OSError):  # a full disk behind it: the exit code reports the failure
-            sys.stderr.write(printable(text.rstrip()) + "\n")
-            sys.stderr.flush()
+    """Print one line on stderr; on a terminal it is wrapped between words."""
+    if sys.stderr is None:
+        return
+    text = printable(text.rstrip())
+    if sys.stderr.isatty():
+        lines = text.splitlines()
+        columns = max(shutil.get_terminal_size().columns, 40)
+        text = "\n".join(textwrap.fill(line, columns, **_HANGING) for line in lines)
+    with suppress(OSError):  # a full disk behind it: the exit code reports the failure
+        sys.stderr.write(text + "\n")
+        sys.stderr.flush()
+
+
+_HANGING: Final[dict[str, Any]] = {
+    "subsequent_indent": "  ",
+    "break_long_words": False,
+    "break_on_hyphens": False,
+    "replace_whitespace": False,
+}
+"""Paths and values stay whole, to be copied."""
 
 
 @contextmanager

@@ -41,8 +41,6 @@ if TYPE_CHECKING:
     from cangauge.replay.player import ReplayState
     from cangauge.replay.steps import Source
 
-MAX = "max"
-
 
 def replay_command(  # noqa: PLR0917 - typer passes options by name
     recorded: Annotated[
@@ -102,17 +100,11 @@ def replay_command(  # noqa: PLR0917 - typer passes options by name
     from cangauge.replay.player import ReplaySettings, play
     from cangauge.service.lifecycle import stop_on_signals
 
-    ids = FrameIds(
-        **frame_ids(
-            soc_estimate=soc_estimate_id, soc_detail=soc_detail_id, replay_clock=replay_clock_id
-        )
-    )
-    settings = ReplaySettings(
-        speed=_speed(speed),
-        loop=loop,
-        wait_s=_seconds(wait_s, "--wait"),
-        ids=ids,
-    )
+    given = {"soc_estimate": soc_estimate_id, "soc_detail": soc_detail_id}
+    ids = FrameIds(**frame_ids(**given, replay_clock=replay_clock_id))
+    if wait_s is not None and not 0.0 < wait_s <= 1e6:
+        raise InputError("must be more than 0 s", field="--wait", value=wait_s)
+    settings = ReplaySettings(speed=_speed(speed), loop=loop, wait_s=wait_s, ids=ids)
     reading = Reading(vehicle, dbc, map_file, columns, sign, temperature)
     source = _source(recorded, reading, ids)
     address = bus_address(interface, channel, parse_bus_options(bus_option or []))
@@ -149,26 +141,14 @@ def _source(recorded: Path, reading: Reading, ids: FrameIds) -> Source:
 
 
 def _speed(text: str) -> float:
-    if text == MAX:
-        return math.inf
     try:
-        speed = float(text)
+        speed = math.inf if text == "max" else float(text)
     except ValueError:
         speed = math.nan
-    if not 1e-3 <= speed <= 1e6:
-        raise InputError(
-            "not a speed",
-            field="--speed",
-            value=text,
-            cure="give 1 (real time), another factor, or max",
-        )
+    if text != "max" and not 1e-3 <= speed <= 1e6:
+        cure = "give 1 (real time), another factor, or max"
+        raise InputError("not a speed", field="--speed", value=text, cure=cure)
     return speed
-
-
-def _seconds(value: float | None, option: str) -> float | None:
-    if value is not None and not 0.0 < value <= 1e6:
-        raise InputError("must be more than 0 s", field=option, value=value)
-    return value
 
 
 class _Bar:

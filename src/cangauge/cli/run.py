@@ -4,18 +4,23 @@ from __future__ import annotations
 
 import gc
 import logging
-from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+from rich.live import Live
 
-from cangauge._logging import LogFormat, emit, logging_to
+from cangauge._logging import emit, logging_to, takes_text
 from cangauge.cli.config_options import config_options, config_values
 from cangauge.cli.options import JsonOption
 from cangauge.cli.output import console, emit_json
+from cangauge.cli.status import live_text
 from cangauge.errors import CangaugeError
+from cangauge.service.output import Output
+
+if TYPE_CHECKING:
+    from cangauge.service.status import Snapshot
 
 _LOG = logging.getLogger(__name__)
 
@@ -42,7 +47,8 @@ def run_command(
     current discharges.
 
     SIGHUP reloads configuration, model and vehicle: the SoC continues, an invalid configuration
-    is refused. Changes of the bus, the time source and output files need a restart.
+    is refused (`cangauge check` tests it before). Changes of the bus, the time source and output
+    files need a restart.
 
     Examples
     --------
@@ -57,7 +63,6 @@ def run_command(
 
     `cangauge run --config car.toml --dashboard`  (the live page at http://127.0.0.1:8642/)
     """
-    from cangauge.cli.live_line import LiveLine
     from cangauge.service.config import load_config
     from cangauge.service.lifecycle import deadline_after_signal
     from cangauge.service.run import Service
@@ -66,25 +71,35 @@ def run_command(
     loaded = load_config(config, given)
     with ExitStack() as stack:
         stack.enter_context(logging_to(loaded.log_format, loaded.log_level))
-        stack.enter_context(_failures_logged(loaded.log_format))
-        outputs = [LiveLine(console)] if console.is_terminal else []
-        service = Service(config, outputs, **given)
-        # Everything loaded so far lives until exit. Garbage collection of it would pause the loop,
-        # and destroying it would delay the exit by a second.
-        gc.freeze()
-        stack.enter_context(deadline_after_signal())
-        result = service.run()
+        try:
+            service = Service(config, [_LiveLine()] if console.is_terminal else [], **given)
+            # Everything loaded so far lives until exit. Garbage collection of it would pause the
+            # loop, and destroying it would delay the exit by a second.
+            gc.freeze()
+            stack.enter_context(deadline_after_signal())
+            result = service.run()
+        except CangaugeError as error:
+            if loaded.log_format == "json":  # each line of stderr is an object
+                emit(_LOG, logging.ERROR, "service.failed", str(error), exit_code=error.exit_code)
+                error.logged = True
+            raise
         if json_output:
             emit_json(result)
 
 
-@contextmanager
-def _failures_logged(log_format: LogFormat) -> Iterator[None]:
-    """Log a failure as an event where stderr is JSON, so that each line is an object."""
-    try:
-        yield
-    except CangaugeError as error:
-        if log_format == "json":
-            emit(_LOG, logging.ERROR, "service.failed", str(error), exit_code=error.exit_code)
-            error.logged = True
-        raise
+class _LiveLine(Output):
+    """One line on the terminal that follows the service, drawn at each snapshot."""
+
+    def __init__(self) -> None:
+        # Without a refresh thread.
+        self._live = Live(console=console, auto_refresh=False, transient=True)
+        self._live.start()
+
+    def on_snapshot(self, snapshot: Snapshot) -> None:
+        """Draw a snapshot, unless the terminal is stopped."""
+        if takes_text(self._live.console.file):
+            self._live.update(live_text(snapshot.status), refresh=True)
+
+    def close(self) -> None:
+        """Remove the line."""
+        self._live.stop()

@@ -51,10 +51,8 @@ class SimulatorOptions:
 
     def __post_init__(self) -> None:
         if self.column is not None and self.function is not None:
-            raise InputError(
-                "two simulators", field="--simulator", value=self.function,
-                cure="give --simulated or --simulator",
-            )  # fmt: skip
+            cure = "give --simulated or --simulator"
+            raise InputError("two simulators", field="--simulator", value=self.function, cure=cure)
 
     @property
     def are_given(self) -> bool:
@@ -105,30 +103,19 @@ class SimulatorOptions:
 
 
 def load_function(text: str) -> Callable[..., Any]:
-    """Return a function named `MODULE:FUNCTION` or `FILE.py:FUNCTION`.
-
-    Raises
-    ------
-    InputError
-        If the module cannot be imported or has no such function.
-    """
+    """Return a function named `MODULE:FUNCTION` or `FILE.py:FUNCTION`; may raise InputError."""
     place, _, name = text.rpartition(":")
-    if not place or not name:
-        raise InputError("not a function", field="--simulator", value=text, cure=SYNTAX)
-    try:
-        module = _file(Path(place)) if place.endswith(".py") else _module(place)
-    except (Exception, SystemExit) as error:
-        raise InputError(
-            f"cannot be imported: {type(error).__name__}: {error}",
-            field="--simulator",
-            value=text,
-            cure=SYNTAX,
-        ) from error
-    function = getattr(module, name, None)
-    if not callable(function):
-        raise InputError(
-            f"{place} has no function {name}", field="--simulator", value=text, cure=SYNTAX
-        )
+    problem, cause = "" if place and name else "not a function", None
+    function: Any = None
+    if not problem:
+        try:
+            module = _file(Path(place)) if place.endswith(".py") else _module(place)
+            function = getattr(module, name, None)
+            problem = "" if callable(function) else f"{place} has no function {name}"
+        except (Exception, SystemExit) as error:  # noqa: BLE001 - whatever the user's module does
+            problem, cause = f"cannot be imported: {type(error).__name__}: {error}", error
+    if problem:
+        raise InputError(problem, field="--simulator", value=text, cure=SYNTAX) from cause
     return function  # type: ignore[no-any-return]
 
 

@@ -1,4 +1,4 @@
-"""`cangauge status`: the state of a running service."""
+"""`cangauge status`: the state of a running service; the line of `cangauge run` on a terminal."""
 
 from __future__ import annotations
 
@@ -15,18 +15,32 @@ from rich.live import Live
 from rich.text import Text
 
 from cangauge._text import NONE_KNOWN, duration, number
-from cangauge.cli.options import EndpointOption, JsonOption, TokenFileOption
+from cangauge.cli.options import JsonOption
 from cangauge.cli.output import PlainConsole, emit_json, print_table, text_table
 from cangauge.errors import CangaugeError, InputError
 
 WATCH_EVERY_S: Final = 0.5
 """Interval of `--watch` [s]."""
 USABLE: Final = frozenset({"valid", "degraded"})
+_STYLE: Final = {"initialising": "yellow", "valid": "green", "degraded": "yellow", "invalid": "red"}
 
 
 def status_command(
-    endpoint: EndpointOption = None,
-    token_file: TokenFileOption = None,
+    endpoint: Annotated[
+        str | None,
+        typer.Option(
+            metavar="PATH|URL",
+            help="Unix socket of the service, or http://HOST:PORT. Default: the service running on"
+            " this machine.",
+        ),
+    ] = None,
+    token_file: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE",
+            help="File with the bearer token of an HTTP endpoint; or in CANGAUGE_HTTP_TOKEN.",
+        ),
+    ] = None,
     watch: Annotated[
         bool, typer.Option("--watch", help="Show it again every half second, until Ctrl-C.")
     ] = False,
@@ -61,8 +75,8 @@ def status_command(
     if json_output:
         emit_json(status)
     else:
-        print_table(f"cangauge at {place}", ("", "<"), _rows(status, place))
-    if status.get("status") not in USABLE:
+        print_table(f"cangauge at {place}", ("", "<"), status_rows(status))
+    if status["status"] not in USABLE:
         raise typer.Exit(1)
 
 
@@ -73,19 +87,8 @@ def _ask(endpoint: str | None, token_file: Path | None) -> tuple[str, dict[str, 
     return place, fetch_status(place, token_file)
 
 
-def _rows(status: dict[str, Any], place: str) -> list[tuple[str, str]]:
-    """Return the rows; raise CangaugeError for an answer of another shape."""
-    try:
-        return status_rows(status)
-    except (AttributeError, KeyError, TypeError, ValueError) as error:
-        text = f"{place}: the answer is not a status of this release of cangauge"
-        raise CangaugeError(text) from error
-
-
 def _watch(endpoint: str | None, token_file: Path | None) -> None:
     """Show the status until stopped, in lines where stdout is no terminal."""
-    from cangauge.cli.live_line import live_text
-
     shown = PlainConsole(highlight=False)
     with ExitStack() as stack:
         show: Callable[[RenderableType], None] = shown.print
@@ -96,10 +99,9 @@ def _watch(endpoint: str | None, token_file: Path | None) -> None:
             content: RenderableType
             try:
                 place, status = _ask(endpoint, token_file)
-                rows = _rows(status, place)
-                content = text_table(f"cangauge at {place}", ("", "<"), rows)
-                if not shown.is_terminal:
-                    content = live_text(status)
+                content = live_text(status)
+                if shown.is_terminal:
+                    content = text_table(f"cangauge at {place}", ("", "<"), status_rows(status))
             except InputError:
                 raise  # waiting does not mend it
             except CangaugeError as error:
@@ -108,14 +110,31 @@ def _watch(endpoint: str | None, token_file: Path | None) -> None:
             time.sleep(WATCH_EVERY_S)
 
 
+def live_text(status: dict[str, Any]) -> Text:
+    """Return SoC ± standard deviation, status, voltage, residual and rate in one line."""
+    estimate, sample, reasons = status["estimate"], status["sample"], status["reasons"]
+    text = Text("SoC ", no_wrap=True, overflow="ellipsis")
+    text.append(_with_std(estimate["soc_pct"], estimate["soc_std_pct"], "%", 2), style="bold")
+    text.append("  ")
+    text.append(status["status"], style=_STYLE[status["status"]])
+    if reasons:
+        text.append(f" ({_words(reasons)})", style="dim")
+    if sample is not None:
+        residual = number(_times(estimate["residual_v"], 1e3), 0, "mV")
+        text.append(f"  {number(sample['voltage_v'], 2, 'V')}  residual {residual}")
+    text.append(f"  {status['samples_per_s']:.0f} samples/s")
+    if status["bus_trouble"]:
+        text.append(f"  {status['bus_trouble']}", style="bold red")
+    return text
+
+
 def status_rows(status: dict[str, Any]) -> list[tuple[str, str]]:
     """Return the rows of name and value that show a status."""
     estimate, sample = status["estimate"], status["sample"] or {}
-    frames, record = status["frames"], status["record"]
-    reasons = "; ".join(each.replace("_", " ") for each in status["reasons"])
-    rejected = _counts(status["rejects"])
+    frames, reasons = status["frames"], _words(status["reasons"])
+    bus = (status["bus"], status["bus_trouble"], _counts(status["bus_counts"]) or "no errors")
     rows = [
-        ("SoC", f"{number(estimate['soc_pct'], 2)} ± {number(estimate['soc_std_pct'], 2, '%')}"),
+        ("SoC", _with_std(estimate["soc_pct"], estimate["soc_std_pct"], "%", 2)),
         ("status", status["status"] + (f": {reasons}" if reasons else "")),
         ("by voltage alone", number(estimate["soc_newton_pct"], 2, "%")),
         ("by charge alone", number(estimate["soc_coulomb_pct"], 2, "%")),
@@ -126,35 +145,18 @@ def status_rows(status: dict[str, Any]) -> list[tuple[str, str]]:
         *_pack_rows(status),
         ("latest sample", f"{number(sample.get('age_s'), 2, 's')} ago"),
         ("samples", f"{status['samples']} ({number(status['samples_per_s'], 1, '/s')})"),
-        (
-            "frames",
-            f"{frames['received']} received, {frames['used']} used, {frames['lost']} lost",
-        ),
-        ("rejected", rejected or "none"),
-        (
-            "bus",
-            "; ".join(
-                (
-                    status["bus"],
-                    *filter(None, [status["bus_trouble"]]),
-                    _counts(status["bus_counts"]) or "no errors",
-                )
-            ),
-        ),
+        ("frames", ", ".join(f"{frames[name]} {name}" for name in ("received", "used", "lost"))),
+        ("rejected", _counts(status["rejects"]) or "none"),
+        ("bus", "; ".join(filter(None, bus))),
         ("latency", _delay(status["latency"])),
         ("processing time", _delay(status["step"])),
     ]
-    if record is not None:
+    if (record := status["record"]) is not None:
         problem = f"; FAILING: {record['problem']}" if record["problem"] else ""
         problem += "" if record["active"] else "; ended"
-        rows.append(
-            (
-                "recording",
-                f"{record['path']}: {record['frames']} frames,"
-                f" {number(1e-6 * record['written_bytes'], 1, 'MB')},"
-                f" {record['lost_frames']} frames lost{problem}",
-            )
-        )
+        size = number(1e-6 * record["written_bytes"], 1, "MB")
+        text = f"{record['path']}: {record['frames']} frames, {size}"
+        rows.append(("recording", f"{text}, {record['lost_frames']} frames lost{problem}"))
     if problem := status["config"]["problem"]:
         rows.append(("configuration", f"the latest one is REFUSED, the old one stays: {problem}"))
     elif status["config"]["reloading"]:
@@ -177,42 +179,36 @@ def _pack_rows(status: dict[str, Any]) -> list[tuple[str, str]]:
     health, power, cells = status["health"], status["power"], status["cells"]
     rows = []
     if health is not None:
+        ratio = (health["resistance_ratio"], health["resistance_std"])
         rows += [
-            ("capacity", with_std(health["capacity_ah"], health["capacity_std_ah"], "Ah")),
-            (
-                "resistance",
-                with_std(health["resistance_ratio"], health["resistance_std"], "× the model's", 2),
-            ),
+            ("capacity", _with_std(health["capacity_ah"], health["capacity_std_ah"], "Ah")),
+            ("resistance", _with_std(*ratio, "× the model's", 2)),
             ("current offset", number(health["offset_a"], 2, "A")),
         ]
     if power is not None:
-        energy = with_std(
-            _times(power["energy_wh"], 1e-3), _times(power["energy_std_wh"], 1e-3), "kWh"
-        )
+        kwh, std_kwh = (_times(power[name], 1e-3) for name in ("energy_wh", "energy_std_wh"))
         rows += [
-            (
-                "discharge for 10 s",
-                with_std(power["discharge_a"], power["discharge_std_a"], "A", 0),
-            ),
-            ("charge for 10 s", with_std(power["charge_a"], power["charge_std_a"], "A", 0)),
-            ("energy left", energy),
+            (f"{way} for 10 s", _with_std(power[f"{way}_a"], power[f"{way}_std_a"], "A", 0))
+            for way in ("discharge", "charge")
         ]
+        rows.append(("energy left", _with_std(kwh, std_kwh, "kWh")))
     if cells is not None:
         weakest = "" if cells["weakest"] is None else f"number {cells['weakest']}: "
+        less = _with_std(cells["sum_error_v"], cells["sum_std_v"], "V", 2)
+        spread = number(cells["spread_pct"], 1, "%")
         rows += [
-            ("weakest cell", weakest + with_std(cells["soc_pct"], cells["soc_std_pct"], "%")),
-            (
-                "cells",
-                f"{cells['cells']} known, spread {number(cells['spread_pct'], 1, '%')}; pack less"
-                f" their sum {with_std(cells['sum_error_v'], cells['sum_std_v'], 'V', 2)}",
-            ),
+            ("weakest cell", weakest + _with_std(cells["soc_pct"], cells["soc_std_pct"], "%")),
+            ("cells", f"{cells['cells']} known, spread {spread}; pack less their sum {less}"),
         ]
     return rows + [("NOTICE", each) for each in status["notices"]]
 
 
-def with_std(value: float | None, std: float | None, unit: str, digits: int = 1) -> str:
-    """Return a value and its standard deviation with their unit."""
+def _with_std(value: float | None, std: float | None, unit: str, digits: int = 1) -> str:
     return f"{number(value, digits)} ± {number(std, digits, unit)}"
+
+
+def _words(reasons: list[str]) -> str:
+    return "; ".join(each.replace("_", " ") for each in reasons)
 
 
 def _counts(counts: dict[str, int]) -> str:

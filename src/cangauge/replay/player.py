@@ -80,11 +80,6 @@ class ReplaySettings:
     acknowledge_s: float = 10.0
     ids: FrameIds = field(default_factory=FrameIds)
 
-    @property
-    def is_max(self) -> bool:
-        """Whether acknowledgements of the receiver set the speed."""
-        return math.isinf(self.speed)
-
 
 @dataclass
 class ReplayState:
@@ -137,7 +132,7 @@ def play(
     CangaugeError
         If the bus fails, or no receiver acknowledges in time.
     """
-    if settings.is_max and not source.counts_samples:
+    if math.isinf(settings.speed) and not source.counts_samples:
         raise InputError(
             "full speed needs the vehicle of a capture, to count the samples acknowledged",
             source=source.name,
@@ -165,18 +160,18 @@ class _Player:
         show: Callable[[ReplayState], None] | None,
     ) -> None:
         self._bus, self._settings, self._stop, self._show = bus, settings, stop, show
-        self._receiver = _Receiver(bus, settings, stop)
-        rest = self._receiver.listen_once
-        self._pacer = None if settings.is_max else Pacer(settings.speed, stop, rest)
+        self._receiver = receiver = _Receiver(bus, settings, stop)
+        is_max = math.isinf(settings.speed)
+        self._pacer = None if is_max else Pacer(settings.speed, stop, receiver.listen_once)
         self._clock = None if settings.speed == 1.0 else ClockFrames(settings.ids.replay_clock)
         self._first_us: int | None = None
         self._clock_us: int | None = None
         self._began_s = self._show_s = 0.0
-        self.state = ReplayState(acknowledged=0 if settings.is_max else None)
-        wait_s = settings.acknowledge_s if settings.is_max else None
+        self.state = ReplayState(acknowledged=0 if is_max else None)
+        wait_s = settings.acknowledge_s if is_max else None
         wait_s = wait_s if settings.wait_s is None else settings.wait_s
         if wait_s is not None:
-            self._receiver.wait_until_ready(wait_s)
+            receiver.wait_until_ready(wait_s)
 
     def send(self, step: Step) -> None:
         """Send a step when it is due, or when the receiver has room."""
@@ -189,10 +184,10 @@ class _Player:
         state = self.state
         if self._clock is not None and step.is_wanted and step.time_us != self._clock_us:
             self._clock_us = step.time_us
-            _send(self._bus, self._clock.at(step.time_us), self._settings)
+            _send(self._bus, self._clock.at(step.time_us), is_max=self._pacer is None)
             state.clocks += 1
         for frame in step.frames:
-            _send(self._bus, frame, self._settings)
+            _send(self._bus, frame, is_max=self._pacer is None)
         state.frames, state.samples = state.frames + len(step.frames), step.samples
         state.log_seconds = (step.time_us - self._first_us) / MICROSECONDS
         self._receiver.sent(step, state.frames + state.clocks)
@@ -218,14 +213,14 @@ class _Player:
             self._show(state)
 
 
-def _send(bus: BusConnection, frame: can.Message, settings: ReplaySettings) -> None:
+def _send(bus: BusConnection, frame: can.Message, *, is_max: bool) -> None:
     if frame.is_fd and not bus.carries_fd:
         raise InputError(
             "holds CAN FD frames, and the bus is not open for them",
             field="--bus-option",
             cure="give --bus-option fd=true",
         )
-    if not bus.send(frame) and settings.is_max:
+    if not bus.send(frame) and is_max:
         raise CangaugeError(
             f"{bus.name}: the transmit queue stays full; is the bus up, with another node that"
             " acknowledges frames?"
@@ -310,9 +305,8 @@ class _Receiver:
         give_up_s = time.monotonic() + within_s
         while self._count is None and not self._stop():
             if time.monotonic() > give_up_s:
-                raise CangaugeError(
-                    f"{self._bus.name}: no receiver: no SOC_DETAIL in {within_s:g} s; {_HINT}"
-                )
+                text = f"no receiver: no SOC_DETAIL in {within_s:g} s; {_HINT}"
+                raise CangaugeError(f"{self._bus.name}: {text}")
             self.listen_once(POLL_S)
 
     def sent(self, step: Step, frames: int) -> None:

@@ -54,21 +54,10 @@ DASHBOARD: Final = "127.0.0.1:8642"
 class KeyInfo:
     """What a key has beside its type, bounds and help.
 
-    Parameters
-    ----------
-    option : str
-        Options of `cangauge run`, such as "-m, --model"; "" for a key of the file only.
-    metavar : str
-        Placeholder of the option's value.
-    unit : str
-    default_text : str
-        Default in words, where the field's own default is not enough.
-    restart : bool
-        A reload does not apply a change of this key.
-    is_path : bool
-        A path, relative to the file that it is in.
-    bare : str
-        Value of the option where none follows it; "" if one must.
+    `option` is that of `cangauge run`, such as "-m, --model" ("": a key of the file only),
+    `metavar` the placeholder of its value, `bare` its value where none follows ("": one must).
+    `default_text` is the default in words, where the field's own is not enough. A reload does not
+    apply a change of a key with `restart`; paths are relative to the file that they are in.
     """
 
     option: str = ""
@@ -407,17 +396,8 @@ def load_config(
 ) -> RunConfig:
     """Read a configuration; options of the command line take precedence over the file.
 
-    Parameters
-    ----------
-    path : path-like, optional
-        TOML file.
-    overrides : mapping, optional
-        Values by key; None: not given. Bus options are merged with those of the file.
-
-    Raises
-    ------
-    InputError
-        Names the file (or the option), the key and the value.
+    `overrides` are values by key (None: not given); ids and bus options are merged with those of
+    the file. An InputError names the file (or the option), the key and the value.
     """
     given = {name: value for name, value in (overrides or {}).items() if value not in (None, {})}
     _check_options(given)  # separately, so that an error names the source of the value
@@ -471,16 +451,9 @@ def _in_folder(model: type[BaseModel], data: Mapping[str, Any], folder: Path) ->
 
 @dataclass(frozen=True)
 class ConfigKey:
-    """A key of the configuration, for the reference and the command line.
+    """A key of the configuration, for the reference and the command line, in words.
 
-    Parameters
-    ----------
-    name : str
-        Dotted key of the TOML file, such as "ids.soc_detail".
-    kind : str
-        Type in words.
-    default, bounds, text : str
-    info : KeyInfo
+    `name` is dotted, such as "ids.soc_detail"; `kind` is the type.
     """
 
     name: str
@@ -501,15 +474,21 @@ class ConfigKey:
 
 def config_keys(model: type[BaseModel] = RunConfig, prefix: str = "") -> Iterator[ConfigKey]:
     """Yield the keys of a table and of its inner tables, with dotted names."""
+    signs = {"gt": ">", "ge": "≥", "lt": "<", "le": "≤"}
     for name, field in model.model_fields.items():
         if (inner := _table(field)) is not None:
             yield from config_keys(inner, f"{prefix}{name}.")
             continue
         info = _info(field)
-        yield ConfigKey(
-            prefix + name, _kind(field.annotation), info.default_text or _default(field, info),
-            _bounds(field), field.description or "", info,
-        )  # fmt: skip
+        bounds = [
+            f"{sign} {getattr(part, bound):g}"
+            for part in field.metadata
+            for bound, sign in signs.items()
+            if isinstance(getattr(part, bound, None), int | float)
+        ]
+        default = info.default_text or _default(field, info)
+        text, kind = field.description or "", _kind(field.annotation)
+        yield ConfigKey(prefix + name, kind, default, ", ".join(bounds), text, info)
 
 
 def reference() -> str:
@@ -517,10 +496,8 @@ def reference() -> str:
     rows = [("Key", "Option", "Type", "Default", "Unit", "Bounds", "Meaning"), ("---",) * 7]
     for each in config_keys():
         option = ", ".join(f"`{name}`" for name in each.info.option.split(", ") if name)
-        rows.append(
-            (f"`{each.name}`", option, each.kind, each.default, each.info.unit, each.bounds,
-             each.text)
-        )  # fmt: skip
+        about = (each.kind, each.default, each.info.unit, each.bounds, each.text)
+        rows.append((f"`{each.name}`", option, *about))
     cells = [[cell.replace("|", "\\|") for cell in row] for row in rows]
     return "".join(f"| {' | '.join(row)} |\n" for row in cells)
 
@@ -559,17 +536,6 @@ def _default(field: FieldInfo, info: KeyInfo) -> str:
     if info.metavar == "ID":
         return f"0x{value:X}"
     return f"{value:.10g}" if isinstance(value, float) else str(value)
-
-
-def _bounds(field: FieldInfo) -> str:
-    signs = {"gt": ">", "ge": "≥", "lt": "<", "le": "≤"}
-    found = [
-        f"{sign} {getattr(part, name):g}"
-        for part in field.metadata
-        for name, sign in signs.items()
-        if isinstance(getattr(part, name, None), int | float)
-    ]
-    return ", ".join(found)
 
 
 if __name__ == "__main__":

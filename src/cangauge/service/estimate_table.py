@@ -44,11 +44,6 @@ _CLOSE_WITHIN_S: Final = 3.0
 _LOG = logging.getLogger(__name__)
 
 
-def require_table_suffix(output: Path, option: str = "--output") -> None:
-    """Raise InputError unless the file is named .csv or .parquet."""
-    require_suffix(output, ".csv", ".parquet", field=option)
-
-
 def write_estimates(path: Path, time_s: FloatArray, table: EstimateTable) -> None:
     """Write one row per sample, as CSV or Parquet by the suffix.
 
@@ -73,15 +68,12 @@ def write_estimates(path: Path, time_s: FloatArray, table: EstimateTable) -> Non
 def read_estimates(path: Path) -> EstimateTable:
     """Read a Parquet file of estimates, as `write_estimates` or the service wrote it."""
     columns = pq.read_table(path).to_pydict()
-    numbers: dict[str, Any] = {
-        name: np.array([np.nan if value is None else value for value in columns[name]])
-        for name in NUMBERS
-    }
     flags = {reason_name(reason): int(reason) for reason in Reason}
     reasons = {
         text: sum(flags[name] for name in text.split("; ") if name)
         for text in set(columns["reasons"])
     }
+    numbers: dict[str, Any] = {name: np.array(columns[name], np.float64) for name in NUMBERS}
     return EstimateTable(
         **numbers,
         status=np.array([Status[name.upper()] for name in columns["status"]], dtype=np.int64),
@@ -118,7 +110,7 @@ class EstimateWriter(Output):
 
     def __init__(self, path: str | PathLike[str]) -> None:
         self._path = Path(path)
-        require_table_suffix(self._path)
+        require_suffix(self._path, ".csv", ".parquet", field="--output")
         self._block: list[tuple[Any, ...]] = []
         self._names: dict[int, str] = {}
         self.failed = False
@@ -158,23 +150,22 @@ class EstimateWriter(Output):
         self._submit()
         self._worker.submit(self._finish)
         if not self._worker.close(_CLOSE_WITHIN_S):
-            self._say(TimeoutError("the disk is too slow"))
+            self._fail(TimeoutError("the disk is too slow"))
             with suppress(OSError):
                 self._part.unlink()
 
     def _submit(self) -> None:
         block, self._block = self._block, []
         if block and not self.failed and not self._worker.submit(partial(self._write, block)):
-            self._say(TimeoutError("the disk is too slow"))
+            self._fail(TimeoutError("the disk is too slow"))
 
     def _write(self, block: list[tuple[Any, ...]]) -> None:
-        if self.failed:
-            return
-        columns = [
-            pa.array(values, field.type, from_pandas=True)
-            for field, values in zip(_SCHEMA, zip(*block, strict=True), strict=True)
-        ]
-        self._sink.write_table(pa.Table.from_arrays(columns, schema=_SCHEMA))
+        if not self.failed:
+            columns = [
+                pa.array(values, field.type, from_pandas=True)
+                for field, values in zip(_SCHEMA, zip(*block, strict=True), strict=True)
+            ]
+            self._sink.write_table(pa.Table.from_arrays(columns, schema=_SCHEMA))
 
     def _finish(self) -> None:
         if not self.failed:
@@ -189,10 +180,10 @@ class EstimateWriter(Output):
 
     def _abandon(self, error: Exception) -> None:
         if not self.failed:
-            self._say(error)
+            self._fail(error)
             self._finish()
 
-    def _say(self, error: Exception) -> None:
+    def _fail(self, error: Exception) -> None:
         if not self.failed:
             self.failed = True
             text = f"{self._path}: cannot be written ({error}); the table is abandoned"

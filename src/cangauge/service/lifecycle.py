@@ -1,8 +1,4 @@
-"""Process control: stop and reload signals, and notifications to systemd (sd_notify(3)).
-
-The sd_notify protocol is implemented here, `KEY=value` datagrams to the socket in NOTIFY_SOCKET:
-the available packages need a C library or are unmaintained.
-"""
+"""Process control: stop and reload signals, and notifications to systemd (sd_notify(3))."""
 
 from __future__ import annotations
 
@@ -24,6 +20,7 @@ PINGS_PER_TIMEOUT: Final = 4
 END_WITHIN_S: Final = 6.0
 """Longest time from SIGTERM to the end [s]: what is written at the end has 5 s, and the systemd
 unit kills after 10 s."""
+_STOPS: Final = (signal.SIGINT, signal.SIGTERM)
 
 
 @contextmanager
@@ -34,34 +31,30 @@ def stop_on_signals() -> Iterator[Callable[[], bool]]:
     thread only.
     """
     received: list[int] = []
-    kinds = (signal.SIGINT, signal.SIGTERM)
-    before = {kind: signal.getsignal(kind) for kind in kinds}
+    before = {kind: signal.getsignal(kind) for kind in _STOPS}
+
+    def restore() -> None:
+        for kind, handler in before.items():
+            signal.signal(kind, handler)
 
     def note(number: int, _frame: FrameType | None) -> None:
         received.append(number)
-        for kind in kinds:
-            signal.signal(kind, before[kind])
+        restore()
 
-    for kind in kinds:
+    for kind in _STOPS:
         signal.signal(kind, note)
     try:
         yield lambda: bool(received)
     finally:
-        for kind in kinds:
-            signal.signal(kind, before[kind])
+        restore()
 
 
 @contextmanager
 def deadline_after_signal(within_s: float = END_WITHIN_S) -> Iterator[None]:
-    """End the process a while after SIGINT or SIGTERM if the block has not ended by itself.
+    """End the process with code 1 if the block still runs `within_s` after SIGINT or SIGTERM.
 
     Nothing that can hang (a disk, a pipe whose reader has stopped) must keep a service from ending.
-    For the main thread of a command; the exit code is then 1.
-
-    Parameters
-    ----------
-    within_s : float
-        Time from the signal to that end [s].
+    The signal wakes a thread by a pipe, since a main thread that hangs runs no handler.
     """
     if sys.platform == "win32":  # it has no wake-up by a pipe
         yield
@@ -73,7 +66,7 @@ def deadline_after_signal(within_s: float = END_WITHIN_S) -> Iterator[None]:
 
     def watch() -> None:
         with os.fdopen(signals, "rb", buffering=0) as received:
-            while (new := received.read(64)) and not {signal.SIGINT, signal.SIGTERM} & {*new}:
+            while (new := received.read(64)) and not {*_STOPS} & {*new}:
                 pass
         if not is_over.wait(within_s):
             with suppress(OSError):  # not by `logging`, whose lock may be what hangs
@@ -104,17 +97,14 @@ class _Hangups:
         else:
             self._received = True
 
-    def take(self) -> bool:
+    def forget(self) -> bool:
+        """Return whether there was one since the last call."""
         received, self._received = self._received, False
         return received
 
 
 def hold_hangups() -> None:
-    """Remember SIGHUP for `note_hangups` from now until the process ends.
-
-    By default the signal would end a service that still loads, or just ends. For the main thread
-    only.
-    """
+    """Remember SIGHUP for `note_hangups` from now on: it would end a service that still loads."""
     if hasattr(signal, "SIGHUP"):
         signal.signal(signal.SIGHUP, _Hangups().note)
 
@@ -134,7 +124,7 @@ def note_hangups() -> Iterator[Callable[[], bool]]:
     hangups = held if isinstance(held, _Hangups) else _Hangups()
     signal.signal(signal.SIGHUP, hangups.note)
     try:
-        yield hangups.take
+        yield hangups.forget
     finally:
         signal.signal(signal.SIGHUP, before)
 
@@ -148,45 +138,34 @@ def _has_terminal() -> bool:
 
 
 class Notifier:
-    """Notify systemd; without effect where there is no address.
+    """Notify systemd by datagrams of `KEY=value` lines; without effect where it does not listen.
 
-    Parameters
-    ----------
-    address : str, optional
-        Path of the datagram socket; a leading "@" denotes the abstract namespace.
-    watchdog_s : float, optional
-        Watchdog time-out of systemd [s].
-
-    Attributes
-    ----------
-    ping_every_s : float or None
-        Longest interval between calls of `ping` [s]; None without a watchdog.
+    The environment has NOTIFY_SOCKET (a path; a leading "@" denotes the abstract namespace; whether
+    it is there is `active`), WATCHDOG_USEC and WATCHDOG_PID. `ping_every_s` is the longest interval
+    between calls of `ping` [s]; None without a watchdog.
     """
 
-    def __init__(self, address: str | None = None, watchdog_s: float | None = None) -> None:
-        self._address = "\0" + address[1:] if address and address[0] == "@" else address
-        self.ping_every_s = None if watchdog_s is None else watchdog_s / PINGS_PER_TIMEOUT
-        self._socket: socket.socket | None = None
-        if self._address:
-            self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_CLOEXEC)
-            self._socket.setblocking(False)
-
-    @classmethod
-    def from_environment(cls, environment: Mapping[str, str] | None = None) -> Self:
-        """Create one from NOTIFY_SOCKET, WATCHDOG_USEC and WATCHDOG_PID."""
-        given = os.environ if environment is None else environment
+    def __init__(self, environment: Mapping[str, str] | None = None) -> None:
+        given = environment or {}
         address = given.get("NOTIFY_SOCKET", "")
-        if not address.startswith(("/", "@")) or not hasattr(socket, "AF_UNIX"):
-            return cls()
-        for_us = given.get("WATCHDOG_PID", str(os.getpid())) == str(os.getpid())
+        self.active = address.startswith(("/", "@")) and hasattr(socket, "AF_UNIX")
+        self.ping_every_s: float | None = None
+        if not self.active:
+            return
+        self._address = "\0" + address[1:] if address[0] == "@" else address
+        self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_CLOEXEC)
+        self._socket.setblocking(False)
         text = given.get("WATCHDOG_USEC", "")
-        microseconds = int(text) if for_us and text.isdecimal() and len(text) < 20 else 0
-        return cls(address, microseconds / 1e6 if microseconds else None)
+        is_ours = given.get("WATCHDOG_PID", str(os.getpid())) == str(os.getpid())
+        if is_ours and text.isdecimal() and int(text[:20]) > 0:
+            self.ping_every_s = int(text[:20]) / 1e6 / PINGS_PER_TIMEOUT
 
-    @property
-    def active(self) -> bool:
-        """Whether systemd listens."""
-        return self._socket is not None
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self.active:
+            self._socket.close()
 
     def ready(self, status: str) -> None:
         """Report the end of start-up or reload; `status` is a line for `systemctl status`."""
@@ -208,14 +187,8 @@ class Notifier:
         """Report that the service stops."""
         self._send("STOPPING=1", "STATUS=stopping")
 
-    def close(self) -> None:
-        """Close the socket."""
-        if self._socket is not None:
-            self._socket.close()
-            self._socket = None
-
     def _send(self, *lines: str) -> None:
-        if self._socket is not None and self._address is not None:
+        if self.active:
             with suppress(OSError):  # systemd restarts, or its queue is full
                 self._socket.sendto("\n".join(lines).encode(), self._address)
 

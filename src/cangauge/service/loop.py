@@ -65,18 +65,11 @@ _SENT_KEPT: Final = 1024
 
 @dataclass(frozen=True)
 class LoopSettings:
-    """Time-outs of the loop.
+    """Time-outs of the loop [s].
 
-    Parameters
-    ----------
-    timeout_s : float
-        Time without a sample after which the estimate is published as stale [s].
-    duration_s, until_idle_s : float, optional
-        End after this time; end after a silence of this length that follows samples [s].
-    checkpoint_every_s : float
-        Interval of checkpoints [s].
-    poll_every_s : float, optional
-        Ask for the vehicle's replies over ISO-TP every so often [s].
+    Without a sample for `timeout_s` the estimate is published as stale. The loop ends after
+    `duration_s`, or after a silence of `until_idle_s` that follows samples. Checkpoints come every
+    `checkpoint_every_s`; replies over ISO-TP are asked for every `poll_every_s`.
     """
 
     timeout_s: float = 2.0
@@ -88,15 +81,17 @@ class LoopSettings:
 
 @dataclass(frozen=True)
 class RunSummary:
-    """Result of a run."""
+    """Result of a run.
+
+    `step_p50_us` is the median time from receiving a frame that completes a sample to having
+    processed it [µs]; the mean counts for frames received together. `foreign_frames` are those with
+    this service's ids from another sender.
+    """
 
     seconds: float
     cpu_seconds: float
     step_p50_us: float | None
-    """Median time from receiving a frame that completes a sample to having processed it [µs]; the
-    mean counts for frames received together."""
     foreign_frames: int = 0
-    """Frames with this service's ids from another sender."""
 
 
 class Loop:
@@ -127,21 +122,19 @@ class Loop:
         outputs: Sequence[Output] = (),
         record: Recorder | None = None,
         monitor: Monitor | None = None,
-        checkpoint: Callable[[], None] | None = None,
-        reload: Callable[[], LoopSettings | None] | None = None,
+        checkpoint: Callable[[], None] = lambda: None,
+        reload: Callable[[], LoopSettings | None] = lambda: None,
     ) -> None:
         self._port = port
         self._pipeline = pipeline
         self._settings = settings or LoopSettings()
         self._outputs = list(outputs)
-        self._samplers = [each for each in outputs if _takes_samples(each)]
+        self._samplers = [each for each in outputs if type(each).on_sample is not Output.on_sample]
         self._record = record
         self._monitor = monitor or Monitor(pipeline, port)
-        self._checkpoint = checkpoint
-        self._reload = reload
+        self._checkpoint, self._reload = checkpoint, reload
         self._own = OwnFrames(echoes=port.capabilities.echoes)
         self._asked = OwnFrames(echoes=port.capabilities.echoes)
-        self._poller = self._make_poller()
         # With receive stamps REPLAY_CLOCK is no input; it is received once, for a warning.
         self._expects_clock = pipeline.settings.time_source == "receive"
         self._stamps_are_arrival = port.capabilities.stamps != "driver"
@@ -154,7 +147,7 @@ class Loop:
         self._drained_s = self._received_s = steady_s()
         self._reported: set[str] = set()
         self._drops = 0
-        self._listen()
+        self._follow_pipeline()
         self._began_s = self._now_s = self._beat_s = self._keep_s = time.monotonic()
         self._save_s = self._began_s + min(FIRST_CHECKPOINT_S, self._settings.checkpoint_every_s)
         # Times at which the latest sample was processed and received. They differ while frames wait
@@ -178,8 +171,7 @@ class Loop:
                 self._on_sample()
                 self._send(frames)
         finally:
-            if self._checkpoint is not None:
-                self._checkpoint()
+            self._checkpoint()
         return RunSummary(
             seconds=time.monotonic() - self._began_s,
             cpu_seconds=time.process_time() - cpu_s,
@@ -188,13 +180,10 @@ class Loop:
         )
 
     def _is_over(self) -> bool:
-        settings, now_s = self._settings, self._now_s
-        if settings.duration_s is not None and now_s - self._began_s >= settings.duration_s:
-            return True
-        idle_s = settings.until_idle_s
-        return (
-            idle_s is not None and self._pipeline.samples > 0 and now_s - self._sample_s >= idle_s
-        )
+        duration_s, idle_s = self._settings.duration_s, self._settings.until_idle_s
+        is_late = duration_s is not None and self._now_s - self._began_s >= duration_s
+        is_idle = idle_s is not None and self._now_s - self._sample_s >= idle_s
+        return is_late or (is_idle and self._pipeline.samples > 0)
 
     def _turn(self) -> None:
         """Receive once, process the frames, and do what is due."""
@@ -249,43 +238,34 @@ class Loop:
         """Handle a frame with an id that is not the vehicle's; return False if it is input."""
         if message.is_extended_id:
             return False
-        ids, frame_id = self._pipeline.settings.ids, message.arbitration_id
-        if frame_id in ids.published:
+        settings, frame_id = self._pipeline.settings, message.arbitration_id
+        if frame_id in settings.ids.published:
             if not self._own.is_echo(message) and self._own.proves_another(self._now_s):
-                emit(
-                    _LOG,
-                    logging.WARNING,
-                    "bus.duplicate_sender",
-                    f"another node on this bus sends 0x{frame_id:X}, which this service publishes:"
-                    " is a second service running? Give one of them other ids ([ids] of the"
-                    " configuration)",
-                )
+                text = f"another node on this bus sends 0x{frame_id:X}, which this service"
+                text += " publishes: is a second service running? Give one of them other ids"
+                text += " ([ids] of the configuration)"
+                emit(_LOG, logging.WARNING, "bus.duplicate_sender", text)
             self._port.foreign = self._own.foreign
             return True
         if self._poller is not None and frame_id in self._poller.request_ids:
             if not self._asked.is_echo(message):
                 self._poller.note_other_tester(self._now_s)
             return True
-        if is_clock(message, ids.replay_clock) and self._pipeline.settings.time_source == "receive":
+        if is_clock(message, settings.ids.replay_clock) and settings.time_source == "receive":
             if self._expects_clock:
                 self._expects_clock = False
                 self._listen()
-                emit(
-                    _LOG,
-                    logging.WARNING,
-                    "bus.replay_clock_ignored",
-                    "a replay sends its log's time on this bus (REPLAY_CLOCK), but this service"
-                    " uses receive stamps; to use the log's time, run with"
-                    " --time-source replay-clock",
-                )
+                text = "a replay sends its log's time on this bus (REPLAY_CLOCK), but this service"
+                text += " uses receive stamps; to use the log's time, run with"
+                text += " --time-source replay-clock"
+                emit(_LOG, logging.WARNING, "bus.replay_clock_ignored", text)
             return True
         return False
 
     def _on_sample(self) -> None:
         sample, estimate = self._pipeline.latest_sample, self._pipeline.latest
-        if sample is not None:
-            for output in self._samplers:
-                self._tell(output, "on_sample", sample, estimate)
+        for output in self._samplers:
+            self._tell(output, "on_sample", sample, estimate)
 
     def _tell(self, output: Output, method: str, *news: object) -> None:
         """Call an output; one that raises is told nothing more, and the estimate continues."""
@@ -318,10 +298,8 @@ class Loop:
                 emit(_LOG, logging.WARNING, "bus.clock_set", text, step_s=step_s)
         if stamps.is_uncertain(steady_s()):
             reasons |= Reason.TIME_UNCERTAIN
-            found["bus.time_uncertain"] = (
-                "the time stamps of the frames contradict the monotonic clock; the time of"
-                " receiving is used instead"
-            )
+            text = "the time stamps of the frames contradict the monotonic clock; the time of"
+            found["bus.time_uncertain"] = f"{text} receiving is used instead"
         if self._own.is_shared(self._now_s):
             reasons |= Reason.DUPLICATE_SENDER
         for name in self._pipeline.decoder.two_sender_messages:
@@ -342,12 +320,6 @@ class Loop:
         if frames:
             self._monitor.sent()
 
-    def _make_poller(self) -> Poller | None:
-        every_s, targets = self._settings.poll_every_s, self._pipeline.vehicle.poll_targets
-        poller = None if every_s is None or not targets else Poller(targets, every_s)
-        self._port.polls = None if poller is None else poller.counts
-        return poller
-
     def _ask(self, frame: can.Message | None) -> None:
         """Send a request or a flow control, if there is one."""
         if frame is not None:
@@ -360,17 +332,23 @@ class Loop:
             lost, self._drops = drops - self._drops, drops
             text = f"{self._port.name}: the receive queue overflowed: {lost} frames lost"
             emit(_LOG, logging.WARNING, "bus.queue_overflow", f"{text} ({drops} so far)")
-        if self._checkpoint is not None and now_s >= self._save_s:
+        if now_s >= self._save_s:
             self._save_s = now_s + self._settings.checkpoint_every_s
             self._checkpoint()
-        if self._reload is not None and (settings := self._reload()) is not None:
+        if (settings := self._reload()) is not None:
             self._settings = settings
             self._save_s = min(self._save_s, now_s + settings.checkpoint_every_s)
-            self._poller = self._make_poller()
-            self._listen()
+            self._follow_pipeline()
         if self._monitor.turn(now_s):
             for output in self._outputs:
                 self._tell(output, "on_snapshot", self._monitor.latest)
+
+    def _follow_pipeline(self) -> None:
+        """Poll and receive for the pipeline's present vehicle."""
+        every_s, targets = self._settings.poll_every_s, self._pipeline.vehicle.poll_targets
+        self._poller = None if every_s is None or not targets else Poller(targets, every_s)
+        self._port.polls = None if self._poller is None else self._poller.counts
+        self._listen()
 
     def _listen(self) -> None:
         """Receive the vehicle's frames, and those that tell of other senders."""
@@ -378,11 +356,9 @@ class Loop:
         ids = set(settings.ids.published)
         if self._poller is not None:
             ids |= self._poller.request_ids
-        if self._expects_clock:
-            ids.add(settings.ids.replay_clock)
-        self._not_input = frozenset(ids)
-        if settings.time_source == "receive":
-            self._not_input |= {settings.ids.replay_clock}
+        clock = {settings.ids.replay_clock}
+        self._not_input = frozenset(ids | clock if settings.time_source == "receive" else ids)
+        ids |= clock if self._expects_clock else set()
         self._port.set_filters([*self._pipeline.filters, *map(standard_filter, sorted(ids))])
 
 
@@ -427,10 +403,8 @@ class OwnFrames:
         """Count a foreign frame; return whether there are enough, at a monotonic time [s]."""
         self.foreign += 1
         self._foreign_s.append(now_s)
-        is_proven = (
-            len(self._foreign_s) == FOREIGN_FRAMES
-            and now_s - self._foreign_s[0] <= FOREIGN_WITHIN_S
-        )
+        is_recent = now_s - self._foreign_s[0] <= FOREIGN_WITHIN_S
+        is_proven = is_recent and len(self._foreign_s) == FOREIGN_FRAMES
         if is_proven:
             self._shared_until_s = now_s + SUSPECTED_FOR_S
         return is_proven
@@ -438,7 +412,3 @@ class OwnFrames:
     def is_shared(self, now_s: float) -> bool:
         """Return whether another sender was proven lately, at a monotonic time [s]."""
         return now_s < self._shared_until_s
-
-
-def _takes_samples(output: Output) -> bool:
-    return type(output).on_sample is not Output.on_sample

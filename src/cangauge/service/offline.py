@@ -40,20 +40,14 @@ from cangauge.logs.log import Log
 from cangauge.model.coulomb_counting import difference_from_reference
 from cangauge.model.model_file import Model
 from cangauge.service.pipeline import FrameCounts, Pipeline, PipelineSettings
-from cangauge.types import (
-    Estimate,
-    Reason,
-    Sample,
-    reason_name,
-    reason_names,
-)
+from cangauge.types import Estimate, Reason, Sample, reason_name, reason_names
 
 PROGRESS_EVERY: Final = 50_000
 """Frames between two calls of the progress callback."""
-
+PACK_EVERY_S: Final = 1.0
+"""Interval of the rows of health, power and cells [s]."""
 PACK_VOLTAGE_MARGIN: Final = 0.2
 """Relative margin around the pseudo-OCV's range; a median voltage outside it is another pack's."""
-
 DOUBTFUL_VALID: Final = 0.1
 DOUBTFUL_COVER: Final = 0.5
 """Fractions of valid samples, and of reference SoC within ±2σ, below which to warn."""
@@ -64,18 +58,9 @@ Origin = Literal["given", "log", "voltage"]
 
 @dataclass(frozen=True, eq=False)
 class RecordedCapture:
-    """Samples of a capture: unlike a log's rows, they may lack voltage and temperature.
+    """Samples of a capture: unlike a log's rows, they may lack voltage and temperature (NaN).
 
-    Parameters
-    ----------
-    time_s : array of shape (n,)
-        Time [s], not decreasing.
-    current_a, voltage_v, temperature_c : array of shape (n,)
-        Current [A] (positive = discharge), voltage [V] and temperature [°C], NaN where missing.
-    soc_pct : array of shape (n,), optional
-        Reference SoC [%], NaN where missing.
-    name, source, temperature_source : str
-    remarks : tuple of str
+    Columns of shape (n,), as in a `Log`; time does not decrease.
     """
 
     time_s: FloatArray
@@ -119,24 +104,12 @@ class RecordedCapture:
 
 Recorded = Log | RecordedCapture
 
-PACK_EVERY_S: Final = 1.0
-"""Interval of the rows of health, power and cells [s]."""
-
 
 class PackHistory:
-    """Health, power and cells of a recording: once a second, and at the end.
+    """Health, power and cells of a recording: at the end, in `report` (None without a sample).
 
-    Parameters
-    ----------
-    keeps_rows : bool
-        Keep a row at the first sample of each second, for `columns`.
-    cells : CellColumns, optional
-        Cell voltages of a log, by its rows.
-
-    Attributes
-    ----------
-    report : PackReport or None
-        At the end; None without a sample.
+    With `keeps_rows` also at the first sample of each second, in `columns`. `cells` are the cell
+    voltages of a log, by its rows.
     """
 
     def __init__(self, *, keeps_rows: bool = False, cells: CellColumns | None = None) -> None:
@@ -209,7 +182,7 @@ class RecordedEstimate:
 
     Parameters
     ----------
-    recorded : Recorded
+    recorded : Log or RecordedCapture
         n samples.
     table : EstimateTable
         n estimates.
@@ -219,8 +192,9 @@ class RecordedEstimate:
         As used.
     origin : {"given", "log", "voltage"}
         Source of the initial SoC.
-    capture_data : dict
-        Time source and frame counts of a capture.
+    time_source : {"receive", "replay-clock"}, optional
+    counts : FrameCounts, optional
+        Source of bus time, and frames and values by outcome, of a capture.
     pack : PackHistory
         Health, power and cells.
     """
@@ -231,7 +205,8 @@ class RecordedEstimate:
     model: Model
     settings: EstimatorSettings = field(default_factory=EstimatorSettings)
     origin: Origin = "voltage"
-    capture_data: dict[str, Any] = field(default_factory=dict)
+    time_source: TimeSourceName | None = None
+    counts: FrameCounts | None = None
     pack: PackHistory = field(default_factory=PackHistory)
 
     @property
@@ -246,19 +221,18 @@ class RecordedEstimate:
     @property
     def warnings(self) -> list[str]:
         """Reasons to doubt the estimate as a whole, one sentence each."""
-        scores, found = self.scores, []
+        scores, found, name = self.scores, [], self.model.name
         if scores.valid_fraction < DOUBTFUL_VALID:
             reasons = reason_names(int(np.bitwise_or.reduce(self.table.reasons)))
             found.append(
                 f"Only {100.0 * scores.valid_fraction:.0f} % of the estimates are valid"
-                f" ({reasons}). Check that {self.model.name} is the model of this pack at these"
-                " temperatures."
+                f" ({reasons}). Check that {name} is the model of this pack at these temperatures."
             )
         if scores.cover_2sigma is not None and scores.cover_2sigma < DOUBTFUL_COVER:
             found.append(
                 f"The reference SoC lies within ±2σ in only {100.0 * scores.cover_2sigma:.0f} % of"
-                f" the samples. Check that {self.model.name} is the model of this pack and that its"
-                " capacity is right."
+                f" the samples. Check that {name} is the model of this pack and that its capacity"
+                " is right."
             )
         if isinstance(self.recorded, Log):
             capacity_ah = self.settings.capacity_ah or self.model.capacity_ah
@@ -271,6 +245,9 @@ class RecordedEstimate:
     def to_dict(self) -> dict[str, Any]:
         """Return the object that `cangauge estimate --json` prints, without the file names."""
         settings = self.settings
+        of_capture = {} if self.counts is None else {
+            "time_source": self.time_source, "frames": asdict(self.counts)
+        }  # fmt: skip
         return {
             **vars(self.scores),
             "method": settings.method,
@@ -280,7 +257,7 @@ class RecordedEstimate:
             "max_gap_s": settings.gap_s,
             "reasons": self.reason_shares,
             **(NO_REPORT if self.pack.report is None else self.pack.report.to_dict()),
-            **self.capture_data,
+            **of_capture,
         }
 
 
@@ -333,70 +310,8 @@ def estimate_recorded_log(
     return RecordedEstimate(log, table, scores, model, settings, origin, pack=history)
 
 
-def estimate_recorded_capture(
-    path: Path,
-    vehicle: Vehicle,
-    model: Model,
-    settings: EstimatorSettings,
-    *,
-    keeps_pack: bool = False,
-    progress: Callable[[int], None] | None = None,
-) -> RecordedEstimate:
-    """Estimate a capture, bit for bit as the service does.
-
-    Like the service it starts from the first voltages unless `settings` holds an initial SoC; the
-    car's own SoC is the reference to compare with only.
-
-    Raises
-    ------
-    InputError
-        If the capture gives no sample.
-    """
-    if settings.temperature_source == "unknown":
-        settings = replace(settings, temperature_source=vehicle.temperature_source)
-    found = estimate_capture(
-        path, vehicle, model, settings, keeps_pack=keeps_pack, progress=progress
-    )
-    recording = RecordedCapture(
-        time_s=_unwrapped(found.time_s),
-        current_a=found.current_a,
-        voltage_v=found.voltage_v,
-        temperature_c=found.temperature_c,
-        soc_pct=found.soc_reference_pct if np.isfinite(found.soc_reference_pct).any() else None,
-        name=path.name.split(".")[0],
-        source=str(path),
-        temperature_source=settings.temperature_source,
-        remarks=found.remarks,
-    )
-    return RecordedEstimate(
-        recorded=recording,
-        table=found.table,
-        # `score` needs only columns that a recording has.
-        scores=score(found.table, cast("Log", recording), found.seconds),
-        model=model,
-        settings=settings,
-        origin="voltage" if settings.initial_soc_pct is None else "given",
-        capture_data={"time_source": found.time_source, "frames": asdict(found.counts)},
-        pack=found.pack,
-    )
-
-
-def _unwrapped(time_s: FloatArray) -> FloatArray:
-    """Return time without the steps back of further replays in the same capture [s]."""
-    step_s = np.diff(time_s)
-    if not np.any(step_s < 0.0):
-        return time_s
-    return np.asarray(time_s[0] + np.concatenate(([0.0], np.cumsum(np.maximum(step_s, 0.0)))))
-
-
 def require_same_pack(recorded: Recorded, model: Model) -> None:
-    """Raise InputError if the voltage shows that the model belongs to another pack.
-
-    Raises
-    ------
-    InputError
-        If the median voltage lies outside the pseudo-OCV's range by `PACK_VOLTAGE_MARGIN`.
-    """
+    """Raise InputError if the median voltage shows that the model belongs to another pack."""
     known = recorded.voltage_v[np.isfinite(recorded.voltage_v)]
     if not known.size:
         return
@@ -412,44 +327,6 @@ def require_same_pack(recorded: Recorded, model: Model) -> None:
         )
 
 
-@dataclass(frozen=True, eq=False)
-class CaptureEstimate:
-    """Estimates of all n samples of a capture.
-
-    Parameters
-    ----------
-    table : EstimateTable
-    time_s, current_a : array of shape (n,)
-        Bus time [s] and current [A], positive = discharge, of the samples.
-    voltage_v, temperature_c : array of shape (n,)
-        Measured voltage [V] and temperature [°C]; NaN where the sample has none.
-    soc_reference_pct : array of shape (n,)
-        The vehicle's own state of charge [%]; NaN where there is none.
-    counts : FrameCounts
-        Frames and values by outcome.
-    time_source : {"receive", "replay-clock"}
-        Source of bus time.
-    seconds : float
-        Computing time [s].
-    remarks : tuple of str
-        Notes for the user.
-    pack : PackHistory
-        Health, power and cells.
-    """
-
-    table: EstimateTable
-    time_s: FloatArray
-    current_a: FloatArray
-    voltage_v: FloatArray
-    temperature_c: FloatArray
-    soc_reference_pct: FloatArray
-    counts: FrameCounts
-    time_source: TimeSourceName
-    seconds: float
-    remarks: tuple[str, ...]
-    pack: PackHistory
-
-
 def estimate_capture(
     path: str | PathLike[str],
     vehicle: Vehicle,
@@ -460,13 +337,17 @@ def estimate_capture(
     clock_id: int = REPLAY_CLOCK_ID,
     keeps_pack: bool = False,
     progress: Callable[[int], None] | None = None,
-) -> CaptureEstimate:
+) -> RecordedEstimate:
     """Estimate a capture, bit for bit as the service does with the same frames.
+
+    Like the service it starts from the first voltages unless `settings` holds an initial SoC; the
+    car's own SoC is the reference to compare with only.
 
     Parameters
     ----------
     path : path-like
     vehicle : Vehicle
+        Its temperature source replaces an unknown one of `settings`.
     model : Model
     settings : EstimatorSettings, optional
     time_source : {"auto", "receive", "replay-clock"}
@@ -478,10 +359,6 @@ def estimate_capture(
     progress : callable, optional
         Called with the number of frames read, every `PROGRESS_EVERY`.
 
-    Returns
-    -------
-    CaptureEstimate
-
     Raises
     ------
     InputError
@@ -490,7 +367,9 @@ def estimate_capture(
     began = time.perf_counter()
     is_undecided = time_source == "auto"
     source: TimeSourceName = "receive" if time_source == "auto" else time_source
-    ids = FrameIds(replay_clock=clock_id)
+    settings, path = settings or EstimatorSettings(), Path(path)
+    if settings.temperature_source == "unknown":
+        settings = replace(settings, temperature_source=vehicle.temperature_source)
     buses: dict[Channel | None, _Bus] = {}
     capture = open_vehicle_capture(path, vehicle)
     for number, message in enumerate(capture, start=1):
@@ -500,7 +379,7 @@ def estimate_capture(
             buses.clear()
         bus = buses.get(message.channel)
         if bus is None:
-            chosen = PipelineSettings(settings or EstimatorSettings(), source, ids)
+            chosen = PipelineSettings(settings, source, FrameIds(replay_clock=clock_id))
             pipeline = Pipeline(vehicle, model, chosen, publishes=False)
             bus = buses[message.channel] = _Bus(pipeline, PackHistory(keeps_rows=keeps_pack))
         if bus.pipeline.handle(message):
@@ -518,20 +397,27 @@ def estimate_capture(
             cure=f"check that this is the bus of {vehicle.name} (see `cangauge inspect`)",
         )
     best = max(found, key=lambda bus: len(bus.estimates))
-    counts = best.pipeline.counts
+    counts, table = best.pipeline.counts, EstimateTable.of(best.estimates)
     time_s, current_a, voltage_v, temperature_c, soc_pct = np.array(best.values).reshape(-1, 5).T
-    return CaptureEstimate(
-        table=EstimateTable.of(best.estimates),
-        time_s=time_s,
+    # Further replays in the same capture begin earlier: their steps back count as none.
+    later_s = np.cumsum(np.maximum(np.diff(time_s), 0.0))
+    is_unwrapped = bool(np.any(np.diff(time_s) < 0.0))
+    recorded = RecordedCapture(
+        time_s=time_s[0] + np.concatenate(([0.0], later_s)) if is_unwrapped else time_s,
         current_a=current_a,
         voltage_v=voltage_v,
         temperature_c=temperature_c,
-        soc_reference_pct=soc_pct,
-        counts=counts,
-        time_source=source,
-        seconds=time.perf_counter() - began,
+        soc_pct=soc_pct if np.isfinite(soc_pct).any() else None,
+        name=path.name.split(".")[0],
+        source=str(path),
+        temperature_source=settings.temperature_source,
         remarks=(*capture.info.remarks, *_remarks(source, counts, len(found))),
-        pack=best.pack,
+    )
+    # `score` needs only columns that a recording has.
+    scores = score(table, cast("Log", recorded), time.perf_counter() - began)
+    origin: Origin = "voltage" if settings.initial_soc_pct is None else "given"
+    return RecordedEstimate(
+        recorded, table, scores, model, settings, origin, source, counts, best.pack
     )
 
 

@@ -7,10 +7,12 @@ the same stamps give the same numbers. `loop` runs it on a bus, `offline` over a
 from __future__ import annotations
 
 import math
+from collections import deque
 from dataclasses import dataclass, field, fields, replace
 from typing import Final
 
 import can
+import numpy as np
 from can.typechecking import CanFilter
 
 from cangauge.bus.decoder import SampleDecoder
@@ -29,6 +31,8 @@ from cangauge.estimation.cells import CellEstimator
 from cangauge.estimation.compiled import make_estimator
 from cangauge.estimation.settings import EstimatorSettings
 from cangauge.estimation.state import EstimatorState
+from cangauge.logs.log import Log
+from cangauge.logs.sign import sign_of_current
 from cangauge.model.model_file import Model
 from cangauge.types import Estimate, Reason, Sample, Status, status_of
 
@@ -38,32 +42,26 @@ NOTHING_YET: Final = Estimate.unknown(Reason.NO_INITIAL_SOC | Reason.INPUT_STALE
 
 @dataclass(frozen=True)
 class FrameCounts:
-    """Frames and values by outcome, over all logs of a run."""
+    """Frames and values by outcome, over all logs of a run.
+
+    Wanted frames are lost by their alive counters, have a wrong CRC, repeat a counter or are too
+    short. Values are coded as not available, implausible (out of range, or changed too fast), of a
+    stuck signal, or held back until their signal has recovered. Untimed frames came before the
+    first REPLAY_CLOCK, where that is the time source; each new log is a beginning.
+    """
 
     frames: int = 0
-    """Frames handled, REPLAY_CLOCK excluded."""
     samples: int = 0
-    """Samples made of them."""
     lost: int = 0
-    """Wanted frames missing according to the alive counters."""
     crc_errors: int = 0
-    """Wanted frames with a wrong CRC."""
     repeated: int = 0
-    """Wanted frames whose alive counter did not advance."""
     short: int = 0
-    """Wanted frames with too few bytes."""
     not_available: int = 0
-    """Values coded as "not available"."""
     implausible: int = 0
-    """Values out of range, or changed too fast."""
     stuck: int = 0
-    """Values of a signal that was constant while it should change."""
     held_back: int = 0
-    """Good values not used yet, while their signal recovers from failures."""
     untimed: int = 0
-    """Frames before the first REPLAY_CLOCK, where that is the time source."""
     beginnings: int = 0
-    """Number of new logs, each of which restarted decoder and estimator."""
 
     def __add__(self, other: FrameCounts) -> FrameCounts:
         """Return the sums."""
@@ -71,18 +69,57 @@ class FrameCounts:
         return FrameCounts(*(getattr(self, name) + getattr(other, name) for name in names))
 
 
+class SignWatch:
+    """Test the sign of the current while the service runs, as the commands test it in a log.
+
+    Attributes
+    ----------
+    evidence : str
+        Why the sign must be inverted; "" while nothing proves it.
+    """
+
+    ROW_S: Final = 1.0
+    """Interval of the rows [s]: that of the steps which the test counts."""
+    ROWS: Final = 1800
+    """Latest rows that are tested: half an hour."""
+    TEST_EVERY_S: Final = 60.0
+    SURE_WEIGHT: Final = 5.0
+    """Decades of odds that the steps alone must give: about 55 unanimous ones. A log is tested
+    once and asks for two; here the test is repeated every minute."""
+
+    def __init__(self) -> None:
+        self.evidence = ""
+        self._rows: deque[tuple[float, float, float]] = deque(maxlen=self.ROWS)
+        self._row_s = self._test_s = -math.inf
+
+    def add(self, sample: Sample) -> None:
+        """Take a sample; test once a minute of bus time."""
+        time_s, current_a, voltage_v, _ = sample
+        if not time_s >= self._row_s or not math.isfinite(current_a + voltage_v):
+            return
+        self._row_s = time_s + self.ROW_S
+        self._rows.append((time_s, current_a, voltage_v))
+        if time_s >= self._test_s:
+            self._test_s = time_s + self.TEST_EVERY_S
+            if len(self._rows) > 1:
+                self._test()
+
+    def _test(self) -> None:
+        time_s, current_a, voltage_v = np.array(self._rows).T
+        finding = sign_of_current(Log(time_s, current_a, voltage_v, np.zeros(time_s.size)))
+        steps = next(each for each in finding.evidence if each.kind == "steps")
+        if finding.sign < 0 and steps.weight <= -self.SURE_WEIGHT:
+            self.evidence = steps.text
+        elif finding.sign > 0:
+            self.evidence = ""
+
+
 @dataclass(frozen=True)
 class PipelineSettings:
     """Settings of a pipeline.
 
-    Parameters
-    ----------
-    estimator : EstimatorSettings
-        An unknown temperature source is replaced by the vehicle's.
-    time_source : {"receive", "replay-clock"}
-        Bus time: the frames' receive stamps, or the log time that REPLAY_CLOCK sends.
-    ids : FrameIds
-        Ids of the published frames and of REPLAY_CLOCK.
+    An unknown temperature source of the estimator is replaced by the vehicle's. Bus time is the
+    frames' receive stamps, or the log time that REPLAY_CLOCK sends.
     """
 
     estimator: EstimatorSettings = field(default_factory=EstimatorSettings)
@@ -110,10 +147,9 @@ class Pipeline:
     decoder : SampleDecoder
         Frame statistics, signal health and the vehicle's own SoC, of the current log.
     estimator : Estimator
-    samples : int
-        Samples handed to the estimator, refused ones included, over all logs.
-    taken : int
-        Samples that the estimator took: only these make an estimate fresh.
+    samples, taken : int
+        Samples handed to the estimator, over all logs, and those of them that it took: only these
+        make an estimate fresh.
     stamp_shift_s : float
         Part of the frames' stamps that their clock does not have, since it was set [s].
     latest_sample : Sample or None
@@ -121,6 +157,8 @@ class Pipeline:
         The estimate in the frames made last.
     cells : CellEstimator or None
         Where the vehicle gives cell voltages.
+    sign : SignWatch
+        Whether the current has the wrong sign.
 
     Raises
     ------
@@ -151,6 +189,7 @@ class Pipeline:
         self._refused = 0  # in a row
         self._pack = _pack_of(model, self.settings.estimator.capacity_ah)
         self.decoder = SampleDecoder(vehicle, self._pack)
+        self.sign = SignWatch()
         self.estimator = make_estimator(model, _with_source(self.settings.estimator, vehicle))
         self.cells = self._new_cells()
         self.samples = self.taken = 0
@@ -245,13 +284,10 @@ class Pipeline:
             self.taken += 1
             self._refused = 0
         self._is_behind = True
-        if self.cells is not None and self.cells.is_due(sample.time_s):
-            self._update_cells(self.cells, sample)
-
-    def _update_cells(self, cells: CellEstimator, sample: Sample) -> None:
-        """Hand the cell voltages that came in since the last second to their estimator."""
-        if self.decoder.cells is not None:
-            volts, times = self.decoder.cells.take(sample.time_s)
+        self.sign.add(sample)
+        cells, received = self.cells, self.decoder.cells
+        if cells is not None and received is not None and cells.is_due(sample.time_s):
+            volts, times = received.take(sample.time_s)
             changes = self.estimator.current_changes(sample.time_s, times)
             cells.update(self.estimator.pack_tick(sample), volts, changes)
 
@@ -277,19 +313,21 @@ class Pipeline:
             reasons |= Reason.TIME_UNCERTAIN
         if self._refused >= MISSED_UNTIL_OLD:
             reasons |= Reason.INPUT_STALE
+        if self.sign.evidence:
+            reasons |= Reason.SIGN_SUSPECT
         if reasons == estimate.reasons:
             return estimate
         return estimate._replace(reasons=reasons, status=status_of(reasons))
 
     def _begin_log(self) -> None:
         """Restart decoder and estimator for the next log of a replay."""
-        _ = self.latest  # computed before its estimator is replaced
+        _ = self.latest  # before its estimator is replaced
         self._earlier_counts = replace(self.counts, beginnings=self._earlier_counts.beginnings + 1)
         self._untimed = 0
         self._beginnings = self._time.beginnings
         if self._publisher is not None:
             self._publisher.restart()
-        self.decoder = SampleDecoder(self.vehicle, self._pack)
+        self.decoder, self.sign = SampleDecoder(self.vehicle, self._pack), SignWatch()
         self.estimator = make_estimator(self.model, self.estimator.settings)
         self.cells = self._new_cells()
         self._estimated = None
@@ -315,16 +353,9 @@ class Pipeline:
     ) -> list[can.Message]:
         """Return the frames due every `publish.ESTIMATE_EVERY_S`.
 
-        Parameters
-        ----------
-        is_stale : bool
-            No sample within the service's time-out: the latest estimate becomes invalid.
-        silent_s : float
-            Time since the latest sample that the estimator took came in, by the loop's monotonic
-            clock [s]. With receive stamps, a silence longer than the current's own time-out is
-            stale as well.
-        reasons : Reason
-            Findings of the loop itself, about time and other senders.
+        `is_stale`: no sample came within the service's time-out. `silent_s` is the time since the
+        latest sample that the estimator took [s]; with receive stamps a silence longer than the
+        current's own time-out is stale as well. `reasons` are the loop's own findings.
         """
         if self._publisher is None:
             return []
@@ -358,21 +389,10 @@ class Pipeline:
     ) -> None:
         """Continue with another configuration, from the SoC known so far.
 
-        Unchanged parts keep their state bit for bit. A changed model or estimator setting makes
-        a new estimator, which takes over SoC and delay line.
-
-        Parameters
-        ----------
-        vehicle : Vehicle, optional
-            None: the same.
-        model : Model
-        settings : PipelineSettings
-            Initial SoC, its standard deviation, the time source and REPLAY_CLOCK's id stay.
-
-        Raises
-        ------
-        InputError
-            If a frame to publish has the id of a vehicle's signal; the old configuration stays.
+        Unchanged parts (vehicle None: the same) keep their state bit for bit. A changed model or
+        estimator setting makes a new estimator, which takes over SoC and delay line. Initial SoC,
+        its standard deviation, the time source and REPLAY_CLOCK's id stay. InputError, and no
+        change, if a frame to publish has the id of a vehicle's signal.
         """
         old, started = self.settings, self.estimator.settings
         ids = replace(settings.ids, replay_clock=old.ids.replay_clock)
@@ -393,7 +413,7 @@ class Pipeline:
             # The plausible range of a signal follows from both.
             self._earlier_counts, self._untimed = self.counts, 0
             self.vehicle, self._pack = vehicle or self.vehicle, pack
-            self.decoder = SampleDecoder(self.vehicle, pack)
+            self.decoder, self.sign = SampleDecoder(self.vehicle, pack), SignWatch()
             self.cells = self._new_cells()
         self._report = None
         self.settings = replace(settings, ids=ids, time_source=old.time_source)
@@ -414,10 +434,7 @@ class Pipeline:
     def restore(self, state: EstimatorState, age_s: float = 0.0) -> Estimate:
         """Continue from a state (see `Estimator.restore`); it is stale until a sample comes.
 
-        Raises
-        ------
-        InputError
-            If the state does not fit the model; nothing is changed then.
+        InputError, and no change, if it does not fit the model.
         """
         estimator = make_estimator(self.model, self.estimator.settings)
         latest = estimator.restore(state, age_s)

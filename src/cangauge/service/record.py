@@ -1,10 +1,11 @@
 """Record the received frames, so that `estimate` on the recording reproduces the live numbers.
 
 Formats are the texts that keep whole microseconds: candump (.log) and python-can's .csv, either
-also gzipped. The receive loop only collects frames; a thread formats and writes them in batches, so
-a kill loses at most the frames since the last snapshot (0.25 s), and a power cut those of the last
-`SYNC_EVERY_S`. A batch that the disk refuses is cut off the file and counted: the file stays whole
-lines, and continues once there is space.
+also gzipped, by python-can's writers. The receive loop only collects frames; a thread formats and
+writes them in batches, so a kill loses at most the frames since the last snapshot (0.25 s), and a
+power cut those of the last `SYNC_EVERY_S`. A batch that the disk refuses is cut off the file and
+counted: the file stays whole lines, and continues once there is space. (python-can's
+`SizedRotatingLogger` writes through a buffer, which leaves half a line on a full disk.)
 """
 
 from __future__ import annotations
@@ -14,7 +15,6 @@ import gzip
 import io
 import logging
 import os
-import shutil
 import time
 from collections.abc import Callable
 from contextlib import suppress
@@ -46,8 +46,6 @@ CLOSE_WITHIN_S: Final = 0.6
 REQUESTED_BYTES: Final = 4 << 30
 """Largest recording begun by a viewer [bytes]: half a day of a busy bus (2,000 frames/s of candump
 text), and what one file of FAT32 can hold."""
-FREE_BYTES: Final = 1 << 30
-"""Space that such a recording leaves free [bytes]: for state, table and logs on the same disk."""
 FORMATS: Final[dict[str, Callable[[io.StringIO], can.CanutilsLogWriter | can.CSVWriter]]] = {
     ".log": can.CanutilsLogWriter,
     ".csv": can.CSVWriter,
@@ -57,22 +55,11 @@ _LOG = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class RecordLimits:
-    """Limits of a recording: size and duration of its parts, and its total size.
+    """Limits of a recording: size and duration at which a new part begins, and its total size.
 
     Without limits it is one file. If that exists already (a restarted service must not overwrite
-    its predecessor's recording), or with any limit, runs and parts are numbered.
-
-    Parameters
-    ----------
-    part_bytes, part_s : float, optional
-        Size [bytes] and duration [s] at which a new part begins.
-    keep_bytes : float, optional
-        Total size above which the oldest parts are removed when a new one begins [bytes].
-
-    Raises
-    ------
-    InputError
-        If `keep_bytes` is given without parts.
+    its predecessor's recording), or with any limit, runs and parts are numbered. The oldest parts
+    are removed above `keep_bytes` when a new one begins; InputError if there are no parts.
     """
 
     part_bytes: float | None = None
@@ -103,17 +90,20 @@ class Recorder(Output):
     ----------
     path : path-like, optional
         Recorded to from the start, and again after each request. Without it a request begins a
-        candump file in the working folder, named by its UTC time.
+        candump file in the working folder, named by its UTC time. InputError if its suffix is
+        unknown, or its folder missing or not writable.
     limits : RecordLimits, optional
         By default one file. Without `keep_bytes` a recording begun by a request ends at
-        `REQUESTED_BYTES`, or when less than `FREE_BYTES` are free.
+        `REQUESTED_BYTES`.
     clock : callable
         Monotonic time [s].
 
-    Raises
-    ------
-    InputError
-        If the suffix is unknown, or the folder is missing or not writable.
+    Attributes
+    ----------
+    state : RecordState or None
+        Progress of the recording, or the end of the latest one; None before the first.
+    written : list of Path
+        All recordings, for `estimate`, in order.
     """
 
     def __init__(
@@ -131,19 +121,12 @@ class Recorder(Output):
         self._file: _File | None = None
         self._lost_frames = 0
         self.state: RecordState | None = None
-        """Progress of the recording, or the end of the latest one; None before the first."""
         self.written: list[Path] = []
-        """Paths of all recordings, for `estimate`, in order."""
         self._worker = Worker("cangauge-record", self._failed, BATCHES_WAITING)
         if self._path is not None:
             _check_path(self._path)
             self._begin(self._path, requested=False)
             self._is_active = True
-
-    @property
-    def frames(self) -> int:
-        """Frames handed to the recording so far."""
-        return 0 if self.state is None else self.state.frames
 
     @property
     def path(self) -> Path:
@@ -198,21 +181,19 @@ class Recorder(Output):
     # --- In the thread
 
     def _begin(self, path: Path, *, requested: bool) -> None:
-        endless = requested and self._limits.keep_bytes is None
         try:
             _check_path(path)
-            if endless and (problem := _full(path, 0)):
-                raise CangaugeError(problem)  # noqa: TRY301 - reported as any other
-            self._file = _File(path, self._limits, self._clock, ends=endless)
+            self._file = file = _File(path, self._limits, self._clock)
         except (CangaugeError, OSError) as error:
             self._is_active = False
             self.state = RecordState(str(path), 0, 0, 0, str(error), active=False)
             emit(_LOG, logging.WARNING, "record.refused", f"no recording: {error}")
             return
-        self.state = RecordState(str(self._file.current), 0, 0, 0, None)
-        self.written.append(self._file.path)
+        file.ends = requested and self._limits.keep_bytes is None
+        self.state = RecordState(str(file.current), 0, 0, 0, None)
+        self.written.append(file.path)
         if requested:
-            emit(_LOG, logging.INFO, "record.began", f"recording to {self._file.path}")
+            emit(_LOG, logging.INFO, "record.began", f"recording to {file.path}")
 
     def _write(self, batch: list[can.Message]) -> None:
         file, state = self._file, self.state
@@ -235,10 +216,11 @@ class Recorder(Output):
         elif state.problem is not None:
             text = f"recording resumed; {lost} frames were lost"
             self._say(logging.WARNING, "record.resumed", text, lost)
-        if file.ends and (full := _full(file.path, file.written_bytes)):
-            emit(_LOG, logging.WARNING, "record.full", f"{file.path}: {full}")
+        if file.ends and file.written_bytes >= REQUESTED_BYTES:
+            end = f"ended at {REQUESTED_BYTES / 1e9:.1f} GB; record_keep_mb sets another limit"
+            emit(_LOG, logging.WARNING, "record.full", f"{file.path}: {end}")
             self._is_active = False
-            self._end(full)
+            self._end(end)
 
     def _end(self, problem: str | None = None) -> None:
         if self._file is None or self.state is None:
@@ -261,19 +243,16 @@ class Recorder(Output):
 class _File:
     """The file or the parts of one recording, written batch by batch."""
 
-    def __init__(
-        self, base: Path, limits: RecordLimits, clock: Callable[[], float], *, ends: bool
-    ) -> None:
+    ends = False
+    """Whether it ends by itself, at `REQUESTED_BYTES`."""
+
+    def __init__(self, base: Path, limits: RecordLimits, clock: Callable[[], float]) -> None:
         exists = base.is_file() and base.stat().st_size > 0
-        self._base = base
-        self._limits = limits
-        self._clock = clock
+        self._base, self._limits, self._clock = base, limits, clock
         self._is_packed = base.suffix.lower() == ".gz"
         self._in_parts = limits.in_parts or exists
         self._run = max((each.run for each in all_parts(base)), default=0) + 1
         self._part = 0
-        self.ends = ends
-        """Whether it ends by itself, at a size or where the disk is full."""
         self.path = run_path(base, self._run) if self._in_parts else base
         self.written_bytes = 0
         self._synced_s = clock()
@@ -282,11 +261,13 @@ class _File:
 
     def write(self, batch: list[can.Message]) -> None:
         """Append frames as whole lines, or nothing of them; may raise OSError."""
-        if self._is_over():
+        limits, now_s = self._limits, self._clock()
+        is_large = limits.part_bytes is not None and self._bytes >= limits.part_bytes
+        if is_large or (limits.part_s is not None and now_s - self._began_s >= limits.part_s):
             self._next_part()
-        if self._clock() - self._synced_s >= SYNC_EVERY_S:
-            self._synced_s = self._clock()
-            self._sync()
+        if now_s - self._synced_s >= SYNC_EVERY_S:
+            self._synced_s = now_s
+            os.fsync(self._descriptor)
         for message in batch:
             self._writer.on_message_received(message)
         self._append()
@@ -296,12 +277,6 @@ class _File:
         if self._descriptor >= 0:
             descriptor, self._descriptor = self._descriptor, -1
             os.close(descriptor)
-
-    def _is_over(self) -> bool:
-        limits = self._limits
-        return (limits.part_bytes is not None and self._bytes >= limits.part_bytes) or (
-            limits.part_s is not None and self._clock() - self._began_s >= limits.part_s
-        )
 
     def _next_part(self) -> None:
         self._remove_oldest()
@@ -339,15 +314,12 @@ class _File:
         self._bytes += len(data)
         self.written_bytes += len(data)
 
-    def _sync(self) -> None:
-        os.fsync(self._descriptor)
-
     def _remove_oldest(self) -> None:
         if self._limits.keep_bytes is None:
             return
-        parts = [(each.path, each.path.stat().st_size) for each in all_parts(self._base)]
-        total = sum(size for _, size in parts)
-        for path, size in parts:
+        sizes = {each.path: each.path.stat().st_size for each in all_parts(self._base)}
+        total = sum(sizes.values())
+        for path, size in sizes.items():
             if total <= self._limits.keep_bytes:
                 return
             path.unlink(missing_ok=True)
@@ -374,16 +346,3 @@ def _check_path(path: Path) -> None:
         cause = error.__cause__  # a full disk is retried while the service runs
         if not (isinstance(cause, OSError) and cause.errno in FULL):
             raise
-
-
-def _full(path: Path, written_bytes: int) -> str | None:
-    """Return the reason to end a recording that a viewer began: size or free space; else None."""
-    if written_bytes >= REQUESTED_BYTES:
-        return f"ended at {REQUESTED_BYTES / 1e9:.1f} GB; record_keep_mb sets another limit"
-    try:
-        free_bytes = shutil.disk_usage(path.parent).free
-    except OSError:  # reported by the recording itself
-        return None
-    if free_bytes < FREE_BYTES:
-        return f"less than {FREE_BYTES / 1e9:.1f} GB free on its disk; free some space"
-    return None

@@ -6,7 +6,7 @@ import logging
 import os
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from contextlib import ExitStack
 from functools import partial
 from importlib import import_module
@@ -27,7 +27,7 @@ from cangauge.service.output import Output
 from cangauge.service.pipeline import Pipeline
 from cangauge.service.record import Recorder, RecordLimits
 from cangauge.service.setup import Reloader, Setup, address_of
-from cangauge.service.state import StateKeeper, StateSettings, check_state_path, state_path
+from cangauge.service.state import StateKeeper, state_path
 from cangauge.service.status import PAGE_EVERY_S, SHOW_EVERY_S, Monitor
 from cangauge.service.status_client import StatusSocket, socket_path
 from cangauge.types import reason_names
@@ -61,8 +61,8 @@ class Service:
         The configuration in use, except for keys that need a restart.
     pipeline : Pipeline
         The estimator.
-    recorder : Recorder
-        The recording.
+    recorder : Recorder or None
+        The recording, while `run` runs.
     bus : str
         Interface and channel.
 
@@ -90,11 +90,9 @@ class Service:
             else partial(load_config, config, options)
         )
         self.config = loaded = self._read()
-        if loaded.output is not None:
-            _check_output(Path(loaded.output), Path(loaded.model))
-        self._state = _state_settings(loaded)
-        setup = Setup.of(loaded)
-        self._vehicle_key = setup.vehicle_key
+        self._state = state_path(loaded.state, os.environ)
+        _check_files(loaded, self._state)
+        self._setup = setup = Setup.of(loaded)
         self.pipeline = Pipeline(setup.vehicle, setup.model, setup.settings)
         self._address = address_of(loaded)
         self.bus = str(self._address)
@@ -134,13 +132,11 @@ class Service:
         config, pipeline = self.config, self.pipeline
         with ExitStack() as stack:
             # Signals first: the service may be stopped at any moment from now on.
-            signalled: Callable[[], bool] = self._stop.is_set
-            hung_up: Callable[[], bool] = self._reload.is_set
+            stopped, hung_up = self._stop.is_set, self._reload.is_set
             if threading.current_thread() is threading.main_thread():
-                signalled = stack.enter_context(stop_on_signals())
+                stopped = stack.enter_context(stop_on_signals())
                 hung_up = stack.enter_context(note_hangups())
-            state = None if self._state is None else self._state.path
-            for owned in (state, config.record, config.output):
+            for owned in (self._state, config.record, config.output):
                 if owned is not None:
                     stack.enter_context(sole_writer(owned))
             reloader = Reloader(self._read)
@@ -149,10 +145,10 @@ class Service:
             port.open(wait=config.wait_for_bus)
             keeper = None
             if self._state is not None:
-                keeper = stack.enter_context(StateKeeper(self._state, pipeline, port.name))
+                keeper = StateKeeper(self._state, pipeline, port.name, config.state_max_age_s)
+                stack.enter_context(keeper)
             self.recorder = recorder = Recorder(config.record, _record_limits(config))
-            notifier = Notifier.from_environment()
-            stack.callback(notifier.close)
+            notifier = stack.enter_context(Notifier(os.environ))
             monitor = Monitor(
                 pipeline,
                 port,
@@ -160,6 +156,7 @@ class Service:
                 notifier=notifier,
                 record=lambda: recorder.state,
                 show_every_s=SHOW_EVERY_S if config.dashboard is None else PAGE_EVERY_S,
+                sign_cure=self._setup.sign_cure,
             )
             self._outputs.insert(0, recorder)
             for output in self._outputs:
@@ -169,15 +166,9 @@ class Service:
                     self._outputs.append(import_module(module).make_output(self))
                     stack.callback(self._outputs[-1].close)
             _serve_status(config, monitor, stack)
-            emit(
-                _LOG,
-                logging.INFO,
-                "service.ready",
-                f"listening on {port.name}; time source: {config.time_source}; Ctrl-C ends",
-                bus=port.name,
-                vehicle=pipeline.vehicle.name,
-                model=config.model,
-            )
+            text = f"listening on {port.name}; time source: {config.time_source}; Ctrl-C ends"
+            about = {"bus": port.name, "vehicle": pipeline.vehicle.name, "model": config.model}
+            emit(_LOG, logging.INFO, "service.ready", text, **about)
             notifier.ready(f"listening on {port.name}")
             stack.callback(notifier.stopping)
             loop = Loop(
@@ -187,10 +178,10 @@ class Service:
                 outputs=self._outputs,
                 record=recorder,
                 monitor=monitor,
-                checkpoint=None if keeper is None else keeper.checkpoint,
+                checkpoint=(lambda: None) if keeper is None else keeper.checkpoint,
                 reload=lambda: self._poll_reload(reloader, monitor, wanted=hung_up()),
             )
-            summary = loop.run(lambda: signalled() or self._stop.is_set())
+            summary = loop.run(lambda: stopped() or self._stop.is_set())
         return self._end(port, summary)
 
     def reconfigure(self) -> LoopSettings | None:
@@ -206,42 +197,40 @@ class Service:
             Those of the new configuration; None if it is invalid, and the old one stays.
         """
         try:
-            return self._apply(Setup.of(self._read()))
+            new: Setup | CangaugeError = Setup.of(self._read())
         except CangaugeError as error:
-            _log_refusal(error)
-            return None
+            new = error
+        return self._use(new)[0]
 
-    def _apply(self, new: Setup) -> LoopSettings:
-        """Use another configuration as a whole; raise InputError if it does not fit."""
-        is_same = new.vehicle_key == self._vehicle_key
-        self.pipeline.reconfigure(None if is_same else new.vehicle, new.model, new.settings)
-        self._vehicle_key = new.vehicle_key
+    def _use(self, new: Setup | CangaugeError) -> tuple[LoopSettings | None, str | None]:
+        """Use another configuration as a whole, or log why not; return its settings, or that."""
+        try:
+            if isinstance(new, CangaugeError):
+                raise new
+            is_same = new.vehicle_key == self._setup.vehicle_key
+            self.pipeline.reconfigure(None if is_same else new.vehicle, new.model, new.settings)
+        except CangaugeError as error:
+            text = f"new configuration refused, the old one stays: {error}"
+            emit(_LOG, logging.WARNING, "config.refused", text)
+            return None, str(error)
         _log_changes(self.config, new.config)
-        self.config = new.config
-        return _loop_settings(new.config)
+        self._setup, self.config = new, new.config
+        return _loop_settings(new.config), None
 
     def _poll_reload(
         self, reloader: Reloader, monitor: Monitor, *, wanted: bool
     ) -> LoopSettings | None:
-        """Begin to read on request; apply what was read since the last call."""
+        """Begin to read on request; use what was read since the last call."""
         if wanted or self._reload.is_set():
             self._reload.clear()
             reloader.request()
             monitor.reload_begins()
-        result, settings = reloader.poll(), None
-        if result is None:
+        if (new := reloader.poll()) is None:
             return None
-        problem: CangaugeError | None = None
-        try:
-            if isinstance(result, CangaugeError):
-                raise result
-            settings = self._apply(result)
-            monitor.model = self.config.model
-        except CangaugeError as error:
-            problem = error
-            _log_refusal(error)
+        settings, problem = self._use(new)
+        monitor.model, monitor.sign_cure = self.config.model, self._setup.sign_cure
         if not reloader.is_reading:
-            monitor.reload_ends(None if problem is None else str(problem))
+            monitor.reload_ends(problem)
         return settings
 
     def _end(self, port: ReconnectingBus, summary: RunSummary) -> dict[str, Any]:
@@ -265,23 +254,18 @@ class Service:
         }
 
 
-def _check_output(output: Path, model: Path) -> None:
-    if output.resolve() == model.resolve():
-        raise InputError(
-            "this output is also an input", source=output, cure="name another file for it"
-        )
-    check_writable(output)
-
-
-def _state_settings(config: RunConfig) -> StateSettings | None:
-    path = state_path(config.state, os.environ)
-    if path is None:
-        return None
-    for other in (config.model, config.record, config.output, config.dbc, config.map):
-        if other is not None and os.path.realpath(other) == os.path.realpath(path):
-            raise InputError("is another file of this service", field="--state", value=other)
-    check_state_path(path)
-    return StateSettings(path, config.state_max_age_s)
+def _check_files(config: RunConfig, state: Path | None) -> None:
+    """Raise InputError if the table or the state is another file of the service."""
+    if config.output is not None:
+        if os.path.realpath(config.output) == os.path.realpath(config.model):
+            cure = "name another file for it"
+            raise InputError("this output is also an input", source=config.output, cure=cure)
+        check_writable(config.output)
+    if state is not None:
+        others = (config.model, config.record, config.output, config.dbc, config.map)
+        for other in filter(None, others):
+            if os.path.realpath(other) == os.path.realpath(state):
+                raise InputError("is another file of this service", field="--state", value=other)
 
 
 def _record_limits(config: RunConfig) -> RecordLimits:
@@ -318,23 +302,15 @@ def _serve_status(config: RunConfig, monitor: Monitor, stack: ExitStack) -> None
         emit(_LOG, logging.WARNING, "status.unavailable", f"no status socket: {error}")
 
 
-def _log_refusal(error: CangaugeError) -> None:
-    text = f"new configuration refused, the old one stays: {error}"
-    emit(_LOG, logging.WARNING, "config.refused", text)
-
-
 def _log_changes(old: RunConfig, new: RunConfig) -> None:
     before, after = old.model_dump(), new.model_dump()
-    changed = [name for name in after if after[name] != before[name]]
-    text = f"configuration reloaded; changed: {', '.join(changed) or 'no option'}"
+    changed = ", ".join(name for name in after if after[name] != before[name])
+    text = f"configuration reloaded; changed: {changed or 'no option'}"
     emit(_LOG, logging.INFO, "config.reloaded", text)
-    late = [
-        key.name
-        for key in config_keys()
-        if key.info.restart and _value(before, key.name) != _value(after, key.name)
-    ]
+    restarts = [key.name for key in config_keys() if key.info.restart]
+    late = ", ".join(name for name in restarts if _value(before, name) != _value(after, name))
     if late:
-        text = f"{', '.join(late)}: takes effect after a restart of the service"
+        text = f"{late}: takes effect after a restart of the service"
         emit(_LOG, logging.WARNING, "config.needs_restart", text)
 
 

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Self
 
+from cangauge._config import read_toml
 from cangauge.bus.mapping import Overrides
 from cangauge.bus.open import BusAddress, bus_address, is_interface_name
 from cangauge.bus.publish import FrameIds
@@ -21,21 +22,13 @@ from cangauge.model.model_file import Model
 from cangauge.service.config import DEFAULT_VEHICLE, RunConfig
 from cangauge.service.pipeline import PipelineSettings
 
-ReadConfig = Callable[[], RunConfig]
-
 
 @dataclass(frozen=True)
 class Setup:
     """A configuration with the files that it names.
 
-    Parameters
-    ----------
-    config : RunConfig
-    vehicle : Vehicle
-    model : Model
-    settings : PipelineSettings
-    vehicle_key : tuple
-        Identity of the vehicle: its options, and the content of its files.
+    `vehicle_key` is the identity of the vehicle: its options, and the content of its files.
+    `sign_cure` is what to change if the current has the wrong sign.
     """
 
     config: RunConfig
@@ -43,16 +36,11 @@ class Setup:
     model: Model
     settings: PipelineSettings
     vehicle_key: tuple[object, ...]
+    sign_cure: str
 
     @classmethod
     def of(cls, config: RunConfig) -> Self:
-        """Read the model and the vehicle of a configuration.
-
-        Raises
-        ------
-        InputError
-            If something is invalid.
-        """
+        """Read the model and the vehicle of a configuration; may raise InputError."""
         vehicle, model = load_vehicle(config), Model.load(config.model)
         _check_poll(config, vehicle)
         files = [*vehicle.dbc_files, *filter(None, [config.map])]
@@ -61,8 +49,8 @@ class Setup:
         except OSError as error:  # it disappeared meanwhile
             raise InputError(f"cannot be read: {error}", cure="try again") from error
         named = (config.vehicle, config.temperature, config.pair_within_s)
-        chosen = (*named, config.messages, config.rules, config.checks)
-        return cls(config, vehicle, model, pipeline_settings(config), (*chosen, *contents))
+        key = (*named, config.messages, config.rules, config.checks, *contents)
+        return cls(config, vehicle, model, pipeline_settings(config), key, _sign_cure(config))
 
 
 def load_vehicle(config: RunConfig) -> Vehicle:
@@ -129,18 +117,20 @@ def _check_poll(config: RunConfig, vehicle: Vehicle) -> None:
         raise InputError(problem, source=config.file, field="poll", cure=cure)
 
 
+def _sign_cure(config: RunConfig) -> str:
+    if config.map is None:
+        return "use the preset of this car, or a map file (`cangauge init` writes one)"
+    sign = -read_toml(config.map).get("current", {}).get("sign", 1)
+    return f"set sign = {sign} under [current] of {config.map}"
+
+
 class Reloader:
     """Read the configuration in a thread, once for each request, while the old one is in use.
 
     The thread waits from the start on: a request starts none, which could fail.
-
-    Parameters
-    ----------
-    read : callable
-        Returns the configuration.
     """
 
-    def __init__(self, read: ReadConfig) -> None:
+    def __init__(self, read: Callable[[], RunConfig]) -> None:
         self._read = read
         self._requests: queue.SimpleQueue[bool] = queue.SimpleQueue()
         self._results: queue.SimpleQueue[Setup | CangaugeError] = queue.SimpleQueue()

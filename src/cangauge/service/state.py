@@ -15,7 +15,6 @@ import math
 import os
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, Final, Self
@@ -50,56 +49,41 @@ _Name = Annotated[str, Field(max_length=_LONGEST_NAME)]
 
 
 class StateContent(BaseModel):
-    """Content of the file, without its hash."""
+    """Content of the file, without its hash.
+
+    `saved_s` is Unix time [s], `boot_id` the boot of the machine (None: unknown), `model` the hash
+    of the model's content; a bus is interface and channel.
+    """
 
     model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
 
     saved_s: Annotated[float, Field(allow_inf_nan=False, ge=-1e12, le=1e12)]
-    """Unix time of the state [s]."""
     boot_id: Annotated[str, Field(max_length=64)] | None
-    """Boot of the machine that it belongs to; None if unknown."""
     model: Annotated[str, Field(pattern="^[0-9a-f]{64}$")]
-    """Hash of the model's content."""
     model_name: _Name
     bus: _Name
-    """Interface and channel."""
     vehicle: _Name
     time_source: Annotated[str, Field(max_length=32)]
     estimator: EstimatorState
-
-
-@dataclass(frozen=True)
-class StateSettings:
-    """Where the state is saved.
-
-    Parameters
-    ----------
-    path : Path
-    max_age_s : float
-        Age above which a state is refused [s].
-    """
-
-    path: Path
-    max_age_s: float = 7.0 * 86400.0
 
 
 def state_path(given: str | None, environment: Mapping[str, str]) -> Path | None:
     """Return the path of the state file, if any; for a folder it is a file in it.
 
     The default is systemd's `StateDirectory=`, if there is one.
+
+    Raises
+    ------
+    InputError
+        If no state can be kept there. A state that is damaged or of another release, model or age
+        is set aside later. A file that is no state at all was named by mistake, and stays.
     """
     folder = environment.get("STATE_DIRECTORY", "").split(":")[0]
-    if given is None:
-        return Path(folder) / FILE_NAME if folder else None
-    return Path(given) / FILE_NAME if os.path.isdir(given) else Path(given)  # noqa: PTH112 - never raises
-
-
-def check_state_path(path: Path) -> None:
-    """Raise InputError if the state cannot be kept at `path`, before anything is changed.
-
-    A state that is damaged or of another release, model or age is set aside later. What is no
-    state at all was named by mistake: it is neither moved nor replaced.
-    """
+    if not (given or folder):
+        return None
+    path = Path(given or folder)
+    if given is None or os.path.isdir(path):  # noqa: PTH112 - never raises
+        path /= FILE_NAME
     if not path.parent.is_dir():
         raise InputError(
             "the folder of this file does not exist",
@@ -107,43 +91,38 @@ def check_state_path(path: Path) -> None:
             field="state",
             cure="create it or name another one",
         )
-    if not path.exists():
-        return
-    with open_regular(path) as file:
-        beginning = file.read(64)
-    if beginning and b'"format": "' + STATE_FORMAT.encode() not in beginning:
-        raise InputError(
-            "not a cangauge state file, so it is not replaced",
-            source=path,
-            field="state",
-            cure="name a new file, or a folder",
-        )
+    if path.exists():
+        with open_regular(path) as file:
+            beginning = file.read(64)
+        if beginning and b'"format": "' + STATE_FORMAT.encode() not in beginning:
+            raise InputError(
+                "not a cangauge state file, so it is not replaced",
+                source=path,
+                field="state",
+                cure="name a new file, or a folder",
+            )
+    return path
 
 
 class StateKeeper:
     """Restore the state at the start, save it on request and at the end; use it in a `with` block.
 
-    Parameters
-    ----------
-    settings : StateSettings
-    pipeline : Pipeline
-    bus : str
-        Interface and channel: the state of another bus is refused.
-    wall_s : callable
-        Unix time [s].
+    The state of another bus (interface and channel), or one older than `max_age_s` [s], is refused.
+    `wall_s` gives Unix time [s]; `restored` is whether the estimator continued from the file.
     """
 
     def __init__(
         self,
-        settings: StateSettings,
+        path: Path,
         pipeline: Pipeline,
-        bus: str = "",
-        *,
+        bus: str,
+        max_age_s: float,
         wall_s: Callable[[], float] = time.time,
     ) -> None:
-        self.settings = settings
+        self._path = path
         self._bus = bus[:_LONGEST_NAME]
         self._pipeline = pipeline
+        self._max_age_s = max_age_s
         self._wall_s = wall_s
         self._boot_id = _boot_id()
         self._worker = Worker("cangauge-state", self._failed, jobs_at_most=3)
@@ -151,16 +130,31 @@ class StateKeeper:
         self._samples_kept = 0
         self._restored_pct: float | None = None
         self.restored = False
-        """True if the estimator continued from the file."""
 
     def __enter__(self) -> Self:
-        self._restore()
+        try:
+            content = read_state(self._path)
+            age_s = self._age_s(content)
+            latest = self._pipeline.restore(content.estimator, age_s)
+        except FileNotFoundError:
+            text = f"{self._path}: no saved state; starting without one"
+            emit(_LOG, logging.INFO, "state.none", text)
+            return self
+        except InputError as error:
+            self._set_aside(error)
+            return self
+        self.restored = True
+        self._restored_pct = latest.soc_pct
+        ago = "of unknown age" if math.isnan(age_s) else f"saved {duration(age_s)} ago"
+        soc = f"{number(latest.soc_pct, 2)} ± {number(latest.soc_std_pct, 2, '%')}"
+        text = f"{self._path}: continuing from a state {ago}: SoC {soc}"
+        emit(_LOG, logging.INFO, "state.restored", text)
         return self
 
     def __exit__(self, *_: object) -> None:
         self.checkpoint()
         if not self._worker.close(CLOSE_WITHIN_S):
-            text = f"{self.settings.path}: the last state was not written in time"
+            text = f"{self._path}: the last state was not written in time"
             emit(_LOG, logging.WARNING, "state.failed", text)
 
     def checkpoint(self) -> None:
@@ -182,38 +176,15 @@ class StateKeeper:
         if self._worker.submit(partial(self._write, content)):
             self._samples_kept = pipeline.samples
 
-    def flush(self, within_s: float) -> bool:
-        """Wait until the state is written; return False if that takes longer [s]."""
-        return self._worker.flush(within_s)
-
     def _model_hash(self) -> str:
         model = self._pipeline.model
         if model is not self._hashed[0]:  # the configuration was reloaded
             self._hashed = (model, text_sha256(model.to_json()))
         return self._hashed[1]
 
-    def _restore(self) -> None:
-        path = self.settings.path
-        try:
-            content = read_state(path)
-            age_s = self._age_s(content)
-            latest = self._pipeline.restore(content.estimator, age_s)
-        except FileNotFoundError:
-            emit(_LOG, logging.INFO, "state.none", f"{path}: no saved state; starting without one")
-            return
-        except InputError as error:
-            self._set_aside(error)
-            return
-        self.restored = True
-        self._restored_pct = latest.soc_pct
-        ago = "of unknown age" if math.isnan(age_s) else f"saved {duration(age_s)} ago"
-        soc = f"{number(latest.soc_pct, 2)} ± {number(latest.soc_std_pct, 2, '%')}"
-        text = f"{path}: continuing from a state {ago}: SoC {soc}"
-        emit(_LOG, logging.INFO, "state.restored", text)
-
     def _age_s(self, content: StateContent) -> float:
-        """Return the least age of a state that may be used [s]; NaN if it is unknown."""
-        pipeline, path = self._pipeline, self.settings.path
+        """Return the age of a state that may be used [s]; NaN: unknown. Else raise InputError."""
+        pipeline, path = self._pipeline, self._path
         now = {
             "model": (self._model_hash(), content.model_name),
             "vehicle": (pipeline.vehicle.name[:_LONGEST_NAME], content.vehicle),
@@ -228,7 +199,7 @@ class StateKeeper:
             raise InputError("has no SoC", source=path, field="estimator")
         if content.time_source == "replay-clock":
             return 0.0
-        age_s, limit_s = self._wall_s() - content.saved_s, self.settings.max_age_s
+        age_s, limit_s = self._wall_s() - content.saved_s, self._max_age_s
         if age_s > limit_s:
             text = f"{age_s / 3600.0:.1f} h old, more than the limit of {limit_s / 3600.0:g} h"
             raise InputError(text, source=path)
@@ -237,10 +208,9 @@ class StateKeeper:
         return max(age_s, REBOOT_S if content.boot_id != self._boot_id else 0.0)
 
     def _set_aside(self, error: InputError) -> None:
-        path = self.settings.path
-        aside = path.with_name(f"{path.name}.refused")
+        aside = self._path.with_name(f"{self._path.name}.refused")
         try:
-            path.replace(aside)
+            self._path.replace(aside)
             kept = f"; kept as {aside.name}"
         except OSError as problem:
             kept = f" (and cannot be renamed: {problem.strerror})"
@@ -255,7 +225,7 @@ class StateKeeper:
 
     def _write(self, content: StateContent) -> None:
         """Replace the file atomically; a power cut leaves the old one or the new one."""
-        path = Path(os.path.realpath(self.settings.path))
+        path = Path(os.path.realpath(self._path))
         # The same name each time: what a killed service left is overwritten.
         part = path.with_name(f".{path.name}.part")
         flags = os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC
@@ -274,14 +244,14 @@ class StateKeeper:
         latest = self._pipeline.latest
         soc = f"{number(latest.soc_pct, 1)} ± {number(latest.soc_std_pct, 1, '%')}"
         words = {
-            "parked": f"the voltage confirms the restored SoC; now {soc}",
-            "moved": f"the voltage refutes the restored SoC of {before:.1f} %; now {soc}",
+            "parked": "the voltage confirms the restored SoC",
+            "moved": f"the voltage refutes the restored SoC of {before:.1f} %",
         }
-        text = words.get(verdict, f"restored SoC and voltage are combined; now {soc}")
-        emit(_LOG, logging.INFO, "state.judged", text)
+        text = words.get(verdict, "restored SoC and voltage are combined")
+        emit(_LOG, logging.INFO, "state.judged", f"{text}; now {soc}")
 
     def _failed(self, error: Exception) -> None:
-        text = f"state not written: {self.settings.path}: {error}"
+        text = f"state not written: {self._path}: {error}"
         emit(_LOG, logging.WARNING, "state.failed", text)
 
 

@@ -44,7 +44,7 @@ REPORT_EVERY_S: Final = 1.0
 BUS_COUNTS: Final = ("garbled", "error_frames", "unsent", "queue_drops", "losses", "foreign")
 """Counts of a bus to report, where it has them."""
 
-_OF_VALUES: Final = frozenset({"not_available", "implausible", "stuck", "held_back"})
+_OF_VALUES: Final = {"not_available", "implausible", "stuck", "held_back"}
 """Reasons that concern values, not whole frames."""
 _REJECTS: Final = tuple(
     each.name
@@ -60,18 +60,10 @@ BOUNDS_S: Final = (
 
 @dataclass(frozen=True, slots=True)
 class RecordState:
-    """Progress of a recording.
+    """Progress of a recording: its current file; frames, and those of them that were not written.
 
-    Parameters
-    ----------
-    path : str
-        The current file.
-    frames, lost_frames, written_bytes : int
-        Frames recorded, frames of these that could not be written, bytes written.
-    problem : str or None
-        Why the disk rejects data at present, or why the recording could not begin.
-    active : bool
-        False once it has ended.
+    `problem` is why the disk rejects data at present, or why the recording could not begin or has
+    ended; it is not active once it has ended.
     """
 
     path: str
@@ -84,15 +76,7 @@ class RecordState:
 
 @dataclass(frozen=True, slots=True)
 class Snapshot:
-    """The state of the service at one moment.
-
-    Parameters
-    ----------
-    made_s : float
-        Monotonic time [s].
-    status : dict
-        The object of `/status` at that time: finite numbers, text and None.
-    """
+    """The object of `/status` (finite numbers, text and None) at a monotonic time [s]."""
 
     made_s: float
     status: dict[str, Any]
@@ -155,26 +139,9 @@ class Histogram:
 class Monitor:
     """Collect counts in the receive loop; its methods are for the loop's thread.
 
-    Parameters
-    ----------
-    pipeline : Pipeline
-    port : BusConnection
-    model : str
-        Name of the model's file.
-    notifier : Notifier, optional
-    record : callable, optional
-        Returns the state of the recording, if any.
-    clock : callable
-        Monotonic time [s].
-    show_every_s : float
-        Interval of the snapshots [s].
-
-    Attributes
-    ----------
-    model : str
-        Replaced when the configuration changes.
-    latest : Snapshot
-        Immutable, hence readable from any thread.
+    `latest` is immutable, hence readable from any thread. `model` (name of the file) and
+    `sign_cure` (what to change if the current has the wrong sign) follow the configuration.
+    `record` returns the state of the recording, `clock` monotonic time [s].
     """
 
     def __init__(
@@ -187,8 +154,9 @@ class Monitor:
         record: Callable[[], RecordState | None] = lambda: None,
         clock: Callable[[], float] = time.monotonic,
         show_every_s: float = SHOW_EVERY_S,
+        sign_cure: str = "set the other sign under [current] of the map file",
     ) -> None:
-        self.model = model
+        self.model, self.sign_cure = model, sign_cure
         self._pipeline = pipeline
         self._port = port
         self._notifier = notifier or Notifier()
@@ -205,20 +173,14 @@ class Monitor:
         self._status: Status | None = None
         self._config: dict[str, Any] = {"reloading": False, "problem": None}
         self._report: Mapping[str, Any] = NO_REPORT
-        self._had_notices = False
+        self._notices: dict[str, str] = {}
         self.latest = Snapshot(now_s, self._object(now_s))
 
     def stepped(self, stamp_s: float, step_s: float, came_s: float) -> None:
-        """Count a step of the estimator.
+        """Count a step of the estimator, of `step_s` [s].
 
-        Parameters
-        ----------
-        stamp_s : float
-            Receive stamp of the frame that completed the sample, seconds since 1970.
-        step_s : float
-            Processing time of the sample [s].
-        came_s : float
-            Monotonic time at which that frame was received [s].
+        The frame that completed the sample has the stamp `stamp_s` (seconds since 1970), and was
+        received at the monotonic time `came_s` [s].
         """
         self._sample_s = came_s
         self._unsent_stamp_s = stamp_s
@@ -302,6 +264,7 @@ class Monitor:
             else {"age_s": now_s - self._sample_s if self._sample_s > -math.inf else None}
             | _finite(sample, "current_a", "voltage_v", "temperature_c"),
             **self._report,
+            "notices": list(self._find_notices().values()),
             "samples": samples,
             "samples_per_s": self._rate,
             "frames": {
@@ -329,12 +292,22 @@ class Monitor:
         status = estimate.status.name.lower() + (f" ({why})" if why else "")
         return f"{soc}, {status}, {self._rate:.1f} samples/s"
 
+    def _find_notices(self) -> dict[str, str]:
+        """Return what the user should look after, by event: one sentence each."""
+        found = {"cells.sum_differs": " ".join(self._report["notices"])}
+        if evidence := self._pipeline.sign.evidence:
+            found["sign.suspect"] = (
+                f"the current has the wrong sign: {evidence}; the SoC is wrong. Positive current"
+                f" must discharge: {self.sign_cure}"
+            )
+        return {event: text for event, text in found.items() if text}
+
     def _log_changes(self, estimate: Estimate) -> None:
         """Log a change of the status, and notices once when they appear."""
-        notices = self._report["notices"]
-        for notice in [] if self._had_notices else notices:
-            emit(_LOG, logging.WARNING, "cells.sum_differs", notice)
-        self._had_notices = bool(notices)
+        notices = self._find_notices()
+        for event in notices.keys() - self._notices.keys():
+            emit(_LOG, logging.WARNING, event, notices[event])
+        self._notices = notices
         if estimate.status is self._status:
             return
         before, self._status = self._status, estimate.status

@@ -16,19 +16,20 @@ import stat
 import threading
 import time
 from collections.abc import Callable
-from contextlib import suppress
+from contextlib import closing, suppress
 from pathlib import Path
 from typing import Any, Final, cast
 from urllib.parse import urlsplit
 
+from cangauge._files import read_bounded
 from cangauge._logging import emit
 from cangauge.errors import CangaugeError, InputError
-from cangauge.service.addresses import read_token
 
 SCHEMA: Final = 1
 """Version of the JSON object of `/status`. Defined here, so that a client need not import the
 estimator."""
 ANSWER_WITHIN_S: Final = 3.0
+"""Longest wait for a part of the answer [s]."""
 LARGEST_ANSWER: Final = 1 << 20
 SEND_WITHIN_S: Final = 0.5
 """Longest wait for a client that does not read [s]; the next one waits as long."""
@@ -59,19 +60,10 @@ def socket_path(bus: str) -> Path:
 
 
 class StatusSocket:
-    """Answer each connection with the status, from a thread; use it in a `with` block.
+    """Answer each connection with the JSON object that `status` returns, in a thread.
 
-    Parameters
-    ----------
-    path : Path
-        A socket that nobody serves is replaced.
-    status : callable
-        Returns the JSON object of `/status`.
-
-    Raises
-    ------
-    InputError
-        If another service uses it, another file has this name, or it cannot be created.
+    A socket that nobody serves is replaced. InputError if another service uses it, another file
+    has this name, or it cannot be created.
     """
 
     def __init__(self, path: Path, status: Callable[[], dict[str, Any]]) -> None:
@@ -108,14 +100,13 @@ class StatusSocket:
         self._path.unlink(missing_ok=True)
 
     def _serve(self) -> None:
-        while True:
+        while not self._is_closed:
             try:
                 connection, _ = self._socket.accept()
-            except OSError as error:
-                if self._is_closed:
-                    return
-                emit(_LOG, logging.WARNING, "status.failed", f"no connection accepted: {error}")
-                time.sleep(SEND_WITHIN_S)
+            except OSError as error:  # out of descriptors, or closed
+                if not self._is_closed:
+                    emit(_LOG, logging.WARNING, "status.failed", f"no connection accepted: {error}")
+                    time.sleep(SEND_WITHIN_S)
                 continue
             with connection, suppress(OSError):
                 connection.settimeout(SEND_WITHIN_S)
@@ -138,15 +129,7 @@ def is_served(path: Path) -> bool:
 
 
 def find_socket() -> Path:
-    """Return the unix socket of the running service.
-
-    Raises
-    ------
-    NotRunningError
-        If no service runs.
-    InputError
-        If several services run.
-    """
+    """Return the socket of the running service; NotRunningError: none, InputError: several."""
     found: list[Path] = []
     with suppress(OSError):  # a folder that this user may not read
         for folder in (*runtime_folders(), SYSTEM_FOLDER, *SYSTEM_FOLDER.glob("*")):
@@ -186,13 +169,11 @@ def fetch_status(endpoint: str, token_file: Path | None = None) -> dict[str, Any
         If the request is refused, or the answer is not a status.
     """
     try:
-        if "://" in endpoint:
-            body = _get(endpoint, read_token(token_file, os.environ))
-        else:
-            body = _read(endpoint)
+        body = _get(endpoint, token_file) if "://" in endpoint else _read(endpoint)
     except (OSError, http.client.HTTPException) as error:
         reason = getattr(error, "strerror", None) or str(error) or type(error).__name__
-        raise NotRunningError(f"{endpoint}: no service answers: {reason}") from error
+        text = f"{endpoint}: no service answers: {reason}"
+        raise NotRunningError(text) from error
     try:
         content = json.loads(body)
     except (ValueError, RecursionError):
@@ -204,46 +185,35 @@ def fetch_status(endpoint: str, token_file: Path | None = None) -> dict[str, Any
 
 
 def _read(path: str) -> bytes:
-    until_s = time.monotonic() + ANSWER_WITHIN_S
     answer = b""
     with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as connection:
         connection.settimeout(ANSWER_WITHIN_S)
         connection.connect(path)
         while len(answer) < LARGEST_ANSWER and (part := connection.recv(1 << 16)):
             answer += part
-            connection.settimeout(max(until_s - time.monotonic(), 1e-3))
     return answer
 
 
-def _get(endpoint: str, token: str | None) -> bytes:
+def _get(endpoint: str, token_file: Path | None) -> bytes:
+    token = os.environ.get("CANGAUGE_HTTP_TOKEN")
+    if token_file is not None:
+        token = read_bounded(token_file, 1024, "a token").decode("ascii", "replace").strip()
+    headers = {} if token is None else {"Authorization": f"Bearer {token}"}
     try:
         parts = urlsplit(endpoint)
-        host, port = parts.hostname, parts.port
-    except ValueError:
-        host = port = None
-    if host is None or parts.scheme not in {"http", "https"}:
+        kind = {"http": http.client.HTTPConnection, "https": http.client.HTTPSConnection}
+        connection = kind[parts.scheme](str(parts.hostname), parts.port, timeout=ANSWER_WITHIN_S)
+    except (KeyError, ValueError) as error:
         raise InputError(
             "neither the path of a unix socket nor a URL",
             field="--endpoint",
             value=endpoint,
             cure="write it as http://127.0.0.1:9464",
-        )
-    kind = http.client.HTTPSConnection if parts.scheme == "https" else http.client.HTTPConnection
-    connection = kind(host, port, timeout=ANSWER_WITHIN_S)
-    headers = {} if token is None else {"Authorization": f"Bearer {token}"}
-    timer: threading.Timer | None = None
-    try:
-        connection.connect()
-        # The time-out of the socket is one of each read: a server could answer byte by byte.
-        timer = threading.Timer(ANSWER_WITHIN_S, connection.sock.shutdown, (socket.SHUT_RDWR,))
-        timer.start()
+        ) from error
+    with closing(connection):
         connection.request("GET", "/status", headers=headers)
         response = connection.getresponse()
-        body = response.read(LARGEST_ANSWER)
-    finally:
-        if timer is not None:
-            timer.cancel()
-        connection.close()
+        body: bytes = response.read(LARGEST_ANSWER)
     if response.status != http.client.OK:
         answer = " ".join(body[:200].decode("utf-8", "replace").split())
         raise CangaugeError(f"{endpoint}: refused ({response.status}): {answer}")

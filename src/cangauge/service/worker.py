@@ -10,7 +10,7 @@ Job = Callable[[], None]
 
 
 class Worker:
-    """A daemon thread that runs jobs in order; it is started here, never by `submit`.
+    """A daemon thread that runs jobs in order.
 
     Parameters
     ----------
@@ -35,11 +35,6 @@ class Worker:
         except queue.Full:
             return False
         return True
-
-    def flush(self, within_s: float) -> bool:
-        """Wait until the jobs so far are done; return False if that takes longer [s]."""
-        done = threading.Event()
-        return self.submit(done.set) and done.wait(within_s)
 
     def close(self, within_s: float) -> bool:
         """Run the jobs that wait and end the thread; return False if that takes longer [s]."""

@@ -14,10 +14,10 @@ from cangauge.bus.captures import is_capture, open_capture
 from cangauge.bus.database import load_dbc
 from cangauge.bus.vehicle import Vehicle
 from cangauge.errors import InputError
+from cangauge.extras.live.addresses import read_token
 from cangauge.extras.validation.twin.drive import read_speed
 from cangauge.logs.read import read_log
 from cangauge.model.model_file import Model
-from cangauge.service.addresses import read_token
 from cangauge.service.config import load_config
 
 READERS: dict[str, Callable[[Path], object]] = {

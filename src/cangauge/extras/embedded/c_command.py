@@ -8,8 +8,24 @@ from typing import Annotated
 
 import typer
 
-from cangauge.cli.options import JsonOption, check_outputs, folder_to_write
+from cangauge._files import check_writable
+from cangauge.cli.options import JsonOption, check_outputs
 from cangauge.cli.output import emit_json, note
+from cangauge.errors import InputError
+
+
+def _folder(param: typer.CallbackParam, folder: Path) -> Path:
+    """Refuse, before any long work, a folder that is a file or cannot be made."""
+    if not os.path.isdir(folder):  # noqa: PTH112 - False, not an error, for a name too long
+        if os.path.exists(folder):  # noqa: PTH110 - likewise
+            raise InputError(
+                "is a file", field=param.opts[-1], value=str(folder), cure="name a folder"
+            )
+        made = folder
+        while not os.path.exists(made.parent):  # noqa: PTH110 - likewise
+            made = made.parent
+        check_writable(made)
+    return folder
 
 
 def export_c_command(
@@ -20,7 +36,7 @@ def export_c_command(
             "-o",
             "--output",
             metavar="DIR",
-            callback=folder_to_write,
+            callback=_folder,
             help="Folder for the sources: empty, of an earlier export, or made.",
         ),
     ],

@@ -26,7 +26,7 @@ from cangauge.model.model_file import Model
 from cangauge.service.offline import (
     PackHistory,
     RecordedEstimate,
-    estimate_recorded_capture,
+    estimate_capture,
     estimate_recorded_log,
     require_same_pack,
 )
@@ -173,7 +173,7 @@ class EstimateJob(LogJob):
         with local_file(log.url) as path:
             is_log = isinstance(self.options.open(path), LogFile)
             if not is_log and self.options.vehicle is not None:
-                done = estimate_recorded_capture(path, self.options.vehicle, self.model, settings)
+                done = estimate_capture(path, self.options.vehicle, self.model, settings)
                 require_same_pack(done.recorded, self.model)
                 return done
             recorded = self.options.read(replace(log, initial_soc_pct=None), path)

@@ -24,7 +24,7 @@ from tornado.web import Application, RequestHandler
 
 from cangauge._logging import emit
 from cangauge.errors import InputError
-from cangauge.service.addresses import HttpAddress, http_address, is_loopback_name
+from cangauge.extras.live.addresses import HttpAddress, http_address, is_loopback_name
 from cangauge.service.output import Output
 from cangauge.service.status import Snapshot
 

@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING, Final
 
 from cangauge._logging import emit
 from cangauge.errors import InputError
+from cangauge.extras.live.addresses import HttpAddress, http_address
 from cangauge.extras.live.http import open_tcp
-from cangauge.service.addresses import HttpAddress, http_address
 from cangauge.service.output import Output
 from cangauge.service.status import Snapshot
 

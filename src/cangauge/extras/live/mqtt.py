@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Any, Final
 from cangauge._logging import emit
 from cangauge._version import __version__
 from cangauge.errors import InputError
-from cangauge.service.addresses import is_loopback_name, read_mqtt_password
+from cangauge.extras.live.addresses import is_loopback_name, read_mqtt_password
 from cangauge.service.output import Output
 from cangauge.service.status import Snapshot
 from cangauge.types import Status

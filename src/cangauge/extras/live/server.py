@@ -32,6 +32,7 @@ from tornado.web import Application, RequestHandler
 from tornado.websocket import WebSocketClosedError, WebSocketHandler
 
 from cangauge._typing import FloatArray
+from cangauge.extras.live.addresses import is_loopback_name
 from cangauge.extras.live.charts import CHARTS, STATUS_COLOURS, STATUS_NAMES, chart_parts
 from cangauge.extras.live.history import (
     COLUMNS,
@@ -43,7 +44,6 @@ from cangauge.extras.live.history import (
     shown_columns,
 )
 from cangauge.extras.live.http import MAX_BODY_BYTES, MAX_HEADER_BYTES, has_token
-from cangauge.service.addresses import is_loopback_name
 
 COOKIE: Final = "cangauge"
 IDLE_S: Final = 30.0

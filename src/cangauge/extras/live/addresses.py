@@ -75,31 +75,6 @@ def http_address(
         If the address is invalid, the token cannot be read or is too short, or the address is
         not loopback and there is no token.
     """
-    host, port = _host_and_port(text, field)
-    token = read_token(token_file, os.environ if environment is None else environment)
-    if token is None and not is_loopback_name(host):
-        raise InputError(
-            "this address is reachable from the network, and there is no token",
-            field=field,
-            value=text,
-            cure=f"put a token into a file for http_token_file or into {TOKEN_VARIABLE},"
-            f" or listen on {LOOPBACK}:{port}",
-        )
-    return HttpAddress(host, port, token)
-
-
-def is_loopback_name(host: str) -> bool:
-    """Return whether a host is this machine's loopback: "localhost", 127.…, ::1."""
-    host = host.removeprefix("[").removesuffix("]").lower()
-    if host == "localhost":
-        return True
-    try:
-        return ipaddress.ip_address(host).is_loopback
-    except ValueError:
-        return False
-
-
-def _host_and_port(text: str, field: str) -> tuple[str, int]:
     host, colon, port = text.strip().rpartition(":")
     host = host.removeprefix("[").removesuffix("]") if colon else LOOPBACK
     try:
@@ -115,7 +90,25 @@ def _host_and_port(text: str, field: str) -> tuple[str, int]:
             value=text,
             cure=f"write it as {LOOPBACK}:9464",
         )
-    return host, number
+    token = read_token(token_file, os.environ if environment is None else environment)
+    if token is None and not is_loopback_name(host):
+        raise InputError(
+            "this address is reachable from the network, and there is no token",
+            field=field,
+            value=text,
+            cure=f"put a token into a file for http_token_file or into {TOKEN_VARIABLE},"
+            f" or listen on {LOOPBACK}:{number}",
+        )
+    return HttpAddress(host, number, token)
+
+
+def is_loopback_name(host: str) -> bool:
+    """Return whether a host is this machine's loopback: "localhost", 127.…, ::1."""
+    host = host.removeprefix("[").removesuffix("]").lower()
+    try:
+        return host == "localhost" or ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return False
 
 
 def read_token(path: str | PathLike[str] | None, environment: Mapping[str, str]) -> str | None:

@@ -1,0 +1,122 @@
+"""A current with the wrong sign is found while the service runs, with the line to change."""
+
+from __future__ import annotations
+
+import threading
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from cangauge._resources import shared_file
+from cangauge.bus.encoder import FrameEncoder
+from cangauge.bus.publish import SocEstimate, SocReader
+from cangauge.bus.vehicle import Vehicle
+from cangauge.estimation.offline import samples_of
+from cangauge.logs.log import Log
+from cangauge.replay.player import ReplaySettings, play
+from cangauge.replay.steps import LogSource
+from cangauge.service.pipeline import Pipeline
+from cangauge.service.run import Service
+from cangauge.service.status import Monitor
+from cangauge.types import Reason, Status
+from live import LoggedLines, leaf_model, leaf_model_path, never, short_log, virtual_port
+
+MAP = """dbc = ["pack.dbc"]
+name = "car"
+[current]
+signal = "current_a"
+sign = {sign}
+[voltage]
+signal = "voltage_v"
+[temperature]
+signal = "temperature_c"
+"""
+
+
+def inverted(log: Log) -> Log:
+    return replace(log, current_a=-log.current_a)
+
+
+def driven(log: Log) -> Pipeline:
+    pipeline = Pipeline(Vehicle.load("generic"), leaf_model())
+    encoder = FrameEncoder(pipeline.vehicle)
+    for sample in samples_of(log):
+        for frame in encoder.encode(sample):
+            frame.timestamp = 1.7e9 + sample.time_s
+            pipeline.handle(frame)
+    return pipeline
+
+
+def test_an_inverted_drive_through_the_service(tmp_path: Path) -> None:
+    (tmp_path / "pack.dbc").write_bytes(shared_file("dbc", "generic_pack.dbc").read_bytes())
+    (tmp_path / "car.toml").write_text(MAP.format(sign=-1))
+    config = tmp_path / "run.toml"
+    config.write_text(
+        f'model = "{leaf_model_path()}"\nmap = "car.toml"\ninterface = "virtual"\nchannel = "sign"'
+        '\ntime_source = "replay-clock"\nstatus_socket = "off"\ninitial_soc = 80\n'
+    )
+    found: dict[str, Any] = {}
+    with LoggedLines() as logged, virtual_port("sign") as port:
+        service = Service(config)
+        running = threading.Thread(target=lambda: found.update(service.run()))
+        running.start()
+        source = LogSource(short_log(600.0, rate_hz=2.0), Vehicle.load("generic"))
+        state = play(port, source, ReplaySettings(speed=float("inf")), stop=never)
+        monitor = Monitor(service.pipeline, port, sign_cure=service._setup.sign_cure)
+        service.stop()
+        running.join(30.0)
+        logged.release_all()
+    # JSON of the end, the status, the log, and the frame on the bus.
+    assert found["estimate"]["status"] == "invalid"
+    assert "sign suspect" in found["estimate"]["reasons"]
+    status = monitor.latest.status
+    assert (status["status"], "sign_suspect" in status["reasons"]) == ("invalid", True)
+    [notice] = status["notices"]
+    assert notice.endswith(f"set sign = 1 under [current] of {tmp_path / 'car.toml'}")
+    assert any("the current has the wrong sign" in line for line in logged.lines)
+    assert state.soc is not None
+    assert state.soc.status is Status.INVALID
+    assert state.soc.reasons & Reason.IMPLAUSIBLE_INPUT
+
+
+def test_the_bits_of_the_frame_do_not_move() -> None:
+    pipeline = driven(inverted(short_log(700.0, rate_hz=2.0)))
+    assert pipeline.latest.reasons & Reason.SIGN_SUSPECT
+    assert not pipeline.latest.reasons & Reason.IMPLAUSIBLE_INPUT
+    content = SocReader().read(pipeline.heartbeat(is_stale=False)[0])
+    assert isinstance(content, SocEstimate)
+    assert content.status is Status.INVALID
+    expected = pipeline.published.reasons & ~Reason.SIGN_SUSPECT | Reason.IMPLAUSIBLE_INPUT
+    assert content.reasons == expected
+
+
+def test_a_right_sign_and_few_steps_prove_nothing() -> None:
+    assert not driven(short_log(700.0, rate_hz=2.0)).sign.evidence
+    few = inverted(short_log(1200.0, rate_hz=1.0))
+    # 20 levels of a minute: their steps agree, but could by chance.
+    level_a = np.repeat(few.current_a[::60], 60)
+    steady = replace(few, current_a=level_a, voltage_v=380.0 + 0.1 * level_a)
+    assert not driven(steady).sign.evidence
+
+
+def test_the_suspicion_ends_once_the_data_prove_the_sign() -> None:
+    pipeline = driven(inverted(short_log(700.0, rate_hz=2.0)))
+    assert pipeline.sign.evidence
+    right = short_log(2400.0, rate_hz=1.0)
+    for sample in samples_of(right):
+        pipeline.sign.add(sample._replace(time_s=2e9 + sample.time_s))
+    assert not pipeline.sign.evidence
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+def test_the_cure_names_the_line_of_the_map(tmp_path: Path, sign: int) -> None:
+    (tmp_path / "pack.dbc").write_bytes(shared_file("dbc", "generic_pack.dbc").read_bytes())
+    (tmp_path / "car.toml").write_text(MAP.format(sign=sign))
+    options = {"interface": "virtual", "channel": "x", "status_socket": "off"}
+    service = Service(model=str(leaf_model_path()), map=str(tmp_path / "car.toml"), **options)
+    assert service._setup.sign_cure.startswith(f"set sign = {-sign} under [current] of ")
+    preset = Service(model=str(leaf_model_path()), **options)
+    assert preset._setup.sign_cure.startswith("use the preset of this car")
