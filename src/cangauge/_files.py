@@ -48,6 +48,13 @@ _SUFFIXES: Final = frozenset(
 )  # fmt: skip
 
 
+def as_path(path: object) -> Path:
+    """Return a path; raise InputError if the object is none."""
+    if isinstance(path, str | os.PathLike):
+        return Path(os.fspath(path))
+    raise InputError("not a path", value=type(path).__name__, cure="give the path of a file")
+
+
 def open_regular(path: str | PathLike[str]) -> BinaryIO:
     """Open a file for reading.
 
@@ -56,7 +63,7 @@ def open_regular(path: str | PathLike[str]) -> BinaryIO:
     InputError
         If it is absent, no regular file, or cannot be read.
     """
-    path = Path(path)
+    path = as_path(path)
     try:
         mode = path.stat().st_mode
         if stat.S_ISDIR(mode):
