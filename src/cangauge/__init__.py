@@ -89,6 +89,8 @@ _PLACES: Final = {
     "simulate": "extras.validation",
 }
 """Module of each public name, and the name there where it differs."""
+_FUNCTIONS: Final = ("diagnose", "estimate", "fit", "read_log", "simulate")
+"""Functions whose errors name arguments where those of a command name options."""
 
 
 def __getattr__(name: str) -> Any:
@@ -96,7 +98,10 @@ def __getattr__(name: str) -> Any:
     if place is None:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     module, _, own = place.partition(":")
-    return getattr(import_module(f"{__name__}.{module}"), own or name)
+    found = getattr(import_module(f"{__name__}.{module}"), own or name)
+    if name in _FUNCTIONS:
+        found = import_module(f"{__name__}.errors").naming_arguments(found)
+    return globals().setdefault(name, found)
 
 
 def __dir__() -> list[str]:

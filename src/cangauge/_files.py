@@ -48,9 +48,16 @@ _SUFFIXES: Final = frozenset(
 )  # fmt: skip
 
 
+def as_path(path: object) -> Path:
+    """Return a path; raise InputError if the object is none."""
+    if isinstance(path, str | os.PathLike):
+        return Path(os.fspath(path))
+    raise InputError("not a path", value=type(path).__name__, cure="give the path of a file")
+
+
 def open_regular(path: str | PathLike[str]) -> BinaryIO:
     """Open a file for reading; InputError if it is absent, no regular file, or unreadable."""
-    path = Path(path)
+    path = as_path(path)
     try:
         mode = path.stat().st_mode
         if stat.S_ISDIR(mode):

@@ -3,10 +3,16 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Iterable
+import re
+from collections.abc import Callable, Iterable
+from functools import wraps
 from itertools import islice
+from numbers import Real
 from os import PathLike
-from typing import Any, Final
+from typing import Any, Final, ParamSpec, TypeVar
+
+P = ParamSpec("P")
+T = TypeVar("T")
 
 
 class CangaugeError(Exception):
@@ -83,6 +89,61 @@ class InputError(CangaugeError):
             "value": _plain(self.value),
             "cure": self.cure and _short(self.cure),
         }
+
+
+_OPTION: Final = re.compile(r"--([a-z]+(?:-[a-z]+)*)( (?='))?")
+_ARGUMENTS: Final = {
+    "temperature": "temperature_c",
+    "initial-soc": "initial_soc_pct",
+    "initial-soc-std": "initial_soc_std_pct",
+    "valid-std": "valid_std_pct",
+    "delays": "delay_s",
+    "reference": "references",
+    "simulated": "simulation",
+}
+"""Arguments of Python whose names differ from those of the options."""
+
+
+def naming_arguments(function: Callable[P, T]) -> Callable[P, T]:
+    """Let the errors of a function of Python name its arguments in place of the options."""
+
+    def named(text: str | None) -> str | None:
+        def argument(match: re.Match[str]) -> str:
+            name = _ARGUMENTS.get(match[1], match[1].replace("-", "_"))
+            return f"{name}=" if match[2] else name
+
+        return None if text is None else _OPTION.sub(argument, text)
+
+    @wraps(function)
+    def call(*arguments: P.args, **options: P.kwargs) -> T:
+        try:
+            return function(*arguments, **options)
+        except InputError as error:
+            if "--" not in str(error):
+                raise
+            raise InputError(
+                named(error.problem) or "",
+                source=error.source,
+                field=named(error.field),
+                value=error.value,
+                cure=named(error.cure),
+            ) from error
+
+    return call
+
+
+def require_choice(value: object, choices: Iterable[object], field: str) -> None:
+    """Raise InputError if a value is none of some; `field` is its argument."""
+    known = list(choices)
+    if value not in known:
+        cure = f"use one of: {', '.join(map(str, known))}"
+        raise InputError("not a known value", field=field, value=value, cure=cure)
+
+
+def require_number(value: object, field: str) -> None:
+    """Raise InputError if a value is no number; `field` is its argument."""
+    if isinstance(value, bool) or not isinstance(value, Real):
+        raise InputError("not a number", field=field, value=value, cure="give it without a unit")
 
 
 # Text quoted from a file may have any length [characters].

@@ -110,7 +110,9 @@ def test_an_open_scale_is_listed_and_not_ticked(mitsubishi: Path, tmp_path: Path
     stated = init(mitsubishi, "-o", tmp_path / "stated", *choice, "--nominal-voltage", 330)
     voltage = stated.out.partition("voltage")[2]
     assert "1 ✓" in voltage
-    assert "do not tell the scale" not in stated.err
+    assert "do not tell the scale of the voltage" not in stated.err
+    assert "do not tell the scale of the SoC" in stated.err  # each with its capacity
+    assert "1 ?" in stated.out.partition("soc")[2]
 
 
 def test_nothing_to_look_at_is_refused(tmp_path: Path) -> None:

@@ -8,11 +8,14 @@ import inspect
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pyarrow as pa
 import pytest
 
 import cangauge
+from cangauge.logs.canonical import write_log
 
 
 def test_every_public_name_is_there_and_documented() -> None:
@@ -81,3 +84,77 @@ def test_an_estimate_goes_to_a_data_frame(tmp_path: Path) -> None:
     assert {"time_s", "soc_pct", "soc_std_pct", "status"} <= set(arrow.column_names)
     again = cangauge.Log.from_dataframe(log.to_arrow())
     assert (again.voltage_v == log.voltage_v).all()
+
+
+@pytest.fixture(scope="module")
+def drives() -> list[cangauge.Log]:
+    return [cangauge.simulate(seed=1, drive=number, hours=0.4).log for number in (1, 2)]
+
+
+@pytest.fixture(scope="module")
+def fitted(drives: list[cangauge.Log]) -> cangauge.Identification:
+    return cangauge.fit(drives, capacity_ah=60.0)
+
+
+def test_a_log_and_a_model_are_taken_in_every_form(
+    drives: list[cangauge.Log], fitted: cangauge.Identification, tmp_path: Path
+) -> None:
+    log, path = drives[0], tmp_path / "pack.json"
+    fitted.model.save(path)
+    drive = tmp_path / "drive.parquet"
+    write_log(log, drive)
+    plain = cangauge.estimate(log, fitted.model).soc_pct
+    for same in (log.to_arrow(), drive, str(drive)):
+        assert np.array_equal(cangauge.estimate(same, fitted.model).soc_pct, plain, equal_nan=True)
+    for model in (fitted, path, str(path)):
+        assert np.array_equal(cangauge.estimate(log, model).soc_pct, plain, equal_nan=True)
+        assert isinstance(cangauge.Estimator(model), cangauge.Estimator)
+    assert cangauge.fit(drive, capacity_ah=60.0).model.capacity_ah == 60.0
+
+
+@pytest.mark.parametrize(
+    ("call", "words"),
+    [
+        (lambda log, model: cangauge.estimate(model, log), "not a log .got 'Model'.; give a Log"),
+        (lambda log, _: cangauge.estimate(log, 7), "model: not a model .got 'int'.; give a Model"),
+        (lambda log, _: cangauge.estimate(log, log), "not a model .got 'Log'"),
+        (lambda *_: cangauge.fit(7), "not a log .got 'int'"),
+        (lambda *_: cangauge.fit([]), "no log given"),
+        (lambda log, _: cangauge.fit(log, capacity_ah="60"), "capacity_ah: not a number .got '60'"),
+        (lambda log, _: cangauge.fit(log, chemistry="x"), "chemistry: not a known value .*oxide"),
+        (lambda log, _: cangauge.fit(log, equation="x"), "equation: not a known value .*knots"),
+        (lambda _, model: cangauge.diagnose([], model), "logs: no log to diagnose"),
+        (lambda log, _: cangauge.diagnose(log, 7), "not a model .got 'int'"),
+        (lambda log, _: cangauge.read_log(log), "not a path .got 'Log'.; give the path of a file"),
+        (lambda *_: cangauge.Model.load(7), "not a path .got 'int'"),
+        (lambda *_: cangauge.Estimator(7), "not a model .got 'int'"),
+        (lambda *_: cangauge.Log.from_dataframe(7), "not a log .got 'int'"),
+        (lambda *_: cangauge.Log(["a"], [1], [2], [3]), "a column of a log holds numbers"),
+    ],
+)
+def test_a_wrong_type_is_one_line_with_a_cure(
+    drives: list[cangauge.Log], fitted: cangauge.Identification, call: Any, words: str
+) -> None:
+    with pytest.raises(cangauge.InputError, match=words) as caught:
+        call(drives[0], fitted.model)
+    assert "\n" not in str(caught.value)
+
+
+def test_errors_in_python_name_its_arguments(tmp_path: Path) -> None:
+    path = tmp_path / "x.csv"
+    path.write_text("Time,Current,Voltage\n0,1,380000\n1,2,380000\n")
+    with pytest.raises(
+        cangauge.InputError, match=r"with columns temperature=… .*with temperature_c$"
+    ):
+        cangauge.read_log(path)
+    with pytest.raises(cangauge.InputError, match=r"unit: columns='voltage=Voltage\[mV\]'"):
+        cangauge.read_log(path, temperature_c=20.0)
+    with pytest.raises(cangauge.InputError, match=r"^temperature_c: must lie within"):
+        cangauge.read_log(path, temperature_c=500.0)
+
+
+def test_a_fit_is_shown_in_ten_lines(fitted: cangauge.Identification) -> None:
+    low, high = fitted.model.range.soc_pct
+    assert 5 < len(repr(fitted).splitlines()) <= 10
+    for text in (repr(fitted), fitted._repr_html_()):
+        assert f"{low:.0f} … {high:.0f} % SoC" in text

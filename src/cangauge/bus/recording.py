@@ -15,6 +15,7 @@ from typing import Any, Final
 
 import numpy as np
 
+from cangauge._files import as_path
 from cangauge._typing import FloatArray
 from cangauge.bus.captures import (
     CLOCK,
@@ -140,7 +141,7 @@ def log_of(
 
 def open_recording(path: str | PathLike[str]) -> LogFile | Capture:
     """Open a file as a log or a capture, recognised by its beginning; InputError if neither."""
-    path = Path(path)
+    path = as_path(path)
     if parts_of_run(path):
         return open_capture(path)
     log_file = open_log(path)

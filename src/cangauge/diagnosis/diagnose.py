@@ -8,7 +8,6 @@ import math
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache, cached_property
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -31,7 +30,7 @@ from cangauge.estimation.offline import estimate
 from cangauge.identify.starts import start_by_model
 from cangauge.logs.log import Log
 from cangauge.logs.read import as_log
-from cangauge.model.model_file import Model
+from cangauge.model.model_file import Model, as_model
 
 _LOG = logging.getLogger(__name__)
 
@@ -454,7 +453,8 @@ def diagnose(
     The current reads 3.0 A (2.7 … 3.3) too high (current_offset, 71 %).
     """
     with _one_thread():
-        logs, model, simulator = _as_logs(logs), _as_model(model), None
+        logs, simulator = _as_logs(logs), None
+        model = None if model is None else as_model(model)
         own = () if isinstance(references, References) else _as_logs(references)
         if simulation is not None:
             simulator = simulator_gap(logs, own, simulation, model, capacity_ah)
@@ -492,12 +492,6 @@ def diagnose(
 
 def _as_logs(logs: Any) -> tuple[Log, ...]:
     return tuple(as_log(log) for log in (logs if isinstance(logs, list | tuple) else [logs]))
-
-
-def _as_model(model: Any) -> Model | None:
-    """Return the model of a model, a path or the result of a fit; None of nothing."""
-    found = Model.load(model) if isinstance(model, str | Path) else model
-    return getattr(found, "model", found)
 
 
 def learn_references(references: Sequence[Log], model: Model) -> References:

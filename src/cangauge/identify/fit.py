@@ -8,17 +8,18 @@ import os
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any, Final, Literal
+from html import escape
+from typing import Any, Final, Literal, get_args
 
 import numpy as np
 from threadpoolctl import threadpool_limits
 
 from cangauge._extras import extra
 from cangauge._files import text_sha256
-from cangauge._text import counted, duration, significant
+from cangauge._text import counted, duration, number, significant, span
 from cangauge._typing import FloatArray
 from cangauge._version import __version__
-from cangauge.errors import InputError
+from cangauge.errors import InputError, require_choice, require_number
 from cangauge.identify.effect_search import (
     AUTO,
     AUTO_LOGS,
@@ -112,7 +113,7 @@ class LogFigures:
     removed: dict[str, int]
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Identification:
     """A fitted model with its figures."""
 
@@ -173,6 +174,38 @@ class Identification:
     def soc_newton_mae_pct(self) -> float:
         """Mean absolute error of the SoC from voltage on the rows of the fit [%]."""
         return self._mean(np.abs(f.soc_newton_pct - f.rows.soc_pct) for f in self.fits)
+
+    def _summary(self) -> list[tuple[str, str]]:
+        """Return what a fit is good for, by name."""
+        model, noise = self.model, self.model.noise
+        cells = f", {model.cells} cells" if model.cells else ""
+        names = ", ".join(log.name for log in self.logs[:3])
+        more = f" and {len(self.logs) - 3} more" if len(self.logs) > 3 else ""
+        error = number(noise.voltage_mae_pct, 2, "%")
+        effects = ", ".join(str(effect["id"]) for effect in model.effects)
+        return [
+            ("model", f"{model.equation}, {model.chemistry}{cells}"),
+            ("logs", f"{names}{more}; {sum(item.rows for item in self.figures):,} rows"),
+            ("good from", f"{span(*model.range.soc_pct, 0, '% SoC')}"),
+            ("voltage error", f"{error} on {noise.judged_on}"),
+            ("of the fit", f"{number(self.voltage_mae_pct, 2, '%')}"),
+            ("SoC by voltage", f"{number(self.soc_newton_mae_pct, 1, '%')} off the counted SoC"),
+            ("capacity", significant(model.capacity_ah, 4, "Ah")),
+            ("resistance", significant(self.slope_ohm, 3, "Ω")),
+            *([("effects", effects)] if effects else []),
+        ]
+
+    def __repr__(self) -> str:
+        """Return ten lines on what the fit is good for."""
+        lines = [f"  {name:15}{text}" for name, text in self._summary()]
+        return "\n".join([f"<Identification {self.model.name!r}", *lines]) + ">"
+
+    def _repr_html_(self) -> str:
+        """Return the same as a table, for notebooks."""
+        rows = "".join(
+            f"<tr><th>{name}</th><td>{escape(text)}</td></tr>" for name, text in self._summary()
+        )
+        return f"<table><caption>{escape(self.model.name)}</caption>{rows}</table>"
 
     def plot(self) -> Any:
         """Return pseudo-OCV and residuals, for `bokeh.plotting.show`."""
@@ -280,6 +313,10 @@ def fit(
     >>> fitted = fit("trip.csv", capacity_ah=60.0, cells=96)  # doctest: +SKIP
     >>> fitted.model.save("pack.json")  # doctest: +SKIP
     """
+    require_choice(equation, get_args(Equation), "equation")
+    require_choice(chemistry, (*CHEMISTRIES, None), "chemistry")
+    if capacity_ah is not None:
+        require_number(capacity_ah, "capacity_ah")
     recorded = [as_log(log) for log in (logs if isinstance(logs, list | tuple) else [logs])]
     _check_logs(recorded)
     given = given_starts(initial_soc_pct, len(recorded))

@@ -13,7 +13,7 @@ from cangauge._dataframes import ArrowExport
 from cangauge._extras import extra
 from cangauge._text import duration
 from cangauge._typing import BoolArray, FloatArray, IntArray
-from cangauge.errors import InputError
+from cangauge.errors import InputError, naming_arguments
 from cangauge.logs.units import (
     REQUIRED,
     TEMPERATURE_SOURCES,
@@ -128,6 +128,7 @@ class Log(ArrowExport):
             )
 
     @classmethod
+    @naming_arguments
     def from_dataframe(
         cls,
         table: Any,
@@ -243,6 +244,9 @@ def _read_only(values: ArrayLike) -> FloatArray:
         flags = values.flags
         if flags.owndata and flags.c_contiguous and not flags.writeable:
             return values  # that of another log; it is never changed
-    array = np.array(values, dtype=np.float64, copy=True)
+    try:
+        array = np.array(values, dtype=np.float64, copy=True)
+    except (TypeError, ValueError) as error:
+        raise InputError(f"a column of a log holds numbers ({error})") from error
     array.flags.writeable = False
     return array

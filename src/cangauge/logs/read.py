@@ -14,7 +14,7 @@ from typing import Any, Final, Protocol
 import pyarrow as pa
 
 from cangauge._files import Head
-from cangauge.errors import InputError
+from cangauge.errors import InputError, require_number
 from cangauge.logs.canonical import arrow_table, open_parquet
 from cangauge.logs.column_map import DOCS, ColumnMap, unknown_columns
 from cangauge.logs.draft import DraftLog, Sign
@@ -139,6 +139,8 @@ def _refuse_options(
 ) -> None:
     if temperature_source is not None:
         known_temperature_source(temperature_source)
+    if temperature_c is not None:
+        require_number(temperature_c, "--temperature")
     if temperature_c is not None and not COLDEST_C <= temperature_c <= HOTTEST_C:
         problem = f"must lie within {COLDEST_C:g} … {HOTTEST_C:g} °C"
         raise InputError(problem, field="--temperature", value=temperature_c)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from itertools import pairwise
+from os import PathLike
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal, Self
 
@@ -11,7 +12,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from cangauge._config import schema_error
-from cangauge._files import MIB, read_bounded, write_text_atomic
+from cangauge._files import MIB, as_path, read_bounded, write_text_atomic
 from cangauge._typing import FloatArray
 from cangauge.errors import InputError
 from cangauge.logs.log import Log, TemperatureSource
@@ -387,7 +388,7 @@ class Model(_Strict):
         )  # fmt: skip
 
     @classmethod
-    def load(cls, path: Path | str) -> Model:
+    def load(cls, path: str | PathLike[str]) -> Model:
         """Read and validate a model file, of this version or version 1.
 
         Raises
@@ -395,7 +396,7 @@ class Model(_Strict):
         InputError
             If the file cannot be read or does not describe a usable model; names the field.
         """
-        path = Path(path)
+        path = as_path(path)
         data = read_bounded(path, 4 * MIB, "a model file")
         try:
             raw = json.loads(data, parse_constant=_refuse_constant)
@@ -484,11 +485,13 @@ PRIOR_C_RATE = 3.0
 
 def as_model(model: Any) -> Model:
     """Return a model for a `Model`, the path of its file, or the result of `fit`."""
-    if isinstance(model, Model):
-        return model
-    if isinstance(model, str | Path):
-        return Model.load(model)
-    return as_model(model.model)
+    found = getattr(model, "model", model)
+    if isinstance(found, str | PathLike):
+        return Model.load(found)
+    if not isinstance(found, Model):
+        cure = "give a Model, the path of its file, or the result of fit"
+        raise InputError("not a model", field="model", value=type(model).__name__, cure=cure)
+    return found
 
 
 def noise_of(

@@ -10,7 +10,7 @@ from typing import Any, Final
 
 import can
 import numpy as np
-from cantools.database.can import Database, Message, Signal
+from cantools.database.can import Message, Signal
 
 from cangauge.bus.database import load_dbc, signal_codec
 from cangauge.bus.vehicle import EXTENDED
@@ -65,6 +65,11 @@ class NamedSignal:
         """Message and signal."""
         return f"{self.message}.{self.signal}"
 
+    @property
+    def range_text(self) -> str:
+        """Range of its values in the capture; "" without frames."""
+        return "" if self.low is None else f"{self.low:.5g} … {self.high:.5g} {self.unit}"
+
     def to_dict(self) -> dict[str, Any]:
         """Return plain values for JSON."""
         return {
@@ -112,7 +117,7 @@ def named_signals(
             source=dbc,
             cure="is it of this car and this bus?",
         )
-    return {role: _best(role, database, present, frames, dbc)[:shown] for role in _ROLES}
+    return {role: _best(role, present, frames, dbc)[:shown] for role in _ROLES}
 
 
 def _key(message: Message) -> int:
@@ -120,9 +125,8 @@ def _key(message: Message) -> int:
 
 
 def _best(
-    role: str, database: Database, present: list[Message], frames: dict[int, list[bytes]], dbc: Path
+    role: str, present: list[Message], frames: dict[int, list[bytes]], dbc: Path
 ) -> tuple[NamedSignal, ...]:
-    del database
     found = []
     for message in present:
         for signal in message.signals:

@@ -8,7 +8,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final
@@ -27,22 +27,19 @@ if TYPE_CHECKING:
 
     from cangauge.extras.discovery.by_name import NamedSignal
     from cangauge.extras.discovery.pairs import Candidate
-    from cangauge.extras.discovery.proposal import Proposal
+    from cangauge.extras.discovery.proposal import Level, Proposal
     from cangauge.extras.discovery.search import Findings
 
-ROLES: Final = {
+_ROLES: Final = {
     "current": "current",
     "voltage": "voltage",
     "soc": "soc_reference",
     "temperature": "temperature",
 }
 """Roles by their names on the command line."""
-NEEDED: Final = ("current", "voltage")
-CLEARLY_NAMED: Final = 1.0
+_NEEDED: Final = ("current", "voltage")
+_CLEARLY_NAMED: Final = 1.0
 """Distance in score of the first signal of a DBC that makes it clear: one matching word."""
-LONGEST_PAIR_S: Final = 1.0
-NOMINAL_CELL_V: Final = 3.7
-"""Nominal voltage of an oxide cell [V]: tells how many cells a scale would mean."""
 
 
 def init_command(  # noqa: PLR0917 - typer fills the arguments by name
@@ -118,13 +115,13 @@ def init_command(  # noqa: PLR0917 - typer fills the arguments by name
         within(nominal_voltage, 10.0, 1500.0, option="--nominal-voltage", unit="V")
     targets = _Targets.of(output, map_file, config)
     targets.check(force=force)
+    options = parse_bus_options(bus_option or [])
     with tempfile.TemporaryDirectory(prefix="cangauge-init-") as folder:
         paths = list(captures or [])
         is_live = interface is not None or channel is not None
         if is_live and paths:
             raise InputError("given together with a capture", field="--interface", cure="omit one")
         if is_live:
-            options = parse_bus_options(bus_option or [])
             address = bus_address(interface, channel, options)
             paths = [_listen(address, seconds, Path(folder) / "live.log")]
         if not paths and dbc is None:
@@ -133,22 +130,16 @@ def init_command(  # noqa: PLR0917 - typer fills the arguments by name
                 field="CAPTURE",
                 cure="give a capture, --interface and --channel, or --dbc FILE",
             )
-        found = _find(
-            paths,
-            dbc,
-            picks,
-            targets,
-            presets=presets,
-            quiet=json_output,
-            nominal_v=nominal_voltage,
-        )
-        bus_options = parse_bus_options(bus_option or [])
-        files = found.files(targets, interface, channel, bus_options)
+        asks = sys.stdin is not None and sys.stdin.isatty() and not json_output
+        found = _find(paths, dbc, nominal_voltage, presets=presets)
+        _choose(found, picks, targets, asks=asks, quiet=json_output)
+        if asks:
+            found = _ask_scales(found, paths)
+        files = found.files(targets, interface, channel, options)
         found.proof = _prove(files, targets, paths, Path(folder), found)
-        if found.proof.get("sign", {}).get("sign") == -1 and found.method == "dbc":
-            found.sign = -1
         if found.method == "dbc":  # the map says how its sign was found
-            files = found.files(targets, interface, channel, bus_options)
+            found.sign = -1 if found.proven_sign == -1 else 1
+            files = found.files(targets, interface, channel, options)
             found.proof |= {"sign": found.proof.get("sign", {}) | {"in_map": found.sign}}
     targets.map.parent.mkdir(exist_ok=True)
     write_texts_atomic(files)
@@ -161,6 +152,22 @@ def init_command(  # noqa: PLR0917 - typer fills the arguments by name
     note(
         f"next: cangauge inspect DRIVE --map {targets.map}, then cangauge fit DRIVE … -o model.json"
     )
+
+
+def _picks(given: Sequence[str]) -> dict[str, int]:
+    """Return the number of the candidate by role, from 0."""
+    picks = {}
+    for text in given:
+        role, _, number = text.partition("=")
+        if role not in _ROLES or not number.isdecimal() or not 1 <= int(number) <= 9:
+            raise InputError(
+                "not ROLE=N",
+                field="--choose",
+                value=text,
+                cure=f"ROLE is {', '.join(_ROLES)}; N counts from 1: --choose current=2",
+            )
+        picks[_ROLES[role]] = int(number) - 1
+    return picks
 
 
 @dataclass(frozen=True)
@@ -200,57 +207,76 @@ class _Targets:
 
 @dataclass
 class _Found:
-    """What was found, and how."""
+    """What was found, and how.
+
+    `sign` is that of the current in the map, where a DBC names it: -1 where positive values charge.
+    """
 
     method: str
     vehicle: str | None = None
     findings: Findings | None = None
-    named: Mapping[str, Sequence[NamedSignal]] = field(default_factory=dict)
+    candidates: Mapping[str, Sequence[Candidate | NamedSignal]] = field(default_factory=dict)
     chosen: dict[str, int] = field(default_factory=dict)
     dbc: Path | None = None
     nominal_v: float | None = None
     sign: int = 1
-    """Sign of the current in the map, where the DBC names it: -1 where positive values charge."""
     proof: dict[str, Any] = field(default_factory=dict)
+    known_scales: set[str] = field(default_factory=set)
+    """Roles whose scale the user has stated."""
 
-    def levels(self) -> list[tuple[float, float]]:
-        """Return usual scales of the chosen voltage and the pack's voltage [V] by each.
+    @property
+    def fields(self) -> dict[str, Candidate]:
+        """Chosen fields that were found by physics, by role."""
+        if self.findings is None:
+            return {}
+        return {role: self.candidates[role][k] for role, k in self.chosen.items()}  # type: ignore[misc]
 
-        One pair where the scale is known: by a DBC, a preset or the nominal voltage.
-        """
-        from cangauge.extras.discovery.proposal import voltage_levels
+    @property
+    def proven_sign(self) -> int:
+        """What the captures show of the sign of current by the files: +1, -1, or 0 if nothing."""
+        return int(self.proof.get("sign", {}).get("sign", 0))
 
-        if self.findings is None or self.nominal_v is not None or "voltage" not in self.chosen:
+    def levels(self, role: str) -> list[Level]:
+        """Return what usual scales of a chosen field mean; empty where the scale is known."""
+        from cangauge.extras.discovery.proposal import levels
+
+        if role not in self.fields or role in self.known_scales:
             return []
-        return voltage_levels(self.findings.voltage[self.chosen["voltage"]])
+        found = levels(role, self.fields[role], self.nominal_v)
+        return found if len(found) > 1 else []
 
     def is_proven(self, role: str) -> bool:
         """Whether nothing that the data leave open changes the values of a chosen signal."""
-        if role == "voltage":
-            return len(self.levels()) < 2
         if role == "current":
-            return self.findings is None and self.proof.get("sign", {}).get("sign", 0) != 0
-        return True
+            return self.findings is None and self.proven_sign != 0
+        return not self.levels(role)
 
-    def candidates(self, role: str) -> Sequence[Candidate | NamedSignal]:
-        """Return the candidates of a role."""
+    def is_clear(self, role: str) -> bool:
+        """Whether the first candidate is clearly ahead of the others."""
         if self.findings is not None:
-            return tuple(getattr(self.findings, role))
-        return tuple(self.named.get(role, ()))
+            return self.findings.is_clear(role)
+        scores = [candidate.score for candidate in self.candidates[role]]
+        return len(scores) == 1 or scores[0] - scores[1] >= _CLEARLY_NAMED
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain values for JSON."""
+        levels = {
+            key: [{"scale": level.scale, value: level.value} for level in self.levels(role)]
+            for key, role, value in (
+                ("voltage_levels", "voltage", "voltage_v"),
+                ("soc_levels", "soc_reference", "highest_pct"),
+            )
+        }
         return {
             "method": self.method,
             "vehicle": self.vehicle,
             "chosen": {role: number + 1 for role, number in self.chosen.items()},
             "candidates": {
-                role: [each.to_dict() for each in self.candidates(role)] for role in ROLES.values()
+                role: [candidate.to_dict() for candidate in self.candidates.get(role, ())]
+                for role in _ROLES.values()
             },
             "remarks": [] if self.findings is None else list(self.findings.remarks),
-            "voltage_levels": [
-                {"scale": scale, "voltage_v": volts} for scale, volts in self.levels()
-            ],
+            **levels,
             "proof": self.proof,
         }
 
@@ -263,141 +289,61 @@ class _Found:
     ) -> dict[Path, str]:
         """Return the texts by file."""
         from cangauge.bus.vehicle import PRESETS
-        from cangauge.extras.discovery.pairs import Candidate
-        from cangauge.extras.discovery.proposal import config_text, dbc_text, map_text, mapped
+        from cangauge.extras.discovery import proposal
 
         texts = {}
         if self.vehicle is not None:
             preset = PRESETS[self.vehicle]
             texts[targets.dbc] = shared_file("dbc", preset.dbc).read_text("utf-8")
-            comments = (f"{preset.about}: recognised by its ids and CRC.",)
-            proposal = mapped(preset.mapping, targets.dbc.name, comments)
+            about = (f"{preset.about}: recognised by its ids and CRC.",)
+            found = proposal.of_preset(preset.mapping, targets.dbc.name, about)
         elif self.findings is not None:
-            chosen = {role: self.candidates(role)[number] for role, number in self.chosen.items()}
-            fields = {role: each for role, each in chosen.items() if isinstance(each, Candidate)}
-            texts[targets.dbc] = dbc_text(fields)
-            proposal = _by_physics(fields, self.findings, targets.dbc.name, self.nominal_v)
+            texts[targets.dbc] = proposal.dbc_text(self.fields)
+            names = {
+                role: [candidate.name for candidate in of_role]
+                for role, of_role in self.candidates.items()
+            }
+            found = proposal.by_physics(
+                self.fields, names, targets.dbc.name, self.nominal_v, self.findings.comments
+            )
         else:
-            proposal = self._by_name(targets)
-        texts[targets.map] = map_text(proposal)
+            found = self._by_name(targets)
+        texts[targets.map] = proposal.map_text(found)
         lacks = self.vehicle is not None and PRESETS[self.vehicle].lacks_temperature
-        texts[targets.config] = config_text(
-            vehicle=None if lacks else self.vehicle,
-            map_name=targets.map.name,
-            interface=interface,
-            channel=channel,
-            bus_options=bus_options,
+        vehicle = None if lacks else self.vehicle
+        texts[targets.config] = proposal.config_text(
+            vehicle, targets.map.name, interface, channel, bus_options
         )
         return texts
 
     @property
     def sign_line(self) -> str:
         """How the sign of the current was found, or what is left to do."""
-        sign = self.proof.get("sign", {})
-        if sign.get("sign", 0) == 0:
+        if not self.proven_sign:
             return "Sign of the current: not proven; `cangauge inspect DRIVE --map FILE` proves it."
-        if self.sign < 0:
-            return f"Sign of the current: positive values charge on this bus ({sign['text']})."
-        return f"Sign of the current: positive discharges ({sign['text']})."
+        way = "positive values charge on this bus" if self.sign < 0 else "positive discharges"
+        return f"Sign of the current: {way} ({self.proof['sign']['text']})."
 
     def _by_name(self, targets: _Targets) -> Proposal:
         from cangauge.extras.discovery.proposal import Assignment, Proposal
 
         roles = {}
         for role, number in self.chosen.items():
-            each = self.named[role][number]
-            seen = "not in the capture"
-            if each.low is not None:
-                seen = f"{each.low:g} … {each.high:g} {each.unit} in the capture"
-            others = [one.name for one in self.named[role] if one is not each]
-            lines = [f"By name and unit: {seen}."]
-            if others:
-                lines.append(f"Else: {', '.join(others)}.")
+            signal: NamedSignal = self.candidates[role][number]  # type: ignore[assignment]
+            seen = signal.range_text
+            others = [other.name for other in self.candidates[role] if other is not signal]
+            lines = [f"By name and unit: {f'{seen} in' if seen else 'not in'} the capture."]
+            lines += [f"Else: {', '.join(others)}."] if others else []
             sign = self.sign if role == "current" else 1
-            roles[role] = Assignment(each.message, each.signal, sign, tuple(lines))
+            roles[role] = Assignment(signal.message, signal.signal, sign, tuple(lines))
         dbc = Path() if self.dbc is None else self.dbc.resolve()
         same = dbc.parent == targets.map.parent.resolve()
-        return Proposal(
-            name=dbc.stem,
-            dbc=dbc.name if same else str(dbc),
-            roles=roles,
-            comments=("Signals found by their names and units in the DBC.", self.sign_line),
-            pair_within_s=0.1,
-        )  # fmt: skip
+        comments = ("Signals found by their names and units in the DBC.", self.sign_line)
+        name = dbc.name if same else str(dbc)
+        return Proposal(dbc.stem, name, roles, comments, pair_within_s=0.1)
 
 
-def _by_physics(
-    chosen: Mapping[str, Candidate], findings: Findings, dbc: str, nominal_v: float | None
-) -> Proposal:
-    from cangauge.extras.discovery.proposal import (
-        SIGNALS,
-        UNITS,
-        Assignment,
-        Proposal,
-        message_name,
-        scale_line,
-    )
-
-    roles = {}
-    for role, each in chosen.items():
-        unit = UNITS[role].replace("degC", "°C")
-        lines = [f"{each.name}: {each.low:.5g} … {each.high:.5g} {unit}, {each.steps} steps."]
-        if role in NEEDED:
-            lines += [_physics_line(each), scale_line(role, each, nominal_v)]
-        elif each.partner:
-            lines.append(f"Falls with the charge (r = {each.correlation:.2f}): {each.partner}.")
-        others = [one.name for one in getattr(findings, role) if one is not each]
-        if others:
-            lines.append(f"Else: {', '.join(others)}.")
-        roles[role] = Assignment(message_name(each), SIGNALS[role], each.sign, tuple(lines))
-    if "temperature" in roles:
-        old = roles["temperature"]
-        guess = "A guess by range and slowness alone: compare it with the car's display."
-        roles["temperature"] = Assignment(old.message, old.signal, 1, (guess, *old.comments))
-    hints = [f"{each.name} ({each.low:.3g} … {each.high:.3g} °C)" for each in findings.temperature]
-    slowest = max(chosen[role].period_s for role in NEEDED)
-    apart = chosen["current"].arbitration_id != chosen["voltage"].arbitration_id
-    pair_s = min(max(0.020, 1.2 * slowest), LONGEST_PAIR_S) if apart else 0.020
-    return Proposal(
-        name="own car",
-        dbc=dbc,
-        roles=roles,
-        comments=(
-            f"Found by physics in {findings.duration_s:.0f} s of frames: {findings.fields} numbers"
-            f" of {findings.streams} ids.",
-            "The bits do not determine the factors: compare voltage and current with a",
-            "meter or the car's display, and correct factor and offset in the DBC.",
-            *findings.remarks,
-            *([f"Slow and plausible as a temperature: {', '.join(hints)}."] if hints else []),
-        ),
-        pair_within_s=pair_s,
-    )
-
-
-def _physics_line(each: Candidate) -> str:
-    if each.evidence < 1.0:
-        return "By the look of its bits alone: no current steps that a voltage follows."
-    one, two = each.halves_ohm
-    return (
-        f"ΔU = −R·ΔI with {each.partner}: R = {each.resistance_ohm:.3g} Ω, r = "
-        f"{each.correlation:+.2f}; by halves of the capture {one:.3g} and {two:.3g} Ω."
-    )
-
-
-def _picks(given: Sequence[str]) -> dict[str, int]:
-    """Return the number of the candidate by role, from 0."""
-    picks = {}
-    for text in given:
-        role, _, number = text.partition("=")
-        if role not in ROLES or not number.isdecimal() or not 1 <= int(number) <= 9:
-            raise InputError(
-                "not ROLE=N",
-                field="--choose",
-                value=text,
-                cure=f"ROLE is {', '.join(ROLES)}; N counts from 1: --choose current=2",
-            )
-        picks[ROLES[role]] = int(number) - 1
-    return picks
+# --- Finding and choosing
 
 
 def _listen(address: Any, seconds: float, path: Path) -> Path:
@@ -430,28 +376,20 @@ def _joined(paths: Sequence[Path]) -> Iterator[can.Message]:
     from cangauge.bus.captures import open_capture
     from cangauge.extras.discovery.search import BETWEEN_S
 
-    end_s = None
+    next_s: float | None = None
     for path in paths:
-        shift_s = None
-        last_s = 0.0
+        shift_s: float | None = None
         for message in open_capture(path):
             if shift_s is None:
-                shift_s = 0.0 if end_s is None else end_s + BETWEEN_S - message.timestamp
+                shift_s = 0.0 if next_s is None else next_s - message.timestamp
             message.timestamp += shift_s
-            last_s = message.timestamp
             yield message
-        end_s = last_s
+            last_s = message.timestamp
+        next_s = None if shift_s is None else last_s + BETWEEN_S
 
 
 def _find(
-    paths: Sequence[Path],
-    dbc: Path | None,
-    picks: dict[str, int],
-    targets: _Targets,
-    *,
-    presets: bool,
-    quiet: bool,
-    nominal_v: float | None,
+    paths: Sequence[Path], dbc: Path | None, nominal_v: float | None, *, presets: bool
 ) -> _Found:
     from cangauge.bus.captures import open_capture
     from cangauge.extras.discovery.by_name import named_signals
@@ -459,26 +397,14 @@ def _find(
 
     if dbc is not None:
         messages = chain.from_iterable(open_capture(path) for path in paths)
-        found = _Found("dbc", named=named_signals(dbc, messages), dbc=dbc)
-    else:
-        if presets and (known := _known(paths)) is not None:
-            return _Found("preset", vehicle=known)
-        status = console.status("reading frames")
-        with status, progress_shown("cangauge.extras.discovery", status.update):
-            findings = search(_joined(paths), nominal_v)
-            found = _Found("physics", findings=findings, nominal_v=nominal_v)
-    _choose(found, picks, targets, quiet=quiet)
-    if len(levels := found.levels()) > 1 and _asks(quiet=quiet):
-        note(f"The bits do not tell the scale of the voltage: {_level_texts(levels)}.")
-        volts = typer.prompt("Voltage of the pack [V]?", type=float, default=levels[0][1], err=True)
-        within(volts, 10.0, 1500.0, option="--nominal-voltage", unit="V")
-        return _find(paths, dbc, picks, targets, presets=presets, quiet=quiet, nominal_v=volts)
-    return found
-
-
-def _asks(*, quiet: bool) -> bool:
-    """Whether a user at a terminal can be asked."""
-    return sys.stdin is not None and sys.stdin.isatty() and not quiet
+        return _Found("dbc", candidates=named_signals(dbc, messages), dbc=dbc)
+    if presets and (known := _known(paths)) is not None:
+        return _Found("preset", vehicle=known)
+    status = console.status("reading frames")
+    with status, progress_shown("cangauge.extras.discovery", status.update):
+        findings = search(_joined(paths), nominal_v)
+    candidates = {role: getattr(findings, role) for role in _ROLES.values()}
+    return _Found("physics", findings=findings, candidates=candidates, nominal_v=nominal_v)
 
 
 def _known(paths: Sequence[Path]) -> str | None:
@@ -492,60 +418,75 @@ def _known(paths: Sequence[Path]) -> str | None:
     return common[0] if len(common) == 1 else None
 
 
-def _choose(  # noqa: C901 - one rule after the other
-    found: _Found, picks: dict[str, int], targets: _Targets, *, quiet: bool
+def _choose(
+    found: _Found, picks: dict[str, int], targets: _Targets, *, asks: bool, quiet: bool
 ) -> None:
     """Choose a candidate for each role: the user's, the clear one, or by asking."""
-    asks = _asks(quiet=quiet)
     unclear = []
-    for name, role in ROLES.items():
-        candidates = found.candidates(role)
+    for name, role in () if found.method == "preset" else _ROLES.items():
+        count = len(found.candidates[role])
         if role in picks:
-            if picks[role] >= len(candidates):
-                raise InputError(
-                    f"there are {len(candidates)} candidates",
-                    field="--choose",
-                    value=f"{name}={picks[role] + 1}",
-                )
+            if picks[role] >= count:
+                value = f"{name}={picks[role] + 1}"
+                raise InputError(f"there are {count} candidates", field="--choose", value=value)
             found.chosen[role] = picks[role]
-        elif not candidates:
-            if role in NEEDED:
-                unclear.append(role)
-        elif role == "temperature" and found.findings is not None:
-            continue  # slow and plausible is not enough: the user chooses it, or none
-        elif role not in NEEDED or _is_clear(found, role):
+        elif role not in _NEEDED:
+            # Slow and plausible is not enough: the user chooses a temperature, or none.
+            if count and (role != "temperature" or found.findings is None):
+                found.chosen[role] = 0
+        elif count and found.is_clear(role):
             found.chosen[role] = 0
-        elif asks:
-            _show_role(found, role)
-            found.chosen[role] = (
-                typer.prompt(f"Which is the {role}?", type=int, default=1, err=True) - 1
-            )
-            if not 0 <= found.chosen[role] < len(candidates):
-                raise InputError("no such candidate", field=role, value=found.chosen[role] + 1)
+        elif count and asks:
+            found.chosen[role] = _asked(found, role)
         else:
             unclear.append(role)
-    if not unclear:
-        return
-    if not quiet:
-        _show(found)
-    remarks = () if found.findings is None else found.findings.remarks
-    lines = [
-        f"{role}: {len(found.candidates(role))} candidates, none clearly ahead"
-        + "".join(f"; {n}) {each.name}" for n, each in enumerate(found.candidates(role), 1))
-        for role in unclear
-    ]
-    raise CangaugeError(
-        f"{'; '.join([*lines, *remarks])}; nothing was written to {targets.map.parent}: choose by"
-        f" {' '.join(f'--choose {role}=1' for role in unclear)}, or record a drive with current"
-        " steps"
+    if unclear:
+        if not quiet:
+            _show(found)
+        raise _unclear(found, unclear, targets)
+
+
+def _asked(found: _Found, role: str) -> int:
+    _show_role(found, role)
+    number = int(typer.prompt(f"Which is the {role}?", type=int, default=1, err=True))
+    if not 1 <= number <= len(found.candidates[role]):
+        raise InputError("no such candidate", field=role, value=number)
+    return number - 1
+
+
+def _unclear(found: _Found, roles: Sequence[str], targets: _Targets) -> CangaugeError:
+    lines = []
+    for role in roles:
+        names = [f"; {n}) {c.name}" for n, c in enumerate(found.candidates[role], 1)]
+        lines.append(f"{role}: {len(names)} candidates, none clearly ahead{''.join(names)}")
+    lines += [] if found.findings is None else found.findings.remarks
+    return CangaugeError(
+        f"{'; '.join(lines)}; nothing was written to {targets.map.parent}: choose by"
+        f" {' '.join(f'--choose {role}=1' for role in roles)}, or record a drive with current steps"
     )
 
 
-def _is_clear(found: _Found, role: str) -> bool:
-    if found.findings is not None:
-        return found.findings.is_clear(role)
-    scores = [each.score for each in found.candidates(role)]
-    return len(scores) == 1 or scores[0] - scores[1] >= CLEARLY_NAMED
+def _ask_scales(found: _Found, paths: Sequence[Path]) -> _Found:
+    """Return what was found with the scales of voltage and SoC that the user states."""
+    if levels := found.levels("voltage"):
+        note(_open_scale("voltage", levels))
+        volts = typer.prompt(
+            "Voltage of the pack [V]?", type=float, default=levels[0].value, err=True
+        )
+        within(volts, 10.0, 1500.0, option="--nominal-voltage", unit="V")
+        again = _find(paths, None, volts, presets=False)
+        found = replace(again, chosen=found.chosen)
+    if levels := found.levels("soc_reference"):
+        note(_open_scale("SoC", levels))
+        question = "Highest SoC that the car showed in these captures [%]?"
+        highest = typer.prompt(question, type=float, default=levels[0].value, err=True)
+        nearest = min(levels, key=lambda level: abs(level.value - highest))
+        old = found.fields["soc_reference"]
+        new = old.rescaled(nearest.scale)
+        of_role = [new if c is old else c for c in found.candidates["soc_reference"]]
+        found.candidates = {**found.candidates, "soc_reference": of_role}
+        found.known_scales.add("soc_reference")
+    return found
 
 
 def _prove(
@@ -592,16 +533,15 @@ def _prove(
         "current_a": [float(samples.current_a.min()), float(samples.current_a.max())],
         "voltage_v": [float(volts.min()), float(volts.max())] if len(volts) else None,
     }
-    if len(volts):
-        log = Log(  # the sign needs no temperature
-            samples.time_s[good], samples.current_a[good], volts, np.zeros(len(volts)),
-            soc_pct=samples.soc_pct[good],
-        )  # fmt: skip
-        finding = sign_of_current(log)
-        proof["sign"] = {
-            "sign": finding.sign, "confidence": finding.confidence, "text": finding.strongest.text,
-        }  # fmt: skip
+    if len(volts):  # the sign needs no temperature
+        rows = (samples.time_s[good], samples.current_a[good], volts, np.zeros(len(volts)))
+        finding = sign_of_current(Log(*rows, soc_pct=samples.soc_pct[good]))
+        text, confidence = finding.strongest.text, finding.confidence
+        proof["sign"] = {"sign": finding.sign, "confidence": confidence, "text": text}
     return proof
+
+
+# --- What is shown
 
 
 def _show(found: _Found) -> None:
@@ -610,42 +550,40 @@ def _show(found: _Found) -> None:
     if found.vehicle is not None:
         about = PRESETS[found.vehicle].about
         print_table("Known vehicle", ["preset", "<about"], [[found.vehicle, about]])
-    for role in ROLES.values():
-        if found.candidates(role):
+    for role in _ROLES.values():
+        if found.candidates.get(role):
             _show_role(found, role)
-    if found.findings is not None:
-        for remark in found.findings.remarks:
-            note(f"note: {remark}")
+    for remark in () if found.findings is None else found.findings.remarks:
+        note(f"note: {remark}")
     if found.proof.get("samples"):
         amps, volts = found.proof["current_a"], found.proof["voltage_v"]
         shown = "no voltage" if volts is None else f"{volts[0]:g} … {volts[1]:g} V"
         note(f"decoded: {found.proof['samples']} samples, {amps[0]:g} … {amps[1]:g} A, {shown}")
     if found.findings is None:
         note(_sign_note(found))
-    if len(levels := found.levels()) > 1:
-        note(
-            f"note: the bits do not tell the scale of the voltage: {_level_texts(levels)}."
-            " Give --nominal-voltage V (type plate, or a meter)."
-        )
+    if levels := found.levels("voltage"):
+        cure = "Give --nominal-voltage V (type plate, or a meter)."
+        note(f"note: {_open_scale('voltage', levels)} {cure}")
+    if levels := found.levels("soc_reference"):
+        cure = "Compare it with the car's display, and correct the factor in the DBC."
+        note(f"note: {_open_scale('SoC', levels)} {cure}")
+
+
+def _open_scale(quantity: str, levels: Sequence[Level]) -> str:
+    texts = ", ".join(level.text for level in levels)
+    return f"The bits do not tell the scale of the {quantity}: {texts}."
 
 
 def _sign_note(found: _Found) -> str:
-    sign = found.proof.get("sign", {})
-    if found.method == "preset" and sign.get("sign") == -1:
+    if found.method == "preset" and found.proven_sign == -1:
         return (
-            f"warning: by this preset positive current charges ({sign['text']}): is it another car,"
-            " or a converter that turns the sign? Set sign under [current] of the map."
+            f"warning: by this preset positive current charges ({found.proof['sign']['text']}): is"
+            " it another car, or a converter that turns the sign? Set sign under [current] of the"
+            " map."
         )
-    if sign.get("sign", 0) == 0:
+    if not found.proven_sign:
         return f"warning: {found.sign_line[0].lower()}{found.sign_line[1:]}"
     return f"{found.sign_line} The map has sign = {found.sign}."
-
-
-def _level_texts(levels: Sequence[tuple[float, float]]) -> str:
-    return ", ".join(
-        f"{volts:.0f} V at {scale:g} V a step (about {round(volts / NOMINAL_CELL_V)} cells)"
-        for scale, volts in levels
-    )
 
 
 def _show_role(found: _Found, role: str) -> None:
@@ -653,28 +591,15 @@ def _show_role(found: _Found, role: str) -> None:
     from cangauge.extras.discovery.proposal import UNITS
 
     rows = []
-    for number, each in enumerate(found.candidates(role), 1):
+    for number, candidate in enumerate(found.candidates[role], 1):
         taken = "✓" if found.is_proven(role) else "?"
         mark = f"{number} {taken}" if found.chosen.get(role) == number - 1 else str(number)
-        if isinstance(each, Candidate):
-            rows.append([
-                mark, each.name, f"{each.scale:g}",
-                f"{each.low:.5g} … {each.high:.5g} {UNITS[role]}",
-                str(each.steps), f"{each.score:.1f}", _facts(each),
-            ])  # fmt: skip
+        scale, ends, steps, facts = "", "", "", "by name and unit"
+        if isinstance(candidate, Candidate):
+            ends = f"{candidate.low:.5g} … {candidate.high:.5g} {UNITS[role]}"
+            scale, steps, facts = f"{candidate.scale:g}", str(candidate.steps), candidate.facts
         else:
-            seen = "" if each.low is None else f"{each.low:.5g} … {each.high:.5g} {each.unit}"
-            rows.append([mark, each.name, "", seen, "", f"{each.score:.1f}", "by name and unit"])
+            ends = candidate.range_text
+        rows.append([mark, candidate.name, scale, ends, steps, f"{candidate.score:.1f}", facts])
     head = ["", "<field", "scale", "range", "steps", "score", "<evidence"]
     print_table(role.replace("_reference", ""), head, rows)
-
-
-def _facts(each: Candidate) -> str:
-    if each.evidence <= 0.0:
-        return "the look of its bits"
-    if each.resistance_ohm != each.resistance_ohm:
-        return f"r {each.correlation:+.2f} with the charge, {each.partner}"
-    return (
-        f"r {each.correlation:+.2f} with {each.partner}, R {each.resistance_ohm:.3g} Ω"
-        f" ({each.halves_ohm[0]:.2g}, {each.halves_ohm[1]:.2g} by halves)"
-    )

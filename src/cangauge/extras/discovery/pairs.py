@@ -51,6 +51,8 @@ CURRENT_SCALES: Final = {
     0.02: -1.5,
 }  # fmt: skip
 """Usual scales [V, A] and their log priors [nats], by their frequency in public DBC files."""
+SOC_SCALES: Final = (0.1, 0.5, 0.01, 1.0, 0.05, 0.025, 0.02, 0.4)
+"""Usual scales of a SoC [%]."""
 SHOWN: Final = 3
 CLEARLY_NATS: Final = 3.0
 """Distance to the second candidate that makes the first clear: a likelihood ratio of 20."""
@@ -104,6 +106,8 @@ class Candidate:
         With its partner; NaN where there is none.
     halves_ohm : tuple of float
         Resistance by the first and by the second half of the capture.
+    capacity_ah : float
+        Charge of 100 % of a SoC [Ah]; else NaN.
     partner : str
     """
 
@@ -127,6 +131,31 @@ class Candidate:
     resistance_ohm: float = math.nan
     halves_ohm: tuple[float, float] = (math.nan, math.nan)
     partner: str = ""
+    capacity_ah: float = math.nan
+
+    @property
+    def facts(self) -> str:
+        """The evidence in a phrase."""
+        if self.evidence <= 0.0:
+            return "the look of its bits"
+        if math.isnan(self.resistance_ohm):
+            return f"r {self.correlation:+.2f} with the charge, {self.partner}"
+        one, two = self.halves_ohm
+        ohm = f"R {self.resistance_ohm:.3g} Ω ({one:.2g}, {two:.2g} by halves)"
+        return f"r {self.correlation:+.2f} with {self.partner}, {ohm}"
+
+    def rescaled(self, scale: float) -> Candidate:
+        """Return a SoC with another scale, and the capacity that follows."""
+        ratio = scale / self.scale
+        capacity_ah = self.capacity_ah / ratio
+        return replace(
+            self,
+            scale=scale,
+            low=self.low * ratio,
+            high=self.high * ratio,
+            capacity_ah=capacity_ah,
+            partner=f"{capacity_ah:.0f} Ah per 100 %",
+        )
 
     @property
     def start(self) -> int:
@@ -184,6 +213,11 @@ class Row:
     def steps(self) -> int:
         """Number of changes."""
         return int(np.count_nonzero(np.diff(self.field.raw[~self.missing])))
+
+
+def is_capacity(capacity_ah: float) -> bool:
+    """Return whether a pack may have this capacity: of a scooter to that of a truck."""
+    return 2.0 < capacity_ah < 600.0
 
 
 def overlap(one: Candidate, bits: frozenset[int], two: Candidate, others: frozenset[int]) -> bool:

@@ -3,14 +3,19 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from types import MappingProxyType
 from typing import Final
 
 from cangauge.bus.mapping import VehicleMap
 from cangauge.bus.vehicle import EXTENDED
-from cangauge.extras.discovery.pairs import CURRENT_SCALES, VOLTAGE_SCALES, Candidate
+from cangauge.extras.discovery.pairs import (
+    CURRENT_SCALES,
+    SOC_SCALES,
+    VOLTAGE_SCALES,
+    Candidate,
+    is_capacity,
+)
 
 UNITS: Final = {"current": "A", "voltage": "V", "temperature": "degC", "soc_reference": "%"}
 SIGNALS: Final = {
@@ -20,29 +25,21 @@ SIGNALS: Final = {
     "soc_reference": "soc_pct",
 }
 """Names of the signals in a DBC that is written."""
-FALLBACK_C: Final = 20.0
+_FALLBACK_C: Final = 20.0
 """Temperature of a map without one [°C]: the reference temperature of the voltage model."""
+_NOMINAL_CELL_V: Final = 3.7
+"""Nominal voltage of an oxide cell [V]: tells how many cells a scale would mean."""
+_LONGEST_PAIR_S: Final = 1.0
 
 
 @dataclass(frozen=True)
 class Assignment:
-    """A signal of a DBC with its role, and why.
-
-    Parameters
-    ----------
-    message, signal : str
-    sign : int
-    comments : tuple of str
-        Lines above its table in the map file.
-    not_available : int or None
-        Raw code without a value that the DBC does not name.
-    """
+    """A signal of a DBC with its role: `comments` are the lines above its table in the map."""
 
     message: str
     signal: str
     sign: int = 1
     comments: tuple[str, ...] = ()
-    not_available: int | None = None
 
 
 @dataclass(frozen=True)
@@ -58,12 +55,8 @@ class Proposal:
         Lines at the top.
     pair_within_s : float
     temperature_source : str
-    fixed_c : float
-        Temperature where no signal has it [°C].
-    periods_s : mapping of str to float
-        By message.
-    protection : mapping of str to str
-        Rule by message.
+    periods_s, protection : mapping
+        Period [s] and rule of protection by message.
     """
 
     name: str
@@ -72,9 +65,49 @@ class Proposal:
     comments: tuple[str, ...] = ()
     pair_within_s: float = 0.020
     temperature_source: str = "unknown"
-    fixed_c: float = FALLBACK_C
     periods_s: Mapping[str, float] = field(default_factory=dict)
     protection: Mapping[str, str] = field(default_factory=dict)
+
+
+# --- What the bits leave open
+
+
+@dataclass(frozen=True)
+class Level:
+    """What a usual scale of a field would mean."""
+
+    scale: float
+    value: float
+    """The pack's voltage in the middle of its range [V], or the largest SoC [%]."""
+    text: str
+
+
+def levels(role: str, candidate: Candidate, nominal_v: float | None) -> list[Level]:
+    """Return what the usual scales of a voltage or SoC mean, its own first.
+
+    Bits and the relation to the current are the same by every scale. One level where the scale is
+    known: a stated nominal voltage decides that of the voltage.
+    """
+    found = []
+    if role == "voltage" and nominal_v is None:
+        middle = (candidate.low + candidate.high) / 2.0 / candidate.scale
+        for scale in VOLTAGE_SCALES:
+            volts = scale * middle
+            text = f"{volts:.0f} V at {scale:g} V a step"
+            text += f" (about {round(volts / _NOMINAL_CELL_V)} cells)"
+            if scale == candidate.scale or 60.0 < volts < 1000.0:
+                found.append(Level(scale, volts, text))
+    if role == "soc_reference":
+        for scale in SOC_SCALES:
+            low, high = (end * scale / candidate.scale for end in (candidate.low, candidate.high))
+            capacity_ah = candidate.capacity_ah * candidate.scale / scale
+            text = f"{low:.3g} … {high:.3g} % at {scale:g} % a step ({capacity_ah:.0f} Ah)"
+            if scale == candidate.scale or (high <= 100.0 and is_capacity(capacity_ah)):
+                found.append(Level(scale, high, text))
+    return sorted(found, key=lambda level: (level.scale != candidate.scale, level.scale))
+
+
+# --- Proposals
 
 
 def message_name(candidate: Candidate) -> str:
@@ -82,75 +115,142 @@ def message_name(candidate: Candidate) -> str:
     return f"FRAME_{candidate.arbitration_id:X}"
 
 
+def by_physics(
+    chosen: Mapping[str, Candidate],
+    names: Mapping[str, Sequence[str]],
+    dbc: str,
+    nominal_v: float | None,
+    comments: Sequence[str],
+) -> Proposal:
+    """Return the map of fields that were found by physics.
+
+    Parameters
+    ----------
+    chosen : mapping of str to Candidate
+    names : mapping of str to sequence of str
+        All candidates by role.
+    dbc : str
+    nominal_v : float, optional
+        Stated voltage of the pack [V].
+    comments : sequence of str
+        How they were found.
+    """
+    roles = {}
+    for role, candidate in chosen.items():
+        unit = UNITS[role].replace("degC", "°C")
+        ends = f"{candidate.low:.5g} … {candidate.high:.5g} {unit}"
+        lines = [f"{candidate.name}: {ends}, {candidate.steps} steps."]
+        if role == "temperature":
+            lines.insert(0, "A guess by range and slowness: compare it with the car's display.")
+        elif role == "soc_reference":
+            lines.append(
+                f"Falls with the charge (r = {candidate.correlation:.2f}): {candidate.partner}."
+            )
+        else:
+            lines.append(_physics_line(candidate))
+        lines += _scale_lines(role, candidate, nominal_v)
+        others = [name for name in names[role] if name != candidate.name]
+        lines += [f"Else: {', '.join(others)}."] if others else []
+        message = message_name(candidate)
+        roles[role] = Assignment(message, SIGNALS[role], candidate.sign, tuple(lines))
+    current, voltage = chosen["current"], chosen["voltage"]
+    apart = current.arbitration_id != voltage.arbitration_id
+    slowest_s = max(current.period_s, voltage.period_s)
+    pair_s = min(max(0.020, 1.2 * slowest_s), _LONGEST_PAIR_S) if apart else 0.020
+    head = (
+        *comments,
+        "The bits do not determine the factors: compare voltage and current with a",
+        "meter or the car's display, and correct factor and offset in the DBC.",
+    )
+    return Proposal("own car", dbc, roles, head, pair_s)
+
+
+def _physics_line(candidate: Candidate) -> str:
+    if candidate.evidence < 1.0:
+        return "By the look of its bits alone: no current steps that a voltage follows."
+    one, two = candidate.halves_ohm
+    return (
+        f"ΔU = −R·ΔI with {candidate.partner}: R = {candidate.resistance_ohm:.3g} Ω, r = "
+        f"{candidate.correlation:+.2f}; by halves of the capture {one:.3g} and {two:.3g} Ω."
+    )
+
+
+def _scale_lines(role: str, candidate: Candidate, nominal_v: float | None) -> list[str]:
+    """Return how the scale of a field was determined, and which others may be."""
+    factor = f"Factor {candidate.scale:g}"
+    if role == "current":
+        zero = round(-candidate.offset / candidate.scale)
+        others = ", ".join(f"{scale:g}" for scale in CURRENT_SCALES if scale != candidate.scale)
+        found = "signed" if candidate.place.is_signed else "a round number near the most common"
+        return [
+            f"{factor} is the usual one that gives a plausible R; the data fit as well with"
+            f" {others}. No current at raw {zero}: {found}."
+        ]
+    if role == "voltage" and nominal_v is not None:
+        return [f"{factor} is the usual one nearest to the stated {nominal_v:g} V."]
+    others = "; ".join(level.text for level in levels(role, candidate, nominal_v)[1:])
+    return [f"{factor} is the likeliest; the data fit as well: {others}."] if others else []
+
+
+def of_preset(mapping: VehicleMap, dbc: str, comments: tuple[str, ...]) -> Proposal:
+    """Return the map of a preset."""
+    signals = {role: getattr(mapping, role) for role in SIGNALS}
+    messages = mapping.messages
+    return Proposal(
+        name=mapping.name,
+        dbc=dbc,
+        roles={
+            role: Assignment(str(signal.message), signal.signal, signal.sign)
+            for role, signal in signals.items()
+            if signal is not None and signal.signal
+        },
+        comments=comments,
+        pair_within_s=mapping.pair_within_s,
+        temperature_source=mapping.temperature_source,
+        periods_s={name: m.period_s for name, m in messages.items() if m.period_s is not None},
+        protection={name: m.protection for name, m in messages.items() if m.protection is not None},
+    )
+
+
+# --- Texts
+
+
 def dbc_text(chosen: Mapping[str, Candidate]) -> str:
     """Return a DBC with the chosen fields."""
     lines = ['VERSION "1"', "", "NS_ :", "", "BS_:", "", "BU_: Vehicle", ""]
-    keys = dict.fromkeys((each.arbitration_id, each.is_extended) for each in chosen.values())
+    by_id: dict[int, dict[str, Candidate]] = {}
+    for role, candidate in chosen.items():
+        key = candidate.arbitration_id | (EXTENDED if candidate.is_extended else 0)
+        by_id.setdefault(key, {})[role] = candidate
     values, cycles = [], []
-    for number, extended in keys:
-        own = {
-            role: each
-            for role, each in chosen.items()
-            if (each.arbitration_id, each.is_extended) == (number, extended)
-        }
+    for key, own in by_id.items():
         first = next(iter(own.values()))
-        key = number | (EXTENDED if extended else 0)
         lines.append(f"BO_ {key} {message_name(first)}: {first.length} Vehicle")
-        selector = next((each.selector for each in own.values() if each.selector), None)
+        selector = next((c.selector for c in own.values() if c.selector is not None), None)
         if selector is not None:
             start = 8 * (selector.first // 8) + 7 - selector.first % 8
             lines.append(f' SG_ selector M : {start}|{selector.width}@0+ (1,0) [0|0] "" Vehicle')
-        for role, each in own.items():
-            mark = "" if each.selector is None else f" m{each.selector.value}"
-            order, sign = int(not each.place.is_motorola), "-" if each.place.is_signed else "+"
+        for role, candidate in own.items():
+            place, code = candidate.place, candidate.not_available
+            mark = "" if candidate.selector is None else f" m{candidate.selector.value}"
+            order, sign = int(not place.is_motorola), "-" if place.is_signed else "+"
             lines.append(
-                f" SG_ {SIGNALS[role]}{mark} : {each.start}|{each.place.width}@{order}{sign}"
-                f' ({each.scale:.10g},{each.offset + 0.0:.10g}) [0|0] "{UNITS[role]}" Vehicle'
+                f" SG_ {SIGNALS[role]}{mark} : {candidate.start}|{place.width}@{order}{sign}"
+                f' ({candidate.scale:.10g},{candidate.offset + 0.0:.10g}) [0|0] "{UNITS[role]}"'
+                " Vehicle"
             )
-            if each.not_available is not None:
-                values.append(f'VAL_ {key} {SIGNALS[role]} {each.not_available} "not available" ;')
+            if code is not None:
+                values.append(f'VAL_ {key} {SIGNALS[role]} {code} "not available" ;')
         lines.append("")
         cycles.append(f'BA_ "GenMsgCycleTime" BO_ {key} {max(round(1e3 * first.period_s), 1)};')
     lines += ['BA_DEF_ BO_ "GenMsgCycleTime" INT 0 65535;', 'BA_DEF_DEF_ "GenMsgCycleTime" 0;']
     return "\n".join([*lines, *cycles, "", *values, ""])
 
 
-def voltage_levels(candidate: Candidate) -> list[tuple[float, float]]:
-    """Return usual scales [V] of a voltage and the pack's voltage by each [V], its own first.
-
-    Bits and the relation to the current are the same by every scale.
-    """
-    middle = (candidate.low + candidate.high) / 2.0 / candidate.scale
-    own = (candidate.scale, candidate.scale * middle)
-    others = [(each, each * middle) for each in sorted(VOLTAGE_SCALES) if each != candidate.scale]
-    return [own, *((scale, volts) for scale, volts in others if 60.0 < volts < 1000.0)]
-
-
-def scale_line(role: str, candidate: Candidate, nominal_v: float | None) -> str:
-    """Return how the scale of a current or a voltage was determined, and which others may be."""
-    usual = VOLTAGE_SCALES if role == "voltage" else CURRENT_SCALES
-    others = [each for each in sorted(usual) if each != candidate.scale]
-    if role == "current":
-        zero = round(-candidate.offset / candidate.scale)
-        return (
-            f"Factor {candidate.scale:g} is the usual one that gives a plausible R; the data fit as"
-            f" well with {', '.join(f'{each:g}' for each in others)}. No current at raw {zero}:"
-            f" {'signed' if candidate.place.is_signed else 'a round number near the most common'}."
-        )
-    shown = [f"{scale:g} ({volts:.0f} V)" for scale, volts in voltage_levels(candidate)[1:]]
-    if nominal_v is not None:
-        return f"Factor {candidate.scale:g} is the usual one nearest to the stated {nominal_v:g} V."
-    return (
-        f"Factor {candidate.scale:g} is the usual one with the likeliest level"
-        + (f"; the data fit as well with {', '.join(shown)}" if shown else "")
-        + ". --nominal-voltage decides."
-    )
-
-
 def map_text(proposal: Proposal) -> str:
     """Return a commented map file."""
-    lines = [f"# {line}" for line in proposal.comments]
-    lines += [
+    lines = [
+        *(f"# {line}" for line in proposal.comments),
         "",
         f"name = {_quoted(proposal.name)}",
         f"dbc = {_quoted(proposal.dbc)}",
@@ -159,28 +259,23 @@ def map_text(proposal: Proposal) -> str:
         f"pair_within_s = {proposal.pair_within_s:.3g}"
         "  # current and voltage at most this far apart make a sample [s]",
     ]
-    for role in ("current", "voltage", "temperature", "soc_reference"):
-        each = proposal.roles.get(role)
-        if each is None:
-            if role == "temperature":
-                lines += [
-                    "",
-                    "# No temperature is known on this bus: a fixed one is assumed. Kt makes an"
-                    " error of some °C",
-                    "# worth several % SoC: name a signal here when you find one.",
-                    "[temperature]",
-                    f"fixed_c = {proposal.fixed_c:g}",
-                ]
-            continue
-        lines += ["", *(f"# {line}" for line in each.comments), f"[{role}]"]
-        lines += [f"message = {_quoted(each.message)}", f"signal = {_quoted(each.signal)}"]
-        if role == "current":
-            lines.append(
-                f"sign = {each.sign}  # "
-                + ("positive current discharges" if each.sign > 0 else "negative discharges")
-            )
-        if each.not_available is not None:
-            lines.append(f"not_available = [{each.not_available}]")
+    for role in SIGNALS:
+        found = proposal.roles.get(role)
+        if found is not None:
+            lines += ["", *(f"# {line}" for line in found.comments), f"[{role}]"]
+            lines += [f"message = {_quoted(found.message)}", f"signal = {_quoted(found.signal)}"]
+        if found is not None and role == "current":
+            way = "positive current discharges" if found.sign > 0 else "negative discharges"
+            lines.append(f"sign = {found.sign}  # {way}")
+    if "temperature" not in proposal.roles:
+        lines += [
+            "",
+            "# No temperature is known on this bus: a fixed one is assumed. Kt makes an error of"
+            " some °C",
+            "# worth several % SoC: name a signal here when you find one.",
+            "[temperature]",
+            f"fixed_c = {_FALLBACK_C:g}",
+        ]
     for message in dict.fromkeys([*proposal.periods_s, *proposal.protection]):
         lines += ["", f"[messages.{message}]"]
         if message in proposal.protection:
@@ -190,33 +285,12 @@ def map_text(proposal: Proposal) -> str:
     return "\n".join([*lines, ""]).lstrip("\n")
 
 
-def mapped(mapping: VehicleMap, dbc: str, comments: tuple[str, ...]) -> Proposal:
-    """Return the proposal that a preset's mapping makes."""
-    roles = {}
-    for role in ("current", "voltage", "temperature", "soc_reference"):
-        signal = getattr(mapping, role)
-        if signal is not None and signal.signal:
-            roles[role] = Assignment(str(signal.message), signal.signal, signal.sign)
-    messages = mapping.messages
-    return Proposal(
-        name=mapping.name,
-        dbc=dbc,
-        roles=roles,
-        comments=comments,
-        pair_within_s=mapping.pair_within_s,
-        temperature_source=mapping.temperature_source,
-        periods_s={name: m.period_s for name, m in messages.items() if m.period_s is not None},
-        protection={name: m.protection for name, m in messages.items() if m.protection is not None},
-    )
-
-
 def config_text(
-    *,
     vehicle: str | None,
     map_name: str,
     interface: str | None,
     channel: str | None,
-    bus_options: Mapping[str, object] = MappingProxyType({}),
+    bus_options: Mapping[str, object],
 ) -> str:
     """Return a commented configuration of the service."""
     lines = [

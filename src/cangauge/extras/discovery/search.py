@@ -17,17 +17,19 @@ import numpy as np
 
 from cangauge._typing import FloatArray
 from cangauge.errors import InputError
-from cangauge.extras.discovery.fields import Field, Place, Stream, byte_order, collect, fields_of
+from cangauge.extras.discovery.fields import Field, Stream, byte_order, collect, fields_of
 from cangauge.extras.discovery.pairs import (
     CLEARLY_NATS,
     IMPOSSIBLE,
     LARGEST_R2,
     MOST_ROWS,
     SHOWN,
+    SOC_SCALES,
     VOLTAGE_SCALES,
     Candidate,
     Pairs,
     Row,
+    is_capacity,
     most_common,
     overlap,
     round_zeros,
@@ -81,6 +83,14 @@ class Findings:
     streams: int
     fields: int
     duration_s: float
+
+    @property
+    def comments(self) -> tuple[str, ...]:
+        """What was looked at and not found, for the head of a map."""
+        found = f"Found by physics in {self.duration_s:.0f} s of frames: {self.fields} numbers of"
+        hints = [f"{c.name} ({c.low:.3g} … {c.high:.3g} °C)" for c in self.temperature]
+        slow = [f"Slow and plausible as a temperature: {', '.join(hints)}."] if hints else []
+        return (f"{found} {self.streams} ids.", *self.remarks, *slow)
 
     def is_clear(self, role: str) -> bool:
         """Whether the first candidate is certain enough to be taken without the user."""
@@ -144,7 +154,6 @@ class _Search:
     def findings(self) -> Findings:
         currents = [row for each in range(len(self._fields)) if (row := self._as_current(each))]
         voltages = [row for each in range(len(self._fields)) if (row := self._as_voltage(each))]
-        voltages += self._constant_voltages(currents)
         # All pairs are held in memory: of the largest buses, the likelier fields.
         currents = sorted(currents, key=lambda row: -row.prior)[:MOST_CURRENTS]
         voltages = sorted(voltages, key=lambda row: -row.prior)[:MOST_VOLTAGES]
@@ -253,17 +262,6 @@ class _Search:
                     best = Row(field, place, prior, scale, level, constant, missing)
         return best
 
-    def _constant_voltages(self, currents: Sequence[Row]) -> list[Row]:
-        """Return constant fields beside a likely current: a pack at rest keeps its voltage."""
-        likely = sorted(currents, key=lambda row: -row.prior)[:20]
-        rows = []
-        for index in dict.fromkeys(row.field.stream for row in likely):
-            stream = self._streams[index]
-            if stream.period_s > 0.11:
-                continue
-            rows += _constants(index, stream, self._rate_prior(stream), self._nominal_v)
-        return rows
-
     def _grid(self, row: Row) -> FloatArray:
         """Return the mean of a field by slot of the grid; empty slots keep the last value."""
         rows, good = len(self._edges) - 1, ~row.missing
@@ -317,7 +315,7 @@ class _Search:
             seen = self._statistics[index]
             if each.place.is_signed or seen.count < 4:
                 continue
-            made = self._as_charge(each, drawn_ah[span], span)
+            made = self._as_charge(index, drawn_ah[span], span)
             if made is not None:
                 found.append(made)
         return _apart(found)[:SHOWN]
@@ -330,8 +328,8 @@ class _Search:
         longest = int((filled[lasts] - filled[firsts]).argmax())
         return slice(int(filled[firsts[longest]]), int(filled[lasts[longest]]) + 1)
 
-    def _as_charge(self, field: Field, drawn_ah: FloatArray, span: slice) -> Candidate | None:
-        best = None
+    def _as_charge(self, index: int, drawn_ah: FloatArray, span: slice) -> Candidate | None:
+        best, field = None, self._fields[index]
         for place, nature, constant in field.extensions:
             row = Row(field, place, 0.0, 1.0, 0.0, constant, field.missing)
             values = self._grid(row)[span] + constant
@@ -343,25 +341,23 @@ class _Search:
             if r > -0.95:
                 continue
             per_ah = spread / moved
-            for scale in (0.1, 0.5, 0.01, 1.0, 0.05, 0.025, 0.02, 0.4):
+            for scale in SOC_SCALES:
                 level = values * scale
                 capacity_ah = 100.0 / (per_ah * scale)
-                if not (level.min() > 0.0 and level.max() <= 101.0 and 2.0 < capacity_ah < 600.0):
+                if not (level.min() > 0.0 and level.max() <= 101.0 and is_capacity(capacity_ah)):
                     continue
                 full = (1 << place.width) * scale
                 prior = nature - 0.5 * (math.log(capacity_ah / 90.0) / 0.8) ** 2
                 prior -= 0.0 if full <= 300.0 or scale <= 0.02 else 0.5
-                events = float(self._statistics_of(field).count)
+                events = float(self._statistics[index].count)
                 evidence = -0.5 * events * math.log(1.0 - min(r * r, LARGEST_R2))
                 if best is None or prior + evidence > best.score:
                     best = self._candidate(
                         row, scale, 0.0, sign=1, score=prior + evidence, evidence=evidence,
                         correlation=r, partner=f"{capacity_ah:.0f} Ah per 100 %",
+                        capacity_ah=capacity_ah,
                     )  # fmt: skip
         return best
-
-    def _statistics_of(self, field: Field) -> _Statistics:
-        return _Statistics.of(field)
 
     def _temperatures(
         self, taken: Sequence[tuple[Candidate, frozenset[int]]]
@@ -451,49 +447,6 @@ def _full_scale_prior(scale: float, width: int) -> float:
     if full > 1400.0:
         return -0.3 if scale <= 0.1 else -2.0
     return -1.0
-
-
-def _constants(  # noqa: C901 - one walk over the places
-    index: int, stream: Stream, rate: float, nominal_v: float | None
-) -> list[Row]:
-    """Return constant fields at the voltage of a car's pack."""
-    rows = []
-    bits = np.unpackbits(stream.payload, axis=1)
-    # Wake-up codes: judged by the second half of the frames.
-    later = bits[len(bits) // 2 :]
-    still = (later == later[0]).all(0)
-    length = stream.length
-    for is_motorola in (True, False):
-        for first in range(0, 8 * length, 4):
-            for width in (10, 12, 16) if is_motorola else (12, 16):
-                last = first + width - 1
-                if last >= 8 * length or (not is_motorola and last % 8 != 7):
-                    continue
-                if is_motorola and first % 8 and width != 12:
-                    continue
-                place = Place(is_motorola, first, last, is_signed=False)
-                where = np.arange(first, last + 1)
-                if not is_motorola:
-                    where = 8 * (length - 1 - where // 8) + where % 8
-                if not still[where].all():
-                    continue
-                weights = 1 << np.arange(width - 1, -1, -1)
-                raw = (bits[:, where] @ weights).astype(np.int32)
-                level = float(raw[-1])
-                if level > 0.95 * (1 << width):
-                    continue
-                missing = np.asarray(raw != raw[-1])
-                for scale, usual in VOLTAGE_SCALES.items():
-                    likely = _level_prior(level * scale, nominal_v)
-                    if likely < -1.0:
-                        continue
-                    prior = rate + usual + _full_scale_prior(scale, width) - 0.5
-                    prior += {16: 0.6, 12: 0.4, 10: 0.2}[width]
-                    rows.append(
-                        Row(Field(index, place, raw, missing, 0.0), place, prior, scale, level, 0,
-                             missing)
-                    )  # fmt: skip
-    return rows
 
 
 def _apart(found: list[Candidate]) -> tuple[Candidate, ...]:
