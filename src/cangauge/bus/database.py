@@ -93,18 +93,14 @@ class Condition:
 
 @dataclass(frozen=True, slots=True)
 class SignalCodec:
-    """Conversion of one signal between payload and physical value.
+    """Conversion of one signal: value = gain × (raw × factor + offset) + shift.
 
     Parameters
     ----------
-    name, unit : str
+    name, unit, factor, offset : str, float
         In the DBC.
-    field : Field
-    is_signed : bool
-    float_format : str
-        `struct` format of an IEEE float, "" for integers.
-    factor, offset, gain, shift : float
-        value = gain × (raw × factor + offset) + shift; the first two are the DBC's.
+    field, is_signed, float_format : Field, bool, str
+        Bits; `float_format` is the `struct` format of an IEEE float, "" for integers.
     not_available : frozenset of int
         Raw codes without a value.
     conditions : tuple of Condition
@@ -164,10 +160,7 @@ class SignalCodec:
     def encode_into(self, payload: bytearray, value: float) -> None:
         """Set the signal and its multiplexers; NaN becomes the first "not available" code.
 
-        Raises
-        ------
-        InputError
-            If the value does not fit, or is NaN and there is no such code.
+        Raises InputError if the value does not fit, or is NaN and there is no such code.
         """
         for condition in self.conditions:
             condition.field.put(payload, min(condition.values))
@@ -250,12 +243,10 @@ def signal_codec(
 
     Parameters
     ----------
-    message, signal : cantools.database.can.Message, cantools.database.can.Signal
     source, field : object, str
         For error messages: the file, and the name of the entry in the map file.
     not_available : tuple of int
-        Raw codes without a value, besides those that the value table names "not available",
-        "SNA", "invalid", ….
+        Raw codes without a value, besides those that the value table names so.
     when : dict of str to int, optional
         Further conditions: raw values of other signals of the message.
 
@@ -327,11 +318,7 @@ def load_dbc(path: str | PathLike[str]) -> Database:
     """Read a DBC file, or an ARXML, KCD or SYM file by its suffix.
 
     Overlapping signals are accepted: many files have some in messages that are not wanted.
-
-    Raises
-    ------
-    InputError
-        If the file is absent, larger than `MAX_DBC_BYTES`, or not a DBC.
+    Raises InputError if the file is absent, larger than `MAX_DBC_BYTES`, or not a DBC.
     """
     path = Path(path)
     kind = _KINDS.get(path.suffix.lower(), "dbc")
@@ -362,10 +349,7 @@ def load_dbc(path: str | PathLike[str]) -> Database:
 def find_message(database: Database, message: str | int, *, source: object, field: str) -> Message:
     """Return the message of that name or id ("PackStatus", 475, "0x1DB").
 
-    Raises
-    ------
-    InputError
-        If there is none (with the closest names) or more than one.
+    Raises InputError if there is none (with the closest names) or more than one.
     """
     wanted: int | None = None
     with suppress(ValueError):
@@ -390,10 +374,7 @@ def find_signal(
 ) -> tuple[Message, Signal]:
     """Return a signal and its message; without a message, the only signal of that name.
 
-    Raises
-    ------
-    InputError
-        If there is none (with the closest names) or more than one.
+    Raises InputError if there is none (with the closest names) or more than one.
     """
     owners = [each for each in database.messages if _signal(each, signal)]
     if message is not None:

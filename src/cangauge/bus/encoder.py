@@ -70,18 +70,9 @@ class FrameEncoder:
     def encode(self, sample: Sample, soc_reference_pct: float | None = None) -> list[can.Message]:
         """Return the frames of one sample, in sending order.
 
-        Parameters
-        ----------
-        sample : Sample
-            A frame whose values are all NaN is not sent; a NaN among others becomes the DBC's
-            code for "not available".
-        soc_reference_pct : float, optional
-            Sent where the vehicle has such a signal; None or NaN: not sent.
-
-        Raises
-        ------
-        InputError
-            If a value does not fit into its signal, or is NaN without such a code.
+        A frame whose values are all NaN is not sent; a NaN among others becomes the DBC's code for
+        "not available". InputError is raised if a value does not fit into its signal, or has no
+        such code.
         """
         values = {
             "current": sample.current_a,
@@ -118,12 +109,9 @@ class FrameEncoder:
         )
 
     def check_range(self, log: Log) -> None:
-        """Check that every value of a log fits into its signal, before anything is sent.
+        """Raise InputError for the first signal that is too narrow for a log, before sending.
 
-        Raises
-        ------
-        InputError
-            Names the first signal that is too narrow, its range, the value and its row.
+        It names the signal, its range, the value and its row.
         """
         for signal, column, values in self._columns(log):
             bad = np.flatnonzero(~signal.codec.fits(values))

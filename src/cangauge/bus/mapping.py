@@ -76,19 +76,10 @@ class CheckMap(_Strict):
 class SignalMap(CheckMap):
     """One signal of the DBC: value = sign × scale × (DBC value) + offset.
 
-    Parameters
-    ----------
-    message : str or int, optional
-        Name or id; optional where the signal's name is unique in the DBC.
-    signal : str
-    sign : {1, -1}
-        -1 where the bus has the opposite sign (current: negative = discharge).
-    scale, offset : float
-        For a DBC with a wrong or unknown unit; stating either also overrides the DBC's unit.
-    when : dict of str to int
-        Raw values that other signals of the frame must have (multiplexers missing in the DBC).
-    not_available : tuple of int
-        Raw codes without a value, besides those named so in the DBC's value table.
+    `message` is a name or id, optional where the signal's name is unique. `sign` is −1 where the
+    bus has the opposite sign (current: negative = discharge). Stating `scale` or `offset` overrides
+    the DBC's unit. `when` are raw values that other signals of the frame must have (multiplexers
+    missing in the DBC), `not_available` raw codes without a value besides those of the value table.
     """
 
     message: str | int | None = None
@@ -121,17 +112,9 @@ class TemperatureMap(SignalMap):
 class CellsMap(_Strict):
     """Voltages of the cells in series: one signal a cell, or groups numbered by a signal.
 
-    Parameters
-    ----------
-    count, first : int
-        Number of cells; number of the first.
-    signal, message : str, optional
-        Name of a cell's signal and of its message, with "{n}" for the cell's number.
-    index, signals, first_index : str, tuple of str, int
-        Signal whose raw value numbers the group in a frame; signals of a group, in the order of
-        the cells; number of the first group.
-    scale, offset, not_available, lowest, highest, timeout_s
-        As in `SignalMap` [V, s].
+    `signal` and `message` are names with "{n}" for the cell's number, from `first` on; or the raw
+    value of `index` numbers the group in a frame, from `first_index` on, and `signals` are those of
+    a group, in the order of the cells. The other keys are as in `SignalMap` [V, s].
     """
 
     count: Annotated[int, Field(ge=2, le=CELLS_AT_MOST)]
@@ -185,21 +168,11 @@ def _numbered(name: str | int | None, number: int) -> str | int | None:
 class MessageMap(_Strict):
     """Protection and period of a message.
 
-    Parameters
-    ----------
-    protection : str, optional
-        One of `protection.RULES`, of [rules] or of `protection.PROFILES`, or "counter".
-    j1939, isotp : bool
-        Whether its PGN identifies it, from any source address and at any priority; whether it is a
-        reply over ISO-TP, with the id of `polling.reply_key` in the DBC.
-    request_id : int, optional
-        Standard id on which the service may ask for this reply.
-    period_s : float, optional
-        Frame period [s].
-    data_id, data_id_list, data_id_mode, header_byte, protected_bytes
-        For a profile; see `E2eRule`.
-    counter, counter_modulus : str, int, optional
-        For "counter": its signal; number of its values, by default all that its bits can hold.
+    `protection` is one of `protection.RULES`, of [rules] or of `protection.PROFILES` (see `E2eRule`
+    for their keys), or "counter", with its signal and the number of its values, by default all that
+    its bits can hold. `j1939`: its PGN identifies it, from any source address and at any priority.
+    `isotp`: it is a reply over ISO-TP, with the id of `polling.reply_key` in the DBC, which the
+    service may ask for on `request_id`.
     """
 
     protection: str | None = None
@@ -222,12 +195,8 @@ class MessageMap(_Strict):
     ) -> Protection | None:
         """Return the protection of a message; None where none is stated.
 
-        `rules` are the user's own, `source` is the file for error messages.
-
-        Raises
-        ------
-        InputError
-            If the rule is unknown, does not fit, lacks a field or has one of another protection.
+        `rules` are the user's own, `source` is the file for error messages. Raises InputError if
+        the rule is unknown, does not fit, lacks a field or has one of another protection.
         """
         try:
             return self._rule(message, rules)
@@ -313,22 +282,10 @@ class RuleMap(_Strict):
 class VehicleMap(_Strict):
     """Content of a map file.
 
-    Parameters
-    ----------
-    name : str
-    dbc : tuple of str
-        DBC files, relative to the map file; searched after `--dbc`.
-    current, voltage, temperature, soc_reference : SignalMap
-        The temperature may be given as an option; `soc_reference` (also: `soc`) is the car's own
-        state of charge, to begin from and to compare with.
-    columns : dict
-        Columns of the car's logs that are tables (`logs.column_map.ColumnMap`).
-    cells : CellsMap, optional
-    temperature_source : {"cell", "pack", "coolant", "room", "unknown"}
-    pair_within_s : float
-        Largest distance in bus time between paired current and voltage [s].
-    messages, rules : dict of str to MessageMap or RuleMap
-        Messages by name or id; rules by name.
+    `dbc` are files relative to it, searched after `--dbc`. The temperature may be given as an
+    option; `soc_reference` (also: `soc`) is the car's own state of charge. `columns` are those of
+    the car's logs that are tables (`logs.column_map.ColumnMap`). `pair_within_s` is the largest
+    distance in bus time between paired current and voltage [s]. Messages go by name or id.
     """
 
     name: str = "own map"
@@ -380,14 +337,8 @@ _NONE: Final[Mapping[str, Any]] = MappingProxyType({})
 class Overrides:
     """Protection and checks of a service configuration, which override the car's map file.
 
-    Parameters
-    ----------
-    source : str
-        The file, for error messages.
-    messages, rules : mapping of str to MessageMap or RuleMap
-        Messages by name or id; missing fields are taken from the map file.
-    checks : mapping of str to CheckMap
-        By role: "current", "voltage", "temperature", "soc_reference".
+    `source` is the file, for error messages. Messages go by name or id, checks by role; missing
+    fields are taken from the map file.
     """
 
     source: str = ""

@@ -244,11 +244,8 @@ def _layouts() -> dict[str, _Layout]:
 class SocPublisher:
     """Encode estimates, health, power and cells as frames.
 
-    Parameters
-    ----------
-    ids : FrameIds, optional
-    acknowledge_every : int, optional
-        Send SOC_DETAIL after this number of samples, and at a beat with unacknowledged ones.
+    With `acknowledge_every`, SOC_DETAIL is sent after this number of samples, and at a beat with
+    unacknowledged ones.
     """
 
     def __init__(self, ids: FrameIds | None = None, acknowledge_every: int | None = None) -> None:
@@ -272,15 +269,8 @@ class SocPublisher:
     ) -> list[can.Message]:
         """Return the frames of one beat; due every `ESTIMATE_EVERY_S`.
 
-        Parameters
-        ----------
-        estimate : Estimate
-        samples : int
-            Samples processed so far, including refused ones.
-        age_s : float
-            Time since the latest of them [s]; NaN: none yet.
-        report : callable, optional
-            Returns health, power and cells; called where their frames are due.
+        `samples` are those processed so far, including refused ones; `age_s` is the time since the
+        latest of them [s], NaN without one. `report` is called where its frames are due.
         """
         frames = [self.estimate_frame(estimate, age_s)]
         is_due = self._beats % DETAIL_EVERY_BEATS == 0

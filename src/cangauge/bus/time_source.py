@@ -63,13 +63,8 @@ class ReceiveTime:
     """Receive stamps.
 
     After a step back of more than `STEP_BACK_US` time continues from the latest stamp, so that
-    setting the clock does not stop the estimate. A step forward is a gap. Stamps that step back
-    again and again are irregular: none of these steps then counts as a clock that was set.
-
-    Attributes
-    ----------
-    steps_back, irregular : int
-        Number of such steps; number of steps back that were not taken for one.
+    setting the clock does not stop the estimate (`steps_back`). A step forward is a gap. Stamps
+    that step back again and again are `irregular`: none of these steps then counts as a set clock.
     """
 
     def __init__(self) -> None:
@@ -139,19 +134,14 @@ class StampLimiter:
     """Limit stamps to the interval in which the frames can have arrived by the monotonic clock.
 
     A frame received now arrived after the receive queue was last seen empty. A stamp outside this
-    interval is replaced by the time of reading; so bus time keeps the right rate whatever the
-    stamps do. Stamps that are off by a constant amount come from a clock that was set: they are
-    shifted from then on, and exact again.
-
-    Parameters
-    ----------
-    tolerance_s : float
-        Difference that is no error [s].
-    offset_s : float
-        Stamps, and so bus time, minus monotonic time [s]; NaN: known from the first frame.
+    interval, by more than `tolerance_s`, is replaced by the time of reading; so bus time keeps the
+    right rate whatever the stamps do. Stamps that are off by a constant amount come from a clock
+    that was set: they are shifted from then on, and exact again.
 
     Attributes
     ----------
+    offset_s : float
+        Stamps, and so bus time, minus monotonic time [s]; NaN: known from the first frame.
     shift_s, limited : float, int
         Added to the stamps at present [s]; number of stamps replaced.
     """

@@ -129,23 +129,11 @@ class MessageProtection(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Vehicle:
-    """Signals of a vehicle, ready to decode and encode.
+    """Signals of a vehicle, ready to decode and encode; None: the vehicle has none.
 
-    Parameters
-    ----------
-    name : str
-    current, voltage, temperature, soc_reference : VehicleSignal
-        None: the vehicle has none.
-    fixed_temperature_c : float
-        Temperature where no signal has it [°C]; NaN: none.
-    temperature_source : {"cell", "pack", "coolant", "room", "unknown"}
-    pair_within_s : float
-        Largest distance in bus time between paired current and voltage [s].
-    messages : dict of int to MessageProtection
-        By key (id, plus `EXTENDED`), for every message with a wanted signal.
-    dbc_files : tuple of str
-    cells : CellSignals or None
-        Voltages of the cells.
+    `fixed_temperature_c` is the temperature where no signal has it [°C], or NaN. `pair_within_s` is
+    the largest distance in bus time between paired current and voltage [s]. `messages` has every
+    message with a wanted signal, by key (id, plus `EXTENDED`).
     """
 
     name: str
