@@ -127,9 +127,9 @@ class CellsMap(_Strict):
     scale: _Positive = 1.0
     offset: FiniteFloat = 0.0
     not_available: tuple[int, ...] = ()
-    lowest: FiniteFloat | None = None
-    highest: FiniteFloat | None = None
-    timeout_s: _Positive | None = None
+    lowest: FiniteFloat = 0.2
+    highest: FiniteFloat = 6.0  # below and above any lithium cell
+    timeout_s: _Positive = 10.0  # large packs send a round of cells in some seconds
 
     @model_validator(mode="after")
     def _one_of_both(self) -> Self:

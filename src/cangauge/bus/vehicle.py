@@ -48,18 +48,11 @@ LOG_COLUMNS: Final = {
 
 EXTENDED: Final = 1 << 31
 """Flag of an extended id in a message key (arbitration id), as in SocketCAN."""
-CELL_TIMEOUT_S: Final = 10.0
-"""Age of a cell's voltage above which it is not known [s]: large packs send a round of cells in
-some seconds."""
-CELL_WITHIN_V: Final = (0.2, 6.0)
-"""Plausible voltages of a cell [V], where none are stated: below and above any lithium cell."""
 
 
 def pgn_mask(key: int) -> int:
-    """Return the bits of an extended id that are its PGN (SAE J1939-21).
-
-    Below 0xF0 the PDU format is followed by a destination, which is no part of the PGN.
-    """
+    """Return the bits of an extended id that are its PGN (SAE J1939-21)."""
+    # Below 0xF0 the PDU format is followed by a destination, which is no part of the PGN.
     return 0x03FF0000 if (key >> 16 & 0xFF) < 0xF0 else 0x03FFFF00
 
 
@@ -101,11 +94,11 @@ class CellSignals:
     count: int
     first: int
     cells: tuple[VehicleSignal, ...]
-    index: BitField | None = None
-    first_index: int = 0
-    lowest_v: float = CELL_WITHIN_V[0]
-    highest_v: float = CELL_WITHIN_V[1]
-    timeout_s: float = CELL_TIMEOUT_S
+    index: BitField | None
+    first_index: int
+    lowest_v: float
+    highest_v: float
+    timeout_s: float
 
     @property
     def keys(self) -> tuple[int, ...]:
@@ -231,9 +224,8 @@ class Vehicle:
         """Ids of the frames with a wanted signal, plus `EXTENDED`, each once."""
         keys = [signal.key for signal in self.signals]
         keys += () if self.cells is None else self.cells.keys
-        return tuple(
-            dict.fromkeys(reply_id(key) if self.messages[key].is_reply else key for key in keys)
-        )
+        ids = (reply_id(key) if self.messages[key].is_reply else key for key in keys)
+        return tuple(dict.fromkeys(ids))
 
     @property
     def wanted_ids(self) -> tuple[int, ...]:
@@ -308,12 +300,9 @@ class _Binder:
                 raise InputError(problem, source=self._source, field="cells.signals")
             numbering = SignalMap(message=wanted.message, signal=wanted.index, scale=1.0)
             index = self._signal("cells", numbering).codec.field
-        low, high = CELL_WITHIN_V
         return CellSignals(
             wanted.count, wanted.first, cells, index, wanted.first_index,
-            low if wanted.lowest is None else wanted.lowest,
-            high if wanted.highest is None else wanted.highest,
-            wanted.timeout_s or CELL_TIMEOUT_S,
+            wanted.lowest, wanted.highest, wanted.timeout_s,
         )  # fmt: skip
 
     def _in_first(self, find: Callable[[Database, Path], _T]) -> tuple[_T, Path]:
@@ -362,13 +351,12 @@ class _Binder:
                 np.array([0.0, 1.0]), column, codec.unit, source=self._source, label=codec.name
             )
         except InputError as error:
+            problem = f"the unit of {codec.name} in the DBC is unknown for {column}"
+            cure = "name another signal, or state scale and offset in the map file"
+            cure += " (scale = 1 takes the values as they are)"
+            where = f"{role}.signal"
             raise InputError(
-                f"the unit of {codec.name} in the DBC is unknown for {column}",
-                source=self._source,
-                field=f"{role}.signal",
-                value=codec.unit,
-                cure="name another signal, or state scale and offset in the map file"
-                " (scale = 1 takes the values as they are)",
+                problem, source=self._source, field=where, value=codec.unit, cure=cure
             ) from error
         return float(ends[1] - ends[0]), float(ends[0])
 
@@ -382,13 +370,10 @@ class _Binder:
             cycle_ms: object = message.cycle_time  # not a number in some DBC files
             is_known = isinstance(cycle_ms, int | float) and 0.0 < cycle_ms < math.inf
             dbc_s = float(str(cycle_ms)) / 1000.0 if is_known else None
-            protections[key] = MessageProtection(
-                each.rule(message, rules, source=source),
-                dbc_s if each.period_s is None else each.period_s,
-                each.isotp,
-                each.j1939,
-                each.request_id,
-            )
+            rule = each.rule(message, rules, source=source)
+            period_s = dbc_s if each.period_s is None else each.period_s
+            more = each.isotp, each.j1939, each.request_id
+            protections[key] = MessageProtection(rule, period_s, *more)
         return protections
 
     def _message_key(self, name: str) -> int:
