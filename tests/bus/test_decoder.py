@@ -1,39 +1,37 @@
-"""Decoding of frames into samples."""
+"""Frames → samples: acceptance, pairing, cells, and the signals of known cars."""
 
 from __future__ import annotations
 
 import math
+import os
 from dataclasses import replace
+from pathlib import Path
 
 import can
+import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
-from cangauge.bus.decoder import SampleDecoder
+from cangauge._resources import shared_file
+from cangauge.bus.decoder import Pairing, SampleDecoder
 from cangauge.bus.encoder import FrameEncoder
+from cangauge.bus.open import bus_address
 from cangauge.bus.protection import LEAF_RULE
-from cangauge.bus.vehicle import EXTENDED, Vehicle
+from cangauge.bus.vehicle import EXTENDED, Vehicle, pgn_mask
+from cangauge.errors import InputError
 from cangauge.types import Sample
+from cells_bus import CAR, CELLS_DBC, cell_frames, numbered_frames
+from fd_pack import estimates_from_64_bytes, fd_frame, fd_vehicle
 
 CURRENT_ID, VOLTAGE_ID, TEMPERATURE_ID, SOC_ID = 0x400, 0x401, 0x402, 0x403
+GENERIC, LEAF = Vehicle.load("generic"), Vehicle.load("leaf_ze0")
 
 
-@pytest.fixture(scope="module")
-def generic() -> Vehicle:
-    return Vehicle.load("generic")
-
-
-@pytest.fixture(scope="module")
-def leaf() -> Vehicle:
-    return Vehicle.load("leaf_ze0")
-
-
-def frames_of(
-    vehicle: Vehicle, count: int = 10, step_s: float = 0.1, soc: float | None = 50.0
-) -> list[can.Message]:
-    encoder = FrameEncoder(vehicle)
-    frames = []
+def frames_of(vehicle: Vehicle, count: int = 10, step_s: float = 0.1) -> list[can.Message]:
+    encoder, frames = FrameEncoder(vehicle), []
     for n in range(count):
-        frames += encoder.encode(Sample(n * step_s, float(n), 380.0 + n, 20.0), soc)
+        frames += encoder.encode(Sample(n * step_s, float(n), 380.0 + n, 20.0), 50.0)
     return frames
 
 
@@ -41,206 +39,340 @@ def feed(decoder: SampleDecoder, frames: list[can.Message]) -> list[Sample]:
     return [sample for frame in frames if (sample := decoder.handle(frame)) is not None]
 
 
+def currents(decoder: SampleDecoder, frames: list[can.Message]) -> list[float]:
+    return [each.current_a for each in feed(decoder, frames)]
+
+
+def frame(number: int, data: bytes, time_s: float = 1.0, *, wide: bool = False) -> can.Message:
+    return can.Message(timestamp=time_s, arbitration_id=number, is_extended_id=wide, data=data)
+
+
 def leaf_frame(hex_data: str, time_s: float, counter: int) -> can.Message:
-    data = LEAF_RULE.protect(bytes.fromhex(hex_data), counter)
-    return can.Message(timestamp=time_s, arbitration_id=0x1DB, is_extended_id=False, data=data)
+    return frame(0x1DB, LEAF_RULE.protect(bytes.fromhex(hex_data), counter), time_s)
 
 
-def test_every_sample_arrives_with_its_temperature_and_soc(generic: Vehicle) -> None:
-    decoder = SampleDecoder(generic)
-    samples = feed(decoder, frames_of(generic))
-    assert [each.current_a for each in samples] == [float(n) for n in range(10)]
-    assert all(each.temperature_c == 20.0 for each in samples)
+def test_every_sample_arrives_with_its_temperature_and_soc() -> None:
+    decoder = SampleDecoder(GENERIC)
+    samples = feed(decoder, frames_of(GENERIC))
+    assert samples == [Sample(n * 0.1, float(n), 380.0 + n, 20.0) for n in range(10)]
     assert decoder.reference_soc_pct == 50.0
-    assert decoder.statistics.samples == 10
-    assert {role: each.latest_s for role, each in decoder.health.items()} == {
-        "current": 0.9,
-        "voltage": 0.9,
-        "temperature": 0.0,
-        "soc_reference": 0.0,
-    }
-
-
-def test_unwanted_ids_are_skipped(generic: Vehicle) -> None:
-    decoder = SampleDecoder(generic)
-    assert generic.wanted_ids == (CURRENT_ID, VOLTAGE_ID, TEMPERATURE_ID, SOC_ID)
-    strange = can.Message(arbitration_id=0x123, is_extended_id=False, data=b"\xff" * 8)
-    assert decoder.handle(strange) is None
-    assert decoder.statistics.frames == 1
-    assert decoder.statistics.wanted == 0
+    assert decoder.now_s == 0.9
+    assert decoder.health["temperature"].latest_s == 0.0
+    counts = decoder.statistics
+    assert (counts.samples, counts.wanted, counts.frames) == (10, 22, 22)
+    assert counts.messages[CURRENT_ID].wanted == 10
+    assert decoder.handle(frame(0x123, b"\xff" * 8)) is None
+    assert (counts.wanted, counts.frames) == (22, 23)
 
 
 @pytest.mark.parametrize("kind", ["is_extended_id", "is_remote_frame", "is_error_frame"])
-def test_extended_remote_and_error_frames_are_skipped(generic: Vehicle, kind: str) -> None:
-    decoder = SampleDecoder(generic)
-    for frame in frames_of(generic):
-        setattr(frame, kind, True)
-        assert decoder.handle(frame) is None
+def test_extended_remote_and_error_frames_are_skipped(kind: str) -> None:
+    decoder = SampleDecoder(GENERIC)
+    for each in frames_of(GENERIC):
+        setattr(each, kind, True)
+        assert decoder.handle(each) is None
     assert decoder.flush() is None
     assert decoder.statistics.wanted == 0
     assert decoder.statistics.ignored == (0 if kind == "is_extended_id" else 22)
 
 
-def test_damaged_and_short_frames_are_refused_and_counted(generic: Vehicle) -> None:
-    frames = [frame for frame in frames_of(generic) if frame.arbitration_id == CURRENT_ID]
+def test_damaged_and_short_frames_are_refused_and_counted() -> None:
+    frames = [each for each in frames_of(GENERIC) if each.arbitration_id == CURRENT_ID]
     frames[3].data[0] ^= 0x10
     frames[5].data = frames[5].data[:-1]
-    decoder = SampleDecoder(generic)
-    samples = feed(decoder, frames)
+    decoder = SampleDecoder(GENERIC)
+    found = currents(decoder, frames)
     last = decoder.flush()
     assert last is not None
-    currents = [each.current_a for each in (*samples, last)]
-    assert currents == [0.0, 1.0, 2.0, 4.0, 6.0, 7.0, 8.0, 9.0]
+    assert [*found, last.current_a] == [0.0, 1.0, 2.0, 4.0, 6.0, 7.0, 8.0, 9.0]
     fate = decoder.statistics.messages[CURRENT_ID]
     assert (fate.crc_errors, fate.short) == (1, 1)
     # The short one counts as lost for the alive counter; the damaged one does not.
     assert (fate.counter_jumps, fate.frames_lost) == (1, 1)
 
 
-def test_repeated_frames_are_refused(generic: Vehicle) -> None:
-    frames = frames_of(generic, 5)
-    decoder = SampleDecoder(generic)
-    samples = feed(decoder, [frame for frame in frames for _ in range(2)])
-    assert [each.current_a for each in samples] == [0.0, 1.0, 2.0, 3.0, 4.0]
+def test_repeated_frames_are_refused_and_longer_ones_cut() -> None:
+    decoder, frames = SampleDecoder(GENERIC), frames_of(GENERIC, 5)
+    for each in frames:
+        each.data += b"\x00\x00"
+    assert currents(decoder, [each for each in frames for _ in range(2)]) == [0, 1, 2, 3, 4]
     assert decoder.statistics.counter_repeats == len(frames)
 
 
-def test_neighbours_of_lost_frames_are_used(generic: Vehicle) -> None:
+def test_neighbours_of_lost_frames_are_used() -> None:
+    frames = [each for each in frames_of(GENERIC) if not 0.25 < each.timestamp < 0.55]
+    decoder = SampleDecoder(GENERIC)
+    assert currents(decoder, frames) == [0.0, 1.0, 2.0, 6.0, 7.0, 8.0, 9.0]
+    assert (decoder.statistics.counter_jumps, decoder.statistics.frames_lost) == (2, 6)
+
+
+def test_temperature_and_soc_are_used_until_their_time_out() -> None:
+    decoder, once = SampleDecoder(GENERIC), {TEMPERATURE_ID, SOC_ID}
+    assert math.isnan(decoder.reference_soc_pct)
     frames = [
-        frame
-        for frame in frames_of(generic)
-        if not (0.25 < frame.timestamp < 0.55 and frame.arbitration_id in {CURRENT_ID, VOLTAGE_ID})
+        each
+        for each in frames_of(GENERIC, 25, step_s=1.0)
+        if each.arbitration_id not in once or each.timestamp == 2.0
     ]
-    decoder = SampleDecoder(generic)
-    samples = feed(decoder, frames)
-    assert [each.current_a for each in samples] == [0.0, 1.0, 2.0, 6.0, 7.0, 8.0, 9.0]
-    assert decoder.statistics.counter_jumps == 2
-    assert decoder.statistics.frames_lost == 6
-
-
-def test_longer_frames_are_cut_to_the_messages_length(generic: Vehicle) -> None:
-    frames = frames_of(generic, 3)
-    for frame in frames:
-        frame.data += b"\x00\x00"
-    assert len(feed(SampleDecoder(generic), frames)) == 3
-
-
-def test_currents_without_voltage_are_kept(generic: Vehicle) -> None:
-    frames = [
-        frame
-        for frame in frames_of(generic)
-        if not (frame.arbitration_id == VOLTAGE_ID and 0.25 < frame.timestamp < 0.65)
-    ]
-    samples = feed(SampleDecoder(generic), frames)
-    assert [each.current_a for each in samples] == [float(n) for n in range(10)]
-    assert [math.isnan(each.voltage_v) for each in samples] == [3 <= n <= 6 for n in range(10)]
-
-
-def test_temperature_is_used_until_its_time_out(generic: Vehicle) -> None:
-    decoder = SampleDecoder(generic)
-    frames = [
-        frame
-        for frame in frames_of(generic, 25, step_s=1.0)
-        if frame.arbitration_id != TEMPERATURE_ID or frame.timestamp == 2.0
-    ]
-    samples = feed(decoder, frames)
-    known = [each.time_s for each in samples if each.temperature_c == 20.0]
+    known = [each.time_s for each in feed(decoder, frames) if each.temperature_c == 20.0]
     assert known == [float(n) for n in range(2, 13)]
-
-
-def test_reference_soc_is_nan_when_it_is_old(generic: Vehicle) -> None:
-    decoder = SampleDecoder(generic)
     assert math.isnan(decoder.reference_soc_pct)
-    frames = frames_of(generic, 15, step_s=1.0)
-    feed(decoder, [f for f in frames if f.arbitration_id != SOC_ID or f.timestamp == 0.0])
-    assert math.isnan(decoder.reference_soc_pct)
-    feed(decoder, frames_of(generic, 1))
-    assert decoder.reference_soc_pct == 50.0
+    fixed = SampleDecoder(Vehicle.load("generic", temperature_c=12.5))
+    assert {each.temperature_c for each in feed(fixed, frames)} == {12.5}
 
 
-def test_fixed_temperature_needs_no_frame() -> None:
-    vehicle = Vehicle.load("generic", temperature_c=12.5)
-    decoder = SampleDecoder(vehicle)
-    assert TEMPERATURE_ID not in vehicle.wanted_ids
-    samples = feed(decoder, frames_of(Vehicle.load("generic"), 20, step_s=5.0))
-    assert {each.temperature_c for each in samples} == {12.5}
-
-
-def test_a_log_that_starts_again_is_decoded_again(generic: Vehicle) -> None:
-    frames = frames_of(generic, 16)  # so that the counters go on
-    decoder = SampleDecoder(generic)
-    first = feed(decoder, frames)
-    second = feed(decoder, frames_of(generic, 16))
-    assert first == second
+def test_a_log_that_starts_again_is_decoded_again() -> None:
+    decoder = SampleDecoder(GENERIC)
+    first = feed(decoder, frames_of(GENERIC, 16))  # so that the counters go on
+    assert feed(decoder, frames_of(GENERIC, 16)) == first
     assert decoder.statistics.time_reversals > 0
 
 
-def test_old_values_time_out_after_a_step_back_in_time(generic: Vehicle) -> None:
-    decoder = SampleDecoder(generic)
-    late = frames_of(generic, 1)
-    for frame in late:
-        frame.timestamp = 5000.0
+def test_old_values_time_out_after_a_step_back_in_time() -> None:
+    decoder, late = SampleDecoder(GENERIC), frames_of(GENERIC, 1)
+    for each in late:
+        each.timestamp = 5000.0
     feed(decoder, late)
-    frames = frames_of(generic, 16, step_s=1.0)[8:]
-    fast = [frame for frame in frames if frame.arbitration_id in {CURRENT_ID, VOLTAGE_ID}]
-    samples = feed(decoder, fast)
-    assert samples[0].time_s == 2.0
-    assert [each.time_s for each in samples if each.temperature_c == 20.0] == [
-        float(n) for n in range(2, 13)
+    fast = [
+        each
+        for each in frames_of(GENERIC, 16, step_s=1.0)[8:]
+        if each.arbitration_id in {CURRENT_ID, VOLTAGE_ID}
     ]
+    samples = feed(decoder, fast)
+    known = [each.time_s for each in samples if each.temperature_c == 20.0]
+    assert known == [float(n) for n in range(2, 13)]
     assert math.isnan(decoder.reference_soc_pct)
 
 
-def test_leaf_inverts_the_sign_and_refuses_wake_up_codes(leaf: Vehicle) -> None:
-    decoder = SampleDecoder(leaf)
-    both = leaf_frame("7FE0FFC000000000", 0.00, 0)
-    voltage = leaf_frame("FFE0FFC000000000", 0.01, 1)
-    good = leaf_frame("FDA0BAAA00000000", 0.02, 2)
-    assert decoder.handle(both) is None
-    without = decoder.handle(voltage)
+# --- Pairing
+
+WITHIN_S = 0.020
+
+
+def paired(frames: list[tuple[float, str, float]]) -> list[tuple[float, float, float | None]]:
+    pairing, samples = Pairing(WITHIN_S), []
+    for time_s, kind, value in frames:
+        add = pairing.voltage if kind == "U" else lambda t, a: pairing.current(t, a, 20.0)
+        samples.append(add(time_s, value))
+    found = [each for each in [*samples, pairing.flush()] if each is not None]
+    return [(t, i, None if math.isnan(u) else u) for t, i, u, _ in found]
+
+
+@pytest.mark.parametrize(
+    ("frames", "samples"),
+    [
+        ([(1.0, "I", 5), (1.01, "U", 400)], [(1.0, 5, 400)]),
+        ([(1.0, "U", 400), (1.01, "I", 5)], [(1.01, 5, 400)]),  # at the current's time
+        ([(1.0, "I", 5), (1.021, "U", 400)], [(1.0, 5, None)]),
+        ([(1e9, "I", 5), (1e9 + 0.02, "U", 400)], [(1e9, 5, 400)]),
+        (
+            [(0.0, "I", 1), (0.001, "U", 400), (0.002, "I", 2), (0.003, "I", 3)],
+            [(0.0, 1, 400), (0.002, 2, None), (0.003, 3, None)],  # each value is used once
+        ),
+        (
+            [(0.0, "I", 1), (0.1, "U", 400), (0.11, "I", 2)],
+            [(0.0, 1, None), (0.11, 2, 400)],  # a late voltage releases the current
+        ),
+        (
+            [(100.0, "I", 1), (0.0, "U", 400), (0.01, "I", 2)],
+            [(100.0, 1, None), (0.01, 2, 400)],  # none across a step back in time
+        ),
+    ],
+)
+def test_currents_and_voltages_pair(
+    frames: list[tuple[float, str, float]], samples: list[tuple[float, float, float | None]]
+) -> None:
+    assert paired(frames) == samples
+
+
+def test_unpaired_values_are_counted() -> None:
+    pairing = Pairing(WITHIN_S)
+    for n in range(3):
+        pairing.voltage(float(n), 400.0)
+    pairing.current(10.0, 1.0, 20.0)
+    pairing.current(11.0, 1.0, 20.0)
+    statistics = pairing.statistics
+    assert (statistics.voltage_unpaired, statistics.current_unpaired) == (3, 1)
+
+
+@given(st.lists(st.tuples(st.integers(0, 60), st.sampled_from("IU")), min_size=1, max_size=60))
+def test_no_current_is_lost_doubled_or_out_of_order(steps: list[tuple[int, str]]) -> None:
+    times = np.cumsum([step for step, _ in steps]) / 1000.0
+    frames = [(float(t), kind, float(n)) for n, (t, (_, kind)) in enumerate(zip(times, steps))]  # noqa: B905
+    samples = paired(frames)
+    assert [each[:2] for each in samples] == [(t, v) for t, kind, v in frames if kind == "I"]
+    used = {voltage: t for t, _, voltage in samples if voltage is not None}
+    assert len(used) == sum(voltage is not None for _, _, voltage in samples)
+    at = {value: t for t, kind, value in frames if kind == "U"}
+    assert all(abs(at[voltage] - t) <= WITHIN_S + 1e-6 for voltage, t in used.items())
+
+
+# --- Cars
+
+
+def test_leaf_inverts_the_sign_and_refuses_wake_up_codes() -> None:
+    decoder = SampleDecoder(LEAF)
+    assert decoder.handle(leaf_frame("7FE0FFC000000000", 0.00, 0)) is None
+    without = decoder.handle(leaf_frame("FFE0FFC000000000", 0.01, 1))
     assert without is not None
-    assert without.current_a == 0.5
-    assert math.isnan(without.voltage_v)
-    sample = decoder.handle(good)
+    assert (without.current_a, math.isnan(without.voltage_v)) == (0.5, True)
+    sample = decoder.handle(leaf_frame("FDA0BAAA00000000", 0.02, 2))
     assert sample is not None
     assert (sample.time_s, sample.current_a, sample.voltage_v) == (0.02, 9.5, 373.0)
-    assert math.isnan(sample.temperature_c)
-    assert decoder.statistics.not_available == 3
-    assert decoder.statistics.current_unpaired == 1
-    assert decoder.health["voltage"].latest_s == 0.02
+    assert (decoder.statistics.not_available, decoder.statistics.current_unpaired) == (3, 1)
 
 
-def test_leaf_uses_the_average_multiplexed_temperature(leaf: Vehicle) -> None:
-    decoder = SampleDecoder(leaf)
+def test_leaf_uses_the_average_multiplexed_temperature() -> None:
+    decoder = SampleDecoder(LEAF)
     for n, payload in enumerate(("405068003A000000", "805656003CD40002", "C06060003AD40000")):
-        data = bytes.fromhex(payload)
-        decoder.handle(
-            can.Message(timestamp=0.1 * n, arbitration_id=0x5C0, is_extended_id=False, data=data)
-        )
+        decoder.handle(frame(0x5C0, bytes.fromhex(payload), 0.1 * n))
     sample = decoder.handle(leaf_frame("FDA0BAAA00000000", 0.3, 2))
     assert sample is not None
     assert sample.temperature_c == 0x56 / 2 - 40
     assert decoder.health["temperature"].latest_s == 0.1
 
 
-def test_an_extended_id_of_the_dbc_is_wanted(generic: Vehicle) -> None:
-    signal = replace(generic.current, key=0x18FF0001 | EXTENDED)
-    messages = {**generic.messages, signal.key: generic.messages[CURRENT_ID]}
-    vehicle = replace(generic, current=signal, messages=messages)
-    decoder = SampleDecoder(vehicle)
+def test_codes_and_signs_of_a_bmw_i3() -> None:
+    with pytest.raises(InputError, match="--temperature"):
+        Vehicle.load("bmw-i3")
+    car = Vehicle.load("bmw_i3", temperature_c=20.0)
+    assert car.soc_reference is not None
+    payload = bytes.fromhex("ee1fb40eb571c55e")
+    signals = (car.current, car.voltage, car.soc_reference)
+    assert [each.codec.decode(payload) for each in signals] == pytest.approx([1.8, 376.4, 43.7])
+    asleep = bytes.fromhex("ffffffffff7ff5ff")
+    assert np.isnan([each.codec.decode(asleep) for each in car.signals]).all()
+
+
+def test_an_extended_id_of_the_dbc_is_wanted() -> None:
+    signal = replace(GENERIC.current, key=0x18FF0001 | EXTENDED)
+    messages = {**GENERIC.messages, signal.key: GENERIC.messages[CURRENT_ID]}
+    vehicle = replace(GENERIC, current=signal, messages=messages)
     assert vehicle.wanted_ids[0] == 0x18FF0001
-    assert vehicle.filters[0] == {
-        "can_id": 0x18FF0001,
-        "can_mask": 0x1FFFFFFF,
-        "extended": True,
-    }
-    assert len(feed(decoder, frames_of(vehicle))) == 10
+    wanted = {"can_id": 0x18FF0001, "can_mask": 0x1FFFFFFF, "extended": True}
+    assert vehicle.filters[0] == wanted
+    assert len(feed(SampleDecoder(vehicle), frames_of(vehicle))) == 10
 
 
-def test_totals_are_sums_over_the_messages(generic: Vehicle) -> None:
-    decoder = SampleDecoder(generic)
-    feed(decoder, frames_of(generic))
-    statistics = decoder.statistics
-    assert statistics.samples == 10
-    assert statistics.wanted == statistics.frames == 22
-    assert statistics.messages[CURRENT_ID].wanted == 10
+def test_signals_beyond_byte_8_decode(tmp_path: Path) -> None:
+    sample = SampleDecoder(fd_vehicle(tmp_path)).handle(fd_frame(-12.35, 401.23))
+    assert sample is not None
+    assert sample[1:3] == pytest.approx((-12.35, 401.23), abs=1e-9)
+
+
+def test_a_service_on_udp_takes_64_bytes(tmp_path: Path) -> None:
+    port = 20_000 + (os.getpid() + 77) % 20_000
+    address = bus_address("udp_multicast", options={"port": port, "fd": True})
+    estimates_from_64_bytes(address, tmp_path)
+
+
+PGN_ID = 0x18F01D27  # PGN 0xF01D from source 0x27
+TRUCK = f"""VERSION "1"
+BU_: V
+BO_ {PGN_ID | EXTENDED} HVESSD1: 8 V
+ SG_ Voltage : 0|16@1+ (0.05,0) [0|0] "V" V
+ SG_ Current : 16|16@1+ (0.05,-1600) [0|0] "A" V
+"""
+
+
+@pytest.mark.parametrize(
+    ("j1939", "number", "is_taken"),
+    [
+        (True, PGN_ID, True),
+        (True, 0x18F01DF3, True),  # another source
+        (True, 0x0CF01D27, True),  # another priority
+        (True, 0x18F01E27, False),
+        (False, PGN_ID, True),
+        (False, 0x18F01DF3, False),
+    ],
+)
+def test_a_pgn_identifies_where_the_map_says_so(
+    tmp_path: Path, j1939: bool, number: int, is_taken: bool
+) -> None:
+    (tmp_path / "truck.dbc").write_text(TRUCK)
+    text = 'current = "Current"\nvoltage = "Voltage"\ntemperature.fixed_c = 20\n'
+    more = "messages.HVESSD1.j1939 = true\n" if j1939 else ""
+    (tmp_path / "map.toml").write_text(text + more)
+    car = Vehicle.load(dbc=tmp_path / "truck.dbc", map=tmp_path / "map.toml")
+    data = (13000).to_bytes(2, "little") + (32400).to_bytes(2, "little") + bytes(4)
+    sample = SampleDecoder(car).handle(frame(number, data, wide=True))
+    assert (sample is not None) is is_taken
+    assert sample is None or sample[1:3] == pytest.approx((20.0, 650.0))
+    wanted = car.filters[0]
+    assert (number & wanted["can_mask"] == wanted["can_id"] & wanted["can_mask"]) is is_taken
+
+
+def test_a_destination_is_no_part_of_a_pgn() -> None:
+    assert pgn_mask(0x18EA00F9) == 0x03FF0000
+    assert pgn_mask(PGN_ID) == 0x03FFFF00
+
+
+# --- Cells
+
+CELLS_V = [round(3.6 + 0.003 * number, 3) for number in range(12)]
+ARRAY = '[cells]\nsignal = "CELL_{n}_V"\ncount = 12\n'
+GROUPS = (
+    '[cells]\nmessage = "CELL_GROUPS"\nindex = "group_number"\ncount = 11\n'
+    'signals = ["cell_a", "cell_b", "cell_c"]\n'
+)
+
+
+def cell_car(folder: Path, cells: str) -> Vehicle:
+    (folder / "cells.dbc").write_text(CELLS_DBC)
+    (folder / "car.toml").write_text(CAR + cells)
+    return Vehicle.load(dbc=shared_file("dbc", "generic_pack.dbc"), map=folder / "car.toml")
+
+
+def cells_after(car: Vehicle, frames: list[can.Message]) -> list[float]:
+    decoder = SampleDecoder(car)
+    feed(decoder, frames)
+    assert decoder.cells is not None
+    return decoder.cells.take(frames[-1].timestamp)[0]
+
+
+def test_cells_come_as_an_array_or_in_groups(tmp_path: Path) -> None:
+    car = cell_car(tmp_path, ARRAY)
+    assert {"can_id": 0x440, "can_mask": 0x7FF, "extended": False} in car.filters
+    assert cells_after(car, cell_frames(CELLS_V)) == pytest.approx(CELLS_V)
+    partly = cells_after(car, cell_frames(CELLS_V)[:2])
+    assert partly[:6] == pytest.approx(CELLS_V[:6])
+    assert all(math.isnan(each) for each in partly[6:])
+    # The last group is filled up: a twelfth cell does not exist.
+    car = cell_car(tmp_path, GROUPS)
+    assert cells_after(car, numbered_frames(CELLS_V)) == pytest.approx(CELLS_V[:11])
+    car = cell_car(tmp_path, GROUPS + "first_index = 1\n")
+    assert cells_after(car, numbered_frames(CELLS_V, first=1)) == pytest.approx(CELLS_V[:11])
+
+
+def test_old_implausible_and_missing_voltages_are_not_used(tmp_path: Path) -> None:
+    decoder = SampleDecoder(cell_car(tmp_path, ARRAY + "lowest = 2.5\ntimeout_s = 3\n"))
+    cells = decoder.cells
+    assert cells is not None
+    feed(decoder, cell_frames([1.0, math.nan, *CELLS_V[2:]], time_s=10.0))
+    volts, times = cells.take(11.0)
+    assert [math.isnan(each) for each in volts[:3]] == [True, True, False]
+    assert (times[2], cells.refused) == (10.0, 1)
+    # Each value is used once, and not once it is old.
+    assert np.isnan(cells.take(11.5)[0]).all()
+    feed(decoder, cell_frames(CELLS_V, time_s=20.0))
+    assert np.isnan(cells.take(24.0)[0]).all()
+
+
+@pytest.mark.parametrize(
+    ("cells", "words"),
+    [
+        (ARRAY.replace("12", "13"), "CELL_13_V"),
+        (ARRAY.replace("{n}", ""), "{n}"),
+        (ARRAY.replace("{n}", "{m}"), "{n}"),
+        ("[cells]\ncount = 12\n", "either signal"),
+        ('[cells]\nindex = "group_number"\ncount = 12\n', "signals and message"),
+        (GROUPS.replace("CELL_GROUPS", "NOTHING"), "NOTHING"),
+        (ARRAY.replace("12", "1"), "count"),
+        (ARRAY.replace("12", "5000"), "count"),
+    ],
+)
+def test_a_wrong_map_of_cells_names_the_field(tmp_path: Path, cells: str, words: str) -> None:
+    with pytest.raises(InputError) as refused:
+        cell_car(tmp_path, cells)
+    assert words in str(refused.value)
+    assert "cells" in str(refused.value)

@@ -1,139 +1,296 @@
-"""CRC, alive counter and the check of successive frames."""
+"""CRC, alive counter, E2E profiles: rules in code and in map files, and successive frames."""
 
 from __future__ import annotations
+
+from pathlib import Path
 
 import crccheck.crc
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from cangauge.bus.database import Field
+from cangauge.bus.mapping import CheckMap, MessageMap, Overrides
 from cangauge.bus.protection import (
     CRC_ONLY_RULE,
     GENERIC_RULE,
     LEAF_RULE,
+    CounterRule,
+    E2eRule,
     FrameChecker,
+    Protection,
     ProtectionRule,
     Verdict,
 )
+from cangauge.bus.vehicle import Vehicle
 from cangauge.errors import InputError
 
-RULES = (
-    LEAF_RULE,
-    GENERIC_RULE,
-    ProtectionRule("first byte", polynomial=0x2F, initial=0xFF, crc_byte=0, counter_byte=1),
-    ProtectionRule("middle", polynomial=0x07, crc_byte=3, counter_byte=-1, counter_shift=4),
-)
-payloads = st.binary(min_size=5, max_size=8)
-rules = st.sampled_from(RULES)
+GOOD, LOSS, WRONG, REPEATED = Verdict
+IDS = bytes(range(0x40, 0x50))
+RULES: dict[str, Protection] = {
+    "leaf": LEAF_RULE,
+    "generic": GENERIC_RULE,
+    "first byte": ProtectionRule("a", 0x2F, initial=0xFF, crc_byte=0, counter_byte=1),
+    "middle": ProtectionRule("b", 0x07, crc_byte=3, counter_byte=-1, counter_shift=4),
+    "01": E2eRule("e2e_01", data_id=0x123),
+    "01 alternating": E2eRule("e2e_01", data_id=0x123, data_id_mode="alternating"),
+    "01 low": E2eRule("e2e_01", data_id=0x123, data_id_mode="low"),
+    "01 nibble": E2eRule("e2e_01", data_id=0x123, data_id_mode="nibble"),
+    "01 at 3": E2eRule("e2e_01", data_id=0x123, header_byte=3),
+    "02": E2eRule("e2e_02", data_ids=IDS),
+    "04": E2eRule("e2e_04", data_id=0x12345678),
+    "05": E2eRule("e2e_05", data_id=0x1234),
+    "05 in part": E2eRule("e2e_05", data_id=0x1234, protected_bytes=6),
+    "06": E2eRule("e2e_06", data_id=0x1234),
+    "07": E2eRule("e2e_07", data_id=0x12345678),
+    "11": E2eRule("e2e_11", data_id=0x123),
+    "11 nibble": E2eRule("e2e_11", data_id=0x123, data_id_mode="nibble"),
+    "counter": CounterRule("counter", Field(4, 4, big_endian=False), 8, 15),
+}
+MODULI = {"leaf": 4, "generic": 16, "first byte": 16, "middle": 16, "counter": 15, "01": 15,
+          "02": 16, "04": 1 << 16, "05": 256, "06": 256, "07": 1 << 32, "11": 15}  # fmt: skip
+each_rule = pytest.mark.parametrize("name", list(RULES))
+
+
+def frame(name: str, counter: int, content: bytes = bytes(24)) -> bytes:
+    return RULES[name].protect(content[: 24 if name in {"04", "07"} else 8], counter)
+
+
+@each_rule
+def test_successive_frames_are_good_across_a_wrap(name: str) -> None:
+    rule, checker = RULES[name], FrameChecker(RULES[name], 0.01)
+    assert rule.modulus == MODULI.get(name, MODULI.get(name[:2]))
+    start = rule.modulus - 3
+    for step in range(20):
+        data = frame(name, start + step)
+        assert rule.counter(data) == (start + step) % rule.modulus
+        assert checker.check(data, 0.01 * step) is GOOD
+
+
+@each_rule
+@given(st.binary(min_size=24, max_size=24), st.integers(0, 2**40), st.data())
+def test_a_protected_frame_is_whole_and_any_flipped_bit_is_not(
+    name: str, content: bytes, counter: int, draw: st.DataObject
+) -> None:
+    rule, data = RULES[name], bytearray(frame(name, counter, content))
+    assert rule.is_whole(data)
+    assert rule.protect(data, counter) == data
+    changed = [old ^ new for old, new in zip(content, data, strict=False)]
+    if isinstance(rule, ProtectionRule):  # nothing but CRC and counter changes
+        crc, place = rule.crc_byte % len(data), rule.counter_byte % len(data)
+        own = (rule.modulus - 1) << rule.counter_shift
+        assert not any(x for n, x in enumerate(changed) if n not in {crc, place})
+        assert not changed[place] & ~own
+    covered = 6 if name == "05 in part" else 0 if name == "counter" else len(data)
+    bit = draw.draw(st.integers(0, 8 * len(data) - 1))
+    data[bit // 8] ^= 1 << bit % 8
+    if name != "counter":
+        assert rule.is_whole(data) is (bit // 8 >= covered)
+
+
+@each_rule
+def test_a_repeated_counter_is_refused_and_a_jump_is_a_loss(name: str) -> None:
+    checker, steps = FrameChecker(RULES[name], 0.01), 3 if name == "leaf" else 5
+    assert checker.check(frame(name, 1), 0.00) is GOOD
+    assert checker.check(frame(name, 1), 0.01) is REPEATED
+    assert checker.check(frame(name, 1 + steps), 0.05) is LOSS
+    assert checker.lost == steps - 1
+
+
+@pytest.mark.parametrize("name", [name for name in RULES if name[0] in "01"])
+def test_the_crc_covers_the_data_id(name: str) -> None:
+    rule = RULES[name]
+    assert isinstance(rule, E2eRule)
+    other = {
+        "data_id": rule.data_id and rule.data_id ^ 0x101,  # in either byte: profile 1 alternates
+        "data_ids": bytes(each ^ 1 for each in rule.data_ids),
+    }
+    more = (rule.data_id_mode, rule.header_byte, rule.protected_bytes)
+    stranger = E2eRule(rule.name, *other.values(), *more)  # type: ignore[arg-type] # of a dict
+    assert not any(stranger.is_whole(frame(name, counter)) for counter in range(4))
 
 
 class LeafCrc(crccheck.crc.Crc8Base):
     _poly, _initvalue, _xor_output = 0x85, 0x00, 0x00
 
 
-def test_the_crc_has_the_published_check_value() -> None:
-    text = b"123456789"
-    assert GENERIC_RULE.crc(text + b"?") == 0x4B == crccheck.crc.Crc8SaeJ1850.calc(text)
+class Crc8OfProfile1(crccheck.crc.Crc8Base):
+    """CRC-8 SAE J1850 with initial value 0 and no final XOR, as in profile 1."""
+
+    _poly = 0x1D
 
 
-@given(payload=st.binary(min_size=2, max_size=64))
-def test_crc_agrees_with_crccheck(payload: bytes) -> None:
+@given(st.binary(min_size=2, max_size=64))
+def test_crcs_agree_with_crccheck(payload: bytes) -> None:
     assert LEAF_RULE.crc(payload) == LeafCrc.calc(payload[:-1])
     assert GENERIC_RULE.crc(payload) == crccheck.crc.Crc8SaeJ1850.calc(payload[:-1])
 
 
-@given(rule=rules, payload=payloads, counter=st.integers(0, 1000))
-def test_a_protected_frame_is_good_and_keeps_its_other_bits(
-    rule: ProtectionRule, payload: bytes, counter: int
-) -> None:
-    data = rule.protect(payload, counter)
-    assert FrameChecker(rule).check(data, 0.0) is Verdict.GOOD
-    assert rule.counter(data) == counter % rule.modulus
-    assert rule.protect(data, counter) == data
-    mask = (rule.modulus - 1) << rule.counter_shift
-    for place, (old, new) in enumerate(zip(payload, data, strict=True)):
-        if place == rule.counter_byte % len(payload):
-            assert (old ^ new) & ~mask == 0
-        elif place != rule.crc_byte % len(payload):
-            assert old == new
+def test_published_check_values() -> None:
+    assert GENERIC_RULE.crc(b"123456789?") == 0x4B
+    # AUTOSAR, E2E Protocol Specification: all data 0, first message, data ids of its examples.
+    assert frame("01", 0).hex() == "cc00000000000000"
+    assert frame("05", 0).hex() == "1cca000000000000"
+    for counter in range(16):
+        data = RULES["02"].protect(b"\0\xa0battry", counter)
+        assert data[1] == 0xA0 | counter
+        assert crccheck.crc.Crc8Autosar.calc(data[1:] + IDS[counter : counter + 1]) == data[0]
+    for name in ("01", "11"):  # they leave counter 15 out
+        for counter in (14, 15):
+            rest = bytes([counter, *b"abcdef"])
+            data = bytes([Crc8OfProfile1.calc(b"\x23\x01" + rest), *rest])
+            assert RULES[name].is_whole(data) is (counter == 14)
 
 
-@given(rule=rules, payload=payloads, data=st.data())
-def test_any_flipped_bit_is_refused(
-    rule: ProtectionRule, payload: bytes, data: st.DataObject
-) -> None:
-    frame = bytearray(rule.protect(payload, 1))
-    bit = data.draw(st.integers(0, 8 * len(frame) - 1))
-    frame[bit // 8] ^= 1 << bit % 8
-    assert FrameChecker(rule).check(frame, 0.0) is Verdict.CRC_WRONG
-
-
-@given(rule=rules, lost=st.integers(0, 14), start=st.integers(0, 15))
-def test_a_jump_counts_the_missing_frames(rule: ProtectionRule, lost: int, start: int) -> None:
-    lost %= rule.modulus - 1
-    checker = FrameChecker(rule)
-    checker.check(rule.protect(bytes(8), start), 0.0)
-    verdict = checker.check(rule.protect(bytes(8), start + 1 + lost), 0.01)
-    assert verdict is (Verdict.AFTER_LOSS if lost else Verdict.GOOD)
-    if lost:
-        assert checker.lost == lost
-
-
-def test_a_repeated_counter_is_refused() -> None:
-    checker = FrameChecker(LEAF_RULE, period_s=0.01)
-    frame = LEAF_RULE.protect(bytes(8), 2)
-    verdicts = [checker.check(frame, 0.01 * n) for n in range(50)]
-    assert verdicts == [Verdict.GOOD] + [Verdict.REPEATED] * 49
-    assert checker.check(LEAF_RULE.protect(bytes(8), 3), 0.5) is Verdict.GOOD
+def checked(rule: Protection, period_s: float | None, *frames: tuple[float, int]) -> list[Verdict]:
+    checker = FrameChecker(rule, period_s)
+    return [checker.check(rule.protect(bytes(24), n), time_s) for time_s, n in frames]
 
 
 def test_a_counter_that_may_have_wrapped_is_a_loss() -> None:
-    checker = FrameChecker(LEAF_RULE, period_s=0.01)
-    frame = LEAF_RULE.protect(bytes(8), 2)
-    assert checker.check(frame, 0.0) is Verdict.GOOD
-    assert checker.check(frame, 0.0399) is Verdict.AFTER_LOSS  # three frames are missing
-    assert checker.lost == 3
+    repeated = [(0.01 * n, 2) for n in range(50)]
+    assert checked(LEAF_RULE, 0.01, *repeated, (0.5, 3)) == [GOOD, *[REPEATED] * 49, GOOD]
+    # After half a wrap three frames are missing; without a period only a silence ends repetition.
+    assert checked(LEAF_RULE, 0.01, (0.0, 2), (0.0199, 2)) == [GOOD, REPEATED]
+    assert checked(LEAF_RULE, 0.01, (0.0, 2), (0.0399, 2)) == [GOOD, LOSS]
+    silence = [(0.0, 2), (1.5, 2), (3.0, 2), (103.0, 2)]
+    assert checked(GENERIC_RULE, None, *silence) == [GOOD, REPEATED, REPEATED, LOSS]
 
 
-def test_without_a_period_a_silence_ends_repetition() -> None:
-    checker = FrameChecker(GENERIC_RULE)
-    frame = GENERIC_RULE.protect(bytes(6), 2)
-    checker.check(frame, 0.0)
-    assert checker.check(frame, 1.5) is Verdict.REPEATED
-    assert checker.check(frame, 3.0) is Verdict.REPEATED
-    # The sender restarted: any counter is good after a silence.
-    assert checker.check(frame, 103.0) is Verdict.AFTER_LOSS
+def test_a_wide_counter_that_restarts_is_no_loss() -> None:
+    assert checked(RULES["04"], 0.01, (1.0, 700), (1.01, 0)) == [GOOD, GOOD]
+    assert checked(RULES["05"], 0.01, (0.0, 100), (2.06, 50)) == [GOOD, LOSS]
 
 
 def test_a_damaged_frame_is_not_counted_as_lost_too() -> None:
     checker = FrameChecker(GENERIC_RULE)
     good = [GENERIC_RULE.protect(bytes(6), n) for n in range(4)]
-    assert checker.check(good[0], 0.0) is Verdict.GOOD
-    assert checker.check(bytes([*good[1][:-1], good[1][-1] ^ 1]), 0.1) is Verdict.CRC_WRONG
-    assert checker.check(good[2], 0.2) is Verdict.GOOD
+    assert checker.check(good[0], 0.0) is GOOD
+    assert checker.check(bytes([*good[1][:-1], good[1][-1] ^ 1]), 0.1) is WRONG
+    assert checker.check(good[2], 0.2) is GOOD
     assert checker.lost == 0
 
 
 def test_without_a_counter_only_the_crc_counts() -> None:
-    checker = FrameChecker(CRC_ONLY_RULE)
-    frame = CRC_ONLY_RULE.protect(b"abcdefgh", 5)
-    assert frame[:-1] == b"abcdefg"
-    assert [checker.check(frame, 0.0) for _ in range(3)] == [Verdict.GOOD] * 3
+    data = CRC_ONLY_RULE.protect(b"abcdefgh", 5)
+    assert data[:-1] == b"abcdefg"
+    assert checked(CRC_ONLY_RULE, None, (0.0, 1), (0.0, 1)) == [GOOD, GOOD]
 
 
 @pytest.mark.parametrize(
-    ("field", "value"),
-    [("polynomial", 256), ("initial", -1), ("counter_bits", 9), ("counter_shift", 8)],
+    ("name", "length", "fits"),
+    [("generic", 1, False), ("generic", 2, True), ("04", 8, False), ("04", 12, True),
+     ("07", 16, False), ("07", 20, True), ("01 at 3", 4, False), ("05 in part", 5, False),
+     ("counter", 7, False), ("middle", 4, False), ("middle", 5, True)],
+)  # fmt: skip
+def test_a_rule_fits_into_enough_bytes(name: str, length: int, fits: bool) -> None:
+    assert RULES[name].fits(length) is fits
+
+
+@pytest.mark.parametrize(
+    ("kind", "values", "field"),
+    [
+        (ProtectionRule, {"polynomial": 256}, "x.polynomial"),
+        (ProtectionRule, {"polynomial": 1, "initial": -1}, "x.initial"),
+        (ProtectionRule, {"polynomial": 1, "counter_bits": 9}, "x.counter_bits"),
+        (ProtectionRule, {"polynomial": 1, "counter_bits": 1}, "x.counter"),
+        (ProtectionRule, {"polynomial": 1, "counter_shift": 8}, "x.counter_shift"),
+        (ProtectionRule, {"polynomial": 1, "counter_byte": -1}, "x.counter_byte"),
+        (E2eRule, {"name": "e2e_03"}, "protection"),
+        (E2eRule, {"name": "e2e_05", "data_id": 1 << 16}, "data_id"),
+        (E2eRule, {"name": "e2e_11", "data_id_mode": "low"}, "data_id_mode"),
+        (E2eRule, {"name": "e2e_02", "data_ids": b"123"}, "data_id_list"),
+        (E2eRule, {"name": "e2e_02", "data_ids": IDS, "header_byte": 1}, "header_byte"),
+        (E2eRule, {"name": "e2e_05", "data_ids": IDS}, "data_id_list"),
+        (E2eRule, {"name": "e2e_05", "protected_bytes": 2}, "protected_bytes"),
+        (E2eRule, {"name": "e2e_05", "header_byte": -1}, "header_byte"),
+    ],
 )
-def test_impossible_rules_are_refused(field: str, value: int) -> None:
-    with pytest.raises(InputError, match=field) as caught:
-        ProtectionRule("x", **{"polynomial": 0x1D, field: value})
-    assert caught.value.value == value
+def test_impossible_rules_are_refused(kind: type, values: dict[str, object], field: str) -> None:
+    with pytest.raises(InputError) as caught:
+        kind(**{"name": "x", **values})
+    assert caught.value.field == field
 
 
-def test_counter_and_crc_in_one_byte_are_refused() -> None:
-    with pytest.raises(InputError, match="share"):
-        ProtectionRule("x", polynomial=0x1D, counter_byte=-1)
-    assert not ProtectionRule("x", polynomial=0x1D, crc_byte=1, counter_byte=-1).fits(2)
-    assert not GENERIC_RULE.fits(1)
-    assert GENERIC_RULE.fits(2)
+DBC = """VERSION ""
+
+BU_: BMS
+
+BO_ 256 Fast: 8 BMS
+ SG_ Crc : 0|8@1+ (1,0) [0|255] "" X
+ SG_ Alive : 8|4@1+ (1,0) [0|14] "" X
+ SG_ Current : 16|16@1- (0.1,0) [-3000|3000] "A" X
+ SG_ Voltage : 32|16@1+ (0.1,0) [0|6000] "V" X
+
+BO_ 257 Slow: 8 BMS
+ SG_ Temperature : 24|8@1+ (1,-40) [-40|215] "degC" X
+"""
+MAP = """dbc = "car.dbc"
+current = "Current"
+voltage = "Voltage"
+temperature = "Temperature"
+"""
+
+
+def load(folder: Path, more: str = "", overrides: Overrides | None = None) -> Vehicle:
+    (folder / "car.dbc").write_text(DBC)
+    (folder / "car.toml").write_text(MAP + more)
+    return Vehicle.load(map=folder / "car.toml", overrides=overrides or Overrides())
+
+
+def test_a_map_file_chooses_the_rule_of_each_message(tmp_path: Path) -> None:
+    fast = '[messages.Fast]\nprotection = "e2e_01"\ndata_id = 291\ndata_id_mode = "nibble"\n'
+    slow = '[messages.Slow]\nprotection = "e2e_05"\ndata_id = 0x1234\nperiod_s = 0.5\n'
+    messages = load(tmp_path, fast + slow).messages
+    assert messages[0x100].rule == RULES["01 nibble"]
+    assert messages[0x101] == (RULES["05"], 0.5, False, False, None)
+    counter = '[messages.Fast]\nprotection = "counter"\ncounter = "Alive"\ncounter_modulus = 15\n'
+    rule = load(tmp_path, counter).messages[0x100].rule
+    assert rule is not None
+    assert rule.counter(b"\0\x0e" + bytes(6)) == 14
+    assert not rule.is_whole(b"\0\x0f" + bytes(6))
+
+
+def test_a_configuration_overrides_the_map_file(tmp_path: Path) -> None:
+    more = '[messages.Fast]\nprotection = "e2e_01"\ndata_id = 291\nperiod_s = 0.1\n'
+    overrides = Overrides(
+        "run.toml",
+        messages={"0x100": MessageMap(protection="e2e_02", data_id_list=tuple(IDS))},
+        checks={"voltage": CheckMap(highest=410.0)},
+    )
+    vehicle = load(tmp_path, more, overrides)
+    assert vehicle.messages[0x100][:2] == (RULES["02"], 0.1)
+    assert vehicle.voltage.checks.highest == 410.0
+    slower = Overrides("run.toml", messages={"BATTERY_1DB": MessageMap(period_s=0.02)})
+    leaf = Vehicle.load("leaf_aze0", overrides=slower)
+    assert leaf.messages[0x1DB][:2] == (LEAF_RULE, 0.02)
+
+
+@pytest.mark.parametrize(
+    ("more", "field", "text"),
+    [
+        ('protection = "e2e_05"', "data_id", "is missing"),
+        ('protection = "e2e_02"', "data_id_list", "is missing"),
+        ('protection = "e2e_02"\ndata_id_list = [1, 2]', "data_id_list", "at least 16"),
+        ('protection = "e2e_05"\ndata_id = 65536', "data_id", "16 bits"),
+        ('protection = "e2e_04"\ndata_id = 1', "protection", "8 bytes"),
+        ('protection = "counter"', "counter", "is missing"),
+        ('protection = "counter"\ncounter = "Nonsense"', "counter", "no such signal"),
+        ('protection = "counter"\ncounter = "Alive"\ncounter_modulus = 17', "counter_modulus",
+         "3 to 16"),
+        ('protection = "leaf"\ndata_id = 5', "data_id", "e2e profile"),
+        ('protection = "e2e_05"\ndata_id = 5\ncounter = "Alive"', "counter", "belongs to"),
+        ('protection = "e2e_03"', "protection", "e2e_11"),
+    ],
+)  # fmt: skip
+def test_mistakes_in_protection_name_field_and_file(
+    tmp_path: Path, more: str, field: str, text: str
+) -> None:
+    with pytest.raises(InputError, match=text) as caught:
+        load(tmp_path, f"[messages.Fast]\n{more}\n")
+    assert caught.value.field == f"messages.Fast.{field}"
+    assert caught.value.source == str(tmp_path / "car.toml")
+    overrides = Overrides("run.toml", messages={"Fast": MessageMap(protection="e2e_05")})
+    with pytest.raises(InputError, match="data_id") as caught:
+        load(tmp_path, "", overrides)
+    assert caught.value.source == "run.toml"

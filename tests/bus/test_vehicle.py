@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from cangauge.bus.protection import LEAF_RULE
+from cangauge.bus.protection import LEAF_RULE, ProtectionRule
 from cangauge.bus.vehicle import PRESETS, Vehicle
 from cangauge.errors import InputError
 
@@ -35,15 +35,12 @@ BA_ "GenMsgCycleTime" BO_ 256 20;
 
 MAP = """name = "my car"
 temperature_source = "pack"
-
 [current]
 message = "BMS_Status"
 signal = "PackCurrent"
 sign = -1
-
 [voltage]
 signal = "PackVoltage"
-
 [temperature]
 signal = "PackTemperature"
 """
@@ -66,15 +63,13 @@ def load(folder: Path, text: str | None = None, **options: float) -> Vehicle:
 def test_every_preset_loads_and_wants_its_three_signals(name: str) -> None:
     temperature_c = 20.0 if PRESETS[name].lacks_temperature else None
     vehicle = Vehicle.load(name, temperature_c=temperature_c)
-    assert vehicle.current.codec.unit == "A"
-    assert vehicle.voltage.codec.unit == "V"
+    assert (vehicle.current.codec.unit, vehicle.voltage.codec.unit) == ("A", "V")
     assert vehicle.soc_reference is not None
     if temperature_c is None:
         assert vehicle.temperature is not None
         assert math.isnan(vehicle.fixed_temperature_c)
     else:
-        assert vehicle.fixed_temperature_c == temperature_c
-        assert vehicle.temperature_source == "unknown"
+        assert (vehicle.fixed_temperature_c, vehicle.temperature_source) == (20.0, "unknown")
     cells = () if vehicle.cells is None else vehicle.cells.keys
     assert set(vehicle.messages) == {*(signal.key for signal in vehicle.signals), *cells}
     assert len(vehicle.filters) == len(vehicle.wanted_ids)
@@ -82,15 +77,12 @@ def test_every_preset_loads_and_wants_its_three_signals(name: str) -> None:
 
 
 def test_presets_are_known_in_any_spelling() -> None:
-    assert Vehicle.load("Leaf-ZE0").name == "Nissan Leaf ZE0"
-    assert Vehicle.load("leaf_ze0").messages[0x1DB].rule is LEAF_RULE
-
-
-def test_a_car_without_temperature_on_its_bus_asks_for_one() -> None:
-    with pytest.raises(InputError, match="no pack temperature") as caught:
-        Vehicle.load("leaf_ze1")
-    assert caught.value.field == "--vehicle"
-    assert "--temperature" in str(caught.value.cure)
+    leaf = Vehicle.load("Leaf-ZE0")
+    assert (leaf.name, leaf.temperature_source) == ("Nissan Leaf ZE0", "pack")
+    assert leaf.messages[0x1DB][:2] == (LEAF_RULE, 0.01)
+    assert (PRESETS["leaf_ze0"].periods_s, PRESETS["leaf_ze1"].periods_s) == (
+        {0x5BC: 0.5}, {0x5BC: 0.1},
+    )  # fmt: skip
 
 
 @pytest.mark.parametrize("temperature_c", [math.nan, math.inf, 300.0, -61.0])
@@ -99,23 +91,19 @@ def test_a_fixed_temperature_must_be_plausible(temperature_c: float) -> None:
         Vehicle.load("leaf_ze1", temperature_c=temperature_c)
 
 
-def test_an_unknown_vehicle_suggests_the_closest() -> None:
-    with pytest.raises(InputError, match="did you mean leaf_ze0") as caught:
-        Vehicle.load("leafze0")
-    assert caught.value.value == "leafze0"
-    with pytest.raises(InputError, match="known are generic, leaf_ze0"):
-        Vehicle.load("tesla")
-
-
 def test_incomplete_or_contradictory_options_are_refused(own: Path) -> None:
-    with pytest.raises(InputError, match="no vehicle is given"):
-        Vehicle.load()
-    with pytest.raises(InputError, match=r"--map.*does not name the signals"):
-        Vehicle.load(dbc=own / "car.dbc")
-    with pytest.raises(InputError, match=r"dbc: is missing"):
-        Vehicle.load(map=own / "car.toml")
-    with pytest.raises(InputError, match="given together"):
-        Vehicle.load("generic", dbc=own / "car.dbc")
+    for options, text in (
+        ({"preset": "leaf_ze1"}, r"--vehicle.*no pack temperature.*--temperature"),
+        ({"preset": "leafze0"}, "'leafze0'.*did you mean leaf_ze0"),
+        ({"preset": "tesla"}, "known are generic, leaf_ze0"),
+        ({}, "no vehicle is given"),
+        ({"dbc": own / "car.dbc"}, "--map.*does not name the signals"),
+        ({"map": own / "car.toml"}, "dbc: is missing"),
+        ({"preset": "generic", "dbc": own / "car.dbc"}, "given together"),
+        ({"dbc": own / "car.dbc", "map": own / "absent.toml"}, "no such file"),
+    ):
+        with pytest.raises(InputError, match=text):
+            Vehicle.load(**options)  # type: ignore[arg-type] # of a table
 
 
 def test_a_dbc_with_a_map_file_gives_a_vehicle(own: Path) -> None:
@@ -131,35 +119,29 @@ def test_a_dbc_with_a_map_file_gives_a_vehicle(own: Path) -> None:
     assert vehicle.soc_reference is None
 
 
-def test_the_map_file_may_name_the_dbc(own: Path) -> None:
-    (own / "car.toml").write_text('dbc = "car.dbc"\n' + MAP)
-    assert Vehicle.load(map=own / "car.toml").dbc_files == (str(own / "car.dbc"),)
-
-
-def test_signals_may_come_from_two_dbc_files(own: Path) -> None:
+def test_the_map_file_may_name_dbc_files(own: Path) -> None:
     (own / "more.dbc").write_text(
         'BO_ 512 MORE: 8 X\n SG_ AmbientTemp : 0|8@1- (1,0) [0|0] "degC" X\n'
     )
-    text = 'dbc = ["more.dbc"]\n' + MAP.replace("PackTemperature", "AmbientTemp")
-    assert load(own, text).wanted_ids == (256, 512)
+    text = MAP.replace("PackTemperature", "AmbientTemp")
+    assert load(own, 'dbc = "more.dbc"\n' + text).wanted_ids == (256, 512)
+    (own / "car.toml").write_text('dbc = ["car.dbc", "more.dbc"]\n' + text)
+    files = Vehicle.load(map=own / "car.toml").dbc_files
+    assert files == (str(own / "car.dbc"), str(own / "more.dbc"))
 
 
-def test_units_of_the_dbc_are_converted(own: Path) -> None:
+KELVIN = bytes([0]) + (2931).to_bytes(2, "little") + bytes(5)
+
+
+def test_units_of_the_dbc_are_converted_before_the_sign(own: Path) -> None:
     text = MAP.replace("PackVoltage", "CellMilliVolts").replace("PackTemperature", "CoolantKelvin")
     vehicle = load(own, text)
     assert vehicle.voltage.codec.decode(bytes([0, 0, 0, 0, 0x0E, 0x74, 0, 0])) == pytest.approx(3.7)
     assert vehicle.temperature is not None
-    assert vehicle.temperature.codec.decode(
-        bytes([0]) + (2931).to_bytes(2, "little") + bytes(5)
-    ) == pytest.approx(19.95)
-
-
-def test_the_sign_applies_after_conversion(own: Path) -> None:
-    text = MAP.replace("PackTemperature", "CoolantKelvin") + "sign = -1\n"
-    temperature = load(own, text).temperature
-    assert temperature is not None
-    payload = bytes([0]) + (2931).to_bytes(2, "little") + bytes(5)
-    assert temperature.codec.decode(payload) == pytest.approx(-19.95)
+    assert vehicle.temperature.codec.decode(KELVIN) == pytest.approx(19.95)
+    turned = load(own, text + "sign = -1\n").temperature
+    assert turned is not None
+    assert turned.codec.decode(KELVIN) == pytest.approx(-19.95)
 
 
 def test_an_unknown_unit_is_refused(own: Path) -> None:
@@ -176,32 +158,28 @@ def test_the_map_file_corrects_sign_and_scale(own: Path) -> None:
     assert load(own, text).current.codec.decode(payload) == pytest.approx(0.5 * 20.0 + 3.0)
 
 
-def test_the_map_file_may_fix_the_temperature(own: Path) -> None:
+def test_the_temperature_may_be_fixed(own: Path) -> None:
     vehicle = load(own, MAP.replace('signal = "PackTemperature"', "fixed_c = 21.5"))
-    assert vehicle.temperature is None
-    assert vehicle.fixed_temperature_c == 21.5
+    assert (vehicle.temperature, vehicle.fixed_temperature_c) == (None, 21.5)
     assert load(own, temperature_c=5.0).fixed_temperature_c == 5.0
+    text = MAP.replace('[temperature]\nsignal = "PackTemperature"\n', "")
+    with pytest.raises(InputError, match="temperature: is missing"):
+        load(own, text)
+    assert load(own, text, temperature_c=20.0).fixed_temperature_c == 20.0
 
 
-def test_the_map_file_adds_codes_and_conditions(own: Path) -> None:
-    text = MAP.replace(
-        "[temperature]", "not_available = [9999]\nwhen = { Counter = 3 }\n\n[temperature]"
-    )
-    voltage = load(own, text).voltage.codec
-    assert 9999 in voltage.not_available
-    assert voltage.is_in(bytes([0, 0, 0, 0, 0, 0, 3, 0]))
-    assert not voltage.is_in(bytes([0, 0, 0, 0, 0, 0, 2, 0]))
-
-
-def test_the_map_file_defines_protection_rules(own: Path) -> None:
-    text = MAP + (
+def test_the_map_file_adds_codes_conditions_and_rules(own: Path) -> None:
+    more = "not_available = [9999]\nwhen = { Counter = 3 }\nlowest = 2\n[temperature]"
+    voltage = load(own, MAP.replace("[temperature]", more)).voltage
+    assert 9999 in voltage.codec.not_available
+    assert [voltage.codec.is_in(bytes([*bytes(6), n, 0])) for n in (3, 2)] == [True, False]
+    assert (voltage.checks.lowest, voltage.checks.stuck_after_s) == (2.0, 10.0)
+    message = load(own, MAP + (
         '\n[messages.0x100]\nprotection = "mine"\nperiod_s = 0.5\n'
         "[rules.mine]\npolynomial = 0x2F\ninitial = 0xFF\ncounter_bits = 4\n"
-    )
-    message = load(own, text).messages[256]
+    )).messages[256]  # fmt: skip
     assert message.period_s == 0.5
-    assert message.rule is not None
-    assert (message.rule.polynomial, message.rule.counter_byte) == (0x2F, -2)
+    assert message.rule == ProtectionRule("mine", 0x2F, initial=0xFF)
 
 
 @pytest.mark.parametrize(
@@ -221,12 +199,7 @@ def test_the_map_file_defines_protection_rules(own: Path) -> None:
         ("[voltage]", "[volts]", "volts", "did you mean voltage"),
         ('[voltage]\nsignal = "PackVoltage"\n', "", "voltage", "is missing"),
         ('"pack"', '"battery"', "temperature_source", "'battery'"),
-        (
-            'name = "my car"',
-            "pair_within_s = 5",
-            "pair_within_s",
-            "must be at most 1",
-        ),
+        ('name = "my car"', "pair_within_s = 5", "pair_within_s", "must be at most 1"),
         ('signal = "PackTemperature"', "", "temperature", "either signal or fixed_c"),
         ('signal = "PackTemperature"', "fixed_c = 900", "temperature.fixed_c", "120"),
     ],
@@ -272,6 +245,7 @@ def test_mistakes_in_protection_name_the_field(own: Path, more: str, field: str,
         (b"\xff\xfe\x00", "not TOML"),
         (b"[" * 5000, "not TOML"),
         (b"", "missing"),
+        (b"#" * 300_000, "larger than"),
     ],
 )
 def test_a_file_that_is_no_map_is_refused(own: Path, content: bytes, text: str) -> None:
@@ -279,18 +253,3 @@ def test_a_file_that_is_no_map_is_refused(own: Path, content: bytes, text: str) 
     with pytest.raises(InputError, match=text) as caught:
         load(own)
     assert caught.value.source == str(own / "car.toml")
-
-
-def test_a_large_or_absent_map_is_refused(own: Path) -> None:
-    (own / "car.toml").write_bytes(b"#" * 300_000)
-    with pytest.raises(InputError, match="larger than"):
-        load(own)
-    with pytest.raises(InputError, match="no such file"):
-        Vehicle.load(dbc=own / "car.dbc", map=own / "absent.toml")
-
-
-def test_a_map_without_temperature_asks_for_one(own: Path) -> None:
-    text = MAP.replace('[temperature]\nsignal = "PackTemperature"\n', "")
-    with pytest.raises(InputError, match="temperature: is missing"):
-        load(own, text)
-    assert load(own, text, temperature_c=20.0).fixed_temperature_c == 20.0

@@ -104,17 +104,9 @@ class Capture:
     """A capture file: iterable over its messages, any number of times.
 
     Time stamps are in seconds, as recorded: from 1970, from the start of the capture or of the
-    logger. In a capture without stamps, time is counted from 0 in frames of the clock's id;
-    frames between two of them have the earlier one's time.
-
-    Parameters
-    ----------
-    path : Path
-    kind : type of CaptureReader
-    clock : tuple of int and float
-        Id of the frames that count time where there are no stamps, and their period [s].
-    parts : sequence of Path
-        The files for which `path` stands; by default itself.
+    logger. In a capture without stamps, time is counted from 0 in frames of an id and with a period
+    [s] (`clock`); frames between two of them have the earlier one's time. `parts` are the files for
+    which `path` stands; by default itself.
     """
 
     def __init__(

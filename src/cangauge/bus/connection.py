@@ -95,12 +95,12 @@ def queue_drops(bus: can.BusABC) -> int | None:
 
 
 class BusConnection:
-    """A bus in use.
+    """A bus in use; closed by `close`, or at the end of a `with` block.
 
     Parameters
     ----------
     bus : can.BusABC, optional
-        Closed by `close`, or at the end of a `with` block; None: no bus at present.
+        None: no bus at present.
     name : str
         For messages.
     capabilities : BackendCapabilities, optional
@@ -118,8 +118,7 @@ class BusConnection:
     is_drained : bool
         Whether the receive queue was empty after the latest call that received.
     foreign, polls : int, PollCounts or None
-        Set by the service's loop: frames from another sender with ids that the service sends, and
-        what came of its requests.
+        Set by the service's loop: frames of others with its ids; outcomes of its requests.
     """
 
     def __init__(
@@ -156,23 +155,14 @@ class BusConnection:
             bus.shutdown()
 
     def receive(self, timeout_s: float) -> can.Message | None:
-        """Return the next frame that passes the filters; None if none came in time.
-
-        Raises
-        ------
-        BusError
-            If the bus is gone.
-        """
+        """Return the next frame that passes the filters; None if none came in time."""
         messages = self._receive(timeout_s, 1)
         return messages[0] if messages else None
 
     def receive_pending(self, timeout_s: float) -> list[can.Message]:
         """Return the pending frames that pass the filters, at most `AT_ONCE`; wait for the first.
 
-        Raises
-        ------
-        BusError
-            If the bus is gone.
+        Raises BusError if the bus is gone.
         """
         return self._receive(timeout_s, AT_ONCE)
 
@@ -215,10 +205,7 @@ class BusConnection:
     def send(self, message: can.Message, within_s: float = SEND_WITHIN_S) -> bool:
         """Send a frame; return False if the transmit queue stayed full for `within_s` [s].
 
-        Raises
-        ------
-        BusError
-            If the bus is gone.
+        Raises BusError if the bus is gone.
         """
         until_s = time.monotonic() + within_s
         while not self._try_to_send(message):
@@ -229,15 +216,10 @@ class BusConnection:
         return True
 
     def post(self, message: can.Message, within_s: float = SEND_WITHIN_S) -> None:
-        """Send a frame without waiting.
+        """Send a frame without waiting; raise BusError if the bus is gone.
 
         While the transmit queue is full, posted frames are retried in order with every call that
         receives, and dropped after `within_s` [s].
-
-        Raises
-        ------
-        BusError
-            If the bus is gone.
         """
         self._posted.append((time.monotonic() + within_s, message))
         self._send_posted()

@@ -12,6 +12,7 @@ import math
 import re
 import struct
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
@@ -40,8 +41,7 @@ _NOT_A_VALUE = re.compile(
 )
 _FLOATS: Final = {16: "e", 32: "f", 64: "d"}
 _LARGEST: Final = {"e": 65504.0, "f": 3.4028234e38, "d": math.inf}
-_KINDS: Final = {".arxml": "arxml", ".kcd": "kcd", ".sym": "sym"}
-"""Formats besides DBC, by suffix."""
+_KINDS: Final = {".arxml": "arxml", ".kcd": "kcd", ".sym": "sym"}  # besides DBC
 
 # cantools warns on stderr of messages defined twice; `find_message` reports the wanted ones.
 logging.getLogger("cantools").addHandler(logging.NullHandler())
@@ -51,29 +51,28 @@ logging.getLogger("cantools").addHandler(logging.NullHandler())
 class Field:
     """Bits of a payload, as an unsigned number.
 
-    Parameters
-    ----------
-    shift, width : int
-        Lowest bit and number of bits, in the payload read as one number.
-    big_endian : bool
-        Byte order of that number: Motorola or Intel.
+    `shift` is the lowest bit and `width` the number of bits, in the payload read as one number of
+    the byte order `big_endian` (Motorola) or not (Intel). Payloads have the message's own length.
     """
 
     shift: int
     width: int
     big_endian: bool
 
+    @property
+    def order(self) -> Literal["big", "little"]:
+        """Byte order, as `int.from_bytes` names it."""
+        return "big" if self.big_endian else "little"
+
     def get(self, payload: bytes | bytearray) -> int:
-        """Return the bits of a payload of the message's own length."""
-        word = int.from_bytes(payload, "big" if self.big_endian else "little")
-        return (word >> self.shift) & ((1 << self.width) - 1)
+        """Return the bits of a payload."""
+        return (int.from_bytes(payload, self.order) >> self.shift) & ((1 << self.width) - 1)
 
     def put(self, payload: bytearray, raw: int) -> None:
-        """Set the bits in a payload of the message's own length."""
-        order: Literal["big", "little"] = "big" if self.big_endian else "little"
+        """Set the bits in a payload."""
         mask = ((1 << self.width) - 1) << self.shift
-        word = int.from_bytes(payload, order) & ~mask | ((raw << self.shift) & mask)
-        payload[:] = word.to_bytes(len(payload), order)
+        word = int.from_bytes(payload, self.order) & ~mask | ((raw << self.shift) & mask)
+        payload[:] = word.to_bytes(len(payload), self.order)
 
     @classmethod
     def of(cls, signal: Signal, length: int) -> Field:
@@ -94,18 +93,14 @@ class Condition:
 
 @dataclass(frozen=True, slots=True)
 class SignalCodec:
-    """Conversion of one signal between payload and physical value.
+    """Conversion of one signal: value = gain × (raw × factor + offset) + shift.
 
     Parameters
     ----------
-    name, unit : str
+    name, unit, factor, offset : str, float
         In the DBC.
-    field : Field
-    is_signed : bool
-    float_format : str
-        `struct` format of an IEEE float, "" for integers.
-    factor, offset, gain, shift : float
-        value = gain × (raw × factor + offset) + shift; the first two are the DBC's.
+    field, is_signed, float_format : Field, bool, str
+        Bits; `float_format` is the `struct` format of an IEEE float, "" for integers.
     not_available : frozenset of int
         Raw codes without a value.
     conditions : tuple of Condition
@@ -140,34 +135,23 @@ class SignalCodec:
 
     def _decoder(self) -> Decode:
         """Return `decode`: the kind of the signal is decided here, once, not for each frame."""
-        order: Literal["big", "little"] = "big" if self.field.big_endian else "little"
-        low_bit, mask = self.field.shift, (1 << self.field.width) - 1
+        order, low_bit, mask = self.field.order, self.field.shift, (1 << self.field.width) - 1
         factor, offset, gain, shift = self.factor, self.offset, self.gain, self.shift
+        not_available, sign_bit = self.not_available, (mask + 1) >> 1 if self.is_signed else 0
+        floating = struct.Struct(">" + (self.float_format or "d"))
 
-        if self.float_format:
-            floating = struct.Struct(">" + self.float_format)
-
-            def decode_float(payload: bytes | bytearray) -> float:
-                raw = (int.from_bytes(payload, order) >> low_bit) & mask
-                number: float = floating.unpack(raw.to_bytes(floating.size, "big"))[0]
-                if not math.isfinite(number):
-                    return math.nan
-                return gain * (number * factor + offset) + shift
-
-            return decode_float
-
-        not_available = self.not_available
-        sign_bit = (mask + 1) >> 1 if self.is_signed else 0
+        def decode_float(payload: bytes | bytearray) -> float:
+            raw = (int.from_bytes(payload, order) >> low_bit) & mask
+            number: float = floating.unpack(raw.to_bytes(floating.size, "big"))[0]
+            return gain * (number * factor + offset) + shift if math.isfinite(number) else math.nan
 
         def decode_integer(payload: bytes | bytearray) -> float:
             raw = (int.from_bytes(payload, order) >> low_bit) & mask
             if raw & sign_bit:
                 raw -= mask + 1
-            if raw in not_available:
-                return math.nan
-            return gain * (raw * factor + offset) + shift
+            return math.nan if raw in not_available else gain * (raw * factor + offset) + shift
 
-        return decode_integer
+        return decode_float if self.float_format else decode_integer
 
     def is_in(self, payload: bytes | bytearray) -> bool:
         """Return whether the signal is present, according to its multiplexers, if any."""
@@ -176,10 +160,7 @@ class SignalCodec:
     def encode_into(self, payload: bytearray, value: float) -> None:
         """Set the signal and its multiplexers; NaN becomes the first "not available" code.
 
-        Raises
-        ------
-        InputError
-            If the value does not fit, or is NaN and there is no such code.
+        Raises InputError if the value does not fit, or is NaN and there is no such code.
         """
         for condition in self.conditions:
             condition.field.put(payload, min(condition.values))
@@ -187,30 +168,25 @@ class SignalCodec:
 
     def _raw(self, value: float) -> int:
         number = ((value - self.shift) / self.gain - self.offset) / self.factor
+        low, high = self.raw_range
         try:
             if self.float_format:
                 return int.from_bytes(struct.pack(">" + self.float_format, number), "big")
-            if math.isnan(value):
-                if not self.not_available:
-                    raise InputError(
-                        "the DBC has no code for a missing value", field=self.name, value=math.nan
-                    )
+            if not math.isnan(value):
+                raw = round(number)
+            elif self.not_available:
                 return min(self.not_available)
-            raw, (low, high) = round(number), self.raw_range
+            else:
+                problem = "the DBC has no code for a missing value"
+                raise InputError(problem, field=self.name, value=math.nan)
         except OverflowError:  # too large for the float, or infinite
-            raise self._does_not_fit(value) from None
+            raw = high + 1
         if not low <= raw <= high or raw in self.not_available:
-            raise self._does_not_fit(value)
+            ends = "{:g} to {:g}".format(*self.range)
+            problem = f"does not fit into the signal, which holds {ends} {self.unit}".rstrip()
+            cure = "use a DBC with a wider signal"
+            raise InputError(problem, field=self.name, value=value, cure=cure)
         return raw
-
-    def _does_not_fit(self, value: float) -> InputError:
-        low, high = self.range
-        return InputError(
-            f"does not fit into the signal, which holds {low:g} to {high:g} {self.unit}".rstrip(),
-            field=self.name,
-            value=value,
-            cure="use a DBC with a wider signal",
-        )
 
     def quantize(self, values: FloatArray) -> FloatArray:
         """Return what `decode` gives after `encode_into`, for each value, without range check."""
@@ -226,17 +202,14 @@ class SignalCodec:
         numbers = ((values - self.shift) / self.gain - self.offset) / self.factor
         if self.float_format:
             return np.asarray(~(np.abs(numbers) > _LARGEST[self.float_format]))
-        raw = np.rint(numbers)
-        low, high = self.raw_range
+        raw, (low, high) = np.rint(numbers), self.raw_range
         return np.asarray(~((raw < low) | (raw > high) | np.isin(raw, list(self.not_available))))
 
     @property
     def raw_range(self) -> tuple[int, int]:
         """Smallest and largest raw number."""
-        width = self.field.width
-        if self.is_signed:
-            return -(1 << (width - 1)), (1 << (width - 1)) - 1
-        return 0, (1 << width) - 1
+        low = -(1 << (self.field.width - 1)) if self.is_signed else 0
+        return low, low + (1 << self.field.width) - 1
 
     @property
     def range(self) -> tuple[float, float]:
@@ -270,12 +243,10 @@ def signal_codec(
 
     Parameters
     ----------
-    message, signal : cantools.database.can.Message, cantools.database.can.Signal
     source, field : object, str
         For error messages: the file, and the name of the entry in the map file.
     not_available : tuple of int
-        Raw codes without a value, besides those that the value table names "not available",
-        "SNA", "invalid", ….
+        Raw codes without a value, besides those that the value table names so.
     when : dict of str to int, optional
         Further conditions: raw values of other signals of the message.
 
@@ -297,12 +268,9 @@ def signal_codec(
         elif not (0.0 < abs(conversion.scale) < math.inf and math.isfinite(conversion.offset)):
             problem = "factor and offset must be finite and the factor not 0"
         if problem:
+            where = f"{field}.signal"
             raise InputError(
-                problem,
-                source=str(source),
-                field=f"{field}.signal",
-                value=each.name,
-                cure="correct the DBC",
+                problem, source=str(source), field=where, value=each.name, cure="correct the DBC"
             )
         return bits
 
@@ -316,12 +284,8 @@ def signal_codec(
     for name, value in (when or {}).items():
         other = _signal(message, name)
         if other is None:
-            raise InputError(
-                f"message {message.name} has no such signal",
-                source=str(source),
-                field=f"{field}.when",
-                value=name,
-            )
+            problem = f"message {message.name} has no such signal"
+            raise InputError(problem, source=str(source), field=f"{field}.when", value=name)
         other_bits = bits_of(other)
         raw = value & ((1 << other_bits.width) - 1)
         conditions.append(Condition(other_bits, frozenset({raw})))
@@ -354,11 +318,7 @@ def load_dbc(path: str | PathLike[str]) -> Database:
     """Read a DBC file, or an ARXML, KCD or SYM file by its suffix.
 
     Overlapping signals are accepted: many files have some in messages that are not wanted.
-
-    Raises
-    ------
-    InputError
-        If the file is absent, larger than `MAX_DBC_BYTES`, or not a DBC.
+    Raises InputError if the file is absent, larger than `MAX_DBC_BYTES`, or not a DBC.
     """
     path = Path(path)
     kind = _KINDS.get(path.suffix.lower(), "dbc")
@@ -372,22 +332,15 @@ def load_dbc(path: str | PathLike[str]) -> Database:
     try:
         database = cantools.database.load_string(text, kind, strict=False)
     except (
-        cantools.Error,
-        ET.ParseError,
-        LookupError,
-        ValueError,
-        TypeError,
-        ArithmeticError,
+        cantools.Error, ET.ParseError, LookupError, ValueError, TypeError, ArithmeticError,
         AttributeError,
         AssertionError,  # a multiplexed signal without a multiplexer
         RecursionError,  # signals multiplexed in a circle
-    ) as error:
+    ) as error:  # fmt: skip
         first_line = (str(error) or type(error).__name__).splitlines()[0][:160]
-        raise InputError(
-            f"not a {kind.upper()} file that can be read: {first_line}",
-            source=path,
-            cure=f"open it in a {kind.upper()} editor, which names the error",
-        ) from error
+        problem = f"not a {kind.upper()} file that can be read: {first_line}"
+        cure = f"open it in a {kind.upper()} editor, which names the error"
+        raise InputError(problem, source=path, cure=cure) from error
     if not isinstance(database, Database) or not database.messages:
         raise InputError(f"the {kind.upper()} defines no messages", source=path)
     return database
@@ -396,28 +349,23 @@ def load_dbc(path: str | PathLike[str]) -> Database:
 def find_message(database: Database, message: str | int, *, source: object, field: str) -> Message:
     """Return the message of that name or id ("PackStatus", 475, "0x1DB").
 
-    Raises
-    ------
-    InputError
-        If there is none (with the closest names) or more than one.
+    Raises InputError if there is none (with the closest names) or more than one.
     """
-    wanted = _as_id(message)
-    found = [
-        each
-        for each in database.messages
-        if each.name == message or (wanted is not None and each.frame_id == wanted)
-    ]
+    wanted: int | None = None
+    with suppress(ValueError):
+        wanted = message if isinstance(message, int) else int(message, 0)
+    messages = database.messages
+    found = [each for each in messages if each.name == message or each.frame_id == wanted]
     if len(found) == 1:
         return found[0]
     if found:
         problem, cure = f"the DBC defines {len(found)} such messages", "keep one of them"
     else:
         problem = "the DBC has no such message"
-        names = [each.name for each in database.messages]
-        near = closest(str(message), names) if wanted is None else ""
-        shown = [f"{each.name} (0x{each.frame_id:X})" for each in database.messages[:6]]
-        more = f" and {len(names) - 6} more" if len(names) > 6 else ""
-        cure = f"did you mean {near}?" if near else f"its messages are {', '.join(shown)}{more}"
+        near = closest(str(message), [each.name for each in messages]) if wanted is None else ""
+        shown = ", ".join(f"{each.name} (0x{each.frame_id:X})" for each in messages[:6])
+        more = f" and {len(messages) - 6} more" if len(messages) > 6 else ""
+        cure = f"did you mean {near}?" if near else f"its messages are {shown}{more}"
     raise InputError(problem, source=str(source), field=field, value=message, cure=cure)
 
 
@@ -426,10 +374,7 @@ def find_signal(
 ) -> tuple[Message, Signal]:
     """Return a signal and its message; without a message, the only signal of that name.
 
-    Raises
-    ------
-    InputError
-        If there is none (with the closest names) or more than one.
+    Raises InputError if there is none (with the closest names) or more than one.
     """
     owners = [each for each in database.messages if _signal(each, signal)]
     if message is not None:
@@ -440,9 +385,9 @@ def find_signal(
         problem = f"message {owner.name} has no such signal"
         names = [each.name for each in owner.signals]
         shown = ", ".join(names[:8]) + (", …" if len(names) > 8 else "")
+        near = closest(signal, names)
         cure = f"it has {shown}" if shown else "it has no signals"
-        if near := closest(signal, names):
-            cure = f"did you mean {near}?"
+        cure = f"did you mean {near}?" if near else cure
         if owners:
             cure = f"it is in {', '.join(each.name for each in owners[:3])}"
     elif len(owners) == 1:
@@ -456,12 +401,3 @@ def find_signal(
         near = closest(signal, (each.name for owner in database.messages for each in owner.signals))
         cure = f"did you mean {near}?" if near else "check the name in the DBC"
     raise InputError(problem, source=str(source), field=f"{field}.signal", value=signal, cure=cure)
-
-
-def _as_id(message: str | int) -> int | None:
-    if isinstance(message, int):
-        return message
-    try:
-        return int(message, 0)
-    except ValueError:
-        return None

@@ -112,14 +112,9 @@ class Pairing:
 
 
 class CellVoltages:
-    """Latest voltage of each cell.
+    """Latest voltage of each cell and its bus time [V, s]; NaN before the first plausible value.
 
-    Attributes
-    ----------
-    voltage_v, time_s : list of float
-        By cell, with its bus time [V, s]; NaN before the first plausible value.
-    refused : int
-        Values out of range.
+    `refused` counts values out of range.
     """
 
     def __init__(self, signals: CellSignals) -> None:
@@ -194,11 +189,10 @@ class SampleDecoder:
     """Decode a vehicle's frames to samples; a pure function of frames and time stamps.
 
     Refused are: frames with a wrong CRC, a repeated alive counter or too few bytes; all frames of a
-    message that seems to have two senders, until `SUSPECTED_FOR_S` after the last sign of the
-    second, since a mixture of both is worse than a gap; values that are not available or
-    implausible (see `plausibility`). A jump of the alive counter counts as a loss, and the frame is
-    used. Error frames, remote frames and frames of the wrong id width are ignored. The temperature
-    of a sample is the latest value while it is usable, else NaN.
+    message that seems to have two senders, since a mixture of both is worse than a gap; values that
+    are not available or implausible (see `plausibility`). A jump of the alive counter counts as a
+    loss, and the frame is used. The temperature of a sample is the latest value while it is usable,
+    else NaN.
 
     Parameters
     ----------
@@ -209,9 +203,8 @@ class SampleDecoder:
 
     Attributes
     ----------
-    statistics : FrameStatistics
-    health : dict of str to SignalHealth
-        By role. Read only.
+    statistics, health : FrameStatistics, dict of str to SignalHealth
+        Counts; health by role, read only.
     now_s : float
         Bus time of the latest wanted frame [s]; −inf before the first.
     cells : CellVoltages or None
@@ -281,11 +274,7 @@ class SampleDecoder:
         return self._routes[key]
 
     def handle(self, message: can.Message) -> Sample | None:
-        """Decode one frame; return the sample that it completes, if any.
-
-        `voltage_v` and `temperature_c` of a sample may be NaN. Samples keep the order of their
-        currents.
-        """
+        """Decode one frame; return the sample that it completes, if any."""
         self.statistics.frames += 1
         if message.is_error_frame or message.is_remote_frame:
             self.statistics.ignored += 1
@@ -381,8 +370,7 @@ class SampleDecoder:
     def reasons(self, now_s: float) -> Reason:
         """Return which signals are missing at bus time `now_s` [s], and why.
 
-        A missing signal without a further reason is old, never came, or is sent as "not
-        available".
+        One without a further reason is old, never came, or is sent as "not available".
         """
         reasons = _DUPLICATE if now_s < self._suspected_until_s else _NO_REASON
         for health, missing in self._needed:

@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Final
+from typing import Any, Final
 
 import can
 import numpy as np
 
 from cangauge._typing import FloatArray
 from cangauge.bus.database import Condition
-from cangauge.bus.protection import Protection
 from cangauge.bus.time_source import MICROSECONDS
 from cangauge.bus.vehicle import LOG_COLUMNS, Vehicle, VehicleSignal
 from cangauge.errors import InputError
@@ -29,8 +27,7 @@ _UNITS: Final = {"current": "A", "voltage": "V", "temperature": "°C", "soc_refe
 class _Outgoing:
     """A frame to send: the signals of one message that share a payload."""
 
-    signals: tuple[VehicleSignal, ...]
-    rule: Protection | None
+    signals: list[VehicleSignal]
     is_slow: bool
     last: bytes = b""
     last_s: float = -math.inf
@@ -43,37 +40,39 @@ class FrameEncoder:
     current; then voltage. Slow ones are sent when their quantized value changes, and every
     `SLOW_EVERY_S` of log time. Alive counters run per message. Time stamps are the samples' times.
 
-    Parameters
-    ----------
-    vehicle : Vehicle
+    Raises InputError for a vehicle whose frames can only be received.
     """
 
     def __init__(self, vehicle: Vehicle) -> None:
         if any(each.is_reply for each in vehicle.messages.values()):
+            cure = "use a vehicle without them, and --temperature"
             raise InputError(
-                "replies over ISO-TP are received only",
-                source=vehicle.name,
-                cure="use a vehicle without them, and --temperature",
+                "replies over ISO-TP are received only", source=vehicle.name, cure=cure
             )
         self.vehicle = vehicle
         self._counters = dict.fromkeys(vehicle.messages, 0)
-        self._frames = _plan(vehicle)
+        groups: dict[tuple[int, tuple[Condition, ...]], list[VehicleSignal]] = {}
+        for signal in vehicle.signals:
+            groups.setdefault((signal.key, signal.codec.conditions), []).append(signal)
+        self._frames = []
+        for (key, conditions), signals in groups.items():
+            is_slow = all(signal.role in {"temperature", "soc_reference"} for signal in signals)
+            if not is_slow and any(other == key and more != conditions for other, more in groups):
+                raise InputError(
+                    "has multiplexed frames with current or voltage, which cannot be replayed",
+                    source=vehicle.dbc_files[0],
+                    field=signals[0].message,
+                    cure="replay as another --vehicle",
+                )
+            self._frames.append(_Outgoing(signals, is_slow))
+        self._frames.sort(key=lambda frame: not frame.is_slow)
 
     def encode(self, sample: Sample, soc_reference_pct: float | None = None) -> list[can.Message]:
         """Return the frames of one sample, in sending order.
 
-        Parameters
-        ----------
-        sample : Sample
-            A frame whose values are all NaN is not sent; a NaN among others becomes the DBC's
-            code for "not available".
-        soc_reference_pct : float, optional
-            Sent where the vehicle has such a signal; None or NaN: not sent.
-
-        Raises
-        ------
-        InputError
-            If a value does not fit into its signal, or is NaN without such a code.
+        A frame whose values are all NaN is not sent; a NaN among others becomes the DBC's code for
+        "not available". InputError is raised if a value does not fit into its signal, or has no
+        such code.
         """
         values = {
             "current": sample.current_a,
@@ -81,32 +80,26 @@ class FrameEncoder:
             "temperature": sample.temperature_c,
             "soc_reference": math.nan if soc_reference_pct is None else soc_reference_pct,
         }
-        messages = []
-        for frame in self._frames:
-            message = self._frame(
-                frame, [values[each.role] for each in frame.signals], sample.time_s
-            )
-            if message is not None:
-                messages.append(message)
-        return messages
+        frames = (self._frame(frame, values, sample.time_s) for frame in self._frames)
+        return [frame for frame in frames if frame is not None]
 
     def _frame(
-        self, frame: _Outgoing, values: Sequence[float], time_s: float
+        self, frame: _Outgoing, values: dict[str, float], time_s: float
     ) -> can.Message | None:
-        if all(math.isnan(value) for value in values):
+        if all(math.isnan(values[signal.role]) for signal in frame.signals):
             return None
         first = frame.signals[0]
         payload = bytearray(first.length)
-        for signal, value in zip(frame.signals, values, strict=True):
-            signal.codec.encode_into(payload, value)
+        for signal in frame.signals:
+            signal.codec.encode_into(payload, values[signal.role])
         if frame.is_slow:
             if payload == frame.last and 0.0 <= time_s - frame.last_s < SLOW_EVERY_S:
                 return None
             frame.last, frame.last_s = bytes(payload), time_s
-        if frame.rule is not None:
-            counter = self._counters[first.key]
-            self._counters[first.key] = counter + 1
-            payload = bytearray(frame.rule.protect(payload, counter))
+        rule = self.vehicle.messages[first.key].rule
+        if rule is not None:
+            payload = bytearray(rule.protect(payload, self._counters[first.key]))
+            self._counters[first.key] += 1
         return can.Message(
             timestamp=time_s,
             arbitration_id=first.arbitration_id,
@@ -116,40 +109,30 @@ class FrameEncoder:
         )
 
     def check_range(self, log: Log) -> None:
-        """Check that every value of a log fits into its signal, before anything is sent.
+        """Raise InputError for the first signal that is too narrow for a log, before sending.
 
-        Raises
-        ------
-        InputError
-            Names the first signal that is too narrow, its range, the value and its row.
+        It names the signal, its range, the value and its row.
         """
-        for signal, field, values in self._columns(log):
+        for signal, column, values in self._columns(log):
             bad = np.flatnonzero(~signal.codec.fits(values))
             if bad.size:
-                row = int(bad[0])
-                low, high = signal.codec.range
-                unit = _UNITS[signal.role]
+                row, (low, high) = int(bad[0]), signal.codec.range
                 raise InputError(
-                    f"does not fit into signal {signal.codec.name} of {signal.message}, which"
-                    f" holds {low:g} to {high:g} {unit}; the first such row is {row + 1}",
+                    f"does not fit into signal {signal.codec.name} of {signal.message}, which holds"
+                    f" {low:g} to {high:g} {_UNITS[signal.role]}; the first such row is {row + 1}",
                     source=log.source or log.name,
-                    field=field,
+                    field=column,
                     value=float(values[row]),
                     cure="replay it as another --vehicle",
                 )
 
     def quantization(self) -> dict[str, float]:
-        """Return the largest quantization errors of frames: half a step.
+        """Return the largest quantization errors of frames, half a step, by column of the log.
 
-        Returns
-        -------
-        dict of str to float
-            `current_a` [A], `voltage_v` [V], `temperature_c` [°C], `soc_pct` [%], where the
-            vehicle sends them, and `time_s` [s] for REPLAY_CLOCK.
+        `time_s` is that of REPLAY_CLOCK.
         """
-        steps = {
-            LOG_COLUMNS[signal.role]: signal.codec.half_step for signal in self.vehicle.signals
-        }
+        signals = self.vehicle.signals
+        steps = {LOG_COLUMNS[signal.role]: signal.codec.half_step for signal in signals}
         return {**steps, "time_s": 0.5 / MICROSECONDS}
 
     def quantize(self, log: Log) -> Log:
@@ -158,43 +141,15 @@ class FrameEncoder:
         A vehicle without a temperature signal gives its fixed temperature, or the log's if it has
         none.
         """
-        sent = {
-            field: signal.codec.quantize(values) for signal, field, values in self._columns(log)
+        sent: dict[str, Any] = {
+            column: each.codec.quantize(values) for each, column, values in self._columns(log)
         }
         if not math.isnan(self.vehicle.fixed_temperature_c):
             sent["temperature_c"] = np.full(len(log), self.vehicle.fixed_temperature_c)
-        return replace(
-            log,
-            time_s=np.rint(log.time_s * MICROSECONDS) / MICROSECONDS,
-            current_a=sent["current_a"],
-            voltage_v=sent["voltage_v"],
-            temperature_c=sent.get("temperature_c", log.temperature_c),
-            soc_pct=sent.get("soc_pct", log.soc_pct),
-        )
+        time_s = np.rint(log.time_s * MICROSECONDS) / MICROSECONDS
+        return replace(log, time_s=time_s, **sent)
 
     def _columns(self, log: Log) -> list[tuple[VehicleSignal, str, FloatArray]]:
-        found = []
-        for signal in self.vehicle.signals:
-            values = getattr(log, LOG_COLUMNS[signal.role])
-            if values is not None:
-                found.append((signal, LOG_COLUMNS[signal.role], values))
-        return found
-
-
-def _plan(vehicle: Vehicle) -> list[_Outgoing]:
-    """Return the frames of one sample, slow ones first."""
-    groups: dict[tuple[int, tuple[Condition, ...]], list[VehicleSignal]] = {}
-    for signal in vehicle.signals:
-        groups.setdefault((signal.key, signal.codec.conditions), []).append(signal)
-    frames = []
-    for (key, conditions), signals in groups.items():
-        is_slow = all(signal.role in {"temperature", "soc_reference"} for signal in signals)
-        if not is_slow and any(other == key and more != conditions for other, more in groups):
-            raise InputError(
-                "has multiplexed frames with current or voltage, which cannot be replayed",
-                source=vehicle.dbc_files[0],
-                field=signals[0].message,
-                cure="replay as another --vehicle",
-            )
-        frames.append(_Outgoing(tuple(signals), vehicle.messages[key].rule, is_slow))
-    return sorted(frames, key=lambda frame: not frame.is_slow)
+        columns = [(signal, LOG_COLUMNS[signal.role]) for signal in self.vehicle.signals]
+        found = [(signal, column, getattr(log, column)) for signal, column in columns]
+        return [each for each in found if each[2] is not None]

@@ -48,22 +48,11 @@ class _Strict(BaseModel):
 
 
 class CheckMap(_Strict):
-    """Plausibility limits of a signal; defaults in `plausibility.DEFAULTS`.
+    """Plausibility limits of a signal [A, positive = discharge; V; °C; %]; see `plausibility`.
 
-    Parameters
-    ----------
-    lowest, highest : float, optional
-        Range [A, positive = discharge; V; °C; %].
-    max_jump, max_rate_per_s : float, optional
-        Largest distance from the latest good value: the first, plus the second for every second
-        since then [A, V, K, %].
-    invalid_after, valid_after : int, optional
-        Consecutive failures until invalid; consecutive good values until valid again.
-    stuck_after_s : float, optional
-        Least duration of a constant value that can count as stuck [s]: current and voltage while
-        the other one moves; temperature in any case, only where this is stated.
-    timeout_s : float, optional
-        Age at which a value becomes old [s]; by default a multiple of the message's period.
+    A value may differ from the latest good one by `max_jump`, plus `max_rate_per_s` for every
+    second since then. `stuck_after_s` is the least duration of a constant value that can count as
+    stuck [s]: current and voltage while the other one moves; temperature only where it is stated.
     """
 
     lowest: FiniteFloat | None = None
@@ -87,19 +76,10 @@ class CheckMap(_Strict):
 class SignalMap(CheckMap):
     """One signal of the DBC: value = sign × scale × (DBC value) + offset.
 
-    Parameters
-    ----------
-    message : str or int, optional
-        Name or id; optional where the signal's name is unique in the DBC.
-    signal : str
-    sign : {1, -1}
-        -1 where the bus has the opposite sign (current: negative = discharge).
-    scale, offset : float
-        For a DBC with a wrong or unknown unit; stating either also overrides the DBC's unit.
-    when : dict of str to int
-        Raw values that other signals of the frame must have (multiplexers missing in the DBC).
-    not_available : tuple of int
-        Raw codes without a value, besides those named so in the DBC's value table.
+    `message` is a name or id, optional where the signal's name is unique. `sign` is −1 where the
+    bus has the opposite sign (current: negative = discharge). Stating `scale` or `offset` overrides
+    the DBC's unit. `when` are raw values that other signals of the frame must have (multiplexers
+    missing in the DBC), `not_available` raw codes without a value besides those of the value table.
     """
 
     message: str | int | None = None
@@ -132,26 +112,9 @@ class TemperatureMap(SignalMap):
 class CellsMap(_Strict):
     """Voltages of the cells in series: one signal a cell, or groups numbered by a signal.
 
-    Parameters
-    ----------
-    count, first : int
-        Number of cells; number of the first.
-    signal : str, optional
-        Name of a cell's signal, with "{n}" for its number.
-    message : str or int, optional
-        Message of the signals, likewise with "{n}" if each cell has its own.
-    index : str, optional
-        Signal whose raw value numbers the group in a frame.
-    signals : tuple of str
-        Signals of a group, in the order of the cells.
-    first_index : int
-        Number of the first group.
-    scale, offset, not_available
-        As in `SignalMap` [V].
-    lowest, highest : float, optional
-        Plausible voltages [V].
-    timeout_s : float, optional
-        Age at which a voltage becomes old [s].
+    `signal` and `message` are names with "{n}" for the cell's number, from `first` on; or the raw
+    value of `index` numbers the group in a frame, from `first_index` on, and `signals` are those of
+    a group, in the order of the cells. The other keys are as in `SignalMap` [V, s].
     """
 
     count: Annotated[int, Field(ge=2, le=CELLS_AT_MOST)]
@@ -164,9 +127,9 @@ class CellsMap(_Strict):
     scale: _Positive = 1.0
     offset: FiniteFloat = 0.0
     not_available: tuple[int, ...] = ()
-    lowest: FiniteFloat | None = None
-    highest: FiniteFloat | None = None
-    timeout_s: _Positive | None = None
+    lowest: FiniteFloat = 0.2
+    highest: FiniteFloat = 6.0  # below and above any lithium cell
+    timeout_s: _Positive = 10.0  # large packs send a round of cells in some seconds
 
     @model_validator(mode="after")
     def _one_of_both(self) -> Self:
@@ -205,24 +168,11 @@ def _numbered(name: str | int | None, number: int) -> str | int | None:
 class MessageMap(_Strict):
     """Protection and period of a message.
 
-    Parameters
-    ----------
-    protection : str, optional
-        One of `protection.RULES`, of [rules] or of `protection.PROFILES`, or "counter".
-    j1939 : bool
-        Whether its PGN identifies it: from any source address, at any priority.
-    isotp : bool
-        Whether it is a reply over ISO-TP, with the id of `polling.reply_key` in the DBC.
-    request_id : int, optional
-        Standard id on which the service may ask for this reply.
-    period_s : float, optional
-        Frame period [s].
-    data_id, data_id_list, data_id_mode, header_byte, protected_bytes
-        For a profile; see `E2eRule`.
-    counter : str, optional
-        For "counter": the counter's signal.
-    counter_modulus : int, optional
-        Number of counter values; by default all that its bits can hold.
+    `protection` is one of `protection.RULES`, of [rules] or of `protection.PROFILES` (see `E2eRule`
+    for their keys), or "counter", with its signal and the number of its values, by default all that
+    its bits can hold. `j1939`: its PGN identifies it, from any source address and at any priority.
+    `isotp`: it is a reply over ISO-TP, with the id of `polling.reply_key` in the DBC, which the
+    service may ask for on `request_id`.
     """
 
     protection: str | None = None
@@ -245,29 +195,16 @@ class MessageMap(_Strict):
     ) -> Protection | None:
         """Return the protection of a message; None where none is stated.
 
-        Parameters
-        ----------
-        message : cantools.database.can.Message
-        rules : mapping of str to RuleMap
-            The user's own rules.
-        source : str
-            The file, for error messages.
-
-        Raises
-        ------
-        InputError
-            If the rule is unknown, does not fit, lacks a field or has one of another protection.
+        `rules` are the user's own, `source` is the file for error messages. Raises InputError if
+        the rule is unknown, does not fit, lacks a field or has one of another protection.
         """
         try:
             return self._rule(message, rules)
         except InputError as error:
             name = (error.field or "").rpartition(".")[2]
+            where = f"messages.{message.name}.{name}"
             raise InputError(
-                error.problem,
-                source=source,
-                field=f"messages.{message.name}.{name}",
-                value=error.value,
-                cure=error.cure,
+                error.problem, source=source, field=where, value=error.value, cure=error.cure
             ) from error
 
     def _rule(self, message: Message, rules: Mapping[str, RuleMap]) -> Protection | None:
@@ -289,42 +226,30 @@ class MessageMap(_Strict):
         elif name in RULES:
             rule = RULES[name]
         else:
-            raise InputError(
-                "unknown protection rule",
-                field="protection",
-                value=name,
-                cure=f"known are {', '.join([*RULES, COUNTER, *PROFILES, *rules])};"
-                f" or define it under [rules.{name}]",
-            )
+            known = ", ".join([*RULES, COUNTER, *PROFILES, *rules])
+            cure = f"known are {known}; or define it under [rules.{name}]"
+            raise InputError("unknown protection rule", field="protection", value=name, cure=cure)
         if not rule.fits(message.length):
-            raise InputError(
-                f"the rule does not fit into the {message.length} bytes of the message",
-                field="protection",
-                value=name,
-            )
+            problem = f"the rule does not fit into the {message.length} bytes of the message"
+            raise InputError(problem, field="protection", value=name)
         return rule
 
     def _counter_rule(self, message: Message) -> CounterRule:
         if self.counter is None:
-            raise InputError(
-                "is missing", field="counter", cure="name the signal of the alive counter"
-            )
+            cure = "name the signal of the alive counter"
+            raise InputError("is missing", field="counter", cure=cure)
         signal = next((each for each in message.signals if each.name == self.counter), None)
         if signal is None:
-            raise InputError(
-                f"message {message.name} has no such signal", field="counter", value=self.counter
-            )
+            problem = f"message {message.name} has no such signal"
+            raise InputError(problem, field="counter", value=self.counter)
         bits = BitField.of(signal, message.length)
         return CounterRule(COUNTER, bits, message.length, self.counter_modulus or 1 << bits.width)
 
     def _profile_rule(self, name: str) -> E2eRule:
         wanted = "data_id" if PROFILES[name].id_bits else "data_id_list"
         if getattr(self, wanted) is None:
-            raise InputError(
-                "is missing",
-                field=wanted,
-                cure=f"the CRC of {name} covers it: ask the sender's manufacturer",
-            )
+            cure = f"the CRC of {name} covers it: ask the sender's manufacturer"
+            raise InputError("is missing", field=wanted, cure=cure)
         return E2eRule(
             name,
             data_id=self.data_id or 0,
@@ -338,11 +263,8 @@ class MessageMap(_Strict):
         """Raise InputError for fields that belong to another protection only."""
         for name in names:
             if getattr(self, name) is not None:
-                raise InputError(
-                    f"belongs to {protection}",
-                    field=name,
-                    cure=f"set protection to {protection}, or remove this field",
-                )
+                cure = f"set protection to {protection}, or remove this field"
+                raise InputError(f"belongs to {protection}", field=name, cure=cure)
 
 
 class RuleMap(_Strict):
@@ -360,26 +282,10 @@ class RuleMap(_Strict):
 class VehicleMap(_Strict):
     """Content of a map file.
 
-    Parameters
-    ----------
-    name : str
-    dbc : tuple of str
-        DBC files, relative to the map file; searched after `--dbc`.
-    current, voltage : SignalMap
-    temperature : TemperatureMap, optional
-        Without it, a fixed temperature must be given as an option.
-    soc_reference : SignalMap, optional
-        The car's own state of charge, to begin from and to compare with; also named `soc`.
-    columns : dict
-        Columns of the car's logs that are tables (`logs.column_map.ColumnMap`).
-    cells : CellsMap, optional
-        Voltages of the cells.
-    temperature_source : {"cell", "pack", "coolant", "room", "unknown"}
-    pair_within_s : float
-        Largest distance in bus time between paired current and voltage [s].
-    messages : dict of str to MessageMap
-        By name or id.
-    rules : dict of str to RuleMap
+    `dbc` are files relative to it, searched after `--dbc`. The temperature may be given as an
+    option; `soc_reference` (also: `soc`) is the car's own state of charge. `columns` are those of
+    the car's logs that are tables (`logs.column_map.ColumnMap`). `pair_within_s` is the largest
+    distance in bus time between paired current and voltage [s]. Messages go by name or id.
     """
 
     name: str = "own map"
@@ -413,10 +319,7 @@ class VehicleMap(_Strict):
 def columns_of_map(path: Path | str) -> ColumnMap | None:
     """Return `[columns]` of a map file, or None; the file may hold nothing else.
 
-    Raises
-    ------
-    InputError
-        If the file cannot be read, or a column is not understood.
+    Raises InputError if the file cannot be read, or a column is not understood.
     """
     columns = read_toml(path).get("columns")
     if columns is None:
@@ -427,25 +330,21 @@ def columns_of_map(path: Path | str) -> ColumnMap | None:
     return ColumnMap.of(columns, where)
 
 
+_NONE: Final[Mapping[str, Any]] = MappingProxyType({})
+
+
 @dataclass(frozen=True, slots=True)
 class Overrides:
     """Protection and checks of a service configuration, which override the car's map file.
 
-    Parameters
-    ----------
-    source : str
-        The file, for error messages.
-    messages : mapping of str to MessageMap
-        By name or id; missing fields are taken from the map file.
-    rules : mapping of str to RuleMap
-    checks : mapping of str to CheckMap
-        By role: "current", "voltage", "temperature", "soc_reference".
+    `source` is the file, for error messages. Messages go by name or id, checks by role; missing
+    fields are taken from the map file.
     """
 
     source: str = ""
-    messages: Mapping[str, MessageMap] = field(default_factory=lambda: MappingProxyType({}))
-    rules: Mapping[str, RuleMap] = field(default_factory=lambda: MappingProxyType({}))
-    checks: Mapping[str, CheckMap] = field(default_factory=lambda: MappingProxyType({}))
+    messages: Mapping[str, MessageMap] = field(default_factory=lambda: _NONE)
+    rules: Mapping[str, RuleMap] = field(default_factory=lambda: _NONE)
+    checks: Mapping[str, CheckMap] = field(default_factory=lambda: _NONE)
 
     def merged_messages(
         self, mapping: VehicleMap, source: str, key_of: Callable[[str], int]

@@ -61,17 +61,9 @@ class DriverMissingError(InputError):
 
 @dataclass(frozen=True)
 class BusAddress:
-    """Address of a bus.
+    """Address of a bus: one of `can.VALID_INTERFACES`, channel, further arguments of the driver.
 
-    Parameters
-    ----------
-    interface : str
-        One of `can.VALID_INTERFACES`.
-    channel : str
-    options : mapping of str to (str, int, float or bool)
-        Further arguments of the driver, such as `bitrate`.
-    local_only : bool
-        Drop packets that other machines send; for `udp_multicast`.
+    `local_only` drops packets that other machines send; for `udp_multicast`.
     """
 
     interface: str
@@ -91,12 +83,8 @@ def bus_address(
     """Complete a partial address.
 
     Default interface: SocketCAN if it has that channel (default vcan0), else `udp_multicast`, which
-    is `local_only` if neither a channel nor `hop_limit` is given.
-
-    Raises
-    ------
-    InputError
-        If the interface is unknown or needs a channel, or no default interface has the channel.
+    is `local_only` if neither a channel nor `hop_limit` is given. Raises InputError if the
+    interface is unknown or needs a channel, or no default interface has the channel.
     """
     options = dict(options or {})
     local_only = interface is None and channel is None and "hop_limit" not in options
@@ -163,13 +151,7 @@ def _is_multicast(channel: str) -> bool:
 
 
 def parse_bus_options(given: Sequence[str]) -> dict[str, BusOption]:
-    """Parse `K=V` texts; whole numbers, decimals, true and false get their type.
-
-    Raises
-    ------
-    InputError
-        If a text is not of that form.
-    """
+    """Parse `K=V` texts; whole numbers, decimals, true and false get their type."""
     options: dict[str, BusOption] = {}
     for text in given:
         key, equals, value = text.partition("=")
@@ -186,13 +168,7 @@ def parse_bus_options(given: Sequence[str]) -> dict[str, BusOption]:
 
 
 def open_bus(address: BusAddress, filters: Sequence[CanFilter] | None = None) -> can.BusABC:
-    """Open a bus.
-
-    Parameters
-    ----------
-    address : BusAddress
-    filters : sequence of CanFilter, optional
-        As in `can.BusABC.set_filters`; applied in the kernel on SocketCAN, else in Python.
+    """Open a bus; `filters` apply in the kernel on SocketCAN, else in Python.
 
     Raises
     ------
@@ -296,16 +272,10 @@ Stamps = Literal["kernel", "sender", "driver"]
 class BackendCapabilities:
     """Properties of an interface.
 
-    Parameters
-    ----------
-    stamps : {"kernel", "sender", "driver"}
-        Origin of the time stamps. "kernel": arrival, however late the frame is read
-        (SO_TIMESTAMPNS). "sender": sending (within one process). "driver": depends on the driver,
-        the adapter's clock or the moment of reading.
-    echoes : bool
-        Whether own frames are received too.
-    has_error_classes : bool
-        Whether error frames have SocketCAN's error classes.
+    `stamps` is the origin of the time stamps. "kernel": arrival, however late the frame is read
+    (SO_TIMESTAMPNS). "sender": sending (within one process). "driver": depends on the driver, the
+    adapter's clock or the moment of reading. `echoes`: own frames are received too.
+    `has_error_classes`: error frames have SocketCAN's error classes.
     """
 
     stamps: Stamps
@@ -345,10 +315,7 @@ _MAX_CHANNEL: Final = 64
 def message_of(packet: bytes, stamp_s: float) -> can.Message:
     """Return the frame of a packet, with the time of its arrival [s since 1970].
 
-    Raises
-    ------
-    can.CanOperationError
-        If it is no frame; it has a cause, and so counts as one garbled packet.
+    Raises can.CanOperationError with a cause if it is no frame: it counts as one garbled packet.
     """
     try:
         fields = msgpack.unpackb(packet, raw=False)
@@ -369,13 +336,10 @@ def _is_channel(value: object) -> bool:
 
 
 class CheckedUdpBus(UdpMulticastBus):
-    """python-can's bus, with checked packets; arguments as of `UdpMulticastBus`.
+    """python-can's bus, with checked packets.
 
-    Parameters
-    ----------
-    local_only : bool
-        Drop packets whose sender is not an address of this machine. (The kernel drops packets
-        from the network that pretend to be.)
+    `local_only` drops packets whose sender is not an address of this machine. (The kernel drops
+    packets from the network that pretend to be.)
     """
 
     def __init__(self, *args: Any, local_only: bool = False, **kwargs: Any) -> None:

@@ -126,17 +126,8 @@ _IMPLAUSIBLE: Final = Reason.IMPLAUSIBLE_INPUT
 class SignalHealth:
     """Check the values of one signal in order of time.
 
-    Parameters
-    ----------
-    checks : SignalChecks
-    period_s : float, optional
-        Stated period of its values [s]; by default it is learned.
-    is_cyclic : bool
-        Whether the signal is sent every period even when it does not change.
-    is_stuck : callable, optional
-        Takes a value and its bus time [s]; returns whether the signal is stuck.
-    statistics : MessageStatistics, optional
-        Counts the refused values.
+    `period_s` is the stated period of its values [s]; by default it is learned. `is_cyclic`: it is
+    sent every period even when it does not change. `is_stuck` takes a value and its bus time [s].
 
     Attributes
     ----------
@@ -204,10 +195,7 @@ class SignalHealth:
             self._learned_s = learned_s + (min(interval_s, 4.0 * learned_s) - learned_s) / 16.0
 
     def fail(self, reason: Reason, *, is_repeated: bool = False) -> float:
-        """Record a failed value or a refused frame; return NaN.
-
-        A repeated frame does not invalidate the original, and so does not restart recovery.
-        """
+        """Record a failed value or frame; return NaN. A repeated one does not stop recovery."""
         self.reason = reason
         self._failures += 1
         if not is_repeated:
@@ -271,14 +259,10 @@ car's, the coarsest in use."""
 class StuckDetector:
     """Detect a signal that is constant while its partner swings; made by `stuck_detectors`.
 
-    Parameters
-    ----------
-    after_s, step : float
-        Least duration of a constant value that counts as stuck [s]; quantization in the frame
-        [A, V], 0 for floats. The smallest change seen counts where it is larger.
-    partner_swing : callable
-        Takes the quantization of this signal; returns the least distance of the partner's turning
-        points that proves that this one should change.
+    `after_s` is the least duration of a constant value that counts as stuck [s]; `step` the
+    quantization in the frame [A, V], 0 for floats. The smallest change seen counts where it is
+    larger. `partner_swing` takes it; it returns the least distance of the partner's turning points
+    that proves that this signal should change.
     """
 
     partner: StuckDetector
@@ -333,14 +317,8 @@ def stuck_detectors(
     A change of the current by ΔI changes the voltage by R·ΔI at once. A voltage whose code stays
     constant while the current swings, by R·ΔI of several quantization steps, is stuck; and vice
     versa. Turning points are counted, not drift, so that these are not called stuck: a pack at
-    rest; a charge at constant current; a current of exactly 0 next to a noisy voltage.
-
-    Parameters
-    ----------
-    pack : Pack
-    steps, after_s : tuple of float
-        Of current and voltage: quantization in their frames [A, V], 0 for floats; least duration
-        of a constant value that counts as stuck [s].
+    rest; a charge at constant current; a current of exactly 0 next to a noisy voltage. `steps` and
+    `after_s`, of current and voltage, are as in `StuckDetector`.
     """
     ohm, least_a = pack.resistance_ohm, SWING_C_RATE * pack.capacity_ah
 
@@ -362,8 +340,7 @@ def stuck_detectors(
 class ConstantDetector:
     """Detect a signal that has been constant for a stated time [s].
 
-    For a temperature: slow, coarse and without a partner, it is constant for hours in a healthy
-    car. Used only where the user states a time.
+    For a temperature: without a partner, it is constant for hours in a healthy car.
     """
 
     def __init__(self, after_s: float) -> None:

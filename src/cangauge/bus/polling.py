@@ -17,28 +17,22 @@ from typing import Final
 import can
 
 LONGEST_GAP_S: Final = 1.0
-"""Longest time between frames of one reply [s]: N_Cr of ISO 15765-2."""
-
 REPLY_WITHIN_S: Final = 1.0
-"""Longest wait for a reply's next frame [s]: N_Cr of ISO 15765-2; a request without one failed."""
-
+"""Longest time between frames of one reply, and wait for its next frame [s]: N_Cr of
+ISO 15765-2. A request without one failed."""
 PENDING_WITHIN_S: Final = 5.0
 """Longest wait after "response pending" [s]: P2* of ISO 14229-2."""
-
 SLOWEST_S: Final = 60.0
 """Longest interval between requests for a reply that does not come [s]: one a minute burdens no
 bus."""
-
 OTHER_TESTER_S: Final = 30.0
 """Silence of another tester after which requests are sent again [s]: applications of drivers ask
 every few seconds."""
-
 BETWEEN_S: Final = 0.05
 """Shortest time from the end of one exchange to the next request [s]: P2 of ISO 14229-2."""
 
 _SINGLE, _FIRST, _CONSECUTIVE = range(3)
-_NEGATIVE, _RESPONSE_PENDING = 0x7F, 0x78
-_REPLY_OFFSET: Final = 0x40
+_NEGATIVE, _RESPONSE_PENDING, _REPLY_OFFSET = 0x7F, 0x78, 0x40
 _CONTINUE: Final = bytes([0x30, 0x00, 0x00])
 """Flow control: continue to send, all frames, without a pause."""
 
@@ -59,17 +53,13 @@ def reply_id(key: int) -> int:
 class Reassembler:
     """Replies of one sender, from its frames.
 
-    Attributes
-    ----------
-    lost : int
-        Replies given up: a frame missing, out of order or late.
+    `lost` counts replies given up: a frame missing, out of order or late.
     """
 
     def __init__(self) -> None:
         self.lost = 0
         self._payload = bytearray()
-        self._length = 0
-        self._sequence = 0
+        self._length = self._sequence = 0
         self._last_s = 0.0
 
     def take(self, data: bytes | bytearray, time_s: float) -> bytes | None:
@@ -105,14 +95,9 @@ class Reassembler:
 
 @dataclass(frozen=True, slots=True)
 class PollTarget:
-    """A reply to ask for.
+    """A reply to ask for: standard ids of the frames, and the first two bytes of the reply.
 
-    Parameters
-    ----------
-    request_id, reply_id : int
-        Standard ids of the frames.
-    reply : tuple of int
-        First two bytes of the reply, such as (0x61, 0x04); the request is `21 04`.
+    The request for a reply (0x61, 0x04) is `21 04`.
     """
 
     request_id: int
@@ -127,15 +112,13 @@ class PollTarget:
 
 @dataclass(slots=True)
 class PollCounts:
-    """Outcomes of requests."""
+    """Outcomes of requests: negative ones are no answers; frames of another tester."""
 
     requests: int = 0
     answers: int = 0
     negative: int = 0
-    """Negative ones among the answers."""
     unanswered: int = 0
     other_tester: int = 0
-    """Frames of another tester."""
 
     def to_dict(self) -> dict[str, int]:
         """Return the counts by name."""
@@ -150,7 +133,7 @@ class _Turn:
 
 
 class Poller:
-    """Requests for replies in turn, one at a time.
+    """Requests for replies in turn, one at a time; all times are monotonic [s].
 
     Parameters
     ----------
@@ -169,19 +152,14 @@ class Poller:
         self._turns = [_Turn(target) for target in targets]
         self._every_s = every_s
         self._waiting: _Turn | None = None
-        self._give_up_s = math.inf
-        self._quiet_until_s = -math.inf
+        self._give_up_s, self._quiet_until_s = math.inf, -math.inf
         self._reassembler = Reassembler()
         self.counts = PollCounts()
         self.request_ids = frozenset(turn.target.request_id for turn in self._turns)
         self.reply_ids = frozenset(turn.target.reply_id for turn in self._turns)
 
-    def is_paused(self, now_s: float) -> bool:
-        """Return whether another tester asked lately, at a monotonic time [s]."""
-        return now_s < self._quiet_until_s
-
     def due(self, now_s: float) -> can.Message | None:
-        """Return the request to send at a monotonic time [s], if one is due."""
+        """Return the request to send, if one is due."""
         if self._waiting is not None:
             if now_s < self._give_up_s:
                 return None
@@ -197,7 +175,7 @@ class Poller:
         return _frame(turn.target.request_id, bytes([len(request)]) + request)
 
     def take(self, message: can.Message, now_s: float) -> can.Message | None:
-        """Take a frame of a reply at a monotonic time [s]; return the flow control to send."""
+        """Take a frame of a reply; return the flow control to send."""
         turn = self._waiting
         if turn is None or message.arbitration_id != turn.target.reply_id or not message.data:
             return None
@@ -237,6 +215,5 @@ class Poller:
 
 
 def _frame(request_id: int, payload: bytes) -> can.Message:
-    return can.Message(
-        arbitration_id=request_id, is_extended_id=False, data=payload.ljust(8, b"\0")
-    )
+    data = payload.ljust(8, b"\0")
+    return can.Message(arbitration_id=request_id, is_extended_id=False, data=data)

@@ -30,24 +30,10 @@ def _require(holds: bool, name: str, value: object, problem: str) -> None:
 
 @dataclass(frozen=True, slots=True)
 class ProtectionRule:
-    """CRC-8 (not reflected) over all other bytes, and a counter.
+    """CRC-8 (not reflected) over all other bytes, and a counter of `counter_bits` (0: none).
 
-    Parameters
-    ----------
-    name : str
-    polynomial, initial, xor_out : int
-        Of the CRC, 0–255.
-    crc_byte : int
-        Byte of the CRC; negative: from the end.
-    counter_bits : int
-        Width of the counter; 0: no counter.
-    counter_byte, counter_shift : int
-        Byte of the counter (negative: from the end) and its lowest bit.
-
-    Raises
-    ------
-    InputError
-        If a value is out of range, or CRC and counter overlap.
+    `crc_byte` and `counter_byte` are places, negative ones from the end; `counter_shift` is the
+    counter's lowest bit. Raises InputError if a value is out of range, or CRC and counter overlap.
     """
 
     name: str
@@ -136,17 +122,9 @@ RULES: Final = {rule.name: rule for rule in (LEAF_RULE, GENERIC_RULE, CRC_ONLY_R
 
 @dataclass(frozen=True, slots=True)
 class CounterRule:
-    """A counter that is a signal of the DBC; no known CRC.
+    """A counter that is a signal of the DBC, with values below `modulus`; no known CRC.
 
-    Parameters
-    ----------
-    name : str
-    field : Field
-        Bits of the counter.
-    length : int
-        Bytes of the message.
-    modulus : int
-        Number of counter values: 0 … `modulus` − 1; InputError if the bits cannot hold them.
+    `length` is the message's. Raises InputError if the bits cannot hold `modulus` values.
     """
 
     name: str
@@ -220,27 +198,12 @@ PROFILES: Final = {
 
 @dataclass(frozen=True, slots=True)
 class E2eRule:
-    """AUTOSAR end-to-end protection by a profile.
+    """AUTOSAR end-to-end protection by a profile, one of `PROFILES`.
 
-    The CRC covers the data id too, so that a frame sent under a wrong id is refused.
-
-    Parameters
-    ----------
-    name : str
-        One of `PROFILES`.
-    data_id, data_ids : int, bytes
-        Data id; in profile 2 a list of 16, one per counter value.
-    data_id_mode : {"both", "alternating", "low", "nibble"}
-        Mode of the data id in the CRC: profile 1; profile 11 has "both" and "nibble" only.
-    header_byte : int
-        First byte of the header; 0 in profile 2.
-    protected_bytes : int
-        Protected bytes; 0: the whole payload.
-
-    Raises
-    ------
-    InputError
-        If the profile is unknown, or does not allow these values.
+    The CRC covers the data id too, so that a frame sent under a wrong id is refused. Profile 2 has
+    a list of 16 data ids, one per counter value; the mode of the data id is a choice in profiles 1
+    and 11. `header_byte` is the first byte of the header, `protected_bytes` 0 for the whole
+    payload. Raises InputError if the profile is unknown, or does not allow these values.
     """
 
     name: str
@@ -360,20 +323,13 @@ class FrameChecker:
     A repeated counter is no new frame, unless enough time has passed for the counter to wrap: on a
     lossy bus one in `modulus` of the surviving frames looks like a repetition. Frames that repeat a
     counter with another content, or come out of sequence too soon, are those of a second sender;
-    CAN itself repeats some frames after an error, which are identical.
-
-    Parameters
-    ----------
-    rule : Protection
-    period_s : float, optional
-        Frame period [s]. Without it a repeated counter is a repetition unless `SILENCE_S` passed
-        without a frame.
+    CAN itself repeats some frames after an error, which are identical. Without a period a repeated
+    counter is a repetition unless `SILENCE_S` passed without a frame.
 
     Attributes
     ----------
     lost : int
-        Frames missing right before the latest accepted one, at least: whole wraps of the counter
-        are not visible.
+        Frames missing right before the latest accepted one, but for whole wraps of the counter.
     learned_period_s : callable
         Returns the frame period [s] where none is stated; NaN while it is not known.
     """

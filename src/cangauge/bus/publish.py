@@ -25,11 +25,11 @@ from can.typechecking import CanFilter
 from cantools.database.can import Database
 
 from cangauge._resources import shared_file
-from cangauge.bus.database import SignalCodec, load_dbc, signal_codec
+from cangauge.bus.database import load_dbc, signal_codec
 from cangauge.bus.protection import E2eRule
 from cangauge.bus.time_source import REPLAY_CLOCK_ID
 from cangauge.errors import InputError
-from cangauge.types import CellReport, Estimate, Health, Power, Reason, Status
+from cangauge.types import REASONS, CellReport, Estimate, Health, Power, Reason, Status
 
 ESTIMATE_EVERY_S: Final = 0.1
 DETAIL_EVERY_S: Final = 1.0
@@ -37,10 +37,8 @@ DETAIL_EVERY_BEATS: Final = 10
 """Periods of the frames: [s] of log time, and beats of `ESTIMATE_EVERY_S`."""
 EARLY_S: Final = 0.01
 """A sample may be this early for a frame that is due [s]: else jitter could halve the rate."""
-
 AGE_AT_MOST_S: Final = 30.0
 """Largest age in SOC_ESTIMATE [s]."""
-
 SAMPLES_MODULO: Final = 1 << 16
 """Modulus of the sample count in SOC_DETAIL."""
 ACKNOWLEDGE_EVERY: Final = 4
@@ -51,13 +49,7 @@ _LENGTH: Final = 8
 
 @dataclass(frozen=True)
 class FrameIds:
-    """Standard ids of the frames.
-
-    Raises
-    ------
-    InputError
-        If one is not a standard id, or two are equal.
-    """
+    """Standard ids of the frames; InputError if one is not a standard id, or two are equal."""
 
     soc_estimate: int = 0x5A0
     soc_detail: int = 0x5A1
@@ -69,61 +61,61 @@ class FrameIds:
     @property
     def published(self) -> dict[int, str]:
         """Names of the frames that the service sends, by id."""
-        names = ("soc_estimate", "soc_detail", "soc_health", "soc_power", "soc_cells")
-        return {getattr(self, name): name for name in names}
+        return {getattr(self, name): name for name in _CONTENTS}
 
     def __post_init__(self) -> None:
-        seen: dict[int, str] = {}
+        names: dict[int, str] = {}
         for name in self.__dataclass_fields__:
-            value = getattr(self, name)
+            value, where = getattr(self, name), f"ids.{name}"
             if not 0 <= value <= 0x7FF:
-                raise InputError(
-                    "no standard CAN id", field=f"ids.{name}", value=value, cure="use 0x000–0x7FF"
-                )
-            if value in seen:
-                raise InputError(
-                    f"{seen[value]} has the same id", field=f"ids.{name}", value=f"0x{value:X}"
-                )
-            seen[value] = name
+                cure = "use 0x000–0x7FF"
+                raise InputError("no standard CAN id", field=where, value=value, cure=cure)
+            if value in names:
+                problem = f"{names[value]} has the same id"
+                raise InputError(problem, field=where, value=f"0x{value:X}")
+            names[value] = name
+
+
+# Contents of the frames: fields are the DBC's signals (`reason` is `reasons`); NaN: not available.
 
 
 class SocEstimate(NamedTuple):
-    """Content of a SOC_ESTIMATE."""
+    """Content of a SOC_ESTIMATE: SoC and its standard deviation [%]; see `Estimate`.
+
+    `age_s` is in whole seconds since charge was last counted, at most 30 [s]; NaN: no sample yet.
+    """
 
     soc_pct: float
-    """State of charge [%]; NaN: not available."""
     soc_std_pct: float
-    """Its standard deviation [%]; NaN: not available."""
     status: Status
     reasons: Reason
     age_s: float = math.nan
-    """Whole seconds since charge was last counted, at most 30 [s]; NaN: no sample yet."""
 
 
 class SocDetail(NamedTuple):
-    """Content of a SOC_DETAIL."""
+    """Content of a SOC_DETAIL; `residual_v` is measured minus predicted voltage [V].
+
+    `samples` are those processed so far, modulo `SAMPLES_MODULO`.
+    """
 
     soc_newton_pct: float
     soc_coulomb_pct: float
     residual_v: float
-    """Measured minus predicted voltage [V]; NaN: not available."""
     samples: int
-    """Samples processed so far, modulo `SAMPLES_MODULO`."""
 
 
 class SocHealth(NamedTuple):
-    """Content of a SOC_HEALTH; NaN: not available."""
+    """Content of a SOC_HEALTH; `resistance_ratio` is relative to the model's [-]."""
 
     capacity_ah: float
     capacity_std_ah: float
     resistance_ratio: float
-    """Resistance relative to the model's [-]."""
     resistance_std: float
     current_offset_a: float
 
 
 class SocPower(NamedTuple):
-    """Content of a SOC_POWER; NaN: not available."""
+    """Content of a SOC_POWER: possible currents, both positive, and the energy left."""
 
     discharge_a: float
     discharge_std_a: float
@@ -134,29 +126,38 @@ class SocPower(NamedTuple):
 
 
 class SocCells(NamedTuple):
-    """Content of a SOC_CELLS; NaN: not available."""
+    """Content of a SOC_CELLS.
+
+    `cell_spread_pct` is the SoC of the strongest cell less that of the weakest [%], `sum_error_v`
+    the pack voltage less the sum of the cells [V]; `sum_check` is 0: not known, 1: they agree, 2:
+    they differ by more than both sensors allow.
+    """
 
     weakest_cell: float
     weakest_soc_pct: float
     weakest_soc_std_pct: float
     cell_spread_pct: float
-    """SoC of the strongest cell less that of the weakest [%]."""
     sum_error_v: float
-    """Pack voltage less the sum of the cells [V]."""
     sum_check: float
-    """0: not known, 1: agrees, 2: differs by more than both sensors allow."""
 
 
 SocContent = SocEstimate | SocDetail | SocHealth | SocPower | SocCells
+_CONTENTS: Final[dict[str, Callable[..., SocContent]]] = {
+    "soc_estimate": SocEstimate, "soc_detail": SocDetail, "soc_health": SocHealth,
+    "soc_power": SocPower, "soc_cells": SocCells,
+}  # fmt: skip
+_KINDS: Final[dict[str, Callable[[int], int]]] = {
+    "status": Status, "reasons": Reason, "samples": int,
+}  # fmt: skip
+"""Fields that are not floats."""
 
 
 class PackReport(NamedTuple):
-    """What is published every second besides the estimate."""
+    """What is published every second besides the estimate; without cells: none have voltages."""
 
     health: Health
     power: Power
     cells: CellReport | None = None
-    """None: the vehicle gives no cell voltages."""
 
     @property
     def notices(self) -> list[str]:
@@ -171,15 +172,13 @@ class PackReport(NamedTuple):
 
     def to_dict(self) -> dict[str, Any]:
         """Return the objects "health", "power", "cells" and "notices" of a JSON status."""
-        cells = self.cells
+        cells = None if self.cells is None else self.cells._asdict()
+        if cells is not None and cells["weakest"] < 0:
+            cells["weakest"] = None
         return {
             "health": _finite(self.health._asdict()),
             "power": _finite(self.power._asdict()),
-            "cells": None
-            if cells is None
-            else _finite(
-                cells._asdict() | {"weakest": cells.weakest if cells.weakest >= 0 else None}
-            ),
+            "cells": cells and _finite(cells),
             "notices": self.notices,
         }
 
@@ -190,58 +189,63 @@ NO_REPORT: Final[Mapping[str, Any]] = MappingProxyType(
 """What `PackReport.to_dict` gives before the first sample."""
 
 
+def _finite(values: dict[str, Any]) -> dict[str, Any]:
+    """Return the values, None for NaN."""
+    return {
+        name: None if isinstance(value, float) and not math.isfinite(value) else value
+        for name, value in values.items()
+    }
+
+
 class _Layout:
     """A message of soc_estimate.dbc: codecs by signal, counter and CRC."""
 
     def __init__(self, database: Database, name: str, path: Path) -> None:
         message = database.get_message_by_name(name)
-        self._codecs: dict[str, SignalCodec] = {
+        codecs = {
             signal.name: signal_codec(message, signal, source=path, field=name)
             for signal in message.signals
             if not signal.name.startswith(("counter_", "crc_"))
         }
-        self._limits = {signal: codec.range for signal, codec in self._codecs.items()}
-        try:
-            attributes = getattr(message.dbc, "attributes", {})
-            data_ids = bytes.fromhex(str(attributes["E2EDataIdList"].value))
-        except (KeyError, ValueError) as error:
-            raise InputError(
-                "has no list of data ids", source=path, field=f"{name}.E2EDataIdList"
-            ) from error
+        self._codecs = [
+            ("reasons" if name == "reason" else name, codec, *codec.range)
+            for name, codec in codecs.items()
+        ]
+        attributes = getattr(message.dbc, "attributes", {})
+        data_ids = bytes.fromhex(str(attributes["E2EDataIdList"].value))
         self._rule = E2eRule("e2e_02", data_ids=data_ids)
 
-    def encode(self, counter: int, **values: float) -> bytes:
+    def encode(self, counter: int, values: Mapping[str, float]) -> bytes:
         """Return the payload; values are clipped to the signal's range, NaN becomes its code."""
         payload = bytearray(_LENGTH)
-        for name, codec in self._codecs.items():
-            value = values[name]
+        for name, codec, low, high in self._codecs:
+            value = float(values[name])
             if not math.isnan(value):
-                low, high = self._limits[name]
                 value = min(max(value, low), high)
             codec.encode_into(payload, value)
         return self._rule.protect(payload, counter)
 
-    def decode(self, data: bytes | bytearray) -> dict[str, float] | None:
+    def decode(self, data: bytes | bytearray) -> dict[str, Any] | None:
         """Return the values by name; None for a damaged frame."""
         if len(data) != _LENGTH or not self._rule.is_whole(data):
             return None
-        return {name: codec.decode(data) for name, codec in self._codecs.items()}
+        values: dict[str, Any] = {name: codec.decode(data) for name, codec, _, _ in self._codecs}
+        for name in _KINDS.keys() & values:
+            values[name] = _KINDS[name](int(values[name]))
+        return values
 
 
 def _layouts() -> dict[str, _Layout]:
     path = shared_file("dbc", "soc_estimate.dbc")
     database = load_dbc(path)
-    return {name: _Layout(database, name.upper(), path) for name in FrameIds().published.values()}
+    return {name: _Layout(database, name.upper(), path) for name in _CONTENTS}
 
 
 class SocPublisher:
     """Encode estimates, health, power and cells as frames.
 
-    Parameters
-    ----------
-    ids : FrameIds, optional
-    acknowledge_every : int, optional
-        Send SOC_DETAIL after this number of samples, and at a beat with unacknowledged ones.
+    With `acknowledge_every`, SOC_DETAIL is sent after this number of samples, and at a beat with
+    unacknowledged ones.
     """
 
     def __init__(self, ids: FrameIds | None = None, acknowledge_every: int | None = None) -> None:
@@ -249,10 +253,12 @@ class SocPublisher:
         self._acknowledge_every = acknowledge_every
         self._layouts = _layouts()
         self._made = dict.fromkeys(self._layouts, 0)
-        self._beats = 0
-        self._estimate_due_s = -math.inf
-        self._detail_due_s = -math.inf
-        self._acknowledged = 0
+        self._beats = self._acknowledged = 0
+        self.restart()
+
+    def restart(self) -> None:
+        """Reset the due times: a new log may begin earlier."""
+        self._estimate_due_s = self._detail_due_s = -math.inf
 
     def beat(
         self,
@@ -263,125 +269,87 @@ class SocPublisher:
     ) -> list[can.Message]:
         """Return the frames of one beat; due every `ESTIMATE_EVERY_S`.
 
-        Parameters
-        ----------
-        estimate : Estimate
-        samples : int
-            Samples processed so far, including refused ones.
-        age_s : float
-            Time since the latest of them [s]; NaN: none yet.
-        report : callable, optional
-            Returns health, power and cells; called where their frames are due.
+        `samples` are those processed so far, including refused ones; `age_s` is the time since the
+        latest of them [s], NaN without one. `report` is called where its frames are due.
         """
         frames = [self.estimate_frame(estimate, age_s)]
         is_due = self._beats % DETAIL_EVERY_BEATS == 0
         self._beats += 1
-        if is_due or (self._acknowledge_every is not None and samples != self._acknowledged):
-            frames.append(self.detail_frame(estimate, samples))
-        if is_due and report is not None:
-            frames += self.report_frames(report())
-        return frames
+        is_behind = self._acknowledge_every is not None and samples != self._acknowledged
+        return frames + self._slow_frames(estimate, samples, report, is_due, is_behind)
 
     def publish(
         self, estimate: Estimate, samples: int, report: Callable[[], PackReport] | None = None
     ) -> list[can.Message]:
         """Return the frames due with a sample of a replayed log; arguments as in `beat`."""
-        now_s = estimate.time_s
-        frames = []
+        now_s, frames = estimate.time_s, []
         if now_s >= self._estimate_due_s - EARLY_S:
             self._estimate_due_s = _next_due(self._estimate_due_s, ESTIMATE_EVERY_S, now_s)
             frames.append(self.estimate_frame(estimate))
         is_due = now_s >= self._detail_due_s - EARLY_S
-        if is_due or samples - self._acknowledged >= (self._acknowledge_every or math.inf):
-            if is_due:
-                self._detail_due_s = _next_due(self._detail_due_s, DETAIL_EVERY_S, now_s)
-            frames.append(self.detail_frame(estimate, samples))
-            if is_due and report is not None:
-                frames += self.report_frames(report())
-        return frames
+        if is_due:
+            self._detail_due_s = _next_due(self._detail_due_s, DETAIL_EVERY_S, now_s)
+        is_behind = samples - self._acknowledged >= (self._acknowledge_every or math.inf)
+        return frames + self._slow_frames(estimate, samples, report, is_due, is_behind)
 
-    def restart(self) -> None:
-        """Reset the due times: a new log may begin earlier."""
-        self._estimate_due_s = self._detail_due_s = -math.inf
+    def _slow_frames(
+        self,
+        estimate: Estimate,
+        samples: int,
+        report: Callable[[], PackReport] | None,
+        is_due: bool,
+        is_behind: bool,
+    ) -> list[can.Message]:
+        frames = [self.detail_frame(estimate, samples)] if is_due or is_behind else []
+        return frames + (self.report_frames(report()) if is_due and report is not None else [])
 
     def estimate_frame(self, estimate: Estimate, age_s: float = 0.0) -> can.Message:
         """Return SOC_ESTIMATE with the next counter; arguments as in `beat`."""
+        age_s = age_s if math.isnan(age_s) else min(math.floor(age_s), AGE_AT_MOST_S)
+        soc_pct, std_pct = estimate.soc_pct, estimate.soc_std_pct
         return self._frame(
             "soc_estimate",
-            soc_pct=estimate.soc_pct,
-            soc_std_pct=estimate.soc_std_pct,
-            age_s=age_s if math.isnan(age_s) else min(math.floor(age_s), AGE_AT_MOST_S),
-            reason=float(reason_bits(estimate.reasons)),
-            status=float(estimate.status),
+            SocEstimate(soc_pct, std_pct, estimate.status, reason_bits(estimate.reasons), age_s),
         )
 
     def detail_frame(self, estimate: Estimate, samples: int) -> can.Message:
         """Return SOC_DETAIL with the next counter."""
         self._acknowledged = samples
-        return self._frame(
-            "soc_detail",
-            soc_newton_pct=estimate.soc_newton_pct,
-            soc_coulomb_pct=estimate.soc_coulomb_pct,
-            samples=float(samples % SAMPLES_MODULO),
-            residual_v=estimate.residual_v,
-        )
+        newton_pct, coulomb_pct = estimate.soc_newton_pct, estimate.soc_coulomb_pct
+        detail = SocDetail(newton_pct, coulomb_pct, estimate.residual_v, samples % SAMPLES_MODULO)
+        return self._frame("soc_detail", detail)
 
     def report_frames(self, report: PackReport) -> list[can.Message]:
         """Return SOC_HEALTH, SOC_POWER and, where there are cells, SOC_CELLS."""
-        health, power, cells = report
+        able = report.power
+        energy_kwh, std_kwh = 1e-3 * able.energy_wh, 1e-3 * able.energy_std_wh
+        power = SocPower(*able[:4], energy_kwh, std_kwh)
         frames = [
-            self._frame(
-                "soc_health",
-                capacity_ah=health.capacity_ah,
-                capacity_std_ah=health.capacity_std_ah,
-                resistance_ratio=health.resistance_ratio,
-                resistance_std=health.resistance_std,
-                current_offset_a=health.offset_a,
-            ),
-            self._frame(
-                "soc_power",
-                discharge_a=power.discharge_a,
-                discharge_std_a=power.discharge_std_a,
-                charge_a=power.charge_a,
-                charge_std_a=power.charge_std_a,
-                energy_kwh=1e-3 * power.energy_wh,
-                energy_std_kwh=1e-3 * power.energy_std_wh,
-            ),
+            self._frame("soc_health", SocHealth(*report.health[:5])),
+            self._frame("soc_power", power),
         ]
-        if cells is not None:
-            is_checked = not math.isnan(cells.sum_error_v)
-            frames.append(
-                self._frame(
-                    "soc_cells",
-                    weakest_cell=math.nan if cells.weakest < 0 else float(cells.weakest),
-                    weakest_soc_pct=cells.soc_pct,
-                    weakest_soc_std_pct=cells.soc_std_pct,
-                    cell_spread_pct=cells.spread_pct,
-                    sum_error_v=cells.sum_error_v,
-                    sum_check=float(is_checked + cells.is_sum_wrong),
-                )
-            )
+        if (cells := report.cells) is not None:
+            weakest = math.nan if cells.weakest < 0 else float(cells.weakest)
+            check = float(not math.isnan(cells.sum_error_v)) + cells.is_sum_wrong
+            content = SocCells(weakest, *cells[2:6], check)
+            frames.append(self._frame("soc_cells", content))
         return frames
 
-    def _frame(self, name: str, **values: float) -> can.Message:
+    def _frame(self, name: str, content: SocContent) -> can.Message:
         """Return a frame with the next counter."""
-        data = self._layouts[name].encode(self._made[name], **values)
+        data = self._layouts[name].encode(self._made[name], content._asdict())
         self._made[name] += 1
-        return _message(getattr(self.ids, name), data)
+        return can.Message(arbitration_id=getattr(self.ids, name), is_extended_id=False, data=data)
+
+
+def _next_due(due_s: float, every_s: float, now_s: float) -> float:
+    """Return the next due time on the grid, or on a new one after a pause."""
+    following = due_s + every_s
+    return following if following > now_s else now_s + every_s
 
 
 class SocReader:
-    """Decode the frames of a `SocPublisher`.
-
-    Parameters
-    ----------
-    ids : FrameIds, optional
-
-    Attributes
-    ----------
-    refused : int
-        Damaged frames.
-    """
+    """Decode the frames of a `SocPublisher`; `refused` counts damaged ones."""
 
     def __init__(self, ids: FrameIds | None = None) -> None:
         self.ids = ids or FrameIds()
@@ -396,62 +364,18 @@ class SocReader:
         if name is None:
             return None
         values = self._layouts[name].decode(message.data)
-        if values is None:
-            self.refused += 1
-            return None
-        return _CONTENTS[name](values)
+        self.refused += values is None
+        return None if values is None else _CONTENTS[name](**values)
 
 
-def _estimate_content(values: dict[str, float]) -> SocEstimate:
-    return SocEstimate(
-        values["soc_pct"],
-        values["soc_std_pct"],
-        Status(int(values["status"])),
-        Reason(int(values["reason"])),
-        values["age_s"],
-    )
-
-
-_CONTENTS: Final[dict[str, Callable[[dict[str, float]], SocContent]]] = {
-    "soc_estimate": _estimate_content,
-    "soc_detail": lambda values: SocDetail(
-        values["soc_newton_pct"],
-        values["soc_coulomb_pct"],
-        values["residual_v"],
-        int(values["samples"]),
-    ),
-    "soc_health": lambda values: SocHealth(**values),
-    "soc_power": lambda values: SocPower(**values),
-    "soc_cells": lambda values: SocCells(**values),
-}
-
-
-def reason_bits(reasons: Reason) -> int:
+def reason_bits(reasons: Reason) -> Reason:
     """Return the 20 bits of the frame: a wrong sign of current is an implausible input there."""
     bits = int(reasons)
     if bits & Reason.SIGN_SUSPECT:
         bits = bits & ~Reason.SIGN_SUSPECT | Reason.IMPLAUSIBLE_INPUT
-    return int(bits)
+    return REASONS[bits]
 
 
 def standard_filter(frame_id: int) -> CanFilter:
     """Return python-can's filter for one standard id."""
     return {"can_id": frame_id, "can_mask": 0x7FF, "extended": False}
-
-
-def _finite(values: dict[str, Any]) -> dict[str, Any]:
-    """Return the values, None for NaN."""
-    return {
-        name: None if isinstance(value, float) and not math.isfinite(value) else value
-        for name, value in values.items()
-    }
-
-
-def _next_due(due_s: float, every_s: float, now_s: float) -> float:
-    """Return the next due time on the grid, or on a new one after a pause."""
-    following = due_s + every_s
-    return following if following > now_s else now_s + every_s
-
-
-def _message(frame_id: int, data: bytes) -> can.Message:
-    return can.Message(arbitration_id=frame_id, is_extended_id=False, data=data)

@@ -53,28 +53,19 @@ DAMAGE: Final = (
 
 
 class CaptureReader(MessageReader, ABC):
-    """Reader of one capture format, in the shape of python-can's readers.
+    """Reader of one capture format, in the shape of python-can's readers; a path may be gzipped.
 
     Malformed lines or frames are skipped and counted, and a file that breaks off gives the frames
     before. Subclasses state `name`, recognise their files in `matches`, and yield the frames in
     `read`, which may raise any of `DAMAGE` where the file breaks off.
-
-    Parameters
-    ----------
-    file : path-like or file object
-        A path may be gzipped.
-    **_options : object
-        Ignored; python-can passes options of other readers too.
 
     Attributes
     ----------
     name, unit : str
         Of the format, and of what is malformed, for messages.
     stamps : {"us", "ms", "none"}
-    frames, malformed : int
-        Frames read, and lines or frames skipped as malformed, so far.
-    first_malformed : int or None
-        Number of the first such line, from 1.
+    frames, malformed, first_malformed : int
+        Frames read, and lines or frames skipped as malformed, so far; number of the first, from 1.
     cut_off, damage : bool, str or None
         Whether the file broke off within a line or frame, and the error there.
     remarks : list of str
@@ -113,10 +104,7 @@ class CaptureReader(MessageReader, ABC):
     def messages(self) -> Iterator[can.Message]:
         """Yield the frames with usable stamps, as far as the file can be read.
 
-        Raises
-        ------
-        InputError
-            If most lines are malformed; names the first.
+        Raises InputError if most lines are malformed; it names the first.
         """
         try:
             for message in self.read():
@@ -167,10 +155,7 @@ class BinaryReader(CaptureReader, BinaryIOMessageReader):
 class LineReader(CaptureReader, TextIOMessageReader):
     """Reader of a text format with one frame a line.
 
-    Attributes
-    ----------
-    states_length : bool
-        Whether a line states its number of bytes, so that a cut line is recognised.
+    `states_length`: a line states its number of bytes, so that a cut line is recognised.
     """
 
     states_length: ClassVar[bool] = True

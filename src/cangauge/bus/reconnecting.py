@@ -36,20 +36,8 @@ class ReconnectingBus(BusConnection):
 
     Without a bus, receiving waits and returns nothing, and frames to send are dropped and counted.
     Opening is retried with growing pauses, in the caller's thread: without a bus it has no more to
-    do, and a driver that takes seconds to open delays it by them.
-    Logs the events bus.missing, bus.lost, bus.away, bus.back, bus.off and bus.on.
-
-    Parameters
-    ----------
-    address : BusAddress
-    filters : sequence of CanFilter
-    opener : callable, optional
-        Opens the bus.
-
-    Attributes
-    ----------
-    losses : int
-        Number of times that the bus was lost.
+    do, and a driver that takes seconds to open delays it by them. `losses` counts them. Logs the
+    events bus.missing, bus.lost, bus.away, bus.back, bus.off and bus.on.
     """
 
     def __init__(
@@ -64,17 +52,9 @@ class ReconnectingBus(BusConnection):
         self._is_closed = self._was_off = False
 
     def open(self, *, wait: bool = False) -> None:
-        """Open the bus for the first time.
+        """Open the bus for the first time; with `wait`, return without it if it is missing.
 
-        Parameters
-        ----------
-        wait : bool
-            If the bus is missing, return without it; receiving retries.
-
-        Raises
-        ------
-        InputError
-            As `open_bus`; with `wait` only for a missing driver.
+        Raises InputError as `open_bus`; with `wait` only for a missing driver.
         """
         try:
             self._bus = self._opener(self._address, self._filters)

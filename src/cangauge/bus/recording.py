@@ -167,18 +167,8 @@ def open_with_columns(
 ) -> LogFile | Capture:
     """Open a log by stated columns, or any recording by its content.
 
-    Parameters
-    ----------
-    path : Path
-    columns, mapped : ColumnMap, optional
-        The user's: the file is then a table; a map file's, for tables of no known format.
-    sign : {"charge", "discharge"}, optional
-        What a positive current in a log does.
-
-    Raises
-    ------
-    InputError
-        If the file cannot be read, or an option is wrong.
+    `columns` are the user's: the file is then a table. `mapped` are a map file's, for tables of no
+    known format. `sign` is what a positive current in a log does.
     """
     if columns is not None:
         return open_log(path, columns=columns, sign=sign)
@@ -225,22 +215,11 @@ def capture_without_vehicle(path: str | PathLike[str]) -> InputError:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CaptureSamples:
-    """All samples of a capture, as the live service makes them without a model.
+    """All samples of a capture, as the live service makes them without a model; shape (n,).
 
-    With a model the service also drops values that are impossible for its pack.
-
-    Parameters
-    ----------
-    time_s, current_a : array of shape (n,)
-        Bus time [s], current [A], positive = discharge.
-    voltage_v, temperature_c, soc_pct : array of shape (n,)
-        [V], [°C]; the car's own SoC when the sample was made [%]. NaN where there is none.
-    statistics : FrameStatistics
-        Of the frames of the chosen bus.
-    info : CaptureInfo
-        Of the file.
-    remarks : tuple of str
-        Losses and refusals, for the user.
+    With a model the service also drops values that are impossible for its pack. Times are bus
+    times, NaN stands for a missing value, `soc_pct` is the car's own SoC when the sample was made.
+    `statistics` are those of the chosen bus, `remarks` losses and refusals, for the user.
     """
 
     time_s: FloatArray
@@ -274,19 +253,9 @@ def capture_samples(
 ) -> CaptureSamples:
     """Return the samples of a capture, bit for bit those of the live service.
 
-    Each bus in the capture has its own decoder; the bus with most samples is returned.
-
-    Parameters
-    ----------
-    path : path-like
-    vehicle : Vehicle
-    source : {"receive", "replay-clock"}
-        Bus time: the recorded stamps, or the log time in REPLAY_CLOCK frames.
-
-    Raises
-    ------
-    InputError
-        If the capture cannot be read, or gives no sample.
+    Each bus in the capture has its own decoder; the bus with most samples is returned. Bus time
+    (`source`) is the recorded stamps, or the log time in REPLAY_CLOCK frames. Raises InputError if
+    the capture cannot be read, or gives no sample.
     """
     capture, clock = open_vehicle_capture(path, vehicle), time_source(source)
     # Of each bus: its time (stamps of two buses can be of two adapters), decoder, and values.
@@ -354,13 +323,8 @@ def capture_to_log(
 
     A log has every value in every row. Time stamps that do not increase are dropped; voltage is
     interpolated over at most `VOLTAGE_FILL_S`; temperature is the latest one, before the first
-    the first. Remarks count these rows and the lost frames. Arguments as in `capture_samples`.
-
-    Raises
-    ------
-    InputError
-        If the capture cannot be read, gives no sample, no voltage or no temperature, holds
-        several consecutive replays, or values that are not a battery's.
+    the first. Remarks count these rows and the lost frames. Raises InputError as `capture_samples`,
+    and without voltage or temperature, or for values that are not a battery's.
     """
     samples, path = capture_samples(path, vehicle, source=source), Path(path)
     remarks, time_s = list(samples.remarks), samples.time_s

@@ -27,20 +27,18 @@ from cangauge.estimation.counting import LATEST_S
 TimeSourceName = Literal["receive", "replay-clock"]
 
 REPLAY_CLOCK_ID: Final = 0x5AF
-
 MICROSECONDS: Final = 1e6
 """Unit of REPLAY_CLOCK [1/s]."""
 
-STEP_BACK_S: Final = 1.0
-"""A larger step back in time [s] means a clock that was set, or a new log."""
-
-REVERSAL_S: Final = 0.1
-"""A smaller step back [s] is a matter of the order of writing, as of two buses in one file."""
+STEP_BACK_US: Final = 1_000_000
+"""A larger step back in time [µs] means a clock that was set, or a new log."""
+REVERSAL_US: Final = 100_000
+"""A smaller step back [µs] is a matter of the order of writing, as of two buses in one file."""
 IRREGULAR_REVERSALS: Final = 3
-IRREGULAR_WITHIN_S: Final = 10.0
-"""Reversals within this time [s] that prove irregular stamps: a clock is not set that often."""
-IRREGULAR_FOR_S: Final = 60.0
-"""Time after the latest reversal for which time stays uncertain [s]."""
+IRREGULAR_WITHIN_US: Final = 10_000_000
+"""Reversals within this time [µs] that prove irregular stamps: a clock is not set that often."""
+IRREGULAR_FOR_US: Final = 60_000_000
+"""Time after the latest reversal for which time stays uncertain [µs]."""
 
 
 def whole_us(time_s: float) -> int:
@@ -49,10 +47,9 @@ def whole_us(time_s: float) -> int:
 
 
 class TimeSource(Protocol):
-    """Source of the bus time of each frame."""
+    """Source of the bus time of each frame; `beginnings` counts new logs after the first."""
 
     beginnings: int
-    """Number of new logs so far, after the first."""
 
     @property
     def is_uncertain(self) -> bool:
@@ -65,28 +62,17 @@ class TimeSource(Protocol):
 class ReceiveTime:
     """Receive stamps.
 
-    After a step back of more than `STEP_BACK_S` time continues from the latest stamp, so that
-    setting the clock does not stop the estimate. A step forward is a gap. Stamps that step back
-    again and again are irregular: none of these steps then counts as a clock that was set.
-
-    Attributes
-    ----------
-    steps_back : int
-        Number of such steps.
-    irregular : int
-        Number of steps back that were not taken for one.
+    After a step back of more than `STEP_BACK_US` time continues from the latest stamp, so that
+    setting the clock does not stop the estimate (`steps_back`). A step forward is a gap. Stamps
+    that step back again and again are `irregular`: none of these steps then counts as a set clock.
     """
 
     def __init__(self) -> None:
-        self.beginnings = 0
-        self.steps_back = 0
-        self.irregular = 0
+        self.beginnings = self.steps_back = self.irregular = 0
         self._latest_us: int | None = None
-        self._previous_us = 0
-        self._shift_us = 0
+        self._previous_us = self._shift_us = self._irregular_until_us = 0
         # Time and shift before each of the latest reversals.
         self._reversals: deque[tuple[int, int]] = deque(maxlen=IRREGULAR_REVERSALS)
-        self._irregular_until_us = 0
 
     def time_of(self, message: can.Message) -> float | None:
         """Return the bus time of a frame [s]."""
@@ -109,20 +95,19 @@ class ReceiveTime:
     def _back(self, now_us: int, latest_us: int) -> int:
         """Return the time of a stamp that lies before the latest one [µs]."""
         back_us, self._previous_us = self._previous_us - now_us, now_us
-        is_far = latest_us - now_us > STEP_BACK_S * MICROSECONDS
-        if not (is_far or back_us > REVERSAL_S * MICROSECONDS or self.is_uncertain):
+        is_far = latest_us - now_us > STEP_BACK_US
+        if not (is_far or back_us > REVERSAL_US or self.is_uncertain):
             return now_us
         reversals = self._reversals
         reversals.append((latest_us, self._shift_us))
-        within_us = latest_us - reversals[0][0]
-        are_many = len(reversals) == IRREGULAR_REVERSALS
-        if self.is_uncertain or (are_many and within_us <= whole_us(IRREGULAR_WITHIN_S)):
+        (first_us, first_shift_us), are_many = reversals[0], len(reversals) == IRREGULAR_REVERSALS
+        if self.is_uncertain or (are_many and latest_us - first_us <= IRREGULAR_WITHIN_US):
             if not self.is_uncertain:
-                now_us -= self._shift_us - reversals[0][1]
-                self._shift_us = reversals[0][1]
-            self._irregular_until_us = latest_us + whole_us(IRREGULAR_FOR_S)
+                now_us -= self._shift_us - first_shift_us
+                self._shift_us = first_shift_us
+            self._irregular_until_us = latest_us + IRREGULAR_FOR_US
             self.irregular += 1
-            return max(now_us, latest_us - whole_us(REVERSAL_S))
+            return max(now_us, latest_us - REVERSAL_US)
         if is_far:
             self.steps_back += 1
             self._shift_us += latest_us - now_us
@@ -132,69 +117,48 @@ class ReceiveTime:
 
 
 KERNEL_TOLERANCE_S: Final = 0.02
-"""Difference of a kernel's stamp from the monotonic clock that is no error [s]: both clocks are of
-one machine and run at one rate; the rest is scheduling between two readings of them."""
 DRIVER_TOLERANCE_S: Final = 0.25
-"""The same for other stamps [s]: an adapter's own clock, delivered with its latency."""
+"""Difference of a stamp from the monotonic clock that is no error [s]. Of a kernel's: both clocks
+are of one machine, the rest is scheduling between two readings. Of others: an adapter's own clock,
+delivered with its latency."""
 STEP_AFTER_S: Final = 1.0
 STEP_FRAMES: Final = 5
 """Time [s] and frames over which stamps must be off by the same amount to prove a set clock."""
 UNCERTAIN_AFTER_S: Final = 2.0
-"""Time over which stamps were unusable, from which time is uncertain [s]: longer than it takes to
-recognise a set clock."""
 CERTAIN_AFTER_S: Final = 10.0
-"""Time without an unusable stamp after which time is certain again [s]."""
+"""Time over which stamps were unusable, from which time is uncertain [s]: longer than it takes to
+recognise a set clock; time without an unusable stamp after which it is certain again [s]."""
 
 
 class StampLimiter:
     """Limit stamps to the interval in which the frames can have arrived by the monotonic clock.
 
     A frame received now arrived after the receive queue was last seen empty. A stamp outside this
-    interval is replaced by the time of reading; so bus time keeps the right rate whatever the
-    stamps do. Stamps that are off by a constant amount come from a clock that was set: they are
-    shifted from then on, and exact again.
-
-    Parameters
-    ----------
-    tolerance_s : float
-        Difference that is no error [s].
-    offset_s : float
-        Stamps minus monotonic time [s]; NaN: known from the first frame.
+    interval, by more than `tolerance_s`, is replaced by the time of reading; so bus time keeps the
+    right rate whatever the stamps do. Stamps that are off by a constant amount come from a clock
+    that was set: they are shifted from then on, and exact again.
 
     Attributes
     ----------
     offset_s : float
-        Bus time minus monotonic time [s].
-    shift_s : float
-        Added to the stamps at present [s].
-    limited : int
-        Number of stamps replaced.
+        Stamps, and so bus time, minus monotonic time [s]; NaN: known from the first frame.
+    shift_s, limited : float, int
+        Added to the stamps at present [s]; number of stamps replaced.
     """
 
     def __init__(self, tolerance_s: float, offset_s: float = math.nan) -> None:
-        self._tolerance_s = tolerance_s
-        self.offset_s = offset_s
-        self.shift_s = 0.0
-        self.limited = 0
+        self._tolerance_s, self.offset_s = tolerance_s, offset_s
+        self.shift_s, self.limited = 0.0, 0
         # Replaced stamps in a row: their number, since when, and how far they were off.
         self._run = 0
-        self._run_since_s = 0.0
-        self._low_s = self._high_s = 0.0
+        self._run_since_s = self._low_s = self._high_s = 0.0
         self._unusable_since_s = self._unusable_s = -math.inf
 
     def limit(self, messages: Iterable[can.Message], since_s: float, now_s: float) -> float:
         """Set the stamps of frames that were received together.
 
-        Parameters
-        ----------
-        messages : iterable of can.Message
-        since_s, now_s : float
-            Monotonic times [s]: the receive queue was last seen empty; the frames were read.
-
-        Returns
-        -------
-        float
-            Monotonic time at which the last of them arrived [s].
+        `since_s` and `now_s` are monotonic times [s]: the receive queue was last seen empty; the
+        frames were read. Returns the one at which the last of them arrived.
         """
         stamp_s = math.nan
         for message in messages:
@@ -209,10 +173,8 @@ class StampLimiter:
 
     def is_uncertain(self, now_s: float) -> bool:
         """Return whether the stamps are unusable at a monotonic time [s]."""
-        return (
-            now_s - self._unusable_s < CERTAIN_AFTER_S
-            and self._unusable_s - self._unusable_since_s >= UNCERTAIN_AFTER_S
-        )
+        lasting_s = self._unusable_s - self._unusable_since_s
+        return now_s - self._unusable_s < CERTAIN_AFTER_S and lasting_s >= UNCERTAIN_AFTER_S
 
     def _replaced(self, stamp_s: float, since_s: float, now_s: float) -> float:
         """Return the time for a stamp outside the interval [s]."""
@@ -249,25 +211,15 @@ def steady_s() -> float:
 
 
 class ReplayClock:
-    """Log time of a replay; a step back of more than `STEP_BACK_S` begins a new log.
+    """Log time of a replay; a step back of more than `STEP_BACK_US` begins a new log.
 
-    Parameters
-    ----------
-    frame_id : int
-        Id of REPLAY_CLOCK.
-
-    Attributes
-    ----------
-    refused : int
-        Clock frames with a wrong CRC or length.
+    `refused` counts clock frames with a wrong CRC or length.
     """
 
     def __init__(self, frame_id: int = REPLAY_CLOCK_ID) -> None:
-        self.beginnings = 0
-        self.refused = 0
+        self.beginnings = self.refused = 0
         self.is_uncertain = False
-        self._id = frame_id
-        self._codec = _clock_codec()
+        self._id, self._codec = frame_id, _clock_codec()
         self._now_us: int | None = None
 
     def time_of(self, message: can.Message) -> float | None:
@@ -279,7 +231,7 @@ class ReplayClock:
             self.refused += 1
             return None
         now_us = int(self._codec.decode(data))
-        if self._now_us is not None and now_us < self._now_us - STEP_BACK_S * MICROSECONDS:
+        if self._now_us is not None and now_us < self._now_us - STEP_BACK_US:
             self.beginnings += 1
         self._now_us = now_us
         return None
@@ -302,16 +254,10 @@ def is_clock(message: can.Message, clock_id: int = REPLAY_CLOCK_ID) -> bool:
 
 
 class ClockFrames:
-    """Encode log times as REPLAY_CLOCK frames.
-
-    Parameters
-    ----------
-    frame_id : int
-    """
+    """Encode log times as REPLAY_CLOCK frames."""
 
     def __init__(self, frame_id: int = REPLAY_CLOCK_ID) -> None:
-        self._id = frame_id
-        self._codec = _clock_codec()
+        self._id, self._codec = frame_id, _clock_codec()
 
     def at(self, time_us: int) -> can.Message:
         """Return the frame of a log time [µs]."""

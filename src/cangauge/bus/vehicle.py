@@ -7,11 +7,11 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
-from typing import Any, Final, Literal, NamedTuple, TypeVar
+from typing import Final, Literal, NamedTuple, TypeVar
 
 import numpy as np
 from can.typechecking import CanFilter
@@ -20,13 +20,7 @@ from cantools.database.can import Database, Message
 from cangauge._config import read_toml, validated
 from cangauge._resources import shared_file
 from cangauge.bus.database import Field as BitField
-from cangauge.bus.database import (
-    SignalCodec,
-    find_message,
-    find_signal,
-    load_dbc,
-    signal_codec,
-)
+from cangauge.bus.database import SignalCodec, find_message, find_signal, load_dbc, signal_codec
 from cangauge.bus.mapping import (
     NO_OVERRIDES,
     CellsMap,
@@ -35,7 +29,6 @@ from cangauge.bus.mapping import (
     Overrides,
     RuleMap,
     SignalMap,
-    TemperatureMap,
     VehicleMap,
 )
 from cangauge.bus.plausibility import DEFAULTS, SignalChecks
@@ -48,50 +41,27 @@ from cangauge.logs.units import convert
 _T = TypeVar("_T")
 Role = Literal["current", "voltage", "temperature", "soc_reference", "cells"]
 LOG_COLUMNS: Final = {
-    "current": "current_a",
-    "voltage": "voltage_v",
-    "temperature": "temperature_c",
-    "soc_reference": "soc_pct",
-    "cells": "voltage_v",
-}
+    "current": "current_a", "voltage": "voltage_v", "temperature": "temperature_c",
+    "soc_reference": "soc_pct", "cells": "voltage_v",
+}  # fmt: skip
 """Column of the canonical log by role."""
 
 EXTENDED: Final = 1 << 31
-"""Flag of an extended id in a message key, as in SocketCAN."""
-
-CELL_TIMEOUT_S: Final = 10.0
-"""Age of a cell's voltage above which it is not known [s]: large packs send a round of cells in
-some seconds."""
-CELL_WITHIN_V: Final = (0.2, 6.0)
-"""Plausible voltages of a cell [V], where none are stated: below and above any lithium cell."""
-POLLED_TIMEOUT_S: Final = 60.0
-"""Age at which a polled value is old [s]: a few rounds of a tester that asks every 10 to 20 s."""
+"""Flag of an extended id in a message key (arbitration id), as in SocketCAN."""
 
 
 def pgn_mask(key: int) -> int:
-    """Return the bits of an extended id that are its PGN (SAE J1939-21).
-
-    Below 0xF0 the PDU format is followed by a destination, which is no part of the PGN.
-    """
+    """Return the bits of an extended id that are its PGN (SAE J1939-21)."""
+    # Below 0xF0 the PDU format is followed by a destination, which is no part of the PGN.
     return 0x03FF0000 if (key >> 16 & 0xFF) < 0xF0 else 0x03FFFF00
 
 
 @dataclass(frozen=True, slots=True)
 class VehicleSignal:
-    """One signal of a vehicle: its message, its codec and its conversion to canonical units.
+    """One signal of a vehicle, in A (positive = discharge), V, °C or %.
 
-    Parameters
-    ----------
-    role : {"current", "voltage", "temperature", "soc_reference", "cells"}
-    key : int
-        Arbitration id, plus `EXTENDED` for an extended one.
-    message : str
-        Name of the message.
-    length : int
-        Bytes of the message.
-    codec : SignalCodec
-        In A (positive = discharge), V, °C or %.
-    checks : SignalChecks
+    `key` is the arbitration id of its message, plus `EXTENDED` for an extended one; `message` and
+    `length` are the message's name and bytes.
     """
 
     role: Role
@@ -114,32 +84,21 @@ class VehicleSignal:
 
 @dataclass(frozen=True, slots=True)
 class CellSignals:
-    """Voltages of all cells of a vehicle.
+    """Voltages of all cells in series: `count` cells, the first of number `first`.
 
-    Parameters
-    ----------
-    count, first : int
-        Number of cells in series; number of the first.
-    cells : tuple of VehicleSignal
-        One a cell, in order; with `index`, those of one group.
-    index : Field, optional
-        Raw number of the group in a frame.
-    first_index : int
-        Number of the first group.
-    lowest_v, highest_v : float
-        Plausible voltages [V].
-    timeout_s : float
-        Age above which a voltage is not known [s].
+    `cells` are one a cell, in order; with `index`, the raw number of the group in a frame, those of
+    one group, and `first_index` is the number of the first group. Voltages are plausible within
+    `lowest_v` and `highest_v` [V], and not known beyond the age `timeout_s` [s].
     """
 
     count: int
     first: int
     cells: tuple[VehicleSignal, ...]
-    index: BitField | None = None
-    first_index: int = 0
-    lowest_v: float = CELL_WITHIN_V[0]
-    highest_v: float = CELL_WITHIN_V[1]
-    timeout_s: float = CELL_TIMEOUT_S
+    index: BitField | None
+    first_index: int
+    lowest_v: float
+    highest_v: float
+    timeout_s: float
 
     @property
     def keys(self) -> tuple[int, ...]:
@@ -148,37 +107,26 @@ class CellSignals:
 
 
 class MessageProtection(NamedTuple):
-    """Protection and period [s] of one message, where known, and how it is identified."""
+    """Protection and period [s] of one message, where known, and how it is identified.
+
+    `is_reply`: over ISO-TP; `request_id`: on which the reply may be asked for; `by_pgn`: from any
+    source address (J1939).
+    """
 
     rule: Protection | None
     period_s: float | None
     is_reply: bool = False
-    """Over ISO-TP."""
     by_pgn: bool = False
-    """From any source address (J1939)."""
     request_id: int | None = None
-    """On which the reply may be asked for."""
 
 
 @dataclass(frozen=True, slots=True)
 class Vehicle:
-    """Signals of a vehicle, ready to decode and encode.
+    """Signals of a vehicle, ready to decode and encode; None: the vehicle has none.
 
-    Parameters
-    ----------
-    name : str
-    current, voltage : VehicleSignal
-    temperature, soc_reference : VehicleSignal or None
-    fixed_temperature_c : float
-        Temperature where no signal has it [°C]; NaN: none.
-    temperature_source : {"cell", "pack", "coolant", "room", "unknown"}
-    pair_within_s : float
-        Largest distance in bus time between paired current and voltage [s].
-    messages : dict of int to MessageProtection
-        By key (id, plus `EXTENDED`), for every message with a wanted signal.
-    dbc_files : tuple of str
-    cells : CellSignals or None
-        Voltages of the cells.
+    `fixed_temperature_c` is the temperature where no signal has it [°C], or NaN. `pair_within_s` is
+    the largest distance in bus time between paired current and voltage [s]. `messages` has every
+    message with a wanted signal, by key (id, plus `EXTENDED`).
     """
 
     name: str
@@ -233,55 +181,36 @@ class Vehicle:
         ('Nissan Leaf AZE0', 'current_a', '0x1db')
         """
         if temperature_c is not None and not -60.0 <= temperature_c <= 120.0:
-            raise InputError(
-                "is not a battery temperature in °C", field="--temperature", value=temperature_c
-            )
+            problem = "is not a battery temperature in °C"
+            raise InputError(problem, field="--temperature", value=temperature_c)
         if preset is not None:
             if dbc is not None or map is not None:
-                raise InputError(
-                    "given together with --dbc or --map",
-                    field="--vehicle",
-                    value=preset,
-                    cure="give one or the other",
-                )
+                problem, cure = "given together with --dbc or --map", "give one or the other"
+                raise InputError(problem, field="--vehicle", value=preset, cure=cure)
             known = _find_preset(preset)
             if known.lacks_temperature and temperature_c is None:
-                raise InputError(
-                    "no pack temperature is known on the bus of this car",
-                    field="--vehicle",
-                    value=preset,
-                    cure="give --temperature °C",
-                )
+                problem = "no pack temperature is known on the bus of this car"
+                cure = "give --temperature °C"
+                raise InputError(problem, field="--vehicle", value=preset, cure=cure)
             return known.vehicle(
                 temperature_c=temperature_c, pair_within_s=pair_within_s, overrides=overrides
             )
         if map is None and dbc is None:
-            raise InputError(
-                "no vehicle is given",
-                field="--vehicle",
-                cure=f"give --vehicle ({', '.join(PRESETS)}), or --dbc FILE --map FILE",
-            )
+            cure = f"give --vehicle ({', '.join(PRESETS)}), or --dbc FILE --map FILE"
+            raise InputError("no vehicle is given", field="--vehicle", cure=cure)
         if map is None:
-            raise InputError(
-                "a DBC alone does not name the signals",
-                source=str(dbc),
-                field="--map",
-                cure="give --map FILE, which names three signals",
-            )
+            problem = "a DBC alone does not name the signals"
+            cure = "give --map FILE, which names three signals"
+            raise InputError(problem, source=str(dbc), field="--map", cure=cure)
         mapping = validated(VehicleMap, read_toml(map), map)
         files = [] if dbc is None else [Path(dbc)]
         files += [Path(map).parent / name for name in mapping.dbc]
         if not files:
-            raise InputError(
-                "is missing", source=map, field="dbc", cure="add it, or give --dbc FILE"
-            )
+            cure = "add it, or give --dbc FILE"
+            raise InputError("is missing", source=map, field="dbc", cure=cure)
         if mapping.temperature is None and temperature_c is None:
-            raise InputError(
-                "is missing",
-                source=map,
-                field="temperature",
-                cure="name its signal, or give --temperature °C",
-            )
+            cure = "name its signal, or give --temperature °C"
+            raise InputError("is missing", source=map, field="temperature", cure=cure)
         return _Binder(mapping, files, str(map), overrides).vehicle(temperature_c, pair_within_s)
 
     @property
@@ -295,9 +224,8 @@ class Vehicle:
         """Ids of the frames with a wanted signal, plus `EXTENDED`, each once."""
         keys = [signal.key for signal in self.signals]
         keys += () if self.cells is None else self.cells.keys
-        return tuple(
-            dict.fromkeys(reply_id(key) if self.messages[key].is_reply else key for key in keys)
-        )
+        ids = (reply_id(key) if self.messages[key].is_reply else key for key in keys)
+        return tuple(dict.fromkeys(ids))
 
     @property
     def wanted_ids(self) -> tuple[int, ...]:
@@ -318,34 +246,25 @@ class Vehicle:
         """The wanted ids as filters of python-can (`bus.set_filters`)."""
         filters: list[CanFilter] = []
         for key in self.frame_keys:
-            mask = 0x1FFFFFFF if key & EXTENDED else 0x7FF
+            is_extended = bool(key & EXTENDED)
+            mask = 0x1FFFFFFF if is_extended else 0x7FF
             if key in self.messages and self.messages[key].by_pgn:
                 mask = pgn_mask(key)
-            is_extended = bool(key & EXTENDED)
             filters.append({"can_id": key & ~EXTENDED, "can_mask": mask, "extended": is_extended})
         return filters
 
 
 class _Binder:
-    """Find the signals of a map file in its DBC files.
+    """Find the signals of a map file in its DBC files; a signal is taken from the first with it.
 
-    Parameters
-    ----------
-    mapping : VehicleMap
-    files : list of Path
-        A signal is taken from the first DBC that has it.
-    source : str
-        The map file, for error messages.
-    overrides : Overrides
+    `source` is the map file, for error messages.
     """
 
     def __init__(
-        self, mapping: VehicleMap, files: list[Path], source: str, overrides: Overrides
+        self, mapping: VehicleMap, files: Sequence[Path], source: str, overrides: Overrides
     ) -> None:
-        self._mapping = mapping
+        self._mapping, self._source, self._overrides = mapping, source, overrides
         self._databases = [(load_dbc(path), path) for path in files]
-        self._source = source
-        self._overrides = overrides
         self._messages: dict[int, Message] = {}
 
     def vehicle(self, temperature_c: float | None, pair_within_s: float | None) -> Vehicle:
@@ -357,16 +276,13 @@ class _Binder:
         fixed_c = temperature_c
         if fixed_c is None and temperature is not None:
             fixed_c = temperature.fixed_c
-        is_sent = fixed_c is None and temperature is not None
-        soc = mapping.soc_reference
+        sent, soc = temperature if fixed_c is None else None, mapping.soc_reference
         return Vehicle(
             name=mapping.name,
             current=self._signal("current", mapping.current),
             voltage=self._signal("voltage", mapping.voltage),
             cells=None if mapping.cells is None else self._cells(mapping.cells),
-            temperature=self._signal("temperature", temperature)
-            if is_sent and temperature is not None
-            else None,
+            temperature=None if sent is None else self._signal("temperature", sent),
             soc_reference=None if soc is None else self._signal("soc_reference", soc),
             fixed_temperature_c=math.nan if fixed_c is None else float(fixed_c),
             temperature_source=mapping.temperature_source if temperature_c is None else "unknown",
@@ -380,35 +296,24 @@ class _Binder:
         index: BitField | None = None
         if wanted.index is not None:
             if len({(cell.key, cell.codec.conditions) for cell in cells}) > 1:
-                raise InputError(
-                    "the signals of a group are not in the same frame",
-                    source=self._source,
-                    field="cells.signals",
-                )
+                problem = "the signals of a group are not in the same frame"
+                raise InputError(problem, source=self._source, field="cells.signals")
             numbering = SignalMap(message=wanted.message, signal=wanted.index, scale=1.0)
             index = self._signal("cells", numbering).codec.field
-        low, high = CELL_WITHIN_V
         return CellSignals(
-            wanted.count,
-            wanted.first,
-            cells,
-            index,
-            wanted.first_index,
-            low if wanted.lowest is None else wanted.lowest,
-            high if wanted.highest is None else wanted.highest,
-            wanted.timeout_s or CELL_TIMEOUT_S,
-        )
+            wanted.count, wanted.first, cells, index, wanted.first_index,
+            wanted.lowest, wanted.highest, wanted.timeout_s,
+        )  # fmt: skip
 
     def _in_first(self, find: Callable[[Database, Path], _T]) -> tuple[_T, Path]:
         """Return what `find` gives in the first DBC that has it; raise the first DBC's error."""
-        first: InputError | None = None
+        errors = []
         for database, file in self._databases:
             try:
                 return find(database, file), file
             except InputError as error:
-                first = first or error
-        assert first is not None  # noqa: S101 - there is at least one DBC
-        raise first
+                errors.append(error)
+        raise errors[0]
 
     def _signal(self, role: Role, wanted: SignalMap) -> VehicleSignal:
         (message, signal), file = self._in_first(
@@ -417,39 +322,24 @@ class _Binder:
             )
         )
         codec = signal_codec(
-            message,
-            signal,
-            source=file,
-            field=role,
-            not_available=wanted.not_available,
-            when=wanted.when,
-        )
+            message, signal, source=file, field=role,
+            not_available=wanted.not_available, when=wanted.when,
+        )  # fmt: skip
         key = _key(message)
         self._messages[key] = message
         factor, offset = self._unit(role, wanted, codec)
-        checks = DEFAULTS.get(role, SignalChecks()).updated(
-            wanted, self._overrides.checks.get(role, CheckMap())
-        )
+        override = self._overrides.checks.get(role, CheckMap())
+        checks = DEFAULTS.get(role, SignalChecks()).updated(wanted, override)
         if checks.lowest >= checks.highest:
-            raise InputError(
+            problem, value = (
                 "lowest is not below highest",
-                source=self._source,
-                field=role,
-                value=f"{checks.lowest:g} … {checks.highest:g}",
+                f"{checks.lowest:g} … {checks.highest:g}",
             )
-        return VehicleSignal(
-            role=role,
-            key=key,
-            message=message.name,
-            length=message.length,
-            codec=dataclasses.replace(
-                codec,
-                gain=wanted.sign * wanted.scale * factor,
-                # A stated offset is in the canonical unit and keeps its sign.
-                shift=wanted.offset + wanted.sign * offset,
-            ),
-            checks=checks,
-        )
+            raise InputError(problem, source=self._source, field=role, value=value)
+        # A stated offset is in the canonical unit and keeps its sign.
+        gain, shift = wanted.sign * wanted.scale * factor, wanted.offset + wanted.sign * offset
+        codec = dataclasses.replace(codec, gain=gain, shift=shift)
+        return VehicleSignal(role, key, message.name, message.length, codec, checks)
 
     def _unit(self, role: Role, wanted: SignalMap, codec: SignalCodec) -> tuple[float, float]:
         """Return factor and offset from the DBC's unit to the canonical one."""
@@ -461,13 +351,12 @@ class _Binder:
                 np.array([0.0, 1.0]), column, codec.unit, source=self._source, label=codec.name
             )
         except InputError as error:
+            problem = f"the unit of {codec.name} in the DBC is unknown for {column}"
+            cure = "name another signal, or state scale and offset in the map file"
+            cure += " (scale = 1 takes the values as they are)"
+            where = f"{role}.signal"
             raise InputError(
-                f"the unit of {codec.name} in the DBC is unknown for {column}",
-                source=self._source,
-                field=f"{role}.signal",
-                value=codec.unit,
-                cure="name another signal, or state scale and offset in the map file"
-                " (scale = 1 takes the values as they are)",
+                problem, source=self._source, field=where, value=codec.unit, cure=cure
             ) from error
         return float(ends[1] - ends[0]), float(ends[0])
 
@@ -481,21 +370,17 @@ class _Binder:
             cycle_ms: object = message.cycle_time  # not a number in some DBC files
             is_known = isinstance(cycle_ms, int | float) and 0.0 < cycle_ms < math.inf
             dbc_s = float(str(cycle_ms)) / 1000.0 if is_known else None
-            protections[key] = MessageProtection(
-                each.rule(message, rules, source=source),
-                dbc_s if each.period_s is None else each.period_s,
-                each.isotp,
-                each.j1939,
-                each.request_id,
-            )
+            rule = each.rule(message, rules, source=source)
+            period_s = dbc_s if each.period_s is None else each.period_s
+            more = each.isotp, each.j1939, each.request_id
+            protections[key] = MessageProtection(rule, period_s, *more)
         return protections
 
     def _message_key(self, name: str) -> int:
         """Return the key of the message for a name or id in [messages]."""
+        field = f"messages.{name}"
         message, _ = self._in_first(
-            lambda database, file: find_message(
-                database, name, source=file, field=f"messages.{name}"
-            )
+            lambda database, file: find_message(database, name, source=file, field=field)
         )
         return _key(message)
 
@@ -509,17 +394,9 @@ def _key(message: Message) -> int:
 
 @dataclass(frozen=True, slots=True)
 class Preset:
-    """A known vehicle.
+    """A known vehicle: its file in `dbc/`, its map, and one line for help texts.
 
-    Parameters
-    ----------
-    dbc : str
-        File in `dbc/`.
-    mapping : VehicleMap
-    about : str
-        One line for help texts.
-    periods_s : dict of int to float
-        Message periods that distinguish this vehicle from similar ones in a capture [s].
+    `periods_s` are message periods that distinguish it from similar ones in a capture [s].
     """
 
     dbc: str
@@ -545,84 +422,19 @@ class Preset:
         return binder.vehicle(temperature_c, pair_within_s)
 
 
-def _leaf(name: str, about: str, period_5bc_s: float, **other: Any) -> Preset:
-    """Return a Leaf; `other` are fields of its map that differ."""
-    mapping = VehicleMap(
-        name=name,
-        current=SignalMap(message="BATTERY_1DB", signal="current_a", sign=-1),
-        voltage=SignalMap(message="BATTERY_1DB", signal="voltage_v"),
-        temperature=TemperatureMap(
-            message="BATTERY_5C0", signal="temperature_average_c", timeout_s=10.0
-        ),
-        soc_reference=SignalMap(message="BATTERY_55B", signal="soc_pct"),
-        temperature_source="pack",
-        messages={
-            "BATTERY_1DB": MessageMap(protection="leaf", period_s=0.010),
-            "BATTERY_55B": MessageMap(protection="leaf", period_s=0.100),
-        },
-    )
-    mapping = mapping.model_copy(update=other)
-    return Preset("nissan_leaf.dbc", mapping, about, {0x5BC: period_5bc_s})
+def _presets() -> dict[str, Preset]:
+    path = shared_file("dbc", "presets.toml")
+    tables, presets = read_toml(path), {}
+    for name, own in tables.items():
+        table = {**tables.get(own.get("like", name), {}), **own}
+        table.pop("like", None)
+        dbc, about = table.pop("dbc"), table.pop("about")
+        periods_s = {int(key, 0): value for key, value in table.pop("periods_s", {}).items()}
+        presets[name] = Preset(dbc, validated(VehicleMap, table, path), about, periods_s)
+    return presets
 
 
-_POLLED: Final = MessageMap(isotp=True, request_id=0x79B)
-_ZE1_MESSAGES: Final = _leaf("", "", 0.1).mapping.messages | {"LBC_04": _POLLED, "LBC_02": _POLLED}
-
-PRESETS: Final[dict[str, Preset]] = {
-    "generic": Preset(
-        dbc="generic_pack.dbc",
-        about="a pack without a car: the default of replay",
-        mapping=VehicleMap(
-            name="generic pack",
-            current=SignalMap(message="PACK_CURRENT", signal="current_a"),
-            voltage=SignalMap(message="PACK_VOLTAGE", signal="voltage_v"),
-            temperature=TemperatureMap(message="PACK_TEMPERATURE", signal="temperature_c"),
-            soc_reference=SignalMap(message="PACK_SOC", signal="soc_pct"),
-            messages={
-                name: MessageMap(protection="generic")
-                for name in ("PACK_CURRENT", "PACK_VOLTAGE", "PACK_TEMPERATURE", "PACK_SOC")
-            },
-        ),
-    ),
-    "leaf_ze0": _leaf("Nissan Leaf ZE0", "Nissan Leaf 24 kWh, 2011-12", 0.500),
-    "leaf_aze0": _leaf(
-        "Nissan Leaf AZE0",
-        "Nissan Leaf 24/30 kWh, 2013-17; e-NV200; 40 kWh pack in such a car",
-        0.100,
-    ),
-    "leaf_ze1": _leaf(
-        "Nissan Leaf ZE1",
-        "Nissan Leaf 40/62 kWh, from 2018; needs --temperature",
-        0.100,
-        temperature=None,
-        temperature_source="unknown",
-    ),
-    "leaf_ze1_polled": _leaf(
-        "Nissan Leaf ZE1",
-        "Nissan Leaf 40/62 kWh whose battery a tester polls: temperature and cells from its"
-        " replies",
-        0.100,
-        temperature=TemperatureMap(
-            message="LBC_04", signal="probe_1_c", timeout_s=POLLED_TIMEOUT_S
-        ),
-        messages=_ZE1_MESSAGES,
-        cells=CellsMap(
-            count=96, signal="CELL_{n:02d}", message="LBC_02", timeout_s=POLLED_TIMEOUT_S
-        ),
-    ),
-    "bmw_i3": Preset(
-        dbc="bmw_i3.dbc",
-        about="BMW i3 60/94/120 Ah; needs --temperature",
-        mapping=VehicleMap(
-            name="BMW i3",
-            current=SignalMap(message="BATTERY_112", signal="current_a", sign=-1),
-            voltage=SignalMap(message="BATTERY_112", signal="voltage_v"),
-            soc_reference=SignalMap(message="BATTERY_112", signal="soc_pct"),
-            messages={"BATTERY_112": MessageMap(period_s=0.010)},
-        ),
-        periods_s={0x112: 0.010},
-    ),
-}
+PRESETS: Final = _presets()
 """By the name that `--vehicle` takes."""
 
 
@@ -633,9 +445,5 @@ def _find_preset(name: str) -> Preset:
         return preset
     near = closest(name, PRESETS)
     known = f"known are {', '.join(PRESETS)}; for another car give --dbc FILE --map FILE"
-    raise InputError(
-        "unknown vehicle",
-        field="--vehicle",
-        value=name,
-        cure=f"did you mean {near}?" if near else known,
-    )
+    cure = f"did you mean {near}?" if near else known
+    raise InputError("unknown vehicle", field="--vehicle", value=name, cure=cure)

@@ -16,7 +16,7 @@ from cangauge.bus.captures import CaptureInfo, open_capture
 from cangauge.bus.decoder import SampleDecoder
 from cangauge.bus.protection import GENERIC_RULE, LEAF_RULE, FrameChecker, ProtectionRule, Verdict
 from cangauge.bus.recording import capture_to_log, open_vehicle_capture
-from cangauge.bus.vehicle import PRESETS, Vehicle
+from cangauge.bus.vehicle import LOG_COLUMNS, PRESETS, Vehicle
 from cangauge.inspect.log import LogInspection, inspect_log
 
 GAP_S: Final = 1.0
@@ -25,17 +25,17 @@ LISTED_GAPS: Final = 20
 MAX_IDS: Final = 4096
 """Most ids to describe, more than any car has; frames of others are only counted."""
 LEARN_FRAMES: Final = 50
-"""First frames of an id, from which the period of its alive counter is learned."""
 INTERVALS: Final = 2000
-"""First intervals of an id, whose median is its period."""
+"""First frames of an id from which the period of its alive counter is learned, and first intervals
+whose median is its period."""
 AGREEING: Final = 0.9
-"""Least share of frames with a correct CRC for an id to be protected by a rule, …"""
 PAYLOADS: Final = 4
-"""… which have at least this many different payloads: a constant one can agree by chance."""
+"""Least share of frames with a correct CRC for an id to be protected by a rule, and least number of
+different payloads: a constant one can agree by chance."""
 REPEATED_SHARE: Final = 0.02
-"""Largest share of repeated counters; above it the counter is elsewhere, or there is none."""
 MIXED_SHARE: Final = 0.55
-"""The same of two senders: of two frames with one counter value, one is repeated."""
+"""Largest share of repeated counters; above it the counter is elsewhere, or there is none. Of two
+senders: of two frames with one counter value, one is repeated."""
 PERIOD_TOLERANCE: Final = 0.3
 """Largest difference of a period from a preset's [-]."""
 LONG_ENOUGH_S: Final = 2.0
@@ -120,13 +120,10 @@ class CaptureInspection:
     def to_dict(self) -> dict[str, Any]:
         """Return plain values for JSON."""
         plain = asdict(self)
-        return {
-            "kind": "capture",
-            **plain.pop("info"),
-            **plain,
-            "matching_presets": ", ".join(self.matching),
-            "log": None if self.log is None else self.log.to_dict(),
-        }
+        log = None if self.log is None else self.log.to_dict()
+        names = ", ".join(self.matching)
+        info = plain.pop("info")
+        return {"kind": "capture", **info, **plain, "matching_presets": names, "log": log}
 
 
 def inspect_capture(path: str | PathLike[str], vehicle: Vehicle | None = None) -> CaptureInspection:
@@ -144,20 +141,11 @@ def inspect_capture(path: str | PathLike[str], vehicle: Vehicle | None = None) -
         survey.add(message)
         attempts.add(message)
     return CaptureInspection(
-        name=path.name,
-        source=str(path),
-        info=capture.info,
-        start_s=survey.first_s,
-        duration_s=survey.last_s - survey.first_s,
-        error_frames=survey.error_frames,
-        remote_frames=survey.remote_frames,
-        time_reversals=survey.time_reversals,
-        ids=survey.summaries(),
-        other_ids=survey.other_ids,
-        gaps=tuple(survey.gaps),
-        presets=attempts.matches(survey),
-        log=None if vehicle is None else inspect_log(capture_to_log(path, vehicle)),
-    )
+        path.name, str(path), capture.info, survey.first_s, survey.last_s - survey.first_s,
+        survey.error_frames, survey.remote_frames, survey.time_reversals, survey.summaries(),
+        survey.other_ids, tuple(survey.gaps), attempts.matches(survey),
+        None if vehicle is None else inspect_log(capture_to_log(path, vehicle)),
+    )  # fmt: skip
 
 
 # --- Frames by id, without a vehicle
@@ -173,34 +161,30 @@ class _Survey:
         self._records: dict[tuple[Channel | None, int, bool], _IdRecord] = {}
 
     def add(self, message: can.Message) -> None:
-        self._add_time(message.timestamp)
-        if message.is_error_frame:
-            self.error_frames += 1
-            return
-        if message.is_remote_frame:
-            self.remote_frames += 1
-            return
-        key = (message.channel, message.arbitration_id, message.is_extended_id)
-        if key not in self._records and len(self._records) >= MAX_IDS:
-            self.other_ids += 1
-        else:
-            self._records.setdefault(key, _IdRecord()).add(bytes(message.data), message.timestamp)
-
-    def _add_time(self, time_s: float) -> None:
+        time_s = message.timestamp
         if math.isnan(self.first_s):
             self.first_s = self.last_s = time_s
         if time_s < self.last_s:
             self.time_reversals += 1
             self.first_s = min(self.first_s, time_s)
+        else:
+            if time_s - self.last_s > GAP_S and len(self.gaps) < LISTED_GAPS:
+                self.gaps.append(Silence(self.last_s, time_s - self.last_s))
+            self.last_s = time_s
+        self.error_frames += message.is_error_frame
+        self.remote_frames += message.is_remote_frame and not message.is_error_frame
+        if message.is_error_frame or message.is_remote_frame:
             return
-        if time_s - self.last_s > GAP_S and len(self.gaps) < LISTED_GAPS:
-            self.gaps.append(Silence(self.last_s, time_s - self.last_s))
-        self.last_s = time_s
+        key = (message.channel, message.arbitration_id, message.is_extended_id)
+        if key in self._records or len(self._records) < MAX_IDS:
+            self._records.setdefault(key, _IdRecord()).add(bytes(message.data), time_s)
+        else:
+            self.other_ids += 1
 
     def period_s(self, number: int) -> float | None:
         """Return the median interval of a standard id [s], on the bus that has most of it."""
-        found = [r for (_, each, extended), r in self._records.items()
-                 if each == number and not extended]  # fmt: skip
+        records = self._records.items()
+        found = [record for (_, each, wide), record in records if each == number and not wide]
         return max(found, key=lambda record: record.frames).period_s if found else None
 
     def summaries(self) -> tuple[IdSummary, ...]:
@@ -216,28 +200,28 @@ class _Trial:
     """A protection rule tried on the frames of one id."""
 
     def __init__(self, rule: ProtectionRule, period_s: float | None) -> None:
-        self.rule, self.checker = rule, FrameChecker(rule, period_s)
-        self.good = self.crc_errors = self.counter_jumps = self.frames_lost = 0
-        self.counter_repeats, self.two_senders = 0, False
+        self.rule, self._checker = rule, FrameChecker(rule, period_s)
+        self.verdicts = dict.fromkeys(Verdict, 0)
+        self.frames_lost, self.two_senders = 0, False
 
     def add(self, data: bytes, time_s: float) -> None:
-        verdict = self.checker.check(data, time_s)
-        self.two_senders |= self.checker.suspects_second_sender
-        self.crc_errors += verdict is Verdict.CRC_WRONG
-        self.good += verdict is not Verdict.CRC_WRONG
-        self.counter_repeats += verdict is Verdict.REPEATED
-        if verdict is Verdict.AFTER_LOSS:
-            self.counter_jumps += 1
-            self.frames_lost += self.checker.lost
+        verdict = self._checker.check(data, time_s)
+        self.verdicts[verdict] += 1
+        self.two_senders |= self._checker.suspects_second_sender
+        self.frames_lost += self._checker.lost if verdict is Verdict.AFTER_LOSS else 0
 
     @property
-    def is_hopeless(self) -> bool:
-        return self.crc_errors > 20 and self.good < self.crc_errors
+    def crc_errors(self) -> int:
+        return self.verdicts[Verdict.CRC_WRONG]
+
+    @property
+    def good(self) -> int:
+        return sum(self.verdicts.values()) - self.crc_errors
 
 
 @dataclass(slots=True)
 class _IdRecord:
-    """Frames of one id on one bus."""
+    """Frames of one id on one bus; `waiting` are the first ones, until the period is known."""
 
     frames: int = 0
     lengths: set[int] = field(default_factory=set)
@@ -246,9 +230,7 @@ class _IdRecord:
     last_s: float = math.nan
     payloads: set[bytes] = field(default_factory=set)
     waiting: list[tuple[bytes, float]] = field(default_factory=list)
-    """First frames, until the period is known."""
     trials: list[_Trial] = field(default_factory=list)
-    """Rules that may still apply."""
 
     def add(self, data: bytes, time_s: float) -> None:
         if self.frames:
@@ -261,27 +243,26 @@ class _IdRecord:
             self.payloads.add(data)
         if self.frames < LEARN_FRAMES:
             self.waiting.append((data, time_s))
-            return
-        self._start_trials()
-        self._try_rules(data, time_s)
+        else:
+            self._start_trials()
+            self._try_rules(data, time_s)
 
     def _start_trials(self) -> None:
-        if not self.waiting:
-            return
-        # Lost frames lengthen intervals, so the lower quartile is the period; 0 for equal stamps.
-        period_s = sorted(self.intervals)[len(self.intervals) // 4] if self.intervals else None
-        self.trials = [_Trial(rule, period_s or None) for rule in (LEAF_RULE, GENERIC_RULE)]
-        for data, time_s in self.waiting:
+        waiting, self.waiting = self.waiting, []
+        if waiting:
+            # Lost frames lengthen intervals: the lower quartile is the period; 0 for equal stamps.
+            period_s = sorted(self.intervals)[len(self.intervals) // 4] if self.intervals else None
+            self.trials = [_Trial(rule, period_s or None) for rule in (LEAF_RULE, GENERIC_RULE)]
+        for data, time_s in waiting:
             self._try_rules(data, time_s)
-        self.waiting = []
 
     def _try_rules(self, data: bytes, time_s: float) -> None:
         if len(data) < 3 or len(self.lengths) > 1:
             self.trials = []
-        for trial in self.trials:
+        for trial in list(self.trials):
             trial.add(data, time_s)
-        if any(trial.is_hopeless for trial in self.trials):
-            self.trials = [trial for trial in self.trials if not trial.is_hopeless]
+            if trial.crc_errors > 20 and trial.good < trial.crc_errors:
+                self.trials.remove(trial)
 
     @property
     def period_s(self) -> float | None:
@@ -289,28 +270,25 @@ class _IdRecord:
 
     def summary(self, name: str, channel: Channel | None) -> IdSummary:
         self._start_trials()
-        found = IdSummary(
-            id=name,
-            bus="" if channel is None else str(channel),
-            frames=self.frames,
-            bytes=", ".join(str(length) for length in sorted(self.lengths)),
-            period_s=self.period_s,
-            longest_s=self.longest_s if self.intervals else None,
+        bus, sizes = (
+            "" if channel is None else str(channel),
+            ", ".join(map(str, sorted(self.lengths))),
         )
+        longest_s = self.longest_s if self.intervals else None
+        found = IdSummary(name, bus, self.frames, sizes, self.period_s, longest_s)
         agreeing = (trial for trial in self.trials if trial.good >= AGREEING * self.frames)
         trial = next(agreeing, None) if len(self.payloads) >= PAYLOADS else None
         if trial is None:
             return found
         found = replace(found, protection=trial.rule.name, crc_errors=trial.crc_errors)
-        # Many repetitions: the counter is not where the rule expects it, or there are two senders.
-        limit = MIXED_SHARE if trial.two_senders else REPEATED_SHARE
-        if trial.counter_repeats > limit * self.frames:
+        repeats = trial.verdicts[Verdict.REPEATED]
+        if repeats > (MIXED_SHARE if trial.two_senders else REPEATED_SHARE) * self.frames:
             return found
         return replace(
             found,
-            counter_jumps=trial.counter_jumps,
+            counter_jumps=trial.verdicts[Verdict.AFTER_LOSS],
             frames_lost=trial.frames_lost,
-            counter_repeats=trial.counter_repeats,
+            counter_repeats=repeats,
             two_senders=trial.two_senders,
         )
 
@@ -330,8 +308,9 @@ class _Attempt:
         if sample is None:
             return
         self.samples += 1
-        names = ("current_a", "voltage_v", "temperature_c", "soc_pct")
-        for name, value in zip(names, (*sample[1:], self.decoder.reference_soc_pct), strict=True):
+        for name, value in zip(
+            LOG_COLUMNS.values(), (*sample[1:], self.decoder.reference_soc_pct), strict=False
+        ):
             if not math.isnan(value):
                 low, high = self.spans.get(name) or (value, value)
                 self.spans[name] = (min(low, value), max(high, value))
@@ -359,18 +338,15 @@ class _Attempts:
         found = [self._match(name, survey) for name in PRESETS]
         # A related preset that also finds its temperature explains more of the capture.
         warm = {PRESETS[match.preset].dbc for match in found if match.temperature_c is not None}
-        return tuple(
-            replace(match, matches=False, because="the pack temperature is on this bus")
-            if match.matches
-            and PRESETS[match.preset].lacks_temperature
-            and PRESETS[match.preset].dbc in warm
-            else match
-            for match in found
-        )
+        because = "the pack temperature is on this bus"
+        for place, match in enumerate(found):
+            preset = PRESETS[match.preset]
+            if match.matches and preset.lacks_temperature and preset.dbc in warm:
+                found[place] = replace(match, matches=False, because=because)
+        return tuple(found)
 
     def _match(self, name: str, survey: _Survey) -> PresetMatch:
-        about = PRESETS[name].about
-        tries = [attempts[name] for attempts in self._buses.values()]
+        about, tries = PRESETS[name].about, [attempts[name] for attempts in self._buses.values()]
         if not tries:
             return PresetMatch(name, about, matches=False, because="none of its frames")
         best = max(tries, key=lambda attempt: attempt.samples)
@@ -381,25 +357,22 @@ class _Attempts:
 
 def _problem(name: str, attempt: _Attempt, vehicle: Vehicle, survey: _Survey) -> str:
     """Return why a preset does not match, or ""."""
-    statistics = attempt.decoder.statistics
+    statistics, spans = attempt.decoder.statistics, attempt.spans
     if not attempt.samples:
         return "no current in its frames" if statistics.wanted else "none of its frames"
     if statistics.crc_errors > 0.1 * statistics.wanted:
         return f"{statistics.crc_errors} of {statistics.wanted} CRCs are wrong"
-    if "voltage_v" not in attempt.spans:
+    if "voltage_v" not in spans:
         return "no voltage"
     long_enough = survey.last_s - survey.first_s >= LONG_ENOUGH_S
-    if long_enough and vehicle.temperature is not None and "temperature_c" not in attempt.spans:
+    if long_enough and vehicle.temperature is not None and "temperature_c" not in spans:
         return "no temperature"
-    return _period_problem(name, survey, long_enough=long_enough)
-
-
-def _period_problem(name: str, survey: _Survey, *, long_enough: bool) -> str:
     for number, expected_s in PRESETS[name].periods_s.items():
-        period_s = survey.period_s(number)
+        period_s, problem = survey.period_s(number), ""
         if period_s is None:
-            if long_enough:
-                return f"no frames of 0x{number:X}"
+            problem = f"no frames of 0x{number:X}" if long_enough else ""
         elif abs(period_s - expected_s) > PERIOD_TOLERANCE * expected_s:
-            return f"0x{number:X} has a period of {period_s:.3g} s, not {expected_s:g} s"
+            problem = f"0x{number:X} has a period of {period_s:.3g} s, not {expected_s:g} s"
+        if problem:
+            return problem
     return ""

@@ -1,0 +1,301 @@
+"""Codecs of signals against cantools; the project's DBC files; KCD, SYM and ARXML."""
+
+from __future__ import annotations
+
+import math
+import pickle
+import re
+import warnings
+from pathlib import Path
+
+import cantools.database
+import numpy as np
+import pytest
+from cantools.database.can import Database, Message
+from hypothesis import assume, given, settings
+from hypothesis import strategies as st
+
+from cangauge._resources import shared_file
+from cangauge.bus.database import SignalCodec, load_dbc, signal_codec
+from cangauge.bus.protection import CRC_ONLY_RULE, GENERIC_RULE, LEAF_RULE, E2eRule
+from cangauge.bus.publish import reason_bits
+from cangauge.errors import InputError
+from cangauge.types import Reason, Status
+
+
+def dbc(signals: str, length: int = 8, more: str = "") -> Message:
+    text = f"BO_ 100 M: {length} X\n{signals}\n\n{more}"
+    database = cantools.database.load_string(text, "dbc", strict=False)
+    assert isinstance(database, Database)
+    return database.messages[0]
+
+
+def codec(signals: str, length: int = 8, more: str = "") -> SignalCodec:
+    message = dbc(signals, length, more)
+    return signal_codec(message, message.get_signal_by_name("s"), source="x.dbc", field="current")
+
+
+@st.composite
+def layouts(draw: st.DrawFn) -> Message:
+    start, width = draw(st.integers(0, 63)), draw(st.integers(1, 48))  # beyond, floats are inexact
+    order, sign = draw(st.sampled_from("01")), draw(st.sampled_from("+-"))
+    factor = draw(st.sampled_from(["1", "0.5", "0.1", "0.0001", "-2", "3"]))
+    offset = draw(st.sampled_from(["0", "-40", "0.25"]))
+    try:
+        message = dbc(f' SG_ s : {start}|{width}@{order}{sign} ({factor},{offset}) [0|0] "" X')
+        message.refresh(strict=True)
+    except cantools.Error:
+        assume(False)
+    return message
+
+
+@settings(max_examples=300)
+@given(layouts(), st.binary(min_size=8, max_size=8))
+def test_decodes_as_cantools_does_and_encoding_inverts_it(message: Message, data: bytes) -> None:
+    found = signal_codec(message, message.signals[0], source="x", field="f")
+    value = found.decode(data)
+    assert value == message.decode(data)["s"]
+    assert pickle.loads(pickle.dumps(found)).decode(data) == value  # noqa: S301 - our own
+    payload, mask = bytearray(8), bytearray(8)
+    found.encode_into(payload, value)
+    found.field.put(mask, (1 << found.field.width) - 1)
+    assert bytes(a & m for a, m in zip(data, mask, strict=True)) == bytes(payload)
+    low, high = found.range
+    assert low <= value <= high
+
+
+@given(st.floats(-500, 500), st.sampled_from([0.5, 0.1, 0.0001, 7.0]))
+def test_rounds_to_the_nearest_step(value: float, factor: float) -> None:
+    found, payload = codec(f' SG_ s : 0|32@1- ({factor},3) [0|0] "A" X'), bytearray(8)
+    found.encode_into(payload, value)
+    decoded = found.decode(payload)
+    assert abs(decoded - value) <= found.half_step * (1 + 1e-9)
+    assert float(found.quantize(np.array([value]))[0]) == decoded
+
+
+@pytest.mark.parametrize(("width", "kind"), [(32, 1), (64, 2)])
+def test_floats_are_exact(width: int, kind: int) -> None:
+    signal = f' SG_ s : 0|{width}@1- (2,1) [0|0] "A" X'
+    found, payload = codec(signal, more=f"SIG_VALTYPE_ 100 s : {kind};\n"), bytearray(8)
+    for value in (0.0, -12.375, 300.25):
+        found.encode_into(payload, value)
+        assert found.decode(payload) == value == float(found.quantize(np.array([value]))[0])
+    found.field.put(payload, (1 << width) - 1)  # a NaN
+    assert math.isnan(found.decode(payload))
+    assert found.half_step == 0.0
+    if width == 32:
+        with pytest.raises(InputError, match="does not fit"):
+            found.encode_into(payload, 1e39)
+
+
+@pytest.mark.parametrize(
+    "name", ["not available", "SNA", "NotAvailable", "invalid", "Signal_Invalid", "Init", "ERROR"]
+)
+def test_not_available_codes_of_value_tables(name: str) -> None:
+    table = f'VAL_ 100 s 1023 "{name}" 3 "three" ;\n'
+    found, payload = codec(' SG_ s : 7|10@0+ (0.5,0) [0|0] "V" X', more=table), bytearray(8)
+    assert found.not_available == {1023}
+    assert math.isnan(found.decode(bytes.fromhex("FFC0000000000000")))
+    assert found.decode(bytes.fromhex("FF80000000000000")) == 511.0
+    found.encode_into(payload, math.nan)
+    assert payload.hex() == "ffc0000000000000"
+    with pytest.raises(InputError, match="holds 0 to 511 V") as caught:
+        found.encode_into(payload, 511.5)  # would read as "not available"
+    assert caught.value.field == "s"
+
+
+def test_an_enumeration_has_no_not_available_codes() -> None:
+    table = 'VAL_ 100 s 0 "init" 1 "valid" 3 "invalid" ;\n'
+    found = codec(' SG_ s : 0|2@1+ (1,0) [0|3] "" X', more=table)
+    assert [found.decode(bytes([raw]) + bytes(7)) for raw in range(4)] == [0, 1, 2, 3]
+
+
+def test_values_that_do_not_fit_are_refused() -> None:
+    found, payload = codec(' SG_ s : 0|8@1- (1,0) [0|0] "A" X'), bytearray(8)
+    for value in (128.0, -129.0, math.inf, math.nan):
+        with pytest.raises(InputError):
+            found.encode_into(payload, value)
+        assert bool(found.fits(np.array([value]))[0]) is math.isnan(value)
+    assert payload == bytes(8)
+    found.encode_into(payload, -128.4)  # rounds into the range
+    assert found.decode(payload) == -128.0
+
+
+def test_nested_multiplexers_must_all_match() -> None:
+    signals = """ SG_ top M : 0|4@1+ (1,0) [0|0] "" X
+ SG_ sub m1M : 4|4@1+ (1,0) [0|0] "" X
+ SG_ s m2 : 8|8@1+ (1,0) [0|0] "A" X"""
+    found = codec(signals, more="SG_MUL_VAL_ 100 sub top 1-1;\nSG_MUL_VAL_ 100 s sub 2-3;\n")
+    present = [found.is_in(bytes([first, *bytes(7)])) for first in (0x21, 0x31, 0x22, 0x11)]
+    assert present == [True, True, False, False]
+    payload = bytearray(8)
+    found.encode_into(payload, 77.0)
+    assert (found.is_in(payload), found.decode(payload)) == (True, 77.0)
+
+
+@pytest.mark.parametrize("layout", ["60|8@1+ (1,0)", "57|8@0+ (1,0)", "0|8@1+ (0,0)"])
+def test_impossible_layouts_are_refused(layout: str) -> None:
+    with pytest.raises(InputError, match=r"x\.dbc: current") as caught:
+        codec(f' SG_ s : {layout} [0|0] "A" X')
+    assert caught.value.value == "s"
+
+
+# --- The project's files
+
+
+def strictly(name: str) -> Database:
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        found = cantools.database.load_file(shared_file("dbc", name), strict=True)
+    assert isinstance(found, Database)
+    return found
+
+
+NAMES = sorted(path.name for path in shared_file("dbc", "soc_estimate.dbc").parent.glob("*.dbc"))
+LOADED = {name: strictly(name) for name in NAMES}
+
+# SavvyCAN reads line by line: what does not fit in one line in this form is not loaded.
+NUMBER = r"[0-9.+\-eE]+"
+SAVVYCAN = {
+    "BO_ ": re.compile(r"BO_ \d+ \w+ ?: \d+ \w+"),
+    "SG_ ": re.compile(
+        rf"SG_ \w+( M| m\d+)? : \d+\|\d+@[01][+-] \({NUMBER},{NUMBER}\)"
+        rf' \[{NUMBER}\|{NUMBER}\] ".*" \w.*'
+    ),
+    "CM_ ": re.compile(r'CM_ ((BO_|BU_) \w+ |SG_ \d+ \w+ )?"[^"]*";'),
+    "VAL_ ": re.compile(r'VAL_ \d+ \w+ (-?\d+ "[^"]*" )+;'),
+    "BA_DEF_ ": re.compile(r'BA_DEF_ ((BO_|SG_|BU_) )?"\w+" (INT|FLOAT|STRING|ENUM) ?.*;'),
+}
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_file_is_complete_and_savvycan_reads_each_line(name: str) -> None:
+    messages = LOADED[name].messages
+    assert len({message.frame_id for message in messages}) == len(messages) > 0
+    if name != "bmw_i3.dbc":
+        assert all(message.comment for message in messages)
+        names = [signal.name for message in messages for signal in message.signals]
+        assert len(set(names) - {"soc_pct"}) == len([each for each in names if each != "soc_pct"])
+    read = 0
+    for line in shared_file("dbc", name).read_text(encoding="utf-8").splitlines():
+        for begin, form in SAVVYCAN.items():
+            if line.strip().startswith(begin):
+                assert form.fullmatch(" ".join(line.split())), line
+                read += 1
+    assert read > 10
+
+
+@pytest.mark.parametrize("name", NAMES)
+@settings(max_examples=60)
+@given(data=st.binary(min_size=8, max_size=8))
+def test_codec_agrees_with_cantools_on_every_signal(name: str, data: bytes) -> None:
+    for message in LOADED[name].messages:
+        payload = data[: message.length]
+        try:
+            expected = message.decode(payload, decode_choices=False)
+        except cantools.database.DecodeError:
+            continue  # a multiplexer with a value that no signal belongs to, or a longer reply
+        for signal in message.signals:
+            found = signal_codec(message, signal, source=name, field="")
+            assert found.is_in(payload) == (signal.name in expected)
+            if signal.name in expected:
+                value, wanted = found.decode(payload), float(expected[signal.name])
+                raw = round((wanted - found.offset) / found.factor)
+                assert raw in found.not_available if math.isnan(value) else value == wanted
+
+
+def test_leaf_frames_as_recorded() -> None:
+    leaf = LOADED["nissan_leaf.dbc"]
+    values = leaf.decode_message("BATTERY_1DB", bytes.fromhex("FDA0BAAA000001A8"), False)
+    # On the bus, negative is discharge.
+    assert (values["current_a"], values["voltage_v"]) == (-9.5, 373.0)
+    assert (values["main_relay_on"], values["counter_1db"]) == (1, 1)
+    assert values["crc_1db"] == LEAF_RULE.crc(bytes.fromhex("FDA0BAAA00000100")) == 0xA8
+    soc = leaf.decode_message("BATTERY_55B", bytes.fromhex("D8800000E7001123"))["soc_pct"]
+    assert soc == pytest.approx(86.6, abs=1e-9)
+    for payload, name in (("405068003a", "max"), ("805656003c", "average"), ("c06060003a", "min")):
+        data = bytes.fromhex(payload + "000000")
+        found = leaf.decode_message("BATTERY_5C0", data)[f"temperature_{name}_c"]
+        assert found == data[2] / 2 - 40
+
+
+def test_published_frames_agree_with_the_estimator() -> None:
+    soc = LOADED["soc_estimate.dbc"]
+    message = soc.get_message_by_name("SOC_ESTIMATE")
+    status = message.get_signal_by_name("status").choices
+    assert status == {int(each): each.name.lower() for each in Status}
+    reason = message.get_signal_by_name("reason")
+    assert reason.length == 20
+    # What comes after the frame's bits shares one of them.
+    assert list(Reason)[20:] == [Reason.SIGN_SUSPECT]
+    assert reason_bits(Reason.SIGN_SUSPECT | Reason.CURRENT_GAP) == 1 << 12 | 1 << 1
+    assert all(f" {bit}: " in str(reason.comment) for bit in range(20))
+    assert message.get_signal_by_name("soc_pct").conversion.scale <= 0.01
+    for name, frame_id, cycle_ms in (("SOC_ESTIMATE", 0x5A0, 100), ("SOC_DETAIL", 0x5A1, 1000)):
+        message = soc.get_message_by_name(name)
+        assert (message.frame_id, message.cycle_time) == (frame_id, cycle_ms)
+        attributes = message.dbc.attributes
+        assert attributes["E2EProfile"].value == "02"
+        data_ids = bytes.fromhex(attributes["E2EDataIdList"].value)
+        assert len(set(data_ids)) == 16
+        protected = E2eRule("e2e_02", data_ids=data_ids).protect(bytes(8), 11)
+        values = message.decode(protected, decode_choices=False)
+        assert [value for key, value in values.items() if key.startswith("counter_")] == [11]
+
+
+@pytest.mark.parametrize("time_us", [0, -10_000_000, 2**53, -(2**53)])
+def test_replay_clock_holds_any_time(time_us: int) -> None:
+    soc = LOADED["soc_estimate.dbc"]
+    data = soc.encode_message("REPLAY_CLOCK", {"log_time_us": time_us, "crc_clock": 0})
+    decoded = soc.decode_message(0x5AF, CRC_ONLY_RULE.protect(data, 0))
+    assert (decoded["log_time_us"], decoded["crc_clock"]) == (time_us, CRC_ONLY_RULE.crc(data))
+
+
+def test_counter_and_crc_are_where_the_rule_has_them() -> None:
+    for message in LOADED["generic_pack.dbc"].messages:
+        data = GENERIC_RULE.protect(bytes(message.length), 11)
+        values = message.decode(data, decode_choices=False)
+        found = {key.partition("_")[0]: value for key, value in values.items()}
+        assert (found["counter"], found["crc"]) == (11, data[-1])
+
+
+# --- Other kinds
+
+KCD = """<?xml version="1.0" encoding="UTF-8"?>
+<NetworkDefinition xmlns="http://kayak.2codeornot2code.org/1.0"><Document name="pack"/>
+ <Bus name="hv"><Message id="0x123" name="Pack" length="8">
+  <Signal name="s" offset="0" length="16"><Value type="signed" slope="0.1" unit="A"/></Signal>
+ </Message></Bus></NetworkDefinition>
+"""
+SYM = """FormatVersion=6.0 // a pack
+Title="pack"
+
+{SENDRECEIVE}
+
+[Pack]
+ID=123h
+Len=8
+Sig=s 0
+
+{SIGNALS}
+Sig=s signed 16 /u:A /f:0.1
+"""
+
+
+@pytest.mark.parametrize(("suffix", "text"), [("kcd", KCD), ("sym", SYM)])
+def test_signals_of_other_databases_decode(tmp_path: Path, suffix: str, text: str) -> None:
+    path = tmp_path / f"pack.{suffix}"
+    path.write_text(text)
+    (message,) = load_dbc(path).messages
+    found = signal_codec(message, message.signals[0], source=path, field="current")
+    assert found.decode((-123).to_bytes(2, "little", signed=True) + bytes(6)) == pytest.approx(
+        -12.3
+    )
+    assert (message.frame_id, found.unit) == (0x123, "A")
+
+
+@pytest.mark.parametrize("suffix", ["kcd", "sym", "arxml"])
+def test_broken_databases_name_their_kind(tmp_path: Path, suffix: str) -> None:
+    (tmp_path / f"pack.{suffix}").write_text("nonsense <")
+    with pytest.raises(InputError, match=suffix.upper()):
+        load_dbc(tmp_path / f"pack.{suffix}")
