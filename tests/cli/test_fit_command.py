@@ -108,7 +108,7 @@ def test_several_logs_and_a_report(run: Run, made: Path, tmp_path: Path) -> None
     assert [item["name"] for item in found["logs"]] == ["full", "part"]
     assert found["report"] == str(tmp_path / "m.html")
     text = (tmp_path / "m.html").read_text(encoding="utf-8")
-    assert text.count("<figure ") > 5
+    assert text.count("<figure>") > 5
     assert files(tmp_path) == ["m.html", "m.json"]
 
 
