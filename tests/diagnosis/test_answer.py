@@ -7,7 +7,7 @@ import pytest
 from days import FAULTS, day
 
 from cangauge.diagnosis import GROUP_OF, GROUPS, NONE, UNKNOWN, Posterior, References
-from cangauge.diagnosis.answer import CHECKS, TITLES, answer
+from cangauge.diagnosis.answer import CHECKS, LIKELY, TITLES, answer
 from cangauge.diagnosis.evidence import Evidence, analyse, columns
 from cangauge.diagnosis.pack_fit import trace
 from cangauge.model.effects.library import LIBRARY
@@ -96,7 +96,8 @@ def test_more_evidence_is_more_probable(known: References) -> None:
     group = [each.groups["sensors_and_count"] for each in stated]
     assert group == sorted(group)
     none = [each.probabilities[NONE] for each in stated]
-    assert none[0] > 0.3
+    assert none == sorted(none, reverse=True)
+    assert none[0] > LIKELY
     assert none[-1] < 0.05
 
 

@@ -94,7 +94,7 @@ NAMED: Final = 0.6
 CREDIBLE: Final = 0.9
 """Probability that the credible set holds at least."""
 
-UNTESTED: Final = 2.0
+UNTESTED: Final = 3.0
 """A healthy log may have this many times the error that a model file states: it is of other logs,
 and no left-out reference shows how much logs differ."""
 
