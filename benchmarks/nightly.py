@@ -45,7 +45,7 @@ def commands(data: Path | None, socketcan: str) -> dict[str, list[list[str]] | s
         "faults": [[python, "-m", "faults", *bus]],
         "grade": [
             [python, "-m", "packs", "--data", str(data)],
-            [python, "-m", "diagnosis_check", "--data", str(data)],
+            [python, "-m", "benchmarks.weights", "check", "--data", str(data)],
         ]
         if data is not None
         else missing,

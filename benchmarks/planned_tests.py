@@ -95,7 +95,7 @@ class Bench:
         else:
             one = next(x for x in MEASUREMENTS if x.name == best.name)
             size = fault.size * IN_ENGINE.get(effect, 1.0)
-            reads = one.readings[effect](self.known.pack, size) if effect in one.readings else 0.0
+            reads = one.reading(self.known.pack, effect, size)
             reads += one.std(self.known.pack) * float(rng.normal())
             planned = settled(self.known.pack, evidence, now.probabilities, one, reads)[effect]
         other = inject(record_drive(self.plant, self.drive(0.5, 1), ()).log, [fault], pack).log

@@ -6,13 +6,15 @@
 
 `fit` draws cases of the part "weights", prints the scores with every data set held out in turn,
 and writes `src/cangauge/diagnosis/weights.json`. `check` draws what `frozen.json` names and scores
-it by the weights that ship. PyBaMM's cases are left out where it is not installed.
+it by the weights that ship; its exit status is 1 where the right group comes first, or healthy logs
+raise an alarm, less well than published. PyBaMM's cases are left out where it is not installed.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+import sys
 import time
 from datetime import UTC, datetime
 from pathlib import Path
@@ -23,6 +25,9 @@ from benchmarks.weights import cases, evidence, fit, packs, score
 ROOT = Path(__file__).parents[2]
 FROZEN = Path(__file__).with_name("frozen.json")
 SHIPPED = ROOT / "src/cangauge/diagnosis/weights.json"
+LEAST_FIRST, MOST_ALARMS = 0.7, 0.05
+"""Bounds of `check`: the right group first at one floor or more, and alarms on healthy logs. Two
+standard deviations of the frozen cases away from what was measured."""
 SEEDS = {"weights": 1, "frozen": 20261125}
 
 
@@ -38,44 +43,28 @@ def draw_all(items: list[dict[str, object]], part: str, data: Path, folder: Path
         print(f"{number:3d} {item['pack']:10s} {time.monotonic() - began:6.1f} s", flush=True)
 
 
-def as_json(w: np.ndarray) -> dict[str, object]:
-    """Return the weights by name."""
-    r = [round(float(x), 4) for x in w]
-    return {
-        "nats": r[0],
-        "volts": r[1],
-        "shapes": r[2],
-        "cold": r[3],
-        "library": r[4:6],
-        "none": r[6:10],
-        "unknown": r[10:14],
-    }
-
-
 def shipped() -> np.ndarray:
     """Return the weights that ship, as one array."""
-    w = json.loads(SHIPPED.read_text())["weights"]
-    return np.array(
-        [w["nats"], w["volts"], w["shapes"], w["cold"], *w["library"], *w["none"], *w["unknown"]]
-    )
+    weights = json.loads(SHIPPED.read_text())["weights"]
+    return np.concatenate([weights[part] for part in fit.PARTS])
 
 
-def main() -> None:
-    """Run one of the commands."""
+def main() -> int:
+    """Run one of the commands; return its exit status."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("command", choices=["fit", "plan", "check"])
     parser.add_argument("--data", type=Path, default=ROOT / "../shared/data")
     parser.add_argument("--cases", type=Path, default=ROOT / "out/weights")
-    parser.add_argument("--half", type=int, default=1, help="half of the frozen splits")
+    parser.add_argument("--half", type=int, choices=[1, 2], help="half of the frozen splits")
     parser.add_argument("--only", nargs="*", help="data sets to draw")
     given = parser.parse_args()
     if given.command == "plan":
         items = cases.plan("frozen", given.data, SEEDS["frozen"])
         FROZEN.write_text("[\n" + ",\n".join(json.dumps(x) for x in items) + "\n]\n")
         print(f"{len(items)} splits, {sum(len(x['cases']) for x in items)} cases in {FROZEN}")
-        return
+        return 0
     part = "weights" if given.command == "fit" else "frozen"
     items = (
         cases.plan(part, given.data, SEEDS[part])
@@ -84,14 +73,16 @@ def main() -> None:
     )
     if given.only:
         items = [x if x["pack"] in given.only else {**x, "pack": ""} for x in items]
-    if part == "frozen":
+    if given.half is not None and part == "frozen":
         items = [x if x["half"] == given.half else {**x, "pack": ""} for x in items]
     folder = given.cases / part
     draw_all(items, part, given.data, folder)
     found = evidence.gather(folder, [k for k, x in enumerate(items) if x["pack"]])
     if part == "frozen":
-        print(score.table(found, fit.probabilities(shipped(), found)))
-        return
+        out = fit.probabilities(shipped(), found)
+        print(score.table(found, out))
+        first, alarms = score.bounds(found, out)
+        return int(first < LEAST_FIRST or alarms > MOST_ALARMS)
     out = fit.held_out(found)
     table = score.table(found, out)
     print("Every data set held out in turn:\n" + table)
@@ -99,13 +90,18 @@ def main() -> None:
         line = score.trade(found, fit.held_out(found, cause_out=share))
         print(f"cause-out weight {share:4.2f}: {line}")
     w = fit.fit(found)
+    ends = np.cumsum([0, *fit.PARTS.values()])
+    weights = {
+        part: w[a:b].round(4).tolist()
+        for part, a, b in zip(fit.PARTS, ends[:-1], ends[1:], strict=True)
+    }
     logs = {x.name: [log.name for log in x.logs] for x in packs.recorded(given.data, part)}
     logs |= {
         f"{k} packs, seeds": list(v)
         for k, v in (("simulated", packs.SIMULATED[part]), ("pybamm", packs.PYBAMM[part]))
     }
     whole = {
-        "weights": as_json(w),
+        "weights": weights,
         "command": "python -m benchmarks.weights fit",
         "date": datetime.now(UTC).strftime("%Y-%m-%d"),
         "cases": {
@@ -116,8 +112,9 @@ def main() -> None:
         "held_out": table.splitlines(),
     }
     SHIPPED.write_text(json.dumps(whole, indent=1) + "\n")
-    print(f"wrote {SHIPPED}: {as_json(w)}")
+    print(f"wrote {SHIPPED}: {weights}")
+    return 0
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())

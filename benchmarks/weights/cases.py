@@ -34,9 +34,9 @@ OUTSIDE = tuple(kind.id for kind in fault_kinds(outside=True))
 PER_SPLIT = 5
 NUMBERS = {
     "weights": {
-        "i3": (80, 24, 8), "i3_winter": (40, 8, 2), "lg_25": (40, 8, 4), "lg_cold": (40, 6, 4),
-        "car1": (40, 12, 4), "a123": (20, 6, 2), "leaf": (14, 4, 0), "simulated": (60, 16, 8),
-        "pybamm": (30, 8, 4),
+        "i3": (200, 60, 20), "i3_winter": (80, 16, 6), "lg_25": (80, 16, 8), "lg_cold": (80, 16, 8),
+        "car1": (120, 36, 12), "a123": (60, 18, 6), "leaf": (28, 8, 0), "simulated": (160, 40, 20),
+        "pybamm": (60, 16, 8),
     },
     "frozen": {
         "i3": (60, 24, 6), "i3_winter": (20, 8, 0), "lg_25": (20, 8, 3), "lg_cold": (20, 10, 0),

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 
-from cangauge.diagnosis.answer import GROUP_OF, GROUPS, Features, features
+from cangauge.diagnosis.answer import GROUP_OF, GROUPS, features
 from cangauge.diagnosis.evidence import Evidence, References, analyse, columns, learn
 from cangauge.diagnosis.pack_fit import trace
 from cangauge.logs.log import Log
 
-__all__ = ["GROUPS", "GROUP_OF", "evidence", "features_of", "floor_v", "references"]
+__all__ = ["GROUPS", "GROUP_OF", "evidence", "features", "floor_v", "references"]
 
 
 def references(logs: Sequence[Log], capacity_ah: float) -> References:
@@ -25,12 +25,3 @@ def floor_v(logs: Sequence[Log], capacity_ah: float) -> float:
 def evidence(known: References, logs: Sequence[Log], capacity_ah: float) -> Evidence:
     """Return the evidence of every effect in logs that share one cause."""
     return analyse(known, [columns(known, trace(log, capacity_ah)) for log in logs])
-
-
-def features_of(
-    known: References, found: Evidence, logs: Sequence[Log], without: Collection[str] = ()
-) -> Features:
-    """Return the features of a case."""
-    return features(
-        known, found, known.colder_k([trace(x, known.pack.capacity_ah) for x in logs]), without
-    )

@@ -29,7 +29,7 @@ def examples_of(split: Split) -> list[Example]:
             left_over={k: (e.left_v2 / known.healthy_v2) ** 0.5 for k, e in found.effects.items()},
         )
         for without in [(), (effect,)] if effect in EFFECTS else [()]:
-            f = engine.features_of(known, found, case.logs, without)
+            f = engine.features(known, found, without)
             of = "unknown" if without else truth
             floors = case.truth.get("reached", 0.0)
             out.append(

@@ -173,6 +173,13 @@ def _covers(x: Example) -> bool | None:
     return abs(size - _TO_ENGINE[x.truth] * x.more["size"]) <= 1.96 * wide
 
 
+def bounds(examples: Sequence[Example], ps: Sequence[dict[str, float]]) -> tuple[float, float]:
+    """Return how often the right group is first (at least 1 floor), and healthy logs alarm."""
+    marks = [(x, one(x, p)) for x, p in zip(examples, ps, strict=True) if not x.cause_out]
+    first = mean([m for x, m in marks if x.truth in GROUP_OF and x.floors >= 1.0], "group")
+    return first, mean([m for x, m in marks if x.truth == "none"], "alarm")
+
+
 def trade(examples: Sequence[Example], ps: Sequence[dict[str, float]]) -> str:
     """Return naming and the open set in a line."""
     marks = [(x, one(x, p)) for x, p in zip(examples, ps, strict=True)]
@@ -180,7 +187,8 @@ def trade(examples: Sequence[Example], ps: Sequence[dict[str, float]]) -> str:
     lost = [m for x, m in marks if x.truth == "unknown" and x.floors >= 1.0]
     quiet = [m for x, m in marks if x.truth == "none"]
     return (
-        f"named {mean(known, 'name'):.2f}, alarm {mean(known, 'alarm'):.2f}; open set misled"
+        f"named {mean(known, 'name'):.2f}, alarm {mean(known, 'alarm'):.2f}, set"
+        f" {mean(known, 'set'):.1f}, log {mean(known, 'log'):.2f}; open set misled"
         f" {mean(lost, 'misled'):.2f}; healthy alarms {sum(m['alarm'] for m in quiet)} of"
         f" {len(quiet)}"
     )

@@ -8,7 +8,7 @@ import pytest
 
 from cangauge.diagnosis import Diagnosis, diagnose
 from cangauge.diagnosis.planner import plan
-from cangauge.diagnosis.summary import EXPLAINED
+from cangauge.diagnosis.sentences import EXPLAINED
 from cangauge.extras.report.diagnosis import gap_page
 from cangauge.extras.report.page import Beside, Page, render
 from cangauge.identify.fit import fit

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from cangauge.diagnosis.summary import candidate_rows, size_text
+from cangauge.diagnosis.sentences import candidate_rows, size_cell
 
 
 def quantity(value: float, ci: list[float] | None, unit: str) -> dict[str, object]:
@@ -16,7 +16,7 @@ def test_a_size_has_its_interval_and_unit() -> None:
             "tau_s": quantity(5.0, None, "s"),
         }
     }
-    assert size_text(candidate) == "offset a 3.01 (2.7 … 3.3) A"
+    assert size_cell(candidate) == "offset a 3.01 (2.7 … 3.3) A"
 
 
 def test_none_and_unknown_follow_the_causes() -> None:

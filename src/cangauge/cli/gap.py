@@ -32,9 +32,6 @@ if TYPE_CHECKING:
     from cangauge.logs.log import Log
     from cangauge.model.model_file import Model
 
-SHORTEST_S = 300.0
-"""Shortest log to diagnose [s]; a shorter one is mostly transient."""
-
 
 @option_groups()
 def gap_command(  # noqa: PLR0917 - typer passes options by name
@@ -157,7 +154,7 @@ def gap_command(  # noqa: PLR0917 - typer passes options by name
     model_file = _model(model, options)
     check_outputs([report, extended], [*paths, *given, *([model] if model else [])])
     used = [] if simulated is None else [simulated]
-    diagnosed = [_long_enough(reading.load(path, used)) for path in paths]
+    diagnosed = [reading.load(path, used) for path in paths]
     references = [reading.load(path, used) for path in given]
     if model_file is not None:
         _note_differences([*diagnosed, *references], model_file.capacity_ah)
@@ -244,25 +241,14 @@ def _refuse_common(logs: list[Path], references: list[Path]) -> None:
             )
 
 
-def _long_enough(log: Log) -> Log:
-    if log.duration_s < SHORTEST_S:
-        raise InputError(
-            f"{log.duration_s:.0f} s are too short for a diagnosis",
-            source=log.source or log.name,
-            cure=f"give a log of at least {SHORTEST_S / 60.0:.0f} min, better half an hour with"
-            " changing load and SoC",
-        )
-    return log
-
-
 def _show(found: Diagnosis, before: Diagnosis | None, steps: Plan | None) -> None:
-    from cangauge.diagnosis.summary import SHOWN, candidate_rows, plan_rows
+    from cangauge.diagnosis.sentences import SHOWN, candidate_rows, plan_rows
 
     for line in found.summary.splitlines():
         typer.echo(printable(line))
     if before is not None:
         typer.echo(f"Without the added test: {printable(before.headline)}")
-    result = found.to_json(soc_error=False)
+    result = found.to_json()
     print_table("Causes", *candidate_rows(result, SHOWN))
     if found.caveats:
         typer.echo("What these logs cannot show:")

@@ -1,12 +1,12 @@
 """The answer: one posterior of `none`, `unknown` and the library, from which everything follows.
 
-    u_k = w₁ ln(1 + n_k / o_k) + w₂ ln((v + V) / (v + V_k)) − w₃ ln m_k + w₄ [in the cold]
+    u_k = w₁ ln(1 + n_k/o_k) − w₂ ln(V_k/v) + w₃ ln o_k − w₄ ln m_k
 
-with n_k / o_k the evidence of effect k over what healthy logs show of it, V, V_k, v the mean square
-errors without it, with it, and of a healthy log, and m_k its number of shapes. Effects compete
-within the library, which competes with `none` and `unknown` (nested logit: Train, Discrete Choice
-Methods with Simulation, 2nd ed., 2009, ch. 4). The group is what a user acts on, so groups, sums of
-their effects, are stated first.
+with n_k/o_k the evidence of effect k over what healthy logs show of it, V_k the mean square error
+with it, v that of a healthy log, and m_k its number of shapes. Effects compete within the library,
+which competes with `none` and `unknown` (nested logit: Train, Discrete Choice Methods with
+Simulation, 2nd ed., 2009, ch. 4). The group is what a user acts on, so groups, sums of their
+effects, are stated first.
 """
 
 from __future__ import annotations
@@ -14,11 +14,11 @@ from __future__ import annotations
 import json
 import math
 from collections import Counter
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, cached_property
 from importlib.resources import files
-from typing import Any, Final, Self
+from typing import Final
 
 import numpy as np
 from scipy.special import logsumexp
@@ -80,12 +80,13 @@ CHECKS: Final[Mapping[str, str]] = {
 """Group → what to check first, and what it settles."""
 
 ALARM: Final = 0.05
-"""Probability of `none` up to which a gap is reported. With every data set held out, 3 of 92
-healthy logs raised an alarm at it (../docs)."""
+"""Probability of `none` up to which a gap is reported."""
+
+LIKELY: Final = 0.2
+"""Probability of `none` up to which a gap is called likely: odds of 4 to 1."""
 
 STATED: Final = 0.8
-"""Part of the library from which one group is stated; else two. Groups with as much were right in
-97 % of cases of held-out data sets."""
+"""Part of the library from which one group is stated; else two."""
 
 NAMED: Final = 0.6
 """Part of its group from which an effect is named."""
@@ -93,48 +94,21 @@ NAMED: Final = 0.6
 CREDIBLE: Final = 0.9
 """Probability that the credible set holds at least."""
 
-COLDER_K: Final = 3.0
-"""Distance from the references' temperatures at which a rise of resistance is expected [K]."""
+UNTESTED: Final = 3.0
+"""A healthy log may have this many times the error that a model file states: it is of other logs,
+and no left-out reference shows how much logs differ."""
 
-
-@dataclass(frozen=True)
-class Weights:
-    """Numbers of the posterior, fitted to labelled cases (`benchmarks/weights`)."""
-
-    nats: float
-    """w₁."""
-    volts: float
-    """w₂."""
-    shapes: float
-    """w₃."""
-    cold: float
-    """w₄, for resistance_temperature beyond the references' temperatures."""
-    library: tuple[float, float]
-    """Slope and offset of the library's inclusive value."""
-    none: tuple[float, float, float, float]
-    """Of `Features.outer`."""
-    unknown: tuple[float, float, float, float]
-    """Of `Features.outer`."""
-
-    @classmethod
-    def of(cls, numbers: Mapping[str, Any]) -> Self:
-        """Return the weights of a mapping with these names."""
-        fields: dict[str, Any] = {
-            name: tuple(value) if isinstance(value, list) else value
-            for name, value in numbers.items()
-        }
-        return cls(**fields)
-
-    @classmethod
-    def shipped(cls) -> Self:
-        """Return the weights in `weights.json`."""
-        return cls.of(_weights_file()["weights"])
+Weights = Mapping[str, Sequence[float]]
+"""Numbers of the posterior, fitted to labelled cases (`benchmarks/weights`): `inner` of
+`Features.inner`; slope and offset of the `library`'s inclusive value; `none` and `unknown` of
+`Features.outer`."""
 
 
 @cache
-def _weights_file() -> dict[str, Any]:
+def shipped_weights() -> Weights:
+    """Return the weights in `weights.json`."""
     content = files("cangauge.diagnosis").joinpath("weights.json").read_text("utf-8")
-    return dict(json.loads(content))
+    return dict(json.loads(content)["weights"])
 
 
 @dataclass(frozen=True, eq=False)
@@ -144,57 +118,38 @@ class Features:
     names: tuple[str, ...]
     """Effects of the library, k of them."""
     inner: FloatArray
-    """Per effect: ln(1 + n_k/o_k), ln((v + V)/(v + V_k)), −ln m_k, cold; shape (k, 4)."""
+    """Per effect: ln(1 + n_k/o_k), −ln(V_k/v), ln o_k, −ln m_k; shape (k, 4)."""
     outer: FloatArray
-    """ln(V_best/v + 0.1), ln(1 + max n/o), the same less that of healthy logs, 1; shape (4,)."""
+    """ln(V_best/v + 0.1), ln(1 + max n/o), the same less that of healthy logs, ln(V/v), 1."""
 
 
-def features(
-    known: References, evidence: Evidence, colder_k: float = 0.0, without: Collection[str] = ()
-) -> Features:
-    """Return what the posterior sees of a case.
-
-    Parameters
-    ----------
-    known : References
-    evidence : Evidence
-    colder_k : float
-        Distance of the logs from the references' temperatures [K].
-    without : collection of str
-        Effects taken out of the library.
-    """
+def features(known: References, evidence: Evidence, without: Collection[str] = ()) -> Features:
+    """Return what the posterior sees of a case, without some effects of the library."""
     effects = {name: e for name, e in evidence.effects.items() if name not in without}
     v, shapes = known.healthy_v2, Counter(trial.effect for trial in known.trials)
     shapes[STEP.effect] = len(PLACES)
     inner = np.array([
         [
-            np.log1p(max(e.nats, 0.0)),
-            np.log((v + evidence.gap_v2) / (v + e.left_v2)),
-            -math.log(shapes[name]),
-            min(colder_k / COLDER_K, 1.0) * (name == "resistance_temperature"),
+            math.log1p(max(e.nats, 0.0)), -math.log(max(e.left_v2 / v, 1e-6)),
+            math.log(known.excess_of(name)), -math.log(shapes[name]),
         ]
         for name, e in effects.items()
     ])  # fmt: skip
-    best = list(effects.values())[int(np.argmax(inner[:, 0] + inner[:, 1]))]
-    most = float(inner[:, 0].max())
-    usual = float(np.log1p(known.healthy_nats).mean())
-    outer = np.array([np.log(best.left_v2 / v + 0.1), most, most - usual, 1.0])
-    return Features(tuple(effects), inner, outer)
+    left_v2 = np.array([e.left_v2 for e in effects.values()])
+    best = np.argmax(inner[:, 0] - np.log(v + left_v2))
+    most, usual = float(inner[:, 0].max()), float(np.log1p(known.healthy_nats).mean())
+    gap = math.log(evidence.gap_v2 / v) - (0.0 if known.left_out else 2.0 * math.log(UNTESTED))
+    outer = [math.log(left_v2[best] / v + 0.1), most, most - usual, gap, 1.0]
+    return Features(tuple(effects), inner, np.array(outer))
 
 
 def probabilities(case: Features, by: Weights) -> dict[str, float]:
-    """Return the probability of `none`, `unknown` and every effect; they sum to 1.
-
-    Parameters
-    ----------
-    case : Features
-    by : Weights
-    """
-    u = case.inner @ [by.nats, by.volts, by.shapes, by.cold]
-    library = float(logsumexp(u))
-    outer = np.array([
-        case.outer @ by.none, case.outer @ by.unknown, by.library[0] * library + by.library[1]
-    ])  # fmt: skip
+    """Return the probability of `none`, `unknown` and every effect; they sum to 1."""
+    u = case.inner @ by["inner"]
+    library, (slope, offset) = float(logsumexp(u)), by["library"]
+    outer = np.array(
+        [case.outer @ by["none"], case.outer @ by["unknown"], slope * library + offset]
+    )
     none, unknown, any_effect = np.exp(outer - logsumexp(outer)).tolist()
     effects = any_effect * np.exp(u - library)
     return {NONE: none, UNKNOWN: unknown} | dict(zip(case.names, effects.tolist(), strict=True))
@@ -213,27 +168,23 @@ class Posterior:
     alarm: float = ALARM
     """P(none) up to which a gap is reported."""
 
-    @property
-    def groups(self) -> dict[str, float]:
-        """Probability of each group, of `none` and of `unknown`, most probable first."""
-        sums = {name: self.probabilities[name] for name in (NONE, UNKNOWN)}
-        for effect, p in self.probabilities.items():
-            if effect in GROUP_OF:
-                sums[GROUP_OF[effect]] = sums.get(GROUP_OF[effect], 0.0) + p
-        return dict(sorted(sums.items(), key=lambda item: -item[1]))
-
-    @property
-    def group_shares(self) -> dict[str, float]:
-        """Part of the library that each group holds, largest first."""
-        library = {name: p for name, p in self.groups.items() if name in GROUPS}
-        total = max(sum(library.values()), 1e-300)
-        return {name: p / total for name, p in library.items()}
+    @cached_property
+    def ranked(self) -> dict[str, float]:
+        """All answers, most probable first."""
+        return dict(sorted(self.probabilities.items(), key=lambda item: -item[1]))
 
     @property
     def effects(self) -> dict[str, float]:
         """Probability of each effect, most probable first."""
-        ranked = sorted(self.probabilities.items(), key=lambda item: -item[1])
-        return {name: p for name, p in ranked if name in GROUP_OF}
+        return {name: p for name, p in self.ranked.items() if name in GROUP_OF}
+
+    @cached_property
+    def groups(self) -> dict[str, float]:
+        """Probability of each group, of `none` and of `unknown`, most probable first."""
+        sums: Counter[str] = Counter()
+        for name, p in self.ranked.items():
+            sums[GROUP_OF.get(name, name)] += p  # type: ignore[assignment]
+        return dict(sums.most_common())
 
     @property
     def detected(self) -> bool:
@@ -241,21 +192,33 @@ class Posterior:
         return self.probabilities[NONE] <= self.alarm
 
     @property
+    def likely(self) -> bool:
+        """Whether there is something to check: a gap is reported, or likely."""
+        return self.probabilities[NONE] <= max(self.alarm, LIKELY)
+
+    @property
     def stated_groups(self) -> tuple[str, ...]:
-        """The group that holds `STATED` of the library, else the first two; () if unknown leads."""
-        first, *others = self.group_shares.items()
-        if first[1] >= STATED or not others:
-            return (first[0],)
-        return first[0], others[0][0]
+        """The group that holds `STATED` of the library, else the first two."""
+        first, *others = [name for name in self.groups if name in GROUPS]
+        library = 1.0 - self.probabilities[NONE] - self.probabilities[UNKNOWN]
+        return (first, *others[: self.groups[first] < STATED * library])
+
+    @property
+    def leading_group(self) -> str:
+        """The likeliest group, or `unknown` where that is likelier than the whole library."""
+        p = self.probabilities
+        return UNKNOWN if 2.0 * p[UNKNOWN] > 1.0 - p[NONE] else self.stated_groups[0]
+
+    @property
+    def members(self) -> list[str]:
+        """Effects of the likeliest group, most probable first."""
+        return [name for name in self.effects if GROUP_OF[name] == self.stated_groups[0]]
 
     @property
     def name(self) -> str | None:
-        """Effect with `NAMED` of the first group; None if no effect stands out."""
-        group = self.stated_groups[0]
-        of_group = [name for name in self.effects if GROUP_OF[name] == group]
-        total = sum(self.probabilities[name] for name in of_group)
-        stands_out = self.probabilities[of_group[0]] >= NAMED * total
-        return of_group[0] if stands_out else None
+        """Effect with `NAMED` of the likeliest group; None if no effect stands out."""
+        first, group = self.members[0], self.groups[self.stated_groups[0]]
+        return first if self.probabilities[first] >= NAMED * group else None
 
     @property
     def named(self) -> bool:
@@ -265,78 +228,46 @@ class Posterior:
     @property
     def verdict(self) -> str:
         """Most probable single answer: an effect, `none` or `unknown`."""
-        return max(self.probabilities, key=lambda name: self.probabilities[name])
+        return next(iter(self.ranked))
 
     @property
     def probability(self) -> float:
         """Probability of the verdict."""
-        return self.probabilities[self.verdict]
+        return self.ranked[self.verdict]
 
     @property
     def credible_set(self) -> tuple[str, ...]:
         """Smallest set of answers that holds 90 %, most probable first."""
-        chosen, total = [], 0.0
-        for name, p in sorted(self.probabilities.items(), key=lambda item: -item[1]):
-            if total >= CREDIBLE:
-                break
-            chosen.append(name)
-            total += p
-        return tuple(chosen)
+        before = np.cumsum([0.0, *self.ranked.values()])
+        return tuple(self.ranked)[: int(np.searchsorted(before, CREDIBLE))]
 
     @property
     def ambiguous_with(self) -> tuple[str, ...]:
         """Effects of the credible set beside the verdict."""
-        apart = {self.verdict, NONE, UNKNOWN}
-        return tuple(name for name in self.credible_set if name not in apart)
+        return tuple(x for x in self.credible_set if x in GROUP_OF and x != self.verdict)
 
     @property
     def check_first(self) -> str:
         """What to look at first, and what would settle the cause."""
-        if not self.detected:
-            return CHECKS[NONE]
-        return CHECKS[self.leading_group]
-
-    @property
-    def leading_group(self) -> str:
-        """The likeliest group, or `unknown` where that is likelier than the whole library."""
-        p = self.probabilities
-        library = 1.0 - p[NONE] - p[UNKNOWN]
-        return UNKNOWN if p[UNKNOWN] > library else self.stated_groups[0]
+        return CHECKS[self.leading_group if self.likely else NONE]
 
 
 def answer(
     known: References,
     evidence: Evidence,
-    colder_k: float = 0.0,
     *,
-    weights: Weights | None = None,
     without: Collection[str] = (),
     alarm: float = ALARM,
 ) -> Posterior:
-    """Return the posterior of a case and what follows from it.
-
-    Parameters
-    ----------
-    known : References
-    evidence : Evidence
-    colder_k : float
-        Distance of the logs from the references' temperatures [K].
-    weights : Weights, optional
-        By default those that ship.
-    without : collection of str
-        Effects taken out of the library.
-    alarm : float
-        P(none) up to which a gap is reported.
-    """
-    case = features(known, evidence, colder_k, without)
-    stated = probabilities(case, weights or Weights.shipped())
-    effects = {name: evidence.effects[name] for name in case.names}
-    best = max(case.names, key=lambda name: stated[name])
+    """Return the posterior of a case, without some effects, and what follows from it."""
+    case = features(known, evidence, without)
+    stated = probabilities(case, shipped_weights())
+    best = evidence.effects[max(case.names, key=lambda name: stated[name])]
+    visible = {name: evidence.effects[name] for name in case.names}
     return Posterior(
         stated,
-        left_over=math.sqrt(effects[best].left_v2 / max(known.healthy_v2, 1e-300)),
-        visible_from={
-            name: e.visible if e.visible <= e.trial.bound else None for name, e in effects.items()
-        },
+        left_over=math.sqrt(best.left_v2 / max(known.healthy_v2, 1e-300)),
+        visible_from={k: e.visible if e.visible <= e.trial.bound else None
+                      for k, e in visible.items()},
         alarm=alarm,
-    )
+    )  # fmt: skip

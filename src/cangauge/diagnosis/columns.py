@@ -74,13 +74,7 @@ def soc_covered(pack: PackFit, log: Trace, others: Sequence[Trace]) -> BoolArray
 def rows_that_count(pack: PackFit, log: Trace, others: Sequence[Trace], r: FloatArray) -> IntArray:
     """Return measured rows whose SoC other logs visit; all measured rows if those are few.
 
-    Parameters
-    ----------
-    pack : PackFit
-    log : Trace
-    others : sequence of Trace
-    r : array of shape (n,)
-        Residual, for single rows that no pack can have produced [V].
+    The residual r [V] shows single rows that no pack can have produced.
     """
     covered = log.measured & soc_covered(pack, log, others)
     if covered.sum() < MIN_COVERED * log.measured.sum():
@@ -116,10 +110,15 @@ def on_rows(
     log: Trace, columns: Sequence[FloatArray], rows: IntArray, folds: int = FOLDS
 ) -> Columns:
     """Return the columns of a log on some rows; in one part for a reference, never held out."""
-    x, b = (part[rows] for part in columns[:2])
-    every, fold = np.concatenate(columns, axis=1)[rows], rows // BLOCK_S % folds
-    blocks = [every[fold == k] for k in range(folds)] if folds > 1 else [every]
-    return Columns(log, rows, x, b, np.array([block.T @ block for block in blocks]))
+    every = np.concatenate(columns, axis=1)[rows]
+    return Columns(log, rows, columns[0][rows], columns[1][rows], in_blocks(every, rows, folds))
+
+
+def in_blocks(columns: FloatArray, rows: IntArray, folds: int) -> FloatArray:
+    """Return products of k columns in each set of blocks, shape (folds, k, k)."""
+    fold = rows // BLOCK_S % folds
+    blocks = [columns[fold == k] for k in range(folds)] if folds > 1 else [columns]
+    return np.array([block.T @ block for block in blocks])
 
 
 def without_own(products: FloatArray, log: Columns, s2: float) -> FloatArray:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import logging
-import math
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache, cached_property
@@ -15,16 +14,16 @@ from threadpoolctl import ThreadpoolController
 
 from cangauge._extras import extra
 from cangauge._files import file_sha256
+from cangauge._typing import FloatArray
 from cangauge.diagnosis import sentences
-from cangauge.diagnosis.answer import ALARM, GROUP_OF, UNKNOWN, Posterior, answer
+from cangauge.diagnosis.answer import ALARM, GROUP_OF, NONE, UNKNOWN, Posterior, answer
 from cangauge.diagnosis.checks import check_logs
 from cangauge.diagnosis.columns import Columns
 from cangauge.diagnosis.evidence import Evidence, References, analyse, columns, learn
 from cangauge.diagnosis.extended import Extension, Quantity, residual_v
 from cangauge.diagnosis.pack_fit import Trace, trace
-from cangauge.diagnosis.simulator import Simulation, SimulatorGap, correction, simulator_gap
-from cangauge.diagnosis.summary import diagnosis_html
-from cangauge.diagnosis.where import ErrorShare, LogErrors, drawn_sums, error_shares, pieces, rms
+from cangauge.diagnosis.simulator import Simulation, SimulatorGap, simulator_gap
+from cangauge.diagnosis.where import ErrorShare, LogErrors, closed_part, error_shares, rms
 from cangauge.errors import InputError
 from cangauge.estimation.offline import estimate
 from cangauge.identify.starts import start_by_model
@@ -36,6 +35,10 @@ _LOG = logging.getLogger(__name__)
 
 CROSS_VALIDATED = 5
 """Number of effects, the most probable ones, whose errors are found on held-out rows."""
+
+WORSE_SOC, WORSE_SOC_PCT = 1.1, 0.1
+"""A cause is not accepted with which the SoC error of these logs is larger than this many times
+that of the given model and this [%]: more than its scatter."""
 
 SETTLING_S = 300.0
 """Start of a log, with withheld initial SoC, that the SoC error leaves out [s]."""
@@ -96,11 +99,6 @@ class Diagnosis:
     simulator: SimulatorGap | None = None
     """The simulator whose gap it is; None: the gap of `model`."""
 
-    @property
-    def colder_k(self) -> float:
-        """Distance of the logs from the temperatures of the references [K]."""
-        return self.known.colder_k([of.log for of in self.columns])
-
     @cached_property
     def _extensions(self) -> dict[str, Extension]:
         model, before = self.model.extended_model(), [log.before_v for log in self._without]
@@ -118,16 +116,11 @@ class Diagnosis:
             before = residual_v(model, signals)[at]
             errors.append(
                 LogErrors(
-                    log.name,
-                    at.astype(np.float64),
-                    signals.current_a[at],
-                    signals.temperature_c[at],
-                    self.known.pack.soc(signals)[at],
-                    before,
-                    before,
+                    log.name, at.astype(np.float64), signals.current_a[at],
+                    signals.temperature_c[at], self.known.pack.soc(signals)[at], before, before,
                     np.ones(len(at), dtype=bool),
                 )
-            )
+            )  # fmt: skip
         return tuple(errors)
 
     @cached_property
@@ -140,24 +133,42 @@ class Diagnosis:
                     self._without, *self._extensions[name].judge(), strict=True
                 )
             )
-            for name in list(self.posterior.effects)[:CROSS_VALIDATED]
+            for name in {*list(self.posterior.effects)[:CROSS_VALIDATED], self.posterior.members[0]}
         }
+
+    @cached_property
+    def likeliest(self) -> str | None:
+        """The effect that explains the gap best and makes held-out voltages better; or None.
+
+        A gap is reported, its cause is likelier in the library than outside, and with the effect
+        the error of held-out rows is smaller: of those that it can change, and of all.
+        """
+        if not self.posterior.detected or self.posterior.leading_group == UNKNOWN:
+            return None
+        errors = self._with[effect := self.posterior.members[0]]
+        every = [replace(log, judged=np.ones_like(log.judged)) for log in errors]
+        better = all(rms(some, after=True) < rms(some) for some in (errors, every))
+        return effect if better else None
+
+    @cached_property
+    def soc_errors_pct(self) -> tuple[float, float] | None:
+        """SoC errors of the estimator, initial SoC withheld: as given, and with `likeliest` [%].
+
+        None where no diagnosed log has a reference SoC.
+        """
+        before = self._soc_error_pct(self.model)
+        if before is None or self.likeliest is None:
+            return None if before is None else (before, before)
+        return before, self._soc_error_pct(self._extended(self.likeliest)) or 0.0
 
     @cached_property
     def accepted(self) -> str | None:
         """The effect that the extended model has; None without one.
 
-        A gap is reported, its cause is likelier in the library than outside, and the effect makes
-        the voltage of held-out rows better: of those that it can change, and of all.
+        It is `likeliest`, unless the SoC of these logs becomes worse with it.
         """
-        if not self.posterior.detected or self.posterior.leading_group == UNKNOWN:
-            return None
-        group = self.posterior.stated_groups[0]
-        effect = next(name for name in self.posterior.effects if GROUP_OF[name] == group)
-        errors = self._with.get(effect, self._without)
-        better = rms(errors, after=True) < rms(errors)
-        every = [replace(log, judged=np.ones_like(log.judged)) for log in errors]
-        return effect if better and rms(every, after=True) < rms(every) else None
+        before, after = self.soc_errors_pct or (0.0, 0.0)
+        return None if after > WORSE_SOC * before + WORSE_SOC_PCT else self.likeliest
 
     @property
     def log_errors(self) -> tuple[LogErrors, ...]:
@@ -173,11 +184,6 @@ class Diagnosis:
     def extended_rmse_v(self) -> float:
         """Error of the extended model on held-out rows [V]."""
         return rms(self.log_errors, after=True)
-
-    @property
-    def expected_rmse_v(self) -> float:
-        """Error with what the references show of this pack, no cause sought [V]."""
-        return math.sqrt(self.evidence.gap_v2)
 
     @property
     def healthy_rmse_v(self) -> float:
@@ -197,34 +203,22 @@ class Diagnosis:
 
     @property
     def closed_fraction(self) -> float | None:
-        """Closed part of the squared error above a healthy log's; None without a gap above it."""
-        return None if self.accepted is None else self._closed(self.log_errors)
+        """Closed part of the squared error above a healthy log's.
+
+        None without a cause, or without a gap above the healthy error.
+        """
+        return self._closed[0]
 
     @property
     def closed_fraction_ci(self) -> tuple[float, float] | None:
         """95 % interval of the closed fraction."""
-        return None if self.accepted is None else self._closed_interval(self.log_errors)
+        return self._closed[1]
 
-    def _closed(self, errors: Sequence[LogErrors]) -> float | None:
-        gap = rms(errors) ** 2 - self.known.healthy_v2
-        if not gap > 0.0:
-            return None
-        return min((rms(errors) ** 2 - rms(errors, after=True) ** 2) / gap, 1.0)
-
-    def _closed_interval(self, errors: Sequence[LogErrors]) -> tuple[float, float] | None:
-        """Return the 95 % interval of the closed fraction, by a bootstrap over pieces."""
-        weight = np.concatenate([log.judged for log in errors]).astype(np.float64)
-        before = np.concatenate([log.before_v for log in errors]) ** 2 * weight
-        after = np.concatenate([log.after_v for log in errors]) ** 2 * weight
-        sums = drawn_sums(pieces(errors), before, after, weight)
-        rows = np.maximum(sums[2], 1.0)
-        gap = sums[0] / rows - self.known.healthy_v2
-        usable = gap > 0.0
-        if usable.mean() < 0.9:
-            return None
-        closed = np.minimum(((sums[0] - sums[1]) / rows)[usable] / gap[usable], 1.0)
-        low, high = np.quantile(closed, [0.025, 0.975])
-        return float(low), float(high)
+    @cached_property
+    def _closed(self) -> tuple[float | None, tuple[float, float] | None]:
+        if self.accepted is None:
+            return None, None
+        return closed_part(self.log_errors, self.known.healthy_v2)
 
     @cached_property
     def where(self) -> list[ErrorShare]:
@@ -234,17 +228,15 @@ class Diagnosis:
     @cached_property
     def candidates(self) -> tuple[Candidate, ...]:
         """Every effect, most probable first."""
-        return tuple(self._candidate(name, p) for name, p in self.posterior.effects.items())
-
-    def _candidate(self, effect: str, probability: float) -> Candidate:
-        judged: tuple[Any, ...] = (None, None, None)
-        if effect in self._with:
-            errors = self._with[effect]
-            judged = rms(errors, after=True), self._closed(errors), self._closed_interval(errors)
-        parameters = self._extensions[effect].parameters
-        rmse_v, closed, ci = judged
-        group = GROUP_OF[effect]
-        return Candidate(effect, group, probability, rmse_v, closed, ci, parameters)
+        found = []
+        for name, p in self.posterior.effects.items():
+            errors, rmse_v, closed, ci = self._with.get(name), None, None, None
+            if errors is not None:
+                rmse_v = rms(errors, after=True)
+                closed, ci = closed_part(errors, self.known.healthy_v2)
+            parameters = self._extensions[name].parameters
+            found.append(Candidate(name, GROUP_OF[name], p, rmse_v, closed, ci, parameters))
+        return tuple(found)
 
     @cached_property
     def parameters(self) -> dict[str, dict[str, Quantity]]:
@@ -262,46 +254,34 @@ class Diagnosis:
             sizes.append({"effect": name, "size": size, "unit": unit})
         return sizes
 
-    @property
-    def correction(self) -> str:
-        """What to change in the simulator, in one sentence; "" without an accepted cause."""
-        if self.simulator is None or self.accepted is None:
-            return ""
-        values = self.parameters[self.accepted]
-        return correction(self.accepted, {name: item.value for name, item in values.items()})
-
     @cached_property
     def extended_model(self) -> Model:
         """The model with the accepted cause, ready to save and run; the given one without."""
-        if self.accepted is None:
-            return self.model
-        return self._extensions[self.accepted].model_file(self.model, self.extended_rmse_v)
+        return self.model if self.accepted is None else self._extended(self.accepted)
 
-    @cached_property
-    def baseline_soc_mae_pct(self) -> float | None:
-        """SoC error of the estimator with the given model, initial SoC withheld [%]; or None."""
-        return self._soc_error_pct(self.model)
-
-    @cached_property
-    def extended_soc_mae_pct(self) -> float | None:
-        """The same with the extended model [%]."""
-        if self.accepted is None:
-            return self.baseline_soc_mae_pct
-        return self._soc_error_pct(self.extended_model)
+    def _extended(self, effect: str) -> Model:
+        return self._extensions[effect].model_file(self.model, rms(self._with[effect], after=True))
 
     def _soc_error_pct(self, model: Model) -> float | None:
-        """Return the mean absolute SoC error at 1 Hz of logs with reference SoC [%]; or None."""
-        errors = []
-        for log, of in zip(self.logs, self.columns, strict=True):
-            if log.soc_pct is None or np.isfinite(log.soc_pct).mean() < 0.5:
+        """Return the mean absolute SoC error at 1 Hz of logs with reference SoC [%]; or None.
+
+        After a step of resistance, if that is the cause: the extended model has it throughout.
+        """
+        errors: list[FloatArray] = []
+        places: tuple[float | None, ...] = (0.0,) * len(self.logs)
+        if self.likeliest is not None:
+            places = self.evidence.effects[self.likeliest].in_logs or places
+        for log, of, place in zip(self.logs, self.columns, places, strict=True):
+            if place is None or log.soc_pct is None or np.isfinite(log.soc_pct).mean() < 0.5:
                 continue
             signals, finite = of.log, np.isfinite(log.soc_pct)
+            first = round(place * len(signals.current_a))
             time_s = np.arange(len(signals.current_a), dtype=np.float64)
             at_1_hz = Log(time_s, signals.current_a, signals.voltage_v, signals.temperature_c)
-            table = estimate(at_1_hz, model, initial_soc_pct="auto")
+            table = estimate(at_1_hz.rows(slice(first, None)), model, initial_soc_pct="auto")
             own = np.interp(table.time_s, log.time_s[finite] - log.time_s[0], log.soc_pct[finite])
-            kept = np.isfinite(table.soc_pct) & (table.time_s >= SETTLING_S) & of.log.measured
-            errors.append(np.abs(table.soc_pct - own)[kept])
+            kept = np.isfinite(table.soc_pct) & (table.time_s - first >= SETTLING_S)
+            errors.append(np.abs(table.soc_pct - own)[kept & signals.measured[first:]])
         together = np.concatenate(errors) if errors else np.zeros(0)
         return float(together.mean()) if together.size else None
 
@@ -331,31 +311,22 @@ class Diagnosis:
 
     def _repr_html_(self) -> str:
         """Return the answer for a notebook."""
-        return diagnosis_html(self)
+        return sentences.diagnosis_html(self)
 
-    def to_json(
-        self, extended_model: str | None = None, *, soc_error: bool = True
-    ) -> dict[str, Any]:
+    def to_json(self, extended_model: str | None = None) -> dict[str, Any]:
         """Return the object that `cangauge gap --json` prints (schema 3).
 
         Parameters
         ----------
         extended_model : str, optional
             Path of the extended model's file, to be reported.
-        soc_error : bool
-            Run the estimator for the SoC error with either model; otherwise these are None.
         """
-        found, ci = self.posterior, self.closed_fraction_ci
+        found, closed, ci = self.posterior, self.closed_fraction, self.closed_fraction_ci
         accepted = []
+        before_pct, after_pct = self.soc_errors_pct or (None, None)
         if self.accepted is not None:
             values = {name: item.value for name, item in self.parameters[self.accepted].items()}
-            accepted = [
-                {
-                    "effect": self.accepted,
-                    "parameters": values,
-                    "closed_fraction": self.closed_fraction,
-                }
-            ]
+            accepted = [{"effect": self.accepted, "parameters": values, "closed_fraction": closed}]
         model = self.model.to_json().encode()
         return {
             "schema": 3,
@@ -363,16 +334,16 @@ class Diagnosis:
                 "baseline_rmse_v": self.baseline_rmse_v,
                 "extended_rmse_v": self.extended_rmse_v,
                 "healthy_rmse_v": self.healthy_rmse_v,
-                "closed_fraction": self.closed_fraction,
+                "closed_fraction": closed,
                 "closed_fraction_ci": ci and list(ci),
-                "baseline_soc_mae_pct": self.baseline_soc_mae_pct if soc_error else None,
-                "extended_soc_mae_pct": self.extended_soc_mae_pct if soc_error else None,
+                "baseline_soc_mae_pct": before_pct,
+                "extended_soc_mae_pct": before_pct if self.accepted is None else after_pct,
             },
             "where": [share.to_dict() for share in self.where],
             "cause": {
                 "detected": found.detected,
-                "probability_none": found.probabilities["none"],
-                "probability_unknown": found.probabilities["unknown"],
+                "probability_none": found.probabilities[NONE],
+                "probability_unknown": found.probabilities[UNKNOWN],
                 "groups": [{"group": g, "probability": p} for g, p in found.groups.items()],
                 "check_first": found.check_first,
                 "named": found.named,
@@ -480,7 +451,7 @@ def diagnose(
             known=known,
             columns=of_logs,
             evidence=evidence,
-            posterior=answer(known, evidence, known.colder_k(traces), without=without, alarm=alarm),
+            posterior=answer(known, evidence, without=without, alarm=alarm),
             remarks=tuple(remarks),
             has_references=bool(own) or known is references,
             simulator=simulator,

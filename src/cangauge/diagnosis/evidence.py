@@ -21,6 +21,7 @@ All functions are pure. Current > 0 discharges.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
@@ -34,13 +35,14 @@ from cangauge.diagnosis.columns import (
     PLACES,
     Columns,
     all_columns,
+    in_blocks,
     on_rows,
     rows_that_count,
     shared_columns,
     squares,
     without_own,
 )
-from cangauge.diagnosis.pack_fit import KNOTS, PackFit, Trace, fit_pack
+from cangauge.diagnosis.pack_fit import PackFit, Trace, fit_pack
 from cangauge.diagnosis.trials import STEP, Trial, library, residual, slope, undone
 
 WIDTHS = np.array([1.0, 0.3, 0.1, 0.03])
@@ -55,18 +57,22 @@ VISIBLE_NATS = 6.0
 COVER_K = 3.0
 """References cover temperatures this far beyond their own [K]."""
 
-UNTESTED_EXCESS = 8.0
-"""Excess of an effect's evidence where fewer than two references are there to show it."""
+UNTESTED_EXCESS = 22.0
+"""Excess of an effect's evidence where fewer than two references are there to show it: nine of ten
+effects stay below it in the packs that the weights were fitted to."""
 
 STEPS, SHRINK, MIN_STEP, MIN_CHANGE = 5, 0.35, 1e-3, 0.03
-"""Gauss–Newton steps of a re-simulated effect, the factor after one that lost evidence, and the
-steps at which it ends: in units of the bound, and relative to the size."""
+"""Gauss–Newton: steps, the factor after one that lost evidence, and the steps at which it ends, in
+units of the bound and relative to the size."""
 
 AFTER = 2.0
 """A place beyond the end of a log, in parts of it: no step in it."""
 
 MIN_PLACE = 0.01
 """A step of resistance is placed this closely, in parts of its log."""
+
+MOVES_SOC = ("current_offset", "current_gain", "capacity", "initial_soc", "coulombic_efficiency")
+"""Effects that change the counted SoC."""
 
 RESIMULATED_PART = 0.15
 """An effect with less than this part of the best one's evidence is not re-simulated."""
@@ -143,14 +149,6 @@ class References:
         ]
         return np.asarray(np.maximum(most or [3.0], 0.0), dtype=np.float64)
 
-    def colder_k(self, logs: Sequence[Trace]) -> float:
-        """Return how far logs lie beyond the temperatures of the references [K]."""
-        low = min(float(log.temperature_c.min()) for log in self.logs)
-        high = max(float(log.temperature_c.max()) for log in self.logs)
-        lowest = min(float(log.temperature_c.min()) for log in logs)
-        highest = max(float(log.temperature_c.max()) for log in logs)
-        return max(0.0, low - COVER_K - lowest, highest - high - COVER_K)
-
     def excess_of(self, effect: str) -> float:
         """Return o_k of an effect."""
         return self.excess.get(effect, 1.0 if self.excess else UNTESTED_EXCESS)
@@ -159,26 +157,28 @@ class References:
 def learn(
     references: Sequence[Trace], capacity_ah: float, stated_rmse_v: float = 0.0
 ) -> References:
-    """Learn structure, noise and healthy evidence from reference logs.
+    """Learn structure, noise and healthy evidence from reference logs, at least one.
 
-    Parameters
-    ----------
-    references : sequence of Trace
-        At least one.
-    capacity_ah : float
-    stated_rmse_v : float
-        Error that the model file states [V]: the floor with fewer than two references.
+    With fewer than two the error that the model file states [V] counts as noise.
     """
     pack = fit_pack(references, capacity_ah)
     trials = library(pack)
-    full, out = _of_references(pack, references, trials)
+    full, out = [], []  # on all rows, and on those whose SoC the others visit
+    for k, log in enumerate(references):
+        every = all_columns(pack, log, trials)
+        others, r = [*references[:k], *references[k + 1 :]], every[-1][:, 0]
+        own, covered = (rows_that_count(pack, log, some, r) for some in ([], others))
+        full.append(on_rows(log, every, own, folds=1))
+        same = len(own) == len(covered)
+        out.append(full[-1] if same else on_rows(log, every, covered, folds=1))
     s2 = _noise_v2(pack, full)
-    p = _prior(pack, full, out, s2)
+    p = pack.precision()
     if len(references) < 2:
         s2 = max(s2, stated_rmse_v**2)
     else:
-        s2 = max(s2, float(np.mean(_left_out_v2(pack, p, _marginal(full, s2), out))))
-    q = _marginal(full, s2)
+        p, left_v2 = _predicting(pack, full, out, s2)
+        s2 = max(s2, left_v2)
+    q = [without_own(log.products, log, s2) for log in full]
     a, b = _normal(pack, p, q)
     known = References(pack, trials, list(references), s2, a, b, stated_v2=stated_rmse_v**2)
     if len(references) < 2:
@@ -194,25 +194,6 @@ def learn(
     return replace(known, left_out=left_out, excess=excess)
 
 
-def _of_references(
-    pack: PackFit, references: Sequence[Trace], trials: Sequence[Trial]
-) -> tuple[list[Columns], list[Columns]]:
-    """Return each reference on all its rows, and on those whose SoC the others visit."""
-    full, out = [], []
-    for k, log in enumerate(references):
-        every = all_columns(pack, log, trials)
-        others, r = [*references[:k], *references[k + 1 :]], every[-1][:, 0]
-        own, covered = (rows_that_count(pack, log, some, r) for some in ([], others))
-        full.append(on_rows(log, every, own, folds=1))
-        same = len(own) == len(covered)
-        out.append(full[-1] if same else on_rows(log, every, covered, folds=1))
-    return full, out
-
-
-def _marginal(logs: Sequence[Columns], s2: float) -> list[FloatArray]:
-    return [without_own(log.products, log, s2) for log in logs]
-
-
 def _normal(pack: PackFit, p: FloatArray, q: Sequence[FloatArray]) -> tuple[FloatArray, FloatArray]:
     """Return precision and right side of θ's change, the prior's precision being p about zero."""
     nx, total = len(pack.theta), np.sum(q, axis=0)
@@ -223,33 +204,31 @@ def _noise_v2(pack: PackFit, full: Sequence[Columns]) -> float:
     """Return the mean square error of all references together [V²]."""
     s2, p, rows = (0.003 * pack.volts) ** 2, pack.precision(), sum(len(log.rows) for log in full)
     for _ in range(3):
-        q = _marginal(full, s2)
+        q = [without_own(log.products, log, s2) for log in full]
         a, b = _normal(pack, p, q)
         chi2 = sum(x[-1, -1] for x in q) + pack.theta @ p @ pack.theta - b @ np.linalg.solve(a, b)
         s2 *= float(chi2) / rows
     return max(s2, (1e-5 * pack.volts) ** 2)
 
 
-def _left_out_v2(
-    pack: PackFit, p: FloatArray, q: Sequence[FloatArray], out: Sequence[Columns]
-) -> FloatArray:
-    """Return the mean square error of each reference by the others [V²]."""
-    (a, b), nx = _normal(pack, p, q), len(pack.theta)
-    return np.array([
-        squares(log, np.linalg.solve(a - x[:nx, :nx], b - x[:nx, -1])) / len(log.rows)
-        for x, log in zip(q, out, strict=True)
-    ])  # fmt: skip
-
-
-def _prior(pack: PackFit, full: Sequence[Columns], out: Sequence[Columns], s2: float) -> FloatArray:
-    """Return the prior precision of θ that predicts left-out references best."""
-    if len(out) < 2:
-        return pack.precision()
-    q, floor_v2 = _marginal(full, s2), (5e-4 * pack.volts) ** 2
-    grid = [
-        pack.precision(size, rough) for size in (0.03, 0.1, 0.3, 1.0) for rough in (0.2, 0.5, 1.5)
-    ]
-    return min(grid, key=lambda p: np.sum(np.log(_left_out_v2(pack, p, q, out) + floor_v2)))
+def _predicting(
+    pack: PackFit, full: Sequence[Columns], out: Sequence[Columns], s2: float
+) -> tuple[FloatArray, float]:
+    """Return the prior precision of θ that predicts left-out references best, and their error."""
+    q, nx = [without_own(log.products, log, s2) for log in full], len(pack.theta)
+    least_v2 = (5e-4 * pack.volts) ** 2
+    best, found = np.inf, (pack.precision(), s2)
+    for size, rough in itertools.product((0.03, 0.1, 0.3, 1.0), (0.2, 0.5, 1.5)):
+        p = pack.precision(size, rough)
+        a, b = _normal(pack, p, q)
+        left_v2 = [
+            squares(log, np.linalg.solve(a - x[:nx, :nx], b - x[:nx, -1])) / len(log.rows)
+            for x, log in zip(q, out, strict=True)
+        ]
+        loss = float(np.sum(np.log(np.add(left_v2, least_v2))))
+        if loss < best:
+            best, found = loss, (p, float(np.mean(left_v2)))
+    return found
 
 
 def columns(known: References, log: Trace) -> Columns:
@@ -262,14 +241,8 @@ def columns(known: References, log: Trace) -> Columns:
 def bounded_evidence(g: FloatArray, s: FloatArray, low: FloatArray, high: FloatArray) -> FloatArray:
     """Return ln Bayes factors of amplitudes within bounds against none, shape (k,).
 
-    The mean over normal priors of `WIDTHS`, cut off at the bounds, of exp(g·a − s·a²/2).
-
-    Parameters
-    ----------
-    g, s : array of shape (k,)
-        Gradient at 0 and curvature of the log likelihood.
-    low, high : array of shape (k,)
-        Bounds, low ≤ 0 ≤ high.
+    The mean over normal priors of `WIDTHS`, cut off at the bounds low ≤ 0 ≤ high, of
+    exp(g·a − s·a²/2): g and s are gradient at 0 and curvature of the log likelihood.
     """
     std = 0.5 * WIDTHS[:, None]
     precision = s + std**-2.0
@@ -288,12 +261,7 @@ def bounded_evidence(g: FloatArray, s: FloatArray, low: FloatArray, high: FloatA
 def analyse(known: References, logs: Sequence[Columns], *, exact: bool = True) -> Evidence:
     """Return the evidence of every effect in logs that share one cause.
 
-    Parameters
-    ----------
-    known : References
-    logs : sequence of Columns
-    exact : bool
-        Re-simulate effects that change a signal at the size found (Gauss–Newton).
+    `exact`: effects that change a signal are simulated again at the size found (Gauss–Newton).
     """
     tried, at = _tried(known, [log.log for log in logs])
     effects = np.array([trial.effect for trial in tried])
@@ -323,22 +291,24 @@ def analyse(known: References, logs: Sequence[Columns], *, exact: bool = True) -
         k = np.flatnonzero(effects == name)
         top = int(k[np.argmax(evidence[k])])
         trial, amplitude, nats, left_v2 = tried[top], float(size[top]), float(gain[top]), None
-        places = tuple(_place(known, place[top]) for place in at) if name == STEP.effect else ()
+        places: tuple[float | None, ...] = ()
+        if name == STEP.effect:
+            of_log = [int(place[top]) - len(known.trials) for place in at]
+            places = tuple(PLACES[k] if k >= 0 else None for k in of_log)
         if exact and gain[top] > RESIMULATED_PART * gain.max():
-            if _needs_resimulation(trial):
-                starts = [amplitude, low[top] / 3.0, high[top] / 3.0]
-                if trial.effect == "time_skew" and trial.shape:
-                    starts = [trial.number / trial.bound]
-                amplitude, nats, left_v2 = _resimulated(known, logs, trial, starts)
+            if trial.changes_signal and trial.effect != "voltage_offset":
+                amplitude, nats, left_v2 = _resimulated(known, logs, trial, [amplitude])
+                if trial.effect in MOVES_SOC:
+                    starts = [amplitude, low[top] / 3.0, high[top] / 3.0]
+                    amplitude = _resimulated(known, logs, trial, starts, moved=True)[0]
             elif places:
                 places, amplitude, nats, left_v2 = _step_refined(known, logs, places)
         if left_v2 is None:
             moved = theta - inverse @ u[:, top] * amplitude
-            columns_of = [None if place[top] < 0 else int(place[top]) for place in at]
             left_v2 = (
                 sum(
-                    squares(log, moved, column, amplitude)
-                    for log, column in zip(logs, columns_of, strict=True)
+                    squares(log, moved, None if place[top] < 0 else int(place[top]), amplitude)
+                    for log, place in zip(logs, at, strict=True)
                 )
                 / rows
             )
@@ -381,11 +351,6 @@ def _tried(known: References, logs: Sequence[Trace]) -> tuple[list[Trial], list[
     return tried, [np.array(place, dtype=np.intp) for place in at]
 
 
-def _place(known: References, column: int) -> float | None:
-    """Return the place of a step of resistance in a log, by its column; None before it."""
-    return None if column < 0 else PLACES[int(column) - len(known.trials)]
-
-
 def _step_refined(
     known: References, logs: Sequence[Columns], places: tuple[float | None, ...]
 ) -> tuple[tuple[float | None, ...], float, float, float]:
@@ -423,36 +388,22 @@ def _step_refined(
     return refined, found[1], found[0], found[2]
 
 
-def _needs_resimulation(trial: Trial) -> bool:
-    return trial.changes_signal and trial.effect != "voltage_offset"
-
-
-def at_size(known: References, log: Columns, trial: Trial, a: float, folds: int = 1) -> FloatArray:
+def at_size(
+    known: References, log: Columns, trial: Trial, a: float, folds: int = 1, *, moved: bool = False
+) -> FloatArray:
     """Return products of (x, b, slope, r) with an effect undone, by blocks, shape (folds, k, k).
 
-    Parameters
-    ----------
-    known : References
-    log : Columns
-    trial : Trial
-    a : float
-        Amplitude in units of its bound, as the slope.
-    folds : int
-        Sets of blocks.
+    The amplitude `a` is in units of the bound, as is the slope. `moved`: θ is uncertain at the SoC
+    without the effect. That is right for its size; between effects it favours those that move rows
+    to SoC that no reference visits.
     """
-    pack, trace, size = known.pack, log.log, a * trial.bound
-    x = log.x
-    if trial.changes_signal:  # θ is uncertain at the SoC, current and temperature without it
-        healthy = undone(pack, trace, trial, size)
-        every = shared_columns(pack, healthy)
-        x, n = every[log.rows], len(KNOTS)
-        r = healthy.voltage_v - pack.ocv(pack.soc(healthy)) - every[:, n:] @ pack.theta[n:]
-    else:
-        r = residual(pack, trace, trial, size)
-    column = slope(pack, trace, trial, size, r) * trial.bound
+    size, x = a * trial.bound, log.x
+    r = residual(known.pack, log.log, trial, size)
+    column = slope(known.pack, log.log, trial, size, r) * trial.bound
+    if moved:
+        x = shared_columns(known.pack, undone(known.pack, log.log, trial, size))[log.rows]
     every = np.column_stack([x, log.b, column[log.rows], r[log.rows]])
-    blocks = [every[log.fold == k] for k in range(folds)] if folds > 1 else [every]
-    return np.array([block.T @ block for block in blocks])
+    return in_blocks(every, log.rows, folds)
 
 
 @dataclass(frozen=True)
@@ -485,23 +436,30 @@ class _OneEffect:
 
 
 def _resimulated(
-    known: References, logs: Sequence[Columns], trial: Trial, starts: Sequence[float]
+    known: References,
+    logs: Sequence[Columns],
+    trial: Trial,
+    starts: Sequence[float],
+    *,
+    moved: bool = False,
 ) -> tuple[float, float, float | None]:
     """Return size [bounds], gain [nats] and remaining error [V²] of an effect, re-simulated.
 
-    From the best of several sizes, since a large one may lie beyond a bend of the curve.
+    From the best of several starts, since the true size may lie beyond a bend of the curve.
     """
     low, high = trial.low / trial.bound, trial.high / trial.bound
     rows = sum(len(log.rows) for log in logs)
 
     def fitted(size: float) -> tuple[_OneEffect, float]:
-        products = [at_size(known, log, trial, size).sum(axis=0) for log in logs]
+        products = [at_size(known, log, trial, size, moved=moved).sum(axis=0) for log in logs]
         one = _OneEffect.of(known, logs, products)
         w = np.concatenate([-one.theta, np.zeros(logs[0].b.shape[1] + 1), [1.0]])
         return one, float(sum(w @ z @ w for z in products)) / rows
 
-    size, (here, _) = 0.0, fitted(0.0)
-    chi2_without, left_v2 = here.chi2, None
+    size, (here, _), left_v2 = 0.0, fitted(0.0), None
+    chi2_without = here.chi2
+    if trial.effect == "time_skew" and trial.shape:  # a secant at 0, best at its shape
+        starts = [trial.number / trial.bound]
     tried = {start: fitted(start) for start in starts if abs(start) >= MIN_STEP}
     step = min(tried, key=lambda start: tried[start][0].chi2, default=0.0)
     for _ in range(STEPS):
@@ -522,18 +480,16 @@ def _resimulated(
 def held_out_sizes(
     known: References, logs: Sequence[Columns], evidence: EffectEvidence
 ) -> list[FloatArray]:
-    """Return the size of an effect for each row, found without the row's set of blocks.
-
-    Returns
-    -------
-    list of array of shape (m,)
-        One for each log [unit of the trial].
-    """
+    """Return the size of an effect for each row of each log, found without its set of blocks."""
     trial, size = evidence.trial, evidence.size / evidence.trial.bound
     low, high = trial.low / trial.bound, trial.high / trial.bound
     places = [AFTER if place is None else place for place in evidence.in_logs]
     trials = [replace(trial, shape=place) for place in places] or [trial] * len(logs)
-    parts = [at_size(known, log, own, size, FOLDS) for log, own in zip(logs, trials, strict=True)]
+    moved = trial.effect in MOVES_SOC
+    parts = [
+        at_size(known, log, own, size, FOLDS, moved=moved)
+        for log, own in zip(logs, trials, strict=True)
+    ]
     sizes = []
     for k in range(FOLDS):
         one = _OneEffect.of(known, logs, [z.sum(axis=0) - z[k] for z in parts])

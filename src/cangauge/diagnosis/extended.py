@@ -105,20 +105,7 @@ def residual_v(model: ExtendedModel, log: Trace) -> FloatArray:
 
 
 class Extension:
-    """The given model with one cause.
-
-    Parameters
-    ----------
-    model : ExtendedModel
-        As given.
-    known : References
-    logs : sequence of Columns
-        The diagnosed logs.
-    before_v : sequence of array of shape (m,)
-        Errors of the given model on the rows that count of each [V].
-    evidence : EffectEvidence
-        Of the cause.
-    """
+    """The given model with one cause; `before_v` are its errors on the rows that count [V]."""
 
     def __init__(
         self,
@@ -134,14 +121,9 @@ class Extension:
         self._values = {} if evidence.trial.effect in _SIGNAL else self._nearest()
 
     def values(self, size: float, place: float | None = 0.0, duration_s: float = 0.0) -> Values:
-        """Return the effect's parameters at a size.
+        """Return the effect's parameters at a size [unit of the trial].
 
-        Parameters
-        ----------
-        size : float
-            [unit of the trial].
-        place, duration_s : float
-            Place of a resistance step in a log, and the log's duration; None: later.
+        A step of resistance has a place in a log of a duration; None: it happens later.
         """
         trial = self.evidence.trial
         if trial.effect in _SIGNAL:
@@ -178,13 +160,10 @@ class Extension:
         }
 
     def judge(self) -> tuple[list[FloatArray], list[BoolArray]]:
-        """Return the errors of each log with the cause, sized without the rows judged [V].
+        """Return the errors of each log with the cause, and the rows judged, shape (m,) each.
 
-        Returns
-        -------
-        after_v : list of array of shape (m,)
-        judged : list of array of shape (m,)
-            Rows that the cause can change, at SoC that references visit with it undone.
+        The cause is sized without the rows judged. These are the ones that it can change, at SoC
+        that references visit with it undone.
         """
         sizes = held_out_sizes(self.known, self.logs, self.evidence)
         after, judged = [], []
@@ -201,14 +180,7 @@ class Extension:
         return after, judged
 
     def model_file(self, given: Model, rmse_v: float) -> Model:
-        """Return the extended model, ready to save and run.
-
-        Parameters
-        ----------
-        given : Model
-        rmse_v : float
-            Its RMS error on held-out rows [V].
-        """
+        """Return the extended model with its error on held-out rows, ready to save and run."""
         extended = self.model
         if self.effect.id not in LOG_EFFECTS:
             extended = self._with(self.values(self.evidence.size))

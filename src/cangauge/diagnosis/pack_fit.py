@@ -75,18 +75,7 @@ class Trace:
 def trace(log: Log, capacity_ah: float, start_pct: float | None = None) -> Trace:
     """Return the 1 Hz signals of a log: means over each second.
 
-    Parameters
-    ----------
-    log : Log
-    capacity_ah : float
-        Counts from the first known SoC back to the first row [Ah].
-    start_pct : float, optional
-        SoC at the first row [%], instead of the log's own.
-
-    Raises
-    ------
-    ValueError
-        If neither is known.
+    Its start is `start_pct`, or counted from its first known SoC back to the first row.
     """
     log = dequantize(log)
     if start_pct is None:
@@ -190,10 +179,7 @@ class PackFit:
     def structure(self, i: FloatArray, s: FloatArray, c: FloatArray) -> FloatArray:
         """Return the structure besides the OCV, shape (n, 22): drops, temperature, bends, memory.
 
-        Parameters
-        ----------
-        i, s, c : array of shape (n,)
-            Current [A], SoC [%], temperature [°C].
+        Of current i [A], SoC s [%], temperature c [°C].
         """
         q, t = self.capacity_ah, (c - self.mean_c) / 10.0
         heat, low = lagged(i * i, 900.0) / q**2, np.clip(s, -5.0, 100.0)
@@ -210,12 +196,7 @@ class PackFit:
     def precision(self, size: float = 1.0, rough: float = 1.0) -> FloatArray:
         """Return the prior precision of θ about zero: a smooth curve, structure of physical size.
 
-        Parameters
-        ----------
-        size : float
-            Size of the structure beside the ohmic resistance, which stays free.
-        rough : float
-            Curvature of the OCV.
+        `size` scales the structure beside the ohmic resistance, `rough` the curvature of the OCV.
         """
         r, u, n = self.ohm, self.volts, len(KNOTS)
         std = np.array([

@@ -1,21 +1,27 @@
-"""The sentences of a diagnosis: what a user reads first, all from one posterior."""
+"""What a user reads of a diagnosis: sentences, table rows and a notebook's block; no bokeh."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Final
+from html import escape
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from cangauge._text import counted, number, significant
-from cangauge.diagnosis.answer import GROUP_OF, NONE, TITLES, UNKNOWN, Posterior
+from cangauge._text import NONE_KNOWN, counted, number, significant
+from cangauge.diagnosis.answer import NONE, TITLES, UNKNOWN, Posterior
 from cangauge.diagnosis.columns import COVER_PCT
 from cangauge.diagnosis.evidence import COVER_K
+from cangauge.diagnosis.extended import LOG_EFFECTS, Quantity
+from cangauge.diagnosis.simulator import correction
 from cangauge.logs.gaps import bridge_s
 
 if TYPE_CHECKING:
     from cangauge.diagnosis.diagnose import Diagnosis
-    from cangauge.diagnosis.extended import Quantity
+    from cangauge.diagnosis.planner import Plan
+
+Rows = list[list[str]]
 
 SIZES: Final[Mapping[str, tuple[str, str, str, str]]] = {
     "current_offset": ("offset_a", "The current reads {size} A {sign}", "too high", "too low"),
@@ -45,6 +51,9 @@ MISFIT: Final = 1.2
 POOR_FIT: Final = 2.0
 """A model misfits its references with an error of more than this many healthy errors."""
 
+SHOWN_MEMBERS: Final = 3
+"""Effects of a group that a summary lists where none stands out."""
+
 COMMON: Final = ("current_offset", "voltage_offset", "initial_soc", "time_skew")
 """Effects whose visible size the summary lists first: what a user suspects first."""
 
@@ -67,46 +76,46 @@ def headline(found: Diagnosis) -> str:
     answer = found.posterior
     none = percent(answer.probabilities[NONE])
     if not answer.detected:
-        text = f"No significant gap beyond that of healthy logs: P(no fault) = {none}."
-        if answer.probabilities[NONE] < 1.0 - answer.probabilities[NONE]:
-            text += f" If there is a fault, look first at {groups_text(answer)}."
-        return text
-    if answer.leading_group == UNKNOWN:
-        unknown = percent(answer.probabilities[UNKNOWN])
-        return (
-            f"A gap of a cause outside the library ({unknown}): the best effect leaves"
-            f" {number(answer.left_over, 1)} times the error of a healthy log."
-        )
+        if not answer.likely:
+            return f"No significant gap beyond that of healthy logs: P(no fault) = {none}."
+        return f"A gap is likely, not certain: P(no fault) = {none}. {_where_to_look(answer)}"
     name = answer.name
-    if name is None or found.parameters.get(name) is None:
-        return f"A gap; look first at {groups_text(answer)}."
+    if answer.leading_group == UNKNOWN or name is None:
+        return f"There is a gap. {_where_to_look(answer)}"
     size = size_sentence(name, found.parameters[name])
     sure = f"{name}, {percent(answer.probabilities[name])}"
     return f"{size} ({sure})." if size else f"The most likely cause is {sure}."
 
 
-def groups_text(answer: Posterior) -> str:
-    """Return the stated group, or two in order, with their probability."""
+def _where_to_look(answer: Posterior) -> str:
+    """Return the stated group, or two in order, with their probability, in a sentence."""
+    if answer.leading_group == UNKNOWN:
+        return (
+            f"Its cause is outside the library ({percent(answer.probabilities[UNKNOWN])}): the best"
+            f" effect leaves {number(answer.left_over, 1)} times the error of a healthy log."
+        )
     stated = answer.stated_groups
     total = percent(sum(answer.groups[group] for group in stated))
     words = ", then ".join(TITLES[group] for group in stated)
-    return f"{words} ({'together ' if len(stated) > 1 else ''}{total})"
+    return f"Look first at {words} ({'together ' if len(stated) > 1 else ''}{total})."
 
 
 def summary(found: Diagnosis) -> str:
     """Return the answer in a few lines: what it is, how large, what to do, what is left open."""
-    answer = found.posterior
-    first = found.simulator.remark if found.simulator is not None else ""
-    lines = [first, headline(found), size_text(found), found.correction]
-    if answer.detected:
-        if answer.leading_group != UNKNOWN and answer.name is not None:
-            lines.append(f"Look first at {groups_text(answer)}.")
+    answer, simulator = found.posterior, found.simulator
+    lines = ["" if simulator is None else simulator.remark, headline(found), size_text(found)]
+    if simulator is not None and found.accepted is not None:
+        lines.append(correction(found.accepted, found.parameters[found.accepted]))
+    if answer.detected and answer.leading_group != UNKNOWN and answer.name is not None:
+        lines.append(_where_to_look(answer))
+    if answer.likely:
         lines.append(answer.check_first)
         if answer.leading_group != UNKNOWN and answer.name is None:
-            group = answer.stated_groups[0]
-            members = [name for name in answer.effects if GROUP_OF[name] == group][:3]
-            lines.append(f"No single effect stands out there; the likeliest: {', '.join(members)}.")
-    else:
+            lines.append(
+                "No single effect stands out there; the likeliest:"
+                f" {', '.join(answer.members[:SHOWN_MEMBERS])}."
+            )
+    if not answer.detected:
         lines.append(visible_text(found))
     if not found.has_references:
         lines.append(
@@ -117,19 +126,34 @@ def summary(found: Diagnosis) -> str:
 
 
 def size_text(found: Diagnosis) -> str:
-    """Return the errors in volts, and what the cause closes of the gap."""
+    """Return the errors in volts, what the cause closes of the gap, and what the SoC gains."""
     healthy = "a healthy log has" if found.has_references else "the model file states"
     what = "model" if found.simulator is None else "simulator"
     text = f"The {what} misses the voltage by {significant(found.baseline_rmse_v, 2, 'V')} RMS"
-    if found.has_references and found.baseline_rmse_v > MISFIT * found.expected_rmse_v:
-        expected = significant(found.expected_rmse_v, 2, "V")
-        text += f" ({expected} with what the references show of this pack)"
+    expected = math.sqrt(found.evidence.gap_v2)
+    if found.has_references and found.baseline_rmse_v > MISFIT * expected:
+        text += f" ({significant(expected, 2, 'V')} with what the references show of this pack)"
     text += f"; {healthy} {significant(found.healthy_rmse_v, 2, 'V')}."
     if found.accepted is not None:
         all_rows = all(log.judged.all() for log in found.log_errors)
         text += f" With {found.accepted}: {significant(found.extended_rmse_v, 2, 'V')}"
         text += "." if all_rows else ", on the rows that it can change."
-    return text
+    return text + soc_text(found)
+
+
+def soc_text(found: Diagnosis) -> str:
+    """Return what the cause does to the SoC error of these logs; "" where that is not known."""
+    if found.soc_errors_pct is None or found.likeliest in {None, *LOG_EFFECTS}:
+        return ""
+    before, after = (number(error, 2) for error in found.soc_errors_pct)
+    if found.accepted is None:
+        return (
+            f" No extended model: with {found.likeliest} the SoC error, start withheld, would rise"
+            f" from {before} to {after} %."
+        )
+    better = found.soc_errors_pct[1] < found.soc_errors_pct[0]
+    words = "SoC error, start withheld" if better else "It does not improve the SoC error"
+    return f" {words}: {before} → {after} %."
 
 
 def visible_text(found: Diagnosis) -> str:
@@ -214,3 +238,114 @@ def _of_references(found: Diagnosis) -> list[str]:
             f" {significant(usual, 2, 'V')}: check that it is without the fault."
         )
     return said
+
+
+EXPLAINED: Final = {
+    "current_offset": "the current sensor is off by a constant, or a load bypasses it",
+    "current_gain": "the current sensor reads too much or too little in proportion",
+    "voltage_offset": "the voltage reading is off by a constant",
+    "voltage_gain": "the voltage reading is off in proportion",
+    "time_skew": "current and voltage are not recorded at the same moment",
+    "temperature_lag": "the temperature sensor follows the pack late",
+    "core_temperature": "the cells inside are warmer than the sensor shows after high current",
+    "inner_temperature": "the cells inside follow slow changes of the measured temperature late",
+    "capacity": "the pack holds more or less charge than the model assumes",
+    "initial_soc": "the log starts at another state of charge than assumed",
+    "coulombic_efficiency": "part of the charge that is put in cannot be taken out again",
+    "resistance_temperature": "the resistance rises more (or less) in the cold than modelled",
+    "resistance_soc": "the resistance rises towards empty or full",
+    "resistance_asymmetry": "charging meets another resistance than discharging",
+    "resistance_step": "the resistance changes at one moment, as by a loose contact",
+    "charge_transfer": "the voltage drop is not in proportion to the current: steep at small ones",
+    "fast_polarization": "the voltage needs seconds to follow a change of load",
+    "slow_diffusion": "the voltage needs minutes to recover after a load",
+    "hysteresis": "at rest the voltage differs after charging and after discharging",
+    "entropic_coefficient": "the open-circuit voltage depends on temperature otherwise",
+    "ocv_shape": "the open-circuit voltage has another shape over the state of charge",
+    "weak_cell": "some cells are empty before the others",
+    NONE: "the logs differ from the model no more than logs without a fault",
+    UNKNOWN: "a gap that no effect of the library explains",
+}
+"""Answer → what it means, in a line."""
+
+
+SHOWN: Final = 5
+"""Causes that a terminal and a notebook show."""
+
+
+def candidate_rows(result: Mapping[str, Any], at_most: int | None = None) -> tuple[list[str], Rows]:
+    """Return headings and rows of `Diagnosis.to_json`: causes, probability, size, error left.
+
+    `none` and `unknown` follow the causes.
+    """
+    cause = result["cause"]
+    rows = [
+        [
+            _words(each["effect"]),
+            number(each["probability"], 2),
+            size_cell(each),
+            number(each["rmse_v"], 2),
+        ]
+        for each in cause["candidates"][:at_most]
+    ]
+    rows += [
+        [answer, number(cause[f"probability_{answer}"], 2), NONE_KNOWN, NONE_KNOWN]
+        for answer in (UNKNOWN, NONE)
+    ]
+    return ["<cause", "probability", "<size (95 %)", "error left [V]"], rows
+
+
+def size_cell(candidate: Mapping[str, Any]) -> str:
+    """Return the sizes of a candidate that have an interval."""
+    parts = []
+    for name, quantity in candidate["parameters"].items():
+        if quantity["ci"] is None:
+            continue
+        low, high = quantity["ci"]
+        unit = "" if quantity["unit"] == "1" else f" {quantity['unit'].replace('ohm', 'Ω')}"
+        parts.append(
+            f"{_words(name)} {significant(quantity['value'], 3)}"
+            f" ({significant(low, 2)} … {significant(high, 2)}){unit}"
+        )
+    return "; ".join(parts) or NONE_KNOWN
+
+
+def visible_rows(result: Mapping[str, Any]) -> tuple[list[str], Rows]:
+    """Return headings and rows: the smallest size of each cause that would have been seen."""
+    rows = [
+        [_words(each["effect"]), significant(each["size"], 2, each["unit"])]
+        for each in result["visible_from"]
+    ]
+    return ["<cause", "seen from"], rows
+
+
+def plan_rows(plan: Plan) -> tuple[list[str], Rows]:
+    """Return headings and rows: the possible next steps, best first."""
+    rows = [
+        [step.name, number(plan.before, 2), number(step.after, 2), f"{step.gain:+.2f}"]
+        for step in plan.steps
+    ]
+    return ["<step", "P(true cause) now", "after", "gain"], rows
+
+
+def _words(name: str) -> str:
+    return name.replace("_", " ")
+
+
+def diagnosis_html(found: Diagnosis) -> str:
+    """Return a diagnosis as a compact HTML block: verdict, probabilities, limits."""
+    result = found.to_json()
+    head, rows = candidate_rows(result, SHOWN)
+    lines = [
+        "".join(f"<{tag} style='text-align:left'>{escape(cell)}</{tag}>" for cell in cells)
+        for tag, cells in (("th", [x.removeprefix("<") for x in head]), *(("td", r) for r in rows))
+    ]
+    table = "".join(f"<tr>{line}</tr>" for line in lines)
+    limits = "".join(f"<li>{escape(text)}</li>" for text in found.caveats)
+    folded = f"<details><summary>What these logs cannot show</summary><ul>{limits}</ul></details>"
+    first, *others = found.summary.splitlines()
+    texts = "".join(f"<p>{escape(text)}</p>" for text in others)
+    return (
+        f"<div><h4>{escape(first)}</h4>{texts}<table>{table}</table>"
+        f"{folded if limits else ''}</div>"
+    )

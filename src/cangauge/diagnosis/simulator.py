@@ -16,6 +16,7 @@ import numpy as np
 
 from cangauge._text import significant
 from cangauge._typing import FloatArray
+from cangauge.diagnosis.extended import Quantity
 from cangauge.errors import InputError
 from cangauge.identify.fit import fit
 from cangauge.logs.log import Log
@@ -45,14 +46,7 @@ voltage, by the equation in the model file."""
 
 
 def simulated_v(simulation: Simulation, log: Log) -> FloatArray:
-    """Return the simulated voltage of every row of a log [V].
-
-    Raises
-    ------
-    InputError
-        If the log has no SoC to start from, the simulation fails, or it does not return one finite
-        number for each row.
-    """
+    """Return the simulated voltage of every row of a log, one finite number each [V]."""
     where, first = log.source or log.name, log.first_soc()
     if first is None:
         raise InputError(
@@ -120,14 +114,7 @@ class SimulatorGap:
     def corrected_v(self, number: int, extended: Model, offset_pct: float = 0.0) -> FloatArray:
         """Return the simulated voltage of a log with the correction of an extended model [V].
 
-        Parameters
-        ----------
-        number : int
-            Of the diagnosed log.
-        extended : Model
-            `Diagnosis.extended_model`.
-        offset_pct : float
-            Change of the log's start, which is no part of the model [%].
+        `offset_pct` changes the log's start, which is no part of the model.
         """
         log = self.logs[number]
         before = self.model.predict(log).residual_v
@@ -136,8 +123,9 @@ class SimulatorGap:
         return np.asarray(self.simulated_v[number] + (before - after))
 
 
-def correction(effect: str, values: Mapping[str, float]) -> str:
+def correction(effect: str, parameters: Mapping[str, Quantity]) -> str:
     """Return what to change in a simulator for an effect, in one sentence."""
+    values = {name: item.value for name, item in parameters.items()}
     factor = 1.0 + values.get("gain_pct", 0.0) / 100.0
     sentence = CORRECTIONS.get(effect, "add the voltage of {effect}")
     return f"To correct the simulator: {sentence.format(effect=effect, factor=factor, **values)}."
@@ -150,18 +138,7 @@ def simulator_gap(
     model: Model | None = None,
     capacity_ah: float | None = None,
 ) -> SimulatorGap:
-    """Return the gap of a simulator as that of a model.
-
-    Parameters
-    ----------
-    logs, references : sequence of Log
-        Logs with a gap, and logs in which the simulator is good.
-    simulation : Simulation
-    model : Model, optional
-        Voltage model of the simulator; by default identified on its output in all logs.
-    capacity_ah : float, optional
-        The simulator's charge from 100 to 0 % [Ah]; by default from a log from full to empty.
-    """
+    """Return the gap of a simulator as that of a model, by default identified on its output."""
     volts = [simulated_v(simulation, log) for log in (*logs, *references)]
     outputs = [
         replace(log, voltage_v=each) for log, each in zip((*logs, *references), volts, strict=True)

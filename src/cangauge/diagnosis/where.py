@@ -88,15 +88,33 @@ def drawn_sums(piece: IntArray, *values: FloatArray) -> list[FloatArray]:
     return [np.asarray(each[draw].sum(axis=1)) for each in sums]
 
 
-def error_shares(logs: Sequence[LogErrors], capacity_ah: float) -> list[ErrorShare]:
-    """Return the shares of the given model's squared error; on each axis they sum to one.
+def closed_part(
+    logs: Sequence[LogErrors], healthy_v2: float
+) -> tuple[float | None, tuple[float, float] | None]:
+    """Return the closed part of the squared error above a healthy log's, and its 95 % interval.
 
-    Parameters
-    ----------
-    logs : sequence of LogErrors
-    capacity_ah : float
-        Defines rest [Ah].
+    Of the judged rows, by a bootstrap over pieces. None without a gap above the healthy error.
     """
+    weight = np.concatenate([log.judged for log in logs]).astype(np.float64)
+    before = np.concatenate([log.before_v for log in logs]) ** 2 * weight
+    after = np.concatenate([log.after_v for log in logs]) ** 2 * weight
+    gap = before.sum() / weight.sum() - healthy_v2
+    if not gap > 0.0:
+        return None, None
+    closed = min(float((before.sum() - after.sum()) / weight.sum() / gap), 1.0)
+    drawn_before, drawn_after, rows = drawn_sums(pieces(logs), before, after, weight)
+    rows = np.maximum(rows, 1.0)
+    gaps = drawn_before / rows - healthy_v2
+    usable = gaps > 0.0
+    if usable.mean() < 0.9:
+        return closed, None
+    parts = np.minimum(((drawn_before - drawn_after) / rows)[usable] / gaps[usable], 1.0)
+    low, high = np.quantile(parts, [0.025, 0.975])
+    return closed, (float(low), float(high))
+
+
+def error_shares(logs: Sequence[LogErrors], capacity_ah: float) -> list[ErrorShare]:
+    """Return the shares of the given model's squared error; on each axis they sum to one."""
     piece, shares = pieces(logs), []
     square = np.concatenate([log.before_v for log in logs]) ** 2
     parts = [

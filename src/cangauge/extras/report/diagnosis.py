@@ -11,7 +11,7 @@ import numpy as np
 from cangauge._text import NONE_KNOWN, number, span
 from cangauge.diagnosis import Diagnosis
 from cangauge.diagnosis.planner import Plan
-from cangauge.diagnosis.summary import (
+from cangauge.diagnosis.sentences import (
     EXPLAINED,
     candidate_rows,
     percent,
