@@ -152,7 +152,7 @@ class CheckedPack:
         evidence = analyse(known, [columns(known, trace(log, self.capacity_ah))])
         found: Posterior = answer(known, evidence)
         truth = NONE if fault is None else fault.id
-        first = next(iter(found.group_shares))
+        first = found.stated_groups[0]
         return Finding(
             log=log.name,
             effect=None if fault is None else fault.id,
