@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from cangauge.bus.plausibility import (
     ConstantDetector,
-    Pack,
+    PackProperties,
     SignalChecks,
     SignalHealth,
     StuckDetector,
@@ -80,7 +80,7 @@ def test_a_spike_is_refused_and_a_lasting_step_accepted() -> None:
 
 
 def test_limits_of_a_pack_hold_where_none_are_stated() -> None:
-    pack = Pack(0.1, 0.5, 50.0, usual_v=400.0)
+    pack = PackProperties(0.1, 0.5, 50.0, usual_v=400.0)
     voltage = SignalChecks(highest=500.0).within_pack("voltage", pack)
     assert (voltage.lowest, voltage.highest) == (200.0, 500.0)
     warm = SignalChecks().within_pack("temperature", pack)
@@ -123,7 +123,7 @@ def test_pauses_and_losses_do_not_distort_the_period() -> None:
 
 # --- Stuck
 
-PACK = Pack(resistance_ohm=0.1, error_std_v=0.5, capacity_ah=50.0, usual_v=370.0)
+PACK = PackProperties(resistance_ohm=0.1, error_std_v=0.5, capacity_ah=50.0, usual_v=370.0)
 Signal = Callable[[float], float]
 
 

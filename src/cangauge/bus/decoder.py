@@ -13,7 +13,7 @@ from cangauge.bus.database import SignalCodec
 from cangauge.bus.plausibility import (
     ConstantDetector,
     MessageStatistics,
-    Pack,
+    PackProperties,
     SignalHealth,
     stuck_detectors,
 )
@@ -197,7 +197,7 @@ class SampleDecoder:
     Parameters
     ----------
     vehicle : Vehicle
-    pack : Pack, optional
+    pack : PackProperties, optional
         Pack properties from the model. Without them only stated limits apply and no signal counts
         as stuck: a capture with a wrong scale then shows as such, not as a missing signal.
 
@@ -211,7 +211,7 @@ class SampleDecoder:
         Latest cell voltages, where the vehicle has them.
     """
 
-    def __init__(self, vehicle: Vehicle, pack: Pack | None = None) -> None:
+    def __init__(self, vehicle: Vehicle, pack: PackProperties | None = None) -> None:
         self.vehicle = vehicle
         self.statistics = FrameStatistics()
         self.health: dict[str, SignalHealth] = {}
@@ -244,7 +244,7 @@ class SampleDecoder:
     def _add(
         self,
         signal: VehicleSignal,
-        pack: Pack | None,
+        pack: PackProperties | None,
         is_stuck: Callable[[float, float], bool] | None,
     ) -> None:
         route, role = self._route(signal), signal.role
@@ -393,7 +393,9 @@ class SampleDecoder:
         return math.nan if health is None else health.value_at(self.now_s)
 
 
-def _detectors(vehicle: Vehicle, pack: Pack | None) -> dict[str, Callable[[float, float], bool]]:
+def _detectors(
+    vehicle: Vehicle, pack: PackProperties | None
+) -> dict[str, Callable[[float, float], bool]]:
     """Return the stuck detectors by role."""
     detectors: dict[str, Callable[[float, float], bool]] = {}
     temperature = vehicle.temperature

@@ -10,7 +10,7 @@ import can
 import numpy as np
 
 from cangauge._typing import FloatArray
-from cangauge.bus.database import Condition
+from cangauge.bus.database import MultiplexCondition
 from cangauge.bus.time_source import MICROSECONDS
 from cangauge.bus.vehicle import LOG_COLUMNS, Vehicle, VehicleSignal
 from cangauge.errors import InputError
@@ -51,7 +51,7 @@ class FrameEncoder:
             )
         self.vehicle = vehicle
         self._counters = dict.fromkeys(vehicle.messages, 0)
-        groups: dict[tuple[int, tuple[Condition, ...]], list[VehicleSignal]] = {}
+        groups: dict[tuple[int, tuple[MultiplexCondition, ...]], list[VehicleSignal]] = {}
         for signal in vehicle.signals:
             groups.setdefault((signal.key, signal.codec.conditions), []).append(signal)
         self._frames = []

@@ -19,7 +19,7 @@ from typing import Any, Final, Literal, NamedTuple
 
 from e2e import p01, p02, p04, p05, p06, p07, p11
 
-from cangauge.bus.database import Field
+from cangauge.bus.database import BitField
 from cangauge.errors import InputError
 
 
@@ -128,7 +128,7 @@ class CounterRule:
     """
 
     name: str
-    field: Field
+    field: BitField
     length: int
     modulus: int
 

@@ -77,7 +77,7 @@ ReportOption = Annotated[
 
 
 @dataclass(frozen=True, slots=True)
-class Reading:
+class ReadingOptions:
     """The options of every command that reads a log or a capture."""
 
     vehicle: Annotated[

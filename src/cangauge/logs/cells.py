@@ -12,7 +12,7 @@ from cangauge._typing import FloatArray
 from cangauge.errors import InputError
 from cangauge.logs.column_map import ColumnMap
 from cangauge.logs.headings import cell_number
-from cangauge.logs.read import TableReader, open_log, open_table
+from cangauge.logs.read import LogTableReader, open_log, open_table
 from cangauge.logs.table import draft_of_table, numbers_of
 
 
@@ -56,7 +56,7 @@ def read_cells(
         If the numbers of the cells have gaps, or a cell holds anything but a number.
     """
     file = open_log(path, columns=columns)
-    if not isinstance(file.reader, TableReader):
+    if not isinstance(file.reader, LogTableReader):
         return None
     source = str(path)
     with open_table(file.head, columns) as table:
