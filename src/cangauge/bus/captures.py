@@ -174,8 +174,6 @@ class Capture:
             if last.damage is not None:
                 raise last.damaged()
             raise InputError("the capture holds no frames", source=self.path, cure=_CURE)
-        for reader in self._readers:
-            reader.refuse_junk()
 
     def _read(self, path: Path) -> Iterator[can.Message]:
         with self._kind(path) as reader:
