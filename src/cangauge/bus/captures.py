@@ -188,11 +188,9 @@ class Capture:
             message.timestamp = max(ticks - 1, 0) * period_s
             yield message
         if not ticks and any(each.frames for each in self._readers):
-            raise InputError(
-                f"no time stamps, and no frames of 0x{number:X} to count time by",
-                source=self.path,
-                cure="record it with stamps, for instance by candump -l",
-            )
+            problem = f"no time stamps, and no frames of 0x{number:X} to count time by"
+            cure = "record it with stamps, for instance by candump -l"
+            raise InputError(problem, source=self.path, cure=cure)
 
 
 def find_capture(path: str | PathLike[str], *, clock: tuple[int, float] = CLOCK) -> Capture | None:

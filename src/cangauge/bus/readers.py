@@ -135,12 +135,9 @@ class CaptureReader(MessageReader, ABC):
             self.first_malformed = line
         if self.malformed > FEW_MALFORMED and self.malformed > self.frames:
             where = "" if self.first_malformed is None else f", the first is {self.first_malformed}"
-            raise InputError(
-                f"{self.malformed} {self.unit} are no frames of {self.name}{where},"
-                f" and only {self.frames} are",
-                source=self.source,
-                cure="record or export it again",
-            )
+            problem = f"{self.malformed} {self.unit} are no frames of {self.name}{where}"
+            problem += f", and only {self.frames} are"
+            raise InputError(problem, source=self.source, cure="record or export it again")
 
 
 class BinaryReader(CaptureReader, BinaryIOMessageReader):
