@@ -140,7 +140,7 @@ def stuck_from(
 ) -> tuple[float | None, float | None]:
     """Return when current and voltage first count as stuck [s]."""
     detectors: tuple[StuckDetector, StuckDetector]
-    detectors = stuck_detectors(PACK, steps=(step, step), after_s=(10.0, 10.0))
+    detectors = stuck_detectors(PACK, steps=(step, min(step, step_v or step)), after_s=(10.0, 10.0))
     found: list[float | None] = [None, None]
     for number in range(int(seconds * 10.0)):
         now_s = number / 10.0
@@ -156,6 +156,11 @@ def test_a_frozen_signal_is_stuck_while_its_partner_swings() -> None:
     assert current is None
     assert voltage is not None
     assert 70.0 <= voltage <= 110.0
+    # A finer voltage needs smaller swings, once it has shown its steps.
+    gentle, step_v = (lambda t: 20.0 * math.sin(t / 3.0)), 0.01
+    frozen = stuck_from(gentle, lambda t: 370.0 - 0.1 * gentle(min(t, 60.0)), 200.0, 0.5, step_v)
+    assert frozen[1] is not None
+    assert 70.0 <= frozen[1] <= 110.0
     current, voltage = stuck_from(lambda t: driving(min(t, 60.0)), under_load, 200.0)
     assert voltage is None
     assert current is not None

@@ -235,11 +235,8 @@ class SampleDecoder:
             # Slow signals first: a sample uses the temperature of its own frame.
             route.inputs.sort(key=lambda each: each.is_current + 2 * each.is_voltage)
         self._temperature = self.health.get("temperature")
-        self._needed = [
-            (self.health[role], missing)
-            for role, missing in _MISSING.items()
-            if role in self.health
-        ]
+        health = self.health
+        self._needed = [(health[role], why) for role, why in _MISSING.items() if role in health]
 
     def _add(
         self,

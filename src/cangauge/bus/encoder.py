@@ -58,12 +58,10 @@ class FrameEncoder:
         for (key, conditions), signals in groups.items():
             is_slow = all(signal.role in {"temperature", "soc_reference"} for signal in signals)
             if not is_slow and any(other == key and more != conditions for other, more in groups):
-                raise InputError(
-                    "has multiplexed frames with current or voltage, which cannot be replayed",
-                    source=vehicle.dbc_files[0],
-                    field=signals[0].message,
-                    cure="replay as another --vehicle",
-                )
+                problem = "has multiplexed frames with current or voltage, which cannot be replayed"
+                source, where = vehicle.dbc_files[0], signals[0].message
+                cure = "replay as another --vehicle"
+                raise InputError(problem, source=source, field=where, cure=cure)
             self._frames.append(_Outgoing(signals, is_slow))
         self._frames.sort(key=lambda frame: not frame.is_slow)
 

@@ -145,9 +145,9 @@ class ReadingOptions:
 
     def open(self, path: Path) -> LogFile | Capture:
         """Open a log by these columns, or any recording by its content; may raise InputError."""
-        from cangauge.bus.recording import open_with_columns, refuse_sign_of_capture
+        from cangauge.bus.recording import open_recording, refuse_sign_of_capture
 
-        recording = open_with_columns(
+        recording = open_recording(
             path,
             columns=self.given_columns(),
             mapped=self.mapped_columns(),
