@@ -16,9 +16,8 @@ from log_cases import CURRENT_A, SOC_PCT, TIME_S, VOLTAGE_V
 
 from cangauge.errors import InputError
 from cangauge.logs.canonical import write_log, write_table
-from cangauge.logs.cells import read_cells
 from cangauge.logs.log import TEMPERATURE_SOURCES, Log
-from cangauge.logs.read import read_log
+from cangauge.logs.read import read_cells, read_log
 
 CHANNELS = ("time_s", "current_a", "voltage_v", "temperature_c", "soc_pct")
 
