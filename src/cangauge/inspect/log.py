@@ -11,9 +11,10 @@ from cangauge._text import counted, duration
 from cangauge.errors import InputError
 from cangauge.identify.rows import SOC_SPAN_AT_LEAST_PCT, usable_delays, usable_rows
 from cangauge.inspect.channels import Channel, describe_channels
-from cangauge.logs.gaps import uncounted_gaps, usual_gap_s
+from cangauge.logs.gaps import uncounted_gaps, usual_gap_s, usual_step_s
 from cangauge.logs.log import Log
 from cangauge.logs.sign import (
+    STEP_SPACING_S,
     SignFinding,
     charge_ah,
     correlation,
@@ -174,7 +175,7 @@ def inspect_log(log: Log) -> LogInspection:
             Ability("sign of current", "yes" if sign.sign else "no", sign.sentence),
             _curve_ability(charge, soc),
             _capacity_ability(log, charge, soc),
-            _resistance_ability(resistance),
+            _resistance_ability(resistance, max(STEP_SPACING_S, usual_step_s(log.time_s))),
             _delay_ability(log, timing),
             _row_ability(log, timing),
             _temperature_ability(log),
@@ -337,13 +338,13 @@ def _capacity_ability(log: Log, charge: Charge, soc: Soc | None) -> Ability:
     return Ability("capacity", "yes", f"{whole_ah:.4g} Ah: the log runs from full to empty")
 
 
-def _resistance_ability(resistance: Resistance | None) -> Ability:
+def _resistance_ability(resistance: Resistance | None, step_s: float) -> Ability:
     topic = "ohmic resistance"
     if resistance is None:
         return Ability(topic, "no", f"fewer than {MIN_STEPS} clear steps of current")
     text = (
         f"{resistance.median_ohm:.4g} Ω (quartiles {resistance.lower_ohm:.4g} …"
-        f" {resistance.upper_ohm:.4g}) from {resistance.steps} steps of current over about a second"
+        f" {resistance.upper_ohm:.4g}) from {resistance.steps} steps of current over {step_s:.3g} s"
     )
     spread = abs(resistance.upper_ohm - resistance.lower_ohm)
     is_steady = spread <= 0.5 * abs(resistance.median_ohm)
