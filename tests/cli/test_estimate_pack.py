@@ -21,9 +21,8 @@ from cangauge.estimation.estimator import Estimator
 from cangauge.estimation.offline import samples_of
 from cangauge.estimation.settings import EstimatorSettings
 from cangauge.logs.canonical import write_log
-from cangauge.logs.cells import read_cells
 from cangauge.logs.log import Log
-from cangauge.logs.read import read_log
+from cangauge.logs.read import read_cells, read_log
 from cangauge.model.model_file import Model
 from cangauge.service.pipeline import Pipeline
 from cells_bus import ALL_CELLS, CAR, CELLS_DBC, CELLS_ON_BUS, all_cell_frames

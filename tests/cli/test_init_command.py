@@ -47,13 +47,14 @@ def test_an_unclear_pair_exits_with_one_and_names_three(mitsubishi: Path, tmp_pa
 
 def test_chosen_candidates_make_files_that_decode(mitsubishi: Path, tmp_path: Path) -> None:
     folder = tmp_path / "car"
-    choice = ("--choose", "current=1", "--choose", "voltage=1")
+    choice = ("--choose", "current=1", "--choose", "voltage=1", "--nominal-voltage", 330)
     done = init(mitsubishi, "-o", folder, *choice, "--json")
     assert done.code == 0, done.err
     result = json.loads(done.out)
     assert result["method"] == "physics"
     assert len(result["candidates"]["current"]) == 3
     assert result["proof"]["samples"] > 5900
+    assert result["voltage_levels"] == []  # the stated voltage decides
     log = capture_to_log(mitsubishi, Vehicle.load(map=folder / "car.toml"))
     assert 280.0 < log.voltage_v.min() < log.voltage_v.max() < 350.0
     assert log.current_a.max() - log.current_a.min() > 200.0
@@ -62,7 +63,6 @@ def test_chosen_candidates_make_files_that_decode(mitsubishi: Path, tmp_path: Pa
     again = init(mitsubishi, "-o", folder, *choice)
     assert again.code == 2
     assert "--force" in again.err
-    assert init(mitsubishi, "-o", folder, *choice, "--force").code == 0
 
 
 def test_a_dbc_gives_signals_by_name(mitsubishi: Path, tmp_path: Path) -> None:
@@ -81,6 +81,7 @@ def test_a_dbc_gives_signals_by_name(mitsubishi: Path, tmp_path: Path) -> None:
     assert chosen["voltage"][0]["signal"] == "PackVoltage"
     car = Vehicle.load(map=tmp_path / "map.toml")
     assert car.current.codec.name == "PackCurrent"
+    assert init(mitsubishi, "--dbc", tmp_path / "car.dbc", *maps, "--force").code == 0
 
 
 @pytest.mark.parametrize(("scale", "sign"), [("(0.01,-327.68)", 1), ("(-0.01,327.68)", -1)])
@@ -102,17 +103,14 @@ def test_the_sign_of_a_dbc_s_current_is_proven(
 
 
 def test_an_open_scale_is_listed_and_not_ticked(mitsubishi: Path, tmp_path: Path) -> None:
-    choice = ("--choose", "current=1", "--choose", "voltage=1")
-    done = init(mitsubishi, "-o", tmp_path / "open", *choice)
+    done = init(mitsubishi, "-o", tmp_path, "--choose", "current=1", "--choose", "voltage=1")
     assert "1 ?" in done.out
-    assert "1 ✓" not in done.out.partition("soc")[0]
+    assert "1 ✓" not in done.out
     assert "V at 0.1 V a step (about" in done.err
-    stated = init(mitsubishi, "-o", tmp_path / "stated", *choice, "--nominal-voltage", 330)
-    voltage = stated.out.partition("voltage")[2]
-    assert "1 ✓" in voltage
-    assert "do not tell the scale of the voltage" not in stated.err
-    assert "do not tell the scale of the SoC" in stated.err  # each with its capacity
-    assert "1 ?" in stated.out.partition("soc")[2]
+    assert "do not tell the scale of the voltage" in done.err
+    assert "do not tell the scale of the SoC" in done.err
+    assert "% a step (" in done.err  # each with the capacity that follows
+    assert "the data fit as well: " in (tmp_path / "car.toml").read_text(encoding="utf-8")
 
 
 def test_nothing_to_look_at_is_refused(tmp_path: Path) -> None:

@@ -51,6 +51,11 @@ def ability(found: LogInspection, topic: str) -> tuple[str, str]:
     return next((a.verdict, a.text) for a in found.abilities if a.topic == topic)
 
 
+def test_steps_of_a_slow_log_have_its_own_seconds() -> None:
+    _, text = ability(inspect_log(slow_drive(90.0, 1)), "ohmic resistance")
+    assert text.endswith("steps of current over 30 s")
+
+
 def test_charge_is_not_integrated_through_a_gap_of_hours() -> None:
     log = two_days()
     found = inspect_log(log)

@@ -102,17 +102,13 @@ def test_what_was_assumed_and_ignored_is_told(tmp_path: Path) -> None:
     assert "1 other column ignored: driver" in log.remarks
 
 
-def test_stated_sign_that_the_data_contradict_warns(tmp_path: Path) -> None:
+def test_a_stated_sign_is_kept_and_a_doubt_is_told(tmp_path: Path) -> None:
     path = tmp_path / "x.csv"
     path.write_bytes(content_of(CASES["plain-with-brackets"]))
     log = read_log(path, sign="charge")
     np.testing.assert_array_equal(log.current_a, -CURRENT_A)
     assert any("the stated sign of current looks inverted" in text for text in log.remarks)
-
-
-def test_stated_sign_agrees_with_a_format_that_defines_it(tmp_path: Path) -> None:
-    path = tmp_path / "TripA01.csv"
-    path.write_bytes(content_of(CASES["bmw-i3"]))
+    path.write_bytes(content_of(CASES["bmw-i3"]))  # a format that defines it: charge
     np.testing.assert_array_equal(read_log(path, sign="charge").current_a, CURRENT_A)
     np.testing.assert_array_equal(read_log(path, sign="discharge").current_a, -CURRENT_A)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,58 +10,72 @@ import pytest
 
 from cangauge.errors import InputError
 from cangauge.logs.read import read_log
-from cangauge.logs.sign import charge_ah
+from cangauge.logs.sign import charge_ah, sign_of_current
 
 pytestmark = pytest.mark.real
 
+UNDECIDED = {
+    # Slow scripts near empty: voltage relaxes more than it drops, charge hardly moves.
+    "A123_DYN_50_P25_s2.csv.gz",
+    "A123_OCV_P05_S2.csv.gz",
+    "A123_OCV_P25_S2.csv.gz",
+    "A123_OCV_P45_S2.csv.gz",
+}
 
-def test_every_i3_trip(shared_data: Path) -> None:
-    paths = sorted((shared_data / "bmw_i3").glob("*.csv.gz"))
-    assert len(paths) == 30
+
+@pytest.mark.parametrize(
+    ("pattern", "count", "source", "charge_ah_range"),
+    [
+        ("bmw_i3/*.csv.gz", 30, "pack", (1.0, 60.0)),
+        ("a123_lfp/*.csv.gz", 21, "room", (0.0, 2.25)),  # a 2.3 Ah cell
+        ("leaf_cell_ornl/*HPPC*.csv.gz", 3, "room", (29.0, 33.0)),  # a 33.1 Ah cell
+        ("leaf_module_ornl/*.csv.gz", 4, "cell", (54.3, 55.7)),
+        ("lg_hg2/*.parquet", 32, "cell", (2.2, 3.1)),  # a 3 Ah cell
+    ],
+)
+def test_every_file_has_its_charge_and_sign(
+    shared_data: Path, pattern: str, count: int, source: str, charge_ah_range: tuple[float, float]
+) -> None:
+    low_ah, high_ah = charge_ah_range
+    paths = sorted(shared_data.glob(pattern))
+    assert len(paths) >= count
     for path in paths:
         log = read_log(path)
-        assert log.temperature_source == "pack"
-        assert 325.0 <= log.voltage_v.min() < log.voltage_v.max() <= 395.0
-        assert np.median(np.diff(log.time_s)) == pytest.approx(0.1)
-        assert charge_ah(log)[-1] > 1.0  # every trip takes charge out
-        assert log.soc_pct is not None
-        assert log.soc_pct[0] - np.nanmin(log.soc_pct) > 2.0
+        assert log.temperature_source in {source, "unknown"}, path.name
+        assert low_ah <= np.ptp(charge_ah(log)) < high_ah, path.name
+        sign = 0 if path.name in UNDECIDED else 1
+        assert sign_of_current(log).sign == sign, path.name
+        assert sign_of_current(replace(log, current_a=-log.current_a)).sign == -sign, path.name
 
 
-def test_every_a123_script(shared_data: Path) -> None:
-    paths = sorted((shared_data / "a123_lfp").glob("*.csv.gz"))
-    assert len(paths) == 21
-    for path in paths:
-        log = read_log(path)
-        assert log.temperature_source == "room"
-        assert log.temperature_c[0] == float(path.name.split("_P")[1][:2])
-        charge = charge_ah(log)
-        if "_S1" in path.name or "_s1" in path.name:  # discharge scripts of a 2.3 Ah cell
-            assert 1.9 < charge[-1] < 2.2
-        if "_S3" in path.name or "_s3" in path.name:  # charge scripts
-            assert -2.2 < charge[-1] < -1.9
-
-
-def test_every_ornl_export(shared_data: Path) -> None:
-    for path in sorted((shared_data / "leaf_cell_ornl").glob("*HPPC*.csv.gz")):
-        log = read_log(path)
-        assert log.temperature_c[0] in {10.0, 25.0, 40.0}
-        assert np.ptp(charge_ah(log)) == pytest.approx(31.0, abs=2.0)  # a 33.1 Ah cell
+def test_values_that_single_files_have(shared_data: Path) -> None:
     for rate, peak in (("1C", 30.6), ("2C", 61.2), ("3C", 91.8)):
         path = shared_data / "leaf_cell_ornl" / f"{rate}-Discharge-Bitrode-data.csv.gz"
         assert read_log(path, temperature_c=24.0).current_a.max() == peak
-    for path in sorted((shared_data / "leaf_module_ornl").glob("*.csv.gz")):
+    for path in (shared_data / "a123_lfp").glob("*.csv.gz"):
         log = read_log(path)
-        assert log.temperature_source == "cell"
-        assert charge_ah(log)[-1] == pytest.approx(55.0, abs=0.7)
+        assert log.temperature_c[0] == float(path.name.split("_P")[1][:2])
+        if path.name.lower().endswith(("s1.csv.gz", "s3.csv.gz")):  # discharge and charge scripts
+            way = 1.0 if "s1" in path.name.lower() else -1.0
+            assert 1.9 < way * charge_ah(log)[-1] < 2.2
+    trip = read_log(shared_data / "bmw_i3" / "TripA01.csv.gz")
+    assert trip.soc_pct is not None
+    assert trip.soc_pct[0] - np.nanmin(trip.soc_pct) > 2.0
     with pytest.raises(InputError, match="not a known kind of log"):
         read_log(shared_data / "leaf_cell_ornl" / "Temperature-1C-discharge.lvm.gz")
 
 
-def test_every_lg_hg2_drive(shared_data: Path) -> None:
-    paths = sorted((shared_data / "lg_hg2").glob("*.parquet"))
-    assert len(paths) == 32
+def test_no_wrong_sign_in_pieces_of_the_recorded_logs(shared_data: Path) -> None:
+    """Pieces of 20 s to 30 min: often open, never wrong."""
+    rng = np.random.default_rng(11)
+    paths = sorted(shared_data.glob("*/*.parquet")) + sorted(shared_data.glob("bmw_i3/*.gz"))
+    found = {1: 0, 0: 0, -1: 0}
     for path in paths:
         log = read_log(path)
-        assert 2.2 < np.ptp(charge_ah(log)) < 3.1  # a 3 Ah cell
-        assert log.remarks == ()
+        for length_s in (20.0, 60.0, 300.0, 1800.0):
+            for start in log.time_s[0] + rng.random(4) * max(log.duration_s - length_s, 0.0):
+                rows = (log.time_s >= start) & (log.time_s <= start + length_s)
+                if rows.any():
+                    found[sign_of_current(log.rows(rows)).sign] += 1
+    assert found[-1] == 0
+    assert found[1] > 0.4 * sum(found.values())

@@ -49,12 +49,9 @@ def test_it_is_never_further_from_the_report_than_half_a_step(pause_s: float) ->
     assert np.max(np.abs(read - seen)) <= 0.25 + 1e-9
 
 
-def test_a_fine_temperature_stays_what_it_is() -> None:
+def test_a_fine_or_constant_temperature_stays_what_it_is() -> None:
     true = warming()
     np.testing.assert_allclose(dequantize(log_of(true)).temperature_c, true, atol=1e-3)
-
-
-def test_a_temperature_that_never_changes_stays() -> None:
     log = log_of(np.full(100, 21.0))
     assert dequantize(log) is log
 

@@ -127,7 +127,7 @@ def estimate_command(  # noqa: PLR0917 - typer passes options by name
     from cangauge.bus.captures import Capture
     from cangauge.bus.recording import capture_without_vehicle
     from cangauge.estimation.settings import EstimatorSettings
-    from cangauge.logs.cells import read_cells
+    from cangauge.logs.read import read_cells
     from cangauge.model.delay_line import GAP_S
     from cangauge.model.model_file import Model
     from cangauge.service.offline import (

@@ -12,9 +12,10 @@ from cangauge._text import counted, duration
 from cangauge.errors import InputError
 from cangauge.identify.rows import SOC_SPAN_AT_LEAST_PCT, usable_delays, usable_rows
 from cangauge.inspect.channels import Channel, describe_channels
-from cangauge.logs.gaps import uncounted_gaps, usual_gap_s
+from cangauge.logs.gaps import uncounted_gaps, usual_gap_s, usual_step_s
 from cangauge.logs.log import Log
 from cangauge.logs.sign import (
+    STEP_SPACING_S,
     SignFinding,
     charge_ah,
     correlation,
@@ -165,7 +166,7 @@ def inspect_log(log: Log) -> LogInspection:
         "sign of current": ("yes" if sign.sign else "no", sign.sentence),
         "voltage curve over SoC": _curve(charge, soc),
         "capacity": _capacity(log, charge, soc),
-        "ohmic resistance": _ohmic(resistance),
+        "ohmic resistance": _ohmic(resistance, max(STEP_SPACING_S, usual_step_s(log.time_s))),
         "delayed current terms": _delays(log, timing),
         "rows for a fit": _rows(log, timing),
         "temperature coefficient": _temperature(log),
@@ -326,13 +327,13 @@ def _capacity(log: Log, charge: Charge, soc: Soc | None) -> tuple[Verdict, str]:
     return "yes", f"{whole_ah:.4g} Ah: the log runs from full to empty"
 
 
-def _ohmic(resistance: Resistance | None) -> tuple[Verdict, str]:
+def _ohmic(resistance: Resistance | None, step_s: float) -> tuple[Verdict, str]:
     if resistance is None:
         return "no", f"fewer than {MIN_STEPS} clear steps of current"
     ohm, low, high = resistance.median_ohm, resistance.lower_ohm, resistance.upper_ohm
     text = f"{ohm:.4g} Ω (quartiles {low:.4g} … {high:.4g}) from {resistance.steps} steps of"
     is_steady = abs(high - low) <= 0.5 * abs(ohm)
-    return "yes" if is_steady else "partly", f"{text} current over about a second"
+    return "yes" if is_steady else "partly", f"{text} current over {step_s:.3g} s"
 
 
 def _delays(log: Log, timing: Timing) -> tuple[Verdict, str]:

@@ -84,14 +84,9 @@ def build_table(
 
 
 def write_log(log: Log, path: str | PathLike[str]) -> None:
-    """Write a canonical log, all or nothing; float64 values read back exactly.
+    """Write a canonical log as `.parquet` or `.csv`, all or nothing; values read back exactly.
 
-    Parameters
-    ----------
-    log : Log
-    path : path-like
-        `.parquet` or `.csv`; `.bdf`, `.bdf.csv` or `.bdf.parquet` for the Battery Data Format,
-        which has no SoC.
+    `.bdf`, `.bdf.csv` and `.bdf.parquet` are the Battery Data Format, which has no SoC.
 
     Raises
     ------

@@ -21,14 +21,6 @@ _NEEDED: Final = ("time", "current", "voltage")
 _SPLIT: Final = re.compile(rf",\s*(?=(?:{'|'.join(FIELDS)})\s*=)", re.IGNORECASE)
 _FACTOR: Final = re.compile(r"^(?P<text>.*\S)\s*:\s*(?P<factor>[-+]?[\d.]+(?:[eE][-+]?\d+)?)$")
 _UNIT: Final = re.compile(r"^(?P<text>.*\S)\s*\[(?P<unit>[^\[\]]*)\]$")
-_STEMS: Final = {
-    "time": "time|zeit|stamp|date|stemp",
-    "current": "curr|amp|strom|ibat",
-    "voltage": "volt|spann|ubat|vbat",
-    "temperature": "temp",
-    "soc": "soc",
-}
-"""Beginnings of words by which a command is suggested."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -201,7 +193,6 @@ def choose_columns(
         ]
         if quantity not in given.specs and plain:
             _choose(quantity, sorted(plain, key=lambda item: item[1].rank), choice)
-    _guess_by_stem(headings, choice)
     return choice
 
 
@@ -225,17 +216,6 @@ def _choose(quantity: str, plain: list[tuple[int, Meaning]], choice: Choice) -> 
     else:
         unit, source = best[0][1].unit, best[0][1].source
         choice.chosen[quantity] = ChosenColumn(tuple(p for p, _ in best), unit, source=source)
-
-
-def _guess_by_stem(headings: Sequence[str], choice: Choice) -> None:
-    """Guess what no word names by beginnings of words, for the command that is suggested."""
-    used = {place for item in choice.chosen.values() for place in item.places}
-    for quantity in _STEMS.keys() - choice.chosen.keys() - choice.guesses.keys():
-        free = (k for k in range(min(len(headings), 500)) if k not in used)
-        stem = re.compile(rf"(?:^|[^a-z])(?:{_STEMS[quantity]})")
-        place = next((k for k in free if stem.search(headings[k].lower())), None)
-        if place is not None:
-            choice.guesses[quantity] = place
 
 
 def _given_column(

@@ -79,12 +79,8 @@ def uncounted_gaps(time_s: FloatArray) -> np.ndarray[tuple[int], np.dtype[np.int
 def split_where_moved(log: Log) -> list[Log]:
     """Split a log at the uncounted gaps over which its own SoC moved: it was charged or driven.
 
-    Each piece begins with its own SoC. A log without SoC, and one that rested, stays whole.
-
-    Returns
-    -------
-    list of Log
-        In order; pieces shorter than `PIECE_S` are left out.
+    Each piece begins with its own SoC; those shorter than `PIECE_S` are left out. A log without
+    SoC, and one that rested, stays whole.
     """
     if log.soc_pct is None:
         return [log]

@@ -63,8 +63,7 @@ class Log(ArrowExport):
 
     Notes
     -----
-    A log exports the Arrow PyCapsule interface, so that `polars.DataFrame(log)`,
-    `pyarrow.table(log)` and other libraries accept it as a table.
+    A log exports the Arrow PyCapsule interface: `polars.DataFrame(log)`, `pyarrow.table(log)`.
 
     Examples
     --------

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import cache
@@ -11,16 +11,19 @@ from importlib.metadata import entry_points
 from os import PathLike
 from typing import Any, Final, Protocol
 
+import numpy as np
 import pyarrow as pa
 
 from cangauge._files import Head
+from cangauge._typing import FloatArray
 from cangauge.errors import InputError, require_number
 from cangauge.logs.canonical import arrow_table, open_parquet
 from cangauge.logs.column_map import DOCS, ColumnMap, unknown_columns
 from cangauge.logs.draft import DraftLog, Sign
+from cangauge.logs.headings import cell_number
 from cangauge.logs.log import Log, TemperatureSource
 from cangauge.logs.sign import resolve_sign
-from cangauge.logs.table import ArrowTable, draft_of_table, is_canonical
+from cangauge.logs.table import ArrowTable, draft_of_table, is_canonical, numbers_of
 from cangauge.logs.text import TextTable, find_table, is_of_frames, likely_header, table_below
 from cangauge.logs.units import COLDEST_C, HOTTEST_C, known_temperature_source
 
@@ -221,31 +224,7 @@ def read_log(
 ) -> Log:
     """Read a log of any known format, plain, packed by gzip or bzip2, or in a zip.
 
-    `Log.remarks` lists what was dropped, converted or assumed.
-
-    Parameters
-    ----------
-    path : path-like
-    temperature_c : float, optional
-        Constant temperature [°C], in place of the file's.
-    temperature_source : {"cell", "pack", "coolant", "room", "unknown"}, optional
-        Location of the temperature sensor, in place of the file's own.
-    columns : mapping or str, optional
-        Columns of a table: "time=t,current=I[mA]:-1", or {"current": "I[mA]"}; `ColumnMap.of`.
-    sign : {"charge", "discharge"}, optional
-        What a positive current in the file does; by default as the format defines it, or found
-        from the data.
-
-    Returns
-    -------
-    Log
-        Positive current discharges.
-
-    Raises
-    ------
-    InputError
-        File absent, empty, damaged or of no known format; missing column; wrong unit; time that
-        runs backwards; too many missing values.
+    Arguments and errors as of `cangauge.read_log`, which also reads captures.
     """
     file = open_log(path, columns=columns, sign=sign)
     return file.read(temperature_c=temperature_c, temperature_source=temperature_source)
@@ -289,3 +268,80 @@ def log_of_dataframe(
     found = arrow_table(table.schema, table.select)
     draft = draft_of_table(found, given, name=name, source="")
     return _log_of(draft, temperature_c, temperature_source, sign)
+
+
+# --- Cells beside a log
+
+
+@dataclass(frozen=True, eq=False)
+class CellColumns:
+    """Voltages of the cells of a log.
+
+    Parameters
+    ----------
+    first : int
+        Number of the first cell.
+    voltage_v : array of shape (n, cells)
+        Voltage [V] at the log's rows; NaN where missing.
+    """
+
+    first: int
+    voltage_v: FloatArray
+
+    @property
+    def count(self) -> int:
+        """Number of cells."""
+        return int(self.voltage_v.shape[1])
+
+
+def read_cells(
+    path: str | PathLike[str], time_s: FloatArray, columns: ColumnMap | None = None
+) -> CellColumns | None:
+    """Return the cell voltages beside a log in its file; None where it has none.
+
+    Parameters
+    ----------
+    path : path-like
+    time_s : array of shape (n,)
+        Times of the log's rows, some of which the reader may have dropped [s].
+    columns : ColumnMap, optional
+        The user's columns of the log.
+    """
+    file = open_log(path, columns=columns)
+    if not isinstance(file.reader, LogTableReader):
+        return None
+    source = str(path)
+    with open_table(file.head, columns) as table:
+        places = _cells(table.headings, source)
+        if len(places) < 2:  # a single cell is its pack
+            return None
+        cells = table.columns([place for place, _ in places.values()])
+        volts = np.column_stack(
+            [
+                scale * numbers_of(cells[place], source, table.headings[place])[0]
+                for place, scale in places.values()
+            ]
+        )
+        file_s = draft_of_table(table, columns, name=file.head.name, source=source).values["time_s"]
+    if file_s.size != volts.shape[0]:
+        return None  # rows that hold only what changed
+    order = np.argsort(file_s, kind="stable")
+    rows = order[np.minimum(np.searchsorted(file_s[order], time_s), file_s.size - 1)]
+    return CellColumns(
+        min(places), np.where((file_s[rows] == time_s)[:, None], volts[rows], np.nan)
+    )
+
+
+def _cells(headings: Sequence[str], source: str) -> dict[int, tuple[int, float]]:
+    """Return the column and scale of each cell by its number, in order."""
+    found: dict[int, tuple[int, float]] = {}
+    for place, heading in enumerate(headings):
+        cell = cell_number(heading)
+        if cell is not None:
+            found.setdefault(cell[0], (place, cell[1]))
+    numbers = sorted(found)
+    missing = [k for k in range(numbers[0], numbers[-1]) if k not in found] if numbers else []
+    if missing:
+        problem, field = "the cells must be numbered without gaps", f"cell_{missing[0]}_v"
+        raise InputError(problem, source=source, field=field, cure="export all cells")
+    return {number: found[number] for number in numbers}

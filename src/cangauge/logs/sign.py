@@ -211,19 +211,9 @@ def spaced_rows(time_s: FloatArray, spacing_s: float) -> IntArray:
 def resolve_sign(log: Log, *, stored_sign_unknown: bool, is_stated: bool = False) -> Log:
     """Check the sign of current against the data; invert it only where the format leaves it open.
 
-    Parameters
-    ----------
-    log : Log
-    stored_sign_unknown : bool
-        The format does not define the sign of current (copies from CAN, tables of any logger).
-    is_stated : bool
-        The user states the sign.
-
-    Returns
-    -------
-    Log
-        With a remark where the data disagree with the sign, or cannot confirm an unknown one. A
-        SoC that contradicts the sign which the voltage alone proves is left out.
+    A remark says where the data disagree with the sign (`is_stated` by the user), or cannot confirm
+    one that the format does not define. A SoC that contradicts the sign which the voltage alone
+    proves is left out.
     """
     finding = sign_of_current(log)
     remarks, assumed = list(log.remarks), ""

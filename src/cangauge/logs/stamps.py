@@ -164,12 +164,8 @@ def _order(fields: FloatArray, unit: str, *, is_word: bool) -> tuple[str, str]:
         return "dmy", " (day first)"
     if np.max(fields[1]) > 12:
         return "mdy", " (month first)"
-    spans = {}  # of the orders in which the days increase, that of fewer days
-    for order in ("dmy", "mdy"):
-        days = _day_numbers(fields, order)
-        if np.all(np.diff(days) >= 0.0):
-            spans[order] = float(np.ptp(days))
-    order = min(spans, key=lambda name: spans[name], default="dmy")
+    # A log is short: the order of fewer days.
+    order = min(("dmy", "mdy"), key=lambda name: float(np.ptp(_day_numbers(fields, name))))
     return order, f" ({'day' if order == 'dmy' else 'month'} first, assumed)"
 
 

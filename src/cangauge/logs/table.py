@@ -78,15 +78,7 @@ def is_canonical(headings: Sequence[str]) -> bool:
 def draft_of_table(
     table: TextTable | ArrowTable, given: ColumnMap | None, *, name: str, source: str
 ) -> DraftLog:
-    """Return the draft of a log from a table.
-
-    Parameters
-    ----------
-    table : TextTable or ArrowTable
-    given : ColumnMap, optional
-        The user's columns.
-    name, source : str
-        Of the log; for messages.
+    """Return the draft of a log from a table; `given` are the user's columns.
 
     Raises
     ------
@@ -236,15 +228,15 @@ def numbers_of(column: Any, source: str, label: str) -> tuple[FloatArray, str]:
     if not (is_text or is_number_type or of.is_null(kind)):
         cure = "store it as floating point"
         raise error("the column does not hold numbers", str(kind)[:60], cure)
-    cells, unit = _present(column) if is_text else column, ""
+    unit = ""
     try:
         try:
-            numbers = pc.cast(cells, pa.float64(), safe=False)
+            numbers = pc.cast(column, pa.float64(), safe=False)
         except pa.ArrowInvalid:
-            bare, unit = _without_unit(_with_decimal_point(cells))
+            bare, unit = _without_unit(_with_decimal_point(_present(column)))
             numbers = pc.cast(bare, pa.float64())
     except pa.ArrowInvalid as problem:
-        shown = enumerate(cells.to_pylist(), start=1)
+        shown = enumerate(_present(column).to_pylist(), start=1)
         wrong = ((k, text) for k, text in shown if text and not is_number(text.replace(",", ".")))
         row, value = next(wrong, (1, None))
         cure = "correct the cell, or leave it empty where the value is unknown"

@@ -44,7 +44,7 @@ class TextTable(NamedTuple):
     remarks: list[str]
 
     def columns(self, places: Sequence[int]) -> dict[int, Any]:
-        """Read columns as numbers where all are plain numbers, else as text.
+        """Read columns as text, null where there is no value.
 
         A cut last line and closing remarks of the exporter are left out, with a remark.
 
@@ -53,18 +53,35 @@ class TextTable(NamedTuple):
         InputError
             If there is no row, or a row in the middle has the wrong number of cells.
         """
-        data = as_utf8(self.head.read())
-        width = self._width()
+        data, odd = as_utf8(self.head.read()), list[Any]()
+        names = [f"c{place}" for place in range(self._width())]
+        wanted = list(dict.fromkeys(names[place] for place in places))
+
+        def skip(row: Any) -> str:
+            odd.append(row)
+            return "skip"
+
         try:
-            table = self._parse(data, places, width, pa.float64(), [])
-        except pa.ArrowInvalid:
-            odd: list[Any] = []
-            try:
-                table = self._parse(data, places, width, pa.string(), odd)
-            except pa.ArrowInvalid as error:
-                problem = f"the table cannot be read: {str(error).splitlines()[0]}"
-                raise self._error(problem, "export it again") from error
-            self._remark_odd(odd, table.num_rows)
+            table = pacsv.read_csv(
+                pa.BufferReader(data),
+                # One thread: otherwise pyarrow does not number odd rows.
+                read_options=pacsv.ReadOptions(
+                    use_threads=False, column_names=names, skip_rows=self.skip_lines
+                ),
+                parse_options=pacsv.ParseOptions(
+                    delimiter=self.delimiter, invalid_row_handler=skip
+                ),
+                convert_options=pacsv.ConvertOptions(
+                    include_columns=wanted,
+                    column_types=dict.fromkeys(wanted, pa.string()),
+                    null_values=_NULLS,
+                    strings_can_be_null=True,
+                ),
+            )
+        except pa.ArrowInvalid as error:
+            problem = f"the table cannot be read: {str(error).splitlines()[0]}"
+            raise self._error(problem, "export it again") from error
+        self._remark_odd(odd, table.num_rows)
         if table.num_rows > MAX_ROWS:
             raise self._error(f"more than the {MAX_ROWS} rows that a log may have", "split it")
         if not table.num_rows:
@@ -75,30 +92,6 @@ class TextTable(NamedTuple):
                 " short"
             )
         return {place: table.column(f"c{place}") for place in places}
-
-    def _parse(
-        self, data: bytes, places: Sequence[int], width: int, kind: Any, odd: list[Any]
-    ) -> Any:
-        def collect(row: Any) -> str:
-            odd.append(row)
-            return "error" if kind == pa.float64() else "skip"
-
-        names = [f"c{place}" for place in range(width)]
-        wanted = list(dict.fromkeys(names[place] for place in places))
-        return pacsv.read_csv(
-            pa.BufferReader(data),
-            # One thread: otherwise pyarrow does not number odd rows.
-            read_options=pacsv.ReadOptions(
-                use_threads=False, column_names=names, skip_rows=self.skip_lines
-            ),
-            parse_options=pacsv.ParseOptions(delimiter=self.delimiter, invalid_row_handler=collect),
-            convert_options=pacsv.ConvertOptions(
-                include_columns=wanted,
-                column_types=dict.fromkeys(wanted, kind),
-                null_values=_NULLS,
-                strings_can_be_null=True,
-            ),
-        )
 
     def _width(self) -> int:
         """Return the number of cells of the first row: headers can be shorter than rows."""

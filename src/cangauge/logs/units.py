@@ -139,24 +139,19 @@ def refuse_wrong_units(
     labels: dict[str, str],
     in_seconds: bool = False,
 ) -> tuple[str, ...]:
-    """Raise InputError if the values cannot be in the canonical units.
+    """Raise InputError if the values cannot be in the canonical units; return remarks.
 
     Medians are checked first, against a few odd rows, then single impossible values.
 
     Parameters
     ----------
-    values : dict of str to array of shape (n,)
-        `time_s`, `current_a`, `voltage_v`, `temperature_c` (finite) and optionally `soc_pct`.
-    source, labels : object, dict of str to str
-        File, and heading by field, for messages.
+    values, labels : dict
+        Arrays of shape (n,) and headings by canonical column; only `soc_pct` may hold NaN.
+    source : object
+        File, for messages.
     in_seconds : bool
         Whether the format fixes the unit of time, as a capture's does: rows may then be as close
         as an accelerated replay makes them.
-
-    Returns
-    -------
-    tuple of str
-        Remarks on possible but unusual values.
     """
 
     def odd_row(field: str, wrong: BoolArray, kind: str) -> _Check:

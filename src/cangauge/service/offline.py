@@ -35,8 +35,8 @@ from cangauge.estimation.offline import (
     score,
 )
 from cangauge.estimation.settings import EstimatorSettings
-from cangauge.logs.cells import CellColumns
 from cangauge.logs.log import Log
+from cangauge.logs.read import CellColumns
 from cangauge.model.coulomb_counting import difference_from_reference
 from cangauge.model.model_file import Model
 from cangauge.service.pipeline import FrameCounts, Pipeline, PipelineSettings
