@@ -77,7 +77,10 @@ def headline(found: Diagnosis) -> str:
     none = percent(answer.probabilities[NONE])
     if not answer.detected:
         if not answer.likely:
-            return f"No significant gap beyond that of healthy logs: P(no fault) = {none}."
+            return (
+                f"No significant gap beyond that of healthy logs. P(no fault) = {none}: a fault too"
+                " small to be seen is not excluded."
+            )
         return f"A gap is likely, not certain: P(no fault) = {none}. {_where_to_look(answer)}"
     name = answer.name
     if answer.leading_group == UNKNOWN or name is None:
@@ -152,8 +155,7 @@ def soc_text(found: Diagnosis) -> str:
             f" from {before} to {after} %."
         )
     better = found.soc_errors_pct[1] < found.soc_errors_pct[0]
-    words = "SoC error, start withheld" if better else "It does not improve the SoC error"
-    return f" {words}: {before} → {after} %."
+    return f" SoC error, start withheld: {before} → {after} %{'' if better else ', no better'}."
 
 
 def visible_text(found: Diagnosis) -> str:
