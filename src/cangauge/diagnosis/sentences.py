@@ -13,7 +13,7 @@ from cangauge._text import NONE_KNOWN, counted, number, significant
 from cangauge.diagnosis.answer import NONE, TITLES, UNKNOWN, Posterior
 from cangauge.diagnosis.columns import COVER_PCT
 from cangauge.diagnosis.evidence import COVER_K
-from cangauge.diagnosis.extended import LOG_EFFECTS, Quantity
+from cangauge.diagnosis.extended import LOG_EFFECTS, Quantity, residual_v
 from cangauge.diagnosis.simulator import correction
 from cangauge.logs.gaps import bridge_s
 
@@ -227,7 +227,13 @@ def _of_references(found: Diagnosis) -> list[str]:
             f"Only {counted(len(references), 'reference log')}: differences between healthy logs"
             " are hardly known, and probabilities are less reliable."
         )
-    errors = found.reference_rmse_v
+    model, names = found.model.extended_model(), [log.name for log in found.references]
+    errors = {
+        name: float(np.sqrt(np.mean(residual_v(model, log)[log.measured] ** 2)))
+        for name, log in zip(
+            names or [f"reference {k + 1}" for k in range(len(references))], references, strict=True
+        )
+    }
     worst, usual = max(errors, key=lambda name: errors[name]), float(np.median([*errors.values()]))
     if usual > POOR_FIT * found.healthy_rmse_v:
         said.append(
