@@ -36,9 +36,9 @@ _LOG = logging.getLogger(__name__)
 CROSS_VALIDATED = 5
 """Number of effects, the most probable ones, whose errors are found on held-out rows."""
 
-WORSE_SOC, WORSE_SOC_PCT = 1.1, 0.1
+WORSE_SOC, WORSE_SOC_PCT = 1.25, 0.25
 """A cause is not accepted with which the SoC error of these logs is larger than this many times
-that of the given model and this [%]: more than its scatter."""
+that of the given model and this [%]: on healthy trips of one car it scatters by as much."""
 
 SETTLING_S = 300.0
 """Start of a log, with withheld initial SoC, that the SoC error leaves out [s]."""

@@ -160,12 +160,17 @@ def soc_text(found: Diagnosis) -> str:
 
 def visible_text(found: Diagnosis) -> str:
     """Return from which size the most usual effects would have been seen."""
+    least = {item["effect"]: item for item in found.visible_from if item["effect"] in COMMON}
     sizes = [
-        f"{item['effect']} from {significant(item['size'], 2)} {item['unit']}"
-        for item in found.visible_from
-        if item["size"] is not None and item["effect"] in COMMON
+        f"{name} from {significant(item['size'], 2)} {item['unit']}"
+        for name, item in least.items()
+        if item["size"] is not None
     ]
-    return f"These logs would have shown {', '.join(sizes)}." if sizes else ""
+    never = [name for name, item in least.items() if item["size"] is None]
+    text = f"These logs would have shown {', '.join(sizes)}." if sizes else ""
+    return text + (
+        f" No {' and no '.join(never)} of a physical size would be seen in them." if never else ""
+    )
 
 
 def percent(fraction: float) -> str:
