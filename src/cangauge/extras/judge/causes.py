@@ -217,7 +217,8 @@ def sums_of(
     inverse = np.linalg.inv(A)
     back = inverse @ M[:, own]
     gram: FloatArray = M - M[:, :, own] @ back
-    log_evidence = float(sum(each.log_norm[0][v] + each.log_norm[1][y] for each in designs))
+    noises = [(part.whiten_voltage[v], part.whiten_gauge[y]) for part in chain]
+    log_evidence = sum(of_v.log_norm + of_y.log_norm for of_v, of_y in noises)
     log_evidence -= 0.5 * float(np.linalg.slogdet(A)[1].sum()) + float(np.log(prior).sum())
     total = gram.sum(axis=0)
     healthy = priors.healthy(gauge)
@@ -254,7 +255,8 @@ class Explanation:
         SoC of each stretch under the most probable signature; of `none`, as if the gauge's zero
         were free, so that the gauge does not confirm itself.
     sums : Sums
-        At the likeliest noise.
+    point : pair of int
+        Sums at the likeliest sizes of the noise, and which those are.
     functions, covariance : array of shape (c,), (c, c)
         Principal functions of the curve after the logs.
     """
@@ -267,6 +269,7 @@ class Explanation:
     std: FloatArray
     tracks: list[Track]
     sums: Sums
+    point: tuple[int, int]
     functions: FloatArray
     covariance: FloatArray
 
@@ -284,9 +287,11 @@ def explain(chain: Sequence[Stretch], model: Model, priors: Priors) -> list[Expl
     for name in NAMES:
         for part, linear_pct in zip(chain, first, strict=True):
             part.linear_pct = linear_pct
+        points: Sequence[tuple[int, int]] = GRID
         for _ in range(ITERATIONS):
             designs = [design_of(part, voltage) for part in chain]
-            explanation = _explanation(name, chain, designs, priors)
+            explanation = _explanation(name, chain, designs, priors, points)
+            points = [explanation.point]
             moved_pct = 0.0
             for part, track in zip(chain, explanation.tracks, strict=True):
                 step = np.clip(track.soc_pct, -3.0, 103.0) - part.linear_pct
@@ -294,6 +299,7 @@ def explain(chain: Sequence[Stretch], model: Model, priors: Priors) -> list[Expl
                 moved_pct = max(moved_pct, float(np.abs(step).max()))
             if moved_pct < SETTLED_PCT:
                 break
+        explanation = _explanation(name, chain, designs, priors, GRID)
         if name == "none":
             # Not by the gauge itself: the SoC that the voltage alone would have shown.
             free = np.zeros_like(explanation.signatures[0].columns)
@@ -302,12 +308,21 @@ def explain(chain: Sequence[Stretch], model: Model, priors: Priors) -> list[Expl
             tracks, *_ = _tracks(chain, designs, explanation.sums, apart, priors)
             explanation = replace(explanation, tracks=tracks)
         found.append(explanation)
+        if name != "none":
+            # The null hypothesis may use any linearisation: no curvature accuses a gauge.
+            null = _explanation("none", chain, designs, priors, GRID).log_evidence
+            found[0] = replace(found[0], log_evidence=max(found[0].log_evidence, null))
     return found
 
 
 def _explanation(
-    name: str, chain: Sequence[Stretch], designs: Sequence[Design], priors: Priors
+    name: str,
+    chain: Sequence[Stretch],
+    designs: Sequence[Design],
+    priors: Priors,
+    points: Sequence[tuple[int, int]],
 ) -> Explanation:
+    """Return an answer at one linearisation, with its noise integrated over some points."""
     starts = np.array([design.start_pct for design in designs])
     columns = designs[0].gauge[0].shape[0] - 1
     signatures = signatures_of(name, chain, starts, columns, priors)
@@ -315,7 +330,7 @@ def _explanation(
     std = np.array([each.std for each in signatures])
     log_weight = np.log([each.weight for each in signatures])
     logs, sizes, variances, all_sums = [], [], [], []
-    for point in GRID:
+    for point in points:
         sums = sums_of(designs, chain, point, priors, unknown=name == "unknown")
         MW = np.einsum("lcd,hld->hlc", sums.gram[:, :-1, :-1], W)
         cross = MW.sum(axis=1)[:, sums.at]
@@ -337,7 +352,8 @@ def _explanation(
     size = (within * np.array(sizes)).sum(axis=0)
     square = (within * (np.array(variances) + np.array(sizes) ** 2)).sum(axis=0)
     best = int(np.argmax(share))
-    sums = all_sums[int(np.argmax(table[:, best]))]
+    likeliest = int(np.argmax(table[:, best]))
+    sums = all_sums[likeliest]
     tracks, functions, covariance = _tracks(chain, designs, sums, signatures[best], priors)
     prior = PRIOR_NONE if name == "none" else (1.0 - PRIOR_NONE) / (len(NAMES) - 1)
     return Explanation(
@@ -349,6 +365,7 @@ def _explanation(
         np.sqrt(np.maximum(square - size**2, 0.0)),
         tracks,
         sums,
+        points[likeliest],
         functions,
         covariance,
     )

@@ -23,7 +23,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 from scipy.linalg import solve_triangular
 
-from cangauge._typing import FloatArray
+from cangauge._typing import BoolArray, FloatArray
 from cangauge.logs.log import Log
 from cangauge.model.extended import ExtendedModel
 from cangauge.model.model_file import Model, Noise
@@ -66,6 +66,23 @@ SECANT_PCT: Final = 1.0
 """Half width over which the curve's slope is taken [%]: about the σ of the SoC."""
 LEAST_SLOPE: Final = 0.1
 """Least slope of the curve, relative to its mean, for a SoC read from a voltage [-]."""
+
+
+class Whitening(NamedTuple):
+    """Inverse root of the covariance of some blocks' noise."""
+
+    has: BoolArray
+    """Blocks with a value."""
+    root: FloatArray
+    log_norm: float
+    """Logarithm of the normalisation."""
+
+    @classmethod
+    def of(cls, has: BoolArray, covariance: FloatArray) -> Whitening:
+        """Factorise a covariance."""
+        root = np.linalg.cholesky(covariance)
+        inverse = solve_triangular(root, np.eye(len(root)), lower=True) if root.size else root
+        return cls(has, np.asarray(inverse), -float(np.log(np.diag(root)).sum()))
 
 
 @dataclass(eq=False)
@@ -111,6 +128,8 @@ class Stretch:
     counted_h: float = 0.0
     linear_pct: FloatArray = field(default_factory=lambda: np.empty(0))
     axis_slope: FloatArray = field(default_factory=lambda: np.empty(0))
+    whiten_voltage: list[Whitening] = field(default_factory=list)
+    whiten_gauge: list[Whitening] = field(default_factory=list)
 
     @property
     def hours_long(self) -> float:
@@ -127,6 +146,7 @@ def stretches_of(logs: Sequence[Log], model: Model) -> list[Stretch]:
         counted_h += part.hours_long
         part.linear_pct = _start_pct(part, extended) - part.drawn_pct
         part.axis_slope = _slope(part, extended)
+        _set_noise(part, model.noise)
     return chain
 
 
@@ -240,6 +260,30 @@ def _full_charges(current_a: FloatArray, voltage_v: FloatArray, model: Model) ->
     return np.array(ends, dtype=np.intp)
 
 
+def _set_noise(part: Stretch, noise: Noise) -> None:
+    """Set the noise of voltage and gauge, for each size."""
+    has = np.isfinite(part.voltage_v)
+    cold = _cold(part, noise)[has]
+    axis_v = noise.soc_std_pct * part.axis_slope[has]
+    level_v = np.hypot(cold * noise.level_std_v, axis_v)
+    gap_s = 3600.0 * np.abs(part.hours[has, None] - part.hours[has])
+    scaled = np.outer(cold, cold) * noise.slow_std_v**2 * np.exp(-gap_s / noise.slow_time_s)
+    scaled += np.outer(level_v, level_v) * np.exp(-gap_s / WANDER_S)
+    scaled += np.diag((cold * noise.fast_std_v) ** 2)
+    axis = np.diag(axis_v**2 + (1e-6 * np.nanmean(part.voltage_v)) ** 2)
+    part.whiten_voltage = [Whitening.of(has, size**2 * scaled + axis) for size in VOLTAGE_SCALES]
+    has = np.isfinite(part.published_pct)
+    walk = np.minimum(part.hours[has, None], part.hours[has])
+    white = np.eye(len(walk)) * (SOC_NOISE_PCT**2 + part.soc_step_pct**2 / 12.0)
+    part.whiten_gauge = [Whitening.of(has, each.walk_pct**2 * walk + white) for each in GAUGES]
+
+
+def _cold(part: Stretch, noise: Noise) -> FloatArray:
+    """Return the growth of the voltage's errors in the cold [-]."""
+    factor = np.maximum(1.0, resistance_factor(part.temperature_c))
+    return np.asarray(factor**noise.cold_exponent)
+
+
 def _slope(part: Stretch, extended: ExtendedModel) -> FloatArray:
     """Return the slope of the voltage over SoC at the linearisation [V/%]."""
     low, high = part.linear_pct - SECANT_PCT, part.linear_pct + SECANT_PCT
@@ -267,8 +311,6 @@ class Design:
     """XᵀX of the voltage for each `VOLTAGE_SCALES`, shape (columns + 1, columns + 1)."""
     gauge: list[FloatArray]
     """XᵀX of the published SoC for each `GAUGES`."""
-    log_norm: tuple[list[float], list[float]]
-    """Logarithm of the normalisation of both."""
     start_pct: float
     """s at the linearisation [%]: columns and residual are relative to it."""
 
@@ -325,7 +367,7 @@ def design_of(part: Stretch, voltage: Voltage) -> Design:
     columns = FUNCTIONS + functions.number
     start = float(S[0] + part.drawn_pct[0])
     per_a = 100.0 * part.hours / capacity_ah
-    cold = np.maximum(1.0, resistance_factor(part.temperature_c)) ** noise.cold_exponent
+    cold = _cold(part, noise)
     V = np.zeros((n, columns + 1))
     V[:, START] = slope
     axis_v = noise.soc_std_pct * part.axis_slope
@@ -350,29 +392,13 @@ def design_of(part: Stretch, voltage: Voltage) -> Design:
     F[:, -1] = 100.0 + part.drawn_pct[part.full] - start
     of_full = F.T @ F / FULL_STD_PCT**2
 
-    has = np.isfinite(part.voltage_v)
-    gap_s = 3600.0 * np.abs(part.hours[has, None] - part.hours[has])
-    slow = np.outer(cold[has], cold[has]) * noise.slow_std_v**2 * np.exp(-gap_s / noise.slow_time_s)
-    slow += np.outer(V[has, LEVEL], V[has, LEVEL]) * np.exp(-gap_s / WANDER_S)
-    slow += np.diag((cold[has] * noise.fast_std_v) ** 2)
-    axis = np.diag(axis_v[has] ** 2 + 1e-12 * typical**2)
-    of_v = [_whitened(V[has], scale**2 * slow + axis) for scale in VOLTAGE_SCALES]
-
-    has = np.isfinite(part.published_pct)
-    walk = np.minimum(part.hours[has, None], part.hours[has])
-    white = np.eye(int(has.sum())) * (SOC_NOISE_PCT**2 + part.soc_step_pct**2 / 12.0)
-    of_y = [_whitened(Y[has], gauge.walk_pct**2 * walk + white) for gauge in GAUGES]
     return Design(
-        [gram + of_full for gram, _ in of_v],
-        [gram for gram, _ in of_y],
-        ([norm for _, norm in of_v], [norm for _, norm in of_y]),
+        [_whitened(V, each) + of_full for each in part.whiten_voltage],
+        [_whitened(Y, each) for each in part.whiten_gauge],
         start,
     )
 
 
-def _whitened(rows: FloatArray, covariance: FloatArray) -> tuple[FloatArray, float]:
-    if not rows.size:
-        return np.zeros((rows.shape[1], rows.shape[1])), 0.0
-    root = np.linalg.cholesky(covariance)
-    white = solve_triangular(root, rows, lower=True)
-    return white.T @ white, -float(np.log(np.diag(root)).sum())
+def _whitened(rows: FloatArray, whitening: Whitening) -> FloatArray:
+    white = whitening.root @ rows[whitening.has]
+    return np.asarray(white.T @ white)

@@ -107,7 +107,7 @@ def _figure(judgement: Judgement) -> Figure:
     if judgement.verdict == "off" and cause.onset is not None:
         moments.append(judgement.moment_s(cause.onset, inside=cause.inside))
     for number_, time_s in moments:
-        at = float(time.timeline.at(number_, np.array([time_s]))[0])
+        at = float(time.at(number_, np.array([time_s]))[0])
         plot.add_layout(
             Span(location=at, dimension="height", line_color=ORANGE, line_dash="dashed",
                  line_width=2)
