@@ -113,7 +113,9 @@ def run(name: str, arguments: argparse.Namespace) -> None:
     if name.startswith("twin"):
         drawn = twin_chains(number, 900 if name.endswith("_dev") else 100)
     else:
-        drawn = chains(load(arguments.data, [name])[0], number, arguments.seed)
+        pack, *winter = load(arguments.data, ["i3", "i3_winter"] if name == "i3" else [name])
+        pack = replace(pack, judged=[*pack.judged, *(log for one in winter for log in one.judged)])
+        drawn = chains(pack, number, arguments.seed)
     for chain, (model, logs, capacity_ah) in enumerate(drawn):
         for fault, (cause, sizes) in FAULTS.items():
             if chain >= (arguments.healthy if fault == "none" else arguments.chains):
@@ -121,7 +123,7 @@ def run(name: str, arguments: argparse.Namespace) -> None:
             size = sizes[chain % len(sizes)]
             changed, told_ah = corrupted(logs, fault, size, capacity_ah)
             spans = np.cumsum([np.ptp(counted_ah(log)) for log in logs])
-            for days in DAYS:
+            for days in DAYS if fault != "none" or chain < 16 else DAYS[:3]:
                 if days > len(logs) and days != min(d for d in DAYS if d >= len(logs)):
                     continue
                 judgement = cangauge.judge(changed[:days], model, capacity_ah=told_ah)

@@ -93,18 +93,22 @@ def judge_command(  # noqa: PLR0917 - typer passes options by name
     `cangauge judge day*.csv --chemistry lfp --cells 16 --capacity-ah 280 --corrected soc.csv`
     """
     from cangauge.extras.judge.judgement import judge, narrowed
+    from cangauge.logs.cells import read_cells
     from cangauge.model.model_file import Model
 
     within(capacity_ah, 1e-3, 1e5, option="--capacity-ah", unit="Ah")
     within(None if cells is None else float(cells), 1, 2000, option="--cells", unit="")
     check_outputs([output, corrected, report], [*logs, *([model] if model else [])])
     loaded = [reading.load(path) for path in logs]
+    columns = reading.given_columns()
+    beside = [read_cells(log.source, log.time_s, columns) if log.source else None for log in loaded]
     judgement = judge(
         loaded,
         None if model is None else Model.load(model),
         chemistry=_chemistry(chemistry),
         cells=cells,
         capacity_ah=capacity_ah,
+        cell_voltages=beside,
     )
     texts = {}
     if output is not None:

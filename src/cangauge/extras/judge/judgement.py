@@ -12,8 +12,11 @@ from threadpoolctl import threadpool_limits
 from cangauge._text import counted, duration, number
 from cangauge._typing import FloatArray
 from cangauge.errors import InputError
-from cangauge.extras.judge.causes import UNITS, Explanation, Priors, Track, explain
+from cangauge.extras.judge.causes import NAMES, PRIOR_NONE, Explanation, Priors, Track, explain
+from cangauge.extras.judge.causes import UNITS as PACK_UNITS
 from cangauge.extras.judge.chain import Stretch, stretches_of
+from cangauge.extras.judge.weak import WeakCell, weak_cell
+from cangauge.logs.cells import CellColumns
 from cangauge.logs.log import Log
 from cangauge.logs.read import as_log
 from cangauge.model.model_file import FunctionFields, Model, as_model
@@ -23,6 +26,7 @@ __all__ = ["Cause", "Judgement", "judge"]
 
 Verdict = Literal["agrees", "off", "cannot_tell"]
 
+UNITS: Final = {**PACK_UNITS, "weak_cell": "%"}
 ALARM: Final = 0.05
 """The gauge is off where the probability that it is right is at most this, as in `gap`."""
 NAMED: Final = 0.6
@@ -111,6 +115,7 @@ class Judgement:
     corrected_std_pct: list[FloatArray]
     chain: list[Stretch]
     explanations: list[Explanation]
+    weakest: WeakCell | None = None
 
     @property
     def days(self) -> int:
@@ -211,7 +216,10 @@ class Judgement:
             return f"The cause is not known{f' (possible: {likely})' if likely else ''}."
         size, (low, high), unit = cause.size
         digits = 2 if unit == "A" else 1
-        text = f"Cause: {_WORDS[cause.verdict]} ({percent}), {_signed(size, digits)} {unit}"
+        words = _WORDS[cause.verdict]
+        if cause.verdict == "weak_cell" and self.weakest is not None:
+            words = f"weak cell, number {self.weakest.number}"
+        text = f"Cause: {words} ({percent}), {_signed(size, digits)} {unit}"
         text += f" ({_signed(low, digits)} … {_signed(high, digits)} {unit}, 95 %)"
         return f"{text}, {self.since}."
 
@@ -287,6 +295,7 @@ def judge(
     chemistry: ChemistryName | None = None,
     cells: int | None = None,
     capacity_ah: float | None = None,
+    cell_voltages: Sequence[CellColumns | None] = (),
 ) -> Judgement:
     """Judge the SoC that a gauge publishes, by logs that carry it.
 
@@ -302,6 +311,8 @@ def judge(
     capacity_ah : float, optional
         Charge from 100 to 0 % that the gauge should count with [Ah]; by default the model's, else
         from the gauge's own count.
+    cell_voltages : sequence of CellColumns, optional
+        Beside each log; None where it has none.
 
     Returns
     -------
@@ -332,7 +343,32 @@ def judge(
                 cure="give logs of at least 10 minutes, better half an hour with changing load",
             )
         explanations = explain(chain, pack, Priors(pack.capacity_ah, capacity_std))
-    return _judgement(chain_logs, pack, chain, explanations)
+        weak = _weakest(chain_logs, cell_voltages, pack, chain, explanations)
+    return _judgement(chain_logs, pack, chain, explanations, weak)
+
+
+def _weakest(
+    logs: Sequence[Log],
+    cell_voltages: Sequence[CellColumns | None],
+    model: Model,
+    chain: Sequence[Stretch],
+    explanations: Sequence[Explanation],
+) -> WeakCell | None:
+    """Return the weakest cell by the SoC of the likeliest answer."""
+    best = max(explanations, key=lambda each: each.log_evidence)
+    parts, first = [], 1
+    for part, track in zip(chain, best.tracks, strict=True):
+        cells = cell_voltages[part.log] if part.log < len(cell_voltages) else None
+        if cells is None:
+            continue
+        rows = np.searchsorted(logs[part.log].time_s, part.time_s)
+        slope = model.voltage_model().pseudo_ocv_slope(track.soc_pct) / cells.count
+        first = cells.first
+        parts.append((cells.voltage_v[rows], track.soc_pct, slope, logs[part.log].current_a[rows]))
+    if not parts:
+        return None
+    volts, soc_pct, slopes, amps = zip(*parts, strict=True)
+    return weak_cell(volts, soc_pct, slopes, amps, first)
 
 
 def _pack(
@@ -380,8 +416,15 @@ def _capacity_ah(logs: Sequence[Log]) -> float:
 
 
 def _judgement(
-    logs: tuple[Log, ...], model: Model, chain: list[Stretch], explanations: list[Explanation]
+    logs: tuple[Log, ...],
+    model: Model,
+    chain: list[Stretch],
+    explanations: list[Explanation],
+    weak: WeakCell | None,
 ) -> Judgement:
+    if weak is not None:
+        none = next(each for each in explanations if each.name == "none")
+        explanations = [*explanations, _of_weak_cell(none, weak)]
     scores = np.array([each.log_evidence for each in explanations])
     share = np.exp(scores - scores.max())
     share /= share.sum()
@@ -421,8 +464,21 @@ def _judgement(
         std,
         chain,
         explanations,
+        weak,
     )
     return replace(partial, jumps=_jumps(partial))
+
+
+def _of_weak_cell(none: Explanation, weak: WeakCell) -> Explanation:
+    """Return the answer "weak cell": the pack's signals are as without a fault."""
+    prior = np.log((1.0 - PRIOR_NONE) / (len(NAMES) - 1) / PRIOR_NONE)
+    return replace(
+        none,
+        name="weak_cell",
+        log_evidence=none.log_evidence + weak.log_factor + float(prior),
+        size=np.array([weak.size_pct]),
+        std=np.array([weak.std_pct]),
+    )
 
 
 def _mixture(tracks: Sequence[Track], share: FloatArray) -> Track:
@@ -438,10 +494,10 @@ def _cause(explanations: Sequence[Explanation], share: FloatArray, *, is_off: bo
     none = by_name["none"][1]
     if not is_off:
         return Cause("none", none, None, None, None, None, inside=False)
-    name = max(UNITS, key=lambda each: by_name[each][1])
+    name = max(UNITS.keys() & by_name.keys(), key=lambda each: by_name[each][1])
     best, probability = by_name[name]
     if probability < NAMED * (1.0 - none):
-        unknown = max(by_name["unknown"][1], 1.0 - none - sum(by_name[each][1] for each in UNITS))
+        unknown = by_name["unknown"][1]
         return Cause("unknown", unknown, None, None, None, None, inside=False)
     size = float(best.share @ best.size)
     spread = float(best.share @ (best.std**2 + (best.size - size) ** 2)) ** 0.5
