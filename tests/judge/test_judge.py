@@ -14,6 +14,7 @@ import pytest
 import cangauge
 from cangauge.__main__ import main
 from cangauge.logs.canonical import write_table
+from cangauge.logs.read import CellColumns
 
 DAYS = 5
 CAPACITY_AH = 60.0
@@ -143,6 +144,31 @@ def test_command_prints_schema_1_and_writes_all_files(
     assert "Second opinion" in (tmp_path / "page.html").read_text()
     narrow = cangauge.Model.load(tmp_path / "narrow.json")
     assert narrow.capacity_ah == model.capacity_ah
+
+
+def with_cells(log: cangauge.Log, model: cangauge.Model, weak: int, lack_pct: float) -> CellColumns:
+    """Return the voltages of 12 cells, of which one lacks capacity; the others differ by 0.5 %."""
+    rng = np.random.default_rng(1)
+    lack = rng.normal(0.0, 0.5, 12)
+    balance = rng.normal(0.0, 0.5, 12)
+    lack[weak] = lack_pct
+    slope = model.voltage_model().pseudo_ocv_slope(log.soc_pct)[:, None] / 12.0
+    moved = balance + lack * (log.soc_pct[:, None] - 100.0) / 100.0
+    noise = rng.normal(0.0, 0.002, moved.shape)
+    return CellColumns(1, log.voltage_v[:, None] / 12.0 + slope * moved + noise)
+
+
+@pytest.mark.parametrize(("lack_pct", "cause"), [(0.0, "none"), (10.0, "weak_cell")])
+def test_a_weak_cell_is_named_with_its_number(pack, lack_pct: float, cause: str) -> None:
+    model, logs = pack
+    cells = [with_cells(log, model, 7, lack_pct) for log in logs[:2]]
+    judgement = cangauge.judge(logs[:2], model, cell_voltages=cells)
+    assert judgement.cause.verdict == cause
+    if cause == "weak_cell":
+        assert judgement.weakest is not None
+        assert judgement.weakest.number == 8
+        assert judgement.cause.size is not None
+        assert judgement.cause.size.value == pytest.approx(lack_pct, abs=2.5)
 
 
 def test_logs_without_a_published_soc_are_refused(pack) -> None:

@@ -93,7 +93,7 @@ def judge_command(  # noqa: PLR0917 - typer passes options by name
     `cangauge judge day*.csv --chemistry lfp --cells 16 --capacity-ah 280 --corrected soc.csv`
     """
     from cangauge.extras.judge.judgement import judge, narrowed
-    from cangauge.logs.cells import read_cells
+    from cangauge.logs.read import read_cells
     from cangauge.model.model_file import Model
 
     within(capacity_ah, 1e-3, 1e5, option="--capacity-ah", unit="Ah")

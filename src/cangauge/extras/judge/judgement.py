@@ -16,9 +16,8 @@ from cangauge.extras.judge.causes import NAMES, PRIOR_NONE, Explanation, Priors,
 from cangauge.extras.judge.causes import UNITS as PACK_UNITS
 from cangauge.extras.judge.chain import Stretch, stretches_of
 from cangauge.extras.judge.weak import WeakCell, weak_cell
-from cangauge.logs.cells import CellColumns
 from cangauge.logs.log import Log
-from cangauge.logs.read import as_log
+from cangauge.logs.read import CellColumns, as_log
 from cangauge.model.model_file import FunctionFields, Model, as_model
 from cangauge.model.prior import ChemistryName
 
@@ -198,6 +197,8 @@ class Judgement:
         )
         if self.cause.verdict == "voltage_sensor":
             reads = "and the logged voltage contradict each other"
+        elif self.cause.verdict == "weak_cell":
+            reads = "holds for the mean cell, not for the weakest"
         elif not is_clear:
             reads = f"is not right, though its SoC at the end may be ({error})"
         return f"The gauge {reads}. {self.reason}"
