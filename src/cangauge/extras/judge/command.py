@@ -12,7 +12,7 @@ from cangauge._files import atomic_path, write_texts_atomic
 from cangauge._text import number, printable
 from cangauge.cli.options import (
     JsonOption,
-    Reading,
+    ReadingOptions,
     ReportOption,
     check_outputs,
     option_groups,
@@ -72,7 +72,7 @@ def judge_command(  # noqa: PLR0917 - typer passes options by name
         ),
     ] = None,
     *,
-    reading: Reading,
+    reading: ReadingOptions,
     report: ReportOption = None,
     json_output: JsonOption = False,
 ) -> None:
