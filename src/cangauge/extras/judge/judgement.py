@@ -15,7 +15,7 @@ from cangauge.errors import InputError
 from cangauge.extras.judge.causes import NAMES, PRIOR_NONE, Explanation, Priors, Track, explain
 from cangauge.extras.judge.causes import UNITS as PACK_UNITS
 from cangauge.extras.judge.chain import Stretch, stretches_of
-from cangauge.extras.judge.weak import WeakCell, weak_cell
+from cangauge.extras.judge.weak import WeakestCell, weak_cell
 from cangauge.logs.log import Log
 from cangauge.logs.read import CellColumns, as_log
 from cangauge.model.model_file import FunctionFields, Model, as_model
@@ -114,7 +114,7 @@ class Judgement:
     corrected_std_pct: list[FloatArray]
     chain: list[Stretch]
     explanations: list[Explanation]
-    weakest: WeakCell | None = None
+    weakest: WeakestCell | None = None
 
     @property
     def days(self) -> int:
@@ -354,7 +354,7 @@ def _weakest(
     model: Model,
     chain: Sequence[Stretch],
     explanations: Sequence[Explanation],
-) -> WeakCell | None:
+) -> WeakestCell | None:
     """Return the weakest cell by the SoC of the likeliest answer."""
     best = max(explanations, key=lambda each: each.log_evidence)
     parts, first = [], 1
@@ -421,7 +421,7 @@ def _judgement(
     model: Model,
     chain: list[Stretch],
     explanations: list[Explanation],
-    weak: WeakCell | None,
+    weak: WeakestCell | None,
 ) -> Judgement:
     if weak is not None:
         none = next(each for each in explanations if each.name == "none")
@@ -470,7 +470,7 @@ def _judgement(
     return replace(partial, jumps=_jumps(partial))
 
 
-def _of_weak_cell(none: Explanation, weak: WeakCell) -> Explanation:
+def _of_weak_cell(none: Explanation, weak: WeakestCell) -> Explanation:
     """Return the answer "weak cell": the pack's signals are as without a fault."""
     prior = np.log((1.0 - PRIOR_NONE) / (len(NAMES) - 1) / PRIOR_NONE)
     return replace(

@@ -27,7 +27,7 @@ MAD: Final = 1.4826
 """Standard deviation over median absolute deviation of a normal distribution."""
 
 
-class WeakCell(NamedTuple):
+class WeakestCell(NamedTuple):
     """The weakest cell."""
 
     number: int
@@ -45,7 +45,7 @@ def weak_cell(
     slope_v: Sequence[FloatArray],
     current_a: Sequence[FloatArray],
     first: int = 1,
-) -> WeakCell | None:
+) -> WeakestCell | None:
     """Return the weakest cell; None where the logs do not compare capacities.
 
     Parameters
@@ -74,4 +74,4 @@ def weak_cell(
     k = int(np.argmax(lack))
     gain = WEAK_STD_PCT**2 / (WEAK_STD_PCT**2 + spread**2)
     log_factor = float(np.logaddexp.reduce(factors) - np.log(lack.size))
-    return WeakCell(first + k, log_factor, gain * float(lack[k]), float(np.sqrt(gain)) * spread)
+    return WeakestCell(first + k, log_factor, gain * float(lack[k]), float(np.sqrt(gain)) * spread)
