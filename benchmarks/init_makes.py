@@ -26,7 +26,7 @@ from pathlib import Path
 import can
 import numpy as np
 
-from cangauge.extras.discovery.pairs import Candidate
+from cangauge.extras.discovery.pairs import SignalCandidate
 from cangauge.extras.discovery.search import Findings, search
 from frame_layouts import STEP_S, Bits, Frame, encode
 
@@ -579,7 +579,7 @@ def capture(data: Path, make: Make) -> Iterator[can.Message]:
 
 
 def rank(
-    found: tuple[Candidate, ...], wanted: tuple[int, Bits], messages: list[can.Message]
+    found: tuple[SignalCandidate, ...], wanted: tuple[int, Bits], messages: list[can.Message]
 ) -> int | None:
     """Return the place of a signal among candidates, None where it is not among them.
 

@@ -76,3 +76,12 @@ def loaded_first(tree: ast.Module, trees: dict[str, ast.Module]) -> set[str]:
             parts = {f"{node.module}.{alias.name}" for alias in node.names} & trees.keys()
             names |= parts or {node.module}
     return names & trees.keys()
+
+
+def test_a_class_name_stands_for_one_thing(project: Path) -> None:
+    places: dict[str, list[str]] = {}
+    for name, tree in modules(project):
+        for node in ast.walk(tree):
+            if isinstance(node, ast.ClassDef):
+                places.setdefault(node.name, []).append(name)
+    assert {each: names for each, names in places.items() if len(names) > 1} == {}

@@ -20,7 +20,7 @@ from benchmarks.weights import engine, packs
 from cangauge.extras.validation.twin.drive import draw_drive
 from cangauge.extras.validation.twin.faults import Fault, fault_kind, fault_kinds
 from cangauge.extras.validation.twin.injection import fit_surrogate_pack, inject
-from cangauge.extras.validation.twin.pack import Pack
+from cangauge.extras.validation.twin.pack import TwinPack
 from cangauge.extras.validation.twin.recording import record_drive, rms
 from cangauge.extras.validation.twin.simulation import draw_plant
 from cangauge.logs.log import Log
@@ -153,7 +153,7 @@ def _start(log: Log) -> float:
     return float(log.soc_pct[np.flatnonzero(np.isfinite(log.soc_pct))[0]])
 
 
-def draw_recorded(item: dict[str, Any], pack: packs.PackLogs, own: Pack | None = None) -> Split:
+def draw_recorded(item: dict[str, Any], pack: packs.PackLogs, own: TwinPack | None = None) -> Split:
     """Inject the effects of a split into recorded logs."""
     by_name = {log.name: log for log in pack.logs}
     logs, references = ([by_name[x] for x in item[key]] for key in ("logs", "references"))
@@ -187,7 +187,7 @@ def _thin(log: Log) -> Log:
     return packs.thinned(log, 1.0)
 
 
-def made_pack(plant_name: str, seed: int, folder: Path) -> tuple[packs.PackLogs, Pack | None]:
+def made_pack(plant_name: str, seed: int, folder: Path) -> tuple[packs.PackLogs, TwinPack | None]:
     """Simulate ten healthy drives of a pack, once; they take faults as recorded logs do.
 
     The faults of a twin's pack act on its own physics, those of a PyBaMM pack on a surrogate.

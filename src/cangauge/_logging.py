@@ -64,7 +64,7 @@ def logging_to(
     `level` is the lowest one written; other libraries are limited to errors, unless it is "debug".
     """
     handler = _Handler(stream or sys.stderr)
-    handler.setFormatter(_Json() if log_format == "json" else _Text())
+    handler.setFormatter(_JsonFormat() if log_format == "json" else _TextFormat())
     limiter = RateLimitFilter(handler.write)
     handler.addFilter(limiter)
     # python-can logs and raises the same error, at each attempt to open a missing bus.
@@ -130,7 +130,7 @@ class _Handler(logging.StreamHandler[TextIO]):
         """Ignore errors: a closed stderr must not end the service, and cannot be reported."""
 
 
-class _Text(logging.Formatter):
+class _TextFormat(logging.Formatter):
     """`2026-10-17T08:30:00.123Z WARNING bus.lost: socketcan can0 is down (retry_s=1)`."""
 
     def format(self, record: logging.LogRecord) -> str:
@@ -143,7 +143,7 @@ class _Text(logging.Formatter):
         return printable(" ".join((f"{line} ({pairs})" if pairs else line).splitlines()))
 
 
-class _Json(logging.Formatter):
+class _JsonFormat(logging.Formatter):
     """One JSON object per line: `time`, `level`, `event`, `message`, `logger` and the fields."""
 
     def format(self, record: logging.LogRecord) -> str:

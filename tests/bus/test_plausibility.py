@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from cangauge.bus.plausibility import (
     ConstantDetector,
-    Pack,
+    PackProperties,
     SignalChecks,
     SignalHealth,
     StuckDetector,
@@ -80,7 +80,7 @@ def test_a_spike_is_refused_and_a_lasting_step_accepted() -> None:
 
 
 def test_limits_of_a_pack_hold_where_none_are_stated() -> None:
-    pack = Pack(0.1, 0.5, 50.0, usual_v=400.0)
+    pack = PackProperties(0.1, 0.5, 50.0, usual_v=400.0)
     voltage = SignalChecks(highest=500.0).within_pack("voltage", pack)
     assert (voltage.lowest, voltage.highest) == (200.0, 500.0)
     warm = SignalChecks().within_pack("temperature", pack)
@@ -123,7 +123,7 @@ def test_pauses_and_losses_do_not_distort_the_period() -> None:
 
 # --- Stuck
 
-PACK = Pack(resistance_ohm=0.1, error_std_v=0.5, capacity_ah=50.0, usual_v=370.0)
+PACK = PackProperties(resistance_ohm=0.1, error_std_v=0.5, capacity_ah=50.0, usual_v=370.0)
 Signal = Callable[[float], float]
 
 
@@ -140,7 +140,7 @@ def stuck_from(
 ) -> tuple[float | None, float | None]:
     """Return when current and voltage first count as stuck [s]."""
     detectors: tuple[StuckDetector, StuckDetector]
-    detectors = stuck_detectors(PACK, steps=(step, step), after_s=(10.0, 10.0))
+    detectors = stuck_detectors(PACK, steps=(step, min(step, step_v or step)), after_s=(10.0, 10.0))
     found: list[float | None] = [None, None]
     for number in range(int(seconds * 10.0)):
         now_s = number / 10.0
@@ -156,6 +156,11 @@ def test_a_frozen_signal_is_stuck_while_its_partner_swings() -> None:
     assert current is None
     assert voltage is not None
     assert 70.0 <= voltage <= 110.0
+    # A finer voltage needs smaller swings, once it has shown its steps.
+    gentle, step_v = (lambda t: 20.0 * math.sin(t / 3.0)), 0.01
+    frozen = stuck_from(gentle, lambda t: 370.0 - 0.1 * gentle(min(t, 60.0)), 200.0, 0.5, step_v)
+    assert frozen[1] is not None
+    assert 70.0 <= frozen[1] <= 110.0
     current, voltage = stuck_from(lambda t: driving(min(t, 60.0)), under_load, 200.0)
     assert voltage is None
     assert current is not None

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cangauge.bus.database import Field
+from cangauge.bus.database import BitField
 from cangauge.bus.mapping import CheckMap, MessageMap, Overrides
 from cangauge.bus.protection import (
     CRC_ONLY_RULE,
@@ -45,7 +45,7 @@ RULES: dict[str, Protection] = {
     "07": E2eRule("e2e_07", data_id=0x12345678),
     "11": E2eRule("e2e_11", data_id=0x123),
     "11 nibble": E2eRule("e2e_11", data_id=0x123, data_id_mode="nibble"),
-    "counter": CounterRule("counter", Field(4, 4, big_endian=False), 8, 15),
+    "counter": CounterRule("counter", BitField(4, 4, big_endian=False), 8, 15),
 }
 MODULI = {"leaf": 4, "generic": 16, "first byte": 16, "middle": 16, "counter": 15, "01": 15,
           "02": 16, "04": 1 << 16, "05": 256, "06": 256, "07": 1 << 32, "11": 15}  # fmt: skip

@@ -12,7 +12,7 @@ import pytest
 
 from cangauge.bus.captures import open_capture
 from cangauge.extras.discovery.fields import collect
-from cangauge.extras.discovery.pairs import Candidate
+from cangauge.extras.discovery.pairs import SignalCandidate
 from cangauge.extras.discovery.search import Findings, search
 from drive_captures import CARS, Bits, Car, Frame, capture
 from init_makes import HELD_OUT, evaluate
@@ -27,7 +27,7 @@ def searched(name: str) -> Findings:
     return search(capture(SEARCHED[name]))
 
 
-def rank(found: tuple[Candidate, ...], wanted: tuple[int, Bits]) -> int:
+def rank(found: tuple[SignalCandidate, ...], wanted: tuple[int, Bits]) -> int:
     """Return the place of a signal among candidates, 99 if it is not there; zeros above may be."""
     number, bits = wanted
     last = int(bits.places()[-1])

@@ -153,6 +153,8 @@ def test_heartbeat_waits_briefly_for_the_next_sample(serve: Callable[..., Served
     port, _ = serve(SimulatedPort(frames_every(0.1, 5.0, from_s=0.004)), 5.0)
     expected = [pytest.approx(0.1 * number + 0.004) for number in range(1, 10)]
     assert [round(at_s, 3) for at_s, _ in port.published[1:10]] == expected
+    read = [SocReader().read(frame) for _, frame in port.sent]
+    assert [each.samples for each in read if isinstance(each, SocDetail)][:5] == [1, 11, 21, 31, 41]
 
 
 @pytest.mark.parametrize("rate", [40.0, -3.0])

@@ -100,6 +100,13 @@ def test_a_reload_ignores_the_initial_soc(car: Car) -> None:
     assert car.service.reconfigure() is not None
     car.drive(1000, 1001)
     assert car.pipeline.latest.soc_pct == pytest.approx(before.soc_pct, abs=0.05)
+    # Nor where none is known yet: the first one stays.
+    car.write("")
+    fresh = Car(car.path.parent)
+    fresh.path.write_text('model = "model.json"\ninitial_soc = 20\n')
+    assert fresh.service.reconfigure() is not None
+    fresh.drive(0, 10)
+    assert fresh.pipeline.latest.soc_pct == pytest.approx(80.0, abs=1.0)
 
 
 PACK_IDS = (0x5A2, 0x5A3)

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 from cangauge.extras.validation.twin.drive import Drive, draw_drive
-from cangauge.extras.validation.twin.pack import Pack, draw_pack
+from cangauge.extras.validation.twin.pack import TwinPack, draw_pack
 from cangauge.extras.validation.twin.plant import TwinPlant
 
 
 @pytest.fixture(scope="session")
-def pack() -> Pack:
+def pack() -> TwinPack:
     """A 96-cell pack with a sampling rate of 1 Hz."""
     for seed in range(100):
         found = draw_pack(np.random.default_rng(seed), "leaf24")
@@ -21,12 +21,12 @@ def pack() -> Pack:
 
 
 @pytest.fixture(scope="session")
-def plant(pack: Pack) -> TwinPlant:
+def plant(pack: TwinPack) -> TwinPlant:
     return TwinPlant(pack)
 
 
 @pytest.fixture(scope="session")
-def drive(pack: Pack) -> Drive:
+def drive(pack: TwinPack) -> Drive:
     """A cool drive from 90 % to 10 % SoC."""
     return draw_drive(
         np.random.default_rng(3),

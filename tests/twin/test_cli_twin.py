@@ -16,7 +16,7 @@ from cangauge.extras.validation import simulate
 from cangauge.extras.validation.twin import simulation
 from cangauge.extras.validation.twin.drive import read_speed
 from cangauge.extras.validation.twin.faults import parse_effect
-from cangauge.extras.validation.twin.pack import Pack
+from cangauge.extras.validation.twin.pack import TwinPack
 from cangauge.extras.validation.twin_command import twin_command
 from cangauge.logs.read import read_log
 from cangauge.model.coulomb_counting import capacity_from_full_discharge
@@ -153,7 +153,7 @@ def test_bad_usage_is_refused(
         ("hysteresis:gap_v=1,reach=7", "within"),
     ],
 )
-def test_invalid_effect_is_refused(text: str, message: str, pack: Pack) -> None:
+def test_invalid_effect_is_refused(text: str, message: str, pack: TwinPack) -> None:
     with pytest.raises(InputError, match=message):
         parse_effect(text, pack, seed=1, default_gap_v=1.0)
 

@@ -16,7 +16,7 @@ from cangauge.extras.validation.twin.faults import (
     fault_kinds,
     finite_warburg,
 )
-from cangauge.extras.validation.twin.pack import Pack
+from cangauge.extras.validation.twin.pack import TwinPack
 from cangauge.extras.validation.twin.plant import TwinPlant
 from cangauge.extras.validation.twin.recording import (
     GroundTruth,
@@ -39,7 +39,7 @@ WANTED_V = 0.4
 
 
 @pytest.fixture(scope="module")
-def demanding_drive(pack: Pack) -> Drive:
+def demanding_drive(pack: TwinPack) -> Drive:
     """A cold drive with pack heating and a stop at a charger: it shows every fault."""
     drawn = draw_drive(
         np.random.default_rng(8),
@@ -89,7 +89,7 @@ def test_fault_is_scaled_to_the_gap(
 
 
 @pytest.mark.parametrize("fault_id", ALL)
-def test_fault_of_size_zero_changes_nothing(fault_id: str, pack: Pack) -> None:
+def test_fault_of_size_zero_changes_nothing(fault_id: str, pack: TwinPack) -> None:
     assert apply_faults(pack, (Fault(fault_id, 0.0),)) is HEALTHY
 
 
@@ -201,14 +201,14 @@ def test_intermittent_is_active_for_its_share() -> None:
     assert 0 < np.mean(on[-40000:]) < 0.6
 
 
-def test_unreachable_gap_is_reported_as_limited(plant: TwinPlant, pack: Pack) -> None:
+def test_unreachable_gap_is_reported_as_limited(plant: TwinPlant, pack: TwinPack) -> None:
     gentle = draw_drive(np.random.default_rng(1), pack, hours=0.5, ambient_c=25.0, start_soc=0.9)
     scaled = scale_to_gap(plant, [gentle], Fault("temperature_lag", 1.0), 5.0)
     assert scaled.limited
     assert scaled.reached_v < 1.0
 
 
-def test_unknown_and_repeated_faults_are_refused(pack: Pack) -> None:
+def test_unknown_and_repeated_faults_are_refused(pack: TwinPack) -> None:
     with pytest.raises(InputError, match="unknown effect"):
         fault_kind("gremlins")
     with pytest.raises(InputError, match="twice"):

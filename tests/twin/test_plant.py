@@ -12,7 +12,7 @@ from scipy.signal import lsim
 
 from cangauge.extras.validation.twin.condition import HEALTHY
 from cangauge.extras.validation.twin.drive import Drive, draw_drive
-from cangauge.extras.validation.twin.pack import KINDS, Pack, draw_pack
+from cangauge.extras.validation.twin.pack import KINDS, TwinPack, draw_pack
 from cangauge.extras.validation.twin.plant import TwinPlant, lagged, relax, temperatures
 from cangauge.extras.validation.twin.recording import simulate_truth, true_soc_pct
 
@@ -47,7 +47,7 @@ def test_chemical_energy_is_work_plus_heat(plant: TwinPlant, drive: Drive) -> No
     assert 0.005 * work < chemical - work < 0.2 * work
 
 
-def test_heat_is_stored_or_lost_to_ambient(pack: Pack, drive: Drive) -> None:
+def test_heat_is_stored_or_lost_to_ambient(pack: TwinPack, drive: Drive) -> None:
     truth = simulate_truth(TwinPlant(pack), drive)
     core, surface = temperatures(pack, drive, truth.heat_w)
     assert np.max(np.abs(core - truth.core_c)) < 0.05  # temperatures and heat are consistent

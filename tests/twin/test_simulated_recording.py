@@ -9,16 +9,16 @@ import pytest
 
 from cangauge.extras.validation.twin.drive import Drive, draw_drive
 from cangauge.extras.validation.twin.faults import Fault
-from cangauge.extras.validation.twin.pack import Pack, draw_pack
+from cangauge.extras.validation.twin.pack import TwinPack, draw_pack
 from cangauge.extras.validation.twin.plant import TwinPlant
 from cangauge.extras.validation.twin.recording import record_drive, rms
 
 
-def with_sensors(pack: Pack, **changes: float) -> Pack:
+def with_sensors(pack: TwinPack, **changes: float) -> TwinPack:
     return replace(pack, sensors=replace(pack.sensors, **changes))
 
 
-def test_values_are_quantized(pack: Pack, drive: Drive) -> None:
+def test_values_are_quantized(pack: TwinPack, drive: Drive) -> None:
     plant = TwinPlant(
         with_sensors(pack, current_step_a=0.5, voltage_step_v=0.25, temperature_step_k=1.0)
     )

@@ -174,8 +174,6 @@ class Capture:
             if last.damage is not None:
                 raise last.damaged()
             raise InputError("the capture holds no frames", source=self.path, cure=_CURE)
-        for reader in self._readers:
-            reader.refuse_junk()
 
     def _read(self, path: Path) -> Iterator[can.Message]:
         with self._kind(path) as reader:
@@ -190,11 +188,9 @@ class Capture:
             message.timestamp = max(ticks - 1, 0) * period_s
             yield message
         if not ticks and any(each.frames for each in self._readers):
-            raise InputError(
-                f"no time stamps, and no frames of 0x{number:X} to count time by",
-                source=self.path,
-                cure="record it with stamps, for instance by candump -l",
-            )
+            problem = f"no time stamps, and no frames of 0x{number:X} to count time by"
+            cure = "record it with stamps, for instance by candump -l"
+            raise InputError(problem, source=self.path, cure=cure)
 
 
 def find_capture(path: str | PathLike[str], *, clock: tuple[int, float] = CLOCK) -> Capture | None:

@@ -15,7 +15,6 @@ import sys
 import time
 from collections import Counter, deque
 from collections.abc import Sequence
-from types import TracebackType
 from typing import Final, Self
 
 import can
@@ -107,16 +106,14 @@ class BusConnection:
 
     Attributes
     ----------
-    garbled : int
-        Packets that were no CAN frames (on `udp_multicast`, which carries other packets too).
+    garbled, unsent : int
+        Packets that were no CAN frames (`udp_multicast` carries others too); frames dropped
+        because the transmit queue stayed full (no other node?), or without a bus.
     error_frames, error_kinds : int, Counter of str
         Error frames of the controller, and their kinds; one frame may have several.
-    is_off : bool
-        Whether the controller reported bus-off, with no frame received since.
-    unsent : int
-        Frames dropped because the transmit queue stayed full (no other node?), or without a bus.
-    is_drained : bool
-        Whether the receive queue was empty after the latest call that received.
+    is_off, is_drained : bool
+        Whether the controller reported bus-off, with no frame received since; whether the receive
+        queue was empty after the latest call that received.
     foreign, polls : int, PollCounts or None
         Set by the service's loop: frames of others with its ids; outcomes of its requests.
     """
@@ -141,12 +138,7 @@ class BusConnection:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     def close(self) -> None:

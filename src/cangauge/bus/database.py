@@ -48,7 +48,7 @@ logging.getLogger("cantools").addHandler(logging.NullHandler())
 
 
 @dataclass(frozen=True, slots=True)
-class Field:
+class BitField:
     """Bits of a payload, as an unsigned number.
 
     `shift` is the lowest bit and `width` the number of bits, in the payload read as one number of
@@ -75,7 +75,7 @@ class Field:
         payload[:] = word.to_bytes(len(payload), self.order)
 
     @classmethod
-    def of(cls, signal: Signal, length: int) -> Field:
+    def of(cls, signal: Signal, length: int) -> BitField:
         """Return the bits of a signal in a payload of `length` bytes (DBC bit numbering)."""
         if signal.byte_order == "little_endian":
             return cls(signal.start, signal.length, big_endian=False)
@@ -84,10 +84,10 @@ class Field:
 
 
 @dataclass(frozen=True, slots=True)
-class Condition:
+class MultiplexCondition:
     """Multiplexer values with which a signal is present in a frame."""
 
-    field: Field
+    field: BitField
     values: frozenset[int]
 
 
@@ -99,11 +99,11 @@ class SignalCodec:
     ----------
     name, unit, factor, offset : str, float
         In the DBC.
-    field, is_signed, float_format : Field, bool, str
+    field, is_signed, float_format : BitField, bool, str
         Bits; `float_format` is the `struct` format of an IEEE float, "" for integers.
     not_available : frozenset of int
         Raw codes without a value.
-    conditions : tuple of Condition
+    conditions : tuple of MultiplexCondition
         All must hold for the signal to be present in a frame.
 
     Attributes
@@ -114,13 +114,13 @@ class SignalCodec:
 
     name: str
     unit: str
-    field: Field
+    field: BitField
     is_signed: bool
     float_format: str
     factor: float
     offset: float
     not_available: frozenset[int]
-    conditions: tuple[Condition, ...] = ()
+    conditions: tuple[MultiplexCondition, ...] = ()
     gain: float = 1.0
     shift: float = 0.0
     decode: Decode = dataclasses.field(init=False, repr=False, compare=False)
@@ -256,8 +256,8 @@ def signal_codec(
         If the signal does not fit into its message or cannot be a number.
     """
 
-    def bits_of(each: Signal) -> Field:
-        bits, conversion = Field.of(each, message.length), each.conversion
+    def bits_of(each: Signal) -> BitField:
+        bits, conversion = BitField.of(each, message.length), each.conversion
         problem = ""
         if each.length < 1 or bits.shift < 0 or bits.shift + bits.width > 8 * message.length:
             problem = f"the signal does not fit into the {message.length} bytes of {message.name}"
@@ -275,12 +275,12 @@ def signal_codec(
         return bits
 
     bits = bits_of(signal)
-    conditions: list[Condition] = []
+    conditions: list[MultiplexCondition] = []
     selector = signal
     while (name := selector.multiplexer_signal) is not None:
         values = frozenset(selector.multiplexer_ids or ())
         selector = message.get_signal_by_name(name)
-        conditions.append(Condition(bits_of(selector), values))
+        conditions.append(MultiplexCondition(bits_of(selector), values))
     for name, value in (when or {}).items():
         other = _signal(message, name)
         if other is None:
@@ -288,7 +288,7 @@ def signal_codec(
             raise InputError(problem, source=str(source), field=f"{field}.when", value=name)
         other_bits = bits_of(other)
         raw = value & ((1 << other_bits.width) - 1)
-        conditions.append(Condition(other_bits, frozenset({raw})))
+        conditions.append(MultiplexCondition(other_bits, frozenset({raw})))
     conversion = signal.conversion
     return SignalCodec(
         name=signal.name,

@@ -13,7 +13,7 @@ from cangauge.bus.database import SignalCodec
 from cangauge.bus.plausibility import (
     ConstantDetector,
     MessageStatistics,
-    Pack,
+    PackProperties,
     SignalHealth,
     stuck_detectors,
 )
@@ -197,7 +197,7 @@ class SampleDecoder:
     Parameters
     ----------
     vehicle : Vehicle
-    pack : Pack, optional
+    pack : PackProperties, optional
         Pack properties from the model. Without them only stated limits apply and no signal counts
         as stuck: a capture with a wrong scale then shows as such, not as a missing signal.
 
@@ -211,7 +211,7 @@ class SampleDecoder:
         Latest cell voltages, where the vehicle has them.
     """
 
-    def __init__(self, vehicle: Vehicle, pack: Pack | None = None) -> None:
+    def __init__(self, vehicle: Vehicle, pack: PackProperties | None = None) -> None:
         self.vehicle = vehicle
         self.statistics = FrameStatistics()
         self.health: dict[str, SignalHealth] = {}
@@ -235,16 +235,13 @@ class SampleDecoder:
             # Slow signals first: a sample uses the temperature of its own frame.
             route.inputs.sort(key=lambda each: each.is_current + 2 * each.is_voltage)
         self._temperature = self.health.get("temperature")
-        self._needed = [
-            (self.health[role], missing)
-            for role, missing in _MISSING.items()
-            if role in self.health
-        ]
+        health = self.health
+        self._needed = [(health[role], why) for role, why in _MISSING.items() if role in health]
 
     def _add(
         self,
         signal: VehicleSignal,
-        pack: Pack | None,
+        pack: PackProperties | None,
         is_stuck: Callable[[float, float], bool] | None,
     ) -> None:
         route, role = self._route(signal), signal.role
@@ -393,7 +390,9 @@ class SampleDecoder:
         return math.nan if health is None else health.value_at(self.now_s)
 
 
-def _detectors(vehicle: Vehicle, pack: Pack | None) -> dict[str, Callable[[float, float], bool]]:
+def _detectors(
+    vehicle: Vehicle, pack: PackProperties | None
+) -> dict[str, Callable[[float, float], bool]]:
     """Return the stuck detectors by role."""
     detectors: dict[str, Callable[[float, float], bool]] = {}
     temperature = vehicle.temperature

@@ -10,7 +10,7 @@ import can
 import numpy as np
 
 from cangauge._typing import FloatArray
-from cangauge.bus.database import Condition
+from cangauge.bus.database import MultiplexCondition
 from cangauge.bus.time_source import MICROSECONDS
 from cangauge.bus.vehicle import LOG_COLUMNS, Vehicle, VehicleSignal
 from cangauge.errors import InputError
@@ -51,19 +51,17 @@ class FrameEncoder:
             )
         self.vehicle = vehicle
         self._counters = dict.fromkeys(vehicle.messages, 0)
-        groups: dict[tuple[int, tuple[Condition, ...]], list[VehicleSignal]] = {}
+        groups: dict[tuple[int, tuple[MultiplexCondition, ...]], list[VehicleSignal]] = {}
         for signal in vehicle.signals:
             groups.setdefault((signal.key, signal.codec.conditions), []).append(signal)
         self._frames = []
         for (key, conditions), signals in groups.items():
             is_slow = all(signal.role in {"temperature", "soc_reference"} for signal in signals)
             if not is_slow and any(other == key and more != conditions for other, more in groups):
-                raise InputError(
-                    "has multiplexed frames with current or voltage, which cannot be replayed",
-                    source=vehicle.dbc_files[0],
-                    field=signals[0].message,
-                    cure="replay as another --vehicle",
-                )
+                problem = "has multiplexed frames with current or voltage, which cannot be replayed"
+                source, where = vehicle.dbc_files[0], signals[0].message
+                cure = "replay as another --vehicle"
+                raise InputError(problem, source=source, field=where, cure=cure)
             self._frames.append(_Outgoing(signals, is_slow))
         self._frames.sort(key=lambda frame: not frame.is_slow)
 

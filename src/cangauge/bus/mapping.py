@@ -15,7 +15,7 @@ from cantools.database.can import Message
 from pydantic import AliasChoices, BaseModel, ConfigDict, Field, FiniteFloat, model_validator
 
 from cangauge._config import read_toml
-from cangauge.bus.database import Field as BitField
+from cangauge.bus.database import BitField
 from cangauge.bus.protection import (
     LIST_LENGTH,
     PROFILES,
@@ -43,11 +43,11 @@ _Positive = Annotated[FiniteFloat, Field(gt=0.0)]
 _Count = Annotated[int, Field(ge=1, le=1000)]
 
 
-class _Strict(BaseModel):
+class _MapTable(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, strict=False)
 
 
-class CheckMap(_Strict):
+class CheckMap(_MapTable):
     """Plausibility limits of a signal [A, positive = discharge; V; °C; %]; see `plausibility`.
 
     A value may differ from the latest good one by `max_jump`, plus `max_rate_per_s` for every
@@ -109,7 +109,7 @@ class TemperatureMap(SignalMap):
         return self
 
 
-class CellsMap(_Strict):
+class CellsMap(_MapTable):
     """Voltages of the cells in series: one signal a cell, or groups numbered by a signal.
 
     `signal` and `message` are names with "{n}" for the cell's number, from `first` on; or the raw
@@ -165,7 +165,7 @@ def _numbered(name: str | int | None, number: int) -> str | int | None:
     return name.format(n=number) if isinstance(name, str) else name
 
 
-class MessageMap(_Strict):
+class MessageMap(_MapTable):
     """Protection and period of a message.
 
     `protection` is one of `protection.RULES`, of [rules] or of `protection.PROFILES` (see `E2eRule`
@@ -267,7 +267,7 @@ class MessageMap(_Strict):
                 raise InputError(f"belongs to {protection}", field=name, cure=cure)
 
 
-class RuleMap(_Strict):
+class RuleMap(_MapTable):
     """A user's own protection rule; see `ProtectionRule`."""
 
     polynomial: _Byte
@@ -279,7 +279,7 @@ class RuleMap(_Strict):
     counter_shift: Annotated[int, Field(ge=0, le=7)] = 0
 
 
-class VehicleMap(_Strict):
+class VehicleMap(_MapTable):
     """Content of a map file.
 
     `dbc` are files relative to it, searched after `--dbc`. The temperature may be given as an

@@ -90,24 +90,16 @@ def bus_address(
     local_only = interface is None and channel is None and "hop_limit" not in options
     interface = interface or _guess_interface(channel)
     if interface not in can.VALID_INTERFACES:
-        raise InputError(
-            "unknown interface",
-            field="--interface",
-            value=interface,
-            cure=f"use one of: {', '.join(sorted(can.VALID_INTERFACES))}",
-        )
+        cure = f"use one of: {', '.join(sorted(can.VALID_INTERFACES))}"
+        raise InputError("unknown interface", field="--interface", value=interface, cure=cure)
     channel = _DEFAULT_CHANNELS.get(interface) if channel is None else channel
     if channel is None:
         raise InputError(f"{interface} needs a channel", field="--channel", cure="name one")
     if interface != "udp_multicast":
         return BusAddress(interface, channel, options)
     if not _is_multicast(channel):
-        raise InputError(
-            "no multicast address",
-            field="--channel",
-            value=channel,
-            cure=f"use one such as {MULTICAST_CHANNEL}",
-        )
+        cure = f"use one such as {MULTICAST_CHANNEL}"
+        raise InputError("no multicast address", field="--channel", value=channel, cure=cure)
     # 0: packets sent stay on this machine; 1 (`--bus-option hop_limit=1`): local network.
     return BusAddress(interface, channel, {"hop_limit": 0, **options}, local_only)
 
@@ -117,13 +109,10 @@ def _guess_interface(channel: str | None) -> str:
         return "socketcan"
     if channel is None or _is_multicast(channel):
         return "udp_multicast"
-    raise InputError(
-        "there is no such SocketCAN interface on this machine",
-        field="--channel",
-        value=channel,
-        cure="bring it up (sudo ip link add dev vcan0 type vcan; sudo ip link set vcan0 up),"
-        " or name the interface too, e.g. --interface udp_multicast",
-    )
+    problem = "there is no such SocketCAN interface on this machine"
+    cure = "bring it up (sudo ip link add dev vcan0 type vcan; sudo ip link set vcan0 up),"
+    cure += " or name the interface too, e.g. --interface udp_multicast"
+    raise InputError(problem, field="--channel", value=channel, cure=cure)
 
 
 def has_socketcan(channel: str) -> bool:
@@ -156,9 +145,8 @@ def parse_bus_options(given: Sequence[str]) -> dict[str, BusOption]:
     for text in given:
         key, equals, value = text.partition("=")
         if not equals or not key.isidentifier():
-            raise InputError(
-                "not of the form K=V", field="--bus-option", value=text, cure="e.g. bitrate=500000"
-            )
+            problem, cure = "not of the form K=V", "e.g. bitrate=500000"
+            raise InputError(problem, field="--bus-option", value=text, cure=cure)
         options[key] = {"true": True, "false": False}.get(value.lower(), value)
         if options[key] is value:
             for kind in (float, lambda word: int(word, 0)):
@@ -188,9 +176,8 @@ def open_bus(address: BusAddress, filters: Sequence[CanFilter] | None = None) ->
         if address.interface == "udp_multicast":
             bus = CheckedUdpBus(channel, local_only=address.local_only, **arguments)
         else:
-            bus = can.Bus(
-                channel=channel, interface=address.interface, ignore_config=True, **arguments
-            )
+            arguments |= {"interface": address.interface, "ignore_config": True}
+            bus = can.Bus(channel=channel, **arguments)
     except _DRIVER_ERRORS as error:
         raise _refusal(address, error) from error
     if address.interface in _ON_SOCKETS and sys.platform != "win32":

@@ -41,7 +41,7 @@ intervals than four periods enter as four: a pause is not a period."""
 
 
 @dataclass(frozen=True, slots=True)
-class Pack:
+class PackProperties:
     """Pack properties used for plausibility, taken from its model.
 
     `resistance_ohm` is instantaneous and positive [Ω], `error_std_v` the standard deviation of the
@@ -76,7 +76,7 @@ class SignalChecks:
         values = [(name, getattr(each, name)) for each in stated for name in CheckMap.model_fields]
         return replace(self, **{name: value for name, value in values if value is not None})
 
-    def within_pack(self, role: str, pack: Pack) -> SignalChecks:
+    def within_pack(self, role: str, pack: PackProperties) -> SignalChecks:
         """Return the checks with the physical limits of a pack where none are stated."""
         limits = {
             "current": (-CURRENT_AT_MOST_A, CURRENT_AT_MOST_A),
@@ -310,7 +310,7 @@ class StuckDetector:
 
 
 def stuck_detectors(
-    pack: Pack, *, steps: tuple[float, float], after_s: tuple[float, float]
+    pack: PackProperties, *, steps: tuple[float, float], after_s: tuple[float, float]
 ) -> tuple[StuckDetector, StuckDetector]:
     """Return coupled stuck detectors for current and voltage of one pack.
 

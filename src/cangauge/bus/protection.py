@@ -19,7 +19,7 @@ from typing import Any, Final, Literal, NamedTuple
 
 from e2e import p01, p02, p04, p05, p06, p07, p11
 
-from cangauge.bus.database import Field
+from cangauge.bus.database import BitField
 from cangauge.errors import InputError
 
 
@@ -128,7 +128,7 @@ class CounterRule:
     """
 
     name: str
-    field: Field
+    field: BitField
     length: int
     modulus: int
 
@@ -165,18 +165,12 @@ LIST_LENGTH: Final = 16
 class Profile(NamedTuple):
     """Header layout of an E2E profile, and the library's functions for it."""
 
-    header: int
-    """Bytes."""
-    counter_at: int
-    """First byte of the counter in the header."""
-    counter_bytes: int
-    """Big-endian; 0: the low half of the byte."""
-    modulus: int
-    """Counter values: profiles 1 and 11 leave 15 out."""
-    id_bits: int
-    """Width of the data id; 0: a list of 16 bytes."""
-    modes: Mapping[str, int]
-    """Modes of the data id in the CRC, where there is a choice."""
+    header: int  # bytes
+    counter_at: int  # first byte of the counter in the header
+    counter_bytes: int  # big-endian; 0: the low half of the byte
+    modulus: int  # profiles 1 and 11 leave 15 out
+    id_bits: int  # width of the data id; 0: a list of 16 bytes
+    modes: Mapping[str, int]  # of the data id in the CRC, where there is a choice
     check: Callable[..., bool]
     protect: Callable[..., None]
 
@@ -269,16 +263,13 @@ class E2eRule:
     def protect(self, data: bytes | bytearray, counter: int) -> bytes:
         """Return the payload with header, counter (modulo its width) and CRC set."""
         profile, out = self._profile, bytearray(data)
-        place = self.header_byte + profile.counter_at
-        counter %= profile.modulus
-        if profile.counter_bytes:
-            end = place + profile.counter_bytes
-            out[place:end] = counter.to_bytes(profile.counter_bytes, "big")
+        place, counter = self.header_byte + profile.counter_at, counter % profile.modulus
+        if size := profile.counter_bytes:
+            out[place : place + size] = counter.to_bytes(size, "big")
         else:
             out[place] = out[place] & 0xF0 | counter
-        profile.protect(
-            out, self.data_ids or self.data_id, increment_counter=False, **self._arguments
-        )
+        data_id = self.data_ids or self.data_id
+        profile.protect(out, data_id, increment_counter=False, **self._arguments)
         return bytes(out)
 
 
@@ -290,14 +281,10 @@ Protection = ProtectionRule | CounterRule | E2eRule
 class Verdict(enum.IntEnum):
     """Result of checking the CRC and the counter of a frame."""
 
-    GOOD = 0
-    """The expected frame."""
-    AFTER_LOSS = 1
-    """A good frame; frames before it are missing."""
-    CRC_WRONG = 2
-    """Refused: damaged."""
-    REPEATED = 3
-    """Refused: the counter did not change, so this is not a new frame."""
+    GOOD = 0  # the expected frame
+    AFTER_LOSS = 1  # a good frame; frames before it are missing
+    CRC_WRONG = 2  # refused: damaged
+    REPEATED = 3  # refused: the counter did not change, so this is not a new frame
 
 
 SILENCE_S: Final = 2.0
@@ -305,7 +292,6 @@ SILENCE_S: Final = 2.0
 WIDE: Final = 256
 """A counter with at least this many values does not wrap within a normal loss. If it steps back
 sooner, the sender restarted or frames came out of order: no loss is proven."""
-
 SOON: Final = 0.8
 """A frame this soon after the one before [periods] is not the next one of the same sender: senders
 keep their period within some percent."""
@@ -337,9 +323,8 @@ class FrameChecker:
     def __init__(self, rule: Protection, period_s: float | None = None) -> None:
         self._is_whole, self._counter, self._modulus = rule.is_whole, rule.counter, rule.modulus
         self._period_s = period_s
-        self._half_wrap_s = (
-            SILENCE_S if period_s is None else period_s * min(rule.modulus, WIDE) / 2
-        )
+        wrap_s = 2.0 * SILENCE_S if period_s is None else period_s * min(rule.modulus, WIDE)
+        self._half_wrap_s = wrap_s / 2
         self._last, self._last_s = -1, 0.0
         self._refused, self._odd = 0, 0.0
         self._content: bytes | bytearray = b""

@@ -37,8 +37,6 @@ DETAIL_EVERY_BEATS: Final = 10
 """Periods of the frames: [s] of log time, and beats of `ESTIMATE_EVERY_S`."""
 EARLY_S: Final = 0.01
 """A sample may be this early for a frame that is due [s]: else jitter could halve the rate."""
-AGE_AT_MOST_S: Final = 30.0
-"""Largest age in SOC_ESTIMATE [s]."""
 SAMPLES_MODULO: Final = 1 << 16
 """Modulus of the sample count in SOC_DETAIL."""
 ACKNOWLEDGE_EVERY: Final = 4
@@ -305,7 +303,7 @@ class SocPublisher:
 
     def estimate_frame(self, estimate: Estimate, age_s: float = 0.0) -> can.Message:
         """Return SOC_ESTIMATE with the next counter; arguments as in `beat`."""
-        age_s = age_s if math.isnan(age_s) else min(math.floor(age_s), AGE_AT_MOST_S)
+        age_s = age_s if math.isnan(age_s) else math.floor(age_s)
         soc_pct, std_pct = estimate.soc_pct, estimate.soc_std_pct
         return self._frame(
             "soc_estimate",

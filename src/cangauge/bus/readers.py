@@ -133,19 +133,11 @@ class CaptureReader(MessageReader, ABC):
         self.malformed += 1
         if self.first_malformed is None:
             self.first_malformed = line
-        if self.malformed > FEW_MALFORMED:
-            self.refuse_junk()
-
-    def refuse_junk(self) -> None:
-        """Raise InputError if more lines are malformed than are frames."""
-        if self.malformed > self.frames:
+        if self.malformed > FEW_MALFORMED and self.malformed > self.frames:
             where = "" if self.first_malformed is None else f", the first is {self.first_malformed}"
-            raise InputError(
-                f"{self.malformed} {self.unit} are no frames of {self.name}{where},"
-                f" and only {self.frames} are",
-                source=self.source,
-                cure="record or export it again",
-            )
+            problem = f"{self.malformed} {self.unit} are no frames of {self.name}{where}"
+            problem += f", and only {self.frames} are"
+            raise InputError(problem, source=self.source, cure="record or export it again")
 
 
 class BinaryReader(CaptureReader, BinaryIOMessageReader):

@@ -127,87 +127,63 @@ def log_of(
     if vehicle is None:
         raise capture_without_vehicle(recording.path)
     if temperature_c is not None:
-        vehicle = replace(
-            vehicle,
-            temperature=None,
-            fixed_temperature_c=temperature_c,
-            temperature_source="unknown",
-        )
+        vehicle = replace(vehicle, temperature=None, fixed_temperature_c=temperature_c)
+        vehicle = replace(vehicle, temperature_source="unknown")
     log = capture_to_log(recording.path, vehicle)
     return (
         log if temperature_source is None else replace(log, temperature_source=temperature_source)
     )
 
 
-def open_recording(path: str | PathLike[str]) -> LogFile | Capture:
-    """Open a file as a log or a capture, recognised by its beginning; InputError if neither."""
-    path = as_path(path)
-    if parts_of_run(path):
-        return open_capture(path)
-    log_file = open_log(path)
-    if log_file.reader is not None:
-        return log_file
-    capture = find_capture(path)
-    if capture is None:
-        raise not_recognised(
-            log_file,
-            "not a known kind of log, nor of capture",
-            f"known logs: {KNOWN_LOGS}; known captures (with --vehicle or --dbc and --map):"
-            f" {KNOWN_CAPTURES}",
-        )
-    return capture
-
-
-def open_with_columns(
-    path: Path,
+def open_recording(
+    path: str | PathLike[str],
     *,
     columns: ColumnMap | None = None,
     mapped: ColumnMap | None = None,
     sign: Sign | None = None,
 ) -> LogFile | Capture:
-    """Open a log by stated columns, or any recording by its content.
+    """Open a file as a log or a capture, recognised by its beginning; InputError if neither.
 
     `columns` are the user's: the file is then a table. `mapped` are a map file's, for tables of no
     known format. `sign` is what a positive current in a log does.
     """
-    if columns is not None:
-        return open_log(path, columns=columns, sign=sign)
-    if mapped is not None and path.is_file():  # not the name of a recording's parts
-        log_file = open_log(path)
-        is_unknown = log_file.reader is None and find_capture(path) is None
-        if log_file.is_any_table or is_unknown:
-            return open_log(path, columns=mapped, sign=sign)
-    recording = open_recording(path)
-    return replace(recording, sign=sign) if isinstance(recording, LogFile) else recording
+    path = as_path(path)
+    if columns is None and parts_of_run(path):
+        return open_capture(path)
+    log_file = open_log(path, columns=columns, sign=sign)
+    is_mapped = mapped is not None and log_file.is_any_table
+    if columns is not None or (log_file.reader is not None and not is_mapped):
+        return log_file
+    capture = None if is_mapped else find_capture(path)
+    if capture is not None:
+        return capture
+    if mapped is not None:
+        return open_log(path, columns=mapped, sign=sign)
+    problem = "not a known kind of log, nor of capture"
+    cure = f"known logs: {KNOWN_LOGS}; known captures (with --vehicle or --dbc and --map):"
+    raise not_recognised(log_file, problem, f"{cure} {KNOWN_CAPTURES}")
 
 
 def refuse_single_row(recorded: Sized) -> None:
     """Raise InputError for a log of one row: no charge can be counted."""
     if len(recorded) < 2:
-        raise InputError(
-            "a single row: charge is counted from one row to the next",
-            source=getattr(recorded, "source", None),
-            cure="give a log of minutes or hours",
-        )
+        problem = "a single row: charge is counted from one row to the next"
+        source, cure = getattr(recorded, "source", None), "give a log of minutes or hours"
+        raise InputError(problem, source=source, cure=cure)
 
 
 def refuse_sign_of_capture(recording: LogFile | Capture, sign: str | None) -> None:
     """Raise InputError if the sign of current is stated for a capture."""
     if sign is not None and not isinstance(recording, LogFile):
-        raise InputError(
-            "this is a capture, whose map states the sign",
-            source=recording.path,
-            field="--sign",
-            value=sign,
-            cure="set sign = -1 under [current] of the map file",
-        )
+        problem = "this is a capture, whose map states the sign"
+        cure = "set sign = -1 under [current] of the map file"
+        raise InputError(problem, source=recording.path, field="--sign", value=sign, cure=cure)
 
 
 def capture_without_vehicle(path: str | PathLike[str]) -> InputError:
     """Return the error for a capture whose vehicle is not given."""
-    return InputError(
-        "this is a CAN capture, not a log", source=path, cure="give --vehicle, or --dbc and --map"
-    )
+    cure = "give --vehicle, or --dbc and --map"
+    return InputError("this is a CAN capture, not a log", source=path, cure=cure)
 
 
 # --- Captures by a vehicle
@@ -331,12 +307,10 @@ def capture_to_log(
     keep = time_s > np.concatenate([[-np.inf], np.maximum.accumulate(time_s)[:-1]])
     dropped = np.count_nonzero(~keep)
     if dropped > 0.5 * keep.size:
-        raise InputError(
-            "time runs backwards or does not advance in the capture",
-            source=path,
-            cure="split it where time starts again; record with absolute stamps (candump -l, not"
-            " -td); of a replay at full speed, take the replay clock as time",
-        )
+        problem = "time runs backwards or does not advance in the capture"
+        cure = "split it where time starts again; record with absolute stamps (candump -l, not"
+        cure += " -td); of a replay at full speed, take the replay clock as time"
+        raise InputError(problem, source=path, cure=cure)
     if dropped:
         remarks.append(f"{dropped} samples dropped whose time does not advance")
     values = {name: getattr(samples, name)[keep] for name in ("time_s", *LOG_COLUMNS.values())}
@@ -366,12 +340,9 @@ def _fill_voltage(
     is_known = np.isfinite(voltage_v)
     known, missing = np.flatnonzero(is_known), np.flatnonzero(~is_known)
     if not known.size:
-        raise InputError(
-            "the capture gives no voltage that pairs with a current",
-            source=path,
-            field=vehicle.voltage.message,
-            cure="check the mapping, and pair_within_s",
-        )
+        problem = "the capture gives no voltage that pairs with a current"
+        where, cure = vehicle.voltage.message, "check the mapping, and pair_within_s"
+        raise InputError(problem, source=path, field=where, cure=cure)
     right = np.searchsorted(known, missing)
     inside = (right > 0) & (right < known.size)
     missing, right = missing[inside], right[inside]
@@ -390,12 +361,9 @@ def _fill_temperature(
     temperature_c = values["temperature_c"]
     rows = np.flatnonzero(np.isfinite(temperature_c))
     if not rows.size:
-        raise InputError(
-            "the capture gives no temperature",
-            source=path,
-            field=None if vehicle.temperature is None else vehicle.temperature.message,
-            cure="give --temperature °C",
-        )
+        where = None if vehicle.temperature is None else vehicle.temperature.message
+        problem, cure = "the capture gives no temperature", "give --temperature °C"
+        raise InputError(problem, source=path, field=where, cure=cure)
     if missing := temperature_c.size - rows.size:
         latest = np.searchsorted(rows, np.arange(temperature_c.size), side="right") - 1
         values["temperature_c"] = temperature_c[rows[np.maximum(latest, 0)]]

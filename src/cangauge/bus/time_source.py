@@ -15,7 +15,7 @@ import time
 from collections import deque
 from collections.abc import Iterable
 from functools import lru_cache
-from typing import Final, Literal, Protocol
+from typing import Final, Literal
 
 import can
 
@@ -35,28 +35,14 @@ STEP_BACK_US: Final = 1_000_000
 REVERSAL_US: Final = 100_000
 """A smaller step back [µs] is a matter of the order of writing, as of two buses in one file."""
 IRREGULAR_REVERSALS: Final = 3
-IRREGULAR_WITHIN_US: Final = 10_000_000
-"""Reversals within this time [µs] that prove irregular stamps: a clock is not set that often."""
-IRREGULAR_FOR_US: Final = 60_000_000
-"""Time after the latest reversal for which time stays uncertain [µs]."""
+IRREGULAR_WITHIN_US, IRREGULAR_FOR_US = 10_000_000, 60_000_000
+"""Reversals within a time [µs] that prove irregular stamps, as a clock is not set that often; time
+after the latest one for which time stays uncertain [µs]."""
 
 
 def whole_us(time_s: float) -> int:
     """Return a time [s] in whole microseconds."""
     return round(time_s * MICROSECONDS)
-
-
-class TimeSource(Protocol):
-    """Source of the bus time of each frame; `beginnings` counts new logs after the first."""
-
-    beginnings: int
-
-    @property
-    def is_uncertain(self) -> bool:
-        """Whether time is uncertain at present."""
-
-    def time_of(self, message: can.Message) -> float | None:
-        """Return the bus time of a frame [s]; None for a clock frame, or while not known."""
 
 
 class ReceiveTime:
@@ -239,6 +225,11 @@ class ReplayClock:
     def resume(self, time_s: float) -> None:
         """Continue from a log time [s] after a restart: an earlier one begins a new log."""
         self._now_us = whole_us(time_s)
+
+
+TimeSource = ReceiveTime | ReplayClock
+"""Source of the bus time of each frame: `time_of`, `is_uncertain`, and `beginnings`, the number of
+new logs after the first."""
 
 
 def time_source(name: TimeSourceName, clock_id: int = REPLAY_CLOCK_ID) -> TimeSource:

@@ -19,8 +19,14 @@ from cantools.database.can import Database, Message
 
 from cangauge._config import read_toml, validated
 from cangauge._resources import shared_file
-from cangauge.bus.database import Field as BitField
-from cangauge.bus.database import SignalCodec, find_message, find_signal, load_dbc, signal_codec
+from cangauge.bus.database import (
+    BitField,
+    SignalCodec,
+    find_message,
+    find_signal,
+    load_dbc,
+    signal_codec,
+)
 from cangauge.bus.mapping import (
     NO_OVERRIDES,
     CellsMap,

@@ -16,7 +16,7 @@ from cangauge._files import atomic_path
 from cangauge._text import number
 from cangauge.cli.options import (
     JsonOption,
-    Reading,
+    ReadingOptions,
     ReportOption,
     assumed_of,
     check_outputs,
@@ -93,7 +93,7 @@ def estimate_command(  # noqa: PLR0917 - typer passes options by name
         ),
     ] = None,
     *,
-    reading: Reading,
+    reading: ReadingOptions,
     pack: Annotated[
         Path | None,
         typer.Option(

@@ -13,7 +13,7 @@ from cangauge._files import write_texts_atomic
 from cangauge._text import number, significant, span
 from cangauge.cli.options import (
     JsonOption,
-    Reading,
+    ReadingOptions,
     ReportOption,
     assumed_of,
     check_outputs,
@@ -112,7 +112,7 @@ def fit_command(  # noqa: PLR0917 - typer passes options by name
         ),
     ] = None,
     *,
-    reading: Reading,
+    reading: ReadingOptions,
     report: ReportOption = None,
     json_output: JsonOption = False,
 ) -> None:

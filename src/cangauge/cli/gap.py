@@ -12,7 +12,7 @@ from cangauge._files import write_texts_atomic
 from cangauge._text import printable
 from cangauge.cli.options import (
     JsonOption,
-    Reading,
+    ReadingOptions,
     ReportOption,
     assumed_of,
     check_outputs,
@@ -116,7 +116,7 @@ def gap_command(  # noqa: PLR0917 - typer passes options by name
         ),
     ] = None,
     *,
-    reading: Reading,
+    reading: ReadingOptions,
     report: ReportOption = None,
     json_output: JsonOption = False,
 ) -> None:

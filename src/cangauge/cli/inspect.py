@@ -15,7 +15,7 @@ from cangauge._extras import extra
 from cangauge._files import write_texts_atomic
 from cangauge.cli.options import (
     JsonOption,
-    Reading,
+    ReadingOptions,
     ReportOption,
     assumed_of,
     check_outputs,
@@ -46,7 +46,7 @@ def inspect_command(
         ),
     ],
     *,
-    reading: Reading,
+    reading: ReadingOptions,
     report: ReportOption = None,
     json_output: JsonOption = False,
 ) -> None:
@@ -114,7 +114,7 @@ def inspect_command(
             _show_log(console, found.log)
 
 
-def _refuse_options_of_captures(reading: Reading, path: Path) -> None:
+def _refuse_options_of_captures(reading: ReadingOptions, path: Path) -> None:
     options = {"--vehicle": reading.vehicle, "--dbc": reading.dbc, "--map": reading.map_file}
     given = {option: str(value) for option, value in options.items() if value is not None}
     if given and not (list(given) == ["--map"] and reading.mapped_columns() is not None):

@@ -77,7 +77,7 @@ ReportOption = Annotated[
 
 
 @dataclass(frozen=True, slots=True)
-class Reading:
+class ReadingOptions:
     """The options of every command that reads a log or a capture."""
 
     vehicle: Annotated[
@@ -145,9 +145,9 @@ class Reading:
 
     def open(self, path: Path) -> LogFile | Capture:
         """Open a log by these columns, or any recording by its content; may raise InputError."""
-        from cangauge.bus.recording import open_with_columns, refuse_sign_of_capture
+        from cangauge.bus.recording import open_recording, refuse_sign_of_capture
 
-        recording = open_with_columns(
+        recording = open_recording(
             path,
             columns=self.given_columns(),
             mapped=self.mapped_columns(),

@@ -27,7 +27,7 @@ from cangauge.cli.config_options import (
 from cangauge.cli.options import (
     ColumnsOption,
     JsonOption,
-    Reading,
+    ReadingOptions,
     SignOption,
     assumed_of,
     note_reading,
@@ -105,7 +105,7 @@ def replay_command(  # noqa: PLR0917 - typer passes options by name
     if wait_s is not None and not 0.0 < wait_s <= 1e6:
         raise InputError("must be more than 0 s", field="--wait", value=wait_s)
     settings = ReplaySettings(speed=_speed(speed), loop=loop, wait_s=wait_s, ids=ids)
-    reading = Reading(vehicle, dbc, map_file, columns, sign, temperature)
+    reading = ReadingOptions(vehicle, dbc, map_file, columns, sign, temperature)
     source = _source(recorded, reading, ids)
     address = bus_address(interface, channel, parse_bus_options(bus_option or []))
     with ExitStack() as stack:
@@ -125,7 +125,7 @@ def replay_command(  # noqa: PLR0917 - typer passes options by name
         raise KeyboardInterrupt
 
 
-def _source(recorded: Path, reading: Reading, ids: FrameIds) -> Source:
+def _source(recorded: Path, reading: ReadingOptions, ids: FrameIds) -> Source:
     from cangauge.bus.vehicle import Vehicle
     from cangauge.logs.read import LogFile
     from cangauge.replay.steps import CaptureSource, LogSource

@@ -133,7 +133,7 @@ MEASUREMENTS: Final = (
 
 
 @dataclass(frozen=True)
-class Step:
+class PlannedStep:
     """A possible next step and what it is expected to bring."""
 
     name: str
@@ -153,10 +153,10 @@ class Plan:
     """The effects to tell apart; empty if there is nothing to."""
     before: float
     """Probability of the true cause today, averaged over the two."""
-    steps: tuple[Step, ...]
+    steps: tuple[PlannedStep, ...]
 
     @property
-    def best(self) -> Step | None:
+    def best(self) -> PlannedStep | None:
         """The step that is worth its effort, or None."""
         return self.steps[0] if self.steps and self.steps[0].gain >= HELPS else None
 
@@ -202,7 +202,7 @@ def plan(
 
     def add(name: str, kind: str, instruction: str, after: list[float]) -> None:
         mean = float(p @ after / p.sum())
-        steps.append(Step(name, kind, instruction, mean, mean - before))
+        steps.append(PlannedStep(name, kind, instruction, mean, mean - before))
 
     for name, (instruction, drive) in proposed_drives(known, [log.log for log in logs]).items():
         after = []

@@ -35,7 +35,7 @@ from cangauge.identify.rows import FitRows
 from cangauge.logs.log import Log
 from cangauge.logs.resample import dequantize
 from cangauge.model.effects.base import Effect, Load, Signals, Values
-from cangauge.model.effects.library import LIBRARY, Candidate, candidates, effect_of
+from cangauge.model.effects.library import LIBRARY, EffectCandidate, candidates, effect_of
 from cangauge.model.extended import ExtendedModel, Prediction
 from cangauge.model.prior import LOW_PASS_S, Chemistry
 
@@ -157,11 +157,11 @@ class Selected:
 
     Parameters
     ----------
-    chosen : tuple of Candidate
+    chosen : tuple of EffectCandidate
     steps : tuple of SearchStep
     """
 
-    chosen: tuple[Candidate, ...]
+    chosen: tuple[EffectCandidate, ...]
     steps: tuple[SearchStep, ...]
 
     @property
@@ -175,7 +175,7 @@ class Selected:
         amplitudes = np.clip(solution.coefficients[P:], low, high)
         return replace(solution, coefficients=np.r_[solution.coefficients[:P], amplitudes])
 
-    def at_bound(self, solution: Solution) -> list[Candidate]:
+    def at_bound(self, solution: Solution) -> list[EffectCandidate]:
         """Return the effects with an amplitude at or beyond a bound other than neutral."""
         found = []
         parts = _parts(self.chosen, solution.coefficients[P:])
@@ -193,7 +193,7 @@ class Selected:
         )
 
 
-def _parts(chosen: Sequence[Candidate], amplitudes: FloatArray) -> list[FloatArray]:
+def _parts(chosen: Sequence[EffectCandidate], amplitudes: FloatArray) -> list[FloatArray]:
     ends = np.cumsum([len(item.amplitudes) for item in chosen]).tolist()
     return [amplitudes[end - len(c.amplitudes) : end] for c, end in zip(chosen, ends, strict=True)]
 
@@ -237,7 +237,7 @@ def linearize(
     model: ExtendedModel,
     log: Log,
     rows: FitRows,
-    chosen: Sequence[Candidate],
+    chosen: Sequence[EffectCandidate],
     amplitudes: FloatArray | None = None,
 ) -> Linearized:
     """Return the model's prediction of a log and its derivatives on the rows of the fit.
@@ -248,7 +248,7 @@ def linearize(
         Without effects, or with those of `chosen`.
     log : Log
     rows : FitRows
-    chosen : sequence of Candidate
+    chosen : sequence of EffectCandidate
     amplitudes : array of shape (e,), optional
         Of the model's effects, relative to neutral; neutral by default.
     """
@@ -330,7 +330,9 @@ def _by_drop(
     return added
 
 
-def offered(effect_ids: Sequence[str], model: ExtendedModel, time_s: FloatArray) -> list[Candidate]:
+def offered(
+    effect_ids: Sequence[str], model: ExtendedModel, time_s: FloatArray
+) -> list[EffectCandidate]:
     """Return the candidates of some effects, without those whose column the equation has."""
     effects = [LIBRARY[effect_id] for effect_id in effect_ids]
     return [
@@ -378,7 +380,7 @@ class Search:
         self._places = [
             list(range(end - width, end)) for end, width in zip(ends.tolist(), widths, strict=True)
         ]
-        self.refused: list[Candidate] = []
+        self.refused: list[EffectCandidate] = []
         """Candidates that are not offered any more."""
         self._sums: list[LogSums] = []
         for number, (log, of_log) in enumerate(zip(logs, rows, strict=True), start=1):

@@ -57,7 +57,7 @@ from cangauge.model.coulomb_counting import (
     capacity_from_full_discharge,
     difference_from_reference,
 )
-from cangauge.model.effects.library import Candidate, effect_entries
+from cangauge.model.effects.library import EffectCandidate, effect_entries
 from cangauge.model.extended import ExtendedModel
 from cangauge.model.model_file import (
     Information,
@@ -497,7 +497,7 @@ def _fit_with_effects(  # noqa: PLR0917
     chemistry: Chemistry,
     selected: Selected,
     first: tuple[Solution, dict[str, Any]],
-    refused: list[Candidate],
+    refused: list[EffectCandidate],
 ) -> _WithEffects | None:
     """Return the rows about the fitted effects, the solutions there, and the file's fields.
 

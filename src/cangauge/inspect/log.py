@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from typing import Any, Final, Literal
 
@@ -160,31 +161,23 @@ def inspect_log(log: Log) -> LogInspection:
     timing, charge, soc, sign = _timing(log), _charge(log), _soc(log), sign_of_current(log)
     resistance = _resistance(log)
     channels = describe_channels(log, None if resistance is None else resistance.median_ohm)
+    warnings = tuple(_warnings(log, timing, channels, charge, sign))
+    assessed: dict[str, tuple[Verdict, str]] = {
+        "sign of current": ("yes" if sign.sign else "no", sign.sentence),
+        "voltage curve over SoC": _curve(charge, soc),
+        "capacity": _capacity(log, charge, soc),
+        "ohmic resistance": _ohmic(resistance, max(STEP_SPACING_S, usual_step_s(log.time_s))),
+        "delayed current terms": _delays(log, timing),
+        "rows for a fit": _rows(log, timing),
+        "temperature coefficient": _temperature(log),
+        "start from rest": _start(log, timing),
+        "rest voltage": _rests(log),
+    }
+    abilities = tuple(Ability(topic, *each) for topic, each in assessed.items())
     return LogInspection(
-        name=log.name,
-        source=log.source,
-        temperature_source=log.temperature_source,
-        rows=len(log),
-        timing=timing,
-        channels=channels,
-        charge=charge,
-        soc=soc,
-        resistance=resistance,
-        sign=sign,
-        abilities=(
-            Ability("sign of current", "yes" if sign.sign else "no", sign.sentence),
-            _curve_ability(charge, soc),
-            _capacity_ability(log, charge, soc),
-            _resistance_ability(resistance, max(STEP_SPACING_S, usual_step_s(log.time_s))),
-            _delay_ability(log, timing),
-            _row_ability(log, timing),
-            _temperature_ability(log),
-            _start_ability(log, timing),
-            _rest_ability(log),
-        ),
-        remarks=log.remarks,
-        warnings=tuple(_warnings(log, timing, channels, charge, sign)),
-    )
+        log.name, log.source, log.temperature_source, len(log), timing, channels, charge, soc,
+        resistance, sign, abilities, log.remarks, warnings,
+    )  # fmt: skip
 
 
 def _timing(log: Log) -> Timing:
@@ -254,171 +247,159 @@ def _resistance(log: Log) -> Resistance | None:
 
 
 def _warnings(
-    log: Log,
-    timing: Timing,
-    channels: dict[str, Channel],
-    charge: Charge,
-    sign: SignFinding,
-) -> list[str]:
-    found = []
+    log: Log, timing: Timing, channels: dict[str, Channel], charge: Charge, sign: SignFinding
+) -> Iterator[str]:
     if sign.sign < 0:
-        found.append("the sign of current is inverted: multiply current_a by -1")
+        yield "the sign of current is inverted: multiply current_a by -1"
     elif sign.sign == 0:
-        found.append("the sign of current could not be confirmed: make sure that discharge is > 0")
+        yield "the sign of current could not be confirmed: make sure that discharge is > 0"
     if (timing.interval_median_s or 0.0) > GAP_S:
-        found.append(
+        yield (
             f"rows are {_interval(timing)} apart: shorter delays of the current cannot be"
             " identified, and quick changes of voltage not be followed"
         )
     if timing.gap_count:
         longest = timing.longest_gaps[0]
-        found.append(
+        yield (
             f"{counted(timing.gap_count, 'gap')} of more than {timing.gap_limit_s:g} s, the longest"
             f" {longest.length_s:.4g} s at {longest.start_s:.1f} s; {charge.in_gaps_ah:.3g} Ah are"
             " interpolated over gaps"
         )
     if charge.uncounted_gaps:
-        found.append(
+        yield (
             f"no charge is counted over {charge.uncounted_gaps} of them,"
             f" {duration(charge.uncounted_s)} in all: the pack is assumed to rest; where the log's"
             " own SoC moves over one, a fit splits the log there"
         )
-    for name, channel in channels.items():
-        found += [
-            f"{name} stuck at {each.value:g} {channel.unit} for {each.duration_s:.0f} s from"
-            f" {each.start_s:.1f} s: {each.why}"
-            for each in channel.stuck[: LISTED // 2]
-        ]
-        more = len(channel.stuck) - LISTED // 2
-        found += [f"{name}: {more} more stuck intervals"] if more > 0 else []
-    constant = (name for name in ("current_a", "voltage_v") if channels[name].levels == 1)
-    found += [f"{name} never changes" for name in constant]
+    yield from _channel_warnings(channels)
     if log.temperature_source == "room":
-        found.append("the temperature is the room's: the battery may be colder or hotter")
-    return found
+        yield "the temperature is the room's: the battery may be colder or hotter"
+
+
+def _channel_warnings(channels: dict[str, Channel]) -> Iterator[str]:
+    for name, channel in channels.items():
+        for each in channel.stuck[: LISTED // 2]:
+            yield (
+                f"{name} stuck at {each.value:g} {channel.unit} for {each.duration_s:.0f} s from"
+                f" {each.start_s:.1f} s: {each.why}"
+            )
+        if (more := len(channel.stuck) - LISTED // 2) > 0:
+            yield f"{name}: {more} more stuck intervals"
+    for name in ("current_a", "voltage_v"):
+        if channels[name].levels == 1:
+            yield f"{name} never changes"
 
 
 def _interval(timing: Timing) -> str:
     return f"{timing.interval_median_s or 0.0:.3g} s"
 
 
-# --- Abilities
+# --- Abilities: a verdict, and the reason with its figures
 
 
-def _curve_ability(charge: Charge, soc: Soc | None) -> Ability:
-    topic = "voltage curve over SoC"
+def _curve(charge: Charge, soc: Soc | None) -> tuple[Verdict, str]:
     if soc is None:
-        text = (
-            f"no reference SoC; the charge state spans {charge.span_ah:.3g} Ah: give the capacity"
-            " and the SoC at the start, or fit it with a log that has both"
-        )
-        return Ability(topic, "partly", text)
+        text = f"no reference SoC; the charge state spans {charge.span_ah:.3g} Ah: give the"
+        text += " capacity and the SoC at the start, or fit it with a log that has both"
+        return "partly", text
     span = soc.maximum_pct - soc.minimum_pct
     covered = f"SoC covers {soc.minimum_pct:.1f} … {soc.maximum_pct:.1f} %"
     if span >= WIDE_SOC_PCT:
-        return Ability(topic, "yes", covered)
+        return "yes", covered
     if span >= SOC_SPAN_AT_LEAST_PCT:
-        return Ability(topic, "partly", f"{covered}: only this part of the curve")
-    return Ability(topic, "no", f"{covered}: too little for a curve")
+        return "partly", f"{covered}: only this part of the curve"
+    return "no", f"{covered}: too little for a curve"
 
 
-def _capacity_ability(log: Log, charge: Charge, soc: Soc | None) -> Ability:
+def _capacity(log: Log, charge: Charge, soc: Soc | None) -> tuple[Verdict, str]:
     if soc is None or soc.implied_capacity_ah is None:
-        text = (
-            f"no reference SoC that spans {MIN_SOC_SPAN_PCT:g} %; at least {charge.span_ah:.3g} Ah,"
-            " the capacity if the log runs from full to empty"
+        text = f"no reference SoC that spans {MIN_SOC_SPAN_PCT:g} %; at least"
+        return (
+            "no",
+            f"{text} {charge.span_ah:.3g} Ah, the capacity if the log runs from full to empty",
         )
-        return Ability("capacity", "no", text)
     span = soc.maximum_pct - soc.minimum_pct
-    text = f"{soc.implied_capacity_ah:.4g} Ah per 100 % of reference SoC, over {span:.1f} %"
     try:
         whole_ah = capacity_from_full_discharge([log], None)
     except InputError:
-        return Ability("capacity", "yes" if span >= WIDE_SOC_PCT else "partly", text)
-    return Ability("capacity", "yes", f"{whole_ah:.4g} Ah: the log runs from full to empty")
+        text = f"{soc.implied_capacity_ah:.4g} Ah per 100 % of reference SoC, over {span:.1f} %"
+        return "yes" if span >= WIDE_SOC_PCT else "partly", text
+    return "yes", f"{whole_ah:.4g} Ah: the log runs from full to empty"
 
 
-def _resistance_ability(resistance: Resistance | None, step_s: float) -> Ability:
-    topic = "ohmic resistance"
+def _ohmic(resistance: Resistance | None, step_s: float) -> tuple[Verdict, str]:
     if resistance is None:
-        return Ability(topic, "no", f"fewer than {MIN_STEPS} clear steps of current")
-    text = (
-        f"{resistance.median_ohm:.4g} Ω (quartiles {resistance.lower_ohm:.4g} …"
-        f" {resistance.upper_ohm:.4g}) from {resistance.steps} steps of current over {step_s:.3g} s"
-    )
-    spread = abs(resistance.upper_ohm - resistance.lower_ohm)
-    is_steady = spread <= 0.5 * abs(resistance.median_ohm)
-    return Ability(topic, "yes" if is_steady else "partly", text)
+        return "no", f"fewer than {MIN_STEPS} clear steps of current"
+    ohm, low, high = resistance.median_ohm, resistance.lower_ohm, resistance.upper_ohm
+    text = f"{ohm:.4g} Ω (quartiles {low:.4g} … {high:.4g}) from {resistance.steps} steps of"
+    is_steady = abs(high - low) <= 0.5 * abs(ohm)
+    return "yes" if is_steady else "partly", f"{text} current over {step_s:.3g} s"
 
 
-def _delay_ability(log: Log, timing: Timing) -> Ability:
-    topic = "delayed current terms"
+def _delays(log: Log, timing: Timing) -> tuple[Verdict, str]:
     if timing.interval_median_s is None or timing.duration_s < 10.0 * DELAYS_S[-1]:
         text = f"{timing.duration_s:.0f} s is too short for delays up to {DELAYS_S[-1]:.0f} s"
-        return Ability(topic, "no", text)
+        return "no", text
     usable = usable_delays([log], DELAYS_S)
     step = f"rows every {_interval(timing)}"
     if len(usable) == 1:
-        return Ability(topic, "no", f"{step} are too slow for any delay")
+        return "no", f"{step} are too slow for any delay"
     if len(usable) < len(DELAYS_S):
         kept = ", ".join(f"{delay:g}" for delay in usable)
-        return Ability(topic, "partly", f"{step} identify delays of {kept} s only")
+        return "partly", f"{step} identify delays of {kept} s only"
     # At rows about a second apart, not on a grid: a gap may last months.
     rows = spaced_rows(log.time_s, 1.0)
     rows = rows[log.time_s[rows] >= log.time_s[0] + DELAYS_S[1]]
     before = np.interp(log.time_s[rows] - DELAYS_S[1], log.time_s, log.current_a)
     if rows.size <= 2 or np.ptp(log.current_a[rows]) == 0.0 or np.ptp(before) == 0.0:
-        return Ability(topic, "no", "current does not vary")
+        return "no", "current does not vary"
     alike = correlation(log.current_a[rows], before)
     text = f"currents {DELAYS_S[1]:.0f} s apart correlate by {alike:.2f}"
     if alike > CORRELATED:
-        return Ability(topic, "partly", f"{text}: the terms are hard to separate")
-    return Ability(topic, "yes", text)
+        return "partly", f"{text}: the terms are hard to separate"
+    return "yes", text
 
 
-def _row_ability(log: Log, timing: Timing) -> Ability:
+def _rows(log: Log, timing: Timing) -> tuple[Verdict, str]:
     """Assess how many rows a fit would use: those behind a filled delay line."""
     delay_s = usable_delays([log], DELAYS_S) if len(log) > 1 else DELAYS_S
     kept, removed = usable_rows(log, delay_s, FIT_RATE_HZ)
     total = kept.size + removed["start_up_or_shut_down"] + removed["delay_line_filling"]
     is_slow = (timing.interval_median_s or 0.0) * FIT_RATE_HZ > 1.0
     rate = f"rows every {_interval(timing)}" if is_slow else f"rows at {FIT_RATE_HZ:g} Hz"
-    text = (
-        f"{kept.size} of {total} {rate}; the first {max(delay_s):.0f} s, and as long after each"
-        f" gap, fill the delay line; {LEAST_ROWS} are needed"
-    )
+    text = f"{kept.size} of {total} {rate}; the first {max(delay_s):.0f} s, and as long after each"
+    text += f" gap, fill the delay line; {LEAST_ROWS} are needed"
     verdict: Verdict = "yes" if kept.size > 0.5 * total else "partly"
-    return Ability("rows for a fit", verdict if kept.size >= LEAST_ROWS else "no", text)
+    return verdict if kept.size >= LEAST_ROWS else "no", text
 
 
-def _temperature_ability(log: Log) -> Ability:
-    topic, span = "temperature coefficient", float(np.ptp(log.temperature_c))
+def _temperature(log: Log) -> tuple[Verdict, str]:
+    span = float(np.ptp(log.temperature_c))
     where = {
         "room": "; it is the ROOM's temperature, not the battery's",
         "unknown": "; where it was measured is not known",
     }.get(log.temperature_source, f" ({log.temperature_source})")
     if span == 0.0:
-        return Ability(topic, "no", f"temperature never changes{where}")
+        return "no", f"temperature never changes{where}"
     if span < TEMPERATURE_SPAN_K:
-        return Ability(topic, "no", f"temperature spans only {span:.1f} K{where}")
+        return "no", f"temperature spans only {span:.1f} K{where}"
     alike = correlation(charge_ah(log), log.temperature_c)
     text = f"temperature spans {span:.1f} K, correlated with charge by {alike:+.2f}{where}"
     is_doubtful = abs(alike) > CORRELATED or where.startswith(";")
-    return Ability(topic, "partly" if is_doubtful else "yes", text)
+    return "partly" if is_doubtful else "yes", text
 
 
-def _start_ability(log: Log, timing: Timing) -> Ability:
+def _start(log: Log, timing: Timing) -> tuple[Verdict, str]:
     within_s = max(DELAYS_S[1], timing.interval_median_s or 0.0)
     first = log.current_a[log.time_s - log.time_s[0] <= within_s]
     at_start = float(np.max(np.abs(first)))
     what = f"the first {within_s:.3g} s" if first.size > 1 else "the first row"
     if at_start <= REST_SHARE * float(np.max(np.abs(log.current_a))):
-        text = f"at most {at_start:.3g} A in {what}: the first voltages are near rest"
-        return Ability("start from rest", "yes", text)
-    return Ability("start from rest", "no", f"up to {at_start:.3g} A in {what}")
+        return "yes", f"at most {at_start:.3g} A in {what}: the first voltages are near rest"
+    return "no", f"up to {at_start:.3g} A in {what}"
 
 
-def _rest_ability(log: Log) -> Ability:
+def _rests(log: Log) -> tuple[Verdict, str]:
     """Assess the rests, which show the rest voltage and an offset of the current sensor."""
     still = np.abs(log.current_a) <= REST_SHARE * float(np.max(np.abs(log.current_a)))
     edges = np.flatnonzero(np.diff(np.concatenate(([False], still, [False])).astype(np.int8)))
@@ -426,4 +407,4 @@ def _rest_ability(log: Log) -> Ability:
     rests = int((length >= REST_S).sum())
     longest = float(length.max()) if length.size else 0.0
     text = f"{counted(rests, 'rest')} of 5 min or more, the longest {duration(longest)}"
-    return Ability("rest voltage", "yes" if rests >= 3 else "partly" if rests else "no", text)
+    return "yes" if rests >= 3 else "partly" if rests else "no", text

@@ -54,7 +54,7 @@ class LogReader(Protocol):
         """Read the file; raise InputError where it is damaged or lacks something."""
 
 
-class TableReader:
+class LogTableReader:
     """Canonical Parquet or CSV, or any such table with plain headings or the user's columns."""
 
     name = "table"
@@ -98,7 +98,7 @@ def _readers() -> tuple[LogReader, ...]:
     """Return all readers, in the order in which a file is offered to them."""
     others = [entry.load()() for entry in entry_points(group=GROUP)]
     formats = [reader for name in _FORMATS for reader in import_module(name).READERS]
-    return (*others, *formats, TableReader())
+    return (*others, *formats, LogTableReader())
 
 
 @dataclass(frozen=True, slots=True)
@@ -118,7 +118,7 @@ class LogFile:
     @property
     def is_any_table(self) -> bool:
         """Whether the file is a table of plain headings, not of a format that defines them."""
-        is_text = isinstance(self.reader, TableReader) and not _is_parquet(self.head)
+        is_text = isinstance(self.reader, LogTableReader) and not _is_parquet(self.head)
         return is_text and _canonical_text(self.head) is None
 
     def read(
@@ -208,7 +208,7 @@ def open_log(
     for reader in _readers():
         is_offered = given is None or reader.takes_columns
         if is_offered and (
-            (given is not None and isinstance(reader, TableReader)) or reader.matches(head)
+            (given is not None and isinstance(reader, LogTableReader)) or reader.matches(head)
         ):
             return LogFile(head, reader, given, sign)
     return LogFile(head, None, given, sign)
@@ -308,7 +308,7 @@ def read_cells(
         The user's columns of the log.
     """
     file = open_log(path, columns=columns)
-    if not isinstance(file.reader, TableReader):
+    if not isinstance(file.reader, LogTableReader):
         return None
     source = str(path)
     with open_table(file.head, columns) as table:

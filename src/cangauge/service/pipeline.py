@@ -16,7 +16,7 @@ import numpy as np
 from can.typechecking import CanFilter
 
 from cangauge.bus.decoder import SampleDecoder
-from cangauge.bus.plausibility import MISSED_AT_LEAST, MISSED_UNTIL_OLD, Pack
+from cangauge.bus.plausibility import MISSED_AT_LEAST, MISSED_UNTIL_OLD, PackProperties
 from cangauge.bus.publish import (
     ACKNOWLEDGE_EVERY,
     FrameIds,
@@ -466,10 +466,10 @@ class Pipeline:
         return self.estimator.verdict
 
 
-def _pack_of(model: Model, capacity_ah: float | None) -> Pack:
+def _pack_of(model: Model, capacity_ah: float | None) -> PackProperties:
     """Return the pack's properties by which its signals are judged."""
     voltage = model.extended_model().model
-    return Pack(
+    return PackProperties(
         resistance_ohm=abs(voltage.resistance_ohm[0]) if voltage.resistance_ohm else 0.0,
         error_std_v=model.noise.residual_std_v,
         capacity_ah=model.capacity_ah if capacity_ah is None else capacity_ah,

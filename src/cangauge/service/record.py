@@ -118,7 +118,7 @@ class Recorder(Output):
         self._is_wanted: bool | None = None
         self._is_active = False
         self._batch: list[can.Message] = []
-        self._file: _File | None = None
+        self._file: _RecordFile | None = None
         self._lost_frames = 0
         self.state: RecordState | None = None
         self.written: list[Path] = []
@@ -183,7 +183,7 @@ class Recorder(Output):
     def _begin(self, path: Path, *, requested: bool) -> None:
         try:
             _check_path(path)
-            self._file = file = _File(path, self._limits, self._clock)
+            self._file = file = _RecordFile(path, self._limits, self._clock)
         except (CangaugeError, OSError) as error:
             self._is_active = False
             self.state = RecordState(str(path), 0, 0, 0, str(error), active=False)
@@ -240,7 +240,7 @@ class Recorder(Output):
         emit(_LOG, level, event, text, limit="record.state", lost_frames=lost_frames)
 
 
-class _File:
+class _RecordFile:
     """The file or the parts of one recording, written batch by batch."""
 
     ends = False

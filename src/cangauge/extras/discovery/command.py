@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     import can
 
     from cangauge.extras.discovery.by_name import NamedSignal
-    from cangauge.extras.discovery.pairs import Candidate
+    from cangauge.extras.discovery.pairs import SignalCandidate
     from cangauge.extras.discovery.proposal import Level, Proposal
     from cangauge.extras.discovery.search import Findings
 
@@ -215,7 +215,7 @@ class _Found:
     method: str
     vehicle: str | None = None
     findings: Findings | None = None
-    candidates: Mapping[str, Sequence[Candidate | NamedSignal]] = field(default_factory=dict)
+    candidates: Mapping[str, Sequence[SignalCandidate | NamedSignal]] = field(default_factory=dict)
     chosen: dict[str, int] = field(default_factory=dict)
     dbc: Path | None = None
     nominal_v: float | None = None
@@ -225,7 +225,7 @@ class _Found:
     """Roles whose scale the user has stated."""
 
     @property
-    def fields(self) -> dict[str, Candidate]:
+    def fields(self) -> dict[str, SignalCandidate]:
         """Chosen fields that were found by physics, by role."""
         if self.findings is None:
             return {}
@@ -587,7 +587,7 @@ def _sign_note(found: _Found) -> str:
 
 
 def _show_role(found: _Found, role: str) -> None:
-    from cangauge.extras.discovery.pairs import Candidate
+    from cangauge.extras.discovery.pairs import SignalCandidate
     from cangauge.extras.discovery.proposal import UNITS
 
     rows = []
@@ -595,7 +595,7 @@ def _show_role(found: _Found, role: str) -> None:
         taken = "✓" if found.is_proven(role) else "?"
         mark = f"{number} {taken}" if found.chosen.get(role) == number - 1 else str(number)
         scale, ends, steps, facts = "", "", "", "by name and unit"
-        if isinstance(candidate, Candidate):
+        if isinstance(candidate, SignalCandidate):
             ends = f"{candidate.low:.5g} … {candidate.high:.5g} {UNITS[role]}"
             scale, steps, facts = f"{candidate.scale:g}", str(candidate.steps), candidate.facts
         else:

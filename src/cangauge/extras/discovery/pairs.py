@@ -76,7 +76,7 @@ IMPOSSIBLE: Final = -99.0
 
 
 @dataclass(frozen=True)
-class Candidate:
+class SignalCandidate:
     """A field that may be the wanted signal.
 
     Parameters
@@ -144,7 +144,7 @@ class Candidate:
         ohm = f"R {self.resistance_ohm:.3g} Ω ({one:.2g}, {two:.2g} by halves)"
         return f"r {self.correlation:+.2f} with {self.partner}, {ohm}"
 
-    def rescaled(self, scale: float) -> Candidate:
+    def rescaled(self, scale: float) -> SignalCandidate:
         """Return a SoC with another scale, and the capacity that follows."""
         ratio = scale / self.scale
         capacity_ah = self.capacity_ah / ratio
@@ -220,7 +220,9 @@ def is_capacity(capacity_ah: float) -> bool:
     return 2.0 < capacity_ah < 600.0
 
 
-def overlap(one: Candidate, bits: frozenset[int], two: Candidate, others: frozenset[int]) -> bool:
+def overlap(
+    one: SignalCandidate, bits: frozenset[int], two: SignalCandidate, others: frozenset[int]
+) -> bool:
     """Return whether two fields share bits of a message."""
     same = (one.bus, one.arbitration_id, one.is_extended) == (
         two.bus, two.arbitration_id, two.is_extended,
@@ -393,12 +395,14 @@ class Pairs:
             & ((alike & (lost < 0.1 * (1.0 + slope**2))) | (count > MANY_MOVES))
         )
 
-    def best(self, make: Any) -> tuple[tuple[Candidate, ...], tuple[Candidate, ...], Row | None]:
+    def best(
+        self, make: Any
+    ) -> tuple[tuple[SignalCandidate, ...], tuple[SignalCandidate, ...], Row | None]:
         """Return the best candidates for current and voltage, and the row of the first current."""
         chosen: Row | None = None
         roles: tuple[list[Row], list[Row]] = ([], [])
-        currents: list[Candidate] = []
-        voltages: list[Candidate] = []
+        currents: list[SignalCandidate] = []
+        voltages: list[SignalCandidate] = []
         flat = np.argsort(-self.score, axis=None)[: 200 * 200]
         for place in flat:
             a, b = divmod(int(place), self.score.shape[1])
@@ -428,7 +432,12 @@ class Pairs:
         return bool(one.place.bits(a.length) & two.place.bits(b.length))
 
     def _add(
-        self, currents: list[Candidate], voltages: list[Candidate], a: int, b: int, make: Any
+        self,
+        currents: list[SignalCandidate],
+        voltages: list[SignalCandidate],
+        a: int,
+        b: int,
+        make: Any,
     ) -> None:
         u, i = self._voltages[a], self._currents[b]
         score, evidence = float(self.score[a, b]), float(self.evidence[a, b])
@@ -511,13 +520,13 @@ def _guess(scale: float, width: int) -> float:
     return CURRENT_SCALES[scale] - float(_narrow(full_a)) - (1.0 if full_a > 2000.0 else 0.0)
 
 
-def _same_numbers(one: Candidate, two: Candidate) -> bool:
+def _same_numbers(one: SignalCandidate, two: SignalCandidate) -> bool:
     return (one.arbitration_id, one.start, one.place.width, one.place.is_motorola) == (
         two.arbitration_id, two.start, two.place.width, two.place.is_motorola,
     )  # fmt: skip
 
 
-def _are_siblings(one: Candidate, two: Candidate) -> bool:
+def _are_siblings(one: SignalCandidate, two: SignalCandidate) -> bool:
     """Whether two candidates are cells in one message: raw numbers alike, but for cut bits."""
     same = (one.bus, one.arbitration_id) == (two.bus, two.arbitration_id)
     middles = [(each.low + each.high) / 2.0 / each.scale for each in (one, two)]

@@ -13,7 +13,7 @@ from cangauge.extras.discovery.pairs import (
     CURRENT_SCALES,
     SOC_SCALES,
     VOLTAGE_SCALES,
-    Candidate,
+    SignalCandidate,
     is_capacity,
 )
 
@@ -82,7 +82,7 @@ class Level:
     text: str
 
 
-def levels(role: str, candidate: Candidate, nominal_v: float | None) -> list[Level]:
+def levels(role: str, candidate: SignalCandidate, nominal_v: float | None) -> list[Level]:
     """Return what the usual scales of a voltage or SoC mean, its own first.
 
     Bits and the relation to the current are the same by every scale. One level where the scale is
@@ -110,13 +110,13 @@ def levels(role: str, candidate: Candidate, nominal_v: float | None) -> list[Lev
 # --- Proposals
 
 
-def message_name(candidate: Candidate) -> str:
+def message_name(candidate: SignalCandidate) -> str:
     """Return the name of a candidate's message in a DBC that is written."""
     return f"FRAME_{candidate.arbitration_id:X}"
 
 
 def by_physics(
-    chosen: Mapping[str, Candidate],
+    chosen: Mapping[str, SignalCandidate],
     names: Mapping[str, Sequence[str]],
     dbc: str,
     nominal_v: float | None,
@@ -126,7 +126,7 @@ def by_physics(
 
     Parameters
     ----------
-    chosen : mapping of str to Candidate
+    chosen : mapping of str to SignalCandidate
     names : mapping of str to sequence of str
         All candidates by role.
     dbc : str
@@ -165,7 +165,7 @@ def by_physics(
     return Proposal("own car", dbc, roles, head, pair_s)
 
 
-def _physics_line(candidate: Candidate) -> str:
+def _physics_line(candidate: SignalCandidate) -> str:
     if candidate.evidence < 1.0:
         return "By the look of its bits alone: no current steps that a voltage follows."
     one, two = candidate.halves_ohm
@@ -175,7 +175,7 @@ def _physics_line(candidate: Candidate) -> str:
     )
 
 
-def _scale_lines(role: str, candidate: Candidate, nominal_v: float | None) -> list[str]:
+def _scale_lines(role: str, candidate: SignalCandidate, nominal_v: float | None) -> list[str]:
     """Return how the scale of a field was determined, and which others may be."""
     factor = f"Factor {candidate.scale:g}"
     if role == "current":
@@ -215,10 +215,10 @@ def of_preset(mapping: VehicleMap, dbc: str, comments: tuple[str, ...]) -> Propo
 # --- Texts
 
 
-def dbc_text(chosen: Mapping[str, Candidate]) -> str:
+def dbc_text(chosen: Mapping[str, SignalCandidate]) -> str:
     """Return a DBC with the chosen fields."""
     lines = ['VERSION "1"', "", "NS_ :", "", "BS_:", "", "BU_: Vehicle", ""]
-    by_id: dict[int, dict[str, Candidate]] = {}
+    by_id: dict[int, dict[str, SignalCandidate]] = {}
     for role, candidate in chosen.items():
         key = candidate.arbitration_id | (EXTENDED if candidate.is_extended else 0)
         by_id.setdefault(key, {})[role] = candidate

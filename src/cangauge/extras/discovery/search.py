@@ -26,9 +26,9 @@ from cangauge.extras.discovery.pairs import (
     SHOWN,
     SOC_SCALES,
     VOLTAGE_SCALES,
-    Candidate,
     Pairs,
     Row,
+    SignalCandidate,
     is_capacity,
     most_common,
     overlap,
@@ -68,17 +68,17 @@ class Findings:
 
     Parameters
     ----------
-    current, voltage, soc_reference, temperature : tuple of Candidate
+    current, voltage, soc_reference, temperature : tuple of SignalCandidate
     remarks : tuple of str
     streams, fields : int
         Number of ids and of numbers looked at.
     duration_s : float
     """
 
-    current: tuple[Candidate, ...]
-    voltage: tuple[Candidate, ...]
-    soc_reference: tuple[Candidate, ...]
-    temperature: tuple[Candidate, ...]
+    current: tuple[SignalCandidate, ...]
+    voltage: tuple[SignalCandidate, ...]
+    soc_reference: tuple[SignalCandidate, ...]
+    temperature: tuple[SignalCandidate, ...]
     remarks: tuple[str, ...]
     streams: int
     fields: int
@@ -94,7 +94,7 @@ class Findings:
 
     def is_clear(self, role: str) -> bool:
         """Whether the first candidate is certain enough to be taken without the user."""
-        found: tuple[Candidate, ...] = getattr(self, role)
+        found: tuple[SignalCandidate, ...] = getattr(self, role)
         if not found or found[0].evidence < ENOUGH_NATS or found[0].steps < ENOUGH_STEPS:
             return False
         one, two = found[0].halves_ohm
@@ -176,7 +176,7 @@ class _Search:
                 " the look of their bits alone; record while driving"
             )
         taken = [(each, each.place.bits(each.length)) for each in (*current[:1], *voltage[:1])]
-        soc: tuple[Candidate, ...] = ()
+        soc: tuple[SignalCandidate, ...] = ()
         if row is not None:
             soc = self._charges(current[0], row)
         if not soc:
@@ -188,10 +188,10 @@ class _Search:
 
     def _result(
         self,
-        current: tuple[Candidate, ...],
-        voltage: tuple[Candidate, ...],
-        soc: tuple[Candidate, ...],
-        temperature: tuple[Candidate, ...],
+        current: tuple[SignalCandidate, ...],
+        voltage: tuple[SignalCandidate, ...],
+        soc: tuple[SignalCandidate, ...],
+        temperature: tuple[SignalCandidate, ...],
         remarks: list[str],
     ) -> Findings:
         return Findings(
@@ -275,7 +275,7 @@ class _Search:
         means[filled] = sums[filled] / counts[filled]
         return np.asarray(means[last])
 
-    def _candidate(self, row: Row, scale: float, offset: float, **more: Any) -> Candidate:
+    def _candidate(self, row: Row, scale: float, offset: float, **more: Any) -> SignalCandidate:
         stream = self._streams[row.field.stream]
         good = row.field.raw[~row.missing] + row.constant
         ends = scale * np.array([good.min(), good.max()], dtype=np.float64) + offset
@@ -287,7 +287,7 @@ class _Search:
             if row.place.is_signed:
                 code = int(np.bincount(row.field.raw[gone] & code).argmax())
                 code -= (1 << width) if code >> (width - 1) else 0
-        return Candidate(
+        return SignalCandidate(
             bus=stream.bus,
             arbitration_id=stream.arbitration_id,
             is_extended=stream.is_extended,
@@ -304,7 +304,7 @@ class _Search:
             **more,
         )
 
-    def _charges(self, current: Candidate, row: Row) -> tuple[Candidate, ...]:
+    def _charges(self, current: SignalCandidate, row: Row) -> tuple[SignalCandidate, ...]:
         """Return fields that fall as the current is drawn."""
         amps = current.scale * (self._grid(row) + row.constant) + current.offset
         amps *= current.sign
@@ -328,7 +328,7 @@ class _Search:
         longest = int((filled[lasts] - filled[firsts]).argmax())
         return slice(int(filled[firsts[longest]]), int(filled[lasts[longest]]) + 1)
 
-    def _as_charge(self, index: int, drawn_ah: FloatArray, span: slice) -> Candidate | None:
+    def _as_charge(self, index: int, drawn_ah: FloatArray, span: slice) -> SignalCandidate | None:
         best, field = None, self._fields[index]
         for place, nature, constant in field.extensions:
             row = Row(field, place, 0.0, 1.0, 0.0, constant, field.missing)
@@ -360,8 +360,8 @@ class _Search:
         return best
 
     def _temperatures(
-        self, taken: Sequence[tuple[Candidate, frozenset[int]]]
-    ) -> tuple[Candidate, ...]:
+        self, taken: Sequence[tuple[SignalCandidate, frozenset[int]]]
+    ) -> tuple[SignalCandidate, ...]:
         """Return slow fields in a plausible range, those of the pack's bus first."""
         buses = {each.bus for each, _ in taken}
         found = []
@@ -449,9 +449,9 @@ def _full_scale_prior(scale: float, width: int) -> float:
     return -1.0
 
 
-def _apart(found: list[Candidate]) -> tuple[Candidate, ...]:
+def _apart(found: list[SignalCandidate]) -> tuple[SignalCandidate, ...]:
     """Return candidates, best first, without those that share bits with a better one."""
-    kept: list[tuple[Candidate, frozenset[int]]] = []
+    kept: list[tuple[SignalCandidate, frozenset[int]]] = []
     for each in sorted(found, key=lambda one: -one.score):
         bits = each.place.bits(each.length)
         if not any(overlap(each, bits, other, taken) for other, taken in kept):

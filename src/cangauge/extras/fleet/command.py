@@ -15,7 +15,7 @@ from cangauge._files import file_sha256, write_texts_atomic
 from cangauge._text import counted, number, significant
 from cangauge.cli.options import (
     JsonOption,
-    Reading,
+    ReadingOptions,
     ReportOption,
     check_outputs,
     known_temperature_source,
@@ -161,7 +161,7 @@ def fit_fleet_command(
             metavar="LOGS", help="Those of LOGS that are not fitted, as LOGS; repeat the option."
         ),
     ] = None,
-    reading: Reading,
+    reading: ReadingOptions,
     report: ReportOption = None,
     json_output: JsonOption = False,
 ) -> None:
@@ -253,7 +253,7 @@ def estimate_fleet_command(
     *,
     cluster: Cluster,
     capacity_ah: CapacityOption = None,
-    reading: Reading,
+    reading: ReadingOptions,
     report: ReportOption = None,
     json_output: JsonOption = False,
 ) -> None:
@@ -279,7 +279,7 @@ def health_fleet_command(
     *,
     cluster: Cluster,
     capacity_ah: CapacityOption = None,
-    reading: Reading,
+    reading: ReadingOptions,
     report: ReportOption = None,
     json_output: JsonOption = False,
 ) -> None:
@@ -302,7 +302,7 @@ def _job(  # noqa: PLR0917 - as the two commands have them
     logs: Sequence[str],
     model: Path,
     cluster: Cluster,
-    reading: Reading,
+    reading: ReadingOptions,
     report: Path | None,
     capacity_ah: float | None,
 ) -> tuple[Job, list[FleetLog]]:
@@ -343,7 +343,7 @@ def gap_fleet_command(  # noqa: PLR0917 - typer passes options by name
     ] = ALARM,
     *,
     cluster: Cluster,
-    reading: Reading,
+    reading: ReadingOptions,
     report: ReportOption = None,
     json_output: JsonOption = False,
 ) -> None:
@@ -372,7 +372,7 @@ def gap_fleet_command(  # noqa: PLR0917 - typer passes options by name
     _run(job, tasks, among, out, cluster, report, json_output=json_output)
 
 
-def _read_options(reading: Reading) -> ReadOptions:
+def _read_options(reading: ReadingOptions) -> ReadOptions:
     """Return how logs are read; files of the vehicle are read here, not by the workers."""
     from cangauge.extras.fleet.sources import ReadOptions
 

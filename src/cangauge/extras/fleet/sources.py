@@ -24,7 +24,7 @@ from cangauge._files import MAX_LOG_BYTES, as_utf8, text_sha256
 from cangauge.bus.captures import Capture
 from cangauge.bus.recording import (
     log_of,
-    open_with_columns,
+    open_recording,
     refuse_sign_of_capture,
     refuse_single_row,
 )
@@ -299,14 +299,14 @@ class ReadOptions:
     described: str = ""
 
     def open(self, path: Path) -> LogFile | Capture:
-        """Open a recording (`open_with_columns`).
+        """Open a recording (`open_recording`).
 
         Raises
         ------
         InputError
             If the file cannot be read, or the sign is stated for a capture.
         """
-        found = open_with_columns(path, columns=self.columns, mapped=self.mapped, sign=self.sign)
+        found = open_recording(path, columns=self.columns, mapped=self.mapped, sign=self.sign)
         refuse_sign_of_capture(found, self.sign)
         return found
 

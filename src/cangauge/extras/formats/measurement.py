@@ -29,7 +29,7 @@ _TIME: Final = "time [s]"
 """Heading of the rasters' own time."""
 
 
-class Channel(NamedTuple):
+class MeasuredChannel(NamedTuple):
     """Times [s] and values of a channel, shape (n,) each."""
 
     time_s: FloatArray
@@ -40,7 +40,7 @@ def _draft_of_channels(
     head: Head,
     headings: Sequence[str],
     given: ColumnMap | None,
-    read: Callable[[list[str]], Mapping[str, Channel]],
+    read: Callable[[list[str]], Mapping[str, MeasuredChannel]],
 ) -> DraftLog:
     """Return the draft of the chosen channels on the raster of the current.
 
@@ -82,7 +82,7 @@ def _draft_of_channels(
 
 
 def _on_raster(
-    time_s: FloatArray, channel: Channel, name: str, *, is_held: bool
+    time_s: FloatArray, channel: MeasuredChannel, name: str, *, is_held: bool
 ) -> tuple[FloatArray, str]:
     """Return a channel at the times of the current, and a remark on what was done."""
     if np.array_equal(channel.time_s, time_s):
@@ -140,7 +140,7 @@ class Mf4Signals:
             with head.open() as unpacked, MDF(unpacked) as file:
                 places = self._places(file)
 
-                def read(names: list[str]) -> dict[str, Channel]:
+                def read(names: list[str]) -> dict[str, MeasuredChannel]:
                     return {name: _signal(file, *places[name]) for name in names}
 
                 draft = _draft_of_channels(head, list(places), columns, read)
@@ -173,11 +173,11 @@ class Mf4Signals:
         return places
 
 
-def _signal(file: Any, group: int, index: int) -> Channel:
+def _signal(file: Any, group: int, index: int) -> MeasuredChannel:
     signal = file.get(group=group, index=index)
     values = np.asarray(signal.samples)
     numbers = values.astype(np.float64) if values.dtype.kind in "iufb" else np.empty(0)
-    return Channel(np.asarray(signal.timestamps, dtype=np.float64)[: numbers.size], numbers)
+    return MeasuredChannel(np.asarray(signal.timestamps, dtype=np.float64)[: numbers.size], numbers)
 
 
 class McapSamples:
@@ -230,7 +230,9 @@ class McapSamples:
             problem = f"the MCAP file is damaged ({damage})" if damage else ""
             problem = problem or "the MCAP file holds no numbers"
             raise InputError(problem, source=head.path, cure="record it again")
-        found = {name: Channel(np.array(t), np.array(v)) for name, (t, v) in channels.items()}
+        found = {
+            name: MeasuredChannel(np.array(t), np.array(v)) for name, (t, v) in channels.items()
+        }
         if has_samples:
             draft = _draft_of_samples(head, found)
         else:
@@ -267,7 +269,7 @@ def _numbers(fields: Mapping[str, Any], before: str) -> Iterator[tuple[str, floa
             yield f"{before}{name}", float(value)
 
 
-def _draft_of_samples(head: Head, found: Mapping[str, Channel]) -> DraftLog:
+def _draft_of_samples(head: Head, found: Mapping[str, MeasuredChannel]) -> DraftLog:
     """Return the samples of a recording; a value that one lacks is filled from its neighbours."""
     draft = DraftLog(head.name, str(head.path))
     rows = found.get("time_s")

@@ -100,7 +100,7 @@ class HttpServer(Output):
 
     async def _serve(self) -> None:
         context = {"server": self}
-        pages = [("/status", _Status, context), ("/healthz", _Health, context),
+        pages = [("/status", _StatusPage, context), ("/healthz", _Health, context),
                  ("/metrics", _Metrics, context)]  # fmt: skip
         application = Application(
             pages,
@@ -212,7 +212,7 @@ class _Page(RequestHandler):
         return latest.at(time.monotonic())
 
 
-class _Status(_Page):
+class _StatusPage(_Page):
     def get(self) -> None:
         self.send_json(self.status)
 

@@ -149,14 +149,14 @@ class Site:
             [
                 ("/", _Live, context),
                 ("/enter", _Enter, context),
-                (r"/files/([a-z.]+)", _File, context),
+                (r"/files/([a-z.]+)", _StaticFile, context),
                 ("/rows", _Rows, context),
                 ("/stream", _Stream, context),
                 ("/range.csv", _Range, context),
                 ("/recording", _Recording, context),
                 (f"/{LOG_NAME}", _LastHour, context),
             ],
-            default_handler_class=_Nothing,
+            default_handler_class=_NotFound,
             default_handler_args=context,
             log_function=lambda _: None,
             websocket_ping_interval=PING_S,
@@ -164,7 +164,7 @@ class Site:
         )
 
 
-class _Page(RequestHandler):
+class _LiveHandler(RequestHandler):
     """Access control of all pages."""
 
     needs_token = True
@@ -221,12 +221,12 @@ class _Page(RequestHandler):
         return value if math.isfinite(value) else default
 
 
-class _Live(_Page):
+class _Live(_LiveHandler):
     def get(self) -> None:
         self.finish(self.site.texts["live.html"])
 
 
-class _Enter(_Page):
+class _Enter(_LiveHandler):
     needs_token = False
 
     def get(self) -> None:
@@ -245,7 +245,7 @@ class _Enter(_Page):
         self.redirect("/")
 
 
-class _File(_Page):
+class _StaticFile(_LiveHandler):
     needs_token = False
     _TYPES: Final = {"js": "text/javascript; charset=utf-8", "css": "text/css; charset=utf-8"}
 
@@ -258,14 +258,14 @@ class _File(_Page):
         self.finish(self.site.texts[name])
 
 
-class _Rows(_Page):
+class _Rows(_LiveHandler):
     def get(self) -> None:
         """Return the status, what is wrong, and the rows of a span after those already known."""
         key, after = self.get_query_argument("key", ""), int(self.argument("after", 0.0))
         self.send_json(self.site.answer(self.get_query_argument("span", ""), key, after))
 
 
-class _Stream(_Page, WebSocketHandler):
+class _Stream(_LiveHandler, WebSocketHandler):
     """Send what `/rows` answers, as it comes: from each question of the viewer on.
 
     The next message is made once the viewer's connection has taken the one before.
@@ -301,7 +301,7 @@ class _Stream(_Page, WebSocketHandler):
                 await self.site.news()
 
 
-class _Range(_Page):
+class _Range(_LiveHandler):
     def get(self) -> None:
         """Return the rows of a span between two wall-clock times [ms] as CSV."""
         history = self.site.history
@@ -312,7 +312,7 @@ class _Range(_Page):
         self.send_csv("cangauge-live.csv", _csv(rows[(time_ms >= start) & (time_ms <= end)]))
 
 
-class _Recording(_Page):
+class _Recording(_LiveHandler):
     def post(self) -> None:
         """Ask the service to begin or end its recording: `{"active": true}`.
 
@@ -334,12 +334,12 @@ class _Recording(_Page):
             self.send_json({"active": wanted})
 
 
-class _LastHour(_Page):
+class _LastHour(_LiveHandler):
     def get(self) -> None:
         self.send_csv(LOG_NAME, last_hour(self.site.history))
 
 
-class _Nothing(_Page):
+class _NotFound(_LiveHandler):
     needs_token = False
 
     def get(self) -> None:

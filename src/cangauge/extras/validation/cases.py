@@ -9,7 +9,7 @@ import numpy as np
 
 from cangauge.errors import InputError
 from cangauge.extras.validation.twin.drive import Drive, draw_drive
-from cangauge.extras.validation.twin.pack import Pack
+from cangauge.extras.validation.twin.pack import TwinPack
 from cangauge.extras.validation.twin.plant import Plant
 from cangauge.extras.validation.twin.recording import Recording, record_drive, rms
 from cangauge.extras.validation.twin.simulation import PlantName, draw_plant
@@ -42,7 +42,7 @@ class Scenario:
     climate: Climate
 
     @property
-    def pack(self) -> Pack:
+    def pack(self) -> TwinPack:
         """Size, thermal masses and sensors."""
         return self.plant.pack
 

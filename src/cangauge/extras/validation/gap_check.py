@@ -22,7 +22,7 @@ from cangauge.errors import InputError
 from cangauge.extras.validation.twin.drive import draw_drive
 from cangauge.extras.validation.twin.faults import Fault, fault_kind, fault_kinds
 from cangauge.extras.validation.twin.injection import fit_surrogate_pack, inject, scale_injection
-from cangauge.extras.validation.twin.pack import Pack
+from cangauge.extras.validation.twin.pack import TwinPack
 from cangauge.extras.validation.twin.recording import record_drive
 from cangauge.extras.validation.twin.simulation import draw_plant
 from cangauge.logs.log import Log
@@ -66,13 +66,13 @@ class CheckedPack:
     logs : tuple of Log
         At least four, each with its start in `soc_pct`.
     capacity_ah : float
-    pack : Pack
+    pack : TwinPack
         Its physics, for the injected effects.
     """
 
     logs: tuple[Log, ...]
     capacity_ah: float
-    pack: Pack
+    pack: TwinPack
 
     @classmethod
     def of_logs(cls, logs: Sequence[Log], capacity_ah: float, cells: int) -> CheckedPack:

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from cangauge.cli.options import JsonOption, Reading, assumed_of, option_groups, within
+from cangauge.cli.options import JsonOption, ReadingOptions, assumed_of, option_groups, within
 from cangauge.cli.output import emit_json, note, print_table, progress_shown
 from cangauge.errors import InputError
 
@@ -35,7 +35,7 @@ def gap_check_command(
     ] = None,
     seed: Annotated[int, typer.Option(metavar="N", min=0, help="Of the simulated pack.")] = 1,
     *,
-    reading: Reading,
+    reading: ReadingOptions,
     json_output: JsonOption = False,
 ) -> None:
     """Measure what `gap` would find: every effect injected into healthy logs of a pack.

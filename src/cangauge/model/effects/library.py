@@ -166,7 +166,7 @@ def _parse_value(parameter: Parameter, given: object, pack: Pack, field: str) ->
 
 
 @dataclass(frozen=True, eq=False)
-class Candidate:
+class EffectCandidate:
     """An effect with one trial value of each shape; its amplitudes are columns of a fit."""
 
     effect: Effect
@@ -185,7 +185,7 @@ class Candidate:
         return {**dict(zip(self.amplitudes, total, strict=True)), **self.shape}
 
 
-def candidates(effects: Sequence[Effect], pack: Pack, time_s: FloatArray) -> list[Candidate]:
+def candidates(effects: Sequence[Effect], pack: Pack, time_s: FloatArray) -> list[EffectCandidate]:
     """Return every effect with every combination of trial values of its shapes.
 
     Parameters
@@ -209,5 +209,5 @@ def candidates(effects: Sequence[Effect], pack: Pack, time_s: FloatArray) -> lis
         for choice in itertools.product(*grids):
             shape = dict(zip((item.name for item in shapes), choice, strict=True))
             shape |= effect.constants(pack)
-            result.append(Candidate(effect, shape, names, centre, bounds, steps))
+            result.append(EffectCandidate(effect, shape, names, centre, bounds, steps))
     return result

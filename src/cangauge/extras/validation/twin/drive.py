@@ -15,7 +15,7 @@ from scipy.signal import lfilter
 from cangauge._files import MIB, read_bounded
 from cangauge._typing import FloatArray
 from cangauge.errors import InputError
-from cangauge.extras.validation.twin.pack import Pack
+from cangauge.extras.validation.twin.pack import TwinPack
 
 # Style → cruise speed [m/s], cruise duration [s], stop between micro-trips [s].
 _STYLES: Final = {
@@ -79,7 +79,7 @@ class Drive:
 
 def draw_drive(
     rng: np.random.Generator,
-    pack: Pack,
+    pack: TwinPack,
     *,
     hours: float | None = None,
     ambient_c: float | None = None,
@@ -93,7 +93,7 @@ def draw_drive(
     Parameters
     ----------
     rng : Generator
-    pack : Pack
+    pack : TwinPack
     hours : float, optional
         Duration [h], 0.05–12; by default 0.5–2.5. The drive ends early at `end_soc`.
     ambient_c : float, optional
@@ -300,7 +300,7 @@ def _battery_power(rng: np.random.Generator, speed: FloatArray, auxiliary_w: flo
 
 
 def _current(
-    rng: np.random.Generator, pack: Pack, power_w: FloatArray, start: float
+    rng: np.random.Generator, pack: TwinPack, power_w: FloatArray, start: float
 ) -> tuple[FloatArray, float]:
     """Return the current on the simulation grid [A], and the grid's step [s]."""
     used = np.cumsum(power_w) / 3.6e6 / pack.energy_kwh
@@ -323,7 +323,7 @@ def _current(
 
 
 def _with_charging(
-    rng: np.random.Generator, pack: Pack, current: FloatArray, step_s: float, start: float
+    rng: np.random.Generator, pack: TwinPack, current: FloatArray, step_s: float, start: float
 ) -> FloatArray:
     """Insert a stop at a charger; same number of rows."""
     row = int(rng.uniform(0.2, 0.7) * current.size)

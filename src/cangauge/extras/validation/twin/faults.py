@@ -25,7 +25,7 @@ from cangauge.extras.validation.twin.condition import (
     SocResistance,
     WeakCells,
 )
-from cangauge.extras.validation.twin.pack import Pack
+from cangauge.extras.validation.twin.pack import TwinPack
 
 OUTSIDE: Final = "outside"
 """Family of the faults without a counterpart in the effects library."""
@@ -66,8 +66,8 @@ class ShapeRange:
 
 
 Shape = Mapping[str, float]
-Apply = Callable[[Condition, Pack, float, Shape, int], Condition]
-Limits = Callable[[Pack], tuple[float, float]]
+Apply = Callable[[Condition, TwinPack, float, Shape, int], Condition]
+Limits = Callable[[TwinPack], tuple[float, float]]
 
 
 @dataclass(frozen=True)
@@ -153,23 +153,23 @@ def finite_warburg(ohm: float, slowest_s: float) -> tuple[Relaxation, ...]:
     )
 
 
-def _fast(c: Condition, _pack: Pack, size: float, shape: Shape, _seed: int) -> Condition:
+def _fast(c: Condition, _pack: TwinPack, size: float, shape: Shape, _seed: int) -> Condition:
     added = cole_cole(size, shape["tau_s"], shape["alpha"])
     return replace(c, relaxations=(*c.relaxations, *added))
 
 
-def _slow(c: Condition, _pack: Pack, size: float, shape: Shape, _seed: int) -> Condition:
+def _slow(c: Condition, _pack: TwinPack, size: float, shape: Shape, _seed: int) -> Condition:
     return replace(c, relaxations=(*c.relaxations, *finite_warburg(size, shape["tau_s"])))
 
 
-def _soc_rise(c: Condition, _pack: Pack, size: float, shape: Shape, _seed: int) -> Condition:
+def _soc_rise(c: Condition, _pack: TwinPack, size: float, shape: Shape, _seed: int) -> Condition:
     towards_full = shape["towards_full"] > 0.75
     centre = 1.0 - shape["centre"] if towards_full else shape["centre"]
     width = -shape["width"] if towards_full else shape["width"]
     return replace(c, soc_resistance=SocResistance(size, centre, width))
 
 
-def _entropy_change(pack: Pack, seed: int) -> NDArray[np.float64]:
+def _entropy_change(pack: TwinPack, seed: int) -> NDArray[np.float64]:
     """Draw a smooth change of dU/dT over the SoC, of RMS 1, on the pack's grid."""
     rng = np.random.default_rng(seed)
     knots = np.array([0.0, 0.25, 0.5, 0.75, 1.0])
@@ -178,11 +178,11 @@ def _entropy_change(pack: Pack, seed: int) -> NDArray[np.float64]:
     return np.asarray(bend / np.sqrt(np.mean(bend**2)), dtype=np.float64)
 
 
-def _entropy(c: Condition, pack: Pack, size: float, _shape: Shape, seed: int) -> Condition:
+def _entropy(c: Condition, pack: TwinPack, size: float, _shape: Shape, seed: int) -> Condition:
     return replace(c, entropy_shift_v_k=1e-3 * size * _entropy_change(pack, seed))
 
 
-def _weak(c: Condition, _pack: Pack, size: float, shape: Shape, _seed: int) -> Condition:
+def _weak(c: Condition, _pack: TwinPack, size: float, shape: Shape, _seed: int) -> Condition:
     weak = WeakCells(int(shape["count"]), size, shape["deficit"] * size)
     return replace(c, weak=weak)
 
@@ -294,18 +294,18 @@ _IN_LIBRARY: Final[tuple[FaultKind, ...]] = (
 
 
 def _intermittent(name: str) -> Apply:
-    def apply(c: Condition, _pack: Pack, size: float, shape: Shape, seed: int) -> Condition:
+    def apply(c: Condition, _pack: TwinPack, size: float, shape: Shape, seed: int) -> Condition:
         change: dict[str, Any] = {name: Intermittent(size, shape["on_s"], shape["off_s"], seed)}
         return replace(c, **change)
 
     return apply
 
 
-def _stale(c: Condition, _pack: Pack, size: float, shape: Shape, seed: int) -> Condition:
+def _stale(c: Condition, _pack: TwinPack, size: float, shape: Shape, seed: int) -> Condition:
     return replace(c, stale=Intermittent(1.0, size, shape["off_s"], seed))
 
 
-def _ripple(c: Condition, pack: Pack, size: float, shape: Shape, _seed: int) -> Condition:
+def _ripple(c: Condition, pack: TwinPack, size: float, shape: Shape, _seed: int) -> Condition:
     period = shape["period_share"] * pack.nominal_v
     return replace(c, ripple_v=size, ripple_period_v=period, ripple_phase=shape["phase"])
 
@@ -410,7 +410,7 @@ class Fault:
         return replace(self, size=size)
 
 
-def apply_faults(pack: Pack, faults: tuple[Fault, ...]) -> Condition:
+def apply_faults(pack: TwinPack, faults: tuple[Fault, ...]) -> Condition:
     """Return the condition of a pack with faults.
 
     Raises
@@ -450,7 +450,7 @@ def fault_kinds(*, outside: bool = False) -> tuple[FaultKind, ...]:
 
 
 def parse_effect(
-    text: str, pack: Pack, *, seed: int, default_gap_v: float
+    text: str, pack: TwinPack, *, seed: int, default_gap_v: float
 ) -> tuple[Fault, float | None]:
     """Parse an effect given as text.
 
@@ -459,7 +459,7 @@ def parse_effect(
     text : str
         For example `current_offset:offset_a=2` or `resistance_step:step_ohm=0.02,at_s=1200`.
         `gap_v=` instead of the size gives the RMS gap to open.
-    pack : Pack
+    pack : TwinPack
         Sets the physical limits of the size.
     seed : int
         Seed of shape parameters that are not given.

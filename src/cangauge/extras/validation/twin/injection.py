@@ -24,9 +24,9 @@ from cangauge.extras.validation.twin.faults import Fault, apply_faults
 from cangauge.extras.validation.twin.pack import (
     HIGHEST,
     LOWEST,
-    Chemistry,
-    Pack,
+    CellChemistry,
     Sensors,
+    TwinPack,
     chemistry,
 )
 from cangauge.extras.validation.twin.plant import TwinPlant, discharged, lagged, temperatures
@@ -74,7 +74,7 @@ def soc_of(log: Log, capacity_ah: float) -> FloatArray:
 
 def fit_surrogate_pack(
     logs: Sequence[Log], *, capacity_ah: float, cells: int, name: str = "recorded"
-) -> Pack:
+) -> TwinPack:
     """Fit open-circuit voltage and resistance of a pack of the twin to recorded logs.
 
     Parameters
@@ -127,22 +127,22 @@ def _hats(soc: FloatArray) -> FloatArray:
     return result
 
 
-def _chemistry(name: str, curve: FloatArray) -> Chemistry:
+def _chemistry(name: str, curve: FloatArray) -> CellChemistry:
     grid = np.linspace(LOWEST, HIGHEST, _POINTS)
     soc = np.concatenate(([-0.06, -0.03], _KNOTS, [1.04]))
     volts = np.concatenate(([curve[0] - 1.2, curve[0] - 0.5], curve, [curve[-1] + 0.1]))
     ocv = np.maximum.accumulate(PchipInterpolator(soc, volts)(grid)) + 1e-6 * grid
     entropy = chemistry("nmc", np.random.default_rng(0)).entropy(grid)
-    return Chemistry(name, grid, ocv, entropy)
+    return CellChemistry(name, grid, ocv, entropy)
 
 
 def _pack(
-    curve: Chemistry, cells: int, capacity_ah: float, resistance_ohm: float, log: Log
-) -> Pack:
+    curve: CellChemistry, cells: int, capacity_ah: float, resistance_ohm: float, log: Log
+) -> TwinPack:
     one = resistance_ohm / cells
     heat_j_k = cells * 3.7 * capacity_ah / 1000.0 * 7000.0
     interval = float(np.median(np.diff(log.time_s)))
-    return Pack(
+    return TwinPack(
         name=curve.name,
         chemistry=curve,
         cells=cells,
@@ -209,7 +209,7 @@ class Injected:
     true_soc_pct: FloatArray
 
 
-def inject(log: Log, faults: Sequence[Fault], pack: Pack, *, seed: int = 0) -> Injected:
+def inject(log: Log, faults: Sequence[Fault], pack: TwinPack, *, seed: int = 0) -> Injected:
     """Return a recorded log as it would have been recorded with the faults.
 
     Parameters
@@ -217,7 +217,7 @@ def inject(log: Log, faults: Sequence[Fault], pack: Pack, *, seed: int = 0) -> I
     log : Log
         Healthy log, at least with its initial SoC.
     faults : sequence of Fault
-    pack : Pack
+    pack : TwinPack
         From `fit_surrogate_pack`.
     seed : int
         Seed of the initial state of the hysteresis.
@@ -288,7 +288,7 @@ def inject(log: Log, faults: Sequence[Fault], pack: Pack, *, seed: int = 0) -> I
 
 
 def scale_injection(
-    logs: Sequence[Log], fault: Fault, target_v: float, pack: Pack, *, seed: int = 0
+    logs: Sequence[Log], fault: Fault, target_v: float, pack: TwinPack, *, seed: int = 0
 ) -> ScaledFault:
     """Scale a fault to an RMS gap [V] over recorded logs; its size gives the sign."""
 
@@ -319,7 +319,7 @@ def with_initial_soc(log: Log, soc_pct: float) -> Log:
     return replace(log, soc_pct=assumed)
 
 
-def _drive(log: Log, pack: Pack, seed: int) -> tuple[Drive, FloatArray]:
+def _drive(log: Log, pack: TwinPack, seed: int) -> tuple[Drive, FloatArray]:
     """Return the recorded log as a drive on an even grid, and its temperature [°C]."""
     step = float(np.clip(np.median(np.diff(log.time_s)), 0.1, 1.0))
     elapsed = log.time_s - log.time_s[0]

@@ -63,7 +63,7 @@ CHEMISTRIES: Final = tuple(_OCV)
 
 
 @dataclass(frozen=True, eq=False)
-class Chemistry:
+class CellChemistry:
     """Open-circuit voltage and entropy of one cell over its state of charge.
 
     Parameters
@@ -91,7 +91,7 @@ class Chemistry:
         return np.interp(soc, self.grid, self.entropy_table_v_k)
 
 
-def chemistry(name: str, rng: np.random.Generator, entropy_scale: float = 1.0) -> Chemistry:
+def chemistry(name: str, rng: np.random.Generator, entropy_scale: float = 1.0) -> CellChemistry:
     """Draw one specimen of a chemistry, some millivolts off its table.
 
     Parameters
@@ -125,7 +125,7 @@ def chemistry(name: str, rng: np.random.Generator, entropy_scale: float = 1.0) -
     entropy_soc, entropy = np.array(_ENTROPY[name]).T
     curve = PchipInterpolator(entropy_soc / 100.0, entropy * 1e-3, extrapolate=False)
     entropy_table = curve(np.clip(grid, 0.0, 1.0)) * entropy_scale
-    return Chemistry(name, grid, table, entropy_table)
+    return CellChemistry(name, grid, table, entropy_table)
 
 
 @dataclass(frozen=True)
@@ -163,7 +163,7 @@ class Sensors:
 
 
 @dataclass(frozen=True, eq=False)
-class Pack:
+class TwinPack:
     """A pack of lithium-ion cells in series.
 
     Resistances are those of one cell at 25 °C [Ω]. Cell spread is represented by g groups of equal
@@ -172,7 +172,7 @@ class Pack:
     Parameters
     ----------
     name : str
-    chemistry : Chemistry
+    chemistry : CellChemistry
     cells : int
     capacity_ah : float
     weights : array of shape (g,)
@@ -208,7 +208,7 @@ class Pack:
     """
 
     name: str
-    chemistry: Chemistry
+    chemistry: CellChemistry
     cells: int
     capacity_ah: float
     weights: FloatArray
@@ -271,7 +271,7 @@ _KIND_ODDS: Final = {"leaf24": 3, "leaf40": 2, "car60": 2, "car60lfp": 1, "compa
 
 def draw_pack(
     rng: np.random.Generator, kind: str | None = None, chemistry_name: str | None = None
-) -> Pack:
+) -> TwinPack:
     """Draw a pack.
 
     Parameters
@@ -308,7 +308,7 @@ def draw_pack(
     energy = cells * 3.7 * capacity / 1000.0
     heat_j_k = energy * rng.uniform(5500.0, 8500.0)
     quantiles = np.array([-1.75, -0.85, 0.0, 0.85, 1.75])  # of the cell spread, for the groups
-    return Pack(
+    return TwinPack(
         name=kind,
         chemistry=specimen,
         cells=cells,

@@ -17,7 +17,7 @@ from scipy.signal import lfilter
 from cangauge._typing import FloatArray
 from cangauge.extras.validation.twin.condition import Condition
 from cangauge.extras.validation.twin.drive import Drive
-from cangauge.extras.validation.twin.pack import KELVIN, Chemistry, Pack
+from cangauge.extras.validation.twin.pack import KELVIN, CellChemistry, TwinPack
 
 REFERENCE_K: Final = 298.15
 _GLASS_K: Final = 230.0
@@ -69,7 +69,7 @@ class Plant(Protocol):
         """Name of the model."""
 
     @property
-    def pack(self) -> Pack:
+    def pack(self) -> TwinPack:
         """Size, thermal masses, sensors and open-circuit voltage."""
 
     @property
@@ -99,7 +99,7 @@ class TwinPlant:
     name = "twin"
     temperature_tolerance_k = 0.05
 
-    def __init__(self, pack: Pack) -> None:
+    def __init__(self, pack: TwinPack) -> None:
         self.pack = pack
 
     def respond(
@@ -152,7 +152,7 @@ class EquationPlant:
 
     Parameters
     ----------
-    pack : Pack
+    pack : TwinPack
         With the equation's open-circuit voltage.
     temperature_v_k : float
         Temperature coefficient of the pack [V/K].
@@ -162,7 +162,7 @@ class EquationPlant:
 
     temperature_tolerance_k = 0.05
 
-    def __init__(self, pack: Pack, temperature_v_k: float, resistance_ohm: FloatArray) -> None:
+    def __init__(self, pack: TwinPack, temperature_v_k: float, resistance_ohm: FloatArray) -> None:
         self.pack = pack
         self.name = "published" if pack.reports_core else "equation"
         self._temperature_v_k = temperature_v_k
@@ -225,14 +225,14 @@ class EquationPlant:
 
 
 def draw_equation_plant(
-    rng: np.random.Generator, pack: Pack, *, reports_core: bool = False
+    rng: np.random.Generator, pack: TwinPack, *, reports_core: bool = False
 ) -> EquationPlant:
     """Draw a pack that obeys the published equation.
 
     Parameters
     ----------
     rng : Generator
-    pack : Pack
+    pack : TwinPack
         Size, thermal masses, kinetics and sensors.
     reports_core : bool
         Report the core temperature, which the equation uses, and draw the temperature coefficient
@@ -254,7 +254,7 @@ def draw_equation_plant(
     beyond = np.clip(drawn.grid, 0.0, 1.0)
     ends = np.interp(beyond, drawn.grid, volts)
     volts = ends + np.interp(beyond, drawn.grid, slope) * (drawn.grid - beyond)
-    table = Chemistry("equation", drawn.grid, volts, np.zeros_like(drawn.grid))
+    table = CellChemistry("equation", drawn.grid, volts, np.zeros_like(drawn.grid))
     shares = np.array(_DELAYED_SHARES) * rng.uniform(0.7, 1.3, len(_DELAYED_SHARES))
     resistance = pack.resistance_ohm * shares / shares.sum()
     # By default the size of the entropy coefficient. The published −7.7 mV/K per cell, fitted to
@@ -312,7 +312,7 @@ def lagged(signal: FloatArray, step_s: float, tau_s: float) -> FloatArray:
 
 
 def temperatures(
-    pack: Pack, drive: Drive, heat_w: FloatArray, insulation: float = 0.0
+    pack: TwinPack, drive: Drive, heat_w: FloatArray, insulation: float = 0.0
 ) -> tuple[FloatArray, FloatArray]:
     """Return core and surface temperature [°C], shape (n,) each.
 
@@ -321,7 +321,7 @@ def temperatures(
 
     Parameters
     ----------
-    pack : Pack
+    pack : TwinPack
     drive : Drive
         Initial and ambient temperature, conditioning.
     heat_w : array of shape (n,)
@@ -418,7 +418,7 @@ def hysteresis_drop(drive: Drive, condition: Condition, charge: FloatArray) -> F
     return condition.hysteresis_v * total
 
 
-def ohmic_factor(pack: Pack, kelvin: FloatArray) -> FloatArray:
+def ohmic_factor(pack: TwinPack, kelvin: FloatArray) -> FloatArray:
     """Return the ohmic resistance relative to 25 °C [-] (Vogel–Fulcher–Tammann)."""
     exponent = 1.0 / (kelvin - _VOGEL_ZERO_K) - 1.0 / (REFERENCE_K - _VOGEL_ZERO_K)
     return np.exp(pack.ohmic_vogel_k * exponent)
@@ -431,7 +431,7 @@ def _overpotential_table(anodic: float) -> tuple[FloatArray, FloatArray]:
 
 
 def _groups(
-    pack: Pack, condition: Condition
+    pack: TwinPack, condition: Condition
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
     """Return number of cells, capacity factor, resistance factor, start shift, shape (g,) each."""
     weights, capacity = pack.weights, pack.capacity_factor * condition.capacity_factor
@@ -448,7 +448,7 @@ def _groups(
 
 
 def _relaxed(
-    pack: Pack, drive: Drive, current_a: FloatArray, kelvin: FloatArray
+    pack: TwinPack, drive: Drive, current_a: FloatArray, kelvin: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return drop in the electrolyte [V], current of the reaction [A], swing of the surface [-]."""
     sluggish = np.exp(pack.diffusion_activation_k * (1.0 / kelvin - 1.0 / REFERENCE_K))
@@ -464,7 +464,7 @@ def _relaxed(
 
 
 def _kinetics(
-    pack: Pack, condition: Condition, soc: FloatArray, current_a: FloatArray, kelvin: FloatArray
+    pack: TwinPack, condition: Condition, soc: FloatArray, current_a: FloatArray, kelvin: FloatArray
 ) -> FloatArray:
     """Return the overpotential of the reaction, shape (g, n)."""
     activation = pack.exchange_activation_k * (1.0 / REFERENCE_K - 1.0 / kelvin)

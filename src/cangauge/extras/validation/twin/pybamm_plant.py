@@ -18,7 +18,7 @@ from cangauge._typing import FloatArray
 from cangauge.errors import CangaugeError, InputError
 from cangauge.extras.validation.twin.condition import Condition
 from cangauge.extras.validation.twin.drive import Drive
-from cangauge.extras.validation.twin.pack import HIGHEST, KELVIN, LOWEST, Chemistry, Pack
+from cangauge.extras.validation.twin.pack import HIGHEST, KELVIN, LOWEST, CellChemistry, TwinPack
 from cangauge.extras.validation.twin.plant import (
     REFERENCE_K,
     Response,
@@ -64,7 +64,7 @@ class PybammPlant:
 
     Parameters
     ----------
-    pack : Pack
+    pack : TwinPack
         Size, thermal masses and sensors; with the open-circuit voltage of the parameters.
     parameters : pybamm.ParameterValues
     stoichiometry : Stoichiometry
@@ -76,7 +76,7 @@ class PybammPlant:
     temperature_tolerance_k = 0.3
 
     def __init__(
-        self, pack: Pack, parameters: Any, stoichiometry: Stoichiometry, contact_ohm: float
+        self, pack: TwinPack, parameters: Any, stoichiometry: Stoichiometry, contact_ohm: float
     ) -> None:
         self.pack = pack
         self._parameters = parameters
@@ -238,14 +238,14 @@ def import_pybamm() -> Any:
 
 
 def draw_pybamm_plant(
-    rng: np.random.Generator, pack: Pack, parameter_set: str | None = None
+    rng: np.random.Generator, pack: TwinPack, parameter_set: str | None = None
 ) -> PybammPlant:
     """Draw a PyBaMM pack: a parameter set with individual exchange currents.
 
     Parameters
     ----------
     rng : Generator
-    pack : Pack
+    pack : TwinPack
         Size, thermal masses and sensors.
     parameter_set : str, optional
         One of `PARAMETER_SETS`; drawn by default.
@@ -302,8 +302,8 @@ def _divided(value: Any, divisor: float) -> Any:
 
 
 def _ocv_table(
-    parameters: Any, s: Stoichiometry, drawn: Chemistry, parameter_set: str
-) -> Chemistry:
+    parameters: Any, s: Stoichiometry, drawn: CellChemistry, parameter_set: str
+) -> CellChemistry:
     """Return the open-circuit voltage of the parameters on the grid of `drawn`."""
     soc = np.linspace(max(LOWEST, -0.02), min(HIGHEST, 1.0), _POINTS)
     negative = np.clip(
@@ -323,7 +323,7 @@ def _ocv_table(
     ocv = np.interp(drawn.grid, soc, volts) + 1e-6 * drawn.grid
     slope = (volts[1] - volts[0]) / (soc[1] - soc[0])
     ocv = np.where(drawn.grid < soc[0], volts[0] + slope * (drawn.grid - soc[0]), ocv)
-    return Chemistry(parameter_set, drawn.grid, ocv, np.zeros_like(drawn.grid))
+    return CellChemistry(parameter_set, drawn.grid, ocv, np.zeros_like(drawn.grid))
 
 
 def _number(parameters: Any, expression: Any) -> float:

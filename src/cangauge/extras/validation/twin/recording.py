@@ -12,7 +12,7 @@ from cangauge._typing import FloatArray
 from cangauge.extras.validation.twin.condition import HEALTHY, Condition
 from cangauge.extras.validation.twin.drive import Drive
 from cangauge.extras.validation.twin.faults import Fault, apply_faults
-from cangauge.extras.validation.twin.pack import KELVIN, Pack, Sensors
+from cangauge.extras.validation.twin.pack import KELVIN, Sensors, TwinPack
 from cangauge.extras.validation.twin.plant import (
     Plant,
     discharged,
@@ -234,7 +234,9 @@ def record_drive(
     )
 
 
-def true_soc_pct(pack: Pack, drive: Drive, truth: GroundTruth, condition: Condition) -> FloatArray:
+def true_soc_pct(
+    pack: TwinPack, drive: Drive, truth: GroundTruth, condition: Condition
+) -> FloatArray:
     """Return the true SoC relative to the true mean capacity [%], shape (n,)."""
     charge = discharged(drive, truth.current_a, condition.charge_loss)
     capacity = pack.capacity_ah * condition.capacity_factor
@@ -283,7 +285,7 @@ def measured_voltage(condition: Condition, drive: Drive, voltage_v: FloatArray) 
 
 
 def measured_temperature(
-    pack: Pack, condition: Condition, drive: Drive, surface_c: FloatArray
+    pack: TwinPack, condition: Condition, drive: Drive, surface_c: FloatArray
 ) -> FloatArray:
     """Return the temperature that a sensor without noise reports [°C], shape (n,)."""
     measured = lagged(surface_c, drive.step_s, pack.sensors.temperature_lag_s)

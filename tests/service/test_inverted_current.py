@@ -16,6 +16,7 @@ from cangauge.bus.publish import SocEstimate, SocReader
 from cangauge.bus.vehicle import Vehicle
 from cangauge.estimation.offline import samples_of
 from cangauge.logs.log import Log
+from cangauge.logs.sign import sign_of_current
 from cangauge.replay.player import ReplaySettings, play
 from cangauge.replay.steps import LogSource
 from cangauge.service.pipeline import Pipeline
@@ -96,9 +97,10 @@ def test_the_bits_of_the_frame_do_not_move() -> None:
 def test_a_right_sign_and_few_steps_prove_nothing() -> None:
     assert not driven(short_log(700.0, rate_hz=2.0)).sign.evidence
     few = inverted(short_log(1200.0, rate_hz=1.0))
-    # 20 levels of a minute: their steps agree, but could by chance.
-    level_a = np.repeat(few.current_a[::60], 60)
+    # 40 levels of half a minute: enough for a log, which is tested once.
+    level_a = np.repeat(few.current_a[::30], 30)
     steady = replace(few, current_a=level_a, voltage_v=380.0 + 0.1 * level_a)
+    assert sign_of_current(steady).sign == -1
     assert not driven(steady).sign.evidence
 
 
