@@ -40,7 +40,8 @@ if TYPE_CHECKING:
     from cangauge.estimation.estimator import Estimator
     from cangauge.estimation.offline import EstimateTable, estimate
     from cangauge.extras.validation import Simulation, simulate
-    from cangauge.identify.fit import Identification, fit
+    from cangauge.identify.fit import fit
+    from cangauge.identify.identification import Identification
     from cangauge.logs.log import Log
     from cangauge.model.model_file import Model
     from cangauge.service.run import Service

@@ -7,6 +7,8 @@ from typing import Final
 
 NONE_KNOWN: Final = "–"
 """Shown in place of an unknown number."""
+LEAST_KWH_WH: Final = 1000.0
+"""Energies from here on are written in kWh [Wh]."""
 LONGEST_WHOLE: Final = 1e6
 """Numbers from here on are written with a power of ten."""
 
@@ -27,6 +29,27 @@ def significant(value: float | None, digits: int = 4, unit: str = "") -> str:
     if "e+" in text and abs(value) < LONGEST_WHOLE:
         text = f"{float(text):.0f}"
     return _with_unit(text, unit)
+
+
+def uncertain(value: float | None, std: float | None, unit: str = "") -> str:
+    """Return a value with as many decimals as its standard deviation has with two digits.
+
+    Examples
+    --------
+    >>> uncertain(199.3, 14.2, "A"), uncertain(9.613, 0.0418, "Wh")
+    ('199 ± 14 A', '9.613 ± 0.042 Wh')
+    """
+    if value is None or std is None or not (math.isfinite(value) and 0.0 < std < math.inf):
+        return f"{significant(value, 3)} ± {significant(std, 2, unit)}"
+    decimals = max(0, 1 - math.floor(math.log10(std)))
+    return f"{number(value, decimals)} ± {number(std, decimals, unit)}"
+
+
+def uncertain_energy(wh: float | None, std_wh: float | None) -> str:
+    """Return an energy with its standard deviation, in kWh from 1 kWh on, in Wh below."""
+    if wh is None or std_wh is None or wh < LEAST_KWH_WH:
+        return uncertain(wh, std_wh, "Wh")
+    return uncertain(1e-3 * wh, 1e-3 * std_wh, "kWh")
 
 
 def span(low: float, high: float, digits: int = 1, unit: str = "") -> str:

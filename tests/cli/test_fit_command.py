@@ -256,7 +256,7 @@ def test_a_capture_needs_its_vehicle(run: Run, shared_data: Path, tmp_path: Path
         "fit", capture, "-o", tmp_path / "m.json", "--vehicle", "leaf_ze0", "--capacity-ah", "50"
     )
     assert ran.code == 0, ran.err
-    assert "beyond, the curve follows the typical cell" in ran.err
+    assert "there the curve follows the typical cell" in ran.err
 
 
 def test_vehicle_options_do_not_apply_to_a_log(run: Run, made: Path, tmp_path: Path) -> None:

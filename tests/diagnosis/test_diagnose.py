@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
+from html.parser import HTMLParser
 from pathlib import Path
 
 import numpy as np
@@ -161,9 +162,37 @@ def test_what_cannot_be_diagnosed_is_refused(
         diagnose([change(day(20))], model, known)  # type: ignore[operator]
 
 
-def test_a_notebook_shows_the_answer(faulty: Diagnosis) -> None:
-    assert faulty.headline.split("(")[0] in faulty._repr_html_()
-    assert faulty.headline in repr(faulty)
+class Cells(HTMLParser):
+    """Open tags, and the text of every table cell."""
+
+    def __init__(self, page: str) -> None:
+        super().__init__()
+        self.open: list[str] = []
+        self.cells: list[str] = []
+        self.feed(page)
+
+    def handle_starttag(self, tag: str, attrs: object) -> None:
+        self.open.append(tag)
+        self.cells += [""] if tag in {"td", "th"} else []
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self.open.pop() == tag
+
+    def handle_data(self, data: str) -> None:
+        if self.open[-1] in {"td", "th"}:
+            self.cells[-1] += data
+
+
+def test_a_notebook_shows_the_answer(known: References, model: Model) -> None:
+    log = replace(more_volts(day(20), 5.0).rows(slice(0, 500)), name="<b>day & night</b>")
+    found = diagnose([log], model, known)
+    shown = Cells(found._repr_html_())
+    assert not shown.open  # every tag is closed, and the log's name is text
+    assert "&lt;b&gt;day &amp; night&lt;/b&gt; is shorter" in found._repr_html_()
+    assert shown.cells[:2] == ["cause", "probability"]
+    assert shown.cells[4] == next(iter(found.posterior.effects)).replace("_", " ")
+    assert shown.cells[-8::4] == ["unknown", "none"]
+    assert found.headline in repr(found)
 
 
 def test_no_log_starts_beyond_full(known: References, model: Model) -> None:

@@ -13,6 +13,7 @@ from cangauge.errors import InputError
 from cangauge.estimation.estimator import Estimator, EstimatorSettings
 from cangauge.estimation.offline import samples_of
 from cangauge.estimation.power import PackLimits
+from cangauge.identify.fit import fit
 from cangauge.logs.log import Log
 from cangauge.model.delay_line import delayed_currents
 from cangauge.model.model_file import Model
@@ -166,3 +167,15 @@ def test_energy_ends_at_the_stated_soc() -> None:
         found.append(estimator.power().energy_wh)
     assert found[0] > found[1] + 0.15 * CAPACITY_AH * 330.0
     assert found[2] == 0.0
+
+
+def test_the_possible_current_does_not_contradict_the_logs() -> None:
+    log = synthetic_log(hours=0.6, start_pct=84.0, end_pct=62.0, noise_v=0.3)
+    model = fit(log, capacity_ah=CAPACITY_AH, effects="none").model
+    mean_a = np.convolve(log.current_a, np.full(10, 0.1), mode="valid")[1:]
+    heaviest = 1200 + int(np.argmax(mean_a[1200:]))
+    estimator = Estimator(model, EstimatorSettings(initial_soc_pct=84.0))
+    for sample in samples_of(log.rows(slice(0, heaviest + 1))):
+        estimator.update(sample)
+    power = estimator.power()
+    assert power.discharge_a + 2.0 * power.discharge_std_a > mean_a[heaviest]

@@ -73,7 +73,8 @@ def test_beyond_its_logs_the_curve_follows_the_typical_cell() -> None:
     zero = np.zeros(len(found.voltage_model.load_coefficients))
     std_v = [float(np.sqrt(np.sum(functions.row(s, zero) ** 2))) for s in soc.tolist()]
     assert np.all(np.abs(error_v) < 3.0 * np.array(std_v))
-    assert any("beyond, the curve follows the typical cell" in text for text in found.remarks)
+    assert "Add a drive below" in found.verdict
+    assert "there the curve follows the typical cell" in found.verdict
 
 
 def test_is_the_weighted_least_squares_of_all_rows() -> None:

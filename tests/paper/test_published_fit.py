@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from cangauge._resources import shared_file
-from cangauge.identify.fit import Identification, fit
+from cangauge.identify.fit import fit
+from cangauge.identify.identification import Identification
 from cangauge.logs.read import read_log
 from cangauge.model import published
 

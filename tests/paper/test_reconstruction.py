@@ -12,7 +12,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from cangauge._resources import shared_file
-from cangauge.identify.evaluate import energy_balance
+from cangauge.identify.identification import energy_balance
 from cangauge.identify.rows import FitRows, decimate, fit_rows
 from cangauge.logs.log import Log
 from cangauge.logs.read import read_log

@@ -11,7 +11,7 @@ from bokeh.embed import json_item
 
 import cangauge
 from cangauge.diagnosis import Diagnosis
-from cangauge.identify.fit import Identification
+from cangauge.identify.identification import Identification
 from cangauge.logs.log import Log
 from cangauge.model.published import CAPACITY_AH
 from synthetic import synthetic_log

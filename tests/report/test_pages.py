@@ -18,7 +18,8 @@ from cangauge.extras.report.charts import TimeFigures
 from cangauge.extras.report.estimate import estimate_page, estimate_report
 from cangauge.extras.report.fit import fit_page, fit_report
 from cangauge.extras.report.page import Bullets, Figure, Page, Section, Table, Tile, joined, render
-from cangauge.identify.fit import Identification, fit
+from cangauge.identify.fit import fit
+from cangauge.identify.identification import Identification
 from cangauge.logs.canonical import write_log
 from cangauge.logs.log import Log
 from cangauge.logs.read import read_log

@@ -15,9 +15,9 @@ from cangauge.errors import InputError
 from cangauge.estimation.offline import estimate_log
 from cangauge.estimation.settings import EstimatorSettings
 from cangauge.extras.report.estimate import estimate_report, estimate_verdict, periods
-from cangauge.extras.report.fit import fit_verdict
 from cangauge.extras.report.inspection import inspect_report, inspect_verdict
-from cangauge.identify.fit import Identification, fit
+from cangauge.identify.fit import fit
+from cangauge.identify.identification import Identification
 from cangauge.inspect.log import inspect_log
 from cangauge.logs.canonical import write_log
 from cangauge.logs.log import Log
@@ -59,21 +59,21 @@ def degraded(estimate: RecordedEstimate, *spans: tuple[int, int]) -> RecordedEst
 
 
 def test_fit_states_range_and_what_is_missing(found: Identification) -> None:
-    text = fit_verdict(found)
+    text = found.verdict
     low, high = found.model.range.soc_pct  # as the terminal prints it
     assert text.startswith(f"Good from {low:.0f} to {high:.0f} % SoC: mean voltage error ")
     assert f"on {found.model.noise.judged_on}. Add a drive below 42 % and above 87 %: " in text
 
 
 def test_fit_over_a_full_discharge_lacks_no_range() -> None:
-    text = fit_verdict(fit([synthetic_log(hours=1.2, noise_v=0.5, name="full")]))
+    text = fit([synthetic_log(hours=1.2, noise_v=0.5, name="full")]).verdict
     assert text.startswith("Good from 1 to 98 % SoC")
     assert "Add a drive" not in text
 
 
 def test_constant_temperature_leaves_kt_unidentified(log: Log) -> None:
     level = replace(log, temperature_c=np.full(len(log), 24.0))
-    text = fit_verdict(fit([level], capacity_ah=CAPACITY_AH))
+    text = fit([level], capacity_ah=CAPACITY_AH).verdict
     assert "The temperature moves by 0.0 K: kt is not identified." in text
 
 

@@ -13,7 +13,7 @@ from rich.progress import Progress
 
 from cangauge._extras import extra
 from cangauge._files import atomic_path
-from cangauge._text import number
+from cangauge._text import number, significant, uncertain, uncertain_energy
 from cangauge.cli.options import (
     JsonOption,
     ReadingOptions,
@@ -33,6 +33,7 @@ from cangauge.errors import InputError
 
 if TYPE_CHECKING:
     from cangauge.bus.publish import PackReport
+    from cangauge.estimation.power import KnownLimits
     from cangauge.estimation.settings import Method
     from cangauge.model.model_file import Model
     from cangauge.service.offline import RecordedEstimate
@@ -293,35 +294,34 @@ def _show(done: RecordedEstimate) -> None:
         ],
     )
     if done.pack.report is not None:
-        _show_pack(done.pack.report)
+        limits = settings.limits.of_model(done.model.voltage_model())
+        _show_pack(done.pack.report, limits)
     if shares := done.reason_shares:
         rows = [[name, number(100.0 * share, 1)] for name, share in shares.items()]
         print_table("Reasons for less than valid estimates", ["reason", "% of samples"], rows)
 
 
-def _show_pack(report: PackReport) -> None:
+def _show_pack(report: PackReport, limits: KnownLimits) -> None:
     health, power, cells = report
+    low_v, high_v = (significant(v, 3) for v in (limits.min_voltage_v, limits.max_voltage_v))
     rows = [
-        ["capacity", _with_std(health.capacity_ah, health.capacity_std_ah, 1), "Ah"],
+        ["capacity", uncertain(health.capacity_ah, health.capacity_std_ah), "Ah"],
         [
             "resistance, relative",
-            _with_std(health.resistance_ratio, health.resistance_std, 2),
+            uncertain(health.resistance_ratio, health.resistance_std),
             "× the model's",
         ],
-        ["current offset", number(health.offset_a, 2), "A"],
-        ["discharge for 10 s", _with_std(power.discharge_a, power.discharge_std_a, 0), "A"],
-        ["charge for 10 s", _with_std(power.charge_a, power.charge_std_a, 0), "A"],
-        ["energy left", _with_std(1e-3 * power.energy_wh, 1e-3 * power.energy_std_wh, 1), "kWh"],
-    ]
+        ["current offset", significant(health.offset_a, 2), "A"],
+        ["discharge for 10 s", uncertain(power.discharge_a, power.discharge_std_a),
+         f"A, down to {low_v} V"],
+        ["charge for 10 s", uncertain(power.charge_a, power.charge_std_a), f"A, up to {high_v} V"],
+        ["energy left", *uncertain_energy(power.energy_wh, power.energy_std_wh).rsplit(" ", 1)],
+    ]  # fmt: skip
     if cells is not None:
         name = "weakest cell" if cells.weakest < 0 else f"weakest cell: number {cells.weakest}"
         rows += [
-            [name, _with_std(cells.soc_pct, cells.soc_std_pct, 1), "%"],
+            [name, uncertain(cells.soc_pct, cells.soc_std_pct), "%"],
             ["  spread of the cells", number(cells.spread_pct, 1), "%"],
-            ["pack less sum of cells", _with_std(cells.sum_error_v, cells.sum_std_v, 2), "V"],
+            ["pack less sum of cells", uncertain(cells.sum_error_v, cells.sum_std_v), "V"],
         ]
     print_table("The pack at the end", ["", "value", "<unit"], rows)
-
-
-def _with_std(value: float, std: float, digits: int) -> str:
-    return f"{number(value, digits)} ± {number(std, digits)}"

@@ -25,7 +25,7 @@ from cangauge.cli.output import console, emit_json, note, print_table, progress_
 from cangauge.errors import InputError
 
 if TYPE_CHECKING:
-    from cangauge.identify.fit import Identification
+    from cangauge.identify.identification import Identification
 
 FROM_SOC = "from-soc"
 AUTO = "auto"
@@ -266,9 +266,10 @@ def parse_delays(given: str) -> tuple[float, ...]:
 
 
 def _show(result: Identification) -> None:
-    from cangauge.identify.tables import effect_rows, rounded, search_rows
+    from cangauge.identify.identification import coefficient_rows, effect_rows, search_rows
 
     model, energy = result.model, result.energy
+    note(result.verdict)
     print_table(
         f"Model {model.name}",
         ["", "value", "<unit"],
@@ -283,29 +284,24 @@ def _show(result: Identification) -> None:
             ["condition number", significant(result.published.condition_number, 2), ""],
             ["identified at SoC", span(*model.range.soc_pct, 1), "%"],
             ["identified at temperature", span(*model.range.temperature_c, 1), "°C"],
-            ["rows used", str(sum(item.rows for item in result.figures)), ""],
+            ["rows used", str(sum(len(item.rows) for item in result.fits)), ""],
         ],
     )
     if model.coefficients:
-        print_table(
-            "Published equation",
-            ["", "value", "std. error", "<unit"],
-            [
-                [name, *rounded(item.value, item.std_error), item.unit.replace("ohm", "Ω")]
-                for name, item in model.coefficients.items()
-            ],
-        )
+        print_table("Published equation", *coefficient_rows(model.coefficients))
+        note("a dash is a coefficient within two standard errors of zero")
     if result.effects is not None and result.effects.steps:
         print_table("Effects", *effect_rows(result))
         print_table("Search for effects", *search_rows(result.effects))
+    kwh, unit = (1.0, "kWh") if energy.driven_kwh >= 1.0 else (1e3, "Wh")
     print_table(
         "Energy at the terminals",
         ["", "value", "<unit"],
         [
-            ["driven", significant(energy.driven_kwh, 3), "kWh"],
-            ["regenerated", significant(energy.regenerated_kwh, 3), "kWh"],
-            ["net", significant(energy.net_kwh, 3), "kWh"],
-            ["Joule heat", significant(energy.heat_kwh, 3), "kWh"],
+            ["driven", significant(kwh * energy.driven_kwh, 3), unit],
+            ["regenerated", significant(kwh * energy.regenerated_kwh, 3), unit],
+            ["net", significant(kwh * energy.net_kwh, 3), unit],
+            ["Joule heat", significant(kwh * energy.heat_kwh, 3), unit],
             ["efficiency", number(energy.efficiency_pct, 1), "%"],
         ],
     )

@@ -24,9 +24,9 @@ The method is described in docs/diagnosis.md.
 """
 
 from cangauge.diagnosis.answer import ALARM, GROUP_OF, GROUPS, NONE, UNKNOWN, Posterior
-from cangauge.diagnosis.diagnose import Candidate, Diagnosis, diagnose, learn_references
+from cangauge.diagnosis.diagnose import Diagnosis, diagnose, learn_references
 from cangauge.diagnosis.evidence import Evidence, References
-from cangauge.diagnosis.where import ErrorShare, LogErrors
+from cangauge.diagnosis.where import LogErrors
 
 __all__ = [
     "ALARM",
@@ -34,9 +34,7 @@ __all__ = [
     "GROUP_OF",
     "NONE",
     "UNKNOWN",
-    "Candidate",
     "Diagnosis",
-    "ErrorShare",
     "Evidence",
     "LogErrors",
     "Posterior",

@@ -23,7 +23,7 @@ from cangauge.diagnosis.evidence import Evidence, References, analyse, columns, 
 from cangauge.diagnosis.extended import Extension, Quantity, residual_v
 from cangauge.diagnosis.pack_fit import Trace, trace
 from cangauge.diagnosis.simulator import Simulation, SimulatorGap, simulator_gap
-from cangauge.diagnosis.where import ErrorShare, LogErrors, closed_part, error_shares, rms
+from cangauge.diagnosis.where import LogErrors, closed_part, error_shares, rms
 from cangauge.errors import InputError
 from cangauge.estimation.offline import estimate
 from cangauge.identify.starts import start_by_model
@@ -36,34 +36,12 @@ _LOG = logging.getLogger(__name__)
 CROSS_VALIDATED = 5
 """Number of effects, the most probable ones, whose errors are found on held-out rows."""
 
-WORSE_SOC, WORSE_SOC_PCT = 1.1, 0.1
+WORSE_SOC, WORSE_SOC_PCT = 1.25, 0.25
 """A cause is not accepted with which the SoC error of these logs is larger than this many times
-that of the given model and this [%]: more than its scatter."""
+that of the given model and this [%]: on healthy trips of one car it scatters by as much."""
 
 SETTLING_S = 300.0
 """Start of a log, with withheld initial SoC, that the SoC error leaves out [s]."""
-
-
-@dataclass(frozen=True)
-class Candidate:
-    """One effect of the library as a cause of these logs."""
-
-    effect: str
-    group: str
-    probability: float
-    rmse_v: float | None
-    """RMS error with it on held-out rows [V]; None for effects of little probability."""
-    closed_fraction: float | None
-    ci: tuple[float, float] | None
-    """95 % interval of the closed fraction."""
-    parameters: dict[str, Quantity]
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return the entry of `cause.candidates` in `gap --json`."""
-        return vars(self) | {
-            "ci": self.ci and list(self.ci),
-            "parameters": {name: item.to_dict() for name, item in self.parameters.items()},
-        }
 
 
 @dataclass(frozen=True, eq=False)
@@ -190,17 +168,6 @@ class Diagnosis:
         """Error of a left-out reference log; without references, what the model file states [V]."""
         return self.known.healthy_rmse_v
 
-    @cached_property
-    def reference_rmse_v(self) -> dict[str, float]:
-        """Error of the given model on each reference [V]."""
-        names = [log.name for log in self.references]
-        names = names or [f"reference {k + 1}" for k in range(len(self.known.logs))]
-        model = self.model.extended_model()
-        return {
-            name: float(np.sqrt(np.mean(residual_v(model, log)[log.measured] ** 2)))
-            for name, log in zip(names, self.known.logs, strict=True)
-        }
-
     @property
     def closed_fraction(self) -> float | None:
         """Closed part of the squared error above a healthy log's.
@@ -221,27 +188,30 @@ class Diagnosis:
         return closed_part(self.log_errors, self.known.healthy_v2)
 
     @cached_property
-    def where(self) -> list[ErrorShare]:
-        """Shares of the given model's squared error over each axis."""
+    def where(self) -> list[dict[str, Any]]:
+        """Shares of the given model's squared error over each axis, as in `gap --json`."""
         return error_shares(self.log_errors, self.known.pack.capacity_ah)
 
     @cached_property
-    def candidates(self) -> tuple[Candidate, ...]:
-        """Every effect, most probable first."""
+    def candidates(self) -> list[dict[str, Any]]:
+        """Every effect, most probable first, as in `gap --json`; error of the likeliest few."""
         found = []
         for name, p in self.posterior.effects.items():
             errors, rmse_v, closed, ci = self._with.get(name), None, None, None
             if errors is not None:
                 rmse_v = rms(errors, after=True)
                 closed, ci = closed_part(errors, self.known.healthy_v2)
-            parameters = self._extensions[name].parameters
-            found.append(Candidate(name, GROUP_OF[name], p, rmse_v, closed, ci, parameters))
-        return tuple(found)
+            found.append({
+                "effect": name, "group": GROUP_OF[name], "probability": p, "rmse_v": rmse_v,
+                "closed_fraction": closed, "ci": ci and list(ci),
+                "parameters": {k: item.to_dict() for k, item in self.parameters[name].items()},
+            })  # fmt: skip
+        return found
 
     @cached_property
     def parameters(self) -> dict[str, dict[str, Quantity]]:
         """Parameters of each effect with 95 % intervals."""
-        return {item.effect: item.parameters for item in self.candidates}
+        return {name: item.parameters for name, item in self._extensions.items()}
 
     @cached_property
     def visible_from(self) -> list[dict[str, Any]]:
@@ -339,7 +309,7 @@ class Diagnosis:
                 "baseline_soc_mae_pct": before_pct,
                 "extended_soc_mae_pct": before_pct if self.accepted is None else after_pct,
             },
-            "where": [share.to_dict() for share in self.where],
+            "where": self.where,
             "cause": {
                 "detected": found.detected,
                 "probability_none": found.probabilities[NONE],
@@ -352,7 +322,7 @@ class Diagnosis:
                 "credible_set": list(found.credible_set),
                 "ambiguous_with": list(found.ambiguous_with),
                 "accepted": accepted,
-                "candidates": [item.to_dict() for item in self.candidates],
+                "candidates": self.candidates,
                 "left_over": found.left_over,
             },
             "visible_from": self.visible_from,
@@ -440,7 +410,11 @@ def diagnose(
         else:
             healthy, more = _traces(own, model)
             remarks += more
-            known = _learn(healthy or [_of_model(model, log) for log in traces], model)
+            known = learn(
+                healthy or [_of_model(model, log) for log in traces],
+                model.capacity_ah,
+                model.noise.voltage_rmse_v,
+            )
         _LOG.info("comparing the effects")
         of_logs = tuple(columns(known, log) for log in traces)
         evidence = analyse(known, of_logs)
@@ -466,21 +440,11 @@ def _as_logs(logs: Any) -> tuple[Log, ...]:
 
 
 def learn_references(references: Sequence[Log], model: Model) -> References:
-    """Learn what references show once, for any number of diagnoses.
-
-    Parameters
-    ----------
-    references : sequence of Log
-        Logs without a fault, at least one.
-    model : Model
-    """
+    """Learn what references, logs without a fault, show, for any number of diagnoses."""
     with _one_thread():
         check_logs(references, (), model)
-        return _learn(_traces(references, model)[0], model)
-
-
-def _learn(references: Sequence[Trace], model: Model) -> References:
-    return learn(references, model.capacity_ah, model.noise.voltage_rmse_v)
+        traces, _ = _traces(references, model)
+        return learn(traces, model.capacity_ah, model.noise.voltage_rmse_v)
 
 
 def _traces(

@@ -24,6 +24,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 from scipy.special import log_ndtr, logsumexp
@@ -360,21 +361,14 @@ def _step_refined(
     that were tried, down to a hundredth of that log.
     """
     first = next(k for k, place in enumerate(places) if place is not None)
+    low, high = STEP.low / STEP.bound, STEP.high / STEP.bound
 
     def fitted(place: float) -> tuple[float, float, float]:
-        tried = [None if k < first else place if k == first else 0.0 for k in range(len(logs))]
-        products = [
-            at_size(known, log, replace(STEP, shape=AFTER if x is None else x), 0.0).sum(axis=0)
-            for log, x in zip(logs, tried, strict=True)
-        ]
-        one = _OneEffect.of(known, logs, products)
-        low, high = STEP.low / STEP.bound, STEP.high / STEP.bound
+        tried = [AFTER if k < first else place if k == first else 0.0 for k in range(len(logs))]
+        steps = [replace(STEP, shape=each) for each in tried]
+        one = _OneEffect.of(known, logs, _all_at_size(known, logs, steps, 0.0))
         size = float(np.clip(one.gradient / (one.curvature + RIDGE), low, high))
-        gain = one.gradient * size - 0.5 * one.curvature * size**2
-        theta = one.theta - size * one.changed
-        w = np.concatenate([-theta, np.zeros(logs[0].b.shape[1]), [-size, 1.0]])
-        left_v2 = sum(w @ z @ w for z in products) / sum(len(log.rows) for log in logs)
-        return float(gain), size, float(left_v2)
+        return one.gradient * size - 0.5 * one.curvature * size**2, size, one.left_v2(size)
 
     best, step = float(places[first] or 0.0), 0.5 * (PLACES[1] - PLACES[0])
     found = fitted(best)
@@ -406,6 +400,16 @@ def at_size(
     return in_blocks(every, log.rows, folds)
 
 
+def _all_at_size(
+    known: References, logs: Sequence[Columns], trials: Sequence[Trial], a: float, **options: Any
+) -> list[FloatArray]:
+    """Return the products of `at_size` of each log on all its rows, shape (k, k) each."""
+    return [
+        at_size(known, log, trial, a, **options).sum(axis=0)
+        for log, trial in zip(logs, trials, strict=True)
+    ]
+
+
 @dataclass(frozen=True)
 class _OneEffect:
     """Likelihood of one effect about a size, everything else integrated out."""
@@ -416,6 +420,8 @@ class _OneEffect:
     theta: FloatArray
     changed: FloatArray
     """Change of θ for each unit of the effect, with the opposite sign."""
+    products: FloatArray
+    """Mean over the rows of all logs [V²]."""
 
     @classmethod
     def of(
@@ -423,7 +429,7 @@ class _OneEffect:
     ) -> _OneEffect:
         nx = len(known.b)
         q = [without_own(z, log, known.s2) for log, z in zip(logs, products, strict=True)]
-        total = np.sum(q, axis=0) if q else np.zeros((nx + 2, nx + 2))
+        total = np.sum(q, axis=0)
         a, b, u = known.a + total[:nx, :nx], known.b + total[:nx, -1], total[:nx, -2]
         theta, changed = np.linalg.solve(a, np.column_stack([b, u])).T
         return cls(
@@ -432,7 +438,14 @@ class _OneEffect:
             chi2=float(total[-1, -1] - b @ theta),
             theta=theta,
             changed=changed,
+            products=np.sum(products, axis=0) / sum(len(log.rows) for log in logs),
         )
+
+    def left_v2(self, step: float = 0.0) -> float:
+        """Return the mean square error with θ and a further step of the effect [V²]."""
+        w = np.zeros(len(self.products))
+        w[: len(self.theta)], w[-2:] = step * self.changed - self.theta, (-step, 1.0)
+        return float(w @ self.products @ w)
 
 
 def _resimulated(
@@ -448,28 +461,25 @@ def _resimulated(
     From the best of several starts, since the true size may lie beyond a bend of the curve.
     """
     low, high = trial.low / trial.bound, trial.high / trial.bound
-    rows = sum(len(log.rows) for log in logs)
+    trials = [trial] * len(logs)
 
-    def fitted(size: float) -> tuple[_OneEffect, float]:
-        products = [at_size(known, log, trial, size, moved=moved).sum(axis=0) for log in logs]
-        one = _OneEffect.of(known, logs, products)
-        w = np.concatenate([-one.theta, np.zeros(logs[0].b.shape[1] + 1), [1.0]])
-        return one, float(sum(w @ z @ w for z in products)) / rows
+    def fitted(size: float) -> _OneEffect:
+        return _OneEffect.of(known, logs, _all_at_size(known, logs, trials, size, moved=moved))
 
-    size, (here, _), left_v2 = 0.0, fitted(0.0), None
+    size, here, left_v2 = 0.0, fitted(0.0), None
     chi2_without = here.chi2
     if trial.effect == "time_skew" and trial.shape:  # a secant at 0, best at its shape
         starts = [trial.number / trial.bound]
     tried = {start: fitted(start) for start in starts if abs(start) >= MIN_STEP}
-    step = min(tried, key=lambda start: tried[start][0].chi2, default=0.0)
+    step = min(tried, key=lambda start: tried[start].chi2, default=0.0)
     for _ in range(STEPS):
         if abs(step) < MIN_STEP:
             break
-        there, left_there = tried.get(size + step) or fitted(size + step)
+        there = tried.get(size + step) or fitted(size + step)
         if there.chi2 >= here.chi2:
             step *= SHRINK
             continue
-        size, here, left_v2 = size + step, there, left_there
+        size, here, left_v2 = size + step, there, there.left_v2()
         change = (here.gradient - RIDGE * size) / (here.curvature + RIDGE)
         step = float(np.clip(size + change, low, high)) - size
         if abs(step) < MIN_CHANGE * abs(size):

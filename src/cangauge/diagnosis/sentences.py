@@ -13,7 +13,7 @@ from cangauge._text import NONE_KNOWN, counted, number, significant
 from cangauge.diagnosis.answer import NONE, TITLES, UNKNOWN, Posterior
 from cangauge.diagnosis.columns import COVER_PCT
 from cangauge.diagnosis.evidence import COVER_K
-from cangauge.diagnosis.extended import LOG_EFFECTS, Quantity
+from cangauge.diagnosis.extended import LOG_EFFECTS, Quantity, residual_v
 from cangauge.diagnosis.simulator import correction
 from cangauge.logs.gaps import bridge_s
 
@@ -77,7 +77,10 @@ def headline(found: Diagnosis) -> str:
     none = percent(answer.probabilities[NONE])
     if not answer.detected:
         if not answer.likely:
-            return f"No significant gap beyond that of healthy logs: P(no fault) = {none}."
+            return (
+                f"No significant gap beyond that of healthy logs. P(no fault) = {none}: a fault too"
+                " small to be seen is not excluded."
+            )
         return f"A gap is likely, not certain: P(no fault) = {none}. {_where_to_look(answer)}"
     name = answer.name
     if answer.leading_group == UNKNOWN or name is None:
@@ -152,18 +155,22 @@ def soc_text(found: Diagnosis) -> str:
             f" from {before} to {after} %."
         )
     better = found.soc_errors_pct[1] < found.soc_errors_pct[0]
-    words = "SoC error, start withheld" if better else "It does not improve the SoC error"
-    return f" {words}: {before} → {after} %."
+    return f" SoC error, start withheld: {before} → {after} %{'' if better else ', no better'}."
 
 
 def visible_text(found: Diagnosis) -> str:
     """Return from which size the most usual effects would have been seen."""
+    least = {item["effect"]: item for item in found.visible_from if item["effect"] in COMMON}
     sizes = [
-        f"{item['effect']} from {significant(item['size'], 2)} {item['unit']}"
-        for item in found.visible_from
-        if item["size"] is not None and item["effect"] in COMMON
+        f"{name} from {significant(item['size'], 2)} {item['unit']}"
+        for name, item in least.items()
+        if item["size"] is not None
     ]
-    return f"These logs would have shown {', '.join(sizes)}." if sizes else ""
+    never = [name for name, item in least.items() if item["size"] is None]
+    text = f"These logs would have shown {', '.join(sizes)}." if sizes else ""
+    return text + (
+        f" No {' and no '.join(never)} of a physical size would be seen in them." if never else ""
+    )
 
 
 def percent(fraction: float) -> str:
@@ -225,7 +232,13 @@ def _of_references(found: Diagnosis) -> list[str]:
             f"Only {counted(len(references), 'reference log')}: differences between healthy logs"
             " are hardly known, and probabilities are less reliable."
         )
-    errors = found.reference_rmse_v
+    model, names = found.model.extended_model(), [log.name for log in found.references]
+    errors = {
+        name: float(np.sqrt(np.mean(residual_v(model, log)[log.measured] ** 2)))
+        for name, log in zip(
+            names or [f"reference {k + 1}" for k in range(len(references))], references, strict=True
+        )
+    }
     worst, usual = max(errors, key=lambda name: errors[name]), float(np.median([*errors.values()]))
     if usual > POOR_FIT * found.healthy_rmse_v:
         said.append(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from scipy.ndimage import uniform_filter1d
@@ -42,27 +42,6 @@ class LogErrors:
     """With the cause, sized without these rows; equal to `before_v` without a cause [V]."""
     judged: BoolArray
     """Rows that the cause can change; all without a cause."""
-
-
-@dataclass(frozen=True)
-class ErrorShare:
-    """Share of the squared error in one interval of an axis."""
-
-    axis: str
-    low: float
-    high: float
-    unit: str
-    share: float
-    rmse_v: float
-    """Within the interval [V]."""
-    ci: tuple[float, float]
-    """95 % interval of the share."""
-
-    def to_dict(self) -> dict[str, object]:
-        """Return the entry of `where` in `gap --json`."""
-        ends, ci = [self.low, self.high], list(self.ci)
-        return {"axis": self.axis, "range": ends, "unit": self.unit, "share": self.share,
-                "rmse_v": self.rmse_v, "ci": ci}  # fmt: skip
 
 
 def rms(logs: Sequence[LogErrors], *, after: bool = False) -> float:
@@ -113,8 +92,11 @@ def closed_part(
     return closed, (float(low), float(high))
 
 
-def error_shares(logs: Sequence[LogErrors], capacity_ah: float) -> list[ErrorShare]:
-    """Return the shares of the given model's squared error; on each axis they sum to one."""
+def error_shares(logs: Sequence[LogErrors], capacity_ah: float) -> list[dict[str, Any]]:
+    """Return the shares of the given model's squared error; on each axis they sum to one.
+
+    Each with its RMS error within the interval and the 95 % interval of the share.
+    """
     piece, shares = pieces(logs), []
     square = np.concatenate([log.before_v for log in logs]) ** 2
     parts = [
@@ -131,10 +113,11 @@ def error_shares(logs: Sequence[LogErrors], capacity_ah: float) -> list[ErrorSha
     ]
     for axis, unit, limits, part, whole, rows in parts:
         drawn_part, drawn_whole = drawn_sums(piece, part, whole)
-        low, high = np.quantile(drawn_part / np.maximum(drawn_whole, 1e-12), [0.025, 0.975])
+        ci = np.quantile(drawn_part / np.maximum(drawn_whole, 1e-12), [0.025, 0.975]).tolist()
         share = float(part.sum() / max(float(whole.sum()), 1e-12))
         rms_v = float(np.sqrt(part.sum() / rows.sum()))
-        shares.append(ErrorShare(axis, *limits, unit, share, rms_v, (float(low), float(high))))
+        shares.append({"axis": axis, "range": list(limits), "unit": unit, "share": share,
+                       "rmse_v": rms_v, "ci": ci})  # fmt: skip
     return shares
 
 

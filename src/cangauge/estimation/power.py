@@ -49,7 +49,8 @@ class PackLimits:
     Parameters
     ----------
     min_voltage_v, max_voltage_v : float, optional
-        Pack voltage [V]; by default the pseudo-OCV at the ends of the identified SoC.
+        Pack voltage [V]; by default the pseudo-OCV at the ends of the identified SoC, or what the
+        logs reached under load: the answer does not contradict them.
     max_discharge_a, max_charge_a : float, optional
         Largest currents, both positive [A]; by default the ends of the identified current.
     cutoff_soc_pct : float, optional
@@ -96,9 +97,13 @@ class PackLimits:
         """
         low_pct, high_pct = model.soc_range_pct
         low_a, high_a = model.current_range_a
+        low_v, high_v = model.pseudo_ocv_at(low_pct)[0], model.pseudo_ocv_at(high_pct)[0]
+        if model.voltage_range_v is not None:
+            low_v = min(low_v, model.voltage_range_v[0])
+            high_v = max(high_v, model.voltage_range_v[1])
         known = KnownLimits(
-            _or(self.min_voltage_v, model.pseudo_ocv_at(low_pct)[0]),
-            _or(self.max_voltage_v, model.pseudo_ocv_at(high_pct)[0]),
+            _or(self.min_voltage_v, low_v),
+            _or(self.max_voltage_v, high_v),
             _or(self.max_discharge_a, max(high_a, 0.0)),
             _or(self.max_charge_a, max(-low_a, 0.0)),
             _or(self.cutoff_soc_pct, max(low_pct, 0.0)),

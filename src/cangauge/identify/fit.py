@@ -6,17 +6,14 @@ import hashlib
 import logging
 import os
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field
-from functools import cached_property
-from html import escape
+from dataclasses import dataclass
 from typing import Any, Final, Literal, get_args
 
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from cangauge._extras import extra
 from cangauge._files import text_sha256
-from cangauge._text import counted, duration, number, significant, span
+from cangauge._text import counted, duration, significant
 from cangauge._typing import FloatArray
 from cangauge._version import __version__
 from cangauge.errors import InputError, require_choice, require_number
@@ -29,7 +26,12 @@ from cangauge.identify.effect_search import (
     linearize,
     parse_effect_ids,
 )
-from cangauge.identify.evaluate import Energy, LogFit, energy_balance, evaluate, slope_resistances
+from cangauge.identify.identification import (
+    Identification,
+    energy_balance,
+    evaluate,
+    slope_resistances,
+)
 from cangauge.identify.least_squares import (
     BASE,
     LOGS_AT_LEAST,
@@ -49,7 +51,7 @@ from cangauge.identify.published import (
     solve_published,
 )
 from cangauge.identify.rows import FitRows, fit_rows, usable_delays
-from cangauge.identify.starts import Start, Starts, find_starts, given_starts, with_start
+from cangauge.identify.starts import Starts, find_starts, given_starts, with_start
 from cangauge.logs.gaps import bridge_s, discharged_ah, uncounted_gaps, usual_step_s
 from cangauge.logs.log import Log, TemperatureSource
 from cangauge.logs.read import as_log
@@ -77,7 +79,7 @@ from cangauge.model.prior import (
     ChemistryName,
     usual_loads,
 )
-from cangauge.model.voltage_model import KNOTS_PCT, VoltageModel
+from cangauge.model.voltage_model import KNOTS_PCT
 
 _LOG = logging.getLogger(__name__)
 
@@ -91,168 +93,6 @@ WHOLE_LOGS: Final = "whole logs left out in turn"
 
 LISTED_LOGS: Final = 4096
 """Source logs that a model file names; of more, it states the number."""
-
-
-@dataclass(frozen=True)
-class LogFigures:
-    """Figures of one log.
-
-    Parameters
-    ----------
-    name : str
-    rows : int
-    voltage_mae_pct, soc_newton_mae_pct : float
-    removed : dict
-        Rows removed by each rule.
-    """
-
-    name: str
-    rows: int
-    voltage_mae_pct: float
-    soc_newton_mae_pct: float
-    removed: dict[str, int]
-
-
-@dataclass(frozen=True, eq=False, repr=False)
-class Identification:
-    """A fitted model with its figures."""
-
-    model: Model
-    logs: tuple[Log, ...]
-    fits: tuple[LogFit, ...] = field(repr=False)
-    """Model and measurement of each log, on the rows of the fit."""
-    held_out_error_v: tuple[FloatArray, ...] = field(repr=False)
-    """Measured minus predicted voltage of each log's rows by fits without the log [V]; () for
-    fewer than three logs."""
-    published: PublishedFit
-    """The published equation on the same rows."""
-    energy: Energy
-    slope_ohm: float
-    """Regression of U − pseudo-OCV on the current, as a positive resistance [Ω]."""
-    slope_expected_ohm: float
-    """What the model's resistances expect of it [Ω]."""
-    remarks: tuple[str, ...] = ()
-    effects: Selected | None = None
-    """Selected effects; None if none were asked for."""
-    starts: tuple[Start, ...] = ()
-    """SoC at the start of each log, and how it is known."""
-
-    @cached_property
-    def voltage_model(self) -> VoltageModel:
-        """The model's equation, without effects."""
-        return self.model.voltage_model()
-
-    @cached_property
-    def figures(self) -> tuple[LogFigures, ...]:
-        """Figures of each log."""
-        return tuple(
-            LogFigures(
-                item.rows.name,
-                len(item.rows),
-                item.voltage_mae_pct,
-                item.soc_newton_mae_pct,
-                item.rows.removed,
-            )
-            for item in self.fits
-        )
-
-    def _mean(self, values: Iterable[FloatArray]) -> float:
-        return float(np.mean(np.concatenate(list(values))))
-
-    @property
-    def voltage_mae_pct(self) -> float:
-        """Mean absolute voltage error on the rows of the fit [%]."""
-        errors = (np.abs(item.residual_v) / item.rows.voltage_v for item in self.fits)
-        return 100.0 * self._mean(errors)
-
-    @property
-    def voltage_rmse_v(self) -> float:
-        """Root mean square of it [V]."""
-        return float(self._mean(item.residual_v**2 for item in self.fits) ** 0.5)
-
-    @property
-    def soc_newton_mae_pct(self) -> float:
-        """Mean absolute error of the SoC from voltage on the rows of the fit [%]."""
-        return self._mean(np.abs(f.soc_newton_pct - f.rows.soc_pct) for f in self.fits)
-
-    def _summary(self) -> list[tuple[str, str]]:
-        """Return what a fit is good for, by name."""
-        model, noise = self.model, self.model.noise
-        cells = f", {model.cells} cells" if model.cells else ""
-        names = ", ".join(log.name for log in self.logs[:3])
-        more = f" and {len(self.logs) - 3} more" if len(self.logs) > 3 else ""
-        error = number(noise.voltage_mae_pct, 2, "%")
-        effects = ", ".join(str(effect["id"]) for effect in model.effects)
-        return [
-            ("model", f"{model.equation}, {model.chemistry}{cells}"),
-            ("logs", f"{names}{more}; {sum(item.rows for item in self.figures):,} rows"),
-            ("good from", f"{span(*model.range.soc_pct, 0, '% SoC')}"),
-            ("voltage error", f"{error} on {noise.judged_on}"),
-            ("of the fit", f"{number(self.voltage_mae_pct, 2, '%')}"),
-            ("SoC by voltage", f"{number(self.soc_newton_mae_pct, 1, '%')} off the counted SoC"),
-            ("capacity", significant(model.capacity_ah, 4, "Ah")),
-            ("resistance", significant(self.slope_ohm, 3, "Ω")),
-            *([("effects", effects)] if effects else []),
-        ]
-
-    def __repr__(self) -> str:
-        """Return ten lines on what the fit is good for."""
-        lines = [f"  {name:15}{text}" for name, text in self._summary()]
-        return "\n".join([f"<Identification {self.model.name!r}", *lines]) + ">"
-
-    def _repr_html_(self) -> str:
-        """Return the same as a table, for notebooks."""
-        rows = "".join(
-            f"<tr><th>{name}</th><td>{escape(text)}</td></tr>" for name, text in self._summary()
-        )
-        return f"<table><caption>{escape(self.model.name)}</caption>{rows}</table>"
-
-    def plot(self) -> Any:
-        """Return pseudo-OCV and residuals, for `bokeh.plotting.show`."""
-        return extra("report.figures:fit_figure")(self)
-
-    def to_dict(self) -> dict[str, object]:
-        """Return the object that `cangauge fit --json` prints."""
-        model, noise = self.model, self.model.noise
-        return {
-            "voltage_mae_pct": self.voltage_mae_pct,
-            "voltage_rmse_v": self.voltage_rmse_v,
-            "soc_newton_mae_pct": self.soc_newton_mae_pct,
-            "capacity_ah": model.capacity_ah,
-            "slope_ohm": self.slope_ohm,
-            "slope_expected_ohm": self.slope_expected_ohm,
-            "condition_number": self.published.condition_number,
-            "coefficients": {name: item.model_dump() for name, item in model.coefficients.items()},
-            "energy": vars(self.energy),
-            "equation": model.equation,
-            "chemistry": model.chemistry,
-            "cells": model.cells,
-            "held_out": {
-                "voltage_mae_pct": noise.voltage_mae_pct,
-                "voltage_rmse_v": noise.voltage_rmse_v,
-                "judged_on": noise.judged_on,
-                "scale": noise.left_out_scale,
-            },
-            "rows": sum(item.rows for item in self.figures),
-            "logs": [
-                {
-                    "name": item.name,
-                    "rows": item.rows,
-                    "voltage_mae_pct": item.voltage_mae_pct,
-                    "soc_newton_mae_pct": item.soc_newton_mae_pct,
-                    "removed": item.removed,
-                    "initial_soc_pct": start.soc_pct,
-                    "initial_soc_std_pct": start.std_pct,
-                    "initial_soc_from": start.origin,
-                }
-                for item, start in zip(self.figures, self.starts, strict=True)
-            ],
-            "effects": model.effects,
-            "effect_search": [step.to_dict() for step in self.effects.steps]
-            if self.effects
-            else [],
-            "remarks": list(self.remarks),
-        }
 
 
 def fit(
@@ -378,7 +218,7 @@ def fit(
         slope_expected_ohm=expected,
         remarks=(
             *said,
-            *_remarks(rows, starts, recorded, delay_s, capacity_ah, knots=knots),
+            *_remarks(rows, starts, recorded, delay_s, capacity_ah),
             *_remarks_on_effects(found.effects, model),
         ),
         effects=found.effects,
@@ -666,25 +506,14 @@ def _fit_published(
     return _Fitted(model, published, errors, None)
 
 
-COVERED_PCT: Final = 50.0
-"""SoC span of the logs below which a remark says that the curve beyond is the prior's [%]."""
-
-
 def _remarks(
     rows: Sequence[FitRows],
     starts: Starts,
     recorded: Sequence[Log],
     delay_s: Sequence[float],
     capacity_ah: float,
-    *,
-    knots: bool,
 ) -> list[str]:
     found = []
-    ranges = ranges_of(rows)
-    low, high = ranges.soc_pct
-    if high - low < COVERED_PCT:
-        beyond = "follows the typical cell" if knots else "is extrapolated linearly"
-        found.append(f"the logs cover {low:.0f}–{high:.0f} % SoC; beyond, the curve {beyond}")
     removed = sum(item.removed["start_up_or_shut_down"] for item in rows)
     if removed:
         found.append(f"{counted(removed, 'row')} of start-up and shut-down left out")
@@ -764,6 +593,7 @@ def ranges_of(rows: Sequence[FitRows]) -> Ranges:
         soc_pct=span(item.soc_pct for item in rows),
         temperature_c=span(item.temperature_c for item in rows),
         current_a=span(item.currents_a[:, 0] for item in rows),
+        voltage_v=span(item.voltage_v for item in rows),
     )
 
 

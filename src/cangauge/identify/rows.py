@@ -36,6 +36,9 @@ GUARD_S = 2.0
 SOC_TOLERANCE_PCT = 3.0
 """Excess of a counted SoC over 0–100 % from which the capacity or the start must be wrong [%]."""
 
+TEMPERATURE_SPAN_K = 3.0
+"""Least span of the temperature from which kt is identified [K]: sensors have steps of 1 K."""
+
 SOC_SPAN_AT_LEAST_PCT = 2.0
 """Least SoC span of the logs from which a published curve is printed [%]: below, its eight terms
 share one level and one slope."""

@@ -10,7 +10,12 @@ import numpy as np
 
 from cangauge._text import counted, duration
 from cangauge.errors import InputError
-from cangauge.identify.rows import SOC_SPAN_AT_LEAST_PCT, usable_delays, usable_rows
+from cangauge.identify.rows import (
+    SOC_SPAN_AT_LEAST_PCT,
+    TEMPERATURE_SPAN_K,
+    usable_delays,
+    usable_rows,
+)
 from cangauge.inspect.channels import Channel, describe_channels
 from cangauge.logs.gaps import uncounted_gaps, usual_gap_s, usual_step_s
 from cangauge.logs.log import Log
@@ -41,8 +46,6 @@ MIN_STEPS: Final = 8
 """Fewest clear steps of current for a resistance."""
 CORRELATED: Final = 0.9
 """Correlation above which two influences are hard to separate [-]."""
-TEMPERATURE_SPAN_K: Final = 3.0
-"""Least span of temperature for its coefficient [K]."""
 REST_SHARE: Final = 0.02
 """Current at rest, relative to the peak [-]."""
 REST_S: Final = 300.0

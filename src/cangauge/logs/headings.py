@@ -56,7 +56,8 @@ _ELAPSED: Final = _words(
 _WORDS: Final[dict[str, frozenset[str]]] = {
     "time": _words(
         "time realtime zeit timestamp timestamps datetime date datum elapsed tiempo tempo seconds"
-        " sec clock uhrzeit stamp zeitstempel changed 时间 总时间 测试时间 日期 绝对时间"
+        " sec clock uhrzeit stamp tstamp stempel zeitstempel tick ticks uptime"
+        " changed 时间 总时间 测试时间 日期 绝对时间"
     ),
     "current": _words(
         "current cur amps amp ampere amperes strom courant corriente corrente stroom curr 电流"

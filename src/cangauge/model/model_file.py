@@ -188,6 +188,8 @@ class Ranges(_Strict):
     soc_pct: tuple[_Soc, _Soc]
     temperature_c: tuple[_Celsius, _Celsius]
     current_a: tuple[_Ampere, _Ampere]
+    voltage_v: tuple[_Volts, _Volts] | None = None
+    """Lowest and highest voltage of the logs, under their currents."""
 
 
 class Information(_Strict):
@@ -286,6 +288,7 @@ class Model(_Strict):
             "soc_range_pct": self.range.soc_pct,
             "temperature_range_c": self.range.temperature_c,
             "current_range_a": self.range.current_a,
+            "voltage_range_v": self.range.voltage_v,
         }
         if self.equation == "knots" and self.curve is not None and self.loads is not None:
             soc_pct, volts = np.array(self.curve.soc_pct), np.array(self.curve.voltage_v)

@@ -419,8 +419,8 @@ class VoltageModel:
         None for constant resistances.
     t_ref_c : float
         Reference temperature T_r [°C].
-    soc_range_pct, temperature_range_c, current_range_a : pairs of floats
-        Identified ranges.
+    soc_range_pct, temperature_range_c, current_range_a, voltage_range_v : pairs of floats
+        Ranges of the logs [%, °C, A, V].
 
     Raises
     ------
@@ -438,6 +438,7 @@ class VoltageModel:
     soc_range_pct: tuple[float, float] = (0.0, 100.0)
     temperature_range_c: tuple[float, float] = (-40.0, 80.0)
     current_range_a: tuple[float, float] = (-math.inf, math.inf)
+    voltage_range_v: tuple[float, float] | None = None
 
     def __post_init__(self) -> None:
         delays = np.array(self.delay_s)

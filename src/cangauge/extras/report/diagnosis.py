@@ -9,7 +9,7 @@ from typing import Any, Final
 import numpy as np
 
 from cangauge._text import NONE_KNOWN, number, span
-from cangauge.diagnosis import Diagnosis
+from cangauge.diagnosis import NONE, Diagnosis
 from cangauge.diagnosis.planner import Plan
 from cangauge.diagnosis.sentences import (
     EXPLAINED,
@@ -94,9 +94,9 @@ def gap_page(found: Diagnosis, model: InputFile | None = None, plan: Plan | None
         title=title if model is None else f"{title} with model {model.name}",
         lead=verdict,
         subtitle=" ".join([*details, *next_words]),
-        tiles=_tiles(result),
+        tiles=_tiles(found),
         sections=[
-            Section("Where and how much", [Beside([places[first], _shrinks(result)])]),
+            Section("Where and how much", [Beside([places[first], _shrinks(found)])]),
             *(Section(heading, blocks, is_folded=True) for heading, blocks in folded.items()),
         ],
         inputs=[
@@ -109,39 +109,37 @@ def gap_page(found: Diagnosis, model: InputFile | None = None, plan: Plan | None
     )
 
 
-def _tiles(result: Mapping[str, Any]) -> list[Tile]:
-    cause, gap = result["cause"], result["gap"]
-    groups = [each for each in cause["groups"] if each["group"] not in {"none", "unknown"}]
-    best = groups[0]
+def _tiles(found: Diagnosis) -> list[Tile]:
+    answer = found.posterior
+    none = f"P(no fault) {percent(answer.probabilities[NONE])}"
+    verdict = "found" if answer.detected else "likely" if answer.likely else "not significant"
+    tiles = [Tile("Gap", verdict, none)]
+    if answer.likely:
+        group = answer.leading_group
+        probability = f"probability {percent(answer.groups[group])}"
+        tiles.append(Tile("Look first at", group.replace("_", " "), probability))
     return [
-        Tile("No gap", percent(cause["probability_none"]), "probability"),
-        Tile(
-            "Likeliest group",
-            best["group"].replace("_", " "),
-            f"probability {percent(best['probability'])}",
-        ),
-        Tile("Model's error", number(gap["baseline_rmse_v"], 2, "V"), "RMS, these logs"),
-        Tile("Error of healthy logs", number(gap["healthy_rmse_v"], 2, "V"), "RMS, left out"),
+        *tiles,
+        Tile("Model's error", number(found.baseline_rmse_v, 2, "V"), "RMS, these logs"),
+        Tile("Error of healthy logs", number(found.healthy_rmse_v, 2, "V"), "RMS, left out"),
     ]
 
 
-def _shrinks(result: Mapping[str, Any]) -> Figure:
-    gap = result["gap"]
-    named = result["cause"]["accepted"]
-    cause = " and ".join(each["effect"].replace("_", " ") for each in named)
-    entries = [("model as given", gap["baseline_rmse_v"], ORANGE)]
-    if named:
-        entries.append((f"with {cause}", gap["extended_rmse_v"], BLUE))
-    entries.append(("healthy logs", gap["healthy_rmse_v"], GREEN))
-    closed = gap["closed_fraction"]
-    caption = "RMS error of the voltage; with a cause, on rows that did not size it."
-    if named and closed is not None:
-        caption += (
-            " The model is worse with it."
-            if closed < -1.0
-            else f" The cause closes {percent(closed)} of the squared gap above healthy logs."
-        )
-    return Figure("How far it shrinks", bars("RMS error", "V", entries, decimals=2), caption)
+def _shrinks(found: Diagnosis) -> Figure:
+    entries = [
+        ("model as given", found.baseline_rmse_v, ORANGE),
+        ("healthy logs", found.healthy_rmse_v, GREEN),
+    ]
+    title, caption = "Beside healthy logs", "RMS error of the voltage."
+    if found.accepted is not None:
+        cause = found.accepted.replace("_", " ")
+        entries.insert(1, (f"with {cause}", found.extended_rmse_v, BLUE))
+        title = "How far it shrinks"
+        caption = "RMS error of the voltage, on rows that did not size the cause."
+        if found.closed_fraction is not None:
+            closed = percent(found.closed_fraction)
+            caption += f" The cause closes {closed} of the squared gap above healthy logs."
+    return Figure(title, bars("RMS error", "V", entries, decimals=2), caption)
 
 
 def _widest(where: Sequence[Mapping[str, Any]]) -> str:

@@ -29,7 +29,7 @@ from cangauge.extras.report.charts import (
 )
 from cangauge.extras.report.estimate import soc_plot
 from cangauge.extras.report.inspection import channel_figures
-from cangauge.identify.fit import Identification
+from cangauge.identify.identification import Identification
 from cangauge.logs.log import Log
 from cangauge.service.offline import Recorded
 

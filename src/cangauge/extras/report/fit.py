@@ -9,7 +9,7 @@ from typing import Final
 
 import numpy as np
 
-from cangauge._text import NONE_KNOWN, duration, number, significant, span
+from cangauge._text import duration, number, significant, span
 from cangauge._typing import FloatArray
 from cangauge.extras.report.charts import (
     BLACK,
@@ -42,11 +42,14 @@ from cangauge.extras.report.page import (
     reconstruction_banners,
     render,
 )
-from cangauge.identify.evaluate import LogFit
-from cangauge.identify.fit import Identification
+from cangauge.identify.identification import (
+    Identification,
+    LogFit,
+    effect_rows,
+    rounded,
+    search_rows,
+)
 from cangauge.identify.rows import running_rows
-from cangauge.identify.tables import effect_rows, rounded, search_rows
-from cangauge.inspect.log import TEMPERATURE_SPAN_K
 from cangauge.model.effects.library import LIBRARY
 from cangauge.model.model_file import Model, Published
 from cangauge.model.voltage_model import VoltageModel
@@ -84,7 +87,7 @@ def fit_page(result: Identification) -> Page:
     ]
     return Page(
         title=f"Voltage model {model.name}",
-        lead=fit_verdict(result),
+        lead=result.verdict,
         subtitle=f"Identified from {joined([log.name for log in logs])}:"
         f" {duration(sum(log.duration_s for log in logs))}, {rows:,} rows used.",
         tiles=_tiles(result),
@@ -97,29 +100,6 @@ def fit_page(result: Identification) -> Page:
             *(text for log in logs for text in (log.name, log.source, *log.remarks))
         ),
     )
-
-
-def fit_verdict(result: Identification) -> str:
-    """Return where the model holds, its error there, and which log would widen it."""
-    low, high = result.model.range.soc_pct
-    noise = result.model.noise
-    error, on = number(noise.voltage_mae_pct, 2, "%"), noise.judged_on
-    if error == NONE_KNOWN:
-        error, on = number(result.voltage_mae_pct, 2, "%"), "its own rows"
-    text = f"Good from {low:.0f} to {high:.0f} % SoC: mean voltage error {error} on {on}."
-    ends = [f"below {low:.0f} %"] if low > _NEAR_AN_END_PCT else []
-    ends += [f"above {high:.0f} %"] if high < 100.0 - _NEAR_AN_END_PCT else []
-    if ends:
-        text += f" Add a drive {' and '.join(ends)}: there the curve {_beyond(result.model)}."
-    temperatures = np.concatenate([item.rows.temperature_c for item in result.fits])
-    if (change_k := float(np.ptp(temperatures))) < TEMPERATURE_SPAN_K:
-        text += f" The temperature moves by {number(change_k, 1, 'K')}: kt is not identified."
-    return text
-
-
-def _beyond(model: Model) -> str:
-    knots = "follows the typical cell of the chemistry"
-    return knots if model.equation == "knots" else "is extrapolated linearly"
 
 
 def _tiles(result: Identification) -> list[Tile]:
@@ -176,7 +156,7 @@ def _fit_figures(result: Identification, time: TimeFigures) -> list[Block]:
                     _ocv_plot(result),
                     "Dots: the measured voltage minus the model's resistances"
                     f"{effects} and temperature term. The logs cover {span(low, high, 1, '%')}; in"
-                    f" the shaded part the curve {_beyond(result.model)}.",
+                    f" the shaded part the curve {result.beyond}.",
                 ),
                 Figure(
                     "Slope of the pseudo-OCV",
@@ -421,8 +401,9 @@ def _published_table(model: Published, condition_number: float) -> Table:
         "U = k0 + k1/s + k2/s² + k3/s³ + k4/s⁴ + k5·s + k6·ln s + k7·ln(1 − s) + kt·(T − Tr)"
         f" + Σ Rj·I(t − dj),  s = S/100·(1 − 2ε) + ε, ε = {model.epsilon:g}: the published equation"
         " by plain least squares of the same rows. Rows of a minute count as one in the standard"
-        " errors. k0 … k7 are strongly correlated (condition number"
-        f" {significant(condition_number, 2)}): use their sum, the curve, not single values.",
+        " errors; a dash is a coefficient within two of them of zero. k0 … k7 are strongly"
+        f" correlated (condition number {significant(condition_number, 2)}): use their sum, the"
+        " curve, not single values.",
     )
 
 

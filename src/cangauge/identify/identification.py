@@ -1,0 +1,354 @@
+"""A fitted model with its figures: fit of each log, slope resistance, energy balance, tables."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from html import escape
+from typing import Any, Final
+
+import numpy as np
+
+from cangauge._extras import extra
+from cangauge._text import NONE_KNOWN, number, significant, span
+from cangauge._typing import FloatArray
+from cangauge.identify.effect_search import Selected
+from cangauge.identify.published import PublishedFit
+from cangauge.identify.rows import TEMPERATURE_SPAN_K, FitRows
+from cangauge.identify.starts import Start
+from cangauge.logs.gaps import BRIDGE_S
+from cangauge.logs.log import Log
+from cangauge.model.effects.base import Signals
+from cangauge.model.extended import ExtendedModel, newton_soc
+from cangauge.model.model_file import Coefficient, Model
+from cangauge.model.voltage_model import VoltageModel
+
+JOULE_PER_KWH = 3.6e6
+
+NEAR_AN_END_PCT: Final = 10.0
+"""Rest of the SoC beyond the logs that is not worth another drive [%]."""
+
+OWN_NOISE: Final = 2.0
+"""Standard errors within which a coefficient may as well be zero [-]: 95 %."""
+
+Rows = list[list[str]]
+
+
+@dataclass(frozen=True)
+class Energy:
+    """Energy at the pack's terminals [kWh]."""
+
+    driven_kwh: float
+    """Discharged, ∫U·I over I > 0."""
+    regenerated_kwh: float
+    """Charged, −∫U·I over I < 0."""
+    net_kwh: float
+    heat_kwh: float
+    """Joule heat, R·∫I² with the slope resistance R."""
+    efficiency_pct: float
+    """Net energy over net energy plus heat [%]."""
+
+
+def energy_balance(logs: Sequence[Log], slope_ohm: float) -> Energy:
+    """Return the energy balance summed over the logs, by the trapezoidal rule.
+
+    Parameters
+    ----------
+    logs : sequence of Log
+    slope_ohm : float
+        Slope resistance [Ω], positive.
+    """
+    driven = regenerated = square = 0.0
+    for log in logs:
+        step_s = np.diff(log.time_s)
+        step_s[step_s > BRIDGE_S] = 0.0
+        power_w = log.voltage_v * log.current_a
+        driven += _integral(np.maximum(power_w, 0.0), step_s)
+        regenerated += _integral(np.maximum(-power_w, 0.0), step_s)
+        square += _integral(log.current_a**2, step_s)
+    net = driven - regenerated
+    heat = slope_ohm * square
+    return Energy(
+        driven_kwh=driven / JOULE_PER_KWH,
+        regenerated_kwh=regenerated / JOULE_PER_KWH,
+        net_kwh=net / JOULE_PER_KWH,
+        heat_kwh=heat / JOULE_PER_KWH,
+        efficiency_pct=100.0 * net / (net + heat) if net > 0.0 else float("nan"),
+    )
+
+
+def _integral(values: FloatArray, step_s: FloatArray) -> float:
+    return float(np.sum((values[1:] + values[:-1]) * step_s) / 2.0)
+
+
+@dataclass(frozen=True, eq=False)
+class LogFit:
+    """Model and measurement of one log, shape (m,) each, on the rows of the fit."""
+
+    rows: FitRows
+    pseudo_ocv_v: FloatArray
+    voltage_model_v: FloatArray
+    soc_newton_pct: FloatArray
+
+    @property
+    def residual_v(self) -> FloatArray:
+        """Measured minus modelled voltage [V]."""
+        return self.rows.voltage_v - self.voltage_model_v
+
+    @property
+    def voltage_mae_pct(self) -> float:
+        """Mean absolute voltage error relative to the measured voltage [%]."""
+        return 100.0 * float(np.mean(np.abs(self.residual_v) / self.rows.voltage_v))
+
+    @property
+    def soc_newton_mae_pct(self) -> float:
+        """Mean absolute error of the Newton inverse against the counted SoC [% SoC]."""
+        return float(np.mean(np.abs(self.soc_newton_pct - self.rows.soc_pct)))
+
+
+def evaluate(model: ExtendedModel, log: Log, rows: FitRows) -> LogFit:
+    """Return the voltages and Newton inverse of a model on the rows of a log."""
+    first = log.first_soc()
+    if first is None:
+        raise ValueError("a log of a fit has a start")
+    signals = Signals(log.time_s, log.current_a, log.voltage_v, log.temperature_c)
+    row, soc_pct = first
+    prediction = model.predict(signals, soc_pct, rows.at, initial_row=row)
+    temperature_c = prediction.signals.temperature_c[rows.at]
+    return LogFit(
+        rows=rows,
+        pseudo_ocv_v=model.model.pseudo_ocv(prediction.soc_pct[rows.at], temperature_c),
+        voltage_model_v=prediction.voltage_v,
+        soc_newton_pct=newton_soc(model, prediction),
+    )
+
+
+def slope_resistances(
+    fits: Sequence[LogFit], resistance_ohm: Sequence[float]
+) -> tuple[float, float]:
+    """Return the regression of U − pseudo-OCV on the current, and what the model expects of it [Ω].
+
+    Both are positive. The expected one is −Σ Rm·ρm, ρm being the regression of the m-th current on
+    the present one.
+
+    Parameters
+    ----------
+    fits : sequence of LogFit
+    resistance_ohm : sequence of float
+        Rm of the first currents of the rows [Ω], negative.
+    """
+    table = np.concatenate([
+        np.column_stack([
+            item.rows.currents_a[:, : len(resistance_ohm)],
+            item.rows.voltage_v - item.pseudo_ocv_v,
+        ])
+        for item in fits
+    ])  # fmt: skip
+    away = table - table.mean(axis=0)
+    slopes = away[:, 0] @ away / max(float(away[:, 0] @ away[:, 0]), 1e-300)
+    return -float(slopes[-1]), -float(slopes[:-1] @ np.array(resistance_ohm))
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Identification:
+    """A fitted model with its figures."""
+
+    model: Model
+    logs: tuple[Log, ...]
+    fits: tuple[LogFit, ...] = field(repr=False)
+    """Model and measurement of each log, on the rows of the fit."""
+    held_out_error_v: tuple[FloatArray, ...] = field(repr=False)
+    """Measured minus predicted voltage of each log's rows by fits without the log [V]; () for
+    fewer than three logs."""
+    published: PublishedFit
+    """The published equation on the same rows."""
+    energy: Energy
+    slope_ohm: float
+    """Regression of U − pseudo-OCV on the current, as a positive resistance [Ω]."""
+    slope_expected_ohm: float
+    """What the model's resistances expect of it [Ω]."""
+    remarks: tuple[str, ...] = ()
+    effects: Selected | None = None
+    """Selected effects; None if none were asked for."""
+    starts: tuple[Start, ...] = ()
+    """SoC at the start of each log, and how it is known."""
+
+    @cached_property
+    def voltage_model(self) -> VoltageModel:
+        """The model's equation, without effects."""
+        return self.model.voltage_model()
+
+    @property
+    def verdict(self) -> str:
+        """Where the model holds, its error there, and which log would widen it."""
+        low, high = self.model.range.soc_pct
+        noise = self.model.noise
+        error, on = number(noise.voltage_mae_pct, 2, "%"), noise.judged_on
+        text = f"Good from {low:.0f} to {high:.0f} % SoC: mean voltage error {error} on {on}."
+        ends = [f"below {low:.0f} %"] if low > NEAR_AN_END_PCT else []
+        ends += [f"above {high:.0f} %"] if high < 100.0 - NEAR_AN_END_PCT else []
+        if ends:
+            text += f" Add a drive {' and '.join(ends)}: there the curve {self.beyond}."
+        celsius = np.concatenate([item.rows.temperature_c for item in self.fits])
+        if (change_k := float(np.ptp(celsius))) < TEMPERATURE_SPAN_K:
+            text += f" The temperature moves by {number(change_k, 1, 'K')}: kt is not identified."
+        return text
+
+    @property
+    def beyond(self) -> str:
+        """What the curve does beyond the SoC of the logs, in a phrase."""
+        knots = "follows the typical cell of the chemistry"
+        return knots if self.model.equation == "knots" else "is extrapolated linearly"
+
+    def _mean(self, values: Iterable[FloatArray]) -> float:
+        return float(np.mean(np.concatenate(list(values))))
+
+    @property
+    def voltage_mae_pct(self) -> float:
+        """Mean absolute voltage error on the rows of the fit [%]."""
+        errors = (np.abs(item.residual_v) / item.rows.voltage_v for item in self.fits)
+        return 100.0 * self._mean(errors)
+
+    @property
+    def voltage_rmse_v(self) -> float:
+        """Root mean square of it [V]."""
+        return float(self._mean(item.residual_v**2 for item in self.fits) ** 0.5)
+
+    @property
+    def soc_newton_mae_pct(self) -> float:
+        """Mean absolute error of the SoC from voltage on the rows of the fit [%]."""
+        return self._mean(np.abs(f.soc_newton_pct - f.rows.soc_pct) for f in self.fits)
+
+    def _summary(self) -> list[tuple[str, str]]:
+        """Return what a fit is good for, by name."""
+        model, noise = self.model, self.model.noise
+        cells = f", {model.cells} cells" if model.cells else ""
+        names = ", ".join(log.name for log in self.logs[:3])
+        more = f" and {len(self.logs) - 3} more" if len(self.logs) > 3 else ""
+        error = number(noise.voltage_mae_pct, 2, "%")
+        effects = ", ".join(str(effect["id"]) for effect in model.effects)
+        return [
+            ("model", f"{model.equation}, {model.chemistry}{cells}"),
+            ("logs", f"{names}{more}; {sum(len(item.rows) for item in self.fits):,} rows"),
+            ("good from", f"{span(*model.range.soc_pct, 0, '% SoC')}"),
+            ("voltage error", f"{error} on {noise.judged_on}"),
+            ("of the fit", f"{number(self.voltage_mae_pct, 2, '%')}"),
+            ("SoC by voltage", f"{number(self.soc_newton_mae_pct, 1, '%')} off the counted SoC"),
+            ("capacity", significant(model.capacity_ah, 4, "Ah")),
+            ("resistance", significant(self.slope_ohm, 3, "Ω")),
+            *([("effects", effects)] if effects else []),
+        ]
+
+    def __repr__(self) -> str:
+        """Return ten lines on what the fit is good for."""
+        lines = [f"  {name:15}{text}" for name, text in self._summary()]
+        return "\n".join([f"<Identification {self.model.name!r}", *lines]) + ">"
+
+    def _repr_html_(self) -> str:
+        """Return the same as a table, for notebooks."""
+        rows = "".join(
+            f"<tr><th>{name}</th><td>{escape(text)}</td></tr>" for name, text in self._summary()
+        )
+        return f"<table><caption>{escape(self.model.name)}</caption>{rows}</table>"
+
+    def plot(self) -> Any:
+        """Return pseudo-OCV and residuals, for `bokeh.plotting.show`."""
+        return extra("report.figures:fit_figure")(self)
+
+    def to_dict(self) -> dict[str, object]:
+        """Return the object that `cangauge fit --json` prints."""
+        model, noise = self.model, self.model.noise
+        return {
+            "verdict": self.verdict,
+            "voltage_mae_pct": self.voltage_mae_pct,
+            "voltage_rmse_v": self.voltage_rmse_v,
+            "soc_newton_mae_pct": self.soc_newton_mae_pct,
+            "capacity_ah": model.capacity_ah,
+            "slope_ohm": self.slope_ohm,
+            "slope_expected_ohm": self.slope_expected_ohm,
+            "condition_number": self.published.condition_number,
+            "coefficients": {name: item.model_dump() for name, item in model.coefficients.items()},
+            "energy": vars(self.energy),
+            "equation": model.equation,
+            "chemistry": model.chemistry,
+            "cells": model.cells,
+            "held_out": {
+                "voltage_mae_pct": noise.voltage_mae_pct,
+                "voltage_rmse_v": noise.voltage_rmse_v,
+                "judged_on": noise.judged_on,
+                "scale": noise.left_out_scale,
+            },
+            "rows": sum(len(item.rows) for item in self.fits),
+            "logs": [
+                {
+                    "name": item.rows.name,
+                    "rows": len(item.rows),
+                    "voltage_mae_pct": item.voltage_mae_pct,
+                    "soc_newton_mae_pct": item.soc_newton_mae_pct,
+                    "removed": item.rows.removed,
+                    "initial_soc_pct": start.soc_pct,
+                    "initial_soc_std_pct": start.std_pct,
+                    "initial_soc_from": start.origin,
+                }
+                for item, start in zip(self.fits, self.starts, strict=True)
+            ],
+            "effects": model.effects,
+            "effect_search": [step.to_dict() for step in self.effects.steps]
+            if self.effects
+            else [],
+            "remarks": list(self.remarks),
+        }
+
+
+def rounded(value: float, std_error: float | None) -> tuple[str, str]:
+    """Return a value rounded to its standard error, and the error with two digits.
+
+    A value that is its own noise is a dash.
+    """
+    if not std_error or not math.isfinite(std_error):
+        return significant(value, 3), significant(std_error, 2)
+    if abs(value) < OWN_NOISE * std_error:
+        return NONE_KNOWN, significant(std_error, 2)
+    decimals = max(0, 1 - math.floor(math.log10(std_error)))
+    return number(value, decimals), significant(std_error, 2)
+
+
+def coefficient_rows(coefficients: dict[str, Coefficient]) -> tuple[list[str], Rows]:
+    """Return headings and rows: the published equation's coefficients with their errors."""
+    rows = [
+        [name, *rounded(item.value, item.std_error), item.unit.replace("ohm", "Ω")]
+        for name, item in coefficients.items()
+    ]
+    return ["", "value", "std. error", "<unit"], rows
+
+
+def effect_rows(result: Identification) -> tuple[list[str], Rows]:
+    """Return headings and rows: every parameter of the fitted effects."""
+    rows = [
+        [
+            effect.id if k == 0 else "",
+            parameter.name,
+            significant(values[parameter.name], 4),
+            "" if parameter.unit == "1" else parameter.unit.replace("ohm", "Ω"),
+        ]
+        for effect, values in result.model.extended_model().effects
+        for k, parameter in enumerate(effect.parameters)
+    ]
+    return ["<effect", "<parameter", "value", "<unit"], rows
+
+
+def search_rows(found: Selected) -> tuple[list[str], Rows]:
+    """Return headings and rows: the steps of the effect search with their left-out errors."""
+    rows = [
+        [
+            step.effect_id,
+            step.what,
+            significant(step.before_rmse_v, 3),
+            significant(step.after_rmse_v, 3),
+            number(step.t_value, 1),
+        ]
+        for step in found.steps
+    ]
+    return ["<effect", "<step", "left out without [V]", "with [V]", "t"], rows
