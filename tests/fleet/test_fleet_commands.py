@@ -258,7 +258,7 @@ def test_the_page_says_which_vehicle_has_which_gap() -> None:
     page = Html(fleet_report(found))
     assert not page.fetched
     assert "1 of 2 vehicles have a gap: car1 (voltage_offset)" in page.text
-    assert "1 differ in their health from the fleet: car3" in page.text
+    assert "1 vehicle differs in health from the fleet: car3" in page.text
     assert "cut off" in page.text
 
 

@@ -76,10 +76,11 @@ def _lead(found: FleetOverview) -> str:
         )
     if found.health:
         names = list(dict.fromkeys(vehicle for vehicle, _, _ in found.outlying))
+        differ = "vehicle differs" if len(names) == 1 else "vehicles differ"
         sentences.append(
-            f"{len(names)} differ in their health from the fleet: {joined(names, 5)}."
+            f"{len(names)} {differ} in health from the fleet: {joined(names, 5)}."
             if names
-            else "No vehicle differs in its health from the fleet."
+            else "No vehicle differs in health from the fleet."
         )
     return " ".join(sentences)
 
@@ -181,7 +182,11 @@ def _over_time(found: FleetOverview, quantity: str) -> Plot:
 
 def _estimates(found: FleetOverview) -> Table:
     rows = []
-    for name, of_vehicle in found.estimates.items():
+    worst_first = sorted(
+        found.estimates.items(),
+        key=lambda item: -(mean_of([row["soc_mae_pct"] for row in item[1]]) or 0.0),
+    )
+    for name, of_vehicle in worst_first:
         columns = ("soc_mae_pct", "mean_soc_std_pct", "cover_2sigma", "valid_share")
         error, std, cover, valid = (
             mean_of([row[column] for row in of_vehicle]) for column in columns
@@ -203,7 +208,6 @@ def _estimates(found: FleetOverview) -> Table:
         "vehicle", "logs", "hours", "SoC MAE [%]", "worst log [%]", "mean σ [%]",
         "within 2σ [%]", "valid [%]",
     ]  # fmt: skip
-    rows.sort(key=lambda row: row[3], reverse=True)
     return _table(head, rows, len(rows))
 
 
