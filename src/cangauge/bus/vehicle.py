@@ -58,7 +58,7 @@ def pgn_mask(key: int) -> int:
 
 @dataclass(frozen=True, slots=True)
 class VehicleSignal:
-    """One signal of a vehicle in A (positive = discharge), V, °C or %; its message, of `length` bytes.
+    """One signal of a vehicle in A (positive = discharge), V, °C or %, and its message.
 
     `key` is the arbitration id, plus `EXTENDED` for an extended one.
     """
