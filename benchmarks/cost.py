@@ -52,7 +52,6 @@ from cangauge.identify.fit import fit
 from cangauge.logs.canonical import write_log
 from cangauge.logs.log import Log
 from cangauge.logs.read import read_log
-from cangauge.model.effects.library import LIBRARY
 from cangauge.model.model_file import Coefficient, Model
 from cangauge.service.pipeline import Pipeline, PipelineSettings
 from cangauge.types import Sample
@@ -289,14 +288,14 @@ def _long_logs(number: int, rows: int) -> Iterator[Log]:
 
 
 def diagnoses() -> Result:
-    """Return the time of a diagnosis by the numbers of logs, references and effects [s]."""
+    """Return the time of a diagnosis by the numbers of logs and references [s]."""
     simulated = [simulate(seed=1, drive=day, hours=1.0).log for day in range(1, 9)]
     known = fit(simulated[:2], capacity_ah=60.0).model
     references = simulated[5:8]
 
-    def seconds(logs: list[Log], references: list[Log], effects: int = len(LIBRARY)) -> float:
+    def seconds(logs: list[Log], references: list[Log]) -> float:
         began = time.process_time()
-        diagnose(logs, known, references, leave_out=list(LIBRARY)[effects:])
+        diagnose(logs, known, references)
         return time.process_time() - began
 
     seconds(simulated[4:5], references)  # the first one imports the solvers
@@ -306,9 +305,6 @@ def diagnoses() -> Result:
         },
         "seconds by references, one log": {
             number: seconds(simulated[4:5], references[:number]) for number in (0, 1, 2)
-        },
-        "seconds by effects, one log, 3 references": {
-            number: seconds(simulated[4:5], references, number) for number in (11, 16)
         },
     }
 

@@ -6,7 +6,7 @@ Simulated vehicles of one type, each with its own capacity and resistance; healt
 vehicles are diagnosed, one each. First with a model of ten logs and a growing number of references,
 each of another vehicle; then with ten references and a model of a growing number of logs
 (`--models`). The smallest visible size is that of which the evidence reaches the limit of the
-diagnosis (`Diagnosis.observability`), in % of the effect's physical range; median of the vehicles.
+diagnosis (`EffectEvidence.visible`), in % of the effect's physical range; median of the vehicles.
 """
 
 from __future__ import annotations
@@ -79,12 +79,11 @@ def _row(
     sizes: dict[str, list[float]] = {name: [] for name in SHOWN}
     healthy = []
     for log in tested:
-        found = diagnose([log], model, learned if learned.covers([log]) else references)
-        healthy.append(found.verdict.probabilities["none"])
-        for item in found.observability:
-            name = str(item["effect"])
-            if name in sizes:
-                sizes[name].append(100.0 * (1.0 - float(str(item["visible"]))))
+        found = diagnose([log], model, learned)
+        healthy.append(found.posterior.probabilities["none"])
+        for name in SHOWN:
+            item = found.evidence.effects[name]
+            sizes[name].append(min(100.0 * item.visible / item.trial.bound, 100.0))
     row = {name: _median(sizes[name]) for name in SHOWN} | {
         "p_none": _median(healthy),
         "learning_s": learned_at - began,

@@ -104,23 +104,16 @@ class SimulatorGap:
     references: tuple[Log, ...]
     model: Model
     """Identified on the simulator's output."""
-    measured: tuple[Log, ...]
-    """Diagnosed logs, as given."""
     simulated_v: tuple[FloatArray, ...]
     """Of each diagnosed log [V]."""
     remark: str
     """Where the simulator is off everywhere; "" else."""
 
-    def corrected_v(self, number: int, extended: Model, offset_pct: float = 0.0) -> FloatArray:
-        """Return the simulated voltage of a log with the correction of an extended model [V].
-
-        `offset_pct` changes the log's start, which is no part of the model.
-        """
+    def corrected_v(self, number: int, extended: Model) -> FloatArray:
+        """Return the simulated voltage of a log with the correction of an extended model [V]."""
         log = self.logs[number]
-        before = self.model.predict(log).residual_v
-        soc_pct = None if log.soc_pct is None else log.soc_pct + offset_pct
-        after = extended.predict(replace(log, soc_pct=soc_pct)).residual_v
-        return np.asarray(self.simulated_v[number] + (before - after))
+        change_v = self.model.predict(log).residual_v - extended.predict(log).residual_v
+        return np.asarray(self.simulated_v[number] + change_v)
 
 
 def correction(effect: str, parameters: Mapping[str, Quantity]) -> str:
@@ -139,24 +132,21 @@ def simulator_gap(
     capacity_ah: float | None = None,
 ) -> SimulatorGap:
     """Return the gap of a simulator as that of a model, by default identified on its output."""
-    volts = [simulated_v(simulation, log) for log in (*logs, *references)]
-    outputs = [
-        replace(log, voltage_v=each) for log, each in zip((*logs, *references), volts, strict=True)
-    ]
+    every, number = (*logs, *references), len(logs)
+    volts = [simulated_v(simulation, log) for log in every]
+    outputs = [replace(log, voltage_v=each) for log, each in zip(every, volts, strict=True)]
     if model is None:
         model = fit(outputs, capacity_ah=capacity_ah).model
     on_model = [
         replace(log, voltage_v=model.predict(output).voltage_v + log.voltage_v - output.voltage_v)
-        for log, output in zip((*logs, *references), outputs, strict=True)
+        for log, output in zip(every, outputs, strict=True)
     ]
-    number = len(logs)
     return SimulatorGap(
         logs=tuple(on_model[:number]),
         references=tuple(on_model[number:]),
         model=model,
-        measured=tuple(logs),
         simulated_v=tuple(volts[:number]),
-        remark=_level_remark((*logs, *references), volts, number),
+        remark=_level_remark(every, volts, number),
     )
 
 
@@ -169,8 +159,8 @@ def _level_remark(logs: Sequence[Log], volts: Sequence[FloatArray], number: int)
         if abs(mean) > max(LEVEL_PART * float(np.mean(logs[0].voltage_v)), varies):
             return (
                 f"The simulator is {significant(abs(mean), 2, 'V')}"
-                f" {'too low' if mean > 0.0 else 'too high'} everywhere{where}; only"
-                f" {significant(varies, 2, 'V')} vary about that. Correct its level first: the"
+                f" {'too low' if mean > 0.0 else 'too high'} everywhere{where}, and varies by"
+                f" {significant(varies, 2, 'V')} about that. Correct its level first: the"
                 " open-circuit voltage, the number of cells or the initial SoC."
             )
     return ""
