@@ -16,9 +16,9 @@ from cangauge.estimation.counting import CoulombCounter
 from cangauge.estimation.estimator import Estimator
 from cangauge.estimation.offline import estimate, estimate_log, run_estimator, samples_of
 from cangauge.estimation.settings import EstimatorSettings
+from cangauge.model.inverse import soc_from_ocv
 from cangauge.model.model_file import Model
 from cangauge.model.published import leaf_2012_model, leaf_2012_model_file
-from cangauge.model.voltage_model import soc_from_ocv
 from cangauge.types import Reason, Sample, Status
 from synthetic import synthetic_log
 

@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 
 from cangauge.errors import InputError
 from cangauge.model.delay_line import DelayLine, delayed_currents, filled_at
+from cangauge.model.inverse import soc_from_ocv, socs_from_ocv
 from cangauge.model.published import leaf_2012_model
 from cangauge.model.voltage_model import (
     KNOTS_PCT,
@@ -19,8 +20,6 @@ from cangauge.model.voltage_model import (
     PublishedCurve,
     VoltageModel,
     hermite_basis,
-    soc_from_ocv,
-    socs_from_ocv,
 )
 
 MODEL = leaf_2012_model()
@@ -49,7 +48,8 @@ def test_is_the_published_equation(soc: float, temperature: float, current: list
 def test_scalar_and_array_forms_agree(soc: float, temperature: float, current: list[float]) -> None:
     volts, slope = MODEL.pseudo_ocv_at(soc)
     whole = MODEL.voltage([soc], [temperature], [current])[0]
-    assert volts + MODEL.offset_at(temperature, current) == pytest.approx(whole, abs=1e-9)
+    beside = MODEL.load_columns([temperature], np.array([current]))[0] @ MODEL.load_coefficients
+    assert volts + beside == pytest.approx(whole, abs=1e-9)
     assert slope == pytest.approx(MODEL.pseudo_ocv_slope([soc])[0], rel=1e-9)
 
 
@@ -182,7 +182,7 @@ def test_ring_buffer_equals_interpolation_of_the_log(
         line.push(time, current)
         assert line.currents() == pytest.approx(expected[k].tolist(), abs=1e-6)
     full = filled_at(time_s, 70.0, time_s)
-    assert line.full == bool(full[-1])
+    assert (line.filled_s >= line.longest_s) == bool(full[-1])
 
 
 def test_a_gap_empties_the_delay_line_in_both_forms() -> None:
@@ -193,9 +193,9 @@ def test_a_gap_empties_the_delay_line_in_both_forms() -> None:
     line = DelayLine((0.0, 70.0))
     for time in time_s[time_s < 173.0].tolist():
         line.push(time, 1.0)
-    assert not line.full
+    assert line.filled_s < line.longest_s
     line.push(173.0, 1.0)
-    assert line.full
+    assert line.filled_s >= line.longest_s
 
 
 def test_memory_is_bounded_at_any_rate() -> None:

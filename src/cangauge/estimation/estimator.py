@@ -33,8 +33,9 @@ from cangauge.estimation.settings import EstimatorSettings, SocReference, detect
 from cangauge.estimation.start import WRONG_PRIOR, WRONG_STD_PCT, Hypotheses
 from cangauge.estimation.state import DelayLineState, EstimatorMemory, EstimatorState
 from cangauge.model.effects.base import Reading
+from cangauge.model.inverse import soc_from_ocv
 from cangauge.model.model_file import Model, as_model
-from cangauge.model.voltage_model import VoltageModel, soc_from_ocv
+from cangauge.model.voltage_model import VoltageModel
 from cangauge.types import (
     CURRENT_AT_MOST_A,
     REASONS,

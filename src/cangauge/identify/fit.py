@@ -13,7 +13,6 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from cangauge._files import text_sha256
-from cangauge._text import counted, duration, significant
 from cangauge._typing import FloatArray
 from cangauge._version import __version__
 from cangauge.errors import InputError, require_choice, require_number
@@ -30,6 +29,8 @@ from cangauge.identify.identification import (
     Identification,
     energy_balance,
     evaluate,
+    remarks_on_effects,
+    remarks_on_logs,
     slope_resistances,
 )
 from cangauge.identify.least_squares import (
@@ -51,13 +52,12 @@ from cangauge.identify.published import (
     solve_published,
 )
 from cangauge.identify.rows import FitRows, fit_rows, usable_delays
-from cangauge.identify.starts import Starts, find_starts, given_starts, with_start
-from cangauge.logs.gaps import bridge_s, discharged_ah, uncounted_gaps, usual_step_s
+from cangauge.identify.starts import find_starts, given_starts, with_start
+from cangauge.logs.gaps import discharged_ah
 from cangauge.logs.log import Log, TemperatureSource
 from cangauge.logs.read import as_log
 from cangauge.model.coulomb_counting import (
     capacity_from_full_discharge,
-    difference_from_reference,
 )
 from cangauge.model.effects.library import EffectCandidate, effect_entries
 from cangauge.model.extended import ExtendedModel
@@ -218,8 +218,8 @@ def fit(
         slope_expected_ohm=expected,
         remarks=(
             *said,
-            *_remarks(rows, starts, recorded, delay_s, capacity_ah),
-            *_remarks_on_effects(found.effects, model),
+            *remarks_on_logs(rows, starts, recorded, delay_s, capacity_ah),
+            *remarks_on_effects(found.effects, model),
         ),
         effects=found.effects,
         starts=starts.starts,
@@ -504,47 +504,6 @@ def _fit_published(
         **fields,
     )  # fmt: skip
     return _Fitted(model, published, errors, None)
-
-
-def _remarks(
-    rows: Sequence[FitRows],
-    starts: Starts,
-    recorded: Sequence[Log],
-    delay_s: Sequence[float],
-    capacity_ah: float,
-) -> list[str]:
-    found = []
-    removed = sum(item.removed["start_up_or_shut_down"] for item in rows)
-    if removed:
-        found.append(f"{counted(removed, 'row')} of start-up and shut-down left out")
-    usable = usable_delays(recorded, delay_s)
-    if len(usable) < len(delay_s):
-        left_out = ", ".join(f"{delay:g}" for delay in delay_s if delay not in usable)
-        step_s = min(usual_step_s(log.time_s) for log in recorded)
-        found.append(f"rows every {step_s:.3g} s do not resolve a delay of {left_out} s")
-    for log in recorded:
-        gaps = uncounted_gaps(log.time_s)
-        if gaps.size:
-            longest = float(np.max(np.diff(log.time_s)[gaps]))
-            found.append(
-                f"{log.name}: {counted(gaps.size, 'gap')} of more than"
-                f" {bridge_s(log.time_s):.0f} s, the longest {duration(longest)}: no charge is"
-                " counted over them (a rest); split the log there if the pack was used"
-            )
-    differences = (difference_from_reference(log, capacity_ah) for log in starts.pieces)
-    return [*found, *starts.remarks(), *(text for text in differences if text is not None)]
-
-
-def _remarks_on_effects(selected: Selected | None, model: Model) -> list[str]:
-    if selected is None:
-        return []
-    if not selected.steps and not selected.chosen:
-        return ["effects need three logs, so that each can be left out"]
-    error_v = significant(model.noise.voltage_rmse_v, 3)
-    names = ", ".join(item.effect.id for item in selected.chosen)
-    if not names:
-        return [f"no effect lowers the error of left-out logs ({error_v} V) significantly"]
-    return [f"effects: {names}; error of left-out logs {error_v} V"]
 
 
 def _check_logs(logs: Sequence[Log]) -> None:

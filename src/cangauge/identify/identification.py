@@ -12,14 +12,15 @@ from typing import Any, Final
 import numpy as np
 
 from cangauge._extras import extra
-from cangauge._text import NONE_KNOWN, number, significant, span
+from cangauge._text import NONE_KNOWN, counted, duration, number, significant, span
 from cangauge._typing import FloatArray
 from cangauge.identify.effect_search import Selected
 from cangauge.identify.published import PublishedFit
-from cangauge.identify.rows import TEMPERATURE_SPAN_K, FitRows
-from cangauge.identify.starts import Start
-from cangauge.logs.gaps import BRIDGE_S
+from cangauge.identify.rows import TEMPERATURE_SPAN_K, FitRows, usable_delays
+from cangauge.identify.starts import Start, Starts
+from cangauge.logs.gaps import BRIDGE_S, bridge_s, uncounted_gaps, usual_step_s
 from cangauge.logs.log import Log
+from cangauge.model.coulomb_counting import difference_from_reference
 from cangauge.model.effects.base import Signals
 from cangauge.model.extended import ExtendedModel, newton_soc
 from cangauge.model.model_file import Coefficient, Model
@@ -352,3 +353,46 @@ def search_rows(found: Selected) -> tuple[list[str], Rows]:
         for step in found.steps
     ]
     return ["<effect", "<step", "left out without [V]", "with [V]", "t"], rows
+
+
+def remarks_on_logs(
+    rows: Sequence[FitRows],
+    starts: Starts,
+    recorded: Sequence[Log],
+    delay_s: Sequence[float],
+    capacity_ah: float,
+) -> list[str]:
+    """Return what is to be said about rows, gaps, starts and counted charge of the logs."""
+    found = []
+    removed = sum(item.removed["start_up_or_shut_down"] for item in rows)
+    if removed:
+        found.append(f"{counted(removed, 'row')} of start-up and shut-down left out")
+    usable = usable_delays(recorded, delay_s)
+    if len(usable) < len(delay_s):
+        left_out = ", ".join(f"{delay:g}" for delay in delay_s if delay not in usable)
+        step_s = min(usual_step_s(log.time_s) for log in recorded)
+        found.append(f"rows every {step_s:.3g} s do not resolve a delay of {left_out} s")
+    for log in recorded:
+        gaps = uncounted_gaps(log.time_s)
+        if gaps.size:
+            longest = float(np.max(np.diff(log.time_s)[gaps]))
+            found.append(
+                f"{log.name}: {counted(gaps.size, 'gap')} of more than"
+                f" {bridge_s(log.time_s):.0f} s, the longest {duration(longest)}: no charge is"
+                " counted over them (a rest); split the log there if the pack was used"
+            )
+    differences = (difference_from_reference(log, capacity_ah) for log in starts.pieces)
+    return [*found, *starts.remarks(), *(text for text in differences if text is not None)]
+
+
+def remarks_on_effects(selected: Selected | None, model: Model) -> list[str]:
+    """Return what is to be said about the selection of effects."""
+    if selected is None:
+        return []
+    if not selected.steps and not selected.chosen:
+        return ["effects need three logs, so that each can be left out"]
+    error_v = significant(model.noise.voltage_rmse_v, 3)
+    names = ", ".join(item.effect.id for item in selected.chosen)
+    if not names:
+        return [f"no effect lowers the error of left-out logs ({error_v} V) significantly"]
+    return [f"effects: {names}; error of left-out logs {error_v} V"]

@@ -114,31 +114,12 @@ class DelayLine:
         """Length of the gap-free stretch up to the newest sample [s]."""
         return self._times[-1] - self._since if self._times else 0.0
 
-    @property
-    def full(self) -> bool:
-        """Whether the gap-free stretch covers the longest delay."""
-        return self.filled_s >= self._longest
-
     def currents(self) -> list[float]:
         """Return I(t − dj) [A] for each delay, t being the newest sample's time."""
-        # As `current_at`, without its calls: this runs for every estimate.
-        times, currents = self._times, self._currents
-        latest_s, count = times[-1], len(times)
-        found = []
-        for delay_s in self._delays:
-            at = latest_s - delay_s
-            right = bisect_right(times, at)
-            if right == 0:
-                found.append(currents[0])
-            elif right == count:
-                found.append(currents[-1])
-            else:
-                t0, c0 = times[right - 1], currents[right - 1]
-                found.append(c0 + (currents[right] - c0) * (at - t0) / (times[right] - t0))
-        return found
+        return [self.current_at(delay_s) for delay_s in self._delays]
 
     def current_at(self, ago_s: float) -> float:
-        """Return I(t − `ago_s`) [A], t being the newest sample's time; see `currents`."""
+        """Return I(t − `ago_s`) [A], t being the newest sample's time."""
         times, currents = self._times, self._currents
         at = times[-1] - ago_s
         right = bisect_right(times, at)

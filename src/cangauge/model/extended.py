@@ -32,7 +32,8 @@ from cangauge.model.effects.base import (
 )
 from cangauge.model.effects.library import LIBRARY
 from cangauge.model.first_order import Lag
-from cangauge.model.voltage_model import SLOPE_AT_LEAST, Functions, VoltageModel, socs_from_ocv
+from cangauge.model.inverse import socs_from_ocv
+from cangauge.model.voltage_model import SLOPE_AT_LEAST, Functions, VoltageModel
 
 if TYPE_CHECKING:
     from cangauge.model.model_file import Noise
@@ -343,10 +344,6 @@ class OnlineModel:
     def load(self) -> FloatArray:
         """Return the load columns at the latest reading, shape (k,)."""
         return self._row
-
-    def offset_v(self) -> float:
-        """Return the part of the voltage model that does not depend on SoC, without effects [V]."""
-        return float(self._row @ self.load_coefficients)
 
     def drives(self) -> FloatArray:
         """Return the effects' drives at the latest reading, shape (1 + effects over SoC,).

@@ -6,7 +6,7 @@ import json
 from itertools import pairwise
 from os import PathLike
 from pathlib import Path
-from typing import Annotated, Any, Final, Literal, Self
+from typing import Annotated, Any, Literal, Self
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
@@ -18,9 +18,10 @@ from cangauge.errors import InputError
 from cangauge.logs.log import Log, TemperatureSource
 from cangauge.logs.read import as_log
 from cangauge.model.delay_line import GAP_S
-from cangauge.model.effects.base import RESISTANCE_AT_LEAST, Pack, Signals
+from cangauge.model.effects.base import Pack, Signals
 from cangauge.model.effects.library import parse_effects
 from cangauge.model.extended import ExtendedModel, OnlineModel, Prediction
+from cangauge.model.physics import check_physics
 from cangauge.model.prior import (
     CHEMISTRIES,
     DELAYS_S,
@@ -32,6 +33,7 @@ from cangauge.model.prior import (
     prior_of,
     usual_loads,
 )
+from cangauge.model.version1 import BLOCK_S, upgraded
 from cangauge.model.voltage_model import (
     BASIS_NAMES,
     KNOTS_PCT,
@@ -46,8 +48,6 @@ from cangauge.model.voltage_model import (
 
 MODEL_FORMAT = "cangauge-model"
 MODEL_VERSION = 2
-BLOCK_S = 30.0
-"""Time over which voltages are averaged for one update of a filter [s]."""
 SLOW_S = 300.0
 """Time constant of the slow voltage error [s]: residuals of recorded trips correlate by 0.3–0.5 at
 60 s and 0.1 at 300 s."""
@@ -337,7 +337,7 @@ class Model(_Strict):
             parameter is out of bounds.
         """
         model = self.voltage_model()
-        _check_physics(model, self)
+        check_physics(model, self)
         effects = parse_effects(self.effects, Pack.of(model, self.capacity_ah))
         return ExtendedModel(model, self.capacity_ah, tuple(effects))
 
@@ -422,13 +422,10 @@ class Model(_Strict):
                 cure=_CURE,
             )
         try:
-            if raw["version"] == 1:
-                return Version1.model_validate(raw).upgraded()
-            model = cls.model_validate(raw)
+            model = cls.model_validate(upgraded(raw) if raw["version"] == 1 else raw)
             model.extended_model()
         except ValidationError as error:
-            schema = Version1 if raw["version"] == 1 else cls
-            raise schema_error(error, schema, path, _CURE) from error
+            raise schema_error(error, cls, path, _CURE) from error
         except InputError as error:
             raise InputError(
                 error.problem, source=path, field=error.field, value=error.value, cure=error.cure
@@ -591,70 +588,6 @@ def function_fields(covariance: FloatArray, loads: FloatArray) -> FunctionFields
     )
 
 
-HIGHEST_VOLTS: Final = 1e4
-"""Largest pseudo-OCV [V]: electrical systems of vehicles and stores stay below 1.5 kV."""
-VOLTAGE_RATIO: Final = 3.0
-"""Largest ratio of the pseudo-OCV of a full pack to that of an empty one [-]: lithium cells are
-used between 2.0 and 4.4 V, lead and nickel cells over a narrower range."""
-DROP_AT_1C: Final = 1.0
-"""Largest voltage that one resistance drops at 1 C, relative to the pseudo-OCV [-]: such a pack
-could not be discharged in an hour at all. 0.02 for a Leaf, 0.3 for a small cell in the cold."""
-SLOPE_BY_TEMPERATURE: Final = 0.01
-"""Largest temperature coefficient relative to the pseudo-OCV [1/K]; 0.002 as published for a Leaf,
-0.0003 by the entropy of the cells."""
-
-
-def _check_physics(model: VoltageModel, file: Model) -> None:
-    """Raise InputError for voltages, resistances, kt or noise that no pack has."""
-    knots = file.equation == "knots"
-    prefix = "loads" if knots else "published.coefficients"
-    middle = model.nominal_v
-    ends = model.pseudo_ocv([*model.soc_range_pct]).tolist()
-    low, high = min(*ends, middle), max(*ends, middle)
-    if not (low > 0.0 and high <= min(HIGHEST_VOLTS, VOLTAGE_RATIO * low)):
-        raise InputError(
-            f"the pseudo-OCV of {low:.5g} … {high:.5g} V is not that of a battery",
-            field="curve.voltage_v" if knots else prefix,
-            cure="check its values and their unit (V), or create the file with `cangauge fit`",
-        )
-    largest = DROP_AT_1C * middle / file.capacity_ah
-    for number, value in enumerate(model.resistance_ohm):
-        if abs(value) > largest:
-            raise InputError(
-                f"must lie within ±{largest:.3g} ohm for a pack of {middle:.4g} V and"
-                f" {file.capacity_ah:.4g} Ah",
-                field=f"{prefix}.resistance_ohm.{number}" if knots else f"{prefix}.R{number + 1}",
-                value=value,
-                cure="check the value and its unit, or the capacity",
-            )
-    # A log of constant current leaves the sign open, and there the resistances cancel. Knots have
-    # the spread of their resistances in the covariance, so that a wrong sign is within it.
-    (low_a, high_a), lasting_ohm = model.current_range_a, sum(model.resistance_ohm)
-    if not knots and lasting_ohm * (high_a - low_a) > RESISTANCE_AT_LEAST * middle:
-        raise InputError(
-            "the sum of the resistances is positive, so that discharging would raise the voltage",
-            field=prefix,
-            value=lasting_ohm,
-            cure="positive current discharges, so resistances are negative",
-        )
-    steepest = SLOPE_BY_TEMPERATURE * middle
-    if abs(model.kt_v_per_k) > steepest:
-        raise InputError(
-            f"must lie within ±{steepest:.3g} V/K for a pack of {middle:.4g} V",
-            field=f"{prefix}.kt_v_per_k" if knots else f"{prefix}.kt",
-            value=model.kt_v_per_k,
-            cure="check the value and its unit",
-        )
-    for name in ("level_std_v", "slow_std_v", "fast_std_v"):
-        if getattr(file.noise, name) > middle:
-            raise InputError(
-                f"is more than the {middle:.4g} V of the pack",
-                field=f"noise.{name}",
-                value=getattr(file.noise, name),
-                cure="check the value and its unit",
-            )
-
-
 def published_names(delays: int) -> list[str]:
     """Return k0 … k7, kt, R1 … Rn."""
     return [*BASIS_NAMES, "kt", *(f"R{k}" for k in range(1, delays + 1))]
@@ -672,92 +605,3 @@ def _check_length(values: list[Any], number: int, name: str) -> None:
 
 def _refuse_constant(name: str) -> float:
     raise ValueError(f"{name} is not a finite number")
-
-
-class Version1Curve(_Strict):
-    """Error of pseudo-OCV and temperature coefficient in version 1."""
-
-    soc_pct: list[_Soc]
-    functions_v: list[list[_Value]]
-    temperature_c: _Celsius
-    kt_std_v_per_k: _Volts
-    resistance_std_per_k: _NotNegative
-
-
-class Version1Noise(_Strict):
-    """Voltage error in version 1: parts of different duration."""
-
-    fast_std_v: _Volts
-    fast_time_s: _NotNegative
-    slow_std_v: _Volts
-    slow_time_s: _Seconds
-    lasting_std_v: _Volts
-    lasting_time_s: _Value = 7200.0
-    lasting_soc_pct: _Value = 8.0
-    curve: Version1Curve | None = None
-    voltage_mae_pct: _NotNegative
-    voltage_rmse_v: _Volts
-    judged_on: str
-
-
-class Version1(Published):
-    """Model file of version 1: the published equation alone."""
-
-    format: Literal["cangauge-model"]
-    version: Literal[1]
-    name: str
-    rate_hz: Annotated[float, Field(ge=1e-3, le=1e4)]
-    capacity_ah: Annotated[float, Field(ge=1e-3, le=1e5)]
-    effects: list[dict[str, object]] = []
-    temperature_source: TemperatureSource
-    range: Ranges
-    noise: Version1Noise
-    information: dict[str, Any] | None = None
-    made: Made
-
-    def upgraded(self) -> Model:
-        """Return the model in the present form; its information is of another kind and left out."""
-        noise, functions, loads = self.noise, [], []
-        zero = [0.0] * len(self.delays_s)
-        if noise.curve is not None:
-            knots = np.array(noise.curve.soc_pct)
-            for function in noise.curve.functions_v:
-                functions.append(np.interp(KNOTS_PCT, knots, function).tolist())
-                loads.append([0.0, *zero])
-            std = noise.curve.kt_std_v_per_k
-            at_mean = std * (self.t_ref_c - noise.curve.temperature_c)
-            functions.append([at_mean] * KNOTS_PCT.size)
-            loads.append([std, *zero])
-        block_share = min(1.0, (1.0 + 2.0 * noise.fast_time_s) / BLOCK_S) ** 0.5
-        model = Model(
-            name=self.name,
-            equation="published",
-            chemistry="oxide",
-            capacity_ah=self.capacity_ah,
-            rate_hz=self.rate_hz,
-            temperature_source=self.temperature_source,
-            published=Published(
-                coefficients=self.coefficients,
-                epsilon=self.epsilon,
-                t_ref_c=self.t_ref_c,
-                delays_s=self.delays_s,
-            ),
-            functions=FunctionFields(soc_pct=KNOTS_PCT.tolist(), curve_v=functions, load=loads),
-            noise=Noise(
-                level_std_v=noise.lasting_std_v,
-                slow_std_v=noise.slow_std_v,
-                slow_time_s=noise.slow_time_s,
-                fast_std_v=block_share * noise.fast_std_v,
-                soc_std_pct=0.0,
-                cold_exponent=0.0,
-                residual_std_v=noise.voltage_rmse_v,
-                voltage_mae_pct=noise.voltage_mae_pct,
-                voltage_rmse_v=noise.voltage_rmse_v,
-                judged_on=noise.judged_on,
-            ),
-            effects=self.effects,
-            range=self.range,
-            made=self.made,
-        )
-        model.extended_model()
-        return model

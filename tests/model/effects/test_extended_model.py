@@ -19,8 +19,8 @@ from cangauge.logs.read import read_log
 from cangauge.model.effects.base import Reading, Signals
 from cangauge.model.effects.library import LIBRARY
 from cangauge.model.extended import ExtendedModel
+from cangauge.model.inverse import soc_from_ocv
 from cangauge.model.published import CAPACITY_AH
-from cangauge.model.voltage_model import soc_from_ocv
 from synthetic import synthetic_log
 
 ALL = tuple((effect, middle(effect)) for effect in EFFECTS)

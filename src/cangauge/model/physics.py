@@ -1,0 +1,75 @@
+"""Voltages, resistances and noise that a battery can have; a wrong unit is refused."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Final
+
+from cangauge.errors import InputError
+from cangauge.model.effects.base import RESISTANCE_AT_LEAST
+from cangauge.model.voltage_model import VoltageModel
+
+if TYPE_CHECKING:
+    from cangauge.model.model_file import Model
+
+HIGHEST_VOLTS: Final = 1e4
+"""Largest pseudo-OCV [V]: electrical systems of vehicles and stores stay below 1.5 kV."""
+VOLTAGE_RATIO: Final = 3.0
+"""Largest ratio of the pseudo-OCV of a full pack to that of an empty one [-]: lithium cells are
+used between 2.0 and 4.4 V, lead and nickel cells over a narrower range."""
+DROP_AT_1C: Final = 1.0
+"""Largest voltage that one resistance drops at 1 C, relative to the pseudo-OCV [-]: such a pack
+could not be discharged in an hour at all. 0.02 for a Leaf, 0.3 for a small cell in the cold."""
+SLOPE_BY_TEMPERATURE: Final = 0.01
+"""Largest temperature coefficient relative to the pseudo-OCV [1/K]; 0.002 as published for a Leaf,
+0.0003 by the entropy of the cells."""
+
+
+def check_physics(model: VoltageModel, file: Model) -> None:
+    """Raise InputError for voltages, resistances, kt or noise that no pack has."""
+    knots = file.equation == "knots"
+    prefix = "loads" if knots else "published.coefficients"
+    middle = model.nominal_v
+    ends = model.pseudo_ocv([*model.soc_range_pct]).tolist()
+    low, high = min(*ends, middle), max(*ends, middle)
+    if not (low > 0.0 and high <= min(HIGHEST_VOLTS, VOLTAGE_RATIO * low)):
+        raise InputError(
+            f"the pseudo-OCV of {low:.5g} … {high:.5g} V is not that of a battery",
+            field="curve.voltage_v" if knots else prefix,
+            cure="check its values and their unit (V), or create the file with `cangauge fit`",
+        )
+    largest = DROP_AT_1C * middle / file.capacity_ah
+    for number, value in enumerate(model.resistance_ohm):
+        if abs(value) > largest:
+            raise InputError(
+                f"must lie within ±{largest:.3g} ohm for a pack of {middle:.4g} V and"
+                f" {file.capacity_ah:.4g} Ah",
+                field=f"{prefix}.resistance_ohm.{number}" if knots else f"{prefix}.R{number + 1}",
+                value=value,
+                cure="check the value and its unit, or the capacity",
+            )
+    # A log of constant current leaves the sign open, and there the resistances cancel. Knots have
+    # the spread of their resistances in the covariance, so that a wrong sign is within it.
+    (low_a, high_a), lasting_ohm = model.current_range_a, sum(model.resistance_ohm)
+    if not knots and lasting_ohm * (high_a - low_a) > RESISTANCE_AT_LEAST * middle:
+        raise InputError(
+            "the sum of the resistances is positive, so that discharging would raise the voltage",
+            field=prefix,
+            value=lasting_ohm,
+            cure="positive current discharges, so resistances are negative",
+        )
+    steepest = SLOPE_BY_TEMPERATURE * middle
+    if abs(model.kt_v_per_k) > steepest:
+        raise InputError(
+            f"must lie within ±{steepest:.3g} V/K for a pack of {middle:.4g} V",
+            field=f"{prefix}.kt_v_per_k" if knots else f"{prefix}.kt",
+            value=model.kt_v_per_k,
+            cure="check the value and its unit",
+        )
+    for name in ("level_std_v", "slow_std_v", "fast_std_v"):
+        if getattr(file.noise, name) > middle:
+            raise InputError(
+                f"is more than the {middle:.4g} V of the pack",
+                field=f"noise.{name}",
+                value=getattr(file.noise, name),
+                cure="check the value and its unit",
+            )
