@@ -175,3 +175,32 @@ def test_logs_without_a_published_soc_are_refused(pack) -> None:
     model, logs = pack
     with pytest.raises(cangauge.InputError, match="publishes"):
         cangauge.judge([replace(logs[0], soc_pct=None)], model)
+
+
+def full_charge(error_pct: float) -> cangauge.Log:
+    """Return a charge of 16 LFP cells until full, and the SoC of a gauge that reads wrong."""
+    model = cangauge.Model.prior("lfp", 16, 100.0)
+    time_s = np.arange(0.0, 9000.0, 5.0)
+    amps = np.where(time_s < 3600.0, -33.0, -33.0 * np.exp(-(time_s - 3600.0) / 900.0))
+    log = cangauge.Log(time_s, amps, np.full(time_s.size, 50.0), np.full(time_s.size, 25.0))
+    soc = 100.0 - drawn_ah(log) + drawn_ah(log)[-1]
+    volts = model.predict(log, initial_soc_pct=float(soc[0])).voltage_v
+    held = np.where(time_s < 3600.0, np.minimum(volts, 55.9), 56.0)
+    return replace(log, voltage_v=held, soc_pct=soc + error_pct)
+
+
+@pytest.mark.parametrize(("error_pct", "verdict"), [(-0.5, "agrees"), (-12.0, "off")])
+def test_the_end_of_a_full_charge_settles_an_lfp_pack(error_pct: float, verdict: str) -> None:
+    judgement = cangauge.judge(
+        [full_charge(error_pct)], chemistry="lfp", cells=16, capacity_ah=100.0
+    )
+    assert judgement.verdict == verdict
+    assert judgement.error_pct == pytest.approx(error_pct, abs=4.0)
+
+
+def test_the_flat_part_of_an_lfp_pack_cannot_be_told() -> None:
+    log = full_charge(0.0)
+    drive = log.rows(log.time_s < 2400.0)
+    judgement = cangauge.judge([drive], chemistry="lfp", cells=16, capacity_ah=100.0)
+    assert judgement.verdict == "cannot_tell"
+    assert "LFP" in judgement.next_step

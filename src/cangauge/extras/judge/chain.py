@@ -190,11 +190,9 @@ def _stretch(number: int, log: Log, model: Model, step: float) -> Stretch:
     published = np.where(
         (published > PEGGED_PCT) & (published < 100.0 - PEGGED_PCT), published, np.nan
     )
-    known = np.isfinite(published)
-    seen = np.add.reduceat(known, first)
-    with np.errstate(invalid="ignore"):
-        # The count at the same rows: the mean of y + Q less the block's mean Q.
-        both = np.add.reduceat(np.where(known, published + drawn, 0.0), first) / seen
+    # The median: a jump within a block stays one jump.
+    blocks = [each[np.isfinite(each)] for each in np.split(published + drawn, first[1:])[::stride]]
+    counted = np.array([np.median(each) if each.size else np.nan for each in blocks])
     drawn_mean = mean(drawn)
     voltage = mean(prediction.signals.voltage_v)
     hours = mean(elapsed) / 3600.0
@@ -204,7 +202,7 @@ def _stretch(number: int, log: Log, model: Model, step: float) -> Stretch:
         hours,
         drawn_mean,
         np.where(hours * 3600.0 < SETTLING_S, np.nan, voltage),
-        both[::stride] - drawn_mean,
+        counted - drawn_mean,
         mean(prediction.signals.temperature_c),
         mean(_load(model, prediction)),
         replace(
