@@ -32,8 +32,12 @@ from cangauge.extras.validation.twin.simulation import draw_plant
 from cangauge.logs.log import Log
 
 FLOORS, LEAST_NAMES = 2.0, 2
-IN_ENGINE = {"capacity": -1.0, "initial_soc": -1.0}
-"""Effects whose size has the other sign in the engine than in the twin."""
+IN_ENGINE = {
+    "current_offset": 1.0, "current_gain": 1.0, "voltage_offset": 1.0, "voltage_gain": 1.0,
+    "time_skew": 1.0, "capacity": -1.0, "initial_soc": -1.0, "coulombic_efficiency": 1.0,
+}  # fmt: skip
+"""Effects with the same size in the twin and in the engine → the sign between them. The others have
+another unit: what is measured of them is the size that the diagnosis found."""
 
 
 def driven(plant: Plant, wanted: Trace, fault: Fault, seed: int) -> Log:
@@ -94,7 +98,9 @@ class Bench:
             planned = self.both(first, driven(self.plant, profile, fault, seed), effect)
         else:
             one = next(x for x in MEASUREMENTS if x.name == best.name)
-            size = fault.size * IN_ENGINE.get(effect, 1.0)
+            size = evidence.effects[effect].size
+            if effect in IN_ENGINE:
+                size = fault.size * IN_ENGINE[effect]
             reads = one.reading(self.known.pack, effect, size)
             reads += one.std(self.known.pack) * float(rng.normal())
             planned = settled(self.known.pack, evidence, now.probabilities, one, reads)[effect]

@@ -10,6 +10,7 @@ Positive current discharges, everywhere.
 `estimate`, `EstimateTable`               SoC at every sample of a log
 `Estimator`, `Sample`, `Estimate`         the same, one sample at a time
 `diagnose`, `Diagnosis`                   where an error lies, what causes it, how far it shrinks
+`judge`, `Judgement`                      whether the SoC of another gauge is right, and why not
 `Vehicle`, `Service`                      the signals of a car; the service on its bus
 `simulate`, `Simulation`                  a simulated pack and drive, with or without faults
 `CangaugeError`, `InputError`             failures; wrong input, with field, value and cure
@@ -39,6 +40,7 @@ if TYPE_CHECKING:
     from cangauge.errors import CangaugeError, InputError
     from cangauge.estimation.estimator import Estimator
     from cangauge.estimation.offline import EstimateTable, estimate
+    from cangauge.extras.judge import Judgement, judge
     from cangauge.extras.validation import Simulation, simulate
     from cangauge.identify.fit import fit
     from cangauge.identify.identification import Identification
@@ -55,6 +57,7 @@ __all__ = [
     "Estimator",
     "Identification",
     "InputError",
+    "Judgement",
     "Log",
     "Model",
     "Sample",
@@ -65,6 +68,7 @@ __all__ = [
     "diagnose",
     "estimate",
     "fit",
+    "judge",
     "read_log",
     "simulate",
 ]
@@ -77,6 +81,7 @@ _PLACES: Final = {
     "Estimator": "estimation.estimator",
     "Identification": "identify.fit",
     "InputError": "errors",
+    "Judgement": "extras.judge",
     "Log": "logs.log",
     "Model": "model.model_file",
     "Sample": "types",
@@ -86,6 +91,7 @@ _PLACES: Final = {
     "diagnose": "diagnosis",
     "estimate": "estimation.offline",
     "fit": "identify.fit",
+    "judge": "extras.judge",
     "read_log": "bus.recording:read_recording",
     "simulate": "extras.validation",
 }

@@ -133,6 +133,11 @@ def reason_names(reasons: int) -> str:
     return "; ".join(reason_name(reason) for reason in Reason if reasons & reason)
 
 
+def reason_sentences(reasons: int) -> str:
+    """Return what the reasons that are set mean to a user, separated by "; "."""
+    return "; ".join(REASON_WORDS[reason] for reason in Reason if reasons & reason)
+
+
 class Estimate(NamedTuple):
     """The estimate after one sample; NaN where a quantity is not known."""
 

@@ -170,9 +170,7 @@ class Capture:
         yield from self._count_time(messages) if self._kind.stamps == "none" else messages
         # An empty last part, begun just before a power cut, does not invalidate the others.
         if not any(each.frames for each in self._readers):
-            last = self._readers[-1]
-            if last.damage is not None:
-                raise last.damaged()
+            self._readers[-1].refuse_damage()
             raise InputError("the capture holds no frames", source=self.path, cure=_CURE)
 
     def _read(self, path: Path) -> Iterator[can.Message]:

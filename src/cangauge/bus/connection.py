@@ -15,6 +15,7 @@ import sys
 import time
 from collections import Counter, deque
 from collections.abc import Sequence
+from contextlib import suppress
 from typing import Final, Self
 
 import can
@@ -76,7 +77,7 @@ _MEMINFO: Final = struct.Struct("=9I")
 _MEMINFO_DROPS: Final = 8
 
 
-def queue_drops(bus: can.BusABC) -> int | None:
+def _queue_drops(bus: can.BusABC) -> int | None:
     """Return the frames dropped by a full receive queue since the bus was opened (modulo 2³²).
 
     None where the system does not count them: buses that are not sockets, systems other than Linux.
@@ -85,12 +86,11 @@ def queue_drops(bus: can.BusABC) -> int | None:
     """
     if sys.platform != "linux":
         return None
-    try:
+    with suppress(OSError, NotImplementedError, ValueError):
         with socket.socket(fileno=os.dup(bus.fileno())) as own:
             answer = own.getsockopt(socket.SOL_SOCKET, _SO_MEMINFO, _MEMINFO.size)
-    except (OSError, NotImplementedError, ValueError):
-        return None
-    return int(_MEMINFO.unpack(answer)[_MEMINFO_DROPS]) if len(answer) >= _MEMINFO.size else None
+        return int(_MEMINFO.unpack(answer)[_MEMINFO_DROPS])
+    return None
 
 
 class BusConnection:
@@ -219,10 +219,8 @@ class BusConnection:
     @property
     def queue_drops(self) -> int | None:
         """Frames dropped because the receive queue was full; None where not counted."""
-        now = None if self._bus is None else queue_drops(self._bus)
-        if now is None or self._dropped_before is None:
-            return self._dropped_before if now is None else now
-        return self._dropped_before + now
+        now, before = None if self._bus is None else _queue_drops(self._bus), self._dropped_before
+        return before if now is None else now + (before or 0)
 
     def set_filters(self, filters: Sequence[CanFilter]) -> None:
         """Receive only frames that pass these filters from now on; BusError if the bus is gone."""

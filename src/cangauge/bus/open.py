@@ -44,8 +44,7 @@ _DEFAULT_CHANNELS: Final = {
 }  # fmt: skip
 _ON_SOCKETS: Final = {"socketcan", "udp_multicast"}
 
-# Errors of python-can, of the operating system, and those that a missing library or a wrong option
-# causes in a driver (NameError: kvaser without canlib).
+# Those of a missing library or a wrong option too (NameError: kvaser without canlib).
 _DRIVER_ERRORS: Final = (
     can.CanError, OSError, ValueError, TypeError, NotImplementedError, NameError, AttributeError,
     ImportError,
@@ -194,8 +193,7 @@ def open_bus(address: BusAddress, filters: Sequence[CanFilter] | None = None) ->
 
 
 def _widen_receive_buffer(bus: can.BusABC) -> None:
-    # The driver's socket is private; a duplicate descriptor refers to the same socket. Best effort:
-    # the system may refuse, or cap the size silently.
+    # A duplicate of the driver's private socket; the system may refuse, or cap the size silently.
     forced = [_SO_RCVBUFFORCE] if sys.platform == "linux" else []
     for option in (socket.SO_RCVBUF, *forced):
         with suppress(OSError), socket.socket(fileno=os.dup(bus.fileno())) as own:

@@ -1,15 +1,13 @@
 """Plausibility of the signals of a pack: range, rate, stuck detection, debouncing, time-out.
 
-- A value fails when its frame was refused, its code means "not available", it is out of range, it
-  changed too fast, or the signal is stuck. A failed value is never used.
-- `invalid_after` consecutive failures make a valid signal invalid, and `valid_after` consecutive
-  good values make it valid again. The first good value makes a new signal valid.
-- The rate limit widens with the time since the latest good value: a lasting step is accepted.
-- A signal is old when its latest good value is older than the time-out. The time-out is stated, or
-  follows from the period p, stated or learned: 10·p, at least 0.5 s and at most the usual time-out
-  of the role, but never below 3·p. Signals often sent on change keep at least the usual one.
+A failed value is never used. `invalid_after` consecutive failures make a valid signal invalid, and
+`valid_after` consecutive good values make it valid again; the first one makes a new signal valid.
+The rate limit widens with the time since the latest good value: a lasting step is accepted.
 
-All times are bus time, so that a live run and its recording give the same result.
+A signal is old when its latest good value is older than the time-out. It is stated, or follows from
+the period p, stated or learned: 10·p, at least 0.5 s and at most the usual time-out of the role,
+but never below 3·p. Signals often sent on change keep at least the usual one. All times are bus
+time, so that a live run and its recording give the same result.
 """
 
 from __future__ import annotations

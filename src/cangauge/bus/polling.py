@@ -18,18 +18,15 @@ import can
 
 LONGEST_GAP_S: Final = 1.0
 REPLY_WITHIN_S: Final = 1.0
-"""Longest time between frames of one reply, and wait for its next frame [s]: N_Cr of
-ISO 15765-2. A request without one failed."""
 PENDING_WITHIN_S: Final = 5.0
-"""Longest wait after "response pending" [s]: P2* of ISO 14229-2."""
-SLOWEST_S: Final = 60.0
-"""Longest interval between requests for a reply that does not come [s]: one a minute burdens no
-bus."""
-OTHER_TESTER_S: Final = 30.0
-"""Silence of another tester after which requests are sent again [s]: applications of drivers ask
-every few seconds."""
 BETWEEN_S: Final = 0.05
-"""Shortest time from the end of one exchange to the next request [s]: P2 of ISO 14229-2."""
+"""Longest time between frames of one reply, and wait for its next frame [s]: N_Cr of
+ISO 15765-2; wait after "response pending": P2* of ISO 14229-2; from the end of one exchange to the
+next request: P2."""
+SLOWEST_S: Final = 60.0
+OTHER_TESTER_S: Final = 30.0
+"""Longest interval between requests for a reply that does not come [s]: one a minute burdens no
+bus; silence of another tester after which requests are sent again: drivers' apps ask often."""
 
 _SINGLE, _FIRST, _CONSECUTIVE = range(3)
 _NEGATIVE, _RESPONSE_PENDING, _REPLY_OFFSET = 0x7F, 0x78, 0x40

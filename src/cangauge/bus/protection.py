@@ -1,8 +1,5 @@
 """Protection of messages by CRC and alive counter: check received frames, protect sent ones.
 
-A frame with a wrong CRC or a repeated counter is refused. A counter that jumps while the CRC
-agrees means that frames were lost; the frame is used.
-
 `ProtectionRule` is a CRC-8 with a counter, as in known cars and in a user's own rules,
 `CounterRule` a counter alone, `E2eRule` a profile of AUTOSAR's end-to-end protection, computed by
 the library `autosar-e2e`. Layouts and CRCs: AUTOSAR FO, "Specification of SW-C End-to-End

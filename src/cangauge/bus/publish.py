@@ -78,10 +78,7 @@ class FrameIds:
 
 
 class SocEstimate(NamedTuple):
-    """Content of a SOC_ESTIMATE: SoC and its standard deviation [%]; see `Estimate`.
-
-    `age_s` is in whole seconds since charge was last counted, at most 30 [s]; NaN: no sample yet.
-    """
+    """SoC and its standard deviation [%]; `age_s`: whole seconds since charge was counted [s]."""
 
     soc_pct: float
     soc_std_pct: float
@@ -91,10 +88,7 @@ class SocEstimate(NamedTuple):
 
 
 class SocDetail(NamedTuple):
-    """Content of a SOC_DETAIL; `residual_v` is measured minus predicted voltage [V].
-
-    `samples` are those processed so far, modulo `SAMPLES_MODULO`.
-    """
+    """`residual_v` is measured minus predicted voltage [V]; samples are modulo `SAMPLES_MODULO`."""
 
     soc_newton_pct: float
     soc_coulomb_pct: float
@@ -103,7 +97,7 @@ class SocDetail(NamedTuple):
 
 
 class SocHealth(NamedTuple):
-    """Content of a SOC_HEALTH; `resistance_ratio` is relative to the model's [-]."""
+    """Capacity, resistance relative to the model's [-], offset of the current sensor."""
 
     capacity_ah: float
     capacity_std_ah: float
@@ -113,7 +107,7 @@ class SocHealth(NamedTuple):
 
 
 class SocPower(NamedTuple):
-    """Content of a SOC_POWER: possible currents, both positive, and the energy left."""
+    """Possible currents, both positive, and the energy left."""
 
     discharge_a: float
     discharge_std_a: float
@@ -124,11 +118,9 @@ class SocPower(NamedTuple):
 
 
 class SocCells(NamedTuple):
-    """Content of a SOC_CELLS.
+    """Weakest cell; spread: SoC of the strongest less its own; pack voltage less the sum of cells.
 
-    `cell_spread_pct` is the SoC of the strongest cell less that of the weakest [%], `sum_error_v`
-    the pack voltage less the sum of the cells [V]; `sum_check` is 0: not known, 1: they agree, 2:
-    they differ by more than both sensors allow.
+    `sum_check` is 0: not known, 1: they agree, 2: they differ by more than both sensors allow.
     """
 
     weakest_cell: float

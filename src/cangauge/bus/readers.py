@@ -120,13 +120,13 @@ class CaptureReader(MessageReader, ABC):
     def __iter__(self) -> Iterator[can.Message]:
         """Yield the frames as `messages`; raise InputError for damage before the first one."""
         yield from self.messages()
-        if self.damage is not None and not self.frames:
-            raise self.damaged()
+        self.refuse_damage()
 
-    def damaged(self) -> InputError:
-        """Return the error for a file that gives no frame."""
-        problem = f"the {self.name} file is damaged ({self.damage})"
-        return InputError(problem, source=self.source, cure="record or fetch it again")
+    def refuse_damage(self) -> None:
+        """Raise InputError for a file that broke off before its first frame."""
+        if self.damage is not None and not self.frames:
+            problem = f"the {self.name} file is damaged ({self.damage})"
+            raise InputError(problem, source=self.source, cure="record or fetch it again")
 
     def skip(self, line: int | None) -> None:
         """Count a malformed line or frame; raise InputError if there are many."""

@@ -7,7 +7,7 @@ samples lack.
 from __future__ import annotations
 
 from array import array
-from collections.abc import Iterator, Mapping, Sized
+from collections.abc import Mapping, Sized
 from dataclasses import dataclass, replace
 from os import PathLike
 from pathlib import Path
@@ -130,9 +130,7 @@ def log_of(
         vehicle = replace(vehicle, temperature=None, fixed_temperature_c=temperature_c)
         vehicle = replace(vehicle, temperature_source="unknown")
     log = capture_to_log(recording.path, vehicle)
-    return (
-        log if temperature_source is None else replace(log, temperature_source=temperature_source)
-    )
+    return replace(log, temperature_source=temperature_source or log.temperature_source)
 
 
 def open_recording(
@@ -210,11 +208,6 @@ class CaptureSamples:
     def __len__(self) -> int:
         """Return the number of samples."""
         return int(self.time_s.size)
-
-    def __iter__(self) -> Iterator[Sample]:
-        """Yield the samples."""
-        columns = (self.time_s, self.current_a, self.voltage_v, self.temperature_c)
-        yield from map(Sample._make, zip(*(column.tolist() for column in columns), strict=True))
 
 
 def open_vehicle_capture(path: str | PathLike[str], vehicle: Vehicle) -> Capture:

@@ -64,10 +64,9 @@ def pgn_mask(key: int) -> int:
 
 @dataclass(frozen=True, slots=True)
 class VehicleSignal:
-    """One signal of a vehicle, in A (positive = discharge), V, °C or %.
+    """One signal of a vehicle in A (positive = discharge), V, °C or %, and its message.
 
-    `key` is the arbitration id of its message, plus `EXTENDED` for an extended one; `message` and
-    `length` are the message's name and bytes.
+    `key` is the arbitration id, plus `EXTENDED` for an extended one.
     """
 
     role: Role

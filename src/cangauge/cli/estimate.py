@@ -13,7 +13,7 @@ from rich.progress import Progress
 
 from cangauge._extras import extra
 from cangauge._files import atomic_path
-from cangauge._text import number, significant, uncertain, uncertain_energy
+from cangauge._text import NONE_KNOWN, number, significant, uncertain, uncertain_energy
 from cangauge.cli.options import (
     JsonOption,
     ReadingOptions,
@@ -30,6 +30,7 @@ from cangauge.cli.options import (
 from cangauge.cli.output import console, emit_json, note, print_table
 from cangauge.cli.shown import VALID_STD_PCT
 from cangauge.errors import InputError
+from cangauge.types import REASON_WORDS, Reason
 
 if TYPE_CHECKING:
     from cangauge.bus.publish import PackReport
@@ -274,30 +275,35 @@ def _check_capture(done: RecordedEstimate, model: Model) -> None:
 def _show(done: RecordedEstimate) -> None:
     scores, table, settings = done.scores, done.table, done.settings
     cover = None if scores.cover_2sigma is None else 100.0 * scores.cover_2sigma
-    origin = {"given": "given", "log": "from the log's soc_pct", "voltage": "from the voltage"}
-    print_table(
-        f"State of charge of {done.recorded.name}",
-        ["", "value", "<unit"],
-        [
-            ["initial SoC", number(settings.initial_soc_pct, 1), f"% ({origin[done.origin]})"],
-            ["SoC at the end", number(table.soc_pct[-1], 1), "%"],
-            ["  its standard deviation", number(table.soc_std_pct[-1], 1), "%"],
-            ["SoC error, MAE", number(scores.soc_mae_pct, 2), "%"],
-            ["SoC error, largest", number(scores.soc_max_pct, 2), "%"],
-            ["  by Newton alone, MAE", number(scores.soc_newton_mae_pct, 2), "%"],
-            ["  by counting alone, MAE", number(scores.soc_coulomb_mae_pct, 2), "%"],
-            ["reference within ±2σ", number(cover, 1), "% of samples"],
-            ["voltage error, MAE", number(scores.voltage_mae_pct, 2), "%"],
-            ["valid", number(100.0 * scores.valid_fraction, 1), "% of samples"],
-            ["samples", str(scores.rows), ""],
-            ["computing time", number(scores.seconds, 1), "s"],
-        ],
-    )
+    origin = {"given": "given", "log": "from the log's soc_pct", "voltage": "found by the voltage"}
+    start = number(settings.initial_soc_pct, 1)
+    known = [row for row in range(len(table.soc_pct)) if table.soc_pct[row] == table.soc_pct[row]]
+    if done.origin == "voltage" and known:
+        start = uncertain(float(table.soc_pct[known[0]]), float(table.soc_std_pct[known[0]]))
+    rows = [
+        ["initial SoC", start, f"% ({origin[done.origin]})"],
+        ["SoC at the end", number(table.soc_pct[-1], 1), "%"],
+        ["  its standard deviation", number(table.soc_std_pct[-1], 1), "%"],
+        ["SoC error, MAE", number(scores.soc_mae_pct, 2), "%"],
+        ["SoC error, largest", number(scores.soc_max_pct, 2), "%"],
+        ["  by Newton alone, MAE", number(scores.soc_newton_mae_pct, 2), "%"],
+        ["  by counting alone, MAE", number(scores.soc_coulomb_mae_pct, 2), "%"],
+        ["reference within ±2σ", number(cover, 1), "% of samples"],
+        ["voltage error, MAE", number(scores.voltage_mae_pct, 2), "%"],
+        ["valid", number(100.0 * scores.valid_fraction, 1), "% of samples"],
+        ["samples", str(scores.rows), ""],
+    ]
+    # Without a reference there are no errors of the SoC.
+    rows = [row for row in rows if row[1] != NONE_KNOWN]
+    print_table(f"State of charge of {done.recorded.name}", ["", "value", "<unit"], rows)
     if done.pack.report is not None:
         limits = settings.limits.of_model(done.model.voltage_model())
         _show_pack(done.pack.report, limits)
     if shares := done.reason_shares:
-        rows = [[name, number(100.0 * share, 1)] for name, share in shares.items()]
+        rows = [
+            [REASON_WORDS[Reason[name.upper().replace(" ", "_")]], number(100.0 * share, 1)]
+            for name, share in shares.items()
+        ]
         print_table("Reasons for less than valid estimates", ["reason", "% of samples"], rows)
 
 
@@ -312,9 +318,10 @@ def _show_pack(report: PackReport, limits: KnownLimits) -> None:
             "× the model's",
         ],
         ["current offset", significant(health.offset_a, 2), "A"],
-        ["discharge for 10 s", uncertain(power.discharge_a, power.discharge_std_a),
+        ["possible discharge, 10 s", uncertain(power.discharge_a, power.discharge_std_a),
          f"A, down to {low_v} V"],
-        ["charge for 10 s", uncertain(power.charge_a, power.charge_std_a), f"A, up to {high_v} V"],
+        ["possible charge, 10 s", uncertain(power.charge_a, power.charge_std_a),
+         f"A, up to {high_v} V"],
         ["energy left", *uncertain_energy(power.energy_wh, power.energy_std_wh).rsplit(" ", 1)],
     ]  # fmt: skip
     if cells is not None:

@@ -18,6 +18,7 @@ from cangauge._text import NONE_KNOWN, duration, number
 from cangauge.cli.options import JsonOption
 from cangauge.cli.output import PlainConsole, emit_json, print_table, text_table
 from cangauge.errors import CangaugeError, InputError
+from cangauge.types import REASON_WORDS, Reason
 
 WATCH_EVERY_S: Final = 0.5
 """Interval of `--watch` [s]."""
@@ -208,7 +209,7 @@ def _with_std(value: float | None, std: float | None, unit: str, digits: int = 1
 
 
 def _words(reasons: list[str]) -> str:
-    return "; ".join(each.replace("_", " ") for each in reasons)
+    return "; ".join(REASON_WORDS[Reason[each.upper()]] for each in reasons)
 
 
 def _counts(counts: dict[str, int]) -> str:

@@ -204,7 +204,7 @@ class Diagnosis:
             found.append({
                 "effect": name, "group": GROUP_OF[name], "probability": p, "rmse_v": rmse_v,
                 "closed_fraction": closed, "ci": ci and list(ci),
-                "parameters": {k: item.to_dict() for k, item in self.parameters[name].items()},
+                "parameters": {k: vars(item) for k, item in self.parameters[name].items()},
             })  # fmt: skip
         return found
 

@@ -30,6 +30,9 @@ LOG_EFFECTS: Final = frozenset({"initial_soc"})
 CHANGED_PART: Final = 0.1
 """A cause can change a row where its voltage is at least this part of its usual largest (95 %)."""
 
+LATER_S: Final = 1e7
+"""Start of a step that happens after a log [s]."""
+
 TWO_SIDED: Final = 1.96
 """Standard deviations of a 95 % interval."""
 
@@ -85,17 +88,6 @@ class Quantity:
     ci: tuple[float, float] | None
     """None for a shape."""
 
-    def to_dict(self) -> dict[str, object]:
-        """Return the object of `gap --json`."""
-        ci = None if self.ci is None else list(self.ci)
-        return {"value": self.value, "ci": ci, "unit": self.unit}
-
-
-def interval(evidence: EffectEvidence) -> tuple[float, float]:
-    """Return the 95 % interval of an effect's size [unit of the trial]."""
-    half = TWO_SIDED * float(np.hypot(evidence.std, TANGENT_STD * evidence.size))
-    return evidence.size - half, evidence.size + half
-
 
 def residual_v(model: ExtendedModel, log: Trace) -> FloatArray:
     """Return corrected measured less predicted voltage of a model at 1 Hz [V], shape (n,)."""
@@ -120,44 +112,38 @@ class Extension:
         self._neutral = self.effect.neutral(model.pack)
         self._values = {} if evidence.trial.effect in _SIGNAL else self._nearest()
 
-    def values(self, size: float, place: float | None = 0.0, duration_s: float = 0.0) -> Values:
-        """Return the effect's parameters at a size [unit of the trial].
+    @property
+    def _starts_s(self) -> list[float]:
+        """Start of a step of resistance in each log; beyond its end where it happens later."""
+        places = self.evidence.in_logs or (0.0,) * len(self.logs)
+        return [
+            LATER_S if place is None else place * len(log.log.current_a)
+            for place, log in zip(places, self.logs, strict=True)
+        ]
 
-        A step of resistance has a place in a log of a duration; None: it happens later.
-        """
+    def values(self, size: float, start_s: float = 0.0) -> Values:
+        """Return the effect's parameters at a size [unit of the trial], and start of a step."""
         trial = self.evidence.trial
         if trial.effect in _SIGNAL:
             return self._neutral | _SIGNAL[trial.effect](size, trial.number)
         part = size / self.evidence.size if self.evidence.size else 0.0
         names = {item.name for item in self.effect.amplitudes}
         values = {k: part * v if k in names else v for k, v in self._values.items()}
-        if self.evidence.in_logs:
-            values["start_s"] = 1e7 if place is None else place * duration_s
-        return values
+        return values | ({"start_s": start_s} if self.evidence.in_logs else {})
 
     @property
     def parameters(self) -> dict[str, Quantity]:
         """The effect's parameters with 95 % intervals of its amplitudes."""
-        places = [
-            (place, float(len(log.log.current_a)))
-            for place, log in zip(self.evidence.in_logs, self.logs, strict=False)
-            if place is not None
-        ]
-        values, *ends = (
-            self.values(size, *(places or [(0.0, 0.0)])[0])
-            for size in (self.evidence.size, *interval(self.evidence))
-        )
-        shapes = {item.name for item in self.effect.parameters if item.neutral is None}
-        return {
-            item.name: Quantity(
-                values[item.name],
-                item.unit,
-                None
-                if item.name in shapes
-                else (min(x[item.name] for x in ends), max(x[item.name] for x in ends)),
-            )
-            for item in self.effect.parameters
-        }
+        size, std = self.evidence.size, self.evidence.std
+        half = TWO_SIDED * float(np.hypot(std, TANGENT_STD * size))
+        start_s = next(start for start in self._starts_s if start < LATER_S)
+        values, *ends = (self.values(x, start_s) for x in (size, size - half, size + half))
+        found = {}
+        for item in self.effect.parameters:
+            low, high = sorted(end[item.name] for end in ends)
+            ci = None if item.neutral is None else (low, high)
+            found[item.name] = Quantity(values[item.name], item.unit, ci)
+        return found
 
     def judge(self) -> tuple[list[FloatArray], list[BoolArray]]:
         """Return the errors of each log with the cause, and the rows judged, shape (m,) each.
@@ -171,7 +157,7 @@ class Extension:
             errors = np.empty_like(before)
             for size in np.unique(sizes[k]):
                 at = sizes[k] == size
-                values = self._in_log(self.values, float(size), k)
+                values = self.values(float(size), self._starts_s[k])
                 errors[at] = residual_v(self._with(values), log.log)[log.rows][at]
             change = np.abs(errors - before)
             usual = float(np.quantile(change, 0.95)) if change.size else 0.0
@@ -196,13 +182,6 @@ class Extension:
             }
         )
 
-    def _in_log(self, of: Callable[..., Values], size: float, number: int) -> Values:
-        """Return the parameters at a size in one of the diagnosed logs."""
-        if not self.evidence.in_logs:
-            return of(size)
-        duration_s = float(len(self.logs[number].log.current_a))
-        return of(size, self.evidence.in_logs[number], duration_s)
-
     def _covered_after(self, log: Columns) -> BoolArray:
         """Return the rows at SoC that references visit with the cause undone; all if none."""
         covered = np.ones(len(log.rows), dtype=bool)
@@ -225,16 +204,16 @@ class Extension:
 
     def _nearest(self) -> dict[str, float]:
         """Return the parameters whose voltage is nearest to the evidence's, at its size."""
-        trial, in_logs = self.evidence.trial, self.evidence.in_logs
-        places = in_logs or (trial.shape,) * len(self.logs)
+        trial = self.evidence.trial
+        places = self.evidence.in_logs or (trial.shape,) * len(self.logs)
         chosen = [
             item
-            for item in zip(self.logs, self.before_v, places, strict=True)
-            if not in_logs or item[2] is not None
+            for item in zip(self.logs, self.before_v, places, self._starts_s, strict=True)
+            if item[3] < LATER_S
         ]
         target = self.evidence.size * np.concatenate([
             additive_column(self.known.pack, log.log, replace(trial, shape=place))[log.rows]
-            for log, _, place in chosen
+            for log, _, place, _ in chosen
         ])  # fmt: skip
         units = {
             item.name: 0.1 * max(map(abs, item.bounds(self.model.pack, BOUND_MARGIN)))
@@ -246,10 +225,10 @@ class Extension:
             columns = []
             for name, unit in units.items():
                 changes = []
-                for log, before, place in chosen:
+                for log, before, _, start_s in chosen:
                     values = neutral | {name: unit}
-                    if in_logs:
-                        values["start_s"] = float(place or 0.0) * len(log.log.current_a)
+                    if self.evidence.in_logs:
+                        values["start_s"] = start_s
                     after = residual_v(self._with(values), log.log)[log.rows]
                     changes.append((before - after) / unit)
                 columns.append(np.concatenate(changes))

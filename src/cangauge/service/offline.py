@@ -40,7 +40,7 @@ from cangauge.logs.read import CellColumns
 from cangauge.model.coulomb_counting import difference_from_reference
 from cangauge.model.model_file import Model
 from cangauge.service.pipeline import FrameCounts, Pipeline, PipelineSettings
-from cangauge.types import Estimate, Reason, Sample, reason_name, reason_names
+from cangauge.types import Estimate, Reason, Sample, reason_name, reason_sentences
 
 PROGRESS_EVERY: Final = 50_000
 """Frames between two calls of the progress callback."""
@@ -223,7 +223,7 @@ class RecordedEstimate:
         """Reasons to doubt the estimate as a whole, one sentence each."""
         scores, found, name = self.scores, [], self.model.name
         if scores.valid_fraction < DOUBTFUL_VALID:
-            reasons = reason_names(int(np.bitwise_or.reduce(self.table.reasons)))
+            reasons = reason_sentences(int(np.bitwise_or.reduce(self.table.reasons)))
             found.append(
                 f"Only {100.0 * scores.valid_fraction:.0f} % of the estimates are valid"
                 f" ({reasons}). Check that {name} is the model of this pack at these temperatures."

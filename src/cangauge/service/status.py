@@ -23,7 +23,7 @@ from cangauge.bus.publish import NO_REPORT
 from cangauge.service.lifecycle import Notifier
 from cangauge.service.pipeline import Pipeline
 from cangauge.service.status_client import SCHEMA
-from cangauge.types import Estimate, Reason, Status, reason_name, reason_names
+from cangauge.types import Estimate, Reason, Status, reason_name, reason_sentences
 
 _LOG = logging.getLogger(__name__)
 
@@ -288,7 +288,9 @@ class Monitor:
         """Return the status in one line, such as "SoC 71.2 ± 0.8 %, valid, 10.0 samples/s"."""
         estimate = self._pipeline.published
         soc = f"SoC {number(estimate.soc_pct, 1)} ± {number(estimate.soc_std_pct, 1, '%')}"
-        why = reason_names(int(estimate.reasons))
+        if math.isnan(estimate.soc_pct):
+            soc = "SoC not known yet"
+        why = reason_sentences(int(estimate.reasons))
         status = estimate.status.name.lower() + (f" ({why})" if why else "")
         return f"{soc}, {status}, {self._rate:.1f} samples/s"
 

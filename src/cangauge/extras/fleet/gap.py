@@ -206,7 +206,7 @@ def _columns_of(found: Diagnosis) -> dict[str, Any]:
         "parameters": json.dumps(
             {
                 answer.verdict: {
-                    name: item.to_dict()
+                    name: vars(item)
                     for name, item in found.parameters.get(answer.verdict, {}).items()
                 }
             }

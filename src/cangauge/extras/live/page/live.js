@@ -54,8 +54,8 @@
       "Capacity": pm(health?.capacity_ah, health?.capacity_std_ah, 1, "Ah"),
       "Resistance, to model": pm(health?.resistance_ratio, health?.resistance_std, 2, "×"),
       "Current offset": pm(health?.offset_a, health?.offset_std_a, 2, "A"),
-      "Discharge for 10 s": pm(power?.discharge_a, power?.discharge_std_a, 1, "A"),
-      "Charge for 10 s": pm(power?.charge_a, power?.charge_std_a, 1, "A"),
+      "Possible discharge, 10 s": pm(power?.discharge_a, power?.discharge_std_a, 1, "A"),
+      "Possible charge, 10 s": pm(power?.charge_a, power?.charge_std_a, 1, "A"),
       "Energy left": pm(scaled(power?.energy_wh, 1e-3), scaled(power?.energy_std_wh, 1e-3), 2, "kWh"),
       ...(cells ? {
         "Weakest cell": cells.weakest === null ? "not distinguishable" : `number ${cells.weakest} of ${cells.cells}`,

@@ -1,0 +1,1 @@
+"""Second opinions on corrupted gauges: see `python -m judge --help`."""

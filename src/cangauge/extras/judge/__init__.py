@@ -1,0 +1,12 @@
+"""A second opinion on a battery gauge: is the SoC that it publishes right, since when not, and why.
+
+chain      logs of several days as one linear Gaussian model
+causes     what may be wrong, and the evidence of each
+judgement  the answer, its sentences and its JSON
+page       the page with both SoCs
+command    `cangauge judge`
+"""
+
+from cangauge.extras.judge.judgement import Judgement, judge
+
+__all__ = ["Judgement", "judge"]

@@ -1,0 +1,177 @@
+"""The second opinion on simulated days of one pack."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import cangauge
+from cangauge.__main__ import main
+from cangauge.logs.canonical import write_table
+from cangauge.logs.read import CellColumns
+
+DAYS = 5
+CAPACITY_AH = 60.0
+
+
+def drawn_ah(log: cangauge.Log) -> np.ndarray:
+    steps = 0.5 * (log.current_a[1:] + log.current_a[:-1]) * np.diff(log.time_s)
+    return np.concatenate(([0.0], np.cumsum(steps))) / 3600.0
+
+
+@pytest.fixture(scope="module")
+def pack() -> tuple[cangauge.Model, list[cangauge.Log]]:
+    """Model and healthy days of a simulated pack."""
+    runs = [cangauge.simulate(seed=3, drive=k, hours=0.5, ambient_c=20.0) for k in range(1, 10)]
+    logs = [replace(run.log, soc_pct=run.recording.true_soc_pct) for run in runs]
+    capacity_ah = runs[0].plant.pack.capacity_ah
+    model = cangauge.fit(logs[:4], capacity_ah=capacity_ah, chemistry="oxide").model
+    return model, logs[4:]
+
+
+def with_offset(logs: Sequence[cangauge.Log], model: cangauge.Model, offset_a: float, first: int):
+    """Return the logs of a gauge that counts an offset from log `first` on."""
+    hours, changed = 0.0, []
+    for number, log in enumerate(logs):
+        elapsed = (log.time_s - log.time_s[0]) / 3600.0
+        error = 100.0 * offset_a * (hours + elapsed) / model.capacity_ah
+        if number >= first:
+            hours += elapsed[-1]
+            log = replace(log, soc_pct=log.soc_pct - error)  # noqa: PLW2901
+        changed.append(log)
+    return changed
+
+
+def test_a_right_gauge_agrees(pack) -> None:
+    model, logs = pack
+    judgement = cangauge.judge(logs, model)
+    assert judgement.verdict == "agrees"
+    assert judgement.cause.verdict == "none"
+    assert abs(judgement.error_pct) < 3.0 * judgement.error_std_pct
+
+
+def test_an_offset_is_named_with_size_and_moment(pack) -> None:
+    model, logs = pack
+    offset_a = model.capacity_ah / 25.0
+    judgement = cangauge.judge(with_offset(logs, model, offset_a, 2), model)
+    assert judgement.verdict == "off"
+    assert judgement.cause.verdict == "current_offset"
+    assert judgement.cause.size is not None
+    low, high = judgement.cause.size.ci
+    assert low < offset_a < high
+    assert judgement.since_s == pytest.approx(sum(log.duration_s for log in logs[:2]), abs=120.0)
+
+
+@pytest.mark.parametrize(
+    ("cause", "change"),
+    [
+        ("start_or_reset", lambda log: {"soc_pct": log.soc_pct - 12.0}),
+        ("voltage_sensor", lambda log: {"voltage_v": 1.02 * log.voltage_v}),
+        (
+            "count_scale",
+            lambda log: {"soc_pct": log.soc_pct[0] + 1.1 * (log.soc_pct - log.soc_pct[0])},
+        ),
+    ],
+)
+def test_other_causes_are_named(pack, cause: str, change) -> None:
+    model, logs = pack
+    judgement = cangauge.judge([replace(log, **change(log)) for log in logs], model)
+    assert (judgement.verdict, judgement.cause.verdict) == ("off", cause)
+
+
+def test_corrected_soc_follows_the_truth_where_the_gauge_does_not(pack) -> None:
+    model, logs = pack
+    judgement = cangauge.judge([replace(log, soc_pct=log.soc_pct - 12.0) for log in logs], model)
+    for log, soc, std in zip(
+        logs, judgement.corrected_pct, judgement.corrected_std_pct, strict=True
+    ):
+        known = np.isfinite(soc)
+        assert known.mean() > 0.9
+        assert np.max(np.abs(soc - log.soc_pct)[known] / std[known]) < 3.0
+
+
+def test_day_one_without_a_model_cannot_tell_a_small_error(pack) -> None:
+    model, logs = pack
+    cells = round(float(logs[0].voltage_v.mean()) / 3.7)
+    short = logs[0].rows(logs[0].time_s < logs[0].time_s[0] + 900.0)
+    judgement = cangauge.judge(
+        [short], chemistry="oxide", cells=cells, capacity_ah=model.capacity_ah
+    )
+    assert judgement.verdict == "cannot_tell"
+
+
+def test_a_jump_is_listed_with_its_size(pack) -> None:
+    model, logs = pack
+    soc = logs[1].soc_pct.copy()
+    soc[len(soc) // 2 :] += 6.0
+    judgement = cangauge.judge([logs[0], replace(logs[1], soc_pct=soc), *logs[2:3]], model)
+    assert [round(jump.size_pct) for jump in judgement.jumps] == [6]
+
+
+def test_command_prints_schema_1_and_writes_all_files(
+    pack, tmp_path: Path, capsys, monkeypatch
+) -> None:
+    model, logs = pack
+    paths = []
+    for number, log in enumerate(logs[:2]):
+        paths.append(str(tmp_path / f"day{number}.csv"))
+        names = ("time_s", "current_a", "voltage_v", "temperature_c", "soc_pct")
+        write_table({name: getattr(log, name) for name in names}, paths[-1])
+    model.save(tmp_path / "m.json")
+    outputs = {name: str(tmp_path / name) for name in ("page.html", "soc.csv", "narrow.json")}
+    arguments = [*paths, "-m", str(tmp_path / "m.json"), "--json", "-o", outputs["narrow.json"]]
+    arguments += ["--report", outputs["page.html"], "--corrected", outputs["soc.csv"]]
+    monkeypatch.setattr(sys, "argv", ["cangauge", "judge", *arguments])
+    with pytest.raises(SystemExit) as ended:
+        main()
+    assert not ended.value.code
+    result = json.loads(capsys.readouterr().out)
+    assert result.keys() == {"schema", "gauge", "cause", "next_step", "days", "corrected"}
+    assert result["gauge"].keys() == {
+        "error_pct", "error_std_pct", "verdict", "since_s", "worst_pct", "jumps",
+    }  # fmt: skip
+    assert result["cause"].keys() == {"verdict", "probability", "size"}
+    assert result["days"] == 2
+    rows = (tmp_path / "soc.csv").read_text().splitlines()
+    assert rows[0] == "log,time_s,published_pct,corrected_pct,corrected_std_pct"
+    assert len(rows) == 1 + len(logs[0]) + len(logs[1])
+    assert "Second opinion" in (tmp_path / "page.html").read_text()
+    narrow = cangauge.Model.load(tmp_path / "narrow.json")
+    assert narrow.capacity_ah == model.capacity_ah
+
+
+def with_cells(log: cangauge.Log, model: cangauge.Model, weak: int, lack_pct: float) -> CellColumns:
+    """Return the voltages of 12 cells, of which one lacks capacity; the others differ by 0.5 %."""
+    rng = np.random.default_rng(1)
+    lack = rng.normal(0.0, 0.5, 12)
+    balance = rng.normal(0.0, 0.5, 12)
+    lack[weak] = lack_pct
+    slope = model.voltage_model().pseudo_ocv_slope(log.soc_pct)[:, None] / 12.0
+    moved = balance + lack * (log.soc_pct[:, None] - 100.0) / 100.0
+    noise = rng.normal(0.0, 0.002, moved.shape)
+    return CellColumns(1, log.voltage_v[:, None] / 12.0 + slope * moved + noise)
+
+
+@pytest.mark.parametrize(("lack_pct", "cause"), [(0.0, "none"), (10.0, "weak_cell")])
+def test_a_weak_cell_is_named_with_its_number(pack, lack_pct: float, cause: str) -> None:
+    model, logs = pack
+    cells = [with_cells(log, model, 7, lack_pct) for log in logs[:2]]
+    judgement = cangauge.judge(logs[:2], model, cell_voltages=cells)
+    assert judgement.cause.verdict == cause
+    if cause == "weak_cell":
+        assert judgement.weakest is not None
+        assert judgement.weakest.number == 8
+        assert judgement.cause.size is not None
+        assert judgement.cause.size.value == pytest.approx(lack_pct, abs=2.5)
+
+
+def test_logs_without_a_published_soc_are_refused(pack) -> None:
+    model, logs = pack
+    with pytest.raises(cangauge.InputError, match="publishes"):
+        cangauge.judge([replace(logs[0], soc_pct=None)], model)
