@@ -48,7 +48,7 @@ from cangauge.model.model_file import Made, Model, Ranges, SourceLog
 from cangauge.model.prior import CHEMISTRIES, DELAYS_S, REFERENCE_C, ChemistryName
 
 _NUMBERS: Final = pa.list_(pa.float64())
-_RANGES: Final = ("soc_pct", "temperature_c", "current_a")
+_RANGES: Final = ("soc_pct", "temperature_c", "current_a", "voltage_v")
 
 Row = Mapping[str, Any]
 
