@@ -1,6 +1,6 @@
 """Chains of days with a corrupted gauge: how often it is seen and named, and false alarms.
 
-    cd benchmarks && python -m judge PACK… [--chains 8] [--healthy 60] [--data FOLDER]
+    cd benchmarks && python -m judge PACK… [--chains 8] [--healthy 60] [--data FOLDER] [--day-one]
 
 Recorded packs are those of `packs.recorded`; `_dev` packs are the ones that constants were chosen
 on, and share no log with the judged ones. `twin_lfp` draws a pack from each seed. Each chain draws
@@ -116,7 +116,10 @@ def run(name: str, arguments: argparse.Namespace) -> None:
         pack, *winter = load(arguments.data, ["i3", "i3_winter"] if name == "i3" else [name])
         pack = replace(pack, judged=[*pack.judged, *(log for one in winter for log in one.judged)])
         drawn = chains(pack, number, arguments.seed)
-    for chain, (model, logs, capacity_ah) in enumerate(drawn):
+    for chain, (fitted, logs, capacity_ah) in enumerate(drawn):
+        model = fitted
+        if arguments.day_one:
+            model = cangauge.Model.prior(fitted.chemistry, fitted.cells, capacity_ah)
         for fault, (cause, sizes) in FAULTS.items():
             if chain >= (arguments.healthy if fault == "none" else arguments.chains):
                 continue
@@ -173,6 +176,7 @@ def main() -> None:
     parser.add_argument("--healthy", type=int, default=60)
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--data", type=Path, default=DATA)
+    parser.add_argument("--day-one", action="store_true", help="judge by the chemistry alone")
     parser.add_argument("--table", nargs="+")
     arguments = parser.parse_args()
     if arguments.table:
