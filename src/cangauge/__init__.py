@@ -40,7 +40,7 @@ if TYPE_CHECKING:
     from cangauge.errors import CangaugeError, InputError
     from cangauge.estimation.estimator import Estimator
     from cangauge.estimation.offline import EstimateTable, estimate
-    from cangauge.extras.judge import Judgement, judge
+    from cangauge.extras.judge.judgement import Judgement, judge
     from cangauge.extras.validation import Simulation, simulate
     from cangauge.identify.fit import fit
     from cangauge.identify.identification import Identification
@@ -81,7 +81,7 @@ _PLACES: Final = {
     "Estimator": "estimation.estimator",
     "Identification": "identify.fit",
     "InputError": "errors",
-    "Judgement": "extras.judge",
+    "Judgement": "extras.judge.judgement",
     "Log": "logs.log",
     "Model": "model.model_file",
     "Sample": "types",
@@ -91,7 +91,7 @@ _PLACES: Final = {
     "diagnose": "diagnosis",
     "estimate": "estimation.offline",
     "fit": "identify.fit",
-    "judge": "extras.judge",
+    "judge": "extras.judge.judgement",
     "read_log": "bus.recording:read_recording",
     "simulate": "extras.validation",
 }

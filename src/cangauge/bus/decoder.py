@@ -378,6 +378,12 @@ class SampleDecoder:
         return reasons
 
     @property
+    def is_voltage_implausible(self) -> bool:
+        """Whether the newest voltage was refused as implausible."""
+        health = self.health.get("voltage")
+        return health is not None and health.is_implausible
+
+    @property
     def two_sender_messages(self) -> tuple[str, ...]:
         """Names of the messages that seem to have two senders at present."""
         routes = self._routes.values()

@@ -215,6 +215,11 @@ class SignalHealth:
         return self.latest if self.is_usable(now_s) else math.nan
 
     @property
+    def is_implausible(self) -> bool:
+        """Whether the newest value was refused as implausible."""
+        return self._failures > 0 and self.reason == _IMPLAUSIBLE
+
+    @property
     def is_failing(self) -> bool:
         """Whether the signal is invalid, or failed too often in a row to become valid."""
         return self.is_invalid or self._failures >= self._checks.invalid_after

@@ -277,7 +277,9 @@ class Pipeline:
     def _estimate(self, sample: Sample) -> None:
         self.samples += 1
         self.latest_sample = sample
-        self.estimator.update(sample)
+        is_implausible = math.isnan(sample.voltage_v) and self.decoder.is_voltage_implausible
+        # The estimator treats a refused voltage otherwise than one that never came, as offline.
+        self.estimator.update(sample._replace(voltage_v=math.inf) if is_implausible else sample)
         if self.estimator.is_refused:
             self._refused += 1
         else:

@@ -6,7 +6,3 @@ judgement  the answer, its sentences and its JSON
 page       the page with both SoCs
 command    `cangauge judge`
 """
-
-from cangauge.extras.judge.judgement import Judgement, judge
-
-__all__ = ["Judgement", "judge"]
