@@ -190,6 +190,13 @@ PACKS: dict[str, tuple[str, Callable[[Path, str], Pack]]] = {
         "lg_hg2",
         lambda at, _: _lg(at, "25degC__551_*", _COLD_DEV, "development", (1, 2, 3)),
     ),
+    "lg_temps_dev": (
+        "lg_hg2",
+        lambda at, _: _lg(
+            at, f"{_COLD_DEV} 25degC__551_Mixed*", f"{_COLD_DEV} 25degC__551_*", "development",
+            (5, 8),
+        ),
+    ),
     "i3": ("bmw_i3", lambda at, _: _i3(at, _EVEN, "judged")),
     "i3_winter": ("bmw_i3", lambda at, _: _i3(at, WINTER, "judged")),
     "car1": ("batic_car1", lambda at, _: _car1(at, "judged")),
