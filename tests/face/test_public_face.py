@@ -125,6 +125,9 @@ def test_a_log_and_a_model_are_taken_in_every_form(
         (lambda log, _: cangauge.fit(log, equation="x"), "equation: not a known value .*knots"),
         (lambda _, model: cangauge.diagnose([], model), "logs: no log to diagnose"),
         (lambda log, _: cangauge.diagnose(log, 7), "not a model .got 'int'"),
+        (lambda log, m: cangauge.estimate(log, m, method="x"), "method: not a known value .*ekf"),
+        (lambda log, m: cangauge.estimate(log, m, initial_soc_pct="x"), "soc_pct: not a number"),
+        (lambda *_: cangauge.simulate(seed="x"), "seed: not a number"),
         (lambda log, _: cangauge.read_log(log), "not a path .got 'Log'.; give the path of a file"),
         (lambda *_: cangauge.Model.load(7), "not a path .got 'int'"),
         (lambda *_: cangauge.Estimator(7), "not a model .got 'int'"),
@@ -158,3 +161,11 @@ def test_a_fit_is_shown_in_ten_lines(fitted: cangauge.Identification) -> None:
     assert 5 < len(repr(fitted).splitlines()) <= 10
     for text in (repr(fitted), fitted._repr_html_()):
         assert f"{low:.0f} … {high:.0f} % SoC" in text
+
+
+def test_an_estimate_shows_itself_in_a_line(
+    drives: list[cangauge.Log], fitted: cangauge.Identification
+) -> None:
+    table = cangauge.estimate(drives[0], fitted)
+    assert repr(table).startswith(f"<EstimateTable: {len(drives[0])} samples, ")
+    assert f"… {table.soc_pct[-1]:.1f} %" in repr(table)

@@ -102,14 +102,25 @@ class EstimateTable(ArrowExport):
         numbers: dict[str, Any] = {name: np.array(by_name[name], np.float64) for name in NUMBERS}
         return cls(**numbers, **flags)
 
-    def plot(self, log: Log | None = None) -> Any:
+    def __repr__(self) -> str:
+        """Return the number of samples, the time and the SoC at both ends."""
+        if not len(self):
+            return "<EstimateTable: no samples>"
+        known = self.soc_pct[~np.isnan(self.soc_pct)]
+        soc = f"SoC {known[0]:.1f} … {known[-1]:.1f} %" if known.size else "SoC unknown"
+        valid = np.mean(self.status == Status.VALID)
+        hours = (self.time_s[-1] - self.time_s[0]) / 3600.0
+        return f"<EstimateTable: {len(self)} samples, {hours:.2f} h, {soc}, valid {valid:.0%}>"
+
+    def plot(self, log: Log | Any = None) -> Any:
         """Return SoC with ±2σ and voltage residual over time, for `bokeh.plotting.show`.
 
         Parameters
         ----------
-        log : Log, optional
+        log : Log, path or DataFrame, optional
             Its reference SoC is drawn too.
         """
+        log = None if log is None else as_log(log)
         return extra("report.figures:estimate_figure")(self, log=log)
 
     def __len__(self) -> int:

@@ -8,9 +8,9 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
-from typing import Literal, NamedTuple
+from typing import Literal, NamedTuple, get_args
 
-from cangauge.errors import InputError
+from cangauge.errors import InputError, require_choice, require_number
 from cangauge.estimation.power import PackLimits
 from cangauge.estimation.state import EstimatorMemory
 from cangauge.logs.log import TemperatureSource
@@ -132,6 +132,7 @@ class EstimatorSettings:
     limits: PackLimits = field(default_factory=PackLimits)
 
     def __post_init__(self) -> None:
+        require_choice(self.method, get_args(Method), "method")
         for name, low, high in (
             ("initial_soc_pct", 0.0, 100.0),
             ("initial_soc_std_pct", 0.0, 100.0),
@@ -183,5 +184,6 @@ def detect_references(
 
 
 def _check_range(field: str, value: float, low: float, high: float) -> None:
+    require_number(value, field)
     if not low <= value <= high:
         raise InputError(f"must lie within {low:g} … {high:g}", field=field, value=value)

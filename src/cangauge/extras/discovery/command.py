@@ -89,7 +89,7 @@ def init_command(  # noqa: PLR0917 - typer fills the arguments by name
     force: Annotated[bool, typer.Option("--force", help="Overwrite existing files.")] = False,
     json_output: JsonOption = False,
 ) -> None:
-    """Find the car's signals, prove them against each other, and write a map and a configuration.
+    """Find the car's signals, check them against each other, and write a map and a configuration.
 
     From captures, or from a live bus that it listens to. Known vehicles are recognised by ids and
     CRC; with --dbc, signals are found by name and unit; without either, by physics: current and
@@ -150,7 +150,8 @@ def init_command(  # noqa: PLR0917 - typer fills the arguments by name
     for path in files:
         note(f"wrote {path}")
     note(
-        f"next: cangauge inspect DRIVE --map {targets.map}, then cangauge fit DRIVE … -o model.json"
+        f"next: cangauge inspect DRIVE --map {targets.map}, then cangauge fit DRIVE …"
+        f" --map {targets.map} -o {targets.config.parent / 'model.json'}"
     )
 
 

@@ -137,7 +137,7 @@ class SignalCandidate:
     def facts(self) -> str:
         """The evidence in a phrase."""
         if self.evidence <= 0.0:
-            return "the look of its bits"
+            return "smooth; no steps prove it"
         if math.isnan(self.resistance_ohm):
             return f"r {self.correlation:+.2f} with the charge, {self.partner}"
         one, two = self.halves_ohm

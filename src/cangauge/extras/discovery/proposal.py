@@ -167,7 +167,7 @@ def by_physics(
 
 def _physics_line(candidate: SignalCandidate) -> str:
     if candidate.evidence < 1.0:
-        return "By the look of its bits alone: no current steps that a voltage follows."
+        return "By its smoothness alone: no current steps that a voltage follows."
     one, two = candidate.halves_ohm
     return (
         f"ΔU = −R·ΔI with {candidate.partner}: R = {candidate.resistance_ohm:.3g} Ω, r = "

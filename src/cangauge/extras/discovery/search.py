@@ -172,8 +172,8 @@ class _Search:
         current, voltage, row = pairs.best(self._candidate)
         if not current or current[0].evidence < ENOUGH_NATS:
             remarks.append(
-                "no current steps in this capture that a voltage follows: the candidates rest on"
-                " the look of their bits alone; record while driving"
+                "no current steps in this capture that a voltage follows: the candidates are"
+                " chosen by their smoothness alone; record while driving"
             )
         taken = [(each, each.place.bits(each.length)) for each in (*current[:1], *voltage[:1])]
         soc: tuple[SignalCandidate, ...] = ()

@@ -9,7 +9,7 @@ from typing import Any, Final, Literal
 import numpy as np
 
 from cangauge._typing import FloatArray
-from cangauge.errors import InputError
+from cangauge.errors import InputError, require_number
 from cangauge.extras.validation.twin.drive import draw_drive
 from cangauge.extras.validation.twin.faults import Fault, parse_effect
 from cangauge.extras.validation.twin.pack import draw_pack
@@ -138,6 +138,7 @@ def simulate(
     >>> trip.faults[0].size
     4.0
     """
+    require_number(seed, "seed")
     if discharge:
         hours = _DISCHARGE_HOURS if hours is None else hours
         start_soc_pct = 100.0 if start_soc_pct is None else start_soc_pct
