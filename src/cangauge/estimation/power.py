@@ -174,13 +174,14 @@ class PowerModel:
         lowest_v, end_pct, energy_wh = limits.min_voltage_v, 0.0, 0.0
         usual_a = ENERGY_C_RATE * health.capacity_ah
         step_pct = max(soc_pct - limits.cutoff_soc_pct, 0.0) / ENERGY_STEPS
-        first_v = volts = ahead.lasting_v(soc_pct, usual_a)
+        load_v = ahead.load_v(usual_a)
+        first_v = volts = ahead.lasting_v(soc_pct, load_v)
         for _ in range(ENERGY_STEPS):
             if volts <= lowest_v:
                 end_pct = ahead.std_v / max(self._model.curve(soc_pct)[1], LEAST_SLOPE)
                 break
             soc_pct -= step_pct
-            below_v = ahead.lasting_v(soc_pct, usual_a)
+            below_v = ahead.lasting_v(soc_pct, load_v)
             part = 1.0 if below_v >= lowest_v else (volts - lowest_v) / (volts - below_v)
             mean_v = volts - 0.5 * part * (volts - below_v)
             energy_wh += mean_v * part * step_pct / 100.0 * health.capacity_ah
@@ -237,13 +238,14 @@ class _Ahead:
         variance = H @ self._P @ H + (self._A * model.noise.residual_std_v) ** 2 + unknown_v**2
         return current_a, math.sqrt(variance) / volt_per_a
 
-    def lasting_v(self, soc_pct: float, current_a: float) -> float:
-        """Return the voltage under a lasting current [V]."""
-        model = self._model
-        lasting = np.full(len(model.model.resistance_ohm), current_a)
-        load = model.load_at(self._temperature_c, lasting)
-        curve_v = model.curve(soc_pct)[0] + self._learned_v(soc_pct)
-        return curve_v + self._volts(load) + self._fixed_v
+    def load_v(self, current_a: float) -> float:
+        """Return the voltage that a lasting current adds to the curve's [V]."""
+        lasting = np.full(len(self._model.model.resistance_ohm), current_a)
+        return self._volts(self._model.load_at(self._temperature_c, lasting))
+
+    def lasting_v(self, soc_pct: float, load_v: float) -> float:
+        """Return the voltage under a lasting load that adds `load_v` [V]."""
+        return self._model.curve(soc_pct)[0] + self._learned_v(soc_pct) + load_v + self._fixed_v
 
     def _learned_v(self, soc_pct: float) -> float:
         """Return the learned change of the curve [V]."""
