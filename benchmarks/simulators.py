@@ -212,7 +212,7 @@ def rms(parts: list[np.ndarray]) -> float:
 
 def _drive(folder: Path, name: str) -> Log:
     log = read_log(folder / "lg_hg2" / f"25degC__{name}.parquet")
-    log = log.rows(np.searchsorted(log.time_s, np.arange(log.time_s[0], log.time_s[-1])))
+    log = log.rows(np.unique(np.searchsorted(log.time_s, np.arange(*log.time_s[[0, -1]]))))
     pack = scaled_to_pack(log, series=LG_SERIES, parallel=LG_PARALLEL)
     return _above(with_initial_soc(pack, START_PCT))
 
