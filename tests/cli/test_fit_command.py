@@ -251,12 +251,10 @@ def test_a_report_that_fails_leaves_no_model(
 def test_a_capture_needs_its_vehicle(run: Run, shared_data: Path, tmp_path: Path) -> None:
     capture = shared_data / "leaf_can" / "ZE0w24kWhstock.log.gz"
     refused(run("fit", capture, "-o", tmp_path / "m.json"), "CAN capture", "--vehicle")
-    # Parked for 78 s: the model is that of the typical cell, and says so.
-    ran = run(
-        "fit", capture, "-o", tmp_path / "m.json", "--vehicle", "leaf_ze0", "--capacity-ah", "50"
-    )
-    assert ran.code == 0, ran.err
-    assert "there the curve follows the typical cell" in ran.err
+    # Parked for 78 s: with its vehicle it is read, and holds too little for a model.
+    options = ("--vehicle", "leaf_ze0", "--capacity-ah", "50")
+    ran = run("fit", capture, "-o", tmp_path / "m.json", *options)
+    refused(ran, "only 8 rows can be used, and a fit needs 52")
 
 
 def test_vehicle_options_do_not_apply_to_a_log(run: Run, made: Path, tmp_path: Path) -> None:
@@ -309,3 +307,22 @@ def test_a_count_that_differs_from_the_log_is_told(run: Run, made: Path, tmp_pat
     out = ("-o", tmp_path / "soc.csv")
     ran = run("estimate", made / "part.csv", "-m", tmp_path / "m.json", *out)
     assert "imply a capacity of" in ran.err
+
+
+@pytest.mark.parametrize(("share", "cells"), [(1.0, 104), (0.5, None)])
+def test_columns_of_all_cells_tell_their_number_and_chemistry(
+    run: Run, tmp_path: Path, share: float, cells: int | None
+) -> None:
+    log = synthetic_log(hours=0.3, start_pct=80.0, end_pct=60.0, noise_v=0.5, seed=3)
+    names = [f"Cell {number} [V]" for number in range(1, 105)]
+    rows = zip(log.time_s, log.current_a, log.voltage_v, log.temperature_c, strict=True)
+    lines = [",".join(["Time [s]", "Current [A]", "Voltage [V]", "Temperature [°C]", *names])]
+    lines += [",".join(map(str, [*row, *[share * row[2] / 104] * 104])) for row in rows]
+    path = tmp_path / "log.csv"
+    path.write_text("\n".join(lines), encoding="utf-8")
+    options = ("--capacity-ah", "50", "--initial-soc", "80", "--json")
+    ran = run("fit", path, "-o", tmp_path / "m.json", *options)
+    found = json.loads(ran.out)
+    assert found["cells"] == cells
+    assert ("V per cell" in " ".join(found["remarks"])) == (cells is not None)
+    assert "104 cells: Cell 1 [V] … Cell 104 [V]" in ran.err

@@ -2,20 +2,19 @@
 
 from __future__ import annotations
 
-import io
 import json
+import re
 from pathlib import Path
 
 import can
 import numpy as np
 import pytest
 import typer
-from rich.console import Console
 from typer.testing import CliRunner
 
 from cangauge.bus.encoder import FrameEncoder
 from cangauge.bus.vehicle import Vehicle
-from cangauge.cli.inspect import _show, inspect_command
+from cangauge.cli.inspect import inspect_command
 from cangauge.errors import InputError
 from cangauge.logs.canonical import write_log
 from cangauge.logs.log import Log
@@ -95,27 +94,17 @@ def test_a_capture_is_inspected_with_and_without_a_vehicle(
     assert len(table.stdout.splitlines()) > 5
 
 
-def test_a_nested_result_is_shown_whole() -> None:
-    found = {
-        "frames": 12,
-        "sign": None,
-        "signals": {"current_a": {"minimum": -1.25}},
-        "ids": [{"id": "0x1DB", "crc_errors": 0}, {"id": "0x55B", "lost": 3}],
-        "remarks": ["one [remark]"],
-    }
-    buffer = io.StringIO()
-    _show(Console(file=buffer, width=100), found)
-    for words in (
-        "frames",
-        "12",
-        "–",
-        "signals current a",
-        "-1.25",
-        "0x55B",
-        "lost",
-        "one [remark]",
-    ):
-        assert words in buffer.getvalue()
+def test_a_capture_is_shown_in_eighty_columns_with_the_next_step(tmp_path: Path) -> None:
+    path = tmp_path / "drive.log"
+    lines = [f"({1.7e9 + k / 10:.6f}) can0 1F0#{k % 256:02X}00" for k in range(200)]
+    path.write_text("\n".join([*lines, "(1700000030.000000) can0 2A0#01", ""]))
+    shown = CliRunner().invoke(app, [str(path)]).stdout
+    assert "drive.log: candump log, 201 frames of 2 ids, 30.0 s, from 2023-11-14 22:13:20" in shown
+    assert f"No known vehicle. Find its signals: cangauge init {path} -o mycar" in shown
+    assert re.search(r"1F0 . +200 . +2 . +0.1 . ", shown)
+    assert "period [s]" in shown
+    assert "Silence of 10.1 s after 19.9 s" in shown
+    assert all(len(line) <= 80 for line in shown.splitlines() if ": " not in line)
 
 
 LOGGER = "Stempel;Wert a;Wert b\n" + "".join(

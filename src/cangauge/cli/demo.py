@@ -39,7 +39,7 @@ def demo_command(
     The shipped log is a reconstruction of the published 2012 Leaf test, computed from its equation,
     not a recording of a car. The fit is that of the publication. The played log has another error
     of the voltage, and a current sensor that reads 1 A too high. The bus is vcan0 if it exists,
-    else UDP multicast on this machine. Takes about half a minute. The live page is served
+    else UDP multicast on this machine. Takes about a minute. The live page is served
     meanwhile, at the address printed.
 
     Examples

@@ -6,6 +6,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
+import numpy as np
 import typer
 
 from cangauge._extras import extra
@@ -26,10 +27,14 @@ from cangauge.errors import InputError
 
 if TYPE_CHECKING:
     from cangauge.identify.identification import Identification
+    from cangauge.logs.log import Log
 
 FROM_SOC = "from-soc"
 AUTO = "auto"
 PUBLISHED_DELAYS = "0,10,30,70"
+SAME_SUM = 0.02
+"""Largest difference between the sum of the cells and the pack's voltage, of the latter: a cell
+more or less in 16 makes three times as much."""
 
 
 @option_groups()
@@ -76,11 +81,17 @@ def fit_command(  # noqa: PLR0917 - typer passes options by name
         Literal["oxide", "lfp"] | None,
         typer.Option(
             help="Chemistry of the cells: layered oxides or manganese spinel, or iron phosphate."
-            " Default: from the volts per cell where --cells is given, else oxide."
+            " Default: from the volts per cell where their number is known, else oxide."
         ),
     ] = None,
     cells: Annotated[
-        int | None, typer.Option(metavar="N", min=1, max=2000, help="Cells in series.")
+        int | None,
+        typer.Option(
+            metavar="N",
+            min=1,
+            max=2000,
+            help="Cells in series. Default: the columns of cells of the first log, if it has all.",
+        ),
     ] = None,
     rate_hz: Annotated[
         float, typer.Option(metavar="HZ", help="Rate of the fit [Hz]; faster logs are decimated.")
@@ -156,6 +167,8 @@ def fit_command(  # noqa: PLR0917 - typer passes options by name
         for path in logs:
             status.update(f"reading {path}")
             recorded.append(reading.load(path))
+        if cells is None:
+            cells = _cells_of(logs[0], recorded[0], reading)
         if capacity_ah == FROM_SOC:
             capacity = capacity_from_reference(recorded)
         with progress_shown("cangauge.identify", status.update):
@@ -191,6 +204,19 @@ def fit_command(  # noqa: PLR0917 - typer passes options by name
     for remark in result.remarks:
         note(f"note: {remark}")
     note(f"model: {output}" + (f"\nreport: {report}" if report else ""))
+
+
+def _cells_of(path: Path, log: Log, reading: ReadingOptions) -> int | None:
+    """Return the number of cells in series that a log's columns of cells prove, or None."""
+    from cangauge.logs.read import LogFile, read_cells
+
+    if not isinstance(reading.open(path), LogFile):
+        return None
+    cells = read_cells(path, log.time_s, reading.given_columns())
+    if cells is None:
+        return None
+    ratio = float(np.nanmedian(cells.voltage_v.sum(axis=1) / log.voltage_v))
+    return cells.count if abs(ratio - 1.0) <= SAME_SUM else None
 
 
 def _refuse_published_options(delays: str, epsilon: float, t_ref: float) -> None:

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import shlex
+from datetime import UTC, datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
-from rich.console import Console
+from rich.console import Console, JustifyMethod
 from rich.markup import escape
 from rich.table import Table
 
@@ -28,9 +29,9 @@ if TYPE_CHECKING:
     from cangauge.inspect.capture import CaptureInspection
     from cangauge.inspect.log import LogInspection
 
-PIPED_WIDTH = 140
-"""Width of the tables where stdout is no terminal [characters]."""
-_NESTED = (Mapping, list, tuple)
+_STAMPS_SINCE_1970_S = 1e9
+"""Earlier stamps count from the start of the capture or of the logger [s]."""
+_GAPS_SHOWN = 5
 _MARKS = {"yes": "[green]yes[/]", "partly": "[yellow]partly[/]", "no": "[red]no[/]"}
 
 
@@ -104,12 +105,10 @@ def inspect_command(
         emit_json(found.to_dict() | {"assumed": assumed})
         return
     console = PlainConsole(highlight=False)
-    if not console.is_terminal:
-        console = PlainConsole(highlight=False, width=PIPED_WIDTH)
     if isinstance(found, LogInspection):
         _show_log(console, found)
     else:
-        _show(console, {key: value for key, value in found.to_dict().items() if key != "log"})
+        _show_capture(console, found)
         if found.log is not None:
             _show_log(console, found.log)
 
@@ -125,7 +124,7 @@ def _refuse_options_of_captures(reading: ReadingOptions, path: Path) -> None:
 
 def _show_log(console: Console, found: LogInspection) -> None:
     timing, charge, soc = found.timing, found.charge, found.soc
-    rate = f"{timing.rate_hz:.4g} Hz" if timing.rate_hz else "one row"
+    rate = f"{timing.rate_hz:.3g} Hz" if timing.rate_hz else "one row"
     console.print(
         f"[bold]{escape(found.name)}[/]: {found.rows} rows, {timing.duration_s / 60.0:.1f} min,"
         f" {rate} ({'regular' if timing.regular else 'irregular'}),"
@@ -154,7 +153,7 @@ def _show_log(console: Console, found: LogInspection) -> None:
             f"Reference SoC: {soc.first_pct:.1f} → {soc.last_pct:.1f} %,"
             f" in {100.0 * soc.coverage:.1f} % of the rows."
         )
-    console.print(f"Sign: {found.sign.sentence}.", markup=False)
+    console.print(f"Sign: {found.sign.sentence}.", markup=False, soft_wrap=not console.is_terminal)
     abilities = Table(title="What this log can identify", title_justify="left")
     for heading in ("quantity", "identifiable", "reason"):
         abilities.add_column(heading)
@@ -163,59 +162,81 @@ def _show_log(console: Console, found: LogInspection) -> None:
     console.print(abilities)
     for heading, lines in (("Remarks", found.remarks), ("Warning", found.warnings)):
         for line in lines:
-            console.print(f"{heading}: {line}", markup=False)
+            console.print(f"{heading}: {line}", markup=False, soft_wrap=not console.is_terminal)
 
 
-def _show(console: Console, found: Mapping[str, Any], title: str = "") -> None:
-    """Print a nested result: plain values first, then tables and lists under their names."""
-    plain = {key: value for key, value in found.items() if not isinstance(value, _NESTED)}
-    if plain:
-        _show_rows(console, title, [{"": _label(key), " ": value} for key, value in plain.items()])
-    for key, value in found.items():
-        name = f"{title} {key}".strip()
-        if isinstance(value, Mapping):
-            _show(console, value, name)
-        elif isinstance(value, list | tuple):
-            if rows := [row for row in value if isinstance(row, Mapping)]:
-                _show_rows(console, name, rows)
-                continue
-            for line in value:
-                console.print(f"{key}: {line}", markup=False)
-
-
-def _show_rows(console: Console, title: str, rows: Sequence[Mapping[str, Any]]) -> None:
-    headings = list(dict.fromkeys(key for row in rows for key in row))
-    named = any(heading.strip() for heading in headings)
-    table = Table(title=title.replace("_", " "), title_justify="left", show_header=named)
-    for heading in headings:
-        table.add_column(escape(_label(heading)))
-    for row in rows:
-        table.add_row(*(escape(_shown(row.get(heading))) for heading in headings))
-    console.print(table)
-
-
-_UNITS = {"_s": "s", "_a": "A", "_v": "V", "_c": "°C", "_pct": "%"}
-_LABELS = {
-    "cut_off": "file is cut off",
-    "first_malformed": "first malformed line",
-    "malformed": "malformed lines",
-    "matching_presets": "presets that match",
-    "other_ids": "frames of further ids",
+_COUNTS = {
+    "error_frames": "error frames",
+    "remote_frames": "remote frames",
     "time_reversals": "stamps that step back",
+    "other_ids": "frames of further ids",
 }
+_FAULTS = {
+    "crc_errors": "CRC errors",
+    "frames_lost": "frames lost",
+    "counter_jumps": "counter jumps",
+    "counter_repeats": "counter repeats",
+}
+_RANGES = {"current_a": "A", "voltage_v": "V", "temperature_c": "°C", "soc_pct": "%"}
 
 
-def _label(key: str) -> str:
-    """Return a key of the JSON as words with its unit."""
-    if key in _LABELS:
-        return _LABELS[key]
-    for suffix, unit in _UNITS.items():
-        if key.endswith(suffix):
-            return f"{key.removesuffix(suffix).replace('_', ' ')} [{unit}]"
-    return key.replace("_", " ")
+def _show_capture(console: Console, found: CaptureInspection) -> None:
+    """Print the frames, the vehicle and the faults of a capture; what is zero is left out."""
+    info = found.info
+    begins = ""
+    if found.start_s > _STAMPS_SINCE_1970_S:
+        begins = f", from {datetime.fromtimestamp(found.start_s, UTC):%Y-%m-%d %H:%M:%S} UTC"
+    console.print(
+        f"[bold]{escape(found.name)}[/]: {info.format}, {info.frames:,} frames of"
+        f" {len(found.ids)} ids, {found.duration_s:.1f} s{begins}."
+    )
+    matching = [preset for preset in found.presets if preset.matches]
+    for preset in matching:
+        spans = [
+            f"{span[0]:.5g} … {span[1]:.5g} {unit}"
+            for name, unit in _RANGES.items()
+            if (span := getattr(preset, name)) is not None
+        ]
+        console.print(
+            f"Vehicle: {preset.about} (--vehicle {preset.preset}), {preset.samples:,} samples:"
+            f" {', '.join(spans)}.",
+            markup=False,
+            soft_wrap=not console.is_terminal,
+        )
+    if not matching and found.log is None:
+        command = f"cangauge init {shlex.quote(found.source)} -o mycar"
+        console.print("No known vehicle. Find its signals:", command, markup=False, soft_wrap=True)
+    console.print(_table_of_ids(found))
+    counts = {words: getattr(found, name) for name, words in _COUNTS.items()}
+    if any(counts.values()):
+        shown = ", ".join(f"{count:,} {words}" for words, count in counts.items() if count)
+        console.print(f"{shown[0].upper()}{shown[1:]}.")
+    for gap in found.gaps[:_GAPS_SHOWN]:
+        console.print(f"Silence of {gap.length_s:.3g} s after {gap.start_s - found.start_s:.1f} s.")
+    if len(found.gaps) > _GAPS_SHOWN:
+        console.print(f"{len(found.gaps) - _GAPS_SHOWN} more silences (--json).")
+    for line in info.remarks:
+        console.print(f"Remarks: {line}", markup=False, soft_wrap=not console.is_terminal)
 
 
-def _shown(value: Any) -> str:
-    if value is None:
-        return "–"
-    return f"{value:.5g}" if isinstance(value, float) else str(value)
+def _table_of_ids(found: CaptureInspection) -> Table:
+    table = Table(title="Frames", title_justify="left")
+    buses = {each.bus for each in found.ids}
+    for heading in ("id", "bus", "frames", "bytes", "period [s]", "longest [s]", "faults"):
+        if heading != "bus" or len(buses) > 1:
+            justify: JustifyMethod = "left" if heading in {"id", "faults"} else "right"
+            table.add_column(escape(heading), justify=justify)
+    for each in found.ids:
+        counts = {words: getattr(each, name) for name, words in _FAULTS.items()}
+        faults = [f"{count} {words}" for words, count in counts.items() if count]
+        faults += ["two senders"] * each.two_senders
+        seconds = ["–" if s is None else f"{s:.3g}" for s in (each.period_s, each.longest_s)]
+        table.add_row(
+            escape(each.id),
+            *([escape(each.bus)] if len(buses) > 1 else []),
+            f"{each.frames:,}",
+            each.bytes,
+            *seconds,
+            ", ".join(faults) or ("none" if each.protection else "not protected"),
+        )
+    return table

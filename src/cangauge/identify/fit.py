@@ -51,7 +51,7 @@ from cangauge.identify.published import (
     published_columns,
     solve_published,
 )
-from cangauge.identify.rows import FitRows, fit_rows, usable_delays
+from cangauge.identify.rows import LEAST_ROWS, FitRows, fit_rows, usable_delays
 from cangauge.identify.starts import find_starts, given_starts, with_start
 from cangauge.logs.gaps import discharged_ah
 from cangauge.logs.log import Log, TemperatureSource
@@ -178,6 +178,13 @@ def fit(
         knots = equation == "knots"
         delays = DELAYS_S if knots else usable_delays(starts.logs, delay_s)
         rows = [fit_rows(log, capacity_ah, rate_hz=rate_hz, delay_s=delays) for log in starts.logs]
+        if (number := sum(map(len, rows))) < LEAST_ROWS:
+            raise InputError(
+                f"only {number} rows can be used, and a fit needs {LEAST_ROWS}",
+                source=recorded[0].source or recorded[0].name,
+                cure="give logs of drives over some hours and much of the SoC; `cangauge inspect`"
+                " lists what a log can identify",
+            )
         options = {
             "capacity_ah": capacity_ah,
             "rate_hz": rate_hz,

@@ -36,6 +36,9 @@ GUARD_S = 2.0
 SOC_TOLERANCE_PCT = 3.0
 """Excess of a counted SoC over 0–100 % from which the capacity or the start must be wrong [%]."""
 
+LEAST_ROWS = 52
+"""Fewest rows for a fit: four for each of the 13 coefficients of the published equation."""
+
 TEMPERATURE_SPAN_K = 3.0
 """Least span of the temperature from which kt is identified [K]: sensors have steps of 1 K."""
 

@@ -11,6 +11,7 @@ import numpy as np
 from cangauge._text import counted, duration
 from cangauge.errors import InputError
 from cangauge.identify.rows import (
+    LEAST_ROWS,
     SOC_SPAN_AT_LEAST_PCT,
     TEMPERATURE_SPAN_K,
     usable_delays,
@@ -38,8 +39,6 @@ GAP_S: Final = 2.0
 LISTED: Final = 10
 FIT_RATE_HZ: Final = 1.0
 """Rate of a fit by default [Hz]."""
-LEAST_ROWS: Final = 52
-"""Fewest rows for a fit: four for each of the 13 coefficients of the published equation."""
 MIN_SOC_SPAN_PCT: Final = 5.0
 """Least span of the reference SoC for a capacity [%]: below, its quantization dominates."""
 MIN_STEPS: Final = 8

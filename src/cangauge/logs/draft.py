@@ -12,6 +12,7 @@ from cangauge._text import counted
 from cangauge._typing import BoolArray, FloatArray
 from cangauge.errors import InputError
 from cangauge.logs.column_map import shown_headings
+from cangauge.logs.headings import cell_number
 from cangauge.logs.units import REQUIRED, TemperatureSource, refuse_wrong_units
 
 Sign = Literal["charge", "discharge"]
@@ -111,6 +112,10 @@ class DraftLog:
                 "the log holds no rows", source=self.source or self.name, cure="check the export"
             )
         ignored = [name for name in self.ignored if name not in used]
+        cells = [name for name in ignored if cell_number(name) is not None]
+        if len(cells) > 1:  # `read_cells`
+            self.remarks.append(f"{len(cells)} cells: {cells[0]} … {cells[-1]}")
+            ignored = [name for name in ignored if name not in cells]
         if ignored:
             shown = ", ".join(ignored[:6]) + (", …" if len(ignored) > 6 else "")
             self.remarks.append(f"{counted(len(ignored), 'other column')} ignored: {shown}")

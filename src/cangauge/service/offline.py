@@ -311,11 +311,17 @@ def estimate_recorded_log(
 
 
 def require_same_pack(recorded: Recorded, model: Model) -> None:
-    """Raise InputError if the median voltage shows that the model belongs to another pack."""
+    """Raise InputError if the voltages show that the model belongs to another pack."""
     known = recorded.voltage_v[np.isfinite(recorded.voltage_v)]
-    if not known.size:
-        return
     low, high = model.voltage_model().pseudo_ocv([0.0, 100.0])
+    if not known.size:  # a capture's voltages are refused where they are implausible for the model
+        raise InputError(
+            f"no voltage is plausible for the model {model.name}, of a pack of"
+            f" {low:.0f} … {high:.0f} V",
+            source=recorded.source or recorded.name,
+            field="voltage_v",
+            cure="give the model of this pack with -m, or check the map's scale of the voltage",
+        )
     median = float(np.median(known))
     if not (1.0 - PACK_VOLTAGE_MARGIN) * low <= median <= (1.0 + PACK_VOLTAGE_MARGIN) * high:
         raise InputError(
