@@ -5,7 +5,7 @@
 fuzz     every reader on 300,000 mutants of small valid files, and the tests of `tests/nightly`
 faults   the table of faults on a live bus
 grade    the estimator on recorded packs, and the diagnosis on its frozen cases (need --data)
-long     restarts by SIGKILL, and load, timing and memory of the live service
+long     the tests marked nightly; restarts by SIGKILL; load, timing and memory of the service
 
 Each part writes `out/nightly/PART.json`: state (passed, failed, skipped), reason, seconds and the
 last lines of each of its commands. Exit status 1 if a part failed.
@@ -50,6 +50,7 @@ def commands(data: Path | None, socketcan: str) -> dict[str, list[list[str]] | s
         if data is not None
         else missing,
         "long": [
+            [python, "-m", "pytest", "-m", "nightly", "tests"],
             [python, "benchmarks/restarts.py"],
             [python, "benchmarks/bus_load.py"],
         ],

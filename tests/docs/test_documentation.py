@@ -52,7 +52,14 @@ def steps(page: str) -> list[Step]:
     return found
 
 
-@pytest.mark.parametrize("page", PAGES)
+IN_SUITE = ("tutorial.md", "init.md", "howto/reading-a-diagnosis.md")
+"""Pages that run on every change; the others run in `make nightly`."""
+
+
+@pytest.mark.parametrize(
+    "page",
+    [pytest.param(page, marks=() if page in IN_SUITE else pytest.mark.nightly) for page in PAGES],
+)
 def test_commands_print_what_the_page_shows(page: str, tmp_path: Path) -> None:
     session = steps(page)
     if not session:

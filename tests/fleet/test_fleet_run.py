@@ -180,7 +180,7 @@ def test_a_job_that_cannot_be_prepared_writes_nothing(
     assert fleet.texts() == ["a", "b", "c"]
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_a_killed_worker_leaves_a_complete_result(
     logs: list[FleetLog], model: Model, tmp_path: Path
 ) -> None:

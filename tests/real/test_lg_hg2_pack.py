@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 import cangauge
+from cangauge.estimation.compiled import make_estimator
 from cangauge.estimation.estimator import Estimator, EstimatorSettings
 from cangauge.estimation.health import Health
 from cangauge.estimation.offline import samples_of
@@ -54,7 +55,7 @@ def health_after_three_charges(
     """Return the health after four drives with counted charges between, without voltages."""
     samples, _ = chain(drives, CAPACITY_AH, offset_a)
     settings = EstimatorSettings(method="coulomb", capacity_ah=(1.0 + error) * CAPACITY_AH)
-    estimator = Estimator(model, settings)
+    estimator = make_estimator(model, settings)
     for sample in samples:
         estimator.update(sample)
     return estimator.health

@@ -8,6 +8,7 @@ from itertools import pairwise
 from pathlib import Path
 
 import can
+import pytest
 
 from faults.large_dbc import write_large_dbc
 from live import Command, in_process, leaf_model_path
@@ -15,6 +16,7 @@ from live import Command, in_process, leaf_model_path
 GROUP = "239.74.163.78"
 
 
+@pytest.mark.nightly
 def test_frames_go_on_while_a_large_dbc_is_read(tmp_path: Path) -> None:
     write_large_dbc(tmp_path, 0.5)
     port = 44_500 + time.monotonic_ns() % 400

@@ -46,12 +46,14 @@ def test_closed_and_full_streams(
     assert len(ended.stderr.splitlines()) <= 1
 
 
+@pytest.mark.nightly
 def test_no_file_takes_the_number_of_a_closed_stream(tmp_path: Path) -> None:
     ended = shell((*RUN, "--record", tmp_path / "r.log", "--json"), "<&- >&- 2>&-")
     assert ended.returncode == 1  # the result could not be printed
     assert (tmp_path / "r.log").read_bytes() == b""
 
 
+@pytest.mark.nightly
 def test_odd_environments(tmp_path: Path) -> None:
     long = str(tmp_path / ("x" * 200))
     environment = {

@@ -88,7 +88,7 @@ def assert_recording_agrees(path: Path, service: Service) -> None:
     assert recorded.table.time_s.tolist() == [each.time_s for _, each in service.rows]
 
 
-@pytest.mark.parametrize("kind", ["still", "random"])
+@pytest.mark.parametrize("kind", ["still", pytest.param("random", marks=pytest.mark.nightly)])
 def test_impossible_stamps_are_replaced_and_reported(kind: str, tmp_path: Path) -> None:
     rng = Random(1)  # noqa: S311 - must be repeatable
     began_s = time.time()
