@@ -209,6 +209,7 @@ class _Ahead:
         self.std_v = math.hypot(self._level_v, self._A * noise.slow_std_v)
         self._fixed_v = self._level_v * float(self._x[LEVEL]) + self._A * float(self._x[SLOW])
         self._no_load = np.zeros_like(model.load_coefficients)
+        self._learned_now_v = self._learned_v(soc_pct)
 
     def current_at(self, limit_v: float, seconds: float) -> tuple[float, float] | None:
         """Return the current that meets a voltage after a time [s], and its deviation [A].
@@ -218,7 +219,7 @@ class _Ahead:
         model = self._model
         base, per_a, unknown_v = self._loads(seconds)
         pct_per_a = seconds / (36.0 * self.health.capacity_ah)
-        fixed_v = self._fixed_v + self._learned_v(self.soc_pct) + self._volts(base) - limit_v
+        fixed_v = self._fixed_v + self._learned_now_v + self._volts(base) - limit_v
         ohm = self._volts(per_a)
         current_a, slope = 0.0, 0.0
         for _ in range(_ITERATIONS):
@@ -254,7 +255,7 @@ class _Ahead:
     def _volts(self, load: FloatArray) -> float:
         """Return the voltage of a load row with what is learned of it [V]."""
         theta, x = self._model.load_coefficients, self._x[FUNCTIONS:]
-        learned_v = float(self._model.row(self.soc_pct, load) @ x) - self._learned_v(self.soc_pct)
+        learned_v = float(self._model.row(self.soc_pct, load) @ x) - self._learned_now_v
         return float(load @ theta) + self.resistance * float(load[1:] @ theta[1:]) + learned_v
 
     def _loads(self, seconds: float) -> tuple[FloatArray, FloatArray, float]:
