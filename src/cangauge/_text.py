@@ -31,6 +31,17 @@ def significant(value: float | None, digits: int = 4, unit: str = "") -> str:
     return _with_unit(text, unit)
 
 
+def rounded(value: float, digits: int = 3) -> str:
+    """Return a number of at most so many significant digits, without zeros behind.
+
+    Examples
+    --------
+    >>> rounded(3.0066, 2), rounded(1804.3)
+    ('3', '1800')
+    """
+    return f"{float(f'{value:.{digits}g}'):.15g}".replace("-", "−")
+
+
 def uncertain(value: float | None, std: float | None, unit: str = "") -> str:
     """Return a value with as many decimals as its standard deviation has with two digits.
 

@@ -23,7 +23,7 @@ from cangauge.logs.read import read_log
 from cangauge.model.model_file import Model
 from cangauge.service.estimate_table import read_estimates, write_estimates
 from cangauge.service.offline import estimate_capture
-from cangauge.types import reason_names
+from cangauge.types import Sample, reason_names
 
 Run = Callable[..., object]
 
@@ -306,11 +306,25 @@ def test_sign_of_a_capture_is_refused(
     refused(ran, "drive.log", "--sign", "under [current]")
 
 
+def test_a_capture_of_another_pack_is_refused(run: Run, made: Path, tmp_path: Path) -> None:
+    encoder = FrameEncoder(Vehicle.load("generic"))
+    with can.Logger(tmp_path / "low.log") as writer:
+        for k in range(100):
+            for frame in encoder.encode(Sample(1e6 + k / 10.0, 10.0, 38.0 + k / 100.0, 23.0), 80.0):
+                writer.on_message_received(frame)
+    model = ("-m", made / "model.json", "-o", tmp_path / "soc.csv")
+    ran = run("estimate", tmp_path / "low.log", "--vehicle", "generic", *model)
+    refused(ran, "low.log", "38 … 38.99 V", "but the model", "is of a pack of")
+    assert not (tmp_path / "soc.csv").exists()
+
+
 def test_turned_current_in_a_capture_is_refused(
     run: Run, made: Path, tmp_path: Path, capture: Path
 ) -> None:
     model = ("-m", made / "model.json", "-o", tmp_path / "soc.csv")
-    refused(run("estimate", capture, *model), "CAN capture", "--vehicle")
+    for command in ("estimate", "fit"):
+        more = model if command == "estimate" else ("-o", tmp_path / "x.json")
+        refused(run(command, capture, *more), "CAN capture", "--vehicle generic matches it")
     vehicle = Vehicle.load("generic")
     current = vehicle.current
     text = f"""

@@ -85,6 +85,8 @@ def test_partial_trip_is_no_full_discharge() -> None:
     for log, initial in ((part, None), (without_soc(part), None), (without_soc(part), 100.0)):
         with pytest.raises(InputError, match=r"unknown capacity.*--capacity-ah A"):
             capacity_from_full_discharge([log], initial)
+    with pytest.raises(InputError, match=r"nearest is .*: 7\d\.\d … 8\d\.\d %, .* Ah per 100 %"):
+        capacity_from_full_discharge([part], None)
 
 
 def test_full_discharge_is_proven_by_soc_or_by_knee() -> None:

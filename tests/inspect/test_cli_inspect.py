@@ -59,6 +59,12 @@ def test_the_table_shows_the_main_findings(path: Path) -> None:
         assert words in result.stdout
 
 
+def test_a_jittering_rate_is_a_round_figure(tmp_path: Path) -> None:
+    time = 1.0022 * np.arange(300) + 0.2 * (np.arange(300) % 3 == 1)
+    write_log(Log(time, time % 7, 380.0 - time % 7, time * 0 + 20.0), tmp_path / "x.parquet")
+    assert "about 1 Hz (irregular)" in CliRunner().invoke(app, [str(tmp_path / "x.parquet")]).stdout
+
+
 def test_a_temperature_is_taken_where_the_file_has_none(tmp_path: Path) -> None:
     path = tmp_path / "x.csv"
     path.write_text("time_s,current_a,voltage_v\n0,1,380\n1,2,379\n")
@@ -107,6 +113,26 @@ def test_a_capture_is_shown_in_eighty_columns_with_the_next_step(tmp_path: Path)
     assert all(len(line) <= 80 for line in shown.splitlines() if ": " not in line)
 
 
+def capture_of(path: Path, start_s: float = 1.7e9) -> Path:
+    """A drive of the generic pack, with a silent bus for 5 s and one damaged frame."""
+    encoder = FrameEncoder(Vehicle.load("generic"))
+    with can.CanutilsLogWriter(path) as writer:
+        for k in [k for k in range(300) if not 100 < k < 150]:
+            current_a = 40.0 * (k // 20 % 2)
+            sample = Sample(start_s + k / 10.0, current_a, 380.0 - 0.1 * current_a, 20.0)
+            for frame in encoder.encode(sample, 80.0):
+                frame.data[0] ^= k == 200
+                writer.on_message_received(frame)
+    return path
+
+
+def test_the_vehicle_of_a_capture_is_named_with_its_ranges(tmp_path: Path) -> None:
+    shown = CliRunner().invoke(app, [str(capture_of(tmp_path / "drive.log"))]).stdout
+    assert "(--vehicle generic), 250 samples: 0 … 40 A, 376 … 380 V, 20 … 20 °C, 80 … 80 %" in shown
+    assert "1 wrong CRC" in shown
+    assert not any(words in shown for words in ("leaf", "Nissan", "False", "(0.0", "0 error"))
+
+
 LOGGER = "Stempel;Wert a;Wert b\n" + "".join(
     f"{k};{1000 * (10 - 50 * (k % 2))};{384 - 5 * (k % 2)}\n" for k in range(60)
 )
@@ -150,13 +176,7 @@ def test_one_map_reads_captures_by_signals_and_tables_by_columns(
         'voltage = "Wert b"\n'
     )
     (tmp_path / "logger.csv").write_text(LOGGER)
-    encoder = FrameEncoder(Vehicle.load("generic"))
-    with can.CanutilsLogWriter(tmp_path / "drive.log") as writer:
-        for k in range(300):
-            current_a = 40.0 * (k // 20 % 2)
-            sample = Sample(1000.0 + k / 10.0, current_a, 380.0 - 0.1 * current_a, 20.0)
-            for frame in encoder.encode(sample, 80.0):
-                writer.on_message_received(frame)
+    capture_of(tmp_path / "drive.log")
     options = ["--map", str(tmp_path / "car.toml"), "--temperature", "20", "--json"]
     table = CliRunner().invoke(app, [str(tmp_path / "logger.csv"), *options])
     assert json.loads(table.stdout)["channels"]["current_a"]["maximum"] == 40.0

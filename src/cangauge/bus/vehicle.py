@@ -205,7 +205,8 @@ class Vehicle:
             raise InputError("no vehicle is given", field="--vehicle", cure=cure)
         if map is None:
             problem = "a DBC alone does not name the signals"
-            cure = "give --map FILE, which names three signals"
+            cure = "give --map FILE, which names three signals; to write one:"
+            cure += f" cangauge init CAPTURE --dbc {dbc} -o mycar"
             raise InputError(problem, source=str(dbc), field="--map", cure=cure)
         mapping = validated(VehicleMap, read_toml(map), map)
         files = [] if dbc is None else [Path(dbc)]

@@ -13,7 +13,7 @@ from rich.progress import Progress
 
 from cangauge._extras import extra
 from cangauge._files import atomic_path
-from cangauge._text import NONE_KNOWN, number, significant, uncertain, uncertain_energy
+from cangauge._text import NONE_KNOWN, number, rounded, significant, uncertain, uncertain_energy
 from cangauge.cli.options import (
     JsonOption,
     ReadingOptions,
@@ -25,6 +25,7 @@ from cangauge.cli.options import (
     option_groups,
     refuse_inverted_current,
     suffixed,
+    unnamed_capture,
     within,
 )
 from cangauge.cli.output import console, emit_json, note, print_table
@@ -127,7 +128,6 @@ def estimate_command(  # noqa: PLR0917 - typer passes options by name
     `cangauge estimate drive.log --vehicle leaf_ze0 -m leaf.json -o soc.csv --method newton`
     """
     from cangauge.bus.captures import Capture
-    from cangauge.bus.recording import capture_without_vehicle
     from cangauge.estimation.settings import EstimatorSettings
     from cangauge.logs.read import read_cells
     from cangauge.model.delay_line import GAP_S
@@ -153,7 +153,7 @@ def estimate_command(  # noqa: PLR0917 - typer passes options by name
     assumed: dict[str, list[str]] = {}
     if isinstance(reading.open(log_path), Capture):
         if not reading.names_vehicle:
-            raise capture_without_vehicle(log_path)
+            raise unnamed_capture(log_path)
         car = reading.car()
         source = known_temperature_source(reading.temperature_source) or "unknown"
         settings = replace(settings, temperature_source=source)
@@ -180,8 +180,8 @@ def estimate_command(  # noqa: PLR0917 - typer passes options by name
             )
         if max_gap_s is None and done.settings.gap_s > GAP_S:
             note(
-                f"note: {log.source}: its usual step is {done.settings.gap_s / 3.0:g} s; steps over"
-                f" {done.settings.gap_s:g} s count as gaps (--max-gap-s)"
+                f"note: {log.source}: its usual step is {rounded(done.settings.gap_s / 3.0, 2)} s;"
+                f" steps over {rounded(done.settings.gap_s, 2)} s count as gaps (--max-gap-s)"
             )
     _write_pack(done, pack)
     _write_output(done, output, report, model_path)

@@ -200,9 +200,9 @@ def fit_command(  # noqa: PLR0917 - typer passes options by name
         }
         emit_json(result.to_dict() | more)
         return
-    _show(result)
     for remark in result.remarks:
         note(f"note: {remark}")
+    _show(result)
     note(f"model: {output}" + (f"\nreport: {report}" if report else ""))
 
 

@@ -14,6 +14,7 @@ from rich.table import Table
 
 from cangauge._extras import extra
 from cangauge._files import write_texts_atomic
+from cangauge._text import rounded
 from cangauge.cli.options import (
     JsonOption,
     ReadingOptions,
@@ -124,11 +125,13 @@ def _refuse_options_of_captures(reading: ReadingOptions, path: Path) -> None:
 
 def _show_log(console: Console, found: LogInspection) -> None:
     timing, charge, soc = found.timing, found.charge, found.soc
-    rate = f"{timing.rate_hz:.3g} Hz" if timing.rate_hz else "one row"
+    rate = "one row"
+    if timing.rate_hz:
+        exact = f"{timing.rate_hz:.4g} Hz (regular)"
+        rate = exact if timing.regular else f"about {rounded(timing.rate_hz, 2)} Hz (irregular)"
     console.print(
         f"[bold]{escape(found.name)}[/]: {found.rows} rows, {timing.duration_s / 60.0:.1f} min,"
-        f" {rate} ({'regular' if timing.regular else 'irregular'}),"
-        f" temperature of: {found.temperature_source}"
+        f" {rate}, temperature of: {found.temperature_source}"
     )
     table = Table()
     for heading in ("channel", "minimum", "median", "maximum", "unit", "step", "missing"):
@@ -172,10 +175,9 @@ _COUNTS = {
     "other_ids": "frames of further ids",
 }
 _FAULTS = {
-    "crc_errors": "CRC errors",
-    "frames_lost": "frames lost",
-    "counter_jumps": "counter jumps",
-    "counter_repeats": "counter repeats",
+    "crc_errors": "wrong CRC",
+    "frames_lost": "lost",
+    "counter_repeats": "repeated",
 }
 _RANGES = {"current_a": "A", "voltage_v": "V", "temperature_c": "°C", "soc_pct": "%"}
 

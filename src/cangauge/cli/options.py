@@ -26,6 +26,8 @@ if TYPE_CHECKING:
 
 # The service shares these options, but needs neither pyarrow nor the readers: imports are deferred.
 
+RECOGNISED_BY = 50_000
+"""Frames by which the preset of a capture is looked for: half a minute of a busy bus."""
 _Value = TypeVar("_Value", bound=float | None)
 
 ColumnsOption = Annotated[
@@ -184,7 +186,9 @@ class ReadingOptions:
         is_capture = not isinstance(recording, LogFile)
         if isinstance(recording, LogFile):
             recording = replace(recording, used=tuple(used))
-        car = self.car() if is_capture and self.names_vehicle else None
+        if is_capture and not self.names_vehicle:
+            raise unnamed_capture(path)
+        car = self.car() if is_capture else None
         if not is_capture and self.names_vehicle and self.mapped_columns() is None:
             note(f"{path}: a log, not a capture: --vehicle, --dbc and --map do not apply to it")
         log = log_of(recording, car, temperature_c=self.temperature, temperature_source=source)
@@ -193,6 +197,19 @@ class ReadingOptions:
             refuse_inverted_current(log, is_capture=is_capture)
         note_reading(log)
         return log
+
+
+def unnamed_capture(path: Path) -> InputError:
+    """Return the error for a capture without a vehicle; it names the one preset that matches."""
+    from cangauge.bus.recording import capture_without_vehicle
+    from cangauge.inspect.capture import inspect_capture
+
+    error = capture_without_vehicle(path)
+    matching = inspect_capture(path, frames=RECOGNISED_BY).matching
+    if len(matching) == 1:
+        cure = f"{error.cure} (--vehicle {matching[0]} matches it)"
+        return InputError(error.problem, source=path, cure=cure)
+    return error
 
 
 def option_groups(*omitted: str) -> Callable[[Callable[..., None]], Callable[..., None]]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import asdict, dataclass, field, replace
+from itertools import islice
 from os import PathLike
 from pathlib import Path
 from statistics import median
@@ -17,7 +18,7 @@ from cangauge.bus.decoder import SampleDecoder
 from cangauge.bus.protection import GENERIC_RULE, LEAF_RULE, FrameChecker, ProtectionRule, Verdict
 from cangauge.bus.recording import capture_to_log, open_vehicle_capture
 from cangauge.bus.vehicle import LOG_COLUMNS, PRESETS, Vehicle
-from cangauge.inspect.log import LogInspection, inspect_log
+from cangauge.inspect.log import Gap, LogInspection, inspect_log
 
 GAP_S: Final = 1.0
 """Longest silence of a bus that does not count as a gap [s]."""
@@ -68,14 +69,6 @@ class IdSummary:
 
 
 @dataclass(frozen=True, slots=True)
-class Silence:
-    """An interval without any frame: stamp of the last frame before it, and its length [s]."""
-
-    start_s: float
-    length_s: float
-
-
-@dataclass(frozen=True, slots=True)
 class PresetMatch:
     """Whether a preset decodes the capture, why, and the range of each value that it decodes."""
 
@@ -108,7 +101,7 @@ class CaptureInspection:
     time_reversals: int
     ids: tuple[IdSummary, ...]
     other_ids: int
-    gaps: tuple[Silence, ...]
+    gaps: tuple[Gap, ...]
     presets: tuple[PresetMatch, ...]
     log: LogInspection | None = None
 
@@ -119,15 +112,15 @@ class CaptureInspection:
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain values for JSON."""
-        plain = asdict(self)
-        log = None if self.log is None else self.log.to_dict()
-        names = ", ".join(self.matching)
-        info = plain.pop("info")
-        return {"kind": "capture", **info, **plain, "matching_presets": names, "log": log}
+        plain, names = asdict(self), ", ".join(self.matching)
+        plain["log"] = None if self.log is None else self.log.to_dict()
+        return {"kind": "capture", **plain.pop("info"), **plain, "matching_presets": names}
 
 
-def inspect_capture(path: str | PathLike[str], vehicle: Vehicle | None = None) -> CaptureInspection:
-    """Inspect a capture; with a vehicle, also the decoded log.
+def inspect_capture(
+    path: str | PathLike[str], vehicle: Vehicle | None = None, frames: int | None = None
+) -> CaptureInspection:
+    """Inspect a capture, or its first `frames`; with a vehicle, also the decoded log.
 
     Raises
     ------
@@ -137,7 +130,7 @@ def inspect_capture(path: str | PathLike[str], vehicle: Vehicle | None = None) -
     path = Path(path)
     capture = open_capture(path) if vehicle is None else open_vehicle_capture(path, vehicle)
     survey, attempts = _Survey(), _Attempts()
-    for message in capture:
+    for message in islice(capture, frames):
         survey.add(message)
         attempts.add(message)
     return CaptureInspection(
@@ -155,22 +148,17 @@ class _Survey:
     """Statistics of the frames of a capture; attributes as of `CaptureInspection`."""
 
     def __init__(self) -> None:
-        self.first_s = self.last_s = math.nan
+        self.first_s, self.last_s = math.inf, -math.inf
         self.error_frames = self.remote_frames = self.time_reversals = self.other_ids = 0
-        self.gaps: list[Silence] = []
+        self.gaps: list[Gap] = []
         self._records: dict[tuple[Channel | None, int, bool], _IdRecord] = {}
 
     def add(self, message: can.Message) -> None:
-        time_s = message.timestamp
-        if math.isnan(self.first_s):
-            self.first_s = self.last_s = time_s
-        if time_s < self.last_s:
-            self.time_reversals += 1
-            self.first_s = min(self.first_s, time_s)
-        else:
-            if time_s - self.last_s > GAP_S and len(self.gaps) < LISTED_GAPS:
-                self.gaps.append(Silence(self.last_s, time_s - self.last_s))
-            self.last_s = time_s
+        time_s, step_s = message.timestamp, message.timestamp - self.last_s
+        self.time_reversals += step_s < 0.0
+        if GAP_S < step_s < math.inf and len(self.gaps) < LISTED_GAPS:
+            self.gaps.append(Gap(self.last_s, step_s))
+        self.first_s, self.last_s = min(self.first_s, time_s), max(self.last_s, time_s)
         self.error_frames += message.is_error_frame
         self.remote_frames += message.is_remote_frame and not message.is_error_frame
         if message.is_error_frame or message.is_remote_frame:
@@ -202,21 +190,16 @@ class _Trial:
     def __init__(self, rule: ProtectionRule, period_s: float | None) -> None:
         self.rule, self._checker = rule, FrameChecker(rule, period_s)
         self.verdicts = dict.fromkeys(Verdict, 0)
-        self.frames_lost, self.two_senders = 0, False
+        self.good = self.crc_errors = self.frames_lost = 0
+        self.two_senders = False
 
     def add(self, data: bytes, time_s: float) -> None:
         verdict = self._checker.check(data, time_s)
         self.verdicts[verdict] += 1
+        self.crc_errors += verdict is Verdict.CRC_WRONG
+        self.good += verdict is not Verdict.CRC_WRONG
         self.two_senders |= self._checker.suspects_second_sender
         self.frames_lost += self._checker.lost if verdict is Verdict.AFTER_LOSS else 0
-
-    @property
-    def crc_errors(self) -> int:
-        return self.verdicts[Verdict.CRC_WRONG]
-
-    @property
-    def good(self) -> int:
-        return sum(self.verdicts.values()) - self.crc_errors
 
 
 @dataclass(slots=True)
@@ -230,7 +213,7 @@ class _IdRecord:
     last_s: float = math.nan
     payloads: set[bytes] = field(default_factory=set)
     waiting: list[tuple[bytes, float]] = field(default_factory=list)
-    trials: list[_Trial] = field(default_factory=list)
+    trials: list[_Trial] | None = None
 
     def add(self, data: bytes, time_s: float) -> None:
         if self.frames:
@@ -241,56 +224,47 @@ class _IdRecord:
         self.lengths.add(len(data))
         if len(self.payloads) < PAYLOADS:
             self.payloads.add(data)
-        if self.frames < LEARN_FRAMES:
-            self.waiting.append((data, time_s))
-        else:
-            self._start_trials()
-            self._try_rules(data, time_s)
+        self.waiting.append((data, time_s))
+        if self.frames >= LEARN_FRAMES:
+            self._try_rules()
 
-    def _start_trials(self) -> None:
-        waiting, self.waiting = self.waiting, []
-        if waiting:
+    def _try_rules(self) -> None:
+        if self.trials is None:
             # Lost frames lengthen intervals: the lower quartile is the period; 0 for equal stamps.
             period_s = sorted(self.intervals)[len(self.intervals) // 4] if self.intervals else None
             self.trials = [_Trial(rule, period_s or None) for rule in (LEAF_RULE, GENERIC_RULE)]
-        for data, time_s in waiting:
-            self._try_rules(data, time_s)
-
-    def _try_rules(self, data: bytes, time_s: float) -> None:
-        if len(data) < 3 or len(self.lengths) > 1:
-            self.trials = []
-        for trial in list(self.trials):
-            trial.add(data, time_s)
-            if trial.crc_errors > 20 and trial.good < trial.crc_errors:
-                self.trials.remove(trial)
+        for data, time_s in self.waiting:
+            if len(data) < 3 or len(self.lengths) > 1:
+                self.trials = []
+            for trial in list(self.trials):
+                trial.add(data, time_s)
+                if trial.crc_errors > 20 and trial.good < trial.crc_errors:
+                    self.trials.remove(trial)
+        self.waiting.clear()
 
     @property
     def period_s(self) -> float | None:
         return median(self.intervals) if self.intervals else None
 
     def summary(self, name: str, channel: Channel | None) -> IdSummary:
-        self._start_trials()
-        bus, sizes = (
-            "" if channel is None else str(channel),
-            ", ".join(map(str, sorted(self.lengths))),
-        )
-        longest_s = self.longest_s if self.intervals else None
-        found = IdSummary(name, bus, self.frames, sizes, self.period_s, longest_s)
-        agreeing = (trial for trial in self.trials if trial.good >= AGREEING * self.frames)
+        self._try_rules()
+        bus, sizes = "" if channel is None else str(channel), sorted(self.lengths)
+        found = IdSummary(
+            name, bus, self.frames, ", ".join(map(str, sizes)), self.period_s,
+            self.longest_s if self.intervals else None,
+        )  # fmt: skip
+        agreeing = (trial for trial in self.trials or () if trial.good >= AGREEING * self.frames)
         trial = next(agreeing, None) if len(self.payloads) >= PAYLOADS else None
         if trial is None:
             return found
         found = replace(found, protection=trial.rule.name, crc_errors=trial.crc_errors)
-        repeats = trial.verdicts[Verdict.REPEATED]
+        repeats, jumps = (trial.verdicts[each] for each in (Verdict.REPEATED, Verdict.AFTER_LOSS))
         if repeats > (MIXED_SHARE if trial.two_senders else REPEATED_SHARE) * self.frames:
             return found
         return replace(
-            found,
-            counter_jumps=trial.verdicts[Verdict.AFTER_LOSS],
-            frames_lost=trial.frames_lost,
-            counter_repeats=repeats,
+            found, counter_jumps=jumps, frames_lost=trial.frames_lost, counter_repeats=repeats,
             two_senders=trial.two_senders,
-        )
+        )  # fmt: skip
 
 
 # --- Match of the presets
@@ -305,12 +279,9 @@ class _Attempt:
 
     def add(self, message: can.Message) -> None:
         sample = self.decoder.handle(message)
-        if sample is None:
-            return
-        self.samples += 1
-        for name, value in zip(
-            LOG_COLUMNS.values(), (*sample[1:], self.decoder.reference_soc_pct), strict=False
-        ):
+        self.samples += sample is not None
+        values = () if sample is None else (*sample[1:], self.decoder.reference_soc_pct)
+        for name, value in zip(LOG_COLUMNS.values(), values, strict=False):
             if not math.isnan(value):
                 low, high = self.spans.get(name) or (value, value)
                 self.spans[name] = (min(low, value), max(high, value))
@@ -325,13 +296,12 @@ class _Attempts:
         self._buses: dict[Channel | None, dict[str, _Attempt]] = {}
 
     def add(self, message: can.Message) -> None:
-        if message.arbitration_id not in self._wanted:
-            return
-        if message.channel not in self._buses:
-            cars = self._vehicles.items()
-            self._buses[message.channel] = {name: _Attempt(car) for name, car in cars}
-        for attempt in self._buses[message.channel].values():
-            attempt.add(message)
+        if message.arbitration_id in self._wanted:
+            if message.channel not in self._buses:
+                cars = self._vehicles.items()
+                self._buses[message.channel] = {name: _Attempt(car) for name, car in cars}
+            for attempt in self._buses[message.channel].values():
+                attempt.add(message)
 
     def matches(self, survey: _Survey) -> tuple[PresetMatch, ...]:
         """Return the match of every preset, on the bus with most of its samples."""
@@ -346,12 +316,11 @@ class _Attempts:
         return tuple(found)
 
     def _match(self, name: str, survey: _Survey) -> PresetMatch:
-        about, tries = PRESETS[name].about, [attempts[name] for attempts in self._buses.values()]
-        if not tries:
-            return PresetMatch(name, about, matches=False, because="none of its frames")
+        car = self._vehicles[name]
+        tries = [attempts[name] for attempts in self._buses.values()] or [_Attempt(car)]
         best = max(tries, key=lambda attempt: attempt.samples)
-        problem = _problem(name, best, self._vehicles[name], survey)
-        because = problem or "all its signals decode"
+        problem = _problem(name, best, car, survey)
+        because, about = problem or "all its signals decode", PRESETS[name].about
         return PresetMatch(name, about, not problem, because, best.samples, **best.spans)
 
 
@@ -362,17 +331,14 @@ def _problem(name: str, attempt: _Attempt, vehicle: Vehicle, survey: _Survey) ->
         return "no current in its frames" if statistics.wanted else "none of its frames"
     if statistics.crc_errors > 0.1 * statistics.wanted:
         return f"{statistics.crc_errors} of {statistics.wanted} CRCs are wrong"
-    if "voltage_v" not in spans:
-        return "no voltage"
     long_enough = survey.last_s - survey.first_s >= LONG_ENOUGH_S
-    if long_enough and vehicle.temperature is not None and "temperature_c" not in spans:
-        return "no temperature"
+    has_temperature = vehicle.temperature is None or "temperature_c" in spans
+    if "voltage_v" not in spans or (long_enough and not has_temperature):
+        return "no temperature" if "voltage_v" in spans else "no voltage"
     for number, expected_s in PRESETS[name].periods_s.items():
-        period_s, problem = survey.period_s(number), ""
-        if period_s is None:
-            problem = f"no frames of 0x{number:X}" if long_enough else ""
-        elif abs(period_s - expected_s) > PERIOD_TOLERANCE * expected_s:
-            problem = f"0x{number:X} has a period of {period_s:.3g} s, not {expected_s:g} s"
-        if problem:
-            return problem
+        period_s = survey.period_s(number)
+        if period_s is None and long_enough:
+            return f"no frames of 0x{number:X}"
+        if period_s is not None and abs(period_s - expected_s) > PERIOD_TOLERANCE * expected_s:
+            return f"0x{number:X} has a period of {period_s:.3g} s, not {expected_s:g} s"
     return ""

@@ -71,11 +71,7 @@ class Channel:
 def describe_channels(log: Log, resistance_ohm: float | None) -> dict[str, Channel]:
     """Describe the channels of a log.
 
-    Parameters
-    ----------
-    log : Log
-    resistance_ohm : float or None
-        By steps of current [Ω]: with it, current and voltage are searched for stuck intervals.
+    With a resistance [Ω], current and voltage are searched for stuck intervals.
     """
     current, voltage = _described(log.current_a, "A"), _described(log.voltage_v, "V")
     if resistance_ohm:
@@ -87,11 +83,8 @@ def describe_channels(log: Log, resistance_ohm: float | None) -> dict[str, Chann
         stuck_v = _stuck(log, log.voltage_v, log.current_a, f"{jump_a:.3g} A", jump_a)
         stuck_a = _stuck(log, log.current_a, log.voltage_v, f"{jump_v:.3g} V", jump_v)
         voltage, current = replace(voltage, stuck=stuck_v), replace(current, stuck=stuck_a)
-    channels = {
-        "current_a": current,
-        "voltage_v": voltage,
-        "temperature_c": _described(log.temperature_c, "°C"),
-    }
+    channels = {"current_a": current, "voltage_v": voltage}
+    channels["temperature_c"] = _described(log.temperature_c, "°C")
     if log.soc_pct is not None and np.isfinite(log.soc_pct).any():
         channels["soc_pct"] = _described(log.soc_pct, "%")
     return channels
@@ -99,15 +92,9 @@ def describe_channels(log: Log, resistance_ohm: float | None) -> dict[str, Chann
 
 def _described(values: FloatArray, unit: str) -> Channel:
     finite = values[np.isfinite(values)]
-    return Channel(
-        unit=unit,
-        minimum=float(finite.min()),
-        maximum=float(finite.max()),
-        median=float(np.median(finite)),
-        quantum=quantum_of(finite),
-        levels=int(np.unique(finite).size),
-        missing=int(values.size - finite.size),
-    )
+    low, high, median = float(finite.min()), float(finite.max()), float(np.median(finite))
+    levels, missing = int(np.unique(finite).size), int(values.size - finite.size)
+    return Channel(unit, low, high, median, quantum_of(finite), levels, missing)
 
 
 def quantum_of(values: FloatArray) -> float | None:
@@ -122,7 +109,8 @@ def quantum_of(values: FloatArray) -> float | None:
         return None
     noise = 1e-9 * max(abs(float(distinct[0])), abs(float(distinct[-1])))
     by_count = distinct[np.argsort(-count, kind="stable")]
-    steps = [_some_steps(each) for each in (*(by_count[:k] for k in _FREQUENT), distinct)]
+    groups = (*(by_count[:k] for k in _FREQUENT), distinct)
+    steps = [np.quantile(np.diff(np.sort(each)), [0.0, 0.02, 0.1, 0.5]) for each in groups]
     for step in sorted({float(step) for each in steps for step in each}, reverse=True):
         if step <= noise:
             break
@@ -138,11 +126,6 @@ def quantum_of(values: FloatArray) -> float | None:
             fitted = np.sum(weight * place * from_origin) / np.sum(weight * place * place)
             return float(f"{fitted:.5g}")
     return None
-
-
-def _some_steps(values: FloatArray) -> FloatArray:
-    steps = np.diff(np.sort(values))
-    return np.quantile(steps, [0.0, 0.02, 0.1, 0.5]) if steps.size else steps
 
 
 def _stuck(

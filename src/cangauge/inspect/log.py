@@ -8,7 +8,7 @@ from typing import Any, Final, Literal
 
 import numpy as np
 
-from cangauge._text import counted, duration
+from cangauge._text import counted, duration, rounded
 from cangauge.errors import InputError
 from cangauge.identify.rows import (
     LEAST_ROWS,
@@ -208,14 +208,10 @@ def _charge(log: Log) -> Charge:
     part, uncounted = np.diff(state), uncounted_gaps(log.time_s)
     in_gaps = part[step > usual_gap_s(log.time_s, GAP_S)]
     return Charge(
-        discharged_ah=float(part[part > 0.0].sum()),
-        charged_ah=float(np.abs(part[part < 0.0]).sum()),
-        net_ah=float(state[-1]),
-        span_ah=float(np.ptp(state)),
-        in_gaps_ah=float(np.abs(in_gaps).sum()),
-        uncounted_gaps=int(uncounted.size),
-        uncounted_s=float(step[uncounted].sum()),
-    )
+        float(part[part > 0.0].sum()), float(np.abs(part[part < 0.0]).sum()),
+        float(state[-1]), float(np.ptp(state)), float(np.abs(in_gaps).sum()),
+        int(uncounted.size), float(step[uncounted].sum()),
+    )  # fmt: skip
 
 
 def _soc(log: Log) -> Soc | None:
@@ -225,24 +221,18 @@ def _soc(log: Log) -> Soc | None:
     soc, holes = log.soc_pct[known], np.diff(log.time_s[known])
     is_wide = np.ptp(soc) >= MIN_SOC_SPAN_PCT
     return Soc(
-        coverage=float(known.size / len(log)),
-        first_pct=float(soc[0]),
-        last_pct=float(soc[-1]),
-        minimum_pct=float(soc.min()),
-        maximum_pct=float(soc.max()),
-        last_at_s=float(log.time_s[known[-1]]),
-        longest_hole_s=float(holes.max()) if holes.size else 0.0,
-        implied_capacity_ah=abs(capacity_from_reference([log])) if is_wide else None,
-    )
+        float(known.size / len(log)), float(soc[0]), float(soc[-1]), float(soc.min()),
+        float(soc.max()), float(log.time_s[known[-1]]), float(holes.max()) if holes.size else 0.0,
+        abs(capacity_from_reference([log])) if is_wide else None,
+    )  # fmt: skip
 
 
 def _resistance(log: Log) -> Resistance | None:
     steps = current_steps(log)
     if steps.current_a.size < MIN_STEPS:
         return None
-    ohm = -steps.voltage_v / steps.current_a
-    lower, median, upper = np.quantile(ohm, [0.25, 0.5, 0.75])
-    return Resistance(float(median), float(lower), float(upper), int(ohm.size))
+    ohm = np.quantile(-steps.voltage_v / steps.current_a, [0.5, 0.25, 0.75]).tolist()
+    return Resistance(ohm[0], ohm[1], ohm[2], int(steps.current_a.size))
 
 
 # --- Warnings
@@ -263,9 +253,9 @@ def _warnings(
     if timing.gap_count:
         longest = timing.longest_gaps[0]
         yield (
-            f"{counted(timing.gap_count, 'gap')} of more than {timing.gap_limit_s:g} s, the longest"
-            f" {longest.length_s:.4g} s at {longest.start_s:.1f} s; {charge.in_gaps_ah:.3g} Ah are"
-            " interpolated over gaps"
+            f"{counted(timing.gap_count, 'gap')} of more than {rounded(timing.gap_limit_s, 2)} s,"
+            f" the longest {longest.length_s:.4g} s at {longest.start_s:.1f} s;"
+            f" {charge.in_gaps_ah:.3g} Ah are interpolated over gaps"
         )
     if charge.uncounted_gaps:
         yield (
@@ -306,20 +296,16 @@ def _curve(charge: Charge, soc: Soc | None) -> tuple[Verdict, str]:
         return "partly", text
     span = soc.maximum_pct - soc.minimum_pct
     covered = f"SoC covers {soc.minimum_pct:.1f} … {soc.maximum_pct:.1f} %"
-    if span >= WIDE_SOC_PCT:
-        return "yes", covered
-    if span >= SOC_SPAN_AT_LEAST_PCT:
-        return "partly", f"{covered}: only this part of the curve"
-    return "no", f"{covered}: too little for a curve"
+    if span < SOC_SPAN_AT_LEAST_PCT:
+        return "no", f"{covered}: too little for a curve"
+    is_wide = span >= WIDE_SOC_PCT
+    return ("yes", covered) if is_wide else ("partly", f"{covered}: only this part of the curve")
 
 
 def _capacity(log: Log, charge: Charge, soc: Soc | None) -> tuple[Verdict, str]:
     if soc is None or soc.implied_capacity_ah is None:
-        text = f"no reference SoC that spans {MIN_SOC_SPAN_PCT:g} %; at least"
-        return (
-            "no",
-            f"{text} {charge.span_ah:.3g} Ah, the capacity if the log runs from full to empty",
-        )
+        text = f"no reference SoC that spans {MIN_SOC_SPAN_PCT:g} %; at least {charge.span_ah:.3g}"
+        return "no", f"{text} Ah, the capacity if the log runs from full to empty"
     span = soc.maximum_pct - soc.minimum_pct
     try:
         whole_ah = capacity_from_full_discharge([log], None)
@@ -344,10 +330,10 @@ def _delays(log: Log, timing: Timing) -> tuple[Verdict, str]:
         return "no", text
     usable = usable_delays([log], DELAYS_S)
     step = f"rows every {_interval(timing)}"
+    kept = ", ".join(f"{delay:g}" for delay in usable)
     if len(usable) == 1:
         return "no", f"{step} are too slow for any delay"
     if len(usable) < len(DELAYS_S):
-        kept = ", ".join(f"{delay:g}" for delay in usable)
         return "partly", f"{step} identify delays of {kept} s only"
     # At rows about a second apart, not on a grid: a gap may last months.
     rows = spaced_rows(log.time_s, 1.0)
@@ -357,9 +343,8 @@ def _delays(log: Log, timing: Timing) -> tuple[Verdict, str]:
         return "no", "current does not vary"
     alike = correlation(log.current_a[rows], before)
     text = f"currents {DELAYS_S[1]:.0f} s apart correlate by {alike:.2f}"
-    if alike > CORRELATED:
-        return "partly", f"{text}: the terms are hard to separate"
-    return "yes", text
+    is_clear = alike <= CORRELATED
+    return ("yes", text) if is_clear else ("partly", f"{text}: the terms are hard to separate")
 
 
 def _rows(log: Log, timing: Timing) -> tuple[Verdict, str]:
@@ -381,10 +366,8 @@ def _temperature(log: Log) -> tuple[Verdict, str]:
         "room": "; it is the ROOM's temperature, not the battery's",
         "unknown": "; where it was measured is not known",
     }.get(log.temperature_source, f" ({log.temperature_source})")
-    if span == 0.0:
-        return "no", f"temperature never changes{where}"
     if span < TEMPERATURE_SPAN_K:
-        return "no", f"temperature spans only {span:.1f} K{where}"
+        return "no", f"temperature {f'spans only {span:.1f} K' if span else 'never changes'}{where}"
     alike = correlation(charge_ah(log), log.temperature_c)
     text = f"temperature spans {span:.1f} K, correlated with charge by {alike:+.2f}{where}"
     is_doubtful = abs(alike) > CORRELATED or where.startswith(";")

@@ -88,7 +88,6 @@ class DraftLog:
         median = np.full(rows.size, np.nan)
         median[rows] = np.nanmedian(values[:, rows], axis=0)
         self.values["temperature_c"] = median
-        self.remarks.append(f"temperature: median of {len(probes_c)} columns")
         highest = np.max(np.where(known, values, -np.inf), axis=0)
         apart = highest - np.min(np.where(known, values, np.inf), axis=0) > _PROBES_APART_K
         if apart.any():

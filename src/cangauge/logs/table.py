@@ -110,6 +110,8 @@ def draft_of_table(
         label = " + ".join(headings[place] for place in column.places)
         draft.labels[FIELDS[quantity]] = label
         unit = how if quantity == "time" else _take(draft, quantity, column, columns)
+        if quantity == "temperature" and len(column.places) > 1:
+            unit += ", the median"
         factor = "" if column.factor == 1.0 else f" × {column.factor:g}"
         shown = label if len(label) <= 80 else f"{label[:80]}…"
         draft.assumed.append(f'{quantity} = "{shown}"{factor} [{unit}]')

@@ -10,6 +10,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from cangauge._text import rounded
 from cangauge._typing import FloatArray
 from cangauge.errors import InputError
 from cangauge.logs.gaps import BRIDGE_S, discharged_ah, split_where_moved
@@ -207,12 +208,29 @@ def capacity_from_full_discharge(
     raise InputError(
         f"unknown capacity: no log is proven to run from full to empty (its own SoC from"
         f" {FULL_PCT:.0f} % or more to {EMPTY_PCT:.0f} % or less; or --initial-soc of"
-        f" {FULL_PCT:.0f} % or more, and a voltage that ends in the knee)",
+        f" {FULL_PCT:.0f} % or more, and a voltage that ends in the knee){_nearest(logs)}",
         source=logs[0].source or logs[0].name,
         field="capacity_ah",
         cure="give --capacity-ah A, or --capacity-ah from-soc for the charge per 100 % of the logs'"
         " soc_pct",
     )
+
+
+def _nearest(logs: Sequence[Log]) -> str:
+    """Return the log whose own SoC spans most, and the charge per 100 % that it implies."""
+    found = [
+        (float(np.nanmin(log.soc_pct)), float(np.nanmax(log.soc_pct)), log)
+        for log in logs
+        if log.soc_pct is not None and log.first_soc() is not None
+    ]
+    if not found:
+        return ""
+    low, high, log = max(found, key=lambda each: each[1] - each[0])
+    try:
+        per_100_ah = rounded(abs(capacity_from_reference([log])), 4)
+    except InputError:
+        return ""
+    return f"; nearest is {log.name}: {low:.1f} … {high:.1f} %, {per_100_ah} Ah per 100 %"
 
 
 def _whole_capacity_ah(log: Log, initial_soc_pct: float | None) -> float | None:

@@ -18,9 +18,10 @@ from typing import Any, Final, Literal, cast
 import numpy as np
 from can.typechecking import Channel
 
+from cangauge._text import rounded
 from cangauge._typing import FloatArray
 from cangauge.bus.publish import NO_REPORT, FrameIds, PackReport
-from cangauge.bus.recording import open_vehicle_capture
+from cangauge.bus.recording import capture_samples, open_vehicle_capture
 from cangauge.bus.time_source import REPLAY_CLOCK_ID, TimeSourceName, is_clock
 from cangauge.bus.vehicle import Vehicle
 from cangauge.errors import InputError
@@ -311,23 +312,22 @@ def estimate_recorded_log(
 
 
 def require_same_pack(recorded: Recorded, model: Model) -> None:
-    """Raise InputError if the voltages show that the model belongs to another pack."""
-    known = recorded.voltage_v[np.isfinite(recorded.voltage_v)]
+    """Raise InputError if the median voltage shows that the model belongs to another pack."""
+    _refuse_other_pack(recorded.voltage_v, model, recorded.source or recorded.name)
+
+
+def _refuse_other_pack(voltage_v: FloatArray, model: Model, source: str) -> None:
+    known = voltage_v[np.isfinite(voltage_v)]
+    if not known.size:
+        return
     low, high = model.voltage_model().pseudo_ocv([0.0, 100.0])
-    if not known.size:  # a capture's voltages are refused where they are implausible for the model
-        raise InputError(
-            f"no voltage is plausible for the model {model.name}, of a pack of"
-            f" {low:.0f} … {high:.0f} V",
-            source=recorded.source or recorded.name,
-            field="voltage_v",
-            cure="give the model of this pack with -m, or check the map's scale of the voltage",
-        )
     median = float(np.median(known))
     if not (1.0 - PACK_VOLTAGE_MARGIN) * low <= median <= (1.0 + PACK_VOLTAGE_MARGIN) * high:
         raise InputError(
-            f"the median is {median:.1f} V, but the model {model.name} is of a pack of"
-            f" {low:.0f} … {high:.0f} V",
-            source=recorded.source or recorded.name,
+            f"the voltage is {rounded(known.min(), 4)} … {rounded(known.max(), 4)} V (median"
+            f" {rounded(median, 4)} V), but the model {model.name} is of a pack of {rounded(low)} …"
+            f" {rounded(high)} V",
+            source=source,
             field="voltage_v",
             cure="give the model of this pack with -m, or check the unit of the voltage",
         )
@@ -368,7 +368,7 @@ def estimate_capture(
     Raises
     ------
     InputError
-        If the capture cannot be read, or gives no sample.
+        If the capture cannot be read, gives no sample, or its voltage is another pack's.
     """
     began = time.perf_counter()
     is_undecided = time_source == "auto"
@@ -405,6 +405,8 @@ def estimate_capture(
     best = max(found, key=lambda bus: len(bus.estimates))
     counts, table = best.pipeline.counts, EstimateTable.of(best.estimates)
     time_s, current_a, voltage_v, temperature_c, soc_pct = np.array(best.values).reshape(-1, 5).T
+    if not np.isfinite(voltage_v).any():  # with a model, another pack's voltage is implausible
+        _refuse_other_pack(capture_samples(path, vehicle).voltage_v, model, str(path))
     # Further replays in the same capture begin earlier: their steps back count as none.
     later_s = np.cumsum(np.maximum(np.diff(time_s), 0.0))
     is_unwrapped = bool(np.any(np.diff(time_s) < 0.0))

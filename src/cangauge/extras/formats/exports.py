@@ -319,6 +319,8 @@ class CyclerExport:
             labels = [text.label(name) for name in values]
             draft.take_probes(labels, list(values.values()))
             draft.temperature_source = "cell"
+            if len(values) > 1:
+                draft.remarks.append(f"temperature: median of {len(values)} columns")
         elif "ambient" in wanted:
             text.take("temperature_c", "ambient")
             draft.temperature_source = "room"
