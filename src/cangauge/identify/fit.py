@@ -159,7 +159,7 @@ def fit(
     """
     require_choice(equation, get_args(Equation), "equation")
     require_choice(chemistry, (*CHEMISTRIES, None), "chemistry")
-    if capacity_ah not in {None, FROM_SOC}:
+    if capacity_ah not in (None, FROM_SOC):
         require_number(capacity_ah, "capacity_ah")
     recorded = [as_log(log) for log in (logs if isinstance(logs, list | tuple) else [logs])]
     _check_logs(recorded)
