@@ -58,8 +58,11 @@ def test_json_is_one_object_that_keeps_the_contract(run: Run, made: Path, tmp_pa
 def test_tables_have_units_and_standard_errors(run: Run, made: Path, tmp_path: Path) -> None:
     ran = run("fit", made / "full.parquet", "-o", tmp_path / "m.json")
     assert ran.code == 0
-    for text in ("std. error", "R4", "Ω", "V/K", "kWh", "condition number", "held out"):
+    for text in ("std. error", "R3", "Ω", "V/K", "kWh"):
         assert text in ran.out
+    for text in ("held out", "condition number", "slope resistance"):  # one log is left out of none
+        assert text not in ran.out
+    assert ran.err.index("note: chemistry taken as oxide") < ran.err.index("model: ")
     assert str(tmp_path / "m.json") in ran.err
 
 
@@ -99,6 +102,17 @@ def test_capacity_from_the_logs_own_soc(run: Run, made: Path, tmp_path: Path) ->
     assert json.loads(ran.out)["capacity_ah"] == pytest.approx(CAPACITY_AH, rel=1e-3)
 
 
+def test_coefficients_that_are_their_own_noise_are_not_printed(
+    run: Run, made: Path, tmp_path: Path
+) -> None:
+    for options, shown in (((), set()), (("--equation", "published"), {"k0", "k1"})):
+        ran = run("fit", made / "full.parquet", "-o", tmp_path / "m.json", *options)
+        assert ran.code == 0, ran.err
+        first = {line.split()[0] for line in ran.out.splitlines() if line.strip()}
+        assert first & {"k0", "k1", "k5"} == shown
+        assert first & {"R1", "R4"} == {"R1"}
+
+
 def test_several_logs_and_a_report(run: Run, made: Path, tmp_path: Path) -> None:
     logs = (made / "full.parquet", made / "part.csv")
     out = ("-o", tmp_path / "m.json", "--report", tmp_path / "m.html")
@@ -106,9 +120,12 @@ def test_several_logs_and_a_report(run: Run, made: Path, tmp_path: Path) -> None
     assert ran.code == 0, ran.err
     found = json.loads(ran.out)
     assert [item["name"] for item in found["logs"]] == ["full", "part"]
+    assert found["held_out"]["voltage_mae_pct"] is None
+    assert "too few logs" in found["held_out"]["judged_on"]
     assert found["report"] == str(tmp_path / "m.html")
     text = (tmp_path / "m.html").read_text(encoding="utf-8")
     assert text.count("<figure>") > 5
+    assert "not measured" in text
     assert files(tmp_path) == ["m.html", "m.json"]
 
 

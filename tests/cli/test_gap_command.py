@@ -64,9 +64,11 @@ def test_json_report_and_a_model_that_runs(
     assert ran.code == 0
 
 
-def test_text_begins_with_the_verdict(run: Run, made: Path, days: Path) -> None:
-    ran = run("gap", days / "good11.parquet", "-m", made / "model.json")
+def test_text_begins_with_the_verdict(run: Run, made: Path, days: Path, tmp_path: Path) -> None:
+    extended = ("--extended", tmp_path / "same.json")
+    ran = run("gap", days / "good11.parquet", "-m", made / "model.json", *extended)
     assert ran.code == 0
+    assert "same.json: the model as given, since no cause is accepted" in ran.err
     assert ran.out.startswith("No significant gap")
     assert "P(no fault) = " in ran.out
     assert "No reference log was given" in ran.out

@@ -121,6 +121,7 @@ def test_a_log_and_a_model_are_taken_in_every_form(
         (lambda *_: cangauge.fit(7), "not a log .got 'int'"),
         (lambda *_: cangauge.fit([]), "no log given"),
         (lambda log, _: cangauge.fit(log, capacity_ah="60"), "capacity_ah: not a number .got '60'"),
+        (lambda log, _: cangauge.fit(log, capacity_ah=[60]), "capacity_ah: not a number"),
         (lambda log, _: cangauge.fit(log, chemistry="x"), "chemistry: not a known value .*oxide"),
         (lambda log, _: cangauge.fit(log, equation="x"), "equation: not a known value .*knots"),
         (lambda _, model: cangauge.diagnose([], model), "logs: no log to diagnose"),

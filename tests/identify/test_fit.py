@@ -163,7 +163,7 @@ def test_chemistry_is_given_guessed_or_assumed_and_said() -> None:
     assert fit(whole, capacity_ah=CAPACITY_AH, cells=96).model.chemistry == "oxide"
     assumed = fit(log, capacity_ah=CAPACITY_AH)
     assert assumed.model.chemistry == "oxide"
-    assert any("--chemistry lfp" in text for text in assumed.remarks)
+    assert any("taken as oxide: say lfp" in text for text in assumed.remarks)
 
 
 def test_published_equation_recovers_its_coefficients() -> None:
@@ -246,6 +246,9 @@ def test_capacity_needs_a_log_from_full_to_empty() -> None:
     with pytest.raises(InputError, match="--capacity-ah"):
         fit([referenced])
     assert capacity_from_reference([referenced]) == pytest.approx(CAPACITY_AH, rel=1e-3)
+    model = fit(referenced, capacity_ah="from-soc").model
+    assert model.capacity_ah == capacity_from_reference([referenced])
+    assert len(repr(model).splitlines()) <= 10
 
 
 @pytest.mark.parametrize(

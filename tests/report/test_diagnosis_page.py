@@ -47,6 +47,8 @@ def page(found: Diagnosis) -> Page:
 def test_the_page_begins_with_the_verdict_and_what_to_check(found: Diagnosis, page: Page) -> None:
     assert page.lead == found.headline
     assert found.posterior.check_first in page.subtitle
+    (tile,) = [tile for tile in page.tiles if tile.label == "Look first at"]
+    assert tile.value in page.lead
 
 
 def test_two_pictures_are_open_and_the_rest_is_folded(page: Page) -> None:
@@ -77,6 +79,16 @@ def test_a_healthy_log_reads_as_one(model: Model) -> None:
     page = gap_page(healthy)
     assert page.lead.startswith("No significant gap")
     assert "would have shown" in page.subtitle
+
+
+def test_a_likely_gap_states_the_figures_that_show_it(model: Model) -> None:
+    log = day(21)
+    logs, references = [replace(log, voltage_v=log.voltage_v + 1.2)], [day(k) for k in (1, 2, 3)]
+    likely = diagnose(logs, model, references)
+    assert likely.posterior.likely
+    assert not likely.posterior.detected
+    assert "with what the references show of this pack); a healthy log has" in likely.summary
+    assert f"{likely.posterior.members[0]}, the likeliest cause, would leave 0." in likely.summary
 
 
 def test_every_cause_is_explained() -> None:

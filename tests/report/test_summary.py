@@ -16,7 +16,9 @@ def test_a_size_has_its_interval_and_unit() -> None:
             "tau_s": quantity(5.0, None, "s"),
         }
     }
-    assert size_cell(candidate) == "offset a 3.01 (2.7 … 3.3) A"
+    assert size_cell(candidate) == "3.01 (2.7 … 3.3) A"
+    candidate["parameters"]["fraction"] = quantity(0.1, [0.05, 0.15], "1")
+    assert size_cell(candidate) == "offset 3.01 (2.7 … 3.3) A; fraction 0.100 (0.050 … 0.15)"
 
 
 def test_none_and_unknown_follow_the_causes() -> None:

@@ -74,7 +74,13 @@ def test_fit_over_a_full_discharge_lacks_no_range() -> None:
 def test_constant_temperature_leaves_kt_unidentified(log: Log) -> None:
     level = replace(log, temperature_c=np.full(len(log), 24.0))
     text = fit([level], capacity_ah=CAPACITY_AH).verdict
-    assert "The temperature moves by 0.0 K: kt is not identified." in text
+    assert "No temperature dependence: the logs have one temperature, within 0.0 K." in text
+
+
+def test_a_parked_hour_identifies_nothing(log: Log) -> None:
+    parked = replace(log, current_a=np.full(len(log), 0.2), voltage_v=np.full(len(log), 380.0))
+    text = fit([parked], capacity_ah=CAPACITY_AH, initial_soc_pct=80.0).verdict
+    assert text.startswith("The logs identify nothing: the SoC moves by 0.4 %, the current by 0.0")
 
 
 def test_estimate_states_error_and_longest_period(estimate: RecordedEstimate, log: Log) -> None:

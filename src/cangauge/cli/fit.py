@@ -11,7 +11,7 @@ import typer
 
 from cangauge._extras import extra
 from cangauge._files import write_texts_atomic
-from cangauge._text import number, significant, span
+from cangauge._text import NONE_KNOWN, number, significant, span
 from cangauge.cli.options import (
     JsonOption,
     ReadingOptions,
@@ -150,7 +150,6 @@ def fit_command(  # noqa: PLR0917 - typer passes options by name
     """
     from cangauge.identify.effect_search import parse_effect_ids
     from cangauge.identify.fit import fit
-    from cangauge.model.coulomb_counting import capacity_from_reference
 
     capacity = _capacity(capacity_ah)
     initial = _initial_soc(initial_soc, len(logs))
@@ -169,8 +168,6 @@ def fit_command(  # noqa: PLR0917 - typer passes options by name
             recorded.append(reading.load(path))
         if cells is None:
             cells = _cells_of(logs[0], recorded[0], reading)
-        if capacity_ah == FROM_SOC:
-            capacity = capacity_from_reference(recorded)
         with progress_shown("cangauge.identify", status.update):
             result = fit(
                 recorded,
@@ -200,8 +197,6 @@ def fit_command(  # noqa: PLR0917 - typer passes options by name
         }
         emit_json(result.to_dict() | more)
         return
-    for remark in result.remarks:
-        note(f"note: {remark}")
     _show(result)
     note(f"model: {output}" + (f"\nreport: {report}" if report else ""))
 
@@ -234,9 +229,11 @@ def _refuse_published_options(delays: str, epsilon: float, t_ref: float) -> None
             )
 
 
-def _capacity(given: str | None) -> float | None:
-    if given is None or given == FROM_SOC:
+def _capacity(given: str | None) -> float | Literal["from-soc"] | None:
+    if given is None:
         return None
+    if given == FROM_SOC:
+        return "from-soc"
     try:
         return within(float(given), 1e-3, 1e5, option="--capacity-ah", unit="Ah")
     except ValueError as error:
@@ -293,29 +290,33 @@ def parse_delays(given: str) -> tuple[float, ...]:
 
 def _show(result: Identification) -> None:
     from cangauge.identify.identification import coefficient_rows, effect_rows, search_rows
+    from cangauge.model.voltage_model import BASIS_NAMES
 
     model, energy = result.model, result.energy
     note(result.verdict)
+    for remark in result.remarks:
+        note(f"note: {remark}")
+    held_out = ["voltage error held out, MAE", number(model.noise.voltage_mae_pct, 3), "%"]
     print_table(
         f"Model {model.name}",
         ["", "value", "<unit"],
         [
             ["voltage error, MAE", number(result.voltage_mae_pct, 3), "%"],
             ["voltage error, RMSE", significant(result.voltage_rmse_v, 3), "V"],
-            ["voltage error held out, MAE", number(model.noise.voltage_mae_pct, 3), "%"],
+            *([held_out] if result.is_held_out else []),
             ["SoC from voltage, MAE", number(result.soc_newton_mae_pct, 2), "%"],
             ["capacity", number(model.capacity_ah, 2), "Ah"],
-            ["slope resistance", significant(result.slope_ohm, 3), "Ω"],
-            ["  expected by the model", significant(result.slope_expected_ohm, 3), "Ω"],
-            ["condition number", significant(result.published.condition_number, 2), ""],
             ["identified at SoC", span(*model.range.soc_pct, 1), "%"],
             ["identified at temperature", span(*model.range.temperature_c, 1), "°C"],
             ["rows used", str(sum(len(item.rows) for item in result.fits)), ""],
         ],
     )
-    if model.coefficients:
-        print_table("Published equation", *coefficient_rows(model.coefficients))
-        note("a dash is a coefficient within two standard errors of zero")
+    head, rows = coefficient_rows(model.coefficients)
+    unknown = {row[0] for row in rows if row[1] == NONE_KNOWN}
+    if model.equation == "knots" and unknown & set(BASIS_NAMES):
+        unknown |= set(BASIS_NAMES)  # terms of one sum: none is known where one is not
+    if shown := [row for row in rows if row[0] not in unknown]:
+        print_table("Published equation", head, shown)
     if result.effects is not None and result.effects.steps:
         print_table("Effects", *effect_rows(result))
         print_table("Search for effects", *search_rows(result.effects))

@@ -195,7 +195,16 @@ def gap_command(  # noqa: PLR0917 - typer passes options by name
         return
     _show(found, before, steps)
     for written in texts:
-        note(f"wrote {written}")
+        note(f"wrote {written}{_held(found) if written == extended else ''}")
+
+
+def _held(found: Diagnosis) -> str:
+    """Return which model `--extended` holds, in words."""
+    from cangauge.diagnosis.sentences import percent
+
+    if (cause := found.accepted) is None:
+        return ": the model as given, since no cause is accepted"
+    return f": the model with {cause} (probability {percent(found.posterior.effects[cause])})"
 
 
 def _started(logs: list[Log], initial_soc_pct: float, capacity_ah: float | None) -> list[Log]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Mapping
 from html import escape
 from typing import TYPE_CHECKING, Any, Final
@@ -133,14 +134,19 @@ def size_text(found: Diagnosis) -> str:
     healthy = "a healthy log has" if found.has_references else "the model file states"
     what = "model" if found.simulator is None else "simulator"
     text = f"The {what} misses the voltage by {significant(found.baseline_rmse_v, 2, 'V')} RMS"
-    expected = math.sqrt(found.evidence.gap_v2)
-    if found.has_references and found.baseline_rmse_v > MISFIT * expected:
+    expected, answer = math.sqrt(found.evidence.gap_v2), found.posterior
+    only_likely = answer.likely and not answer.detected and answer.leading_group != UNKNOWN
+    if found.has_references and (only_likely or found.baseline_rmse_v > MISFIT * expected):
         text += f" ({significant(expected, 2, 'V')} with what the references show of this pack)"
     text += f"; {healthy} {significant(found.healthy_rmse_v, 2, 'V')}."
     if found.accepted is not None:
         all_rows = all(log.judged.all() for log in found.log_errors)
         text += f" With {found.accepted}: {significant(found.extended_rmse_v, 2, 'V')}"
         text += "." if all_rows else ", on the rows that it can change."
+    elif only_likely:
+        left_v = math.sqrt(found.evidence.effects[answer.members[0]].left_v2)
+        text += f" {answer.members[0]}, the likeliest cause, would leave"
+        text += f" {significant(left_v, 2, 'V')}."
     return text + soc_text(found)
 
 
@@ -307,18 +313,23 @@ def candidate_rows(result: Mapping[str, Any], at_most: int | None = None) -> tup
 
 
 def size_cell(candidate: Mapping[str, Any]) -> str:
-    """Return the sizes of a candidate that have an interval."""
+    """Return the sizes of a candidate that have an interval, named where the unit is no name."""
+    sizes = {k: each for k, each in candidate["parameters"].items() if each["ci"] is not None}
     parts = []
-    for name, quantity in candidate["parameters"].items():
-        if quantity["ci"] is None:
-            continue
+    for name, quantity in sizes.items():
         low, high = quantity["ci"]
-        unit = "" if quantity["unit"] == "1" else f" {quantity['unit'].replace('ohm', 'Ω')}"
-        parts.append(
-            f"{_words(name)} {significant(quantity['value'], 3)}"
-            f" ({significant(low, 2)} … {significant(high, 2)}){unit}"
+        has_unit = quantity["unit"] != "1"
+        unit = f" {quantity['unit'].replace('ohm', 'Ω')}" if has_unit else ""
+        label = "" if has_unit and len(sizes) == 1 else f"{_words(_UNIT_SUFFIX.sub('', name))} "
+        size = (
+            f"{significant(quantity['value'], 3)} ({significant(low, 2)} … {significant(high, 2)})"
         )
+        parts.append(f"{label}{size}{unit}")
     return "; ".join(parts) or NONE_KNOWN
+
+
+_UNIT_SUFFIX: Final = re.compile(r"_(v_per_k|ohm|pct|[avsk])$")
+"""Unit at the end of a parameter's name."""
 
 
 def visible_rows(result: Mapping[str, Any]) -> tuple[list[str], Rows]:

@@ -58,6 +58,7 @@ from cangauge.logs.log import Log, TemperatureSource
 from cangauge.logs.read import as_log
 from cangauge.model.coulomb_counting import (
     capacity_from_full_discharge,
+    capacity_from_reference,
 )
 from cangauge.model.effects.library import EffectCandidate, effect_entries
 from cangauge.model.extended import ExtendedModel
@@ -91,6 +92,8 @@ EPSILON: Final = 0.05
 FITTED_ROWS: Final = "the rows of the fit itself (too few logs to leave one out)"
 WHOLE_LOGS: Final = "whole logs left out in turn"
 
+FROM_SOC: Final = "from-soc"
+
 LISTED_LOGS: Final = 4096
 """Source logs that a model file names; of more, it states the number."""
 
@@ -98,7 +101,7 @@ LISTED_LOGS: Final = 4096
 def fit(
     logs: Any,
     *,
-    capacity_ah: float | None = None,
+    capacity_ah: float | Literal["from-soc"] | None = None,
     initial_soc_pct: float | Sequence[float | None] | None = None,
     equation: Equation = "knots",
     chemistry: ChemistryName | None = None,
@@ -116,8 +119,9 @@ def fit(
     Parameters
     ----------
     logs : Log, path or DataFrame, or a sequence of them
-    capacity_ah : float, optional
-        Charge from 100 to 0 % [Ah]; by default from a log that runs from full to empty.
+    capacity_ah : float or "from-soc", optional
+        Charge from 100 to 0 % [Ah]; "from-soc": the charge per 100 % of the logs' own SoC; by
+        default from a log that runs from full to empty.
     initial_soc_pct : float, or sequence of float or None, optional
         SoC at the first row [%], of all logs or of each; by default the log's reference SoC. Where
         neither is known it is estimated together with the curve, if another log pins it.
@@ -155,13 +159,15 @@ def fit(
     """
     require_choice(equation, get_args(Equation), "equation")
     require_choice(chemistry, (*CHEMISTRIES, None), "chemistry")
-    if capacity_ah is not None:
+    if capacity_ah not in (None, FROM_SOC):
         require_number(capacity_ah, "capacity_ah")
     recorded = [as_log(log) for log in (logs if isinstance(logs, list | tuple) else [logs])]
     _check_logs(recorded)
     given = given_starts(initial_soc_pct, len(recorded))
     if capacity_ah is None:
         capacity_ah = capacity_from_full_discharge(recorded, given)
+    elif isinstance(capacity_ah, str):
+        capacity_ah = capacity_from_reference(recorded)
     if not capacity_ah > 0.0:
         raise InputError(
             "the capacity must be positive", field="capacity_ah", value=capacity_ah,
@@ -267,8 +273,8 @@ def resolve_chemistry(
         return CHEMISTRIES[chemistry], []
     if cells is None:
         return CHEMISTRIES["oxide"], [
-            "chemistry taken as oxide: --chemistry lfp for iron phosphate, or --cells N to take it"
-            " from the volts per cell"
+            "chemistry taken as oxide: say lfp for iron phosphate, or give the number of cells, and"
+            " the volts per cell tell"
         ]
     volts = float(np.mean(np.concatenate([log.voltage_v for log in logs]))) / cells
     middles = []
@@ -282,7 +288,7 @@ def resolve_chemistry(
         return abs(volts - float(np.interp(middle, KNOTS_PCT, CHEMISTRIES[name].curve_v)))
 
     name = min(CHEMISTRIES, key=distance_v)
-    return CHEMISTRIES[name], [f"chemistry {name} by {volts:.2f} V per cell"]
+    return CHEMISTRIES[name], [f"chemistry {name} by {volts:.2f} V per cell, of {cells} cells"]
 
 
 @dataclass(frozen=True, eq=False)

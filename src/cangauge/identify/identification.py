@@ -16,7 +16,12 @@ from cangauge._text import NONE_KNOWN, counted, duration, number, significant, s
 from cangauge._typing import FloatArray
 from cangauge.identify.effect_search import Selected
 from cangauge.identify.published import PublishedFit
-from cangauge.identify.rows import TEMPERATURE_SPAN_K, FitRows, usable_delays
+from cangauge.identify.rows import (
+    SOC_SPAN_AT_LEAST_PCT,
+    TEMPERATURE_SPAN_K,
+    FitRows,
+    usable_delays,
+)
 from cangauge.identify.starts import Start, Starts
 from cangauge.logs.gaps import BRIDGE_S, bridge_s, uncounted_gaps, usual_step_s
 from cangauge.logs.log import Log
@@ -33,6 +38,9 @@ NEAR_AN_END_PCT: Final = 10.0
 
 OWN_NOISE: Final = 2.0
 """Standard errors within which a coefficient may as well be zero [-]: 95 %."""
+
+AT_REST: Final = 0.1
+"""Change of the current, over the capacity, below which the logs show no resistance [1/h]."""
 
 Rows = list[list[str]]
 
@@ -185,6 +193,13 @@ class Identification:
     def verdict(self) -> str:
         """Where the model holds, its error there, and which log would widen it."""
         low, high = self.model.range.soc_pct
+        least, most = self.model.range.current_a
+        if high - low < SOC_SPAN_AT_LEAST_PCT and most - least < AT_REST * self.model.capacity_ah:
+            return (
+                f"The logs identify nothing: the SoC moves by {number(high - low, 1, '%')}, the"
+                f" current by {number(most - least, 1, 'A')}. The curve {self.beyond}, and so do"
+                " the resistances: add a drive."
+            )
         noise = self.model.noise
         error, on = number(noise.voltage_mae_pct, 2, "%"), noise.judged_on
         text = f"Good from {low:.0f} to {high:.0f} % SoC: mean voltage error {error} on {on}."
@@ -194,7 +209,10 @@ class Identification:
             text += f" Add a drive {' and '.join(ends)}: there the curve {self.beyond}."
         celsius = np.concatenate([item.rows.temperature_c for item in self.fits])
         if (change_k := float(np.ptp(celsius))) < TEMPERATURE_SPAN_K:
-            text += f" The temperature moves by {number(change_k, 1, 'K')}: kt is not identified."
+            text += (
+                " No temperature dependence: the logs have one temperature, within"
+                f" {number(change_k, 1, 'K')}."
+            )
         return text
 
     @property
@@ -202,6 +220,11 @@ class Identification:
         """What the curve does beyond the SoC of the logs, in a phrase."""
         knots = "follows the typical cell of the chemistry"
         return knots if self.model.equation == "knots" else "is extrapolated linearly"
+
+    @property
+    def is_held_out(self) -> bool:
+        """Whether the error that the model states is of logs left out in turn."""
+        return any(np.isfinite(error_v).any() for error_v in self.held_out_error_v)
 
     def _mean(self, values: Iterable[FloatArray]) -> float:
         return float(np.mean(np.concatenate(list(values))))
@@ -276,8 +299,8 @@ class Identification:
             "chemistry": model.chemistry,
             "cells": model.cells,
             "held_out": {
-                "voltage_mae_pct": noise.voltage_mae_pct,
-                "voltage_rmse_v": noise.voltage_rmse_v,
+                "voltage_mae_pct": noise.voltage_mae_pct if self.is_held_out else None,
+                "voltage_rmse_v": noise.voltage_rmse_v if self.is_held_out else None,
                 "judged_on": noise.judged_on,
                 "scale": noise.left_out_scale,
             },

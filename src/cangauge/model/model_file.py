@@ -13,6 +13,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 
 from cangauge._config import schema_error
 from cangauge._files import MIB, as_path, read_bounded, write_text_atomic
+from cangauge._text import number, significant, span
 from cangauge._typing import FloatArray
 from cangauge.errors import InputError
 from cangauge.logs.log import Log, TemperatureSource
@@ -270,6 +271,20 @@ class Model(_Strict):
         for function in self.functions.load:
             _check_length(function, columns, "functions.load: each function")
         return self
+
+    def __repr__(self) -> str:
+        """Return what the model is of and where it holds."""
+        cells = f", {self.cells} cells" if self.cells else ""
+        effects = ", ".join(str(effect["id"]) for effect in self.effects) or "none"
+        error = number(self.noise.voltage_mae_pct, 2, "%")
+        return "\n".join([
+            f"<Model {self.name!r}",
+            f"  {self.equation}, {self.chemistry}{cells}, {significant(self.capacity_ah, 4, 'Ah')}",
+            f"  identified at {span(*self.range.soc_pct, 0, '% SoC')},"
+            f" {span(*self.range.temperature_c, 0, '°C')}, {span(*self.range.current_a, 0, 'A')}",
+            f"  voltage error {error} on {self.noise.judged_on}",
+            f"  effects: {effects}>",
+        ])  # fmt: skip
 
     @property
     def coefficients(self) -> dict[str, Coefficient]:

@@ -10,6 +10,7 @@ import numpy as np
 
 from cangauge._text import NONE_KNOWN, number, span
 from cangauge.diagnosis import NONE, Diagnosis
+from cangauge.diagnosis.answer import TITLES
 from cangauge.diagnosis.planner import Plan
 from cangauge.diagnosis.sentences import (
     EXPLAINED,
@@ -117,7 +118,7 @@ def _tiles(found: Diagnosis) -> list[Tile]:
     if answer.likely:
         group = answer.leading_group
         probability = f"probability {percent(answer.groups[group])}"
-        tiles.append(Tile("Look first at", group.replace("_", " "), probability))
+        tiles.append(Tile("Look first at", TITLES[group], probability))
     return [
         *tiles,
         Tile("Model's error", number(found.baseline_rmse_v, 2, "V"), "RMS, these logs"),

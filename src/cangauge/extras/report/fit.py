@@ -113,10 +113,10 @@ def _tiles(result: Identification) -> list[Tile]:
         ),
         Tile(
             "Held out (MAE)",
-            number(noise.voltage_mae_pct if result.held_out_error_v else None, 3, "%"),
+            number(noise.voltage_mae_pct, 3, "%") if result.is_held_out else "not measured",
             f"RMSE {significant(noise.voltage_rmse_v, 3, 'V')}"
-            if result.held_out_error_v
-            else noise.judged_on,
+            if result.is_held_out
+            else "too few logs to leave one out",
         ),
         Tile("SoC by Newton (MAE)", number(result.soc_newton_mae_pct, 2, "%"), "against counting"),
         Tile(
