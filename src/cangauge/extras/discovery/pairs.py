@@ -54,6 +54,8 @@ CURRENT_SCALES: Final = {
 SOC_SCALES: Final = (0.1, 0.5, 0.01, 1.0, 0.05, 0.025, 0.02, 0.4)
 """Usual scales of a SoC [%]."""
 SHOWN: Final = 3
+LARGEST_RATIO: Final = 2.0
+"""Largest ratio of the resistances by two halves of a capture: a coincidence does not repeat."""
 CLEARLY_NATS: Final = 3.0
 """Distance to the second candidate that makes the first clear: a likelihood ratio of 20."""
 SATURATION_NATS: Final = 20.0
@@ -134,15 +136,22 @@ class SignalCandidate:
     capacity_ah: float = math.nan
 
     @property
+    def is_repeated(self) -> bool:
+        """Whether both halves of the capture show alike resistances."""
+        one, two = self.halves_ohm
+        return max(one, two) <= LARGEST_RATIO * min(one, two)
+
+    @property
     def facts(self) -> str:
         """The evidence in a phrase."""
-        if self.evidence <= 0.0:
-            return "smooth; no steps prove it"
+        if self.evidence < 1.0:
+            return "smooth; nothing else proves it"
+        r = abs(self.correlation)
         if math.isnan(self.resistance_ohm):
-            return f"r {self.correlation:+.2f} with the charge, {self.partner}"
-        one, two = self.halves_ohm
-        ohm = f"R {self.resistance_ohm:.3g} Ω ({one:.2g}, {two:.2g} by halves)"
-        return f"r {self.correlation:+.2f} with {self.partner}, {ohm}"
+            return f"falls with the charge (correlation {r:.2f}), {self.partner}"
+        text = f"voltage falls when current rises: with {self.partner}, correlation {r:.2f}"
+        text += f", R {self.resistance_ohm:.2g} Ω"
+        return text if self.is_repeated else f"{text}, but not in both halves of the capture"
 
     def rescaled(self, scale: float) -> SignalCandidate:
         """Return a SoC with another scale, and the capacity that follows."""
@@ -213,6 +222,12 @@ class Row:
     def steps(self) -> int:
         """Number of changes."""
         return int(np.count_nonzero(np.diff(self.field.raw[~self.missing])))
+
+
+def range_text(low: float, high: float, unit: str, sign: int = 1) -> str:
+    """Return a range of values of a sign."""
+    ends = sorted((sign * low + 0.0, sign * high + 0.0))
+    return f"{ends[0]:.5g} … {ends[1]:.5g} {unit}".replace("-", "−")
 
 
 def is_capacity(capacity_ah: float) -> bool:
