@@ -118,20 +118,15 @@ def named_signals(
             for signal in wanted[key]:
                 signal.add(bytes(each.data))
     if taken and not present:
-        raise InputError(
-            "no message of this DBC is in the capture",
-            source=dbc,
-            cure="is it of this car and this bus?",
-        )
-    found = [seen for key in (present if taken else wanted) for seen in wanted[key]]
-    named = {
-        role: [one for seen in found if (one := seen.as_role(role, taken=taken)) is not None]
-        for role in _ROLES
-    }
-    return {
-        role: tuple(sorted(of_role, key=lambda one: -one.score)[:shown])
-        for role, of_role in named.items()
-    }
+        cure = "is it of this car and this bus?"
+        raise InputError("no message of this DBC is in the capture", source=dbc, cure=cure)
+    keys = [key for key in wanted if key in present or not taken]
+    found = [seen for key in keys for seen in wanted[key]]
+    best = {}
+    for role in _ROLES:
+        named = filter(None, (seen.as_role(role, taken=taken) for seen in found))
+        best[role] = tuple(sorted(named, key=lambda one: -one.score)[:shown])
+    return best
 
 
 @dataclass
@@ -148,7 +143,7 @@ class _Seen:
     def of(cls, message: Message, signal: Signal, dbc: Path) -> _Seen:
         scores = {role: _name_score(role, message, signal) for role in _ROLES}
         codec = None
-        with suppress(InputError):  # no number
+        with suppress(InputError):  # it does not fit into its message
             codec = signal_codec(message, signal, source=dbc, field=signal.name)
         return cls(message, signal, {k: score for k, score in scores.items() if score > 0.0}, codec)
 

@@ -125,11 +125,8 @@ def init_command(  # noqa: PLR0917 - typer fills the arguments by name
             address = bus_address(interface, channel, options)
             paths = [_listen(address, seconds, Path(folder) / "live.log")]
         if not paths and dbc is None:
-            raise InputError(
-                "nothing to look at",
-                field="CAPTURE",
-                cure="give a capture, --interface and --channel, or --dbc FILE",
-            )
+            cure = "give a capture, --interface and --channel, or --dbc FILE"
+            raise InputError("nothing to look at", field="CAPTURE", cure=cure)
         asks = sys.stdin is not None and sys.stdin.isatty() and not json_output
         found = _find(paths, dbc, nominal_voltage, presets=presets)
         _choose(found, picks, targets, asks=asks, quiet=json_output)
@@ -164,12 +161,8 @@ def _picks(given: Sequence[str]) -> dict[str, int]:
     for text in given:
         role, _, number = text.partition("=")
         if role not in _ROLES or not number.isdecimal() or not 1 <= int(number) <= 9:
-            raise InputError(
-                "not ROLE=N",
-                field="--choose",
-                value=text,
-                cure=f"ROLE is {', '.join(_ROLES)}; N counts from 1: --choose current=2",
-            )
+            cure = f"ROLE is {', '.join(_ROLES)}; N counts from 1: --choose current=2"
+            raise InputError("not ROLE=N", field="--choose", value=text, cure=cure)
         picks[_ROLES[role]] = int(number) - 1
     return picks
 
@@ -189,11 +182,8 @@ class _Targets:
                 raise InputError("given together with -o", field="--map/--config", cure="omit one")
             return cls(folder / "car.toml", folder / "run.toml", folder / "car.dbc")
         if map_file is None or config is None:
-            raise InputError(
-                "no place for the files",
-                field="-o",
-                cure="give -o DIR, or --map FILE --config FILE",
-            )
+            cure = "give -o DIR, or --map FILE --config FILE"
+            raise InputError("no place for the files", field="-o", cure=cure)
         return cls(map_file, config, map_file.parent / f"{map_file.stem or 'car'}.dbc")
 
     def check(self, *, force: bool) -> None:
@@ -264,13 +254,7 @@ class _Found:
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain values for JSON."""
-        levels = {
-            key: [{"scale": level.scale, value: level.value} for level in self.levels(role)]
-            for key, role, value in (
-                ("voltage_levels", "voltage", "voltage_v"),
-                ("soc_levels", "soc_reference", "highest_pct"),
-            )
-        }
+        volts, socs = self.levels("voltage"), self.levels("soc_reference")
         return {
             "method": self.method,
             "vehicle": self.vehicle,
@@ -280,7 +264,8 @@ class _Found:
                 for role in _ROLES.values()
             },
             "remarks": [] if self.findings is None else list(self.findings.remarks),
-            **levels,
+            "voltage_levels": [{"scale": each.scale, "voltage_v": each.value} for each in volts],
+            "soc_levels": [{"scale": each.scale, "highest_pct": each.value} for each in socs],
             "proof": self.proof,
         }
 
@@ -303,10 +288,7 @@ class _Found:
             found = proposal.of_preset(preset.mapping, targets.dbc.name, about)
         elif self.findings is not None:
             texts[targets.dbc] = proposal.dbc_text(self.fields)
-            names = {
-                role: [candidate.name for candidate in of_role]
-                for role, of_role in self.candidates.items()
-            }
+            names = {role: [c.name for c in each] for role, each in self.candidates.items()}
             found = proposal.by_physics(
                 self.fields, names, targets.dbc.name, self.nominal_v, self.findings.comments
             )
@@ -450,29 +432,25 @@ def _choose(
         elif count and found.is_clear(role):
             found.chosen[role] = 0
         elif count and asks:
-            found.chosen[role] = _asked(found, role)
+            _show_role(found, role)
+            pick = int(typer.prompt(f"Which is the {role}?", type=int, default=1, err=True))
+            if not 1 <= pick <= count:
+                raise InputError("no such candidate", field=role, value=pick)
+            found.chosen[role] = pick - 1
         else:
             unclear.append(role)
     if unclear:
-        if not quiet:
-            _show(found)
-        raise _unclear(found, unclear, targets, named=quiet)
-
-
-def _asked(found: _Found, role: str) -> int:
-    _show_role(found, role)
-    number = int(typer.prompt(f"Which is the {role}?", type=int, default=1, err=True))
-    if not 1 <= number <= len(found.candidates[role]):
-        raise InputError("no such candidate", field=role, value=number)
-    return number - 1
+        raise _unclear(found, unclear, targets, quiet=quiet)
 
 
 def _unclear(
-    found: _Found, roles: Sequence[str], targets: _Targets, *, named: bool
+    found: _Found, roles: Sequence[str], targets: _Targets, *, quiet: bool
 ) -> CangaugeError:
-    """Return the error of roles without a clear candidate, `named` where no table was shown."""
+    """Return the error of roles without a clear candidate, after tables of them if not `quiet`."""
     lines = [f"no {' and no '.join(roles)} is clearly ahead of the others"]
-    for role in roles if named else ():
+    if not quiet:
+        _show(found)
+    for role in roles if quiet else ():
         names = [f"{n}) {c.name}" for n, c in enumerate(found.candidates[role], 1)]
         lines.append(f"{role}: {', '.join(names)}")
     return CangaugeError(

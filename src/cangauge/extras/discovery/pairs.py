@@ -206,6 +206,10 @@ class SignalCandidate:
         }
 
 
+Candidates = tuple[SignalCandidate, ...]
+_Found = list[SignalCandidate]
+
+
 @dataclass
 class Row:
     """A field on the grid, as a current or as a voltage."""
@@ -410,34 +414,32 @@ class Pairs:
             & ((alike & (lost < 0.1 * (1.0 + slope**2))) | (count > MANY_MOVES))
         )
 
-    def best(
-        self, make: Any
-    ) -> tuple[tuple[SignalCandidate, ...], tuple[SignalCandidate, ...], Row | None]:
+    def best(self, make: Any) -> tuple[Candidates, Candidates, Row | None]:
         """Return the best candidates for current and voltage, and the row of the first current."""
         chosen: Row | None = None
         roles: tuple[list[Row], list[Row]] = ([], [])
-        currents: list[SignalCandidate] = []
-        voltages: list[SignalCandidate] = []
+        found: tuple[_Found, _Found] = ([], [])
         flat = np.argsort(-self.score, axis=None)[: 200 * 200]
         for place in flat:
             a, b = divmod(int(place), self.score.shape[1])
             u, i = self._voltages[a], self._currents[b]
             if self.score[a, b] < IMPOSSIBLE / 2.0:
                 break
-            if self._share_bits(u, i):
-                continue
             # A field of a better pair keeps its role.
-            if any(self._share_bits(u, other) for other in roles[0]):
-                continue
-            if any(self._share_bits(i, other) for other in roles[1]):
+            rivals = [
+                (u, i),
+                *((u, other) for other in roles[0]),
+                *((i, other) for other in roles[1]),
+            ]
+            if any(self._share_bits(*pair) for pair in rivals):
                 continue
             roles[0].append(i)
             roles[1].append(u)
             chosen = chosen or i
-            self._add(currents, voltages, a, b, make)
-            if len(currents) >= SHOWN and len(voltages) >= SHOWN:
+            self._add(found, a, b, make)
+            if min(map(len, found)) >= SHOWN:
                 break
-        return tuple(currents[:SHOWN]), tuple(voltages[:SHOWN]), chosen
+        return tuple(found[0][:SHOWN]), tuple(found[1][:SHOWN]), chosen
 
     def _share_bits(self, one: Row, two: Row) -> bool:
         """Whether two fields share bits; a gateway repeats frames on other buses."""
@@ -446,35 +448,22 @@ class Pairs:
             return False
         return bool(one.place.bits(a.length) & two.place.bits(b.length))
 
-    def _add(
-        self,
-        currents: list[SignalCandidate],
-        voltages: list[SignalCandidate],
-        a: int,
-        b: int,
-        make: Any,
-    ) -> None:
+    def _add(self, pair: tuple[_Found, _Found], a: int, b: int, make: Any) -> None:
         u, i = self._voltages[a], self._currents[b]
-        score, evidence = float(self.score[a, b]), float(self.evidence[a, b])
         amps = float(self.current_scale[a, b])
-        ohm = float(self.slope[a, b]) * u.scale / amps
         halves = self._halves(a, b)
         sign = 1 if self.r[a, b] < 0.0 else -1
-        half_ohm = (halves[0] * u.scale / amps, halves[1] * u.scale / amps)
         facts = {
-            "score": score,
-            "evidence": evidence,
+            "score": float(self.score[a, b]),
+            "evidence": float(self.evidence[a, b]),
             "correlation": float(self.r[a, b]),
-            "resistance_ohm": ohm,
-            "halves_ohm": half_ohm,
+            "resistance_ohm": float(self.slope[a, b]) * u.scale / amps,
+            "halves_ohm": (halves[0] * u.scale / amps, halves[1] * u.scale / amps),
         }
         zero = self._zero(i)
         current = make(i, amps, -amps * zero, sign=sign, **facts)
         voltage = make(u, u.scale, 0.0, sign=1, **facts)
-        for found, each, partner in (
-            (currents, current, voltage),
-            (voltages, voltage, current),
-        ):
+        for found, each, partner in zip(pair, (current, voltage), (voltage, current), strict=True):
             bits = each.place.bits(each.length)
             if not any(
                 overlap(each, bits, one, one.place.bits(one.length))

@@ -123,18 +123,9 @@ def by_physics(
     nominal_v: float | None,
     comments: Sequence[str],
 ) -> Proposal:
-    """Return the map of fields that were found by physics.
+    """Return the map of fields that were found by physics, as `comments` say.
 
-    Parameters
-    ----------
-    chosen : mapping of str to SignalCandidate
-    names : mapping of str to sequence of str
-        All candidates by role.
-    dbc : str
-    nominal_v : float, optional
-        Stated voltage of the pack [V].
-    comments : sequence of str
-        How they were found.
+    `names` are those of all candidates by role; `nominal_v` is the stated voltage of the pack [V].
     """
     roles = {}
     for role, candidate in chosen.items():

@@ -10,6 +10,7 @@ import logging
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import islice
 from typing import Any, Final
 
@@ -28,6 +29,7 @@ from cangauge.extras.discovery.pairs import (
     SHOWN,
     SOC_SCALES,
     VOLTAGE_SCALES,
+    Candidates,
     Pairs,
     Row,
     SignalCandidate,
@@ -81,10 +83,10 @@ class Findings:
     duration_s : float
     """
 
-    current: tuple[SignalCandidate, ...]
-    voltage: tuple[SignalCandidate, ...]
-    soc_reference: tuple[SignalCandidate, ...]
-    temperature: tuple[SignalCandidate, ...]
+    current: Candidates
+    voltage: Candidates
+    soc_reference: Candidates
+    temperature: Candidates
     remarks: tuple[str, ...]
     streams: int
     fields: int
@@ -100,7 +102,7 @@ class Findings:
 
     def is_clear(self, role: str) -> bool:
         """Whether the first candidate is certain enough to be taken without the user."""
-        found: tuple[SignalCandidate, ...] = getattr(self, role)
+        found: Candidates = getattr(self, role)
         if not found or found[0].evidence < ENOUGH_NATS or found[0].steps < ENOUGH_STEPS:
             return False
         if not found[0].is_repeated:
@@ -168,9 +170,13 @@ class _Search:
         currents = sorted(currents, key=lambda row: -row.prior)[:MOST_CURRENTS]
         voltages = sorted(voltages, key=lambda row: -row.prior)[:MOST_VOLTAGES]
         remarks: list[str] = []
+        result = partial(
+            Findings, streams=len(self._streams), fields=len(self._fields),
+            duration_s=self._duration_s,
+        )  # fmt: skip
         if not currents or not voltages:
-            remarks.append("no field of this capture can be the current or the voltage of a pack")
-            return self._result((), (), (), (), remarks)
+            remark = "no field of this capture can be the current or the voltage of a pack"
+            return result((), (), (), (), (remark,))
         pairs = Pairs(
             [self._grid(row) for row in currents],
             [self._grid(row) for row in voltages],
@@ -186,28 +192,13 @@ class _Search:
                 " chosen by their smoothness alone; record while driving"
             )
         taken = [(each, each.place.bits(each.length)) for each in (*current[:1], *voltage[:1])]
-        soc: tuple[SignalCandidate, ...] = ()
-        if row is not None:
-            soc = self._charges(current[0], row, taken)
+        soc = () if row is None else self._charges(current[0], row, taken)
         if not soc:
             remarks.append("no field falls with the charge: record a longer drive to find the SoC")
         temperature = self._temperatures(taken)
         if not temperature:
             remarks.append("no slow field looks like a temperature")
-        return self._result(current, voltage, soc, temperature, remarks)
-
-    def _result(
-        self,
-        current: tuple[SignalCandidate, ...],
-        voltage: tuple[SignalCandidate, ...],
-        soc: tuple[SignalCandidate, ...],
-        temperature: tuple[SignalCandidate, ...],
-        remarks: list[str],
-    ) -> Findings:
-        return Findings(
-            current, voltage, soc, temperature, tuple(remarks), len(self._streams),
-            len(self._fields), self._duration_s,
-        )  # fmt: skip
+        return result(current, voltage, soc, temperature, tuple(remarks))
 
     def _rate_prior(self, stream: Stream) -> float:
         """Return the log prior of a period: pack messages are fast, and not in turns."""
@@ -314,9 +305,7 @@ class _Search:
             **more,
         )
 
-    def _charges(
-        self, current: SignalCandidate, row: Row, taken: Sequence[_Taken]
-    ) -> tuple[SignalCandidate, ...]:
+    def _charges(self, current: SignalCandidate, row: Row, taken: Sequence[_Taken]) -> Candidates:
         """Return fields that fall as the current is drawn, of other bits than those `taken`."""
         amps = current.scale * (self._grid(row) + row.constant) + current.offset
         amps *= current.sign
@@ -371,7 +360,7 @@ class _Search:
                     )  # fmt: skip
         return best
 
-    def _temperatures(self, taken: Sequence[_Taken]) -> tuple[SignalCandidate, ...]:
+    def _temperatures(self, taken: Sequence[_Taken]) -> Candidates:
         """Return slow fields in a plausible range, those of the pack's bus first."""
         buses = {each.bus for each, _ in taken}
         found = []
@@ -436,8 +425,6 @@ class _Statistics:
 def _level_prior(volts: float, nominal_v: float | None = None) -> float:
     """Return the log prior of a pack's voltage [nats]: most cars have 250–450 V."""
     if nominal_v is not None:
-        if volts <= 0.0:
-            return IMPOSSIBLE
         return -0.5 * (math.log(volts / nominal_v) / NOMINAL_SPREAD) ** 2
     if 250.0 <= volts <= 450.0:
         return 0.0
@@ -458,7 +445,7 @@ def _full_scale_prior(scale: float, width: int) -> float:
     return -1.0
 
 
-def _apart(found: list[SignalCandidate]) -> tuple[SignalCandidate, ...]:
+def _apart(found: list[SignalCandidate]) -> Candidates:
     """Return candidates, best first, without those that share bits with a better one."""
     kept: list[_Taken] = []
     for each in sorted(found, key=lambda one: -one.score):
