@@ -63,6 +63,20 @@ def uncertain_energy(wh: float | None, std_wh: float | None) -> str:
     return uncertain(1e-3 * wh, 1e-3 * std_wh, "kWh")
 
 
+def possible(current_a: float | None, std_a: float | None, unit: str = "") -> str:
+    """Return a possible current; one without deviation is the largest that the model's logs had."""
+    if current_a and std_a == 0.0:
+        return f"at least {significant(current_a, 3, unit)}"
+    return uncertain(current_a, std_a, unit)
+
+
+def known_soc(soc_pct: float | None, std_pct: float | None, digits: int) -> str:
+    """Return a SoC with its standard deviation, or that it is not known yet."""
+    if soc_pct is None or not math.isfinite(soc_pct):
+        return "not known yet"
+    return f"{number(soc_pct, digits)} ± {number(std_pct, digits, '%')}"
+
+
 def span(low: float, high: float, digits: int = 1, unit: str = "") -> str:
     """Return a range, such as "20.0 … 26.0 °C"."""
     return f"{number(low, digits)} … {number(high, digits)} {unit}".rstrip()

@@ -43,7 +43,11 @@ def mitsubishi(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_an_unclear_pair_exits_with_one_and_names_three(mitsubishi: Path, tmp_path: Path) -> None:
     done = init(mitsubishi, "-o", tmp_path / "car")
     assert done.code == 1
-    assert "1) 0x373 23|16@0+" in done.err
+    assert "1   0x373 23|16@0+" in done.out
+    assert "no current and no voltage is clearly ahead" in done.err
+    assert "0x373" not in done.err  # the tables name them
+    assert "by halves" not in done.out
+    assert "voltage falls when" in done.out
     assert "--choose current=1 --choose voltage=1" in done.err
     assert not list((tmp_path / "car").glob("*"))
 
@@ -101,6 +105,14 @@ def test_the_sign_of_a_dbc_s_current_is_proven(
     assert done.code == 0, done.err
     assert f"The map has sign = {sign}." in done.err
     assert ("positive values charge on this bus" in done.err) == (sign < 0)
+    assert "the map assumes 20 °C (fixed_c)" in done.err
+    table = done.out.partition("voltage")[0]
+    (ends,) = re.findall(r"(\S+ … \S+ A)", table)
+    assert ends in done.err  # one range, of one sign, of the whole capture
+    assert ends in (tmp_path / "map.toml").read_text(encoding="utf-8")
+    assert "BMS_Status" in table
+    assert "PackCurrent" in table
+    assert "score" not in table
     log = capture_to_log(mitsubishi, Vehicle.load(map=tmp_path / "map.toml"))
     assert sign_of_current(log).sign == 1
 

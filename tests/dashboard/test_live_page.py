@@ -156,6 +156,9 @@ def test_the_page_shows_what_the_bus_carries(bench: Bench, page: Any) -> None:
     assert soc == pytest.approx(frame["soc_pct"], abs=0.005 + 0.005 + 0.02)
     assert std == pytest.approx(frame["soc_std_pct"], abs=0.025 + 0.005 + 0.01)
     assert text(page, "state") == str(frame["status"])
+    # The largest current of the model's logs is a lower bound; this pack holds more than 1 kWh.
+    assert tile(page, "Possible discharge, 10 s") == "at least 200 A"
+    assert str(tile(page, "Energy left")).endswith(" kWh")
     drawn = page.execute_script(
         "const rows = Bokeh.documents[0].get_model_by_name('rows').data;"
         "return ['current_a', 'voltage_v', 'soc_pct'].map(name => rows[name].at(-1))"

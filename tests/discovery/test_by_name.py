@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import can
 import pytest
 
 from cangauge.extras.discovery.by_name import named_signals
@@ -64,3 +65,19 @@ def test_the_packs_signals_come_first_by_name(make: str, tmp_path: Path) -> None
     found = named_signals(tmp_path / "car.dbc", [])
     assert found["current"][0].signal == PUBLIC[make][0][0]
     assert found["voltage"][0].signal == PUBLIC[make][1][0]
+
+
+def test_a_temperature_is_found_by_its_unit(tmp_path: Path) -> None:
+    (tmp_path / "car.dbc").write_text(
+        'VERSION "1"\nNS_ :\nBS_:\nBU_: V\nBO_ 256 BMS_Measure2: 8 V\n'
+        ' SG_ TModMax : 7|8@0- (1,0) [0|0] "degC" V\n'
+        ' SG_ TModMin : 15|8@0- (1,0) [0|0] "degC" V\n'
+        ' SG_ InverterTemp : 23|8@0- (1,0) [0|0] "degC" V\n'
+    )
+    frames = [
+        can.Message(arbitration_id=256, data=[hot, 24, 60, 0, 0, 0, 0, 0], is_extended_id=False)
+        for hot in (*[25] * 3000, 31)
+    ]
+    found = named_signals(tmp_path / "car.dbc", frames)["temperature"]
+    assert [each.signal for each in found] == ["TModMax", "TModMin"]
+    assert (found[0].low, found[0].high) == (25.0, 31.0)  # of the whole capture

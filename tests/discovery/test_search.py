@@ -13,6 +13,7 @@ import pytest
 from cangauge.bus.captures import open_capture
 from cangauge.extras.discovery.fields import collect
 from cangauge.extras.discovery.pairs import SignalCandidate
+from cangauge.extras.discovery.proposal import levels
 from cangauge.extras.discovery.search import Findings, search
 from drive_captures import CARS, Bits, Car, Frame, capture
 from init_makes import HELD_OUT, evaluate
@@ -156,3 +157,28 @@ def test_the_generators_layouts_decode_to_the_drive() -> None:
     bits = np.unpackbits(payloads, axis=1)[:, car.current[1].places()]
     raw = bits.astype(int) @ (1 << np.arange(11, -1, -1))
     assert np.all(np.abs(0.25 * raw - 500.0) < 250.0)
+
+
+MODULE = {
+    "voltage": Bits(7, 16, True, 0.01),
+    "current": Bits(23, 16, True, 0.1, signed=True),
+}
+
+
+def test_a_low_voltage_modules_scale_is_among_the_levels_or_stated(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    frames = (Frame(0x618, 0.1, 8, MODULE), Frame(0x300, 0.01, 8, {"speed": Bits(0, 8, True, 1.0)}))
+    module = Car("module", frames, *((0x618, MODULE[each]) for each in ("current", "voltage")),
+                 volts=52.0, ohm=0.01)  # fmt: skip
+    open_scale = levels("voltage", search(capture(module)).voltage[0], None)
+    assert any(each.scale == 0.01 and 45.0 < each.value < 54.0 for each in open_scale)
+    stated = search(capture(module), nominal_v=52.0)
+    assert stated.voltage[0].scale == 0.01
+    assert stated.is_clear("voltage")
+    assert stated.is_clear("current")
+    # Of a long capture all ids are looked at over one time, which is said.
+    monkeypatch.setattr("cangauge.extras.discovery.search.MOST_FRAMES", 3300)
+    part = search(capture(module), nominal_v=52.0)
+    assert part.duration_s == pytest.approx(30.0, abs=0.5)
+    assert part.remarks[-1] == "ranges and steps are those of the first 30 s"

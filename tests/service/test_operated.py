@@ -51,7 +51,7 @@ def test_a_whole_run(bus: list[str], tmp_path: Path) -> None:
     assert found.json["samples"] == 1200
     assert found.json["latency"]["count"] > 0
     shown = in_process("status", "--endpoint", sock).out
-    assert all(name in shown for name in ("capacity", "discharge for 10 s", "energy left"))
+    assert all(name in shown for name in ("capacity", "possible discharge, 10 s", "energy left"))
     assert found.json["record"]["lost_frames"] == 0
     with urllib.request.urlopen(f"http://127.0.0.1:{http_port}/metrics") as answer:
         assert b"cangauge_samples_total 1200.0" in answer.read()

@@ -16,6 +16,7 @@ from typing import Any
 import pytest
 from watched import StandInPort, Watched
 
+from cangauge.cli.status import live_text, status_rows
 from cangauge.errors import CangaugeError, InputError
 from cangauge.estimation.cells import CellReport
 from cangauge.service.lifecycle import Notifier
@@ -71,6 +72,36 @@ def test_a_status_before_the_first_frame() -> None:
     assert status["status"] == "initialising"
     assert status["sample"] is status["health"] is status["cells"] is None
     assert status["latency"]["p99_at_most_s"] is None
+
+
+def test_before_the_first_sample_the_soc_is_not_known_yet() -> None:
+    watched = Watched()
+    watched.pipeline.heartbeat(is_stale=False)
+    watched.turn()
+    assert "implausible_input" not in watched.status["reasons"]
+    rows = dict(status_rows(watched.status))
+    assert rows["SoC"] == "not known yet"
+    assert not [name for name, text in rows.items() if text.startswith("–")]
+    assert not {"current", "latest sample", "latency", "energy left"} & rows.keys()
+    assert live_text(watched.status).plain.startswith("SoC not known yet  initialising")
+
+
+def test_a_capped_current_is_a_least_one_and_a_small_energy_in_wh(watched: Watched) -> None:
+    status = json.loads(json.dumps(watched.status))
+    status["power"] |= {"discharge_a": 200.0, "discharge_std_a": 0.0}
+    status["power"] |= {"charge_a": 45.2, "charge_std_a": 3.1}
+    status["power"] |= {"energy_wh": 9.613, "energy_std_wh": 0.0418}
+    status["latency"] |= {"count": 9, "p50_at_most_s": 0.01, "p99_at_most_s": None}
+    status["record"] = {
+        "path": "a.log", "frames": 12, "written_bytes": 9947, "lost_frames": 0, "problem": None,
+        "active": True,
+    }  # fmt: skip
+    rows = dict(status_rows(status))
+    assert rows["possible discharge, 10 s"] == "at least 200 A"
+    assert rows["possible charge, 10 s"] == "45.2 ± 3.1 A"
+    assert rows["energy left"] == "9.613 ± 0.042 Wh"
+    assert rows["latency"] == "median at most 10 ms, 99 % over 1 s"
+    assert rows["recording"] == "a.log: 12 frames, 10 kB, 0 frames lost"
 
 
 def test_a_snapshot_grows_old_and_stale(watched: Watched) -> None:

@@ -13,7 +13,15 @@ from rich.progress import Progress
 
 from cangauge._extras import extra
 from cangauge._files import atomic_path
-from cangauge._text import NONE_KNOWN, number, rounded, significant, uncertain, uncertain_energy
+from cangauge._text import (
+    NONE_KNOWN,
+    number,
+    possible,
+    rounded,
+    significant,
+    uncertain,
+    uncertain_energy,
+)
 from cangauge.cli.options import (
     JsonOption,
     ReadingOptions,
@@ -307,13 +315,6 @@ def _show(done: RecordedEstimate) -> None:
         print_table("Reasons for less than valid estimates", ["reason", "% of samples"], rows)
 
 
-def _possible(current_a: float, std_a: float) -> str:
-    """Return a possible current; one without deviation is the largest of the model's logs."""
-    if std_a == 0.0 and current_a > 0.0:
-        return f"at least {significant(current_a, 3)}"
-    return uncertain(current_a, std_a)
-
-
 def _show_pack(report: PackReport, limits: KnownLimits) -> None:
     health, power, cells = report
     low_v, high_v = (significant(v, 3) for v in (limits.min_voltage_v, limits.max_voltage_v))
@@ -325,9 +326,9 @@ def _show_pack(report: PackReport, limits: KnownLimits) -> None:
             "× the model's",
         ],
         ["current offset", significant(health.offset_a, 2), "A"],
-        ["possible discharge, 10 s", _possible(power.discharge_a, power.discharge_std_a),
+        ["possible discharge, 10 s", possible(power.discharge_a, power.discharge_std_a),
          f"A, down to {low_v} V"],
-        ["possible charge, 10 s", _possible(power.charge_a, power.charge_std_a),
+        ["possible charge, 10 s", possible(power.charge_a, power.charge_std_a),
          f"A, up to {high_v} V"],
         ["energy left", *uncertain_energy(power.energy_wh, power.energy_std_wh).rsplit(" ", 1)],
     ]  # fmt: skip

@@ -14,7 +14,15 @@ from rich.console import RenderableType
 from rich.live import Live
 from rich.text import Text
 
-from cangauge._text import NONE_KNOWN, duration, number
+from cangauge._text import (
+    NONE_KNOWN,
+    duration,
+    known_soc,
+    number,
+    possible,
+    uncertain,
+    uncertain_energy,
+)
 from cangauge.cli.options import JsonOption
 from cangauge.cli.output import PlainConsole, emit_json, print_table, text_table
 from cangauge.errors import CangaugeError, InputError
@@ -115,7 +123,7 @@ def live_text(status: dict[str, Any]) -> Text:
     """Return SoC ± standard deviation, status, voltage, residual and rate in one line."""
     estimate, sample, reasons = status["estimate"], status["sample"], status["reasons"]
     text = Text("SoC ", no_wrap=True, overflow="ellipsis")
-    text.append(_with_std(estimate["soc_pct"], estimate["soc_std_pct"], "%", 2), style="bold")
+    text.append(known_soc(estimate["soc_pct"], estimate["soc_std_pct"], 2), style="bold")
     text.append("  ")
     text.append(status["status"], style=_STYLE[status["status"]])
     if reasons:
@@ -130,12 +138,12 @@ def live_text(status: dict[str, Any]) -> Text:
 
 
 def status_rows(status: dict[str, Any]) -> list[tuple[str, str]]:
-    """Return the rows of name and value that show a status."""
+    """Return the rows of name and value that show a status; none for what is not known yet."""
     estimate, sample = status["estimate"], status["sample"] or {}
     frames, reasons = status["frames"], _words(status["reasons"])
     bus = (status["bus"], status["bus_trouble"], _counts(status["bus_counts"]) or "no errors")
     rows = [
-        ("SoC", _with_std(estimate["soc_pct"], estimate["soc_std_pct"], "%", 2)),
+        ("SoC", known_soc(estimate["soc_pct"], estimate["soc_std_pct"], 2)),
         ("status", status["status"] + (f": {reasons}" if reasons else "")),
         ("by voltage alone", number(estimate["soc_newton_pct"], 2, "%")),
         ("by charge alone", number(estimate["soc_coulomb_pct"], 2, "%")),
@@ -155,7 +163,7 @@ def status_rows(status: dict[str, Any]) -> list[tuple[str, str]]:
     if (record := status["record"]) is not None:
         problem = f"; FAILING: {record['problem']}" if record["problem"] else ""
         problem += "" if record["active"] else "; ended"
-        size = number(1e-6 * record["written_bytes"], 1, "MB")
+        size = _size(record["written_bytes"])
         text = f"{record['path']}: {record['frames']} frames, {size}"
         rows.append(("recording", f"{text}, {record['lost_frames']} frames lost{problem}"))
     if problem := status["config"]["problem"]:
@@ -165,7 +173,7 @@ def status_rows(status: dict[str, Any]) -> list[tuple[str, str]]:
     if status["loop_stuck"]:
         rows.insert(0, ("LOOP STUCK", "the receive loop hangs; restart the service"))
     return [
-        *rows,
+        *(row for row in rows if not row[1].startswith(NONE_KNOWN)),
         ("vehicle", status["vehicle"]),
         ("model", f"{status['model']} ({status['method']}, time: {status['time_source']})"),
         (
@@ -187,15 +195,15 @@ def _pack_rows(status: dict[str, Any]) -> list[tuple[str, str]]:
             ("current offset", number(health["offset_a"], 2, "A")),
         ]
     if power is not None:
-        kwh, std_kwh = (_times(power[name], 1e-3) for name in ("energy_wh", "energy_std_wh"))
         rows += [
-            (f"{way} for 10 s", _with_std(power[f"{way}_a"], power[f"{way}_std_a"], "A", 0))
+            (f"possible {way}, 10 s", possible(power[f"{way}_a"], power[f"{way}_std_a"], "A"))
             for way in ("discharge", "charge")
         ]
-        rows.append(("energy left", _with_std(kwh, std_kwh, "kWh")))
+        energy = uncertain_energy(power["energy_wh"], power["energy_std_wh"])
+        rows.append(("energy left", energy))
     if cells is not None:
         weakest = "" if cells["weakest"] is None else f"number {cells['weakest']}: "
-        less = _with_std(cells["sum_error_v"], cells["sum_std_v"], "V", 2)
+        less = uncertain(cells["sum_error_v"], cells["sum_std_v"], "V")
         spread = number(cells["spread_pct"], 1, "%")
         rows += [
             ("weakest cell", weakest + _with_std(cells["soc_pct"], cells["soc_std_pct"], "%")),
@@ -219,8 +227,13 @@ def _counts(counts: dict[str, int]) -> str:
 def _delay(durations: dict[str, Any]) -> str:
     if not durations["count"]:
         return NONE_KNOWN
-    p50, p99 = (_times(durations[f"{name}_at_most_s"], 1e3) for name in ("p50", "p99"))
-    return f"median at most {number(p50, 3, 'ms')}, 99 % within {number(p99, 3, 'ms')}"
+    bounds = (durations[f"{name}_at_most_s"] for name in ("p50", "p99"))
+    p50, p99 = ("over 1 s" if s is None else f"at most {1e3 * s:g} ms" for s in bounds)
+    return f"median {p50}, 99 % {p99}"
+
+
+def _size(count: int) -> str:
+    return number(1e-3 * count, 0, "kB") if count < 1e6 else number(1e-6 * count, 1, "MB")
 
 
 def _times(value: float | None, factor: float) -> float | None:

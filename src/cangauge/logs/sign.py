@@ -177,7 +177,7 @@ def _from_soc(log: Log) -> SignEvidence:
     alike = correlation(taken, soc)
     weight = 4.0 if abs(alike) >= 0.95 else 1.0 if abs(alike) >= 0.8 else 0.0
     way = "rises" if alike > 0.0 else "falls"
-    text = f"reference SoC {way} as charge is taken out (correlation {alike:+.3f})"
+    text = f"reference SoC {way} as charge is taken out, correlation {alike:.2f}"
     return SignEvidence("soc", -float(np.sign(alike)) * weight, text)
 
 

@@ -16,7 +16,7 @@ from typing import Any, Final
 
 from cangauge._files import check_writable, sole_writer
 from cangauge._logging import emit
-from cangauge._text import number
+from cangauge._text import known_soc, number
 from cangauge.bus.publish import NO_REPORT
 from cangauge.bus.reconnecting import ReconnectingBus
 from cangauge.errors import CangaugeError, InputError
@@ -332,7 +332,7 @@ def _summary_line(pipeline: Pipeline, port: ReconnectingBus, summary: RunSummary
         f"bus losses ({port.away_s:.1f} s)": port.losses,
     }
     errors = "".join(f", {count} {what}" for what, count in found.items() if count)
-    soc = f"{number(latest.soc_pct, 2)} ± {number(latest.soc_std_pct, 2, '%')}"
+    soc = known_soc(latest.soc_pct, latest.soc_std_pct, 2)
     return (
         f"{summary.seconds:.1f} s, {counts.frames} frames, {counts.samples} samples,"
         f" {counts.lost} lost, {counts.crc_errors} CRC errors{errors}; last SoC {soc}"

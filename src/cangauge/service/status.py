@@ -15,7 +15,7 @@ from dataclasses import asdict, dataclass, fields
 from typing import Any, Final
 
 from cangauge._logging import emit, release_held
-from cangauge._text import number
+from cangauge._text import known_soc
 from cangauge._version import __version__
 from cangauge.bus.connection import BusConnection
 from cangauge.bus.plausibility import MessageStatistics
@@ -287,12 +287,10 @@ class Monitor:
     def _line(self) -> str:
         """Return the status in one line, such as "SoC 71.2 ± 0.8 %, valid, 10.0 samples/s"."""
         estimate = self._pipeline.published
-        soc = f"SoC {number(estimate.soc_pct, 1)} ± {number(estimate.soc_std_pct, 1, '%')}"
-        if math.isnan(estimate.soc_pct):
-            soc = "SoC not known yet"
         why = reason_sentences(int(estimate.reasons))
         status = estimate.status.name.lower() + (f" ({why})" if why else "")
-        return f"{soc}, {status}, {self._rate:.1f} samples/s"
+        soc = known_soc(estimate.soc_pct, estimate.soc_std_pct, 1)
+        return f"SoC {soc}, {status}, {self._rate:.1f} samples/s"
 
     def _find_notices(self) -> dict[str, str]:
         """Return what the user should look after, by event: one sentence each."""

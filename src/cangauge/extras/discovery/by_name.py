@@ -2,19 +2,23 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Iterable
-from dataclasses import dataclass
+from contextlib import suppress
+from dataclasses import dataclass, field
 from pathlib import Path
+from statistics import median
 from typing import Any, Final
 
 import can
 import numpy as np
 from cantools.database.can import Message, Signal
 
-from cangauge.bus.database import load_dbc, signal_codec
+from cangauge.bus.database import SignalCodec, load_dbc, signal_codec
 from cangauge.bus.vehicle import EXTENDED
 from cangauge.errors import InputError
+from cangauge.extras.discovery.pairs import range_text
 from cangauge.logs.units import convert
 
 _PACK = re.compile(r"bat|bms|pack|traction|hv|hochvolt|esu|rechargeable", re.IGNORECASE)
@@ -35,9 +39,9 @@ _RANGES: Final = {
     "temperature": (-30.0, 60.0),
     "soc_reference": (0.0, 100.0),
 }
-"""Plausible medians [A, V, °C, %]."""
-KEPT: Final = 2000
-"""Frames of a message that are decoded for its range."""
+"""Plausible medians of the distinct values [A, V, °C, %]."""
+_EXTREME = re.compile(r"max|min|cell", re.IGNORECASE)
+"""Words that the pack's temperature may hold in its name: that of its warmest cell."""
 
 
 @dataclass(frozen=True)
@@ -65,10 +69,11 @@ class NamedSignal:
         """Message and signal."""
         return f"{self.message}.{self.signal}"
 
-    @property
-    def range_text(self) -> str:
-        """Range of its values in the capture; "" without frames."""
-        return "" if self.low is None else f"{self.low:.5g} … {self.high:.5g} {self.unit}"
+    def range_text(self, sign: int = 1) -> str:
+        """Return the range of its values in the whole capture; "" without frames."""
+        if self.low is None or self.high is None:
+            return ""
+        return range_text(self.low, self.high, self.unit.replace("degC", "°C"), sign)
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain values for JSON."""
@@ -99,55 +104,70 @@ def named_signals(
     InputError
         If the DBC cannot be read, or no message of it is in the capture.
     """
-    database = load_dbc(dbc)
-    frames: dict[int, list[bytes]] = {}
-    taken = False
+    wanted: dict[int, list[_Seen]] = {}
+    for message in load_dbc(dbc).messages:
+        key = message.frame_id | (EXTENDED if message.is_extended_frame else 0)
+        seen = [_Seen.of(message, signal, dbc) for signal in message.signals]
+        wanted[key] = [each for each in seen if each.scores]
+    taken, present = False, set()
     for each in messages:
         taken = True
-        if each.is_error_frame or each.is_remote_frame:
-            continue
         key = each.arbitration_id | (EXTENDED if each.is_extended_id else 0)
-        kept = frames.setdefault(key, [])
-        if len(kept) < KEPT:
-            kept.append(bytes(each.data))
-    present = [each for each in database.messages if not taken or _key(each) in frames]
-    if not present:
-        raise InputError(
-            "no message of this DBC is in the capture",
-            source=dbc,
-            cure="is it of this car and this bus?",
-        )
-    return {role: _best(role, present, frames, dbc)[:shown] for role in _ROLES}
+        if key in wanted and not each.is_error_frame and not each.is_remote_frame:
+            present.add(key)
+            for signal in wanted[key]:
+                signal.add(bytes(each.data))
+    if taken and not present:
+        cure = "is it of this car and this bus?"
+        raise InputError("no message of this DBC is in the capture", source=dbc, cure=cure)
+    keys = [key for key in wanted if key in present or not taken]
+    found = [seen for key in keys for seen in wanted[key]]
+    best = {}
+    for role in _ROLES:
+        named = filter(None, (seen.as_role(role, taken=taken) for seen in found))
+        best[role] = tuple(sorted(named, key=lambda one: -one.score)[:shown])
+    return best
 
 
-def _key(message: Message) -> int:
-    return message.frame_id | (EXTENDED if message.is_extended_frame else 0)
+@dataclass
+class _Seen:
+    """A signal that may have a role, with its distinct values in the capture."""
 
+    message: Message
+    signal: Signal
+    scores: dict[str, float]
+    codec: SignalCodec | None
+    values: set[float] = field(default_factory=set)
 
-def _best(
-    role: str, present: list[Message], frames: dict[int, list[bytes]], dbc: Path
-) -> tuple[NamedSignal, ...]:
-    found = []
-    for message in present:
-        for signal in message.signals:
-            score = _name_score(role, message, signal)
-            if score <= 0.0:
-                continue
-            named: tuple[float, float] | tuple[None, None] = (None, None)
-            ends = _range(message, signal, frames.get(_key(message), []), dbc)
-            if ends is not None:
-                low, middle, high = ends
-                bounds = _RANGES[role]
-                if not bounds[0] <= middle <= bounds[1]:
-                    continue
-                if role == "current" and low == high:
-                    score -= 0.5
-                named = (float(low), float(high))
-            else:
-                score -= 1.0 if frames else 0.0
-            unit = (signal.unit or "").strip()
-            found.append(NamedSignal(message.name, signal.name, unit, score, *named))
-    return tuple(sorted(found, key=lambda each: -each.score))
+    @classmethod
+    def of(cls, message: Message, signal: Signal, dbc: Path) -> _Seen:
+        scores = {role: _name_score(role, message, signal) for role in _ROLES}
+        codec = None
+        with suppress(InputError):  # it does not fit into its message
+            codec = signal_codec(message, signal, source=dbc, field=signal.name)
+        return cls(message, signal, {k: score for k, score in scores.items() if score > 0.0}, codec)
+
+    def add(self, payload: bytes) -> None:
+        payload, codec = payload[: self.message.length], self.codec
+        if codec is not None and len(payload) == self.message.length and codec.is_in(payload):
+            value = codec.decode(payload)
+            if not math.isnan(value):
+                self.values.add(value)
+
+    def as_role(self, role: str, *, taken: bool) -> NamedSignal | None:
+        if role not in self.scores:
+            return None
+        score, low, high = self.scores[role], None, None
+        if self.values:
+            low, high = min(self.values), max(self.values)
+            lowest, highest = _RANGES[role]
+            if not lowest <= median(self.values) <= highest:
+                return None
+            score -= 0.5 if role == "current" and low == high else 0.0
+        elif taken:
+            score -= 1.0
+        unit = (self.signal.unit or "").strip()
+        return NamedSignal(self.message.name, self.signal.name, unit, score, low, high)
 
 
 def _name_score(role: str, message: Message, signal: Signal) -> float:
@@ -167,25 +187,10 @@ def _name_score(role: str, message: Message, signal: Signal) -> float:
     score = 2.0 * named + 1.0 * suits
     score += 1.0 * (_PACK.search(signal.name) is not None)
     score += 0.5 * (_PACK.search(message.name) is not None)
-    score -= 1.5 * (_OTHER.search(signal.name) is not None)
+    if role == "temperature":  # by its unit as well; of another part, it is no guess at all
+        score += 2.0 * (suits and not named)
+        score -= 9.0 * (_OTHER.search(_EXTREME.sub("", signal.name)) is not None)
+    else:
+        score -= 1.5 * (_OTHER.search(signal.name) is not None)
     score -= 0.5 * (_OTHER.search(message.name) is not None)
     return score
-
-
-def _range(
-    message: Message, signal: Signal, frames: list[bytes], dbc: Path
-) -> tuple[float, float, float] | None:
-    """Return lowest value, median and highest; None without values."""
-    try:
-        codec = signal_codec(message, signal, source=dbc, field=signal.name)
-    except InputError:
-        return None
-    values = [
-        codec.decode(payload[: message.length])
-        for payload in frames
-        if len(payload) >= message.length and codec.is_in(payload[: message.length])
-    ]
-    good = np.array([value for value in values if value == value])  # noqa: PLR0124 - not NaN
-    if not len(good):
-        return None
-    return float(good.min()), float(np.median(good)), float(good.max())

@@ -125,11 +125,8 @@ def init_command(  # noqa: PLR0917 - typer fills the arguments by name
             address = bus_address(interface, channel, options)
             paths = [_listen(address, seconds, Path(folder) / "live.log")]
         if not paths and dbc is None:
-            raise InputError(
-                "nothing to look at",
-                field="CAPTURE",
-                cure="give a capture, --interface and --channel, or --dbc FILE",
-            )
+            cure = "give a capture, --interface and --channel, or --dbc FILE"
+            raise InputError("nothing to look at", field="CAPTURE", cure=cure)
         asks = sys.stdin is not None and sys.stdin.isatty() and not json_output
         found = _find(paths, dbc, nominal_voltage, presets=presets)
         _choose(found, picks, targets, asks=asks, quiet=json_output)
@@ -141,12 +138,15 @@ def init_command(  # noqa: PLR0917 - typer fills the arguments by name
             found.sign = -1 if found.proven_sign == -1 else 1
             files = found.files(targets, interface, channel, options)
             found.proof |= {"sign": found.proof.get("sign", {}) | {"in_map": found.sign}}
+            if paths:
+                found.proof["current_a"] = sorted(found.sign * a for a in found.proof["current_a"])
     targets.map.parent.mkdir(exist_ok=True)
     write_texts_atomic(files)
     if json_output:
         emit_json({**found.to_dict(), "files": [str(path) for path in files]})
         return
     _show(found)
+    _show_proof(found, paths)
     for path in files:
         note(f"wrote {path}")
     note(
@@ -161,12 +161,8 @@ def _picks(given: Sequence[str]) -> dict[str, int]:
     for text in given:
         role, _, number = text.partition("=")
         if role not in _ROLES or not number.isdecimal() or not 1 <= int(number) <= 9:
-            raise InputError(
-                "not ROLE=N",
-                field="--choose",
-                value=text,
-                cure=f"ROLE is {', '.join(_ROLES)}; N counts from 1: --choose current=2",
-            )
+            cure = f"ROLE is {', '.join(_ROLES)}; N counts from 1: --choose current=2"
+            raise InputError("not ROLE=N", field="--choose", value=text, cure=cure)
         picks[_ROLES[role]] = int(number) - 1
     return picks
 
@@ -186,11 +182,8 @@ class _Targets:
                 raise InputError("given together with -o", field="--map/--config", cure="omit one")
             return cls(folder / "car.toml", folder / "run.toml", folder / "car.dbc")
         if map_file is None or config is None:
-            raise InputError(
-                "no place for the files",
-                field="-o",
-                cure="give -o DIR, or --map FILE --config FILE",
-            )
+            cure = "give -o DIR, or --map FILE --config FILE"
+            raise InputError("no place for the files", field="-o", cure=cure)
         return cls(map_file, config, map_file.parent / f"{map_file.stem or 'car'}.dbc")
 
     def check(self, *, force: bool) -> None:
@@ -261,13 +254,7 @@ class _Found:
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain values for JSON."""
-        levels = {
-            key: [{"scale": level.scale, value: level.value} for level in self.levels(role)]
-            for key, role, value in (
-                ("voltage_levels", "voltage", "voltage_v"),
-                ("soc_levels", "soc_reference", "highest_pct"),
-            )
-        }
+        volts, socs = self.levels("voltage"), self.levels("soc_reference")
         return {
             "method": self.method,
             "vehicle": self.vehicle,
@@ -277,7 +264,8 @@ class _Found:
                 for role in _ROLES.values()
             },
             "remarks": [] if self.findings is None else list(self.findings.remarks),
-            **levels,
+            "voltage_levels": [{"scale": each.scale, "voltage_v": each.value} for each in volts],
+            "soc_levels": [{"scale": each.scale, "highest_pct": each.value} for each in socs],
             "proof": self.proof,
         }
 
@@ -300,10 +288,7 @@ class _Found:
             found = proposal.of_preset(preset.mapping, targets.dbc.name, about)
         elif self.findings is not None:
             texts[targets.dbc] = proposal.dbc_text(self.fields)
-            names = {
-                role: [candidate.name for candidate in of_role]
-                for role, of_role in self.candidates.items()
-            }
+            names = {role: [c.name for c in each] for role, each in self.candidates.items()}
             found = proposal.by_physics(
                 self.fields, names, targets.dbc.name, self.nominal_v, self.findings.comments
             )
@@ -323,7 +308,16 @@ class _Found:
         if not self.proven_sign:
             return "Sign of the current: not proven; `cangauge inspect DRIVE --map FILE` proves it."
         way = "positive values charge on this bus" if self.sign < 0 else "positive discharges"
-        return f"Sign of the current: {way} ({self.proof['sign']['text']})."
+        return f"Sign of the current: {way}; {self.proof['sign']['text']}."
+
+    @property
+    def assumes_temperature(self) -> bool:
+        """Whether the map has a fixed temperature."""
+        from cangauge.bus.vehicle import PRESETS
+
+        if self.vehicle is not None:
+            return PRESETS[self.vehicle].lacks_temperature
+        return "temperature" not in self.chosen
 
     def _by_name(self, targets: _Targets) -> Proposal:
         from cangauge.extras.discovery.proposal import Assignment, Proposal
@@ -331,11 +325,11 @@ class _Found:
         roles = {}
         for role, number in self.chosen.items():
             signal: NamedSignal = self.candidates[role][number]  # type: ignore[assignment]
-            seen = signal.range_text
+            sign = self.sign if role == "current" else 1
+            seen = signal.range_text(sign)
             others = [other.name for other in self.candidates[role] if other is not signal]
             lines = [f"By name and unit: {f'{seen} in' if seen else 'not in'} the capture."]
             lines += [f"Else: {', '.join(others)}."] if others else []
-            sign = self.sign if role == "current" else 1
             roles[role] = Assignment(signal.message, signal.signal, sign, tuple(lines))
         dbc = Path() if self.dbc is None else self.dbc.resolve()
         same = dbc.parent == targets.map.parent.resolve()
@@ -438,29 +432,27 @@ def _choose(
         elif count and found.is_clear(role):
             found.chosen[role] = 0
         elif count and asks:
-            found.chosen[role] = _asked(found, role)
+            _show_role(found, role)
+            pick = int(typer.prompt(f"Which is the {role}?", type=int, default=1, err=True))
+            if not 1 <= pick <= count:
+                raise InputError("no such candidate", field=role, value=pick)
+            found.chosen[role] = pick - 1
         else:
             unclear.append(role)
     if unclear:
-        if not quiet:
-            _show(found)
-        raise _unclear(found, unclear, targets)
+        raise _unclear(found, unclear, targets, quiet=quiet)
 
 
-def _asked(found: _Found, role: str) -> int:
-    _show_role(found, role)
-    number = int(typer.prompt(f"Which is the {role}?", type=int, default=1, err=True))
-    if not 1 <= number <= len(found.candidates[role]):
-        raise InputError("no such candidate", field=role, value=number)
-    return number - 1
-
-
-def _unclear(found: _Found, roles: Sequence[str], targets: _Targets) -> CangaugeError:
-    lines = []
-    for role in roles:
-        names = [f"; {n}) {c.name}" for n, c in enumerate(found.candidates[role], 1)]
-        lines.append(f"{role}: {len(names)} candidates, none clearly ahead{''.join(names)}")
-    lines += [] if found.findings is None else found.findings.remarks
+def _unclear(
+    found: _Found, roles: Sequence[str], targets: _Targets, *, quiet: bool
+) -> CangaugeError:
+    """Return the error of roles without a clear candidate, after tables of them if not `quiet`."""
+    lines = [f"no {' and no '.join(roles)} is clearly ahead of the others"]
+    if not quiet:
+        _show(found)
+    for role in roles if quiet else ():
+        names = [f"{n}) {c.name}" for n, c in enumerate(found.candidates[role], 1)]
+        lines.append(f"{role}: {', '.join(names)}")
     return CangaugeError(
         f"{'; '.join(lines)}; nothing was written to {targets.map.parent}: choose by"
         f" {' '.join(f'--choose {role}=1' for role in roles)}, or record a drive with current steps"
@@ -556,12 +548,25 @@ def _show(found: _Found) -> None:
             _show_role(found, role)
     for remark in () if found.findings is None else found.findings.remarks:
         note(f"note: {remark}")
+
+
+def _show_proof(found: _Found, paths: Sequence[Path]) -> None:
+    from cangauge.extras.discovery.pairs import range_text
+    from cangauge.extras.discovery.proposal import FALLBACK_C
+
     if found.proof.get("samples"):
         amps, volts = found.proof["current_a"], found.proof["voltage_v"]
-        shown = "no voltage" if volts is None else f"{volts[0]:g} … {volts[1]:g} V"
-        note(f"decoded: {found.proof['samples']} samples, {amps[0]:g} … {amps[1]:g} A, {shown}")
+        of = f" of {paths[0].name}" if len(paths) > 1 else ""
+        shown = "no voltage" if volts is None else range_text(volts[0], volts[1], "V")
+        shown = f"{range_text(amps[0], amps[1], 'A')}, {shown}"
+        note(f"decoded: {found.proof['samples']} samples{of}, {shown}")
     if found.findings is None:
         note(_sign_note(found))
+    if found.assumes_temperature:
+        note(
+            f"note: no temperature was found or chosen: the map assumes {FALLBACK_C:g} °C"
+            " (fixed_c); some °C of error are worth several % SoC"
+        )
     if levels := found.levels("voltage"):
         cure = "Give --nominal-voltage V (type plate, or a meter)."
         note(f"note: {_open_scale('voltage', levels)} {cure}")
@@ -588,19 +593,24 @@ def _sign_note(found: _Found) -> str:
 
 
 def _show_role(found: _Found, role: str) -> None:
-    from cangauge.extras.discovery.pairs import SignalCandidate
+    from cangauge.extras.discovery.pairs import SignalCandidate, range_text
     from cangauge.extras.discovery.proposal import UNITS
 
     rows = []
+    title, head = (
+        role.replace("_reference", ""),
+        ["", "<field", "scale", "range", "score", "<evidence"],
+    )
+    if found.findings is None:
+        title, head = f"{title}, by name and unit", ["", "<signal", "range"]
     for number, candidate in enumerate(found.candidates[role], 1):
         taken = "✓" if found.is_proven(role) else "?"
         mark = f"{number} {taken}" if found.chosen.get(role) == number - 1 else str(number)
-        scale, ends, steps, facts = "", "", "", "by name and unit"
         if isinstance(candidate, SignalCandidate):
-            ends = f"{candidate.low:.5g} … {candidate.high:.5g} {UNITS[role]}"
-            scale, steps, facts = f"{candidate.scale:g}", str(candidate.steps), candidate.facts
+            ends = range_text(candidate.low, candidate.high, UNITS[role], candidate.sign)
+            scale, score = f"{candidate.scale:g}", f"{candidate.score:.1f}"
+            rows.append([mark, candidate.name, scale, ends, score, candidate.facts])
         else:
-            ends = candidate.range_text
-        rows.append([mark, candidate.name, scale, ends, steps, f"{candidate.score:.1f}", facts])
-    head = ["", "<field", "scale", "range", "steps", "score", "<evidence"]
-    print_table(role.replace("_reference", ""), head, rows)
+            ends = candidate.range_text(found.sign if role == "current" else 1)
+            rows.append([mark, f"{candidate.message}\n{candidate.signal}", ends])
+    print_table(title, head, rows)

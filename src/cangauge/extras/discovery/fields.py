@@ -24,8 +24,6 @@ MOST_BITS: Final = 16
 MIN_FRAMES: Final = 12
 """Fewest frames of an id that can show how its bits move."""
 MAX_IDS: Final = 1024
-MAX_FRAMES: Final = 30_000
-"""Frames of an id that are kept: five minutes at 100 Hz; further ones add little evidence."""
 STEADY: Final = 0.55
 """Least share of equal steps of an alive counter. A capture that loses a quarter of its frames
 still has 0.75."""
@@ -102,9 +100,8 @@ def collect(messages: Iterable[can.Message]) -> list[Stream]:
             if len(times) >= MAX_IDS:
                 continue
             times[key], data[key] = [], []
-        if len(times[key]) < MAX_FRAMES:
-            times[key].append(message.timestamp)
-            data[key].append(bytes(message.data))
+        times[key].append(message.timestamp)
+        data[key].append(bytes(message.data))
     streams = []
     for key, stamps in times.items():
         lengths = np.array([len(each) for each in data[key]])

@@ -54,6 +54,8 @@ CURRENT_SCALES: Final = {
 SOC_SCALES: Final = (0.1, 0.5, 0.01, 1.0, 0.05, 0.025, 0.02, 0.4)
 """Usual scales of a SoC [%]."""
 SHOWN: Final = 3
+LARGEST_RATIO: Final = 2.0
+"""Largest ratio of the resistances by two halves of a capture: a coincidence does not repeat."""
 CLEARLY_NATS: Final = 3.0
 """Distance to the second candidate that makes the first clear: a likelihood ratio of 20."""
 SATURATION_NATS: Final = 20.0
@@ -134,15 +136,22 @@ class SignalCandidate:
     capacity_ah: float = math.nan
 
     @property
+    def is_repeated(self) -> bool:
+        """Whether both halves of the capture show alike resistances."""
+        one, two = self.halves_ohm
+        return max(one, two) <= LARGEST_RATIO * min(one, two)
+
+    @property
     def facts(self) -> str:
         """The evidence in a phrase."""
-        if self.evidence <= 0.0:
-            return "smooth; no steps prove it"
+        if self.evidence < 1.0:
+            return "smooth; nothing else proves it"
+        r = abs(self.correlation)
         if math.isnan(self.resistance_ohm):
-            return f"r {self.correlation:+.2f} with the charge, {self.partner}"
-        one, two = self.halves_ohm
-        ohm = f"R {self.resistance_ohm:.3g} Ω ({one:.2g}, {two:.2g} by halves)"
-        return f"r {self.correlation:+.2f} with {self.partner}, {ohm}"
+            return f"falls with the charge (correlation {r:.2f}), {self.partner}"
+        text = f"voltage falls when current rises: with {self.partner}, correlation {r:.2f}"
+        text += f", R {self.resistance_ohm:.2g} Ω"
+        return text if self.is_repeated else f"{text}, but not in both halves of the capture"
 
     def rescaled(self, scale: float) -> SignalCandidate:
         """Return a SoC with another scale, and the capacity that follows."""
@@ -197,6 +206,10 @@ class SignalCandidate:
         }
 
 
+Candidates = tuple[SignalCandidate, ...]
+_Found = list[SignalCandidate]
+
+
 @dataclass
 class Row:
     """A field on the grid, as a current or as a voltage."""
@@ -213,6 +226,12 @@ class Row:
     def steps(self) -> int:
         """Number of changes."""
         return int(np.count_nonzero(np.diff(self.field.raw[~self.missing])))
+
+
+def range_text(low: float, high: float, unit: str, sign: int = 1) -> str:
+    """Return a range of values of a sign."""
+    ends = sorted((sign * low + 0.0, sign * high + 0.0))
+    return f"{ends[0]:.5g} … {ends[1]:.5g} {unit}".replace("-", "−")
 
 
 def is_capacity(capacity_ah: float) -> bool:
@@ -395,34 +414,32 @@ class Pairs:
             & ((alike & (lost < 0.1 * (1.0 + slope**2))) | (count > MANY_MOVES))
         )
 
-    def best(
-        self, make: Any
-    ) -> tuple[tuple[SignalCandidate, ...], tuple[SignalCandidate, ...], Row | None]:
+    def best(self, make: Any) -> tuple[Candidates, Candidates, Row | None]:
         """Return the best candidates for current and voltage, and the row of the first current."""
         chosen: Row | None = None
         roles: tuple[list[Row], list[Row]] = ([], [])
-        currents: list[SignalCandidate] = []
-        voltages: list[SignalCandidate] = []
+        found: tuple[_Found, _Found] = ([], [])
         flat = np.argsort(-self.score, axis=None)[: 200 * 200]
         for place in flat:
             a, b = divmod(int(place), self.score.shape[1])
             u, i = self._voltages[a], self._currents[b]
             if self.score[a, b] < IMPOSSIBLE / 2.0:
                 break
-            if self._share_bits(u, i):
-                continue
             # A field of a better pair keeps its role.
-            if any(self._share_bits(u, other) for other in roles[0]):
-                continue
-            if any(self._share_bits(i, other) for other in roles[1]):
+            rivals = [
+                (u, i),
+                *((u, other) for other in roles[0]),
+                *((i, other) for other in roles[1]),
+            ]
+            if any(self._share_bits(*pair) for pair in rivals):
                 continue
             roles[0].append(i)
             roles[1].append(u)
             chosen = chosen or i
-            self._add(currents, voltages, a, b, make)
-            if len(currents) >= SHOWN and len(voltages) >= SHOWN:
+            self._add(found, a, b, make)
+            if min(map(len, found)) >= SHOWN:
                 break
-        return tuple(currents[:SHOWN]), tuple(voltages[:SHOWN]), chosen
+        return tuple(found[0][:SHOWN]), tuple(found[1][:SHOWN]), chosen
 
     def _share_bits(self, one: Row, two: Row) -> bool:
         """Whether two fields share bits; a gateway repeats frames on other buses."""
@@ -431,35 +448,22 @@ class Pairs:
             return False
         return bool(one.place.bits(a.length) & two.place.bits(b.length))
 
-    def _add(
-        self,
-        currents: list[SignalCandidate],
-        voltages: list[SignalCandidate],
-        a: int,
-        b: int,
-        make: Any,
-    ) -> None:
+    def _add(self, pair: tuple[_Found, _Found], a: int, b: int, make: Any) -> None:
         u, i = self._voltages[a], self._currents[b]
-        score, evidence = float(self.score[a, b]), float(self.evidence[a, b])
         amps = float(self.current_scale[a, b])
-        ohm = float(self.slope[a, b]) * u.scale / amps
         halves = self._halves(a, b)
         sign = 1 if self.r[a, b] < 0.0 else -1
-        half_ohm = (halves[0] * u.scale / amps, halves[1] * u.scale / amps)
         facts = {
-            "score": score,
-            "evidence": evidence,
+            "score": float(self.score[a, b]),
+            "evidence": float(self.evidence[a, b]),
             "correlation": float(self.r[a, b]),
-            "resistance_ohm": ohm,
-            "halves_ohm": half_ohm,
+            "resistance_ohm": float(self.slope[a, b]) * u.scale / amps,
+            "halves_ohm": (halves[0] * u.scale / amps, halves[1] * u.scale / amps),
         }
         zero = self._zero(i)
         current = make(i, amps, -amps * zero, sign=sign, **facts)
         voltage = make(u, u.scale, 0.0, sign=1, **facts)
-        for found, each, partner in (
-            (currents, current, voltage),
-            (voltages, voltage, current),
-        ):
+        for found, each, partner in zip(pair, (current, voltage), (voltage, current), strict=True):
             bits = each.place.bits(each.length)
             if not any(
                 overlap(each, bits, one, one.place.bits(one.length))

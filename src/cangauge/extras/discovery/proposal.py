@@ -15,9 +15,10 @@ from cangauge.extras.discovery.pairs import (
     VOLTAGE_SCALES,
     SignalCandidate,
     is_capacity,
+    range_text,
 )
 
-UNITS: Final = {"current": "A", "voltage": "V", "temperature": "degC", "soc_reference": "%"}
+UNITS: Final = {"current": "A", "voltage": "V", "temperature": "°C", "soc_reference": "%"}
 SIGNALS: Final = {
     "current": "current_a",
     "voltage": "voltage_v",
@@ -25,7 +26,7 @@ SIGNALS: Final = {
     "soc_reference": "soc_pct",
 }
 """Names of the signals in a DBC that is written."""
-_FALLBACK_C: Final = 20.0
+FALLBACK_C: Final = 20.0
 """Temperature of a map without one [°C]: the reference temperature of the voltage model."""
 _NOMINAL_CELL_V: Final = 3.7
 """Nominal voltage of an oxide cell [V]: tells how many cells a scale would mean."""
@@ -93,9 +94,9 @@ def levels(role: str, candidate: SignalCandidate, nominal_v: float | None) -> li
         middle = (candidate.low + candidate.high) / 2.0 / candidate.scale
         for scale in VOLTAGE_SCALES:
             volts = scale * middle
-            text = f"{volts:.0f} V at {scale:g} V a step"
+            text = f"{volts:.3g} V at {scale:g} V a step"
             text += f" (about {round(volts / _NOMINAL_CELL_V)} cells)"
-            if scale == candidate.scale or 60.0 < volts < 1000.0:
+            if scale == candidate.scale or 30.0 < volts < 1000.0:
                 found.append(Level(scale, volts, text))
     if role == "soc_reference":
         for scale in SOC_SCALES:
@@ -122,32 +123,18 @@ def by_physics(
     nominal_v: float | None,
     comments: Sequence[str],
 ) -> Proposal:
-    """Return the map of fields that were found by physics.
+    """Return the map of fields that were found by physics, as `comments` say.
 
-    Parameters
-    ----------
-    chosen : mapping of str to SignalCandidate
-    names : mapping of str to sequence of str
-        All candidates by role.
-    dbc : str
-    nominal_v : float, optional
-        Stated voltage of the pack [V].
-    comments : sequence of str
-        How they were found.
+    `names` are those of all candidates by role; `nominal_v` is the stated voltage of the pack [V].
     """
     roles = {}
     for role, candidate in chosen.items():
-        unit = UNITS[role].replace("degC", "°C")
-        ends = f"{candidate.low:.5g} … {candidate.high:.5g} {unit}"
+        ends = range_text(candidate.low, candidate.high, UNITS[role], candidate.sign)
         lines = [f"{candidate.name}: {ends}, {candidate.steps} steps."]
         if role == "temperature":
             lines.insert(0, "A guess by range and slowness: compare it with the car's display.")
-        elif role == "soc_reference":
-            lines.append(
-                f"Falls with the charge (r = {candidate.correlation:.2f}): {candidate.partner}."
-            )
         else:
-            lines.append(_physics_line(candidate))
+            lines.append(f"{candidate.facts[0].upper()}{candidate.facts[1:]}.")
         lines += _scale_lines(role, candidate, nominal_v)
         others = [name for name in names[role] if name != candidate.name]
         lines += [f"Else: {', '.join(others)}."] if others else []
@@ -163,16 +150,6 @@ def by_physics(
         "meter or the car's display, and correct factor and offset in the DBC.",
     )
     return Proposal("own car", dbc, roles, head, pair_s)
-
-
-def _physics_line(candidate: SignalCandidate) -> str:
-    if candidate.evidence < 1.0:
-        return "By its smoothness alone: no current steps that a voltage follows."
-    one, two = candidate.halves_ohm
-    return (
-        f"ΔU = −R·ΔI with {candidate.partner}: R = {candidate.resistance_ohm:.3g} Ω, r = "
-        f"{candidate.correlation:+.2f}; by halves of the capture {one:.3g} and {two:.3g} Ω."
-    )
 
 
 def _scale_lines(role: str, candidate: SignalCandidate, nominal_v: float | None) -> list[str]:
@@ -236,7 +213,8 @@ def dbc_text(chosen: Mapping[str, SignalCandidate]) -> str:
             order, sign = int(not place.is_motorola), "-" if place.is_signed else "+"
             lines.append(
                 f" SG_ {SIGNALS[role]}{mark} : {candidate.start}|{place.width}@{order}{sign}"
-                f' ({candidate.scale:.10g},{candidate.offset + 0.0:.10g}) [0|0] "{UNITS[role]}"'
+                f" ({candidate.scale:.10g},{candidate.offset + 0.0:.10g}) [0|0]"
+                f' "{UNITS[role].replace("°", "deg")}"'
                 " Vehicle"
             )
             if code is not None:
@@ -274,7 +252,7 @@ def map_text(proposal: Proposal) -> str:
             " some °C",
             "# worth several % SoC: name a signal here when you find one.",
             "[temperature]",
-            f"fixed_c = {_FALLBACK_C:g}",
+            f"fixed_c = {FALLBACK_C:g}",
         ]
     for message in dict.fromkeys([*proposal.periods_s, *proposal.protection]):
         lines += ["", f"[messages.{message}]"]

@@ -10,11 +10,14 @@ import logging
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
+from itertools import islice
 from typing import Any, Final
 
 import can
 import numpy as np
 
+from cangauge._text import duration
 from cangauge._typing import FloatArray
 from cangauge.errors import InputError
 from cangauge.extras.discovery.fields import Field, Stream, byte_order, collect, fields_of
@@ -26,6 +29,7 @@ from cangauge.extras.discovery.pairs import (
     SHOWN,
     SOC_SCALES,
     VOLTAGE_SCALES,
+    Candidates,
     Pairs,
     Row,
     SignalCandidate,
@@ -57,9 +61,13 @@ AT_HALF_NATS: Final = 3.0
 """A number that rests at half its range, to this share, is a torque, a yaw rate or the like with
 an offset; a voltage is there by chance once in twenty or thirty."""
 ENOUGH_STEPS: Final = 50
-LARGEST_RATIO: Final = 2.0
-"""Fewest changes of a field that is taken without the user, and largest ratio of the resistances by
-the two halves of the capture: a coincidence does not repeat."""
+"""Fewest changes of a field that is taken without the user."""
+MOST_FRAMES: Final = 1_000_000
+"""Frames that are looked at, all ids over one time: 5–15 minutes of a car, hours of a module."""
+
+
+_Taken = tuple[SignalCandidate, frozenset[int]]
+"""A field and its bits."""
 
 
 @dataclass(frozen=True)
@@ -75,10 +83,10 @@ class Findings:
     duration_s : float
     """
 
-    current: tuple[SignalCandidate, ...]
-    voltage: tuple[SignalCandidate, ...]
-    soc_reference: tuple[SignalCandidate, ...]
-    temperature: tuple[SignalCandidate, ...]
+    current: Candidates
+    voltage: Candidates
+    soc_reference: Candidates
+    temperature: Candidates
     remarks: tuple[str, ...]
     streams: int
     fields: int
@@ -94,11 +102,10 @@ class Findings:
 
     def is_clear(self, role: str) -> bool:
         """Whether the first candidate is certain enough to be taken without the user."""
-        found: tuple[SignalCandidate, ...] = getattr(self, role)
+        found: Candidates = getattr(self, role)
         if not found or found[0].evidence < ENOUGH_NATS or found[0].steps < ENOUGH_STEPS:
             return False
-        one, two = found[0].halves_ohm
-        if not max(one, two) <= LARGEST_RATIO * min(one, two):
+        if not found[0].is_repeated:
             return False
         if any(each.evidence > RIVAL * found[0].evidence for each in found[1:]):
             return False  # the inverter's pair and the pack's: both obey the same physics
@@ -119,7 +126,8 @@ def search(messages: Iterable[can.Message], nominal_v: float | None = None) -> F
     InputError
         If no id has enough frames.
     """
-    streams = collect(messages)
+    frames = iter(messages)
+    streams = collect(islice(frames, MOST_FRAMES))
     if not streams:
         raise InputError(
             "no id has enough frames to search", cure="record at least a minute, while driving"
@@ -129,7 +137,11 @@ def search(messages: Iterable[can.Message], nominal_v: float | None = None) -> F
     for index, stream in enumerate(streams):
         _LOG.debug("id %d of %d: %s", index + 1, len(streams), stream.name)
         fields += fields_of(index, stream, order)
-    return _Search(streams, fields, nominal_v).findings()
+    found = _Search(streams, fields, nominal_v).findings()
+    if next(frames, None) is None:
+        return found
+    part = f"ranges and steps are those of the first {duration(found.duration_s)}"
+    return replace(found, remarks=(*found.remarks, part))
 
 
 class _Search:
@@ -158,9 +170,13 @@ class _Search:
         currents = sorted(currents, key=lambda row: -row.prior)[:MOST_CURRENTS]
         voltages = sorted(voltages, key=lambda row: -row.prior)[:MOST_VOLTAGES]
         remarks: list[str] = []
+        result = partial(
+            Findings, streams=len(self._streams), fields=len(self._fields),
+            duration_s=self._duration_s,
+        )  # fmt: skip
         if not currents or not voltages:
-            remarks.append("no field of this capture can be the current or the voltage of a pack")
-            return self._result((), (), (), (), remarks)
+            remark = "no field of this capture can be the current or the voltage of a pack"
+            return result((), (), (), (), (remark,))
         pairs = Pairs(
             [self._grid(row) for row in currents],
             [self._grid(row) for row in voltages],
@@ -176,28 +192,13 @@ class _Search:
                 " chosen by their smoothness alone; record while driving"
             )
         taken = [(each, each.place.bits(each.length)) for each in (*current[:1], *voltage[:1])]
-        soc: tuple[SignalCandidate, ...] = ()
-        if row is not None:
-            soc = self._charges(current[0], row)
+        soc = () if row is None else self._charges(current[0], row, taken)
         if not soc:
             remarks.append("no field falls with the charge: record a longer drive to find the SoC")
         temperature = self._temperatures(taken)
         if not temperature:
             remarks.append("no slow field looks like a temperature")
-        return self._result(current, voltage, soc, temperature, remarks)
-
-    def _result(
-        self,
-        current: tuple[SignalCandidate, ...],
-        voltage: tuple[SignalCandidate, ...],
-        soc: tuple[SignalCandidate, ...],
-        temperature: tuple[SignalCandidate, ...],
-        remarks: list[str],
-    ) -> Findings:
-        return Findings(
-            current, voltage, soc, temperature, tuple(remarks), len(self._streams),
-            len(self._fields), self._duration_s,
-        )  # fmt: skip
+        return result(current, voltage, soc, temperature, tuple(remarks))
 
     def _rate_prior(self, stream: Stream) -> float:
         """Return the log prior of a period: pack messages are fast, and not in turns."""
@@ -304,8 +305,8 @@ class _Search:
             **more,
         )
 
-    def _charges(self, current: SignalCandidate, row: Row) -> tuple[SignalCandidate, ...]:
-        """Return fields that fall as the current is drawn."""
+    def _charges(self, current: SignalCandidate, row: Row, taken: Sequence[_Taken]) -> Candidates:
+        """Return fields that fall as the current is drawn, of other bits than those `taken`."""
         amps = current.scale * (self._grid(row) + row.constant) + current.offset
         amps *= current.sign
         drawn_ah = np.cumsum(amps) * self._step_s / 3600.0
@@ -316,7 +317,7 @@ class _Search:
             if each.place.is_signed or seen.count < 4:
                 continue
             made = self._as_charge(index, drawn_ah[span], span)
-            if made is not None:
+            if made is not None and not _is_taken(made, taken):
                 found.append(made)
         return _apart(found)[:SHOWN]
 
@@ -359,9 +360,7 @@ class _Search:
                     )  # fmt: skip
         return best
 
-    def _temperatures(
-        self, taken: Sequence[tuple[SignalCandidate, frozenset[int]]]
-    ) -> tuple[SignalCandidate, ...]:
+    def _temperatures(self, taken: Sequence[_Taken]) -> Candidates:
         """Return slow fields in a plausible range, those of the pack's bus first."""
         buses = {each.bus for each, _ in taken}
         found = []
@@ -387,8 +386,7 @@ class _Search:
                     candidate = self._candidate(
                         row, scale, offset, sign=1, score=prior, evidence=0.0
                     )
-                    bits = place.bits(stream.length)
-                    if not any(overlap(candidate, bits, other, b) for other, b in taken):
+                    if not _is_taken(candidate, taken):
                         found.append(candidate)
         return _apart(found)[:SHOWN]
 
@@ -427,8 +425,6 @@ class _Statistics:
 def _level_prior(volts: float, nominal_v: float | None = None) -> float:
     """Return the log prior of a pack's voltage [nats]: most cars have 250–450 V."""
     if nominal_v is not None:
-        if volts <= 0.0:
-            return IMPOSSIBLE
         return -0.5 * (math.log(volts / nominal_v) / NOMINAL_SPREAD) ** 2
     if 250.0 <= volts <= 450.0:
         return 0.0
@@ -449,11 +445,15 @@ def _full_scale_prior(scale: float, width: int) -> float:
     return -1.0
 
 
-def _apart(found: list[SignalCandidate]) -> tuple[SignalCandidate, ...]:
+def _apart(found: list[SignalCandidate]) -> Candidates:
     """Return candidates, best first, without those that share bits with a better one."""
-    kept: list[tuple[SignalCandidate, frozenset[int]]] = []
+    kept: list[_Taken] = []
     for each in sorted(found, key=lambda one: -one.score):
-        bits = each.place.bits(each.length)
-        if not any(overlap(each, bits, other, taken) for other, taken in kept):
-            kept.append((each, bits))
+        if not _is_taken(each, kept):
+            kept.append((each, each.place.bits(each.length)))
     return tuple(each for each, _ in kept)
+
+
+def _is_taken(one: SignalCandidate, taken: Sequence[_Taken]) -> bool:
+    bits = one.place.bits(one.length)
+    return any(overlap(one, bits, other, others) for other, others in taken)

@@ -16,6 +16,9 @@
     typeof value === "number" ? `${fixed(value, digits)}${unit && " " + unit}` : "–";
   const pm = (value, std, digits, unit) =>
     typeof value === "number" ? `${fixed(value, digits)} ± ${num(std, digits)} ${unit}` : "–";
+  // A possible current without deviation is the largest that the model's logs had.
+  const possible = (a, std) => a && std === 0 ? `at least ${Number(a.toPrecision(3))} A` : pm(a, std, 1, "A");
+  const energy = (wh, std) => wh < 1000 ? pm(wh, std, wh < 100 ? 2 : 0, "Wh") : pm(scaled(wh, 1e-3), scaled(std, 1e-3), 2, "kWh");
   const scaled = (value, factor) => (typeof value === "number" ? value * factor : null);
   const words = bits => Object.entries(FACTS.reasons).filter(([bit]) => bits & bit).map(([, text]) => text);
   // bokeh's axes show UTC: local time is drawn by moving the stamps.
@@ -54,9 +57,9 @@
       "Capacity": pm(health?.capacity_ah, health?.capacity_std_ah, 1, "Ah"),
       "Resistance, to model": pm(health?.resistance_ratio, health?.resistance_std, 2, "×"),
       "Current offset": pm(health?.offset_a, health?.offset_std_a, 2, "A"),
-      "Possible discharge, 10 s": pm(power?.discharge_a, power?.discharge_std_a, 1, "A"),
-      "Possible charge, 10 s": pm(power?.charge_a, power?.charge_std_a, 1, "A"),
-      "Energy left": pm(scaled(power?.energy_wh, 1e-3), scaled(power?.energy_std_wh, 1e-3), 2, "kWh"),
+      "Possible discharge, 10 s": possible(power?.discharge_a, power?.discharge_std_a),
+      "Possible charge, 10 s": possible(power?.charge_a, power?.charge_std_a),
+      "Energy left": energy(power?.energy_wh, power?.energy_std_wh),
       ...(cells ? {
         "Weakest cell": cells.weakest === null ? "not distinguishable" : `number ${cells.weakest} of ${cells.cells}`,
         "SoC of that cell": pm(cells.soc_pct, cells.soc_std_pct, 1, "%"),
@@ -67,7 +70,8 @@
 
   function show(status, latest) {
     put(at("place"), `${status.vehicle} on ${status.bus}`);
-    put(at("soc"), pm(status.estimate.soc_pct, status.estimate.soc_std_pct, 2, "%"));
+    const { soc_pct, soc_std_pct } = status.estimate;
+    put(at("soc"), soc_pct === null ? "not known yet" : pm(soc_pct, soc_std_pct, 2, "%"));
     put(at("state"), status.status);
     at("state").dataset.status = status.status;
     put(at("reasons"), words(latest.reasons).join("; "));
