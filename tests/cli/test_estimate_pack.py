@@ -155,3 +155,14 @@ def test_the_pack_table_needs_a_known_suffix(run: Run, made: Path, tmp_path: Pat
               tmp_path / "soc.csv", "--pack", tmp_path / "pack.txt")  # fmt: skip
     assert ran.code == 2
     assert "--pack" in ran.err
+
+
+def test_rows_of_a_long_log_are_limited_and_reach_its_end(
+    run: Run, made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("cangauge.service.offline.PACK_ROWS", 60)
+    options = ("-o", tmp_path / "soc.csv", "--pack", tmp_path / "pack.csv")
+    assert run("estimate", made / "part.csv", "-m", made / "model.json", *options).code == 0
+    time_s = pa.csv.read_csv(tmp_path / "pack.csv")["time_s"].to_numpy()
+    assert 50 <= time_s.size <= 61
+    assert time_s[-1] > 0.95 * 0.4 * 3600.0

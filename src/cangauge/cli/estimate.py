@@ -123,9 +123,10 @@ def estimate_command(  # noqa: PLR0917 - typer passes options by name
     invalid) and reasons (separated by "; "). An unknown value is empty (CSV) or null (Parquet).
     An .mcap holds samples and estimates for Foxglove and PlotJuggler. Positive current discharges.
 
-    PACK has one row per second: capacity_ah, resistance_ratio, offset_a, discharge_a and charge_a
-    (possible for 10 s), energy_wh (left), with standard deviations; and, where the log has cell
-    voltages (columns cell_1_v, cell_2_v, …, or [cells] of the map file), the weakest cell.
+    PACK has one row per second, of a log over an hour 3,600 rows: capacity_ah, resistance_ratio,
+    offset_a, discharge_a and charge_a (possible for 10 s), energy_wh (left), with standard
+    deviations; and, where the log has cell voltages (columns cell_1_v, cell_2_v, …, or [cells] of
+    the map file), the weakest cell.
 
     Examples
     --------
@@ -183,7 +184,9 @@ def estimate_command(  # noqa: PLR0917 - typer passes options by name
                 settings,
                 soc_from_log=initial_soc is None,
                 gap_from_log=max_gap_s is None,
-                pack=PackHistory(keeps_rows=pack is not None, cells=cells),
+                pack=PackHistory(
+                    keeps_rows=pack is not None, cells=cells, duration_s=log.duration_s
+                ),
                 progress=progress,
             )
         if max_gap_s is None and done.settings.gap_s > GAP_S:

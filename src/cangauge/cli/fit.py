@@ -6,7 +6,6 @@ from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
-import numpy as np
 import typer
 
 from cangauge._extras import extra
@@ -203,6 +202,8 @@ def fit_command(  # noqa: PLR0917 - typer passes options by name
 
 def _cells_of(path: Path, log: Log, reading: ReadingOptions) -> int | None:
     """Return the number of cells in series that a log's columns of cells prove, or None."""
+    import numpy as np
+
     from cangauge.logs.read import LogFile, read_cells
 
     if not isinstance(reading.open(path), LogFile):

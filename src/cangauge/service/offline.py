@@ -46,7 +46,9 @@ from cangauge.types import Estimate, Reason, Sample, reason_name, reason_sentenc
 PROGRESS_EVERY: Final = 50_000
 """Frames between two calls of the progress callback."""
 PACK_EVERY_S: Final = 1.0
-"""Interval of the rows of health, power and cells [s]."""
+"""Least interval of the rows of health, power and cells [s]."""
+PACK_ROWS: Final = 3600
+"""Most rows of them for a log: each takes 5 ms, and they change over minutes."""
 PACK_VOLTAGE_MARGIN: Final = 0.2
 """Relative margin around the pseudo-OCV's range; a median voltage outside it is another pack's."""
 DOUBTFUL_VALID: Final = 0.1
@@ -109,12 +111,20 @@ Recorded = Log | RecordedCapture
 class PackHistory:
     """Health, power and cells of a recording: at the end, in `report` (None without a sample).
 
-    With `keeps_rows` also at the first sample of each second, in `columns`. `cells` are the cell
-    voltages of a log, by its rows.
+    With `keeps_rows` also at the first sample of each interval, in `columns`: of a second, and in a
+    log of a duration [s] long enough that there are `PACK_ROWS`. `cells` are the cell voltages of
+    a log, by its rows.
     """
 
-    def __init__(self, *, keeps_rows: bool = False, cells: CellColumns | None = None) -> None:
+    def __init__(
+        self,
+        *,
+        keeps_rows: bool = False,
+        cells: CellColumns | None = None,
+        duration_s: float = 0.0,
+    ) -> None:
         self.report: PackReport | None = None
+        self._every_s = max(PACK_EVERY_S, duration_s / PACK_ROWS)
         self._keeps_rows = keeps_rows
         self._cells = cells
         self._cell_estimator: CellEstimator | None = None
@@ -142,9 +152,9 @@ class PackHistory:
         self.add(sample.time_s, lambda: self._report_of(estimator))
 
     def add(self, time_s: float, report: Callable[[], PackReport]) -> None:
-        """Keep the report of a sample's time [s], if its second has begun."""
-        if self._keeps_rows and not self._due_s - PACK_EVERY_S <= time_s < self._due_s:
-            self._due_s = time_s + PACK_EVERY_S
+        """Keep the report of a sample's time [s], if its interval has begun."""
+        if self._keeps_rows and not self._due_s - self._every_s <= time_s < self._due_s:
+            self._due_s = time_s + self._every_s
             self._rows.append((time_s, report()))
 
     def take(self, estimator: Estimator) -> None:
