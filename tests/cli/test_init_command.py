@@ -45,6 +45,7 @@ def test_an_unclear_pair_exits_with_one_and_names_three(mitsubishi: Path, tmp_pa
     assert done.code == 1
     assert "1   0x373 23|16@0+" in done.out
     assert "no current and no voltage is clearly ahead" in done.err
+    assert "the scale of the voltage is open (--nominal-voltage V decides it)" in done.err
     assert "0x373" not in done.err  # the tables name them
     assert "by halves" not in done.out
     assert "voltage falls when" in done.out
@@ -70,6 +71,9 @@ def test_chosen_candidates_make_files_that_decode(mitsubishi: Path, tmp_path: Pa
     again = init(mitsubishi, "-o", folder, *choice)
     assert again.code == 2
     assert "--force" in again.err
+    forced = init(mitsubishi, "-o", folder, *choice, "--force")
+    voltage = re.split(r"^(?:voltage|soc) *$", forced.out, flags=re.MULTILINE)[1]
+    assert "1 ✓" in voltage
 
 
 def test_a_dbc_gives_signals_by_name(mitsubishi: Path, tmp_path: Path) -> None:

@@ -448,6 +448,8 @@ def _unclear(
 ) -> CangaugeError:
     """Return the error of roles without a clear candidate, after tables of them if not `quiet`."""
     lines = [f"no {' and no '.join(roles)} is clearly ahead of the others"]
+    if found.findings is not None and found.nominal_v is None:
+        lines.append("the scale of the voltage is open (--nominal-voltage V decides it)")
     if not quiet:
         _show(found)
     for role in roles if quiet else ():
