@@ -12,7 +12,15 @@ import pytest
 from cangauge.bus.vehicle import Vehicle
 from cangauge.logs.canonical import write_log
 from cangauge.service.offline import estimate_capture
-from live import Command, in_process, leaf_model, leaf_model_path, run_to_end, short_log
+from live import (
+    Command,
+    in_process,
+    leaf_model,
+    leaf_model_path,
+    run_to_end,
+    short_log,
+    waits,
+)
 
 pytestmark = pytest.mark.slow
 
@@ -50,6 +58,8 @@ def test_a_whole_run(bus: list[str], tmp_path: Path) -> None:
     found = in_process("status", "--endpoint", sock, "--json")
     assert found.json["samples"] == 1200
     assert found.json["latency"]["count"] > 0
+    # Health and possible current are renewed once a second.
+    assert waits(lambda: "energy left" in in_process("status", "--endpoint", sock).out, 10.0)
     shown = in_process("status", "--endpoint", sock).out
     assert all(name in shown for name in ("capacity", "possible discharge, 10 s", "energy left"))
     assert found.json["record"]["lost_frames"] == 0
