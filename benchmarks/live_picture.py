@@ -12,6 +12,7 @@ import argparse
 import io
 import subprocess
 import sys
+import tempfile
 import time
 from pathlib import Path
 from typing import Any, Final
@@ -21,10 +22,13 @@ from PIL import Image
 from cangauge._resources import shared_file
 from cangauge.bus.open import bus_address
 from cangauge.extras.report.charts import AMBER, BLUE, GREEN, ORANGE
+from cangauge.identify.fit import fit
+from cangauge.logs.read import read_log
 from live_page import PAGE_PORT, chromium
 from live_service import command, service
 
 BUS: Final = bus_address("udp_multicast", "239.74.163.93", {"port": 43_563})
+TRAINED_ON: Final = shared_file("replay", "leaf2012_reconstruction_white.parquet")
 LOG: Final = shared_file("replay", "leaf2012_reconstruction_correlated.parquet")
 EVERY_S: Final = 0.25
 SIZE: Final = (1264, 826)
@@ -57,11 +61,15 @@ def main() -> None:
     parser.add_argument("-o", "--output", type=Path, default=Path("docs/live.gif"))
     parser.add_argument("--seconds", type=float, default=20.0)
     given = parser.parse_args()
-    arguments = ("--time-source", "replay-clock")
-    page = ("--dashboard", str(PAGE_PORT), "--status-socket", "off")
-    with service(BUS, *arguments, *page), chromium(PAGE_PORT) as browser:
-        browser.set_window_size(SIZE[0], 1200)
-        found = pictures(browser)
+    arguments = ("--time-source", "replay-clock", "--status-socket", "off")
+    page = ("--dashboard", str(PAGE_PORT))
+    with tempfile.TemporaryDirectory() as folder:
+        model = Path(folder) / "model.json"  # as in `cangauge demo`
+        fit([read_log(TRAINED_ON)], equation="published").model.save(model)
+        of_model = ("--model", str(model))
+        with service(BUS, *arguments, *page, *of_model), chromium(PAGE_PORT) as browser:
+            browser.set_window_size(SIZE[0], 1200)
+            found = pictures(browser)
     found = found[:: -(-len(found) // PICTURES)]
     # One palette for all pictures: what does not change costs nothing then.
     sample = found[-1].copy()
