@@ -15,8 +15,8 @@ from faults.line import vcan
 from faults.process import prepare
 from faults.run import Jobs, run_all
 
-# Fails in about one run of four in a guest of one slow core; whether the guest or the service is the
-# cause is open.
+# Fails in about one run of four in a guest of one slow core; whether guest or service is the cause
+# is open.
 pytestmark = [pytest.mark.socketcan, pytest.mark.slow, pytest.mark.nightly]
 
 SEED = 3
