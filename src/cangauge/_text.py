@@ -32,7 +32,7 @@ def significant(value: float | None, digits: int = 4, unit: str = "") -> str:
 
 
 def rounded(value: float, digits: int = 3) -> str:
-    """Return a number of at most so many significant digits, without zeros behind.
+    """Return a number with at most `digits` significant digits, without trailing zeros.
 
     Examples
     --------
