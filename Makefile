@@ -92,7 +92,8 @@ faults: $(VENV)/installed
 
 site: export NO_MKDOCS_2_WARNING := 1
 site: $(VENV)/installed-docs
-	$(BIN)/mkdocs build --strict --quiet
+	$(BIN)/python docs/pages.py out/docs
+	$(BIN)/zensical build --clean --strict
 	@echo "out/site/index.html"
 
 wheel:
