@@ -33,12 +33,10 @@ from cangauge.service.status_client import StatusSocket, socket_path
 from cangauge.types import reason_names
 
 OUTPUTS: Final = {
-    "output": "cangauge.service.estimate_table",
-    "http": "cangauge.extras.live.http",
-    "mqtt": "cangauge.extras.live.mqtt",
-    "dashboard": "cangauge.extras.live.launch",
+    "cangauge.service.estimate_table": ("output",),
+    "cangauge.extras.live.launch": ("http", "dashboard", "mqtt"),
 }
-"""Modules with an output, by the key that asks for it; imported only then. Each has
+"""Modules with an output, and the keys that ask for it; imported only then. Each has
 `make_output(service)`."""
 _LOG = logging.getLogger(__name__)
 
@@ -155,14 +153,15 @@ class Service:
                 config.model,
                 notifier=notifier,
                 record=lambda: recorder.state,
+                troubles=lambda: [text for each in self._outputs if (text := each.trouble)],
                 show_every_s=SHOW_EVERY_S if config.dashboard is None else PAGE_EVERY_S,
                 sign_cure=self._setup.sign_cure,
             )
             self._outputs.insert(0, recorder)
             for output in self._outputs:
                 stack.callback(output.close)
-            for key, module in OUTPUTS.items():
-                if getattr(config, key) is not None:
+            for module, keys in OUTPUTS.items():
+                if any(getattr(config, key) is not None for key in keys):
                     self._outputs.append(import_module(module).make_output(self))
                     stack.callback(self._outputs[-1].close)
             _serve_status(config, monitor, stack)

@@ -228,9 +228,9 @@ def _computed(
     from distributed import as_completed  # noqa: PLC0415 - an extra
 
     absent = [task for task in todo if all(log.stamp == ABSENT for log in task.logs)]
-    for task in absent:  # seen from here: no task of the scheduler
-        missing = InputError("no such file", source=task.name)
-        yield task, Finished(bad=[set_aside(task.name, missing)])
+    for gone in absent:  # seen from here: no task of the scheduler
+        missing = InputError("no such file", source=gone.name)
+        yield gone, Finished(bad=[set_aside(gone.name, missing)])
     todo = [task for task in todo if task not in absent]
     if not todo:
         return
