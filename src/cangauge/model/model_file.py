@@ -418,6 +418,7 @@ class Model(_Strict):
         data = read_bounded(path, 4 * MIB, "a model file")
         try:
             raw = json.loads(data, parse_constant=_refuse_constant)
+            json.dumps(raw, ensure_ascii=False).encode()  # half of a surrogate pair is no text
         except (ValueError, RecursionError) as error:
             raise InputError(f"not JSON ({error})", source=path, cure=_CURE) from error
         if not isinstance(raw, dict) or raw.get("format") != MODEL_FORMAT:
