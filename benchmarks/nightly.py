@@ -5,7 +5,8 @@
 fuzz     every reader on 300,000 mutants of small valid files, and the tests of `tests/nightly`
 faults   the table of faults on a live bus
 grade    the estimator on recorded packs, and the diagnosis on its frozen cases (need --data)
-long     the tests marked nightly; restarts by SIGKILL; load, timing and memory of the service
+long     the tests marked nightly; restarts by SIGKILL; load, timing and memory of the service;
+         attacks on its page, status and MQTT
 
 Each part writes `out/nightly/PART.json`: state (passed, failed, skipped), reason, seconds and the
 last lines of each of its commands. Exit status 1 if a part failed.
@@ -53,6 +54,7 @@ def commands(data: Path | None, socketcan: str) -> dict[str, list[list[str]] | s
             [python, "-m", "pytest", "-m", "nightly", "tests"],
             [python, "benchmarks/restarts.py"],
             [python, "benchmarks/bus_load.py"],
+            [python, "benchmarks/wall.py"],
         ],
     }
 
