@@ -203,6 +203,22 @@ class MqttConfig(Strict):
     )
 
 
+class PublishConfig(Strict):
+    """A gateway to an inverter, which gets the battery's frames with the estimated SoC."""
+
+    profile: Literal["pylontech", "victron"] = key(
+        ..., "Layout of the frame with the SoC.", restart=True
+    )
+    interface: str | None = key(
+        None, "Driver of the inverter's bus, e.g. socketcan.",
+        default_text="as without `interface`", restart=True,
+    )  # fmt: skip
+    channel: str = key(..., "The inverter's bus, e.g. can1; not the battery's.", restart=True)
+    bus_options: dict[str, StrictBool | int | float | str] = key(
+        {}, "Further arguments of its driver.", restart=True
+    )
+
+
 def _none_for_auto(value: object) -> object:
     if value == "auto":
         return None
@@ -353,6 +369,9 @@ class RunConfig(Strict):
     limits: LimitsConfig = key(LimitsConfig(), "Limits of the possible currents.")
     poll: PollConfig | None = key(
         None, "Ask the battery controller for its replies over ISO-TP: the service then sends."
+    )
+    publish: PublishConfig | None = key(
+        None, "Hand the battery's frames on to an inverter, with the estimated SoC in them."
     )
     http: str | None = key(
         None,

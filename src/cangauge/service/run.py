@@ -35,6 +35,7 @@ from cangauge.types import reason_names
 OUTPUTS: Final = {
     "cangauge.service.estimate_table": ("output",),
     "cangauge.extras.live.launch": ("http", "dashboard", "mqtt"),
+    "cangauge.extras.inverter.gateway": ("publish",),
 }
 """Modules with an output, and the keys that ask for it; imported only then. Each has
 `make_output(service)`."""
@@ -61,7 +62,7 @@ class Service:
         The estimator.
     recorder : Recorder or None
         The recording, while `run` runs.
-    bus : str
+    address, bus : BusAddress, str
         Interface and channel.
 
     Raises
@@ -92,8 +93,8 @@ class Service:
         _check_files(loaded, self._state)
         self._setup = setup = Setup.of(loaded)
         self.pipeline = Pipeline(setup.vehicle, setup.model, setup.settings)
-        self._address = address_of(loaded)
-        self.bus = str(self._address)
+        self.address = address_of(loaded)
+        self.bus = str(self.address)
         self._outputs = list(outputs)
         self._stop = threading.Event()
         self._reload = threading.Event()
@@ -139,7 +140,7 @@ class Service:
                     stack.enter_context(sole_writer(owned))
             reloader = Reloader(self._read)
             stack.callback(reloader.close)
-            port = stack.enter_context(ReconnectingBus(self._address, pipeline.filters))
+            port = stack.enter_context(ReconnectingBus(self.address, pipeline.filters))
             port.open(wait=config.wait_for_bus)
             keeper = None
             if self._state is not None:
