@@ -203,6 +203,15 @@ class MqttConfig(Strict):
     )
 
 
+class JudgeConfig(Strict):
+    """A second opinion on the SoC that the battery itself publishes."""
+
+    folder: str = key(
+        ..., "Folder for its logs, judgement.json and judgement.html.", restart=True, is_path=True
+    )
+    keep: int = key(30, "Logs that are kept and judged.", restart=True, ge=1, le=1000)
+
+
 class PublishConfig(Strict):
     """A gateway to an inverter, which gets the battery's frames with the estimated SoC."""
 
@@ -372,6 +381,9 @@ class RunConfig(Strict):
     )
     publish: PublishConfig | None = key(
         None, "Hand the battery's frames on to an inverter, with the estimated SoC in them."
+    )
+    judge: JudgeConfig | None = key(
+        None, "Judge the SoC that the battery itself publishes, at the end of each drive or charge."
     )
     http: str | None = key(
         None,

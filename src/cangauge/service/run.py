@@ -36,6 +36,7 @@ OUTPUTS: Final = {
     "cangauge.service.estimate_table": ("output",),
     "cangauge.extras.live.launch": ("http", "dashboard", "mqtt"),
     "cangauge.extras.inverter.gateway": ("publish",),
+    "cangauge.extras.judge.live": ("judge",),
 }
 """Modules with an output, and the keys that ask for it; imported only then. Each has
 `make_output(service)`."""
