@@ -47,6 +47,8 @@ from cangauge.model.voltage_model import (
     resistance_factor,
 )
 
+PRIOR_MADE_BY = "prior of the chemistry"
+"""`made.by` of a model without any log."""
 MODEL_FORMAT = "cangauge-model"
 MODEL_VERSION = 2
 SLOW_S = 300.0
@@ -402,7 +404,7 @@ class Model(_Strict):
             temperature_source="unknown",
             range=Ranges(soc_pct=(0.0, 100.0), temperature_c=PRIOR_RANGE_C,
                          current_a=(-PRIOR_C_RATE * capacity_ah, PRIOR_C_RATE * capacity_ah)),
-            made=Made(by="prior of the chemistry", options={}, logs=[], fingerprint="prior"),
+            made=Made(by=PRIOR_MADE_BY, options={}, logs=[], fingerprint="prior"),
         )  # fmt: skip
 
     @classmethod

@@ -81,7 +81,7 @@ class CountFault:
     lost : float
         Share of the samples whose frames are lost.
     gap_s : float
-        Without frames, in the middle of the drive [s].
+        Without frames, from a quarter of the drive on [s].
     late_rows : int
         Rows by which the current is late.
     limit_c : float
@@ -114,9 +114,9 @@ class CountFault:
     def sent(self, log: Log) -> np.ndarray[Any, np.dtype[np.bool_]]:
         """Return whether the frames of each row are sent; the first ones always are."""
         since_s = log.time_s - log.time_s[0]
-        middle_s = 0.5 * since_s[-1]
+        begin_s = 0.25 * since_s[-1]
         is_lost = np.random.default_rng(0).random(len(log)) < self.lost
-        is_lost |= (since_s > middle_s) & (since_s < middle_s + self.gap_s)
+        is_lost |= (since_s > begin_s) & (since_s < begin_s + self.gap_s)
         return np.asarray(~is_lost | (since_s < ANSWER_EVERY_S))
 
 
@@ -345,7 +345,7 @@ def _score(fault: CountFault, drives: Sequence[Drive], runs: Sequence[Reading]) 
         known = np.isfinite(error)
         errors.append(error[known])
         since_s = drive.log.time_s[at] - drive.log.time_s[0]
-        bad = np.flatnonzero(~(np.abs(error) < RECOVERED_PCT))
+        bad = np.flatnonzero(np.abs(error) >= RECOVERED_PCT)
         recoveries.append(
             0.0 if not bad.size else math.inf if bad[-1] == at.size - 1 else since_s[bad[-1]]
         )
