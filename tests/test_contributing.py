@@ -8,7 +8,6 @@ import pytest
 
 import cangauge
 from cangauge.bus.decoder import SampleDecoder
-from cangauge.bus.encoder import FrameEncoder
 from cangauge.bus.mapping import SignalMap, TemperatureMap, VehicleMap
 from cangauge.bus.vehicle import PRESETS, Preset, Vehicle
 from cangauge.extras.report.charts import new_figure
@@ -16,6 +15,7 @@ from cangauge.extras.report.page import Figure, Page, Paragraph, Section, Tile, 
 from cangauge.model.effects.base import Effect, Load, Memories, Pack, Parameter, Values
 from cangauge.model.effects.library import LIBRARY
 from cangauge.model.voltage_model import VoltageModel
+from cangauge.replay.encoder import FrameEncoder
 from cangauge.types import Sample
 from synthetic import synthetic_log
 
