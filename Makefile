@@ -14,7 +14,7 @@ DATA ?= $(wildcard ../shared/data)
 help:
 	@echo "make demo      the whole job on the shipped log: fit, bus, service, report"
 	@echo "make test      the whole test suite"
-	@echo "make nightly   what is too long for the suite (PART=fuzz|faults|grade|long, DATA=FOLDER)"
+	@echo "make nightly   what is too long for the suite (PART=fuzz|faults|grade|suite|long, DATA=FOLDER)"
 	@echo "make lint      ruff and mypy"
 	@echo "make coverage  the test suite with coverage"
 	@echo "make check     a small part of the withheld check of the diagnosis"
@@ -92,7 +92,8 @@ faults: $(VENV)/installed
 
 site: export NO_MKDOCS_2_WARNING := 1
 site: $(VENV)/installed-docs
-	$(BIN)/mkdocs build --strict --quiet
+	$(BIN)/python docs/pages.py out/docs
+	$(BIN)/zensical build --clean --strict
 	@echo "out/site/index.html"
 
 wheel:

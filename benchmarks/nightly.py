@@ -5,7 +5,9 @@
 fuzz     every reader on 300,000 mutants of small valid files, and the tests of `tests/nightly`
 faults   the table of faults on a live bus
 grade    the estimator on recorded packs, and the diagnosis on its frozen cases (need --data)
-long     the tests marked nightly; restarts by SIGKILL; load, timing and memory of the service
+suite    the score cards of three gauges: our service, a counter, filterpy's filter
+long     the tests marked nightly; restarts by SIGKILL; load, timing and memory of the service;
+         attacks on its page, status and MQTT
 
 Each part writes `out/nightly/PART.json`: state (passed, failed, skipped), reason, seconds and the
 last lines of each of its commands. Exit status 1 if a part failed.
@@ -28,6 +30,10 @@ ROOT = Path(__file__).resolve().parents[1]
 LIMIT_S = 35 * 60.0
 """Longest part [s]."""
 SHOWN_LINES = 60
+OWN_GAUGE = (
+    "run --interface {interface} --channel {channel} --bus-option port={port} -m {model}"
+    " --initial-soc {soc} --time-source replay-clock"
+)
 
 console = Console(highlight=False)
 
@@ -36,6 +42,10 @@ def commands(data: Path | None, socketcan: str) -> dict[str, list[list[str]] | s
     """Return the commands of each part, or the reason for which it cannot run."""
     python = sys.executable
     bus = ["--socketcan", socketcan] if socketcan else []
+    suite, bus_of = (
+        ["-m", "cangauge", "judge", "--suite", "--"],
+        ["{interface}", "{channel}", "{port}"],
+    )
     missing = "no folder of recorded logs: --data FOLDER"
     return {
         "fuzz": [
@@ -49,10 +59,32 @@ def commands(data: Path | None, socketcan: str) -> dict[str, list[list[str]] | s
         ]
         if data is not None
         else missing,
+        "suite": [
+            [
+                python,
+                *suite,
+                python,
+                "examples/gauge_coulomb.py",
+                *bus_of,
+                "{capacity_ah}",
+                "{soc}",
+            ],
+            [
+                python,
+                *suite,
+                python,
+                "examples/gauge_filterpy.py",
+                *bus_of,
+                "{model}",
+                "{soc}",
+            ],
+            [python, *suite, python, "-m", "cangauge", *OWN_GAUGE.split()],
+        ],
         "long": [
             [python, "-m", "pytest", "-m", "nightly", "tests"],
             [python, "benchmarks/restarts.py"],
             [python, "benchmarks/bus_load.py"],
+            [python, "benchmarks/wall.py"],
         ],
     }
 

@@ -1,7 +1,9 @@
-"""Pages of the site that are made from the code: commands, frames, effects. A hook of mkdocs.
+"""The pages of the site: those of this folder, and those made from the code.
 
-`mkdocs build --strict` calls `on_files`; nothing that it makes is committed, so that no page can
-differ from the code.
+    python docs/pages.py out/docs
+
+Commands, frames and effects are made from the code; nothing of them is committed, so that no page
+can differ from it. `make site` calls this, and builds the site from the folder.
 """
 
 from __future__ import annotations
@@ -9,14 +11,14 @@ from __future__ import annotations
 import html
 import inspect
 import re
+import shutil
+import sys
 from pathlib import Path
 from typing import Any
 
 import cantools
 import numpy as np
 import typer
-from mkdocs.config.defaults import MkDocsConfig
-from mkdocs.structure.files import File, Files
 from typer.main import get_command
 
 from cangauge.cli.app import COMMANDS, LazyGroup, app
@@ -36,21 +38,23 @@ STRUCTURE = {"ocv_shape", "inner_temperature"}
 """Effects that are structure of a pack: never named as a cause, and no fault of the simulator."""
 
 
-def on_files(files: Files, config: MkDocsConfig) -> Files:
-    """Add the generated pages."""
+def write_pages(folder: Path) -> None:
+    """Write all pages into a folder, anew."""
+    shutil.rmtree(folder, ignore_errors=True)
+    shutil.copytree(
+        ROOT / "docs", folder, ignore=shutil.ignore_patterns("*.py", "*.sh", "__pycache__")
+    )
     for path, text in (
         ("reference/commands.md", commands_page()),
         ("reference/frames.md", frames_page()),
         ("explanation/effects.md", effects_page()),
     ):
-        files.append(File.generated(config, path, content=text))
-    return files
-
-
-def on_page_markdown(markdown: str, page: Any, config: MkDocsConfig, files: Files) -> str:
-    """Turn links to files of the repository into their names: the site does not hold them."""
-    del page, config, files
-    return OUTSIDE_LINK.sub(r"\1", markdown)
+        target = folder / path
+        target.parent.mkdir(exist_ok=True)
+        target.write_text(text, encoding="utf-8")
+    for page in folder.rglob("*.md"):  # the site does not hold the files of the repository
+        text = page.read_text(encoding="utf-8")
+        page.write_text(OUTSIDE_LINK.sub(r"\1", text), encoding="utf-8")
 
 
 def commands_page() -> str:
@@ -194,3 +198,7 @@ def signature_svg(effect_id: str) -> str:
         parts.append(f'<text x="{at:.0f}" y="{bottom}" text-anchor="middle">{minute} min</text>')
     parts.append("</svg>")
     return "".join(parts)
+
+
+if __name__ == "__main__":
+    write_pages(Path(sys.argv[1]))

@@ -111,7 +111,8 @@ def run(name: str, arguments: argparse.Namespace) -> None:
     """Judge the chains of a pack, and print a line for each judgement."""
     number = max(arguments.chains, arguments.healthy)
     if name.startswith("twin"):
-        drawn = twin_chains(number, 900 if name.endswith("_dev") else 100)
+        first = 900 if name.endswith("_dev") else 100
+        drawn = twin_chains(number, first + 1000 * (arguments.seed - 1))
     else:
         pack, *winter = load(arguments.data, ["i3", "i3_winter"] if name == "i3" else [name])
         pack = replace(pack, judged=[*pack.judged, *(log for one in winter for log in one.judged)])

@@ -5,12 +5,13 @@ from __future__ import annotations
 from itertools import pairwise
 
 import can
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from cangauge.bus.polling import (
+    EXCHANGE_WITHIN_S,
     OTHER_TESTER_S,
-    PENDING_WITHIN_S,
     REPLY_WITHIN_S,
     SLOWEST_S,
     Poller,
@@ -103,9 +104,27 @@ def test_a_pending_response_is_waited_for() -> None:
     poller = Poller([PROBES_OF_LEAF], every_s=2.0)
     assert poller.due(0.0) is not None
     assert poller.take(reply(b"\x03\x7f\x21\x78"), 0.5) is None
-    assert poller.due(0.5 + PENDING_WITHIN_S - 0.1) is None
-    answer(poller, PROBES, 0.5 + PENDING_WITHIN_S - 0.05)
+    assert poller.due(EXCHANGE_WITHIN_S - 0.1) is None
+    answer(poller, PROBES, EXCHANGE_WITHIN_S - 0.05)
     assert (poller.counts.answers, poller.counts.negative, poller.counts.unanswered) == (1, 0, 0)
+
+
+@pytest.mark.parametrize(
+    "data", [b"\x10\x10\x61\x04\0\0\0\0", b"\x03\x7f\x21\x78"], ids=["first frame", "pending"]
+)
+def test_a_node_that_repeats_itself_for_ever_loses_its_turn(data: bytes) -> None:
+    poller = Poller([PROBES_OF_LEAF, CELLS_OF_LEAF], every_s=1.0)
+    asked, controls = [], 0
+    for step in range(2000):
+        now_s = 0.01 * step
+        if (request := poller.due(now_s)) is not None:
+            asked.append((now_s, request.data[2]))
+        controls += poller.take(reply(data), now_s) is not None
+    assert [each for _, each in asked] == [4, 2, 4, 2]
+    assert asked[1][0] == pytest.approx(EXCHANGE_WITHIN_S, abs=1.2)
+    assert controls <= len(asked)
+    assert poller.counts.unanswered == len(asked) - 1
+    assert poller.counts.answers == 0
 
 
 def test_requests_stop_while_another_tester_asks() -> None:
@@ -124,7 +143,7 @@ def test_any_frames_are_survived(frames: list[tuple[bytes, float]]) -> None:
         poller.due(now_s)
         control = poller.take(reply(data), now_s)
         assert control is None or control.data[0] == 0x30
-    asks = [poller.due(now_s + wait_s) for wait_s in (PENDING_WITHIN_S, 2.0 * SLOWEST_S)]
+    asks = [poller.due(now_s + wait_s) for wait_s in (EXCHANGE_WITHIN_S, 2.0 * SLOWEST_S)]
     assert any(ask is not None for ask in asks)
 
 

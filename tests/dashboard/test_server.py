@@ -5,11 +5,11 @@ from __future__ import annotations
 import asyncio
 import http.client
 import json
+import os
+import signal
 import socket
-import time
 from collections.abc import Iterator
 from contextlib import closing
-from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -17,11 +17,13 @@ from tornado.websocket import websocket_connect
 
 from cangauge.bus.vehicle import Vehicle
 from cangauge.errors import InputError
-from cangauge.extras.live.addresses import http_address
-from cangauge.extras.live.launch import LivePage
+from cangauge.extras.live import launch
+from cangauge.extras.live.addresses import HttpAddress, http_address
+from cangauge.extras.live.launch import Live
 from cangauge.service.pipeline import Pipeline
 from cangauge.service.run import Service
-from cangauge.service.status import Monitor, Snapshot
+from cangauge.service.status import Monitor
+from cangauge.service.status_client import Snapshot
 from live import LoggedLines, in_process, leaf_model, leaf_model_path, waits
 
 TOKEN = "a-token-of-some-length"  # noqa: S105 - made up
@@ -38,7 +40,7 @@ def snapshot() -> Snapshot:
     return Monitor(pipeline, Nowhere(), str(leaf_model_path())).latest  # type: ignore[arg-type] # no port
 
 
-def get(page: LivePage, path: str, **options: Any) -> tuple[int, dict[str, str], bytes]:
+def get(page: Live, path: str, **options: Any) -> tuple[int, dict[str, str], bytes]:
     """Return code, headers and body."""
     connection = http.client.HTTPConnection("127.0.0.1", page.port, timeout=120.0)
     try:
@@ -50,23 +52,23 @@ def get(page: LivePage, path: str, **options: Any) -> tuple[int, dict[str, str],
 
 
 @pytest.fixture(scope="module")
-def page() -> Iterator[LivePage]:
-    with closing(LivePage(http_address("127.0.0.1:0", None, {}))) as page:
+def page() -> Iterator[Live]:
+    with closing(Live(dashboard=http_address("127.0.0.1:0", None, {}))) as page:
         page.on_snapshot(snapshot())
         yield page
 
 
 @pytest.fixture(scope="module")
-def guarded(tmp_path_factory: pytest.TempPathFactory) -> Iterator[LivePage]:
+def guarded(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Live]:
     file = tmp_path_factory.mktemp("token") / "token"
     file.write_text(TOKEN)
     file.chmod(0o600)
-    with closing(LivePage(http_address("127.0.0.1:0", file, {}))) as page:
+    with closing(Live(dashboard=http_address("127.0.0.1:0", file, {}))) as page:
         page.on_snapshot(snapshot())
         yield page
 
 
-def test_the_latest_status_is_served(page: LivePage) -> None:
+def test_the_latest_status_is_served(page: Live) -> None:
     # The process may still be starting.
     assert waits(lambda: json.loads(get(page, "/rows")[2])["status"] is not None)
     content = json.loads(get(page, "/rows?span=10min")[2])
@@ -86,21 +88,21 @@ def test_the_latest_status_is_served(page: LivePage) -> None:
         "/cangauge-last-hour.csv",
     ],
 )
-def test_odd_questions_are_answered(page: LivePage, path: str) -> None:
+def test_odd_questions_are_answered(page: Live, path: str) -> None:
     assert get(page, path)[0] == 200
 
 
 @pytest.mark.parametrize("path", ["/files/server.py", "/files/..", "/nothing", "/files/"])
-def test_nothing_else_is_served(page: LivePage, path: str) -> None:
+def test_nothing_else_is_served(page: Live, path: str) -> None:
     assert get(page, path)[0] == 404
 
 
-def test_a_page_under_another_name_is_refused(page: LivePage) -> None:
+def test_a_page_under_another_name_is_refused(page: Live) -> None:
     assert get(page, "/rows", headers={"Host": "evil.example"})[0] == 403
     assert get(page, "/", headers={"Host": "evil.example"})[0] == 403
 
 
-def test_the_page_allows_no_content_from_elsewhere(page: LivePage) -> None:
+def test_the_page_allows_no_content_from_elsewhere(page: Live) -> None:
     code, headers, body = get(page, "/")
     assert code == 200
     assert headers["Content-Security-Policy"].startswith("default-src 'none'; script-src 'self';")
@@ -108,17 +110,12 @@ def test_the_page_allows_no_content_from_elsewhere(page: LivePage) -> None:
     assert b"https://" not in body
 
 
-def test_a_slow_viewer_does_not_hold_the_others(page: LivePage) -> None:
+def test_a_slow_viewer_does_not_hold_the_others(page: Live) -> None:
     with socket.create_connection(("127.0.0.1", page.port)) as slow:
         slow.sendall(b"GET /files/bokeh.min.js HTTP/1.1\r\nHost: localhost\r\n\r\n")
         for _ in range(20):
-            page.on_snapshot(snapshot_of(page))
+            page.on_snapshot(snapshot())
             assert get(page, "/rows?span=10min")[0] == 200
-
-
-def snapshot_of(page: LivePage) -> Snapshot:
-    assert page._latest is not None
-    return replace(page._latest, made_s=time.monotonic())
 
 
 UPGRADE = {
@@ -127,14 +124,14 @@ UPGRADE = {
 }  # fmt: skip
 
 
-def test_the_stream_is_for_the_own_page_only(page: LivePage, guarded: LivePage) -> None:
+def test_the_stream_is_for_the_own_page_only(page: Live, guarded: Live) -> None:
     evil = UPGRADE | {"Origin": "https://evil.example"}
     assert get(page, "/stream", headers=evil)[0] == 403
     assert get(page, "/stream", headers=UPGRADE | {"Host": "evil.example"})[0] == 403
     assert get(guarded, "/stream", headers=UPGRADE)[0] == 401
 
 
-def test_the_stream_sends_what_is_new(page: LivePage) -> None:
+def test_the_stream_sends_what_is_new(page: Live) -> None:
     async def watch() -> list[dict[str, Any]]:
         stream = await websocket_connect(f"ws://127.0.0.1:{page.port}/stream")
         found = []
@@ -145,7 +142,7 @@ def test_the_stream_sends_what_is_new(page: LivePage) -> None:
             found.append(json.loads(str(await stream.read_message())))
         for _ in range(3):
             await asyncio.sleep(0.15)  # rows are 0.1 s apart
-            page.on_snapshot(snapshot_of(page))
+            page.on_snapshot(snapshot())
             found.append(json.loads(str(await stream.read_message())))
         stream.close()
         return found
@@ -161,13 +158,13 @@ def test_the_stream_sends_what_is_new(page: LivePage) -> None:
 
 
 @pytest.mark.parametrize("path", ["/rows", "/range.csv", "/cangauge-last-hour.csv"])
-def test_a_token_is_needed(guarded: LivePage, path: str) -> None:
+def test_a_token_is_needed(guarded: Live, path: str) -> None:
     assert get(guarded, path)[0] == 401
     assert get(guarded, path, headers={"Cookie": "cangauge=guess"})[0] == 401
     assert get(guarded, path, headers={"Authorization": f"Bearer {TOKEN}"})[0] == 200
 
 
-def test_the_browser_is_asked_for_the_token(guarded: LivePage) -> None:
+def test_the_browser_is_asked_for_the_token(guarded: Live) -> None:
     code, headers, _ = get(guarded, "/")
     assert (code, headers["Location"]) == (302, "/enter")
     form = {"Content-Type": "application/x-www-form-urlencoded"}
@@ -183,15 +180,16 @@ def test_the_browser_is_asked_for_the_token(guarded: LivePage) -> None:
     assert get(guarded, "/rows", headers={"Cookie": cookie.split(";")[0]})[0] == 200
 
 
-def test_the_cookie_outlives_a_restart(guarded: LivePage) -> None:
+def test_the_cookie_outlives_a_restart(guarded: Live) -> None:
     form = {"Content-Type": "application/x-www-form-urlencoded"}
     _, headers, _ = get(guarded, "/enter", method="POST", body=f"token={TOKEN}", headers=form)
     cookie = headers["Set-Cookie"].split(";")[0]
-    with closing(LivePage(replace(guarded._address, port=0))) as other:
+    again = HttpAddress("127.0.0.1", 0, TOKEN)
+    with closing(Live(dashboard=again)) as other:
         assert get(other, "/rows", headers={"Cookie": cookie})[0] == 200
 
 
-def asked_for(page: LivePage, body: str, **headers: str) -> int:
+def asked_for(page: Live, body: str, **headers: str) -> int:
     """Return the code of a request for a recording."""
     kind = {"Content-Type": "application/json"}
     return get(page, "/recording", method="POST", body=body, headers=kind | headers)[0]
@@ -199,7 +197,9 @@ def asked_for(page: LivePage, body: str, **headers: str) -> int:
 
 def test_a_viewer_asks_for_a_recording_and_its_end() -> None:
     asked: list[bool] = []
-    with closing(LivePage(http_address("127.0.0.1:0", None, {}), asked.append)) as page:
+    with closing(
+        Live(dashboard=http_address("127.0.0.1:0", None, {}), on_record=asked.append)
+    ) as page:
         own = f"http://127.0.0.1:{page.port}"
         assert asked_for(page, '{"active": true}', Origin=own) == 202
         assert asked_for(page, '{"active": false}') == 202
@@ -221,12 +221,12 @@ def test_a_viewer_asks_for_a_recording_and_its_end() -> None:
     ],
 )
 def test_other_requests_for_a_recording_are_refused(
-    page: LivePage, body: str, headers: dict[str, str], code: int
+    page: Live, body: str, headers: dict[str, str], code: int
 ) -> None:
     assert asked_for(page, body, **headers) == code
 
 
-def test_a_recording_needs_the_token(guarded: LivePage) -> None:
+def test_a_recording_needs_the_token(guarded: Live) -> None:
     assert asked_for(guarded, '{"active": true}') == 401
     assert asked_for(guarded, '{"active": true}', Authorization=f"Bearer {TOKEN}") == 202
 
@@ -246,9 +246,9 @@ def test_the_option_alone_means_a_loopback_address(
     assert given["channel"] == ("x" if "x" in after else None)
 
 
-def test_an_address_in_use_is_refused(page: LivePage) -> None:
+def test_an_address_in_use_is_refused(page: Live) -> None:
     with pytest.raises(InputError, match=r"dashboard.*in use"):
-        LivePage(http_address(f"127.0.0.1:{page.port}", None, {}, "dashboard"))
+        Live(dashboard=http_address(f"127.0.0.1:{page.port}", None, {}, "dashboard"))
 
 
 def test_beyond_loopback_needs_a_token(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -260,25 +260,38 @@ def test_beyond_loopback_needs_a_token(monkeypatch: pytest.MonkeyPatch) -> None:
         service.run()
 
 
-def test_a_page_that_dies_leaves_the_service_alone() -> None:
+def test_a_process_that_dies_or_hangs_is_started_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(launch, "SILENT_S", 3.0)
     with (
         LoggedLines("cangauge.extras.live") as lines,
-        closing(LivePage(http_address("127.0.0.1:0", None, {}))) as page,
+        closing(Live(dashboard=http_address("127.0.0.1:0", None, {}))) as page,
     ):
-        latest = snapshot()
-        page._process.kill()
-        page._process.wait()
+        page.on_snapshot(snapshot())
+        for number, words in ((signal.SIGKILL, "ended by itself"), (signal.SIGSTOP, "answer")):
+            assert get(page, "/rows")[0] == 200
+            assert page.pid is not None
+            before = page.pid
+            os.kill(before, number)
+            assert waits(lambda before=before: page.pid not in {None, before}, 20.0)
+            page.on_snapshot(snapshot())
+            assert get(page, "/rows")[0] == 200  # the port is the same
+            assert words in page.trouble
+        assert sum("has ended" in line for line in lines.lines) == 2
+        assert "(2 so far)" in page.trouble
 
-        def is_reported() -> bool:
-            page.on_snapshot(latest)
-            return any("no longer served" in line for line in lines.lines)
 
-        assert waits(is_reported)
+def test_a_process_that_grows_is_ended(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(launch, "LARGEST_BYTES", 1 << 20)
+    with closing(Live(dashboard=http_address("127.0.0.1:0", None, {}))) as page:
+        assert waits(lambda: "MiB of memory" in page.trouble, 20.0)
 
 
 def test_the_process_ends_with_the_service() -> None:
-    with closing(LivePage(http_address("127.0.0.1:0", None, {}))) as page:
-        process = page._process
-    assert process.returncode is not None
+    with closing(Live(dashboard=http_address("127.0.0.1:0", None, {}))) as page:
+        assert get(page, "/")[0] == 200
+        process = page.pid
+    assert process is not None
+    with pytest.raises(ProcessLookupError):
+        os.kill(process, 0)
     with pytest.raises(OSError, match="refused"):
         socket.create_connection(("127.0.0.1", page.port), 1.0)

@@ -87,6 +87,19 @@ def test_sanitizers_find_nothing(folders: dict[str, Path]) -> None:
     assert "PASSED" in run(folder, "./sanitized")
 
 
+@needs_make
+@pytest.mark.parametrize("real", ["double", "float"])
+@pytest.mark.parametrize("which", ["knots", "effects"])
+def test_no_sample_leaves_the_language(folders: dict[str, Path], which: str, real: str) -> None:
+    sanitize = ["-g", "-fsanitize=address,undefined,float-cast-overflow"]
+    flags = [*STRICT[:3], *sanitize, "-fno-sanitize-recover=all", f"-DCANGAUGE_REAL={real}"]
+    shutil.copy(Path(__file__).with_name("hostile.c"), folders[which])
+    files = [*CORE_SOURCES, "pack_model.c", "hostile.c"]
+    program = f"hostile-{real}"
+    run(folders[which], "cc", *flags, "-DCANGAUGE_CONFIG", *files, "-lm", "-o", program)
+    assert "PASSED" in run(folders[which], f"./{program}")
+
+
 @pytest.mark.skipif(not shutil.which("cppcheck"), reason="no cppcheck")
 def test_cppcheck_finds_nothing(folders: dict[str, Path]) -> None:
     run(

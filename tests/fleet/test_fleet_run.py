@@ -7,9 +7,13 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, ClassVar, Self
+from urllib.error import HTTPError
+from urllib.request import urlopen
 
 import numpy as np
+import pyarrow as pa
 import pyarrow.dataset as pds
+import pyarrow.parquet as pq
 import pytest
 
 from cangauge.errors import CangaugeError, InputError
@@ -19,7 +23,7 @@ from cangauge.extras.fleet.gap import GapJob
 from cangauge.extras.fleet.jobs import TEXT, EstimateJob, HealthJob, Job, Task, by_log, by_vehicle
 from cangauge.extras.fleet.results import Results
 from cangauge.extras.fleet.run import Summary, connected, perform, run_id, run_job
-from cangauge.extras.fleet.sources import FleetLog, ReadOptions, find_logs
+from cangauge.extras.fleet.sources import ABSENT, FleetLog, ReadOptions, find_logs
 from cangauge.logs.canonical import write_log
 from cangauge.logs.read import read_log
 from cangauge.model.model_file import Model
@@ -92,6 +96,29 @@ def test_what_is_known_is_not_computed_again(fleet: Fleet) -> None:
     assert fleet.texts() == ["a9.0", "b", "c"]
     other = replace(NotingJob(), options=ReadOptions(described="other"))
     assert (fleet.run(job=other).done, fleet.texts()) == (3, ["a", "b", "c"])
+
+
+def test_absent_logs_are_set_aside_without_a_task(fleet: Fleet) -> None:
+    found = fleet.run(*(replace(log, stamp=ABSENT) for log in fleet.logs()[:2]), fleet.logs()[2])
+    assert (found.done, found.bad, COMPUTED) == (1, 2, ["c"])
+    assert found.reasons == {"no such file": 2}
+
+
+@pytest.mark.parametrize("content", [b"PAR1 cut", None])
+def test_a_file_in_the_results_that_is_not_theirs_is_named(
+    tmp_path: Path, client: Any, content: bytes | None
+) -> None:
+    fleet = Fleet(tmp_path, str(tmp_path / "out"), client)
+    fleet.run()
+    (path,) = (tmp_path / "out" / "noting").rglob("*.parquet")
+    if content is None:
+        pq.write_table(pa.table({"other": [1]}), path)
+    else:
+        path.write_bytes(content)
+    with pytest.raises(InputError, match=f"{path.name}.*delete it"):
+        fleet.run()
+    path.unlink()
+    assert fleet.run().done == 3
 
 
 def test_rows_are_a_hive_data_set(tmp_path: Path, client: Any) -> None:
@@ -206,6 +233,22 @@ def test_a_killed_worker_leaves_a_complete_result(
     wanted = perform(job, by_log(logs)[1]).rows[0]
     row = next(row for row in results.rows() if row["log"] == logs[1].url)
     assert {name: row[name] for name in wanted} == wanted
+
+
+def test_nobody_without_its_certificate_reaches_a_local_cluster() -> None:
+    distributed = pytest.importorskip("distributed")
+    with connected("local", 1) as client:
+        place = client.scheduler.address
+        plain = place.replace("tls://", "tcp://")
+        for address, security in (
+            (plain, None),
+            (place, distributed.Security.temporary()),  # a certificate, but not this one
+        ):
+            with pytest.raises(OSError, match=r"(?i)timed out|closed|certificate|unknown ca"):
+                distributed.Client(address, security=security, timeout=1.0, set_as_default=False)
+        page = client.cluster.dashboard_link.replace("/status", "/info/main/workers.html")
+        with pytest.raises(HTTPError, match="404"):
+            urlopen(page, timeout=5.0)  # noqa: S310 - http
 
 
 def test_a_scheduler_that_does_not_answer_is_bad_input(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -113,6 +113,8 @@ def test_a_file_that_is_named_like_a_glob_is_found(tmp_path: Path) -> None:
         ("log,healthy\na.csv,perhaps\n", "neither yes nor no"),
         ("log,vehicle\n,X\n", "names no log"),
         ("log,vehicle\na.csv,X\na.csv,X\n", "named twice"),
+        ("log,vehicle\nzip://a.csv::b.zip,X\n", "line 2.*a chain of URLs"),
+        (f"log,vehicle\na.csv,{'X' * 300}\n", "a.csv.*300 characters"),
         (f'log,vehicle\na.csv,"{"X" * 200_000}\n', "not a table: field larger"),
     ],
 )

@@ -90,7 +90,7 @@ def captures() -> list[Path]:
 
 
 # The other presets decode as these: leaf_ze0 as leaf_aze0, leaf_ze1 without a temperature.
-DECODED_BY = ("generic", "leaf_aze0", "leaf_ze1_polled", "bmw_i3")
+DECODED_BY = ("generic", "leaf_aze0", "leaf_ze1_polled", "bmw_i3", "hyundai_kona_64")
 LOGS_BY = ("leaf_aze0", "bmw_i3")
 
 
@@ -463,9 +463,22 @@ SETS: dict[str, Callable[[], dict[str, Any]]] = {
 
 
 def write(name: str) -> None:
-    """Write a set."""
-    text = json.dumps(SETS[name](), indent=1, ensure_ascii=False, sort_keys=True)
-    (HERE / f"{name}.json").write_text(text + "\n")
+    """Write a set, and print each value that is another one than before."""
+    path = HERE / f"{name}.json"
+    before, content = json.loads(path.read_text()), SETS[name]()
+    text = json.dumps(content, indent=1, ensure_ascii=False, sort_keys=True)
+    path.write_text(text + "\n")
+    for line in differences(before, json.loads(text), name):
+        print(line)
+
+
+def differences(before: Any, after: Any, at: str) -> Iterator[str]:
+    """Yield the values that differ, with their places."""
+    if isinstance(before, dict) and isinstance(after, dict):
+        for key in sorted({*before, *after}):
+            yield from differences(before.get(key), after.get(key), f"{at}/{key}")
+    elif before != after:
+        yield f"{at}: {before} -> {after}"
 
 
 def run(arguments: list[str]) -> None:

@@ -143,6 +143,13 @@ def test_refuses_other_files(tmp_path: Path, text: str) -> None:
         Model.load(path)
 
 
+def test_half_of_a_surrogate_pair_is_no_name(model: Model, tmp_path: Path) -> None:
+    path = tmp_path / "x.json"
+    path.write_text(json.dumps(json.loads(model.to_json()) | {"name": "a\ud800"}))
+    with pytest.raises(InputError, match="surrogates not allowed"):
+        Model.load(path)
+
+
 def test_names_the_path_of_a_missing_file(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"nowhere\.json.*no such file"):
         Model.load(tmp_path / "nowhere.json")

@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import json
 import socket
-import sys
 import threading
 import time
 import urllib.error
@@ -20,7 +19,8 @@ from watched import Watched
 
 from cangauge.errors import CangaugeError, InputError
 from cangauge.extras.live.addresses import http_address, read_token
-from cangauge.extras.live.http import MAX_CLIENTS, HttpServer
+from cangauge.extras.live.http import MAX_CLIENTS
+from cangauge.extras.live.launch import Live
 from cangauge.model.published import CAPACITY_AH
 from cangauge.service.status_client import fetch_status
 from live import in_process
@@ -38,8 +38,8 @@ def watched() -> Watched:
 
 
 @pytest.fixture
-def http(watched: Watched) -> Iterator[HttpServer]:
-    with contextlib.closing(HttpServer(http_address("127.0.0.1:0", None, {}))) as server:
+def http(watched: Watched) -> Iterator[Live]:
+    with contextlib.closing(Live(http=http_address("127.0.0.1:0", None, {}))) as server:
         server.on_snapshot(watched.monitor.latest)
         yield server
 
@@ -53,7 +53,7 @@ def get(port: int, path: str, **headers: str) -> tuple[int, bytes, Any]:
         return error.code, error.read(), error.headers
 
 
-def test_status_and_health(http: HttpServer, watched: Watched) -> None:
+def test_status_and_health(http: Live, watched: Watched) -> None:
     watched.monitor.latest = type(watched.monitor.latest)(
         time.monotonic(), watched.monitor.latest.status
     )
@@ -68,16 +68,14 @@ def test_status_and_health(http: HttpServer, watched: Watched) -> None:
     assert in_process("status", "--endpoint", f"http://127.0.0.1:{http.port}", "--json").code == 0
 
 
-def test_a_loop_that_does_not_turn_is_not_healthy(http: HttpServer, watched: Watched) -> None:
+def test_a_loop_that_does_not_turn_is_not_healthy(http: Live, watched: Watched) -> None:
     latest = watched.monitor.latest
     http.on_snapshot(type(latest)(time.monotonic() - 60.0, latest.status))
     code, body, _ = get(http.port, "/healthz")
     assert (code, json.loads(body)) == (503, {"ok": False, "status": "invalid"})
-    http.latest = None
-    assert get(http.port, "/status")[0] == 503
 
 
-def test_metrics_are_what_prometheus_reads(http: HttpServer) -> None:
+def test_metrics_are_what_prometheus_reads(http: Live) -> None:
     code, body, headers = get(http.port, "/metrics")
     assert code == 200
     assert "text/plain" in headers["Content-Type"]
@@ -104,21 +102,28 @@ def test_metrics_are_what_prometheus_reads(http: HttpServer) -> None:
     assert open_metrics[1].endswith(b"# EOF\n")
 
 
+def test_before_the_first_snapshot_the_service_has_just_started() -> None:
+    with contextlib.closing(Live(http=http_address("127.0.0.1:0", None, {}))) as server:
+        assert get(server.port, "/status")[0] == 503
+
+
 def test_without_prometheus_client_the_page_says_so(
-    http: HttpServer, monkeypatch: pytest.MonkeyPatch
+    watched: Watched, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setitem(sys.modules, "prometheus_client", None)
-    monkeypatch.delitem(sys.modules, "cangauge.extras.live.metrics", raising=False)
-    code, body, _ = get(http.port, "/metrics")
+    (tmp_path / "prometheus_client.py").write_text("raise ImportError\n")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    with contextlib.closing(Live(http=http_address("127.0.0.1:0", None, {}))) as server:
+        server.on_snapshot(watched.monitor.latest)
+        assert get(server.port, "/status")[0] == 200
+        code, body, _ = get(server.port, "/metrics")
     assert code == 404
     assert b"cangauge[metrics]" in body
-    assert get(http.port, "/status")[0] == 200
 
 
 def test_a_token_is_required_where_there_is_one(watched: Watched) -> None:
     address = http_address("127.0.0.1:0", None, {"CANGAUGE_HTTP_TOKEN": TOKEN})
     assert TOKEN not in repr(address)
-    with contextlib.closing(HttpServer(address)) as server:
+    with contextlib.closing(Live(http=address)) as server:
         server.on_snapshot(watched.monitor.latest)
         for path in ("/status", "/healthz", "/metrics", "/nothing"):
             code, body, headers = get(server.port, path)
@@ -129,7 +134,7 @@ def test_a_token_is_required_where_there_is_one(watched: Watched) -> None:
         assert get(server.port, "/status", Authorization=f"Bearer {TOKEN}")[0] == 200
 
 
-def test_without_a_token_only_loopback_names_are_answered(http: HttpServer) -> None:
+def test_without_a_token_only_loopback_names_are_answered(http: Live) -> None:
     assert get(http.port, "/status", Host="evil.example")[0] == 403
     assert get(http.port, "/status", Host="localhost:1")[0] == 200
 
@@ -152,7 +157,7 @@ def test_addresses_that_are_refused(text: str, say: str) -> None:
     assert caught.value.field == "http"
 
 
-def test_addresses_and_tokens(tmp_path: Path, http: HttpServer) -> None:
+def test_addresses_and_tokens(tmp_path: Path, http: Live) -> None:
     assert str(http_address("9464", None, {})) == "127.0.0.1:9464"
     assert str(http_address("[::1]:9464", None, {})) == "[::1]:9464"
     path = tmp_path / "token"
@@ -164,13 +169,13 @@ def test_addresses_and_tokens(tmp_path: Path, http: HttpServer) -> None:
             read_token(path, {})
         assert not content or content not in str(caught.value)
     with pytest.raises(InputError, match="cannot listen"):
-        HttpServer(http_address(f"127.0.0.1:{http.port}", None, {}))
+        Live(http=http_address(f"127.0.0.1:{http.port}", None, {}))
 
 
 @pytest.mark.parametrize(
     "first", ["", "GET /healthz HTTP/1.1\r\nX: ", "POST / HTTP/1.1\r\nContent-Length: 9\r\n\r\n"]
 )
-def test_slow_clients_leave_a_place_for_a_probe(http: HttpServer, first: str) -> None:
+def test_slow_clients_leave_a_place_for_a_probe(http: Live, first: str) -> None:
     slow = [socket.create_connection(("127.0.0.1", http.port)) for _ in range(2 * MAX_CLIENTS)]
     for each in slow:
         with contextlib.suppress(OSError):  # thrown out already
@@ -186,7 +191,7 @@ def test_slow_clients_leave_a_place_for_a_probe(http: HttpServer, first: str) ->
         each.close()
 
 
-def test_a_header_without_end_is_cut_off(http: HttpServer) -> None:
+def test_a_header_without_end_is_cut_off(http: Live) -> None:
     greedy = socket.create_connection(("127.0.0.1", http.port), 60.0)
     with greedy, contextlib.suppress(OSError):
         greedy.sendall(b"GET /status HTTP/1.1\r\nX: " + b"y" * 100_000)

@@ -15,7 +15,7 @@ from typing import Any
 import pytest
 
 from cangauge.errors import InputError
-from cangauge.extras.live.mqtt import MqttSettings, mqtt_settings
+from cangauge.extras.live.addresses import MqttSettings, mqtt_settings
 from cangauge.service.config import load_config
 from live import Command, leaf_model_path, waits
 from running import RunningService, free_port

@@ -24,7 +24,7 @@ from cangauge.service import record
 from cangauge.service.offline import estimate_capture
 from cangauge.service.pipeline import Pipeline
 from cangauge.service.record import Recorder, RecordLimits
-from cangauge.service.status import Snapshot
+from cangauge.service.status_client import Snapshot
 from live import in_process, leaf_model, leaf_model_path, short_log, waits
 
 SNAPSHOT = Snapshot(0.0, {})
@@ -217,7 +217,7 @@ def test_a_folder_that_goes_and_comes_back(tmp_path: Path) -> None:
 CHILD = """
 import sys, time, can
 from cangauge.service.record import Recorder
-from cangauge.service.status import Snapshot
+from cangauge.service.status_client import Snapshot
 with Recorder(sys.argv[1]) as recorder:
     for number in range(100_000):
         recorder.write(can.Message(

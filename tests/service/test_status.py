@@ -20,8 +20,9 @@ from cangauge.cli.status import live_text, status_rows
 from cangauge.errors import CangaugeError, InputError
 from cangauge.estimation.cells import CellReport
 from cangauge.service.lifecycle import Notifier
-from cangauge.service.status import BOUNDS_S, Histogram
+from cangauge.service.status import Histogram
 from cangauge.service.status_client import (
+    BOUNDS_S,
     NotRunningError,
     StatusSocket,
     fetch_status,

@@ -17,7 +17,7 @@ from cangauge.bus.open import BusAddress, has_socketcan, open_bus
 from cangauge.bus.vehicle import Vehicle
 from cangauge.estimation.offline import samples_of
 from cangauge.extras.live.addresses import http_address
-from cangauge.extras.live.http import HttpServer
+from cangauge.extras.live.launch import Live
 from cangauge.service.loop import Loop
 from cangauge.service.offline import estimate_capture
 from cangauge.service.pipeline import Pipeline
@@ -49,7 +49,7 @@ def test_scraped_and_recorded_by_kernel_stamps(tmp_path: Path) -> None:
         Recorder(tmp_path / "seen.log", RecordLimits(part_bytes=5_000)) as recorder,
     ):
         monitor = Monitor(pipeline, port, record=lambda: recorder.state)
-        server = HttpServer(http_address("127.0.0.1:0"))
+        server = Live(http=http_address("127.0.0.1:0"))
         outputs = [Rows(rows), recorder, server]
         loop = Loop(port, pipeline, outputs=outputs, record=recorder, monitor=monitor)
         thread = threading.Thread(target=loop.run, args=(stop.is_set,))

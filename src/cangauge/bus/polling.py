@@ -18,11 +18,11 @@ import can
 
 LONGEST_GAP_S: Final = 1.0
 REPLY_WITHIN_S: Final = 1.0
-PENDING_WITHIN_S: Final = 5.0
+EXCHANGE_WITHIN_S: Final = 5.0
 BETWEEN_S: Final = 0.05
 """Longest time between frames of one reply, and wait for its next frame [s]: N_Cr of
-ISO 15765-2; wait after "response pending": P2* of ISO 14229-2; from the end of one exchange to the
-next request: P2."""
+ISO 15765-2; from a request to its whole reply, also after "response pending": P2* of ISO 14229-2;
+from the end of one exchange to the next request: P2."""
 SLOWEST_S: Final = 60.0
 OTHER_TESTER_S: Final = 30.0
 """Longest interval between requests for a reply that does not come [s]: one a minute burdens no
@@ -149,7 +149,9 @@ class Poller:
         self._turns = [_Turn(target) for target in targets]
         self._every_s = every_s
         self._waiting: _Turn | None = None
-        self._give_up_s, self._quiet_until_s = math.inf, -math.inf
+        self._give_up_s = self._exchange_ends_s = math.inf
+        self._quiet_until_s = -math.inf
+        self._may_continue = False
         self._reassembler = Reassembler()
         self.counts = PollCounts()
         self.request_ids = frozenset(turn.target.request_id for turn in self._turns)
@@ -166,6 +168,7 @@ class Poller:
         if now_s < max(turn.due_s, self._quiet_until_s):
             return None
         self._waiting, self._give_up_s = turn, now_s + REPLY_WITHIN_S
+        self._exchange_ends_s, self._may_continue = now_s + EXCHANGE_WITHIN_S, True
         self._reassembler = Reassembler()
         self.counts.requests += 1
         request = turn.target.request
@@ -181,14 +184,16 @@ class Poller:
         if reply is None:
             kind = message.data[0] >> 4
             if kind in {_FIRST, _CONSECUTIVE}:
-                self._give_up_s = now_s + REPLY_WITHIN_S
-            if kind == _FIRST and tuple(message.data[2:4]) == target.reply:
+                self._give_up_s = min(now_s + REPLY_WITHIN_S, self._exchange_ends_s)
+            is_ours = kind == _FIRST and tuple(message.data[2:4]) == target.reply
+            if is_ours and self._may_continue:  # once: a node may repeat its first frame for ever
+                self._may_continue = False
                 return _frame(target.request_id, _CONTINUE)
         elif reply[:2] == bytes(target.reply):
             self.counts.answers += 1
             self._end(turn, now_s, failed=False)
         elif reply[:3] == bytes([_NEGATIVE, target.request[0], _RESPONSE_PENDING]):
-            self._give_up_s = now_s + PENDING_WITHIN_S
+            self._give_up_s = self._exchange_ends_s
         elif reply[:2] == bytes([_NEGATIVE, target.request[0]]):
             self.counts.negative += 1
             self._end(turn, now_s, failed=True)

@@ -187,6 +187,7 @@ def _summary_line(state: ReplayState) -> str:
     )
     if state.acknowledged is not None:
         text += f"; {state.acknowledged} of {state.samples} samples acknowledged"
+        text += f", {state.lost} LOST" if state.lost else ""
     if state.soc is not None:
         text += f"; latest SoC received {number(state.soc.soc_pct, 2, '%')}"
     return text
@@ -202,6 +203,7 @@ def _as_json(state: ReplayState, bus: BusConnection, source: Source) -> dict[str
         "clock_frames": state.clocks,
         "samples": state.samples if source.counts_samples else None,
         "acknowledged": state.acknowledged,
+        "lost": state.lost,
         "seconds": state.seconds,
         "log_seconds": state.log_seconds,
         "speed": state.speed,

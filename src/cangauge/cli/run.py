@@ -20,7 +20,7 @@ from cangauge.errors import CangaugeError
 from cangauge.service.output import Output
 
 if TYPE_CHECKING:
-    from cangauge.service.status import Snapshot
+    from cangauge.service.status_client import Snapshot
 
 _LOG = logging.getLogger(__name__)
 

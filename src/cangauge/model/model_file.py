@@ -47,6 +47,8 @@ from cangauge.model.voltage_model import (
     resistance_factor,
 )
 
+PRIOR_MADE_BY = "prior of the chemistry"
+"""`made.by` of a model without any log."""
 MODEL_FORMAT = "cangauge-model"
 MODEL_VERSION = 2
 SLOW_S = 300.0
@@ -402,7 +404,7 @@ class Model(_Strict):
             temperature_source="unknown",
             range=Ranges(soc_pct=(0.0, 100.0), temperature_c=PRIOR_RANGE_C,
                          current_a=(-PRIOR_C_RATE * capacity_ah, PRIOR_C_RATE * capacity_ah)),
-            made=Made(by="prior of the chemistry", options={}, logs=[], fingerprint="prior"),
+            made=Made(by=PRIOR_MADE_BY, options={}, logs=[], fingerprint="prior"),
         )  # fmt: skip
 
     @classmethod
@@ -418,6 +420,7 @@ class Model(_Strict):
         data = read_bounded(path, 4 * MIB, "a model file")
         try:
             raw = json.loads(data, parse_constant=_refuse_constant)
+            json.dumps(raw, ensure_ascii=False).encode()  # half of a surrogate pair is no text
         except (ValueError, RecursionError) as error:
             raise InputError(f"not JSON ({error})", source=path, cure=_CURE) from error
         if not isinstance(raw, dict) or raw.get("format") != MODEL_FORMAT:

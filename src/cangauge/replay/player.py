@@ -3,6 +3,7 @@
 At full speed nothing may be lost, although socket buffers drop excess frames silently. The receiver
 (`cangauge run --time-source replay-clock`) reports its sample count in SOC_DETAIL every few
 samples, and again in the silence after them; the player limits the samples and frames in flight.
+Samples that are lost all the same are counted, and the replay goes on.
 """
 
 from __future__ import annotations
@@ -43,6 +44,9 @@ WINDOW_FRAMES: Final = 160
 """Most frames in flight: a default socket buffer of Linux holds about 270."""
 SAMPLES_AT_LEAST: Final = 2 * ACKNOWLEDGE_EVERY
 """Samples that may always be in flight: fewer would not trigger an acknowledgement."""
+LOST_AFTER_S: Final = 1.0
+"""Time for which the receiver reports the same count in the silence after which the samples in
+flight are lost [s]: a socket buffer has dropped their frames."""
 SLOW_S: Final = 0.5
 """Wait for an acknowledgement above which to warn [s]."""
 POLL_S: Final = 0.05
@@ -86,13 +90,15 @@ class ReplayState:
     """Progress of a replay.
 
     `samples` are those that a receiver makes of the frames, where known; `acknowledged` those that
-    it has processed (None below full speed); `soc` its latest estimate.
+    it has processed (None below full speed); `lost` those that never reached it; `soc` its latest
+    estimate.
     """
 
     frames: int = 0
     clocks: int = 0
     samples: int = 0
     acknowledged: int | None = None
+    lost: int = 0
     log_seconds: float = 0.0
     seconds: float = 0.0
     soc: SocEstimate | None = None
@@ -209,6 +215,7 @@ class _Player:
         state.soc = self._receiver.soc
         if state.acknowledged is not None:
             state.acknowledged = self._receiver.acknowledged
+            state.lost = self._receiver.lost
         if self._show is not None:
             self._show(state)
 
@@ -272,8 +279,9 @@ class _Receiver:
         self._bus, self._within_s, self._stop = bus, settings.acknowledge_s, stop
         self._reader = SocReader(settings.ids)
         self.soc: SocEstimate | None = None
-        self.acknowledged = 0
+        self.acknowledged = self.lost = 0
         self._count: int | None = None  # latest sample count in SOC_DETAIL
+        self._heard_s = -math.inf
         self._samples = self._frames = self._frames_acknowledged = 0
         # Frames sent when a sample was complete: (sample, frames).
         self._marks: deque[tuple[int, int]] = deque()
@@ -326,7 +334,7 @@ class _Receiver:
 
     @property
     def _in_flight(self) -> int:
-        return self._samples - self.acknowledged
+        return self._samples - self.acknowledged - self.lost
 
     def _is_full(self) -> bool:
         frames = self._frames - self._frames_acknowledged
@@ -341,6 +349,12 @@ class _Receiver:
             now_s = time.monotonic()
             if self.acknowledged != before:
                 before, last_s = self.acknowledged, now_s
+            elif self.acknowledged and self._heard_s - last_s > LOST_AFTER_S:
+                self.lost += self._in_flight
+                self._frames_acknowledged = self._frames
+                self._marks.clear()
+                text = f"{self.lost} samples have not reached the receiver so far; it goes on"
+                emit(_LOG, logging.WARNING, "replay.lost", text)
             elif now_s - last_s > self._within_s:
                 raise CangaugeError(
                     f"{self._bus.name}: no acknowledgement in {self._within_s:g} s:"
@@ -353,10 +367,13 @@ class _Receiver:
                 emit(_LOG, logging.WARNING, "replay.slow", text)
 
     def _acknowledge(self, count: int) -> None:
+        self._heard_s = time.monotonic()
         if self._count is None or not self._samples:
             self._count = count
             return
         more = (count - self._count) % SAMPLES_MODULO
+        late = min(max(more - self._in_flight, 0), self.lost)
+        self.lost -= late  # it was slow: they have reached it after all
         if more > self._in_flight:
             raise CangaugeError(
                 f"{self._bus.name}: the receiver has processed {more} samples where"

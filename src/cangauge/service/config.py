@@ -203,6 +203,31 @@ class MqttConfig(Strict):
     )
 
 
+class JudgeConfig(Strict):
+    """A second opinion on the SoC that the battery itself publishes."""
+
+    folder: str = key(
+        ..., "Folder for its logs, judgement.json and judgement.html.", restart=True, is_path=True
+    )
+    keep: int = key(30, "Logs that are kept and judged.", restart=True, ge=1, le=1000)
+
+
+class PublishConfig(Strict):
+    """A gateway to an inverter, which gets the battery's frames with the estimated SoC."""
+
+    profile: Literal["pylontech", "victron"] = key(
+        ..., "Layout of the frame with the SoC.", restart=True
+    )
+    interface: str | None = key(
+        None, "Driver of the inverter's bus, e.g. socketcan.",
+        default_text="as without `interface`", restart=True,
+    )  # fmt: skip
+    channel: str = key(..., "The inverter's bus, e.g. can1; not the battery's.", restart=True)
+    bus_options: dict[str, StrictBool | int | float | str] = key(
+        {}, "Further arguments of its driver.", restart=True
+    )
+
+
 def _none_for_auto(value: object) -> object:
     if value == "auto":
         return None
@@ -353,6 +378,12 @@ class RunConfig(Strict):
     limits: LimitsConfig = key(LimitsConfig(), "Limits of the possible currents.")
     poll: PollConfig | None = key(
         None, "Ask the battery controller for its replies over ISO-TP: the service then sends."
+    )
+    publish: PublishConfig | None = key(
+        None, "Hand the battery's frames on to an inverter, with the estimated SoC in them."
+    )
+    judge: JudgeConfig | None = key(
+        None, "Judge the SoC that the battery itself publishes, at the end of each drive or charge."
     )
     http: str | None = key(
         None,

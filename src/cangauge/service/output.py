@@ -7,15 +7,18 @@ from typing import TYPE_CHECKING
 from cangauge.types import Estimate, Sample
 
 if TYPE_CHECKING:
-    from cangauge.service.status import Snapshot
+    from cangauge.service.status_client import Snapshot
 
 
 class Output:
     """Takes the results of a service: table, recording, status, page, MQTT, metrics.
 
-    Its methods are called in the thread of the receive loop and must return at once. One that
-    raises is logged and told nothing more until `close`; the estimate continues.
+    `trouble` is a sentence for the user, shown in the status; "" while nothing is wrong. The
+    methods are called in the thread of the receive loop and must return at once. One that raises
+    is logged and told nothing more until `close`; the estimate continues.
     """
+
+    trouble = ""
 
     def on_sample(self, sample: Sample, estimate: Estimate) -> None:
         """Take a sample and the estimate after it."""

@@ -32,7 +32,8 @@ from cangauge.bus.captures import all_parts, part_path, run_path
 from cangauge.bus.time_source import whole_us
 from cangauge.errors import CangaugeError, InputError
 from cangauge.service.output import Output
-from cangauge.service.status import RecordState, Snapshot
+from cangauge.service.status import RecordState
+from cangauge.service.status_client import Snapshot
 from cangauge.service.worker import Worker
 
 BATCH_FRAMES: Final = 256

@@ -33,12 +33,12 @@ from cangauge.service.status_client import StatusSocket, socket_path
 from cangauge.types import reason_names
 
 OUTPUTS: Final = {
-    "output": "cangauge.service.estimate_table",
-    "http": "cangauge.extras.live.http",
-    "mqtt": "cangauge.extras.live.mqtt",
-    "dashboard": "cangauge.extras.live.launch",
+    "cangauge.service.estimate_table": ("output",),
+    "cangauge.extras.live.launch": ("http", "dashboard", "mqtt"),
+    "cangauge.extras.inverter.gateway": ("publish",),
+    "cangauge.extras.judge.live": ("judge",),
 }
-"""Modules with an output, by the key that asks for it; imported only then. Each has
+"""Modules with an output, and the keys that ask for it; imported only then. Each has
 `make_output(service)`."""
 _LOG = logging.getLogger(__name__)
 
@@ -63,7 +63,7 @@ class Service:
         The estimator.
     recorder : Recorder or None
         The recording, while `run` runs.
-    bus : str
+    address, bus : BusAddress, str
         Interface and channel.
 
     Raises
@@ -94,8 +94,8 @@ class Service:
         _check_files(loaded, self._state)
         self._setup = setup = Setup.of(loaded)
         self.pipeline = Pipeline(setup.vehicle, setup.model, setup.settings)
-        self._address = address_of(loaded)
-        self.bus = str(self._address)
+        self.address = address_of(loaded)
+        self.bus = str(self.address)
         self._outputs = list(outputs)
         self._stop = threading.Event()
         self._reload = threading.Event()
@@ -141,7 +141,7 @@ class Service:
                     stack.enter_context(sole_writer(owned))
             reloader = Reloader(self._read)
             stack.callback(reloader.close)
-            port = stack.enter_context(ReconnectingBus(self._address, pipeline.filters))
+            port = stack.enter_context(ReconnectingBus(self.address, pipeline.filters))
             port.open(wait=config.wait_for_bus)
             keeper = None
             if self._state is not None:
@@ -155,14 +155,15 @@ class Service:
                 config.model,
                 notifier=notifier,
                 record=lambda: recorder.state,
+                troubles=lambda: [text for each in self._outputs if (text := each.trouble)],
                 show_every_s=SHOW_EVERY_S if config.dashboard is None else PAGE_EVERY_S,
                 sign_cure=self._setup.sign_cure,
             )
             self._outputs.insert(0, recorder)
             for output in self._outputs:
                 stack.callback(output.close)
-            for key, module in OUTPUTS.items():
-                if getattr(config, key) is not None:
+            for module, keys in OUTPUTS.items():
+                if any(getattr(config, key) is not None for key in keys):
                     self._outputs.append(import_module(module).make_output(self))
                     stack.callback(self._outputs[-1].close)
             _serve_status(config, monitor, stack)

@@ -19,7 +19,7 @@ from cangauge.errors import CangaugeError, InputError
 from cangauge.estimation.power import PackLimits
 from cangauge.estimation.settings import EstimatorSettings, FullCharge, LongRest
 from cangauge.model.model_file import Model
-from cangauge.service.config import DEFAULT_VEHICLE, RunConfig
+from cangauge.service.config import DEFAULT_VEHICLE, PublishConfig, RunConfig
 from cangauge.service.pipeline import PipelineSettings
 
 
@@ -43,6 +43,7 @@ class Setup:
         """Read the model and the vehicle of a configuration; may raise InputError."""
         vehicle, model = load_vehicle(config), Model.load(config.model)
         _check_poll(config, vehicle)
+        _check_publish(config)
         files = [*vehicle.dbc_files, *filter(None, [config.map])]
         try:
             contents = [hashlib.sha256(Path(file).read_bytes()).hexdigest() for file in files]
@@ -95,6 +96,24 @@ def address_of(config: RunConfig) -> BusAddress:
     if interface is None and config.wait_for_bus and is_interface_name(config.channel):
         interface = "socketcan"  # cannot be detected while the interface is missing
     return bus_address(interface, config.channel, config.bus_options)
+
+
+def inverter_address(publish: PublishConfig) -> BusAddress:
+    """Return the address of the inverter's bus; may raise InputError."""
+    return bus_address(publish.interface, publish.channel, publish.bus_options)
+
+
+def _check_publish(config: RunConfig) -> None:
+    """Raise InputError if the inverter's bus is the battery's."""
+    publish = config.publish
+    if publish is not None and str(inverter_address(publish)) == str(address_of(config)):
+        raise InputError(
+            "is the battery's bus: a frame cannot be replaced on the bus that carries it",
+            source=config.file,
+            field="publish.channel",
+            value=publish.channel,
+            cure="connect the inverter to a bus of its own",
+        )
 
 
 def _check_poll(config: RunConfig, vehicle: Vehicle) -> None:

@@ -22,13 +22,11 @@ from cangauge.bus.plausibility import MessageStatistics
 from cangauge.bus.publish import NO_REPORT
 from cangauge.service.lifecycle import Notifier
 from cangauge.service.pipeline import Pipeline
-from cangauge.service.status_client import SCHEMA
-from cangauge.types import Estimate, Reason, Status, reason_name, reason_sentences
+from cangauge.service.status_client import BOUNDS_S, SCHEMA, Snapshot, reason_ids
+from cangauge.types import Estimate, Status, reason_sentences
 
 _LOG = logging.getLogger(__name__)
 
-STUCK_S: Final = 2.0
-"""Age of a snapshot above which the receive loop counts as stuck, and its SoC as stale [s]."""
 SHOW_EVERY_S: Final = 0.25
 """Interval of the snapshots [s]."""
 PAGE_EVERY_S: Final = 0.1
@@ -51,11 +49,6 @@ _REJECTS: Final = tuple(
     for each in fields(MessageStatistics)
     if each.name not in {"wanted", "counter_jumps", "frames_lost"}
 )
-BOUNDS_S: Final = (
-    5e-6, 1e-5, 2e-5, 5e-5, 1e-4, 2e-4, 5e-4,
-    1e-3, 2e-3, 5e-3, 1e-2, 2e-2, 5e-2, 0.1, 0.2, 0.5, 1.0,
-)  # fmt: skip
-"""Upper bounds of the buckets of a histogram [s]; one more bucket holds larger values."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,34 +65,6 @@ class RecordState:
     written_bytes: int
     problem: str | None
     active: bool = True
-
-
-@dataclass(frozen=True, slots=True)
-class Snapshot:
-    """The object of `/status` (finite numbers, text and None) at a monotonic time [s]."""
-
-    made_s: float
-    status: dict[str, Any]
-
-    def is_stuck(self, now_s: float) -> bool:
-        """Return whether the receive loop is stuck at a monotonic time [s]."""
-        return now_s - self.made_s > STUCK_S
-
-    def at(self, now_s: float) -> dict[str, Any]:
-        """Return the object of `/status` at a monotonic time [s]: older, stale once stuck."""
-        status, later_s = dict(self.status), max(now_s - self.made_s, 0.0)
-        status |= {"uptime_s": status["uptime_s"] + later_s, "loop_age_s": later_s}
-        if status["sample"] is not None and status["sample"]["age_s"] is not None:
-            status["sample"] = status["sample"] | {"age_s": status["sample"]["age_s"] + later_s}
-        if self.is_stuck(now_s):
-            status |= {"loop_stuck": True, "status": "invalid"}
-            status["reasons"] = sorted({*status["reasons"], *reason_ids(Reason.INPUT_STALE)})
-        return status
-
-
-def reason_ids(reasons: Reason) -> list[str]:
-    """Return the names of the reasons, such as "delay_line_filling"."""
-    return [reason_name(each).replace(" ", "_") for each in Reason if each and reasons & each]
 
 
 class Histogram:
@@ -141,7 +106,8 @@ class Monitor:
 
     `latest` is immutable, hence readable from any thread. `model` (name of the file) and
     `sign_cure` (what to change if the current has the wrong sign) follow the configuration.
-    `record` returns the state of the recording, `clock` monotonic time [s].
+    `record` returns the state of the recording, `troubles` what is wrong with the outputs, `clock`
+    monotonic time [s].
     """
 
     def __init__(
@@ -152,6 +118,7 @@ class Monitor:
         *,
         notifier: Notifier | None = None,
         record: Callable[[], RecordState | None] = lambda: None,
+        troubles: Callable[[], list[str]] = list,
         clock: Callable[[], float] = time.monotonic,
         show_every_s: float = SHOW_EVERY_S,
         sign_cure: str = "set the other sign under [current] of the map file",
@@ -160,7 +127,7 @@ class Monitor:
         self._pipeline = pipeline
         self._port = port
         self._notifier = notifier or Notifier()
-        self._record = record
+        self._record, self._troubles = record, troubles
         self._show_every_s = show_every_s
         self._began_s = now_s = clock()
         self._latency = Histogram()
@@ -264,7 +231,7 @@ class Monitor:
             else {"age_s": now_s - self._sample_s if self._sample_s > -math.inf else None}
             | _finite(sample, "current_a", "voltage_v", "temperature_c"),
             **self._report,
-            "notices": list(self._find_notices().values()),
+            "notices": [*self._find_notices().values(), *self._troubles()],
             "samples": samples,
             "samples_per_s": self._rate,
             "frames": {

@@ -1,4 +1,4 @@
-"""The status of a running service: its unix socket, and clients of it and of HTTP.
+"""The status of a running service: its object, its unix socket, clients of that and of HTTP.
 
 There is one path: BUS.sock in the runtime folder of the user or of systemd. A connection to it
 answers with one JSON object and ends, so `nc -U PATH` shows it.
@@ -17,6 +17,7 @@ import threading
 import time
 from collections.abc import Callable
 from contextlib import closing, suppress
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final, cast
 from urllib.parse import urlsplit
@@ -24,10 +25,17 @@ from urllib.parse import urlsplit
 from cangauge._files import read_bounded
 from cangauge._logging import emit
 from cangauge.errors import CangaugeError, InputError
+from cangauge.types import Reason, reason_name
 
 SCHEMA: Final = 1
-"""Version of the JSON object of `/status`. Defined here, so that a client need not import the
-estimator."""
+"""Version of the JSON object of `/status`. This module imports no estimator."""
+STUCK_S: Final = 2.0
+"""Age of a snapshot above which the receive loop counts as stuck, and its SoC as stale [s]."""
+BOUNDS_S: Final = (
+    5e-6, 1e-5, 2e-5, 5e-5, 1e-4, 2e-4, 5e-4,
+    1e-3, 2e-3, 5e-3, 1e-2, 2e-2, 5e-2, 0.1, 0.2, 0.5, 1.0,
+)  # fmt: skip
+"""Upper bounds of the buckets of a histogram [s]; one more bucket holds larger values."""
 ANSWER_WITHIN_S: Final = 3.0
 """Longest wait for a part of the answer [s]."""
 LARGEST_ANSWER: Final = 1 << 20
@@ -37,6 +45,34 @@ SOCKET_MODE: Final = 0o660
 SYSTEM_FOLDER: Final = Path("/run/cangauge")
 """Folder of the systemd units, one subfolder for each service."""
 _LOG = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True)
+class Snapshot:
+    """The object of `/status` (finite numbers, text and None) at a monotonic time [s]."""
+
+    made_s: float
+    status: dict[str, Any]
+
+    def is_stuck(self, now_s: float) -> bool:
+        """Return whether the receive loop is stuck at a monotonic time [s]."""
+        return now_s - self.made_s > STUCK_S
+
+    def at(self, now_s: float) -> dict[str, Any]:
+        """Return the object of `/status` at a monotonic time [s]: older, stale once stuck."""
+        status, later_s = dict(self.status), max(now_s - self.made_s, 0.0)
+        status |= {"uptime_s": status["uptime_s"] + later_s, "loop_age_s": later_s}
+        if status["sample"] is not None and status["sample"]["age_s"] is not None:
+            status["sample"] = status["sample"] | {"age_s": status["sample"]["age_s"] + later_s}
+        if self.is_stuck(now_s):
+            status |= {"loop_stuck": True, "status": "invalid"}
+            status["reasons"] = sorted({*status["reasons"], *reason_ids(Reason.INPUT_STALE)})
+        return status
+
+
+def reason_ids(reasons: Reason) -> list[str]:
+    """Return the names of the reasons, such as "delay_line_filling"."""
+    return [reason_name(each).replace(" ", "_") for each in Reason if each and reasons & each]
 
 
 class NotRunningError(CangaugeError):

@@ -115,9 +115,16 @@ class Results:
 
     def _read(self, path: str) -> Iterator[dict[str, Any]]:
         vehicle = unquote(path.rpartition("/")[0].rpartition("vehicle=")[2])
-        with self._fs.open(path, "rb") as file:
-            for batch in pq.ParquetFile(file).iter_batches(4096):
-                yield from (row | {"vehicle": vehicle} for row in batch.to_pylist())
+        try:
+            with self._fs.open(path, "rb") as file:
+                table = pq.ParquetFile(file)
+                if not set(_KEYS) <= set(table.schema_arrow.names):
+                    raise pa.ArrowInvalid("not a table of cangauge fleet")
+                for batch in table.iter_batches(4096):
+                    yield from (row | {"vehicle": vehicle} for row in batch.to_pylist())
+        except pa.ArrowException as error:
+            cure = "delete it: its logs are computed again"
+            raise InputError(f"damaged: {error}", source=path, cure=cure) from error
 
     def _write(self, path: str, schema: Any, rows: Sequence[Row]) -> None:
         columns = {name: [row.get(name) for row in rows] for name in schema.names}

@@ -22,6 +22,7 @@ from cangauge._version import __version__
 from cangauge.errors import CangaugeError, InputError
 from cangauge.extras.fleet.jobs import Job, Task
 from cangauge.extras.fleet.results import Finished, Results, by_kind, reason_of
+from cangauge.extras.fleet.sources import ABSENT
 
 _LOG = logging.getLogger(__name__)
 
@@ -97,7 +98,8 @@ def connected(scheduler: str, workers: int | None = None) -> Iterator[Any]:
         If Dask is not installed, the scheduler does not answer, or a worker has another version.
     """
     try:
-        from distributed import Client, LocalCluster  # noqa: PLC0415 - an extra, slow to import
+        import dask  # noqa: PLC0415 - an extra, slow to import
+        from distributed import Client, LocalCluster  # noqa: PLC0415
     except ImportError as error:
         raise InputError(
             "dask.distributed is not installed",
@@ -109,15 +111,23 @@ def connected(scheduler: str, workers: int | None = None) -> Iterator[Any]:
         # A lost worker or scheduler is reported here, without their tracebacks.
         logging.getLogger(name).setLevel(logging.CRITICAL)
     if scheduler == LOCAL:
-        cluster = LocalCluster(
-            n_workers=workers or os.cpu_count() or 1,
-            threads_per_worker=1,
-            processes=True,
-            dashboard_address="127.0.0.1:0",
-            silence_logs=logging.CRITICAL,
-        )
-        with cluster, Client(cluster, set_as_default=False) as client:
-            _LOG.info("dashboard: %s", client.dashboard_link)
+        # Whoever reaches a scheduler runs code as its user: a certificate of this run keeps other
+        # users of the machine out, and no page is served.
+        closed: dict[str, Any] = {
+            f"distributed.{of}.http.routes": [] for of in ("scheduler", "worker")
+        }
+        with (
+            dask.config.set(closed),
+            LocalCluster(
+                n_workers=workers or os.cpu_count() or 1,
+                threads_per_worker=1,
+                processes=True,
+                security=True,
+                dashboard_address="127.0.0.1:0",
+                silence_logs=logging.CRITICAL,
+            ) as cluster,
+            Client(cluster, set_as_default=False) as client,
+        ):
             yield client
         return
     try:
@@ -217,6 +227,11 @@ def _computed(
     """Yield tasks with what became of them, as they finish."""
     from distributed import as_completed  # noqa: PLC0415 - an extra
 
+    absent = [task for task in todo if all(log.stamp == ABSENT for log in task.logs)]
+    for gone in absent:  # seen from here: no task of the scheduler
+        missing = InputError("no such file", source=gone.name)
+        yield gone, Finished(bad=[set_aside(gone.name, missing)])
+    todo = [task for task in todo if task not in absent]
     if not todo:
         return
     # A task, not scattered data: it is computed again if its worker is lost.

@@ -19,6 +19,7 @@ from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path, PurePosixPath
 from typing import Any, Final
+from urllib.parse import quote
 
 from cangauge._files import MAX_LOG_BYTES, as_utf8, text_sha256
 from cangauge.bus.captures import Capture
@@ -43,6 +44,8 @@ VEHICLE_PATTERN: Final = r"(?:vehicle=)?([^/]+)/[^/]+$"
 _COLUMNS: Final = ("log", "vehicle", "start", "initial_soc_pct", "healthy")
 _HEALTHY: Final = {"1": True, "true": True, "yes": True, "": False, "0": False, "false": False,
                    "no": False}  # fmt: skip
+_LONGEST_VEHICLE: Final = 255 - len("vehicle=")
+"""Bytes of a vehicle's quoted name: file systems name a folder in 255."""
 ABSENT: Final = "absent"
 """Stamp of a log that a manifest names and the storage does not have."""
 
@@ -121,6 +124,9 @@ def find_logs(given: Sequence[str], *, pattern: str = VEHICLE_PATTERN) -> list[F
                     **option,
                     cure="give another pattern, or a manifest with the columns log and vehicle",
                 )
+            if len(quote(vehicle, safe="").encode()) > _LONGEST_VEHICLE:
+                problem = f"a vehicle's name of {len(vehicle)} characters names no folder"
+                raise InputError(problem, source=log.url, value=f"{vehicle[:40]}…")
             found[log.url] = replace(log, vehicle=vehicle)
     return sorted(found.values(), key=lambda log: (log.vehicle, log.start_s or 0.0, log.url))
 
@@ -249,6 +255,8 @@ def _of_row(row: Mapping[str, str], url: str, at: str) -> FleetLog:
     name, folder = row.get("log", ""), url.rpartition("/")[0]
     if not name:
         raise wrong("log", "names no log")
+    if "::" in name:
+        raise wrong("log", "a chain of URLs is not read", "unpack the archive, and name its files")
     whole = name if "://" in name or name.startswith("/") or not folder else f"{folder}/{name}"
     healthy = _HEALTHY.get(row.get("healthy", "").lower())
     if healthy is None:

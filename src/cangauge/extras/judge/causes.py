@@ -63,6 +63,13 @@ DAMPING: Final = 0.6
 """… each this part of the way, since the slope of a curve jumps between its features, …"""
 SETTLED_PCT: Final = 0.1
 """… until no SoC moves by more [%]."""
+STRAYS: Final = 0.05
+"""Prior probability that a gauge strays further on a stretch than it usually does: a trip in
+twenty has a balancing, a reset or lost frames in it."""
+WINDOW_PCT: Final = 5.0
+"""Standard deviation of the zero of a gauge beside the typical oxide cell [% SoC]: cars show the
+usable part of a pack, which leaves up to a tenth of the cells' charge at either end. A gauge of LFP
+cells is set to 100 % at the end of a charge."""
 GRID: Final = [(v, y) for v in range(len(VOLTAGE_SCALES)) for y in range(len(GAUGES))]
 """Sizes of the noise of voltage and gauge, equally likely before the logs."""
 
@@ -77,16 +84,19 @@ class Priors:
         [Ah].
     capacity_std_pct : float
         Of the capacity, as it was stated [%].
+    zero_std_pct : float
+        Of the gauge's own zero beside the model's [% SoC].
     """
 
     capacity_ah: float
     capacity_std_pct: float = 1.5
+    zero_std_pct: float = 0.5
 
     def healthy(self, gauge: GaugeNoise) -> dict[int, float]:
         """Return what is the same in all stretches of a healthy pack, by column."""
         return {
             LEVEL: 0.5,  # half of what differs from log to log does not average out over days
-            ERROR: 0.5,  # the gauge's own zero [% SoC]
+            ERROR: self.zero_std_pct,
             COUNT_OFFSET: gauge.drift_pct * self.capacity_ah / 100.0,  # [A]
             COUNT_SCALE: max(gauge.scale_pct, self.capacity_std_pct / 4.0),
             OFFSET: self.capacity_ah / 400.0,  # 0.15 A at 60 Ah [A]
@@ -198,39 +208,99 @@ def sums_of(
     designs: Sequence[Design],
     chain: Sequence[Stretch],
     grid: tuple[int, int],
+    classes: Sequence[int],
     priors: Priors,
     *,
     unknown: bool,
 ) -> Sums:
-    """Integrate out what each stretch has of its own, and collect what all share."""
+    """Integrate out what each stretch has of its own, and collect what all share.
+
+    Parameters
+    ----------
+    grid : pair of int
+        Size of the voltage's noise, and of the gauge's as it usually is.
+    classes : sequence of int
+        Size of the gauge's noise in each stretch.
+    """
     v, y = grid
-    gauge = GAUGES[y]
-    error_pct = UNKNOWN_PCT if unknown else gauge.error_pct
     own = list(LOCAL)
-    M = np.array([design.voltage[v] + design.gauge[y] for design in designs])
-    hours = np.maximum([part.hours_long for part in chain], 1.0)
-    level = VOLTAGE_SCALES[v]
-    prior = np.tile(
-        [FREE_PCT, level, error_pct, gauge.error_pct, 1.0, gauge.scale_pct], (len(chain), 1)
+    M = np.array(
+        [design.voltage[v] + design.gauge[c] for design, c in zip(designs, classes, strict=True)]
     )
-    drift_a = gauge.drift_pct / 100.0 * priors.capacity_ah
-    prior[:, LOCAL.index(COUNT_OFFSET)] = drift_a / np.sqrt(hours)
+    prior = np.array(
+        [
+            _local(part, v, c, priors, unknown=unknown)
+            for part, c in zip(chain, classes, strict=True)
+        ]
+    )
     A = M[:, own][:, :, own] + np.eye(len(own)) * prior[:, None] ** -2.0
     inverse = np.linalg.inv(A)
     back = inverse @ M[:, own]
     gram: FloatArray = M - M[:, :, own] @ back
-    noises = [(part.whiten_voltage[v], part.whiten_gauge[y]) for part in chain]
-    log_evidence = sum(of_v.log_norm + of_y.log_norm for of_v, of_y in noises)
+    log_evidence = sum(
+        part.whiten_voltage[v].log_norm + part.whiten_gauge[c].log_norm + _log_stray(c, y)
+        for part, c in zip(chain, classes, strict=True)
+    )
     log_evidence -= 0.5 * float(np.linalg.slogdet(A)[1].sum()) + float(np.log(prior).sum())
     total = gram.sum(axis=0)
-    healthy = priors.healthy(gauge)
+    healthy = priors.healthy(GAUGES[y])
     at = [*healthy, *range(FUNCTIONS, total.shape[0] - 1)]
-    prior = np.array([healthy.get(column, 1.0) for column in at]) ** -2.0
-    A = total[np.ix_(at, at)] + np.diag(prior)
+    shared = np.array([healthy.get(column, 1.0) for column in at]) ** -2.0
+    A = total[np.ix_(at, at)] + np.diag(shared)
     b = total[at, -1]
     log_evidence += 0.5 * (float(b @ np.linalg.solve(A, b)) - float(total[-1, -1]))
-    log_evidence -= 0.5 * (np.linalg.slogdet(A)[1] - float(np.log(prior).sum()))
+    log_evidence -= 0.5 * (np.linalg.slogdet(A)[1] - float(np.log(shared).sum()))
     return Sums(gram, np.asarray(inverse), back, at, A, b, log_evidence)
+
+
+def _local(part: Stretch, v: int, c: int, priors: Priors, *, unknown: bool) -> FloatArray:
+    """Return the standard deviations of the columns that a stretch has of its own."""
+    gauge = GAUGES[c]
+    drift_a = gauge.drift_pct / 100.0 * priors.capacity_ah / np.sqrt(max(part.hours_long, 1.0))
+    error_pct = UNKNOWN_PCT if unknown else gauge.error_pct
+    return np.array(
+        [FREE_PCT, VOLTAGE_SCALES[v], error_pct, gauge.error_pct, drift_a, gauge.scale_pct]
+    )
+
+
+def _log_stray(c: int, y: int) -> float:
+    """Return the log prior of a stretch's size of noise, where the gauge's usual one is y."""
+    larger = len(GAUGES) - 1 - y
+    return float(np.log(1.0 - STRAYS if c == y else STRAYS / larger)) if larger else 0.0
+
+
+def straying(
+    designs: Sequence[Design],
+    chain: Sequence[Stretch],
+    grid: tuple[int, int],
+    shared: FloatArray,
+    priors: Priors,
+    *,
+    unknown: bool,
+) -> list[int]:
+    """Return the likeliest size of the gauge's noise in each stretch.
+
+    Parameters
+    ----------
+    shared : array of shape (L, columns)
+        What all stretches share, and the cause, in the columns of each stretch.
+    """
+    (v, y), own = grid, list(LOCAL)
+    found = []
+    for design, part, theta in zip(designs, chain, shared, strict=True):
+        scores = []
+        for c in range(y, len(GAUGES)):
+            M = design.voltage[v] + design.gauge[c]
+            prior = _local(part, v, c, priors, unknown=unknown)
+            A = M[np.ix_(own, own)] + np.diag(prior**-2.0)
+            left = np.r_[-theta, 1.0]
+            b = M[own] @ left
+            fit = float(left @ M @ left) - float(b @ np.linalg.solve(A, b))
+            norm = part.whiten_gauge[c].log_norm - float(np.log(prior).sum())
+            norm -= 0.5 * float(np.linalg.slogdet(A)[1])
+            scores.append(norm - 0.5 * fit + _log_stray(c, y))
+        found.append(y + int(np.argmax(scores)))
+    return found
 
 
 class Track(NamedTuple):
@@ -317,6 +387,16 @@ def explain(chain: Sequence[Stretch], model: Model, priors: Priors) -> list[Expl
     return found
 
 
+class _OfPoint(NamedTuple):
+    """All signatures of an answer at some sizes of the noise."""
+
+    logs: FloatArray
+    """Logarithm of the evidence."""
+    size: FloatArray
+    variance: FloatArray
+    sums: Sums
+
+
 def _explanation(
     name: str,
     chain: Sequence[Stretch],
@@ -331,9 +411,9 @@ def _explanation(
     W = np.array([each.columns for each in signatures])
     std = np.array([each.std for each in signatures])
     log_weight = np.log([each.weight for each in signatures])
-    logs, sizes, variances, all_sums = [], [], [], []
-    for point in points:
-        sums = sums_of(designs, chain, point, priors, unknown=name == "unknown")
+
+    def _at(point: tuple[int, int], classes: list[int]) -> _OfPoint:
+        sums = sums_of(designs, chain, point, classes, priors, unknown=name == "unknown")
         MW = np.einsum("lcd,hld->hlc", sums.gram[:, :-1, :-1], W)
         cross = MW.sum(axis=1)[:, sums.at]
         solved = np.linalg.solve(sums.precision, cross.T)
@@ -341,10 +421,26 @@ def _explanation(
         g = np.einsum("hlc,lc->h", W, sums.gram[:, :-1, -1]) - sums.gradient @ solved
         precision = np.maximum(K, 0.0) + std**-2
         factor = 0.5 * g**2 / precision - 0.5 * np.log(precision * std**2)
-        logs.append(sums.log_evidence + log_weight + factor)
-        sizes.append(g / precision)
-        variances.append(1.0 / precision)
-        all_sums.append(sums)
+        return _OfPoint(
+            sums.log_evidence + log_weight + factor, g / precision, 1.0 / precision, sums
+        )
+
+    logs, sizes, variances, all_sums = [], [], [], []
+    for point in points:
+        of_point = _at(point, [point[1]] * len(chain))
+        best = int(np.argmax(of_point.logs))
+        theta, _ = _posterior(of_point.sums, signatures[best])
+        shared = np.zeros((len(chain), columns))
+        shared[:, of_point.sums.at] = theta[:-1]
+        shared += signatures[best].columns * theta[-1]
+        classes = straying(designs, chain, point, shared, priors, unknown=name == "unknown")
+        if any(c != point[1] for c in classes):
+            strayed = _at(point, classes)
+            of_point = strayed if strayed.logs.max() > of_point.logs.max() else of_point
+        logs.append(of_point.logs)
+        sizes.append(of_point.size)
+        variances.append(of_point.variance)
+        all_sums.append(of_point.sums)
     table = np.array(logs)
     top = float(table.max())
     weights = np.exp(table - top)
@@ -383,11 +479,7 @@ def _tracks(
     """Return the SoC under one signature, and the curve's functions with their covariance."""
     p, columns = len(sums.at), sums.gram.shape[1] - 1
     W = signature.columns
-    MW = np.einsum("lcd,ld->lc", sums.gram[:, :-1, :-1], W)
-    cross = MW.sum(axis=0)[sums.at]
-    own = np.array([[float(np.sum(MW * W)) + signature.std**-2]])
-    V = np.linalg.inv(np.block([[sums.precision, cross[:, None]], [cross[None], own]]))
-    theta = V @ np.r_[sums.gradient, float(np.sum(W * sums.gram[:, :-1, -1]))]
+    theta, V = _posterior(sums, signature)
     tracks = []
     for k, (design, part) in enumerate(zip(designs, chain, strict=True)):
         inverse, back = sums.inverse[k], sums.back[k]
@@ -401,3 +493,14 @@ def _tracks(
         tracks.append(Track(soc_pct, np.sqrt(variance)))
     functions = slice(p - (columns - FUNCTIONS), p)
     return tracks, theta[functions], V[functions, functions]
+
+
+def _posterior(sums: Sums, signature: Signature) -> tuple[FloatArray, FloatArray]:
+    """Return mean and covariance of what all stretches share, and of the cause's size."""
+    W = signature.columns
+    MW = np.einsum("lcd,ld->lc", sums.gram[:, :-1, :-1], W)
+    cross = MW.sum(axis=0)[sums.at]
+    own = np.array([[float(np.sum(MW * W)) + signature.std**-2]])
+    V = np.linalg.inv(np.block([[sums.precision, cross[:, None]], [cross[None], own]]))
+    theta = V @ np.r_[sums.gradient, float(np.sum(W * sums.gram[:, :-1, -1]))]
+    return np.asarray(theta), np.asarray(V)

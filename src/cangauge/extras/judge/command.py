@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from contextlib import ExitStack
+import math
+from collections.abc import Sequence
+from contextlib import ExitStack, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, cast
 
@@ -19,7 +21,7 @@ from cangauge.cli.options import (
     suffixed,
     within,
 )
-from cangauge.cli.output import emit_json, note, print_table
+from cangauge.cli.output import console, emit_json, note, print_table
 from cangauge.errors import InputError
 
 if TYPE_CHECKING:
@@ -30,7 +32,7 @@ if TYPE_CHECKING:
 @option_groups()
 def judge_command(  # noqa: PLR0917 - typer passes options by name
     logs: Annotated[
-        list[Path],
+        list[str],
         typer.Argument(
             metavar="LOG", help="Logs or captures in order of time, with the published SoC."
         ),
@@ -71,6 +73,20 @@ def judge_command(  # noqa: PLR0917 - typer passes options by name
             help="Write published and corrected SoC of every row, .csv or .parquet.",
         ),
     ] = None,
+    suite: Annotated[
+        bool,
+        typer.Option(
+            "--suite", help="Play drives with faults to the gauge that is started by LOG …"
+        ),
+    ] = False,
+    data: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FOLDER",
+            help="With --suite: recorded logs of the model's pack, with their true SoC, in place of"
+            " the simulated ones.",
+        ),
+    ] = None,
     *,
     reading: ReadingOptions,
     report: ReportOption = None,
@@ -91,15 +107,28 @@ def judge_command(  # noqa: PLR0917 - typer passes options by name
     `cangauge judge monday.csv tuesday.csv wednesday.csv -m pack.json --report judge.html`
 
     `cangauge judge day*.csv --chemistry lfp --cells 16 --capacity-ah 280 --corrected soc.csv`
+
+    With --suite, twelve simulated drives with twenty faults of the count are played to a gauge, and
+    a score card is printed. The command that starts it follows `--`; {interface}, {channel},
+    {port}, {model}, {capacity_ah} and {soc} in it are replaced for each run.
+
+    `cangauge judge --suite -- cangauge run --interface {interface} --channel {channel} --bus-option
+    port={port} -m {model} --initial-soc {soc} --time-source replay-clock`
     """
     from cangauge.extras.judge.judgement import judge, narrowed
     from cangauge.logs.read import read_cells
     from cangauge.model.model_file import Model
 
+    if suite:
+        _suite(logs, model, data, json_output=json_output)
+        return
+    if data is not None:
+        raise InputError("belongs to --suite", field="--data", cure="give the logs themselves")
+    paths = [Path(log) for log in logs]
     within(capacity_ah, 1e-3, 1e5, option="--capacity-ah", unit="Ah")
     within(None if cells is None else float(cells), 1, 2000, option="--cells", unit="")
-    check_outputs([output, corrected, report], [*logs, *([model] if model else [])])
-    loaded = [reading.load(path) for path in logs]
+    check_outputs([output, corrected, report], [*paths, *([model] if model else [])])
+    loaded = [reading.load(path) for path in paths]
     columns = reading.given_columns()
     beside = [read_cells(log.source, log.time_s, columns) if log.source else None for log in loaded]
     judgement = judge(
@@ -129,6 +158,46 @@ def judge_command(  # noqa: PLR0917 - typer passes options by name
     for written in (output, corrected, report):
         if written is not None:
             note(f"wrote {written}")
+
+
+def _suite(
+    command: Sequence[str], model: Path | None, data: Path | None, *, json_output: bool
+) -> None:
+    """Play the suite to a gauge, and print its score card."""
+    from cangauge.extras.judge.suite import recorded_drives, run_suite, simulated_drives
+    from cangauge.model.model_file import Model
+
+    if (model is None) != (data is None):
+        raise InputError("give both, or neither", field="--data/-m", cure="recorded: both")
+    with console.status("making the drives") if console.is_terminal else nullcontext() as status:
+        show = (lambda _: None) if status is None else status.update
+        drives = (
+            simulated_drives()
+            if model is None or data is None
+            else recorded_drives(sorted(data.iterdir()), Model.load(model))
+        )
+        scores = run_suite(command, drives, show=show)
+    if json_output:
+        gauge = " ".join(command)
+        emit_json({"schema": 1, "gauge": gauge, "scores": [each.to_dict() for each in scores]})
+        return
+    rows = [
+        [
+            score.fault,
+            number(score.mae_pct, 2),
+            number(score.worst_pct, 1),
+            number(score.jumps_per_h, 1),
+            "never" if score.recovery_s == math.inf else number(score.recovery_s / 60.0, 0),
+            number(None if score.cover_2sigma is None else 100.0 * score.cover_2sigma, 0),
+            number(100.0 * score.silent, 0),
+        ]
+        for score in scores
+    ]
+    head = [
+        "fault", "MAE [%]", "worst [%]", "jumps/h", "within 5 % after [min]", "within 2σ [%]",
+        "silent [%]",
+    ]  # fmt: skip
+    print_table(f"{len(drives)} drives", head, rows)
 
 
 def _chemistry(given: str | None) -> ChemistryName | None:

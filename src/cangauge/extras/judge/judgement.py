@@ -12,13 +12,21 @@ from threadpoolctl import threadpool_limits
 from cangauge._text import counted, duration, number
 from cangauge._typing import FloatArray
 from cangauge.errors import InputError
-from cangauge.extras.judge.causes import NAMES, PRIOR_NONE, Explanation, Priors, Track, explain
+from cangauge.extras.judge.causes import (
+    NAMES,
+    PRIOR_NONE,
+    WINDOW_PCT,
+    Explanation,
+    Priors,
+    Track,
+    explain,
+)
 from cangauge.extras.judge.causes import UNITS as PACK_UNITS
 from cangauge.extras.judge.chain import Stretch, stretches_of
 from cangauge.extras.judge.weak import WeakestCell, weak_cell
 from cangauge.logs.log import Log
 from cangauge.logs.read import CellColumns, as_log
-from cangauge.model.model_file import FunctionFields, Model, as_model
+from cangauge.model.model_file import PRIOR_MADE_BY, FunctionFields, Model, as_model
 from cangauge.model.prior import ChemistryName
 
 __all__ = ["Cause", "Judgement", "judge"]
@@ -343,7 +351,9 @@ def judge(
                 "no stretch of samples is long enough",
                 cure="give logs of at least 10 minutes, better half an hour with changing load",
             )
-        explanations = explain(chain, pack, Priors(pack.capacity_ah, capacity_std))
+        typical = pack.made.by == PRIOR_MADE_BY and pack.chemistry == "oxide"
+        zero_std = WINDOW_PCT if typical else Priors.zero_std_pct
+        explanations = explain(chain, pack, Priors(pack.capacity_ah, capacity_std, zero_std))
         weak = _weakest(chain_logs, cell_voltages, pack, chain, explanations)
     return _judgement(chain_logs, pack, chain, explanations, weak)
 

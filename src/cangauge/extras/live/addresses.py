@@ -9,15 +9,23 @@ from __future__ import annotations
 import ipaddress
 import logging
 import os
+import re
+import socket
+import ssl
 import stat
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from os import PathLike
-from typing import Final
+from typing import TYPE_CHECKING, Final
+
+from tornado.netutil import bind_sockets
 
 from cangauge._files import open_regular
 from cangauge._logging import emit
 from cangauge.errors import InputError
+
+if TYPE_CHECKING:
+    from cangauge.service.config import MqttConfig
 
 _LOG = logging.getLogger(__name__)
 
@@ -49,6 +57,67 @@ class HttpAddress:
     def __str__(self) -> str:
         """Return the address as in a URL."""
         return f"[{self.host}]:{self.port}" if ":" in self.host else f"{self.host}:{self.port}"
+
+
+@dataclass(frozen=True, slots=True)
+class MqttSettings:
+    """Broker and topics.
+
+    Parameters
+    ----------
+    broker : str
+    port : int
+    tls : bool
+    ca_file : str or None
+        Certificates that sign the broker's; None: the system's.
+    user, password : str or None
+    topic_prefix : str
+        Topics are `PREFIX/DEVICE/state` and `PREFIX/DEVICE/availability`.
+    discovery_prefix : str
+        Home Assistant's; "" without discovery.
+    device : str
+        Identifies this service among those of the broker: letters, digits, "_" and "-".
+    every_s : float
+        Interval of the states [s].
+    """
+
+    broker: str
+    port: int
+    tls: bool
+    ca_file: str | None
+    user: str | None
+    password: str | None = field(repr=False)
+    topic_prefix: str
+    discovery_prefix: str
+    device: str
+    every_s: float
+
+    @property
+    def state_topic(self) -> str:
+        """Topic of the state: one JSON object, retained."""
+        return f"{self.topic_prefix}/{self.device}/state"
+
+    @property
+    def availability_topic(self) -> str:
+        """Topic of "online" or "offline", retained; "offline" is the last will."""
+        return f"{self.topic_prefix}/{self.device}/availability"
+
+    def tls_context(self) -> ssl.SSLContext:
+        """Return the certificates that are trusted; raise InputError if they cannot be read."""
+        try:
+            return ssl.create_default_context(cafile=self.ca_file)
+        except (OSError, ssl.SSLError) as error:
+            raise InputError(
+                f"no certificates can be read: {error}",
+                field="mqtt.ca_file",
+                value=self.ca_file,
+                cure="name a PEM file",
+            ) from error
+
+    def check(self) -> None:
+        """Raise InputError if the certificates cannot be read."""
+        if self.tls:
+            self.tls_context()
 
 
 def http_address(
@@ -111,6 +180,19 @@ def is_loopback_name(host: str) -> bool:
         return False
 
 
+def open_tcp(address: HttpAddress, field: str = "http") -> list[socket.socket]:
+    """Return listening sockets; raise InputError, with this field, if they cannot be bound."""
+    try:
+        return bind_sockets(address.port, address.host)
+    except (OSError, UnicodeError) as error:
+        raise InputError(
+            f"cannot listen: {getattr(error, 'strerror', None) or error}",
+            field=field,
+            value=str(address),
+            cure="choose another port",
+        ) from error
+
+
 def read_token(path: str | PathLike[str] | None, environment: Mapping[str, str]) -> str | None:
     """Return the token in a file, or in the environment; None if there is neither.
 
@@ -170,3 +252,17 @@ def _read_secret(path: str | PathLike[str], event: str, kind: str, key: str) -> 
         return data.decode("utf-8")
     except UnicodeDecodeError as error:
         raise InputError("not UTF-8 text", source=path, field=key) from error
+
+
+def mqtt_settings(config: MqttConfig, bus: str) -> MqttSettings:
+    """Return the broker of a configuration for a bus of this name; may raise InputError."""
+    given = config.model_dump(exclude={"password_file"})
+    given["port"] = config.port or (8883 if config.tls else 1883)
+    name = f"cangauge_{socket.gethostname()}_{bus}"
+    given["device"] = config.device or re.sub(r"[^A-Za-z0-9_-]+", "_", name)
+    password = read_mqtt_password(config.password_file, os.environ)
+    if password is not None and config.user is None:
+        raise InputError(
+            "is missing", field="mqtt.user", cure="name the user whose password is given"
+        )
+    return MqttSettings(**given, password=password)

@@ -1,35 +1,29 @@
 """Serve the status of a running service by HTTP: `/status`, `/healthz` and `/metrics`.
 
-All pages are read-only. A thread serves them from the latest snapshot and never blocks the receive
-loop. There is no encryption: beyond a trusted network, put a TLS proxy in front.
+All pages are read-only and show the latest snapshot. There is no encryption: beyond a trusted
+network, put a TLS proxy in front.
 """
 
 from __future__ import annotations
 
-import asyncio
 import hmac
 import json
 import logging
 import socket
-import threading
 import time
 from collections import Counter
-from contextlib import suppress
-from typing import TYPE_CHECKING, Any, Final
+from collections.abc import Sequence
+from typing import Any, Final
 
 from tornado.httpserver import HTTPServer
 from tornado.iostream import IOStream
-from tornado.netutil import bind_sockets
 from tornado.web import Application, RequestHandler
 
 from cangauge._logging import emit
 from cangauge.errors import InputError
-from cangauge.extras.live.addresses import HttpAddress, http_address, is_loopback_name
+from cangauge.extras.live.addresses import is_loopback_name
 from cangauge.service.output import Output
-from cangauge.service.status import Snapshot
-
-if TYPE_CHECKING:
-    from cangauge.service.run import Service
+from cangauge.service.status_client import Snapshot
 
 MAX_HEADER_BYTES: Final = 8192
 MAX_BODY_BYTES: Final = 1024
@@ -38,67 +32,28 @@ MAX_CLIENTS: Final = 32
 oldest of the peer that has most: a client with many connections cannot starve health checks."""
 REQUEST_WITHIN_S: Final = 3.0
 """Time limit for receiving a request [s]."""
-CLOSE_WITHIN_S: Final = 0.3
-"""Time limit for the thread to end [s]; it is a daemon."""
 _LOG = logging.getLogger(__name__)
 
 
-class HttpServer(Output):
-    """Serve snapshots from a thread.
+class StatusServer(Output):
+    """Serve snapshots on the running loop.
 
     Parameters
     ----------
-    address : HttpAddress
+    sockets : sequence of socket
+        Listening ones.
+    token : str or None
+        Bearer token that requests need.
 
     Attributes
     ----------
-    port : int
-        TCP port.
     latest : Snapshot or None
         None before the first.
-
-    Raises
-    ------
-    InputError
-        If the address is in use or cannot be bound.
     """
 
-    def __init__(self, address: HttpAddress) -> None:
-        self.address = address
+    def __init__(self, sockets: Sequence[socket.socket], token: str | None) -> None:
+        self.token = token
         self.latest: Snapshot | None = None
-        self._sockets = open_tcp(address)
-        self.port = int(self._sockets[0].getsockname()[1])
-        self._loop = asyncio.new_event_loop()
-        self._thread = threading.Thread(target=self._run, name="cangauge-http", daemon=True)
-        self._thread.start()
-        token = "with a token" if address.token else "without a token"
-        text = f"http://{address.host}:{self.port}/status, {token}"
-        emit(_LOG, logging.INFO, "http.listening", text, port=self.port)
-
-    def on_snapshot(self, snapshot: Snapshot) -> None:
-        """Make a snapshot the latest one."""
-        self.latest = snapshot
-
-    def close(self) -> None:
-        """End the thread."""
-        with suppress(RuntimeError):  # it has ended
-            self._loop.call_soon_threadsafe(self._loop.stop)
-        self._thread.join(CLOSE_WITHIN_S)
-        for each in self._sockets:
-            each.close()
-
-    def _run(self) -> None:
-        try:
-            asyncio.set_event_loop(self._loop)
-            self._loop.run_until_complete(self._serve())
-            self._loop.run_forever()
-        except Exception as error:  # noqa: BLE001 - an error here must not end the estimate
-            text = f"status and metrics are no longer served: {error!r}"
-            emit(_LOG, logging.ERROR, "http.failed", text)
-        finally:
-            self._loop.close()
-
-    async def _serve(self) -> None:
         context = {"server": self}
         pages = [("/status", _StatusPage, context), ("/healthz", _Health, context),
                  ("/metrics", _Metrics, context)]  # fmt: skip
@@ -117,7 +72,11 @@ class HttpServer(Output):
             idle_connection_timeout=REQUEST_WITHIN_S,
             body_timeout=REQUEST_WITHIN_S,
         )
-        server.add_sockets(self._sockets)
+        server.add_sockets(sockets)
+
+    def on_snapshot(self, snapshot: Snapshot) -> None:
+        """Make a snapshot the latest one."""
+        self.latest = snapshot
 
 
 class _Server(HTTPServer):
@@ -141,19 +100,6 @@ class _Server(HTTPServer):
         super().on_close(server_conn)
 
 
-def open_tcp(address: HttpAddress, field: str = "http") -> list[socket.socket]:
-    """Return listening sockets; raise InputError, with this field, if they cannot be bound."""
-    try:
-        return bind_sockets(address.port, address.host)
-    except (OSError, UnicodeError) as error:
-        raise InputError(
-            f"cannot listen: {getattr(error, 'strerror', None) or error}",
-            field=field,
-            value=str(address),
-            cure="choose another port",
-        ) from error
-
-
 def has_token(header: str, token: str) -> bool:
     """Return whether an Authorization header bears the token; takes the same time for each."""
     scheme, _, given = header.partition(" ")
@@ -169,7 +115,7 @@ def _log_failure(handler: RequestHandler) -> None:
 class _Page(RequestHandler):
     """Access control and plain-text errors of all pages."""
 
-    def initialize(self, server: HttpServer) -> None:
+    def initialize(self, server: StatusServer) -> None:
         self.server = server
 
     def set_default_headers(self) -> None:
@@ -179,7 +125,7 @@ class _Page(RequestHandler):
         self.set_header("Content-Type", "text/plain; charset=utf-8")
 
     def prepare(self) -> None:
-        token = self.server.address.token
+        token = self.server.token
         if token is None:
             # Against DNS rebinding: a web page could otherwise read this under another name.
             if not is_loopback_name(self.request.host_name):
@@ -244,9 +190,3 @@ class _Nothing(_Page):
         super().prepare()
         if not self._finished:
             self.refuse(404, "available: /status, /healthz, /metrics")
-
-
-def make_output(service: Service) -> HttpServer:
-    """Return the server that a service's configuration asks for."""
-    config = service.config
-    return HttpServer(http_address(str(config.http), config.http_token_file))

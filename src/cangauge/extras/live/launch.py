@@ -1,148 +1,297 @@
-"""Start the process of the live page, and hand it the service's latest status."""
+"""The wall: what speaks to networks runs in a process of its own, started and watched from here.
+
+Page, `/status`, `/metrics` and MQTT share that process (`process`). It inherits the listening
+sockets, takes snapshots as lines on stdin, and writes lines on stdout: that it is alive, its log,
+and a viewer's wish for a recording. One that ends, is silent for too long, or grows too large is
+ended and started again. The estimate does not notice.
+"""
 
 from __future__ import annotations
 
 import json
 import logging
 import os
+import select
 import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable
-from typing import TYPE_CHECKING, Final
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from dataclasses import asdict
+from importlib.util import find_spec
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final, Self
 
 from cangauge._logging import emit
 from cangauge.errors import InputError
-from cangauge.extras.live.addresses import HttpAddress, http_address
-from cangauge.extras.live.http import open_tcp
+from cangauge.extras.live.addresses import (
+    HttpAddress,
+    MqttSettings,
+    http_address,
+    mqtt_settings,
+    open_tcp,
+)
 from cangauge.service.output import Output
-from cangauge.service.status import Snapshot
+from cangauge.service.status_client import Snapshot
 
 if TYPE_CHECKING:
     from cangauge.service.run import Service
 
-NICE: Final = 5
-"""Lower priority of the page's process, so that the estimate comes first."""
+SILENT_S: Final = 20.0
+"""Silence after which the process counts as hanging [s]. It says each second that it is alive; a
+small computer takes some seconds to start it."""
+LARGEST_BYTES: Final = 512 << 20
+"""Resident memory above which it is ended: three times what the page needs."""
+PAUSE_S: Final = (1.0, 60.0)
+"""First and longest pause before it is started again, doubled each time [s]. One that has run for
+the longest begins with the first again."""
 END_WITHIN_S: Final = 0.5
 """Time limit for the process to end by itself [s]."""
+_LONGEST_LINE: Final = 1 << 16
 
 _LOG = logging.getLogger(__name__)
 
 
-class LivePage(Output):
-    """The live page of a service.
+class Live(Output):
+    """What a service offers over networks.
 
     A thread sends the latest snapshot and drops those that come while it sends, so that
     `on_snapshot` never waits. The constructor opens the sockets, so that errors show at once.
 
     Parameters
     ----------
-    address : HttpAddress
+    http : HttpAddress, optional
+        Of `/status`, `/healthz` and `/metrics`.
+    dashboard : HttpAddress, optional
+        Of the live page.
+    mqtt : MqttSettings, optional
     on_record : callable, optional
         Takes, in a thread, whether a recording shall run, once a viewer asks.
+
+    Attributes
+    ----------
+    port : int
+        TCP port of the first of `dashboard` and `http`; 0 without either.
+    trouble : str
+        How often the process has ended and why at last; "" while it never has.
+    pid : int or None
+        Of the process, while it runs.
 
     Raises
     ------
     InputError
-        If the address cannot be bound, or the system cannot hand sockets to another process.
+        If an address cannot be bound, a package is missing, certificates cannot be read, or the
+        system cannot hand sockets to another process.
     """
 
     def __init__(
-        self, address: HttpAddress, on_record: Callable[[bool], None] = lambda _: None
+        self,
+        *,
+        http: HttpAddress | None = None,
+        dashboard: HttpAddress | None = None,
+        mqtt: MqttSettings | None = None,
+        on_record: Callable[[bool], None] = lambda _: None,
     ) -> None:
         if os.name != "posix":
-            raise InputError(
-                "the live page needs Linux or macOS", field="dashboard", cure="run without it"
-            )
-        self._address = address
-        self._sockets = open_tcp(address, "dashboard")
-        self.port = int(self._sockets[0].getsockname()[1])
+            problem = "page, status by HTTP and MQTT need Linux or macOS"
+            raise InputError(problem, field="dashboard", cure="run without them")
+        self._asks: dict[str, Any] = {"level": _LOG.getEffectiveLevel()}
+        self._sockets = []
+        for key, address in (("dashboard", dashboard), ("http", http)):
+            if address is None:
+                continue
+            sockets = open_tcp(address, key)
+            self._sockets += sockets
+            numbers = [each.fileno() for each in sockets]
+            self._asks[key] = {"token": address.token, "sockets": numbers}
+            _announce(key, address, sockets[0].getsockname()[1])
+        self.port = int(self._sockets[0].getsockname()[1]) if self._sockets else 0
+        if mqtt is not None:
+            if find_spec("paho") is None:
+                problem = "MQTT needs the package paho-mqtt, which is not installed"
+                raise InputError(problem, field="mqtt", cure="pip install 'cangauge[mqtt]'")
+            mqtt.check()
+            self._asks["mqtt"] = asdict(mqtt)
         self._on_record = on_record
         self._latest: Snapshot | None = None
-        self._new = threading.Event()
-        self._done = False
-        self._thread = threading.Thread(target=self._run, name="cangauge-page", daemon=True)
-
-        self._start()
-
-    def _start(self) -> None:
-        numbers = [each.fileno() for each in self._sockets]
-        self._process = subprocess.Popen(
-            [
-                sys.executable,
-                "-P",
-                "-m",
-                "cangauge.extras.live.server",
-            ],  # -P: not the working folder
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            pass_fds=numbers,
-            env=os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
-        )
-        self._first = {"sockets": numbers, "token": self._address.token, "nice": NICE}
+        self._done = threading.Event()
+        self._woken, self._wake = os.pipe()
+        os.set_blocking(self._wake, False)
+        self.trouble = ""
+        self.pid: int | None = None
+        self._thread = threading.Thread(target=self._run, name="cangauge-live", daemon=True)
         self._thread.start()
-        threading.Thread(target=self._listen, name="cangauge-page-asks", daemon=True).start()
-        host = f"[{self._address.host}]" if ":" in self._address.host else self._address.host
-        emit(
-            _LOG,
-            logging.INFO,
-            "dashboard.listening",
-            f"live page: http://{host}:{self.port}/"
-            + (", with a token" if self._address.token else ""),
-            port=self.port,
-        )
-
-    def close(self) -> None:
-        """End the page's process."""
-        self._done = True
-        self._new.set()
-        self._thread.join(END_WITHIN_S)
-        try:
-            self._process.wait(END_WITHIN_S)
-        except subprocess.TimeoutExpired:
-            self._process.kill()
-            self._process.wait()
-        for each in self._sockets:
-            each.close()
 
     def on_snapshot(self, snapshot: Snapshot) -> None:
         """Make a snapshot the latest one; returns at once."""
         self._latest = snapshot
-        self._new.set()
+        with suppress(BlockingIOError):  # a full pipe wakes as well
+            os.write(self._wake, b"\n")
+
+    def close(self) -> None:
+        """End the process."""
+        self._done.set()
+        with suppress(BlockingIOError):
+            os.write(self._wake, b"\n")
+        self._thread.join(3.0 * END_WITHIN_S)
+        for each in self._sockets:
+            each.close()
 
     def _run(self) -> None:
-        pipe = self._process.stdin
-        assert pipe is not None  # noqa: S101 - as it was made
-        try:
-            with pipe:
-                self._send(pipe.fileno(), self._first)
-                while not self._done:
-                    self._new.wait()
-                    self._new.clear()
-                    if self._latest is not None and not self._done:
-                        self._send(pipe.fileno(), self._latest.at(time.monotonic()))
-        except OSError as error:
-            if not self._done:
-                text = f"the live page is no longer served: {error}; the estimate continues"
-                emit(_LOG, logging.WARNING, "dashboard.failed", text)
+        """Keep the process running until `close`."""
+        ended, pause_s = 0, PAUSE_S[0]
+        while not self._done.is_set():
+            began_s = time.monotonic()
+            try:
+                why = self._serve()
+            except (OSError, ValueError, KeyError) as error:  # no process, or not our lines
+                why = f"it failed: {error!r}"
+            if self._done.is_set():
+                return
+            ended += 1
+            pause_s = PAUSE_S[0] if time.monotonic() - began_s > PAUSE_S[1] else pause_s
+            self.trouble = (
+                f"what serves {self._names} has ended: {why}. It is started again ({ended} so far);"
+                " the estimate continues"
+            )
+            emit(_LOG, logging.WARNING, "live.ended", self.trouble, retry_s=pause_s)
+            self._done.wait(pause_s)
+            pause_s = min(2.0 * pause_s, PAUSE_S[1])
 
-    def _listen(self) -> None:
-        lines = self._process.stdout
-        assert lines is not None  # noqa: S101 - as it was made
-        with lines:
-            for line in lines:
-                self._on_record(json.loads(line)["active"])
+    @property
+    def _names(self) -> str:
+        words = {"dashboard": "the live page", "http": "the status", "mqtt": "MQTT"}
+        return " and ".join(word for key, word in words.items() if key in self._asks)
 
-    @staticmethod
-    def _send(pipe: int, content: object) -> None:
-        left = json.dumps(content, ensure_ascii=False).encode() + b"\n"
-        while left:
-            left = left[os.write(pipe, left) :]
+    def _serve(self) -> str:
+        """Start the process and feed it; return why it has ended, or had to be."""
+        with _Process([each.fileno() for each in self._sockets], self._woken) as process:
+            self.pid = process.pid
+            process.send(self._asks)
+            while not self._done.is_set():
+                for line in process.exchange():
+                    self._hear(json.loads(line))
+                if process.is_idle and self._latest is not None:
+                    snapshot, self._latest = self._latest, None
+                    process.send({"made_s": snapshot.made_s, "status": snapshot.status})
+                if why := process.trouble:
+                    return why
+        return ""
+
+    def _hear(self, told: dict[str, Any]) -> None:
+        """Take a line of the process."""
+        if (wanted := told.get("record")) is not None:
+            self._on_record(bool(wanted))
+        if (log := told.get("log")) is not None:
+            logger = logging.getLogger(log["logger"])
+            fields = log["fields"] | {"limit": log["limit"]}
+            emit(logger, log["level"], log["event"], log["text"], **fields)
 
 
-def make_output(service: Service) -> LivePage:
-    """Return the page that a service's configuration asks for; may raise InputError."""
+class _Process:
+    """The process with its two pipes; it ends with the block.
+
+    Parameters
+    ----------
+    sockets : sequence of int
+        Descriptors that it inherits.
+    woken : int
+        Descriptor of which input ends a wait.
+    """
+
+    def __init__(self, sockets: Sequence[int], woken: int) -> None:
+        self._process = subprocess.Popen(
+            # -P: modules do not come from the working folder
+            [sys.executable, "-P", "-m", "cangauge.extras.live.process"],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            pass_fds=sockets,
+            env=os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
+        )
+        assert self._process.stdin is not None  # noqa: S101 - as it was made
+        assert self._process.stdout is not None  # noqa: S101
+        self._into, self._out = self._process.stdin, self._process.stdout
+        os.set_blocking(self._into.fileno(), False)
+        self._woken, self.pid = woken, self._process.pid
+        self._pending = self._received = b""
+        self._heard_s = time.monotonic()
+        self._has_ended = False
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        with suppress(OSError):  # what is still to be written is lost
+            self._into.close()
+        with suppress(subprocess.TimeoutExpired):
+            self._process.wait(END_WITHIN_S)
+        self._process.kill()
+        self._process.wait()
+        self._out.close()
+
+    def send(self, content: object) -> None:
+        """Add a line to what `exchange` writes."""
+        self._pending += json.dumps(content).encode() + b"\n"
+
+    @property
+    def is_idle(self) -> bool:
+        """Whether all lines are written."""
+        return not self._pending
+
+    def exchange(self) -> list[bytes]:
+        """Write and read what is possible, waiting for at most a second; return whole lines."""
+        into, out = self._into.fileno(), self._out.fileno()
+        writes = [into] if self._pending else []
+        readable, writable, _ = select.select([self._woken, out], writes, [], 1.0)
+        if self._woken in readable:
+            os.read(self._woken, 4096)
+        if writable:
+            self._pending = self._pending[os.write(into, self._pending) :]
+        if out not in readable:
+            return []
+        data = os.read(out, _LONGEST_LINE)
+        self._has_ended = not data
+        self._heard_s = time.monotonic()
+        *lines, self._received = (self._received + data).split(b"\n")
+        return lines
+
+    @property
+    def trouble(self) -> str:
+        """Why the process must be ended; "" while it need not."""
+        if self._has_ended:
+            return "it ended by itself"
+        if time.monotonic() - self._heard_s > SILENT_S or len(self._received) > _LONGEST_LINE:
+            return f"it did not answer for {SILENT_S:g} s"
+        if (size := _resident_bytes(self.pid)) > LARGEST_BYTES:
+            return f"it took {size >> 20} MiB of memory"
+        return ""
+
+
+def _resident_bytes(pid: int) -> int:
+    """Return the resident memory of a process; 0 where the system does not tell."""
+    try:
+        return int(Path(f"/proc/{pid}/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+    except OSError:
+        return 0
+
+
+def _announce(key: str, address: HttpAddress, port: int) -> None:
+    host = f"[{address.host}]" if ":" in address.host else address.host
+    token = "with a token" if address.token else "without a token"
+    text = f"live page: http://{host}:{port}/, {token}"
+    if key == "http":
+        text = f"http://{host}:{port}/status, {token}"
+    emit(_LOG, logging.INFO, f"{key}.listening", text, port=port)
+
+
+def make_output(service: Service) -> Live:
+    """Return what a service's configuration asks for; may raise InputError."""
     config = service.config
-    address = http_address(str(config.dashboard), config.http_token_file, field="dashboard")
-    return LivePage(address, lambda active: service.record(active=active))
+    address = {
+        key: http_address(str(getattr(config, key)), config.http_token_file, field=key)
+        for key in ("http", "dashboard")
+        if getattr(config, key) is not None
+    }
+    mqtt = None if config.mqtt is None else mqtt_settings(config.mqtt, service.bus)
+    return Live(**address, mqtt=mqtt, on_record=lambda active: service.record(active=active))

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
+import os
 import platform
 import time
 from collections.abc import Iterator, Mapping
 from typing import Any, Final
 
 from cangauge.errors import InputError
-from cangauge.service.status import BOUNDS_S, reason_ids
+from cangauge.service.status_client import BOUNDS_S, reason_ids
 from cangauge.types import Reason, Status
 
 try:
@@ -102,7 +103,7 @@ def render(status: Mapping[str, Any], accept: str) -> tuple[bytes, str]:
     """Return the text for a status and its content type, as the Accept header asks for."""
     registry = CollectorRegistry()
     registry.register(_Status(status))
-    ProcessCollector(registry=registry)
+    ProcessCollector(pid=os.getppid, registry=registry)  # the service, which started this one
     encode, content_type = choose_encoder(accept)
     return encode(registry), content_type
 

@@ -1,45 +1,28 @@
 """Publish a running service's state to an MQTT broker, with Home Assistant's discovery.
 
 Needs paho-mqtt (extra `mqtt`). Two threads do the work: one publishes the latest snapshot, paho's
-own one has the network. The receive loop never waits for either, and a state that cannot be sent
-is dropped, since the next one replaces it.
+own one has the network. A state that cannot be sent is dropped, since the next one replaces it.
 """
 
 from __future__ import annotations
 
 import json
 import logging
-import os
-import re
-import socket
-import ssl
 import threading
 import time
 from collections.abc import Mapping
-from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, Final
+from dataclasses import dataclass
+from typing import Any, Final
+
+from paho.mqtt.client import Client, MQTTMessageInfo
+from paho.mqtt.enums import CallbackAPIVersion
 
 from cangauge._logging import emit
 from cangauge._version import __version__
-from cangauge.errors import InputError
-from cangauge.extras.live.addresses import is_loopback_name, read_mqtt_password
+from cangauge.extras.live.addresses import MqttSettings, is_loopback_name
 from cangauge.service.output import Output
-from cangauge.service.status import Snapshot
+from cangauge.service.status_client import Snapshot
 from cangauge.types import Status
-
-try:
-    from paho.mqtt.client import Client, MQTTMessageInfo
-    from paho.mqtt.enums import CallbackAPIVersion
-except ImportError as error:
-    raise InputError(
-        "MQTT needs the package paho-mqtt, which is not installed",
-        field="mqtt",
-        cure="pip install 'cangauge[mqtt]'",
-    ) from error
-
-if TYPE_CHECKING:
-    from cangauge.service.config import MqttConfig
-    from cangauge.service.run import Service
 
 _LOG = logging.getLogger(__name__)
 
@@ -50,50 +33,6 @@ RETRY_S: Final = (1, 30)
 """First and longest pause between attempts to connect, doubled each time [s]."""
 LEAVE_WITHIN_S: Final = 0.5
 """Time limit for saying goodbye to the broker [s]."""
-
-
-@dataclass(frozen=True, slots=True)
-class MqttSettings:
-    """Broker and topics.
-
-    Parameters
-    ----------
-    broker : str
-    port : int
-    tls : bool
-    ca_file : str or None
-        Certificates that sign the broker's; None: the system's.
-    user, password : str or None
-    topic_prefix : str
-        Topics are `PREFIX/DEVICE/state` and `PREFIX/DEVICE/availability`.
-    discovery_prefix : str
-        Home Assistant's; "" without discovery.
-    device : str
-        Identifies this service among those of the broker: letters, digits, "_" and "-".
-    every_s : float
-        Interval of the states [s].
-    """
-
-    broker: str
-    port: int
-    tls: bool
-    ca_file: str | None
-    user: str | None
-    password: str | None = field(repr=False)
-    topic_prefix: str
-    discovery_prefix: str
-    device: str
-    every_s: float
-
-    @property
-    def state_topic(self) -> str:
-        """Topic of the state: one JSON object, retained."""
-        return f"{self.topic_prefix}/{self.device}/state"
-
-    @property
-    def availability_topic(self) -> str:
-        """Topic of "online" or "offline", retained; "offline" is the last will."""
-        return f"{self.topic_prefix}/{self.device}/availability"
 
 
 @dataclass(frozen=True, slots=True)
@@ -200,11 +139,6 @@ class MqttPublisher(Output):
     Parameters
     ----------
     settings : MqttSettings
-
-    Raises
-    ------
-    InputError
-        If the certificates cannot be read.
     """
 
     def __init__(self, settings: MqttSettings) -> None:
@@ -222,7 +156,7 @@ class MqttPublisher(Output):
         if settings.user is not None:
             client.username_pw_set(settings.user, settings.password)
         if settings.tls:
-            client.tls_set_context(_tls_context(settings.ca_file))
+            client.tls_set_context(settings.tls_context())
         elif settings.password is not None and not is_loopback_name(settings.broker):
             emit(
                 _LOG,
@@ -312,37 +246,3 @@ class MqttPublisher(Output):
 
     def _emit(self, level: int, event: str, text: str) -> None:
         emit(_LOG, level, event, f"MQTT broker {self._place}: {text}", limit="mqtt")
-
-
-def _tls_context(ca_file: str | None) -> ssl.SSLContext:
-    try:
-        return ssl.create_default_context(cafile=ca_file)
-    except (OSError, ssl.SSLError) as error:
-        raise InputError(
-            f"no certificates can be read: {error}",
-            field="mqtt.ca_file",
-            value=ca_file,
-            cure="name a PEM file",
-        ) from error
-
-
-def mqtt_settings(config: MqttConfig, bus: str) -> MqttSettings:
-    """Return the broker of a configuration for a bus of this name; may raise InputError."""
-    given = config.model_dump(exclude={"password_file"})
-    given["port"] = config.port or (8883 if config.tls else 1883)
-    name = f"cangauge_{socket.gethostname()}_{bus}"
-    given["device"] = config.device or re.sub(r"[^A-Za-z0-9_-]+", "_", name)
-    password = read_mqtt_password(config.password_file, os.environ)
-    if password is not None and config.user is None:
-        raise InputError(
-            "is missing", field="mqtt.user", cure="name the user whose password is given"
-        )
-    return MqttSettings(**given, password=password)
-
-
-def make_output(service: Service) -> MqttPublisher:
-    """Return the publisher that a service's configuration asks for; may raise InputError."""
-    config = service.config.mqtt
-    if config is None:
-        raise ValueError("no [mqtt]")
-    return MqttPublisher(mqtt_settings(config, service.bus))

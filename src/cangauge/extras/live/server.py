@@ -1,9 +1,7 @@
-"""Answer the browsers of the live page; the service's status arrives as lines on stdin.
+"""Answer the browsers of the live page.
 
-`python -m cangauge.extras.live.server` is started by `launch`, with listening sockets that it
-inherits. Each viewer is sent what is new once it has taken what came before, so a slow or hidden
-one costs nothing, here or in the service. A line on stdout asks the service for a recording or for
-its end. End of stdin ends the process.
+Each viewer is sent what is new once it has taken what came before, so a slow or hidden one costs
+nothing, here or in the service.
 """
 
 from __future__ import annotations
@@ -13,17 +11,14 @@ import hashlib
 import hmac
 import json
 import math
-import os
 import secrets
-import signal
 import socket
-import sys
-from collections.abc import Callable, Mapping, Sequence
+import time
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import IO, Any, Final, cast
-from urllib.parse import urlsplit
+from typing import Any, Final, cast
 
 from bokeh.resources import Resources
 from jinja2 import Environment, PackageLoader, StrictUndefined
@@ -44,6 +39,8 @@ from cangauge.extras.live.history import (
     shown_columns,
 )
 from cangauge.extras.live.http import MAX_BODY_BYTES, MAX_HEADER_BYTES, has_token
+from cangauge.service.output import Output
+from cangauge.service.status_client import Snapshot
 
 COOKIE: Final = "cangauge"
 IDLE_S: Final = 30.0
@@ -52,7 +49,6 @@ ALIVE_S: Final = 0.25
 """Longest time without a message to a viewer [s]."""
 PING_S: Final = 10.0
 """Interval at which a viewer must show that it still listens [s]."""
-_LINE_BYTES: Final = 1 << 20
 _SCRIPTS: Final = ("bokeh.min.js",)
 _POLICY: Final = (
     "default-src 'none'; script-src 'self'; connect-src 'self'; img-src 'self' data: blob:;"
@@ -162,6 +158,35 @@ class Site:
             websocket_ping_interval=PING_S,
             websocket_max_message_size=MAX_BODY_BYTES,
         )
+
+
+class LivePage(Output):
+    """Serve the page on the running loop.
+
+    Parameters
+    ----------
+    sockets : sequence of socket
+        Listening ones.
+    token, ask
+        As of `Site`.
+    """
+
+    def __init__(
+        self, sockets: Sequence[socket.socket], token: str | None, ask: Callable[[bool], None]
+    ) -> None:
+        self._site = Site(History(), token, ask)
+        server = HTTPServer(
+            self._site.application(),
+            max_header_size=MAX_HEADER_BYTES,
+            max_body_size=MAX_BODY_BYTES,
+            idle_connection_timeout=IDLE_S,
+            body_timeout=IDLE_S,
+        )
+        server.add_sockets(sockets)
+
+    def on_snapshot(self, snapshot: Snapshot) -> None:
+        """Show a snapshot."""
+        self._site.add(snapshot.at(time.monotonic()))
 
 
 class _LiveHandler(RequestHandler):
@@ -322,7 +347,7 @@ class _Recording(_LiveHandler):
         headers = self.request.headers
         kind = headers.get("Content-Type", "").partition(";")[0].strip().lower()
         origin = headers.get("Origin")
-        if origin is not None and urlsplit(origin).netloc != self.request.host:
+        if origin is not None and origin.partition("://")[2] != self.request.host:
             self.refuse(403, "a page of another site may not ask for this")
         elif kind != "application/json":
             self.refuse(415, "send JSON")
@@ -387,41 +412,3 @@ def _own_file(name: str) -> str:
 
 def _bokeh_file(name: str) -> str:
     return Path(Resources(mode="server").base_dir, "js", name).read_text(encoding="utf-8")
-
-
-def _ask_service(active: bool) -> None:
-    sys.stdout.write(json.dumps({"active": active}) + "\n")
-    sys.stdout.flush()
-
-
-async def _serve(site: Site, sockets: Sequence[socket.socket], lines: IO[bytes]) -> None:
-    server = HTTPServer(
-        site.application(),
-        max_header_size=MAX_HEADER_BYTES,
-        max_body_size=MAX_BODY_BYTES,
-        idle_connection_timeout=IDLE_S,
-        body_timeout=IDLE_S,
-    )
-    server.add_sockets(sockets)
-    reader = asyncio.StreamReader(limit=_LINE_BYTES)
-    await asyncio.get_running_loop().connect_read_pipe(
-        lambda: asyncio.StreamReaderProtocol(reader), lines
-    )
-    while line := await reader.readline():
-        site.add(json.loads(line))
-
-
-def main() -> None:
-    """Serve until stdin ends; the first line says on which sockets, and the token."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the service ends this process, not Ctrl-C
-    lines = open(0, "rb", buffering=0)  # noqa: SIM115 - stdin, which ends with the process
-    settings: Mapping[str, Any] = json.loads(lines.readline())
-    sockets = [socket.socket(fileno=number) for number in settings["sockets"]]
-    for each in sockets:
-        each.setblocking(False)
-    os.nice(settings["nice"])
-    asyncio.run(_serve(Site(History(), settings["token"], _ask_service), sockets, lines))
-
-
-if __name__ == "__main__":
-    main()

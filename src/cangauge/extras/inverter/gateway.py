@@ -1,0 +1,171 @@
+"""A gateway between a battery and its inverter that replaces the state of charge, and nothing else.
+
+The battery's bus is the one that the service listens to; the inverter has a bus of its own, since a
+frame cannot be replaced on the bus that carries it. Every frame is handed on unchanged, in both
+directions. Only the SoC of one message is replaced, while the estimate is VALID and its samples are
+current; on any doubt the battery's own value passes at once. A gateway that ends, ends the frames:
+the inverter then stops by itself, as if the battery had been unplugged.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+import threading
+import time
+from collections.abc import Mapping
+from copy import copy
+from typing import TYPE_CHECKING, Final
+
+import can
+
+from cangauge._logging import emit
+from cangauge._resources import shared_file
+from cangauge.bus.database import BitField, load_dbc
+from cangauge.bus.reconnecting import ReconnectingBus
+from cangauge.errors import InputError
+from cangauge.service.output import Output
+from cangauge.service.setup import inverter_address
+from cangauge.service.status_client import Snapshot
+from cangauge.types import Estimate, Sample
+
+if TYPE_CHECKING:
+    from cangauge.service.run import Service
+
+DOUBT_S: Final = 0.5
+"""Time after which an estimate that is not confirmed is no longer sent [s]."""
+POLL_S: Final = 0.005
+"""Longest wait on either bus [s]: what a frame is late on the other."""
+CLOSE_WITHIN_S: Final = 1.0
+_SOC: Final = "soc_pct"
+"""Beginning of the names of the signals that hold the SoC, in a profile's DBC."""
+
+_LOG = logging.getLogger(__name__)
+
+
+def soc_fields(profile: str) -> dict[int, list[tuple[BitField, float]]]:
+    """Return bits and step [%] of the SoC in the frames of a profile, by id."""
+    database = load_dbc(shared_file("dbc", f"inverter_{profile}.dbc"))
+    found: dict[int, list[tuple[BitField, float]]] = {}
+    for message in database.messages:
+        fields = [
+            (BitField.of(signal, message.length), float(signal.scale))
+            for signal in message.signals
+            if signal.name.startswith(_SOC)
+        ]
+        if fields:
+            found[message.frame_id] = fields
+    return found
+
+
+class Gateway(Output):
+    """Hand frames on between a battery's and an inverter's bus, in a thread.
+
+    Parameters
+    ----------
+    battery, inverter : ReconnectingBus
+        Open ones, of the gateway alone.
+    fields : mapping
+        Of `soc_fields`.
+    own_ids : set of int
+        Ids that the service itself sends on the battery's bus: not for the inverter.
+    """
+
+    def __init__(
+        self,
+        battery: ReconnectingBus,
+        inverter: ReconnectingBus,
+        fields: Mapping[int, list[tuple[BitField, float]]],
+        own_ids: frozenset[int] = frozenset(),
+    ) -> None:
+        self._battery, self._inverter = battery, inverter
+        self._fields, self._own_ids = fields, own_ids
+        self._sampled_s, self._current_until_s = math.inf, -math.inf  # one sample has no interval
+        self._soc: tuple[float, float] | None = None  # [%], and until when it is confirmed
+        self._done = threading.Event()
+        self._replaces: bool | None = None
+        self._thread = threading.Thread(target=self._run, name="cangauge-inverter", daemon=True)
+        self._thread.start()
+
+    def on_sample(self, sample: Sample, estimate: Estimate) -> None:
+        """Note that samples come, and how often."""
+        del sample, estimate
+        now_s = time.monotonic()
+        self._current_until_s = now_s + (now_s - self._sampled_s) + DOUBT_S
+        self._sampled_s = now_s
+
+    def on_snapshot(self, snapshot: Snapshot) -> None:
+        """Take the SoC if it is valid, else none."""
+        soc_pct = snapshot.status["estimate"]["soc_pct"]
+        if snapshot.status["status"] != "valid" or soc_pct is None:
+            self._soc = None
+        else:
+            self._soc = soc_pct, snapshot.made_s + DOUBT_S
+
+    def close(self) -> None:
+        """End the gateway."""
+        self._done.set()
+        self._thread.join(CLOSE_WITHIN_S)
+        self._battery.close()
+        self._inverter.close()
+
+    def soc_pct(self, now_s: float) -> float | None:
+        """Return the SoC that may be sent at a monotonic time [s]; None: the battery's own."""
+        soc = self._soc
+        if soc is None or now_s > min(soc[1], self._current_until_s):
+            return None
+        return min(max(soc[0], 0.0), 100.0)
+
+    def replaced(self, frame: can.Message, now_s: float) -> can.Message:
+        """Return a frame of the battery as the inverter gets it."""
+        fields = self._fields.get(frame.arbitration_id)
+        if fields is None or frame.is_extended_id or frame.is_remote_frame:
+            return frame
+        soc_pct = self.soc_pct(now_s)
+        self._note(is_replaced=soc_pct is not None)
+        if soc_pct is None:
+            return frame
+        data = bytearray(frame.data)
+        for field, step in fields:
+            if field.shift + field.width <= 8 * len(data):  # older batteries have shorter frames
+                field.put(data, round(soc_pct / step))
+        told = copy(frame)
+        told.data = data
+        return told
+
+    def _note(self, *, is_replaced: bool) -> None:
+        """Log and state a change of what the inverter is told."""
+        if is_replaced is self._replaces:
+            return
+        self._replaces = is_replaced
+        self.trouble = "" if is_replaced else "the inverter gets the battery's own SoC"
+        text = "the inverter gets the estimated SoC" if is_replaced else self.trouble
+        emit(_LOG, logging.INFO if is_replaced else logging.WARNING, "inverter.soc", text)
+
+    def _run(self) -> None:
+        while not self._done.is_set():
+            for frame in self._battery.receive_pending(POLL_S):
+                if frame.arbitration_id not in self._own_ids and not frame.is_error_frame:
+                    self._inverter.post(self.replaced(frame, time.monotonic()))
+            for frame in self._inverter.receive_pending(POLL_S):
+                if not frame.is_error_frame:
+                    self._battery.post(frame)
+
+
+def make_output(service: Service) -> Gateway:
+    """Return the gateway that a service's configuration asks for; may raise InputError."""
+    config = service.config.publish
+    if config is None:
+        raise ValueError("no [publish]")
+    battery = ReconnectingBus(service.address, [])
+    inverter = ReconnectingBus(inverter_address(config), [])
+    battery.open()
+    try:
+        inverter.open()
+    except InputError:
+        battery.close()
+        raise
+    own_ids = frozenset(service.pipeline.settings.ids.published)
+    text = f"frames are handed on between {battery.name} and the inverter on {inverter.name}"
+    emit(_LOG, logging.INFO, "inverter.ready", text, profile=config.profile)
+    return Gateway(battery, inverter, soc_fields(config.profile), own_ids)

@@ -1,0 +1,123 @@
+"""The process that speaks to networks: the live page, status and metrics, MQTT.
+
+`python -m cangauge.extras.live.process` is started by `launch`. The first line on stdin says what
+to serve, on which inherited sockets; each further line is a snapshot of the service. Lines on
+stdout go to the service. The end of stdin ends the process.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import logging
+import os
+import signal
+import socket
+import threading
+from collections.abc import Mapping
+from typing import IO, Any, Final
+
+from cangauge._logging import RateLimitFilter
+from cangauge.service.output import Output
+from cangauge.service.status_client import Snapshot
+
+NICE: Final = 5
+"""Lower priority, so that the estimate comes first."""
+ALIVE_EVERY_S: Final = 1.0
+_LINE_BYTES: Final = 1 << 20
+
+_TELLING: Final = threading.Lock()
+
+
+def tell(**content: object) -> None:
+    """Send the service a line; from any thread."""
+    left = json.dumps(content).encode() + b"\n"
+    with _TELLING:
+        while left:
+            left = left[os.write(1, left) :]
+
+
+class _Told(logging.Handler):
+    """Hands the events of this process to the service, which writes them as its own."""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        fields = dict(getattr(record, "fields", {}))
+        if hasattr(record, "suppressed"):
+            fields["repeats_suppressed"] = record.suppressed
+        event = str(getattr(record, "event", "live.log"))
+        tell(
+            log={
+                "logger": record.name,
+                "level": record.levelno,
+                "event": event,
+                "text": record.getMessage(),
+                "limit": str(getattr(record, "limit", event)),
+                "fields": fields,
+            }
+        )
+
+
+def outputs_of(asks: Mapping[str, Any]) -> list[Output]:
+    """Return what is asked for, each on the running loop; imported only where it is."""
+    outputs: list[Output] = []
+    for key in ("http", "dashboard"):
+        if key in asks:
+            sockets = [socket.socket(fileno=number) for number in asks[key]["sockets"]]
+            for each in sockets:
+                each.setblocking(False)
+            if key == "http":
+                from cangauge.extras.live.http import StatusServer  # noqa: PLC0415
+
+                outputs.append(StatusServer(sockets, asks[key]["token"]))
+            else:
+                from cangauge.extras.live.server import LivePage  # noqa: PLC0415
+
+                ask = lambda active: tell(record=active)  # noqa: E731
+                outputs.append(LivePage(sockets, asks[key]["token"], ask))
+    if "mqtt" in asks:
+        from cangauge.extras.live.addresses import MqttSettings  # noqa: PLC0415
+        from cangauge.extras.live.mqtt import MqttPublisher  # noqa: PLC0415
+
+        outputs.append(MqttPublisher(MqttSettings(**asks["mqtt"])))
+    return outputs
+
+
+async def _serve(asks: Mapping[str, Any], lines: IO[bytes], limiter: RateLimitFilter) -> None:
+    reader = asyncio.StreamReader(limit=_LINE_BYTES)
+    loop = asyncio.get_running_loop()
+    await loop.connect_read_pipe(lambda: asyncio.StreamReaderProtocol(reader), lines)
+
+    async def tell_that_it_lives() -> None:
+        while True:
+            tell(alive=True)
+            limiter.release_due()
+            await asyncio.sleep(ALIVE_EVERY_S)
+
+    living = asyncio.ensure_future(tell_that_it_lives())
+    outputs = outputs_of(asks)
+    while line := await reader.readline():
+        snapshot = Snapshot(**json.loads(line))
+        for output in outputs:
+            output.on_snapshot(snapshot)
+    living.cancel()
+    for output in outputs:
+        output.close()
+
+
+def main() -> None:
+    """Serve until stdin ends."""
+    for number in (signal.SIGINT, signal.SIGTERM):  # the service ends this process
+        signal.signal(number, signal.SIG_IGN)
+    lines = open(0, "rb", buffering=0)  # noqa: SIM115 - stdin, which ends with the process
+    asks: Mapping[str, Any] = json.loads(lines.readline())
+    os.nice(NICE)
+    told = _Told()
+    limiter = RateLimitFilter(told.emit)
+    told.addFilter(limiter)
+    logging.getLogger().handlers[:] = [told]
+    logging.getLogger("cangauge").setLevel(asks["level"])
+    asyncio.run(_serve(asks, lines, limiter))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,125 @@
+"""`[judge]`: the battery's own SoC judged while the service runs, over restarts."""
+
+from __future__ import annotations
+
+import json
+from contextlib import closing
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from cangauge.errors import InputError
+from cangauge.estimation.offline import samples_of
+from cangauge.extras.judge.live import PAGE, RESULT, LiveJudge, Stored, make_output
+from cangauge.logs.log import Log
+from cangauge.logs.read import read_log
+from cangauge.service.run import Service
+from cangauge.service.status_client import Snapshot
+from cangauge.types import Estimate, Reason, Status
+from live import LoggedLines, leaf_model_path, waits
+from running import RunningService
+from synthetic import synthetic_log
+
+NONE = Estimate(*[float("nan")] * 7, Status.VALID, Reason.NONE, 0)
+DAY_S = 86400.0
+
+
+@pytest.fixture
+def stored(tmp_path: Path) -> Stored:
+    import sys  # noqa: PLC0415
+
+    command = (sys.executable, "-m", "cangauge", "judge", "-m", str(leaf_model_path()))
+    return Stored(tmp_path, 2, command)
+
+
+def day(number: int) -> Log:
+    return synthetic_log(
+        hours=0.7, rate_hz=2.0, start_pct=85.0, end_pct=50.0, noise_v=0.3, seed=number
+    )
+
+
+def drive(judge: LiveJudge, published: dict[str, float], number: int, error_pct: float) -> None:
+    log = day(number)
+    assert log.soc_pct is not None
+    for sample, soc_pct in zip(samples_of(log), log.soc_pct, strict=True):
+        published["soc"] = soc_pct + error_pct
+        judge.on_sample(sample._replace(time_s=sample.time_s + number * DAY_S), NONE)
+
+
+def test_a_gauge_that_is_off_is_said_after_the_drive(stored: Stored) -> None:
+    published = {"soc": float("nan")}
+    with (
+        LoggedLines("cangauge.extras.judge") as lines,
+        closing(LiveJudge(stored, lambda: published["soc"])) as judge,
+    ):
+        drive(judge, published, 1, 15.0)
+        judge.on_snapshot(Snapshot(0.0, {}))
+        assert not stored.logs()  # the drive goes on
+        judge._came_s -= 601.0  # ten minutes of silence
+        judge.on_snapshot(Snapshot(judge._came_s + 601.0, {}))
+        assert waits(lambda: bool(judge.trouble), 60.0), lines.lines
+        assert "off, +" in judge.trouble
+    result = json.loads((stored.folder / RESULT).read_text())
+    assert result["gauge"]["error_pct"] == pytest.approx(15.0, abs=3.0)
+    assert "judge" in (stored.folder / PAGE).read_text()
+    (path,) = stored.logs()
+    kept = read_log(path)
+    assert kept.soc_pct is not None
+    assert np.median(np.diff(kept.time_s)) == pytest.approx(1.0)
+    assert kept.duration_s == pytest.approx(day(1).duration_s, abs=2.0)
+
+
+def test_a_gauge_that_is_right_is_no_trouble_and_logs_outlive_a_restart(stored: Stored) -> None:
+    published = {"soc": float("nan")}
+    judge = LiveJudge(stored, lambda: published["soc"])
+    drive(judge, published, 1, 0.0)
+    judge.close()  # written, not judged
+    assert len(stored.logs()) == 1
+    assert not (stored.folder / RESULT).exists()
+    with (
+        LoggedLines("cangauge.extras.judge") as lines,
+        closing(LiveJudge(stored, lambda: published["soc"])) as again,
+    ):
+        assert waits((stored.folder / RESULT).is_file, 60.0)  # begun at the start
+        drive(again, published, 2, 0.0)
+        drive(again, published, 3, 0.0)  # a pause of a night between them
+        assert waits(lambda: sum("second opinion" in each for each in lines.lines) == 2, 90.0)
+        assert again.trouble == ""
+    assert len(stored.logs()) == 2  # `keep`
+
+
+def test_a_judgement_that_fails_says_why(stored: Stored) -> None:
+    published = {"soc": float("nan")}  # the battery never publishes one
+    with (
+        LoggedLines("cangauge.extras.judge") as lines,
+        closing(LiveJudge(stored, lambda: published["soc"])) as judge,
+    ):
+        for sample in samples_of(day(1)):
+            judge.on_sample(sample, NONE)
+        judge._end_stretch()
+        assert waits(lambda: any("was not judged" in line for line in lines.lines), 60.0)
+    assert any("no log has the SoC" in line for line in lines.lines)
+
+
+def test_a_vehicle_without_a_soc_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "car.toml").write_text(
+        '[current]\nsignal = "current_a"\n[voltage]\nsignal = "voltage_v"\n'
+        "[temperature]\nfixed_c = 20\n"
+    )
+    from cangauge._resources import shared_file  # noqa: PLC0415
+
+    service = Service(
+        model=str(leaf_model_path()), interface="virtual", channel="none",
+        dbc=str(shared_file("dbc", "generic_pack.dbc")), map=str(tmp_path / "car.toml"),
+        judge={"folder": str(tmp_path / "judge")},
+    )  # fmt: skip
+    with pytest.raises(InputError, match="no SoC of its own"):
+        make_output(service)
+
+
+def test_a_service_keeps_what_it_receives(tmp_path: Path) -> None:
+    with RunningService(tmp_path, '[judge]\nfolder = "opinion"\n') as running:
+        judge = next(each for each in running.service._outputs if isinstance(each, LiveJudge))
+        assert waits(lambda: len(judge._rows) >= 2, 20.0)
+    assert (tmp_path / "opinion").is_dir()
