@@ -12,33 +12,27 @@ from cangauge.bus.mapping import SignalMap, TemperatureMap, VehicleMap
 from cangauge.bus.vehicle import PRESETS, Preset, Vehicle
 from cangauge.extras.report.charts import new_figure
 from cangauge.extras.report.page import Figure, Page, Paragraph, Section, Tile, render
-from cangauge.model.effects.base import Effect, Load, Memories, Pack, Parameter, Values
+from cangauge.model.effects.base import Effect, Parameter
 from cangauge.model.effects.library import LIBRARY
-from cangauge.model.voltage_model import VoltageModel
 from cangauge.replay.encoder import FrameEncoder
 from cangauge.types import Sample
 from synthetic import synthetic_log
 
-
-class HeaterDrop(Effect):
-    """A constant drop at every current, as a worked example."""
-
-    id = "heater_drop"
-    family = "voltage_sensing"
-    parameters = (Parameter("drop_v", "V", -0.04, 0.04, scale="voltage"),)
-    signature = "a constant"
-    equation = "U = OCV − drop"
-    source = "an example"
-    separated_by = "nothing"
-
-    def drive(
-        self, load: Load, values: Values, model: VoltageModel, pack: Pack, memory: Memories
-    ) -> np.ndarray:
-        return np.full_like(load.current_a, -values["drop_v"])
+HEATER_DROP = Effect(
+    id="heater_drop",
+    family="voltage_sensing",
+    parameters=(Parameter("drop_v", "V", -0.04, 0.04, scale="voltage"),),
+    signature="a constant",
+    equation="U = OCV − drop",
+    source="an example",
+    separated_by="nothing",
+    drive=lambda load, values, *_: np.full_like(load.current_a, -values["drop_v"]),
+)
+"""A constant drop at every current, as a worked example."""
 
 
 def test_an_effect_of_your_own_is_identified(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(LIBRARY, "heater_drop", HeaterDrop())  # type: ignore[misc] # a dict
+    monkeypatch.setitem(LIBRARY, "heater_drop", HEATER_DROP)  # type: ignore[misc] # a dict
     log = synthetic_log(hours=1.0, seed=4)
     model = cangauge.fit([log], capacity_ah=60.0).model
     entry = {"id": "heater_drop", "parameters": {"drop_v": 2.0}}

@@ -275,10 +275,10 @@ def linearize(
     soc = plain.soc_pct[rows.at]
 
     def added_v(effect: Effect, values: Values, at_load: Load = load) -> FloatArray:
-        drive = effect.drive(at_load, values, voltage, pack, effect.memory(values, pack))
+        drive = effect.drive(at_load, values, effect.context(values, voltage, pack))
         if drive is None:
             raise ValueError("an effect of the voltage has a drive")
-        return np.asarray(drive[rows.at] * effect.over_soc(soc, values, voltage, pack))
+        return np.asarray(drive[rows.at] * effect.over_soc(soc, values, voltage))
 
     at = replace(
         rows,

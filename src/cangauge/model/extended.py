@@ -130,10 +130,10 @@ class ExtendedModel:
         model, effects, pack = self.model, self.effects, self.pack
         measured_a = signals.current_a
         for effect, values in effects:
-            memory = effect.memory(values, pack)
-            for item in memory:
+            context = effect.context(values, model, pack)
+            for item in context.memory:
                 item.whole = True
-            signals = effect.correct(signals, values, pack, memory)
+            signals = effect.correct(signals, values, context)
         soc = self.counted_soc(signals, initial_soc_pct, initial_row=initial_row)
         every = any(effect.adds_voltage for effect, _ in effects)
         rows = slice(None) if every else at_rows
@@ -148,7 +148,7 @@ class ExtendedModel:
         load = Load(signals.time_s[rows], signals.current_a[rows], temperature_c, drop_v)
         over_soc = []
         for effect, values in effects:
-            drive = effect.drive(load, values, model, pack, effect.memory(values, pack))
+            drive = effect.drive(load, values, effect.context(values, model, pack))
             if drive is None:
                 continue
             if effect.uses_soc:
@@ -170,7 +170,7 @@ class ExtendedModel:
         """
         volts = self.model.pseudo_ocv(soc_pct) + prediction.beside_v
         for effect, values, drive in prediction.over_soc:
-            volts = volts + drive * effect.over_soc(soc_pct, values, self.model, self.pack)
+            volts = volts + drive * effect.over_soc(soc_pct, values, self.model)
         return np.asarray(volts)
 
     def added_v(self, load: Load, soc_pct: FloatArray) -> FloatArray:
@@ -184,10 +184,9 @@ class ExtendedModel:
         """
         volts = np.zeros_like(soc_pct)
         for effect, values in self.effects:
-            memory = effect.memory(values, self.pack)
-            drive = effect.drive(load, values, self.model, self.pack, memory)
+            drive = effect.drive(load, values, effect.context(values, self.model, self.pack))
             if drive is not None:
-                volts += drive * effect.over_soc(soc_pct, values, self.model, self.pack)
+                volts += drive * effect.over_soc(soc_pct, values, self.model)
         return volts
 
     def counting(self, initial_soc_pct: float) -> Counting:
@@ -265,10 +264,10 @@ class OnlineModel:
         """Capacity for the Coulomb counter [Ah]."""
         self.delay_line = DelayLine(self.model.delay_s, gap_s=gap_s)
         self.lags = [Lag(tau_s, 0.0, rest_s=BRIDGE_S) for tau_s in self.model.low_pass_s]
-        self._memory = [effect.memory(values, extended.pack) for effect, values in extended.effects]
-        self._corrects = [
-            type(effect).correct is not Effect.correct for effect, _ in extended.effects
+        self._contexts = [
+            effect.context(values, self.model, extended.pack) for effect, values in extended.effects
         ]
+        self._corrects = any(effect.corrects for effect, _ in extended.effects)
         self._row = np.empty(0)
         self._over_soc = [each for each in extended.effects if each[0].uses_soc]
         self._drives = np.zeros(1 + len(self._over_soc))
@@ -296,12 +295,12 @@ class OnlineModel:
 
     def correct(self, reading: Reading) -> Sequence[Reading]:
         """Return the corrected readings that are ready, usually one, in order."""
-        if not any(self._corrects):
+        if not self._corrects:
             return (reading,)
         signals = Signals(*(np.array([value]) for value in reading))
-        for (effect, values), memory in zip(self.extended.effects, self._memory, strict=True):
+        for (effect, values), context in zip(self.extended.effects, self._contexts, strict=True):
             if signals.time_s.size:
-                signals = effect.correct(signals, values, self.extended.pack, memory)
+                signals = effect.correct(signals, values, context)
         return [Reading(*row) for row in np.stack(signals, axis=1).tolist()]
 
     def advance(self, time_s: float, current_a: float, temperature_c: float) -> None:
@@ -326,12 +325,12 @@ class OnlineModel:
             return
         drop_v = self._row[1:] @ self.load_coefficients[1:]
         over = 0
-        for (effect, values), memory in zip(self.extended.effects, self._memory, strict=True):
-            of_history = any(isinstance(lag, Lag) and lag.is_lagging for lag in memory)
+        for (effect, values), context in zip(self.extended.effects, self._contexts, strict=True):
+            of_history = any(isinstance(lag, Lag) and lag.is_lagging for lag in context.memory)
             follows = of_history and not effect.rc_elements(values)
             celsius = np.array([temperature_c if follows else known_c])
             load = Load(at, now, celsius, np.array([drop_v]))
-            drive = effect.drive(load, values, self.model, self.extended.pack, memory)
+            drive = effect.drive(load, values, context)
             place = 1 + over if effect.uses_soc else 0
             over += effect.uses_soc
             if drive is not None and not math.isnan(drive[0]):
@@ -371,7 +370,7 @@ class OnlineModel:
             at = soc_pct + SLOPE_STEP_PCT * np.array([-1.0, 0.0, 1.0])
             extra = np.zeros(3)
             for (effect, values), drive in zip(self._over_soc, drives[1:], strict=True):
-                extra += drive * effect.over_soc(at, values, self.model, self.extended.pack)
+                extra += drive * effect.over_soc(at, values, self.model)
             volts += float(extra[1])
             slope += float(extra[2] - extra[0]) / (2.0 * SLOPE_STEP_PCT)
             slope = max(slope, self._slope_at_least)
@@ -412,7 +411,7 @@ class OnlineModel:
     def state(self) -> list[list[float]]:
         """Return the low-passed currents' state, then that of each effect, for `restore`."""
         lags = [number for lag in self.lags for number in lag.state()]
-        return [lags, *([x for item in memory for x in item.state()] for memory in self._memory)]
+        return [lags, *([x for item in at.memory for x in item.state()] for at in self._contexts)]
 
     def restore(self, state: Sequence[Sequence[float]]) -> None:
         """Continue from a saved state of the same model; the delay line is filled separately.
@@ -422,10 +421,10 @@ class OnlineModel:
         InputError
             If the state does not belong to this model or is malformed; names the effect.
         """
-        if len(state) != 1 + len(self._memory):
-            raise InputError(f"the model has {len(self._memory)} effects", field="effects")
+        if len(state) != 1 + len(self._contexts):
+            raise InputError(f"the model has {len(self._contexts)} effects", field="effects")
         for number, (memory, saved) in enumerate(
-            zip([self.lags, *self._memory], state, strict=True)
+            zip([self.lags, *(at.memory for at in self._contexts)], state, strict=True)
         ):
             size = LAG_NUMBERS if len(memory) > 1 else len(saved)  # several are lags
             numbers = iter(saved)

@@ -16,6 +16,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from cangauge._typing import FloatArray
+from cangauge.logs.gaps import BRIDGE_S
 
 NO_LAG_S = 1e-3
 """A time constant up to this is no lag: output = input [s]."""
@@ -117,13 +118,17 @@ class Lag(Memory):
             latest_s, latest, first = self._last
             times, inputs, skip = np.r_[latest_s, time_s], np.r_[latest, values], 1
         seconds = np.diff(times)
+        result = decaying_sum(*self._increments(seconds, inputs), first)[skip:]
+        self._last = (float(times[-1]), float(inputs[-1]), float(result[-1]))
+        return result
+
+    def _increments(self, seconds: FloatArray, inputs: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return the decay over each step of shape (n,), and its increment."""
         step = seconds / self.tau_s
         gone = -np.expm1(-step)  # 1 − a
         drive = gone * inputs[1:] + (gone / step - (1.0 - gone)) * (inputs[:-1] - inputs[1:])
         drive[seconds > self._rest_s] = 0.0
-        result = decaying_sum(step, drive, first)[skip:]
-        self._last = (float(times[-1]), float(inputs[-1]), float(result[-1]))
-        return result
+        return step, drive
 
     def state(self) -> list[float]:
         """Return time [s], input and output at the latest sample; empty before the first."""
@@ -138,6 +143,55 @@ class Lag(Memory):
         if not all(map(math.isfinite, state)):
             raise ValueError("not finite")
         self._last = (time_s, latest, value)
+
+
+class Turned(Lag):
+    """Lag of −sign(I) over a charge instead of time; 0 at the start, unchanged over gaps.
+
+    Parameters
+    ----------
+    travel_as : float
+        Charge that turns it [As].
+    """
+
+    def __init__(self, travel_as: float) -> None:
+        super().__init__(travel_as, 0.0)
+
+    def _increments(self, seconds: FloatArray, inputs: FloatArray) -> tuple[FloatArray, FloatArray]:
+        mean = 0.5 * (inputs[1:] + inputs[:-1])
+        decay = np.where(seconds > BRIDGE_S, 0.0, np.abs(mean) * seconds / self.tau_s)
+        return decay, np.sign(mean) * np.expm1(-decay)
+
+    def restore(self, state: Sequence[float]) -> None:
+        """Continue from a saved state; raise ValueError if it is malformed."""
+        super().restore(state)
+        if abs(self.value) > 1.0:
+            raise ValueError("the state lies within ±1")
+
+
+class First(Memory):
+    """Time of the first sample."""
+
+    def __init__(self) -> None:
+        self._first_s: float | None = None
+
+    def of(self, time_s: FloatArray) -> float:
+        """Return the time of the first sample ever [s], given the times of the next ones."""
+        if self._first_s is None:
+            self._first_s = float(time_s[0])
+        return self._first_s
+
+    def state(self) -> list[float]:
+        """Return the time [s]; empty before the first sample."""
+        return [] if self._first_s is None else [self._first_s]
+
+    def restore(self, state: Sequence[float]) -> None:
+        """Continue from a saved state; raise ValueError if it is malformed."""
+        self._first_s = None
+        if state:
+            (self._first_s,) = state
+            if not math.isfinite(self._first_s):
+                raise ValueError("not finite")
 
 
 def low_passed(

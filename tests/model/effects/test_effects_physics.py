@@ -33,10 +33,10 @@ class PackState:
 def corrected(effect_id: str, signals: Signals, values: Values) -> Signals:
     """A whole log as ideal sensors would have shown it."""
     effect = LIBRARY[effect_id]
-    memory = effect.memory(values, PACK)
-    for item in memory:
+    context = effect.context(values, MODEL, PACK)
+    for item in context.memory:
         item.whole = True
-    return effect.correct(signals, values, PACK, memory)
+    return effect.correct(signals, values, context)
 
 
 def steady(
@@ -56,9 +56,9 @@ def extra(effect_id: str, state: PackState, values: Values) -> np.ndarray:
     effect = LIBRARY[effect_id]
     values = {**effect.neutral(PACK), **values}
     load = Load(state.time_s, state.current_a, state.temperature_c, state.drop_v)
-    drive = effect.drive(load, values, MODEL, PACK, effect.memory(values, PACK))
+    drive = effect.drive(load, values, effect.context(values, MODEL, PACK))
     assert drive is not None
-    return drive * effect.over_soc(state.soc_pct, values, MODEL, PACK)
+    return drive * effect.over_soc(state.soc_pct, values, MODEL)
 
 
 def with_current(state: PackState, current_a: np.ndarray) -> PackState:

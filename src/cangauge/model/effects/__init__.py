@@ -1,1 +1,1 @@
-"""Effects that extend the voltage model, one file per family; see `base` and `library`."""
+"""Effects that extend the voltage model: two tables of `Effect`s; see `base` and `library`."""

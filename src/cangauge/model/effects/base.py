@@ -22,9 +22,9 @@ through its pseudo-OCV, the slope of that, and its drop over the resistances.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar, Final, Literal, NamedTuple
+from typing import Any, Final, Literal, NamedTuple
 
 import numpy as np
 
@@ -219,23 +219,91 @@ class CoreForm(NamedTuple):
     """Time constants of its lags [s]."""
 
 
+NO_FORM = CoreForm("no_effect")
+"""Of an effect that the core applies elsewhere: in the count."""
+
+
+class Context(NamedTuple):
+    """What an effect works with."""
+
+    model: VoltageModel
+    pack: Pack
+    memory: Memories = ()
+    """Carried from sample to sample."""
+
+
+def _same(signals: Signals, *_: object) -> Signals:
+    return signals
+
+
+def _none(*_: object) -> None:
+    return None
+
+
+def _own_trials(parameter: Parameter, pack: Pack, _: FloatArray) -> tuple[float, ...]:
+    return parameter.trials(pack)
+
+
+def _at_every_soc(*_: object) -> float:
+    return 1.0
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
 class Effect:
-    """A mechanism that the voltage model lacks."""
+    """A mechanism that the voltage model lacks: a row of the library's table.
 
-    id: ClassVar[str]
-    family: ClassVar[Family]
-    parameters: ClassVar[tuple[Parameter, ...]]
-    signature: ClassVar[str]
-    """Its signature in U_measured − U_model, in words."""
-    equation: ClassVar[str]
-    source: ClassVar[str]
-    separated_by: ClassVar[str]
-    """The test that separates it from effects that look alike."""
-    is_cause: ClassVar[bool] = True
-    """Whether a diagnosis may name it; otherwise it is structure, learned from references only."""
+    Parameters
+    ----------
+    id : str
+    family : Family
+    parameters : tuple of Parameter
+    equation, source : str
+    signature : str
+        Its signature in U_measured − U_model, in words.
+    separated_by : str
+        The test that separates it from effects that look alike.
+    correct : callable
+        (signals, values, context) → signals as ideal sensors would have shown them. Rows may be
+        held back in the memory until later ones have come.
+    count : callable
+        (counting, values) → how charge is counted with the effect.
+    drive : callable
+        (load, values, context) → added voltage [V], or its part besides `over_soc`, shape (n,);
+        None if it adds none. Rows come once and in order: the memory is advanced.
+    over_soc : callable
+        (soc_pct, values, model) → factor on `drive` at SoC [%] of shape (n,).
+    memory : callable
+        (values, pack) → what is carried from sample to sample, before the first one.
+    rc_elements : callable
+        (values) → resistance [Ω] and time constant [s] of voltages from earlier currents.
+    core_form : callable
+        (values, model, pack) → form in the C core; None if it has none.
+    trials : callable
+        (parameter, pack, time_s) → trial values of a shape, in its unit, on a log with these
+        times. The k-th value has the same meaning on every log of a group with one cause.
+    is_cause : bool
+        Whether a diagnosis may name it; otherwise it is structure, learned from references only.
+    scales_drop : bool
+        Whether the added voltage follows the model's drop over the resistances.
+    """
 
-    scales_drop: ClassVar[bool] = False
-    """Whether the added voltage follows the model's drop over the resistances."""
+    id: str
+    family: Family
+    parameters: tuple[Parameter, ...]
+    equation: str
+    source: str
+    signature: str
+    separated_by: str
+    correct: Callable[[Signals, Values, Context], Signals] = _same
+    count: Callable[[Counting, Values], Counting] = lambda counting, _: counting
+    drive: Callable[[Load, Values, Context], FloatArray | None] = _none
+    over_soc: Callable[[FloatArray, Values, VoltageModel], FloatArray | float] = _at_every_soc
+    memory: Callable[[Values, Pack], Memories] = lambda *_: ()
+    rc_elements: Callable[[Values], list[tuple[float, float]]] = lambda _: []
+    core_form: Callable[[Values, VoltageModel, Pack], CoreForm | None] = _none
+    trials: Callable[[Parameter, Pack, FloatArray], tuple[float, ...]] = _own_trials
+    is_cause: bool = True
+    scales_drop: bool = False
 
     @property
     def amplitudes(self) -> tuple[Parameter, ...]:
@@ -247,15 +315,24 @@ class Effect:
         """Parameters with trial values."""
         return tuple(item for item in self.parameters if item.grid)
 
+    def context(self, values: Values, model: VoltageModel, pack: Pack) -> Context:
+        """Return what it works with on a model, before the first sample."""
+        return Context(model, pack, self.memory(values, pack))
+
+    @property
+    def corrects(self) -> bool:
+        """Whether it changes the measured signals."""
+        return self.correct is not _same
+
     @property
     def adds_voltage(self) -> bool:
         """Whether it adds a voltage, and changes neither signals nor count."""
-        return type(self).drive is not Effect.drive
+        return self.drive is not _none
 
     @property
     def uses_soc(self) -> bool:
         """Whether the added voltage depends on the SoC."""
-        return type(self).over_soc is not Effect.over_soc
+        return self.over_soc is not _at_every_soc
 
     def constants(self, pack: Pack) -> dict[str, float]:
         """Return the parameters that are taken from the pack when the effect is added to it."""
@@ -284,47 +361,3 @@ class Effect:
             low, high = item.bounds(pack, BOUND_MARGIN)
             result[item.name] = min(max(result[item.name], low), high)
         return result
-
-    def trials(self, parameter: Parameter, pack: Pack, time_s: FloatArray) -> tuple[float, ...]:
-        """Return the trial values of a shape, in its unit, on a log with these times.
-
-        The k-th value has the same meaning on every log of a group with one cause.
-        """
-        return parameter.trials(pack)
-
-    def memory(self, values: Values, pack: Pack) -> Memories:
-        """Return what the effect carries from sample to sample, before the first one."""
-        return ()
-
-    def correct(self, signals: Signals, values: Values, pack: Pack, memory: Memories) -> Signals:
-        """Return the signals as ideal sensors would have shown them.
-
-        Rows may be held back in the memory until later ones have come.
-        """
-        return signals
-
-    def count(self, counting: Counting, values: Values) -> Counting:
-        """Return how charge is counted with the effect."""
-        return counting
-
-    def drive(
-        self, load: Load, values: Values, model: VoltageModel, pack: Pack, memory: Memories
-    ) -> FloatArray | None:  # fmt: skip
-        """Return the added voltage [V], or its part besides `over_soc`, shape (n,); None if none.
-
-        Every row comes once and in order, since the memory is advanced.
-        """
-
-    def over_soc(
-        self, soc_pct: FloatArray, values: Values, model: VoltageModel, pack: Pack
-    ) -> FloatArray | float:
-        """Return the factor on `drive` at SoC [%] of shape (n,)."""
-        return 1.0
-
-    def rc_elements(self, values: Values) -> list[tuple[float, float]]:
-        """Return resistance [Ω] and time constant [s] of voltages from earlier currents."""
-        return []
-
-    def core_form(self, values: Values, model: VoltageModel, pack: Pack) -> CoreForm | None:
-        """Return its form in the C core; None if it has none."""
-        return CoreForm("no_effect")

@@ -11,46 +11,10 @@ import numpy as np
 from cangauge._typing import FloatArray
 from cangauge.errors import InputError
 from cangauge.model.effects.base import BOUND_MARGIN, Effect, Pack, Parameter, Values
-from cangauge.model.effects.charge import Capacity, CoulombicEfficiency, InitialSoc
-from cangauge.model.effects.dynamics import ChargeTransfer, FastPolarization, SlowDiffusion
-from cangauge.model.effects.equilibrium import EntropicCoefficient, Hysteresis, OcvShape, WeakCell
-from cangauge.model.effects.resistance import (
-    ResistanceAsymmetry,
-    ResistanceSoc,
-    ResistanceStep,
-    ResistanceTemperature,
-)
-from cangauge.model.effects.sensing import CurrentGain, CurrentOffset, VoltageGain, VoltageOffset
-from cangauge.model.effects.thermal import CoreTemperature, InnerTemperature, TemperatureLag
-from cangauge.model.effects.timing import TimeSkew
+from cangauge.model.effects.signals import CORRECTIONS, COUNTS
+from cangauge.model.effects.voltages import VOLTAGES
 
-# In the order of correction: sensors before quantities computed from their signals.
-_EFFECTS: tuple[Effect, ...] = (
-    CurrentOffset(),
-    CurrentGain(),
-    VoltageOffset(),
-    VoltageGain(),
-    TimeSkew(),
-    TemperatureLag(),
-    CoreTemperature(),
-    Capacity(),
-    InitialSoc(),
-    CoulombicEfficiency(),
-    ResistanceTemperature(),
-    ResistanceSoc(),
-    ResistanceAsymmetry(),
-    ResistanceStep(),
-    ChargeTransfer(),
-    FastPolarization(),
-    SlowDiffusion(),
-    Hysteresis(),
-    EntropicCoefficient(),
-    InnerTemperature(),
-    OcvShape(),
-    WeakCell(),
-)
-
-LIBRARY: Mapping[str, Effect] = {effect.id: effect for effect in _EFFECTS}
+LIBRARY: Mapping[str, Effect] = {effect.id: effect for effect in (*CORRECTIONS, *COUNTS, *VOLTAGES)}
 """Effect id → effect, in the order in which effects are applied."""
 
 LARGEST = 1e30

@@ -1,0 +1,318 @@
+"""Effects on signals and charge: errors of sensors, clocks, thermometers and of the count.
+
+The rows stand in the order of correction: sensors before quantities computed from their signals.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import partial
+from typing import Final, Literal
+
+import numpy as np
+
+from cangauge.logs.gaps import BRIDGE_S
+from cangauge.model.effects.base import (
+    NO_FORM,
+    Context,
+    CoreForm,
+    Effect,
+    Memories,
+    Parameter,
+    Signals,
+    Values,
+)
+from cangauge.model.first_order import Lag, Memory
+
+SMOOTHING_S: Final = 200.0
+"""Time constant of the smoothed derivative [s]: short against the warming of a pack, long against
+the steps of a sensor with whole degrees; the same for all lags, so that the effect is linear in
+`tau_s`."""
+
+STALE: Final = 64
+"""Currents that are not needed any more are dropped from this number on."""
+
+
+def _linear_sensor(
+    signal: Literal["current", "voltage"],
+    error: Literal["offset", "gain"],
+    parameter: Parameter,
+    signature: str,
+    separated_by: str,
+) -> Effect:
+    """Return a sensor's error, measured = gain·true + offset, undone."""
+    field = {"current": "current_a", "voltage": "voltage_v"}[signal]
+    symbol = {"current": "I", "voltage": "U"}[signal]
+
+    def offset_and_gain(values: Values) -> tuple[float, float]:
+        value = values[parameter.name]
+        return (value, 1.0) if error == "offset" else (0.0, 1.0 + value / 100.0)
+
+    def correct(signals: Signals, values: Values, *_: object) -> Signals:
+        offset, gain = offset_and_gain(values)
+        return signals._replace(**{field: (getattr(signals, field) - offset) / gain})
+
+    is_offset = error == "offset"
+    return Effect(
+        id=f"{signal}_{error}",
+        family="current_sensing" if signal == "current" else "voltage_sensing",
+        parameters=(parameter,),
+        signature=signature,
+        equation=f"{symbol} = {symbol}_measured " + ("− b" if is_offset else "/ (1 + g)"),
+        source=f"{'zero' if is_offset else 'sensitivity'} error, JCGM 200:2012 (VIM)",
+        separated_by=separated_by,
+        correct=correct,
+        core_form=lambda values, *_: CoreForm(f"{signal}_sensor", offset_and_gain(values)),
+    )
+
+
+class _Waiting(Memory):
+    """Rows that wait for their current, and the currents that later rows need."""
+
+    def __init__(self, skew_s: float) -> None:
+        self._skew_s = skew_s
+        self._waiting = np.empty((4, 0))
+        self._currents = np.empty((2, 0))
+
+    def step(self, signals: Signals) -> Signals:
+        """Append rows and return those whose current has come."""
+        self._waiting = np.concatenate([self._waiting, np.stack(signals)], axis=1)
+        self._currents = np.concatenate([self._currents, np.stack(signals[:2])], axis=1)
+        times, currents = self._currents
+        at_s = self._waiting[0] + self._skew_s
+        ready = at_s.size if self.whole else int(np.searchsorted(at_s, times[-1], side="right"))
+        time_s, _, voltage_v, temperature_c = self._waiting[:, :ready]
+        skewed = np.interp(at_s[:ready], times, currents)
+        self._waiting = self._waiting[:, ready:]
+        upcoming_s = self._waiting[0, 0] if self._waiting.size else times[-1]
+        stale = int(np.searchsorted(times, upcoming_s + self._skew_s, side="right")) - 1
+        if stale > STALE:
+            self._currents = self._currents[:, stale:]
+        return Signals(time_s, skewed, voltage_v, temperature_c)
+
+    def state(self) -> list[float]:
+        waiting = self._waiting.T.ravel().tolist()
+        return [float(self._waiting.shape[1]), *waiting, *self._currents.ravel().tolist()]
+
+    def restore(self, state: Sequence[float]) -> None:
+        waiting = int(state[0]) if state else -1
+        first = 1 + 4 * waiting
+        kept, odd = divmod(len(state) - first, 2)
+        if waiting < 0 or kept < 0 or odd:
+            raise ValueError("not the waiting readings followed by times and as many currents")
+        times = state[first : first + kept]
+        stamps = state[1:first:4]
+        if not all(map(math.isfinite, [*state[first:], *stamps])):
+            raise ValueError("not finite")
+        if any(np.any(np.diff(kind) <= 0.0) for kind in (times, stamps)):
+            raise ValueError("times must increase")
+        # The waiting readings are the latest samples, and the kept times end with the same ones.
+        both = min(waiting, kept)
+        if list(stamps[waiting - both :]) != list(times[kept - both :]) or (waiting and not kept):
+            raise ValueError("the waiting readings do not match the times")
+        self._waiting = np.array(state[1:first]).reshape(waiting, 4).T
+        self._currents = np.array(state[first:]).reshape(2, kept)
+
+
+def _time_skew(signals: Signals, _: Values, at: Context) -> Signals:
+    return at.memory[0].step(signals) if at.memory else signals
+
+
+def _temperature_lag(signals: Signals, values: Values, at: Context) -> Signals:
+    measured = signals.temperature_c
+    ahead = values["tau_s"] / SMOOTHING_S
+    smooth = at.memory[0].step(signals.time_s, measured)
+    return signals._replace(temperature_c=measured + ahead * (measured - smooth))
+
+
+def _core_temperature(signals: Signals, values: Values, at: Context) -> Signals:
+    time_s, current_a, _, outside = signals
+    heat = at.memory[0].step(time_s, (current_a / at.pack.capacity_ah) ** 2)
+    core = outside + values["rise_k"] * heat
+    if values["late"]:
+        core = core + values["late"] * (at.memory[1].step(time_s, outside) - outside)
+    return signals._replace(temperature_c=core)
+
+
+def _core_memory(values: Values, *_: object) -> Memories:
+    heat = Lag(values["tau_s"], 0.0, rest_s=BRIDGE_S)
+    return (heat, Lag(values["tau_s"])) if values["late"] else (heat,)
+
+
+_current, _voltage = partial(_linear_sensor, "current"), partial(_linear_sensor, "voltage")
+
+CORRECTIONS: Final = (
+    # Or an unmeasured parasitic load (with opposite sign).
+    _current(
+        "offset",
+        Parameter("offset_a", "A", -0.15, 0.15, scale="capacity"),
+        signature="a constant R·b, and a slope over time as the count drifts: OCV′·b·t/C",
+        separated_by=(
+            "a long rest with the bus awake: the count drifts while no current flows. Not separable"
+            " from a load that bypasses the sensor; from capacity by alternating driving and"
+            " resting"
+        ),
+    ),
+    _current(
+        "gain",
+        Parameter("gain_pct", "%", -10.0, 10.0),
+        signature="a scaled drop over the resistance, and a slope over SoC as the count is scaled",
+        separated_by=(
+            "a drive at high current over little SoC (drop) against a long gentle one (count);"
+            " not separable from a joint change of capacity and resistance"
+        ),
+    ),
+    _voltage(
+        "offset",
+        Parameter("offset_v", "V", -0.04, 0.04, scale="voltage"),
+        signature="a constant, at any current, SoC and temperature",
+        separated_by=(
+            "a log over much SoC: the error of an initial SoC shrinks where the OCV is flat, that"
+            " of a gain follows the voltage, this one is constant; or the voltage with open"
+            " contactors"
+        ),
+    ),
+    _voltage(
+        "gain",
+        Parameter("gain_pct", "%", -4.0, 4.0),
+        signature="in proportion to the voltage: nearly constant, a little smaller near empty",
+        separated_by=(
+            "a log from full to empty: at one SoC it is not separable from voltage_offset, since"
+            " the voltage of a pack varies by only a fifth"
+        ),
+    ),
+    # The current is interpolated, never the voltage: averaging neighbouring voltages would reduce
+    # their noise and look like an improvement. Online, with a positive skew, a voltage is held
+    # until its current arrives, so estimates are `skew_s` late. The last rows of a whole log, whose
+    # current never arrives, use the last current.
+    Effect(
+        id="time_skew",
+        family="timing",
+        parameters=(
+            Parameter(
+                "skew_s", "s", -4.0, 4.0,
+                grid=(-4.0, -3.0, -2.0, -1.5, -1.0, -0.7, -0.5, -0.35, -0.2, -0.1, 0.0,
+                      0.1, 0.2, 0.35, 0.5, 0.7, 1.0, 1.5, 2.0, 3.0, 4.0),
+            ),
+        ),
+        signature="∝ R·dI/dt: spikes of either sign at every change of load",
+        equation="I(t) = I_measured(t + skew)",
+        source="definition",
+        separated_by=(
+            "a log at 10 Hz or faster: a skew gives spikes of both signs and the same area at both"
+            " ends of a pulse, fast_polarization a tail after each"
+        ),
+        correct=_time_skew,
+        memory=lambda v, _: (_Waiting(v["skew_s"]),) if v["skew_s"] else (),
+        core_form=lambda v, *_: CoreForm("time_skew", (v["skew_s"],)) if v["skew_s"] else NO_FORM,
+    ),
+    # Undone with a causal smoothed derivative.
+    Effect(
+        id="temperature_lag",
+        family="thermal",
+        parameters=(Parameter("tau_s", "s", 0.0, 2000.0),),
+        signature="kt·τ·dT/dt: while the pack warms or cools, zero at constant temperature",
+        equation="T = T_measured + τ·dT_measured/dt, the derivative smoothed over 200 s",
+        source="first-order response of a sensor; Michalski et al., Temperature Measurement, 2001",
+        separated_by=(
+            "warming or cooling from outside without current: core_temperature needs current"
+        ),
+        correct=_temperature_lag,
+        memory=lambda *_: (Lag(SMOOTHING_S),),
+        core_form=lambda v, *_: CoreForm(
+            "temperature_lag", (v["tau_s"] / SMOOTHING_S,), (SMOOTHING_S,)
+        ),
+    ),
+    # The thermal insulation also delays changes of the ambient temperature, with the same time
+    # constant: `late` is the fraction of them that the core follows with the lag (1: the whole cell
+    # is core). It has an effect only in a model with a temperature coefficient, or together with an
+    # effect that uses the temperature.
+    Effect(
+        id="core_temperature",
+        family="thermal",
+        parameters=(
+            Parameter("rise_k", "K", 0.0, 25.0),
+            Parameter("late", "1", 0.0, 1.0),
+            Parameter(
+                "tau_s", "s", 150.0, 4000.0, neutral=None,
+                grid=(200.0, 500.0, 1000.0, 2000.0, 3500.0),
+            ),
+        ),
+        signature=(
+            "kt times low-passed I²: it builds up over minutes of high current of either sign; and"
+            " the negative change of the measured temperature over the same time"
+        ),
+        equation=(
+            "T = T_m + ΔT + late·(T_τ − T_m),  τ·dΔT/dt = rise·(I/C)² − ΔT (rise: at a lasting"
+            " 1 C), τ·dT_τ/dt = T_m − T_τ"
+        ),
+        source="two-state thermal model, Forgez et al., J. Power Sources 195 (2010) 2961",
+        separated_by=(
+            "high current of alternating sign at constant SoC: slow_diffusion, linear in I,"
+            " cancels; temperature_lag follows the sensor and not the current"
+        ),
+        correct=_core_temperature,
+        memory=_core_memory,
+        core_form=lambda v, _, pack: CoreForm(
+            "core_temperature", (v["rise_k"], v["late"], pack.capacity_ah), (v["tau_s"],) * 2
+        ),
+    ),
+)  # fmt: skip
+
+COUNTS: Final = (
+    # By ageing, cold or a wrong data sheet.
+    Effect(
+        id="capacity",
+        family="charge",
+        parameters=(Parameter("change_pct", "%", -35.0, 35.0),),
+        signature="OCV′·(Ah since the start): a slope over charge, steep in the knee near empty",
+        equation="S = S₀ − 100·∫I dt / (C·(1 + x))",
+        source="Plett, Battery Management Systems vol. II, Artech House 2015, ch. 4",
+        separated_by=(
+            "a discharge from full to the knee at steady temperature; from current_offset by"
+            " alternating driving and resting, from current_gain by the drop over the resistance"
+        ),
+        count=lambda counting, v: replace(
+            counting, capacity_ah=counting.capacity_ah * (1.0 + v["change_pct"] / 100.0)
+        ),
+        core_form=lambda *_: NO_FORM,
+    ),
+    # A property of a log, not of a pack. Online it is added to the initial SoC given by the user;
+    # an initial SoC from the first voltage needs no correction.
+    Effect(
+        id="initial_soc",
+        family="charge",
+        parameters=(Parameter("offset_pct", "%", -12.0, 12.0),),
+        signature="OCV′(S): larger where the OCV is steep, at any current and time",
+        equation="S₀ = S₀_assumed + x",
+        source="definition",
+        separated_by=(
+            "a long rest before the start (the first voltage is then the OCV), or a log that"
+            " reaches the steep ends of the OCV, where it grows and voltage_offset does not"
+        ),
+        count=lambda counting, v: replace(
+            counting, initial_soc_pct=counting.initial_soc_pct + v["offset_pct"]
+        ),
+        core_form=lambda *_: NO_FORM,
+    ),
+    # Cells lose less than a tenth. A larger loss is a sensor that reads charging too high, or
+    # charge that bypasses it, with the same signature.
+    Effect(
+        id="coulombic_efficiency",
+        family="charge",
+        parameters=(Parameter("efficiency", "1", 0.7, 1.0, neutral=1.0),),
+        signature="OCV′·(Ah charged since the start): a drift that grows with regeneration only",
+        equation="S = S₀ − 100·∫(I⁺ + η·I⁻)dt / C",
+        source="Plett, Battery Management Systems vol. II, Artech House 2015, ch. 1",
+        separated_by=(
+            "logs with much and with little regeneration over the same discharge, or a full charge"
+            " within the log; not separable from capacity and current_offset in a plain drive"
+        ),
+        count=lambda counting, v: replace(
+            counting, charge_efficiency=counting.charge_efficiency * v["efficiency"]
+        ),
+        core_form=lambda *_: NO_FORM,
+    ),
+)
