@@ -97,7 +97,7 @@ class Gateway(Output):
     def on_snapshot(self, snapshot: Snapshot) -> None:
         """Take the SoC if it is valid, else none."""
         soc_pct = snapshot.status["estimate"]["soc_pct"]
-        if snapshot.status["status"] != "valid" or soc_pct is None:
+        if snapshot.status["status"] != "valid" or soc_pct is None or not math.isfinite(soc_pct):
             self._soc = None
         else:
             self._soc = soc_pct, snapshot.made_s + DOUBT_S

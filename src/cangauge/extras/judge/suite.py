@@ -23,6 +23,7 @@ import numpy as np
 
 from cangauge._resources import shared_file
 from cangauge._typing import FloatArray
+from cangauge.bus.connection import BusConnection
 from cangauge.bus.database import SignalCodec, find_message, load_dbc, signal_codec
 from cangauge.bus.open import BusAddress, bus_address, has_socketcan, open_bus
 from cangauge.bus.time_source import MICROSECONDS, ClockFrames
@@ -46,6 +47,8 @@ ANSWER_EVERY_S: Final = 10.0
 """Log time between two readings of the gauge [s]: as often it is compared with the truth."""
 QUIET_S: Final = 0.05
 """Time without a frame after which a gauge has answered [s]."""
+ANSWER_WITHIN_S: Final = 5.0
+"""Longest wait for an answer [s], also where other frames never end."""
 READY_WITHIN_S: Final = 30.0
 SILENT_AT_MOST: Final = 30
 """Readings without an answer after which a gauge counts as dead."""
@@ -223,7 +226,10 @@ def run_suite(
     found = bus_address("socketcan" if has_socketcan("vcan0") else "udp_multicast")
     address = replace(found, options={**found.options} | {"port": port})
     scores = []
-    with tempfile.TemporaryDirectory(prefix="cangauge-suite-") as folder, open_bus(address) as bus:
+    with (
+        tempfile.TemporaryDirectory(prefix="cangauge-suite-") as folder,
+        BusConnection(open_bus(address), str(address)) as bus,
+    ):
         gauge = _Gauge(bus, address, Path(folder), [*command])
         for number, fault in enumerate(faults, start=1):
             show(f"fault {number} of {len(faults)}: {fault.name}")
@@ -238,7 +244,7 @@ Reading = tuple[FloatArray, FloatArray, FloatArray]
 
 class _Gauge:
     def __init__(
-        self, bus: can.BusABC, address: BusAddress, folder: Path, command: list[str]
+        self, bus: BusConnection, address: BusAddress, folder: Path, command: list[str]
     ) -> None:
         self._bus, self._address, self._folder, self._command = bus, address, folder, command
         path = shared_file("dbc", "soc_estimate.dbc")
@@ -279,11 +285,12 @@ class _Gauge:
                     process.kill()
 
     def _wait_until_ready(self, process: subprocess.Popen[bytes]) -> None:
-        while self._bus.recv(0.0) is not None:  # of the gauge before
-            pass
+        until_s = time.monotonic() + QUIET_S
+        while time.monotonic() < until_s and self._bus.receive(0.0) is not None:
+            pass  # of the gauge before
         until_s = time.monotonic() + READY_WITHIN_S
         while time.monotonic() < until_s and process.poll() is None:
-            message = self._bus.recv(0.1)
+            message = self._bus.receive(0.1)
             if message is not None and message.arbitration_id == self._id:
                 return
         said = (self._folder / "gauge.log").read_text(errors="replace").strip()[-500:]
@@ -327,8 +334,10 @@ class _Gauge:
 
     def _answer(self, samples: int) -> tuple[float, float]:
         """Return SoC and σ after so many samples; NaN if the gauge said nothing."""
-        found = math.nan, math.nan
-        while samples > 0 and (message := self._bus.recv(QUIET_S)) is not None:
+        found, until_s = (math.nan, math.nan), time.monotonic() + ANSWER_WITHIN_S
+        while samples > 0 and (message := self._bus.receive(QUIET_S)) is not None:
+            if time.monotonic() > until_s:
+                break
             if message.arbitration_id == self._id and len(message.data) == 8:
                 samples -= 1
                 soc_pct, std_pct = (codec.decode(message.data) for codec in self._codecs)

@@ -145,7 +145,7 @@ class Live(Output):
             began_s = time.monotonic()
             try:
                 why = self._serve()
-            except (OSError, ValueError, KeyError) as error:  # no process, or not our lines
+            except Exception as error:  # noqa: BLE001 - no process, or lines that are not ours
                 why = f"it failed: {error!r}"
             if self._done.is_set():
                 return

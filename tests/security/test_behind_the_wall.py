@@ -1,0 +1,180 @@
+"""Attacks on what came last: the live process, the gateway, the suite, `[judge]`."""
+
+from __future__ import annotations
+
+import shutil
+import sys
+import time
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+import can
+import numpy as np
+import pytest
+
+from cangauge.bus.open import BusAddress
+from cangauge.bus.reconnecting import ReconnectingBus
+from cangauge.extras.inverter.gateway import Gateway, soc_fields
+from cangauge.extras.judge import suite
+from cangauge.extras.judge.live import LiveJudge, Stored
+from cangauge.extras.judge.suite import FAULTS, PlayedDrive, run_suite
+from cangauge.extras.live import launch
+from cangauge.extras.live.addresses import http_address
+from cangauge.extras.live.launch import Live
+from cangauge.service.status_client import Snapshot
+from cangauge.types import Estimate, Reason, Sample, Status
+from live import LoggedLines, leaf_model, waits
+from synthetic import synthetic_log
+
+NONE = Estimate(*[0.0] * 7, Status.VALID, Reason.NONE, 1)
+VALID = {"status": "valid", "estimate": {"soc_pct": 70.0}}
+# What a process that an attacker has taken over may write in place of its own lines.
+TAKEN_OVER = {
+    "no JSON": "print('x' * 100)",
+    "another shape": "print('[1, 2]')",
+    "a log of nonsense": "print('{\"log\": 3}')",
+    "a log that lacks its parts": 'print(\'{"log": {"level": "high"}}\')',
+    "a line without an end": "import os\nwhile True: os.write(1, b'x' * 65536)",
+    "an end at once": "pass",
+    "a crash": "raise SystemExit(9)",
+    "a closed stdin": "import os, time; os.close(0); os.close(1); time.sleep(60)",
+}
+
+
+@pytest.mark.parametrize("script", TAKEN_OVER.values(), ids=TAKEN_OVER.keys())
+def test_a_live_process_that_is_taken_over_is_ended(
+    monkeypatch: pytest.MonkeyPatch, script: str
+) -> None:
+    popen = launch.subprocess.Popen
+
+    def other(command: list[str], **options: Any) -> Any:
+        return popen([sys.executable, "-c", f"import sys\n{script}\nsys.stdout.flush()"], **options)
+
+    monkeypatch.setattr(launch.subprocess, "Popen", other)
+    with closing(Live(http=http_address("127.0.0.1:0", None, {}))) as page:
+        began_s = time.monotonic()
+        for _ in range(2000):  # far more than a pipe holds
+            page.on_snapshot(Snapshot(0.0, {"x": "y" * 1000}))
+        assert time.monotonic() - began_s < 1.0
+        assert waits(lambda: "started again" in page.trouble, 20.0)
+        assert page._thread.is_alive()
+
+
+def test_records_are_asked_for_by_a_boolean_only(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[bool] = []
+    with closing(Live(http=http_address("127.0.0.1:0", None, {}), on_record=asked.append)) as page:
+        for told in ({"record": "rm -rf"}, {"record": [0]}, {"other": 1}, {"record": None}):
+            page._hear(told)
+    assert asked == [True, True]
+
+
+FRAMES = [
+    can.Message(arbitration_id=0x355, is_extended_id=True, data=b"\x0b\x00\x5e\x00"),
+    can.Message(arbitration_id=0x355, is_extended_id=False, is_remote_frame=True, dlc=8),
+    can.Message(arbitration_id=0x355, is_extended_id=False, data=b""),
+    can.Message(arbitration_id=0x355, is_extended_id=False, data=b"\x0b"),
+    can.Message(arbitration_id=0x351, is_extended_id=False, data=bytes(8)),
+]
+
+
+@pytest.mark.parametrize("frame", FRAMES, ids=["extended", "remote", "empty", "short", "limits"])
+def test_the_gateway_changes_nothing_else(frame: can.Message) -> None:
+    gateway = Gateway.__new__(Gateway)
+    gateway._fields, gateway._replaces = soc_fields("victron"), True
+    gateway._soc, gateway._current_until_s = (70.0, 1.0), 1.0
+    told = gateway.replaced(frame, 0.5)
+    assert told.equals(frame, timestamp_delta=None)
+
+
+@pytest.mark.parametrize("soc_pct", [float("nan"), float("inf"), -5.0, 1e9])
+def test_no_odd_soc_reaches_an_inverter(soc_pct: float) -> None:
+    name = f"odd {soc_pct}"
+    buses = [ReconnectingBus(BusAddress("virtual", f"{name} {side}"), []) for side in "bi"]
+    for bus in buses:
+        bus.open()
+    with closing(Gateway(*buses, soc_fields("pylontech"))) as gateway:
+        for _ in range(2):
+            gateway.on_sample(Sample(0.0, 1.0, 50.0, 20.0), NONE)
+        status = {"status": "valid", "estimate": {"soc_pct": soc_pct}}
+        gateway.on_snapshot(Snapshot(time.monotonic(), status))
+        own = can.Message(arbitration_id=0x355, is_extended_id=False, data=b"\x0b\x00\x5e\x00")
+        assert 0 <= gateway.replaced(own, time.monotonic()).data[0] <= 100
+
+
+def test_a_flood_on_the_batterys_bus_does_not_stop_the_inverters() -> None:
+    buses = [ReconnectingBus(BusAddress("virtual", f"flood {side}"), []) for side in "bi"]
+    for bus in buses:
+        bus.open()
+    with (
+        closing(Gateway(*buses, soc_fields("pylontech"))),
+        can.Bus(interface="virtual", channel="flood b") as battery,
+        can.Bus(interface="virtual", channel="flood i") as inverter,
+    ):
+        inverter.send(can.Message(arbitration_id=0x305, is_extended_id=False, data=bytes(8)))
+        for number in range(5000):
+            data = number.to_bytes(8, "big")
+            battery.send(can.Message(arbitration_id=0x7FF, is_extended_id=False, data=data))
+        alive = battery.recv(5.0)
+        assert alive is not None
+        assert alive.arbitration_id == 0x305
+        seen = 0
+        while seen < 5000 and inverter.recv(5.0) is not None:
+            seen += 1
+        assert seen == 5000
+
+
+@pytest.fixture(scope="module")
+def drive() -> PlayedDrive:
+    log = synthetic_log(hours=0.02, rate_hz=1.0, start_pct=80.0, end_pct=79.0)
+    assert log.soc_pct is not None
+    return PlayedDrive("drive", log, log.soc_pct, leaf_model())
+
+
+GAUGE = """
+import sys, can
+bus = can.Bus(interface=sys.argv[1], channel=sys.argv[2], port=int(sys.argv[3]))
+soc = can.Message(arbitration_id=0x5A0, is_extended_id=False, data=bytes(8))
+bus.send(soc)
+{script}
+"""
+GAUGES = {
+    "floods": "while True: bus.send(can.Message(arbitration_id=0x123, is_extended_id=False))",
+    "sends short frames": "while True:\n bus.recv(); soc.data = b'1'; bus.send(soc)",
+    "ends at once": "pass",
+    "prints without end": "while True: print('x' * 1000)",
+}
+
+
+@pytest.mark.parametrize("script", GAUGES.values(), ids=GAUGES.keys())
+def test_a_bad_gauge_is_silent_and_ends(
+    monkeypatch: pytest.MonkeyPatch, drive: PlayedDrive, script: str
+) -> None:
+    monkeypatch.setattr(suite, "ANSWER_WITHIN_S", 0.3)
+    command = [sys.executable, "-c", GAUGE.format(script=script)]
+    command += ["{interface}", "{channel}", "{port}"]
+    began_s = time.monotonic()
+    (score,) = run_suite(command, [drive], FAULTS[:1])
+    assert score.silent == 1.0
+    assert np.isnan(score.mae_pct)
+    assert time.monotonic() - began_s < 60.0
+
+
+def test_a_folder_of_the_judge_that_goes_away_costs_the_opinion_only(tmp_path: Path) -> None:
+    folder = tmp_path / "opinion"
+    folder.mkdir()
+    with (
+        LoggedLines("cangauge.extras.judge") as lines,
+        closing(LiveJudge(Stored(folder, 3, ("false",)), lambda: 50.0)) as judge,
+    ):
+        shutil.rmtree(folder)
+        for second in range(600):
+            judge.on_sample(Sample(float(second), 10.0, 380.0, 20.0), NONE)
+        judge._end_stretch()
+        assert waits(lambda: any("was not judged" in line for line in lines.lines), 20.0)
+        folder.mkdir()
+        (folder / "junk.parquet").write_bytes(b"PAR1")
+        for second in range(600):
+            judge.on_sample(Sample(float(second), 10.0, 380.0, 20.0), NONE)
+        judge._end_stretch()
+        assert waits(lambda: len(list(folder.glob("2*.parquet"))) == 1, 20.0)
