@@ -16,7 +16,7 @@ import numpy as np
 from cangauge._typing import FloatArray
 from cangauge.errors import InputError
 from cangauge.identify.least_squares import SECONDS_PER_DATUM
-from cangauge.identify.rows import SOC_SPAN_AT_LEAST_PCT, FitRows
+from cangauge.identify.rows import ROWS_PER_COEFFICIENT, SOC_SPAN_AT_LEAST_PCT, FitRows
 from cangauge.model.model_file import Coefficient, Published, published_names
 from cangauge.model.voltage_model import (
     BASIS_NAMES,
@@ -30,8 +30,6 @@ SINGULAR = 1e-9
 """Singular value relative to the largest, of columns of equal norm, below which a combination of
 coefficients is not identified [-]: voltages are known to 1e-4, and trips over a fifth of the SoC
 reach 1e-10, from full to empty 1e-6."""
-ROWS_PER_COEFFICIENT = 4
-"""Rows that a coefficient needs."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -27,7 +27,6 @@ from cangauge.model.prior import (
     CHEMISTRIES,
     DELAYS_S,
     LOW_PASS_S,
-    REFERENCE_C,
     Chemistry,
     ChemistryName,
     principal_functions,
@@ -38,6 +37,7 @@ from cangauge.model.version1 import BLOCK_S, upgraded
 from cangauge.model.voltage_model import (
     BASIS_NAMES,
     KNOTS_PCT,
+    REFERENCE_C,
     Arrhenius,
     Functions,
     HermiteCurve,
