@@ -41,8 +41,6 @@ MEAN_SLOPE_PCT: Final = (10.0, 90.0)
 """SoC between which the mean slope of the open-circuit voltage is taken [%]."""
 STEEPNESS_AT_MOST: Final = 5.0
 """Upper limit of the slope, relative to the mean."""
-MEAN_SLOPE_AT_LEAST: Final = 1e-6
-"""Lower limit of the mean slope [V per %], so that the ratio exists."""
 
 BEND_ZERO_C_RATE: Final = 1.0
 """Current at which the bend alone is zero, as at rest [1/h]: a model identified on logs of the same
@@ -153,7 +151,7 @@ def _mean_slope(model: VoltageModel) -> float:
     """Return the mean slope of the pseudo-OCV [V per % SoC], positive."""
     low, high = MEAN_SLOPE_PCT
     rise_v = model.pseudo_ocv_at(high)[0] - model.pseudo_ocv_at(low)[0]
-    return max(rise_v / (high - low), MEAN_SLOPE_AT_LEAST)
+    return rise_v / (high - low)
 
 
 def _steepness(soc_pct: FloatArray, values: Values, model: VoltageModel) -> FloatArray | float:
