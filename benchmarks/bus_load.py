@@ -35,7 +35,6 @@ from rich.console import Console
 from rich.table import Table
 
 from cangauge._resources import shared_file
-from cangauge.bus.encoder import FrameEncoder
 from cangauge.bus.open import BusAddress, bus_address, open_bus
 from cangauge.bus.vehicle import Vehicle
 from cangauge.estimation.offline import estimate_log
@@ -43,6 +42,7 @@ from cangauge.estimation.settings import EstimatorSettings
 from cangauge.logs.log import Log
 from cangauge.logs.read import read_log
 from cangauge.model.model_file import Model
+from cangauge.replay.encoder import FrameEncoder
 from cangauge.replay.player import Pacer
 from cangauge.service.pipeline import Pipeline, PipelineSettings
 from cangauge.service.record import Recorder

@@ -38,7 +38,6 @@ from rich.console import Console
 from rich.table import Table
 
 from cangauge._resources import shared_file
-from cangauge.bus.encoder import FrameEncoder
 from cangauge.bus.vehicle import Vehicle
 from cangauge.cli.app import COMMANDS
 from cangauge.diagnosis import diagnose
@@ -53,6 +52,7 @@ from cangauge.logs.canonical import write_log
 from cangauge.logs.log import Log
 from cangauge.logs.read import read_log
 from cangauge.model.model_file import Coefficient, Model
+from cangauge.replay.encoder import FrameEncoder
 from cangauge.service.pipeline import Pipeline, PipelineSettings
 from cangauge.types import Sample
 from peer_filters import Circuit, bare_ekf, run

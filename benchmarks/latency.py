@@ -37,10 +37,10 @@ from rich.console import Console
 from rich.table import Table
 
 from cangauge._resources import shared_file
-from cangauge.bus.encoder import FrameEncoder
 from cangauge.bus.open import BusAddress, bus_address, open_bus
 from cangauge.bus.time_source import ClockFrames
 from cangauge.bus.vehicle import Vehicle
+from cangauge.replay.encoder import FrameEncoder
 from cangauge.replay.player import Pacer
 from cangauge.types import Sample
 from faults.line import udp

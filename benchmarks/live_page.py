@@ -29,9 +29,9 @@ from rich.console import Console
 from rich.table import Table
 from tornado.websocket import websocket_connect
 
-from cangauge.bus.encoder import FrameEncoder
 from cangauge.bus.open import BusAddress, bus_address, open_bus
 from cangauge.bus.vehicle import Vehicle
+from cangauge.replay.encoder import FrameEncoder
 from cangauge.replay.player import Pacer
 from cangauge.types import Sample
 from live_service import service

@@ -37,12 +37,12 @@ from rich.markup import escape
 from rich.table import Table
 
 from cangauge._resources import shared_file
-from cangauge.bus.encoder import FrameEncoder
 from cangauge.bus.open import BusAddress, open_bus
 from cangauge.bus.publish import FrameIds, SocEstimate, SocReader
 from cangauge.bus.vehicle import Vehicle
 from cangauge.estimation.settings import EstimatorSettings
 from cangauge.model.model_file import Model
+from cangauge.replay.encoder import FrameEncoder
 from cangauge.service.loop import CHECKPOINT_EVERY_S, FIRST_CHECKPOINT_S
 from cangauge.service.pipeline import Pipeline, PipelineSettings
 from cangauge.service.state import StateKeeper, StateSettings

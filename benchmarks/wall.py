@@ -29,8 +29,8 @@ import can
 from rich.console import Console
 from rich.table import Table
 
-from cangauge.bus.encoder import FrameEncoder
 from cangauge.bus.vehicle import Vehicle
+from cangauge.replay.encoder import FrameEncoder
 from cangauge.service.status_client import fetch_status
 from cangauge.types import Sample
 

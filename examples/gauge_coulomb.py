@@ -1,6 +1,6 @@
-"""A gauge that only counts, as small as one can be; for `cangauge judge --suite`.
+r"""A gauge that only counts, as small as one can be; for `cangauge judge --suite`.
 
-cangauge judge --suite -- python examples/gauge_coulomb.py {interface} {channel} {port} \\
+cangauge judge --suite -- python examples/gauge_coulomb.py {interface} {channel} {port} \
         {capacity_ah} {soc}
 """
 

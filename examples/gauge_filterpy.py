@@ -1,6 +1,6 @@
-"""A gauge with filterpy's extended Kalman filter over SoC and one RC pair, nothing tuned.
+r"""A gauge with filterpy's extended Kalman filter over SoC and one RC pair, nothing tuned.
 
-cangauge judge --suite -- python examples/gauge_filterpy.py {interface} {channel} {port} \\
+cangauge judge --suite -- python examples/gauge_filterpy.py {interface} {channel} {port} \
         {model} {soc}
 """
 

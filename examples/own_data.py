@@ -25,7 +25,7 @@ import can
 import numpy as np
 
 import cangauge
-from cangauge.bus.encoder import FrameEncoder
+from cangauge.replay.encoder import FrameEncoder
 
 MY_DBC = """VERSION ""
 NS_ :

@@ -12,9 +12,9 @@ from typing import Any, Self
 import can
 
 from cangauge._resources import shared_file
-from cangauge.bus.encoder import FrameEncoder
 from cangauge.bus.vehicle import Vehicle
 from cangauge.estimation.offline import samples_of
+from cangauge.replay.encoder import FrameEncoder
 from cangauge.service.run import Service
 from cells_bus import ALL_CELLS, CAR, CELLS_DBC, CELLS_ON_BUS, all_cell_frames
 from live import leaf_model_path, short_log, virtual_port, waits

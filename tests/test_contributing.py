@@ -8,13 +8,13 @@ import pytest
 
 import cangauge
 from cangauge.bus.decoder import SampleDecoder
-from cangauge.bus.encoder import FrameEncoder
 from cangauge.bus.mapping import SignalMap, TemperatureMap, VehicleMap
 from cangauge.bus.vehicle import PRESETS, Preset, Vehicle
 from cangauge.extras.report.charts import new_figure
 from cangauge.extras.report.page import Figure, Page, Paragraph, Section, Tile, render
 from cangauge.model.effects.base import Effect, Parameter
 from cangauge.model.effects.library import LIBRARY
+from cangauge.replay.encoder import FrameEncoder
 from cangauge.types import Sample
 from synthetic import synthetic_log
 

@@ -15,12 +15,12 @@ from typing import Final
 import can
 
 from cangauge._resources import shared_file
-from cangauge.bus.encoder import FrameEncoder
 from cangauge.bus.protection import ProtectionRule
 from cangauge.bus.time_source import ClockFrames
 from cangauge.bus.vehicle import Vehicle
 from cangauge.estimation.offline import samples_of
 from cangauge.logs.read import read_log
+from cangauge.replay.encoder import FrameEncoder
 from cangauge.types import Sample
 
 LOG: Final = "leaf2012_reconstruction_10min.parquet"

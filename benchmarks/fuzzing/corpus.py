@@ -19,13 +19,13 @@ import pyarrow.parquet as pq
 from mcap.writer import CompressionType, Writer
 
 from cangauge._resources import shared_file
-from cangauge.bus.encoder import FrameEncoder
 from cangauge.bus.vehicle import Vehicle
 from cangauge.extras.formats.mcap import frame_content, frame_topic
 from cangauge.extras.formats.mcap_messages import FRAME, SAMPLE
 from cangauge.model.effects.base import Pack, Parameter
 from cangauge.model.effects.library import LIBRARY, effect_entries
 from cangauge.model.model_file import Model
+from cangauge.replay.encoder import FrameEncoder
 from cangauge.types import Sample
 
 ROWS = 12

@@ -21,7 +21,6 @@ from cangauge._files import text_sha256
 from cangauge._resources import shared_file
 from cangauge.bus.captures import is_capture, open_capture
 from cangauge.bus.database import load_dbc
-from cangauge.bus.encoder import FrameEncoder
 from cangauge.bus.protection import GENERIC_RULE
 from cangauge.bus.publish import SocPublisher, SocReader
 from cangauge.bus.recording import capture_to_log
@@ -36,6 +35,7 @@ from cangauge.inspect.log import inspect_log
 from cangauge.logs.log import Log
 from cangauge.logs.read import read_log
 from cangauge.model.model_file import Model
+from cangauge.replay.encoder import FrameEncoder
 from cangauge.service import state as state_file
 from cangauge.service.config import load_config
 from cangauge.service.pipeline import Pipeline, PipelineSettings

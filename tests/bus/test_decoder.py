@@ -15,11 +15,11 @@ from hypothesis import strategies as st
 
 from cangauge._resources import shared_file
 from cangauge.bus.decoder import Pairing, SampleDecoder
-from cangauge.bus.encoder import FrameEncoder
 from cangauge.bus.open import bus_address
 from cangauge.bus.protection import LEAF_RULE
 from cangauge.bus.vehicle import EXTENDED, Vehicle, pgn_mask
 from cangauge.errors import InputError
+from cangauge.replay.encoder import FrameEncoder
 from cangauge.types import Sample
 from cells_bus import CAR, CELLS_DBC, cell_frames, numbered_frames
 from fd_pack import estimates_from_64_bytes, fd_frame, fd_vehicle

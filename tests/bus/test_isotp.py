@@ -14,11 +14,11 @@ from cangauge._resources import shared_file
 from cangauge.bus.captures import open_capture
 from cangauge.bus.database import load_dbc
 from cangauge.bus.decoder import SampleDecoder
-from cangauge.bus.encoder import FrameEncoder
-from cangauge.bus.polling import Reassembler, reply_key
+from cangauge.bus.isotp import Reassembler, reply_key
 from cangauge.bus.recording import capture_to_log
 from cangauge.bus.vehicle import Vehicle
 from cangauge.errors import InputError
+from cangauge.replay.encoder import FrameEncoder
 
 
 def frames_of(payload: bytes) -> list[bytes]:

@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 
 from cangauge.bus.decoder import SampleDecoder
-from cangauge.bus.encoder import FrameEncoder
 from cangauge.bus.recording import (
     capture_samples,
     capture_to_log,
@@ -24,6 +23,7 @@ from cangauge.errors import InputError
 from cangauge.logs.canonical import write_log
 from cangauge.logs.log import Log
 from cangauge.logs.read import LogFile
+from cangauge.replay.encoder import FrameEncoder
 from cangauge.types import Sample
 
 CURRENT_ID, VOLTAGE_ID, TEMPERATURE_ID = 0x400, 0x401, 0x402

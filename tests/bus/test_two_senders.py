@@ -12,10 +12,10 @@ import can
 import pytest
 
 from cangauge.bus.decoder import SUSPECTED_FOR_S, SampleDecoder
-from cangauge.bus.encoder import FrameEncoder
 from cangauge.bus.protection import Protection
 from cangauge.bus.recording import capture_samples, open_vehicle_capture
 from cangauge.bus.vehicle import Vehicle
+from cangauge.replay.encoder import FrameEncoder
 from cangauge.types import Reason, Sample
 
 LEAF, GENERIC = Vehicle.load("leaf_aze0"), Vehicle.load("generic")

@@ -14,7 +14,6 @@ import pyarrow.parquet
 import pytest
 
 from cangauge._resources import shared_file
-from cangauge.bus.encoder import FrameEncoder
 from cangauge.bus.vehicle import Vehicle
 from cangauge.errors import InputError
 from cangauge.estimation.estimator import Estimator
@@ -24,6 +23,7 @@ from cangauge.logs.canonical import write_log
 from cangauge.logs.log import Log
 from cangauge.logs.read import read_cells, read_log
 from cangauge.model.model_file import Model
+from cangauge.replay.encoder import FrameEncoder
 from cangauge.service.pipeline import Pipeline
 from cells_bus import ALL_CELLS, CAR, CELLS_DBC, CELLS_ON_BUS, all_cell_frames
 

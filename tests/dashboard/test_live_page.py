@@ -21,9 +21,9 @@ from headless import MARKS, chromium, faults, set_scheme
 
 from cangauge._resources import shared_file
 from cangauge.bus.captures import open_capture
-from cangauge.bus.encoder import FrameEncoder
 from cangauge.bus.open import BusAddress, bus_address, open_bus
 from cangauge.bus.vehicle import Vehicle
+from cangauge.replay.encoder import FrameEncoder
 from cangauge.types import Sample
 from live import Command, leaf_model_path, waits
 

@@ -35,9 +35,9 @@ import numpy as np
 import cangauge
 from cangauge.__main__ import main
 from cangauge.bus.captures import open_capture
-from cangauge.bus.encoder import FrameEncoder
 from cangauge.bus.recording import capture_samples
 from cangauge.bus.vehicle import PRESETS
+from cangauge.replay.encoder import FrameEncoder
 from cangauge.service.pipeline import Pipeline, PipelineSettings
 
 HERE = Path(__file__).resolve().parent

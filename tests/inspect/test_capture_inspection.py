@@ -8,10 +8,10 @@ from pathlib import Path
 import can
 import pytest
 
-from cangauge.bus.encoder import FrameEncoder
 from cangauge.bus.protection import LEAF_RULE
 from cangauge.bus.vehicle import Vehicle
 from cangauge.inspect.capture import inspect_capture
+from cangauge.replay.encoder import FrameEncoder
 from cangauge.types import Sample
 
 CURRENT_ID, VOLTAGE_ID, TEMPERATURE_ID = 0x400, 0x401, 0x402

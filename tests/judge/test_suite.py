@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from cangauge.errors import CangaugeError
-from cangauge.extras.judge.suite import FAULTS, Drive, run_suite
+from cangauge.extras.judge.suite import FAULTS, PlayedDrive, run_suite
 from live import in_process, leaf_model
 from synthetic import synthetic_log
 
@@ -26,13 +26,13 @@ FAULT = {fault.name: fault for fault in FAULTS}
 
 
 @pytest.fixture(scope="module")
-def drive() -> Drive:
+def drive() -> PlayedDrive:
     log = synthetic_log(hours=0.3, rate_hz=1.0, start_pct=80.0, end_pct=60.0, noise_v=0.3)
     assert log.soc_pct is not None
-    return Drive("drive", log, log.soc_pct, leaf_model())
+    return PlayedDrive("drive", log, log.soc_pct, leaf_model())
 
 
-def test_a_counter_has_the_errors_of_its_faults(drive: Drive) -> None:
+def test_a_counter_has_the_errors_of_its_faults(drive: PlayedDrive) -> None:
     wanted = [FAULT[name] for name in ("none", "offset +2 A", "start -20 %", "gain -5 %")]
     none, offset, start, gain = run_suite(COUNTER, [drive], wanted)
     assert none.worst_pct < 0.5
@@ -46,14 +46,14 @@ def test_a_counter_has_the_errors_of_its_faults(drive: Drive) -> None:
     assert none.silent == 0.0
 
 
-def test_a_filter_recovers_and_states_its_error(drive: Drive) -> None:
+def test_a_filter_recovers_and_states_its_error(drive: PlayedDrive) -> None:
     none, start = run_suite(FILTER, [drive], [FAULT["none"], FAULT["start -20 %"]])
     assert none.mae_pct < 3.0
     assert start.recovery_s < drive.log.duration_s
     assert start.cover_2sigma is not None
 
 
-def test_a_program_that_says_nothing_is_named(drive: Drive) -> None:
+def test_a_program_that_says_nothing_is_named(drive: PlayedDrive) -> None:
     command = [sys.executable, "-c", "import sys; sys.exit('no licence')"]
     with pytest.raises(CangaugeError, match=r"ended before publishing SOC_ESTIMATE.*no licence"):
         run_suite(command, [drive], FAULTS[:1])
@@ -61,7 +61,7 @@ def test_a_program_that_says_nothing_is_named(drive: Drive) -> None:
     assert (ended.code, "give both" in ended.err) == (2, True)
 
 
-def test_there_are_twenty_faults_of_the_count(drive: Drive) -> None:
+def test_there_are_twenty_faults_of_the_count(drive: PlayedDrive) -> None:
     assert len({fault.name for fault in FAULTS}) == 21
     log, capacity_ah = drive.log, drive.model.capacity_ah
     for fault in FAULTS[1:]:

@@ -14,7 +14,6 @@ import numpy as np
 import pytest
 
 from cangauge.bus.connection import BusConnection
-from cangauge.bus.encoder import FrameEncoder
 from cangauge.bus.open import BusAddress, open_bus
 from cangauge.bus.publish import FrameIds, SocPublisher, standard_filter
 from cangauge.bus.time_source import is_clock
@@ -22,6 +21,7 @@ from cangauge.bus.vehicle import Vehicle
 from cangauge.errors import CangaugeError, InputError
 from cangauge.estimation.offline import run_estimator, samples_of
 from cangauge.estimation.settings import EstimatorSettings
+from cangauge.replay.encoder import FrameEncoder
 from cangauge.replay.player import ReplaySettings, ReplayState, play
 from cangauge.replay.steps import CaptureSource, LogSource, quantization_bound
 from cangauge.service.pipeline import NOTHING_YET, PipelineSettings

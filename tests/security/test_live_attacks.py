@@ -17,8 +17,8 @@ from typing import Any
 import can
 import pytest
 
-from cangauge.bus.encoder import FrameEncoder
 from cangauge.bus.vehicle import Vehicle
+from cangauge.replay.encoder import FrameEncoder
 from cangauge.service.state import FILE_NAME
 from cangauge.service.status_client import fetch_status
 from cangauge.types import Sample

@@ -14,10 +14,10 @@ import pyarrow.csv
 import pyarrow.parquet
 import pytest
 
-from cangauge.bus.encoder import FrameEncoder
 from cangauge.bus.vehicle import Vehicle
 from cangauge.estimation.offline import samples_of
 from cangauge.logs.canonical import write_log
+from cangauge.replay.encoder import FrameEncoder
 from cangauge.service.offline import estimate_capture
 from cangauge.service.record import Recorder
 from live import Command, in_process, leaf_model, leaf_model_path, run_to_end, short_log

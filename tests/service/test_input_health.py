@@ -10,12 +10,12 @@ from dataclasses import dataclass
 import can
 import pytest
 
-from cangauge.bus.encoder import FrameEncoder
 from cangauge.bus.protection import GENERIC_RULE
 from cangauge.bus.publish import SocEstimate, SocReader
 from cangauge.bus.vehicle import Vehicle, VehicleSignal
 from cangauge.estimation.offline import samples_of
 from cangauge.estimation.settings import EstimatorSettings
+from cangauge.replay.encoder import FrameEncoder
 from cangauge.service.pipeline import Pipeline, PipelineSettings
 from cangauge.types import Estimate, Reason, Sample, Status
 from live import leaf_model, short_log

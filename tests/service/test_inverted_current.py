@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 
 from cangauge._resources import shared_file
-from cangauge.bus.encoder import FrameEncoder
 from cangauge.bus.publish import SocEstimate, SocReader
 from cangauge.bus.vehicle import Vehicle
 from cangauge.estimation.offline import samples_of
 from cangauge.logs.log import Log
 from cangauge.logs.sign import sign_of_current
+from cangauge.replay.encoder import FrameEncoder
 from cangauge.replay.player import ReplaySettings, play
 from cangauge.replay.steps import LogSource
 from cangauge.service.pipeline import Pipeline

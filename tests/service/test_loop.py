@@ -16,7 +16,6 @@ import numpy as np
 import pytest
 
 from cangauge.bus.connection import BusConnection, BusError
-from cangauge.bus.encoder import FrameEncoder
 from cangauge.bus.open import (
     UNKNOWN_INTERFACE,
     BackendCapabilities,
@@ -30,6 +29,7 @@ from cangauge.bus.time_source import ClockFrames
 from cangauge.bus.vehicle import Vehicle
 from cangauge.estimation.offline import samples_of
 from cangauge.estimation.settings import EstimatorSettings
+from cangauge.replay.encoder import FrameEncoder
 from cangauge.service import loop
 from cangauge.service.loop import Loop, LoopSettings, OwnFrames, RunSummary
 from cangauge.service.offline import estimate_capture

@@ -8,11 +8,11 @@ import can
 import numpy as np
 import pytest
 
-from cangauge.bus.encoder import FrameEncoder
 from cangauge.bus.time_source import ClockFrames
 from cangauge.bus.vehicle import Vehicle
 from cangauge.errors import InputError
 from cangauge.estimation.offline import samples_of
+from cangauge.replay.encoder import FrameEncoder
 from cangauge.service import record
 from cangauge.service.offline import estimate_capture
 from cangauge.service.pipeline import Pipeline, PipelineSettings

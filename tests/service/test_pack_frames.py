@@ -12,7 +12,6 @@ import numpy as np
 import pytest
 
 from cangauge._resources import shared_file
-from cangauge.bus.encoder import FrameEncoder
 from cangauge.bus.publish import (
     FrameIds,
     PackReport,
@@ -29,6 +28,7 @@ from cangauge.estimation.compiled import make_estimator
 from cangauge.estimation.offline import samples_of
 from cangauge.estimation.power import PackLimits
 from cangauge.logs.log import Log
+from cangauge.replay.encoder import FrameEncoder
 from cangauge.service.config import load_config
 from cangauge.service.pipeline import Pipeline, PipelineSettings
 from cangauge.service.setup import pipeline_settings

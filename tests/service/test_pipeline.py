@@ -8,7 +8,6 @@ import can
 import numpy as np
 import pytest
 
-from cangauge.bus.encoder import FrameEncoder
 from cangauge.bus.publish import FrameIds, SocDetail, SocEstimate, SocReader
 from cangauge.bus.time_source import ClockFrames
 from cangauge.bus.vehicle import Vehicle
@@ -16,6 +15,7 @@ from cangauge.errors import InputError
 from cangauge.estimation.offline import run_estimator, samples_of
 from cangauge.estimation.settings import EstimatorSettings
 from cangauge.logs.log import Log
+from cangauge.replay.encoder import FrameEncoder
 from cangauge.service.pipeline import Pipeline, PipelineSettings
 from cangauge.types import Estimate, Reason, Status
 from live import leaf_model, short_log

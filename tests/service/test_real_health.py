@@ -10,13 +10,13 @@ from pathlib import Path
 import can
 import pytest
 
-from cangauge.bus.encoder import FrameEncoder
 from cangauge.bus.protection import LEAF_RULE
 from cangauge.bus.recording import open_vehicle_capture
 from cangauge.bus.vehicle import Vehicle
 from cangauge.estimation.offline import run_estimator, samples_of
 from cangauge.estimation.settings import EstimatorSettings
 from cangauge.logs.read import read_log
+from cangauge.replay.encoder import FrameEncoder
 from cangauge.service.pipeline import Pipeline, PipelineSettings
 from cangauge.types import Estimate, Reason, Status
 from live import leaf_model

@@ -16,10 +16,10 @@ import numpy as np
 import pytest
 
 from cangauge.bus.captures import all_parts, open_capture, parts_of_run
-from cangauge.bus.encoder import FrameEncoder
 from cangauge.bus.vehicle import Vehicle
 from cangauge.errors import InputError
 from cangauge.estimation.offline import samples_of
+from cangauge.replay.encoder import FrameEncoder
 from cangauge.service import record
 from cangauge.service.offline import estimate_capture
 from cangauge.service.pipeline import Pipeline

@@ -12,9 +12,9 @@ import pytest
 
 from cangauge._resources import shared_file
 from cangauge.bus.database import load_dbc
-from cangauge.bus.encoder import FrameEncoder
 from cangauge.bus.vehicle import Vehicle
 from cangauge.estimation.offline import samples_of
+from cangauge.replay.encoder import FrameEncoder
 from cangauge.service.loop import LoopSettings
 from cangauge.service.run import Service
 from cangauge.types import Reason

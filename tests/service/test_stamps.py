@@ -13,7 +13,6 @@ import can
 import pytest
 
 from cangauge.bus.connection import BusConnection
-from cangauge.bus.encoder import FrameEncoder
 from cangauge.bus.open import BackendCapabilities, BusAddress, open_bus
 from cangauge.bus.publish import SocEstimate, SocReader
 from cangauge.bus.recording import capture_samples
@@ -21,6 +20,7 @@ from cangauge.bus.time_source import ClockFrames, ReceiveTime
 from cangauge.bus.vehicle import Vehicle
 from cangauge.estimation.offline import samples_of
 from cangauge.estimation.settings import EstimatorSettings
+from cangauge.replay.encoder import FrameEncoder
 from cangauge.service.loop import LoopSettings
 from cangauge.service.offline import estimate_capture
 from cangauge.service.pipeline import Pipeline, PipelineSettings

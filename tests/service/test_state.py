@@ -16,13 +16,13 @@ from typing import Any
 
 import pytest
 
-from cangauge.bus.encoder import FrameEncoder
 from cangauge.bus.time_source import ClockFrames
 from cangauge.bus.vehicle import Vehicle
 from cangauge.errors import InputError
 from cangauge.estimation.offline import samples_of
 from cangauge.estimation.settings import EstimatorSettings
 from cangauge.model.model_file import Model
+from cangauge.replay.encoder import FrameEncoder
 from cangauge.service import state as state_file
 from cangauge.service.pipeline import Pipeline, PipelineSettings
 from cangauge.service.state import (

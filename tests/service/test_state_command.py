@@ -10,11 +10,11 @@ from pathlib import Path
 import pytest
 
 from cangauge.bus.connection import BusConnection
-from cangauge.bus.encoder import FrameEncoder
 from cangauge.bus.open import BusAddress, open_bus
 from cangauge.bus.publish import SocEstimate, SocReader, standard_filter
 from cangauge.bus.vehicle import Vehicle
 from cangauge.estimation.offline import samples_of
+from cangauge.replay.encoder import FrameEncoder
 from cangauge.service.state import read_state
 from cangauge.types import Reason, Status
 from live import (

@@ -20,7 +20,6 @@ import pytest
 
 from bus_log import BusLog
 from cangauge.bus.connection import BusConnection
-from cangauge.bus.encoder import FrameEncoder
 from cangauge.bus.open import BusAddress, has_socketcan, open_bus
 from cangauge.bus.publish import SocDetail, SocEstimate, SocReader, standard_filter
 from cangauge.bus.reconnecting import LONGEST_PAUSE_S, ReconnectingBus
@@ -28,6 +27,7 @@ from cangauge.bus.vehicle import Vehicle
 from cangauge.errors import InputError
 from cangauge.estimation.offline import samples_of
 from cangauge.estimation.settings import EstimatorSettings
+from cangauge.replay.encoder import FrameEncoder
 from cangauge.service.loop import LoopSettings
 from cangauge.service.pipeline import Pipeline, PipelineSettings
 from cangauge.types import Reason, Status

@@ -12,12 +12,12 @@ import numpy as np
 import pytest
 
 from cangauge.bus.connection import BusConnection
-from cangauge.bus.encoder import FrameEncoder
 from cangauge.bus.open import BusAddress, has_socketcan, open_bus
 from cangauge.bus.vehicle import Vehicle
 from cangauge.estimation.offline import samples_of
 from cangauge.extras.live.addresses import http_address
 from cangauge.extras.live.launch import Live
+from cangauge.replay.encoder import FrameEncoder
 from cangauge.service.loop import Loop
 from cangauge.service.offline import estimate_capture
 from cangauge.service.pipeline import Pipeline

@@ -16,7 +16,6 @@ import numpy as np
 import pytest
 
 from cangauge.bus.connection import BusConnection
-from cangauge.bus.encoder import FrameEncoder
 from cangauge.bus.open import BusAddress, bus_address, has_socketcan, open_bus
 from cangauge.bus.publish import (
     FrameIds,
@@ -30,6 +29,7 @@ from cangauge.bus.vehicle import Vehicle
 from cangauge.errors import InputError
 from cangauge.estimation.offline import run_estimator, samples_of
 from cangauge.estimation.settings import EstimatorSettings
+from cangauge.replay.encoder import FrameEncoder
 from cangauge.replay.player import ReplaySettings, play
 from cangauge.replay.steps import CaptureSource, LogSource, quantization_bound
 from cangauge.service.loop import LoopSettings

@@ -16,7 +16,7 @@ import time
 from collections import Counter, deque
 from collections.abc import Sequence
 from contextlib import suppress
-from typing import Final, Self
+from typing import Any, Final, Self
 
 import can
 from can.interfaces.socketcan import SocketcanBus
@@ -27,7 +27,6 @@ from cangauge.bus.open import (
     UNKNOWN_INTERFACE,
     BackendCapabilities,
 )
-from cangauge.bus.polling import PollCounts
 from cangauge.errors import CangaugeError
 
 SEND_WITHIN_S: Final = 1.0
@@ -114,7 +113,7 @@ class BusConnection:
     is_off, is_drained : bool
         Whether the controller reported bus-off, with no frame received since; whether the receive
         queue was empty after the latest call that received.
-    foreign, polls : int, PollCounts or None
+    foreign, polls : int, `service.polling.PollCounts` or None
         Set by the service's loop: frames of others with its ids; outcomes of its requests.
     """
 
@@ -129,7 +128,7 @@ class BusConnection:
         self.garbled = self.error_frames = self.unsent = self.foreign = 0
         self.error_kinds: Counter[str] = Counter()
         self.is_off = self.is_drained = False
-        self.polls: PollCounts | None = None
+        self.polls: Any = None
         self._bus = bus
         self._failed: BusError | None = None
         self._posted: deque[tuple[float, can.Message]] = deque()

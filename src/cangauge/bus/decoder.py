@@ -10,6 +10,7 @@ from typing import Final, NamedTuple
 import can
 
 from cangauge.bus.database import SignalCodec
+from cangauge.bus.isotp import Reassembler, reply_id, reply_key
 from cangauge.bus.plausibility import (
     ConstantDetector,
     MessageStatistics,
@@ -17,7 +18,6 @@ from cangauge.bus.plausibility import (
     SignalHealth,
     stuck_detectors,
 )
-from cangauge.bus.polling import Reassembler, reply_id, reply_key
 from cangauge.bus.protection import FrameChecker, Verdict
 from cangauge.bus.vehicle import EXTENDED, CellSignals, Vehicle, VehicleSignal, pgn_mask
 from cangauge.types import Reason, Sample

@@ -171,7 +171,7 @@ class MessageMap(_MapTable):
     `protection` is one of `protection.RULES`, of [rules] or of `protection.PROFILES` (see `E2eRule`
     for their keys), or "counter", with its signal and the number of its values, by default all that
     its bits can hold. `j1939`: its PGN identifies it, from any source address and at any priority.
-    `isotp`: it is a reply over ISO-TP, with the id of `polling.reply_key` in the DBC, which the
+    `isotp`: it is a reply over ISO-TP, with the id of `isotp.reply_key` in the DBC, which the
     service may ask for on `request_id`.
     """
 

@@ -27,6 +27,7 @@ from cangauge.bus.database import (
     load_dbc,
     signal_codec,
 )
+from cangauge.bus.isotp import PollTarget, reply_id
 from cangauge.bus.mapping import (
     NO_OVERRIDES,
     CellsMap,
@@ -38,7 +39,6 @@ from cangauge.bus.mapping import (
     VehicleMap,
 )
 from cangauge.bus.plausibility import DEFAULTS, SignalChecks
-from cangauge.bus.polling import PollTarget, reply_id
 from cangauge.bus.protection import Protection
 from cangauge.errors import InputError, closest
 from cangauge.logs.log import TemperatureSource

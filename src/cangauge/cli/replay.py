@@ -194,7 +194,7 @@ def _summary_line(state: ReplayState) -> str:
 
 
 def _as_json(state: ReplayState, bus: BusConnection, source: Source) -> dict[str, Any]:
-    from cangauge.bus.encoder import FrameEncoder
+    from cangauge.replay.encoder import FrameEncoder
     from cangauge.replay.steps import CaptureSource, LogSource
 
     result: dict[str, Any] = {

@@ -21,7 +21,6 @@ import can
 from cangauge._logging import emit
 from cangauge.bus.connection import BusConnection
 from cangauge.bus.decoder import SUSPECTED_FOR_S
-from cangauge.bus.polling import Poller
 from cangauge.bus.publish import ESTIMATE_EVERY_S, standard_filter
 from cangauge.bus.time_source import (
     DRIVER_TOLERANCE_S,
@@ -32,6 +31,7 @@ from cangauge.bus.time_source import (
 )
 from cangauge.service.output import Output
 from cangauge.service.pipeline import Pipeline
+from cangauge.service.polling import Poller
 from cangauge.service.record import Recorder
 from cangauge.service.status import Monitor
 from cangauge.types import Reason

@@ -24,7 +24,6 @@ import numpy as np
 from cangauge._resources import shared_file
 from cangauge._typing import FloatArray
 from cangauge.bus.database import SignalCodec, find_message, load_dbc, signal_codec
-from cangauge.bus.encoder import FrameEncoder
 from cangauge.bus.open import BusAddress, bus_address, has_socketcan, open_bus
 from cangauge.bus.time_source import MICROSECONDS, ClockFrames
 from cangauge.bus.vehicle import Vehicle
@@ -36,6 +35,7 @@ from cangauge.logs.gaps import discharged_ah
 from cangauge.logs.log import Log
 from cangauge.logs.read import read_log
 from cangauge.model.model_file import Model
+from cangauge.replay.encoder import FrameEncoder
 from cangauge.types import Sample
 
 PACKS: Final = (211, 212, 213, 214)
@@ -57,7 +57,7 @@ TYPICAL_AH: Final = 60.0
 
 
 @dataclass(frozen=True)
-class Drive:
+class PlayedDrive:
     """A drive with the true SoC [%] of its rows, and the model of its pack."""
 
     name: str
@@ -160,7 +160,7 @@ class Score:
         }
 
 
-def simulated_drives() -> list[Drive]:
+def simulated_drives() -> list[PlayedDrive]:
     """Return twelve drives of four simulated packs, with models of other drives of theirs."""
     found = []
     for seed in PACKS:
@@ -172,12 +172,12 @@ def simulated_drives() -> list[Drive]:
             made = record_drive(scenario.plant, drive, ())
             rows = _every_second(made.log)
             found.append(
-                Drive(f"{seed}/{number}", made.log.rows(rows), made.true_soc_pct[rows], model)
+                PlayedDrive(f"{seed}/{number}", made.log.rows(rows), made.true_soc_pct[rows], model)
             )
     return found
 
 
-def recorded_drives(paths: Sequence[Path], model: Model) -> list[Drive]:
+def recorded_drives(paths: Sequence[Path], model: Model) -> list[PlayedDrive]:
     """Return drives of recorded logs of a model's pack; may raise InputError."""
     found = []
     for path in paths:
@@ -186,7 +186,7 @@ def recorded_drives(paths: Sequence[Path], model: Model) -> list[Drive]:
             cure = "give logs with the true SoC in each row"
             raise InputError("the true SoC is missing", source=path, field="soc_pct", cure=cure)
         rows = _every_second(log)
-        found.append(Drive(path.stem, log.rows(rows), log.soc_pct[rows], model))
+        found.append(PlayedDrive(path.stem, log.rows(rows), log.soc_pct[rows], model))
     return found
 
 
@@ -197,7 +197,7 @@ def _every_second(log: Log) -> slice:
 
 def run_suite(
     command: Sequence[str],
-    drives: Sequence[Drive],
+    drives: Sequence[PlayedDrive],
     faults: Sequence[CountFault] = FAULTS,
     show: Callable[[str], None] = lambda _: None,
 ) -> list[Score]:
@@ -224,10 +224,10 @@ def run_suite(
     address = replace(found, options={**found.options} | {"port": port})
     scores = []
     with tempfile.TemporaryDirectory(prefix="cangauge-suite-") as folder, open_bus(address) as bus:
-        player = _Player(bus, address, Path(folder), [*command])
+        gauge = _Gauge(bus, address, Path(folder), [*command])
         for number, fault in enumerate(faults, start=1):
             show(f"fault {number} of {len(faults)}: {fault.name}")
-            runs = [player.play(drive, fault) for drive in drives]
+            runs = [gauge.play(drive, fault) for drive in drives]
             scores.append(_score(fault, drives, runs))
     return scores
 
@@ -236,7 +236,7 @@ Reading = tuple[FloatArray, FloatArray, FloatArray]
 """Row of the drive, SoC and σ [%] of each reading; NaN where the gauge said nothing."""
 
 
-class _Player:
+class _Gauge:
     def __init__(
         self, bus: can.BusABC, address: BusAddress, folder: Path, command: list[str]
     ) -> None:
@@ -251,7 +251,7 @@ class _Player:
         ]
         self._vehicle, self._clock = Vehicle.load("generic"), ClockFrames()
 
-    def play(self, drive: Drive, fault: CountFault) -> Reading:
+    def play(self, drive: PlayedDrive, fault: CountFault) -> Reading:
         """Play a drive to a new gauge."""
         capacity_ah = drive.model.capacity_ah
         model = self._folder / f"{drive.model.made.fingerprint[:16]}.json"
@@ -292,7 +292,7 @@ class _Player:
         text = f"{' '.join(self._command)}: {problem} publishing SOC_ESTIMATE"
         raise CangaugeError(f"{text}; it said: {said}" if said else text)
 
-    def _readings(self, drive: Drive, fault: CountFault) -> Reading:
+    def _readings(self, drive: PlayedDrive, fault: CountFault) -> Reading:
         rows, values, silent = [], [], 0
         for last, frames, samples in self._batches(drive, fault):
             for frame in frames:
@@ -308,7 +308,7 @@ class _Player:
         return np.array(ends), soc[:, 0], soc[:, 1]
 
     def _batches(
-        self, drive: Drive, fault: CountFault
+        self, drive: PlayedDrive, fault: CountFault
     ) -> Iterator[tuple[int, list[can.Message], int]]:
         """Yield the last row, the frames and the number of samples of each `ANSWER_EVERY_S`."""
         log, encoder = drive.log, FrameEncoder(self._vehicle)
@@ -336,7 +336,7 @@ class _Player:
         return found
 
 
-def _score(fault: CountFault, drives: Sequence[Drive], runs: Sequence[Reading]) -> Score:
+def _score(fault: CountFault, drives: Sequence[PlayedDrive], runs: Sequence[Reading]) -> Score:
     errors, recoveries, jumps, hours, covered = [], [], 0, 0.0, []
     silent = np.concatenate([np.isnan(soc) for _, soc, _ in runs])
     for drive, (rows, soc_pct, std_pct) in zip(drives, runs, strict=True):

@@ -9,15 +9,15 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cangauge.bus.polling import (
+from cangauge.bus.isotp import PollTarget
+from cangauge.bus.vehicle import Vehicle
+from cangauge.service.polling import (
     EXCHANGE_WITHIN_S,
     OTHER_TESTER_S,
     REPLY_WITHIN_S,
     SLOWEST_S,
     Poller,
-    PollTarget,
 )
-from cangauge.bus.vehicle import Vehicle
 from polled_battery import CELLS, PROBES
 
 PROBES_OF_LEAF = PollTarget(0x79B, 0x7BB, (0x61, 0x04))

@@ -11,10 +11,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from cangauge.bus.decoder import SampleDecoder
-from cangauge.bus.encoder import FrameEncoder
 from cangauge.bus.vehicle import Vehicle
 from cangauge.errors import InputError
 from cangauge.logs.log import Log
+from cangauge.replay.encoder import FrameEncoder
 from cangauge.types import Sample
 
 VEHICLES = {

@@ -1,10 +1,7 @@
-"""Replies over ISO-TP (ISO 15765-2): reassembly, and requests for them one at a time.
+"""Requests for replies over ISO-TP, one at a time: a state machine without a bus or a clock.
 
-Replies become signals as any frame. Bus time drives the `Reassembler`, not a clock, so that a
-recorded exchange gives the same replies as a live one; the stacks of libraries answer with flow
-control and time out by the clock. `Poller` is a state machine without a bus or a clock: `due`
-returns the request to send, `take` the answer to a reply's first frame. Requests stop while another
-tester asks: two of them spoil each other's replies.
+`due` returns the request to send, `take` the answer to a reply's first frame. Requests stop while
+another tester asks: two of them spoil each other's replies.
 """
 
 from __future__ import annotations
@@ -16,95 +13,22 @@ from typing import Final
 
 import can
 
-LONGEST_GAP_S: Final = 1.0
+from cangauge.bus.isotp import CONSECUTIVE, FIRST, PollTarget, Reassembler
+
 REPLY_WITHIN_S: Final = 1.0
 EXCHANGE_WITHIN_S: Final = 5.0
 BETWEEN_S: Final = 0.05
-"""Longest time between frames of one reply, and wait for its next frame [s]: N_Cr of
-ISO 15765-2; from a request to its whole reply, also after "response pending": P2* of ISO 14229-2;
-from the end of one exchange to the next request: P2."""
+"""Wait for the next frame of a reply [s]: N_Cr of ISO 15765-2; from a request to its whole reply,
+also after "response pending": P2* of ISO 14229-2; from the end of one exchange to the next request:
+P2."""
 SLOWEST_S: Final = 60.0
 OTHER_TESTER_S: Final = 30.0
 """Longest interval between requests for a reply that does not come [s]: one a minute burdens no
 bus; silence of another tester after which requests are sent again: drivers' apps ask often."""
 
-_SINGLE, _FIRST, _CONSECUTIVE = range(3)
-_NEGATIVE, _RESPONSE_PENDING, _REPLY_OFFSET = 0x7F, 0x78, 0x40
+_NEGATIVE, _RESPONSE_PENDING = 0x7F, 0x78
 _CONTINUE: Final = bytes([0x30, 0x00, 0x00])
 """Flow control: continue to send, all frames, without a pause."""
-
-
-def reply_key(reply_id: int, payload: bytes | bytearray) -> int:
-    """Return the id of a reply's message in a DBC: the frames' id, then two bytes of the payload.
-
-    A reply `61 04 …` on 0x7BB is the message 0x7BB6104.
-    """
-    return reply_id << 16 | payload[0] << 8 | payload[1]
-
-
-def reply_id(key: int) -> int:
-    """Return the id of the frames that carry a reply; see `reply_key`."""
-    return key >> 16 & 0x7FF
-
-
-class Reassembler:
-    """Replies of one sender, from its frames.
-
-    `lost` counts replies given up: a frame missing, out of order or late.
-    """
-
-    def __init__(self) -> None:
-        self.lost = 0
-        self._payload = bytearray()
-        self._length = self._sequence = 0
-        self._last_s = 0.0
-
-    def take(self, data: bytes | bytearray, time_s: float) -> bytes | None:
-        """Take a frame at bus time `time_s` [s]; return the reply that it completes, if any."""
-        if not data:
-            return None
-        kind, low = data[0] >> 4, data[0] & 0x0F
-        if kind == _SINGLE:
-            self._give_up()
-            # CAN FD: the length is in the second byte.
-            start, length = (2, data[1]) if low == 0 and len(data) > 8 else (1, low)
-            return bytes(data[start : start + length]) if 0 < length <= len(data) - start else None
-        if kind == _FIRST and len(data) >= 2:
-            self._give_up()
-            self._payload, length = bytearray(data[2:]), low << 8 | data[1]
-            self._length = length if length > len(self._payload) else 0
-            self._sequence, self._last_s = 1, time_s
-        elif kind == _CONSECUTIVE and self._length:
-            if low != self._sequence & 0x0F or not 0.0 <= time_s - self._last_s <= LONGEST_GAP_S:
-                self._give_up()
-                return None
-            self._sequence, self._last_s = self._sequence + 1, time_s
-            self._payload += data[1:]
-            if len(self._payload) >= self._length:
-                reply, self._length = bytes(self._payload[: self._length]), 0
-                return reply
-        return None
-
-    def _give_up(self) -> None:
-        self.lost += self._length > 0
-        self._length = 0
-
-
-@dataclass(frozen=True, slots=True)
-class PollTarget:
-    """A reply to ask for: standard ids of the frames, and the first two bytes of the reply.
-
-    The request for a reply (0x61, 0x04) is `21 04`.
-    """
-
-    request_id: int
-    reply_id: int
-    reply: tuple[int, int]
-
-    @property
-    def request(self) -> bytes:
-        """Payload of the request."""
-        return bytes([self.reply[0] - _REPLY_OFFSET, self.reply[1]])
 
 
 @dataclass(slots=True)
@@ -183,9 +107,9 @@ class Poller:
         reply = self._reassembler.take(message.data, now_s)
         if reply is None:
             kind = message.data[0] >> 4
-            if kind in {_FIRST, _CONSECUTIVE}:
+            if kind in {FIRST, CONSECUTIVE}:
                 self._give_up_s = min(now_s + REPLY_WITHIN_S, self._exchange_ends_s)
-            is_ours = kind == _FIRST and tuple(message.data[2:4]) == target.reply
+            is_ours = kind == FIRST and tuple(message.data[2:4]) == target.reply
             if is_ours and self._may_continue:  # once: a node may repeat its first frame for ever
                 self._may_continue = False
                 return _frame(target.request_id, _CONTINUE)

@@ -1,0 +1,91 @@
+"""Replies over ISO-TP (ISO 15765-2): their keys in a DBC, and reassembly from frames.
+
+Replies become signals as any frame. Bus time drives the `Reassembler`, not a clock, so that a
+recorded exchange gives the same replies as a live one; the stacks of libraries answer with flow
+control and time out by the clock. `service.polling` asks for them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+LONGEST_GAP_S: Final = 1.0
+"""Longest time between frames of one reply [s]: N_Cr of ISO 15765-2."""
+
+SINGLE, FIRST, CONSECUTIVE = range(3)
+"""Kinds of frames, in the upper half of their first byte."""
+_REPLY_OFFSET = 0x40
+
+
+def reply_key(reply_id: int, payload: bytes | bytearray) -> int:
+    """Return the id of a reply's message in a DBC: the frames' id, then two bytes of the payload.
+
+    A reply `61 04 …` on 0x7BB is the message 0x7BB6104.
+    """
+    return reply_id << 16 | payload[0] << 8 | payload[1]
+
+
+def reply_id(key: int) -> int:
+    """Return the id of the frames that carry a reply; see `reply_key`."""
+    return key >> 16 & 0x7FF
+
+
+class Reassembler:
+    """Replies of one sender, from its frames.
+
+    `lost` counts replies given up: a frame missing, out of order or late.
+    """
+
+    def __init__(self) -> None:
+        self.lost = 0
+        self._payload = bytearray()
+        self._length = self._sequence = 0
+        self._last_s = 0.0
+
+    def take(self, data: bytes | bytearray, time_s: float) -> bytes | None:
+        """Take a frame at bus time `time_s` [s]; return the reply that it completes, if any."""
+        if not data:
+            return None
+        kind, low = data[0] >> 4, data[0] & 0x0F
+        if kind == SINGLE:
+            self._give_up()
+            # CAN FD: the length is in the second byte.
+            start, length = (2, data[1]) if low == 0 and len(data) > 8 else (1, low)
+            return bytes(data[start : start + length]) if 0 < length <= len(data) - start else None
+        if kind == FIRST and len(data) >= 2:
+            self._give_up()
+            self._payload, length = bytearray(data[2:]), low << 8 | data[1]
+            self._length = length if length > len(self._payload) else 0
+            self._sequence, self._last_s = 1, time_s
+        elif kind == CONSECUTIVE and self._length:
+            if low != self._sequence & 0x0F or not 0.0 <= time_s - self._last_s <= LONGEST_GAP_S:
+                self._give_up()
+                return None
+            self._sequence, self._last_s = self._sequence + 1, time_s
+            self._payload += data[1:]
+            if len(self._payload) >= self._length:
+                reply, self._length = bytes(self._payload[: self._length]), 0
+                return reply
+        return None
+
+    def _give_up(self) -> None:
+        self.lost += self._length > 0
+        self._length = 0
+
+
+@dataclass(frozen=True, slots=True)
+class PollTarget:
+    """A reply to ask for: standard ids of the frames, and the first two bytes of the reply.
+
+    The request for a reply (0x61, 0x04) is `21 04`.
+    """
+
+    request_id: int
+    reply_id: int
+    reply: tuple[int, int]
+
+    @property
+    def request(self) -> bytes:
+        """Payload of the request."""
+        return bytes([self.reply[0] - _REPLY_OFFSET, self.reply[1]])
