@@ -92,12 +92,6 @@ def _step(load: Load, values: Values, at: Context) -> FloatArray:
     return np.where(after, -values["step_ohm"] * load.current_a, 0.0)
 
 
-def _change_points(_: Parameter, __: Pack, time_s: FloatArray) -> tuple[float, ...]:
-    """Return times spread evenly over a log, without its ends [s]."""
-    duration = float(time_s[-1] - time_s[0])
-    return tuple(duration * part / 20.0 for part in range(1, 20))
-
-
 # --- dynamics
 
 
@@ -302,7 +296,6 @@ VOLTAGES: Final = (
         memory=lambda *_: (First(),),
         drive=_step,
         core_form=lambda v, *_: CoreForm("resistance_step", _of(v, "step_ohm", "start_s")),
-        trials=_change_points,
     ),
     # Butler–Volmer. With `bend_only` the line through 0 and ±1 C is subtracted. `scale_v` is 2RT/F
     # per electrode (51 mV at 25 °C) times the cells in series; the bound allows two electrodes.
