@@ -19,7 +19,6 @@ from cangauge.errors import InputError, require_choice, require_number
 from cangauge.identify.effect_search import (
     AUTO,
     AUTO_LOGS,
-    Linearized,
     Search,
     Selected,
     linearize,
@@ -60,7 +59,8 @@ from cangauge.model.coulomb_counting import (
     capacity_from_full_discharge,
     capacity_from_reference,
 )
-from cangauge.model.effects.library import EffectCandidate, effect_entries
+from cangauge.model.effects.base import Effect, Values
+from cangauge.model.effects.library import effect_entries
 from cangauge.model.extended import ExtendedModel
 from cangauge.model.model_file import (
     Information,
@@ -75,12 +75,11 @@ from cangauge.model.model_file import (
 from cangauge.model.prior import (
     CHEMISTRIES,
     DELAYS_S,
-    REFERENCE_C,
     Chemistry,
     ChemistryName,
     usual_loads,
 )
-from cangauge.model.voltage_model import KNOTS_PCT
+from cangauge.model.voltage_model import KNOTS_PCT, REFERENCE_C
 
 _LOG = logging.getLogger(__name__)
 
@@ -299,6 +298,29 @@ class _Fitted:
     effects: Selected | None
 
 
+@dataclass(frozen=True, eq=False)
+class _Joint:
+    """Curve of knots, and effects if any, of some logs together and with each left out."""
+
+    rows: Sequence[FitRows]
+    columns: Sequence[FloatArray]
+    """Of the moments, on the rows of each log."""
+    solution: Solution
+    without: Sequence[Solution]
+    effects: tuple[tuple[Effect, Values], ...] = ()
+
+    def held_out_error_v(self) -> tuple[FloatArray, ...]:
+        """Return the errors of each log by the others [V]; () for too few logs."""
+        return tuple(
+            _where_covered(
+                number,
+                self.rows,
+                other.residual_v_of(self.columns[number], self.rows[number].voltage_v),
+            )
+            for number, other in enumerate(self.without)
+        )
+
+
 def _fit_knots(
     logs: Sequence[Log],
     rows: Sequence[FitRows],
@@ -306,81 +328,63 @@ def _fit_knots(
     effect_ids: Sequence[str],
     fields: dict[str, Any],
 ) -> _Fitted:
-    capacity_ah = fields["capacity_ah"]
     factors = [factor_of(item, len(DELAYS_S), EPSILON, REFERENCE_C) for item in rows]
     published = solve_published(pooled(factors), EPSILON)
     if usable_delays(logs, DELAYS_S) == DELAYS_S and published.identified:
         fields = fields | {"published": published.fields(EPSILON, REFERENCE_C, DELAYS_S)}
-    columns = [row_features(item) for item in rows]
     sums = [log_sums(item, chemistry) for item in rows]
-    solution, without = solve_scaled(sums, capacity_ah, chemistry)
+    solved = solve_scaled(sums, fields["capacity_ah"], chemistry)
+    joint = _Joint(rows, [row_features(item) for item in rows], *solved)
     selected: Selected | None = None
     if effect_ids:
-        plain = knots_file(solution, chemistry, fields).extended_model()
+        plain = knots_file(joint.solution, chemistry, fields).extended_model()
         search = Search(plain, logs, rows, chemistry, effect_ids)
-        joint: _WithEffects | None = None
-        selected = search.select()
-        while selected.chosen and joint is None:
-            start = solution, fields
-            joint = _fit_with_effects(logs, rows, chemistry, selected, start, search.refused)
-            selected = selected if joint is not None else search.select()
-        if joint is not None:
-            about, solution, without, fields = joint
-            rows = [item.rows for item in about]
-            columns = [np.column_stack([item.features, item.columns]) for item in about]
-    errors = tuple(
-        _where_covered(number, rows, other.residual_v_of(columns[number], rows[number].voltage_v))
-        for number, other in enumerate(without)
-    )
-    return _Fitted(
-        knots_file(solution, chemistry, fields, errors, rows), published, errors, selected
-    )
+        while (selected := search.select()).chosen:
+            with_effects = _with_effects(joint, selected, logs, chemistry, fields)
+            at_bound = selected.at_bound(with_effects.solution)
+            if not at_bound:
+                joint = with_effects
+                break
+            search.refused += at_bound
+    fields = fields | {"effects": effect_entries(joint.effects)}
+    errors = joint.held_out_error_v()
+    model = knots_file(joint.solution, chemistry, fields, errors, joint.rows)
+    return _Fitted(model, published, errors, selected)
 
 
 RELINEARIZED: Final = 4
 """Linearizations about the fitted effects: products of effects and resistances have converged."""
 
 
-_WithEffects = tuple[list[Linearized], Solution, list[Solution], dict[str, Any]]
-
-
-def _fit_with_effects(  # noqa: PLR0917
-    logs: Sequence[Log],
-    rows: Sequence[FitRows],
-    chemistry: Chemistry,
+def _with_effects(
+    plain: _Joint,
     selected: Selected,
-    first: tuple[Solution, dict[str, Any]],
-    refused: list[EffectCandidate],
-) -> _WithEffects | None:
-    """Return the rows about the fitted effects, the solutions there, and the file's fields.
-
-    Gauss–Newton from the solution without effects. None where amplitudes end at their physical
-    bounds; the effects that do are appended to `refused`.
-    """
-    solution, fields = first
-    std = selected.amplitude_std
+    logs: Sequence[Log],
+    chemistry: Chemistry,
+    fields: dict[str, Any],
+) -> _Joint:
+    """Return the fit with the selected effects: Gauss–Newton from `plain`, without effects."""
+    capacity_ah = fields["capacity_ah"]
+    solution, std = plain.solution, selected.amplitude_std
+    extended = knots_file(solution, chemistry, fields).extended_model()
     amplitudes: FloatArray | None = None
-    model = knots_file(solution, chemistry, fields).extended_model()
     for _ in range(RELINEARIZED):
         coefficients = solution.select[:P, :BASE].T @ solution.coefficients[:P]
-        of_effects = np.zeros(std.size) if amplitudes is None else amplitudes
         about = [
-            linearize(model, log, item, selected.chosen, amplitudes).with_voltage(
-                coefficients, of_effects
+            linearize(extended, log, item, selected.chosen, amplitudes).with_voltage(
+                coefficients, np.zeros(std.size) if amplitudes is None else amplitudes
             )
-            for log, item in zip(logs, rows, strict=True)
+            for log, item in zip(logs, plain.rows, strict=True)
         ]
         sums = [log_sums(item.rows, chemistry, item.columns, item.features) for item in about]
-        solution, without = solve_scaled(sums, fields["capacity_ah"], chemistry, std)
+        solution, without = solve_scaled(sums, capacity_ah, chemistry, std)
         solution = selected.clipped(solution)
         amplitudes = solution.coefficients[P:]
         effects = selected.effects(solution)
         voltage = knots_file(solution, chemistry, fields).voltage_model()
-        model = ExtendedModel(voltage, fields["capacity_ah"], effects)
-    if at_bound := selected.at_bound(solution):
-        refused += at_bound
-        return None
-    return about, solution, without, fields | {"effects": effect_entries(effects)}
+        extended = ExtendedModel(voltage, capacity_ah, effects)
+    columns = [np.column_stack([item.features, item.columns]) for item in about]
+    return _Joint([item.rows for item in about], columns, solution, without, effects)
 
 
 def _where_covered(number: int, rows: Sequence[FitRows], error_v: FloatArray) -> FloatArray:

@@ -19,8 +19,13 @@ import numpy as np
 
 from cangauge._typing import FloatArray
 from cangauge.identify.rows import FitRows
-from cangauge.model.prior import REFERENCE_C, RESISTANCE_H, Chemistry, prior_of
-from cangauge.model.voltage_model import KNOTS_PCT, hermite_basis, resistance_factor
+from cangauge.model.prior import RESIDUAL_STD, RESISTANCE_H, Chemistry, prior_of
+from cangauge.model.voltage_model import (
+    KNOTS_PCT,
+    REFERENCE_C,
+    hermite_basis,
+    resistance_factor,
+)
 
 N: Final = KNOTS_PCT.size
 """Knots of the curve."""
@@ -37,9 +42,6 @@ SECONDS_PER_DATUM: Final = 60.0
 SECONDS_PER_PERCENT: Final = 600.0
 """Most time that one log may count within one percent of SoC [s]: rests and charging at constant
 voltage repeat themselves."""
-SLOPE_NOISE: Final = 0.003
-"""Voltage noise relative to the mean voltage against which an uncertain SoC is weighed: the
-published model leaves 0.25 %."""
 ADDED_STD: Final = 0.0015
 """Error of the model added to the residuals, relative to the mean voltage: residuals of few logs
 are too small (development packs)."""
@@ -100,7 +102,7 @@ def row_weights(soc_pct: FloatArray, seconds: FloatArray, chemistry: Chemistry) 
     full = np.bincount(percent, counted, minlength=103)[percent]
     curve = chemistry.curve_v / np.interp(50.0, KNOTS_PCT, chemistry.curve_v)
     slope = np.interp(soc_pct, KNOTS_PCT, np.gradient(curve, KNOTS_PCT))
-    steep = 1.0 + (chemistry.soc_std_pct * slope / SLOPE_NOISE) ** 2
+    steep = 1.0 + (chemistry.soc_std_pct * slope / RESIDUAL_STD) ** 2
     weight = counted * np.minimum(1.0, SECONDS_PER_PERCENT / full) / steep
     return np.where((soc_pct > -1.0) & (soc_pct < 101.0), weight, 0.0)
 

@@ -16,8 +16,8 @@ import numpy as np
 from cangauge._typing import FloatArray
 from cangauge.errors import InputError
 from cangauge.identify.least_squares import SECONDS_PER_DATUM
-from cangauge.identify.rows import SOC_SPAN_AT_LEAST_PCT, FitRows
-from cangauge.model.model_file import Coefficient, Published, published_names
+from cangauge.identify.rows import ROWS_PER_COEFFICIENT, SOC_SPAN_AT_LEAST_PCT, FitRows
+from cangauge.model.model_file import Published
 from cangauge.model.voltage_model import (
     BASIS_NAMES,
     EDGE,
@@ -30,8 +30,6 @@ SINGULAR = 1e-9
 """Singular value relative to the largest, of columns of equal norm, below which a combination of
 coefficients is not identified [-]: voltages are known to 1e-4, and trips over a fifth of the SoC
 reach 1e-10, from full to empty 1e-6."""
-ROWS_PER_COEFFICIENT = 4
-"""Rows that a coefficient needs."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,20 +109,12 @@ class PublishedFit:
 
     def fields(self, epsilon: float, t_ref_c: float, delay_s: Sequence[float]) -> Published:
         """Return the equation for a model file."""
-        names = published_names(len(delay_s))
-        std = np.sqrt(np.diag(self.covariance))
-        return Published(
-            coefficients={
-                name: Coefficient(
-                    value=float(value),
-                    std_error=float(error),
-                    unit="V/K" if name == "kt" else "ohm" if name.startswith("R") else "V",
-                )
-                for name, value, error in zip(names, self.coefficients, std, strict=True)
-            },
+        return Published.of(
+            self.coefficients.tolist(),
+            np.sqrt(np.diag(self.covariance)).tolist(),
             epsilon=epsilon,
             t_ref_c=t_ref_c,
-            delays_s=list(delay_s),
+            delays_s=delay_s,
         )
 
     def jacobian(self, epsilon: float) -> FloatArray:

@@ -26,6 +26,7 @@ from cangauge.model.coulomb_counting import counted_soc_pct
 from cangauge.model.delay_line import GAP_S, delayed_currents, filled_at
 from cangauge.model.first_order import low_passed
 from cangauge.model.prior import DELAYS_S, LOW_PASS_S
+from cangauge.model.voltage_model import BASIS_NAMES
 
 LOW_VOLTAGE = 0.5
 """Rows below this fraction of the log's median voltage are start-up or shut-down."""
@@ -36,8 +37,11 @@ GUARD_S = 2.0
 SOC_TOLERANCE_PCT = 3.0
 """Excess of a counted SoC over 0–100 % from which the capacity or the start must be wrong [%]."""
 
-LEAST_ROWS = 52
-"""Fewest rows for a fit: four for each of the 13 coefficients of the published equation."""
+ROWS_PER_COEFFICIENT = 4
+"""Rows that a coefficient of the published equation needs."""
+
+LEAST_ROWS = ROWS_PER_COEFFICIENT * (len(BASIS_NAMES) + 1 + len(DELAYS_S))
+"""Fewest rows for a fit: so that its 13 coefficients have theirs."""
 
 TEMPERATURE_SPAN_K = 3.0
 """Least span of the temperature from which kt is identified [K]: sensors have steps of 1 K."""

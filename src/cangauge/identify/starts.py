@@ -33,7 +33,7 @@ from cangauge.logs.log import Log
 from cangauge.model.effects.base import Signals
 from cangauge.model.model_file import Model
 from cangauge.model.prior import CHEMISTRIES, Chemistry
-from cangauge.model.voltage_model import KNOTS_PCT, HermiteCurve
+from cangauge.model.voltage_model import KNOTS_PCT, SLOPE_AT_LEAST, HermiteCurve
 
 _LOG = logging.getLogger(__name__)
 
@@ -50,9 +50,6 @@ rest voltages."""
 
 SEARCH_STEP_PCT: Final = 1.0
 """Grid of the search for a start [%]."""
-
-SLOPE_AT_LEAST: Final = 1e-5
-"""Least mean slope of a curve relative to its voltage [1/%]: a flat curve tells nothing."""
 
 
 @dataclass(frozen=True, slots=True)

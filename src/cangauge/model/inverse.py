@@ -61,7 +61,7 @@ def soc_from_ocv(model: Invertible, ocv_v: float, guess_pct: float = 50.0) -> In
             low = soc
         following = soc - error / slope
         if abs(following - soc) < TOLERANCE_PCT:
-            return Inverse(following, inside=True)
+            return Inverse(min(max(following, 0.0), 100.0), inside=True)
         soc = following if low < following < high else 0.5 * (low + high)
     return Inverse(soc, inside=True)
 

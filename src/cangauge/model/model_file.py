@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
 import json
-from itertools import pairwise
+from collections.abc import Iterable, Sequence
 from os import PathLike
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
@@ -27,7 +28,6 @@ from cangauge.model.prior import (
     CHEMISTRIES,
     DELAYS_S,
     LOW_PASS_S,
-    REFERENCE_C,
     Chemistry,
     ChemistryName,
     principal_functions,
@@ -38,6 +38,7 @@ from cangauge.model.version1 import BLOCK_S, upgraded
 from cangauge.model.voltage_model import (
     BASIS_NAMES,
     KNOTS_PCT,
+    REFERENCE_C,
     Arrhenius,
     Functions,
     HermiteCurve,
@@ -86,6 +87,27 @@ class Published(_Strict):
     epsilon: Annotated[float, Field(ge=1e-4, lt=0.5)]
     t_ref_c: _Celsius
     delays_s: _Delays
+
+    @classmethod
+    def of(
+        cls,
+        values: Iterable[float],
+        std: Iterable[float | None] = itertools.repeat(None),
+        *,
+        epsilon: float,
+        t_ref_c: float,
+        delays_s: Sequence[float],
+    ) -> Published:
+        """Return the equation of the values k0 … k7, kt, R1 … Rn and their standard errors."""
+        units = {"kt": "V/K", "k": "V", "R": "ohm"}
+        coefficients = {
+            name: {"value": value, "std_error": error, "unit": units.get(name) or units[name[0]]}
+            for name, value, error in zip(published_names(len(delays_s)), values, std, strict=False)
+        }
+        return cls.model_validate({
+            "coefficients": coefficients, "epsilon": epsilon, "t_ref_c": t_ref_c,
+            "delays_s": list(delays_s),
+        })  # fmt: skip
 
     @model_validator(mode="after")
     def _complete(self) -> Self:
@@ -612,7 +634,7 @@ def published_names(delays: int) -> list[str]:
 
 
 def _check_increasing(values: list[float], name: str) -> None:
-    if any(high <= low for low, high in pairwise(values)):
+    if any(high <= low for low, high in itertools.pairwise(values)):
         raise ValueError(f"{name} must increase")
 
 

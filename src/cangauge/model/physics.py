@@ -37,13 +37,24 @@ def check_physics(model: VoltageModel, file: Model) -> None:
             field="curve.voltage_v" if knots else prefix,
             cure="check its values and their unit (V), or create the file with `cangauge fit`",
         )
-    largest = DROP_AT_1C * middle / file.capacity_ah
-    for number, value in enumerate(model.resistance_ohm):
-        if abs(value) > largest:
+    most_ohm, noise = DROP_AT_1C * middle / file.capacity_ah, file.noise
+    limits = [
+        (f"{prefix}.resistance_ohm.{number}" if knots else f"{prefix}.R{number + 1}", ohm, most_ohm,
+         "ohm")
+        for number, ohm in enumerate(model.resistance_ohm)
+    ] + [
+        (f"{prefix}.{'kt_v_per_k' if knots else 'kt'}", model.kt_v_per_k,
+         SLOPE_BY_TEMPERATURE * middle, "V/K"),
+        ("noise.level_std_v", noise.level_std_v, middle, "V"),
+        ("noise.slow_std_v", noise.slow_std_v, middle, "V"),
+        ("noise.fast_std_v", noise.fast_std_v, middle, "V"),
+    ]  # fmt: skip
+    for field, value, most, unit in limits:
+        if abs(value) > most:
             raise InputError(
-                f"must lie within ±{largest:.3g} ohm for a pack of {middle:.4g} V and"
+                f"must lie within ±{most:.3g} {unit} for a pack of {middle:.4g} V and"
                 f" {file.capacity_ah:.4g} Ah",
-                field=f"{prefix}.resistance_ohm.{number}" if knots else f"{prefix}.R{number + 1}",
+                field=field,
                 value=value,
                 cure="check the value and its unit, or the capacity",
             )
@@ -57,19 +68,3 @@ def check_physics(model: VoltageModel, file: Model) -> None:
             value=lasting_ohm,
             cure="positive current discharges, so resistances are negative",
         )
-    steepest = SLOPE_BY_TEMPERATURE * middle
-    if abs(model.kt_v_per_k) > steepest:
-        raise InputError(
-            f"must lie within ±{steepest:.3g} V/K for a pack of {middle:.4g} V",
-            field=f"{prefix}.kt_v_per_k" if knots else f"{prefix}.kt",
-            value=model.kt_v_per_k,
-            cure="check the value and its unit",
-        )
-    for name in ("level_std_v", "slow_std_v", "fast_std_v"):
-        if getattr(file.noise, name) > middle:
-            raise InputError(
-                f"is more than the {middle:.4g} V of the pack",
-                field=f"noise.{name}",
-                value=getattr(file.noise, name),
-                cure="check the value and its unit",
-            )

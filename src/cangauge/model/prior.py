@@ -25,8 +25,6 @@ from cangauge.model.voltage_model import KNOTS_PCT, hermite_basis
 
 ChemistryName = Literal["oxide", "lfp"]
 
-REFERENCE_C: Final = 20.0
-"""Reference temperature of the curve [°C]."""
 DELAYS_S: Final = (0.0, 10.0, 30.0, 70.0)
 """The published delays of the current [s]."""
 LOW_PASS_S: Final = (10.0, 140.0)

@@ -4,15 +4,18 @@ from __future__ import annotations
 
 import math
 
-from cangauge.model.model_file import Model, published_names
-from cangauge.model.version1 import upgraded
-from cangauge.model.voltage_model import PublishedCurve, VoltageModel
+from cangauge.model.model_file import FunctionFields, Made, Model, Noise, Published, Ranges
+from cangauge.model.version1 import block_share
+from cangauge.model.voltage_model import KNOTS_PCT, PublishedCurve, VoltageModel
 
 CAPACITY_AH = 51.5
 """Charge from 100 to 0 % [Ah]."""
 
 MEAN_VOLTAGE_V = 370.0
 """Approximate mean pack voltage over the test [V]."""
+
+FAST_TIME_S = 3.0
+"""Assumed correlation time of the fast error [s]."""
 
 # Figures of the paper, to compare results with.
 VOLTAGE_MAE_PCT = 0.25
@@ -49,47 +52,34 @@ def leaf_2012_model_file() -> Model:
     curve = model.curve
     if not isinstance(curve, PublishedCurve):
         raise TypeError("the published model has the published curve")
-    values = [*curve.ocv_v, model.kt_v_per_k, *model.resistance_ohm]
-    return Model.model_validate(
-        upgraded(
-            {
-                "format": "cangauge-model",
-                "version": 1,
-                "name": "2012 Nissan Leaf, published coefficients",
-                "coefficients": {
-                    name: {
-                        "value": value,
-                        "unit": {"k": "V", "R": "ohm"}[name[0]] if name != "kt" else "V/K",
-                    }
-                    for name, value in zip(published_names(4), values, strict=True)
-                },
-                "epsilon": curve.epsilon,
-                "t_ref_c": model.t_ref_c,
-                "delays_s": list(model.delay_s),
-                "rate_hz": 1.0,
-                "capacity_ah": CAPACITY_AH,
-                "temperature_source": "room",
-                "range": {
-                    "soc_pct": model.soc_range_pct,
-                    "temperature_c": model.temperature_range_c,
-                    "current_a": model.current_range_a,
-                },
-                "noise": {
-                    "fast_std_v": part_v,
-                    "fast_time_s": 3.0,
-                    "slow_std_v": part_v,
-                    "slow_time_s": 300.0,
-                    "lasting_std_v": part_v,
-                    "voltage_mae_pct": VOLTAGE_MAE_PCT,
-                    "voltage_rmse_v": rmse_v,
-                    "judged_on": "published; split into parts by assumption",
-                },
-                "made": {
-                    "by": "published Table 1",
-                    "options": {},
-                    "logs": [],
-                    "fingerprint": "published",
-                },
-            }
-        )
+    return Model(
+        name="2012 Nissan Leaf, published coefficients",
+        equation="published",
+        chemistry="oxide",
+        capacity_ah=CAPACITY_AH,
+        temperature_source="room",
+        published=Published.of(
+            [*curve.ocv_v, model.kt_v_per_k, *model.resistance_ohm],
+            epsilon=curve.epsilon,
+            t_ref_c=model.t_ref_c,
+            delays_s=model.delay_s,
+        ),
+        functions=FunctionFields(soc_pct=KNOTS_PCT.tolist(), curve_v=[], load=[]),
+        noise=Noise(
+            level_std_v=part_v,
+            slow_std_v=part_v,
+            fast_std_v=block_share(FAST_TIME_S) * part_v,
+            soc_std_pct=0.0,
+            cold_exponent=0.0,
+            residual_std_v=rmse_v,
+            voltage_mae_pct=VOLTAGE_MAE_PCT,
+            voltage_rmse_v=rmse_v,
+            judged_on="published; split into parts by assumption",
+        ),
+        range=Ranges(
+            soc_pct=model.soc_range_pct,
+            temperature_c=model.temperature_range_c,
+            current_a=model.current_range_a,
+        ),
+        made=Made(by="published Table 1", options={}, logs=[], fingerprint="published"),
     )

@@ -17,6 +17,14 @@ _SAME = (
 )  # fmt: skip
 
 
+def block_share(fast_time_s: float) -> float:
+    """Return the error of a block's mean relative to that of one second [-].
+
+    It holds as many independent values as the correlation time of the error [s] allows.
+    """
+    return float(min(1.0, (1.0 + 2.0 * fast_time_s) / BLOCK_S) ** 0.5)
+
+
 def upgraded(raw: Mapping[str, Any]) -> dict[str, Any]:
     """Return the fields of a version-1 file as those of version 2, to be validated.
 
@@ -47,8 +55,6 @@ def _upgraded(raw: Mapping[str, Any]) -> dict[str, Any]:
         std = curve["kt_std_v_per_k"]
         functions.append([std * (raw["t_ref_c"] - curve["temperature_c"])] * KNOTS_PCT.size)
         loads.append([std, *zero])
-    # A mean over a block holds as many independent values as the fast error's time allows.
-    block_share = min(1.0, (1.0 + 2.0 * noise["fast_time_s"]) / BLOCK_S) ** 0.5
     return {name: raw[name] for name in _SAME if name in raw} | {
         "version": 2,
         "equation": "published",
@@ -59,7 +65,7 @@ def _upgraded(raw: Mapping[str, Any]) -> dict[str, Any]:
         "functions": {"soc_pct": KNOTS_PCT.tolist(), "curve_v": functions, "load": loads},
         "noise": {
             "level_std_v": noise["lasting_std_v"],
-            "fast_std_v": block_share * noise["fast_std_v"],
+            "fast_std_v": block_share(noise["fast_time_s"]) * noise["fast_std_v"],
             "soc_std_pct": 0.0,
             "cold_exponent": 0.0,
             "residual_std_v": noise["voltage_rmse_v"],

@@ -21,7 +21,7 @@ from bisect import bisect_right
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -44,8 +44,8 @@ ACTIVATION_K = 3000.0
 """Activation temperature of the resistance [K]: 25 kJ/mol, that of charge transfer and electrolyte
 in lithium cells; Waldmann et al., J. Power Sources 262 (2014) 129."""
 
-RESISTANCE_REFERENCE_C = 20.0
-"""Temperature at which a(T) = 1 [°C]."""
+REFERENCE_C = 20.0
+"""Reference temperature of the curve, at which a(T) = 1 too [°C]."""
 
 PLAUSIBLE_C = (-60.0, 120.0)
 """Pack temperatures beyond which every law of temperature is constant [°C]."""
@@ -77,9 +77,7 @@ otherwise. Below 3 a cubic Hermite curve rises: Fritsch, Carlson, SIAM J. Numer.
 def resistance_factor(temperature_c: ArrayLike) -> FloatArray:
     """Return a(T), the resistance relative to that at 20 °C by Arrhenius' law."""
     kelvin = np.clip(np.asarray(temperature_c, dtype=np.float64), *PLAUSIBLE_C) + 273.15
-    return np.asarray(
-        np.exp(ACTIVATION_K * (1.0 / kelvin - 1.0 / (RESISTANCE_REFERENCE_C + 273.15)))
-    )
+    return np.asarray(np.exp(ACTIVATION_K * (1.0 / kelvin - 1.0 / (REFERENCE_C + 273.15))))
 
 
 class Curve(Protocol):
@@ -104,62 +102,72 @@ def hermite_basis(soc_pct: FloatArray, knots_pct: FloatArray = KNOTS_PCT) -> Flo
     """Return d g/d values at the knots [-], shape (n, knots), for SoC [%] of shape (n,)."""
     one = np.eye(knots_pct.size)
     bend = hermite_slopes(knots_pct, one)
-    left, (of_left, of_left_slope, of_right, of_right_slope) = _weights(knots_pct, soc_pct)
+    left, (of_left, of_left_slope, of_right, of_right_slope), _ = _cubics(knots_pct, soc_pct)
     basis = of_left_slope[:, None] * bend[left]
     basis += of_right_slope[:, None] * bend[left + 1]
     row = np.arange(left.size)
     basis[row, left] += of_left
     basis[row, left + 1] += of_right
-    return basis
+    return np.asarray(basis)
 
 
-def _weights(
-    knots: FloatArray, soc_pct: FloatArray
-) -> tuple[NDArray[np.intp], tuple[FloatArray, ...]]:
-    """Return the knot to the left, and the weights of value and slope there and to the right."""
-    left = np.clip(np.searchsorted(knots, soc_pct, side="right") - 1, 0, knots.size - 2)
-    width = knots[left + 1] - knots[left]
-    inside = np.clip(soc_pct, knots[0], knots[-1])
-    f = (inside - knots[left]) / width
-    back = 1.0 - f
-    beyond = soc_pct - inside
-    return left, (
-        (1.0 + 2.0 * f) * back * back,
-        width * f * back * back + np.minimum(beyond, 0.0),
-        f * f * (3.0 - 2.0 * f),
-        np.maximum(beyond, 0.0) - width * f * f * back,
-    )
+class _Cubic(NamedTuple):
+    """Knot to the left, and weights of value and slope there and at the knot to the right.
+
+    Of one SoC or of many: all members are numbers, or arrays of shape (n,).
+    """
+
+    left: Any
+    value: tuple[Any, Any, Any, Any]
+    """For the value between them."""
+    slope: tuple[Any, Any, Any, Any]
+    """For the slope there."""
+
+    def curve(self, value: Any, slope: Any) -> Any:
+        """Return the curve through values and slopes at the knots."""
+        return self._sum(self.value, value, slope)
+
+    def curve_slope(self, value: Any, slope: Any) -> Any:
+        """Return the slope of that curve."""
+        return self._sum(self.slope, value, slope)
+
+    def _sum(self, weights: tuple[Any, Any, Any, Any], value: Any, slope: Any) -> Any:
+        a, b, c, d = weights
+        at_left = a * value[self.left] + b * slope[self.left]
+        return at_left + c * value[self.left + 1] + d * slope[self.left + 1]
 
 
-class _Place(NamedTuple):
-    """Knot to the left of one SoC, and weights of value and slope there and to the right."""
-
-    left: int
-    value: tuple[float, float, float, float]
-    slope: tuple[float, float, float, float]
-
-
-def _place(knots: Sequence[float], soc_pct: float) -> _Place:
-    last = len(knots) - 1
-    if soc_pct < knots[0]:
-        return _Place(0, (1.0, soc_pct - knots[0], 0.0, 0.0), (0.0, 1.0, 0.0, 0.0))
-    if soc_pct > knots[last]:
-        return _Place(last - 1, (0.0, 0.0, 1.0, soc_pct - knots[last]), (0.0, 0.0, 0.0, 1.0))
-    left = min(bisect_right(knots, soc_pct) - 1, last - 1)
-    width = knots[left + 1] - knots[left]
-    f = (soc_pct - knots[left]) / width
+def _cubic(left: Any, width: Any, f: Any, below: Any, above: Any) -> _Cubic:
+    """Return the weights at a fraction f of an interval, or beyond the first and last knot [%]."""
     back = 1.0 - f
     turn = 6.0 * f * back / width
-    return _Place(
+    return _Cubic(
         left,
         (
             (1.0 + 2.0 * f) * back * back,
-            width * f * back * back,
+            width * f * back * back + below,
             f * f * (3.0 - 2.0 * f),
-            -width * f * f * back,
+            above - width * f * f * back,
         ),
         (-turn, back * (1.0 - 3.0 * f), turn, f * (3.0 * f - 2.0)),
     )
+
+
+def _cubics(knots: FloatArray, soc_pct: FloatArray) -> _Cubic:
+    left = np.clip(np.searchsorted(knots, soc_pct, side="right") - 1, 0, knots.size - 2)
+    width = knots[left + 1] - knots[left]
+    inside = np.clip(soc_pct, knots[0], knots[-1])
+    beyond = soc_pct - inside
+    f = (inside - knots[left]) / width
+    return _cubic(left, width, f, np.minimum(beyond, 0.0), np.maximum(beyond, 0.0))
+
+
+def _cubic_at(knots: Sequence[float], soc_pct: float) -> _Cubic:
+    inside = min(max(soc_pct, knots[0]), knots[-1])
+    left = min(bisect_right(knots, inside) - 1, len(knots) - 2)
+    width = knots[left + 1] - knots[left]
+    beyond = soc_pct - inside
+    return _cubic(left, width, (inside - knots[left]) / width, min(beyond, 0.0), max(beyond, 0.0))
 
 
 @dataclass(frozen=True, eq=False)
@@ -187,9 +195,8 @@ class HermiteCurve:
         flatter = np.minimum(np.r_[secant[0], secant], np.r_[secant, secant[-1]])
         limited = np.clip(slope, FLATTEST_SECANT * flatter, STEEPEST_SECANT * flatter)
         f = np.array([0.0, 0.25, 0.5, 0.75, 1.0])[:, None]
-        bend = 6.0 * f * (1.0 - f)
-        across = bend * secant + (1.0 - f) * (1.0 - 3.0 * f) * slope[:-1]
-        across += f * (3.0 * f - 2.0) * slope[1:]
+        left = np.arange(secant.size)
+        across = _cubic(left, np.diff(soc_pct), f, 0.0, 0.0).curve_slope(value, slope)
         falls = (across <= 0.0).any(axis=0)
         beside = np.r_[falls, False] | np.r_[False, falls]
         return cls(soc_pct, value, np.where(beside, limited, slope))
@@ -201,25 +208,16 @@ class HermiteCurve:
     def at(self, soc_pct: float) -> tuple[float, float]:
         """Return voltage [V] and slope [V per %] at one SoC [%]."""
         knots, value, slope = self._lists
-        left, (a, b, c, d), (da, db, dc, dd) = _place(knots, soc_pct)
-        v0, s0, v1, s1 = value[left], slope[left], value[left + 1], slope[left + 1]
-        return a * v0 + b * s0 + c * v1 + d * s1, da * v0 + db * s0 + dc * v1 + dd * s1
+        cubic = _cubic_at(knots, soc_pct)
+        return cubic.curve(value, slope), cubic.curve_slope(value, slope)
 
     def values(self, soc_pct: FloatArray) -> FloatArray:
         """Return voltages [V] at SoC [%] of shape (n,)."""
-        left, (a, b, c, d) = _weights(self.soc_pct, soc_pct)
-        at_left = a * self.value[left] + b * self.slope[left]
-        return np.asarray(at_left + c * self.value[left + 1] + d * self.slope[left + 1])
+        return np.asarray(_cubics(self.soc_pct, soc_pct).curve(self.value, self.slope))
 
     def slopes(self, soc_pct: FloatArray) -> FloatArray:
         """Return slopes [V per %] at SoC [%] of shape (n,)."""
-        knots = self.soc_pct
-        left = np.clip(np.searchsorted(knots, soc_pct, side="right") - 1, 0, knots.size - 2)
-        width = knots[left + 1] - knots[left]
-        f = (np.clip(soc_pct, knots[0], knots[-1]) - knots[left]) / width
-        secant = (self.value[left + 1] - self.value[left]) / width
-        slope = 6.0 * f * (1.0 - f) * secant + (1.0 - f) * (1.0 - 3.0 * f) * self.slope[left]
-        return np.asarray(slope + f * (3.0 * f - 2.0) * self.slope[left + 1])
+        return np.asarray(_cubics(self.soc_pct, soc_pct).curve_slope(self.value, self.slope))
 
 
 @dataclass(frozen=True, eq=False)
@@ -254,9 +252,7 @@ class Functions:
         load : array of shape (k,)
             A row of `VoltageModel.load_columns`.
         """
-        left, (a, b, c, d), _ = _place(self.soc_pct.tolist(), soc_pct)
-        curve = a * self.value[left] + b * self.slope[left]
-        curve += c * self.value[left + 1] + d * self.slope[left + 1]
+        curve = _cubic_at(self.soc_pct.tolist(), soc_pct).curve(self.value, self.slope)
         return np.asarray(curve + load @ self.load)
 
 
@@ -432,7 +428,7 @@ class VoltageModel:
     delay_s: tuple[float, ...] = (0.0, 10.0, 30.0, 70.0)
     low_pass_s: tuple[float, ...] = ()
     arrhenius: Arrhenius | None = None
-    t_ref_c: float = 20.0
+    t_ref_c: float = REFERENCE_C
     soc_range_pct: tuple[float, float] = (0.0, 100.0)
     temperature_range_c: tuple[float, float] = (-40.0, 80.0)
     current_range_a: tuple[float, float] = (-math.inf, math.inf)

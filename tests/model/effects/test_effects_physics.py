@@ -265,11 +265,10 @@ def test_a_step_persists_from_its_change_point() -> None:
 
 def test_trial_change_points_lie_inside_the_log() -> None:
     """Outside the log a step is not separable from a constant resistance, or from none."""
-    effect = LIBRARY["resistance_step"]
-    start = effect.parameters[1]
+    start = LIBRARY["resistance_step"].parameters[1]
     for hours in (0.2, 3.0):
         seconds = 3600.0 * hours
-        trials = effect.trials(start, PACK, np.linspace(100.0, 100.0 + seconds, 50))
+        trials = start.trials(PACK, np.linspace(100.0, 100.0 + seconds, 50))
         assert trials[0] == pytest.approx(0.05 * seconds)
         assert trials[-1] == pytest.approx(0.95 * seconds)
         np.testing.assert_allclose(np.diff(trials), 0.05 * seconds, rtol=1e-9)

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from stepping import EFFECTS, MODEL, irregular_signals, middle, online_of, step_through
 
@@ -135,6 +135,7 @@ def test_slope_stays_positive_where_the_voltage_falls() -> None:
 
 @settings(max_examples=150, deadline=None)
 @given(st.floats(-400.0, 400.0), st.floats(-30.0, 50.0), st.floats(0.0, 100.0), st.floats(0.0, 1.0))
+@example(-157.0, 0.0, 99.99999999999999, 0.0)  # a last step beyond 100 %
 def test_newton_finds_a_root_with_all_effects(
     current: float, temperature: float, soc: float, part: float
 ) -> None:

@@ -45,7 +45,8 @@ from cangauge.identify.rows import fit_rows
 from cangauge.identify.starts import unknown_start
 from cangauge.logs.gaps import split_where_moved
 from cangauge.model.model_file import Made, Model, Ranges, SourceLog
-from cangauge.model.prior import CHEMISTRIES, DELAYS_S, REFERENCE_C, ChemistryName
+from cangauge.model.prior import CHEMISTRIES, DELAYS_S, ChemistryName
+from cangauge.model.voltage_model import REFERENCE_C
 
 _NUMBERS: Final = pa.list_(pa.float64())
 _RANGES: Final = ("soc_pct", "temperature_c", "current_a", "voltage_v")

@@ -107,7 +107,7 @@ class Parameter:
     from_pack : {"temperature_c"}, optional
         Marks a constant: this size of the pack at the time the effect is added, fixed afterwards.
     is_change_point : bool
-        Whether this shape is the time of a step in the voltage.
+        Whether this shape is the time of a step: its trial values spread over each log.
     """
 
     name: str
@@ -141,8 +141,15 @@ class Parameter:
             low, high = (low * margin if low < 0.0 else low / margin), high * margin
         return low, high
 
-    def trials(self, pack: Pack) -> tuple[float, ...]:
-        """Return the trial values of a shape in its unit; none for an amplitude."""
+    def trials(self, pack: Pack, time_s: FloatArray | None = None) -> tuple[float, ...]:
+        """Return the trial values of a shape in its unit; none for an amplitude.
+
+        On a log with times `time_s` [s], change points spread evenly over it, without its ends. The
+        k-th value has the same meaning on every log of a group with one cause.
+        """
+        if self.is_change_point and time_s is not None:
+            duration = float(time_s[-1] - time_s[0])
+            return tuple(duration * part / 20.0 for part in range(1, 20))
         factor = self.factor(pack)
         return tuple(value * factor for value in self.grid or ())
 
@@ -240,10 +247,6 @@ def _none(*_: object) -> None:
     return None
 
 
-def _own_trials(parameter: Parameter, pack: Pack, _: FloatArray) -> tuple[float, ...]:
-    return parameter.trials(pack)
-
-
 def _at_every_soc(*_: object) -> float:
     return 1.0
 
@@ -278,9 +281,6 @@ class Effect:
         (values) → resistance [Ω] and time constant [s] of voltages from earlier currents.
     core_form : callable
         (values, model, pack) → form in the C core; None if it has none.
-    trials : callable
-        (parameter, pack, time_s) → trial values of a shape, in its unit, on a log with these
-        times. The k-th value has the same meaning on every log of a group with one cause.
     is_cause : bool
         Whether a diagnosis may name it; otherwise it is structure, learned from references only.
     scales_drop : bool
@@ -301,7 +301,6 @@ class Effect:
     memory: Callable[[Values, Pack], Memories] = lambda *_: ()
     rc_elements: Callable[[Values], list[tuple[float, float]]] = lambda _: []
     core_form: Callable[[Values, VoltageModel, Pack], CoreForm | None] = _none
-    trials: Callable[[Parameter, Pack, FloatArray], tuple[float, ...]] = _own_trials
     is_cause: bool = True
     scales_drop: bool = False
 

@@ -169,7 +169,7 @@ def candidates(effects: Sequence[Effect], pack: Pack, time_s: FloatArray) -> lis
         small = STEP * (bounds[:, 1] - bounds[:, 0])
         steps = np.where(small > bounds[:, 1], -small, small)
         shapes = effect.shapes if effect.amplitudes else ()
-        grids = [effect.trials(parameter, pack, time_s) for parameter in shapes]
+        grids = [parameter.trials(pack, time_s) for parameter in shapes]
         for choice in itertools.product(*grids):
             shape = dict(zip((item.name for item in shapes), choice, strict=True))
             shape |= effect.constants(pack)

@@ -41,8 +41,6 @@ MEAN_SLOPE_PCT: Final = (10.0, 90.0)
 """SoC between which the mean slope of the open-circuit voltage is taken [%]."""
 STEEPNESS_AT_MOST: Final = 5.0
 """Upper limit of the slope, relative to the mean."""
-MEAN_SLOPE_AT_LEAST: Final = 1e-6
-"""Lower limit of the mean slope [V per %], so that the ratio exists."""
 
 BEND_ZERO_C_RATE: Final = 1.0
 """Current at which the bend alone is zero, as at rest [1/h]: a model identified on logs of the same
@@ -92,12 +90,6 @@ def _ends_of_soc(soc_pct: FloatArray, values: Values, *_: object) -> FloatArray:
 def _step(load: Load, values: Values, at: Context) -> FloatArray:
     after = load.time_s - at.memory[0].of(load.time_s) >= values["start_s"]
     return np.where(after, -values["step_ohm"] * load.current_a, 0.0)
-
-
-def _change_points(_: Parameter, __: Pack, time_s: FloatArray) -> tuple[float, ...]:
-    """Return times spread evenly over a log, without its ends [s]."""
-    duration = float(time_s[-1] - time_s[0])
-    return tuple(duration * part / 20.0 for part in range(1, 20))
 
 
 # --- dynamics
@@ -153,7 +145,7 @@ def _mean_slope(model: VoltageModel) -> float:
     """Return the mean slope of the pseudo-OCV [V per % SoC], positive."""
     low, high = MEAN_SLOPE_PCT
     rise_v = model.pseudo_ocv_at(high)[0] - model.pseudo_ocv_at(low)[0]
-    return max(rise_v / (high - low), MEAN_SLOPE_AT_LEAST)
+    return rise_v / (high - low)
 
 
 def _steepness(soc_pct: FloatArray, values: Values, model: VoltageModel) -> FloatArray | float:
@@ -304,7 +296,6 @@ VOLTAGES: Final = (
         memory=lambda *_: (First(),),
         drive=_step,
         core_form=lambda v, *_: CoreForm("resistance_step", _of(v, "step_ohm", "start_s")),
-        trials=_change_points,
     ),
     # Butler–Volmer. With `bend_only` the line through 0 and ±1 C is subtracted. `scale_v` is 2RT/F
     # per electrode (51 mV at 25 °C) times the cells in series; the bound allows two electrodes.
