@@ -19,14 +19,13 @@ from numpy.typing import NDArray
 
 from cangauge._typing import FloatArray
 from cangauge.errors import InputError
-from cangauge.logs.gaps import BRIDGE_S, usual_gap_s, usual_step_s
+from cangauge.logs.gaps import usual_gap_s, usual_step_s
 from cangauge.logs.log import Log
 from cangauge.logs.resample import dequantize
 from cangauge.model.coulomb_counting import counted_soc_pct
-from cangauge.model.delay_line import GAP_S, delayed_currents, filled_at
-from cangauge.model.first_order import low_passed
+from cangauge.model.delay_line import GAP_S, filled_at
 from cangauge.model.prior import DELAYS_S, LOW_PASS_S
-from cangauge.model.voltage_model import BASIS_NAMES
+from cangauge.model.voltage_model import BASIS_NAMES, past_currents
 
 LOW_VOLTAGE = 0.5
 """Rows below this fraction of the log's median voltage are start-up or shut-down."""
@@ -126,9 +125,7 @@ def fit_rows(
             source=source,
             cure="give a longer log",
         )
-    time_s, current_a = log.time_s, log.current_a
-    smooth = [low_passed(time_s, current_a, tau, 0.0, rest_s=BRIDGE_S)[at] for tau in low_pass_s]
-    delayed = delayed_currents(time_s, current_a, delay_s, time_s[at])
+    time_s = log.time_s
     usual_s = usual_step_s(time_s[at])
     return FitRows(
         name=log.name,
@@ -139,7 +136,7 @@ def fit_rows(
         temperature_c=log.temperature_c[at],
         dequantized_c=dequantize(log).temperature_c[at],
         soc_pct=soc[at],
-        currents_a=np.column_stack([delayed, *smooth]),
+        currents_a=past_currents(time_s, log.current_a, at, delay_s, low_pass_s),
         removed=removed,
     )
 

@@ -25,16 +25,20 @@ from cangauge.model.effects.library import parse_effects
 from cangauge.model.extended import ExtendedModel, OnlineModel, Prediction
 from cangauge.model.physics import check_physics
 from cangauge.model.prior import (
+    BLOCK_S,
     CHEMISTRIES,
     DELAYS_S,
+    FAST_FLOOR,
     LOW_PASS_S,
+    SLOW_S,
+    SLOW_SHARE,
     Chemistry,
     ChemistryName,
     principal_functions,
     prior_of,
     usual_loads,
 )
-from cangauge.model.version1 import BLOCK_S, upgraded
+from cangauge.model.version1 import upgraded
 from cangauge.model.voltage_model import (
     BASIS_NAMES,
     KNOTS_PCT,
@@ -52,9 +56,6 @@ PRIOR_MADE_BY = "prior of the chemistry"
 """`made.by` of a model without any log."""
 MODEL_FORMAT = "cangauge-model"
 MODEL_VERSION = 2
-SLOW_S = 300.0
-"""Time constant of the slow voltage error [s]: residuals of recorded trips correlate by 0.3–0.5 at
-60 s and 0.1 at 300 s."""
 _CURE = "create the file with `cangauge fit`"
 
 _NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
@@ -566,11 +567,6 @@ def noise_of(
         left_out_scale=scale,
         **(fields | judged),
     )
-
-
-SLOW_SHARE, FAST_FLOOR = 0.4, 0.0003
-"""Share of the residuals that is slow [-], and least noise of a block's mean relative to the mean
-voltage [-]: development packs."""
 
 
 def knots_model(

@@ -61,6 +61,16 @@ RESIDUAL_STD: Final = 0.003
 """Rms residual of a pack without logs, relative to V0; also the voltage noise against which an
 uncertain SoC is weighed: the published model leaves 0.25 %."""
 
+BLOCK_S: Final = 30.0
+"""Time over which voltages are averaged for one update of a filter [s]."""
+SLOW_S: Final = 300.0
+"""Time constant of the slow voltage error [s]: residuals of recorded trips correlate by 0.3–0.5 at
+60 s and 0.1 at 300 s."""
+SLOW_SHARE: Final = 0.4
+"""Share of the residuals that is slow [-]: development packs."""
+FAST_FLOOR: Final = 0.0003
+"""Least noise of a block's mean, relative to the mean voltage [-]: development packs."""
+
 FUNCTIONS: Final = 12
 """Principal functions that a filter carries; eight leave 2.5 times as many starts astray."""
 TYPICAL_C_RATE: Final = 1.0 / 3.0

@@ -8,10 +8,9 @@ from typing import Any
 import numpy as np
 
 from cangauge.errors import InputError
+from cangauge.model.prior import BLOCK_S
 from cangauge.model.voltage_model import KNOTS_PCT
 
-BLOCK_S = 30.0
-"""Time over which voltages are averaged for one update of a filter [s]."""
 _SAME = (
     "format", "name", "rate_hz", "capacity_ah", "effects", "temperature_source", "range", "made",
 )  # fmt: skip

@@ -374,6 +374,28 @@ class PublishedCurve:
         return np.asarray(np.where(soc_pct < lo, low, np.where(soc_pct > hi, high, inside)))
 
 
+def past_currents(
+    time_s: FloatArray,
+    current_a: FloatArray,
+    rows: NDArray[np.intp] | slice,
+    delay_s: Sequence[float],
+    low_pass_s: Sequence[float],
+) -> FloatArray:
+    """Return the delayed, then the low-passed currents of a log at some rows [A], shape (m, M).
+
+    Parameters
+    ----------
+    time_s, current_a : array of shape (n,)
+        The whole log; the pack rested before it.
+    rows : array of int or slice
+    delay_s, low_pass_s : sequence of float
+        Delays and time constants [s].
+    """
+    delayed = delayed_currents(time_s, current_a, delay_s, time_s[rows])
+    smooth = [low_passed(time_s, current_a, tau, 0.0, rest_s=BRIDGE_S)[rows] for tau in low_pass_s]
+    return np.column_stack([delayed, *smooth])
+
+
 @dataclass(frozen=True)
 class Arrhenius:
     """Change of the resistances with temperature.
@@ -479,20 +501,8 @@ class VoltageModel:
     def currents(
         self, time_s: FloatArray, current_a: FloatArray, rows: NDArray[np.intp] | slice
     ) -> FloatArray:
-        """Return the delayed and low-passed currents of a log at some rows [A], shape (m, M).
-
-        Parameters
-        ----------
-        time_s, current_a : array of shape (n,)
-            The whole log; the pack rested before it.
-        rows : array of int or slice
-        """
-        delayed = delayed_currents(time_s, current_a, self.delay_s, time_s[rows])
-        smooth = [
-            low_passed(time_s, current_a, tau_s, 0.0, rest_s=BRIDGE_S)[rows]
-            for tau_s in self.low_pass_s
-        ]
-        return np.column_stack([delayed, *smooth])
+        """Return `past_currents` with the model's delays and time constants [A], shape (m, M)."""
+        return past_currents(time_s, current_a, rows, self.delay_s, self.low_pass_s)
 
     def load_columns(self, temperature_c: ArrayLike, currents_a: FloatArray) -> FloatArray:
         """Return the columns of `load_coefficients`, shape (n, k).
