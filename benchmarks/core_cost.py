@@ -6,7 +6,8 @@ step    processor time of a step, at 10 Hz and at 1 Hz (at 1 Hz every step uses 
         published Leaf model: the reference in Python, the compiled one sample by sample as in the
         service, and over columns as offline. Median of five interleaved rounds.
 target  flash of core, model and frames, memory, and instructions of a step with floats, from the
-        exported sources on QEMU's mps2-an386. Left out without gcc-arm-none-eabi or QEMU.
+        exported sources on QEMU's mps2-an386, of a curve of knots as `fit` writes it and of the
+        published equation. Left out without gcc-arm-none-eabi or QEMU.
 bits    estimates of every judged log of the recorded packs in a folder, which both give: numbers
         that differ in a bit.
 """
@@ -36,6 +37,7 @@ from cangauge.estimation.offline import run_estimator, samples_of
 from cangauge.estimation.settings import EstimatorSettings
 from cangauge.extras.embedded.embedded import export_c
 from cangauge.identify.fit import fit
+from cangauge.model.model_file import Model
 from cangauge.model.published import leaf_2012_model_file
 from cangauge.types import Sample
 from packs.recorded import load
@@ -92,12 +94,10 @@ def step_costs() -> list[dict[str, Any]]:
     return found
 
 
-def target_costs() -> dict[str, int]:
-    """Measure flash, memory [B] and instructions on a Cortex-M4F; empty without its tools."""
-    if not (shutil.which("arm-none-eabi-gcc") and shutil.which("qemu-system-arm")):
-        return {}
+def target_costs(model: Model) -> dict[str, int]:
+    """Measure flash, memory [B] and instructions on a Cortex-M4F."""
     with tempfile.TemporaryDirectory() as folder:
-        export_c(MODEL, Path(folder))
+        export_c(model, Path(folder))
         done = subprocess.run(
             ["make", "arm"],  # noqa: S607
             cwd=folder, capture_output=True, text=True, check=True,
@@ -151,7 +151,10 @@ def main() -> None:
     parser.add_argument("--bits", type=Path, metavar="FOLDER", help="recorded packs to compare on")
     parser.add_argument("--json", action="store_true", help="print JSON")
     given = parser.parse_args()
-    result: dict[str, Any] = {"step": step_costs(), "target": target_costs()}
+    result: dict[str, Any] = {"step": step_costs()}
+    if shutil.which("arm-none-eabi-gcc") and shutil.which("qemu-system-arm"):
+        result["knots"] = target_costs(Model.prior("oxide", 96, 60.0))
+        result["published"] = target_costs(MODEL)
     if given.bits is not None:
         result["bits"] = differing_bits(given.bits)
     if given.json:
@@ -162,7 +165,7 @@ def main() -> None:
     for row in result["step"]:
         table.add_row(f"{row['rate_hz']:g}", row["way"], f"{row['us']:.2f}")
     console.print(table)
-    for name in ("target", "bits"):
+    for name in ("knots", "published", "bits"):
         if result.get(name):
             table = Table(name, "", title=name)
             for key, value in result[name].items():

@@ -663,7 +663,7 @@ cg_real cg_newton(const cg_estimator *self, cg_real ocv_v, cg_real guess_pct, bo
         }
         const cg_real following = soc - (error / slope);
         if (cg_fabs(following - soc) < R(CG_CLOSE_PCT)) {
-            return following;
+            return cg_clip_soc(following);
         }
         const bool is_between = (low < following) && (following < high);
         soc = is_between ? following : (R(0.5) * (low + high));

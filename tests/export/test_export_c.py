@@ -109,14 +109,28 @@ def test_cppcheck_finds_nothing(folders: dict[str, Path]) -> None:
     )  # fmt: skip
 
 
-@pytest.mark.skipif(
+needs_arm = pytest.mark.skipif(
     not (shutil.which("arm-none-eabi-gcc") and shutil.which("qemu-system-arm")),
     reason="no gcc-arm-none-eabi or no qemu-system-arm",
 )
+
+
+@needs_arm
 def test_cortex_m4f_gives_the_numbers_in_qemu(folders: dict[str, Path]) -> None:
     output = run(folders["effects"], "make", "arm")
     assert "PASSED" in output
     assert re.search(r"instructions: \d+ a sample, \d+ where its voltage is used", output)
+
+
+@needs_arm
+def test_curve_of_knots_keeps_its_cost_on_a_cortex_m4f(folders: dict[str, Path]) -> None:
+    output = run(folders["knots"], "make", "arm")
+    core = re.findall(r"^ *(\d+).*\scangauge\w*\.o$", output, re.MULTILINE)
+    assert len(core) == len(CORE_SOURCES)
+    assert sum(map(int, core)) <= 16 * 1024
+    steps = re.search(r"a sample, (\d+) where its voltage is used", output)
+    assert steps is not None
+    assert int(steps[1]) <= 24000
 
 
 @needs_make
