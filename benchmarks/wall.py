@@ -184,7 +184,7 @@ def main() -> int:
             with suppress(StopIteration):
                 os.kill(live_pid(process.pid), number)
             measured(text)
-        time.sleep(20.0)  # the stopped one is found
+        time.sleep(60.0)  # the stopped one is found
         for attack, text in (
             (never_released, "QoS 2, never released"),
             (one_large, "a message of 200 MB"),

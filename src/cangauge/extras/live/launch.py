@@ -38,9 +38,9 @@ from cangauge.service.status_client import Snapshot
 if TYPE_CHECKING:
     from cangauge.service.run import Service
 
-SILENT_S: Final = 20.0
+SILENT_S: Final = 60.0
 """Silence after which the process counts as hanging [s]. It says each second that it is alive; a
-small computer takes some seconds to start it."""
+small or busy computer takes half a minute to start it."""
 LARGEST_BYTES: Final = 512 << 20
 """Resident memory above which it is ended: three times what the page needs."""
 PAUSE_S: Final = (1.0, 60.0)

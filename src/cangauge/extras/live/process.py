@@ -95,6 +95,7 @@ async def _serve(asks: Mapping[str, Any], lines: IO[bytes], limiter: RateLimitFi
 
     living = asyncio.ensure_future(tell_that_it_lives())
     outputs = outputs_of(asks)
+    os.nice(NICE)  # once it has started
     while line := await reader.readline():
         snapshot = Snapshot(**json.loads(line))
         for output in outputs:
@@ -110,7 +111,6 @@ def main() -> None:
         signal.signal(number, signal.SIG_IGN)
     lines = open(0, "rb", buffering=0)  # noqa: SIM115 - stdin, which ends with the process
     asks: Mapping[str, Any] = json.loads(lines.readline())
-    os.nice(NICE)
     told = _Told()
     limiter = RateLimitFilter(told.emit)
     told.addFilter(limiter)
