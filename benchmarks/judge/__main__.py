@@ -3,9 +3,9 @@
     cd benchmarks && python -m judge PACK… [--chains 8] [--healthy 60] [--data FOLDER] [--day-one]
 
 Recorded packs are those of `packs.recorded`; `_dev` packs are the ones that constants were chosen
-on, and share no log with the judged ones. `twin_lfp` draws a pack from each seed. Each chain draws
-its training logs (the model's), then other logs in random order as days. Prints one line of JSON
-for each judgement; `python -m judge --table FILE…` prints the table of such lines.
+on, and share no log with the judged ones. `twin_lfp` and `pybamm_lfp` draw a pack from each seed.
+Each chain draws its training logs (the model's), then other logs in random order as days. Prints
+one line of JSON for each judgement; `python -m judge --table FILE…` prints the table of such lines.
 """
 
 from __future__ import annotations
@@ -23,6 +23,7 @@ import numpy as np
 
 import cangauge
 from cangauge.extras.judge.judgement import ALARM
+from cangauge.logs.read import CellColumns
 from packs.recorded import Pack, counted_ah, load, one_hz
 
 DATA = Path(__file__).resolve().parents[3] / "shared" / "data"
@@ -38,6 +39,8 @@ FAULTS = {
     "voltage": ("voltage_sensor", (1.0, -1.0, 1.5, -1.5)),
     "count": ("count_scale", (3.0, -3.0, 5.0, -5.0)),
     "capacity": ("pack_capacity", (5.0, 10.0)),
+    "weak cell": ("weak_cell", (10.0, 15.0)),
+    "none, with cells": ("none", (0.0,)),
 }
 """Fault: cause to name, and sizes [A at 60 Ah, % SoC, % of the voltage, %]."""
 
@@ -71,6 +74,29 @@ def corrupted(
     return changed, told_ah
 
 
+def with_cells(
+    logs: Sequence[cangauge.Log], model: cangauge.Model, lack_pct: float, chain: int
+) -> list[CellColumns]:
+    """Return voltages of the cells of a pack beside its logs: one of them lacks capacity.
+
+    The others differ by 0.5 % in capacity and in charge (σ), each voltage by 2 mV.
+    """
+    rng = np.random.default_rng([chain, 5])
+    number = model.cells or round(model.nominal_v / 3.7)
+    lack, balance = rng.normal(0.0, 0.5, (2, number))
+    lack[rng.integers(number)] = lack_pct
+    found = []
+    for log in logs:
+        soc = np.interp(
+            log.time_s, log.time_s[np.isfinite(log.soc_pct)], log.soc_pct[np.isfinite(log.soc_pct)]
+        )
+        slope = model.voltage_model().pseudo_ocv_slope(soc)[:, None] / number
+        moved = balance + lack * (soc[:, None] - 100.0) / 100.0
+        noise = rng.normal(0.0, 0.002, moved.shape)
+        found.append(CellColumns(1, log.voltage_v[:, None] / number + slope * moved + noise))
+    return found
+
+
 def chains(pack: Pack, number: int, seed: int) -> Iterator[tuple[cangauge.Model, list, float]]:
     """Yield model, days in random order and capacity of a number of chains of a recorded pack."""
     logs = {log.name: one_hz(log) for log in [*pack.training, *pack.judged]}
@@ -88,7 +114,7 @@ def chains(pack: Pack, number: int, seed: int) -> Iterator[tuple[cangauge.Model,
         yield model, [logs[name] for name in order[training:]], capacity_ah
 
 
-def twin_chains(number: int, seed: int) -> Iterator[tuple[cangauge.Model, list, float]]:
+def twin_chains(number: int, seed: int, plant: str) -> Iterator[tuple[cangauge.Model, list, float]]:
     """Yield the same of simulated LFP packs, a pack a chain."""
     for chain in range(number):
         rng = np.random.default_rng([seed, chain])
@@ -96,6 +122,7 @@ def twin_chains(number: int, seed: int) -> Iterator[tuple[cangauge.Model, list, 
             cangauge.simulate(
                 seed=seed + chain, drive=day, hours=float(rng.uniform(0.5, 1.5)), chemistry="lfp",
                 ambient_c=float(rng.uniform(10.0, 30.0)), start_soc_pct=float(rng.uniform(60, 100)),
+                plant=plant,
             )
             for day in range(1, 11)
         ]  # fmt: skip
@@ -110,9 +137,9 @@ def twin_chains(number: int, seed: int) -> Iterator[tuple[cangauge.Model, list, 
 def run(name: str, arguments: argparse.Namespace) -> None:
     """Judge the chains of a pack, and print a line for each judgement."""
     number = max(arguments.chains, arguments.healthy)
-    if name.startswith("twin"):
-        first = 900 if name.endswith("_dev") else 100
-        drawn = twin_chains(number, first + 1000 * (arguments.seed - 1))
+    if name in {"twin_lfp", "pybamm_lfp"}:
+        plant = name.removesuffix("_lfp")
+        drawn = twin_chains(number, 100 + 1000 * (arguments.seed - 1), plant)
     else:
         pack, *winter = load(arguments.data, ["i3", "i3_winter"] if name == "i3" else [name])
         pack = replace(pack, judged=[*pack.judged, *(log for one in winter for log in one.judged)])
@@ -121,7 +148,8 @@ def run(name: str, arguments: argparse.Namespace) -> None:
         model = fitted
         if arguments.day_one:
             model = cangauge.Model.prior(fitted.chemistry, fitted.cells, capacity_ah)
-        for fault, (cause, sizes) in FAULTS.items():
+        for fault in arguments.faults:
+            cause, sizes = FAULTS[fault]
             if chain >= (arguments.healthy if fault == "none" else arguments.chains):
                 continue
             size = sizes[chain % len(sizes)]
@@ -130,7 +158,9 @@ def run(name: str, arguments: argparse.Namespace) -> None:
             for days in DAYS if fault != "none" or chain < 16 else DAYS[:3]:
                 if days > len(logs) and days != min(d for d in DAYS if d >= len(logs)):
                     continue
-                judgement = cangauge.judge(changed[:days], model, capacity_ah=told_ah)
+                seen = changed[:days]
+                cells = with_cells(seen, fitted, size, chain) if "cell" in fault else []
+                judgement = cangauge.judge(seen, model, capacity_ah=told_ah, cell_voltages=cells)
                 best = max(
                     (key for key in judgement.probabilities if key != "none"),
                     key=judgement.probabilities.__getitem__,
@@ -164,7 +194,7 @@ def table(paths: Sequence[str]) -> None:
             seen = sum(line["none"] <= ALARM for line in group)
             right = sum(line["named"] == line["cause"] and line["none"] <= ALARM for line in group)
             open_ = sum(line["verdict"] == "cannot_tell" for line in group)
-            text = f"{seen} / {open_} of {len(group)}" if fault == "none" else ""
+            text = f"{seen} / {open_} of {len(group)}" if fault.startswith("none") else ""
             shown.append(text or f"{seen} / {right} / {open_} of {len(group)}" if group else "–")
         print(f"| {pack} | {fault} | " + " | ".join(shown) + " |")
 
@@ -177,6 +207,7 @@ def main() -> None:
     parser.add_argument("--healthy", type=int, default=60)
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--data", type=Path, default=DATA)
+    parser.add_argument("--faults", nargs="+", choices=FAULTS, default=[*FAULTS])
     parser.add_argument("--day-one", action="store_true", help="judge by the chemistry alone")
     parser.add_argument("--table", nargs="+")
     arguments = parser.parse_args()
