@@ -215,14 +215,10 @@ def _write_corrected(path: Path, judgement: Judgement) -> None:
     from cangauge.logs.canonical import write_table
 
     logs = judgement.logs
-    unknown = [np.full(len(log), np.nan) for log in logs]
-    published = [
-        nan if log.soc_pct is None else log.soc_pct for log, nan in zip(logs, unknown, strict=True)
-    ]
     columns = {
         "log": pa.array([log.name for log in logs for _ in range(len(log))]),
         "time_s": np.concatenate([log.time_s for log in logs]),
-        "published_pct": np.concatenate(published),
+        "published_pct": np.concatenate(judgement.published_pct),
         "corrected_pct": np.concatenate(judgement.corrected_pct),
         "corrected_std_pct": np.concatenate(judgement.corrected_std_pct),
     }

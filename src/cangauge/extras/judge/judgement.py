@@ -125,6 +125,13 @@ class Judgement:
     weakest: WeakestCell | None = None
 
     @property
+    def published_pct(self) -> list[FloatArray]:
+        """Published SoC at each row of each log [%]; NaN where a log has none."""
+        return [
+            np.full(len(log), np.nan) if log.soc_pct is None else log.soc_pct for log in self.logs
+        ]
+
+    @property
     def days(self) -> int:
         """Days with logs: by their stamps, or one for each log."""
         if any(log.time_s[0] < EPOCH_S for log in self.logs):

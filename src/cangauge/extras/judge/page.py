@@ -97,11 +97,8 @@ def _figure(judgement: Judgement) -> Figure:
     time.band(plot, "±2σ", bands, BLUE)
     time.line(plot, "corrected", [(log.time_s, soc) for log, soc, _ in pieces],
               Pen(BLUE, width=2.0))  # fmt: skip
-    published = [
-        (log.time_s, np.full(len(log), np.nan) if log.soc_pct is None else log.soc_pct)
-        for log in logs
-    ]
-    time.line(plot, "published", published, Pen(BLACK, width=2.0))
+    published = zip((log.time_s for log in logs), judgement.published_pct, strict=True)
+    time.line(plot, "published", list(published), Pen(BLACK, width=2.0))
     moments = [(jump.log, jump.time_s) for jump in judgement.jumps]
     cause = judgement.cause
     if judgement.verdict == "off" and cause.onset is not None:
