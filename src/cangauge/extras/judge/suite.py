@@ -43,10 +43,13 @@ PACKS: Final = (211, 212, 213, 214)
 """Seeds of the simulated packs; no table of the estimator or the diagnosis has them."""
 DRIVES_A_PACK: Final = 3
 HOURS: Final = 0.5
-ANSWER_EVERY_S: Final = 10.0
+ANSWER_EVERY_S: Final = 20.0
 """Log time between two readings of the gauge [s]: as often it is compared with the truth."""
-QUIET_S: Final = 0.05
-"""Time without a frame after which a gauge has answered [s]."""
+QUIET_S: Final = 0.02
+"""Time without a frame after which a gauge has answered [s]: a sample takes it a tenth of that, and
+what it sends in silence comes more seldom."""
+SILENT_S: Final = 0.25
+"""Time without a frame after which a gauge has no answer, where it owes one [s]."""
 ANSWER_WITHIN_S: Final = 5.0
 """Longest wait for an answer [s], also where other frames never end."""
 READY_WITHIN_S: Final = 30.0
@@ -335,8 +338,12 @@ class _Gauge:
     def _answer(self, samples: int) -> tuple[float, float]:
         """Return SoC and σ after so many samples; NaN if the gauge said nothing."""
         found, until_s = (math.nan, math.nan), time.monotonic() + ANSWER_WITHIN_S
-        while samples > 0 and (message := self._bus.receive(QUIET_S)) is not None:
-            if time.monotonic() > until_s:
+        if not samples:
+            return found
+        while time.monotonic() < until_s:
+            # What it sends by its own clock counts too: listen on until it is quiet.
+            message = self._bus.receive(SILENT_S if samples > 0 else QUIET_S)
+            if message is None:
                 break
             if message.arbitration_id == self._id and len(message.data) == 8:
                 samples -= 1
