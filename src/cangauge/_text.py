@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+import re
+from collections.abc import Iterable
 from typing import Final
 
 NONE_KNOWN: Final = "–"
@@ -63,6 +65,12 @@ def uncertain_energy(wh: float | None, std_wh: float | None) -> str:
     return uncertain(1e-3 * wh, 1e-3 * std_wh, "kWh")
 
 
+def energy_text(wh: float) -> str:
+    """Return an energy with three digits, in kWh from 1 kWh on, in Wh below."""
+    is_large = abs(wh) >= LEAST_KWH_WH
+    return significant(1e-3 * wh, 3, "kWh") if is_large else significant(wh, 3, "Wh")
+
+
 def possible(current_a: float | None, std_a: float | None, unit: str = "") -> str:
     """Return a possible current; one without deviation is the largest that the model's logs had."""
     if current_a and std_a == 0.0:
@@ -92,6 +100,15 @@ def duration(seconds: float) -> str:
     if seconds < 120.0:
         return f"{seconds:.0f} s"
     return f"{seconds / 60.0:.1f} min" if seconds < 7200.0 else f"{seconds / 3600.0:.2f} h"
+
+
+_NUMBER: Final = re.compile(r"[−+-]?[\d.,]+([eE][+−-]?\d+)?( ?[%Ω])?|–|")
+
+
+def is_numeric(column: Iterable[str]) -> bool:
+    """Whether a table's column holds nothing but numbers: it is then set flush right."""
+    cells = list(column)
+    return bool(cells) and all(_NUMBER.fullmatch(cell) for cell in cells)
 
 
 _NOT_FOR_TERMINALS: Final = frozenset((*range(0x20), *range(0x7F, 0xA0))) - {0x09, 0x0A}

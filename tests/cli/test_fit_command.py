@@ -70,7 +70,7 @@ def test_options_go_into_the_model_file(run: Run, made: Path, tmp_path: Path) ->
     ran = run(
         "fit", made / "full.parquet", "-o", tmp_path / "m.json", "--capacity-ah", "51",
         "--equation", "published", "--rate-hz", "0.5", "--delays", "0,20", "--epsilon", "0.04",
-        "--t-ref", "25", "--temperature-source", "cell", "--initial-soc", "99.5",
+        "--t-ref", "25", "--initial-soc", "99.5",
     )  # fmt: skip
     assert ran.code == 0, ran.err
     model = Model.load(tmp_path / "m.json")
@@ -80,7 +80,6 @@ def test_options_go_into_the_model_file(run: Run, made: Path, tmp_path: Path) ->
     assert model.published.delays_s == [0.0, 20.0]
     assert model.published.epsilon == 0.04
     assert model.published.t_ref_c == 25.0
-    assert model.temperature_source == "cell"
     assert model.made.options["initial_soc_pct"] == 99.5
 
 
@@ -179,7 +178,6 @@ def test_effects_by_left_out_logs_need_three(run: Run, made: Path, tmp_path: Pat
         (["--capacity-ah", "-51"], ["--capacity-ah", "-51"]),
         (["--capacity-ah", "0.5"], ["soc_pct", "--capacity-ah"]),
         (["--initial-soc", "120"], ["--initial-soc", "120"]),
-        (["--temperature-source", "moon"], ["--temperature-source", "moon", "cell"]),
         (["--report", "no/such/folder/m.html"], ["no/such/folder/m.html", "folder"]),
         (["--report", "m.json"], ["--report", ".html"]),
         (["-o", "keep.csv"], ["--output", "keep.csv", ".json"]),

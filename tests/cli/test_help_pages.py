@@ -6,12 +6,9 @@ import json
 import subprocess
 import sys
 
-from cangauge.cli import shown
+from cangauge.cli import options
 from cangauge.cli.app import COMMANDS
 from cangauge.diagnosis import ALARM
-from cangauge.estimation.settings import VALID_STD_PCT
-from cangauge.extras.fleet import gap, run, sources
-from cangauge.logs.units import TEMPERATURE_SOURCES
 
 SLOW_TO_IMPORT = {
     "numpy", "scipy", "pandas", "pyarrow", "bokeh", "matplotlib", "clarabel", "can", "cantools",
@@ -52,9 +49,5 @@ def test_no_help_page_imports_what_computes() -> None:
     assert len(found) == len(names) + len(FLEET) + 1
 
 
-def test_help_pages_repeat_names_and_defaults_truly() -> None:
-    assert shown.TEMPERATURE_SOURCES == TEMPERATURE_SOURCES
-    assert shown.VALID_STD_PCT == VALID_STD_PCT
-    assert shown.ALARM == ALARM
-    assert (run.LOCAL, sources.VEHICLE_PATTERN) == (shown.LOCAL, shown.VEHICLE_PATTERN)
-    assert (gap.LOGS, gap.REFERENCES) == (shown.FLEET_LOGS, shown.FLEET_REFERENCES)
+def test_help_pages_repeat_the_probability_of_an_alarm_truly() -> None:
+    assert options.ALARM == ALARM

@@ -84,15 +84,16 @@ def test_a_dbc_gives_signals_by_name(mitsubishi: Path, tmp_path: Path) -> None:
         ' SG_ MaxChargeCurrent : 7|8@0+ (1,0) [0|0] "A" V\n'
         ' SG_ MinCellVoltage : 15|8@0+ (0.02,0) [0|0] "V" V\n'
     )
-    maps = ("--map", tmp_path / "map.toml", "--config", tmp_path / "run.toml")
-    done = init(mitsubishi, "--dbc", tmp_path / "car.dbc", *maps, "--json")
+    done = init(mitsubishi, "--dbc", tmp_path / "car.dbc", "-o", tmp_path / "out", "--json")
     assert done.code == 0, done.err
     chosen = json.loads(done.out)["candidates"]
     assert chosen["current"][0]["signal"] == "PackCurrent"
     assert chosen["voltage"][0]["signal"] == "PackVoltage"
-    car = Vehicle.load(map=tmp_path / "map.toml")
+    car = Vehicle.load(map=tmp_path / "out" / "car.toml")
     assert car.current.codec.name == "PackCurrent"
-    assert init(mitsubishi, "--dbc", tmp_path / "car.dbc", *maps, "--force").code == 0
+    assert (
+        init(mitsubishi, "--dbc", tmp_path / "car.dbc", "-o", tmp_path / "out", "--force").code == 0
+    )
 
 
 @pytest.mark.parametrize(("scale", "sign"), [("(0.01,-327.68)", 1), ("(-0.01,327.68)", -1)])
@@ -104,8 +105,7 @@ def test_the_sign_of_a_dbc_s_current_is_proven(
         f' SG_ PackCurrent : 23|16@0+ {scale} [0|0] "A" V\n'
         ' SG_ PackVoltage : 39|16@0+ (0.1,0) [0|0] "V" V\n'
     )
-    maps = ("--map", tmp_path / "map.toml", "--config", tmp_path / "run.toml")
-    done = init(mitsubishi, "--dbc", tmp_path / "car.dbc", *maps)
+    done = init(mitsubishi, "--dbc", tmp_path / "car.dbc", "-o", tmp_path / "out")
     assert done.code == 0, done.err
     assert f"The map has sign = {sign}." in done.err
     assert ("positive values charge on this bus" in done.err) == (sign < 0)
@@ -113,11 +113,11 @@ def test_the_sign_of_a_dbc_s_current_is_proven(
     table = done.out.partition("voltage")[0]
     (ends,) = re.findall(r"(\S+ … \S+ A)", table)
     assert ends in done.err  # one range, of one sign, of the whole capture
-    assert ends in (tmp_path / "map.toml").read_text(encoding="utf-8")
+    assert ends in (tmp_path / "out" / "car.toml").read_text(encoding="utf-8")
     assert "BMS_Status" in table
     assert "PackCurrent" in table
     assert "score" not in table
-    log = capture_to_log(mitsubishi, Vehicle.load(map=tmp_path / "map.toml"))
+    log = capture_to_log(mitsubishi, Vehicle.load(map=tmp_path / "out" / "car.toml"))
     assert sign_of_current(log).sign == 1
 
 

@@ -168,5 +168,5 @@ def test_a_table_of_other_headings_is_read_by_its_columns(tmp_path: Path) -> Non
     rows = "\n".join(f"{k},{2 * k % 7 - 3},{380 - 0.1 * (2 * k % 7)},21" for k in range(20))
     path.write_text(f"t,I,U,Temp\n{rows}\n")
     columns = ColumnMap.of("time=t[s],current=I[A],voltage=U[V],temperature=Temp[°C]")
-    log = ReadOptions(columns=columns, sign="discharge").read(FleetLog("x", "v", "s"), path)
+    log = ReadOptions(columns=columns).read(FleetLog("x", "v", "s"), path)
     assert len(log) == 20

@@ -117,7 +117,7 @@ def test_a_missing_receiver_is_an_error_of_one_line() -> None:
 
 
 def test_a_service_for_another_vehicle_is_an_error() -> None:
-    settings = ReplaySettings(speed=math.inf, wait_s=3.0, acknowledge_s=0.5)
+    settings = ReplaySettings(speed=math.inf, acknowledge_s=2.0)
     with (
         virtual_service("other", REPLAYED, vehicle=Vehicle.load("leaf_aze0")),
         pytest.raises(CangaugeError, match=r"0 of \d+ samples sent have been processed"),
@@ -264,7 +264,7 @@ def test_a_long_wait_can_be_stopped(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_the_estimate_does_not_depend_on_the_speed() -> None:
     log, model = short_log(40.0), leaf_model()
     with virtual_service("fast", REPLAYED) as service:
-        state = play_log("fast", 40.0, ReplaySettings(speed=40.0, wait_s=3.0))
+        state = play_log("fast", 40.0, ReplaySettings(speed=40.0))
         assert waits(lambda: service.pipeline.samples == 400)
     assert state.acknowledged is None
     sent = FrameEncoder(Vehicle.load("generic")).quantize(log)

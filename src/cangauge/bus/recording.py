@@ -113,8 +113,8 @@ def log_of(
     recording: LogFile | Capture,
     vehicle: Vehicle | None,
     *,
-    temperature_c: float | None,
-    temperature_source: TemperatureSource | None,
+    temperature_c: float | None = None,
+    temperature_source: TemperatureSource | None = None,
 ) -> Log:
     """Read an opened recording; arguments as in `read_recording`."""
     if temperature_source is not None:
@@ -147,19 +147,27 @@ def open_recording(
     """
     path = as_path(path)
     if columns is None and parts_of_run(path):
-        return open_capture(path)
+        return _unsigned(open_capture(path), sign)
     log_file = open_log(path, columns=columns, sign=sign)
     is_mapped = mapped is not None and log_file.is_any_table
     if columns is not None or (log_file.reader is not None and not is_mapped):
         return log_file
     capture = None if is_mapped else find_capture(path)
     if capture is not None:
-        return capture
+        return _unsigned(capture, sign)
     if mapped is not None:
         return open_log(path, columns=mapped, sign=sign)
     problem = "not a known kind of log, nor of capture"
     cure = f"known logs: {KNOWN_LOGS}; known captures (with --vehicle or --dbc and --map):"
     raise not_recognised(log_file, problem, f"{cure} {KNOWN_CAPTURES}")
+
+
+def _unsigned(capture: Capture, sign: Sign | None) -> Capture:
+    if sign is None:
+        return capture
+    problem = "this is a capture, whose map states the sign"
+    cure = "set sign = -1 under [current] of the map file"
+    raise InputError(problem, source=capture.path, field="--sign", value=sign, cure=cure)
 
 
 def refuse_single_row(recorded: Sized) -> None:
@@ -168,14 +176,6 @@ def refuse_single_row(recorded: Sized) -> None:
         problem = "a single row: charge is counted from one row to the next"
         source, cure = getattr(recorded, "source", None), "give a log of minutes or hours"
         raise InputError(problem, source=source, cure=cure)
-
-
-def refuse_sign_of_capture(recording: LogFile | Capture, sign: str | None) -> None:
-    """Raise InputError if the sign of current is stated for a capture."""
-    if sign is not None and not isinstance(recording, LogFile):
-        problem = "this is a capture, whose map states the sign"
-        cure = "set sign = -1 under [current] of the map file"
-        raise InputError(problem, source=recording.path, field="--sign", value=sign, cure=cure)
 
 
 def capture_without_vehicle(path: str | PathLike[str]) -> InputError:

@@ -46,4 +46,4 @@ def check_command(
         (name.replace("_", " "), ", ".join(value) if isinstance(value, list) else str(value))
         for name, value in found.items()
     ]
-    print_table(f"{config}: `cangauge run` takes it", ("", "<"), rows)
+    print_table(f"{config}: `cangauge run` takes it", ("", ""), rows)

@@ -12,12 +12,10 @@ import typer
 from typer.core import TyperCommand
 
 from cangauge.cli.options import with_signature
-from cangauge.errors import InputError
 from cangauge.service.config import ConfigKey, config_keys
 
-_KEYS: Final = {key.name: key for key in config_keys()}
-_OPTIONS: Final = {name: key for name, key in _KEYS.items() if key.info.option}
-_BARE: Final = {key.info.option: key.info.bare for key in _KEYS.values() if key.info.bare}
+_OPTIONS: Final = {key.name: key for key in config_keys() if key.info.option}
+_BARE: Final = {key.info.option: key.info.bare for key in _OPTIONS.values() if key.info.bare}
 _TYPES: Final[Mapping[str, type]] = {"number": float, "true or false": bool}
 
 
@@ -36,11 +34,9 @@ def _with_values(arguments: Sequence[str]) -> Iterator[str]:
             yield _BARE[word]
 
 
-def _option(name: str, *flags: str) -> Any:
-    """Return the option of a key, such as "ids.soc_detail"; by default with its own flags."""
-    key = _KEYS[name]
-    names = flags or key.info.option.split(", ")
-    return typer.Option(*names, metavar=key.info.metavar or None, help=key.help)
+def _option(key: ConfigKey) -> Any:
+    flags = key.info.option.split(", ")
+    return typer.Option(*flags, metavar=key.info.metavar or None, help=key.help)
 
 
 def _type(key: ConfigKey) -> Any:
@@ -52,55 +48,39 @@ def _type(key: ConfigKey) -> Any:
     return str if key.name == "initial_soc" else _TYPES.get(key.kind, str)
 
 
-def config_options(command: Callable[..., None]) -> Callable[..., None]:
-    """Replace the `**options` of a command by the options that the configuration declares."""
-    named = inspect.Parameter.KEYWORD_ONLY
-    given = inspect.signature(command, eval_str=True).parameters.values()
-    own = [each.replace(kind=named) for each in given if each.kind is not each.VAR_KEYWORD]
-    made = [
-        inspect.Parameter(
-            name, named, default=None, annotation=Annotated[_type(key) | None, _option(name)]
-        )
-        for name, key in _OPTIONS.items()
-    ]
+def config_options(*names: str) -> Callable[[Callable[..., None]], Callable[..., None]]:
+    """Replace the `**options` of a command by options that the configuration declares.
 
-    def with_options(**values: Any) -> None:
-        command(**values)
+    Parameters
+    ----------
+    *names : str
+        Keys, such as "channel". Default: every key that has an option.
+    """
 
-    with_options.command_class = ConfigCommand  # type: ignore[attr-defined] # read by the app
-    return with_signature(with_options, command, own + made)
+    def spread(command: Callable[..., None]) -> Callable[..., None]:
+        named = inspect.Parameter.KEYWORD_ONLY
+        given = inspect.signature(command, eval_str=True).parameters.values()
+        own = [each.replace(kind=named) for each in given if each.kind is not each.VAR_KEYWORD]
+        made = [
+            inspect.Parameter(
+                name, named, default=None, annotation=Annotated[_type(key) | None, _option(key)]
+            )
+            for name, key in _OPTIONS.items()
+            if not names or name in names
+        ]
+
+        def with_options(**values: Any) -> None:
+            command(**values)
+
+        with_options.command_class = ConfigCommand  # type: ignore[attr-defined] # read by the app
+        return with_signature(with_options, command, own + made)
+
+    return spread
 
 
 def config_values(options: Mapping[str, Any]) -> dict[str, Any]:
-    """Return given options as the keys of a configuration; InputError if a bus option is wrong."""
+    """Return given options as keys of a configuration; InputError if a bus option is wrong."""
     from cangauge.bus.open import parse_bus_options
 
-    values = {name: options[name] for name in _OPTIONS}
-    values["bus_options"] = parse_bus_options(values["bus_options"] or [])
-    return {name: str(v) if isinstance(v, Path) else v for name, v in values.items()}
-
-
-def frame_ids(**given: str | None) -> dict[str, int]:
-    """Return the given ids by key, "0x…" hexadecimal; InputError if one is not a number."""
-    ids: dict[str, int] = {}
-    for key, text in given.items():
-        try:
-            ids |= {} if text is None else {key: int(text, 0)}
-        except ValueError as error:
-            option = f"--{key.replace('_', '-')}-id"
-            raise InputError(
-                "not a CAN id", field=option, value=text, cure="write it as 0x5A0"
-            ) from error
-    return ids
-
-
-InterfaceOption = Annotated[str | None, _option("interface")]
-ChannelOption = Annotated[str | None, _option("channel")]
-BusOptionOption = Annotated[list[str] | None, _option("bus_options")]
-BusVehicleOption = Annotated[str | None, _option("vehicle")]
-BusDbcOption = Annotated[Path | None, _option("dbc")]
-BusMapOption = Annotated[Path | None, _option("map")]
-BusTemperatureOption = Annotated[float | None, _option("temperature")]
-EstimateIdOption = Annotated[str | None, _option("ids.soc_estimate", "--soc-estimate-id")]
-DetailIdOption = Annotated[str | None, _option("ids.soc_detail", "--soc-detail-id")]
-ClockIdOption = Annotated[str | None, _option("ids.replay_clock", "--replay-clock-id")]
+    values = {name: str(v) if isinstance(v, Path) else v for name, v in options.items()}
+    return values | {"bus_options": parse_bus_options(options["bus_options"] or [])}

@@ -4,33 +4,40 @@ from __future__ import annotations
 
 from itertools import pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
 
 import typer
 
 from cangauge._extras import extra
 from cangauge._files import write_texts_atomic
-from cangauge._text import NONE_KNOWN, number, significant, span
+from cangauge._text import NONE_KNOWN, energy_text, number, significant, span
 from cangauge.cli.options import (
+    AUTO,
     JsonOption,
     ReadingOptions,
     ReportOption,
     assumed_of,
     check_outputs,
+    number_unless,
     option_groups,
     suffixed,
     within,
 )
-from cangauge.cli.output import console, emit_json, note, print_table, progress_shown
+from cangauge.cli.output import (
+    console,
+    emit_json,
+    note,
+    print_table,
+    print_values,
+    progress_shown,
+)
 from cangauge.errors import InputError
 
 if TYPE_CHECKING:
     from cangauge.identify.identification import Identification
     from cangauge.logs.log import Log
 
-FROM_SOC = "from-soc"
-AUTO = "auto"
-PUBLISHED_DELAYS = "0,10,30,70"
+FROM_SOC: Final = "from-soc"
 SAME_SUM = 0.02
 """Largest difference between the sum of the cells and the pack's voltage, of the latter: a cell
 more or less in 16 makes three times as much."""
@@ -96,22 +103,27 @@ def fit_command(  # noqa: PLR0917 - typer passes options by name
         float, typer.Option(metavar="HZ", help="Rate of the fit [Hz]; faster logs are decimated.")
     ] = 1.0,
     delays: Annotated[
-        str,
-        typer.Option(metavar="S,S,…", help="Delays of the current [s]; with --equation published."),
-    ] = PUBLISHED_DELAYS,
+        str | None,
+        typer.Option(
+            metavar="S,S,…",
+            help="Delays of the current [s], by default 0,10,30,70; with --equation published.",
+        ),
+    ] = None,
     epsilon: Annotated[
-        float,
+        float | None,
         typer.Option(
             metavar="E",
-            help="Margin ε of the scaled SoC [-], 0 < ε < 0.5; with --equation published.",
+            help="Margin ε of the scaled SoC [-], 0 < ε < 0.5, by default 0.05; with --equation"
+            " published.",
         ),
-    ] = 0.05,
+    ] = None,
     t_ref: Annotated[
-        float,
+        float | None,
         typer.Option(
-            metavar="C", help="Reference temperature T_r [°C]; with --equation published."
+            metavar="C",
+            help="Reference temperature T_r [°C], by default 20; with --equation published.",
         ),
-    ] = 20.0,
+    ] = None,
     effects: Annotated[
         list[str] | None,
         typer.Option(
@@ -150,23 +162,32 @@ def fit_command(  # noqa: PLR0917 - typer passes options by name
     from cangauge.identify.effect_search import parse_effect_ids
     from cangauge.identify.fit import fit
 
-    capacity = _capacity(capacity_ah)
-    initial = _initial_soc(initial_soc, len(logs))
+    capacity: float | Literal["from-soc"] | None = None
+    if capacity_ah is not None:
+        capacity = (
+            number_unless(FROM_SOC, capacity_ah, 1e-3, 1e5, option="--capacity-ah", unit="Ah")
+            or FROM_SOC
+        )
+    initial = _initial_soc(initial_soc or [AUTO], len(logs))
     within(rate_hz, 0.01, 1000.0, option="--rate-hz", unit="Hz")
-    within(epsilon, 1e-4, 0.49, option="--epsilon", unit="")
-    within(t_ref, -60.0, 120.0, option="--t-ref", unit="°C")
-    effect_ids = parse_effect_ids(effects) if effects else None
-    delay_s = parse_delays(delays)
-    if equation == "knots":
-        _refuse_published_options(delays, epsilon, t_ref)
+    published: dict[str, Any] = {
+        "delay_s": None if delays is None else parse_delays(delays),
+        "epsilon": within(epsilon, 1e-4, 0.49, option="--epsilon"),
+        "t_ref_c": within(t_ref, -60.0, 120.0, option="--t-ref", unit="°C"),
+    }
+    published = {name: value for name, value in published.items() if value is not None}
+    if equation == "knots" and published:
+        option = {"delay_s": "--delays", "epsilon": "--epsilon", "t_ref_c": "--t-ref"}
+        cure = "add --equation published, or leave it out"
+        raise InputError(
+            "belongs to the published equation", field=option[next(iter(published))], cure=cure
+        )
     check_outputs([output, report], logs)
     with console.status("reading") as status:
         recorded = []
         for path in logs:
             status.update(f"reading {path}")
             recorded.append(reading.load(path))
-        if cells is None:
-            cells = _cells_of(logs[0], recorded[0], reading)
         with progress_shown("cangauge.identify", status.update):
             result = fit(
                 recorded,
@@ -174,27 +195,19 @@ def fit_command(  # noqa: PLR0917 - typer passes options by name
                 initial_soc_pct=initial,
                 equation=equation,
                 chemistry=chemistry,
-                cells=cells,
+                cells=cells or _cells_of(logs[0], recorded[0], reading),
                 rate_hz=rate_hz,
-                delay_s=delay_s,
-                epsilon=epsilon,
-                t_ref_c=t_ref,
-                effects=effect_ids,
+                effects=parse_effect_ids(effects) if effects else None,
+                **published,
             )
-        page = None
+        status.update("writing")
+        texts = {output: result.model.to_json()}
         if report is not None:
-            status.update("writing the report")
-            page = extra("report.fit:fit_report")(result)
-    write_texts_atomic(
-        {output: result.model.to_json()} | ({report: page} if report and page else {})
-    )
+            texts[report] = extra("report.fit:fit_report")(result)
+        write_texts_atomic(texts)
     if json_output:
-        more: dict[str, object] = {
-            "model": str(output),
-            "report": report and str(report),
-            "assumed": assumed_of(recorded),
-        }
-        emit_json(result.to_dict() | more)
+        written = {"model": str(output), "report": report and str(report)}
+        emit_json(result.to_dict() | written | {"assumed": assumed_of(recorded)})
         return
     _show(result)
     note(f"model: {output}" + (f"\nreport: {report}" if report else ""))
@@ -215,76 +228,34 @@ def _cells_of(path: Path, log: Log, reading: ReadingOptions) -> int | None:
     return cells.count if abs(ratio - 1.0) <= SAME_SUM else None
 
 
-def _refuse_published_options(delays: str, epsilon: float, t_ref: float) -> None:
-    for option, value, default in (
-        ("--delays", delays, PUBLISHED_DELAYS),
-        ("--epsilon", epsilon, 0.05),
-        ("--t-ref", t_ref, 20.0),
-    ):
-        if value != default:
-            raise InputError(
-                "belongs to the published equation",
-                field=option,
-                value=value,
-                cure="add --equation published, or leave it out",
-            )
-
-
-def _capacity(given: str | None) -> float | Literal["from-soc"] | None:
-    if given is None:
-        return None
-    if given == FROM_SOC:
-        return "from-soc"
-    try:
-        return within(float(given), 1e-3, 1e5, option="--capacity-ah", unit="Ah")
-    except ValueError as error:
-        raise InputError(
-            "not a number of Ah",
-            field="--capacity-ah",
-            value=given,
-            cure=f"give it as 51.5, or as {FROM_SOC} to take it from the logs' soc_pct",
-        ) from error
-
-
-def _initial_soc(given: list[str] | None, number: int) -> float | list[float | None] | None:
+def _initial_soc(given: list[str], number: int) -> float | list[float | None] | None:
     """Return the value for all logs, or one for each; None where it is not given."""
-    if not given:
-        return None
-    found: list[float | None] = []
-    for text in given:
-        try:
-            value = None if text == AUTO else float(text)
-        except ValueError as error:
-            raise InputError(
-                "neither a number nor auto", field="--initial-soc", value=text, cure="give it as 80"
-            ) from error
-        found.append(within(value, 0.0, 100.0, option="--initial-soc", unit="%"))
-    if len(found) not in {1, number}:
+    values = [
+        number_unless(AUTO, text, 0.0, 100.0, option="--initial-soc", unit="%") for text in given
+    ]
+    if len(values) not in {1, number}:
         raise InputError(
-            f"{len(found)} values for {number} logs",
+            f"{len(values)} values for {number} logs",
             field="--initial-soc",
             cure="give one for all, or one for each log in order (auto where it is unknown)",
         )
-    return found[0] if len(found) == 1 else found
+    return values[0] if len(values) == 1 else values
 
 
 def parse_delays(given: str) -> tuple[float, ...]:
     """Return the value of `--delays` [s]; raise InputError if it is none."""
-    cure = "give increasing seconds from 0, such as 0,10,30,70"
     try:
         delays = tuple(float(text) for text in given.split(","))
-    except ValueError as error:
-        raise InputError(
-            "not a list of seconds", field="--delays", value=given, cure=cure
-        ) from error
+    except ValueError:
+        delays = ()
     increasing = all(low < high for low, high in pairwise(delays))
     # Slope resistance and heat are defined by the undelayed current.
-    if not (delays[0] == 0.0 and increasing and delays[-1] <= 3600.0):
+    if not (delays and delays[0] == 0.0 and increasing and delays[-1] <= 3600.0):
         raise InputError(
-            "delays must begin with 0 and increase to 3600 s at most",
+            "not delays that begin with 0 and increase to 3600 s at most",
             field="--delays",
             value=given,
-            cure=cure,
+            cure="give increasing seconds from 0, such as 0,10,30,70",
         )
     return delays
 
@@ -297,20 +268,19 @@ def _show(result: Identification) -> None:
     note(result.verdict)
     for remark in result.remarks:
         note(f"note: {remark}")
-    held_out = ["voltage error held out, MAE", number(model.noise.voltage_mae_pct, 3), "%"]
-    print_table(
+    held_out = number(model.noise.voltage_mae_pct, 3, "%") if result.is_held_out else NONE_KNOWN
+    print_values(
         f"Model {model.name}",
-        ["", "value", "<unit"],
-        [
-            ["voltage error, MAE", number(result.voltage_mae_pct, 3), "%"],
-            ["voltage error, RMSE", significant(result.voltage_rmse_v, 3), "V"],
-            *([held_out] if result.is_held_out else []),
-            ["SoC from voltage, MAE", number(result.soc_newton_mae_pct, 2), "%"],
-            ["capacity", number(model.capacity_ah, 2), "Ah"],
-            ["identified at SoC", span(*model.range.soc_pct, 1), "%"],
-            ["identified at temperature", span(*model.range.temperature_c, 1), "°C"],
-            ["rows used", str(sum(len(item.rows) for item in result.fits)), ""],
-        ],
+        {
+            "voltage error, MAE": number(result.voltage_mae_pct, 3, "%"),
+            "voltage error, RMSE": significant(result.voltage_rmse_v, 3, "V"),
+            "voltage error held out, MAE": held_out,
+            "SoC from voltage, MAE": number(result.soc_newton_mae_pct, 2, "%"),
+            "capacity": number(model.capacity_ah, 2, "Ah"),
+            "identified at SoC": span(*model.range.soc_pct, 1, "%"),
+            "identified at temperature": span(*model.range.temperature_c, 1, "°C"),
+            "rows used": str(sum(len(item.rows) for item in result.fits)),
+        },
     )
     head, rows = coefficient_rows(model.coefficients)
     unknown = {row[0] for row in rows if row[1] == NONE_KNOWN}
@@ -321,15 +291,13 @@ def _show(result: Identification) -> None:
     if result.effects is not None and result.effects.steps:
         print_table("Effects", *effect_rows(result))
         print_table("Search for effects", *search_rows(result.effects))
-    kwh, unit = (1.0, "kWh") if energy.driven_kwh >= 1.0 else (1e3, "Wh")
-    print_table(
+    print_values(
         "Energy at the terminals",
-        ["", "value", "<unit"],
-        [
-            ["driven", significant(kwh * energy.driven_kwh, 3), unit],
-            ["regenerated", significant(kwh * energy.regenerated_kwh, 3), unit],
-            ["net", significant(kwh * energy.net_kwh, 3), unit],
-            ["Joule heat", significant(kwh * energy.heat_kwh, 3), unit],
-            ["efficiency", number(energy.efficiency_pct, 1), "%"],
-        ],
+        {
+            "driven": energy_text(1e3 * energy.driven_kwh),
+            "regenerated": energy_text(1e3 * energy.regenerated_kwh),
+            "net": energy_text(1e3 * energy.net_kwh),
+            "Joule heat": energy_text(1e3 * energy.heat_kwh),
+            "efficiency": number(energy.efficiency_pct, 1, "%"),
+        },
     )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -11,6 +11,8 @@ from cangauge._extras import extra
 from cangauge._files import write_texts_atomic
 from cangauge._text import printable
 from cangauge.cli.options import (
+    ALARM,
+    AlarmOption,
     JsonOption,
     ReadingOptions,
     ReportOption,
@@ -22,15 +24,13 @@ from cangauge.cli.options import (
     within,
 )
 from cangauge.cli.output import emit_json, note, print_table, progress_shown
-from cangauge.cli.shown import ALARM
-from cangauge.cli.simulator import SimulatorOptions
+from cangauge.cli.simulator import column_of, load_function
 from cangauge.errors import InputError
 
 if TYPE_CHECKING:
     from cangauge.diagnosis import Diagnosis
     from cangauge.diagnosis.planner import Plan
     from cangauge.logs.log import Log
-    from cangauge.model.model_file import Model
 
 
 @option_groups()
@@ -92,14 +92,7 @@ def gap_command(  # noqa: PLR0917 - typer passes options by name
             " returns the voltage [V].",
         ),
     ] = None,
-    alarm: Annotated[
-        float,
-        typer.Option(
-            "--alarm",
-            metavar="P",
-            help="Report a fault where the probability of none is at most this.",
-        ),
-    ] = ALARM,
+    alarm: AlarmOption = ALARM,
     plan: Annotated[
         bool,
         typer.Option(
@@ -141,39 +134,39 @@ def gap_command(  # noqa: PLR0917 - typer passes options by name
     """
     from cangauge.diagnosis import diagnose
     from cangauge.diagnosis.planner import plan as plan_next
+    from cangauge.model.model_file import Model
 
     added, given = list(add_test or []), list(reference or [])
     paths = [*logs, *added]
-    options = SimulatorOptions(
-        simulated, simulator, reading.columns, reading.temperature, capacity_ah
-    )
     _refuse_common(paths, given)
+    _refuse_simulators(model, simulated, simulator)
     within(initial_soc, 0.0, 100.0, option="--initial-soc", unit="%")
-    within(alarm, 0.0, 1.0, option="--alarm", unit="")
+    within(alarm, 0.0, 1.0, option="--alarm")
     within(capacity_ah, 1e-3, 1e5, option="--capacity-ah", unit="Ah")
-    model_file = _model(model, options)
+    model_file = None if model is None else Model.load(model)
+    if model_file is not None and capacity_ah is not None:
+        model_file = model_file.model_copy(update={"capacity_ah": capacity_ah})
     check_outputs([report, extended], [*paths, *given, *([model] if model else [])])
     used = [] if simulated is None else [simulated]
-    diagnosed = [reading.load(path, used) for path in paths]
-    references = [reading.load(path, used) for path in given]
+    read = [reading.load(path, used) for path in [*paths, *given]]
     if model_file is not None:
-        _note_differences([*diagnosed, *references], model_file.capacity_ah)
+        capacity_ah = model_file.capacity_ah
+        _note_differences(read, capacity_ah)
+    diagnosed, references = read[: len(paths)], read[len(paths) :]
     if initial_soc is not None:  # an added test has its own start
-        capacity = capacity_ah if model_file is None else model_file.capacity_ah
-        diagnosed[: len(logs)] = _started(diagnosed[: len(logs)], initial_soc, capacity)
+        diagnosed[: len(logs)] = _started(diagnosed[: len(logs)], initial_soc, capacity_ah)
     with progress_shown("cangauge.diagnosis"):
         found = diagnose(
             diagnosed,
             model_file,
             references,
-            simulation=options.simulation([*diagnosed, *references], [*paths, *given]),
+            simulation=_simulation(simulated, simulator, read, [*paths, *given], reading),
             capacity_ah=capacity_ah,
             alarm=alarm,
         )
         before = None
         if added:
-            first = found.logs[: len(logs)]
-            before = diagnose(first, found.model, found.known, alarm=alarm)
+            before = diagnose(found.logs[: len(logs)], found.model, found.known, alarm=alarm)
         steps = (
             plan_next(found.known, found.columns, found.evidence, found.posterior) if plan else None
         )
@@ -191,11 +184,28 @@ def gap_command(  # noqa: PLR0917 - typer passes options by name
                 "before": dict(before.posterior.probabilities),
             }
         result |= {} if steps is None else {"plan": steps.to_dict()}
-        emit_json(result | {"assumed": assumed_of([*diagnosed, *references])})
+        emit_json(result | {"assumed": assumed_of(read)})
         return
     _show(found, before, steps)
     for written in texts:
         note(f"wrote {written}{_held(found) if written == extended else ''}")
+
+
+def _simulation(
+    heading: str | None,
+    function: str | None,
+    logs: list[Log],
+    paths: list[Path],
+    reading: ReadingOptions,
+) -> Any:
+    if function is not None:
+        return load_function(function)
+    if heading is None:
+        return None
+    return {
+        log.source or log.name: column_of(log, path, heading, reading)
+        for log, path in zip(logs, paths, strict=True)
+    }
 
 
 def _held(found: Diagnosis) -> str:
@@ -222,20 +232,14 @@ def _note_differences(logs: list[Log], capacity_ah: float) -> None:
             note(f"warning: {difference}")
 
 
-def _model(path: Path | None, options: SimulatorOptions) -> Model | None:
-    """Return the given model; None for a simulator without one."""
-    from cangauge.model.model_file import Model
-
-    if path is None and not options.are_given:
-        raise InputError(
-            "no model", field="--model", cure="give the model file, or --simulated or --simulator"
-        )
-    if path is None:
-        return None
-    found = Model.load(path)
-    if options.capacity_ah is None:
-        return found
-    return found.model_copy(update={"capacity_ah": options.capacity_ah})
+def _refuse_simulators(model: Path | None, simulated: str | None, simulator: str | None) -> None:
+    """Raise InputError for two simulators, or for neither a model nor a simulator."""
+    if simulated is not None and simulator is not None:
+        cure = "give --simulated or --simulator"
+        raise InputError("two simulators", field="--simulator", value=simulator, cure=cure)
+    if (model, simulated, simulator) == (None, None, None):
+        cure = "give the model file, or --simulated or --simulator"
+        raise InputError("no model", field="--model", cure=cure)
 
 
 def _refuse_common(logs: list[Path], references: list[Path]) -> None:

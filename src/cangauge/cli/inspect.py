@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import shlex
+import sys
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
-from rich.console import Console, JustifyMethod
-from rich.markup import escape
-from rich.table import Table
 
 from cangauge._extras import extra
 from cangauge._files import write_texts_atomic
@@ -23,7 +21,7 @@ from cangauge.cli.options import (
     check_outputs,
     option_groups,
 )
-from cangauge.cli.output import PlainConsole, emit_json, note
+from cangauge.cli.output import emit_json, note, print_table, wrapped
 from cangauge.errors import InputError
 
 if TYPE_CHECKING:
@@ -33,10 +31,17 @@ if TYPE_CHECKING:
 _STAMPS_SINCE_1970_S = 1e9
 """Earlier stamps count from the start of the capture or of the logger [s]."""
 _GAPS_SHOWN = 5
-_MARKS = {"yes": "[green]yes[/]", "partly": "[yellow]partly[/]", "no": "[red]no[/]"}
+_COUNTS = {
+    "error_frames": "error frames",
+    "remote_frames": "remote frames",
+    "time_reversals": "stamps that step back",
+    "other_ids": "frames of further ids",
+}
+_FAULTS = {"crc_errors": "wrong CRC", "frames_lost": "lost", "counter_repeats": "repeated"}
+_RANGES = {"current_a": "A", "voltage_v": "V", "temperature_c": "°C", "soc_pct": "%"}
 
 
-@option_groups("temperature_source")
+@option_groups()
 def inspect_command(
     path: Annotated[
         Path,
@@ -79,39 +84,31 @@ def inspect_command(
     from cangauge.logs.read import LogFile
 
     check_outputs([report], [path])
-    recording = reading.open(path)
-    assumed: dict[str, list[str]] = {}
+    recording, logs = reading.open(path), []
     found: LogInspection | CaptureInspection
     if isinstance(recording, LogFile):
         _refuse_options_of_captures(reading, path)
-        log = recording.read(temperature_c=reading.temperature)
-        assumed = assumed_of([log])
+        logs = [log := recording.read(temperature_c=reading.temperature)]
         if log.assumed:
             note(f"{path}: read as {', '.join(log.assumed)}")
         found = of_log = inspect_log(log)
         if report is not None:
             write_texts_atomic({report: extra("report.inspection:inspect_report")(of_log, log)})
             note(f"report: {report}")
+    elif report is not None:
+        cure = "omit it, or use cangauge estimate --report"
+        problem = "shows a log, and this is a capture"
+        raise InputError(problem, source=path, field="--report", value=str(report), cure=cure)
     else:
-        if report is not None:
-            raise InputError(
-                "shows a log, and this is a capture",
-                source=path,
-                field="--report",
-                value=str(report),
-                cure="omit it, or use cangauge estimate --report",
-            )
         found = inspect_capture(path, reading.car() if reading.names_vehicle else None)
     if json_output:
-        emit_json(found.to_dict() | {"assumed": assumed})
-        return
-    console = PlainConsole(highlight=False)
-    if isinstance(found, LogInspection):
-        _show_log(console, found)
+        emit_json(found.to_dict() | {"assumed": assumed_of(logs)})
+    elif isinstance(found, LogInspection):
+        _show_log(found)
     else:
-        _show_capture(console, found)
+        _show_capture(found)
         if found.log is not None:
-            _show_log(console, found.log)
+            _show_log(found.log)
 
 
 def _refuse_options_of_captures(reading: ReadingOptions, path: Path) -> None:
@@ -123,74 +120,49 @@ def _refuse_options_of_captures(reading: ReadingOptions, path: Path) -> None:
         raise InputError(problem, source=path, field=option, value=value, cure="omit it")
 
 
-def _show_log(console: Console, found: LogInspection) -> None:
+def _say(text: str) -> None:
+    """Print a line of the result; a terminal wraps it between words."""
+    typer.echo(wrapped(text, sys.stdout))
+
+
+def _show_log(found: LogInspection) -> None:
+    from cangauge.inspect.log import ability_rows, channel_rows
+
     timing, charge, soc = found.timing, found.charge, found.soc
     rate = "one row"
     if timing.rate_hz:
         exact = f"{timing.rate_hz:.4g} Hz (regular)"
         rate = exact if timing.regular else f"about {rounded(timing.rate_hz, 2)} Hz (irregular)"
-    console.print(
-        f"[bold]{escape(found.name)}[/]: {found.rows} rows, {timing.duration_s / 60.0:.1f} min,"
-        f" {rate}, temperature of: {found.temperature_source}"
+    _say(
+        f"{found.name}: {found.rows} rows, {timing.duration_s / 60.0:.1f} min, {rate},"
+        f" temperature of: {found.temperature_source}"
     )
-    table = Table()
-    for heading in ("channel", "minimum", "median", "maximum", "unit", "step", "missing"):
-        table.add_column(heading, justify="left" if heading in {"channel", "unit"} else "right")
-    for name, channel in found.channels.items():
-        step = "none" if channel.quantum is None else f"{channel.quantum:.4g}"
-        values = (channel.minimum, channel.median, channel.maximum)
-        table.add_row(
-            escape(name),
-            *(f"{value:.5g}" for value in values),
-            escape(channel.unit),
-            "constant" if channel.levels == 1 else step,
-            str(channel.missing or ""),
-        )
-    console.print(table)
-    console.print(
+    print_table("Channels", *channel_rows(found))
+    _say(
         f"Charge: {charge.discharged_ah:.4g} Ah discharged, {charge.charged_ah:.4g} Ah charged,"
         f" net {charge.net_ah:+.4g} Ah."
     )
     if soc is not None:
-        console.print(
+        _say(
             f"Reference SoC: {soc.first_pct:.1f} → {soc.last_pct:.1f} %,"
             f" in {100.0 * soc.coverage:.1f} % of the rows."
         )
-    console.print(f"Sign: {found.sign.sentence}.", markup=False, soft_wrap=not console.is_terminal)
-    abilities = Table(title="What this log can identify", title_justify="left")
-    for heading in ("quantity", "identifiable", "reason"):
-        abilities.add_column(heading)
-    for ability in found.abilities[1:]:
-        abilities.add_row(ability.topic, _MARKS[ability.verdict], ability.text)
-    console.print(abilities)
+    _say(f"Sign: {found.sign.sentence}.")
+    head, rows = ability_rows(found)
+    print_table("What this log can identify", head, rows[1:])  # the first is the sign
     for heading, lines in (("Remarks", found.remarks), ("Warning", found.warnings)):
         for line in lines:
-            console.print(f"{heading}: {line}", markup=False, soft_wrap=not console.is_terminal)
+            _say(f"{heading}: {line}")
 
 
-_COUNTS = {
-    "error_frames": "error frames",
-    "remote_frames": "remote frames",
-    "time_reversals": "stamps that step back",
-    "other_ids": "frames of further ids",
-}
-_FAULTS = {
-    "crc_errors": "wrong CRC",
-    "frames_lost": "lost",
-    "counter_repeats": "repeated",
-}
-_RANGES = {"current_a": "A", "voltage_v": "V", "temperature_c": "°C", "soc_pct": "%"}
-
-
-def _show_capture(console: Console, found: CaptureInspection) -> None:
+def _show_capture(found: CaptureInspection) -> None:
     """Print the frames, the vehicle and the faults of a capture; what is zero is left out."""
-    info = found.info
-    begins = ""
+    info, begins = found.info, ""
     if found.start_s > _STAMPS_SINCE_1970_S:
         begins = f", from {datetime.fromtimestamp(found.start_s, UTC):%Y-%m-%d %H:%M:%S} UTC"
-    console.print(
-        f"[bold]{escape(found.name)}[/]: {info.format}, {info.frames:,} frames of"
-        f" {len(found.ids)} ids, {found.duration_s:.1f} s{begins}."
+    _say(
+        f"{found.name}: {info.format}, {info.frames:,} frames of {len(found.ids)} ids,"
+        f" {found.duration_s:.1f} s{begins}."
     )
     matching = [preset for preset in found.presets if preset.matches]
     for preset in matching:
@@ -199,46 +171,36 @@ def _show_capture(console: Console, found: CaptureInspection) -> None:
             for name, unit in _RANGES.items()
             if (span := getattr(preset, name)) is not None
         ]
-        console.print(
+        _say(
             f"Vehicle: {preset.about} (--vehicle {preset.preset}), {preset.samples:,} samples:"
-            f" {', '.join(spans)}.",
-            markup=False,
-            soft_wrap=not console.is_terminal,
+            f" {', '.join(spans)}."
         )
     if not matching and found.log is None:
         command = f"cangauge init {shlex.quote(found.source)} -o mycar"
-        console.print("No known vehicle. Find its signals:", command, markup=False, soft_wrap=True)
-    console.print(_table_of_ids(found))
+        _say(f"No known vehicle. Find its signals: {command}")
+    print_table("Frames", *_rows_of_ids(found))
     counts = {words: getattr(found, name) for name, words in _COUNTS.items()}
     if any(counts.values()):
         shown = ", ".join(f"{count:,} {words}" for words, count in counts.items() if count)
-        console.print(f"{shown[0].upper()}{shown[1:]}.")
+        _say(f"{shown[0].upper()}{shown[1:]}.")
     for gap in found.gaps[:_GAPS_SHOWN]:
-        console.print(f"Silence of {gap.length_s:.3g} s after {gap.start_s - found.start_s:.1f} s.")
+        _say(f"Silence of {gap.length_s:.3g} s after {gap.start_s - found.start_s:.1f} s.")
     if len(found.gaps) > _GAPS_SHOWN:
-        console.print(f"{len(found.gaps) - _GAPS_SHOWN} more silences (--json).")
+        _say(f"{len(found.gaps) - _GAPS_SHOWN} more silences (--json).")
     for line in info.remarks:
-        console.print(f"Remarks: {line}", markup=False, soft_wrap=not console.is_terminal)
+        _say(f"Remarks: {line}")
 
 
-def _table_of_ids(found: CaptureInspection) -> Table:
-    table = Table(title="Frames", title_justify="left")
-    buses = {each.bus for each in found.ids}
-    for heading in ("id", "bus", "frames", "bytes", "period [s]", "longest [s]", "faults"):
-        if heading != "bus" or len(buses) > 1:
-            justify: JustifyMethod = "left" if heading in {"id", "faults"} else "right"
-            table.add_column(escape(heading), justify=justify)
+def _rows_of_ids(found: CaptureInspection) -> tuple[list[str], list[list[str]]]:
+    has_buses = len({each.bus for each in found.ids}) > 1
+    rows = []
     for each in found.ids:
         counts = {words: getattr(each, name) for name, words in _FAULTS.items()}
         faults = [f"{count} {words}" for words, count in counts.items() if count]
         faults += ["two senders"] * each.two_senders
         seconds = ["–" if s is None else f"{s:.3g}" for s in (each.period_s, each.longest_s)]
-        table.add_row(
-            escape(each.id),
-            *([escape(each.bus)] if len(buses) > 1 else []),
-            f"{each.frames:,}",
-            each.bytes,
-            *seconds,
-            ", ".join(faults) or ("none" if each.protection else "not protected"),
-        )
-    return table
+        state = ", ".join(faults) or ("none" if each.protection else "not protected")
+        bus = [each.bus] if has_buses else []
+        rows.append([each.id, *bus, f"{each.frames:,}", each.bytes, *seconds, state])
+    bus = ["bus"] if has_buses else []
+    return ["id", *bus, "frames", "bytes", "period [s]", "longest [s]", "faults"], rows

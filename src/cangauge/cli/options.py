@@ -12,7 +12,6 @@ import typer
 
 from cangauge._files import check_writable, require_suffix
 from cangauge.cli.output import note
-from cangauge.cli.shown import TEMPERATURE_SOURCES
 from cangauge.errors import InputError
 
 if TYPE_CHECKING:
@@ -22,38 +21,15 @@ if TYPE_CHECKING:
     from cangauge.logs.draft import Sign
     from cangauge.logs.log import Log
     from cangauge.logs.read import LogFile
-    from cangauge.logs.units import TemperatureSource
 
 # The service shares these options, but needs neither pyarrow nor the readers: imports are deferred.
 
 RECOGNISED_BY = 50_000
 """Frames by which the preset of a capture is looked for: half a minute of a busy bus."""
+AUTO = "auto"
+ALARM = 0.05
+"""`cangauge.diagnosis.ALARM`: a help page imports nothing that computes."""
 _Value = TypeVar("_Value", bound=float | None)
-
-ColumnsOption = Annotated[
-    str | None,
-    typer.Option(
-        "--columns",
-        metavar="NAME=HEADING,…",
-        help="For a table of other headings: time, current, voltage, temperature, soc, each"
-        " NAME=HEADING[UNIT]:FACTOR; unit and factor only where the heading leaves them open."
-        " 'current=I_batt[mA]:-1' (mA, discharge negative); 'time=Date+Time' joins two columns;"
-        " 'temperature=T1+T2' averages; '#3' is the third column. See docs/logs.md.",
-    ),
-]
-SignOption = Annotated[
-    str | None,
-    typer.Option(
-        "--sign",
-        metavar="charge|discharge",
-        help="What a positive current in the file does. Default: as its format defines it, else"
-        " found from the data.",
-    ),
-]
-JsonOption = Annotated[
-    bool,
-    typer.Option("--json", help="Print exactly one JSON object on stdout, also for an error."),
-]
 
 
 def suffixed(*suffixes: str) -> Callable[[typer.CallbackParam, Path | None], Path | None]:
@@ -67,6 +43,33 @@ def suffixed(*suffixes: str) -> Callable[[typer.CallbackParam, Path | None], Pat
     return check
 
 
+ColumnsOption = Annotated[
+    str | None,
+    typer.Option(
+        metavar="NAME=HEADING,…",
+        help="For a table of other headings: time, current, voltage, temperature, soc, each"
+        " NAME=HEADING[UNIT]:FACTOR; unit and factor only where the heading leaves them open."
+        " 'current=I_batt[mA]:-1' (mA, discharge negative); 'time=Date+Time' joins two columns;"
+        " 'temperature=T1+T2' averages; '#3' is the third column. See docs/logs.md.",
+    ),
+]
+JsonOption = Annotated[
+    bool,
+    typer.Option("--json", help="Print exactly one JSON object on stdout, also for an error."),
+]
+ModelOption = Annotated[
+    Path, typer.Option("-m", "--model", metavar="MODEL", help="Model file of `cangauge fit`.")
+]
+CapacityOption = Annotated[
+    float | None,
+    typer.Option(
+        "--capacity-ah", metavar="A", help="Charge from 100 to 0 % [Ah]. Default: the model's."
+    ),
+]
+AlarmOption = Annotated[
+    float,
+    typer.Option(metavar="P", help="Report a fault where the probability of none is at most this."),
+]
 ReportOption = Annotated[
     Path | None,
     typer.Option(
@@ -85,14 +88,13 @@ class ReadingOptions:
     vehicle: Annotated[
         str | None,
         typer.Option(
-            "--vehicle",
             metavar="PRESET",
             help="For a capture: the car's preset (a DBC and a map that ship with cangauge).",
         ),
     ] = None
     dbc: Annotated[
         Path | None,
-        typer.Option("--dbc", metavar="FILE", help="For a capture: the bus's DBC; needs --map."),
+        typer.Option(metavar="FILE", help="For a capture: the bus's DBC; needs --map."),
     ] = None
     map_file: Annotated[
         Path | None,
@@ -103,23 +105,17 @@ class ReadingOptions:
         ),
     ] = None
     columns: ColumnsOption = None
-    sign: SignOption = None
-    temperature: Annotated[
-        float | None,
-        typer.Option(
-            "--temperature",
-            metavar="C",
-            help="Constant temperature [°C], where the input has none.",
-        ),
-    ] = None
-    temperature_source: Annotated[
+    sign: Annotated[
         str | None,
         typer.Option(
-            "--temperature-source",
-            metavar="SOURCE",
-            help="Location of the temperature sensor, where the input does not state it: "
-            f"{', '.join(TEMPERATURE_SOURCES)}.",
+            metavar="charge|discharge",
+            help="What a positive current in the file does. Default: as its format defines it,"
+            " else found from the data.",
         ),
+    ] = None
+    temperature: Annotated[
+        float | None,
+        typer.Option(metavar="C", help="Constant temperature [°C], where the input has none."),
     ] = None
 
     @property
@@ -147,16 +143,14 @@ class ReadingOptions:
 
     def open(self, path: Path) -> LogFile | Capture:
         """Open a log by these columns, or any recording by its content; may raise InputError."""
-        from cangauge.bus.recording import open_recording, refuse_sign_of_capture
+        from cangauge.bus.recording import open_recording
 
-        recording = open_recording(
+        return open_recording(
             path,
             columns=self.given_columns(),
             mapped=self.mapped_columns(),
             sign=cast("Sign | None", self.sign),
         )
-        refuse_sign_of_capture(recording, self.sign)
-        return recording
 
     def load(self, path: Path, used: Sequence[str] = ()) -> Log:
         """Read a log, or decode a capture; print the reader's remarks on stderr.
@@ -180,36 +174,33 @@ class ReadingOptions:
         """
         from cangauge.bus.recording import log_of, refuse_single_row
         from cangauge.logs.read import LogFile
+        from cangauge.logs.sign import require_discharge_positive
 
-        source = known_temperature_source(self.temperature_source)
-        recording = self.open(path)
-        is_capture = not isinstance(recording, LogFile)
+        recording, car = self.open(path), None
+        if not isinstance(recording, LogFile):
+            car = self.car_of(path)
+        elif self.names_vehicle and self.mapped_columns() is None:
+            note(f"{path}: a log, not a capture: --vehicle, --dbc and --map do not apply to it")
         if isinstance(recording, LogFile):
             recording = replace(recording, used=tuple(used))
-        if is_capture and not self.names_vehicle:
-            raise unnamed_capture(path)
-        car = self.car() if is_capture else None
-        if not is_capture and self.names_vehicle and self.mapped_columns() is None:
-            note(f"{path}: a log, not a capture: --vehicle, --dbc and --map do not apply to it")
-        log = log_of(recording, car, temperature_c=self.temperature, temperature_source=source)
+        log = log_of(recording, car, temperature_c=self.temperature)
         refuse_single_row(log)
         if self.sign is None:
-            refuse_inverted_current(log, is_capture=is_capture)
+            require_discharge_positive(log, is_capture=car is not None)
         note_reading(log)
         return log
 
+    def car_of(self, capture: Path) -> Vehicle:
+        """Return the vehicle; without one, raise an InputError that names the preset to give."""
+        from cangauge.bus.recording import capture_without_vehicle
+        from cangauge.inspect.capture import inspect_capture
 
-def unnamed_capture(path: Path) -> InputError:
-    """Return the error for a capture without a vehicle; it names the one preset that matches."""
-    from cangauge.bus.recording import capture_without_vehicle
-    from cangauge.inspect.capture import inspect_capture
-
-    error = capture_without_vehicle(path)
-    matching = inspect_capture(path, frames=RECOGNISED_BY).matching
-    if len(matching) == 1:
-        cure = f"{error.cure} (--vehicle {matching[0]} matches it)"
-        return InputError(error.problem, source=path, cure=cure)
-    return error
+        if self.names_vehicle:
+            return self.car()
+        error = capture_without_vehicle(capture)
+        matching = inspect_capture(capture, frames=RECOGNISED_BY).matching
+        hint = f" (--vehicle {matching[0]} matches it)" if len(matching) == 1 else ""
+        raise InputError(error.problem, source=capture, cure=f"{error.cure}{hint}")
 
 
 def option_groups(*omitted: str) -> Callable[[Callable[..., None]], Callable[..., None]]:
@@ -259,9 +250,8 @@ def with_signature(
 
 def note_reading(log: Log) -> None:
     """Print on stderr what was assumed of a log's columns, in one line, and the remarks."""
-    if log.assumed:
-        note(f"{log.source or log.name}: read as {', '.join(log.assumed)}")
-    for remark in log.remarks:
+    remarks = [f"read as {', '.join(log.assumed)}"] if log.assumed else []
+    for remark in (*remarks, *log.remarks):
         note(f"{log.source or log.name}: {remark}")
 
 
@@ -312,7 +302,7 @@ def check_outputs(
             check_writable(output)
 
 
-def within(value: _Value, low: float, high: float, *, option: str, unit: str) -> _Value:
+def within(value: _Value, low: float, high: float, *, option: str, unit: str = "") -> _Value:
     """Return `value` if it is None or within low … high; else (NaN too) raise InputError."""
     if value is not None and not low <= value <= high:
         raise InputError(
@@ -321,26 +311,23 @@ def within(value: _Value, low: float, high: float, *, option: str, unit: str) ->
     return value
 
 
-def refuse_inverted_current(log: Log, *, is_capture: bool) -> None:
-    """Raise InputError if the data show clearly that positive current charges."""
-    from cangauge.logs.sign import require_discharge_positive
+def number_unless(
+    word: str, text: str, low: float, high: float, *, option: str, unit: str = ""
+) -> float | None:
+    """Return None for `word`, else the number that `text` states, within low … high.
 
-    try:
-        require_discharge_positive(log)
-    except InputError as error:
-        if not is_capture:
-            raise
-        # Recorded frames are never changed: the map inverts the sign.
-        cure = "use the preset of this car, or set sign = -1 under [current] of the map file"
-        raise InputError(
-            error.problem, source=error.source, field=error.field, cure=cure
-        ) from error
-
-
-def known_temperature_source(given: str | None) -> TemperatureSource | None:
-    """Check the value of --temperature-source; raise InputError if it is not a known one."""
-    from cangauge.logs import units
-
-    if given is None:
+    Raises
+    ------
+    InputError
+        If it is neither the word nor such a number.
+    """
+    if text == word:
         return None
-    return units.known_temperature_source(given, field="--temperature-source")
+    try:
+        value = float(text)
+    except ValueError as error:
+        cure = f"give a number{f' of {unit}' if unit else ''}, or {word}"
+        raise InputError(
+            f"neither a number nor {word}", field=option, value=text, cure=cure
+        ) from error
+    return within(value, low, high, option=option, unit=unit)

@@ -10,7 +10,7 @@ import sys
 import textwrap
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from typing import Any, Final
+from typing import Any, Final, TextIO
 
 from rich import box
 from rich.console import Console, ConsoleOptions, RenderableType
@@ -18,7 +18,7 @@ from rich.segment import Segment
 from rich.table import Table
 from rich.text import Text
 
-from cangauge._text import printable, printable_json
+from cangauge._text import NONE_KNOWN, is_numeric, printable, printable_json
 from cangauge.errors import CangaugeError
 
 
@@ -39,16 +39,19 @@ console = PlainConsole(stderr=True, highlight=False)
 
 def note(text: str) -> None:
     """Print one line on stderr; on a terminal it is wrapped between words."""
-    if sys.stderr is None:
-        return
+    if sys.stderr is not None:
+        with suppress(OSError):  # a full disk behind it: the exit code reports the failure
+            sys.stderr.write(wrapped(text, sys.stderr) + "\n")
+            sys.stderr.flush()
+
+
+def wrapped(text: str, file: TextIO) -> str:
+    """Return printable text, wrapped between words where the file is a terminal."""
     text = printable(text.rstrip())
-    if sys.stderr.isatty():
-        lines = text.splitlines()
-        columns = max(shutil.get_terminal_size().columns, 40)
-        text = "\n".join(textwrap.fill(line, columns, **_HANGING) for line in lines)
-    with suppress(OSError):  # a full disk behind it: the exit code reports the failure
-        sys.stderr.write(text + "\n")
-        sys.stderr.flush()
+    if not file.isatty():
+        return text
+    columns = max(shutil.get_terminal_size().columns, 40)
+    return "\n".join(textwrap.fill(line, columns, **_HANGING) for line in text.splitlines())
 
 
 _HANGING: Final[dict[str, Any]] = {
@@ -122,21 +125,14 @@ def _plain(value: Any) -> Any:
 
 
 def text_table(title: str, head: Sequence[str], rows: Sequence[Sequence[str]]) -> Table:
-    """Return a table of plain text; its first column is left-aligned.
-
-    Parameters
-    ----------
-    title : str
-    head : sequence of str
-        Headings; a leading "<" (not shown) left-aligns the column.
-    rows : sequence of sequences of str
-    """
+    """Return a table of plain text; columns of numbers but the first are set flush right."""
     table = Table(
         title=Text(printable(title)), title_justify="left", title_style="bold", box=box.SIMPLE_HEAD
     )
-    for number, heading in enumerate(head):
-        left = number == 0 or heading.startswith("<")
-        table.add_column(Text(heading.removeprefix("<")), justify="left" if left else "right")
+    columns = list(zip(*rows, strict=True)) or [()] * len(head)
+    for number, (heading, column) in enumerate(zip(head, columns, strict=True)):
+        is_right = number > 0 and is_numeric(column)
+        table.add_column(Text(heading), justify="right" if is_right else "left")
     for row in rows:
         # Text: brackets in names are not markup.
         table.add_row(*(Text(printable(cell)) for cell in row))
@@ -146,3 +142,9 @@ def text_table(title: str, head: Sequence[str], rows: Sequence[Sequence[str]]) -
 def print_table(title: str, head: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
     """Print a table of plain text on stdout; arguments as of `text_table`."""
     PlainConsole(highlight=False).print(text_table(title, head, rows))
+
+
+def print_values(title: str, values: Mapping[str, str]) -> None:
+    """Print a table of names and values with their units; what is not known is left out."""
+    rows = [(name, text) for name, text in values.items() if not text.startswith(NONE_KNOWN)]
+    print_table(title, ("", ""), rows)

@@ -11,50 +11,39 @@ import typer
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
 
 from cangauge._text import duration, number
-from cangauge.cli.config_options import (
-    BusDbcOption,
-    BusMapOption,
-    BusOptionOption,
-    BusTemperatureOption,
-    BusVehicleOption,
-    ChannelOption,
-    ClockIdOption,
-    DetailIdOption,
-    EstimateIdOption,
-    InterfaceOption,
-    frame_ids,
-)
+from cangauge.cli.config_options import config_options, config_values
 from cangauge.cli.options import (
     ColumnsOption,
     JsonOption,
     ReadingOptions,
-    SignOption,
     assumed_of,
     note_reading,
+    number_unless,
 )
 from cangauge.cli.output import console, emit_json, note
-from cangauge.errors import InputError
 
 if TYPE_CHECKING:
     from cangauge.bus.connection import BusConnection
     from cangauge.bus.publish import FrameIds
     from cangauge.replay.player import ReplayState
     from cangauge.replay.steps import Source
+    from cangauge.service.config import RunConfig
 
 
-def replay_command(  # noqa: PLR0917 - typer passes options by name
+@config_options("interface", "channel", "bus_options", "vehicle", "dbc", "map", "temperature")
+def replay_command(
     recorded: Annotated[
         Path, typer.Argument(metavar="LOG|CAPTURE", help="Recorded log, or recorded frames.")
     ],
-    interface: InterfaceOption = None,
-    channel: ChannelOption = None,
-    bus_option: BusOptionOption = None,
-    vehicle: BusVehicleOption = None,
-    dbc: BusDbcOption = None,
-    map_file: BusMapOption = None,
-    temperature: BusTemperatureOption = None,
+    *,
+    config: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE.toml",
+            help="Configuration of the `cangauge run` that listens: its bus, vehicle and ids.",
+        ),
+    ] = None,
     columns: ColumnsOption = None,
-    sign: SignOption = None,
     speed: Annotated[
         str,
         typer.Option(
@@ -66,18 +55,8 @@ def replay_command(  # noqa: PLR0917 - typer passes options by name
     loop: Annotated[
         bool, typer.Option("--loop", help="Repeat until Ctrl-C, with increasing log time.")
     ] = False,
-    wait_s: Annotated[
-        float | None,
-        typer.Option(
-            "--wait",
-            metavar="S",
-            help="Longest wait for `cangauge run` before the first frame [s].",
-        ),
-    ] = None,
-    soc_estimate_id: EstimateIdOption = None,
-    soc_detail_id: DetailIdOption = None,
-    replay_clock_id: ClockIdOption = None,
     json_output: JsonOption = False,
+    **options: Any,
 ) -> None:
     """Play a recorded log or capture on a bus.
 
@@ -95,25 +74,24 @@ def replay_command(  # noqa: PLR0917 - typer passes options by name
     `cangauge replay candump.log.gz --speed 10 --interface socketcan --channel vcan0 --loop`
     """
     from cangauge.bus.connection import BusConnection
-    from cangauge.bus.open import bus_address, open_bus, parse_bus_options
+    from cangauge.bus.open import open_bus
     from cangauge.bus.publish import FrameIds, standard_filter
     from cangauge.replay.player import ReplaySettings, play
+    from cangauge.service.config import load_config
     from cangauge.service.lifecycle import stop_on_signals
+    from cangauge.service.setup import address_of
 
-    given = {"soc_estimate": soc_estimate_id, "soc_detail": soc_detail_id}
-    ids = FrameIds(**frame_ids(**given, replay_clock=replay_clock_id))
-    if wait_s is not None and not 0.0 < wait_s <= 1e6:
-        raise InputError("must be more than 0 s", field="--wait", value=wait_s)
-    settings = ReplaySettings(speed=_speed(speed), loop=loop, wait_s=wait_s, ids=ids)
-    reading = ReadingOptions(vehicle, dbc, map_file, columns, sign, temperature)
-    source = _source(recorded, reading, ids)
-    address = bus_address(interface, channel, parse_bus_options(bus_option or []))
+    factor = number_unless("max", speed, 1e-3, 1e6, option="--speed") or math.inf
+    loaded = load_config(config, {"model": "-", **config_values(options)})
+    ids = FrameIds(**loaded.ids.model_dump())
+    source, address = _source(recorded, columns, loaded, ids), address_of(loaded)
     with ExitStack() as stack:
         stop = stack.enter_context(stop_on_signals())
         filters = [standard_filter(ids.soc_estimate), standard_filter(ids.soc_detail)]
         bus = stack.enter_context(BusConnection(open_bus(address, filters), str(address)))
         note(f"playing {recorded} on {address}, speed {speed}")
         bar = stack.enter_context(_Bar(source, loop=loop)) if console.is_terminal else None
+        settings = ReplaySettings(speed=factor, loop=loop, ids=ids)
         state = play(bus, source, settings, stop=stop, show=None if bar is None else bar.show)
         stopped = stop()
     note(_summary_line(state))
@@ -125,30 +103,20 @@ def replay_command(  # noqa: PLR0917 - typer passes options by name
         raise KeyboardInterrupt
 
 
-def _source(recorded: Path, reading: ReadingOptions, ids: FrameIds) -> Source:
-    from cangauge.bus.vehicle import Vehicle
+def _source(recorded: Path, columns: str | None, config: RunConfig, ids: FrameIds) -> Source:
     from cangauge.logs.read import LogFile
     from cangauge.replay.steps import CaptureSource, LogSource
-    from cangauge.service.config import DEFAULT_VEHICLE
+    from cangauge.service.setup import load_vehicle
 
-    car = reading.car() if reading.names_vehicle else None
+    map_file = None if config.map is None else Path(config.map)
+    reading = ReadingOptions(map_file=map_file, columns=columns)
     recording = reading.open(recorded)
     if not isinstance(recording, LogFile):
-        return CaptureSource(recorded, car, ids)
-    log = recording.read(temperature_c=reading.temperature)
+        is_named = (config.vehicle, config.dbc, config.map) != (None, None, None)
+        return CaptureSource(recorded, load_vehicle(config) if is_named else None, ids)
+    log = recording.read(temperature_c=config.temperature)
     note_reading(log)
-    return LogSource(log, car or Vehicle.load(DEFAULT_VEHICLE))
-
-
-def _speed(text: str) -> float:
-    try:
-        speed = math.inf if text == "max" else float(text)
-    except ValueError:
-        speed = math.nan
-    if text != "max" and not 1e-3 <= speed <= 1e6:
-        cure = "give 1 (real time), another factor, or max"
-        raise InputError("not a speed", field="--speed", value=text, cure=cure)
-    return speed
+    return LogSource(log, load_vehicle(config))
 
 
 class _Bar:

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 _LOG = logging.getLogger(__name__)
 
 
-@config_options
+@config_options()
 def run_command(
     config: Annotated[
         Path | None,

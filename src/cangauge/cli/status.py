@@ -84,7 +84,7 @@ def status_command(
     if json_output:
         emit_json(status)
     else:
-        print_table(f"cangauge at {place}", ("", "<"), status_rows(status))
+        print_table(f"cangauge at {place}", ("", ""), status_rows(status))
     if status["status"] not in USABLE:
         raise typer.Exit(1)
 
@@ -110,7 +110,7 @@ def _watch(endpoint: str | None, token_file: Path | None) -> None:
                 place, status = _ask(endpoint, token_file)
                 content = live_text(status)
                 if shown.is_terminal:
-                    content = text_table(f"cangauge at {place}", ("", "<"), status_rows(status))
+                    content = text_table(f"cangauge at {place}", ("", ""), status_rows(status))
             except InputError:
                 raise  # waiting does not mend it
             except CangaugeError as error:

@@ -309,7 +309,7 @@ def candidate_rows(result: Mapping[str, Any], at_most: int | None = None) -> tup
         [answer, number(cause[f"probability_{answer}"], 2), NONE_KNOWN, NONE_KNOWN]
         for answer in (UNKNOWN, NONE)
     ]
-    return ["<cause", "probability", "<size (95 %)", "error left [V]"], rows
+    return ["cause", "probability", "size (95 %)", "error left [V]"], rows
 
 
 def size_cell(candidate: Mapping[str, Any]) -> str:
@@ -338,7 +338,7 @@ def visible_rows(result: Mapping[str, Any]) -> tuple[list[str], Rows]:
         [_words(each["effect"]), significant(each["size"], 2, each["unit"])]
         for each in result["visible_from"]
     ]
-    return ["<cause", "seen from"], rows
+    return ["cause", "seen from"], rows
 
 
 def plan_rows(plan: Plan) -> tuple[list[str], Rows]:
@@ -347,7 +347,7 @@ def plan_rows(plan: Plan) -> tuple[list[str], Rows]:
         [step.name, number(plan.before, 2), number(step.after, 2), f"{step.gain:+.2f}"]
         for step in plan.steps
     ]
-    return ["<step", "P(true cause) now", "after", "gain"], rows
+    return ["step", "P(true cause) now", "after", "gain"], rows
 
 
 def _words(name: str) -> str:
@@ -360,7 +360,7 @@ def diagnosis_html(found: Diagnosis) -> str:
     head, rows = candidate_rows(result, SHOWN)
     lines = [
         "".join(f"<{tag} style='text-align:left'>{escape(cell)}</{tag}>" for cell in cells)
-        for tag, cells in (("th", [x.removeprefix("<") for x in head]), *(("td", r) for r in rows))
+        for tag, cells in (("th", head), *(("td", r) for r in rows))
     ]
     table = "".join(f"<tr>{line}</tr>" for line in lines)
     limits = "".join(f"<li>{escape(text)}</li>" for text in found.caveats)

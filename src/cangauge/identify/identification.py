@@ -345,7 +345,7 @@ def coefficient_rows(coefficients: dict[str, Coefficient]) -> tuple[list[str], R
         [name, *rounded(item.value, item.std_error), item.unit.replace("ohm", "Ω")]
         for name, item in coefficients.items()
     ]
-    return ["", "value", "std. error", "<unit"], rows
+    return ["", "value", "std. error", "unit"], rows
 
 
 def effect_rows(result: Identification) -> tuple[list[str], Rows]:
@@ -360,7 +360,7 @@ def effect_rows(result: Identification) -> tuple[list[str], Rows]:
         for effect, values in result.model.extended_model().effects
         for k, parameter in enumerate(effect.parameters)
     ]
-    return ["<effect", "<parameter", "value", "<unit"], rows
+    return ["effect", "parameter", "value", "unit"], rows
 
 
 def search_rows(found: Selected) -> tuple[list[str], Rows]:
@@ -375,7 +375,7 @@ def search_rows(found: Selected) -> tuple[list[str], Rows]:
         ]
         for step in found.steps
     ]
-    return ["<effect", "<step", "left out without [V]", "with [V]", "t"], rows
+    return ["effect", "step", "left out without [V]", "with [V]", "t"], rows
 
 
 def remarks_on_logs(

@@ -8,7 +8,7 @@ from typing import Any, Final, Literal
 
 import numpy as np
 
-from cangauge._text import counted, duration, rounded
+from cangauge._text import counted, duration, rounded, significant
 from cangauge.errors import InputError
 from cangauge.identify.rows import (
     LEAST_ROWS,
@@ -180,6 +180,27 @@ def inspect_log(log: Log) -> LogInspection:
         log.name, log.source, log.temperature_source, len(log), timing, channels, charge, soc,
         resistance, sign, abilities, log.remarks, warnings,
     )  # fmt: skip
+
+
+def channel_rows(found: LogInspection) -> tuple[list[str], list[list[str]]]:
+    """Return headings and rows of the channels: a constant one has no step."""
+    rows = [
+        [
+            name,
+            *(significant(value, 5) for value in (item.minimum, item.median, item.maximum)),
+            item.unit,
+            "constant" if item.levels == 1 else significant(item.quantum, 3),
+            str(item.missing or ""),
+        ]
+        for name, item in found.channels.items()
+    ]
+    return ["channel", "minimum", "median", "maximum", "unit", "step", "missing rows"], rows
+
+
+def ability_rows(found: LogInspection) -> tuple[list[str], list[list[str]]]:
+    """Return headings and rows of what a log can identify."""
+    rows = [[item.topic, item.verdict, item.text] for item in found.abilities]
+    return ["quantity", "identifiable", "reason"], rows
 
 
 def _timing(log: Log) -> Timing:

@@ -109,12 +109,14 @@ def _finding(evidence: Sequence[SignEvidence]) -> SignFinding:
     return SignFinding(sign, min(float(odds / (1.0 + odds)), 0.9999), tuple(evidence))
 
 
-def require_discharge_positive(log: Log) -> None:
+def require_discharge_positive(log: Log, *, is_capture: bool = False) -> None:
     """Raise InputError if the data show clearly that positive current charges."""
     finding = sign_of_current(log)
     if finding.sign < 0:
         cure = "multiply the column by -1: positive current discharges (or give --sign charge)"
-        if finding.strongest.kind == "soc":
+        if is_capture:  # recorded frames are never changed: the map inverts the sign
+            cure = "use the preset of this car, or set sign = -1 under [current] of the map file"
+        elif finding.strongest.kind == "soc":
             cure += "; or, if the current is right, correct soc_pct or leave it out"
         raise InputError(
             f"the sign of current is inverted: {finding.strongest.text}",

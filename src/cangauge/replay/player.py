@@ -47,8 +47,6 @@ SAMPLES_AT_LEAST: Final = 2 * ACKNOWLEDGE_EVERY
 LOST_AFTER_S: Final = 1.0
 """Time for which the receiver reports the same count in the silence after which the samples in
 flight are lost [s]: a socket buffer has dropped their frames."""
-SLOW_S: Final = 0.5
-"""Wait for an acknowledgement above which to warn [s]."""
 POLL_S: Final = 0.05
 SHOW_EVERY_S: Final = 0.2
 LISTEN_S: Final = 0.001
@@ -70,17 +68,13 @@ class ReplaySettings:
         Log seconds per second; infinite: as fast as the receiver acknowledges.
     loop : bool
         Repeat until stopped.
-    wait_s : float, optional
-        Longest wait for a receiver before the first frame [s]; default: `acknowledge_s` at full
-        speed, else no wait.
     acknowledge_s : float
-        Longest wait for an acknowledgement at full speed [s].
+        Longest wait for a receiver, and for its acknowledgement, at full speed [s].
     ids : FrameIds
     """
 
     speed: float = 1.0
     loop: bool = False
-    wait_s: float | None = None
     acknowledge_s: float = 10.0
     ids: FrameIds = field(default_factory=FrameIds)
 
@@ -174,10 +168,8 @@ class _Player:
         self._clock_us: int | None = None
         self._began_s = self._show_s = 0.0
         self.state = ReplayState(acknowledged=0 if is_max else None)
-        wait_s = settings.acknowledge_s if is_max else None
-        wait_s = wait_s if settings.wait_s is None else settings.wait_s
-        if wait_s is not None:
-            receiver.wait_until_ready(wait_s)
+        if is_max:
+            receiver.wait_until_ready()
 
     def send(self, step: Step) -> None:
         """Send a step when it is due, or when the receiver has room."""
@@ -285,7 +277,6 @@ class _Receiver:
         self._samples = self._frames = self._frames_acknowledged = 0
         # Frames sent when a sample was complete: (sample, frames).
         self._marks: deque[tuple[int, int]] = deque()
-        self._has_warned = False
 
     def listen(self, within_s: float) -> None:
         """Receive for at most `within_s` [s]; return when the bus is quiet.
@@ -308,12 +299,12 @@ class _Receiver:
             self._acknowledge(content.samples)
         return True
 
-    def wait_until_ready(self, within_s: float) -> None:
+    def wait_until_ready(self) -> None:
         """Wait for the first SOC_DETAIL, from which samples are counted; raise CangaugeError."""
-        give_up_s = time.monotonic() + within_s
+        give_up_s = time.monotonic() + self._within_s
         while self._count is None and not self._stop():
             if time.monotonic() > give_up_s:
-                text = f"no receiver: no SOC_DETAIL in {within_s:g} s; {_HINT}"
+                text = f"no receiver: no SOC_DETAIL in {self._within_s:g} s; {_HINT}"
                 raise CangaugeError(f"{self._bus.name}: {text}")
             self.listen_once(POLL_S)
 
@@ -342,7 +333,7 @@ class _Receiver:
         return is_large and self._in_flight >= SAMPLES_AT_LEAST
 
     def _wait(self, is_enough: Callable[[], bool]) -> None:
-        began_s = last_s = time.monotonic()
+        last_s = time.monotonic()
         before = self.acknowledged
         while not is_enough() and not self._stop():
             self.listen_once(POLL_S)
@@ -361,10 +352,6 @@ class _Receiver:
                     f" {self.acknowledged} of {self._samples} samples sent have been processed;"
                     f" {_HINT}"
                 )
-            if now_s - began_s > SLOW_S and not self._has_warned:
-                self._has_warned = True
-                text = f"the receiver acknowledges slowly; {_HINT}"
-                emit(_LOG, logging.WARNING, "replay.slow", text)
 
     def _acknowledge(self, count: int) -> None:
         self._heard_s = time.monotonic()

@@ -8,7 +8,7 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from itertools import count
 from pathlib import Path
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import can
 import numpy as np
@@ -42,23 +42,6 @@ class Step(NamedTuple):
     frames: list[can.Message]
     samples: int
     is_wanted: bool
-
-
-class Source(Protocol):
-    """A recording to replay."""
-
-    name: str
-
-    @property
-    def duration_s(self) -> float | None:
-        """Length [s]; None if known only at the end."""
-
-    @property
-    def counts_samples(self) -> bool:
-        """Whether `Step.samples` is known."""
-
-    def steps(self, *, loop: bool) -> Iterator[Step]:
-        """Yield the steps, repeatedly if `loop`."""
 
 
 class LogSource:
@@ -170,6 +153,10 @@ class CaptureSource:
         if self._vehicle is None:
             return open_capture(self._path)
         return open_vehicle_capture(self._path, self._vehicle)
+
+
+Source = LogSource | CaptureSource
+"""A recording to replay."""
 
 
 @dataclass(frozen=True)

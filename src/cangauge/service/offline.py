@@ -278,7 +278,6 @@ def estimate_recorded_log(
     settings: EstimatorSettings,
     *,
     soc_from_log: bool = True,
-    gap_from_log: bool = True,
     pack: PackHistory | None = None,
     progress: Callable[[int], None] | None = None,
 ) -> RecordedEstimate:
@@ -289,11 +288,10 @@ def estimate_recorded_log(
     log : Log
     model : Model
     settings : EstimatorSettings
-        The log's temperature source replaces its own.
+        The log's temperature source replaces its own, and so does the gap of a slow log: three of
+        its usual steps.
     soc_from_log : bool
         Begin from the log's first reference SoC, counted back to its first row, if it has one.
-    gap_from_log : bool
-        Lengthen the gap for a slow log, to three of its usual steps.
     pack : PackHistory, optional
         Collects health, power and cells.
     progress : callable, optional
@@ -306,13 +304,11 @@ def estimate_recorded_log(
     """
     require_same_pack(log, model)
     origin: Origin = "voltage" if settings.initial_soc_pct is None else "given"
-    settings = replace(settings, temperature_source=log.temperature_source)
+    settings = replace(settings, temperature_source=log.temperature_source, gap_s=gap_of(log))
     if soc_from_log and log.first_soc() is not None:
         origin = "log"
         start_pct = initial_soc_of(log, settings.capacity_ah or model.capacity_ah)
         settings = replace(settings, initial_soc_pct=start_pct)
-    if gap_from_log:
-        settings = replace(settings, gap_s=gap_of(log))
     history = PackHistory() if pack is None else pack
     observe = history.observe if history.takes_samples else None
     table, scores = estimate_log(

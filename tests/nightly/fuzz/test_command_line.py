@@ -172,7 +172,7 @@ NUMBERS = {
     "gap": ("--initial-soc", "--capacity-ah", "--temperature"),
     "run": ("--temperature", "--initial-soc", "--initial-soc-std", "--capacity-ah", "--max-gap-s",
             "--pair-within-s", "--timeout-s", "--duration", "--until-idle"),
-    "replay": ("--speed", "--wait", "--temperature"),
+    "replay": ("--speed", "--temperature"),
     "inspect": ("--temperature",),
     "twin": ("--hours", "--ambient-c", "--start-soc", "--end-soc"),
 }  # fmt: skip

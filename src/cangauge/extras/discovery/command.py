@@ -17,7 +17,7 @@ import typer
 
 from cangauge._files import check_writable, write_texts_atomic
 from cangauge._resources import shared_file
-from cangauge.cli.config_options import BusOptionOption, ChannelOption, InterfaceOption
+from cangauge.cli.config_options import config_options, config_values
 from cangauge.cli.options import JsonOption, within
 from cangauge.cli.output import console, emit_json, note, print_table, progress_shown
 from cangauge.errors import CangaugeError, InputError
@@ -42,22 +42,18 @@ _CLEARLY_NAMED: Final = 1.0
 """Distance in score of the first signal of a DBC that makes it clear: one matching word."""
 
 
-def init_command(  # noqa: PLR0917 - typer fills the arguments by name
+@config_options("interface", "channel", "bus_options")
+def init_command(
+    output: Annotated[
+        Path,
+        typer.Option("-o", "--output", metavar="DIR", help="Folder for car.toml and the others."),
+    ],
+    *,
     captures: Annotated[
         list[Path] | None,
         typer.Argument(
             metavar="[CAPTURE]…", help="Captures of one car, of a drive.", show_default=False
         ),
-    ] = None,
-    output: Annotated[
-        Path | None,
-        typer.Option("-o", "--output", metavar="DIR", help="Folder for car.toml and the others."),
-    ] = None,
-    map_file: Annotated[
-        Path | None, typer.Option("--map", metavar="FILE", help="Map file to write.")
-    ] = None,
-    config: Annotated[
-        Path | None, typer.Option("--config", metavar="FILE", help="Configuration to write.")
     ] = None,
     dbc: Annotated[
         Path | None,
@@ -80,14 +76,12 @@ def init_command(  # noqa: PLR0917 - typer fills the arguments by name
     presets: Annotated[
         bool, typer.Option("--presets/--no-presets", help="Look for known vehicles.")
     ] = True,
-    interface: InterfaceOption = None,
-    channel: ChannelOption = None,
-    bus_option: BusOptionOption = None,
     seconds: Annotated[
         float, typer.Option(metavar="S", help="Time to listen to a live bus [s].")
     ] = 60.0,
     force: Annotated[bool, typer.Option("--force", help="Overwrite existing files.")] = False,
     json_output: JsonOption = False,
+    **options: Any,
 ) -> None:
     """Find the car's signals, check them against each other, and write a map and a configuration.
 
@@ -103,26 +97,29 @@ def init_command(  # noqa: PLR0917 - typer fills the arguments by name
 
     `cangauge init --interface socketcan --channel can0 --seconds 120 -o mycar`
 
-    `cangauge init drive.log --dbc car.dbc --map car.toml --config run.toml`
+    `cangauge init drive.log --dbc car.dbc -o mycar`
 
     `cangauge init drive.log --choose current=2 -o mycar`
     """
-    from cangauge.bus.open import bus_address, parse_bus_options
+    from cangauge.bus.open import bus_address
 
     picks = _picks(choose or [])
     within(seconds, 1.0, 86400.0, option="--seconds", unit="s")
     if nominal_voltage is not None:
         within(nominal_voltage, 10.0, 1500.0, option="--nominal-voltage", unit="V")
-    targets = _Targets.of(output, map_file, config)
+    targets = _Targets(output / "car.toml", output / "run.toml", output / "car.dbc")
     targets.check(force=force)
-    options = parse_bus_options(bus_option or [])
+    values = config_values(options)
+    interface, channel, bus_options = (
+        values[name] for name in ("interface", "channel", "bus_options")
+    )
     with tempfile.TemporaryDirectory(prefix="cangauge-init-") as folder:
         paths = list(captures or [])
         is_live = interface is not None or channel is not None
         if is_live and paths:
             raise InputError("given together with a capture", field="--interface", cure="omit one")
         if is_live:
-            address = bus_address(interface, channel, options)
+            address = bus_address(interface, channel, bus_options)
             paths = [_listen(address, seconds, Path(folder) / "live.log")]
         if not paths and dbc is None:
             cure = "give a capture, --interface and --channel, or --dbc FILE"
@@ -132,11 +129,11 @@ def init_command(  # noqa: PLR0917 - typer fills the arguments by name
         _choose(found, picks, targets, asks=asks, quiet=json_output)
         if asks:
             found = _ask_scales(found, paths)
-        files = found.files(targets, interface, channel, options)
+        files = found.files(targets, interface, channel, bus_options)
         found.proof = _prove(files, targets, paths, Path(folder), found)
         if found.method == "dbc":  # the map says how its sign was found
             found.sign = -1 if found.proven_sign == -1 else 1
-            files = found.files(targets, interface, channel, options)
+            files = found.files(targets, interface, channel, bus_options)
             found.proof |= {"sign": found.proof.get("sign", {}) | {"in_map": found.sign}}
             if paths:
                 found.proof["current_a"] = sorted(found.sign * a for a in found.proof["current_a"])
@@ -174,17 +171,6 @@ class _Targets:
     map: Path
     config: Path
     dbc: Path
-
-    @classmethod
-    def of(cls, folder: Path | None, map_file: Path | None, config: Path | None) -> _Targets:
-        if folder is not None:
-            if map_file is not None or config is not None:
-                raise InputError("given together with -o", field="--map/--config", cure="omit one")
-            return cls(folder / "car.toml", folder / "run.toml", folder / "car.dbc")
-        if map_file is None or config is None:
-            cure = "give -o DIR, or --map FILE --config FILE"
-            raise InputError("no place for the files", field="-o", cure=cure)
-        return cls(map_file, config, map_file.parent / f"{map_file.stem or 'car'}.dbc")
 
     def check(self, *, force: bool) -> None:
         """Raise InputError if a file exists, or cannot be written."""
@@ -544,7 +530,7 @@ def _show(found: _Found) -> None:
 
     if found.vehicle is not None:
         about = PRESETS[found.vehicle].about
-        print_table("Known vehicle", ["preset", "<about"], [[found.vehicle, about]])
+        print_table("Known vehicle", ["preset", "about"], [[found.vehicle, about]])
     for role in _ROLES.values():
         if found.candidates.get(role):
             _show_role(found, role)
@@ -601,10 +587,10 @@ def _show_role(found: _Found, role: str) -> None:
     rows = []
     title, head = (
         role.replace("_reference", ""),
-        ["", "<field", "scale", "range", "score", "<evidence"],
+        ["", "field", "scale", "range", "score", "evidence"],
     )
     if found.findings is None:
-        title, head = f"{title}, by name and unit", ["", "<signal", "range"]
+        title, head = f"{title}, by name and unit", ["", "signal", "range"]
     for number, candidate in enumerate(found.candidates[role], 1):
         taken = "✓" if found.is_proven(role) else "?"
         mark = f"{number} {taken}" if found.chosen.get(role) == number - 1 else str(number)

@@ -65,5 +65,5 @@ def export_ecm_command(
         for k, tau_s in enumerate(circuit.pair_tau_s, start=1)
     ]
     rows.append(["step response, RMS error", number(circuit.step_error_pct, 2), "%"])
-    print_table(f"Equivalent circuit of {circuit.name}", ["", "value", "<unit"], rows)
+    print_table(f"Equivalent circuit of {circuit.name}", ["", "value", "unit"], rows)
     note(f"equivalent circuit: {output}")

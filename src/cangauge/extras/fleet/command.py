@@ -7,25 +7,28 @@ from collections.abc import Callable, Iterable, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, cast
+from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
 
 import typer
 
 from cangauge._files import file_sha256, write_texts_atomic
 from cangauge._text import counted, number, significant
 from cangauge.cli.options import (
+    ALARM,
+    AlarmOption,
+    CapacityOption,
     JsonOption,
+    ModelOption,
     ReadingOptions,
     ReportOption,
     check_outputs,
-    known_temperature_source,
     option_groups,
     suffixed,
     within,
 )
 from cangauge.cli.output import console, emit_json, note, print_table, progress_shown
-from cangauge.cli.shown import ALARM, FLEET_LOGS, FLEET_REFERENCES, LOCAL, VEHICLE_PATTERN
 from cangauge.errors import InputError
+from cangauge.extras.fleet import LOCAL, LOGS, REFERENCES, VEHICLE_PATTERN
 
 if TYPE_CHECKING:
     from cangauge.extras.fleet.fit import FleetFit
@@ -33,7 +36,6 @@ if TYPE_CHECKING:
     from cangauge.extras.fleet.overview import FleetOverview
     from cangauge.extras.fleet.run import Summary
     from cangauge.extras.fleet.sources import FleetLog, ReadOptions
-    from cangauge.logs.draft import Sign
 
 _SHOWN_REASONS: Final = 10
 """Reasons that are printed, the most frequent first; a page has all."""
@@ -53,9 +55,6 @@ LogsArgument = Annotated[
         " log, vehicle, start, initial_soc_pct, healthy).",
     ),
 ]
-ModelOption = Annotated[
-    Path, typer.Option("-m", "--model", metavar="MODEL", help="Model file of the vehicles' type.")
-]
 OutOption = Annotated[
     str,
     typer.Option(
@@ -64,10 +63,6 @@ OutOption = Annotated[
         " with the same model and options are skipped.",
     ),
 ]  # fmt: skip
-CapacityOption = Annotated[
-    float | None,
-    typer.Option("--capacity-ah", metavar="A", help="Charge from 100 to 0 % [Ah]."),
-]
 
 
 @dataclass(frozen=True, slots=True)
@@ -129,7 +124,7 @@ fleet_command.group = fleet_app  # type: ignore[attr-defined] # read by the app
 
 
 @fleet_app.command("fit")
-@option_groups()
+@option_groups("sign", "temperature")
 def fit_fleet_command(
     logs: LogsArgument,
     output: Annotated[
@@ -209,7 +204,7 @@ def _show_fit(result: FleetFit) -> None:
     figures, by_log = result.to_dict(), result.by_log
     print_table(
         f"Model {result.model.name}",
-        ["", "value", "<unit"],
+        ["", "value", "unit"],
         [
             ["voltage error, RMSE", significant(figures["voltage_rmse_v"], 3), "V"],
             [
@@ -245,7 +240,7 @@ def _show_fit(result: FleetFit) -> None:
 
 
 @fleet_app.command("estimate")
-@option_groups()
+@option_groups("sign", "temperature")
 def estimate_fleet_command(
     logs: LogsArgument,
     model: ModelOption,
@@ -271,7 +266,7 @@ def estimate_fleet_command(
 
 
 @fleet_app.command("health")
-@option_groups()
+@option_groups("sign", "temperature")
 def health_fleet_command(
     logs: LogsArgument,
     model: ModelOption,
@@ -316,7 +311,7 @@ def _job(  # noqa: PLR0917 - as the two commands have them
 
 
 @fleet_app.command("gap")
-@option_groups()
+@option_groups("sign", "temperature")
 def gap_fleet_command(  # noqa: PLR0917 - typer passes options by name
     logs: LogsArgument,
     model: ModelOption,
@@ -331,16 +326,11 @@ def gap_fleet_command(  # noqa: PLR0917 - typer passes options by name
     ] = None,
     references: Annotated[
         int, typer.Option(metavar="N", help="References at most of vehicles without own ones.")
-    ] = FLEET_REFERENCES,
+    ] = REFERENCES,
     latest: Annotated[
         int, typer.Option(metavar="N", help="Latest logs of a vehicle, diagnosed together.")
-    ] = FLEET_LOGS,
-    alarm: Annotated[
-        float,
-        typer.Option(
-            metavar="P", help="Report a fault where the probability of none is at most this."
-        ),
-    ] = ALARM,
+    ] = LOGS,
+    alarm: AlarmOption = ALARM,
     *,
     cluster: Cluster,
     reading: ReadingOptions,
@@ -376,25 +366,16 @@ def _read_options(reading: ReadingOptions) -> ReadOptions:
     """Return how logs are read; files of the vehicle are read here, not by the workers."""
     from cangauge.extras.fleet.sources import ReadOptions
 
-    if reading.sign not in {None, "charge", "discharge"}:
-        raise InputError("neither charge nor discharge", field="--sign", value=reading.sign)
     mapped = reading.mapped_columns()
     is_map_of_columns = mapped is not None and reading.vehicle is None and reading.dbc is None
     car = reading.car() if reading.names_vehicle and not is_map_of_columns else None
     paths = (reading.dbc, reading.map_file)
     files = {str(path): file_sha256(path) for path in paths if path is not None}
-    given = [
-        reading.vehicle, files, reading.columns, reading.sign, reading.temperature,
-        reading.temperature_source,
-    ]  # fmt: skip
     return ReadOptions(
         vehicle=car,
         columns=reading.given_columns(),
         mapped=mapped,
-        sign=cast("Sign | None", reading.sign),
-        temperature_c=reading.temperature,
-        temperature_source=known_temperature_source(reading.temperature_source),
-        described=json.dumps(given),
+        described=json.dumps([reading.vehicle, files, reading.columns]),
     )
 
 
@@ -455,11 +436,11 @@ def _show(summary: Summary, found: FleetOverview) -> None:
             [name, row["verdict"], number(row["probability"], 2), number(row["probability_none"])]
             for name, row in ((name, found.gaps[name]) for name in found.alarms)
         ]
-        print_table("Vehicles with a gap", ["vehicle", "<cause", "probability", "P(none)"], rows)
+        print_table("Vehicles with a gap", ["vehicle", "cause", "probability", "P(none)"], rows)
     elif found.gaps:
         typer.echo(f"No alarm in {counted(len(found.gaps), 'vehicle')}; {found.nearest_text}")
     if found.outlying:
         rows = [[vehicle, quantity, number(z, 1)] for vehicle, quantity, z in found.outlying]
-        print_table("Outliers in health", ["vehicle", "<quantity", "robust z"], rows)
+        print_table("Outliers in health", ["vehicle", "quantity", "robust z"], rows)
     elif found.health:
         typer.echo(found.no_outlier_text)

@@ -27,16 +27,12 @@ from cangauge.diagnosis import (
     learn_references,
 )
 from cangauge.errors import InputError
+from cangauge.extras.fleet import REFERENCES
 from cangauge.extras.fleet.jobs import COUNT, REAL, TEXT, Job, Task, by_vehicle
 from cangauge.extras.fleet.sources import FleetLog
 from cangauge.logs.log import Log
 from cangauge.model.model_file import Model
 
-REFERENCES: Final = 30
-"""References of a diagnosis by default; more gain little, and learning from a thousand takes 1.9 GB
-(see docs/fleet.md)."""
-LOGS: Final = 3
-"""Latest logs of a vehicle that are diagnosed together by default."""
 _WITH_OWN: Final = 30
 """References at most of a vehicle that has healthy logs of its own, or whose logs lie beyond the
 common references: they are learned from for this vehicle alone, in half a second each."""

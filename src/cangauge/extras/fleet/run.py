@@ -20,14 +20,13 @@ from typing import Any, Final
 from cangauge._files import text_sha256
 from cangauge._version import __version__
 from cangauge.errors import CangaugeError, InputError
+from cangauge.extras.fleet import LOCAL
 from cangauge.extras.fleet.jobs import Job, Task
 from cangauge.extras.fleet.results import Finished, Results, by_kind, reason_of
 from cangauge.extras.fleet.sources import ABSENT
 
 _LOG = logging.getLogger(__name__)
 
-LOCAL: Final = "local"
-"""Scheduler and workers on this machine."""
 CONNECT_S: Final = 10.0
 """Time for the scheduler to answer [s]."""
 FLUSH_S: Final = 10.0

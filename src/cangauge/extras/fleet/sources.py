@@ -26,21 +26,17 @@ from cangauge.bus.captures import Capture
 from cangauge.bus.recording import (
     log_of,
     open_recording,
-    refuse_sign_of_capture,
     refuse_single_row,
 )
 from cangauge.bus.vehicle import Vehicle
 from cangauge.errors import InputError
+from cangauge.extras.fleet import VEHICLE_PATTERN
 from cangauge.identify.starts import with_start
 from cangauge.logs.column_map import ColumnMap
-from cangauge.logs.draft import Sign
 from cangauge.logs.log import Log
 from cangauge.logs.read import LogFile
 from cangauge.logs.sign import require_discharge_positive
-from cangauge.logs.units import TemperatureSource
 
-VEHICLE_PATTERN: Final = r"(?:vehicle=)?([^/]+)/[^/]+$"
-"""By default a vehicle is the folder that its logs lie in; also the hive layout."""
 _COLUMNS: Final = ("log", "vehicle", "start", "initial_soc_pct", "healthy")
 _HEALTHY: Final = {"1": True, "true": True, "yes": True, "": False, "0": False, "false": False,
                    "no": False}  # fmt: skip
@@ -290,10 +286,6 @@ class ReadOptions:
         Decodes captures.
     columns, mapped : ColumnMap, optional
         Columns of a table: the user's, and those of a map file.
-    sign : {"charge", "discharge"}, optional
-    temperature_c : float, optional
-        Constant temperature [°C].
-    temperature_source : str, optional
     described : str
         What identifies these options: the same text, the same rows.
     """
@@ -301,22 +293,11 @@ class ReadOptions:
     vehicle: Vehicle | None = None
     columns: ColumnMap | None = None
     mapped: ColumnMap | None = None
-    sign: Sign | None = None
-    temperature_c: float | None = None
-    temperature_source: TemperatureSource | None = None
     described: str = ""
 
     def open(self, path: Path) -> LogFile | Capture:
-        """Open a recording (`open_recording`).
-
-        Raises
-        ------
-        InputError
-            If the file cannot be read, or the sign is stated for a capture.
-        """
-        found = open_recording(path, columns=self.columns, mapped=self.mapped, sign=self.sign)
-        refuse_sign_of_capture(found, self.sign)
-        return found
+        """Open a recording (`open_recording`)."""
+        return open_recording(path, columns=self.columns, mapped=self.mapped)
 
     def read(self, log: FleetLog, path: Path) -> Log:
         """Read a log, or decode a capture, from its local copy; its start as the manifest states.
@@ -326,15 +307,9 @@ class ReadOptions:
         InputError
             As `cangauge.read_log`; if it has a single row, or its current is clearly inverted.
         """
-        found = log_of(
-            self.open(path),
-            self.vehicle,
-            temperature_c=self.temperature_c,
-            temperature_source=self.temperature_source,
-        )
+        found = log_of(self.open(path), self.vehicle)
         refuse_single_row(found)
-        if self.sign is None:
-            require_discharge_positive(found)
+        require_discharge_positive(found)
         found = replace(found, source=log.url)
         return found if log.initial_soc_pct is None else with_start(found, log.initial_soc_pct)
 

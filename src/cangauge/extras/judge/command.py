@@ -230,7 +230,7 @@ def _show(judgement: Judgement) -> None:
 
     typer.echo(printable(judgement.headline))
     typer.echo(printable(f"Next step: {judgement.next_step}"))
-    print_table("Answers", ["answer", "probability", "<size"], rows_of(judgement))
+    print_table("Answers", ["answer", "probability", "size"], rows_of(judgement))
     if judgement.jumps:
         rows = [
             [judgement.logs[jump.log].name, number(jump.since_start_s, 0), number(jump.size_pct, 1)]

@@ -186,7 +186,7 @@ def _interval(place: Mapping[str, Any]) -> str:
 def _causes(result: Mapping[str, Any]) -> Table:
     headings, rows = candidate_rows(result)
     return Table(
-        [heading.removeprefix("<") for heading in [*headings, "what it means"]],
+        [*headings, "what it means"],
         [[*row, EXPLAINED.get(row[0].replace(" ", "_"), "")] for row in rows],
         note="A cause is a signature at the terminals, not proof of a mechanism.",
     )
@@ -195,7 +195,7 @@ def _causes(result: Mapping[str, Any]) -> Table:
 def _visible(result: Mapping[str, Any]) -> Table:
     headings, rows = visible_rows(result)
     return Table(
-        [heading.removeprefix("<") for heading in headings],
+        headings,
         rows,
         note=f"{NONE_KNOWN}: no physical size would have been seen in these logs.",
     )
@@ -206,7 +206,7 @@ def _next_step(plan: Plan) -> list[Block]:
     return [
         Paragraph(plan.sentence),
         Table(
-            [heading.removeprefix("<") for heading in headings],
+            headings,
             rows,
             note="Optimistic: it assumes that the pack behaves as the references' model.",
         ),

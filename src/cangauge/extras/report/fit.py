@@ -424,7 +424,7 @@ def _effects(result: Identification) -> list[Block]:
             " same data selected the effects, so the last figure is slightly optimistic.",
         ),
     ):
-        blocks.append(Table([heading.removeprefix("<") for heading in head], rows, note))
+        blocks.append(Table(head, rows, note))
     return blocks
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from cangauge._text import NONE_KNOWN, duration, significant
+from cangauge._text import duration, significant
 from cangauge.extras.report.charts import BLUE, GREEN, ORANGE, PURPLE, Pen, TimeFigures
 from cangauge.extras.report.page import (
     Block,
@@ -16,7 +16,7 @@ from cangauge.extras.report.page import (
     reconstruction_banners,
     render,
 )
-from cangauge.inspect.log import LogInspection
+from cangauge.inspect.log import LogInspection, ability_rows, channel_rows
 from cangauge.logs.log import Log
 
 
@@ -38,14 +38,10 @@ def inspect_report(found: LogInspection, log: Log) -> str:
     if soc is not None:
         ends = f"{soc.first_pct:.1f} → {soc.last_pct:.1f} %"
         tiles.append(Tile("The log's own SoC", ends, f"in {100.0 * soc.coverage:.1f} % of rows"))
-    abilities = [[item.topic, item.verdict, item.text] for item in found.abilities]
     parts: tuple[tuple[str, list[Block]], ...] = (
         ("Recorded data", [*channel_figures(log)]),
-        (
-            "What this log can identify",
-            [Table(["quantity", "identifiable", "reason"], abilities)],
-        ),
-        ("Channels", [_channels(found)]),
+        ("What this log can identify", [Table(*ability_rows(found))]),
+        ("Channels", [Table(*channel_rows(found), "Step: the quantization.")]),
         ("Warnings", [Bullets(found.warnings)] if found.warnings else []),
         ("Remarks", [Bullets(found.remarks)] if found.remarks else []),
     )
@@ -79,21 +75,6 @@ def channel_figures(log: Log) -> list[Figure]:
         time.line(plot, name.lower(), [(log.time_s, values)], Pen(color, 1.0, in_legend=False))
         figures.append(Figure(name, plot, caption))
     return figures
-
-
-def _channels(found: LogInspection) -> Table:
-    rows = [
-        [
-            name.rsplit("_", 1)[0],
-            *(significant(value, 5) for value in (item.minimum, item.median, item.maximum)),
-            item.unit,
-            NONE_KNOWN if item.levels == 1 else significant(item.quantum, 3),
-            str(item.missing),
-        ]
-        for name, item in found.channels.items()
-    ]
-    head = ["channel", "minimum", "median", "maximum", "unit", "step", "missing rows"]
-    return Table(head, rows, "Step: the quantization; – for a constant channel.")
 
 
 def inspect_verdict(found: LogInspection) -> str:

@@ -6,7 +6,6 @@ no network and stays readable.
 
 from __future__ import annotations
 
-import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
@@ -20,6 +19,7 @@ from bokeh.themes import Theme
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from cangauge._files import file_sha256, text_sha256
+from cangauge._text import is_numeric
 from cangauge._version import __version__
 from cangauge.extras.report.charts import MAX_POINTS
 from cangauge.model.model_file import Model
@@ -62,9 +62,6 @@ _THEME: Final = Theme(
         }
     }
 )
-
-_NUMBER: Final = re.compile(r"[−+-]?[\d.,]+([eE][+−-]?\d+)?( ?[%Ω])?|–|")
-"""A table cell that counts as a number: a column of these is set flush right."""
 
 
 @dataclass(frozen=True)
@@ -119,9 +116,7 @@ class Table:
     def is_numeric(self) -> list[bool]:
         """Whether each column holds nothing but numbers."""
         columns = list(zip(*self.rows, strict=True)) or [()] * len(self.head)
-        return [
-            bool(column) and all(_NUMBER.fullmatch(cell) for cell in column) for column in columns
-        ]
+        return [is_numeric(column) for column in columns]
 
 
 @dataclass(frozen=True, eq=False)

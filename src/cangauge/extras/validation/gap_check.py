@@ -220,7 +220,7 @@ def table(result: dict[str, Any]) -> tuple[list[str], list[list[str]]]:
                 f" {of['named']}/{of['of']}"
             )
         rows.append([item["effect"], *cells])
-    return ["<effect", *(f"{floors:g} floor{'s' * (floors > 1)}" for floors in FLOORS)], rows
+    return ["effect", *(f"{floors:g} floor{'s' * (floors > 1)}" for floors in FLOORS)], rows
 
 
 def summary(result: dict[str, Any]) -> str:

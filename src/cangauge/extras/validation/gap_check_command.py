@@ -12,7 +12,7 @@ from cangauge.cli.output import emit_json, note, print_table, progress_shown
 from cangauge.errors import InputError
 
 
-@option_groups("temperature_source")
+@option_groups("sign")
 def gap_check_command(
     logs: Annotated[
         list[Path] | None,

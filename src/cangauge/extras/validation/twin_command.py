@@ -187,7 +187,7 @@ def _show(result: dict[str, Any]) -> None:
         [item["effect"], f"{item['parameter']} = {item['value']:.4g}", item["unit"]]
         for item in result["effects"]
     ]
-    print_table("Simulated truth", ["", "value", "<unit"], rows)
+    print_table("Simulated truth", ["", "value", "unit"], rows)
 
 
 def _list(json_output: bool) -> None:
@@ -214,7 +214,7 @@ def _list(json_output: bool) -> None:
         return
     print_table(
         "Effects",
-        ["id", "<parameters", "<effect on the log"],
+        ["id", "parameters", "effect on the log"],
         [
             [
                 kind.id,
