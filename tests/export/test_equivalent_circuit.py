@@ -146,17 +146,19 @@ def test_an_initial_soc_beyond_the_pack_is_refused(
 def test_the_command_writes_tables_or_a_module(tmp_path: Path) -> None:
     model, tables = tmp_path / "model.json", tmp_path / "tables.json"
     leaf_2012_model_file().save(model)
-    run = CliRunner().invoke(app, ["export-ecm", str(model), "-o", str(tables), "--json"])
+    run = CliRunner().invoke(app, ["export-ecm", "-m", str(model), "-o", str(tables), "--json"])
     assert run.exit_code == 0
     assert json.loads(run.stdout)["pairs"] == len(json.loads(tables.read_text())["pair_tau_s"])
     module = tmp_path / "pack.py"
-    assert CliRunner().invoke(app, ["export-ecm", str(model), "-o", str(module)]).exit_code == 0
+    assert (
+        CliRunner().invoke(app, ["export-ecm", "-m", str(model), "-o", str(module)]).exit_code == 0
+    )
     assert callable(runpy.run_path(str(module))["pybamm_parameters"])
 
 
 @pytest.mark.parametrize("name", ["my-pack.py", "class.py", "pack.txt"])
 def test_a_module_that_cannot_be_imported_is_refused(tmp_path: Path, name: str) -> None:
     leaf_2012_model_file().save(tmp_path / "model.json")
-    arguments = ["export-ecm", str(tmp_path / "model.json"), "-o", str(tmp_path / name)]
+    arguments = ["export-ecm", "-m", str(tmp_path / "model.json"), "-o", str(tmp_path / name)]
     assert isinstance(CliRunner().invoke(app, arguments).exception, InputError)
     assert not (tmp_path / name).exists()

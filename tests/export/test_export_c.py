@@ -200,7 +200,7 @@ def test_drive_of_the_tests_has_its_events() -> None:
 def test_command_names_what_it_wrote(tmp_path: Path) -> None:
     PLAIN.save(tmp_path / "pack.json")
     done = CliRunner().invoke(
-        app, ["export-c", str(tmp_path / "pack.json"), "-o", str(tmp_path / "c"), "--json"]
+        app, ["export-c", "-m", str(tmp_path / "pack.json"), "-o", str(tmp_path / "c"), "--json"]
     )
     assert done.exit_code == 0, done.output
     assert (tmp_path / "c" / "pack_model.c").is_file()
@@ -210,7 +210,7 @@ def test_command_names_what_it_wrote(tmp_path: Path) -> None:
 def test_a_file_in_place_of_the_folder_is_refused(tmp_path: Path) -> None:
     PLAIN.save(tmp_path / "pack.json")
     (tmp_path / "ecm.py").write_text("kept")
-    arguments = ["export-c", str(tmp_path / "pack.json"), "-o", str(tmp_path / "ecm.py")]
+    arguments = ["export-c", "-m", str(tmp_path / "pack.json"), "-o", str(tmp_path / "ecm.py")]
     with pytest.raises(InputError, match="is a file"):
         CliRunner().invoke(app, arguments, catch_exceptions=False)
     assert (tmp_path / "ecm.py").read_text() == "kept"
@@ -219,7 +219,7 @@ def test_a_file_in_place_of_the_folder_is_refused(tmp_path: Path) -> None:
 @pytest.mark.parametrize("name", ["x" * 300, "x" * 300 + "/new"])
 def test_a_folder_that_cannot_be_made_is_refused(tmp_path: Path, name: str) -> None:
     PLAIN.save(tmp_path / "pack.json")
-    arguments = ["export-c", str(tmp_path / "pack.json"), "-o", str(tmp_path / name)]
+    arguments = ["export-c", "-m", str(tmp_path / "pack.json"), "-o", str(tmp_path / name)]
     with pytest.raises(InputError, match="too long"):
         CliRunner().invoke(app, arguments, catch_exceptions=False)
 

@@ -249,7 +249,7 @@ def test_the_command_writes_a_unit(tmp_path: Path) -> None:
     model, unit = tmp_path / "model.json", tmp_path / "estimator.fmu"
     leaf_2012_model_file().save(model)
     done = CliRunner().invoke(
-        app, ["export-fmu", str(model), "-o", str(unit), "--kind", "estimator", "--fmi", "2"]
+        app, ["export-fmu", "-m", str(model), "-o", str(unit), "--kind", "estimator", "--fmi", "2"]
     )
     assert done.exit_code == 0
     description = fmpy.read_model_description(str(unit))

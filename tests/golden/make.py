@@ -353,9 +353,9 @@ def command_records() -> dict[str, Any]:
         keep("inspect", "inspect", drive)
         keep("inspect_capture", "inspect", capture, "--vehicle", "generic")
         keep("init", "init", capture, "-o", folder / "car")
-        keep("export-c", "export-c", model, "-o", folder / "c")
-        keep("export-ecm", "export-ecm", model, "-o", folder / "ecm.py")
-        keep("export-fmu", "export-fmu", model, "-o", folder / "unit.fmu")
+        keep("export-c", "export-c", "-m", model, "-o", folder / "c")
+        keep("export-ecm", "export-ecm", "-m", model, "-o", folder / "ecm.py")
+        keep("export-fmu", "export-fmu", "-m", model, "-o", folder / "unit.fmu")
         keep("error", "estimate", drive, "-m", folder / "none.json", "-o", folder / "out.csv")
         with gzip.open(capture, "rt") as file:
             (folder / "short.log").write_text("".join(file.readlines()[:400]))

@@ -16,7 +16,7 @@ from typing import Any
 import pytest
 from watched import StandInPort, Watched
 
-from cangauge.cli.status import live_text, status_rows
+from cangauge.cli.status import live_text, status_values
 from cangauge.errors import CangaugeError, InputError
 from cangauge.estimation.cells import CellReport
 from cangauge.service.lifecycle import Notifier
@@ -80,10 +80,11 @@ def test_before_the_first_sample_the_soc_is_not_known_yet() -> None:
     watched.pipeline.heartbeat(is_stale=False)
     watched.turn()
     assert "implausible_input" not in watched.status["reasons"]
-    rows = dict(status_rows(watched.status))
+    rows = dict(status_values(watched.status))
     assert rows["SoC"] == "not known yet"
-    assert not [name for name, text in rows.items() if text.startswith("–")]
-    assert not {"current", "latest sample", "latency", "energy left"} & rows.keys()
+    unknown = {name for name, text in rows.items() if text.startswith("–")}
+    assert {"current", "latest sample", "latency", "residual"} <= unknown
+    assert "energy left" not in rows
     assert live_text(watched.status).plain.startswith("SoC not known yet  initialising")
 
 
@@ -97,7 +98,7 @@ def test_a_capped_current_is_a_least_one_and_a_small_energy_in_wh(watched: Watch
         "path": "a.log", "frames": 12, "written_bytes": 9947, "lost_frames": 0, "problem": None,
         "active": True,
     }  # fmt: skip
-    rows = dict(status_rows(status))
+    rows = dict(status_values(status))
     assert rows["possible discharge, 10 s"] == "at least 200 A"
     assert rows["possible charge, 10 s"] == "45.2 ± 3.1 A"
     assert rows["energy left"] == "9.613 ± 0.042 Wh"

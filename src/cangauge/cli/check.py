@@ -3,20 +3,13 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
 
-import typer
-
-from cangauge.cli.options import JsonOption
+from cangauge.cli.declare import command
 from cangauge.cli.output import emit_json, print_table
 
 
-def check_command(
-    config: Annotated[
-        Path, typer.Argument(metavar="FILE.toml", help="Configuration of `cangauge run`.")
-    ],
-    json_output: JsonOption = False,
-) -> None:
+@command()
+def check_command(config: Path, *, json_output: bool = False) -> None:
     """Check a configuration as `cangauge run` would read it, without opening the bus.
 
     Reads model, DBC and map, and checks ids, bus and output files. Exit code 2 and one line
@@ -25,6 +18,11 @@ def check_command(
     Examples
     --------
     `cangauge check car.toml && systemctl reload cangauge@can0`
+
+    Parameters
+    ----------
+    config : FILE.toml
+        Configuration of `cangauge run`.
     """
     from cangauge.service.run import Service
 

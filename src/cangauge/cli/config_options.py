@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from itertools import zip_longest
 from pathlib import Path
 from typing import Annotated, Any, Final
@@ -11,7 +11,6 @@ from typing import Annotated, Any, Final
 import typer
 from typer.core import TyperCommand
 
-from cangauge.cli.options import with_signature
 from cangauge.service.config import ConfigKey, config_keys
 
 _OPTIONS: Final = {key.name: key for key in config_keys() if key.info.option}
@@ -34,9 +33,29 @@ def _with_values(arguments: Sequence[str]) -> Iterator[str]:
             yield _BARE[word]
 
 
-def _option(key: ConfigKey) -> Any:
-    flags = key.info.option.split(", ")
-    return typer.Option(*flags, metavar=key.info.metavar or None, help=key.help)
+def config_parameters(*names: str) -> list[inspect.Parameter]:
+    """Return the options of keys of the configuration, as typer reads them.
+
+    Parameters
+    ----------
+    *names : str
+        Keys, such as "channel". Default: every key that has an option.
+    """
+    return [
+        inspect.Parameter(
+            name,
+            inspect.Parameter.KEYWORD_ONLY,
+            default=None,
+            annotation=Annotated[
+                _type(key) | None,
+                typer.Option(
+                    *key.info.option.split(", "), metavar=key.info.metavar or None, help=key.help
+                ),
+            ],
+        )
+        for name, key in _OPTIONS.items()
+        if not names or name in names
+    ]
 
 
 def _type(key: ConfigKey) -> Any:
@@ -46,36 +65,6 @@ def _type(key: ConfigKey) -> Any:
         return Path
     # Checked by the configuration, for the same message as in a file; "auto" is no number.
     return str if key.name == "initial_soc" else _TYPES.get(key.kind, str)
-
-
-def config_options(*names: str) -> Callable[[Callable[..., None]], Callable[..., None]]:
-    """Replace the `**options` of a command by options that the configuration declares.
-
-    Parameters
-    ----------
-    *names : str
-        Keys, such as "channel". Default: every key that has an option.
-    """
-
-    def spread(command: Callable[..., None]) -> Callable[..., None]:
-        named = inspect.Parameter.KEYWORD_ONLY
-        given = inspect.signature(command, eval_str=True).parameters.values()
-        own = [each.replace(kind=named) for each in given if each.kind is not each.VAR_KEYWORD]
-        made = [
-            inspect.Parameter(
-                name, named, default=None, annotation=Annotated[_type(key) | None, _option(key)]
-            )
-            for name, key in _OPTIONS.items()
-            if not names or name in names
-        ]
-
-        def with_options(**values: Any) -> None:
-            command(**values)
-
-        with_options.command_class = ConfigCommand  # type: ignore[attr-defined] # read by the app
-        return with_signature(with_options, command, own + made)
-
-    return spread
 
 
 def config_values(options: Mapping[str, Any]) -> dict[str, Any]:

@@ -8,32 +8,33 @@ import subprocess
 import sys
 import time
 from pathlib import Path
-from typing import Annotated, Any
-
-import typer
+from typing import Any
 
 from cangauge._extras import extra
-from cangauge._files import check_writable, write_text_atomic
+from cangauge._files import write_text_atomic
 from cangauge._resources import shared_file
 from cangauge._text import number, significant
-from cangauge.cli.options import JsonOption
+from cangauge.cli.declare import command
 from cangauge.cli.output import emit_json, note, print_table
-from cangauge.errors import CangaugeError, InputError
+from cangauge.errors import CangaugeError
 
 TRAINED_ON = "leaf2012_reconstruction_white.parquet"
 PLAYED = "leaf2012_reconstruction_correlated.parquet"
 SENSOR_OFFSET_A = 1.0
 """Offset of the played current [A]: that of an ordinary Hall-effect sensor, which counting sums."""
-IDLE_S = 3.0
-"""The service exits after this time without a sample [s]."""
+CONFIGURATION = """\
+model = "model.json"
+time_source = "replay-clock"
+temperature_source = "room"
+until_idle_s = 3
+output = "live.parquet"
+"""
+EXIT_WITHIN_S = 33.0
+"""Longest wait for the service to exit after the replay: its idle time and half a minute [s]."""
 
 
-def demo_command(
-    folder: Annotated[
-        Path, typer.Option("--folder", metavar="DIR", help="Folder for the model and the pages.")
-    ] = Path("out/demo"),
-    json_output: JsonOption = False,
-) -> None:
+@command()
+def demo_command(*, folder: Path = Path("out/demo"), json_output: bool = False) -> None:
     """Fit a model, replay a log on a bus, estimate its SoC live, and report the errors.
 
     The shipped log is a reconstruction of the published 2012 Leaf test, computed from its equation,
@@ -47,6 +48,11 @@ def demo_command(
     `cangauge demo`
 
     `cangauge demo --folder /tmp/demo --json`
+
+    Parameters
+    ----------
+    folder : DIR
+        Folder for the model and the pages.
     """
     from dataclasses import replace
 
@@ -63,42 +69,31 @@ def demo_command(
     from cangauge.service.offline import RecordedEstimate
 
     began = time.monotonic()
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(
-            f"cannot create this folder: {error.strerror}",
-            source=folder,
-            field="--folder",
-            cure="name another one",
-        ) from error
-    check_writable(folder / "model.json")
-    model_path, live_path = folder / "model.json", folder / "live.parquet"
-    config_path = folder / "run.toml"
-    fit_page, soc_page = folder / "fit.html", folder / "soc.html"
+    folder.mkdir(parents=True, exist_ok=True)
+    paths = {
+        "model": folder / "model.json",
+        "fit_page": folder / "fit.html",
+        "soc_page": folder / "soc.html",
+    }
     note("1/4  fit the voltage model to 2.6 h of the reconstructed Leaf test")
     identification = fit([read_log(shared_file("replay", TRAINED_ON))], equation="published")
-    identification.model.save(model_path)
-    write_text_atomic(fit_page, extra("report.fit:fit_report")(identification))
+    model = identification.model
+    model.save(paths["model"])
+    write_text_atomic(paths["fit_page"], extra("report.fit:fit_report")(identification))
     note("2/4  replay another 2.6 h on the bus at full speed, and estimate its SoC live")
-    port = _free_port() if os.name == "posix" else None
-    if port is not None:
-        note(f"     see it while it plays: http://127.0.0.1:{port}/")
-    write_text_atomic(config_path, _configuration(port))
-    log, model = read_log(shared_file("replay", PLAYED)), identification.model
+    log = read_log(shared_file("replay", PLAYED))
     log = replace(log, current_a=log.current_a + SENSOR_OFFSET_A)
     write_log(log, folder / PLAYED)
-    seconds = _play(config_path, folder / PLAYED)
+    seconds = _play(folder, folder / PLAYED)
     note("3/4  compare live with offline and with the reference")
-    table = read_estimates(live_path)
+    table = read_estimates(folder / "live.parquet")
     live = score(table, log, seconds)
     settings = EstimatorSettings(temperature_source=log.temperature_source)
     offline, _ = estimate_log(log, model, settings)
-    difference = float(np.nanmax(np.abs(table.soc_pct - offline.soc_pct)))
-    bound = quantization_bound(Vehicle.load("generic"), model, log).ekf_pct
     note("4/4  write the pages")
     estimate = RecordedEstimate(log, table, live, model, settings)
-    write_text_atomic(soc_page, extra("report.estimate:estimate_report")(estimate, model_path))
+    page = extra("report.estimate:estimate_report")(estimate, paths["model"])
+    write_text_atomic(paths["soc_page"], page)
     result = {
         "log": "a reconstruction of the published 2012 Leaf test, no recording",
         "current_offset_a": SENSOR_OFFSET_A,
@@ -112,39 +107,27 @@ def demo_command(
         "live_soc_newton_mae_pct": live.soc_newton_mae_pct,
         "live_soc_coulomb_mae_pct": live.soc_coulomb_mae_pct,
         "live_cover_2sigma": live.cover_2sigma,
-        "live_minus_offline_pct": difference,
-        "quantisation_bound_pct": bound,
+        "live_minus_offline_pct": float(np.nanmax(np.abs(table.soc_pct - offline.soc_pct))),
+        "quantisation_bound_pct": quantization_bound(Vehicle.load("generic"), model, log).ekf_pct,
         "seconds": time.monotonic() - began,
-        "model": str(model_path),
-        "fit_page": str(fit_page),
-        "soc_page": str(soc_page),
+        **{name: str(path) for name, path in paths.items()},
     }
     if json_output:
         emit_json(result)
-        return
-    _show(result)
+    else:
+        _show(result)
 
 
-def _free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
-
-
-def _configuration(port: int | None) -> str:
-    """Return the TOML configuration of the service; without a bus it takes the default one."""
-    page = "" if port is None else f'dashboard = "127.0.0.1:{port}"\n'
-    return (
-        'model = "model.json"\n'
-        'time_source = "replay-clock"\n'
-        'temperature_source = "room"\n'
-        f"until_idle_s = {IDLE_S}\n"
-        'output = "live.parquet"\n' + page
-    )
-
-
-def _play(config: Path, log: Path) -> float:
+def _play(folder: Path, log: Path) -> float:
     """Replay a log to the service, each in its own process; return the duration [s]."""
+    page = ""
+    if os.name == "posix":
+        with socket.socket() as probe:
+            probe.bind(("127.0.0.1", 0))
+            page = f"127.0.0.1:{probe.getsockname()[1]}"
+        note(f"     see it while it plays: http://{page}/")
+    config = folder / "run.toml"
+    write_text_atomic(config, CONFIGURATION + (f'dashboard = "{page}"\n' if page else ""))
     cangauge = [sys.executable, "-P", "-m", "cangauge"]  # -P: no modules of the working folder
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
     service = [*cangauge, "run", "--config", str(config)]
@@ -157,15 +140,13 @@ def _play(config: Path, log: Path) -> float:
         )
         seconds = time.monotonic() - began
         try:
-            _, errors = running.communicate(timeout=IDLE_S + 30.0)
+            _, errors = running.communicate(timeout=EXIT_WITHIN_S)
         except subprocess.TimeoutExpired:
             running.kill()
             raise CangaugeError("the service did not exit after the replay") from None
     if replay.returncode or running.returncode:
-        raise CangaugeError(
-            f"replay exited with {replay.returncode}, the service with {running.returncode}:"
-            f" {errors.strip()}"
-        )
+        codes = f"replay exited with {replay.returncode}, the service with {running.returncode}"
+        raise CangaugeError(f"{codes}: {errors.strip()}")
     return seconds
 
 

@@ -2,33 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
-
-import typer
-from rich.progress import Progress
+from typing import TYPE_CHECKING, Literal
 
 from cangauge._extras import extra
 from cangauge._files import atomic_path
-from cangauge._text import number, possible, rounded, significant, uncertain, uncertain_energy
-from cangauge.cli.options import (
-    AUTO,
-    CapacityOption,
-    JsonOption,
-    ModelOption,
-    ReadingOptions,
-    ReportOption,
-    assumed_of,
-    check_outputs,
-    note_starts,
-    number_unless,
-    option_groups,
-    suffixed,
-    within,
-)
-from cangauge.cli.output import console, emit_json, note, print_table, print_values
+from cangauge._text import number, rounded, significant, uncertain
+from cangauge.cli.declare import Written, command
+from cangauge.cli.options import ReadingOptions, assumed_of, check_outputs, note_starts
+from cangauge.cli.output import emit_json, note, print_table, print_values, progress_bar
+from cangauge.cli.status import pack_values
 from cangauge.types import REASON_WORDS, Reason
 
 if TYPE_CHECKING:
@@ -39,52 +23,20 @@ if TYPE_CHECKING:
     from cangauge.service.offline import RecordedEstimate
 
 
-@option_groups()
-def estimate_command(  # noqa: PLR0917 - typer passes options by name
-    log_path: Annotated[Path, typer.Argument(metavar="LOG", help="Recorded log or capture.")],
-    model_path: ModelOption,
-    output: Annotated[
-        Path,
-        typer.Option(
-            "-o",
-            "--output",
-            metavar="OUT",
-            callback=suffixed(".csv", ".parquet", ".mcap"),
-            help="Table of estimates, .csv, .parquet or .mcap.",
-        ),
-    ],
-    method: Annotated[
-        Literal["ekf", "newton", "coulomb"],
-        typer.Option(
-            help="Method of soc_pct: Kalman filter over voltage and charge (ekf), voltage alone"
-            " (newton), or counting alone (coulomb).",
-        ),
-    ] = "ekf",
-    initial_soc: Annotated[
-        str | None,
-        typer.Option(
-            metavar="P|auto",
-            help="SoC at the first sample [%], e.g. 80; `auto` takes it from the first voltages."
-            " Default: the first soc_pct of a log, counted back to its first row; else, and for a"
-            " capture (as live), auto.",
-        ),
-    ] = None,
-    initial_soc_std: Annotated[
-        float, typer.Option(metavar="X", help="Standard deviation of the initial SoC [%].")
-    ] = 1.0,
-    capacity_ah: CapacityOption = None,
+@command()
+def estimate_command(
+    log_path: Path,
     *,
+    model: Path,
+    output: Written,
+    method: Literal["ekf", "newton", "coulomb"] = "ekf",
+    initial_soc: float | Literal["auto"] | None = None,
+    initial_soc_std: float = 1.0,
+    capacity_ah: float | None = None,
     reading: ReadingOptions,
-    pack: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="PACK",
-            callback=suffixed(".csv", ".parquet"),
-            help="Table of health, power and cells, once a second, .csv or .parquet.",
-        ),
-    ] = None,
-    report: ReportOption = None,
-    json_output: JsonOption = False,
+    pack: Written | None = None,
+    report: Written | None = None,
+    json_output: bool = False,
 ) -> None:
     """Estimate the state of charge of a recorded log or capture, offline.
 
@@ -105,6 +57,24 @@ def estimate_command(  # noqa: PLR0917 - typer passes options by name
     `cangauge estimate trip.csv -m pack.json -o soc.parquet --initial-soc auto`
 
     `cangauge estimate drive.log --vehicle leaf_ze0 -m leaf.json -o soc.csv --method newton`
+
+    Parameters
+    ----------
+    log_path : LOG
+        Recorded log or capture.
+    output : -o, --output OUT.csv|.parquet|.mcap
+        Table of estimates.
+    method : ekf|newton|coulomb
+        Method of soc_pct: Kalman filter over voltage and charge (ekf), voltage alone (newton), or
+        counting alone (coulomb).
+    initial_soc : P|auto (0 … 100 %)
+        SoC at the first sample, e.g. 80; `auto` takes it from the first voltages. Default: the
+        first soc_pct of a log, counted back to its first row; else, and for a capture (as live),
+        auto.
+    initial_soc_std : X (0 … 100 %)
+        Standard deviation of the initial SoC.
+    pack : PACK.csv|.parquet
+        Table of health, power and cells, once a second.
     """
     from cangauge.estimation.settings import EstimatorSettings
     from cangauge.logs.read import LogFile
@@ -112,29 +82,25 @@ def estimate_command(  # noqa: PLR0917 - typer passes options by name
 
     settings = EstimatorSettings(
         method=method,
-        initial_soc_pct=number_unless(
-            AUTO, initial_soc or AUTO, 0.0, 100.0, option="--initial-soc", unit="%"
-        ),
-        initial_soc_std_pct=within(
-            initial_soc_std, 0.0, 100.0, option="--initial-soc-std", unit="%"
-        ),
-        capacity_ah=within(capacity_ah, 1e-3, 1e5, option="--capacity-ah", unit="Ah"),
+        initial_soc_pct=None if initial_soc == "auto" else initial_soc,
+        initial_soc_std_pct=initial_soc_std,
+        capacity_ah=capacity_ah,
     )
-    check_outputs([output, pack, report], [log_path, model_path])
-    model, logs, recording = Model.load(model_path), [], reading.open(log_path)
+    check_outputs([output, pack, report], [log_path, model])
+    pack_model, logs, recording = Model.load(model), [], reading.open(log_path)
     if isinstance(recording, LogFile):
         logs = [reading.load(log_path)]
         done = _of_log(
             logs[0],
-            model,
+            pack_model,
             settings,
             reading,
             soc_from_log=initial_soc is None,
             keeps_pack=pack is not None,
         )
     else:
-        done = _of_capture(recording, model, settings, reading, keeps_pack=pack is not None)
-    _write(done, output, pack, report, model_path)
+        done = _of_capture(recording, pack_model, settings, reading, keeps_pack=pack is not None)
+    _write(done, output, pack, report, model)
     for warning in done.warnings:
         note(f"warning: {done.recorded.source}: {warning}")
     if json_output:
@@ -168,7 +134,7 @@ def _of_log(
         note_starts([log], settings.initial_soc_pct, settings.capacity_ah or model.capacity_ah)
     cells = read_cells(Path(log.source), log.time_s, reading.given_columns())
     history = PackHistory(keeps_rows=keeps_pack, cells=cells, duration_s=log.duration_s)
-    with _progress(len(log)) as progress:
+    with progress_bar(log.name, len(log)) as progress:
         done = estimate_recorded_log(
             log, model, settings, soc_from_log=soc_from_log, pack=history, progress=progress
         )
@@ -194,7 +160,7 @@ def _of_capture(
     from cangauge.service.offline import RecordedCapture, estimate_capture, require_same_pack
 
     car = reading.car_of(capture.path)
-    with _progress(None) as progress:
+    with progress_bar(capture.path.name, None) as progress:
         done = estimate_capture(
             capture.path, car, model, settings, keeps_pack=keeps_pack, progress=progress
         )
@@ -228,13 +194,6 @@ def _write(
             all_of_them.enter_context(atomic_path(report)).write_text(page, encoding="utf-8")
 
 
-@contextmanager
-def _progress(total: int | None) -> Iterator[Callable[[int], None]]:
-    with Progress(console=console, transient=True, disable=not console.is_terminal) as progress:
-        task = progress.add_task("estimating", total=total)
-        yield lambda done: progress.update(task, completed=done)
-
-
 def _show(done: RecordedEstimate) -> None:
     scores, table, settings = done.scores, done.table, done.settings
     origin = {"given": "given", "log": "from the log's soc_pct", "voltage": "found by the voltage"}
@@ -259,38 +218,15 @@ def _show(done: RecordedEstimate) -> None:
             "samples": str(scores.rows),
         },
     )
-    _show_pack(done)
+    if done.pack.report is not None:
+        limits = settings.limits.of_model(done.model.voltage_model())
+        low_v, high_v = (significant(v, 3) for v in (limits.min_voltage_v, limits.max_voltage_v))
+        report = done.pack.report.to_dict()
+        values = pack_values(report, f", down to {low_v} V", f", up to {high_v} V")
+        print_values("The pack at the end", values)
     if shares := done.reason_shares:
         rows = [
             [REASON_WORDS[Reason[name.upper().replace(" ", "_")]], number(100.0 * share, 1)]
             for name, share in shares.items()
         ]
         print_table("Reasons for less than valid estimates", ["reason", "% of samples"], rows)
-
-
-def _show_pack(done: RecordedEstimate) -> None:
-    if done.pack.report is None:
-        return
-    health, power, cells = done.pack.report
-    limits = done.settings.limits.of_model(done.model.voltage_model())
-    low_v, high_v = (significant(v, 3) for v in (limits.min_voltage_v, limits.max_voltage_v))
-    values = {
-        "capacity": uncertain(health.capacity_ah, health.capacity_std_ah, "Ah"),
-        "resistance": uncertain(health.resistance_ratio, health.resistance_std, "× the model's"),
-        "current offset": significant(health.offset_a, 2, "A"),
-        "possible discharge, 10 s": possible(
-            power.discharge_a, power.discharge_std_a, f"A, down to {low_v} V"
-        ),
-        "possible charge, 10 s": possible(
-            power.charge_a, power.charge_std_a, f"A, up to {high_v} V"
-        ),
-        "energy left": uncertain_energy(power.energy_wh, power.energy_std_wh),
-    }
-    if cells is not None:
-        name = "weakest cell" if cells.weakest < 0 else f"weakest cell: number {cells.weakest}"
-        values |= {
-            name: uncertain(cells.soc_pct, cells.soc_std_pct, "%"),
-            "  spread of the cells": number(cells.spread_pct, 1, "%"),
-            "pack less sum of cells": uncertain(cells.sum_error_v, cells.sum_std_v, "V"),
-        }
-    print_values("The pack at the end", values)

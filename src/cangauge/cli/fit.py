@@ -4,25 +4,13 @@ from __future__ import annotations
 
 from itertools import pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
-
-import typer
+from typing import TYPE_CHECKING, Any, Literal
 
 from cangauge._extras import extra
 from cangauge._files import write_texts_atomic
 from cangauge._text import NONE_KNOWN, energy_text, number, significant, span
-from cangauge.cli.options import (
-    AUTO,
-    JsonOption,
-    ReadingOptions,
-    ReportOption,
-    assumed_of,
-    check_outputs,
-    number_unless,
-    option_groups,
-    suffixed,
-    within,
-)
+from cangauge.cli.declare import Written, command
+from cangauge.cli.options import ReadingOptions, assumed_of, check_outputs
 from cangauge.cli.output import (
     console,
     emit_json,
@@ -37,106 +25,29 @@ if TYPE_CHECKING:
     from cangauge.identify.identification import Identification
     from cangauge.logs.log import Log
 
-FROM_SOC: Final = "from-soc"
 SAME_SUM = 0.02
 """Largest difference between the sum of the cells and the pack's voltage, of the latter: a cell
 more or less in 16 makes three times as much."""
 
 
-@option_groups()
-def fit_command(  # noqa: PLR0917 - typer passes options by name
-    logs: Annotated[
-        list[Path],
-        typer.Argument(metavar="LOG", help="Recorded logs or captures of one pack."),
-    ],
-    output: Annotated[
-        Path,
-        typer.Option(
-            "-o",
-            "--output",
-            metavar="MODEL.json",
-            callback=suffixed(".json"),
-            help="Model file to write.",
-        ),
-    ],
-    capacity_ah: Annotated[
-        str | None,
-        typer.Option(
-            metavar="A|from-soc",
-            help="Charge from 100 to 0 % [Ah], e.g. 51.5; `from-soc` takes the charge per 100 % of"
-            " the logs' soc_pct. Default: from a log that runs from full to empty.",
-        ),
-    ] = None,
-    initial_soc: Annotated[
-        list[str] | None,
-        typer.Option(
-            metavar="P|auto",
-            help="SoC at the first row [%]; once for all logs, or repeated, once for each in order."
-            " Default, and auto: its soc_pct; a log without is estimated together with the curve,"
-            " if another log pins it.",
-        ),
-    ] = None,
-    equation: Annotated[
-        Literal["knots", "published"],
-        typer.Option(
-            help="knots: a curve around the typical cell of the chemistry; published: the published"
-            " equation by plain least squares."
-        ),
-    ] = "knots",
-    chemistry: Annotated[
-        Literal["oxide", "lfp"] | None,
-        typer.Option(
-            help="Chemistry of the cells: layered oxides or manganese spinel, or iron phosphate."
-            " Default: from the volts per cell where their number is known, else oxide."
-        ),
-    ] = None,
-    cells: Annotated[
-        int | None,
-        typer.Option(
-            metavar="N",
-            min=1,
-            max=2000,
-            help="Cells in series. Default: the columns of cells of the first log, if it has all.",
-        ),
-    ] = None,
-    rate_hz: Annotated[
-        float, typer.Option(metavar="HZ", help="Rate of the fit [Hz]; faster logs are decimated.")
-    ] = 1.0,
-    delays: Annotated[
-        str | None,
-        typer.Option(
-            metavar="S,S,…",
-            help="Delays of the current [s], by default 0,10,30,70; with --equation published.",
-        ),
-    ] = None,
-    epsilon: Annotated[
-        float | None,
-        typer.Option(
-            metavar="E",
-            help="Margin ε of the scaled SoC [-], 0 < ε < 0.5, by default 0.05; with --equation"
-            " published.",
-        ),
-    ] = None,
-    t_ref: Annotated[
-        float | None,
-        typer.Option(
-            metavar="C",
-            help="Reference temperature T_r [°C], by default 20; with --equation published.",
-        ),
-    ] = None,
-    effects: Annotated[
-        list[str] | None,
-        typer.Option(
-            metavar="ID…|auto|none",
-            help="Effects to add to the model, separated by commas, e.g. hysteresis; `auto` adds"
-            " those that lower the error of left-out logs significantly. Default: auto from five"
-            " logs on.",
-        ),
-    ] = None,
+@command()
+def fit_command(
+    logs: list[Path],
     *,
+    output: Written,
+    capacity_ah: float | Literal["from-soc"] | None = None,
+    initial_soc: list[float | Literal["auto"]] | None = None,
+    equation: Literal["knots", "published"] = "knots",
+    chemistry: Literal["oxide", "lfp"] | None = None,
+    cells: int | None = None,
+    rate_hz: float = 1.0,
+    delays: str | None = None,
+    epsilon: float | None = None,
+    t_ref: float | None = None,
+    effects: list[str] | None = None,
     reading: ReadingOptions,
-    report: ReportOption = None,
-    json_output: JsonOption = False,
+    report: Written | None = None,
+    json_output: bool = False,
 ) -> None:
     """Identify the voltage model of a pack from recorded logs.
 
@@ -158,22 +69,54 @@ def fit_command(  # noqa: PLR0917 - typer passes options by name
     auto`
 
     Model file and report are written together, or neither.
+
+    Parameters
+    ----------
+    logs : LOG
+        Recorded logs or captures of one pack.
+    output : -o, --output MODEL.json
+        Model file to write.
+    capacity_ah : A|from-soc (0.001 … 1e5 Ah)
+        Charge from 100 to 0 %, e.g. 51.5; `from-soc` takes the charge per 100 % of the logs'
+        soc_pct. Default: from a log that runs from full to empty.
+    initial_soc : P|auto (0 … 100 %)
+        SoC at the first row; once for all logs, or repeated, once for each in order. Default, and
+        auto: its soc_pct; a log without is estimated together with the curve, if another log pins
+        it.
+    equation : knots|published
+        knots: a curve around the typical cell of the chemistry; published: the published equation
+        by plain least squares.
+    chemistry : oxide|lfp
+        Chemistry of the cells: layered oxides or manganese spinel, or iron phosphate. Default: from
+        the volts per cell where their number is known, else oxide.
+    cells : N (1 … 2000)
+        Cells in series. Default: the columns of cells of the first log, if it has all.
+    rate_hz : HZ (0.01 … 1000 Hz)
+        Rate of the fit; faster logs are decimated.
+    delays : S,S,…
+        Delays of the current [s], by default 0,10,30,70; with --equation published.
+    epsilon : E (0.0001 … 0.49)
+        Margin ε of the scaled SoC, by default 0.05; with --equation published.
+    t_ref : C (-60 … 120 °C)
+        Reference temperature T_r, by default 20; with --equation published.
+    effects : ID…|auto|none
+        Effects to add to the model, separated by commas, e.g. hysteresis; `auto` adds those that
+        lower the error of left-out logs significantly. Default: auto from five logs on.
     """
     from cangauge.identify.effect_search import parse_effect_ids
     from cangauge.identify.fit import fit
 
-    capacity: float | Literal["from-soc"] | None = None
-    if capacity_ah is not None:
-        capacity = (
-            number_unless(FROM_SOC, capacity_ah, 1e-3, 1e5, option="--capacity-ah", unit="Ah")
-            or FROM_SOC
+    if initial_soc is not None and len(initial_soc) not in {1, len(logs)}:
+        raise InputError(
+            f"{len(initial_soc)} values for {len(logs)} logs",
+            field="--initial-soc",
+            cure="give one for all, or one for each log in order (auto where it is unknown)",
         )
-    initial = _initial_soc(initial_soc or [AUTO], len(logs))
-    within(rate_hz, 0.01, 1000.0, option="--rate-hz", unit="Hz")
+    starts = [None if each == "auto" else each for each in initial_soc or ["auto"]]
     published: dict[str, Any] = {
         "delay_s": None if delays is None else parse_delays(delays),
-        "epsilon": within(epsilon, 1e-4, 0.49, option="--epsilon"),
-        "t_ref_c": within(t_ref, -60.0, 120.0, option="--t-ref", unit="°C"),
+        "epsilon": epsilon,
+        "t_ref_c": t_ref,
     }
     published = {name: value for name, value in published.items() if value is not None}
     if equation == "knots" and published:
@@ -191,8 +134,8 @@ def fit_command(  # noqa: PLR0917 - typer passes options by name
         with progress_shown("cangauge.identify", status.update):
             result = fit(
                 recorded,
-                capacity_ah=capacity,
-                initial_soc_pct=initial,
+                capacity_ah=capacity_ah,
+                initial_soc_pct=starts if len(starts) > 1 else starts[0],
                 equation=equation,
                 chemistry=chemistry,
                 cells=cells or _cells_of(logs[0], recorded[0], reading),
@@ -226,20 +169,6 @@ def _cells_of(path: Path, log: Log, reading: ReadingOptions) -> int | None:
         return None
     ratio = float(np.nanmedian(cells.voltage_v.sum(axis=1) / log.voltage_v))
     return cells.count if abs(ratio - 1.0) <= SAME_SUM else None
-
-
-def _initial_soc(given: list[str], number: int) -> float | list[float | None] | None:
-    """Return the value for all logs, or one for each; None where it is not given."""
-    values = [
-        number_unless(AUTO, text, 0.0, 100.0, option="--initial-soc", unit="%") for text in given
-    ]
-    if len(values) not in {1, number}:
-        raise InputError(
-            f"{len(values)} values for {number} logs",
-            field="--initial-soc",
-            cure="give one for all, or one for each log in order (auto where it is unknown)",
-        )
-    return values[0] if len(values) == 1 else values
 
 
 def parse_delays(given: str) -> tuple[float, ...]:

@@ -3,26 +3,15 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Any
 
 import typer
 
 from cangauge._extras import extra
 from cangauge._files import write_texts_atomic
 from cangauge._text import printable
-from cangauge.cli.options import (
-    ALARM,
-    AlarmOption,
-    JsonOption,
-    ReadingOptions,
-    ReportOption,
-    assumed_of,
-    check_outputs,
-    note_starts,
-    option_groups,
-    suffixed,
-    within,
-)
+from cangauge.cli.declare import Written, command
+from cangauge.cli.options import ALARM, ReadingOptions, assumed_of, check_outputs, note_starts
 from cangauge.cli.output import emit_json, note, print_table, progress_shown
 from cangauge.cli.simulator import column_of, load_function
 from cangauge.errors import InputError
@@ -33,85 +22,23 @@ if TYPE_CHECKING:
     from cangauge.logs.log import Log
 
 
-@option_groups()
-def gap_command(  # noqa: PLR0917 - typer passes options by name
-    logs: Annotated[
-        list[Path],
-        typer.Argument(metavar="LOG", help="Logs to diagnose; one cause is sought for all."),
-    ],
-    model: Annotated[
-        Path | None,
-        typer.Option(
-            "-m", "--model", metavar="MODEL", help="Model file; not needed for a simulator."
-        ),
-    ] = None,
-    reference: Annotated[
-        list[Path] | None,
-        typer.Option(
-            metavar="LOG",
-            help="Log without a fault; repeat the option. Without soc_pct its start is found from"
-            " the voltage.",
-        ),
-    ] = None,
-    initial_soc: Annotated[
-        float | None,
-        typer.Option(
-            metavar="P",
-            help="SoC at the first row of each diagnosed log [%], e.g. 80. Default: its soc_pct,"
-            " else found from the voltage.",
-        ),
-    ] = None,
-    capacity_ah: Annotated[
-        float | None,
-        typer.Option(
-            metavar="A", help="Charge from 100 to 0 % [Ah], in place of the model's, for all logs."
-        ),
-    ] = None,
-    extended: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="MODEL.json",
-            callback=suffixed(".json"),
-            help="Write the model, extended by the cause, to this file.",
-        ),
-    ] = None,
-    simulated: Annotated[
-        str | None,
-        typer.Option(
-            metavar="HEADING",
-            help="Column of every log with a simulator's voltage for the same current and"
-            " temperature: what it misses is diagnosed, in place of a model's gap.",
-        ),
-    ] = None,
-    simulator: Annotated[
-        str | None,
-        typer.Option(
-            metavar="MODULE:FUNCTION",
-            help="The same by a Python function, also FILE.py:FUNCTION, called with time [s],"
-            " current [A, positive = discharge], temperature [°C], SoC of the first row [%]; it"
-            " returns the voltage [V].",
-        ),
-    ] = None,
-    alarm: AlarmOption = ALARM,
-    plan: Annotated[
-        bool,
-        typer.Option(
-            "--plan",
-            help="Propose the drive or measurement that tells the likeliest two causes apart.",
-        ),
-    ] = False,
-    add_test: Annotated[
-        list[Path] | None,
-        typer.Option(
-            metavar="LOG",
-            help="Log of a further test of the same cause, beside the LOGs of the first diagnosis:"
-            " diagnoses both together and reports what the test changed; repeat the option.",
-        ),
-    ] = None,
+@command()
+def gap_command(
+    logs: list[Path],
     *,
+    model: Path | None = None,
+    reference: list[Path] | None = None,
+    initial_soc: float | None = None,
+    capacity_ah: float | None = None,
+    extended: Written | None = None,
+    simulated: str | None = None,
+    simulator: str | None = None,
+    alarm: float = ALARM,
+    plan: bool = False,
+    add_test: list[Path] | None = None,
     reading: ReadingOptions,
-    report: ReportOption = None,
-    json_output: JsonOption = False,
+    report: Written | None = None,
+    json_output: bool = False,
 ) -> None:
     """Diagnose the gap between a model and logs: how large, where, what to check first.
 
@@ -131,6 +58,34 @@ def gap_command(  # noqa: PLR0917 - typer passes options by name
 
     `cangauge gap day1.csv --simulated "V sim [V]" --capacity-ah 60 --reference good1.csv
     --reference good2.csv --reference good3.csv`
+
+    Parameters
+    ----------
+    logs : LOG
+        Logs to diagnose; one cause is sought for all.
+    model : -m, --model MODEL
+        Model file; not needed for a simulator.
+    reference : LOG
+        Log without a fault; repeat the option. Without soc_pct its start is found from the voltage.
+    initial_soc : P (0 … 100 %)
+        SoC at the first row of each diagnosed log, e.g. 80. Default: its soc_pct, else found from
+        the voltage.
+    capacity_ah : A (0.001 … 1e5 Ah)
+        Charge from 100 to 0 %, in place of the model's, for all logs.
+    extended : MODEL.json
+        Write the model, extended by the cause.
+    simulated : HEADING
+        Column of every log with a simulator's voltage for the same current and temperature: what it
+        misses is diagnosed, in place of a model's gap.
+    simulator : MODULE:FUNCTION
+        The same by a Python function, also FILE.py:FUNCTION, called with time [s], current [A,
+        positive = discharge], temperature [°C], SoC of the first row [%]; it returns the voltage
+        [V].
+    plan : --plan
+        Propose the drive or measurement that tells the likeliest two causes apart.
+    add_test : LOG
+        Log of a further test of the same cause, beside the LOGs of the first diagnosis: diagnoses
+        both together and reports what the test changed; repeat the option.
     """
     from cangauge.diagnosis import diagnose
     from cangauge.diagnosis.planner import plan as plan_next
@@ -140,9 +95,6 @@ def gap_command(  # noqa: PLR0917 - typer passes options by name
     paths = [*logs, *added]
     _refuse_common(paths, given)
     _refuse_simulators(model, simulated, simulator)
-    within(initial_soc, 0.0, 100.0, option="--initial-soc", unit="%")
-    within(alarm, 0.0, 1.0, option="--alarm")
-    within(capacity_ah, 1e-3, 1e5, option="--capacity-ah", unit="Ah")
     model_file = None if model is None else Model.load(model)
     if model_file is not None and capacity_ah is not None:
         model_file = model_file.model_copy(update={"capacity_ah": capacity_ah})

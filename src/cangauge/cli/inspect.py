@@ -6,21 +6,15 @@ import shlex
 import sys
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING
 
 import typer
 
 from cangauge._extras import extra
 from cangauge._files import write_texts_atomic
 from cangauge._text import rounded
-from cangauge.cli.options import (
-    JsonOption,
-    ReadingOptions,
-    ReportOption,
-    assumed_of,
-    check_outputs,
-    option_groups,
-)
+from cangauge.cli.declare import Written, command
+from cangauge.cli.options import ReadingOptions, assumed_of, check_outputs
 from cangauge.cli.output import emit_json, note, print_table, wrapped
 from cangauge.errors import InputError
 
@@ -41,21 +35,13 @@ _FAULTS = {"crc_errors": "wrong CRC", "frames_lost": "lost", "counter_repeats": 
 _RANGES = {"current_a": "A", "voltage_v": "V", "temperature_c": "°C", "soc_pct": "%"}
 
 
-@option_groups()
+@command()
 def inspect_command(
-    path: Annotated[
-        Path,
-        typer.Argument(
-            metavar="LOG|CAPTURE",
-            help="Log (canonical Parquet or CSV, ANL D3 test, BMW i3 trip, cycler export, or any"
-            " table with a heading for each column; also gzipped or zipped) or CAN capture.",
-            show_default=False,
-        ),
-    ],
+    path: Path,
     *,
     reading: ReadingOptions,
-    report: ReportOption = None,
-    json_output: JsonOption = False,
+    report: Written | None = None,
+    json_output: bool = False,
 ) -> None:
     """Show what a log or capture holds, and the sign of its current.
 
@@ -77,6 +63,12 @@ def inspect_command(
     `cangauge inspect logger.csv --columns 'time=Stamp,current=I_batt[mA]:-1,voltage=U_batt'`
 
     `cangauge inspect capture.log --vehicle leaf_ze0`
+
+    Parameters
+    ----------
+    path : LOG|CAPTURE
+        Log (canonical Parquet or CSV, ANL D3 test, BMW i3 trip, cycler export, or any table with a
+        heading for each column; also gzipped or zipped) or CAN capture.
     """
     # Deferred: the readers and the decoder take half a second to import.
     from cangauge.inspect.capture import inspect_capture

@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import inspect
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, fields, is_dataclass, replace
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, TypeVar, cast, get_type_hints
+from typing import TYPE_CHECKING, cast
 
-import typer
-
-from cangauge._files import check_writable, require_suffix
+from cangauge._files import check_writable
 from cangauge.cli.output import note
 from cangauge.errors import InputError
 
@@ -26,97 +23,40 @@ if TYPE_CHECKING:
 
 RECOGNISED_BY = 50_000
 """Frames by which the preset of a capture is looked for: half a minute of a busy bus."""
-AUTO = "auto"
 ALARM = 0.05
 """`cangauge.diagnosis.ALARM`: a help page imports nothing that computes."""
-_Value = TypeVar("_Value", bound=float | None)
-
-
-def suffixed(*suffixes: str) -> Callable[[typer.CallbackParam, Path | None], Path | None]:
-    """Return the callback of an option for a file to write: it must have one of these suffixes."""
-
-    def check(param: typer.CallbackParam, value: Path | None) -> Path | None:
-        if value is not None:
-            require_suffix(value, *suffixes, field=param.opts[-1])
-        return value
-
-    return check
-
-
-ColumnsOption = Annotated[
-    str | None,
-    typer.Option(
-        metavar="NAME=HEADING,…",
-        help="For a table of other headings: time, current, voltage, temperature, soc, each"
-        " NAME=HEADING[UNIT]:FACTOR; unit and factor only where the heading leaves them open."
-        " 'current=I_batt[mA]:-1' (mA, discharge negative); 'time=Date+Time' joins two columns;"
-        " 'temperature=T1+T2' averages; '#3' is the third column. See docs/logs.md.",
-    ),
-]
-JsonOption = Annotated[
-    bool,
-    typer.Option("--json", help="Print exactly one JSON object on stdout, also for an error."),
-]
-ModelOption = Annotated[
-    Path, typer.Option("-m", "--model", metavar="MODEL", help="Model file of `cangauge fit`.")
-]
-CapacityOption = Annotated[
-    float | None,
-    typer.Option(
-        "--capacity-ah", metavar="A", help="Charge from 100 to 0 % [Ah]. Default: the model's."
-    ),
-]
-AlarmOption = Annotated[
-    float,
-    typer.Option(metavar="P", help="Report a fault where the probability of none is at most this."),
-]
-ReportOption = Annotated[
-    Path | None,
-    typer.Option(
-        "--report",
-        metavar="FILE.html",
-        callback=suffixed(".html", ".htm"),
-        help="Write a report as one self-contained page.",
-    ),
-]
 
 
 @dataclass(frozen=True, slots=True)
 class ReadingOptions:
-    """The options of every command that reads a log or a capture."""
+    """The options of every command that reads a log or a capture.
 
-    vehicle: Annotated[
-        str | None,
-        typer.Option(
-            metavar="PRESET",
-            help="For a capture: the car's preset (a DBC and a map that ship with cangauge).",
-        ),
-    ] = None
-    dbc: Annotated[
-        Path | None,
-        typer.Option(metavar="FILE", help="For a capture: the bus's DBC; needs --map."),
-    ] = None
-    map_file: Annotated[
-        Path | None,
-        typer.Option(
-            "--map",
-            metavar="FILE",
-            help="For a capture: which signals of the DBC are current, voltage and temperature.",
-        ),
-    ] = None
-    columns: ColumnsOption = None
-    sign: Annotated[
-        str | None,
-        typer.Option(
-            metavar="charge|discharge",
-            help="What a positive current in the file does. Default: as its format defines it,"
-            " else found from the data.",
-        ),
-    ] = None
-    temperature: Annotated[
-        float | None,
-        typer.Option(metavar="C", help="Constant temperature [°C], where the input has none."),
-    ] = None
+    Parameters
+    ----------
+    vehicle : PRESET
+        For a capture: the car's preset (a DBC and a map that ship with cangauge).
+    dbc : FILE
+        For a capture: the bus's DBC; needs --map.
+    map_file : --map FILE
+        For a capture: which signals of the DBC are current, voltage and temperature.
+    columns : NAME=HEADING,…
+        For a table of other headings: time, current, voltage, temperature, soc, each
+        NAME=HEADING[UNIT]:FACTOR; unit and factor only where the heading leaves them open.
+        'current=I_batt[mA]:-1' (mA, discharge negative); 'time=Date+Time' joins two columns;
+        'temperature=T1+T2' averages; '#3' is the third column. See docs/logs.md.
+    sign : charge|discharge
+        What a positive current in the file does. Default: as its format defines it, else found
+        from the data.
+    temperature : C
+        Constant temperature [°C], where the input has none.
+    """
+
+    vehicle: str | None = None
+    dbc: Path | None = None
+    map_file: Path | None = None
+    columns: str | None = None
+    sign: str | None = None
+    temperature: float | None = None
 
     @property
     def names_vehicle(self) -> bool:
@@ -203,51 +143,6 @@ class ReadingOptions:
         raise InputError(error.problem, source=capture, cure=f"{error.cure}{hint}")
 
 
-def option_groups(*omitted: str) -> Callable[[Callable[..., None]], Callable[..., None]]:
-    """Replace each parameter of a command that is a dataclass of options by those options.
-
-    Parameters
-    ----------
-    *omitted : str
-        Fields that are no options of this command, but keep their defaults.
-    """
-
-    def spread(command: Callable[..., None]) -> Callable[..., None]:
-        groups: dict[str, tuple[type, list[str]]] = {}
-        parameters: list[inspect.Parameter] = []
-        for parameter in inspect.signature(command, eval_str=True).parameters.values():
-            kind = parameter.annotation
-            if not (isinstance(kind, type) and is_dataclass(kind)):
-                parameters.append(parameter)
-                continue
-            hints = get_type_hints(kind, include_extras=True)
-            offered = [each for each in fields(kind) if each.name not in omitted]
-            groups[parameter.name] = kind, [each.name for each in offered]
-            parameters += [
-                parameter.replace(name=each.name, default=each.default, annotation=hints[each.name])
-                for each in offered
-            ]
-
-        def run(**given: Any) -> None:
-            for name, (kind, names) in groups.items():
-                given[name] = kind(**{each: given.pop(each) for each in names})
-            command(**given)
-
-        return with_signature(run, command, parameters)
-
-    return spread
-
-
-def with_signature(
-    run: Callable[..., None], command: Callable[..., None], parameters: list[inspect.Parameter]
-) -> Callable[..., None]:
-    """Give a function the help page of a command and the parameters that typer reads."""
-    run.__doc__ = command.__doc__
-    run.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
-    run.__annotations__ = {each.name: each.annotation for each in parameters}
-    return run
-
-
 def note_reading(log: Log) -> None:
     """Print on stderr what was assumed of a log's columns, in one line, and the remarks."""
     remarks = [f"read as {', '.join(log.assumed)}"] if log.assumed else []
@@ -300,34 +195,3 @@ def check_outputs(
         written.add(place)
         if output.parent != made or made.is_dir():
             check_writable(output)
-
-
-def within(value: _Value, low: float, high: float, *, option: str, unit: str = "") -> _Value:
-    """Return `value` if it is None or within low … high; else (NaN too) raise InputError."""
-    if value is not None and not low <= value <= high:
-        raise InputError(
-            f"must lie within {low:g} … {high:g} {unit}".rstrip(), field=option, value=value
-        )
-    return value
-
-
-def number_unless(
-    word: str, text: str, low: float, high: float, *, option: str, unit: str = ""
-) -> float | None:
-    """Return None for `word`, else the number that `text` states, within low … high.
-
-    Raises
-    ------
-    InputError
-        If it is neither the word nor such a number.
-    """
-    if text == word:
-        return None
-    try:
-        value = float(text)
-    except ValueError as error:
-        cure = f"give a number{f' of {unit}' if unit else ''}, or {word}"
-        raise InputError(
-            f"neither a number nor {word}", field=option, value=text, cure=cure
-        ) from error
-    return within(value, low, high, option=option, unit=unit)

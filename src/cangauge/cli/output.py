@@ -14,6 +14,7 @@ from typing import Any, Final, TextIO
 
 from rich import box
 from rich.console import Console, ConsoleOptions, RenderableType
+from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.segment import Segment
 from rich.table import Table
 from rich.text import Text
@@ -85,6 +86,27 @@ def progress_shown(logger: str, show: Callable[[str], None] | None = None) -> It
         own.setLevel(level)
 
 
+@contextmanager
+def progress_bar(name: str, total: float | None) -> Iterator[Callable[..., None]]:
+    """Yield a function that shows how much is done, and optionally a text, on a terminal."""
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        TextColumn("{task.fields[text]}"),
+        TimeRemainingColumn(),
+    )
+    # No refresh thread: redrawn at each call.
+    with Progress(
+        *columns,
+        console=console,
+        transient=True,
+        auto_refresh=False,
+        disable=not console.is_terminal,
+    ) as bar:
+        task = bar.add_task(name, total=total, text="")
+        yield lambda done, text="": bar.update(task, completed=done, text=text, refresh=True)
+
+
 class _ProgressHandler(logging.Handler):
     def __init__(self, show: Callable[[str], None] | None) -> None:
         super().__init__()
@@ -144,7 +166,12 @@ def print_table(title: str, head: Sequence[str], rows: Sequence[Sequence[str]]) 
     PlainConsole(highlight=False).print(text_table(title, head, rows))
 
 
-def print_values(title: str, values: Mapping[str, str]) -> None:
-    """Print a table of names and values with their units; what is not known is left out."""
+def values_table(title: str, values: Mapping[str, str]) -> Table:
+    """Return a table of names and values with their units; what is not known is left out."""
     rows = [(name, text) for name, text in values.items() if not text.startswith(NONE_KNOWN)]
-    print_table(title, ("", ""), rows)
+    return text_table(title, ("", ""), rows)
+
+
+def print_values(title: str, values: Mapping[str, str]) -> None:
+    """Print names and values on stdout; arguments as of `values_table`."""
+    PlainConsole(highlight=False).print(values_table(title, values))

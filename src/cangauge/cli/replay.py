@@ -5,22 +5,13 @@ from __future__ import annotations
 import math
 from contextlib import ExitStack
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Self
-
-import typer
-from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
+from typing import TYPE_CHECKING, Any, Literal
 
 from cangauge._text import duration, number
-from cangauge.cli.config_options import config_options, config_values
-from cangauge.cli.options import (
-    ColumnsOption,
-    JsonOption,
-    ReadingOptions,
-    assumed_of,
-    note_reading,
-    number_unless,
-)
-from cangauge.cli.output import console, emit_json, note
+from cangauge.cli.config_options import config_parameters, config_values
+from cangauge.cli.declare import command
+from cangauge.cli.options import ReadingOptions, assumed_of, note_reading
+from cangauge.cli.output import emit_json, note, progress_bar
 
 if TYPE_CHECKING:
     from cangauge.bus.connection import BusConnection
@@ -30,32 +21,19 @@ if TYPE_CHECKING:
     from cangauge.service.config import RunConfig
 
 
-@config_options("interface", "channel", "bus_options", "vehicle", "dbc", "map", "temperature")
+@command(
+    keys=lambda: config_parameters(
+        "interface", "channel", "bus_options", "vehicle", "dbc", "map", "temperature"
+    )
+)
 def replay_command(
-    recorded: Annotated[
-        Path, typer.Argument(metavar="LOG|CAPTURE", help="Recorded log, or recorded frames.")
-    ],
+    recorded: Path,
     *,
-    config: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="FILE.toml",
-            help="Configuration of the `cangauge run` that listens: its bus, vehicle and ids.",
-        ),
-    ] = None,
-    columns: ColumnsOption = None,
-    speed: Annotated[
-        str,
-        typer.Option(
-            metavar="1|N|max",
-            help="1: real time; N: N times faster; max: as fast as `cangauge run` acknowledges,"
-            " without loss.",
-        ),
-    ] = "1",
-    loop: Annotated[
-        bool, typer.Option("--loop", help="Repeat until Ctrl-C, with increasing log time.")
-    ] = False,
-    json_output: JsonOption = False,
+    config: Path | None = None,
+    columns: str | None = None,
+    speed: float | Literal["max"] = 1.0,
+    loop: bool = False,
+    json_output: bool = False,
     **options: Any,
 ) -> None:
     """Play a recorded log or capture on a bus.
@@ -72,6 +50,19 @@ def replay_command(
     `cangauge replay trip.parquet --speed max --vehicle leaf_aze0`
 
     `cangauge replay candump.log.gz --speed 10 --interface socketcan --channel vcan0 --loop`
+
+    Parameters
+    ----------
+    recorded : LOG|CAPTURE
+        Recorded log, or recorded frames.
+    config : FILE.toml
+        Configuration of the `cangauge run` that listens: its bus, vehicle and ids.
+    columns : NAME=HEADING,…
+        Columns of a table of other headings, as of `cangauge inspect`.
+    speed : 1|N|max (0.001 … 1e6)
+        1: real time; N: N times faster; max: as fast as `cangauge run` acknowledges, without loss.
+    loop : --loop
+        Repeat until Ctrl-C, with increasing log time.
     """
     from cangauge.bus.connection import BusConnection
     from cangauge.bus.open import open_bus
@@ -81,7 +72,6 @@ def replay_command(
     from cangauge.service.lifecycle import stop_on_signals
     from cangauge.service.setup import address_of
 
-    factor = number_unless("max", speed, 1e-3, 1e6, option="--speed") or math.inf
     loaded = load_config(config, {"model": "-", **config_values(options)})
     ids = FrameIds(**loaded.ids.model_dump())
     source, address = _source(recorded, columns, loaded, ids), address_of(loaded)
@@ -90,9 +80,12 @@ def replay_command(
         filters = [standard_filter(ids.soc_estimate), standard_filter(ids.soc_detail)]
         bus = stack.enter_context(BusConnection(open_bus(address, filters), str(address)))
         note(f"playing {recorded} on {address}, speed {speed}")
-        bar = stack.enter_context(_Bar(source, loop=loop)) if console.is_terminal else None
+        bar = stack.enter_context(progress_bar(source.name, None if loop else source.duration_s))
+        factor = math.inf if speed == "max" else speed
         settings = ReplaySettings(speed=factor, loop=loop, ids=ids)
-        state = play(bus, source, settings, stop=stop, show=None if bar is None else bar.show)
+        state = play(
+            bus, source, settings, stop=stop, show=lambda now: bar(now.log_seconds, _shown(now))
+        )
         stopped = stop()
     note(_summary_line(state))
     if bus.unsent:
@@ -119,33 +112,10 @@ def _source(recorded: Path, columns: str | None, config: RunConfig, ids: FrameId
     return LogSource(log, load_vehicle(config))
 
 
-class _Bar:
-    """Progress on the terminal: log time, speed, SoC published by the receiver."""
-
-    def __init__(self, source: Source, *, loop: bool) -> None:
-        length_s = None if loop else source.duration_s
-        columns = (
-            TextColumn("{task.description}"),
-            BarColumn(),
-            TextColumn("{task.fields[text]}"),
-            TimeRemainingColumn(),
-        )
-        # No refresh thread: redrawn with each state.
-        self._bar = Progress(*columns, console=console, transient=True, auto_refresh=False)
-        self._task: TaskID = self._bar.add_task(source.name, total=length_s, text="")
-
-    def __enter__(self) -> Self:
-        self._bar.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._bar.stop()
-
-    def show(self, state: ReplayState) -> None:
-        text = f"{duration(state.log_seconds)}, {number(state.speed, 1)}×"
-        if state.soc is not None:
-            text += f", SoC {number(state.soc.soc_pct, 2, '%')}"
-        self._bar.update(self._task, completed=state.log_seconds, text=text, refresh=True)
+def _shown(state: ReplayState) -> str:
+    """Return log time, speed and the SoC published by the receiver."""
+    soc = "" if state.soc is None else f", SoC {number(state.soc.soc_pct, 2, '%')}"
+    return f"{duration(state.log_seconds)}, {number(state.speed, 1)}×{soc}"
 
 
 def _summary_line(state: ReplayState) -> str:

@@ -6,14 +6,13 @@ import gc
 import logging
 from contextlib import ExitStack
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Any
 
-import typer
 from rich.live import Live
 
 from cangauge._logging import emit, logging_to, takes_text
-from cangauge.cli.config_options import config_options, config_values
-from cangauge.cli.options import JsonOption
+from cangauge.cli.config_options import ConfigCommand, config_parameters, config_values
+from cangauge.cli.declare import command
 from cangauge.cli.output import console, emit_json
 from cangauge.cli.status import live_text
 from cangauge.errors import CangaugeError
@@ -25,19 +24,8 @@ if TYPE_CHECKING:
 _LOG = logging.getLogger(__name__)
 
 
-@config_options()
-def run_command(
-    config: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="FILE.toml",
-            help="Configuration; its keys are in docs/configuration.md. Options given here take"
-            " precedence.",
-        ),
-    ] = None,
-    json_output: JsonOption = False,
-    **options: Any,
-) -> None:
+@command(keys=config_parameters)
+def run_command(*, config: Path | None = None, json_output: bool = False, **options: Any) -> None:
     """Estimate the state of charge from a bus, and publish it there.
 
     Publishes SOC_ESTIMATE (0x5A0) every 100 ms, and SOC_DETAIL (0x5A1), SOC_HEALTH (0x5A2),
@@ -62,6 +50,11 @@ def run_command(
     `cangauge run --config car.toml --state /var/lib/cangauge`
 
     `cangauge run --config car.toml --dashboard`  (the live page at http://127.0.0.1:8642/)
+
+    Parameters
+    ----------
+    config : FILE.toml
+        Configuration; its keys are in docs/configuration.md. Options given here take precedence.
     """
     from cangauge.service.config import load_config
     from cangauge.service.lifecycle import deadline_after_signal
@@ -85,6 +78,9 @@ def run_command(
             raise
         if json_output:
             emit_json(result)
+
+
+run_command.command_class = ConfigCommand  # type: ignore[attr-defined] # read by the app: --dashboard may stand without a value
 
 
 class _LiveLine(Output):

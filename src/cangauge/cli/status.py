@@ -6,8 +6,7 @@ import time
 from collections.abc import Callable
 from contextlib import ExitStack
 from functools import partial
-from pathlib import Path
-from typing import Annotated, Any, Final
+from typing import Any, Final
 
 import typer
 from rich.console import RenderableType
@@ -23,8 +22,8 @@ from cangauge._text import (
     uncertain,
     uncertain_energy,
 )
-from cangauge.cli.options import JsonOption
-from cangauge.cli.output import PlainConsole, emit_json, print_table, text_table
+from cangauge.cli.declare import command
+from cangauge.cli.output import PlainConsole, emit_json, print_values, values_table
 from cangauge.errors import CangaugeError, InputError
 from cangauge.types import REASON_WORDS, Reason
 
@@ -34,26 +33,9 @@ USABLE: Final = frozenset({"valid", "degraded"})
 _STYLE: Final = {"initialising": "yellow", "valid": "green", "degraded": "yellow", "invalid": "red"}
 
 
+@command()
 def status_command(
-    endpoint: Annotated[
-        str | None,
-        typer.Option(
-            metavar="PATH|URL",
-            help="Unix socket of the service, or http://HOST:PORT. Default: the service running on"
-            " this machine.",
-        ),
-    ] = None,
-    token_file: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="FILE",
-            help="File with the bearer token of an HTTP endpoint; or in CANGAUGE_HTTP_TOKEN.",
-        ),
-    ] = None,
-    watch: Annotated[
-        bool, typer.Option("--watch", help="Show it again every half second, until Ctrl-C.")
-    ] = False,
-    json_output: JsonOption = False,
+    *, endpoint: str | None = None, watch: bool = False, json_output: bool = False
 ) -> None:
     """Show the state of a running service: SoC ± standard deviation [%], frames, delays.
 
@@ -68,14 +50,22 @@ def status_command(
     `cangauge status --watch --endpoint http://127.0.0.1:9464`
 
     `cangauge status --endpoint /run/cangauge/can0/status.sock --json`
+
+    Parameters
+    ----------
+    endpoint : PATH|URL
+        Unix socket of the service, or http://HOST:PORT (with the bearer token in
+        CANGAUGE_HTTP_TOKEN). Default: the service running on this machine.
+    watch : --watch
+        Show it again every half second, until Ctrl-C.
     """
     from cangauge.service.status_client import NotRunningError
 
     if watch:
-        _watch(endpoint, token_file)
+        _watch(endpoint)
         return
     try:
-        place, status = _ask(endpoint, token_file)
+        place, status = _ask(endpoint)
     except NotRunningError as error:
         if json_output:
             emit_json({"running": False, "status": None, "problem": str(error)})
@@ -84,19 +74,19 @@ def status_command(
     if json_output:
         emit_json(status)
     else:
-        print_table(f"cangauge at {place}", ("", ""), status_rows(status))
+        print_values(f"cangauge at {place}", status_values(status))
     if status["status"] not in USABLE:
         raise typer.Exit(1)
 
 
-def _ask(endpoint: str | None, token_file: Path | None) -> tuple[str, dict[str, Any]]:
+def _ask(endpoint: str | None) -> tuple[str, dict[str, Any]]:
     from cangauge.service.status_client import fetch_status, find_socket
 
     place = endpoint or str(find_socket())
-    return place, fetch_status(place, token_file)
+    return place, fetch_status(place)
 
 
-def _watch(endpoint: str | None, token_file: Path | None) -> None:
+def _watch(endpoint: str | None) -> None:
     """Show the status until stopped, in lines where stdout is no terminal."""
     shown = PlainConsole(highlight=False)
     with ExitStack() as stack:
@@ -107,10 +97,10 @@ def _watch(endpoint: str | None, token_file: Path | None) -> None:
         while True:
             content: RenderableType
             try:
-                place, status = _ask(endpoint, token_file)
+                place, status = _ask(endpoint)
                 content = live_text(status)
                 if shown.is_terminal:
-                    content = text_table(f"cangauge at {place}", ("", ""), status_rows(status))
+                    content = values_table(f"cangauge at {place}", status_values(status))
             except InputError:
                 raise  # waiting does not mend it
             except CangaugeError as error:
@@ -137,83 +127,71 @@ def live_text(status: dict[str, Any]) -> Text:
     return text
 
 
-def status_rows(status: dict[str, Any]) -> list[tuple[str, str]]:
-    """Return the rows of name and value that show a status; none for what is not known yet."""
+def status_values(status: dict[str, Any]) -> dict[str, str]:
+    """Return names and values that show a status; a dash for what is not known yet."""
     estimate, sample = status["estimate"], status["sample"] or {}
-    frames, reasons = status["frames"], _words(status["reasons"])
+    frames, reasons, config = status["frames"], _words(status["reasons"]), status["config"]
     bus = (status["bus"], status["bus_trouble"], _counts(status["bus_counts"]) or "no errors")
-    rows = [
-        ("SoC", known_soc(estimate["soc_pct"], estimate["soc_std_pct"], 2)),
-        ("status", status["status"] + (f": {reasons}" if reasons else "")),
-        ("by voltage alone", number(estimate["soc_newton_pct"], 2, "%")),
-        ("by charge alone", number(estimate["soc_coulomb_pct"], 2, "%")),
-        ("current", number(sample.get("current_a"), 2, "A (positive = discharge)")),
-        ("voltage", number(sample.get("voltage_v"), 2, "V")),
-        ("residual", number(_times(estimate["residual_v"], 1e3), 0, "mV")),
-        ("temperature", number(sample.get("temperature_c"), 1, "°C")),
-        *_pack_rows(status),
-        ("latest sample", f"{number(sample.get('age_s'), 2, 's')} ago"),
-        ("samples", f"{status['samples']} ({number(status['samples_per_s'], 1, '/s')})"),
-        ("frames", ", ".join(f"{frames[name]} {name}" for name in ("received", "used", "lost"))),
-        ("rejected", _counts(status["rejects"]) or "none"),
-        ("bus", "; ".join(filter(None, bus))),
-        ("latency", _delay(status["latency"])),
-        ("processing time", _delay(status["step"])),
-    ]
-    if (record := status["record"]) is not None:
-        problem = f"; FAILING: {record['problem']}" if record["problem"] else ""
-        problem += "" if record["active"] else "; ended"
-        size = _size(record["written_bytes"])
-        text = f"{record['path']}: {record['frames']} frames, {size}"
-        rows.append(("recording", f"{text}, {record['lost_frames']} frames lost{problem}"))
-    if problem := status["config"]["problem"]:
-        rows.append(("configuration", f"the latest one is REFUSED, the old one stays: {problem}"))
-    elif status["config"]["reloading"]:
-        rows.append(("configuration", "reading a new one"))
-    if status["loop_stuck"]:
-        rows.insert(0, ("LOOP STUCK", "the receive loop hangs; restart the service"))
-    return [
-        *(row for row in rows if not row[1].startswith(NONE_KNOWN)),
-        ("vehicle", status["vehicle"]),
-        ("model", f"{status['model']} ({status['method']}, time: {status['time_source']})"),
-        (
-            "running for",
-            f"{duration(status['uptime_s'])}, cangauge {status['version']}, {status['core']} core",
-        ),
-    ]
+    stuck = "the receive loop hangs; restart the service"
+    refused = f"the latest one is REFUSED, the old one stays: {config['problem']}"
+    reading = "reading a new one" if config["reloading"] else NONE_KNOWN
+    uptime = duration(status["uptime_s"])
+    return {
+        "LOOP STUCK": stuck if status["loop_stuck"] else NONE_KNOWN,
+        "SoC": known_soc(estimate["soc_pct"], estimate["soc_std_pct"], 2),
+        "status": status["status"] + (f": {reasons}" if reasons else ""),
+        "by voltage alone": number(estimate["soc_newton_pct"], 2, "%"),
+        "by charge alone": number(estimate["soc_coulomb_pct"], 2, "%"),
+        "current": number(sample.get("current_a"), 2, "A (positive = discharge)"),
+        "voltage": number(sample.get("voltage_v"), 2, "V"),
+        "residual": number(_times(estimate["residual_v"], 1e3), 0, "mV"),
+        "temperature": number(sample.get("temperature_c"), 1, "°C"),
+        **pack_values(status),
+        **{f"NOTICE {k}": each for k, each in enumerate(status["notices"], start=1)},
+        "latest sample": number(sample.get("age_s"), 2, "s ago"),
+        "samples": f"{status['samples']} ({number(status['samples_per_s'], 1, '/s')})",
+        "frames": ", ".join(f"{frames[name]} {name}" for name in ("received", "used", "lost")),
+        "rejected": _counts(status["rejects"]) or "none",
+        "bus": "; ".join(filter(None, bus)),
+        "latency": _delay(status["latency"]),
+        "processing time": _delay(status["step"]),
+        "recording": _recording(status["record"]),
+        "configuration": refused if config["problem"] else reading,
+        "vehicle": status["vehicle"],
+        "model": f"{status['model']} ({status['method']}, time: {status['time_source']})",
+        "running for": f"{uptime}, cangauge {status['version']}, {status['core']} core",
+    }
 
 
-def _pack_rows(status: dict[str, Any]) -> list[tuple[str, str]]:
-    """Return the rows of health, power and cells, where known."""
-    health, power, cells = status["health"], status["power"], status["cells"]
-    rows = []
+def pack_values(report: dict[str, Any], down_to: str = "", up_to: str = "") -> dict[str, str]:
+    """Return names and values of health, power and cells, where known (`PackReport.to_dict`).
+
+    `down_to` and `up_to` follow the possible currents.
+    """
+    health, power, cells = report["health"], report["power"], report["cells"]
+    values = {}
     if health is not None:
-        ratio = (health["resistance_ratio"], health["resistance_std"])
-        rows += [
-            ("capacity", _with_std(health["capacity_ah"], health["capacity_std_ah"], "Ah")),
-            ("resistance", _with_std(*ratio, "× the model's", 2)),
-            ("current offset", number(health["offset_a"], 2, "A")),
-        ]
+        ratio, std = health["resistance_ratio"], health["resistance_std"]
+        values = {
+            "capacity": uncertain(health["capacity_ah"], health["capacity_std_ah"], "Ah"),
+            "resistance": uncertain(ratio, std, "× the model's"),
+            "current offset": number(health["offset_a"], 2, "A"),
+        }
     if power is not None:
-        rows += [
-            (f"possible {way}, 10 s", possible(power[f"{way}_a"], power[f"{way}_std_a"], "A"))
-            for way in ("discharge", "charge")
-        ]
-        energy = uncertain_energy(power["energy_wh"], power["energy_std_wh"])
-        rows.append(("energy left", energy))
+        for way, limit in (("discharge", down_to), ("charge", up_to)):
+            values[f"possible {way}, 10 s"] = possible(
+                power[f"{way}_a"], power[f"{way}_std_a"], f"A{limit}"
+            )
+        values["energy left"] = uncertain_energy(power["energy_wh"], power["energy_std_wh"])
     if cells is not None:
         weakest = "" if cells["weakest"] is None else f"number {cells['weakest']}: "
         less = uncertain(cells["sum_error_v"], cells["sum_std_v"], "V")
         spread = number(cells["spread_pct"], 1, "%")
-        rows += [
-            ("weakest cell", weakest + _with_std(cells["soc_pct"], cells["soc_std_pct"], "%")),
-            ("cells", f"{cells['cells']} known, spread {spread}; pack less their sum {less}"),
-        ]
-    return rows + [("NOTICE", each) for each in status["notices"]]
-
-
-def _with_std(value: float | None, std: float | None, unit: str, digits: int = 1) -> str:
-    return f"{number(value, digits)} ± {number(std, digits, unit)}"
+        values |= {
+            "weakest cell": weakest + uncertain(cells["soc_pct"], cells["soc_std_pct"], "%"),
+            "cells": f"{cells['cells']} known, spread {spread}; pack less their sum {less}",
+        }
+    return values
 
 
 def _words(reasons: list[str]) -> str:
@@ -232,8 +210,15 @@ def _delay(durations: dict[str, Any]) -> str:
     return f"median {p50}, 99 % {p99}"
 
 
-def _size(count: int) -> str:
-    return number(1e-3 * count, 0, "kB") if count < 1e6 else number(1e-6 * count, 1, "MB")
+def _recording(record: dict[str, Any] | None) -> str:
+    if record is None:
+        return NONE_KNOWN
+    size = record["written_bytes"]
+    shown = number(1e-3 * size, 0, "kB") if size < 1e6 else number(1e-6 * size, 1, "MB")
+    text = f"{record['path']}: {record['frames']} frames, {shown}"
+    text += f", {record['lost_frames']} frames lost"
+    text += f"; FAILING: {record['problem']}" if record["problem"] else ""
+    return text + ("" if record["active"] else "; ended")
 
 
 def _times(value: float | None, factor: float) -> float | None:

@@ -22,7 +22,6 @@ from pathlib import Path
 from typing import Any, Final, cast
 from urllib.parse import urlsplit
 
-from cangauge._files import read_bounded
 from cangauge._logging import emit
 from cangauge.errors import CangaugeError, InputError
 from cangauge.types import Reason, reason_name
@@ -185,15 +184,13 @@ def find_socket() -> Path:
     return found[0]
 
 
-def fetch_status(endpoint: str, token_file: Path | None = None) -> dict[str, Any]:
+def fetch_status(endpoint: str) -> dict[str, Any]:
     """Return the status of a service: the JSON object of `/status`.
 
     Parameters
     ----------
     endpoint : str
-        Path of a unix socket, or "http://host:port".
-    token_file : Path, optional
-        File with the token for HTTP; by default the environment's. A unix socket needs none.
+        Path of a unix socket, or "http://host:port", for which the token is the environment's.
 
     Raises
     ------
@@ -205,7 +202,7 @@ def fetch_status(endpoint: str, token_file: Path | None = None) -> dict[str, Any
         If the request is refused, or the answer is not a status.
     """
     try:
-        body = _get(endpoint, token_file) if "://" in endpoint else _read(endpoint)
+        body = _get(endpoint) if "://" in endpoint else _read(endpoint)
     except (OSError, http.client.HTTPException) as error:
         reason = getattr(error, "strerror", None) or str(error) or type(error).__name__
         text = f"{endpoint}: no service answers: {reason}"
@@ -230,10 +227,8 @@ def _read(path: str) -> bytes:
     return answer
 
 
-def _get(endpoint: str, token_file: Path | None) -> bytes:
+def _get(endpoint: str) -> bytes:
     token = os.environ.get("CANGAUGE_HTTP_TOKEN")
-    if token_file is not None:
-        token = read_bounded(token_file, 1024, "a token").decode("ascii", "replace").strip()
     headers = {} if token is None else {"Authorization": f"Bearer {token}"}
     try:
         parts = urlsplit(endpoint)

@@ -37,9 +37,9 @@ VALID = {
     "replay": ["absent.csv"],
     "inspect": ["absent.csv"],
     "twin": ["-o", "absent/out.csv"],
-    "export-c": ["absent.json", "-o", "out"],
-    "export-ecm": ["absent.json", "-o", "out.py"],
-    "export-fmu": ["absent.json", "-o", "out.fmu"],
+    "export-c": ["-m", "absent.json", "-o", "out"],
+    "export-ecm": ["-m", "absent.json", "-o", "out.py"],
+    "export-fmu": ["-m", "absent.json", "-o", "out.fmu"],
 }
 
 

@@ -11,14 +11,14 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import chain
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import typer
 
 from cangauge._files import check_writable, write_texts_atomic
 from cangauge._resources import shared_file
-from cangauge.cli.config_options import config_options, config_values
-from cangauge.cli.options import JsonOption, within
+from cangauge.cli.config_options import config_parameters, config_values
+from cangauge.cli.declare import command, within
 from cangauge.cli.output import console, emit_json, note, print_table, progress_shown
 from cangauge.errors import CangaugeError, InputError
 
@@ -42,45 +42,18 @@ _CLEARLY_NAMED: Final = 1.0
 """Distance in score of the first signal of a DBC that makes it clear: one matching word."""
 
 
-@config_options("interface", "channel", "bus_options")
+@command(keys=lambda: config_parameters("interface", "channel", "bus_options"))
 def init_command(
-    output: Annotated[
-        Path,
-        typer.Option("-o", "--output", metavar="DIR", help="Folder for car.toml and the others."),
-    ],
+    captures: list[Path] | None = None,
     *,
-    captures: Annotated[
-        list[Path] | None,
-        typer.Argument(
-            metavar="[CAPTURE]…", help="Captures of one car, of a drive.", show_default=False
-        ),
-    ] = None,
-    dbc: Annotated[
-        Path | None,
-        typer.Option("--dbc", metavar="FILE", help="DBC of the car: signals by name and unit."),
-    ] = None,
-    choose: Annotated[
-        list[str] | None,
-        typer.Option(
-            metavar="ROLE=N", help="Take candidate N for current, voltage, soc or temperature."
-        ),
-    ] = None,
-    nominal_voltage: Annotated[
-        float | None,
-        typer.Option(
-            metavar="V",
-            help="Voltage of the pack, nominal or as a meter shows it [V]: decides its scale.",
-            show_default=False,
-        ),
-    ] = None,
-    presets: Annotated[
-        bool, typer.Option("--presets/--no-presets", help="Look for known vehicles.")
-    ] = True,
-    seconds: Annotated[
-        float, typer.Option(metavar="S", help="Time to listen to a live bus [s].")
-    ] = 60.0,
-    force: Annotated[bool, typer.Option("--force", help="Overwrite existing files.")] = False,
-    json_output: JsonOption = False,
+    output: Path,
+    dbc: Path | None = None,
+    choose: list[str] | None = None,
+    nominal_voltage: float | None = None,
+    presets: bool = True,
+    seconds: float = 60.0,
+    force: bool = False,
+    json_output: bool = False,
     **options: Any,
 ) -> None:
     """Find the car's signals, check them against each other, and write a map and a configuration.
@@ -100,13 +73,29 @@ def init_command(
     `cangauge init drive.log --dbc car.dbc -o mycar`
 
     `cangauge init drive.log --choose current=2 -o mycar`
+
+    Parameters
+    ----------
+    captures : [CAPTURE]…
+        Captures of one car, of a drive.
+    output : -o, --output DIR
+        Folder for car.toml and the others.
+    dbc : FILE
+        DBC of the car: signals by name and unit.
+    choose : ROLE=N
+        Take candidate N for current, voltage, soc or temperature.
+    nominal_voltage : V (10 … 1500 V)
+        Voltage of the pack, nominal or as a meter shows it: decides its scale.
+    presets : --presets/--no-presets
+        Look for known vehicles.
+    seconds : S (1 … 86400 s)
+        Time to listen to a live bus.
+    force : --force
+        Overwrite existing files.
     """
     from cangauge.bus.open import bus_address
 
     picks = _picks(choose or [])
-    within(seconds, 1.0, 86400.0, option="--seconds", unit="s")
-    if nominal_voltage is not None:
-        within(nominal_voltage, 10.0, 1500.0, option="--nominal-voltage", unit="V")
     targets = _Targets(output / "car.toml", output / "run.toml", output / "car.dbc")
     targets.check(force=force)
     values = config_values(options)

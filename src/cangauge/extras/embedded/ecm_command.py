@@ -4,36 +4,30 @@ from __future__ import annotations
 
 from keyword import iskeyword
 from pathlib import Path
-from typing import Annotated
-
-import typer
 
 from cangauge._files import write_text_atomic
 from cangauge._text import number, significant
-from cangauge.cli.options import JsonOption, check_outputs, suffixed
+from cangauge.cli.declare import Written, command
+from cangauge.cli.options import check_outputs
 from cangauge.cli.output import emit_json, note, print_table
 from cangauge.errors import InputError
 
 
-def export_ecm_command(
-    model: Annotated[Path, typer.Argument(metavar="MODEL", help="Model file (JSON).")],
-    output: Annotated[
-        Path,
-        typer.Option(
-            "-o", "--output", metavar="FILE", callback=suffixed(".py", ".json"),
-            help=".py: a module with the parameters of PyBaMM's Thevenin model and of `thevenin`;"
-            " .json: the tables alone.",
-        ),
-    ],
-    json_output: JsonOption = False,
-) -> None:  # fmt: skip
+@command()
+def export_ecm_command(*, model: Path, output: Written, json_output: bool = False) -> None:
     """Write a model as an equivalent circuit: open-circuit voltage, R0 and RC pairs as tables.
 
     The RC pairs are fitted to the model's step response; the error of that fit is printed.
 
     Examples
     --------
-    `cangauge export-ecm pack.json -o pack_ecm.py`
+    `cangauge export-ecm -m pack.json -o pack_ecm.py`
+
+    Parameters
+    ----------
+    output : -o, --output FILE.py|.json
+        .py: a module with the parameters of PyBaMM's Thevenin model and of `thevenin`; .json: the
+        tables alone.
     """
     is_module = output.suffix.lower() == ".py"
     if is_module and (not output.stem.isidentifier() or iskeyword(output.stem)):

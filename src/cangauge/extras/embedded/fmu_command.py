@@ -3,33 +3,21 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, cast
+from typing import Literal, cast
 
-import typer
-
-from cangauge.cli.options import JsonOption, check_outputs, suffixed
+from cangauge.cli.declare import Written, command
+from cangauge.cli.options import check_outputs
 from cangauge.cli.output import emit_json, note
-from cangauge.errors import InputError
 
 
+@command()
 def export_fmu_command(
-    model: Annotated[Path, typer.Argument(metavar="MODEL", help="Model file (JSON).")],
-    output: Annotated[
-        Path,
-        typer.Option(
-            "-o", "--output", metavar="FILE.fmu", callback=suffixed(".fmu"), help="Unit to write."
-        ),
-    ],
-    kind: Annotated[
-        str,
-        typer.Option(
-            metavar="pack|estimator",
-            help="pack: current and temperature in, voltage and SoC out; estimator: voltage too in,"
-            " SoC, σ and status out.",
-        ),
-    ] = "pack",
-    fmi: Annotated[int, typer.Option(metavar="2|3", help="Version of the interface.")] = 3,
-    json_output: JsonOption = False,
+    *,
+    model: Path,
+    output: Written,
+    kind: Literal["pack", "estimator"] = "pack",
+    fmi: int = 3,
+    json_output: bool = False,
 ) -> None:
     """Write a model as a functional mock-up unit (FMI 2.0 or 3.0, co-simulation).
 
@@ -37,20 +25,26 @@ def export_fmu_command(
 
     Examples
     --------
-    `cangauge export-fmu pack.json -o pack.fmu`
+    `cangauge export-fmu -m pack.json -o pack.fmu`
 
-    `cangauge export-fmu pack.json -o estimator.fmu --kind estimator --fmi 2`
+    `cangauge export-fmu -m pack.json -o estimator.fmu --kind estimator --fmi 2`
+
+    Parameters
+    ----------
+    output : -o, --output FILE.fmu
+        Unit to write.
+    kind : pack|estimator
+        pack: current and temperature in, voltage and SoC out; estimator: voltage too in, SoC, σ and
+        status out.
+    fmi : 2|3 (2 … 3)
+        Version of the interface.
     """
-    if kind not in {"pack", "estimator"}:
-        raise InputError("neither pack nor estimator", field="--kind", value=kind)
-    if fmi not in {2, 3}:
-        raise InputError("neither 2 nor 3", field="--fmi", value=fmi)
     check_outputs([output], [model])
     # Deferred, so that the help page does not wait for numpy and scipy.
-    from cangauge.extras.embedded.fmu import Kind, Version, export_fmu
+    from cangauge.extras.embedded.fmu import Version, export_fmu
     from cangauge.model.model_file import Model
 
-    export_fmu(Model.load(model), output, kind=cast("Kind", kind), version=cast("Version", fmi))
+    export_fmu(Model.load(model), output, kind=kind, version=cast("Version", fmi))
     if json_output:
         emit_json({"output": str(output), "kind": kind, "fmi": fmi})
         return

@@ -7,25 +7,14 @@ from collections.abc import Callable, Iterable, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
+from typing import TYPE_CHECKING, Any, Final, Literal
 
 import typer
 
 from cangauge._files import file_sha256, write_texts_atomic
 from cangauge._text import counted, number, significant
-from cangauge.cli.options import (
-    ALARM,
-    AlarmOption,
-    CapacityOption,
-    JsonOption,
-    ModelOption,
-    ReadingOptions,
-    ReportOption,
-    check_outputs,
-    option_groups,
-    suffixed,
-    within,
-)
+from cangauge.cli.declare import Written, command
+from cangauge.cli.options import ALARM, ReadingOptions, check_outputs
 from cangauge.cli.output import console, emit_json, note, print_table, progress_shown
 from cangauge.errors import InputError
 from cangauge.extras.fleet import LOCAL, LOGS, REFERENCES, VEHICLE_PATTERN
@@ -47,46 +36,28 @@ fleet_app: Final = typer.Typer(
     context_settings={"help_option_names": ["-h", "--help"]},
 )  # fmt: skip
 
-LogsArgument = Annotated[
-    list[str],
-    typer.Argument(
-        metavar="LOGS",
-        help="Logs or captures: paths or URLs with * and **, or a manifest (CSV with the columns"
-        " log, vehicle, start, initial_soc_pct, healthy).",
-    ),
-]
-OutOption = Annotated[
-    str,
-    typer.Option(
-        "-o", "--output", metavar="OUT",
-        help="Folder or URL of the results: Parquet, one row a log, by vehicle. Logs that it holds"
-        " with the same model and options are skipped.",
-    ),
-]  # fmt: skip
 
-
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Cluster:
-    """The options of every fleet command: what computes, and how logs name their vehicles."""
+    """The options of every fleet command: where results go, what computes, how logs are named.
 
-    scheduler: Annotated[
-        str,
-        typer.Option(
-            metavar="ADDRESS|local",
-            help="Dask scheduler (tcp://10.0.0.5:8786), or this machine.",
-        ),
-    ] = LOCAL
-    workers: Annotated[
-        int | None,
-        typer.Option(metavar="N", help="Worker processes of `local`. Default: one a core."),
-    ] = None
-    pattern: Annotated[
-        str,
-        typer.Option(
-            "--vehicle-pattern", metavar="REGEX",
-            help="The first group finds the vehicle in the name of a log. Default: its folder.",
-        ),
-    ] = VEHICLE_PATTERN  # fmt: skip
+    Parameters
+    ----------
+    out : -o, --output OUT
+        Folder or URL of the results: Parquet, one row a log, by vehicle. Logs that it holds with
+        the same model and options are skipped.
+    scheduler : ADDRESS|local
+        Dask scheduler (tcp://10.0.0.5:8786), or this machine.
+    workers : N (1 … 1024)
+        Worker processes of `local`. Default: one a core.
+    pattern : --vehicle-pattern REGEX
+        The first group finds the vehicle in the name of a log. Default: its folder.
+    """
+
+    out: str
+    scheduler: str = LOCAL
+    workers: int | None = None
+    pattern: str = VEHICLE_PATTERN
 
     def find(self, logs: Sequence[str]) -> list[FleetLog]:
         """Return the logs that paths, globs and manifests name (`find_logs`)."""
@@ -98,8 +69,6 @@ class Cluster:
         """Return what a function of the Dask client returns; show its progress."""
         from cangauge.extras.fleet.run import connected
 
-        workers = None if self.workers is None else float(self.workers)
-        within(workers, 1, 1024, option="--workers", unit="")
         shown: AbstractContextManager[Any] = nullcontext()
         if console.is_terminal:
             shown = console.status("starting")
@@ -116,7 +85,8 @@ def fleet_command() -> None:
 
     Each log is a task of a Dask scheduler. Results are Parquet files by vehicle: a run that is
     repeated or killed continues where it was, and logs that cannot be read are set aside with the
-    reason. Needs the extra `fleet`.
+    reason. LOGS are paths or URLs with * and **, or a manifest: CSV with the columns log, vehicle,
+    start, initial_soc_pct, healthy. Needs the extra `fleet`.
     """
 
 
@@ -124,41 +94,20 @@ fleet_command.group = fleet_app  # type: ignore[attr-defined] # read by the app
 
 
 @fleet_app.command("fit")
-@option_groups("sign", "temperature")
+@command("sign", "temperature")
 def fit_fleet_command(
-    logs: LogsArgument,
-    output: Annotated[
-        Path,
-        typer.Option(
-            "-m",
-            "--model",
-            metavar="MODEL.json",
-            callback=suffixed(".json"),
-            help="Model file to write.",
-        ),
-    ],
-    out: OutOption,
-    capacity_ah: Annotated[
-        float, typer.Option(metavar="A", help="Charge from 100 to 0 % [Ah], e.g. 51.5.")
-    ],
+    logs: list[str],
     *,
+    model: Written,
+    capacity_ah: float,
     cluster: Cluster,
-    rate_hz: Annotated[
-        float, typer.Option(metavar="HZ", help="Rate of the fit [Hz]; faster logs are decimated.")
-    ] = 1.0,
-    chemistry: Annotated[
-        Literal["oxide", "lfp"], typer.Option(help="Chemistry of the cells.")
-    ] = "oxide",
-    cells: Annotated[int | None, typer.Option(metavar="N", min=1, help="Cells in series.")] = None,
-    leave_out: Annotated[
-        list[str] | None,
-        typer.Option(
-            metavar="LOGS", help="Those of LOGS that are not fitted, as LOGS; repeat the option."
-        ),
-    ] = None,
+    rate_hz: float = 1.0,
+    chemistry: Literal["oxide", "lfp"] = "oxide",
+    cells: int | None = None,
+    leave_out: list[str] | None = None,
     reading: ReadingOptions,
-    report: ReportOption = None,
-    json_output: JsonOption = False,
+    report: Written | None = None,
+    json_output: bool = False,
 ) -> None:
     """Identify one model from all logs: the fit of `cangauge fit`.
 
@@ -168,33 +117,48 @@ def fit_fleet_command(
     Examples
     --------
     `cangauge fleet fit 'logs/*/*.parquet' -m type.json -o results --capacity-ah 51.5`
+
+    Parameters
+    ----------
+    logs : LOGS
+        Logs, captures or a manifest.
+    model : -m, --model MODEL.json
+        Model file to write.
+    capacity_ah : A (0.001 … 1e5 Ah)
+        Charge from 100 to 0 %, e.g. 51.5.
+    rate_hz : HZ (0.01 … 1000 Hz)
+        Rate of the fit; faster logs are decimated.
+    chemistry : oxide|lfp
+        Chemistry of the cells.
+    cells : N (1 … 2000)
+        Cells in series.
+    leave_out : LOGS
+        Those of LOGS that are not fitted, as LOGS; repeat the option.
     """
     from cangauge.extras.fleet.fit import SumsJob, fit_fleet
 
-    within(capacity_ah, 1e-3, 1e5, option="--capacity-ah", unit="Ah")
-    within(rate_hz, 0.01, 1000.0, option="--rate-hz", unit="Hz")
     job = SumsJob(_read_options(reading), capacity_ah, chemistry, cells, rate_hz)
     found, left_out = cluster.find(logs), cluster.find(leave_out or [])
-    _check_outputs([output, report], found, *map(Path, logs))
+    _check_outputs([model, report], found, *map(Path, logs))
     for log in left_out:
         if log.url not in {other.url for other in found}:
             raise InputError(
                 "is not among LOGS", source=log.url, field="--leave-out", cure="check its path"
             )
     fitted = [log for log in found if log.url not in {other.url for other in left_out}]
-    result = cluster.run(lambda client: fit_fleet(job, fitted, out, client))
-    texts = {output: result.model.to_json()}
+    result = cluster.run(lambda client: fit_fleet(job, fitted, cluster.out, client))
+    texts = {model: result.model.to_json()}
     if report is not None:
         from cangauge.extras.report.fleet import fleet_fit_report
 
         texts[report] = fleet_fit_report(result)
     write_texts_atomic(texts)
     if json_output:
-        written = {"model": str(output), "output": out, "report": report and str(report)}
+        written = {"model": str(model), "output": cluster.out, "report": report and str(report)}
         emit_json(result.to_dict() | written)
         return
     _show_fit(result)
-    note(f"model: {output}" + (f"\nreport: {report}" if report else ""))
+    note(f"model: {model}" + (f"\nreport: {report}" if report else ""))
 
 
 def _show_fit(result: FleetFit) -> None:
@@ -240,17 +204,16 @@ def _show_fit(result: FleetFit) -> None:
 
 
 @fleet_app.command("estimate")
-@option_groups("sign", "temperature")
+@command("sign", "temperature")
 def estimate_fleet_command(
-    logs: LogsArgument,
-    model: ModelOption,
-    out: OutOption,
+    logs: list[str],
     *,
+    model: Path,
     cluster: Cluster,
-    capacity_ah: CapacityOption = None,
+    capacity_ah: float | None = None,
     reading: ReadingOptions,
-    report: ReportOption = None,
-    json_output: JsonOption = False,
+    report: Written | None = None,
+    json_output: bool = False,
 ) -> None:
     """Estimate the state of charge of every log, with its error where the log has SoC.
 
@@ -258,25 +221,29 @@ def estimate_fleet_command(
     --------
     `cangauge fleet estimate 's3://drives/*/*.parquet' -m type.json -o s3://results/may
     --scheduler tcp://10.0.0.5:8786`
+
+    Parameters
+    ----------
+    logs : LOGS
+        Logs, captures or a manifest.
     """
     from cangauge.extras.fleet.jobs import EstimateJob, by_log
 
     job, found = _job(EstimateJob, logs, model, cluster, reading, report, capacity_ah)
-    _run(job, by_log(found), found, out, cluster, report, json_output=json_output)
+    _run(job, by_log(found), found, cluster, report, json_output=json_output)
 
 
 @fleet_app.command("health")
-@option_groups("sign", "temperature")
+@command("sign", "temperature")
 def health_fleet_command(
-    logs: LogsArgument,
-    model: ModelOption,
-    out: OutOption,
+    logs: list[str],
     *,
+    model: Path,
     cluster: Cluster,
-    capacity_ah: CapacityOption = None,
+    capacity_ah: float | None = None,
     reading: ReadingOptions,
-    report: ReportOption = None,
-    json_output: JsonOption = False,
+    report: Written | None = None,
+    json_output: bool = False,
 ) -> None:
     """Follow capacity and resistance of each vehicle over its logs, and find outliers.
 
@@ -285,11 +252,16 @@ def health_fleet_command(
     Examples
     --------
     `cangauge fleet health manifest.csv -m type.json -o results --report fleet.html`
+
+    Parameters
+    ----------
+    logs : LOGS
+        Logs, captures or a manifest.
     """
     from cangauge.extras.fleet.jobs import HealthJob, by_vehicle
 
     job, found = _job(HealthJob, logs, model, cluster, reading, report, capacity_ah)
-    _run(job, by_vehicle(found), found, out, cluster, report, json_output=json_output)
+    _run(job, by_vehicle(found), found, cluster, report, json_output=json_output)
 
 
 def _job(  # noqa: PLR0917 - as the two commands have them
@@ -311,31 +283,19 @@ def _job(  # noqa: PLR0917 - as the two commands have them
 
 
 @fleet_app.command("gap")
-@option_groups("sign", "temperature")
-def gap_fleet_command(  # noqa: PLR0917 - typer passes options by name
-    logs: LogsArgument,
-    model: ModelOption,
-    out: OutOption,
-    reference: Annotated[
-        list[str] | None,
-        typer.Option(
-            metavar="LOGS",
-            help="Logs without a fault, of any vehicles of the type; repeat the option. Or the"
-            " column healthy of a manifest.",
-        ),
-    ] = None,
-    references: Annotated[
-        int, typer.Option(metavar="N", help="References at most of vehicles without own ones.")
-    ] = REFERENCES,
-    latest: Annotated[
-        int, typer.Option(metavar="N", help="Latest logs of a vehicle, diagnosed together.")
-    ] = LOGS,
-    alarm: AlarmOption = ALARM,
+@command("sign", "temperature")
+def gap_fleet_command(
+    logs: list[str],
     *,
+    model: Path,
+    reference: list[str] | None = None,
+    references: int = REFERENCES,
+    latest: int = LOGS,
+    alarm: float = ALARM,
     cluster: Cluster,
     reading: ReadingOptions,
-    report: ReportOption = None,
-    json_output: JsonOption = False,
+    report: Written | None = None,
+    json_output: bool = False,
 ) -> None:
     """Diagnose each vehicle against references of the whole fleet.
 
@@ -346,20 +306,29 @@ def gap_fleet_command(  # noqa: PLR0917 - typer passes options by name
     --------
     `cangauge fleet gap 'may/*/*.parquet' --reference 'april/*/*.parquet' -m type.json -o results
     --report fleet.html`
+
+    Parameters
+    ----------
+    logs : LOGS
+        Logs, captures or a manifest.
+    reference : LOGS
+        Logs without a fault, of any vehicles of the type; repeat the option. Or the column healthy
+        of a manifest.
+    references : N (1 … 1000)
+        References at most of vehicles without own ones.
+    latest : N (1 … 1000)
+        Latest logs of a vehicle, diagnosed together.
     """
     from cangauge.extras.fleet.gap import GapJob
     from cangauge.model.model_file import Model
 
-    within(float(references), 1, 1000, option="--references", unit="")
-    within(float(latest), 1, 1000, option="--latest", unit="")
-    within(alarm, 0.0, 1.0, option="--alarm", unit="")
     known = {log.url: replace(log, healthy=True) for log in cluster.find(reference or [])}
     among = [known.pop(log.url, log) for log in cluster.find(logs)] + [*known.values()]
     _check_outputs([report], among, model, *map(Path, [*logs, *(reference or [])]))
     job, tasks = GapJob(_read_options(reading), Model.load(model), references, alarm).of_fleet(
         [log for log in among if not log.healthy], [log for log in among if log.healthy], latest
     )
-    _run(job, tasks, among, out, cluster, report, json_output=json_output)
+    _run(job, tasks, among, cluster, report, json_output=json_output)
 
 
 def _read_options(reading: ReadingOptions) -> ReadOptions:
@@ -379,11 +348,10 @@ def _read_options(reading: ReadingOptions) -> ReadOptions:
     )
 
 
-def _run(  # noqa: PLR0917 - as the commands have them
+def _run(
     job: Job,
     tasks: Sequence[Task],
     among: Sequence[FleetLog],
-    out: str,
     cluster: Cluster,
     report: Path | None,
     *,
@@ -394,20 +362,20 @@ def _run(  # noqa: PLR0917 - as the commands have them
     from cangauge.extras.fleet.results import Results
     from cangauge.extras.fleet.run import run_job
 
-    results = Results(out, job.kind, job.columns)
+    results = Results(cluster.out, job.kind, job.columns)
     summary = cluster.run(lambda client: run_job(job, tasks, results, client))
-    found = FleetOverview.read(out, among)
+    found = FleetOverview.read(cluster.out, among)
     if report is not None:
         from cangauge.extras.report.fleet import fleet_report
 
         write_texts_atomic({report: fleet_report(found)})
     if json_output:
-        written = {"output": out, "report": report and str(report)}
+        written = {"output": cluster.out, "report": report and str(report)}
         emit_json(vars(summary) | found.to_dict() | written)
     else:
         _show(summary, found)
     if not summary.done + summary.skipped:
-        note(f"error: no result; the reasons are in {out}/{job.kind}-bad")
+        note(f"error: no result; the reasons are in {cluster.out}/{job.kind}-bad")
         raise typer.Exit(1)
 
 

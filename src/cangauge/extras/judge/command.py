@@ -6,91 +6,36 @@ import math
 from collections.abc import Sequence
 from contextlib import ExitStack, nullcontext
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, cast
+from typing import TYPE_CHECKING, Literal
 
 import typer
 
 from cangauge._files import atomic_path, write_texts_atomic
 from cangauge._text import number, printable
-from cangauge.cli.options import (
-    JsonOption,
-    ReadingOptions,
-    ReportOption,
-    check_outputs,
-    option_groups,
-    suffixed,
-    within,
-)
+from cangauge.cli.declare import Written, command
+from cangauge.cli.options import ReadingOptions, check_outputs
 from cangauge.cli.output import console, emit_json, note, print_table
 from cangauge.errors import InputError
 
 if TYPE_CHECKING:
     from cangauge.extras.judge.judgement import Judgement
-    from cangauge.model.prior import ChemistryName
 
 
-@option_groups()
-def judge_command(  # noqa: PLR0917 - typer passes options by name
-    logs: Annotated[
-        list[str],
-        typer.Argument(
-            metavar="LOG", help="Logs or captures in order of time, with the published SoC."
-        ),
-    ],
-    model: Annotated[
-        Path | None, typer.Option("-m", "--model", metavar="MODEL", help="Model file of the pack.")
-    ] = None,
-    chemistry: Annotated[
-        str | None,
-        typer.Option(metavar="oxide|lfp", help="Without a model: the cells' chemistry, …"),
-    ] = None,
-    cells: Annotated[
-        int | None, typer.Option(metavar="N", help="… and how many are in series.")
-    ] = None,
-    capacity_ah: Annotated[
-        float | None,
-        typer.Option(
-            metavar="A",
-            help="Charge from 100 to 0 % that the gauge should count with [Ah]. Default: the"
-            " model's; without a model, from the gauge's own count.",
-        ),
-    ] = None,
-    output: Annotated[
-        Path | None,
-        typer.Option(
-            "-o",
-            "--output",
-            metavar="MODEL.json",
-            callback=suffixed(".json"),
-            help="Write the model, narrowed by these logs.",
-        ),
-    ] = None,
-    corrected: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="FILE",
-            callback=suffixed(".csv", ".parquet"),
-            help="Write published and corrected SoC of every row, .csv or .parquet.",
-        ),
-    ] = None,
-    suite: Annotated[
-        bool,
-        typer.Option(
-            "--suite", help="Play drives with faults to the gauge that is started by LOG …"
-        ),
-    ] = False,
-    data: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="FOLDER",
-            help="With --suite: recorded logs of the model's pack, with their true SoC, in place of"
-            " the simulated ones.",
-        ),
-    ] = None,
+@command()
+def judge_command(
+    logs: list[str],
     *,
+    model: Path | None = None,
+    chemistry: Literal["oxide", "lfp"] | None = None,
+    cells: int | None = None,
+    capacity_ah: float | None = None,
+    output: Written | None = None,
+    corrected: Written | None = None,
+    suite: bool = False,
+    data: Path | None = None,
     reading: ReadingOptions,
-    report: ReportOption = None,
-    json_output: JsonOption = False,
+    report: Written | None = None,
+    json_output: bool = False,
 ) -> None:
     """Judge the SoC that a battery gauge publishes: is it right, since when not, and why.
 
@@ -114,6 +59,27 @@ def judge_command(  # noqa: PLR0917 - typer passes options by name
 
     `cangauge judge --suite -- cangauge run --interface {interface} --channel {channel} --bus-option
     port={port} -m {model} --initial-soc {soc} --time-source replay-clock`
+
+    Parameters
+    ----------
+    logs : LOG
+        Logs or captures in order of time, with the published SoC.
+    chemistry : oxide|lfp
+        Without a model: the cells' chemistry, …
+    cells : N (1 … 2000)
+        … and how many are in series.
+    capacity_ah : A (0.001 … 1e5 Ah)
+        Charge from 100 to 0 % that the gauge should count with. Default: the model's; without a
+        model, from the gauge's own count.
+    output : -o, --output MODEL.json
+        Write the model, narrowed by these logs.
+    corrected : FILE.csv|.parquet
+        Write published and corrected SoC of every row.
+    suite : --suite
+        Play drives with faults to the gauge that is started by LOG …
+    data : FOLDER
+        With --suite: recorded logs of the model's pack, with their true SoC, in place of the
+        simulated ones.
     """
     from cangauge.extras.judge.judgement import judge, narrowed
     from cangauge.logs.read import read_cells
@@ -125,8 +91,6 @@ def judge_command(  # noqa: PLR0917 - typer passes options by name
     if data is not None:
         raise InputError("belongs to --suite", field="--data", cure="give the logs themselves")
     paths = [Path(log) for log in logs]
-    within(capacity_ah, 1e-3, 1e5, option="--capacity-ah", unit="Ah")
-    within(None if cells is None else float(cells), 1, 2000, option="--cells", unit="")
     check_outputs([output, corrected, report], [*paths, *([model] if model else [])])
     loaded = [reading.load(path) for path in paths]
     columns = reading.given_columns()
@@ -134,7 +98,7 @@ def judge_command(  # noqa: PLR0917 - typer passes options by name
     judgement = judge(
         loaded,
         None if model is None else Model.load(model),
-        chemistry=_chemistry(chemistry),
+        chemistry=chemistry,
         cells=cells,
         capacity_ah=capacity_ah,
         cell_voltages=beside,
@@ -161,7 +125,7 @@ def judge_command(  # noqa: PLR0917 - typer passes options by name
 
 
 def _suite(
-    command: Sequence[str], model: Path | None, data: Path | None, *, json_output: bool
+    started_by: Sequence[str], model: Path | None, data: Path | None, *, json_output: bool
 ) -> None:
     """Play the suite to a gauge, and print its score card."""
     from cangauge.extras.judge.suite import recorded_drives, run_suite, simulated_drives
@@ -176,9 +140,9 @@ def _suite(
             if model is None or data is None
             else recorded_drives(sorted(data.iterdir()), Model.load(model))
         )
-        scores = run_suite(command, drives, show=show)
+        scores = run_suite(started_by, drives, show=show)
     if json_output:
-        gauge = " ".join(command)
+        gauge = " ".join(started_by)
         emit_json({"schema": 1, "gauge": gauge, "scores": [each.to_dict() for each in scores]})
         return
     rows = [
@@ -198,14 +162,6 @@ def _suite(
         "silent [%]",
     ]  # fmt: skip
     print_table(f"{len(drives)} drives", head, rows)
-
-
-def _chemistry(given: str | None) -> ChemistryName | None:
-    if given not in {None, "oxide", "lfp"}:
-        raise InputError(
-            "not a known chemistry", field="--chemistry", value=given, cure="use oxide or lfp"
-        )
-    return cast("ChemistryName | None", given)
 
 
 def _write_corrected(path: Path, judgement: Judgement) -> None:

@@ -3,40 +3,25 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
 
 import typer
 
-from cangauge.cli.options import JsonOption, ReadingOptions, assumed_of, option_groups, within
+from cangauge.cli.declare import command
+from cangauge.cli.options import ReadingOptions, assumed_of
 from cangauge.cli.output import emit_json, note, print_table, progress_shown
 from cangauge.errors import InputError
 
 
-@option_groups("sign")
+@command("sign")
 def gap_check_command(
-    logs: Annotated[
-        list[Path] | None,
-        typer.Argument(
-            metavar="[LOG]…",
-            help="Your own logs without a fault, four at least. Default: a simulated pack.",
-        ),
-    ] = None,
-    capacity_ah: Annotated[
-        float | None,
-        typer.Option(
-            metavar="A", help="Charge of the logs' pack from 100 to 0 % [Ah]; needed with LOGs."
-        ),
-    ] = None,
-    cells: Annotated[
-        int, typer.Option(metavar="N", min=1, help="Cells in series of the logs' pack.")
-    ] = 96,
-    at_most: Annotated[
-        int | None, typer.Option(metavar="N", min=1, help="Leave out at most this many logs.")
-    ] = None,
-    seed: Annotated[int, typer.Option(metavar="N", min=0, help="Of the simulated pack.")] = 1,
+    logs: list[Path] | None = None,
     *,
+    capacity_ah: float | None = None,
+    cells: int = 96,
+    at_most: int | None = None,
+    seed: int = 1,
     reading: ReadingOptions,
-    json_output: JsonOption = False,
+    json_output: bool = False,
 ) -> None:
     """Measure what `gap` would find: every effect injected into healthy logs of a pack.
 
@@ -49,6 +34,19 @@ def gap_check_command(
     `cangauge gap-check mine/*.csv --capacity-ah 60 --cells 96`
 
     `cangauge gap-check --seed 3 --at-most 2`
+
+    Parameters
+    ----------
+    logs : [LOG]…
+        Your own logs without a fault, four at least. Default: a simulated pack.
+    capacity_ah : A (0.001 … 1e5 Ah)
+        Charge of the logs' pack from 100 to 0 %; needed with LOGs.
+    cells : N (1 … 2000)
+        Cells in series of the logs' pack.
+    at_most : N (1 … inf)
+        Leave out at most this many logs.
+    seed : N (0 … inf)
+        Of the simulated pack.
     """
     from cangauge.extras.validation.gap_check import (
         PER_LOG,
@@ -58,7 +56,6 @@ def gap_check_command(
         table,
     )
 
-    within(capacity_ah, 1e-3, 1e5, option="--capacity-ah", unit="Ah")
     if logs:
         if capacity_ah is None:
             raise InputError(

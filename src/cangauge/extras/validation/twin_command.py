@@ -5,106 +5,35 @@ from __future__ import annotations
 import json
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, cast
-
-import typer
+from typing import Any, Literal
 
 from cangauge._files import write_text_atomic
-from cangauge.cli.options import JsonOption, check_outputs, suffixed, within
+from cangauge.cli.declare import Written, command
+from cangauge.cli.options import check_outputs
 from cangauge.cli.output import console, emit_json, note, print_table
 from cangauge.errors import InputError
 
-if TYPE_CHECKING:
-    from cangauge.extras.validation.twin.simulation import PlantName
 
-
-def twin_command(  # noqa: PLR0917 - typer passes options by name
-    output: Annotated[
-        Path | None,
-        typer.Option(
-            "-o",
-            "--output",
-            metavar="LOG",
-            callback=suffixed(".parquet", ".pq", ".csv", ".bdf"),
-            help="Log to write: .parquet or .csv.",
-        ),
-    ] = None,
-    seed: Annotated[
-        int, typer.Option(metavar="N", min=0, help="Selects the pack. Same seed, same log.")
-    ] = 0,
-    effect: Annotated[
-        list[str] | None,
-        typer.Option(
-            metavar="ID[:parameter=value,…]",
-            help="Fault of the pack or its sensors; repeat for several. `gap_v=V` in place of a"
-            " size: the size that opens this RMS gap. Default: a gap of 0.3 % of the pack voltage.",
-        ),
-    ] = None,
-    day: Annotated[
-        int, typer.Option(metavar="N", min=1, help="Number of the drive, with its weather.")
-    ] = 1,
-    hours: Annotated[
-        float | None, typer.Option(metavar="H", help="Duration [h]. Default: 0.5 to 2.5, drawn.")
-    ] = None,
-    ambient_c: Annotated[
-        float | None,
-        typer.Option(metavar="C", help="Ambient temperature [°C]. Default: −10 to 35, drawn."),
-    ] = None,
-    start_soc: Annotated[
-        float | None, typer.Option(metavar="P", help="Initial SoC [%]. Default: drawn.")
-    ] = None,
-    end_soc: Annotated[
-        float | None, typer.Option(metavar="P", help="SoC at which the drive ends [%].")
-    ] = None,
-    discharge: Annotated[
-        bool,
-        typer.Option(
-            "--discharge",
-            help="Drive from full to empty within the hours (default 2.5 h): a log for `fit`.",
-        ),
-    ] = False,
-    speed: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="FILE", help="Driving schedule: CSV of time [s] and speed [m/s], repeated."
-        ),
-    ] = None,
-    pack: Annotated[
-        str | None,
-        typer.Option(
-            metavar="KIND",
-            help="leaf24, leaf40, car60, car60lfp, compact or module12. Default: drawn.",
-        ),
-    ] = None,
-    chemistry: Annotated[
-        str | None, typer.Option(metavar="NAME", help="nmc, lmo, nca or lfp.")
-    ] = None,
-    plant: Annotated[
-        str,
-        typer.Option(
-            metavar="twin|equation|published|pybamm",
-            help="Model of the cells; pybamm needs the extra cangauge[pybamm].",
-        ),
-    ] = "twin",
-    soc: Annotated[
-        str,
-        typer.Option(
-            metavar="full|start",
-            help="soc_pct of the log: assumed initial SoC, then the true SoC; or the former alone.",
-        ),
-    ] = "full",
-    truth: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="FILE.json",
-            callback=suffixed(".json"),
-            help="Write the truth to this file too.",
-        ),
-    ] = None,
-    list_effects: Annotated[
-        bool, typer.Option("--list", help="List the effects and their parameters.")
-    ] = False,
-    json_output: JsonOption = False,
+@command()
+def twin_command(
+    *,
+    output: Written | None = None,
+    seed: int = 0,
+    effect: list[str] | None = None,
+    day: int = 1,
+    hours: float | None = None,
+    ambient_c: float | None = None,
+    start_soc: float | None = None,
+    end_soc: float | None = None,
+    discharge: bool = False,
+    speed: Path | None = None,
+    pack: str | None = None,
+    chemistry: str | None = None,
+    plant: Literal["twin", "equation", "published", "pybamm"] = "twin",
+    soc: Literal["full", "start"] = "full",
+    truth: Written | None = None,
+    list_effects: bool = False,
+    json_output: bool = False,
 ) -> None:
     """Simulate a pack, a drive, the weather and the sensors: a log whose truth is known.
 
@@ -121,6 +50,42 @@ def twin_command(  # noqa: PLR0917 - typer passes options by name
     `cangauge twin --seed 1 --day 3 --effect weak_cell:gap_v=1 --ambient-c -5 -o cold.csv`
 
     `cangauge twin --list`
+
+    Parameters
+    ----------
+    output : -o, --output LOG.parquet|.pq|.csv|.bdf
+        Log to write.
+    seed : N (0 … inf)
+        Selects the pack. Same seed, same log.
+    effect : ID[:parameter=value,…]
+        Fault of the pack or its sensors; repeat for several. `gap_v=V` in place of a size: the size
+        that opens this RMS gap. Default: a gap of 0.3 % of the pack voltage.
+    day : N (1 … inf)
+        Number of the drive, with its weather.
+    hours : H (0.05 … 12 h)
+        Duration. Default: 0.5 to 2.5, drawn.
+    ambient_c : C (-30 … 50 °C)
+        Ambient temperature. Default: -10 to 35, drawn.
+    start_soc : P (0 … 100 %)
+        Initial SoC. Default: drawn.
+    end_soc : P (0 … 100 %)
+        SoC at which the drive ends.
+    discharge : --discharge
+        Drive from full to empty within the hours (default 2.5 h): a log for `fit`.
+    speed : FILE
+        Driving schedule: CSV of time [s] and speed [m/s], repeated.
+    pack : KIND
+        leaf24, leaf40, car60, car60lfp, compact or module12. Default: drawn.
+    chemistry : NAME
+        nmc, lmo, nca or lfp.
+    plant : twin|equation|published|pybamm
+        Model of the cells; pybamm needs the extra cangauge[pybamm].
+    soc : full|start
+        soc_pct of the log: assumed initial SoC, then the true SoC; or the former alone.
+    truth : FILE.json
+        Write the truth to this file too.
+    list_effects : --list
+        List the effects and their parameters.
     """
     from cangauge.extras.validation.twin.drive import read_speed
     from cangauge.extras.validation.twin.simulation import simulate
@@ -131,8 +96,6 @@ def twin_command(  # noqa: PLR0917 - typer passes options by name
         return
     if output is None:
         raise InputError("no log to write", field="-o", cure="name a .parquet or a .csv file")
-    if soc not in {"full", "start"}:
-        raise InputError("unknown choice", field="--soc", value=soc, cure="use full or start")
     check_outputs([output, truth], [speed] if speed is not None else [])
     began = time.perf_counter()
     with console.status("simulating"):
@@ -140,15 +103,15 @@ def twin_command(  # noqa: PLR0917 - typer passes options by name
             effect or (),
             seed=seed,
             drive=day,
-            hours=within(hours, 0.05, 12.0, option="--hours", unit="h"),
-            ambient_c=within(ambient_c, -30.0, 50.0, option="--ambient-c", unit="°C"),
-            start_soc_pct=within(start_soc, 0.0, 100.0, option="--start-soc", unit="%"),
-            end_soc_pct=within(end_soc, 0.0, 100.0, option="--end-soc", unit="%"),
+            hours=hours,
+            ambient_c=ambient_c,
+            start_soc_pct=start_soc,
+            end_soc_pct=end_soc,
             discharge=discharge,
             speed_ms=None if speed is None else read_speed(speed),
             pack=pack,
             chemistry=chemistry,
-            plant=cast("PlantName", plant),
+            plant=plant,
             name=output.stem,
         )
     for scaled in simulated.limited:
