@@ -181,7 +181,7 @@ class _VcanRun:
     def __init__(self, options: argparse.Namespace, chosen: set[str]) -> None:
         command = [
             *shlex.split(options.socketcan), sys.executable, "-m", "faults", "--bus", "vcan",
-            "--json", "--seed", str(options.seed), "--jobs", "2", "--jobs-real", "8",
+            "--json", "--seed", str(options.seed), "--jobs", "1", "--jobs-real", "3",
         ]  # fmt: skip
         for fault in ON_VCAN:
             if fault.name in chosen:

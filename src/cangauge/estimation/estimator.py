@@ -35,6 +35,7 @@ from cangauge.estimation.state import DelayLineState, EstimatorMemory, Estimator
 from cangauge.model.effects.base import Reading
 from cangauge.model.inverse import soc_from_ocv
 from cangauge.model.model_file import Model, as_model
+from cangauge.model.prior import SLOW_S
 from cangauge.model.voltage_model import VoltageModel
 from cangauge.types import (
     CURRENT_AT_MOST_A,
@@ -61,7 +62,7 @@ REST_S: Final = 600.0
 CONTRADICTED_S: Final = 300.0
 """How long a rejected hypothesis, or a restart of the filter, degrades the estimate [s]."""
 
-MISMATCH_S: Final = 600.0
+MISMATCH_S: Final = 2.0 * SLOW_S
 """Time over which innovations are tested against the model, and for which a failed test makes the
 estimate invalid [s]: twice the memory of the voltage's slow error."""
 

@@ -79,13 +79,13 @@ from cangauge.model.prior import (
     ChemistryName,
     usual_loads,
 )
-from cangauge.model.voltage_model import KNOTS_PCT, REFERENCE_C
+from cangauge.model.voltage_model import KNOTS_PCT, REFERENCE_C, PublishedCurve
 
 _LOG = logging.getLogger(__name__)
 
 Equation = Literal["knots", "published"]
 
-EPSILON: Final = 0.05
+EPSILON: Final = PublishedCurve.epsilon
 """Published margin of the scaled SoC [-]."""
 
 FITTED_ROWS: Final = "the rows of the fit itself (too few logs to leave one out)"

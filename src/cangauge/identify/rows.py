@@ -84,7 +84,6 @@ def fit_rows(
     rate_hz: float = 1.0,
     delay_s: Sequence[float] = DELAYS_S,
     low_pass_s: Sequence[float] = LOW_PASS_S,
-    soc_tolerance_pct: float = SOC_TOLERANCE_PCT,
 ) -> FitRows:
     """Return the rows of a log that take part in a fit.
 
@@ -97,8 +96,6 @@ def fit_rows(
     rate_hz : float
     delay_s, low_pass_s : sequence of float
         Columns of `currents_a` [s].
-    soc_tolerance_pct : float
-        Excess of the counted SoC over 0–100 % that is accepted [%].
 
     Raises
     ------
@@ -109,7 +106,7 @@ def fit_rows(
     source = log.source or log.name
     soc = counted_soc_pct(log, capacity_ah, None)
     low, high = float(soc.min()), float(soc.max())
-    if low < -soc_tolerance_pct or high > 100.0 + soc_tolerance_pct:
+    if low < -SOC_TOLERANCE_PCT or high > 100.0 + SOC_TOLERANCE_PCT:
         raise InputError(
             f"the SoC counted with {capacity_ah:.2f} Ah runs from {high:.1f} to {low:.1f} %",
             source=source,

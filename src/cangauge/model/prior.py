@@ -21,11 +21,11 @@ from typing import Final, Literal
 import numpy as np
 
 from cangauge._typing import FloatArray
-from cangauge.model.voltage_model import KNOTS_PCT, hermite_basis
+from cangauge.model.voltage_model import KNOTS_PCT, VoltageModel, hermite_basis
 
 ChemistryName = Literal["oxide", "lfp"]
 
-DELAYS_S: Final = (0.0, 10.0, 30.0, 70.0)
+DELAYS_S: Final = VoltageModel.delay_s
 """The published delays of the current [s]."""
 LOW_PASS_S: Final = (10.0, 140.0)
 """Time constants of the low-passed currents [s]: the polarization of a drive has seconds to

@@ -33,8 +33,6 @@ def leaf_2012_model() -> VoltageModel:
         PublishedCurve((394.4, 48.89, -4.769, 0.2158, -0.003718, -54.59, 109.3, -3.141)),
         kt_v_per_k=-0.7428,
         resistance_ohm=(-0.1032, -0.01501, -0.009697, -0.004652),
-        delay_s=(0.0, 10.0, 30.0, 70.0),
-        t_ref_c=20.0,
         temperature_range_c=(20.0, 26.0),
         current_range_a=(-50.0, 200.0),
     )

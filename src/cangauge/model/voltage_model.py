@@ -74,10 +74,16 @@ otherwise. Below 3 a cubic Hermite curve rises: Fritsch, Carlson, SIAM J. Numer.
 238."""
 
 
+def inverse_k(temperature_c: ArrayLike) -> FloatArray:
+    """Return 1/T [1/K], constant beyond `PLAUSIBLE_C`."""
+    celsius = np.clip(np.asarray(temperature_c, dtype=np.float64), *PLAUSIBLE_C)
+    return np.asarray(1.0 / (celsius + 273.15))
+
+
 def resistance_factor(temperature_c: ArrayLike) -> FloatArray:
     """Return a(T), the resistance relative to that at 20 °C by Arrhenius' law."""
-    kelvin = np.clip(np.asarray(temperature_c, dtype=np.float64), *PLAUSIBLE_C) + 273.15
-    return np.asarray(np.exp(ACTIVATION_K * (1.0 / kelvin - 1.0 / (REFERENCE_C + 273.15))))
+    colder = inverse_k(temperature_c) - inverse_k(REFERENCE_C)
+    return np.asarray(np.exp(ACTIVATION_K * colder))
 
 
 class Curve(Protocol):

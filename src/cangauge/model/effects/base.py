@@ -51,8 +51,6 @@ Values = Mapping[str, float]
 Memories = Sequence[Any]
 """An effect's `Memory` objects, of its own kinds."""
 
-WITHIN_C: Final = PLAUSIBLE_C
-
 RESISTANCE_AT_LEAST = 0.002
 """Lower limit of the resistance that bounds scale with, as voltage drop at 1 C relative to the
 pack voltage (0.018 for a Leaf): coefficients that happen to cancel must not exclude every
@@ -85,7 +83,7 @@ class Pack:
             voltage_v=volts,
             capacity_ah=capacity_ah,
             resistance_ohm=max(abs(sum(model.resistance_ohm)), least_ohm),
-            temperature_c=float(np.clip(0.5 * sum(model.temperature_range_c), *WITHIN_C)),
+            temperature_c=float(np.clip(0.5 * sum(model.temperature_range_c), *PLAUSIBLE_C)),
         )
 
 

@@ -12,7 +12,6 @@ from cangauge.logs.gaps import BRIDGE_S
 from cangauge.model.effects.base import (
     DELAYED,
     LAG,
-    WITHIN_C,
     Context,
     CoreForm,
     Effect,
@@ -22,7 +21,7 @@ from cangauge.model.effects.base import (
     Values,
 )
 from cangauge.model.first_order import First, Lag, Turned
-from cangauge.model.voltage_model import VoltageModel
+from cangauge.model.voltage_model import PLAUSIBLE_C, VoltageModel, inverse_k
 
 REFERENCE_C: Final = 25.0
 """Temperature at which Arrhenius factors are 1 [°C]."""
@@ -62,11 +61,6 @@ def _of(values: Values, *names: str) -> tuple[float, ...]:
 
 
 # --- resistance
-
-
-def inverse_k(temperature_c: FloatArray | float) -> FloatArray:
-    """Return 1/T [1/K]."""
-    return np.asarray(1.0 / (np.clip(temperature_c, *WITHIN_C) + 273.15))
 
 
 def arrhenius(temperature_c: FloatArray, activation_k: float) -> FloatArray:
@@ -165,7 +159,7 @@ def _travel_as(values: Values, pack: Pack) -> float:
 
 def _entropic_drive(load: Load, _: Values, at: Context) -> FloatArray:
     interior_c = at.memory[0].step(load.time_s, load.temperature_c)
-    return np.asarray(np.clip(interior_c, *WITHIN_C) - at.model.t_ref_c)
+    return np.asarray(np.clip(interior_c, *PLAUSIBLE_C) - at.model.t_ref_c)
 
 
 def _entropic_shape(soc_pct: FloatArray, values: Values, *_: object) -> FloatArray:
@@ -207,7 +201,7 @@ VOLTAGES: Final = (
                 "activation_k", "K", 100.0, 8000.0, neutral=None, grid=(1000.0, 2500.0, 4500.0)
             ),
             DELAYED,
-            Parameter("reference_c", "°C", *WITHIN_C, neutral=None, from_pack="temperature_c"),
+            Parameter("reference_c", "°C", *PLAUSIBLE_C, neutral=None, from_pack="temperature_c"),
             LAG,
         ),
         signature="the drop over the resistance, growing with (T₀ − T)",
