@@ -85,7 +85,7 @@ def test_a_missing_model(made: Path, tmp_path: Path, command: str) -> None:
 def test_a_value_keeps_its_kind(made: Path) -> None:
     gap = ("gap", made / "part.csv", "-m", made / "model.json")
     assert failed(*gap, "--initial-soc", "150")["value"] == 150.0
-    assert failed("twin", "-o", "x.csv", "--soc", "half")["value"] == "half"
+    assert failed("replay", made / "part.csv", "--speed", "fast")["value"] == "fast"
 
 
 @pytest.mark.parametrize("command", COMMANDS)

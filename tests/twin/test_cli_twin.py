@@ -122,8 +122,6 @@ def test_list_has_every_parameter() -> None:
         (("-o", "x.csv", "--ambient-c", "90"), "ambient"),
         (("-o", "x.csv", "--pack", "tank"), "leaf24"),
         (("-o", "x.csv", "--chemistry", "lead"), "nmc"),
-        (("-o", "x.csv", "--plant", "real"), "twin, equation, published or pybamm"),
-        (("-o", "x.csv", "--soc", "maybe"), "full or start"),
         (("-o", "x.csv", "--speed", "absent.csv"), "absent.csv"),
         (("-o", "x.csv", "--effect", "gremlins"), "current_offset"),
         (("-o", "nowhere/x.csv"), "folder"),

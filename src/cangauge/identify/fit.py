@@ -552,8 +552,8 @@ def common_temperature_source(sources: Iterable[TemperatureSource]) -> Temperatu
             "the temperatures of the logs have different sources",
             field="temperature_source",
             value=found,
-            cure="state it for the logs that do not (--temperature-source), or fit logs of one"
-            " source together",
+            cure="state it in a column temperature_source of the logs that do not, or fit logs of"
+            " one source together",
         )
     return found[0]
 

@@ -132,6 +132,8 @@ class StateKeeper:
         self.restored = False
 
     def __enter__(self) -> Self:
+        if self._path.exists() and not self._path.is_file():  # a device would be replaced
+            raise InputError("not a file", source=self._path, field="state", cure="name a file")
         try:
             content = read_state(self._path)
             age_s = self._age_s(content)

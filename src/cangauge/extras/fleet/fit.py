@@ -273,8 +273,8 @@ def _reasons_left_out(rows: Sequence[Row]) -> dict[str, dict[str, str]]:
         if source != most:
             found[url] = {
                 "reason": f"its temperature source is {source}, that of"
-                f" {counted(counts[most], 'other')} {most}; --temperature-source states it where"
-                " a log does not",
+                f" {counted(counts[most], 'other')} {most}; a column temperature_source"
+                " states it where a log does not",
                 "kind": f"its temperature source is {source}",
             }
         elif (first := firsts.setdefault(row["signals_sha256"], url)) != url:
