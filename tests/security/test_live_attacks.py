@@ -144,6 +144,7 @@ def test_frames_go_on_under_attack(target: Target, tmp_path: Path) -> None:
         with suppress(FileExistsError):  # the service was quicker
             swap(target.state)
         target.holds(f"state: {name}", 0.25)
+    assert Path("/dev/zero").is_char_device()
     removed(target.state)
     shutil.rmtree(target.state.parent)
     target.holds("state's folder removed", 0.25)

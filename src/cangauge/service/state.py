@@ -9,6 +9,7 @@ cannot be used is set aside; one that cannot be written never stops the estimato
 
 from __future__ import annotations
 
+import errno
 import json
 import logging
 import math
@@ -132,8 +133,6 @@ class StateKeeper:
         self.restored = False
 
     def __enter__(self) -> Self:
-        if self._path.exists() and not self._path.is_file():  # a device would be replaced
-            raise InputError("not a file", source=self._path, field="state", cure="name a file")
         try:
             content = read_state(self._path)
             age_s = self._age_s(content)
@@ -228,6 +227,8 @@ class StateKeeper:
     def _write(self, content: StateContent) -> None:
         """Replace the file atomically; a power cut leaves the old one or the new one."""
         path = Path(os.path.realpath(self._path))
+        if path.exists() and not path.is_file():  # a link to a device would replace the device
+            raise FileExistsError(errno.EEXIST, "not a file", str(path))
         # The same name each time: what a killed service left is overwritten.
         part = path.with_name(f".{path.name}.part")
         flags = os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC
