@@ -254,6 +254,7 @@ def test_both_commands_until_the_bus_goes_down(tmp_path: Path) -> None:
         "run", "-m", leaf_model_path(), "--time-source", "replay-clock", "--record", record,
         "--json",
     )  # fmt: skip
+    live.wait_for("service.ready")
     replayed = run_to_end("replay", log_path, "--speed", "max", "--json")
     assert replayed.code == 0, replayed.err
     assert replayed.json["bus"] == "socketcan vcan0"
