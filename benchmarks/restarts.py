@@ -352,18 +352,25 @@ class Player(threading.Thread):
 
     def service(self, model: Path, frame_id: int, state: Path | None) -> subprocess.Popen[bytes]:
         """Start `cangauge run`."""
-        kept = [] if state is None else ["--state", state, "--state-every", REAL_EVERY_S]
-        arguments = [
-            "run", "-m", model, "--interface", "udp_multicast", "--channel", CHANNEL,
-            "--bus-option", f"port={PORT}", "--initial-soc", START_PCT - 15.0,
-            "--soc-estimate-id", f"0x{frame_id:X}", "--soc-detail-id", f"0x{frame_id + 1:X}",
-            "--soc-health-id", f"0x{frame_id + 2:X}", "--soc-power-id", f"0x{frame_id + 3:X}",
-            "--soc-cells-id", f"0x{frame_id + 4:X}",
-            "--replay-clock-id", f"0x{frame_id + 15:X}", "--log-format", "json", *kept,
-        ]  # fmt: skip
+        names = ("soc_estimate", "soc_detail", "soc_health", "soc_power", "soc_cells")
+        ids = {name: frame_id + k for k, name in enumerate(names)}
+        ids["replay_clock"] = frame_id + 15
+        lines = [
+            f"model = {json.dumps(str(model))}",
+            f'interface = "udp_multicast"\nchannel = "{CHANNEL}"',
+            f"bus_options = {{ port = {PORT} }}",
+            f"initial_soc = {START_PCT - 15.0}",
+            f"ids = {{ {', '.join(f'{name} = {each}' for name, each in ids.items())} }}",
+            'log_format = "json"\nstatus_socket = "off"',
+        ]
+        if state is not None:
+            lines.append(f"state = {json.dumps(str(state))}\nstate_every_s = {REAL_EVERY_S}")
+        config = self._log.with_name(f"{frame_id:X}.toml")
+        config.write_text("\n".join(lines) + "\n", encoding="utf-8")
+        arguments = ["run", "--config", str(config)]
         with self._log.open("ab") as log:
             return subprocess.Popen(
-                [sys.executable, "-c", ENTRY, *map(str, arguments)],
+                [sys.executable, "-c", ENTRY, *arguments],
                 stderr=log,
                 stdout=subprocess.DEVNULL,
             )

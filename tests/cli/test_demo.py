@@ -9,6 +9,8 @@ from pathlib import Path
 
 import pytest
 
+from live import in_process
+
 
 @pytest.mark.slow
 def test_the_demo_ends_with_the_filter_ahead(tmp_path: Path) -> None:
@@ -27,3 +29,11 @@ def test_the_demo_ends_with_the_filter_ahead(tmp_path: Path) -> None:
     assert result["live_minus_offline_pct"] <= result["quantisation_bound_pct"]
     assert (tmp_path / "soc.html").stat().st_size > 100_000
     assert (tmp_path / "fit.html").stat().st_size > 100_000
+
+
+def test_a_folder_that_cannot_be_made_is_one_line(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    ended = in_process("demo", "--folder", tmp_path / "file")
+    assert ended.code == 2
+    assert "--folder: cannot create this folder" in ended.err
+    assert ended.err.count("\n") == 1

@@ -42,6 +42,26 @@ def log_path(tmp_path: Path) -> Path:
     return path
 
 
+def test_a_replay_by_the_configuration_of_the_service(
+    bus: list[str], log_path: Path, tmp_path: Path
+) -> None:
+    """Bus, vehicle and ids are those of the file that the service reads."""
+    config = tmp_path / "run.toml"
+    interface, channel, port = bus[1], bus[3], bus[5].partition("=")[2]
+    config.write_text(
+        f'model = "{MODEL[1]}"\ninterface = "{interface}"\nchannel = "{channel}"\n'
+        'vehicle = "leaf_aze0"\ntime_source = "replay-clock"\nuntil_idle_s = 1\n'
+        f"bus_options = {{ port = {port} }}\n"
+        "ids = { soc_estimate = 0x4A0, soc_detail = 0x4A1, replay_clock = 0x4AF }\n"
+    )
+    service = Command("run", "--config", config, "--json")
+    replayed = run_to_end("replay", log_path, "--config", config, "--speed", "max", "--json")
+    ended = service.end()
+    assert (replayed.code, ended.code) == (0, 0), replayed.err + ended.err
+    assert replayed.json["acknowledged"] == replayed.json["samples"] == ended.json["samples"] > 0
+    assert replayed.json["quantisation"]["current_a"] == 0.25  # a Leaf's step is 0.5 A
+
+
 @pytest.mark.parametrize("suffix", [".csv", ".parquet"])
 def test_a_log_at_full_speed_from_one_process_to_the_other(
     bus: list[str], log_path: Path, tmp_path: Path, suffix: str

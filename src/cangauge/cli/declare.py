@@ -1,18 +1,13 @@
 """Commands declared by their docstrings: arguments, options, units and bounds from *Parameters*.
 
-    @command()
-    def scale_command(log: Path, *, output: Written, gain: float = 1.0) -> None:
-        '''Scale the current of a log.
+The function of a command has plain types, and its docstring says the rest::
 
-Parameters
-----------
-        log : LOG
-            Recorded log.
-        output : -o, --output OUT.csv|.parquet
-            Scaled log.
-        gain : X (0.5 … 2)
-            Factor of the current.
-        '''
+    log : LOG
+        Recorded log.
+    output : -o, --output OUT.csv|.parquet
+        Table of estimates.
+    initial_soc : P|auto (0 … 100 %)
+        SoC at the first row.
 
 Positional parameters are arguments, keyword-only ones options; those in `SHARED` need no entry. The
 line after a name holds flags (default: the name), the placeholder of the value, and its bounds with
@@ -142,12 +137,12 @@ def _declared(
     """Return the parameter as typer reads it."""
     spec = _SPEC.fullmatch(specification)
     if spec is None:
-        raise SyntaxError(f"{parameter.name} : {specification}")
+        raise ValueError(f"{parameter.name} : {specification} is no specification")
     options: dict[str, Any] = {"metavar": spec["metavar"] or None, "help": text}
     suffixes = re.findall(r"\.\w+", spec["metavar"]) if _is_written(kind) else []
     if spec["low"] is not None:
-        bounds = f"Within {spec['low']} … {spec['high']}".replace(" … inf", " or more")
-        options["help"] += f" {bounds} {spec['unit'] or ''}".rstrip() + "."
+        bounds = f"within {spec['low']} … {spec['high']} {spec['unit'] or ''}".rstrip()
+        options["help"] += f" ({bounds})"
     if suffixes or spec["low"] is not None:
         options["callback"] = _checked(spec, suffixes)
     if parameter.kind is parameter.KEYWORD_ONLY:

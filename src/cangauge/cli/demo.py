@@ -16,7 +16,7 @@ from cangauge._resources import shared_file
 from cangauge._text import number, significant
 from cangauge.cli.declare import command
 from cangauge.cli.output import emit_json, note, print_table
-from cangauge.errors import CangaugeError
+from cangauge.errors import CangaugeError, InputError
 
 TRAINED_ON = "leaf2012_reconstruction_white.parquet"
 PLAYED = "leaf2012_reconstruction_correlated.parquet"
@@ -69,7 +69,11 @@ def demo_command(*, folder: Path = Path("out/demo"), json_output: bool = False) 
     from cangauge.service.offline import RecordedEstimate
 
     began = time.monotonic()
-    folder.mkdir(parents=True, exist_ok=True)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        problem, cure = f"cannot create this folder: {error.strerror}", "name another one"
+        raise InputError(problem, source=folder, field="--folder", cure=cure) from error
     paths = {
         "model": folder / "model.json",
         "fit_page": folder / "fit.html",

@@ -82,7 +82,7 @@ def gap_command(
         positive = discharge], temperature [°C], SoC of the first row [%]; it returns the voltage
         [V].
     plan : --plan
-        Propose the drive or measurement that tells the likeliest two causes apart.
+        Propose the drive or measurement that best separates the two likeliest causes.
     add_test : LOG
         Log of a further test of the same cause, beside the LOGs of the first diagnosis: diagnoses
         both together and reports what the test changed; repeat the option.

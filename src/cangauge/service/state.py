@@ -92,7 +92,12 @@ def state_path(given: str | None, environment: Mapping[str, str]) -> Path | None
             field="state",
             cure="create it or name another one",
         )
-    if path.exists():
+    try:
+        is_there = path.exists()
+    except OSError as error:  # a name that no file can have
+        problem, cure = f"cannot be written: {error.strerror}", "name another path"
+        raise InputError(problem, source=path, field="state", cure=cure) from error
+    if is_there:
         with open_regular(path) as file:
             beginning = file.read(64)
         if beginning and b'"format": "' + STATE_FORMAT.encode() not in beginning:
