@@ -45,7 +45,7 @@ from cangauge.model.model_file import Model
 from cangauge.replay.encoder import FrameEncoder
 from cangauge.service.loop import CHECKPOINT_EVERY_S, FIRST_CHECKPOINT_S
 from cangauge.service.pipeline import Pipeline, PipelineSettings
-from cangauge.service.state import StateKeeper, StateSettings
+from cangauge.service.state import StateKeeper
 from cangauge.types import Estimate, Reason, Sample
 from live_service import ENTRY
 
@@ -133,10 +133,7 @@ class ServiceRun:
         self.pipeline = Pipeline(Vehicle.load("generic"), model, settings)
         self.keeper: StateKeeper | None = None
         if path is not None:
-            self.keeper = StateKeeper(
-                StateSettings(path), self.pipeline,
-                wall_s=lambda: self.now_s,
-            )  # fmt: skip
+            self.keeper = StateKeeper(path, self.pipeline, "bench", 86400.0, lambda: self.now_s)
 
     def begin(self, now_s: float) -> None:
         """Start at a moment [s]."""
@@ -156,7 +153,9 @@ class ServiceRun:
         if self.keeper is None:
             return
         self.keeper.checkpoint()
-        if not self.keeper.flush(30.0):
+        written = threading.Event()
+        self.keeper._worker.submit(written.set)  # noqa: SLF001 - after the write in its queue
+        if not written.wait(30.0):
             raise TimeoutError("the state was not written within 30 s")
 
 
