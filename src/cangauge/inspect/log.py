@@ -190,7 +190,7 @@ def channel_rows(found: LogInspection) -> tuple[list[str], list[list[str]]]:
             *(significant(value, 5) for value in (item.minimum, item.median, item.maximum)),
             item.unit,
             "constant" if item.levels == 1 else significant(item.quantum, 3),
-            str(item.missing or ""),
+            str(item.missing),
         ]
         for name, item in found.channels.items()
     ]
