@@ -31,47 +31,29 @@ from __future__ import annotations
 from importlib import import_module
 from typing import TYPE_CHECKING, Any, Final
 
-from cangauge._version import __version__
+from cangauge._version import __version__ as __version__
 
 if TYPE_CHECKING:
-    from cangauge.bus.recording import read_recording as read_log
-    from cangauge.bus.vehicle import Vehicle
-    from cangauge.diagnosis import Diagnosis, diagnose
-    from cangauge.errors import CangaugeError, InputError
-    from cangauge.estimation.estimator import Estimator
-    from cangauge.estimation.offline import EstimateTable, estimate
-    from cangauge.extras.judge.judgement import Judgement, judge
-    from cangauge.extras.validation import Simulation, simulate
-    from cangauge.identify.fit import fit
-    from cangauge.identify.identification import Identification
-    from cangauge.logs.log import Log
-    from cangauge.model.model_file import Model
-    from cangauge.service.run import Service
-    from cangauge.types import Estimate, Sample
-
-__all__ = [
-    "CangaugeError",
-    "Diagnosis",
-    "Estimate",
-    "EstimateTable",
-    "Estimator",
-    "Identification",
-    "InputError",
-    "Judgement",
-    "Log",
-    "Model",
-    "Sample",
-    "Service",
-    "Simulation",
-    "Vehicle",
-    "__version__",
-    "diagnose",
-    "estimate",
-    "fit",
-    "judge",
-    "read_log",
-    "simulate",
-]
+    from cangauge.bus.recording import read_log as read_log
+    from cangauge.bus.vehicle import Vehicle as Vehicle
+    from cangauge.diagnosis import Diagnosis as Diagnosis
+    from cangauge.diagnosis import diagnose as diagnose
+    from cangauge.errors import CangaugeError as CangaugeError
+    from cangauge.errors import InputError as InputError
+    from cangauge.estimation.estimator import Estimator as Estimator
+    from cangauge.estimation.offline import EstimateTable as EstimateTable
+    from cangauge.estimation.offline import estimate as estimate
+    from cangauge.extras.judge.judgement import Judgement as Judgement
+    from cangauge.extras.judge.judgement import judge as judge
+    from cangauge.extras.validation import Simulation as Simulation
+    from cangauge.extras.validation import simulate as simulate
+    from cangauge.identify.fit import fit as fit
+    from cangauge.identify.identification import Identification as Identification
+    from cangauge.logs.log import Log as Log
+    from cangauge.model.model_file import Model as Model
+    from cangauge.service.run import Service as Service
+    from cangauge.types import Estimate as Estimate
+    from cangauge.types import Sample as Sample
 
 _PLACES: Final = {
     "CangaugeError": "errors",
@@ -88,14 +70,16 @@ _PLACES: Final = {
     "Service": "service.run",
     "Simulation": "extras.validation",
     "Vehicle": "bus.vehicle",
+    "__version__": "_version",
     "diagnose": "diagnosis",
     "estimate": "estimation.offline",
     "fit": "identify.fit",
     "judge": "extras.judge.judgement",
-    "read_log": "bus.recording:read_recording",
+    "read_log": "bus.recording",
     "simulate": "extras.validation",
 }
-"""Module of each public name, and the name there where it differs."""
+"""Module of each public name."""
+__all__ = list(_PLACES)
 _FUNCTIONS: Final = ("diagnose", "estimate", "fit", "read_log", "simulate")
 """Functions whose errors name arguments where those of a command name options."""
 
@@ -104,8 +88,7 @@ def __getattr__(name: str) -> Any:
     place = _PLACES.get(name)
     if place is None:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    module, _, own = place.partition(":")
-    found = getattr(import_module(f"{__name__}.{module}"), own or name)
+    found = getattr(import_module(f"{__name__}.{place}"), name)
     if name in _FUNCTIONS:
         found = import_module(f"{__name__}.errors").naming_arguments(found)
     return globals().setdefault(name, found)

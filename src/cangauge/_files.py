@@ -24,11 +24,6 @@ from typing import BinaryIO, Final, Protocol, TypeVar, cast
 
 from cangauge.errors import CangaugeError, InputError
 
-try:
-    import fcntl
-except ImportError:  # Windows
-    fcntl = None  # type: ignore[assignment] # checked before use
-
 MIB: Final = 1 << 20
 MAX_LOG_BYTES: Final = 1024 * MIB
 """A log, unpacked: it is held in memory."""
@@ -285,10 +280,6 @@ _WRITE_ERRORS: Final[dict[int, tuple[str, str]]] = {
     errno.EROFS: ("the file system is read-only", "name another folder"),
     errno.ENAMETOOLONG: ("the file name is too long", "use a shorter one"),
 }
-PRIVATE: Final = 0o600
-"""Rights of a state: for its owner only."""
-FOR_GROUP: Final = 0o640
-"""Rights of a recording: the group may read where and how the car was driven, others not."""
 
 
 @contextmanager
@@ -387,56 +378,6 @@ def require_suffix(path: str | PathLike[str], *suffixes: str, field: str) -> Non
         value=output.suffix,
         cure=f"name a {names} file",
     )
-
-
-@contextmanager
-def sole_writer(path: str | PathLike[str]) -> Iterator[None]:
-    """Hold a file for this process while the block runs, by a lock on a file beside it.
-
-    The kernel releases the lock at the latest when the process ends. Where there can be no lock (a
-    read-only disk, a network file system without locks, Windows) the block runs without.
-
-    Raises
-    ------
-    InputError
-        If another process holds it; names that process.
-    """
-    target = Path(os.path.realpath(path))
-    lock = target.with_name(f".{target.name[:200]}.lock")
-    held = None
-    with suppress(OSError):  # no lock here; where nothing can be written, writing reports it
-        while fcntl is not None and held is None:
-            held = _locked(lock, path)
-    try:
-        yield
-    finally:
-        if held is not None:
-            lock.unlink(missing_ok=True)
-            os.close(held)
-
-
-def _locked(lock: Path, shown: str | PathLike[str]) -> int | None:
-    """Return the descriptor of a locked file; None if its holder removed it just now."""
-    held = os.open(lock, os.O_RDWR | os.O_CREAT, PRIVATE)
-    try:
-        fcntl.flock(held, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        if lock.exists() and os.path.samestat(os.fstat(held), lock.stat()):
-            os.ftruncate(held, 0)
-            os.write(held, f"{os.getpid()}\n".encode())
-            return held
-    except BlockingIOError as error:
-        holder = os.read(held, 20).decode("ascii", "replace").strip()
-        os.close(held)
-        raise InputError(
-            f"another service{f' (process {holder})' if holder else ''} writes this file",
-            source=shown,
-            cure="stop that one, or name another file",
-        ) from error
-    except OSError:
-        os.close(held)
-        raise
-    os.close(held)
-    return None
 
 
 def text_sha256(text: str) -> str:

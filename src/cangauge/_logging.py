@@ -24,7 +24,7 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import IO, Any, Final, Literal, TextIO
 
-from cangauge._text import printable, printable_json
+from cangauge._text import plain, printable, printable_json
 
 LogFormat = Literal["text", "json"]
 LogLevel = Literal["debug", "info", "warning", "error"]
@@ -148,14 +148,14 @@ class _JsonFormat(logging.Formatter):
 
     def format(self, record: logging.LogRecord) -> str:
         time_text, event, message, fields = _parts(record)
-        content = {name: _plain(value) for name, value in fields.items()} | {
+        content = plain(fields) | {
             "time": time_text,
             "level": record.levelname.lower(),
             "event": event,
             "message": message,
             "logger": record.name,
         }
-        return printable_json(json.dumps(content, ensure_ascii=False))
+        return printable_json(json.dumps(content, ensure_ascii=False, default=str))
 
 
 def _parts(record: logging.LogRecord) -> tuple[str, str, str, dict[str, Any]]:
@@ -168,14 +168,6 @@ def _parts(record: logging.LogRecord) -> tuple[str, str, str, dict[str, Any]]:
     if hasattr(record, "suppressed"):
         fields["repeats_suppressed"] = record.suppressed
     return stamp.replace("+00:00", "Z"), str(getattr(record, "event", "log")), message, fields
-
-
-def _plain(value: Any) -> Any:
-    if isinstance(value, float):
-        return value if math.isfinite(value) else None
-    if isinstance(value, list | tuple):
-        return [_plain(item) for item in value]
-    return value if isinstance(value, str | int | bool) or value is None else str(value)
 
 
 @dataclass(slots=True)

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterable
-from typing import Final
+from collections.abc import Iterable, Mapping
+from typing import Any, Final
 
 NONE_KNOWN: Final = "–"
 """Shown in place of an unknown number."""
@@ -123,6 +123,17 @@ def printable(text: str) -> str:
     Names of files and signals, and what a server answers, may hold anything.
     """
     return text.translate(_AS_TEXT)
+
+
+def plain(value: Any) -> Any:
+    """Return a value as JSON can hold it: numpy's as Python's, NaN and infinities as None."""
+    if isinstance(value, Mapping):
+        return {str(key): plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [plain(item) for item in value]
+    if hasattr(value, "tolist"):  # numpy, without its import
+        return plain(value.tolist())
+    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def printable_json(text: str) -> str:

@@ -15,7 +15,7 @@ from cangauge.bus.recording import (
     capture_samples,
     capture_to_log,
     open_recording,
-    read_recording,
+    read_log,
 )
 from cangauge.bus.time_source import ClockFrames, ReceiveTime
 from cangauge.bus.vehicle import Vehicle
@@ -59,19 +59,19 @@ def test_content_decides_between_log_and_capture(tmp_path: Path, generic: Vehicl
     log = (tmp_path / "drive.parquet").rename(tmp_path / "drive.blf")
     assert isinstance(open_recording(log), LogFile)
     assert not isinstance(open_recording(capture), LogFile)
-    by_capture, by_log = read_recording(capture, generic), read_recording(log)
+    by_capture, by_log = read_log(capture, generic), read_log(log)
     for channel in ("time_s", "current_a", "voltage_v", "temperature_c", "soc_pct"):
         np.testing.assert_array_equal(getattr(by_capture, channel), getattr(by_log, channel))
 
 
 def test_a_log_needs_no_vehicle(tmp_path: Path, generic: Vehicle) -> None:
     write_log(Log([0, 1], [10, 30], [380, 378], [21, 21]), tmp_path / "drive.csv")
-    log = read_recording(tmp_path / "drive.csv", generic)
+    log = read_log(tmp_path / "drive.csv", generic)
     assert log.remarks == ("a log, not a capture: no vehicle is needed",)
     notes = tmp_path / "notes.txt"
     notes.write_text("hello\nworld\n")
     with pytest.raises(InputError, match=r"first line: not a known kind of log, nor") as caught:
-        read_recording(notes)
+        read_log(notes)
     assert caught.value.value == "hello"
     assert "candump" in str(caught.value.cure)
 
@@ -84,19 +84,19 @@ def test_temperature_and_its_source_can_be_given(
     if kind == "log":
         path = tmp_path / "drive.csv"
         write_log(Log([0, 1], [10, 30], [380, 378], [21, 21], temperature_source="pack"), path)
-    log = read_recording(path, generic, temperature_c=7.0, temperature_source="room")
+    log = read_log(path, generic, temperature_c=7.0, temperature_source="room")
     assert set(log.temperature_c) == {7.0}
     assert log.temperature_source == "room"
-    assert read_recording(path, generic, temperature_c=7.0).temperature_source == "unknown"
+    assert read_log(path, generic, temperature_c=7.0).temperature_source == "unknown"
     with pytest.raises(InputError, match="not a known temperature source"):
-        read_recording(path, generic, temperature_source="oven")  # type: ignore[arg-type]
+        read_log(path, generic, temperature_source="oven")  # type: ignore[arg-type]
 
 
 def test_a_packed_capture_that_is_cut_off_is_read(tmp_path: Path, generic: Vehicle) -> None:
     whole = record(tmp_path / "drive.log", drive(generic)).read_bytes()
     path = tmp_path / "drive.log.gz"
     path.write_bytes(gzip.compress(whole)[:-200])
-    log = read_recording(path, generic)
+    log = read_log(path, generic)
     assert 100 < len(log) < 200
     assert any("cut off" in remark for remark in log.remarks)
 

@@ -25,6 +25,7 @@ from can.typechecking import CanFilter
 from cantools.database.can import Database
 
 from cangauge._resources import shared_file
+from cangauge._text import plain
 from cangauge.bus.database import load_dbc, signal_codec
 from cangauge.bus.protection import E2eRule
 from cangauge.bus.time_source import REPLAY_CLOCK_ID
@@ -166,9 +167,9 @@ class PackReport(NamedTuple):
         if cells is not None and cells["weakest"] < 0:
             cells["weakest"] = None
         return {
-            "health": _finite(self.health._asdict()),
-            "power": _finite(self.power._asdict()),
-            "cells": cells and _finite(cells),
+            "health": plain(self.health._asdict()),
+            "power": plain(self.power._asdict()),
+            "cells": cells and plain(cells),
             "notices": self.notices,
         }
 
@@ -177,14 +178,6 @@ NO_REPORT: Final[Mapping[str, Any]] = MappingProxyType(
     {"health": None, "power": None, "cells": None, "notices": []}
 )
 """What `PackReport.to_dict` gives before the first sample."""
-
-
-def _finite(values: dict[str, Any]) -> dict[str, Any]:
-    """Return the values, None for NaN."""
-    return {
-        name: None if isinstance(value, float) and not math.isfinite(value) else value
-        for name, value in values.items()
-    }
 
 
 class _Layout:

@@ -43,7 +43,7 @@ VOLTAGE_FILL_S: Final = 1.0
 from one are dropped."""
 
 
-def read_recording(
+def read_log(
     path: str | PathLike[str],
     vehicle: Vehicle | None = None,
     *,
@@ -98,7 +98,7 @@ def read_recording(
     >>> from cangauge.logs.canonical import write_log
     >>> path = Path(mkdtemp()) / "drive.parquet"
     >>> write_log(Log([0, 1], [10, 30], [380, 378], [21, 21]), path)
-    >>> log = read_recording(path)
+    >>> log = read_log(path)
     >>> log.name, log.current_a
     ('drive', array([10., 30.]))
     """
@@ -116,7 +116,7 @@ def log_of(
     temperature_c: float | None = None,
     temperature_source: TemperatureSource | None = None,
 ) -> Log:
-    """Read an opened recording; arguments as in `read_recording`."""
+    """Read an opened recording; arguments as in `read_log`."""
     if temperature_source is not None:
         known_temperature_source(temperature_source)
     if isinstance(recording, LogFile):

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import logging
-import math
 import shutil
 import sys
 import textwrap
@@ -19,7 +18,7 @@ from rich.segment import Segment
 from rich.table import Table
 from rich.text import Text
 
-from cangauge._text import NONE_KNOWN, is_numeric, printable, printable_json
+from cangauge._text import NONE_KNOWN, is_numeric, plain, printable, printable_json
 from cangauge.errors import CangaugeError
 
 
@@ -124,26 +123,14 @@ def emit_json(result: Mapping[str, Any]) -> None:
     """Print exactly one JSON object on stdout; NaN and infinities become null."""
     if sys.stdout is None:
         raise CangaugeError("stdout is closed: the result cannot be printed")
-    plain = _plain(result)
-    text = printable_json(json.dumps(plain, ensure_ascii=False))
+    content = plain(result)
+    text = printable_json(json.dumps(content, ensure_ascii=False))
     try:
         text.encode(sys.stdout.encoding or "utf-8")
     except UnicodeEncodeError:  # a terminal without these characters, or an undecodable file name
-        text = json.dumps(plain)
+        text = json.dumps(content)
     sys.stdout.write(text + "\n")
     sys.stdout.flush()
-
-
-def _plain(value: Any) -> Any:
-    if isinstance(value, Mapping):
-        return {str(key): _plain(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [_plain(item) for item in value]
-    if hasattr(value, "tolist"):  # numpy, without its import
-        return _plain(value.tolist())
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    return value
 
 
 def text_table(title: str, head: Sequence[str], rows: Sequence[Sequence[str]]) -> Table:

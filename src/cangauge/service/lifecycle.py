@@ -1,4 +1,4 @@
-"""Process control: stop and reload signals, and notifications to systemd (sd_notify(3))."""
+"""Process control: stop and reload signals, files held by one service, notes to systemd."""
 
 from __future__ import annotations
 
@@ -9,11 +9,19 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
+from os import PathLike
+from pathlib import Path
 from types import FrameType
 from typing import Final, Self
 
 from cangauge._text import printable
+from cangauge.errors import InputError
+
+try:
+    import fcntl
+except ImportError:  # Windows
+    fcntl = None  # type: ignore[assignment] # checked before use
 
 PINGS_PER_TIMEOUT: Final = 4
 """Watchdog pings per time-out of systemd."""
@@ -47,6 +55,41 @@ def stop_on_signals() -> Iterator[Callable[[], bool]]:
         yield lambda: bool(received)
     finally:
         restore()
+
+
+@contextmanager
+def sole_writer(path: str | PathLike[str]) -> Iterator[None]:
+    """Hold a file for this process while the block runs, by a lock on a hidden file beside it.
+
+    The kernel releases the lock at the latest when the process ends; the hidden file stays. Where
+    there can be no lock (a read-only disk, a network file system without locks, Windows) the block
+    runs without.
+
+    Raises
+    ------
+    InputError
+        If another process holds it; names that process.
+    """
+    target = Path(os.path.realpath(path))
+    with ExitStack() as stack:
+        try:
+            lock = target.with_name(f".{target.name[:200]}.lock")
+            held = os.open(lock, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
+            stack.callback(os.close, held)
+            if fcntl is not None:
+                fcntl.flock(held, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            os.ftruncate(held, 0)
+            os.write(held, f"{os.getpid()}\n".encode())
+        except BlockingIOError as error:
+            holder = os.read(held, 20).decode("ascii", "replace").strip()
+            raise InputError(
+                f"another service{f' (process {holder})' if holder else ''} writes this file",
+                source=path,
+                cure="stop that one, or name another file",
+            ) from error
+        except OSError:  # no lock here; where nothing can be written, writing reports it
+            pass
+        yield
 
 
 @contextmanager

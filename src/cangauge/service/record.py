@@ -26,7 +26,7 @@ from typing import Final, Self
 
 import can
 
-from cangauge._files import FOR_GROUP, FULL, check_writable
+from cangauge._files import FULL, check_writable
 from cangauge._logging import emit
 from cangauge.bus.captures import all_parts, part_path, run_path
 from cangauge.bus.time_source import whole_us
@@ -51,6 +51,8 @@ FORMATS: Final[dict[str, Callable[[io.StringIO], can.CanutilsLogWriter | can.CSV
     ".log": can.CanutilsLogWriter,
     ".csv": can.CSVWriter,
 }
+_RIGHTS: Final = 0o640
+"""Of a recording: the group may read where and how the car was driven, others not."""
 _LOG = logging.getLogger(__name__)
 
 
@@ -287,7 +289,7 @@ class _RecordFile:
             self.current = part_path(self._base, self._run, self._part)
         self.close()
         flags = os.O_WRONLY | os.O_CREAT | os.O_CLOEXEC | (os.O_EXCL if self._in_parts else 0)
-        self._descriptor = os.open(self.current, flags, FOR_GROUP)
+        self._descriptor = os.open(self.current, flags, _RIGHTS)
         self._bytes, self._began_s = 0, self._clock()
         self._text = io.StringIO(newline="")
         kind = self.current.with_suffix("") if self._is_packed else self.current

@@ -14,14 +14,14 @@ from os import PathLike
 from pathlib import Path
 from typing import Any, Final
 
-from cangauge._files import check_writable, sole_writer
+from cangauge._files import check_writable
 from cangauge._logging import emit
 from cangauge._text import known_soc, number
 from cangauge.bus.publish import NO_REPORT
 from cangauge.bus.reconnecting import ReconnectingBus
 from cangauge.errors import CangaugeError, InputError
 from cangauge.service.config import RunConfig, config_keys, load_config
-from cangauge.service.lifecycle import Notifier, note_hangups, stop_on_signals
+from cangauge.service.lifecycle import Notifier, note_hangups, sole_writer, stop_on_signals
 from cangauge.service.loop import Loop, LoopSettings, RunSummary
 from cangauge.service.output import Output
 from cangauge.service.pipeline import Pipeline

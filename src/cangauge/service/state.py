@@ -23,7 +23,7 @@ from typing import Annotated, Any, Final, Self
 from pydantic import BaseModel, ConfigDict, Field
 
 from cangauge._config import validated
-from cangauge._files import PRIVATE, open_regular, text_sha256
+from cangauge._files import open_regular, text_sha256
 from cangauge._logging import emit
 from cangauge._text import duration, number
 from cangauge.errors import InputError
@@ -237,7 +237,7 @@ class StateKeeper:
         # The same name each time: what a killed service left is overwritten.
         part = path.with_name(f".{path.name}.part")
         flags = os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC
-        with os.fdopen(os.open(part, flags, PRIVATE), "w", encoding="utf-8") as file:
+        with os.fdopen(os.open(part, flags, 0o600), "w", encoding="utf-8") as file:
             file.write(state_text(content))
             file.flush()
             os.fsync(file.fileno())

@@ -15,7 +15,7 @@ from dataclasses import asdict, dataclass, fields
 from typing import Any, Final
 
 from cangauge._logging import emit, release_held
-from cangauge._text import known_soc
+from cangauge._text import known_soc, plain
 from cangauge._version import __version__
 from cangauge.bus.connection import BusConnection
 from cangauge.bus.plausibility import MessageStatistics
@@ -44,6 +44,7 @@ BUS_COUNTS: Final = ("garbled", "error_frames", "unsent", "queue_drops", "losses
 
 _OF_VALUES: Final = {"not_available", "implausible", "stuck", "held_back"}
 """Reasons that concern values, not whole frames."""
+_VALUES: Final = Estimate._fields[: Estimate._fields.index("status")]
 _REJECTS: Final = tuple(
     each.name
     for each in fields(MessageStatistics)
@@ -222,14 +223,11 @@ class Monitor:
             "loop_age_s": 0.0,
             "status": estimate.status.name.lower(),
             "reasons": reason_ids(estimate.reasons),
-            "estimate": _finite(
-                estimate, "time_s", "soc_pct", "soc_std_pct", "soc_newton_pct",
-                "soc_coulomb_pct", "voltage_model_v", "residual_v",
-            ),
+            "estimate": plain(dict(zip(_VALUES, estimate, strict=False))),
             "sample": None
             if sample is None
             else {"age_s": now_s - self._sample_s if self._sample_s > -math.inf else None}
-            | _finite(sample, "current_a", "voltage_v", "temperature_c"),
+            | plain({name: value for name, value in sample._asdict().items() if name != "time_s"}),
             **self._report,
             "notices": [*self._find_notices().values(), *self._troubles()],
             "samples": samples,
@@ -289,8 +287,3 @@ class Monitor:
             soc_pct=estimate.soc_pct,
             soc_std_pct=estimate.soc_std_pct,
         )
-
-
-def _finite(values: Any, *names: str) -> dict[str, float | None]:
-    found = {name: getattr(values, name) for name in names}
-    return {name: value if math.isfinite(value) else None for name, value in found.items()}

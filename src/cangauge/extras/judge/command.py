@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from contextlib import ExitStack, nullcontext
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
@@ -143,7 +144,7 @@ def _suite(
         scores = run_suite(started_by, drives, show=show)
     if json_output:
         gauge = " ".join(started_by)
-        emit_json({"schema": 1, "gauge": gauge, "scores": [each.to_dict() for each in scores]})
+        emit_json({"schema": 1, "gauge": gauge, "scores": [asdict(each) for each in scores]})
         return
     rows = [
         [

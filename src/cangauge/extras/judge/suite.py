@@ -14,7 +14,7 @@ import subprocess
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -157,13 +157,6 @@ class Score:
     recovery_s: float
     cover_2sigma: float | None
     silent: float
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return plain values for JSON; None for what is not known."""
-        return {
-            name: None if isinstance(value, float) and not math.isfinite(value) else value
-            for name, value in asdict(self).items()
-        }
 
 
 def simulated_drives() -> list[PlayedDrive]:
