@@ -4,11 +4,7 @@ from __future__ import annotations
 
 import enum
 import math
-from typing import TYPE_CHECKING, Final, NamedTuple
-
-if TYPE_CHECKING:
-    from cangauge.logs.log import TemperatureSource
-    from cangauge.model.voltage_model import VoltageModel
+from typing import Final, NamedTuple
 
 CURRENT_AT_MOST_A = 5000.0
 """Largest plausible absolute current [A]."""
@@ -16,11 +12,6 @@ TEMPERATURE_WITHIN_C = (-60.0, 120.0)
 """Plausible temperatures [°C]."""
 VOLTAGE_WITHIN = (0.5, 1.5)
 """Plausible voltages, relative to the pack's at half charge."""
-
-SOC_MARGIN_PCT = 1.0
-TEMPERATURE_MARGIN_K = 1.0
-CURRENT_MARGIN = 1.1
-"""How far outside the identified range still counts as inside [%, K, relative]."""
 
 
 class Sample(NamedTuple):
@@ -106,8 +97,6 @@ REASON_WORDS: Final = {
     Reason.SIGN_SUSPECT: "the current has the wrong sign: the voltage moves with it in its steps",
 }
 """Description of each reason, for pages and messages."""
-
-_NO_REASON = Reason.NONE  # used for every sample; looking up an enum member is slow
 
 
 class _Reasons(dict[int, Reason]):
@@ -223,43 +212,3 @@ def status_of(reasons: Reason) -> Status:
     if bits & _INVALID_BITS:
         return Status.INVALID
     return Status.DEGRADED
-
-
-def drop_implausible(sample: Sample, nominal_v: float) -> tuple[Sample, Reason]:
-    """Return the sample with an implausible voltage or temperature replaced by NaN, and why.
-
-    `nominal_v` is the pack's voltage at half charge [V]; behind open contactors it is close to 0.
-    """
-    reason = _NO_REASON
-    low, high = VOLTAGE_WITHIN[0] * nominal_v, VOLTAGE_WITHIN[1] * nominal_v
-    if not math.isnan(sample.voltage_v) and not low <= sample.voltage_v <= high:
-        sample = sample._replace(voltage_v=math.nan)
-        reason = Reason.IMPLAUSIBLE_INPUT
-    low, high = TEMPERATURE_WITHIN_C
-    if not math.isnan(sample.temperature_c) and not low <= sample.temperature_c <= high:
-        sample = sample._replace(temperature_c=math.nan)
-        reason = Reason.IMPLAUSIBLE_INPUT
-    return sample, reason
-
-
-def outside_model(model: VoltageModel, soc_pct: float, sample: Sample) -> Reason:
-    """Return which of SoC, temperature and current the model was not identified at (NaN: none)."""
-    reasons = _NO_REASON
-    low, high = model.soc_range_pct
-    if soc_pct < low - SOC_MARGIN_PCT or soc_pct > high + SOC_MARGIN_PCT:
-        reasons |= Reason.SOC_OUTSIDE_MODEL
-    low, high = model.temperature_range_c
-    cold, hot = low - TEMPERATURE_MARGIN_K, high + TEMPERATURE_MARGIN_K
-    if sample.temperature_c < cold or sample.temperature_c > hot:
-        reasons |= Reason.TEMPERATURE_OUTSIDE_MODEL
-    low, high = model.current_range_a
-    if sample.current_a < CURRENT_MARGIN * low or sample.current_a > CURRENT_MARGIN * high:
-        reasons |= Reason.CURRENT_OUTSIDE_MODEL
-    return reasons
-
-
-def temperature_mismatch(of_model: TemperatureSource, of_input: TemperatureSource) -> Reason:
-    """Return the reason for a mismatch if both sources are known and differ."""
-    if "unknown" in {of_model, of_input} or of_model == of_input:
-        return Reason.NONE
-    return Reason.TEMPERATURE_SOURCE_MISMATCH

@@ -11,11 +11,11 @@ from typing import Any, Final
 import numpy as np
 
 from cangauge.estimation.settings import EstimatorSettings
+from cangauge.estimation.validity import temperature_mismatch
 from cangauge.model.effects.base import CoreForm
 from cangauge.model.extended import OnlineModel
 from cangauge.model.model_file import Model
 from cangauge.model.voltage_model import HermiteCurve, PublishedCurve, resistance_factor
-from cangauge.types import temperature_mismatch
 
 DELAYS, LOW_PASSES, KNOTS, FUNCTIONS, EFFECTS, WAITING = 64, 4, 201, 16, 32, 8192
 OCV, LAGS, VALUES, TESTED = 8, 5, 12, 64

@@ -32,6 +32,7 @@ from cangauge.estimation.power import PowerModel
 from cangauge.estimation.settings import EstimatorSettings, SocReference, detect_references
 from cangauge.estimation.start import WRONG_PRIOR, WRONG_STD_PCT, Hypotheses
 from cangauge.estimation.state import DelayLineState, EstimatorMemory, EstimatorState
+from cangauge.estimation.validity import drop_implausible, outside_model, temperature_mismatch
 from cangauge.model.effects.base import Reading
 from cangauge.model.inverse import soc_from_ocv
 from cangauge.model.model_file import Model, as_model
@@ -45,10 +46,7 @@ from cangauge.types import (
     Power,
     Reason,
     Sample,
-    drop_implausible,
-    outside_model,
     status_of,
-    temperature_mismatch,
 )
 
 __all__ = ["Estimator", "EstimatorSettings"]

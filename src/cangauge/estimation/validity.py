@@ -1,0 +1,57 @@
+"""What makes a sample implausible, or a model not identified at it."""
+
+from __future__ import annotations
+
+import math
+from typing import Final
+
+from cangauge.logs.log import TemperatureSource
+from cangauge.model.voltage_model import VoltageModel
+from cangauge.types import TEMPERATURE_WITHIN_C, VOLTAGE_WITHIN, Reason, Sample
+
+SOC_MARGIN_PCT: Final = 1.0
+MARGIN_K: Final = 1.0
+CURRENT_MARGIN: Final = 1.1
+"""How far outside the identified range still counts as inside [%, K, relative]."""
+
+_NO_REASON: Final = Reason.NONE  # used for every sample; looking up an enum member is slow
+
+
+def drop_implausible(sample: Sample, nominal_v: float) -> tuple[Sample, Reason]:
+    """Return the sample with an implausible voltage or temperature replaced by NaN, and why.
+
+    `nominal_v` is the pack's voltage at half charge [V]; behind open contactors it is close to 0.
+    """
+    reason = _NO_REASON
+    low, high = VOLTAGE_WITHIN[0] * nominal_v, VOLTAGE_WITHIN[1] * nominal_v
+    if not math.isnan(sample.voltage_v) and not low <= sample.voltage_v <= high:
+        sample = sample._replace(voltage_v=math.nan)
+        reason = Reason.IMPLAUSIBLE_INPUT
+    low, high = TEMPERATURE_WITHIN_C
+    if not math.isnan(sample.temperature_c) and not low <= sample.temperature_c <= high:
+        sample = sample._replace(temperature_c=math.nan)
+        reason = Reason.IMPLAUSIBLE_INPUT
+    return sample, reason
+
+
+def outside_model(model: VoltageModel, soc_pct: float, sample: Sample) -> Reason:
+    """Return which of SoC, temperature and current the model was not identified at (NaN: none)."""
+    reasons = _NO_REASON
+    low, high = model.soc_range_pct
+    if soc_pct < low - SOC_MARGIN_PCT or soc_pct > high + SOC_MARGIN_PCT:
+        reasons |= Reason.SOC_OUTSIDE_MODEL
+    low, high = model.temperature_range_c
+    cold, hot = low - MARGIN_K, high + MARGIN_K
+    if sample.temperature_c < cold or sample.temperature_c > hot:
+        reasons |= Reason.TEMPERATURE_OUTSIDE_MODEL
+    low, high = model.current_range_a
+    if sample.current_a < CURRENT_MARGIN * low or sample.current_a > CURRENT_MARGIN * high:
+        reasons |= Reason.CURRENT_OUTSIDE_MODEL
+    return reasons
+
+
+def temperature_mismatch(of_model: TemperatureSource, of_input: TemperatureSource) -> Reason:
+    """Return the reason for a mismatch if both sources are known and differ."""
+    if "unknown" in {of_model, of_input} or of_model == of_input:
+        return Reason.NONE
+    return Reason.TEMPERATURE_SOURCE_MISMATCH
