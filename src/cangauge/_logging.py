@@ -176,7 +176,7 @@ class _Repetitions:
 
     latest_s: float = -math.inf
     next_s: float = -math.inf
-    interval_s: float = FIRST_INTERVAL_S
+    interval_s: float = 0.0
     suppressed: int = 0
     held: logging.LogRecord | None = None
 
@@ -184,19 +184,21 @@ class _Repetitions:
         """Note that a record is written."""
         if self.suppressed:
             record.suppressed = self.suppressed
-        self.suppressed, self.held, self.next_s = 0, None, now_s + self.interval_s
+        self.suppressed, self.held = 0, None
+        self.interval_s = min(2.0 * self.interval_s, LONGEST_INTERVAL_S) or FIRST_INTERVAL_S
+        self.next_s = now_s + self.interval_s
 
 
 class RateLimitFilter(logging.Filter):
     """Limit each event to one record per interval; the latest suppressed one follows at its end.
 
     `release` writes it, when `release_due` is called: no thread is started for it, which could
-    fail. Without it, suppressed records are only counted. `clock` gives monotonic time [s].
+    fail. `clock` gives monotonic time [s].
     """
 
     def __init__(
         self,
-        release: Callable[[logging.LogRecord], None] | None = None,
+        release: Callable[[logging.LogRecord], None],
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         super().__init__()
@@ -210,34 +212,28 @@ class RateLimitFilter(logging.Filter):
         key = (record.name, str(getattr(record, "limit", record.msg)))
         with self._lock:
             now_s = self._clock()
-            seen = self._events[key] = self._events.pop(key, _Repetitions())
+            event = self._events[key] = self._events.pop(key, _Repetitions())
             if len(self._events) > EVENTS_KEPT:
                 del self._events[next(iter(self._events))]  # the one quiet for longest
-            if now_s - seen.latest_s > LONGEST_INTERVAL_S:
-                seen.interval_s = FIRST_INTERVAL_S
-            elif now_s < seen.next_s:
-                seen.latest_s = now_s
-                seen.suppressed += 1
-                seen.held = record
+            if now_s - event.latest_s > LONGEST_INTERVAL_S:
+                event.interval_s = 0.0
+            event.latest_s = now_s
+            if now_s < event.next_s:
+                event.suppressed += 1
+                event.held = record
                 return False
-            else:
-                seen.interval_s = min(2.0 * seen.interval_s, LONGEST_INTERVAL_S)
-            seen.latest_s = now_s
-            seen.write(record, now_s)
+            event.write(record, now_s)
         return True
 
     def release_due(self, *, everything: bool = False) -> None:
         """Write the suppressed records whose interval has ended, or all of them."""
-        if self._release is None:
-            return
         with self._lock:
             now_s = self._clock()
             due: list[logging.LogRecord] = []
-            for seen in self._events.values():
-                if seen.held is not None and (everything or now_s >= seen.next_s):
-                    due.append(seen.held)
-                    seen.suppressed -= 1
-                    seen.interval_s = min(2.0 * seen.interval_s, LONGEST_INTERVAL_S)
-                    seen.write(seen.held, now_s)
+            for event in self._events.values():
+                if event.held is not None and (everything or now_s >= event.next_s):
+                    due.append(event.held)
+                    event.suppressed -= 1
+                    event.write(event.held, now_s)
         for record in sorted(due, key=lambda each: each.created):
             self._release(record)

@@ -86,7 +86,7 @@ class InputError(CangaugeError):
             "message": str(self),
             "source": self.source,
             "field": self.field and _short(self.field, _LONGEST_VALUE),
-            "value": _plain(self.value),
+            "value": _json_value(self.value),
             "cure": self.cure and _short(self.cure),
         }
 
@@ -163,15 +163,13 @@ def _quoted(value: object) -> str:
         return f"a huge {type(value).__name__}"
 
 
-def _plain(value: object) -> bool | float | str | None:
+def _json_value(value: Any) -> bool | float | str | None:
     """Return numbers and text unchanged, anything else as quoted in the message."""
-    if hasattr(value, "tolist"):  # numpy's
-        value = value.tolist()
-    if value is None or isinstance(value, bool | float):
-        return value
-    if isinstance(value, int) and value.bit_length() <= 64:
-        return value
-    return _short(value, _LONGEST_VALUE) if isinstance(value, str) else _quoted(value)
+    value = value.tolist() if hasattr(value, "tolist") else value  # numpy's
+    if isinstance(value, str):
+        return _short(value, _LONGEST_VALUE)
+    is_small = isinstance(value, int) and value.bit_length() <= 64
+    return value if is_small or value is None or isinstance(value, float) else _quoted(value)
 
 
 def closest(word: str, names: Iterable[str]) -> str:

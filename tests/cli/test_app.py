@@ -11,8 +11,7 @@ from pathlib import Path
 import pytest
 import typer
 
-from cangauge._resources import THREADS
-from cangauge.cli.app import COMMANDS, app, help_line
+from cangauge.cli.app import COMMANDS, THREADS, app, help_line
 from cangauge.cli.output import note
 from live import in_process
 

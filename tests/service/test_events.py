@@ -71,7 +71,7 @@ def test_a_closed_stream_is_ignored(capsys: pytest.CaptureFixture[str]) -> None:
 
 def test_repetitions_are_written_at_growing_intervals() -> None:
     now = [0.0]
-    repeats = RateLimitFilter(clock=lambda: now[0])
+    repeats = RateLimitFilter(print, clock=lambda: now[0])
     written = []
     for tenth in range(10_000):
         now[0] = 0.1 * tenth
@@ -97,14 +97,14 @@ def test_events_are_limited_separately() -> None:
 
 
 def test_many_different_events_use_bounded_memory() -> None:
-    repeats = RateLimitFilter(clock=lambda: 0.0)
+    repeats = RateLimitFilter(print, clock=lambda: 0.0)
     for number in range(5_000):
         repeats.filter(record(f"made.up_{number}"))
     assert sys.getsizeof(repeats._events) < 100_000
 
 
 def test_the_first_of_an_event_is_always_written() -> None:
-    limiter = RateLimitFilter(clock=lambda: -1e9)
+    limiter = RateLimitFilter(print, clock=lambda: -1e9)
     assert limiter.filter(record("bus.lost"))
     assert not limiter.filter(record("bus.lost"))
 

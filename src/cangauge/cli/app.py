@@ -19,7 +19,6 @@ from typer.core import TyperCommand, TyperGroup
 from typer.main import get_command as build_command
 
 from cangauge._files import FULL
-from cangauge._resources import one_thread
 from cangauge._version import __version__
 from cangauge.cli.output import emit_json, note
 from cangauge.errors import CangaugeError, closest
@@ -28,6 +27,10 @@ FIRST: Final = (
     "demo", "init", "inspect", "fit", "estimate", "gap", "check", "run", "status", "replay",
 )  # fmt: skip
 """Commands of the main job, in its order; the others follow by name."""
+
+
+THREADS: Final = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+"""Environment variables of the linear algebra, set to 1 where the user has not set them."""
 
 
 def _entry_points() -> dict[str, EntryPoint]:
@@ -142,7 +145,9 @@ def _root(
 
 def main() -> None:
     """Run the command line and exit with its code."""
-    one_thread(os.environ)  # before any command imports numpy
+    # Before numpy is imported: on thousands of small systems threads wait for each other.
+    for name in THREADS:
+        os.environ.setdefault(name, "1")
     try:
         code = app(standalone_mode=False, prog_name="cangauge")
     except CangaugeError as error:

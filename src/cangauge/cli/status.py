@@ -16,11 +16,11 @@ from rich.text import Text
 from cangauge._text import (
     NONE_KNOWN,
     duration,
+    energy_text,
     known_soc,
     number,
     possible,
     uncertain,
-    uncertain_energy,
 )
 from cangauge.cli.declare import command
 from cangauge.cli.output import PlainConsole, emit_json, print_values, values_table
@@ -182,7 +182,7 @@ def pack_values(report: dict[str, Any], down_to: str = "", up_to: str = "") -> d
             values[f"possible {way}, 10 s"] = possible(
                 power[f"{way}_a"], power[f"{way}_std_a"], f"A{limit}"
             )
-        values["energy left"] = uncertain_energy(power["energy_wh"], power["energy_std_wh"])
+        values["energy left"] = energy_text(power["energy_wh"], power["energy_std_wh"])
     if cells is not None:
         weakest = "" if cells["weakest"] is None else f"number {cells['weakest']}: "
         less = uncertain(cells["sum_error_v"], cells["sum_std_v"], "V")
