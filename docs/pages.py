@@ -19,9 +19,8 @@ from typing import Any
 import cantools
 import numpy as np
 import typer
-from typer.main import get_command
 
-from cangauge.cli.app import COMMANDS, LazyGroup, app
+from cangauge.cli.app import COMMANDS, load_command
 from cangauge.extras.validation import simulate
 from cangauge.model.effects.library import LIBRARY
 from cangauge.types import REASON_WORDS, reason_name
@@ -59,15 +58,13 @@ def write_pages(folder: Path) -> None:
 
 def commands_page() -> str:
     """Return the reference of the commands, from their help."""
-    group = get_command(app)
-    assert isinstance(group, LazyGroup)
     parts = [
         "# Commands",
         "Every command has `-h` with the text below, and `--json` for one JSON object on stdout."
         " Exit codes: 0 done, 1 failed, 2 bad usage or input, 130 stopped by Ctrl-C.",
     ]
     for name in COMMANDS:
-        command = group.get_command(None, name)
+        command = load_command(name)
         text = inspect.cleandoc(command.help or "")
         text = re.sub(r"^#+ (.+)$", r"**\1**", text, flags=re.MULTILINE)
         parts += [f"## cangauge {name}", text]

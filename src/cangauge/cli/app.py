@@ -66,46 +66,22 @@ class LazyGroup(TyperGroup):
         return list(COMMANDS)
 
     def get_command(self, ctx: Any, cmd_name: str) -> Any:
-        """Return a command, or None."""
+        """Return a placeholder of a command for lists: its name and help line."""
         del ctx
-        return _command(cmd_name) if cmd_name in COMMANDS else None
+        return TyperCommand(cmd_name, help=help_line(COMMANDS[cmd_name]))
 
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
         """Return the command that the arguments name, or suggest the closest name."""
-        if args[0] not in COMMANDS and not args[0].startswith("-"):
-            near = closest(args[0], COMMANDS)
-            raise UsageError(
-                f"no such command: {args[0]}" + (f". Did you mean {near}?" * bool(near))
-            )
-        return super().resolve_command(ctx, args)
-
-    def format_help(self, ctx: Any, formatter: Any) -> None:
-        """Write the root page."""
-        _Listing(self).format_help(ctx, formatter)
-
-    def shell_complete(self, ctx: Any, incomplete: str) -> Any:
-        """Return the commands and options that begin with `incomplete`."""
-        ctx.command = _Listing(self)
-        return ctx.command.shell_complete(ctx, incomplete)
+        if args[0] in COMMANDS:
+            return args[0], load_command(args[0]), args[1:]
+        if args[0].startswith("-"):
+            self.parse_args(ctx, args)  # an unknown option
+        near = closest(args[0], COMMANDS)
+        raise UsageError(f"no such command: {args[0]}" + f". Did you mean {near}?" * bool(near))
 
 
-class _Listing(TyperGroup):
-    """The same group with placeholders for its commands: name and help line."""
-
-    def __init__(self, group: LazyGroup) -> None:
-        super().__init__(
-            commands={
-                name: TyperCommand(name, help=help_line(command))
-                for name, command in COMMANDS.items()
-            },
-            rich_markup_mode=group.rich_markup_mode,
-        )
-        self.__dict__.update(
-            {key: value for key, value in vars(group).items() if key != "commands"}
-        )
-
-
-def _command(name: str) -> Any:
+def load_command(name: str) -> Any:
+    """Import a command and return it as typer runs it."""
     function = COMMANDS[name].load()
     if (group := getattr(function, "group", None)) is not None:
         return build_command(group)

@@ -114,7 +114,7 @@ def fit_command(
         )
     starts = [None if each == "auto" else each for each in initial_soc or ["auto"]]
     published: dict[str, Any] = {
-        "delay_s": None if delays is None else parse_delays(delays),
+        "delay_s": None if delays is None else _delays_s(delays),
         "epsilon": epsilon,
         "t_ref_c": t_ref,
     }
@@ -171,22 +171,18 @@ def _cells_of(path: Path, log: Log, reading: ReadingOptions) -> int | None:
     return cells.count if abs(ratio - 1.0) <= SAME_SUM else None
 
 
-def parse_delays(given: str) -> tuple[float, ...]:
+def _delays_s(given: str) -> tuple[float, ...]:
     """Return the value of `--delays` [s]; raise InputError if it is none."""
     try:
         delays = tuple(float(text) for text in given.split(","))
     except ValueError:
         delays = ()
-    increasing = all(low < high for low, high in pairwise(delays))
     # Slope resistance and heat are defined by the undelayed current.
-    if not (delays and delays[0] == 0.0 and increasing and delays[-1] <= 3600.0):
-        raise InputError(
-            "not delays that begin with 0 and increase to 3600 s at most",
-            field="--delays",
-            value=given,
-            cure="give increasing seconds from 0, such as 0,10,30,70",
-        )
-    return delays
+    if delays[:1] == (0.0,) and all(low < high <= 3600.0 for low, high in pairwise(delays)):
+        return delays
+    problem = "not delays that begin with 0 and increase to 3600 s at most"
+    cure = "give increasing seconds from 0, such as 0,10,30,70"
+    raise InputError(problem, field="--delays", value=given, cure=cure)
 
 
 def _show(result: Identification) -> None:

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import importlib
-import importlib.util
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from types import ModuleType
+from runpy import run_path
 from typing import TYPE_CHECKING, Any
 
 from cangauge.errors import InputError
@@ -46,34 +45,19 @@ def column_of(log: Log, path: Path, heading: str, reading: ReadingOptions) -> Fl
 def load_function(text: str) -> Callable[..., Any]:
     """Return a function named `MODULE:FUNCTION` or `FILE.py:FUNCTION`; may raise InputError."""
     place, _, name = text.rpartition(":")
-    problem, cause = "" if place and name else "not a function", None
-    function: Any = None
-    if not problem:
-        try:
-            module = _file(Path(place)) if place.endswith(".py") else _module(place)
-            function = getattr(module, name, None)
-            problem = "" if callable(function) else f"{place} has no function {name}"
-        except (Exception, SystemExit) as error:  # noqa: BLE001 - whatever the user's module does
-            problem, cause = f"cannot be imported: {type(error).__name__}: {error}", error
-    if problem:
-        cure = "give MODULE:FUNCTION or path/to/file.py:FUNCTION"
-        raise InputError(problem, field="--simulator", value=text, cure=cure) from cause
-    return function  # type: ignore[no-any-return]
-
-
-def _module(name: str) -> ModuleType:
-    """Import a module, also from the working directory."""
-    sys.path.insert(0, "")
+    cure = "give MODULE:FUNCTION or path/to/file.py:FUNCTION"
+    if not (place and name):
+        raise InputError("not a function", field="--simulator", value=text, cure=cure)
+    sys.path.insert(0, "")  # modules of the working directory too
     try:
-        return importlib.import_module(name)
+        is_file = place.endswith(".py")
+        names = run_path(place) if is_file else vars(importlib.import_module(place))
+    except (Exception, SystemExit) as error:
+        problem = f"cannot be imported: {type(error).__name__}: {error}"
+        raise InputError(problem, field="--simulator", value=text, cure=cure) from error
     finally:
         sys.path.remove("")
-
-
-def _file(path: Path) -> ModuleType:
-    spec = importlib.util.spec_from_file_location(path.stem, path)
-    if spec is None or spec.loader is None or not path.is_file():
-        raise FileNotFoundError(f"no file {path}")
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+    if not callable(function := names.get(name)):
+        problem = f"{place} has no function {name}"
+        raise InputError(problem, field="--simulator", value=text, cure=cure)
+    return function  # type: ignore[no-any-return]
