@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cangauge.cli.simulator import load_function
+from cangauge.cli.gap import load_function
 from cangauge.logs.canonical import write_table
 from cangauge.model.published import CAPACITY_AH
 from synthetic import synthetic_log

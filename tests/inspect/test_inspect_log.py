@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from cangauge.cli.output import _plain
+from cangauge._text import plain
 from cangauge.inspect.channels import quantum_of
 from cangauge.inspect.log import LogInspection, inspect_log
 from cangauge.logs.log import Log
@@ -181,7 +181,7 @@ def test_tiny_logs_do_not_break_it(rows: int) -> None:
     found = inspect_log(log)
     assert found.rows == rows
     assert found.resistance is None
-    json.dumps(_plain(found.to_dict()), allow_nan=False)
+    json.dumps(plain(found.to_dict()), allow_nan=False)
 
 
 @settings(max_examples=60)
@@ -227,5 +227,5 @@ def test_recorded_trips(shared_data: Path) -> None:
         )
         assert not found.channels["voltage_v"].stuck
         assert not found.channels["current_a"].stuck
-        json.dumps(_plain(found.to_dict()), allow_nan=False)
+        json.dumps(plain(found.to_dict()), allow_nan=False)
     assert np.median(capacities) == pytest.approx(61.75, abs=0.1)  # as its README says

@@ -3,19 +3,16 @@
 from __future__ import annotations
 
 import shlex
-import sys
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING
-
-import typer
 
 from cangauge._extras import extra
 from cangauge._files import write_texts_atomic
 from cangauge._text import rounded
 from cangauge.cli.declare import Written, command
 from cangauge.cli.options import ReadingOptions, assumed_of, check_outputs
-from cangauge.cli.output import emit_json, note, print_table, wrapped
+from cangauge.cli.output import emit_json, note, print_table, say
 from cangauge.errors import InputError
 
 if TYPE_CHECKING:
@@ -112,11 +109,6 @@ def _refuse_options_of_captures(reading: ReadingOptions, path: Path) -> None:
         raise InputError(problem, source=path, field=option, value=value, cure="omit it")
 
 
-def _say(text: str) -> None:
-    """Print a line of the result; a terminal wraps it between words."""
-    typer.echo(wrapped(text, sys.stdout))
-
-
 def _show_log(found: LogInspection) -> None:
     from cangauge.inspect.log import ability_rows, channel_rows
 
@@ -125,26 +117,26 @@ def _show_log(found: LogInspection) -> None:
     if timing.rate_hz:
         exact = f"{timing.rate_hz:.4g} Hz (regular)"
         rate = exact if timing.regular else f"about {rounded(timing.rate_hz, 2)} Hz (irregular)"
-    _say(
+    say(
         f"{found.name}: {found.rows} rows, {timing.duration_s / 60.0:.1f} min, {rate},"
         f" temperature of: {found.temperature_source}"
     )
     print_table("Channels", *channel_rows(found))
-    _say(
+    say(
         f"Charge: {charge.discharged_ah:.4g} Ah discharged, {charge.charged_ah:.4g} Ah charged,"
         f" net {charge.net_ah:+.4g} Ah."
     )
     if soc is not None:
-        _say(
+        say(
             f"Reference SoC: {soc.first_pct:.1f} → {soc.last_pct:.1f} %,"
             f" in {100.0 * soc.coverage:.1f} % of the rows."
         )
-    _say(f"Sign: {found.sign.sentence}.")
+    say(f"Sign: {found.sign.sentence}.")
     head, rows = ability_rows(found)
     print_table("What this log can identify", head, rows[1:])  # the first is the sign
     for heading, lines in (("Remarks", found.remarks), ("Warning", found.warnings)):
         for line in lines:
-            _say(f"{heading}: {line}")
+            say(f"{heading}: {line}")
 
 
 def _show_capture(found: CaptureInspection) -> None:
@@ -152,7 +144,7 @@ def _show_capture(found: CaptureInspection) -> None:
     info, begins = found.info, ""
     if found.start_s > _STAMPS_SINCE_1970_S:
         begins = f", from {datetime.fromtimestamp(found.start_s, UTC):%Y-%m-%d %H:%M:%S} UTC"
-    _say(
+    say(
         f"{found.name}: {info.format}, {info.frames:,} frames of {len(found.ids)} ids,"
         f" {found.duration_s:.1f} s{begins}."
     )
@@ -163,24 +155,24 @@ def _show_capture(found: CaptureInspection) -> None:
             for name, unit in _RANGES.items()
             if (span := getattr(preset, name)) is not None
         ]
-        _say(
+        say(
             f"Vehicle: {preset.about} (--vehicle {preset.preset}), {preset.samples:,} samples:"
             f" {', '.join(spans)}."
         )
     if not matching and found.log is None:
         command = f"cangauge init {shlex.quote(found.source)} -o mycar"
-        _say(f"No known vehicle. Find its signals: {command}")
+        say(f"No known vehicle. Find its signals: {command}")
     print_table("Frames", *_rows_of_ids(found))
     counts = {words: getattr(found, name) for name, words in _COUNTS.items()}
     if any(counts.values()):
         shown = ", ".join(f"{count:,} {words}" for words, count in counts.items() if count)
-        _say(f"{shown[0].upper()}{shown[1:]}.")
+        say(f"{shown[0].upper()}{shown[1:]}.")
     for gap in found.gaps[:_GAPS_SHOWN]:
-        _say(f"Silence of {gap.length_s:.3g} s after {gap.start_s - found.start_s:.1f} s.")
+        say(f"Silence of {gap.length_s:.3g} s after {gap.start_s - found.start_s:.1f} s.")
     if len(found.gaps) > _GAPS_SHOWN:
-        _say(f"{len(found.gaps) - _GAPS_SHOWN} more silences (--json).")
+        say(f"{len(found.gaps) - _GAPS_SHOWN} more silences (--json).")
     for line in info.remarks:
-        _say(f"Remarks: {line}")
+        say(f"Remarks: {line}")
 
 
 def _rows_of_ids(found: CaptureInspection) -> tuple[list[str], list[list[str]]]:

@@ -9,7 +9,7 @@ import sys
 import textwrap
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from typing import Any, Final, TextIO
+from typing import Any, TextIO
 
 from rich import box
 from rich.console import Console, ConsoleOptions, RenderableType
@@ -38,29 +38,25 @@ console = PlainConsole(stderr=True, highlight=False)
 
 
 def note(text: str) -> None:
-    """Print one line on stderr; on a terminal it is wrapped between words."""
+    """Print lines on stderr; on a terminal they are wrapped between words."""
     if sys.stderr is not None:
         with suppress(OSError):  # a full disk behind it: the exit code reports the failure
-            sys.stderr.write(wrapped(text, sys.stderr) + "\n")
-            sys.stderr.flush()
+            _print(text, sys.stderr)
 
 
-def wrapped(text: str, file: TextIO) -> str:
-    """Return printable text, wrapped between words where the file is a terminal."""
-    text = printable(text.rstrip())
-    if not file.isatty():
-        return text
-    columns = max(shutil.get_terminal_size().columns, 40)
-    return "\n".join(textwrap.fill(line, columns, **_HANGING) for line in text.splitlines())
+def say(text: str) -> None:
+    """Print lines of the result on stdout; on a terminal they are wrapped between words."""
+    _print(text, sys.stdout)
 
 
-_HANGING: Final[dict[str, Any]] = {
-    "subsequent_indent": "  ",
-    "break_long_words": False,
-    "break_on_hyphens": False,
-    "replace_whitespace": False,
-}
-"""Paths and values stay whole, to be copied."""
+def _print(text: str, file: TextIO) -> None:
+    lines = printable(text.rstrip()).splitlines()
+    if file.isatty():  # paths and values stay whole, to be copied
+        wrap = textwrap.TextWrapper(max(shutil.get_terminal_size().columns, 40), "", "  ")
+        wrap.break_long_words = wrap.break_on_hyphens = False
+        lines = [wrap.fill(line) for line in lines]
+    file.write("\n".join(lines) + "\n")
+    file.flush()
 
 
 @contextmanager
