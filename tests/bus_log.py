@@ -6,7 +6,7 @@ import io
 import json
 from typing import Any, Self
 
-from cangauge._logging import logging_to
+from cangauge.service.events import logging_to
 
 
 class BusLog:

@@ -7,27 +7,30 @@ import errno
 import io
 import json
 import logging
+import math
 import os
 import subprocess
 import sys
 import threading
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Self
 
 import can
+import numpy as np
 import pytest
 
-from cangauge._logging import RateLimitFilter
 from cangauge._resources import shared_file
 from cangauge.bus.connection import BusConnection
 from cangauge.bus.open import BusAddress, open_bus
-from cangauge.bus.vehicle import Vehicle
+from cangauge.bus.time_source import MICROSECONDS
+from cangauge.bus.vehicle import LOG_COLUMNS, Vehicle
 from cangauge.cli.app import main
 from cangauge.logs.log import Log
 from cangauge.model.model_file import Model
+from cangauge.service.events import RateLimitFilter
 from cangauge.service.loop import Loop, LoopSettings, RunSummary
 from cangauge.service.output import Output
 from cangauge.service.pipeline import Pipeline, PipelineSettings
@@ -328,3 +331,19 @@ def waits(condition: Callable[[], bool], seconds: float = 60.0) -> bool:
             return False
         time.sleep(0.005)
     return True
+
+
+def quantized(vehicle: Vehicle, log: Log) -> Log:
+    """Return the log as decoded from a vehicle's frames with REPLAY_CLOCK, bit for bit.
+
+    A vehicle without a temperature signal gives its fixed temperature, or the log's if it has none.
+    """
+    columns = {LOG_COLUMNS[signal.role]: signal for signal in vehicle.signals}
+    sent: dict[str, Any] = {
+        column: signal.codec.quantize(values)
+        for column, signal in columns.items()
+        if (values := getattr(log, column)) is not None
+    }
+    if not math.isnan(vehicle.fixed_temperature_c):
+        sent["temperature_c"] = np.full(len(log), vehicle.fixed_temperature_c)
+    return replace(log, time_s=np.rint(log.time_s * MICROSECONDS) / MICROSECONDS, **sent)

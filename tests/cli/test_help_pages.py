@@ -31,8 +31,8 @@ print(json.dumps(found))
 """
 
 
-ON_A_BUS = ("init", "replay", "run")
-"""Commands with options made from the service's configuration."""
+ON_A_BUS = ("check", "init", "replay", "run")
+"""Commands of the service's configuration, or with options made from it."""
 
 
 def test_no_help_page_imports_what_computes() -> None:

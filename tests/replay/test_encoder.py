@@ -16,6 +16,7 @@ from cangauge.errors import InputError
 from cangauge.logs.log import Log
 from cangauge.replay.encoder import FrameEncoder
 from cangauge.types import Sample
+from live import quantized
 
 VEHICLES = {
     "generic": Vehicle.load("generic"),
@@ -69,14 +70,14 @@ def test_the_decoder_gives_the_quantized_log_bit_for_bit(name: str, log: Log) ->
     encoder = FrameEncoder(VEHICLES[name])
     encoder.check_range(log)
     # Time goes through REPLAY_CLOCK, which is not part of these frames.
-    bound, quantized = encoder.quantization(), encoder.quantize(log)
+    bound, read = encoder.quantization(), quantized(encoder.vehicle, log)
     samples, references = through_frames(VEHICLES[name], log)
-    assert [each[1:] for each in samples] == [each[1:] for each in rows_of(quantized)]
-    assert quantized.soc_pct is not None
-    for got, wanted in zip(references, quantized.soc_pct.tolist(), strict=True):
+    assert [each[1:] for each in samples] == [each[1:] for each in rows_of(read)]
+    assert read.soc_pct is not None
+    for got, wanted in zip(references, read.soc_pct.tolist(), strict=True):
         assert math.isnan(wanted) or got == wanted
     for field in bound:
-        error = np.abs(getattr(quantized, field) - getattr(log, field))
+        error = np.abs(getattr(read, field) - getattr(log, field))
         assert np.nanmax(error, initial=0.0) <= bound[field] * (1 + 1e-6)
 
 

@@ -30,6 +30,7 @@ from live import (
     Service,
     leaf_model,
     never,
+    quantized,
     short_log,
     virtual_port,
     virtual_service,
@@ -245,7 +246,7 @@ def test_recorded_timing_is_kept(
     sent_s = np.array([at for at, frame in bus.sent if not is_clock(frame)])
     clocks = [frame for _, frame in bus.sent if is_clock(frame)]
     assert len(sent_s) == len(times) == state.frames
-    assert len(clocks) == state.clocks == (0 if speed == 1.0 else len(times))
+    assert len(clocks) == state.clock_frames == (0 if speed == 1.0 else len(times))
     late = sent_s - sent_s[0] - (np.array(times) - times[0]) / speed
     caught_up = np.array(times) - times[0] > late_s + 0.02
     assert np.abs(late[caught_up]).max() < 2e-3  # a late frame does not delay the rest
@@ -267,7 +268,7 @@ def test_the_estimate_does_not_depend_on_the_speed() -> None:
         state = play_log("fast", 40.0, ReplaySettings(speed=40.0))
         assert waits(lambda: service.pipeline.samples == 400)
     assert state.acknowledged is None
-    sent = FrameEncoder(Vehicle.load("generic")).quantize(log)
+    sent = quantized(Vehicle.load("generic"), log)
     offline = run_estimator(samples_of(sent), model, EstimatorSettings()).soc_pct
     live = [estimate.soc_pct for _, estimate in service.rows]
     assert repr(live) == repr(offline.tolist())  # NaN until the first block

@@ -11,8 +11,9 @@ from typing import Any
 import pytest
 from rich.table import Table
 
-from cangauge._logging import LogFormat, emit, logging_to
+from cangauge._logging import emit
 from cangauge.cli.output import PlainConsole, emit_json, note, print_table
+from cangauge.service.events import LogFormat, logging_to
 from live import in_process, leaf_model_path
 
 HOSTILE = "a\x1b]0;owned\x07b\x1b[2Jc\x9bd\x08e\rf\x7fg\x00h"

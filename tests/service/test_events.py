@@ -11,7 +11,8 @@ import threading
 
 import pytest
 
-from cangauge._logging import LogFormat, RateLimitFilter, emit, logging_to, release_held
+from cangauge._logging import emit
+from cangauge.service.events import LogFormat, RateLimitFilter, logging_to, release_held
 from live import waits
 
 LOG = logging.getLogger("cangauge.test")

@@ -34,7 +34,7 @@ from cangauge.service.pipeline import Pipeline, PipelineSettings
 from cangauge.service.setup import pipeline_settings
 from cangauge.types import CellReport, Estimate, Health, Power, Reason, Status
 from cells_bus import ALL_CELLS, CAR, CELLS_DBC, CELLS_ON_BUS, all_cell_frames
-from live import collect, leaf_model, short_log, virtual_port, virtual_service
+from live import collect, leaf_model, quantized, short_log, virtual_port, virtual_service
 
 NAN = math.nan
 ESTIMATE = Estimate(0.0, 63.2, 1.5, 62.1, 63.9, 370.0, -0.25, Status.VALID, Reason.NONE, 1)
@@ -177,7 +177,7 @@ def cells_of(log: Log, row: int) -> list[float]:
 
 def test_live_health_power_and_cells_equal_offline_ones(tmp_path: Path) -> None:
     log, car = short_log(120.0, rate_hz=2.0), car_with_cells(tmp_path)
-    log = FrameEncoder(car).quantize(log)
+    log = quantized(car, log)
     pipeline = Pipeline(car, leaf_model(), PipelineSettings())
     offline = make_estimator(leaf_model())
     encoder, reports = FrameEncoder(car), []

@@ -18,7 +18,7 @@ from cangauge.logs.log import Log
 from cangauge.replay.encoder import FrameEncoder
 from cangauge.service.pipeline import Pipeline, PipelineSettings
 from cangauge.types import Estimate, Reason, Status
-from live import leaf_model, short_log
+from live import leaf_model, quantized, short_log
 
 START = EstimatorSettings(initial_soc_pct=80.0)
 
@@ -63,7 +63,7 @@ def test_live_equals_offline_on_quantized_values(log: Log, preset: str, method: 
     settings = EstimatorSettings(method=method, initial_soc_pct=80.0)  # type: ignore[arg-type] # parametrised
     pipeline = Pipeline(vehicle, leaf_model(), PipelineSettings(settings, "replay-clock"))
     live = estimates(pipeline, with_clock(frames_of(log, vehicle)))
-    offline = run_estimator(samples_of(FrameEncoder(vehicle).quantize(log)), leaf_model(), settings)
+    offline = run_estimator(samples_of(quantized(vehicle, log)), leaf_model(), settings)
     assert len(live) == len(log)
     for name in ("soc_pct", "soc_std_pct", "residual_v"):  # to the last bit
         numbers = [getattr(each, name) for each in live]

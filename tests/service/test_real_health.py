@@ -19,7 +19,7 @@ from cangauge.logs.read import read_log
 from cangauge.replay.encoder import FrameEncoder
 from cangauge.service.pipeline import Pipeline, PipelineSettings
 from cangauge.types import Estimate, Reason, Status
-from live import leaf_model
+from live import leaf_model, quantized
 
 pytestmark = pytest.mark.real
 
@@ -73,13 +73,13 @@ def test_replayed_trips_raise_no_alarm_and_match_offline(
     pipeline = Pipeline(vehicle, leaf_model(), PipelineSettings(START))
     encoder = FrameEncoder(vehicle)
     estimates: list[Estimate] = []
-    for sample in samples_of(FrameEncoder(vehicle).quantize(log)):
+    for sample in samples_of(quantized(vehicle, log)):
         frames = encoder.encode(sample)
         estimates += [pipeline.latest for frame in frames if pipeline.handle(frame)]
     counts = pipeline.counts
     assert (counts.implausible, counts.stuck, counts.held_back) == (0, 0, 0)
     settings = replace(START, temperature_source=vehicle.temperature_source)
-    offline = run_estimator(samples_of(encoder.quantize(log)), leaf_model(), settings)
+    offline = run_estimator(samples_of(quantized(encoder.vehicle, log)), leaf_model(), settings)
     assert [each.soc_pct for each in estimates] == offline.soc_pct.tolist()
     assert [each.status for each in estimates] == offline.status.tolist()
 

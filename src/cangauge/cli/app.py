@@ -157,15 +157,7 @@ UsageError: Final[type[Any]] = typer.BadParameter.__mro__[1]
 
 
 def _emit_failure(error: Mapping[str, Any], exit_code: int) -> None:
-    """Print `{"error": …, "exit_code": …}` on stdout if the command line asks for `--json`.
-
-    Parameters
-    ----------
-    error : mapping
-        From `CangaugeError.to_dict`.
-    exit_code : int
-        Exit code of the process.
-    """
+    """Print `{"error": …, "exit_code": …}` on stdout if the command line asks for `--json`."""
     arguments = sys.argv[1:]
     options = arguments[: arguments.index("--")] if "--" in arguments else arguments
     # Not from the parser: the error may be one of parsing.
@@ -184,14 +176,7 @@ def _discard_stdout() -> None:
 
 
 def _usage(error: Any) -> tuple[str, str | None]:
-    """Return a usage error in one line, which names the help page, and its option or argument.
-
-    The line is "" if the help page was shown.
-
-    Parameters
-    ----------
-    error : UsageError
-    """
+    """Return a usage error in one line, "" if the help page was shown, and its option."""
     field, parameter = getattr(error, "option_name", None), getattr(error, "param", None)
     if field is None and parameter is not None:
         # The help page shows an argument by its metavar.

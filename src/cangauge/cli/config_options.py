@@ -34,13 +34,7 @@ def _with_values(arguments: Sequence[str]) -> Iterator[str]:
 
 
 def config_parameters(*names: str) -> list[inspect.Parameter]:
-    """Return the options of keys of the configuration, as typer reads them.
-
-    Parameters
-    ----------
-    *names : str
-        Keys, such as "channel". Default: every key that has an option.
-    """
+    """Return the options of keys, such as "channel", as typer reads them; without names of all."""
     return [
         inspect.Parameter(
             name,

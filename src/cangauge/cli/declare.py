@@ -22,7 +22,7 @@ from __future__ import annotations
 import inspect
 import re
 from collections.abc import Callable, Iterator
-from dataclasses import MISSING, Field, fields, is_dataclass
+from dataclasses import MISSING, fields, is_dataclass
 from pathlib import Path
 from types import NoneType, UnionType
 from typing import Annotated, Any, Final, Union, get_args, get_origin, get_type_hints
@@ -121,14 +121,9 @@ def _of_group(kind: type, omitted: tuple[str, ...]) -> Iterator[inspect.Paramete
     hints = get_type_hints(kind, include_extras=True)
     for each in fields(kind):
         if each.name not in omitted:
-            named = inspect.Parameter(
-                each.name, inspect.Parameter.KEYWORD_ONLY, default=_default(each)
-            )
+            default = inspect.Parameter.empty if each.default is MISSING else each.default
+            named = inspect.Parameter(each.name, inspect.Parameter.KEYWORD_ONLY, default=default)
             yield _declared(named, hints[each.name], *entries[each.name])
-
-
-def _default(each: Field[Any]) -> Any:
-    return inspect.Parameter.empty if each.default is MISSING else each.default
 
 
 def _declared(

@@ -8,7 +8,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 from cangauge._extras import extra
 from cangauge._files import write_text_atomic
@@ -74,11 +74,8 @@ def demo_command(*, folder: Path = Path("out/demo"), json_output: bool = False) 
     except OSError as error:
         problem, cure = f"cannot create this folder: {error.strerror}", "name another one"
         raise InputError(problem, source=folder, field="--folder", cure=cure) from error
-    paths = {
-        "model": folder / "model.json",
-        "fit_page": folder / "fit.html",
-        "soc_page": folder / "soc.html",
-    }
+    files = {"model": "model.json", "fit_page": "fit.html", "soc_page": "soc.html"}
+    paths = {name: folder / file for name, file in files.items()}
     note("1/4  fit the voltage model to 2.6 h of the reconstructed Leaf test")
     identification = fit([read_log(shared_file("replay", TRAINED_ON))], equation="published")
     model = identification.model
@@ -154,30 +151,32 @@ def _play(folder: Path, log: Path) -> float:
     return seconds
 
 
+_SHOWN: Final = {
+    "fit_voltage_mae_pct": "voltage error of the fit, MAE",
+    "fit_soc_newton_mae_pct": "SoC by Newton on the fitted log, MAE",
+    "live_soc_newton_mae_pct": "SoC by Newton, live, MAE",
+    "live_soc_coulomb_mae_pct": "SoC by Coulomb counting, live, MAE",
+    "live_soc_mae_pct": "SoC by EKF, live, MAE",
+    "live_soc_max_pct": "SoC by EKF, live, largest",
+    "live_minus_offline_pct": "live minus offline, largest",
+    "quantisation_bound_pct": "  bound from rounding in frames",
+}
+
+
 def _show(result: dict[str, Any]) -> None:
     from cangauge.model.published import SOC_NEWTON_MAE_PCT, VOLTAGE_MAE_PCT
 
+    published = {
+        "fit_voltage_mae_pct": f"{VOLTAGE_MAE_PCT:.2f} %",
+        "fit_soc_newton_mae_pct": f"{SOC_NEWTON_MAE_PCT:.2f} %",
+    }
     rows = [
-        [name, significant(result[key], 3, "%"), "" if published is None else f"{published:.2f} %"]
-        for name, key, published in (
-            ("voltage error of the fit, MAE", "fit_voltage_mae_pct", VOLTAGE_MAE_PCT),
-            ("SoC by Newton on the fitted log, MAE", "fit_soc_newton_mae_pct", SOC_NEWTON_MAE_PCT),
-            ("SoC by Newton, live, MAE", "live_soc_newton_mae_pct", None),
-            ("SoC by Coulomb counting, live, MAE", "live_soc_coulomb_mae_pct", None),
-            ("SoC by EKF, live, MAE", "live_soc_mae_pct", None),
-            ("SoC by EKF, live, largest", "live_soc_max_pct", None),
-            ("live minus offline, largest", "live_minus_offline_pct", None),
-            ("  bound from rounding in frames", "quantisation_bound_pct", None),
-        )
+        [name, significant(result[key], 3, "%"), published.get(key, "")]
+        for key, name in _SHOWN.items()
     ]
     rows.append(["reference within ±2σ", number(100.0 * result["live_cover_2sigma"], 1, "%"), ""])
-    print_table(
-        f"Reconstructed Leaf test, live; current {SENSOR_OFFSET_A:g} A too high",
-        ["error", "here", "published"],
-        rows,
-    )
-    note(
-        f"{result['samples']} samples in {result['replay_seconds']:.0f} s over the bus;"
-        f" {result['seconds']:.0f} s in total"
-    )
+    title = f"Reconstructed Leaf test, live; current {SENSOR_OFFSET_A:g} A too high"
+    print_table(title, ["error", "here", "published"], rows)
+    seconds = f"{result['replay_seconds']:.0f} s over the bus; {result['seconds']:.0f} s in total"
+    note(f"{result['samples']} samples in {seconds}")
     note(f"open {result['soc_page']} (SoC against reference) and {result['fit_page']} (the model)")

@@ -90,29 +90,20 @@ def estimate_command(
     pack_model, logs, recording = Model.load(model), [], reading.open(log_path)
     if isinstance(recording, LogFile):
         logs = [reading.load(log_path)]
-        done = _of_log(
-            logs[0],
-            pack_model,
-            settings,
-            reading,
-            soc_from_log=initial_soc is None,
-            keeps_pack=pack is not None,
-        )
+        done = _of_log(logs[0], pack_model, settings, reading, pack=pack, initial_soc=initial_soc)
     else:
-        done = _of_capture(recording, pack_model, settings, reading, keeps_pack=pack is not None)
+        done = _of_capture(recording, pack_model, settings, reading, pack)
     _write(done, output, pack, report, model)
     for warning in done.warnings:
         note(f"warning: {done.recorded.source}: {warning}")
     if json_output:
-        written = {"output": str(output), "pack": pack and str(pack), "assumed": assumed_of(logs)}
-        emit_json(done.to_dict() | written | {"report": report and str(report)})
+        files = {"output": output, "pack": pack, "report": report}
+        named = {name: path and str(path) for name, path in files.items()}
+        emit_json(done.to_dict() | named | {"assumed": assumed_of(logs)})
         return
     _show(done)
-    for what, path in (
-        ("estimates", output),
-        ("health, power and cells", pack),
-        ("report", report),
-    ):
+    written = {"estimates": output, "health, power and cells": pack, "report": report}
+    for what, path in written.items():
         if path is not None:
             note(f"{what}: {path}")
 
@@ -123,8 +114,8 @@ def _of_log(
     settings: EstimatorSettings,
     reading: ReadingOptions,
     *,
-    soc_from_log: bool,
-    keeps_pack: bool,
+    pack: Path | None,
+    initial_soc: float | str | None,
 ) -> RecordedEstimate:
     from cangauge.logs.read import read_cells
     from cangauge.model.delay_line import GAP_S
@@ -133,10 +124,10 @@ def _of_log(
     if settings.initial_soc_pct is not None:
         note_starts([log], settings.initial_soc_pct, settings.capacity_ah or model.capacity_ah)
     cells = read_cells(Path(log.source), log.time_s, reading.given_columns())
-    history = PackHistory(keeps_rows=keeps_pack, cells=cells, duration_s=log.duration_s)
+    history = PackHistory(keeps_rows=pack is not None, cells=cells, duration_s=log.duration_s)
     with progress_bar(log.name, len(log)) as progress:
         done = estimate_recorded_log(
-            log, model, settings, soc_from_log=soc_from_log, pack=history, progress=progress
+            log, model, settings, soc_from_log=initial_soc is None, pack=history, progress=progress
         )
     if (gap_s := done.settings.gap_s) > GAP_S:
         note(
@@ -151,24 +142,23 @@ def _of_capture(
     model: Model,
     settings: EstimatorSettings,
     reading: ReadingOptions,
-    *,
-    keeps_pack: bool,
+    pack: Path | None,
 ) -> RecordedEstimate:
-    """Estimate a capture; InputError if it has one sample, another pack's or inverted current."""
+    """Estimate a capture; InputError if it has one sample, or inverted current."""
     from cangauge.bus.recording import refuse_single_row
     from cangauge.logs.sign import require_discharge_positive
-    from cangauge.service.offline import RecordedCapture, estimate_capture, require_same_pack
+    from cangauge.service.offline import RecordedCapture, estimate_capture
 
     car = reading.car_of(capture.path)
     with progress_bar(capture.path.name, None) as progress:
+        keeps = pack is not None
         done = estimate_capture(
-            capture.path, car, model, settings, keeps_pack=keeps_pack, progress=progress
+            capture.path, car, model, settings, keeps_pack=keeps, progress=progress
         )
     recorded = done.recorded
     refuse_single_row(recorded)
     for remark in recorded.remarks:
         note(f"{recorded.source}: {remark}")
-    require_same_pack(recorded, model)
     if isinstance(recorded, RecordedCapture) and (log := recorded.as_log()) is not None:
         require_discharge_positive(log, is_capture=True)
     return done

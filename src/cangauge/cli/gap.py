@@ -93,6 +93,7 @@ def gap_command(
     """
     from cangauge.diagnosis import diagnose
     from cangauge.diagnosis.planner import plan as plan_next
+    from cangauge.identify.starts import with_start
     from cangauge.model.model_file import Model
 
     added, given = list(add_test or []), list(reference or [])
@@ -110,7 +111,8 @@ def gap_command(
         _note_differences(read, capacity_ah)
     diagnosed, references = read[: len(paths)], read[len(paths) :]
     if initial_soc is not None:  # an added test has its own start
-        diagnosed[: len(logs)] = _started(diagnosed[: len(logs)], initial_soc, capacity_ah)
+        note_starts(diagnosed[: len(logs)], initial_soc, capacity_ah)
+        diagnosed[: len(logs)] = [with_start(log, initial_soc) for log in diagnosed[: len(logs)]]
     with progress_shown("cangauge.diagnosis"):
         found = diagnose(
             diagnosed,
@@ -219,13 +221,6 @@ def _held(found: Diagnosis) -> str:
     return f": the model with {cause} (probability {percent(found.posterior.effects[cause])})"
 
 
-def _started(logs: list[Log], initial_soc_pct: float, capacity_ah: float | None) -> list[Log]:
-    from cangauge.identify.starts import with_start
-
-    note_starts(logs, initial_soc_pct, capacity_ah)
-    return [with_start(log, initial_soc_pct) for log in logs]
-
-
 def _note_differences(logs: list[Log], capacity_ah: float) -> None:
     from cangauge.model.coulomb_counting import difference_from_reference
 
@@ -235,12 +230,10 @@ def _note_differences(logs: list[Log], capacity_ah: float) -> None:
 
 
 def _refuse_simulators(model: Path | None, simulated: str | None, simulator: str | None) -> None:
-    """Raise InputError for two simulators, or for neither a model nor a simulator."""
+    cure = "give the model file, or --simulated or --simulator"
     if simulated is not None and simulator is not None:
-        cure = "give --simulated or --simulator"
-        raise InputError("two simulators", field="--simulator", value=simulator, cure=cure)
+        raise InputError("two simulators", field="--simulator", value=simulator, cure="give one")
     if (model, simulated, simulator) == (None, None, None):
-        cure = "give the model file, or --simulated or --simulator"
         raise InputError("no model", field="--model", cure=cure)
 
 
@@ -248,12 +241,9 @@ def _refuse_common(logs: list[Path], references: list[Path]) -> None:
     known = {path.resolve() for path in references}
     for path in logs:
         if path.resolve() in known:
-            raise InputError(
-                "is both a LOG and a reference, which must be without the fault",
-                source=path,
-                field="--reference",
-                cure="give it as one of them",
-            )
+            problem = "is both a LOG and a reference, which must be without the fault"
+            cure = "give it as one of them"
+            raise InputError(problem, source=path, field="--reference", cure=cure)
 
 
 def _show(found: Diagnosis, before: Diagnosis | None, steps: Plan | None) -> None:

@@ -95,22 +95,9 @@ class ReadingOptions:
     def load(self, path: Path, used: Sequence[str] = ()) -> Log:
         """Read a log, or decode a capture; print the reader's remarks on stderr.
 
-        Parameters
-        ----------
-        path : Path
-        used : sequence of str
-            Columns of a log that the command reads besides.
-
-        Returns
-        -------
-        Log
-            Positive current discharges, where the format defines the sign.
-
-        Raises
-        ------
-        InputError
-            If the input cannot be read or has a single row, an option has an unknown value, or the
-            data show clearly that positive current charges, unless `sign` states it.
+        `used` are columns that the command reads besides. Raises InputError if the input cannot be
+        read or has a single row, or if the data show clearly that positive current charges and
+        `sign` does not state it.
         """
         from cangauge.bus.recording import log_of, refuse_single_row
         from cangauge.logs.read import LogFile
@@ -169,17 +156,7 @@ def check_outputs(
 ) -> None:
     """Refuse, before any long work, outputs that cannot be written or would overwrite input.
 
-    Parameters
-    ----------
-    outputs, inputs : iterable of Path
-        None stands for an output that is not wanted.
-    made : Path, optional
-        A folder that the command makes, of outputs; made after the check.
-
-    Raises
-    ------
-    InputError
-        If a folder is missing or not writable, an output is named twice, or is also an input.
+    None stands for an output that is not wanted; `made` is a folder that the command makes later.
     """
     read = {path.resolve() for path in inputs}
     written: set[Path] = set()

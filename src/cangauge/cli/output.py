@@ -61,15 +61,7 @@ def _print(text: str, file: TextIO) -> None:
 
 @contextmanager
 def progress_shown(logger: str, show: Callable[[str], None] | None = None) -> Iterator[None]:
-    """Show the log records of a long computation: decisions (INFO) as lines, each step by `show`.
-
-    Parameters
-    ----------
-    logger : str
-        Name of the logger, such as "cangauge.identify".
-    show : callable, optional
-        Takes the text of each step, for a status line.
-    """
+    """Show what a computation logs: decisions (INFO) as lines, each step by `show`."""
     own, handler = logging.getLogger(logger), _ProgressHandler(show)
     level = own.level
     own.addHandler(handler)

@@ -135,20 +135,15 @@ def _as_json(state: ReplayState, bus: BusConnection, source: Source) -> dict[str
     from cangauge.replay.encoder import FrameEncoder
     from cangauge.replay.steps import CaptureSource, LogSource
 
-    result: dict[str, Any] = {
+    result = vars(state) | {
         "bus": bus.name,
-        "frames": state.frames,
-        "clock_frames": state.clocks,
         "samples": state.samples if source.counts_samples else None,
-        "acknowledged": state.acknowledged,
-        "lost": state.lost,
-        "seconds": state.seconds,
-        "log_seconds": state.log_seconds,
         "speed": state.speed,
         "unsent": bus.unsent,
         "soc_pct": None if state.soc is None else state.soc.soc_pct,
         "soc_std_pct": None if state.soc is None else state.soc.soc_std_pct,
     }
+    del result["soc"]
     if isinstance(source, LogSource):
         result["quantisation"] = FrameEncoder(source.vehicle).quantization()
         result["assumed"] = assumed_of([source.log])

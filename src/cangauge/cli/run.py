@@ -1,4 +1,4 @@
-"""`cangauge run`: the service, frames in, SoC frames out."""
+"""`cangauge run`: the service, frames in, SoC frames out; `cangauge check` of its configuration."""
 
 from __future__ import annotations
 
@@ -10,12 +10,13 @@ from typing import TYPE_CHECKING, Any
 
 from rich.live import Live
 
-from cangauge._logging import emit, logging_to, takes_text
+from cangauge._logging import emit
 from cangauge.cli.config_options import ConfigCommand, config_parameters, config_values
 from cangauge.cli.declare import command
-from cangauge.cli.output import console, emit_json
+from cangauge.cli.output import console, emit_json, print_values
 from cangauge.cli.status import live_text
 from cangauge.errors import CangaugeError
+from cangauge.service.events import logging_to, takes_text
 from cangauge.service.output import Output
 
 if TYPE_CHECKING:
@@ -99,3 +100,40 @@ class _LiveLine(Output):
     def close(self) -> None:
         """Remove the line."""
         self._live.stop()
+
+
+@command()
+def check_command(config: Path, *, json_output: bool = False) -> None:
+    """Check a configuration as `cangauge run` would read it, without opening the bus.
+
+    Reads model, DBC and map, and checks ids, bus and output files. Exit code 2 and one line
+    with file, key, value and cure, if `run` or a reload would refuse it.
+
+    Examples
+    --------
+    `cangauge check car.toml && systemctl reload cangauge@can0`
+
+    Parameters
+    ----------
+    config : FILE.toml
+        Configuration of `cangauge run`.
+    """
+    from cangauge.service.run import Service
+
+    service = Service(config)
+    pipeline, ids = service.pipeline, service.pipeline.settings.ids
+    found = {
+        "bus": service.bus,
+        "vehicle": pipeline.vehicle.name,
+        "model": pipeline.model.name,
+        "method": pipeline.settings.estimator.method,
+        "time_source": pipeline.settings.time_source,
+        "received": sorted(f"0x{key:X}" for key in pipeline.vehicle.wanted_ids),
+        "published": [f"0x{key:X} {name.upper()}" for key, name in ids.published.items()],
+    }
+    if json_output:
+        emit_json(found)
+        return
+    shown = {k: ", ".join(v) if isinstance(v, list) else str(v) for k, v in found.items()}
+    rows = {name.replace("_", " "): text for name, text in shown.items()}
+    print_values(f"{config}: `cangauge run` takes it", rows)

@@ -29,9 +29,9 @@ LEARN_FRAMES: Final = 50
 INTERVALS: Final = 2000
 """First frames of an id from which the period of its alive counter is learned, and first intervals
 whose median is its period."""
-AGREEING: Final = 0.9
+DAMAGED: Final = 0.1
 PAYLOADS: Final = 4
-"""Least share of frames with a correct CRC for an id to be protected by a rule, and least number of
+"""Largest share of frames with a wrong CRC for an id to be protected by a rule, and least number of
 different payloads: a constant one can agree by chance."""
 REPEATED_SHARE: Final = 0.02
 MIXED_SHARE: Final = 0.55
@@ -190,14 +190,13 @@ class _Trial:
     def __init__(self, rule: ProtectionRule, period_s: float | None) -> None:
         self.rule, self._checker = rule, FrameChecker(rule, period_s)
         self.verdicts = dict.fromkeys(Verdict, 0)
-        self.good = self.crc_errors = self.frames_lost = 0
+        self.crc_errors = self.frames_lost = 0
         self.two_senders = False
 
     def add(self, data: bytes, time_s: float) -> None:
         verdict = self._checker.check(data, time_s)
         self.verdicts[verdict] += 1
         self.crc_errors += verdict is Verdict.CRC_WRONG
-        self.good += verdict is not Verdict.CRC_WRONG
         self.two_senders |= self._checker.suspects_second_sender
         self.frames_lost += self._checker.lost if verdict is Verdict.AFTER_LOSS else 0
 
@@ -238,7 +237,7 @@ class _IdRecord:
                 self.trials = []
             for trial in list(self.trials):
                 trial.add(data, time_s)
-                if trial.crc_errors > 20 and trial.good < trial.crc_errors:
+                if trial.crc_errors > max(20, sum(trial.verdicts.values()) / 2):
                     self.trials.remove(trial)
         self.waiting.clear()
 
@@ -253,7 +252,9 @@ class _IdRecord:
             name, bus, self.frames, ", ".join(map(str, sizes)), self.period_s,
             self.longest_s if self.intervals else None,
         )  # fmt: skip
-        agreeing = (trial for trial in self.trials or () if trial.good >= AGREEING * self.frames)
+        agreeing = (
+            trial for trial in self.trials or () if trial.crc_errors <= DAMAGED * self.frames
+        )
         trial = next(agreeing, None) if len(self.payloads) >= PAYLOADS else None
         if trial is None:
             return found

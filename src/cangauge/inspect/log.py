@@ -209,19 +209,13 @@ def _timing(log: Log) -> Timing:
     gaps = np.flatnonzero(step > limit_s)
     longest = gaps[np.argsort(-step[gaps], kind="stable")][:LISTED]
     median = float(np.median(step)) if step.size else None
+    is_regular = bool(median and np.mean(np.abs(step - median) <= 0.1 * median) >= 0.99)
+    shortest, longest_s = (float(step.min()), float(step.max())) if step.size else (None, None)
     return Timing(
-        start_s=float(time_s[0]),
-        duration_s=log.duration_s,
-        interval_median_s=median,
-        interval_min_s=float(step.min()) if step.size else None,
-        interval_max_s=float(step.max()) if step.size else None,
-        rate_hz=1.0 / median if median else None,
-        regular=bool(median and np.mean(np.abs(step - median) <= 0.1 * median) >= 0.99),
-        gap_limit_s=limit_s,
-        gap_count=int(gaps.size),
-        gap_total_s=float(step[gaps].sum()),
-        longest_gaps=tuple(Gap(float(time_s[i]), float(step[i])) for i in longest),
-    )
+        float(time_s[0]), log.duration_s, median, shortest, longest_s,
+        1.0 / median if median else None, is_regular, limit_s, int(gaps.size),
+        float(step[gaps].sum()), tuple(Gap(float(time_s[i]), float(step[i])) for i in longest),
+    )  # fmt: skip
 
 
 def _charge(log: Log) -> Charge:
@@ -291,16 +285,12 @@ def _warnings(
 
 def _channel_warnings(channels: dict[str, Channel]) -> Iterator[str]:
     for name, channel in channels.items():
-        for each in channel.stuck[: LISTED // 2]:
+        for each in channel.stuck[:LISTED]:
             yield (
                 f"{name} stuck at {each.value:g} {channel.unit} for {each.duration_s:.0f} s from"
                 f" {each.start_s:.1f} s: {each.why}"
             )
-        if (more := len(channel.stuck) - LISTED // 2) > 0:
-            yield f"{name}: {more} more stuck intervals"
-    for name in ("current_a", "voltage_v"):
-        if channels[name].levels == 1:
-            yield f"{name} never changes"
+    yield from (f"{n} never changes" for n in ("current_a", "voltage_v") if channels[n].levels == 1)
 
 
 def _interval(timing: Timing) -> str:

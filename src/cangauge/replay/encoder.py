@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
-from typing import Any, Final
+from dataclasses import dataclass
+from typing import Final
 
 import can
 import numpy as np
 
-from cangauge._typing import FloatArray
 from cangauge.bus.database import MultiplexCondition
 from cangauge.bus.time_source import MICROSECONDS
 from cangauge.bus.vehicle import LOG_COLUMNS, Vehicle, VehicleSignal
@@ -107,11 +106,11 @@ class FrameEncoder:
         )
 
     def check_range(self, log: Log) -> None:
-        """Raise InputError for the first signal that is too narrow for a log, before sending.
-
-        It names the signal, its range, the value and its row.
-        """
-        for signal, column, values in self._columns(log):
+        """Raise InputError for the first signal that is too narrow for a log, before sending."""
+        for signal in self.vehicle.signals:
+            column = LOG_COLUMNS[signal.role]
+            if (values := getattr(log, column)) is None:
+                continue
             bad = np.flatnonzero(~signal.codec.fits(values))
             if bad.size:
                 row, (low, high) = int(bad[0]), signal.codec.range
@@ -125,29 +124,7 @@ class FrameEncoder:
                 )
 
     def quantization(self) -> dict[str, float]:
-        """Return the largest quantization errors of frames, half a step, by column of the log.
-
-        `time_s` is that of REPLAY_CLOCK.
-        """
+        """Return the largest quantization errors of frames by column; `time_s` is the clock's."""
         signals = self.vehicle.signals
         steps = {LOG_COLUMNS[signal.role]: signal.codec.half_step for signal in signals}
         return {**steps, "time_s": 0.5 / MICROSECONDS}
-
-    def quantize(self, log: Log) -> Log:
-        """Return the log as decoded from its frames with REPLAY_CLOCK, bit for bit.
-
-        A vehicle without a temperature signal gives its fixed temperature, or the log's if it has
-        none.
-        """
-        sent: dict[str, Any] = {
-            column: each.codec.quantize(values) for each, column, values in self._columns(log)
-        }
-        if not math.isnan(self.vehicle.fixed_temperature_c):
-            sent["temperature_c"] = np.full(len(log), self.vehicle.fixed_temperature_c)
-        time_s = np.rint(log.time_s * MICROSECONDS) / MICROSECONDS
-        return replace(log, time_s=time_s, **sent)
-
-    def _columns(self, log: Log) -> list[tuple[VehicleSignal, str, FloatArray]]:
-        columns = [(signal, LOG_COLUMNS[signal.role]) for signal in self.vehicle.signals]
-        found = [(signal, column, getattr(log, column)) for signal, column in columns]
-        return [each for each in found if each[2] is not None]

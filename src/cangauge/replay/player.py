@@ -89,7 +89,7 @@ class ReplayState:
     """
 
     frames: int = 0
-    clocks: int = 0
+    clock_frames: int = 0
     samples: int = 0
     acknowledged: int | None = None
     lost: int = 0
@@ -183,12 +183,12 @@ class _Player:
         if self._clock is not None and step.is_wanted and step.time_us != self._clock_us:
             self._clock_us = step.time_us
             _send(self._bus, self._clock.at(step.time_us), is_max=self._pacer is None)
-            state.clocks += 1
+            state.clock_frames += 1
         for frame in step.frames:
             _send(self._bus, frame, is_max=self._pacer is None)
         state.frames, state.samples = state.frames + len(step.frames), step.samples
         state.log_seconds = (step.time_us - self._first_us) / MICROSECONDS
-        self._receiver.sent(step, state.frames + state.clocks)
+        self._receiver.sent(step, state.frames + state.clock_frames)
         if time.monotonic() >= self._show_s:
             self._show_s = time.monotonic() + SHOW_EVERY_S
             self._update(LISTEN_S)
@@ -227,19 +227,10 @@ def _send(bus: BusConnection, frame: can.Message, *, is_max: bool) -> None:
 
 
 class Pacer:
-    """Wait for moments of log time.
+    """Wait for moments of log time, `speed` log seconds per second.
 
     All moments are counted from the first, on the monotonic clock: errors do not accumulate, and a
-    late frame does not delay the rest.
-
-    Parameters
-    ----------
-    speed : float
-        Log seconds per second.
-    stop : callable
-        Called while waiting; True ends the wait.
-    rest : callable
-        Waits for at most a time [s]; may return earlier.
+    late frame does not delay the rest. `stop` ends a wait, `rest` waits for at most a time [s].
     """
 
     def __init__(

@@ -82,12 +82,7 @@ class CaptureSource:
     Frames of cangauge itself are dropped. If REPLAY_CLOCK is among them, log time is that of the
     replayed log, else the recorded stamps.
 
-    Parameters
-    ----------
-    path : path-like
-    vehicle : Vehicle, optional
-        Its frames are wanted. Without it all frames are, and samples cannot be counted.
-    ids : FrameIds, optional
+    With a vehicle its frames are wanted; without one all are, and samples cannot be counted.
     """
 
     duration_s = None

@@ -35,7 +35,6 @@ from pydantic import (
 from pydantic.fields import FieldInfo
 
 from cangauge._config import read_toml, validated
-from cangauge._logging import LogFormat, LogLevel
 from cangauge.bus.mapping import CheckMap, MessageMap, RuleMap
 from cangauge.bus.time_source import TimeSourceName
 from cangauge.bus.vehicle import PRESETS
@@ -43,6 +42,7 @@ from cangauge.errors import InputError
 from cangauge.estimation.settings import VALID_STD_PCT, Method
 from cangauge.logs.log import TEMPERATURE_SOURCES, TemperatureSource
 from cangauge.model.delay_line import GAP_S
+from cangauge.service.events import LogFormat, LogLevel
 
 DEFAULT_VEHICLE: Final = "generic"
 """Default of `replay` as well, so that both commands work together without options."""

@@ -61,9 +61,8 @@ def stop_on_signals() -> Iterator[Callable[[], bool]]:
 def sole_writer(path: str | PathLike[str]) -> Iterator[None]:
     """Hold a file for this process while the block runs, by a lock on a hidden file beside it.
 
-    The kernel releases the lock at the latest when the process ends; the hidden file stays. Where
-    there can be no lock (a read-only disk, a network file system without locks, Windows) the block
-    runs without.
+    The kernel releases the lock at the latest when the process ends. Where there can be no lock (a
+    read-only disk, a network file system without locks, Windows) the block runs without.
 
     Raises
     ------
@@ -78,6 +77,7 @@ def sole_writer(path: str | PathLike[str]) -> Iterator[None]:
             stack.callback(os.close, held)
             if fcntl is not None:
                 fcntl.flock(held, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            stack.callback(lock.unlink, missing_ok=True)
             os.ftruncate(held, 0)
             os.write(held, f"{os.getpid()}\n".encode())
         except BlockingIOError as error:

@@ -302,7 +302,7 @@ def estimate_recorded_log(
     InputError
         If the log's voltage is another pack's.
     """
-    require_same_pack(log, model)
+    require_same_pack(log.voltage_v, model, log.source or log.name)
     origin: Origin = "voltage" if settings.initial_soc_pct is None else "given"
     settings = replace(settings, temperature_source=log.temperature_source, gap_s=gap_of(log))
     if soc_from_log and log.first_soc() is not None:
@@ -317,12 +317,8 @@ def estimate_recorded_log(
     return RecordedEstimate(log, table, scores, model, settings, origin, pack=history)
 
 
-def require_same_pack(recorded: Recorded, model: Model) -> None:
+def require_same_pack(voltage_v: FloatArray, model: Model, source: str) -> None:
     """Raise InputError if the median voltage shows that the model belongs to another pack."""
-    _refuse_other_pack(recorded.voltage_v, model, recorded.source or recorded.name)
-
-
-def _refuse_other_pack(voltage_v: FloatArray, model: Model, source: str) -> None:
     known = voltage_v[np.isfinite(voltage_v)]
     if not known.size:
         return
@@ -411,8 +407,10 @@ def estimate_capture(
     best = max(found, key=lambda bus: len(bus.estimates))
     counts, table = best.pipeline.counts, EstimateTable.of(best.estimates)
     time_s, current_a, voltage_v, temperature_c, soc_pct = np.array(best.values).reshape(-1, 5).T
-    if not np.isfinite(voltage_v).any():  # with a model, another pack's voltage is implausible
-        _refuse_other_pack(capture_samples(path, vehicle).voltage_v, model, str(path))
+    # With a model, another pack's voltage is implausible.
+    is_known = np.isfinite(voltage_v).any()
+    seen_v = voltage_v if is_known else capture_samples(path, vehicle).voltage_v
+    require_same_pack(seen_v, model, str(path))
     # Further replays in the same capture begin earlier: their steps back count as none.
     later_s = np.cumsum(np.maximum(np.diff(time_s), 0.0))
     is_unwrapped = bool(np.any(np.diff(time_s) < 0.0))

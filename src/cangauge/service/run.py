@@ -341,9 +341,11 @@ def _summary_line(pipeline: Pipeline, port: ReconnectingBus, summary: RunSummary
     )
 
 
+_COUNTED: Final = ("frames", "samples", "lost", "crc_errors", "untimed")
 _REFUSED: Final = (
     "crc_errors", "repeated", "short", "not_available", "implausible", "stuck", "held_back",
 )  # fmt: skip
+_OF_BUS: Final = ("garbled", "error_frames", "queue_drops", "unsent")
 _ESTIMATED: Final = (
     "time_s", "soc_pct", "soc_std_pct", "soc_newton_pct", "soc_coulomb_pct", "residual_v",
 )  # fmt: skip
@@ -356,18 +358,11 @@ def _summary_json(pipeline: Pipeline, port: ReconnectingBus, summary: RunSummary
         "bus": port.name,
         "seconds": summary.seconds,
         "cpu_seconds": summary.cpu_seconds,
-        "frames": counts.frames,
-        "samples": counts.samples,
-        "lost": counts.lost,
-        "crc_errors": counts.crc_errors,
+        **{name: getattr(counts, name) for name in _COUNTED},
         "refused": {name: getattr(counts, name) for name in _REFUSED},
-        "untimed": counts.untimed,
         "restarts": counts.beginnings,
-        "garbled": port.garbled,
-        "error_frames": port.error_frames,
+        **{name: getattr(port, name) for name in _OF_BUS},
         "error_kinds": dict(port.error_kinds),
-        "queue_drops": port.queue_drops,
-        "unsent": port.unsent,
         "bus_losses": port.losses,
         "bus_away_s": port.away_s,
         "rival_frames": summary.foreign_frames,

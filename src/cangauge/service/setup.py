@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import queue
-import threading
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,6 +20,7 @@ from cangauge.estimation.settings import EstimatorSettings, FullCharge, LongRest
 from cangauge.model.model_file import Model
 from cangauge.service.config import DEFAULT_VEHICLE, PublishConfig, RunConfig
 from cangauge.service.pipeline import PipelineSettings
+from cangauge.service.worker import Worker
 
 
 @dataclass(frozen=True)
@@ -144,17 +144,13 @@ def _sign_cure(config: RunConfig) -> str:
 
 
 class Reloader:
-    """Read the configuration in a thread, once for each request, while the old one is in use.
-
-    The thread waits from the start on: a request starts none, which could fail.
-    """
+    """Read the configuration in a thread, once for each request, while the old one is in use."""
 
     def __init__(self, read: Callable[[], RunConfig]) -> None:
         self._read = read
-        self._requests: queue.SimpleQueue[bool] = queue.SimpleQueue()
         self._results: queue.SimpleQueue[Setup | CangaugeError] = queue.SimpleQueue()
         self._pending = 0
-        threading.Thread(target=self._run, name="cangauge-reload", daemon=True).start()
+        self._worker = Worker("cangauge-reload", self._refuse, 2)
 
     @property
     def is_reading(self) -> bool:
@@ -165,7 +161,7 @@ class Reloader:
         """Begin to read; once more at its end if it is under way, as files may have changed."""
         if self._pending < 2:
             self._pending += 1
-            self._requests.put(True)
+            self._worker.submit(lambda: self._results.put(Setup.of(self._read())))
 
     def poll(self) -> Setup | CangaugeError | None:
         """Return what was read, or why it is refused, once; None while there is nothing new."""
@@ -176,13 +172,9 @@ class Reloader:
 
     def close(self) -> None:
         """End the thread once it has nothing to read."""
-        self._requests.put(False)
+        self._worker.close(0.0)
 
-    def _run(self) -> None:
-        while self._requests.get():
-            try:
-                self._results.put(Setup.of(self._read()))
-            except CangaugeError as error:
-                self._results.put(error)
-            except Exception as error:  # noqa: BLE001 - of any library that reads a file
-                self._results.put(InputError(f"cannot be read: {error!r}", cure="check the files"))
+    def _refuse(self, error: Exception) -> None:
+        if not isinstance(error, CangaugeError):  # of a library that reads a file
+            error = InputError(f"cannot be read: {error!r}", cure="check the files")
+        self._results.put(error)

@@ -14,12 +14,13 @@ from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, fields
 from typing import Any, Final
 
-from cangauge._logging import emit, release_held
+from cangauge._logging import emit
 from cangauge._text import known_soc, plain
 from cangauge._version import __version__
 from cangauge.bus.connection import BusConnection
 from cangauge.bus.plausibility import MessageStatistics
 from cangauge.bus.publish import NO_REPORT
+from cangauge.service.events import release_held
 from cangauge.service.lifecycle import Notifier
 from cangauge.service.pipeline import Pipeline
 from cangauge.service.status_client import BOUNDS_S, SCHEMA, Snapshot, reason_ids

@@ -173,9 +173,7 @@ class EstimateJob(LogJob):
         with local_file(log.url) as path:
             is_log = isinstance(self.options.open(path), LogFile)
             if not is_log and self.options.vehicle is not None:
-                done = estimate_capture(path, self.options.vehicle, self.model, settings)
-                require_same_pack(done.recorded, self.model)
-                return done
+                return estimate_capture(path, self.options.vehicle, self.model, settings)
             recorded = self.options.read(replace(log, initial_soc_pct=None), path)
         unstated = settings.initial_soc_pct is None
         return estimate_recorded_log(
@@ -227,7 +225,7 @@ class HealthJob(Job):
 
     def _row(self, log: FleetLog, states: list[EstimatorState]) -> dict[str, Any]:
         recorded = self.read(log)
-        require_same_pack(recorded, self.model)
+        require_same_pack(recorded.voltage_v, self.model, recorded.source or recorded.name)
         before = states[-1] if states else None
         shift_s = _shift_s(log, recorded, before)
         settings = replace(

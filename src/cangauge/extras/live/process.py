@@ -17,7 +17,7 @@ import threading
 from collections.abc import Mapping
 from typing import IO, Any, Final
 
-from cangauge._logging import RateLimitFilter
+from cangauge.service.events import RateLimitFilter
 from cangauge.service.output import Output
 from cangauge.service.status_client import Snapshot
 

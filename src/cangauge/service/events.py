@@ -1,0 +1,212 @@
+"""The log of a running service: an event a line on stderr, for people or as JSON, rate-limited."""
+
+from __future__ import annotations
+
+import json
+import logging
+import math
+import select
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from typing import IO, Any, Final, Literal, TextIO
+
+from cangauge._text import plain, printable, printable_json
+
+LogFormat = Literal["text", "json"]
+LogLevel = Literal["debug", "info", "warning", "error"]
+
+FIRST_INTERVAL_S: Final = 1.0
+"""Minimum time between the first two records of an event [s]; doubles with each repetition …"""
+LONGEST_INTERVAL_S: Final = 60.0
+"""… up to this [s]. An event that was quiet for longer starts again at the first interval."""
+EVENTS_KEPT: Final = 256
+"""Most events whose repetitions are tracked, to bound the memory."""
+
+
+@contextmanager
+def logging_to(
+    log_format: LogFormat, level: LogLevel = "info", stream: TextIO | None = None
+) -> Iterator[None]:
+    """Write log records to a stream (stderr) while the block runs, then restore the set-up.
+
+    `level` is the lowest one written; other libraries are limited to errors, unless it is "debug".
+    """
+    handler = _Handler(stream or sys.stderr)
+    handler.setFormatter(_JsonFormat() if log_format == "json" else _TextFormat())
+    limiter = RateLimitFilter(handler.write)
+    handler.addFilter(limiter)
+    # python-can logs and raises the same error, at each attempt to open a missing bus.
+    levels: dict[str, int | str] = {
+        "": logging.ERROR, "cangauge": level.upper(), "can": logging.CRITICAL
+    }  # fmt: skip
+    if level == "debug":
+        levels |= {"": logging.DEBUG, "can": logging.NOTSET}
+    root = logging.getLogger()
+    before = root.handlers[:], {name: logging.getLogger(name).level for name in levels}
+    root.handlers[:] = [handler]
+    for name, least in levels.items():
+        logging.getLogger(name).setLevel(least)
+    _LIMITERS.append(limiter)
+    try:
+        yield
+    finally:
+        _LIMITERS.remove(limiter)
+        limiter.release_due(everything=True)
+        root.handlers[:] = before[0]
+        for name, least in before[1].items():
+            logging.getLogger(name).setLevel(least)
+
+
+_LIMITERS: Final[list[RateLimitFilter]] = []
+
+
+def release_held() -> None:
+    """Write the suppressed records whose interval has ended; the receive loop calls this."""
+    for limiter in _LIMITERS:
+        limiter.release_due()
+
+
+def takes_text(stream: IO[str]) -> bool:
+    """Return whether a stream takes a line without waiting.
+
+    A pipe whose reader has stopped, or a terminal after Ctrl-S, does not: whoever writes there
+    would stop with it.
+    """
+    try:
+        ready = select.poll()
+        ready.register(stream.fileno(), select.POLLOUT)
+        return bool(ready.poll(0))
+    except (AttributeError, OSError, ValueError):  # Windows; no real file
+        return True
+
+
+class _Handler(logging.StreamHandler[TextIO]):
+    def emit(self, record: logging.LogRecord) -> None:
+        """Write a record; drop it if its reader is stopped, instead of waiting."""
+        if takes_text(self.stream):
+            super().emit(record)
+
+    def write(self, record: logging.LogRecord) -> None:
+        """Write a record without filtering it."""
+        self.acquire()
+        try:
+            self.emit(record)
+        finally:
+            self.release()
+
+    def handleError(self, record: logging.LogRecord) -> None:  # noqa: N802 - logging's name
+        """Ignore errors: a closed stderr must not end the service, and cannot be reported."""
+
+
+class _TextFormat(logging.Formatter):
+    """`2026-10-17T08:30:00.123Z WARNING bus.lost: socketcan can0 is down (retry_s=1)`."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        time_text, event, message, fields = _parts(record)
+        pairs = " ".join(
+            f"{name}={value:.6g}" if isinstance(value, float) else f"{name}={value}"
+            for name, value in fields.items()
+        )
+        line = f"{time_text} {record.levelname} {event}: {message}"
+        return printable(" ".join((f"{line} ({pairs})" if pairs else line).splitlines()))
+
+
+class _JsonFormat(logging.Formatter):
+    """One JSON object per line: `time`, `level`, `event`, `message`, `logger` and the fields."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        time_text, event, message, fields = _parts(record)
+        content = plain(fields) | {
+            "time": time_text,
+            "level": record.levelname.lower(),
+            "event": event,
+            "message": message,
+            "logger": record.name,
+        }
+        return printable_json(json.dumps(content, ensure_ascii=False, default=str))
+
+
+def _parts(record: logging.LogRecord) -> tuple[str, str, str, dict[str, Any]]:
+    """Return time, event ("log" of other libraries), message and fields of a record."""
+    stamp = datetime.fromtimestamp(record.created, UTC).isoformat(timespec="milliseconds")
+    message = record.getMessage()
+    if record.exc_info is not None:
+        message = f"{message}: {record.exc_info[1]!r}"
+    fields = dict(getattr(record, "fields", {}))
+    if hasattr(record, "suppressed"):
+        fields["repeats_suppressed"] = record.suppressed
+    return stamp.replace("+00:00", "Z"), str(getattr(record, "event", "log")), message, fields
+
+
+@dataclass(slots=True)
+class _Repetitions:
+    """State of one event."""
+
+    latest_s: float = -math.inf
+    next_s: float = -math.inf
+    interval_s: float = 0.0
+    suppressed: int = 0
+    held: logging.LogRecord | None = None
+
+    def write(self, record: logging.LogRecord, now_s: float) -> None:
+        """Note that a record is written."""
+        if self.suppressed:
+            record.suppressed = self.suppressed
+        self.suppressed, self.held = 0, None
+        self.interval_s = min(2.0 * self.interval_s, LONGEST_INTERVAL_S) or FIRST_INTERVAL_S
+        self.next_s = now_s + self.interval_s
+
+
+class RateLimitFilter(logging.Filter):
+    """Limit each event to one record per interval; the latest suppressed one follows at its end.
+
+    `release` writes it, when `release_due` is called: no thread is started for it, which could
+    fail. `clock` gives monotonic time [s].
+    """
+
+    def __init__(
+        self,
+        release: Callable[[logging.LogRecord], None],
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        super().__init__()
+        self._release = release
+        self._clock = clock
+        self._lock = threading.Lock()
+        self._events: dict[tuple[str, str], _Repetitions] = {}
+
+    def filter(self, record: logging.LogRecord) -> bool:
+        """Return whether to write the record now; its `suppressed` counts those before it."""
+        key = (record.name, str(getattr(record, "limit", record.msg)))
+        with self._lock:
+            now_s = self._clock()
+            event = self._events[key] = self._events.pop(key, _Repetitions())
+            if len(self._events) > EVENTS_KEPT:
+                del self._events[next(iter(self._events))]  # the one quiet for longest
+            if now_s - event.latest_s > LONGEST_INTERVAL_S:
+                event.interval_s = 0.0
+            event.latest_s = now_s
+            if now_s < event.next_s:
+                event.suppressed += 1
+                event.held = record
+                return False
+            event.write(record, now_s)
+        return True
+
+    def release_due(self, *, everything: bool = False) -> None:
+        """Write the suppressed records whose interval has ended, or all of them."""
+        with self._lock:
+            now_s = self._clock()
+            due: list[logging.LogRecord] = []
+            for event in self._events.values():
+                if event.held is not None and (everything or now_s >= event.next_s):
+                    due.append(event.held)
+                    event.suppressed -= 1
+                    event.write(event.held, now_s)
+        for record in sorted(due, key=lambda each: each.created):
+            self._release(record)
