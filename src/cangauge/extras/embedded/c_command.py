@@ -33,6 +33,7 @@ def export_c_command(
     chemistry: Literal["oxide", "lfp"] = "oxide",
     cells: int | None = None,
     capacity_ah: float | None = None,
+    platform: Literal["generic", "esp-idf", "zephyr", "arduino", "foxbms"] = "generic",
     period: float = 0.5,
     json_output: bool = False,
 ) -> None:
@@ -57,6 +58,9 @@ def export_c_command(
         … how many are in series, …
     capacity_ah : A (0.001 … 1e5 Ah)
         … and the charge from 100 to 0 %.
+    platform : generic|esp-idf|zephyr|arduino|foxbms
+        What the folder is to be: sources with a Makefile and tests, an ESP-IDF component, a Zephyr
+        module, an Arduino library, or the SoC module of foxBMS 2; with an example.
     period : S (0.001 … 60 s)
         Time between two currents that the delay line keeps: more samples cost no memory.
     """
@@ -77,7 +81,8 @@ def export_c_command(
         chosen = Model.load(model)
     else:
         chosen = Model.prior(chemistry, cells or 1, capacity_ah or 1.0)
-    done, std_pct = export_c(chosen, output, period_s=period), std_at_rest_pct(chosen)
+    done = export_c(chosen, output, period_s=period, platform=platform)
+    std_pct = std_at_rest_pct(chosen)
     if json_output:
         emit_json({
             "folder": str(done.folder),
@@ -87,6 +92,7 @@ def export_c_command(
         })  # fmt: skip
         return
     files = f"{len(done.files)} files in {done.folder}"
-    note(f"{files}: `make test` there runs the tests on this machine.")
+    tests = "" if platform == "arduino" else ": `make test` there runs the tests on this machine"
+    note(f"{files}{tests}.")
     note(f"The delay line takes {done.delay_line_bytes / 1024:.1f} KiB at {period:g} s a sample.")
     note(f"{chosen.name}: from half a minute of rest the SoC is known to ± {std_pct:.1f} % (1σ).")
