@@ -439,18 +439,17 @@ def mf4_signals() -> bytes | None:
 def model_tree() -> dict[str, Any]:
     """Return the content of a model file with all effects and an information matrix."""
     path = shared_file("replay", "leaf2012_published_model.json")
-    tree: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
     file = Model.load(path)
+    tree: dict[str, Any] = json.loads(file.to_json())
     pack = Pack.of(file.voltage_model(), file.capacity_ah)
     tree["effects"] = effect_entries(
         [(effect, {p.name: _somewhere(p, pack) for p in effect.parameters})
          for effect in LIBRARY.values()]
     )  # fmt: skip
-    names = list(tree["coefficients"])
+    names = list(tree["published"]["coefficients"])
     n = len(names)
     tree["information"] = {
         "columns": names,
-        "scale": [1.0 + k for k in range(n)],
         "root": [[float(i == k) for k in range(n)] for i in range(n)],
         "projected": [0.5] * n,
     }

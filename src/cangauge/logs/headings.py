@@ -95,6 +95,8 @@ _CELL_VOLTAGE: Final = re.compile(
     re.IGNORECASE,
 )
 
+LONGEST: Final = 200
+"""Longest heading that is read for its meaning [characters]."""
 GUESS: Final = 10
 """Rank from which a meaning is a guess that only the user can confirm."""
 
@@ -112,10 +114,10 @@ class Meaning(NamedTuple):
     source: TemperatureSource = "unknown"
 
 
-@lru_cache(maxsize=4096)
+@lru_cache(maxsize=1 << 16)
 def meaning_of(heading: str, unit_below: str = "") -> Meaning | None:
     """Return the most direct meaning of a heading with the cell of a row of units, or None."""
-    if not heading.strip() or len(heading) > 200 or cell_number(heading) is not None:
+    if not heading.strip() or len(heading) > LONGEST or cell_number(heading) is not None:
         return None
     # Measurement tools qualify a signal: `Bus::Message::Signal`, `Signal\\Device:1`.
     heading = re.sub(r"\\[^\[(]*", "", heading.rpartition("::")[2])
@@ -125,7 +127,7 @@ def meaning_of(heading: str, unit_below: str = "") -> Meaning | None:
 
 def cell_number(heading: str) -> tuple[int, float] | None:
     """Return number and scale [V] of a cell's voltage (`cell_3_v`, `Cell 3 [mV]`), or None."""
-    match = _CELL_VOLTAGE.fullmatch(heading.strip())
+    match = _CELL_VOLTAGE.fullmatch(heading.strip()) if len(heading) <= LONGEST else None
     if match is None:
         return None
     return int(match["number"]), 1e-3 if (match["unit"] or "").lower() == "mv" else 1.0
@@ -136,6 +138,8 @@ def names_and_units(heading: str, unit_below: str = "") -> list[tuple[str, str]]
     heading = heading.strip()
     if heading.lower() in _DEGREES:
         return [("", heading)]
+    if len(heading) > LONGEST:
+        return [(heading, "")]
     matches = [match for form in _UNIT_FORMS if (match := form.match(heading))]
     found = [(match["name"], match["unit"].strip()) for match in matches if match["name"].strip()]
     below = unit_below.strip().strip("[](){}").strip()

@@ -217,14 +217,13 @@ def test_configurations(tmp_path: Path, text: str) -> None:
 @pytest.mark.parametrize(
     "change",
     [
-        {"information": {"scale": [1.0] * 300_000}},
+        {"information": {"projected": [1.0] * 300_000}},
         {"information": {"root": [[1.0] * 1000] * 300}},
         {"effects": [{}] * 300_000},
         {"effects": [{"id": "capacity", "parameters": {"change_pct": 10**300}}]},
         {"coefficients": {f"k{n}": 1 for n in range(100_000)}},
         {"delays_s": list(range(100_000))},
         {"name": {f"k{n}": n for n in range(100_000)}},
-        {"made": {"options": {f"k{n}": n for n in range(100_000)}}},
         {f"k{n}": n for n in range(100_000)},
         {"name": "x" * 5_000_000},
         {"range": {"soc_pct": [-500, 900]}},
@@ -232,7 +231,7 @@ def test_configurations(tmp_path: Path, text: str) -> None:
         {"capacity_ah": 5e-324},
         {"epsilon": 1e-300},
     ],
-    ids=range(14),
+    ids=range(13),
 )
 def test_models(tmp_path: Path, change: dict[str, object]) -> None:
     tree = json.loads(json.dumps(corpus.model_tree()))

@@ -14,6 +14,7 @@ from cangauge._typing import FloatArray
 from cangauge.errors import InputError
 from cangauge.logs.column_map import ColumnMap, shown_headings
 from cangauge.logs.draft import DraftLog
+from cangauge.logs.headings import LONGEST
 from cangauge.logs.table import numbers_of
 from cangauge.logs.text import TextTable, split_cells
 from cangauge.logs.units import convert
@@ -36,7 +37,7 @@ class _Column:
 def _columns(line: str, delimiter: str) -> list[_Column]:
     found = []
     for place, text in enumerate(split_cells(line, delimiter)):
-        match = _HEADING.match(text)
+        match = _HEADING.match(text) if len(text) <= LONGEST else None
         name = match["name"] if match else text
         unit = (match["square"] or match["tail"] or "") if match else ""
         found.append(_Column(place, text, re.sub(r"[\s_]", "", name).lower(), unit))
