@@ -87,7 +87,7 @@ WORDS = {
     "folder": "this is a folder, not a file",
     "pipe": "this is a pipe",
     "link to a pipe": "this is a pipe",
-    "socket": "this is a socket",
+    "socket": "this is a device",
     "/dev/zero": "this is a device",
     "/dev/null": "this is a device",
     "/dev/full": "this is a device",

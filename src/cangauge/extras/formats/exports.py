@@ -22,6 +22,8 @@ from cangauge.logs.units import convert
 _HEADING: Final = re.compile(
     r"^(?P<name>.*?)\s*(?:\[(?P<square>[^\])]*)[\])]|__(?P<tail>[^_\s]*))?\s*$"
 )
+LONGEST_HEADING: Final = 200
+"""Longest text that is searched for a unit [characters]; the expression takes the square of it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,7 +38,7 @@ class _Column:
 def _columns(line: str, delimiter: str) -> list[_Column]:
     found = []
     for place, text in enumerate(split_cells(line, delimiter)):
-        match = _HEADING.match(text)
+        match = _HEADING.match(text) if len(text) <= LONGEST_HEADING else None
         name = match["name"] if match else text
         unit = (match["square"] or match["tail"] or "") if match else ""
         found.append(_Column(place, text, re.sub(r"[\s_]", "", name).lower(), unit))
