@@ -137,8 +137,14 @@ static cg_place place_of(const cg_real *knots, int32_t count, cg_real soc_pct)
         return above;
     }
     int32_t left = 0;
-    while ((left < (last - 1)) && !(soc_pct < knots[left + 1])) {
-        ++left;
+    int32_t right = last;
+    while ((right - left) > 1) {
+        const int32_t middle = (left + right) / 2;
+        if (soc_pct < knots[middle]) {
+            right = middle;
+        } else {
+            left = middle;
+        }
     }
     const cg_real width = knots[left + 1] - knots[left];
     const cg_real f = (soc_pct - knots[left]) / width;
@@ -180,10 +186,13 @@ static cg_real curve_v(const cg_model *model, cg_real soc_pct, cg_real *slope)
         return published_ocv(model, soc_pct, slope);
     }
     const cg_place at = place_of(model->knot_pct, model->knots, soc_pct);
-    const cg_real knot[4] = {model->knot_v[at.left], model->knot_slope[at.left],
-                             model->knot_v[at.left + 1], model->knot_slope[at.left + 1]};
-    *slope = cg_dot(at.slope, knot, 4);
-    return cg_dot(at.value, knot, 4);
+    /* By the rise between the knots: floats lose less than by the weights of two high voltages. */
+    const cg_real rise_v = model->knot_v[at.left + 1] - model->knot_v[at.left];
+    const cg_real before = model->knot_slope[at.left];
+    const cg_real after = model->knot_slope[at.left + 1];
+    *slope = (at.slope[1] * before) + (at.slope[2] * rise_v) + (at.slope[3] * after);
+    return model->knot_v[at.left] +
+           ((at.value[1] * before) + (at.value[2] * rise_v) + (at.value[3] * after));
 }
 
 static cg_real resistance_factor(cg_real temperature_c)

@@ -1,6 +1,6 @@
 /* fmu.h - a functional mock-up unit: its variables by value reference, and a step.
  *
- * `pack.c` and `estimator.c` say what a unit does, `fmi2.c` and `fmi3.c`, with `fmi.h`, how a
+ * `pack.c` and `estimator.c` say what a unit does, `fmi2.c` how a
  * simulator calls it; `fmu_config.h` and `fmu_model.c` are written by `cangauge export-fmu`.
  *
  * An input that is set before a step is the sample at the end of that step; between two samples the

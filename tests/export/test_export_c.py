@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 import shutil
 import subprocess
@@ -16,7 +17,7 @@ from cangauge.cli.app import app
 from cangauge.errors import InputError
 from cangauge.estimation.offline import run_estimator, samples_of
 from cangauge.estimation.settings import EstimatorSettings
-from cangauge.extras.embedded.c_source import CORE_HEADERS, CORE_SOURCES
+from cangauge.extras.embedded.c_source import CORE_HEADERS, CORE_SOURCES, TabulatedModel
 from cangauge.extras.embedded.embedded import drive_with_events, export_c
 from cangauge.identify.fit import fit
 from cangauge.logs.read import read_log
@@ -24,6 +25,7 @@ from cangauge.model.model_file import Model
 from cangauge.model.published import leaf_2012_model_file
 from cangauge.types import Sample
 from estimation.test_snapshot import extended_by
+from live import in_process
 
 PLAIN = leaf_2012_model_file()
 EFFECTS = [
@@ -123,14 +125,35 @@ def test_cortex_m4f_gives_the_numbers_in_qemu(folders: dict[str, Path]) -> None:
 
 
 @needs_arm
-def test_curve_of_knots_keeps_its_cost_on_a_cortex_m4f(folders: dict[str, Path]) -> None:
-    output = run(folders["knots"], "make", "arm")
+@pytest.mark.parametrize("which", ["knots", "plain"])
+def test_a_voltage_update_keeps_its_cost_on_a_cortex_m4f(
+    folders: dict[str, Path], which: str
+) -> None:
+    output = run(folders[which], "make", "arm")
     core = re.findall(r"^ *(\d+).*\scangauge\w*\.o$", output, re.MULTILINE)
     assert len(core) == len(CORE_SOURCES)
     assert sum(map(int, core)) <= 16 * 1024
     steps = re.search(r"a sample, (\d+) where its voltage is used", output)
     assert steps is not None
     assert int(steps[1]) <= 24000
+
+
+def test_the_table_is_the_published_equation() -> None:
+    curve = PLAIN.voltage_model().curve
+    table = TabulatedModel.of(PLAIN).voltage_model().curve
+    soc_pct = np.linspace(-5.0, 105.0, 20_001)
+    error_v = np.abs(table.values(soc_pct) - curve.values(soc_pct))
+    assert (error_v / curve.slopes(soc_pct)).max() < 1e-3  # [% SoC]
+
+
+def test_a_pack_without_logs_is_exported_with_its_uncertainty(tmp_path: Path) -> None:
+    given = ("--chemistry", "lfp", "--cells", "16", "--capacity-ah", "280")
+    told = in_process("export-c", *given, "-o", tmp_path / "c", "--json")
+    result = json.loads(told.out)
+    assert "pack_model.c" in result["files"]
+    # Iron phosphate is flat: half a minute of rest tells little.
+    assert result["std_at_rest_pct"] > 5.0
+    assert in_process("export-c", "--cells", "16", "-o", tmp_path / "d").code == 2
 
 
 @needs_make
@@ -236,5 +259,6 @@ def test_own_files_are_kept_and_an_export_is_renewed(tmp_path: Path) -> None:
 
 
 def test_period_out_of_range_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"0\.001"):
-        export_c(PLAIN, tmp_path, period_s=0.0)
+    pack = ("--cells", "16", "--capacity-ah", "60")
+    told = in_process("export-c", *pack, "-o", tmp_path / "c", "--period", "0")
+    assert (told.code, "--period: must lie within 0.001" in told.err) == (2, True)

@@ -14,7 +14,7 @@ from cangauge.cli.app import app
 from cangauge.errors import CangaugeError, InputError
 from cangauge.estimation.estimator import Estimator
 from cangauge.estimation.settings import EstimatorSettings
-from cangauge.extras.embedded.fmu import Kind, Version, export_fmu
+from cangauge.extras.embedded.fmu import Kind, export_fmu
 from cangauge.model.effects.base import Reading
 from cangauge.model.model_file import Model
 from cangauge.model.published import leaf_2012_model_file
@@ -43,15 +43,10 @@ def repaired() -> Model:
 
 
 @pytest.fixture(scope="module")
-def units(tmp_path_factory: pytest.TempPathFactory) -> dict[tuple[Kind, Version], Path]:
-    folder, kinds = tmp_path_factory.mktemp("units"), ("pack", "estimator")
-    return {
-        (kind, version): export_fmu(
-            repaired(), folder / f"{kind}{version}.fmu", kind=kind, version=version
-        )
-        for kind in kinds
-        for version in (2, 3)
-    }
+def units(tmp_path_factory: pytest.TempPathFactory) -> dict[Kind, Path]:
+    folder = tmp_path_factory.mktemp("units")
+    kinds: tuple[Kind, ...] = ("pack", "estimator")
+    return {kind: export_fmu(repaired(), folder / f"{kind}.fmu", kind=kind) for kind in kinds}
 
 
 def simulate(
@@ -94,26 +89,21 @@ def pack_voltage(model: Model, initial_soc_pct: float) -> list[float]:
     return volts
 
 
-@pytest.mark.parametrize("version", [2, 3])
 @pytest.mark.parametrize("kind", ["pack", "estimator"])
-def test_the_unit_is_valid(units: dict[Any, Path], kind: Kind, version: Version) -> None:
+def test_the_unit_is_valid(units: dict[Any, Path], kind: Kind) -> None:
     from fmpy.validation import validate_fmu  # noqa: PLC0415
 
-    assert validate_fmu(str(units[kind, version])) == []
+    assert validate_fmu(str(units[kind])) == []
 
 
-@pytest.mark.parametrize("version", [2, 3])
-def test_the_pack_is_the_model_within_1e_9(units: dict[Any, Path], version: Version) -> None:
-    found = simulate(units["pack", version], ["voltage_v"], {}, initial_soc_pct=81.0)
+def test_the_pack_is_the_model_within_1e_9(units: dict[Any, Path]) -> None:
+    found = simulate(units["pack"], ["voltage_v"], {}, initial_soc_pct=81.0)
     np.testing.assert_allclose(found["voltage_v"], pack_voltage(repaired(), 81.0), atol=1e-9)
 
 
-@pytest.mark.parametrize("version", [2, 3])
-def test_the_estimator_is_pythons_within_1e_9(units: dict[Any, Path], version: Version) -> None:
+def test_the_estimator_is_pythons_within_1e_9(units: dict[Any, Path]) -> None:
     volts = np.array(pack_voltage(repaired(), 80.0))
-    found = simulate(
-        units["estimator", version], ["soc_pct", "soc_std_pct", "status"], {"voltage_v": volts}
-    )
+    found = simulate(units["estimator"], ["soc_pct", "soc_std_pct", "status"], {"voltage_v": volts})
     estimator = Estimator(repaired(), EstimatorSettings())
     samples = zip(TIME_S.tolist(), held(CURRENT_A), held(volts), held(TEMPERATURE_C), strict=True)
     for row, sample in zip(found, samples, strict=True):
@@ -126,14 +116,13 @@ def test_the_estimator_is_pythons_within_1e_9(units: dict[Any, Path], version: V
 
 def test_a_diagnosed_effect_is_a_parameter(units: dict[Any, Path]) -> None:
     given = {"initial_soc_pct": 81.0, "effect_3_rc.ohm_1": 0.05}
-    found = simulate(units["pack", 3], ["voltage_v"], {}, **given)
+    found = simulate(units["pack"], ["voltage_v"], {}, **given)
     polarization = {"ohm": 0.05, "tau_s": 4.0, "activation_k": 900.0}
     changed = [*EFFECTS[:2], {"id": "fast_polarization", "parameters": polarization}]
     model = repaired().model_copy(update={"effects": changed})
     np.testing.assert_allclose(found["voltage_v"], pack_voltage(model, 81.0), atol=1e-9)
 
 
-@pytest.mark.parametrize("version", [2, 3])
 @pytest.mark.parametrize(
     ("kind", "name", "value"),
     [
@@ -145,7 +134,7 @@ def test_a_diagnosed_effect_is_a_parameter(units: dict[Any, Path]) -> None:
     ],
 )  # fmt: skip
 def test_a_parameter_out_of_range_is_refused(
-    units: dict[Any, Path], kind: Kind, name: str, value: float, version: Version
+    units: dict[Any, Path], kind: Kind, name: str, value: float
 ) -> None:
     told: list[str] = []
 
@@ -154,17 +143,16 @@ def test_a_parameter_out_of_range_is_refused(
 
     more = {"voltage_v": 0.0 * TIME_S} if kind == "estimator" else {}
     with pytest.raises(fmpy.fmi1.FMICallException):
-        simulate(units[kind, version], ["soc_pct"], more, logger=log, **{name: value})
+        simulate(units[kind], ["soc_pct"], more, logger=log, **{name: value})
     assert any("is outside" in text for text in told)
 
 
 def test_the_range_of_a_parameter_is_stated(units: dict[Any, Path]) -> None:
-    for version in (2, 3):
-        found = fmpy.read_model_description(str(units["pack", version])).modelVariables
-        limits = {item.name: (item.min, item.max) for item in found}
-        assert [float(end) for end in limits["initial_soc_pct"]] == [0.0, 100.0]
-        assert [float(end) for end in limits["capacity_ah"]] == [1e-3, 1e5]
-        assert limits["effect_3_rc.ohm_1"] == (None, None)
+    found = fmpy.read_model_description(str(units["pack"])).modelVariables
+    limits = {item.name: (item.min, item.max) for item in found}
+    assert [float(end) for end in limits["initial_soc_pct"]] == [0.0, 100.0]
+    assert [float(end) for end in limits["capacity_ah"]] == [1e-3, 1e5]
+    assert limits["effect_3_rc.ohm_1"] == (None, None)
 
 
 def test_what_the_core_divides_by_is_positive(tmp_path: Path) -> None:
@@ -189,16 +177,13 @@ def test_what_the_core_divides_by_is_positive(tmp_path: Path) -> None:
     assert all(float(low) > 0.0 for low in limits.values())
 
 
-@pytest.mark.parametrize("version", [2, 3])
-def test_inputs_of_the_end_of_a_step_estimate_the_log(
-    units: dict[Any, Path], version: Version
-) -> None:
+def test_inputs_of_the_end_of_a_step_estimate_the_log(units: dict[Any, Path]) -> None:
     volts = np.array(pack_voltage(repaired(), 80.0))
     columns = {"current_a": CURRENT_A, "temperature_c": TEMPERATURE_C, "voltage_v": volts}
     # The recipe of docs/howto/export.md.
     earlier = {"time": np.concatenate(([TIME_S[0] - 1.0, TIME_S[0]], TIME_S[:-1]))}
     earlier |= {name: np.concatenate((values[:1], values)) for name, values in columns.items()}
-    found = simulate(units["estimator", version], ["soc_pct"], earlier)
+    found = simulate(units["estimator"], ["soc_pct"], earlier)
     estimator = Estimator(repaired(), EstimatorSettings())
     samples = zip(TIME_S.tolist(), CURRENT_A, volts, TEMPERATURE_C, strict=True)
     for row, sample in zip(found, samples, strict=True):
@@ -208,12 +193,13 @@ def test_inputs_of_the_end_of_a_step_estimate_the_log(
 
 
 def test_a_saved_state_continues_as_it_was(units: dict[Any, Path], tmp_path: Path) -> None:
-    unit = units["pack", 3]
+    unit = units["pack"]
     description = fmpy.read_model_description(str(unit))
     fmu = fmpy.instantiate_fmu(fmpy.extract(str(unit), tmp_path), description, "CoSimulation")
-    fmu.enterInitializationMode(startTime=0.0)
+    fmu.setupExperiment(startTime=0.0)
+    fmu.enterInitializationMode()
     fmu.exitInitializationMode()
-    fmu.setFloat64([1], [30.0])
+    fmu.setReal([1], [30.0])
     fmu.doStep(0.0, 1.0)
     state = fmu.getFMUState()
     first = [_stepped(fmu, time_s) for time_s in range(1, 20)]
@@ -226,7 +212,7 @@ def test_a_saved_state_continues_as_it_was(units: dict[Any, Path], tmp_path: Pat
 
 def _stepped(fmu: Any, time_s: float) -> float:
     fmu.doStep(float(time_s), 1.0)
-    return float(fmu.getFloat64([3])[0])
+    return float(fmu.getReal([3])[0])
 
 
 def test_a_missing_compiler_is_named(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
@@ -249,7 +235,7 @@ def test_the_command_writes_a_unit(tmp_path: Path) -> None:
     model, unit = tmp_path / "model.json", tmp_path / "estimator.fmu"
     leaf_2012_model_file().save(model)
     done = CliRunner().invoke(
-        app, ["export-fmu", "-m", str(model), "-o", str(unit), "--kind", "estimator", "--fmi", "2"]
+        app, ["export-fmu", "-m", str(model), "-o", str(unit), "--kind", "estimator"]
     )
     assert done.exit_code == 0
     description = fmpy.read_model_description(str(unit))

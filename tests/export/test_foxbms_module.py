@@ -36,7 +36,7 @@ pytestmark = pytest.mark.skipif(not shutil.which("cc"), reason="no C compiler")
 
 
 def built(folder: Path, model: Model, *defines: str, period_s: float = 0.1) -> Path:
-    export_c(model, folder, period_s=period_s)
+    export_c(model, folder, period_s=period_s, platform="foxbms")
     sources = [*CORE_SOURCES, "pack_model.c", str(HERE / "driver.c")]  # it includes foxbms_soc.c
     subprocess.run(
         ["cc", *STRICT, "-DCANGAUGE_CONFIG", *defines, f"-I{HERE}", "-I.", *sources, "-lm",

@@ -76,10 +76,10 @@ def test_parts_are_one_capture_and_give_the_live_numbers(tmp_path: Path, suffix:
                 live.append(pipeline.latest)
     assert recorder.state is not None
     assert (recorder.state.lost_frames, recorder.state.frames) == (0, len(messages))
-    assert recorder.path == tmp_path / f"drive-0001{suffix}"
-    assert len(parts_of_run(recorder.path)) >= 3
-    assert content(recorder.path) == expected(messages)
-    offline = estimate_capture(recorder.path, Vehicle.load("generic"), leaf_model()).table
+    assert recorder.written[-1] == tmp_path / f"drive-0001{suffix}"
+    assert len(parts_of_run(recorder.written[-1])) >= 3
+    assert content(recorder.written[-1]) == expected(messages)
+    offline = estimate_capture(recorder.written[-1], Vehicle.load("generic"), leaf_model()).table
     for name in ("time_s", "soc_pct", "soc_std_pct", "residual_v"):
         numbers = np.array([getattr(each, name) for each in live])
         assert np.array_equal(getattr(offline, name), numbers, equal_nan=True), name
@@ -88,7 +88,7 @@ def test_parts_are_one_capture_and_give_the_live_numbers(tmp_path: Path, suffix:
 def test_a_command_takes_the_name_of_a_run(tmp_path: Path) -> None:
     with Recorder(tmp_path / "drive.log", RecordLimits(part_bytes=2_000)) as recorder:
         write(recorder, frames(20.0))
-    arguments = (recorder.path, "--vehicle", "generic", "--json")
+    arguments = (recorder.written[-1], "--vehicle", "generic", "--json")
     ended = in_process("estimate", *arguments, "-m", leaf_model_path(), "-o", tmp_path / "soc.csv")
     assert (ended.code, ended.json["rows"]) == (0, 200), ended.err
 
@@ -97,7 +97,7 @@ def test_a_clock_that_is_set_back_is_recorded(tmp_path: Path) -> None:
     messages = frames(5.0) + frames(5.0, begin_s=1.6e9) + frames(5.0, begin_s=12.0)
     with Recorder(tmp_path / "drive.log") as recorder:
         write(recorder, messages)
-    assert content(recorder.path) == expected(messages)
+    assert content(recorder.written[-1]) == expected(messages)
 
 
 def test_an_existing_recording_is_never_replaced(tmp_path: Path) -> None:
@@ -105,7 +105,7 @@ def test_an_existing_recording_is_never_replaced(tmp_path: Path) -> None:
     for number, name in enumerate(names):
         with Recorder(tmp_path / "drive.log") as recorder:
             write(recorder, frames(1.0, 1.7e9 + 100.0 * number))
-        assert recorder.path == tmp_path / name
+        assert recorder.written[-1] == tmp_path / name
     for number, name in enumerate(names):
         assert content(tmp_path / name) == expected(frames(1.0, 1.7e9 + 100.0 * number))
 
@@ -118,7 +118,7 @@ def test_the_oldest_parts_are_removed(tmp_path: Path) -> None:
     parts = all_parts(tmp_path / "drive.log")
     assert {part.run for part in parts} <= {2, 3}
     assert 30_000 < sum(part.path.stat().st_size for part in parts) < 40_000 + 3 * 4_500
-    assert recorder.path.name == "drive-0003.log"
+    assert recorder.written[-1].name == "drive-0003.log"
 
 
 def test_impossible_recordings_are_refused(tmp_path: Path) -> None:
@@ -170,7 +170,7 @@ def test_a_full_disk_costs_frames_of_the_recording_only(
         write(recorder, messages[:100])
     assert recorder.state.lost_frames == 500
     # The file is whole lines: a part in the middle is missing, and nothing else.
-    assert content(recorder.path) == expected(messages[:400] + messages[800:])
+    assert content(recorder.written[-1]) == expected(messages[:400] + messages[800:])
     events = [getattr(each, "event", "") for each in caplog.records]
     assert {"record.failed", "record.resumed"} <= set(events)
 
@@ -211,7 +211,7 @@ def test_a_folder_that_goes_and_comes_back(tmp_path: Path) -> None:
         write(recorder, messages[200:])
     assert recorder.state.problem is None
     assert 0 < recorder.state.lost_frames <= 100
-    assert len(content(recorder.path)) == len(messages) - recorder.state.lost_frames
+    assert len(content(recorder.written[-1])) == len(messages) - recorder.state.lost_frames
 
 
 CHILD = """

@@ -113,10 +113,7 @@ def demo_command(*, folder: Path = Path("out/demo"), json_output: bool = False) 
         "seconds": time.monotonic() - began,
         **{name: str(path) for name, path in paths.items()},
     }
-    if json_output:
-        emit_json(result)
-    else:
-        _show(result)
+    (emit_json if json_output else _show)(result)
 
 
 def _play(folder: Path, log: Path) -> float:

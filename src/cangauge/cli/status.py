@@ -29,7 +29,6 @@ from cangauge.types import REASON_WORDS, Reason
 
 WATCH_EVERY_S: Final = 0.5
 """Interval of `--watch` [s]."""
-USABLE: Final = frozenset({"valid", "degraded"})
 _STYLE: Final = {"initialising": "yellow", "valid": "green", "degraded": "yellow", "invalid": "red"}
 
 
@@ -75,7 +74,7 @@ def status_command(
         emit_json(status)
     else:
         print_values(f"cangauge at {place}", status_values(status))
-    if status["status"] not in USABLE:
+    if status["status"] not in {"valid", "degraded"}:
         raise typer.Exit(1)
 
 

@@ -309,12 +309,9 @@ class _Attempts:
         found = [self._match(name, survey) for name in PRESETS]
         # A related preset that also finds its temperature explains more of the capture.
         warm = {PRESETS[match.preset].dbc for match in found if match.temperature_c is not None}
-        because = "the pack temperature is on this bus"
-        for place, match in enumerate(found):
-            preset = PRESETS[match.preset]
-            if match.matches and preset.lacks_temperature and preset.dbc in warm:
-                found[place] = replace(match, matches=False, because=because)
-        return tuple(found)
+        cold = {name for name, car in PRESETS.items() if car.lacks_temperature and car.dbc in warm}
+        no = {"matches": False, "because": "the pack temperature is on this bus"}
+        return tuple(replace(m, **no) if m.matches and m.preset in cold else m for m in found)  # type: ignore[arg-type] # of its fields
 
     def _match(self, name: str, survey: _Survey) -> PresetMatch:
         car = self._vehicles[name]

@@ -162,7 +162,7 @@ def inspect_log(log: Log) -> LogInspection:
     """Inspect a log; the sign of its current is one of the findings."""
     timing, charge, soc, sign = _timing(log), _charge(log), _soc(log), sign_of_current(log)
     resistance = _resistance(log)
-    channels = describe_channels(log, None if resistance is None else resistance.median_ohm)
+    channels = describe_channels(log, resistance.median_ohm if resistance else None)
     warnings = tuple(_warnings(log, timing, channels, charge, sign))
     assessed: dict[str, tuple[Verdict, str]] = {
         "sign of current": ("yes" if sign.sign else "no", sign.sentence),
@@ -184,16 +184,11 @@ def inspect_log(log: Log) -> LogInspection:
 
 def channel_rows(found: LogInspection) -> tuple[list[str], list[list[str]]]:
     """Return headings and rows of the channels: a constant one has no step."""
-    rows = [
-        [
-            name,
-            *(significant(value, 5) for value in (item.minimum, item.median, item.maximum)),
-            item.unit,
-            "constant" if item.levels == 1 else significant(item.quantum, 3),
-            str(item.missing),
-        ]
-        for name, item in found.channels.items()
-    ]
+    rows = []
+    for name, item in found.channels.items():
+        values = (significant(value, 5) for value in (item.minimum, item.median, item.maximum))
+        step = "constant" if item.levels == 1 else significant(item.quantum, 3)
+        rows.append([name, *values, item.unit, step, str(item.missing)])
     return ["channel", "minimum", "median", "maximum", "unit", "step", "missing rows"], rows
 
 
@@ -331,8 +326,8 @@ def _ohmic(resistance: Resistance | None, step_s: float) -> tuple[Verdict, str]:
         return "no", f"fewer than {MIN_STEPS} clear steps of current"
     ohm, low, high = resistance.median_ohm, resistance.lower_ohm, resistance.upper_ohm
     text = f"{ohm:.4g} Ω (quartiles {low:.4g} … {high:.4g}) from {resistance.steps} steps of"
-    is_steady = abs(high - low) <= 0.5 * abs(ohm)
-    return "yes" if is_steady else "partly", f"{text} current over {step_s:.3g} s"
+    verdict: Verdict = "yes" if abs(high - low) <= 0.5 * abs(ohm) else "partly"
+    return verdict, f"{text} current over {step_s:.3g} s"
 
 
 def _delays(log: Log, timing: Timing) -> tuple[Verdict, str]:
@@ -354,8 +349,7 @@ def _delays(log: Log, timing: Timing) -> tuple[Verdict, str]:
         return "no", "current does not vary"
     alike = correlation(log.current_a[rows], before)
     text = f"currents {DELAYS_S[1]:.0f} s apart correlate by {alike:.2f}"
-    is_clear = alike <= CORRELATED
-    return ("yes", text) if is_clear else ("partly", f"{text}: the terms are hard to separate")
+    return ("yes", text) if alike <= CORRELATED else ("partly", f"{text}: hard to separate")
 
 
 def _rows(log: Log, timing: Timing) -> tuple[Verdict, str]:
@@ -401,6 +395,6 @@ def _rests(log: Log) -> tuple[Verdict, str]:
     edges = np.flatnonzero(np.diff(np.concatenate(([False], still, [False])).astype(np.int8)))
     length = log.time_s[edges[1::2] - 1] - log.time_s[edges[::2]]
     rests = int((length >= REST_S).sum())
-    longest = float(length.max()) if length.size else 0.0
-    text = f"{counted(rests, 'rest')} of 5 min or more, the longest {duration(longest)}"
+    longest = duration(float(length.max(initial=0.0)))
+    text = f"{counted(rests, 'rest')} of 5 min or more, the longest {longest}"
     return "yes" if rests >= 3 else "partly" if rests else "no", text

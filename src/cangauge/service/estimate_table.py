@@ -12,7 +12,7 @@ from dataclasses import replace
 from functools import partial
 from os import PathLike
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, BinaryIO, Final, Self
+from typing import TYPE_CHECKING, Any, BinaryIO, Final
 
 import numpy as np
 import pyarrow as pa
@@ -124,12 +124,6 @@ class EstimateWriter(Output):
             _write_header(file)
             self._sink = pacsv.CSVWriter(file, _SCHEMA, write_options=_PLAIN_CSV)
         self._worker = Worker("cangauge-table", self._abandon, _BLOCKS_WAITING)
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
 
     def on_sample(self, sample: Sample, estimate: Estimate) -> None:
         """Add the row of a sample and the estimate after it."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Self
 
 from cangauge.types import Estimate, Sample
 
@@ -28,3 +28,9 @@ class Output:
 
     def close(self) -> None:
         """Complete what was written, within a limited time."""
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()

@@ -22,7 +22,7 @@ from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
-from typing import Final, Self
+from typing import Final
 
 import can
 
@@ -131,11 +131,6 @@ class Recorder(Output):
             self._begin(self._path, requested=False)
             self._is_active = True
 
-    @property
-    def path(self) -> Path:
-        """Name of the latest recording, for `estimate` and `replay`."""
-        return self.written[-1]
-
     def request(self, *, active: bool) -> None:
         """Ask for a recording, or for its end; it follows with the next snapshot."""
         self._is_wanted = active
@@ -169,12 +164,6 @@ class Recorder(Output):
         if not self._worker.close(CLOSE_WITHIN_S) and self.state is not None:
             text = f"{self.state.path}: the end of the recording is missing"
             emit(_LOG, logging.ERROR, "record.incomplete", text)
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
 
     def _hand_over(self) -> None:
         batch, self._batch = self._batch, []

@@ -243,7 +243,7 @@ class Monitor:
             "bus_up": not any(getattr(port, name, False) for name in ("is_away", "is_off")),
             "bus_counts": {name: int(n) for name, n in counts.items() if n is not None},
             "bus_trouble": getattr(port, "trouble", "") or None,
-            "polls": None if polls is None else polls.to_dict(),
+            "polls": None if polls is None else asdict(polls),
             "config": self._config,
             "latency": self._latency.to_dict(),
             "step": self._step.to_dict(),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
+from typing import Literal
 
 from cangauge._files import check_writable
 from cangauge.cli.declare import command
@@ -26,7 +27,15 @@ def _check_folder(folder: Path) -> None:
 
 @command()
 def export_c_command(
-    *, model: Path, output: Path, period: float = 0.1, json_output: bool = False
+    *,
+    model: Path | None = None,
+    output: Path,
+    chemistry: Literal["oxide", "lfp"] = "oxide",
+    cells: int | None = None,
+    capacity_ah: float | None = None,
+    platform: Literal["generic", "esp-idf", "zephyr", "arduino", "foxbms"] = "generic",
+    period: float = 0.5,
+    json_output: bool = False,
 ) -> None:
     """Write a model and the estimator as C sources, with tests, for a microcontroller.
 
@@ -34,28 +43,56 @@ def export_c_command(
     --------
     `cangauge export-c -m pack.json -o pack_c`
 
+    `cangauge export-c --chemistry lfp --cells 16 --capacity-ah 280 -o pack_c`  (no log yet: the
+    typical cell, with the uncertainty that belongs to it)
+
     Parameters
     ----------
+    model : -m, --model MODEL
+        Model file of `cangauge fit`.
     output : -o, --output DIR
         Folder for the sources: empty, of an earlier export, or made.
-    period : S
-        Time between two samples of the current [s].
+    chemistry : oxide|lfp
+        Without a model: the cells' chemistry, …
+    cells : N (1 … 2000)
+        … how many are in series, …
+    capacity_ah : A (0.001 … 1e5 Ah)
+        … and the charge from 100 to 0 %.
+    platform : generic|esp-idf|zephyr|arduino|foxbms
+        What the folder is to be: sources with a Makefile and tests, an ESP-IDF component, a Zephyr
+        module, an Arduino library, or the SoC module of foxBMS 2; with an example.
+    period : S (0.001 … 60 s)
+        Time between two currents that the delay line keeps: more samples cost no memory.
     """
     _check_folder(output)
     if os.path.isdir(output):  # noqa: PTH112 - pathlib raises for an impossible name
-        check_outputs([output / "pack_model.c"], [model])
+        check_outputs([output / "pack_model.c"], [model] if model else [])
     # Deferred, so that the help page does not wait for numpy and scipy.
-    from cangauge.extras.embedded.embedded import export_c
+    from cangauge.extras.embedded.embedded import export_c, std_at_rest_pct
     from cangauge.model.model_file import Model
 
-    done = export_c(Model.load(model), output, period_s=period)
+    if model is not None and (cells, capacity_ah) != (None, None):
+        cure = "leave out -m, or --cells and --capacity-ah"
+        raise InputError("the model states these", field="--cells/--capacity-ah", cure=cure)
+    if model is None and (cells is None or capacity_ah is None):
+        cure = "give -m MODEL, or --chemistry, --cells and --capacity-ah of a pack without logs"
+        raise InputError("no model", field="--model", cure=cure)
+    if model is not None:
+        chosen = Model.load(model)
+    else:
+        chosen = Model.prior(chemistry, cells or 1, capacity_ah or 1.0)
+    done = export_c(chosen, output, period_s=period, platform=platform)
+    std_pct = std_at_rest_pct(chosen)
     if json_output:
         emit_json({
             "folder": str(done.folder),
             "files": list(done.files),
             "delay_line_bytes": done.delay_line_bytes,
+            "std_at_rest_pct": std_pct,
         })  # fmt: skip
         return
     files = f"{len(done.files)} files in {done.folder}"
-    note(f"{files}: `make test` there runs the tests on this machine.")
+    tests = "" if platform == "arduino" else ": `make test` there runs the tests on this machine"
+    note(f"{files}{tests}.")
     note(f"The delay line takes {done.delay_line_bytes / 1024:.1f} KiB at {period:g} s a sample.")
+    note(f"{chosen.name}: from half a minute of rest the SoC is known to ± {std_pct:.1f} % (1σ).")

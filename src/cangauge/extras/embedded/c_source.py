@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Final
 
 import numpy as np
@@ -14,11 +14,43 @@ from cangauge.estimation.estimator import Estimator
 from cangauge.estimation.settings import EstimatorSettings
 from cangauge.model.effects.base import CoreForm
 from cangauge.model.model_file import Model
+from cangauge.model.voltage_model import HermiteCurve, PublishedCurve, VoltageModel
 
 CORE_SOURCES: Final = ("cangauge.c", "cangauge_filter.c", "cangauge_model.c")
 CORE_HEADERS: Final = ("cangauge.h", "cangauge_internal.h")
 WIDE: Final = ("ocv_v", "epsilon", "skew_s")
 """Fields that are doubles where the others are floats."""
+
+
+EDGE_PCT: Final = 1e-3
+"""Distance from the identified SoC at which a table has the slope beyond it [%]: the curve has a
+kink there, which a cubic between two knots cannot have."""
+
+
+class TabulatedModel(Model):
+    """A model of the published equation whose curve is a table of `KNOTS` knots.
+
+    The equation has logarithms and negative powers of the SoC, which cost a microcontroller without
+    doubles four times as much as all the rest of a voltage update.
+    """
+
+    @classmethod
+    def of(cls, model: Model) -> Model:
+        """Return a model with its curve as a table."""
+        fields = {name: getattr(model, name) for name in Model.model_fields}
+        return model if model.equation == "knots" else cls.model_construct(**fields)
+
+    def voltage_model(self) -> VoltageModel:
+        """Return the voltage model; see `Model.voltage_model`."""
+        voltage = super().voltage_model()
+        curve = voltage.curve
+        if not isinstance(curve, PublishedCurve):
+            return voltage
+        low, high = voltage.soc_range_pct
+        inside = np.linspace(low, high, layout.KNOTS - 2)
+        soc_pct = np.r_[low - EDGE_PCT, inside, high + EDGE_PCT]
+        slope = np.r_[curve.beyond[0], curve.slopes(inside), curve.beyond[1]]
+        return replace(voltage, curve=HermiteCurve(soc_pct, curve.values(soc_pct), slope))
 
 
 @dataclass(frozen=True)

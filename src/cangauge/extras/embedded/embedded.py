@@ -28,20 +28,21 @@ from cangauge.extras.embedded.c_source import (
     CORE_HEADERS,
     CORE_SOURCES,
     CoreConstants,
+    TabulatedModel,
     exported_constants,
     line_size,
     model_definition,
 )
+from cangauge.extras.embedded.platforms import Platform, arranged
 from cangauge.model.model_file import Model
 from cangauge.types import Estimate, Sample
 
-EMBEDDED: Final = (
-    "Makefile", "example.c", "test.c", "clock.h", "startup.c", "mps2.ld",
-    "foxbms_soc.c", "foxbms_soc.h",
-)  # fmt: skip
+EMBEDDED: Final = ("Makefile", "example.c", "test.c", "clock.h", "startup.c", "mps2.ld")
+FOXBMS: Final = ("foxbms_soc.c", "foxbms_soc.h")
 
-PERIOD_S: Final = 0.1
-"""Time between two samples that the delay line has memory for [s]."""
+PERIOD_S: Final = 0.5
+"""Time between two samples that the delay line has memory for [s]: of five drives at 10 Hz the SoC
+then differs by at most 0.006 % from that with every sample (at 1 s by 0.02 %)."""
 
 JITTER: Final = 0.9
 """Part of the period from which a sample is kept: a task's jitter stays within a tenth of it."""
@@ -69,7 +70,9 @@ class Exported:
     """Memory of the delay line with floats [B]."""
 
 
-def export_c(model: Model, folder: Path, *, period_s: float = PERIOD_S) -> Exported:
+def export_c(
+    model: Model, folder: Path, *, period_s: float = PERIOD_S, platform: Platform = "generic"
+) -> Exported:
     """Write the C sources of a model.
 
     Parameters
@@ -80,21 +83,22 @@ def export_c(model: Model, folder: Path, *, period_s: float = PERIOD_S) -> Expor
     period_s : float
         Time between two samples of the current [s]. More samples are taken too, but the delay line
         then keeps some of them only.
+    platform : {"generic", "esp-idf", "zephyr", "arduino", "foxbms"}
+        What the folder is to be: sources with a Makefile, or what a platform builds (`platforms`).
 
     Raises
     ------
     InputError
-        If the period is out of range, the core lacks one of the model's effects, or a file of
+        If the core lacks one of the model's effects, or a file of
         the same name in the folder is not of an export.
     """
-    if not 1e-3 <= period_s <= 60.0:
-        raise InputError("must lie within 0.001 … 60 s", field="--period", value=period_s)
+    model = TabulatedModel.of(model)
     constants = exported_constants(model)
     spacing_s = JITTER * 2.0 * period_s
     length = line_size(constants.longest_s, spacing_s)
     head = f"{_HEAD}{_comment(model.name)}, by cangauge {__version__}. */\n"
     folders = dict.fromkeys(CORE_HEADERS + CORE_SOURCES, "core")
-    folders |= dict.fromkeys(EMBEDDED, "core/embedded")
+    folders |= dict.fromkeys(EMBEDDED + FOXBMS * (platform == "foxbms"), "core/embedded")
     texts = {
         name: shared_file(place, name).read_text(encoding="utf-8")
         for name, place in folders.items()
@@ -111,17 +115,27 @@ def export_c(model: Model, folder: Path, *, period_s: float = PERIOD_S) -> Expor
     )
     texts |= _frames()
     texts["golden.h"] = head.format("golden.h") + _golden(model, period_s)
+    texts = arranged(platform, texts)
     _refuse_foreign_names(folder, texts)
-    folder.mkdir(parents=True, exist_ok=True)
+    for parent in {(folder / name).parent for name in texts}:
+        parent.mkdir(parents=True, exist_ok=True)
     write_texts_atomic({folder / name: text for name, text in texts.items()})
     return Exported(folder, tuple(sorted(texts)), 16 * length)
+
+
+def std_at_rest_pct(model: Model) -> float:
+    """Return the deviation of a SoC near 50 % that the voltage of a rest gives [%]."""
+    estimator, voltage = Estimator(model, EstimatorSettings()), model.voltage_model()
+    for second in range(round(model.noise.block_s) + 1):
+        estimator.update(Sample(float(second), 0.0, voltage.nominal_v, voltage.t_ref_c))
+    return estimator.estimate.soc_std_pct
 
 
 def _refuse_foreign_names(folder: Path, names: Iterable[str]) -> None:
     """Raise InputError for a folder that has files of these names, but not from an export."""
     taken = sorted(name for name in names if os.path.lexists(folder / name))
-    header = folder / "pack_model.h"
-    if not taken or (header.is_file() and header.read_bytes().startswith(_MARK.encode())):
+    headers = [folder / name for name in names if name.endswith("pack_model.h")]
+    if not taken or any(h.is_file() and h.read_bytes().startswith(_MARK.encode()) for h in headers):
         return
     raise InputError(
         "the folder has files of these names that are not from an export",

@@ -1,11 +1,12 @@
-"""Functional mock-up units (FMI 2.0 and 3.0, co-simulation) of a model, from the C core.
+"""Functional mock-up units (FMI 2.0, co-simulation) of a model, from the C core.
 
 The *pack* takes current and temperature and gives voltage and SoC: the voltage model, its delays,
 and the effects that a diagnosis found, whose constants are parameters of the unit. Effects of
 sensors are no part of a pack. The *estimator* takes voltage, current and temperature and gives SoC,
 its standard deviation and status, as `cangauge run` does on a bus, but for the learned capacity.
 
-A unit holds a binary for this platform and the sources for others. Its interface is `core/fmi`.
+A unit holds a binary for this platform and the sources for others. Its interface is `core/fmi`, by
+FMI 2.0: fmpy, OMSimulator and Simulink all read it.
 """
 
 from __future__ import annotations
@@ -46,18 +47,17 @@ from cangauge.model.effects.base import CoreForm
 from cangauge.model.model_file import Model
 
 Kind = Literal["pack", "estimator"]
-Version = Literal[2, 3]
 
 FLAGS: Final = ("-std=c99", "-O2", "-ffp-contract=off", "-fPIC", "-shared", "-fvisibility=hidden")
 """Without contraction: the same bits as the Python reference."""
 PLATFORMS: Final = {
-    ("Linux", "x86_64"): ("linux64", "x86_64-linux", ".so"),
-    ("Linux", "aarch64"): ("aarch64-linux", "aarch64-linux", ".so"),
-    ("Darwin", "x86_64"): ("darwin64", "x86_64-darwin", ".dylib"),
-    ("Darwin", "arm64"): ("darwin64", "aarch64-darwin", ".dylib"),
-    ("Windows", "AMD64"): ("win64", "x86_64-windows", ".dll"),
+    ("Linux", "x86_64"): ("linux64", ".so"),
+    ("Linux", "aarch64"): ("aarch64-linux", ".so"),
+    ("Darwin", "x86_64"): ("darwin64", ".dylib"),
+    ("Darwin", "arm64"): ("darwin64", ".dylib"),
+    ("Windows", "AMD64"): ("win64", ".dll"),
 }
-"""System and machine → folder of the binary in FMI 2 and FMI 3, and its suffix."""
+"""System and machine → folder of the binary, and its suffix."""
 VALUES: Final = {
     "temperature_lag": ("ahead",),
     "core_temperature": ("rise_k", "late", "capacity_ah"),
@@ -120,7 +120,7 @@ class Variable:
     """Lowest and highest value that can be set; None: any, NaN too."""
 
 
-def export_fmu(model: Model, path: Path, *, kind: Kind = "pack", version: Version = 3) -> Path:
+def export_fmu(model: Model, path: Path, *, kind: Kind = "pack") -> Path:
     """Write the functional mock-up unit of a model.
 
     Parameters
@@ -129,8 +129,6 @@ def export_fmu(model: Model, path: Path, *, kind: Kind = "pack", version: Versio
     path : Path
         File to write, `.fmu`.
     kind : {"pack", "estimator"}
-    version : {2, 3}
-        Of the Functional Mock-up Interface.
 
     Raises
     ------
@@ -139,14 +137,12 @@ def export_fmu(model: Model, path: Path, *, kind: Kind = "pack", version: Versio
     CangaugeError
         If the compiler fails.
     """
-    unit = _Unit.of(model, exported_constants(model), kind, version)
+    unit = _Unit.of(model, exported_constants(model), kind)
     with tempfile.TemporaryDirectory() as folder:
         root = Path(folder)
         unit.write_sources(root / "sources")
         unit.compile(root)
         (root / "modelDescription.xml").write_bytes(unit.description())
-        if version == 3:
-            (root / "sources" / "buildDescription.xml").write_bytes(unit.build_description())
         with atomic_path(path) as part, zipfile.ZipFile(part, "w", zipfile.ZIP_DEFLATED) as archive:
             for file in sorted(root.rglob("*")):
                 if file.is_file():
@@ -160,7 +156,6 @@ class _Unit:
 
     identifier: str
     kind: Kind
-    version: Version
     constants: CoreConstants
     variables: tuple[Variable, ...]
     parameters: tuple[tuple[int, str], ...]
@@ -168,7 +163,7 @@ class _Unit:
     token: str
 
     @classmethod
-    def of(cls, model: Model, constants: CoreConstants, kind: Kind, version: Version) -> _Unit:
+    def of(cls, model: Model, constants: CoreConstants, kind: Kind) -> _Unit:
         if kind == "pack":
             forms = [
                 CoreForm("no_effect") if form.kind in SENSORS else form
@@ -183,23 +178,23 @@ class _Unit:
         else:
             parameters, variables = [], _estimator_variables()
         name = re.sub(r"\W+", "_", f"{kind} {model.name}", flags=re.ASCII).rstrip("_")
-        token = hashlib.sha256(f"{kind} {version} {__version__} {model.to_json()}".encode())
+        token = hashlib.sha256(f"{kind} {__version__} {model.to_json()}".encode())
         return cls(
-            name[:LONGEST_NAME], kind, version, constants, tuple(variables), tuple(parameters),
+            name[:LONGEST_NAME], kind, constants, tuple(variables), tuple(parameters),
             token.hexdigest(),
         )  # fmt: skip
 
     @property
     def sources(self) -> list[str]:
         """Names of the C files."""
-        return [*CORE_SOURCES, "fmu.c", f"{self.kind}.c", f"fmi{self.version}.c", "fmu_model.c"]
+        return [*CORE_SOURCES, "fmu.c", f"{self.kind}.c", "fmi2.c", "fmu_model.c"]
 
     def write_sources(self, folder: Path) -> None:
         """Write the sources, with the constants of the model."""
         folder.mkdir()
         for name in (*CORE_SOURCES, *CORE_HEADERS):
             shutil.copyfile(shared_file("core", name), folder / name)
-        for name in ("fmu.h", "fmu.c", "fmi.h", f"{self.kind}.c", f"fmi{self.version}.c"):
+        for name in ("fmu.h", "fmu.c", f"{self.kind}.c", "fmi2.c"):
             shutil.copyfile(shared_file("core", f"fmi/{name}"), folder / name)
         config = {
             "FMU_TOKEN": f'"{self.token}"',
@@ -231,9 +226,8 @@ class _Unit:
         key = platform.system(), platform.machine()
         if key not in PLATFORMS:
             raise InputError("no name in FMI for this platform", value=" ".join(key))
-        second, third, suffix = PLATFORMS[key]
-        binary = root / "binaries" / (second if self.version == 2 else third)
-        binary = binary / f"{self.identifier}{suffix}"
+        folder, suffix = PLATFORMS[key]
+        binary = root / "binaries" / folder / f"{self.identifier}{suffix}"
         binary.parent.mkdir(parents=True)
         sources = [str(root / "sources" / name) for name in self.sources]
         command = [*_compiler(), *FLAGS, *sources, "-o", str(binary), "-lm"]
@@ -243,57 +237,43 @@ class _Unit:
 
     def description(self) -> bytes:
         """Return modelDescription.xml."""
-        is_third = self.version == 3
         root = ET.Element(
             "fmiModelDescription",
             {
-                "fmiVersion": "3.0" if is_third else "2.0",
+                "fmiVersion": "2.0",
                 "modelName": self.identifier,
-                "instantiationToken" if is_third else "guid": self.token,
+                "guid": self.token,
                 "generationTool": f"cangauge {__version__}",
                 "variableNamingConvention": "structured",
             },
         )
-        state = "canGetAndSetFMUState" if is_third else "canGetAndSetFMUstate"
         interface = ET.SubElement(
             root, "CoSimulation",
             {
                 "modelIdentifier": self.identifier,
-                "canHandleVariableCommunicationStepSize": "true", state: "true",
+                "canHandleVariableCommunicationStepSize": "true",
+                "canGetAndSetFMUstate": "true",
             },
         )  # fmt: skip
-        if not is_third:
-            files = ET.SubElement(interface, "SourceFiles")
-            for name in self.sources:
-                ET.SubElement(files, "File", name=name)
+        files = ET.SubElement(interface, "SourceFiles")
+        for name in self.sources:
+            ET.SubElement(files, "File", name=name)
         units = ET.SubElement(root, "UnitDefinitions")
         for name, base in UNITS.items():
             ET.SubElement(ET.SubElement(units, "Unit", name=name), "BaseUnit", base)
         ET.SubElement(root, "DefaultExperiment", startTime="0", stepSize=str(STEP_S))
         variables = ET.SubElement(root, "ModelVariables")
+        for reference, item in enumerate(self.variables):
+            _add(variables, reference, item)
         structure = ET.SubElement(root, "ModelStructure")
         outputs = [k for k, item in enumerate(self.variables) if item.causality == "output"]
-        for reference, item in enumerate(self.variables):
-            (_third if is_third else _second)(variables, reference, item)
-        if is_third:
-            for tag in ("Output", "InitialUnknown"):
-                for reference in outputs:
-                    ET.SubElement(structure, tag, valueReference=str(reference))
-        else:
-            for tag in ("Outputs", "InitialUnknowns"):
-                parent = ET.SubElement(structure, tag)
-                for reference in outputs:
-                    ET.SubElement(parent, "Unknown", index=str(reference + 1))
-        return _bytes(root)
-
-    def build_description(self) -> bytes:
-        """Return buildDescription.xml of the sources, for other platforms (FMI 3)."""
-        root = ET.Element("fmiBuildDescription", fmiVersion="3.0")
-        build = ET.SubElement(root, "BuildConfiguration", modelIdentifier=self.identifier)
-        files = ET.SubElement(build, "SourceFileSet", language="C99")
-        for name in self.sources:
-            ET.SubElement(files, "SourceFile", name=name)
-        return _bytes(root)
+        for tag in ("Outputs", "InitialUnknowns"):
+            parent = ET.SubElement(structure, tag)
+            for reference in outputs:
+                ET.SubElement(parent, "Unknown", index=str(reference + 1))
+        ET.indent(root)
+        text: bytes = ET.tostring(root, encoding="UTF-8", xml_declaration=True)
+        return text
 
 
 def _pack_variables(model: Model) -> tuple[Variable, ...]:
@@ -359,33 +339,8 @@ def _effect_parameters(
     return variables, places
 
 
-def _second(parent: ET.Element, reference: int, item: Variable) -> None:
-    """Add a variable as FMI 2 states it."""
-    attributes = _attributes(reference, item)
-    outer = ET.SubElement(parent, "ScalarVariable", attributes)
-    inner = _limits(item) | ({} if item.start is None else {"start": repr(item.start)})
-    if item.unit is not None:
-        inner["unit"] = item.unit
-    ET.SubElement(outer, "Integer" if item.is_integer else "Real", inner)
-
-
-def _third(parent: ET.Element, reference: int, item: Variable) -> None:
-    """Add a variable as FMI 3 states it."""
-    attributes = _attributes(reference, item) | _limits(item)
-    if item.start is not None:
-        attributes["start"] = repr(item.start)
-    if item.unit is not None:
-        attributes["unit"] = item.unit
-    ET.SubElement(parent, "Int32" if item.is_integer else "Float64", attributes)
-
-
-def _limits(item: Variable) -> dict[str, str]:
-    """Return the attributes min and max, as far as the range has ends."""
-    named = zip(("min", "max"), item.range or FINITE, FINITE, strict=True)
-    return {name: repr(value) for name, value, end in named if value != end}
-
-
-def _attributes(reference: int, item: Variable) -> dict[str, str]:
+def _add(parent: ET.Element, reference: int, item: Variable) -> None:
+    """Add a variable to the model's description."""
     variability = {"parameter": "fixed"}.get(
         item.causality, "discrete" if item.is_integer else "continuous"
     )
@@ -394,13 +349,13 @@ def _attributes(reference: int, item: Variable) -> dict[str, str]:
         "name": item.name, "valueReference": str(reference), "causality": item.causality,
         "variability": variability, "description": item.description,
     }  # fmt: skip
-    return attributes if initial is None else attributes | {"initial": initial}
-
-
-def _bytes(root: ET.Element) -> bytes:
-    ET.indent(root)
-    text: bytes = ET.tostring(root, encoding="UTF-8", xml_declaration=True)
-    return text
+    attributes |= {} if initial is None else {"initial": initial}
+    outer = ET.SubElement(parent, "ScalarVariable", attributes)
+    limits = zip(("min", "max"), item.range or FINITE, FINITE, strict=True)
+    inner = {name: repr(value) for name, value, end in limits if value != end}
+    inner |= {} if item.start is None else {"start": repr(item.start)}
+    inner |= {} if item.unit is None else {"unit": item.unit}
+    ET.SubElement(outer, "Integer" if item.is_integer else "Real", inner)
 
 
 def _compiler() -> list[str]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Literal, cast
+from typing import Literal
 
 from cangauge.cli.declare import Written, command
 from cangauge.cli.options import check_outputs
@@ -16,10 +16,9 @@ def export_fmu_command(
     model: Path,
     output: Written,
     kind: Literal["pack", "estimator"] = "pack",
-    fmi: int = 3,
     json_output: bool = False,
 ) -> None:
-    """Write a model as a functional mock-up unit (FMI 2.0 or 3.0, co-simulation).
+    """Write a model as a functional mock-up unit (FMI 2.0, co-simulation).
 
     The unit is compiled by the C compiler of this machine, and holds its sources for others.
 
@@ -27,7 +26,7 @@ def export_fmu_command(
     --------
     `cangauge export-fmu -m pack.json -o pack.fmu`
 
-    `cangauge export-fmu -m pack.json -o estimator.fmu --kind estimator --fmi 2`
+    `cangauge export-fmu -m pack.json -o estimator.fmu --kind estimator`
 
     Parameters
     ----------
@@ -36,16 +35,14 @@ def export_fmu_command(
     kind : pack|estimator
         pack: current and temperature in, voltage and SoC out; estimator: voltage too in, SoC, σ and
         status out.
-    fmi : 2|3 (2 … 3)
-        Version of the interface.
     """
     check_outputs([output], [model])
     # Deferred, so that the help page does not wait for numpy and scipy.
-    from cangauge.extras.embedded.fmu import Version, export_fmu
+    from cangauge.extras.embedded.fmu import export_fmu
     from cangauge.model.model_file import Model
 
-    export_fmu(Model.load(model), output, kind=kind, version=cast("Version", fmi))
+    export_fmu(Model.load(model), output, kind=kind)
     if json_output:
-        emit_json({"output": str(output), "kind": kind, "fmi": fmi})
+        emit_json({"output": str(output), "kind": kind, "fmi": 2})
         return
     note(f"{kind}: {output}")

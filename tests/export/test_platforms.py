@@ -1,0 +1,98 @@
+"""Exports for platforms: their manifests are read, and their examples compile against stubs."""
+
+from __future__ import annotations
+
+import re
+import shutil
+import subprocess
+from pathlib import Path
+
+import pytest
+import yaml
+
+from cangauge.extras.embedded.embedded import export_c
+from cangauge.extras.embedded.platforms import Platform
+from cangauge.model.model_file import Model
+
+pytestmark = pytest.mark.skipif(not shutil.which("cc"), reason="no C compiler")
+STUBS = {
+    "esp_timer.h": "long long esp_timer_get_time(void);",
+    "freertos/FreeRTOS.h": "#define pdMS_TO_TICKS(ms) (ms)",
+    "freertos/task.h": "void vTaskDelay(unsigned ticks);",
+    "zephyr/kernel.h": "long long k_uptime_get(void); void k_msleep(int ms);"
+    "void printk(const char *format, ...);",
+    "Arduino.h": "struct port { void begin(long); template <class T> void print(T);"
+    "template <class T> void println(T); };"
+    "extern port Serial; unsigned long millis(); void delay(unsigned long);",
+}
+
+
+@pytest.fixture(scope="module")
+def stubs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("stubs")
+    for name, text in STUBS.items():
+        (folder / name).parent.mkdir(exist_ok=True)
+        (folder / name).write_text(text)
+    return folder
+
+
+def exported(folder: Path, platform: Platform) -> Path:
+    export_c(Model.prior("oxide", 96, 60.0), folder, platform=platform)
+    return folder
+
+
+def compile_all(folder: Path, stubs: Path, *files: str, defines: tuple[str, ...] = ()) -> None:
+    compiler = "c++" if files[0].endswith(".ino") else "cc"
+    kind = ["-x", "c++"] if compiler == "c++" else ["-std=c99"]
+    flags = [*kind, "-Wall", "-Werror", "-fsyntax-only", *(f"-D{each}" for each in defines)]
+    places = [f"-I{stubs}", "-I.", "-Isrc"]
+    done = subprocess.run(
+        [compiler, *flags, *places, *files], cwd=folder, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.parametrize(
+    ("platform", "example"),
+    [("esp-idf", "examples/gauge/main/gauge.c"), ("zephyr", "samples/gauge/src/main.c")],
+)
+def test_what_the_build_names_compiles(
+    tmp_path: Path, stubs: Path, platform: Platform, example: str
+) -> None:
+    build = (exported(tmp_path, platform) / "CMakeLists.txt").read_text()
+    sources = re.findall(r"[a-z_]+\.c\b", build)
+    assert len(sources) == 6
+    defines = re.search(r"CANGAUGE_CONFIG CANGAUGE_REAL=float", build)
+    assert defines is not None
+    compile_all(tmp_path, stubs, *sources, example, defines=tuple(defines[0].split()))
+
+
+def test_manifests_are_read(tmp_path: Path) -> None:
+    component = exported(tmp_path / "esp", "esp-idf") / "idf_component.yml"
+    assert {"version", "description"} <= set(yaml.safe_load(component.read_text()))
+    module = exported(tmp_path / "zephyr", "zephyr") / "zephyr" / "module.yml"
+    build = yaml.safe_load(module.read_text())["build"]
+    assert build == {"cmake": ".", "kconfig": "Kconfig"}
+    kconfig = (tmp_path / "zephyr" / build["kconfig"]).read_text()
+    assert kconfig.startswith("config CANGAUGE\n\tbool")
+
+
+@pytest.mark.skipif(not shutil.which("c++"), reason="no C++ compiler")
+def test_an_arduino_library_compiles_without_definitions(tmp_path: Path, stubs: Path) -> None:
+    folder = exported(tmp_path, "arduino")
+    lines = (folder / "library.properties").read_text().splitlines()
+    properties = dict(line.split("=", 1) for line in lines)
+    # Of the library specification 1.5.
+    assert {"name", "version", "author", "maintainer", "sentence", "paragraph", "category", "url",
+            "architectures"} <= set(properties)  # fmt: skip
+    compile_all(folder, stubs, *(f"src/{each.name}" for each in (folder / "src").glob("*.c")))
+    sketch = folder / "examples" / "Gauge" / "Gauge.ino"
+    sketch.write_text("#include <Arduino.h>\n" + sketch.read_text())
+    compile_all(folder, stubs, "examples/Gauge/Gauge.ino")
+
+
+def test_another_platform_in_the_same_folder_is_no_accident(tmp_path: Path) -> None:
+    exported(tmp_path, "esp-idf")
+    exported(tmp_path, "esp-idf")
+    assert not (tmp_path / "foxbms_soc.c").exists()
+    assert (exported(tmp_path / "fox", "foxbms") / "foxbms_soc.c").exists()
