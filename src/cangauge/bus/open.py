@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import errno
 import ipaddress
-import logging
 import os
 import socket
 import sys
@@ -49,9 +48,6 @@ _DRIVER_ERRORS: Final = (
     can.CanError, OSError, ValueError, TypeError, NotImplementedError, NameError, AttributeError,
     ImportError,
 )  # fmt: skip
-
-# Drivers also log the errors that they raise; a program that sets up logging still sees them.
-logging.getLogger("can").addHandler(logging.NullHandler())
 
 
 class DriverMissingError(InputError):

@@ -8,7 +8,6 @@ in `cangauge.extras.formats`; those of other packages join by the entry point gr
 from __future__ import annotations
 
 import io
-import logging
 import os
 import re
 import struct
@@ -29,9 +28,6 @@ from can.typechecking import StringPathLike
 
 from cangauge._files import open_unpacked
 from cangauge.errors import InputError
-
-# It logs a line for each object that it does not know, which Python would print without a handler.
-logging.getLogger("can").addHandler(logging.NullHandler())
 
 PYTHON_CAN: Final = "cangauge.extras.formats.python_can"
 """Module of the formats that python-can reads; loaded when a capture is opened."""

@@ -16,6 +16,7 @@ from typing import Any, ClassVar, Final
 from scipy.special import chdtri
 
 from cangauge._typing import FloatArray
+from cangauge.errors import InputError
 from cangauge.estimation.blocks import OpenBlock
 from cangauge.estimation.cells import PackTick
 from cangauge.estimation.counting import (
@@ -518,6 +519,10 @@ class Estimator:
         self._online.delay_line.fill(line.time_s, line.current_a, line.since_s)
         self._online.restore(state.online)
         if (state.method, state.capacity_ah) == (self.settings.method, self.capacity_ah):
+            columns = self._online.load_coefficients.size
+            sums = len(Block._fields) - 2 + columns + self._online.drives().size
+            if state.block.rows and (state.block.columns, len(state.block.sums)) != (columns, sums):
+                raise InputError(f"the model's blocks have {sums} sums", field="block.sums")
             self._block.restore(state.block)
             self.hypotheses.restore(state.hypotheses)
         else:

@@ -14,7 +14,6 @@ and Navigation, 2001, ch. 11.6). A hypothesis is dropped once its probability no
 from __future__ import annotations
 
 import math
-from contextlib import suppress
 from typing import Final
 
 import numpy as np
@@ -183,9 +182,8 @@ class Hypotheses:
         """
         n = self.filters[0].x.size
         for each in state.filters:
-            bias, shapes = each.bias, list[tuple[int, ...]]()
-            with suppress(ValueError):  # rows of different lengths
-                shapes = [np.shape(part) for part in (each.x, each.p, bias.b, bias.p, bias.v)]
+            bias = each.bias
+            shapes = [np.shape(part) for part in (each.x, each.p, bias.b, bias.p, bias.v)]
             if shapes != [(n,), (n, n), (2,), (2, 2), (n, 2)]:
                 raise InputError(f"the model's filter has {n} states", field="hypotheses.filters")
         self.filters = [

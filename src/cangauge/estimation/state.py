@@ -212,9 +212,13 @@ class EstimatorState(BaseModel):
     reasons: Annotated[int, Field(strict=True, ge=0, lt=2 * max(Reason))]
 
     @model_validator(mode="after")
-    def _check_line(self) -> Self:
+    def _check_shapes(self) -> Self:
         if len(self.line.time_s) != len(self.line.current_a):
             raise ValueError("the delay line needs one current per time")
+        for each in self.hypotheses.filters:
+            for matrix in (each.p, each.bias.p, each.bias.v):
+                if len({len(row) for row in matrix}) != 1:
+                    raise ValueError("the rows of a matrix need one length")
         return self
 
     @property

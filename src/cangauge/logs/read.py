@@ -131,8 +131,13 @@ class LogFile:
         if self.reader is None:
             raise not_recognised(self, "not a known kind of log", f"known are: {KNOWN_LOGS}")
         _refuse_options(temperature_c, temperature_source, self.sign)
-        draft = self.reader.read(self.head, self.columns)
-        log = _log_of(draft, temperature_c, temperature_source, self.sign, self.used)
+        try:
+            draft = self.reader.read(self.head, self.columns)
+            log = _log_of(draft, temperature_c, temperature_source, self.sign, self.used)
+        except MemoryError as error:
+            raise InputError(
+                "larger than the free memory", source=self.head.path, cure="split it"
+            ) from error
         pa.default_memory_pool().release_unused()
         return log
 

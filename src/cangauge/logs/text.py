@@ -20,8 +20,8 @@ from cangauge.logs import stamps
 from cangauge.logs.column_map import Choice, ColumnMap, choose_columns, unknown_columns
 from cangauge.logs.headings import meaning_of
 
-MAX_ROWS: Final = 10_000_000
-"""Rows of a log: 11 days at 10 Hz, 0.4 GB as float64."""
+MAX_ROWS: Final = 20_000_000
+"""Rows of a log: 23 days at 10 Hz, 0.8 GB as float64."""
 MAX_COLUMNS: Final = 10_000
 _MISSING: Final = "nan na n/a #n/a null none - -- 1.#qnan -1.#ind unknown unavailable n.a."
 MISSING: Final = tuple(_MISSING.split())
