@@ -214,7 +214,7 @@ def test_a_killed_worker_leaves_a_complete_result(
     pytest.importorskip("distributed")
     job = EstimateJob(ReadOptions(), model, EstimatorSettings())
     results = Results(str(tmp_path), job.kind, job.columns)
-    with connected("local", 2) as client:
+    with connected("2") as client:
         killed: list[int] = []
 
         def kill(*_: object) -> Any:
@@ -237,7 +237,7 @@ def test_a_killed_worker_leaves_a_complete_result(
 
 def test_nobody_without_its_certificate_reaches_a_local_cluster() -> None:
     distributed = pytest.importorskip("distributed")
-    with connected("local", 1) as client:
+    with connected("1") as client:
         place = client.scheduler.address
         plain = place.replace("tls://", "tcp://")
         for address, security in (
@@ -295,18 +295,18 @@ def test_health_passes_from_log_to_log(logs: list[FleetLog], model: Model) -> No
 def test_references_come_from_all_vehicles(logs: list[FleetLog], model: Model) -> None:
     suspect = [log for log in logs if "trip1" in log.url]
     healthy = [log for log in logs if "trip1" not in log.url]
-    job, tasks = GapJob(ReadOptions(), model, references=5).of_fleet(suspect, healthy, 1)
+    job, tasks = GapJob(ReadOptions(), model).of_fleet(suspect, healthy)
     found = {task.vehicle: task for task in tasks}
     chosen = [log.vehicle for log in found["car1"].references]
     assert (chosen[0], chosen.count("car1"), set(chosen)) == (
         "car1", 1, {"car0", "car1", "car2", "car3"},
     )  # fmt: skip
     assert (job.common, job.prepared()) == ((), job)  # all have their own
-    again = GapJob(ReadOptions(), model, references=5).of_fleet(suspect[::-1], healthy, 1)[1]
+    again = GapJob(ReadOptions(), model).of_fleet(suspect[::-1], healthy)[1]
     assert sorted(again, key=lambda task: task.vehicle) == tasks
     for few, words in ((([], healthy), "every log is"), ((suspect, []), "known to be healthy")):
         with pytest.raises(InputError, match=words):
-            GapJob(ReadOptions(), model).of_fleet(*few, 1)
+            GapJob(ReadOptions(), model).of_fleet(*few)
 
 
 def test_a_vehicle_without_own_references_has_the_common_ones(
@@ -318,7 +318,7 @@ def test_a_vehicle_without_own_references_has_the_common_ones(
     write_log(replace(still, current_a=np.zeros(len(still))), dead)
     suspect = [logs[3], FleetLog(str(broken), "car1", "s")]
     healthy = [FleetLog(str(dead), "car0", "s"), logs[5], logs[7]]
-    job, (task,) = GapJob(ReadOptions(), model, references=3).of_fleet(suspect, healthy, 3)
+    job, (task,) = GapJob(ReadOptions(), model).of_fleet(suspect, healthy)
     assert (len(job.common), task.references, task.common) == (3, (), job.common)
     (row,) = perform(job.prepared(), task).rows
     assert (row["log"], row["references"], row["reference_vehicles"]) == ("car1", 2, 2)

@@ -21,15 +21,14 @@ def test_a_glob_finds_the_logs_of_each_folder(folder: Path) -> None:
     assert [Path(log.url).stem for log in found[:2]] == ["trip0", "trip1"]
 
 
-def test_a_pattern_finds_the_vehicle_in_the_name(tmp_path: Path) -> None:
-    (tmp_path / "A17_may.csv").write_text(HEAD)
-    (log,) = find_logs([f"{tmp_path}/*.csv"], pattern=r"([A-Z]\d+)_\w+\.csv$")
-    assert log.vehicle == "A17"
-    with pytest.raises(InputError, match="finds no vehicle"):
-        find_logs([f"{tmp_path}/*.csv"], pattern=r"(VIN\d+)")
-    for wrong, words in (("(", "regular expression"), ("A17", "no group")):
-        with pytest.raises(InputError, match=words):
-            find_logs([f"{tmp_path}/*.csv"], pattern=wrong)
+def test_the_folder_of_a_log_names_its_vehicle(tmp_path: Path) -> None:
+    for folder in ("A17", "vehicle=B 4"):
+        (tmp_path / folder).mkdir()
+        (tmp_path / folder / "may.csv").write_text(HEAD)
+    assert [log.vehicle for log in find_logs([f"{tmp_path}/*/may.csv"])] == ["A17", "B 4"]
+    fsspec.filesystem("memory").pipe_file("/may.csv", HEAD.encode())
+    with pytest.raises(InputError, match="names its vehicle"):
+        find_logs(["memory://may.csv"])
 
 
 def test_a_manifest_orders_by_start_and_names_what_is_absent(tmp_path: Path) -> None:

@@ -11,16 +11,3 @@ overview   what the results say of each vehicle
 
 Dask and fsspec are the extra `fleet`. The user's view is in docs/fleet.md.
 """
-
-from typing import Final
-
-# Defaults of the command line: its help pages import nothing that computes.
-LOCAL: Final = "local"
-"""Scheduler that is started on this machine."""
-VEHICLE_PATTERN: Final = r"(?:vehicle=)?([^/]+)/[^/]+$"
-"""Finds the vehicle in the name of a log: its folder."""
-REFERENCES: Final = 30
-"""References of a diagnosis; more gain little, and learning from a thousand takes 1.9 GB (see
-docs/fleet.md)."""
-LOGS: Final = 3
-"""Latest logs of a vehicle that are diagnosed together."""

@@ -16,8 +16,6 @@ from cangauge._text import counted, number, significant
 from cangauge.cli.declare import Written, command
 from cangauge.cli.options import ALARM, ReadingOptions, check_outputs
 from cangauge.cli.output import console, emit_json, note, print_table, progress_shown
-from cangauge.errors import InputError
-from cangauge.extras.fleet import LOCAL, LOGS, REFERENCES, VEHICLE_PATTERN
 
 if TYPE_CHECKING:
     from cangauge.extras.fleet.fit import FleetFit
@@ -46,24 +44,13 @@ class Cluster:
     out : -o, --output OUT
         Folder or URL of the results: Parquet, one row a log, by vehicle. Logs that it holds with
         the same model and options are skipped.
-    scheduler : ADDRESS|local
-        Dask scheduler (tcp://10.0.0.5:8786), or this machine.
-    workers : N (1 … 1024)
-        Worker processes of `local`. Default: one a core.
-    pattern : --vehicle-pattern REGEX
-        The first group finds the vehicle in the name of a log. Default: its folder.
+    workers : N|ADDRESS
+        Worker processes of this machine, or a Dask scheduler (tcp://10.0.0.5:8786). Default: one a
+        core.
     """
 
     out: str
-    scheduler: str = LOCAL
-    workers: int | None = None
-    pattern: str = VEHICLE_PATTERN
-
-    def find(self, logs: Sequence[str]) -> list[FleetLog]:
-        """Return the logs that paths, globs and manifests name (`find_logs`)."""
-        from cangauge.extras.fleet.sources import find_logs
-
-        return find_logs(logs, pattern=self.pattern)
+    workers: str | None = None
 
     def run(self, work: Callable[[Any], Any]) -> Any:
         """Return what a function of the Dask client returns; show its progress."""
@@ -74,7 +61,7 @@ class Cluster:
             shown = console.status("starting")
         with shown as status:
             step = None if status is None else status.update
-            connection = connected(self.scheduler, self.workers)
+            connection = connected(self.workers)
             with progress_shown("cangauge.extras.fleet", step), connection as client:
                 return work(client)
 
@@ -94,17 +81,15 @@ fleet_command.group = fleet_app  # type: ignore[attr-defined] # read by the app
 
 
 @fleet_app.command("fit")
-@command("sign", "temperature")
+@command("columns", "sign", "temperature")
 def fit_fleet_command(
     logs: list[str],
     *,
     model: Written,
     capacity_ah: float,
     cluster: Cluster,
-    rate_hz: float = 1.0,
     chemistry: Literal["oxide", "lfp"] = "oxide",
     cells: int | None = None,
-    leave_out: list[str] | None = None,
     reading: ReadingOptions,
     report: Written | None = None,
     json_output: bool = False,
@@ -126,27 +111,18 @@ def fit_fleet_command(
         Model file to write.
     capacity_ah : A (0.001 … 1e5 Ah)
         Charge from 100 to 0 %, e.g. 51.5.
-    rate_hz : HZ (0.01 … 1000 Hz)
-        Rate of the fit; faster logs are decimated.
     chemistry : oxide|lfp
         Chemistry of the cells.
     cells : N (1 … 2000)
         Cells in series.
-    leave_out : LOGS
-        Those of LOGS that are not fitted, as LOGS; repeat the option.
     """
     from cangauge.extras.fleet.fit import SumsJob, fit_fleet
+    from cangauge.extras.fleet.sources import find_logs
 
-    job = SumsJob(_read_options(reading), capacity_ah, chemistry, cells, rate_hz)
-    found, left_out = cluster.find(logs), cluster.find(leave_out or [])
+    job = SumsJob(_read_options(reading), capacity_ah, chemistry, cells)
+    found = find_logs(logs)
     _check_outputs([model, report], found, *map(Path, logs))
-    for log in left_out:
-        if log.url not in {other.url for other in found}:
-            raise InputError(
-                "is not among LOGS", source=log.url, field="--leave-out", cure="check its path"
-            )
-    fitted = [log for log in found if log.url not in {other.url for other in left_out}]
-    result = cluster.run(lambda client: fit_fleet(job, fitted, cluster.out, client))
+    result = cluster.run(lambda client: fit_fleet(job, found, cluster.out, client))
     texts = {model: result.model.to_json()}
     if report is not None:
         from cangauge.extras.report.fleet import fleet_fit_report
@@ -204,7 +180,7 @@ def _show_fit(result: FleetFit) -> None:
 
 
 @fleet_app.command("estimate")
-@command("sign", "temperature")
+@command("columns", "sign", "temperature")
 def estimate_fleet_command(
     logs: list[str],
     *,
@@ -220,7 +196,7 @@ def estimate_fleet_command(
     Examples
     --------
     `cangauge fleet estimate 's3://drives/*/*.parquet' -m type.json -o s3://results/may
-    --scheduler tcp://10.0.0.5:8786`
+    --workers tcp://10.0.0.5:8786`
 
     Parameters
     ----------
@@ -229,12 +205,12 @@ def estimate_fleet_command(
     """
     from cangauge.extras.fleet.jobs import EstimateJob, by_log
 
-    job, found = _job(EstimateJob, logs, model, cluster, reading, report, capacity_ah)
+    job, found = _job(EstimateJob, logs, model, reading, report, capacity_ah)
     _run(job, by_log(found), found, cluster, report, json_output=json_output)
 
 
 @fleet_app.command("health")
-@command("sign", "temperature")
+@command("columns", "sign", "temperature")
 def health_fleet_command(
     logs: list[str],
     *,
@@ -260,7 +236,7 @@ def health_fleet_command(
     """
     from cangauge.extras.fleet.jobs import HealthJob, by_vehicle
 
-    job, found = _job(HealthJob, logs, model, cluster, reading, report, capacity_ah)
+    job, found = _job(HealthJob, logs, model, reading, report, capacity_ah)
     _run(job, by_vehicle(found), found, cluster, report, json_output=json_output)
 
 
@@ -268,29 +244,27 @@ def _job(  # noqa: PLR0917 - as the two commands have them
     kind: Callable[..., Job],
     logs: Sequence[str],
     model: Path,
-    cluster: Cluster,
     reading: ReadingOptions,
     report: Path | None,
     capacity_ah: float | None,
 ) -> tuple[Job, list[FleetLog]]:
     from cangauge.estimation.settings import EstimatorSettings
+    from cangauge.extras.fleet.sources import find_logs
     from cangauge.model.model_file import Model
 
-    found = cluster.find(logs)
+    found = find_logs(logs)
     _check_outputs([report], found, model, *map(Path, logs))
     settings = EstimatorSettings(capacity_ah=capacity_ah)
     return kind(_read_options(reading), Model.load(model), settings), found
 
 
 @fleet_app.command("gap")
-@command("sign", "temperature")
+@command("columns", "sign", "temperature")
 def gap_fleet_command(
     logs: list[str],
     *,
     model: Path,
     reference: list[str] | None = None,
-    references: int = REFERENCES,
-    latest: int = LOGS,
     alarm: float = ALARM,
     cluster: Cluster,
     reading: ReadingOptions,
@@ -300,7 +274,8 @@ def gap_fleet_command(
     """Diagnose each vehicle against references of the whole fleet.
 
     Its own healthy logs come first, then one of each other vehicle in turn, 30 at most. Vehicles
-    without healthy logs of their own have N common references, which are learned from once.
+    without healthy logs of their own have common references, which are learned from once. Logs to
+    diagnose are the latest three of a vehicle.
 
     Examples
     --------
@@ -314,19 +289,16 @@ def gap_fleet_command(
     reference : LOGS
         Logs without a fault, of any vehicles of the type; repeat the option. Or the column healthy
         of a manifest.
-    references : N (1 … 1000)
-        References at most of vehicles without own ones.
-    latest : N (1 … 1000)
-        Latest logs of a vehicle, diagnosed together.
     """
     from cangauge.extras.fleet.gap import GapJob
+    from cangauge.extras.fleet.sources import find_logs
     from cangauge.model.model_file import Model
 
-    known = {log.url: replace(log, healthy=True) for log in cluster.find(reference or [])}
-    among = [known.pop(log.url, log) for log in cluster.find(logs)] + [*known.values()]
+    known = {log.url: replace(log, healthy=True) for log in find_logs(reference or [])}
+    among = [known.pop(log.url, log) for log in find_logs(logs)] + [*known.values()]
     _check_outputs([report], among, model, *map(Path, [*logs, *(reference or [])]))
-    job, tasks = GapJob(_read_options(reading), Model.load(model), references, alarm).of_fleet(
-        [log for log in among if not log.healthy], [log for log in among if log.healthy], latest
+    job, tasks = GapJob(_read_options(reading), Model.load(model), alarm=alarm).of_fleet(
+        [log for log in among if not log.healthy], [log for log in among if log.healthy]
     )
     _run(job, tasks, among, cluster, report, json_output=json_output)
 
@@ -342,9 +314,8 @@ def _read_options(reading: ReadingOptions) -> ReadOptions:
     files = {str(path): file_sha256(path) for path in paths if path is not None}
     return ReadOptions(
         vehicle=car,
-        columns=reading.given_columns(),
-        mapped=mapped,
-        described=json.dumps([reading.vehicle, files, reading.columns]),
+        columns=mapped,
+        described=json.dumps([reading.vehicle, files]),
     )
 
 

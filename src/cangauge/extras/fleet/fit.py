@@ -48,6 +48,8 @@ from cangauge.model.model_file import Made, Model, Ranges, SourceLog
 from cangauge.model.prior import CHEMISTRIES, DELAYS_S, ChemistryName
 from cangauge.model.voltage_model import REFERENCE_C
 
+_RATE_HZ: Final = 1.0
+"""Rate of the rows [Hz], as that of `cangauge fit` by default."""
 _NUMBERS: Final = pa.list_(pa.float64())
 _RANGES: Final = ("soc_pct", "temperature_c", "current_a", "voltage_v")
 
@@ -65,14 +67,11 @@ class SumsJob(LogJob):
     chemistry : {"oxide", "lfp"}
     cells : int or None
         Cells in series.
-    rate_hz : float
-        Rate of the rows [Hz].
     """
 
     capacity_ah: float
     chemistry: ChemistryName = "oxide"
     cells: int | None = None
-    rate_hz: float = 1.0
 
     kind: ClassVar[str] = "sums"
     columns: ClassVar[Mapping[str, Any]] = {
@@ -83,7 +82,7 @@ class SumsJob(LogJob):
 
     def identity(self) -> dict[str, Any]:
         """Return the options of the fit."""
-        return {"fit": [self.capacity_ah, self.chemistry, self.cells, self.rate_hz]}
+        return {"fit": [self.capacity_ah, self.chemistry, self.cells]}
 
     def row(self, log: FleetLog) -> dict[str, Any]:
         """Return the log's sums, flattened.
@@ -96,7 +95,7 @@ class SumsJob(LogJob):
         recorded = self.read(log)
         if recorded.first_soc() is None:
             unknown = unknown_start(recorded, others=False)
-            cure = "state initial_soc_pct in a manifest, or name the SoC (--columns soc=…)"
+            cure = "state initial_soc_pct in a manifest, or name the SoC ([columns] of --map)"
             raise InputError(unknown.problem, field=unknown.field, cure=cure)
         if len(split_where_moved(recorded)) > 1:
             raise InputError(
@@ -104,7 +103,7 @@ class SumsJob(LogJob):
                 field="time_s",
                 cure="split it there: each part begins with its own SoC",
             )
-        rows = fit_rows(recorded, self.capacity_ah, rate_hz=self.rate_hz)
+        rows = fit_rows(recorded, self.capacity_ah, rate_hz=_RATE_HZ)
         sums = log_sums(rows, CHEMISTRIES[self.chemistry])
         factor = factor_of(rows, len(DELAYS_S), EPSILON, REFERENCE_C)
         return {
@@ -297,14 +296,14 @@ def _model(
         "chemistry": job.chemistry,
         "cells": job.cells,
         "capacity_ah": job.capacity_ah,
-        "rate_hz": job.rate_hz,
+        "rate_hz": _RATE_HZ,
         "temperature_source": rows[0]["temperature_source"],
         "range": Ranges(**ranges),
         "made": Made(
             by=f"cangauge {__version__}",
             options={
                 "capacity_ah": job.capacity_ah,
-                "rate_hz": job.rate_hz,
+                "rate_hz": _RATE_HZ,
                 "chemistry": job.chemistry,
                 "equation": "knots",
                 "fleet_logs": len(rows),

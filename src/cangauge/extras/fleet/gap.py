@@ -27,15 +27,16 @@ from cangauge.diagnosis import (
     learn_references,
 )
 from cangauge.errors import InputError
-from cangauge.extras.fleet import REFERENCES
 from cangauge.extras.fleet.jobs import COUNT, REAL, TEXT, Job, Task, by_vehicle
 from cangauge.extras.fleet.sources import FleetLog
 from cangauge.logs.log import Log
 from cangauge.model.model_file import Model
 
-_WITH_OWN: Final = 30
-"""References at most of a vehicle that has healthy logs of its own, or whose logs lie beyond the
-common references: they are learned from for this vehicle alone, in half a second each."""
+_REFERENCES: Final = 30
+"""References of a diagnosis; more gain little, and learning from a thousand takes 1.9 GB (see
+docs/fleet.md)."""
+_LATEST: Final = 3
+"""Latest logs of a vehicle that are diagnosed together."""
 _NAMES: Final = pa.list_(pa.string())
 
 
@@ -47,8 +48,6 @@ class GapJob(Job):
     ----------
     model : Model
         Of the vehicles' type, such as from `fleet fit`.
-    references : int
-        Largest number of references of a diagnosis.
     alarm : float
         Probability of `none` up to which a fault is reported.
     common : tuple of FleetLog
@@ -60,7 +59,6 @@ class GapJob(Job):
     """
 
     model: Model
-    references: int = REFERENCES
     alarm: float = ALARM
     common: tuple[FleetLog, ...] = ()
     learned: References | None = None
@@ -78,12 +76,11 @@ class GapJob(Job):
     }  # fmt: skip
 
     def identity(self) -> dict[str, Any]:
-        """Return model, references and alarm."""
-        model = self.model.to_json()
-        return {"model": model, "references": self.references, "alarm": self.alarm}
+        """Return model and alarm."""
+        return {"model": self.model.to_json(), "alarm": self.alarm}
 
     def of_fleet(
-        self, logs: Iterable[FleetLog], healthy: Iterable[FleetLog], latest: int
+        self, logs: Iterable[FleetLog], healthy: Iterable[FleetLog]
     ) -> tuple[Self, list[Task]]:
         """Return the job with the common references, and a task for each vehicle.
 
@@ -93,9 +90,8 @@ class GapJob(Job):
         Parameters
         ----------
         logs, healthy : iterable of FleetLog
-            Logs to diagnose, and logs without a fault, each in order of time.
-        latest : int
-            Latest logs of a vehicle, diagnosed together.
+            Logs to diagnose, and logs without a fault, each in order of time. The latest of a
+            vehicle (`_LATEST`) are diagnosed together.
 
         Raises
         ------
@@ -111,18 +107,17 @@ class GapJob(Job):
             raise InputError("every log is a reference", cure="give logs to diagnose")
         groups = sorted(good.values(), key=lambda of_vehicle: _order(of_vehicle[0]))
         in_turn = [log for log in chain(*zip_longest(*groups)) if log is not None]
-        most = min(self.references, _WITH_OWN)
         needed = any(task.vehicle not in good for task in suspect)
-        common = tuple(in_turn[: self.references]) if needed else ()
+        common = tuple(in_turn[:_REFERENCES]) if needed else ()
         tasks = []
         for task in suspect:
-            own = good.get(task.vehicle, [])[: max(most // 2, 1)]
+            own = good.get(task.vehicle, [])[: _REFERENCES // 2]
             others = [log for log in in_turn if log.vehicle != task.vehicle] if own else []
             tasks.append(
                 replace(
                     task,
-                    logs=task.logs[-latest:],
-                    references=tuple(islice(chain(own, others), most)),
+                    logs=task.logs[-_LATEST:],
+                    references=tuple(islice(chain(own, others), _REFERENCES)),
                     common=() if own else common,
                 )
             )
@@ -159,7 +154,7 @@ class GapJob(Job):
         of, bad = task.references or self.common, list(self.unread)
         references: References | list[Log] | None = self.learned
         if task.references or references is None:
-            of, bad = of[:_WITH_OWN], []
+            bad = []
             references = self._read_all(of, bad)
         found = diagnose(logs, self.model, references, alarm=self.alarm)
         unusable = {text.partition(": ")[0] for text in bad}

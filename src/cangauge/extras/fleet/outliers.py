@@ -107,9 +107,9 @@ class ErrorsByLog:
         if not self.misfits:
             return rule
         return (
-            f"{rule} Check it (sensor, unit, temperature, SoC at its start), and fit again without"
-            f" it: --leave-out '{self.logs[self.misfits[0]]}'. The farthest first, since it also"
-            " distorts the errors of the others."
+            f"{rule} Check it (sensor, unit, temperature, SoC at its start), and fit again"
+            f" without {self.logs[self.misfits[0]]}. The farthest first, since it also distorts the"
+            " errors of the others."
         )
 
     def to_dict(self) -> dict[str, Any]:

@@ -20,7 +20,6 @@ from typing import Any, Final
 from cangauge._files import text_sha256
 from cangauge._version import __version__
 from cangauge.errors import CangaugeError, InputError
-from cangauge.extras.fleet import LOCAL
 from cangauge.extras.fleet.jobs import Job, Task
 from cangauge.extras.fleet.results import Finished, Results, by_kind, reason_of
 from cangauge.extras.fleet.sources import ABSENT
@@ -35,6 +34,7 @@ _TASKS_PER_THREAD: Final = 4
 """Tasks in flight for each thread of the workers: enough to hide the way to the scheduler."""
 _ASK_S: Final = 1.0
 """Interval of questions to the scheduler for its workers, and of the progress shown [s]."""
+_FIELD: Final = "--workers"
 _LOST: Final = "the scheduler was lost; finished logs are kept: run the same command again"
 
 
@@ -81,35 +81,37 @@ def run_id(job: Job) -> str:
 
 
 @contextmanager
-def connected(scheduler: str, workers: int | None = None) -> Iterator[Any]:
+def connected(workers: str | None = None) -> Iterator[Any]:
     """Yield a Dask client; a local cluster ends with the block.
 
     Parameters
     ----------
-    scheduler : str
-        Address such as "tcp://10.0.0.5:8786", or "local".
-    workers : int, optional
-        Worker processes of a local cluster; by default the number of cores.
+    workers : str, optional
+        Worker processes of a local cluster, by default the number of cores; or the address of a
+        scheduler, such as "tcp://10.0.0.5:8786".
 
     Raises
     ------
     InputError
-        If Dask is not installed, the scheduler does not answer, or a worker has another version.
+        If Dask is not installed, the number is none, the scheduler does not answer, or a worker has
+        another version.
     """
+    number = workers or str(os.cpu_count() or 1)
+    if "://" not in number and not (number.isdecimal() and int(number)):
+        cure = "give a number of processes, or the address of a scheduler: tcp://HOST:8786"
+        raise InputError("neither a number nor an address", field=_FIELD, value=workers, cure=cure)
     try:
         import dask  # noqa: PLC0415 - an extra, slow to import
         from distributed import Client, LocalCluster  # noqa: PLC0415
     except ImportError as error:
         raise InputError(
             "dask.distributed is not installed",
-            field="--scheduler",
-            value=scheduler,
             cure="pip install 'cangauge[fleet]'",
         ) from error
     for name in ("distributed", "distributed.client"):
         # A lost worker or scheduler is reported here, without their tracebacks.
         logging.getLogger(name).setLevel(logging.CRITICAL)
-    if scheduler == LOCAL:
+    if "://" not in number:
         # Whoever reaches a scheduler runs code as its user: a certificate of this run keeps other
         # users of the machine out, and no page is served.
         closed: dict[str, Any] = {
@@ -118,7 +120,7 @@ def connected(scheduler: str, workers: int | None = None) -> Iterator[Any]:
         with (
             dask.config.set(closed),
             LocalCluster(
-                n_workers=workers or os.cpu_count() or 1,
+                n_workers=int(number),
                 threads_per_worker=1,
                 processes=True,
                 security=True,
@@ -130,13 +132,13 @@ def connected(scheduler: str, workers: int | None = None) -> Iterator[Any]:
             yield client
         return
     try:
-        client = Client(scheduler, timeout=CONNECT_S, set_as_default=False)
+        client = Client(number, timeout=CONNECT_S, set_as_default=False)
     except (OSError, ValueError) as error:
         raise InputError(
             "no Dask scheduler answers",
-            field="--scheduler",
-            value=scheduler,
-            cure="start one with `dask scheduler`, or give --scheduler local",
+            field=_FIELD,
+            value=number,
+            cure="start one with `dask scheduler`, or give a number of processes",
         ) from error
     with client:
         _check_versions(client)
@@ -157,11 +159,11 @@ def _check_versions(client: Any) -> None:
         raise CangaugeError(_LOST) from error
     except Exception as error:
         problem = f"the workers cannot run cangauge: {error}"
-        raise InputError(problem, field="--scheduler", cure=cure) from error
+        raise InputError(problem, field=_FIELD, cure=cure) from error
     for address, version in found.items():
         if version != __version__:
             problem = f"worker {address} has cangauge {version}"
-            raise InputError(problem, field="--scheduler", cure=cure)
+            raise InputError(problem, field=_FIELD, cure=cure)
 
 
 def run_job(job: Job, tasks: Sequence[Task], results: Results, client: Any) -> Summary:

@@ -11,7 +11,6 @@ import csv
 import io
 import json
 import posixpath
-import re
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
@@ -30,7 +29,6 @@ from cangauge.bus.recording import (
 )
 from cangauge.bus.vehicle import Vehicle
 from cangauge.errors import InputError
-from cangauge.extras.fleet import VEHICLE_PATTERN
 from cangauge.identify.starts import with_start
 from cangauge.logs.column_map import ColumnMap
 from cangauge.logs.log import Log
@@ -81,7 +79,7 @@ class FleetLog:
         return (moment if moment.tzinfo else moment.replace(tzinfo=UTC)).timestamp()
 
 
-def find_logs(given: Sequence[str], *, pattern: str = VEHICLE_PATTERN) -> list[FleetLog]:
+def find_logs(given: Sequence[str]) -> list[FleetLog]:
     """Return the logs that paths, globs and manifests name, by vehicle, in order of their start.
 
     Parameters
@@ -89,36 +87,25 @@ def find_logs(given: Sequence[str], *, pattern: str = VEHICLE_PATTERN) -> list[F
     given : sequence of str
         Paths or URLs; `*`, `?` and `**` stand for names and folders (unless a file is named so),
         and a table with a column `log` is a manifest. Paths in a manifest are relative to it.
-    pattern : str
-        Regular expression of which the first group finds the vehicle in a URL.
 
     Raises
     ------
     InputError
-        If nothing is found, a manifest is wrong, a log is named twice, or the pattern finds no
-        vehicle.
+        If nothing is found, a manifest is wrong, a log is named twice, or lies in no folder that
+        names its vehicle.
     """
-    option = {"field": "--vehicle-pattern", "value": pattern}
-    try:
-        expression = re.compile(pattern)
-    except re.error as error:
-        raise InputError(f"not a regular expression: {error}", **option) from error
-    if expression.groups < 1:
-        cure = "mark the vehicle by (…), as in 'logs/([^/]+)/'"
-        raise InputError("has no group", **option, cure=cure)
     found: dict[str, FleetLog] = {}
     for text in given:
         for log in _logs_of(text):
             if log.url in found:
                 raise InputError("is named twice", source=log.url, cure="give each log once")
-            match = expression.search(log.url)
-            vehicle = log.vehicle or (match[1] if match is not None else "")
+            folder = log.url.rpartition("/")[0].rpartition("/")[2]
+            vehicle = log.vehicle or folder.removeprefix("vehicle=")
             if not vehicle:
                 raise InputError(
-                    "the pattern finds no vehicle in this name",
+                    "lies in no folder that names its vehicle",
                     source=log.url,
-                    **option,
-                    cure="give another pattern, or a manifest with the columns log and vehicle",
+                    cure="give a manifest with the columns log and vehicle",
                 )
             if len(quote(vehicle, safe="").encode()) > _LONGEST_VEHICLE:
                 problem = f"a vehicle's name of {len(vehicle)} characters names no folder"
@@ -284,20 +271,19 @@ class ReadOptions:
     ----------
     vehicle : Vehicle, optional
         Decodes captures.
-    columns, mapped : ColumnMap, optional
-        Columns of a table: the user's, and those of a map file.
+    columns : ColumnMap, optional
+        Columns of a table, as a map file states them.
     described : str
         What identifies these options: the same text, the same rows.
     """
 
     vehicle: Vehicle | None = None
     columns: ColumnMap | None = None
-    mapped: ColumnMap | None = None
     described: str = ""
 
     def open(self, path: Path) -> LogFile | Capture:
         """Open a recording (`open_recording`)."""
-        return open_recording(path, columns=self.columns, mapped=self.mapped)
+        return open_recording(path, mapped=self.columns)
 
     def read(self, log: FleetLog, path: Path) -> Log:
         """Read a log, or decode a capture, from its local copy; its start as the manifest states.
