@@ -27,8 +27,7 @@ from cangauge.diagnosis.where import LogErrors, closed_part, error_shares, rms
 from cangauge.errors import InputError
 from cangauge.estimation.offline import estimate
 from cangauge.identify.starts import start_by_model
-from cangauge.logs.log import Log
-from cangauge.logs.read import as_log
+from cangauge.logs.log import Log, as_log
 from cangauge.model.model_file import Model, as_model
 
 _LOG = logging.getLogger(__name__)

@@ -23,8 +23,7 @@ from cangauge.estimation.settings import (
     Method,
 )
 from cangauge.logs.gaps import usual_gap_s
-from cangauge.logs.log import Log
-from cangauge.logs.read import as_log
+from cangauge.logs.log import Log, as_log
 from cangauge.model.coulomb_counting import counted_soc_pct
 from cangauge.model.delay_line import GAP_S
 from cangauge.model.model_file import Model, as_model
@@ -192,7 +191,7 @@ def estimate(
     --------
     >>> import numpy as np
     >>> from cangauge.estimation.offline import estimate
-    >>> from cangauge.logs.log import Log
+    >>> from cangauge.logs.log import Log, as_log
     >>> from cangauge.model.published import leaf_2012_model_file
     >>> rest = np.ones(120)
     >>> log = Log(np.arange(120.0), 0.0 * rest, 385.0 * rest, 23.0 * rest)

@@ -53,8 +53,7 @@ from cangauge.identify.published import (
 from cangauge.identify.rows import LEAST_ROWS, FitRows, fit_rows, usable_delays
 from cangauge.identify.starts import find_starts, given_starts, with_start
 from cangauge.logs.gaps import discharged_ah
-from cangauge.logs.log import Log, TemperatureSource
-from cangauge.logs.read import as_log
+from cangauge.logs.log import Log, TemperatureSource, as_log
 from cangauge.model.coulomb_counting import (
     capacity_from_full_discharge,
     capacity_from_reference,

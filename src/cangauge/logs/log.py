@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from os import PathLike
 from typing import Any, Literal, Self
 
 import numpy as np
@@ -166,7 +167,7 @@ class Log(ArrowExport):
         >>> Log.from_dataframe(table, temperature_c=21.0).voltage_v
         array([380., 379.])
         """
-        # Deferred: pyarrow takes 0.3 s to import, and the live service needs no tables.
+        # Deferred: the service runs where pyarrow is not installed.
         from cangauge.logs.read import log_of_dataframe  # noqa: PLC0415
 
         return log_of_dataframe(
@@ -236,6 +237,17 @@ class Log(ArrowExport):
             temperature_c=self.temperature_c[keep],
             soc_pct=None if self.soc_pct is None else self.soc_pct[keep],
         )
+
+
+def as_log(log: Any) -> Log:
+    """Return a log for a `Log`, a path, or a data frame (`Log.from_dataframe`)."""
+    if isinstance(log, Log):
+        return log
+    if isinstance(log, str | PathLike):
+        from cangauge.logs.read import read_log  # noqa: PLC0415 - pyarrow, as above
+
+        return read_log(log)
+    return Log.from_dataframe(log)
 
 
 def _read_only(values: ArrayLike) -> FloatArray:

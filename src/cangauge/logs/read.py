@@ -235,15 +235,6 @@ def read_log(
     return file.read(temperature_c=temperature_c, temperature_source=temperature_source)
 
 
-def as_log(log: Any) -> Log:
-    """Return a log for a `Log`, a path, or a data frame (`Log.from_dataframe`)."""
-    if isinstance(log, Log):
-        return log
-    if isinstance(log, str | PathLike):
-        return read_log(log)
-    return Log.from_dataframe(log)
-
-
 def log_of_dataframe(
     frame: Any,
     *,

@@ -17,8 +17,7 @@ from cangauge._files import MIB, as_path, read_bounded, write_text_atomic
 from cangauge._text import number, significant, span
 from cangauge._typing import FloatArray
 from cangauge.errors import InputError
-from cangauge.logs.log import Log, TemperatureSource
-from cangauge.logs.read import as_log
+from cangauge.logs.log import Log, TemperatureSource, as_log
 from cangauge.model.delay_line import GAP_S
 from cangauge.model.effects.base import Pack, Signals
 from cangauge.model.effects.library import parse_effects

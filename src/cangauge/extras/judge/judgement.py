@@ -24,8 +24,8 @@ from cangauge.extras.judge.causes import (
 from cangauge.extras.judge.causes import UNITS as PACK_UNITS
 from cangauge.extras.judge.chain import Stretch, stretches_of
 from cangauge.extras.judge.weak import WeakestCell, weak_cell
-from cangauge.logs.log import Log
-from cangauge.logs.read import CellColumns, as_log
+from cangauge.logs.log import Log, as_log
+from cangauge.logs.read import CellColumns
 from cangauge.model.model_file import PRIOR_MADE_BY, FunctionFields, Model, as_model
 from cangauge.model.prior import ChemistryName
 
