@@ -189,48 +189,6 @@ def test_the_cookie_outlives_a_restart(guarded: Live) -> None:
         assert get(other, "/rows", headers={"Cookie": cookie})[0] == 200
 
 
-def asked_for(page: Live, body: str, **headers: str) -> int:
-    """Return the code of a request for a recording."""
-    kind = {"Content-Type": "application/json"}
-    return get(page, "/recording", method="POST", body=body, headers=kind | headers)[0]
-
-
-def test_a_viewer_asks_for_a_recording_and_its_end() -> None:
-    asked: list[bool] = []
-    with closing(
-        Live(dashboard=http_address("127.0.0.1:0", None, {}), on_record=asked.append)
-    ) as page:
-        own = f"http://127.0.0.1:{page.port}"
-        assert asked_for(page, '{"active": true}', Origin=own) == 202
-        assert asked_for(page, '{"active": false}') == 202
-        assert waits(lambda: asked == [True, False])
-
-
-@pytest.mark.parametrize(
-    ("body", "headers", "code"),
-    [
-        ('{"active": true}', {"Origin": "https://evil.example"}, 403),
-        ('{"active": true}', {"Origin": "http://127.0.0.1:1"}, 403),
-        ('{"active": true}', {"Origin": "null"}, 403),
-        ('{"active": true}', {"Host": "evil.example"}, 403),
-        ('{"active": true}', {"Content-Type": "text/plain"}, 415),
-        ("active=true", {"Content-Type": "application/x-www-form-urlencoded"}, 415),
-        ('{"active": 1}', {}, 400),
-        ("[true]", {}, 400),
-        ("\xff", {}, 400),
-    ],
-)
-def test_other_requests_for_a_recording_are_refused(
-    page: Live, body: str, headers: dict[str, str], code: int
-) -> None:
-    assert asked_for(page, body, **headers) == code
-
-
-def test_a_recording_needs_the_token(guarded: Live) -> None:
-    assert asked_for(guarded, '{"active": true}') == 401
-    assert asked_for(guarded, '{"active": true}', Authorization=f"Bearer {TOKEN}") == 202
-
-
 @pytest.mark.parametrize("after", [[], ["--channel", "x"], ["127.0.0.1:8642"]])
 def test_the_option_alone_means_a_loopback_address(
     monkeypatch: pytest.MonkeyPatch, after: list[str]

@@ -61,14 +61,6 @@ def test_a_live_process_that_is_taken_over_is_ended(
         assert page._thread.is_alive()
 
 
-def test_records_are_asked_for_by_a_boolean_only(monkeypatch: pytest.MonkeyPatch) -> None:
-    asked: list[bool] = []
-    with closing(Live(http=http_address("127.0.0.1:0", None, {}), on_record=asked.append)) as page:
-        for told in ({"record": "rm -rf"}, {"record": [0]}, {"other": 1}, {"record": None}):
-            page._hear(told)
-    assert asked == [True, True]
-
-
 FRAMES = [
     can.Message(arbitration_id=0x355, is_extended_id=True, data=b"\x0b\x00\x5e\x00"),
     can.Message(arbitration_id=0x355, is_extended_id=False, is_remote_frame=True, dlc=8),

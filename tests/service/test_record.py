@@ -76,10 +76,10 @@ def test_parts_are_one_capture_and_give_the_live_numbers(tmp_path: Path, suffix:
                 live.append(pipeline.latest)
     assert recorder.state is not None
     assert (recorder.state.lost_frames, recorder.state.frames) == (0, len(messages))
-    assert recorder.written[-1] == tmp_path / f"drive-0001{suffix}"
-    assert len(parts_of_run(recorder.written[-1])) >= 3
-    assert content(recorder.written[-1]) == expected(messages)
-    offline = estimate_capture(recorder.written[-1], Vehicle.load("generic"), leaf_model()).table
+    assert recorder.written == tmp_path / f"drive-0001{suffix}"
+    assert len(parts_of_run(recorder.written)) >= 3
+    assert content(recorder.written) == expected(messages)
+    offline = estimate_capture(recorder.written, Vehicle.load("generic"), leaf_model()).table
     for name in ("time_s", "soc_pct", "soc_std_pct", "residual_v"):
         numbers = np.array([getattr(each, name) for each in live])
         assert np.array_equal(getattr(offline, name), numbers, equal_nan=True), name
@@ -88,7 +88,7 @@ def test_parts_are_one_capture_and_give_the_live_numbers(tmp_path: Path, suffix:
 def test_a_command_takes_the_name_of_a_run(tmp_path: Path) -> None:
     with Recorder(tmp_path / "drive.log", RecordLimits(part_bytes=2_000)) as recorder:
         write(recorder, frames(20.0))
-    arguments = (recorder.written[-1], "--vehicle", "generic", "--json")
+    arguments = (recorder.written, "--vehicle", "generic", "--json")
     ended = in_process("estimate", *arguments, "-m", leaf_model_path(), "-o", tmp_path / "soc.csv")
     assert (ended.code, ended.json["rows"]) == (0, 200), ended.err
 
@@ -97,7 +97,7 @@ def test_a_clock_that_is_set_back_is_recorded(tmp_path: Path) -> None:
     messages = frames(5.0) + frames(5.0, begin_s=1.6e9) + frames(5.0, begin_s=12.0)
     with Recorder(tmp_path / "drive.log") as recorder:
         write(recorder, messages)
-    assert content(recorder.written[-1]) == expected(messages)
+    assert content(recorder.written) == expected(messages)
 
 
 def test_an_existing_recording_is_never_replaced(tmp_path: Path) -> None:
@@ -105,7 +105,7 @@ def test_an_existing_recording_is_never_replaced(tmp_path: Path) -> None:
     for number, name in enumerate(names):
         with Recorder(tmp_path / "drive.log") as recorder:
             write(recorder, frames(1.0, 1.7e9 + 100.0 * number))
-        assert recorder.written[-1] == tmp_path / name
+        assert recorder.written == tmp_path / name
     for number, name in enumerate(names):
         assert content(tmp_path / name) == expected(frames(1.0, 1.7e9 + 100.0 * number))
 
@@ -118,7 +118,7 @@ def test_the_oldest_parts_are_removed(tmp_path: Path) -> None:
     parts = all_parts(tmp_path / "drive.log")
     assert {part.run for part in parts} <= {2, 3}
     assert 30_000 < sum(part.path.stat().st_size for part in parts) < 40_000 + 3 * 4_500
-    assert recorder.written[-1].name == "drive-0003.log"
+    assert recorder.written.name == "drive-0003.log"
 
 
 def test_impossible_recordings_are_refused(tmp_path: Path) -> None:
@@ -170,7 +170,7 @@ def test_a_full_disk_costs_frames_of_the_recording_only(
         write(recorder, messages[:100])
     assert recorder.state.lost_frames == 500
     # The file is whole lines: a part in the middle is missing, and nothing else.
-    assert content(recorder.written[-1]) == expected(messages[:400] + messages[800:])
+    assert content(recorder.written) == expected(messages[:400] + messages[800:])
     events = [getattr(each, "event", "") for each in caplog.records]
     assert {"record.failed", "record.resumed"} <= set(events)
 
@@ -211,7 +211,7 @@ def test_a_folder_that_goes_and_comes_back(tmp_path: Path) -> None:
         write(recorder, messages[200:])
     assert recorder.state.problem is None
     assert 0 < recorder.state.lost_frames <= 100
-    assert len(content(recorder.written[-1])) == len(messages) - recorder.state.lost_frames
+    assert len(content(recorder.written)) == len(messages) - recorder.state.lost_frames
 
 
 CHILD = """
@@ -242,81 +242,3 @@ def test_a_kill_loses_only_what_was_not_handed_over(tmp_path: Path, suffix: str)
     numbers = [int.from_bytes(data, "big") for _, _, data in content(path)]
     assert numbers == list(range(len(numbers)))
     assert len(numbers) > lines[-1]
-
-
-# --- Begun and ended on request
-
-
-def turned(recorder: Recorder, *, active: bool, problem: bool = False) -> bool:
-    """Return whether the recording begins or ends, as the loop turns."""
-
-    def is_so() -> bool:
-        recorder.on_snapshot(SNAPSHOT)
-        state = recorder.state
-        return state is not None and (state.active, bool(state.problem)) == (active, problem)
-
-    return waits(is_so)
-
-
-def frame(number: int) -> can.Message:
-    return can.Message(
-        timestamp=1.7e9 + number, arbitration_id=0x123, data=[number], is_extended_id=False
-    )
-
-
-def numbers_in(path: Path) -> list[int]:
-    return [message.data[0] for message in open_capture(path)]
-
-
-def test_frames_between_the_requests_are_recorded(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    with Recorder(None) as recorder:
-        recorder.write(frame(1))
-        assert recorder.state is None
-        recorder.request(active=True)
-        assert turned(recorder, active=True)
-        recorder.write(frame(2))
-        recorder.write(frame(3))
-        recorder.request(active=False)
-        assert turned(recorder, active=False)
-        recorder.write(frame(4))
-    [path] = tmp_path.glob("cangauge-*Z.log")
-    assert recorder.written == [path]
-    assert numbers_in(path) == [2, 3]
-
-
-def test_each_request_is_a_run_of_the_named_file(tmp_path: Path) -> None:
-    path = tmp_path / "drive.log"
-    with Recorder(path) as recorder:
-        recorder.write(frame(1))
-        recorder.request(active=False)
-        assert turned(recorder, active=False)
-        recorder.request(active=True)
-        assert turned(recorder, active=True)
-        recorder.write(frame(2))
-    assert numbers_in(path) == [1]
-    assert recorder.written == [path, tmp_path / "drive-0001.log"]
-    assert numbers_in(recorder.written[1]) == [2]
-
-
-def test_a_requested_recording_ends_at_its_limit(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    with Recorder(tmp_path / "drive.log") as recorder:
-        monkeypatch.setattr(record, "REQUESTED_BYTES", 1)
-        recorder.write(frame(1))
-        recorder.on_snapshot(SNAPSHOT)
-        assert recorder.state is not None
-        assert waits(lambda: recorder.state.frames == 1)
-        assert recorder.state.active  # a configured one is not cut short
-        recorder.request(active=False)
-        assert turned(recorder, active=False)
-        recorder.request(active=True)
-        assert turned(recorder, active=True)
-        recorder.write(frame(2))
-        assert turned(recorder, active=False, problem=True)
-        recorder.write(frame(3))
-        assert "record_keep_mb" in str(recorder.state.problem)
-    assert numbers_in(recorder.written[1]) == [2]

@@ -96,7 +96,6 @@ def test_a_capped_current_is_a_least_one_and_a_small_energy_in_wh(watched: Watch
     status["latency"] |= {"count": 9, "p50_at_most_s": 0.01, "p99_at_most_s": None}
     status["record"] = {
         "path": "a.log", "frames": 12, "written_bytes": 9947, "lost_frames": 0, "problem": None,
-        "active": True,
     }  # fmt: skip
     rows = dict(status_values(status))
     assert rows["possible discharge, 10 s"] == "at least 200 A"

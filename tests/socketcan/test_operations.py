@@ -79,7 +79,7 @@ def test_scraped_and_recorded_by_kernel_stamps(tmp_path: Path) -> None:
     # Relative to the kernel's stamps, the arrival.
     assert status["latency"]["count"] >= 10
     assert 0.0 < status["latency"]["mean_s"] < 1.0
-    recorded = estimate_capture(recorder.written[-1], Vehicle.load("generic"), leaf_model())
+    recorded = estimate_capture(recorder.written, Vehicle.load("generic"), leaf_model())
     assert len(list(tmp_path.iterdir())) > 1
     live = [each.soc_pct for _, each in rows]
     assert repr(recorded.table.soc_pct.tolist()) == repr(live)  # NaN until the first block

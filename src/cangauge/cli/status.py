@@ -217,7 +217,7 @@ def _recording(record: dict[str, Any] | None) -> str:
     text = f"{record['path']}: {record['frames']} frames, {shown}"
     text += f", {record['lost_frames']} frames lost"
     text += f"; FAILING: {record['problem']}" if record["problem"] else ""
-    return text + ("" if record["active"] else "; ended")
+    return text
 
 
 def _times(value: float | None, factor: float) -> float | None:

@@ -399,8 +399,7 @@ class RunConfig(Strict):
     dashboard: str | None = key(
         None,
         "Serve the live page there; on the command line alone: at 127.0.0.1:8642. An address beyond"
-        " loopback needs a token, as with --http. The page can begin and end a recording: that of"
-        " `record`, else candump files in the working folder.",
+        " loopback needs a token, as with --http.",
         "--dashboard", "HOST:PORT", restart=True, bare=DASHBOARD,
     )  # fmt: skip
     status_socket: str = key(

@@ -18,8 +18,7 @@ import os
 import time
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import dataclass, replace
-from datetime import UTC, datetime
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Final
@@ -30,7 +29,7 @@ from cangauge._files import FULL, check_writable
 from cangauge._logging import emit
 from cangauge.bus.captures import all_parts, part_path, run_path
 from cangauge.bus.time_source import whole_us
-from cangauge.errors import CangaugeError, InputError
+from cangauge.errors import InputError
 from cangauge.service.output import Output
 from cangauge.service.status import RecordState
 from cangauge.service.status_client import Snapshot
@@ -44,9 +43,6 @@ SYNC_EVERY_S: Final = 30.0
 """Interval of fsync, against power cuts [s]."""
 CLOSE_WITHIN_S: Final = 0.6
 """Time limit for writing what is left at the end [s]."""
-REQUESTED_BYTES: Final = 4 << 30
-"""Largest recording begun by a viewer [bytes]: half a day of a busy bus (2,000 frames/s of candump
-text), and what one file of FAT32 can hold."""
 FORMATS: Final[dict[str, Callable[[io.StringIO], can.CanutilsLogWriter | can.CSVWriter]]] = {
     ".log": can.CanutilsLogWriter,
     ".csv": can.CSVWriter,
@@ -86,82 +82,60 @@ class RecordLimits:
 class Recorder(Output):
     """The recording of a service: one file, or parts.
 
-    `request` is for any thread, everything else for the loop's. No method waits for the disk but
-    the constructor, and `close` for a limited time.
+    No method waits for the disk but the constructor, and `close` for a limited time.
 
     Parameters
     ----------
-    path : path-like, optional
-        Recorded to from the start, and again after each request. Without it a request begins a
-        candump file in the working folder, named by its UTC time. InputError if its suffix is
-        unknown, or its folder missing or not writable.
+    path : path-like
     limits : RecordLimits, optional
-        By default one file. Without `keep_bytes` a recording begun by a request ends at
-        `REQUESTED_BYTES`.
+        By default one file.
     clock : callable
         Monotonic time [s].
 
     Attributes
     ----------
-    state : RecordState or None
-        Progress of the recording, or the end of the latest one; None before the first.
-    written : list of Path
-        All recordings, for `estimate`, in order.
+    state : RecordState
+        Progress.
+    written : Path
+        The recording, for `estimate`.
+
+    Raises
+    ------
+    InputError
+        If the suffix is unknown, or the folder missing or not writable.
     """
 
     def __init__(
         self,
-        path: str | os.PathLike[str] | None,
+        path: str | os.PathLike[str],
         limits: RecordLimits | None = None,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        self._path = None if path is None else Path(path)
-        self._limits = limits or RecordLimits()
-        self._clock = clock
-        self._is_wanted: bool | None = None
-        self._is_active = False
+        _check_path(Path(path))
         self._batch: list[can.Message] = []
-        self._file: _RecordFile | None = None
         self._lost_frames = 0
-        self.state: RecordState | None = None
-        self.written: list[Path] = []
+        self._file = file = _RecordFile(Path(path), limits or RecordLimits(), clock)
+        self.state = RecordState(str(file.current), 0, 0, 0, None)
+        self.written = file.path
         self._worker = Worker("cangauge-record", self._failed, BATCHES_WAITING)
-        if self._path is not None:
-            _check_path(self._path)
-            self._begin(self._path, requested=False)
-            self._is_active = True
-
-    def request(self, *, active: bool) -> None:
-        """Ask for a recording, or for its end; it follows with the next snapshot."""
-        self._is_wanted = active
 
     def write(self, message: can.Message) -> None:
         """Record a received frame and round its stamp to the one that is written."""
-        if not self._is_active:
-            return
         message.timestamp = whole_us(message.timestamp) / 1e6
         self._batch.append(copy.copy(message))
         if len(self._batch) >= BATCH_FRAMES:
             self._hand_over()
 
     def on_snapshot(self, snapshot: Snapshot) -> None:
-        """Hand the new frames to the thread, and do what a viewer asked for."""
+        """Hand the new frames to the thread."""
         del snapshot
         self._hand_over()
-        wanted, self._is_wanted = self._is_wanted, None
-        if wanted and not self._is_active:
-            name = f"cangauge-{datetime.now(UTC):%Y%m%dT%H%M%SZ}.log"
-            path = self._path or Path.cwd() / name
-            self._is_active = self._worker.submit(partial(self._begin, path, requested=True))
-        elif wanted is False and self._is_active:
-            self._is_active = False
-            self._worker.submit(self._end)
 
     def close(self) -> None:
         """Complete the file; frames that are not written in time are lost."""
         self._hand_over()
-        self._worker.submit(self._end)
-        if not self._worker.close(CLOSE_WITHIN_S) and self.state is not None:
+        self._worker.submit(self._file.close)
+        if not self._worker.close(CLOSE_WITHIN_S):
             text = f"{self.state.path}: the end of the recording is missing"
             emit(_LOG, logging.ERROR, "record.incomplete", text)
 
@@ -172,25 +146,8 @@ class Recorder(Output):
 
     # --- In the thread
 
-    def _begin(self, path: Path, *, requested: bool) -> None:
-        try:
-            _check_path(path)
-            self._file = file = _RecordFile(path, self._limits, self._clock)
-        except (CangaugeError, OSError) as error:
-            self._is_active = False
-            self.state = RecordState(str(path), 0, 0, 0, str(error), active=False)
-            emit(_LOG, logging.WARNING, "record.refused", f"no recording: {error}")
-            return
-        file.ends = requested and self._limits.keep_bytes is None
-        self.state = RecordState(str(file.current), 0, 0, 0, None)
-        self.written.append(file.path)
-        if requested:
-            emit(_LOG, logging.INFO, "record.began", f"recording to {file.path}")
-
     def _write(self, batch: list[can.Message]) -> None:
         file, state = self._file, self.state
-        if file is None or state is None:
-            return
         missed, self._lost_frames = self._lost_frames, 0
         problem = None
         try:
@@ -208,20 +165,6 @@ class Recorder(Output):
         elif state.problem is not None:
             text = f"recording resumed; {lost} frames were lost"
             self._say(logging.WARNING, "record.resumed", text, lost)
-        if file.ends and file.written_bytes >= REQUESTED_BYTES:
-            end = f"ended at {REQUESTED_BYTES / 1e9:.1f} GB; record_keep_mb sets another limit"
-            emit(_LOG, logging.WARNING, "record.full", f"{file.path}: {end}")
-            self._is_active = False
-            self._end(end)
-
-    def _end(self, problem: str | None = None) -> None:
-        if self._file is None or self.state is None:
-            return
-        file, self._file = self._file, None
-        self.state = replace(self.state, active=False, problem=problem or self.state.problem)
-        file.close()
-        if file.ends:
-            emit(_LOG, logging.INFO, "record.ended", f"recorded: {file.path}")
 
     @staticmethod
     def _failed(error: Exception) -> None:
@@ -235,9 +178,6 @@ class Recorder(Output):
 class _RecordFile:
     """The file or the parts of one recording, written batch by batch."""
 
-    ends = False
-    """Whether it ends by itself, at `REQUESTED_BYTES`."""
-
     def __init__(self, base: Path, limits: RecordLimits, clock: Callable[[], float]) -> None:
         exists = base.is_file() and base.stat().st_size > 0
         self._base, self._limits, self._clock = base, limits, clock
@@ -249,13 +189,18 @@ class _RecordFile:
         self.written_bytes = 0
         self._synced_s = clock()
         self._descriptor = -1
-        self._next_part()
+        with suppress(OSError):  # tried again with each batch
+            self._next_part()
 
     def write(self, batch: list[can.Message]) -> None:
         """Append frames as whole lines, or nothing of them; may raise OSError."""
         limits, now_s = self._limits, self._clock()
         is_large = limits.part_bytes is not None and self._bytes >= limits.part_bytes
-        if is_large or (limits.part_s is not None and now_s - self._began_s >= limits.part_s):
+        if (
+            self._descriptor < 0
+            or is_large
+            or (limits.part_s is not None and now_s - self._began_s >= limits.part_s)
+        ):
             self._next_part()
         if now_s - self._synced_s >= SYNC_EVERY_S:
             self._synced_s = now_s
@@ -272,14 +217,12 @@ class _RecordFile:
 
     def _next_part(self) -> None:
         self._remove_oldest()
-        self._part += 1
-        self.current = self._base
-        if self._in_parts:
-            self.current = part_path(self._base, self._run, self._part)
+        part = self._part + 1
+        self.current = part_path(self._base, self._run, part) if self._in_parts else self._base
         self.close()
         flags = os.O_WRONLY | os.O_CREAT | os.O_CLOEXEC | (os.O_EXCL if self._in_parts else 0)
         self._descriptor = os.open(self.current, flags, _RIGHTS)
-        self._bytes, self._began_s = 0, self._clock()
+        self._part, self._bytes, self._began_s = part, 0, self._clock()
         self._text = io.StringIO(newline="")
         kind = self.current.with_suffix("") if self._is_packed else self.current
         self._writer = FORMATS[kind.suffix.lower()](self._text)

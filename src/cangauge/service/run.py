@@ -109,11 +109,6 @@ class Service:
         """Read and apply the configuration again while `run` runs; from any thread."""
         self._reload.set()
 
-    def record(self, *, active: bool) -> None:
-        """Begin or end a recording while `run` runs; from any thread."""
-        if self.recorder is not None:
-            self.recorder.request(active=active)
-
     def run(self) -> dict[str, Any]:
         """Run until `stop`, a signal, or a configured end.
 
@@ -147,19 +142,21 @@ class Service:
             if self._state is not None:
                 keeper = StateKeeper(self._state, pipeline, port.name, config.state_max_age_s)
                 stack.enter_context(keeper)
-            self.recorder = recorder = Recorder(config.record, _record_limits(config))
+            recorder = None
+            if config.record is not None:
+                self.recorder = recorder = Recorder(config.record, _record_limits(config))
+                self._outputs.insert(0, recorder)
             notifier = stack.enter_context(Notifier(os.environ))
             monitor = Monitor(
                 pipeline,
                 port,
                 config.model,
                 notifier=notifier,
-                record=lambda: recorder.state,
+                record=lambda: None if recorder is None else recorder.state,
                 troubles=lambda: [text for each in self._outputs if (text := each.trouble)],
                 show_every_s=SHOW_EVERY_S if config.dashboard is None else PAGE_EVERY_S,
                 sign_cure=self._setup.sign_cure,
             )
-            self._outputs.insert(0, recorder)
             for output in self._outputs:
                 stack.callback(output.close)
             for module, keys in OUTPUTS.items():
@@ -242,15 +239,14 @@ class Service:
             text = f"{port.name}: no expected frame arrived; check channel, bit rate and vehicle"
             text += " (--vehicle, or --dbc and --map)"
             emit(_LOG, logging.WARNING, "bus.nothing_wanted", text)
-        records = [] if recorder is None else [str(path) for path in recorder.written]
+        record = None if recorder is None else str(recorder.written)
         has_failed = any(getattr(each, "failed", False) for each in self._outputs)
         output = None if has_failed else self.config.output
-        for path in filter(None, (*records, output)):
+        for path in filter(None, (record, output)):
             emit(_LOG, logging.INFO, "file.written", f"written: {path}", limit=path, path=path)
         return _summary_json(pipeline, port, summary) | {
             "state": self.config.state,
-            "record": records[-1] if records else None,
-            "records": records,
+            "record": record,
             "output": output,
         }
 

@@ -57,8 +57,7 @@ _REJECTS: Final = tuple(
 class RecordState:
     """Progress of a recording: its current file; frames, and those of them that were not written.
 
-    `problem` is why the disk rejects data at present, or why the recording could not begin or has
-    ended; it is not active once it has ended.
+    `problem` is why the disk rejects data at present.
     """
 
     path: str
@@ -66,7 +65,6 @@ class RecordState:
     lost_frames: int
     written_bytes: int
     problem: str | None
-    active: bool = True
 
 
 class Histogram:

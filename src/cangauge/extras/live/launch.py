@@ -1,9 +1,9 @@
 """The wall: what speaks to networks runs in a process of its own, started and watched from here.
 
 Page, `/status`, `/metrics` and MQTT share that process (`process`). It inherits the listening
-sockets, takes snapshots as lines on stdin, and writes lines on stdout: that it is alive, its log,
-and a viewer's wish for a recording. One that ends, is silent for too long, or grows too large is
-ended and started again. The estimate does not notice.
+sockets, takes snapshots as lines on stdin, and writes lines on stdout: that it is alive, and its
+log. It can ask the service for nothing. One that ends, is silent for too long, or grows too large
+is ended and started again. The estimate does not notice.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import asdict
 from importlib.util import find_spec
@@ -66,8 +66,6 @@ class Live(Output):
     dashboard : HttpAddress, optional
         Of the live page.
     mqtt : MqttSettings, optional
-    on_record : callable, optional
-        Takes, in a thread, whether a recording shall run, once a viewer asks.
 
     Attributes
     ----------
@@ -91,7 +89,6 @@ class Live(Output):
         http: HttpAddress | None = None,
         dashboard: HttpAddress | None = None,
         mqtt: MqttSettings | None = None,
-        on_record: Callable[[bool], None] = lambda _: None,
     ) -> None:
         if os.name != "posix":
             problem = "page, status by HTTP and MQTT need Linux or macOS"
@@ -113,7 +110,6 @@ class Live(Output):
                 raise InputError(problem, field="mqtt", cure="pip install 'cangauge[mqtt]'")
             mqtt.check()
             self._asks["mqtt"] = asdict(mqtt)
-        self._on_record = on_record
         self._latest: Snapshot | None = None
         self._done = threading.Event()
         self._woken, self._wake = os.pipe()
@@ -181,8 +177,6 @@ class Live(Output):
 
     def _hear(self, told: dict[str, Any]) -> None:
         """Take a line of the process."""
-        if (wanted := told.get("record")) is not None:
-            self._on_record(bool(wanted))
         if (log := told.get("log")) is not None:
             logger = logging.getLogger(log["logger"])
             fields = log["fields"] | {"limit": log["limit"]}
@@ -294,4 +288,4 @@ def make_output(service: Service) -> Live:
         if getattr(config, key) is not None
     }
     mqtt = None if config.mqtt is None else mqtt_settings(config.mqtt, service.bus)
-    return Live(**address, mqtt=mqtt, on_record=lambda active: service.record(active=active))
+    return Live(**address, mqtt=mqtt)

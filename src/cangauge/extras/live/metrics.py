@@ -144,7 +144,7 @@ class _Status(Collector):
             if not math.isnan(value := _number(status, key)):
                 yield CounterMetricFamily(f"cangauge_{name}", text, value)
         if (record := status["record"]) is not None:
-            is_failing = record["active"] and record["problem"] is not None
+            is_failing = record["problem"] is not None
             text = "1 while the disk rejects data."
             yield GaugeMetricFamily("cangauge_record_failing", text, is_failing)
         statuses = {each.name.lower(): each.name.lower() == status["status"] for each in Status}

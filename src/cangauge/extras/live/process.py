@@ -72,8 +72,7 @@ def outputs_of(asks: Mapping[str, Any]) -> list[Output]:
             else:
                 from cangauge.extras.live.server import LivePage  # noqa: PLC0415
 
-                ask = lambda active: tell(record=active)  # noqa: E731
-                outputs.append(LivePage(sockets, asks[key]["token"], ask))
+                outputs.append(LivePage(sockets, asks[key]["token"]))
     if "mqtt" in asks:
         from cangauge.extras.live.addresses import MqttSettings  # noqa: PLC0415
         from cangauge.extras.live.mqtt import MqttPublisher  # noqa: PLC0415

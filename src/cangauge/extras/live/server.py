@@ -14,7 +14,7 @@ import math
 import secrets
 import socket
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
 from datetime import UTC, datetime
 from pathlib import Path
@@ -64,13 +64,10 @@ class Site:
     history : History
     token : str or None
         Token that a viewer must know.
-    ask : callable
-        Takes whether a recording shall run, once a viewer asks.
     """
 
-    def __init__(self, history: History, token: str | None, ask: Callable[[bool], None]) -> None:
+    def __init__(self, history: History, token: str | None) -> None:
         self.history = history
-        self.ask = ask
         self.token = token
         self.id = secrets.token_hex(8)
         """Key of this run; another one means that the row numbers start again."""
@@ -149,7 +146,6 @@ class Site:
                 ("/rows", _Rows, context),
                 ("/stream", _Stream, context),
                 ("/range.csv", _Range, context),
-                ("/recording", _Recording, context),
                 (f"/{LOG_NAME}", _LastHour, context),
             ],
             default_handler_class=_NotFound,
@@ -167,14 +163,12 @@ class LivePage(Output):
     ----------
     sockets : sequence of socket
         Listening ones.
-    token, ask
-        As of `Site`.
+    token : str or None
+        Token that a viewer must know.
     """
 
-    def __init__(
-        self, sockets: Sequence[socket.socket], token: str | None, ask: Callable[[bool], None]
-    ) -> None:
-        self._site = Site(History(), token, ask)
+    def __init__(self, sockets: Sequence[socket.socket], token: str | None) -> None:
+        self._site = Site(History(), token)
         server = HTTPServer(
             self._site.application(),
             max_header_size=MAX_HEADER_BYTES,
@@ -337,28 +331,6 @@ class _Range(_LiveHandler):
         self.send_csv("cangauge-live.csv", _csv(rows[(time_ms >= start) & (time_ms <= end)]))
 
 
-class _Recording(_LiveHandler):
-    def post(self) -> None:
-        """Ask the service to begin or end its recording: `{"active": true}`.
-
-        Not for pages of other sites, of other ports of this machine neither: a browser states
-        whose page asks, and asks first before it sends JSON elsewhere, which is never allowed.
-        """
-        headers = self.request.headers
-        kind = headers.get("Content-Type", "").partition(";")[0].strip().lower()
-        origin = headers.get("Origin")
-        if origin is not None and origin.partition("://")[2] != self.request.host:
-            self.refuse(403, "a page of another site may not ask for this")
-        elif kind != "application/json":
-            self.refuse(415, "send JSON")
-        elif (wanted := _wanted(self.request.body)) is None:
-            self.refuse(400, 'send {"active": true} or {"active": false}')
-        else:
-            self.site.ask(wanted)
-            self.set_status(202)
-            self.send_json({"active": wanted})
-
-
 class _LastHour(_LiveHandler):
     def get(self) -> None:
         self.send_csv(LOG_NAME, last_hour(self.site.history))
@@ -369,15 +341,6 @@ class _NotFound(_LiveHandler):
 
     def get(self) -> None:
         self.refuse(404, "there is nothing here: the live page is at /")
-
-
-def _wanted(body: bytes) -> bool | None:
-    try:
-        content = json.loads(body)
-    except (ValueError, RecursionError):
-        return None
-    wanted = content.get("active") if isinstance(content, dict) else None
-    return wanted if isinstance(wanted, bool) else None
 
 
 def _csv(rows: FloatArray) -> str:

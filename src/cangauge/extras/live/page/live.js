@@ -75,7 +75,7 @@
     put(at("state"), status.status);
     at("state").dataset.status = status.status;
     put(at("reasons"), words(latest.reasons).join("; "));
-    showRecording(status);
+    showRecording(status.record);
     put(at("command"), `cangauge gap cangauge-last-hour.csv -m '${status.model.replaceAll("'", "'\\''")}'`);
     const wanted = Object.entries(tiles(status, latest)), list = at("tiles");
     if (list.children.length !== wanted.length) {
@@ -92,34 +92,11 @@
     });
   }
 
-  // The state of the recording is the service's, so all viewers see the same.
-  let recording = null, uptime_s = 0, restarted = false, asked_ms = -ANSWER_MS;
-  function showRecording(status) {
-    const record = status.record, is_active = Boolean(record?.active), was = Boolean(recording?.active);
-    if (status.uptime_s < uptime_s) restarted = was && !is_active;
-    else if (was !== is_active) { restarted = false; asked_ms = -ANSWER_MS; }
-    [recording, uptime_s] = [record, status.uptime_s];
-    put(at("record"), is_active ? "Stop recording" : "Start recording");
-    at("record").dataset.active = String(is_active);
-    at("record").setAttribute("aria-disabled", String(performance.now() - asked_ms < ANSWER_MS));
-    const lost = record?.lost_frames ? `, ${record.lost_frames} frames lost` : "";
-    const bytes = record?.written_bytes, size = (bytes < 1e6 ? num(bytes / 1e3, 0, "kB") : num(bytes / 1e6, 1, "MB")) + lost;
-    const problem = record?.problem ? ` ${record.problem}` : "";
-    put(at("recording"), is_active ? `${record.path}: ${size}.${problem}`
-      : restarted ? "Not recording: the service was restarted."
-        : problem ? `Not recording:${problem}` : record ? `Recorded: ${record.path}, ${size}.` : "Not recording.");
-  }
-
-  async function toggleRecording() {
-    if (performance.now() - asked_ms < ANSWER_MS) return;
-    asked_ms = performance.now();
-    try {
-      const answer = await fetch("/recording", {
-        method: "POST", headers: { "Content-Type": "application/json" },
-        body: JSON.stringify({ active: !recording?.active }), signal: AbortSignal.timeout(ANSWER_MS),
-      });
-      if (answer.status === 401) location.assign("/enter");
-    } catch { asked_ms = -ANSWER_MS; }
+  function showRecording(record) {
+    if (!record) { put(at("recording"), ""); return; }
+    const bytes = record.written_bytes, size = bytes < 1e6 ? num(bytes / 1e3, 0, "kB") : num(bytes / 1e6, 1, "MB");
+    const lost = record.lost_frames ? `, ${record.lost_frames} frames lost` : "";
+    put(at("recording"), `Recording to ${record.path}: ${size}${lost}. ${record.problem ?? ""}`);
   }
 
   function trouble(texts) {
@@ -341,7 +318,6 @@
       if (!paused) setPaused(true);
       draw();
     });
-    at("record").addEventListener("click", toggleRecording);
     dark.addEventListener("change", paint);
   }
 
