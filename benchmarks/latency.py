@@ -10,7 +10,8 @@ latency  1,000 wanted frames/s (current and voltage at 500 Hz each, and REPLAY_C
          that receives, decodes by cantools and sends as often.
 loss     finds the highest rate that a bare python-can receive loop carries without loss; then the
          service receives that rate for --minutes, and after it the bare loop again. Twice: with 5 %
-         of the frames wanted, as on a car's bus, and with all of them.
+         of the frames wanted, as on a car's bus, and with all of them. Exit status 1 if the service
+         lost a frame or its memory grew by more than 5 % from its first tenth to the end.
 
 On UDP multicast on this machine, or on SocketCAN (`--interface socketcan --channel vcan0`). The
 service listens before the first frame, so start-up does not count.
@@ -22,12 +23,16 @@ import argparse
 import json
 import math
 import multiprocessing
+import multiprocessing.pool
+import os
+import subprocess
 import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
+from pathlib import Path
 from typing import Any, Final
 
 import can
@@ -53,6 +58,7 @@ SAMPLE_HZ: Final = 500
 """Sample rate; two wanted frames each [Hz]."""
 BARE_EVERY: Final = 4
 """Samples between frames of the bare loop, as the service acknowledges."""
+LARGEST_GROWTH: Final = 0.05
 WARM_S: Final = 1.0
 """Excluded start of each round [s]."""
 WANTED_SHARE: Final = 0.05
@@ -203,8 +209,10 @@ def loss(
         rate_hz = highest_rate(address, share, highest_hz)
         sys.stderr.write(f"loss, {name}: {rate_hz:.0f} frames/s for {seconds:.0f} s …\n")
         with service(address, "--until-idle", "5") as process:
+            watched = multiprocessing.pool.ThreadPool(1).apply_async(_sizes_mb, (process,))
             sent = _send(address, rate_hz, seconds, share)
             out, _ = process.communicate(timeout=seconds + 120.0)
+        sizes_mb = watched.get()
         run = json.loads(out)
         # The bare loop again for longer: it carried the rate for a moment only.
         bare, bare_got = _bare_count(address, rate_hz, bare_seconds, share)
@@ -217,8 +225,19 @@ def loss(
             "bare_seconds": bare.seconds,
             "bare_lost": bare.wanted - bare_got,
             "cpu_share": run["cpu_seconds"] / sent.seconds,
+            "resident_mb": [sizes_mb[len(sizes_mb) // 10], sizes_mb[-1]],
         }
     return result
+
+
+def _sizes_mb(process: subprocess.Popen[str]) -> list[float]:
+    """Return the resident memory of a process each second until it ends [MB]."""
+    page_mb, sizes_mb = os.sysconf("SC_PAGE_SIZE") / 1e6, []
+    while process.poll() is None:
+        pages = Path(f"/proc/{process.pid}/statm").read_text().split()[1]
+        sizes_mb.append(int(pages) * page_mb)
+        time.sleep(1.0)
+    return [size for size in sizes_mb if size > 0.0]
 
 
 def highest_rate(address: BusAddress, share: float, highest_hz: float = HIGHEST_HZ) -> float:
@@ -349,7 +368,13 @@ def main() -> int:
         sys.stdout.write(json.dumps(result) + "\n")
     else:
         _show(result, Console())
-    return 0
+    found = result.get("loss", {}).values()
+    return int(any(each["wanted_lost"] or _growth(each) > LARGEST_GROWTH for each in found))
+
+
+def _growth(found: Result) -> float:
+    first, last = found["resident_mb"]
+    return float(last / first - 1.0)
 
 
 def _show(result: Result, console: Console) -> None:
@@ -370,6 +395,10 @@ def _show(result: Result, console: Console) -> None:
             f"{found['wanted_lost']} of {found['wanted']} ({100 * found['cpu_share']:.0f} % CPU)",
             f"{found['bare_lost']} in {found['bare_seconds']:.0f} s",
             "0",
+        )
+        first, last = found["resident_mb"]
+        table.add_row(
+            "  memory, at first and at the end", f"{first:.1f}, {last:.1f} MB", "", "+ 5 %"
         )
     console.print(table)
 

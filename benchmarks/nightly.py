@@ -8,6 +8,7 @@ grade    the estimator on recorded packs, and the diagnosis on its frozen cases 
 suite    the score cards of three gauges: our service, a counter, filterpy's filter
 long     the tests marked nightly; restarts by SIGKILL; load, timing and memory of the service;
          attacks on its page, status and MQTT
+load     half an hour at 12,000 frames/s, or what a bare loop carries here: no loss, memory flat
 
 Each part writes `out/nightly/PART.json`: state (passed, failed, skipped), reason, seconds and the
 last lines of each of its commands. Exit status 1 if a part failed.
@@ -34,6 +35,7 @@ OWN_GAUGE = (
     "run --interface {interface} --channel {channel} --bus-option port={port} -m {model}"
     " --initial-soc {soc} --time-source replay-clock"
 )
+LOAD = "--only loss --wanted 0.05 --highest 12000 --minutes 29 --bare-minutes 1"
 
 console = Console(highlight=False)
 
@@ -85,6 +87,9 @@ def commands(data: Path | None, socketcan: str) -> dict[str, list[list[str]] | s
             [python, "benchmarks/restarts.py"],
             [python, "benchmarks/bus_load.py"],
             [python, "benchmarks/wall.py"],
+        ],
+        "load": [
+            [python, "benchmarks/latency.py", *LOAD.split()],
         ],
     }
 

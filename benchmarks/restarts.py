@@ -51,7 +51,7 @@ from live_service import ENTRY
 
 EVERY_S = CHECKPOINT_EVERY_S
 RATE_HZ = 10
-START_PCT = 90.0
+BEGIN_PCT = 75.0
 MEAN_BETWEEN_KILLS_S = 60.0
 EPOCH_S = 1_700_000_000.0
 PORT = 43_777
@@ -112,7 +112,7 @@ def drive(seconds: float, model: Model, seed: int) -> list[Sample]:
     mean_a = 0.25 * model.capacity_ah * np.sign(np.sin(np.pi * time_s / 3600.0) + 1e-12)
     current_a = levels[np.searchsorted(edges, time_s)] + mean_a
     out_pct = np.concatenate(([0.0], np.cumsum((current_a[1:] + current_a[:-1]) / 2.0)))
-    soc_pct = START_PCT - 15.0 - out_pct * 100.0 / (3600.0 * RATE_HZ * model.capacity_ah)
+    soc_pct = BEGIN_PCT - out_pct * 100.0 / (3600.0 * RATE_HZ * model.capacity_ah)
     voltage_model = model.voltage_model()
     delayed = np.column_stack(
         [np.interp(time_s - delay, time_s, current_a) for delay in voltage_model.delay_s]
@@ -127,9 +127,9 @@ def drive(seconds: float, model: Model, seed: int) -> list[Sample]:
 class ServiceRun:
     """A service from its start to its kill, on the clock of the samples."""
 
-    def __init__(self, model: Model, path: Path | None) -> None:
+    def __init__(self, model: Model, path: Path | None, soc_pct: float | None = None) -> None:
         self.now_s = EPOCH_S
-        settings = PipelineSettings(EstimatorSettings(initial_soc_pct=START_PCT - 15.0))
+        settings = PipelineSettings(EstimatorSettings(initial_soc_pct=soc_pct))
         self.pipeline = Pipeline(Vehicle.load("generic"), model, settings)
         self.keeper: StateKeeper | None = None
         if path is not None:
@@ -169,7 +169,7 @@ def in_process(kills: int, seed: int, folder: Path, console: Console) -> Result:
     samples = drive(float(lives.sum() + away.sum()) / RATE_HZ, model, seed)
     flowed, net = flowed_pct(samples, model.capacity_ah)
     encoder, other = (FrameEncoder(Vehicle.load("generic")) for _ in range(2))
-    whole, life = ServiceRun(model, None), ServiceRun(model, path)
+    whole, life = ServiceRun(model, None, BEGIN_PCT), ServiceRun(model, path, BEGIN_PCT)
     life.begin(EPOCH_S)
     restarts, begun = [], None
     first = saved = refused = 0
@@ -197,7 +197,7 @@ def in_process(kills: int, seed: int, folder: Path, console: Console) -> Result:
         first += alive + down
         for at in range(first - down, min(first, len(samples))):
             whole.handle(samples[at], other)
-        life = ServiceRun(model, path)
+        life = ServiceRun(model, path, BEGIN_PCT)
         life.begin(EPOCH_S + first / RATE_HZ)
         refused += not (life.keeper is not None and life.keeper.restored)
         console.print(f"{number} kills", end="\r")
@@ -358,7 +358,7 @@ class Player(threading.Thread):
             f"model = {json.dumps(str(model))}",
             f'interface = "udp_multicast"\nchannel = "{CHANNEL}"',
             f"bus_options = {{ port = {PORT} }}",
-            f"initial_soc = {START_PCT - 15.0}",
+            f"initial_soc = {BEGIN_PCT}",
             f"ids = {{ {', '.join(f'{name} = {each}' for name, each in ids.items())} }}",
             'log_format = "json"\nstatus_socket = "off"',
         ]
