@@ -524,7 +524,7 @@ static void process(cg_estimator *self, const cg_sample *sample)
     if (!isnan(sample->temperature_c)) {
         memory->temperature_c = sample->temperature_c;
     }
-    cg_advance(self, sample, memory->temperature_c);
+    cg_advance(self, sample, memory->temperature_c, charge.seconds > self->settings.gap_s);
     follow(self, sample, &charge);
     const int64_t tick = (int64_t)floor((since_s * (cg_time)model->rate_hz) + 1e-6);
     if (tick > memory->tick) {
@@ -807,5 +807,5 @@ cg_real cg_offset_a(const cg_estimator *self)
 
 cg_real cg_current_at(const cg_estimator *self, cg_time ago_s)
 {
-    return cg_line_at(&self->line, ago_s);
+    return cg_line_at(&self->line, (cg_real)ago_s);
 }

@@ -47,6 +47,7 @@ typedef double cg_wide;
 #define CG_CURRENTS (CG_DELAYS + CG_LOW_PASSES)
 #define CG_LOADS (CG_CURRENTS + 2)
 #define CG_STATES (CG_FUNCTIONS + 4)
+#define CG_PAIRS (CG_STATES * (CG_STATES + 1) / 2)
 #define CG_SUMS (CG_LOADS + 5)
 
 /* ------------------------------------------------------------------ constants of a model */
@@ -247,7 +248,7 @@ typedef struct {
  * the biases b = (capacity, resistance) with their covariance and their influence v on x. */
 typedef struct {
     cg_real x[CG_STATES];
-    cg_real p[CG_STATES][CG_STATES];
+    cg_real p[CG_PAIRS]; /* of the symmetric matrix: row by row up to the diagonal */
     cg_sum evidence; /* log-likelihood of all voltages */
     cg_real b[2];
     cg_real b_p[2][2];
@@ -333,7 +334,7 @@ typedef struct {
 
 /* One sample of the current in the delay line. */
 typedef struct {
-    cg_time time_s;
+    cg_real time_s; /* since `base_s` of the line, so that a float keeps its digits */
     cg_real current_a;
 } cg_current;
 
@@ -346,12 +347,14 @@ typedef struct {
     int32_t block; /* stale currents dropped at once; 0: as soon as they are */
     cg_real spacing_s; /* least time between every second of the samples kept */
     cg_time since_s; /* start of the stretch without a gap */
+    cg_time base_s; /* 0 with doubles */
 } cg_line;
 
 /* Samples that `time_skew` holds back until their current is known. */
 typedef struct {
     cg_sample waiting[CG_WAITING];
-    cg_current at[CG_WAITING];
+    cg_time at_s[CG_WAITING];
+    cg_real at_a[CG_WAITING];
     int32_t waiting_first;
     int32_t waiting_count;
     int32_t first;
@@ -370,6 +373,8 @@ typedef struct {
 
 /* Storage for the delay line at samples `spacing_s` apart; for static arrays. Rounded up. */
 #define CG_LINE_SIZE(longest_s, spacing_s) ((int32_t)(2.0 * (longest_s) / (spacing_s)) + 9)
+/* An empty delay line in an array of a size. */
+#define CG_LINE(array, size, spacing_s) {(array), (size), 0, 0, 0, (cg_real)(spacing_s), 0.0, 0.0}
 
 /* Begin, with memory for the delay line (CG_LINE_SIZE) and, for a model with `time_skew`, for the
  * samples that it holds back. */

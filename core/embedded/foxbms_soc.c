@@ -52,8 +52,7 @@ static float_t within(double percent)
 /* Begin with a SoC and its standard deviation [%]; NAN: found from the first voltage. */
 static void begin(string_s *string, double soc_pct, double std_pct)
 {
-    const cg_line line = {string->storage, PACK_LINE_SIZE, 0, 0, 0, (cg_real)PACK_SPACING_S,
-                          0.0};
+    const cg_line line = CG_LINE(string->storage, PACK_LINE_SIZE, PACK_SPACING_S);
     cg_settings settings = cg_default_settings();
     settings.initial_soc_pct = (cg_real)soc_pct;
     settings.initial_soc_std_pct = (cg_real)fmax(std_pct, (double)settings.initial_soc_std_pct);

@@ -82,7 +82,7 @@ static void test_reset(const cg_settings *settings, const cg_line *line)
 int main(void)
 {
     const cg_settings settings = cg_default_settings();
-    const cg_line line = {storage, PACK_LINE_SIZE, 0, 0, 0, PACK_SPACING_S, 0.0};
+    const cg_line line = CG_LINE(storage, PACK_LINE_SIZE, PACK_SPACING_S);
     double worst[4] = {0.0, 0.0, 0.0, 0.0};
     long differing = 0, other_status = 0, other_frames = 0;
     unsigned long steps[2] = {0, 0}, all[2] = {0, 0}, longest = 0;

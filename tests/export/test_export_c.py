@@ -136,6 +136,9 @@ def test_a_voltage_update_keeps_its_cost_on_a_cortex_m4f(
     steps = re.search(r"a sample, (\d+) where its voltage is used", output)
     assert steps is not None
     assert int(steps[1]) <= 24000
+    memory = re.search(r"bytes: state (\d+), delay line (\d+)", output)
+    assert memory is not None
+    assert int(memory[1]) + int(memory[2]) <= 4096
 
 
 def test_the_table_is_the_published_equation() -> None:

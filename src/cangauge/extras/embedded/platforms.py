@@ -37,7 +37,7 @@ static float temperature_c(void) { return 25.0F; }
 static void gauge_begin(void)
 {
     const cg_settings settings = cg_default_settings();
-    const cg_line line = {storage, PACK_LINE_SIZE, 0, 0, 0, PACK_SPACING_S, 0.0};
+    const cg_line line = CG_LINE(storage, PACK_LINE_SIZE, PACK_SPACING_S);
     cg_init(&pack, &pack_model, &settings, &line, &skew);
 }
 
