@@ -262,14 +262,18 @@ static void start_count(cg_state *state, cg_real soc_pct, cg_real std_pct)
 
 /* ------------------------------------------------------------------ step */
 
-static void propagate(cg_estimator *self, cg_sum counted_s, cg_sum discharged_pct)
+static void set_filter_time(cg_state *state, cg_sum counted_s, cg_sum discharged_pct)
 {
-    cg_state *state = &self->state;
-    const cg_passed passed = since_filter(state, counted_s, discharged_pct);
-    cg_filter_predict(&state->filter, self->model, &passed);
     state->memory.filter_counted_s = counted_s;
     state->memory.filter_discharged_pct = discharged_pct;
     state->memory.filter_gap_var_pct2 = state->counter.gap_var_pct2;
+}
+
+static void propagate(cg_estimator *self, cg_sum counted_s, cg_sum discharged_pct)
+{
+    const cg_passed passed = since_filter(&self->state, counted_s, discharged_pct);
+    cg_filter_predict(&self->state.filter, self->model, &passed);
+    set_filter_time(&self->state, counted_s, discharged_pct);
 }
 
 /* The open block then lies in part before the filter's state. */
@@ -720,6 +724,16 @@ static void forget(cg_state *state)
                                   (int32_t)CG_INITIALISING, CG_NO_INITIAL_SOC, 0};
 }
 
+static void empty(cg_skew *skew)
+{
+    if (skew != NULL) {
+        skew->first = 0;
+        skew->count = 0;
+        skew->waiting_first = 0;
+        skew->waiting_count = 0;
+    }
+}
+
 void cg_init(cg_estimator *self, const cg_model *model, const cg_settings *settings,
              const cg_line *line, cg_skew *skew)
 {
@@ -731,12 +745,7 @@ void cg_init(cg_estimator *self, const cg_model *model, const cg_settings *setti
     self->line.first = 0;
     self->line.count = 0;
     self->skew = skew;
-    if (skew != NULL) {
-        skew->first = 0;
-        skew->count = 0;
-        skew->waiting_first = 0;
-        skew->waiting_count = 0;
-    }
+    empty(skew);
     forget(state);
     cg_filter_start(&state->filter, model, CG_NAN, R(0.0), false);
     if (!isnan(given_pct)) {
@@ -745,6 +754,52 @@ void cg_init(cg_estimator *self, const cg_model *model, const cg_settings *setti
         state->memory.is_known = true;
         state->memory.doubt = (int32_t)CG_START;
         start_count(state, soc_pct, settings->initial_soc_std_pct);
+    }
+}
+
+void cg_set_table(cg_estimator *self, const cg_model *model)
+{
+    const cg_estimate latest = cg_evaluate(self);
+    const cg_model *before = self->model;
+    cg_state *state = &self->state;
+    cg_memory *memory = &state->memory;
+    cg_lag low_pass[CG_LOW_PASSES];
+    cg_real soc_pct = latest.soc_pct;
+    cg_real std_pct = latest.soc_std_pct;
+    if (isnan(soc_pct)) { /* the inverse has none without a voltage; counting has */
+        soc_pct = latest.soc_coulomb_pct;
+        std_pct = cg_sqrt(R(CG_UNKNOWN_VAR_PCT2));
+    }
+    for (int32_t j = 0; j < model->low_passes; ++j) {
+        low_pass[j] = (cg_lag){0};
+        for (int32_t k = 0; k < before->low_passes; ++k) {
+            if (before->low_pass_s[k] == model->low_pass_s[j]) {
+                low_pass[j] = state->low_pass[k];
+            }
+        }
+    }
+    for (int32_t j = 0; j < model->low_passes; ++j) {
+        state->low_pass[j] = low_pass[j];
+    }
+    for (int32_t k = 0; k < CG_EFFECTS; ++k) {
+        state->effect[k] = (cg_effect_state){0};
+        state->drive[k] = R(0.0);
+    }
+    if (model->delay_s[model->delays - 1] > before->delay_s[before->delays - 1]) {
+        cg_line_lengthen(&self->line);
+    }
+    empty(self->skew);
+    self->model = model;
+    set_filter_time(state, state->counter.counted_s, state->counter.discharged_pct);
+    state->block.is_broken = true;
+    memory->mismatch_until_s = (cg_time)NAN;
+    memory->innovations = 0;
+    memory->is_known = !isnan(soc_pct);
+    cg_filter_take_over(&state->filter, model, soc_pct, std_pct,
+                        model->capacity_ah / before->capacity_ah);
+    if (memory->is_known) {
+        memory->doubt = (int32_t)CG_NO_DOUBT;
+        start_count(state, soc_pct, std_pct);
     }
 }
 

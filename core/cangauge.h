@@ -385,6 +385,11 @@ void cg_init(cg_estimator *self, const cg_model *model, const cg_settings *setti
  * another clock; NAN: none measured it. False: implausible numbers, nothing is changed. */
 bool cg_restore(cg_estimator *self, const cg_state *state, cg_time age_s);
 
+/* Continue with the constants of another model, as one that was fitted to the pack later. SoC, offset
+ * of the current, learned capacity and delay line are kept; what the voltage taught is not. The sizes
+ * of cangauge_config.h must hold for both models, and one with `time_skew` needs its memory. */
+void cg_set_table(cg_estimator *self, const cg_model *model);
+
 /* Process one sample. False: refused (no plausible current, or not later than the last). */
 bool cg_update(cg_estimator *self, const cg_sample *sample);
 

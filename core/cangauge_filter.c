@@ -280,6 +280,26 @@ void cg_filter_start(cg_filter *filter, const cg_model *model, cg_real soc_pct, 
     }
 }
 
+/* Begin with another model: keep the offset of the current, and the capacity, whose reference becomes
+ * so many times as large. */
+void cg_filter_take_over(cg_filter *filter, const cg_model *model, cg_real soc_pct,
+                         cg_real std_pct, cg_real capacity_ratio)
+{
+    cg_ekf *ekf = &filter->ekf[0];
+    const cg_ekf *before = cg_likelier(filter);
+    const cg_real *v = before->b_v[CG_X_OFFSET];
+    const cg_real spread[2] = {cg_dot(before->b_p[0], v, 2), cg_dot(before->b_p[1], v, 2)};
+    const cg_real offset_a = before->x[CG_X_OFFSET] + cg_dot(v, before->b, 2);
+    const cg_real offset_var = var_of(before, CG_X_OFFSET) + cg_dot(v, spread, 2);
+    const cg_real capacity = (R(1.0) + before->b[CG_B_CAPACITY]) * capacity_ratio;
+    const cg_real capacity_var = before->b_p[CG_B_CAPACITY][CG_B_CAPACITY];
+    cg_filter_start(filter, model, soc_pct, std_pct, false);
+    ekf->x[CG_X_OFFSET] = offset_a;
+    ekf->p[pair(CG_X_OFFSET, CG_X_OFFSET)] = offset_var;
+    ekf->b[CG_B_CAPACITY] = capacity - R(1.0);
+    ekf->b_p[CG_B_CAPACITY][CG_B_CAPACITY] = capacity_var * cg_square(capacity_ratio);
+}
+
 void cg_filter_predict(cg_filter *filter, const cg_model *model, const cg_passed *passed)
 {
     for (int32_t k = 0; k < filter->hypotheses; ++k) {

@@ -89,6 +89,7 @@ void cg_line_push(cg_line *line, cg_real longest_s, bool is_gap, cg_time time_s,
                   cg_real current_a);
 cg_real cg_line_at(const cg_line *line, cg_real ago_s);
 cg_time cg_line_filled_s(const cg_line *line);
+void cg_line_lengthen(cg_line *line);
 
 /* voltage model */
 cg_real cg_cold(const cg_model *model, cg_real temperature_c);
@@ -126,6 +127,8 @@ typedef struct {
 /* filter */
 void cg_filter_start(cg_filter *filter, const cg_model *model, cg_real soc_pct, cg_real std_pct,
                      bool is_doubtful);
+void cg_filter_take_over(cg_filter *filter, const cg_model *model, cg_real soc_pct,
+                         cg_real std_pct, cg_real capacity_ratio);
 void cg_filter_predict(cg_filter *filter, const cg_model *model, const cg_passed *passed);
 void cg_filter_update(cg_filter *filter, const cg_model *model, const cg_means *block);
 void cg_filter_correct(cg_filter *filter, const cg_model *model, cg_real soc_pct, cg_real std_pct);

@@ -103,6 +103,15 @@ void cg_line_push(cg_line *line, cg_real longest_s, bool is_gap, cg_time time_s,
     }
 }
 
+/* After a while of another longest delay: what was dropped meanwhile is missing. */
+void cg_line_lengthen(cg_line *line)
+{
+    if (line->count > 0) {
+        const cg_time oldest_s = line->base_s + (cg_time)line_entry(line, 0)->time_s;
+        line->since_s = (oldest_s > line->since_s) ? oldest_s : line->since_s;
+    }
+}
+
 cg_time cg_line_filled_s(const cg_line *line)
 {
     if (line->count == 0) {
@@ -180,6 +189,7 @@ static cg_place place_of(const cg_real *knots, int32_t count, cg_real soc_pct)
     return inside;
 }
 
+#ifndef CANGAUGE_CONFIG /* an exported model has a table of it */
 static cg_real published_ocv(const cg_model *model, cg_real soc_pct, cg_real *slope)
 {
     const cg_wide *k = model->ocv_v;
@@ -200,12 +210,16 @@ static cg_real published_ocv(const cg_model *model, cg_real soc_pct, cg_real *sl
     return volts + (*slope * (soc_pct - at));
 }
 
+#endif
+
 /* The curve of the model, and its slope. */
 static cg_real curve_v(const cg_model *model, cg_real soc_pct, cg_real *slope)
 {
+#ifndef CANGAUGE_CONFIG
     if (model->knots == 0) {
         return published_ocv(model, soc_pct, slope);
     }
+#endif
     const cg_place at = place_of(model->knot_pct, model->knots, soc_pct);
     /* By the rise between the knots: floats lose less than by the weights of two high voltages. */
     const cg_real rise_v = model->knot_v[at.left + 1] - model->knot_v[at.left];
