@@ -803,42 +803,34 @@ void cg_set_table(cg_estimator *self, const cg_model *model)
     }
 }
 
-static bool are_lags_plausible(const cg_lag *lag, int32_t count)
+/* Sum of the numbers that go on: finite only if each of them is. */
+static cg_sum sum_of(const cg_state *state, const cg_model *model)
 {
-    bool is_finite = true;
-    for (int32_t k = 0; k < count; ++k) {
-        is_finite = is_finite && (!lag[k].is_started ||
-                                  (isfinite(lag[k].time_s) && isfinite(lag[k].input) &&
-                                   isfinite(lag[k].value)));
+    const cg_counter *counter = &state->counter;
+    cg_sum total = state->clock.shift_s + (cg_sum)counter->current_a +
+                   (cg_sum)counter->mean_square_a2 + (cg_sum)counter->mean_a +
+                   counter->discharged_pct + counter->moved_pct + counter->counted_s +
+                   counter->gap_var_pct2 + state->filter.prior_log_odds;
+    for (int32_t k = 0; k < model->low_passes; ++k) {
+        total += (cg_sum)state->low_pass[k].input + (cg_sum)state->low_pass[k].value;
     }
-    return is_finite;
+    for (int32_t k = 0; k < model->effects; ++k) {
+        for (int32_t j = 0; j < model->effect[k].lags; ++j) {
+            const cg_lag *lag = &state->effect[k].lag[j];
+            total += (cg_sum)lag->input + (cg_sum)lag->value;
+        }
+    }
+    return total;
 }
 
 static bool is_plausible(const cg_state *state, const cg_model *model)
 {
-    const cg_clock *clock = &state->clock;
-    const cg_counter *counter = &state->counter;
     const cg_memory *memory = &state->memory;
     const cg_filter *filter = &state->filter;
-    const bool are_counts = (clock->behind >= 0) && (memory->samples >= 0) &&
-                            (memory->resets >= 0) && (memory->tick >= -1) &&
-                            (memory->innovations >= 0) &&
-                            (memory->innovations <= model->tested_blocks) &&
-                            (filter->hypotheses >= 1) && (filter->hypotheses <= 2);
-    const bool are_times = (isnan(clock->last_s) || (fabs(clock->last_s) <= (2.0 * LATEST_S))) &&
-                           isfinite(clock->shift_s) && !isinf(counter->time_s);
-    const bool is_charge = isfinite(counter->current_a) && isfinite(counter->mean_square_a2) &&
-                           isfinite(counter->mean_a) && isfinite(counter->discharged_pct) &&
-                           isfinite(counter->moved_pct) && isfinite(counter->counted_s) &&
-                           isfinite(counter->gap_var_pct2) &&
-                           isfinite(filter->prior_log_odds) &&
-                           !isinf(memory->coulomb_start_pct) && !isinf(memory->newton_pct) &&
-                           !isinf(memory->temperature_c);
-    bool are_lags = are_lags_plausible(state->low_pass, model->low_passes);
-    for (int32_t k = 0; k < model->effects; ++k) {
-        are_lags = are_lags && are_lags_plausible(state->effect[k].lag, model->effect[k].lags);
-    }
-    return are_counts && are_times && is_charge && are_lags && cg_filter_is_valid(filter, model);
+    return (memory->samples >= 0) && (memory->innovations >= 0) &&
+           (memory->innovations <= model->tested_blocks) && (filter->hypotheses >= 1) &&
+           (filter->hypotheses <= 2) && isfinite(sum_of(state, model)) &&
+           cg_filter_is_valid(filter, model);
 }
 
 bool cg_restore(cg_estimator *self, const cg_state *state, cg_time age_s)
@@ -853,14 +845,4 @@ bool cg_restore(cg_estimator *self, const cg_state *state, cg_time age_s)
     self->state.counter.is_restored = true;
     self->line.count = 0;
     return true;
-}
-
-cg_real cg_offset_a(const cg_estimator *self)
-{
-    return cg_likelier(&self->state.filter)->x[CG_X_OFFSET];
-}
-
-cg_real cg_current_at(const cg_estimator *self, cg_time ago_s)
-{
-    return cg_line_at(&self->line, (cg_real)ago_s);
 }

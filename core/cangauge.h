@@ -396,16 +396,10 @@ bool cg_update(cg_estimator *self, const cg_sample *sample);
 /* Return the estimate after the latest sample. Changes nothing that a later one depends on. */
 cg_estimate cg_evaluate(cg_estimator *self);
 
-/* Return the estimated offset of the current sensor [A]. */
-cg_real cg_offset_a(const cg_estimator *self);
-
 /* Return the standard deviation that the SoC lacks after a time without samples [%]. */
 cg_real cg_uncounted_std_pct(const cg_estimator *self, cg_real seconds);
 
 /* Return the voltage without the load's [V], with effects, and its slope [V per %]. */
 cg_real cg_pseudo_ocv(const cg_estimator *self, cg_real soc_pct, cg_real *slope);
-
-/* Return the current some time before the latest sample [A]. */
-cg_real cg_current_at(const cg_estimator *self, cg_time ago_s);
 
 #endif

@@ -62,7 +62,6 @@ static void test_reset(const cg_settings *settings, const cg_line *line)
     cg_init(&pack, &pack_model, settings, line, &skew);
     check("refused: a sound state", cg_restore(&pack, &kept, 1.0) ? 0.0 : 1.0, 0.0);
     (void)cg_evaluate(&pack);
-    (void)cg_current_at(&pack, 0.0);
     check("refused: one evaluated", cg_restore(&pack, &evaluated, 1.0) ? 0.0 : 1.0, 0.0);
     check("SoC after a reset [%]", apart(before_pct, (double)cg_evaluate(&pack).soc_pct), 0.0);
     update(&golden_samples[at]);
