@@ -728,9 +728,8 @@ static void empty(cg_skew *skew)
 {
     if (skew != NULL) {
         skew->first = 0;
+        skew->waiting = 0;
         skew->count = 0;
-        skew->waiting_first = 0;
-        skew->waiting_count = 0;
     }
 }
 

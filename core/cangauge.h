@@ -350,15 +350,13 @@ typedef struct {
     cg_time base_s; /* 0 with doubles */
 } cg_line;
 
-/* Samples that `time_skew` holds back until their current is known. */
+/* The latest samples in a ring, which `time_skew` holds back until their current is known. The numbers
+ * count from the first of all. */
 typedef struct {
-    cg_sample waiting[CG_WAITING];
-    cg_time at_s[CG_WAITING];
-    cg_real at_a[CG_WAITING];
-    int32_t waiting_first;
-    int32_t waiting_count;
-    int32_t first;
-    int32_t count;
+    cg_sample at[CG_WAITING];
+    int64_t first; /* whose current is needed */
+    int64_t waiting; /* the oldest that is held back */
+    int64_t count;
 } cg_skew;
 
 typedef struct {

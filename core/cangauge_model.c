@@ -375,32 +375,29 @@ void cg_correct(cg_estimator *self, cg_sample *sample, int32_t from, int32_t to)
     }
 }
 
+static cg_sample *skew_entry(cg_skew *skew, int64_t number)
+{
+    return &skew->at[number % CG_WAITING];
+}
+
 /* Keep a sample until its current is known. */
 void cg_skew_push(cg_skew *skew, const cg_sample *sample)
 {
-    if (skew->count == CG_WAITING) {
-        skew->first = (skew->first + 1) % CG_WAITING;
-        skew->count -= 1;
-    }
-    const int32_t newest = (skew->first + skew->count) % CG_WAITING;
-    skew->at_s[newest] = sample->time_s;
-    skew->at_a[newest] = sample->current_a;
+    *skew_entry(skew, skew->count) = *sample;
     skew->count += 1;
-    if (skew->waiting_count == CG_WAITING) {
-        skew->waiting_first = (skew->waiting_first + 1) % CG_WAITING;
-        skew->waiting_count -= 1;
-    }
-    skew->waiting[(skew->waiting_first + skew->waiting_count) % CG_WAITING] = *sample;
-    skew->waiting_count += 1;
+    const int64_t oldest = skew->count - CG_WAITING;
+    skew->first = (oldest > skew->first) ? oldest : skew->first;
+    skew->waiting = (oldest > skew->waiting) ? oldest : skew->waiting;
 }
 
-static int32_t skew_until(const cg_skew *skew, cg_time time_s)
+/* Number of the first current after a time. */
+static int64_t skew_after(cg_skew *skew, cg_time time_s)
 {
-    int32_t low = 0;
-    int32_t high = skew->count;
+    int64_t low = skew->first;
+    int64_t high = skew->count;
     while (low < high) {
-        const int32_t middle = (low + high) / 2;
-        if (time_s < skew->at_s[(skew->first + middle) % CG_WAITING]) {
+        const int64_t middle = (low + high) / 2;
+        if (time_s < skew_entry(skew, middle)->time_s) {
             high = middle;
         } else {
             low = middle + 1;
@@ -412,34 +409,30 @@ static int32_t skew_until(const cg_skew *skew, cg_time time_s)
 /* Take the oldest sample if its current is known, which it then has. */
 bool cg_skew_pop(cg_skew *skew, cg_time skew_s, cg_time now_s, cg_sample *sample)
 {
-    if ((skew->waiting_count > 0) &&
-        ((skew->waiting[skew->waiting_first].time_s + skew_s) <= now_s)) {
-        *sample = skew->waiting[skew->waiting_first];
-        skew->waiting_first = (skew->waiting_first + 1) % CG_WAITING;
-        skew->waiting_count -= 1;
-        const cg_time at_s = sample->time_s + skew_s;
-        const int32_t right = skew_until(skew, at_s);
-        const int32_t after = (skew->first + right) % CG_WAITING;
-        const int32_t before = (after + CG_WAITING - 1) % CG_WAITING;
-        if (right == 0) {
-            sample->current_a = skew->at_a[after];
-        } else if (right == skew->count) {
-            sample->current_a = skew->at_a[before];
-        } else {
-            sample->current_a = between(skew->at_a[before], skew->at_a[after],
-                                        (cg_real)(at_s - skew->at_s[before]),
-                                        (cg_real)(skew->at_s[after] - skew->at_s[before]));
-        }
+    const bool is_waiting = skew->waiting < skew->count;
+    const cg_time upcoming_s = is_waiting ? skew_entry(skew, skew->waiting)->time_s : now_s;
+    const cg_time at_s = upcoming_s + skew_s;
+    const int64_t right = skew_after(skew, at_s);
+    if (!is_waiting || (at_s > now_s)) {
+        const int64_t stale = right - 1 - skew->first;
+        skew->first += (stale > STALE_AT_MOST) ? stale : 0;
+        return false;
+    }
+    *sample = *skew_entry(skew, skew->waiting);
+    skew->waiting += 1;
+    const cg_sample *after = skew_entry(skew, right);
+    if (right == skew->first) {
+        sample->current_a = after->current_a;
         return true;
     }
-    const cg_time upcoming_s =
-        (skew->waiting_count > 0) ? skew->waiting[skew->waiting_first].time_s : now_s;
-    const int32_t stale = skew_until(skew, upcoming_s + skew_s) - 1;
-    if (stale > STALE_AT_MOST) {
-        skew->first = (skew->first + stale) % CG_WAITING;
-        skew->count -= stale;
+    const cg_sample *before = skew_entry(skew, right - 1);
+    sample->current_a = before->current_a;
+    if (right < skew->count) {
+        sample->current_a = between(before->current_a, after->current_a,
+                                    (cg_real)(at_s - before->time_s),
+                                    (cg_real)(after->time_s - before->time_s));
     }
-    return false;
+    return true;
 }
 
 static void advance_hysteresis(const cg_effect *effect, cg_lag *lag, const cg_sample *sample)

@@ -280,10 +280,13 @@ class CompiledEstimator(Estimator):
         kind = self._forms[number].kind
         if kind == "time_skew":
             skew = self._part("skew", layout.SKEW)[0]
-            waiting = _ring(skew["waiting"], skew["waiting_first"], skew["waiting_count"])
-            at = [_ring(skew[name], skew["first"], skew["count"]) for name in ("at_s", "at_a")]
+            waiting, at = (
+                skew["at"][np.arange(skew[oldest], skew["count"]) % skew["at"].size]
+                for oldest in ("waiting", "first")
+            )
             readings = [number for each in waiting.tolist() for number in each]
-            return [float(len(waiting)), *readings, *at[0].tolist(), *at[1].tolist()]
+            currents = at["time_s"].tolist() + at["current_a"].tolist()
+            return [float(len(waiting)), *readings, *currents]
         lags = self._record["effect"][number]["lag"]
         return _numbers(lags, _LAG[:1] if kind == "resistance_step" else _LAG)
 
@@ -337,11 +340,12 @@ class CompiledEstimator(Estimator):
                 skew, waiting = self._part("skew", layout.SKEW)[0], int(state[0])
                 readings = np.array(state[1 : 1 + 4 * waiting]).reshape(waiting, 4)
                 kept = np.array(state[1 + 4 * waiting :]).reshape(2, -1)
+                count = skew["count"] = max(waiting, kept.shape[1])
+                skew["waiting"], skew["first"] = count - waiting, count - kept.shape[1]
+                at = skew["at"]
+                at["time_s"][skew["first"] : count], at["current_a"][skew["first"] : count] = kept
                 for column, name in enumerate(layout.SAMPLE.names or ()):
-                    skew["waiting"][name][:waiting] = readings[:, column]
-                skew["at_s"][: kept.shape[1]], skew["at_a"][: kept.shape[1]] = kept
-                skew["waiting_first"] = skew["first"] = 0
-                skew["waiting_count"], skew["count"] = waiting, kept.shape[1]
+                    at[name][skew["waiting"] : count] = readings[:, column]
             else:
                 lags = self._record["effect"][number]["lag"]
                 _set_lags(lags, state, 1 if kind == "resistance_step" else 3)
@@ -368,7 +372,3 @@ def _set_lags(lags: NDArray[Any], numbers: Sequence[float], each: int) -> None:
         lag["is_started"] = True
         for name, value in zip(_LAG, numbers[first : first + each], strict=False):
             lag[name] = value
-
-
-def _ring(items: NDArray[Any], first: int, count: int) -> NDArray[Any]:
-    return items[(first + np.arange(count)) % items.size]

@@ -78,10 +78,7 @@ SAMPLE: Final = _structure("d:time_s d:current_a d:voltage_v d:temperature_c")
 CURRENT: Final = _structure("d:time_s d:current_a")
 LINE: Final = _structure("l:at i:size i:first i:count i:block d:spacing_s d:since_s d:base_s")
 SKEW: Final = _structure(
-    "sample:waiting[WAITING] d:at_s[WAITING] d:at_a[WAITING] i:waiting_first i:waiting_count"
-    " i:first i:count",
-    sample=SAMPLE,
-)  # fmt: skip
+"sample:at[WAITING] l:first l:waiting l:count", sample=SAMPLE)  # fmt: skip
 LAG: Final = _structure("d:time_s d:input d:value b:is_started")
 _EKF: Final = _structure(
     "d:x[STATES] d:p[PAIRS] d:evidence d:b[2] d:b_p[2,2] d:b_v[STATES,2] d:innovation2"
