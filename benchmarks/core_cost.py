@@ -130,7 +130,7 @@ def target_costs(model: Model) -> dict[str, Any]:
     return {
         "flash_core": sum(text[name] for name in text if name.startswith("cangauge")),
         "flash_model": text["pack_model"],
-        "flash_frames": text["frames"] + text["soc_frames"],
+        "flash_frames": text["frames"],
         "ram_state": int(parts["state"]),
         "ram_delay_line": int(parts["delay line"]),
         "instructions_sample": int(steps[1]),

@@ -10,18 +10,13 @@ from collections.abc import Mapping
 from typing import Final, Literal
 
 from cangauge._version import __version__
+from cangauge.extras.embedded.c_source import CORE_HEADERS, CORE_SOURCES
 
 Platform = Literal["generic", "esp-idf", "zephyr", "arduino", "foxbms"]
 
-SOURCES: Final = (
-    "cangauge.c", "cangauge_filter.c", "cangauge_model.c", "pack_model.c", "frames.c",
-    "soc_frames.c",
-)  # fmt: skip
+SOURCES: Final = (*CORE_SOURCES, "pack_model.c", "frames.c")
 """What a program compiles."""
-HEADERS: Final = (
-    "cangauge.h", "cangauge_internal.h", "cangauge_config.h", "pack_model.h", "frames.h",
-    "soc_frames.h",
-)  # fmt: skip
+HEADERS: Final = (*CORE_HEADERS, "cangauge_config.h", "pack_model.h", "frames.h")
 ABOUT: Final = "State of charge of a battery pack from current, voltage and temperature"
 
 _GAUGE: Final = """\
