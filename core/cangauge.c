@@ -262,14 +262,18 @@ static void start_count(cg_state *state, cg_real soc_pct, cg_real std_pct)
 
 /* ------------------------------------------------------------------ step */
 
-static void propagate(cg_estimator *self, cg_sum counted_s, cg_sum discharged_pct)
+static void set_filter_time(cg_state *state, cg_sum counted_s, cg_sum discharged_pct)
 {
-    cg_state *state = &self->state;
-    const cg_passed passed = since_filter(state, counted_s, discharged_pct);
-    cg_filter_predict(&state->filter, self->model, &passed);
     state->memory.filter_counted_s = counted_s;
     state->memory.filter_discharged_pct = discharged_pct;
     state->memory.filter_gap_var_pct2 = state->counter.gap_var_pct2;
+}
+
+static void propagate(cg_estimator *self, cg_sum counted_s, cg_sum discharged_pct)
+{
+    const cg_passed passed = since_filter(&self->state, counted_s, discharged_pct);
+    cg_filter_predict(&self->state.filter, self->model, &passed);
+    set_filter_time(&self->state, counted_s, discharged_pct);
 }
 
 /* The open block then lies in part before the filter's state. */
@@ -524,7 +528,7 @@ static void process(cg_estimator *self, const cg_sample *sample)
     if (!isnan(sample->temperature_c)) {
         memory->temperature_c = sample->temperature_c;
     }
-    cg_advance(self, sample, memory->temperature_c);
+    cg_advance(self, sample, memory->temperature_c, charge.seconds > self->settings.gap_s);
     follow(self, sample, &charge);
     const int64_t tick = (int64_t)floor((since_s * (cg_time)model->rate_hz) + 1e-6);
     if (tick > memory->tick) {
@@ -720,6 +724,15 @@ static void forget(cg_state *state)
                                   (int32_t)CG_INITIALISING, CG_NO_INITIAL_SOC, 0};
 }
 
+static void empty(cg_skew *skew)
+{
+    if (skew != NULL) {
+        skew->first = 0;
+        skew->waiting = 0;
+        skew->count = 0;
+    }
+}
+
 void cg_init(cg_estimator *self, const cg_model *model, const cg_settings *settings,
              const cg_line *line, cg_skew *skew)
 {
@@ -731,12 +744,7 @@ void cg_init(cg_estimator *self, const cg_model *model, const cg_settings *setti
     self->line.first = 0;
     self->line.count = 0;
     self->skew = skew;
-    if (skew != NULL) {
-        skew->first = 0;
-        skew->count = 0;
-        skew->waiting_first = 0;
-        skew->waiting_count = 0;
-    }
+    empty(skew);
     forget(state);
     cg_filter_start(&state->filter, model, CG_NAN, R(0.0), false);
     if (!isnan(given_pct)) {
@@ -748,42 +756,80 @@ void cg_init(cg_estimator *self, const cg_model *model, const cg_settings *setti
     }
 }
 
-static bool are_lags_plausible(const cg_lag *lag, int32_t count)
+void cg_set_table(cg_estimator *self, const cg_model *model)
 {
-    bool is_finite = true;
-    for (int32_t k = 0; k < count; ++k) {
-        is_finite = is_finite && (!lag[k].is_started ||
-                                  (isfinite(lag[k].time_s) && isfinite(lag[k].input) &&
-                                   isfinite(lag[k].value)));
+    const cg_estimate latest = cg_evaluate(self);
+    const cg_model *before = self->model;
+    cg_state *state = &self->state;
+    cg_memory *memory = &state->memory;
+    cg_lag low_pass[CG_LOW_PASSES];
+    cg_real soc_pct = latest.soc_pct;
+    cg_real std_pct = latest.soc_std_pct;
+    if (isnan(soc_pct)) { /* the inverse has none without a voltage; counting has */
+        soc_pct = latest.soc_coulomb_pct;
+        std_pct = cg_sqrt(R(CG_UNKNOWN_VAR_PCT2));
     }
-    return is_finite;
+    for (int32_t j = 0; j < model->low_passes; ++j) {
+        low_pass[j] = (cg_lag){0};
+        for (int32_t k = 0; k < before->low_passes; ++k) {
+            if (before->low_pass_s[k] == model->low_pass_s[j]) {
+                low_pass[j] = state->low_pass[k];
+            }
+        }
+    }
+    for (int32_t j = 0; j < model->low_passes; ++j) {
+        state->low_pass[j] = low_pass[j];
+    }
+    for (int32_t k = 0; k < CG_EFFECTS; ++k) {
+        state->effect[k] = (cg_effect_state){0};
+        state->drive[k] = R(0.0);
+    }
+    if (model->delay_s[model->delays - 1] > before->delay_s[before->delays - 1]) {
+        cg_line_lengthen(&self->line);
+    }
+    empty(self->skew);
+    self->model = model;
+    set_filter_time(state, state->counter.counted_s, state->counter.discharged_pct);
+    state->block.is_broken = true;
+    memory->mismatch_until_s = (cg_time)NAN;
+    memory->innovations = 0;
+    memory->is_known = !isnan(soc_pct);
+    cg_filter_take_over(&state->filter, model, soc_pct, std_pct,
+                        model->capacity_ah / before->capacity_ah);
+    if (memory->is_known) {
+        memory->doubt = (int32_t)CG_NO_DOUBT;
+        start_count(state, soc_pct, std_pct);
+    }
+}
+
+/* Sum of the numbers that go on: finite only if each of them is. */
+static cg_sum sum_of(const cg_state *state, const cg_model *model)
+{
+    const cg_counter *counter = &state->counter;
+    cg_sum total = state->clock.shift_s + (cg_sum)counter->current_a +
+                   (cg_sum)counter->mean_square_a2 + (cg_sum)counter->mean_a +
+                   counter->discharged_pct + counter->moved_pct + counter->counted_s +
+                   counter->gap_var_pct2 + state->filter.prior_log_odds;
+    for (int32_t k = 0; k < model->low_passes; ++k) {
+        total += (cg_sum)state->low_pass[k].input + (cg_sum)state->low_pass[k].value;
+    }
+    for (int32_t k = 0; k < model->effects; ++k) {
+        for (int32_t j = 0; j < model->effect[k].lags; ++j) {
+            const cg_lag *lag = &state->effect[k].lag[j];
+            total += (cg_sum)lag->input + (cg_sum)lag->value;
+        }
+    }
+    return total;
 }
 
 static bool is_plausible(const cg_state *state, const cg_model *model)
 {
-    const cg_clock *clock = &state->clock;
-    const cg_counter *counter = &state->counter;
     const cg_memory *memory = &state->memory;
     const cg_filter *filter = &state->filter;
-    const bool are_counts = (clock->behind >= 0) && (memory->samples >= 0) &&
-                            (memory->resets >= 0) && (memory->tick >= -1) &&
-                            (memory->innovations >= 0) &&
-                            (memory->innovations <= model->tested_blocks) &&
-                            (filter->hypotheses >= 1) && (filter->hypotheses <= 2);
-    const bool are_times = (isnan(clock->last_s) || (fabs(clock->last_s) <= (2.0 * LATEST_S))) &&
-                           isfinite(clock->shift_s) && !isinf(counter->time_s);
-    const bool is_charge = isfinite(counter->current_a) && isfinite(counter->mean_square_a2) &&
-                           isfinite(counter->mean_a) && isfinite(counter->discharged_pct) &&
-                           isfinite(counter->moved_pct) && isfinite(counter->counted_s) &&
-                           isfinite(counter->gap_var_pct2) &&
-                           isfinite(filter->prior_log_odds) &&
-                           !isinf(memory->coulomb_start_pct) && !isinf(memory->newton_pct) &&
-                           !isinf(memory->temperature_c);
-    bool are_lags = are_lags_plausible(state->low_pass, model->low_passes);
-    for (int32_t k = 0; k < model->effects; ++k) {
-        are_lags = are_lags && are_lags_plausible(state->effect[k].lag, model->effect[k].lags);
-    }
-    return are_counts && are_times && is_charge && are_lags && cg_filter_is_valid(filter, model);
+    return (memory->samples >= 0) && (memory->innovations >= 0) &&
+           (memory->innovations <= model->tested_blocks) && (filter->hypotheses >= 1) &&
+           (filter->hypotheses <= 2) && isfinite(sum_of(state, model)) &&
+           cg_filter_is_valid(filter, model);
 }
 
 bool cg_restore(cg_estimator *self, const cg_state *state, cg_time age_s)
@@ -798,14 +844,4 @@ bool cg_restore(cg_estimator *self, const cg_state *state, cg_time age_s)
     self->state.counter.is_restored = true;
     self->line.count = 0;
     return true;
-}
-
-cg_real cg_offset_a(const cg_estimator *self)
-{
-    return cg_likelier(&self->state.filter)->x[CG_X_OFFSET];
-}
-
-cg_real cg_current_at(const cg_estimator *self, cg_time ago_s)
-{
-    return cg_line_at(&self->line, ago_s);
 }

@@ -47,6 +47,7 @@ typedef double cg_wide;
 #define CG_CURRENTS (CG_DELAYS + CG_LOW_PASSES)
 #define CG_LOADS (CG_CURRENTS + 2)
 #define CG_STATES (CG_FUNCTIONS + 4)
+#define CG_PAIRS (CG_STATES * (CG_STATES + 1) / 2)
 #define CG_SUMS (CG_LOADS + 5)
 
 /* ------------------------------------------------------------------ constants of a model */
@@ -247,7 +248,7 @@ typedef struct {
  * the biases b = (capacity, resistance) with their covariance and their influence v on x. */
 typedef struct {
     cg_real x[CG_STATES];
-    cg_real p[CG_STATES][CG_STATES];
+    cg_real p[CG_PAIRS]; /* of the symmetric matrix: row by row up to the diagonal */
     cg_sum evidence; /* log-likelihood of all voltages */
     cg_real b[2];
     cg_real b_p[2][2];
@@ -333,7 +334,7 @@ typedef struct {
 
 /* One sample of the current in the delay line. */
 typedef struct {
-    cg_time time_s;
+    cg_real time_s; /* since `base_s` of the line, so that a float keeps its digits */
     cg_real current_a;
 } cg_current;
 
@@ -346,16 +347,16 @@ typedef struct {
     int32_t block; /* stale currents dropped at once; 0: as soon as they are */
     cg_real spacing_s; /* least time between every second of the samples kept */
     cg_time since_s; /* start of the stretch without a gap */
+    cg_time base_s; /* 0 with doubles */
 } cg_line;
 
-/* Samples that `time_skew` holds back until their current is known. */
+/* The latest samples in a ring, which `time_skew` holds back until their current is known. The numbers
+ * count from the first of all. */
 typedef struct {
-    cg_sample waiting[CG_WAITING];
-    cg_current at[CG_WAITING];
-    int32_t waiting_first;
-    int32_t waiting_count;
-    int32_t first;
-    int32_t count;
+    cg_sample at[CG_WAITING];
+    int64_t first; /* whose current is needed */
+    int64_t waiting; /* the oldest that is held back */
+    int64_t count;
 } cg_skew;
 
 typedef struct {
@@ -370,6 +371,8 @@ typedef struct {
 
 /* Storage for the delay line at samples `spacing_s` apart; for static arrays. Rounded up. */
 #define CG_LINE_SIZE(longest_s, spacing_s) ((int32_t)(2.0 * (longest_s) / (spacing_s)) + 9)
+/* An empty delay line in an array of a size. */
+#define CG_LINE(array, size, spacing_s) {(array), (size), 0, 0, 0, (cg_real)(spacing_s), 0.0, 0.0}
 
 /* Begin, with memory for the delay line (CG_LINE_SIZE) and, for a model with `time_skew`, for the
  * samples that it holds back. */
@@ -380,22 +383,21 @@ void cg_init(cg_estimator *self, const cg_model *model, const cg_settings *setti
  * another clock; NAN: none measured it. False: implausible numbers, nothing is changed. */
 bool cg_restore(cg_estimator *self, const cg_state *state, cg_time age_s);
 
+/* Continue with the constants of another model, as one that was fitted to the pack later. SoC, offset
+ * of the current, learned capacity and delay line are kept; what the voltage taught is not. The sizes
+ * of cangauge_config.h must hold for both models, and one with `time_skew` needs its memory. */
+void cg_set_table(cg_estimator *self, const cg_model *model);
+
 /* Process one sample. False: refused (no plausible current, or not later than the last). */
 bool cg_update(cg_estimator *self, const cg_sample *sample);
 
 /* Return the estimate after the latest sample. Changes nothing that a later one depends on. */
 cg_estimate cg_evaluate(cg_estimator *self);
 
-/* Return the estimated offset of the current sensor [A]. */
-cg_real cg_offset_a(const cg_estimator *self);
-
 /* Return the standard deviation that the SoC lacks after a time without samples [%]. */
 cg_real cg_uncounted_std_pct(const cg_estimator *self, cg_real seconds);
 
 /* Return the voltage without the load's [V], with effects, and its slope [V per %]. */
 cg_real cg_pseudo_ocv(const cg_estimator *self, cg_real soc_pct, cg_real *slope);
-
-/* Return the current some time before the latest sample [A]. */
-cg_real cg_current_at(const cg_estimator *self, cg_time ago_s);
 
 #endif

@@ -26,16 +26,20 @@
 
 /* ------------------------------------------------------------------ one filter */
 
+/* Place of a covariance among the pairs, i >= j. */
+static int32_t pair(int32_t i, int32_t j) { return (i * (i + 1) / 2) + j; }
+static cg_real var_of(const cg_ekf *ekf, int32_t k) { return ekf->p[pair(k, k)]; }
+
 static void ekf_start(cg_ekf *ekf, const cg_model *model, cg_real soc_pct, cg_real var_pct2)
 {
     *ekf = (cg_ekf){0};
     ekf->x[CG_X_SOC] = soc_pct;
     for (int32_t k = 0; k < cg_states(model); ++k) {
-        ekf->p[k][k] = R(1.0);
+        ekf->p[pair(k, k)] = R(1.0);
     }
-    ekf->p[CG_X_SOC][CG_X_SOC] = var_pct2;
-    ekf->p[CG_X_OFFSET][CG_X_OFFSET] = cg_square(R(OFFSET_STD_A));
-    ekf->p[CG_X_SLOW][CG_X_SLOW] = cg_square(model->slow_std_v);
+    ekf->p[pair(CG_X_SOC, CG_X_SOC)] = var_pct2;
+    ekf->p[pair(CG_X_OFFSET, CG_X_OFFSET)] = cg_square(R(OFFSET_STD_A));
+    ekf->p[pair(CG_X_SLOW, CG_X_SLOW)] = cg_square(model->slow_std_v);
     ekf->b_p[CG_B_CAPACITY][CG_B_CAPACITY] = cg_square(R(CAPACITY_STD));
     ekf->b_p[CG_B_RESISTANCE][CG_B_RESISTANCE] = cg_square(R(RESISTANCE_STD));
 }
@@ -54,16 +58,17 @@ static void ekf_predict(cg_ekf *ekf, const cg_model *model, const cg_passed *pas
     const cg_real keep = cg_exp(-(passed->seconds + passed->away_s) / model->slow_time_s);
     ekf->x[CG_X_SOC] += (gain * ekf->x[CG_X_OFFSET]) - passed->discharged_pct;
     ekf->x[CG_X_SLOW] *= keep;
-    for (int32_t j = 0; j < size; ++j) {
-        ekf->p[CG_X_SOC][j] += gain * ekf->p[CG_X_OFFSET][j];
-        ekf->p[CG_X_SLOW][j] *= keep;
+    ekf->p[pair(CG_X_SOC, CG_X_SOC)] += gain * ekf->p[pair(CG_X_OFFSET, CG_X_SOC)];
+    for (int32_t i = CG_X_OFFSET; i < size; ++i) {
+        ekf->p[pair(i, CG_X_SOC)] += gain * ekf->p[pair(i, CG_X_OFFSET)];
     }
-    for (int32_t i = 0; i < size; ++i) {
-        ekf->p[i][CG_X_SOC] += gain * ekf->p[i][CG_X_OFFSET];
-        ekf->p[i][CG_X_SLOW] *= keep;
+    ekf->p[pair(CG_X_SOC, CG_X_SOC)] += gain * ekf->p[pair(CG_X_OFFSET, CG_X_SOC)];
+    for (int32_t k = 0; k < size; ++k) {
+        ekf->p[(k < CG_X_SLOW) ? pair(CG_X_SLOW, k) : pair(k, CG_X_SLOW)] *= keep;
     }
-    ekf->p[CG_X_SOC][CG_X_SOC] += (R(DRIFT_PCT2_PER_S) * passed->seconds) + variance_pct2;
-    ekf->p[CG_X_SLOW][CG_X_SLOW] +=
+    ekf->p[pair(CG_X_SLOW, CG_X_SLOW)] *= keep;
+    ekf->p[pair(CG_X_SOC, CG_X_SOC)] += (R(DRIFT_PCT2_PER_S) * passed->seconds) + variance_pct2;
+    ekf->p[pair(CG_X_SLOW, CG_X_SLOW)] +=
         (R(1.0) - cg_square(keep)) * cg_square(model->slow_std_v);
     for (int32_t k = 0; k < 2; ++k) {
         ekf->b_v[CG_X_SOC][k] += gain * ekf->b_v[CG_X_OFFSET][k];
@@ -87,8 +92,15 @@ typedef struct {
 
 static void weigh(linear *at, const cg_ekf *ekf, int32_t size, cg_real noise)
 {
-    for (int32_t k = 0; k < size; ++k) {
-        at->spread[k] = cg_dot(ekf->p[k], at->h, size);
+    const cg_real *p = ekf->p;
+    for (int32_t i = 0; i < size; ++i) {
+        at->spread[i] = R(0.0);
+        for (int32_t j = 0; j < i; ++j, ++p) {
+            at->spread[i] += *p * at->h[j];
+            at->spread[j] += *p * at->h[i];
+        }
+        at->spread[i] += *p * at->h[i];
+        ++p;
     }
     at->variance = cg_dot(at->h, at->spread, size) + noise;
     for (int32_t k = 0; k < size; ++k) {
@@ -99,12 +111,12 @@ static void weigh(linear *at, const cg_ekf *ekf, int32_t size, cg_real noise)
 /* P <- P - K (P H')', symmetric; then the biases (Friedland). */
 static void condition(cg_ekf *ekf, const linear *at, int32_t size, cg_real drop_v)
 {
+    cg_real *p = ekf->p;
     for (int32_t i = 0; i < size; ++i) {
-        for (int32_t j = i; j < size; ++j) {
-            const cg_real one = ekf->p[i][j] - (at->gain[i] * at->spread[j]);
-            const cg_real other = ekf->p[j][i] - (at->gain[j] * at->spread[i]);
-            ekf->p[i][j] = R(0.5) * (one + other);
-            ekf->p[j][i] = ekf->p[i][j];
+        for (int32_t j = 0; j <= i; ++j, ++p) {
+            const cg_real one = *p - (at->gain[i] * at->spread[j]);
+            const cg_real other = *p - (at->gain[j] * at->spread[i]);
+            *p = R(0.5) * (one + other);
         }
     }
     cg_real t[2] = {R(0.0), drop_v};
@@ -154,7 +166,7 @@ static cg_real measurement(const cg_model *model, const cg_real *x, const cg_mea
 static void ekf_update(const cg_model *model, cg_ekf *ekf, const cg_means *block)
 {
     const int32_t size = cg_states(model);
-    const bool is_wide = ekf->p[CG_X_SOC][CG_X_SOC] > cg_square(R(LINEAR_PCT));
+    const bool is_wide = var_of(ekf, CG_X_SOC) > cg_square(R(LINEAR_PCT));
     cg_real x[CG_STATES];
     linear at = {{R(0.0)}, {R(0.0)}, {R(0.0)}, R(0.0), R(1.0)};
     for (int32_t k = 0; k < size; ++k) {
@@ -201,8 +213,8 @@ static cg_real soc_after(const cg_ekf *ekf, const cg_model *model, const cg_pass
                          cg_real *var_pct2)
 {
     const cg_real a = offset_gain(model, passed->seconds);
-    *var_pct2 = ekf->p[CG_X_SOC][CG_X_SOC] + (R(2.0) * a * ekf->p[CG_X_SOC][CG_X_OFFSET]) +
-                (a * a * ekf->p[CG_X_OFFSET][CG_X_OFFSET]) +
+    *var_pct2 = var_of(ekf, CG_X_SOC) + (R(2.0) * a * ekf->p[pair(CG_X_OFFSET, CG_X_SOC)]) +
+                (a * a * var_of(ekf, CG_X_OFFSET)) +
                 (R(DRIFT_PCT2_PER_S) * passed->seconds) + passed->variance_pct2 +
                 cg_square(cg_dot(ekf->b_v[CG_X_SOC], ekf->b, 2));
     return ekf->x[CG_X_SOC] + (a * ekf->x[CG_X_OFFSET]) - passed->discharged_pct;
@@ -266,6 +278,26 @@ void cg_filter_start(cg_filter *filter, const cg_model *model, cg_real soc_pct, 
         filter->hypotheses = 2;
         filter->prior_log_odds = log_odds_of(CG_WRONG_PRIOR);
     }
+}
+
+/* Begin with another model: keep the offset of the current, and the capacity, whose reference becomes
+ * so many times as large. */
+void cg_filter_take_over(cg_filter *filter, const cg_model *model, cg_real soc_pct,
+                         cg_real std_pct, cg_real capacity_ratio)
+{
+    cg_ekf *ekf = &filter->ekf[0];
+    const cg_ekf *before = cg_likelier(filter);
+    const cg_real *v = before->b_v[CG_X_OFFSET];
+    const cg_real spread[2] = {cg_dot(before->b_p[0], v, 2), cg_dot(before->b_p[1], v, 2)};
+    const cg_real offset_a = before->x[CG_X_OFFSET] + cg_dot(v, before->b, 2);
+    const cg_real offset_var = var_of(before, CG_X_OFFSET) + cg_dot(v, spread, 2);
+    const cg_real capacity = (R(1.0) + before->b[CG_B_CAPACITY]) * capacity_ratio;
+    const cg_real capacity_var = before->b_p[CG_B_CAPACITY][CG_B_CAPACITY];
+    cg_filter_start(filter, model, soc_pct, std_pct, false);
+    ekf->x[CG_X_OFFSET] = offset_a;
+    ekf->p[pair(CG_X_OFFSET, CG_X_OFFSET)] = offset_var;
+    ekf->b[CG_B_CAPACITY] = capacity - R(1.0);
+    ekf->b_p[CG_B_CAPACITY][CG_B_CAPACITY] = capacity_var * cg_square(capacity_ratio);
 }
 
 void cg_filter_predict(cg_filter *filter, const cg_model *model, const cg_passed *passed)
@@ -343,9 +375,9 @@ bool cg_filter_is_valid(const cg_filter *filter, const cg_model *model)
         const cg_ekf *ekf = &filter->ekf[i];
         is_valid = is_valid && isfinite(ekf->evidence);
         for (int32_t k = 0; k < size; ++k) {
-            is_valid = is_valid && isfinite(ekf->x[k]) && (ekf->p[k][k] > R(0.0));
-            for (int32_t j = 0; j < size; ++j) {
-                is_valid = is_valid && isfinite(ekf->p[k][j]);
+            is_valid = is_valid && isfinite(ekf->x[k]) && (var_of(ekf, k) > R(0.0));
+            for (int32_t j = 0; j <= k; ++j) {
+                is_valid = is_valid && isfinite(ekf->p[pair(k, j)]);
             }
         }
     }

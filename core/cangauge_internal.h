@@ -14,6 +14,7 @@
 
 #if CG_JOIN(CG_REAL_IS_, CANGAUGE_REAL)
 #define CG_CLOSE_PCT 1e-4 /* where an iteration on a SoC stops */
+#define CG_REBASE_S 128.0 /* age of the delay line's base at which floats need another one */
 #define cg_exp expf
 #define cg_expm1 expm1f
 #define cg_pow powf
@@ -22,6 +23,7 @@
 #define cg_fabs fabsf
 #else
 #define CG_CLOSE_PCT 1e-9
+#define CG_REBASE_S INFINITY
 #define cg_exp exp
 #define cg_expm1 expm1
 #define cg_pow pow
@@ -83,10 +85,11 @@ static inline cg_real cg_dot(const cg_real *a, const cg_real *b, int32_t size)
 }
 
 /* delay line */
-void cg_line_push(cg_line *line, cg_real longest_s, cg_real gap_s, cg_time time_s,
+void cg_line_push(cg_line *line, cg_real longest_s, bool is_gap, cg_time time_s,
                   cg_real current_a);
-cg_real cg_line_at(const cg_line *line, cg_time ago_s);
+cg_real cg_line_at(const cg_line *line, cg_real ago_s);
 cg_time cg_line_filled_s(const cg_line *line);
+void cg_line_lengthen(cg_line *line);
 
 /* voltage model */
 cg_real cg_cold(const cg_model *model, cg_real temperature_c);
@@ -99,7 +102,8 @@ int32_t cg_skew_of(const cg_model *model);
 void cg_correct(cg_estimator *self, cg_sample *sample, int32_t from, int32_t to);
 void cg_skew_push(cg_skew *skew, const cg_sample *sample);
 bool cg_skew_pop(cg_skew *skew, cg_time skew_s, cg_time now_s, cg_sample *sample);
-void cg_advance(cg_estimator *self, const cg_sample *sample, cg_real temperature_c);
+void cg_advance(cg_estimator *self, const cg_sample *sample, cg_real temperature_c,
+                bool is_gap);
 
 /* Means over the rows of a block. */
 typedef struct {
@@ -123,6 +127,8 @@ typedef struct {
 /* filter */
 void cg_filter_start(cg_filter *filter, const cg_model *model, cg_real soc_pct, cg_real std_pct,
                      bool is_doubtful);
+void cg_filter_take_over(cg_filter *filter, const cg_model *model, cg_real soc_pct,
+                         cg_real std_pct, cg_real capacity_ratio);
 void cg_filter_predict(cg_filter *filter, const cg_model *model, const cg_passed *passed);
 void cg_filter_update(cg_filter *filter, const cg_model *model, const cg_means *block);
 void cg_filter_correct(cg_filter *filter, const cg_model *model, cg_real soc_pct, cg_real std_pct);

@@ -46,7 +46,7 @@ static void line_drop(cg_line *line, int32_t number)
 }
 
 /* Number of entries at or before a time. */
-static int32_t line_until(const cg_line *line, cg_time time_s)
+static int32_t line_until(const cg_line *line, cg_real time_s)
 {
     int32_t low = 0;
     int32_t high = line->count;
@@ -61,15 +61,31 @@ static int32_t line_until(const cg_line *line, cg_time time_s)
     return low;
 }
 
-void cg_line_push(cg_line *line, cg_real longest_s, cg_real gap_s, cg_time time_s,
+/* Let the times count from the oldest entry. */
+static void line_rebase(cg_line *line)
+{
+    const cg_real later_s = line_entry(line, 0)->time_s;
+    for (int32_t k = 0; k < line->count; ++k) {
+        line_entry(line, k)->time_s -= later_s;
+    }
+    line->base_s += (cg_time)later_s;
+}
+
+void cg_line_push(cg_line *line, cg_real longest_s, bool is_gap, cg_time time_s,
                   cg_real current_a)
 {
-    if ((line->count == 0) ||
-        ((time_s - line_entry(line, line->count - 1)->time_s) > (cg_time)gap_s)) {
+    if ((line->count == 0) || is_gap) {
         line->count = 0;
         line->since_s = time_s;
-    } else if ((line->count > 1) && ((time_s - line_entry(line, line->count - 2)->time_s) <
-                                     (cg_time)line->spacing_s)) {
+        line->base_s = isinf(CG_REBASE_S) ? 0.0 : time_s;
+    } else if (line_entry(line, 0)->time_s >= R(CG_REBASE_S)) {
+        line_rebase(line);
+    } else {
+        /* as before */
+    }
+    const cg_real now_s = (cg_real)(time_s - line->base_s);
+    if ((line->count > 1) &&
+        ((now_s - line_entry(line, line->count - 2)->time_s) < line->spacing_s)) {
         line->count -= 1;
     } else if (line->count == line->size) {
         line_drop(line, 1); /* memory smaller than the spacing needs */
@@ -78,41 +94,55 @@ void cg_line_push(cg_line *line, cg_real longest_s, cg_real gap_s, cg_time time_
     }
     line->count += 1;
     cg_current *newest = line_entry(line, line->count - 1);
-    newest->time_s = time_s;
+    newest->time_s = now_s;
     newest->current_a = current_a;
     const int32_t stale_at = line->block + 1;
-    const cg_time oldest_s = time_s - (cg_time)longest_s;
+    const cg_real oldest_s = now_s - longest_s;
     if ((line->count > stale_at) && (line_entry(line, stale_at)->time_s <= oldest_s)) {
         line_drop(line, line_until(line, oldest_s) - 1);
     }
 }
 
+/* After a while of another longest delay: what was dropped meanwhile is missing. */
+void cg_line_lengthen(cg_line *line)
+{
+    if (line->count > 0) {
+        const cg_time oldest_s = line->base_s + (cg_time)line_entry(line, 0)->time_s;
+        line->since_s = (oldest_s > line->since_s) ? oldest_s : line->since_s;
+    }
+}
+
 cg_time cg_line_filled_s(const cg_line *line)
 {
-    return (line->count > 0) ? (line_entry(line, line->count - 1)->time_s - line->since_s) : 0.0;
+    if (line->count == 0) {
+        return 0.0;
+    }
+    return (cg_time)line_entry(line, line->count - 1)->time_s + line->base_s - line->since_s;
 }
 
-static cg_real between(const cg_current *before, const cg_current *after, cg_time at_s)
+/* Current between two samples. */
+static cg_real between(cg_real before_a, cg_real after_a, cg_real part_s, cg_real step_s)
 {
-    const cg_real part_s = (cg_real)(at_s - before->time_s);
-    const cg_real step_s = (cg_real)(after->time_s - before->time_s);
-    return before->current_a + ((after->current_a - before->current_a) * part_s / step_s);
+    return before_a + ((after_a - before_a) * part_s / step_s);
 }
 
-cg_real cg_line_at(const cg_line *line, cg_time ago_s)
+cg_real cg_line_at(const cg_line *line, cg_real ago_s)
 {
     if (line->count == 0) {
         return R(0.0); /* as before the first sample */
     }
-    const cg_time at_s = line_entry(line, line->count - 1)->time_s - ago_s;
+    const cg_real at_s = line_entry(line, line->count - 1)->time_s - ago_s;
     const int32_t right = line_until(line, at_s);
     if (right == 0) {
         return line_entry(line, 0)->current_a;
     }
+    const cg_current *before = line_entry(line, right - 1);
     if (right == line->count) {
-        return line_entry(line, line->count - 1)->current_a;
+        return before->current_a;
     }
-    return between(line_entry(line, right - 1), line_entry(line, right), at_s);
+    const cg_current *after = line_entry(line, right);
+    return between(before->current_a, after->current_a, at_s - before->time_s,
+                   after->time_s - before->time_s);
 }
 
 /* ------------------------------------------------------------------ voltage model */
@@ -159,6 +189,7 @@ static cg_place place_of(const cg_real *knots, int32_t count, cg_real soc_pct)
     return inside;
 }
 
+#ifndef CANGAUGE_CONFIG /* an exported model has a table of it */
 static cg_real published_ocv(const cg_model *model, cg_real soc_pct, cg_real *slope)
 {
     const cg_wide *k = model->ocv_v;
@@ -179,12 +210,16 @@ static cg_real published_ocv(const cg_model *model, cg_real soc_pct, cg_real *sl
     return volts + (*slope * (soc_pct - at));
 }
 
+#endif
+
 /* The curve of the model, and its slope. */
 static cg_real curve_v(const cg_model *model, cg_real soc_pct, cg_real *slope)
 {
+#ifndef CANGAUGE_CONFIG
     if (model->knots == 0) {
         return published_ocv(model, soc_pct, slope);
     }
+#endif
     const cg_place at = place_of(model->knot_pct, model->knots, soc_pct);
     /* By the rise between the knots: floats lose less than by the weights of two high voltages. */
     const cg_real rise_v = model->knot_v[at.left + 1] - model->knot_v[at.left];
@@ -340,32 +375,29 @@ void cg_correct(cg_estimator *self, cg_sample *sample, int32_t from, int32_t to)
     }
 }
 
+static cg_sample *skew_entry(cg_skew *skew, int64_t number)
+{
+    return &skew->at[number % CG_WAITING];
+}
+
 /* Keep a sample until its current is known. */
 void cg_skew_push(cg_skew *skew, const cg_sample *sample)
 {
-    if (skew->count == CG_WAITING) {
-        skew->first = (skew->first + 1) % CG_WAITING;
-        skew->count -= 1;
-    }
-    cg_current *newest = &skew->at[(skew->first + skew->count) % CG_WAITING];
-    newest->time_s = sample->time_s;
-    newest->current_a = sample->current_a;
+    *skew_entry(skew, skew->count) = *sample;
     skew->count += 1;
-    if (skew->waiting_count == CG_WAITING) {
-        skew->waiting_first = (skew->waiting_first + 1) % CG_WAITING;
-        skew->waiting_count -= 1;
-    }
-    skew->waiting[(skew->waiting_first + skew->waiting_count) % CG_WAITING] = *sample;
-    skew->waiting_count += 1;
+    const int64_t oldest = skew->count - CG_WAITING;
+    skew->first = (oldest > skew->first) ? oldest : skew->first;
+    skew->waiting = (oldest > skew->waiting) ? oldest : skew->waiting;
 }
 
-static int32_t skew_until(const cg_skew *skew, cg_time time_s)
+/* Number of the first current after a time. */
+static int64_t skew_after(cg_skew *skew, cg_time time_s)
 {
-    int32_t low = 0;
-    int32_t high = skew->count;
+    int64_t low = skew->first;
+    int64_t high = skew->count;
     while (low < high) {
-        const int32_t middle = (low + high) / 2;
-        if (time_s < skew->at[(skew->first + middle) % CG_WAITING].time_s) {
+        const int64_t middle = (low + high) / 2;
+        if (time_s < skew_entry(skew, middle)->time_s) {
             high = middle;
         } else {
             low = middle + 1;
@@ -377,32 +409,30 @@ static int32_t skew_until(const cg_skew *skew, cg_time time_s)
 /* Take the oldest sample if its current is known, which it then has. */
 bool cg_skew_pop(cg_skew *skew, cg_time skew_s, cg_time now_s, cg_sample *sample)
 {
-    if ((skew->waiting_count > 0) &&
-        ((skew->waiting[skew->waiting_first].time_s + skew_s) <= now_s)) {
-        *sample = skew->waiting[skew->waiting_first];
-        skew->waiting_first = (skew->waiting_first + 1) % CG_WAITING;
-        skew->waiting_count -= 1;
-        const cg_time at_s = sample->time_s + skew_s;
-        const int32_t right = skew_until(skew, at_s);
-        const cg_current *after = &skew->at[(skew->first + right) % CG_WAITING];
-        const cg_current *before = &skew->at[(skew->first + right + CG_WAITING - 1) % CG_WAITING];
-        if (right == 0) {
-            sample->current_a = after->current_a;
-        } else if (right == skew->count) {
-            sample->current_a = before->current_a;
-        } else {
-            sample->current_a = between(before, after, at_s);
-        }
+    const bool is_waiting = skew->waiting < skew->count;
+    const cg_time upcoming_s = is_waiting ? skew_entry(skew, skew->waiting)->time_s : now_s;
+    const cg_time at_s = upcoming_s + skew_s;
+    const int64_t right = skew_after(skew, at_s);
+    if (!is_waiting || (at_s > now_s)) {
+        const int64_t stale = right - 1 - skew->first;
+        skew->first += (stale > STALE_AT_MOST) ? stale : 0;
+        return false;
+    }
+    *sample = *skew_entry(skew, skew->waiting);
+    skew->waiting += 1;
+    const cg_sample *after = skew_entry(skew, right);
+    if (right == skew->first) {
+        sample->current_a = after->current_a;
         return true;
     }
-    const cg_time upcoming_s =
-        (skew->waiting_count > 0) ? skew->waiting[skew->waiting_first].time_s : now_s;
-    const int32_t stale = skew_until(skew, upcoming_s + skew_s) - 1;
-    if (stale > STALE_AT_MOST) {
-        skew->first = (skew->first + stale) % CG_WAITING;
-        skew->count -= stale;
+    const cg_sample *before = skew_entry(skew, right - 1);
+    sample->current_a = before->current_a;
+    if (right < skew->count) {
+        sample->current_a = between(before->current_a, after->current_a,
+                                    (cg_real)(at_s - before->time_s),
+                                    (cg_real)(after->time_s - before->time_s));
     }
-    return false;
+    return true;
 }
 
 static void advance_hysteresis(const cg_effect *effect, cg_lag *lag, const cg_sample *sample)
@@ -530,7 +560,7 @@ static void advance_load(cg_estimator *self, const cg_sample *sample, cg_real te
         cg_clip(temperature_c, model->temperature_limits_c[0], model->temperature_limits_c[1]);
     load[0] = bounded - model->t_ref_c;
     for (int32_t j = 0; j < model->delays; ++j) {
-        load[1 + j] = cg_line_at(&self->line, (cg_time)model->delay_s[j]);
+        load[1 + j] = cg_line_at(&self->line, model->delay_s[j]);
     }
     for (int32_t j = 0; j < model->low_passes; ++j) {
         load[1 + model->delays + j] = lag_from_rest(&state->low_pass[j], model->low_pass_s[j],
@@ -545,14 +575,15 @@ static void advance_load(cg_estimator *self, const cg_sample *sample, cg_real te
 }
 
 /* Advance the voltage model to a corrected sample. */
-void cg_advance(cg_estimator *self, const cg_sample *sample, cg_real temperature_c)
+void cg_advance(cg_estimator *self, const cg_sample *sample, cg_real temperature_c,
+                bool is_gap)
 {
     const cg_model *model = self->model;
     cg_state *state = &self->state;
     const bool is_known = isfinite(temperature_c) != 0;
     const cg_real known_c = is_known ? temperature_c : model->t_ref_c;
-    cg_line_push(&self->line, model->delay_s[model->delays - 1], self->settings.gap_s,
-                 sample->time_s, sample->current_a);
+    cg_line_push(&self->line, model->delay_s[model->delays - 1], is_gap, sample->time_s,
+                 sample->current_a);
     advance_load(self, sample, known_c);
     for (int32_t k = 0; k < model->effects; ++k) {
         const cg_effect *effect = &model->effect[k];

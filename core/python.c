@@ -58,7 +58,8 @@ static int begin(Core *self, PyObject *args)
         PyErr_NoMemory();
         return -1;
     }
-    const cg_line line = {self->storage, size, 0, 0, block, spacing_s, 0.0};
+    cg_line line = CG_LINE(self->storage, size, spacing_s);
+    line.block = block;
     cg_init(&self->estimator, &self->model, &of_user, &line, self->skew);
     self->estimate = (PyTypeObject *)Py_NewRef(estimate);
     self->statuses = Py_NewRef(statuses);

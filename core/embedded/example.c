@@ -18,7 +18,7 @@ static cg_estimator pack;
 int main(void)
 {
     const cg_settings settings = cg_default_settings();
-    const cg_line line = {storage, PACK_LINE_SIZE, 0, 0, 0, PACK_SPACING_S, 0.0};
+    const cg_line line = CG_LINE(storage, PACK_LINE_SIZE, PACK_SPACING_S);
     double time_s, current_a, voltage_v, temperature_c;
     char text[256];
     unsigned long lines = 0, samples = 0;

@@ -9,6 +9,7 @@
  */
 #include <math.h>
 
+#include "cangauge_internal.h"
 #include "database.h"
 #include "fram.h"
 #include "pack_model.h"
@@ -23,7 +24,6 @@
 #define MILLI (1000.0) /* of the units of the database: mA, mV, ms */
 #define DECI (10.0) /* 0.1 degC */
 #define SIGMAS (2.0) /* from the average to minimum and maximum */
-#define HALVINGS (40) /* of 0 ... 100 %: to less than a float resolves */
 
 typedef struct {
     cg_estimator estimator;
@@ -52,8 +52,7 @@ static float_t within(double percent)
 /* Begin with a SoC and its standard deviation [%]; NAN: found from the first voltage. */
 static void begin(string_s *string, double soc_pct, double std_pct)
 {
-    const cg_line line = {string->storage, PACK_LINE_SIZE, 0, 0, 0, (cg_real)PACK_SPACING_S,
-                          0.0};
+    const cg_line line = CG_LINE(string->storage, PACK_LINE_SIZE, PACK_SPACING_S);
     cg_settings settings = cg_default_settings();
     settings.initial_soc_pct = (cg_real)soc_pct;
     settings.initial_soc_std_pct = (cg_real)fmax(std_pct, (double)settings.initial_soc_std_pct);
@@ -164,19 +163,9 @@ float_t SE_GetStateOfChargeFromVoltage(int16_t voltage_mV)
 {
     const cg_real wanted_v =
         (cg_real)(((double)voltage_mV * (double)BS_NR_OF_CELL_BLOCKS_PER_STRING) / MILLI);
-    double low_pct = 0.0;
-    double high_pct = 100.0;
+    bool is_inside;
     if (!strings[0].is_begun) {
         begin(&strings[0], (double)NAN, 0.0);
     }
-    for (int k = 0; k < HALVINGS; ++k) {
-        const double middle_pct = 0.5 * (low_pct + high_pct);
-        cg_real slope;
-        if (cg_pseudo_ocv(&strings[0].estimator, (cg_real)middle_pct, &slope) < wanted_v) {
-            low_pct = middle_pct;
-        } else {
-            high_pct = middle_pct;
-        }
-    }
-    return within(0.5 * (low_pct + high_pct));
+    return within((double)cg_newton(&strings[0].estimator, wanted_v, (cg_real)50.0, &is_inside));
 }

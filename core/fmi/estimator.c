@@ -3,7 +3,7 @@
 
 void fmu_begin(fmu *self, double time_s)
 {
-    const cg_line line = {self->line, FMU_LINE, 0, 0, 0, R(FMU_SPACING_S), 0.0};
+    const cg_line line = CG_LINE(self->line, FMU_LINE, FMU_SPACING_S);
     self->model = FMU_MODEL;
     cg_settings settings = FMU_SETTINGS;
     const double initial_pct = self->value[FMU_INITIAL_SOC_PCT];

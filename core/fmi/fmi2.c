@@ -1,10 +1,22 @@
-/* fmi2.c - co-simulation by FMI 2.0 (fmi-standard.org). */
+/* fmi2.c - a unit by FMI 2.0, co-simulation (fmi-standard.org); see fmu.h. */
 #include "fmu.h"
 
 #include <stdlib.h>
 #include <string.h>
 
+#if defined(_WIN32)
+#define FMU_API __declspec(dllexport)
+#else
+#define FMU_API __attribute__((visibility("default")))
+#endif
+
 typedef enum { OK = 0, ERROR = 3 } status;
+
+typedef struct {
+    fmu_logger log;
+    void (*others[3])(void); /* memory, end of a step: not used */
+    void *environment;
+} callbacks;
 
 #define REFUSED(name) \
     FMU_API status fmi2##name(fmu *self) \
@@ -12,44 +24,35 @@ typedef enum { OK = 0, ERROR = 3 } status;
         (void)self; \
         return ERROR; \
     }
+#define REPORT(...) \
+    if (self->logger != NULL) { \
+        self->logger(self->environment, self->name, ERROR, "error", __VA_ARGS__); \
+    }
 
-typedef void (*logger)(void *environment, const char *name, int status, const char *category,
-                       const char *message, ...);
+FMU_API const char *fmi2GetTypesPlatform(void) { return "default"; }
+FMU_API const char *fmi2GetVersion(void) { return "2.0"; }
 
-typedef struct {
-    logger log;
-    void (*others[3])(void); /* memory, end of a step: not used */
-    void *environment;
-} callbacks;
-
-/* Give the simulator the message of a unit. */
-static void report(const fmu *self)
+FMU_API status fmi2Reset(fmu *self)
 {
-    ((logger)self->logger)(self->environment, self->name, ERROR, "error", self->message);
+    memcpy(self->value, FMU_START, sizeof(self->value));
+    return OK;
 }
 
-/* A new unit that reports to the simulator. */
-static fmu *instantiated(const char *name, const char *token, void (*logger)(void),
-                         void *environment)
+FMU_API fmu *fmi2Instantiate(const char *name, int type, const char *token, const char *resources,
+                             const callbacks *of, int visible, int logging)
 {
-    fmu *self = fmu_new(token);
+    (void)resources, (void)visible, (void)logging;
+    if ((type != 1) || (token == NULL) || (strcmp(token, FMU_TOKEN) != 0)) {
+        return NULL; /* co-simulation only, of this unit */
+    }
+    fmu *self = calloc(1, sizeof(fmu));
     if (self != NULL) {
-        strncpy(self->name, (name != NULL) ? name : "", FMU_TEXT - 1U);
-        self->logger = logger;
-        self->environment = environment;
+        strncpy(self->name, (name != NULL) ? name : "", sizeof(self->name) - 1U);
+        self->logger = (of != NULL) ? of->log : NULL;
+        self->environment = (of != NULL) ? of->environment : NULL;
+        (void)fmi2Reset(self);
     }
     return self;
-}
-
-static status set_reals(fmu *self, const uint32_t *reference, size_t count, const double *value)
-{
-    if (fmu_set(self, reference, count, value)) {
-        return OK;
-    }
-    if (self->logger != NULL) {
-        report(self);
-    }
-    return ERROR;
 }
 
 FMU_API void fmi2FreeInstance(fmu *self) { free(self); }
@@ -60,6 +63,16 @@ FMU_API status fmi2SetDebugLogging(fmu *self, int on, size_t count, const char *
     return OK;
 }
 
+FMU_API status fmi2SetupExperiment(fmu *self, int has_tolerance, double tolerance, double start,
+                                   int has_stop, double stop)
+{
+    (void)has_tolerance, (void)tolerance, (void)has_stop, (void)stop;
+    self->value[FMU_TIME_S] = start;
+    return OK;
+}
+
+FMU_API status fmi2EnterInitializationMode(fmu *self) { return (self != NULL) ? OK : ERROR; }
+
 FMU_API status fmi2ExitInitializationMode(fmu *self)
 {
     fmu_begin(self, self->value[FMU_TIME_S]);
@@ -68,17 +81,57 @@ FMU_API status fmi2ExitInitializationMode(fmu *self)
 
 FMU_API status fmi2Terminate(fmu *self) { return (self != NULL) ? OK : ERROR; }
 
-FMU_API status fmi2Reset(fmu *self)
+FMU_API status fmi2DoStep(fmu *self, double time_s, double step_s, int keeps_no_state)
 {
-    fmu_reset(self);
+    (void)keeps_no_state;
+    fmu_sample(self, time_s + step_s);
+    return OK;
+}
+
+FMU_API status fmi2GetReal(fmu *self, const uint32_t *reference, size_t count, double *value)
+{
+    for (size_t k = 0; k < count; ++k) {
+        if (reference[k] >= FMU_VARIABLES) {
+            return ERROR;
+        }
+        value[k] = self->value[reference[k]];
+    }
+    return OK;
+}
+
+FMU_API status fmi2GetInteger(fmu *self, const uint32_t *reference, size_t count, int *value)
+{
+    status done = OK;
+    for (size_t k = 0; (k < count) && (done == OK); ++k) {
+        double number = 0.0;
+        done = fmi2GetReal(self, &reference[k], 1, &number);
+        value[k] = (int)number;
+    }
+    return done;
+}
+
+FMU_API status fmi2SetReal(fmu *self, const uint32_t *reference, size_t count, const double *value)
+{
+    for (size_t k = 0; k < count; ++k) {
+        const unsigned place = reference[k];
+        if (place >= FMU_VARIABLES) {
+            REPORT("no variable has the value reference %u", place)
+            return ERROR;
+        }
+        const double *range = FMU_RANGE[place];
+        if (!isnan(range[0]) && !((value[k] >= range[0]) && (value[k] <= range[1]))) {
+            REPORT("the value %g of value reference %u is outside %g ... %g", value[k], place,
+                   range[0], range[1])
+            return ERROR;
+        }
+        self->value[place] = value[k];
+    }
     return OK;
 }
 
 FMU_API status fmi2GetFMUstate(fmu *self, void **state)
 {
-    if (*state == NULL) {
-        *state = malloc(sizeof(fmu));
-    }
+    *state = (*state == NULL) ? malloc(sizeof(fmu)) : *state;
     if (*state == NULL) {
         return ERROR;
     }
@@ -97,65 +150,6 @@ FMU_API status fmi2FreeFMUstate(fmu *self, void **state)
     (void)self;
     free(*state);
     *state = NULL;
-    return OK;
-}
-
-/* Integer outputs, one by one. */
-static status get_integers(const fmu *self, const uint32_t *reference, size_t count, int32_t *value)
-{
-    for (size_t k = 0; k < count; ++k) {
-        double number;
-        if (!fmu_get(self, &reference[k], 1, &number)) {
-            return ERROR;
-        }
-        value[k] = (int32_t)number;
-    }
-    return OK;
-}
-
-FMU_API const char *fmi2GetTypesPlatform(void) { return "default"; }
-FMU_API const char *fmi2GetVersion(void) { return "2.0"; }
-
-FMU_API fmu *fmi2Instantiate(const char *name, int type, const char *token, const char *resources,
-                             const callbacks *of, int visible, int logging)
-{
-    (void)resources, (void)visible, (void)logging;
-    if (type != 1) {
-        return NULL; /* co-simulation only */
-    }
-    return (of == NULL) ? instantiated(name, token, NULL, NULL)
-                        : instantiated(name, token, (void (*)(void))of->log, of->environment);
-}
-
-FMU_API status fmi2SetupExperiment(fmu *self, int has_tolerance, double tolerance, double start,
-                                   int has_stop, double stop)
-{
-    (void)has_tolerance, (void)tolerance, (void)has_stop, (void)stop;
-    self->value[FMU_TIME_S] = start;
-    return OK;
-}
-
-FMU_API status fmi2EnterInitializationMode(fmu *self) { return (self != NULL) ? OK : ERROR; }
-
-FMU_API status fmi2GetReal(fmu *self, const uint32_t *reference, size_t count, double *value)
-{
-    return fmu_get(self, reference, count, value) ? OK : ERROR;
-}
-
-FMU_API status fmi2SetReal(fmu *self, const uint32_t *reference, size_t count, const double *value)
-{
-    return set_reals(self, reference, count, value);
-}
-
-FMU_API status fmi2GetInteger(fmu *self, const uint32_t *reference, size_t count, int *value)
-{
-    return get_integers(self, reference, count, value);
-}
-
-FMU_API status fmi2DoStep(fmu *self, double time_s, double step_s, int keeps_no_state)
-{
-    (void)keeps_no_state;
-    fmu_sample(self, time_s + step_s);
     return OK;
 }
 

@@ -1,7 +1,7 @@
 /* fmu.h - a functional mock-up unit: its variables by value reference, and a step.
  *
- * `pack.c` and `estimator.c` say what a unit does, `fmi2.c` how a
- * simulator calls it; `fmu_config.h` and `fmu_model.c` are written by `cangauge export-fmu`.
+ * `pack.c` and `estimator.c` say what a unit does, `fmi2.c` how a simulator calls it. `fmu_config.h`
+ * and `fmu_model.c` are written by `cangauge export-fmu`.
  *
  * An input that is set before a step is the sample at the end of that step; between two samples the
  * current is linear. A parameter outside its range is refused with a message.
@@ -9,16 +9,8 @@
 #ifndef CANGAUGE_FMU_H
 #define CANGAUGE_FMU_H
 
-#include <stddef.h>
-
 #include "cangauge_internal.h"
 #include "fmu_config.h"
-
-#if defined(_WIN32)
-#define FMU_API __declspec(dllexport)
-#else
-#define FMU_API __attribute__((visibility("default")))
-#endif
 
 /* Value references: time and inputs first, then what the unit is given, then outputs. */
 enum {
@@ -37,7 +29,8 @@ enum {
     FMU_VOLTAGE_MODEL_V = 11
 };
 
-#define FMU_TEXT 128 /* longest name and message */
+typedef void (*fmu_logger)(void *environment, const char *name, int status, const char *category,
+                           const char *message, ...);
 
 typedef struct {
     double value[FMU_VARIABLES];
@@ -47,9 +40,8 @@ typedef struct {
     cg_skew skew;
     cg_sample last; /* pack */
     cg_sum discharged_ah; /* pack */
-    char name[FMU_TEXT]; /* of the instance */
-    char message[FMU_TEXT]; /* why values were refused */
-    void (*logger)(void); /* of the simulator, NULL without; its type is that of the interface */
+    char name[128]; /* of the instance */
+    fmu_logger logger; /* of the simulator, NULL without */
     void *environment;
 } fmu;
 
@@ -69,12 +61,5 @@ extern const fmu_parameter FMU_PARAMETER[FMU_PARAMETERS + 1];
 /* The unit: begin at a time with the values that are set, take a sample at a later time. */
 void fmu_begin(fmu *self, double time_s);
 void fmu_sample(fmu *self, double time_s);
-
-/* For the interfaces: a new unit (NULL without memory or for another token), and its values. */
-fmu *fmu_new(const char *token);
-void fmu_reset(fmu *self);
-bool fmu_get(const fmu *self, const uint32_t *reference, size_t count, double *value);
-/* On failure `message` says why. */
-bool fmu_set(fmu *self, const uint32_t *reference, size_t count, const double *value);
 
 #endif

@@ -3,11 +3,9 @@
 
 #include <string.h>
 
-#define NEVER_S 1e12 /* between samples the current is linear, however long */
-
 void fmu_begin(fmu *self, double time_s)
 {
-    const cg_line line = {self->line, FMU_LINE, 0, 0, 0, R(FMU_SPACING_S), 0.0};
+    const cg_line line = CG_LINE(self->line, FMU_LINE, FMU_SPACING_S);
     self->model = FMU_MODEL;
     self->model.capacity_ah = self->value[FMU_CAPACITY_AH];
     for (int32_t k = 0; k < FMU_PARAMETERS; ++k) {
@@ -18,9 +16,7 @@ void fmu_begin(fmu *self, double time_s)
                              : &effect->tau_s[parameter->place - CG_VALUES];
         *place = self->value[parameter->reference];
     }
-    cg_settings settings = FMU_SETTINGS;
-    settings.gap_s = NEVER_S;
-    cg_init(&self->core, &self->model, &settings, &line, NULL);
+    cg_init(&self->core, &self->model, &FMU_SETTINGS, &line, NULL);
     self->discharged_ah = 0.0;
     self->last.time_s = NAN;
     fmu_sample(self, time_s);
@@ -41,7 +37,8 @@ void fmu_sample(fmu *self, double time_s)
     }
     self->last.time_s = time_s;
     self->last.current_a = counted;
-    cg_advance(core, &now, now.temperature_c);
+    /* No gap: between samples the current is linear, however long. */
+    cg_advance(core, &now, now.temperature_c, false);
     const double soc_pct =
         value[FMU_INITIAL_SOC_PCT] - (100.0 * self->discharged_ah / model->capacity_ah);
     cg_real slope;

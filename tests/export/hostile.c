@@ -29,7 +29,7 @@ int main(void)
 {
     const cg_settings settings = cg_default_settings();
     for (int run = 0; run < 400; ++run) {
-        const cg_line line = {storage, PACK_LINE_SIZE, 0, 0, 0, PACK_SPACING_S, 0.0};
+        const cg_line line = CG_LINE(storage, PACK_LINE_SIZE, PACK_SPACING_S);
         double time_s = 0.0;
         cg_init(&pack, &pack_model, &settings, &line, &skew);
         for (int k = 0; k < 500; ++k) {

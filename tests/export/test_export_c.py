@@ -15,6 +15,7 @@ from typer.testing import CliRunner
 
 from cangauge.cli.app import app
 from cangauge.errors import InputError
+from cangauge.estimation.estimator import Estimator
 from cangauge.estimation.offline import run_estimator, samples_of
 from cangauge.estimation.settings import EstimatorSettings
 from cangauge.extras.embedded.c_source import CORE_HEADERS, CORE_SOURCES, TabulatedModel
@@ -23,9 +24,10 @@ from cangauge.identify.fit import fit
 from cangauge.logs.read import read_log
 from cangauge.model.model_file import Model
 from cangauge.model.published import leaf_2012_model_file
-from cangauge.types import Sample
-from estimation.test_snapshot import extended_by
+from cangauge.types import Reason, Sample
+from estimation.test_snapshot import EVENTFUL, extended_by
 from live import in_process
+from synthetic import synthetic_log
 
 PLAIN = leaf_2012_model_file()
 EFFECTS = [
@@ -82,9 +84,8 @@ def test_core_compiles_without_a_warning(folders: dict[str, Path], real: str) ->
 @needs_make
 def test_sanitizers_find_nothing(folders: dict[str, Path]) -> None:
     flags = [*STRICT, "-g", "-fsanitize=address,undefined", "-fno-sanitize-recover=all"]
-    own = ["pack_model.c", "frames.c", "soc_frames.c", "test.c"]
+    own = ["pack_model.c", "frames.c", "test.c"]
     folder = folders["effects"]
-    flags.remove("-Wconversion")  # cantools' frames
     run(folder, "cc", *flags, "-DCANGAUGE_CONFIG", *CORE_SOURCES, *own, "-lm", "-o", "sanitized")
     assert "PASSED" in run(folder, "./sanitized")
 
@@ -100,6 +101,64 @@ def test_no_sample_leaves_the_language(folders: dict[str, Path], which: str, rea
     program = f"hostile-{real}"
     run(folders[which], "cc", *flags, "-DCANGAUGE_CONFIG", *files, "-lm", "-o", program)
     assert "PASSED" in run(folders[which], f"./{program}")
+
+
+AT = 400
+"""Sample of `EVENTFUL` at which another table is set."""
+
+
+def switched(folder: Path, first: Model, later: Model, real: str) -> np.ndarray:
+    """Return SoC, its deviation, SoC by voltage and by counting, and reasons of `EVENTFUL`."""
+    for name, model in (("pack", first), ("later", later)):
+        export_c(model, folder / name, period_s=0.2)
+    shutil.copy(folder / "later" / "pack_model.c", folder / "pack" / "later.c")
+    shutil.copy(Path(__file__).with_name("table.c"), folder / "pack")
+    flags = [*STRICT[:3], "-DCANGAUGE_CONFIG", f"-DCANGAUGE_REAL={real}", STRICT[-1]]
+    run(folder / "pack", "cc", *flags, "-Dpack_model=later_model", "-c", "later.c")
+    sources = [*CORE_SOURCES, "pack_model.c", "later.o", "table.c"]
+    run(folder / "pack", "cc", *flags, *sources, "-lm", "-o", "table")
+    done = subprocess.run(
+        ["./table", str(AT)], check=True, cwd=folder / "pack", capture_output=True, text=True,
+        input="".join(",".join(map(repr, sample)) + "\n" for sample in EVENTFUL), timeout=60,
+    )  # fmt: skip
+    return np.array([line.split() for line in done.stdout.splitlines()], float)
+
+
+def short_lined() -> Model:
+    data = PLAIN.model_dump()
+    data["published"]["delays_s"] = [0.0, 1.0, 2.0, 3.0]
+    return Model.model_validate(data)
+
+
+@needs_make
+@pytest.mark.parametrize("real", ["double", "float"])
+@pytest.mark.parametrize("which", ["fitted", "shorter"])
+def test_a_later_table_goes_on_as_python_does(which: str, real: str, tmp_path: Path) -> None:
+    if which == "fitted":
+        log = synthetic_log(hours=0.5, rate_hz=1.0, start_pct=85.0, end_pct=60.0)
+        first, later = Model.prior("oxide", 96, 60.0), fit(log, capacity_ah=58.0).model
+    else:
+        first, later = PLAIN, short_lined()
+    found = switched(tmp_path, first, later, real)
+    before, after = (Estimator(TabulatedModel.of(model)) for model in (first, later))
+    expected = [before.step(sample) for sample in EVENTFUL[:AT]]
+    after.take_over(before)
+    expected += [after.step(sample) for sample in EVENTFUL[AT:]]
+    atol, share = (1e-9, 1.0) if real == "double" else (0.02, 0.99)
+    np.testing.assert_allclose(found[:, :4], [each[1:5] for each in expected], rtol=0.0, atol=atol)
+    assert np.mean(found[:, 4] == [int(each.reasons) for each in expected]) >= share
+
+
+@needs_make
+def test_a_table_with_longer_delays_fills_its_delay_line(tmp_path: Path) -> None:
+    short, long = short_lined(), PLAIN
+    reasons = switched(tmp_path, short, long, "double")[:, 4].astype(int)
+    is_filling = reasons & int(Reason.DELAY_LINE_FILLING) != 0
+    time_s = np.array([sample.time_s for sample in EVENTFUL])
+    filled_s = long.voltage_model().delay_s[-1]
+    assert not is_filling[AT - 1]
+    after = (time_s >= time_s[AT]) & (time_s < time_s[AT] + filled_s - 4.0)
+    assert is_filling[after].all()
 
 
 @pytest.mark.skipif(not shutil.which("cppcheck"), reason="no cppcheck")
@@ -136,6 +195,9 @@ def test_a_voltage_update_keeps_its_cost_on_a_cortex_m4f(
     steps = re.search(r"a sample, (\d+) where its voltage is used", output)
     assert steps is not None
     assert int(steps[1]) <= 24000
+    memory = re.search(r"bytes: state (\d+), delay line (\d+)", output)
+    assert memory is not None
+    assert int(memory[1]) + int(memory[2]) <= 4096
 
 
 def test_the_table_is_the_published_equation() -> None:

@@ -61,7 +61,7 @@ def test_what_the_build_names_compiles(
 ) -> None:
     build = (exported(tmp_path, platform) / "CMakeLists.txt").read_text()
     sources = re.findall(r"[a-z_]+\.c\b", build)
-    assert len(sources) == 6
+    assert len(sources) == 5
     defines = re.search(r"CANGAUGE_CONFIG CANGAUGE_REAL=float", build)
     assert defines is not None
     compile_all(tmp_path, stubs, *sources, example, defines=tuple(defines[0].split()))

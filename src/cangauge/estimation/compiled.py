@@ -250,10 +250,12 @@ class CompiledEstimator(Estimator):
 
     def _hypotheses_state(self) -> HypothesesState:
         record, n = self._record["filter"], 4 + self._online.functions.number
+        row, column = np.indices((n, n))
+        high, low = np.maximum(row, column), np.minimum(row, column)
         filters = [
             FilterState(
                 ekf["x"][:n].tolist(),
-                ekf["p"][:n, :n].tolist(),
+                ekf["p"][high * (high + 1) // 2 + low].tolist(),
                 float(ekf["evidence"]),
                 BiasState(ekf["b"].tolist(), ekf["b_p"].tolist(), ekf["b_v"][:n].tolist()),
             )
@@ -278,11 +280,13 @@ class CompiledEstimator(Estimator):
         kind = self._forms[number].kind
         if kind == "time_skew":
             skew = self._part("skew", layout.SKEW)[0]
-            waiting = _ring(skew["waiting"], skew["waiting_first"], skew["waiting_count"])
-            currents = _ring(skew["at"], skew["first"], skew["count"])
+            waiting, at = (
+                skew["at"][np.arange(skew[oldest], skew["count"]) % skew["at"].size]
+                for oldest in ("waiting", "first")
+            )
             readings = [number for each in waiting.tolist() for number in each]
-            times = currents["time_s"].tolist()
-            return [float(len(waiting)), *readings, *times, *currents["current_a"].tolist()]
+            currents = at["time_s"].tolist() + at["current_a"].tolist()
+            return [float(len(waiting)), *readings, *currents]
         lags = self._record["effect"][number]["lag"]
         return _numbers(lags, _LAG[:1] if kind == "resistance_step" else _LAG)
 
@@ -313,7 +317,8 @@ class CompiledEstimator(Estimator):
         hypotheses = self.hypotheses.snapshot()
         for ekf, state in zip(record["filter"]["ekf"], hypotheses.filters, strict=False):
             n = len(state.x)
-            ekf["x"][:n], ekf["p"][:n, :n], ekf["evidence"] = state.x, state.p, state.evidence
+            ekf["x"][:n], ekf["evidence"] = state.x, state.evidence
+            ekf["p"][: n * (n + 1) // 2] = np.array(state.p)[np.tril_indices(n)]
             ekf["b"], ekf["b_p"], ekf["b_v"][:n] = state.bias.b, state.bias.p, state.bias.v
         record["filter"]["hypotheses"] = len(hypotheses.filters)
         record["filter"]["prior_log_odds"] = hypotheses.prior_log_odds
@@ -335,12 +340,12 @@ class CompiledEstimator(Estimator):
                 skew, waiting = self._part("skew", layout.SKEW)[0], int(state[0])
                 readings = np.array(state[1 : 1 + 4 * waiting]).reshape(waiting, 4)
                 kept = np.array(state[1 + 4 * waiting :]).reshape(2, -1)
+                count = skew["count"] = max(waiting, kept.shape[1])
+                skew["waiting"], skew["first"] = count - waiting, count - kept.shape[1]
+                at = skew["at"]
+                at["time_s"][skew["first"] : count], at["current_a"][skew["first"] : count] = kept
                 for column, name in enumerate(layout.SAMPLE.names or ()):
-                    skew["waiting"][name][:waiting] = readings[:, column]
-                skew["at"]["time_s"][: kept.shape[1]] = kept[0]
-                skew["at"]["current_a"][: kept.shape[1]] = kept[1]
-                skew["waiting_first"] = skew["first"] = 0
-                skew["waiting_count"], skew["count"] = waiting, kept.shape[1]
+                    at[name][skew["waiting"] : count] = readings[:, column]
             else:
                 lags = self._record["effect"][number]["lag"]
                 _set_lags(lags, state, 1 if kind == "resistance_step" else 3)
@@ -367,7 +372,3 @@ def _set_lags(lags: NDArray[Any], numbers: Sequence[float], each: int) -> None:
         lag["is_started"] = True
         for name, value in zip(_LAG, numbers[first : first + each], strict=False):
             lag[name] = value
-
-
-def _ring(items: NDArray[Any], first: int, count: int) -> NDArray[Any]:
-    return items[(first + np.arange(count)) % items.size]

@@ -22,6 +22,7 @@ OCV, LAGS, VALUES, TESTED = 8, 5, 12, 64
 CURRENTS: Final = DELAYS + LOW_PASSES
 LOADS: Final = CURRENTS + 2
 STATES: Final = FUNCTIONS + 4
+PAIRS: Final = STATES * (STATES + 1) // 2
 SUMS: Final = LOADS + 5
 """Upper limits of a model, as in the header."""
 
@@ -75,14 +76,12 @@ SETTINGS: Final = _structure(
 )
 SAMPLE: Final = _structure("d:time_s d:current_a d:voltage_v d:temperature_c")
 CURRENT: Final = _structure("d:time_s d:current_a")
-LINE: Final = _structure("l:at i:size i:first i:count i:block d:spacing_s d:since_s")
+LINE: Final = _structure("l:at i:size i:first i:count i:block d:spacing_s d:since_s d:base_s")
 SKEW: Final = _structure(
-    "sample:waiting[WAITING] current:at[WAITING] i:waiting_first i:waiting_count i:first i:count",
-    sample=SAMPLE, current=CURRENT,
-)  # fmt: skip
+"sample:at[WAITING] l:first l:waiting l:count", sample=SAMPLE)  # fmt: skip
 LAG: Final = _structure("d:time_s d:input d:value b:is_started")
 _EKF: Final = _structure(
-    "d:x[STATES] d:p[STATES,STATES] d:evidence d:b[2] d:b_p[2,2] d:b_v[STATES,2] d:innovation2"
+    "d:x[STATES] d:p[PAIRS] d:evidence d:b[2] d:b_p[2,2] d:b_v[STATES,2] d:innovation2"
 )
 STATE: Final = _structure(
     "clock:clock counter:counter block:block filter:filter memory:memory lag:low_pass[LOW_PASSES]"

@@ -187,14 +187,14 @@ class _Unit:
     @property
     def sources(self) -> list[str]:
         """Names of the C files."""
-        return [*CORE_SOURCES, "fmu.c", f"{self.kind}.c", "fmi2.c", "fmu_model.c"]
+        return [*CORE_SOURCES, f"{self.kind}.c", "fmi2.c", "fmu_model.c"]
 
     def write_sources(self, folder: Path) -> None:
         """Write the sources, with the constants of the model."""
         folder.mkdir()
         for name in (*CORE_SOURCES, *CORE_HEADERS):
             shutil.copyfile(shared_file("core", name), folder / name)
-        for name in ("fmu.h", "fmu.c", f"{self.kind}.c", "fmi2.c"):
+        for name in ("fmu.h", f"{self.kind}.c", "fmi2.c"):
             shutil.copyfile(shared_file("core", f"fmi/{name}"), folder / name)
         config = {
             "FMU_TOKEN": f'"{self.token}"',

@@ -10,18 +10,13 @@ from collections.abc import Mapping
 from typing import Final, Literal
 
 from cangauge._version import __version__
+from cangauge.extras.embedded.c_source import CORE_HEADERS, CORE_SOURCES
 
 Platform = Literal["generic", "esp-idf", "zephyr", "arduino", "foxbms"]
 
-SOURCES: Final = (
-    "cangauge.c", "cangauge_filter.c", "cangauge_model.c", "pack_model.c", "frames.c",
-    "soc_frames.c",
-)  # fmt: skip
+SOURCES: Final = (*CORE_SOURCES, "pack_model.c", "frames.c")
 """What a program compiles."""
-HEADERS: Final = (
-    "cangauge.h", "cangauge_internal.h", "cangauge_config.h", "pack_model.h", "frames.h",
-    "soc_frames.h",
-)  # fmt: skip
+HEADERS: Final = (*CORE_HEADERS, "cangauge_config.h", "pack_model.h", "frames.h")
 ABOUT: Final = "State of charge of a battery pack from current, voltage and temperature"
 
 _GAUGE: Final = """\
@@ -37,7 +32,7 @@ static float temperature_c(void) { return 25.0F; }
 static void gauge_begin(void)
 {
     const cg_settings settings = cg_default_settings();
-    const cg_line line = {storage, PACK_LINE_SIZE, 0, 0, 0, PACK_SPACING_S, 0.0};
+    const cg_line line = CG_LINE(storage, PACK_LINE_SIZE, PACK_SPACING_S);
     cg_init(&pack, &pack_model, &settings, &line, &skew);
 }
 
