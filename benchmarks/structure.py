@@ -27,33 +27,11 @@ from types import FrameType
 from typing import Any
 
 LAYERS = (
-    (
-        "errors",
-        "_typing",
-        "_version",
-        "_files",
-        "_config",
-        "_logging",
-        "_text",
-        "_resources",
-        "_dataframes",
-    ),
-    ("logs",),
-    ("model",),
-    ("inference",),
-    ("identify",),
-    ("estimate", "estimation"),
-    ("diagnosis",),
-    ("bus",),
-    ("service",),
-    ("replay",),
-    ("inspect",),
-    ("validation",),
-    ("fleet",),
-    ("report",),
-    ("cli",),
+    "logs", "model", "identify", "estimation", "diagnosis", "bus", "service", "replay", "inspect",
+    "cli", "extras",
 )  # fmt: skip
-"""Packages from the lowest to the highest; an import of a higher one by a lower one is upward."""
+"""Packages from the lowest to the highest, above the root files; an import of a higher one by a
+lower one is upward."""
 
 
 @dataclass
@@ -110,9 +88,11 @@ def imports_of(modules: dict[str, Module]) -> dict[str, set[str]]:
 
 
 def layer_of(name: str) -> int:
-    """Return a module's layer, the lowest being 0; the package itself is above all."""
+    """Return a module's layer; −1: a root file. What hands the names on is above all."""
     top = name.removeprefix("cangauge").strip(".").split(".")[0]
-    return next((at for at, layer in enumerate(LAYERS) if top in layer), len(LAYERS))
+    if top in LAYERS:
+        return LAYERS.index(top)
+    return -1 if top not in {"", "__main__"} else len(LAYERS)
 
 
 def upward_imports(modules: dict[str, Module]) -> list[tuple[str, str]]:
@@ -135,6 +115,40 @@ def public_names(modules: dict[str, Module]) -> int:
         and not node.name.startswith("_")
         and not any(part.startswith("_") and part != "__init__" for part in name.split("."))
     )
+
+
+def constants_of(module: Module) -> int:
+    """Return how many names of a module, in capitals, stand for numbers written there."""
+    count = 0
+    for node in module.tree.body:
+        if isinstance(node, ast.Assign | ast.AnnAssign) and node.value is not None:
+            targets = node.targets if isinstance(node, ast.Assign) else [node.target]
+            names = [x.id for each in targets for x in ast.walk(each) if isinstance(x, ast.Name)]
+            if all(map(str.isupper, names)) and _is_number(node.value):
+                count += len(names)
+    return count
+
+
+def _is_number(value: ast.expr) -> bool:
+    try:
+        found = ast.literal_eval(value)
+    except ValueError:  # 1.0 / 3.0
+        return isinstance(value, ast.BinOp) and _is_number(value.left) and _is_number(value.right)
+    values = found if isinstance(found, tuple) else (found,)
+    return bool(values) and all(type(each) in {int, float} for each in values)
+
+
+def packages(modules: dict[str, Module]) -> Iterator[tuple[str, str]]:
+    """Yield each package, or extra, with its modules, lines and numeric constants."""
+    found: dict[str, list[Module]] = defaultdict(list)
+    for name, module in modules.items():
+        parts = name.split(".")[1:]
+        deep = 2 if parts[:1] == ["extras"] and len(parts) > 1 else 1
+        is_file = module.path.name != "__init__.py" and len(parts) == 1
+        found["root files" if is_file or not parts else " ".join(parts[:deep])].append(module)
+    for name, of_it in sorted(found.items()):
+        lines, constants = sum(m.lines for m in of_it), sum(map(constants_of, of_it))
+        yield name, f"{len(of_it)} modules, {lines} lines, {constants} numeric constants"
 
 
 def docstring_coverage(modules: dict[str, Module]) -> dict[str, tuple[int, int]]:
@@ -297,6 +311,7 @@ def main() -> None:
             )
         )
     modules = read_modules(root / "src/cangauge", "cangauge.")
+    rows += packages(modules)
     importers: Counter[str] = Counter()
     by: dict[str, set[str]] = defaultdict(set)
     for name, others in imports_of(modules).items():
