@@ -52,7 +52,7 @@ def steps(page: str) -> list[Step]:
     return found
 
 
-IN_SUITE = ("tutorial.md", "init.md", "howto/reading-a-diagnosis.md")
+IN_SUITE = ("tutorial.md", "init.md")
 """Pages that run on every change; the others run in `make nightly`."""
 
 
