@@ -173,6 +173,8 @@ static void ekf_update(const cg_model *model, cg_ekf *ekf, const cg_means *block
         x[k] = ekf->x[k];
     }
     bool is_close = false;
+    cg_real part = R(1.0);
+    cg_real last_pct = R(0.0);
     for (int32_t step = 0; (step < (is_wide ? ITERATIONS_AT_MOST : 1)) && !is_close; ++step) {
         cg_real noise;
         const cg_real voltage_v = measurement(model, x, block, at.h, &noise);
@@ -181,12 +183,17 @@ static void ekf_update(const cg_model *model, cg_ekf *ekf, const cg_means *block
         for (int32_t k = 0; k < size; ++k) {
             at.innovation -= at.h[k] * (ekf->x[k] - x[k]);
         }
-        const cg_real before = x[CG_X_SOC];
+        const cg_real to_pct = cg_clip(ekf->x[CG_X_SOC] + (at.gain[CG_X_SOC] * at.innovation),
+                                       R(LOWEST_PCT), R(HIGHEST_PCT));
+        const cg_real step_pct = to_pct - x[CG_X_SOC];
+        part *= ((step_pct * last_pct) < (R(-0.5) * cg_square(last_pct))) ? R(0.5) : R(1.0); /* it went too far */
+        last_pct = step_pct;
         for (int32_t k = 0; k < size; ++k) {
-            x[k] = ekf->x[k] + (at.gain[k] * at.innovation);
+            const cg_real to =
+                (k == CG_X_SOC) ? to_pct : (ekf->x[k] + (at.gain[k] * at.innovation));
+            x[k] = (part == R(1.0)) ? to : (x[k] + (part * (to - x[k])));
         }
-        x[CG_X_SOC] = cg_clip(x[CG_X_SOC], R(LOWEST_PCT), R(HIGHEST_PCT));
-        is_close = cg_fabs(x[CG_X_SOC] - before) < R(CLOSE_PCT);
+        is_close = cg_fabs(step_pct) < R(CLOSE_PCT);
     }
     for (int32_t k = 0; k < size; ++k) {
         ekf->x[k] = x[k];

@@ -156,15 +156,21 @@ class SocFilter(ExtendedKalmanFilter):  # type: ignore[misc] # filterpy has no t
         """Correct the state by the mean voltage of a block."""
         prior, x = self.x, self.x
         iterations = ITERATIONS_AT_MOST if self.P[SOC, SOC] > LINEAR_PCT**2 else 1
+        part, last_pct = 1.0, 0.0
         for _ in range(iterations):
             voltage_v, self.H, self.R = self.measurement(x, block)
             PHt = self.P @ self.H
             self.S = float(self.H @ PHt) + self.R
             self.K = PHt / self.S
             self.y = block.voltage_v - voltage_v - float(self.H @ (prior - x))
-            before, x = x[SOC], prior + self.K * self.y
-            x[SOC] = min(max(x[SOC], LOWEST_PCT), HIGHEST_PCT)
-            if abs(x[SOC] - before) < CLOSE_PCT:
+            to = prior + self.K * self.y
+            to[SOC] = min(max(to[SOC], LOWEST_PCT), HIGHEST_PCT)
+            step_pct = float(to[SOC] - x[SOC])
+            if step_pct * last_pct < -0.5 * last_pct**2:
+                part *= 0.5  # it went too far: where the slope changes, full steps circle
+            last_pct = step_pct
+            x = to if part == 1.0 else x + part * (to - x)
+            if abs(step_pct) < CLOSE_PCT:
                 break
         self.x = x
         self._condition(PHt, block.drop_v)
