@@ -6,8 +6,20 @@
 #include <stdio.h>
 
 #include "frames.h"
-#include "golden.h"
 #include "pack_model.h"
+
+typedef struct {
+    double time_s;
+    double current_a;
+    double voltage_v;
+    double temperature_c;
+    double number[4]; /* SoC, its deviation, by voltage, by counting [%] */
+    int32_t status;
+    uint32_t reasons;
+    uint8_t frame[8];
+} golden;
+
+#include "golden.h"
 
 #ifdef CG_CLOCK
 #include "clock.h"

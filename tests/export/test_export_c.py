@@ -296,7 +296,7 @@ def test_a_file_in_place_of_the_folder_is_refused(tmp_path: Path) -> None:
     PLAIN.save(tmp_path / "pack.json")
     (tmp_path / "ecm.py").write_text("kept")
     arguments = ["export-c", "-m", str(tmp_path / "pack.json"), "-o", str(tmp_path / "ecm.py")]
-    with pytest.raises(InputError, match="is a file"):
+    with pytest.raises(InputError, match="File exists"):
         CliRunner().invoke(app, arguments, catch_exceptions=False)
     assert (tmp_path / "ecm.py").read_text() == "kept"
 

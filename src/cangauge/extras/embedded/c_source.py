@@ -18,9 +18,8 @@ from cangauge.model.voltage_model import HermiteCurve, PublishedCurve, VoltageMo
 
 CORE_SOURCES: Final = ("cangauge.c", "cangauge_filter.c", "cangauge_model.c")
 CORE_HEADERS: Final = ("cangauge.h", "cangauge_internal.h")
-WIDE: Final = ("ocv_v", "epsilon", "skew_s")
-"""Fields that are doubles where the others are floats."""
-
+WIDE: Final = ("ocv_v", "epsilon", "skew_s", "golden")
+"""Fields that are doubles where the others are floats, and rows of the tests."""
 
 EDGE_PCT: Final = 1e-3
 """Distance from the identified SoC at which a table has the slope beyond it [%]: the curve has a

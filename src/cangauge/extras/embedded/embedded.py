@@ -26,12 +26,13 @@ from cangauge.extras.embedded.c_source import (
     CoreConstants,
     TabulatedModel,
     exported_constants,
+    initialiser,
     line_size,
     model_definition,
 )
 from cangauge.extras.embedded.platforms import Platform, arranged
 from cangauge.model.model_file import Model
-from cangauge.types import Estimate, Sample
+from cangauge.types import Sample
 
 EMBEDDED: Final = (
     "Makefile", "frames.c", "frames.h", "example.c", "test.c", "clock.h", "startup.c", "mps2.ld",
@@ -177,46 +178,16 @@ extern const cg_model pack_model;
 
 def _golden(model: Model, period_s: float) -> str:
     """Return the drive of the tests, and what this package estimates on it."""
-    reference = Estimator(model, EstimatorSettings())
-    publisher = SocPublisher()
-    rows = []
+    reference, publisher = Estimator(model, EstimatorSettings()), SocPublisher()
+    rows: list[str] = []
     for sample in drive_with_events(model, period_s):
         found = reference.step(sample)
-        rows.append(_golden_row(sample, found, publisher.estimate_frame(found).data))
-    return "\n".join([_GOLDEN.replace("NUMBER", str(len(rows))), *rows, "};", "", "#endif", ""])
-
-
-def _golden_row(sample: Sample, found: Estimate, frame: bytes | bytearray) -> str:
-    def plain(value: float) -> str:
-        return "NAN" if math.isnan(value) else repr(float(value))
-
-    estimated = (found.soc_pct, found.soc_std_pct, found.soc_newton_pct, found.soc_coulomb_pct)
-    inputs = ", ".join(map(plain, sample))
-    outputs = ", ".join(map(plain, estimated))
-    octets = ", ".join(map(str, frame))
-    flags = f"{int(found.status)}, {int(found.reasons)}U"
-    return f"    {{{inputs}, {{{outputs}}}, {flags}, {{{octets}}}}},"
-
-
-_GOLDEN: Final = """#ifndef GOLDEN_H
-#define GOLDEN_H
-
-#include <math.h>
-#include <stdint.h>
-
-typedef struct {
-    double time_s;
-    double current_a;
-    double voltage_v;
-    double temperature_c;
-    double number[4]; /* SoC, its deviation, by voltage, by counting [%] */
-    int32_t status;
-    uint32_t reasons;
-    uint8_t frame[8];
-} golden;
-
-#define GOLDEN_SAMPLES NUMBER
-static const golden golden_samples[GOLDEN_SAMPLES] = {"""
+        flags = int(found.status), f"{int(found.reasons)}U"
+        frame = list(publisher.estimate_frame(found).data)
+        row = [*sample, list(found[1:5]), *flags, frame]
+        rows.append(f"    {initialiser(row, 'golden')},\n")
+    head = f"#define GOLDEN_SAMPLES {len(rows)}\nstatic const golden golden_samples[] = {{\n"
+    return f"{head}{''.join(rows)}}};\n"
 
 
 def drive_with_events(model: Model, period_s: float) -> Iterator[Sample]:

@@ -359,12 +359,9 @@ def _add(parent: ET.Element, reference: int, item: Variable) -> None:
 
 
 def _compiler() -> list[str]:
-    """Return the command of the compiler: `CC` with its options, or the first that is found."""
-    given = shlex.split(os.environ.get("CC", ""))
-    for name, *options in [given] if given else [["cc"], ["gcc"], ["clang"]]:
-        if found := shutil.which(name):
-            return [found, *options]
-    raise InputError(
-        "no C compiler", value=" ".join(given) or None,
-        cure="install gcc or clang, or name one in CC",
-    )  # fmt: skip
+    """Return the command of the compiler: `CC` with its options, or `cc`."""
+    name, *options = shlex.split(os.environ.get("CC") or "cc")
+    if found := shutil.which(name):
+        return [found, *options]
+    cure = "install gcc or clang, or name one in CC"
+    raise InputError("no C compiler", value=name, cure=cure)
