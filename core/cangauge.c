@@ -92,8 +92,6 @@ static bool clock_time(cg_clock *clock, cg_time stamp_s, cg_time *time_s)
         shift_s += stamp_s - clock->behind_s - step_s;
     } else if (step_s > LONGEST_INTERRUPTION_S) {
         shift_s += LONGEST_INTERRUPTION_S - step_s;
-    } else {
-        /* the usual step */
     }
     *time_s = stamp_s + shift_s;
     if ((*time_s - clock->last_s) < SHORTEST_STEP_S) {
@@ -345,8 +343,6 @@ static void close_block(cg_estimator *self, cg_time time_s)
         memory->contradicted_until_s = time_s + CONTRADICTED_S;
     } else if (cg_filter_is_rejected(filter) && !was_rejected) {
         memory->contradicted_until_s = time_s + CONTRADICTED_S;
-    } else {
-        /* as before */
     }
     memory->is_known = true;
     test_model(self, time_s);
@@ -497,8 +493,6 @@ static void follow(cg_estimator *self, const cg_sample *sample, const charge_ste
         memory->rest_since_s = (cg_time)NAN;
     } else if (isnan(memory->rest_since_s)) {
         memory->rest_since_s = sample->time_s;
-    } else {
-        /* still at rest */
     }
     if (charge->seconds > R(REST_S)) {
         memory->rest_since_s = sample->time_s - (cg_time)charge->seconds;
@@ -802,34 +796,14 @@ void cg_set_table(cg_estimator *self, const cg_model *model)
     }
 }
 
-/* Sum of the numbers that go on: finite only if each of them is. */
-static cg_sum sum_of(const cg_state *state, const cg_model *model)
-{
-    const cg_counter *counter = &state->counter;
-    cg_sum total = state->clock.shift_s + (cg_sum)counter->current_a +
-                   (cg_sum)counter->mean_square_a2 + (cg_sum)counter->mean_a +
-                   counter->discharged_pct + counter->moved_pct + counter->counted_s +
-                   counter->gap_var_pct2 + state->filter.prior_log_odds;
-    for (int32_t k = 0; k < model->low_passes; ++k) {
-        total += (cg_sum)state->low_pass[k].input + (cg_sum)state->low_pass[k].value;
-    }
-    for (int32_t k = 0; k < model->effects; ++k) {
-        for (int32_t j = 0; j < model->effect[k].lags; ++j) {
-            const cg_lag *lag = &state->effect[k].lag[j];
-            total += (cg_sum)lag->input + (cg_sum)lag->value;
-        }
-    }
-    return total;
-}
-
 static bool is_plausible(const cg_state *state, const cg_model *model)
 {
     const cg_memory *memory = &state->memory;
     const cg_filter *filter = &state->filter;
     return (memory->samples >= 0) && (memory->innovations >= 0) &&
            (memory->innovations <= model->tested_blocks) && (filter->hypotheses >= 1) &&
-           (filter->hypotheses <= 2) && isfinite(sum_of(state, model)) &&
-           cg_filter_is_valid(filter, model);
+           (filter->hypotheses <= 2) && isfinite(state->counter.discharged_pct) &&
+           isfinite(state->counter.counted_s) && cg_filter_is_valid(filter, model);
 }
 
 bool cg_restore(cg_estimator *self, const cg_state *state, cg_time age_s)

@@ -380,7 +380,8 @@ void cg_init(cg_estimator *self, const cg_model *model, const cg_settings *setti
              const cg_line *line, cg_skew *skew);
 
 /* Continue from a state that was copied, after cg_evaluate. `age_s`: least time since then by
- * another clock; NAN: none measured it. False: implausible numbers, nothing is changed. */
+ * another clock; NAN: none measured it. False: impossible numbers, nothing is changed; against a
+ * copy that was torn or lost a bit the caller keeps a checksum. */
 bool cg_restore(cg_estimator *self, const cg_state *state, cg_time age_s);
 
 /* Continue with the constants of another model, as one that was fitted to the pack later. SoC, offset

@@ -80,8 +80,6 @@ void cg_line_push(cg_line *line, cg_real longest_s, bool is_gap, cg_time time_s,
         line->base_s = isinf(CG_REBASE_S) ? 0.0 : time_s;
     } else if (line_entry(line, 0)->time_s >= R(CG_REBASE_S)) {
         line_rebase(line);
-    } else {
-        /* as before */
     }
     const cg_real now_s = (cg_real)(time_s - line->base_s);
     if ((line->count > 1) &&
@@ -89,8 +87,6 @@ void cg_line_push(cg_line *line, cg_real longest_s, bool is_gap, cg_time time_s,
         line->count -= 1;
     } else if (line->count == line->size) {
         line_drop(line, 1); /* memory smaller than the spacing needs */
-    } else {
-        /* room for one more */
     }
     line->count += 1;
     cg_current *newest = line_entry(line, line->count - 1);
