@@ -193,7 +193,7 @@ class Trace:
     source: Path
     entry: str
     needs: str = ""
-    """Keep only entries that call a function of a file with this ending."""
+    """Keep only entries that call a function with this ending."""
     calls: list[list[tuple[str, str]]] = field(default_factory=list)
     _open: list[tuple[str, str]] | None = None
     _entered: FrameType | None = None
@@ -218,7 +218,7 @@ class Trace:
         elif event == "call":
             self._open.append((place, name))
         elif frame is self._entered:
-            if any(each.endswith(self.needs) for each, _ in self._open):
+            if any(name.endswith(self.needs) for _, name in self._open):
                 self.calls.append(self._open)
             self._open = self._entered = None
 
@@ -261,7 +261,7 @@ def run_command(*arguments: object) -> None:
 
 def trace_frames(root: Path, data: Path, entry: str) -> Trace:
     """Trace every frame of a Leaf capture through the offline path of the service."""
-    trace = Trace(root / "src/cangauge", entry, needs="estimation/estimator.py")
+    trace = Trace(root / "src/cangauge", entry, needs="Pipeline._estimate")
     model = root / "replay/leaf2012_published_model.json"
     with tempfile.TemporaryDirectory() as folder:
         arguments = ("-m", model, "-o", Path(folder) / "soc.csv", "--vehicle", "leaf_ze0")
@@ -270,20 +270,34 @@ def trace_frames(root: Path, data: Path, entry: str) -> Trace:
     return trace
 
 
-def trace_diagnosis(root: Path, data: Path, entry: str) -> Trace:
-    """Trace one diagnosis of a winter trip with two summer trips as references."""
-    trace, trips = Trace(root / "src/cangauge", entry), data / "bmw_i3"
+def trace_trips(root: Path, data: Path, fit_entry: str, diagnosis_entry: str) -> list[Trace]:
+    """Trace a fit of three summer trips, and the diagnosis of a winter trip with two of them."""
+    fit, diagnosis = (Trace(root / "src/cangauge", entry) for entry in (fit_entry, diagnosis_entry))
+    trips = data / "bmw_i3"
     with tempfile.TemporaryDirectory() as folder:
         model = Path(folder) / "model.json"
         summer = [trips / f"TripA{number}.csv.gz" for number in ("11", "13", "15")]
-        with redirect_stdout(StringIO()), redirect_stderr(StringIO()):
+        with profiled(fit):
             run_command("fit", *summer, "--capacity-ah", "60", "-o", model)
-        with profiled(trace):
+        with profiled(diagnosis):
             run_command(
                 "gap", trips / "TripB03.csv.gz", "-m", model, "--reference", summer[0],
                 "--reference", summer[1],
             )  # fmt: skip
-    return trace
+    return [fit, diagnosis]
+
+
+def traced(root: Path, data: Path, options: argparse.Namespace) -> Iterator[tuple[str, str]]:
+    """Yield what a frame, a fit and a diagnosis go through."""
+    frames = trace_frames(root, data, options.frame_entry)
+    fit, diagnosis = trace_trips(root, data, options.fit_entry, options.diagnosis_entry)
+    for name, trace, at in (
+        ("a frame that completes a sample, median", frames, statistics.median),
+        ("a frame that completes a sample, largest", frames, max),
+        ("a fit of three trips", fit, max),
+        ("a diagnosis", diagnosis, max),
+    ):
+        yield name, ", ".join(f"{value:.0f} {key}" for key, value in trace.figures(at).items())
 
 
 def main() -> None:
@@ -292,6 +306,7 @@ def main() -> None:
     parser.add_argument("--root", type=Path, default=Path(__file__).resolve().parents[1])
     parser.add_argument("--data", type=Path, help="folder of recorded logs; without: no traces")
     parser.add_argument("--frame-entry", default="service/pipeline.py:Pipeline.handle")
+    parser.add_argument("--fit-entry", default="identify/fit.py:fit")
     parser.add_argument("--diagnosis-entry", default="diagnosis/diagnose.py:diagnose")
     parser.add_argument("--list", action="store_true", help="also list upward imports")
     options = parser.parse_args()
@@ -328,18 +343,7 @@ def main() -> None:
         rows.append((f"docstrings of public functions: {key}", f"{have} of {want}"))
     rows.append(("README: lines", f"{len((root / 'README.md').read_text().splitlines())}"))
     if options.data is not None:
-        frames = trace_frames(root, options.data.resolve(), options.frame_entry)
-        for word, at in (("median", statistics.median), ("largest", max)):
-            figures = ", ".join(f"{value:.0f} {key}" for key, value in frames.figures(at).items())
-            rows.append((f"a frame that completes a sample, {word}", figures))
-        diagnosis = trace_diagnosis(root, options.data.resolve(), options.diagnosis_entry)
-        figures = diagnosis.figures(max)
-        rows.append(
-            (
-                "one diagnosis",
-                f"{figures['functions']:.0f} functions in {figures['files']:.0f} files",
-            )
-        )
+        rows += traced(root, options.data.resolve(), options)
     print("| | |\n|---|---|")
     for label, value in rows:
         print(f"| {label} | {value} |")
