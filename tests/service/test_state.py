@@ -313,6 +313,10 @@ def test_what_is_no_state_is_refused_at_the_start(tmp_path: Path) -> None:
     foreign.write_text("precious")
     with pytest.raises(InputError, match="not a cangauge state file"):
         state_path(str(foreign), {})
+    for content in (b"\0" * 4096, b"{", b"\xff\xfe{\0"):  # what a disk made of the state
+        (tmp_path / FILE_NAME).write_bytes(content)
+        assert state_path(str(tmp_path), {}) == tmp_path / FILE_NAME
+        assert state_path(str(tmp_path / FILE_NAME), {}) == tmp_path / FILE_NAME
     os.mkfifo(tmp_path / "pipe")
     with pytest.raises(InputError, match="FIFO"):
         state_path(str(tmp_path / "pipe"), {})

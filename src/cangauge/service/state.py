@@ -77,7 +77,8 @@ def state_path(given: str | None, environment: Mapping[str, str]) -> Path | None
     ------
     InputError
         If no state can be kept there. A state that is damaged or of another release, model or age
-        is set aside later. A file that is no state at all was named by mistake, and stays.
+        is set aside later, and so is whatever has the name `FILE_NAME`: a disk may have lost the
+        state. A file of another name that is no state was named by mistake, and stays.
     """
     folder = environment.get("STATE_DIRECTORY", "").split(":")[0]
     if not (given or folder):
@@ -100,7 +101,8 @@ def state_path(given: str | None, environment: Mapping[str, str]) -> Path | None
     if is_there:
         with open_regular(path) as file:
             beginning = file.read(64)
-        if beginning and b'"format": "' + STATE_FORMAT.encode() not in beginning:
+        is_state = not beginning or b'"format": "' + STATE_FORMAT.encode() in beginning
+        if not is_state and path.name != FILE_NAME:
             raise InputError(
                 "not a cangauge state file, so it is not replaced",
                 source=path,
