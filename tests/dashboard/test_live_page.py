@@ -286,5 +286,5 @@ def test_an_open_page_survives_a_restart(bench: Bench, page: Any) -> None:
     assert after == sorted(after)
     broken = 'return Bokeh.documents[0].get_model_by_name("rows").data.soc_pct.some(Number.isNaN)'
     assert page.execute_script(broken)  # no line over the time without a service
-    again = f"Recording to {bench.record.with_name('drive-0001.log')}: "
-    assert text(page, "recording").startswith(again)
+    again = bench.record.with_name("drive-0001-000001.log")
+    assert text(page, "recording").startswith(f"Recording to {again}: ")

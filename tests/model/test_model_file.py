@@ -106,6 +106,7 @@ def test_prediction_is_anchored_at_the_first_known_soc(model: Model, log: Log) -
     ("break_it", "field"),
     [
         (lambda raw: raw.update(version=99), "version"),
+        (lambda raw: raw.update(version=[]), "version"),
         (lambda raw: raw.update(format="other"), "format"),
         (lambda raw: raw.pop("capacity_ah"), "capacity_ah"),
         (lambda raw: raw.update(capacity_ah=-1.0), "capacity_ah"),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import logging
+import math
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache, cached_property
@@ -136,7 +137,8 @@ class Diagnosis:
         before = self._soc_error_pct(self.model)
         if before is None or self.likeliest is None:
             return None if before is None else (before, before)
-        return before, self._soc_error_pct(self._extended(self.likeliest)) or 0.0
+        after = self._soc_error_pct(self._extended(self.likeliest))
+        return before, math.inf if after is None else after
 
     @cached_property
     def accepted(self) -> str | None:

@@ -194,7 +194,7 @@ def fit(
             "rate_hz": rate_hz,
             "chemistry": known.name,
             "equation": equation,
-            "initial_soc_pct": initial_soc_pct if isinstance(initial_soc_pct, float) else None,
+            "initial_soc_pct": given[0] if len({*given}) == 1 else None,
             "effects": ", ".join(ids) or None,
         }
         fields: dict[str, Any] = {

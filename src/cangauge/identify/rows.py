@@ -6,7 +6,7 @@ A row passes these rules, in this order:
 2. Start-up and shut-down: rows with a voltage below half the log's median (contactor open,
    pre-charge) are removed, and rows within `GUARD_S` of one.
 3. Delay line: rows within the longest delay (70 s) of the log's start, or of the end of a gap in
-   the current longer than `gap_s`, are removed.
+   the current longer than usual (`logs.gaps.usual_gap_s`), are removed.
 """
 
 from __future__ import annotations

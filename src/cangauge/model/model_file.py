@@ -180,7 +180,7 @@ class FunctionFields(_Strict):
 
 
 class Noise(_Strict):
-    """Errors of the voltage that the coefficients do not explain, scaled by left-out logs."""
+    """Errors of the voltage that the coefficients do not explain."""
 
     level_std_v: _Volts
     """Lasts a whole log."""
@@ -196,7 +196,7 @@ class Noise(_Strict):
     residual_std_v: _Volts
     """Rms residual of the rows of the fit."""
     left_out_scale: Annotated[float, Field(ge=1, le=1e6)] = 1.0
-    """κ²: the variances above and of the coefficients are already multiplied by it."""
+    """κ²: the variances of the level and of the coefficients are already multiplied by it."""
     voltage_mae_pct: _NotNegative
     voltage_rmse_v: _Volts
     """Errors of left-out logs."""
@@ -453,7 +453,7 @@ class Model(_Strict):
                 value=raw.get("format") if isinstance(raw, dict) else type(raw).__name__,
                 cure=_CURE,
             )
-        if raw.get("version") not in {1, MODEL_VERSION}:
+        if raw.get("version") not in (1, MODEL_VERSION):  # no set: it may be a list
             raise InputError(
                 f"this release reads versions 1 and {MODEL_VERSION}",
                 source=path,

@@ -325,7 +325,7 @@ class Pipeline:
         """Restart decoder and estimator for the next log of a replay."""
         _ = self.latest  # before its estimator is replaced
         self._earlier_counts = replace(self.counts, beginnings=self._earlier_counts.beginnings + 1)
-        self._untimed = 0
+        self._untimed = self._refused = 0
         self._beginnings = self._time.beginnings
         if self._publisher is not None:
             self._publisher.restart()
@@ -445,7 +445,7 @@ class Pipeline:
             self._time.resume(latest.time_s)
         reasons = latest.reasons | Reason.INPUT_STALE
         self._latest = latest._replace(status=Status.INVALID, reasons=reasons)
-        self._report = None
+        self._estimated = self._report = None
         self._is_behind = False
         return self._latest
 
