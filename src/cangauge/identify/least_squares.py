@@ -145,7 +145,7 @@ def log_sums(
     if not total:
         low, high = float(rows.soc_pct.min()), float(rows.soc_pct.max())
         raise InputError(
-            f"the counted SoC stays outside 0–100 % ({low:.1f} … {high:.1f} %): no row can be fitted",
+            f"the counted SoC stays outside 0–100 % ({low:.1f} … {high:.1f} %): no row is left",
             source=rows.name,
             field="soc_pct",
             cure="check the SoC at the start (soc_pct, --initial-soc), or leave this log out",
