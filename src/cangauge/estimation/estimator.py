@@ -545,7 +545,7 @@ class Estimator:
     def _resume(self, state: EstimatorState, age_s: float | None) -> None:
         """Copy from a state what depends on neither model nor settings.
 
-        `age_s` is None where the estimator never stopped: the next stamp alone tells the time.
+        Without an interruption `age_s` is None, and the stamps of the samples give the time.
         """
         self._clock.restore(replace(state.clock), age_s)
         self._counter.restore(replace(state.counter))
