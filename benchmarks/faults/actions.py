@@ -198,7 +198,7 @@ def same_files(option: Literal["state", "record"]) -> Callable[[Bench], None]:
 
 def slow_clients(bench: Bench) -> None:
     """Hold 64 connections with half a request, and probe the health once a second."""
-    found = re.search(r"http://127\.0\.0\.1:(\d+)/metrics", bench.service.output())
+    found = re.search(r"http://127\.0\.0\.1:(\d+)/status", bench.service.output())
     if found is None:
         bench.incidents.append("HTTP is not served")
         return

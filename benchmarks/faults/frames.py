@@ -64,7 +64,7 @@ class Profile:
 FAST: Final = Profile("replay clock", 40.0, 430.0, (110.0, 170.0), 24.0)
 
 REAL: Final = Profile("real time", 75.0, 190.0, (80.0, 100.0), 1.0)
-SHORT: Final = Profile("replay clock, short", 55.0, 200.0, (90.0, 130.0), 25.0)
+SHORT: Final = Profile("replay clock, short", 40.0, 220.0, (110.0, 150.0), 25.0)
 """For tests: as `FAST`, with little time to recover."""
 
 

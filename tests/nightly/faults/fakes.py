@@ -48,7 +48,8 @@ def _serve(
         if reply is not None:
             soc_pct, status = reply
             values = dict.fromkeys((signal.name for signal in layout.signals), 0)
-            data = layout.encode({**values, "soc_pct": soc_pct, "status": int(status)})
+            values |= {"soc_pct": soc_pct, "soc_std_pct": 1.0, "status": int(status)}
+            data = layout.encode(values)
             bus.send(can.Message(arbitration_id=layout.frame_id, is_extended_id=False, data=data))
 
 

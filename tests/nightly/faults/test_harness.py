@@ -27,7 +27,7 @@ GONE = Fault("gone", "no frame for four seconds", BRIEF, frames=alter.drop())
 BROKEN: list[tuple[Target, str]] = [
     (fakes.always_valid, "current"),
     (fakes.silent_after_a_fault, "nothing published after the fault"),
-    (fakes.drifts_after_a_fault, "SoC 2.0 % off and valid after recovery"),
+    (fakes.drifts_after_a_fault, "SoC 2.0 % off with σ 1.0 %, valid after recovery"),
     (fakes.dies_of_a_fault, "ended by itself, status 1"),
 ]
 NO_REFERENCE: list[tuple[Target, str]] = [
