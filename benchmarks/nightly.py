@@ -2,7 +2,8 @@
 
     python benchmarks/nightly.py [PART…] [--data FOLDER] [--socketcan COMMAND]
 
-fuzz     every reader on 300,000 mutants of small valid files, and the tests of `tests/nightly`
+fuzz     every reader on 300,000 mutants of small valid files, the tests of `tests/nightly`, and
+         the suite's tests of properties with 300 examples each in place of 20
 faults   the table of faults on a live bus
 grade    the estimator on recorded packs, and the diagnosis on its frozen cases (need --data)
 suite    the score cards of three gauges: our service, a counter, filterpy's filter
@@ -52,6 +53,7 @@ def commands(data: Path | None, socketcan: str) -> dict[str, list[list[str]] | s
     return {
         "fuzz": [
             [python, "-m", "pytest", "tests/nightly"],
+            [python, "-m", "pytest", "-m", "hypothesis", "--hypothesis-profile=nightly", "tests"],
             [python, "benchmarks/fuzz.py", "--inputs", "300000"],
         ],
         "faults": [[python, "-m", "faults", *bus]],

@@ -11,7 +11,8 @@ PROJECT = Path(__file__).resolve().parent.parent
 SHARED_DATA = PROJECT.parent / "shared" / "data"
 
 # How long an example takes is a matter of the machine's other work, not of the code.
-settings.register_profile("cangauge", deadline=None)
+settings.register_profile("cangauge", deadline=None, max_examples=20)
+settings.register_profile("nightly", deadline=None, max_examples=300)
 settings.load_profile("cangauge")
 
 

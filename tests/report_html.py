@@ -1,14 +1,9 @@
-"""Report pages as a parser and a browser see them."""
+"""Report pages as a parser sees them."""
 
 from __future__ import annotations
 
 import re
-import shutil
-import subprocess
 from html.parser import HTMLParser
-from pathlib import Path
-
-import pytest
 
 MAX_PAGE_BYTES = 3_000_000
 
@@ -41,30 +36,3 @@ class Html(HTMLParser):
 
     def handle_endtag(self, _tag: str) -> None:
         self._open = ""
-
-
-def title_after_scripts(page: Path, window: str) -> str:
-    """Return a page's title in a headless browser after its scripts; skip without a browser."""
-    browser = shutil.which("chromium") or shutil.which("google-chrome")
-    if browser is None:
-        pytest.skip("no chromium on this machine")
-    dumped = subprocess.run(
-        [browser, "--headless", "--no-sandbox", "--disable-gpu", "--virtual-time-budget=8000",
-         f"--window-size={window}", "--dump-dom", page.as_uri()],
-        capture_output=True, text=True, timeout=60, check=True,
-    ).stdout  # fmt: skip
-    return re.search(r"<title>(.*?)</title>", dumped).group(1)
-
-
-def excess_width_px(page: str, folder: Path) -> int:
-    """Return by how much a page is wider than a screen of 400 px."""
-    # In a frame, since a browser's window cannot be that narrow.
-    measuring = """<script>setTimeout(() => { const page = document.documentElement;
-      parent.postMessage(page.scrollWidth - page.clientWidth, '*') }, 3000)</script></body>"""
-    (folder / "inner.html").write_text(page.replace("</body>", measuring), encoding="utf-8")
-    outer = folder / "outer.html"
-    outer.write_text(
-        "<title>-</title><iframe src='inner.html' style='width:400px;height:9000px'></iframe>"
-        "<script>addEventListener('message', e => document.title = e.data)</script>"
-    )
-    return int(title_after_scripts(outer, "1000,9000"))

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import ast
-from collections.abc import Iterator
 from pathlib import Path
+
+import pytest
 
 LAYERS = ("cli", "service", "replay", "inspect", "bus", "diagnosis", "estimation", "identify",
           "model", "logs")  # fmt: skip
@@ -13,13 +14,16 @@ ABOVE = {("replay", "service"), ("inspect", "service")}
 """Neighbours that are independent of each other."""
 
 
-def modules(project: Path) -> Iterator[tuple[str, ast.Module]]:
-    """Yield the dotted name and the syntax tree of each module of the package."""
+@pytest.fixture(scope="module")
+def trees(project: Path) -> dict[str, ast.Module]:
+    """Syntax tree of each module of the package by its dotted name."""
     root = project / "src"
+    names = {}
     for path in sorted((root / "cangauge").rglob("*.py")):
         parts = path.relative_to(root).with_suffix("").parts
         name = ".".join(parts).removesuffix(".__init__")
-        yield name, ast.parse(path.read_text(encoding="utf-8"))
+        names[name] = ast.parse(path.read_text(encoding="utf-8"))
+    return names
 
 
 def imported(tree: ast.AST, *, at_run_time: bool = False) -> set[str]:
@@ -39,16 +43,16 @@ def imported(tree: ast.AST, *, at_run_time: bool = False) -> set[str]:
     return names
 
 
-def test_the_core_imports_no_extra(project: Path) -> None:
-    for name, tree in modules(project):
+def test_the_core_imports_no_extra(trees: dict[str, ast.Module]) -> None:
+    for name, tree in trees.items():
         if name == "cangauge" or name.startswith("cangauge.extras"):
             continue  # the package itself has the names for type checkers, lazily
         extras = {each for each in imported(tree) if each.startswith("cangauge.extras")}
         assert not extras, f"{name} imports {extras}"
 
 
-def test_imports_of_the_core_run_down(project: Path) -> None:
-    for name, tree in modules(project):
+def test_imports_of_the_core_run_down(trees: dict[str, ast.Module]) -> None:
+    for name, tree in trees.items():
         package = name.split(".")[1] if name.count(".") else ""
         if package not in LAYERS:
             continue
@@ -59,8 +63,7 @@ def test_imports_of_the_core_run_down(project: Path) -> None:
                 assert (package, parts[1]) in ABOVE, f"{name} imports {other}"
 
 
-def test_no_module_is_in_a_circle_of_imports(project: Path) -> None:
-    trees = dict(modules(project))
+def test_no_module_is_in_a_circle_of_imports(trees: dict[str, ast.Module]) -> None:
     graph = {name: loaded_first(tree, trees) - {name} for name, tree in trees.items()}
     while free := [name for name, others in graph.items() if not others & graph.keys()]:
         for name in free:
@@ -78,9 +81,9 @@ def loaded_first(tree: ast.Module, trees: dict[str, ast.Module]) -> set[str]:
     return names & trees.keys()
 
 
-def test_a_class_name_stands_for_one_thing(project: Path) -> None:
+def test_a_class_name_stands_for_one_thing(trees: dict[str, ast.Module]) -> None:
     places: dict[str, list[str]] = {}
-    for name, tree in modules(project):
+    for name, tree in trees.items():
         for node in ast.walk(tree):
             if isinstance(node, ast.ClassDef):
                 places.setdefault(node.name, []).append(name)

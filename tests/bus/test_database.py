@@ -12,7 +12,7 @@ import cantools.database
 import numpy as np
 import pytest
 from cantools.database.can import Database, Message
-from hypothesis import assume, given, settings
+from hypothesis import assume, given
 from hypothesis import strategies as st
 
 from cangauge._resources import shared_file
@@ -49,7 +49,6 @@ def layouts(draw: st.DrawFn) -> Message:
     return message
 
 
-@settings(max_examples=300)
 @given(layouts(), st.binary(min_size=8, max_size=8))
 def test_decodes_as_cantools_does_and_encoding_inverts_it(message: Message, data: bytes) -> None:
     found = signal_codec(message, message.signals[0], source="x", field="f")
@@ -186,7 +185,6 @@ def test_a_file_is_complete_and_savvycan_reads_each_line(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", NAMES)
-@settings(max_examples=60)
 @given(data=st.binary(min_size=8, max_size=8))
 def test_codec_agrees_with_cantools_on_every_signal(name: str, data: bytes) -> None:
     for message in LOADED[name].messages:

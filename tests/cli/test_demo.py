@@ -12,7 +12,7 @@ import pytest
 from live import in_process
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_the_demo_ends_with_the_filter_ahead(tmp_path: Path) -> None:
     ended = subprocess.run(
         [sys.executable, "-m", "cangauge", "demo", "--folder", str(tmp_path), "--json"],

@@ -1,4 +1,4 @@
-"""Commands that take a log or capture take every format."""
+"""Commands that take a log or capture take every format: two of each in the suite."""
 
 from __future__ import annotations
 
@@ -11,12 +11,13 @@ from cangauge.logs.read import read_log
 from cangauge.replay.steps import CaptureSource
 from fuzzing import corpus
 from live import in_process, leaf_model_path
+from selection import nightly_except
 
 CAPTURES = [name for name in corpus.capture_files() if name != "x.mf4"]
 LOGS = ["samples.mcap", "x.bdf.csv", "bds.csv", "signals.mf4"]
 
 
-@pytest.mark.parametrize("name", CAPTURES)
+@pytest.mark.parametrize("name", nightly_except(("candump.log", "plain.blf"), CAPTURES))
 def test_captures(tmp_path: Path, name: str) -> None:
     path = tmp_path / name
     path.write_bytes(corpus.capture_files()[name])
@@ -30,7 +31,7 @@ def test_captures(tmp_path: Path, name: str) -> None:
     assert sum(len(step.frames) for step in source.steps(loop=False)) == len(corpus.leaf_frames())
 
 
-@pytest.mark.parametrize("name", LOGS)
+@pytest.mark.parametrize("name", nightly_except(LOGS[:2], LOGS))
 def test_logs(tmp_path: Path, name: str) -> None:
     files = corpus.log_files() | {"signals.mf4": corpus.mf4_signals()}
     content = files[name]

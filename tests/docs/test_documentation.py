@@ -17,6 +17,8 @@ from pathlib import Path
 
 import pytest
 
+from selection import nightly_except
+
 DOCS = Path(__file__).parents[2] / "docs"
 BLOCK = re.compile(
     r"(?P<skip><!-- not run: [^>]+ -->\n[ ]*)?```console\n(?P<text>.*?)\n[ ]*```", re.DOTALL
@@ -56,10 +58,7 @@ IN_SUITE = ("tutorial.md", "init.md")
 """Pages that run on every change; the others run in `make nightly`."""
 
 
-@pytest.mark.parametrize(
-    "page",
-    [pytest.param(page, marks=() if page in IN_SUITE else pytest.mark.nightly) for page in PAGES],
-)
+@pytest.mark.parametrize("page", nightly_except(IN_SUITE, PAGES))
 def test_commands_print_what_the_page_shows(page: str, tmp_path: Path) -> None:
     session = steps(page)
     if not session:

@@ -172,23 +172,3 @@ def test_weakest_cells_of_a_real_module(shared_data: Path) -> None:
     used_pct = 100.0 * weak[:, 1].sum() / 3600.0 / 65.0
     # It has 20 % less of what the same cell had given.
     assert reports[-1].soc_pct == pytest.approx(100.0 - used_pct / 0.8, abs=6.0)
-
-
-@pytest.mark.real
-def test_the_weak_cell_of_96_real_cells(shared_data: Path) -> None:
-    model, table = module_model(shared_data, times=16), module_rows(shared_data, "1_0c")
-    used_ah = np.cumsum(table[:, 1]) / 3600.0
-    rng = np.random.default_rng(2)
-    cells_v = np.column_stack(
-        [
-            # Another balance and capacity for each copy of the six cells.
-            np.interp(used_ah / (1.0 + 0.01 * rng.normal()), used_ah, table[:, 3 + number % 6])
-            for number in range(CELLS)
-        ]
-    )
-    cells_v[:, 49] = weakened(table, 49 % 6, 0.75)
-    known = np.isfinite(cells_v[:, 49])
-    cells_v, table = np.round(cells_v[known], 3), table[known]
-    reports, _ = follow(model, rows_of(table, cells_v.sum(axis=1)), cells_v)
-    assert reports[-1].weakest == 50
-    assert all(each.weakest == 50 for each in reports[len(reports) * 2 // 3 :])

@@ -107,7 +107,7 @@ def test_failed_build_leaves_no_earlier_extension(
 
 @pytest.mark.parametrize("method", ["ekf", "newton", "coulomb"])
 @pytest.mark.parametrize("which", ["plain", "together"])
-@settings(max_examples=8, deadline=None, suppress_health_check=list(HealthCheck))
+@settings(max_examples=8, suppress_health_check=list(HealthCheck))
 @given(drawn=inputs, with_rules=st.booleans(), start=STARTS)
 def test_any_input_gives_the_same_numbers(
     which: str, method: Any, drawn: Any, with_rules: bool, start: Any

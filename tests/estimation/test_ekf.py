@@ -1,9 +1,7 @@
-"""The Kalman filter: identities of a linear problem, and the prototype that it follows."""
+"""The Kalman filter: identities of a linear problem."""
 
 from __future__ import annotations
 
-import sys
-from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -175,96 +173,3 @@ def test_doubt_keeps_the_odds_of_an_open_question() -> None:
     narrow, wide = hypotheses.filters
     assert narrow.P[0, 0] == pytest.approx(1.0 + 0.01)
     assert wide.P[0, 0] == pytest.approx(WRONG_STD_PCT**2 + 100.0)
-
-
-class PrototypeModel:
-    """The prototype's model with all its coefficients, behind the face of `OnlineModel`."""
-
-    def __init__(self, fit: Any, model: Any) -> None:
-        self.capacity_ah = model.capacity_ah
-        small = 1e-14 * np.diag(np.diag(model.covariance))
-        root = np.linalg.cholesky(model.covariance * (1.0 + 1e-9) + small)
-        self._of_curve, self._of_load = fit.BASIS @ root[: fit.N_KNOTS], root[fit.N_KNOTS :]
-        self.functions = SimpleNamespace(number=root.shape[1])
-        self.load_coefficients = model.coefficients[fit.N_KNOTS :]
-        self._table = fit.curve_table(model)
-        self.noise = SimpleNamespace(
-            level_std_v=model.level_v, slow_std_v=model.slow_v, slow_time_s=300.0,
-            fast_std_v=model.fast_v, soc_std_pct=model.chemistry.soc_std_pct,
-            cold=lambda celsius: float(fit.noise_factor(celsius, model.chemistry)),
-        )  # fmt: skip
-
-    def _place(self, soc_pct: float) -> tuple[int, float]:
-        place = (min(max(soc_pct, -20.0), 119.9) + 20.0) * 4.0
-        return int(place), place - int(place)
-
-    def curve(self, soc_pct: float, drives: Any = None) -> tuple[float, float]:
-        i, f = self._place(soc_pct)
-        step = self._table[i + 1] - self._table[i]
-        return self._table[i] + f * step, step * 4.0
-
-    def row(self, soc_pct: float, load: np.ndarray) -> np.ndarray:
-        i, f = self._place(soc_pct)
-        curve = self._of_curve[i] * (1.0 - f) + self._of_curve[i + 1] * f
-        return np.asarray(curve + load @ self._of_load)
-
-
-def drive(fit: Any, seed: int, start_pct: float, capacity_ah: float) -> dict[str, Any]:
-    """A simulated drive of an hour on another curve than the typical one."""
-    rng = np.random.default_rng(seed)
-    time_s = np.arange(3600.0)
-    current_a = np.repeat(rng.normal(25.0, 30.0, 360), 10)
-    soc_pct = start_pct - np.cumsum(current_a) / 36.0 / capacity_ah
-    temperature_c = 12.0 + 4.0 * np.sin(time_s / 900.0)
-    load = fit.load_features(current_a, temperature_c)
-    volts = 96.0 * (np.interp(soc_pct, fit.KNOTS_PCT, fit.OXIDE.curve_v) + 1e-4 * soc_pct)
-    volts += load[:, 1:5] @ [0.06, 0.02, 0.02, 0.03] + rng.normal(0.0, 0.3, time_s.size)
-    return {
-        "time_s": time_s, "current_a": current_a, "voltage_v": volts, "soc_pct": soc_pct,
-        "temperature_c": temperature_c, "usable": np.ones(time_s.size, bool),
-    }  # fmt: skip
-
-
-@pytest.mark.parametrize("given_pct", [None, 70.0, 50.0])
-def test_filter_equals_the_prototype(
-    given_pct: float | None, shared_data: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    folder = shared_data.parent / "prototypes"
-    if not (folder / "estimator_filter.py").is_file():
-        pytest.skip("the prototype (../shared/prototypes) is not beside the project")
-    monkeypatch.setattr(sys, "path", [*sys.path, str(folder)])
-    import estimator_filter as prototype  # noqa: PLC0415
-    import estimator_fit as fit  # noqa: PLC0415
-
-    sums = [fit.log_sums(drive(fit, k, 90.0 - 5.0 * k, CAPACITY_AH), fit.OXIDE) for k in (1, 2, 3)]
-    model = fit.fit(sums, CAPACITY_AH, fit.OXIDE)
-    log = drive(fit, 9, 70.0, CAPACITY_AH)
-    online = PrototypeModel(fit, model)
-    ours = Hypotheses(online, given_pct)
-    for each in ours.filters:  # the prototype knows capacity and resistance
-        each.bias.P[:] = 0.0
-    theirs = (
-        prototype.unknown_start(model)
-        if given_pct is None
-        else prototype.GivenStart(model, given_pct)
-    )
-    time_s, charge_ah = None, 0.0
-    for each in prototype.blocks(model, log, np.cumsum(log["current_a"]) / 3600.0):
-        theirs.update(each)
-        seconds = 0.0 if time_s is None else each.time_s - time_s
-        ours.predict(seconds, (each.charge_ah - charge_ah) / CAPACITY_AH * 100.0)
-        volts = each.voltage_v, each.temperature_c, 0.0
-        ours.update(Block(each.time_s, 0.0, *volts, each.load, NO_EFFECTS))
-        time_s, charge_ah = each.time_s, each.charge_ah
-        if given_pct is None:
-            expected = theirs.soc_pct, theirs.soc_std_pct
-        else:
-            a, b = theirs.given, theirs.wrong
-            ratio = prototype.WRONG_PRIOR / (1.0 - prototype.WRONG_PRIOR)
-            odds = ratio * np.exp(np.clip(b.log_likelihood - a.log_likelihood, -50.0, 50.0))
-            weight = 1.0 / (1.0 + odds)
-            mean = weight * a.soc_pct + (1.0 - weight) * b.soc_pct
-            spread = weight * (a.soc_std_pct**2 + (a.soc_pct - mean) ** 2)
-            spread += (1.0 - weight) * (b.soc_std_pct**2 + (b.soc_pct - mean) ** 2)
-            expected = mean, np.sqrt(spread)
-        assert ours.soc_after(0.0, 0.0) == pytest.approx(expected, abs=1e-6)

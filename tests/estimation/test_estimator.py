@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pyarrow as pa
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from cangauge.errors import InputError
@@ -224,22 +224,6 @@ def test_charge_is_counted_without_voltage_and_temperature(model: Model) -> None
     assert np.all(late & Reason.TEMPERATURE_MISSING)
 
 
-@settings(max_examples=50, deadline=None)
-@given(
-    st.lists(
-        st.tuples(*(st.floats(allow_nan=True, allow_infinity=True) for _ in range(4))), max_size=60
-    )
-)
-def test_no_input_raises_or_leaves_0_to_100(rows: list[tuple[float, ...]]) -> None:
-    estimator = Estimator(_MODEL)
-    for row in rows:
-        estimate = estimator.step(Sample(*row))
-        assert math.isnan(estimate.soc_pct) or 0.0 <= estimate.soc_pct <= 100.0
-
-
-_MODEL = leaf_2012_model_file()
-
-
 def test_time_that_does_not_increase_is_refused(model: Model) -> None:
     estimator = Estimator(model)
     estimator.step(Sample(1.0, 10.0, 380.0, 23.0))
@@ -252,14 +236,6 @@ def test_temperature_source_mismatch_degrades(model: Model) -> None:
     estimator = Estimator(model, EstimatorSettings(temperature_source="cell"))
     estimate = estimator.step(Sample(0.0, 10.0, 380.0, 23.0))
     assert estimate.reasons & Reason.TEMPERATURE_SOURCE_MISMATCH
-
-
-def test_same_samples_give_same_numbers(model: Model) -> None:
-    log = synthetic_log(hours=0.3, noise_v=0.5)
-    first = run_estimator(samples_of(log), model, EstimatorSettings())
-    again = run_estimator(samples_of(log), model, EstimatorSettings())
-    for name in set(vars(first)) - {"scores"}:
-        assert np.array_equal(getattr(first, name), getattr(again, name), equal_nan=True)
 
 
 def test_setting_out_of_range_is_named() -> None:

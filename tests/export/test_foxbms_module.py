@@ -6,7 +6,6 @@ import math
 import shutil
 import subprocess
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,13 +13,10 @@ import pytest
 
 from cangauge._typing import FloatArray
 from cangauge.estimation.estimator import Estimator
-from cangauge.estimation.offline import samples_of
 from cangauge.estimation.settings import EstimatorSettings
 from cangauge.estimation.state import DelayLineState
 from cangauge.extras.embedded.c_source import CORE_SOURCES
 from cangauge.extras.embedded.embedded import drive_with_events, export_c
-from cangauge.identify.fit import fit
-from cangauge.logs.read import read_log
 from cangauge.model.model_file import Model
 from cangauge.model.published import leaf_2012_model_file
 from cangauge.types import Estimate, Sample
@@ -35,8 +31,8 @@ Row = tuple[int, int | None, int | None, int | None]
 pytestmark = pytest.mark.skipif(not shutil.which("cc"), reason="no C compiler")
 
 
-def built(folder: Path, model: Model, *defines: str, period_s: float = 0.1) -> Path:
-    export_c(model, folder, period_s=period_s, platform="foxbms")
+def built(folder: Path, model: Model, *defines: str) -> Path:
+    export_c(model, folder, period_s=0.1, platform="foxbms")
     sources = [*CORE_SOURCES, "pack_model.c", str(HERE / "driver.c")]  # it includes foxbms_soc.c
     subprocess.run(
         ["cc", *STRICT, "-DCANGAUGE_CONFIG", *defines, f"-I{HERE}", "-I.", *sources, "-lm",
@@ -195,14 +191,3 @@ def test_sign_of_the_current_follows_foxbms(driver: Path, drive: list[Row], tmp_
 def test_a_cells_voltage_gives_the_soc_of_its_curve(driver: Path) -> None:
     _, soc_pct = run(driver, [])
     assert MODEL.voltage_model().pseudo_ocv_at(soc_pct)[0] == pytest.approx(3.9 * CELLS, abs=1e-3)
-
-
-@pytest.mark.real
-def test_recorded_trip_gives_pythons_estimate(shared_data: Path, tmp_path: Path) -> None:
-    trips = [read_log(shared_data / "bmw_i3" / f"TripA0{k}.csv.gz") for k in (1, 3, 5, 6)]
-    *training, held_out = trips
-    model, log = fit(training, capacity_ah=60.0).model, held_out.rows(slice(None, None, 10))
-    started = replace(log, time_s=log.time_s - log.time_s[0] + 1.0)
-    rows = rounded(samples_of(started))
-    found, _ = run(built(tmp_path, model, period_s=1.0), rows)
-    assert_published(found, estimated(rows, model, EstimatorSettings()))

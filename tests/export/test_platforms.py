@@ -36,9 +36,14 @@ def stubs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def exported(folder: Path, platform: Platform) -> Path:
-    export_c(Model.prior("oxide", 96, 60.0), folder, platform=platform)
-    return folder
+@pytest.fixture(scope="module")
+def exports(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """A folder exported for each platform."""
+    platforms: tuple[Platform, ...] = ("esp-idf", "zephyr", "arduino")
+    folders = {each: tmp_path_factory.mktemp(each) for each in platforms}
+    for platform, folder in folders.items():
+        export_c(Model.prior("oxide", 96, 60.0), folder, platform=platform)
+    return dict(folders)
 
 
 def compile_all(folder: Path, stubs: Path, *files: str, defines: tuple[str, ...] = ()) -> None:
@@ -57,29 +62,33 @@ def compile_all(folder: Path, stubs: Path, *files: str, defines: tuple[str, ...]
     [("esp-idf", "examples/gauge/main/gauge.c"), ("zephyr", "samples/gauge/src/main.c")],
 )
 def test_what_the_build_names_compiles(
-    tmp_path: Path, stubs: Path, platform: Platform, example: str
+    exports: dict[str, Path], stubs: Path, platform: str, example: str
 ) -> None:
-    build = (exported(tmp_path, platform) / "CMakeLists.txt").read_text()
+    folder = exports[platform]
+    build = (folder / "CMakeLists.txt").read_text()
     sources = re.findall(r"[a-z_]+\.c\b", build)
     assert len(sources) == 5
     defines = re.search(r"CANGAUGE_CONFIG CANGAUGE_REAL=float", build)
     assert defines is not None
-    compile_all(tmp_path, stubs, *sources, example, defines=tuple(defines[0].split()))
+    compile_all(folder, stubs, *sources, example, defines=tuple(defines[0].split()))
+    assert not (folder / "foxbms_soc.c").exists()
 
 
-def test_manifests_are_read(tmp_path: Path) -> None:
-    component = exported(tmp_path / "esp", "esp-idf") / "idf_component.yml"
+def test_manifests_are_read(exports: dict[str, Path]) -> None:
+    component = exports["esp-idf"] / "idf_component.yml"
     assert {"version", "description"} <= set(yaml.safe_load(component.read_text()))
-    module = exported(tmp_path / "zephyr", "zephyr") / "zephyr" / "module.yml"
+    module = exports["zephyr"] / "zephyr" / "module.yml"
     build = yaml.safe_load(module.read_text())["build"]
     assert build == {"cmake": ".", "kconfig": "Kconfig"}
-    kconfig = (tmp_path / "zephyr" / build["kconfig"]).read_text()
+    kconfig = (exports["zephyr"] / build["kconfig"]).read_text()
     assert kconfig.startswith("config CANGAUGE\n\tbool")
 
 
 @pytest.mark.skipif(not shutil.which("c++"), reason="no C++ compiler")
-def test_an_arduino_library_compiles_without_definitions(tmp_path: Path, stubs: Path) -> None:
-    folder = exported(tmp_path, "arduino")
+def test_an_arduino_library_compiles_without_definitions(
+    exports: dict[str, Path], stubs: Path
+) -> None:
+    folder = exports["arduino"]
     lines = (folder / "library.properties").read_text().splitlines()
     properties = dict(line.split("=", 1) for line in lines)
     # Of the library specification 1.5.
@@ -89,10 +98,3 @@ def test_an_arduino_library_compiles_without_definitions(tmp_path: Path, stubs: 
     sketch = folder / "examples" / "Gauge" / "Gauge.ino"
     sketch.write_text("#include <Arduino.h>\n" + sketch.read_text())
     compile_all(folder, stubs, "examples/Gauge/Gauge.ino")
-
-
-def test_another_platform_in_the_same_folder_is_no_accident(tmp_path: Path) -> None:
-    exported(tmp_path, "esp-idf")
-    exported(tmp_path, "esp-idf")
-    assert not (tmp_path / "foxbms_soc.c").exists()
-    assert (exported(tmp_path / "fox", "foxbms") / "foxbms_soc.c").exists()

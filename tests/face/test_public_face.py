@@ -53,7 +53,7 @@ def test_the_examples_of_the_package_run() -> None:
     assert doctest.testmod(cangauge).failed == 0
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.parametrize(
     ("example", "words"),
     [

@@ -133,24 +133,6 @@ def test_a_slow_log_weighs_by_its_time() -> None:
     assert total(slow) == pytest.approx(total(fast), rel=0.02)
 
 
-def test_takes_a_path_a_frame_and_a_log(tmp_path: Path) -> None:
-    pandas = pytest.importorskip("pandas")
-    logs = trips(3)
-    frame = pandas.DataFrame(
-        {
-            name: getattr(logs[1], name)
-            for name in ("time_s", "current_a", "voltage_v", "temperature_c", "soc_pct")
-        }
-    )
-    path = tmp_path / "trip.csv"
-    frame.to_csv(path, index=False)
-    source = {"temperature_source": "unknown"}
-    found = cangauge.fit([replace(logs[0], **source), path], capacity_ah=CAPACITY_AH)
-    again = cangauge.fit([replace(logs[0], **source), frame], capacity_ah=CAPACITY_AH)
-    assert found.voltage_rmse_v == pytest.approx(again.voltage_rmse_v)
-    assert cangauge.fit(logs[0], capacity_ah=CAPACITY_AH).model.name == "trip1"
-
-
 def test_chemistry_is_given_guessed_or_assumed_and_said() -> None:
     log = trips(1)[0]
     assert fit(log, capacity_ah=50.0, chemistry="lfp").model.chemistry == "lfp"
@@ -229,11 +211,6 @@ def test_removes_start_up_and_shut_down_rows() -> None:
     whole = fit([log], capacity_ah=CAPACITY_AH)
     assert broken.fits[0].rows.removed["start_up_or_shut_down"] == 24
     assert broken.voltage_mae_pct == pytest.approx(whole.voltage_mae_pct, rel=0.02)
-
-
-def test_slope_resistance_agrees_with_the_coefficients() -> None:
-    found = fit([synthetic_log(noise_v=0.9, model=CELLS)])
-    assert found.slope_ohm == pytest.approx(found.slope_expected_ohm, rel=0.02)
 
 
 def test_capacity_needs_a_log_from_full_to_empty() -> None:

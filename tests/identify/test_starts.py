@@ -140,10 +140,9 @@ def test_trips_without_soc_attach_to_one_that_has_it(shared_data: Path) -> None:
 
 
 @pytest.mark.real
-@pytest.mark.parametrize("name", ["A01", "A11"])
-def test_real_partial_trip_gives_no_capacity(shared_data: Path, name: str) -> None:
-    # From 87 to 81 %, whose last volts fall as steeply as an empty pack's, and from 87 to 76 %.
-    log = read_log(shared_data / "bmw_i3" / f"Trip{name}.csv.gz")
+def test_real_partial_trip_gives_no_capacity(shared_data: Path) -> None:
+    # From 87 to 81 %, whose last volts fall as steeply as an empty pack's.
+    log = read_log(shared_data / "bmw_i3" / "TripA01.csv.gz")
     assert discharged_ah(log.time_s, log.current_a)[-1] < 7.5
     for initial in (None, 100.0):
         with pytest.raises(InputError, match="unknown capacity"):

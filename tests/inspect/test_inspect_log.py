@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from cangauge._text import plain
@@ -184,7 +184,6 @@ def test_tiny_logs_do_not_break_it(rows: int) -> None:
     json.dumps(plain(found.to_dict()), allow_nan=False)
 
 
-@settings(max_examples=60)
 @given(
     step=st.sampled_from([0.01, 0.1, 0.25, 0.5, 1.0, 0.1051588]),
     levels=st.integers(5, 400),

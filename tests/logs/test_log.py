@@ -52,7 +52,7 @@ def assert_same(back: Log, log: Log) -> None:
     assert back.temperature_source == log.temperature_source
 
 
-@settings(max_examples=60, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(log=logs(), suffix=st.sampled_from([".parquet", ".csv", None]))
 def test_log_reads_back_exactly(log: Log, suffix: str | None, tmp_path: Path) -> None:
     if suffix is None:

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from cangauge.errors import InputError
@@ -35,7 +35,6 @@ def turned(log: Log) -> Log:
     return replace(log, current_a=-log.current_a)
 
 
-@settings(max_examples=40)
 @given(seed=st.integers(0, 10_000), resistance_ohm=st.floats(0.05, 0.2))
 def test_both_conventions_are_distinguished(seed: int, resistance_ohm: float) -> None:
     log = drive(seed, resistance_ohm=resistance_ohm)

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from cangauge.bus.decoder import SampleDecoder
@@ -64,7 +64,6 @@ def rows_of(log: Log) -> list[Sample]:
 
 
 @pytest.mark.parametrize("name", list(VEHICLES))
-@settings(max_examples=60)
 @given(log=logs)
 def test_the_decoder_gives_the_quantized_log_bit_for_bit(name: str, log: Log) -> None:
     encoder = FrameEncoder(VEHICLES[name])

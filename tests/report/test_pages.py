@@ -26,7 +26,7 @@ from cangauge.logs.read import read_log
 from cangauge.model.model_file import Model
 from cangauge.service.offline import RecordedCapture, RecordedEstimate
 from cangauge.types import REASON_WORDS, Reason
-from report_html import MAX_PAGE_BYTES, Html, excess_width_px, title_after_scripts
+from report_html import MAX_PAGE_BYTES, Html
 from synthetic import synthetic_log
 
 FIT_FIGURES = [
@@ -259,27 +259,3 @@ def test_columns_of_numbers_are_flush_right() -> None:
 def test_titles_name_a_few_logs_and_count_the_rest() -> None:
     assert joined(["a", "b", "c"]) == "a, b, c"
     assert joined(["a", "b", "c", "d", "e"]) == "a, b and 3 more"
-
-
-@pytest.mark.slow
-def test_a_browser_draws_every_figure(found: Identification, tmp_path: Path) -> None:
-    path = tmp_path / "fit.html"
-    # The drawings live in shadow roots, which a dump leaves out: the page itself counts them.
-    counting = """<script>setTimeout(() => {
-      let found = 0;
-      const walk = root => { for (const e of root.querySelectorAll('*')) {
-        if (e.tagName === 'CANVAS' && e.width > 100) found++;
-        if (e.shadowRoot) walk(e.shadowRoot); } };
-      walk(document); document.title = 'drawn ' + found; }, 3000)</script>"""
-    path.write_text(fit_report(found).replace("</body>", counting + "</body>"), encoding="utf-8")
-    drawn = re.match(r"drawn (\d+)", title_after_scripts(path, "1300,9000"))
-    assert drawn
-    assert int(drawn.group(1)) >= len(FIT_FIGURES)
-
-
-@pytest.mark.slow
-def test_no_page_scrolls_sideways_at_400_px(
-    found: Identification, log: Log, tmp_path: Path
-) -> None:
-    for page in (fit_report(found), estimate_report(estimated(log, found.model))):
-        assert excess_width_px(page, tmp_path) == 0

@@ -26,6 +26,7 @@ from cangauge.extras.validation.twin.recording import (
     simulate_truth,
 )
 from cangauge.extras.validation.twin.scaling import scale_to_gap
+from selection import nightly_except
 
 DESIGN_IDS = {
     "current_offset", "current_gain", "voltage_offset", "voltage_gain", "temperature_lag",
@@ -36,6 +37,8 @@ DESIGN_IDS = {
 }  # fmt: skip
 ALL = [kind.id for kind in (*fault_kinds(), *fault_kinds(outside=True))]
 WANTED_V = 0.4
+IN_SUITE = ("current_offset", "time_skew", "slow_diffusion", "hysteresis", "weak_cell")
+"""A fault of each way to act; the others run in `make nightly`."""
 
 
 @pytest.fixture(scope="module")
@@ -70,7 +73,7 @@ def test_faults_of_the_library_are_complete() -> None:
     assert len(fault_kinds(outside=True)) >= 6
 
 
-@pytest.mark.parametrize("fault_id", ALL)
+@pytest.mark.parametrize("fault_id", nightly_except(IN_SUITE, ALL))
 def test_fault_is_scaled_to_the_gap(
     fault_id: str, plant: TwinPlant, demanding_drive: Drive, healthy: GroundTruth
 ) -> None:
@@ -95,7 +98,10 @@ def test_fault_of_size_zero_changes_nothing(fault_id: str, pack: TwinPack) -> No
 
 # A late current is not the mirror image of an early one within the skew.
 @pytest.mark.parametrize(
-    "fault_id", [kind.id for kind in fault_kinds() if kind.signed and kind.id != "time_skew"]
+    "fault_id",
+    nightly_except(
+        IN_SUITE, [each.id for each in fault_kinds() if each.signed and each.id != "time_skew"]
+    ),
 )
 def test_negative_fault_opens_the_opposite_gap(
     fault_id: str, plant: TwinPlant, demanding_drive: Drive, healthy: GroundTruth

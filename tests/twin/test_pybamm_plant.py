@@ -17,6 +17,7 @@ from cangauge.extras.validation.twin.pybamm_plant import (
     draw_pybamm_plant,
 )
 from cangauge.extras.validation.twin.recording import simulate_truth
+from selection import nightly_except
 
 needs_pybamm = pytest.mark.skipif(
     importlib.util.find_spec("pybamm") is None, reason="the extra pybamm is not installed"
@@ -38,7 +39,7 @@ def drive(plant: PybammPlant) -> Drive:
 
 @needs_pybamm
 @pytest.mark.slow
-@pytest.mark.parametrize("parameter_set", PARAMETER_SETS)
+@pytest.mark.parametrize("parameter_set", nightly_except(PARAMETER_SETS[:1], PARAMETER_SETS))
 def test_every_parameter_set_simulates_a_drive(parameter_set: str) -> None:
     rng = np.random.default_rng(5)
     plant = draw_pybamm_plant(rng, draw_pack(rng, "leaf24"), parameter_set)

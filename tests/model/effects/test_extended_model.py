@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import example, given, settings
+from hypothesis import example, given
 from hypothesis import strategies as st
 from stepping import EFFECTS, MODEL, irregular_signals, middle, online_of, step_through
 
@@ -93,7 +93,6 @@ def test_an_offset_is_corrected_before_a_gain() -> None:
     np.testing.assert_allclose(found, (signals.current_a - 2.0) / 1.05, rtol=1e-12)
 
 
-@settings(max_examples=25, deadline=None)
 @given(st.sets(st.sampled_from(sorted(LIBRARY)), min_size=2, max_size=6), st.integers(0, 99))
 def test_combined_effects_agree_offline_and_online(chosen: set[str], seed: int) -> None:
     signals = irregular_signals(400, seed)
@@ -133,7 +132,6 @@ def test_slope_stays_positive_where_the_voltage_falls() -> None:
     assert 0.0 < slope < 0.1
 
 
-@settings(max_examples=150, deadline=None)
 @given(st.floats(-400.0, 400.0), st.floats(-30.0, 50.0), st.floats(0.0, 100.0), st.floats(0.0, 1.0))
 @example(-157.0, 0.0, 99.99999999999999, 0.0)  # a last step beyond 100 %
 def test_newton_finds_a_root_with_all_effects(
