@@ -19,7 +19,7 @@ import can
 
 from cangauge._files import text_sha256
 from cangauge._resources import shared_file
-from cangauge.bus.captures import is_capture, open_capture
+from cangauge.bus.captures import find_capture, open_capture
 from cangauge.bus.database import load_dbc
 from cangauge.bus.protection import GENERIC_RULE
 from cangauge.bus.publish import SocPublisher, SocReader
@@ -108,7 +108,7 @@ _LOG_NAMES = ("input", "A_P25_x.csv", "Cell-HPPC-10C.csv", "_N05_.csv")
 def _run_log(data: bytes) -> bool:
     with _file(data, _LOG_NAMES[zlib.crc32(data) % len(_LOG_NAMES)]) as path:
         log = read_log(path, temperature_c=20.0 if zlib.crc32(data) % 3 else None)
-        is_capture(path)
+        find_capture(path)
     inspect_log(log).to_dict()
     if len(log) <= ESTIMATED_ROWS:
         _estimate(log)

@@ -109,6 +109,19 @@ def test_message_is_used_again_after_the_second_sender() -> None:
     assert not decoder.reasons(decoder.now_s)
 
 
+def test_a_clock_that_is_set_back_ends_the_suspicion() -> None:
+    decoder, _ = decoded(LEAF, attacked(LEAF, 0, 0.3))
+    refused, more = decoder.statistics.two_senders, true_frames(LEAF, 100)
+    for frame in more:
+        frame.timestamp -= 3600.0
+    samples = [sample for each in more if (sample := decoder.handle(each)) is not None]
+    assert refused
+    assert decoder.statistics.two_senders == refused
+    assert len(samples) >= 98
+    assert decoder.two_sender_messages == ()
+    assert not decoder.reasons(decoder.now_s) & Reason.DUPLICATE_SENDER
+
+
 def copies(frames: list[can.Message], rng: Random) -> Iterator[can.Message]:
     for frame in frames:
         yield frame

@@ -10,7 +10,7 @@ from pathlib import Path
 import can
 import pytest
 
-from cangauge.bus.captures import is_capture, open_capture
+from cangauge.bus.captures import find_capture, open_capture
 from cangauge.errors import InputError
 
 SPACED = (
@@ -117,7 +117,6 @@ def test_every_text_format_is_recognised_and_read(tmp_path: Path, name: str, pac
     info = capture.info
     assert (info.format, info.frames, info.malformed) == (name, frames, 0)
     assert len(messages) == frames
-    assert is_capture(path)
     assert messages[-1].is_extended_id or name in {"tab-separated table", "candump log"}
     assert [facts(each) for each in capture] == [facts(each) for each in messages]  # again
 
@@ -267,14 +266,13 @@ def test_mostly_junk_is_refused_by_line(tmp_path: Path) -> None:
 )
 def test_what_is_no_capture(tmp_path: Path, content: bytes) -> None:
     path = write(tmp_path, content)
-    assert not is_capture(path)
+    assert find_capture(path) is None
     with pytest.raises(InputError, match="not a known kind of capture") as caught:
         open_capture(path)
     assert "candump" in str(caught.value.cure)
 
 
 def test_absent_file_and_folder(tmp_path: Path) -> None:
-    assert not is_capture(tmp_path / "absent")
     with pytest.raises(InputError, match="no such file"):
         open_capture(tmp_path / "absent")
     with pytest.raises(InputError, match="folder"):

@@ -213,11 +213,3 @@ def open_capture(path: str | PathLike[str], *, clock: tuple[int, float] = CLOCK)
     if capture is None:
         raise InputError("the file is not a known kind of capture", source=path, cure=_CURE)
     return capture
-
-
-def is_capture(path: str | PathLike[str]) -> bool:
-    """Return whether a file is a readable capture of a known kind."""
-    try:
-        return find_capture(path) is not None
-    except InputError:
-        return False

@@ -45,7 +45,7 @@ class FrameStatistics:
     samples: int = 0
     current_unpaired: int = 0  # samples without a voltage (NaN)
     voltage_unpaired: int = 0  # voltages dropped without a current
-    time_reversals: int = 0  # wanted frames stamped earlier than the frame before
+    time_reversals: int = 0  # wanted frames stamped before the last used one of their message
 
     def __getattr__(self, name: str) -> int:
         """Return the total of a statistic of the messages."""
@@ -61,7 +61,8 @@ class Pairing:
       time, when the later of the two arrives. Each value is used once.
     - A current left without a voltage (a newer value lies more than `within_s` after it, or the
       next current arrives) becomes a sample with voltage NaN, so that its charge is counted.
-    - A voltage left without a current is dropped when the next voltage arrives.
+    - A voltage left without a current is dropped when the next voltage arrives, or a current more
+      than `within_s` away.
     - When time runs backwards by more than `within_s`, waiting values are released likewise.
 
     A value completes at most one sample. Samples keep the order of their currents. All times are
@@ -176,7 +177,7 @@ class _Route:
     inputs: list[_Input] = field(default_factory=list)
     cells: list[tuple[int, SignalCodec]] = field(default_factory=list)
     last_s: float = -math.inf
-    suspected_until_s: float = -math.inf
+    suspected_s: float = -math.inf  # the last sign of a second sender
 
     def refuse(self, reason: Reason, *, is_repeated: bool = False) -> bytearray | None:
         """Record a refused frame as a failure of each of its signals; return no payload."""
@@ -215,7 +216,7 @@ class SampleDecoder:
         self.vehicle = vehicle
         self.statistics = FrameStatistics()
         self.health: dict[str, SignalHealth] = {}
-        self.now_s = self._suspected_until_s = -math.inf
+        self.now_s = self._suspected_s = -math.inf
         self._pairing = Pairing(vehicle.pair_within_s, self.statistics)
         # In one frame: each is a sample by itself.
         self._is_paired = vehicle.current.key == vehicle.voltage.key
@@ -311,13 +312,13 @@ class SampleDecoder:
                 statistics.crc_errors += 1
                 return route.refuse(Reason.PROTECTION_FAILED)
             if checker.suspects_second_sender:
-                route.suspected_until_s = self._suspected_until_s = time_s + SUSPECTED_FOR_S
+                route.suspected_s = self._suspected_s = time_s
             if verdict is Verdict.REPEATED:
                 statistics.counter_repeats += 1
                 return route.refuse(Reason.PROTECTION_FAILED, is_repeated=True)
             statistics.counter_jumps += 1
             statistics.frames_lost += checker.lost
-        if time_s < route.suspected_until_s:
+        if _is_suspected(route.suspected_s, time_s):
             statistics.two_senders += 1
             return route.refuse(_DUPLICATE)
         route.last_s = time_s
@@ -369,7 +370,7 @@ class SampleDecoder:
 
         One without a further reason is old, never came, or is sent as "not available".
         """
-        reasons = _DUPLICATE if now_s < self._suspected_until_s else _NO_REASON
+        reasons = _DUPLICATE if _is_suspected(self._suspected_s, now_s) else _NO_REASON
         for health, missing in self._needed:
             if not health.is_usable(now_s):
                 reasons |= missing
@@ -386,14 +387,22 @@ class SampleDecoder:
     @property
     def two_sender_messages(self) -> tuple[str, ...]:
         """Names of the messages that seem to have two senders at present."""
-        routes = self._routes.values()
-        return tuple(route.name for route in routes if self.now_s < route.suspected_until_s)
+        return tuple(
+            route.name
+            for route in self._routes.values()
+            if _is_suspected(route.suspected_s, self.now_s)
+        )
 
     @property
     def reference_soc_pct(self) -> float:
         """The car's own state of charge [%]; NaN without a usable one."""
         health = self.health.get("soc_reference")
         return math.nan if health is None else health.value_at(self.now_s)
+
+
+def _is_suspected(sign_s: float, now_s: float) -> bool:
+    """Return whether a sign of a second sender counts; not after the clock was set far back."""
+    return abs(now_s - sign_s) < SUSPECTED_FOR_S
 
 
 def _detectors(

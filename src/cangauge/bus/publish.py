@@ -253,7 +253,8 @@ class SocPublisher:
         """Return the frames of one beat; due every `ESTIMATE_EVERY_S`.
 
         `samples` are those processed so far, including refused ones; `age_s` is the time since the
-        latest of them [s], NaN without one. `report` is called where its frames are due.
+        latest that the estimator took [s], NaN without a sample. `report` is called where its
+        frames are due.
         """
         frames = [self.estimate_frame(estimate, age_s)]
         is_due = self._beats % DETAIL_EVERY_BEATS == 0

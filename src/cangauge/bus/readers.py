@@ -40,6 +40,8 @@ HEAD_LINES: Final = 400
 FEW_MALFORMED: Final = 100
 """A file with more malformed lines than this, and than frames, is refused at once."""
 MAX_ID: Final = 0x1FFFFFFF
+MAX_STANDARD_ID: Final = 0x7FF
+MAX_BYTES: Final = 64
 ERROR_FLAG: Final = 0x20000000
 
 Stamps = Literal["us", "ms", "none"]
@@ -165,18 +167,19 @@ class LineReader(CaptureReader, TextIOMessageReader):
         frames = malformed = 0
         for line in lines:
             try:
-                frames += reader.parse(line) is not None
+                frames += not line.isspace() and reader.parse(line) is not None
             except (ValueError, OverflowError):
                 malformed += 1
         return frames > malformed
 
     def prepare(self, head: Sequence[str]) -> bool:
         """Set up parsing by the first lines; return whether they are of this format."""
-        return bool(head)
+        del head
+        return True
 
     @abstractmethod
     def parse(self, line: str) -> can.Message | None:
-        """Return the frame of a line, None for a line without one.
+        """Return the frame of a line that is not blank; None for one that states no frame.
 
         Raises ValueError or OverflowError if the line is malformed.
         """
@@ -188,7 +191,9 @@ class LineReader(CaptureReader, TextIOMessageReader):
         if head and not self.prepare(head):
             raise InputError(f"the file is not a {self.name}", source=self.source)
         for number, line in enumerate(chain(head, lines), start=1):
-            is_cut = not (line.endswith("\n") or self.states_length) and bool(line.strip())
+            if line.isspace():
+                continue
+            is_cut = not (line.endswith("\n") or self.states_length)
             self.cut_off |= is_cut
             try:
                 message = None if is_cut else self.parse(line)
@@ -230,51 +235,96 @@ class _Salvage(io.RawIOBase):
         return len(part)
 
 
-def blank(line: str) -> can.Message | None:
-    """Return None for a blank line; raise ValueError for any other."""
-    if line.strip():
-        raise ValueError("not a frame")
-    return None
+def frame(
+    time: str | float,
+    number: str,
+    data: str,
+    length: str | int | None = None,
+    *,
+    is_extended: bool | None = None,
+    **more: Any,
+) -> can.Message:
+    """Return a frame of hex text; `length` is the stated number of bytes, `more` as `can.Message`.
+
+    By default an id is extended where it has more than 11 bits. Raises ValueError for no such id or
+    another number of bytes.
+    """
+    arbitration_id, content = int(number, 16), bytes.fromhex(data)
+    is_large = arbitration_id > MAX_STANDARD_ID
+    if not 0 <= arbitration_id <= MAX_ID or (is_large and is_extended is False):
+        raise ValueError("no such id")
+    if len(content) > MAX_BYTES or (length is not None and len(content) != int(length)):
+        raise ValueError("length and bytes differ")
+    return can.Message(
+        timestamp=float(time),
+        arbitration_id=arbitration_id,
+        is_extended_id=is_large if is_extended is None else is_extended,
+        is_fd=len(content) > 8,
+        data=content,
+        **more,
+    )
 
 
-# (1436509052.249713) vcan0 044#2A366C2BBA
-_CANDUMP_LOG = re.compile(
-    r"\((\d+\.\d+)\) (\S+) ([0-9A-Fa-f]{3}|[0-9A-Fa-f]{8})#"
-    r"(?:(#[0-9A-Fa-f])?((?:[0-9A-Fa-f]{2}\.?)*)|R(\d?))(?: ([RT]))?\s*$"
-)
+class PatternReader(LineReader):
+    """Reader of a format whose frames all match one `pattern`; lines of `other` state none."""
+
+    pattern: ClassVar[re.Pattern[str]]
+    other: ClassVar[re.Pattern[str] | None] = None
+
+    def parse(self, line: str) -> can.Message | None:
+        """Return the frame of a line."""
+        match = self.pattern.match(line)
+        if match is None and not (self.other and self.other.match(line)):
+            raise ValueError("not a frame")
+        return None if match is None else self._frame(*match.groups())
+
+    @abstractmethod
+    def _frame(self, *groups: Any) -> can.Message:
+        """Return the frame of the groups of the pattern."""
 
 
-class CandumpLogReader(LineReader):
+def candump_frame(
+    time: str, channel: str, number: str, data: str | None, dlc: int | None = None, **more: Any
+) -> can.Message:
+    """Return a frame as candump writes it; `data` is None for a remote frame of `dlc` bytes."""
+    bits, is_extended = int(number, 16), len(number) == 8
+    content = None if data is None else bytes.fromhex(data)
+    if content is not None and len(content) > MAX_BYTES:
+        raise ValueError("longer than any frame")
+    return can.Message(
+        timestamp=float(time),
+        arbitration_id=bits & MAX_ID,
+        is_extended_id=is_extended,
+        channel=channel,
+        is_remote_frame=data is None,
+        is_error_frame=is_extended and bool(bits & ERROR_FLAG),
+        dlc=dlc,
+        data=content,
+        **more,
+    )
+
+
+class CandumpLogReader(PatternReader):
     """Log file of candump -l; python-can's reader stops at a malformed line."""
 
     name = "candump log"
     states_length = False
+    # (1436509052.249713) vcan0 044#2A366C2BBA
+    pattern = re.compile(
+        r"\((\d+\.\d+)\) (\S+) ([0-9A-Fa-f]{3}|[0-9A-Fa-f]{8})#"
+        r"(?:(#[0-9A-Fa-f])?((?:[0-9A-Fa-f]{2}\.?)*)|R(\d?))(?: ([RT]))?\s*$"
+    )
 
-    def parse(self, line: str) -> can.Message | None:
-        """Return the frame of a line."""
-        match = _CANDUMP_LOG.match(line)
-        if match is None:
-            return blank(line)
-        number, extended = int(match[3], 16), len(match[3]) == 8
-        remote = match[6] is not None
-        data = b"" if remote else bytes.fromhex(match[5].replace(".", ""))
-        if len(data) > 64:
-            raise ValueError("longer than any frame")
-        fd_flags = int(match[4][1], 16) if match[4] else 0
-        return can.Message(
-            timestamp=float(match[1]),
-            arbitration_id=number & MAX_ID,
-            is_extended_id=extended,
-            channel=match[2],
-            is_remote_frame=remote,
-            is_error_frame=extended and bool(number & ERROR_FLAG),
-            is_fd=match[4] is not None,
-            bitrate_switch=bool(fd_flags & 1),
-            error_state_indicator=bool(fd_flags & 2),
-            is_rx=match[7] != "T",
-            dlc=int(match[6] or 0) if remote else None,
-            data=None if remote else data,
-        )
+    def _frame(self, *groups: Any) -> can.Message:
+        time, channel, number, fd_flags, data, remote, way = groups
+        flags = int(fd_flags[1], 16) if fd_flags else 0
+        return candump_frame(
+            time, channel, number,
+            None if data is None else data.replace(".", ""),
+            int(remote or 0) if data is None else None,
+            is_fd=fd_flags is not None, bitrate_switch=bool(flags & 1),
+            error_state_indicator=bool(flags & 2), is_rx=way != "T",
+        )  # fmt: skip
 
 
 @cache

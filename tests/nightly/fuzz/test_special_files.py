@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from cangauge.bus.captures import is_capture, open_capture
+from cangauge.bus.captures import open_capture
 from cangauge.bus.database import load_dbc
 from cangauge.bus.vehicle import Vehicle
 from cangauge.errors import InputError
@@ -109,11 +109,6 @@ def test_it_is_refused_by_name(tmp_path: Path, reader: str, kind: str) -> None:
     if kind not in {"no name", "long name"}:
         # An empty configuration is one without a model.
         assert caught.value.source == str(path)
-
-
-@pytest.mark.parametrize("kind", list(WORDS))
-def test_none_of_them_is_a_capture(tmp_path: Path, kind: str) -> None:
-    assert not is_capture(special(tmp_path, kind))
 
 
 @pytest.mark.skipif(os.geteuid() == 0, reason="root reads everything")

@@ -5,9 +5,10 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
+import pyarrow.compute as pc
 
 from cangauge._files import Head
 from cangauge._typing import FloatArray
@@ -17,7 +18,7 @@ from cangauge.logs.draft import DraftLog
 from cangauge.logs.headings import LONGEST
 from cangauge.logs.table import numbers_of
 from cangauge.logs.text import TextTable, split_cells
-from cangauge.logs.units import convert
+from cangauge.logs.units import REQUIRED, convert
 
 # One heading of the i3 trips misspells the unit's bracket: `max. SoC [%)`; D3's units follow `__`.
 _HEADING: Final = re.compile(
@@ -25,12 +26,12 @@ _HEADING: Final = re.compile(
 )
 
 
-@dataclass(frozen=True, slots=True)
-class _Column:
+class _Column(NamedTuple):
+    """A heading; `simple` is it without unit, spaces and underscores, in lower case."""
+
     place: int
     text: str
     simple: str
-    """Without unit, spaces and underscores, in lower case."""
     unit: str
 
 
@@ -52,49 +53,44 @@ def _find(columns: Sequence[_Column], *patterns: str) -> _Column | None:
 
 
 class _Text:
-    """Values of a delimited text by a name for each column."""
+    """Wanted columns of a delimited text by name, and the draft that they fill."""
 
     def __init__(
         self, head: Head, delimiter: str, header: Sequence[str], skip_lines: int,
-        wanted: Mapping[str, tuple[int, str]],
+        wanted: Mapping[str, _Column | None],
     ) -> None:  # fmt: skip
-        self.table = TextTable(head, delimiter, header, (), skip_lines, [])
-        self._wanted = wanted
-        self._columns = self.table.columns([place for place, _ in wanted.values()])
-        self.draft = DraftLog(head.name, str(head.path), remarks=[*self.table.remarks])
+        table = TextTable(head, delimiter, header, (), skip_lines, [])
+        self.wanted = {name: column for name, column in wanted.items() if column is not None}
+        self._cells = table.columns([column.place for column in self.wanted.values()])
+        self._shown = shown_headings(header)
+        self.draft = DraftLog(head.name, str(head.path), remarks=[*table.remarks])
 
-    def label(self, name: str) -> str:
-        place = self._wanted[name][0]
-        headings = self.table.headings
-        return headings[place] if place < len(headings) else f"column {place + 1}"
+    def cells(self, name: str) -> Any:
+        return self._cells[self.wanted[name].place]
 
     def values(self, name: str, field: str) -> FloatArray:
         """Return a column in the canonical unit of a field, with a remark if it is converted."""
-        place, unit = self._wanted[name]
-        source, label = self.draft.source, self.label(name)
-        numbers, _ = numbers_of(self._columns[place], source, label)
+        source, label = self.draft.source, self.wanted[name].text
+        numbers, _ = numbers_of(self.cells(name), source, label)
+        unit = self.wanted[name].unit
         values, remark = convert(numbers, field, unit, source=source, label=label)
         self.draft.remarks.extend([remark] if remark else [])
         return values
 
-    def cells(self, name: str) -> list[str]:
-        return [str(cell).strip() for cell in self._columns[self._wanted[name][0]].to_pylist()]
+    def take(self, field: str, name: str = "", values: FloatArray | None = None) -> None:
+        name = name or field
+        self.draft.values[field] = self.values(name, field) if values is None else values
+        self.draft.labels[field] = self.wanted[name].text
 
-    def take(self, field: str, name: str = "") -> None:
-        self.draft.values[field] = self.values(name or field, field)
-        self.draft.labels[field] = self.label(name or field)
-
-
-def _require(draft: DraftLog, columns: Sequence[_Column], *fields: str) -> None:
-    for field in fields:
-        if field not in draft.values:
-            shown = shown_headings([column.text for column in columns])
-            raise InputError(
-                f"no column of this file holds it (found: {shown})",
-                source=draft.source,
-                field=field,
-                cure="check the export, or convert it to a canonical log",
-            )
+    def require(self, *fields: str) -> None:
+        for field in fields:
+            if field not in self.draft.values:
+                raise InputError(
+                    f"no column of this file holds it (found: {self._shown})",
+                    source=self.draft.source,
+                    field=field,
+                    cure="check the export, or convert it to a canonical log",
+                )
 
 
 class BmwI3Trip:
@@ -118,12 +114,11 @@ class BmwI3Trip:
     def read(self, head: Head, _given: ColumnMap | None = None, /) -> DraftLog:
         """Read a trip; discharge is stored as negative current."""
         header = _columns(head.lines[0], ";")
-        found = {field: _find(header, name) for field, name in self._FIELDS.items()}
-        wanted = {field: (c.place, c.unit) for field, c in found.items() if c is not None}
+        wanted = {field: _find(header, name) for field, name in self._FIELDS.items()}
         text = _Text(head, ";", [column.text for column in header], 1, wanted)
-        for field in wanted:
+        for field in text.wanted:
             text.take(field)
-        _require(text.draft, header, "time_s", "current_a", "voltage_v")
+        text.require("time_s", "current_a", "voltage_v")
         text.draft.temperature_source = "pack"
         text.draft.negate_current("i3 trips store discharge as negative")
         return text.draft
@@ -141,25 +136,14 @@ class D3Test:
     takes_columns = False
     _CAN: Final = "car's CAN"
     # In order of preference: instruments before copies from CAN, the 500 A clamp before the other.
-    _INSTRUMENTS: Final[dict[str, dict[str, str]]] = {
-        "500 A clamp": {
-            "current_a": r"hvbatterycurrentw/?500amaxclamp",
-            "voltage_v": r"hvbatteryvoltagew/?500amaxclamp",
-        },
-        "200 A clamp": {
-            "current_a": r"hvbatterycurrentw/?200amaxclamp",
-            "voltage_v": r"hvbatteryvoltagew/?200amaxclamp",
-        },
-        "HV battery channels": {"current_a": "hvbatterycurrent", "voltage_v": "hvbatteryvoltage"},
-        "power analyser": {
-            "current_a": r"hvbattcurrhioki\w*",
-            "voltage_v": r"hvbattvolthioki\w*",
-        },
-        _CAN: {
-            "current_a": r"hvbatt(ery)?curr(ent)?\w*can\d*",
-            "voltage_v": r"hvbatt(ery)?volt(age)?\w*can\d*",
-        },
+    _INSTRUMENTS: Final = {
+        "500 A clamp": r"hvbattery{0}w/?500amaxclamp",
+        "200 A clamp": r"hvbattery{0}w/?200amaxclamp",
+        "HV battery channels": "hvbattery{0}",
+        "power analyser": r"hvbatt{1}hioki\w*",
+        _CAN: r"hvbatt(ery)?({0}|{1})\w*can\d*",
     }
+    _WORDS: Final = {"current_a": ("current", "curr"), "voltage_v": ("voltage", "volt")}
     _OTHERS: Final = {
         "time_s": (r"time(stamp)?", "daqtime"),
         "temperature_c": (r"(test)?celltemp(erature)?",),
@@ -177,22 +161,22 @@ class D3Test:
     def read(self, head: Head, _given: ColumnMap | None = None, /) -> DraftLog:
         """Read a test."""
         header = _columns(head.lines[0], "\t")
-        found = {field: _find(header, *names) for field, names in self._OTHERS.items()}
-        for instrument, names in self._INSTRUMENTS.items():
-            found |= {f"{instrument} {field}": _find(header, n) for field, n in names.items()}
-        wanted = {name: (c.place, c.unit) for name, c in found.items() if c is not None}
+        wanted = {field: _find(header, *names) for field, names in self._OTHERS.items()}
+        for instrument, pattern in self._INSTRUMENTS.items():
+            for field, words in self._WORDS.items():
+                wanted[f"{instrument} {field}"] = _find(header, pattern.format(*words))
         text = _Text(head, "\t", [column.text for column in header], 1, wanted)
         draft = text.draft
         for field in self._OTHERS:
-            if field in wanted:
+            if field in text.wanted:
                 text.take(field)
-        _require(draft, header, "time_s")
-        if "temperature_c" in wanted:
+        text.require("time_s")
+        if "temperature_c" in draft.labels:
             draft.temperature_source = "room"
             label = draft.labels["temperature_c"]
             draft.remarks.append(f"{label} is the temperature of the test room, not the battery's")
-        self._take_instrument(text, wanted)
-        _require(draft, header, "current_a", "voltage_v")
+        self._take_instrument(text)
+        text.require("current_a", "voltage_v")
         waiting = draft.values["time_s"] < 0.0
         if waiting.all():
             problem, cure = "all rows are before time 0", "check the export"
@@ -201,55 +185,41 @@ class D3Test:
         draft.keep(~waiting, "before time 0 (the wait before the test) dropped")
         return draft
 
-    def _take_instrument(self, text: _Text, wanted: Mapping[str, object]) -> None:
+    def _take_instrument(self, text: _Text) -> None:
         """Take current and voltage from the first instrument that has both, else from the first."""
-        filled: dict[str, dict[str, FloatArray]] = {"current_a": {}, "voltage_v": {}}
+        taken: dict[str, tuple[str, FloatArray]] = {}
         for instrument in self._INSTRUMENTS:
-            for field, of_field in filled.items():
-                column = f"{instrument} {field}"
-                if column not in wanted:
-                    continue
-                values = text.values(column, field)
-                if np.isfinite(values).any():
-                    of_field[instrument] = values
-                else:
-                    label = text.label(column)
-                    text.draft.remarks.append(f"{label} is empty and was not used")
-            if all(instrument in of_field for of_field in filled.values()):
-                filled = {field: {instrument: of[instrument]} for field, of in filled.items()}
+            own = {}
+            for field in self._WORDS:
+                name = f"{instrument} {field}"
+                if name in text.wanted:
+                    values = text.values(name, field)
+                    if np.isfinite(values).any():
+                        own[field] = instrument, values
+                    else:
+                        label = text.wanted[name].text
+                        text.draft.remarks.append(f"{label} is empty and was not used")
+            if len(own) == len(self._WORDS):
+                taken = own
                 break
-        for field, of_field in filled.items():
-            if of_field:
-                instrument, values = next(iter(of_field.items()))
-                text.draft.values[field] = values
-                text.draft.labels[field] = text.label(f"{instrument} {field}")
+            taken = {**own, **taken}
+        for field in self._WORDS:
+            if field in taken:
+                instrument, values = taken[field]
+                text.take(field, f"{instrument} {field}", values)
                 text.draft.remarks.append(f"{field} from the {instrument}")
-                if field == "current_a":
-                    text.draft.sign_unknown = instrument == self._CAN
+                text.draft.sign_unknown |= field == "current_a" and instrument == self._CAN
 
 
 @dataclass(frozen=True, slots=True)
 class CyclerExport:
     """A cycler's export as comma-separated text, known by its headings (in lower case).
 
-    A temperature from the file name is the chamber's set point (`_P25_`: +25 °C, `_N05_`: −5 °C;
-    `HPPC-40C`: 40 °C; `2C-Discharge` is a rate and no temperature).
-
-    Parameters
-    ----------
-    name : str
-    time, current, voltage, must_have : str
-        Headings.
-    charges : bool
-        Whether positive current charges.
-    set_point : str
-        Regular expression of the temperature in the file name.
-    sensors : str
-        Beginning of the headings of temperature sensors; their median is taken.
-    ambient : str
-        Heading of the room's temperature, taken where there is no sensor.
-    bare : str
-        Header of files that have none.
+    `must_have` is a further heading. `charges`: positive current charges. `sensors` begins the
+    headings of temperature sensors, whose median is taken; `ambient` is the room's, taken where
+    there is none. `set_point` is the regular expression of a temperature in the file name, the
+    chamber's set point (`_P25_`: +25 °C, `_N05_`: −5 °C; `HPPC-40C`: 40 °C; `2C-Discharge` is a
+    rate). `bare` is the header of files that have none; they mark rows to `exclude`.
     """
 
     name: str
@@ -284,59 +254,56 @@ class CyclerExport:
     def read(self, head: Head, _given: ColumnMap | None = None, /) -> DraftLog:
         """Read an export."""
         header, skip_lines = self._header(head) or ([], 0)
-        names = [cell.lower() for cell in header]
-        fields = {"time_s": self.time, "current_a": self.current, "voltage_v": self.voltage}
-        wanted = {field: (names.index(name), "") for field, name in fields.items()}
-        sensors = [
-            k for k, name in enumerate(names) if self.sensors and name.startswith(self.sensors)
-        ]
-        wanted |= {f"sensor {k}": (k, "") for k in sensors}
-        for name in ("ambient", "exclude"):
-            heading = self.ambient if name == "ambient" else name
-            if heading and heading in names and (name == "ambient" or self.bare):
-                wanted[name] = (names.index(heading), "")
-        text = _Text(head, ",", header, skip_lines, wanted)
+        columns = [_Column(k, text, text.lower(), "") for k, text in enumerate(header)]
+        names = {
+            "time_s": self.time, "current_a": self.current, "voltage_v": self.voltage,
+            "ambient": self.ambient, "exclude": self.bare and "exclude",
+        }  # fmt: skip
+        wanted = {
+            field: next((column for column in columns if name and column.simple == name), None)
+            for field, name in names.items()
+        }
+        sensors = {
+            f"sensor {column.place}": column
+            for column in columns
+            if self.sensors and column.simple.startswith(self.sensors)
+        }
+        text = _Text(head, ",", header, skip_lines, {**wanted, **sensors})
         draft = text.draft
         draft.remarks.insert(0, f"{self.name} export")
-        for field in fields:
+        for field in REQUIRED[:3]:
             text.take(field)
         if self.charges:
             draft.negate_current(f"{self.name} stores discharge as negative")
-        if sensors or "ambient" in wanted:
-            self._take_sensors(text, [name for name in wanted if name.startswith("sensor")], wanted)
-        elif self.set_point:
-            self._take_set_point(draft, head.path.name)
-        if "exclude" in wanted:
-            excluded = np.array([cell == "Yes" for cell in text.cells("exclude")])
-            draft.keep(~excluded, "that the cycler excludes dropped")
+        self._take_temperature(text, head.path.name, list(sensors))
+        if "exclude" in text.wanted:
+            excluded = pc.equal(pc.utf8_trim_whitespace(text.cells("exclude")), "Yes")
+            is_excluded = np.asarray(pc.fill_null(excluded, fill_value=False), dtype=bool)
+            draft.keep(~is_excluded, "that the cycler excludes dropped")
         return draft
 
-    def _take_sensors(self, text: _Text, names: list[str], wanted: Mapping[str, object]) -> None:
-        """Take the mean of the sensors on the cell, else the room's temperature."""
+    def _take_temperature(self, text: _Text, file_name: str, sensors: list[str]) -> None:
+        """Take the sensors on the cell, else the room's temperature or the set point, if any."""
         draft = text.draft
-        values = {name: text.values(name, "temperature_c") for name in names}
-        values = {name: each for name, each in values.items() if np.isfinite(each).any()}
-        if values:
-            labels = [text.label(name) for name in values]
-            draft.take_probes(labels, list(values.values()))
+        probes = {name: text.values(name, "temperature_c") for name in sensors}
+        probes = {name: each for name, each in probes.items() if np.isfinite(each).any()}
+        if probes:
+            draft.take_probes([text.wanted[name].text for name in probes], list(probes.values()))
             draft.temperature_source = "cell"
-            if len(values) > 1:
-                draft.remarks.append(f"temperature: median of {len(values)} columns")
-        elif "ambient" in wanted:
+            if len(probes) > 1:
+                draft.remarks.append(f"temperature: median of {len(probes)} columns")
+        elif "ambient" in text.wanted:
             text.take("temperature_c", "ambient")
             draft.temperature_source = "room"
             draft.remarks.append("temperature: the room's")
-
-    def _take_set_point(self, draft: DraftLog, file_name: str) -> None:
-        found = list(re.finditer(self.set_point, file_name, re.IGNORECASE))
-        if len(found) != 1:
-            return
-        groups = found[0].groupdict()
-        value_c = float(groups["value"]) * (-1.0 if groups.get("sign") == "N" else 1.0)
-        draft.values["temperature_c"] = np.full(draft.values["time_s"].size, value_c)
-        draft.temperature_source = "room"
-        shown = f"temperature {value_c:g} °C from the file name: the chamber's set point"
-        draft.remarks.append(shown)
+        found = list(re.finditer(self.set_point or "(?!)", file_name, re.IGNORECASE))
+        if len(found) == 1 and not sensors:
+            groups = found[0].groupdict()
+            value_c = float(groups["value"]) * (-1.0 if groups.get("sign") == "N" else 1.0)
+            draft.values["temperature_c"] = np.full(draft.values["time_s"].size, value_c)
+            draft.temperature_source = "room"
+            shown = f"temperature {value_c:g} °C from the file name: the chamber's set point"
+            draft.remarks.append(shown)
 
 
 _SIGNED: Final = r"_(?P<sign>[NP])(?P<value>\d\d)(?=[_.])"
