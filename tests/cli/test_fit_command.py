@@ -69,17 +69,12 @@ def test_tables_have_units_and_standard_errors(run: Run, made: Path, tmp_path: P
 def test_options_go_into_the_model_file(run: Run, made: Path, tmp_path: Path) -> None:
     ran = run(
         "fit", made / "full.parquet", "-o", tmp_path / "m.json", "--capacity-ah", "51",
-        "--equation", "published", "--rate-hz", "0.5", "--delays", "0,20", "--epsilon", "0.04",
-        "--t-ref", "25", "--initial-soc", "99.5",
+        "--equation", "published", "--initial-soc", "99.5",
     )  # fmt: skip
     assert ran.code == 0, ran.err
     model = Model.load(tmp_path / "m.json")
     assert model.capacity_ah == 51.0
-    assert model.rate_hz == 0.5
-    assert model.published is not None
-    assert model.published.delays_s == [0.0, 20.0]
-    assert model.published.epsilon == 0.04
-    assert model.published.t_ref_c == 25.0
+    assert model.equation == "published"
     assert model.made.options["initial_soc_pct"] == 99.5
 
 
@@ -166,14 +161,8 @@ def test_effects_by_left_out_logs_need_three(run: Run, made: Path, tmp_path: Pat
         (["--effects", "gremlin"], ["--effects", "gremlin", "known are", "hysteresis"]),
         (["--effects", "auto,hysteresis"], ["--effects", "auto alone"]),
         (["--effects", "voltage_offset"], ["--effects", "voltage_offset", "the curve absorbs it"]),
-        (["--delays", "0,10,5"], ["--delays", "increase", "0,10,5"]),
-        (["--delays", "0,20"], ["--delays", "--equation published"]),
         (["--chemistry", "lead"], ["--chemistry", "lead"]),
         (["--equation", "published", "--effects", "hysteresis"], ["--effects", "hysteresis"]),
-        (["--delays", "0;10"], ["--delays", "0;10"]),
-        (["--epsilon", "0.6"], ["--epsilon", "0.6"]),
-        (["--rate-hz", "0"], ["--rate-hz"]),
-        (["--rate-hz", "nan"], ["--rate-hz"]),
         (["--capacity-ah", "many"], ["--capacity-ah", "many", "from-soc"]),
         (["--capacity-ah", "-51"], ["--capacity-ah", "-51"]),
         (["--capacity-ah", "0.5"], ["soc_pct", "--capacity-ah"]),

@@ -29,9 +29,7 @@ def estimate_command(
     *,
     model: Path,
     output: Written,
-    method: Literal["ekf", "newton", "coulomb"] = "ekf",
     initial_soc: float | Literal["auto"] | None = None,
-    initial_soc_std: float = 1.0,
     capacity_ah: float | None = None,
     reading: ReadingOptions,
     pack: Written | None = None,
@@ -40,10 +38,11 @@ def estimate_command(
 ) -> None:
     """Estimate the state of charge of a recorded log or capture, offline.
 
-    OUT has one row per sample: time_s [s], soc_pct, soc_std_pct, soc_newton_pct, soc_coulomb_pct
-    [%], voltage_model_v, residual_v (measured − model) [V], status (initialising, valid, degraded,
-    invalid) and reasons (separated by "; "). An unknown value is empty (CSV) or null (Parquet).
-    An .mcap holds samples and estimates for Foxglove and PlotJuggler. Positive current discharges.
+    OUT has one row per sample: time_s [s], soc_pct and soc_std_pct by the filter over voltage and
+    charge, soc_newton_pct by voltage alone, soc_coulomb_pct by counting alone [%], voltage_model_v,
+    residual_v (measured − model) [V], status (initialising, valid, degraded, invalid) and reasons
+    (separated by "; "). An unknown value is empty (CSV) or null (Parquet). An .mcap holds samples
+    and estimates for Foxglove and PlotJuggler. Positive current discharges.
 
     PACK has one row per second, of a log over an hour 3,600 rows: capacity_ah, resistance_ratio,
     offset_a, discharge_a and charge_a (possible for 10 s), energy_wh (left), with standard
@@ -56,7 +55,7 @@ def estimate_command(
 
     `cangauge estimate trip.csv -m pack.json -o soc.parquet --initial-soc auto`
 
-    `cangauge estimate drive.log --vehicle leaf_ze0 -m leaf.json -o soc.csv --method newton`
+    `cangauge estimate drive.log --vehicle leaf_ze0 -m leaf.json -o soc.csv`
 
     Parameters
     ----------
@@ -64,15 +63,10 @@ def estimate_command(
         Recorded log or capture.
     output : -o, --output OUT.csv|.parquet|.mcap
         Table of estimates.
-    method : ekf|newton|coulomb
-        Method of soc_pct: Kalman filter over voltage and charge (ekf), voltage alone (newton), or
-        counting alone (coulomb).
     initial_soc : P|auto (0 … 100 %)
         SoC at the first sample, e.g. 80; `auto` takes it from the first voltages. Default: the
         first soc_pct of a log, counted back to its first row; else, and for a capture (as live),
         auto.
-    initial_soc_std : X (0 … 100 %)
-        Standard deviation of the initial SoC.
     pack : PACK.csv|.parquet
         Table of health, power and cells, once a second.
     """
@@ -81,9 +75,7 @@ def estimate_command(
     from cangauge.model.model_file import Model
 
     settings = EstimatorSettings(
-        method=method,
         initial_soc_pct=None if initial_soc == "auto" else initial_soc,
-        initial_soc_std_pct=initial_soc_std,
         capacity_ah=capacity_ah,
     )
     check_outputs([output, pack, report], [log_path, model])

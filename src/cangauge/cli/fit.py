@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from itertools import pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Literal
 
 from cangauge._extras import extra
 from cangauge._files import write_texts_atomic
@@ -40,10 +39,6 @@ def fit_command(
     equation: Literal["knots", "published"] = "knots",
     chemistry: Literal["oxide", "lfp"] | None = None,
     cells: int | None = None,
-    rate_hz: float = 1.0,
-    delays: str | None = None,
-    epsilon: float | None = None,
-    t_ref: float | None = None,
     effects: list[str] | None = None,
     reading: ReadingOptions,
     report: Written | None = None,
@@ -91,14 +86,6 @@ def fit_command(
         the volts per cell where their number is known, else oxide.
     cells : N (1 … 2000)
         Cells in series. Default: the columns of cells of the first log, if it has all.
-    rate_hz : HZ (0.01 … 1000 Hz)
-        Rate of the fit; faster logs are decimated.
-    delays : S,S,…
-        Delays of the current [s], by default 0,10,30,70; with --equation published.
-    epsilon : E (0.0001 … 0.49)
-        Margin ε of the scaled SoC, by default 0.05; with --equation published.
-    t_ref : C (-60 … 120 °C)
-        Reference temperature T_r, by default 20; with --equation published.
     effects : ID…|auto|none
         Effects to add to the model, separated by commas, e.g. hysteresis; `auto` adds those that
         lower the error of left-out logs significantly. Default: auto from five logs on.
@@ -113,18 +100,6 @@ def fit_command(
             cure="give one for all, or one for each log in order (auto where it is unknown)",
         )
     starts = [None if each == "auto" else each for each in initial_soc or ["auto"]]
-    published: dict[str, Any] = {
-        "delay_s": None if delays is None else _delays_s(delays),
-        "epsilon": epsilon,
-        "t_ref_c": t_ref,
-    }
-    published = {name: value for name, value in published.items() if value is not None}
-    if equation == "knots" and published:
-        option = {"delay_s": "--delays", "epsilon": "--epsilon", "t_ref_c": "--t-ref"}
-        cure = "add --equation published, or leave it out"
-        raise InputError(
-            "belongs to the published equation", field=option[next(iter(published))], cure=cure
-        )
     check_outputs([output, report], logs)
     with console.status("reading") as status:
         recorded = []
@@ -139,9 +114,7 @@ def fit_command(
                 equation=equation,
                 chemistry=chemistry,
                 cells=cells or _cells_of(logs[0], recorded[0], reading),
-                rate_hz=rate_hz,
                 effects=parse_effect_ids(effects) if effects else None,
-                **published,
             )
         status.update("writing")
         texts = {output: result.model.to_json()}
@@ -169,20 +142,6 @@ def _cells_of(path: Path, log: Log, reading: ReadingOptions) -> int | None:
         return None
     ratio = float(np.nanmedian(cells.voltage_v.sum(axis=1) / log.voltage_v))
     return cells.count if abs(ratio - 1.0) <= SAME_SUM else None
-
-
-def _delays_s(given: str) -> tuple[float, ...]:
-    """Return the value of `--delays` [s]; raise InputError if it is none."""
-    try:
-        delays = tuple(float(text) for text in given.split(","))
-    except ValueError:
-        delays = ()
-    # Slope resistance and heat are defined by the undelayed current.
-    if delays[:1] == (0.0,) and all(low < high <= 3600.0 for low, high in pairwise(delays)):
-        return delays
-    problem = "not delays that begin with 0 and increase to 3600 s at most"
-    cure = "give increasing seconds from 0, such as 0,10,30,70"
-    raise InputError(problem, field="--delays", value=given, cure=cure)
 
 
 def _show(result: Identification) -> None:

@@ -166,8 +166,8 @@ def test_every_option_with_every_kind_of_wrong_value(
 
 WRONG = ("", "nan", "inf", "-inf", "-1", "1e999", "x", ".", "/dev/zero", "a" * 5000, "é=ä")
 NUMBERS = {
-    "fit": ("--capacity-ah", "--initial-soc", "--rate-hz", "--epsilon", "--t-ref", "--temperature"),
-    "estimate": ("--initial-soc", "--initial-soc-std", "--capacity-ah", "--temperature"),
+    "fit": ("--capacity-ah", "--initial-soc", "--cells", "--temperature"),
+    "estimate": ("--initial-soc", "--capacity-ah", "--temperature"),
     "gap": ("--initial-soc", "--capacity-ah", "--temperature"),
     "run": ("--temperature", "--initial-soc", "--initial-soc-std", "--duration", "--until-idle"),
     "replay": ("--speed", "--temperature"),
