@@ -247,7 +247,7 @@ class StateKeeper:
 
     def _log_verdict(self) -> None:
         """Log once what the voltage says of the restored SoC."""
-        verdict = self._pipeline.verdict
+        verdict = self._pipeline.estimator.verdict
         if self._restored_pct is None or verdict in {"", "open"}:
             return
         before, self._restored_pct = self._restored_pct, None
