@@ -261,7 +261,7 @@ DAMAGE: dict[str, tuple[Callable[[Path], object], str]] = {
     "one bit": (flip, ""),
     "a list": (lambda path: path.write_text("[]"), "not a cangauge state"),
     "nested": (lambda path: path.write_text("[" * 200_000), "not a cangauge state"),
-    "large": (lambda path: path.write_bytes(b" " * ((8 << 20) + 1)), "larger than 8 MB"),
+    "large": (lambda path: path.write_bytes(b" " * ((8 << 20) + 1)), "larger than the 8 MB"),
     "version": (lambda path: path.write_text(path.read_text().replace(
         f'"version": {STATE_VERSION}', '"version": 1')), "(got '1')"),
     "hash": (lambda path: path.write_text(path.read_text().replace('"sha256": "', '"sha256": "0')),
