@@ -306,9 +306,7 @@ class Pipeline:
 
     def _restart_cells(self) -> None:
         signals, model = self.vehicle.cells, self.estimator.voltage_model
-        self.cells = (
-            None if signals is None else CellEstimator(model, signals.count, signals.first)
-        )
+        self.cells = None if signals is None else CellEstimator(model, signals.count, signals.first)
 
     def _begin_log(self) -> None:
         """Restart decoder and estimator for the next log of a replay."""
