@@ -85,7 +85,7 @@ REASON_WORDS: Final = {
     Reason.TEMPERATURE_SOURCE_MISMATCH: "the temperature is not measured where the model's was",
     Reason.INNOVATION_LARGE: "voltage and prediction disagree persistently: σ was increased",
     Reason.NO_INITIAL_SOC: "the SoC is not known yet",
-    Reason.INPUT_STALE: "no wanted frame within the time-out",
+    Reason.INPUT_STALE: "no usable sample within the time-out",
     Reason.IMPLAUSIBLE_INPUT: "a value was refused: out of range, or changed too fast",
     Reason.PROTECTION_FAILED: "frames were refused: wrong CRC, repeated counter, or too short",
     Reason.SIGNAL_STUCK: "a signal is constant while another proves that it should change",

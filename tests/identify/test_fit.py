@@ -348,3 +348,13 @@ def test_a_log_that_leaves_the_sign_of_the_resistance_open_is_fitted(
     found.model.save(tmp_path / "m.json")
     table = cangauge.estimate(log, cangauge.Model.load(tmp_path / "m.json"))
     assert table.soc_pct[-1] == pytest.approx(100.0, abs=5.0)
+
+
+def test_a_log_wholly_above_full_is_refused_by_name() -> None:
+    trip = trips(1)[0]
+    full = replace(
+        trip, current_a=0.01 * trip.current_a, soc_pct=np.full(len(trip), 102.0), name="full"
+    )
+    assert fit_rows(full, CAPACITY_AH).soc_pct.min() > 101.0  # within the tolerance
+    with pytest.raises(InputError, match=r"full: soc_pct: the counted SoC stays outside 0–100 %"):
+        fit([*trips(2), full], capacity_ah=CAPACITY_AH)

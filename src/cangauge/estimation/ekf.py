@@ -88,7 +88,9 @@ class Block(NamedTuple):
 
 
 class SocFilter(ExtendedKalmanFilter):  # type: ignore[misc] # filterpy has no types
-    """Kalman filter from one start; x, P, F, Q, H, R, K, y and S are filterpy's.
+    """Kalman filter from one start, in filterpy's names: x, P, F, Q, H, R, K, y and S.
+
+    Only `predict` is filterpy's. `update` takes a block and repeats itself where the curve bends.
 
     Parameters
     ----------

@@ -502,8 +502,8 @@ class Estimator:
         ----------
         state : EstimatorState
         age_s : float
-            Minimum age of the state [s] by a clock other than the samples' stamps; NaN if no
-            clock measured it. It overrides stamps that show less.
+            Least age of the state [s] by a clock other than the samples' stamps, which overrides
+            stamps that show less; NaN if no clock measured it: the age then counts as unknown.
 
         Returns
         -------
@@ -543,7 +543,10 @@ class Estimator:
         self.hypotheses.take_over(before.hypotheses)
 
     def _resume(self, state: EstimatorState, age_s: float | None) -> None:
-        """Copy from a state what depends on neither model nor settings."""
+        """Copy from a state what depends on neither model nor settings.
+
+        Without an interruption `age_s` is None, and the stamps of the samples give the time.
+        """
         self._clock.restore(replace(state.clock), age_s)
         self._counter.restore(replace(state.counter))
         self._memory = replace(state.memory, innovations=list(state.memory.innovations))

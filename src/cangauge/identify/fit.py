@@ -93,7 +93,7 @@ WHOLE_LOGS: Final = "whole logs left out in turn"
 FROM_SOC: Final = "from-soc"
 
 LISTED_LOGS: Final = 4096
-"""Source logs that a model file names; of more, it states the number."""
+"""Source logs that a model file lists; of more, only its name holds the number."""
 
 
 def fit(

@@ -18,6 +18,7 @@ from typing import Final
 import numpy as np
 
 from cangauge._typing import FloatArray
+from cangauge.errors import InputError
 from cangauge.identify.rows import FitRows
 from cangauge.model.prior import RESIDUAL_STD, RESISTANCE_H, Chemistry, prior_of
 from cangauge.model.voltage_model import (
@@ -129,6 +130,11 @@ def log_sums(
         Columns of effects.
     features : array of shape (m, BASE), optional
         Instead of `row_features`.
+
+    Raises
+    ------
+    InputError
+        If every row lies so far outside 0–100 % that it has no weight.
     """
     weight = row_weights(rows.soc_pct, rows.seconds, chemistry)
     columns = [row_features(rows) if features is None else features]
@@ -136,7 +142,15 @@ def log_sums(
         columns.append(extra)
     table = np.column_stack([*columns, np.ones(len(rows)), rows.voltage_v])
     total = float(weight.sum())
-    mean_soc = float(weight @ rows.soc_pct) / max(total, 1e-9)
+    if not total:
+        low, high = float(rows.soc_pct.min()), float(rows.soc_pct.max())
+        raise InputError(
+            f"the counted SoC stays outside 0–100 % ({low:.1f} … {high:.1f} %): no row is left",
+            source=rows.name,
+            field="soc_pct",
+            cure="check the SoC at the start (soc_pct, --initial-soc), or leave this log out",
+        )
+    mean_soc = float(weight @ rows.soc_pct) / total
     return LogSums(table.T @ (table * weight[:, None]), total, mean_soc)
 
 

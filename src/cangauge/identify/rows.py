@@ -94,6 +94,7 @@ def fit_rows(
     capacity_ah : float
         Charge from 100 to 0 % [Ah].
     rate_hz : float
+        Rate to which the log is decimated [Hz].
     delay_s, low_pass_s : sequence of float
         Columns of `currents_a` [s].
 

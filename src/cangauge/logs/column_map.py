@@ -30,8 +30,8 @@ class ColumnSpec:
     Parameters
     ----------
     text : str
-        Heading, or headings joined by `+` (a date and its time; the mean of temperatures), or `#3`
-        for the third column; then `[UNIT]` and `:FACTOR`, both optional.
+        Heading, or headings joined by `+` (a date and its time; the median of temperatures), or
+        `#3` for the third column; then `[UNIT]` and `:FACTOR`, both optional.
     unit : str, optional
         Unit of the column, in place of the heading's.
     factor : float

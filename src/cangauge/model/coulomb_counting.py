@@ -23,6 +23,7 @@ __all__ = [
     "counted_soc_pct",
     "difference_from_reference",
     "discharged_ah",
+    "doubt_of_start",
 ]
 
 FULL_PCT, EMPTY_PCT = 95.0, 5.0

@@ -1,7 +1,8 @@
 """Delayed currents I(t − dj): over a whole log, and online from a ring buffer.
 
 Both interpolate linearly between time stamps, which may be irregular, and hold the current of the
-first sample before it. A test checks that the two forms agree.
+first sample before it. After a gap longer than `GAP_S` they differ: `delayed_currents` interpolates
+across it, `DelayLine` starts again. `filled_at` marks the times at which they agree.
 """
 
 from __future__ import annotations

@@ -196,7 +196,7 @@ class Noise(_Strict):
     residual_std_v: _Volts
     """Rms residual of the rows of the fit."""
     left_out_scale: Annotated[float, Field(ge=1, le=1e6)] = 1.0
-    """κ²: the variances of the level and of the coefficients are already multiplied by it."""
+    """κ²: `level_std_v` and the covariance of the coefficients contain it already."""
     voltage_mae_pct: _NotNegative
     voltage_rmse_v: _Volts
     """Errors of left-out logs."""
@@ -312,7 +312,7 @@ class Model(_Strict):
 
     @property
     def coefficients(self) -> dict[str, Coefficient]:
-        """The published equation's coefficients; none where the logs do not identify them."""
+        """The published equation's, also beside a curve of knots; none where not identified."""
         return {} if self.published is None else self.published.coefficients
 
     def voltage_model(self) -> VoltageModel:

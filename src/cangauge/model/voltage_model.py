@@ -392,7 +392,8 @@ def past_currents(
     Parameters
     ----------
     time_s, current_a : array of shape (n,)
-        The whole log; the pack rested before it.
+        The whole log. Before it, delayed currents hold the first sample, and low-passed ones start
+        from rest.
     rows : array of int or slice
     delay_s, low_pass_s : sequence of float
         Delays and time constants [s].

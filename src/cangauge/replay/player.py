@@ -16,8 +16,6 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Final
 
-import can
-
 from cangauge._logging import emit
 from cangauge.bus.connection import BusConnection
 from cangauge.bus.publish import (
@@ -159,33 +157,44 @@ class _Player:
         stop: Callable[[], bool],
         show: Callable[[ReplayState], None] | None,
     ) -> None:
-        self._bus, self._settings, self._stop, self._show = bus, settings, stop, show
+        self._bus, self._stop, self._show = bus, stop, show
         self._receiver = receiver = _Receiver(bus, settings, stop)
-        is_max = math.isinf(settings.speed)
-        self._pacer = None if is_max else Pacer(settings.speed, stop, receiver.listen_once)
+        self._is_max = math.isinf(settings.speed)
+        self._pacer = Pacer(settings.speed, stop, receiver.listen_once)
         self._clock = None if settings.speed == 1.0 else ClockFrames(settings.ids.replay_clock)
         self._first_us: int | None = None
         self._clock_us: int | None = None
         self._began_s = self._show_s = 0.0
-        self.state = ReplayState(acknowledged=0 if is_max else None)
-        if is_max:
+        self.state = ReplayState(acknowledged=0 if self._is_max else None)
+        if self._is_max:
             receiver.wait_until_ready()
 
     def send(self, step: Step) -> None:
         """Send a step when it is due, or when the receiver has room."""
-        if self._pacer is None:
+        state = self.state
+        if self._is_max:
             self._receiver.wait_for_room()
         else:
             self._pacer.wait(step.time_us)
         if self._first_us is None:
             self._first_us, self._began_s = step.time_us, time.monotonic()
-        state = self.state
+        frames = step.frames
         if self._clock is not None and step.is_wanted and step.time_us != self._clock_us:
             self._clock_us = step.time_us
-            _send(self._bus, self._clock.at(step.time_us), is_max=self._pacer is None)
+            frames = [self._clock.at(step.time_us), *frames]
             state.clock_frames += 1
-        for frame in step.frames:
-            _send(self._bus, frame, is_max=self._pacer is None)
+        for frame in frames:
+            if frame.is_fd and not self._bus.carries_fd:
+                raise InputError(
+                    "holds CAN FD frames, and the bus is not open for them",
+                    field="--bus-option",
+                    cure="give --bus-option fd=true",
+                )
+            if not self._bus.send(frame) and self._is_max:
+                raise CangaugeError(
+                    f"{self._bus.name}: the transmit queue stays full; is the bus up, with another"
+                    " node that acknowledges frames?"
+                )
         state.frames, state.samples = state.frames + len(step.frames), step.samples
         state.log_seconds = (step.time_us - self._first_us) / MICROSECONDS
         self._receiver.sent(step, state.frames + state.clock_frames)
@@ -195,35 +204,20 @@ class _Player:
 
     def finish(self) -> None:
         """Wait for the last acknowledgements and the last estimate."""
-        if self._pacer is None and not self._stop():
+        if self._is_max and not self._stop():
             self._receiver.wait_for_all()
         self._update(LISTEN_AT_END_S)
 
     def _update(self, listen_s: float) -> None:
-        state = self.state
+        state, receiver = self.state, self._receiver
         if self._first_us is not None:
             state.seconds = time.monotonic() - self._began_s
-        self._receiver.listen(listen_s)
-        state.soc = self._receiver.soc
-        if state.acknowledged is not None:
-            state.acknowledged = self._receiver.acknowledged
-            state.lost = self._receiver.lost
+        receiver.listen(listen_s)
+        state.soc = receiver.soc
+        if self._is_max:
+            state.acknowledged, state.lost = receiver.acknowledged, receiver.lost
         if self._show is not None:
             self._show(state)
-
-
-def _send(bus: BusConnection, frame: can.Message, *, is_max: bool) -> None:
-    if frame.is_fd and not bus.carries_fd:
-        raise InputError(
-            "holds CAN FD frames, and the bus is not open for them",
-            field="--bus-option",
-            cure="give --bus-option fd=true",
-        )
-    if not bus.send(frame) and is_max:
-        raise CangaugeError(
-            f"{bus.name}: the transmit queue stays full; is the bus up, with another node that"
-            " acknowledges frames?"
-        )
 
 
 class Pacer:
@@ -281,22 +275,19 @@ class _Receiver:
     def listen_once(self, timeout_s: float) -> bool:
         """Receive one frame; return whether one came in time [s]."""
         message = self._bus.receive(timeout_s)
-        if message is None:
-            return False
-        content = self._reader.read(message)
+        content = None if message is None else self._reader.read(message)
         if isinstance(content, SocEstimate) and math.isfinite(content.soc_pct):
             self.soc = content
         elif isinstance(content, SocDetail):
             self._acknowledge(content.samples)
-        return True
+        return message is not None
 
     def wait_until_ready(self) -> None:
         """Wait for the first SOC_DETAIL, from which samples are counted; raise CangaugeError."""
         give_up_s = time.monotonic() + self._within_s
         while self._count is None and not self._stop():
             if time.monotonic() > give_up_s:
-                text = f"no receiver: no SOC_DETAIL in {self._within_s:g} s; {_HINT}"
-                raise CangaugeError(f"{self._bus.name}: {text}")
+                raise self._error(f"no receiver: no SOC_DETAIL in {self._within_s:g} s; {_HINT}")
             self.listen_once(POLL_S)
 
     def sent(self, step: Step, frames: int) -> None:
@@ -324,8 +315,7 @@ class _Receiver:
         return is_large and self._in_flight >= SAMPLES_AT_LEAST
 
     def _wait(self, is_enough: Callable[[], bool]) -> None:
-        last_s = time.monotonic()
-        before = self.acknowledged
+        before, last_s = self.acknowledged, time.monotonic()
         while not is_enough() and not self._stop():
             self.listen_once(POLL_S)
             now_s = time.monotonic()
@@ -338,27 +328,26 @@ class _Receiver:
                 text = f"{self.lost} samples have not reached the receiver so far; it goes on"
                 emit(_LOG, logging.WARNING, "replay.lost", text)
             elif now_s - last_s > self._within_s:
-                raise CangaugeError(
-                    f"{self._bus.name}: no acknowledgement in {self._within_s:g} s:"
-                    f" {self.acknowledged} of {self._samples} samples sent have been processed;"
-                    f" {_HINT}"
+                raise self._error(
+                    f"no acknowledgement in {self._within_s:g} s: {self.acknowledged} of"
+                    f" {self._samples} samples sent have been processed; {_HINT}"
                 )
 
     def _acknowledge(self, count: int) -> None:
         self._heard_s = time.monotonic()
-        if self._count is None or not self._samples:
-            self._count = count
+        before, self._count = self._count, count
+        if before is None or not self._samples:
             return
-        more = (count - self._count) % SAMPLES_MODULO
-        late = min(max(more - self._in_flight, 0), self.lost)
-        self.lost -= late  # it was slow: they have reached it after all
+        more = (count - before) % SAMPLES_MODULO
+        self.lost -= min(max(more - self._in_flight, 0), self.lost)  # slow: they came after all
         if more > self._in_flight:
-            raise CangaugeError(
-                f"{self._bus.name}: the receiver has processed {more} samples where"
-                f" {self._in_flight} were in flight: it was restarted, or another program sends or"
-                " acknowledges on this bus too"
+            raise self._error(
+                f"the receiver has processed {more} samples where {self._in_flight} were in flight:"
+                " it was restarted, or another program sends or acknowledges on this bus too"
             )
-        self._count = count
         self.acknowledged += more
         while self._marks and self._marks[0][0] <= self.acknowledged:
             self._frames_acknowledged = self._marks.popleft()[1]
+
+    def _error(self, problem: str) -> CangaugeError:
+        return CangaugeError(f"{self._bus.name}: {problem}")
