@@ -157,6 +157,20 @@ def test_heartbeat_waits_briefly_for_the_next_sample(serve: Callable[..., Served
     assert [each.samples for each in read if isinstance(each, SocDetail)][:5] == [1, 11, 21, 31, 41]
 
 
+def test_a_waiting_current_is_stale_after_a_silence(serve: Callable[..., Served]) -> None:
+    current = GENERIC.current.key
+    frames = [
+        (at_s, frame)
+        for at_s, frame in frames_every(0.1, 2.1)
+        if at_s < 1.95 or frame.arbitration_id == current
+    ]
+    port, _ = serve(SimulatedPort(frames), 10.0)
+    last = port.published[-1][1]
+    assert last.status is Status.INVALID
+    assert last.reasons & Reason.INPUT_STALE
+    assert last.age_s >= 7.0
+
+
 @pytest.mark.parametrize("rate", [40.0, -3.0])
 def test_rate_is_independent_of_bus_time(serve: Callable[..., Served], rate: float) -> None:
     port, _ = serve(SimulatedPort(frames_every(0.02, 5.0, stamp_rate=rate)), 5.05)

@@ -197,6 +197,17 @@ def test_live_health_power_and_cells_equal_offline_ones(tmp_path: Path) -> None:
     assert any(isinstance(each, SocCells) and each.weakest_cell == 40 for each in contents)
 
 
+def test_cells_follow_a_reloaded_model(tmp_path: Path) -> None:
+    model = leaf_model()
+    pipeline = Pipeline(car_with_cells(tmp_path), model, PipelineSettings())
+    before = pipeline.cells
+    pipeline.reconfigure(None, model, PipelineSettings())
+    assert pipeline.cells is before
+    other = model.model_copy(update={"name": "other"})
+    pipeline.reconfigure(None, other, PipelineSettings())
+    assert pipeline.cells is not before
+
+
 def test_no_cell_frame_without_cell_signals() -> None:
     pipeline = Pipeline(Vehicle.load("generic"), leaf_model())
     kinds = {type(SocReader().read(each)) for each in pipeline.heartbeat(is_stale=False)}

@@ -183,7 +183,7 @@ def test_after_a_reboot_the_pause_may_have_been_long(machine: Machine) -> None:
     service = machine.start()
     service.drive(DRIVE[1000:1001])
     assert service.pipeline.latest.soc_std_pct >= same
-    assert service.pipeline.verdict == "open"
+    assert service.pipeline.estimator.verdict == "open"
 
 
 def test_a_replayed_log_goes_on_and_another_one_begins_anew(machine: Machine) -> None:
@@ -261,7 +261,7 @@ DAMAGE: dict[str, tuple[Callable[[Path], object], str]] = {
     "one bit": (flip, ""),
     "a list": (lambda path: path.write_text("[]"), "not a cangauge state"),
     "nested": (lambda path: path.write_text("[" * 200_000), "not a cangauge state"),
-    "large": (lambda path: path.write_bytes(b" " * ((8 << 20) + 1)), "larger than 8 MB"),
+    "large": (lambda path: path.write_bytes(b" " * ((8 << 20) + 1)), "larger than the 8 MB"),
     "version": (lambda path: path.write_text(path.read_text().replace(
         f'"version": {STATE_VERSION}', '"version": 1')), "(got '1')"),
     "hash": (lambda path: path.write_text(path.read_text().replace('"sha256": "', '"sha256": "0')),

@@ -133,8 +133,7 @@ class _Hangups:
         self._received = False
         self._had_terminal = _has_terminal()
 
-    def note(self, number: int, frame: FrameType | None) -> None:
-        del number, frame
+    def __call__(self, _number: int, _frame: FrameType | None) -> None:
         if self._had_terminal and not _has_terminal():
             signal.raise_signal(signal.SIGTERM)
         else:
@@ -149,7 +148,7 @@ class _Hangups:
 def hold_hangups() -> None:
     """Remember SIGHUP for `note_hangups` from now on: it would end a service that still loads."""
     if hasattr(signal, "SIGHUP"):
-        signal.signal(signal.SIGHUP, _Hangups().note)
+        signal.signal(signal.SIGHUP, _Hangups())
 
 
 @contextmanager
@@ -163,9 +162,8 @@ def note_hangups() -> Iterator[Callable[[], bool]]:
         yield lambda: False
         return
     before = signal.getsignal(signal.SIGHUP)
-    held = getattr(before, "__self__", None)
-    hangups = held if isinstance(held, _Hangups) else _Hangups()
-    signal.signal(signal.SIGHUP, hangups.note)
+    hangups = before if isinstance(before, _Hangups) else _Hangups()
+    signal.signal(signal.SIGHUP, hangups)
     try:
         yield hangups.forget
     finally:

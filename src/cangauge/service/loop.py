@@ -142,8 +142,8 @@ class Loop:
         if self._stamps_are_arrival:
             self._stamps = StampLimiter(KERNEL_TOLERANCE_S, time.time() - steady_s())
         self._shift_s = 0.0
-        # The receive queue was empty at some time after the first; the latest turn received at the
-        # second.
+        # Beginning of the latest turn that emptied the receive queue, after which the frames of
+        # the next turn arrived; time at which the latest turn received.
         self._drained_s = self._received_s = steady_s()
         self._reported: set[str] = set()
         self._drops = 0
@@ -167,9 +167,10 @@ class Loop:
         try:
             while not (stop() or self._is_over()):
                 self._turn()
-            if frames := self._pipeline.finish():
+            if self._pipeline.finish():
                 self._on_sample()
-                self._send(frames)
+                self._now_s = time.monotonic()
+                self._beat()  # with the silence since the sample before: this one waited
         finally:
             self._checkpoint()
         return RunSummary(
@@ -207,7 +208,7 @@ class Loop:
 
     def _process(self, messages: list[can.Message], now_s: float) -> None:
         pipeline, record, poller = self._pipeline, self._record, self._poller
-        before, taken, stamp_s = pipeline.samples, pipeline.taken, math.nan
+        samples_before, taken_before, stamp_s = pipeline.samples, pipeline.taken, math.nan
         stamps = [message.timestamp for message in messages]
         lag_s = now_s - self._stamps.limit(messages, self._drained_s, now_s)
         for message, received_s in zip(messages, stamps, strict=True):
@@ -225,9 +226,9 @@ class Loop:
             if frames := pipeline.acknowledgement():
                 self._send(frames)
                 self._beat_s = self._now_s + ESTIMATE_EVERY_S
-        if pipeline.samples != before:
+        if pipeline.samples != samples_before:
             self._sample_s = self._now_s
-        if taken := pipeline.taken - taken:
+        if taken := pipeline.taken - taken_before:
             began_s, self._now_s = self._now_s, time.monotonic()
             step_s = (self._now_s - began_s) / taken
             self._came_s = began_s - lag_s if self._stamps_are_arrival else began_s

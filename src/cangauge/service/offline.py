@@ -444,9 +444,7 @@ class _Bus:
     values: array[float] = field(default_factory=lambda: array("d"))
 
     def finish(self) -> None:
-        before = self.pipeline.samples
-        self.pipeline.finish()
-        if self.pipeline.samples != before:
+        if self.pipeline.finish():
             self.collect()
         self.pack.report = self.pipeline.report()
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import astuple, dataclass, field, replace
 from typing import Final
 
 import can
@@ -65,8 +65,7 @@ class FrameCounts:
 
     def __add__(self, other: FrameCounts) -> FrameCounts:
         """Return the sums."""
-        names = [each.name for each in fields(self)]
-        return FrameCounts(*(getattr(self, name) + getattr(other, name) for name in names))
+        return FrameCounts(*map(sum, zip(astuple(self), astuple(other), strict=True)))
 
 
 class SignWatch:
@@ -154,7 +153,7 @@ class Pipeline:
         Part of the frames' stamps that their clock does not have, since it was set [s].
     latest_sample : Sample or None
     published : Estimate
-        The estimate in the frames made last.
+        The one in the frames made last: `latest`, or at a heartbeat what is true of it then.
     cells : CellEstimator or None
         Where the vehicle gives cell voltages.
     sign : SignWatch
@@ -185,22 +184,18 @@ class Pipeline:
             self._publisher = SocPublisher(ids, ACKNOWLEDGE_EVERY if self._is_replay else None)
         self._time = time_source(self.settings.time_source, ids.replay_clock)
         self._earlier_counts = FrameCounts()
-        self._untimed = self._beginnings = 0
+        self._untimed = 0
         self._refused = 0  # in a row
         self._pack = _pack_of(model, self.settings.estimator.capacity_ah)
-        self.decoder = SampleDecoder(vehicle, self._pack)
-        self.sign = SignWatch()
         self.estimator = make_estimator(model, _with_source(self.settings.estimator, vehicle))
-        self.cells = self._new_cells()
+        self._restart_decoder()
         self.samples = self.taken = 0
         self.stamp_shift_s = 0.0
         self.latest_sample: Sample | None = None
         self.published = NOTHING_YET
-        # Computed when read: the estimator's latest estimate (None before the first sample, or
-        # when restored), and the same with signal health.
-        self._estimated: Estimate | None = None
-        self._latest = NOTHING_YET
-        self._is_behind = False
+        # What stands for the estimator's own estimate until its next sample: at the start, and
+        # where it is new, restored or of another log.
+        self._until_sample: Estimate | None = NOTHING_YET
         self._report: tuple[int, PackReport] | None = None
 
     # --- frames → estimates
@@ -214,39 +209,32 @@ class Pipeline:
         if time_s is None:
             self._untimed += not is_clock(message, self.settings.ids.replay_clock)
             return False
-        if self._time.beginnings != self._beginnings:
+        if self._time.beginnings != self._earlier_counts.beginnings:
             self._begin_log()
         message.timestamp = time_s
         sample = self.decoder.handle(message)
         if sample is None:
             return False
-        self._estimate(sample)
+        self._take(sample)
         return True
 
-    def finish(self) -> list[can.Message]:
-        """Release the last current if it is unpaired; return the frames of its sample, if any."""
+    def finish(self) -> bool:
+        """Release the last current if it is unpaired; return whether it completed a sample."""
         sample = self.decoder.flush()
-        if sample is None:
-            return []
-        self._estimate(sample)
-        if self._publisher is None:
-            return []
-        self.published = self.latest
-        return self._publisher.beat(self.published, self.samples, 0.0, self.report)
+        if sample is not None:
+            self._take(sample)
+        return sample is not None
 
     @property
     def latest(self) -> Estimate:
         """The estimate of the latest sample, with the signal health at its time."""
-        if self._is_behind and self.latest_sample is not None:
-            self._is_behind = False
-            self._estimated = self.estimator.estimate
-            self._latest = self._with_health(self.latest_sample.time_s)
-        return self._latest
+        if self._until_sample is not None or self.latest_sample is None:
+            return self._until_sample or NOTHING_YET
+        return self._with_health(self.estimator.estimate, self.latest_sample.time_s)
 
     def estimate_now(self) -> Estimate:
         """Return the latest estimate with the signal health at the latest wanted frame."""
-        _ = self.latest
-        return self._with_health(self.decoder.now_s)
+        return self._with_health(self._until_sample or self.estimator.estimate, self.decoder.now_s)
 
     def report(self) -> PackReport:
         """Return health, power and cells after the latest sample; computed once a sample."""
@@ -274,18 +262,15 @@ class Pipeline:
             untimed=self._untimed,
         )
 
-    def _estimate(self, sample: Sample) -> None:
+    def _take(self, sample: Sample) -> None:
         self.samples += 1
         self.latest_sample = sample
+        self._until_sample = None
         is_implausible = math.isnan(sample.voltage_v) and self.decoder.is_voltage_implausible
         # The estimator treats a refused voltage otherwise than one that never came, as offline.
         self.estimator.update(sample._replace(voltage_v=math.inf) if is_implausible else sample)
-        if self.estimator.is_refused:
-            self._refused += 1
-        else:
-            self.taken += 1
-            self._refused = 0
-        self._is_behind = True
+        self._refused = self._refused + 1 if self.estimator.is_refused else 0
+        self.taken += not self.estimator.is_refused
         self.sign.add(sample)
         cells, received = self.cells, self.decoder.cells
         if cells is not None and received is not None and cells.is_due(sample.time_s):
@@ -293,20 +278,13 @@ class Pipeline:
             changes = self.estimator.current_changes(sample.time_s, times)
             cells.update(self.estimator.pack_tick(sample), volts, changes)
 
-    def _new_cells(self) -> CellEstimator | None:
-        signals = self.vehicle.cells
-        if signals is None:
-            return None
-        return CellEstimator(self.estimator.voltage_model, signals.count, signals.first)
-
-    def _with_health(self, now_s: float) -> Estimate:
+    def _with_health(self, estimate: Estimate, now_s: float) -> Estimate:
         """Return the latest estimate, marked by the health of the signals at bus time `now_s`.
 
         A single voltage that failed or has not come yet is not missing; several consecutive ones
         are, or one that is too old. Samples that are refused one after the other do not make an
         estimate fresh.
         """
-        estimate = self._latest if self._estimated is None else self._estimated
         reasons = estimate.reasons
         if self.latest_sample is not None and math.isnan(self.latest_sample.voltage_v):
             reasons &= ~Reason.VOLTAGE_MISSING
@@ -321,18 +299,24 @@ class Pipeline:
             return estimate
         return estimate._replace(reasons=reasons, status=status_of(reasons))
 
+    def _restart_decoder(self) -> None:
+        """Begin to decode anew, for the present vehicle, pack and estimator."""
+        self.decoder, self.sign = SampleDecoder(self.vehicle, self._pack), SignWatch()
+        self._restart_cells()
+
+    def _restart_cells(self) -> None:
+        signals, model = self.vehicle.cells, self.estimator.voltage_model
+        self.cells = None if signals is None else CellEstimator(model, signals.count, signals.first)
+
     def _begin_log(self) -> None:
         """Restart decoder and estimator for the next log of a replay."""
-        _ = self.latest  # before its estimator is replaced
-        self._earlier_counts = replace(self.counts, beginnings=self._earlier_counts.beginnings + 1)
+        self._until_sample = self.latest
+        self._earlier_counts = replace(self.counts, beginnings=self._time.beginnings)
         self._untimed = self._refused = 0
-        self._beginnings = self._time.beginnings
         if self._publisher is not None:
             self._publisher.restart()
-        self.decoder, self.sign = SampleDecoder(self.vehicle, self._pack), SignWatch()
         self.estimator = make_estimator(self.model, self.estimator.settings)
-        self.cells = self._new_cells()
-        self._estimated = None
+        self._restart_decoder()
 
     # --- estimates → frames
 
@@ -364,18 +348,19 @@ class Pipeline:
         estimate = self.estimate_now()
         if not self._is_replay:
             is_stale = is_stale or silent_s > self.decoder.health["current"].timeout_s
-        if is_stale and self.samples:
+        if is_stale and self.taken:
             reasons |= Reason.INPUT_STALE
         if reasons:
             reasons |= estimate.reasons
             estimate = estimate._replace(status=status_of(reasons), reasons=reasons)
         if estimate.status is Status.INVALID:
-            # No charge is counted; the last estimate grows old.
+            # What was not counted since the latest sample: little where samples come, and the model
+            # or the sign is what invalidates them.
             missing_pct = self.estimator.uncounted_std_pct(silent_s)
             std_pct = math.hypot(estimate.soc_std_pct, missing_pct)
             estimate = estimate._replace(soc_std_pct=std_pct)
         self.published = estimate
-        age_s = silent_s if self.samples else math.nan
+        age_s = silent_s if self.taken else math.nan
         return self._publisher.beat(estimate, self.samples, age_s, self.report)
 
     @property
@@ -400,14 +385,15 @@ class Pipeline:
         ids = replace(settings.ids, replay_clock=old.ids.replay_clock)
         if self._publisher is not None:
             _check_ids(vehicle or self.vehicle, ids)
-        _ = self.latest  # computed before its estimator is replaced
         estimator_settings = replace(
             _with_source(settings.estimator, vehicle or self.vehicle),
             initial_soc_pct=started.initial_soc_pct,
             initial_soc_std_pct=started.initial_soc_std_pct,
         )
-        if (model, estimator_settings) != (self.model, started):
-            before, self.estimator = self.estimator, make_estimator(model, estimator_settings)
+        is_other_model = model != self.model
+        if is_other_model or estimator_settings != started:
+            before, self._until_sample = self.estimator, self.latest
+            self.estimator = make_estimator(model, estimator_settings)
             self.estimator.take_over(before)
             self.model = model
         pack = _pack_of(model, estimator_settings.capacity_ah)
@@ -415,8 +401,9 @@ class Pipeline:
             # The plausible range of a signal follows from both.
             self._earlier_counts, self._untimed = self.counts, 0
             self.vehicle, self._pack = vehicle or self.vehicle, pack
-            self.decoder, self.sign = SampleDecoder(self.vehicle, pack), SignWatch()
-            self.cells = self._new_cells()
+            self._restart_decoder()
+        elif is_other_model:
+            self._restart_cells()
         self._report = None
         self.settings = replace(settings, ids=ids, time_source=old.time_source)
         if self._publisher is not None:
@@ -444,10 +431,9 @@ class Pipeline:
         if isinstance(self._time, ReplayClock):
             self._time.resume(latest.time_s)
         reasons = latest.reasons | Reason.INPUT_STALE
-        self._latest = latest._replace(status=Status.INVALID, reasons=reasons)
-        self._estimated = self._report = None
-        self._is_behind = False
-        return self._latest
+        self._until_sample = latest._replace(status=Status.INVALID, reasons=reasons)
+        self._report = None
+        return self._until_sample
 
     def discard_initial_soc(self) -> bool:
         """Start from the first voltages instead of the given initial SoC; False if none was given.
@@ -461,11 +447,6 @@ class Pipeline:
         settings = replace(settings, initial_soc_pct=None, initial_soc_std_pct=std_pct)
         self.estimator = make_estimator(self.model, settings)
         return True
-
-    @property
-    def verdict(self) -> str:
-        """What the voltage said of the restored SoC: "parked", "moved", …; "" or "open" before."""
-        return self.estimator.verdict
 
 
 def _pack_of(model: Model, capacity_ah: float | None) -> PackProperties:

@@ -9,7 +9,6 @@ cannot be used is set aside; one that cannot be written never stops the estimato
 
 from __future__ import annotations
 
-import errno
 import json
 import logging
 import math
@@ -23,7 +22,7 @@ from typing import Annotated, Any, Final, Self
 from pydantic import BaseModel, ConfigDict, Field
 
 from cangauge._config import validated
-from cangauge._files import open_regular, text_sha256
+from cangauge._files import open_regular, read_bounded, text_sha256
 from cangauge._logging import emit
 from cangauge._text import duration, number
 from cangauge.errors import InputError
@@ -44,9 +43,7 @@ REBOOT_S: Final = 600.0
 """Least duration of a pause over a reboot [s]: the clock may have stopped with the machine."""
 FUTURE_S: Final = 60.0
 """A state further in the future than this [s] has another clock: its age is unknown."""
-_LONGEST_NAME: Final = 200
 _LOG = logging.getLogger(__name__)
-_Name = Annotated[str, Field(max_length=_LONGEST_NAME)]
 
 
 class StateContent(BaseModel):
@@ -61,9 +58,9 @@ class StateContent(BaseModel):
     saved_s: Annotated[float, Field(allow_inf_nan=False, ge=-1e12, le=1e12)]
     boot_id: Annotated[str, Field(max_length=64)] | None
     model: Annotated[str, Field(pattern="^[0-9a-f]{64}$")]
-    model_name: _Name
-    bus: _Name
-    vehicle: _Name
+    model_name: str
+    bus: str
+    vehicle: str
     time_source: Annotated[str, Field(max_length=32)]
     estimator: EstimatorState
 
@@ -128,7 +125,7 @@ class StateKeeper:
         wall_s: Callable[[], float] = time.time,
     ) -> None:
         self._path = path
-        self._bus = bus[:_LONGEST_NAME]
+        self._bus = bus
         self._pipeline = pipeline
         self._max_age_s = max_age_s
         self._wall_s = wall_s
@@ -140,14 +137,14 @@ class StateKeeper:
         self.restored = False
 
     def __enter__(self) -> Self:
+        if not self._path.exists():
+            text = f"{self._path}: no saved state; starting without one"
+            emit(_LOG, logging.INFO, "state.none", text)
+            return self
         try:
             content = read_state(self._path)
             age_s = self._age_s(content)
             latest = self._pipeline.restore(content.estimator, age_s)
-        except FileNotFoundError:
-            text = f"{self._path}: no saved state; starting without one"
-            emit(_LOG, logging.INFO, "state.none", text)
-            return self
         except InputError as error:
             self._set_aside(error)
             return self
@@ -175,9 +172,9 @@ class StateKeeper:
             saved_s=self._wall_s(),
             boot_id=self._boot_id,
             model=self._model_hash(),
-            model_name=pipeline.model.name[:_LONGEST_NAME],
+            model_name=pipeline.model.name,
             bus=self._bus,
-            vehicle=pipeline.vehicle.name[:_LONGEST_NAME],
+            vehicle=pipeline.vehicle.name,
             time_source=pipeline.settings.time_source,
             estimator=state,
         )
@@ -195,7 +192,7 @@ class StateKeeper:
         pipeline, path = self._pipeline, self._path
         now = {
             "model": (self._model_hash(), content.model_name),
-            "vehicle": (pipeline.vehicle.name[:_LONGEST_NAME], content.vehicle),
+            "vehicle": (pipeline.vehicle.name, content.vehicle),
             "bus": (self._bus, content.bus),
             "time_source": (pipeline.settings.time_source, content.time_source),
         }
@@ -234,8 +231,6 @@ class StateKeeper:
     def _write(self, content: StateContent) -> None:
         """Replace the file atomically; a power cut leaves the old one or the new one."""
         path = Path(os.path.realpath(self._path))
-        if path.exists() and not path.is_file():  # a link to a device would replace the device
-            raise FileExistsError(errno.EEXIST, "not a file", str(path))
         # The same name each time: what a killed service left is overwritten.
         part = path.with_name(f".{path.name}.part")
         flags = os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC
@@ -247,7 +242,7 @@ class StateKeeper:
 
     def _log_verdict(self) -> None:
         """Log once what the voltage says of the restored SoC."""
-        verdict = self._pipeline.verdict
+        verdict = self._pipeline.estimator.verdict
         if self._restored_pct is None or verdict in {"", "open"}:
             return
         before, self._restored_pct = self._restored_pct, None
@@ -277,20 +272,10 @@ def read_state(path: Path) -> StateContent:
 
     Raises
     ------
-    FileNotFoundError
-        If there is none.
     InputError
-        If it cannot be read, is damaged, or has another version.
+        If there is none, or it cannot be read, is damaged, or has another version.
     """
-    try:
-        with path.open("rb") as file:
-            raw = file.read(LARGEST_BYTES + 1)
-    except FileNotFoundError:
-        raise
-    except OSError as error:
-        raise InputError(f"cannot be read: {error.strerror}", source=path) from error
-    if len(raw) > LARGEST_BYTES:
-        raise InputError(f"larger than {LARGEST_BYTES >> 20} MB", source=path)
+    raw = read_bounded(path, LARGEST_BYTES, "a state file")
     try:
         data = json.loads(raw.decode("utf-8"))
         content = data["content"]

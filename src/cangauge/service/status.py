@@ -12,6 +12,7 @@ import time
 from bisect import bisect_left
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, fields
+from itertools import accumulate
 from typing import Any, Final
 
 from cangauge._logging import emit
@@ -93,12 +94,8 @@ class Histogram:
 
     def _at_most_s(self, share: float, count: int) -> float | None:
         """Return the upper bound of the bucket with this quantile [s]; None above all bounds."""
-        seen = 0
-        for bound, observed in zip(BOUNDS_S, self._counts, strict=False):
-            seen += observed
-            if seen and seen >= share * count:
-                return bound
-        return None
+        place = bisect_left(list(accumulate(self._counts)), share * count)
+        return BOUNDS_S[place] if count and place < len(BOUNDS_S) else None
 
 
 class Monitor:
