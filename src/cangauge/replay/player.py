@@ -16,6 +16,8 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Final
 
+import can
+
 from cangauge._logging import emit
 from cangauge.bus.connection import BusConnection
 from cangauge.bus.publish import (
@@ -36,8 +38,6 @@ AHEAD_S: Final = 0.0002
 """Frames due within this time are sent at once: sleeping is less precise [s]."""
 REST_AT_MOST_S: Final = 0.2
 """Longest uninterrupted wait, so that a stop is noticed [s]."""
-WINDOW_SAMPLES: Final = 40
-"""Most samples in flight."""
 WINDOW_FRAMES: Final = 160
 """Most frames in flight: a default socket buffer of Linux holds about 270."""
 SAMPLES_AT_LEAST: Final = 2 * ACKNOWLEDGE_EVERY
@@ -107,7 +107,7 @@ def play(
     settings: ReplaySettings,
     *,
     stop: Callable[[], bool],
-    show: Callable[[ReplayState], None] | None = None,
+    show: Callable[[ReplayState], None] = lambda _: None,
 ) -> ReplayState:
     """Play a source on a bus.
 
@@ -130,7 +130,8 @@ def play(
     CangaugeError
         If the bus fails, or no receiver acknowledges in time.
     """
-    if math.isinf(settings.speed) and not source.counts_samples:
+    player = _Player(bus, settings, stop)
+    if player.is_max and not source.counts_samples:
         raise InputError(
             "full speed needs the vehicle of a capture, to count the samples acknowledged",
             source=source.name,
@@ -138,86 +139,20 @@ def play(
             value="max",
             cure="give --vehicle, or --dbc and --map, or another speed",
         )
-    player = _Player(bus, settings, stop, show)
+    show_s = -math.inf
+    if player.is_max:
+        player.wait_until_ready()
     for step in source.steps(loop=settings.loop):
         if stop():
             break
         player.send(step)
-    player.finish()
+        if time.monotonic() >= show_s:
+            show_s = time.monotonic() + SHOW_EVERY_S
+            show(player.update(LISTEN_S))
+    if player.is_max:
+        player.wait_for_all()
+    show(player.update(LISTEN_AT_END_S))
     return player.state
-
-
-class _Player:
-    """Sends steps when they are due, with the clock, and keeps the state."""
-
-    def __init__(
-        self,
-        bus: BusConnection,
-        settings: ReplaySettings,
-        stop: Callable[[], bool],
-        show: Callable[[ReplayState], None] | None,
-    ) -> None:
-        self._bus, self._stop, self._show = bus, stop, show
-        self._receiver = receiver = _Receiver(bus, settings, stop)
-        self._is_max = math.isinf(settings.speed)
-        self._pacer = Pacer(settings.speed, stop, receiver.listen_once)
-        self._clock = None if settings.speed == 1.0 else ClockFrames(settings.ids.replay_clock)
-        self._first_us: int | None = None
-        self._clock_us: int | None = None
-        self._began_s = self._show_s = 0.0
-        self.state = ReplayState(acknowledged=0 if self._is_max else None)
-        if self._is_max:
-            receiver.wait_until_ready()
-
-    def send(self, step: Step) -> None:
-        """Send a step when it is due, or when the receiver has room."""
-        state = self.state
-        if self._is_max:
-            self._receiver.wait_for_room()
-        else:
-            self._pacer.wait(step.time_us)
-        if self._first_us is None:
-            self._first_us, self._began_s = step.time_us, time.monotonic()
-        frames = step.frames
-        if self._clock is not None and step.is_wanted and step.time_us != self._clock_us:
-            self._clock_us = step.time_us
-            frames = [self._clock.at(step.time_us), *frames]
-            state.clock_frames += 1
-        for frame in frames:
-            if frame.is_fd and not self._bus.carries_fd:
-                raise InputError(
-                    "holds CAN FD frames, and the bus is not open for them",
-                    field="--bus-option",
-                    cure="give --bus-option fd=true",
-                )
-            if not self._bus.send(frame) and self._is_max:
-                raise CangaugeError(
-                    f"{self._bus.name}: the transmit queue stays full; is the bus up, with another"
-                    " node that acknowledges frames?"
-                )
-        state.frames, state.samples = state.frames + len(step.frames), step.samples
-        state.log_seconds = (step.time_us - self._first_us) / MICROSECONDS
-        self._receiver.sent(step, state.frames + state.clock_frames)
-        if time.monotonic() >= self._show_s:
-            self._show_s = time.monotonic() + SHOW_EVERY_S
-            self._update(LISTEN_S)
-
-    def finish(self) -> None:
-        """Wait for the last acknowledgements and the last estimate."""
-        if self._is_max and not self._stop():
-            self._receiver.wait_for_all()
-        self._update(LISTEN_AT_END_S)
-
-    def _update(self, listen_s: float) -> None:
-        state, receiver = self.state, self._receiver
-        if self._first_us is not None:
-            state.seconds = time.monotonic() - self._began_s
-        receiver.listen(listen_s)
-        state.soc = receiver.soc
-        if self._is_max:
-            state.acknowledged, state.lost = receiver.acknowledged, receiver.lost
-        if self._show is not None:
-            self._show(state)
 
 
 class Pacer:
@@ -247,106 +182,143 @@ class Pacer:
             self._rest(min(ahead_s, REST_AT_MOST_S))
 
 
-class _Receiver:
-    """The receiver as seen by the player: samples acknowledged since it was ready, its SoC."""
+class _Player:
+    """Sends steps when they are due, or when the receiver has room; keeps the state."""
 
     def __init__(
         self, bus: BusConnection, settings: ReplaySettings, stop: Callable[[], bool]
     ) -> None:
         self._bus, self._within_s, self._stop = bus, settings.acknowledge_s, stop
+        self.is_max = math.isinf(settings.speed)
+        self._pacer = Pacer(settings.speed, stop, self._listen_once)
+        self._clock = None if settings.speed == 1.0 else ClockFrames(settings.ids.replay_clock)
         self._reader = SocReader(settings.ids)
-        self.soc: SocEstimate | None = None
-        self.acknowledged = self.lost = 0
-        self._count: int | None = None  # latest sample count in SOC_DETAIL
+        self._first_us: int | None = None
+        self._began_s, self._clock_us = 0.0, -1
+        self._count: int | None = None  # in the latest SOC_DETAIL
         self._heard_s = -math.inf
-        self._samples = self._frames = self._frames_acknowledged = 0
-        # Frames sent when a sample was complete: (sample, frames).
+        self._acknowledged = self._frames_acknowledged = 0
+        # Frames sent when a sample was complete: (samples, frames).
         self._marks: deque[tuple[int, int]] = deque()
+        self.state = ReplayState(acknowledged=0 if self.is_max else None)
 
-    def listen(self, within_s: float) -> None:
-        """Receive for at most `within_s` [s]; return when the bus is quiet.
+    def send(self, step: Step) -> None:
+        """Send a step when it is due, or when the receiver has room."""
+        state = self.state
+        if not self.is_max:
+            self._pacer.wait(step.time_us)
+        elif self._frames_in_flight >= WINDOW_FRAMES:
+            # Drain to half, so that both sides work in batches.
+            self._wait(lambda: self._frames_in_flight <= WINDOW_FRAMES // 2)
+        if self._first_us is None:
+            self._first_us, self._began_s = step.time_us, time.monotonic()
+        if self._clock is not None and step.is_wanted and step.time_us != self._clock_us:
+            self._clock_us = step.time_us
+            self._send(self._clock.at(step.time_us))
+            state.clock_frames += 1
+        for frame in step.frames:
+            self._send(frame)
+        state.frames += len(step.frames)
+        if step.samples != state.samples:
+            self._marks.append((step.samples, state.frames + state.clock_frames))
+        state.samples = step.samples
+        state.log_seconds = (step.time_us - self._first_us) / MICROSECONDS
+
+    def update(self, listen_s: float) -> ReplayState:
+        """Listen until the bus is quiet, for at most `listen_s` [s]; return the state.
 
         Not with a timeout of 0: where Python filters, own frames must be skipped first.
         """
-        until_s = time.monotonic() + within_s
-        while (left_s := until_s - time.monotonic()) > 0.0 and self.listen_once(left_s):
+        if self._first_us is not None:
+            self.state.seconds = time.monotonic() - self._began_s
+        until_s = time.monotonic() + listen_s
+        while (left_s := until_s - time.monotonic()) > 0.0 and self._listen_once(left_s):
             pass
+        return self.state
 
-    def listen_once(self, timeout_s: float) -> bool:
+    def wait_until_ready(self) -> None:
+        """Wait for the first SOC_DETAIL, from which samples are counted; raise CangaugeError."""
+        self._wait(lambda: self._count is not None)
+
+    def wait_for_all(self) -> None:
+        """Wait until all samples are acknowledged or lost; raise CangaugeError without a sign."""
+        self._wait(lambda: self._in_flight == 0)
+
+    def _send(self, frame: can.Message) -> None:
+        if frame.is_fd and not self._bus.carries_fd:
+            raise InputError(
+                "holds CAN FD frames, and the bus is not open for them",
+                field="--bus-option",
+                cure="give --bus-option fd=true",
+            )
+        if not self._bus.send(frame) and self.is_max:
+            raise self._error(
+                "the transmit queue stays full; is the bus up, with another node that"
+                " acknowledges frames?"
+            )
+
+    @property
+    def _in_flight(self) -> int:
+        return self.state.samples - self._acknowledged - self.state.lost
+
+    @property
+    def _frames_in_flight(self) -> int:
+        """Frames that may wait at the receiver; 0 with too few samples for an acknowledgement."""
+        frames = self.state.frames + self.state.clock_frames - self._frames_acknowledged
+        return frames if self._in_flight >= SAMPLES_AT_LEAST else 0
+
+    def _wait(self, is_enough: Callable[[], bool]) -> None:
+        before, last_s = self._acknowledged, time.monotonic()
+        while not is_enough() and not self._stop():
+            self._listen_once(POLL_S)
+            now_s = time.monotonic()
+            if self._acknowledged != before:
+                before, last_s = self._acknowledged, now_s
+            elif self._acknowledged and self._heard_s - last_s > LOST_AFTER_S:
+                self._give_up()
+            elif now_s - last_s > self._within_s:
+                problem = (
+                    "no receiver: no SOC_DETAIL"
+                    if self._count is None
+                    else (
+                        f"{self._acknowledged} of {self.state.samples} samples sent have been"
+                        " processed: no acknowledgement"
+                    )
+                )
+                raise self._error(f"{problem} in {self._within_s:g} s; {_HINT}")
+
+    def _give_up(self) -> None:
+        """Count the samples in flight as lost, and all frames as arrived."""
+        self.state.lost += self._in_flight
+        self._frames_acknowledged = self.state.frames + self.state.clock_frames
+        self._marks.clear()
+        text = f"{self.state.lost} samples have not reached the receiver so far; it goes on"
+        emit(_LOG, logging.WARNING, "replay.lost", text)
+
+    def _listen_once(self, timeout_s: float) -> bool:
         """Receive one frame; return whether one came in time [s]."""
         message = self._bus.receive(timeout_s)
         content = None if message is None else self._reader.read(message)
         if isinstance(content, SocEstimate) and math.isfinite(content.soc_pct):
-            self.soc = content
-        elif isinstance(content, SocDetail):
+            self.state.soc = content
+        elif isinstance(content, SocDetail) and self.is_max:
             self._acknowledge(content.samples)
         return message is not None
-
-    def wait_until_ready(self) -> None:
-        """Wait for the first SOC_DETAIL, from which samples are counted; raise CangaugeError."""
-        give_up_s = time.monotonic() + self._within_s
-        while self._count is None and not self._stop():
-            if time.monotonic() > give_up_s:
-                raise self._error(f"no receiver: no SOC_DETAIL in {self._within_s:g} s; {_HINT}")
-            self.listen_once(POLL_S)
-
-    def sent(self, step: Step, frames: int) -> None:
-        """Record the samples and frames sent so far."""
-        if step.samples != self._samples:
-            self._marks.append((step.samples, frames))
-        self._samples, self._frames = step.samples, frames
-
-    def wait_for_room(self) -> None:
-        """Wait until the window has room; raise CangaugeError without an acknowledgement."""
-        if self._is_full():  # drain to half, so that both sides work in batches
-            self._wait(lambda: self._in_flight <= WINDOW_SAMPLES // 2 and not self._is_full())
-
-    def wait_for_all(self) -> None:
-        """Wait until all samples are acknowledged; raise like `wait_for_room`."""
-        self._wait(lambda: self._in_flight == 0)
-
-    @property
-    def _in_flight(self) -> int:
-        return self._samples - self.acknowledged - self.lost
-
-    def _is_full(self) -> bool:
-        frames = self._frames - self._frames_acknowledged
-        is_large = self._in_flight >= WINDOW_SAMPLES or frames >= WINDOW_FRAMES
-        return is_large and self._in_flight >= SAMPLES_AT_LEAST
-
-    def _wait(self, is_enough: Callable[[], bool]) -> None:
-        before, last_s = self.acknowledged, time.monotonic()
-        while not is_enough() and not self._stop():
-            self.listen_once(POLL_S)
-            now_s = time.monotonic()
-            if self.acknowledged != before:
-                before, last_s = self.acknowledged, now_s
-            elif self.acknowledged and self._heard_s - last_s > LOST_AFTER_S:
-                self.lost += self._in_flight
-                self._frames_acknowledged = self._frames
-                self._marks.clear()
-                text = f"{self.lost} samples have not reached the receiver so far; it goes on"
-                emit(_LOG, logging.WARNING, "replay.lost", text)
-            elif now_s - last_s > self._within_s:
-                raise self._error(
-                    f"no acknowledgement in {self._within_s:g} s: {self.acknowledged} of"
-                    f" {self._samples} samples sent have been processed; {_HINT}"
-                )
 
     def _acknowledge(self, count: int) -> None:
         self._heard_s = time.monotonic()
         before, self._count = self._count, count
-        if before is None or not self._samples:
+        if before is None or not self.state.samples:
             return
-        more = (count - before) % SAMPLES_MODULO
-        self.lost -= min(max(more - self._in_flight, 0), self.lost)  # slow: they came after all
+        more, state = (count - before) % SAMPLES_MODULO, self.state
+        state.lost -= min(max(more - self._in_flight, 0), state.lost)  # slow: they came after all
         if more > self._in_flight:
             raise self._error(
                 f"the receiver has processed {more} samples where {self._in_flight} were in flight:"
                 " it was restarted, or another program sends or acknowledges on this bus too"
             )
-        self.acknowledged += more
-        while self._marks and self._marks[0][0] <= self.acknowledged:
+        state.acknowledged = self._acknowledged = self._acknowledged + more
+        while self._marks and self._marks[0][0] <= self._acknowledged:
             self._frames_acknowledged = self._marks.popleft()[1]
 
     def _error(self, problem: str) -> CangaugeError:
