@@ -330,6 +330,7 @@ fixed_c = 23.0
 
 
 @pytest.mark.real
+@pytest.mark.nightly
 def test_a_real_capture(run: Run, shared_data: Path, project: Path, tmp_path: Path) -> None:
     capture = shared_data / "leaf_can" / "ZE0w24kWhstock.log.gz"
     model = project / "replay" / "leaf2012_published_model.json"

@@ -212,6 +212,7 @@ def test_no_step_is_claimed_where_there_is_none() -> None:
 
 
 @pytest.mark.real
+@pytest.mark.nightly
 def test_recorded_trips(shared_data: Path) -> None:
     capacities = []
     for path in sorted((shared_data / "bmw_i3").glob("*.csv.gz")):

@@ -11,6 +11,7 @@ import pytest
 from cangauge.errors import InputError
 from cangauge.logs.read import read_log
 from cangauge.logs.sign import charge_ah, sign_of_current
+from selection import nightly_except
 
 pytestmark = pytest.mark.real
 
@@ -23,23 +24,23 @@ UNDECIDED = {
 }
 
 
-@pytest.mark.parametrize(
-    ("pattern", "count", "source", "charge_ah_range"),
-    [
-        ("bmw_i3/*.csv.gz", 30, "pack", (1.0, 60.0)),
-        ("a123_lfp/*.csv.gz", 21, "room", (0.0, 2.25)),  # a 2.3 Ah cell
-        ("leaf_cell_ornl/*HPPC*.csv.gz", 3, "room", (29.0, 33.0)),  # a 33.1 Ah cell
-        ("leaf_module_ornl/*.csv.gz", 4, "cell", (54.3, 55.7)),
-        ("lg_hg2/*.parquet", 32, "cell", (2.2, 3.1)),  # a 3 Ah cell
-    ],
-)
-def test_every_file_has_its_charge_and_sign(
-    shared_data: Path, pattern: str, count: int, source: str, charge_ah_range: tuple[float, float]
-) -> None:
-    low_ah, high_ah = charge_ah_range
+FILES = {
+    "bmw_i3/*.csv.gz": (30, "pack", 1.0, 60.0),
+    "a123_lfp/*.csv.gz": (21, "room", 0.0, 2.25),  # a 2.3 Ah cell
+    "leaf_cell_ornl/*HPPC*.csv.gz": (3, "room", 29.0, 33.0),  # a 33.1 Ah cell
+    "leaf_module_ornl/*.csv.gz": (4, "cell", 54.3, 55.7),
+    "lg_hg2/*.parquet": (32, "cell", 2.2, 3.1),  # a 3 Ah cell
+}
+"""Number of files, source of the temperature, and least and largest charge [Ah]."""
+
+
+@pytest.mark.parametrize("every", nightly_except((6,), (6, 1)))
+@pytest.mark.parametrize("pattern", FILES)
+def test_every_file_has_its_charge_and_sign(shared_data: Path, pattern: str, every: int) -> None:
+    count, source, low_ah, high_ah = FILES[pattern]
     paths = sorted(shared_data.glob(pattern))
     assert len(paths) >= count
-    for path in paths:
+    for path in paths[::every]:
         log = read_log(path)
         assert log.temperature_source in {source, "unknown"}, path.name
         assert low_ah <= np.ptp(charge_ah(log)) < high_ah, path.name
@@ -52,7 +53,7 @@ def test_values_that_single_files_have(shared_data: Path) -> None:
     for rate, peak in (("1C", 30.6), ("2C", 61.2), ("3C", 91.8)):
         path = shared_data / "leaf_cell_ornl" / f"{rate}-Discharge-Bitrode-data.csv.gz"
         assert read_log(path, temperature_c=24.0).current_a.max() == peak
-    for path in (shared_data / "a123_lfp").glob("*.csv.gz"):
+    for path in sorted((shared_data / "a123_lfp").glob("*.csv.gz"))[::6]:
         log = read_log(path)
         assert log.temperature_c[0] == float(path.name.split("_P")[1][:2])
         if path.name.lower().endswith(("s1.csv.gz", "s3.csv.gz")):  # discharge and charge scripts
@@ -65,6 +66,7 @@ def test_values_that_single_files_have(shared_data: Path) -> None:
         read_log(shared_data / "leaf_cell_ornl" / "Temperature-1C-discharge.lvm.gz")
 
 
+@pytest.mark.nightly
 def test_no_wrong_sign_in_pieces_of_the_recorded_logs(shared_data: Path) -> None:
     """Pieces of 20 s to 30 min: often open, never wrong."""
     rng = np.random.default_rng(11)

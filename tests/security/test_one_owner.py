@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import stat
 import subprocess
 import sys
 from pathlib import Path
@@ -12,7 +10,7 @@ import pytest
 
 from cangauge.errors import InputError
 from cangauge.service.lifecycle import sole_writer
-from live import Command, in_process, leaf_model_path, run_to_end
+from live import Command, in_process, leaf_model_path
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="flock is Unix's")
 RUN = ("run", "-m", leaf_model_path(), "--interface", "virtual", "--channel", "a")
@@ -72,18 +70,6 @@ def test_a_second_service_with_a_file_of_the_first_is_refused(tmp_path: Path) ->
         first.process.terminate()
     assert first.end().code == 0
     assert sorted(each.name for each in tmp_path.iterdir()) == ["r.log", "t.csv"]
-
-
-def test_files_of_a_service_are_not_for_others(tmp_path: Path) -> None:
-    before = os.umask(0)
-    try:
-        ended = run_to_end(
-            *RUN, "--initial-soc", "80", "--record", tmp_path / "r.log", "--duration", "0.1"
-        )
-    finally:
-        os.umask(before)
-    assert ended.code == 0
-    assert stat.S_IMODE((tmp_path / "r.log").stat().st_mode) == 0o640
 
 
 @pytest.mark.parametrize("rights", [0o600, 0o644, 0o666])

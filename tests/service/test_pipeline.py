@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import math
-
 import can
 import numpy as np
 import pytest
 
-from cangauge.bus.publish import FrameIds, SocDetail, SocEstimate, SocReader
+from cangauge.bus.publish import FrameIds
 from cangauge.bus.time_source import ClockFrames
 from cangauge.bus.vehicle import Vehicle
 from cangauge.errors import InputError
@@ -17,7 +15,7 @@ from cangauge.estimation.settings import EstimatorSettings
 from cangauge.logs.log import Log
 from cangauge.replay.encoder import FrameEncoder
 from cangauge.service.pipeline import Pipeline, PipelineSettings
-from cangauge.types import Estimate, Reason, Status
+from cangauge.types import Estimate
 from live import leaf_model, quantized, short_log
 
 START = EstimatorSettings(initial_soc_pct=80.0)
@@ -87,73 +85,6 @@ def test_no_estimate_before_the_first_replay_clock(log: Log) -> None:
     assert pipeline.counts.untimed == 50
 
 
-def test_initialising_before_the_first_sample() -> None:
-    pipeline = Pipeline(Vehicle.load("generic"), leaf_model())
-    reader = SocReader()
-    contents = [reader.read(frame) for frame in pipeline.heartbeat(is_stale=False)]
-    assert isinstance(contents[0], SocEstimate)
-    assert math.isnan(contents[0].soc_pct)
-    assert contents[0].status is Status.INITIALISING
-    assert contents[0].reasons & Reason.INPUT_STALE
-    assert math.isnan(contents[0].age_s)
-    assert contents[1] == SocDetail(*contents[1][:3], samples=0)  # type: ignore[index] # a SocDetail
-
-
-def test_silence_is_invalid_with_the_last_soc(log: Log) -> None:
-    vehicle = Vehicle.load("generic")
-    pipeline = Pipeline(vehicle, leaf_model(), PipelineSettings(START))
-    estimates(pipeline, frames_of(log, vehicle))
-    reader = SocReader()
-    fresh = reader.read(pipeline.heartbeat(is_stale=False)[0])
-    stale = reader.read(pipeline.heartbeat(is_stale=True, silent_s=7.9)[0])
-    assert isinstance(fresh, SocEstimate)
-    assert isinstance(stale, SocEstimate)
-    assert not fresh.reasons & Reason.INPUT_STALE
-    assert stale.status is Status.INVALID
-    assert stale.reasons & Reason.INPUT_STALE
-    assert stale.soc_pct == fresh.soc_pct == pytest.approx(pipeline.latest.soc_pct, abs=0.005)
-    assert (fresh.age_s, stale.age_s) == (0.0, 7.0)
-    # The estimate recovers with the next frames.
-    again = frames_of(log.rows(slice(0, 2)), vehicle, shift_s=log.time_s[-1] + 0.1)
-    assert estimates(pipeline, again)[-1].status is not Status.INVALID
-
-
-def test_heartbeat_acknowledges_the_last_samples(log: Log) -> None:
-    vehicle = Vehicle.load("generic")
-    pipeline = Pipeline(vehicle, leaf_model(), PipelineSettings(START, "replay-clock"))
-    reader = SocReader()
-    acknowledged = 0
-    for frame in with_clock(frames_of(log.rows(slice(0, 7)), vehicle)):
-        for sent in pipeline.acknowledgement() if pipeline.handle(frame) else []:
-            content = reader.read(sent)
-            acknowledged = content.samples if isinstance(content, SocDetail) else acknowledged
-    assert acknowledged < 7
-    contents = [reader.read(frame) for frame in pipeline.heartbeat(is_stale=False)]
-    assert [each.samples for each in contents if isinstance(each, SocDetail)] == [7]
-
-
-def test_second_replay_restarts_the_estimator(log: Log) -> None:
-    vehicle = Vehicle.load("generic")
-    pipeline = Pipeline(vehicle, leaf_model(), PipelineSettings(START, "replay-clock"))
-    first = estimates(pipeline, with_clock(frames_of(log, vehicle)))
-    second = estimates(pipeline, with_clock(frames_of(log, vehicle)))
-    assert [each.soc_pct for each in second] == [each.soc_pct for each in first]
-    assert pipeline.samples == 2 * len(log)
-    assert pipeline.counts.samples == 2 * len(log)
-    assert pipeline.counts.beginnings == 1
-
-
-def test_damaged_and_lost_frames_are_counted(log: Log) -> None:
-    vehicle = Vehicle.load("leaf_aze0")
-    pipeline = Pipeline(vehicle, leaf_model(), PipelineSettings(START))
-    frames = [each for each in frames_of(log, vehicle) if each.arbitration_id == 0x1DB]
-    frames[10].data[0] ^= 0xFF
-    del frames[20]
-    assert len(estimates(pipeline, frames)) == len(log) - 2
-    assert pipeline.counts.crc_errors == 1
-    assert pipeline.counts.lost >= 1
-
-
 def test_published_id_of_a_vehicle_signal_is_refused() -> None:
     with pytest.raises(InputError, match="PACK_CURRENT"):
         Pipeline(
@@ -170,18 +101,3 @@ def test_only_wanted_ids_pass_the_filters() -> None:
     settings = PipelineSettings(time_source="replay-clock")
     clocked = Pipeline(Vehicle.load("leaf_aze0"), leaf_model(), settings)
     assert {each["can_id"] for each in clocked.filters} == {0x1DB, 0x55B, 0x5C0, 0x5AF}
-
-
-def test_uncertain_soc_is_published_as_degraded(log: Log) -> None:
-    reader = SocReader()
-    for limit, status, reasons in (
-        (0.5, Status.DEGRADED, Reason.SOC_UNCERTAIN),
-        (1.5, Status.VALID, Reason.NONE),
-    ):
-        given = EstimatorSettings(initial_soc_pct=80.0, valid_std_pct=limit)
-        pipeline = Pipeline(Vehicle.load("generic"), leaf_model(), PipelineSettings(given))
-        for frame in frames_of(log, Vehicle.load("generic")):
-            pipeline.handle(frame)
-        found = reader.read(pipeline.heartbeat(is_stale=False)[0])
-        assert isinstance(found, SocEstimate)
-        assert (found.status, found.reasons) == (status, reasons)

@@ -9,7 +9,6 @@ from pathlib import Path
 
 import pytest
 
-from cangauge.errors import InputError
 from cangauge.extras.live.addresses import http_address
 from cangauge.service.config import load_config
 
@@ -75,19 +74,3 @@ def test_the_example_configuration_is_one(project: Path) -> None:
     assert config.record == "/var/lib/cangauge/can0/drive.log.gz"
     assert (config.record_part_mb, config.record_part_s, config.record_keep_mb) == (64, 3600, 2000)
     assert http_address(str(config.http), None, {}).host == "127.0.0.1"
-
-
-@pytest.mark.parametrize(
-    ("text", "say"),
-    [
-        ("a = " + "[" * 60_000, "nested too deeply"),
-        ("a = \0", "not TOML"),
-        ("#" * 300_000, "larger than the 64 kB"),
-        (b"\xff\xfe\x00", "not TOML"),
-    ],
-)
-def test_a_damaged_configuration_is_refused(tmp_path: Path, text: str | bytes, say: str) -> None:
-    path = tmp_path / "car.toml"
-    path.write_bytes(text.encode() if isinstance(text, str) else text)
-    with pytest.raises(InputError, match=say):
-        load_config(path)

@@ -176,11 +176,11 @@ def _column_of(log: Log, path: Path, heading: str, reading: ReadingOptions) -> F
     """
     import numpy as np
 
-    from cangauge.logs.column_map import ColumnMap, ColumnSpec
+    from cangauge.logs.column_map import ColumnMap
     from cangauge.logs.read import open_log
 
     specs = dict(ColumnMap.of(reading.columns or {}, "--columns").specs)
-    specs["voltage"] = ColumnSpec(heading)
+    specs["voltage"] = heading
     file = open_log(path, columns=ColumnMap(specs, "--simulated"))
     simulated = file.read(temperature_c=reading.temperature)
     if not np.array_equal(simulated.time_s, log.time_s):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Final
 
@@ -24,54 +24,25 @@ _UNIT: Final = re.compile(r"^(?P<text>.*\S)\s*\[(?P<unit>[^\[\]]*)\]$")
 
 
 @dataclass(frozen=True, slots=True)
-class ColumnSpec:
-    """One column as the user gives it.
+class ColumnMap:
+    """The user's columns.
 
     Parameters
     ----------
-    text : str
-        Heading, or headings joined by `+` (a date and its time; the median of temperatures), or
-        `#3` for the third column; then `[UNIT]` and `:FACTOR`, both optional.
-    unit : str, optional
-        Unit of the column, in place of the heading's.
-    factor : float
-        The column times this is in its unit; its sign inverts.
+    specs : dict
+        By quantity (time, current, voltage, temperature, soc): a heading, or headings joined by
+        `+` (a date and its time; the median of temperatures), or `#3` for the third column; then
+        `[UNIT]`, in place of the heading's, and `:FACTOR`, both optional.
+    where : str
+        Option or file that states them, for messages.
     """
 
-    text: str
-    unit: str | None = None
-    factor: float = 1.0
-
-    def readings(self) -> list[ColumnSpec]:
-        """Return the readings of the text: the whole, then without factor, without unit."""
-        found = [self]
-        if match := _FACTOR.match(self.text):
-            found.append(ColumnSpec(match["text"], self.unit, self.factor * float(match["factor"])))
-        if self.unit is None:
-            found += [
-                ColumnSpec(match["text"], match["unit"].strip(), item.factor)
-                for item in list(found)
-                if (match := _UNIT.match(item.text))
-            ]
-        return found
-
-
-@dataclass(frozen=True, slots=True)
-class ColumnMap:
-    """The user's columns by quantity: time, current, voltage, temperature, soc.
-
-    `where` is the option or file that states them, for messages.
-    """
-
-    specs: Mapping[str, ColumnSpec] = field(default_factory=dict)
+    specs: Mapping[str, str] = field(default_factory=dict)
     where: str = "--columns"
 
     @classmethod
     def of(cls, given: ColumnMap | Mapping[str, Any] | str, where: str = "columns") -> ColumnMap:
-        """Return the map of a text (`time=t,current=I[mA]:-1`) or of a mapping.
-
-        Values of a mapping are texts, or mappings with `heading` and optionally `unit`, `sign` and
-        `scale`.
+        """Return the map of a text (`time=t,current=I[mA]:-1`) or of a mapping of texts.
 
         Raises
         ------
@@ -80,52 +51,30 @@ class ColumnMap:
 
         Examples
         --------
-        >>> ColumnMap.of("time=t,current=I, pack[mA]:-1").specs["current"].text
+        >>> ColumnMap.of("time=t,current=I, pack[mA]:-1").specs["current"]
         'I, pack[mA]:-1'
         """
         if isinstance(given, ColumnMap):
             return given
-        if not isinstance(given, Mapping | str):
+        if isinstance(given, str):
+            parts = (part.partition("=") for part in _SPLIT.split(given))
+            pairs: Iterable[tuple[Any, Any]] = [(name, text) for name, _, text in parts]
+        elif isinstance(given, Mapping):
+            pairs = given.items()
+        else:
             raise InputError("not columns", field=where, value=given, cure=_SYNTAX)
-        pairs = given.items() if isinstance(given, Mapping) else _pairs(given, where)
-        specs: dict[str, ColumnSpec] = {}
-        for name, value in pairs:
-            quantity = str(name).lower()
+        specs: dict[str, str] = {}
+        for name, text in pairs:
+            quantity = str(name).strip().lower()
+            if not isinstance(text, str) or not text.strip():
+                raise InputError("not a column", field=where, value=text or name, cure=_SYNTAX)
+            if quantity not in FIELDS:
+                cure = f"known are {', '.join(FIELDS)}"
+                raise InputError("not a quantity of a log", field=where, value=quantity, cure=cure)
             if quantity in specs:
                 raise InputError("is given twice", field=where, value=name)
-            specs[quantity] = _spec_of(quantity, value, where)
+            specs[quantity] = text.strip()
         return cls(specs, where)
-
-
-def _pairs(text: str, where: str) -> list[tuple[str, str]]:
-    parts = [(part, *part.partition("=")) for part in _SPLIT.split(text)]
-    for part, _, equals, value in parts:
-        if not equals or not value.strip():
-            raise InputError("not a column", field=where, value=part, cure=_SYNTAX)
-    return [(name.strip(), value.strip()) for _, name, _, value in parts]
-
-
-def _spec_of(quantity: str, value: Any, where: str) -> ColumnSpec:
-    if quantity not in FIELDS:
-        cure = f"known are {', '.join(FIELDS)}"
-        raise InputError("not a quantity of a log", field=where, value=quantity, cure=cure)
-    if isinstance(value, ColumnSpec):
-        return value
-    if isinstance(value, str) and value.strip():
-        return ColumnSpec(value.strip())
-    if isinstance(value, Mapping) and isinstance(value.get("heading"), str):
-        unit, sign, scale = value.get("unit"), value.get("sign", 1), value.get("scale", 1.0)
-        is_number = isinstance(scale, int | float) and not isinstance(scale, bool) and scale > 0.0
-        known = set(value) <= {"heading", "unit", "sign", "scale"}
-        if known and is_number and sign in {1, -1} and isinstance(unit, str | None):
-            return ColumnSpec(value["heading"], unit, float(sign * scale))
-    raise InputError(
-        "not a column",
-        field=f"{where}.{quantity}",
-        value=value,
-        cure='give a text such as "Pack Current[mA]:-1", or { heading = …, unit = …, sign = ±1,'
-        " scale = … }",
-    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -140,9 +89,8 @@ class ChosenColumn:
     places: tuple[int, ...]
     unit: str = ""
     factor: float = 1.0
-    given: bool = False
     source: TemperatureSource = "unknown"
-    others: tuple[int, ...] = ()
+    others: tuple[ChosenColumn, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -150,7 +98,7 @@ class Choice:
     """Columns of a table by quantity, and the likeliest column of each that is not plain."""
 
     chosen: dict[str, ChosenColumn] = field(default_factory=dict)
-    guesses: dict[str, int] = field(default_factory=dict)
+    guesses: dict[str, ChosenColumn] = field(default_factory=dict)
 
     @property
     def is_complete(self) -> bool:
@@ -168,23 +116,22 @@ def choose_columns(
     InputError
         If a column of the user is not in the table, or is named for two quantities.
     """
-    below = [*units_below, *[""] * (len(headings) - len(units_below))]
+    below = [*units_below, *[""] * len(headings)]
     meanings = [meaning_of(text, unit) for text, unit in zip(headings, below, strict=False)]
-    given = given or ColumnMap()
-    choice = Choice()
+    given, choice = given or ColumnMap(), Choice()
     owner: dict[int, str] = {}
-    for quantity, spec in given.specs.items():
-        found = _given_column(quantity, spec, headings, meanings, given.where)
-        for place in found.places:
+    for quantity, text in given.specs.items():
+        column = _named_column(quantity, text, headings, meanings, given.where)
+        for place in column.places:
             if place in owner:
                 raise InputError(
                     f"is the column of {owner[place]} too",
                     field=f"{given.where} {quantity}",
-                    value=spec.text,
+                    value=text,
                     cure="give each quantity a column of its own, as headings or as #1, #2, …",
                 )
-        owner |= dict.fromkeys(found.places, quantity)
-        choice.chosen[quantity] = found
+        owner |= dict.fromkeys(column.places, quantity)
+        choice.chosen[quantity] = column
     for quantity in FIELDS:
         plain = [
             (place, meaning)
@@ -198,49 +145,59 @@ def choose_columns(
 
 def _choose(quantity: str, plain: list[tuple[int, Meaning]], choice: Choice) -> None:
     """Choose among the columns of a quantity, the most direct first; or guess one."""
-    place, first = plain[0]
-    best = [item for item in plain if item[1].rank == first.rank]
-    numbered = [meaning.numbered for _, meaning in plain if meaning.rank <= GUESS]
-    siblings = quantity in {"current", "voltage"} and first.numbered and sum(numbered) > 1
-    if quantity == "temperature" and len(best) > 1:  # of one unit, °C first; T beside T1, T2 is it
-        celsius = [item for item in best if unit_of("temperature_c", item[1].unit) == (1.0, 0.0)]
-        best = celsius or [item for item in best if item[1].unit == first.unit]
-        best = [item for item in best if not item[1].numbered] or best
-    are_probes = quantity == "temperature" and all(meaning.numbered for _, meaning in best)
-    one_of_many = len(best) > 1 and quantity != "time" and not are_probes
-    if first.rank >= GUESS or siblings or one_of_many:
-        choice.guesses[quantity] = place
-    elif quantity == "time":
-        others = tuple(other for other, meaning in plain[1:] if meaning.rank < GUESS)
-        choice.chosen[quantity] = ChosenColumn((place,), first.unit, others=others)
+    _, first = plain[0]
+    best = [(place, item) for place, item in plain if item.rank == first.rank]
+    others: tuple[ChosenColumn, ...] = ()
+    if quantity == "time":
+        best, later = plain[:1], plain[1:]
+        others = tuple(ChosenColumn((k,), item.unit) for k, item in later if item.rank < GUESS)
+        is_plain = True
+    elif quantity == "temperature":  # of one unit, °C first; T beside T1, T2 is it
+        celsius = [each for each in best if unit_of("temperature_c", each[1].unit) == (1.0, 0.0)]
+        best = celsius or [each for each in best if each[1].unit == first.unit]
+        best = [each for each in best if not each[1].numbered] or best
+        is_plain = len(best) == 1 or all(item.numbered for _, item in best)
     else:
-        unit, source = best[0][1].unit, best[0][1].source
-        choice.chosen[quantity] = ChosenColumn(tuple(p for p, _ in best), unit, source=source)
+        siblings = [item for _, item in plain if item.numbered and item.rank <= GUESS]
+        is_plain = len(best) == 1 and not (first.numbered and len(siblings) > 1)
+    is_plain = is_plain and first.rank < GUESS
+    places = tuple(place for place, _ in best) if is_plain else (plain[0][0],)
+    column = ChosenColumn(places, best[0][1].unit, 1.0, best[0][1].source, others)
+    (choice.chosen if is_plain else choice.guesses)[quantity] = column
 
 
-def _given_column(
+def _named_column(
     quantity: str,
-    spec: ColumnSpec,
+    text: str,
     headings: Sequence[str],
     meanings: Sequence[Meaning | None],
     where: str,
 ) -> ChosenColumn:
-    for reading in spec.readings():
-        places = _places(reading.text, headings)
-        if not places:
-            continue
-        units = {_stated_unit(headings[place], meanings[place], quantity) for place in places}
-        unit = reading.unit if reading.unit is not None else units.pop() if len(units) == 1 else ""
-        first = meanings[places[0]]
-        source = first.source if first is not None and quantity == "temperature" else "unknown"
-        return ChosenColumn(places, unit, reading.factor, given=True, source=source)
-    near = closest(spec.text, headings)
+    for heading, unit, factor in _readings(text):
+        if places := _places(heading, headings):
+            stated = {_stated_unit(headings[k], meanings[k], quantity) for k in places}
+            found = unit or (stated.pop() if len(stated) == 1 else "")
+            first = meanings[places[0]]
+            source = first.source if first is not None and quantity == "temperature" else "unknown"
+            return ChosenColumn(places, found, factor, source)
+    near = closest(text, headings)
     raise InputError(
         f"no column has this heading (found: {shown_headings(headings)})",
         field=f"{where} {quantity}",
-        value=spec.text,
+        value=text,
         cure=f"did you mean {near}?" if near else _SYNTAX,
     )
+
+
+def _readings(text: str) -> Iterator[tuple[str, str, float]]:
+    """Yield heading, unit and factor as a text may be meant: the whole is a heading first."""
+    texts = [(text, 1.0)]
+    if match := _FACTOR.match(text):
+        texts.append((match["text"], float(match["factor"])))
+    yield from ((heading, "", factor) for heading, factor in texts)
+    for heading, factor in texts:
+        if match := _UNIT.match(heading):
+            yield match["text"], match["unit"].strip(), factor
 
 
 def _stated_unit(heading: str, meaning: Meaning | None, quantity: str) -> str:
@@ -253,12 +210,11 @@ def _stated_unit(heading: str, meaning: Meaning | None, quantity: str) -> str:
 
 def _places(text: str, headings: Sequence[str]) -> tuple[int, ...]:
     """Return the columns that a text names; none where it names no column, or not all."""
-    whole = _place(text, headings)
-    if whole is not None:
-        return (whole,)
-    places = [_place(part, headings) for part in text.split("+")]
-    found = tuple(place for place in places if place is not None)
-    return found if len(found) == len(places) > 1 else ()
+    for parts in ([text], text.split("+")):
+        found = [_place(part, headings) for part in parts]
+        if all(place is not None for place in found):
+            return tuple(place for place in found if place is not None)
+    return ()
 
 
 def _place(text: str, headings: Sequence[str]) -> int | None:
@@ -278,10 +234,13 @@ def _simple(text: str) -> str:
     return " ".join(text.split()).casefold()
 
 
+# --- For messages
+
+
 def unknown_columns(source: str, headings: Sequence[str], choice: Choice) -> InputError:
     """Return the error for a table whose columns are not plain, with the option to paste."""
-    names = [name for name in _NEEDED if name not in choice.chosen]
-    missing = " and ".join(part for part in (", ".join(names[:-1]), *names[-1:]) if part)
+    missing = ", ".join(name for name in _NEEDED if name not in choice.chosen)
+    missing = " and ".join(missing.rsplit(", ", 1))
     return InputError(
         f"no plain heading of {missing} (found: {shown_headings(headings)})",
         source=source,
@@ -291,15 +250,12 @@ def unknown_columns(source: str, headings: Sequence[str], choice: Choice) -> Inp
 
 def suggestion(headings: Sequence[str], choice: Choice) -> str:
     """Return the likeliest `--columns` option to paste; `?` where nothing is likely."""
-    parts = []
-    for quantity in FIELDS:
-        if quantity in choice.chosen:
-            places = choice.chosen[quantity].places
-            parts.append(f"{quantity}={'+'.join(headings[place] for place in places)}")
-        elif quantity in choice.guesses:
-            parts.append(f"{quantity}={headings[choice.guesses[quantity]]}")
-        elif quantity in _NEEDED:
-            parts.append(f"{quantity}=?")
+    likely = choice.guesses | choice.chosen
+    texts = {
+        quantity: "+".join(headings[place] for place in column.places)
+        for quantity, column in likely.items()
+    }
+    parts = (f"{name}={texts.get(name, '?')}" for name in FIELDS if name in {*_NEEDED, *texts})
     return "--columns '" + ",".join(parts).replace("'", "'\\''") + "'"
 
 

@@ -18,12 +18,13 @@ from cangauge._files import Head
 from cangauge._typing import FloatArray
 from cangauge.errors import InputError, require_number
 from cangauge.logs.canonical import arrow_table, open_parquet
+from cangauge.logs.cells import numbers_of
 from cangauge.logs.column_map import DOCS, ColumnMap, unknown_columns
 from cangauge.logs.draft import DraftLog, Sign
 from cangauge.logs.headings import cell_number
 from cangauge.logs.log import Log, TemperatureSource
 from cangauge.logs.sign import resolve_sign
-from cangauge.logs.table import ArrowTable, draft_of_table, is_canonical, numbers_of
+from cangauge.logs.table import ArrowTable, draft_of_table, is_canonical
 from cangauge.logs.text import TextTable, find_table, is_of_frames, likely_header, table_below
 from cangauge.logs.units import COLDEST_C, HOTTEST_C, known_temperature_source
 

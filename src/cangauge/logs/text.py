@@ -16,16 +16,13 @@ import pyarrow.csv as pacsv
 
 from cangauge._files import Head, as_utf8
 from cangauge.errors import InputError
-from cangauge.logs import stamps
+from cangauge.logs.cells import MISSING, is_number, is_stamp
 from cangauge.logs.column_map import Choice, ColumnMap, choose_columns, unknown_columns
 from cangauge.logs.headings import meaning_of
 
 MAX_ROWS: Final = 20_000_000
 """Rows of a log: 23 days at 10 Hz, 0.8 GB as float64."""
 MAX_COLUMNS: Final = 10_000
-_MISSING: Final = "nan na n/a #n/a null none - -- 1.#qnan -1.#ind unknown unavailable n.a."
-MISSING: Final = tuple(_MISSING.split())
-"""Cells without a value, in lower case."""
 _NULLS: Final = ["", *{s for text in MISSING for s in (text, text.upper(), text.title(), "NaN")}]
 _DELIMITERS: Final = ("\t", ";", ",", "|")
 _ROWS_ABOVE_DATA: Final = 4
@@ -134,17 +131,8 @@ def split_cells(line: str, delimiter: str) -> list[str]:
     return [cell.strip() for cell in next(reader, [])]
 
 
-def is_number(text: str) -> bool:
-    """Return whether a text is a number."""
-    try:
-        float(text)
-    except ValueError:
-        return False
-    return True
-
-
 def _is_value(cell: str) -> bool:
-    return is_number(cell.replace(",", ".")) or stamps.is_stamp(cell)
+    return is_number(cell.replace(",", ".")) or is_stamp(cell)
 
 
 def table_below(head: Head, header: str) -> TextTable:
@@ -162,7 +150,7 @@ def find_table(head: Head, given: ColumnMap | None = None) -> TextTable | None:
         If a column of the user is in no line.
     """
     specs = given.specs.values() if given else ()
-    if specs and all(spec.text.startswith("#") for spec in specs):
+    if specs and all(spec.startswith("#") for spec in specs):
         found = _without_header(head)
         if found is not None:
             return found

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import re
 import sys
 from collections.abc import Callable, Iterator
@@ -255,22 +254,3 @@ def test_junk_is_neither_log_nor_capture(name: str, refused: Callable[..., str])
         line = refused(*args)
         assert f"{name}: not a known kind of log, nor of capture" in line
         assert "candump" in line
-
-
-@pytest.mark.parametrize("command", ["fit", "estimate", "gap", "inspect", "replay", "run"])
-def test_what_is_no_file(command: str, refused: Callable[..., str]) -> None:
-    os.mkfifo("pipe")
-    Path("folder").mkdir()
-    Path("empty").touch()
-    for name, words in (
-        ("pipe", "a pipe"), ("folder", "a folder"), ("empty", "empty|no JSON|not JSON"),
-        ("/dev/zero", "a device"), ("absent", "no such file"),
-    ):  # fmt: skip
-        args = ["-m", name] if command == "run" else [name, *VALID[command][1:]]
-        assert re.search(words, refused(command, *args))
-    Path("drive.log").write_bytes(corpus.capture_files()["candump.log"])
-    Path("car.dbc").write_text(corpus.DBC)
-    Path("car.toml").write_text(corpus.MAP)
-    args = ["-m", "model.json"] if command == "run" else ["drive.log", *VALID[command][1:]]
-    assert "pipe: this is a pipe" in refused(command, *args, "--dbc", "pipe", "--map", "car.toml")
-    assert "pipe: this is a pipe" in refused(command, *args, "--dbc", "car.dbc", "--map", "pipe")

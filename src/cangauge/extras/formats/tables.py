@@ -11,9 +11,9 @@ import pyarrow.compute as pc
 
 from cangauge._files import Head
 from cangauge.errors import InputError
+from cangauge.logs.cells import seconds_of_text
 from cangauge.logs.column_map import ColumnMap, choose_columns, unknown_columns
 from cangauge.logs.draft import DraftLog
-from cangauge.logs.stamps import seconds_of_text
 from cangauge.logs.table import ArrowTable, draft_of_table, held
 from cangauge.logs.text import MAX_ROWS, find_table, likely_header, split_cells, table_below
 
