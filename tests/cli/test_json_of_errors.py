@@ -16,6 +16,7 @@ from cangauge._files import atomic_path
 from cangauge.cli.app import COMMANDS, main
 from cangauge.errors import CangaugeError, InputError
 from live import Ended, in_process
+from selection import nightly_except
 
 PARTS = {"message", "source", "field", "value", "cure"}
 
@@ -88,7 +89,7 @@ def test_a_value_keeps_its_kind(made: Path) -> None:
     assert failed("replay", made / "part.csv", "--speed", "fast")["value"] == "fast"
 
 
-@pytest.mark.parametrize("command", COMMANDS)
+@pytest.mark.parametrize("command", nightly_except(("fit", "run"), COMMANDS))
 def test_usage_that_typer_refuses(command: str) -> None:
     assert failed(command, "--bogus")["field"] == "--bogus"
     # Spelt nearly like --help, which is suggested.

@@ -173,7 +173,7 @@ def messages(browser: Any, method: str) -> list[dict[str, Any]]:
 def test_the_values_come_ten_times_a_second(page: Any) -> None:
     messages(page, "")
     began = time.monotonic()
-    time.sleep(2.0)
+    time.sleep(1.0)
     came = len(messages(page, "Network.webSocketFrameReceived"))
     assert came / (time.monotonic() - began) > 5.0
 
@@ -231,12 +231,12 @@ def test_the_range_shown_is_downloaded(bench: Bench, page: Any) -> None:
     assert rows[-1]["status"] in {"valid", "degraded"}
 
 
-@pytest.mark.parametrize("scheme", ["light", "dark"])
-def test_axe_finds_no_serious_fault(page: Any, scheme: str) -> None:
-    set_scheme(page, scheme)
-    assert faults(page) == []
-    page.find_element("id", "tab-gap").click()
-    assert faults(page) == []
+def test_axe_finds_no_serious_fault(page: Any) -> None:
+    for tab in ("tab-live", "tab-gap"):
+        page.find_element("id", tab).click()
+        for scheme in ("light", "dark"):
+            set_scheme(page, scheme)
+            assert faults(page) == []
 
 
 def test_two_viewers_see_the_same(bench: Bench, page: Any) -> None:

@@ -180,13 +180,21 @@ def test_the_browser_is_asked_for_the_token(guarded: Live) -> None:
     assert get(guarded, "/rows", headers={"Cookie": cookie.split(";")[0]})[0] == 200
 
 
-def test_the_cookie_outlives_a_restart(guarded: Live) -> None:
+def test_the_cookie_outlives_a_restart_and_the_process_ends_with_the_service(
+    guarded: Live,
+) -> None:
     form = {"Content-Type": "application/x-www-form-urlencoded"}
     _, headers, _ = get(guarded, "/enter", method="POST", body=f"token={TOKEN}", headers=form)
     cookie = headers["Set-Cookie"].split(";")[0]
     again = HttpAddress("127.0.0.1", 0, TOKEN)
     with closing(Live(dashboard=again)) as other:
         assert get(other, "/rows", headers={"Cookie": cookie})[0] == 200
+        process = other.pid
+    assert process is not None
+    with pytest.raises(ProcessLookupError):
+        os.kill(process, 0)
+    with pytest.raises(OSError, match="refused"):
+        socket.create_connection(("127.0.0.1", other.port), 1.0)
 
 
 @pytest.mark.parametrize("after", [[], ["--channel", "x"], ["127.0.0.1:8642"]])
@@ -218,12 +226,11 @@ def test_beyond_loopback_needs_a_token(monkeypatch: pytest.MonkeyPatch) -> None:
         service.run()
 
 
-def test_a_process_that_dies_or_hangs_is_started_again(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_process_that_dies_or_hangs_is_started_again(
+    page: Live, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(launch, "SILENT_S", 300.0)  # a busy machine is no reason
-    with (
-        LoggedLines("cangauge.extras.live") as lines,
-        closing(Live(dashboard=http_address("127.0.0.1:0", None, {}))) as page,
-    ):
+    with LoggedLines("cangauge.extras.live") as lines:
         page.on_snapshot(snapshot())
         for number, words in ((signal.SIGKILL, "ended by itself"), (signal.SIGSTOP, "answer")):
             assert get(page, "/rows")[0] == 200
@@ -242,18 +249,6 @@ def test_a_process_that_dies_or_hangs_is_started_again(monkeypatch: pytest.Monke
         assert "(2 so far)" in page.trouble
 
 
-def test_a_process_that_grows_is_ended(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_process_that_grows_is_ended(page: Live, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(launch, "LARGEST_BYTES", 1 << 20)
-    with closing(Live(dashboard=http_address("127.0.0.1:0", None, {}))) as page:
-        assert waits(lambda: "MiB of memory" in page.trouble, 20.0)
-
-
-def test_the_process_ends_with_the_service() -> None:
-    with closing(Live(dashboard=http_address("127.0.0.1:0", None, {}))) as page:
-        assert get(page, "/")[0] == 200
-        process = page.pid
-    assert process is not None
-    with pytest.raises(ProcessLookupError):
-        os.kill(process, 0)
-    with pytest.raises(OSError, match="refused"):
-        socket.create_connection(("127.0.0.1", page.port), 1.0)
+    assert waits(lambda: "MiB of memory" in page.trouble, 20.0)

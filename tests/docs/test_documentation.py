@@ -1,4 +1,4 @@
-"""Every command on a page of docs/ runs, and prints what the page shows.
+"""Every command on a page of docs/ has its options, runs, and prints what the page shows.
 
 A page's `console` blocks are one session in a new folder. In the shown output `...` stands for any
 text, and white space does not count. A block after `<!-- not run: REASON -->` needs what a test
@@ -17,6 +17,7 @@ from pathlib import Path
 
 import pytest
 
+from cangauge.cli.app import load_command
 from selection import nightly_except
 
 DOCS = Path(__file__).parents[2] / "docs"
@@ -36,11 +37,11 @@ class Step:
     shown: str
 
 
-def steps(page: str) -> list[Step]:
-    """The commands of a page that run everywhere, each with the output shown."""
+def steps(page: str, *, everywhere: bool = True) -> list[Step]:
+    """The commands of a page, or those that run everywhere, each with the output shown."""
     found: list[Step] = []
     for block in BLOCK.finditer((DOCS / page).read_text(encoding="utf-8")):
-        if block["skip"]:
+        if block["skip"] and everywhere:
             continue
         indent = re.search(rf"^([ ]*){re.escape(block['text'].split()[0])}", block["text"])
         text = textwrap.dedent(block["text"]) if indent else block["text"]
@@ -54,7 +55,7 @@ def steps(page: str) -> list[Step]:
     return found
 
 
-IN_SUITE = ("tutorial.md", "init.md")
+IN_SUITE = ("init.md",)
 """Pages that run on every change; the others run in `make nightly`."""
 
 
@@ -89,6 +90,19 @@ def matches(shown: str, output: str) -> bool:
         return True
     parts = [re.escape("".join(part.split())) for part in shown.split("...")]
     return re.fullmatch(".*".join(parts), "".join(output.split()), re.DOTALL) is not None
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_commands_of_the_page_have_these_options(page: str) -> None:
+    for step in steps(page, everywhere=False):
+        own = re.sub(r"\$\(.*?\)\"", "", step.command)  # what another program prints
+        for name, rest in re.findall(r"\bcangauge ([a-z-]+)([^|;&>]*)", own):
+            command = load_command(name)
+            used = {each.partition("=")[0] for each in rest.split() if re.match("--?[a-z]", each)}
+            for part in getattr(command, "commands", {}).values():
+                command = part if part.name == rest.split()[0] else command
+            known = {each for parameter in command.params for each in parameter.opts}
+            assert used <= known | {"--help"}, step.command
 
 
 def test_each_page_is_in_the_navigation() -> None:

@@ -32,11 +32,8 @@ VALID = {"status": "valid", "estimate": {"soc_pct": 70.0}}
 # What a process that an attacker has taken over may write in place of its own lines.
 TAKEN_OVER = {
     "no JSON": "print('x' * 100)",
-    "another shape": "print('[1, 2]')",
     "a log of nonsense": "print('{\"log\": 3}')",
-    "a log that lacks its parts": 'print(\'{"log": {"level": "high"}}\')',
     "a line without an end": "import os\nwhile True: os.write(1, b'x' * 65536)",
-    "an end at once": "pass",
     "a crash": "raise SystemExit(9)",
     "a closed stdin": "import os, time; os.close(0); os.close(1); time.sleep(60)",
 }
@@ -133,7 +130,6 @@ bus.send(soc)
 GAUGES = {
     "floods": "while True: bus.send(can.Message(arbitration_id=0x123, is_extended_id=False))",
     "sends short frames": "while True:\n bus.recv(); soc.data = b'1'; bus.send(soc)",
-    "ends at once": "pass",
     "prints without end": "while True: print('x' * 1000)",
 }
 

@@ -81,27 +81,6 @@ def test_a_whole_run(bus: list[str], tmp_path: Path) -> None:
     assert {name: ended.json[name] for name in offline} == offline
 
 
-def test_a_disk_that_is_full_does_not_stop_the_service(bus: list[str], tmp_path: Path) -> None:
-    log, sock = tmp_path / "drive.parquet", tmp_path / "status.sock"
-    write_log(short_log(60.0), log)
-    (tmp_path / "seen.log").symlink_to("/dev/full")
-    service = Command(
-        "run", *bus, *MODEL, "--time-source", "replay-clock", "--json",
-        "--status-socket", sock, "--record", tmp_path / "seen.log",
-    )  # fmt: skip
-    service.wait_for("service.ready")
-    assert run_to_end("replay", log, *bus, "--speed", "max").code == 0
-    service.wait_for("record.failed")
-    record = in_process("status", "--endpoint", sock, "--json").json["record"]
-    assert record["problem"] == "No space left on device"
-    assert "FAILING" in in_process("status", "--endpoint", sock).out
-    service.process.terminate()
-    ended = service.end(10.0)
-    assert ended.code == 0
-    assert ended.json["samples"] == 600
-    assert record["lost_frames"] == record["frames"] > 0
-
-
 @pytest.mark.parametrize(
     ("text", "say"),
     [

@@ -103,6 +103,8 @@ def test_a_capped_current_is_a_least_one_and_a_small_energy_in_wh(watched: Watch
     assert rows["energy left"] == "9.613 ± 0.042 Wh"
     assert rows["latency"] == "median at most 10 ms, 99 % over 1 s"
     assert rows["recording"] == "a.log: 12 frames, 10 kB, 0 frames lost"
+    status["record"]["problem"] = "No space left on device"
+    assert "FAILING" in dict(status_values(status))["recording"]
 
 
 def test_a_snapshot_grows_old_and_stale(watched: Watched) -> None:
