@@ -26,7 +26,7 @@ from pathlib import Path
 import can
 import numpy as np
 
-from cangauge.extras.discovery.pairs import SignalCandidate
+from cangauge.extras.discovery.candidate import SignalCandidate
 from cangauge.extras.discovery.search import Findings, search
 from frame_layouts import STEP_S, Bits, Frame, encode
 
@@ -579,7 +579,7 @@ def capture(data: Path, make: Make) -> Iterator[can.Message]:
 
 
 def rank(
-    found: tuple[SignalCandidate, ...], wanted: tuple[int, Bits], messages: list[can.Message]
+    found: list[SignalCandidate], wanted: tuple[int, Bits], messages: list[can.Message]
 ) -> int | None:
     """Return the place of a signal among candidates, None where it is not among them.
 
@@ -590,7 +590,7 @@ def rank(
     payload = np.frombuffer(b"".join(frames), np.uint8).reshape(len(frames), -1)
     truth = bits.raw(payload)
     for place, each in enumerate(found, 1):
-        if each.arbitration_id != number or each.selector is not None:
+        if each.stream.arbitration_id != number or each.stream.selector is not None:
             continue
         own = Bits(
             each.start, each.place.width, each.place.is_motorola, 1.0, 0.0, each.place.is_signed

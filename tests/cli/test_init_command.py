@@ -5,11 +5,9 @@ from __future__ import annotations
 import json
 import os
 import re
-import sys
 import threading
 import time
 from pathlib import Path
-from types import SimpleNamespace
 
 import can
 import pytest
@@ -106,7 +104,7 @@ def test_the_sign_of_a_dbc_s_current_is_proven(
     assert done.code == 0, done.err
     assert f"The map has sign = {sign}." in done.err
     assert ("positive values charge on this bus" in done.err) == (sign < 0)
-    assert "the map assumes 20 °C (fixed_c)" in done.err
+    assert "the files assume 20 °C" in done.err
     table = done.out.partition("voltage")[0]
     (ends,) = re.findall(r"(\S+ … \S+ A)", table)
     assert ends in done.err  # one range, of one sign, of the whole capture
@@ -127,33 +125,6 @@ def test_an_open_scale_is_listed_and_not_ticked(mitsubishi: Path, tmp_path: Path
     assert "do not tell the scale of the SoC" in done.err
     assert "% a step (" in done.err  # each with the capacity that follows
     assert "the data fit as well: " in (tmp_path / "car.toml").read_text(encoding="utf-8")
-
-
-def test_a_terminal_is_asked_for_what_the_bits_leave_open(
-    mitsubishi: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    answers = {
-        "Which is the current": 1,
-        "Which is the voltage": 1,
-        "Voltage of the pack": 165.0,
-        "Highest SoC": 45.0,
-    }
-    asked: list[str] = []
-
-    def prompt(question: str, **_: object) -> float:
-        asked.append(next(words for words in answers if words in question))
-        return answers[asked[-1]]
-
-    monkeypatch.setattr("typer.prompt", prompt)
-    monkeypatch.setattr(sys, "stdin", SimpleNamespace(isatty=lambda: True))
-    done = init(mitsubishi, "-o", tmp_path)
-    assert done.code == 0, done.err
-    assert asked == list(answers)
-    dbc = (tmp_path / "car.dbc").read_text(encoding="utf-8")
-    assert "voltage_v : 39|16@0+ (0.05,0)" in dbc
-    assert re.search(r"soc_pct : \S+ \(0\.1,0\)", dbc)
-    assert "do not tell the scale of the voltage" not in done.err.rpartition("decoded")[2]
-    assert "1 ✓" in done.out.partition("soc")[2]
 
 
 def test_nothing_to_look_at_is_refused(tmp_path: Path) -> None:

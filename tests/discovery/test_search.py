@@ -11,9 +11,8 @@ import numpy as np
 import pytest
 
 from cangauge.bus.captures import open_capture
+from cangauge.extras.discovery.candidate import SignalCandidate
 from cangauge.extras.discovery.fields import collect
-from cangauge.extras.discovery.pairs import SignalCandidate
-from cangauge.extras.discovery.proposal import levels
 from cangauge.extras.discovery.search import Findings, search
 from drive_captures import CARS, Bits, Car, Frame, capture
 from init_makes import HELD_OUT, evaluate
@@ -29,14 +28,18 @@ def searched(name: str) -> Findings:
     return search(capture(SEARCHED[name]))
 
 
-def rank(found: tuple[SignalCandidate, ...], wanted: tuple[int, Bits]) -> int:
+def rank(found: list[SignalCandidate], wanted: tuple[int, Bits]) -> int:
     """Return the place of a signal among candidates, 99 if it is not there; zeros above may be."""
     number, bits = wanted
     last = int(bits.places()[-1])
     for place, each in enumerate(found, 1):
         lowest = each.place.last if each.place.is_motorola else None
         same_end = lowest == last if bits.motorola else each.start == bits.start
-        if each.arbitration_id == number and each.place.is_motorola == bits.motorola and same_end:
+        if (
+            each.stream.arbitration_id == number
+            and each.place.is_motorola == bits.motorola
+            and same_end
+        ):
             return place
     return 99
 
@@ -87,7 +90,7 @@ def test_counters_and_crcs_are_no_candidates() -> None:
     found = searched("tesla_3")
     counters = {(0x101, byte) for byte in (6, 7)} | {(0x109, 0), (0x109, 7)}
     for each in (*found.current, *found.voltage, *found.soc_reference):
-        touched = {(each.arbitration_id, bit // 8) for bit in each.place.bits(each.length)}
+        touched = {(number, bit // 8) for number, _, bit in each.bits}
         assert not touched & counters
 
 
@@ -169,7 +172,7 @@ def test_a_low_voltage_modules_scale_is_among_the_levels_or_stated(
     frames = (Frame(0x618, 0.1, 8, MODULE), Frame(0x300, 0.01, 8, {"speed": Bits(0, 8, True, 1.0)}))
     module = Car("module", frames, *((0x618, MODULE[each]) for each in ("current", "voltage")),
                  volts=52.0, ohm=0.01)  # fmt: skip
-    open_scale = levels("voltage", search(capture(module)).voltage[0], None)
+    open_scale = search(capture(module)).voltage[0].levels(None)
     assert any(each.scale == 0.01 and 45.0 < each.value < 54.0 for each in open_scale)
     stated = search(capture(module), nominal_v=52.0)
     assert stated.voltage[0].scale == 0.01

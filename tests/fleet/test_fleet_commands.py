@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 from cangauge.extras.fleet.gap import GapJob
+from cangauge.extras.fleet.jobs import Task
 from cangauge.extras.fleet.outliers import ErrorsByLog
 from cangauge.extras.fleet.overview import FleetOverview
 from cangauge.extras.fleet.sources import FleetLog
@@ -126,34 +127,33 @@ def test_reason_and_no_result_at_all_are_told(
 def test_results_of_renamed_logs_do_not_count(
     logs: list[FleetLog], type_json: Path, tmp_path: Path
 ) -> None:
-    folder, page = tmp_path / "logs", tmp_path / "fleet.html"
-    trip = copied(logs[1], folder / "A" / "trip.parquet")
-    first = estimate(folder, type_json, "--report", page, "--json")
-    assert json.loads(first.out)["rows_elsewhere"] == 0
-    trip.rename(folder / "A" / "renamed.parquet")
-    assert "1 row of logs that are not among LOGS" in estimate(folder, type_json).err
+    trip = copied(logs[1], tmp_path / "logs" / "A" / "trip.parquet")
+    assert estimate(tmp_path / "logs", type_json, "--json").code == 0
+    named = [FleetLog(str(trip), "A", ""), FleetLog(str(trip) + "2", "A", "")]
+    read = [FleetOverview.read(str(tmp_path / "out"), [log]).vehicles for log in named]
+    assert read == [["A"], []]
 
 
-def test_the_vehicle_nearest_to_an_alarm_is_named(
+def test_the_likeliest_gap_comes_first(
     logs: list[FleetLog], type_json: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    row = {
-        "logs": [log.url for log in logs[3:4]], "references": 1, "detected": False,
-        "verdict": "voltage_gain", "probability": 0.41, "probability_none": 0.088,
-        "group": "sensors_and_count", "group_probability": 0.82, "credible_set": [],
-        "baseline_rmse_v": 3.4, "healthy_rmse_v": 1.04,
-    }  # fmt: skip
-    monkeypatch.setattr(GapJob, "_row", lambda *_: dict(row))
-    arguments = (
-        "fleet", "gap", logs[3].url, "--reference", logs[5].url, "-m", type_json,
-        "-o", tmp_path / "out", "--report", tmp_path / "fleet.html",
+    def row(_: GapJob, task: Task) -> dict[str, Any]:
+        return {
+            "logs": [log.url for log in task.logs], "references": 1, "detected": False,
+            "verdict": "voltage_gain", "probability": 0.41, "group": "sensors_and_count",
+            "probability_none": 0.09 if task.vehicle == "car1" else 0.5, "credible_set": [],
+            "group_probability": 0.82, "baseline_rmse_v": 3.4, "healthy_rmse_v": 1.04,
+        }  # fmt: skip
+
+    monkeypatch.setattr(GapJob, "_row", row)
+    page = tmp_path / "fleet.html"
+    ended = in_process(
+        "fleet", "gap", logs[1].url, logs[3].url, "--reference", logs[5].url, "-m", type_json,
+        "-o", tmp_path / "out", "--report", page,
     )  # fmt: skip
-    ended = in_process(*arguments)
-    shown = "nearest: car1 (P(no fault) 9 %, sensors_and_count 82 %)"
-    assert shown in ended.out
-    assert shown in Html((tmp_path / "fleet.html").read_text(encoding="utf-8")).text
-    found = json.loads(in_process(*arguments, "--json").out)
-    assert (found["alarms"], found["nearest"]["vehicle"]) == ([], "car1")
+    assert "0 of 2 vehicles have a gap" in ended.out
+    assert ended.out.index("car1") < ended.out.index("car0")
+    assert "No significant gap in 2 vehicles." in Html(page.read_text(encoding="utf-8")).text
 
 
 def test_a_log_that_does_not_fit_the_others_is_named(

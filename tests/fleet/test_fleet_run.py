@@ -23,7 +23,7 @@ from cangauge.extras.fleet.gap import GapJob
 from cangauge.extras.fleet.jobs import TEXT, EstimateJob, HealthJob, Job, Task, by_log, by_vehicle
 from cangauge.extras.fleet.results import Results
 from cangauge.extras.fleet.run import Summary, connected, perform, run_id, run_job
-from cangauge.extras.fleet.sources import ABSENT, FleetLog, ReadOptions, find_logs
+from cangauge.extras.fleet.sources import FleetLog, ReadOptions, find_logs
 from cangauge.logs.canonical import write_log
 from cangauge.logs.read import read_log
 from cangauge.model.model_file import Model
@@ -96,12 +96,6 @@ def test_what_is_known_is_not_computed_again(fleet: Fleet) -> None:
     assert fleet.texts() == ["a9.0", "b", "c"]
     other = replace(NotingJob(), options=ReadOptions(described="other"))
     assert (fleet.run(job=other).done, fleet.texts()) == (3, ["a", "b", "c"])
-
-
-def test_absent_logs_are_set_aside_without_a_task(fleet: Fleet) -> None:
-    found = fleet.run(*(replace(log, stamp=ABSENT) for log in fleet.logs()[:2]), fleet.logs()[2])
-    assert (found.done, found.bad, COMPUTED) == (1, 2, ["c"])
-    assert found.reasons == {"no such file": 2}
 
 
 @pytest.mark.parametrize("content", [b"PAR1 cut", None])

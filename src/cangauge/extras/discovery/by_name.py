@@ -4,21 +4,20 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterable
-from contextlib import suppress
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from statistics import median
-from typing import Any, Final
+from typing import Any, ClassVar, Final
 
 import can
 import numpy as np
 from cantools.database.can import Message, Signal
 
-from cangauge.bus.database import SignalCodec, load_dbc, signal_codec
+from cangauge.bus.database import load_dbc, signal_codec
 from cangauge.bus.vehicle import EXTENDED
 from cangauge.errors import InputError
-from cangauge.extras.discovery.pairs import range_text
+from cangauge.extras.discovery.candidate import Level, range_text
 from cangauge.logs.units import convert
 
 _PACK = re.compile(r"bat|bms|pack|traction|hv|hochvolt|esu|rechargeable", re.IGNORECASE)
@@ -40,6 +39,8 @@ _RANGES: Final = {
     "soc_reference": (0.0, 100.0),
 }
 """Plausible medians of the distinct values [A, V, °C, %]."""
+_CLEARLY: Final = 1.0
+"""Distance in score of the first signal that makes it clear: one matching word."""
 _EXTREME = re.compile(r"max|min|cell", re.IGNORECASE)
 """Words that the pack's temperature may hold in its name: that of its warmest cell."""
 
@@ -53,27 +54,47 @@ class NamedSignal:
     message, signal, unit : str
     score : float
         Larger is likelier; in units of one matching word.
-    low, high : float or None
-        Range of its values in the capture, in the DBC's unit; None without frames.
+    low, high : float
+        Range of its values in the whole capture, in the DBC's unit; NaN without frames.
+    sign : int
+        −1 where positive values charge.
     """
+
+    HEAD: ClassVar = ("signal, by name and unit", "range")
 
     message: str
     signal: str
     unit: str
     score: float
-    low: float | None
-    high: float | None
+    low: float
+    high: float
+    sign: int = 1
 
     @property
     def name(self) -> str:
         """Message and signal."""
         return f"{self.message}.{self.signal}"
 
-    def range_text(self, sign: int = 1) -> str:
-        """Return the range of its values in the whole capture; "" without frames."""
-        if self.low is None or self.high is None:
+    @property
+    def range_text(self) -> str:
+        """Range of its values, discharge positive; "" without frames."""
+        if math.isnan(self.low):
             return ""
-        return range_text(self.low, self.high, self.unit.replace("degC", "°C"), sign)
+        return range_text(self.low, self.high, self.unit.replace("degC", "°C"), self.sign)
+
+    @property
+    def cells(self) -> tuple[str, ...]:
+        """Cells of a table under `HEAD`."""
+        return f"{self.message}\n{self.signal}", self.range_text
+
+    def levels(self, nominal_v: float | None) -> list[Level]:  # noqa: ARG002 - as of a field
+        """Return nothing: a DBC states the scale."""
+        return []
+
+    def comments(self, nominal_v: float | None) -> list[str]:  # noqa: ARG002 - as of a field
+        """Return the lines that the map states of it."""
+        ends = self.range_text
+        return [f"By name and unit: {f'{ends} in' if ends else 'not in'} the capture."]
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain values for JSON."""
@@ -82,7 +103,7 @@ class NamedSignal:
             "signal": self.signal,
             "unit": self.unit,
             "score": self.score,
-            "range": None if self.low is None else [self.low, self.high],
+            "range": None if math.isnan(self.low) else [self.low, self.high],
         }
 
 
@@ -104,70 +125,56 @@ def named_signals(
     InputError
         If the DBC cannot be read, or no message of it is in the capture.
     """
-    wanted: dict[int, list[_Seen]] = {}
-    for message in load_dbc(dbc).messages:
-        key = message.frame_id | (EXTENDED if message.is_extended_frame else 0)
-        seen = [_Seen.of(message, signal, dbc) for signal in message.signals]
-        wanted[key] = [each for each in seen if each.scores]
-    taken, present = False, set()
+    of_dbc = {
+        message.frame_id | (EXTENDED if message.is_extended_frame else 0): message
+        for message in load_dbc(dbc).messages
+    }
+    payloads: dict[int, set[bytes]] = {}
+    is_capture = False
     for each in messages:
-        taken = True
+        is_capture = True
         key = each.arbitration_id | (EXTENDED if each.is_extended_id else 0)
-        if key in wanted and not each.is_error_frame and not each.is_remote_frame:
-            present.add(key)
-            for signal in wanted[key]:
-                signal.add(bytes(each.data))
-    if taken and not present:
+        if key in of_dbc and not each.is_error_frame and not each.is_remote_frame:
+            payloads.setdefault(key, set()).add(bytes(each.data))
+    if is_capture and not payloads:
         cure = "is it of this car and this bus?"
         raise InputError("no message of this DBC is in the capture", source=dbc, cure=cure)
-    keys = [key for key in wanted if key in present or not taken]
-    found = [seen for key in keys for seen in wanted[key]]
-    best = {}
-    for role in _ROLES:
-        named = filter(None, (seen.as_role(role, taken=taken) for seen in found))
-        best[role] = tuple(sorted(named, key=lambda one: -one.score)[:shown])
-    return best
+    found: dict[str, list[NamedSignal]] = {role: [] for role in _ROLES}
+    for key in payloads if is_capture else of_dbc:
+        for signal in of_dbc[key].signals:
+            scores = {role: _name_score(role, of_dbc[key], signal) for role in _ROLES}
+            roles = [role for role, score in scores.items() if score > 0.0]
+            values = _values(dbc, of_dbc[key], signal, payloads.get(key, set())) if roles else set()
+            for role in roles:
+                lowest, highest = _RANGES[role]
+                if values and not lowest <= median(values) <= highest:
+                    continue
+                low, high = min(values, default=math.nan), max(values, default=math.nan)
+                score = scores[role] - (1.0 if is_capture and not values else 0.0)
+                score -= 0.5 if role == "current" and low == high else 0.0
+                unit = (signal.unit or "").strip()
+                made = NamedSignal(of_dbc[key].name, signal.name, unit, score, low, high)
+                found[role].append(made)
+    return {
+        role: tuple(sorted(each, key=lambda one: -one.score)[:shown])
+        for role, each in found.items()
+    }
 
 
-@dataclass
-class _Seen:
-    """A signal that may have a role, with its distinct values in the capture."""
+def is_clear(found: Sequence[NamedSignal]) -> bool:
+    """Whether the first signal is clearly ahead of the others."""
+    return len(found) == 1 or (len(found) > 1 and found[0].score - found[1].score >= _CLEARLY)
 
-    message: Message
-    signal: Signal
-    scores: dict[str, float]
-    codec: SignalCodec | None
-    values: set[float] = field(default_factory=set)
 
-    @classmethod
-    def of(cls, message: Message, signal: Signal, dbc: Path) -> _Seen:
-        scores = {role: _name_score(role, message, signal) for role in _ROLES}
-        codec = None
-        with suppress(InputError):  # it does not fit into its message
-            codec = signal_codec(message, signal, source=dbc, field=signal.name)
-        return cls(message, signal, {k: score for k, score in scores.items() if score > 0.0}, codec)
-
-    def add(self, payload: bytes) -> None:
-        payload, codec = payload[: self.message.length], self.codec
-        if codec is not None and len(payload) == self.message.length and codec.is_in(payload):
-            value = codec.decode(payload)
-            if not math.isnan(value):
-                self.values.add(value)
-
-    def as_role(self, role: str, *, taken: bool) -> NamedSignal | None:
-        if role not in self.scores:
-            return None
-        score, low, high = self.scores[role], None, None
-        if self.values:
-            low, high = min(self.values), max(self.values)
-            lowest, highest = _RANGES[role]
-            if not lowest <= median(self.values) <= highest:
-                return None
-            score -= 0.5 if role == "current" and low == high else 0.0
-        elif taken:
-            score -= 1.0
-        unit = (self.signal.unit or "").strip()
-        return NamedSignal(self.message.name, self.signal.name, unit, score, low, high)
+def _values(dbc: Path, message: Message, signal: Signal, payloads: set[bytes]) -> set[float]:
+    """Return the distinct values of a signal; none where it does not fit into its message."""
+    try:
+        codec = signal_codec(message, signal, source=dbc, field=signal.name)
+    except InputError:
+        return set()
+    cut = {payload[: message.length] for payload in payloads if len(payload) >= message.length}
+    values = {codec.decode(payload) for payload in cut if codec.is_in(payload)}
+    return {value for value in values if not math.isnan(value)}
 
 
 def _name_score(role: str, message: Message, signal: Signal) -> float:

@@ -7,23 +7,26 @@ carries: when the part above a cut steps by one, the part below wraps.
 
 from __future__ import annotations
 
+import logging
 import math
-from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, field
-from typing import Final
+from collections import defaultdict
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from operator import attrgetter
+from typing import Any, Final, NamedTuple
 
 import can
 import numpy as np
-from can.typechecking import Channel
 from numpy.typing import NDArray
 
-from cangauge._typing import FloatArray
+from cangauge._typing import BoolArray, FloatArray
+
+_LOG = logging.getLogger(__name__)
 
 LEAST_BITS: Final = 8
 MOST_BITS: Final = 16
 MIN_FRAMES: Final = 12
 """Fewest frames of an id that can show how its bits move."""
-MAX_IDS: Final = 1024
 STEADY: Final = 0.55
 """Least share of equal steps of an alive counter. A capture that loses a quarter of its frames
 still has 0.75."""
@@ -38,7 +41,6 @@ LINK_EVENTS: Final = 4
 NATURAL: Final = -2.0
 """Least log prior of a field whose numbers are looked at [nats]."""
 
-Bits = NDArray[np.bool_]
 Ints = NDArray[np.int32]
 
 
@@ -51,7 +53,7 @@ class Selector:
     value: int
 
 
-@dataclass
+@dataclass(eq=False)
 class Stream:
     """Frames of one id on one bus, all of one length and one multiplexer value.
 
@@ -87,120 +89,13 @@ class Stream:
         """Id in hexadecimal."""
         return f"0x{self.arbitration_id:X}"
 
-
-def collect(messages: Iterable[can.Message]) -> list[Stream]:
-    """Return the streams of a capture; ids with too few frames are left out."""
-    times: dict[tuple[Channel | None, int, bool], list[float]] = {}
-    data: dict[tuple[Channel | None, int, bool], list[bytes]] = {}
-    for message in messages:
-        if message.is_error_frame or message.is_remote_frame or not message.data:
-            continue
-        key = (message.channel, message.arbitration_id, message.is_extended_id)
-        if key not in times:
-            if len(times) >= MAX_IDS:
-                continue
-            times[key], data[key] = [], []
-        times[key].append(message.timestamp)
-        data[key].append(bytes(message.data))
-    streams = []
-    for key, stamps in times.items():
-        lengths = np.array([len(each) for each in data[key]])
-        length = int(np.bincount(lengths).argmax())
-        keep = np.flatnonzero(lengths == length)
-        if len(keep) < MIN_FRAMES:
-            continue
-        joined = b"".join(data[key][index] for index in keep)
-        payload = np.frombuffer(joined, np.uint8).reshape(-1, length)
-        time_s = np.array(stamps)[keep]
-        order = np.argsort(time_s, kind="stable")
-        bus = "" if key[0] is None else str(key[0])
-        whole = Stream(bus, key[1], key[2], time_s[order], payload[order])
-        streams += _demultiplexed(whole)
-    return streams
+    def bits(self, place: Place) -> frozenset[tuple[int, bool, int]]:
+        """Return the bits of a field, each with its id: a gateway repeats frames on other buses."""
+        bits = place.bits(self.length)
+        return frozenset((self.arbitration_id, self.is_extended, each) for each in bits)
 
 
-def _demultiplexed(stream: Stream) -> list[Stream]:
-    """Return a stream by value of its multiplexer; itself where it has none.
-
-    A multiplexer is a short code in whose absence the other bits change wildly from frame to frame,
-    and among frames of one value little.
-    """
-    if len(stream.payload) < 2 * MIN_FRAMES:
-        return [stream]
-    bits = np.unpackbits(stream.payload, axis=1)
-    moves = bits[1:] != bits[:-1]
-    best: tuple[float, int, int] | None = None
-    for first in range(0, min(8 * stream.length, 64), 2):
-        for width in (8, 4, 2, 1):
-            if first % width or not moves[:, first : first + width].any():
-                continue
-            codes = _codes(bits, first, width)
-            values, counts = np.unique(codes, return_counts=True)
-            if not 2 <= len(values) <= MOST_VALUES or counts.min() < MIN_FRAMES:
-                continue
-            if np.count_nonzero(np.diff(codes)) < 0.5 * len(codes):
-                continue
-            bytes_moved = (stream.payload[1:] != stream.payload[:-1]).mean(0)
-            parts = [stream.payload[codes == value] for value in values]
-            among = [(part[1:] != part[:-1]).mean(0) for part in parts]
-            within = np.average(among, axis=0, weights=counts)
-            others = np.arange(stream.length) != first // 8
-            selected = others & (bytes_moved > 0.3) & (within < MULTIPLEXED * bytes_moved)
-            if selected.sum() < 2:
-                continue  # a CRC, which follows an alive counter, is one byte
-            ratio = float(within[others].sum() / bytes_moved[others].sum())
-            if ratio < MULTIPLEXED and (best is None or ratio < best[0]):
-                best = (ratio, first, width)
-    if best is None:
-        return [stream]
-    _, first, width = best
-    codes = _codes(bits, first, width)
-    return [
-        Stream(
-            stream.bus, stream.arbitration_id, stream.is_extended, stream.time_s[codes == value],
-            stream.payload[codes == value], Selector(first, width, int(value)),
-        )
-        for value in np.unique(codes)
-    ]  # fmt: skip
-
-
-def _codes(bits: NDArray[np.uint8], first: int, width: int) -> NDArray[np.int64]:
-    return bits[:, first : first + width].astype(np.int64) @ (1 << np.arange(width - 1, -1, -1))
-
-
-@dataclass
-class _Order:
-    """Bits of a stream in one reading order, most significant first."""
-
-    is_motorola: bool
-    windows: NDArray[np.uint16]
-    """The 16 bits from each position on."""
-    set_mostly: Bits
-    flips: NDArray[np.int64]
-    links: FloatArray
-    """By cut below each bit: mean of the carries, its standard error, their number, movement of the
-    lower part between them."""
-    together: Bits
-    """By cut: whether the upper bit flips only with the lower one, which itself is often still."""
-    dead: Bits
-    """Bits of alive counters and CRCs."""
-
-    def is_linked(self, cut: int) -> bool:
-        """Whether the bits on both sides of a cut surely belong to one number."""
-        if not 0 <= cut < len(self.flips) - 1:
-            return False
-        if self.together[cut]:
-            return True
-        mean, error, events, _ = self.links[cut]
-        return bool(events >= LINK_EVENTS and mean - 2.0 * error > 0.3)
-
-    def is_cut(self, cut: int) -> bool:
-        """Whether the bits on both sides of a cut surely belong to different numbers."""
-        mean, error, events, movement = self.links[cut]
-        return bool(events >= LINK_EVENTS and mean + 2.0 * error < 0.3 and movement < 0.15)
-
-
-@dataclass
+@dataclass(frozen=True)
 class Place:
     """Bits of a field: reading order, first and last position, sign."""
 
@@ -223,147 +118,194 @@ class Place:
     def bits(self, length: int) -> frozenset[int]:
         """Return its bits in Motorola's reading order."""
         places = range(self.first, self.last + 1)
-        if self.is_motorola:
-            return frozenset(places)
-        return frozenset(8 * (length - 1 - place // 8) + place % 8 for place in places)
+        return frozenset(places if self.is_motorola else (_turned(each, length) for each in places))
 
 
-@dataclass
+class Extent(NamedTuple):
+    """A field together with constant bits above it.
+
+    `nature` is the log prior that these bits are a measured number [nats], `constant` what the
+    constant bits add to it.
+    """
+
+    place: Place
+    nature: float
+    constant: int
+
+
+@dataclass(eq=False)
 class Field:
     """A number in the frames of a stream.
 
     Parameters
     ----------
-    stream : int
-        Index of its stream.
-    place : Place
+    stream : Stream
     raw : array (n,)
-        By frame.
+        By frame, of the bits that toggle.
     missing : array (n,) of bool
         Frames with a code for "not available".
-    nature : float
-        Log prior that these bits are a measured number [nats].
-    constant : int
-        What constant bits above `raw` add to it.
+    extents : list of Extent
     """
 
-    stream: int
-    place: Place
+    stream: Stream
     raw: Ints
-    missing: Bits
-    nature: float
-    constant: int = 0
-    extensions: list[tuple[Place, float, int]] = field(default_factory=list)
-    """The same with constant bits above: place, nature, what they add."""
+    missing: BoolArray
+    extents: list[Extent]
+
+    @property
+    def best(self) -> Extent:
+        """The likeliest reading."""
+        return max(self.extents, key=attrgetter("nature"))
 
 
-def fields_of(index: int, stream: Stream, byte_order: float = 0.0) -> list[Field]:
-    """Return the numbers in a stream that its bits make plausible, each once.
+# --- Streams
 
-    Parameters
-    ----------
-    index : int
-        Index of the stream, for the fields.
-    stream : Stream
-    byte_order : float
-        Log odds that a car's numbers are in Motorola order; see `byte_order`.
+
+def collect(messages: Iterable[can.Message]) -> list[Stream]:
+    """Return the streams of a capture; ids with too few frames are left out."""
+    frames: dict[tuple[Any, int, bool], list[tuple[float, bytes]]] = defaultdict(list)
+    for message in messages:
+        if message.data and not message.is_error_frame and not message.is_remote_frame:
+            key = (message.channel, message.arbitration_id, message.is_extended_id)
+            frames[key].append((message.timestamp, bytes(message.data)))
+    streams = []
+    for (channel, number, is_extended), all_of_id in frames.items():
+        length = int(np.bincount([len(data) for _, data in all_of_id]).argmax())
+        own = sorted((each for each in all_of_id if len(each[1]) == length), key=lambda one: one[0])
+        if len(own) >= MIN_FRAMES:
+            time_s = np.array([stamp for stamp, _ in own])
+            payload = np.frombuffer(b"".join(data for _, data in own), np.uint8)
+            bus = "" if channel is None else str(channel)
+            whole = Stream(bus, number, is_extended, time_s, payload.reshape(-1, length))
+            streams += _demultiplexed(whole)
+    return streams
+
+
+def _demultiplexed(stream: Stream) -> list[Stream]:
+    """Return a stream by value of its multiplexer; itself where it has none.
+
+    A multiplexer is a short code in whose absence the other bits change wildly from frame to frame,
+    and among frames of one value little.
     """
-    orders = read_orders(stream)
-    odds = {True: min(byte_order, 0.0), False: min(-byte_order, 0.0)}
-    found: dict[bytes, Field] = {}
-    for order, other in (orders, orders[::-1]):
-        for first, last, extensions in _candidates(order, other, odds[order.is_motorola]):
-            for is_signed in (False, True):
-                made = _number(index, order, first, last, extensions, is_signed=is_signed)
-                if made is None:
-                    continue
-                key = made.raw.tobytes()
-                kept = found.get(key)
-                if kept is None:
-                    found[key] = made
-                else:
-                    kept.extensions += made.extensions
-                    if made.nature > kept.nature:
-                        made.extensions = kept.extensions
-                        found[key] = made
-    return list(found.values())
+    bits = np.unpackbits(stream.payload, axis=1)
+    moving = (bits[1:] != bits[:-1]).any(0)
+    moved = (stream.payload[1:] != stream.payload[:-1]).mean(0)
+    best: tuple[float, int, int] | None = None
+    for first in range(0, min(8 * stream.length, 64), 2):
+        for width in (8, 4, 2, 1):
+            if first % width or not moving[first : first + width].any():
+                continue
+            codes = _codes(bits, first, width)
+            values, counts = np.unique(codes, return_counts=True)
+            if not 2 <= len(values) <= MOST_VALUES or counts.min() < MIN_FRAMES:
+                continue
+            if np.count_nonzero(np.diff(codes)) < 0.5 * len(codes):
+                continue
+            parts = [stream.payload[codes == value] for value in values]
+            among = [(part[1:] != part[:-1]).mean(0) for part in parts]
+            within = np.average(among, axis=0, weights=counts)
+            others = np.arange(stream.length) != first // 8
+            selected = others & (moved > 0.3) & (within < MULTIPLEXED * moved)
+            if selected.sum() < 2:
+                continue  # a CRC, which follows an alive counter, is one byte
+            ratio = float(within[others].sum() / moved[others].sum())
+            if ratio < MULTIPLEXED and (best is None or ratio < best[0]):
+                best = (ratio, first, width)
+    if best is None:
+        return [stream]
+    _, first, width = best
+    codes = _codes(bits, first, width)
+    return [
+        Stream(
+            stream.bus, stream.arbitration_id, stream.is_extended, stream.time_s[codes == value],
+            stream.payload[codes == value], Selector(first, width, int(value)),
+        )
+        for value in np.unique(codes)
+    ]  # fmt: skip
 
 
-def read_orders(stream: Stream) -> list[_Order]:
-    """Return how the bits of a stream move, read in Motorola and in Intel order."""
-    dead = _counters_and_crcs(stream.payload)
-    return [_read(stream.payload, dead, is_motorola=each) for each in (True, False)]
+def _codes(bits: NDArray[np.uint8], first: int, width: int) -> NDArray[np.int64]:
+    return bits[:, first : first + width].astype(np.int64) @ (1 << np.arange(width - 1, -1, -1))
 
 
-def byte_order(streams: Iterable[Stream]) -> float:
-    """Return the log odds that a car's numbers are in Motorola order [nats].
-
-    A maker uses one order nearly throughout. Carries between bytes show it: ids vote.
-    """
-    votes = [0, 0]
-    for stream in streams:
-        linked = [
-            sum(order.is_linked(cut) for cut in range(7, 8 * stream.length - 1, 8))
-            for order in read_orders(stream)
-        ]
-        if linked[0] != linked[1]:
-            votes[linked[1] > linked[0]] += 1
-    odds = math.log((votes[0] + 1.0) / (votes[1] + 1.0))
-    return max(-LARGEST_ODDS, min(LARGEST_ODDS, odds))
+# --- Bits in reading order
 
 
-def _read(payload: NDArray[np.uint8], dead: Bits, *, is_motorola: bool) -> _Order:
-    count, length = payload.shape
-    ordered = payload if is_motorola else payload[:, ::-1]
-    bits = np.unpackbits(ordered, axis=1)
-    padded = np.pad(ordered, ((0, 0), (0, 2))).astype(np.uint32)
-    words = padded[:, :-2] << 16 | padded[:, 1:-1] << 8 | padded[:, 2:]
-    shifts = 8 - np.arange(8)
-    windows = (words[:, :, None] >> shifts).astype(np.uint16).reshape(count, 8 * length)
-    # The end of a byte of ones (not available, at wake-up) is no sign of how its bits move.
-    ones = ordered == 0xFF
-    few = (ones[1:] != ones[:-1]).sum(0) <= 2
-    steady = ~((ones[1:] | ones[:-1]) & few)
-    moved = (bits[1:] != bits[:-1]) & np.repeat(steady, 8, axis=1)
-    flips = moved.sum(0)
-    places = np.arange(8 * length)
-    turned = places if is_motorola else 8 * (length - 1 - places // 8) + places % 8
-    return _Order(
-        is_motorola, windows, bits.mean(0) > 0.5, flips, _links(bits, flips), _together(moved),
-        dead[turned],
-    )  # fmt: skip
+@dataclass
+class _Order:
+    """Bits of a stream in one reading order, most significant first."""
+
+    is_motorola: bool
+    payload: NDArray[np.uint8]
+    flips: NDArray[np.int64]
+    set_mostly: BoolArray
+    dead: BoolArray
+    """Bits of alive counters and CRCs."""
+    linked: BoolArray
+    """By cut below each bit: whether the bits on both sides surely belong to one number."""
+    cut: BoolArray
+    """By cut: whether the bits on both sides surely belong to different numbers."""
+
+    @classmethod
+    def of(cls, payload: NDArray[np.uint8], dead: BoolArray, *, is_motorola: bool) -> _Order:
+        ordered = payload if is_motorola else payload[:, ::-1]
+        bits = np.unpackbits(ordered, axis=1)
+        # The end of a byte of ones (not available, at wake-up) is no sign of how its bits move.
+        ones = ordered == 0xFF
+        few = (ones[1:] != ones[:-1]).sum(0) <= 2
+        steady = ~((ones[1:] | ones[:-1]) & few)
+        moved = (bits[1:] != bits[:-1]) & np.repeat(steady, 8, axis=1)
+        flips = moved.sum(0)
+        if not is_motorola:
+            dead = dead[[_turned(place, payload.shape[1]) for place in range(len(dead))]]
+        linked, cut = _links(bits, flips)
+        padded = np.pad(ordered, ((0, 0), (0, 2)))
+        linked |= _together(moved)
+        return cls(is_motorola, padded, flips, bits.mean(0) > 0.5, dead, linked, cut)
+
+    def codes(self, first: int, last: int) -> Ints:
+        """Return the unsigned number from `first` to `last` of at most 16 bits, by frame."""
+        one, two, three = self.payload[:, first // 8 : first // 8 + 3].astype(np.int32).T
+        words = one << 16 | two << 8 | three
+        return np.asarray(words >> 23 - last + first // 8 * 8 & (1 << last - first + 1) - 1)
 
 
-def _links(bits: NDArray[np.uint8], flips: NDArray[np.int64]) -> FloatArray:
-    """Return how each cut behaves at carries; see `_Order.links`."""
+def _turned(place: int, length: int) -> int:
+    """Return the position of a bit in the other reading order."""
+    return 8 * (length - 1 - place // 8) + place % 8
+
+
+def _links(bits: NDArray[np.uint8], flips: NDArray[np.int64]) -> tuple[BoolArray, BoolArray]:
+    """Return by cut whether carries cross it, and whether they surely do not; see `_Order`."""
     count = bits.shape[1]
-    out = np.zeros((count, 4))
+    linked, apart = np.zeros(count, np.bool_), np.zeros(count, np.bool_)
     wide = bits.astype(np.int16)
-    for cut in np.flatnonzero((flips[:-1] > 0) & (flips[1:] > 0)):
+    for cut in np.flatnonzero((flips[:-1] > 0) & (flips[1:] > 0)).tolist():
         # Only bits that move: a lone sign bit steps up where its number falls.
-        top = int(cut)
+        top = cut
         while top > 0 and flips[top - 1] > 0 and cut - top < 3:
             top -= 1
+        if top == cut:
+            continue
         above = wide[:, top : cut + 1]
         below = wide[:, cut + 1 : cut + 7]
         high = above @ (1 << np.arange(above.shape[1] - 1, -1, -1, dtype=np.int16))
         low = below @ (1 << np.arange(below.shape[1] - 1, -1, -1, dtype=np.int16))
         modulus = 1 << above.shape[1]
-        if modulus == 2:
-            continue
         step = np.diff(high) % modulus
         change = np.diff(low) / float(1 << below.shape[1])
         carries = np.concatenate([-change[step == 1], change[step == modulus - 1]])
-        if len(carries):
+        if len(carries) >= LINK_EVENTS:
             still = change[(step == 0) & (change != 0.0)]
-            error = carries.std() / np.sqrt(len(carries)) + 0.3 / len(carries)
+            error = 2.0 * (carries.std() / np.sqrt(len(carries)) + 0.3 / len(carries))
             movement = float(np.abs(still).mean()) if len(still) else 1.0
-            out[cut] = carries.mean(), error, len(carries), movement
-    return out
+            linked[cut] = carries.mean() - error > 0.3
+            apart[cut] = carries.mean() + error < 0.3 and movement < 0.15
+    return linked, apart
 
 
-def _together(moved: Bits) -> Bits:
-    """Return by cut whether the upper bit flips only with the lower one; see `_Order.together`."""
+def _together(moved: BoolArray) -> BoolArray:
+    """Return by cut whether the upper bit flips only with the lower one, itself often still."""
     flips = moved.sum(0)
     shared = (moved[:, :-1] & moved[:, 1:]).sum(0)
     often = flips[1:] > 0.5 * len(moved)
@@ -371,19 +313,18 @@ def _together(moved: Bits) -> Bits:
     return np.append(found, False)
 
 
-def _counters_and_crcs(payload: NDArray[np.uint8]) -> Bits:
+def _counters_and_crcs(payload: NDArray[np.uint8]) -> BoolArray:
     """Return which bits, in Motorola's reading order, are an alive counter or a CRC."""
     count, length = payload.shape
     bits = np.unpackbits(payload, axis=1)
     changed = bits[1:] != bits[:-1]
-    dead: Bits = np.asarray(changed.mean(0) > 0.9)
+    dead: BoolArray = np.asarray(changed.mean(0) > 0.9)
     for byte in np.flatnonzero(changed.reshape(count - 1, length, 8).any((0, 2))).tolist():
         for width, offsets in ((8, (0,)), (4, range(5)), (3, (0, 1, 5)), (2, (0, 2, 4, 6))):
             for offset in offsets:
                 codes = (payload[:, byte] >> (8 - offset - width)) & ((1 << width) - 1)
                 if _counts(codes.astype(np.int64), 1 << width):
                     dead[8 * byte + offset : 8 * byte + offset + width] = True
-    for byte in range(length):
         if _is_crc(changed, byte):
             dead[8 * byte : 8 * byte + 8] = True
     return dead
@@ -404,11 +345,11 @@ def _counts(codes: NDArray[np.int64], modulus: int) -> bool:
     return bool((uses > 0).sum() >= modulus - 1 and uses.max() < 2.5 * len(codes) / modulus)
 
 
-def _is_crc(changed: Bits, byte: int) -> bool:
+def _is_crc(changed: BoolArray, byte: int) -> bool:
     """Whether a byte changes in half its bits when, and only when, the other bytes change."""
     own = changed[:, 8 * byte : 8 * byte + 8]
-    other: Bits = np.asarray(np.delete(changed, np.s_[8 * byte : 8 * byte + 8], axis=1).any(1))
-    moves: Bits = np.asarray(own.any(1))
+    other: BoolArray = np.asarray(np.delete(changed, np.s_[8 * byte : 8 * byte + 8], axis=1).any(1))
+    moves: BoolArray = np.asarray(own.any(1))
     if other.sum() < 8 or moves[~other].any() or moves[other].mean() < 0.93:
         return False
     distance = own[other].sum(1).mean()
@@ -416,41 +357,78 @@ def _is_crc(changed: Bits, byte: int) -> bool:
     return bool(3.0 < distance < 5.0 and often >= 7)
 
 
-def _candidates(  # noqa: C901 - one walk over the bits
-    order: _Order, other: _Order, odds: float
-) -> Iterator[tuple[int, int, list[tuple[int, float, int]]]]:
-    """Yield first and last toggling bit of plausible fields, with what may stand above them."""
+# --- Numbers
+
+
+def fields_of(streams: Sequence[Stream]) -> list[Field]:
+    """Return the numbers that the bits of streams make plausible, each of a stream once."""
+    orders = []
+    for stream in streams:
+        dead = _counters_and_crcs(stream.payload)
+        orders.append([_Order.of(stream.payload, dead, is_motorola=each) for each in (True, False)])
+    odds = _byte_order(orders)
+    fields: list[Field] = []
+    for number, (stream, pair) in enumerate(zip(streams, orders, strict=True), 1):
+        _LOG.debug("id %d of %d: %s", number, len(streams), stream.name)
+        found: dict[bytes, Field] = {}
+        for order, other in (pair, pair[::-1]):
+            for extents in _extents(order, other, min(odds if order.is_motorola else -odds, 0.0)):
+                for is_signed in (False, True):
+                    made = _number(stream, order, extents, is_signed=is_signed)
+                    if made is not None:
+                        kept = found.setdefault(made.raw.tobytes(), made)
+                        if kept is not made:
+                            if made.best.nature > kept.best.nature:
+                                kept.missing = made.missing
+                            kept.extents += made.extents
+        fields += found.values()
+    return fields
+
+
+def _byte_order(orders: Iterable[Sequence[_Order]]) -> float:
+    """Return the log odds that a car's numbers are in Motorola order [nats].
+
+    A maker uses one order nearly throughout. Carries between bytes show it: ids vote.
+    """
+    votes = [0, 0]
+    for pair in orders:
+        motorola, intel = (int(order.linked[7:-1:8].sum()) for order in pair)
+        if motorola != intel:
+            votes[intel > motorola] += 1
+    odds = math.log((votes[0] + 1.0) / (votes[1] + 1.0))
+    return max(-LARGEST_ODDS, min(LARGEST_ODDS, odds))
+
+
+def _extents(order: _Order, other: _Order, odds: float) -> Iterator[tuple[int, list[Extent]]]:
+    """Yield the first toggling bit of plausible fields, with what may stand above them."""
     toggles = np.flatnonzero((order.flips > 0) & ~order.dead)
     dead_before = np.concatenate([[0], np.cumsum(order.dead)])
-    for last in toggles:
-        for first in toggles[(toggles <= last) & (toggles > last - MOST_BITS)]:
-            if dead_before[last + 1] > dead_before[first]:
-                continue
-            body = _body(order, int(first), int(last))
-            if body < NATURAL - 3.0:
+    for last in toggles.tolist():
+        for first in toggles[(toggles <= last) & (toggles > last - MOST_BITS)].tolist():
+            body = _body(order, first, last)
+            if dead_before[last + 1] > dead_before[first] or body < NATURAL - 3.0:
                 continue
             found = []
-            top, constant = int(first), 0
-            while True:
+            top, constant = first, 0
+            while last - top < MOST_BITS:
+                if top < first:
+                    if top < 0 or order.flips[top] > 0 or order.dead[top]:
+                        break
+                    constant += int(order.set_mostly[top]) << last - top
                 if last - top + 1 >= LEAST_BITS:
-                    nature = body + _ends(order, other, top, int(last))
-                    nature += odds if top // 8 != int(last) // 8 else 0.0
+                    nature = body + _ends(order, other, top, last)
+                    nature += odds if top // 8 != last // 8 else 0.0
                     if nature > NATURAL:
-                        found.append((top, nature, constant))
-                above = top - 1
-                if above < 0 or order.flips[above] > 0 or order.dead[above]:
-                    break
-                if last - above + 1 > MOST_BITS:
-                    break
-                constant += int(order.set_mostly[above]) << int(last - above)
-                top = above
+                        place = Place(order.is_motorola, top, last, is_signed=False)
+                        found.append(Extent(place, nature, constant))
+                top -= 1
             if found:
-                yield int(first), int(last), found
+                yield first, found
 
 
 def _body(order: _Order, first: int, last: int) -> float:
     """Return the log prior of the toggling bits as one number: no cuts, lower bits toggle more."""
-    cuts = sum(order.is_cut(cut) for cut in range(first, last))
+    cuts = int(order.cut[first:last].sum())
     flips = order.flips[first : last + 1].astype(np.float64)
     rises = flips[1:] < flips[:-1] - 2.0 * np.sqrt(flips[1:] + flips[:-1] + 1.0)
     return -min(2.0 * cuts, 8.0) - min(float(rises.sum()), 4.0)
@@ -475,67 +453,51 @@ def _ends(  # noqa: C901 - one rule after the other
         score -= 0.5 if first % 4 == 0 else 3.0
     elif first % 4 and flips[first] == 0 and order.set_mostly[first]:
         score -= 5.0  # a constant one of another byte
-    length = count // 8
-
-    def turned(place: int) -> int:
-        return 8 * (length - 1 - place // 8) + place % 8
-
-    if order.is_linked(last):
+    if order.linked[last]:
         score -= 2.5
     elif last + 1 < count and not order.dead[last + 1] and flips[last + 1] > 0:
         if flips[last + 1] < 0.6 * flips[last]:
             score += 0.5
         elif (last + 1) % 8:
             score -= 1.0  # the noise of a measurement may extend below
-    if last % 8 == 7 and other.is_linked(turned(last)):
-        score -= 2.5
-    if order.is_linked(first - 1):
+    if first > 0 and order.linked[first - 1]:
         score -= 2.5
     elif first > 0 and flips[first - 1] > 0:
         score += 0.3
-    if first % 8 == 0 and other.is_linked(turned(first) - 1):
+    # At the end of a byte the number may continue in the other order.
+    turned = _turned(last, count // 8)
+    if last % 8 == 7 and other.linked[turned]:
+        score -= 2.5
+    turned = _turned(first, count // 8) - 1
+    if first % 8 == 0 and turned >= 0 and other.linked[turned]:
         score -= 2.5
     return score
 
 
 def _number(
-    index: int,
-    order: _Order,
-    first: int,
-    last: int,
-    extensions: list[tuple[int, float, int]],
-    *,
-    is_signed: bool,
+    stream: Stream, order: _Order, found: tuple[int, list[Extent]], *, is_signed: bool
 ) -> Field | None:
     """Return the numbers of a field; None for noise over its whole range."""
-    width = last - first + 1
-    if is_signed and width < LEAST_BITS:
-        return None
-    code = (order.windows[:, first] >> (MOST_BITS - width)).astype(np.int32)
+    first, extents = found
+    last = extents[0].place.last
+    raw = order.codes(first, last)
     if is_signed:
-        raw = np.where(code >> (width - 1), code - (1 << width), code).astype(np.int32)
-        missing = (raw == (1 << (width - 1)) - 1) | (raw == -(1 << (width - 1)))
-        extensions = [each for each in extensions if each[0] == first]
+        if extents[0].place.first != first:
+            return None
+        half = 1 << last - first
+        raw = np.where(raw >= half, raw - 2 * half, raw).astype(np.int32)
+        missing = (raw == half - 1) | (raw == -half)
+        place = Place(order.is_motorola, first, last, is_signed=True)
+        extents = [extents[0]._replace(place=place)]
     else:
-        raw = code
-        top = extensions[-1][0]
-        wide = last - top + 1
-        missing = (order.windows[:, top] >> (MOST_BITS - wide)) == (1 << wide) - 1
-    if not extensions or missing.mean() > 0.5:
+        widest = extents[-1].place
+        missing = order.codes(widest.first, last) == (1 << widest.width) - 1
+    if missing.mean() > 0.5:
         return None
     good = raw[~missing].astype(np.float64)
-    low, high = good.min(), good.max()
-    if low == high:
+    reach = good.max() - good.min()
+    if reach == 0.0:
         return None
-    change = np.diff(good)
-    roughness = float((change**2).mean() / (2.0 * good.var()))
-    best = max(extensions, key=lambda each: each[1])
-    full = (1 << (last - best[0] + 1)) - 1
-    if roughness > 0.35 and high - low > 0.5 * full:
-        return None
-    made = [
-        (Place(order.is_motorola, top, last, is_signed), nature, constant)
-        for top, nature, constant in extensions
-    ]
-    place = Place(order.is_motorola, best[0], last, is_signed)
-    return Field(index, place, raw, missing, best[1], best[2], made)
+    made = Field(stream, raw, missing, extents)
+    roughness = float((np.diff(good) ** 2).mean() / (2.0 * good.var()))
+    return None if roughness > 0.35 and 2.0 * reach > (1 << made.best.place.width) - 1 else made

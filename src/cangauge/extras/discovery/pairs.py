@@ -11,13 +11,15 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any, Final
 
 import numpy as np
 from scipy.signal import lfilter
 
-from cangauge._typing import FloatArray
-from cangauge.extras.discovery.fields import Bits, Field, Ints, Place, Selector, Stream
+from cangauge._typing import BoolArray, FloatArray
+from cangauge.extras.discovery.candidate import CURRENT_SCALES, SignalCandidate
+from cangauge.extras.discovery.fields import Field, Ints, Place, Stream
 
 MOST_ROWS: Final = 4000
 TREND_S: Final = 10.0
@@ -42,22 +44,7 @@ RESISTANCE_OHM: Final = (0.008, 1.2)
 TYPICAL_OHM: Final = 0.12
 RESISTANCE_SPREAD: Final = 1.2
 """Bounds, median and log spread of a pack's resistance: 12 V starter packs to old car packs."""
-VOLTAGE_SCALES: Final = {
-    0.1: 0.0, 0.5: -0.3, 0.25: -0.3, 0.01: -0.3, 0.125: -1.2, 0.05: -2.0, 0.02: -2.0, 1.0: -1.0,
-    2.0: -3.0,
-}  # fmt: skip
-CURRENT_SCALES: Final = {
-    0.1: 0.0, 0.5: -0.3, 0.25: -0.5, 0.01: -0.5, 0.05: -0.5, 1.0: -1.0, 0.025: -1.0, 0.125: -1.2,
-    0.02: -1.5,
-}  # fmt: skip
-"""Usual scales [V, A] and their log priors [nats], by their frequency in public DBC files."""
-SOC_SCALES: Final = (0.1, 0.5, 0.01, 1.0, 0.05, 0.025, 0.02, 0.4)
-"""Usual scales of a SoC [%]."""
 SHOWN: Final = 3
-LARGEST_RATIO: Final = 2.0
-"""Largest ratio of the resistances by two halves of a capture: a coincidence does not repeat."""
-CLEARLY_NATS: Final = 3.0
-"""Distance to the second candidate that makes the first clear: a likelihood ratio of 20."""
 SATURATION_NATS: Final = 20.0
 """Evidence from which on further samples count half: loads of a car are correlated."""
 SIBLING: Final = 0.02
@@ -77,181 +64,108 @@ SAME_FRAME_NATS: Final = 4.0
 IMPOSSIBLE: Final = -99.0
 
 
-@dataclass(frozen=True)
-class SignalCandidate:
-    """A field that may be the wanted signal.
+class Grid:
+    """Slots of time over all streams.
 
     Parameters
     ----------
-    bus : str
-    arbitration_id : int
-    is_extended : bool
-    length : int
-        Bytes of the frame.
-    place : Place
-    scale, offset : float
-        value = scale × raw + offset, in A, V, % or °C.
-    sign : int
-        −1 where positive values charge.
-    low, high : float
-        Range of the values.
-    steps : int
-        Number of changes in the capture.
-    period_s : float
-    not_available : int or None
-        Raw code in the capture that means "no value".
-    selector : Selector or None
-        Multiplexer value with which the field is in the frame.
-    score, evidence : float
-        Log posterior and its part from the physics [nats].
-    correlation, resistance_ohm : float
-        With its partner; NaN where there is none.
-    halves_ohm : tuple of float
-        Resistance by the first and by the second half of the capture.
-    capacity_ah : float
-        Charge of 100 % of a SoC [Ah]; else NaN.
-    partner : str
+    streams : sequence of Stream
+    step_s : float
+        Shortest slot [s].
     """
 
-    bus: str
-    arbitration_id: int
-    is_extended: bool
-    length: int
-    place: Place
-    scale: float
-    offset: float
-    sign: int
-    low: float
-    high: float
-    steps: int
-    period_s: float
-    not_available: int | None
-    selector: Selector | None
-    score: float
-    evidence: float
-    correlation: float = math.nan
-    resistance_ohm: float = math.nan
-    halves_ohm: tuple[float, float] = (math.nan, math.nan)
-    partner: str = ""
-    capacity_ah: float = math.nan
-
-    @property
-    def is_repeated(self) -> bool:
-        """Whether both halves of the capture show alike resistances."""
-        one, two = self.halves_ohm
-        return max(one, two) <= LARGEST_RATIO * min(one, two)
-
-    @property
-    def facts(self) -> str:
-        """The evidence in a phrase."""
-        if self.evidence < 1.0:
-            return "smooth; nothing else proves it"
-        r = abs(self.correlation)
-        if math.isnan(self.resistance_ohm):
-            return f"falls with the charge (correlation {r:.2f}), {self.partner}"
-        text = f"voltage falls when current rises: with {self.partner}, correlation {r:.2f}"
-        text += f", R {self.resistance_ohm:.2g} Ω"
-        return text if self.is_repeated else f"{text}, but not in both halves of the capture"
-
-    def rescaled(self, scale: float) -> SignalCandidate:
-        """Return a SoC with another scale, and the capacity that follows."""
-        ratio = scale / self.scale
-        capacity_ah = self.capacity_ah / ratio
-        return replace(
-            self,
-            scale=scale,
-            low=self.low * ratio,
-            high=self.high * ratio,
-            capacity_ah=capacity_ah,
-            partner=f"{capacity_ah:.0f} Ah per 100 %",
-        )
-
-    @property
-    def start(self) -> int:
-        """Start bit as in a DBC."""
-        return self.place.start(self.length)
-
-    @property
-    def name(self) -> str:
-        """Id and bits as in a DBC, such as "0x1DB 7|11@0-"."""
-        order = "0" if self.place.is_motorola else "1"
-        sign = "-" if self.place.is_signed else "+"
-        name = f"0x{self.arbitration_id:X} {self.start}|{self.place.width}@{order}{sign}"
-        if self.selector is not None:
-            name += f" m{self.selector.value}"
-        return name
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return plain values for JSON."""
-        return {
-            "id": f"0x{self.arbitration_id:X}",
-            "bus": self.bus,
-            "start": self.start,
-            "length": self.place.width,
-            "byte_order": "motorola" if self.place.is_motorola else "intel",
-            "signed": self.place.is_signed,
-            "scale": self.scale,
-            "offset": self.offset,
-            "sign": self.sign,
-            "multiplexer_value": None if self.selector is None else self.selector.value,
-            "range": [self.low, self.high],
-            "steps": self.steps,
-            "period_s": self.period_s,
-            "score": self.score,
-            "evidence": self.evidence,
-            "correlation": self.correlation,
-            "resistance_ohm": self.resistance_ohm,
-            "halves_ohm": list(self.halves_ohm),
-            "partner": self.partner,
+    def __init__(self, streams: Sequence[Stream], step_s: float) -> None:
+        start_s = min(float(each.time_s[0]) for each in streams)
+        self.duration_s = max(float(each.time_s[-1]) for each in streams) - start_s
+        self.step_s = max(step_s, self.duration_s / MOST_ROWS)
+        self._rows = max(int(self.duration_s / self.step_s), 4)
+        edges = start_s + self.step_s * np.arange(self._rows + 1)
+        self._slots = {
+            each: np.clip(np.searchsorted(edges, each.time_s, "right") - 1, 0, self._rows - 1)
+            for each in streams
         }
 
+    def means(self, stream: Stream, values: Ints, missing: BoolArray) -> FloatArray:
+        """Return the means of a stream's values by slot; empty slots keep the last one."""
+        slots, good = self._slots[stream][~missing], values[~missing]
+        counts = np.bincount(slots, minlength=self._rows)
+        filled = np.flatnonzero(counts)
+        last = np.maximum(np.searchsorted(filled, np.arange(self._rows), "right") - 1, 0)
+        sums = np.bincount(slots, weights=good, minlength=self._rows)
+        return np.asarray((sums[filled] / counts[filled])[last])
 
-Candidates = tuple[SignalCandidate, ...]
-_Found = list[SignalCandidate]
+    def longest(self, pause_s: float) -> slice:
+        """Return the slots of the longest part without a pause: there the SoC may jump."""
+        filled = np.unique(np.concatenate(list(self._slots.values())))
+        ends = np.flatnonzero(np.diff(filled) * self.step_s > pause_s)
+        firsts, lasts = np.append(0, ends + 1), np.append(ends, len(filled) - 1)
+        longest = int((filled[lasts] - filled[firsts]).argmax())
+        return slice(int(filled[firsts[longest]]), int(filled[lasts[longest]]) + 1)
 
 
-@dataclass
+@dataclass(eq=False)
 class Row:
-    """A field on the grid, as a current or as a voltage."""
+    """A field as a current or as a voltage.
+
+    Parameters
+    ----------
+    field : Field
+    place : Place
+    constant : int
+        What constant bits above the field add to `raw`.
+    missing : array (n,) of bool
+    prior : float
+        Log prior of the field in its role [nats].
+    scale : float
+        Of a voltage [V].
+    grid : Grid
+    """
 
     field: Field
     place: Place
+    constant: int
+    missing: BoolArray
     prior: float
     scale: float
-    level: float
-    constant: int
-    missing: Bits
+    grid: Grid
+
+    @cached_property
+    def values(self) -> Ints:
+        """Raw numbers by frame."""
+        return self.field.raw[~self.missing] + self.constant
+
+    def values_on_grid(self) -> FloatArray:
+        """Return the means of the raw numbers by slot of time."""
+        return self.grid.means(self.field.stream, self.field.raw + self.constant, self.missing)
 
     @property
     def steps(self) -> int:
         """Number of changes."""
-        return int(np.count_nonzero(np.diff(self.field.raw[~self.missing])))
+        return int(np.count_nonzero(np.diff(self.values)))
 
+    @cached_property
+    def bits(self) -> frozenset[tuple[int, bool, int]]:
+        """Its bits, each with its id: a gateway repeats frames on other buses."""
+        return self.field.stream.bits(self.place)
 
-def range_text(low: float, high: float, unit: str, sign: int = 1) -> str:
-    """Return a range of values of a sign."""
-    ends = sorted((sign * low + 0.0, sign * high + 0.0))
-    return f"{ends[0]:.5g} … {ends[1]:.5g} {unit}".replace("-", "−")
-
-
-def is_capacity(capacity_ah: float) -> bool:
-    """Return whether a pack may have this capacity: of a scooter to that of a truck."""
-    return 2.0 < capacity_ah < 600.0
-
-
-def overlap(
-    one: SignalCandidate, bits: frozenset[int], two: SignalCandidate, others: frozenset[int]
-) -> bool:
-    """Return whether two fields share bits of a message."""
-    same = (one.bus, one.arbitration_id, one.is_extended) == (
-        two.bus, two.arbitration_id, two.is_extended,
-    )  # fmt: skip
-    return same and bool(bits & others)
+    def candidate(self, role: str, scale: float, offset: float, **more: Any) -> SignalCandidate:
+        """Return the field as the signal of a role."""
+        ends = scale * np.array([self.values.min(), self.values.max()], np.float64) + offset
+        code: int | None = None
+        gone = self.field.raw[self.field.missing & (self.field.raw != 0)]
+        if len(gone):
+            codes, counts = np.unique(gone, return_counts=True)
+            is_signed = self.place.is_signed
+            code = int(codes[counts.argmax()]) if is_signed else (1 << self.place.width) - 1
+        return SignalCandidate(
+            role, self.field.stream, self.place, scale, offset, float(ends.min()),
+            float(ends.max()), self.steps, code, **more,
+        )  # fmt: skip
 
 
 @dataclass(frozen=True)
 class _Moves:
-    """Fields freed of their slow part, in units of their standard deviation."""
+    """Grids freed of their slow part, in units of their standard deviation."""
 
     values: FloatArray
     std: FloatArray
@@ -290,52 +204,27 @@ def _participation(rows: FloatArray) -> FloatArray:
 
 
 class Pairs:
-    """All pairs of a voltage (rows) and a current (columns), with their log posterior."""
+    """All pairs of a voltage (rows) and a current (columns), with their log posterior.
 
-    def __init__(  # noqa: PLR0917 - made in one place
-        self,
-        current_grid: list[FloatArray],
-        voltage_grid: list[FloatArray],
-        currents: Sequence[Row],
-        voltages: Sequence[Row],
-        streams: Sequence[Stream],
-        step_s: float,
-    ) -> None:
-        self._currents, self._voltages, self._streams = currents, voltages, streams
-        self._current_grid, self._voltage_grid = current_grid, voltage_grid
-        one, two = np.array(voltage_grid), np.array(current_grid)
-        u, i = _Moves.of(one, step_s), _Moves.of(two, step_s)
-        rows = one.shape[1]
-        self._u, self._i = u, i
-        self.r = np.asarray(u.values @ i.values.T / rows, dtype=np.float64)
-        polarisation = self._polarisation(two, step_s)
-        # A measured quantity dithers: several changes make one independent move.
-        moves = [np.array([row.steps / 4.0 for row in rows]) for rows in (voltages, currents)]
-        count = np.minimum(
-            np.minimum(u.independent, moves[0])[:, None],
-            np.minimum(i.independent, moves[1])[None, :],
-        )
-        # Bartlett (1946): what moves slowly, such as speeds, has few independent samples.
-        memory = np.clip(u.memory[:, None] * i.memory[None, :], 0.0, 0.99)
-        slots = rows * step_s / MOVE_S
-        count = np.minimum(count, np.maximum(slots * (1.0 - memory) / (1.0 + memory), 1.0))
-        evidence = _ratio(self.r, count) - 0.5 * np.log(np.maximum(count, 1.0))
-        half = rows // 2
-        first = _correlation(u.values[:, :half], i.values[:, :half])
-        second = _correlation(u.values[:, half:], i.values[:, half:])
-        agree = (np.sign(first) == np.sign(self.r)) & (np.sign(second) == np.sign(self.r))
-        both = np.sqrt(_ratio(first, count / 2.0) * _ratio(second, count / 2.0))
-        # A relation that only one half shows may be one coincidence, such as the wake-up.
-        capped = np.minimum(evidence, 2.0 + 3.0 * np.where(agree, both, 0.0))
-        evidence = np.where(count < FEW_MOVES, capped, evidence)
-        evidence = np.where(self._are_copies(count), 0.0, np.maximum(evidence, 0.0))
-        few = np.array([len(np.unique(row.field.raw[~row.missing])) < 4 for row in voltages])
-        evidence = np.where(few[:, None], np.minimum(evidence, 2.0), evidence)
-        self.slope = np.abs(self.r) * u.std[:, None] / np.maximum(i.std[None, :], 1e-9)
+    Parameters
+    ----------
+    voltages, currents : sequence of Row
+    step_s : float
+        Interval of their grid [s].
+    """
+
+    def __init__(self, voltages: Sequence[Row], currents: Sequence[Row], step_s: float) -> None:
+        self._voltages, self._currents, self._step_s = voltages, currents, step_s
+        level = [np.array([row.values_on_grid() for row in rows]) for rows in (voltages, currents)]
+        self._u, self._i = (_Moves.of(each, step_s) for each in level)
+        self._rows = level[0].shape[1]
+        self.r = _product(self._u.values, self._i.values)
+        self.slope = np.abs(self.r) * self._u.std[:, None] / np.maximum(self._i.std[None, :], 1e-9)
+        evidence = self._likelihood()
         scale = np.array([row.scale for row in voltages])[:, None]
+        widths = np.array([row.place.width for row in currents])
         likely = np.full(self.r.shape, IMPOSSIBLE)
         self.current_scale = np.ones(self.r.shape)
-        widths = np.array([row.place.width for row in currents])[None, :]
         for amps, usual in CURRENT_SCALES.items():
             prior = _resistance_prior(self.slope * scale / amps) + usual
             prior = prior - _narrow(amps * 2.0 ** (widths - 1))
@@ -345,155 +234,150 @@ class Pairs:
         # Without evidence the slope is chance and constrains neither scale nor resistance.
         unknown = evidence < 1.0
         likely = np.where(unknown, -1.0, np.maximum(likely, -3.0))
-        guessed = [max(CURRENT_SCALES, key=lambda each: _guess(each, width)) for width in widths[0]]
+        guessed = [max(CURRENT_SCALES, key=lambda each: _guess(each, width)) for width in widths]
         self.current_scale = np.where(unknown, np.array(guessed)[None, :], self.current_scale)
-        level = np.array([row.level for row in voltages])[:, None]
-        constants = np.array([float(row.constant) for row in currents])
-        middle = (np.median(two, axis=1) + constants)[None, :]
-        is_copy = (np.abs(self.slope * middle / level - 1.0) < 0.25) & (self.r > 0.5)
-        ids = np.array([row.field.stream for row in currents])
-        same = np.array([row.field.stream for row in voltages])[:, None] == ids[None, :]
+        middle = [np.median(each, axis=1) for each in level]
+        is_copy = (np.abs(self.slope * middle[1] / middle[0][:, None] - 1.0) < 0.25) & (
+            self.r > 0.5
+        )
+        ids = [np.array([id(row.field.stream) for row in each]) for each in (voltages, currents)]
         # Correlated loads (torque, power) are no independent samples: evidence saturates.
         self.evidence = SATURATION_NATS * np.log1p(evidence / SATURATION_NATS)
         self.score = (
             self.evidence
-            + polarisation
+            + self._polarisation(level[1])
             + np.array([row.prior for row in voltages])[:, None]
-            + np.array([row.prior for row in currents])[None, :]
+            + np.array([row.prior for row in currents])
             + likely
-            + np.where(same, SAME_FRAME_NATS, 0.0)
+            + np.where(ids[0][:, None] == ids[1], SAME_FRAME_NATS, 0.0)
             + np.where(is_copy, IMPOSSIBLE, 0.0)
-            - 1.5 * self._has_sibling(voltages)[:, None]
+            - 1.5 * self._has_sibling(middle[0])[:, None]
         )
 
-    def _polarisation(self, current: FloatArray, step_s: float) -> FloatArray:
+    def _likelihood(self) -> FloatArray:
+        """Return the log likelihood ratio of a common variation against none."""
+        u, i = self._u, self._i
+        # A measured quantity dithers: several changes make one independent move.
+        moves = [
+            np.minimum(free.independent, np.array([row.steps / 4.0 for row in rows]))
+            for free, rows in ((u, self._voltages), (i, self._currents))
+        ]
+        count = np.minimum(moves[0][:, None], moves[1])
+        # Bartlett (1946): what moves slowly, such as speeds, has few independent samples.
+        memory = np.clip(u.memory[:, None] * i.memory, 0.0, 0.99)
+        slots = self._rows * self._step_s / MOVE_S
+        count = np.minimum(count, np.maximum(slots * (1.0 - memory) / (1.0 + memory), 1.0))
+        evidence = _ratio(self.r, count) - 0.5 * np.log(np.maximum(count, 1.0))
+        half = self._rows // 2
+        first = _correlation(u.values[:, :half], i.values[:, :half])
+        second = _correlation(u.values[:, half:], i.values[:, half:])
+        agree = (np.sign(first) == np.sign(self.r)) & (np.sign(second) == np.sign(self.r))
+        both = np.sqrt(_ratio(first, count / 2.0) * _ratio(second, count / 2.0))
+        # A relation that only one half shows may be one coincidence, such as the wake-up.
+        capped = np.minimum(evidence, 2.0 + 3.0 * np.where(agree, both, 0.0))
+        evidence = np.where(count < FEW_MOVES, capped, evidence)
+        evidence = np.where(self._are_copies(count), 0.0, np.maximum(evidence, 0.0))
+        few = np.array([len(np.unique(row.values)) < 4 for row in self._voltages])
+        return np.where(few[:, None], np.minimum(evidence, 2.0), evidence)
+
+    def _are_copies(self, count: FloatArray) -> BoolArray:
+        """Return which pairs are one quantity twice: no residual but quantization."""
+        lost = (1.0 - np.minimum(self.r**2, 1.0)) * self._u.std[:, None] ** 2
+        # Of rounding: a twelfth of a step squared in each, the current's by the slope.
+        alike = (self.slope > 1.0 / ALIKE) & (self.slope < ALIKE)
+        return np.asarray(
+            (self.r**2 > COPY_R2)
+            & ((alike & (lost < 0.1 * (1.0 + self.slope**2))) | (count > MANY_MOVES))
+        )
+
+    def _polarisation(self, current: FloatArray) -> FloatArray:
         """Return the evidence that the voltage sags on under a sustained current.
 
         U = a − R·(I + ρ·⟨I⟩), ⟨I⟩ the current through a low pass. Polarisation makes ρ > 0; torque,
         power and speed follow each other with ρ = 0. The evidence is the likelihood ratio of the
         two, where the relation is close enough to show it.
         """
-        keep = math.exp(-step_s / POLARISATION_S)
+        keep = math.exp(-self._step_s / POLARISATION_S)
         past = lfilter([1.0 - keep], [1.0, -keep], current - current[:, :1], axis=1)
-        low = _Moves.of(np.asarray(past), step_s)
-        rows = current.shape[1]
-        with_past = np.asarray(self._u.values @ low.values.T / rows, dtype=np.float64)
+        low = _Moves.of(np.asarray(past), self._step_s)
+        with_past = _product(self._u.values, low.values)
         own = (self._i.values * low.values).mean(1, dtype=np.float64)
         spread = low.std / np.maximum(self._i.std, 1e-9)
         best = np.full(self.r.shape, -np.inf)
         for ratio in POLARISATION:
             share = ratio * spread
-            r = self.r + share * with_past
-            r /= np.sqrt(1.0 + 2.0 * share * own + share**2)
+            r = (self.r + share * with_past) / np.sqrt(1.0 + 2.0 * share * own + share**2)
             best = np.maximum(best, r**2)
-        count = rows * step_s / POLARISATION_S
+        count = self._rows * self._step_s / POLARISATION_S
         left = np.maximum(1.0 - best, 1e-6) / np.maximum(1.0 - self.r**2, 1e-6)
         return np.asarray(np.clip(-0.5 * count * np.log(left), -TRUSTED_NATS, SHOWN_NATS))
 
-    def _has_sibling(self, voltages: Sequence[Row]) -> Bits:
+    def _has_sibling(self, level: FloatArray) -> BoolArray:
         """Return which voltages are one of two in a frame: lowest and highest cell."""
-        level = np.array([row.level for row in voltages])
-        stream = np.array([row.field.stream for row in voltages])
-        found = np.zeros(len(voltages), dtype=np.bool_)
-        for number, row in enumerate(voltages):
+        stream = np.array([id(row.field.stream) for row in self._voltages])
+        found = np.zeros(len(level), dtype=np.bool_)
+        for number, row in enumerate(self._voltages):
             near = (stream == stream[number]) & (np.abs(level / level[number] - 1.0) < SIBLING)
             for other in np.flatnonzero(near).tolist():
-                if other != number and not self._share_bits(row, voltages[other]):
-                    both = self._u.values[number] @ self._u.values[other] / self._u.values.shape[1]
+                if not row.bits & self._voltages[other].bits:
+                    both = self._u.values[number] @ self._u.values[other] / self._rows
                     found[number] |= bool(both > 0.95)
         return found
 
-    def _are_copies(self, count: FloatArray) -> Bits:
-        """Return which pairs are one quantity twice: no residual but quantization."""
-        lost = (1.0 - np.minimum(self.r**2, 1.0)) * self._u.std[:, None] ** 2
-        # Of rounding: a twelfth of a step squared in each, the current's by the slope.
-        slope = np.abs(self.r) * self._u.std[:, None] / np.maximum(self._i.std[None, :], 1e-9)
-        alike = (slope > 1.0 / ALIKE) & (slope < ALIKE)
-        return np.asarray(
-            (self.r**2 > COPY_R2)
-            & ((alike & (lost < 0.1 * (1.0 + slope**2))) | (count > MANY_MOVES))
-        )
-
-    def best(self, make: Any) -> tuple[Candidates, Candidates, Row | None]:
+    def best(self) -> tuple[list[SignalCandidate], list[SignalCandidate], Row | None]:
         """Return the best candidates for current and voltage, and the row of the first current."""
+        currents: list[SignalCandidate] = []
+        voltages: list[SignalCandidate] = []
         chosen: Row | None = None
-        roles: tuple[list[Row], list[Row]] = ([], [])
-        found: tuple[_Found, _Found] = ([], [])
-        flat = np.argsort(-self.score, axis=None)[: 200 * 200]
-        for place in flat:
-            a, b = divmod(int(place), self.score.shape[1])
+        bits: tuple[set[Any], set[Any]] = (set(), set())
+        for place in np.argsort(-self.score, axis=None)[: 200 * 200].tolist():
+            a, b = divmod(place, self.score.shape[1])
             u, i = self._voltages[a], self._currents[b]
-            if self.score[a, b] < IMPOSSIBLE / 2.0:
+            if self.score[a, b] < IMPOSSIBLE / 2.0 or min(len(currents), len(voltages)) >= SHOWN:
                 break
             # A field of a better pair keeps its role.
-            rivals = [
-                (u, i),
-                *((u, other) for other in roles[0]),
-                *((i, other) for other in roles[1]),
-            ]
-            if any(self._share_bits(*pair) for pair in rivals):
+            if u.bits & i.bits or u.bits & bits[0] or i.bits & bits[1]:
                 continue
-            roles[0].append(i)
-            roles[1].append(u)
+            bits[0].update(i.bits)
+            bits[1].update(u.bits)
             chosen = chosen or i
-            self._add(found, a, b, make)
-            if min(map(len, found)) >= SHOWN:
-                break
-        return tuple(found[0][:SHOWN]), tuple(found[1][:SHOWN]), chosen
+            one, two = self._candidates(a, b)
+            for found, each in ((currents, one), (voltages, two)):
+                if not any(each.bits & kept.bits or _are_siblings(each, kept) for kept in found):
+                    found.append(each)
+        return currents[:SHOWN], voltages[:SHOWN], chosen
 
-    def _share_bits(self, one: Row, two: Row) -> bool:
-        """Whether two fields share bits; a gateway repeats frames on other buses."""
-        a, b = self._streams[one.field.stream], self._streams[two.field.stream]
-        if (a.arbitration_id, a.is_extended) != (b.arbitration_id, b.is_extended):
-            return False
-        return bool(one.place.bits(a.length) & two.place.bits(b.length))
-
-    def _add(self, pair: tuple[_Found, _Found], a: int, b: int, make: Any) -> None:
-        u, i = self._voltages[a], self._currents[b]
+    def _candidates(self, a: int, b: int) -> tuple[SignalCandidate, SignalCandidate]:
+        """Return the current and the voltage of a pair."""
+        u, i, r = self._voltages[a], self._currents[b], float(self.r[a, b])
         amps = float(self.current_scale[a, b])
-        halves = self._halves(a, b)
-        sign = 1 if self.r[a, b] < 0.0 else -1
         facts = {
             "score": float(self.score[a, b]),
             "evidence": float(self.evidence[a, b]),
-            "correlation": float(self.r[a, b]),
+            "correlation": r,
             "resistance_ohm": float(self.slope[a, b]) * u.scale / amps,
-            "halves_ohm": (halves[0] * u.scale / amps, halves[1] * u.scale / amps),
+            "halves_ohm": tuple(half * u.scale / amps for half in self._halves(a, b)),
         }
-        zero = self._zero(i)
-        current = make(i, amps, -amps * zero, sign=sign, **facts)
-        voltage = make(u, u.scale, 0.0, sign=1, **facts)
-        for found, each, partner in zip(pair, (current, voltage), (voltage, current), strict=True):
-            bits = each.place.bits(each.length)
-            if not any(
-                overlap(each, bits, one, one.place.bits(one.length))
-                or _same_numbers(each, one)
-                or _are_siblings(each, one)
-                for one in found
-            ):
-                found.append(replace(each, partner=partner.name))
+        zero = 0.0
+        if not i.place.is_signed:
+            zeros = round_zeros(float(i.values.min()), float(i.values.max()), i.place.width)
+            zero = min(zeros or [0.0], key=lambda each: abs(each - most_common(i.values)))
+        sign = 1 if r < 0.0 else -1
+        current = i.candidate("current", amps, -amps * zero, sign=sign, **facts)
+        voltage = u.candidate("voltage", u.scale, 0.0, **facts)
+        return replace(current, partner=voltage.name), replace(voltage, partner=current.name)
 
-    def _halves(self, a: int, b: int) -> tuple[float, float]:
+    def _halves(self, a: int, b: int) -> list[float]:
         """Return dU/dI by each half of the capture, in raw numbers; discharge gives R > 0."""
-        u = self._u.values[a].astype(np.float64) * self._u.std[a]
-        i = self._i.values[b].astype(np.float64) * self._i.std[b]
-        half, found = len(u) // 2, []
+        half, found = self._rows // 2, []
         for part in (slice(0, half), slice(half, None)):
-            y, x = u[part] - u[part].mean(), i[part] - i[part].mean()
-            power = float(x @ x)
-            turn = -1.0 if self.r[a, b] < 0.0 else 1.0
-            found.append(turn * float(x @ y) / power if power > 0.0 else math.nan)
-        return found[0], found[1]
-
-    @staticmethod
-    def _zero(row: Row) -> float:
-        """Return the raw number of no current: 0 if signed, else a round one that was passed."""
-        if row.place.is_signed:
-            return 0.0
-        good = row.field.raw[~row.missing] + row.constant
-        resting = most_common(good)
-        zeros = round_zeros(float(good.min()), float(good.max()), row.place.width) or [0.0]
-        return min(zeros, key=lambda each: abs(each - resting))
+            u = self._u.values[a, part].astype(np.float64)
+            i = self._i.values[b, part].astype(np.float64)
+            power = float(np.var(i))
+            both = float(np.mean((u - u.mean()) * (i - i.mean())))
+            ratio = both / power * float(self._u.std[a] / self._i.std[b]) if power else math.nan
+            found.append(-ratio if self.r[a, b] < 0.0 else ratio)
+        return found
 
 
 def most_common(values: Ints) -> float:
@@ -524,20 +408,18 @@ def _guess(scale: float, width: int) -> float:
     return CURRENT_SCALES[scale] - float(_narrow(full_a)) - (1.0 if full_a > 2000.0 else 0.0)
 
 
-def _same_numbers(one: SignalCandidate, two: SignalCandidate) -> bool:
-    return (one.arbitration_id, one.start, one.place.width, one.place.is_motorola) == (
-        two.arbitration_id, two.start, two.place.width, two.place.is_motorola,
-    )  # fmt: skip
-
-
 def _are_siblings(one: SignalCandidate, two: SignalCandidate) -> bool:
     """Whether two candidates are cells in one message: raw numbers alike, but for cut bits."""
-    same = (one.bus, one.arbitration_id) == (two.bus, two.arbitration_id)
     middles = [(each.low + each.high) / 2.0 / each.scale for each in (one, two)]
-    if not same or min(one.low, two.low) <= 0.0:
+    if one.stream.name != two.stream.name or min(one.low, two.low) <= 0.0:
         return False
     octaves = math.log2(middles[0] / middles[1])
     return abs(octaves - round(octaves)) < SIBLING
+
+
+def _product(one: FloatArray, two: FloatArray) -> FloatArray:
+    """Return the mean products of rows."""
+    return np.asarray(one @ two.T / one.shape[1], dtype=np.float64)
 
 
 def _ratio(r: FloatArray, count: FloatArray) -> FloatArray:
@@ -552,7 +434,7 @@ def _correlation(one: FloatArray, two: FloatArray) -> FloatArray:
         free = each - each.mean(1, keepdims=True)
         std = free.std(1)
         parts.append(np.where(std > 0.02, 1.0 / np.maximum(std, 1e-9), 0.0)[:, None] * free)
-    return np.asarray(parts[0] @ parts[1].T / one.shape[1], dtype=np.float64)
+    return _product(parts[0], parts[1])
 
 
 def _resistance_prior(ohm: FloatArray) -> FloatArray:

@@ -12,10 +12,17 @@ from typing import TYPE_CHECKING, Any, Final, Literal
 import typer
 
 from cangauge._files import file_sha256, write_texts_atomic
-from cangauge._text import counted, number, significant
+from cangauge._text import number, significant
 from cangauge.cli.declare import Written, command
 from cangauge.cli.options import ALARM, ReadingOptions, check_outputs
-from cangauge.cli.output import console, emit_json, note, print_table, progress_shown
+from cangauge.cli.output import (
+    console,
+    emit_json,
+    note,
+    print_table,
+    print_values,
+    progress_shown,
+)
 
 if TYPE_CHECKING:
     from cangauge.extras.fleet.fit import FleetFit
@@ -27,7 +34,7 @@ if TYPE_CHECKING:
 _SHOWN_REASONS: Final = 10
 """Reasons that are printed, the most frequent first; a page has all."""
 _SHOWN_LOGS: Final = 20
-"""Logs that are printed; a page and JSON have more."""
+"""Logs, or vehicles, that are printed; a page has more."""
 
 fleet_app: Final = typer.Typer(
     name="fleet", rich_markup_mode="markdown", add_completion=False, no_args_is_help=True,
@@ -141,23 +148,16 @@ def _show_fit(result: FleetFit) -> None:
     from cangauge.extras.fleet.results import by_kind, reason_of
     from cangauge.extras.fleet.sources import short_names
 
-    figures, by_log = result.to_dict(), result.by_log
-    print_table(
-        f"Model {result.model.name}",
-        ["", "value", "unit"],
-        [
-            ["voltage error, RMSE", significant(figures["voltage_rmse_v"], 3), "V"],
-            [
-                "voltage error of left-out logs, RMSE",
-                significant(result.model.noise.voltage_rmse_v, 3),
-                "V",
-            ],
-            ["slope resistance", significant(result.slope_ohm, 3), "Ω"],
-            ["condition number", significant(result.published.condition_number, 2), ""],
-            ["rows used", str(figures["rows"]), ""],
-            ["logs that do not fit", by_log.count_text, ""],
-        ],
-    )
+    by_log = result.by_log
+    values = {
+        "voltage error, RMSE": significant(result.voltage_rmse_v, 3, "V"),
+        "voltage error of left-out logs, RMSE": significant(
+            result.model.noise.voltage_rmse_v, 3, "V"
+        ),
+        "rows used": str(result.rows),
+        "logs that do not fit": by_log.count_text,
+    }
+    print_values(f"Model {result.model.name}", values)
     for what, rows in (("set aside", result.bad), ("left out", result.left_out)):
         _note_reasons(what, [(reason_of(row), count) for row, count in by_kind(rows)])
     if misfits := by_log.misfits[:_SHOWN_LOGS]:
@@ -368,16 +368,14 @@ def _check_outputs(outputs: Sequence[Path | None], logs: Sequence[FleetLog], *fi
 def _show(summary: Summary, found: FleetOverview) -> None:
     typer.echo(f"{summary} ({summary.seconds:.0f} s, {summary.workers} workers)")
     _note_reasons("set aside", summary.reasons.items())
-    if found.elsewhere_text:
-        note(f"note: {found.elsewhere_text}")
-    if found.alarms:
-        rows = [
-            [name, row["verdict"], number(row["probability"], 2), number(row["probability_none"])]
-            for name, row in ((name, found.gaps[name]) for name in found.alarms)
-        ]
-        print_table("Vehicles with a gap", ["vehicle", "cause", "probability", "P(none)"], rows)
-    elif found.gaps:
-        typer.echo(f"No alarm in {counted(len(found.gaps), 'vehicle')}; {found.nearest_text}")
+    if found.gaps:
+        rows = []
+        for name in found.by_gap[:_SHOWN_LOGS]:
+            row = found.gaps[name]
+            shown = number(row["probability"], 2), number(row["probability_none"], 2)
+            rows.append([name, row["verdict"], *shown, "gap" if row["detected"] else ""])
+        head = ["vehicle", "cause", "probability", "P(no fault)", ""]
+        print_table(f"{len(found.alarms)} of {len(found.gaps)} vehicles have a gap", head, rows)
     if found.outlying:
         rows = [[vehicle, quantity, number(z, 1)] for vehicle, quantity, z in found.outlying]
         print_table("Outliers in health", ["vehicle", "quantity", "robust z"], rows)

@@ -143,8 +143,6 @@ class FleetFit:
         The published equation on the same rows.
     voltage_rmse_v : float
         Rms error of all logs under the model [V], weighted as in the fit.
-    slope_ohm : float
-        As of `cangauge.Identification` [Ω], weighted as in the fit.
     rows, logs_used : int
     summary : Summary
         Of the pass.
@@ -158,7 +156,6 @@ class FleetFit:
     solution: Solution
     published: PublishedFit
     voltage_rmse_v: float
-    slope_ohm: float
     rows: int
     logs_used: int
     summary: Summary
@@ -173,7 +170,6 @@ class FleetFit:
             "voltage_rmse_v": self.voltage_rmse_v,
             "voltage_rmse_pct": 100.0 * self.voltage_rmse_v / self.solution.mean_v,
             "capacity_ah": model.capacity_ah,
-            "slope_ohm": self.slope_ohm,
             "condition_number": self.published.condition_number,
             "coefficients": {name: item.model_dump() for name, item in model.coefficients.items()},
             "chemistry": model.chemistry,
@@ -241,7 +237,6 @@ def fit_fleet(job: SumsJob, logs: Sequence[FleetLog], out: str, client: Any) -> 
         solution=solution,
         published=published,
         voltage_rmse_v=model_rmse([solution] * len(sums), sums),
-        slope_ohm=_slope_ohm(sums, solution),
         rows=sum(row["rows"] for row in rows),
         logs_used=len(rows),
         summary=summary,
@@ -326,16 +321,3 @@ def _model(
         }
     )
     return model.model_copy(update={"noise": noise})
-
-
-def _slope_ohm(sums: Sequence[LogSums], solution: Solution) -> float:
-    """Return the regression of U − pseudo-OCV on the current, as a positive resistance [Ω]."""
-    total = np.sum([item.moments for item in sums], axis=0)
-    weight = sum(item.weight for item in sums)
-    coefficients = solution.select.T @ solution.coefficients
-    kt = len(coefficients) - 2 * len(solution.arrhenius_ohm)  # knots and kt before the currents
-    curve, current, one = np.zeros((3, len(total)))
-    curve[:kt], curve[-1], current[kt], one[-2] = -coefficients[:kt], 1.0, 1.0, 1.0
-    spread = current @ total @ current - (one @ total @ current) ** 2 / weight
-    shared = current @ total @ curve - (one @ total @ current) * (one @ total @ curve) / weight
-    return -float(shared / spread)

@@ -8,8 +8,6 @@ from typing import Any, Final
 
 import numpy as np
 
-from cangauge._text import counted, number
-from cangauge.diagnosis import NONE
 from cangauge.extras.fleet.gap import GapJob
 from cangauge.extras.fleet.jobs import EstimateJob, HealthJob, mean_of
 from cangauge.extras.fleet.outliers import OUTLIER_Z, VALUES_AT_LEAST, robust_z
@@ -41,8 +39,6 @@ class FleetOverview:
         Rows of `fleet gap`.
     bad : list of dict
         Logs set aside, each with `reason`, its `kind`, `log` and `table`.
-    elsewhere : int
-        Rows of logs that are not among those asked for.
     """
 
     name: str
@@ -50,28 +46,23 @@ class FleetOverview:
     health: dict[str, Rows] = field(default_factory=dict)
     gaps: dict[str, dict[str, Any]] = field(default_factory=dict)
     bad: Rows = field(default_factory=list)
-    elsewhere: int = 0
 
     @classmethod
     def read(cls, out: str, logs: Iterable[FleetLog]) -> FleetOverview:
         """Read the results in a folder or URL: the rows of some logs, and of their vehicles.
 
-        A folder keeps the rows of logs that were given to an earlier run only, such as those of
-        another month or those that were renamed since: they are counted, and not shown.
+        Rows of logs that were given to an earlier run only, such as those of another month or those
+        that were renamed since, are left out.
         """
         vehicles = {log.url: log.vehicle for log in logs}
         # A diagnosis is of a vehicle, and so is the row of one set aside.
         vehicles |= {vehicle: vehicle for vehicle in vehicles.values()}
-        elsewhere = 0
 
         def asked(rows: Iterable[dict[str, Any]]) -> Iterator[dict[str, Any]]:
-            nonlocal elsewhere
             for row in rows:
                 names = row.get("logs") or [row["log"]]
                 if {vehicles.get(name) for name in names} == {row["vehicle"]}:
                     yield row
-                else:
-                    elsewhere += 1
 
         tables = {job.kind: Results(out, job.kind, job.columns) for job in _JOBS}
         good = {kind: list(asked(table.rows())) for kind, table in tables.items()}
@@ -86,7 +77,6 @@ class FleetOverview:
             health=_by_vehicle(sorted(good["health"], key=lambda row: float(row["end_s"]))),
             gaps={row["vehicle"]: row for row in good["gap"]},
             bad=bad,
-            elsewhere=elsewhere,
         )
 
     @property
@@ -95,38 +85,14 @@ class FleetOverview:
         return sorted({*self.estimates, *self.health, *self.gaps})
 
     @property
+    def by_gap(self) -> list[str]:
+        """The diagnosed vehicles, that with the likeliest fault first."""
+        return sorted(self.gaps, key=lambda name: (self.gaps[name]["probability_none"], name))
+
+    @property
     def alarms(self) -> list[str]:
         """Vehicles with a gap, the surest first."""
-        found = [name for name, row in self.gaps.items() if row["detected"]]
-        return sorted(found, key=lambda name: (self.gaps[name]["probability_none"], name))
-
-    @property
-    def nearest(self) -> str | None:
-        """The vehicle without a gap whose probability of no fault is smallest."""
-        without = [name for name, row in self.gaps.items() if not row["detected"]]
-        return min(without, key=lambda name: self.gaps[name]["probability_none"], default=None)
-
-    @property
-    def nearest_text(self) -> str:
-        """The nearest vehicle in a phrase; "" if there is none."""
-        if self.nearest is None:
-            return ""
-        row = self.gaps[self.nearest]
-        probability = number(100.0 * row["probability_none"], 0)
-        text = f"nearest: {self.nearest} (P(no fault) {probability} %"
-        if row["group"] != NONE:
-            text += f", {row['group']} {number(100.0 * row['group_probability'], 0)} %"
-        return f"{text})"
-
-    @property
-    def elsewhere_text(self) -> str:
-        """The rows that are not counted, in a sentence; "" if there are none."""
-        if not self.elsewhere:
-            return ""
-        return (
-            f"{self.name} holds {counted(self.elsewhere, 'row')} of logs that are not among LOGS"
-            " (earlier runs, or deleted or renamed since); not counted."
-        )
+        return [name for name in self.by_gap if self.gaps[name]["detected"]]
 
     @property
     def outlying(self) -> list[tuple[str, str, float]]:
@@ -154,10 +120,7 @@ class FleetOverview:
 
     def to_dict(self) -> dict[str, Any]:
         """Return what `--json` prints of the vehicles."""
-
-        def alarm(name: str) -> dict[str, Any]:
-            shown = ("verdict", "probability", "probability_none", "group", "group_probability")
-            return {"vehicle": name, **{key: self.gaps[name][key] for key in shown}}
+        shown = ("verdict", "probability", "probability_none", "group", "group_probability")
 
         def mean(column: str) -> float | None:
             """Return the mean over the vehicles of their means."""
@@ -167,9 +130,10 @@ class FleetOverview:
 
         return {
             "vehicles": len(self.vehicles),
-            "alarms": [alarm(name) for name in self.alarms],
-            "nearest": None if self.nearest is None else alarm(self.nearest),
-            "rows_elsewhere": self.elsewhere,
+            "alarms": [
+                {"vehicle": name, **{key: self.gaps[name][key] for key in shown}}
+                for name in self.alarms
+            ],
             "outliers": [
                 {"vehicle": vehicle, "quantity": quantity, "z": z}
                 for vehicle, quantity, z in self.outlying

@@ -22,7 +22,6 @@ from cangauge._version import __version__
 from cangauge.errors import CangaugeError, InputError
 from cangauge.extras.fleet.jobs import Job, Task
 from cangauge.extras.fleet.results import Finished, Results, by_kind, reason_of
-from cangauge.extras.fleet.sources import ABSENT
 
 _LOG = logging.getLogger(__name__)
 
@@ -154,16 +153,13 @@ def worker_version() -> str:
 def _check_versions(client: Any) -> None:
     cure = f"install 'cangauge[fleet]' {__version__} where the workers run"
     try:
-        found = client.run(worker_version)
-    except OSError as error:
-        raise CangaugeError(_LOST) from error
+        found = set(client.run(worker_version).values())
     except Exception as error:
         problem = f"the workers cannot run cangauge: {error}"
         raise InputError(problem, field=_FIELD, cure=cure) from error
-    for address, version in found.items():
-        if version != __version__:
-            problem = f"worker {address} has cangauge {version}"
-            raise InputError(problem, field=_FIELD, cure=cure)
+    if other := found - {__version__}:
+        problem = f"a worker has cangauge {other.pop()}"
+        raise InputError(problem, field=_FIELD, cure=cure)
 
 
 def run_job(job: Job, tasks: Sequence[Task], results: Results, client: Any) -> Summary:
@@ -228,11 +224,6 @@ def _computed(
     """Yield tasks with what became of them, as they finish."""
     from distributed import as_completed  # noqa: PLC0415 - an extra
 
-    absent = [task for task in todo if all(log.stamp == ABSENT for log in task.logs)]
-    for gone in absent:  # seen from here: no task of the scheduler
-        missing = InputError("no such file", source=gone.name)
-        yield gone, Finished(bad=[set_aside(gone.name, missing)])
-    todo = [task for task in todo if task not in absent]
     if not todo:
         return
     # A task, not scattered data: it is computed again if its worker is lost.

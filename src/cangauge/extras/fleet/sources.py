@@ -17,9 +17,12 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path, PurePosixPath
-from typing import Any, Final
+from typing import Annotated, Any, Final
 from urllib.parse import quote
 
+from pydantic import BaseModel, ConfigDict, Field, field_validator
+
+from cangauge._config import validated
 from cangauge._files import MAX_LOG_BYTES, as_utf8, text_sha256
 from cangauge.bus.captures import Capture
 from cangauge.bus.recording import (
@@ -35,9 +38,6 @@ from cangauge.logs.log import Log
 from cangauge.logs.read import LogFile
 from cangauge.logs.sign import require_discharge_positive
 
-_COLUMNS: Final = ("log", "vehicle", "start", "initial_soc_pct", "healthy")
-_HEALTHY: Final = {"1": True, "true": True, "yes": True, "": False, "0": False, "false": False,
-                   "no": False}  # fmt: skip
 _LONGEST_VEHICLE: Final = 255 - len("vehicle=")
 """Bytes of a vehicle's quoted name: file systems name a folder in 255."""
 ABSENT: Final = "absent"
@@ -196,28 +196,59 @@ def _headings(text: str) -> tuple[list[str], str]:
     return [cell.strip() for cell in next(csv.reader([first], delimiter=delimiter), [])], delimiter
 
 
+class _Row(BaseModel):
+    """A row of a manifest, without its empty cells."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    log: str
+    vehicle: str = ""
+    start: str = ""
+    initial_soc_pct: Annotated[float, Field(ge=0.0, le=100.0)] | None = None
+    healthy: bool = False
+
+    @field_validator("log")
+    @classmethod
+    def _is_no_chain(cls, log: str) -> str:
+        if "::" in log:
+            raise ValueError("a chain of URLs is not read: unpack the archive, and name its files")
+        return log
+
+    @field_validator("start")
+    @classmethod
+    def _is_a_date(cls, start: str) -> str:
+        try:
+            datetime.fromisoformat(start)
+        except ValueError as error:
+            raise ValueError("is no date such as 2024-05-01T08:30:00Z") from error
+        return start
+
+    @field_validator("initial_soc_pct", mode="before")
+    @classmethod
+    def _with_a_point(cls, soc_pct: str) -> str:
+        return soc_pct.replace(",", ".")
+
+
 def _of_manifest(text: str, url: str) -> list[FleetLog]:
     headings, delimiter = _headings(text)
-    unknown = sorted(set(headings) - set(_COLUMNS))
-    if unknown:
-        raise InputError(
-            f"not a column of a manifest: {', '.join(unknown)}",
-            source=url,
-            field=unknown[0],
-            cure=f"use {', '.join(_COLUMNS)}",
-        )
     reader = csv.reader(io.StringIO(text, newline=""), delimiter=delimiter)
     next(reader, None)
-    logs: list[FleetLog] = []
+    folder, logs = url.rpartition("/")[0], []
     try:
         for cells in reader:
             row = {name: cell.strip() for name, cell in zip(headings, cells, strict=False)}
-            if any(row.values()):
-                logs.append(_of_row(row, url, f"{url} line {reader.line_num}"))
+            if not any(row.values()):
+                continue
+            filled = {name: cell for name, cell in row.items() if cell}
+            found = validated(_Row, filled, f"{url} line {reader.line_num}")
+            is_whole = "://" in found.log or found.log.startswith("/") or not folder
+            name = found.log if is_whole else f"{folder}/{found.log}"
+            name = name if "://" in name else posixpath.normpath(name)
+            logs.append(FleetLog(url=name, stamp="", **found.model_dump(exclude={"log"})))
     except csv.Error as error:
         raise InputError(f"not a table: {error}", source=url) from error
-    for folder in {log.url.rpartition("/")[0] for log in logs}:  # fsspec remembers the listing
-        fs, path = filesystem(folder or ".")
+    for parent in {log.url.rpartition("/")[0] for log in logs}:  # fsspec remembers the listing
+        fs, path = filesystem(parent or ".")
         with suppress(OSError):
             fs.ls(path, detail=True)
     return [replace(log, stamp=_stamp_of(log.url)) for log in logs]
@@ -229,35 +260,6 @@ def _stamp_of(url: str) -> str:
         return _stamp(fs.info(path))
     except OSError:
         return ABSENT
-
-
-def _of_row(row: Mapping[str, str], url: str, at: str) -> FleetLog:
-    def wrong(field: str, problem: str, cure: str | None = None) -> InputError:
-        return InputError(problem, source=at, field=field, value=row.get(field) or None, cure=cure)
-
-    name, folder = row.get("log", ""), url.rpartition("/")[0]
-    if not name:
-        raise wrong("log", "names no log")
-    if "::" in name:
-        raise wrong("log", "a chain of URLs is not read", "unpack the archive, and name its files")
-    whole = name if "://" in name or name.startswith("/") or not folder else f"{folder}/{name}"
-    healthy = _HEALTHY.get(row.get("healthy", "").lower())
-    if healthy is None:
-        raise wrong("healthy", "neither yes nor no")
-    initial = row.get("initial_soc_pct", "").replace(",", ".")
-    try:
-        soc_pct = float(initial) if initial else None
-    except ValueError as error:
-        raise wrong("initial_soc_pct", "not a number of %") from error
-    if soc_pct is not None and not 0.0 <= soc_pct <= 100.0:
-        raise wrong("initial_soc_pct", "must lie within 0 … 100 %")
-    whole = whole if "://" in whole else posixpath.normpath(whole)
-    log = FleetLog(whole, row.get("vehicle", ""), "", row.get("start", ""), soc_pct, healthy)
-    try:
-        _ = log.start_s
-    except ValueError as error:
-        raise wrong("start", "not a date", "give it as 2024-05-01T08:30:00Z") from error
-    return log
 
 
 # --- Reading

@@ -51,8 +51,6 @@ def fleet_report(found: FleetOverview) -> str:
         ("State of charge", [_estimates(found)] if found.estimates else []),
         ("Logs set aside", _set_aside(found.bad)),
     )
-    if found.elsewhere_text:
-        parts[-1][1].append(Paragraph(found.elsewhere_text))
     return render(
         Page(
             title=f"Fleet of {counted(len(found.vehicles), 'vehicle')}",
@@ -71,8 +69,7 @@ def _lead(found: FleetOverview) -> str:
         sentences.append(
             f"{len(causes)} of {len(found.gaps)} vehicles have a gap: {joined(causes, 5)}."
             if causes
-            else f"No significant gap in {counted(len(found.gaps), 'vehicle')};"
-            f" {found.nearest_text}."
+            else f"No significant gap in {counted(len(found.gaps), 'vehicle')}."
         )
     if found.health:
         names = list(dict.fromkeys(vehicle for vehicle, _, _ in found.outlying))
@@ -103,9 +100,8 @@ def _tiles(found: FleetOverview) -> list[Tile]:
 
 
 def _gaps(found: FleetOverview) -> list[Block]:
-    ordered = [*found.alarms, *(name for name in sorted(found.gaps) if name not in found.alarms)]
     rows = []
-    for name in ordered[:_SHOWN]:
+    for name in found.by_gap[:_SHOWN]:
         row = found.gaps[name]
         closed = row["closed_fraction"]
         rows.append(
@@ -136,7 +132,7 @@ def _gaps(found: FleetOverview) -> list[Block]:
     largest = sorted(entries, key=lambda entry: -entry[1])[:_BARS]
     plot = bars("error of the model over that of the references", "", largest, decimals=2)
     caption = f"The {len(largest)} largest. Orange: P(no fault) is below the alarm's limit."
-    return [_table(head, rows, len(ordered)), Figure("Size of the gaps", plot, caption)]
+    return [_table(head, rows, len(found.gaps)), Figure("Size of the gaps", plot, caption)]
 
 
 def _health(found: FleetOverview) -> list[Block]:
