@@ -10,8 +10,8 @@ import cangauge
 from cangauge.bus.decoder import SampleDecoder
 from cangauge.bus.mapping import SignalMap, TemperatureMap, VehicleMap
 from cangauge.bus.vehicle import PRESETS, Preset, Vehicle
-from cangauge.extras.report.charts import new_figure
-from cangauge.extras.report.page import Figure, Page, Paragraph, Section, Tile, render
+from cangauge.extras.report.charts import BLUE, Figure
+from cangauge.extras.report.page import Page, Tile
 from cangauge.model.effects.base import Effect, Parameter
 from cangauge.model.effects.library import LIBRARY
 from cangauge.replay.encoder import FrameEncoder
@@ -64,16 +64,16 @@ def test_a_preset_of_your_own_decodes(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_a_page_of_your_own_renders() -> None:
-    plot = new_figure(("time", "voltage"), "@y", units=("s", "V"))
-    plot.line([0.0, 1.0], [380.0, 379.0])
+    figure = Figure("Voltage", "time [s]", "voltage [V]", "It falls.", hover="@y")
+    figure.line("voltage", np.array([0.0, 1.0]), np.array([380.0, 379.0]), BLUE)
     page = Page(
-        "My page",
-        "an example",
-        [Tile("voltage", "380 V")],
-        [Section("One", [Paragraph("Words & more"), Figure("Voltage", plot, "It falls.")])],
+        title="My page",
         lead="The voltage falls.",
+        subtitle="an example",
+        tiles=[Tile("voltage", "380 V")],
+        sections={"One": ["Words & more", figure]},
     )
-    text = render(page)
+    text = page.html()
     assert "<title>My page" in text
     assert "Words &amp; more" in text
     assert "Content-Security-Policy" in text  # nothing is fetched

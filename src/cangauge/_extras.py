@@ -10,6 +10,6 @@ from typing import Any
 
 
 def extra(place: str) -> Any:
-    """Return a function of an extra, named as "report.fit:fit_report"."""
+    """Return a function of an extra, named as "report.fit:fit_page"."""
     module, _, name = place.partition(":")
     return getattr(import_module(f"cangauge.extras.{module}"), name)

@@ -241,7 +241,7 @@ def test_a_report_that_fails_leaves_no_model(
     def broken(_result: object) -> str:
         raise CangaugeError("no ink")
 
-    monkeypatch.setattr("cangauge.extras.report.fit.fit_report", broken)
+    monkeypatch.setattr("cangauge.extras.report.fit.fit_page", broken)
     (tmp_path / "m.json").write_text("the model before", encoding="utf-8")
     out = ("-o", tmp_path / "m.json", "--report", tmp_path / "m.html")
     ran = run("fit", made / "full.parquet", *out)

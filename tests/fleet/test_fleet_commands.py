@@ -18,7 +18,7 @@ from cangauge.extras.fleet.jobs import Task
 from cangauge.extras.fleet.outliers import ErrorsByLog
 from cangauge.extras.fleet.overview import FleetOverview
 from cangauge.extras.fleet.sources import FleetLog
-from cangauge.extras.report.fleet import fleet_report
+from cangauge.extras.report.fleet import fleet_page
 from cangauge.extras.validation.cases import Scenario
 from cangauge.logs.canonical import write_log
 from cangauge.logs.read import read_log
@@ -255,7 +255,7 @@ def test_the_page_says_which_vehicle_has_which_gap() -> None:
     assert (vehicle, quantity, z < -3.5) == ("car3", "capacity_ah", True)
     few = replace(found, health={name: rows[name] for name in list(rows)[:4]})
     assert (few.outlying, few.no_outlier_text[:5]) == ([], "Fewer")
-    page = Html(fleet_report(found))
+    page = Html(fleet_page(found).html())
     assert not page.fetched
     assert "1 of 2 vehicles have a gap: car1 (voltage_offset)" in page.text
     assert "1 vehicle differs in health from the fleet: car3" in page.text

@@ -7,11 +7,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from cangauge.extras.report.charts import envelope, extremes, sampling_slice
+from cangauge.extras.report.charts import extremes
 
 VALUES = st.one_of(st.floats(-1e6, 1e6), st.just(float("nan")))
 SERIES = arrays(np.float64, st.integers(0, 400), elements=VALUES)
-SOME = arrays(np.float64, st.integers(1, 400), elements=VALUES)
 
 
 @given(values=SERIES, max_points=st.integers(6, 60))
@@ -25,25 +24,6 @@ def test_extremes_are_kept_in_order_and_few(values: np.ndarray, max_points: int)
         assert np.nanmin(drawn) == known.min()
         assert np.nanmax(drawn) == known.max()
     assert np.isnan(values).any() == np.isnan(drawn).any()
-
-
-@given(values=SOME, max_points=st.integers(6, 60))
-def test_a_reduced_band_covers_all_rows(values: np.ndarray, max_points: int) -> None:
-    rows, low, high = envelope(values - 1.0, values + 1.0, max_points)
-    assert rows.size == low.size == high.size <= max_points
-    ends = np.append(rows[1:], values.size)
-    for first, end, bottom, top in zip(rows, ends, low, high, strict=True):
-        inside = values[first:end][np.isfinite(values[first:end])]
-        if inside.size:
-            assert bottom <= inside.min() - 1.0
-            assert top >= inside.max() + 1.0
-        else:
-            assert np.isnan(bottom)
-
-
-@given(n=st.integers(0, 100_000), max_points=st.integers(1, 5000))
-def test_a_cloud_is_sampled_evenly(n: int, max_points: int) -> None:
-    assert len(range(n)[sampling_slice(n, max_points)]) <= max_points
 
 
 def test_a_single_spike_in_a_long_series_is_drawn() -> None:

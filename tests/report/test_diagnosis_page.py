@@ -10,7 +10,7 @@ from cangauge.diagnosis import Diagnosis, References, diagnose, learn_references
 from cangauge.diagnosis.planner import plan
 from cangauge.diagnosis.sentences import EXPLAINED
 from cangauge.extras.report.diagnosis import gap_page
-from cangauge.extras.report.page import Beside, Page, render
+from cangauge.extras.report.page import Page
 from cangauge.identify.fit import fit
 from cangauge.logs.log import Log
 from cangauge.model.effects.library import LIBRARY
@@ -55,18 +55,16 @@ def test_the_page_begins_with_the_verdict_and_what_to_check(found: Diagnosis, pa
 
 
 def test_two_pictures_are_open_and_the_rest_is_folded(page: Page) -> None:
-    first, *others = page.sections
-    (beside,) = first.blocks
-    assert isinstance(beside, Beside)
-    assert [figure.title.split(":")[0] for figure in beside.figures] == [
+    ((beside,),) = page.sections.values()
+    assert [figure.title.split(":")[0] for figure in beside] == [
         "Where",
         "How far it shrinks",
     ]
-    assert all(section.is_folded for section in others)
+    assert "Every cause: probability and size" in page.folded
 
 
 def test_page_says_the_same_as_the_json(found: Diagnosis, page: Page) -> None:
-    text, gap = render(page), found.to_json()["gap"]
+    text, gap = page.html(), found.to_json()["gap"]
     assert f"{gap['baseline_rmse_v']:.2f}" in text
     assert f"{gap['healthy_rmse_v']:.2f}" in text
     assert len(text) < MAX_PAGE_BYTES

@@ -62,7 +62,8 @@ def test_estimate_plots_band_and_reference(drive: Log, identified: Identificatio
 
 def test_fit_plots_curve_and_residuals(identified: Identification) -> None:
     plot = identified.plot()
-    curve = plot.children[0].renderers[0].data_source.data
+    (line,) = [each for each in plot.children[0].renderers if each.name == "pseudo-OCV"]
+    curve = line.data_source.data
     model = identified.voltage_model
     expected = model.pseudo_ocv(np.asarray(curve["x"], dtype=float))
     assert np.asarray(curve["y"]) == pytest.approx(expected, abs=1e-3)

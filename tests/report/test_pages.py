@@ -14,10 +14,10 @@ from markupsafe import escape
 from cangauge._version import __version__
 from cangauge.estimation.offline import estimate_log
 from cangauge.estimation.settings import EstimatorSettings
-from cangauge.extras.report.charts import TimeFigures
-from cangauge.extras.report.estimate import estimate_page, estimate_report
-from cangauge.extras.report.fit import fit_page, fit_report
-from cangauge.extras.report.page import Bullets, Figure, Page, Section, Table, Tile, joined, render
+from cangauge.extras.report.charts import Figure, TimeFigures
+from cangauge.extras.report.estimate import estimate_page
+from cangauge.extras.report.fit import fit_page
+from cangauge.extras.report.page import Page, Table, Tile, joined
 from cangauge.identify.fit import fit
 from cangauge.identify.identification import Identification
 from cangauge.logs.canonical import write_log
@@ -74,7 +74,7 @@ def figure(page: Page, title: str) -> Figure:
 
 
 def test_fit_report_is_one_file_with_every_published_figure(found: Identification) -> None:
-    page = fit_report(found)
+    page = fit_page(found).html()
     html = Html(page)
     assert html.fetched == []
     assert "default-src 'none'" in page
@@ -116,7 +116,7 @@ def test_long_series_are_reduced_and_the_page_says_so() -> None:
         if "x" in renderer.data_source.data
     ]
     assert max(len(source.data["x"]) for source in sources) <= 4000
-    assert "Lines longer than 4000 points" in render(page)
+    assert "Lines longer than 4000 points" in page.html()
     drawn = figure(page, "Current").plot.renderers[0]
     assert np.nanmax(drawn.data_source.data["y"]) == pytest.approx(long.current_a.max(), rel=1e-6)
 
@@ -132,7 +132,7 @@ def test_several_logs_follow_one_another(log: Log) -> None:
     assert names[0] == "drive"
     assert "second & <third>".startswith(names[1])
     assert any(type(item).__name__ == "Span" for item in current.center)
-    html = render(page)
+    html = page.html()
     assert "second &amp; &lt;third&gt;" in html
     assert "second & <third>" not in html.split("<script", maxsplit=1)[0]
 
@@ -140,8 +140,8 @@ def test_several_logs_follow_one_another(log: Log) -> None:
 def test_a_reconstruction_is_called_one(log: Log) -> None:
     named = replace(log, name="leaf2012_reconstruction_white")
     found = fit([named])
-    assert "This is a reconstruction" in fit_report(found)
-    assert "This is a reconstruction" in estimate_report(estimated(named, found.model))
+    assert "This is a reconstruction" in fit_page(found).html()
+    assert "This is a reconstruction" in estimate_page(estimated(named, found.model)).html()
 
 
 def test_pages_name_version_date_and_hashed_inputs(log: Log, tmp_path: Path) -> None:
@@ -152,7 +152,7 @@ def test_pages_name_version_date_and_hashed_inputs(log: Log, tmp_path: Path) -> 
     found.model.save(model_path)
     paths = (tmp_path / "drive.csv", model_path)
     hashes = [hashlib.sha256(path.read_bytes()).hexdigest()[:12] for path in paths]
-    pages = [fit_report(found), estimate_report(estimated(log, found.model), model_path)]
+    pages = [fit_page(found).html(), estimate_page(estimated(log, found.model), model_path).html()]
     for page in pages:
         text = Html(page).text
         for words in (f"cangauge {__version__}", "drive", *(f">{digits}<" for digits in hashes)):
@@ -163,7 +163,7 @@ def test_pages_name_version_date_and_hashed_inputs(log: Log, tmp_path: Path) -> 
 
 def test_estimate_report(found: Identification, log: Log) -> None:
     estimate = estimated(log, found.model, EstimatorSettings(initial_soc_pct=100.0))
-    page = estimate_report(estimate)
+    page = estimate_page(estimate).html()
     html = Html(page)
     assert html.fetched == []
     assert set(ESTIMATE_FIGURES) <= set(html.headings)
@@ -173,7 +173,9 @@ def test_estimate_report(found: Identification, log: Log) -> None:
 
 
 def test_without_reference_nothing_is_compared(found: Identification, log: Log) -> None:
-    headings = Html(estimate_report(estimated(replace(log, soc_pct=None), found.model))).headings
+    headings = Html(
+        estimate_page(estimated(replace(log, soc_pct=None), found.model)).html()
+    ).headings
     assert "Error against the reference" not in headings
     assert "Uncertainty" in headings
 
@@ -183,13 +185,13 @@ def test_an_initial_value_is_no_reference(found: Identification, log: Log) -> No
     soc[0] = 100.0
     settings = EstimatorSettings(initial_soc_pct=100.0)
     estimate = estimated(replace(log, soc_pct=soc), found.model, settings)
-    assert "Error against the reference" not in Html(estimate_report(estimate)).headings
+    assert "Error against the reference" not in Html(estimate_page(estimate).html()).headings
 
 
 @pytest.mark.parametrize("rows", [1, 2, 30])
 def test_short_logs_still_give_a_page(found: Identification, log: Log, rows: int) -> None:
     estimate = estimated(log.rows(slice(0, rows)), found.model)
-    assert "Estimated state of charge" in Html(estimate_report(estimate)).headings
+    assert "Estimated state of charge" in Html(estimate_page(estimate).html()).headings
 
 
 def test_samples_without_voltage_or_any_estimate(found: Identification, log: Log) -> None:
@@ -197,7 +199,7 @@ def test_samples_without_voltage_or_any_estimate(found: Identification, log: Log
     estimate = estimated(few, found.model)
     nothing = np.full(60, np.nan)
     numbers = set(vars(estimate.table)) - {"time_s", "status", "reasons"}
-    page = estimate_report(
+    page = estimate_page(
         replace(
             estimate,
             recorded=RecordedCapture(
@@ -206,7 +208,7 @@ def test_samples_without_voltage_or_any_estimate(found: Identification, log: Log
             table=replace(estimate.table, **dict.fromkeys(numbers, nothing)),
             scores=replace(estimate.scores, soc_mae_pct=None),
         )
-    )
+    ).html()
     assert "State of charge of parked" in page
     assert "NaN" not in Html(page).text
 
@@ -225,7 +227,7 @@ def test_lines_break_over_gaps_and_between_logs() -> None:
         return Log(np.array(time_s), np.zeros(n), np.ones(n), np.ones(n))
 
     logs = [make([100.0, 101.0, 102.0, 110.0, 111.0]), make([5.0, 6.0, 7.0])]
-    time = TimeFigures(logs)
+    time = TimeFigures([item.time_s for item in logs])
     x, y = time.joined([(item.time_s, item.time_s) for item in logs])
     nan = np.nan
     expected = [100.0, 101.0, 102.0, nan, 110.0, 111.0, nan, 5.0, 6.0, 7.0, nan]
@@ -241,10 +243,10 @@ def test_page_escapes_what_it_shows() -> None:
         lead="<lead>",
         subtitle="a & b",
         tiles=[Tile("<i>", "1 < 2")],
-        sections=[Section("<s>", [Table(["<h>"], [["<c>"]], "<n>"), Bullets(["<li>"])])],
-        banners=["<banner>"],
+        sections={"<s>": [Table(["<h>"], [["<c>"]], "<n>"), ["<li>"]]},
+        warnings=["<banner>"],
     )
-    html = render(page)
+    html = page.html()
     for text in ("<b>title", "<lead>", "<i>", "<s>", "<h>", "<c>", "<n>", "<li><li>", "<banner>"):
         assert text not in html
     assert "&lt;b&gt;title&lt;/b&gt;" in html
@@ -252,7 +254,7 @@ def test_page_escapes_what_it_shows() -> None:
 
 def test_columns_of_numbers_are_flush_right() -> None:
     table = Table(["name", "value"], [["a", "−1.5"], ["b", "–"]])
-    html = render(Page("t", "", [], [Section("s", [table])]))
+    html = Page("t", "", "", [], {"s": [table]}).html()
     assert '<td>a</td><td class="number">−1.5</td>' in html
 
 

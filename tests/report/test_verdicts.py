@@ -14,8 +14,8 @@ from cangauge.cli.app import app
 from cangauge.errors import InputError
 from cangauge.estimation.offline import estimate_log
 from cangauge.estimation.settings import EstimatorSettings
-from cangauge.extras.report.estimate import estimate_report, estimate_verdict, periods
-from cangauge.extras.report.inspection import inspect_report, inspect_verdict
+from cangauge.extras.report.estimate import estimate_page, estimate_verdict, periods
+from cangauge.extras.report.inspection import inspect_page, inspect_verdict
 from cangauge.identify.fit import fit
 from cangauge.identify.identification import Identification
 from cangauge.inspect.log import inspect_log
@@ -113,7 +113,7 @@ def test_initialising_is_no_period(estimate: RecordedEstimate, log: Log) -> None
 
 
 def test_every_link_has_its_anchor_and_each_id_is_unique(estimate: RecordedEstimate) -> None:
-    page = estimate_report(degraded(estimate, (700, 940)))
+    page = estimate_page(degraded(estimate, (700, 940))).html()
     markup = re.sub(r"<(script|style).*?</\1>", "", page, flags=re.DOTALL)
     ids = re.findall(r' id="([^"]+)"', markup)
     assert len(set(ids)) == len(ids)
@@ -132,7 +132,7 @@ def test_inspection_states_what_is_identifiable(log: Log) -> None:
 @pytest.mark.parametrize("rows", [1, 10])
 def test_a_short_log_still_gives_a_page(log: Log, rows: int) -> None:
     short = log.rows(slice(0, rows))
-    assert "Recorded data" in Html(inspect_report(inspect_log(short), short)).headings
+    assert "Recorded data" in Html(inspect_page(inspect_log(short), short).html()).headings
 
 
 def test_inspect_writes_an_offline_page(log: Log, tmp_path: Path) -> None:

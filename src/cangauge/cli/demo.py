@@ -80,7 +80,7 @@ def demo_command(*, folder: Path = Path("out/demo"), json_output: bool = False) 
     identification = fit([read_log(shared_file("replay", TRAINED_ON))], equation="published")
     model = identification.model
     model.save(paths["model"])
-    write_text_atomic(paths["fit_page"], extra("report.fit:fit_report")(identification))
+    write_text_atomic(paths["fit_page"], extra("report.fit:fit_page")(identification).html())
     note("2/4  replay another 2.6 h on the bus at full speed, and estimate its SoC live")
     log = read_log(shared_file("replay", PLAYED))
     log = replace(log, current_a=log.current_a + SENSOR_OFFSET_A)
@@ -93,7 +93,7 @@ def demo_command(*, folder: Path = Path("out/demo"), json_output: bool = False) 
     offline, _ = estimate_log(log, model, settings)
     note("4/4  write the pages")
     estimate = RecordedEstimate(log, table, live, model, settings)
-    page = extra("report.estimate:estimate_report")(estimate, paths["model"])
+    page = extra("report.estimate:estimate_page")(estimate, paths["model"]).html()
     write_text_atomic(paths["soc_page"], page)
     result = {
         "log": "a reconstruction of the published 2012 Leaf test, no recording",

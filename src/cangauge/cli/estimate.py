@@ -163,7 +163,7 @@ def _write(
     from cangauge.logs.canonical import write_table
     from cangauge.service.estimate_table import write_estimates
 
-    page = extra("report.estimate:estimate_report")(done, model_path) if report else ""
+    page = extra("report.estimate:estimate_page")(done, model_path).html() if report else ""
     with ExitStack() as all_of_them:
         part = all_of_them.enter_context(atomic_path(output))
         if output.suffix.lower() == ".mcap":

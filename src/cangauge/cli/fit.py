@@ -119,7 +119,7 @@ def fit_command(
         status.update("writing")
         texts = {output: result.model.to_json()}
         if report is not None:
-            texts[report] = extra("report.fit:fit_report")(result)
+            texts[report] = extra("report.fit:fit_page")(result).html()
         write_texts_atomic(texts)
     if json_output:
         written = {"model": str(output), "report": report and str(report)}

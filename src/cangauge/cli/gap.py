@@ -132,7 +132,7 @@ def gap_command(
     if extended is not None:
         texts[extended] = found.extended_model.to_json()
     if report is not None:
-        texts[report] = extra("report.diagnosis:gap_report")(found, model, steps)
+        texts[report] = extra("report.diagnosis:gap_page")(found, model, steps).html()
     write_texts_atomic(texts)
     if json_output:
         result = found.to_json(None if extended is None else str(extended))

@@ -82,7 +82,8 @@ def inspect_command(
             note(f"{path}: read as {', '.join(log.assumed)}")
         found = of_log = inspect_log(log)
         if report is not None:
-            write_texts_atomic({report: extra("report.inspection:inspect_report")(of_log, log)})
+            page = extra("report.inspection:inspect_page")(of_log, log)
+            write_texts_atomic({report: page.html()})
             note(f"report: {report}")
     elif report is not None:
         cure = "omit it, or use cangauge estimate --report"

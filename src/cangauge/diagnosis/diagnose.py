@@ -278,7 +278,7 @@ class Diagnosis:
 
     def plot(self) -> Any:
         """Return the probabilities of the causes as bars, for `bokeh.plotting.show`."""
-        return extra("report.figures:diagnosis_figure")(self)
+        return extra("report.diagnosis:diagnosis_figure")(self)
 
     def _repr_html_(self) -> str:
         """Return the answer for a notebook."""

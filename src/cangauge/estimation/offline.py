@@ -120,7 +120,7 @@ class EstimateTable(ArrowExport):
             Its reference SoC is drawn too.
         """
         log = None if log is None else as_log(log)
-        return extra("report.figures:estimate_figure")(self, log=log)
+        return extra("report.estimate:estimate_figure")(self, log=log)
 
     def __len__(self) -> int:
         """Return the number of samples."""

@@ -279,7 +279,7 @@ class Identification:
 
     def plot(self) -> Any:
         """Return pseudo-OCV and residuals, for `bokeh.plotting.show`."""
-        return extra("report.figures:fit_figure")(self)
+        return extra("report.fit:fit_figure")(self)
 
     def to_dict(self) -> dict[str, object]:
         """Return the object that `cangauge fit --json` prints."""

@@ -209,7 +209,7 @@ class Log(ArrowExport):
 
     def plot(self) -> Any:
         """Return current, voltage, temperature and SoC over time, for `bokeh.plotting.show`."""
-        return extra("report.figures:log_figure")(self)
+        return extra("report.inspection:log_figure")(self)
 
     def __len__(self) -> int:
         """Return the number of rows."""

@@ -15,7 +15,7 @@ import socket
 import stat
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import closing, suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -67,6 +67,14 @@ class Snapshot:
             status |= {"loop_stuck": True, "status": "invalid"}
             status["reasons"] = sorted({*status["reasons"], *reason_ids(Reason.INPUT_STALE)})
         return status
+
+
+def value_at(status: Mapping[str, Any], place: str) -> Any:
+    """Return the value at a place in a status, such as "sample.current_a"; None if not known."""
+    value: Any = status
+    for part in place.split("."):
+        value = None if value is None else value.get(part)
+    return value
 
 
 def reason_ids(reasons: Reason) -> list[str]:

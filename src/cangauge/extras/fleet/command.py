@@ -132,9 +132,9 @@ def fit_fleet_command(
     result = cluster.run(lambda client: fit_fleet(job, found, cluster.out, client))
     texts = {model: result.model.to_json()}
     if report is not None:
-        from cangauge.extras.report.fleet import fleet_fit_report
+        from cangauge.extras.report.fleet import fleet_fit_page
 
-        texts[report] = fleet_fit_report(result)
+        texts[report] = fleet_fit_page(result).html()
     write_texts_atomic(texts)
     if json_output:
         written = {"model": str(model), "output": cluster.out, "report": report and str(report)}
@@ -337,9 +337,9 @@ def _run(
     summary = cluster.run(lambda client: run_job(job, tasks, results, client))
     found = FleetOverview.read(cluster.out, among)
     if report is not None:
-        from cangauge.extras.report.fleet import fleet_report
+        from cangauge.extras.report.fleet import fleet_page
 
-        write_texts_atomic({report: fleet_report(found)})
+        write_texts_atomic({report: fleet_page(found).html()})
     if json_output:
         written = {"output": cluster.out, "report": report and str(report)}
         emit_json(vars(summary) | found.to_dict() | written)

@@ -108,9 +108,9 @@ def judge_command(
     if output is not None:
         texts[output] = narrowed(judgement).to_json()
     if report is not None:
-        from cangauge.extras.judge.page import judge_report
+        from cangauge.extras.judge.page import judge_page
 
-        texts[report] = judge_report(judgement, model)
+        texts[report] = judge_page(judgement, model).html()
     with ExitStack() as both:
         if corrected is not None:
             _write_corrected(both.enter_context(atomic_path(corrected)), judgement)

@@ -114,11 +114,6 @@ class MqttSettings:
                 cure="name a PEM file",
             ) from error
 
-    def check(self) -> None:
-        """Raise InputError if the certificates cannot be read."""
-        if self.tls:
-            self.tls_context()
-
 
 def http_address(
     text: str,

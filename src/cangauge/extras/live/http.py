@@ -12,7 +12,7 @@ import logging
 import socket
 import time
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, Final
 
 from tornado.httpserver import HTTPServer
@@ -54,17 +54,9 @@ class StatusServer(Output):
     def __init__(self, sockets: Sequence[socket.socket], token: str | None) -> None:
         self.token = token
         self.latest: Snapshot | None = None
-        context = {"server": self}
-        pages = [("/status", _StatusPage, context), ("/healthz", _Health, context),
-                 ("/metrics", _Metrics, context)]  # fmt: skip
-        application = Application(
-            pages,
-            default_handler_class=_Nothing,
-            default_handler_args=context,
-            log_function=_log_failure,
-        )
+        pages = {"/status": _StatusPage, "/healthz": _Health, "/metrics": _Metrics}
         server = _Server(
-            application,
+            application_of(self, pages, _Nothing, log_function=_log_failure),
             no_keep_alive=True,
             max_header_size=MAX_HEADER_BYTES,
             max_body_size=MAX_BODY_BYTES,
@@ -77,6 +69,19 @@ class StatusServer(Output):
     def on_snapshot(self, snapshot: Snapshot) -> None:
         """Make a snapshot the latest one."""
         self.latest = snapshot
+
+
+def application_of(
+    server: Output, pages: Mapping[str, type[Handler]], default: type[Handler], **settings: Any
+) -> Application:
+    """Return the pages of a server by their paths; other paths get the default page."""
+    context = {"server": server}
+    return Application(
+        [(path, page, context) for path, page in pages.items()],
+        default_handler_class=default,
+        default_handler_args=context,
+        **settings,
+    )
 
 
 class _Server(HTTPServer):
@@ -112,50 +117,65 @@ def _log_failure(handler: RequestHandler) -> None:
         _LOG.debug("%s: %s", handler.request.path, handler.get_status())
 
 
-class _Page(RequestHandler):
+class Handler(RequestHandler):
     """Access control and plain-text errors of all pages."""
 
-    def initialize(self, server: StatusServer) -> None:
+    def initialize(self, server: Any) -> None:
+        """Take the server, which has the token."""
         self.server = server
 
     def set_default_headers(self) -> None:
+        """Let no answer be stored."""
         self.clear_header("Server")
         self.set_header("Cache-Control", "no-store")
         self.set_header("X-Content-Type-Options", "nosniff")
-        self.set_header("Content-Type", "text/plain; charset=utf-8")
 
     def prepare(self) -> None:
+        """Refuse a request that lacks the token, or is by a foreign name."""
         token = self.server.token
-        if token is None:
-            # Against DNS rebinding: a web page could otherwise read this under another name.
-            if not is_loopback_name(self.request.host_name):
-                self.refuse(403, "request this by a loopback address")
-        elif not has_token(self.request.headers.get("Authorization", ""), token):
-            self.set_header("WWW-Authenticate", "Bearer")
-            self.refuse(401, "a bearer token is required")
-            text = f"refused {self.request.remote_ip}: missing or wrong token"
-            emit(_LOG, logging.WARNING, "http.refused", text, remote=self.request.remote_ip)
-        if self.server.latest is None and not self._finished:
-            self.refuse(503, "the service has just started")
+        # Against DNS rebinding: a web page could otherwise read this under another name.
+        if token is None and not is_loopback_name(self.request.host_name):
+            self.refuse(403, "request this by a loopback address")
+        elif token is not None and not self.is_known(token):
+            self.refuse_unknown()
+
+    def is_known(self, token: str) -> bool:
+        """Return whether the request bears the token."""
+        return has_token(self.request.headers.get("Authorization", ""), token)
+
+    def refuse_unknown(self) -> None:
+        """Answer a request without the token."""
+        self.set_header("WWW-Authenticate", "Bearer")
+        self.refuse(401, "a bearer token is required")
+        text = f"refused {self.request.remote_ip}: missing or wrong token"
+        emit(_LOG, logging.WARNING, "http.refused", text, remote=self.request.remote_ip)
 
     def refuse(self, code: int, text: str) -> None:
+        """Answer with an error in plain text."""
         self.set_status(code)
+        self.set_header("Content-Type", "text/plain; charset=utf-8")
         self.finish(text + "\n")
 
     def write_error(self, status_code: int, **_: Any) -> None:
-        self.finish(f"{status_code} {self._reason}\n")
+        """Answer with tornado's reason, without a trace."""
+        self.refuse(status_code, f"{status_code} {self._reason}")
 
     def send_json(self, content: dict[str, Any]) -> None:
+        """Answer with a JSON object."""
         self.set_header("Content-Type", "application/json")
         self.finish(json.dumps(content, ensure_ascii=False) + "\n")
+
+
+class _Page(Handler):
+    def prepare(self) -> None:
+        super().prepare()
+        if self.server.latest is None and not self._finished:
+            self.refuse(503, "the service has just started")
 
     @property
     def status(self) -> dict[str, Any]:
         """The status now."""
-        latest = self.server.latest
-        if latest is None:
-            raise LookupError("no snapshot yet")
-        return latest.at(time.monotonic())
+        return dict(self.server.latest.at(time.monotonic()))
 
 
 class _StatusPage(_Page):

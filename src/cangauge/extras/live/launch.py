@@ -108,7 +108,8 @@ class Live(Output):
             if find_spec("paho") is None:
                 problem = "MQTT needs the package paho-mqtt, which is not installed"
                 raise InputError(problem, field="mqtt", cure="pip install 'cangauge[mqtt]'")
-            mqtt.check()
+            if mqtt.tls:
+                mqtt.tls_context()  # certificates that cannot be read show at once
             self._asks["mqtt"] = asdict(mqtt)
         self._latest: Snapshot | None = None
         self._done = threading.Event()

@@ -10,7 +10,7 @@ from collections.abc import Iterator, Mapping
 from typing import Any, Final
 
 from cangauge.errors import InputError
-from cangauge.service.status_client import BOUNDS_S, reason_ids
+from cangauge.service.status_client import BOUNDS_S, reason_ids, value_at
 from cangauge.types import Reason, Status
 
 try:
@@ -162,9 +162,7 @@ class _Status(Collector):
 
 def _number(status: Mapping[str, Any], key: str) -> float:
     """Return the number of a dotted key; NaN where it is not known."""
-    value: Any = status
-    for part in key.split("."):
-        value = None if value is None else value.get(part)
+    value = value_at(status, key)
     return math.nan if value is None else float(value)
 
 

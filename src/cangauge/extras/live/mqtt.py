@@ -21,7 +21,7 @@ from cangauge._logging import emit
 from cangauge._version import __version__
 from cangauge.extras.live.addresses import MqttSettings, is_loopback_name
 from cangauge.service.output import Output
-from cangauge.service.status_client import Snapshot
+from cangauge.service.status_client import Snapshot, value_at
 from cangauge.types import Status
 
 _LOG = logging.getLogger(__name__)
@@ -37,9 +37,10 @@ LEAVE_WITHIN_S: Final = 0.5
 
 @dataclass(frozen=True, slots=True)
 class _Sensor:
-    """One sensor of Home Assistant: key of the state, name, unit and class."""
+    """One sensor of Home Assistant: key of the state, its place in a status, name, unit, class."""
 
     key: str
+    place: str
     name: str
     unit: str | None = None
     device_class: str | None = None
@@ -48,49 +49,36 @@ class _Sensor:
 
 
 _SENSORS: Final = (
-    _Sensor("soc_pct", "State of charge", "%", "battery", 1, needs_soc=True),
+    _Sensor("soc_pct", "estimate.soc_pct", "State of charge", "%", "battery", 1, needs_soc=True),
     # A class "battery" of the same unit would make two batteries of one pack.
-    _Sensor("soc_std_pct", "State of charge, standard deviation", "%", None, 2, needs_soc=True),
-    _Sensor("status", "Status", None, "enum"),
-    _Sensor("current_a", "Current", "A", "current", 1),
-    _Sensor("voltage_v", "Voltage", "V", "voltage", 1),
-    _Sensor("residual_v", "Voltage, measured less modelled", "V", "voltage", 3),
-    _Sensor("temperature_c", "Temperature", "°C", "temperature", 1),
-    _Sensor("capacity_ah", "Capacity", "Ah", None, 1),
-    _Sensor("resistance_ratio", "Resistance relative to the model's", None, None, 2),
-    _Sensor("current_offset_a", "Current sensor offset", "A", "current", 2),
-    _Sensor("discharge_a", "Discharge current possible for 10 s", "A", "current", 0),
-    _Sensor("charge_a", "Charge current possible for 10 s", "A", "current", 0),
-    _Sensor("energy_kwh", "Energy left", "kWh", "energy_storage", 2),
-    _Sensor("weakest_cell", "Weakest cell"),
-    _Sensor("weakest_soc_pct", "State of charge of the weakest cell", "%", None, 1),
-)
+    _Sensor("soc_std_pct", "estimate.soc_std_pct", "State of charge, standard deviation", "%",
+            None, 2, needs_soc=True),
+    _Sensor("status", "status", "Status", None, "enum"),
+    _Sensor("current_a", "sample.current_a", "Current", "A", "current", 1),
+    _Sensor("voltage_v", "sample.voltage_v", "Voltage", "V", "voltage", 1),
+    _Sensor("residual_v", "estimate.residual_v", "Voltage, measured less modelled", "V",
+            "voltage", 3),
+    _Sensor("temperature_c", "sample.temperature_c", "Temperature", "°C", "temperature", 1),
+    _Sensor("capacity_ah", "health.capacity_ah", "Capacity", "Ah", None, 1),
+    _Sensor("resistance_ratio", "health.resistance_ratio", "Resistance relative to the model's",
+            None, None, 2),
+    _Sensor("current_offset_a", "health.offset_a", "Current sensor offset", "A", "current", 2),
+    _Sensor("discharge_a", "power.discharge_a", "Discharge current possible for 10 s", "A",
+            "current", 0),
+    _Sensor("charge_a", "power.charge_a", "Charge current possible for 10 s", "A", "current", 0),
+    _Sensor("energy_kwh", "power.energy_wh", "Energy left", "kWh", "energy_storage", 2),
+    _Sensor("weakest_cell", "cells.weakest", "Weakest cell"),
+    _Sensor("weakest_soc_pct", "cells.soc_pct", "State of charge of the weakest cell", "%",
+            None, 1),
+)  # fmt: skip
 
 
 def state(status: Mapping[str, Any]) -> dict[str, Any]:
     """Return the state to publish for a status: one flat JSON object."""
-    estimate, sample = status["estimate"], status["sample"] or {}
-    health, power = status["health"] or {}, status["power"] or {}
-    cells = status["cells"] or {}
-    energy_wh = power.get("energy_wh")
-    return {
-        "soc_pct": estimate["soc_pct"],
-        "soc_std_pct": estimate["soc_std_pct"],
-        "status": status["status"],
-        "reasons": status["reasons"],
-        "current_a": sample.get("current_a"),
-        "voltage_v": sample.get("voltage_v"),
-        "residual_v": estimate["residual_v"],
-        "temperature_c": sample.get("temperature_c"),
-        "capacity_ah": health.get("capacity_ah"),
-        "resistance_ratio": health.get("resistance_ratio"),
-        "current_offset_a": health.get("offset_a"),
-        "discharge_a": power.get("discharge_a"),
-        "charge_a": power.get("charge_a"),
-        "energy_kwh": None if energy_wh is None else 1e-3 * energy_wh,
-        "weakest_cell": cells.get("weakest"),
-        "weakest_soc_pct": cells.get("soc_pct"),
-    }
+    values = {sensor.key: value_at(status, sensor.place) for sensor in _SENSORS}
+    if (energy_wh := values["energy_kwh"]) is not None:
+        values["energy_kwh"] = 1e-3 * energy_wh
+    return values | {"reasons": status["reasons"]}
 
 
 def discovery(settings: MqttSettings, status: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
@@ -158,12 +146,8 @@ class MqttPublisher(Output):
         if settings.tls:
             client.tls_set_context(settings.tls_context())
         elif settings.password is not None and not is_loopback_name(settings.broker):
-            emit(
-                _LOG,
-                logging.WARNING,
-                "mqtt.unencrypted",
-                f"the password for {self._place} is sent unencrypted: set tls = true in [mqtt]",
-            )
+            text = f"the password for {self._place} is sent unencrypted: set tls = true in [mqtt]"
+            emit(_LOG, logging.WARNING, "mqtt.unencrypted", text)
         client.on_connect = self._on_connect
         client.on_disconnect = self._on_disconnect
         client.on_connect_fail = self._on_connect_fail
@@ -218,9 +202,8 @@ class MqttPublisher(Output):
         self._client.disconnect()
 
     def _on_connect(
-        self, client: Client, userdata: object, flags: object, reason: Any, properties: object
+        self, _client: Client, _userdata: object, _flags: object, reason: Any, _properties: object
     ) -> None:
-        del client, userdata, flags, properties
         if reason.is_failure:
             self._emit(logging.WARNING, "mqtt.refused", f"refused the connection: {reason}")
             return
@@ -228,21 +211,15 @@ class MqttPublisher(Output):
         self._emit(logging.INFO, "mqtt.connected", "connected")
 
     def _on_disconnect(
-        self, client: Client, userdata: object, flags: object, reason: Any, properties: object
+        self, _client: Client, _userdata: object, _flags: object, reason: Any, _properties: object
     ) -> None:
-        del client, userdata, flags, properties
         if not self._done.is_set():
-            self._emit(
-                logging.WARNING, "mqtt.lost", f"connection lost ({reason}); the estimate continues"
-            )
+            text = f"connection lost ({reason}); the estimate continues"
+            self._emit(logging.WARNING, "mqtt.lost", text)
 
-    def _on_connect_fail(self, client: Client, userdata: object) -> None:
-        del client, userdata
-        self._emit(
-            logging.WARNING,
-            "mqtt.unreachable",
-            f"not reachable; tried again after at most {RETRY_S[1]} s",
-        )
+    def _on_connect_fail(self, _client: Client, _userdata: object) -> None:
+        text = f"not reachable; tried again after at most {RETRY_S[1]} s"
+        self._emit(logging.WARNING, "mqtt.unreachable", text)
 
     def _emit(self, level: int, event: str, text: str) -> None:
         emit(_LOG, level, event, f"MQTT broker {self._place}: {text}", limit="mqtt")

@@ -21,13 +21,11 @@ from pathlib import Path
 from typing import Any, Final, cast
 
 from bokeh.resources import Resources
-from jinja2 import Environment, PackageLoader, StrictUndefined
+from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from tornado.httpserver import HTTPServer
-from tornado.web import Application, RequestHandler
 from tornado.websocket import WebSocketClosedError, WebSocketHandler
 
 from cangauge._typing import FloatArray
-from cangauge.extras.live.addresses import is_loopback_name
 from cangauge.extras.live.charts import CHARTS, STATUS_COLOURS, STATUS_NAMES, chart_parts
 from cangauge.extras.live.history import (
     COLUMNS,
@@ -38,7 +36,13 @@ from cangauge.extras.live.history import (
     last_hour,
     shown_columns,
 )
-from cangauge.extras.live.http import MAX_BODY_BYTES, MAX_HEADER_BYTES, has_token
+from cangauge.extras.live.http import (
+    MAX_BODY_BYTES,
+    MAX_HEADER_BYTES,
+    Handler,
+    application_of,
+    has_token,
+)
 from cangauge.service.output import Output
 from cangauge.service.status_client import Snapshot
 
@@ -49,56 +53,85 @@ ALIVE_S: Final = 0.25
 """Longest time without a message to a viewer [s]."""
 PING_S: Final = 10.0
 """Interval at which a viewer must show that it still listens [s]."""
-_SCRIPTS: Final = ("bokeh.min.js",)
+_FILES: Final = Path(__file__).with_name("page")
+_OWN: Final = ("enter.html", "live.js", "live.css")
+_BOKEH: Final = "bokeh.min.js"
 _POLICY: Final = (
     "default-src 'none'; script-src 'self'; connect-src 'self'; img-src 'self' data: blob:;"
     " style-src 'self' 'unsafe-inline'; form-action 'self'; frame-ancestors 'none'; base-uri 'none'"
 )
 
 
-class Site:
-    """What all pages share.
+class LivePage(Output):
+    """Serve the page on the running loop.
 
     Parameters
     ----------
-    history : History
+    sockets : sequence of socket
+        Listening ones.
     token : str or None
         Token that a viewer must know.
     """
 
-    def __init__(self, history: History, token: str | None) -> None:
-        self.history = history
+    def __init__(self, sockets: Sequence[socket.socket], token: str | None) -> None:
         self.token = token
+        self.history = History()
         self.id = secrets.token_hex(8)
         """Key of this run; another one means that the row numbers start again."""
         # The same after a restart, so that an open page stays logged in; does not reveal the token.
         self.pass_word = "" if token is None else _cookie_of(token)
-        environment = Environment(
-            loader=PackageLoader("cangauge.extras.live", "page"),
-            autoescape=True,
-            undefined=StrictUndefined,
-        )
         self._news = asyncio.Event()
+        self.texts = self._texts()
+        pages: dict[str, type[_LiveHandler]] = {
+            "/": _Live,
+            "/enter": _Enter,
+            r"/files/([a-z.]+)": _StaticFile,
+            "/rows": _Rows,
+            "/stream": _Stream,
+            "/range.csv": _Range,
+            f"/{LOG_NAME}": _LastHour,
+        }
+        application = application_of(
+            self,
+            pages,
+            _NotFound,
+            log_function=lambda _: None,
+            websocket_ping_interval=PING_S,
+            websocket_max_message_size=MAX_BODY_BYTES,
+        )
+        server = HTTPServer(
+            application,
+            max_header_size=MAX_HEADER_BYTES,
+            max_body_size=MAX_BODY_BYTES,
+            idle_connection_timeout=IDLE_S,
+            body_timeout=IDLE_S,
+        )
+        server.add_sockets(sockets)
+
+    def _texts(self) -> dict[str, str]:
+        """Return the files of the page by their names."""
         script, elements = chart_parts()
+        spans = self.history.spans.items()
         facts = {
             "reasons": REASONS,
             "statuses": STATUS_NAMES,
             "colours": STATUS_COLOURS,
-            "rows_at_most": {name: span.rows_at_most for name, span in history.spans.items()},
+            "rows_at_most": {name: span.rows_at_most for name, span in spans},
         }
-        self.texts = {
-            "live.html": environment.get_template("live.html").render(
-                charts=CHARTS, elements=elements, log_name=LOG_NAME
-            ),
-            "enter.html": environment.get_template("enter.html").render(),
+        environment = Environment(
+            loader=FileSystemLoader(_FILES), autoescape=True, undefined=StrictUndefined
+        )
+        page = environment.get_template("live.html")
+        bokeh = Path(Resources(mode="server").base_dir, "js", _BOKEH)
+        return {
+            "live.html": page.render(charts=CHARTS, elements=elements, log_name=LOG_NAME),
             "charts.js": f"window.FACTS = {json.dumps(facts)};\n{script}",
-            **{name: _own_file(name) for name in ("live.js", "live.css")},
-            **{name: _bokeh_file(name) for name in _SCRIPTS},
+            **{path.name: path.read_text("utf-8") for path in (bokeh, *map(_FILES.joinpath, _OWN))},
         }
 
-    def add(self, status: dict[str, Any]) -> None:
+    def on_snapshot(self, snapshot: Snapshot) -> None:
         """Add a status, and wake those who wait for it."""
-        self.history.add(status)
+        self.history.add(snapshot.at(time.monotonic()))
         news, self._news = self._news, asyncio.Event()
         news.set()
 
@@ -135,96 +168,30 @@ class Site:
             "columns": shown_columns(span.rows(after if key == present else 0)),
         }
 
-    def application(self) -> Application:
-        """Return the pages by their paths."""
-        context = {"site": self}
-        return Application(
-            [
-                ("/", _Live, context),
-                ("/enter", _Enter, context),
-                (r"/files/([a-z.]+)", _StaticFile, context),
-                ("/rows", _Rows, context),
-                ("/stream", _Stream, context),
-                ("/range.csv", _Range, context),
-                (f"/{LOG_NAME}", _LastHour, context),
-            ],
-            default_handler_class=_NotFound,
-            default_handler_args=context,
-            log_function=lambda _: None,
-            websocket_ping_interval=PING_S,
-            websocket_max_message_size=MAX_BODY_BYTES,
-        )
 
-
-class LivePage(Output):
-    """Serve the page on the running loop.
-
-    Parameters
-    ----------
-    sockets : sequence of socket
-        Listening ones.
-    token : str or None
-        Token that a viewer must know.
-    """
-
-    def __init__(self, sockets: Sequence[socket.socket], token: str | None) -> None:
-        self._site = Site(History(), token)
-        server = HTTPServer(
-            self._site.application(),
-            max_header_size=MAX_HEADER_BYTES,
-            max_body_size=MAX_BODY_BYTES,
-            idle_connection_timeout=IDLE_S,
-            body_timeout=IDLE_S,
-        )
-        server.add_sockets(sockets)
-
-    def on_snapshot(self, snapshot: Snapshot) -> None:
-        """Show a snapshot."""
-        self._site.add(snapshot.at(time.monotonic()))
-
-
-class _LiveHandler(RequestHandler):
-    """Access control of all pages."""
+class _LiveHandler(Handler):
+    """Access control of all pages: by a cookie, or a bearer token."""
 
     needs_token = True
 
-    def initialize(self, site: Site) -> None:
-        self.site = site
-
     def set_default_headers(self) -> None:
-        self.clear_header("Server")
-        self.set_header("Cache-Control", "no-store")
-        self.set_header("X-Content-Type-Options", "nosniff")
+        super().set_default_headers()
         self.set_header("Referrer-Policy", "no-referrer")
         self.set_header("Content-Security-Policy", _POLICY)
 
-    def prepare(self) -> None:
-        token = self.site.token
-        if token is None:
-            # Against DNS rebinding: a web page could otherwise read this under another name.
-            if not is_loopback_name(self.request.host_name):
-                self.refuse(403, "request this by a loopback address")
-            return
+    def is_known(self, token: str) -> bool:
         given = self.get_cookie(COOKIE, "") or ""
-        is_known = hmac.compare_digest(given.encode(), self.site.pass_word.encode())
-        is_known = is_known or has_token(self.request.headers.get("Authorization", ""), token)
-        if self.needs_token and not is_known:
-            if self.request.path == "/":
-                self.redirect("/enter")
-            else:
-                self.refuse(401, "a token is required")
+        return (
+            not self.needs_token
+            or hmac.compare_digest(given.encode(), self.server.pass_word.encode())
+            or super().is_known(token)
+        )
 
-    def refuse(self, code: int, text: str) -> None:
-        self.set_status(code)
-        self.set_header("Content-Type", "text/plain; charset=utf-8")
-        self.finish(text + "\n")
-
-    def write_error(self, status_code: int, **_: Any) -> None:
-        self.refuse(status_code, f"{status_code} {self._reason}")
-
-    def send_json(self, content: dict[str, Any]) -> None:
-        self.set_header("Content-Type", "application/json")
-        self.finish(json.dumps(content, ensure_ascii=False, allow_nan=False))
+    def refuse_unknown(self) -> None:
+        if self.request.path == "/":
+            self.redirect("/enter")
+        else:
+            self.refuse(401, "a token is required")
 
     def send_csv(self, name: str, text: str) -> None:
         self.set_header("Content-Type", "text/csv; charset=utf-8")
@@ -242,24 +209,24 @@ class _LiveHandler(RequestHandler):
 
 class _Live(_LiveHandler):
     def get(self) -> None:
-        self.finish(self.site.texts["live.html"])
+        self.finish(self.server.texts["live.html"])
 
 
 class _Enter(_LiveHandler):
     needs_token = False
 
     def get(self) -> None:
-        self.finish(self.site.texts["enter.html"])
+        self.finish(self.server.texts["enter.html"])
 
     def post(self) -> None:
-        token = self.site.token
+        token = self.server.token
         given = self.get_body_argument("token", "")
         if token is not None and not has_token(f"Bearer {given}", token):
             self.set_status(401)
-            self.finish(self.site.texts["enter.html"])
+            self.finish(self.server.texts["enter.html"])
             return
         self.set_cookie(
-            COOKIE, self.site.pass_word, httponly=True, samesite="Strict", expires_days=None
+            COOKIE, self.server.pass_word, httponly=True, samesite="Strict", expires_days=None
         )
         self.redirect("/")
 
@@ -270,18 +237,18 @@ class _StaticFile(_LiveHandler):
 
     def get(self, name: str) -> None:
         kind = self._TYPES.get(name.rpartition(".")[2])
-        if kind is None or name not in self.site.texts:
+        if kind is None or name not in self.server.texts:
             self.refuse(404, "no such file")
             return
         self.set_header("Content-Type", kind)
-        self.finish(self.site.texts[name])
+        self.finish(self.server.texts[name])
 
 
 class _Rows(_LiveHandler):
     def get(self) -> None:
         """Return the status, what is wrong, and the rows of a span after those already known."""
         key, after = self.get_query_argument("key", ""), int(self.argument("after", 0.0))
-        self.send_json(self.site.answer(self.get_query_argument("span", ""), key, after))
+        self.send_json(self.server.answer(self.get_query_argument("span", ""), key, after))
 
 
 class _Stream(_LiveHandler, WebSocketHandler):
@@ -314,16 +281,16 @@ class _Stream(_LiveHandler, WebSocketHandler):
                 question = self._question
                 name, key, after = (question.get(part) for part in ("span", "key", "after"))
                 number = after if isinstance(after, int) and after >= 0 else 0
-                answer = self.site.answer(str(name), str(key), number)
+                answer = self.server.answer(str(name), str(key), number)
                 self._question = question | {"key": answer.get("key"), "after": answer.get("added")}
                 await self.write_message(json.dumps(answer, ensure_ascii=False, allow_nan=False))
-                await self.site.news()
+                await self.server.news()
 
 
 class _Range(_LiveHandler):
     def get(self) -> None:
         """Return the rows of a span between two wall-clock times [ms] as CSV."""
-        history = self.site.history
+        history = self.server.history
         span = history.spans.get(self.get_query_argument("span", ""), history.hour)
         rows = span.rows()
         time_ms = column(rows, "time_ms")
@@ -333,7 +300,7 @@ class _Range(_LiveHandler):
 
 class _LastHour(_LiveHandler):
     def get(self) -> None:
-        self.send_csv(LOG_NAME, last_hour(self.site.history))
+        self.send_csv(LOG_NAME, last_hour(self.server.history))
 
 
 class _NotFound(_LiveHandler):
@@ -367,11 +334,3 @@ def _csv(rows: FloatArray) -> str:
 
 def _cookie_of(token: str) -> str:
     return hmac.new(token.encode(), b"cangauge live page", hashlib.sha256).hexdigest()
-
-
-def _own_file(name: str) -> str:
-    return (Path(__file__).parent / "page" / name).read_text(encoding="utf-8")
-
-
-def _bokeh_file(name: str) -> str:
-    return Path(Resources(mode="server").base_dir, "js", name).read_text(encoding="utf-8")

@@ -1,6 +1,5 @@
 """Results as self-contained HTML pages.
 
-`fit.fit_page`, `estimate.estimate_page` and `diagnosis.gap_page` return a
-`page.Page`; `page.render` writes it as HTML, and its `figures` are bokeh figures for a notebook.
-The package imports nothing, since importing bokeh takes half a second.
+Each module returns a `page.Page`, whose `html()` is the file and whose `figures` are bokeh figures
+for a notebook. The package imports nothing, since importing bokeh takes half a second.
 """

@@ -8,6 +8,7 @@ from typing import Any, Final
 
 import numpy as np
 
+from cangauge._files import file_sha256
 from cangauge._text import NONE_KNOWN, number, span
 from cangauge.diagnosis import NONE, Diagnosis
 from cangauge.diagnosis.answer import TITLES
@@ -24,26 +25,12 @@ from cangauge.extras.report.charts import (
     GREEN,
     GREY,
     ORANGE,
-    Pen,
+    Figure,
+    Plot,
     TimeFigures,
-    add_zero,
     bars,
 )
-from cangauge.extras.report.page import (
-    Beside,
-    Block,
-    Bullets,
-    Figure,
-    InputFile,
-    Page,
-    Paragraph,
-    Section,
-    Table,
-    Tile,
-    joined,
-    reconstruction_banners,
-    render,
-)
+from cangauge.extras.report.page import Block, Page, Table, Tile, joined
 
 _AXES: Final = {
     "soc": "state of charge",
@@ -56,10 +43,11 @@ _AXES: Final = {
 _SHOWN_SHARE: Final = 0.005
 """Intervals with less of the squared error are left out."""
 _TIMESCALES: Final = ("under 10 s", "10 to 100 s", "100 to 1000 s", "over 1000 s")
+_SHOWN_CAUSES: Final = 8
 
 
-def gap_report(found: Diagnosis, model_path: Path | None = None, plan: Plan | None = None) -> str:
-    """Return the diagnosis as one self-contained HTML page.
+def gap_page(found: Diagnosis, model_path: Path | None = None, plan: Plan | None = None) -> Page:
+    """Return the page of a diagnosis.
 
     Parameters
     ----------
@@ -69,45 +57,48 @@ def gap_report(found: Diagnosis, model_path: Path | None = None, plan: Plan | No
     plan : Plan, optional
         The next step.
     """
-    return render(gap_page(found, InputFile.of_model(found.model, model_path), plan))
-
-
-def gap_page(found: Diagnosis, model: InputFile | None = None, plan: Plan | None = None) -> Page:
-    """Return the report's content (see `gap_report`); `figures` holds the bokeh figures."""
     result = found.to_json()
     places = _places(result["where"])
-    first = _widest(result["where"])
-    others = [figure for axis, figure in places.items() if axis != first]
+    first = places.pop(_widest(result["where"]))
     verdict, *details = found.summary.splitlines()
     next_words = [] if plan is None or not plan.between else [plan.sentence]
-    folded: dict[str, list[Block]] = {
-        "Every cause: probability and size": [_causes(result)],
-        "What these logs would have shown": [_visible(result)],
-        "Where else the error lies": [Beside(others)],
-        "Error over time": list(_over_time(found)),
-        "Logs and references": [_compared(found)],
-        **({"What these logs cannot show": [Bullets(found.caveats)]} if found.caveats else {}),
-    }
-    if plan is not None:
-        folded = {"The next step": _next_step(plan), **folded}
-    title = f"Diagnosis of {joined([log.name for log in found.logs])}"
+    head, causes = candidate_rows(result)
+    explained = [[*row, EXPLAINED.get(row[0].replace(" ", "_"), "")] for row in causes]
+    signature = "A cause is a signature at the terminals, not proof of a mechanism."
+    unseen = f"{NONE_KNOWN}: no physical size would have been seen in these logs."
+    names = joined([log.name for log in found.logs])
     return Page(
-        title=title if model is None else f"{title} with model {model.name}",
+        title=f"Diagnosis of {names} with model {found.model.name}",
         lead=verdict,
         subtitle=" ".join([*details, *next_words]),
         tiles=_tiles(found),
-        sections=[
-            Section("Where and how much", [Beside([places[first], _shrinks(found)])]),
-            *(Section(heading, blocks, is_folded=True) for heading, blocks in folded.items()),
-        ],
-        inputs=[
-            *([] if model is None else [model]),
-            *(InputFile.of_path("log", log.name, log.source) for log in found.logs),
-        ],
-        banners=reconstruction_banners(
-            *(text for log in found.logs for text in (log.name, log.source))
-        ),
+        sections={"Where and how much": [[first, _shrinks(found)]]},
+        folded={
+            "The next step": [] if plan is None else _next_step(plan),
+            "Every cause: probability and size": [
+                Table([*head, "what it means"], explained, signature)
+            ],
+            "What these logs would have shown": [Table(*visible_rows(result), unseen)],
+            "Where else the error lies": [list(places.values())],
+            "Error over time": _over_time(found),
+            "Logs and references": [_compared(found)],
+            "What these logs cannot show": [found.caveats] if found.caveats else [],
+        },
+        model=found.model,
+        model_path=model_path,
+        logs=found.logs,
     )
+
+
+def diagnosis_figure(found: Diagnosis) -> Plot:
+    """Return the probabilities of the causes as bars, the likeliest first, for a notebook."""
+    answer = found.posterior
+    ordered = sorted(answer.probabilities.items(), key=lambda item: -item[1])
+    entries = [
+        (name, float(probability), BLUE if name == answer.verdict else GREY)
+        for name, probability in ordered[:_SHOWN_CAUSES]
+    ]
+    return bars("", "probability", entries, "").plot
 
 
 def _tiles(found: Diagnosis) -> list[Tile]:
@@ -140,35 +131,34 @@ def _shrinks(found: Diagnosis) -> Figure:
         if found.closed_fraction is not None:
             closed = percent(found.closed_fraction)
             caption += f" The cause closes {closed} of the squared gap above healthy logs."
-    return Figure(title, bars("RMS error", "V", entries, decimals=2), caption)
+    return bars(title, "RMS error", entries, caption, unit="V")
+
+
+def _shown(where: Sequence[Mapping[str, Any]], axis: str) -> list[Mapping[str, Any]]:
+    return [place for place in where if place["axis"] == axis and place["share"] >= _SHOWN_SHARE]
 
 
 def _widest(where: Sequence[Mapping[str, Any]]) -> str:
     """Return the axis along which the error differs most: its squares over their mean."""
     spread = {}
     for axis in ("soc", "current", "temperature", "time"):
-        mine = [each for each in where if each["axis"] == axis]
-        rms_v = np.array([each["rmse_v"] for each in mine if each["share"] >= _SHOWN_SHARE])
-        spread[axis] = float(np.std(rms_v**2) / np.mean(rms_v**2)) if rms_v.size else 0.0
+        squares = np.array([place["rmse_v"] ** 2 for place in _shown(where, axis)])
+        spread[axis] = float(np.std(squares) / np.mean(squares)) if squares.size else 0.0
     return max(spread, key=lambda axis: spread[axis])
 
 
 def _places(where: Sequence[Mapping[str, Any]]) -> dict[str, Figure]:
+    """Return the error of the model along each axis."""
     figures = {}
-    for axis in dict.fromkeys(each["axis"] for each in where):
-        mine = [each for each in where if each["axis"] == axis and each["share"] >= _SHOWN_SHARE]
-        entries = [(_interval(each), each["rmse_v"], ORANGE) for each in mine]
-        figures[axis] = Figure(
-            f"Where: {_AXES.get(axis, axis)}",
-            bars("RMS error of the model", "V", entries, decimals=2),
-            _place_caption(mine),
-        )
+    for axis in dict.fromkeys(place["axis"] for place in where):
+        shown = _shown(where, axis)
+        entries = [(_interval(place), place["rmse_v"], ORANGE) for place in shown]
+        largest = max(shown, key=lambda place: place["share"])
+        share = percent(largest["share"])
+        caption = f"{share} of the squared error lies at {_interval(largest)}."
+        title = f"Where: {_AXES.get(axis, axis)}"
+        figures[axis] = bars(title, "RMS error of the model", entries, caption, unit="V")
     return figures
-
-
-def _place_caption(places: Sequence[Mapping[str, Any]]) -> str:
-    most = max(places, key=lambda each: each["share"])
-    return f"{percent(most['share'])} of the squared error lies at {_interval(most)}."
 
 
 def _interval(place: Mapping[str, Any]) -> str:
@@ -183,69 +173,41 @@ def _interval(place: Mapping[str, Any]) -> str:
     return span(low, high, 0, place["unit"])
 
 
-def _causes(result: Mapping[str, Any]) -> Table:
-    headings, rows = candidate_rows(result)
-    return Table(
-        [*headings, "what it means"],
-        [[*row, EXPLAINED.get(row[0].replace(" ", "_"), "")] for row in rows],
-        note="A cause is a signature at the terminals, not proof of a mechanism.",
-    )
-
-
-def _visible(result: Mapping[str, Any]) -> Table:
-    headings, rows = visible_rows(result)
-    return Table(
-        headings,
-        rows,
-        note=f"{NONE_KNOWN}: no physical size would have been seen in these logs.",
-    )
-
-
 def _next_step(plan: Plan) -> list[Block]:
-    headings, rows = plan_rows(plan)
-    return [
-        Paragraph(plan.sentence),
-        Table(
-            headings,
-            rows,
-            note="Optimistic: it assumes that the pack behaves as the references' model.",
-        ),
-    ]
+    note = "Optimistic: it assumes that the pack behaves as the references' model."
+    return [plan.sentence, Table(*plan_rows(plan), note)]
 
 
 def _compared(found: Diagnosis) -> Table:
-    rows = []
-    for role, logs in (("log", found.logs), ("reference", found.references)):
-        for log in logs:
-            file = InputFile.of_path(role, log.name, log.source)
-            rows.append(
-                [
-                    role,
-                    log.name,
-                    number(log.duration_s / 60.0, 0),
-                    span(float(log.temperature_c.min()), float(log.temperature_c.max()), 0),
-                    "–" if file.sha256 is None else file.sha256[:12],
-                ]
-            )
-    return Table(["", "name", "duration [min]", "temperature [°C]", "SHA-256"], rows)
+    both = (("log", found.logs), ("reference", found.references))
+    return Table.of(
+        [(role, log) for role, logs in both for log in logs],
+        {
+            "": lambda item: item[0],
+            "name": lambda item: item[1].name,
+            "duration [min]": lambda item: number(item[1].duration_s / 60.0, 0),
+            "temperature [°C]": lambda item: span(
+                float(item[1].temperature_c.min()), float(item[1].temperature_c.max()), 0
+            ),
+            "SHA-256": lambda item: (file_sha256(item[1].source) or NONE_KNOWN)[:12],
+        },
+    )
 
 
-def _over_time(found: Diagnosis) -> tuple[Figure, Figure]:
+def _over_time(found: Diagnosis) -> list[Block]:
     """Return the figures of the errors, before and after, and of the current."""
-    errors, time = found.log_errors, TimeFigures(found.logs)
-    plot = time.plot("measured − model", "V", height=260, names=True)
-    rows_s = [log.time_s for log in errors]
+    errors, logs = found.log_errors, found.logs
+    time = TimeFigures([log.time_s for log in logs], [log.name for log in logs])
+    title, caption = "Measured minus modelled voltage", "At 1 Hz, as the model is identified."
+    error = time.figure(title, "measured − model [V]", caption, height=260, names=True)
     for name, color, values in (
         ("model as given", ORANGE, [log.before_v for log in errors]),
         ("with the cause", BLUE, [log.after_v for log in errors]),
     ):
-        pieces = list(zip(rows_s, values, strict=True))
-        time.line(plot, name, pieces, Pen(color, width=1.0, alpha=0.85))
-    add_zero(plot)
-    current = time.plot("current", "A", height=160)
+        pieces = list(zip((log.time_s for log in errors), values, strict=True))
+        time.line(error, name, pieces, color, line_width=1.0, line_alpha=0.85)
+    error.mark("width", 0.0)
+    caption = "Positive current discharges the pack."
+    current = time.figure("Current", "current [A]", caption, height=160)
     pieces = [(log.time_s, log.current_a) for log in errors]
-    time.line(current, "current", pieces, Pen(GREY, width=1.0, in_legend=False))
-    return (
-        Figure("Measured minus modelled voltage", plot, "At 1 Hz, as the model is identified."),
-        Figure("Current", current, "Positive current discharges the pack."),
-    )
+    return [error, time.line(current, "current", pieces, GREY, line_width=1.0)]

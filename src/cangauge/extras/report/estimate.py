@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Final, NamedTuple
+from typing import Final, NamedTuple
 
 import numpy as np
 from bokeh.models import ColumnDataSource
 from numpy.typing import NDArray
 
-from cangauge._text import duration, number, span
+from cangauge._text import duration, number
 from cangauge._typing import FloatArray
 from cangauge.estimation.offline import EstimateTable
 from cangauge.extras.report.charts import (
@@ -21,27 +21,14 @@ from cangauge.extras.report.charts import (
     GREY,
     ORANGE,
     PURPLE,
-    Pen,
+    Figure,
     Plot,
     TimeFigures,
-    add_zero,
-    new_figure,
-    set_y_limits,
+    stacked,
 )
-from cangauge.extras.report.page import (
-    Block,
-    Bullets,
-    Figure,
-    InputFile,
-    Page,
-    Paragraph,
-    Section,
-    Table,
-    Tile,
-    reconstruction_banners,
-    render,
-)
+from cangauge.extras.report.page import Block, Page, Table, Tile, range_rows
 from cangauge.identify.rows import running_rows
+from cangauge.logs.log import Log
 from cangauge.service.offline import Recorded, RecordedEstimate
 from cangauge.types import REASON_WORDS, Reason, Status, reason_name
 
@@ -56,14 +43,16 @@ _STATUS_COLORS: Final = {
     Status.DEGRADED: AMBER,
     Status.INVALID: BLACK,
 }
+_NEWTON: Final = {"line_width": 0.8, "line_alpha": 0.6, "visible": False}
+"""Style of the SoC by voltage alone: noisy, and hidden until its legend entry is clicked."""
 _MAX_BARS: Final = 500
 """Gaps shorter than the time axis over this number are closed: no screen resolves them."""
 _LISTED_PERIODS: Final = 20
 """Most periods without a valid estimate to list, the longest ones."""
 
 
-def estimate_report(estimate: RecordedEstimate, model_path: Path | None = None) -> str:
-    """Return the report of an estimate as one self-contained HTML page.
+def estimate_page(estimate: RecordedEstimate, model_path: Path | None = None) -> Page:
+    """Return the page of an estimate.
 
     Parameters
     ----------
@@ -71,39 +60,50 @@ def estimate_report(estimate: RecordedEstimate, model_path: Path | None = None) 
     model_path : Path, optional
         The model's file, to name it by its SHA-256.
     """
-    return render(estimate_page(estimate, model_path))
-
-
-def estimate_page(estimate: RecordedEstimate, model_path: Path | None = None) -> Page:
-    """Return the report's content (see `estimate_report`); `figures` holds the bokeh figures."""
     log, model, table = estimate.recorded, estimate.model, estimate.table
-    time = TimeFigures([log])
+    time = TimeFigures([log.time_s])
     found = periods(table)
     reference = _reference(log)
-    status = [_status_figure(log, table, time), *_periods(found), _reasons(table)]
-    errors = [] if reference is None else [_error_table(estimate, reference)]
+    settings = [_settings(estimate), *(("Remarks on the log:", log.remarks) if log.remarks else ())]
     return Page(
         title=f"State of charge of {log.name}",
         lead=estimate_verdict(estimate, found),
         subtitle=f"{duration(log.duration_s)}, {len(log):,} samples, estimated by"
         f" {_METHODS[estimate.settings.method]} with the model {model.name}.",
         tiles=_tiles(estimate),
-        sections=[
-            Section("State of charge", [*_soc(table, log.time_s, reference, time), *errors]),
-            Section("Voltage", _voltage(log, table, time)),
-            Section("Input", _input(log, time)),
-            Section("Status", status),
-            Section("Model and settings", _settings(estimate)),
-        ],
-        inputs=[
-            InputFile.of_model(model, model_path),
-            InputFile.of_path("log", log.name, log.source),
-        ],
-        banners=[
-            *reconstruction_banners(log.name, log.source, *log.remarks),
-            *estimate.warnings,
-        ],
+        sections={
+            "State of charge": [
+                _soc_figure(table, None if reference is None else (log.time_s, reference), time),
+                *_soc_error(estimate, reference, time),
+            ],
+            "Voltage": _voltage(log, table, time),
+            "Input": _input(log, time),
+            "Status": [_status_figure(log, table, time), *_periods(found), _reasons(table)],
+            "Model and settings": settings,
+        },
+        model=model,
+        model_path=model_path,
+        logs=[log],
+        warnings=estimate.warnings,
     )
+
+
+def estimate_figure(table: EstimateTable, log: Log | None = None) -> Plot:
+    """Return the SoC with ±2σ, by voltage and by counting alone, and the residual, for a notebook.
+
+    Parameters
+    ----------
+    table : EstimateTable
+    log : Log, optional
+        Its reference SoC is drawn too.
+    """
+    time = TimeFigures([table.time_s])
+    has_soc = log is not None and log.soc_pct is not None
+    soc = _soc_figure(table, (log.time_s, log.soc_pct) if has_soc else None, time)  # type: ignore[union-attr,arg-type]
+    residual = time.figure("", "measured − model [V]", "")
+    residual.mark("width", 0.0)
+    time.line(residual, "measured − model", [(table.time_s, table.residual_v)], BLUE)
+    return stacked(soc, residual)
 
 
 # --- The result in a sentence
@@ -118,6 +118,11 @@ class Period(NamedTuple):
     reason: Reason
     """The reason that applied to most of its samples."""
 
+    @property
+    def duration_s(self) -> float:
+        """Length [s]."""
+        return self.end_s - self.start_s
+
     def when(self, template: str = "{} … {}") -> str:
         """Return the times as h:mm:ss."""
         return template.format(_clock(self.start_s), _clock(self.end_s))
@@ -130,7 +135,7 @@ def _clock(seconds: float) -> str:
 
 def periods(table: EstimateTable) -> list[Period]:
     """Return the times that are degraded or invalid, in sequence."""
-    status, time_s = np.asarray(table.status), table.time_s
+    status, since_s = np.asarray(table.status), table.time_s - table.time_s[:1]
     edges = np.flatnonzero(np.diff(status)) + 1
     found = []
     for begin, end in zip((0, *edges), (*edges, status.size), strict=True):
@@ -139,14 +144,9 @@ def periods(table: EstimateTable) -> list[Period]:
         reasons = np.asarray(table.reasons[begin:end]).astype(np.int64)
         counts = {reason: int(np.count_nonzero(reasons & reason)) for reason in Reason}
         most = max(counts, key=counts.__getitem__)
-        found.append(
-            Period(
-                float(time_s[begin] - time_s[0]),
-                float(time_s[min(end, status.size - 1)] - time_s[0]),
-                Status(int(status[begin])),
-                most if counts[most] else Reason.NONE,
-            )
-        )
+        start_s, end_s = float(since_s[begin]), float(since_s[min(end, status.size - 1)])
+        reason = most if counts[most] else Reason.NONE
+        found.append(Period(start_s, end_s, Status(int(status[begin])), reason))
     return found
 
 
@@ -168,7 +168,7 @@ def estimate_verdict(estimate: RecordedEstimate, found: Sequence[Period]) -> str
     whole = {0.0: "never valid", 1.0: "valid throughout"}
     text += f"; {whole.get(scores.valid_fraction, f'valid in {share} of the samples')}"
     if found:
-        longest = max(found, key=lambda period: period.end_s - period.start_s)
+        longest = max(found, key=lambda period: period.duration_s)
         text += f"; {longest.status.name.lower()} {longest.when('from {} to {}')}"
         text += f" because {REASON_WORDS[longest.reason]}" if longest.reason else ""
         text += f", the longest of {len(found)} periods" if len(found) > 1 else ""
@@ -210,125 +210,121 @@ def _reference(log: Recorded) -> FloatArray | None:
 # --- Figures
 
 
-def soc_plot(
+def _soc_figure(
     table: EstimateTable, reference: tuple[FloatArray, FloatArray] | None, time: TimeFigures
-) -> Plot:
+) -> Figure:
     """Return the SoC with ±2σ, by voltage and by counting alone; `reference` is (time_s, SoC)."""
     at = table.time_s
-    plot = time.plot("state of charge", "%", height=380)
     low, high = table.soc_pct - 2.0 * table.soc_std_pct, table.soc_pct + 2.0 * table.soc_std_pct
-    time.band(plot, "±2σ", [(at, np.maximum(low, 0.0), np.minimum(high, 100.0))], BLUE)
-    time.line(plot, "Newton", [(at, table.soc_newton_pct)], Pen(AMBER, 0.8, 0.6, visible=False))
-    time.line(plot, "Coulomb", [(at, table.soc_coulomb_pct)], Pen(GREEN, dash="dashed"))
-    if reference is not None:
-        time.line(plot, "reference", [reference], Pen(BLACK, width=2.0))
-    time.line(plot, "estimate", [(at, table.soc_pct)], Pen(BLUE, width=2.0))
-    return plot
-
-
-def _soc(
-    table: EstimateTable, at: FloatArray, reference: FloatArray | None, time: TimeFigures
-) -> list[Block]:
-    plot = soc_plot(table, None if reference is None else (at, reference), time)
-    caption = "Click “Newton” for the SoC by voltage alone; Coulomb counting drifts."
-    if reference is None:
-        std = time.plot("σ of SoC", "%", height=235)
-        time.line(std, "σ", [(at, table.soc_std_pct)], Pen(BLUE, in_legend=False))
-        return [
-            Figure("Estimated state of charge", plot, f"The log has no reference SoC. {caption}"),
-            Figure("Uncertainty", std, "Standard deviation of the estimated SoC."),
-        ]
-    error = time.plot("SoC error", "%", height=280)
-    band = np.minimum(2.0 * table.soc_std_pct, 100.0)
-    time.band(error, "±2σ", [(at, -band, band)], BLUE)
-    sizes = [(2.0 * table.soc_std_pct, 0.9)]
-    for name, soc_pct, pen in (
-        ("Newton", table.soc_newton_pct, Pen(AMBER, 0.8, 0.6, visible=False)),
-        ("Coulomb", table.soc_coulomb_pct, Pen(GREEN, dash="dashed")),
-        ("estimate", table.soc_pct, Pen(BLUE, width=1.8)),
-    ):
-        time.line(error, name, [(at, soc_pct - reference)], pen)
-        sizes += [(np.abs(soc_pct - reference), 0.99)] if pen.visible else []
-    # A wide start or a few outliers do not flatten the rest.
-    known = [(size[np.isfinite(size)], quantile) for size, quantile in sizes]
-    limit = max((float(np.quantile(size, q)) for size, q in known if size.size), default=1.0)
-    set_y_limits(error, -max(limit, 0.1), max(limit, 0.1))
-    add_zero(error)
     follow = "The estimate should follow the reference, which should lie inside the band."
-    return [
-        Figure("Estimated state of charge", plot, f"{follow} {caption}"),
-        Figure(
-            "Error against the reference",
-            error,
-            "Each SoC minus the reference. An estimate that leaves the ±2σ band for long has an"
-            " error that its model does not expect.",
-        ),
+    follow = "The log has no reference SoC." if reference is None else follow
+    caption = f"{follow} Click “Newton” for the SoC by voltage alone; Coulomb counting drifts."
+    figure = time.figure("Estimated state of charge", "state of charge [%]", caption, height=380)
+    time.band(figure, [(at, np.maximum(low, 0.0), np.minimum(high, 100.0))])
+    time.line(figure, "Newton", [(at, table.soc_newton_pct)], AMBER, **_NEWTON)
+    time.line(figure, "Coulomb", [(at, table.soc_coulomb_pct)], GREEN, line_dash="dashed")
+    if reference is not None:
+        time.line(figure, "reference", [reference], BLACK, line_width=2.0)
+    return time.line(figure, "estimate", [(at, table.soc_pct)], BLUE, line_width=2.0)
+
+
+def _soc_error(
+    estimate: RecordedEstimate, reference: FloatArray | None, time: TimeFigures
+) -> list[Block]:
+    """Return the errors against the reference; without one, the standard deviation alone."""
+    table, scores, at = estimate.table, estimate.scores, estimate.table.time_s
+    if reference is None:
+        caption = "Standard deviation of the estimated SoC."
+        figure = time.figure("Uncertainty", "σ of SoC [%]", caption)
+        return [time.line(figure, "σ", [(at, table.soc_std_pct)], BLUE)]
+    newton, coulomb, error = (
+        soc_pct - reference
+        for soc_pct in (table.soc_newton_pct, table.soc_coulomb_pct, table.soc_pct)
+    )
+    figure = time.figure(
+        "Error against the reference",
+        "SoC error [%]",
+        "Each SoC minus the reference. An estimate that leaves the ±2σ band for long has an"
+        " error that its model does not expect.",
+        height=280,
+    )
+    band = np.minimum(2.0 * table.soc_std_pct, 100.0)
+    time.band(figure, [(at, -band, band)])
+    time.line(figure, "Newton", [(at, newton)], AMBER, **_NEWTON)
+    time.line(figure, "Coulomb", [(at, coulomb)], GREEN, line_dash="dashed")
+    time.line(figure, "estimate", [(at, error)], BLUE, line_width=1.8)
+    figure.mark("width", 0.0)
+    # A wide start or a few outliers do not flatten the rest.
+    sizes = ((2.0 * table.soc_std_pct, 0.9), (coulomb, 0.99), (error, 0.99))
+    known = [(np.abs(size[np.isfinite(size)]), quantile) for size, quantile in sizes]
+    limit = max((float(np.quantile(size, q)) for size, q in known if size.size), default=1.0)
+    figure.set_y_limits(-max(limit, 0.1), max(limit, 0.1))
+    rows = [
+        _error_row("estimate", scores.soc_mae_pct, error),
+        _error_row("Newton alone", scores.soc_newton_mae_pct, newton),
+        _error_row("Coulomb alone", scores.soc_coulomb_mae_pct, coulomb),
     ]
-
-
-def _error_table(estimate: RecordedEstimate, reference: FloatArray) -> Table:
-    table, scores = estimate.table, estimate.scores
-    rows = []
-    for name, soc_pct, mae_pct in (
-        ("estimate", table.soc_pct, scores.soc_mae_pct),
-        ("Newton alone", table.soc_newton_pct, scores.soc_newton_mae_pct),
-        ("Coulomb alone", table.soc_coulomb_pct, scores.soc_coulomb_mae_pct),
-    ):
-        error = (soc_pct - reference)[np.isfinite(soc_pct - reference)]
-        error = error if error.size else np.full(1, np.nan)
-        rms = float(np.sqrt(np.mean(error**2)))
-        values = (mae_pct, rms, float(error.mean()), float(np.abs(error).max()), float(error[-1]))
-        rows.append([name, *(number(value, 2) for value in values)])
     head = ["SoC by", "MAE [%]", "RMSE [%]", "mean [%]", "largest [%]", "at the end [%]"]
     note = f"Over {np.isfinite(reference).sum():,} samples with a reference; errors in % SoC."
-    return Table(head, rows, note)
+    return [figure, Table(head, rows, note)]
+
+
+def _error_row(name: str, mae_pct: float | None, error: FloatArray) -> list[str]:
+    error = error[np.isfinite(error)]
+    error = error if error.size else np.full(1, np.nan)
+    rms = float(np.sqrt(np.mean(error**2)))
+    values = (mae_pct, rms, float(error.mean()), float(np.abs(error).max()), float(error[-1]))
+    return [name, *(number(value, 2) for value in values)]
 
 
 def _voltage(log: Recorded, table: EstimateTable, time: TimeFigures) -> list[Block]:
-    at = log.time_s
-    both = time.plot("voltage", "V", height=260)
-    time.line(both, "measured", [(at, log.voltage_v)], Pen(BLACK, width=1.1))
-    time.line(both, "model", [(at, table.voltage_model_v)], Pen(ORANGE, width=0.9, alpha=0.85))
-    residual = time.plot("residual", "V", height=235)
-    time.line(residual, "residual", [(at, table.residual_v)], Pen(PURPLE, 0.9, in_legend=False))
-    add_zero(residual)
-    running = np.isfinite(log.voltage_v)
+    at, running = log.time_s, np.isfinite(log.voltage_v)
     measured = int(running.sum())
     if measured:
-        running[running] = running_rows(log.time_s[running], log.voltage_v[running])
+        running[running] = running_rows(at[running], log.voltage_v[running])
     error = np.abs(table.residual_v[running])
     error = error[np.isfinite(error)]
-    below = ""
-    if int(running.sum()) < measured and error.size:
+    is_limited = int(running.sum()) < measured and error.size > 0
+    below = " Start-up and shut-down rows lie below the figure." if is_limited else ""
+    both = time.figure(
+        "Measured and modelled voltage",
+        "voltage [V]",
+        f"The model's voltage at the estimated SoC should lie on the measurement.{below}",
+        height=260,
+    )
+    time.line(both, "measured", [(at, log.voltage_v)], BLACK, line_width=1.1)
+    model = [(at, table.voltage_model_v)]
+    time.line(both, "model", model, ORANGE, line_width=0.9, line_alpha=0.85)
+    residual = time.figure(
+        "Measured minus modelled voltage",
+        "residual [V]",
+        "Scatter about zero averages out. A lasting bias shifts the SoC; the filter allows for"
+        " the lasting error that the model file states.",
+    )
+    time.line(residual, "residual", [(at, table.residual_v)], PURPLE, line_width=0.9)
+    residual.mark("width", 0.0)
+    if is_limited:
         shown = np.concatenate([log.voltage_v[running], table.voltage_model_v[running]])
-        set_y_limits(both, float(np.nanmin(shown)), float(np.nanmax(shown)))
+        both.set_y_limits(float(np.nanmin(shown)), float(np.nanmax(shown)))
         limit = float(np.quantile(error, 0.9995))
-        set_y_limits(residual, -limit, limit)
-        below = " Start-up and shut-down rows lie below the figure."
-    follow = "The model's voltage at the estimated SoC should lie on the measurement."
-    return [
-        Figure("Measured and modelled voltage", both, f"{follow}{below}"),
-        Figure(
-            "Measured minus modelled voltage",
-            residual,
-            "Scatter about zero averages out. A lasting bias shifts the SoC; the filter allows for"
-            " the lasting error that the model file states.",
-        ),
-    ]
+        residual.set_y_limits(-limit, limit)
+    return [both, residual]
 
 
 def _input(log: Recorded, time: TimeFigures) -> list[Block]:
-    valid = "An estimate is valid only at temperatures that the model was identified at."
-    figures: list[Block] = []
-    for name, unit, values, color, caption in (
-        ("Current", "A", log.current_a, BLUE, "Positive current discharges the pack."),
-        ("Temperature", "°C", log.temperature_c, ORANGE,
-         f"Measured on: {log.temperature_source}. {valid}"),
-    ):  # fmt: skip
-        plot = time.plot(name.lower(), unit, height=235)
-        time.line(plot, name.lower(), [(log.time_s, values)], Pen(color, 1.0, in_legend=False))
-        figures.append(Figure(name, plot, caption))
-    return figures
+    channels = (
+        ("current", "A", log.current_a, BLUE, "Positive current discharges the pack."),
+        ("temperature", "°C", log.temperature_c, ORANGE,
+         f"Measured on: {log.temperature_source}. An estimate is valid only at temperatures that"
+         " the model was identified at."),
+    )  # fmt: skip
+    return [
+        time.line(
+            time.figure(name.capitalize(), f"{name} [{unit}]", caption),
+            name, [(log.time_s, values)], color, line_width=1.0,
+        )
+        for name, unit, values, color, caption in channels
+    ]  # fmt: skip
 
 
 # --- Status
@@ -341,42 +337,31 @@ def _status_figure(log: Recorded, table: EstimateTable, time: TimeFigures) -> Fi
         ("status", status.name.lower(), table.status == status, _STATUS_COLORS[status])
         for status in Status
     ]
-    bars += [
-        (reason_name(reason), reason_name(reason), (table.reasons & reason) != 0, AMBER)
-        for reason in _occurring(table)
-    ]
+    bars += [(name, name, mask, AMBER) for name, mask, _ in _reason_masks(table)]
     names = list(dict.fromkeys(row for row, _, _, _ in bars))
-    plot = new_figure(
-        (time.label, ""),
-        f"@what<br>@left{{0.[00]}} … @right{{0.[00]}} {time.unit}",
-        units=("", ""),
+    figure = Figure(
+        "Status over time",
+        time.label,
+        "",
+        "Green: valid; amber: degraded; grey: initialising; black: invalid. Below: when each reason"
+        " applied.",
+        hover=f"@what<br>@left{{0.[00]}} … @right{{0.[00]}} {time.unit}",
         height=76 + 30 * len(names),
         x_range=time.x_range,
         y_categories=names[::-1],
     )
-    for row, what, mask, color in bars:
-        left, right = _intervals(at, mask)
-        columns: dict[str, Any] = {"left": left, "right": right}
-        columns |= {"row": [row] * left.size, "what": [what] * left.size}
-        plot.hbar(
-            y="row",
-            left="left",
-            right="right",
-            height=0.62,
-            fill_color=color,
-            line_color=color,  # keeps a single sample visible
-            source=ColumnDataSource(columns),
-        )
-    plot.ygrid.grid_line_color = None
-    return Figure(
-        "Status over time",
-        plot,
-        "Green: valid; amber: degraded; grey: initialising; black: invalid. Below: when each reason"
-        " applied.",
-    )
+    spans = [(row, what, *ends, c) for row, what, mask, c in bars for ends in _intervals(at, mask)]
+    columns = zip(("row", "what", "left", "right", "color"), zip(*spans, strict=True), strict=True)
+    # An outline keeps a single sample visible.
+    figure.plot.hbar(
+        y="row", left="left", right="right", height=0.62, fill_color="color", line_color="color",
+        source=ColumnDataSource(dict(columns)),
+    )  # fmt: skip
+    figure.plot.ygrid.grid_line_color = None
+    return figure
 
 
-def _intervals(at: FloatArray, mask: NDArray[np.bool_]) -> tuple[FloatArray, FloatArray]:
+def _intervals(at: FloatArray, mask: NDArray[np.bool_]) -> list[tuple[float, float]]:
     """Return where `mask` begins and ceases to hold; each row lasts until the next one."""
     change = np.diff(np.concatenate(([0], mask.astype(np.int8), [0])))
     begin, end = np.flatnonzero(change == 1), np.flatnonzero(change == -1)
@@ -384,68 +369,62 @@ def _intervals(at: FloatArray, mask: NDArray[np.bool_]) -> tuple[FloatArray, Flo
     if left.size > 1:
         apart = left[1:] - right[:-1] >= (at[-1] - at[0]) / _MAX_BARS
         left, right = left[np.r_[True, apart]], right[np.r_[apart, True]]
-    return left, right
+    return list(zip(left.tolist(), right.tolist(), strict=True))
+
+
+def _reason_masks(table: EstimateTable) -> list[tuple[str, NDArray[np.bool_], str]]:
+    """Return name, rows and meaning of each reason that occurs."""
+    masks = [(reason, (table.reasons & reason) != 0) for reason in Reason]
+    return [
+        (reason_name(reason), mask, REASON_WORDS[reason]) for reason, mask in masks if mask.any()
+    ]
 
 
 def _reasons(table: EstimateTable) -> Table:
     """Return the share of samples with each status and each reason, with its meaning."""
     shares = [(status.name.lower(), table.status == status, "") for status in Status]
-    shares += [
-        (reason_name(reason), (table.reasons & reason) != 0, REASON_WORDS[reason])
-        for reason in _occurring(table)
-    ]
-    rows = [
-        [name, number(100.0 * float(mask.mean()), 1, "%"), words]
-        for name, mask, words in shares
-        if mask.any()
-    ]
-    return Table(["status or reason", "share of samples", "meaning"], rows)
+    return Table.of(
+        [share for share in (*shares, *_reason_masks(table)) if share[1].any()],
+        {
+            "status or reason": lambda share: share[0],
+            "share of samples": lambda share: number(100.0 * float(share[1].mean()), 1, "%"),
+            "meaning": lambda share: share[2],
+        },
+    )
 
 
 def _periods(found: Sequence[Period]) -> list[Block]:
     """Return the table of the periods without a valid estimate."""
     if not found:
         return []
-    longest = sorted(found, key=lambda period: period.start_s - period.end_s)[:_LISTED_PERIODS]
-    rows = [
-        [
-            period.when(),
-            duration(period.end_s - period.start_s),
-            period.status.name.lower(),
-            REASON_WORDS.get(period.reason, ""),
-        ]
-        for period in sorted(longest)
-    ]
+    longest = sorted(found, key=lambda period: -period.duration_s)[:_LISTED_PERIODS]
     note = "h:mm:ss since the start of the log."
-    if len(found) > len(rows):
-        note += f" The longest {len(rows)} of {len(found):,} periods."
-    return [Table(["period", "duration", "status", "main reason"], rows, note)]
+    if len(found) > len(longest):
+        note += f" The longest {len(longest)} of {len(found):,} periods."
+    columns = {
+        "period": Period.when,
+        "duration": lambda period: duration(period.duration_s),
+        "status": lambda period: period.status.name.lower(),
+        "main reason": lambda period: REASON_WORDS.get(period.reason, ""),
+    }
+    return [Table.of(sorted(longest), columns, note)]
 
 
-def _occurring(table: EstimateTable) -> Sequence[Reason]:
-    return [reason for reason in Reason if np.any(table.reasons & reason)]
-
-
-def _settings(estimate: RecordedEstimate) -> list[Block]:
+def _settings(estimate: RecordedEstimate) -> Table:
     log, model, settings = estimate.recorded, estimate.model, estimate.settings
     initial = "from the first voltages"
     if settings.initial_soc_pct is not None:
         std = number(settings.initial_soc_std_pct, 1, "%")
         initial = f"{number(settings.initial_soc_pct, 1)} ± {std}"
     error = number(model.noise.voltage_mae_pct, 2, "%")
-    rows = {
-        "method": settings.method,
-        "initial SoC (±1σ)": initial,
-        "capacity": number(settings.capacity_ah or model.capacity_ah, 2, "Ah"),
-        "a gap is longer than": number(settings.gap_s, 1, "s"),
-        "model": model.name,
-        "voltage error (MAE) of the model": f"{error} on {model.noise.judged_on}",
-        "identified at SoC": span(*model.range.soc_pct, 1, "%"),
-        "identified at temperature": span(*model.range.temperature_c, 1, "°C"),
-        "identified at current": span(*model.range.current_a, 0, "A"),
-        "temperature of model / log": f"{model.temperature_source} / {log.temperature_source}",
-    }
-    blocks: list[Block] = [Table(["setting", ""], [list(row) for row in rows.items()])]
-    if log.remarks:
-        blocks += [Paragraph("Remarks on the log:"), Bullets(log.remarks)]
-    return blocks
+    rows = [
+        ["method", settings.method],
+        ["initial SoC (±1σ)", initial],
+        ["capacity", number(settings.capacity_ah or model.capacity_ah, 2, "Ah")],
+        ["a gap is longer than", number(settings.gap_s, 1, "s")],
+        ["model", model.name],
+        ["voltage error (MAE) of the model", f"{error} on {model.noise.judged_on}"],
+        *range_rows(model),
+        ["temperature of model / log", f"{model.temperature_source} / {log.temperature_source}"],
+    ]
+    return Table(["setting", ""], rows)

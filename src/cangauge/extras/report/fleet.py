@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from datetime import UTC, datetime
 from typing import Any, Final
 
@@ -15,20 +15,9 @@ from cangauge.extras.fleet.outliers import OUTLIER_Z
 from cangauge.extras.fleet.overview import QUANTITIES, FleetOverview
 from cangauge.extras.fleet.results import by_kind, reason_of
 from cangauge.extras.fleet.sources import short_names
-from cangauge.extras.report.charts import BLUE, GREY, ORANGE, Pen, Plot, add_line, bars, new_figure
-from cangauge.extras.report.fit import coefficient_tables, settings_table, slope_plot
-from cangauge.extras.report.page import (
-    Block,
-    Figure,
-    InputFile,
-    Page,
-    Paragraph,
-    Section,
-    Table,
-    Tile,
-    joined,
-    render,
-)
+from cangauge.extras.report.charts import BLUE, GREY, ORANGE, Figure, bars
+from cangauge.extras.report.fit import coefficient_tables, settings_table, slope_figure
+from cangauge.extras.report.page import Block, Page, Table, Tile, joined
 
 _SHOWN: Final = 200
 """Vehicles that a table or a figure shows; the results have all."""
@@ -43,22 +32,19 @@ _LABELS: Final = {
 }
 
 
-def fleet_report(found: FleetOverview) -> str:
-    """Return the results of a fleet as one self-contained HTML page."""
-    parts = (
-        ("Gaps", _gaps(found) if found.gaps else []),
-        ("Health over time", _health(found) if found.health else []),
-        ("State of charge", [_estimates(found)] if found.estimates else []),
-        ("Logs set aside", _set_aside(found.bad)),
-    )
-    return render(
-        Page(
-            title=f"Fleet of {counted(len(found.vehicles), 'vehicle')}",
-            subtitle=found.name,
-            lead=_lead(found),
-            tiles=_tiles(found),
-            sections=[Section(title, blocks) for title, blocks in parts if blocks],
-        )
+def fleet_page(found: FleetOverview) -> Page:
+    """Return the page of the results of a fleet."""
+    return Page(
+        title=f"Fleet of {counted(len(found.vehicles), 'vehicle')}",
+        lead=_lead(found),
+        subtitle=found.name,
+        tiles=_tiles(found),
+        sections={
+            "Gaps": _gaps(found) if found.gaps else [],
+            "Health over time": _health(found) if found.health else [],
+            "State of charge": [_estimates(found)] if found.estimates else [],
+            "Logs set aside": _set_aside(found.bad),
+        },
     )
 
 
@@ -100,39 +86,34 @@ def _tiles(found: FleetOverview) -> list[Tile]:
 
 
 def _gaps(found: FleetOverview) -> list[Block]:
-    rows = []
-    for name in found.by_gap[:_SHOWN]:
-        row = found.gaps[name]
-        closed = row["closed_fraction"]
-        rows.append(
-            [
-                name,
-                "gap" if row["detected"] else "–",
-                row["verdict"],
-                number(row["probability"], 2),
-                number(row["probability_none"], 3),
-                number(row["baseline_rmse_v"], 2),
-                number(row["healthy_rmse_v"], 2),
-                number(None if closed is None else 100.0 * closed, 0),
-                ", ".join(row["credible_set"]),
-            ]
-        )
-    head = [
-        "vehicle", "alarm", "verdict", "its probability", "P(no fault)", "error [V]",
-        "of references [V]", "closed [%]", "90 % set",
-    ]  # fmt: skip
-    entries = [
-        (
-            name,
-            row["baseline_rmse_v"] / row["healthy_rmse_v"],
-            ORANGE if row["detected"] else GREY,
-        )
-        for name, row in found.gaps.items()
+    table = _table(
+        [(name, found.gaps[name]) for name in found.by_gap],
+        {
+            "vehicle": lambda of: of[0],
+            "alarm": lambda of: "gap" if of[1]["detected"] else "–",
+            "verdict": lambda of: of[1]["verdict"],
+            "its probability": lambda of: number(of[1]["probability"], 2),
+            "P(no fault)": lambda of: number(of[1]["probability_none"], 3),
+            "error [V]": lambda of: number(of[1]["baseline_rmse_v"], 2),
+            "of references [V]": lambda of: number(of[1]["healthy_rmse_v"], 2),
+            "closed [%]": lambda of: _percent(of[1]["closed_fraction"]),
+            "90 % set": lambda of: ", ".join(of[1]["credible_set"]),
+        },
+    )
+    ratios = {
+        name: row["baseline_rmse_v"] / row["healthy_rmse_v"] for name, row in found.gaps.items()
+    }
+    largest = [
+        (name, ratios[name], ORANGE if found.gaps[name]["detected"] else GREY)
+        for name in sorted(ratios, key=lambda name: -ratios[name])[:_BARS]
     ]
-    largest = sorted(entries, key=lambda entry: -entry[1])[:_BARS]
-    plot = bars("error of the model over that of the references", "", largest, decimals=2)
     caption = f"The {len(largest)} largest. Orange: P(no fault) is below the alarm's limit."
-    return [_table(head, rows, len(found.gaps)), Figure("Size of the gaps", plot, caption)]
+    label = "error of the model over that of the references"
+    return [table, bars("Size of the gaps", label, largest, caption)]
+
+
+def _percent(share: float | None) -> str:
+    return number(None if share is None else 100.0 * share, 0)
 
 
 def _health(found: FleetOverview) -> list[Block]:
@@ -146,163 +127,144 @@ def _health(found: FleetOverview) -> list[Block]:
         shown = [number(value, digits, unit) for value in numbers]
         rows.append([vehicle, label, *shown, number(z, 1)])
     head = ["vehicle", "outlier in", "value", "σ", "median of the fleet", "robust z"]
-    outliers = _table(head, rows, len(found.outlying)) if rows else Paragraph(found.no_outlier_text)
-    caption = "One line a vehicle, a point at the end of each log; outliers of the fleet in orange."
-    figures = [
-        Figure(_LABELS[quantity][0].capitalize(), _over_time(found, quantity), caption)
-        for quantity in QUANTITIES
-    ]
-    return [outliers, *figures]
+    outliers = Table(head, rows, _note(len(found.outlying))) if rows else found.no_outlier_text
+    return [outliers, *(_over_time(found, quantity) for quantity in QUANTITIES)]
 
 
-def _over_time(found: FleetOverview, quantity: str) -> Plot:
+def _over_time(found: FleetOverview, quantity: str) -> Figure:
     label, unit, _ = _LABELS[quantity]
     marked = sorted(vehicle for vehicle, of, _ in found.outlying if of == quantity)
-    starts_s = [rows[0]["end_s"] for rows in found.health.values()]
-    first_s = min(starts_s)
+    first_s = min(rows[0]["end_s"] for rows in found.health.values())
     dated = first_s > _YEAR_2000_S
     since = datetime.fromtimestamp(first_s, UTC).strftime("since %Y-%m-%d") if dated else "time"
-    plot = new_figure((since, label), "$name: @y", units=("days", unit), height=320)
+    figure = Figure(
+        label.capitalize(),
+        f"{since} [days]",
+        f"{label} [{unit}]" if unit else label,
+        "One line a vehicle, a point at the end of each log; outliers of the fleet in orange.",
+        hover="$name: @y",
+        height=320,
+    )
     others = [name for name in found.health if name not in marked][:_SHOWN]
     for name in (*others, *marked):
         rows = [row for row in found.health[name] if row[quantity] is not None]
         x = np.array([(row["end_s"] - first_s) / 86400.0 for row in rows])
-        y = np.array([row[quantity] for row in rows])
+        y = np.array([row[quantity] for row in rows], np.float64)
         is_marked = name in marked
-        color = ORANGE if is_marked else BLUE
-        pen = Pen(color, 2.0 if is_marked else 1.0, 1.0 if is_marked else 0.5, in_legend=is_marked)
-        add_line(plot, name, x, y, pen)
-        plot.scatter(x=x, y=y, size=4, color=color, alpha=pen.alpha, name=name)
-    return plot
+        color, width, alpha = (ORANGE, 2.0, 1.0) if is_marked else (BLUE, 1.0, 0.5)
+        figure.line(name, x, y, color, in_legend=is_marked, line_width=width, line_alpha=alpha)
+        figure.plot.scatter(x=x, y=y, size=4, color=color, alpha=alpha, name=name)
+    return figure
 
 
 def _estimates(found: FleetOverview) -> Table:
-    rows = []
-    worst_first = sorted(
-        found.estimates.items(),
-        key=lambda item: -(mean_of([row["soc_mae_pct"] for row in item[1]]) or 0.0),
+    """Return the errors of each vehicle, the worst first."""
+
+    def mean(rows: Sequence[Mapping[str, Any]], column: str) -> float | None:
+        return mean_of([row[column] for row in rows])
+
+    def worst(rows: Sequence[Mapping[str, Any]]) -> float | None:
+        errors = [row["soc_mae_pct"] for row in rows if row["soc_mae_pct"] is not None]
+        return max(errors, default=None)
+
+    return _table(
+        sorted(found.estimates.items(), key=lambda of: -(mean(of[1], "soc_mae_pct") or 0.0)),
+        {
+            "vehicle": lambda of: of[0],
+            "logs": lambda of: str(len(of[1])),
+            "hours": lambda of: number(sum(row["duration_s"] for row in of[1]) / 3600.0, 1),
+            "SoC MAE [%]": lambda of: number(mean(of[1], "soc_mae_pct"), 2),
+            "worst log [%]": lambda of: number(worst(of[1]), 2),
+            "mean σ [%]": lambda of: number(mean(of[1], "mean_soc_std_pct"), 2),
+            "within 2σ [%]": lambda of: _percent(mean(of[1], "cover_2sigma")),
+            "valid [%]": lambda of: _percent(mean(of[1], "valid_share")),
+        },
     )
-    for name, of_vehicle in worst_first:
-        columns = ("soc_mae_pct", "mean_soc_std_pct", "cover_2sigma", "valid_share")
-        error, std, cover, valid = (
-            mean_of([row[column] for row in of_vehicle]) for column in columns
-        )
-        known = [row["soc_mae_pct"] for row in of_vehicle if row["soc_mae_pct"] is not None]
-        percents = [None if share is None else 100.0 * share for share in (cover, valid)]
-        rows.append(
-            [
-                name,
-                str(len(of_vehicle)),
-                number(sum(row["duration_s"] for row in of_vehicle) / 3600.0, 1),
-                number(error, 2),
-                number(max(known, default=None), 2),
-                number(std, 2),
-                *(number(share, 0) for share in percents),
-            ]
-        )
-    head = [
-        "vehicle", "logs", "hours", "SoC MAE [%]", "worst log [%]", "mean σ [%]",
-        "within 2σ [%]", "valid [%]",
-    ]  # fmt: skip
-    return _table(head, rows, len(rows))
 
 
 def _set_aside(bad: Sequence[Mapping[str, Any]], heading: str = "command") -> list[Block]:
     """Return a table of the reasons for which logs were set aside, if any were."""
     rows = [[row["table"], str(count), reason_of(row), row["log"]] for row, count in by_kind(bad)]
-    return [_table([heading, "logs", "reason", "for example"], rows, len(rows))] if rows else []
+    head = [heading, "logs", "reason", "for example"]
+    return [Table(head, rows[:_SHOWN], _note(len(rows)))] if rows else []
 
 
-def _table(head: Sequence[str], rows: Sequence[Sequence[str]], total: int) -> Table:
-    note = f"{_SHOWN} of {total}; the results have all." if total > _SHOWN else ""
-    return Table(head, rows[:_SHOWN], note=note)
+def _table(items: Sequence[Any], columns: Mapping[str, Callable[[Any], str]]) -> Table:
+    return Table.of(items[:_SHOWN], columns, _note(len(items)))
 
 
-def fleet_fit_report(result: FleetFit) -> str:
-    """Return the report of a fleet's fit as one self-contained HTML page."""
+def _note(total: int) -> str:
+    return f"{_SHOWN} of {total}; the results have all." if total > _SHOWN else ""
+
+
+def fleet_fit_page(result: FleetFit) -> Page:
+    """Return the page of a fleet's fit."""
     model, by_log = result.model, result.by_log
     unused = [
         *(row | {"table": "set aside"} for row in result.bad),
         *(row | {"table": "left out"} for row in result.left_out),
     ]
-    curve = new_figure(
-        ("state of charge", "voltage"), "@y{0.00} V<br>at @x{0.0} %", units=("%", "V"), height=340
+    grid, equation = np.linspace(0.0, 100.0, 401), model.voltage_model()
+    curve = Figure(
+        "Pseudo-OCV against SoC",
+        "state of charge [%]",
+        "voltage [V]",
+        "The curve of all logs.",
+        hover="@y{0.00} V<br>at @x{0.0} %",
+        height=340,
     )
-    grid = np.linspace(0.0, 100.0, 401)
-    equation = model.voltage_model()
-    add_line(curve, "pseudo-OCV", grid, equation.pseudo_ocv(grid), Pen(BLUE, 2.2, in_legend=False))
-    parts = (
-        ("Logs that do not fit the others", _misfits(result)),
-        (
-            "Pseudo-OCV",
-            [
-                Figure("Pseudo-OCV against SoC", curve, "The curve of all logs."),
-                Figure(
-                    "Slope of the pseudo-OCV",
-                    slope_plot(equation),
-                    "A voltage error divided by this slope is the SoC error.",
-                ),
-            ],
-        ),
-        ("Coefficients", coefficient_tables(model, result.published.condition_number)),
-        ("Logs set aside and left out", _set_aside(unused, "status")),
-        ("How the model was made", [settings_table(model)]),
-    )
-    figures, noise = result.to_dict(), model.noise
+    curve.line("pseudo-OCV", grid, equation.pseudo_ocv(grid), BLUE, line_width=2.2)
+    slope = slope_figure(equation, "A voltage error divided by this slope is the SoC error.")
+    figures = result.to_dict()
     names = [by_log.logs[k] for k in by_log.misfits]
     verb = "does" if len(names) == 1 else "do"
     lead = f"{by_log.count_text} logs {verb} not fit the others: {joined(names)}."
     if not names:
         lead = "Every log fits the others." if by_log.is_known else by_log.rule_text
-    return render(
-        Page(
-            title=f"Voltage model {model.name}",
-            lead=lead,
-            subtitle=f"Identified from {result.logs_used} logs of a fleet.",
-            tiles=[
-                Tile(
-                    "Voltage error (RMSE)",
-                    significant(figures["voltage_rmse_v"], 3, "V"),
-                    f"{number(figures['voltage_rmse_pct'], 3, '%')} of the voltage",
-                ),
-                Tile(
-                    "Logs left out (RMSE)",
-                    significant(noise.voltage_rmse_v, 3, "V"),
-                    "each by the model of the others",
-                ),
-                Tile("Logs used", str(result.logs_used), f"{result.rows:,} rows"),
-                Tile("Do not fit the others", by_log.count_text, "used all the same"),
-                Tile("Logs set aside", str(len(unused)), "not used"),
-            ],
-            sections=[Section(title, blocks) for title, blocks in parts if blocks],
-            inputs=[InputFile.of_model(model)],
-        )
+    rmse = significant(figures["voltage_rmse_v"], 3, "V")
+    share = f"{number(figures['voltage_rmse_pct'], 3, '%')} of the voltage"
+    left_out = significant(model.noise.voltage_rmse_v, 3, "V")
+    return Page(
+        title=f"Voltage model {model.name}",
+        lead=lead,
+        subtitle=f"Identified from {result.logs_used} logs of a fleet.",
+        tiles=[
+            Tile("Voltage error (RMSE)", rmse, share),
+            Tile("Logs left out (RMSE)", left_out, "each by the model of the others"),
+            Tile("Logs used", str(result.logs_used), f"{result.rows:,} rows"),
+            Tile("Do not fit the others", by_log.count_text, "used all the same"),
+            Tile("Logs set aside", str(len(unused)), "not used"),
+        ],
+        sections={
+            "Logs that do not fit the others": _misfits(result),
+            "Pseudo-OCV": [curve, slope],
+            "Coefficients": coefficient_tables(model, result.published.condition_number),
+            "Logs set aside and left out": _set_aside(unused, "status"),
+            "How the model was made": [settings_table(model)],
+        },
+        model=model,
     )
 
 
 def _misfits(result: FleetFit) -> list[Block]:
-    by_log, z = result.by_log, result.by_log.z
-    rows = [
-        [
-            by_log.vehicles[k],
-            by_log.logs[k],
-            significant(float(by_log.mean_v[k]), 3),
-            significant(float(by_log.rmse_v[k]), 3),
-            number(float(z[k]), 1),
-        ]
-        for k in by_log.misfits
-    ]
+    by_log = result.by_log
+    table = _table(
+        by_log.misfits,
+        {
+            "vehicle": lambda k: by_log.vehicles[k],
+            "log": lambda k: by_log.logs[k],
+            "mean error [V]": lambda k: significant(float(by_log.mean_v[k]), 3),
+            "RMSE [V]": lambda k: significant(float(by_log.rmse_v[k]), 3),
+            "robust z": lambda k: number(float(by_log.z[k]), 1),
+        },
+    )
     largest = by_log.order[:_BARS]
     names = short_names([by_log.logs[k] for k in largest])
     entries = [
         (name, float(by_log.mean_v[k]), ORANGE if k in by_log.misfits else GREY)
         for name, k in zip(names, largest, strict=True)
     ]
-    plot = bars("mean of measured − modelled", "V", entries, decimals=None)
-    head = ["vehicle", "log", "mean error [V]", "RMSE [V]", "robust z"]
     caption = f"The {len(largest)} farthest of {len(by_log.logs)}."
-    return [
-        *([_table(head, rows, len(rows))] if rows else []),
-        Paragraph(by_log.rule_text),
-        Figure("Mean error of each log under the model of all", plot, caption),
-    ]
+    title, label = "Mean error of each log under the model of all", "mean of measured − modelled"
+    figure = bars(title, label, entries, caption, unit="V", decimals=None)
+    return [*([table] if table.rows else []), by_log.rule_text, figure]

@@ -6,92 +6,32 @@ no network and stays readable.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any, ClassVar, Final
+from typing import Any, Final, TypeVar
 
 from bokeh.document import Document
 from bokeh.embed import components
 from bokeh.resources import Resources
 from bokeh.themes import Theme
-from jinja2 import Environment, PackageLoader, StrictUndefined
+from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
 from cangauge._files import file_sha256, text_sha256
-from cangauge._text import is_numeric
+from cangauge._text import is_numeric, span
 from cangauge._version import __version__
-from cangauge.extras.report.charts import MAX_POINTS
+from cangauge.extras.report.charts import MAX_POINTS, Figure
 from cangauge.model.model_file import Model
+from cangauge.service.offline import Recorded
 
-_FONT: Final = "system-ui, -apple-system, 'Segoe UI', Roboto, 'Helvetica Neue', Arial, sans-serif"
-"""As in page.css: a canvas does not inherit the page's font."""
+Item = TypeVar("Item")
 
-_THEME: Final = Theme(
-    json={
-        "attrs": {
-            "Plot": {
-                "background_fill_color": "#ffffff",
-                "border_fill_color": "#ffffff",
-                "outline_line_color": "#d5dae1",
-            },
-            "Axis": {
-                "axis_label_text_font": _FONT,
-                "axis_label_text_font_size": "13px",
-                "axis_label_text_font_style": "normal",
-                "axis_label_text_color": "#3b4654",
-                "major_label_text_font": _FONT,
-                "major_label_text_font_size": "12px",
-                "major_label_text_color": "#3b4654",
-                "axis_line_color": "#aab3bf",
-                "major_tick_line_color": "#aab3bf",
-                "minor_tick_line_color": None,
-            },
-            "Grid": {"grid_line_color": "#edf0f4"},
-            "Legend": {
-                "label_text_font": _FONT,
-                "label_text_font_size": "12px",
-                "label_text_color": "#1c2430",
-                "border_line_color": None,
-                "background_fill_alpha": 0.0,
-                "padding": 0,
-                "margin": 2,
-                "spacing": 14,
-                "glyph_width": 18,
-            },
-        }
-    }
+_RECONSTRUCTION: Final = (
+    "This is a reconstruction: the log was computed from a published equation and published"
+    " coefficients. It is not a recording of a car."
 )
-
-
-@dataclass(frozen=True)
-class InputFile:
-    """An input file of a page.
-
-    Parameters
-    ----------
-    role : str
-        "model", "log", "reference", …
-    name : str
-    sha256 : str, optional
-        In hexadecimal; None where the data did not come from a single file.
-    """
-
-    role: str
-    name: str
-    sha256: str | None = None
-
-    @classmethod
-    def of_path(cls, role: str, name: str, path: str | Path) -> InputFile:
-        """Hash the file at `path`, if it is one."""
-        return cls(role, name, file_sha256(path))
-
-    @classmethod
-    def of_model(cls, model: Model, path: Path | None = None) -> InputFile:
-        """Hash a model's file, or without one the file that it would be written as."""
-        if path is not None:
-            return cls.of_path("model", model.name, path)
-        return cls("model", model.name, text_sha256(model.to_json()))
+_TEMPLATES: Final = Path(__file__).with_name("templates")
 
 
 @dataclass(frozen=True)
@@ -107,10 +47,17 @@ class Tile:
 class Table:
     """A table of texts; columns of numbers are set flush right."""
 
-    kind: ClassVar[str] = "table"
     head: Sequence[str]
     rows: Sequence[Sequence[str]]
     note: str = ""
+
+    @classmethod
+    def of(
+        cls, items: Iterable[Item], columns: Mapping[str, Callable[[Item], str]], note: str = ""
+    ) -> Table:
+        """Return a table with a row for each item; `columns` maps a heading to a cell's text."""
+        rows = [[text(item) for text in columns.values()] for item in items]
+        return cls(list(columns), rows, note)
 
     @property
     def is_numeric(self) -> list[bool]:
@@ -119,60 +66,8 @@ class Table:
         return [is_numeric(column) for column in columns]
 
 
-@dataclass(frozen=True, eq=False)
-class Figure:
-    """A bokeh figure with a title above and a caption below.
-
-    Parameters
-    ----------
-    title : str
-    plot : bokeh figure
-        `bokeh.plotting.show(figure.plot)` draws it in a notebook.
-    caption : str
-        What to look for.
-    """
-
-    kind: ClassVar[str] = "figure"
-    title: str
-    plot: Any
-    caption: str
-
-
-@dataclass(frozen=True, eq=False)
-class Beside:
-    """Figures side by side where the page is wide enough."""
-
-    kind: ClassVar[str] = "beside"
-    figures: Sequence[Figure]
-
-
-@dataclass(frozen=True)
-class Paragraph:
-    """Plain text."""
-
-    kind: ClassVar[str] = "paragraph"
-    text: str
-
-
-@dataclass(frozen=True)
-class Bullets:
-    """A list of remarks."""
-
-    kind: ClassVar[str] = "bullets"
-    items: Sequence[str]
-
-
-Block = Table | Figure | Beside | Paragraph | Bullets
-
-
-@dataclass(frozen=True, eq=False)
-class Section:
-    """A titled part of the page."""
-
-    title: str
-    blocks: Sequence[Block]
-    is_folded: bool = False
-    """Whether only the title is seen until it is opened."""
+Block = str | Table | Figure | Sequence[str] | Sequence[Figure]
+"""A paragraph, a table, a figure, a list of remarks, or figures side by side."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -183,60 +78,90 @@ class Page:
     ----------
     title : str
         Names the model or the logs; also the title of the browser's tab.
+    lead : str
+        The result in a sentence.
     subtitle : str
     tiles : sequence of Tile
-    sections : sequence of Section
-    lead : str
-        The result in a sentence, above the subtitle.
-    inputs : sequence of InputFile
-        Input files.
-    banners : sequence of str
-        Warnings at the top of the page, such as that a log is a reconstruction.
+    sections, folded : mapping of str to sequence of Block
+        Parts by title; of a folded one only the title is seen until it is opened. A part without
+        blocks is left out.
+    model : Model, optional
+    model_path : Path, optional
+        The model's file; without one the model is hashed as it would be written.
+    logs : sequence of Log or RecordedCapture
+        Named with their SHA-256; a banner says so if one is a reconstruction.
+    warnings : sequence of str
+        Further banners at the top of the page.
     """
 
     title: str
+    lead: str
     subtitle: str
     tiles: Sequence[Tile]
-    sections: Sequence[Section]
-    lead: str = ""
-    inputs: Sequence[InputFile] = field(default=())
-    banners: Sequence[str] = field(default=())
+    sections: Mapping[str, Sequence[Block]]
+    folded: Mapping[str, Sequence[Block]] = field(default_factory=dict)
+    model: Model | None = None
+    model_path: Path | None = None
+    logs: Sequence[Recorded] = ()
+    warnings: Sequence[str] = ()
 
     @property
     def figures(self) -> list[Figure]:
         """All figures in the order of the page."""
-        blocks = [block for section in self.sections for block in section.blocks]
-        beside = [block.figures if isinstance(block, Beside) else [block] for block in blocks]
-        return [item for items in beside for item in items if isinstance(item, Figure)]
+        parts = (*self.sections.values(), *self.folded.values())
+        blocks = [block for part in parts for block in part]
+        rows = [block if isinstance(block, list | tuple) else [block] for block in blocks]
+        return [item for row in rows for item in row if isinstance(item, Figure)]
 
+    def html(self) -> str:
+        """Return the page as one self-contained text, dated now."""
+        figures = self.figures
+        script, drawn, bokeh_js = "", (), ""
+        if figures:
+            _add_to_document([item.plot for item in figures])
+            theme = Theme(filename=_TEMPLATES / "theme.yaml")
+            script, drawn = components([item.plot for item in figures], theme=theme)
+            # Only bokeh's core: its widgets, tables and formulae would add 2.7 MB.
+            bokeh_js = Resources(mode="inline", components=["bokeh"]).render()
+        environment = Environment(
+            loader=FileSystemLoader(_TEMPLATES),
+            autoescape=True,
+            undefined=StrictUndefined,
+            trim_blocks=True,
+            lstrip_blocks=True,
+        )
+        environment.tests["figure"] = lambda block: isinstance(block, Figure)
+        environment.tests["table"] = lambda block: isinstance(block, Table)
+        texts = [text for log in self.logs for text in (log.name, log.source, *log.remarks)]
+        is_reconstruction = any("reconstruction" in text.lower() for text in texts)
+        parts = [
+            (title, blocks, is_folded)
+            for of, is_folded in ((self.sections, False), (self.folded, True))
+            for title, blocks in of.items()
+            if blocks
+        ]
+        return environment.get_template("page.html.j2").render(
+            page=self,
+            parts=parts,
+            inputs=self._inputs(),
+            banners=[*([_RECONSTRUCTION] if is_reconstruction else []), *self.warnings],
+            plots=dict(zip(figures, drawn, strict=True)),
+            style=(_TEMPLATES / "page.css").read_text(encoding="utf-8"),
+            bokeh_js=bokeh_js,
+            bokeh_script=script,
+            version=__version__,
+            made=datetime.now(UTC),
+            max_points=MAX_POINTS,
+        )
 
-def render(page: Page) -> str:
-    """Return the page as one self-contained HTML text, dated now."""
-    figures = page.figures
-    script, drawn, bokeh_js = "", (), ""
-    if figures:
-        _add_to_document([item.plot for item in figures])
-        script, drawn = components([item.plot for item in figures], theme=_THEME)
-        # Only bokeh's core: its widgets, tables and formulae would add 2.7 MB.
-        bokeh_js = Resources(mode="inline", components=["bokeh"]).render()
-    environment = Environment(
-        loader=PackageLoader("cangauge.extras.report"),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
-    style, _, _ = environment.loader.get_source(environment, "page.css")  # type: ignore[union-attr]
-    return environment.get_template("page.html.j2").render(
-        page=page,
-        plots=dict(zip(figures, drawn, strict=True)),
-        style=style,
-        bokeh_js=bokeh_js,
-        bokeh_script=script,
-        version=__version__,
-        made=datetime.now(UTC),
-        max_points=MAX_POINTS,
-    )
+    def _inputs(self) -> list[tuple[str, str, str | None]]:
+        """Return role, name and SHA-256 of the inputs; None if a log is not a single file."""
+        logs = [("log", log.name, file_sha256(log.source)) for log in self.logs]
+        if self.model is None:
+            return logs
+        path = self.model_path
+        sha256 = text_sha256(self.model.to_json()) if path is None else file_sha256(path)
+        return [("model", self.model.name, sha256), *logs]
 
 
 def _add_to_document(plots: Sequence[Any]) -> None:
@@ -256,11 +181,10 @@ def joined(names: Sequence[str], at_most: int = 3) -> str:
     return f"{', '.join(names[: at_most - 1])} and {len(names) - at_most + 1} more"
 
 
-def reconstruction_banners(*texts: str) -> list[str]:
-    """Return the banner to show if a name, source or remark mentions a reconstruction."""
-    if not any("reconstruction" in text.lower() for text in texts):
-        return []
+def range_rows(model: Model) -> list[list[str]]:
+    """Return rows of the range that a model is identified in."""
     return [
-        "This is a reconstruction: the log was computed from a published equation and published"
-        " coefficients. It is not a recording of a car."
+        ["identified at SoC", span(*model.range.soc_pct, 1, "%")],
+        ["identified at temperature", span(*model.range.temperature_c, 1, "°C")],
+        ["identified at current", span(*model.range.current_a, 0, "A")],
     ]
