@@ -120,6 +120,7 @@ class CompiledEstimator(Estimator):
             REASONS,
         )
         self._record = self._part("state", layout.STATE)[0]
+        self._is_pulled = False
 
     def _part(self, name: str, of: np.dtype[Any]) -> NDArray[Any]:
         """Return the core's memory of a part; it lives as long as the core."""
@@ -128,6 +129,7 @@ class CompiledEstimator(Estimator):
     def update(self, sample: Sample) -> None:
         """Process one sample; see `Estimator.update`."""
         self.is_refused = not self._core.update(sample)
+        self._is_pulled = False
 
     def run(self, columns: Sequence[FloatArray]) -> list[NDArray[Any]]:
         """Process whole columns; return those of the estimates.
@@ -147,6 +149,7 @@ class CompiledEstimator(Estimator):
         found: list[NDArray[Any]] = [np.empty(rows) for _ in range(7)]
         found += [np.empty(rows, np.int64) for _ in range(2)]
         self._core.run((*given, *found))
+        self._is_pulled = False
         return found
 
     @property
@@ -214,7 +217,10 @@ class CompiledEstimator(Estimator):
         self._push()
 
     def _pull(self) -> None:
-        """Read the core's state, but for its voltage model, into the reference."""
+        """Read the core's state, but for its voltage model, into the reference, once a sample."""
+        if self._is_pulled:
+            return
+        self._is_pulled = True
         self._core.estimate()
         record, self._pending = self._record, None
         latest = _plain(record["latest"])

@@ -23,7 +23,7 @@ from cangauge.errors import InputError
 from cangauge.estimation.ekf import FUNCTIONS, LEAST_SLOPE, LEVEL, SLOW, SocFilter
 from cangauge.estimation.health import health_of
 from cangauge.model.extended import OnlineModel
-from cangauge.model.voltage_model import VoltageModel
+from cangauge.model.voltage_model import HermiteCurve, VoltageModel
 from cangauge.types import Health, Power
 
 HORIZON_S: Final = 10.0
@@ -157,39 +157,59 @@ class PowerModel:
         if 1.0 + ahead.resistance <= 0.0:  # learned of the wrong sign: not the pack's
             return Power()
         limits = self.limits
-        moments = [HORIZON_S * step / STEPS for step in range(1, STEPS + 1)]
-        out = [ahead.current_at(limits.min_voltage_v, each) for each in moments]
-        into = [ahead.current_at(limits.max_voltage_v, each) for each in moments]
-        discharge = min(filter(None, out), default=(math.nan, math.nan))
-        charge = max(filter(None, into), default=(math.nan, math.nan))
+        moments = [ahead.moment(HORIZON_S * step / STEPS) for step in range(1, STEPS + 1)]
+        out = [ahead.possible(limits.min_voltage_v, moment) for moment in moments]
+        into = [ahead.possible(limits.max_voltage_v, moment) for moment in moments]
+        discharge = min(filter(None, out), default=None)
+        charge = max(filter(None, into), default=None)
         return Power(
-            *_within(discharge[0], discharge[1], limits.max_discharge_a),
-            *_within(-charge[0], charge[1], limits.max_charge_a),
+            *_within(*ahead.with_std(discharge), limits.max_discharge_a),
+            *_within(*ahead.with_std(charge, sign=-1.0), limits.max_charge_a),
             *self._energy(ahead, soc_std_pct),
         )
 
     def _energy(self, ahead: _Ahead, soc_std_pct: float) -> tuple[float, float]:
         """Return the energy left and its standard deviation [Wh]."""
-        health, limits, soc_pct = ahead.health, self.limits, ahead.soc_pct
-        lowest_v, end_pct, energy_wh = limits.min_voltage_v, 0.0, 0.0
-        usual_a = ENERGY_C_RATE * health.capacity_ah
-        step_pct = max(soc_pct - limits.cutoff_soc_pct, 0.0) / ENERGY_STEPS
-        load_v = ahead.load_v(usual_a)
-        first_v = volts = ahead.lasting_v(soc_pct, load_v)
-        for _ in range(ENERGY_STEPS):
-            if volts <= lowest_v:
-                end_pct = ahead.std_v / max(self._model.curve(soc_pct)[1], LEAST_SLOPE)
-                break
-            soc_pct -= step_pct
-            below_v = ahead.lasting_v(soc_pct, load_v)
-            part = 1.0 if below_v >= lowest_v else (volts - lowest_v) / (volts - below_v)
-            mean_v = volts - 0.5 * part * (volts - below_v)
-            energy_wh += mean_v * part * step_pct / 100.0 * health.capacity_ah
-            volts = below_v
+        health, limits = ahead.health, self.limits
+        end_pct = min(limits.cutoff_soc_pct, ahead.soc_pct)
+        soc_pct = np.linspace(ahead.soc_pct, end_pct, ENERGY_STEPS + 1)
+        step_pct = (ahead.soc_pct - end_pct) / ENERGY_STEPS
+        volts = ahead.lasting_v(soc_pct, ENERGY_C_RATE * health.capacity_ah)
+        low = np.flatnonzero(volts <= limits.min_voltage_v)
+        last = int(low[0]) if low.size else ENERGY_STEPS
+        # Part of each step above the lowest voltage: all of it, but for the last.
+        part, drop_v = np.ones(last), volts[:last] - volts[1 : last + 1]
+        unknown_pct = 0.0
+        if low.size:
+            unknown_pct = ahead.std_v / ahead.slope_at(float(soc_pct[last]))
+            part[-1:] = (volts[last - 1] - limits.min_voltage_v) / drop_v[-1:]
+        mean_v = volts[:last] - 0.5 * part * drop_v
+        energy_wh = float(mean_v @ part) * step_pct / 100.0 * health.capacity_ah
         return energy_wh, math.hypot(
-            first_v * math.hypot(soc_std_pct, end_pct) / 100.0 * health.capacity_ah,
+            float(volts[0]) * math.hypot(soc_std_pct, unknown_pct) / 100.0 * health.capacity_ah,
             energy_wh * health.capacity_std_ah / health.capacity_ah,
         )
+
+
+class _Moment(NamedTuple):
+    """What a constant current from now on does to the voltage after a time."""
+
+    pct_per_a: float
+    """Charge that it takes [% per A]."""
+    base: FloatArray
+    """Load row without it, shape (k,)."""
+    per_a: FloatArray
+    """Change of the load row by it [1/A], shape (k,)."""
+    unknown_v: float
+    """Drop of currents that were not observed [V]."""
+
+
+class _Possible(NamedTuple):
+    """A current that meets a limit of the voltage; ordered by the current."""
+
+    current_a: float
+    volt_per_a: float
+    moment: _Moment
 
 
 class _Ahead:
@@ -201,68 +221,27 @@ class _Ahead:
         self.soc_pct = soc_pct
         self.health: Health = health_of(filter_, temperature_c)
         x, self._P = filter_.joint()
-        self._x, self.resistance = x[:-2], float(x[-1])
+        self.resistance = float(x[-1])
         self._model, self._temperature_c = model, temperature_c
         noise, self._A = model.noise, model.noise.cold(temperature_c)
-        slope = max(model.curve(soc_pct)[1], LEAST_SLOPE)
-        self._level_v = math.hypot(self._A * noise.level_std_v, noise.soc_std_pct * slope)
+        self._level_v = math.hypot(
+            self._A * noise.level_std_v, noise.soc_std_pct * self.slope_at(soc_pct)
+        )
         self.std_v = math.hypot(self._level_v, self._A * noise.slow_std_v)
-        self._fixed_v = self._level_v * float(self._x[LEVEL]) + self._A * float(self._x[SLOW])
-        self._no_load = np.zeros_like(model.load_coefficients)
-        self._learned_now_v = self._learned_v(soc_pct)
+        self._fixed_v = self._level_v * float(x[LEVEL]) + self._A * float(x[SLOW])
+        functions, learned = model.functions, x[FUNCTIONS:-2]
+        self._learned = HermiteCurve(
+            functions.soc_pct, functions.value @ learned, functions.slope @ learned
+        )
+        theta = model.load_coefficients
+        self._theta = theta + self.resistance * np.r_[0.0, theta[1:]] + functions.load @ learned
 
-    def current_at(self, limit_v: float, seconds: float) -> tuple[float, float] | None:
-        """Return the current that meets a voltage after a time [s], and its deviation [A].
+    def slope_at(self, soc_pct: float) -> float:
+        """Return the curve's slope [V per %], not less than the least."""
+        return max(self._model.curve(soc_pct)[1], LEAST_SLOPE)
 
-        None: the voltage rises with the current, so it is no limit.
-        """
-        model = self._model
-        base, per_a, unknown_v = self._loads(seconds)
-        pct_per_a = seconds / (36.0 * self.health.capacity_ah)
-        fixed_v = self._fixed_v + self._learned_now_v + self._volts(base) - limit_v
-        ohm = self._volts(per_a)
-        current_a, slope = 0.0, 0.0
-        for _ in range(_ITERATIONS):
-            volts, slope = model.curve(self.soc_pct - pct_per_a * current_a)
-            step_a = (volts + fixed_v + ohm * current_a) / (slope * pct_per_a - ohm)
-            current_a += step_a
-            if abs(step_a) < _CLOSE_A:
-                break
-        volt_per_a = slope * pct_per_a - ohm
-        if volt_per_a <= 0.0:
-            return None
-        load = base + current_a * per_a
-        after_pct = self.soc_pct - pct_per_a * current_a
-        drop_v = float(load[1:] @ model.load_coefficients[1:])
-        functions = model.row(after_pct, load).tolist()
-        H = np.array([slope, 0.0, self._A, self._level_v, *functions, 0.0, drop_v])
-        variance = H @ self._P @ H + (self._A * model.noise.residual_std_v) ** 2 + unknown_v**2
-        return current_a, math.sqrt(variance) / volt_per_a
-
-    def load_v(self, current_a: float) -> float:
-        """Return the voltage that a lasting current adds to the curve's [V]."""
-        lasting = np.full(len(self._model.model.resistance_ohm), current_a)
-        return self._volts(self._model.load_at(self._temperature_c, lasting))
-
-    def lasting_v(self, soc_pct: float, load_v: float) -> float:
-        """Return the voltage under a lasting load that adds `load_v` [V]."""
-        return self._model.curve(soc_pct)[0] + self._learned_v(soc_pct) + load_v + self._fixed_v
-
-    def _learned_v(self, soc_pct: float) -> float:
-        """Return the learned change of the curve [V]."""
-        return float(self._model.row(soc_pct, self._no_load) @ self._x[FUNCTIONS:])
-
-    def _volts(self, load: FloatArray) -> float:
-        """Return the voltage of a load row with what is learned of it [V]."""
-        theta, x = self._model.load_coefficients, self._x[FUNCTIONS:]
-        learned_v = float(self._model.row(self.soc_pct, load) @ x) - self._learned_now_v
-        return float(load @ theta) + self.resistance * float(load[1:] @ theta[1:]) + learned_v
-
-    def _loads(self, seconds: float) -> tuple[FloatArray, FloatArray, float]:
-        """Return the load row after a time [s] without current, and its change by a current [1/A].
-
-        The third is the drop of currents that were not observed [V].
-        """
+    def moment(self, seconds: float) -> _Moment:
+        """Return the effect of a current after a time [s]."""
         model = self._model
         voltage, line = model.model, model.delay_line
         past, share, unknown_v = [], [], 0.0
@@ -278,7 +257,49 @@ class _Ahead:
             share.append(1.0 - keep)
         base = model.load_at(self._temperature_c, np.array(past))
         ones = model.load_at(self._temperature_c, np.array(past) + np.array(share))
-        return base, ones - base, unknown_v
+        pct_per_a = seconds / (36.0 * self.health.capacity_ah)
+        return _Moment(pct_per_a, base, ones - base, unknown_v)
+
+    def possible(self, limit_v: float, moment: _Moment) -> _Possible | None:
+        """Return the current that meets a voltage at a moment.
+
+        None: the voltage rises with the current, so it is no limit.
+        """
+        learned_v = self._learned.at(self.soc_pct)[0]
+        fixed_v = self._fixed_v + learned_v + float(moment.base @ self._theta) - limit_v
+        ohm = float(moment.per_a @ self._theta)
+        current_a = volt_per_a = 0.0
+        for _ in range(_ITERATIONS):
+            volts, slope = self._model.curve(self.soc_pct - moment.pct_per_a * current_a)
+            volt_per_a = slope * moment.pct_per_a - ohm
+            step_a = (volts + fixed_v + ohm * current_a) / volt_per_a
+            current_a += step_a
+            if abs(step_a) < _CLOSE_A:
+                break
+        return _Possible(current_a, volt_per_a, moment) if volt_per_a > 0.0 else None
+
+    def with_std(self, found: _Possible | None, sign: float = 1.0) -> tuple[float, float]:
+        """Return a possible current times a sign and its standard deviation [A]; NaN for None."""
+        if found is None:
+            return math.nan, math.nan
+        current_a, volt_per_a, moment = found
+        model = self._model
+        load = moment.base + current_a * moment.per_a
+        after_pct = self.soc_pct - moment.pct_per_a * current_a
+        slope = model.curve(after_pct)[1]
+        drop_v = float(load[1:] @ model.load_coefficients[1:])
+        functions = model.row(after_pct, load).tolist()
+        H = np.array([slope, 0.0, self._A, self._level_v, *functions, 0.0, drop_v])
+        residual_v = self._A * model.noise.residual_std_v
+        std_v = math.sqrt(H @ self._P @ H + residual_v**2 + moment.unknown_v**2)
+        return sign * current_a, std_v / volt_per_a
+
+    def lasting_v(self, soc_pct: FloatArray, current_a: float) -> FloatArray:
+        """Return the voltages [V] of a lasting current at SoC [%] of shape (n,)."""
+        lasting = np.full(len(self._model.model.resistance_ohm), current_a)
+        load_v = float(self._model.load_at(self._temperature_c, lasting) @ self._theta)
+        curve_v = self._model.curve_values(soc_pct) + self._learned.values(soc_pct)
+        return curve_v + (load_v + self._fixed_v)
 
 
 def _within(current_a: float, std_a: float, most_a: float) -> tuple[float, float]:

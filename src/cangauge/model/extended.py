@@ -378,6 +378,13 @@ class OnlineModel:
 
     curve = pseudo_ocv_at
 
+    def curve_values(self, soc_pct: FloatArray) -> FloatArray:
+        """Return curve and effects [V] of the latest reading at SoC [%] of shape (n,)."""
+        volts = self.model.curve.values(soc_pct) + float(self._drives[0])
+        for (effect, values), drive in zip(self._over_soc, self._drives[1:], strict=True):
+            volts += drive * effect.over_soc(soc_pct, values, self.model)
+        return volts
+
     def row(self, soc_pct: float, load: FloatArray) -> FloatArray:
         """Return the change of voltage by each principal function [V], shape (n,)."""
         return self.functions.row(soc_pct, load)
