@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from cangauge.logs.column_map import ColumnMap, choose_columns, suggestion
+from cangauge.logs.column_map import ColumnMap, find_columns, suggestion
 from cangauge.logs.headings import meaning_of
 
 SPELLINGS = {
@@ -86,11 +86,9 @@ SPELLINGS = {
 def test_headings_of_public_exporters(name: str) -> None:
     text, expected = SPELLINGS[name]
     headings = text.split(",")
-    choice = choose_columns(headings)
+    chosen, _ = find_columns(headings)
     found = [
-        "+".join(headings[place] for place in choice.chosen[quantity].places)
-        if quantity in choice.chosen
-        else ""
+        "+".join(headings[place] for place in chosen[quantity].places) if quantity in chosen else ""
         for quantity in ("time", "current", "voltage", "temperature", "soc")
     ]
     assert "|".join(found) == expected
@@ -102,14 +100,14 @@ def test_headings_of_public_exporters(name: str) -> None:
      "Charge Time", "Amp-hr", "dV/dt (V/s)", "Voltage Setpoint [V]", "Inverter Temp"],
 )  # fmt: skip
 def test_other_quantities_are_not_taken(heading: str) -> None:
-    assert not choose_columns([heading]).chosen
+    assert not find_columns([heading])[0]
 
 
 def test_several_of_a_kind_are_left_to_the_user() -> None:
     headings = ["Time [s]", "Battery Current [A]", "Battery Current [A]", "Voltage 1", "Voltage 2"]
-    choice = choose_columns(headings)
-    assert set(choice.chosen) == {"time"}
-    assert suggestion(headings, choice) == (
+    chosen, guesses = find_columns(headings)
+    assert set(chosen) == {"time"}
+    assert suggestion(headings, guesses | chosen) == (
         "--columns 'time=Time [s],current=Battery Current [A],voltage=Voltage 1'"
     )
 
@@ -129,7 +127,7 @@ def test_heading_unit_and_factor_are_told_apart(
     text: str, expected: tuple[str, str, float]
 ) -> None:
     headings = ["Time [s]", "I, pack [A]", "ratio 1:2", "U [V]"]
-    column = choose_columns(headings, (), ColumnMap.of(text)).chosen["current"]
+    column = find_columns(headings, (), ColumnMap.of(text))[0]["current"]
     assert (headings[column.places[0]], column.unit, column.factor) == expected
 
 

@@ -78,7 +78,7 @@ def test_log_in_the_battery_data_format_has_no_soc(tmp_path: Path, drive: Log) -
     [
         ([[], [], [], []], "the log holds no rows"),
         ([[0, 1], [1], [380, 380], [20, 20]], "current_a: has 1 values where time_s has 2"),
-        ([[0, 1], [1, np.nan], [380, 380], [20, 20]], "current_a: 1 of 2 values are not finite"),
+        ([[0, 1], [1, np.nan], [380, 380], [20, 20]], "current_a: 1 of 2 rows lack time, current"),
         ([[0, 0], [1, 1], [380, 380], [20, 20]], "time_s: time does not increase at row 2"),
     ],
 )

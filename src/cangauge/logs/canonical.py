@@ -20,46 +20,47 @@ import pyarrow.parquet as pq
 
 from cangauge._files import Head, atomic_path
 from cangauge.errors import InputError
+from cangauge.logs.column_map import SOURCE
 from cangauge.logs.log import Log
-from cangauge.logs.table import SOURCE, ArrowTable
+from cangauge.logs.table import ArrowTable
 from cangauge.logs.text import MAX_COLUMNS, MAX_ROWS
 from cangauge.logs.units import TemperatureSource
 
 _METADATA_KEY: Final = b"cangauge.temperature_source"
 
 
-@contextmanager
-def open_parquet(head: Head) -> Iterator[ArrowTable]:
-    """Open a Parquet file as a table that is read by column.
+def parquet_table(head: Head) -> ArrowTable:
+    """Return a Parquet file as a table that is read by column.
 
     Raises
     ------
     InputError
         If it is damaged, or larger than a log may be.
     """
-    with head.open() as unpacked:
-        stream = unpacked if unpacked.seekable() else pa.BufferReader(unpacked.read())
-        try:
-            file = pq.ParquetFile(stream, page_checksum_verification=True)
-            rows, columns = file.metadata.num_rows, file.metadata.num_columns
-            for what, count, limit in (("rows", rows, MAX_ROWS), ("columns", columns, MAX_COLUMNS)):
-                if count > limit:
-                    problem = f"more than the {limit} {what} that a log may have"
-                    raise InputError(problem, source=head.path, value=count, cure="split it")
+    with _damage_named(head):
+        file = pq.ParquetFile(pa.BufferReader(head.read()), page_checksum_verification=True)
+    for what, limit in (("rows", MAX_ROWS), ("columns", MAX_COLUMNS)):
+        if (count := getattr(file.metadata, f"num_{what}")) > limit:
+            problem = f"more than the {limit} {what} that a log may have"
+            raise InputError(problem, source=head.path, value=count, cure="split it")
 
-            def read(names: list[str]) -> Any:
-                table = file.read(columns=names)
-                table.validate(full=True)  # damaged indices may exceed a dictionary
-                return table
+    def read(names: list[str]) -> Any:
+        with _damage_named(head):
+            table = file.read(columns=names)
+            table.validate(full=True)  # damaged indices may exceed a dictionary
+        return table
 
-            yield arrow_table(file.schema_arrow, read)
-        except (pa.ArrowException, OSError, ValueError) as error:
-            reason = (str(error) or type(error).__name__).splitlines()[0]
-            raise InputError(
-                f"the Parquet file is cut off or damaged ({reason})",
-                source=head.path,
-                cure="export again",
-            ) from error
+    return arrow_table(file.schema_arrow, read)
+
+
+@contextmanager
+def _damage_named(head: Head) -> Iterator[None]:
+    try:
+        yield
+    except (pa.ArrowException, OSError, ValueError) as error:
+        reason = (str(error) or type(error).__name__).splitlines()[0]
+        problem = f"the Parquet file is cut off or damaged ({reason})"
+        raise InputError(problem, source=head.path, cure="export again") from error
 
 
 def arrow_table(schema: Any, read: Any) -> ArrowTable:

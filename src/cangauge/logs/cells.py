@@ -1,7 +1,7 @@
 """Cells of a table as numbers and as times.
 
 Times are numbers, clock times, or dates with and without a zone. Dates become seconds since 1970
-(UTC). A date without a zone is read as UTC unless a zone is given: only differences matter.
+(UTC). A date without a zone is read as UTC: only differences matter.
 """
 
 from __future__ import annotations
@@ -16,20 +16,20 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from cangauge._typing import FloatArray, IntArray
+from cangauge._typing import FloatArray
 from cangauge.errors import InputError
-from cangauge.logs.units import convert, unit_of
+from cangauge.logs.units import convert
 
 MISSING: Final = (
     "nan", "na", "n/a", "#n/a", "null", "none", "-", "--", "1.#qnan", "-1.#ind", "unknown",
     "unavailable", "n.a.",
 )  # fmt: skip
 """Cells without a value, in lower case."""
-_STAMP: Final = (
-    r"^(?P<date>[^:]*?)"
-    r"(?:(?:^|[T,_\s])\s*(?P<h>\d{1,5}):(?P<m>\d{1,2})(?::(?P<s>\d{1,2}(?:[.,:]\d+)?))?"
+_STAMP: Final = re.compile(
+    r"(?P<date>[^:]*?)"
+    r"(?:(?:^|[T,_\s])\s*(?P<h>\d{1,5}):(?P<m>\d{1,2})(?::(?P<s>\d{1,2})(?:[.,:](?P<part>\d+))?)?"
     r"\s*(?P<half>[AaPp])?(?:\.?[Mm]\.?)?"
-    r"\s*(?P<zone>Z|z|UTC|GMT|[+-]\d{2}:?\d{2}|[+-]\d{2})?)?$"
+    r"\s*(?P<zone>Z|z|UTC|GMT|(?P<sign>[+-])(?P<zone_h>\d{2})(?::?(?P<zone_m>\d{2}))?)?)?"
 )
 _DATE: Final = re.compile(
     r"(?:[A-Za-z]{3,9},?\s+)?"
@@ -151,13 +151,13 @@ def is_stamp(text: str) -> bool:
 
 def is_clock(text: str) -> bool:
     """Return whether a cell holds a clock time without a date."""
-    match = re.match(_STAMP, text.strip())
+    match = _STAMP.fullmatch(text.strip())
     return bool(match and match["h"] and _DAYS.fullmatch(match["date"]))
 
 
 def is_date(text: str) -> bool:
     """Return whether a cell holds a date, with or without a time of day."""
-    match = re.match(_STAMP, text.strip())
+    match = _STAMP.fullmatch(text.strip())
     return match is not None and _fields(match["date"]) is not None
 
 
@@ -179,61 +179,53 @@ def seconds_of_text(cells: Any, unit: str, source: str, label: str) -> tuple[Flo
     """Return stamps of text as seconds, NaN where empty, and how they were read.
 
     All cells are clock times (`1:02:03.5`, `2d 01:02:03`), or dates with or without a time of day.
-    `unit` is an order of dates (`dmy`, `mdy`), or the zone of dates without one (`Europe/Berlin`).
+    `unit` may be an order of dates (`dmy`, `mdy`).
 
     Raises
     ------
     InputError
-        If a cell is no time, or the zone is not known.
+        If a cell is no time, or the unit is not known.
     """
-    cells = cells.combine_chunks() if isinstance(cells, pa.ChunkedArray) else cells
-    blanks = pc.replace_substring_regex(cells, "[\u00a0\u202f]", " ")  # before AM and PM
-    parts = pc.extract_regex(pc.utf8_trim_whitespace(blanks), _STAMP)
-    hours, minutes, seconds = (_numbers(parts, name) for name in "hms")
-    (dates, date), (halves, half), (zones, zone) = (
-        _unique(parts, name) for name in ("date", "half", "zone")
-    )
-    clock = is_clock(first_text(cells))
-    days, how = _days_before_clock(dates) if clock else _days_since_1970(dates, unit.lower())
-    values = np.array(days)[date] * 86400.0
-    read = np.isfinite(values + hours if clock else values)
-    wrong = np.asarray(pc.is_valid(cells).to_numpy(zero_copy_only=False), dtype=bool) & ~read
-    if wrong.any():
-        row = int(np.argmax(wrong))
+    if unit.lower() not in {"dmy", "mdy"}:
+        convert(np.empty(0), "time_s", unit, source=source, label=label)
+    texts: list[str | None] = cells.to_pylist()
+    clock = is_clock(next((text for text in texts if text), ""))
+    dates: dict[str, int] = {}
+    date, zones = np.zeros(len(texts), dtype=np.intp), False
+    of_day_s, offset_s = np.full((2, len(texts)), np.nan)
+    for row, text in enumerate(texts):
+        match = _STAMP.fullmatch(text.strip()) if text else None
+        if match and (match["h"] or not clock):
+            date[row] = dates.setdefault(match["date"], len(dates))
+            of_day_s[row], offset_s[row] = _of_day_s(match)
+            zones = zones or bool(match["zone"])
+    days, how = _days_before_clock([*dates]) if clock else _days_since_1970([*dates], unit.lower())
+    values = np.array([*days, np.nan])[date] * 86400.0 + of_day_s
+    wrong = next((row for row in np.flatnonzero(np.isnan(values)) if texts[row]), None)
+    if wrong is not None:
         raise InputError(
-            f"row {row + 1} is not a time",
+            f"row {wrong + 1} is not a time",
             source=source,
             field=label,
-            value=cells[row].as_py(),
+            value=texts[wrong],
             cure="seconds, hh:mm:ss or dates are read; name another column with --columns time=…",
         )
-    noon_h = np.array([{"a": 0.0, "p": 12.0}.get(text.lower(), np.nan) for text in halves])[half]
-    hours = np.where(np.isnan(noon_h), hours, hours % 12.0 + noon_h)
-    values += np.nan_to_num(hours) * 3600.0 + np.nan_to_num(minutes) * 60.0 + np.nan_to_num(seconds)
-    values[~read] = np.nan
-    if clock:
-        midnights = np.cumsum(np.diff(values[read], prepend=0.0) < -43200.0)
-        values[read] += midnights * 86400.0
-    elif any(zones):
-        return values - np.array([_offset_s(text) for text in zones])[zone], f"{how} with zone"
-    elif unit and unit.lower() not in {"dmy", "mdy", "ymd"} and not unit_of("time_s", unit):
-        return _utc(values, unit, source, label), f"{how} in {unit}"
-    else:
-        how += " without zone"
+    if not clock:
+        return values - offset_s, f"{how} with{'' if zones else 'out'} zone"
+    known = np.isfinite(values)
+    midnights = np.cumsum(np.diff(values[known], prepend=0.0) < -43200.0)
+    values[known] += midnights * 86400.0
     return values, how
 
 
-def _numbers(parts: Any, name: str) -> FloatArray:
-    """Return a group as numbers, NaN where it is empty; `59:123` is 59.123."""
-    text = pc.replace_substring_regex(pc.struct_field(parts, name), "[,:]", ".")
-    text = pc.if_else(pc.equal(text, ""), pa.scalar(None, pa.string()), text)
-    return _floats(pc.cast(text, pa.float64()))
-
-
-def _unique(parts: Any, name: str) -> tuple[list[str], IntArray]:
-    """Return the different texts of a group, "" where it is empty, and the one of each row."""
-    coded = pc.dictionary_encode(pc.fill_null(pc.struct_field(parts, name), ""))
-    return coded.dictionary.to_pylist(), coded.indices.to_numpy()
+def _of_day_s(match: re.Match[str]) -> tuple[float, float]:
+    """Return the time of day of a stamp and its offset from UTC [s]; `59:123` is 59.123 s."""
+    hour, second = float(match["h"] or 0), float(f"{match['s'] or 0}.{match['part'] or 0}")
+    if match["half"]:
+        hour = hour % 12.0 + (12.0 if match["half"] in "Pp" else 0.0)
+    offset_s = float(match["zone_h"] or 0) * 3600.0 + float(match["zone_m"] or 0) * 60.0
+    of_day_s = hour * 3600.0 + float(match["m"] or 0) * 60.0 + second
+    return of_day_s, -offset_s if match["sign"] == "-" else offset_s
 
 
 def _days_before_clock(texts: Sequence[str]) -> tuple[list[float], str]:
@@ -260,8 +252,8 @@ def _days_since_1970(texts: Sequence[str], given: str) -> tuple[list[float], str
     orders = [given] if given in {"dmy", "mdy"} else ["dmy", "mdy"]
     days = {order: [_day(each, order) for each in fields] for order in orders}
     gaps = {order: np.isnan(each).sum() for order, each in days.items()}
-    # A log is short: the order of fewer days.
     finite = {order: [day for day in days[order] if np.isfinite(day)] or [0.0] for order in orders}
+    # A log is short: the order of fewer days.
     best = min(orders, key=lambda order: (gaps[order], max(finite[order]) - min(finite[order])))
     note = "day first" if best == "dmy" else "month first"
     if given == best:
@@ -280,24 +272,3 @@ def _day(fields: tuple[int, ...] | None, order: str) -> float:
         return float(dt.date(year + 2000 * (year < 100), month, day).toordinal() - _1970)
     except ValueError:
         return np.nan
-
-
-def _offset_s(zone: str) -> float:
-    """Return the offset from UTC that a stamp states [s]: `+02:00`, `-0530`, `z`."""
-    digits = zone[1:].replace(":", "")
-    if not digits.isdigit():
-        return 0.0
-    seconds = int(digits[:2]) * 3600.0 + int(digits[2:] or 0) * 60.0
-    return -seconds if zone[0] == "-" else seconds
-
-
-def _utc(values: FloatArray, zone: str, source: str, label: str) -> FloatArray:
-    """Return local times of a zone as UTC [s]."""
-    local = pa.array(values * 1e6, from_pandas=True).cast(pa.int64()).cast(pa.timestamp("us"))
-    try:
-        utc = pc.assume_timezone(local, zone, ambiguous="earliest", nonexistent="latest")
-    except pa.ArrowInvalid as error:
-        cure = "name one such as Europe/Berlin, or an order of dates: dmy, mdy"
-        problem = "not a time zone"
-        raise InputError(problem, source=source, field=label, value=zone, cure=cure) from error
-    return _floats(utc.cast(pa.int64()).cast(pa.float64())) / 1e6

@@ -9,10 +9,12 @@ from typing import Any, Final
 
 from cangauge.errors import InputError, closest
 from cangauge.logs.headings import GUESS, Meaning, meaning_of, names_and_units
-from cangauge.logs.units import FIELDS, TemperatureSource, unit_of
+from cangauge.logs.units import FIELDS, REQUIRED, TemperatureSource, unit_of
 
 DOCS: Final = "docs/logs.md"
 """Page that explains the columns of a log."""
+SOURCE: Final = "temperature_source"
+"""Column or metadata of a canonical log: the location of the temperature sensor."""
 _SYNTAX: Final = (
     "give NAME=HEADING, NAME=HEADING[UNIT] or NAME=HEADING[UNIT]:FACTOR, separated by commas, for"
     " time, current, voltage, temperature, soc"
@@ -93,63 +95,66 @@ class ChosenColumn:
     others: tuple[ChosenColumn, ...] = ()
 
 
-@dataclass(frozen=True, slots=True)
-class Choice:
-    """Columns of a table by quantity, and the likeliest column of each that is not plain."""
-
-    chosen: dict[str, ChosenColumn] = field(default_factory=dict)
-    guesses: dict[str, ChosenColumn] = field(default_factory=dict)
-
-    @property
-    def is_complete(self) -> bool:
-        """Whether time, current and voltage are known (a temperature may be given)."""
-        return set(_NEEDED) <= set(self.chosen)
-
-
 def choose_columns(
-    headings: Sequence[str], units_below: Sequence[str] = (), given: ColumnMap | None = None
-) -> Choice:
-    """Choose the columns of a table: the user's first, then plain headings.
+    headings: Sequence[str],
+    units_below: Sequence[str] = (),
+    given: ColumnMap | None = None,
+    *,
+    source: str,
+) -> dict[str, ChosenColumn]:
+    """Return the columns of a table by quantity: the user's first, then by plain headings.
 
     Raises
     ------
     InputError
-        If a column of the user is not in the table, or is named for two quantities.
+        If a column of the user is not in the table, or is named for two quantities; if time,
+        current or voltage is not known (a temperature may be given).
     """
+    chosen, _ = find_columns(headings, units_below, given)
+    if not set(_NEEDED) <= set(chosen):
+        raise unknown_columns(source, headings, given)
+    return chosen
+
+
+def find_columns(
+    headings: Sequence[str], units_below: Sequence[str] = (), given: ColumnMap | None = None
+) -> tuple[dict[str, ChosenColumn], dict[str, ChosenColumn]]:
+    """Return the columns that are named or plain, and the likeliest one of each other quantity."""
     below = [*units_below, *[""] * len(headings)]
     meanings = [meaning_of(text, unit) for text, unit in zip(headings, below, strict=False)]
-    given, choice = given or ColumnMap(), Choice()
+    chosen: dict[str, ChosenColumn] = {}
+    guesses: dict[str, ChosenColumn] = {}
     owner: dict[int, str] = {}
+    given = given or ColumnMap()
     for quantity, text in given.specs.items():
-        column = _named_column(quantity, text, headings, meanings, given.where)
-        for place in column.places:
-            if place in owner:
+        chosen[quantity] = _named_column(quantity, text, headings, meanings, given.where)
+        for place in chosen[quantity].places:
+            if owner.setdefault(place, quantity) != quantity:
                 raise InputError(
                     f"is the column of {owner[place]} too",
                     field=f"{given.where} {quantity}",
                     value=text,
                     cure="give each quantity a column of its own, as headings or as #1, #2, …",
                 )
-        owner |= dict.fromkeys(column.places, quantity)
-        choice.chosen[quantity] = column
-    for quantity in FIELDS:
+    for quantity in (name for name in FIELDS if name not in given.specs):
         plain = [
             (place, meaning)
             for place, meaning in enumerate(meanings)
             if meaning is not None and meaning.quantity == quantity and place not in owner
         ]
-        if quantity not in given.specs and plain:
-            _choose(quantity, sorted(plain, key=lambda item: item[1].rank), choice)
-    return choice
+        if plain:
+            column, is_plain = _best_column(quantity, sorted(plain, key=lambda item: item[1].rank))
+            (chosen if is_plain else guesses)[quantity] = column
+    return chosen, guesses
 
 
-def _choose(quantity: str, plain: list[tuple[int, Meaning]], choice: Choice) -> None:
-    """Choose among the columns of a quantity, the most direct first; or guess one."""
-    _, first = plain[0]
-    best = [(place, item) for place, item in plain if item.rank == first.rank]
+def _best_column(quantity: str, ranked: list[tuple[int, Meaning]]) -> tuple[ChosenColumn, bool]:
+    """Return the most direct column of a quantity, or several, and whether it is plain."""
+    place, first = ranked[0]
+    best = [(place, item) for place, item in ranked if item.rank == first.rank]
     others: tuple[ChosenColumn, ...] = ()
     if quantity == "time":
-        best, later = plain[:1], plain[1:]
+        best, later = ranked[:1], ranked[1:]
         others = tuple(ChosenColumn((k,), item.unit) for k, item in later if item.rank < GUESS)
         is_plain = True
     elif quantity == "temperature":  # of one unit, °C first; T beside T1, T2 is it
@@ -158,12 +163,11 @@ def _choose(quantity: str, plain: list[tuple[int, Meaning]], choice: Choice) -> 
         best = [each for each in best if not each[1].numbered] or best
         is_plain = len(best) == 1 or all(item.numbered for _, item in best)
     else:
-        siblings = [item for _, item in plain if item.numbered and item.rank <= GUESS]
+        siblings = [item for _, item in ranked if item.numbered and item.rank <= GUESS]
         is_plain = len(best) == 1 and not (first.numbered and len(siblings) > 1)
     is_plain = is_plain and first.rank < GUESS
-    places = tuple(place for place, _ in best) if is_plain else (plain[0][0],)
-    column = ChosenColumn(places, best[0][1].unit, 1.0, best[0][1].source, others)
-    (choice.chosen if is_plain else choice.guesses)[quantity] = column
+    places = tuple(k for k, _ in best) if is_plain else (place,)
+    return ChosenColumn(places, best[0][1].unit, 1.0, best[0][1].source, others), is_plain
 
 
 def _named_column(
@@ -174,7 +178,8 @@ def _named_column(
     where: str,
 ) -> ChosenColumn:
     for heading, unit, factor in _readings(text):
-        if places := _places(heading, headings):
+        places = _places(heading, headings)
+        if places and (len(places) == 1 or quantity in {"time", "temperature"}):
             stated = {_stated_unit(headings[k], meanings[k], quantity) for k in places}
             found = unit or (stated.pop() if len(stated) == 1 else "")
             first = meanings[places[0]]
@@ -220,37 +225,48 @@ def _places(text: str, headings: Sequence[str]) -> tuple[int, ...]:
 def _place(text: str, headings: Sequence[str]) -> int | None:
     if text in headings:  # `t` beside `T`
         return headings.index(text)
-    names = [_simple(heading) for heading in headings]
-    if _simple(text) in names:
-        return names.index(_simple(text))
-    number = re.fullmatch(r"#(\d{1,5})", text.strip())
+    simple = " ".join(text.split()).casefold()
+    names = [" ".join(heading.split()).casefold() for heading in headings]
+    if simple in names:
+        return names.index(simple)
+    number = re.fullmatch(r"#(\d{1,5})", simple)
     if number and 1 <= int(number[1]) <= len(headings):
         return int(number[1]) - 1
-    bare = [_simple(names_and_units(heading)[0][0]) for heading in headings]
-    return bare.index(_simple(text)) if bare.count(_simple(text)) == 1 else None
+    bare = [names_and_units(name)[0][0] for name in names]
+    return bare.index(simple) if bare.count(simple) == 1 else None
 
 
-def _simple(text: str) -> str:
-    return " ".join(text.split()).casefold()
+def is_canonical(headings: Sequence[str]) -> bool:
+    """Return whether columns have the names of a canonical log's, possibly an incomplete one.
+
+    A temperature of another name is not a missing one: such a table is a logger's own.
+    """
+    names = {name.strip().lower() for name in headings}
+    others = any(
+        "temperature" in name
+        or ((meaning := meaning_of(name)) and meaning.quantity == "temperature")
+        for name in names - {SOURCE}
+    )
+    return len(names & set(REQUIRED)) >= 2 and ("temperature_c" in names or not others)
 
 
 # --- For messages
 
 
-def unknown_columns(source: str, headings: Sequence[str], choice: Choice) -> InputError:
+def unknown_columns(source: str, headings: Sequence[str], given: ColumnMap | None) -> InputError:
     """Return the error for a table whose columns are not plain, with the option to paste."""
-    missing = ", ".join(name for name in _NEEDED if name not in choice.chosen)
+    chosen, guesses = find_columns(headings, (), given)
+    missing = ", ".join(name for name in _NEEDED if name not in chosen)
     missing = " and ".join(missing.rsplit(", ", 1))
     return InputError(
         f"no plain heading of {missing} (found: {shown_headings(headings)})",
         source=source,
-        cure=f"name the columns, e.g. {suggestion(headings, choice)} ({DOCS})",
+        cure=f"name the columns, e.g. {suggestion(headings, guesses | chosen)} ({DOCS})",
     )
 
 
-def suggestion(headings: Sequence[str], choice: Choice) -> str:
+def suggestion(headings: Sequence[str], likely: Mapping[str, ChosenColumn]) -> str:
     """Return the likeliest `--columns` option to paste; `?` where nothing is likely."""
-    likely = choice.guesses | choice.chosen
     texts = {
         quantity: "+".join(headings[place] for place in column.places)
         for quantity, column in likely.items()

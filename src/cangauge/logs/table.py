@@ -31,19 +31,17 @@ from cangauge.logs.cells import (
     seconds_of_text,
 )
 from cangauge.logs.column_map import (
+    SOURCE,
     ChosenColumn,
     ColumnMap,
     choose_columns,
+    is_canonical,
     shown_headings,
-    unknown_columns,
 )
 from cangauge.logs.draft import MAX_INCOMPLETE, DraftLog
-from cangauge.logs.headings import meaning_of
 from cangauge.logs.text import TextTable
 from cangauge.logs.units import FIELDS, REQUIRED, convert, known_temperature_source
 
-SOURCE: Final = "temperature_source"
-"""Column or metadata of a canonical log: the location of the temperature sensor."""
 _CANONICAL_UNIT: Final = dict(zip(FIELDS, ("s", "A", "V", "°C", "%"), strict=True))
 _HOLD_S: Final = 1.0
 """Longest time that a voltage is held to the next row with a current [s], where rows hold only the
@@ -72,20 +70,6 @@ class ArrowTable:
         return {place: table.column(self.headings[place]) for place in places}
 
 
-def is_canonical(headings: Sequence[str]) -> bool:
-    """Return whether columns have the names of a canonical log's, possibly an incomplete one.
-
-    A temperature of another name is not a missing one: such a table is a logger's own.
-    """
-    names = {name.strip().lower() for name in headings}
-    others = any(
-        "temperature" in name
-        or ((meaning := meaning_of(name)) and meaning.quantity == "temperature")
-        for name in names - {SOURCE}
-    )
-    return len(names & set(REQUIRED)) >= 2 and ("temperature_c" in names or not others)
-
-
 def draft_of_table(
     table: TextTable | ArrowTable, given: ColumnMap | None, *, name: str, source: str
 ) -> DraftLog:
@@ -98,18 +82,22 @@ def draft_of_table(
     """
     headings, where = list(table.headings), source or name
     draft = DraftLog(name, source, headings=tuple(headings))
+    names = [heading.strip().lower() for heading in headings]
     defined = given is None and is_canonical(headings)
-    if defined:
-        chosen = _canonical_columns(headings, where)
-    else:
-        choice = choose_columns(headings, table.units, given)
-        if not choice.is_complete:
-            raise unknown_columns(where, headings, choice)
-        chosen = choice.chosen
-    places = (k for each in (*chosen.values(), *chosen["time"].others) for k in each.places)
-    columns = table.columns([*dict.fromkeys(places)])
+    for missing in REQUIRED[:3]:
+        if defined and missing not in names:
+            raise InputError(
+                f"this column is missing (found: {shown_headings(headings)})",
+                source=where,
+                field=missing,
+                cure="a log needs time_s, current_a (positive = discharge), voltage_v,"
+                " temperature_c [s, A, V, °C]",
+            )
+    chosen = choose_columns(headings, table.units, given, source=where)
+    word_at = [names.index(SOURCE)] if defined and SOURCE in names else []
+    places = [k for each in (*chosen.values(), *chosen["time"].others) for k in each.places]
+    columns = table.columns([*dict.fromkeys([*places, *word_at])])
     draft.remarks.extend(table.remarks)
-    words = chosen.pop(SOURCE, None)
     chosen["time"], draft.values["time_s"], how = _time(columns, chosen["time"], headings, where)
     for quantity, column in chosen.items():
         label = " + ".join(headings[place] for place in column.places)
@@ -117,45 +105,21 @@ def draft_of_table(
         unit = how if quantity == "time" else _take(draft, quantity, column, columns)
         factor = "" if column.factor == 1.0 else f" × {column.factor:g}"
         shown = label if len(label) <= 80 else f"{label[:80]}…"
-        draft.assumed.append(f'{quantity} = "{shown}"{factor} [{unit}]')
-    used = {place for column in (*chosen.values(), words) if column for place in column.places}
+        if not (defined and label.strip().lower() == FIELDS[quantity]):
+            draft.assumed.append(f'{quantity} = "{shown}"{factor} [{unit}]')
+    used = {*word_at, *(place for column in chosen.values() for place in column.places)}
     draft.ignored = tuple(text for k, text in enumerate(headings) if text and k not in used)
     if defined:
-        draft.assumed = []
-        word = _only_word(columns[words.places[0]], where) if words else ""
-        word = word or getattr(table, "word", "") or "unknown"
-        draft.temperature_source = known_temperature_source(word, source=where, field=SOURCE)
+        word = _only_word(columns[word_at[0]], where) if word_at else getattr(table, "word", "")
+        draft.temperature_source = known_temperature_source(
+            word or "unknown", source=where, field=SOURCE
+        )
     else:
         draft.sign_unknown = chosen["current"].factor > 0.0
         if "temperature" in chosen:
             draft.temperature_source = chosen["temperature"].source
         _hold_changes(draft)
     return draft
-
-
-def _canonical_columns(headings: Sequence[str], where: str) -> dict[str, ChosenColumn]:
-    """Return the columns of a canonical log by their names."""
-    names = [name.strip().lower() for name in headings]
-    chosen = {}
-    for quantity, name in (*FIELDS.items(), (SOURCE, SOURCE)):
-        if names.count(name) > 1:
-            problem, cure = (
-                f"{names.count(name)} columns have this name",
-                "rename or drop all but one",
-            )
-            raise InputError(problem, source=where, field=name, cure=cure)
-        if name in names:
-            unit = _CANONICAL_UNIT.get(quantity, "")
-            chosen[quantity] = ChosenColumn((names.index(name),), unit)
-        elif name in REQUIRED[:3]:
-            raise InputError(
-                f"this column is missing (found: {shown_headings(headings)})",
-                source=where,
-                field=name,
-                cure="a log needs time_s, current_a (positive = discharge), voltage_v,"
-                " temperature_c [s, A, V, °C]",
-            )
-    return chosen
 
 
 def _only_word(column: Any, where: str) -> str:
