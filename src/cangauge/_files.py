@@ -320,10 +320,8 @@ def atomic_path(path: str | PathLike[str]) -> Iterator[Path]:
 
 def _create_beside(target: Path, shown: str | PathLike[str]) -> Path:
     # The suffix stays last: writers such as pyarrow and bokeh choose the format by it.
-    part = target.with_name(f".{target.stem[:200]}.{secrets.token_hex(4)}{target.suffix}")
+    part = target.with_name(f".{target.stem}.{secrets.token_hex(4)}{target.suffix}")
     try:
-        with suppress(FileNotFoundError):
-            target.lstat()  # its name can be too long where that of `part` is not
         if target.is_dir():
             raise InputError("this is a folder", source=shown, cure="name a file in it")
         part.touch(exist_ok=False)
@@ -370,7 +368,7 @@ def require_suffix(path: str | PathLike[str], *suffixes: str, field: str) -> Non
     output = Path(path)
     if output.suffix.lower() in suffixes or _is_device(output):
         return
-    names = " or ".join(part for part in (", ".join(suffixes[:-1]), suffixes[-1]) if part)
+    names = " or ".join(filter(None, (", ".join(suffixes[:-1]), suffixes[-1])))
     raise InputError(
         f"the suffix is not {names}",
         source=output,

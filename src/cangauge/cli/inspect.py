@@ -26,7 +26,6 @@ _COUNTS = {
     "error_frames": "error frames",
     "remote_frames": "remote frames",
     "time_reversals": "stamps that step back",
-    "other_ids": "frames of further ids",
 }
 _FAULTS = {"crc_errors": "wrong CRC", "frames_lost": "lost", "counter_repeats": "repeated"}
 _RANGES = {"current_a": "A", "voltage_v": "V", "temperature_c": "°C", "soc_pct": "%"}

@@ -7,26 +7,20 @@ from typing import Final
 
 import numpy as np
 
-from cangauge._typing import FloatArray
+from cangauge._typing import BoolArray, FloatArray
+from cangauge.bus.plausibility import (
+    ERRORS,
+    STUCK_AFTER_S,
+    SWING_C_RATE,
+    PackProperties,
+    stuck_detectors,
+)
 from cangauge.logs.log import Log
-from cangauge.logs.sign import STEP_SPACING_S, spaced_rows
 
-STUCK_S: Final = 10.0
-"""Shortest interval of one value that may be stuck [s], …"""
-STUCK_ROWS: Final = 5
-"""… its fewest rows, …"""
-STUCK_JUMPS: Final = 3
-"""… and the fewest jumps of the other channel within it."""
-JUMP_LIMIT_S: Final = 5.0
-"""Longest interval between rows for a jump [s]."""
-END_S: Final = 2.0
-"""Jumps this close to the ends of an interval do not count [s]."""
-CURRENT_JUMP_SHARE: Final = 0.05
-"""Smallest jump of current, of its range [-]."""
-VOLTAGE_QUANTA: Final = 4.0
-"""Smallest jump of voltage, in quanta; a jump of current must move the voltage by as much."""
+CURRENT_SHARE: Final = 0.05
+"""Smallest swing of current that must move the voltage, of its range [-]."""
 VOLTAGE_SHARE: Final = 0.002
-"""Smallest jump of voltage, relative to its median [-]."""
+"""Smallest swing of voltage that must move the current, relative to its median [-]."""
 
 _FREQUENT: Final = (3, 6, 12, 50)
 """Numbers of most frequent values whose differences are candidates for the quantum."""
@@ -42,7 +36,7 @@ _OFF_GRID: Final = 0.05
 
 @dataclass(frozen=True, slots=True)
 class Stuck:
-    """An interval in which a channel kept one value while the other one jumped."""
+    """An interval in which a channel kept one value while the other one swung."""
 
     start_s: float
     duration_s: float
@@ -75,14 +69,8 @@ def describe_channels(log: Log, resistance_ohm: float | None) -> dict[str, Chann
     """
     current, voltage = _described(log.current_a, "A"), _described(log.voltage_v, "V")
     if resistance_ohm:
-        ohm = abs(resistance_ohm)
-        visible_v = max(VOLTAGE_QUANTA * (voltage.quantum or 0.0), VOLTAGE_SHARE * voltage.median)
-        range_a = current.maximum - current.minimum
-        jump_a = max(visible_v / ohm, CURRENT_JUMP_SHARE * range_a)
-        jump_v = max(visible_v, jump_a * ohm)
-        stuck_v = _stuck(log, log.voltage_v, log.current_a, f"{jump_a:.3g} A", jump_a)
-        stuck_a = _stuck(log, log.current_a, log.voltage_v, f"{jump_v:.3g} V", jump_v)
-        voltage, current = replace(voltage, stuck=stuck_v), replace(current, stuck=stuck_a)
+        stuck_a, stuck_v = _stuck(log, current, voltage, abs(resistance_ohm))
+        current, voltage = replace(current, stuck=stuck_a), replace(voltage, stuck=stuck_v)
     channels = {"current_a": current, "voltage_v": voltage}
     channels["temperature_c"] = _described(log.temperature_c, "°C")
     if log.soc_pct is not None and np.isfinite(log.soc_pct).any():
@@ -129,28 +117,38 @@ def quantum_of(values: FloatArray) -> float | None:
 
 
 def _stuck(
-    log: Log, values: FloatArray, other: FloatArray, shown: str, jump: float
-) -> tuple[Stuck, ...]:
-    """Return the intervals in which a channel keeps one value while the other jumps.
+    log: Log, current: Channel, voltage: Channel, resistance_ohm: float
+) -> tuple[tuple[Stuck, ...], tuple[Stuck, ...]]:
+    """Return the stuck intervals of current and voltage, by the detectors of the service."""
+    pack = PackProperties(
+        resistance_ohm,
+        error_std_v=VOLTAGE_SHARE * abs(voltage.median) / ERRORS,
+        capacity_ah=CURRENT_SHARE * (current.maximum - current.minimum) / SWING_C_RATE,
+        usual_v=abs(voltage.median),
+    )
+    steps = current.quantum or 0.0, voltage.quantum or 0.0
+    of_current, of_voltage = stuck_detectors(pack, steps=steps, after_s=(STUCK_AFTER_S,) * 2)
+    columns = (each.tolist() for each in (log.time_s, log.current_a, log.voltage_v))
+    flags = [
+        (of_current.update(current_a, time_s), of_voltage.update(voltage_v, time_s))
+        for time_s, current_a, voltage_v in zip(*columns, strict=True)
+    ]
+    is_stuck_a, is_stuck_v = np.transpose(flags)
+    why_a = f"the voltage swung several times by {of_voltage.swing:.3g} V or more"
+    why_v = f"the current swung several times by {of_current.swing:.3g} A or more"
+    return (
+        _intervals(log.time_s, log.current_a, is_stuck_a, why_a),
+        _intervals(log.time_s, log.voltage_v, is_stuck_v, why_v),
+    )
 
-    Jumps are changes from one second to the next; several in both directions are needed, since in
-    a constant-current or constant-voltage phase the other channel drifts but does not jump.
-    """
-    rows = spaced_rows(log.time_s, STEP_SPACING_S)
-    near = np.diff(log.time_s[rows]) <= JUMP_LIMIT_S
-    change = np.where(near, np.diff(other[rows]), 0.0)
-    time = log.time_s[rows[1:]]
-    up, down = time[change > jump], time[change < -jump]
-    edges = np.concatenate(([0], np.flatnonzero(np.diff(values)) + 1, [values.size]))
-    found = []
-    for first, last in zip(edges[:-1].tolist(), (edges[1:] - 1).tolist(), strict=True):
-        start, end = float(log.time_s[first]), float(log.time_s[last])
-        if end - start < STUCK_S or last - first + 1 < STUCK_ROWS:
-            continue
-        # A jump at either end bounds the interval; jumps in one direction are relaxation.
-        ends = (start + END_S, end - END_S)
-        ups, downs = (int(np.diff(np.searchsorted(jumps, ends))[0]) for jumps in (up, down))
-        if ups and downs and ups + downs >= STUCK_JUMPS:
-            why = f"the other channel jumped {ups + downs} times by more than {shown}"
-            found.append(Stuck(start, end - start, float(values[first]), why))
-    return tuple(found)
+
+def _intervals(
+    time_s: FloatArray, values: FloatArray, is_stuck: BoolArray, why: str
+) -> tuple[Stuck, ...]:
+    """Return the intervals of one value that have a row recognised as stuck."""
+    first = np.flatnonzero(np.diff(values, prepend=np.nan) != 0.0)
+    last = np.append(first[1:], values.size) - 1
+    hit = np.logical_or.reduceat(is_stuck, first)
+    start_s, end_s, value = time_s[first[hit]], time_s[last[hit]], values[first[hit]]
+    columns = start_s.tolist(), (end_s - start_s).tolist(), value.tolist()
+    return tuple(Stuck(*each, why) for each in zip(*columns, strict=True))

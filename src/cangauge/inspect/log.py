@@ -70,7 +70,6 @@ class Timing:
     start_s: float
     duration_s: float
     interval_median_s: float | None
-    interval_min_s: float | None
     interval_max_s: float | None
     rate_hz: float | None
     regular: bool
@@ -98,7 +97,7 @@ class Charge:
 
 @dataclass(frozen=True, slots=True)
 class Soc:
-    """The reference SoC: share of rows with a value [-], values [%], times [s].
+    """The reference SoC: share of rows with a value [-], values [%].
 
     `implied_capacity_ah` is the charge per 100 %, by least squares; None below a span of 5 %.
     """
@@ -108,8 +107,6 @@ class Soc:
     last_pct: float
     minimum_pct: float
     maximum_pct: float
-    last_at_s: float
-    longest_hole_s: float
     implied_capacity_ah: float | None
 
 
@@ -204,9 +201,8 @@ def _timing(log: Log) -> Timing:
     longest = gaps[np.argsort(-step[gaps], kind="stable")][:LISTED]
     median = float(np.median(step)) if step.size else None
     is_regular = bool(median and np.mean(np.abs(step - median) <= 0.1 * median) >= 0.99)
-    shortest, longest_s = (float(step.min()), float(step.max())) if step.size else (None, None)
     return Timing(
-        float(time_s[0]), log.duration_s, median, shortest, longest_s,
+        float(time_s[0]), log.duration_s, median, float(step.max()) if step.size else None,
         1.0 / median if median else None, is_regular, limit_s, int(gaps.size),
         float(step[gaps].sum()), tuple(Gap(float(time_s[i]), float(step[i])) for i in longest),
     )  # fmt: skip
@@ -226,14 +222,11 @@ def _charge(log: Log) -> Charge:
 def _soc(log: Log) -> Soc | None:
     if log.soc_pct is None or not np.isfinite(log.soc_pct).any():
         return None
-    known = np.flatnonzero(np.isfinite(log.soc_pct))
-    soc, holes = log.soc_pct[known], np.diff(log.time_s[known])
+    soc = log.soc_pct[np.isfinite(log.soc_pct)]
     is_wide = np.ptp(soc) >= MIN_SOC_SPAN_PCT
-    return Soc(
-        float(known.size / len(log)), float(soc[0]), float(soc[-1]), float(soc.min()),
-        float(soc.max()), float(log.time_s[known[-1]]), float(holes.max()) if holes.size else 0.0,
-        abs(capacity_from_reference([log])) if is_wide else None,
-    )  # fmt: skip
+    capacity_ah = abs(capacity_from_reference([log])) if is_wide else None
+    first, last, low, high = (float(each) for each in (soc[0], soc[-1], soc.min(), soc.max()))
+    return Soc(soc.size / len(log), first, last, low, high, capacity_ah)
 
 
 def _resistance(log: Log) -> Resistance | None:

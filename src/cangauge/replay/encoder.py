@@ -28,7 +28,7 @@ class _Outgoing:
 
     signals: list[VehicleSignal]
     is_slow: bool
-    last: bytes = b""
+    last: bytearray | None = None
     last_s: float = -math.inf
 
 
@@ -44,19 +44,19 @@ class FrameEncoder:
 
     def __init__(self, vehicle: Vehicle) -> None:
         if any(each.is_reply for each in vehicle.messages.values()):
+            problem = "replies over ISO-TP are received only"
             cure = "use a vehicle without them, and --temperature"
-            raise InputError(
-                "replies over ISO-TP are received only", source=vehicle.name, cure=cure
-            )
+            raise InputError(problem, source=vehicle.name, cure=cure)
         self.vehicle = vehicle
         self._counters = dict.fromkeys(vehicle.messages, 0)
         groups: dict[tuple[int, tuple[MultiplexCondition, ...]], list[VehicleSignal]] = {}
         for signal in vehicle.signals:
             groups.setdefault((signal.key, signal.codec.conditions), []).append(signal)
+        keys = [key for key, _ in groups]
         self._frames = []
-        for (key, conditions), signals in groups.items():
+        for (key, _), signals in groups.items():
             is_slow = all(signal.role in {"temperature", "soc_reference"} for signal in signals)
-            if not is_slow and any(other == key and more != conditions for other, more in groups):
+            if not is_slow and keys.count(key) > 1:
                 problem = "has multiplexed frames with current or voltage, which cannot be replayed"
                 source, where = vehicle.dbc_files[0], signals[0].message
                 cure = "replay as another --vehicle"
@@ -64,46 +64,46 @@ class FrameEncoder:
             self._frames.append(_Outgoing(signals, is_slow))
         self._frames.sort(key=lambda frame: not frame.is_slow)
 
-    def encode(self, sample: Sample, soc_reference_pct: float | None = None) -> list[can.Message]:
+    def encode(self, sample: Sample, soc_reference_pct: float = math.nan) -> list[can.Message]:
         """Return the frames of one sample, in sending order.
 
         A frame whose values are all NaN is not sent; a NaN among others becomes the DBC's code for
         "not available". InputError is raised if a value does not fit into its signal, or has no
         such code.
         """
+        time_s, current_a, voltage_v, temperature_c = sample
         values = {
-            "current": sample.current_a,
-            "voltage": sample.voltage_v,
-            "temperature": sample.temperature_c,
-            "soc_reference": math.nan if soc_reference_pct is None else soc_reference_pct,
+            "current": current_a,
+            "voltage": voltage_v,
+            "temperature": temperature_c,
+            "soc_reference": soc_reference_pct,
         }
-        frames = (self._frame(frame, values, sample.time_s) for frame in self._frames)
-        return [frame for frame in frames if frame is not None]
-
-    def _frame(
-        self, frame: _Outgoing, values: dict[str, float], time_s: float
-    ) -> can.Message | None:
-        if all(math.isnan(values[signal.role]) for signal in frame.signals):
-            return None
-        first = frame.signals[0]
-        payload = bytearray(first.length)
-        for signal in frame.signals:
-            signal.codec.encode_into(payload, values[signal.role])
-        if frame.is_slow:
-            if payload == frame.last and 0.0 <= time_s - frame.last_s < SLOW_EVERY_S:
-                return None
-            frame.last, frame.last_s = bytes(payload), time_s
-        rule = self.vehicle.messages[first.key].rule
-        if rule is not None:
-            payload = bytearray(rule.protect(payload, self._counters[first.key]))
-            self._counters[first.key] += 1
-        return can.Message(
-            timestamp=time_s,
-            arbitration_id=first.arbitration_id,
-            is_extended_id=first.is_extended,
-            is_fd=first.length > 8,
-            data=payload,
-        )
+        messages = []
+        for frame in self._frames:
+            if all(math.isnan(values[signal.role]) for signal in frame.signals):
+                continue
+            first = frame.signals[0]
+            payload = bytearray(first.length)
+            for signal in frame.signals:
+                signal.codec.encode_into(payload, values[signal.role])
+            if frame.is_slow:
+                if payload == frame.last and 0.0 <= time_s - frame.last_s < SLOW_EVERY_S:
+                    continue
+                frame.last, frame.last_s = payload, time_s
+            rule = self.vehicle.messages[first.key].rule
+            data = bytes(payload)
+            if rule is not None:
+                data = rule.protect(payload, self._counters[first.key])
+                self._counters[first.key] += 1
+            message = can.Message(
+                timestamp=time_s,
+                arbitration_id=first.arbitration_id,
+                is_extended_id=first.is_extended,
+                is_fd=first.length > 8,
+                data=data,
+            )
+            messages.append(message)
+        return messages
 
     def check_range(self, log: Log) -> None:
         """Raise InputError for the first signal that is too narrow for a log, before sending."""

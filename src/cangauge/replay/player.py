@@ -2,7 +2,7 @@
 
 At full speed nothing may be lost, although socket buffers drop excess frames silently. The receiver
 (`cangauge run --time-source replay-clock`) reports its sample count in SOC_DETAIL every few
-samples, and again in the silence after them; the player limits the samples and frames in flight.
+samples, and again in the silence after them; the player limits the frames in flight.
 Samples that are lost all the same are counted, and the replay goes on.
 """
 

@@ -50,30 +50,22 @@ class LogSource:
     counts_samples = True
 
     def __init__(self, log: Log, vehicle: Vehicle) -> None:
-        self.name, self.log, self.vehicle = log.name, log, vehicle
+        self.name, self.duration_s, self.log, self.vehicle = log.name, log.duration_s, log, vehicle
         FrameEncoder(vehicle).check_range(log)
 
-    @property
-    def duration_s(self) -> float:
-        """Length [s]."""
-        return self.log.duration_s
-
     def steps(self, *, loop: bool) -> Iterator[Step]:
-        """Yield a step per row; repetitions follow one typical step later."""
-        log = self.log
+        """Yield a step per row, each one sample; repetitions follow one typical step later."""
+        log, encoder = self.log, FrameEncoder(self.vehicle)
         soc_pct = np.full(len(log), math.nan) if log.soc_pct is None else log.soc_pct
         columns = (log.time_s, log.current_a, log.voltage_v, log.temperature_c, soc_pct)
         rows = list(zip(*(column.tolist() for column in columns), strict=True))
         again_us = whole_us(log.duration_s + (usual_step_s(log.time_s) or 1.0))
-        encoder, decoder = FrameEncoder(self.vehicle), SampleDecoder(self.vehicle)
-        for turn in count() if loop else (0,):
+        samples = count(1)
+        for repetition in count() if loop else (0,):
             for time_s, current_a, voltage_v, temperature_c, soc in rows:
-                time_us = whole_us(time_s) + turn * again_us
+                time_us = whole_us(time_s) + repetition * again_us
                 sample = Sample(time_us / MICROSECONDS, current_a, voltage_v, temperature_c)
-                frames = encoder.encode(sample, soc)
-                for frame in frames:
-                    decoder.handle(frame)
-                yield Step(time_us, frames, decoder.statistics.samples, is_wanted=True)
+                yield Step(time_us, encoder.encode(sample, soc), next(samples), is_wanted=True)
 
 
 class CaptureSource:
@@ -91,14 +83,9 @@ class CaptureSource:
         self, path: str | Path, vehicle: Vehicle | None = None, ids: FrameIds | None = None
     ) -> None:
         self._path, self._vehicle, self._ids = Path(path), vehicle, ids or FrameIds()
-        self.name = self._path.name
+        self.name, self.counts_samples = self._path.name, vehicle is not None
         self.dropped = 0
         """Frames dropped in the latest pass: those of cangauge itself, and error frames."""
-
-    @property
-    def counts_samples(self) -> bool:
-        """Whether `Step.samples` is known: with a vehicle."""
-        return self._vehicle is not None
 
     def steps(self, *, loop: bool) -> Iterator[Step]:
         """Yield a step per frame; repetitions follow 10 ms later."""
@@ -106,8 +93,7 @@ class CaptureSource:
         wanted = None if self._vehicle is None else self._vehicle.messages.keys()
         samples = shift_us = 0
         while True:
-            first_us: int | None = None
-            last_us = 0
+            first_us, last_us = None, 0
             for message in self._timed():
                 time_us = whole_us(message.timestamp)
                 first_us = time_us if first_us is None else first_us
