@@ -2,13 +2,13 @@
 
     python benchmarks/nightly.py [PART…] [--data FOLDER] [--socketcan COMMAND]
 
-fuzz     every reader on 300,000 mutants of small valid files, the tests of `tests/nightly`, and
-         the suite's tests of properties with 300 examples each in place of 20
+fuzz     every reader on 300,000 mutants of small valid files, and the tests of `tests/nightly`
 faults   the table of faults on a live bus
 grade    the estimator on recorded packs, and the diagnosis on its frozen cases (need --data)
 suite    the score cards of three gauges: our service, a counter, filterpy's filter
-long     the tests marked nightly; restarts by SIGKILL; load, timing and memory of the service;
-         attacks on its page, status and MQTT
+tests    what `make test` leaves out: tests marked nightly, and 300 examples of each property for 20
+long     restarts by SIGKILL; load, timing and memory of the service; attacks on its page, status
+         and MQTT
 load     half an hour at 12,000 frames/s, or what a bare loop carries here: no loss, memory flat
 
 Each part writes `out/nightly/PART.json`: state (passed, failed, skipped), reason, seconds and the
@@ -53,7 +53,6 @@ def commands(data: Path | None, socketcan: str) -> dict[str, list[list[str]] | s
     return {
         "fuzz": [
             [python, "-m", "pytest", "tests/nightly"],
-            [python, "-m", "pytest", "-m", "hypothesis", "--hypothesis-profile=nightly", "tests"],
             [python, "benchmarks/fuzz.py", "--inputs", "300000"],
         ],
         "faults": [[python, "-m", "faults", *bus]],
@@ -84,8 +83,11 @@ def commands(data: Path | None, socketcan: str) -> dict[str, list[list[str]] | s
             ],
             [python, *suite, python, "-m", "cangauge", *OWN_GAUGE.split()],
         ],
-        "long": [
+        "tests": [
             [python, "-m", "pytest", "-m", "nightly", "tests"],
+            [python, "-m", "pytest", "-m", "hypothesis", "--hypothesis-profile=nightly", "tests"],
+        ],
+        "long": [
             [python, "benchmarks/restarts.py"],
             [python, "benchmarks/bus_load.py"],
             [python, "benchmarks/wall.py"],

@@ -1,54 +1,22 @@
-"""The commands as a user meets them: arguments in; exit code, stdout and stderr out."""
+"""A log, a part of one and a model for the tests of commands."""
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
-import typer
 
-from cangauge.cli.app import main
-from cangauge.cli.estimate import estimate_command
-from cangauge.cli.fit import fit_command
-from cangauge.cli.gap import gap_command
-from cangauge.cli.inspect import inspect_command
-from cangauge.extras.validation.gap_check_command import gap_check_command
 from cangauge.identify.fit import fit
 from cangauge.logs.canonical import write_log
+from live import Ended, in_process
 from synthetic import synthetic_log
-
-app = typer.Typer()
-app.command("fit")(fit_command)
-app.command("estimate")(estimate_command)
-app.command("gap")(gap_command)
-app.command("gap-check")(gap_check_command)
-app.command("inspect")(inspect_command)
-
-
-@dataclass
-class Ran:
-    code: int
-    out: str
-    err: str
 
 
 @pytest.fixture
-def run(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Callable[..., Ran]:
-    """Run `cangauge ARG…` through its own `main`."""
-
-    def call(*args: object) -> Ran:
-        monkeypatch.setattr("cangauge.cli.app.app", app)
-        monkeypatch.setattr(sys, "argv", ["cangauge", *map(str, args)])
-        capsys.readouterr()
-        with pytest.raises(SystemExit) as left:
-            main()
-        said = capsys.readouterr()
-        return Ran(int(left.value.code or 0), said.out, said.err)
-
-    return call
+def run() -> Callable[..., Ended]:
+    """Run `cangauge ARG…` through its own `main`: exit code, stdout and stderr."""
+    return in_process
 
 
 @pytest.fixture(scope="session")

@@ -71,6 +71,7 @@ def test_a_stated_voltage_decides_the_scale() -> None:
 
 
 @pytest.mark.real
+@pytest.mark.nightly
 def test_a_real_drive_is_found_among_a_cars_signals(shared_data: Path) -> None:
     make = next(each for each in HELD_OUT if each.name == "stellantis_van")
     result = evaluate(shared_data, make)

@@ -38,15 +38,6 @@ def error_of(rows: FitRows) -> np.ndarray:
     return np.asarray(rows.voltage_v - truth)
 
 
-def slope_and_expected(rows: FitRows) -> tuple[float, float]:
-    """Slope of (U − pseudo-OCV) on I, and R1 + Σ Rj·ρj, with the published coefficients [Ω]."""
-    drop = rows.voltage_v - MODEL.pseudo_ocv(rows.soc_pct, rows.temperature_c)
-    current = rows.currents_a
-    covariance = np.cov(np.column_stack([current, drop]), rowvar=False)[0]
-    rho = covariance[:-1] / covariance[0]
-    return covariance[-1] / covariance[0], float(np.dot(MODEL.resistance_ohm, rho))
-
-
 @pytest.mark.parametrize("variant", VARIANTS)
 def test_rate_and_duration(variant: str) -> None:
     log = shipped(variant)

@@ -15,7 +15,7 @@ import pytest
 
 from cangauge.bus.connection import BusConnection
 from cangauge.bus.open import BusAddress, open_bus
-from cangauge.bus.publish import FrameIds, SocPublisher, standard_filter
+from cangauge.bus.publish import SocPublisher, standard_filter
 from cangauge.bus.time_source import is_clock
 from cangauge.bus.vehicle import Vehicle
 from cangauge.errors import CangaugeError, InputError
@@ -297,18 +297,6 @@ def test_fd_frames_need_an_fd_bus(tmp_path: Path) -> None:
     path.write_text("(1.000000) can0 123##000112233445566778899AABB\n")
     with virtual_port("classic") as port, pytest.raises(InputError, match="fd=true"):
         play(port, CaptureSource(path), ReplaySettings(), stop=never)
-
-
-def test_ids_are_configurable() -> None:
-    ids = FrameIds(0x111, 0x112, 0x113)
-    filters = [standard_filter(0x111), standard_filter(0x112)]
-    given = EstimatorSettings(initial_soc_pct=80.0)
-    settings = PipelineSettings(given, time_source="replay-clock", ids=ids)
-    with virtual_service("ids", settings), virtual_port("ids", filters) as port:
-        source = LogSource(short_log(10.0), Vehicle.load("generic"))
-        state = play(port, source, ReplaySettings(math.inf, ids=ids), stop=never)
-    assert state.acknowledged == 100
-    assert state.soc is not None
 
 
 @pytest.mark.real

@@ -52,10 +52,7 @@ def test_open_circuit_voltage_is_monotone(scenario: Scenario) -> None:
     assert np.all(np.diff(scenario.pack.chemistry.ocv_table_v) > 0.0)
 
 
-@pytest.mark.parametrize(
-    "fault_id",
-    nightly_except(("current_offset", "hysteresis"), [kind.id for kind in fault_kinds()]),
-)
+@pytest.mark.parametrize("fault_id", nightly_except(IN_SUITE, FAULTS))
 def test_every_fault_opens_a_gap(fault_id: str, scenario: Scenario, healthy: GroundTruth) -> None:
     _, largest = fault_kind(fault_id).limits(scenario.pack)
     fault = Fault(fault_id, largest, seed=2)
