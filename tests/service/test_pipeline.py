@@ -124,7 +124,7 @@ def test_heartbeat_acknowledges_the_last_samples(log: Log) -> None:
     reader = SocReader()
     acknowledged = 0
     for frame in with_clock(frames_of(log.rows(slice(0, 7)), vehicle)):
-        for sent in pipeline.acknowledgement() if pipeline.handle(frame) else []:
+        for sent in pipeline.acknowledgement(pipeline.latest) if pipeline.handle(frame) else []:
             content = reader.read(sent)
             acknowledged = content.samples if isinstance(content, SocDetail) else acknowledged
     assert acknowledged < 7
