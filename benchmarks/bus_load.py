@@ -83,7 +83,7 @@ def load(seconds: float) -> tuple[Result, list[Row]]:
         # Waiting 1.5 s for the end costs no CPU time.
         "run_cores": run["cpu_seconds"] / sent["seconds"],
         "bare_cores": bare["cpu_seconds"] / sent["seconds"],
-        "wanted_lost": wanted - run["frames"],
+        "wanted_lost": wanted - run["frames"]["received"],
     }
     rows = [
         ("frames sent", f"{sent['frames'] / sent['seconds']:.0f}/s over {sent['seconds']:.1f} s",
@@ -173,7 +173,7 @@ def full_speed() -> tuple[Result, list[Row]]:
         ("time through the bus", f"{replay['seconds']:.1f} s", "< 60 s"),
         ("samples lost", str(lost), "0"),
         ("CPU of `cangauge run`", f"{run['cpu_seconds']:.1f} s", ""),
-        ("step, median", f"{run['step_p50_us']:.0f} µs", ""),
+        ("step, mean", f"{1e6 * run['step']['mean_s']:.0f} µs", ""),
     ]
     return {"replay": replay, "run": run, "lost": lost}, rows
 

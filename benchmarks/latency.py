@@ -222,7 +222,7 @@ def loss(
             "seconds": sent.seconds,
             "frames": sent.frames,
             "wanted": sent.wanted,
-            "wanted_lost": sent.wanted - run["frames"],
+            "wanted_lost": sent.wanted - run["frames"]["received"],
             "bare_seconds": bare.seconds,
             "bare_lost": bare.wanted - bare_got,
             "cpu_share": run["cpu_seconds"] / sent.seconds,

@@ -174,7 +174,7 @@ def main() -> int:
             seen_s = [at for at in car.seen_s if at >= began_s - 0.2]
             gaps = [b - a for a, b in pairwise([*seen_s, time.monotonic()])]
             with suppress(OSError):
-                notices = fetch_status(f"{name}/status")["notices"]
+                notices = fetch_status(Path(name, "status"))["notices"]
             live = next((text for text in notices if "is started again" in text), "")
             why = live.partition("ended: ")[2].partition(";")[0].replace(" It is started again", "")
             rows.append((attack, max(gaps), resident_mb(process.pid), why))

@@ -31,7 +31,7 @@ from cangauge.cli.app import main
 from cangauge.logs.log import Log
 from cangauge.model.model_file import Model
 from cangauge.service.events import RateLimitFilter
-from cangauge.service.loop import Loop, LoopSettings, RunSummary
+from cangauge.service.loop import Loop, LoopSettings
 from cangauge.service.output import Output
 from cangauge.service.pipeline import Pipeline, PipelineSettings
 from cangauge.types import Estimate, Sample
@@ -119,7 +119,6 @@ class Service:
     record: Any = None
     checkpoint: Callable[[], None] = lambda: None
     rows: list[tuple[float, Estimate]] = field(default_factory=list)
-    summary: RunSummary | None = None
     error: BaseException | None = None
 
     def __enter__(self) -> Self:
@@ -159,7 +158,7 @@ class Service:
                 record=self.record,
                 checkpoint=self.checkpoint,
             )
-            self.summary = loop.run(self._stop.is_set)
+            loop.run(self._stop.is_set)
         except Exception as error:  # noqa: BLE001 - for the test to look at
             self.error = error
 

@@ -106,5 +106,4 @@ def temperature_and_cells_come(address: BusAddress) -> None:
         assert sorted({group for _, group in battery.requests}) == [2, 4]
         assert battery.early == 0
     assert polls.unanswered == polls.negative == polls.other_tester == 0
-    assert service.summary is not None
-    assert service.summary.foreign_frames == 0
+    assert service.port.foreign == 0

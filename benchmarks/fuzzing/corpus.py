@@ -97,7 +97,6 @@ pair_within_s = 0.02
 time_source = "receive"
 timeout_s = 2.0
 record = "drive.log"
-output = "soc.parquet"
 duration_s = 60
 until_idle_s = 3
 [bus_options]

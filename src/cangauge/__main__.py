@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import io
 import os
+import signal
 import sys
 
 
 def main() -> None:
-    """Run the command line; a service holds SIGHUP before its imports, which take a second."""
+    """Run the command line; a service ignores SIGHUP, the request to reload, while it loads."""
     for number in range(3):
         try:
             os.fstat(number)
@@ -17,11 +18,9 @@ def main() -> None:
     if isinstance(sys.stdout, io.TextIOWrapper):  # not what a test or a notebook has in its place
         # In a locale without "±" or "°C" the text is legible; otherwise it would be an error.
         sys.stdout.reconfigure(errors="backslashreplace")
-    if sys.argv[1:2] == ["run"]:
-        from cangauge.service.lifecycle import hold_hangups  # noqa: PLC0415 - as above
-
-        hold_hangups()
-    from cangauge.cli.app import main as command_line  # noqa: PLC0415 - as above
+    if sys.argv[1:2] == ["run"] and hasattr(signal, "SIGHUP"):
+        signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    from cangauge.cli.app import main as command_line  # noqa: PLC0415 - takes a second
 
     command_line()
 

@@ -77,7 +77,7 @@ def test_a_bad_log(
 @pytest.mark.parametrize("command", ["estimate", "gap", "run"])
 def test_a_missing_model(made: Path, tmp_path: Path, command: str) -> None:
     log = [] if command == "run" else [made / "part.csv"]
-    output = [] if command == "gap" else ["-o", tmp_path / "out.csv"]
+    output = ["-o", tmp_path / "out.csv"] if command == "estimate" else []
     error = failed(command, *log, "-m", tmp_path / "none.json", *output)
     assert error["source"] == str(tmp_path / "none.json")
     assert error["cure"] == "check the path"

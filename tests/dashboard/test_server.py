@@ -15,6 +15,7 @@ from typing import Any
 import pytest
 from tornado.websocket import websocket_connect
 
+from cangauge.bus.open import UNKNOWN_INTERFACE
 from cangauge.bus.vehicle import Vehicle
 from cangauge.errors import InputError
 from cangauge.extras.live import launch
@@ -24,7 +25,7 @@ from cangauge.service.pipeline import Pipeline
 from cangauge.service.run import Service
 from cangauge.service.status import Monitor
 from cangauge.service.status_client import Snapshot
-from live import LoggedLines, in_process, leaf_model, leaf_model_path, waits
+from live import LoggedLines, leaf_model, leaf_model_path, waits
 
 TOKEN = "a-token-of-some-length"  # noqa: S105 - made up
 
@@ -33,6 +34,7 @@ class Nowhere:
     """A port without counts."""
 
     name = "virtual x"
+    capabilities = UNKNOWN_INTERFACE
 
 
 def snapshot() -> Snapshot:
@@ -195,21 +197,6 @@ def test_the_cookie_outlives_a_restart_and_the_process_ends_with_the_service(
         os.kill(process, 0)
     with pytest.raises(OSError, match="refused"):
         socket.create_connection(("127.0.0.1", other.port), 1.0)
-
-
-@pytest.mark.parametrize("after", [[], ["--channel", "x"], ["127.0.0.1:8642"]])
-def test_the_option_alone_means_a_loopback_address(
-    monkeypatch: pytest.MonkeyPatch, after: list[str]
-) -> None:
-    def note(_: object, values: dict[str, Any]) -> None:
-        given.update(values)
-        raise InputError("enough")
-
-    given: dict[str, Any] = {}
-    monkeypatch.setattr("cangauge.service.config.load_config", note)
-    assert "enough" in in_process("run", "-m", "m.json", "--dashboard", *after).err
-    assert given["dashboard"] == "127.0.0.1:8642"
-    assert given["channel"] == ("x" if "x" in after else None)
 
 
 def test_an_address_in_use_is_refused(page: Live) -> None:

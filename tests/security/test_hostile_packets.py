@@ -163,8 +163,8 @@ def test_hangups_at_the_start_and_malformed_packets_do_not_end_the_service(
     assert ended.code == 0, ended.err
     assert "Traceback" not in ended.err
     assert "config.reloaded" in ended.err
-    assert ended.json["bus_losses"] == 0
-    assert ended.json["garbled"] == 2 * len(HOSTILE)
+    assert ended.json["bus_counts"]["losses"] == 0
+    assert ended.json["bus_counts"]["garbled"] == 2 * len(HOSTILE)
 
 
 def _catches_hangups(process: Path) -> bool:

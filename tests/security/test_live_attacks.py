@@ -43,7 +43,8 @@ class Target:
         self.good = (
             f'model = "{leaf_model_path()}"\ninterface = "udp_multicast"\nchannel = "{GROUP}"\n'
             f'initial_soc = 80\nstate = "state/{FILE_NAME}"\nstate_every_s = 0.1\n'
-            f'record = "recordings/r.log"\nrecord_part_s = 1\nstatus_socket = "{self.socket}"\n'
+            f'record = "recordings/r.log"\nrecord_part_mb = 0.002\n'
+            f'status_socket = "{self.socket}"\n'
             f'http = "127.0.0.1:{PORT}"\n[bus_options]\nport = {PORT}\n'
         )
         self.config.write_text(self.good)
@@ -87,7 +88,7 @@ class Target:
         assert max(gaps, default=9.0) < LONGEST_GAP_S, attack
 
     def status(self) -> dict[str, Any]:
-        return fetch_status(str(self.socket))
+        return fetch_status(self.socket)
 
 
 @pytest.fixture

@@ -53,14 +53,13 @@ def test_a_second_writer_is_refused_until_the_first_ends(tmp_path: Path) -> None
 
 
 def test_a_second_service_with_a_file_of_the_first_is_refused(tmp_path: Path) -> None:
-    record, state, table = tmp_path / "r.log", tmp_path / "s.json", tmp_path / "t.csv"
-    first = Command(*RUN, "--record", record, "--state", state, "-o", table)
+    record, state = tmp_path / "r.log", tmp_path / "s.json"
+    first = Command(*RUN, "--record", record, "--state", state)
     first.wait_for("service.ready")
     try:
         for options in (
             ("--record", record),
             ("--state", state),
-            ("-o", table),
         ):
             second = in_process(*RUN, *options, "--duration", "0.1")
             assert second.code == 2, options
@@ -69,7 +68,7 @@ def test_a_second_service_with_a_file_of_the_first_is_refused(tmp_path: Path) ->
     finally:
         first.process.terminate()
     assert first.end().code == 0
-    assert sorted(each.name for each in tmp_path.iterdir()) == ["r.log", "t.csv"]
+    assert sorted(each.name for each in tmp_path.iterdir()) == ["r.log"]
 
 
 @pytest.mark.parametrize("rights", [0o600, 0o644, 0o666])

@@ -252,7 +252,7 @@ def test_check_reads_what_run_would_read(tmp_path: Path) -> None:
             f'model = "{leaf_model_path()}"\nvehicle = "leaf_aze0"\n[ids]\nsoc_power = 0x1DB',
             "0x1DB",
         ),
-        (f'model = "{leaf_model_path()}"\noutput = "no/x.csv"', "no/x.csv"),
+        (f'model = "{leaf_model_path()}"\nstate = "no/x.json"', "no/x.json"),
     ):
         ended = in_process("check", write(tmp_path, text))
         assert (ended.code, ended.out, len(ended.err.splitlines())) == (2, "", 1)

@@ -6,7 +6,6 @@ import contextlib
 import itertools
 import json
 import socket
-import threading
 import time
 import urllib.error
 import urllib.request
@@ -18,13 +17,12 @@ import pytest
 from prometheus_client.parser import text_string_to_metric_families
 from watched import Watched
 
-from cangauge.errors import CangaugeError, InputError
+from cangauge.errors import InputError
 from cangauge.extras.live.addresses import http_address, read_token
 from cangauge.extras.live.http import MAX_CLIENTS
 from cangauge.extras.live.launch import Live
 from cangauge.model.published import CAPACITY_AH
-from cangauge.service.status_client import fetch_status
-from live import in_process, waits
+from live import waits
 
 TOKEN = "a-token-of-some-length"  # noqa: S105 - made up
 
@@ -66,7 +64,6 @@ def test_status_and_health(http: Live, watched: Watched) -> None:
     assert json.loads(get(http.port, "/healthz")[1])["ok"]
     for path in ("/", "/../etc/passwd"):
         assert get(http.port, path)[0] == 404
-    assert in_process("status", "--endpoint", f"http://127.0.0.1:{http.port}", "--json").code == 0
 
 
 def test_a_loop_that_does_not_turn_is_not_healthy(http: Live, watched: Watched) -> None:
@@ -196,22 +193,3 @@ def test_a_header_without_end_is_cut_off(http: Live) -> None:
         greedy.sendall(b"GET /status HTTP/1.1\r\nX: " + b"y" * 100_000)
         assert b"200" not in greedy.recv(4096)
     assert get(http.port, "/healthz")[0] in {200, 503}
-
-
-@pytest.mark.parametrize(
-    "answer", [b"", b"HTTP/1.1 200 OK\r\n\r\n[[[", b"HTTP/1.1 500 No\r\n\r\noops"]
-)
-def test_answers_of_another_server(answer: bytes) -> None:
-    with socket.create_server(("127.0.0.1", 0)) as server:
-
-        def serve() -> None:
-            peer, _ = server.accept()
-            with peer:
-                peer.recv(4096)
-                peer.sendall(answer)
-
-        thread = threading.Thread(target=serve)
-        thread.start()
-        with pytest.raises(CangaugeError):
-            fetch_status(f"http://127.0.0.1:{server.getsockname()[1]}")
-        thread.join()

@@ -157,7 +157,7 @@ def test_a_broker_that_goes_costs_no_sample(
         assert "homeassistant/sensor/bench/soc_pct/config" in listener.latest
     assert rate == pytest.approx(20.0, rel=0.15)
     assert running.summary is not None
-    assert running.summary["lost"] == 0
+    assert running.summary["frames"]["lost"] == 0
 
 
 def test_a_broker_that_hangs_delays_no_stop(tmp_path: Path, broker: Broker) -> None:

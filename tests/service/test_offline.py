@@ -57,7 +57,7 @@ def assert_same(live: list[Estimate], path: Path, preset: str) -> None:
         assert np.array_equal(getattr(recorded.table, name), expected, equal_nan=True), name
 
 
-@pytest.mark.parametrize(("suffix", "preset"), [(".log", "leaf_aze0"), (".csv", "generic")])
+@pytest.mark.parametrize(("suffix", "preset"), [(".log", "leaf_aze0"), (".log.gz", "generic")])
 def test_recorded_stamps_are_the_live_ones(tmp_path: Path, suffix: str, preset: str) -> None:
     rng = np.random.default_rng(5)
     encoder = FrameEncoder(Vehicle.load(preset))

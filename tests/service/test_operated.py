@@ -71,9 +71,9 @@ def test_a_whole_run(bus: list[str], tmp_path: Path) -> None:
     assert not sock.exists()
     events = [json.loads(line)["event"] for line in ended.err.splitlines()]
     assert {"http.listening", "service.ready", "status.changed", "service.stopped"} <= {*events}
-    assert ended.json["record"] == str(tmp_path / "seen-0001.log.gz")
+    assert ended.json["recording"] == str(tmp_path / "seen-0001.log.gz")
     assert len(list(tmp_path.glob("seen-0001-*.log.gz"))) > 1
-    recorded = estimate_capture(ended.json["record"], Vehicle.load("generic"), leaf_model())
+    recorded = estimate_capture(ended.json["recording"], Vehicle.load("generic"), leaf_model())
     assert recorded.table.soc_pct[-1] == ended.json["estimate"]["soc_pct"]
     assert recorded.table.soc_pct.size == 1200
     assert recorded.pack.report is not None
@@ -89,8 +89,8 @@ def test_a_whole_run(bus: list[str], tmp_path: Path) -> None:
         ('http = "127.0.0.1:0"\nhttp_token_file = "/nowhere/token"', "/nowhere/token"),
         ('status_socket = "/proc/x.sock"', "/proc/x.sock"),
         ('record_keep_mb = 5\nrecord = "x.log"', "record_part_mb"),
-        ('record = "x.asc"', "microsecond"),
-        ("record_part_s = 0.1", "record_part_s"),
+        ('record = "x.asc"', "candump"),
+        ("record_part_mb = 0", "record_part_mb"),
         ('log_level = "loud"', "log_level"),
     ],
 )

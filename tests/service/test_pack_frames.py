@@ -201,10 +201,10 @@ def test_cells_follow_a_reloaded_model(tmp_path: Path) -> None:
     model = leaf_model()
     pipeline = Pipeline(car_with_cells(tmp_path), model, PipelineSettings())
     before = pipeline.cells
-    pipeline.reconfigure(None, model, PipelineSettings())
+    pipeline.reconfigure(pipeline.vehicle, model, PipelineSettings())
     assert pipeline.cells is before
     other = model.model_copy(update={"name": "other"})
-    pipeline.reconfigure(None, other, PipelineSettings())
+    pipeline.reconfigure(pipeline.vehicle, other, PipelineSettings())
     assert pipeline.cells is not before
 
 

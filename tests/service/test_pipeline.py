@@ -90,7 +90,7 @@ def test_samples_of_a_replay_are_acknowledged_while_they_come(log: Log) -> None:
     pipeline = Pipeline(vehicle, leaf_model(), PipelineSettings(START, "replay-clock"))
     reader, told = SocReader(), [0]
     for frame in with_clock(frames_of(log.rows(slice(0, 100)), vehicle)):
-        for sent in pipeline.acknowledgement() if pipeline.handle(frame) else []:
+        for sent in pipeline.acknowledgement(pipeline.latest) if pipeline.handle(frame) else []:
             content = reader.read(sent)
             told += [content.samples] if isinstance(content, SocDetail) else []
         assert pipeline.samples - told[-1] < ACKNOWLEDGE_EVERY

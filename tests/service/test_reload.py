@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 
 import can
@@ -15,8 +16,10 @@ from cangauge.bus.database import load_dbc
 from cangauge.bus.vehicle import Vehicle
 from cangauge.estimation.offline import samples_of
 from cangauge.replay.encoder import FrameEncoder
+from cangauge.service.config import load_config
 from cangauge.service.loop import LoopSettings
 from cangauge.service.run import Service
+from cangauge.service.setup import SetupReader
 from cangauge.types import Reason
 from faults.large_dbc import SIGNALS
 from live import LoggedLines, leaf_model_path, short_log
@@ -53,9 +56,13 @@ class Car:
             sent += self.pipeline.heartbeat(is_stale=False)
         return sent
 
-    def reload(self, text: str) -> LoopSettings | None:
-        self.write(text)
-        return self.service.reconfigure()
+    def reload(self, text: str | None = None) -> LoopSettings | None:
+        """Read the file, with another text if one is given, and apply it."""
+        if text is not None:
+            self.write(text)
+        reading = SetupReader(partial(load_config, self.path))
+        reading.join()
+        return self.service.apply(reading.result)[0]
 
 
 @pytest.fixture
@@ -97,14 +104,14 @@ def test_a_reload_ignores_the_initial_soc(car: Car) -> None:
     before = car.pipeline.latest
     assert car.reload("initial_soc_std = 20\n") is not None
     car.path.write_text('model = "model.json"\ninitial_soc = 20\n')
-    assert car.service.reconfigure() is not None
+    assert car.reload() is not None
     car.drive(1000, 1001)
     assert car.pipeline.latest.soc_pct == pytest.approx(before.soc_pct, abs=0.05)
     # Nor where none is known yet: the first one stays.
     car.write("")
     fresh = Car(car.path.parent)
     fresh.path.write_text('model = "model.json"\ninitial_soc = 20\n')
-    assert fresh.service.reconfigure() is not None
+    assert fresh.reload() is not None
     fresh.drive(0, 10)
     assert fresh.pipeline.latest.soc_pct == pytest.approx(80.0, abs=1.0)
 
@@ -148,7 +155,7 @@ def test_a_dbc_or_map_that_changed_is_noticed(tmp_path: Path) -> None:
     car.drive(0, 100)
     temperature_c = car.pipeline.latest_sample.temperature_c  # type: ignore[union-attr] # there is one
     (tmp_path / "map.toml").write_text(MAP + "offset = 5\n")
-    assert car.service.reconfigure() is not None
+    assert car.reload() is not None
     car.drive(100, 200)
     assert car.pipeline.latest_sample.temperature_c == pytest.approx(  # type: ignore[union-attr] # as above
         temperature_c + 5.0, abs=1.0
@@ -196,7 +203,7 @@ def test_a_broken_model_is_refused(car: Car, content: bytes) -> None:
     assert car.reload("timeout_s = 0.5\n") is None
     assert "model.json" in car.said[0]
     car.model.unlink()
-    assert car.service.reconfigure() is None
+    assert car.reload() is None
     car.logged.release_all()
     assert len(car.said) == 2
 

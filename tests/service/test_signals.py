@@ -10,34 +10,36 @@ from pathlib import Path
 
 import pytest
 
-from cangauge.service.lifecycle import note_hangups, stop_on_signals
+from cangauge.service.lifecycle import reload_on_hangup, stop_on_signals
 
 pytestmark = pytest.mark.skipif(not hasattr(signal, "SIGHUP"), reason="no SIGHUP on this system")
 
 
-def test_a_hangup_is_reported_once() -> None:
+def test_a_hangup_reloads() -> None:
     before = signal.getsignal(signal.SIGHUP)
-    with stop_on_signals() as stop, note_hangups() as take:
-        assert not take()
+    calls = list[str]()
+    with (
+        stop_on_signals(lambda: calls.append("stop")),
+        reload_on_hangup(lambda: calls.append("reload")),
+    ):
         signal.raise_signal(signal.SIGHUP)
-        signal.raise_signal(signal.SIGHUP)
-        assert take()
-        assert not take()
-        assert not stop()
+        assert calls == ["reload"]
     assert signal.getsignal(signal.SIGHUP) == before
 
 
 LOOP = """
 import sys, time
-from cangauge.service.lifecycle import note_hangups, stop_on_signals
-with stop_on_signals() as stop, note_hangups() as take:
+from cangauge.service.lifecycle import reload_on_hangup, stop_on_signals
+calls, stops = [], []
+with stop_on_signals(lambda: stops.append(1)), reload_on_hangup(lambda: calls.append(1)):
     print("ready", flush=True)
     until = time.monotonic() + 20.0
-    while not stop() and time.monotonic() < until:
-        if take():
+    while not stops and time.monotonic() < until:
+        if calls:
             print("again", flush=True)
+            calls.clear()
         time.sleep(0.01)
-open(sys.argv[1], "w").write("stopped" if stop() else "went on")
+open(sys.argv[1], "w").write("stopped" if stops else "went on")
 """
 
 

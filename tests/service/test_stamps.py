@@ -131,7 +131,10 @@ def test_clock_set_in_mid_drive_costs_nothing(tmp_path: Path) -> None:
     assert state is not None
     later = Pipeline(Vehicle.load("generic"), leaf_model(), GIVEN)
     later.restore(state, 1.0)
-    later._estimate(Sample(time.time() + 86_401.0, 1.0, 380.0, 20.0))
+    for frame in FrameEncoder(later.vehicle).encode(
+        Sample(time.time() + 86_401.0, 1.0, 380.0, 20.0)
+    ):
+        later.handle(frame)
     assert later.taken == 1
     assert not later.latest.reasons & Reason.CURRENT_GAP
 

@@ -263,7 +263,7 @@ DAMAGE: dict[str, tuple[Callable[[Path], object], str]] = {
     "nested": (lambda path: path.write_text("[" * 200_000), "not a cangauge state"),
     "large": (lambda path: path.write_bytes(b" " * ((8 << 20) + 1)), "larger than the 8 MB"),
     "version": (lambda path: path.write_text(path.read_text().replace(
-        f'"version": {STATE_VERSION}', '"version": 1')), "(got '1')"),
+        f'"version": {STATE_VERSION}', '"version": 1')), "(got 1)"),
     "hash": (lambda path: path.write_text(path.read_text().replace('"sha256": "', '"sha256": "0')),
              "damaged"),
     "unknown key": (edited("more", value=1), "more"),
@@ -301,7 +301,7 @@ def test_a_refused_state_discards_the_initial_soc(machine: Machine) -> None:
     assert "starting from the voltage, since the given initial SoC is outdated" in machine.text
     assert again.drive(DRIVE[:1000])[-1].soc_pct == pytest.approx(79.0, abs=4.0)
     # Nor does it come back when the configuration is read again.
-    again.pipeline.reconfigure(None, machine.model, machine.settings)
+    again.pipeline.reconfigure(VEHICLE, machine.model, machine.settings)
     assert again.drive(DRIVE[1000:1010])[-1].soc_pct == pytest.approx(79.0, abs=4.0)
 
 
@@ -320,15 +320,15 @@ def test_what_is_no_state_is_refused_at_the_start(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "pipe")
     with pytest.raises(InputError, match="FIFO"):
         state_path(str(tmp_path / "pipe"), {})
-    with pytest.raises(InputError, match="does not exist"):
-        state_path(str(tmp_path / "no" / "state.json"), {})
-    assert state_path(str(tmp_path / "new.json"), {}) == tmp_path / "new.json"
 
 
 def test_where_the_file_is(tmp_path: Path) -> None:
     assert state_path(None, {}) is None
     assert state_path(str(tmp_path), {}) == tmp_path / FILE_NAME
     assert state_path("a.json", {"STATE_DIRECTORY": "/var/lib/x"}) == Path("a.json")
+    assert state_path(str(tmp_path / "new.json"), {}) == tmp_path / "new.json"
+    with pytest.raises(InputError, match="does not exist"):
+        state_path(str(tmp_path / "no" / "state.json"), {})
     folders = {"STATE_DIRECTORY": f"{tmp_path}:/var/lib/y"}
     assert state_path(None, folders) == tmp_path / FILE_NAME
 

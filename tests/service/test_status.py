@@ -34,7 +34,7 @@ from live import Command, in_process, waits
 KEYS = {
     "": "schema running version bus vehicle model method time_source core uptime_s loop_stuck"
     " loop_age_s status reasons estimate sample health power cells notices samples samples_per_s"
-    " frames rejects bus_up bus_counts bus_trouble polls config latency step record",
+    " frames rejects stamps bus_up bus_counts bus_trouble polls config latency step record",
     "estimate": "time_s soc_pct soc_std_pct soc_newton_pct soc_coulomb_pct voltage_model_v"
     " residual_v",
     "sample": "age_s current_a voltage_v temperature_c",
@@ -183,8 +183,8 @@ def test_watchdog_pings_come_with_turns_only() -> None:
     class Counting(Notifier):
         pings = 0
 
-        def ping(self) -> None:
-            self.pings += 1
+        def send(self, **values: object) -> None:
+            self.pings += "WATCHDOG" in values
 
     notifier = Counting()
     notifier.ping_every_s = 0.5
@@ -230,7 +230,7 @@ def served(watched: Watched, tmp_path: Path) -> Iterator[Path]:
 
 def test_the_socket_and_the_command(watched: Watched, served: Path) -> None:
     assert stat.S_IMODE(served.stat().st_mode) == 0o660
-    assert fetch_status(str(served))["samples"] == 900
+    assert fetch_status(served)["samples"] == 900
     ended = in_process("status", "--endpoint", served, "--json")
     assert (ended.code, ended.json["status"]) == (0, "valid")
     ended = in_process("status", "--endpoint", served)
@@ -261,7 +261,6 @@ def test_no_service_is_one_line_and_exit_1(tmp_path: Path) -> None:
     assert (ended.code, ended.json["running"]) == (1, False)
     ended = in_process("status", "--endpoint", tmp_path / "no.sock")
     assert (ended.code, ended.out, len(ended.err.splitlines())) == (1, "", 1)
-    assert in_process("status", "--endpoint", "http://[::1").code == 2
 
 
 def test_a_socket_left_behind_is_replaced_and_a_file_is_not(
@@ -306,7 +305,7 @@ def test_a_client_that_does_not_read_holds_nobody(served: Path) -> None:
     silent = [socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) for _ in range(3)]
     for each in silent:
         each.connect(str(served))
-    assert fetch_status(str(served))["samples"] == 900
+    assert fetch_status(served)["samples"] == 900
     for each in silent:
         each.close()
 
@@ -326,7 +325,7 @@ def test_an_answer_that_is_no_status(tmp_path: Path, answer: bytes) -> None:
         thread = threading.Thread(target=serve)
         thread.start()
         with pytest.raises(CangaugeError, match="not a status"):
-            fetch_status(str(path))
+            fetch_status(path)
         thread.join()
 
 
@@ -348,7 +347,7 @@ def test_a_socket_survives_a_lack_of_descriptors(
 
     def ask() -> bool:
         try:
-            first.append(fetch(str(served))["samples"])
+            first.append(fetch(served)["samples"])
         except CangaugeError:
             return False
         return True

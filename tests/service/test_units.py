@@ -72,5 +72,5 @@ def test_the_unit_names_options_that_there_are(project: Path) -> None:
 def test_the_example_configuration_is_one(project: Path) -> None:
     config = load_config(project / "contrib" / "systemd" / "example.toml")
     assert config.record == "/var/lib/cangauge/can0/drive.log.gz"
-    assert (config.record_part_mb, config.record_part_s, config.record_keep_mb) == (64, 3600, 2000)
+    assert (config.record_part_mb, config.record_keep_mb) == (64, 2000)
     assert http_address(str(config.http), None, {}).host == "127.0.0.1"

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Any
 
+from cangauge.bus.open import UNKNOWN_INTERFACE, BackendCapabilities
 from cangauge.bus.vehicle import Vehicle
 from cangauge.estimation.offline import samples_of
 from cangauge.estimation.settings import EstimatorSettings
@@ -25,6 +26,7 @@ class StandInPort:
     unsent: int = 3
     queue_drops: int | None = 4
     is_off: bool = False
+    capabilities: BackendCapabilities = UNKNOWN_INTERFACE
 
 
 @dataclass

@@ -196,9 +196,8 @@ def test_an_interface_that_flaps() -> None:
         samples = live.pipeline.samples
         assert waits(lambda: live.pipeline.samples >= samples + 20)
     assert live.error is None
-    assert live.summary is not None
     assert 1 <= live.bus.losses <= 5
-    assert live.log.events.count("bus.lost") <= live.summary.seconds + 1.0
+    assert live.log.events.count("bus.lost") <= 5
 
 
 def test_a_bus_that_does_not_exist_yet() -> None:
@@ -345,12 +344,12 @@ def test_overflow_signals_and_a_bus_that_is_down(tmp_path: Path) -> None:
     assert time.monotonic() - began_s < 1.0
     assert ended.code == 0, ended.err
     result = ended.json
-    assert result["queue_drops"] > 0
-    assert result["frames"] + result["queue_drops"] == burst
+    drops = result["bus_counts"]["queue_drops"]
+    assert drops > 0
+    assert result["frames"]["received"] + drops == burst
     assert result["stamps"] == "kernel"
-    assert result["bus_losses"] == 1
-    assert result["bus_away_s"] > 0.5
-    assert f"{result['queue_drops']} dropped in the receive queue" in ended.err
+    assert result["bus_counts"]["losses"] == 1
+    assert f"{drops} dropped in the receive queue" in ended.err
 
 
 def _wait_until_worked_off() -> None:

@@ -202,7 +202,7 @@ def test_both_commands_until_the_bus_goes_down(tmp_path: Path) -> None:
     finally:
         subprocess.run(["ip", "link", "set", "vcan0", "up"], check=True)
     assert ended.code == 0
-    assert ended.json["bus_losses"] == 1
+    assert ended.json["bus_counts"]["losses"] == 1
     # The recording until then is complete.
     recorded = estimate_capture(record, Vehicle.load("generic"), leaf_model())
     assert recorded.table.soc_pct.size == 200

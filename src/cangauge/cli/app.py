@@ -88,7 +88,7 @@ def load_command(name: str) -> Any:
     alone = typer.Typer(
         rich_markup_mode="markdown", add_completion=False, context_settings=_CONTEXT
     )
-    alone.command(name, cls=getattr(function, "command_class", None))(function)
+    alone.command(name)(function)
     return build_command(alone)
 
 

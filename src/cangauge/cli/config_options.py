@@ -3,34 +3,16 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Iterator, Mapping, Sequence
-from itertools import zip_longest
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Final
 
 import typer
-from typer.core import TyperCommand
 
 from cangauge.service.config import ConfigKey, config_keys
 
 _OPTIONS: Final = {key.name: key for key in config_keys() if key.info.option}
-_BARE: Final = {key.info.option: key.info.bare for key in _OPTIONS.values() if key.info.bare}
 _TYPES: Final[Mapping[str, type]] = {"number": float, "true or false": bool}
-
-
-class ConfigCommand(TyperCommand):
-    """A command some of whose options may stand without a value."""
-
-    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """Parse the arguments, with the usual values where none are given."""
-        return super().parse_args(ctx, list(_with_values(args)))
-
-
-def _with_values(arguments: Sequence[str]) -> Iterator[str]:
-    for word, following in zip_longest(arguments, arguments[1:], fillvalue="-"):
-        yield word
-        if word in _BARE and following.startswith("-"):
-            yield _BARE[word]
 
 
 def config_parameters(*names: str) -> list[inspect.Parameter]:

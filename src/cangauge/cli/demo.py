@@ -27,7 +27,7 @@ model = "model.json"
 time_source = "replay-clock"
 temperature_source = "room"
 until_idle_s = 3
-output = "live.parquet"
+record = "live.log"
 """
 EXIT_WITHIN_S = 33.0
 """Longest wait for the service to exit after the replay: its idle time and half a minute [s]."""
@@ -65,8 +65,7 @@ def demo_command(*, folder: Path = Path("out/demo"), json_output: bool = False) 
     from cangauge.logs.canonical import write_log
     from cangauge.logs.read import read_log
     from cangauge.replay.steps import quantization_bound
-    from cangauge.service.estimate_table import read_estimates
-    from cangauge.service.offline import RecordedEstimate
+    from cangauge.service.offline import RecordedEstimate, estimate_capture
 
     began = time.monotonic()
     try:
@@ -87,9 +86,10 @@ def demo_command(*, folder: Path = Path("out/demo"), json_output: bool = False) 
     write_log(log, folder / PLAYED)
     seconds = _play(folder, folder / PLAYED)
     note("3/4  compare live with offline and with the reference")
-    table = read_estimates(folder / "live.parquet")
+    settings, vehicle = EstimatorSettings(temperature_source="room"), Vehicle.load("generic")
+    # The recording gives the live numbers again, bit for bit.
+    table = estimate_capture(folder / "live.log", vehicle, model, settings).table
     live = score(table, log, seconds)
-    settings = EstimatorSettings(temperature_source=log.temperature_source)
     offline, _ = estimate_log(log, model, settings)
     note("4/4  write the pages")
     estimate = RecordedEstimate(log, table, live, model, settings)
@@ -109,7 +109,7 @@ def demo_command(*, folder: Path = Path("out/demo"), json_output: bool = False) 
         "live_soc_coulomb_mae_pct": live.soc_coulomb_mae_pct,
         "live_cover_2sigma": live.cover_2sigma,
         "live_minus_offline_pct": float(np.nanmax(np.abs(table.soc_pct - offline.soc_pct))),
-        "quantisation_bound_pct": quantization_bound(Vehicle.load("generic"), model, log).ekf_pct,
+        "quantisation_bound_pct": quantization_bound(vehicle, model, log).ekf_pct,
         "seconds": time.monotonic() - began,
         **{name: str(path) for name, path in paths.items()},
     }

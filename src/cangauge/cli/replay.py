@@ -75,8 +75,9 @@ def replay_command(
     loaded = load_config(config, {"model": "-", **config_values(options)})
     ids = FrameIds(**loaded.ids.model_dump())
     source, address = _source(recorded, columns, loaded, ids), address_of(loaded)
+    stopped: list[bool] = []
     with ExitStack() as stack:
-        stop = stack.enter_context(stop_on_signals())
+        stack.enter_context(stop_on_signals(lambda: stopped.append(True)))
         filters = [standard_filter(ids.soc_estimate), standard_filter(ids.soc_detail)]
         bus = stack.enter_context(BusConnection(open_bus(address, filters), str(address)))
         note(f"playing {recorded} on {address}, speed {speed}")
@@ -84,9 +85,12 @@ def replay_command(
         factor = math.inf if speed == "max" else speed
         settings = ReplaySettings(speed=factor, loop=loop, ids=ids)
         state = play(
-            bus, source, settings, stop=stop, show=lambda now: bar(now.log_seconds, _shown(now))
+            bus,
+            source,
+            settings,
+            stop=lambda: bool(stopped),
+            show=lambda now: bar(now.log_seconds, _shown(now)),
         )
-        stopped = stop()
     note(_summary_line(state))
     if bus.unsent:
         note(f"warning: {bus.unsent} frames were not sent: the transmit queue stayed full")

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 from rich.live import Live
 
 from cangauge._logging import emit
-from cangauge.cli.config_options import ConfigCommand, config_parameters, config_values
+from cangauge.cli.config_options import config_parameters, config_values
 from cangauge.cli.declare import command
 from cangauge.cli.output import console, emit_json, print_values
 from cangauge.cli.status import live_text
@@ -36,8 +36,8 @@ def run_command(*, config: Path | None = None, json_output: bool = False, **opti
     current discharges.
 
     SIGHUP reloads configuration, model and vehicle: the SoC continues, an invalid configuration
-    is refused (`cangauge check` tests it before). Changes of the bus, the time source and output
-    files need a restart.
+    is refused (`cangauge check` tests it before). Changes of the bus, the time source and the
+    recording need a restart.
 
     Examples
     --------
@@ -46,11 +46,12 @@ def run_command(*, config: Path | None = None, json_output: bool = False, **opti
     `cangauge run -m leaf.json --time-source replay-clock`  (and, beside it,
     `cangauge replay trip.parquet --speed max`)
 
-    `cangauge run --config car.toml --record drive.log -o soc.parquet`
+    `cangauge run --config car.toml --record drive.log`  (then
+    `cangauge estimate drive.log` writes the table of the live estimates, bit for bit)
 
     `cangauge run --config car.toml --state /var/lib/cangauge`
 
-    `cangauge run --config car.toml --dashboard`  (the live page at http://127.0.0.1:8642/)
+    `cangauge run --config car.toml --dashboard 8642`  (the live page at http://127.0.0.1:8642/)
 
     Parameters
     ----------
@@ -58,7 +59,6 @@ def run_command(*, config: Path | None = None, json_output: bool = False, **opti
         Configuration; its keys are in docs/configuration.md. Options given here take precedence.
     """
     from cangauge.service.config import load_config
-    from cangauge.service.lifecycle import deadline_after_signal
     from cangauge.service.run import Service
 
     given = config_values(options)
@@ -70,7 +70,6 @@ def run_command(*, config: Path | None = None, json_output: bool = False, **opti
             # Everything loaded so far lives until exit. Garbage collection of it would pause the
             # loop, and destroying it would delay the exit by a second.
             gc.freeze()
-            stack.enter_context(deadline_after_signal())
             result = service.run()
         except CangaugeError as error:
             if loaded.log_format == "json":  # each line of stderr is an object
@@ -79,9 +78,6 @@ def run_command(*, config: Path | None = None, json_output: bool = False, **opti
             raise
         if json_output:
             emit_json(result)
-
-
-run_command.command_class = ConfigCommand  # type: ignore[attr-defined] # read by the app: --dashboard may stand without a value
 
 
 class _LiveLine(Output):

@@ -6,6 +6,7 @@ import time
 from collections.abc import Callable
 from contextlib import ExitStack
 from functools import partial
+from pathlib import Path
 from typing import Any, Final
 
 import typer
@@ -34,7 +35,7 @@ _STYLE: Final = {"initialising": "yellow", "valid": "green", "degraded": "yellow
 
 @command()
 def status_command(
-    *, endpoint: str | None = None, watch: bool = False, json_output: bool = False
+    *, endpoint: Path | None = None, watch: bool = False, json_output: bool = False
 ) -> None:
     """Show the state of a running service: SoC ± standard deviation [%], frames, delays.
 
@@ -46,15 +47,15 @@ def status_command(
     --------
     `cangauge status`
 
-    `cangauge status --watch --endpoint http://127.0.0.1:9464`
+    `cangauge status --watch`
 
     `cangauge status --endpoint /run/cangauge/can0/status.sock --json`
 
     Parameters
     ----------
-    endpoint : PATH|URL
-        Unix socket of the service, or http://HOST:PORT (with the bearer token in
-        CANGAUGE_HTTP_TOKEN). Default: the service running on this machine.
+    endpoint : PATH
+        Unix socket of the service. Default: the service running on this machine. From another
+        machine: `curl http://HOST:PORT/status`.
     watch : --watch
         Show it again every half second, until Ctrl-C.
     """
@@ -78,14 +79,14 @@ def status_command(
         raise typer.Exit(1)
 
 
-def _ask(endpoint: str | None) -> tuple[str, dict[str, Any]]:
+def _ask(endpoint: Path | None) -> tuple[Path, dict[str, Any]]:
     from cangauge.service.status_client import fetch_status, find_socket
 
-    place = endpoint or str(find_socket())
+    place = endpoint or find_socket()
     return place, fetch_status(place)
 
 
-def _watch(endpoint: str | None) -> None:
+def _watch(endpoint: Path | None) -> None:
     """Show the status until stopped, in lines where stdout is no terminal."""
     shown = PlainConsole(highlight=False)
     with ExitStack() as stack:

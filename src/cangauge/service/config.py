@@ -19,9 +19,10 @@ from __future__ import annotations
 import sys
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from functools import cache, reduce
 from os import PathLike
 from pathlib import Path
-from typing import Annotated, Any, Final, Literal, Self, get_args, get_origin
+from typing import Annotated, Any, Final, Literal, Self
 
 from pydantic import (
     BaseModel,
@@ -32,7 +33,6 @@ from pydantic import (
     PrivateAttr,
     StrictBool,
 )
-from pydantic.fields import FieldInfo
 
 from cangauge._config import read_toml, validated
 from cangauge.bus.mapping import CheckMap, MessageMap, RuleMap
@@ -46,8 +46,6 @@ from cangauge.service.events import LogFormat, LogLevel
 
 DEFAULT_VEHICLE: Final = "generic"
 """Default of `replay` as well, so that both commands work together without options."""
-DASHBOARD: Final = "127.0.0.1:8642"
-"""Address of the live page where the option stands without one."""
 
 
 @dataclass(frozen=True)
@@ -55,9 +53,9 @@ class KeyInfo:
     """What a key has beside its type, bounds and help.
 
     `option` is that of `cangauge run`, such as "-m, --model" ("": a key of the file only),
-    `metavar` the placeholder of its value, `bare` its value where none follows ("": one must).
-    `default_text` is the default in words, where the field's own is not enough. A reload does not
-    apply a change of a key with `restart`; paths are relative to the file that they are in.
+    `metavar` the placeholder of its value, `default_text` the default in words, where the field's
+    own is not enough. A reload does not apply a change of a key with `restart`; paths are relative
+    to the file that they are in.
     """
 
     option: str = ""
@@ -66,21 +64,19 @@ class KeyInfo:
     default_text: str = ""
     restart: bool = False
     is_path: bool = False
-    bare: str = ""
 
 
 def key(default: Any, text: str, option: str = "", metavar: str = "", **more: Any) -> Any:
     """Return the field of a key; further arguments are those of `KeyInfo`, or pydantic's bounds."""
     info = {name: more.pop(name) for name in KeyInfo.__dataclass_fields__ if name in more}
-    field: FieldInfo = Field(default, description=text, **more)
-    field.metadata.append(KeyInfo(option, metavar, **info))
-    return field
+    about = {"option": option, "metavar": metavar, **info}
+    return Field(default, description=text, json_schema_extra={"key": about}, **more)
 
 
 class Strict(BaseModel):
-    """A table that refuses unknown keys."""
+    """A table of keys; unknown ones are refused."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    model_config = ConfigDict(extra="forbid", frozen=True, json_schema_extra={"has_keys": True})
 
 
 def _id(default: int, name: str, *, restart: bool = False) -> Any:
@@ -331,7 +327,7 @@ class RunConfig(Strict):
     )
     record: str | None = key(
         None,
-        "Record the received frames (.log, .csv, either with .gz): `cangauge estimate` on them"
+        "Record the received frames (candump .log or .log.gz): `cangauge estimate` on them"
         " gives the live numbers, bit for bit. A kill loses the last half second. A full disk costs"
         " frames of the recording, never the estimate. An existing recording is kept: the next run"
         " is FILE-0001, FILE-0002, …",
@@ -341,16 +337,9 @@ class RunConfig(Strict):
         None, "Size of a part of the recording: NAME-RUN-PART. NAME-RUN denotes all its parts.",
         unit="MB", restart=True, gt=0.0, le=1e9,
     )  # fmt: skip
-    record_part_s: FiniteFloat | None = key(
-        None, "Duration of a part of the recording.", unit="s", restart=True, ge=1.0, le=1e9
-    )
     record_keep_mb: FiniteFloat | None = key(
         None, "Total size of the recording; the oldest files are removed.",
         unit="MB", restart=True, gt=0.0, le=1e9,
-    )  # fmt: skip
-    output: str | None = key(
-        None, "Table of the estimates, .csv or .parquet.",
-        "-o, --output", "FILE", restart=True, is_path=True,
     )  # fmt: skip
     duration_s: FiniteFloat | None = key(
         None, "Stop after this time.", "--duration", "S", unit="s", gt=0.0, le=1e9
@@ -398,9 +387,9 @@ class RunConfig(Strict):
     mqtt: MqttConfig | None = key(None, "MQTT broker that takes the state (extra `mqtt`).")
     dashboard: str | None = key(
         None,
-        "Serve the live page there; on the command line alone: at 127.0.0.1:8642. An address beyond"
-        " loopback needs a token, as with --http.",
-        "--dashboard", "HOST:PORT", restart=True, bare=DASHBOARD,
+        "Serve the live page there, e.g. 8642. An address beyond loopback needs a token, as with"
+        " --http.",
+        "--dashboard", "HOST:PORT", restart=True,
     )  # fmt: skip
     status_socket: str = key(
         "auto", "Unix socket for `cangauge status`; auto: in the user's runtime folder.",
@@ -431,49 +420,33 @@ def load_config(
     """
     given = {name: value for name, value in (overrides or {}).items() if value not in (None, {})}
     _check_options(given)  # separately, so that an error names the source of the value
-    if path is None:
-        if "model" not in given:
-            raise InputError(
-                "is missing", field="-m/--model", cure="give -m MODEL (made by `cangauge fit`)"
-            )
-        return RunConfig.model_validate(given)
-    data = read_toml(path)
-    validated(RunConfig, {"model": "-", **data}, path)
-    data = _in_folder(RunConfig, data, Path(path).parent)
-    if given.keys() & {"vehicle", "dbc", "map"}:
-        # A vehicle given as an option replaces the file's as a whole.
-        data = {
-            name: value for name, value in data.items() if name not in {"vehicle", "dbc", "map"}
-        }
-    for name in ("ids", "bus_options"):
-        if name in data and name in given:
-            given[name] = {**data[name], **given[name]}
+    data = {} if path is None else read_toml(path)
+    validated(RunConfig, {"model": "-", **data}, path or "")
+    for each in config_keys():
+        *tables, name = each.name.split(".")
+        table = reduce(lambda found, key: found.get(key, {}), tables, data)
+        if path is not None and each.info.is_path and name in table:
+            table[name] = str(Path(path).parent / table[name])
+    if given.keys() & {"vehicle", "dbc", "map"}:  # replaces the file's vehicle as a whole
+        data = {name: data[name] for name in data if name not in {"vehicle", "dbc", "map"}}
+    for name in given.keys() & {"ids", "bus_options"}:
+        given[name] = {**data.get(name, {}), **given[name]}
     merged = {**data, **given}
     if "model" not in merged:
-        raise InputError("is missing", source=path, field="model", cure="add it, or give -m MODEL")
-    return validated(RunConfig, merged, path).named(path)
+        field = "-m/--model" if path is None else "model"
+        cure = "give -m MODEL (made by `cangauge fit`)"
+        raise InputError("is missing", source=path, field=field, cure=cure)
+    config = validated(RunConfig, merged, path or "")
+    return config if path is None else config.named(path)
 
 
 def _check_options(given: Mapping[str, Any]) -> None:
     try:
         validated(RunConfig, {"model": "-", **given}, "")
     except InputError as error:
-        field = error.field or ""
         options = {each.name: each.info.option for each in config_keys() if each.info.option}
-        option = options.get(field, field).rpartition(", ")[2]
+        option = options.get(error.field or "", error.field or "").rpartition(", ")[2]
         raise InputError(error.problem, field=option, value=error.value, cure=error.cure) from error
-
-
-def _in_folder(model: type[BaseModel], data: Mapping[str, Any], folder: Path) -> dict[str, Any]:
-    """Return data of a file with its paths relative to the file's folder."""
-    found = dict(data)
-    for name in data.keys() & model.model_fields.keys():
-        field, value = model.model_fields[name], data[name]
-        if _info(field).is_path and isinstance(value, str):
-            found[name] = str(folder / value)
-        elif isinstance(value, Mapping) and (inner := _table(field)) is not None:
-            found[name] = _in_folder(inner, value, folder)
-    return found
 
 
 # --- Description of the keys
@@ -493,6 +466,13 @@ class ConfigKey:
     text: str
     info: KeyInfo
 
+    def value_in(self, table: Mapping[str, Any]) -> Any:
+        """Return the value of the key in a table, or None."""
+        value: Any = table
+        for part in self.name.split("."):
+            value = value and value[part]
+        return value
+
     @property
     def help(self) -> str:
         """Help text of the option, with unit and default."""
@@ -502,23 +482,43 @@ class ConfigKey:
         return f"{text} Default: {self.default}." if self.default else text
 
 
-def config_keys(model: type[BaseModel] = RunConfig, prefix: str = "") -> Iterator[ConfigKey]:
-    """Yield the keys of a table and of its inner tables, with dotted names."""
-    signs = {"gt": ">", "ge": "≥", "lt": "<", "le": "≤"}
-    for name, field in model.model_fields.items():
-        if (inner := _table(field)) is not None:
-            yield from config_keys(inner, f"{prefix}{name}.")
+_KINDS: Final = {
+    "boolean": "true or false", "number": "number", "integer": "whole number", "string": "text"
+}  # fmt: skip
+_BOUNDS: Final = {"exclusiveMinimum": ">", "minimum": "≥", "maximum": "≤"}
+
+
+@cache
+def config_keys() -> tuple[ConfigKey, ...]:
+    """Return all keys, from the JSON schema of the configuration."""
+    schema = RunConfig.model_json_schema()
+    return tuple(_keys(schema, schema["$defs"], ""))
+
+
+def _keys(table: dict[str, Any], tables: dict[str, Any], prefix: str) -> Iterator[ConfigKey]:
+    for name, field in table["properties"].items():
+        # The type of an optional key is one of two; the other one is null.
+        kind = field.get("anyOf", [field])[0]
+        inner = tables.get(kind.get("$ref", "").rpartition("/")[2], {})
+        if inner.get("has_keys"):
+            yield from _keys(inner, tables, f"{prefix}{name}.")
             continue
-        info = _info(field)
-        bounds = [
-            f"{sign} {getattr(part, bound):g}"
-            for part in field.metadata
-            for bound, sign in signs.items()
-            if isinstance(getattr(part, bound, None), int | float)
-        ]
-        default = info.default_text or _default(field, info)
-        text, kind = field.description or "", _kind(field.annotation)
-        yield ConfigKey(prefix + name, kind, default, ", ".join(bounds), text, info)
+        info, default = KeyInfo(**field["key"]), field.get("default")
+        values = kind.get("enum")
+        words = f"one of {', '.join(values)}" if values else _KINDS.get(kind.get("type"), "table")
+        bounds = [f"{sign} {kind[bound]:g}" for bound, sign in _BOUNDS.items() if bound in kind]
+        text = info.default_text or _default(default, info)
+        yield ConfigKey(prefix + name, words, text, ", ".join(bounds), field["description"], info)
+
+
+def _default(value: Any, info: KeyInfo) -> str:
+    if value is None or isinstance(value, dict):
+        return ""
+    if isinstance(value, bool):
+        return str(value).lower()
+    if info.metavar == "ID":
+        return f"0x{value:X}"
+    return f"{value:.10g}" if isinstance(value, float) else str(value)
 
 
 def reference() -> str:
@@ -530,42 +530,6 @@ def reference() -> str:
         rows.append((f"`{each.name}`", option, *about))
     cells = [[cell.replace("|", "\\|") for cell in row] for row in rows]
     return "".join(f"| {' | '.join(row)} |\n" for row in cells)
-
-
-def _info(field: FieldInfo) -> KeyInfo:
-    return next((each for each in field.metadata if isinstance(each, KeyInfo)), KeyInfo())
-
-
-def _table(field: FieldInfo) -> type[BaseModel] | None:
-    """Return the model of a key that is a table of further keys."""
-    for each in (field.annotation, *get_args(field.annotation)):
-        if isinstance(each, type) and issubclass(each, Strict):
-            return each
-    return None
-
-
-def _kind(annotation: Any) -> str:
-    if get_origin(annotation) is Annotated:
-        return _kind(get_args(annotation)[0])
-    if get_origin(annotation) is Literal:
-        return "one of " + ", ".join(map(str, get_args(annotation)))
-    if get_origin(annotation) is dict:
-        return "table"
-    if isinstance(annotation, type):
-        names = {bool: "true or false", float: "number", int: "whole number", str: "text"}
-        return names.get(annotation, "table")
-    return next(_kind(each) for each in get_args(annotation) if each is not type(None))
-
-
-def _default(field: FieldInfo, info: KeyInfo) -> str:
-    value = field.default
-    if field.is_required() or value is None or isinstance(value, dict | BaseModel):
-        return ""
-    if isinstance(value, bool):
-        return str(value).lower()
-    if info.metavar == "ID":
-        return f"0x{value:X}"
-    return f"{value:.10g}" if isinstance(value, float) else str(value)
 
 
 if __name__ == "__main__":

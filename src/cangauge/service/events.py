@@ -46,29 +46,27 @@ def logging_to(
     }  # fmt: skip
     if level == "debug":
         levels |= {"": logging.DEBUG, "can": logging.NOTSET}
+    loggers = {logging.getLogger(name): least for name, least in levels.items()}
     root = logging.getLogger()
-    before = root.handlers[:], {name: logging.getLogger(name).level for name in levels}
-    root.handlers[:] = [handler]
-    for name, least in levels.items():
-        logging.getLogger(name).setLevel(least)
-    _LIMITERS.append(limiter)
+    before, levels_before = root.handlers, {logger: logger.level for logger in loggers}
+    root.handlers = [handler]
+    for logger, least in loggers.items():
+        logger.setLevel(least)
     try:
         yield
     finally:
-        _LIMITERS.remove(limiter)
         limiter.release_due(everything=True)
-        root.handlers[:] = before[0]
-        for name, least in before[1].items():
-            logging.getLogger(name).setLevel(least)
-
-
-_LIMITERS: Final[list[RateLimitFilter]] = []
+        root.handlers = before
+        for logger, number in levels_before.items():
+            logger.setLevel(number)
 
 
 def release_held() -> None:
     """Write the suppressed records whose interval has ended; the receive loop calls this."""
-    for limiter in _LIMITERS:
-        limiter.release_due()
+    for handler in logging.getLogger().handlers:
+        for each in handler.filters:
+            if isinstance(each, RateLimitFilter):
+                each.release_due()
 
 
 def takes_text(stream: IO[str]) -> bool:

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import logging
 import math
-import statistics
 import time
 from collections import deque
 from collections.abc import Callable, Sequence
@@ -34,7 +33,7 @@ from cangauge.service.pipeline import Pipeline
 from cangauge.service.polling import Poller
 from cangauge.service.record import Recorder
 from cangauge.service.status import Monitor
-from cangauge.types import Reason
+from cangauge.types import Estimate, Reason
 
 _LOG = logging.getLogger(__name__)
 
@@ -49,8 +48,6 @@ The loop itself never waits: a full queue (no other node on the bus) costs frame
 estimate."""
 SAID_FROM_S: Final = 1.0
 """Smallest step of the stamps' clock that is logged [s]; smaller ones are its drift."""
-STEPS_KEPT: Final = 4096
-"""Latest steps whose durations enter the median."""
 CHECKPOINT_EVERY_S: Final = 10.0
 """Interval of checkpoints [s]. A service that is killed and restarts within three seconds misses
 less than half a minute of charge; 20 kB per checkpoint make 0.2 GB a day."""
@@ -77,21 +74,6 @@ class LoopSettings:
     until_idle_s: float | None = None
     checkpoint_every_s: float = CHECKPOINT_EVERY_S
     poll_every_s: float | None = None
-
-
-@dataclass(frozen=True)
-class RunSummary:
-    """Result of a run.
-
-    `step_p50_us` is the median time from receiving a frame that completes a sample to having
-    processed it [µs]; the mean counts for frames received together. `foreign_frames` are those with
-    this service's ids from another sender.
-    """
-
-    seconds: float
-    cpu_seconds: float
-    step_p50_us: float | None
-    foreign_frames: int = 0
 
 
 class Loop:
@@ -136,7 +118,7 @@ class Loop:
         self._own = OwnFrames(echoes=port.capabilities.echoes)
         self._asked = OwnFrames(echoes=port.capabilities.echoes)
         # With receive stamps REPLAY_CLOCK is no input; it is received once, for a warning.
-        self._expects_clock = pipeline.settings.time_source == "receive"
+        self._expects_clock = not pipeline.is_replay
         self._stamps_are_arrival = port.capabilities.stamps != "driver"
         self._stamps = StampLimiter(DRIVER_TOLERANCE_S)
         if self._stamps_are_arrival:
@@ -153,9 +135,8 @@ class Loop:
         # Times at which the latest sample was processed and received. They differ while frames wait
         # in the socket, after the process was suspended or under load.
         self._sample_s = self._came_s = self._began_s
-        self._step_s: deque[float] = deque(maxlen=STEPS_KEPT)
 
-    def run(self, stop: Callable[[], bool]) -> RunSummary:
+    def run(self, stop: Callable[[], bool]) -> None:
         """Receive, estimate and publish until `stop()`, which is called every `LONGEST_WAIT_S`.
 
         Raises
@@ -163,22 +144,15 @@ class Loop:
         BusError
             If the bus is lost. A `ReconnectingBus` waits until it is back instead.
         """
-        cpu_s = time.process_time()
         try:
             while not (stop() or self._is_over()):
                 self._turn()
             if self._pipeline.finish():
-                self._on_sample()
+                self._tell_sample(self._pipeline.latest)
                 self._now_s = time.monotonic()
                 self._beat()  # with the silence since the sample before: this one waited
         finally:
             self._checkpoint()
-        return RunSummary(
-            seconds=time.monotonic() - self._began_s,
-            cpu_seconds=time.process_time() - cpu_s,
-            step_p50_us=1e6 * statistics.median(self._step_s) if self._step_s else None,
-            foreign_frames=self._own.foreign,
-        )
 
     def _is_over(self) -> bool:
         duration_s, idle_s = self._settings.duration_s, self._settings.until_idle_s
@@ -221,18 +195,18 @@ class Loop:
             if not pipeline.handle(message):
                 continue
             stamp_s = received_s
-            if self._samplers:
-                self._on_sample()
-            if frames := pipeline.acknowledgement():
-                self._send(frames)
-                self._beat_s = self._now_s + ESTIMATE_EVERY_S
+            if self._samplers or pipeline.is_replay:
+                estimate = pipeline.latest
+                self._tell_sample(estimate)
+                if frames := pipeline.acknowledgement(estimate):
+                    self._send(frames)
+                    self._beat_s = self._now_s + ESTIMATE_EVERY_S
         if pipeline.samples != samples_before:
             self._sample_s = self._now_s
         if taken := pipeline.taken - taken_before:
             began_s, self._now_s = self._now_s, time.monotonic()
             step_s = (self._now_s - began_s) / taken
             self._came_s = began_s - lag_s if self._stamps_are_arrival else began_s
-            self._step_s.append(step_s)
             self._monitor.stepped(stamp_s, step_s, self._came_s)
 
     def _is_not_input(self, message: can.Message) -> bool:
@@ -252,7 +226,7 @@ class Loop:
             if not self._asked.is_echo(message):
                 self._poller.note_other_tester(self._now_s)
             return True
-        if is_clock(message, settings.ids.replay_clock) and settings.time_source == "receive":
+        if is_clock(message, settings.ids.replay_clock) and not self._pipeline.is_replay:
             if self._expects_clock:
                 self._expects_clock = False
                 self._listen()
@@ -263,10 +237,9 @@ class Loop:
             return True
         return False
 
-    def _on_sample(self) -> None:
-        sample, estimate = self._pipeline.latest_sample, self._pipeline.latest
+    def _tell_sample(self, estimate: Estimate) -> None:
         for output in self._samplers:
-            self._tell(output, "on_sample", sample, estimate)
+            self._tell(output, "on_sample", self._pipeline.latest_sample, estimate)
 
     def _tell(self, output: Output, method: str, *news: object) -> None:
         """Call an output; one that raises is told nothing more, and the estimate continues."""
@@ -358,7 +331,7 @@ class Loop:
         if self._poller is not None:
             ids |= self._poller.request_ids
         clock = {settings.ids.replay_clock}
-        self._not_input = frozenset(ids | clock if settings.time_source == "receive" else ids)
+        self._not_input = frozenset(ids if self._pipeline.is_replay else ids | clock)
         ids |= clock if self._expects_clock else set()
         self._port.set_filters([*self._pipeline.filters, *map(standard_filter, sorted(ids))])
 

@@ -130,7 +130,7 @@ class PackHistory:
         self._cell_estimator: CellEstimator | None = None
         self._row = 0
         self._due_s = -math.inf
-        self._rows: list[tuple[float, PackReport]] = []
+        self._reports: list[tuple[float, PackReport]] = []
 
     @property
     def takes_samples(self) -> bool:
@@ -139,15 +139,13 @@ class PackHistory:
 
     def observe(self, estimator: Estimator, sample: Sample) -> None:
         """Take a sample of a log, and the estimator after it."""
-        if self._cells is not None:
+        if (cells := self._cells) is not None:
             if self._cell_estimator is None:
-                self._cell_estimator = CellEstimator(
-                    estimator.voltage_model, self._cells.count, self._cells.first
-                )
+                model = estimator.voltage_model
+                self._cell_estimator = CellEstimator(model, cells.count, cells.first)
             if self._cell_estimator.is_due(sample.time_s):
-                volts = self._cells.voltage_v[self._row].tolist()
-                tick = estimator.pack_tick(sample)
-                self._cell_estimator.update(tick, volts, [0.0] * len(volts))
+                volts = cells.voltage_v[self._row].tolist()
+                self._cell_estimator.update(estimator.pack_tick(sample), volts, [0.0] * cells.count)
         self._row += 1
         self.add(sample.time_s, lambda: self._report_of(estimator))
 
@@ -155,7 +153,7 @@ class PackHistory:
         """Keep the report of a sample's time [s], if its interval has begun."""
         if self._keeps_rows and not self._due_s - self._every_s <= time_s < self._due_s:
             self._due_s = time_s + self._every_s
-            self._rows.append((time_s, report()))
+            self._reports.append((time_s, report()))
 
     def take(self, estimator: Estimator) -> None:
         """Take the estimator after the last sample of a log."""
@@ -164,27 +162,16 @@ class PackHistory:
     @property
     def columns(self) -> dict[str, FloatArray]:
         """The rows as columns: time_s, health, power and, where known, cells; NaN: unknown."""
-        reports = [report for _, report in self._rows]
-        columns = {"time_s": np.array([time_s for time_s, _ in self._rows], dtype=np.float64)}
-        parts: tuple[tuple[str, list[Any]], ...] = (
-            ("", [report.health for report in reports]),
-            ("", [report.power for report in reports]),
-            ("cell_", [report.cells for report in reports if report.cells is not None]),
-        )
-        for prefix, values in parts:
-            for name in values[0]._fields if values else ():
-                numbers = [float(getattr(each, name)) for each in values]
-                columns[prefix + name] = np.array(numbers, dtype=np.float64)
-        if "cell_weakest" in columns:
-            weakest = columns["cell_weakest"]
-            columns["cell_weakest"] = np.where(weakest < 0.0, np.nan, weakest)
-        return columns
+        rows = []
+        for time_s, report in self._reports:
+            parts = report.to_dict()
+            cells = {f"cell_{name}": value for name, value in (parts["cells"] or {}).items()}
+            rows.append({"time_s": time_s, **parts["health"], **parts["power"], **cells})
+        return {name: np.array([row[name] for row in rows], np.float64) for name in rows[0]}
 
     def _report_of(self, estimator: Estimator) -> PackReport:
-        cells = self._cell_estimator
-        return PackReport(
-            estimator.health, estimator.power(), None if cells is None else cells.report
-        )
+        cells = None if self._cell_estimator is None else self._cell_estimator.report
+        return PackReport(estimator.health, estimator.power(), cells)
 
 
 @dataclass(frozen=True, eq=False)
@@ -373,29 +360,29 @@ def estimate_capture(
         If the capture cannot be read, gives no sample, or its voltage is another pack's.
     """
     began = time.perf_counter()
-    is_undecided = time_source == "auto"
-    source: TimeSourceName = "receive" if time_source == "auto" else time_source
     settings, path = settings or EstimatorSettings(), Path(path)
     if settings.temperature_source == "unknown":
         settings = replace(settings, temperature_source=vehicle.temperature_source)
+    source: TimeSourceName = "receive" if time_source == "auto" else time_source
     buses: dict[Channel | None, _Bus] = {}
     capture = open_vehicle_capture(path, vehicle)
     for number, message in enumerate(capture, start=1):
-        if is_undecided and is_clock(message, clock_id):
+        if time_source == "auto" and source == "receive" and is_clock(message, clock_id):
             # Earlier frames have no log time; a live run starts here as well.
-            is_undecided, source = False, "replay-clock"
+            source = "replay-clock"
             buses.clear()
-        bus = buses.get(message.channel)
-        if bus is None:
+        if message.channel not in buses:
             chosen = PipelineSettings(settings, source, FrameIds(replay_clock=clock_id))
             pipeline = Pipeline(vehicle, model, chosen, publishes=False)
-            bus = buses[message.channel] = _Bus(pipeline, PackHistory(keeps_rows=keeps_pack))
+            buses[message.channel] = _Bus(pipeline, PackHistory(keeps_rows=keeps_pack))
+        bus = buses[message.channel]
         if bus.pipeline.handle(message):
             bus.collect()
         if progress is not None and number % PROGRESS_EVERY == 0:
             progress(number)
-    for each in buses.values():
-        each.finish()
+    for bus in buses.values():
+        if bus.pipeline.finish():
+            bus.collect()
     found = [bus for bus in buses.values() if bus.estimates]
     if not found:
         raise InputError(
@@ -405,17 +392,15 @@ def estimate_capture(
             cure=f"check that this is the bus of {vehicle.name} (see `cangauge inspect`)",
         )
     best = max(found, key=lambda bus: len(bus.estimates))
+    best.pack.report = best.pipeline.report()
     counts, table = best.pipeline.counts, EstimateTable.of(best.estimates)
     time_s, current_a, voltage_v, temperature_c, soc_pct = np.array(best.values).reshape(-1, 5).T
     # With a model, another pack's voltage is implausible.
     is_known = np.isfinite(voltage_v).any()
     seen_v = voltage_v if is_known else capture_samples(path, vehicle).voltage_v
     require_same_pack(seen_v, model, str(path))
-    # Further replays in the same capture begin earlier: their steps back count as none.
-    later_s = np.cumsum(np.maximum(np.diff(time_s), 0.0))
-    is_unwrapped = bool(np.any(np.diff(time_s) < 0.0))
     recorded = RecordedCapture(
-        time_s=time_s[0] + np.concatenate(([0.0], later_s)) if is_unwrapped else time_s,
+        time_s=_without_steps_back(time_s),
         current_a=current_a,
         voltage_v=voltage_v,
         temperature_c=temperature_c,
@@ -433,6 +418,14 @@ def estimate_capture(
     )
 
 
+def _without_steps_back(time_s: FloatArray) -> FloatArray:
+    """Count steps back as none: further replays in the same capture begin earlier."""
+    steps_s = np.diff(time_s)
+    if not np.any(steps_s < 0.0):
+        return time_s
+    return np.asarray(time_s[0] + np.concatenate(([0.0], np.cumsum(np.maximum(steps_s, 0.0)))))
+
+
 @dataclass
 class _Bus:
     """One of the buses in a capture; each has its own pipeline."""
@@ -442,11 +435,6 @@ class _Bus:
     estimates: list[Estimate] = field(default_factory=list)
     # Time, current, voltage, temperature and the vehicle's own SoC of every sample.
     values: array[float] = field(default_factory=lambda: array("d"))
-
-    def finish(self) -> None:
-        if self.pipeline.finish():
-            self.collect()
-        self.pack.report = self.pipeline.report()
 
     def collect(self) -> None:
         sample = self.pipeline.latest_sample

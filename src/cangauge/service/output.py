@@ -11,7 +11,7 @@ if TYPE_CHECKING:
 
 
 class Output:
-    """Takes the results of a service: table, recording, status, page, MQTT, metrics.
+    """Takes the results of a service: recording, status, page, MQTT, metrics.
 
     `trouble` is a sentence for the user, shown in the status; "" while nothing is wrong. The
     methods are called in the thread of the receive loop and must return at once. One that raises

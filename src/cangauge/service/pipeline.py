@@ -149,6 +149,8 @@ class Pipeline:
     samples, taken : int
         Samples handed to the estimator, over all logs, and those of them that it took: only these
         make an estimate fresh.
+    is_replay : bool
+        Whether bus time is a replay's.
     stamp_shift_s : float
         Part of the frames' stamps that their clock does not have, since it was set [s].
     latest_sample : Sample or None
@@ -177,11 +179,11 @@ class Pipeline:
         self.model = model
         self.settings = settings or PipelineSettings()
         ids = self.settings.ids
-        self._is_replay = self.settings.time_source == "replay-clock"
+        self.is_replay = self.settings.time_source == "replay-clock"
         self._publisher: SocPublisher | None = None
         if publishes:
             _check_ids(vehicle, ids)
-            self._publisher = SocPublisher(ids, ACKNOWLEDGE_EVERY if self._is_replay else None)
+            self._publisher = SocPublisher(ids, ACKNOWLEDGE_EVERY if self.is_replay else None)
         self._time = time_source(self.settings.time_source, ids.replay_clock)
         self._earlier_counts = FrameCounts()
         self._untimed = 0
@@ -193,9 +195,7 @@ class Pipeline:
         self.stamp_shift_s = 0.0
         self.latest_sample: Sample | None = None
         self.published = NOTHING_YET
-        # What stands for the estimator's own estimate until its next sample: at the start, and
-        # where it is new, restored or of another log.
-        self._until_sample: Estimate | None = NOTHING_YET
+        self._estimate = NOTHING_YET  # after the latest sample, without the signals' health
         self._report: tuple[int, PackReport] | None = None
 
     # --- frames → estimates
@@ -227,14 +227,13 @@ class Pipeline:
 
     @property
     def latest(self) -> Estimate:
-        """The estimate of the latest sample, with the signal health at its time."""
-        if self._until_sample is not None or self.latest_sample is None:
-            return self._until_sample or NOTHING_YET
-        return self._with_health(self.estimator.estimate, self.latest_sample.time_s)
+        """The estimate of the latest sample, with the signal health at its time; not cached."""
+        sample = self.latest_sample
+        return self._estimate if sample is None else self._with_health(sample.time_s)
 
     def estimate_now(self) -> Estimate:
         """Return the latest estimate with the signal health at the latest wanted frame."""
-        return self._with_health(self._until_sample or self.estimator.estimate, self.decoder.now_s)
+        return self._with_health(self.decoder.now_s)
 
     def report(self) -> PackReport:
         """Return health, power and cells after the latest sample; computed once a sample."""
@@ -265,10 +264,10 @@ class Pipeline:
     def _take(self, sample: Sample) -> None:
         self.samples += 1
         self.latest_sample = sample
-        self._until_sample = None
         is_implausible = math.isnan(sample.voltage_v) and self.decoder.is_voltage_implausible
         # The estimator treats a refused voltage otherwise than one that never came, as offline.
         self.estimator.update(sample._replace(voltage_v=math.inf) if is_implausible else sample)
+        self._estimate = self.estimator.estimate
         self._refused = self._refused + 1 if self.estimator.is_refused else 0
         self.taken += not self.estimator.is_refused
         self.sign.add(sample)
@@ -278,14 +277,14 @@ class Pipeline:
             changes = self.estimator.current_changes(sample.time_s, times)
             cells.update(self.estimator.pack_tick(sample), volts, changes)
 
-    def _with_health(self, estimate: Estimate, now_s: float) -> Estimate:
+    def _with_health(self, now_s: float) -> Estimate:
         """Return the latest estimate, marked by the health of the signals at bus time `now_s`.
 
         A single voltage that failed or has not come yet is not missing; several consecutive ones
         are, or one that is too old. Samples that are refused one after the other do not make an
         estimate fresh.
         """
-        reasons = estimate.reasons
+        estimate, reasons = self._estimate, self._estimate.reasons
         if self.latest_sample is not None and math.isnan(self.latest_sample.voltage_v):
             reasons &= ~Reason.VOLTAGE_MISSING
         reasons |= self.decoder.reasons(now_s)
@@ -310,7 +309,6 @@ class Pipeline:
 
     def _begin_log(self) -> None:
         """Restart decoder and estimator for the next log of a replay."""
-        self._until_sample = self.latest
         self._earlier_counts = replace(self.counts, beginnings=self._time.beginnings)
         self._untimed = self._refused = 0
         if self._publisher is not None:
@@ -323,16 +321,16 @@ class Pipeline:
     @property
     def filters(self) -> list[CanFilter]:
         """Filters for the vehicle's frames, and for REPLAY_CLOCK where that is the time source."""
-        if not self._is_replay:
+        if not self.is_replay:
             return self.vehicle.filters
         return [*self.vehicle.filters, standard_filter(self.settings.ids.replay_clock)]
 
-    def acknowledgement(self) -> list[can.Message]:
-        """Return the frames due with the latest sample of a replay; none with receive stamps."""
-        if not self._is_replay or self._publisher is None:
+    def acknowledgement(self, estimate: Estimate) -> list[can.Message]:
+        """Return the frames due with the latest sample's estimate in a replay, else none."""
+        if not self.is_replay or self._publisher is None:
             return []
-        self.published = self.latest
-        return self._publisher.publish(self.published, self.samples, self.report)
+        self.published = estimate
+        return self._publisher.publish(estimate, self.samples, self.report)
 
     def heartbeat(
         self, *, is_stale: bool, silent_s: float = 0.0, reasons: Reason = Reason.NONE
@@ -346,7 +344,7 @@ class Pipeline:
         if self._publisher is None:
             return []
         estimate = self.estimate_now()
-        if not self._is_replay:
+        if not self.is_replay:
             is_stale = is_stale or silent_s > self.decoder.health["current"].timeout_s
         if is_stale and self.taken:
             reasons |= Reason.INPUT_STALE
@@ -367,40 +365,37 @@ class Pipeline:
     def least_timeout_s(self) -> float:
         """Lower bound of a time-out for samples [s]: a slow source is not stale between two."""
         period_s = self.decoder.health["current"].period_s
-        return 0.0 if self._is_replay or math.isnan(period_s) else MISSED_AT_LEAST * period_s
+        return 0.0 if self.is_replay or math.isnan(period_s) else MISSED_AT_LEAST * period_s
 
     # --- reload and restart
 
-    def reconfigure(
-        self, vehicle: Vehicle | None, model: Model, settings: PipelineSettings
-    ) -> None:
+    def reconfigure(self, vehicle: Vehicle, model: Model, settings: PipelineSettings) -> None:
         """Continue with another configuration, from the SoC known so far.
 
-        Unchanged parts (vehicle None: the same) keep their state bit for bit. A changed model or
-        estimator setting makes a new estimator, which takes over SoC and delay line. Initial SoC,
-        its standard deviation, the time source and REPLAY_CLOCK's id stay. InputError, and no
-        change, if a frame to publish has the id of a vehicle's signal.
+        Unchanged parts keep their state bit for bit. A changed model or estimator setting makes a
+        new estimator, which takes over SoC and delay line. Initial SoC, its standard deviation, the
+        time source and REPLAY_CLOCK's id stay. InputError, and no change, if a frame to publish has
+        the id of a vehicle's signal.
         """
         old, started = self.settings, self.estimator.settings
         ids = replace(settings.ids, replay_clock=old.ids.replay_clock)
         if self._publisher is not None:
-            _check_ids(vehicle or self.vehicle, ids)
+            _check_ids(vehicle, ids)
         estimator_settings = replace(
-            _with_source(settings.estimator, vehicle or self.vehicle),
+            _with_source(settings.estimator, vehicle),
             initial_soc_pct=started.initial_soc_pct,
             initial_soc_std_pct=started.initial_soc_std_pct,
         )
         is_other_model = model != self.model
         if is_other_model or estimator_settings != started:
-            before, self._until_sample = self.estimator, self.latest
+            before, self.model = self.estimator, model
             self.estimator = make_estimator(model, estimator_settings)
             self.estimator.take_over(before)
-            self.model = model
         pack = _pack_of(model, estimator_settings.capacity_ah)
-        if vehicle is not None or pack != self._pack:
+        if vehicle != self.vehicle or pack != self._pack:
             # The plausible range of a signal follows from both.
             self._earlier_counts, self._untimed = self.counts, 0
-            self.vehicle, self._pack = vehicle or self.vehicle, pack
+            self.vehicle, self._pack = vehicle, pack
             self._restart_decoder()
         elif is_other_model:
             self._restart_cells()
@@ -414,7 +409,7 @@ class Pipeline:
 
         It refers to the stamps as their clock makes them now: after a restart they come so.
         """
-        if not math.isfinite(self.latest.soc_pct):
+        if not math.isfinite(self._estimate.soc_pct):
             return None
         state = self.estimator.snapshot()
         state.clock.shift_s += self.stamp_shift_s
@@ -431,9 +426,9 @@ class Pipeline:
         if isinstance(self._time, ReplayClock):
             self._time.resume(latest.time_s)
         reasons = latest.reasons | Reason.INPUT_STALE
-        self._until_sample = latest._replace(status=Status.INVALID, reasons=reasons)
+        self._estimate = latest._replace(status=Status.INVALID, reasons=reasons)
         self._report = None
-        return self._until_sample
+        return self._estimate
 
     def discard_initial_soc(self) -> bool:
         """Start from the first voltages instead of the given initial SoC; False if none was given.

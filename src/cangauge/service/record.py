@@ -1,11 +1,11 @@
 """Record the received frames, so that `estimate` on the recording reproduces the live numbers.
 
-Formats are the texts that keep whole microseconds: candump (.log) and python-can's .csv, either
-also gzipped, by python-can's writers. The receive loop only collects frames; a thread formats and
-writes them in batches, so a kill loses at most the frames since the last snapshot (0.25 s), and a
-power cut those of the last `SYNC_EVERY_S`. A batch that the disk refuses is cut off the file and
-counted: the file stays whole lines, and continues once there is space. (python-can's
-`SizedRotatingLogger` writes through a buffer, which leaves half a line on a full disk.)
+The format is candump's text (.log), which keeps whole microseconds, also gzipped, by python-can's
+writer. The receive loop only collects frames; a thread formats and writes them in batches, so a
+kill loses at most the frames since the last snapshot (0.25 s), and a power cut those of the last
+`SYNC_EVERY_S`. A batch that the disk refuses is cut off the file and counted: the file stays whole
+lines, and continues once there is space. (python-can's `SizedRotatingLogger` writes through a
+buffer, which leaves half a line on a full disk.)
 """
 
 from __future__ import annotations
@@ -16,9 +16,7 @@ import io
 import logging
 import os
 import time
-from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Final
@@ -43,54 +41,25 @@ SYNC_EVERY_S: Final = 30.0
 """Interval of fsync, against power cuts [s]."""
 CLOSE_WITHIN_S: Final = 0.6
 """Time limit for writing what is left at the end [s]."""
-FORMATS: Final[dict[str, Callable[[io.StringIO], can.CanutilsLogWriter | can.CSVWriter]]] = {
-    ".log": can.CanutilsLogWriter,
-    ".csv": can.CSVWriter,
-}
 _RIGHTS: Final = 0o640
 """Of a recording: the group may read where and how the car was driven, others not."""
 _LOG = logging.getLogger(__name__)
 
 
-@dataclass(frozen=True)
-class RecordLimits:
-    """Limits of a recording: size and duration at which a new part begins, and its total size.
-
-    Without limits it is one file. If that exists already (a restarted service must not overwrite
-    its predecessor's recording), or with any limit, runs and parts are numbered. The oldest parts
-    are removed above `keep_bytes` when a new one begins; InputError if there are no parts.
-    """
-
-    part_bytes: float | None = None
-    part_s: float | None = None
-    keep_bytes: float | None = None
-
-    def __post_init__(self) -> None:
-        if self.keep_bytes is not None and not self.in_parts:
-            raise InputError(
-                "the recording is one file, which is never removed",
-                field="record_keep_mb",
-                cure="give record_part_mb or record_part_s as well",
-            )
-
-    @property
-    def in_parts(self) -> bool:
-        """Whether the recording is in parts."""
-        return self.part_bytes is not None or self.part_s is not None
-
-
 class Recorder(Output):
     """The recording of a service: one file, or parts.
 
-    No method waits for the disk but the constructor, and `close` for a limited time.
+    If the file exists already (a restarted service must not overwrite its predecessor's recording),
+    or with `part_bytes`, runs and parts are numbered. No method waits for the disk but the
+    constructor, and `close` for a limited time.
 
     Parameters
     ----------
     path : path-like
-    limits : RecordLimits, optional
-        By default one file.
-    clock : callable
-        Monotonic time [s].
+    part_bytes : float, optional
+        Size at which a new part begins [bytes].
+    keep_bytes : float, optional
+        Total size above which the oldest parts are removed when a new one begins [bytes].
 
     Attributes
     ----------
@@ -102,19 +71,19 @@ class Recorder(Output):
     Raises
     ------
     InputError
-        If the suffix is unknown, or the folder missing or not writable.
+        If the suffix is unknown, the folder missing or not writable, or nothing can be removed.
     """
 
     def __init__(
         self,
         path: str | os.PathLike[str],
-        limits: RecordLimits | None = None,
-        clock: Callable[[], float] = time.monotonic,
+        part_bytes: float | None = None,
+        keep_bytes: float | None = None,
     ) -> None:
-        _check_path(Path(path))
+        _check(Path(path), part_bytes, keep_bytes)
         self._batch: list[can.Message] = []
         self._lost_frames = 0
-        self._file = file = _RecordFile(Path(path), limits or RecordLimits(), clock)
+        self._file = file = _RecordFile(Path(path), part_bytes, keep_bytes)
         self.state = RecordState(str(file.current), 0, 0, 0, None)
         self.written = file.path
         self._worker = Worker("cangauge-record", self._failed, BATCHES_WAITING)
@@ -126,9 +95,8 @@ class Recorder(Output):
         if len(self._batch) >= BATCH_FRAMES:
             self._hand_over()
 
-    def on_snapshot(self, snapshot: Snapshot) -> None:
+    def on_snapshot(self, _snapshot: Snapshot) -> None:
         """Hand the new frames to the thread."""
-        del snapshot
         self._hand_over()
 
     def close(self) -> None:
@@ -147,22 +115,21 @@ class Recorder(Output):
     # --- In the thread
 
     def _write(self, batch: list[can.Message]) -> None:
-        file, state = self._file, self.state
-        missed, self._lost_frames = self._lost_frames, 0
+        file, before = self._file, self.state
+        lost, self._lost_frames = before.lost_frames + self._lost_frames, 0
         problem = None
         try:
             file.write(batch)
         except OSError as error:
             problem = error.strerror or str(error)
-            missed += len(batch)
-        lost = state.lost_frames + missed
+            lost += len(batch)
         self.state = RecordState(
-            str(file.current), state.frames + len(batch), lost, file.written_bytes, problem
+            str(file.current), before.frames + len(batch), lost, file.written_bytes, problem
         )
         if problem is not None:
             text = f"recording: {problem}; the estimate continues, writing is retried"
             self._say(logging.ERROR, "record.failed", text, lost)
-        elif state.problem is not None:
+        elif before.problem is not None:
             text = f"recording resumed; {lost} frames were lost"
             self._say(logging.WARNING, "record.resumed", text, lost)
 
@@ -176,66 +143,34 @@ class Recorder(Output):
 
 
 class _RecordFile:
-    """The file or the parts of one recording, written batch by batch."""
+    """The file or the parts of one recording, written batch by batch; methods may raise OSError."""
 
-    def __init__(self, base: Path, limits: RecordLimits, clock: Callable[[], float]) -> None:
+    def __init__(self, base: Path, part_bytes: float | None, keep_bytes: float | None) -> None:
         exists = base.is_file() and base.stat().st_size > 0
-        self._base, self._limits, self._clock = base, limits, clock
-        self._is_packed = base.suffix.lower() == ".gz"
-        self._in_parts = limits.in_parts or exists
+        self._base, self._part_bytes, self._keep_bytes = base, part_bytes, keep_bytes
+        self._in_parts = part_bytes is not None or exists
         self._run = max((each.run for each in all_parts(base)), default=0) + 1
-        self._part = 0
+        self._part = self._bytes = self.written_bytes = 0
         self.path = run_path(base, self._run) if self._in_parts else base
-        self.written_bytes = 0
-        self._synced_s = clock()
+        self._synced_s = time.monotonic()
         self._descriptor = -1
         with suppress(OSError):  # tried again with each batch
             self._next_part()
 
     def write(self, batch: list[can.Message]) -> None:
-        """Append frames as whole lines, or nothing of them; may raise OSError."""
-        limits, now_s = self._limits, self._clock()
-        is_large = limits.part_bytes is not None and self._bytes >= limits.part_bytes
-        if (
-            self._descriptor < 0
-            or is_large
-            or (limits.part_s is not None and now_s - self._began_s >= limits.part_s)
-        ):
+        """Append frames as whole lines, or nothing of them."""
+        is_full = self._part_bytes is not None and self._bytes >= self._part_bytes
+        if self._descriptor < 0 or is_full:
             self._next_part()
-        if now_s - self._synced_s >= SYNC_EVERY_S:
-            self._synced_s = now_s
+        if time.monotonic() - self._synced_s >= SYNC_EVERY_S:
+            self._synced_s = time.monotonic()
             os.fsync(self._descriptor)
         for message in batch:
             self._writer.on_message_received(message)
-        self._append()
-
-    def close(self) -> None:
-        """Close the file; may raise OSError."""
-        if self._descriptor >= 0:
-            descriptor, self._descriptor = self._descriptor, -1
-            os.close(descriptor)
-
-    def _next_part(self) -> None:
-        self._remove_oldest()
-        part = self._part + 1
-        self.current = part_path(self._base, self._run, part) if self._in_parts else self._base
-        self.close()
-        flags = os.O_WRONLY | os.O_CREAT | os.O_CLOEXEC | (os.O_EXCL if self._in_parts else 0)
-        self._descriptor = os.open(self.current, flags, _RIGHTS)
-        self._part, self._bytes, self._began_s = part, 0, self._clock()
-        self._text = io.StringIO(newline="")
-        kind = self.current.with_suffix("") if self._is_packed else self.current
-        self._writer = FORMATS[kind.suffix.lower()](self._text)
-        if isinstance(self._writer, can.CanutilsLogWriter):
-            # Otherwise it raises stamps below the first one, and hides a clock that was set back.
-            self._writer.last_timestamp = 0.0
-        self._append()
-
-    def _append(self) -> None:
         data = self._text.getvalue().encode()
         self._text.seek(0)
         self._text.truncate()
-        if self._is_packed and data:
+        if self._base.suffix.lower() == ".gz":
             data = gzip.compress(data, 6)  # members of one file: gzip reads them as one
         left = memoryview(data)
         try:
@@ -249,31 +184,52 @@ class _RecordFile:
         self._bytes += len(data)
         self.written_bytes += len(data)
 
+    def close(self) -> None:
+        """Close the file."""
+        if self._descriptor >= 0:
+            descriptor, self._descriptor = self._descriptor, -1
+            os.close(descriptor)
+
+    def _next_part(self) -> None:
+        self._remove_oldest()
+        part = self._part + 1
+        self.current = part_path(self._base, self._run, part) if self._in_parts else self._base
+        self.close()
+        flags = os.O_WRONLY | os.O_CREAT | os.O_CLOEXEC | (os.O_EXCL if self._in_parts else 0)
+        self._descriptor = os.open(self.current, flags, _RIGHTS)
+        self._part, self._bytes = part, 0
+        self._text = io.StringIO(newline="")
+        self._writer = can.CanutilsLogWriter(self._text)
+        # Otherwise it raises stamps below the first one, and hides a clock that was set back.
+        self._writer.last_timestamp = 0.0
+
     def _remove_oldest(self) -> None:
-        if self._limits.keep_bytes is None:
+        if self._keep_bytes is None:
             return
         sizes = {each.path: each.path.stat().st_size for each in all_parts(self._base)}
         total = sum(sizes.values())
         for path, size in sizes.items():
-            if total <= self._limits.keep_bytes:
+            if total <= self._keep_bytes:
                 return
             path.unlink(missing_ok=True)
             total -= size
             emit(_LOG, logging.INFO, "record.removed", f"removed the oldest part: {path}")
 
 
-def _check_path(path: Path) -> None:
-    """Raise InputError for an unknown format, or a folder that cannot be written."""
-    suffixes = [suffix.lower() for suffix in path.suffixes]
-    kind = "".join(suffixes[-2:] if suffixes[-1:] == [".gz"] else suffixes[-1:])
-    if kind.removesuffix(".gz") not in FORMATS:
+def _check(path: Path, part_bytes: float | None, keep_bytes: float | None) -> None:
+    """Raise InputError for a recording that cannot be written, or not be limited."""
+    if not path.name.lower().removesuffix(".gz").endswith(".log"):
         raise InputError(
-            "this format is unknown, or does not keep time stamps to the microsecond",
+            "a recording is a candump log",
             source=path,
             field="--record",
-            value=kind,
-            cure="name a .log (candump) or .csv file, or either with .gz; `python -m"
-            " can.logconvert` turns it into others",
+            cure="name a .log or .log.gz file; `python -m can.logconvert` turns it into others",
+        )
+    if keep_bytes is not None and part_bytes is None:
+        raise InputError(
+            "the recording is one file, which is never removed",
+            field="record_keep_mb",
+            cure="give record_part_mb as well",
         )
     try:
         check_writable(path)

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import hashlib
-import queue
+import threading
 from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Self
 
 from cangauge._config import read_toml
@@ -20,14 +18,12 @@ from cangauge.estimation.settings import EstimatorSettings, FullCharge, LongRest
 from cangauge.model.model_file import Model
 from cangauge.service.config import DEFAULT_VEHICLE, PublishConfig, RunConfig
 from cangauge.service.pipeline import PipelineSettings
-from cangauge.service.worker import Worker
 
 
 @dataclass(frozen=True)
 class Setup:
     """A configuration with the files that it names.
 
-    `vehicle_key` is the identity of the vehicle: its options, and the content of its files.
     `sign_cure` is what to change if the current has the wrong sign.
     """
 
@@ -35,7 +31,6 @@ class Setup:
     vehicle: Vehicle
     model: Model
     settings: PipelineSettings
-    vehicle_key: tuple[object, ...]
     sign_cure: str
 
     @classmethod
@@ -44,14 +39,29 @@ class Setup:
         vehicle, model = load_vehicle(config), Model.load(config.model)
         _check_poll(config, vehicle)
         _check_publish(config)
-        files = [*vehicle.dbc_files, *filter(None, [config.map])]
+        return cls(config, vehicle, model, pipeline_settings(config), _sign_cure(config))
+
+
+class SetupReader(threading.Thread):
+    """Read a configuration in a thread, while the old one is in use.
+
+    `result` is the new one, or why it is refused, once the thread has ended.
+    """
+
+    def __init__(self, read: Callable[[], RunConfig]) -> None:
+        super().__init__(name="cangauge-reload", daemon=True)
+        self._read = read
+        self.result: Setup | CangaugeError
+        self.start()
+
+    def run(self) -> None:
+        """Read; may take seconds for a large DBC."""
         try:
-            contents = [hashlib.sha256(Path(file).read_bytes()).hexdigest() for file in files]
-        except OSError as error:  # it disappeared meanwhile
-            raise InputError(f"cannot be read: {error}", cure="try again") from error
-        named = (config.vehicle, config.temperature, config.pair_within_s)
-        key = (*named, config.messages, config.rules, config.checks, *contents)
-        return cls(config, vehicle, model, pipeline_settings(config), key, _sign_cure(config))
+            self.result = Setup.of(self._read())
+        except CangaugeError as error:
+            self.result = error
+        except Exception as error:  # noqa: BLE001 - of a library that reads a file
+            self.result = InputError(f"cannot be read: {error!r}", cure="check the files")
 
 
 def load_vehicle(config: RunConfig) -> Vehicle:
@@ -141,40 +151,3 @@ def _sign_cure(config: RunConfig) -> str:
         return "use the preset of this car, or a map file (`cangauge init` writes one)"
     sign = -read_toml(config.map).get("current", {}).get("sign", 1)
     return f"set sign = {sign} under [current] of {config.map}"
-
-
-class Reloader:
-    """Read the configuration in a thread, once for each request, while the old one is in use."""
-
-    def __init__(self, read: Callable[[], RunConfig]) -> None:
-        self._read = read
-        self._results: queue.SimpleQueue[Setup | CangaugeError] = queue.SimpleQueue()
-        self._pending = 0
-        self._worker = Worker("cangauge-reload", self._refuse, 2)
-
-    @property
-    def is_reading(self) -> bool:
-        """Whether a result is still to come."""
-        return self._pending > 0
-
-    def request(self) -> None:
-        """Begin to read; once more at its end if it is under way, as files may have changed."""
-        if self._pending < 2:
-            self._pending += 1
-            self._worker.submit(lambda: self._results.put(Setup.of(self._read())))
-
-    def poll(self) -> Setup | CangaugeError | None:
-        """Return what was read, or why it is refused, once; None while there is nothing new."""
-        if self._results.empty():
-            return None
-        self._pending -= 1
-        return self._results.get()
-
-    def close(self) -> None:
-        """End the thread once it has nothing to read."""
-        self._worker.close(0.0)
-
-    def _refuse(self, error: Exception) -> None:
-        if not isinstance(error, CangaugeError):  # of a library that reads a file
-            error = InputError(f"cannot be read: {error!r}", cure="check the files")
-        self._results.put(error)

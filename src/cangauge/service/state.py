@@ -2,9 +2,8 @@
 
     {"format": "cangauge-state", "version": 3, "sha256": "…", "content": {…}}
 
-The hash is that of the content, written without spaces and with sorted keys. A file is checked
-before use: size, JSON, format, version, hash, then the type and range of every field. A file that
-cannot be used is set aside; one that cannot be written never stops the estimator.
+The hash is that of the content, written without spaces and with sorted keys. A file that cannot be
+used is set aside; one that cannot be written never stops the estimator.
 """
 
 from __future__ import annotations
@@ -17,9 +16,9 @@ import time
 from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any, Final, Self
+from typing import Any, Final, Self
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict
 
 from cangauge._config import validated
 from cangauge._files import open_regular, read_bounded, text_sha256
@@ -55,32 +54,27 @@ class StateContent(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
 
-    saved_s: Annotated[float, Field(allow_inf_nan=False, ge=-1e12, le=1e12)]
-    boot_id: Annotated[str, Field(max_length=64)] | None
-    model: Annotated[str, Field(pattern="^[0-9a-f]{64}$")]
+    saved_s: float
+    boot_id: str | None
+    model: str
     model_name: str
     bus: str
     vehicle: str
-    time_source: Annotated[str, Field(max_length=32)]
+    time_source: str
     estimator: EstimatorState
 
 
 def state_path(given: str | None, environment: Mapping[str, str]) -> Path | None:
     """Return the path of the state file, if any; for a folder it is a file in it.
 
-    The default is systemd's `StateDirectory=`, if there is one.
-
-    Raises
-    ------
-    InputError
-        If no state can be kept there. A state that is damaged or of another release, model or age
-        is set aside later, and so is whatever has the name `FILE_NAME`: a disk may have lost the
-        state. A file of another name that is no state was named by mistake, and stays.
+    The default is systemd's `StateDirectory=`, if there is one. InputError if there is no such
+    folder, or another file, which was named by mistake and stays. (Whatever has the name
+    `FILE_NAME` was a state, which a disk may have lost: it is set aside later.)
     """
-    folder = environment.get("STATE_DIRECTORY", "").split(":")[0]
-    if not (given or folder):
+    place = given or environment.get("STATE_DIRECTORY", "").split(":")[0]
+    if not place:
         return None
-    path = Path(given or folder)
+    path = Path(place)
     if given is None or os.path.isdir(path):  # noqa: PTH112 - never raises
         path /= FILE_NAME
     if not path.parent.is_dir():
@@ -90,16 +84,10 @@ def state_path(given: str | None, environment: Mapping[str, str]) -> Path | None
             field="state",
             cure="create it or name another one",
         )
-    try:
-        is_there = path.exists()
-    except OSError as error:  # a name that no file can have
-        problem, cure = f"cannot be written: {error.strerror}", "name another path"
-        raise InputError(problem, source=path, field="state", cure=cure) from error
-    if is_there:
+    if path.name != FILE_NAME and os.path.exists(path):  # noqa: PTH110 - never raises
         with open_regular(path) as file:
             beginning = file.read(64)
-        is_state = not beginning or b'"format": "' + STATE_FORMAT.encode() in beginning
-        if not is_state and path.name != FILE_NAME:
+        if beginning and b'"format": "' + STATE_FORMAT.encode() not in beginning:
             raise InputError(
                 "not a cangauge state file, so it is not replaced",
                 source=path,
@@ -133,11 +121,10 @@ class StateKeeper:
         self._worker = Worker("cangauge-state", self._failed, jobs_at_most=3)
         self._hashed = (pipeline.model, text_sha256(pipeline.model.to_json()))
         self._samples_kept = 0
-        self._restored_pct: float | None = None
         self.restored = False
 
     def __enter__(self) -> Self:
-        if not self._path.exists():
+        if not os.path.exists(self._path):  # noqa: PTH110 - never raises
             text = f"{self._path}: no saved state; starting without one"
             emit(_LOG, logging.INFO, "state.none", text)
             return self
@@ -149,7 +136,6 @@ class StateKeeper:
             self._set_aside(error)
             return self
         self.restored = True
-        self._restored_pct = latest.soc_pct
         ago = "of unknown age" if math.isnan(age_s) else f"saved {duration(age_s)} ago"
         soc = f"{number(latest.soc_pct, 2)} ± {number(latest.soc_std_pct, 2, '%')}"
         text = f"{self._path}: continuing from a state {ago}: SoC {soc}"
@@ -164,42 +150,38 @@ class StateKeeper:
 
     def checkpoint(self) -> None:
         """Start saving the state if it has new samples; return at once."""
-        self._log_verdict()
         pipeline = self._pipeline
         if pipeline.samples == self._samples_kept or (state := pipeline.snapshot()) is None:
             return
         content = StateContent.model_construct(
+            **self._uses(),
             saved_s=self._wall_s(),
             boot_id=self._boot_id,
-            model=self._model_hash(),
             model_name=pipeline.model.name,
-            bus=self._bus,
-            vehicle=pipeline.vehicle.name,
-            time_source=pipeline.settings.time_source,
             estimator=state,
         )
         if self._worker.submit(partial(self._write, content)):
             self._samples_kept = pipeline.samples
 
-    def _model_hash(self) -> str:
-        model = self._pipeline.model
-        if model is not self._hashed[0]:  # the configuration was reloaded
-            self._hashed = (model, text_sha256(model.to_json()))
-        return self._hashed[1]
+    def _uses(self) -> dict[str, Any]:
+        """Return what a state belongs to."""
+        pipeline = self._pipeline
+        if pipeline.model is not self._hashed[0]:  # the configuration was reloaded
+            self._hashed = (pipeline.model, text_sha256(pipeline.model.to_json()))
+        return {
+            "model": self._hashed[1],
+            "vehicle": pipeline.vehicle.name,
+            "bus": self._bus,
+            "time_source": pipeline.settings.time_source,
+        }
 
     def _age_s(self, content: StateContent) -> float:
         """Return the age of a state that may be used [s]; NaN: unknown. Else raise InputError."""
-        pipeline, path = self._pipeline, self._path
-        now = {
-            "model": (self._model_hash(), content.model_name),
-            "vehicle": (pipeline.vehicle.name, content.vehicle),
-            "bus": (self._bus, content.bus),
-            "time_source": (pipeline.settings.time_source, content.time_source),
-        }
-        for field, (wanted, owner) in now.items():
-            if getattr(content, field) != wanted:
-                words = field.replace("_", " ")
-                raise InputError(f"of another {words} ({owner})", source=path, field=field)
+        path, names = self._path, {"model": content.model_name}
+        for field, wanted in self._uses().items():
+            if (owner := getattr(content, field)) != wanted:
+                text = f"of another {field.replace('_', ' ')} ({names.get(field, owner)})"
+                raise InputError(text, source=path, field=field)
         if math.isnan(content.estimator.soc_pct):
             raise InputError("has no SoC", source=path, field="estimator")
         if content.time_source == "replay-clock":
@@ -240,21 +222,6 @@ class StateKeeper:
             os.fsync(file.fileno())
         part.replace(path)
 
-    def _log_verdict(self) -> None:
-        """Log once what the voltage says of the restored SoC."""
-        verdict = self._pipeline.estimator.verdict
-        if self._restored_pct is None or verdict in {"", "open"}:
-            return
-        before, self._restored_pct = self._restored_pct, None
-        latest = self._pipeline.latest
-        soc = f"{number(latest.soc_pct, 1)} ± {number(latest.soc_std_pct, 1, '%')}"
-        words = {
-            "parked": "the voltage confirms the restored SoC",
-            "moved": f"the voltage refutes the restored SoC of {before:.1f} %",
-        }
-        text = words.get(verdict, "restored SoC and voltage are combined")
-        emit(_LOG, logging.INFO, "state.judged", f"{text}; now {soc}")
-
     def _failed(self, error: Exception) -> None:
         text = f"state not written: {self._path}: {error}"
         emit(_LOG, logging.WARNING, "state.failed", text)
@@ -285,7 +252,7 @@ def read_state(path: Path) -> StateContent:
         raise InputError("not a cangauge state file", source=path) from error
     if found[:2] != (STATE_FORMAT, STATE_VERSION):
         text = f"this release reads version {STATE_VERSION}"
-        raise InputError(text, source=path, field="version", value=str(found[1])[:60])
+        raise InputError(text, source=path, field="version", value=found[1])
     if found[2] != digest:
         raise InputError("damaged: the hash does not match", source=path, field="sha256")
     return validated(StateContent, content, path)

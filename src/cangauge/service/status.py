@@ -126,6 +126,7 @@ class Monitor:
         self._notifier = notifier or Notifier()
         self._record, self._troubles = record, troubles
         self._show_every_s = show_every_s
+        self._clock = clock
         self._began_s = now_s = clock()
         self._latency = Histogram()
         self._step = Histogram()
@@ -160,13 +161,13 @@ class Monitor:
     def reload_begins(self) -> None:
         """Report a reload; `reload_ends` ends it."""
         self._config = self._config | {"reloading": True}
-        self._notifier.reloading()
+        self._notifier.send(RELOADING=1, MONOTONIC_USEC=time.monotonic_ns() // 1000)
 
     def reload_ends(self, problem: str | None) -> None:
         """Report the end of a reload, and why it was refused; None if it was not."""
         self._config = {"reloading": False, "problem": problem}
         refused = "" if problem is None else f"; new configuration REFUSED: {problem}"
-        self._notifier.ready(self._line() + refused)
+        self._notifier.send(READY=1, STATUS=self._line() + refused)
 
     def turn(self, now_s: float) -> bool:
         """Record a turn of the loop (monotonic time [s]); return whether `latest` is new."""
@@ -179,11 +180,17 @@ class Monitor:
         ping_every_s = self._notifier.ping_every_s
         if ping_every_s is not None and now_s >= self._ping_s:
             self._ping_s = now_s + ping_every_s - self._show_every_s
-            self._notifier.ping()
+            self._notifier.send(WATCHDOG=1)
         if self._notifier.active and now_s >= self._notify_s:
             self._notify_s = now_s + NOTIFY_EVERY_S
-            self._notifier.status(self._line())
+            self._notifier.send(STATUS=self._line())
         return True
+
+    def final(self) -> dict[str, Any]:
+        """Return the object of `/status` after the run, with the estimate of the latest sample."""
+        self._pipeline.published = self._pipeline.latest
+        self._report_due_s = -math.inf
+        return self._object(self._clock()) | {"running": False}
 
     def _object(self, now_s: float) -> dict[str, Any]:
         """Return the object of `/status`."""
@@ -235,6 +242,7 @@ class Monitor:
                 "lost": statistics.frames_lost,
             },
             "rejects": rejects,
+            "stamps": port.capabilities.stamps,
             "bus_up": not any(getattr(port, name, False) for name in ("is_away", "is_off")),
             "bus_counts": {name: int(n) for name, n in counts.items() if n is not None},
             "bus_trouble": getattr(port, "trouble", "") or None,

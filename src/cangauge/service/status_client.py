@@ -1,4 +1,4 @@
-"""The status of a running service: its object, its unix socket, clients of that and of HTTP.
+"""The status of a running service: its object, its unix socket, and a client of that.
 
 There is one path: BUS.sock in the runtime folder of the user or of systemd. A connection to it
 answers with one JSON object and ends, so `nc -U PATH` shows it.
@@ -6,21 +6,18 @@ answers with one JSON object and ends, so `nc -U PATH` shows it.
 
 from __future__ import annotations
 
-import http.client
 import json
 import logging
 import os
 import re
 import socket
-import stat
 import threading
 import time
 from collections.abc import Callable, Mapping
-from contextlib import closing, suppress
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final, cast
-from urllib.parse import urlsplit
 
 from cangauge._logging import emit
 from cangauge.errors import CangaugeError, InputError
@@ -99,7 +96,7 @@ def runtime_folders() -> list[Path]:
 def socket_path(bus: str) -> Path:
     """Return the socket of a service on a bus, such as "socketcan can0"."""
     name = re.sub(r"[^A-Za-z0-9.]+", "-", bus).strip("-.")[:40]
-    return runtime_folders()[0] / f"{name or 'bus'}.sock"
+    return runtime_folders()[0] / f"{name}.sock"
 
 
 class StatusSocket:
@@ -125,9 +122,9 @@ class StatusSocket:
             self._socket.bind(str(path))
             path.chmod(SOCKET_MODE)
             self._socket.listen(16)
-        except (OSError, ValueError) as error:
+        except OSError as error:
             raise InputError(
-                f"cannot be created: {getattr(error, 'strerror', None) or error}",
+                f"cannot be created: {error.strerror or error}",
                 source=path,
                 field="status_socket",
                 cure="name another one, or off",
@@ -159,16 +156,10 @@ class StatusSocket:
 def is_served(path: Path) -> bool:
     """Return whether a process listens on a unix socket."""
     try:
-        if not stat.S_ISSOCK(path.stat().st_mode):
-            return False
-        with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as probe:
-            probe.settimeout(1.0)
-            probe.connect(str(path))
-    except (ConnectionRefusedError, FileNotFoundError, ValueError):
-        return False
-    except OSError:  # busy, or of another user
-        return True
-    return True
+        with _connected(path):
+            return True
+    except OSError as error:  # one that is busy, or of another user, is served
+        return path.is_socket() and not isinstance(error, ConnectionRefusedError)
 
 
 def find_socket() -> Path:
@@ -192,68 +183,40 @@ def find_socket() -> Path:
     return found[0]
 
 
-def fetch_status(endpoint: str) -> dict[str, Any]:
-    """Return the status of a service: the JSON object of `/status`.
-
-    Parameters
-    ----------
-    endpoint : str
-        Path of a unix socket, or "http://host:port", for which the token is the environment's.
+def fetch_status(path: Path) -> dict[str, Any]:
+    """Return the status of the service at a unix socket: the JSON object of `/status`.
 
     Raises
     ------
-    InputError
-        If the endpoint is neither of both.
     NotRunningError
         If no service answers.
     CangaugeError
-        If the request is refused, or the answer is not a status.
+        If the answer is not a status.
     """
+    answer = b""
     try:
-        body = _get(endpoint) if "://" in endpoint else _read(endpoint)
-    except (OSError, http.client.HTTPException) as error:
-        reason = getattr(error, "strerror", None) or str(error) or type(error).__name__
-        text = f"{endpoint}: no service answers: {reason}"
+        with _connected(path) as connection:
+            while len(answer) < LARGEST_ANSWER and (part := connection.recv(1 << 16)):
+                answer += part
+    except OSError as error:
+        text = f"{path}: no service answers: {error.strerror or error}"
         raise NotRunningError(text) from error
     try:
-        content = json.loads(body)
-    except (ValueError, RecursionError):
-        content = None
-    if not isinstance(content, dict) or content.get("schema") != SCHEMA:
-        text = f"{endpoint}: the answer is not a status of this release of cangauge"
-        raise CangaugeError(text)
-    return cast("dict[str, Any]", content)
+        content = json.loads(answer)
+        if content["schema"] == SCHEMA:
+            return cast("dict[str, Any]", content)
+    except (ValueError, KeyError, TypeError):
+        pass
+    raise CangaugeError(f"{path}: the answer is not a status of this release of cangauge")
 
 
-def _read(path: str) -> bytes:
-    answer = b""
-    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as connection:
-        connection.settimeout(ANSWER_WITHIN_S)
-        connection.connect(path)
-        while len(answer) < LARGEST_ANSWER and (part := connection.recv(1 << 16)):
-            answer += part
-    return answer
-
-
-def _get(endpoint: str) -> bytes:
-    token = os.environ.get("CANGAUGE_HTTP_TOKEN")
-    headers = {} if token is None else {"Authorization": f"Bearer {token}"}
+def _connected(path: Path) -> socket.socket:
+    """Return a connection to a unix socket; may raise OSError."""
+    connection = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+    connection.settimeout(ANSWER_WITHIN_S)
     try:
-        parts = urlsplit(endpoint)
-        kind = {"http": http.client.HTTPConnection, "https": http.client.HTTPSConnection}
-        connection = kind[parts.scheme](str(parts.hostname), parts.port, timeout=ANSWER_WITHIN_S)
-    except (KeyError, ValueError) as error:
-        raise InputError(
-            "neither the path of a unix socket nor a URL",
-            field="--endpoint",
-            value=endpoint,
-            cure="write it as http://127.0.0.1:9464",
-        ) from error
-    with closing(connection):
-        connection.request("GET", "/status", headers=headers)
-        response = connection.getresponse()
-        body: bytes = response.read(LARGEST_ANSWER)
-    if response.status != http.client.OK:
-        answer = " ".join(body[:200].decode("utf-8", "replace").split())
-        raise CangaugeError(f"{endpoint}: refused ({response.status}): {answer}")
-    return body
+        connection.connect(str(path))
+    except OSError:
+        connection.close()
+        raise
+    return connection
