@@ -187,8 +187,10 @@ def same_files(option: Literal["state", "record"]) -> Callable[[Bench], None]:
 
     def do(bench: Bench) -> None:
         path = bench.state_path if option == "state" else bench.folder / bench.config["record"]
-        arguments = ["run", "--config", str(bench.config_path), f"--{option}", str(path)]
-        arguments += ["--interface", "virtual", "--channel", "elsewhere", "--duration", "0.5"]
+        second = bench.folder / "second.toml"
+        second.write_text(f"duration_s = 0.5\n{bench.config_path.read_text()}")
+        arguments = ["run", "--config", str(second), f"--{option}", str(path)]
+        arguments += ["--interface", "virtual", "--channel", "elsewhere"]
         ended = run_command(arguments)
         if ended != REFUSED:
             bench.incidents.append(f"a second service with its --{option} ended with {ended}")

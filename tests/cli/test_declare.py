@@ -10,7 +10,7 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
-from cangauge.cli.declare import Written, command
+from cangauge.cli.declare import command
 from cangauge.errors import InputError
 
 GOT: dict[str, Any] = {}
@@ -42,7 +42,7 @@ def narrow_command(*, shared: Shared) -> None:
 def wide_command(
     logs: list[Path],
     *,
-    table: Written | None = None,
+    table: Path | None = None,
     starts: list[float | Literal["auto"]] | None = None,
     cells: int = 4,
     shared: Shared,

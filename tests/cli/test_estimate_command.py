@@ -137,7 +137,7 @@ def test_initial_soc(
     given, start, origin, doubt = case
     ran = run(
         "estimate", made / "part.csv", "-m", made / "model.json", "-o", tmp_path / "soc.parquet",
-        "--initial-soc", given, "--json",
+        "--initial-soc", given, "--initial-soc-std", "20", "--json",
     )  # fmt: skip
     found = json.loads(ran.out)
     assert (found["initial_soc_pct"], found["initial_soc_from"]) == (start, origin)
@@ -147,6 +147,17 @@ def test_initial_soc(
     assert counted == pytest.approx(start or 80.0, abs=1e-9 if start else 10.0)
     assert doubt in ran.err
     assert ("the initial SoC is" in ran.err) is bool(doubt)
+
+
+def test_each_method_gives_its_own_soc(run: Run, made: Path, tmp_path: Path) -> None:
+    for method in ("newton", "coulomb"):
+        out = tmp_path / f"{method}.parquet"
+        ran = run(
+            "estimate", made / "part.csv", "-m", made / "model.json", "-o", out, "--method", method
+        )
+        assert ran.code == 0, ran.err
+        table = pa.parquet.read_table(out)
+        assert table["soc_pct"].to_pylist() == table[f"soc_{method}_pct"].to_pylist()
 
 
 def test_unknown_values_are_empty(run: Run, made: Path, tmp_path: Path) -> None:
@@ -192,8 +203,10 @@ def test_a_slow_log_has_no_gaps_by_default(run: Run, made: Path, tmp_path: Path)
 @pytest.mark.parametrize(
     "case",
     [
+        (["--method", "ukf"], ["'--method'", "'ukf' is not one of 'ekf', 'newton', 'coulomb'"]),
         (["--initial-soc", "half"], ["--initial-soc", "half"]),
         (["--initial-soc", "101"], ["--initial-soc", "101"]),
+        (["--initial-soc-std", "-1"], ["--initial-soc-std", "-1"]),
         (["--capacity-ah", "0"], ["--capacity-ah"]),
         (["-o", "soc.txt"], ["soc.txt", ".csv, .parquet or .mcap"]),
         (["--pack", "pack.mcap"], ["--pack", ".csv or .parquet"]),

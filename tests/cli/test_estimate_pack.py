@@ -81,7 +81,7 @@ def test_pack_rows_are_those_of_the_estimator(run: Run, made: Path, tmp_path: Pa
     ran = run("estimate", tmp_path / "part.parquet", "-m", made / "model.json", "-o",
               tmp_path / "soc.csv", "--pack", pack)  # fmt: skip
     assert ran.code == 0, ran.err
-    assert "The pack at the end" in ran.out
+    assert "energy left" in ran.out
     table = pa.csv.read_csv(pack)
     assert table.column_names == ["time_s", *HEALTH, *POWER]
     settings = EstimatorSettings(initial_soc_pct=log.soc_pct[0], temperature_source="room")
@@ -98,9 +98,10 @@ def test_pack_rows_are_those_of_the_estimator(run: Run, made: Path, tmp_path: Pa
 
 def test_a_capture_with_cells_as_live(run: Run, made: Path, tmp_path: Path) -> None:
     (tmp_path / "cells.dbc").write_text(CELLS_DBC)
-    (tmp_path / "car.toml").write_text(CAR + ALL_CELLS)
-    dbc, map_file = shared_file("dbc", "generic_pack.dbc"), tmp_path / "car.toml"
-    car = Vehicle.load(dbc=dbc, map=map_file)
+    dbc_files = f'["{shared_file("dbc", "generic_pack.dbc")}", "cells.dbc"]'
+    map_file = tmp_path / "car.toml"
+    map_file.write_text(CAR.replace('"cells.dbc"', dbc_files) + ALL_CELLS)
+    car = Vehicle.load(map=map_file)
     log = read_log(made / "part.csv").rows(slice(0, 100))
     encoder, cells, frames = FrameEncoder(car), cells_of(log), []
     for row, sample in enumerate(samples_of(log)):
@@ -112,7 +113,7 @@ def test_a_capture_with_cells_as_live(run: Run, made: Path, tmp_path: Path) -> N
             writer.on_message_received(frame)
     pack = tmp_path / "pack.parquet"
     ran = run(
-        "estimate", tmp_path / "drive.log", "--dbc", dbc, "--map", map_file, "-m",
+        "estimate", tmp_path / "drive.log", "--map", map_file, "-m",
         made / "model.json", "-o", tmp_path / "soc.csv", "--pack", pack, "--json",
     )  # fmt: skip
     assert ran.code == 0, ran.err

@@ -17,7 +17,6 @@ import pyarrow.parquet as pq
 import pytest
 
 from cangauge.errors import CangaugeError, InputError
-from cangauge.estimation.settings import EstimatorSettings
 from cangauge.extras.fleet import run as fleet_run
 from cangauge.extras.fleet.gap import GapJob
 from cangauge.extras.fleet.jobs import TEXT, EstimateJob, HealthJob, Job, Task, by_log, by_vehicle
@@ -206,7 +205,7 @@ def test_a_killed_worker_leaves_a_complete_result(
     logs: list[FleetLog], model: Model, tmp_path: Path
 ) -> None:
     pytest.importorskip("distributed")
-    job = EstimateJob(ReadOptions(), model, EstimatorSettings())
+    job = EstimateJob(ReadOptions(), model)
     results = Results(str(tmp_path), job.kind, job.columns)
     with connected("2") as client:
         killed: list[int] = []
@@ -259,8 +258,8 @@ def test_a_scheduler_that_does_not_answer_is_bad_input(monkeypatch: pytest.Monke
 
 
 def test_a_broken_log_is_set_aside_with_its_reason(tmp_path: Path, model: Model) -> None:
-    job = EstimateJob(ReadOptions(), model, EstimatorSettings())
-    assert run_id(job) != run_id(replace(job, settings=EstimatorSettings(capacity_ah=50.0)))
+    job = EstimateJob(ReadOptions(), model)
+    assert run_id(job) != run_id(replace(job, model=model.model_copy(update={"capacity_ah": 50.0})))
     broken = tmp_path / "broken.parquet"
     broken.write_bytes(b"PAR1")
     for path, words in ((broken, "cut off or damaged"), (tmp_path / "gone.csv", "no such file")):
@@ -271,7 +270,7 @@ def test_a_broken_log_is_set_aside_with_its_reason(tmp_path: Path, model: Model)
 
 
 def test_health_passes_from_log_to_log(logs: list[FleetLog], model: Model) -> None:
-    job = HealthJob(ReadOptions(), model, EstimatorSettings())
+    job = HealthJob(ReadOptions(), model)
     trips = tuple(log for log in logs if log.vehicle == "car1")
     rows = perform(job, Task("car1", "car1", trips)).rows
     alone = perform(job, Task("car1", "car1", trips[1:])).rows[0]

@@ -14,6 +14,7 @@ from live import Command, in_process, leaf_model_path
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="flock is Unix's")
 RUN = ("run", "-m", leaf_model_path(), "--interface", "virtual", "--channel", "a")
+BRIEF = ("--config", Path(__file__).with_name("brief.toml"))
 HOLD = (
     "import sys; from cangauge.service.lifecycle import sole_writer\n"
     "with sole_writer(sys.argv[1]): print('held', flush=True); sys.stdin.read()"
@@ -61,7 +62,7 @@ def test_a_second_service_with_a_file_of_the_first_is_refused(tmp_path: Path) ->
             ("--record", record),
             ("--state", state),
         ):
-            second = in_process(*RUN, *options, "--duration", "0.1")
+            second = in_process(*RUN, *options, *BRIEF)
             assert second.code == 2, options
             assert f"(process {first.process.pid})" in second.err
             assert str(options[1]) in second.err
@@ -77,8 +78,8 @@ def test_a_token_that_others_can_read_is_reported(tmp_path: Path, rights: int) -
     token.write_text("a-token-of-some-length")
     token.chmod(rights)
     config = tmp_path / "run.toml"
-    config.write_text('http_token_file = "token"\n')
-    ended = in_process(*RUN, "--http", "127.0.0.1:0", "--config", config, "--duration", "0.1")
+    config.write_text('http_token_file = "token"\nduration_s = 0.1\n')
+    ended = in_process(*RUN, "--http", "127.0.0.1:0", "--config", config)
     assert ended.code == 0
     assert ("http.token_exposed" in ended.err) == (rights != 0o600)
 

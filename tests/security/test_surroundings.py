@@ -11,8 +11,10 @@ import pytest
 from live import COMMAND, leaf_model_path
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="needs a Unix shell")
-RUN = ("run", "-m", leaf_model_path(), "--interface", "virtual", "--channel", "a", "--duration",
-       "0.1")  # fmt: skip
+RUN = (
+    "run", "-m", leaf_model_path(), "--interface", "virtual", "--channel", "a", "--config",
+    Path(__file__).with_name("brief.toml"),
+)  # fmt: skip
 
 
 def shell(

@@ -155,7 +155,6 @@ def test_an_interrupted_replay_says_how_far_it_came(bus: list[str], log_path: Pa
         (["--channel", "can7x"], "can7x"),
         (["--interface", "pcan", "--channel", "PCAN_USBBUS1"], "pcan"),
         (["--vehicle", "moped"], "moped"),
-        (["--dbc", "car.dbc"], "--map"),
         (["--bus-option", "fast"], "K=V"),
     ],
 )
@@ -179,7 +178,6 @@ def test_bad_options_of_both_commands(
     [
         (["run"], "--model"),
         (["run", "-m", "/nowhere/model.json"], "/nowhere/model.json"),
-        (["run", *MODEL, "--method", "magic"], "magic"),
         (["run", *MODEL, "--initial-soc", "150"], "150"),
         (["run", *MODEL, "--time-source", "sundial"], "sundial"),
         (["run", *MODEL, "--config", "/nowhere/car.toml"], "/nowhere/car.toml"),

@@ -158,7 +158,7 @@ def open_recording(
     if mapped is not None:
         return open_log(path, columns=mapped, sign=sign)
     problem = "not a known kind of log, nor of capture"
-    cure = f"known logs: {KNOWN_LOGS}; known captures (with --vehicle or --dbc and --map):"
+    cure = f"known logs: {KNOWN_LOGS}; known captures (with --vehicle or --map):"
     raise not_recognised(log_file, problem, f"{cure} {KNOWN_CAPTURES}")
 
 
@@ -180,7 +180,7 @@ def refuse_single_row(recorded: Sized) -> None:
 
 def capture_without_vehicle(path: str | PathLike[str]) -> InputError:
     """Return the error for a capture whose vehicle is not given."""
-    cure = "give --vehicle, or --dbc and --map"
+    cure = "give --vehicle or --map"
     return InputError("this is a CAN capture, not a log", source=path, cure=cure)
 
 

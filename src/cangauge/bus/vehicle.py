@@ -190,7 +190,7 @@ class Vehicle:
             raise InputError(problem, field="--temperature", value=temperature_c)
         if preset is not None:
             if dbc is not None or map is not None:
-                problem, cure = "given together with --dbc or --map", "give one or the other"
+                problem, cure = "given together with a DBC or a map", "give one or the other"
                 raise InputError(problem, field="--vehicle", value=preset, cure=cure)
             known = _find_preset(preset)
             if known.lacks_temperature and temperature_c is None:
@@ -201,7 +201,7 @@ class Vehicle:
                 temperature_c=temperature_c, pair_within_s=pair_within_s, overrides=overrides
             )
         if map is None and dbc is None:
-            cure = f"give --vehicle ({', '.join(PRESETS)}), or --dbc FILE --map FILE"
+            cure = f"give --vehicle ({', '.join(PRESETS)}), or --map FILE"
             raise InputError("no vehicle is given", field="--vehicle", cure=cure)
         if map is None:
             problem = "a DBC alone does not name the signals"
@@ -212,7 +212,7 @@ class Vehicle:
         files = [] if dbc is None else [Path(dbc)]
         files += [Path(map).parent / name for name in mapping.dbc]
         if not files:
-            cure = "add it, or give --dbc FILE"
+            cure = 'name the DBC: dbc = "car.dbc"'
             raise InputError("is missing", source=map, field="dbc", cure=cure)
         if mapping.temperature is None and temperature_c is None:
             cure = "name its signal, or give --temperature °C"
@@ -450,6 +450,6 @@ def _find_preset(name: str) -> Preset:
     if preset is not None:
         return preset
     near = closest(name, PRESETS)
-    known = f"known are {', '.join(PRESETS)}; for another car give --dbc FILE --map FILE"
+    known = f"known are {', '.join(PRESETS)}; for another car give --map FILE"
     cure = f"did you mean {near}?" if near else known
     raise InputError("unknown vehicle", field="--vehicle", value=name, cure=cure)

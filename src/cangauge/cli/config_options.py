@@ -5,42 +5,33 @@ from __future__ import annotations
 import inspect
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any, Final
+from typing import Annotated, Any
 
 import typer
 
 from cangauge.service.config import ConfigKey, config_keys
 
-_OPTIONS: Final = {key.name: key for key in config_keys() if key.info.option}
-_TYPES: Final[Mapping[str, type]] = {"number": float, "true or false": bool}
-
 
 def config_parameters(*names: str) -> list[inspect.Parameter]:
     """Return the options of keys, such as "channel", as typer reads them; without names of all."""
-    return [
-        inspect.Parameter(
-            name,
-            inspect.Parameter.KEYWORD_ONLY,
-            default=None,
-            annotation=Annotated[
-                _type(key) | None,
-                typer.Option(
-                    *key.info.option.split(", "), metavar=key.info.metavar or None, help=key.help
-                ),
-            ],
-        )
-        for name, key in _OPTIONS.items()
-        if not names or name in names
-    ]
+    keys = [key for key in config_keys() if key.info.option]
+    return [_parameter(key) for key in keys if not names or key.name in names]
 
 
-def _type(key: ConfigKey) -> Any:
+def _parameter(key: ConfigKey) -> inspect.Parameter:
+    kind: Any = Path if key.info.is_path else float if key.kind == "number" else str
     if key.name == "bus_options":
-        return list[str]
-    if key.info.is_path:
-        return Path
-    # Checked by the configuration, for the same message as in a file; "auto" is no number.
-    return str if key.name == "initial_soc" else _TYPES.get(key.kind, str)
+        kind = list[str]
+    elif key.name == "initial_soc":  # "auto" is no number: checked by the configuration
+        kind = str
+    flags = key.info.option.split(", ")
+    option = typer.Option(*flags, metavar=key.info.metavar or None, help=key.help)
+    return inspect.Parameter(
+        key.name,
+        inspect.Parameter.KEYWORD_ONLY,
+        default=None,
+        annotation=Annotated[kind | None, option],
+    )
 
 
 def config_values(options: Mapping[str, Any]) -> dict[str, Any]:

@@ -8,7 +8,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
 from cangauge._extras import extra
 from cangauge._files import write_text_atomic
@@ -95,21 +95,15 @@ def demo_command(*, folder: Path = Path("out/demo"), json_output: bool = False) 
     estimate = RecordedEstimate(log, table, live, model, settings)
     page = extra("report.estimate:estimate_page")(estimate, paths["model"]).html()
     write_text_atomic(paths["soc_page"], page)
+    bound_pct = quantization_bound(Vehicle.load("generic"), model, log).ekf_pct
     result = {
         "log": "a reconstruction of the published 2012 Leaf test, no recording",
         "current_offset_a": SENSOR_OFFSET_A,
-        "samples": live.rows,
-        "replay_seconds": live.seconds,
         "fit_voltage_mae_pct": identification.voltage_mae_pct,
         "fit_soc_newton_mae_pct": identification.soc_newton_mae_pct,
-        "live_voltage_mae_pct": live.voltage_mae_pct,
-        "live_soc_mae_pct": live.soc_mae_pct,
-        "live_soc_max_pct": live.soc_max_pct,
-        "live_soc_newton_mae_pct": live.soc_newton_mae_pct,
-        "live_soc_coulomb_mae_pct": live.soc_coulomb_mae_pct,
-        "live_cover_2sigma": live.cover_2sigma,
+        **{f"live_{name}": value for name, value in vars(live).items()},
         "live_minus_offline_pct": float(np.nanmax(np.abs(table.soc_pct - offline.soc_pct))),
-        "quantisation_bound_pct": quantization_bound(vehicle, model, log).ekf_pct,
+        "quantisation_bound_pct": bound_pct,
         "seconds": time.monotonic() - began,
         **{name: str(path) for name, path in paths.items()},
     }
@@ -148,32 +142,27 @@ def _play(folder: Path, log: Path) -> float:
     return seconds
 
 
-_SHOWN: Final = {
-    "fit_voltage_mae_pct": "voltage error of the fit, MAE",
-    "fit_soc_newton_mae_pct": "SoC by Newton on the fitted log, MAE",
-    "live_soc_newton_mae_pct": "SoC by Newton, live, MAE",
-    "live_soc_coulomb_mae_pct": "SoC by Coulomb counting, live, MAE",
-    "live_soc_mae_pct": "SoC by EKF, live, MAE",
-    "live_soc_max_pct": "SoC by EKF, live, largest",
-    "live_minus_offline_pct": "live minus offline, largest",
-    "quantisation_bound_pct": "  bound from rounding in frames",
-}
-
-
 def _show(result: dict[str, Any]) -> None:
+    """Print the errors of fit and live estimate, beside the published ones, and where to look."""
     from cangauge.model.published import SOC_NEWTON_MAE_PCT, VOLTAGE_MAE_PCT
 
-    published = {
-        "fit_voltage_mae_pct": f"{VOLTAGE_MAE_PCT:.2f} %",
-        "fit_soc_newton_mae_pct": f"{SOC_NEWTON_MAE_PCT:.2f} %",
-    }
     rows = [
-        [name, significant(result[key], 3, "%"), published.get(key, "")]
-        for key, name in _SHOWN.items()
+        ("voltage error of the fit, MAE", "fit_voltage_mae_pct", f"{VOLTAGE_MAE_PCT:.2f} %"),
+        ("SoC by Newton, fitted log, MAE", "fit_soc_newton_mae_pct", f"{SOC_NEWTON_MAE_PCT:.2f} %"),
+        ("SoC by Newton, live, MAE", "live_soc_newton_mae_pct", ""),
+        ("SoC by Coulomb counting, live, MAE", "live_soc_coulomb_mae_pct", ""),
+        ("SoC by EKF, live, MAE", "live_soc_mae_pct", ""),
+        ("SoC by EKF, live, largest", "live_soc_max_pct", ""),
+        ("live minus offline, largest", "live_minus_offline_pct", ""),
+        ("  bound from rounding in frames", "quantisation_bound_pct", ""),
     ]
-    rows.append(["reference within ±2σ", number(100.0 * result["live_cover_2sigma"], 1, "%"), ""])
-    title = f"Reconstructed Leaf test, live; current {SENSOR_OFFSET_A:g} A too high"
-    print_table(title, ["error", "here", "published"], rows)
-    seconds = f"{result['replay_seconds']:.0f} s over the bus; {result['seconds']:.0f} s in total"
-    note(f"{result['samples']} samples in {seconds}")
+    cover = number(100.0 * result["live_cover_2sigma"], 1, "%")
+    print_table(
+        f"Reconstructed Leaf test, live; current {SENSOR_OFFSET_A:g} A too high",
+        ["error", "here", "published"],
+        [[name, significant(result[key], 3, "%"), published] for name, key, published in rows]
+        + [["reference within ±2σ", cover, ""]],
+    )
+    seconds = f"{result['live_seconds']:.0f} s over the bus; {result['seconds']:.0f} s in total"
+    note(f"{result['live_rows']} samples in {seconds}")
     note(f"open {result['soc_page']} (SoC against reference) and {result['fit_page']} (the model)")

@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING, Literal
 
 from cangauge._extras import extra
 from cangauge._files import atomic_path
-from cangauge._text import number, rounded, significant, uncertain
-from cangauge.cli.declare import Written, command
+from cangauge._text import NONE_KNOWN, number, rounded, uncertain
+from cangauge.cli.declare import command
 from cangauge.cli.options import ReadingOptions, assumed_of, check_outputs, note_starts
-from cangauge.cli.output import emit_json, note, print_table, print_values, progress_bar
+from cangauge.cli.output import emit_json, live_line, note, print_values
 from cangauge.cli.status import pack_values
 from cangauge.types import REASON_WORDS, Reason
 
@@ -28,21 +28,22 @@ def estimate_command(
     log_path: Path,
     *,
     model: Path,
-    output: Written,
+    output: Path,
+    method: Literal["ekf", "newton", "coulomb"] = "ekf",
     initial_soc: float | Literal["auto"] | None = None,
+    initial_soc_std: float = 1.0,
     capacity_ah: float | None = None,
     reading: ReadingOptions,
-    pack: Written | None = None,
-    report: Written | None = None,
+    pack: Path | None = None,
+    report: Path | None = None,
     json_output: bool = False,
 ) -> None:
     """Estimate the state of charge of a recorded log or capture, offline.
 
-    OUT has one row per sample: time_s [s], soc_pct and soc_std_pct by the filter over voltage and
-    charge, soc_newton_pct by voltage alone, soc_coulomb_pct by counting alone [%], voltage_model_v,
-    residual_v (measured − model) [V], status (initialising, valid, degraded, invalid) and reasons
-    (separated by "; "). An unknown value is empty (CSV) or null (Parquet). An .mcap holds samples
-    and estimates for Foxglove and PlotJuggler. Positive current discharges.
+    OUT has one row per sample: time_s [s], soc_pct, soc_std_pct, soc_newton_pct, soc_coulomb_pct
+    [%], voltage_model_v, residual_v (measured − model) [V], status (initialising, valid, degraded,
+    invalid) and reasons (separated by "; "). An unknown value is empty (CSV) or null (Parquet).
+    An .mcap holds samples and estimates for Foxglove and PlotJuggler. Positive current discharges.
 
     PACK has one row per second, of a log over an hour 3,600 rows: capacity_ah, resistance_ratio,
     offset_a, discharge_a and charge_a (possible for 10 s), energy_wh (left), with standard
@@ -55,7 +56,7 @@ def estimate_command(
 
     `cangauge estimate trip.csv -m pack.json -o soc.parquet --initial-soc auto`
 
-    `cangauge estimate drive.log --vehicle leaf_ze0 -m leaf.json -o soc.csv`
+    `cangauge estimate drive.log --vehicle leaf_ze0 -m leaf.json -o soc.csv --method newton`
 
     Parameters
     ----------
@@ -63,10 +64,15 @@ def estimate_command(
         Recorded log or capture.
     output : -o, --output OUT.csv|.parquet|.mcap
         Table of estimates.
+    method : ekf|newton|coulomb
+        Method of soc_pct: Kalman filter over voltage and charge (ekf), voltage alone (newton), or
+        counting alone (coulomb).
     initial_soc : P|auto (0 … 100 %)
         SoC at the first sample, e.g. 80; `auto` takes it from the first voltages. Default: the
         first soc_pct of a log, counted back to its first row; else, and for a capture (as live),
         auto.
+    initial_soc_std : X (0 … 100 %)
+        Standard deviation of the initial SoC.
     pack : PACK.csv|.parquet
         Table of health, power and cells, once a second.
     """
@@ -75,7 +81,9 @@ def estimate_command(
     from cangauge.model.model_file import Model
 
     settings = EstimatorSettings(
+        method=method,
         initial_soc_pct=None if initial_soc == "auto" else initial_soc,
+        initial_soc_std_pct=initial_soc_std,
         capacity_ah=capacity_ah,
     )
     check_outputs([output, pack, report], [log_path, model])
@@ -117,9 +125,14 @@ def _of_log(
         note_starts([log], settings.initial_soc_pct, settings.capacity_ah or model.capacity_ah)
     cells = read_cells(Path(log.source), log.time_s, reading.given_columns())
     history = PackHistory(keeps_rows=pack is not None, cells=cells, duration_s=log.duration_s)
-    with progress_bar(log.name, len(log)) as progress:
+    with live_line() as show:
         done = estimate_recorded_log(
-            log, model, settings, soc_from_log=initial_soc is None, pack=history, progress=progress
+            log,
+            model,
+            settings,
+            soc_from_log=initial_soc is None,
+            pack=history,
+            progress=lambda number: show(f"{log.name}: {number} of {len(log)} samples"),
         )
     if (gap_s := done.settings.gap_s) > GAP_S:
         note(
@@ -142,10 +155,14 @@ def _of_capture(
     from cangauge.service.offline import RecordedCapture, estimate_capture
 
     car = reading.car_of(capture.path)
-    with progress_bar(capture.path.name, None) as progress:
-        keeps = pack is not None
+    with live_line() as show:
         done = estimate_capture(
-            capture.path, car, model, settings, keeps_pack=keeps, progress=progress
+            capture.path,
+            car,
+            model,
+            settings,
+            keeps_pack=pack is not None,
+            progress=lambda number: show(f"{capture.path.name}: {number} frames"),
         )
     recorded = done.recorded
     refuse_single_row(recorded)
@@ -177,38 +194,28 @@ def _write(
 
 
 def _show(done: RecordedEstimate) -> None:
-    scores, table, settings = done.scores, done.table, done.settings
+    """Print the SoC at both ends, its error where the log has a reference, and the pack."""
+    scores, table = done.scores, done.table
     origin = {"given": "given", "log": "from the log's soc_pct", "voltage": "found by the voltage"}
-    start = number(settings.initial_soc_pct, 1, "%")
     known = [row for row in range(len(table.soc_pct)) if table.soc_pct[row] == table.soc_pct[row]]
+    start = number(done.settings.initial_soc_pct, 1, "%")
     if done.origin == "voltage" and known:
         start = uncertain(float(table.soc_pct[known[0]]), float(table.soc_std_pct[known[0]]), "%")
     cover = None if scores.cover_2sigma is None else 100.0 * scores.cover_2sigma
-    print_values(
-        f"State of charge of {done.recorded.name}",
-        {
-            "initial SoC": f"{start} ({origin[done.origin]})",
-            "SoC at the end": number(table.soc_pct[-1], 1, "%"),
-            "  its standard deviation": number(table.soc_std_pct[-1], 1, "%"),
-            "SoC error, MAE": number(scores.soc_mae_pct, 2, "%"),
-            "SoC error, largest": number(scores.soc_max_pct, 2, "%"),
-            "  by Newton alone, MAE": number(scores.soc_newton_mae_pct, 2, "%"),
-            "  by counting alone, MAE": number(scores.soc_coulomb_mae_pct, 2, "%"),
-            "reference within ±2σ": number(cover, 1, "% of samples"),
-            "voltage error, MAE": number(scores.voltage_mae_pct, 2, "%"),
-            "valid": number(100.0 * scores.valid_fraction, 1, "% of samples"),
-            "samples": str(scores.rows),
-        },
-    )
+    shares = [
+        f"{REASON_WORDS[Reason[name.upper().replace(' ', '_')]]} {number(100.0 * share, 1, '%')}"
+        for name, share in done.reason_shares.items()
+    ]
+    values = {
+        "initial SoC": f"{start} ({origin[done.origin]})",
+        "SoC at the end": uncertain(float(table.soc_pct[-1]), float(table.soc_std_pct[-1]), "%"),
+        "SoC error, MAE": number(scores.soc_mae_pct, 2, "%"),
+        "SoC error, largest": number(scores.soc_max_pct, 2, "%"),
+        "reference within ±2σ": number(cover, 1, "% of samples"),
+        "voltage error, MAE": number(scores.voltage_mae_pct, 2, "%"),
+        "valid": number(100.0 * scores.valid_fraction, 1, "% of samples"),
+        "less than valid": "; ".join(shares) or NONE_KNOWN,
+    }
     if done.pack.report is not None:
-        limits = settings.limits.of_model(done.model.voltage_model())
-        low_v, high_v = (significant(v, 3) for v in (limits.min_voltage_v, limits.max_voltage_v))
-        report = done.pack.report.to_dict()
-        values = pack_values(report, f", down to {low_v} V", f", up to {high_v} V")
-        print_values("The pack at the end", values)
-    if shares := done.reason_shares:
-        rows = [
-            [REASON_WORDS[Reason[name.upper().replace(" ", "_")]], number(100.0 * share, 1)]
-            for name, share in shares.items()
-        ]
-        print_table("Reasons for less than valid estimates", ["reason", "% of samples"], rows)
+        values |= pack_values(done.pack.report.to_dict())
+    print_values(f"State of charge of {done.recorded.name}", values)

@@ -2,22 +2,16 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from cangauge._extras import extra
 from cangauge._files import write_texts_atomic
-from cangauge._text import NONE_KNOWN, energy_text, number, significant, span
-from cangauge.cli.declare import Written, command
+from cangauge._text import NONE_KNOWN, number, significant, span
+from cangauge.cli.declare import command
 from cangauge.cli.options import ReadingOptions, assumed_of, check_outputs
-from cangauge.cli.output import (
-    console,
-    emit_json,
-    note,
-    print_table,
-    print_values,
-    progress_shown,
-)
+from cangauge.cli.output import console, emit_json, note, print_values, progress_shown
 from cangauge.errors import InputError
 
 if TYPE_CHECKING:
@@ -33,15 +27,19 @@ more or less in 16 makes three times as much."""
 def fit_command(
     logs: list[Path],
     *,
-    output: Written,
+    output: Path,
     capacity_ah: float | Literal["from-soc"] | None = None,
     initial_soc: list[float | Literal["auto"]] | None = None,
     equation: Literal["knots", "published"] = "knots",
     chemistry: Literal["oxide", "lfp"] | None = None,
     cells: int | None = None,
+    rate_hz: float = 1.0,
+    delays: str | None = None,
+    epsilon: float | None = None,
+    t_ref: float | None = None,
     effects: list[str] | None = None,
     reading: ReadingOptions,
-    report: Written | None = None,
+    report: Path | None = None,
     json_output: bool = False,
 ) -> None:
     """Identify the voltage model of a pack from recorded logs.
@@ -86,6 +84,14 @@ def fit_command(
         the volts per cell where their number is known, else oxide.
     cells : N (1 … 2000)
         Cells in series. Default: the columns of cells of the first log, if it has all.
+    rate_hz : HZ (0.01 … 1000 Hz)
+        Rate of the fit; faster logs are decimated.
+    delays : S,S,…
+        Delays of the current [s], by default 0,10,30,70; with --equation published.
+    epsilon : E (0.0001 … 0.49)
+        Margin ε of the scaled SoC, by default 0.05; with --equation published.
+    t_ref : C (-60 … 120 °C)
+        Reference temperature T_r, by default 20; with --equation published.
     effects : ID…|auto|none
         Effects to add to the model, separated by commas, e.g. hysteresis; `auto` adds those that
         lower the error of left-out logs significantly. Default: auto from five logs on.
@@ -100,6 +106,18 @@ def fit_command(
             cure="give one for all, or one for each log in order (auto where it is unknown)",
         )
     starts = [None if each == "auto" else each for each in initial_soc or ["auto"]]
+    published: dict[str, Any] = {
+        "delay_s": None if delays is None else _delays_s(delays),
+        "epsilon": epsilon,
+        "t_ref_c": t_ref,
+    }
+    published = {name: value for name, value in published.items() if value is not None}
+    if equation == "knots" and published:
+        option = {"delay_s": "--delays", "epsilon": "--epsilon", "t_ref_c": "--t-ref"}
+        cure = "add --equation published, or leave it out"
+        raise InputError(
+            "belongs to the published equation", field=option[next(iter(published))], cure=cure
+        )
     check_outputs([output, report], logs)
     with console.status("reading") as status:
         recorded = []
@@ -114,7 +132,9 @@ def fit_command(
                 equation=equation,
                 chemistry=chemistry,
                 cells=cells or _cells_of(logs[0], recorded[0], reading),
+                rate_hz=rate_hz,
                 effects=parse_effect_ids(effects) if effects else None,
+                **published,
             )
         status.update("writing")
         texts = {output: result.model.to_json()}
@@ -144,11 +164,23 @@ def _cells_of(path: Path, log: Log, reading: ReadingOptions) -> int | None:
     return cells.count if abs(ratio - 1.0) <= SAME_SUM else None
 
 
-def _show(result: Identification) -> None:
-    from cangauge.identify.identification import coefficient_rows, effect_rows, search_rows
-    from cangauge.model.voltage_model import BASIS_NAMES
+def _delays_s(given: str) -> tuple[float, ...]:
+    """Return the value of `--delays` [s]; raise InputError if it is none."""
+    try:
+        delays = tuple(float(text) for text in given.split(","))
+    except ValueError:
+        delays = ()
+    # Slope resistance and heat are defined by the undelayed current.
+    if delays[:1] == (0.0,) and all(low < high <= 3600.0 for low, high in pairwise(delays)):
+        return delays
+    problem = "not delays that begin with 0 and increase to 3600 s at most"
+    cure = "give increasing seconds from 0, such as 0,10,30,70"
+    raise InputError(problem, field="--delays", value=given, cure=cure)
 
-    model, energy = result.model, result.energy
+
+def _show(result: Identification) -> None:
+    """Print how well the model fits, and where it holds; the report has the coefficients."""
+    model = result.model
     note(result.verdict)
     for remark in result.remarks:
         note(f"note: {remark}")
@@ -161,27 +193,9 @@ def _show(result: Identification) -> None:
             "voltage error held out, MAE": held_out,
             "SoC from voltage, MAE": number(result.soc_newton_mae_pct, 2, "%"),
             "capacity": number(model.capacity_ah, 2, "Ah"),
+            "effects": ", ".join(str(effect["id"]) for effect in model.effects) or NONE_KNOWN,
             "identified at SoC": span(*model.range.soc_pct, 1, "%"),
             "identified at temperature": span(*model.range.temperature_c, 1, "°C"),
             "rows used": str(sum(len(item.rows) for item in result.fits)),
-        },
-    )
-    head, rows = coefficient_rows(model.coefficients)
-    unknown = {row[0] for row in rows if row[1] == NONE_KNOWN}
-    if model.equation == "knots" and unknown & set(BASIS_NAMES):
-        unknown |= set(BASIS_NAMES)  # terms of one sum: none is known where one is not
-    if shown := [row for row in rows if row[0] not in unknown]:
-        print_table("Published equation", head, shown)
-    if result.effects is not None and result.effects.steps:
-        print_table("Effects", *effect_rows(result))
-        print_table("Search for effects", *search_rows(result.effects))
-    print_values(
-        "Energy at the terminals",
-        {
-            "driven": energy_text(1e3 * energy.driven_kwh),
-            "regenerated": energy_text(1e3 * energy.regenerated_kwh),
-            "net": energy_text(1e3 * energy.net_kwh),
-            "Joule heat": energy_text(1e3 * energy.heat_kwh),
-            "efficiency": number(energy.efficiency_pct, 1, "%"),
         },
     )

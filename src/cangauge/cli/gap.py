@@ -9,14 +9,11 @@ from pathlib import Path
 from runpy import run_path
 from typing import TYPE_CHECKING, Any
 
-import typer
-
 from cangauge._extras import extra
 from cangauge._files import write_texts_atomic
-from cangauge._text import printable
-from cangauge.cli.declare import Written, command
+from cangauge.cli.declare import command
 from cangauge.cli.options import ALARM, ReadingOptions, assumed_of, check_outputs, note_starts
-from cangauge.cli.output import emit_json, note, print_table, progress_shown
+from cangauge.cli.output import emit_json, note, print_table, progress_shown, say
 from cangauge.errors import InputError
 
 if TYPE_CHECKING:
@@ -34,14 +31,14 @@ def gap_command(
     reference: list[Path] | None = None,
     initial_soc: float | None = None,
     capacity_ah: float | None = None,
-    extended: Written | None = None,
+    extended: Path | None = None,
     simulated: str | None = None,
     simulator: str | None = None,
     alarm: float = ALARM,
     plan: bool = False,
     add_test: list[Path] | None = None,
     reading: ReadingOptions,
-    report: Written | None = None,
+    report: Path | None = None,
     json_output: bool = False,
 ) -> None:
     """Diagnose the gap between a model and logs: how large, where, what to check first.
@@ -49,8 +46,8 @@ def gap_command(
     The answer begins with the group of causes to look at, and names a single cause only where one
     stands out. A gap is reported where the probability of none is at most --alarm. The
     documentation states how often each answer is right. Give at least three references, better
-    more; without any, the error stated in the model file counts as normal. A log needs 10
-    minutes, better an hour, with changing load and SoC. Positive current discharges.
+    more; without any, the error stated in the model file counts as normal. A log needs 10 minutes,
+    better an hour, with changing load and SoC. Positive current discharges.
 
     Examples
     --------
@@ -76,6 +73,8 @@ def gap_command(
         the voltage.
     capacity_ah : A (0.001 … 1e5 Ah)
         Charge from 100 to 0 %, in place of the model's, for all logs.
+    alarm : P (0 … 1)
+        Report a fault where the probability of none is at most this.
     extended : MODEL.json
         Write the model, extended by the cause.
     simulated : HEADING
@@ -98,8 +97,7 @@ def gap_command(
 
     added, given = list(add_test or []), list(reference or [])
     paths = [*logs, *added]
-    _refuse_common(paths, given)
-    _refuse_simulators(model, simulated, simulator)
+    _refuse(paths, given, (model, simulated, simulator))
     model_file = None if model is None else Model.load(model)
     if model_file is not None and capacity_ah is not None:
         model_file = model_file.model_copy(update={"capacity_ah": capacity_ah})
@@ -118,16 +116,15 @@ def gap_command(
             diagnosed,
             model_file,
             references,
-            simulation=_simulation(simulated, simulator, read, [*paths, *given], reading),
+            simulation=_simulation(simulated, simulator, read, reading),
             capacity_ah=capacity_ah,
             alarm=alarm,
         )
-        before = None
-        if added:
-            before = diagnose(found.logs[: len(logs)], found.model, found.known, alarm=alarm)
-        steps = (
-            plan_next(found.known, found.columns, found.evidence, found.posterior) if plan else None
-        )
+        own = found.logs[: len(logs)]
+        before = diagnose(own, found.model, found.known, alarm=alarm) if added else None
+        steps = None
+        if plan:
+            steps = plan_next(found.known, found.columns, found.evidence, found.posterior)
     texts = {}
     if extended is not None:
         texts[extended] = found.extended_model.to_json()
@@ -149,24 +146,25 @@ def gap_command(
         note(f"wrote {written}{_held(found) if written == extended else ''}")
 
 
+def _note_differences(logs: list[Log], capacity_ah: float) -> None:
+    from cangauge.model.coulomb_counting import difference_from_reference
+
+    for difference in filter(None, (difference_from_reference(log, capacity_ah) for log in logs)):
+        note(f"warning: {difference}")
+
+
 def _simulation(
-    heading: str | None,
-    function: str | None,
-    logs: list[Log],
-    paths: list[Path],
-    reading: ReadingOptions,
+    heading: str | None, function: str | None, logs: list[Log], reading: ReadingOptions
 ) -> Any:
+    """Return the simulator, or the voltage that it wrote into a column of each log, by log."""
     if function is not None:
         return load_function(function)
     if heading is None:
         return None
-    return {
-        log.source or log.name: _column_of(log, path, heading, reading)
-        for log, path in zip(logs, paths, strict=True)
-    }
+    return {log.source or log.name: _column_of(log, heading, reading) for log in logs}
 
 
-def _column_of(log: Log, path: Path, heading: str, reading: ReadingOptions) -> FloatArray:
+def _column_of(log: Log, heading: str, reading: ReadingOptions) -> FloatArray:
     """Return the simulated voltage [V] in a column of a log's file, shape (n,).
 
     Raises
@@ -181,12 +179,12 @@ def _column_of(log: Log, path: Path, heading: str, reading: ReadingOptions) -> F
 
     specs = dict(ColumnMap.of(reading.columns or {}, "--columns").specs)
     specs["voltage"] = heading
-    file = open_log(path, columns=ColumnMap(specs, "--simulated"))
+    file = open_log(log.source, columns=ColumnMap(specs, "--simulated"))
     simulated = file.read(temperature_c=reading.temperature)
     if not np.array_equal(simulated.time_s, log.time_s):
         raise InputError(
             f"{len(simulated)} rows have a simulated voltage, {len(log)} a measured one",
-            source=path, field="--simulated", value=heading, cure="give both for every row",
+            source=log.source, field="--simulated", value=heading, cure="give both for every row",
         )  # fmt: skip
     return simulated.voltage_v
 
@@ -212,6 +210,23 @@ def load_function(text: str) -> Callable[..., Any]:
     return function  # type: ignore[no-any-return]
 
 
+def _refuse(
+    logs: list[Path], references: list[Path], models: tuple[Path | None, str | None, str | None]
+) -> None:
+    """Refuse a log that is its own reference, and two simulators or no model."""
+    if models == (None, None, None):
+        cure = "give the model file, or --simulated or --simulator"
+        raise InputError("no model", field="--model", cure=cure)
+    if None not in models[1:]:
+        raise InputError("two simulators", field="--simulator", value=models[2], cure="give one")
+    known = {path.resolve() for path in references}
+    for path in logs:
+        if path.resolve() in known:
+            problem = "is both a LOG and a reference, which must be without the fault"
+            cure = "give it as one of them"
+            raise InputError(problem, source=path, field="--reference", cure=cure)
+
+
 def _held(found: Diagnosis) -> str:
     """Return which model `--extended` holds, in words."""
     from cangauge.diagnosis.sentences import percent
@@ -221,45 +236,17 @@ def _held(found: Diagnosis) -> str:
     return f": the model with {cause} (probability {percent(found.posterior.effects[cause])})"
 
 
-def _note_differences(logs: list[Log], capacity_ah: float) -> None:
-    from cangauge.model.coulomb_counting import difference_from_reference
-
-    for log in logs:
-        if (difference := difference_from_reference(log, capacity_ah)) is not None:
-            note(f"warning: {difference}")
-
-
-def _refuse_simulators(model: Path | None, simulated: str | None, simulator: str | None) -> None:
-    cure = "give the model file, or --simulated or --simulator"
-    if simulated is not None and simulator is not None:
-        raise InputError("two simulators", field="--simulator", value=simulator, cure="give one")
-    if (model, simulated, simulator) == (None, None, None):
-        raise InputError("no model", field="--model", cure=cure)
-
-
-def _refuse_common(logs: list[Path], references: list[Path]) -> None:
-    known = {path.resolve() for path in references}
-    for path in logs:
-        if path.resolve() in known:
-            problem = "is both a LOG and a reference, which must be without the fault"
-            cure = "give it as one of them"
-            raise InputError(problem, source=path, field="--reference", cure=cure)
-
-
 def _show(found: Diagnosis, before: Diagnosis | None, steps: Plan | None) -> None:
+    """Print the answer, the candidates, what the logs cannot show, and the next steps."""
     from cangauge.diagnosis.sentences import SHOWN, candidate_rows, plan_rows
 
-    for line in found.summary.splitlines():
-        typer.echo(printable(line))
+    say(found.summary)
     if before is not None:
-        typer.echo(f"Without the added test: {printable(before.headline)}")
-    result = found.to_json()
-    print_table("Causes", *candidate_rows(result, SHOWN))
+        say(f"Without the added test: {before.headline}")
+    print_table("Causes", *candidate_rows(found.to_json(), SHOWN))
     if found.caveats:
-        typer.echo("What these logs cannot show:")
-    for sentence in found.caveats:
-        typer.echo(printable(f"- {sentence}"))
+        say("\n- ".join(["What these logs cannot show:", *found.caveats]))
     if steps is not None:
-        typer.echo(printable(steps.sentence))
+        say(steps.sentence)
         if steps.steps:
             print_table("Possible next steps, best first", *plan_rows(steps))

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 from cangauge._extras import extra
 from cangauge._files import write_texts_atomic
 from cangauge._text import rounded
-from cangauge.cli.declare import Written, command
+from cangauge.cli.declare import command
 from cangauge.cli.options import ReadingOptions, assumed_of, check_outputs
 from cangauge.cli.output import emit_json, note, print_table, say
 from cangauge.errors import InputError
@@ -21,7 +21,6 @@ if TYPE_CHECKING:
 
 _STAMPS_SINCE_1970_S = 1e9
 """Earlier stamps count from the start of the capture or of the logger [s]."""
-_GAPS_SHOWN = 5
 _COUNTS = {
     "error_frames": "error frames",
     "remote_frames": "remote frames",
@@ -36,7 +35,7 @@ def inspect_command(
     path: Path,
     *,
     reading: ReadingOptions,
-    report: Written | None = None,
+    report: Path | None = None,
     json_output: bool = False,
 ) -> None:
     """Show what a log or capture holds, and the sign of its current.
@@ -75,7 +74,7 @@ def inspect_command(
     recording, logs = reading.open(path), []
     found: LogInspection | CaptureInspection
     if isinstance(recording, LogFile):
-        _refuse_options_of_captures(reading, path)
+        reading.note_log(path)
         logs = [log := recording.read(temperature_c=reading.temperature)]
         if log.assumed:
             note(f"{path}: read as {', '.join(log.assumed)}")
@@ -98,15 +97,6 @@ def inspect_command(
         _show_capture(found)
         if found.log is not None:
             _show_log(found.log)
-
-
-def _refuse_options_of_captures(reading: ReadingOptions, path: Path) -> None:
-    options = {"--vehicle": reading.vehicle, "--dbc": reading.dbc, "--map": reading.map_file}
-    given = {option: str(value) for option, value in options.items() if value is not None}
-    if given and not (list(given) == ["--map"] and reading.mapped_columns() is not None):
-        option, value = next(iter(given.items()))
-        problem = "this is a log; the option is for captures"
-        raise InputError(problem, source=path, field=option, value=value, cure="omit it")
 
 
 def _show_log(found: LogInspection) -> None:
@@ -167,10 +157,10 @@ def _show_capture(found: CaptureInspection) -> None:
     if any(counts.values()):
         shown = ", ".join(f"{count:,} {words}" for words, count in counts.items() if count)
         say(f"{shown[0].upper()}{shown[1:]}.")
-    for gap in found.gaps[:_GAPS_SHOWN]:
-        say(f"Silence of {gap.length_s:.3g} s after {gap.start_s - found.start_s:.1f} s.")
-    if len(found.gaps) > _GAPS_SHOWN:
-        say(f"{len(found.gaps) - _GAPS_SHOWN} more silences (--json).")
+    if found.gaps:
+        gap = max(found.gaps, key=lambda gap: gap.length_s)
+        others = f", the longest of {len(found.gaps)}" if len(found.gaps) > 1 else ""
+        say(f"Silence of {gap.length_s:.3g} s after {gap.start_s - found.start_s:.1f} s{others}.")
     for line in info.remarks:
         say(f"Remarks: {line}")
 

@@ -35,10 +35,8 @@ class ReadingOptions:
     ----------
     vehicle : PRESET
         For a capture: the car's preset (a DBC and a map that ship with cangauge).
-    dbc : FILE
-        For a capture: the bus's DBC; needs --map.
     map_file : --map FILE
-        For a capture: which signals of the DBC are current, voltage and temperature.
+        For a capture: the car's DBC, and which of its signals are current, voltage and temperature.
     columns : NAME=HEADING,…
         For a table of other headings: time, current, voltage, temperature, soc, each
         NAME=HEADING[UNIT]:FACTOR; unit and factor only where the heading leaves them open.
@@ -52,7 +50,6 @@ class ReadingOptions:
     """
 
     vehicle: str | None = None
-    dbc: Path | None = None
     map_file: Path | None = None
     columns: str | None = None
     sign: str | None = None
@@ -61,13 +58,13 @@ class ReadingOptions:
     @property
     def names_vehicle(self) -> bool:
         """Whether an option for captures is given."""
-        return (self.vehicle, self.dbc, self.map_file) != (None, None, None)
+        return (self.vehicle, self.map_file) != (None, None)
 
     def car(self) -> Vehicle:
         """Return the vehicle that decodes a capture; may raise InputError."""
         from cangauge.bus.vehicle import Vehicle
 
-        return Vehicle.load(self.vehicle, self.dbc, self.map_file, temperature_c=self.temperature)
+        return Vehicle.load(self.vehicle, map=self.map_file, temperature_c=self.temperature)
 
     def given_columns(self) -> ColumnMap | None:
         """Return the columns of `--columns`; may raise InputError."""
@@ -85,12 +82,14 @@ class ReadingOptions:
         """Open a log by these columns, or any recording by its content; may raise InputError."""
         from cangauge.bus.recording import open_recording
 
-        return open_recording(
-            path,
-            columns=self.given_columns(),
-            mapped=self.mapped_columns(),
-            sign=cast("Sign | None", self.sign),
-        )
+        columns, mapped = self.given_columns(), self.mapped_columns()
+        sign = cast("Sign | None", self.sign)
+        return open_recording(path, columns=columns, mapped=mapped, sign=sign)
+
+    def note_log(self, path: Path) -> None:
+        """Print on stderr that options for captures do not apply to a log."""
+        if self.names_vehicle and self.mapped_columns() is None:
+            note(f"{path}: a log, not a capture: --vehicle and --map do not apply to it")
 
     def load(self, path: Path, used: Sequence[str] = ()) -> Log:
         """Read a log, or decode a capture; print the reader's remarks on stderr.
@@ -104,12 +103,11 @@ class ReadingOptions:
         from cangauge.logs.sign import require_discharge_positive
 
         recording, car = self.open(path), None
-        if not isinstance(recording, LogFile):
-            car = self.car_of(path)
-        elif self.names_vehicle and self.mapped_columns() is None:
-            note(f"{path}: a log, not a capture: --vehicle, --dbc and --map do not apply to it")
         if isinstance(recording, LogFile):
+            self.note_log(path)
             recording = replace(recording, used=tuple(used))
+        else:
+            car = self.car_of(path)
         log = log_of(recording, car, temperature_c=self.temperature)
         refuse_single_row(log)
         if self.sign is None:

@@ -13,7 +13,7 @@ from typing import Any, TextIO
 
 from rich import box
 from rich.console import Console, ConsoleOptions, RenderableType
-from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.live import Live
 from rich.segment import Segment
 from rich.table import Table
 from rich.text import Text
@@ -74,24 +74,14 @@ def progress_shown(logger: str, show: Callable[[str], None] | None = None) -> It
 
 
 @contextmanager
-def progress_bar(name: str, total: float | None) -> Iterator[Callable[..., None]]:
-    """Yield a function that shows how much is done, and optionally a text, on a terminal."""
-    columns = (
-        TextColumn("{task.description}"),
-        BarColumn(),
-        TextColumn("{task.fields[text]}"),
-        TimeRemainingColumn(),
-    )
+def live_line() -> Iterator[Callable[[str], None]]:
+    """Yield a function that shows a line on a terminal, in place of the one before."""
+    if not console.is_terminal:
+        yield lambda _: None
+        return
     # No refresh thread: redrawn at each call.
-    with Progress(
-        *columns,
-        console=console,
-        transient=True,
-        auto_refresh=False,
-        disable=not console.is_terminal,
-    ) as bar:
-        task = bar.add_task(name, total=total, text="")
-        yield lambda done, text="": bar.update(task, completed=done, text=text, refresh=True)
+    with Live(console=console, auto_refresh=False, transient=True) as live:
+        yield lambda text: live.update(Text(text), refresh=True)
 
 
 class _ProgressHandler(logging.Handler):
@@ -141,12 +131,11 @@ def print_table(title: str, head: Sequence[str], rows: Sequence[Sequence[str]]) 
     PlainConsole(highlight=False).print(text_table(title, head, rows))
 
 
-def values_table(title: str, values: Mapping[str, str]) -> Table:
-    """Return a table of names and values with their units; what is not known is left out."""
-    rows = [(name, text) for name, text in values.items() if not text.startswith(NONE_KNOWN)]
-    return text_table(title, ("", ""), rows)
+def known_rows(values: Mapping[str, str]) -> list[tuple[str, str]]:
+    """Return names and values with their units; what is not known is left out."""
+    return [(name, text) for name, text in values.items() if not text.startswith(NONE_KNOWN)]
 
 
 def print_values(title: str, values: Mapping[str, str]) -> None:
-    """Print names and values on stdout; arguments as of `values_table`."""
-    PlainConsole(highlight=False).print(values_table(title, values))
+    """Print names and values on stdout; what is not known is left out."""
+    print_table(title, ("", ""), known_rows(values))

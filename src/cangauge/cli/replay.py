@@ -11,7 +11,7 @@ from cangauge._text import duration, number
 from cangauge.cli.config_options import config_parameters, config_values
 from cangauge.cli.declare import command
 from cangauge.cli.options import ReadingOptions, assumed_of, note_reading
-from cangauge.cli.output import emit_json, note, progress_bar
+from cangauge.cli.output import emit_json, live_line, note
 
 if TYPE_CHECKING:
     from cangauge.bus.connection import BusConnection
@@ -55,7 +55,7 @@ def replay_command(
     ----------
     recorded : LOG|CAPTURE
         Recorded log, or recorded frames.
-    config : FILE.toml
+    config : FILE
         Configuration of the `cangauge run` that listens: its bus, vehicle and ids.
     columns : NAME=HEADING,…
         Columns of a table of other headings, as of `cangauge inspect`.
@@ -81,7 +81,7 @@ def replay_command(
         filters = [standard_filter(ids.soc_estimate), standard_filter(ids.soc_detail)]
         bus = stack.enter_context(BusConnection(open_bus(address, filters), str(address)))
         note(f"playing {recorded} on {address}, speed {speed}")
-        bar = stack.enter_context(progress_bar(source.name, None if loop else source.duration_s))
+        show = stack.enter_context(live_line())
         factor = math.inf if speed == "max" else speed
         settings = ReplaySettings(speed=factor, loop=loop, ids=ids)
         state = play(
@@ -89,9 +89,9 @@ def replay_command(
             source,
             settings,
             stop=lambda: bool(stopped),
-            show=lambda now: bar(now.log_seconds, _shown(now)),
+            show=lambda now: show(_line(now)),
         )
-    note(_summary_line(state))
+    note(_line(state))
     if bus.unsent:
         note(f"warning: {bus.unsent} frames were not sent: the transmit queue stayed full")
     if json_output:
@@ -116,13 +116,8 @@ def _source(recorded: Path, columns: str | None, config: RunConfig, ids: FrameId
     return LogSource(log, load_vehicle(config))
 
 
-def _shown(state: ReplayState) -> str:
-    """Return log time, speed and the SoC published by the receiver."""
-    soc = "" if state.soc is None else f", SoC {number(state.soc.soc_pct, 2, '%')}"
-    return f"{duration(state.log_seconds)}, {number(state.speed, 1)}×{soc}"
-
-
-def _summary_line(state: ReplayState) -> str:
+def _line(state: ReplayState) -> str:
+    """Return frames, log time, speed, acknowledged samples and the latest SoC of the receiver."""
     text = (
         f"{state.frames} frames, {duration(state.log_seconds)} of log in {state.seconds:.2f} s"
         f" ({number(state.speed, 2)}×)"

@@ -55,8 +55,9 @@ def run_command(*, config: Path | None = None, json_output: bool = False, **opti
 
     Parameters
     ----------
-    config : FILE.toml
-        Configuration; its keys are in docs/configuration.md. Options given here take precedence.
+    config : FILE
+        Configuration in TOML; its keys are in docs/configuration.md. Options given here take
+        precedence.
     """
     from cangauge.service.config import load_config
     from cangauge.service.run import Service

@@ -16,7 +16,6 @@ from rich.text import Text
 
 from cangauge._text import (
     NONE_KNOWN,
-    duration,
     energy_text,
     known_soc,
     number,
@@ -24,7 +23,7 @@ from cangauge._text import (
     uncertain,
 )
 from cangauge.cli.declare import command
-from cangauge.cli.output import PlainConsole, emit_json, print_values, values_table
+from cangauge.cli.output import PlainConsole, emit_json, known_rows, print_values, text_table
 from cangauge.errors import CangaugeError, InputError
 from cangauge.types import REASON_WORDS, Reason
 
@@ -37,7 +36,7 @@ _STYLE: Final = {"initialising": "yellow", "valid": "green", "degraded": "yellow
 def status_command(
     *, endpoint: Path | None = None, watch: bool = False, json_output: bool = False
 ) -> None:
-    """Show the state of a running service: SoC ± standard deviation [%], frames, delays.
+    """Show the state of a running service: SoC ± standard deviation [%], inputs, bus.
 
     Exit code 0: the SoC is valid or degraded. 1: it is invalid or unknown, or no service runs.
     2: bad usage. With `--json` the object is printed with exit codes 0 and 1. `--watch` may be
@@ -100,7 +99,8 @@ def _watch(endpoint: Path | None) -> None:
                 place, status = _ask(endpoint)
                 content = live_text(status)
                 if shown.is_terminal:
-                    content = values_table(f"cangauge at {place}", status_values(status))
+                    rows = known_rows(status_values(status))
+                    content = text_table(f"cangauge at {place}", ("", ""), rows)
             except InputError:
                 raise  # waiting does not mend it
             except CangaugeError as error:
@@ -119,7 +119,7 @@ def live_text(status: dict[str, Any]) -> Text:
     if reasons:
         text.append(f" ({_words(reasons)})", style="dim")
     if sample is not None:
-        residual = number(_times(estimate["residual_v"], 1e3), 0, "mV")
+        residual = number(estimate["residual_v"], 3, "V")
         text.append(f"  {number(sample['voltage_v'], 2, 'V')}  residual {residual}")
     text.append(f"  {status['samples_per_s']:.0f} samples/s")
     if status["bus_trouble"]:
@@ -135,7 +135,10 @@ def status_values(status: dict[str, Any]) -> dict[str, str]:
     stuck = "the receive loop hangs; restart the service"
     refused = f"the latest one is REFUSED, the old one stays: {config['problem']}"
     reading = "reading a new one" if config["reloading"] else NONE_KNOWN
-    uptime = duration(status["uptime_s"])
+    recorded = NONE_KNOWN
+    if (record := status["record"]) is not None:
+        recorded = f"{record['path']}, {record['lost_frames']} frames lost"
+        recorded += f"; FAILING: {record['problem']}" if record["problem"] else ""
     return {
         "LOOP STUCK": stuck if status["loop_stuck"] else NONE_KNOWN,
         "SoC": known_soc(estimate["soc_pct"], estimate["soc_std_pct"], 2),
@@ -144,30 +147,23 @@ def status_values(status: dict[str, Any]) -> dict[str, str]:
         "by charge alone": number(estimate["soc_coulomb_pct"], 2, "%"),
         "current": number(sample.get("current_a"), 2, "A (positive = discharge)"),
         "voltage": number(sample.get("voltage_v"), 2, "V"),
-        "residual": number(_times(estimate["residual_v"], 1e3), 0, "mV"),
+        "residual": number(estimate["residual_v"], 3, "V"),
         "temperature": number(sample.get("temperature_c"), 1, "°C"),
         **pack_values(status),
         **{f"NOTICE {k}": each for k, each in enumerate(status["notices"], start=1)},
         "latest sample": number(sample.get("age_s"), 2, "s ago"),
-        "samples": f"{status['samples']} ({number(status['samples_per_s'], 1, '/s')})",
         "frames": ", ".join(f"{frames[name]} {name}" for name in ("received", "used", "lost")),
         "rejected": _counts(status["rejects"]) or "none",
         "bus": "; ".join(filter(None, bus)),
-        "latency": _delay(status["latency"]),
-        "processing time": _delay(status["step"]),
-        "recording": _recording(status["record"]),
+        "recording": recorded,
         "configuration": refused if config["problem"] else reading,
         "vehicle": status["vehicle"],
         "model": f"{status['model']} ({status['method']}, time: {status['time_source']})",
-        "running for": f"{uptime}, cangauge {status['version']}, {status['core']} core",
     }
 
 
-def pack_values(report: dict[str, Any], down_to: str = "", up_to: str = "") -> dict[str, str]:
-    """Return names and values of health, power and cells, where known (`PackReport.to_dict`).
-
-    `down_to` and `up_to` follow the possible currents.
-    """
+def pack_values(report: dict[str, Any]) -> dict[str, str]:
+    """Return names and values of health, power and cells, where known (`PackReport.to_dict`)."""
     health, power, cells = report["health"], report["power"], report["cells"]
     values = {}
     if health is not None:
@@ -178,10 +174,9 @@ def pack_values(report: dict[str, Any], down_to: str = "", up_to: str = "") -> d
             "current offset": number(health["offset_a"], 2, "A"),
         }
     if power is not None:
-        for way, limit in (("discharge", down_to), ("charge", up_to)):
-            values[f"possible {way}, 10 s"] = possible(
-                power[f"{way}_a"], power[f"{way}_std_a"], f"A{limit}"
-            )
+        for way in ("discharge", "charge"):
+            currents = power[f"{way}_a"], power[f"{way}_std_a"]
+            values[f"possible {way}, 10 s"] = possible(*currents, "A")
         values["energy left"] = energy_text(power["energy_wh"], power["energy_std_wh"])
     if cells is not None:
         weakest = "" if cells["weakest"] is None else f"number {cells['weakest']}: "
@@ -200,26 +195,3 @@ def _words(reasons: list[str]) -> str:
 
 def _counts(counts: dict[str, int]) -> str:
     return ", ".join(f"{value} {name.replace('_', ' ')}" for name, value in counts.items() if value)
-
-
-def _delay(durations: dict[str, Any]) -> str:
-    if not durations["count"]:
-        return NONE_KNOWN
-    bounds = (durations[f"{name}_at_most_s"] for name in ("p50", "p99"))
-    p50, p99 = ("over 1 s" if s is None else f"at most {1e3 * s:g} ms" for s in bounds)
-    return f"median {p50}, 99 % {p99}"
-
-
-def _recording(record: dict[str, Any] | None) -> str:
-    if record is None:
-        return NONE_KNOWN
-    size = record["written_bytes"]
-    shown = number(1e-3 * size, 0, "kB") if size < 1e6 else number(1e-6 * size, 1, "MB")
-    text = f"{record['path']}: {record['frames']} frames, {shown}"
-    text += f", {record['lost_frames']} frames lost"
-    text += f"; FAILING: {record['problem']}" if record["problem"] else ""
-    return text
-
-
-def _times(value: float | None, factor: float) -> float | None:
-    return None if value is None else factor * value

@@ -137,7 +137,7 @@ def play(
             source=source.name,
             field="--speed",
             value="max",
-            cure="give --vehicle, or --dbc and --map, or another speed",
+            cure="give --vehicle or --map, or another speed",
         )
     show_s = -math.inf
     if player.is_max:

@@ -7,7 +7,7 @@ precedence over the file; paths in a file are relative to it::
 
     model = "leaf.json"
     channel = "can0"
-    vehicle = "leaf_aze0"           # or: dbc = "car.dbc" and map = "car.toml"
+    vehicle = "leaf_aze0"           # or: map = "car.toml"
     record = "record/drive.log"
 
     [bus_options]
@@ -261,14 +261,15 @@ class RunConfig(Strict):
     )
     vehicle: str | None = key(
         None, f"Vehicle preset: {', '.join(PRESETS)}.", "--vehicle", "PRESET",
-        default_text=f"{DEFAULT_VEHICLE}, without --dbc and --map",
+        default_text=f"{DEFAULT_VEHICLE}, without a map",
     )  # fmt: skip
     dbc: str | None = key(
-        None, "DBC file of another vehicle; needs --map.", "--dbc", "FILE", is_path=True
+        None, "DBC file of another vehicle, whose map names none.", "--dbc", "FILE", is_path=True
     )
     map: str | None = key(
         None,
-        "TOML file: which signals are current, voltage and temperature, with sign and scale.",
+        "TOML file of another vehicle: its DBC, and which signals are current, voltage and"
+        " temperature, with sign and scale.",
         "--map", "FILE", is_path=True,
     )  # fmt: skip
     temperature: FiniteFloat | None = key(
@@ -341,9 +342,7 @@ class RunConfig(Strict):
         None, "Total size of the recording; the oldest files are removed.",
         unit="MB", restart=True, gt=0.0, le=1e9,
     )  # fmt: skip
-    duration_s: FiniteFloat | None = key(
-        None, "Stop after this time.", "--duration", "S", unit="s", gt=0.0, le=1e9
-    )
+    duration_s: FiniteFloat | None = key(None, "Stop after this time.", unit="s", gt=0.0, le=1e9)
     until_idle_s: FiniteFloat | None = key(
         None, "Stop when no sample came for this time, after the first.",
         "--until-idle", "S", unit="s", gt=0.0, le=1e9,
@@ -387,8 +386,8 @@ class RunConfig(Strict):
     mqtt: MqttConfig | None = key(None, "MQTT broker that takes the state (extra `mqtt`).")
     dashboard: str | None = key(
         None,
-        "Serve the live page there, e.g. 8642. An address beyond loopback needs a token, as with"
-        " --http.",
+        "Serve the live page there, e.g. 8642: a port alone is on this machine. An address beyond"
+        " loopback needs a token, as with --http.",
         "--dashboard", "HOST:PORT", restart=True,
     )  # fmt: skip
     status_socket: str = key(

@@ -221,7 +221,7 @@ class Service:
         emit(_LOG, logging.INFO, "service.stopped", text)
         if not self.pipeline.counts.frames:
             text = f"{port.name}: no expected frame arrived; check channel, bit rate and vehicle"
-            text += " (--vehicle, or --dbc and --map)"
+            text += " (--vehicle or --map)"
             emit(_LOG, logging.WARNING, "bus.nothing_wanted", text)
         if (path := status["recording"]) is not None:
             emit(_LOG, logging.INFO, "file.written", f"written: {path}", path=path)

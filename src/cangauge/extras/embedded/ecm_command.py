@@ -7,14 +7,14 @@ from pathlib import Path
 
 from cangauge._files import write_text_atomic
 from cangauge._text import number, significant
-from cangauge.cli.declare import Written, command
+from cangauge.cli.declare import command
 from cangauge.cli.options import check_outputs
 from cangauge.cli.output import emit_json, note, print_table
 from cangauge.errors import InputError
 
 
 @command()
-def export_ecm_command(*, model: Path, output: Written, json_output: bool = False) -> None:
+def export_ecm_command(*, model: Path, output: Path, json_output: bool = False) -> None:
     """Write a model as an equivalent circuit: open-circuit voltage, R0 and RC pairs as tables.
 
     The RC pairs are fitted to the model's step response; the error of that fit is printed.

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Literal
 
-from cangauge.cli.declare import Written, command
+from cangauge.cli.declare import command
 from cangauge.cli.options import check_outputs
 from cangauge.cli.output import emit_json, note
 
@@ -14,7 +14,7 @@ from cangauge.cli.output import emit_json, note
 def export_fmu_command(
     *,
     model: Path,
-    output: Written,
+    output: Path,
     kind: Literal["pack", "estimator"] = "pack",
     json_output: bool = False,
 ) -> None:

@@ -11,18 +11,12 @@ from typing import TYPE_CHECKING, Any, Final, Literal
 
 import typer
 
+from cangauge._config import read_toml
 from cangauge._files import file_sha256, write_texts_atomic
 from cangauge._text import number, significant
-from cangauge.cli.declare import Written, command
-from cangauge.cli.options import ALARM, ReadingOptions, check_outputs
-from cangauge.cli.output import (
-    console,
-    emit_json,
-    note,
-    print_table,
-    print_values,
-    progress_shown,
-)
+from cangauge.cli.declare import command
+from cangauge.cli.options import ReadingOptions, check_outputs
+from cangauge.cli.output import console, emit_json, note, print_table, print_values, progress_shown
 
 if TYPE_CHECKING:
     from cangauge.extras.fleet.fit import FleetFit
@@ -92,13 +86,13 @@ fleet_command.group = fleet_app  # type: ignore[attr-defined] # read by the app
 def fit_fleet_command(
     logs: list[str],
     *,
-    model: Written,
+    model: Path,
     capacity_ah: float,
     cluster: Cluster,
     chemistry: Literal["oxide", "lfp"] = "oxide",
     cells: int | None = None,
     reading: ReadingOptions,
-    report: Written | None = None,
+    report: Path | None = None,
     json_output: bool = False,
 ) -> None:
     """Identify one model from all logs: the fit of `cangauge fit`.
@@ -186,9 +180,8 @@ def estimate_fleet_command(
     *,
     model: Path,
     cluster: Cluster,
-    capacity_ah: float | None = None,
     reading: ReadingOptions,
-    report: Written | None = None,
+    report: Path | None = None,
     json_output: bool = False,
 ) -> None:
     """Estimate the state of charge of every log, with its error where the log has SoC.
@@ -205,7 +198,7 @@ def estimate_fleet_command(
     """
     from cangauge.extras.fleet.jobs import EstimateJob, by_log
 
-    job, found = _job(EstimateJob, logs, model, reading, report, capacity_ah)
+    job, found = _job(EstimateJob, logs, model, reading, report)
     _run(job, by_log(found), found, cluster, report, json_output=json_output)
 
 
@@ -216,9 +209,8 @@ def health_fleet_command(
     *,
     model: Path,
     cluster: Cluster,
-    capacity_ah: float | None = None,
     reading: ReadingOptions,
-    report: Written | None = None,
+    report: Path | None = None,
     json_output: bool = False,
 ) -> None:
     """Follow capacity and resistance of each vehicle over its logs, and find outliers.
@@ -236,26 +228,23 @@ def health_fleet_command(
     """
     from cangauge.extras.fleet.jobs import HealthJob, by_vehicle
 
-    job, found = _job(HealthJob, logs, model, reading, report, capacity_ah)
+    job, found = _job(HealthJob, logs, model, reading, report)
     _run(job, by_vehicle(found), found, cluster, report, json_output=json_output)
 
 
-def _job(  # noqa: PLR0917 - as the two commands have them
+def _job(
     kind: Callable[..., Job],
     logs: Sequence[str],
     model: Path,
     reading: ReadingOptions,
     report: Path | None,
-    capacity_ah: float | None,
 ) -> tuple[Job, list[FleetLog]]:
-    from cangauge.estimation.settings import EstimatorSettings
     from cangauge.extras.fleet.sources import find_logs
     from cangauge.model.model_file import Model
 
     found = find_logs(logs)
     _check_outputs([report], found, model, *map(Path, logs))
-    settings = EstimatorSettings(capacity_ah=capacity_ah)
-    return kind(_read_options(reading), Model.load(model), settings), found
+    return kind(_read_options(reading), Model.load(model)), found
 
 
 @fleet_app.command("gap")
@@ -265,10 +254,9 @@ def gap_fleet_command(
     *,
     model: Path,
     reference: list[str] | None = None,
-    alarm: float = ALARM,
     cluster: Cluster,
     reading: ReadingOptions,
-    report: Written | None = None,
+    report: Path | None = None,
     json_output: bool = False,
 ) -> None:
     """Diagnose each vehicle against references of the whole fleet.
@@ -297,7 +285,7 @@ def gap_fleet_command(
     known = {log.url: replace(log, healthy=True) for log in find_logs(reference or [])}
     among = [known.pop(log.url, log) for log in find_logs(logs)] + [*known.values()]
     _check_outputs([report], among, model, *map(Path, [*logs, *(reference or [])]))
-    job, tasks = GapJob(_read_options(reading), Model.load(model), alarm=alarm).of_fleet(
+    job, tasks = GapJob(_read_options(reading), Model.load(model)).of_fleet(
         [log for log in among if not log.healthy], [log for log in among if log.healthy]
     )
     _run(job, tasks, among, cluster, report, json_output=json_output)
@@ -307,11 +295,14 @@ def _read_options(reading: ReadingOptions) -> ReadOptions:
     """Return how logs are read; files of the vehicle are read here, not by the workers."""
     from cangauge.extras.fleet.sources import ReadOptions
 
-    mapped = reading.mapped_columns()
-    is_map_of_columns = mapped is not None and reading.vehicle is None and reading.dbc is None
-    car = reading.car() if reading.names_vehicle and not is_map_of_columns else None
-    paths = (reading.dbc, reading.map_file)
-    files = {str(path): file_sha256(path) for path in paths if path is not None}
+    mapped, car = reading.mapped_columns(), None
+    is_map_of_columns = mapped is not None and "dbc" not in read_toml(str(reading.map_file))
+    if reading.names_vehicle and (reading.vehicle or not is_map_of_columns):
+        car = reading.car()
+    paths: list[str] = []
+    if reading.map_file is not None:
+        paths = [str(reading.map_file), *(car.dbc_files if car is not None else ())]
+    files = {path: file_sha256(path) for path in paths}
     return ReadOptions(
         vehicle=car,
         columns=mapped,

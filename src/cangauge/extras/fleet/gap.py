@@ -18,7 +18,6 @@ import pyarrow as pa
 
 from cangauge._files import text_sha256
 from cangauge.diagnosis import (
-    ALARM,
     NONE,
     UNKNOWN,
     Diagnosis,
@@ -48,8 +47,6 @@ class GapJob(Job):
     ----------
     model : Model
         Of the vehicles' type, such as from `fleet fit`.
-    alarm : float
-        Probability of `none` up to which a fault is reported.
     common : tuple of FleetLog
         References of every vehicle without healthy logs of its own.
     learned : References, optional
@@ -59,7 +56,6 @@ class GapJob(Job):
     """
 
     model: Model
-    alarm: float = ALARM
     common: tuple[FleetLog, ...] = ()
     learned: References | None = None
     unread: tuple[str, ...] = ()
@@ -76,8 +72,8 @@ class GapJob(Job):
     }  # fmt: skip
 
     def identity(self) -> dict[str, Any]:
-        """Return model and alarm."""
-        return {"model": self.model.to_json(), "alarm": self.alarm}
+        """Return the model."""
+        return {"model": self.model.to_json()}
 
     def of_fleet(
         self, logs: Iterable[FleetLog], healthy: Iterable[FleetLog]
@@ -156,7 +152,7 @@ class GapJob(Job):
         if task.references or references is None:
             bad = []
             references = self._read_all(of, bad)
-        found = diagnose(logs, self.model, references, alarm=self.alarm)
+        found = diagnose(logs, self.model, references)
         unusable = {text.partition(": ")[0] for text in bad}
         return {
             "logs": [log.url for log in task.logs],

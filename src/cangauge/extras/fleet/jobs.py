@@ -127,7 +127,6 @@ class EstimateJob(LogJob):
     """State of charge of each log, as `cangauge estimate` computes it."""
 
     model: Model
-    settings: EstimatorSettings
 
     kind: ClassVar[str] = "estimate"
     columns: ClassVar[Mapping[str, Any]] = {
@@ -141,8 +140,8 @@ class EstimateJob(LogJob):
     }  # fmt: skip
 
     def identity(self) -> dict[str, Any]:
-        """Return model and settings."""
-        return {"model": self.model.to_json(), "settings": repr(self.settings)}
+        """Return the model."""
+        return {"model": self.model.to_json()}
 
     def row(self, log: FleetLog) -> dict[str, Any]:
         """Return SoC at both ends, errors where the log has SoC, and the shares of each status."""
@@ -167,9 +166,7 @@ class EstimateJob(LogJob):
         }
 
     def _estimate(self, log: FleetLog) -> RecordedEstimate:
-        settings = self.settings
-        if log.initial_soc_pct is not None:
-            settings = replace(settings, initial_soc_pct=log.initial_soc_pct)
+        settings = EstimatorSettings(initial_soc_pct=log.initial_soc_pct)
         with local_file(log.url) as path:
             is_log = isinstance(self.options.open(path), LogFile)
             if not is_log and self.options.vehicle is not None:
@@ -204,7 +201,6 @@ class HealthJob(Job):
     """
 
     model: Model
-    settings: EstimatorSettings
 
     kind: ClassVar[str] = "health"
     columns: ClassVar[Mapping[str, Any]] = {
@@ -214,8 +210,8 @@ class HealthJob(Job):
     }  # fmt: skip
 
     def identity(self) -> dict[str, Any]:
-        """Return model and settings."""
-        return {"model": self.model.to_json(), "settings": repr(self.settings)}
+        """Return the model."""
+        return {"model": self.model.to_json()}
 
     def parts(self, task: Task) -> Iterator[tuple[str, Callable[[], dict[str, Any]]]]:
         """Yield the row of each log, in order of time."""
@@ -228,11 +224,11 @@ class HealthJob(Job):
         require_same_pack(recorded.voltage_v, self.model, recorded.source or recorded.name)
         before = states[-1] if states else None
         shift_s = _shift_s(log, recorded, before)
-        settings = replace(
-            self.settings, gap_s=gap_of(recorded), temperature_source=recorded.temperature_source
+        settings = EstimatorSettings(
+            gap_s=gap_of(recorded), temperature_source=recorded.temperature_source
         )
         if before is None and recorded.first_soc() is not None:
-            start = initial_soc_of(recorded, settings.capacity_ah or self.model.capacity_ah)
+            start = initial_soc_of(recorded, self.model.capacity_ah)
             settings = replace(settings, initial_soc_pct=start)
         estimator = make_estimator(self.model, settings)
         if before is not None:

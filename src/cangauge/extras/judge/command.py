@@ -13,7 +13,7 @@ import typer
 
 from cangauge._files import atomic_path, write_texts_atomic
 from cangauge._text import number, printable
-from cangauge.cli.declare import Written, command
+from cangauge.cli.declare import command
 from cangauge.cli.options import ReadingOptions, check_outputs
 from cangauge.cli.output import console, emit_json, note, print_table
 from cangauge.errors import InputError
@@ -30,12 +30,12 @@ def judge_command(
     chemistry: Literal["oxide", "lfp"] | None = None,
     cells: int | None = None,
     capacity_ah: float | None = None,
-    output: Written | None = None,
-    corrected: Written | None = None,
+    output: Path | None = None,
+    corrected: Path | None = None,
     suite: bool = False,
     data: Path | None = None,
     reading: ReadingOptions,
-    report: Written | None = None,
+    report: Path | None = None,
     json_output: bool = False,
 ) -> None:
     """Judge the SoC that a battery gauge publishes: is it right, since when not, and why.

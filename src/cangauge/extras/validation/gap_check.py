@@ -94,9 +94,9 @@ class CheckedPack:
         return cls(tuple(logs), capacity_ah, pack)
 
     @classmethod
-    def simulated(cls, seed: int) -> CheckedPack:
+    def simulated(cls) -> CheckedPack:
         """Return a simulated pack with a discharge and five drives."""
-        plant, rng = draw_plant(np.random.default_rng([seed, 1])), np.random.default_rng([seed, 2])
+        plant, rng = draw_plant(np.random.default_rng([1, 1])), np.random.default_rng([1, 2])
         pack, ambient_c = plant.pack, rng.uniform(8.0, 25.0)
         drives = [
             draw_drive(

@@ -12,14 +12,13 @@ from cangauge.cli.output import emit_json, note, print_table, progress_shown
 from cangauge.errors import InputError
 
 
-@command("sign")
+@command("columns", "sign", "temperature")
 def gap_check_command(
     logs: list[Path] | None = None,
     *,
     capacity_ah: float | None = None,
     cells: int = 96,
     at_most: int | None = None,
-    seed: int = 1,
     reading: ReadingOptions,
     json_output: bool = False,
 ) -> None:
@@ -33,20 +32,19 @@ def gap_check_command(
     --------
     `cangauge gap-check mine/*.csv --capacity-ah 60 --cells 96`
 
-    `cangauge gap-check --seed 3 --at-most 2`
+    `cangauge gap-check --at-most 2`
 
     Parameters
     ----------
     logs : [LOG]…
-        Your own logs without a fault, four at least. Default: a simulated pack.
+        Your own logs without a fault, four at least, whose headings are plain or named by
+        [columns] of the map file. Default: a simulated pack.
     capacity_ah : A (0.001 … 1e5 Ah)
         Charge of the logs' pack from 100 to 0 %; needed with LOGs.
     cells : N (1 … 2000)
         Cells in series of the logs' pack.
     at_most : N (1 … inf)
         Leave out at most this many logs.
-    seed : N (0 … inf)
-        Of the simulated pack.
     """
     from cangauge.extras.validation.gap_check import (
         PER_LOG,
@@ -64,7 +62,7 @@ def gap_check_command(
         read = [reading.load(path) for path in logs]
         pack = CheckedPack.of_logs(read, capacity_ah, cells)
     else:
-        read, pack = [], CheckedPack.simulated(seed)
+        read, pack = [], CheckedPack.simulated()
     left_out = min(at_most or len(pack.logs), len(pack.logs))
     note(f"at most {left_out * PER_LOG} diagnoses, about half a second each")
     with progress_shown("cangauge.validation"):

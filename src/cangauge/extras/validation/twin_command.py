@@ -2,22 +2,19 @@
 
 from __future__ import annotations
 
-import json
 import time
 from pathlib import Path
 from typing import Any, Literal
 
-from cangauge._files import write_text_atomic
-from cangauge.cli.declare import Written, command
+from cangauge.cli.declare import command
 from cangauge.cli.options import check_outputs
 from cangauge.cli.output import console, emit_json, note, print_table
-from cangauge.errors import InputError
 
 
 @command()
 def twin_command(
     *,
-    output: Written | None = None,
+    output: Path,
     seed: int = 0,
     effect: list[str] | None = None,
     day: int = 1,
@@ -26,13 +23,8 @@ def twin_command(
     start_soc: float | None = None,
     end_soc: float | None = None,
     discharge: bool = False,
-    speed: Path | None = None,
     pack: str | None = None,
-    chemistry: str | None = None,
     plant: Literal["twin", "equation", "published", "pybamm"] = "twin",
-    soc: Literal["full", "start"] = "full",
-    truth: Written | None = None,
-    list_effects: bool = False,
     json_output: bool = False,
 ) -> None:
     """Simulate a pack, a drive, the weather and the sensors: a log whose truth is known.
@@ -49,8 +41,6 @@ def twin_command(
 
     `cangauge twin --seed 1 --day 3 --effect weak_cell:gap_v=1 --ambient-c -5 -o cold.csv`
 
-    `cangauge twin --list`
-
     Parameters
     ----------
     output : -o, --output LOG.parquet|.pq|.csv|.bdf
@@ -58,8 +48,9 @@ def twin_command(
     seed : N (0 … inf)
         Selects the pack. Same seed, same log.
     effect : ID[:parameter=value,…]
-        Fault of the pack or its sensors; repeat for several. `gap_v=V` in place of a size: the size
-        that opens this RMS gap. Default: a gap of 0.3 % of the pack voltage.
+        Fault of the pack or its sensors; repeat for several. A wrong ID or parameter is answered
+        with the known ones. `gap_v=V` in place of a size: the size that opens this RMS gap.
+        Default: a gap of 0.3 % of the pack voltage.
     day : N (1 … inf)
         Number of the drive, with its weather.
     hours : H (0.05 … 12 h)
@@ -72,31 +63,15 @@ def twin_command(
         SoC at which the drive ends.
     discharge : --discharge
         Drive from full to empty within the hours (default 2.5 h): a log for `fit`.
-    speed : FILE
-        Driving schedule: CSV of time [s] and speed [m/s], repeated.
     pack : KIND
         leaf24, leaf40, car60, car60lfp, compact or module12. Default: drawn.
-    chemistry : NAME
-        nmc, lmo, nca or lfp.
     plant : twin|equation|published|pybamm
         Model of the cells; pybamm needs the extra cangauge[pybamm].
-    soc : full|start
-        soc_pct of the log: assumed initial SoC, then the true SoC; or the former alone.
-    truth : FILE.json
-        Write the truth to this file too.
-    list_effects : --list
-        List the effects and their parameters.
     """
-    from cangauge.extras.validation.twin.drive import read_speed
     from cangauge.extras.validation.twin.simulation import simulate
     from cangauge.logs.canonical import write_log
 
-    if list_effects:
-        _list(json_output)
-        return
-    if output is None:
-        raise InputError("no log to write", field="-o", cure="name a .parquet or a .csv file")
-    check_outputs([output, truth], [speed] if speed is not None else [])
+    check_outputs([output], [])
     began = time.perf_counter()
     with console.status("simulating"):
         simulated = simulate(
@@ -108,9 +83,7 @@ def twin_command(
             start_soc_pct=start_soc,
             end_soc_pct=end_soc,
             discharge=discharge,
-            speed_ms=None if speed is None else read_speed(speed),
             pack=pack,
-            chemistry=chemistry,
             plant=plant,
             name=output.stem,
         )
@@ -119,14 +92,12 @@ def twin_command(
             f"{scaled.fault.id}: on this drive its physical limits allow a gap of"
             f" {scaled.reached_v:.3g} V, not {scaled.target_v:.3g} V"
         )
-    write_log(simulated.log if soc == "full" else simulated.recording.log, output)
+    write_log(simulated.log, output)
     result = {
         "log": str(output),
         **simulated.to_dict(),
         "seconds": time.perf_counter() - began,
     }
-    if truth is not None:
-        write_text_atomic(truth, json.dumps(result, indent=1) + "\n")
     if json_output:
         emit_json(result)
         return
@@ -151,39 +122,3 @@ def _show(result: dict[str, Any]) -> None:
         for item in result["effects"]
     ]
     print_table("Simulated truth", ["", "value", "unit"], rows)
-
-
-def _list(json_output: bool) -> None:
-    from cangauge.extras.validation.twin.faults import fault_kinds
-
-    kinds = (*fault_kinds(), *fault_kinds(outside=True))
-    if json_output:
-        emit_json(
-            {
-                "effects": [
-                    {
-                        "effect": kind.id,
-                        "family": kind.family,
-                        "parameter": kind.parameter,
-                        "unit": kind.unit,
-                        "signed": kind.signed,
-                        "shape": list(kind.shape),
-                        "says": kind.summary,
-                    }
-                    for kind in kinds
-                ]
-            }
-        )
-        return
-    print_table(
-        "Effects",
-        ["id", "parameters", "effect on the log"],
-        [
-            [
-                kind.id,
-                f"{kind.parameter} [{kind.unit}]" + "".join(f", {name}" for name in kind.shape),
-                kind.summary,
-            ]
-            for kind in kinds
-        ],
-    )
