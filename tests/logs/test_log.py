@@ -65,14 +65,6 @@ def test_log_reads_back_exactly(log: Log, suffix: str | None, tmp_path: Path) ->
     assert not [text for text in back.remarks if not text.startswith("current looks inverted")]
 
 
-def test_log_in_the_battery_data_format_has_no_soc(tmp_path: Path, drive: Log) -> None:
-    write_log(drive, tmp_path / "drive.bdf.csv")
-    assert (tmp_path / "drive.bdf.csv").read_text().startswith("Test Time / s,Voltage / V,Current")
-    back = read_log(tmp_path / "drive.bdf.csv")
-    np.testing.assert_array_equal(back.current_a, drive.current_a)
-    assert (back.soc_pct, back.temperature_source, back.name) == (None, "cell", "drive")
-
-
 @pytest.mark.parametrize(
     ("values", "words"),
     [

@@ -58,7 +58,7 @@ def is_number(text: str) -> bool:
     return True
 
 
-def is_text(kind: Any) -> bool:
+def _is_text(kind: Any) -> bool:
     """Return whether an Arrow type is text, dictionary-encoded or not."""
     kind = kind.value_type if pa.types.is_dictionary(kind) else kind
     return str(kind) in {"string", "large_string", "string_view"}
@@ -66,12 +66,12 @@ def is_text(kind: Any) -> bool:
 
 def first_text(column: Any) -> str:
     """Return the first value of a column of text; "" of any other."""
-    if not is_text(column.type):
+    if not _is_text(column.type):
         return ""
     return next((str(cell.as_py()) for cell in column if cell.is_valid), "")
 
 
-def present(column: Any) -> Any:
+def _present(column: Any) -> Any:
     """Return the trimmed cells of a column of text, null where there is no value."""
     trimmed = pc.utf8_trim_whitespace(column.cast(pa.string()))
     missing = pc.is_in(pc.utf8_lower(trimmed), value_set=pa.array(["", *MISSING]))
@@ -91,7 +91,7 @@ def numbers_of(column: Any, source: str, label: str) -> tuple[FloatArray, str]:
     """
     kind, of = column.type, pa.types
     is_number_type = of.is_integer(kind) or of.is_floating(kind) or of.is_decimal(kind)
-    if not (is_number_type or is_text(kind) or of.is_null(kind)):
+    if not (is_number_type or _is_text(kind) or of.is_null(kind)):
         raise InputError(
             "the column does not hold numbers",
             source=source,
@@ -101,7 +101,7 @@ def numbers_of(column: Any, source: str, label: str) -> tuple[FloatArray, str]:
         )
     with suppress(pa.ArrowInvalid):
         return _floats(pc.cast(column, pa.float64(), safe=False)), ""
-    cells = present(column)
+    cells = _present(column)
     bare, unit = _without_unit(_with_decimal_point(cells))
     try:
         return _floats(pc.cast(bare, pa.float64())), unit
@@ -161,21 +161,40 @@ def is_date(text: str) -> bool:
     return match is not None and _fields(match["date"]) is not None
 
 
-def seconds_of_numbers(
-    values: FloatArray, unit: str, source: str, label: str
+def seconds_of(
+    parts: Sequence[Any], unit: str, factor: float, source: str, label: str
 ) -> tuple[FloatArray, str]:
-    """Return numbers as seconds, and their unit as stated or as the size of an epoch shows."""
+    """Return a time column, or a date and its time, as seconds, NaN where empty.
+
+    The second value states how the cells were read: the unit as stated, or as the size of an epoch
+    shows. See `_seconds_of_text` for errors.
+    """
+    if len(parts) > 1:
+        cells = pc.binary_join_element_wise(*(part.cast(pa.string()) for part in parts), " ")
+        return _seconds_of_text(cells, unit, source, label)
+    cells, kind = parts[0], parts[0].type
+    if pa.types.is_date(kind):
+        cells, kind = cells.cast(pa.timestamp("s")), pa.timestamp("s")
+    if pa.types.is_timestamp(kind) or pa.types.is_duration(kind):
+        per_second = {"s": 1.0, "ms": 1e3, "us": 1e6, "ns": 1e9}[kind.unit]
+        counts = _floats(cells.cast(pa.int64()).cast(pa.float64(), safe=False))
+        return counts / per_second, str(kind)
+    if _is_text(kind):
+        filled = _present(cells)
+        if not is_number(first_text(filled).replace(",", ".") or "0"):
+            return _seconds_of_text(filled, unit, source, label)
+    values = numbers_of(cells, source, label)[0] * factor
     if unit:
         return convert(values, "time_s", unit, source=source, label=label)[0], unit
     finite = values[np.isfinite(values)]
     typical = float(np.median(finite)) if finite.size else 0.0
-    for least, factor, name in _EPOCHS:
+    for least, per_one, name in _EPOCHS:
         if typical >= least:
-            return values * factor, f"{name} since 1970, from its size"
+            return values * per_one, f"{name} since 1970, from its size"
     return values, "s, assumed"
 
 
-def seconds_of_text(cells: Any, unit: str, source: str, label: str) -> tuple[FloatArray, str]:
+def _seconds_of_text(cells: Any, unit: str, source: str, label: str) -> tuple[FloatArray, str]:
     """Return stamps of text as seconds, NaN where empty, and how they were read.
 
     All cells are clock times (`1:02:03.5`, `2d 01:02:03`), or dates with or without a time of day.

@@ -112,8 +112,14 @@ class LogFile:
         """Read the log; see `read_log`."""
         if self.reader is None:
             raise not_recognised(self, "not a known kind of log", f"known are: {KNOWN_LOGS}")
-        draft = self.reader.read(self.head, self.columns)
-        log = draft.to_log(temperature_c, temperature_source, self.sign, self.used)
+        try:
+            draft = self.reader.read(self.head, self.columns)
+            log = draft.to_log(temperature_c, temperature_source, self.sign, self.used)
+        except (MemoryError, pa.ArrowException) as error:
+            problem = f"damaged, or larger than the memory ({error or type(error).__name__})"
+            raise InputError(
+                problem, source=self.head.path, cure="export again, or split"
+            ) from error
         pa.default_memory_pool().release_unused()
         return log
 

@@ -19,17 +19,7 @@ import pyarrow.compute as pc
 
 from cangauge._typing import FloatArray, IntArray
 from cangauge.errors import InputError
-from cangauge.logs.cells import (
-    first_text,
-    is_clock,
-    is_date,
-    is_number,
-    is_text,
-    numbers_of,
-    present,
-    seconds_of_numbers,
-    seconds_of_text,
-)
+from cangauge.logs.cells import first_text, is_clock, is_date, numbers_of, seconds_of
 from cangauge.logs.column_map import (
     SOURCE,
     ChosenColumn,
@@ -174,7 +164,8 @@ def _time(
 
     def read(one: ChosenColumn) -> tuple[ChosenColumn, FloatArray, str]:
         label = " + ".join(headings[place] for place in one.places)
-        return one, *_seconds([columns[place] for place in one.places], one, where, label)
+        parts = [columns[place] for place in one.places]
+        return one, *seconds_of(parts, one.unit, one.factor, where, label)
 
     first = read(column)
     for other in () if _increases(first[1]) else column.others:
@@ -188,28 +179,6 @@ def _time(
 def _increases(time_s: FloatArray) -> bool:
     finite = time_s[np.isfinite(time_s)]
     return finite.size > 1 and bool(np.all(np.diff(finite) >= 0.0)) and finite[-1] > finite[0]
-
-
-def _seconds(
-    parts: Sequence[Any], column: ChosenColumn, source: str, label: str
-) -> tuple[FloatArray, str]:
-    """Return a time column, or a date and its time, as seconds, and how it was read."""
-    if len(parts) > 1:
-        cells = pc.binary_join_element_wise(*(part.cast(pa.string()) for part in parts), " ")
-        return seconds_of_text(cells, column.unit, source, label)
-    cells, kind = parts[0], parts[0].type
-    if pa.types.is_date(kind):
-        cells, kind = cells.cast(pa.timestamp("s")), pa.timestamp("s")
-    if pa.types.is_timestamp(kind) or pa.types.is_duration(kind):
-        per_second = {"s": 1.0, "ms": 1e3, "us": 1e6, "ns": 1e9}[kind.unit]
-        counts = cells.cast(pa.int64()).cast(pa.float64(), safe=False).to_numpy()
-        return np.asarray(counts, dtype=np.float64) / per_second, str(kind)
-    if is_text(kind):
-        filled = present(cells)
-        if not is_number(first_text(filled).replace(",", ".") or "0"):
-            return seconds_of_text(filled, column.unit, source, label)
-    values, _ = numbers_of(cells, source, label)
-    return seconds_of_numbers(values * column.factor, column.unit, source, label)
 
 
 # --- Rows that hold only what changed

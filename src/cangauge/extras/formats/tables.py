@@ -11,7 +11,7 @@ import pyarrow.compute as pc
 
 from cangauge._files import Head
 from cangauge.errors import InputError
-from cangauge.logs.cells import seconds_of_text
+from cangauge.logs.cells import seconds_of
 from cangauge.logs.column_map import ColumnMap, choose_columns
 from cangauge.logs.draft import DraftLog
 from cangauge.logs.table import ArrowTable, draft_of_table, held
@@ -109,7 +109,7 @@ class EntityHistory:
         cells = text.columns(places)
         entity, state, changed = (cells[place].cast(pa.string()) for place in places)
         source = str(head.path)
-        stamps, how = seconds_of_text(changed, "", source, "last_changed")
+        stamps, how = seconds_of([changed], "", 1.0, source, "last_changed")
         order = np.argsort(stamps, kind="stable")
         stamps = stamps[order]
         entity, values = entity.take(order), _as_numbers(state).take(order)
