@@ -67,7 +67,7 @@ def test_logs(tmp_path: Path, name: str) -> None:
 
 @pytest.mark.parametrize(
     "text",
-    ["x" * 1_000_000, "initial_soc = " + "9" * 5000, "model = " + "[" * 60_000],
+    ['model = "m"\n' + "#" * 300_000, "initial_soc = " + "9" * 5000, "model = " + "[" * 60_000],
     ids=["size", "number", "depth"],
 )
 def test_configurations(tmp_path: Path, text: str) -> None:
