@@ -288,7 +288,7 @@ def _listen(bus: Mapping[str, Any], seconds: float, path: Path) -> Path:
     from cangauge.bus.connection import BusConnection
     from cangauge.bus.open import bus_address, open_bus
 
-    address = bus_address(**{"options" if k == "bus_options" else k: v for k, v in bus.items()})
+    address = bus_address(bus["interface"], bus["channel"], bus["bus_options"])
     frames = 0
     with (
         BusConnection(open_bus(address), str(address)) as port,
