@@ -25,7 +25,6 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import asdict
 from itertools import product
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -91,7 +90,7 @@ def drive(rate_hz: int) -> Log:
 
 def bare_step_us(known: Model, log: Log) -> float:
     """Return the time of a step of a bare filter [µs]."""
-    circuit = Circuit(asdict(equivalent_circuit(known)) | {"noise_v": 1.0}, 23.0)
+    circuit = Circuit(equivalent_circuit(known) | {"noise_v": 1.0}, 23.0)
     columns = {
         name: np.asarray(getattr(log, name)).tolist()
         for name in ("time_s", "current_a", "voltage_v")

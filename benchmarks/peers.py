@@ -20,7 +20,6 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -98,7 +97,7 @@ def prepare(data: Path) -> tuple[Result, dict[str, list[Log]], dict[str, Model]]
 
 
 def _tables(model: Model) -> Result:
-    return asdict(equivalent_circuit(model)) | {"noise_v": model.noise.voltage_rmse_v}
+    return equivalent_circuit(model) | {"noise_v": model.noise.voltage_rmse_v}
 
 
 def _columns(log: Log) -> Result:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
@@ -89,7 +89,7 @@ class BareEkf(Cangauge):
         from cangauge.extras.embedded.equivalent_circuit import equivalent_circuit  # noqa: PLC0415
 
         model = super().fit(logs, told)
-        return asdict(equivalent_circuit(model)) | {"noise_v": model.noise.voltage_rmse_v}
+        return equivalent_circuit(model) | {"noise_v": model.noise.voltage_rmse_v}
 
     def estimate(
         self, log: cangauge.Log, model: Any, start_pct: float | None, capacity_ah: float

@@ -14,7 +14,7 @@ from typer.testing import CliRunner
 
 from cangauge.cli.app import app
 from cangauge.errors import InputError
-from cangauge.extras.embedded.equivalent_circuit import equivalent_circuit
+from cangauge.extras.embedded.equivalent_circuit import equivalent_circuit, module_of
 from cangauge.logs.log import Log
 from cangauge.model.first_order import low_passed
 from cangauge.model.model_file import Model
@@ -43,7 +43,7 @@ def log() -> Log:
 @pytest.fixture
 def exported(tmp_path: Path) -> dict[str, Any]:
     path = tmp_path / "pack.py"
-    path.write_text(equivalent_circuit(leaf_2012_model_file()).to_module(), encoding="utf-8")
+    path.write_text(module_of(equivalent_circuit(leaf_2012_model_file())), encoding="utf-8")
     return runpy.run_path(str(path))
 
 
@@ -65,9 +65,9 @@ def test_the_circuit_follows_the_model(exported: dict[str, Any], log: Log) -> No
 def test_resistances_add_up_to_the_lasting_one() -> None:
     model = leaf_2012_model_file()
     circuit = equivalent_circuit(model)
-    total = np.array(circuit.series_ohm) + np.sum(circuit.pair_ohm, axis=0)
+    total = np.array(circuit["series_ohm"]) + np.sum(circuit["pair_ohm"], axis=0)
     assert total == pytest.approx(-sum(model.voltage_model().resistance_ohm), rel=0.02)
-    assert 0.0 < circuit.step_error_pct < 2.0
+    assert 0.0 < circuit["step_error_pct"] < 2.0
 
 
 def test_an_rc_effect_is_a_pair_of_the_circuit() -> None:
@@ -78,9 +78,9 @@ def test_an_rc_effect_is_a_pair_of_the_circuit() -> None:
     published = model.published.model_copy(update={"delays_s": [0.0], "coefficients": kept})
     model = model.model_copy(update={"published": published})
     circuit = equivalent_circuit(model)
-    assert circuit.pair_tau_s == pytest.approx([6.0])
-    assert np.array(circuit.pair_ohm) == pytest.approx(0.02, rel=1e-6)
-    assert circuit.step_error_pct < 1e-6
+    assert circuit["pair_tau_s"] == pytest.approx([6.0])
+    assert np.array(circuit["pair_ohm"]) == pytest.approx(0.02, rel=1e-6)
+    assert circuit["step_error_pct"] < 1e-6
 
 
 def test_a_resistance_that_bends_with_current_is_in_the_table() -> None:
@@ -89,8 +89,8 @@ def test_a_resistance_that_bends_with_current_is_in_the_table() -> None:
     )
     circuit = equivalent_circuit(model)
     small, large = (
-        np.interp(amperes, circuit.current_a, np.array(circuit.series_ohm)[0, :, 5])
-        for amperes in (0.05 * circuit.capacity_ah, 2.0 * circuit.capacity_ah)
+        np.interp(amperes, circuit["current_a"], np.array(circuit["series_ohm"])[0, :, 5])
+        for amperes in (0.05 * circuit["capacity_ah"], 2.0 * circuit["capacity_ah"])
     )
     by_hand = 5.0 * np.arcsinh(np.array([2.575, 103.0]) / 20.0) / np.array([2.575, 103.0])
     assert small - large == pytest.approx(by_hand[0] - by_hand[1], rel=0.02)
@@ -108,9 +108,9 @@ def test_a_resistance_that_bends_with_current_is_in_the_table() -> None:
 def test_a_model_of_one_temperature_has_increasing_axes(model: Model) -> None:
     narrow = model.range.model_copy(update={"temperature_c": (TEMPERATURE_C, TEMPERATURE_C)})
     circuit = equivalent_circuit(model.model_copy(update={"range": narrow}))
-    assert np.diff(circuit.temperature_c).min() > 0.0
-    assert np.mean(circuit.temperature_c) == pytest.approx(TEMPERATURE_C)
-    assert np.diff(circuit.current_a).min() > 0.0
+    assert np.diff(circuit["temperature_c"]).min() > 0.0
+    assert np.mean(circuit["temperature_c"]) == pytest.approx(TEMPERATURE_C)
+    assert np.diff(circuit["current_a"]).min() > 0.0
 
 
 def test_thevenin_computes_the_voltage(exported: dict[str, Any], log: Log) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from keyword import iskeyword
 from pathlib import Path
 
@@ -37,27 +38,21 @@ def export_ecm_command(*, model: Path, output: Path, json_output: bool = False) 
         )  # fmt: skip
     check_outputs([output], [model])
     # Deferred, so that the help page does not wait for numpy and scipy.
-    from cangauge.extras.embedded.equivalent_circuit import equivalent_circuit
+    from cangauge.extras.embedded.equivalent_circuit import equivalent_circuit, module_of
     from cangauge.model.model_file import Model
 
     circuit = equivalent_circuit(Model.load(model))
-    text = circuit.to_module() if is_module else circuit.to_json()
-    write_text_atomic(output, text)
+    write_text_atomic(output, module_of(circuit) if is_module else json.dumps(circuit) + "\n")
+    taus_s, error_pct = circuit["pair_tau_s"], circuit["step_error_pct"]
     if json_output:
-        emit_json(
-            {
-                "output": str(output),
-                "pairs": len(circuit.pair_tau_s),
-                "pair_tau_s": circuit.pair_tau_s,
-                "step_error_pct": circuit.step_error_pct,
-            }
-        )
+        shown = {"pairs": len(taus_s), "pair_tau_s": taus_s, "step_error_pct": error_pct}
+        emit_json({"output": str(output), **shown})
         return
-    rows = [["capacity", number(circuit.capacity_ah, 2), "Ah"]]
+    rows = [["capacity", number(circuit["capacity_ah"], 2), "Ah"]]
     rows += [
         [f"time constant of RC pair {k}", significant(tau_s, 3), "s"]
-        for k, tau_s in enumerate(circuit.pair_tau_s, start=1)
+        for k, tau_s in enumerate(taus_s, start=1)
     ]
-    rows.append(["step response, RMS error", number(circuit.step_error_pct, 2), "%"])
-    print_table(f"Equivalent circuit of {circuit.name}", ["", "value", "unit"], rows)
+    rows.append(["step response, RMS error", number(error_pct, 2), "%"])
+    print_table(f"Equivalent circuit of {circuit['name']}", ["", "value", "unit"], rows)
     note(f"equivalent circuit: {output}")

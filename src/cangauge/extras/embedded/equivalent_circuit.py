@@ -17,11 +17,11 @@ last current (hysteresis) enter as their mean response.
 
 from __future__ import annotations
 
+import itertools
 import json
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Mapping, Sequence
 from importlib.resources import files
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from scipy.optimize import nnls
@@ -57,42 +57,8 @@ NEGLIGIBLE: Final = 1e-3
 """RC pairs with less than this fraction of the steady resistance are left out [-]."""
 
 
-@dataclass(frozen=True)
-class EquivalentCircuit:
-    """Tables of an equivalent circuit; positive current discharges."""
-
-    name: str
-    capacity_ah: float
-    charge_efficiency: float
-    soc_range_pct: tuple[float, float]
-    """SoC over which the model was identified."""
-    temperature_c: list[float]
-    curve_soc_pct: list[float]
-    ocv_v: list[list[float]]
-    """Open-circuit voltage, temperatures × `curve_soc_pct`."""
-    current_a: list[float]
-    soc_pct: list[float]
-    series_ohm: list[list[list[float]]]
-    """R0, temperatures × currents × `soc_pct`."""
-    pair_tau_s: list[float]
-    pair_ohm: list[list[list[list[float]]]]
-    """Resistances of the RC pairs, each as `series_ohm`."""
-    step_error_pct: float
-    """RMS error of the step response relative to its end, at half charge [%]."""
-
-    def to_json(self) -> str:
-        """Return the tables as JSON."""
-        return json.dumps(asdict(self)) + "\n"
-
-    def to_module(self) -> str:
-        """Return a Python module with the tables and the parameters of both simulators."""
-        template = files("cangauge.extras.embedded") / "equivalent_circuit_module.py.txt"
-        tables = f"TABLES: dict = {json.dumps(asdict(self))}"
-        return template.read_text("utf-8").replace("TABLES: dict = {}", tables, 1)
-
-
-def equivalent_circuit(model: Model) -> EquivalentCircuit:
-    """Return the equivalent circuit of a model.
+def equivalent_circuit(model: Model) -> dict[str, Any]:
+    """Return the tables of the equivalent circuit of a model; positive current discharges.
 
     Parameters
     ----------
@@ -100,7 +66,12 @@ def equivalent_circuit(model: Model) -> EquivalentCircuit:
 
     Returns
     -------
-    EquivalentCircuit
+    dict
+        `name`, `capacity_ah`, `charge_efficiency` and `soc_range_pct`, over which the model was
+        identified; `ocv_v` [V], temperatures × `curve_soc_pct`; `series_ohm` (R0 [Ω]), and
+        `pair_ohm` with the same of each RC pair, `temperature_c` × `current_a` × `soc_pct`;
+        `pair_tau_s`; and `step_error_pct`, the RMS error of the step response relative to its end,
+        at half charge.
     """
     extended = model.extended_model()
     counting = extended.counting(50.0)
@@ -118,30 +89,32 @@ def equivalent_circuit(model: Model) -> EquivalentCircuit:
     amperes, socs = np.array(C_RATES) * extended.capacity_ah, np.array(RESISTANCE_SOC_PCT)
     if is_plain:
         amperes, socs = amperes[[0, -1]], socs[[0, -1]]
+    places = itertools.product(temperatures, amperes, socs)
     ohm = np.array(
-        [
-            [
-                [response.resistances(response.at(soc, celsius, a), tau_s)[0] for soc in socs]
-                for a in amperes
-            ]
-            for celsius in temperatures
-        ]
-    )
-    return EquivalentCircuit(
-        name=model.name,
-        capacity_ah=counting.capacity_ah,
-        charge_efficiency=counting.charge_efficiency,
-        soc_range_pct=model.range.soc_pct,
-        temperature_c=temperatures.tolist(),
-        curve_soc_pct=curve_soc.tolist(),
-        ocv_v=[_rest_v(extended, curve_soc, celsius).tolist() for celsius in temperatures],
-        current_a=amperes.tolist(),
-        soc_pct=socs.tolist(),
-        series_ohm=ohm[..., 0].tolist(),
-        pair_tau_s=list(tau_s),
-        pair_ohm=[ohm[..., k].tolist() for k in range(1, ohm.shape[-1])],
-        step_error_pct=100.0 * error_ohm / usual[-1],
-    )
+        [response.resistances(response.at(soc, celsius, a), tau_s)[0] for celsius, a, soc in places]
+    ).reshape(temperatures.size, amperes.size, socs.size, -1)
+    return {
+        "name": model.name,
+        "capacity_ah": counting.capacity_ah,
+        "charge_efficiency": counting.charge_efficiency,
+        "soc_range_pct": model.range.soc_pct,
+        "temperature_c": temperatures.tolist(),
+        "curve_soc_pct": curve_soc.tolist(),
+        "ocv_v": [_rest_v(extended, curve_soc, celsius).tolist() for celsius in temperatures],
+        "current_a": amperes.tolist(),
+        "soc_pct": socs.tolist(),
+        "series_ohm": ohm[..., 0].tolist(),
+        "pair_tau_s": list(tau_s),
+        "pair_ohm": [ohm[..., k].tolist() for k in range(1, ohm.shape[-1])],
+        "step_error_pct": 100.0 * error_ohm / usual[-1],
+    }
+
+
+def module_of(tables: Mapping[str, Any]) -> str:
+    """Return a Python module with the tables and the parameters of both simulators."""
+    template = files("cangauge.extras.embedded") / "equivalent_circuit_module.py.txt"
+    text = f"TABLES: dict = {json.dumps(tables)}"
+    return template.read_text("utf-8").replace("TABLES: dict = {}", text, 1)
 
 
 def _rest_v(extended: ExtendedModel, soc_pct: FloatArray, temperature_c: float) -> FloatArray:

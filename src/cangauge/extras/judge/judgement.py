@@ -77,13 +77,13 @@ class Cause(NamedTuple):
     """`current_offset`, `count_scale`, `pack_capacity`, `start_or_reset`, `voltage_sensor`,
     `weak_cell`, `none` or `unknown`."""
     probability: float
-    size: Size | None
-    onset: int | None
+    size: Size | None = None
+    onset: int | None = None
     """Stretch with which it begins."""
-    earliest: int | None
-    latest: int | None
+    earliest: int | None = None
+    latest: int | None = None
     """First and last stretch with which it may have begun (90 %)."""
-    inside: bool
+    inside: bool = False
     """Whether it begins at the step within that stretch, not before it."""
 
 
@@ -104,7 +104,6 @@ class Judgement:
     cause : Cause
     probabilities : dict
         Of `none`, `unknown` and each cause.
-    jumps : list of Jump
     corrected_pct, corrected_std_pct : list of array
         Corrected SoC and its σ at each row of each log [%]; NaN where not known.
     """
@@ -117,7 +116,6 @@ class Judgement:
     verdict: Verdict
     cause: Cause
     probabilities: dict[str, float]
-    jumps: list[Jump]
     corrected_pct: list[FloatArray]
     corrected_std_pct: list[FloatArray]
     chain: list[Stretch]
@@ -130,6 +128,24 @@ class Judgement:
         return [
             np.full(len(log), np.nan) if log.soc_pct is None else log.soc_pct for log in self.logs
         ]
+
+    @property
+    def jumps(self) -> list[Jump]:
+        """Jumps of the published SoC within stretches that the charge does not explain."""
+        found = []
+        for part in self.chain:
+            count = part.published_pct + part.drawn_pct
+            known = np.flatnonzero(np.isfinite(count))
+            change = np.diff(count[known])
+            if not change.size:
+                continue
+            usual = 1.5 * float(np.median(np.abs(change)))
+            least = max(JUMP_PCT, SEVERAL * usual, 2.0 * part.soc_step_pct)
+            for k in np.flatnonzero(np.abs(change) >= least):
+                time_s = float(part.time_s[known[k + 1]])
+                elapsed_s = self.elapsed_s(part.log, time_s)
+                found.append(Jump(part.log, time_s, elapsed_s, float(change[k])))
+        return found
 
     @property
     def days(self) -> int:
@@ -468,7 +484,7 @@ def _judgement(
     verdict: Verdict = (
         "off" if is_off else "agrees" if 2.0 * error_std <= USEFUL_PCT else "cannot_tell"
     )
-    partial = Judgement(
+    return Judgement(
         logs,
         model,
         float(error[end][last]),
@@ -477,14 +493,12 @@ def _judgement(
         verdict,
         _cause(explanations, share, is_off=is_off),
         probabilities,
-        [],
         corrected,
         std,
         chain,
         explanations,
         weak,
     )
-    return replace(partial, jumps=_jumps(partial))
 
 
 def _of_weak_cell(none: Explanation, weak: WeakestCell) -> Explanation:
@@ -511,12 +525,11 @@ def _cause(explanations: Sequence[Explanation], share: FloatArray, *, is_off: bo
     by_name = {each.name: (each, float(p)) for each, p in zip(explanations, share, strict=True)}
     none = by_name["none"][1]
     if not is_off:
-        return Cause("none", none, None, None, None, None, inside=False)
+        return Cause("none", none)
     name = max(UNITS.keys() & by_name.keys(), key=lambda each: by_name[each][1])
     best, probability = by_name[name]
     if probability < NAMED * (1.0 - none):
-        unknown = by_name["unknown"][1]
-        return Cause("unknown", unknown, None, None, None, None, inside=False)
+        return Cause("unknown", by_name["unknown"][1])
     size = float(best.share @ best.size)
     spread = float(best.share @ (best.std**2 + (best.size - size) ** 2)) ** 0.5
     onset = np.zeros(1 + max(each.onset for each in best.signatures))
@@ -535,24 +548,6 @@ def _cause(explanations: Sequence[Explanation], share: FloatArray, *, is_off: bo
     )
 
 
-def _jumps(judgement: Judgement) -> list[Jump]:
-    """Return the jumps of the published SoC within stretches that the charge does not explain."""
-    found = []
-    for part in judgement.chain:
-        count = part.published_pct + part.drawn_pct
-        known = np.flatnonzero(np.isfinite(count))
-        change = np.diff(count[known])
-        if not change.size:
-            continue
-        usual = 1.5 * float(np.median(np.abs(change)))
-        least = max(JUMP_PCT, SEVERAL * usual, 2.0 * part.soc_step_pct)
-        for k in np.flatnonzero(np.abs(change) >= least):
-            time_s = float(part.time_s[known[k + 1]])
-            elapsed = judgement.elapsed_s(part.log, time_s)
-            found.append(Jump(part.log, time_s, elapsed, float(change[k])))
-    return found
-
-
 def narrowed(judgement: Judgement) -> Model:
     """Return the model with its curve and loads learned from the logs, and their σ."""
     best = max(judgement.explanations, key=lambda each: each.log_evidence)
@@ -565,26 +560,20 @@ def narrowed(judgement: Judgement) -> Model:
     )
     update: dict[str, Any] = {"functions": functions, "name": f"{model.name}, narrowed"}
     if model.curve is not None and model.loads is not None:
-        volts = np.array(model.curve.voltage_v) + np.interp(
-            model.curve.soc_pct, fields.soc_pct, curve @ best.functions
-        )
-        change = loads @ best.functions
-        M = len(model.loads.resistance_ohm)
-        colder = model.loads.arrhenius.model_copy(
-            update={"factor": model.loads.arrhenius.factor + float(change[1 + M])}
-        )
-        update["curve"] = model.curve.model_copy(
-            update={"voltage_v": np.maximum.accumulate(volts).tolist()}
-        )
-        update["loads"] = model.loads.model_copy(
-            update={
-                "kt_v_per_k": model.loads.kt_v_per_k + float(change[0]),
-                "resistance_ohm": (
-                    np.array(model.loads.resistance_ohm) + change[1 : 1 + M]
-                ).tolist(),
-                "arrhenius": colder,
-            }
-        )
+        at_pct = model.curve.soc_pct
+        volts = np.array(model.curve.voltage_v)
+        volts += np.interp(at_pct, fields.soc_pct, curve @ best.functions)
+        rising = np.maximum.accumulate(volts).tolist()
+        update["curve"] = model.curve.model_copy(update={"voltage_v": rising})
+        kt, *ohm = loads @ best.functions
+        known, M = model.loads, len(model.loads.resistance_ohm)
+        factor = known.arrhenius.factor + float(ohm[M])
+        changed = {
+            "kt_v_per_k": known.kt_v_per_k + float(kt),
+            "resistance_ohm": (np.array(known.resistance_ohm) + ohm[:M]).tolist(),
+            "arrhenius": known.arrhenius.model_copy(update={"factor": factor}),
+        }
+        update["loads"] = known.model_copy(update=changed)
     return model.model_copy(update=update)
 
 
