@@ -15,7 +15,7 @@ from can.typechecking import Channel
 
 from cangauge.bus.captures import CaptureInfo, open_capture
 from cangauge.bus.decoder import SampleDecoder
-from cangauge.bus.protection import GENERIC_RULE, LEAF_RULE, FrameChecker, ProtectionRule, Verdict
+from cangauge.bus.protection import RULES, FrameChecker, Verdict
 from cangauge.bus.recording import capture_to_log, open_vehicle_capture
 from cangauge.bus.vehicle import LOG_COLUMNS, PRESETS, Vehicle
 from cangauge.inspect.log import Gap, LogInspection, inspect_log
@@ -185,10 +185,10 @@ class _Survey:
 
 
 class _Trial:
-    """A protection rule tried on the frames of one id."""
+    """One of `RULES` tried on the frames of one id."""
 
-    def __init__(self, rule: ProtectionRule, period_s: float | None) -> None:
-        self.rule, self._checker = rule, FrameChecker(rule, period_s)
+    def __init__(self, rule: str, period_s: float | None) -> None:
+        self.rule, self._checker = rule, FrameChecker(RULES[rule], period_s)
         self.verdicts = dict.fromkeys(Verdict, 0)
         self.crc_errors = self.frames_lost = 0
         self.two_senders = False
@@ -231,7 +231,7 @@ class _IdRecord:
         if self.trials is None:
             # Lost frames lengthen intervals: the lower quartile is the period; 0 for equal stamps.
             period_s = sorted(self.intervals)[len(self.intervals) // 4] if self.intervals else None
-            self.trials = [_Trial(rule, period_s or None) for rule in (LEAF_RULE, GENERIC_RULE)]
+            self.trials = [_Trial(rule, period_s or None) for rule in ("leaf", "generic")]
         for data, time_s in self.waiting:
             if len(data) < 3 or len(self.lengths) > 1:
                 self.trials = []
@@ -258,7 +258,7 @@ class _IdRecord:
         trial = next(agreeing, None) if len(self.payloads) >= PAYLOADS else None
         if trial is None:
             return found
-        found = replace(found, protection=trial.rule.name, crc_errors=trial.crc_errors)
+        found = replace(found, protection=trial.rule, crc_errors=trial.crc_errors)
         repeats, jumps = (trial.verdicts[each] for each in (Verdict.REPEATED, Verdict.AFTER_LOSS))
         if repeats > (MIXED_SHARE if trial.two_senders else REPEATED_SHARE) * self.frames:
             return found
