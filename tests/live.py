@@ -24,6 +24,7 @@ import pytest
 
 from cangauge._resources import shared_file
 from cangauge.bus.connection import BusConnection
+from cangauge.bus.database import SignalCodec
 from cangauge.bus.open import BusAddress, open_bus
 from cangauge.bus.time_source import MICROSECONDS
 from cangauge.bus.vehicle import LOG_COLUMNS, Vehicle
@@ -339,10 +340,16 @@ def quantized(vehicle: Vehicle, log: Log) -> Log:
     """
     columns = {LOG_COLUMNS[signal.role]: signal for signal in vehicle.signals}
     sent: dict[str, Any] = {
-        column: signal.codec.quantize(values)
+        column: np.array([_sent(signal.codec, value) for value in values.tolist()])
         for column, signal in columns.items()
         if (values := getattr(log, column)) is not None
     }
     if not math.isnan(vehicle.fixed_temperature_c):
         sent["temperature_c"] = np.full(len(log), vehicle.fixed_temperature_c)
     return replace(log, time_s=np.rint(log.time_s * MICROSECONDS) / MICROSECONDS, **sent)
+
+
+def _sent(codec: SignalCodec, value: float) -> float:
+    payload = bytearray(64)
+    codec.encode_into(payload, value)
+    return codec.decode(payload)

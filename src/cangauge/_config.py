@@ -14,6 +14,7 @@ from cangauge.errors import InputError, closest
 
 MAX_TOML_BYTES: Final = 64 * 1024
 _UNION_TAGS: Final = {"bool", "int", "float", "str", "constrained-int", "constrained-float"}
+_UNKNOWN_KEY: Final = {"extra_forbidden", "unexpected_keyword_argument"}  # of models, dataclasses
 # Wording of pydantic, and the shorter one of our messages.
 _WORDING: Final = (
     ("Value error, ", ""),
@@ -61,19 +62,20 @@ def schema_error(
     An unknown key comes before a missing one: it is often that key, misspelt. `cure` is general
     advice, for errors without a better one.
     """
-    first = min(error.errors(include_url=False), key=lambda each: each["type"] != "extra_forbidden")
+    errors = error.errors(include_url=False)
+    first = min(errors, key=lambda each: each["type"] not in _UNKNOWN_KEY)
     place = list(first["loc"])
     while len(place) > 1 and place[-1] in _UNION_TAGS:  # pydantic names the member of a union
         place.pop()
     problem, value = first["msg"], first["input"]
     if first["type"] == "missing":
         problem, value, cure = "is missing", None, cure or "add it"
-    elif first["type"] == "extra_forbidden":
+    elif first["type"] in _UNKNOWN_KEY:
         problem, value = "unknown key", None
         keys = _known_keys(model, place[:-1])
         near = closest(str(place[-1]), keys)
         cure = f"did you mean {near}?" if near else f"known are {', '.join(sorted(keys))}"
-    elif first["type"] in {"model_type", "model_attributes_type", "dict_type"}:
+    elif first["type"] in {"model_type", "model_attributes_type", "dict_type", "dataclass_type"}:
         problem = "must be a table"
     else:
         for theirs, ours in _WORDING:
@@ -90,20 +92,21 @@ def schema_error(
 
 def _known_keys(model: type[BaseModel], place: list[int | str]) -> list[str]:
     """Return the keys that the schema allows at a place; list indices and dict keys are skipped."""
-    owners = [model]
+    owners: list[Any] = [model]
     for part in place:
         inner = [
             each
             for owner in owners
-            if part in owner.model_fields
-            for each in _models_in(owner.model_fields[str(part)].annotation)
+            if part in owner.__pydantic_fields__
+            for each in _models_in(owner.__pydantic_fields__[str(part)].annotation)
         ]
         owners = inner or owners
-    return list(dict.fromkeys(key for owner in owners for key in owner.model_fields))
+    return list(dict.fromkeys(key for owner in owners for key in owner.__pydantic_fields__))
 
 
-def _models_in(annotation: Any) -> Iterator[type[BaseModel]]:
-    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+def _models_in(annotation: Any) -> Iterator[Any]:
+    """Yield the models and checked dataclasses of an annotation."""
+    if isinstance(annotation, type) and hasattr(annotation, "__pydantic_fields__"):
         yield annotation
     for part in get_args(annotation):
         yield from _models_in(part)

@@ -93,7 +93,7 @@ REASON_WORDS: Final = {
     Reason.SOC_UNCERTAIN: "the standard deviation exceeds the limit of a valid SoC",
     Reason.DUPLICATE_SENDER: "another node sends frames with an id that is read or published here",
     Reason.MODEL_MISMATCH: "the pack does not behave as its model: run `cangauge gap` on a log",
-    Reason.TIME_UNCERTAIN: "time stamps are irregular, or contradict the monotonic clock",
+    Reason.TIME_UNCERTAIN: "time stamps contradict the monotonic clock",
     Reason.SIGN_SUSPECT: "the current has the wrong sign: the voltage moves with it in its steps",
 }
 """Description of each reason, for pages and messages."""

@@ -9,7 +9,6 @@ import warnings
 from pathlib import Path
 
 import cantools.database
-import numpy as np
 import pytest
 from cantools.database.can import Database, Message
 from hypothesis import assume, given
@@ -69,7 +68,6 @@ def test_rounds_to_the_nearest_step(value: float, factor: float) -> None:
     found.encode_into(payload, value)
     decoded = found.decode(payload)
     assert abs(decoded - value) <= found.half_step * (1 + 1e-9)
-    assert float(found.quantize(np.array([value]))[0]) == decoded
 
 
 @pytest.mark.parametrize(("width", "kind"), [(32, 1), (64, 2)])
@@ -78,7 +76,7 @@ def test_floats_are_exact(width: int, kind: int) -> None:
     found, payload = codec(signal, more=f"SIG_VALTYPE_ 100 s : {kind};\n"), bytearray(8)
     for value in (0.0, -12.375, 300.25):
         found.encode_into(payload, value)
-        assert found.decode(payload) == value == float(found.quantize(np.array([value]))[0])
+        assert found.decode(payload) == value
     found.field.put(payload, (1 << width) - 1)  # a NaN
     assert math.isnan(found.decode(payload))
     assert found.half_step == 0.0
@@ -114,7 +112,6 @@ def test_values_that_do_not_fit_are_refused() -> None:
     for value in (128.0, -129.0, math.inf, math.nan):
         with pytest.raises(InputError):
             found.encode_into(payload, value)
-        assert bool(found.fits(np.array([value]))[0]) is math.isnan(value)
     assert payload == bytes(8)
     found.encode_into(payload, -128.4)  # rounds into the range
     assert found.decode(payload) == -128.0
@@ -234,9 +231,9 @@ def test_published_frames_agree_with_the_estimator() -> None:
         assert (message.frame_id, message.cycle_time) == (frame_id, cycle_ms)
         attributes = message.dbc.attributes
         assert attributes["E2EProfile"].value == "02"
-        data_ids = bytes.fromhex(attributes["E2EDataIdList"].value)
+        data_ids = tuple(bytes.fromhex(attributes["E2EDataIdList"].value))
         assert len(set(data_ids)) == 16
-        protected = E2eRule("e2e_02", data_ids=data_ids).protect(bytes(8), 11)
+        protected = E2eRule("e2e_02", data_id_list=data_ids).protect(bytes(8), 11)
         values = message.decode(protected, decode_choices=False)
         assert [value for key, value in values.items() if key.startswith("counter_")] == [11]
 

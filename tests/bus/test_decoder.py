@@ -152,8 +152,8 @@ WITHIN_S = 0.020
 def paired(frames: list[tuple[float, str, float]]) -> list[tuple[float, float, float | None]]:
     pairing, samples = Pairing(WITHIN_S), []
     for time_s, kind, value in frames:
-        add = pairing.voltage if kind == "U" else lambda t, a: pairing.current(t, a, 20.0)
-        samples.append(add(time_s, value))
+        is_voltage, current = kind == "U", Sample(time_s, value, math.nan, 20.0)
+        samples.append(pairing.voltage(time_s, value) if is_voltage else pairing.current(current))
     found = [each for each in [*samples, pairing.flush()] if each is not None]
     return [(t, i, None if math.isnan(u) else u) for t, i, u, _ in found]
 
@@ -185,14 +185,12 @@ def test_currents_and_voltages_pair(
     assert paired(frames) == samples
 
 
-def test_unpaired_values_are_counted() -> None:
+def test_unpaired_currents_are_counted() -> None:
     pairing = Pairing(WITHIN_S)
-    for n in range(3):
-        pairing.voltage(float(n), 400.0)
-    pairing.current(10.0, 1.0, 20.0)
-    pairing.current(11.0, 1.0, 20.0)
-    statistics = pairing.statistics
-    assert (statistics.voltage_unpaired, statistics.current_unpaired) == (3, 1)
+    pairing.voltage(0.0, 400.0)
+    for time_s in (10.0, 11.0):
+        pairing.current(Sample(time_s, 1.0, math.nan, 20.0))
+    assert pairing.statistics.current_unpaired == 1
 
 
 @given(st.lists(st.tuples(st.integers(0, 60), st.sampled_from("IU")), min_size=1, max_size=60))

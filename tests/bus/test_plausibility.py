@@ -11,7 +11,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from cangauge.bus.plausibility import (
-    ConstantDetector,
     PackProperties,
     SignalChecks,
     SignalHealth,
@@ -102,7 +101,7 @@ def test_a_stated_time_out_is_exact() -> None:
     ("period_s", "timeout_s"), [(0.01, 0.5), (0.1, 1.0), (0.5, 2.0), (1.0, 3.0), (10.0, 30.0)]
 )
 def test_the_time_out_follows_the_period(period_s: float, timeout_s: float) -> None:
-    checks = SignalChecks(usual_timeout_s=2.0)
+    checks = SignalChecks()
     assert SignalHealth(checks, period_s).timeout_s == pytest.approx(timeout_s)
     learned = SignalHealth(checks)
     passed(learned, [1.0] * 8, period_s)
@@ -140,7 +139,7 @@ def stuck_from(
 ) -> tuple[float | None, float | None]:
     """Return when current and voltage first count as stuck [s]."""
     detectors: tuple[StuckDetector, StuckDetector]
-    detectors = stuck_detectors(PACK, steps=(step, min(step, step_v or step)), after_s=(10.0, 10.0))
+    detectors = stuck_detectors(PACK, (step, 10.0), (min(step, step_v or step), None))
     found: list[float | None] = [None, None]
     for number in range(int(seconds * 10.0)):
         now_s = number / 10.0
@@ -192,7 +191,7 @@ def test_a_constant_signal_can_be_sound(name: str) -> None:
 
 
 def test_a_signal_that_changes_again_is_no_longer_stuck() -> None:
-    current, voltage = stuck_detectors(PACK, steps=(0.5, 0.5), after_s=(10.0, 10.0))
+    current, voltage = stuck_detectors(PACK, (0.5, None), (0.5, None))
     verdicts = []
     for number in range(2000):
         now_s = number / 10.0
@@ -204,9 +203,10 @@ def test_a_signal_that_changes_again_is_no_longer_stuck() -> None:
 
 
 def test_a_temperature_is_stuck_after_the_stated_time_alone() -> None:
-    detector = ConstantDetector(60.0)
-    found = [detector.update(20.0 if t < 100 else 21.0, float(t)) for t in range(170)]
-    assert [t for t, is_stuck in enumerate(found) if is_stuck] == [
+    health = SignalHealth(SignalChecks(stuck_after_s=60.0, valid_after=1), is_cyclic=False)
+    used = passed(health, [20.0 if t < 100 else 21.0 for t in range(170)], 1.0)
+    assert [t for t, value in enumerate(used) if value is None] == [
         *range(60, 100),
         *range(160, 170),
     ]
+    assert health.reason == Reason.SIGNAL_STUCK

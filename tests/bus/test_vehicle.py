@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+from cangauge.bus.plausibility import SignalChecks
 from cangauge.bus.protection import LEAF_RULE, ProtectionRule
 from cangauge.bus.vehicle import PRESETS, Vehicle
 from cangauge.errors import InputError
@@ -173,13 +174,13 @@ def test_the_map_file_adds_codes_conditions_and_rules(own: Path) -> None:
     voltage = load(own, MAP.replace("[temperature]", more)).voltage
     assert 9999 in voltage.codec.not_available
     assert [voltage.codec.is_in(bytes([*bytes(6), n, 0])) for n in (3, 2)] == [True, False]
-    assert (voltage.checks.lowest, voltage.checks.stuck_after_s) == (2.0, 10.0)
+    assert voltage.checks == SignalChecks(lowest=2.0)
     message = load(own, MAP + (
         '\n[messages.0x100]\nprotection = "mine"\nperiod_s = 0.5\n'
         "[rules.mine]\npolynomial = 0x2F\ninitial = 0xFF\ncounter_bits = 4\n"
     )).messages[256]  # fmt: skip
     assert message.period_s == 0.5
-    assert message.rule == ProtectionRule("mine", 0x2F, initial=0xFF)
+    assert message.rule == ProtectionRule(polynomial=0x2F, initial=0xFF)
 
 
 @pytest.mark.parametrize(
@@ -228,7 +229,14 @@ def test_mistakes_in_a_map_name_field_and_cure(
             "does not fit",
         ),
         ("[rules.r]\npolynomial = 300", "rules.r.polynomial", "255"),
+        ("[rules.r]\npolynomial = 7\ninitial = -1", "rules.r.initial", "at least 0"),
+        ("[rules.r]\npolynomial = 7\ncounter_bits = 9", "rules.r.counter_bits", "at most 8"),
+        ("[rules.r]\npolynomial = 7\ncounter_bits = 1", "rules.r", "from 2 to 8"),
+        ("[rules.r]\npolynomial = 7\ncounter_shift = 5", "rules.r", "counter_shift"),
+        ("[rules.r]\npolynomial = 7\ncounter_byte = -1", "rules.r", "cannot be the same"),
         ("[rules.r]\n", "rules.r.polynomial", "is missing"),
+        ("[rules.r]\npolynomal = 7", "rules.r.polynomal", "mean polynomial"),
+        ("[rules]\nr = 7", "rules.r", "must be a table"),
     ],
 )
 def test_mistakes_in_protection_name_the_field(own: Path, more: str, field: str, text: str) -> None:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from cangauge.bus.protection import GENERIC_RULE, E2eRule
+from cangauge.bus.protection import GENERIC_RULE, E2eRule, ProtectionRule
 from cangauge.errors import InputError
 from cangauge.service.config import config_keys, load_config, reference
 from cangauge.service.setup import address_of, load_vehicle, pipeline_settings
@@ -162,9 +162,7 @@ def test_protection_and_checks_precede_the_vehicles(tmp_path: Path) -> None:
     vehicle = load_vehicle(load_config(path))
     assert vehicle.messages[0x400].rule == E2eRule("e2e_05", data_id=0x1234)
     assert vehicle.messages[0x400].period_s == 0.05
-    rule = vehicle.messages[0x401].rule
-    assert rule is not None
-    assert rule.name == "counter_of_mine"
+    assert vehicle.messages[0x401].rule == ProtectionRule(polynomial=7)
     assert vehicle.messages[0x402].rule is GENERIC_RULE
     checks = vehicle.voltage.checks
     assert (checks.lowest, checks.highest, checks.invalid_after) == (240.0, 410.0, 7)

@@ -23,10 +23,7 @@ from can.interfaces.socketcan import SocketcanBus
 from can.interfaces.udp_multicast import UdpMulticastBus
 from can.typechecking import CanFilter
 
-from cangauge.bus.open import (
-    UNKNOWN_INTERFACE,
-    BackendCapabilities,
-)
+from cangauge.bus.open import UNKNOWN_INTERFACE, BackendCapabilities
 from cangauge.errors import CangaugeError
 
 SEND_WITHIN_S: Final = 1.0
@@ -38,12 +35,9 @@ _POSTED_RETRY_S: Final = 0.005
 """Interval at which posted frames are retried while the transmit queue is full [s]."""
 _QUEUE_FULL: Final = {errno.ENOBUFS, errno.EAGAIN}
 
-BUS_OFF: Final = "bus_off"
-RESTARTED: Final = "restarted"
-UNSPECIFIED: Final = "unspecified"
 _CLASSES: Final = {
     0x001: "transmit_timeout", 0x002: "arbitration_lost", 0x008: "protocol", 0x010: "transceiver",
-    0x020: "no_acknowledge", 0x040: BUS_OFF, 0x080: "bus_error", 0x100: RESTARTED,
+    0x020: "no_acknowledge", 0x040: "bus_off", 0x080: "bus_error", 0x100: "restarted",
 }  # fmt: skip
 _CONTROLLER: Final = 0x004
 _CONTROLLER_STATES: Final = {
@@ -68,7 +62,7 @@ def error_kinds(message: can.Message) -> list[str]:
         state = message.data[1] if len(message.data) > 1 else 0
         states = [name for bit, name in _CONTROLLER_STATES.items() if state & bit]
         kinds += states or ["controller"]
-    return kinds or [UNSPECIFIED]
+    return kinds or ["unspecified"]
 
 
 _SO_MEMINFO: Final = 55
@@ -147,17 +141,14 @@ class BusConnection:
 
     def receive(self, timeout_s: float) -> can.Message | None:
         """Return the next frame that passes the filters; None if none came in time."""
-        messages = self._receive(timeout_s, 1)
+        messages = self.receive_pending(timeout_s, 1)
         return messages[0] if messages else None
 
-    def receive_pending(self, timeout_s: float) -> list[can.Message]:
-        """Return the pending frames that pass the filters, at most `AT_ONCE`; wait for the first.
+    def receive_pending(self, timeout_s: float, at_most: int = AT_ONCE) -> list[can.Message]:
+        """Return the pending frames that pass the filters; wait for the first.
 
         Raises BusError if the bus is gone.
         """
-        return self._receive(timeout_s, AT_ONCE)
-
-    def _receive(self, timeout_s: float, most: int) -> list[can.Message]:
         if self._posted:
             self._send_posted()
             timeout_s = min(timeout_s, _POSTED_RETRY_S)
@@ -188,7 +179,7 @@ class BusConnection:
                 self._count_error(message)
                 return messages
             messages.append(message)
-            if len(messages) == most:
+            if len(messages) == at_most:
                 break
         self.is_off = self.is_off and not messages
         return messages
@@ -271,12 +262,10 @@ class BusConnection:
 
     def _count_error(self, message: can.Message) -> None:
         self.error_frames += 1
-        kinds = error_kinds(message) if self.capabilities.has_error_classes else [UNSPECIFIED]
+        has_classes = self.capabilities.has_error_classes
+        kinds = error_kinds(message) if has_classes else ["unspecified"]
         self.error_kinds.update(kinds)
-        if BUS_OFF in kinds:
-            self.is_off = True
-        elif RESTARTED in kinds:
-            self.is_off = False
+        self.is_off = "bus_off" in kinds or (self.is_off and "restarted" not in kinds)
 
     def _classify(self, error: Exception) -> None:
         """Count an error of a single packet; take any other as a lost bus.

@@ -20,12 +20,9 @@ from typing import Final, Literal
 from xml.etree import ElementTree as ET
 
 import cantools.database
-import numpy as np
 from cantools.database.can import Database, Message, Signal
-from numpy.typing import NDArray
 
 from cangauge._files import MIB, read_bounded
-from cangauge._typing import FloatArray
 from cangauge.errors import InputError, closest
 
 MAX_DBC_BYTES: Final = 4 * MIB
@@ -40,7 +37,6 @@ _NOT_A_VALUE = re.compile(
     re.IGNORECASE,
 )
 _FLOATS: Final = {16: "e", 32: "f", 64: "d"}
-_LARGEST: Final = {"e": 65504.0, "f": 3.4028234e38, "d": math.inf}
 _KINDS: Final = {".arxml": "arxml", ".kcd": "kcd", ".sym": "sym"}  # besides DBC
 
 # cantools warns on stderr of messages defined twice; `find_message` reports the wanted ones.
@@ -168,17 +164,16 @@ class SignalCodec:
 
     def _raw(self, value: float) -> int:
         number = ((value - self.shift) / self.gain - self.offset) / self.factor
+        if math.isnan(value) and not self.float_format:
+            if not self.not_available:
+                problem = "the DBC has no code for a missing value"
+                raise InputError(problem, field=self.name, value=value)
+            return min(self.not_available)
         low, high = self.raw_range
         try:
             if self.float_format:
                 return int.from_bytes(struct.pack(">" + self.float_format, number), "big")
-            if not math.isnan(value):
-                raw = round(number)
-            elif self.not_available:
-                return min(self.not_available)
-            else:
-                problem = "the DBC has no code for a missing value"
-                raise InputError(problem, field=self.name, value=math.nan)
+            raw = round(number)
         except OverflowError:  # too large for the float, or infinite
             raw = high + 1
         if not low <= raw <= high or raw in self.not_available:
@@ -187,23 +182,6 @@ class SignalCodec:
             cure = "use a DBC with a wider signal"
             raise InputError(problem, field=self.name, value=value, cure=cure)
         return raw
-
-    def quantize(self, values: FloatArray) -> FloatArray:
-        """Return what `decode` gives after `encode_into`, for each value, without range check."""
-        numbers = ((values - self.shift) / self.gain - self.offset) / self.factor
-        if self.float_format:
-            numbers = numbers.astype(np.dtype(self.float_format)).astype(np.float64)
-        else:
-            numbers = np.rint(numbers)
-        return np.asarray(self.gain * (numbers * self.factor + self.offset) + self.shift)
-
-    def fits(self, values: FloatArray) -> NDArray[np.bool_]:
-        """Return which values `encode_into` accepts; NaN counts as accepted."""
-        numbers = ((values - self.shift) / self.gain - self.offset) / self.factor
-        if self.float_format:
-            return np.asarray(~(np.abs(numbers) > _LARGEST[self.float_format]))
-        raw, (low, high) = np.rint(numbers), self.raw_range
-        return np.asarray(~((raw < low) | (raw > high) | np.isin(raw, list(self.not_available))))
 
     @property
     def raw_range(self) -> tuple[int, int]:
@@ -351,21 +329,20 @@ def find_message(database: Database, message: str | int, *, source: object, fiel
 
     Raises InputError if there is none (with the closest names) or more than one.
     """
-    wanted: int | None = None
+    number: int | None = None
     with suppress(ValueError):
-        wanted = message if isinstance(message, int) else int(message, 0)
+        number = message if isinstance(message, int) else int(message, 0)
     messages = database.messages
-    found = [each for each in messages if each.name == message or each.frame_id == wanted]
-    if len(found) == 1:
-        return found[0]
-    if found:
-        problem, cure = f"the DBC defines {len(found)} such messages", "keep one of them"
+    matching = [each for each in messages if each.name == message or each.frame_id == number]
+    if len(matching) == 1:
+        return matching[0]
+    if matching:
+        problem, cure = f"the DBC defines {len(matching)} such messages", "keep one of them"
     else:
         problem = "the DBC has no such message"
-        near = closest(str(message), [each.name for each in messages]) if wanted is None else ""
-        shown = ", ".join(f"{each.name} (0x{each.frame_id:X})" for each in messages[:6])
-        more = f" and {len(messages) - 6} more" if len(messages) > 6 else ""
-        cure = f"did you mean {near}?" if near else f"its messages are {shown}{more}"
+        near = "" if number is not None else closest(str(message), [m.name for m in messages])
+        cure = near and f"did you mean {near}?"
+        cure = cure or _listed([f"{m.name} (0x{m.frame_id:X})" for m in messages], "its messages")
     raise InputError(problem, source=str(source), field=field, value=message, cure=cure)
 
 
@@ -377,27 +354,27 @@ def find_signal(
     Raises InputError if there is none (with the closest names) or more than one.
     """
     owners = [each for each in database.messages if _signal(each, signal)]
+    names = [owner.name for owner in owners]
+    problem, cure = "the DBC has no such signal", "check the name in the DBC"
+    searched = database.messages
     if message is not None:
         owner = find_message(database, message, source=source, field=f"{field}.message")
-        found = _signal(owner, signal)
-        if found is not None:
-            return owner, found
-        problem = f"message {owner.name} has no such signal"
-        names = [each.name for each in owner.signals]
-        shown = ", ".join(names[:8]) + (", …" if len(names) > 8 else "")
-        near = closest(signal, names)
-        cure = f"it has {shown}" if shown else "it has no signals"
-        cure = f"did you mean {near}?" if near else cure
-        if owners:
-            cure = f"it is in {', '.join(each.name for each in owners[:3])}"
+        if owner in owners:
+            return owner, owner.get_signal_by_name(signal)
+        problem, searched = f"message {owner.name} has no such signal", [owner]
+        cure = _listed([each.name for each in owner.signals], "its signals")
     elif len(owners) == 1:
         return owners[0], owners[0].get_signal_by_name(signal)
-    elif owners:
-        problem = f"{len(owners)} messages have such a signal"
-        problem += f" ({', '.join(each.name for each in owners[:5])})"
+    if owners and message is None:
+        problem = f"{len(owners)} messages have such a signal ({', '.join(names[:5])})"
         cure = "name the message too"
-    else:
-        problem = "the DBC has no such signal"
-        near = closest(signal, (each.name for owner in database.messages for each in owner.signals))
-        cure = f"did you mean {near}?" if near else "check the name in the DBC"
+    elif owners:
+        cure = f"it is in {', '.join(names[:3])}"
+    elif near := closest(signal, (each.name for owner in searched for each in owner.signals)):
+        cure = f"did you mean {near}?"
     raise InputError(problem, source=str(source), field=f"{field}.signal", value=signal, cure=cure)
+
+
+def _listed(names: list[str], what: str) -> str:
+    more = f" and {len(names) - 6} more" if len(names) > 6 else ""
+    return f"{what} are {', '.join(names[:6])}{more}" if names else f"{what} are none"

@@ -12,10 +12,10 @@ import can
 from cangauge.bus.database import SignalCodec
 from cangauge.bus.isotp import Reassembler, reply_id, reply_key
 from cangauge.bus.plausibility import (
-    ConstantDetector,
     MessageStatistics,
     PackProperties,
     SignalHealth,
+    StuckDetector,
     stuck_detectors,
 )
 from cangauge.bus.protection import FrameChecker, Verdict
@@ -44,7 +44,6 @@ class FrameStatistics:
     ignored: int = 0  # error frames and remote frames
     samples: int = 0
     current_unpaired: int = 0  # samples without a voltage (NaN)
-    voltage_unpaired: int = 0  # voltages dropped without a current
     time_reversals: int = 0  # wanted frames stamped before the last used one of their message
 
     def __getattr__(self, name: str) -> int:
@@ -66,50 +65,41 @@ class Pairing:
     - When time runs backwards by more than `within_s`, waiting values are released likewise.
 
     A value completes at most one sample. Samples keep the order of their currents. All times are
-    bus time [s]; `statistics` counts the values left unpaired.
+    bus time [s]; `statistics` counts the currents left unpaired.
     """
 
     def __init__(self, within_s: float, statistics: FrameStatistics | None = None) -> None:
         # Slightly more than stated: stamps 20 ms apart must pair in spite of rounding.
         self._within_s = within_s + 1e-6
         self.statistics = statistics or FrameStatistics()
-        self._current_s = self._voltage_s = math.nan  # NaN: no value waits
-        self._current_a = self._temperature_c = self._voltage_v = math.nan
+        self._waiting: Sample | None = None
+        self._voltage_s = self._voltage_v = math.nan  # NaN: no voltage waits
 
-    def current(self, time_s: float, current_a: float, temperature_c: float) -> Sample | None:
-        """Add a current [A] with the temperature [°C] at its time; return a sample, if any."""
-        if abs(time_s - self._voltage_s) <= self._within_s:
+    def current(self, sample: Sample) -> Sample | None:
+        """Add a current, as a sample without voltage; return a sample, if any."""
+        time_s, current_a, _, temperature_c = sample
+        is_paired = abs(time_s - self._voltage_s) <= self._within_s
+        self._voltage_s = math.nan
+        if is_paired:
             # No current can be waiting next to this voltage: they would have been paired.
-            self._voltage_s = math.nan
             return Sample(time_s, current_a, self._voltage_v, temperature_c)
-        self._drop_voltage()
-        unpaired = self.flush()
-        self._current_s, self._current_a = time_s, current_a
-        self._temperature_c = temperature_c
+        unpaired, self._waiting = self.flush(), sample
         return unpaired
 
     def voltage(self, time_s: float, voltage_v: float) -> Sample | None:
         """Add a voltage [V]; return a sample, if any."""
-        if abs(time_s - self._current_s) <= self._within_s:
-            sample = Sample(self._current_s, self._current_a, voltage_v, self._temperature_c)
-            self._current_s = math.nan
-            return sample
-        self._drop_voltage()
+        waiting = self._waiting
+        if waiting is not None and abs(time_s - waiting.time_s) <= self._within_s:
+            self._waiting = None
+            return Sample(waiting.time_s, waiting.current_a, voltage_v, waiting.temperature_c)
         self._voltage_s, self._voltage_v = time_s, voltage_v
         return self.flush()
 
     def flush(self) -> Sample | None:
         """Release the waiting current, if any, as a sample without voltage."""
-        if math.isnan(self._current_s):
-            return None
-        sample = Sample(self._current_s, self._current_a, math.nan, self._temperature_c)
-        self._current_s = math.nan
-        self.statistics.current_unpaired += 1
-        return sample
-
-    def _drop_voltage(self) -> None:
-        self.statistics.voltage_unpaired += not math.isnan(self._voltage_s)
-        self._voltage_s = math.nan
+        waiting, self._waiting = self._waiting, None
+        self.statistics.current_unpaired += waiting is not None
+        return waiting
 
 
 class CellVoltages:
@@ -224,7 +214,11 @@ class SampleDecoder:
         messages = vehicle.messages.items()
         self._by_pgn = {key & pgn_mask(key): key for key, each in messages if each.by_pgn}
         self._replies = {reply_id(key): Reassembler() for key, each in messages if each.is_reply}
-        detectors = _detectors(vehicle, pack)
+        detectors: dict[str, StuckDetector] = {}
+        if pack is not None:
+            both = (vehicle.current, vehicle.voltage)
+            steps = [(2.0 * each.codec.half_step, each.checks.stuck_after_s) for each in both]
+            detectors["current"], detectors["voltage"] = stuck_detectors(pack, *steps)
         for signal in vehicle.signals:
             self._add(signal, pack, detectors.get(signal.role))
         self.cells: CellVoltages | None = None
@@ -243,7 +237,7 @@ class SampleDecoder:
         self,
         signal: VehicleSignal,
         pack: PackProperties | None,
-        is_stuck: Callable[[float, float], bool] | None,
+        detector: StuckDetector | None,
     ) -> None:
         route, role = self._route(signal), signal.role
         is_multiplexed = bool(signal.codec.conditions)
@@ -252,7 +246,7 @@ class SampleDecoder:
             # A multiplexed signal is not in every frame of its message: its period is learned.
             None if is_multiplexed else self.vehicle.messages[signal.key].period_s,
             is_cyclic=role in {"current", "voltage"},
-            is_stuck=is_stuck,
+            is_stuck=None if detector is None else detector.update,
             statistics=route.statistics,
         )
         if route.checker is not None and not is_multiplexed:
@@ -337,16 +331,16 @@ class SampleDecoder:
                 current_a = value
             elif is_voltage:
                 voltage_v = value
-        sample = None
+        sample: Sample | None = None
         if not math.isnan(current_a):
             temperature_c = self.vehicle.fixed_temperature_c
             if self._temperature is not None:
                 temperature_c = self._temperature.value_at(time_s)
+            sample = Sample(time_s, current_a, voltage_v, temperature_c)
             if self._is_paired:
                 self.statistics.current_unpaired += math.isnan(voltage_v)
-                sample = Sample(time_s, current_a, voltage_v, temperature_c)
             else:
-                sample = self._pairing.current(time_s, current_a, temperature_c)
+                sample = self._pairing.current(sample)
         elif not (math.isnan(voltage_v) or self._is_paired):
             sample = self._pairing.voltage(time_s, voltage_v)
         self.statistics.samples += sample is not None
@@ -403,21 +397,3 @@ class SampleDecoder:
 def _is_suspected(sign_s: float, now_s: float) -> bool:
     """Return whether a sign of a second sender counts; not after the clock was set far back."""
     return abs(now_s - sign_s) < SUSPECTED_FOR_S
-
-
-def _detectors(
-    vehicle: Vehicle, pack: PackProperties | None
-) -> dict[str, Callable[[float, float], bool]]:
-    """Return the stuck detectors by role."""
-    detectors: dict[str, Callable[[float, float], bool]] = {}
-    temperature = vehicle.temperature
-    if temperature is not None and temperature.checks.stuck_after_s < math.inf:
-        detectors["temperature"] = ConstantDetector(temperature.checks.stuck_after_s).update
-    if pack is not None:
-        both = vehicle.current, vehicle.voltage
-        steps, after_s = zip(
-            *((2.0 * each.codec.half_step, each.checks.stuck_after_s) for each in both), strict=True
-        )
-        current, voltage = stuck_detectors(pack, steps=steps, after_s=after_s)
-        detectors["current"], detectors["voltage"] = current.update, voltage.update
-    return detectors

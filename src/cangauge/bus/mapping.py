@@ -8,7 +8,6 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from types import MappingProxyType
 from typing import Annotated, Any, Final, Literal, Self
 
 from cantools.database.can import Message
@@ -16,6 +15,7 @@ from pydantic import AliasChoices, BaseModel, ConfigDict, Field, FiniteFloat, mo
 
 from cangauge._config import read_toml
 from cangauge.bus.database import BitField
+from cangauge.bus.plausibility import SignalChecks
 from cangauge.bus.protection import (
     LIST_LENGTH,
     PROFILES,
@@ -38,42 +38,14 @@ COUNTER: Final = "counter"
 """Protection by a counter alone."""
 
 _Byte = Annotated[int, Field(ge=0, le=255)]
-_Place = Annotated[int, Field(ge=-64, le=63)]
 _Positive = Annotated[FiniteFloat, Field(gt=0.0)]
-_Count = Annotated[int, Field(ge=1, le=1000)]
 
 
 class _MapTable(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, strict=False)
 
 
-class CheckMap(_MapTable):
-    """Plausibility limits of a signal [A, positive = discharge; V; °C; %]; see `plausibility`.
-
-    A value may differ from the latest good one by `max_jump`, plus `max_rate_per_s` for every
-    second since then. `stuck_after_s` is the least duration of a constant value that can count as
-    stuck [s]: current and voltage while the other one moves; temperature only where it is stated.
-    """
-
-    lowest: FiniteFloat | None = None
-    highest: FiniteFloat | None = None
-    max_jump: _Positive | None = None
-    max_rate_per_s: _Positive | None = None
-    invalid_after: _Count | None = None
-    valid_after: _Count | None = None
-    stuck_after_s: _Positive | None = None
-    timeout_s: _Positive | None = None
-
-    @model_validator(mode="after")
-    def _a_range(self) -> Self:
-        if self.lowest is not None and self.highest is not None and self.lowest >= self.highest:
-            raise ValueError("lowest must lie below highest")
-        if (self.max_rate_per_s is None) is not (self.max_jump is None):
-            raise ValueError("max_jump and max_rate_per_s need each other")
-        return self
-
-
-class SignalMap(CheckMap):
+class SignalMap(SignalChecks):
     """One signal of the DBC: value = sign × scale × (DBC value) + offset.
 
     `message` is a name or id, optional where the signal's name is unique. `sign` is −1 where the
@@ -191,7 +163,7 @@ class MessageMap(_MapTable):
     counter_modulus: Annotated[int, Field(ge=3, lt=1 << 32)] | None = None
 
     def rule(
-        self, message: Message, rules: Mapping[str, RuleMap], *, source: str
+        self, message: Message, rules: Mapping[str, ProtectionRule], *, source: str
     ) -> Protection | None:
         """Return the protection of a message; None where none is stated.
 
@@ -201,33 +173,33 @@ class MessageMap(_MapTable):
         try:
             return self._rule(message, rules)
         except InputError as error:
-            name = (error.field or "").rpartition(".")[2]
-            where = f"messages.{message.name}.{name}"
+            where = f"messages.{message.name}.{error.field}"
             raise InputError(
                 error.problem, source=source, field=where, value=error.value, cure=error.cure
             ) from error
 
-    def _rule(self, message: Message, rules: Mapping[str, RuleMap]) -> Protection | None:
-        name = self.protection
-        if name != COUNTER:
-            self._refuse(f'"{COUNTER}"', "counter", "counter_modulus")
-        if name not in PROFILES:
-            self._refuse("an e2e profile", "data_id", "data_id_list", "data_id_mode",
-                         "header_byte", "protected_bytes")  # fmt: skip
+    def _rule(self, message: Message, rules: Mapping[str, ProtectionRule]) -> Protection | None:
+        name, known = self.protection, {**RULES, **rules}
+        names = _FIELDS_OF_COUNTER + _FIELDS_OF_PROFILES
+        stated = {each: getattr(self, each) for each in names if getattr(self, each) is not None}
+        for stated_name in stated:
+            of_counter = stated_name in _FIELDS_OF_COUNTER
+            if not (name == COUNTER if of_counter else name in PROFILES):
+                owner = f'"{COUNTER}"' if of_counter else "an e2e profile"
+                cure = f"set protection to {owner}, or remove this field"
+                raise InputError(f"belongs to {owner}", field=stated_name, cure=cure)
+        rule: Protection
         if name is None:
             return None
-        rule: Protection
-        if name in rules:
-            rule = ProtectionRule(name, **rules[name].model_dump())
+        if name in known:
+            rule = known[name]
+        elif name in PROFILES:
+            rule = E2eRule(name, **stated)
         elif name == COUNTER:
             rule = self._counter_rule(message)
-        elif name in PROFILES:
-            rule = self._profile_rule(name)
-        elif name in RULES:
-            rule = RULES[name]
         else:
-            known = ", ".join([*RULES, COUNTER, *PROFILES, *rules])
-            cure = f"known are {known}; or define it under [rules.{name}]"
+            cure = f"known are {', '.join([*RULES, COUNTER, *PROFILES, *rules])};"
+            cure += f" or define it under [rules.{name}]"
             raise InputError("unknown protection rule", field="protection", value=name, cure=cure)
         if not rule.fits(message.length):
             problem = f"the rule does not fit into the {message.length} bytes of the message"
@@ -243,40 +215,13 @@ class MessageMap(_MapTable):
             problem = f"message {message.name} has no such signal"
             raise InputError(problem, field="counter", value=self.counter)
         bits = BitField.of(signal, message.length)
-        return CounterRule(COUNTER, bits, message.length, self.counter_modulus or 1 << bits.width)
-
-    def _profile_rule(self, name: str) -> E2eRule:
-        wanted = "data_id" if PROFILES[name].id_bits else "data_id_list"
-        if getattr(self, wanted) is None:
-            cure = f"the CRC of {name} covers it: ask the sender's manufacturer"
-            raise InputError("is missing", field=wanted, cure=cure)
-        return E2eRule(
-            name,
-            data_id=self.data_id or 0,
-            data_ids=bytes(self.data_id_list or ()),
-            data_id_mode=self.data_id_mode or "both",
-            header_byte=self.header_byte or 0,
-            protected_bytes=self.protected_bytes or 0,
-        )
-
-    def _refuse(self, protection: str, *names: str) -> None:
-        """Raise InputError for fields that belong to another protection only."""
-        for name in names:
-            if getattr(self, name) is not None:
-                cure = f"set protection to {protection}, or remove this field"
-                raise InputError(f"belongs to {protection}", field=name, cure=cure)
+        return CounterRule(bits, self.counter_modulus or 1 << bits.width)
 
 
-class RuleMap(_MapTable):
-    """A user's own protection rule; see `ProtectionRule`."""
-
-    polynomial: _Byte
-    initial: _Byte = 0
-    xor_out: _Byte = 0
-    crc_byte: _Place = -1
-    counter_bits: Annotated[int, Field(ge=0, le=8)] = 4
-    counter_byte: _Place = -2
-    counter_shift: Annotated[int, Field(ge=0, le=7)] = 0
+_FIELDS_OF_COUNTER: Final = ("counter", "counter_modulus")
+_FIELDS_OF_PROFILES: Final = (
+    "data_id", "data_id_list", "data_id_mode", "header_byte", "protected_bytes",
+)  # fmt: skip
 
 
 class VehicleMap(_MapTable):
@@ -301,7 +246,7 @@ class VehicleMap(_MapTable):
     temperature_source: TemperatureSource = "unknown"
     pair_within_s: Annotated[FiniteFloat, Field(ge=0.0, le=1.0)] = PAIR_WITHIN_S
     messages: dict[str, MessageMap] = Field(default_factory=dict)
-    rules: dict[str, RuleMap] = Field(default_factory=dict)
+    rules: dict[str, ProtectionRule] = Field(default_factory=dict)
 
     @model_validator(mode="before")
     @classmethod
@@ -330,9 +275,6 @@ def columns_of_map(path: Path | str) -> ColumnMap | None:
     return ColumnMap.of(columns, where)
 
 
-_NONE: Final[Mapping[str, Any]] = MappingProxyType({})
-
-
 @dataclass(frozen=True, slots=True)
 class Overrides:
     """Protection and checks of a service configuration, which override the car's map file.
@@ -342,9 +284,9 @@ class Overrides:
     """
 
     source: str = ""
-    messages: Mapping[str, MessageMap] = field(default_factory=lambda: _NONE)
-    rules: Mapping[str, RuleMap] = field(default_factory=lambda: _NONE)
-    checks: Mapping[str, CheckMap] = field(default_factory=lambda: _NONE)
+    messages: Mapping[str, MessageMap] = field(default_factory=dict)
+    rules: Mapping[str, ProtectionRule] = field(default_factory=dict)
+    checks: Mapping[str, SignalChecks] = field(default_factory=dict)
 
     def merged_messages(
         self, mapping: VehicleMap, source: str, key_of: Callable[[str], int]

@@ -26,7 +26,7 @@ from cangauge.errors import InputError
 
 try:
     import msgpack
-except ImportError:  # then there is no UDP bus either
+except ImportError:  # in a light install; then there is no UDP bus either
     msgpack = None
 
 BusOption = str | int | float | bool
@@ -92,7 +92,7 @@ def bus_address(
         raise InputError(f"{interface} needs a channel", field="--channel", cure="name one")
     if interface != "udp_multicast":
         return BusAddress(interface, channel, options)
-    if not _is_multicast(channel):
+    if not is_multicast(channel):
         cure = f"use one such as {MULTICAST_CHANNEL}"
         raise InputError("no multicast address", field="--channel", value=channel, cure=cure)
     # 0: packets sent stay on this machine; 1 (`--bus-option hop_limit=1`): local network.
@@ -102,7 +102,7 @@ def bus_address(
 def _guess_interface(channel: str | None) -> str:
     if has_socketcan(channel or _DEFAULT_CHANNELS["socketcan"]):
         return "socketcan"
-    if channel is None or _is_multicast(channel):
+    if channel is None or is_multicast(channel):
         return "udp_multicast"
     problem = "there is no such SocketCAN interface on this machine"
     cure = "bring it up (sudo ip link add dev vcan0 type vcan; sudo ip link set vcan0 up),"
@@ -122,12 +122,8 @@ def has_socketcan(channel: str) -> bool:
         return False
 
 
-def is_interface_name(channel: str | None) -> bool:
-    """Return whether a channel is the name of a network interface, not a multicast address."""
-    return channel is not None and not _is_multicast(channel)
-
-
-def _is_multicast(channel: str) -> bool:
+def is_multicast(channel: str) -> bool:
+    """Return whether a channel is a multicast address, not the name of a network interface."""
     try:
         return ipaddress.ip_address(channel).is_multicast
     except ValueError:
@@ -204,15 +200,13 @@ def _refusal(address: BusAddress, error: BaseException) -> InputError:
     code = cause.errno if isinstance(cause, OSError) else None
     interface, channel = address.interface, address.channel
     reason = " ".join(str(cause).split()) or type(cause).__name__
-    kind, name, value = InputError, "--channel", channel
+    kind, of_interface = InputError, False
     if code in {errno.EAFNOSUPPORT, errno.EPROTONOSUPPORT} and interface == "socketcan":
-        problem = "this machine has no SocketCAN"
+        problem, of_interface = "this machine has no SocketCAN", True
         cure = "use another interface, e.g. --interface udp_multicast"
-        name, value = "--interface", interface
     elif code in {errno.ENETUNREACH, errno.EADDRNOTAVAIL} and interface == "udp_multicast":
-        problem = "no network interface of this machine carries multicast"
+        problem, of_interface = "no network interface of this machine carries multicast", True
         cure = "bring a network interface up, or use SocketCAN"
-        name, value = "--interface", interface
     elif code == errno.ENETDOWN:
         problem, cure = "this bus is down", f"bring it up: sudo ip link set {channel} up"
     elif code in {errno.ENODEV, errno.ENXIO, errno.ENOENT}:
@@ -224,14 +218,15 @@ def _refusal(address: BusAddress, error: BaseException) -> InputError:
     elif isinstance(error, can.CanInterfaceNotImplementedError | ImportError | NameError) or any(
         word in reason for word in ("library", "module", "install")
     ):
+        kind, of_interface = DriverMissingError, True
         problem = f"a library for this interface is missing ({reason})"
         cure = f"install the library that python-can's documentation names for {interface}"
         if interface == "udp_multicast":
             cure = "install msgpack (pip install 'python-can[multicast]')"
-        kind, name, value = DriverMissingError, "--interface", interface
     else:
         problem = f"{interface} cannot open this bus ({reason})"
         cure = "check channel and --bus-option"
+    name, value = ("--interface", interface) if of_interface else ("--channel", channel)
     return kind(problem, field=name, value=value, cure=cure)
 
 

@@ -14,10 +14,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, replace
-from typing import Final
+from dataclasses import dataclass
+from typing import Annotated, Final, Self
 
-from cangauge.bus.mapping import CheckMap
+from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, model_validator
+
 from cangauge.types import CURRENT_AT_MOST_A, TEMPERATURE_WITHIN_C, VOLTAGE_WITHIN, Reason
 
 INVALID_AFTER: Final = 5
@@ -29,6 +30,8 @@ TEMPERATURE_JUMP_K: Final = 5.0
 TEMPERATURE_RATE_K_PER_S: Final = 1.0
 """Above coarse quantization and alternating sensors, and above what a pack's heat capacity allows.
 Current and voltage have no default rate limit: contactors, fuses, short circuits."""
+USUAL_TIMEOUT_S: Final = (10.0, 2.0)
+"""Time-out while the period is not known [s]: of signals sent on change, and of cyclic ones."""
 MISSED_UNTIL_OLD: Final = 10.0
 MISSED_AT_LEAST: Final = 3.0
 TIMEOUT_AT_LEAST_S: Final = 0.5
@@ -52,51 +55,50 @@ class PackProperties:
     usual_v: float
 
 
-@dataclass(frozen=True, slots=True)
-class SignalChecks:
-    """Limits of one signal; as in `mapping.CheckMap`, without limit by default.
+_Positive = Annotated[FiniteFloat, Field(gt=0.0)]
+_Count = Annotated[int, Field(ge=1, le=1000)]
 
-    `usual_timeout_s` is the time-out while the period is not known [s].
+
+class SignalChecks(BaseModel):
+    """Plausibility limits of a signal [A, positive = discharge; V; °C; %].
+
+    A value may differ from the latest good one by `max_jump`, plus `max_rate_per_s` for every
+    second since then. `stuck_after_s` is the least duration of a constant value that can count as
+    stuck [s]: current and voltage while the other one moves; others only where it is stated.
     """
 
-    lowest: float = -math.inf
-    highest: float = math.inf
-    max_jump: float = math.inf
-    max_rate_per_s: float = 0.0
-    invalid_after: int = INVALID_AFTER
-    valid_after: int = VALID_AFTER
-    stuck_after_s: float = math.inf
-    timeout_s: float | None = None
-    usual_timeout_s: float = 10.0
+    model_config = ConfigDict(extra="forbid", frozen=True)
 
-    def updated(self, *stated: CheckMap) -> SignalChecks:
-        """Return the checks with stated values replaced; the last mapping wins."""
-        values = [(name, getattr(each, name)) for each in stated for name in CheckMap.model_fields]
-        return replace(self, **{name: value for name, value in values if value is not None})
+    lowest: FiniteFloat = -math.inf
+    highest: FiniteFloat = math.inf
+    max_jump: _Positive = math.inf
+    max_rate_per_s: _Positive = 0.0
+    invalid_after: _Count = INVALID_AFTER
+    valid_after: _Count = VALID_AFTER
+    stuck_after_s: _Positive | None = None
+    timeout_s: _Positive | None = None
+
+    @model_validator(mode="after")
+    def _a_range(self) -> Self:
+        if self.lowest >= self.highest:
+            raise ValueError("lowest must lie below highest")
+        if (self.max_rate_per_s > 0.0) is not (self.max_jump < math.inf):
+            raise ValueError("max_jump and max_rate_per_s need each other")
+        return self
 
     def within_pack(self, role: str, pack: PackProperties) -> SignalChecks:
         """Return the checks with the physical limits of a pack where none are stated."""
-        limits = {
-            "current": (-CURRENT_AT_MOST_A, CURRENT_AT_MOST_A),
-            "voltage": (VOLTAGE_WITHIN[0] * pack.usual_v, VOLTAGE_WITHIN[1] * pack.usual_v),
-            "temperature": TEMPERATURE_WITHIN_C,
-        }
-        low, high = limits.get(role, (-math.inf, math.inf))
-        jump, rate_per_s = self.max_jump, self.max_rate_per_s
-        if role == "temperature" and jump == math.inf:
-            jump, rate_per_s = TEMPERATURE_JUMP_K, TEMPERATURE_RATE_K_PER_S
-        return replace(
-            self,
-            lowest=low if self.lowest == -math.inf else self.lowest,
-            highest=high if self.highest == math.inf else self.highest,
-            max_jump=jump,
-            max_rate_per_s=rate_per_s,
-        )
-
-
-_FAST: Final = SignalChecks(stuck_after_s=STUCK_AFTER_S, usual_timeout_s=2.0)
-DEFAULTS: Final = {"current": _FAST, "voltage": _FAST}
-"""By role. Physical limits need the pack's model; see `SignalChecks.within_pack`."""
+        limits: dict[str, float] = {}
+        if role == "current":
+            limits = {"lowest": -CURRENT_AT_MOST_A, "highest": CURRENT_AT_MOST_A}
+        elif role == "voltage":
+            low, high = VOLTAGE_WITHIN
+            limits = {"lowest": low * pack.usual_v, "highest": high * pack.usual_v}
+        elif role == "temperature":
+            low, high = TEMPERATURE_WITHIN_C
+            limits = {"lowest": low, "highest": high, "max_jump": TEMPERATURE_JUMP_K,
+                      "max_rate_per_s": TEMPERATURE_RATE_K_PER_S}  # fmt: skip
+        return self.model_copy(update={**limits, **self.model_dump(exclude_unset=True)})
 
 
 @dataclass(slots=True)
@@ -145,6 +147,12 @@ class SignalHealth:
         statistics: MessageStatistics | None = None,
     ) -> None:
         self._checks = checks
+        # Read for every value; slow to read from a model.
+        self._lowest, self._highest = checks.lowest, checks.highest
+        self._max_jump, self._max_rate_per_s = checks.max_jump, checks.max_rate_per_s
+        self._stated_timeout_s = checks.timeout_s
+        # A cyclic signal is compared with its partner.
+        self._constant_for_s = (not is_cyclic and checks.stuck_after_s) or math.inf
         self._period_s = period_s
         self._is_cyclic = is_cyclic
         self._is_stuck = is_stuck
@@ -153,31 +161,33 @@ class SignalHealth:
         self.reason = Reason.NONE
         self.latest = self.latest_s = math.nan
         self._failures = self._passes = self._intervals = 0
-        self._arrived_s = self._learned_s = math.nan
+        self._arrived_s = self._learned_s = self._since_s = math.nan
 
     def update(self, value: float, time_s: float) -> float:
         """Return a value [A, V, °C, %; NaN: not available] at bus time [s]; NaN if refused."""
-        checks = self._checks
         interval_s, self._arrived_s = time_s - self._arrived_s, time_s
         if interval_s > 0.0:
             self._learn(interval_s)
         if value != value:  # noqa: PLR0124 - NaN; this runs for every value
             self._statistics.not_available += 1
             return self.fail(_NO_REASON)
-        most = checks.max_jump
+        most = self._max_jump
         if most < math.inf:
-            most += checks.max_rate_per_s * abs(time_s - self.latest_s)
+            most += self._max_rate_per_s * abs(time_s - self.latest_s)
         # The second is false before the first good value (NaN).
-        if not checks.lowest <= value <= checks.highest or abs(value - self.latest) > most:
+        if not self._lowest <= value <= self._highest or abs(value - self.latest) > most:
             self._statistics.implausible += 1
             return self.fail(_IMPLAUSIBLE)
-        if self._is_stuck is not None and self._is_stuck(value, time_s):
+        if value != self.latest or time_s < self._since_s:
+            self._since_s = time_s
+        is_stuck = time_s - self._since_s >= self._constant_for_s
+        if is_stuck or (self._is_stuck is not None and self._is_stuck(value, time_s)):
             self._statistics.stuck += 1
             return self.fail(Reason.SIGNAL_STUCK)
         self._failures = 0
         if self.is_invalid:
             self._passes += 1
-            if self._passes < checks.valid_after:
+            if self._passes < self._checks.valid_after:
                 self._statistics.held_back += 1
                 return math.nan
         self.is_invalid, self.reason = False, _NO_REASON
@@ -234,10 +244,9 @@ class SignalHealth:
     @property
     def timeout_s(self) -> float:
         """Age at which a value becomes old [s]."""
-        checks = self._checks
-        if checks.timeout_s is not None:
-            return checks.timeout_s
-        usual_s, period_s = checks.usual_timeout_s, self.period_s
+        if self._stated_timeout_s is not None:
+            return self._stated_timeout_s
+        usual_s, period_s = USUAL_TIMEOUT_S[self._is_cyclic], self.period_s
         if math.isnan(period_s):
             return usual_s
         if self._is_cyclic:
@@ -313,16 +322,17 @@ class StuckDetector:
 
 
 def stuck_detectors(
-    pack: PackProperties, *, steps: tuple[float, float], after_s: tuple[float, float]
+    pack: PackProperties, current: tuple[float, float | None], voltage: tuple[float, float | None]
 ) -> tuple[StuckDetector, StuckDetector]:
     """Return coupled stuck detectors for current and voltage of one pack.
 
     A change of the current by ΔI changes the voltage by R·ΔI at once. A voltage whose code stays
     constant while the current swings, by R·ΔI of several quantization steps, is stuck; and vice
     versa. Turning points are counted, not drift, so that these are not called stuck: a pack at
-    rest; a charge at constant current; a current of exactly 0 next to a noisy voltage. `steps` and
-    `after_s`, of current and voltage, are as in `StuckDetector`.
+    rest; a charge at constant current; a current of exactly 0 next to a noisy voltage. Of each
+    signal: its quantization in the frame [A, V] and `stuck_after_s`.
     """
+    (step_a, after_a_s), (step_v, after_v_s) = current, voltage
     ohm, least_a = pack.resistance_ohm, SWING_C_RATE * pack.capacity_ah
 
     def swing_a(step_v: float) -> float:
@@ -332,26 +342,9 @@ def stuck_detectors(
         least_v = max(max(STEPS * step_a, least_a) * ohm, ERRORS * pack.error_std_v)
         return least_v if least_v > 0.0 else math.inf
 
-    current = StuckDetector(after_s[0], steps[0], swing_v)
-    voltage = StuckDetector(after_s[1], steps[1], swing_a)
-    current.swing = swing_a(max(steps[1], COARSE_STEP * pack.usual_v))
-    voltage.swing = swing_v(steps[0])
-    current.partner, voltage.partner = voltage, current
-    return current, voltage
-
-
-class ConstantDetector:
-    """Detect a signal that has been constant for a stated time [s].
-
-    For a temperature: without a partner, it is constant for hours in a healthy car.
-    """
-
-    def __init__(self, after_s: float) -> None:
-        self._after_s = after_s
-        self._value = self._since_s = math.nan
-
-    def update(self, value: float, time_s: float) -> bool:
-        """Add a value at bus time `time_s` [s]; return whether the signal is stuck."""
-        if value != self._value or time_s < self._since_s:
-            self._value, self._since_s = value, time_s
-        return time_s - self._since_s >= self._after_s
+    of_current = StuckDetector(after_a_s or STUCK_AFTER_S, step_a, swing_v)
+    of_voltage = StuckDetector(after_v_s or STUCK_AFTER_S, step_v, swing_a)
+    of_current.swing = swing_a(max(step_v, COARSE_STEP * pack.usual_v))
+    of_voltage.swing = swing_v(step_a)
+    of_current.partner, of_voltage.partner = of_voltage, of_current
+    return of_current, of_voltage

@@ -10,56 +10,47 @@ from __future__ import annotations
 
 import enum
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Final, Literal, NamedTuple
+from typing import Annotated, Any, Final, Literal, NamedTuple
 
 from e2e import p01, p02, p04, p05, p06, p07, p11
+from pydantic import ConfigDict, Field
+from pydantic.dataclasses import dataclass as checked_dataclass
 
 from cangauge.bus.database import BitField
 from cangauge.errors import InputError
 
-
-def _require(holds: bool, name: str, value: object, problem: str) -> None:
-    if not holds:
-        raise InputError(problem, field=name, value=value)
+_Byte = Annotated[int, Field(ge=0, le=255)]
+_Place = Annotated[int, Field(ge=-64, le=63)]
 
 
-@dataclass(frozen=True, slots=True)
+@checked_dataclass(frozen=True, slots=True, config=ConfigDict(extra="forbid"))
 class ProtectionRule:
     """CRC-8 (not reflected) over all other bytes, and a counter of `counter_bits` (0: none).
 
     `crc_byte` and `counter_byte` are places, negative ones from the end; `counter_shift` is the
-    counter's lowest bit. Raises InputError if a value is out of range, or CRC and counter overlap.
+    counter's lowest bit.
     """
 
-    name: str
-    polynomial: int
-    initial: int = 0
-    xor_out: int = 0
-    crc_byte: int = -1
-    counter_bits: int = 4
-    counter_byte: int = -2
-    counter_shift: int = 0
+    polynomial: _Byte
+    initial: _Byte = 0
+    xor_out: _Byte = 0
+    crc_byte: _Place = -1
+    counter_bits: Annotated[int, Field(ge=0, le=8)] = 4
+    counter_byte: _Place = -2
+    counter_shift: Annotated[int, Field(ge=0, le=7)] = 0
+
     _table: bytes = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
-        ranges = {"polynomial": 255, "initial": 255, "xor_out": 255, "counter_shift": 7,
-                  "counter_bits": 8 - self.counter_shift}  # fmt: skip
-        for name, high in ranges.items():
-            value = getattr(self, name)
-            _require(0 <= value <= high, f"{self.name}.{name}", value, f"must be within 0–{high}")
-        _require(self.counter_bits != 1, f"{self.name}.counter", None,
-                 "a 1-bit counter is too short")  # fmt: skip
-        _require(not self.counter_bits or self.counter_byte != self.crc_byte,
-                 f"{self.name}.counter_byte", self.counter_byte,
-                 "counter and CRC cannot share a byte")  # fmt: skip
-        table = bytearray(256)
-        for value in range(256):
-            crc = value
-            for _ in range(8):
-                crc = ((crc << 1) ^ self.polynomial if crc & 0x80 else crc << 1) & 0xFF
-            table[value] = crc
+        if self.counter_bits == 1 or self.counter_bits + self.counter_shift > 8:
+            raise ValueError("counter_bits must be 0, or from 2 to 8 with counter_shift")
+        if self.counter_bits and self.counter_byte == self.crc_byte:
+            raise ValueError("counter_byte and crc_byte cannot be the same")
+        table: Sequence[int] = range(256)
+        for _ in range(8):
+            table = [(v << 1 & 0xFF) ^ (self.polynomial if v & 0x80 else 0) for v in table]
         object.__setattr__(self, "_table", bytes(table))
 
     @property
@@ -70,8 +61,8 @@ class ProtectionRule:
     def fits(self, length: int) -> bool:
         """Return whether a payload of `length` bytes has both bytes, and they differ."""
         places = (self.crc_byte, self.counter_byte) if self.counter_bits else (self.crc_byte,)
-        found = {place if place >= 0 else length + place for place in places}
-        return all(0 <= place < length for place in found) and len(found) == len(places)
+        bytes_of = {place if place >= 0 else length + place for place in places}
+        return all(0 <= byte < length for byte in bytes_of) and len(bytes_of) == len(places)
 
     def crc(self, data: bytes | bytearray) -> int:
         """Return the CRC of a payload, independent of its CRC byte."""
@@ -99,45 +90,39 @@ class ProtectionRule:
         return bytes(out)
 
 
-LEAF_RULE: Final = ProtectionRule("leaf", polynomial=0x85, counter_bits=2)
+LEAF_RULE: Final = ProtectionRule(polynomial=0x85, counter_bits=2)
 """Nissan Leaf EV-CAN: 0x1DB, 0x1DC, 0x55B."""
 
 GENERIC_RULE: Final = ProtectionRule(
-    "generic", polynomial=0x1D, initial=0xFF, xor_out=0xFF, counter_bits=4, counter_shift=4
+    polynomial=0x1D, initial=0xFF, xor_out=0xFF, counter_bits=4, counter_shift=4
 )
 """CRC-8 SAE J1850 in the last byte, counter in the high half of the byte before: the frames that
 `replay` sends as the generic pack."""
 
-CRC_ONLY_RULE: Final = ProtectionRule(
-    "crc_only", polynomial=0x1D, initial=0xFF, xor_out=0xFF, counter_bits=0
-)
+CRC_ONLY_RULE: Final = ProtectionRule(polynomial=0x1D, initial=0xFF, xor_out=0xFF, counter_bits=0)
 """CRC-8 SAE J1850 in the last byte, no counter: REPLAY_CLOCK."""
 
-RULES: Final = {rule.name: rule for rule in (LEAF_RULE, GENERIC_RULE, CRC_ONLY_RULE)}
+RULES: Final = {"leaf": LEAF_RULE, "generic": GENERIC_RULE, "crc_only": CRC_ONLY_RULE}
 """Rules that a map file can name."""
 
 
 @dataclass(frozen=True, slots=True)
 class CounterRule:
-    """A counter that is a signal of the DBC, with values below `modulus`; no known CRC.
+    """A counter that is a signal of the DBC, with values below `modulus`; no known CRC."""
 
-    `length` is the message's. Raises InputError if the bits cannot hold `modulus` values.
-    """
-
-    name: str
     field: BitField
-    length: int
     modulus: int
 
     def __post_init__(self) -> None:
-        width, most = self.field.width, 1 << self.field.width
-        problem = f"a counter of {width} bits has 3 to {most} values"
-        _require(3 <= self.modulus <= most, f"{self.name}.counter_modulus", self.modulus,
-                 problem if most >= 3 else "a 1-bit counter is too short")  # fmt: skip
+        most = 1 << self.field.width
+        if not 3 <= self.modulus <= most:
+            problem = f"a counter of {self.field.width} bits has 3 to {most} values"
+            problem = problem if most >= 3 else "a 1-bit counter is too short"
+            raise InputError(problem, field="counter_modulus", value=self.modulus)
 
-    def fits(self, length: int) -> bool:
-        """Return whether a payload has the length of the message."""
-        return length == self.length
+    def fits(self, _length: int) -> bool:
+        """Return True: the signal fits into its message."""
+        return True
 
     def is_whole(self, data: bytes | bytearray) -> bool:
         """Return whether the counter value is a possible one."""
@@ -194,44 +179,46 @@ class E2eRule:
     The CRC covers the data id too, so that a frame sent under a wrong id is refused. Profile 2 has
     a list of 16 data ids, one per counter value; the mode of the data id is a choice in profiles 1
     and 11. `header_byte` is the first byte of the header, `protected_bytes` 0 for the whole
-    payload. Raises InputError if the profile is unknown, or does not allow these values.
+    payload. Raises InputError if the profile does not allow these values.
     """
 
     name: str
-    data_id: int = 0
-    data_ids: bytes = b""
+    data_id: int | None = None
+    data_id_list: tuple[int, ...] | None = None
     data_id_mode: DataIdMode = "both"
     header_byte: int = 0
     protected_bytes: int = 0
     _profile: Profile = field(init=False, repr=False, compare=False)
+    _data_id: int | bytes = field(init=False, repr=False, compare=False)
     _arguments: dict[str, Any] = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
-        profile = PROFILES.get(self.name)
-        if profile is None:
-            raise InputError("unknown profile", field="protection", value=self.name,
-                             cure=f"known are {', '.join(PROFILES)}")  # fmt: skip
-        arguments: dict[str, Any] = {"length": self.protected_bytes}
-        if profile.id_bits:
-            _require(0 <= self.data_id < 1 << profile.id_bits, "data_id", self.data_id,
-                     f"{self.name} has a data id of {profile.id_bits} bits")  # fmt: skip
-            _require(not self.data_ids, "data_id_list", None, f"{self.name} has one data id")
+        name, profile = self.name, PROFILES[self.name]
+        bits, modes = profile.id_bits, profile.modes or {"both": 0}
+        least, protected = self.header_byte + profile.header, self.protected_bytes
+        wanted = "data_id" if bits else "data_id_list"
+        if getattr(self, wanted) is None:
+            cure = f"the CRC of {name} covers it: ask the sender's manufacturer"
+            raise InputError("is missing", field=wanted, cure=cure)
+        problems = {
+            "data_id_list": bits and self.data_id_list and f"{name} has one data id",
+            "data_id": (self.data_id or 0) >> bits and f"{name} has a data id of {bits} bits",
+            "data_id_mode": self.data_id_mode not in modes and f"{name} has {', '.join(modes)}",
+            "header_byte": self.header_byte and not bits and f"{name} has its header at byte 0",
+            "protected_bytes": 0 < protected < least
+            and f"must hold the header: at least {least} bytes",
+        }
+        for where, problem in problems.items():
+            if problem:
+                raise InputError(str(problem), field=where, value=getattr(self, where))
+        arguments: dict[str, Any] = {"length": protected}
+        if bits:
             arguments["offset"] = self.header_byte
-        else:
-            _require(len(self.data_ids) == LIST_LENGTH, "data_id_list", len(self.data_ids),
-                     f"{self.name} has a list of {LIST_LENGTH} data ids")  # fmt: skip
-            _require(not self.header_byte, "header_byte", self.header_byte,
-                     f"the header of {self.name} begins at byte 0")  # fmt: skip
-        modes = profile.modes or {"both": 0}
-        _require(self.data_id_mode in modes, "data_id_mode", self.data_id_mode,
-                 f"{self.name} has {', '.join(modes)}")  # fmt: skip
-        _require(self.header_byte >= 0, "header_byte", self.header_byte, "must not be negative")
-        least = self.header_byte + profile.header
-        _require(self.protected_bytes == 0 or self.protected_bytes >= least, "protected_bytes",
-                 self.protected_bytes, f"must hold the header: at least {least}")  # fmt: skip
         if profile.modes:
-            arguments["data_id_mode"] = profile.modes[self.data_id_mode]
+            arguments["data_id_mode"] = modes[self.data_id_mode]
+        data_id = self.data_id if self.data_id_list is None else bytes(self.data_id_list)
         object.__setattr__(self, "_profile", profile)
+        object.__setattr__(self, "_data_id", data_id)
         object.__setattr__(self, "_arguments", arguments)
 
     @property
@@ -247,7 +234,7 @@ class E2eRule:
         """Return whether header and CRC agree; the library refuses impossible counters."""
         if isinstance(data, bytes):
             data = bytearray(data)  # some checks of the library accept bytearray only
-        return self._profile.check(data, self.data_ids or self.data_id, **self._arguments)
+        return self._profile.check(data, self._data_id, **self._arguments)
 
     def counter(self, data: bytes | bytearray) -> int:
         """Return the counter of a payload."""
@@ -265,13 +252,12 @@ class E2eRule:
             out[place : place + size] = counter.to_bytes(size, "big")
         else:
             out[place] = out[place] & 0xF0 | counter
-        data_id = self.data_ids or self.data_id
-        profile.protect(out, data_id, increment_counter=False, **self._arguments)
+        profile.protect(out, self._data_id, increment_counter=False, **self._arguments)
         return bytes(out)
 
 
 Protection = ProtectionRule | CounterRule | E2eRule
-"""CRC and alive counter of a message: `name`, `modulus` (0 without a counter), `fits`, `is_whole`,
+"""CRC and alive counter of a message: `modulus` (0 without a counter), `fits`, `is_whole`,
 `counter`, `protect`."""
 
 
@@ -336,40 +322,37 @@ class FrameChecker:
 
     def check(self, data: bytes | bytearray, time_s: float) -> Verdict:
         """Check a payload of the message's own length, received at bus time `time_s` [s]."""
-        modulus = self._modulus
+        modulus, last = self._modulus, self._last
         if not self._is_whole(data):
             self._refused += 1
             return Verdict.CRC_WRONG
         if not modulus:
             return Verdict.GOOD
-        last, counter = self._last, self._counter(data)
+        counter = self._counter(data)
         elapsed_s, self._last_s = time_s - self._last_s, time_s
         steps = (counter - last) % modulus
+        self.lost = 0
         if steps == 1 or last < 0:
             self._is_repeated = False
             if self._odd:
                 self._odd = max(self._odd - FORGIVEN, 0.0)
-            return self._accept(counter, data, lost=0)
-        period_s = self.learned_period_s() if self._period_s is None else self._period_s
-        is_soon = 0.0 <= elapsed_s < SOON * period_s
-        is_repeated, was_repeated = steps == 0 and elapsed_s <= self._half_wrap_s, self._is_repeated
-        self._is_repeated = is_repeated
-        # The second repetition in a row is a stuck counter.
-        if (is_soon or (is_repeated and not was_repeated)) and data != self._content:
-            self._odd = min(self._odd + 1.0, 2.0 * SUSPECTED_AT)
-        if is_repeated:
-            return Verdict.REPEATED
-        if steps == 0:
-            steps = min(modulus, WIDE)
-        elif (
-            modulus >= WIDE
-            and steps > modulus // 2
-            and (self._period_s is None or elapsed_s < self._period_s * steps / 2)
-        ):
-            steps = 1
-        # Damaged frames are counted as damaged, not as lost.
-        return self._accept(counter, data, lost=max(steps - 1 - self._refused, 0))
-
-    def _accept(self, counter: int, data: bytes | bytearray, lost: int) -> Verdict:
-        self._last, self._refused, self._content, self.lost = counter, 0, data, lost
-        return Verdict.AFTER_LOSS if lost else Verdict.GOOD
+        else:
+            period_s = self.learned_period_s() if self._period_s is None else self._period_s
+            is_soon = 0.0 <= elapsed_s < SOON * period_s
+            was_repeated = self._is_repeated
+            self._is_repeated = steps == 0 and elapsed_s <= self._half_wrap_s
+            # The second repetition in a row is a stuck counter.
+            is_odd = is_soon or (self._is_repeated and not was_repeated)
+            if is_odd and data != self._content:
+                self._odd = min(self._odd + 1.0, 2.0 * SUSPECTED_AT)
+            if self._is_repeated:
+                return Verdict.REPEATED
+            if steps == 0:
+                steps = min(modulus, WIDE)
+            elif modulus >= WIDE and steps > modulus // 2:
+                is_early = self._period_s is None or elapsed_s < self._period_s * steps / 2
+                steps = 1 if is_early else steps
+            # Damaged frames are counted as damaged, not as lost.
+            self.lost = max(steps - 1 - self._refused, 0)
+        self._last, self._refused, self._content = counter, 0, data
+        return Verdict.AFTER_LOSS if self.lost else Verdict.GOOD

@@ -48,7 +48,7 @@ _LENGTH: Final = 8
 
 @dataclass(frozen=True)
 class FrameIds:
-    """Standard ids of the frames; InputError if one is not a standard id, or two are equal."""
+    """Standard ids of the frames; InputError if two are equal."""
 
     soc_estimate: int = 0x5A0
     soc_detail: int = 0x5A1
@@ -64,14 +64,10 @@ class FrameIds:
 
     def __post_init__(self) -> None:
         names: dict[int, str] = {}
-        for name in self.__dataclass_fields__:
-            value, where = getattr(self, name), f"ids.{name}"
-            if not 0 <= value <= 0x7FF:
-                cure = "use 0x000–0x7FF"
-                raise InputError("no standard CAN id", field=where, value=value, cure=cure)
+        for name, value in vars(self).items():
             if value in names:
                 problem = f"{names[value]} has the same id"
-                raise InputError(problem, field=where, value=f"0x{value:X}")
+                raise InputError(problem, field=f"ids.{name}", value=f"0x{value:X}")
             names[value] = name
 
 
@@ -195,8 +191,8 @@ class _Layout:
             for name, codec in codecs.items()
         ]
         attributes = getattr(message.dbc, "attributes", {})
-        data_ids = bytes.fromhex(str(attributes["E2EDataIdList"].value))
-        self._rule = E2eRule("e2e_02", data_ids=data_ids)
+        data_ids = tuple(bytes.fromhex(str(attributes["E2EDataIdList"].value)))
+        self._rule = E2eRule("e2e_02", data_id_list=data_ids)
 
     def encode(self, counter: int, values: Mapping[str, float]) -> bytes:
         """Return the payload; values are clipped to the signal's range, NaN becomes its code."""

@@ -159,7 +159,7 @@ class LineReader(CaptureReader, TextIOMessageReader):
     def matches(cls, head: bytes) -> bool:
         """Return whether most lines are frames."""
         reader = cls(io.BytesIO(head))
-        lines = list(islice(_lines(reader), HEAD_LINES))
+        lines = list(islice(reader.lines(), HEAD_LINES))
         if len(lines) > 1:
             lines.pop()  # may be cut
         if not lines or not reader.prepare(lines):
@@ -184,9 +184,20 @@ class LineReader(CaptureReader, TextIOMessageReader):
         Raises ValueError or OverflowError if the line is malformed.
         """
 
+    def lines(self) -> Iterator[str]:
+        """Yield the lines before the file breaks off; one beyond `MAX_LINE` in pieces."""
+        text: Any = self.raw
+        if not isinstance(text, io.TextIOBase):
+            text = io.TextIOWrapper(self.raw, "latin-1", newline=None)
+        try:
+            while line := text.readline(MAX_LINE):
+                yield line
+        except (EOFError, OSError, zlib.error):
+            self.cut_off = True
+
     def read(self) -> Iterator[can.Message]:
         """Yield the frames of the lines."""
-        lines = _lines(self)
+        lines = self.lines()
         head = list(islice(lines, HEAD_LINES))
         if head and not self.prepare(head):
             raise InputError(f"the file is not a {self.name}", source=self.source)
@@ -205,64 +216,51 @@ class LineReader(CaptureReader, TextIOMessageReader):
                 yield message
 
 
-def _lines(reader: CaptureReader) -> Iterator[str]:
-    """Yield the lines of a text as far as it can be read; a line beyond `MAX_LINE` in pieces."""
-    text: Any = reader.raw
-    if not isinstance(text, io.TextIOBase):
-        text = io.TextIOWrapper(io.BufferedReader(_Salvage(reader)), "latin-1", newline=None)
-    while line := text.readline(MAX_LINE):
-        yield line
-
-
-class _Salvage(io.RawIOBase):
-    """The content of a reader's file; it ends, instead of raising, where the file breaks off."""
-
-    def __init__(self, reader: CaptureReader) -> None:
-        self._reader = reader
-
-    def readable(self) -> bool:
-        return True
-
-    def readinto(self, buffer: Any, /) -> int:
-        view = memoryview(buffer)
-        try:
-            # `read1`: the content before the break is delivered before the error.
-            part = self._reader.raw.read1(view.nbytes)
-        except (EOFError, OSError, zlib.error):
-            self._reader.cut_off = True
-            return 0
-        view[: len(part)] = part
-        return len(part)
-
-
 def frame(
     time: str | float,
-    number: str,
-    data: str,
+    number: str | int,
+    data: str | None,
     length: str | int | None = None,
     *,
     is_extended: bool | None = None,
     **more: Any,
 ) -> can.Message:
-    """Return a frame of hex text; `length` is the stated number of bytes, `more` as `can.Message`.
+    """Return a frame; id and bytes are hex text, `more` is as `can.Message`.
 
-    By default an id is extended where it has more than 11 bits. Raises ValueError for no such id or
-    another number of bytes.
+    `data` is None for a remote frame; `length` is the stated number of bytes. By default an id is
+    extended where it has more than 11 bits. Raises ValueError for no such id or another number of
+    bytes.
     """
-    arbitration_id, content = int(number, 16), bytes.fromhex(data)
+    arbitration_id = int(number, 16) if isinstance(number, str) else number
     is_large = arbitration_id > MAX_STANDARD_ID
     if not 0 <= arbitration_id <= MAX_ID or (is_large and is_extended is False):
         raise ValueError("no such id")
-    if len(content) > MAX_BYTES or (length is not None and len(content) != int(length)):
+    content = bytes.fromhex(data or "")
+    size = len(content) if length is None else int(length or 0)
+    if len(content) > MAX_BYTES or (data is not None and size != len(content)):
         raise ValueError("length and bytes differ")
+    more.setdefault("is_fd", len(content) > 8)
     return can.Message(
         timestamp=float(time),
         arbitration_id=arbitration_id,
         is_extended_id=is_large if is_extended is None else is_extended,
-        is_fd=len(content) > 8,
+        is_remote_frame=data is None,
+        dlc=size if data is None else None,
         data=content,
         **more,
     )
+
+
+def candump_frame(
+    time: str, channel: str, number: str, data: str | None, length: str | None = None, **more: Any
+) -> can.Message:
+    """Return a frame as candump writes it: ids of eight digits are extended, and have flags."""
+    bits, is_extended = int(number, 16), len(number) == 8
+    is_error = is_extended and bool(bits & ERROR_FLAG)
+    return frame(
+        time, bits & MAX_ID, data, length,
+        is_extended=is_extended, is_error_frame=is_error, channel=channel, **more,
+    )  # fmt: skip
 
 
 class PatternReader(LineReader):
@@ -283,27 +281,6 @@ class PatternReader(LineReader):
         """Return the frame of the groups of the pattern."""
 
 
-def candump_frame(
-    time: str, channel: str, number: str, data: str | None, dlc: int | None = None, **more: Any
-) -> can.Message:
-    """Return a frame as candump writes it; `data` is None for a remote frame of `dlc` bytes."""
-    bits, is_extended = int(number, 16), len(number) == 8
-    content = None if data is None else bytes.fromhex(data)
-    if content is not None and len(content) > MAX_BYTES:
-        raise ValueError("longer than any frame")
-    return can.Message(
-        timestamp=float(time),
-        arbitration_id=bits & MAX_ID,
-        is_extended_id=is_extended,
-        channel=channel,
-        is_remote_frame=data is None,
-        is_error_frame=is_extended and bool(bits & ERROR_FLAG),
-        dlc=dlc,
-        data=content,
-        **more,
-    )
-
-
 class CandumpLogReader(PatternReader):
     """Log file of candump -l; python-can's reader stops at a malformed line."""
 
@@ -319,9 +296,7 @@ class CandumpLogReader(PatternReader):
         time, channel, number, fd_flags, data, remote, way = groups
         flags = int(fd_flags[1], 16) if fd_flags else 0
         return candump_frame(
-            time, channel, number,
-            None if data is None else data.replace(".", ""),
-            int(remote or 0) if data is None else None,
+            time, channel, number, data and data.replace(".", ""), remote,
             is_fd=fd_flags is not None, bitrate_switch=bool(flags & 1),
             error_state_indicator=bool(flags & 2), is_rx=way != "T",
         )  # fmt: skip

@@ -12,7 +12,7 @@ import can
 from can.typechecking import CanFilter
 
 from cangauge._logging import emit
-from cangauge.bus.connection import SEND_WITHIN_S, BusConnection, BusError
+from cangauge.bus.connection import AT_ONCE, SEND_WITHIN_S, BusConnection, BusError
 from cangauge.bus.open import BusAddress, DriverMissingError, backend_capabilities, open_bus
 from cangauge.errors import InputError
 
@@ -113,13 +113,13 @@ class ReconnectingBus(BusConnection):
             phrases.append(f"{drops} frames lost in the receive queue")
         return ", ".join(phrases)
 
-    def _receive(self, timeout_s: float, most: int) -> list[can.Message]:
-        """Receive; while the bus is away, wait and try to open it."""
+    def receive_pending(self, timeout_s: float, at_most: int = AT_ONCE) -> list[can.Message]:
+        """Return the pending frames; while the bus is away, wait and try to open it."""
         if self._bus is None:
             self._reconnect(timeout_s)
             return []
         try:
-            messages = super()._receive(timeout_s, most)
+            messages = super().receive_pending(timeout_s, at_most)
         except BusError as error:
             self._lose(error)
             return []

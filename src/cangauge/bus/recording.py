@@ -146,28 +146,24 @@ def open_recording(
     known format. `sign` is what a positive current in a log does.
     """
     path = as_path(path)
-    if columns is None and parts_of_run(path):
-        return _unsigned(open_capture(path), sign)
-    log_file = open_log(path, columns=columns, sign=sign)
-    is_mapped = mapped is not None and log_file.is_any_table
-    if columns is not None or (log_file.reader is not None and not is_mapped):
-        return log_file
-    capture = None if is_mapped else find_capture(path)
-    if capture is not None:
-        return _unsigned(capture, sign)
-    if mapped is not None:
-        return open_log(path, columns=mapped, sign=sign)
-    problem = "not a known kind of log, nor of capture"
-    cure = f"known logs: {KNOWN_LOGS}; known captures (with --vehicle or --map):"
-    raise not_recognised(log_file, problem, f"{cure} {KNOWN_CAPTURES}")
-
-
-def _unsigned(capture: Capture, sign: Sign | None) -> Capture:
-    if sign is None:
-        return capture
-    problem = "this is a capture, whose map states the sign"
-    cure = "set sign = -1 under [current] of the map file"
-    raise InputError(problem, source=capture.path, field="--sign", value=sign, cure=cure)
+    capture = open_capture(path) if columns is None and parts_of_run(path) else None
+    if capture is None:
+        log_file = open_log(path, columns=columns, sign=sign)
+        is_mapped = mapped is not None and log_file.is_any_table
+        if columns is not None or (log_file.reader is not None and not is_mapped):
+            return log_file
+        capture = None if is_mapped else find_capture(path)
+    if capture is None:
+        if mapped is not None:
+            return open_log(path, columns=mapped, sign=sign)
+        problem = "not a known kind of log, nor of capture"
+        cure = f"known logs: {KNOWN_LOGS}; known captures (with --vehicle or --map):"
+        raise not_recognised(log_file, problem, f"{cure} {KNOWN_CAPTURES}")
+    if sign is not None:
+        problem = "this is a capture, whose map states the sign"
+        cure = "set sign = -1 under [current] of the map file"
+        raise InputError(problem, source=path, field="--sign", value=sign, cure=cure)
+    return capture
 
 
 def refuse_single_row(recorded: Sized) -> None:
@@ -239,15 +235,13 @@ def capture_samples(
             _keep(decoder.handle(message), decoder, values)
     for _, decoder, values in buses.values():
         _keep(decoder.flush(), decoder, values)
-    channel, (own, decoder, values) = max(buses.items(), key=lambda item: len(item[1][2]))
+    channel, (_, decoder, values) = max(buses.items(), key=lambda item: len(item[1][2]))
     statistics = decoder.statistics
     if not values:
         raise _without_current(path, vehicle, statistics)
     remarks = [*capture.info.remarks, *_losses(statistics)]
     if sum(bool(each[2]) for each in buses.values()) > 1:
         remarks.append(f"several buses carry the frames; bus {channel} is used: most samples")
-    if isinstance(own, ReceiveTime) and own.irregular:
-        remarks.append(f"{own.irregular} time stamps step back: they are irregular")
     if clock.beginnings:
         remarks.append(f"the replay clock starts again {clock.beginnings} times")
     time_s, current_a, voltage_v, temperature_c, soc_pct = np.array(values).reshape(-1, 5).T
@@ -307,9 +301,32 @@ def capture_to_log(
     if dropped:
         remarks.append(f"{dropped} samples dropped whose time does not advance")
     values = {name: getattr(samples, name)[keep] for name in ("time_s", *LOG_COLUMNS.values())}
-    _fill_voltage(values, path, vehicle, remarks)
-    _fill_temperature(values, path, vehicle, remarks)
-    complete = np.isfinite(values["voltage_v"])
+    time_s, voltage_v, temperature_c = (
+        values[name] for name in ("time_s", "voltage_v", "temperature_c")
+    )
+    is_known = np.isfinite(voltage_v)
+    if not is_known.any():
+        problem = "the capture gives no voltage that pairs with a current"
+        where, cure = vehicle.voltage.message, "check the mapping, and pair_within_s"
+        raise InputError(problem, source=path, field=where, cure=cure)
+    before_s = np.maximum.accumulate(np.where(is_known, time_s, -np.inf))
+    after_s = np.minimum.accumulate(np.where(is_known, time_s, np.inf)[::-1])[::-1]
+    near = ~is_known & (after_s - before_s <= VOLTAGE_FILL_S)
+    voltage_v[near] = np.interp(time_s[near], time_s[is_known], voltage_v[is_known])
+    complete = is_known | near
+    if near.any():
+        remarks.append(f"{np.count_nonzero(near)} samples without voltage: interpolated")
+    if not complete.all():
+        remarks.append(f"{np.count_nonzero(~complete)} samples without voltage dropped")
+    warm = np.flatnonzero(np.isfinite(temperature_c))
+    if not warm.size:
+        where = "" if vehicle.temperature is None else vehicle.temperature.message
+        problem, cure = "the capture gives no temperature", "give --temperature °C"
+        raise InputError(problem, source=path, field=where or None, cure=cure)
+    if missing := temperature_c.size - warm.size:
+        latest = np.searchsorted(warm, np.arange(temperature_c.size), side="right") - 1
+        values["temperature_c"] = temperature_c[warm[np.maximum(latest, 0)]]
+        remarks.append(f"{missing} samples without temperature: the nearest is used")
     values = {name: column[complete] for name, column in values.items()}
     if not np.isfinite(values["soc_pct"]).any():
         del values["soc_pct"]
@@ -324,40 +341,3 @@ def capture_to_log(
     labels = {"time_s": "time stamps", **names}
     refuse_wrong_units(values, source=path, labels=labels, in_seconds=True)
     return resolve_sign(log)
-
-
-def _fill_voltage(
-    values: dict[str, FloatArray], path: Path, vehicle: Vehicle, remarks: list[str]
-) -> None:
-    time_s, voltage_v = values["time_s"], values["voltage_v"]
-    is_known = np.isfinite(voltage_v)
-    known, missing = np.flatnonzero(is_known), np.flatnonzero(~is_known)
-    if not known.size:
-        problem = "the capture gives no voltage that pairs with a current"
-        where, cure = vehicle.voltage.message, "check the mapping, and pair_within_s"
-        raise InputError(problem, source=path, field=where, cure=cure)
-    right = np.searchsorted(known, missing)
-    inside = (right > 0) & (right < known.size)
-    missing, right = missing[inside], right[inside]
-    near = time_s[known[right]] - time_s[known[right - 1]] <= VOLTAGE_FILL_S
-    rows = missing[near]
-    voltage_v[rows] = np.interp(time_s[rows], time_s[known], voltage_v[known])
-    if rows.size:
-        remarks.append(f"{rows.size} samples without voltage: interpolated")
-    if dropped := voltage_v.size - known.size - rows.size:
-        remarks.append(f"{dropped} samples without voltage dropped")
-
-
-def _fill_temperature(
-    values: dict[str, FloatArray], path: Path, vehicle: Vehicle, remarks: list[str]
-) -> None:
-    temperature_c = values["temperature_c"]
-    rows = np.flatnonzero(np.isfinite(temperature_c))
-    if not rows.size:
-        where = None if vehicle.temperature is None else vehicle.temperature.message
-        problem, cure = "the capture gives no temperature", "give --temperature °C"
-        raise InputError(problem, source=path, field=where, cure=cure)
-    if missing := temperature_c.size - rows.size:
-        latest = np.searchsorted(rows, np.arange(temperature_c.size), side="right") - 1
-        values["temperature_c"] = temperature_c[rows[np.maximum(latest, 0)]]
-        remarks.append(f"{missing} samples without temperature: the nearest is used")

@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import math
 import time
-from collections import deque
 from collections.abc import Iterable
 from functools import lru_cache
 from typing import Final, Literal
@@ -31,13 +30,8 @@ MICROSECONDS: Final = 1e6
 """Unit of REPLAY_CLOCK [1/s]."""
 
 STEP_BACK_US: Final = 1_000_000
-"""A larger step back in time [µs] means a clock that was set, or a new log."""
-REVERSAL_US: Final = 100_000
-"""A smaller step back [µs] is a matter of the order of writing, as of two buses in one file."""
-IRREGULAR_REVERSALS: Final = 3
-IRREGULAR_WITHIN_US, IRREGULAR_FOR_US = 10_000_000, 60_000_000
-"""Reversals within a time [µs] that prove irregular stamps, as a clock is not set that often; time
-after the latest one for which time stays uncertain [µs]."""
+"""A larger step back in time [µs] means a clock that was set, or a new log; a smaller one is a
+matter of the order of writing."""
 
 
 def whole_us(time_s: float) -> int:
@@ -49,16 +43,13 @@ class ReceiveTime:
     """Receive stamps.
 
     After a step back of more than `STEP_BACK_US` time continues from the latest stamp, so that
-    setting the clock does not stop the estimate (`steps_back`). A step forward is a gap. Stamps
-    that step back again and again are `irregular`: none of these steps then counts as a set clock.
+    setting the clock does not stop the estimate (`steps_back`). A step forward is a gap.
     """
 
     def __init__(self) -> None:
-        self.beginnings = self.steps_back = self.irregular = 0
+        self.beginnings = self.steps_back = 0
         self._latest_us: int | None = None
-        self._previous_us = self._shift_us = self._irregular_until_us = 0
-        # Time and shift before each of the latest reversals.
-        self._reversals: deque[tuple[int, int]] = deque(maxlen=IRREGULAR_REVERSALS)
+        self._shift_us = 0
 
     def time_of(self, message: can.Message) -> float | None:
         """Return the bus time of a frame [s]."""
@@ -68,38 +59,12 @@ class ReceiveTime:
             return (latest_us or 0) / MICROSECONDS
         now_us = round(stamp_s * MICROSECONDS) + self._shift_us
         if latest_us is None or now_us >= latest_us:
-            self._latest_us = self._previous_us = now_us
-        else:
-            now_us = self._back(now_us, latest_us)
-        return now_us / MICROSECONDS
-
-    @property
-    def is_uncertain(self) -> bool:
-        """Whether the stamps are irregular at present."""
-        return self._latest_us is not None and self._latest_us < self._irregular_until_us
-
-    def _back(self, now_us: int, latest_us: int) -> int:
-        """Return the time of a stamp that lies before the latest one [µs]."""
-        back_us, self._previous_us = self._previous_us - now_us, now_us
-        is_far = latest_us - now_us > STEP_BACK_US
-        if not (is_far or back_us > REVERSAL_US or self.is_uncertain):
-            return now_us
-        reversals = self._reversals
-        reversals.append((latest_us, self._shift_us))
-        (first_us, first_shift_us), are_many = reversals[0], len(reversals) == IRREGULAR_REVERSALS
-        if self.is_uncertain or (are_many and latest_us - first_us <= IRREGULAR_WITHIN_US):
-            if not self.is_uncertain:
-                now_us -= self._shift_us - first_shift_us
-                self._shift_us = first_shift_us
-            self._irregular_until_us = latest_us + IRREGULAR_FOR_US
-            self.irregular += 1
-            return max(now_us, latest_us - REVERSAL_US)
-        if is_far:
+            self._latest_us = now_us
+        elif latest_us - now_us > STEP_BACK_US:
             self.steps_back += 1
             self._shift_us += latest_us - now_us
-            self._previous_us = latest_us
-            return latest_us
-        return now_us
+            now_us = latest_us
+        return now_us / MICROSECONDS
 
 
 KERNEL_TOLERANCE_S: Final = 0.02
@@ -108,8 +73,7 @@ DRIVER_TOLERANCE_S: Final = 0.25
 are of one machine, the rest is scheduling between two readings. Of others: an adapter's own clock,
 delivered with its latency."""
 STEP_AFTER_S: Final = 1.0
-STEP_FRAMES: Final = 5
-"""Time [s] and frames over which stamps must be off by the same amount to prove a set clock."""
+"""Time over which stamps must be off by the same amount to prove a set clock [s]."""
 UNCERTAIN_AFTER_S: Final = 2.0
 CERTAIN_AFTER_S: Final = 10.0
 """Time over which stamps were unusable, from which time is uncertain [s]: longer than it takes to
@@ -135,9 +99,8 @@ class StampLimiter:
     def __init__(self, tolerance_s: float, offset_s: float = math.nan) -> None:
         self._tolerance_s, self.offset_s = tolerance_s, offset_s
         self.shift_s, self.limited = 0.0, 0
-        # Replaced stamps in a row: their number, since when, and how far they were off.
-        self._run = 0
-        self._run_since_s = self._low_s = self._high_s = 0.0
+        # Of the first of replaced stamps in a row that are off by the same amount.
+        self._off_s = self._off_since_s = math.nan
         self._unusable_since_s = self._unusable_s = -math.inf
 
     def limit(self, messages: Iterable[can.Message], since_s: float, now_s: float) -> float:
@@ -151,9 +114,9 @@ class StampLimiter:
             stamp_s = message.timestamp + self.shift_s
             early_s = since_s + self.offset_s - self._tolerance_s
             if early_s <= stamp_s <= now_s + self.offset_s + self._tolerance_s:
-                self._run = 0
+                self._off_s = math.nan
             else:
-                stamp_s = self._replaced(stamp_s, since_s, now_s)
+                stamp_s = self._replaced(stamp_s, now_s)
             message.timestamp = stamp_s
         return min(stamp_s - self.offset_s, now_s)
 
@@ -162,30 +125,21 @@ class StampLimiter:
         lasting_s = self._unusable_s - self._unusable_since_s
         return now_s - self._unusable_s < CERTAIN_AFTER_S and lasting_s >= UNCERTAIN_AFTER_S
 
-    def _replaced(self, stamp_s: float, since_s: float, now_s: float) -> float:
+    def _replaced(self, stamp_s: float, now_s: float) -> float:
         """Return the time for a stamp outside the interval [s]."""
         if math.isnan(self.offset_s):
-            if not abs(stamp_s) <= LATEST_S:  # NaN too
-                stamp_s = 0.0
-            self.offset_s = stamp_s - now_s
-            return stamp_s
+            self.offset_s = (stamp_s if abs(stamp_s) <= LATEST_S else 0.0) - now_s
+            return now_s + self.offset_s
         self.limited += 1
         if now_s - self._unusable_s >= CERTAIN_AFTER_S:
             self._unusable_since_s = now_s
         self._unusable_s = now_s
         off_s = stamp_s - now_s - self.offset_s
-        low_s, high_s = min(self._low_s, off_s), max(self._high_s, off_s)
-        if self._run == 0 or not high_s - low_s <= self._tolerance_s:
-            self._run, self._run_since_s = 0, now_s
-            low_s = high_s = off_s
-        self._run += 1
-        self._low_s, self._high_s = low_s, high_s
-        if self._run >= STEP_FRAMES and now_s - self._run_since_s >= STEP_AFTER_S:
-            self.shift_s -= high_s
-            self._run, self._unusable_since_s = 0, now_s
-            stamp_s -= high_s
-        received_s = now_s + self.offset_s
-        return stamp_s if since_s + self.offset_s <= stamp_s <= received_s else received_s
+        if not abs(off_s - self._off_s) <= self._tolerance_s:  # NaN too
+            self._off_s, self._off_since_s = off_s, now_s
+        elif now_s - self._off_since_s >= STEP_AFTER_S:
+            self.shift_s -= max(off_s, self._off_s)  # the one read sooner
+        return now_s + self.offset_s
 
 
 _STEADY: Final[int | None] = getattr(time, "CLOCK_BOOTTIME", None)
@@ -204,7 +158,6 @@ class ReplayClock:
 
     def __init__(self, frame_id: int = REPLAY_CLOCK_ID) -> None:
         self.beginnings = self.refused = 0
-        self.is_uncertain = False
         self._id, self._codec = frame_id, _clock_codec()
         self._now_us: int | None = None
 
@@ -228,8 +181,8 @@ class ReplayClock:
 
 
 TimeSource = ReceiveTime | ReplayClock
-"""Source of the bus time of each frame: `time_of`, `is_uncertain`, and `beginnings`, the number of
-new logs after the first."""
+"""Source of the bus time of each frame: `time_of`, and `beginnings`, the number of new logs after
+the first."""
 
 
 def time_source(name: TimeSourceName, clock_id: int = REPLAY_CLOCK_ID) -> TimeSource:

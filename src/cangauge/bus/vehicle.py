@@ -31,14 +31,12 @@ from cangauge.bus.isotp import PollTarget, reply_id
 from cangauge.bus.mapping import (
     NO_OVERRIDES,
     CellsMap,
-    CheckMap,
     MessageMap,
     Overrides,
-    RuleMap,
     SignalMap,
     VehicleMap,
 )
-from cangauge.bus.plausibility import DEFAULTS, SignalChecks
+from cangauge.bus.plausibility import SignalChecks
 from cangauge.bus.protection import Protection
 from cangauge.errors import InputError, closest
 from cangauge.logs.log import TemperatureSource
@@ -197,13 +195,11 @@ class Vehicle:
                 problem = "no pack temperature is known on the bus of this car"
                 cure = "give --temperature °C"
                 raise InputError(problem, field="--vehicle", value=preset, cure=cure)
-            return known.vehicle(
-                temperature_c=temperature_c, pair_within_s=pair_within_s, overrides=overrides
-            )
-        if map is None and dbc is None:
-            cure = f"give --vehicle ({', '.join(PRESETS)}), or --map FILE"
-            raise InputError("no vehicle is given", field="--vehicle", cure=cure)
+            return known.vehicle(temperature_c, pair_within_s, overrides)
         if map is None:
+            if dbc is None:
+                cure = f"give --vehicle ({', '.join(PRESETS)}), or --map FILE"
+                raise InputError("no vehicle is given", field="--vehicle", cure=cure)
             problem = "a DBC alone does not name the signals"
             cure = "give --map FILE, which names three signals; to write one:"
             cure += f" cangauge init CAPTURE --dbc {dbc} -o mycar"
@@ -275,22 +271,21 @@ class _Binder:
 
     def vehicle(self, temperature_c: float | None, pair_within_s: float | None) -> Vehicle:
         """Return the vehicle; arguments as in `Vehicle.load`."""
-        mapping, temperature = self._mapping, self._mapping.temperature
+        mapping = self._mapping
         within_s = mapping.pair_within_s if pair_within_s is None else pair_within_s
         if not 0.0 <= within_s <= 1.0:
             raise InputError("must be within 0–1 s", field="pair_within_s", value=within_s)
-        fixed_c = temperature_c
-        if fixed_c is None and temperature is not None:
+        temperature, fixed_c = mapping.temperature, temperature_c
+        if temperature is not None and fixed_c is None:
             fixed_c = temperature.fixed_c
-        sent, soc = temperature if fixed_c is None else None, mapping.soc_reference
         return Vehicle(
             name=mapping.name,
             current=self._signal("current", mapping.current),
             voltage=self._signal("voltage", mapping.voltage),
             cells=None if mapping.cells is None else self._cells(mapping.cells),
-            temperature=None if sent is None else self._signal("temperature", sent),
-            soc_reference=None if soc is None else self._signal("soc_reference", soc),
-            fixed_temperature_c=math.nan if fixed_c is None else float(fixed_c),
+            temperature=self._optional("temperature", temperature if fixed_c is None else None),
+            soc_reference=self._optional("soc_reference", mapping.soc_reference),
+            fixed_temperature_c=math.nan if fixed_c is None else fixed_c,
             temperature_source=mapping.temperature_source if temperature_c is None else "unknown",
             pair_within_s=within_s,
             messages=self._protections(),
@@ -321,6 +316,9 @@ class _Binder:
                 errors.append(error)
         raise errors[0]
 
+    def _optional(self, role: Role, wanted: SignalMap | None) -> VehicleSignal | None:
+        return None if wanted is None else self._signal(role, wanted)
+
     def _signal(self, role: Role, wanted: SignalMap) -> VehicleSignal:
         (message, signal), file = self._in_first(
             lambda database, file: find_signal(
@@ -333,28 +331,25 @@ class _Binder:
         )  # fmt: skip
         key = _key(message)
         self._messages[key] = message
-        factor, offset = self._unit(role, wanted, codec)
-        override = self._overrides.checks.get(role, CheckMap())
-        checks = DEFAULTS.get(role, SignalChecks()).updated(wanted, override)
-        if checks.lowest >= checks.highest:
-            problem, value = (
-                "lowest is not below highest",
-                f"{checks.lowest:g} … {checks.highest:g}",
-            )
-            raise InputError(problem, source=self._source, field=role, value=value)
+        factor, offset = (1.0, 0.0) if wanted.states_unit else self._unit(role, codec)
         # A stated offset is in the canonical unit and keeps its sign.
         gain, shift = wanted.sign * wanted.scale * factor, wanted.offset + wanted.sign * offset
         codec = dataclasses.replace(codec, gain=gain, shift=shift)
+        override = self._overrides.checks.get(role, SignalChecks())
+        stated = {
+            **wanted.model_dump(exclude_unset=True),
+            **override.model_dump(exclude_unset=True),
+        }
+        stated = {name: stated[name] for name in SignalChecks.model_fields.keys() & stated}
+        checks = validated(SignalChecks, stated, f"{self._source}: {role}")
         return VehicleSignal(role, key, message.name, message.length, codec, checks)
 
-    def _unit(self, role: Role, wanted: SignalMap, codec: SignalCodec) -> tuple[float, float]:
+    def _unit(self, role: Role, codec: SignalCodec) -> tuple[float, float]:
         """Return factor and offset from the DBC's unit to the canonical one."""
-        if wanted.states_unit:
-            return 1.0, 0.0
-        column = LOG_COLUMNS[role]
+        column, source = LOG_COLUMNS[role], self._source
         try:
             ends, _ = convert(
-                np.array([0.0, 1.0]), column, codec.unit, source=self._source, label=codec.name
+                np.array([0.0, 1.0]), column, codec.unit, source=source, label=codec.name
             )
         except InputError as error:
             problem = f"the unit of {codec.name} in the DBC is unknown for {column}"
@@ -362,24 +357,25 @@ class _Binder:
             cure += " (scale = 1 takes the values as they are)"
             where = f"{role}.signal"
             raise InputError(
-                problem, source=self._source, field=where, value=codec.unit, cure=cure
+                problem, source=source, field=where, value=codec.unit, cure=cure
             ) from error
         return float(ends[1] - ends[0]), float(ends[0])
 
     def _protections(self) -> dict[int, MessageProtection]:
         """Return protection and period of the messages with a signal."""
         stated = self._overrides.merged_messages(self._mapping, self._source, self._message_key)
-        rules: dict[str, RuleMap] = {**self._mapping.rules, **self._overrides.rules}
+        rules = {**self._mapping.rules, **self._overrides.rules}
         protections = {}
         for key, message in self._messages.items():
             each, source = stated.get(key, (MessageMap(), self._source))
-            cycle_ms: object = message.cycle_time  # not a number in some DBC files
-            is_known = isinstance(cycle_ms, int | float) and 0.0 < cycle_ms < math.inf
-            dbc_s = float(str(cycle_ms)) / 1000.0 if is_known else None
+            cycle_ms, period_s = message.cycle_time, each.period_s
+            # In some DBC files it is not a number.
+            if period_s is None and isinstance(cycle_ms, int | float) and 0 < cycle_ms < math.inf:
+                period_s = cycle_ms / 1000.0
             rule = each.rule(message, rules, source=source)
-            period_s = dbc_s if each.period_s is None else each.period_s
-            more = each.isotp, each.j1939, each.request_id
-            protections[key] = MessageProtection(rule, period_s, *more)
+            protections[key] = MessageProtection(
+                rule, period_s, each.isotp, each.j1939, each.request_id
+            )
         return protections
 
     def _message_key(self, name: str) -> int:
@@ -417,15 +413,15 @@ class Preset:
 
     def vehicle(
         self,
-        *,
         temperature_c: float | None = None,
         pair_within_s: float | None = None,
         overrides: Overrides = NO_OVERRIDES,
     ) -> Vehicle:
         """Return the vehicle, with or without a temperature; arguments as in `Vehicle.load`."""
         dbc = shared_file("dbc", self.dbc)
-        binder = _Binder(self.mapping, [dbc], str(dbc), overrides)
-        return binder.vehicle(temperature_c, pair_within_s)
+        return _Binder(self.mapping, [dbc], str(dbc), overrides).vehicle(
+            temperature_c, pair_within_s
+        )
 
 
 def _presets() -> dict[str, Preset]:

@@ -16,7 +16,7 @@ import numpy as np
 
 from cangauge.bus.captures import CaptureInfo, open_capture
 from cangauge.bus.decoder import SampleDecoder
-from cangauge.bus.protection import GENERIC_RULE, LEAF_RULE, FrameChecker, ProtectionRule, Verdict
+from cangauge.bus.protection import RULES, FrameChecker, Verdict
 from cangauge.bus.recording import capture_to_log, open_vehicle_capture
 from cangauge.bus.vehicle import PRESETS, Vehicle
 from cangauge.inspect.log import Gap, LogInspection, inspect_log
@@ -184,16 +184,16 @@ class _Frames:
         period_s = float(np.quantile(intervals_s, 0.25))
         tried = (
             _protection(rule, payloads, self.stamps_s, period_s or None)
-            for rule in (LEAF_RULE, GENERIC_RULE)
+            for rule in ("leaf", "generic")
         )
         return replace(found, **next(filter(None, tried), {}))
 
 
 def _protection(
-    rule: ProtectionRule, payloads: list[bytearray], stamps_s: array[float], period_s: float | None
+    name: str, payloads: list[bytearray], stamps_s: array[float], period_s: float | None
 ) -> dict[str, Any]:
     """Return the fields of `IdSummary` by a rule; none where its CRCs do not agree."""
-    first = payloads[:LEARN_FRAMES]
+    rule, first = RULES[name], payloads[:LEARN_FRAMES]
     if 2 * sum(map(rule.is_whole, first)) < len(first):
         return {}
     checker, lost, two_senders = FrameChecker(rule, period_s), 0, False
@@ -206,7 +206,7 @@ def _protection(
     crc_errors, repeats = verdicts[Verdict.CRC_WRONG], verdicts[Verdict.REPEATED]
     if crc_errors > DAMAGED * len(payloads):
         return {}
-    found = {"protection": rule.name, "crc_errors": crc_errors}
+    found = {"protection": name, "crc_errors": crc_errors}
     if repeats > (MIXED_SHARE if two_senders else REPEATED_SHARE) * len(payloads):
         return found
     return found | {

@@ -111,9 +111,10 @@ class FrameEncoder:
             column = LOG_COLUMNS[signal.role]
             if (values := getattr(log, column)) is None:
                 continue
-            bad = np.flatnonzero(~signal.codec.fits(values))
+            (low, high), half = signal.codec.range, signal.codec.half_step
+            bad = np.flatnonzero((values < low - half) | (values > high + half))
             if bad.size:
-                row, (low, high) = int(bad[0]), signal.codec.range
+                row = int(bad[0])
                 raise InputError(
                     f"does not fit into signal {signal.codec.name} of {signal.message}, which holds"
                     f" {low:g} to {high:g} {_UNITS[signal.role]}; the first such row is {row + 1}",

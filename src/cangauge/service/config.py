@@ -35,7 +35,9 @@ from pydantic import (
 )
 
 from cangauge._config import read_toml, validated
-from cangauge.bus.mapping import CheckMap, MessageMap, RuleMap
+from cangauge.bus.mapping import MessageMap
+from cangauge.bus.plausibility import SignalChecks
+from cangauge.bus.protection import ProtectionRule
 from cangauge.bus.time_source import TimeSourceName
 from cangauge.bus.vehicle import PRESETS
 from cangauge.errors import InputError
@@ -95,12 +97,14 @@ class IdsConfig(Strict):
 
 
 class ChecksConfig(Strict):
-    """Plausibility checks by signal, as in a map file; see `CheckMap`."""
+    """Plausibility checks by signal, as in a map file; see `SignalChecks`."""
 
-    current: CheckMap = key(CheckMap(), "Plausibility check of the current.")
-    voltage: CheckMap = key(CheckMap(), "Plausibility check of the voltage.")
-    temperature: CheckMap = key(CheckMap(), "Plausibility check of the temperature.")
-    soc_reference: CheckMap = key(CheckMap(), "Plausibility check of the vehicle's own SoC.")
+    current: SignalChecks = key(SignalChecks(), "Plausibility check of the current.")
+    voltage: SignalChecks = key(SignalChecks(), "Plausibility check of the voltage.")
+    temperature: SignalChecks = key(SignalChecks(), "Plausibility check of the temperature.")
+    soc_reference: SignalChecks = key(
+        SignalChecks(), "Plausibility check of the vehicle's own SoC."
+    )
 
 
 class FullChargeConfig(Strict):
@@ -322,7 +326,7 @@ class RunConfig(Strict):
     messages: dict[str, MessageMap] = key(
         {}, "Protection and period of messages, by name or id; before those of the vehicle."
     )
-    rules: dict[str, RuleMap] = key({}, "Further protection rules.")
+    rules: dict[str, ProtectionRule] = key({}, "Further protection rules.")
     checks: ChecksConfig = key(
         ChecksConfig(), "Plausibility checks by signal; before those of the vehicle."
     )

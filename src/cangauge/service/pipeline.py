@@ -288,8 +288,6 @@ class Pipeline:
         if self.latest_sample is not None and math.isnan(self.latest_sample.voltage_v):
             reasons &= ~Reason.VOLTAGE_MISSING
         reasons |= self.decoder.reasons(now_s)
-        if self._time.is_uncertain:
-            reasons |= Reason.TIME_UNCERTAIN
         if self._refused >= MISSED_UNTIL_OLD:
             reasons |= Reason.INPUT_STALE
         if self.sign.evidence:

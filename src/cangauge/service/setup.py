@@ -9,7 +9,7 @@ from typing import Self
 
 from cangauge._config import read_toml
 from cangauge.bus.mapping import Overrides
-from cangauge.bus.open import BusAddress, bus_address, is_interface_name
+from cangauge.bus.open import BusAddress, bus_address, is_multicast
 from cangauge.bus.publish import FrameIds
 from cangauge.bus.vehicle import Vehicle
 from cangauge.errors import CangaugeError, InputError
@@ -102,10 +102,10 @@ def pipeline_settings(config: RunConfig) -> PipelineSettings:
 
 def address_of(config: RunConfig) -> BusAddress:
     """Return the bus address of a configuration; may raise InputError."""
-    interface = config.interface
-    if interface is None and config.wait_for_bus and is_interface_name(config.channel):
+    interface, channel = config.interface, config.channel
+    if interface is None and config.wait_for_bus and channel and not is_multicast(channel):
         interface = "socketcan"  # cannot be detected while the interface is missing
-    return bus_address(interface, config.channel, config.bus_options)
+    return bus_address(interface, channel, config.bus_options)
 
 
 def inverter_address(publish: PublishConfig) -> BusAddress:

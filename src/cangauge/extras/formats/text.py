@@ -92,16 +92,11 @@ class CandumpReader(PatternReader):
     )
 
     def _frame(self, *groups: Any) -> can.Message:
-        time, channel, number, stated, data = groups
+        time, channel, number, length, data = groups
         if (time is not None) is not self.has_stamps:
             raise ValueError("only some lines have stamps")
-        length = int(stated)
-        if data == "remote request":
-            return candump_frame(time or "0", channel, number, None, length, is_fd=length > 8)
-        message = candump_frame(time or "0", channel, number, data, is_fd=length > 8)
-        if message.dlc != length:
-            raise ValueError("length and bytes differ")
-        return message
+        content = None if data == "remote request" else data
+        return candump_frame(time or "0", channel, number, content, length)
 
 
 class UnstampedCandumpReader(CandumpReader):
