@@ -126,8 +126,9 @@ def _stuck(
         capacity_ah=CURRENT_SHARE * (current.maximum - current.minimum) / SWING_C_RATE,
         usual_v=abs(voltage.median),
     )
-    steps = current.quantum or 0.0, voltage.quantum or 0.0
-    of_current, of_voltage = stuck_detectors(pack, steps=steps, after_s=(STUCK_AFTER_S,) * 2)
+    of_current, of_voltage = stuck_detectors(
+        pack, (current.quantum or 0.0, STUCK_AFTER_S), (voltage.quantum or 0.0, STUCK_AFTER_S)
+    )
     columns = (each.tolist() for each in (log.time_s, log.current_a, log.voltage_v))
     flags = [
         (of_current.update(current_a, time_s), of_voltage.update(voltage_v, time_s))
