@@ -112,7 +112,7 @@ def test_errors_name_file_field_and_value(
 @pytest.mark.parametrize(
     ("options", "field"),
     [
-        ({"model": "m", "method": "magic"}, "method"),
+        ({"model": "m", "method": "magic"}, "--method"),
         ({"model": "m", "initial_soc": "x"}, "--initial-soc"),
         ({"model": "m", "ids": {"soc_estimate": -1}}, "ids.soc_estimate"),
         ({}, "-m/--model"),

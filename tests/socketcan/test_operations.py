@@ -21,7 +21,7 @@ from cangauge.replay.encoder import FrameEncoder
 from cangauge.service.loop import Loop
 from cangauge.service.offline import estimate_capture
 from cangauge.service.pipeline import Pipeline
-from cangauge.service.record import Recorder, RecordLimits
+from cangauge.service.record import Recorder
 from cangauge.service.status import Monitor
 from cangauge.types import Estimate
 from live import Rows, leaf_model, short_log, waits
@@ -46,7 +46,7 @@ def test_scraped_and_recorded_by_kernel_stamps(tmp_path: Path) -> None:
     with (
         BusConnection(open_bus(VCAN, pipeline.filters), "vcan0") as port,
         BusConnection(open_bus(VCAN, []), "sender") as sender,
-        Recorder(tmp_path / "seen.log", RecordLimits(part_bytes=5_000)) as recorder,
+        Recorder(tmp_path / "seen.log", part_bytes=5_000) as recorder,
     ):
         monitor = Monitor(pipeline, port, record=lambda: recorder.state)
         server = Live(http=http_address("127.0.0.1:0"))

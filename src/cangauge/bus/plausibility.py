@@ -151,11 +151,11 @@ class SignalHealth:
         self._lowest, self._highest = checks.lowest, checks.highest
         self._max_jump, self._max_rate_per_s = checks.max_jump, checks.max_rate_per_s
         self._stated_timeout_s = checks.timeout_s
-        # A cyclic signal is compared with its partner.
-        self._constant_for_s = (not is_cyclic and checks.stuck_after_s) or math.inf
         self._period_s = period_s
         self._is_cyclic = is_cyclic
         self._is_stuck = is_stuck
+        if not is_cyclic and checks.stuck_after_s is not None:  # it has no partner
+            self._is_stuck = self._is_constant
         self._statistics = statistics or MessageStatistics()
         self.is_invalid = False
         self.reason = Reason.NONE
@@ -178,10 +178,7 @@ class SignalHealth:
         if not self._lowest <= value <= self._highest or abs(value - self.latest) > most:
             self._statistics.implausible += 1
             return self.fail(_IMPLAUSIBLE)
-        if value != self.latest or time_s < self._since_s:
-            self._since_s = time_s
-        is_stuck = time_s - self._since_s >= self._constant_for_s
-        if is_stuck or (self._is_stuck is not None and self._is_stuck(value, time_s)):
+        if self._is_stuck is not None and self._is_stuck(value, time_s):
             self._statistics.stuck += 1
             return self.fail(Reason.SIGNAL_STUCK)
         self._failures = 0
@@ -193,6 +190,11 @@ class SignalHealth:
         self.is_invalid, self.reason = False, _NO_REASON
         self.latest, self.latest_s = value, time_s
         return value
+
+    def _is_constant(self, value: float, time_s: float) -> bool:
+        if value != self.latest or time_s < self._since_s:
+            self._since_s = time_s
+        return time_s - self._since_s >= (self._checks.stuck_after_s or math.inf)
 
     def _learn(self, interval_s: float) -> None:
         self._intervals += 1
