@@ -6,7 +6,8 @@ fuzz     every reader on 300,000 mutants of small valid files, and the tests of 
 faults   the table of faults on a live bus
 grade    the estimator on recorded packs, and the diagnosis on its frozen cases (need --data)
 suite    the score cards of three gauges: our service, a counter, filterpy's filter
-tests    what `make test` leaves out: tests marked nightly, and 300 examples of each property for 20
+tests    what `make test` leaves out: tests marked nightly, and 300 examples of each property
+         (20 there) that states no number of its own
 long     restarts by SIGKILL; load, timing and memory of the service; attacks on its page, status
          and MQTT
 load     half an hour at 12,000 frames/s, or what a bare loop carries here: no loss, memory flat

@@ -1,6 +1,6 @@
 """Pass criteria: observation of a run → verdict, and the table of verdicts.
 
-A fault passes if all of these hold (`tests/faults` makes each fail):
+A fault passes if all of these hold (`tests/nightly/faults` makes each fail):
 
 - After recovery (the last part of the run) each valid SoC is within 1.5 of its own published
   standard deviations of the undisturbed run at the same bus time; and something is published.

@@ -104,7 +104,7 @@ RULES = {"full_charge": FullCharge(380.0, 10.0, 2.0), "long_rest": LongRest(60.0
 
 @pytest.mark.parametrize("method", ["ekf", "newton", "coulomb"])
 @pytest.mark.parametrize("which", ["plain", "together"])
-@settings(max_examples=20, suppress_health_check=list(HealthCheck))
+@settings(suppress_health_check=list(HealthCheck))
 @given(drawn=inputs, with_rules=st.booleans(), start=st.sampled_from([None, 0.0, 50.0, 100.0]))
 def test_estimates_stay_bounded_for_any_input(
     which: str, method: Any, drawn: Any, with_rules: bool, start: Any
@@ -123,7 +123,7 @@ def test_estimates_stay_bounded_with_each_effect(effect_id: str, drawn: Any) -> 
 
 
 @pytest.mark.parametrize("which", ["plain", "together"])
-@settings(max_examples=20, suppress_health_check=list(HealthCheck))
+@settings(suppress_health_check=list(HealthCheck))
 @given(drawn=st.lists(st.tuples(odd, odd, odd, odd), max_size=40))
 def test_estimates_stay_bounded_for_extreme_numbers(which: str, drawn: Any) -> None:
     run(MODELS[which], EstimatorSettings(), [Sample(*row) for row in drawn])
@@ -142,7 +142,7 @@ def test_model_without_noise_is_accepted(zero: str) -> None:
 
 @pytest.mark.parametrize("which", ["plain", "time_skew", "together"])
 @pytest.mark.parametrize("method", ["ekf", "newton", "coulomb"])
-@settings(max_examples=20, suppress_health_check=list(HealthCheck))
+@settings(suppress_health_check=list(HealthCheck))
 @given(drawn=inputs, asked_every=st.sampled_from([2, 3, 17]))
 def test_reading_the_estimate_changes_nothing(
     which: str, method: Any, drawn: Any, asked_every: int

@@ -109,7 +109,8 @@ def test_a_log_and_a_model_are_taken_in_every_form(
     for model in (fitted, path, str(path)):
         assert np.array_equal(cangauge.estimate(log, model).soc_pct, plain, equal_nan=True)
         assert isinstance(cangauge.Estimator(model), cangauge.Estimator)
-    assert cangauge.fit(drive, capacity_ah=60.0).model.capacity_ah == 60.0
+    for same in (drive, log.to_arrow()):
+        assert cangauge.fit(same, capacity_ah=60.0).model.capacity_ah == 60.0
 
 
 @pytest.mark.parametrize(

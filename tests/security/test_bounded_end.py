@@ -1,4 +1,4 @@
-"""A service ends soon after SIGTERM, and publishes until then, whatever its files do."""
+"""A service ends after SIGTERM, and publishes until then, while its reader stands."""
 
 from __future__ import annotations
 

@@ -50,7 +50,7 @@ def test_a_log_at_full_speed_from_one_process_to_the_other(
         f'model = "{MODEL[1]}"\ninterface = "{interface}"\nchannel = "{channel}"\n'
         'vehicle = "leaf_aze0"\ntime_source = "replay-clock"\nuntil_idle_s = 1\n'
         f"bus_options = {{ port = {port} }}\n"
-        "ids = { soc_estimate = 0x4A0, soc_detail = 0x4A1 }\n"
+        "ids = { soc_estimate = 0x4A0, soc_detail = 0x4A1, replay_clock = 0x4AF }\n"
     )
     service = Command("run", "--config", config, "--json", "--record", record)
     replayed = run_to_end("replay", log_path, "--config", config, "--speed", "max", "--json")
@@ -63,7 +63,8 @@ def test_a_log_at_full_speed_from_one_process_to_the_other(
     assert result["frames"]["lost"] == result["rejects"]["crc_errors"] == 0
     assert result["estimate"]["soc_pct"] == pytest.approx(replayed.json["soc_pct"], abs=0.01)
     # Bit for bit: the recording, offline.
-    offline = estimate_capture(record, Vehicle.load("leaf_aze0"), leaf_model()).table
+    vehicle = Vehicle.load("leaf_aze0")
+    offline = estimate_capture(record, vehicle, leaf_model(), clock_id=0x4AF).table
     assert offline.soc_pct.size == 1200
     for name in ("time_s", "soc_pct", "soc_std_pct", "soc_newton_pct", "soc_coulomb_pct"):
         assert result["estimate"][name] == getattr(offline, name)[-1], name
@@ -178,6 +179,7 @@ def test_bad_options_of_both_commands(
     [
         (["run"], "--model"),
         (["run", "-m", "/nowhere/model.json"], "/nowhere/model.json"),
+        (["run", *MODEL, "--method", "magic"], "magic"),
         (["run", *MODEL, "--initial-soc", "150"], "150"),
         (["run", *MODEL, "--time-source", "sundial"], "sundial"),
         (["run", *MODEL, "--config", "/nowhere/car.toml"], "/nowhere/car.toml"),

@@ -175,22 +175,39 @@ def test_a_histogram_counts_every_value_once() -> None:
     assert found["p99_at_most_s"] is None
 
 
+class Kept(Notifier):
+    """A notifier that keeps what it is to send."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.sent: list[dict[str, object]] = []
+
+    def send(self, **values: object) -> None:
+        self.sent.append(values)
+
+
 def test_watchdog_pings_come_with_turns_only() -> None:
-    class Counting(Notifier):
-        pings = 0
-
-        def send(self, **values: object) -> None:
-            self.pings += "WATCHDOG" in values
-
-    notifier = Counting()
+    notifier = Kept()
     notifier.ping_every_s = 0.5
     watched = Watched(notifier=notifier)
     for _ in range(100):
         watched.turn(0.1)
-    assert 19 <= notifier.pings <= 50
-    before = notifier.pings
+    before = sum("WATCHDOG" in values for values in notifier.sent)
+    assert 19 <= before <= 50
     watched.now_s += 60.0
-    assert notifier.pings == before
+    assert sum("WATCHDOG" in values for values in notifier.sent) == before
+
+
+def test_systemd_learns_of_a_reload_and_of_its_refusal() -> None:
+    notifier = Kept()
+    monitor = Watched(notifier=notifier).monitor
+    notifier.sent.clear()
+    monitor.reload_begins()
+    monitor.reload_ends("no such file")
+    begins, ends = notifier.sent
+    assert begins["RELOADING"] == ends["READY"] == 1
+    assert int(str(begins["MONOTONIC_USEC"])) > 0
+    assert "new configuration REFUSED: no such file" in str(ends["STATUS"])
 
 
 def test_status_changes_are_logged(caplog: pytest.LogCaptureFixture, watched: Watched) -> None:

@@ -10,6 +10,7 @@ import pytest
 from cangauge.types import Reason
 from faults.criteria import (
     DEGRADED,
+    INVALID,
     VALID,
     Estimate,
     Observation,
@@ -86,6 +87,40 @@ def test_soc_error_after_recovery(shift: float, passes: bool) -> None:
     assert found.soc_error_pct == pytest.approx(abs(shift), abs=0.011)  # transport time
 
 
+def test_wrong_soc_passes_while_not_valid() -> None:
+    wrong = [replace(each, soc_pct=20.0, status=DEGRADED) for each in published()]
+    found = verdict(observed(published=wrong))
+    assert found.passed
+    assert math.isnan(found.soc_error_pct)
+
+
+def test_the_worst_error_is_that_beyond_its_own_deviation() -> None:
+    frames = published()
+    for place, error_pct, std_pct in ((-60, 1.5, 5.0), (-50, 0.9, 0.1)):
+        soc_pct = frames[place].soc_pct - error_pct
+        frames[place] = replace(frames[place], soc_pct=soc_pct, soc_std_pct=std_pct)
+    found = verdict(observed(published=frames))
+    assert (found.passed, found.std_pct) == (False, 0.1)
+
+
+def test_single_wrong_frame_fails() -> None:
+    frames = published()
+    frames[-50] = replace(frames[-50], soc_pct=frames[-50].soc_pct - 3.0)
+    assert not verdict(observed(published=frames)).passed
+
+
+def test_soc_error_during_the_fault_passes() -> None:
+    found = verdict(observed(published=published(-5.0, *FAULT)))
+    assert found.passed
+    assert found.worst_error_pct == pytest.approx(5.0, abs=0.02)
+
+
+def test_valid_without_a_number_fails() -> None:
+    frames = published()
+    frames[-10] = replace(frames[-10], soc_pct=math.nan)
+    assert not verdict(observed(published=frames)).passed
+
+
 @pytest.mark.parametrize(
     ("role", "seconds", "passes"),
     [
@@ -102,6 +137,21 @@ def test_stale_and_valid_fails(role: str, seconds: float, passes: bool) -> None:
     assert (role in " ".join(found.failures)) is not passes
 
 
+def test_stale_and_invalid_passes() -> None:
+    run = observed(
+        good_sent_s=without("current", 20.0), published=published(INVALID, FAULT[0] + 2.0, FAULT[1])
+    )
+    found = verdict(run)
+    assert found.passed
+    assert found.worst_status == "invalid"
+    assert found.not_valid_s == pytest.approx(18.0, abs=0.2)
+
+
+def test_missing_role_fails() -> None:
+    good = {**observed().good_sent_s, "voltage": []}
+    assert not verdict(observed(good_sent_s=good)).passed
+
+
 def test_unexpected_silence_fails() -> None:
     gone = published(None, 1090.0, 1095.0)
     found = verdict(observed(published=gone))
@@ -109,6 +159,32 @@ def test_unexpected_silence_fails() -> None:
     assert verdict(
         observed(published=gone, expected_silence_s=[(1089.0, 1091.0), (1090.5, 1094.0)])
     ).passed
+
+
+def test_silence_until_the_end_fails() -> None:
+    found = verdict(observed(published=published(None, 1120.0)))
+    assert "nothing published after the fault" in found.failures
+    assert found.last_status == "none"
+    assert not verdict(observed(published=[])).passed
+
+
+def test_unexpected_end_of_the_process_fails() -> None:
+    found = verdict(observed(incidents=["ended by itself, status -11"]))
+    assert found.failures == ("ended by itself, status -11",)
+
+
+@pytest.mark.parametrize(
+    "bad",
+    [
+        {"published": published(DEGRADED, 1185.0)},
+        {"published": published(DEGRADED, 1079.5, 1081.0)},
+        {"published": []},
+        {"incidents": ["ended by itself, status 1"]},
+    ],
+)
+def test_invalid_undisturbed_run_is_refused(bad: dict[str, object]) -> None:
+    with pytest.raises(ValueError, match="undisturbed"):
+        Reference(observed(**bad))
 
 
 def reported(reason: Reason, first: float, last: float, status: int = DEGRADED) -> Observation:

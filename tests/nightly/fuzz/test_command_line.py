@@ -196,10 +196,11 @@ def test_no_number_of_an_option_is_out_of_its_range(
     assert not re.search(r"[Ii]nput should|less than or equal|greater than or equal", line)
 
 
-def test_a_soc_beyond_100_is_refused(refused: Callable[..., str]) -> None:
+@pytest.mark.parametrize("option", ["--initial-soc", "--initial-soc-std"])
+def test_a_soc_beyond_100_is_refused(option: str, refused: Callable[..., str]) -> None:
     for command in ("run", "estimate"):
-        line = refused(command, *PRESENT[command], "--initial-soc", "150")
-        assert re.search("--initial-soc: must (lie within 0 … 100|be at most 100) ", line)
+        line = refused(command, *PRESENT[command], option, "150")
+        assert re.search(f"{option}: must (lie within 0 … 100|be at most 100) ", line)
         assert "(got 150.0)" in line
 
 
