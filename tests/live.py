@@ -7,7 +7,6 @@ import errno
 import io
 import json
 import logging
-import math
 import os
 import subprocess
 import sys
@@ -344,7 +343,7 @@ def quantized(vehicle: Vehicle, log: Log) -> Log:
         for column, signal in columns.items()
         if (values := getattr(log, column)) is not None
     }
-    if not math.isnan(vehicle.fixed_temperature_c):
+    if vehicle.fixed_temperature_c is not None:
         sent["temperature_c"] = np.full(len(log), vehicle.fixed_temperature_c)
     return replace(log, time_s=np.rint(log.time_s * MICROSECONDS) / MICROSECONDS, **sent)
 

@@ -68,7 +68,7 @@ def test_every_preset_loads_and_wants_its_three_signals(name: str) -> None:
     assert vehicle.soc_reference is not None
     if temperature_c is None:
         assert vehicle.temperature is not None
-        assert math.isnan(vehicle.fixed_temperature_c)
+        assert vehicle.fixed_temperature_c is None
     else:
         assert (vehicle.fixed_temperature_c, vehicle.temperature_source) == (20.0, "unknown")
     cells = () if vehicle.cells is None else vehicle.cells.keys

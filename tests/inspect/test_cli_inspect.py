@@ -81,7 +81,7 @@ def test_a_log_needs_no_vehicle(path: Path, option: str) -> None:
     given.write_text('[current]\nsignal = "x"\n')
     result = CliRunner().invoke(app, [str(path), option, str(given), "--json"])
     assert json.loads(result.stdout)["rows"] == 6000
-    assert "--vehicle and --map do not apply to it" in result.stderr
+    assert "--vehicle, --dbc and --map do not apply to it" in result.stderr
 
 
 @pytest.mark.real

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from cangauge.logs.column_map import ColumnMap, find_columns, suggestion
+from cangauge.logs.column_map import ColumnMap, choose_columns, suggestion
 from cangauge.logs.headings import meaning_of
 
 SPELLINGS = {
@@ -86,9 +86,11 @@ SPELLINGS = {
 def test_headings_of_public_exporters(name: str) -> None:
     text, expected = SPELLINGS[name]
     headings = text.split(",")
-    chosen, _ = find_columns(headings)
+    choice = choose_columns(headings)
     found = [
-        "+".join(headings[place] for place in chosen[quantity].places) if quantity in chosen else ""
+        "+".join(headings[place] for place in choice.chosen[quantity].places)
+        if quantity in choice.chosen
+        else ""
         for quantity in ("time", "current", "voltage", "temperature", "soc")
     ]
     assert "|".join(found) == expected
@@ -100,14 +102,14 @@ def test_headings_of_public_exporters(name: str) -> None:
      "Charge Time", "Amp-hr", "dV/dt (V/s)", "Voltage Setpoint [V]", "Inverter Temp"],
 )  # fmt: skip
 def test_other_quantities_are_not_taken(heading: str) -> None:
-    assert not find_columns([heading])[0]
+    assert not choose_columns([heading]).chosen
 
 
 def test_several_of_a_kind_are_left_to_the_user() -> None:
     headings = ["Time [s]", "Battery Current [A]", "Battery Current [A]", "Voltage 1", "Voltage 2"]
-    chosen, guesses = find_columns(headings)
-    assert set(chosen) == {"time"}
-    assert suggestion(headings, guesses | chosen) == (
+    choice = choose_columns(headings)
+    assert set(choice.chosen) == {"time"}
+    assert suggestion(headings, choice) == (
         "--columns 'time=Time [s],current=Battery Current [A],voltage=Voltage 1'"
     )
 
@@ -127,7 +129,7 @@ def test_heading_unit_and_factor_are_told_apart(
     text: str, expected: tuple[str, str, float]
 ) -> None:
     headings = ["Time [s]", "I, pack [A]", "ratio 1:2", "U [V]"]
-    column = find_columns(headings, (), ColumnMap.of(text))[0]["current"]
+    column = choose_columns(headings, (), ColumnMap.of(text)).chosen["current"]
     assert (headings[column.places[0]], column.unit, column.factor) == expected
 
 

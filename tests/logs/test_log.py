@@ -65,12 +65,20 @@ def test_log_reads_back_exactly(log: Log, suffix: str | None, tmp_path: Path) ->
     assert not [text for text in back.remarks if not text.startswith("current looks inverted")]
 
 
+def test_log_in_the_battery_data_format_has_no_soc(tmp_path: Path, drive: Log) -> None:
+    write_log(drive, tmp_path / "drive.bdf.csv")
+    assert (tmp_path / "drive.bdf.csv").read_text().startswith("Test Time / s,Voltage / V,Current")
+    back = read_log(tmp_path / "drive.bdf.csv")
+    np.testing.assert_array_equal(back.current_a, drive.current_a)
+    assert (back.soc_pct, back.temperature_source, back.name) == (None, "cell", "drive")
+
+
 @pytest.mark.parametrize(
     ("values", "words"),
     [
         ([[], [], [], []], "the log holds no rows"),
         ([[0, 1], [1], [380, 380], [20, 20]], "current_a: has 1 values where time_s has 2"),
-        ([[0, 1], [1, np.nan], [380, 380], [20, 20]], "current_a: 1 of 2 rows lack time, current"),
+        ([[0, 1], [1, np.nan], [380, 380], [20, 20]], "current_a: 1 of 2 values are not finite"),
         ([[0, 0], [1, 1], [380, 380], [20, 20]], "time_s: time does not increase at row 2"),
     ],
 )
@@ -216,7 +224,7 @@ def test_units_signs_and_factors_round_trip(units: tuple[str, ...], factor: floa
     columns = {
         "time": f"a[{units[0]}]",
         "current": f"b[{units[1]}]:{factor!r}",
-        "voltage": f"c[{units[2]}]",
+        "voltage": {"heading": "c", "unit": units[2]},
         "temperature": f"d[{units[3]}]",
     }
     log = Log.from_dataframe(frame, columns=columns, sign="discharge")

@@ -251,6 +251,7 @@ def test_check_reads_what_run_would_read(tmp_path: Path) -> None:
             "0x1DB",
         ),
         (f'model = "{leaf_model_path()}"\nstate = "no/x.json"', "no/x.json"),
+        (f'model = "{leaf_model_path()}"\nrecord = "x.csv"', "x.csv: --record: a recording is a"),
     ):
         ended = in_process("check", write(tmp_path, text))
         assert (ended.code, ended.out, len(ended.err.splitlines())) == (2, "", 1)

@@ -377,4 +377,4 @@ def find_signal(
 
 def _listed(names: list[str], what: str) -> str:
     more = f" and {len(names) - 6} more" if len(names) > 6 else ""
-    return f"{what} are {', '.join(names[:6])}{more}" if names else f"{what} are none"
+    return f"{what} are {', '.join(names[:6])}{more}" if names else f"it has no {what[4:]}"

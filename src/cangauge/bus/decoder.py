@@ -210,6 +210,8 @@ class SampleDecoder:
         self._pairing = Pairing(vehicle.pair_within_s, self.statistics)
         # In one frame: each is a sample by itself.
         self._is_paired = vehicle.current.key == vehicle.voltage.key
+        fixed_c = vehicle.fixed_temperature_c
+        self._fixed_c = math.nan if fixed_c is None else fixed_c
         self._routes: dict[int, _Route] = {}
         messages = vehicle.messages.items()
         self._by_pgn = {key & pgn_mask(key): key for key, each in messages if each.by_pgn}
@@ -333,7 +335,7 @@ class SampleDecoder:
                 voltage_v = value
         sample: Sample | None = None
         if not math.isnan(current_a):
-            temperature_c = self.vehicle.fixed_temperature_c
+            temperature_c = self._fixed_c
             if self._temperature is not None:
                 temperature_c = self._temperature.value_at(time_s)
             sample = Sample(time_s, current_a, voltage_v, temperature_c)

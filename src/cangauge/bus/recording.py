@@ -340,4 +340,4 @@ def capture_to_log(
     names = {LOG_COLUMNS[each.role]: each.codec.name for each in vehicle.signals}
     labels = {"time_s": "time stamps", **names}
     refuse_wrong_units(values, source=path, labels=labels, in_seconds=True)
-    return resolve_sign(log)
+    return resolve_sign(log, stored_sign_unknown=False)

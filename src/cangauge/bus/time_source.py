@@ -138,7 +138,7 @@ class StampLimiter:
         if not abs(off_s - self._off_s) <= self._tolerance_s:  # NaN too
             self._off_s, self._off_since_s = off_s, now_s
         elif now_s - self._off_since_s >= STEP_AFTER_S:
-            self.shift_s -= max(off_s, self._off_s)  # the one read sooner
+            self.shift_s -= max(off_s, self._off_s)  # the larger one was delayed less on its way
         return now_s + self.offset_s
 
 

@@ -127,8 +127,8 @@ class MessageProtection(NamedTuple):
 class Vehicle:
     """Signals of a vehicle, ready to decode and encode; None: the vehicle has none.
 
-    `fixed_temperature_c` is the temperature where no signal has it [°C], or NaN. `pair_within_s` is
-    the largest distance in bus time between paired current and voltage [s]. `messages` has every
+    `fixed_temperature_c` is the temperature where no signal has it [°C]. `pair_within_s` is the
+    largest distance in bus time between paired current and voltage [s]. `messages` has every
     message with a wanted signal, by key (id, plus `EXTENDED`).
     """
 
@@ -137,7 +137,7 @@ class Vehicle:
     voltage: VehicleSignal
     temperature: VehicleSignal | None
     soc_reference: VehicleSignal | None
-    fixed_temperature_c: float
+    fixed_temperature_c: float | None
     temperature_source: TemperatureSource
     pair_within_s: float
     messages: dict[int, MessageProtection]
@@ -285,7 +285,7 @@ class _Binder:
             cells=None if mapping.cells is None else self._cells(mapping.cells),
             temperature=self._optional("temperature", temperature if fixed_c is None else None),
             soc_reference=self._optional("soc_reference", mapping.soc_reference),
-            fixed_temperature_c=math.nan if fixed_c is None else fixed_c,
+            fixed_temperature_c=fixed_c,
             temperature_source=mapping.temperature_source if temperature_c is None else "unknown",
             pair_within_s=within_s,
             messages=self._protections(),

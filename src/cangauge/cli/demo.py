@@ -84,6 +84,8 @@ def demo_command(*, folder: Path = Path("out/demo"), json_output: bool = False) 
     log = read_log(shared_file("replay", PLAYED))
     log = replace(log, current_a=log.current_a + SENSOR_OFFSET_A)
     write_log(log, folder / PLAYED)
+    for old in folder.glob("live*.log"):  # a recording is never overwritten
+        old.unlink()
     seconds = _play(folder, folder / PLAYED)
     note("3/4  compare live with offline and with the reference")
     settings, vehicle = EstimatorSettings(temperature_source="room"), Vehicle.load("generic")

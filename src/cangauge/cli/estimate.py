@@ -132,7 +132,7 @@ def _of_log(
             settings,
             soc_from_log=initial_soc is None,
             pack=history,
-            progress=lambda number: show(f"{log.name}: {number} of {len(log)} samples"),
+            progress=lambda count: show(f"{log.name}: {count} of {len(log)} samples"),
         )
     if (gap_s := done.settings.gap_s) > GAP_S:
         note(
@@ -162,7 +162,7 @@ def _of_capture(
             model,
             settings,
             keeps_pack=pack is not None,
-            progress=lambda number: show(f"{capture.path.name}: {number} frames"),
+            progress=lambda count: show(f"{capture.path.name}: {count} frames"),
         )
     recorded = done.recorded
     refuse_single_row(recorded)

@@ -35,13 +35,15 @@ class ReadingOptions:
     ----------
     vehicle : PRESET
         For a capture: the car's preset (a DBC and a map that ship with cangauge).
+    dbc : FILE
+        For a capture: the bus's DBC, where the map names none.
     map_file : --map FILE
-        For a capture: the car's DBC, and which of its signals are current, voltage and temperature.
+        For a capture: which signals are current, voltage and temperature, and their DBC.
     columns : NAME=HEADING,…
         For a table of other headings: time, current, voltage, temperature, soc, each
         NAME=HEADING[UNIT]:FACTOR; unit and factor only where the heading leaves them open.
         'current=I_batt[mA]:-1' (mA, discharge negative); 'time=Date+Time' joins two columns;
-        'temperature=T1+T2' averages; '#3' is the third column. See docs/logs.md.
+        'temperature=T1+T2' takes the median; '#3' is the third column. See docs/logs.md.
     sign : charge|discharge
         What a positive current in the file does. Default: as its format defines it, else found
         from the data.
@@ -50,6 +52,7 @@ class ReadingOptions:
     """
 
     vehicle: str | None = None
+    dbc: Path | None = None
     map_file: Path | None = None
     columns: str | None = None
     sign: str | None = None
@@ -58,13 +61,13 @@ class ReadingOptions:
     @property
     def names_vehicle(self) -> bool:
         """Whether an option for captures is given."""
-        return (self.vehicle, self.map_file) != (None, None)
+        return (self.vehicle, self.dbc, self.map_file) != (None, None, None)
 
     def car(self) -> Vehicle:
         """Return the vehicle that decodes a capture; may raise InputError."""
         from cangauge.bus.vehicle import Vehicle
 
-        return Vehicle.load(self.vehicle, map=self.map_file, temperature_c=self.temperature)
+        return Vehicle.load(self.vehicle, self.dbc, self.map_file, temperature_c=self.temperature)
 
     def given_columns(self) -> ColumnMap | None:
         """Return the columns of `--columns`; may raise InputError."""
@@ -89,7 +92,7 @@ class ReadingOptions:
     def note_log(self, path: Path) -> None:
         """Print on stderr that options for captures do not apply to a log."""
         if self.names_vehicle and self.mapped_columns() is None:
-            note(f"{path}: a log, not a capture: --vehicle and --map do not apply to it")
+            note(f"{path}: a log, not a capture: --vehicle, --dbc and --map do not apply to it")
 
     def load(self, path: Path, used: Sequence[str] = ()) -> Log:
         """Read a log, or decode a capture; print the reader's remarks on stderr.

@@ -46,8 +46,8 @@ def run_command(*, config: Path | None = None, json_output: bool = False, **opti
     `cangauge run -m leaf.json --time-source replay-clock`  (and, beside it,
     `cangauge replay trip.parquet --speed max`)
 
-    `cangauge run --config car.toml --record drive.log`  (then
-    `cangauge estimate drive.log` writes the table of the live estimates, bit for bit)
+    `cangauge run --config car.toml --record drive.log`  (then `cangauge estimate drive.log -m
+    leaf.json --vehicle leaf_aze0 -o soc.parquet` writes the live estimates, bit for bit)
 
     `cangauge run --config car.toml --state /var/lib/cangauge`
 
@@ -96,7 +96,8 @@ class _LiveLine(Output):
 
     def close(self) -> None:
         """Remove the line."""
-        self._live.stop()
+        if takes_text(self._live.console.file):
+            self._live.stop()
 
 
 @command()

@@ -54,7 +54,7 @@ def status_command(
     ----------
     endpoint : PATH
         Unix socket of the service. Default: the service running on this machine. From another
-        machine: `curl http://HOST:PORT/status`.
+        machine: `curl -H "Authorization: Bearer TOKEN" http://HOST:PORT/status`.
     watch : --watch
         Show it again every half second, until Ctrl-C.
     """

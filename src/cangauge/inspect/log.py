@@ -18,11 +18,12 @@ from cangauge.identify.rows import (
     usable_rows,
 )
 from cangauge.inspect.channels import Channel, describe_channels
-from cangauge.logs.gaps import discharged_ah, uncounted_gaps, usual_gap_s, usual_step_s
+from cangauge.logs.gaps import uncounted_gaps, usual_gap_s, usual_step_s
 from cangauge.logs.log import Log
 from cangauge.logs.sign import (
     STEP_SPACING_S,
     SignFinding,
+    charge_ah,
     correlation,
     current_steps,
     sign_of_current,
@@ -209,7 +210,7 @@ def _timing(log: Log) -> Timing:
 
 
 def _charge(log: Log) -> Charge:
-    state, step = discharged_ah(log.time_s, log.current_a), np.diff(log.time_s)
+    state, step = charge_ah(log), np.diff(log.time_s)
     part, uncounted = np.diff(state), uncounted_gaps(log.time_s)
     in_gaps = part[step > usual_gap_s(log.time_s, GAP_S)]
     return Charge(
@@ -365,7 +366,7 @@ def _temperature(log: Log) -> tuple[Verdict, str]:
     }.get(log.temperature_source, f" ({log.temperature_source})")
     if span < TEMPERATURE_SPAN_K:
         return "no", f"temperature {f'spans only {span:.1f} K' if span else 'never changes'}{where}"
-    alike = correlation(discharged_ah(log.time_s, log.current_a), log.temperature_c)
+    alike = correlation(charge_ah(log), log.temperature_c)
     text = f"temperature spans {span:.1f} K, correlated with charge by {alike:+.2f}{where}"
     is_doubtful = abs(alike) > CORRELATED or where.startswith(";")
     return "partly" if is_doubtful else "yes", text

@@ -20,47 +20,46 @@ import pyarrow.parquet as pq
 
 from cangauge._files import Head, atomic_path
 from cangauge.errors import InputError
-from cangauge.logs.column_map import SOURCE
 from cangauge.logs.log import Log
-from cangauge.logs.table import ArrowTable
+from cangauge.logs.table import SOURCE, ArrowTable
 from cangauge.logs.text import MAX_COLUMNS, MAX_ROWS
 from cangauge.logs.units import TemperatureSource
 
 _METADATA_KEY: Final = b"cangauge.temperature_source"
 
 
-def parquet_table(head: Head) -> ArrowTable:
-    """Return a Parquet file as a table that is read by column.
+@contextmanager
+def open_parquet(head: Head) -> Iterator[ArrowTable]:
+    """Open a Parquet file as a table that is read by column.
 
     Raises
     ------
     InputError
         If it is damaged, or larger than a log may be.
     """
-    with _damage_named(head):
-        file = pq.ParquetFile(pa.BufferReader(head.read()), page_checksum_verification=True)
-    for what, limit in (("rows", MAX_ROWS), ("columns", MAX_COLUMNS)):
-        if (count := getattr(file.metadata, f"num_{what}")) > limit:
-            problem = f"more than the {limit} {what} that a log may have"
-            raise InputError(problem, source=head.path, value=count, cure="split it")
+    with head.open() as unpacked:
+        stream = unpacked if unpacked.seekable() else pa.BufferReader(unpacked.read())
+        try:
+            file = pq.ParquetFile(stream, page_checksum_verification=True)
+            rows, columns = file.metadata.num_rows, file.metadata.num_columns
+            for what, count, limit in (("rows", rows, MAX_ROWS), ("columns", columns, MAX_COLUMNS)):
+                if count > limit:
+                    problem = f"more than the {limit} {what} that a log may have"
+                    raise InputError(problem, source=head.path, value=count, cure="split it")
 
-    def read(names: list[str]) -> Any:
-        with _damage_named(head):
-            table = file.read(columns=names)
-            table.validate(full=True)  # damaged indices may exceed a dictionary
-        return table
+            def read(names: list[str]) -> Any:
+                table = file.read(columns=names)
+                table.validate(full=True)  # damaged indices may exceed a dictionary
+                return table
 
-    return arrow_table(file.schema_arrow, read)
-
-
-@contextmanager
-def _damage_named(head: Head) -> Iterator[None]:
-    try:
-        yield
-    except (pa.ArrowException, OSError, ValueError) as error:
-        reason = (str(error) or type(error).__name__).splitlines()[0]
-        problem = f"the Parquet file is cut off or damaged ({reason})"
-        raise InputError(problem, source=head.path, cure="export again") from error
+            yield arrow_table(file.schema_arrow, read)
+        except (pa.ArrowException, OSError, ValueError) as error:
+            reason = (str(error) or type(error).__name__).splitlines()[0]
+            raise InputError(
+                f"the Parquet file is cut off or damaged ({reason})",
+                source=head.path,
+                cure="export again",
+            ) from error
 
 
 def arrow_table(schema: Any, read: Any) -> ArrowTable:
@@ -87,32 +86,45 @@ def build_table(
 def write_log(log: Log, path: str | PathLike[str]) -> None:
     """Write a canonical log as `.parquet` or `.csv`, all or nothing; values read back exactly.
 
+    `.bdf`, `.bdf.csv` and `.bdf.parquet` are the Battery Data Format, which has no SoC.
+
     Raises
     ------
     InputError
         If the suffix is another one, or the folder is absent or not writable.
     """
+    if ".bdf" in Path(path).suffixes[-2:]:
+        place = "Ambient" if log.temperature_source == "room" else "Surface"
+        number = "" if place == "Ambient" else " T1"
+        columns = {
+            "Test Time / s": log.time_s,
+            "Voltage / V": log.voltage_v,
+            "Current / A": 0.0 - log.current_a,  # positive charges
+            f"{place} Temperature{number} / degC": log.temperature_c,
+        }
+        write_table(columns, path)
+        return
     table = log.to_arrow()
     if Path(path).suffix.lower() == ".csv" and log.temperature_source != "unknown":
         table = table.append_column(SOURCE, [[log.temperature_source] * len(log)])
-    write_table(table, path)
+    _write(table, path)
 
 
-def write_table(columns: Any, path: str | PathLike[str]) -> None:
-    """Write arrays of one length, or a pyarrow.Table, as `.parquet` or `.csv`, all or nothing.
+def write_table(columns: Mapping[str, Any], path: str | PathLike[str]) -> None:
+    """Write arrays of one length as `.parquet` or `.csv`, all or nothing; NaN becomes missing."""
+    _write(build_table(columns), path)
 
-    NaN becomes missing.
-    """
-    table = columns if isinstance(columns, pa.Table) else build_table(columns)
+
+def _write(table: Any, path: str | PathLike[str]) -> None:
     suffix = Path(path).suffix.lower()
-    if suffix not in {".parquet", ".pq", ".csv"}:
+    if suffix not in {".parquet", ".pq", ".csv", ".bdf"}:
         cure = "use .parquet or .csv"
         raise InputError("unknown suffix for a table", source=path, value=suffix, cure=cure)
     with atomic_path(path) as part:
-        if suffix != ".csv":
+        if suffix in {".csv", ".bdf"}:
+            with part.open("wb") as file:
+                file.write((",".join(table.column_names) + "\n").encode())
+                options = pacsv.WriteOptions(include_header=False, quoting_style="needed")
+                pacsv.write_csv(table, file, options)
+        else:
             pq.write_table(table, part, write_page_checksum=True)
-            return
-        with part.open("wb") as file:
-            file.write((",".join(table.column_names) + "\n").encode())
-            options = pacsv.WriteOptions(include_header=False, quoting_style="needed")
-            pacsv.write_csv(table, file, options)

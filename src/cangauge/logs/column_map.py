@@ -3,18 +3,16 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Final
 
 from cangauge.errors import InputError, closest
 from cangauge.logs.headings import GUESS, Meaning, meaning_of, names_and_units
-from cangauge.logs.units import FIELDS, REQUIRED, TemperatureSource, unit_of
+from cangauge.logs.units import FIELDS, TemperatureSource, unit_of
 
 DOCS: Final = "docs/logs.md"
 """Page that explains the columns of a log."""
-SOURCE: Final = "temperature_source"
-"""Column or metadata of a canonical log: the location of the temperature sensor."""
 _SYNTAX: Final = (
     "give NAME=HEADING, NAME=HEADING[UNIT] or NAME=HEADING[UNIT]:FACTOR, separated by commas, for"
     " time, current, voltage, temperature, soc"
@@ -26,25 +24,54 @@ _UNIT: Final = re.compile(r"^(?P<text>.*\S)\s*\[(?P<unit>[^\[\]]*)\]$")
 
 
 @dataclass(frozen=True, slots=True)
-class ColumnMap:
-    """The user's columns.
+class ColumnSpec:
+    """One column as the user gives it.
 
     Parameters
     ----------
-    specs : dict
-        By quantity (time, current, voltage, temperature, soc): a heading, or headings joined by
-        `+` (a date and its time; the median of temperatures), or `#3` for the third column; then
-        `[UNIT]`, in place of the heading's, and `:FACTOR`, both optional.
-    where : str
-        Option or file that states them, for messages.
+    text : str
+        Heading, or headings joined by `+` (a date and its time; the median of temperatures), or
+        `#3` for the third column; then `[UNIT]` and `:FACTOR`, both optional.
+    unit : str, optional
+        Unit of the column, in place of the heading's.
+    factor : float
+        The column times this is in its unit; its sign inverts.
     """
 
-    specs: Mapping[str, str] = field(default_factory=dict)
+    text: str
+    unit: str | None = None
+    factor: float = 1.0
+
+    def readings(self) -> list[ColumnSpec]:
+        """Return the readings of the text: the whole, then without factor, without unit."""
+        found = [self]
+        if match := _FACTOR.match(self.text):
+            found.append(ColumnSpec(match["text"], self.unit, self.factor * float(match["factor"])))
+        if self.unit is None:
+            found += [
+                ColumnSpec(match["text"], match["unit"].strip(), item.factor)
+                for item in list(found)
+                if (match := _UNIT.match(item.text))
+            ]
+        return found
+
+
+@dataclass(frozen=True, slots=True)
+class ColumnMap:
+    """The user's columns by quantity: time, current, voltage, temperature, soc.
+
+    `where` is the option or file that states them, for messages.
+    """
+
+    specs: Mapping[str, ColumnSpec] = field(default_factory=dict)
     where: str = "--columns"
 
     @classmethod
     def of(cls, given: ColumnMap | Mapping[str, Any] | str, where: str = "columns") -> ColumnMap:
-        """Return the map of a text (`time=t,current=I[mA]:-1`) or of a mapping of texts.
+        """Return the map of a text (`time=t,current=I[mA]:-1`) or of a mapping.
+
+        Values of a mapping are texts, or mappings with `heading` and optionally `unit`, `sign` and
+        `scale`.
 
         Raises
         ------
@@ -53,30 +80,52 @@ class ColumnMap:
 
         Examples
         --------
-        >>> ColumnMap.of("time=t,current=I, pack[mA]:-1").specs["current"]
+        >>> ColumnMap.of("time=t,current=I, pack[mA]:-1").specs["current"].text
         'I, pack[mA]:-1'
         """
         if isinstance(given, ColumnMap):
             return given
-        if isinstance(given, str):
-            parts = (part.partition("=") for part in _SPLIT.split(given))
-            pairs: Iterable[tuple[Any, Any]] = [(name, text) for name, _, text in parts]
-        elif isinstance(given, Mapping):
-            pairs = given.items()
-        else:
+        if not isinstance(given, Mapping | str):
             raise InputError("not columns", field=where, value=given, cure=_SYNTAX)
-        specs: dict[str, str] = {}
-        for name, text in pairs:
-            quantity = str(name).strip().lower()
-            if not isinstance(text, str) or not text.strip():
-                raise InputError("not a column", field=where, value=text or name, cure=_SYNTAX)
-            if quantity not in FIELDS:
-                cure = f"known are {', '.join(FIELDS)}"
-                raise InputError("not a quantity of a log", field=where, value=quantity, cure=cure)
+        pairs = given.items() if isinstance(given, Mapping) else _pairs(given, where)
+        specs: dict[str, ColumnSpec] = {}
+        for name, value in pairs:
+            quantity = str(name).lower()
             if quantity in specs:
                 raise InputError("is given twice", field=where, value=name)
-            specs[quantity] = text.strip()
+            specs[quantity] = _spec_of(quantity, value, where)
         return cls(specs, where)
+
+
+def _pairs(text: str, where: str) -> list[tuple[str, str]]:
+    parts = [(part, *part.partition("=")) for part in _SPLIT.split(text)]
+    for part, _, equals, value in parts:
+        if not equals or not value.strip():
+            raise InputError("not a column", field=where, value=part, cure=_SYNTAX)
+    return [(name.strip(), value.strip()) for _, name, _, value in parts]
+
+
+def _spec_of(quantity: str, value: Any, where: str) -> ColumnSpec:
+    if quantity not in FIELDS:
+        cure = f"known are {', '.join(FIELDS)}"
+        raise InputError("not a quantity of a log", field=where, value=quantity, cure=cure)
+    if isinstance(value, ColumnSpec):
+        return value
+    if isinstance(value, str) and value.strip():
+        return ColumnSpec(value.strip())
+    if isinstance(value, Mapping) and isinstance(value.get("heading"), str):
+        unit, sign, scale = value.get("unit"), value.get("sign", 1), value.get("scale", 1.0)
+        is_number = isinstance(scale, int | float) and not isinstance(scale, bool) and scale > 0.0
+        known = set(value) <= {"heading", "unit", "sign", "scale"}
+        if known and is_number and sign in {1, -1} and isinstance(unit, str | None):
+            return ColumnSpec(value["heading"], unit, float(sign * scale))
+    raise InputError(
+        "not a column",
+        field=f"{where}.{quantity}",
+        value=value,
+        cure='give a text such as "Pack Current[mA]:-1", or { heading = …, unit = …, sign = ±1,'
+        " scale = … }",
+    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,118 +140,107 @@ class ChosenColumn:
     places: tuple[int, ...]
     unit: str = ""
     factor: float = 1.0
+    given: bool = False
     source: TemperatureSource = "unknown"
-    others: tuple[ChosenColumn, ...] = ()
+    others: tuple[int, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class Choice:
+    """Columns of a table by quantity, and the likeliest column of each that is not plain."""
+
+    chosen: dict[str, ChosenColumn] = field(default_factory=dict)
+    guesses: dict[str, int] = field(default_factory=dict)
+
+    @property
+    def is_complete(self) -> bool:
+        """Whether time, current and voltage are known (a temperature may be given)."""
+        return set(_NEEDED) <= set(self.chosen)
 
 
 def choose_columns(
-    headings: Sequence[str],
-    units_below: Sequence[str] = (),
-    given: ColumnMap | None = None,
-    *,
-    source: str,
-) -> dict[str, ChosenColumn]:
-    """Return the columns of a table by quantity: the user's first, then by plain headings.
+    headings: Sequence[str], units_below: Sequence[str] = (), given: ColumnMap | None = None
+) -> Choice:
+    """Choose the columns of a table: the user's first, then plain headings.
 
     Raises
     ------
     InputError
-        If a column of the user is not in the table, or is named for two quantities; if time,
-        current or voltage is not known (a temperature may be given).
+        If a column of the user is not in the table, or is named for two quantities.
     """
-    chosen, _ = find_columns(headings, units_below, given)
-    if not set(_NEEDED) <= set(chosen):
-        raise unknown_columns(source, headings, given)
-    return chosen
-
-
-def find_columns(
-    headings: Sequence[str], units_below: Sequence[str] = (), given: ColumnMap | None = None
-) -> tuple[dict[str, ChosenColumn], dict[str, ChosenColumn]]:
-    """Return the columns that are named or plain, and the likeliest one of each other quantity."""
-    below = [*units_below, *[""] * len(headings)]
+    below = [*units_below, *[""] * (len(headings) - len(units_below))]
     meanings = [meaning_of(text, unit) for text, unit in zip(headings, below, strict=False)]
-    chosen: dict[str, ChosenColumn] = {}
-    guesses: dict[str, ChosenColumn] = {}
-    owner: dict[int, str] = {}
     given = given or ColumnMap()
-    for quantity, text in given.specs.items():
-        chosen[quantity] = _named_column(quantity, text, headings, meanings, given.where)
-        for place in chosen[quantity].places:
-            if owner.setdefault(place, quantity) != quantity:
+    choice = Choice()
+    owner: dict[int, str] = {}
+    for quantity, spec in given.specs.items():
+        found = _given_column(quantity, spec, headings, meanings, given.where)
+        for place in found.places:
+            if place in owner:
                 raise InputError(
                     f"is the column of {owner[place]} too",
                     field=f"{given.where} {quantity}",
-                    value=text,
+                    value=spec.text,
                     cure="give each quantity a column of its own, as headings or as #1, #2, …",
                 )
-    for quantity in (name for name in FIELDS if name not in given.specs):
+        owner |= dict.fromkeys(found.places, quantity)
+        choice.chosen[quantity] = found
+    for quantity in FIELDS:
         plain = [
             (place, meaning)
             for place, meaning in enumerate(meanings)
             if meaning is not None and meaning.quantity == quantity and place not in owner
         ]
-        if plain:
-            column, is_plain = _best_column(quantity, sorted(plain, key=lambda item: item[1].rank))
-            (chosen if is_plain else guesses)[quantity] = column
-    return chosen, guesses
+        if quantity not in given.specs and plain:
+            _choose(quantity, sorted(plain, key=lambda item: item[1].rank), choice)
+    return choice
 
 
-def _best_column(quantity: str, ranked: list[tuple[int, Meaning]]) -> tuple[ChosenColumn, bool]:
-    """Return the most direct column of a quantity, or several, and whether it is plain."""
-    place, first = ranked[0]
-    best = [(place, item) for place, item in ranked if item.rank == first.rank]
-    others: tuple[ChosenColumn, ...] = ()
-    if quantity == "time":
-        best, later = ranked[:1], ranked[1:]
-        others = tuple(ChosenColumn((k,), item.unit) for k, item in later if item.rank < GUESS)
-        is_plain = True
-    elif quantity == "temperature":  # of one unit, °C first; T beside T1, T2 is it
-        celsius = [each for each in best if unit_of("temperature_c", each[1].unit) == (1.0, 0.0)]
-        best = celsius or [each for each in best if each[1].unit == first.unit]
-        best = [each for each in best if not each[1].numbered] or best
-        is_plain = len(best) == 1 or all(item.numbered for _, item in best)
+def _choose(quantity: str, plain: list[tuple[int, Meaning]], choice: Choice) -> None:
+    """Choose among the columns of a quantity, the most direct first; or guess one."""
+    place, first = plain[0]
+    best = [item for item in plain if item[1].rank == first.rank]
+    numbered = [meaning.numbered for _, meaning in plain if meaning.rank <= GUESS]
+    siblings = quantity in {"current", "voltage"} and first.numbered and sum(numbered) > 1
+    if quantity == "temperature" and len(best) > 1:  # of one unit, °C first; T beside T1, T2 is it
+        celsius = [item for item in best if unit_of("temperature_c", item[1].unit) == (1.0, 0.0)]
+        best = celsius or [item for item in best if item[1].unit == first.unit]
+        best = [item for item in best if not item[1].numbered] or best
+    are_probes = quantity == "temperature" and all(meaning.numbered for _, meaning in best)
+    one_of_many = len(best) > 1 and quantity != "time" and not are_probes
+    if first.rank >= GUESS or siblings or one_of_many:
+        choice.guesses[quantity] = place
+    elif quantity == "time":
+        others = tuple(other for other, meaning in plain[1:] if meaning.rank < GUESS)
+        choice.chosen[quantity] = ChosenColumn((place,), first.unit, others=others)
     else:
-        siblings = [item for _, item in ranked if item.numbered and item.rank <= GUESS]
-        is_plain = len(best) == 1 and not (first.numbered and len(siblings) > 1)
-    is_plain = is_plain and first.rank < GUESS
-    places = tuple(k for k, _ in best) if is_plain else (place,)
-    return ChosenColumn(places, best[0][1].unit, 1.0, best[0][1].source, others), is_plain
+        unit, source = best[0][1].unit, best[0][1].source
+        choice.chosen[quantity] = ChosenColumn(tuple(p for p, _ in best), unit, source=source)
 
 
-def _named_column(
+def _given_column(
     quantity: str,
-    text: str,
+    spec: ColumnSpec,
     headings: Sequence[str],
     meanings: Sequence[Meaning | None],
     where: str,
 ) -> ChosenColumn:
-    for heading, unit, factor in _readings(text):
-        places = _places(heading, headings)
-        if places and (len(places) == 1 or quantity in {"time", "temperature"}):
-            stated = {_stated_unit(headings[k], meanings[k], quantity) for k in places}
-            found = unit or (stated.pop() if len(stated) == 1 else "")
-            first = meanings[places[0]]
-            source = first.source if first is not None and quantity == "temperature" else "unknown"
-            return ChosenColumn(places, found, factor, source)
-    near = closest(text, headings)
+    for reading in spec.readings():
+        places = _places(reading.text, headings)
+        if not places:
+            continue
+        units = {_stated_unit(headings[place], meanings[place], quantity) for place in places}
+        unit = reading.unit if reading.unit is not None else units.pop() if len(units) == 1 else ""
+        first = meanings[places[0]]
+        source = first.source if first is not None and quantity == "temperature" else "unknown"
+        return ChosenColumn(places, unit, reading.factor, given=True, source=source)
+    near = closest(spec.text, headings)
     raise InputError(
         f"no column has this heading (found: {shown_headings(headings)})",
         field=f"{where} {quantity}",
-        value=text,
+        value=spec.text,
         cure=f"did you mean {near}?" if near else _SYNTAX,
     )
-
-
-def _readings(text: str) -> Iterator[tuple[str, str, float]]:
-    """Yield heading, unit and factor as a text may be meant: the whole is a heading first."""
-    texts = [(text, 1.0)]
-    if match := _FACTOR.match(text):
-        texts.append((match["text"], float(match["factor"])))
-    yield from ((heading, "", factor) for heading, factor in texts)
-    for heading, factor in texts:
-        if match := _UNIT.match(heading):
-            yield match["text"], match["unit"].strip(), factor
 
 
 def _stated_unit(heading: str, meaning: Meaning | None, quantity: str) -> str:
@@ -215,63 +253,53 @@ def _stated_unit(heading: str, meaning: Meaning | None, quantity: str) -> str:
 
 def _places(text: str, headings: Sequence[str]) -> tuple[int, ...]:
     """Return the columns that a text names; none where it names no column, or not all."""
-    for parts in ([text], text.split("+")):
-        found = [_place(part, headings) for part in parts]
-        if all(place is not None for place in found):
-            return tuple(place for place in found if place is not None)
-    return ()
+    whole = _place(text, headings)
+    if whole is not None:
+        return (whole,)
+    places = [_place(part, headings) for part in text.split("+")]
+    found = tuple(place for place in places if place is not None)
+    return found if len(found) == len(places) > 1 else ()
 
 
 def _place(text: str, headings: Sequence[str]) -> int | None:
     if text in headings:  # `t` beside `T`
         return headings.index(text)
-    simple = " ".join(text.split()).casefold()
-    names = [" ".join(heading.split()).casefold() for heading in headings]
-    if simple in names:
-        return names.index(simple)
-    number = re.fullmatch(r"#(\d{1,5})", simple)
+    names = [_simple(heading) for heading in headings]
+    if _simple(text) in names:
+        return names.index(_simple(text))
+    number = re.fullmatch(r"#(\d{1,5})", text.strip())
     if number and 1 <= int(number[1]) <= len(headings):
         return int(number[1]) - 1
-    bare = [names_and_units(name)[0][0] for name in names]
-    return bare.index(simple) if bare.count(simple) == 1 else None
+    bare = [_simple(names_and_units(heading)[0][0]) for heading in headings]
+    return bare.index(_simple(text)) if bare.count(_simple(text)) == 1 else None
 
 
-def is_canonical(headings: Sequence[str]) -> bool:
-    """Return whether columns have the names of a canonical log's, possibly an incomplete one.
-
-    A temperature of another name is not a missing one: such a table is a logger's own.
-    """
-    names = {name.strip().lower() for name in headings}
-    others = any(
-        "temperature" in name
-        or ((meaning := meaning_of(name)) and meaning.quantity == "temperature")
-        for name in names - {SOURCE}
-    )
-    return len(names & set(REQUIRED)) >= 2 and ("temperature_c" in names or not others)
+def _simple(text: str) -> str:
+    return " ".join(text.split()).casefold()
 
 
-# --- For messages
-
-
-def unknown_columns(source: str, headings: Sequence[str], given: ColumnMap | None) -> InputError:
+def unknown_columns(source: str, headings: Sequence[str], choice: Choice) -> InputError:
     """Return the error for a table whose columns are not plain, with the option to paste."""
-    chosen, guesses = find_columns(headings, (), given)
-    missing = ", ".join(name for name in _NEEDED if name not in chosen)
-    missing = " and ".join(missing.rsplit(", ", 1))
+    names = [name for name in _NEEDED if name not in choice.chosen]
+    missing = " and ".join(part for part in (", ".join(names[:-1]), *names[-1:]) if part)
     return InputError(
         f"no plain heading of {missing} (found: {shown_headings(headings)})",
         source=source,
-        cure=f"name the columns, e.g. {suggestion(headings, guesses | chosen)} ({DOCS})",
+        cure=f"name the columns, e.g. {suggestion(headings, choice)} ({DOCS})",
     )
 
 
-def suggestion(headings: Sequence[str], likely: Mapping[str, ChosenColumn]) -> str:
+def suggestion(headings: Sequence[str], choice: Choice) -> str:
     """Return the likeliest `--columns` option to paste; `?` where nothing is likely."""
-    texts = {
-        quantity: "+".join(headings[place] for place in column.places)
-        for quantity, column in likely.items()
-    }
-    parts = (f"{name}={texts.get(name, '?')}" for name in FIELDS if name in {*_NEEDED, *texts})
+    parts = []
+    for quantity in FIELDS:
+        if quantity in choice.chosen:
+            places = choice.chosen[quantity].places
+            parts.append(f"{quantity}={'+'.join(headings[place] for place in places)}")
+        elif quantity in choice.guesses:
+            parts.append(f"{quantity}={headings[choice.guesses[quantity]]}")
+        elif quantity in _NEEDED:
+            parts.append(f"{quantity}=?")
     return "--columns '" + ",".join(parts).replace("'", "'\\''") + "'"
 
 

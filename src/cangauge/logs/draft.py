@@ -4,25 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Final, Literal
+from typing import Any, Final, Literal
 
 import numpy as np
 
 from cangauge._text import counted
 from cangauge._typing import BoolArray, FloatArray
-from cangauge.errors import InputError, require_number
+from cangauge.errors import InputError
 from cangauge.logs.column_map import shown_headings
 from cangauge.logs.headings import cell_number
-from cangauge.logs.log import NEEDED, Log, refuse_bad_rows
-from cangauge.logs.sign import resolve_sign
-from cangauge.logs.units import (
-    COLDEST_C,
-    HOTTEST_C,
-    REQUIRED,
-    TemperatureSource,
-    known_temperature_source,
-    refuse_wrong_units,
-)
+from cangauge.logs.units import REQUIRED, TemperatureSource, refuse_wrong_units
 
 Sign = Literal["charge", "discharge"]
 """What a positive current in the file does."""
@@ -80,82 +71,74 @@ class DraftLog:
         self.negated = not self.negated
         self.remarks.append(f"current negated: {because}")
 
+    def state_sign(self, sign: Sign) -> None:
+        """Apply the sign that the user states: what positive current in the file does."""
+        if (sign == "charge") is not self.negated:
+            self.negate_current(f"positive {sign}s in the file, as stated")
+        self.sign_unknown = False
+
     def take_probes(self, names: Sequence[str], probes_c: Sequence[FloatArray]) -> None:
         """Take the median of temperature probes [°C], shape (n,) each; remark where they differ."""
-        values = np.vstack([np.where(np.isfinite(each), each, np.nan) for each in probes_c])
-        rows = np.flatnonzero(np.isfinite(values).any(axis=0))
-        known, median = values[:, rows], np.full(values.shape[1], np.nan)
-        median[rows] = np.nanmedian(known, axis=0)
+        self.values["temperature_c"] = probes_c[0]
+        if len(probes_c) == 1:
+            return
+        values = np.vstack(probes_c)
+        known = np.isfinite(values)
+        rows = known.any(axis=0)
+        median = np.full(rows.size, np.nan)
+        median[rows] = np.nanmedian(values[:, rows], axis=0)
         self.values["temperature_c"] = median
-        apart = np.nanmax(known, axis=0) - np.nanmin(known, axis=0) > _PROBES_APART_K
+        highest = np.max(np.where(known, values, -np.inf), axis=0)
+        apart = highest - np.min(np.where(known, values, np.inf), axis=0) > _PROBES_APART_K
         if apart.any():
-            row = int(rows[np.argmax(apart)])
+            row = int(np.argmax(apart))
             shown = " and ".join(f"{value:.4g}" for value in values[:, row])
             self.remarks.append(
                 f"temperature: {' and '.join(names)} are {shown} °C in row {row + 1}: one of the"
                 " probes fails; name the good ones with --columns temperature=…"
             )
 
-    def to_log(
-        self,
-        temperature_c: float | None = None,
-        temperature_source: TemperatureSource | None = None,
-        sign: Sign | None = None,
-        used: Sequence[str] = (),
-    ) -> Log:
-        """Check all values and return the log; see `read_log` for the arguments and errors.
+    def checked(
+        self, temperature_c: float | None = None, used: Sequence[str] = ()
+    ) -> dict[str, Any]:
+        """Check all values and return the arguments of `Log`; see `read_log` for errors.
 
         Rows that lack a value or repeat the time stamp of the row before are dropped, with a
         remark. `used` are columns that the caller reads besides.
         """
-        if sign is not None:
-            self._state_sign(sign)
-        self._remark_ignored([name for name in self.ignored if name not in used])
-        self._set_temperature(temperature_c)
-        if temperature_source is not None:
-            self.temperature_source = known_temperature_source(temperature_source)
-        if "soc_pct" in self.values:
-            self.values["soc_pct"][np.isinf(self.values["soc_pct"])] = np.nan
-        where = self.source or self.name
-        self._drop_rows()
-        refuse_bad_rows(self.values, where, self.labels)
-        for values in self.values.values():
-            values.flags.writeable = False  # the log need not copy them
-        self.remarks.extend(refuse_wrong_units(self.values, source=where, labels=self.labels))
-        log = Log(
-            **self.values,
-            name=self.name,
-            source=self.source,
-            temperature_source=self.temperature_source,
-            remarks=tuple(self.remarks),
-            assumed=tuple(self.assumed),
-        )
-        return resolve_sign(log, is_unknown=self.sign_unknown, is_stated=sign is not None)
-
-    def _state_sign(self, sign: Sign) -> None:
-        if sign not in {"charge", "discharge"}:
-            cure = "say what a positive current does: charge or discharge"
-            raise InputError("not a sign", field="--sign", value=sign, cure=cure)
-        if (sign == "charge") is not self.negated:
-            self.negate_current(f"positive {sign}s in the file, as stated")
-        self.sign_unknown = False
-
-    def _remark_ignored(self, names: list[str]) -> None:
-        cells = [name for name in names if cell_number(name) is not None]
+        if not self.values["time_s"].size:
+            raise InputError(
+                "the log holds no rows", source=self.source or self.name, cure="check the export"
+            )
+        ignored = [name for name in self.ignored if name not in used]
+        cells = [name for name in ignored if cell_number(name) is not None]
         if len(cells) > 1:  # `read_cells`
             self.remarks.append(f"{len(cells)} cells: {cells[0]} … {cells[-1]}")
-            names = [name for name in names if name not in cells]
-        if names:
-            shown = ", ".join(names[:6]) + (", …" if len(names) > 6 else "")
-            self.remarks.append(f"{counted(len(names), 'other column')} ignored: {shown}")
+            ignored = [name for name in ignored if name not in cells]
+        if ignored:
+            shown = ", ".join(ignored[:6]) + (", …" if len(ignored) > 6 else "")
+            self.remarks.append(f"{counted(len(ignored), 'other column')} ignored: {shown}")
+        self._set_temperature(temperature_c)
+        if "soc_pct" in self.values:
+            self.values["soc_pct"][np.isinf(self.values["soc_pct"])] = np.nan
+        self._drop_incomplete()
+        self._drop_repeated()
+        for values in self.values.values():
+            values.flags.writeable = False  # the log need not copy them
+        where = self.source or self.name
+        self.remarks.extend(refuse_wrong_units(self.values, source=where, labels=self.labels))
+        return {
+            **self.values,
+            "name": self.name,
+            "source": self.source,
+            "temperature_source": self.temperature_source,
+            "remarks": tuple(self.remarks),
+            "assumed": tuple(self.assumed),
+        }
 
     def _set_temperature(self, given_c: float | None) -> None:
         kind = "file" if self.source else "table"
         if given_c is not None:
-            require_number(given_c, "--temperature")
-            if not COLDEST_C <= given_c <= HOTTEST_C:
-                problem = f"must lie within {COLDEST_C:g} … {HOTTEST_C:g} °C"
-                raise InputError(problem, field="--temperature", value=given_c)
             replaced = f" in place of the {kind}'s" if "temperature_c" in self.values else ""
             self.remarks.append(f"temperature {given_c:g} °C as given{replaced}")
             self.values["temperature_c"] = np.full(self.values["time_s"].size, float(given_c))
@@ -165,17 +148,45 @@ class DraftLog:
             named = "name its column with --columns temperature=…" if found else "add this column"
             option = "--temperature" if self.source else "temperature_c"
             cure = f"{named} [°C], or give a constant with {option}"
-            problem, where = f"the {kind} holds no temperature{found}", self.source or self.name
-            raise InputError(problem, source=where, field="temperature_c", cure=cure)
+            raise self._error("temperature_c", f"the {kind} holds no temperature{found}", cure)
 
-    def _drop_rows(self) -> None:
-        """Drop a few incomplete rows, and those that repeat a time stamp."""
+    def _drop_incomplete(self) -> None:
+        lacks = {name: ~np.isfinite(self.values[name]) for name in REQUIRED}
+        incomplete = np.any([*lacks.values()], axis=0)
+        for name, rows in lacks.items():
+            if rows.all():
+                raise self._error(name, "the column is empty", "check the export")
+        count, row = int(incomplete.sum()), int(np.argmax(incomplete))
+        lacking = "time, current, voltage or temperature"
+        if count > MAX_INCOMPLETE * incomplete.size:
+            name = next(name for name, rows in lacks.items() if rows[row])
+            problem = f"{count} of {incomplete.size} rows lack {lacking}"
+            raise self._error(name, problem, f"check the export: the first is row {row + 1}")
+        self.keep(~incomplete, f"without {lacking} dropped (the first is row {row + 1})")
 
-        def drop(rows: BoolArray, what: str) -> None:
-            self.keep(~rows, f"{what} dropped (the first is row {int(np.argmax(rows)) + 1})")
+    def _drop_repeated(self) -> None:
+        time = self.values["time_s"]
+        step = np.diff(time, prepend=-np.inf)
+        back = np.flatnonzero(step < 0.0)
+        if back.size:
+            row = int(back[0])
+            raise self._error(
+                "time_s",
+                f"time runs backwards at row {row + 1} ({back.size} such rows;"
+                f" the row before has {time[row - 1]:.6f} s)",
+                "sort the rows by time, or split the file into one log each",
+                float(time[row]),
+            )
+        first = int(np.argmax(step == 0.0)) + 1
+        self.keep(
+            step != 0.0, f"with the time stamp of the row before dropped (the first is row {first})"
+        )
 
-        lacks = np.any([~np.isfinite(self.values[name]) for name in REQUIRED], axis=0)
-        if 0 < lacks.sum() <= MAX_INCOMPLETE * lacks.size:
-            drop(lacks, f"without {NEEDED}")
-        if (again := np.diff(self.values["time_s"], prepend=-np.inf) == 0.0).any():
-            drop(again, "with the time stamp of the row before")
+    def _error(self, name: str, problem: str, cure: str, value: float | None = None) -> InputError:
+        return InputError(
+            problem,
+            source=self.source or self.name,
+            field=self.labels.get(name, name),
+            value=value,
+            cure=cure,
+        )

@@ -97,8 +97,6 @@ _CELL_VOLTAGE: Final = re.compile(
 
 LONGEST: Final = 200
 """Longest heading that is read for its meaning [characters]."""
-CANONICAL: Final = -1
-"""Rank of the names of a canonical log."""
 GUESS: Final = 10
 """Rank from which a meaning is a guess that only the user can confirm."""
 
@@ -106,8 +104,7 @@ GUESS: Final = 10
 class Meaning(NamedTuple):
     """Meaning of a heading: its quantity, the unit that it states ("" if none) and how direct.
 
-    `rank` is 0 for the pack's, lower for a canonical name and higher for less direct ones; from
-    `GUESS` on it is not plain.
+    `rank` is 0 for the pack's and higher for less direct ones; from `GUESS` on it is not plain.
     """
 
     quantity: str
@@ -122,12 +119,10 @@ def meaning_of(heading: str, unit_below: str = "") -> Meaning | None:
     """Return the most direct meaning of a heading with the cell of a row of units, or None."""
     if not heading.strip() or len(heading) > LONGEST or cell_number(heading) is not None:
         return None
-    is_canonical = heading.strip().lower() in FIELDS.values()
     # Measurement tools qualify a signal: `Bus::Message::Signal`, `Signal\\Device:1`.
     heading = re.sub(r"\\[^\[(]*", "", heading.rpartition("::")[2])
     readings = (_meaning(name, unit) for name, unit in names_and_units(heading, unit_below))
-    found = next((found for found in readings if found is not None), None)
-    return found._replace(rank=CANONICAL) if found and is_canonical else found
+    return next((found for found in readings if found is not None), None)
 
 
 def cell_number(heading: str) -> tuple[int, float] | None:
@@ -143,8 +138,9 @@ def names_and_units(heading: str, unit_below: str = "") -> list[tuple[str, str]]
     heading = heading.strip()
     if heading.lower() in _DEGREES:
         return [("", heading)]
-    forms = _UNIT_FORMS if len(heading) <= LONGEST else ()
-    matches = [match for form in forms if (match := form.match(heading))]
+    if len(heading) > LONGEST:
+        return [(heading, "")]
+    matches = [match for form in _UNIT_FORMS if (match := form.match(heading))]
     found = [(match["name"], match["unit"].strip()) for match in matches if match["name"].strip()]
     below = unit_below.strip().strip("[](){}").strip()
     if below:  # instead of the heading's own unit, as in `Pack_V`
@@ -168,6 +164,8 @@ def _meaning(name: str, unit: str) -> Meaning | None:
         return None
     if quantity == "time" and re.match(r"h+\s*:\s*m", unit, re.IGNORECASE):
         unit = ""
+    if quantity == "time" and not unit and others and others[-1] in {"us", "ms"}:  # TimeUS
+        unit, others = others[-1], others[:-1]
     if unit and unit_of(FIELDS[quantity], unit) is None:
         return None
     in_brackets = re.findall(r"[\[(]([^\[\]()]*)[\])]", name) + name.split("/")[1:]
@@ -233,8 +231,8 @@ def _rank(quantity: str, others: list[str]) -> tuple[int, bool, TemperatureSourc
     is_one = not numbered or is_temperature or bool(words & _PACK) or "1" in others
     unknown = words - _PACK - _NEUTRAL - _CELL - _DISPLAY - _AMBIENT
     if words & _EXCLUDED or "12" in others:
-        rank = GUESS + 1
-    elif words & _AMBIENT:
+        return GUESS + 1, numbered, source
+    if words & _AMBIENT:
         rank = 4 if is_temperature else GUESS
     elif (unknown and not words & _PACK) or not is_one:
         rank = GUESS

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from os import PathLike
-from typing import Any, Final, Literal, Self
+from typing import Any, Literal, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -15,12 +15,13 @@ from cangauge._extras import extra
 from cangauge._text import duration
 from cangauge._typing import BoolArray, FloatArray, IntArray
 from cangauge.errors import InputError, naming_arguments
-from cangauge.logs.units import REQUIRED, TEMPERATURE_SOURCES, TemperatureSource
+from cangauge.logs.units import (
+    REQUIRED,
+    TEMPERATURE_SOURCES,
+    TemperatureSource,
+)
 
 __all__ = ["TEMPERATURE_SOURCES", "Log", "TemperatureSource"]
-
-NEEDED: Final = "time, current, voltage or temperature"
-"""What no row may lack, for messages."""
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
@@ -82,13 +83,49 @@ class Log(ArrowExport):
     name: str = "log"
     source: str = ""
     temperature_source: TemperatureSource = "unknown"
-    remarks: tuple[str, ...] = ()
-    assumed: tuple[str, ...] = ()
+    remarks: tuple[str, ...] = field(default=())
+    assumed: tuple[str, ...] = field(default=())
 
     def __post_init__(self) -> None:
-        for name, column in self._columns().items():
-            object.__setattr__(self, name, _read_only(column))
-        refuse_bad_rows(self._columns(), self.source or self.name, {})
+        for channel in (*REQUIRED, "soc_pct"):
+            values = getattr(self, channel)
+            if values is not None:
+                object.__setattr__(self, channel, _read_only(values))
+        self._validate()
+
+    def _validate(self) -> None:
+        where = self.source or self.name
+        n = self.time_s.size
+        if n == 0:
+            raise InputError("the log holds no rows", source=where, cure="check the export")
+        for channel in ("current_a", "voltage_v", "temperature_c", "soc_pct"):
+            values = getattr(self, channel)
+            if values is not None and values.shape != (n,):
+                raise InputError(
+                    f"has {values.size} values where time_s has {n}", source=where, field=channel
+                )
+        for channel in REQUIRED:
+            values = getattr(self, channel)
+            bad = np.flatnonzero(~np.isfinite(values))
+            if bad.size:
+                raise InputError(
+                    f"{bad.size} of {n} values are not finite, the first in row {bad[0] + 1}",
+                    source=where,
+                    field=channel,
+                    value=float(values[bad[0]]),
+                    cure="fill or drop these rows",
+                )
+        back = np.flatnonzero(np.diff(self.time_s) <= 0.0)
+        if back.size:
+            row = int(back[0]) + 1
+            raise InputError(
+                f"time does not increase at row {row + 1} ({back.size} such rows;"
+                f" the row before has {self.time_s[row - 1]:.6f} s)",
+                source=where,
+                field="time_s",
+                value=float(self.time_s[row]),
+                cure="sort the rows by time and drop duplicated stamps",
+            )
 
     @classmethod
     @naming_arguments
@@ -133,7 +170,14 @@ class Log(ArrowExport):
         # Deferred: the service runs where pyarrow is not installed.
         from cangauge.logs.read import log_of_dataframe  # noqa: PLC0415
 
-        return log_of_dataframe(table, name, columns, temperature_c, temperature_source, sign)
+        return log_of_dataframe(
+            table,
+            name=name,
+            temperature_c=temperature_c,
+            temperature_source=temperature_source,
+            columns=columns,
+            sign=sign,
+        )
 
     def to_arrow(self) -> Any:
         """Return a pyarrow.Table of the columns; missing SoC is null.
@@ -142,12 +186,21 @@ class Log(ArrowExport):
         """
         from cangauge.logs.canonical import build_table  # noqa: PLC0415 - pyarrow, as above
 
-        return build_table(self._columns(), self.temperature_source)
+        columns = {channel: getattr(self, channel) for channel in REQUIRED}
+        if self.soc_pct is not None:
+            columns["soc_pct"] = self.soc_pct
+        return build_table(columns, self.temperature_source)
 
     def __repr__(self) -> str:
         """Return one line of what the log holds."""
-        units = ((self.current_a, "A"), (self.voltage_v, "V"), (self.temperature_c, "°C"))
-        spans = [f"{column.min():.4g} … {column.max():.4g} {unit}" for column, unit in units]
+        spans = [
+            f"{values.min():.4g} … {values.max():.4g} {unit}"
+            for values, unit in (
+                (self.current_a, "A"),
+                (self.voltage_v, "V"),
+                (self.temperature_c, "°C"),
+            )
+        ]
         text = f"{self.name!r}: {len(self):,} rows in {duration(self.duration_s)}"
         soc = np.empty(0) if self.soc_pct is None else self.soc_pct[np.isfinite(self.soc_pct)]
         if soc.size:
@@ -176,45 +229,14 @@ class Log(ArrowExport):
 
     def rows(self, keep: BoolArray | IntArray | slice) -> Self:
         """Return the log of the rows that `keep` selects (mask, indices or slice)."""
-        return replace(self, **{name: column[keep] for name, column in self._columns().items()})
-
-    def _columns(self) -> dict[str, Any]:
-        columns = {name: getattr(self, name) for name in (*REQUIRED, "soc_pct")}
-        return {name: column for name, column in columns.items() if column is not None}
-
-
-def refuse_bad_rows(
-    values: Mapping[str, FloatArray], where: str, labels: Mapping[str, str]
-) -> None:
-    """Raise InputError unless columns have one length, every value but SoC, and time increases."""
-
-    def error(name: str, problem: str, cure: str, value: float | None = None) -> InputError:
-        field = labels.get(name, name)
-        return InputError(problem, source=where, field=field, value=value, cure=cure)
-
-    time_s = values["time_s"]
-    if not time_s.size:
-        raise InputError("the log holds no rows", source=where, cure="check the export")
-    for name, column in values.items():
-        if column.shape != time_s.shape:
-            problem = f"has {column.size} values where time_s has {time_s.size}"
-            raise error(name, problem, "give one value per row")
-    lacks = {name: ~np.isfinite(values[name]) for name in REQUIRED}
-    incomplete = np.any([*lacks.values()], axis=0)
-    row = int(np.argmax(incomplete))
-    for name, rows in lacks.items():
-        if rows.all():
-            raise error(name, "the column is empty", "check the export")
-        if rows[row]:
-            cure = f"check the export: the first is row {row + 1}"
-            raise error(name, f"{incomplete.sum()} of {time_s.size} rows lack {NEEDED}", cure)
-    step_s = np.diff(time_s)
-    if (back := np.flatnonzero(step_s <= 0.0)).size:
-        row = int(back[0]) + 1
-        what = "runs backwards" if step_s[row - 1] < 0.0 else "does not increase"
-        problem = f"time {what} at row {row + 1} ({back.size} such rows; the row before has"
-        cure = "sort the rows by time, or split the file into one log each"
-        raise error("time_s", f"{problem} {time_s[row - 1]:.6f} s)", cure, float(time_s[row]))
+        return replace(
+            self,
+            time_s=self.time_s[keep],
+            current_a=self.current_a[keep],
+            voltage_v=self.voltage_v[keep],
+            temperature_c=self.temperature_c[keep],
+            soc_pct=None if self.soc_pct is None else self.soc_pct[keep],
+        )
 
 
 def as_log(log: Any) -> Log:

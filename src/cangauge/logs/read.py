@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from contextlib import suppress
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
 from functools import cache
 from importlib import import_module
 from importlib.metadata import entry_points
@@ -14,17 +14,18 @@ from typing import Any, Final, Protocol
 import numpy as np
 import pyarrow as pa
 
-from cangauge._files import Head, Reader
+from cangauge._files import Head
 from cangauge._typing import FloatArray
-from cangauge.errors import InputError
-from cangauge.logs.canonical import arrow_table, parquet_table
-from cangauge.logs.cells import numbers_of
-from cangauge.logs.column_map import DOCS, ColumnMap, is_canonical, unknown_columns
+from cangauge.errors import InputError, require_number
+from cangauge.logs.canonical import arrow_table, open_parquet
+from cangauge.logs.column_map import DOCS, ColumnMap, unknown_columns
 from cangauge.logs.draft import DraftLog, Sign
 from cangauge.logs.headings import cell_number
 from cangauge.logs.log import Log, TemperatureSource
-from cangauge.logs.table import ArrowTable, draft_of_table
-from cangauge.logs.text import TextTable, find_table, is_of_frames, likely_header
+from cangauge.logs.sign import resolve_sign
+from cangauge.logs.table import ArrowTable, draft_of_table, is_canonical, numbers_of
+from cangauge.logs.text import TextTable, find_table, is_of_frames, likely_header, table_below
+from cangauge.logs.units import COLDEST_C, HOTTEST_C, known_temperature_source
 
 KNOWN_LOGS: Final = (
     "canonical Parquet and CSV (time_s, current_a, voltage_v, temperature_c, soc_pct), ANL D3"
@@ -37,14 +38,17 @@ _FORMATS: Final = tuple(
 """Modules with further readers, each in its tuple `READERS`; loaded when a log is opened."""
 GROUP: Final = "cangauge.readers"
 """Entry points of readers of other packages: a `LogReader`."""
-_PARQUET: Final = b"PAR1"
 
 
-class LogReader(Reader[DraftLog], Protocol):
-    """Reader of one format of logs."""
+class LogReader(Protocol):
+    """Reader of one format of logs; a `cangauge._files.Reader`."""
 
+    name: str
     takes_columns: bool
     """Whether the user may name the columns of this format."""
+
+    def matches(self, head: Head) -> bool:
+        """Return whether a file begins as this format does."""
 
     def read(self, head: Head, columns: ColumnMap | None = None, /) -> DraftLog:
         """Read the file; raise InputError where it is damaged or lacks something."""
@@ -58,20 +62,35 @@ class LogTableReader:
 
     def matches(self, head: Head) -> bool:
         """Return whether the file is Parquet, or a text with time, current and voltage."""
-        with suppress(InputError):
-            return head.data.startswith(_PARQUET) or bool(find_table(head))
-        return False
-
-    def table(self, head: Head, columns: ColumnMap | None = None) -> TextTable | ArrowTable:
-        """Return the table of Parquet or a text; may raise InputError."""
-        if head.data.startswith(_PARQUET):
-            return parquet_table(head)
-        return find_table(head, columns)
+        return _is_parquet(head) or bool(_canonical_text(head) or find_table(head))
 
     def read(self, head: Head, columns: ColumnMap | None = None) -> DraftLog:
         """Read a log; see `LogReader`."""
-        table = self.table(head, columns)
-        return draft_of_table(table, columns, name=head.name, source=str(head.path))
+        with open_table(head, columns) as table:
+            return draft_of_table(table, columns, name=head.name, source=str(head.path))
+
+
+def _is_parquet(head: Head) -> bool:
+    return head.data.startswith(b"PAR1")
+
+
+def _canonical_text(head: Head) -> TextTable | None:
+    table = table_below(head, head.first_line) if head.first_line else None
+    return table if table is not None and is_canonical(table.headings) else None
+
+
+@contextmanager
+def open_table(head: Head, columns: ColumnMap | None) -> Iterator[TextTable | ArrowTable]:
+    """Open Parquet or a text as a table."""
+    if _is_parquet(head):
+        with open_parquet(head) as found:
+            yield found
+        return
+    table = _canonical_text(head) if columns is None else None
+    table = table or find_table(head, columns)
+    if table is None:
+        raise unknown_columns(str(head.path), *likely_header(head))
+    yield table
 
 
 @cache
@@ -99,9 +118,8 @@ class LogFile:
     @property
     def is_any_table(self) -> bool:
         """Whether the file is a table of plain headings, not of a format that defines them."""
-        if not isinstance(self.reader, LogTableReader) or self.head.data.startswith(_PARQUET):
-            return False
-        return not is_canonical(self.reader.table(self.head, self.columns).headings)
+        is_text = isinstance(self.reader, LogTableReader) and not _is_parquet(self.head)
+        return is_text and _canonical_text(self.head) is None
 
     def read(
         self,
@@ -112,16 +130,48 @@ class LogFile:
         """Read the log; see `read_log`."""
         if self.reader is None:
             raise not_recognised(self, "not a known kind of log", f"known are: {KNOWN_LOGS}")
+        _refuse_options(temperature_c, temperature_source, self.sign)
         try:
             draft = self.reader.read(self.head, self.columns)
-            log = draft.to_log(temperature_c, temperature_source, self.sign, self.used)
-        except (MemoryError, pa.ArrowException) as error:
-            problem = f"damaged, or larger than the memory ({error or type(error).__name__})"
+            log = _log_of(draft, temperature_c, temperature_source, self.sign, self.used)
+        except MemoryError as error:
             raise InputError(
-                problem, source=self.head.path, cure="export again, or split"
+                "larger than the free memory", source=self.head.path, cure="split it"
             ) from error
         pa.default_memory_pool().release_unused()
         return log
+
+
+def _refuse_options(
+    temperature_c: float | None, temperature_source: str | None, sign: str | None
+) -> None:
+    if temperature_source is not None:
+        known_temperature_source(temperature_source)
+    if temperature_c is not None:
+        require_number(temperature_c, "--temperature")
+    if temperature_c is not None and not COLDEST_C <= temperature_c <= HOTTEST_C:
+        problem = f"must lie within {COLDEST_C:g} … {HOTTEST_C:g} °C"
+        raise InputError(problem, field="--temperature", value=temperature_c)
+    if sign not in {None, "charge", "discharge"}:
+        cure = "say what a positive current does: charge or discharge"
+        raise InputError("not a sign", field="--sign", value=sign, cure=cure)
+
+
+def _log_of(
+    draft: DraftLog,
+    temperature_c: float | None,
+    temperature_source: TemperatureSource | None,
+    sign: Sign | None,
+    used: tuple[str, ...] = (),
+) -> Log:
+    """Return the checked log of a draft, with its sign of current."""
+    if sign is not None:
+        draft.state_sign(sign)
+    log = Log(**draft.checked(temperature_c, used))
+    if temperature_source is not None:
+        log = replace(log, temperature_source=temperature_source)
+    is_stated = sign is not None
+    return resolve_sign(log, stored_sign_unknown=draft.sign_unknown, is_stated=is_stated)
 
 
 def not_recognised(file: LogFile, problem: str, cure: str) -> InputError:
@@ -130,9 +180,9 @@ def not_recognised(file: LogFile, problem: str, cure: str) -> InputError:
     foreign = import_module("cangauge.extras.formats.foreign").foreign_format(head.data)
     if foreign is not None:
         return InputError(f"{problem}: it is {foreign[0]}", source=head.path, cure=foreign[1])
-    headings = likely_header(head)
+    headings, choice = likely_header(head)
     if len(headings) >= 3 and not is_of_frames(headings):
-        error = unknown_columns(str(head.path), headings, None)
+        error = unknown_columns(str(head.path), headings, choice)
         return InputError(f"{problem}: {error.problem}", source=head.path, cure=error.cure)
     shown = head.first_line.strip()
     is_text = bool(shown) and shown.isprintable()
@@ -158,10 +208,13 @@ def open_log(
     InputError
         If the file is absent, empty, damaged or not a regular file.
     """
-    head, given = Head(path), None if columns is None else ColumnMap.of(columns)
+    head = Head(path)
+    given = None if columns is None else ColumnMap.of(columns)
     for reader in _readers():
-        is_named = given is not None and isinstance(reader, LogTableReader)
-        if is_named or ((given is None or reader.takes_columns) and reader.matches(head)):
+        is_offered = given is None or reader.takes_columns
+        if is_offered and (
+            (given is not None and isinstance(reader, LogTableReader)) or reader.matches(head)
+        ):
             return LogFile(head, reader, given, sign)
     return LogFile(head, None, given, sign)
 
@@ -183,9 +236,16 @@ def read_log(
 
 
 def log_of_dataframe(
-    frame: Any, name: str, columns: ColumnMap | Mapping[str, Any] | str | None, *options: Any
+    frame: Any,
+    *,
+    name: str,
+    temperature_c: float | None,
+    temperature_source: TemperatureSource | None,
+    columns: ColumnMap | Mapping[str, Any] | str | None,
+    sign: Sign | None,
 ) -> Log:
-    """Return the log of a data frame; see `Log.from_dataframe` and `DraftLog.to_log`."""
+    """Return the log of a data frame; see `Log.from_dataframe`."""
+    _refuse_options(temperature_c, temperature_source, sign)
     try:
         table = pa.table(frame)
     except (TypeError, ValueError, pa.ArrowException) as error:
@@ -202,7 +262,8 @@ def log_of_dataframe(
     table = table.drop_columns([c.name for c in indices if c.name in table.column_names])
     given = None if columns is None else ColumnMap.of(columns)
     found = arrow_table(table.schema, table.select)
-    return draft_of_table(found, given, name=name, source="").to_log(*options)
+    draft = draft_of_table(found, given, name=name, source="")
+    return _log_of(draft, temperature_c, temperature_source, sign)
 
 
 # --- Cells beside a log
@@ -242,38 +303,41 @@ def read_cells(
     columns : ColumnMap, optional
         The user's columns of the log.
     """
-    file, source = open_log(path, columns=columns), str(path)
+    file = open_log(path, columns=columns)
     if not isinstance(file.reader, LogTableReader):
         return None
-    table = file.reader.table(file.head, columns)
-    cells = _cells(table.headings, source)
-    if len(cells) < 2:  # a single cell is its pack
-        return None
-    read = table.columns([place for place, _ in cells.values()])
-    volts = np.column_stack(
-        [
-            scale * numbers_of(read[place], source, table.headings[place])[0]
-            for place, scale in cells.values()
-        ]
-    )
-    draft = draft_of_table(table, columns, name=file.head.name, source=source)
-    file_s = draft.values["time_s"]
+    source = str(path)
+    with open_table(file.head, columns) as table:
+        places = _cells(table.headings, source)
+        if len(places) < 2:  # a single cell is its pack
+            return None
+        cells = table.columns([place for place, _ in places.values()])
+        volts = np.column_stack(
+            [
+                scale * numbers_of(cells[place], source, table.headings[place])[0]
+                for place, scale in places.values()
+            ]
+        )
+        file_s = draft_of_table(table, columns, name=file.head.name, source=source).values["time_s"]
     if file_s.size != volts.shape[0]:
         return None  # rows that hold only what changed
     order = np.argsort(file_s, kind="stable")
     rows = order[np.minimum(np.searchsorted(file_s[order], time_s), file_s.size - 1)]
-    is_row = (file_s[rows] == time_s)[:, None]
-    return CellColumns(min(cells), np.where(is_row, volts[rows], np.nan))
+    return CellColumns(
+        min(places), np.where((file_s[rows] == time_s)[:, None], volts[rows], np.nan)
+    )
 
 
 def _cells(headings: Sequence[str], source: str) -> dict[int, tuple[int, float]]:
     """Return the column and scale of each cell by its number, in order."""
     found: dict[int, tuple[int, float]] = {}
     for place, heading in enumerate(headings):
-        if (cell := cell_number(heading)) is not None:
+        cell = cell_number(heading)
+        if cell is not None:
             found.setdefault(cell[0], (place, cell[1]))
-    for number in range(min(found, default=0), max(found, default=0)):
-        if number not in found:
-            problem, field = "the cells must be numbered without gaps", f"cell_{number}_v"
-            raise InputError(problem, source=source, field=field, cure="export all cells")
-    return dict(sorted(found.items()))
+    numbers = sorted(found)
+    missing = [k for k in range(numbers[0], numbers[-1]) if k not in found] if numbers else []
+    if missing:
+        problem, field = "the cells must be numbered without gaps", f"cell_{missing[0]}_v"
+        raise InputError(problem, source=source, field=field, cure="export all cells")
+    return {number: found[number] for number in numbers}

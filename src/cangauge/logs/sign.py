@@ -103,9 +103,9 @@ def sign_of_current(log: Log) -> SignFinding:
 def _finding(evidence: Sequence[SignEvidence]) -> SignFinding:
     weight = sum(item.weight for item in evidence)
     opposed = any(item.weight * weight < 0.0 and abs(item.weight) >= 1.0 for item in evidence)
-    is_open = opposed or abs(weight) < _SURE_WEIGHT
-    sign: Literal[1, -1, 0] = 0 if is_open else 1 if weight > 0.0 else -1
+    sure = abs(weight) >= _SURE_WEIGHT and not opposed
     odds = 10.0 ** abs(weight)
+    sign: Literal[1, -1, 0] = (1 if weight > 0.0 else -1) if sure else 0
     return SignFinding(sign, min(float(odds / (1.0 + odds)), 0.9999), tuple(evidence))
 
 
@@ -157,22 +157,22 @@ def _from_steps(log: Log) -> SignEvidence:
 
 def _from_charge(log: Log) -> SignEvidence:
     rows = spaced_rows(log.time_s, log.duration_s / 200.0)
-    voltage, taken = log.voltage_v[rows], discharged_ah(log.time_s, log.current_a)[rows]
+    voltage, taken = log.voltage_v[rows], charge_ah(log)[rows]
     span = float(np.ptp(voltage))
     if rows.size < 20 or np.ptp(taken) <= 0.0 or span <= 0.0:
         return SignEvidence("charge", 0.0, "no voltage trend over charge")
     rank = correlation(_ranks(taken), _ranks(voltage))
+    clear = span >= 0.05 * float(np.median(log.voltage_v))
     weight = 3.0 if abs(rank) >= 0.9 else 1.5 if abs(rank) >= 0.7 else 0.0
-    is_clear = span >= 0.05 * float(np.median(log.voltage_v))
     text = f"voltage against charge taken out: rank correlation {rank:+.2f}"
-    return SignEvidence("charge", -float(np.sign(rank)) * (weight if is_clear else 0.0), text)
+    return SignEvidence("charge", -float(np.sign(rank)) * (weight if clear else 0.0), text)
 
 
 def _from_soc(log: Log) -> SignEvidence:
     if log.soc_pct is None:
         return SignEvidence("soc", 0.0, "no reference SoC")
     known = np.flatnonzero(np.isfinite(log.soc_pct))
-    soc, taken = log.soc_pct[known], discharged_ah(log.time_s, log.current_a)[known]
+    soc, taken = log.soc_pct[known], charge_ah(log)[known]
     span = float(np.ptp(soc)) if known.size > 10 else 0.0
     if span < 1.0 or np.ptp(taken) <= 0.0:
         return SignEvidence("soc", 0.0, f"reference SoC moves by only {span:.1f} %")
@@ -197,6 +197,11 @@ def _ranks(values: FloatArray) -> FloatArray:
     return np.asarray((np.cumsum(count) - (count + 1) / 2.0)[place], dtype=np.float64)
 
 
+def charge_ah(log: Log) -> FloatArray:
+    """Return the charge taken out since the first row [Ah], shape (n,); see `discharged_ah`."""
+    return discharged_ah(log.time_s, log.current_a)
+
+
 def spaced_rows(time_s: FloatArray, spacing_s: float) -> IntArray:
     """Return the first row of every slot of `spacing_s` that holds any."""
     if spacing_s <= 0.0:
@@ -205,36 +210,40 @@ def spaced_rows(time_s: FloatArray, spacing_s: float) -> IntArray:
     return np.concatenate(([0], np.flatnonzero(np.diff(slot) > 0.0) + 1)).astype(np.intp)
 
 
-def resolve_sign(log: Log, *, is_unknown: bool = False, is_stated: bool = False) -> Log:
+def resolve_sign(log: Log, *, stored_sign_unknown: bool, is_stated: bool = False) -> Log:
     """Check the sign of current against the data; invert it only where the format leaves it open.
 
     A remark says where the data disagree with the sign (`is_stated` by the user), or cannot confirm
     one that the format does not define. A SoC that contradicts the sign which the voltage alone
     proves is left out.
     """
-    finding, remarks, assumed = sign_of_current(log), list(log.remarks), list(log.assumed)
-    voltage, soc = _finding(finding.evidence[:2]), finding.evidence[2]
-    if log.soc_pct is not None and abs(soc.weight) >= 1.0 and soc.weight * voltage.sign < 0.0:
-        first, last = log.soc_pct[np.isfinite(log.soc_pct)][[0, -1]]
+    finding = sign_of_current(log)
+    remarks, assumed = list(log.remarks), ""
+    voltage = _finding(finding.evidence[:2])
+    soc = finding.evidence[2]
+    if not finding.sign and abs(soc.weight) >= 1.0 and soc.weight * voltage.sign < 0.0:
+        _, first = log.first_soc() or (0, np.nan)
+        last = log.soc_pct[np.isfinite(log.soc_pct)][-1] if log.soc_pct is not None else np.nan
         remarks.append(
             f"SoC left out: it moves from {first:.4g} to {last:.4g} % against the charge, by the"
             f" sign of current that the voltage proves ({voltage.strongest.text}); is it a depth of"
             " discharge?"
         )
         log, finding = replace(log, soc_pct=None), voltage
-    if is_unknown:
-        proof = "found from the data" if finding.sign else "not confirmed by the data"
-        way = "charges" if finding.sign < 0 else "discharges"
-        assumed += [f"positive current {way}, {proof}"] if assumed else []
-    if is_unknown and finding.sign < 0:
+    if stored_sign_unknown and finding.sign < 0:
         log = replace(log, current_a=0.0 - log.current_a)
         remarks.append(f"current negated, sign found from the data: {finding.strongest.text}")
-    elif is_unknown and not finding.sign:
+        assumed = "positive current charges, found from the data"
+    elif stored_sign_unknown and finding.sign > 0:
+        assumed = "positive current discharges, found from the data"
+    elif stored_sign_unknown:
         remarks.append(
             "sign of current unknown and undetermined by the data: kept as stored (--sign charge"
             " inverts it)"
         )
+        assumed = "positive current discharges, not confirmed by the data"
     elif finding.sign < 0:
         what, how = ("the stated sign of current", "stated") if is_stated else ("current", "stored")
         remarks.append(f"{what} looks inverted and was kept as {how}: {finding.sentence}")
-    return replace(log, remarks=tuple(remarks), assumed=tuple(assumed))
+    stated = (assumed,) if assumed and log.assumed else ()
+    return replace(log, remarks=tuple(remarks), assumed=(*log.assumed, *stated))

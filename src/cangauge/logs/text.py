@@ -7,7 +7,7 @@ columns, and a last line that is cut off.
 from __future__ import annotations
 
 import csv
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import suppress
 from typing import Any, Final, NamedTuple
 
@@ -16,20 +16,16 @@ import pyarrow.csv as pacsv
 
 from cangauge._files import Head, as_utf8
 from cangauge.errors import InputError
-from cangauge.logs.cells import MISSING, is_number, is_stamp
-from cangauge.logs.column_map import (
-    ChosenColumn,
-    ColumnMap,
-    choose_columns,
-    is_canonical,
-    unknown_columns,
-)
+from cangauge.logs import stamps
+from cangauge.logs.column_map import Choice, ColumnMap, choose_columns, unknown_columns
 from cangauge.logs.headings import meaning_of
-from cangauge.logs.units import FIELDS, unit_of
 
 MAX_ROWS: Final = 20_000_000
 """Rows of a log: 23 days at 10 Hz, 0.8 GB as float64."""
 MAX_COLUMNS: Final = 10_000
+_MISSING: Final = "nan na n/a #n/a null none - -- 1.#qnan -1.#ind unknown unavailable n.a."
+MISSING: Final = tuple(_MISSING.split())
+"""Cells without a value, in lower case."""
 _NULLS: Final = ["", *{s for text in MISSING for s in (text, text.upper(), text.title(), "NaN")}]
 _DELIMITERS: Final = ("\t", ";", ",", "|")
 _ROWS_ABOVE_DATA: Final = 4
@@ -57,15 +53,9 @@ class TextTable(NamedTuple):
         InputError
             If there is no row, or a row in the middle has the wrong number of cells.
         """
-        first = next((line for line in self.head.lines[self.skip_lines :] if line.strip()), "")
-        width, wanted = len(split_cells(first, self.delimiter)), [f"f{place}" for place in places]
-        if not first:
-            raise self._error("there are no rows below the header", "check the export")
-        if any(self.headings[width:]):
-            problem = f"row 1 has {width} cells where the header has {len(self.headings)}"
-            cure = "the file looks cut off or has another delimiter: export it again"
-            raise self._error(problem, cure)
         data, odd = as_utf8(self.head.read()), list[Any]()
+        names = [f"c{place}" for place in range(self._width())]
+        wanted = list(dict.fromkeys(names[place] for place in places))
 
         def skip(row: Any) -> str:
             odd.append(row)
@@ -76,9 +66,7 @@ class TextTable(NamedTuple):
                 pa.BufferReader(data),
                 # One thread: otherwise pyarrow does not number odd rows.
                 read_options=pacsv.ReadOptions(
-                    use_threads=False,
-                    autogenerate_column_names=True,
-                    skip_rows=self.skip_lines,
+                    use_threads=False, column_names=names, skip_rows=self.skip_lines
                 ),
                 parse_options=pacsv.ParseOptions(
                     delimiter=self.delimiter, invalid_row_handler=skip
@@ -93,15 +81,31 @@ class TextTable(NamedTuple):
         except pa.ArrowInvalid as error:
             problem = f"the table cannot be read: {str(error).splitlines()[0]}"
             raise self._error(problem, "export it again") from error
+        self._remark_odd(odd, table.num_rows)
         if table.num_rows > MAX_ROWS:
             raise self._error(f"more than the {MAX_ROWS} rows that a log may have", "split it")
-        self._remark_odd(odd, table.num_rows)
+        if not table.num_rows:
+            raise self._error("there are no rows below the header", "check the export")
         if not data.endswith((b"\n", b"\r")):
             self.remarks.append(
                 "the last line has no line end: if the file was cut off, its last value may be"
                 " short"
             )
-        return {place: table.column(f"f{place}") for place in places}
+        return {place: table.column(f"c{place}") for place in places}
+
+    def _width(self) -> int:
+        """Return the number of cells of the first row: headers can be shorter than rows."""
+        first = next((line for line in self.head.lines[self.skip_lines :] if line.strip()), "")
+        if not first:
+            raise self._error("there are no rows below the header", "check the export")
+        width = len(split_cells(first, self.delimiter))
+        named = max((k + 1 for k, name in enumerate(self.headings) if name), default=0)
+        if not named <= width <= MAX_COLUMNS:
+            raise self._error(
+                f"row 1 has {width} cells where the header has {named} (at most {MAX_COLUMNS})",
+                "the file looks cut off or has another delimiter: export it again",
+            )
+        return width
 
     def _remark_odd(self, odd: list[Any], rows: int) -> None:
         # pyarrow numbers rows from 1, skipped lines included; only the last ones may be odd.
@@ -130,31 +134,48 @@ def split_cells(line: str, delimiter: str) -> list[str]:
     return [cell.strip() for cell in next(reader, [])]
 
 
+def is_number(text: str) -> bool:
+    """Return whether a text is a number."""
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
+
+
 def _is_value(cell: str) -> bool:
-    return is_number(cell.replace(",", ".")) or is_stamp(cell)
+    return is_number(cell.replace(",", ".")) or stamps.is_stamp(cell)
 
 
-def find_table(head: Head, given: ColumnMap | None = None) -> TextTable:
-    """Return the table of a text that is canonical, or has time, current and voltage.
+def table_below(head: Head, header: str) -> TextTable:
+    """Return the table below a known line, with the first delimiter of tab, `;` and `,` in it."""
+    mark = next((mark for mark in _DELIMITERS[:3] if mark in header), ",")
+    return TextTable(head, mark, split_cells(header, mark), (), head.lines.index(header) + 1, [])
+
+
+def find_table(head: Head, given: ColumnMap | None = None) -> TextTable | None:
+    """Return the table of a text in which time, current and voltage are known, or None.
 
     Raises
     ------
     InputError
-        If there is none, or a column of the user is in no line.
+        If a column of the user is in no line.
     """
-    source, specs = str(head.path), given.specs.values() if given else ()
-    by_number = bool(specs) and all(text.startswith("#") for text in specs)
+    specs = given.specs.values() if given else ()
+    if specs and all(spec.text.startswith("#") for spec in specs):
+        found = _without_header(head)
+        if found is not None:
+            return found
     for rows in (1, 2):  # the words of a header may be in two rows
         for number, delimiter, cells in _headers(head, rows):
-            if by_number and 2 * sum(map(_is_value, cells)) > len(cells):  # without a header
-                headings = [f"column {k}" for k in range(1, len(cells) + 1)]
-                return TextTable(head, delimiter, headings, (), number, [])
-            if given is None and is_canonical(cells):
-                return TextTable(head, delimiter, cells, (), number + rows, [])
             with suppress(InputError):
-                chosen = choose_columns(cells, (), given, source=source)
-                return _below(head, number + rows, delimiter, cells, chosen)
-    raise unknown_columns(source, likely_header(head), given)
+                if choose_columns(cells, (), given).is_complete:
+                    return _below(head, number + rows, delimiter, cells, given)
+    if not specs:
+        return None
+    headings, _ = likely_header(head)
+    choice = choose_columns(headings, (), given)  # names a heading that is missing
+    raise unknown_columns(str(head.path), headings, choice)
 
 
 def _headers(head: Head, rows: int = 1) -> Iterator[tuple[int, str, list[str]]]:
@@ -172,22 +193,39 @@ def _headers(head: Head, rows: int = 1) -> Iterator[tuple[int, str, list[str]]]:
 
 
 def _below(
-    head: Head, first: int, delimiter: str, cells: list[str], chosen: Mapping[str, ChosenColumn]
+    head: Head, first: int, delimiter: str, cells: list[str], given: ColumnMap | None
 ) -> TextTable:
     """Return the table below a header, with its row of units where there is one."""
+    choice = choose_columns(cells, (), given)
+    place = choice.chosen["time"].places[-1]
     units: list[str] = []
-    places = [(FIELDS[name], k) for name, column in chosen.items() for k in column.places]
     for number, line in enumerate(head.lines[first : first + _ROWS_ABOVE_DATA], start=first):
-        row = split_cells(line, delimiter) + [""] * len(cells)
-        if _is_value(row[chosen["time"].places[-1]]):
+        row = split_cells(line, delimiter)
+        if place < len(row) and _is_value(row[place]):
             return TextTable(head, delimiter, cells, units, number, [])
-        if any(unit_of(field, row[place].strip("[](){} ")) for field, place in places):
+        again = choose_columns(cells, row, given).chosen if any(row) else {}
+        if len(again) >= len(choice.chosen) and any(
+            again[name].unit != column.unit for name, column in choice.chosen.items()
+        ):
             units = row
     return TextTable(head, delimiter, cells, units, first, [])
 
 
-def likely_header(head: Head) -> list[str]:
-    """Return the likeliest header of a text in which no table was found, for messages."""
+def _without_header(head: Head) -> TextTable | None:
+    """Return the table of a text that has no header, for columns given by number."""
+    for number, line in enumerate(head.lines):
+        for delimiter in _DELIMITERS:
+            cells = split_cells(line, delimiter)
+            if len(cells) > 2 and 2 * sum(map(_is_value, cells)) > len(cells):
+                above = split_cells(head.lines[number - 1], delimiter) if number else []
+                headings = [f"column {k}" for k in range(1, len(cells) + 1)]
+                is_header = len(above) == len(cells)
+                return None if is_header else TextTable(head, delimiter, headings, (), number, [])
+    return None
+
+
+def likely_header(head: Head) -> tuple[list[str], Choice]:
+    """Return the likeliest header of a text and its incomplete choice, for messages."""
     best: list[str] = []
     for number, delimiter, cells in _headers(head):
         if sum(map(_is_value, cells)) > 1:
@@ -197,7 +235,7 @@ def likely_header(head: Head) -> list[str]:
         known, most = (sum(map(bool, map(meaning_of, row))) for row in (cells, best))
         if has_data and (not best or known > most):
             best = cells
-    return best
+    return best, choose_columns(best)
 
 
 def is_of_frames(headings: Iterable[str]) -> bool:

@@ -219,7 +219,7 @@ class _Player:
         for frame in step.frames:
             self._send(frame)
         state.frames += len(step.frames)
-        if step.samples != state.samples:
+        if self.is_max and step.samples != state.samples:
             self._marks.append((step.samples, state.frames + state.clock_frames))
         state.samples = step.samples
         state.log_seconds = (step.time_us - self._first_us) / MICROSECONDS

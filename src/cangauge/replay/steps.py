@@ -50,11 +50,14 @@ class LogSource:
     counts_samples = True
 
     def __init__(self, log: Log, vehicle: Vehicle) -> None:
-        self.name, self.duration_s, self.log, self.vehicle = log.name, log.duration_s, log, vehicle
+        self.name, self.log, self.vehicle = log.name, log, vehicle
         FrameEncoder(vehicle).check_range(log)
 
     def steps(self, *, loop: bool) -> Iterator[Step]:
-        """Yield a step per row, each one sample; repetitions follow one typical step later."""
+        """Yield a step per row, each one sample; repetitions follow one typical step later.
+
+        A row that the checks of the map refuse counts as lost.
+        """
         log, encoder = self.log, FrameEncoder(self.vehicle)
         soc_pct = np.full(len(log), math.nan) if log.soc_pct is None else log.soc_pct
         columns = (log.time_s, log.current_a, log.voltage_v, log.temperature_c, soc_pct)
@@ -76,8 +79,6 @@ class CaptureSource:
 
     With a vehicle its frames are wanted; without one all are, and samples cannot be counted.
     """
-
-    duration_s = None
 
     def __init__(
         self, path: str | Path, vehicle: Vehicle | None = None, ids: FrameIds | None = None

@@ -268,7 +268,11 @@ class RunConfig(Strict):
         default_text=f"{DEFAULT_VEHICLE}, without a map",
     )  # fmt: skip
     dbc: str | None = key(
-        None, "DBC file of another vehicle, whose map names none.", "--dbc", "FILE", is_path=True
+        None,
+        "DBC file of another vehicle, searched before those that its map names.",
+        "--dbc",
+        "FILE",
+        is_path=True,
     )
     map: str | None = key(
         None,
@@ -390,7 +394,7 @@ class RunConfig(Strict):
     mqtt: MqttConfig | None = key(None, "MQTT broker that takes the state (extra `mqtt`).")
     dashboard: str | None = key(
         None,
-        "Serve the live page there, e.g. 8642: a port alone is on this machine. An address beyond"
+        "Address of the live page. A port alone, such as 8642, serves this machine only. One beyond"
         " loopback needs a token, as with --http.",
         "--dashboard", "HOST:PORT", restart=True,
     )  # fmt: skip

@@ -104,7 +104,7 @@ def sole_writer(path: str | PathLike[str]) -> Iterator[None]:
         except BlockingIOError as error:
             holder = os.read(held, 20).decode("ascii", "replace")
             raise InputError(
-                f"another service (process {holder}) writes this file",
+                f"another service{f' (process {holder})' if holder else ''} writes this file",
                 source=path,
                 cure="stop that one, or name another file",
             ) from error

@@ -80,7 +80,7 @@ class Recorder(Output):
         part_bytes: float | None = None,
         keep_bytes: float | None = None,
     ) -> None:
-        _check(Path(path), part_bytes, keep_bytes)
+        check_recording(Path(path), part_bytes, keep_bytes)
         self._batch: list[can.Message] = []
         self._lost_frames = 0
         self._file = file = _RecordFile(Path(path), part_bytes, keep_bytes)
@@ -216,7 +216,7 @@ class _RecordFile:
             emit(_LOG, logging.INFO, "record.removed", f"removed the oldest part: {path}")
 
 
-def _check(path: Path, part_bytes: float | None, keep_bytes: float | None) -> None:
+def check_recording(path: Path, part_bytes: float | None, keep_bytes: float | None) -> None:
     """Raise InputError for a recording that cannot be written, or not be limited."""
     if not path.name.lower().removesuffix(".gz").endswith(".log"):
         raise InputError(

@@ -14,6 +14,7 @@ from os import PathLike
 from pathlib import Path
 from typing import Any, Final
 
+from cangauge._files import check_writable
 from cangauge._logging import emit
 from cangauge._text import known_soc, number
 from cangauge.bus.reconnecting import ReconnectingBus
@@ -23,7 +24,7 @@ from cangauge.service.lifecycle import Notifier, reload_on_hangup, sole_writer, 
 from cangauge.service.loop import Loop, LoopSettings
 from cangauge.service.output import Output
 from cangauge.service.pipeline import Pipeline
-from cangauge.service.record import Recorder
+from cangauge.service.record import Recorder, check_recording
 from cangauge.service.setup import Setup, SetupReader, address_of
 from cangauge.service.state import StateKeeper, state_path
 from cangauge.service.status import PAGE_EVERY_S, SHOW_EVERY_S, Monitor
@@ -87,7 +88,7 @@ class Service:
         )
         self.config = self._read()
         self._state = state_path(self.config.state, os.environ)
-        self._check_state()
+        self._check_files()
         self._setup = setup = Setup.of(self.config)
         self.pipeline = Pipeline(setup.vehicle, setup.model, setup.settings)
         self.address = address_of(self.config)
@@ -226,12 +227,16 @@ class Service:
         if (path := status["recording"]) is not None:
             emit(_LOG, logging.INFO, "file.written", f"written: {path}", path=path)
 
-    def _check_state(self) -> None:
-        """Raise InputError if the state is another file of the service."""
+    def _check_files(self) -> None:
+        """Raise InputError if state or recording cannot be written, or are another file."""
         config = self.config
         for other in filter(None, (config.model, config.record, config.dbc, config.map)):
             if self._state and os.path.realpath(other) == os.path.realpath(self._state):
                 raise InputError("is another file of this service", field="--state", value=other)
+        if self._state is not None:
+            check_writable(self._state)
+        if config.record is not None:
+            check_recording(Path(config.record), config.record_part_mb, config.record_keep_mb)
 
 
 def _loop_settings(config: RunConfig) -> LoopSettings:

@@ -297,7 +297,7 @@ def _read_options(reading: ReadingOptions) -> ReadOptions:
 
     mapped, car = reading.mapped_columns(), None
     is_map_of_columns = mapped is not None and "dbc" not in read_toml(str(reading.map_file))
-    if reading.names_vehicle and (reading.vehicle or not is_map_of_columns):
+    if reading.names_vehicle and (reading.vehicle or reading.dbc or not is_map_of_columns):
         car = reading.car()
     paths: list[str] = []
     if reading.map_file is not None:

@@ -17,7 +17,7 @@ from cangauge._typing import FloatArray
 from cangauge.errors import InputError
 from cangauge.extras.formats.mcap_messages import FRAME, MAGIC, SAMPLE, McapMessage, read_messages
 from cangauge.logs.canonical import build_table
-from cangauge.logs.column_map import ColumnMap, choose_columns
+from cangauge.logs.column_map import ColumnMap, choose_columns, unknown_columns
 from cangauge.logs.draft import DraftLog
 from cangauge.logs.table import ArrowTable, draft_of_table
 from cangauge.logs.text import MAX_COLUMNS, MAX_ROWS
@@ -56,10 +56,12 @@ def _draft_of_channels(
     """
     source = str(head.path)
     names = [_TIME, *(name for name in headings if name != _TIME)]
-    chosen = choose_columns(names, (), given, source=source)
-    held = {names[p] for q in ("temperature", "soc") if q in chosen
-            for p in chosen[q].places}  # fmt: skip
-    current = names[chosen["current"].places[0]]
+    choice = choose_columns(names, (), given)
+    if not choice.is_complete:
+        raise unknown_columns(source, names, choice)
+    held = {names[p] for q in ("temperature", "soc") if q in choice.chosen
+            for p in choice.chosen[q].places}  # fmt: skip
+    current = names[choice.chosen["current"].places[0]]
     notes: list[str] = []
 
     def table(wanted: list[str]) -> Any:

@@ -11,11 +11,11 @@ import pyarrow.compute as pc
 
 from cangauge._files import Head
 from cangauge.errors import InputError
-from cangauge.logs.cells import seconds_of
-from cangauge.logs.column_map import ColumnMap, choose_columns
+from cangauge.logs.column_map import ColumnMap, choose_columns, unknown_columns
 from cangauge.logs.draft import DraftLog
+from cangauge.logs.stamps import seconds_of_text
 from cangauge.logs.table import ArrowTable, draft_of_table, held
-from cangauge.logs.text import MAX_ROWS, TextTable, find_table, split_cells
+from cangauge.logs.text import MAX_ROWS, find_table, likely_header, split_cells, table_below
 
 HOLD_ENTITY_S: Final = 60.0
 """Longest time that a stored value is held [s], as long as charge is counted over a gap: a recorder
@@ -42,6 +42,8 @@ class Workbook:
         """
         sheet = _SheetText(head)
         table = find_table(sheet, columns)
+        if table is None:
+            raise unknown_columns(str(head.path), *likely_header(sheet))
         return draft_of_table(table, columns, name=head.name, source=str(head.path))
 
 
@@ -102,24 +104,27 @@ class EntityHistory:
 
     def read(self, head: Head, columns: ColumnMap | None = None) -> DraftLog:
         """Read a history: a row for every time at which the current or the voltage changed."""
-        names, skip = split_cells(head.first_line, ","), head.lines.index(head.first_line) + 1
-        text = TextTable(head, ",", names, (), skip, [])
+        text = table_below(head, head.first_line)
         lower = [cell.lower() for cell in text.headings]
         places = [lower.index(name) for name in self._NAMES]
         cells = text.columns(places)
         entity, state, changed = (cells[place].cast(pa.string()) for place in places)
         source = str(head.path)
-        stamps, how = seconds_of([changed], "", 1.0, source, "last_changed")
+        stamps, how = seconds_of_text(changed, "", source, "last_changed")
         order = np.argsort(stamps, kind="stable")
         stamps = stamps[order]
         entity, values = entity.take(order), _as_numbers(state).take(order)
         headings = ["time", *entity.unique().to_pylist()]
-        chosen = choose_columns(headings, (), columns, source=source)
+        choice = choose_columns(headings, (), columns)
+        if not choice.is_complete:
+            raise unknown_columns(source, headings, choice)
         of_entity = {
             name: np.where(pc.equal(entity, name).to_numpy(), values.to_numpy(), np.nan)
             for name in headings[1:]
         }
-        driving = [headings[place] for q in ("current", "voltage") for place in chosen[q].places]
+        driving = [
+            headings[place] for q in ("current", "voltage") for place in choice.chosen[q].places
+        ]
         is_change = np.any([np.isfinite(of_entity[name]) for name in driving], axis=0)
         last = np.append(np.flatnonzero(np.diff(stamps) > 0.0), stamps.size - 1)
         at = last[np.isin(stamps[last], stamps[is_change])]

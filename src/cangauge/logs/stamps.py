@@ -1,0 +1,201 @@
+"""Times of a table as seconds: numbers, clock times, dates with and without a zone.
+
+Dates become seconds since 1970 (UTC). A date without a zone is read as UTC unless a zone is given:
+only differences matter.
+"""
+
+from __future__ import annotations
+
+from typing import Any, Final
+from zoneinfo import ZoneInfo, ZoneInfoNotFoundError
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+
+from cangauge._typing import FloatArray
+from cangauge.errors import InputError
+from cangauge.logs.units import unit_of
+
+_CLOCK: Final = (
+    r"(?P<h>\d{1,5}):(?P<m>\d{1,2})(?::(?P<s>\d{1,2}(?:[.,:]\d+)?))?"
+    r"\s*(?P<half>[AaPp])?(?:\.?[Mm]\.?)?"
+)
+_DATE: Final = (
+    r"(?:[A-Za-z]{3},?\s+)?(?P<a>\d{1,4})[-/.](?P<b>\d{1,2}|[A-Za-z]{3})[-/.](?P<c>\d{1,4})"
+)
+_ZONE: Final = r"(?P<z>Z|z|UTC|GMT|[+-]\d{2}:?\d{2}|[+-]\d{2})?"
+_DATE_TIME: Final = rf"^{_DATE}(?:(?:[T,_]|\s)\s*{_CLOCK})?\s*{_ZONE}$"
+_CLOCK_TIME: Final = rf"^(?:(?P<d>\d+)\s*(?:[dD]|[dD]ays?)?\s+)?{_CLOCK}$"
+_SPELLINGS: Final = (
+    ("[\u00a0\u202f]", " "),  # before AM and PM
+    # `Mar 31, 2024` and `31 March 2024` are read as `31-Mar-2024`.
+    (
+        r"^(?:[A-Za-z]{3,9},?\s+)?([A-Za-z]{3})[a-z]*\.?\s+(\d{1,2})(?:st|nd|rd|th)?,?\s+(\d{4}),?\s*",
+        r"\2-\1-\3 ",
+    ),
+    (r"^(\d{1,2})\.?\s+([A-Za-z]{3})[a-z]*\.?,?\s+(\d{4}),?\s*", r"\1-\2-\3 "),
+)
+_MONTH_NAMES: Final = "jan feb mar/mrz apr may/mai jun jul aug sep oct/okt nov dec/dez"
+_MONTHS: Final = {
+    name: float(number)
+    for number, names in enumerate(_MONTH_NAMES.split(), start=1)
+    for name in names.split("/")
+}
+_EPOCHS: Final = ((1e17, 1e-9, "ns"), (1e14, 1e-6, "µs"), (1e11, 1e-3, "ms"), (1e9, 1.0, "s"))
+"""Smallest number since 1970 in each unit, its seconds, its name."""
+
+
+def is_stamp(text: str) -> bool:
+    """Return whether a cell holds a date or a clock time."""
+    return _matches(text, _DATE_TIME) or _matches(text, _CLOCK_TIME)
+
+
+def is_clock(text: str) -> bool:
+    """Return whether a cell holds a clock time without a date."""
+    return _matches(text, _CLOCK_TIME)
+
+
+def _matches(text: str, pattern: str) -> bool:
+    cell = _spelled_alike(pa.array([text], pa.string()))
+    return bool(pc.match_substring_regex(cell, pattern)[0].as_py())
+
+
+def _spelled_alike(cells: Any) -> Any:
+    cells = pc.utf8_trim_whitespace(cells)
+    for pattern, replacement in _SPELLINGS:
+        cells = pc.replace_substring_regex(cells, pattern, replacement)
+    return pc.utf8_trim_whitespace(cells)
+
+
+def is_time_format(unit: str) -> bool:
+    """Return whether a unit is an order of dates (dmy, mdy, ymd) or a time zone."""
+    return unit.lower() in {"ymd", "dmy", "mdy"} or _zone_of(unit) is not None
+
+
+def _zone_of(name: str) -> ZoneInfo | None:
+    if not name or unit_of("time_s", name) is not None:
+        return None
+    try:
+        return ZoneInfo(name)
+    except (ZoneInfoNotFoundError, ValueError, OSError):
+        return None
+
+
+def seconds_of_numbers(values: FloatArray, unit: str) -> tuple[FloatArray, str]:
+    """Return numbers as seconds, and their unit as stated or as the size of an epoch shows."""
+    if unit:
+        return values * (unit_of("time_s", unit) or (1.0, 0.0))[0], unit
+    finite = values[np.isfinite(values)]
+    typical = float(np.median(finite)) if finite.size else 0.0
+    for least, factor, name in _EPOCHS:
+        if typical >= least:
+            return values * factor, f"{name} since 1970, from its size"
+    return values, "s, assumed"
+
+
+def seconds_of_text(cells: Any, unit: str, source: str, label: str) -> tuple[FloatArray, str]:
+    """Return stamps of text as seconds, NaN where empty, and how they were read.
+
+    All cells are clock times (`1:02:03.5`, `2d 01:02:03`), or dates with or without a time of day.
+    `unit` is an order of dates (`dmy`, `mdy`), or the zone of dates without one (`Europe/Berlin`).
+
+    Raises
+    ------
+    InputError
+        If a cell is no time.
+    """
+    cells = cells.combine_chunks() if isinstance(cells, pa.ChunkedArray) else cells
+    spelled = _spelled_alike(cells)
+    known = np.asarray(pc.is_valid(spelled).to_numpy(zero_copy_only=False), dtype=bool)
+    first = spelled[int(np.argmax(known))].as_py() if known.any() else ""
+    parts = pc.extract_regex(spelled, _CLOCK_TIME if is_clock(first) else _DATE_TIME)
+    read = np.asarray(pc.is_valid(parts).to_numpy(zero_copy_only=False), dtype=bool)
+    if np.any(known & ~read):
+        row = int(np.argmax(known & ~read))
+        raise InputError(
+            f"row {row + 1} is not a time",
+            source=source,
+            field=label,
+            value=cells[row].as_py(),
+            cure="seconds, hh:mm:ss or dates are read; name another column with --columns time=…",
+        )
+    hours, minutes, seconds = (np.nan_to_num(_numbers(parts, name)) for name in "hms")
+    half = _words(parts, "half")
+    hours = np.where(half == "", hours, hours % 12 + np.where(half == "p", 12.0, 0.0))
+    of_day_s = np.where(read, hours * 3600.0 + minutes * 60.0 + seconds, np.nan)
+    if not is_clock(first):
+        return _dates(parts, of_day_s, unit)
+    values = np.nan_to_num(_numbers(parts, "d")) * 86400.0 + of_day_s
+    values[read] += np.cumsum(np.diff(values[read], prepend=0.0) < -43200.0) * 86400.0  # midnights
+    return values, "clock time"
+
+
+def _dates(parts: Any, of_day_s: FloatArray, unit: str) -> tuple[FloatArray, str]:
+    months = np.array([_MONTHS.get(word, np.nan) for word in _words(parts, "b")])
+    is_word = bool(np.isfinite(months).any())
+    middle = months if is_word else _numbers(parts, "b")
+    fields = np.array([_numbers(parts, "a"), middle, _numbers(parts, "c")])
+    known = np.isfinite(fields).all(axis=0)
+    order, how = _order(fields[:, known], unit.lower(), is_word=is_word)
+    values = np.full(known.size, np.nan)
+    values[known] = _day_numbers(fields[:, known], order) * 86400.0
+    values += of_day_s
+    zones = _words(parts, "z")
+    if np.any(zones != ""):
+        offset_s = {zone: _offset_s(zone) for zone in set(zones)}
+        return values - np.array([offset_s[zone] for zone in zones]), f"date{how} with zone"
+    zone = _zone_of(unit)
+    if zone is None:
+        return values, f"date{how} without zone"
+    local = pa.array(values * 1e6, from_pandas=True).cast(pa.int64()).cast(pa.timestamp("us"))
+    utc = pc.assume_timezone(local, zone.key, ambiguous="earliest", nonexistent="latest")
+    micros = utc.cast(pa.int64()).cast(pa.float64()).to_numpy(zero_copy_only=False)
+    return np.asarray(micros) / 1e6, f"date{how} in {zone.key}"
+
+
+def _order(fields: FloatArray, unit: str, *, is_word: bool) -> tuple[str, str]:
+    """Return the order of year, month and day, and a note where it was assumed."""
+    if not fields.size or np.max(fields[0]) > 31:
+        return "ymd", ""
+    if unit in {"dmy", "mdy"}:
+        return unit, f" ({unit} as given)"
+    if is_word or np.max(fields[0]) > 12:
+        return "dmy", " (day first)"
+    if np.max(fields[1]) > 12:
+        return "mdy", " (month first)"
+    # A log is short: the order of fewer days.
+    order = min(("dmy", "mdy"), key=lambda name: float(np.ptp(_day_numbers(fields, name))))
+    return order, f" ({'day' if order == 'dmy' else 'month'} first, assumed)"
+
+
+def _day_numbers(fields: FloatArray, order: str) -> FloatArray:
+    """Return days since 1970 of fields of shape (3, n)."""
+    year, month, day = (fields[order.index(letter)].astype(np.int64) for letter in "ymd")
+    year = np.where(year < 100, year + 2000, year)
+    first = ((year - 1970) * 12 + month - 1).astype("datetime64[M]").astype("datetime64[D]")
+    return np.asarray(first.astype(np.int64) + day - 1, dtype=np.float64)
+
+
+def _offset_s(zone: str) -> float:
+    """Return the offset from UTC that a stamp states [s]: `+02:00`, `-0530`, `z`."""
+    digits = zone[1:].replace(":", "")
+    if not digits.isdigit():
+        return 0.0
+    seconds = int(digits[:2]) * 3600.0 + int(digits[2:] or 0) * 60.0
+    return -seconds if zone[0] == "-" else seconds
+
+
+def _numbers(parts: Any, name: str) -> FloatArray:
+    """Return a group as numbers, NaN where it is empty; `59:123` is 59.123."""
+    text = pc.replace_substring_regex(parts.field(name), "[,:]", ".")
+    valid = pc.fill_null(pc.match_substring_regex(text, r"^\d+(\.\d+)?$"), fill_value=False)
+    text = pc.if_else(valid, text, pa.scalar(None, pa.string()))
+    numbers = pc.cast(text, pa.float64()).to_numpy(zero_copy_only=False)
+    return np.asarray(numbers, dtype=np.float64)
+
+
+def _words(parts: Any, name: str) -> Any:
+    """Return a group in lower case, "" where it is empty."""
+    text = pc.fill_null(pc.utf8_lower(parts.field(name)), "")
+    return np.asarray(text.to_numpy(zero_copy_only=False), dtype=object)
