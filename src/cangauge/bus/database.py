@@ -342,7 +342,7 @@ def find_message(database: Database, message: str | int, *, source: object, fiel
         problem = "the DBC has no such message"
         near = "" if number is not None else closest(str(message), [m.name for m in messages])
         cure = near and f"did you mean {near}?"
-        cure = cure or _listed([f"{m.name} (0x{m.frame_id:X})" for m in messages], "its messages")
+        cure = cure or _listed([f"{m.name} (0x{m.frame_id:X})" for m in messages], "messages")
     raise InputError(problem, source=str(source), field=field, value=message, cure=cure)
 
 
@@ -362,7 +362,7 @@ def find_signal(
         if owner in owners:
             return owner, owner.get_signal_by_name(signal)
         problem, searched = f"message {owner.name} has no such signal", [owner]
-        cure = _listed([each.name for each in owner.signals], "its signals")
+        cure = _listed([each.name for each in owner.signals], "signals")
     elif len(owners) == 1:
         return owners[0], owners[0].get_signal_by_name(signal)
     if owners and message is None:
@@ -377,4 +377,4 @@ def find_signal(
 
 def _listed(names: list[str], what: str) -> str:
     more = f" and {len(names) - 6} more" if len(names) > 6 else ""
-    return f"{what} are {', '.join(names[:6])}{more}" if names else f"it has no {what[4:]}"
+    return f"its {what} are {', '.join(names[:6])}{more}" if names else f"it has no {what}"

@@ -292,7 +292,7 @@ class _Player:
         self.state.lost += self._in_flight
         self._frames_acknowledged = self.state.frames + self.state.clock_frames
         self._marks.clear()
-        text = f"{self.state.lost} samples have not reached the receiver so far; it goes on"
+        text = f"{self.state.lost} samples lost so far; the replay continues"
         emit(_LOG, logging.WARNING, "replay.lost", text)
 
     def _listen_once(self, timeout_s: float) -> bool:

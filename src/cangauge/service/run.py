@@ -228,7 +228,7 @@ class Service:
             emit(_LOG, logging.INFO, "file.written", f"written: {path}", path=path)
 
     def _check_files(self) -> None:
-        """Raise InputError if state or recording cannot be written, or are another file."""
+        """Raise InputError if state or recording cannot be written, or if two files are one."""
         config = self.config
         for other in filter(None, (config.model, config.record, config.dbc, config.map)):
             if self._state and os.path.realpath(other) == os.path.realpath(self._state):

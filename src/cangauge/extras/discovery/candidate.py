@@ -27,7 +27,7 @@ CURRENT_SCALES: Final = {
 SOC_SCALES: Final = (0.1, 0.5, 0.01, 1.0, 0.05, 0.025, 0.02, 0.4)
 """Usual scales of a SoC [%]."""
 NOMINAL_CELL_V: Final = 3.7
-"""Nominal voltage of an oxide cell [V]: tells how many cells a scale would mean."""
+"""Nominal voltage of an oxide cell [V], to count the cells that a scale implies."""
 LARGEST_RATIO: Final = 2.0
 """Largest ratio of the resistances by two halves of a capture: a coincidence does not repeat."""
 

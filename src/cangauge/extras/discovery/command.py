@@ -7,7 +7,7 @@ import tempfile
 import time
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from itertools import chain, islice
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
@@ -328,11 +328,11 @@ def _find(
 ) -> _Found:
     from cangauge.bus.captures import open_capture
     from cangauge.extras.discovery.by_name import is_clear, named_signals
-    from cangauge.extras.discovery.search import MOST_FRAMES, search
+    from cangauge.extras.discovery.search import search
 
     if dbc is not None:
         messages = chain.from_iterable(open_capture(path) for path in paths)
-        named = named_signals(dbc, islice(messages, MOST_FRAMES))
+        named = named_signals(dbc, messages)
         clear = [role for role in _NEEDED if is_clear(named[role])]
         head = ("Signals found by their names and units in the DBC.",)
         return _Found("dbc", {**named}, clear, head, dbc=dbc)

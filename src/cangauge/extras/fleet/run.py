@@ -154,6 +154,8 @@ def _check_versions(client: Any) -> None:
     cure = f"install 'cangauge[fleet]' {__version__} where the workers run"
     try:
         found = set(client.run(worker_version).values())
+    except OSError as error:  # the connection's
+        raise CangaugeError(_LOST) from error
     except Exception as error:
         problem = f"the workers cannot run cangauge: {error}"
         raise InputError(problem, field=_FIELD, cure=cure) from error

@@ -37,7 +37,7 @@ LEAVE_WITHIN_S: Final = 0.5
 
 @dataclass(frozen=True, slots=True)
 class _Sensor:
-    """One sensor of Home Assistant: key of the state, its place in a status, name, unit, class."""
+    """One sensor of Home Assistant, and the place of its state in a status."""
 
     key: str
     place: str
