@@ -53,15 +53,17 @@ def forged(frame: can.Message, rule: Protection, ahead: int, later_s: float) -> 
     )
 
 
-def attacked(vehicle: Vehicle, ahead: int, later: float) -> list[can.Message]:
-    """Add a forged frame to every current frame, `later` periods after it."""
+def attacked(vehicle: Vehicle, ahead: int, later: float, copies: int = 1) -> list[can.Message]:
+    """Add forged frames with running counters to each current frame, `later` periods apart."""
     period_s, out, number = PERIODS_S[vehicle.name], [], 0
     for frame in true_frames(vehicle):
         out.append(frame)
         if frame.arbitration_id == vehicle.current.arbitration_id:
             number += 1
             if number > FROM:
-                out.append(forged(frame, rule_of(vehicle), ahead, later * period_s))
+                for copy in range(copies):
+                    later_s = later * (1 + copy) * period_s
+                    out.append(forged(frame, rule_of(vehicle), ahead + copy, later_s))
     return sorted(out, key=lambda each: each.timestamp)
 
 
@@ -95,6 +97,13 @@ def test_a_second_sender_is_reported_whatever_its_counter(
     assert decoder.two_sender_messages == (vehicle.current.message,)
     # Nothing of the mixture is used.
     assert math.isnan(decoder.health["current"].value_at(decoder.now_s))
+
+
+@pytest.mark.parametrize("vehicle", [LEAF, GENERIC], ids=lambda vehicle: vehicle.name)
+def test_a_second_sender_that_floods_in_sequence_is_reported(vehicle: Vehicle) -> None:
+    decoder, first = decoded(vehicle, attacked(vehicle, 3, 0.09, copies=10))
+    assert FROM <= first <= FROM + 60
+    assert decoder.reasons(decoder.now_s) & Reason.DUPLICATE_SENDER
 
 
 def test_message_is_used_again_after_the_second_sender() -> None:
