@@ -25,18 +25,25 @@ help:
 	@echo "make bench     time and accuracy beside other packages, and how the cost grows (DATA=FOLDER, see README)"
 	@echo "make packs     SoC errors on recorded packs, with models from few logs (DATA=FOLDER)"
 
+# Bytecode is made where a module is first imported: compiling all of it takes longer than the job.
+INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile
+
 $(VENV)/installed: pyproject.toml hatch_build.py $(wildcard core/*.[ch])
 	$(PYTHON) -c 'import sys; sys.exit("cangauge needs Python 3.11 or later (set PYTHON=…)" if sys.version_info < (3, 11) else 0)'
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable .
+	$(INSTALL) --editable .
 	touch $@
 
 $(VENV)/installed-dev: $(VENV)/installed
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[dev]'
+	$(INSTALL) --editable '.[dev]'
+	touch $@
+
+$(VENV)/installed-nightly: $(VENV)/installed-dev
+	$(INSTALL) --editable '.[nightly]'
 	touch $@
 
 $(VENV)/installed-docs: $(VENV)/installed
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[docs]'
+	$(INSTALL) --editable '.[docs]'
 	touch $@
 
 demo: $(VENV)/installed
@@ -49,7 +56,7 @@ test: export OPENBLAS_NUM_THREADS := 1
 test: $(VENV)/installed-dev
 	$(BIN)/python -m pytest -n auto --dist loadfile --no-loadscope-reorder
 
-nightly: $(VENV)/installed-dev
+nightly: $(VENV)/installed-nightly
 	$(BIN)/python benchmarks/nightly.py $(PART) $(if $(DATA),--data "$(DATA)") $(if $(SOCKETCAN),--socketcan "$(SOCKETCAN) -t 3600 -m 2G")
 
 lint: $(VENV)/installed-dev
