@@ -9,11 +9,12 @@ SOCKETCAN ?= $(wildcard ../shared/tools/with-socketcan)
 # Folder of the recorded logs (see README for their sources).
 DATA ?= $(wildcard ../shared/data)
 
-.PHONY: packs help demo test nightly lint coverage check data faults bench bench-check lowest site wheel clean
+.PHONY: packs help demo test socketcan nightly lint coverage check data faults bench bench-check lowest site wheel clean
 
 help:
 	@echo "make demo      the whole job on the shipped log: fit, bus, service, report"
 	@echo "make test      the whole test suite"
+	@echo "make socketcan the tests that need a real SocketCAN interface"
 	@echo "make nightly   what is too long for the suite (PART=fuzz|faults|grade|suite|tests|long|load, DATA=FOLDER)"
 	@echo "make lint      ruff and mypy"
 	@echo "make coverage  the test suite with coverage"
@@ -55,6 +56,10 @@ test: export OMP_NUM_THREADS := 1
 test: export OPENBLAS_NUM_THREADS := 1
 test: $(VENV)/installed-dev
 	$(BIN)/python -m pytest -n auto --dist loadfile --no-loadscope-reorder
+
+# On a kernel without CAN a guest is booted; without either these tests say that they are left out.
+socketcan: $(VENV)/installed-dev
+	$(SOCKETCAN) $(BIN)/python -m pytest -m socketcan tests/socketcan
 
 nightly: $(VENV)/installed-nightly
 	$(BIN)/python benchmarks/nightly.py $(PART) $(if $(DATA),--data "$(DATA)") $(if $(SOCKETCAN),--socketcan "$(SOCKETCAN) -t 3600 -m 2G")
