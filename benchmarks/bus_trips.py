@@ -27,7 +27,7 @@ from rich.console import Console
 from rich.table import Table
 
 from cangauge.bus.connection import BusConnection
-from cangauge.bus.open import BusAddress, bus_address, open_bus
+from cangauge.bus.open import BusAddress, backend_capabilities, bus_address, open_bus
 from cangauge.bus.publish import standard_filter
 from cangauge.bus.vehicle import Vehicle
 from cangauge.estimation.offline import run_estimator, samples_of
@@ -98,8 +98,9 @@ def over_bus(
     pipeline = Pipeline(vehicle, model, PipelineSettings(time_source="replay-clock"))
     rows: list[Estimate] = []
     done = threading.Event()
+    bus = open_bus(address, pipeline.filters)
     with (
-        BusConnection(open_bus(address, pipeline.filters), str(address)) as receiver,
+        BusConnection(bus, str(address), backend_capabilities(address)) as receiver,
         BusConnection(open_bus(address, [standard_filter(0x5A1)]), str(address)) as sender,
         Recorder(record) as recorder,
     ):
