@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Iterable, Sequence
-from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Literal
@@ -16,7 +15,7 @@ from cangauge._files import file_sha256, write_texts_atomic
 from cangauge._text import number, significant
 from cangauge.cli.declare import command
 from cangauge.cli.options import ReadingOptions, check_outputs
-from cangauge.cli.output import console, emit_json, note, print_table, print_values, progress_shown
+from cangauge.cli.output import emit_json, note, print_table, print_values, progress
 
 if TYPE_CHECKING:
     from cangauge.extras.fleet.fit import FleetFit
@@ -57,14 +56,8 @@ class Cluster:
         """Return what a function of the Dask client returns; show its progress."""
         from cangauge.extras.fleet.run import connected
 
-        shown: AbstractContextManager[Any] = nullcontext()
-        if console.is_terminal:
-            shown = console.status("starting")
-        with shown as status:
-            step = None if status is None else status.update
-            connection = connected(self.workers)
-            with progress_shown("cangauge.extras.fleet", step), connection as client:
-                return work(client)
+        with progress("cangauge.extras.fleet"), connected(self.workers) as client:
+            return work(client)
 
 
 @fleet_app.callback()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from contextlib import ExitStack, nullcontext
+from contextlib import ExitStack
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
@@ -15,7 +15,7 @@ from cangauge._files import atomic_path, write_texts_atomic
 from cangauge._text import number, printable
 from cangauge.cli.declare import command
 from cangauge.cli.options import ReadingOptions, check_outputs
-from cangauge.cli.output import console, emit_json, note, print_table
+from cangauge.cli.output import emit_json, note, print_table, progress
 from cangauge.errors import InputError
 
 if TYPE_CHECKING:
@@ -134,8 +134,8 @@ def _suite(
 
     if (model is None) != (data is None):
         raise InputError("give both, or neither", field="--data/-m", cure="recorded: both")
-    with console.status("making the drives") if console.is_terminal else nullcontext() as status:
-        show = (lambda _: None) if status is None else status.update
+    with progress() as show:
+        show("making the drives")
         drives = (
             simulated_drives()
             if model is None or data is None

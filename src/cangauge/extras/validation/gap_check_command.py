@@ -8,7 +8,7 @@ import typer
 
 from cangauge.cli.declare import command
 from cangauge.cli.options import ReadingOptions, assumed_of
-from cangauge.cli.output import emit_json, note, print_table, progress_shown
+from cangauge.cli.output import emit_json, note, print_table, progress
 from cangauge.errors import InputError
 
 
@@ -65,7 +65,7 @@ def gap_check_command(
         read, pack = [], CheckedPack.simulated()
     left_out = min(at_most or len(pack.logs), len(pack.logs))
     note(f"at most {left_out * PER_LOG} diagnoses, about half a second each")
-    with progress_shown("cangauge.validation"):
+    with progress("cangauge.validation"):
         result = summarize(list(pack.findings(at_most)))
     if json_output:
         emit_json(result | {"assumed": assumed_of(read)})

@@ -8,7 +8,7 @@ from typing import Any, Literal
 
 from cangauge.cli.declare import command
 from cangauge.cli.options import check_outputs
-from cangauge.cli.output import console, emit_json, note, print_table
+from cangauge.cli.output import emit_json, note, print_table, progress
 
 
 @command()
@@ -73,7 +73,8 @@ def twin_command(
 
     check_outputs([output], [])
     began = time.perf_counter()
-    with console.status("simulating"):
+    with progress() as show:
+        show("simulating")
         simulated = simulate(
             effect or (),
             seed=seed,
