@@ -89,6 +89,10 @@ def _entries(section: str) -> dict[str, tuple[str, str]]:
 SHARED: Final = _entries("""
 model : -m, --model MODEL
     Model file of `cangauge fit`.
+chemistry : oxide|lfp
+    Chemistry of the cells.
+cells : N (1 … 2000)
+    Cells in series.
 capacity_ah : A (0.001 … 1e5 Ah)
     Charge from 100 to 0 %. Default: the model's.
 report : FILE.html|.htm

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, Final
 from cangauge._files import check_writable, write_texts_atomic
 from cangauge.cli.declare import command
 from cangauge.cli.options import config_parameters, config_values
-from cangauge.cli.output import emit_json, note, print_table, progress
+from cangauge.cli.output import finish, note, print_table, progress
 from cangauge.errors import CangaugeError, InputError
 
 if TYPE_CHECKING:
@@ -107,18 +107,19 @@ def init_command(
     output.mkdir(exist_ok=True)
     write_texts_atomic({output / name: text for name, text in texts.items()})
     files = [str(output / name) for name in texts]
-    if json_output:
-        emit_json({**found.to_dict(), "files": files})
-        return
-    _show(found)
-    _show_proof(found)
-    for path in files:
-        note(f"wrote {path}")
-    reading = found.reading(output)
-    note(
-        f"next: cangauge inspect DRIVE {reading}, then cangauge fit DRIVE … {reading}"
-        f" -o {output / 'model.json'}"
-    )
+
+    def show() -> None:
+        _show(found)
+        _show_proof(found)
+        for path in files:
+            note(f"wrote {path}")
+        reading = found.reading(output)
+        note(
+            f"next: cangauge inspect DRIVE {reading}, then cangauge fit DRIVE … {reading}"
+            f" -o {output / 'model.json'}"
+        )
+
+    finish({**found.to_dict(), "files": files}, show, as_json=json_output)
 
 
 def _picks(given: Sequence[str]) -> dict[str, int]:

@@ -6,6 +6,7 @@ import math
 from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
@@ -15,7 +16,7 @@ from cangauge._files import atomic_path, write_texts_atomic
 from cangauge._text import number, printable
 from cangauge.cli.declare import command
 from cangauge.cli.options import ReadingOptions, check_outputs
-from cangauge.cli.output import emit_json, note, print_table, progress
+from cangauge.cli.output import finish, note, print_table, progress
 from cangauge.errors import InputError
 
 if TYPE_CHECKING:
@@ -115,14 +116,9 @@ def judge_command(
         if corrected is not None:
             _write_corrected(both.enter_context(atomic_path(corrected)), judgement)
         write_texts_atomic(texts)
-    if json_output:
-        result = judgement.to_dict(None if corrected is None else str(corrected))
-        emit_json(result)
-        return
-    _show(judgement)
-    for written in (output, corrected, report):
-        if written is not None:
-            note(f"wrote {written}")
+    result = judgement.to_dict(None if corrected is None else str(corrected))
+    written = [path for path in (output, corrected, report) if path is not None]
+    finish(result, partial(_show, judgement, written), as_json=json_output)
 
 
 def _suite(
@@ -142,10 +138,6 @@ def _suite(
             else recorded_drives(sorted(data.iterdir()), Model.load(model))
         )
         scores = run_suite(started_by, drives, show=show)
-    if json_output:
-        gauge = " ".join(started_by)
-        emit_json({"schema": 1, "gauge": gauge, "scores": [asdict(each) for each in scores]})
-        return
     rows = [
         [
             score.fault,
@@ -162,7 +154,13 @@ def _suite(
         "fault", "MAE [%]", "worst [%]", "jumps/h", "within 5 % after [min]", "within 2σ [%]",
         "silent [%]",
     ]  # fmt: skip
-    print_table(f"{len(drives)} drives", head, rows)
+    result = {
+        "schema": 1,
+        "gauge": " ".join(started_by),
+        "scores": [asdict(each) for each in scores],
+    }
+    show = partial(print_table, f"{len(drives)} drives", head, rows)
+    finish(result, show, as_json=json_output)
 
 
 def _write_corrected(path: Path, judgement: Judgement) -> None:
@@ -182,7 +180,7 @@ def _write_corrected(path: Path, judgement: Judgement) -> None:
     write_table(columns, path)
 
 
-def _show(judgement: Judgement) -> None:
+def _show(judgement: Judgement, written: Sequence[Path]) -> None:
     from cangauge.extras.judge.judgement import rows_of
 
     typer.echo(printable(judgement.headline))
@@ -194,3 +192,5 @@ def _show(judgement: Judgement) -> None:
             for jump in judgement.jumps
         ]
         print_table("Jumps that the charge does not explain", ["log", "s", "% SoC"], rows)
+    for path in written:
+        note(f"wrote {path}")
