@@ -199,8 +199,6 @@ def load_function(text: str) -> Callable[..., Any]:
     """Return a function named `MODULE:FUNCTION` or `FILE.py:FUNCTION`; may raise InputError."""
     place, _, name = text.rpartition(":")
     cure = "give MODULE:FUNCTION or path/to/file.py:FUNCTION"
-    if not (place and name):
-        raise InputError("not a function", field="--simulator", value=text, cure=cure)
     sys.path.insert(0, "")  # modules of the working directory too
     try:
         is_file = place.endswith(".py")
@@ -210,10 +208,10 @@ def load_function(text: str) -> Callable[..., Any]:
         raise InputError(problem, field="--simulator", value=text, cure=cure) from error
     finally:
         sys.path.remove("")
-    if not callable(function := names.get(name)):
-        problem = f"{place} has no function {name}"
-        raise InputError(problem, field="--simulator", value=text, cure=cure)
-    return function  # type: ignore[no-any-return]
+    if callable(function := names.get(name)):
+        return function  # type: ignore[no-any-return]
+    problem = f"{place} has no function {name}"
+    raise InputError(problem, field="--simulator", value=text, cure=cure)
 
 
 def _show(

@@ -174,27 +174,24 @@ def assumed_of(logs: Iterable[Log]) -> dict[str, list[str]]:
     return {log.source or log.name: list(log.assumed) for log in logs if log.assumed}
 
 
-def check_outputs(
-    outputs: Iterable[Path | None], inputs: Iterable[Path], made: Path | None = None
-) -> None:
+def check_outputs(outputs: Iterable[Path | None], inputs: Iterable[Path]) -> None:
     """Refuse, before any long work, outputs that cannot be written or would overwrite input.
 
-    None stands for an output that is not wanted; `made` is a folder that the command makes later.
+    None stands for an output that is not wanted.
     """
     read = {path.resolve() for path in inputs}
     written: set[Path] = set()
     for output in filter(None, outputs):
-        place, problem, cure = output.resolve(), "", "name two different files"
+        place = output.resolve()
         if place in read:
             problem, cure = "this output is also an input", "name another file for it"
+            raise InputError(problem, source=output, cure=cure)
         # /dev/null may be named twice.
-        elif place in written and (place.is_file() or not place.exists()):
-            problem = "two outputs have this name"
-        if problem:
+        if place in written and (place.is_file() or not place.exists()):
+            problem, cure = "two outputs have this name", "name two different files"
             raise InputError(problem, source=output, cure=cure)
         written.add(place)
-        if output.parent != made or made.is_dir():
-            check_writable(output)
+        check_writable(output)
 
 
 # --- Options of the commands on a bus, made from the keys of `RunConfig`

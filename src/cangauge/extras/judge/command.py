@@ -84,7 +84,6 @@ def judge_command(
         simulated ones.
     """
     from cangauge.extras.judge.judgement import judge, narrowed
-    from cangauge.logs.read import read_cells
     from cangauge.model.model_file import Model
 
     if suite:
@@ -94,16 +93,15 @@ def judge_command(
         raise InputError("belongs to --suite", field="--data", cure="give the logs themselves")
     paths = [Path(log) for log in logs]
     check_outputs([output, corrected, report], [*paths, *([model] if model else [])])
-    loaded = [reading.load(path) for path in paths]
-    columns = reading.given_columns()
-    beside = [read_cells(log.source, log.time_s, columns) if log.source else None for log in loaded]
+    with progress() as show:
+        loaded = reading.load_all(paths, show)
     judgement = judge(
         loaded,
         None if model is None else Model.load(model),
         chemistry=chemistry,
         cells=cells,
         capacity_ah=capacity_ah,
-        cell_voltages=beside,
+        cell_voltages=[reading.cells_of(log) for log in loaded],
     )
     texts = {}
     if output is not None:
