@@ -339,7 +339,8 @@ def _find(
         return _Found("dbc", {**named}, clear, head, dbc=dbc)
     if presets and (known := _known(paths)) is not None:
         return _Found("preset", vehicle=known)
-    with progress("cangauge.extras.discovery"):
+    with progress("cangauge.extras.discovery") as show:
+        show("reading frames")
         found = search(_joined(paths), nominal_v)
     candidates = {role: getattr(found, role) for role in _ROLES.values()}
     clear = [role for role in _NEEDED if found.is_clear(role)]

@@ -57,8 +57,10 @@ class Cluster:
         """Return what a function of the Dask client returns; show its progress."""
         from cangauge.extras.fleet.run import connected
 
-        with progress("cangauge.extras.fleet"), connected(self.workers) as client:
-            return work(client)
+        with progress("cangauge.extras.fleet") as show:
+            show("starting")
+            with connected(self.workers) as client:
+                return work(client)
 
 
 @fleet_app.callback()

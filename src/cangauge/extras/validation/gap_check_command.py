@@ -63,8 +63,12 @@ def gap_check_command(
         read, pack = [], CheckedPack.simulated()
     left_out = min(at_most or len(pack.logs), len(pack.logs))
     note(f"at most {left_out * PER_LOG} diagnoses, about half a second each")
-    with progress("cangauge.validation"):
-        result = summarize(list(pack.findings(at_most)))
+    findings = []
+    with progress() as tell:
+        for finding in pack.findings(at_most):
+            findings.append(finding)
+            tell(f"{len(findings)} diagnoses")
+    result = summarize(findings)
 
     def show() -> None:
         typer.echo(summary(result))
