@@ -8,9 +8,10 @@ from __future__ import annotations
 import ast
 import os
 import sys
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from importlib.metadata import EntryPoint, entry_points
 from importlib.util import find_spec
+from itertools import takewhile
 from pathlib import Path
 from typing import Any, Final
 
@@ -33,14 +34,14 @@ THREADS: Final = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 """Environment variables of the linear algebra, set to 1 where the user has not set them."""
 
 
-def _entry_points() -> dict[str, EntryPoint]:
-    """Return the installed commands by name: entry points of the group `cangauge.commands`."""
-    found = {each.name: each for each in entry_points(group="cangauge.commands")}
-    order = [name for name in FIRST if name in found]
-    return {name: found[name] for name in [*order, *sorted(found.keys() - set(order))]}
-
-
-COMMANDS: Final = _entry_points()
+COMMANDS: Final = {
+    command.name: command
+    for command in sorted(
+        entry_points(group="cangauge.commands"),
+        key=lambda each: ((*FIRST, each.name).index(each.name), each.name),
+    )
+}
+"""The installed commands by name."""
 
 
 def help_line(command: EntryPoint) -> str:
@@ -76,8 +77,7 @@ class LazyGroup(TyperGroup):
             return args[0], load_command(args[0]), args[1:]
         if args[0].startswith("-"):
             self.parse_args(ctx, args)  # an unknown option
-        near = closest(args[0], COMMANDS)
-        raise UsageError(f"no such command: {args[0]}" + f". Did you mean {near}?" * bool(near))
+        raise UsageError(f"no such command: {args[0]}{_suggestion(args[0], COMMANDS)}")
 
 
 def load_command(name: str) -> Any:
@@ -127,25 +127,18 @@ def main() -> None:
     try:
         code = app(standalone_mode=False, prog_name="cangauge")
     except CangaugeError as error:
-        if not error.logged:
-            note(f"error: {error}")
-        _emit_failure(error.to_dict(), error.exit_code)
-        sys.exit(error.exit_code)
+        sys.exit(_failed("" if error.logged else str(error), error.to_dict(), error.exit_code))
     except UsageError as error:
         line, field = _usage(error)
-        if line:
-            note(f"error: {line}")
-        _emit_failure({**CangaugeError(line).to_dict(), "field": field}, 2)
-        sys.exit(2)
+        sys.exit(_failed(line, {**CangaugeError(line).to_dict(), "field": field}, 2))
     except OSError as error:
         if error.errno not in FULL:
             raise
         # Files are written elsewhere: this is stdout, into a file on a full disk.
-        note(f"error: stdout: {error.strerror}")
         _discard_stdout()
-        sys.exit(1)
+        sys.exit(_failed(f"stdout: {error.strerror}", {}, 1))
     except Exception as error:  # a bug: Python prints the traceback and exits with 1
-        _emit_failure(CangaugeError(f"{type(error).__name__}: {error}").to_dict(), 1)
+        _failed("", CangaugeError(f"{type(error).__name__}: {error}").to_dict(), 1)
         raise
     if code == 130:  # typer's code for Ctrl-C
         note("stopped")
@@ -156,18 +149,18 @@ def main() -> None:
 UsageError: Final[type[Any]] = typer.BadParameter.__mro__[1]
 
 
-def _emit_failure(error: Mapping[str, Any], exit_code: int) -> None:
-    """Print `{"error": …, "exit_code": …}` on stdout if the command line asks for `--json`."""
-    arguments = sys.argv[1:]
-    options = arguments[: arguments.index("--")] if "--" in arguments else arguments
+def _failed(line: str, error: Mapping[str, Any], exit_code: int) -> int:
+    """Print an error on stderr; and as JSON on stdout if `--json` is given; return the code."""
+    if line:
+        note(f"error: {line}")
     # Not from the parser: the error may be one of parsing.
-    if sys.stdout is None or not any(word.partition("=")[0] == "--json" for word in options):
-        return
-    try:
-        emit_json({"error": error, "exit_code": exit_code})
-    except OSError:
-        # A closed pipe or a full disk. The exit code stays that of the failure.
-        _discard_stdout()
+    words = [word.partition("=")[0] for word in takewhile("--".__ne__, sys.argv[1:])]
+    if sys.stdout is not None and "--json" in words:
+        try:
+            emit_json({"error": error, "exit_code": exit_code})
+        except OSError:  # a closed pipe or a full disk: the exit code stays that of the failure
+            _discard_stdout()
+    return exit_code
 
 
 def _discard_stdout() -> None:
@@ -182,13 +175,17 @@ def _usage(error: Any) -> tuple[str, str | None]:
         # The help page shows an argument by its metavar.
         is_option = parameter.param_type_name == "option"
         field = "/".join(parameter.opts) if is_option else parameter.metavar or parameter.name
-    text = " ".join(error.format_message().split()).replace("Input should be", "must be")
+    text = " ".join(error.format_message().split())
     if options := getattr(error, "possibilities", None):
-        near = closest(error.option_name, options)
-        text = f"no such option: {error.option_name}" + f". Did you mean {near}?" * bool(near)
+        text = f"no such option: {field}" + _suggestion(str(field), options)
     if not text or type(error).__name__ == "NoArgsIsHelpError":
         return "", field
     if not text[1:2].isupper():
         text = text[0].lower() + text[1:]
     command = "cangauge" if error.ctx is None else error.ctx.command_path
     return f"{text.rstrip('.')}; see `{command} --help`", field
+
+
+def _suggestion(word: str, names: Iterable[str]) -> str:
+    near = closest(word, names)
+    return f". Did you mean {near}?" if near else ""

@@ -89,6 +89,10 @@ def _entries(section: str) -> dict[str, tuple[str, str]]:
 SHARED: Final = _entries("""
 model : -m, --model MODEL
     Model file of `cangauge fit`.
+chemistry : oxide|lfp
+    Chemistry of the cells.
+cells : N (1 … 2000)
+    Cells in series.
 capacity_ah : A (0.001 … 1e5 Ah)
     Charge from 100 to 0 %. Default: the model's.
 report : FILE.html|.htm
@@ -139,6 +143,7 @@ def _annotated(name: str, kind: Any, specification: str, text: str, *, is_option
 def _checked(spec: re.Match[str], suffixes: list[str]) -> Any:
     """Return the callback that checks suffix or bounds, and makes numbers of text."""
     words = [word for word in spec["metavar"].split("|") if word.islower()]
+    unit = spec["unit"] or ""
 
     def check(param: typer.CallbackParam, value: Any) -> Any:
         if isinstance(value, list):
@@ -149,32 +154,19 @@ def _checked(spec: re.Match[str], suffixes: list[str]) -> Any:
         if suffixes:
             require_suffix(value, *suffixes, field=option)
             return value
-        low, high, unit = float(spec["low"]), float(spec["high"]), spec["unit"] or ""
-        return within(_number(value, words, option, unit), low, high, option=option, unit=unit)
+        try:
+            number = float(value) if isinstance(value, str) else value
+        except ValueError as error:
+            word, of = " or ".join(words), f" of {unit}" if unit else ""
+            problem, cure = f"neither a number nor {word}", f"give a number{of}, or {word}"
+            raise InputError(problem, field=option, value=value, cure=cure) from error
+        low, high = float(spec["low"]), float(spec["high"])
+        if not low <= number <= high:  # NaN too
+            problem = f"must lie within {low:g} … {high:g} {unit}".rstrip()
+            raise InputError(problem, field=option, value=number)
+        return number
 
     return check
-
-
-def _number(value: Any, words: list[str], option: str, unit: str) -> Any:
-    if not isinstance(value, str):
-        return value
-    try:
-        return float(value)
-    except ValueError as error:
-        word = " or ".join(words)
-        cure = f"give a number{f' of {unit}' if unit else ''}, or {word}"
-        raise InputError(
-            f"neither a number nor {word}", field=option, value=value, cure=cure
-        ) from error
-
-
-def within(value: Any, low: float, high: float, *, option: str, unit: str = "") -> Any:
-    """Return a number within low … high; else (NaN too) raise InputError."""
-    if not low <= value <= high:
-        raise InputError(
-            f"must lie within {low:g} … {high:g} {unit}".rstrip(), field=option, value=value
-        )
-    return value
 
 
 def _plain(kind: Any) -> Any:

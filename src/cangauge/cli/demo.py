@@ -7,6 +7,7 @@ import socket
 import subprocess
 import sys
 import time
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +16,7 @@ from cangauge._files import write_text_atomic
 from cangauge._resources import shared_file
 from cangauge._text import number, significant
 from cangauge.cli.declare import command
-from cangauge.cli.output import emit_json, note, print_table
+from cangauge.cli.output import finish, note, print_table
 from cangauge.errors import CangaugeError, InputError
 
 TRAINED_ON = "leaf2012_reconstruction_white.parquet"
@@ -109,7 +110,7 @@ def demo_command(*, folder: Path = Path("out/demo"), json_output: bool = False) 
         "seconds": time.monotonic() - began,
         **{name: str(path) for name, path in paths.items()},
     }
-    (emit_json if json_output else _show)(result)
+    finish(result, partial(_show, result), as_json=json_output)
 
 
 def _play(folder: Path, log: Path) -> float:

@@ -2,25 +2,29 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from contextlib import ExitStack
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from cangauge._extras import extra
 from cangauge._files import atomic_path
 from cangauge._text import NONE_KNOWN, number, rounded, uncertain
 from cangauge.cli.declare import command
 from cangauge.cli.options import ReadingOptions, assumed_of, check_outputs, note_starts
-from cangauge.cli.output import emit_json, live_line, note, print_values
+from cangauge.cli.output import finish, note, print_values, progress
 from cangauge.cli.status import pack_values
 from cangauge.types import REASON_WORDS, Reason
 
 if TYPE_CHECKING:
-    from cangauge.bus.captures import Capture
+    from cangauge.estimation.offline import EstimateTable
     from cangauge.estimation.settings import EstimatorSettings
-    from cangauge.logs.log import Log
     from cangauge.model.model_file import Model
     from cangauge.service.offline import RecordedEstimate
+
+_ORIGINS = {"given": "given", "log": "from the log's soc_pct", "voltage": "found by the voltage"}
+"""How the initial SoC is known."""
 
 
 @command()
@@ -77,8 +81,11 @@ def estimate_command(
         Table of health, power and cells, once a second.
     """
     from cangauge.estimation.settings import EstimatorSettings
+    from cangauge.logs.canonical import write_table
+    from cangauge.logs.log import Log
     from cangauge.logs.read import LogFile
     from cangauge.model.model_file import Model
+    from cangauge.service.estimate_table import write_estimates
 
     settings = EstimatorSettings(
         method=method,
@@ -86,51 +93,55 @@ def estimate_command(
         initial_soc_std_pct=initial_soc_std,
         capacity_ah=capacity_ah,
     )
-    check_outputs([output, pack, report], [log_path, model])
-    pack_model, logs, recording = Model.load(model), [], reading.open(log_path)
-    if isinstance(recording, LogFile):
-        logs = [reading.load(log_path)]
-        done = _of_log(logs[0], pack_model, settings, reading, pack=pack, initial_soc=initial_soc)
-    else:
-        done = _of_capture(recording, pack_model, settings, reading, pack)
-    _write(done, output, pack, report, model)
+    files = {"output": output, "pack": pack, "report": report}
+    check_outputs(files.values(), [log_path, model])
+    pack_model = Model.load(model)
+    is_log = isinstance(reading.open(log_path), LogFile)
+    estimate = partial(_of_log, soc_from_log=initial_soc is None) if is_log else _of_capture
+    done = estimate(log_path, pack_model, settings, reading, keeps_pack=pack is not None)
+    page = extra("report.estimate:estimate_page")(done, model).html() if report else ""
+    with ExitStack() as all_of_them:
+        parts = {what: all_of_them.enter_context(atomic_path(p)) for what, p in files.items() if p}
+        if output.suffix.lower() == ".mcap":
+            write = extra("formats.estimate_mcap:write_estimates_mcap")
+            write(parts["output"], done.recorded, done.table)
+        else:
+            write_estimates(parts["output"], done.recorded.time_s, done.table)
+        if pack is not None:
+            write_table(done.pack.columns, parts["pack"])
+        if report is not None:
+            parts["report"].write_text(page, encoding="utf-8")
     for warning in done.warnings:
         note(f"warning: {done.recorded.source}: {warning}")
-    if json_output:
-        files = {"output": output, "pack": pack, "report": report}
-        named = {name: path and str(path) for name, path in files.items()}
-        emit_json(done.to_dict() | named | {"assumed": assumed_of(logs)})
-        return
-    _show(done)
-    written = {"estimates": output, "health, power and cells": pack, "report": report}
-    for what, path in written.items():
-        if path is not None:
-            note(f"{what}: {path}")
+    logs = [done.recorded] if isinstance(done.recorded, Log) else []
+    found = done.to_dict() | {"assumed": assumed_of(logs)}
+    show = partial(_show, done.recorded.name, found, done.table)
+    finish(found, show, files, as_json=json_output)
 
 
 def _of_log(
-    log: Log,
+    path: Path,
     model: Model,
     settings: EstimatorSettings,
     reading: ReadingOptions,
     *,
-    pack: Path | None,
-    initial_soc: float | str | None,
+    soc_from_log: bool,
+    keeps_pack: bool,
 ) -> RecordedEstimate:
-    from cangauge.logs.read import read_cells
     from cangauge.model.delay_line import GAP_S
     from cangauge.service.offline import PackHistory, estimate_recorded_log
 
+    log = reading.load(path)
     if settings.initial_soc_pct is not None:
         note_starts([log], settings.initial_soc_pct, settings.capacity_ah or model.capacity_ah)
-    cells = read_cells(Path(log.source), log.time_s, reading.given_columns())
-    history = PackHistory(keeps_rows=pack is not None, cells=cells, duration_s=log.duration_s)
-    with live_line() as show:
+    cells = reading.cells_of(log)
+    history = PackHistory(keeps_rows=keeps_pack, cells=cells, duration_s=log.duration_s)
+    with progress() as show:
         done = estimate_recorded_log(
             log,
             model,
             settings,
-            soc_from_log=initial_soc is None,
+            soc_from_log=soc_from_log,
             pack=history,
             progress=lambda count: show(f"{log.name}: {count} of {len(log)} samples"),
         )
@@ -143,26 +154,27 @@ def _of_log(
 
 
 def _of_capture(
-    capture: Capture,
+    path: Path,
     model: Model,
     settings: EstimatorSettings,
     reading: ReadingOptions,
-    pack: Path | None,
+    *,
+    keeps_pack: bool,
 ) -> RecordedEstimate:
     """Estimate a capture; InputError if it has one sample, or inverted current."""
     from cangauge.bus.recording import refuse_single_row
     from cangauge.logs.sign import require_discharge_positive
     from cangauge.service.offline import RecordedCapture, estimate_capture
 
-    car = reading.car_of(capture.path)
-    with live_line() as show:
+    car = reading.car_of(path)
+    with progress() as show:
         done = estimate_capture(
-            capture.path,
+            path,
             car,
             model,
             settings,
-            keeps_pack=pack is not None,
-            progress=lambda count: show(f"{capture.path.name}: {count} frames"),
+            keeps_pack=keeps_pack,
+            progress=lambda count: show(f"{path.name}: {count} frames"),
         )
     recorded = done.recorded
     refuse_single_row(recorded)
@@ -173,49 +185,32 @@ def _of_capture(
     return done
 
 
-def _write(
-    done: RecordedEstimate, output: Path, pack: Path | None, report: Path | None, model_path: Path
-) -> None:
-    """Write the tables and the report, or none of them."""
-    from cangauge.logs.canonical import write_table
-    from cangauge.service.estimate_table import write_estimates
-
-    page = extra("report.estimate:estimate_page")(done, model_path).html() if report else ""
-    with ExitStack() as all_of_them:
-        part = all_of_them.enter_context(atomic_path(output))
-        if output.suffix.lower() == ".mcap":
-            extra("formats.estimate_mcap:write_estimates_mcap")(part, done.recorded, done.table)
-        else:
-            write_estimates(part, done.recorded.time_s, done.table)
-        if pack is not None:
-            write_table(done.pack.columns, all_of_them.enter_context(atomic_path(pack)))
-        if report is not None:
-            all_of_them.enter_context(atomic_path(report)).write_text(page, encoding="utf-8")
-
-
-def _show(done: RecordedEstimate) -> None:
+def _show(name: str, found: Mapping[str, Any], table: EstimateTable) -> None:
     """Print the SoC at both ends, its error where the log has a reference, and the pack."""
-    scores, table = done.scores, done.table
-    origin = {"given": "given", "log": "from the log's soc_pct", "voltage": "found by the voltage"}
-    known = [row for row in range(len(table.soc_pct)) if table.soc_pct[row] == table.soc_pct[row]]
-    start = number(done.settings.initial_soc_pct, 1, "%")
-    if done.origin == "voltage" and known:
-        start = uncertain(float(table.soc_pct[known[0]]), float(table.soc_std_pct[known[0]]), "%")
-    cover = None if scores.cover_2sigma is None else 100.0 * scores.cover_2sigma
+    import numpy as np
+
+    def percent(share: float | None, of: str = "") -> str:
+        return number(None if share is None else 100.0 * share, 1, f"%{of}")
+
+    def soc_at(row: int) -> str:
+        return uncertain(float(table.soc_pct[row]), float(table.soc_std_pct[row]), "%")
+
+    known = np.isfinite(table.soc_pct)
+    start, origin = number(found["initial_soc_pct"], 1, "%"), found["initial_soc_from"]
+    if origin == "voltage" and known.any():
+        start = soc_at(int(known.argmax()))
     shares = [
-        f"{REASON_WORDS[Reason[name.upper().replace(' ', '_')]]} {number(100.0 * share, 1, '%')}"
-        for name, share in done.reason_shares.items()
+        f"{REASON_WORDS[Reason[name.upper().replace(' ', '_')]]} {percent(share)}"
+        for name, share in found["reasons"].items()
     ]
     values = {
-        "initial SoC": f"{start} ({origin[done.origin]})",
-        "SoC at the end": uncertain(float(table.soc_pct[-1]), float(table.soc_std_pct[-1]), "%"),
-        "SoC error, MAE": number(scores.soc_mae_pct, 2, "%"),
-        "SoC error, largest": number(scores.soc_max_pct, 2, "%"),
-        "reference within ±2σ": number(cover, 1, "% of samples"),
-        "voltage error, MAE": number(scores.voltage_mae_pct, 2, "%"),
-        "valid": number(100.0 * scores.valid_fraction, 1, "% of samples"),
+        "initial SoC": f"{start} ({_ORIGINS[origin]})",
+        "SoC at the end": soc_at(-1),
+        "SoC error, MAE": number(found["soc_mae_pct"], 2, "%"),
+        "SoC error, largest": number(found["soc_max_pct"], 2, "%"),
+        "reference within ±2σ": percent(found["cover_2sigma"], " of samples"),
+        "voltage error, MAE": number(found["voltage_mae_pct"], 2, "%"),
+        "valid": percent(found["valid_fraction"], " of samples"),
         "less than valid": "; ".join(shares) or NONE_KNOWN,
     }
-    if done.pack.report is not None:
-        values |= pack_values(done.pack.report.to_dict())
-    print_values(f"State of charge of {done.recorded.name}", values)
+    print_values(f"State of charge of {name}", values | pack_values(found))

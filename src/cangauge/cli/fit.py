@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Literal
 
 from cangauge._extras import extra
 from cangauge._files import write_texts_atomic
 from cangauge._text import NONE_KNOWN, number, significant, span
 from cangauge.cli.declare import command
 from cangauge.cli.options import ReadingOptions, assumed_of, check_outputs
-from cangauge.cli.output import console, emit_json, note, print_values, progress_shown
+from cangauge.cli.output import finish, note, print_values, progress
 from cangauge.errors import InputError
 
 if TYPE_CHECKING:
@@ -106,59 +107,44 @@ def fit_command(
             cure="give one for all, or one for each log in order (auto where it is unknown)",
         )
     starts = [None if each == "auto" else each for each in initial_soc or ["auto"]]
-    published: dict[str, Any] = {
-        "delay_s": None if delays is None else _delays_s(delays),
-        "epsilon": epsilon,
-        "t_ref_c": t_ref,
+    published = {
+        "--delays": ("delay_s", None if delays is None else _delays_s(delays)),
+        "--epsilon": ("epsilon", epsilon),
+        "--t-ref": ("t_ref_c", t_ref),
     }
-    published = {name: value for name, value in published.items() if value is not None}
-    if equation == "knots" and published:
-        option = {"delay_s": "--delays", "epsilon": "--epsilon", "t_ref_c": "--t-ref"}
-        cure = "add --equation published, or leave it out"
-        raise InputError(
-            "belongs to the published equation", field=option[next(iter(published))], cure=cure
-        )
+    given = {option: item for option, item in published.items() if item[1] is not None}
+    if equation == "knots" and given:
+        problem, cure = "belongs to the published equation", "add --equation published, or omit it"
+        raise InputError(problem, field=next(iter(given)), cure=cure)
     check_outputs([output, report], logs)
-    with console.status("reading") as status:
-        recorded = []
-        for path in logs:
-            status.update(f"reading {path}")
-            recorded.append(reading.load(path))
-        with progress_shown("cangauge.identify", status.update):
-            result = fit(
-                recorded,
-                capacity_ah=capacity_ah,
-                initial_soc_pct=starts if len(starts) > 1 else starts[0],
-                equation=equation,
-                chemistry=chemistry,
-                cells=cells or _cells_of(logs[0], recorded[0], reading),
-                rate_hz=rate_hz,
-                effects=parse_effect_ids(effects) if effects else None,
-                **published,
-            )
-        status.update("writing")
+    with progress("cangauge.identify") as show:
+        recorded = reading.load_all(logs, show)
+        result = fit(
+            recorded,
+            capacity_ah=capacity_ah,
+            initial_soc_pct=starts if len(starts) > 1 else starts[0],
+            equation=equation,
+            chemistry=chemistry,
+            cells=cells or _cells_of(recorded[0], reading),
+            rate_hz=rate_hz,
+            effects=parse_effect_ids(effects) if effects else None,
+            **dict(given.values()),  # type: ignore[arg-type] # names and values belong together
+        )
+        show("writing")
         texts = {output: result.model.to_json()}
         if report is not None:
             texts[report] = extra("report.fit:fit_page")(result).html()
         write_texts_atomic(texts)
-    if json_output:
-        written = {"model": str(output), "report": report and str(report)}
-        emit_json(result.to_dict() | written | {"assumed": assumed_of(recorded)})
-        return
-    _show(result)
-    note(f"model: {output}" + (f"\nreport: {report}" if report else ""))
+    found = result.to_dict() | {"assumed": assumed_of(recorded)}
+    files = {"model": output, "report": report}
+    finish(found, partial(_show, result), files, as_json=json_output)
 
 
-def _cells_of(path: Path, log: Log, reading: ReadingOptions) -> int | None:
+def _cells_of(log: Log, reading: ReadingOptions) -> int | None:
     """Return the number of cells in series that a log's columns of cells prove, or None."""
     import numpy as np
 
-    from cangauge.logs.read import LogFile, read_cells
-
-    if not isinstance(reading.open(path), LogFile):
-        return None
-    cells = read_cells(path, log.time_s, reading.given_columns())
-    if cells is None:
+    if (cells := reading.cells_of(log)) is None:
         return None
     ratio = float(np.nanmedian(cells.voltage_v.sum(axis=1) / log.voltage_v))
     return cells.count if abs(ratio - 1.0) <= SAME_SUM else None

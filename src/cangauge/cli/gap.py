@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import importlib
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Mapping
+from functools import partial
 from pathlib import Path
 from runpy import run_path
 from typing import TYPE_CHECKING, Any
@@ -13,7 +14,7 @@ from cangauge._extras import extra
 from cangauge._files import write_texts_atomic
 from cangauge.cli.declare import command
 from cangauge.cli.options import ALARM, ReadingOptions, assumed_of, check_outputs, note_starts
-from cangauge.cli.output import emit_json, note, print_table, progress_shown, say
+from cangauge.cli.output import finish, note, print_table, progress, say
 from cangauge.errors import InputError
 
 if TYPE_CHECKING:
@@ -64,15 +65,11 @@ def gap_command(
     ----------
     logs : LOG
         Logs to diagnose; one cause is sought for all.
-    model : -m, --model MODEL
-        Model file; not needed for a simulator.
     reference : LOG
         Log without a fault; repeat the option. Without soc_pct its start is found from the voltage.
     initial_soc : P (0 … 100 %)
         SoC at the first row of each diagnosed log, e.g. 80. Default: its soc_pct, else found from
         the voltage.
-    capacity_ah : A (0.001 … 1e5 Ah)
-        Charge from 100 to 0 %, in place of the model's, for all logs.
     alarm : P (0 … 1)
         Report a fault where the probability of none is at most this.
     extended : MODEL.json
@@ -95,34 +92,33 @@ def gap_command(
     from cangauge.identify.starts import with_start
     from cangauge.model.model_file import Model
 
-    added, given = list(add_test or []), list(reference or [])
+    added, healthy = list(add_test or []), list(reference or [])
     paths = [*logs, *added]
-    _refuse(paths, given, (model, simulated, simulator))
+    _refuse(paths, healthy, (model, simulated, simulator))
     model_file = None if model is None else Model.load(model)
     if model_file is not None and capacity_ah is not None:
         model_file = model_file.model_copy(update={"capacity_ah": capacity_ah})
-    check_outputs([report, extended], [*paths, *given, *([model] if model else [])])
-    used = [] if simulated is None else [simulated]
-    read = [reading.load(path, used) for path in [*paths, *given]]
-    if model_file is not None:
-        capacity_ah = model_file.capacity_ah
-        _note_differences(read, capacity_ah)
-    diagnosed, references = read[: len(paths)], read[len(paths) :]
-    if initial_soc is not None:  # an added test has its own start
-        note_starts(diagnosed[: len(logs)], initial_soc, capacity_ah)
-        diagnosed[: len(logs)] = [with_start(log, initial_soc) for log in diagnosed[: len(logs)]]
-    with progress_shown("cangauge.diagnosis"):
+    check_outputs([report, extended], [*paths, *healthy, *([model] if model else [])])
+    with progress("cangauge.diagnosis") as show:
+        read = reading.load_all([*paths, *healthy], show, [simulated] if simulated else [])
+        if model_file is not None:
+            capacity_ah = model_file.capacity_ah
+            _note_differences(read, capacity_ah)
+        own, references = read[: len(logs)], read[len(paths) :]
+        if initial_soc is not None:  # an added test has its own start
+            note_starts(own, initial_soc, capacity_ah)
+            own = [with_start(log, initial_soc) for log in own]
         found = diagnose(
-            diagnosed,
+            [*own, *read[len(logs) : len(paths)]],
             model_file,
             references,
             simulation=_simulation(simulated, simulator, read, reading),
             capacity_ah=capacity_ah,
             alarm=alarm,
         )
-        own = found.logs[: len(logs)]
-        before = diagnose(own, found.model, found.known, alarm=alarm) if added else None
-        steps = None
+        before = steps = None
+        if added:
+            before = diagnose(found.logs[: len(logs)], found.model, found.known, alarm=alarm)
         if plan:
             steps = plan_next(found.known, found.columns, found.evidence, found.posterior)
     texts = {}
@@ -131,19 +127,29 @@ def gap_command(
     if report is not None:
         texts[report] = extra("report.diagnosis:gap_page")(found, model, steps).html()
     write_texts_atomic(texts)
-    if json_output:
-        result = found.to_json(None if extended is None else str(extended))
-        if before is not None:
-            result["added_test"] = {
-                "logs": [log.name for log in diagnosed[len(logs) :]],
-                "before": dict(before.posterior.probabilities),
-            }
-        result |= {} if steps is None else {"plan": steps.to_dict()}
-        emit_json(result | {"assumed": assumed_of(read)})
-        return
-    _show(found, before, steps)
-    for written in texts:
-        note(f"wrote {written}{_held(found) if written == extended else ''}")
+    result = found.to_json(None if extended is None else str(extended))
+    result["assumed"] = assumed_of(read)
+    if before is not None:
+        names = [log.name for log in read[len(logs) : len(paths)]]
+        result["added_test"] = {"logs": names, "before": dict(before.posterior.probabilities)}
+    if steps is not None:
+        result["plan"] = steps.to_dict()
+    finish(result, partial(_show, found, result, before, steps, texts), as_json=json_output)
+
+
+def _refuse(
+    logs: list[Path], references: list[Path], models: tuple[Path | None, str | None, str | None]
+) -> None:
+    """Refuse a log that is its own reference, and two simulators or no model."""
+    if models == (None, None, None):
+        cure = "give the model file, or --simulated or --simulator"
+        raise InputError("no model", field="--model", cure=cure)
+    if None not in models[1:]:
+        raise InputError("two simulators", field="--simulator", value=models[2], cure="give one")
+    known = {path.resolve() for path in references}
+    for path in (path for path in logs if path.resolve() in known):
+        problem = "is both a LOG and a reference, which must be without the fault"
+        raise InputError(problem, source=path, field="--reference", cure="give it as one of them")
 
 
 def _note_differences(logs: list[Log], capacity_ah: float) -> None:
@@ -193,8 +199,6 @@ def load_function(text: str) -> Callable[..., Any]:
     """Return a function named `MODULE:FUNCTION` or `FILE.py:FUNCTION`; may raise InputError."""
     place, _, name = text.rpartition(":")
     cure = "give MODULE:FUNCTION or path/to/file.py:FUNCTION"
-    if not (place and name):
-        raise InputError("not a function", field="--simulator", value=text, cure=cure)
     sys.path.insert(0, "")  # modules of the working directory too
     try:
         is_file = place.endswith(".py")
@@ -204,49 +208,34 @@ def load_function(text: str) -> Callable[..., Any]:
         raise InputError(problem, field="--simulator", value=text, cure=cure) from error
     finally:
         sys.path.remove("")
-    if not callable(function := names.get(name)):
-        problem = f"{place} has no function {name}"
-        raise InputError(problem, field="--simulator", value=text, cure=cure)
-    return function  # type: ignore[no-any-return]
+    if callable(function := names.get(name)):
+        return function  # type: ignore[no-any-return]
+    problem = f"{place} has no function {name}"
+    raise InputError(problem, field="--simulator", value=text, cure=cure)
 
 
-def _refuse(
-    logs: list[Path], references: list[Path], models: tuple[Path | None, str | None, str | None]
+def _show(
+    found: Diagnosis,
+    result: Mapping[str, Any],
+    before: Diagnosis | None,
+    steps: Plan | None,
+    written: Iterable[Path],
 ) -> None:
-    """Refuse a log that is its own reference, and two simulators or no model."""
-    if models == (None, None, None):
-        cure = "give the model file, or --simulated or --simulator"
-        raise InputError("no model", field="--model", cure=cure)
-    if None not in models[1:]:
-        raise InputError("two simulators", field="--simulator", value=models[2], cure="give one")
-    known = {path.resolve() for path in references}
-    for path in logs:
-        if path.resolve() in known:
-            problem = "is both a LOG and a reference, which must be without the fault"
-            cure = "give it as one of them"
-            raise InputError(problem, source=path, field="--reference", cure=cure)
-
-
-def _held(found: Diagnosis) -> str:
-    """Return which model `--extended` holds, in words."""
-    from cangauge.diagnosis.sentences import percent
-
-    if (cause := found.accepted) is None:
-        return ": the model as given, since no cause is accepted"
-    return f": the model with {cause} (probability {percent(found.posterior.effects[cause])})"
-
-
-def _show(found: Diagnosis, before: Diagnosis | None, steps: Plan | None) -> None:
     """Print the answer, the candidates, what the logs cannot show, and the next steps."""
-    from cangauge.diagnosis.sentences import SHOWN, candidate_rows, plan_rows
+    from cangauge.diagnosis.sentences import SHOWN, candidate_rows, percent, plan_rows
 
     say(found.summary)
     if before is not None:
         say(f"Without the added test: {before.headline}")
-    print_table("Causes", *candidate_rows(found.to_json(), SHOWN))
+    print_table("Causes", *candidate_rows(result, SHOWN))
     if found.caveats:
         say("\n- ".join(["What these logs cannot show:", *found.caveats]))
     if steps is not None:
         say(steps.sentence)
         if steps.steps:
             print_table("Possible next steps, best first", *plan_rows(steps))
+    held = ": the model as given, since no cause is accepted"
+    if (cause := found.accepted) is not None:
+        held = f": the model with {cause} (probability {percent(found.posterior.effects[cause])})"
+    for path in written:
+        note(f"wrote {path}{held if str(path) == result['extended_model'] else ''}")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shlex
 from datetime import UTC, datetime
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -12,7 +13,7 @@ from cangauge._files import write_texts_atomic
 from cangauge._text import rounded
 from cangauge.cli.declare import command
 from cangauge.cli.options import ReadingOptions, assumed_of, check_outputs
-from cangauge.cli.output import emit_json, note, print_table, say
+from cangauge.cli.output import finish, note, print_table, say
 from cangauge.errors import InputError
 
 if TYPE_CHECKING:
@@ -67,18 +68,18 @@ def inspect_command(
     """
     # Deferred: the readers and the decoder take half a second to import.
     from cangauge.inspect.capture import inspect_capture
-    from cangauge.inspect.log import LogInspection, inspect_log
+    from cangauge.inspect.log import inspect_log
     from cangauge.logs.read import LogFile
 
     check_outputs([report], [path])
     recording, logs = reading.open(path), []
-    found: LogInspection | CaptureInspection
     if isinstance(recording, LogFile):
         reading.note_log(path)
         logs = [log := recording.read(temperature_c=reading.temperature)]
         if log.assumed:
             note(f"{path}: read as {', '.join(log.assumed)}")
-        found = of_log = inspect_log(log)
+        of_log = inspect_log(log)
+        found, show = of_log.to_dict(), partial(_show_log, of_log)
         if report is not None:
             page = extra("report.inspection:inspect_page")(of_log, log)
             write_texts_atomic({report: page.html()})
@@ -88,15 +89,9 @@ def inspect_command(
         problem = "shows a log, and this is a capture"
         raise InputError(problem, source=path, field="--report", value=str(report), cure=cure)
     else:
-        found = inspect_capture(path, reading.car() if reading.names_vehicle else None)
-    if json_output:
-        emit_json(found.to_dict() | {"assumed": assumed_of(logs)})
-    elif isinstance(found, LogInspection):
-        _show_log(found)
-    else:
-        _show_capture(found)
-        if found.log is not None:
-            _show_log(found.log)
+        of_capture = inspect_capture(path, reading.car() if reading.names_vehicle else None)
+        found, show = of_capture.to_dict(), partial(_show_capture, of_capture)
+    finish(found | {"assumed": assumed_of(logs)}, show, as_json=json_output)
 
 
 def _show_log(found: LogInspection) -> None:
@@ -117,10 +112,8 @@ def _show_log(found: LogInspection) -> None:
         f" net {charge.net_ah:+.4g} Ah."
     )
     if soc is not None:
-        say(
-            f"Reference SoC: {soc.first_pct:.1f} → {soc.last_pct:.1f} %,"
-            f" in {100.0 * soc.coverage:.1f} % of the rows."
-        )
+        share = f"in {100.0 * soc.coverage:.1f} % of the rows"
+        say(f"Reference SoC: {soc.first_pct:.1f} → {soc.last_pct:.1f} %, {share}.")
     say(f"Sign: {found.sign.sentence}.")
     head, rows = ability_rows(found)
     print_table("What this log can identify", head, rows[1:])  # the first is the sign
@@ -138,24 +131,18 @@ def _show_capture(found: CaptureInspection) -> None:
         f"{found.name}: {info.format}, {info.frames:,} frames of {len(found.ids)} ids,"
         f" {found.duration_s:.1f} s{begins}."
     )
-    matching = [preset for preset in found.presets if preset.matches]
-    for preset in matching:
-        spans = [
-            f"{span[0]:.5g} … {span[1]:.5g} {unit}"
-            for name, unit in _RANGES.items()
-            if (span := getattr(preset, name)) is not None
-        ]
-        say(
-            f"Vehicle: {preset.about} (--vehicle {preset.preset}), {preset.samples:,} samples:"
-            f" {', '.join(spans)}."
-        )
-    if not matching and found.log is None:
+    for preset in found.presets:
+        if preset.matches:
+            spans = ((getattr(preset, name), unit) for name, unit in _RANGES.items())
+            shown = ", ".join(f"{s[0]:.5g} … {s[1]:.5g} {unit}" for s, unit in spans if s)
+            about = f"{preset.about} (--vehicle {preset.preset})"
+            say(f"Vehicle: {about}, {preset.samples:,} samples: {shown}.")
+    if not found.matching and found.log is None:
         command = f"cangauge init {shlex.quote(found.source)} -o mycar"
         say(f"No known vehicle. Find its signals: {command}")
     print_table("Frames", *_rows_of_ids(found))
     counts = {words: getattr(found, name) for name, words in _COUNTS.items()}
-    if any(counts.values()):
-        shown = ", ".join(f"{count:,} {words}" for words, count in counts.items() if count)
+    if shown := ", ".join(f"{count:,} {words}" for words, count in counts.items() if count):
         say(f"{shown[0].upper()}{shown[1:]}.")
     if found.gaps:
         gap = max(found.gaps, key=lambda gap: gap.length_s)
@@ -163,6 +150,8 @@ def _show_capture(found: CaptureInspection) -> None:
         say(f"Silence of {gap.length_s:.3g} s after {gap.start_s - found.start_s:.1f} s{others}.")
     for line in info.remarks:
         say(f"Remarks: {line}")
+    if found.log is not None:
+        _show_log(found.log)
 
 
 def _rows_of_ids(found: CaptureInspection) -> tuple[list[str], list[list[str]]]:

@@ -1,11 +1,14 @@
-"""Options, reading and input checks shared by the commands that take a log or a capture."""
+"""What several commands share: options of recordings and of the bus, reading, checks of files."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+import inspect
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, cast
+from typing import TYPE_CHECKING, Annotated, Any, cast
+
+import typer
 
 from cangauge._files import check_writable
 from cangauge.cli.output import note
@@ -17,7 +20,8 @@ if TYPE_CHECKING:
     from cangauge.logs.column_map import ColumnMap
     from cangauge.logs.draft import Sign
     from cangauge.logs.log import Log
-    from cangauge.logs.read import LogFile
+    from cangauge.logs.read import CellColumns, LogFile
+    from cangauge.service.config import ConfigKey
 
 # The service shares these options, but needs neither pyarrow nor the readers: imports are deferred.
 
@@ -118,6 +122,24 @@ class ReadingOptions:
         note_reading(log)
         return log
 
+    def load_all(
+        self, paths: Iterable[Path], show: Callable[[str], None], used: Sequence[str] = ()
+    ) -> list[Log]:
+        """Read logs as `load` does; `show` is called with a line of progress for each."""
+        logs = []
+        for path in paths:
+            show(f"reading {path}")
+            logs.append(self.load(path, used))
+        return logs
+
+    def cells_of(self, log: Log) -> CellColumns | None:
+        """Return the cell voltages beside a log in its file; None for a capture or without any."""
+        from cangauge.logs.read import LogFile, read_cells
+
+        if not isinstance(self.open(Path(log.source)), LogFile):
+            return None
+        return read_cells(log.source, log.time_s, self.given_columns())
+
     def car_of(self, capture: Path) -> Vehicle:
         """Return the vehicle; without one, raise an InputError that names the preset to give."""
         from cangauge.bus.recording import capture_without_vehicle
@@ -152,24 +174,52 @@ def assumed_of(logs: Iterable[Log]) -> dict[str, list[str]]:
     return {log.source or log.name: list(log.assumed) for log in logs if log.assumed}
 
 
-def check_outputs(
-    outputs: Iterable[Path | None], inputs: Iterable[Path], made: Path | None = None
-) -> None:
+def check_outputs(outputs: Iterable[Path | None], inputs: Iterable[Path]) -> None:
     """Refuse, before any long work, outputs that cannot be written or would overwrite input.
 
-    None stands for an output that is not wanted; `made` is a folder that the command makes later.
+    None stands for an output that is not wanted.
     """
     read = {path.resolve() for path in inputs}
     written: set[Path] = set()
     for output in filter(None, outputs):
-        place, problem, cure = output.resolve(), "", "name two different files"
+        place = output.resolve()
         if place in read:
             problem, cure = "this output is also an input", "name another file for it"
+            raise InputError(problem, source=output, cure=cure)
         # /dev/null may be named twice.
-        elif place in written and (place.is_file() or not place.exists()):
-            problem = "two outputs have this name"
-        if problem:
+        if place in written and (place.is_file() or not place.exists()):
+            problem, cure = "two outputs have this name", "name two different files"
             raise InputError(problem, source=output, cure=cure)
         written.add(place)
-        if output.parent != made or made.is_dir():
-            check_writable(output)
+        check_writable(output)
+
+
+# --- Options of the commands on a bus, made from the keys of `RunConfig`
+
+
+def config_parameters(*names: str) -> list[inspect.Parameter]:
+    """Return the options of keys, such as "channel", as typer reads them; without names of all."""
+    from cangauge.service.config import config_keys
+
+    keys = [key for key in config_keys() if key.info.option]
+    return [_parameter(key) for key in keys if not names or key.name in names]
+
+
+def _parameter(key: ConfigKey) -> inspect.Parameter:
+    kind: Any = Path if key.info.is_path else float if key.kind == "number" else str
+    if key.name == "bus_options":
+        kind = list[str]
+    elif key.name == "initial_soc":  # "auto" is no number: checked by the configuration
+        kind = str
+    flags, metavar = key.info.option.split(", "), key.info.metavar or None
+    option = Annotated[kind | None, typer.Option(*flags, metavar=metavar, help=key.help)]
+    keyword = inspect.Parameter.KEYWORD_ONLY
+    return inspect.Parameter(key.name, keyword, default=None, annotation=option)
+
+
+def config_values(options: Mapping[str, Any]) -> dict[str, Any]:
+    """Return given options as keys of a configuration; InputError if a bus option is wrong."""
+    from cangauge.bus.open import parse_bus_options
+
+    values = {name: str(v) if isinstance(v, Path) else v for name, v in options.items()}
+    return values | {"bus_options": parse_bus_options(options["bus_options"] or [])}

@@ -8,7 +8,8 @@ import shutil
 import sys
 import textwrap
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
+from pathlib import Path
 from typing import Any, TextIO
 
 from rich import box
@@ -60,41 +61,59 @@ def _print(text: str, file: TextIO) -> None:
 
 
 @contextmanager
-def progress_shown(logger: str, show: Callable[[str], None] | None = None) -> Iterator[None]:
-    """Show what a computation logs: decisions (INFO) as lines, each step by `show`."""
-    own, handler = logging.getLogger(logger), _ProgressHandler(show)
-    level = own.level
-    own.addHandler(handler)
-    own.setLevel(logging.DEBUG)
-    try:
-        yield
-    finally:
-        own.removeHandler(handler)
-        own.setLevel(level)
+def progress(logger: str = "") -> Iterator[Callable[[str], None]]:
+    """Yield a function that shows a line on a terminal, in place of the one before.
+
+    Of what a logger says, decisions (INFO) are printed as lines, and each step is shown there.
+    """
+    with ExitStack() as stack:
+        handler = _Progress()
+        if console.is_terminal:
+            # No refresh thread: redrawn at each call.
+            handler.live = Live(console=console, auto_refresh=False, transient=True)
+            stack.enter_context(handler.live)
+        if logger:
+            own = logging.getLogger(logger)
+            stack.callback(own.setLevel, own.level)
+            stack.callback(own.removeHandler, handler)
+            own.addHandler(handler)
+            own.setLevel(logging.DEBUG)
+        yield handler.show
 
 
-@contextmanager
-def live_line() -> Iterator[Callable[[str], None]]:
-    """Yield a function that shows a line on a terminal, in place of the one before."""
-    if not console.is_terminal:
-        yield lambda _: None
-        return
-    # No refresh thread: redrawn at each call.
-    with Live(console=console, auto_refresh=False, transient=True) as live:
-        yield lambda text: live.update(Text(text), refresh=True)
+class _Progress(logging.Handler):
+    live: Live | None = None
 
-
-class _ProgressHandler(logging.Handler):
-    def __init__(self, show: Callable[[str], None] | None) -> None:
-        super().__init__()
-        self._show = show
+    def show(self, text: str) -> None:
+        if self.live is not None:
+            self.live.update(Text(text), refresh=True)
 
     def emit(self, record: logging.LogRecord) -> None:
         text = record.getMessage()
         if record.levelno >= logging.INFO:
             note(text)
-        if self._show is not None:
-            self._show(text)
+        self.show(text)
+
+
+def finish(
+    result: Mapping[str, Any],
+    show: Callable[[], None],
+    files: Mapping[str, Path | None] | None = None,
+    *,
+    as_json: bool,
+) -> None:
+    """Print a result as one JSON object, or as text by `show`; then name the files written.
+
+    The object also has the names of the files, by what they hold; None: not asked for.
+    """
+    named = {what: path and str(path) for what, path in (files or {}).items()}
+    if as_json:
+        emit_json({**result, **named})
+        return
+    show()
+    for what, path in named.items():
+        if path:
+            note(f"{what}: {path}")
 
 
 def emit_json(result: Mapping[str, Any]) -> None:

@@ -8,10 +8,15 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from cangauge._text import duration, number
-from cangauge.cli.config_options import config_parameters, config_values
 from cangauge.cli.declare import command
-from cangauge.cli.options import ReadingOptions, assumed_of, note_reading
-from cangauge.cli.output import emit_json, live_line, note
+from cangauge.cli.options import (
+    ReadingOptions,
+    assumed_of,
+    config_parameters,
+    config_values,
+    note_reading,
+)
+from cangauge.cli.output import emit_json, note, progress
 
 if TYPE_CHECKING:
     from cangauge.bus.connection import BusConnection
@@ -76,20 +81,16 @@ def replay_command(
     ids = FrameIds(**loaded.ids.model_dump())
     source, address = _source(recorded, columns, loaded, ids), address_of(loaded)
     stopped: list[bool] = []
+    factor = math.inf if speed == "max" else speed
+    settings = ReplaySettings(speed=factor, loop=loop, ids=ids)
     with ExitStack() as stack:
         stack.enter_context(stop_on_signals(lambda: stopped.append(True)))
         filters = [standard_filter(ids.soc_estimate), standard_filter(ids.soc_detail)]
         bus = stack.enter_context(BusConnection(open_bus(address, filters), str(address)))
         note(f"playing {recorded} on {address}, speed {speed}")
-        show = stack.enter_context(live_line())
-        factor = math.inf if speed == "max" else speed
-        settings = ReplaySettings(speed=factor, loop=loop, ids=ids)
+        show = stack.enter_context(progress())
         state = play(
-            bus,
-            source,
-            settings,
-            stop=lambda: bool(stopped),
-            show=lambda now: show(_line(now)),
+            bus, source, settings, stop=lambda: bool(stopped), show=lambda now: show(_line(now))
         )
     note(_line(state))
     if bus.unsent:
@@ -131,21 +132,17 @@ def _line(state: ReplayState) -> str:
 
 
 def _as_json(state: ReplayState, bus: BusConnection, source: Source) -> dict[str, Any]:
-    from cangauge.replay.encoder import FrameEncoder
-    from cangauge.replay.steps import CaptureSource, LogSource
+    from cangauge.replay.steps import LogSource
 
-    result = vars(state) | {
+    soc_pct, soc_std_pct = (None, None) if state.soc is None else state.soc[:2]
+    result = {name: value for name, value in vars(state).items() if name != "soc"} | {
         "bus": bus.name,
         "samples": state.samples if source.counts_samples else None,
         "speed": state.speed,
         "unsent": bus.unsent,
-        "soc_pct": None if state.soc is None else state.soc.soc_pct,
-        "soc_std_pct": None if state.soc is None else state.soc.soc_std_pct,
+        "soc_pct": soc_pct,
+        "soc_std_pct": soc_std_pct,
     }
-    del result["soc"]
     if isinstance(source, LogSource):
-        result["quantisation"] = FrameEncoder(source.vehicle).quantization()
-        result["assumed"] = assumed_of([source.log])
-    if isinstance(source, CaptureSource):
-        result["dropped"] = source.dropped
-    return result
+        return result | {"quantisation": source.quantization, "assumed": assumed_of([source.log])}
+    return result | {"dropped": source.dropped}

@@ -5,15 +5,16 @@ from __future__ import annotations
 import gc
 import logging
 from contextlib import ExitStack
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rich.live import Live
 
 from cangauge._logging import emit
-from cangauge.cli.config_options import config_parameters, config_values
 from cangauge.cli.declare import command
-from cangauge.cli.output import console, emit_json, print_values
+from cangauge.cli.options import config_parameters, config_values
+from cangauge.cli.output import console, emit_json, finish, print_values
 from cangauge.cli.status import live_text
 from cangauge.errors import CangaugeError
 from cangauge.service.events import logging_to, takes_text
@@ -129,9 +130,9 @@ def check_command(config: Path, *, json_output: bool = False) -> None:
         "received": sorted(f"0x{key:X}" for key in pipeline.vehicle.wanted_ids),
         "published": [f"0x{key:X} {name.upper()}" for key, name in ids.published.items()],
     }
-    if json_output:
-        emit_json(found)
-        return
-    shown = {k: ", ".join(v) if isinstance(v, list) else str(v) for k, v in found.items()}
-    rows = {name.replace("_", " "): text for name, text in shown.items()}
-    print_values(f"{config}: `cangauge run` takes it", rows)
+    rows = {
+        name.replace("_", " "): ", ".join(value) if isinstance(value, list) else str(value)
+        for name, value in found.items()
+    }
+    show = partial(print_values, f"{config}: `cangauge run` takes it", rows)
+    finish(found, show, as_json=json_output)

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, NoReturn
 
 import typer
 from rich.console import RenderableType
@@ -23,7 +23,14 @@ from cangauge._text import (
     uncertain,
 )
 from cangauge.cli.declare import command
-from cangauge.cli.output import PlainConsole, emit_json, known_rows, print_values, text_table
+from cangauge.cli.output import (
+    PlainConsole,
+    emit_json,
+    finish,
+    known_rows,
+    print_values,
+    text_table,
+)
 from cangauge.errors import CangaugeError, InputError
 from cangauge.types import REASON_WORDS, Reason
 
@@ -58,34 +65,27 @@ def status_command(
     watch : --watch
         Show it again every half second, until Ctrl-C.
     """
-    from cangauge.service.status_client import NotRunningError
+    from cangauge.service.status_client import NotRunningError, fetch_status, find_socket
+
+    def ask() -> tuple[str, dict[str, Any]]:
+        place = endpoint or find_socket()
+        return f"cangauge at {place}", fetch_status(place)
 
     if watch:
-        _watch(endpoint)
-        return
+        _watch(ask)
     try:
-        place, status = _ask(endpoint)
+        title, status = ask()
     except NotRunningError as error:
         if json_output:
             emit_json({"running": False, "status": None, "problem": str(error)})
             raise typer.Exit(1) from error
         raise CangaugeError(str(error)) from error
-    if json_output:
-        emit_json(status)
-    else:
-        print_values(f"cangauge at {place}", status_values(status))
+    finish(status, lambda: print_values(title, status_values(status)), as_json=json_output)
     if status["status"] not in {"valid", "degraded"}:
         raise typer.Exit(1)
 
 
-def _ask(endpoint: Path | None) -> tuple[Path, dict[str, Any]]:
-    from cangauge.service.status_client import fetch_status, find_socket
-
-    place = endpoint or find_socket()
-    return place, fetch_status(place)
-
-
-def _watch(endpoint: Path | None) -> None:
+def _watch(ask: Callable[[], tuple[str, dict[str, Any]]]) -> NoReturn:
     """Show the status until stopped, in lines where stdout is no terminal."""
     shown = PlainConsole(highlight=False)
     with ExitStack() as stack:
@@ -96,11 +96,10 @@ def _watch(endpoint: Path | None) -> None:
         while True:
             content: RenderableType
             try:
-                place, status = _ask(endpoint)
+                title, status = ask()
                 content = live_text(status)
                 if shown.is_terminal:
-                    rows = known_rows(status_values(status))
-                    content = text_table(f"cangauge at {place}", ("", ""), rows)
+                    content = text_table(title, ("", ""), known_rows(status_values(status)))
             except InputError:
                 raise  # waiting does not mend it
             except CangaugeError as error:
@@ -162,7 +161,7 @@ def status_values(status: dict[str, Any]) -> dict[str, str]:
     }
 
 
-def pack_values(report: dict[str, Any]) -> dict[str, str]:
+def pack_values(report: Mapping[str, Any]) -> dict[str, str]:
     """Return names and values of health, power and cells, where known (`PackReport.to_dict`)."""
     health, power, cells = report["health"], report["power"], report["cells"]
     values = {}

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from array import array
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from itertools import islice
 from os import PathLike
@@ -14,6 +14,7 @@ from typing import Any, Final
 import can
 import numpy as np
 
+from cangauge._typing import FloatArray
 from cangauge.bus.captures import CaptureInfo, open_capture
 from cangauge.bus.decoder import SampleDecoder
 from cangauge.bus.protection import RULES, FrameChecker, Verdict
@@ -127,7 +128,9 @@ def inspect_capture(
     capture = open_capture(path) if vehicle is None else open_vehicle_capture(path, vehicle)
     stamps_s, error_frames, remote_frames = array("d"), 0, 0
     ids: defaultdict[tuple[str, int, bool], _Frames] = defaultdict(_Frames)
-    trials = _Trials()
+    cars = {name: preset.vehicle() for name, preset in PRESETS.items()}
+    wanted = {key for car in cars.values() for key in car.wanted_ids}
+    buses = defaultdict[str, list[_Trial]](lambda: [_Trial(*each) for each in cars.items()])
     for message in islice(capture, frames):
         stamps_s.append(message.timestamp)
         error_frames += message.is_error_frame
@@ -135,17 +138,21 @@ def inspect_capture(
         if not (message.is_error_frame or message.is_remote_frame):
             bus = "" if message.channel is None else str(message.channel)
             ids[bus, message.arbitration_id, message.is_extended_id].add(message)
-            trials.add(message, bus)
+            if message.arbitration_id in wanted:
+                for trial in buses[bus]:
+                    trial.add(message)
     start_s, steps_s = min(stamps_s), np.diff(stamps_s)
     duration_s = max(stamps_s) - start_s
     gaps = np.flatnonzero(steps_s > GAP_S)[:LISTED_GAPS].tolist()
     summaries = tuple(frames.summary(*key) for key, frames in sorted(ids.items()))
+    # Of every preset the trial on the bus with most of its samples.
+    best = [max(each, key=len) for each in zip(*(buses.values() or [buses[""]]), strict=True)]
     return CaptureInspection(
         path.name, str(path), capture.info, start_s, duration_s, error_frames, remote_frames,
         time_reversals=int((steps_s < 0.0).sum()),
         ids=summaries,
         gaps=tuple(Gap(stamps_s[at], float(steps_s[at])) for at in gaps),
-        presets=trials.matches(summaries, duration_s),
+        presets=_without_cold_relatives(trial.match(summaries, duration_s) for trial in best),
         log=None if vehicle is None else inspect_log(capture_to_log(path, vehicle)),
     )  # fmt: skip
 
@@ -169,27 +176,31 @@ class _Frames:
 
     def summary(self, bus: str, number: int, is_extended: bool) -> IdSummary:
         name = f"{number:08X}" if is_extended else f"{number:03X}"
-        (length, *others), intervals_s = sorted(self.lengths), np.diff(self.stamps_s)
-        found = IdSummary(name, bus, len(self.stamps_s), ", ".join(map(str, (length, *others))))
-        if not intervals_s.size:
-            return found
-        period_s, longest_s = float(np.median(intervals_s)), float(intervals_s.max())
-        found = replace(found, period_s=period_s, longest_s=longest_s)
-        if others or length < 3:
-            return found
+        lengths, intervals_s = ", ".join(map(str, sorted(self.lengths))), np.diff(self.stamps_s)
+        known: dict[str, Any] = {}
+        if intervals_s.size:
+            known = {
+                "period_s": float(np.median(intervals_s)),
+                "longest_s": float(intervals_s.max()),
+            }
+            known |= self._protection(intervals_s)
+        return IdSummary(name, bus, len(self.stamps_s), lengths, **known)
+
+    def _protection(self, intervals_s: FloatArray) -> dict[str, Any]:
+        """Return the fields of `IdSummary` by the first rule whose CRCs agree; {} without one."""
+        length = max(self.lengths)
+        if len(self.lengths) > 1 or length < 3:
+            return {}
         payloads = [self.payloads[at : at + length] for at in range(0, len(self.payloads), length)]
         if len(set(map(bytes, payloads))) < PAYLOADS:
-            return found
+            return {}
         # Lost frames lengthen intervals: the lower quartile is the period; 0 for equal stamps.
-        period_s = float(np.quantile(intervals_s, 0.25))
-        tried = (
-            _protection(rule, payloads, self.stamps_s, period_s or None)
-            for rule in ("leaf", "generic")
-        )
-        return replace(found, **next(filter(None, tried), {}))
+        period_s = float(np.quantile(intervals_s, 0.25)) or None
+        tried = (_by_rule(each, payloads, self.stamps_s, period_s) for each in ("leaf", "generic"))
+        return next(filter(None, tried), {})
 
 
-def _protection(
+def _by_rule(
     name: str, payloads: list[bytearray], stamps_s: array[float], period_s: float | None
 ) -> dict[str, Any]:
     """Return the fields of `IdSummary` by a rule; none where its CRCs do not agree."""
@@ -220,42 +231,11 @@ def _protection(
 # --- Match of the presets
 
 
-class _Trials:
-    """Every preset tried on every bus of the capture."""
-
-    def __init__(self) -> None:
-        self._vehicles = {name: preset.vehicle() for name, preset in PRESETS.items()}
-        self._wanted = {key for car in self._vehicles.values() for key in car.wanted_ids}
-        self._buses: defaultdict[str, dict[str, _Trial]] = defaultdict(self._trials)
-
-    def _trials(self) -> dict[str, _Trial]:
-        return {name: _Trial(car) for name, car in self._vehicles.items()}
-
-    def add(self, message: can.Message, bus: str) -> None:
-        if message.arbitration_id in self._wanted:
-            for trial in self._buses[bus].values():
-                trial.add(message)
-
-    def matches(self, ids: Sequence[IdSummary], duration_s: float) -> tuple[PresetMatch, ...]:
-        """Return the match of every preset, on the bus with most of its samples."""
-        buses = list(self._buses.values()) or [self._trials()]
-        best = {name: max((bus[name] for bus in buses), key=len) for name in PRESETS}
-        found = [trial.match(name, ids, duration_s) for name, trial in best.items()]
-        # A related preset that also finds its temperature explains more of the capture.
-        warm = {PRESETS[match.preset].dbc for match in found if match.temperature_c is not None}
-        for place, match in enumerate(found):
-            car = PRESETS[match.preset]
-            if match.matches and car.lacks_temperature and car.dbc in warm:
-                why = "the pack temperature is on this bus"
-                found[place] = replace(match, matches=False, because=why)
-        return tuple(found)
-
-
 class _Trial:
     """A preset tried on one bus of the capture; its length is the number of samples."""
 
-    def __init__(self, vehicle: Vehicle) -> None:
-        self._decoder, self._values = SampleDecoder(vehicle), array("d")
+    def __init__(self, name: str, vehicle: Vehicle) -> None:
+        self._name, self._decoder, self._values = name, SampleDecoder(vehicle), array("d")
 
     def __len__(self) -> int:
         return self._decoder.statistics.samples
@@ -264,14 +244,14 @@ class _Trial:
         if (sample := self._decoder.handle(message)) is not None:
             self._values.extend((*sample[1:], self._decoder.reference_soc_pct))
 
-    def match(self, name: str, ids: Sequence[IdSummary], duration_s: float) -> PresetMatch:
+    def match(self, ids: Sequence[IdSummary], duration_s: float) -> PresetMatch:
         spans: dict[str, Span] = {}
         for column, values in zip(_COLUMNS, np.reshape(self._values, (-1, 4)).T, strict=True):
             if (finite := values[np.isfinite(values)]).size:
                 spans[column] = float(finite.min()), float(finite.max())
-        problem = self._problem(spans, duration_s) or _wrong_period(name, ids, duration_s)
-        because, about = problem or "all its signals decode", PRESETS[name].about
-        return PresetMatch(name, about, not problem, because, len(self), **spans)
+        problem = self._problem(spans, duration_s) or _wrong_period(self._name, ids, duration_s)
+        because, about = problem or "all its signals decode", PRESETS[self._name].about
+        return PresetMatch(self._name, about, not problem, because, len(self), **spans)
 
     def _problem(self, spans: dict[str, Span], duration_s: float) -> str:
         """Return why the frames are not those of the preset, or ""."""
@@ -296,3 +276,15 @@ def _wrong_period(preset: str, ids: Sequence[IdSummary], duration_s: float) -> s
         if period_s is not None and abs(period_s - expected_s) > PERIOD_TOLERANCE * expected_s:
             return f"0x{number:X} has a period of {period_s:.3g} s, not {expected_s:g} s"
     return ""
+
+
+def _without_cold_relatives(matches: Iterable[PresetMatch]) -> tuple[PresetMatch, ...]:
+    """Drop a match where a related preset, which also finds its temperature, explains more."""
+    found = list(matches)
+    warm = {PRESETS[match.preset].dbc for match in found if match.temperature_c is not None}
+    for place, match in enumerate(found):
+        car = PRESETS[match.preset]
+        if match.matches and car.lacks_temperature and car.dbc in warm:
+            why = "the pack temperature is on this bus"
+            found[place] = replace(match, matches=False, because=why)
+    return tuple(found)

@@ -30,12 +30,11 @@ from cangauge.logs.sign import (
     spaced_rows,
 )
 from cangauge.model.coulomb_counting import capacity_from_full_discharge, capacity_from_reference
+from cangauge.model.delay_line import GAP_S
 from cangauge.model.prior import DELAYS_S
 
 Verdict = Literal["yes", "partly", "no"]
 
-GAP_S: Final = 2.0
-"""Longest interval that the delay line of the model bridges [s]; longer ones are gaps."""
 LISTED: Final = 10
 FIT_RATE_HZ: Final = 1.0
 """Rate of a fit by default [Hz]."""
@@ -157,7 +156,8 @@ class LogInspection:
 
 def inspect_log(log: Log) -> LogInspection:
     """Inspect a log; the sign of its current is one of the findings."""
-    timing, charge, soc, sign = _timing(log), _charge(log), _soc(log), sign_of_current(log)
+    timing, soc, sign = _timing(log), _soc(log), sign_of_current(log)
+    charge = _charge(log, timing.gap_limit_s)
     resistance = _resistance(log)
     channels = describe_channels(log, resistance.median_ohm if resistance else None)
     warnings = tuple(_warnings(log, timing, channels, charge, sign))
@@ -209,13 +209,12 @@ def _timing(log: Log) -> Timing:
     )  # fmt: skip
 
 
-def _charge(log: Log) -> Charge:
+def _charge(log: Log, gap_limit_s: float) -> Charge:
     state, step = charge_ah(log), np.diff(log.time_s)
     part, uncounted = np.diff(state), uncounted_gaps(log.time_s)
-    in_gaps = part[step > usual_gap_s(log.time_s, GAP_S)]
     return Charge(
         float(part[part > 0.0].sum()), float(np.abs(part[part < 0.0]).sum()),
-        float(state[-1]), float(np.ptp(state)), float(np.abs(in_gaps).sum()),
+        float(state[-1]), float(np.ptp(state)), float(np.abs(part[step > gap_limit_s]).sum()),
         int(uncounted.size), float(step[uncounted].sum()),
     )  # fmt: skip
 
@@ -266,12 +265,6 @@ def _warnings(
             f" {duration(charge.uncounted_s)} in all: the pack is assumed to rest; where the log's"
             " own SoC moves over one, a fit splits the log there"
         )
-    yield from _channel_warnings(channels)
-    if log.temperature_source == "room":
-        yield "the temperature is the room's: the battery may be colder or hotter"
-
-
-def _channel_warnings(channels: dict[str, Channel]) -> Iterator[str]:
     for name, channel in channels.items():
         for each in channel.stuck[:LISTED]:
             yield (
@@ -279,6 +272,8 @@ def _channel_warnings(channels: dict[str, Channel]) -> Iterator[str]:
                 f" {each.start_s:.1f} s: {each.why}"
             )
     yield from (f"{n} never changes" for n in ("current_a", "voltage_v") if channels[n].levels == 1)
+    if log.temperature_source == "room":
+        yield "the temperature is the room's: the battery may be colder or hotter"
 
 
 def _interval(timing: Timing) -> str:
@@ -350,10 +345,9 @@ def _rows(log: Log, timing: Timing) -> tuple[Verdict, str]:
     delay_s = usable_delays([log], DELAYS_S) if len(log) > 1 else DELAYS_S
     kept, removed = usable_rows(log, delay_s, FIT_RATE_HZ)
     total = kept.size + removed["start_up_or_shut_down"] + removed["delay_line_filling"]
-    is_slow = (timing.interval_median_s or 0.0) * FIT_RATE_HZ > 1.0
-    rate = f"rows every {_interval(timing)}" if is_slow else f"rows at {FIT_RATE_HZ:g} Hz"
-    text = f"{kept.size} of {total} {rate}; the first {max(delay_s):.0f} s, and as long after each"
-    text += f" gap, fill the delay line; {LEAST_ROWS} are needed"
+    step_s = max(timing.interval_median_s or 0.0, 1.0 / FIT_RATE_HZ)
+    text = f"{kept.size} of {total} rows every {step_s:.3g} s; the first {max(delay_s):.0f} s, and"
+    text += f" as long after each gap, fill the delay line; {LEAST_ROWS} are needed"
     verdict: Verdict = "yes" if kept.size > 0.5 * total else "partly"
     return verdict if kept.size >= LEAST_ROWS else "no", text
 
@@ -376,10 +370,10 @@ def _start(log: Log, timing: Timing) -> tuple[Verdict, str]:
     within_s = max(DELAYS_S[1], timing.interval_median_s or 0.0)
     first = log.current_a[log.time_s - log.time_s[0] <= within_s]
     at_start = float(np.max(np.abs(first)))
-    what = f"the first {within_s:.3g} s" if first.size > 1 else "the first row"
-    if at_start <= REST_SHARE * float(np.max(np.abs(log.current_a))):
-        return "yes", f"at most {at_start:.3g} A in {what}: the first voltages are near rest"
-    return "no", f"up to {at_start:.3g} A in {what}"
+    text = f"up to {at_start:.3g} A in the first {within_s:.3g} s"
+    if at_start > REST_SHARE * float(np.max(np.abs(log.current_a))):
+        return "no", text
+    return "yes", f"{text}: the first voltages are near rest"
 
 
 def _rests(log: Log) -> tuple[Verdict, str]:

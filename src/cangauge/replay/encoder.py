@@ -71,13 +71,8 @@ class FrameEncoder:
         "not available". InputError is raised if a value does not fit into its signal, or has no
         such code.
         """
-        time_s, current_a, voltage_v, temperature_c = sample
-        values = {
-            "current": current_a,
-            "voltage": voltage_v,
-            "temperature": temperature_c,
-            "soc_reference": soc_reference_pct,
-        }
+        time_s, *pack = sample
+        values = dict(zip(_UNITS, (*pack, soc_reference_pct), strict=True))
         messages = []
         for frame in self._frames:
             if all(math.isnan(values[signal.role]) for signal in frame.signals):
@@ -95,14 +90,15 @@ class FrameEncoder:
             if rule is not None:
                 data = rule.protect(payload, self._counters[first.key])
                 self._counters[first.key] += 1
-            message = can.Message(
-                timestamp=time_s,
-                arbitration_id=first.arbitration_id,
-                is_extended_id=first.is_extended,
-                is_fd=first.length > 8,
-                data=data,
+            messages.append(
+                can.Message(
+                    timestamp=time_s,
+                    arbitration_id=first.arbitration_id,
+                    is_extended_id=first.is_extended,
+                    is_fd=first.length > 8,
+                    data=data,
+                )
             )
-            messages.append(message)
         return messages
 
     def check_range(self, log: Log) -> None:

@@ -131,17 +131,17 @@ def play(
         If the bus fails, or no receiver acknowledges in time.
     """
     player = _Player(bus, settings, stop)
-    if player.is_max and not source.counts_samples:
-        raise InputError(
-            "full speed needs the vehicle of a capture, to count the samples acknowledged",
-            source=source.name,
-            field="--speed",
-            value="max",
-            cure="give --vehicle or --map, or another speed",
-        )
-    show_s = -math.inf
     if player.is_max:
-        player.wait_until_ready()
+        if not source.counts_samples:
+            raise InputError(
+                "full speed needs the vehicle of a capture, to count the samples acknowledged",
+                source=source.name,
+                field="--speed",
+                value="max",
+                cure="give --vehicle or --map, or another speed",
+            )
+        player.wait_until(lambda: player.is_ready)
+    show_s = -math.inf
     for step in source.steps(loop=settings.loop):
         if stop():
             break
@@ -150,7 +150,7 @@ def play(
             show_s = time.monotonic() + SHOW_EVERY_S
             show(player.update(LISTEN_S))
     if player.is_max:
-        player.wait_for_all()
+        player.wait_until(lambda: not player.in_flight)
     show(player.update(LISTEN_AT_END_S))
     return player.state
 
@@ -197,9 +197,9 @@ class _Player:
         self._began_s, self._clock_us = 0.0, -1
         self._count: int | None = None  # in the latest SOC_DETAIL
         self._heard_s = -math.inf
-        self._acknowledged = self._frames_acknowledged = 0
-        # Frames sent when a sample was complete: (samples, frames).
-        self._marks: deque[tuple[int, int]] = deque()
+        self.in_flight: deque[int] = deque()
+        """Frames of each sample sent that is neither acknowledged nor lost."""
+        self._incomplete = 0  # frames sent since the latest sample
         self.state = ReplayState(acknowledged=0 if self.is_max else None)
 
     def send(self, step: Step) -> None:
@@ -209,7 +209,7 @@ class _Player:
             self._pacer.wait(step.time_us)
         elif self._frames_in_flight >= WINDOW_FRAMES:
             # Drain to half, so that both sides work in batches.
-            self._wait(lambda: self._frames_in_flight <= WINDOW_FRAMES // 2)
+            self.wait_until(lambda: self._frames_in_flight <= WINDOW_FRAMES // 2)
         if self._first_us is None:
             self._first_us, self._began_s = step.time_us, time.monotonic()
         if self._clock is not None and step.is_wanted and step.time_us != self._clock_us:
@@ -220,7 +220,8 @@ class _Player:
             self._send(frame)
         state.frames += len(step.frames)
         if self.is_max and step.samples != state.samples:
-            self._marks.append((step.samples, state.frames + state.clock_frames))
+            self.in_flight.append(self._incomplete)
+            self._incomplete = 0
         state.samples = step.samples
         state.log_seconds = (step.time_us - self._first_us) / MICROSECONDS
 
@@ -236,15 +237,8 @@ class _Player:
             pass
         return self.state
 
-    def wait_until_ready(self) -> None:
-        """Wait for the first SOC_DETAIL, from which samples are counted; raise CangaugeError."""
-        self._wait(lambda: self._count is not None)
-
-    def wait_for_all(self) -> None:
-        """Wait until all samples are acknowledged or lost; raise CangaugeError without a sign."""
-        self._wait(lambda: self._in_flight == 0)
-
     def _send(self, frame: can.Message) -> None:
+        self._incomplete += 1
         if frame.is_fd and not self._bus.carries_fd:
             raise InputError(
                 "holds CAN FD frames, and the bus is not open for them",
@@ -258,42 +252,36 @@ class _Player:
             )
 
     @property
-    def _in_flight(self) -> int:
-        return self.state.samples - self._acknowledged - self.state.lost
+    def is_ready(self) -> bool:
+        """Whether a SOC_DETAIL has come, from which samples are counted."""
+        return self._count is not None
 
     @property
     def _frames_in_flight(self) -> int:
         """Frames that may wait at the receiver; 0 with too few samples for an acknowledgement."""
-        frames = self.state.frames + self.state.clock_frames - self._frames_acknowledged
-        return frames if self._in_flight >= SAMPLES_AT_LEAST else 0
+        has_enough = len(self.in_flight) >= SAMPLES_AT_LEAST
+        return sum(self.in_flight) + self._incomplete if has_enough else 0
 
-    def _wait(self, is_enough: Callable[[], bool]) -> None:
-        before, last_s = self._acknowledged, time.monotonic()
+    def wait_until(self, is_enough: Callable[[], bool]) -> None:
+        """Listen until a condition holds; raise CangaugeError if no acknowledgement comes."""
+        state, before, last_s = self.state, self.state.acknowledged, time.monotonic()
         while not is_enough() and not self._stop():
             self._listen_once(POLL_S)
             now_s = time.monotonic()
-            if self._acknowledged != before:
-                before, last_s = self._acknowledged, now_s
-            elif self._acknowledged and self._heard_s - last_s > LOST_AFTER_S:
-                self._give_up()
+            if state.acknowledged != before:
+                before, last_s = state.acknowledged, now_s
+            elif state.acknowledged and self._heard_s - last_s > LOST_AFTER_S:
+                state.lost += len(self.in_flight)
+                self.in_flight.clear()
+                self._incomplete = 0
+                text = f"{state.lost} samples lost so far; the replay continues"
+                emit(_LOG, logging.WARNING, "replay.lost", text)
             elif now_s - last_s > self._within_s:
-                problem = (
-                    "no receiver: no SOC_DETAIL"
-                    if self._count is None
-                    else (
-                        f"{self._acknowledged} of {self.state.samples} samples sent have been"
-                        " processed: no acknowledgement"
-                    )
-                )
+                problem = "no receiver: no SOC_DETAIL"
+                if self.is_ready:
+                    problem = f"{state.acknowledged} of {state.samples} samples sent have been"
+                    problem += " processed: no acknowledgement"
                 raise self._error(f"{problem} in {self._within_s:g} s; {_HINT}")
-
-    def _give_up(self) -> None:
-        """Count the samples in flight as lost, and all frames as arrived."""
-        self.state.lost += self._in_flight
-        self._frames_acknowledged = self.state.frames + self.state.clock_frames
-        self._marks.clear()
-        text = f"{self.state.lost} samples lost so far; the replay continues"
-        emit(_LOG, logging.WARNING, "replay.lost", text)
 
     def _listen_once(self, timeout_s: float) -> bool:
         """Receive one frame; return whether one came in time [s]."""
@@ -310,16 +298,18 @@ class _Player:
         before, self._count = self._count, count
         if before is None or not self.state.samples:
             return
-        more, state = (count - before) % SAMPLES_MODULO, self.state
-        state.lost -= min(max(more - self._in_flight, 0), state.lost)  # slow: they came after all
-        if more > self._in_flight:
+        more, state, sent = (count - before) % SAMPLES_MODULO, self.state, len(self.in_flight)
+        late = max(more - sent, 0)  # counted as lost, but only slow
+        if late > state.lost:
             raise self._error(
-                f"the receiver has processed {more} samples where {self._in_flight} were in flight:"
-                " it was restarted, or another program sends or acknowledges on this bus too"
+                f"the receiver has processed {more} samples where {sent + state.lost} were in"
+                " flight: it was restarted, or another program sends or acknowledges on this bus"
+                " too"
             )
-        state.acknowledged = self._acknowledged = self._acknowledged + more
-        while self._marks and self._marks[0][0] <= self._acknowledged:
-            self._frames_acknowledged = self._marks.popleft()[1]
+        state.lost -= late
+        state.acknowledged = (state.acknowledged or 0) + more
+        for _ in range(more - late):
+            self.in_flight.popleft()
 
     def _error(self, problem: str) -> CangaugeError:
         return CangaugeError(f"{self._bus.name}: {problem}")

@@ -51,7 +51,10 @@ class LogSource:
 
     def __init__(self, log: Log, vehicle: Vehicle) -> None:
         self.name, self.log, self.vehicle = log.name, log, vehicle
-        FrameEncoder(vehicle).check_range(log)
+        encoder = FrameEncoder(vehicle)
+        encoder.check_range(log)
+        self.quantization = encoder.quantization()
+        """Largest errors by rounding into frames, by column."""
 
     def steps(self, *, loop: bool) -> Iterator[Step]:
         """Yield a step per row, each one sample; repetitions follow one typical step later.

@@ -1,7 +1,7 @@
 """Configuration of the service: one declaration for the TOML file, the options and the reference.
 
 Each key is declared once, as a field with its type, bounds, default, unit and help. The command
-line makes its options from the same fields (`cangauge.cli.config_options`), and
+line makes its options from the same fields (`cangauge.cli.options`), and
 `python -m cangauge.service.config` prints the reference of all keys as Markdown. Options take
 precedence over the file; paths in a file are relative to it::
 

@@ -12,9 +12,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from cangauge._files import check_writable, write_texts_atomic
-from cangauge.cli.config_options import config_parameters, config_values
 from cangauge.cli.declare import command
-from cangauge.cli.output import console, emit_json, note, print_table, progress_shown
+from cangauge.cli.options import config_parameters, config_values
+from cangauge.cli.output import finish, note, print_table, progress
 from cangauge.errors import CangaugeError, InputError
 
 if TYPE_CHECKING:
@@ -107,18 +107,19 @@ def init_command(
     output.mkdir(exist_ok=True)
     write_texts_atomic({output / name: text for name, text in texts.items()})
     files = [str(output / name) for name in texts]
-    if json_output:
-        emit_json({**found.to_dict(), "files": files})
-        return
-    _show(found)
-    _show_proof(found)
-    for path in files:
-        note(f"wrote {path}")
-    reading = found.reading(output)
-    note(
-        f"next: cangauge inspect DRIVE {reading}, then cangauge fit DRIVE … {reading}"
-        f" -o {output / 'model.json'}"
-    )
+
+    def show() -> None:
+        _show(found)
+        _show_proof(found)
+        for path in files:
+            note(f"wrote {path}")
+        reading = found.reading(output)
+        note(
+            f"next: cangauge inspect DRIVE {reading}, then cangauge fit DRIVE … {reading}"
+            f" -o {output / 'model.json'}"
+        )
+
+    finish({**found.to_dict(), "files": files}, show, as_json=json_output)
 
 
 def _picks(given: Sequence[str]) -> dict[str, int]:
@@ -293,7 +294,7 @@ def _listen(bus: Mapping[str, Any], seconds: float, path: Path) -> Path:
     with (
         BusConnection(open_bus(address), str(address)) as port,
         can.CanutilsLogWriter(path) as writer,
-        console.status(f"listening on {address}") as status,
+        progress() as show,
     ):
         until_s = time.monotonic() + seconds
         while (left_s := until_s - time.monotonic()) > 0.0:
@@ -301,7 +302,7 @@ def _listen(bus: Mapping[str, Any], seconds: float, path: Path) -> Path:
                 message.channel = message.channel or "can0"
                 writer.on_message_received(message)
                 frames += 1
-            status.update(f"listening on {address}: {left_s:.0f} s left, {frames} frames")
+            show(f"listening on {address}: {left_s:.0f} s left, {frames} frames")
     if not frames:
         raise InputError("no frame came", source=str(address), cure="is the car awake?")
     return path
@@ -338,8 +339,8 @@ def _find(
         return _Found("dbc", {**named}, clear, head, dbc=dbc)
     if presets and (known := _known(paths)) is not None:
         return _Found("preset", vehicle=known)
-    status = console.status("reading frames")
-    with status, progress_shown("cangauge.extras.discovery", status.update):
+    with progress("cangauge.extras.discovery") as show:
+        show("reading frames")
         found = search(_joined(paths), nominal_v)
     candidates = {role: getattr(found, role) for role in _ROLES.values()}
     clear = [role for role in _NEEDED if found.is_clear(role)]

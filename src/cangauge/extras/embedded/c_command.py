@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from typing import Literal
 
 from cangauge.cli.declare import command
-from cangauge.cli.output import emit_json, note
+from cangauge.cli.output import finish, note
 from cangauge.errors import InputError
 
 
@@ -33,8 +34,6 @@ def export_c_command(
 
     Parameters
     ----------
-    model : -m, --model MODEL
-        Model file of `cangauge fit`.
     output : -o, --output DIR
         Folder for the sources: empty, of an earlier export, or made.
     chemistry : oxide|lfp
@@ -70,16 +69,16 @@ def export_c_command(
         chosen = Model.prior(chemistry, cells or 1, capacity_ah or 1.0)
     done = export_c(chosen, output, period_s=period, platform=platform)
     std_pct = std_at_rest_pct(chosen)
-    if json_output:
-        emit_json({
-            "folder": str(done.folder),
-            "files": list(done.files),
-            "delay_line_bytes": done.delay_line_bytes,
-            "std_at_rest_pct": std_pct,
-        })  # fmt: skip
-        return
-    files = f"{len(done.files)} files in {done.folder}"
+    result = {
+        "folder": str(done.folder),
+        "files": list(done.files),
+        "delay_line_bytes": done.delay_line_bytes,
+        "std_at_rest_pct": std_pct,
+    }
     tests = "" if platform == "arduino" else ": `make test` there runs the tests on this machine"
-    note(f"{files}{tests}.")
-    note(f"The delay line takes {done.delay_line_bytes / 1024:.1f} KiB at {period:g} s a sample.")
-    note(f"{chosen.name}: from half a minute of rest the SoC is known to ± {std_pct:.1f} % (1σ).")
+    text = (
+        f"{len(done.files)} files in {done.folder}{tests}.\n"
+        f"The delay line takes {done.delay_line_bytes / 1024:.1f} KiB at {period:g} s a sample.\n"
+        f"{chosen.name}: from half a minute of rest the SoC is known to ± {std_pct:.1f} % (1σ)."
+    )
+    finish(result, partial(note, text), as_json=json_output)

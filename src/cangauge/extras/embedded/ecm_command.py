@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from functools import partial
 from keyword import iskeyword
 from pathlib import Path
 
@@ -10,7 +11,7 @@ from cangauge._files import write_text_atomic
 from cangauge._text import number, significant
 from cangauge.cli.declare import command
 from cangauge.cli.options import check_outputs
-from cangauge.cli.output import emit_json, note, print_table
+from cangauge.cli.output import finish, print_table
 from cangauge.errors import InputError
 
 
@@ -44,15 +45,13 @@ def export_ecm_command(*, model: Path, output: Path, json_output: bool = False) 
     circuit = equivalent_circuit(Model.load(model))
     write_text_atomic(output, module_of(circuit) if is_module else json.dumps(circuit) + "\n")
     taus_s, error_pct = circuit["pair_tau_s"], circuit["step_error_pct"]
-    if json_output:
-        shown = {"pairs": len(taus_s), "pair_tau_s": taus_s, "step_error_pct": error_pct}
-        emit_json({"output": str(output), **shown})
-        return
     rows = [["capacity", number(circuit["capacity_ah"], 2), "Ah"]]
     rows += [
         [f"time constant of RC pair {k}", significant(tau_s, 3), "s"]
         for k, tau_s in enumerate(taus_s, start=1)
     ]
     rows.append(["step response, RMS error", number(error_pct, 2), "%"])
-    print_table(f"Equivalent circuit of {circuit['name']}", ["", "value", "unit"], rows)
-    note(f"equivalent circuit: {output}")
+    title = f"Equivalent circuit of {circuit['name']}"
+    show = partial(print_table, title, ["", "value", "unit"], rows)
+    found = {"pairs": len(taus_s), "pair_tau_s": taus_s, "step_error_pct": error_pct}
+    finish(found, show, {"output": output}, as_json=json_output)

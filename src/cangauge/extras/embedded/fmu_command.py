@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from typing import Literal
 
 from cangauge.cli.declare import command
 from cangauge.cli.options import check_outputs
-from cangauge.cli.output import emit_json, note
+from cangauge.cli.output import finish, note
 
 
 @command()
@@ -42,7 +43,5 @@ def export_fmu_command(
     from cangauge.model.model_file import Model
 
     export_fmu(Model.load(model), output, kind=kind)
-    if json_output:
-        emit_json({"output": str(output), "kind": kind, "fmi": 2})
-        return
-    note(f"{kind}: {output}")
+    result = {"output": str(output), "kind": kind, "fmi": 2}
+    finish(result, partial(note, f"{kind}: {output}"), as_json=json_output)

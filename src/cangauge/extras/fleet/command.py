@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Iterable, Sequence
-from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Literal
 
@@ -16,7 +16,7 @@ from cangauge._files import file_sha256, write_texts_atomic
 from cangauge._text import number, significant
 from cangauge.cli.declare import command
 from cangauge.cli.options import ReadingOptions, check_outputs
-from cangauge.cli.output import console, emit_json, note, print_table, print_values, progress_shown
+from cangauge.cli.output import finish, note, print_table, print_values, progress
 
 if TYPE_CHECKING:
     from cangauge.extras.fleet.fit import FleetFit
@@ -57,13 +57,9 @@ class Cluster:
         """Return what a function of the Dask client returns; show its progress."""
         from cangauge.extras.fleet.run import connected
 
-        shown: AbstractContextManager[Any] = nullcontext()
-        if console.is_terminal:
-            shown = console.status("starting")
-        with shown as status:
-            step = None if status is None else status.update
-            connection = connected(self.workers)
-            with progress_shown("cangauge.extras.fleet", step), connection as client:
+        with progress("cangauge.extras.fleet") as show:
+            show("starting")
+            with connected(self.workers) as client:
                 return work(client)
 
 
@@ -112,10 +108,6 @@ def fit_fleet_command(
         Model file to write.
     capacity_ah : A (0.001 … 1e5 Ah)
         Charge from 100 to 0 %, e.g. 51.5.
-    chemistry : oxide|lfp
-        Chemistry of the cells.
-    cells : N (1 … 2000)
-        Cells in series.
     """
     from cangauge.extras.fleet.fit import SumsJob, fit_fleet
     from cangauge.extras.fleet.sources import find_logs
@@ -130,12 +122,9 @@ def fit_fleet_command(
 
         texts[report] = fleet_fit_page(result).html()
     write_texts_atomic(texts)
-    if json_output:
-        written = {"model": str(model), "output": cluster.out, "report": report and str(report)}
-        emit_json(result.to_dict() | written)
-        return
-    _show_fit(result)
-    note(f"model: {model}" + (f"\nreport: {report}" if report else ""))
+    figures = result.to_dict() | {"output": cluster.out}
+    files = {"model": model, "report": report}
+    finish(figures, partial(_show_fit, result), files, as_json=json_output)
 
 
 def _show_fit(result: FleetFit) -> None:
@@ -331,11 +320,8 @@ def _run(
         from cangauge.extras.report.fleet import fleet_page
 
         write_texts_atomic({report: fleet_page(found).html()})
-    if json_output:
-        written = {"output": cluster.out, "report": report and str(report)}
-        emit_json(vars(summary) | found.to_dict() | written)
-    else:
-        _show(summary, found)
+    result = vars(summary) | found.to_dict() | {"output": cluster.out}
+    finish(result, partial(_show, summary, found), {"report": report}, as_json=json_output)
     if not summary.done + summary.skipped:
         note(f"error: no result; the reasons are in {cluster.out}/{job.kind}-bad")
         raise typer.Exit(1)

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from contextlib import ExitStack, nullcontext
+from contextlib import ExitStack
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
@@ -15,7 +16,7 @@ from cangauge._files import atomic_path, write_texts_atomic
 from cangauge._text import number, printable
 from cangauge.cli.declare import command
 from cangauge.cli.options import ReadingOptions, check_outputs
-from cangauge.cli.output import console, emit_json, note, print_table
+from cangauge.cli.output import finish, note, print_table, progress
 from cangauge.errors import InputError
 
 if TYPE_CHECKING:
@@ -83,7 +84,6 @@ def judge_command(
         simulated ones.
     """
     from cangauge.extras.judge.judgement import judge, narrowed
-    from cangauge.logs.read import read_cells
     from cangauge.model.model_file import Model
 
     if suite:
@@ -93,16 +93,15 @@ def judge_command(
         raise InputError("belongs to --suite", field="--data", cure="give the logs themselves")
     paths = [Path(log) for log in logs]
     check_outputs([output, corrected, report], [*paths, *([model] if model else [])])
-    loaded = [reading.load(path) for path in paths]
-    columns = reading.given_columns()
-    beside = [read_cells(log.source, log.time_s, columns) if log.source else None for log in loaded]
+    with progress() as show:
+        loaded = reading.load_all(paths, show)
     judgement = judge(
         loaded,
         None if model is None else Model.load(model),
         chemistry=chemistry,
         cells=cells,
         capacity_ah=capacity_ah,
-        cell_voltages=beside,
+        cell_voltages=[reading.cells_of(log) for log in loaded],
     )
     texts = {}
     if output is not None:
@@ -115,14 +114,9 @@ def judge_command(
         if corrected is not None:
             _write_corrected(both.enter_context(atomic_path(corrected)), judgement)
         write_texts_atomic(texts)
-    if json_output:
-        result = judgement.to_dict(None if corrected is None else str(corrected))
-        emit_json(result)
-        return
-    _show(judgement)
-    for written in (output, corrected, report):
-        if written is not None:
-            note(f"wrote {written}")
+    result = judgement.to_dict(None if corrected is None else str(corrected))
+    written = [path for path in (output, corrected, report) if path is not None]
+    finish(result, partial(_show, judgement, written), as_json=json_output)
 
 
 def _suite(
@@ -134,18 +128,14 @@ def _suite(
 
     if (model is None) != (data is None):
         raise InputError("give both, or neither", field="--data/-m", cure="recorded: both")
-    with console.status("making the drives") if console.is_terminal else nullcontext() as status:
-        show = (lambda _: None) if status is None else status.update
+    with progress() as show:
+        show("making the drives")
         drives = (
             simulated_drives()
             if model is None or data is None
             else recorded_drives(sorted(data.iterdir()), Model.load(model))
         )
         scores = run_suite(started_by, drives, show=show)
-    if json_output:
-        gauge = " ".join(started_by)
-        emit_json({"schema": 1, "gauge": gauge, "scores": [asdict(each) for each in scores]})
-        return
     rows = [
         [
             score.fault,
@@ -162,7 +152,13 @@ def _suite(
         "fault", "MAE [%]", "worst [%]", "jumps/h", "within 5 % after [min]", "within 2σ [%]",
         "silent [%]",
     ]  # fmt: skip
-    print_table(f"{len(drives)} drives", head, rows)
+    result = {
+        "schema": 1,
+        "gauge": " ".join(started_by),
+        "scores": [asdict(each) for each in scores],
+    }
+    show = partial(print_table, f"{len(drives)} drives", head, rows)
+    finish(result, show, as_json=json_output)
 
 
 def _write_corrected(path: Path, judgement: Judgement) -> None:
@@ -182,7 +178,7 @@ def _write_corrected(path: Path, judgement: Judgement) -> None:
     write_table(columns, path)
 
 
-def _show(judgement: Judgement) -> None:
+def _show(judgement: Judgement, written: Sequence[Path]) -> None:
     from cangauge.extras.judge.judgement import rows_of
 
     typer.echo(printable(judgement.headline))
@@ -194,3 +190,5 @@ def _show(judgement: Judgement) -> None:
             for jump in judgement.jumps
         ]
         print_table("Jumps that the charge does not explain", ["log", "s", "% SoC"], rows)
+    for path in written:
+        note(f"wrote {path}")

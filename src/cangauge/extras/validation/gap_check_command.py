@@ -8,7 +8,7 @@ import typer
 
 from cangauge.cli.declare import command
 from cangauge.cli.options import ReadingOptions, assumed_of
-from cangauge.cli.output import emit_json, note, print_table, progress_shown
+from cangauge.cli.output import finish, note, print_table, progress
 from cangauge.errors import InputError
 
 
@@ -41,8 +41,6 @@ def gap_check_command(
         [columns] of the map file. Default: a simulated pack.
     capacity_ah : A (0.001 … 1e5 Ah)
         Charge of the logs' pack from 100 to 0 %; needed with LOGs.
-    cells : N (1 … 2000)
-        Cells in series of the logs' pack.
     at_most : N (1 … inf)
         Leave out at most this many logs.
     """
@@ -65,11 +63,15 @@ def gap_check_command(
         read, pack = [], CheckedPack.simulated()
     left_out = min(at_most or len(pack.logs), len(pack.logs))
     note(f"at most {left_out * PER_LOG} diagnoses, about half a second each")
-    with progress_shown("cangauge.validation"):
-        result = summarize(list(pack.findings(at_most)))
-    if json_output:
-        emit_json(result | {"assumed": assumed_of(read)})
-        return
-    typer.echo(summary(result))
-    headings, rows = table(result)
-    print_table("Injected size: right group first, right name first", headings, rows)
+    findings = []
+    with progress() as tell:
+        for finding in pack.findings(at_most):
+            findings.append(finding)
+            tell(f"{len(findings)} diagnoses")
+    result = summarize(findings)
+
+    def show() -> None:
+        typer.echo(summary(result))
+        print_table("Injected size: right group first, right name first", *table(result))
+
+    finish(result | {"assumed": assumed_of(read)}, show, as_json=json_output)

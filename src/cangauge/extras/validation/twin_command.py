@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import time
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
 from cangauge.cli.declare import command
 from cangauge.cli.options import check_outputs
-from cangauge.cli.output import console, emit_json, note, print_table
+from cangauge.cli.output import finish, note, print_table, progress
 
 
 @command()
@@ -73,7 +74,8 @@ def twin_command(
 
     check_outputs([output], [])
     began = time.perf_counter()
-    with console.status("simulating"):
+    with progress() as show:
+        show("simulating")
         simulated = simulate(
             effect or (),
             seed=seed,
@@ -93,16 +95,8 @@ def twin_command(
             f" {scaled.reached_v:.3g} V, not {scaled.target_v:.3g} V"
         )
     write_log(simulated.log, output)
-    result = {
-        "log": str(output),
-        **simulated.to_dict(),
-        "seconds": time.perf_counter() - began,
-    }
-    if json_output:
-        emit_json(result)
-        return
-    _show(result)
-    note(f"log: {output}")
+    result = {**simulated.to_dict(), "seconds": time.perf_counter() - began}
+    finish(result, partial(_show, result), {"log": output}, as_json=json_output)
 
 
 def _show(result: dict[str, Any]) -> None:
