@@ -168,12 +168,6 @@ class CompiledEstimator(Estimator):
         self._pull()
         return super().health
 
-    @property
-    def verdict(self) -> str:
-        """What the voltage says of the last interval; see `Estimator.verdict`."""
-        self._pull()
-        return super().verdict
-
     def uncounted_std_pct(self, seconds: float) -> float:
         """Return what the SoC's standard deviation lacks [%] when no sample came for a time [s]."""
         return float(self._core.uncounted_std_pct(seconds))
