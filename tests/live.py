@@ -273,6 +273,7 @@ class Command:
             stderr=subprocess.PIPE,
             text=True,
             env={**os.environ, "COLUMNS": "200"},
+            start_new_session=True,  # without a terminal, as systemd starts it
         )
         self._stderr: list[str] = []
 
