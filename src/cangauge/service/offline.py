@@ -11,6 +11,7 @@ import time
 from array import array
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field, replace
+from functools import partial
 from os import PathLike
 from pathlib import Path
 from typing import Any, Final, Literal, cast
@@ -21,19 +22,20 @@ from can.typechecking import Channel
 from cangauge._text import rounded
 from cangauge._typing import FloatArray
 from cangauge.bus.publish import NO_REPORT, FrameIds, PackReport
-from cangauge.bus.recording import capture_samples, open_vehicle_capture
+from cangauge.bus.recording import CaptureSamples, capture_samples, open_vehicle_capture
 from cangauge.bus.time_source import REPLAY_CLOCK_ID, TimeSourceName, is_clock
 from cangauge.bus.vehicle import Vehicle
 from cangauge.errors import InputError
 from cangauge.estimation.cells import CellEstimator
+from cangauge.estimation.compiled import make_estimator
 from cangauge.estimation.estimator import Estimator
 from cangauge.estimation.offline import (
     EstimateTable,
     Scores,
-    estimate_log,
     gap_of,
     initial_soc_of,
     score,
+    step_all,
 )
 from cangauge.estimation.settings import EstimatorSettings
 from cangauge.logs.log import Log
@@ -57,55 +59,6 @@ DOUBTFUL_COVER: Final = 0.5
 
 Origin = Literal["given", "log", "voltage"]
 """Source of the initial SoC: an option, the log's soc_pct, or the first voltages."""
-
-
-@dataclass(frozen=True, eq=False)
-class RecordedCapture:
-    """Samples of a capture: unlike a log's rows, they may lack voltage and temperature (NaN).
-
-    Columns of shape (n,), as in a `Log`; time does not decrease.
-    """
-
-    time_s: FloatArray
-    current_a: FloatArray
-    voltage_v: FloatArray
-    temperature_c: FloatArray
-    soc_pct: FloatArray | None
-    name: str
-    source: str
-    temperature_source: str
-    remarks: tuple[str, ...] = ()
-
-    def __len__(self) -> int:
-        """Return the number of rows."""
-        return int(self.time_s.size)
-
-    @property
-    def duration_s(self) -> float:
-        """Time from the first row to the last [s]."""
-        return float(self.time_s[-1] - self.time_s[0])
-
-    def as_log(self) -> Log | None:
-        """Return the rows with a voltage and a new time, at 0 °C; None if there are fewer than 2.
-
-        Enough to check the sign of the current.
-        """
-        rows = np.isfinite(self.voltage_v)
-        rows[1:] &= np.diff(self.time_s) > 0.0
-        if rows.sum() < 2:
-            return None
-        return Log(
-            time_s=self.time_s[rows],
-            current_a=self.current_a[rows],
-            voltage_v=self.voltage_v[rows],
-            temperature_c=np.zeros(int(rows.sum())),
-            soc_pct=None if self.soc_pct is None else self.soc_pct[rows],
-            name=self.name,
-            source=self.source,
-        )
-
-
-Recorded = Log | RecordedCapture
 
 
 class PackHistory:
@@ -180,7 +133,7 @@ class RecordedEstimate:
 
     Parameters
     ----------
-    recorded : Log or RecordedCapture
+    recorded : Log or CaptureSamples
         n samples.
     table : EstimateTable
         n estimates.
@@ -197,7 +150,7 @@ class RecordedEstimate:
         Health, power and cells.
     """
 
-    recorded: Recorded
+    recorded: Log | CaptureSamples
     table: EstimateTable
     scores: Scores
     model: Model
@@ -296,11 +249,12 @@ def estimate_recorded_log(
         origin = "log"
         start_pct = initial_soc_of(log, settings.capacity_ah or model.capacity_ah)
         settings = replace(settings, initial_soc_pct=start_pct)
+    began, estimator = time.perf_counter(), make_estimator(model, settings)
     history = PackHistory() if pack is None else pack
-    observe = history.observe if history.takes_samples else None
-    table, scores = estimate_log(
-        log, model, settings, progress=progress, observe=observe, at_end=history.take
-    )
+    observe = partial(history.observe, estimator) if history.takes_samples else None
+    table = step_all(estimator, log, progress=progress, observe=observe)
+    scores = score(table, log, time.perf_counter() - began)
+    history.take(estimator)
     return RecordedEstimate(log, table, scores, model, settings, origin, pack=history)
 
 
@@ -392,25 +346,20 @@ def estimate_capture(
             cure=f"check that this is the bus of {vehicle.name} (see `cangauge inspect`)",
         )
     best = max(found, key=lambda bus: len(bus.estimates))
-    best.pack.report = best.pipeline.report()
-    counts, table = best.pipeline.counts, EstimateTable.of(best.estimates)
+    pipeline, table = best.pipeline, EstimateTable.of(best.estimates)
+    best.pack.report, counts = pipeline.report(), pipeline.counts
     time_s, current_a, voltage_v, temperature_c, soc_pct = np.array(best.values).reshape(-1, 5).T
+    time_s, remarks = _without_steps_back(time_s), _remarks(source, counts, len(found))
+    recorded = CaptureSamples(
+        time_s, current_a, voltage_v, temperature_c, soc_pct, str(path),
+        settings.temperature_source, pipeline.decoder.statistics, capture.info,
+        (*capture.info.remarks, *remarks),
+    )  # fmt: skip
     # With a model, another pack's voltage is implausible.
-    is_known = np.isfinite(voltage_v).any()
-    seen_v = voltage_v if is_known else capture_samples(path, vehicle).voltage_v
-    require_same_pack(seen_v, model, str(path))
-    recorded = RecordedCapture(
-        time_s=_without_steps_back(time_s),
-        current_a=current_a,
-        voltage_v=voltage_v,
-        temperature_c=temperature_c,
-        soc_pct=soc_pct if np.isfinite(soc_pct).any() else None,
-        name=path.name.split(".")[0],
-        source=str(path),
-        temperature_source=settings.temperature_source,
-        remarks=(*capture.info.remarks, *_remarks(source, counts, len(found))),
-    )
-    # `score` needs only columns that a recording has.
+    is_known = np.isfinite(recorded.voltage_v).any()
+    own = recorded if is_known else capture_samples(path, vehicle)
+    require_same_pack(own.voltage_v, model, str(path))
+    # `score` needs only columns that a capture has.
     scores = score(table, cast("Log", recorded), time.perf_counter() - began)
     origin: Origin = "voltage" if settings.initial_soc_pct is None else "given"
     return RecordedEstimate(
