@@ -53,7 +53,7 @@ class Car:
         for frames in self.frames[first:last]:
             for frame in frames:
                 self.pipeline.handle(can.Message.__copy__(frame))
-            sent += self.pipeline.heartbeat(is_stale=False)
+            sent += self.pipeline.heartbeat()
         return sent
 
     def reload(self, text: str | None = None) -> LoopSettings | None:

@@ -260,10 +260,8 @@ class Loop:
             self._samplers = [each for each in self._samplers if each is not output]
 
     def _beat(self) -> None:
-        silent_s = self._now_s - self._came_s
-        is_stale = silent_s > max(self._settings.timeout_s, self._pipeline.least_timeout_s)
-        reasons = self._report_findings()
-        self._send(self._pipeline.heartbeat(is_stale=is_stale, silent_s=silent_s, reasons=reasons))
+        silent_s, reasons = self._now_s - self._came_s, self._report_findings()
+        self._send(self._pipeline.heartbeat(silent_s, self._settings.timeout_s, reasons))
         # Stay on the clock's grid; skip beats missed while the process was suspended.
         missed = max(math.floor((self._now_s - self._beat_s) / ESTIMATE_EVERY_S), 0)
         self._beat_s += (missed + 1) * ESTIMATE_EVERY_S

@@ -100,17 +100,13 @@ class PackHistory:
                 volts = cells.voltage_v[self._row].tolist()
                 self._cell_estimator.update(estimator.pack_tick(sample), volts, [0.0] * cells.count)
         self._row += 1
-        self.add(sample.time_s, lambda: self._report_of(estimator))
+        self.add(sample.time_s, lambda: self.report_of(estimator))
 
     def add(self, time_s: float, report: Callable[[], PackReport]) -> None:
         """Keep the report of a sample's time [s], if its interval has begun."""
         if self._keeps_rows and not self._due_s - self._every_s <= time_s < self._due_s:
             self._due_s = time_s + self._every_s
             self._reports.append((time_s, report()))
-
-    def take(self, estimator: Estimator) -> None:
-        """Take the estimator after the last sample of a log."""
-        self.report = self._report_of(estimator)
 
     @property
     def columns(self) -> dict[str, FloatArray]:
@@ -122,7 +118,8 @@ class PackHistory:
             rows.append({"time_s": time_s, **parts["health"], **parts["power"], **cells})
         return {name: np.array([row[name] for row in rows], np.float64) for name in rows[0]}
 
-    def _report_of(self, estimator: Estimator) -> PackReport:
+    def report_of(self, estimator: Estimator) -> PackReport:
+        """Return health and power after the estimator's latest sample, and the log's cells."""
         cells = None if self._cell_estimator is None else self._cell_estimator.report
         return PackReport(estimator.health, estimator.power(), cells)
 
@@ -254,7 +251,7 @@ def estimate_recorded_log(
     observe = partial(history.observe, estimator) if history.takes_samples else None
     table = step_all(estimator, log, progress=progress, observe=observe)
     scores = score(table, log, time.perf_counter() - began)
-    history.take(estimator)
+    history.report = history.report_of(estimator)
     return RecordedEstimate(log, table, scores, model, settings, origin, pack=history)
 
 

@@ -209,14 +209,14 @@ class Pipeline:
         sample = self.decoder.handle(message)
         if sample is None:
             return False
-        self._take(sample)
+        self._estimate_after(sample)
         return True
 
     def finish(self) -> bool:
         """Release the last current if it is unpaired; return whether it completed a sample."""
         sample = self.decoder.flush()
         if sample is not None:
-            self._take(sample)
+            self._estimate_after(sample)
         return sample is not None
 
     @property
@@ -256,7 +256,7 @@ class Pipeline:
             beginnings=self._time.beginnings,
         )
 
-    def _take(self, sample: Sample) -> None:
+    def _estimate_after(self, sample: Sample) -> None:
         self.samples += 1
         self.latest_sample = sample
         is_implausible = math.isnan(sample.voltage_v) and self.decoder.is_voltage_implausible
@@ -331,20 +331,31 @@ class Pipeline:
         return self._publisher.publish(estimate, self.samples, self.report)
 
     def heartbeat(
-        self, *, is_stale: bool, silent_s: float = 0.0, reasons: Reason = Reason.NONE
+        self,
+        silent_s: float = 0.0,
+        timeout_s: float = math.inf,
+        reasons: Reason = Reason.NONE,
     ) -> list[can.Message]:
         """Return the frames due every `publish.ESTIMATE_EVERY_S`.
 
-        `is_stale`: no sample came within the service's time-out. `silent_s` is the time since the
-        latest sample that the estimator took [s]; with receive stamps a silence longer than the
-        current's own time-out is stale as well. `reasons` are the loop's own findings.
+        Parameters
+        ----------
+        silent_s : float
+            Time since the latest sample that the estimator took [s].
+        timeout_s : float
+            The estimate is stale after a longer silence [s]. With receive stamps it is not between
+            two samples of a slow source, and after the current's own time-out in any case.
+        reasons : Reason
+            Findings of the loop.
         """
         if self._publisher is None:
             return []
         estimate = self.estimate_now()
         if not self.is_replay:
-            is_stale = is_stale or silent_s > self.decoder.health["current"].timeout_s
-        if is_stale and self.taken:
+            current = self.decoder.health["current"]
+            slowest_s = MISSED_AT_LEAST * current.period_s  # NaN, which max drops, while not known
+            timeout_s = min(max(timeout_s, slowest_s), current.timeout_s)
+        if silent_s > timeout_s and self.taken:
             reasons |= Reason.INPUT_STALE
         if reasons:
             reasons |= estimate.reasons
@@ -358,12 +369,6 @@ class Pipeline:
         self.published = estimate
         age_s = silent_s if self.taken else math.nan
         return self._publisher.beat(estimate, self.samples, age_s, self.report)
-
-    @property
-    def least_timeout_s(self) -> float:
-        """Lower bound of a time-out for samples [s]: a slow source is not stale between two."""
-        period_s = self.decoder.health["current"].period_s
-        return 0.0 if self.is_replay or math.isnan(period_s) else MISSED_AT_LEAST * period_s
 
     # --- reload and restart
 
