@@ -14,18 +14,18 @@ from cangauge.service.config import ConfigKey, config_keys
 
 def config_parameters(*names: str) -> list[inspect.Parameter]:
     """Return the options of keys, such as "channel", as typer reads them; without names of all."""
-    keys = [key for key in config_keys() if key.info.option]
+    keys = [key for key in config_keys() if key.option]
     return [_parameter(key) for key in keys if not names or key.name in names]
 
 
 def _parameter(key: ConfigKey) -> inspect.Parameter:
-    kind: Any = Path if key.info.is_path else float if key.kind == "number" else str
+    kind: Any = Path if key.is_path else float if key.kind == "number" else str
     if key.name == "bus_options":
         kind = list[str]
     elif key.name == "initial_soc":  # "auto" is no number: checked by the configuration
         kind = str
-    flags = key.info.option.split(", ")
-    option = typer.Option(*flags, metavar=key.info.metavar or None, help=key.help)
+    flags = key.option.split(", ")
+    option = typer.Option(*flags, metavar=key.metavar or None, help=key.help)
     return inspect.Parameter(
         key.name,
         inspect.Parameter.KEYWORD_ONLY,

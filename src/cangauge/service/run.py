@@ -272,7 +272,7 @@ def _log_changes(old: RunConfig, new: RunConfig) -> None:
     late = ", ".join(
         each.name
         for each in config_keys()
-        if each.info.restart and each.value_in(before) != each.value_in(after)
+        if each.restart and each.value_in(before) != each.value_in(after)
     )
     if late:
         text = f"{late}: takes effect after a restart of the service"
