@@ -204,10 +204,7 @@ class Monitor:
             self._report_due_s = now_s + REPORT_EVERY_S
             self._report = pipeline.report().to_dict()
         statistics, settings = pipeline.decoder.statistics, pipeline.settings
-        rejects = {
-            name: sum(int(getattr(each, name)) for each in statistics.messages.values())
-            for name in _REJECTS
-        }
+        rejects = {name: getattr(statistics, name) for name in _REJECTS}
         rejected = sum(count for name, count in rejects.items() if name not in _OF_VALUES)
         counts = {name: getattr(port, name, None) for name in BUS_COUNTS}
         polls, record = getattr(port, "polls", None), self._record()
