@@ -63,7 +63,8 @@ def test_the_keys_of_a_status(watched: Watched) -> None:
     assert status["estimate"]["soc_pct"] == watched.pipeline.latest.soc_pct
     frames = watched.pipeline.counts.frames
     assert status["frames"] == {"received": frames, "wanted": frames, "used": frames, "lost": 0}
-    assert status["bus_counts"] == {"garbled": 1, "error_frames": 2, "unsent": 3, "queue_drops": 4}
+    counts = {"garbled": 1, "error_frames": 2, "unsent": 3, "queue_drops": 4, "foreign": 0}
+    assert status["bus_counts"] == counts
     assert status["step"]["count"] == 900
 
 

@@ -141,7 +141,7 @@ class Loop:
         pipeline, every_s = self._pipeline, self._settings.poll_every_s
         targets, ids = pipeline.vehicle.poll_targets, pipeline.settings.ids
         self._poller = None if every_s is None or not targets else Poller(targets, every_s)
-        self._port.polls = None if self._poller is None else self._poller.counts
+        self._monitor.polls = None if self._poller is None else self._poller.counts
         not_input = set(ids.published)
         if self._poller is not None:
             not_input |= self._poller.request_ids
@@ -232,7 +232,7 @@ class Loop:
                 text = f"another node on this bus sends 0x{frame_id:X}, which this service"
                 text += " publishes: is a second service running? Give one of them other ids"
                 _warn("bus.duplicate_sender", f"{text} ([ids] of the configuration)")
-            self._port.foreign = self._own.foreign
+            self._monitor.foreign = self._own.foreign
         elif self._poller is not None and frame_id in self._poller.request_ids:
             if not self._asked.is_echo(message):
                 self._poller.note_other_tester(self._now_s)
