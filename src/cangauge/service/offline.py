@@ -13,7 +13,6 @@ from collections.abc import Callable
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from os import PathLike
-from pathlib import Path
 from typing import Any, Final, Literal, cast
 
 import numpy as np
@@ -279,15 +278,15 @@ def estimate_capture(
     model: Model,
     settings: EstimatorSettings | None = None,
     *,
-    time_source: TimeSourceName | Literal["auto"] = "auto",
     clock_id: int = REPLAY_CLOCK_ID,
     keeps_pack: bool = False,
     progress: Callable[[int], None] | None = None,
 ) -> RecordedEstimate:
     """Estimate a capture, bit for bit as the service does with the same frames.
 
-    Like the service it starts from the first voltages unless `settings` holds an initial SoC; the
-    car's own SoC is the reference to compare with only.
+    Bus time is that of REPLAY_CLOCK if the capture holds one, else the receive stamps. Like the
+    service it starts from the first voltages unless `settings` holds an initial SoC; the car's own
+    SoC is the reference to compare with only.
 
     Parameters
     ----------
@@ -296,8 +295,6 @@ def estimate_capture(
         Its temperature source replaces an unknown one of `settings`.
     model : Model
     settings : EstimatorSettings, optional
-    time_source : {"auto", "receive", "replay-clock"}
-        "auto": the replay clock if the capture holds one, else the receive stamps.
     clock_id : int
         REPLAY_CLOCK's id.
     keeps_pack : bool
@@ -311,19 +308,17 @@ def estimate_capture(
         If the capture cannot be read, gives no sample, or its voltage is another pack's.
     """
     began = time.perf_counter()
-    settings, path = settings or EstimatorSettings(), Path(path)
-    if settings.temperature_source == "unknown":
-        settings = replace(settings, temperature_source=vehicle.temperature_source)
-    source: TimeSourceName = "receive" if time_source == "auto" else time_source
+    source: TimeSourceName = "receive"
     buses: dict[Channel | None, _Bus] = {}
     capture = open_vehicle_capture(path, vehicle)
     for number, message in enumerate(capture, start=1):
-        if time_source == "auto" and source == "receive" and is_clock(message, clock_id):
+        if source == "receive" and is_clock(message, clock_id):
             # Earlier frames have no log time; a live run starts here as well.
             source = "replay-clock"
             buses.clear()
         if message.channel not in buses:
-            chosen = PipelineSettings(settings, source, FrameIds(replay_clock=clock_id))
+            ids = FrameIds(replay_clock=clock_id)
+            chosen = PipelineSettings(settings or EstimatorSettings(), source, ids)
             pipeline = Pipeline(vehicle, model, chosen, publishes=False)
             buses[message.channel] = _Bus(pipeline, PackHistory(keeps_rows=keeps_pack))
         bus = buses[message.channel]
@@ -345,6 +340,7 @@ def estimate_capture(
     best = max(found, key=lambda bus: len(bus.estimates))
     pipeline, table = best.pipeline, EstimateTable.of(best.estimates)
     best.pack.report, counts = pipeline.report(), pipeline.counts
+    settings = pipeline.estimator.settings
     time_s, current_a, voltage_v, temperature_c, soc_pct = np.array(best.values).reshape(-1, 5).T
     time_s, remarks = _without_steps_back(time_s), _remarks(source, counts, len(found))
     recorded = CaptureSamples(
