@@ -28,6 +28,14 @@ def test_a_hangup_reloads() -> None:
     assert signal.getsignal(signal.SIGHUP) == before
 
 
+def test_a_hangup_held_back_during_the_start_reloads_after_it() -> None:
+    calls = list[str]()
+    signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGHUP])
+    signal.raise_signal(signal.SIGHUP)
+    with reload_on_hangup(lambda: calls.append("reload")):
+        assert calls == ["reload"]
+
+
 LOOP = """
 import sys, time
 from cangauge.service.lifecycle import reload_on_hangup, stop_on_signals

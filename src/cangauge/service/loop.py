@@ -48,7 +48,7 @@ SEND_WITHIN_S: Final = 0.1
 """Longest time that a frame waits for room in the transmit queue [s]: until the next one is due.
 The loop itself never waits: a full queue (no other node on the bus) costs frames, not the
 estimate."""
-SAID_FROM_S: Final = 1.0
+LOGGED_FROM_S: Final = 1.0
 """Smallest step of the stamps' clock that is logged [s]; smaller ones are its drift."""
 CHECKPOINT_EVERY_S: Final = 10.0
 """Interval of checkpoints [s]. A service that is killed and restarts within three seconds misses
@@ -192,7 +192,7 @@ class Loop:
             self._ask(self._poller.due(self._now_s))
         if self._now_s >= self._keep_s:
             self._keep_s = self._now_s + LATE_S
-            self._keep_house()
+            self._housekeep()
 
     def _process(self, messages: list[can.Message], now_s: float) -> None:
         pipeline, record, poller = self._pipeline, self._record, self._poller
@@ -272,7 +272,7 @@ class Loop:
         if stamps.shift_s != self._shift_s:
             step_s, self._shift_s = self._shift_s - stamps.shift_s, stamps.shift_s
             self._pipeline.stamp_shift_s = stamps.shift_s
-            if abs(step_s) >= SAID_FROM_S:
+            if abs(step_s) >= LOGGED_FROM_S:
                 text = f"the clock of the time stamps was set by {step_s:+.1f} s; bus time follows"
                 _warn("bus.clock_set", f"{text} the monotonic clock", step_s=step_s)
         if stamps.is_uncertain(steady_s()):
@@ -305,7 +305,7 @@ class Loop:
             self._asked.note_sent(frame)
             self._port.post(frame, SEND_WITHIN_S)
 
-    def _keep_house(self) -> None:
+    def _housekeep(self) -> None:
         """Report lost frames, save, reload and show."""
         now_s, drops = self._now_s, self._port.queue_drops or 0
         if drops > self._drops:
