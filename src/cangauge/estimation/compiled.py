@@ -158,11 +158,6 @@ class CompiledEstimator(Estimator):
         return cast("Estimate", self._core.estimate())
 
     @property
-    def time_s(self) -> float:
-        """The estimator's own time at the latest sample [s]: it always increases."""
-        return float(self._record["clock"]["last_s"])
-
-    @property
     def health(self) -> Health:
         """Capacity, resistance and current offset, with standard deviations."""
         self._pull()
