@@ -249,7 +249,7 @@ def _handle_a_day(pipe: Any, hours: float) -> None:
         sample = Sample(1.7e9 + 0.1 * number, *next(rows))
         for frame in encoder.encode(sample):
             pipeline.handle(frame)
-        pipeline.heartbeat(is_stale=False)
+        pipeline.heartbeat()
         if number == min(18_000, total // 2):
             first = _resident_mb()
     pipe.send(

@@ -34,6 +34,7 @@ from cangauge.service.events import RateLimitFilter
 from cangauge.service.loop import Loop, LoopSettings
 from cangauge.service.output import Output
 from cangauge.service.pipeline import Pipeline, PipelineSettings
+from cangauge.service.status import Monitor
 from cangauge.types import Estimate, Sample
 from synthetic import synthetic_log
 
@@ -122,6 +123,7 @@ class Service:
     error: BaseException | None = None
 
     def __enter__(self) -> Self:
+        self.monitor = Monitor(self.pipeline, self.port)
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run)
         self._logged = LoggedLines("cangauge.service.loop", self._thread)
@@ -156,6 +158,7 @@ class Service:
                 self.settings,
                 outputs=[Rows(self.rows), *([self.record] if self.record else [])],
                 record=self.record,
+                monitor=self.monitor,
                 checkpoint=self.checkpoint,
             )
             loop.run(self._stop.is_set)
@@ -273,6 +276,7 @@ class Command:
             stderr=subprocess.PIPE,
             text=True,
             env={**os.environ, "COLUMNS": "200"},
+            start_new_session=True,  # without a terminal, as systemd starts it
         )
         self._stderr: list[str] = []
 

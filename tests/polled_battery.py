@@ -96,8 +96,8 @@ def polling_service(address: BusAddress, every_s: float = 1.0) -> Service:
 def temperature_and_cells_come(address: BusAddress) -> None:
     """The service asks, and its signals are those of the replies."""
     with Battery(address) as battery, polling_service(address) as service:
-        assert waits(lambda: service.port.polls is not None)  # the loop begins in its thread
-        polls = service.port.polls
+        assert waits(lambda: service.monitor.polls is not None)  # the loop begins in its thread
+        polls = service.monitor.polls
         assert polls is not None
         assert waits(lambda: polls.answers >= 4)
         decoder = service.pipeline.decoder
@@ -106,4 +106,4 @@ def temperature_and_cells_come(address: BusAddress) -> None:
         assert sorted({group for _, group in battery.requests}) == [2, 4]
         assert battery.early == 0
     assert polls.unanswered == polls.negative == polls.other_tester == 0
-    assert service.port.foreign == 0
+    assert service.monitor.foreign == 0

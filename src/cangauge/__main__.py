@@ -9,7 +9,7 @@ import sys
 
 
 def main() -> None:
-    """Run the command line; a service ignores SIGHUP, the request to reload, while it loads."""
+    """Run the command line; SIGHUP, the request to reload, waits until a service has loaded."""
     for number in range(3):
         try:
             os.fstat(number)
@@ -19,7 +19,10 @@ def main() -> None:
         # In a locale without "±" or "°C" the text is legible; otherwise it would be an error.
         sys.stdout.reconfigure(errors="backslashreplace")
     if sys.argv[1:2] == ["run"] and hasattr(signal, "SIGHUP"):
-        signal.signal(signal.SIGHUP, signal.SIG_IGN)
+        from cangauge.service.lifecycle import has_terminal  # noqa: PLC0415 - for `run` only
+
+        if not has_terminal():  # else its default: closing the terminal ends the start as well
+            signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGHUP])
     from cangauge.cli.app import main as command_line  # noqa: PLC0415 - takes a second
 
     command_line()

@@ -72,7 +72,6 @@ def assert_same_state(reference: Estimator, compiled: Estimator) -> None:
     assert_same(compiled.snapshot().model_dump(), reference.snapshot().model_dump())
     assert_same(compiled.health, reference.health)
     assert_same(compiled.power(), reference.power())
-    assert compiled.verdict == reference.verdict
 
 
 def test_extension_is_built_from_these_sources() -> None:

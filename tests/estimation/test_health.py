@@ -8,7 +8,8 @@ from functools import cache
 import numpy as np
 import pytest
 
-from cangauge.estimation.estimator import Estimator, EstimatorSettings
+from cangauge.estimation.estimator import Estimator
+from cangauge.estimation.settings import EstimatorSettings
 from cangauge.model.delay_line import delayed_currents
 from cangauge.model.model_file import Model
 from cangauge.model.published import CAPACITY_AH, leaf_2012_model, leaf_2012_model_file

@@ -417,7 +417,7 @@ def published(model: cangauge.Model) -> list[str]:
         while due_s <= frame.timestamp:
             lines += [
                 f"{due_s:.1f} {sent.arbitration_id:X}#{sent.data.hex()}"
-                for sent in pipeline.heartbeat(is_stale=False)
+                for sent in pipeline.heartbeat()
             ]
             due_s += 0.1
         pipeline.handle(frame)

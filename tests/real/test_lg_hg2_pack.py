@@ -11,10 +11,11 @@ import pytest
 
 import cangauge
 from cangauge.estimation.compiled import make_estimator
-from cangauge.estimation.estimator import Estimator, EstimatorSettings
+from cangauge.estimation.estimator import Estimator
 from cangauge.estimation.health import Health
 from cangauge.estimation.offline import samples_of
 from cangauge.estimation.power import PackLimits
+from cangauge.estimation.settings import EstimatorSettings
 from cangauge.logs.log import Log
 from cangauge.logs.read import read_log
 from cangauge.model.coulomb_counting import discharged_ah

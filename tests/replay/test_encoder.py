@@ -169,6 +169,26 @@ def test_the_check_accepts_exactly_what_can_be_sent(value: float) -> None:
         assert encoder.encode(rows_of(log)[0])
 
 
+def test_a_value_that_rounds_out_of_its_range_is_refused_before_sending() -> None:
+    """Half a step beyond the last code, rounding to even may stay or go on to the next one."""
+    vehicle, outcomes = VEHICLES["generic"], set()
+    for column, signal in (("current_a", vehicle.current), ("voltage_v", vehicle.voltage)):
+        codec = signal.codec
+        for end, beyond in zip(codec.range, (-codec.half_step, codec.half_step), strict=True):
+            row = {"current_a": [1.0], "voltage_v": [380.0], column: [end + beyond]}
+            log, encoder = Log([0.0], temperature_c=[20.0], **row), FrameEncoder(vehicle)
+            try:
+                encoder.encode(rows_of(log)[0])
+            except InputError:
+                outcomes.add("refused")
+                with pytest.raises(InputError, match=codec.name):
+                    encoder.check_range(log)
+            else:
+                outcomes.add("sent")
+                encoder.check_range(log)
+    assert outcomes == {"refused", "sent"}
+
+
 def test_multiplexed_current_cannot_be_replayed(tmp_path: Path) -> None:
     (tmp_path / "x.dbc").write_text(
         "BO_ 256 M: 8 X\n"

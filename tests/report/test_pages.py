@@ -12,6 +12,9 @@ import pytest
 from markupsafe import escape
 
 from cangauge._version import __version__
+from cangauge.bus.captures import CaptureInfo
+from cangauge.bus.decoder import FrameStatistics
+from cangauge.bus.recording import CaptureSamples
 from cangauge.estimation.offline import estimate_log
 from cangauge.estimation.settings import EstimatorSettings
 from cangauge.extras.report.charts import Figure, TimeFigures
@@ -24,7 +27,7 @@ from cangauge.logs.canonical import write_log
 from cangauge.logs.log import Log
 from cangauge.logs.read import read_log
 from cangauge.model.model_file import Model
-from cangauge.service.offline import RecordedCapture, RecordedEstimate
+from cangauge.service.offline import RecordedEstimate
 from cangauge.types import REASON_WORDS, Reason
 from report_html import MAX_PAGE_BYTES, Html
 from synthetic import synthetic_log
@@ -202,8 +205,17 @@ def test_samples_without_voltage_or_any_estimate(found: Identification, log: Log
     page = estimate_page(
         replace(
             estimate,
-            recorded=RecordedCapture(
-                few.time_s, few.current_a, nothing, nothing, nothing, "parked", "", "pack"
+            recorded=CaptureSamples(
+                few.time_s,
+                few.current_a,
+                nothing,
+                nothing,
+                nothing,
+                "parked.log",
+                "pack",
+                FrameStatistics(),
+                CaptureInfo("candump", "us"),
+                (),
             ),
             table=replace(estimate.table, **dict.fromkeys(numbers, nothing)),
             scores=replace(estimate.scores, soc_mae_pct=None),

@@ -206,10 +206,10 @@ def test_each_key_is_described_and_each_option_declared_once() -> None:
     keys = {key.name: key for key in config_keys()}
     assert set(keys) > {"model", "ids.soc_estimate", "full_charge.voltage_v", "checks.voltage"}
     assert all(key.text for key in keys.values())
-    flags = [flag for key in keys.values() for flag in re.split(", ", key.info.option) if flag]
+    flags = [flag for key in keys.values() for flag in re.split(", ", key.option) if flag]
     assert len(flags) == len(set(flags))
     until = keys["until_idle_s"]
-    assert (until.info.option, until.info.unit, until.bounds) == (
+    assert (until.option, until.unit, until.bounds) == (
         "--until-idle",
         "s",
         "> 0, ≤ 1e+09",

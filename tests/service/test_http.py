@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import itertools
 import json
+import math
 import socket
 import time
 import urllib.error
@@ -64,6 +65,14 @@ def test_status_and_health(http: Live, watched: Watched) -> None:
     assert json.loads(get(http.port, "/healthz")[1])["ok"]
     for path in ("/", "/../etc/passwd"):
         assert get(http.port, path)[0] == 404
+
+
+def test_a_number_that_is_not_finite_is_null(http: Live, watched: Watched) -> None:
+    latest = watched.monitor.latest
+    broken = latest.status | {"samples_per_s": math.nan, "estimate": {"soc_pct": math.inf}}
+    http.on_snapshot(type(latest)(time.monotonic(), broken))
+    assert waits(lambda: b'"soc_pct": null' in get(http.port, "/status")[1])
+    assert b'"samples_per_s": null' in get(http.port, "/status")[1]
 
 
 def test_a_loop_that_does_not_turn_is_not_healthy(http: Live, watched: Watched) -> None:

@@ -92,7 +92,7 @@ def run(frames: list[can.Message], settings: EstimatorSettings = START) -> Resul
             assert pipeline.latest_sample is not None
             result.samples.append(pipeline.latest_sample)
             result.estimates.append(pipeline.latest)
-        published = reader.read(pipeline.heartbeat(is_stale=False)[0])
+        published = reader.read(pipeline.heartbeat()[0])
         assert isinstance(published, SocEstimate)
         result.published[frame.timestamp] = published
     return result
@@ -262,7 +262,7 @@ def test_silence_is_timed_by_the_loops_clock() -> None:
     reader = SocReader()
 
     def published(silent_s: float) -> SocEstimate:
-        content = reader.read(result.pipeline.heartbeat(is_stale=False, silent_s=silent_s)[0])
+        content = reader.read(result.pipeline.heartbeat(silent_s)[0])
         assert isinstance(content, SocEstimate)
         return content
 
@@ -284,9 +284,11 @@ def test_slow_source_is_not_stale_between_samples() -> None:
     for sample in samples_of(log):
         for frame in encoder.encode(sample):
             pipeline.handle(frame)
-    assert pipeline.least_timeout_s == pytest.approx(15.0)
-    replayed = Pipeline(VEHICLE, leaf_model(), PipelineSettings(START, "replay-clock"))
-    assert replayed.least_timeout_s == 0.0
+    stale = []
+    for silent_s in (14.9, 15.1):
+        pipeline.heartbeat(silent_s, 2.0)
+        stale.append(bool(pipeline.published.reasons & Reason.INPUT_STALE))
+    assert stale == [False, True]
 
 
 def test_reason_is_given_for_signals_never_accepted() -> None:

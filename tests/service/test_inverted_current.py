@@ -82,7 +82,7 @@ def test_the_bits_of_the_frame_do_not_move() -> None:
     pipeline = driven(inverted(short_log(700.0, rate_hz=2.0)))
     assert pipeline.latest.reasons & Reason.SIGN_SUSPECT
     assert not pipeline.latest.reasons & Reason.IMPLAUSIBLE_INPUT
-    content = SocReader().read(pipeline.heartbeat(is_stale=False)[0])
+    content = SocReader().read(pipeline.heartbeat()[0])
     assert isinstance(content, SocEstimate)
     assert content.status is Status.INVALID
     expected = pipeline.published.reasons & ~Reason.SIGN_SUSPECT | Reason.IMPLAUSIBLE_INPUT

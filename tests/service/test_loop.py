@@ -314,7 +314,7 @@ def test_two_services_with_the_same_ids_notice_each_other() -> None:
         assert waits(lambda: bool(one.pipeline.published.reasons & Reason.DUPLICATE_SENDER))
     for service in (one, two):
         assert "sends 0x5A" in service.warnings[0]
-        assert service.port.foreign >= 3
+        assert service.monitor.foreign >= 3
         assert service.pipeline.counts.frames == 0  # they are not input
 
 
@@ -322,7 +322,7 @@ def test_own_frames_that_the_bus_returns_are_not_foreign() -> None:
     with multicast_service(20_000 + (os.getpid() + 7919) % 20_000) as alone:
         time.sleep(0.5)  # five frames
     assert alone.warnings == []
-    assert alone.port.foreign == 0
+    assert alone.monitor.foreign == 0
 
 
 @pytest.mark.parametrize("echoes", [False, True])

@@ -77,6 +77,7 @@ def test_the_abstract_name_space() -> None:
         ({"NOTIFY_SOCKET": "/x", "WATCHDOG_USEC": "10000000"}, True, 2.5),
         ({"NOTIFY_SOCKET": "/x", "WATCHDOG_USEC": "10000000", "WATCHDOG_PID": "1"}, True, None),
         ({"NOTIFY_SOCKET": "/x", "WATCHDOG_USEC": "soon"}, True, None),
+        ({"NOTIFY_SOCKET": "/x", "WATCHDOG_USEC": "0"}, True, None),
     ],
 )
 def test_what_the_environment_asks_for(

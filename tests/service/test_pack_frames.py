@@ -193,7 +193,7 @@ def test_live_health_power_and_cells_equal_offline_ones(tmp_path: Path) -> None:
     assert (last.cells, last.weakest) == (CELLS_ON_BUS, 40)
     assert last.soc_pct < offline.estimate.soc_pct - 3.0
     assert last.sum_error_v == pytest.approx(0.03, abs=0.03)
-    contents = [SocReader().read(each) for each in pipeline.heartbeat(is_stale=False)]
+    contents = [SocReader().read(each) for each in pipeline.heartbeat()]
     assert any(isinstance(each, SocCells) and each.weakest_cell == 40 for each in contents)
 
 
@@ -210,7 +210,7 @@ def test_cells_follow_a_reloaded_model(tmp_path: Path) -> None:
 
 def test_no_cell_frame_without_cell_signals() -> None:
     pipeline = Pipeline(Vehicle.load("generic"), leaf_model())
-    kinds = {type(SocReader().read(each)) for each in pipeline.heartbeat(is_stale=False)}
+    kinds = {type(SocReader().read(each)) for each in pipeline.heartbeat()}
     assert SocHealth in kinds
     assert SocPower in kinds
     assert SocCells not in kinds

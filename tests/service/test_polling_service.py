@@ -32,7 +32,7 @@ def test_temperature_and_cells_are_polled_over_udp() -> None:
 def test_a_battery_that_does_not_answer_costs_nothing(manner: str) -> None:
     address = BusAddress("virtual", f"polled {manner}")
     with Battery(address, manner) as battery, polling_service(address) as service:
-        polls = service.port.polls
+        polls = service.monitor.polls
         assert polls is not None
         wanted = {NEGATIVE: "negative", PENDING: "answers", SILENT: "unanswered"}[manner]
         assert waits(lambda: getattr(polls, wanted) >= 2, 8.0)
@@ -47,7 +47,7 @@ def test_a_battery_that_does_not_answer_costs_nothing(manner: str) -> None:
 def test_another_tester_pauses_the_requests() -> None:
     address = BusAddress("virtual", "two testers")
     with Battery(address) as battery, polling_service(address) as service:
-        polls = service.port.polls
+        polls = service.monitor.polls
         assert polls is not None
         assert waits(lambda: polls.answers >= 2)
         battery.ask(4)

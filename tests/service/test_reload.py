@@ -53,7 +53,7 @@ class Car:
         for frames in self.frames[first:last]:
             for frame in frames:
                 self.pipeline.handle(can.Message.__copy__(frame))
-            sent += self.pipeline.heartbeat(is_stale=False)
+            sent += self.pipeline.heartbeat()
         return sent
 
     def reload(self, text: str | None = None) -> LoopSettings | None:
@@ -137,8 +137,9 @@ def estimate_counter(frame: can.Message) -> int:
 
 
 def test_a_reload_changes_the_vehicle_and_keeps_counts(car: Car) -> None:
-    frames = car.pipeline.counts.frames
+    frames, wanted = car.pipeline.counts.frames, car.pipeline.decoder.statistics.wanted
     assert car.reload('vehicle = "leaf_aze0"\n') is not None
+    assert car.pipeline.decoder.statistics.wanted == wanted > 0
     car.drive(1000, 1100)  # the frames of the other car: not wanted now
     assert car.pipeline.samples == 1000
     assert car.pipeline.counts.frames > frames

@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 
 from cangauge.service.lifecycle import reload_on_hangup, stop_on_signals
+from live import leaf_model_path, waits
 
 pytestmark = pytest.mark.skipif(not hasattr(signal, "SIGHUP"), reason="no SIGHUP on this system")
 
@@ -25,6 +26,14 @@ def test_a_hangup_reloads() -> None:
         signal.raise_signal(signal.SIGHUP)
         assert calls == ["reload"]
     assert signal.getsignal(signal.SIGHUP) == before
+
+
+def test_a_hangup_held_back_during_the_start_reloads_after_it() -> None:
+    calls = list[str]()
+    signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGHUP])
+    signal.raise_signal(signal.SIGHUP)
+    with reload_on_hangup(lambda: calls.append("reload")):
+        assert calls == ["reload"]
 
 
 LOOP = """
@@ -60,6 +69,22 @@ def test_a_closed_terminal_stops_the_process(tmp_path: Path) -> None:
     os.waitpid(child, 0)
     assert time.monotonic() - began_s < 5.0
     assert said.read_text() == "stopped"
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
+def test_a_terminal_closed_during_the_start_ends_it() -> None:
+    import pty  # noqa: PLC0415 - not on every system
+
+    command = [sys.executable, "-m", "cangauge", "run", "-m", str(leaf_model_path())]
+    child, terminal = pty.fork()
+    if child == 0:
+        os.execv(sys.executable, command)  # noqa: S606 - no shell wanted
+    process = Path(f"/proc/{child}")
+    assert waits(lambda: b"\0cangauge\0" in (process / "cmdline").read_bytes(), 30.0)
+    assert waits(lambda: "numpy" in (process / "maps").read_text(), 30.0)  # it loads
+    os.close(terminal)
+    _, status = os.waitpid(child, 0)
+    assert os.waitstatus_to_exitcode(status) == -signal.SIGHUP
 
 
 def _reads(terminal: int, text: bytes) -> bool:

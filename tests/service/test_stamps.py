@@ -171,13 +171,13 @@ def test_uncertainty_grows_while_no_charge_is_counted() -> None:
             pipeline.handle(each)
     published = []
     for silent_s in (0.0, 1.0, 10.0, 60.0):
-        pipeline.heartbeat(is_stale=silent_s > 0.5, silent_s=silent_s)
+        pipeline.heartbeat(silent_s, 0.5)
         published.append(pipeline.published.soc_std_pct)
     assert published[0] == pipeline.latest.soc_std_pct
     assert published == sorted(published)
     # A minute of the drive's mean square current.
     assert published[-1] > published[0] + 0.1
-    pipeline.heartbeat(is_stale=False)
+    pipeline.heartbeat()
     assert pipeline.published.soc_std_pct == published[0]
 
 

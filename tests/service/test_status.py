@@ -63,7 +63,8 @@ def test_the_keys_of_a_status(watched: Watched) -> None:
     assert status["estimate"]["soc_pct"] == watched.pipeline.latest.soc_pct
     frames = watched.pipeline.counts.frames
     assert status["frames"] == {"received": frames, "wanted": frames, "used": frames, "lost": 0}
-    assert status["bus_counts"] == {"garbled": 1, "error_frames": 2, "unsent": 3, "queue_drops": 4}
+    counts = {"garbled": 1, "error_frames": 2, "unsent": 3, "queue_drops": 4, "foreign": 0}
+    assert status["bus_counts"] == counts
     assert status["step"]["count"] == 900
 
 
@@ -77,7 +78,7 @@ def test_a_status_before_the_first_frame() -> None:
 
 def test_before_the_first_sample_the_soc_is_not_known_yet() -> None:
     watched = Watched()
-    watched.pipeline.heartbeat(is_stale=False)
+    watched.pipeline.heartbeat()
     watched.turn()
     assert "implausible_input" not in watched.status["reasons"]
     rows = dict(status_values(watched.status))
@@ -114,7 +115,7 @@ def test_a_snapshot_grows_old_and_stale(watched: Watched) -> None:
     watched.drive(10.0)
     watched.turn()
     assert json.dumps(snapshot.status) == before  # it never changes
-    watched.pipeline.heartbeat(is_stale=True)
+    watched.pipeline.heartbeat(3.0)
     watched.turn()
     assert watched.status["status"] == "invalid"
 
@@ -212,8 +213,8 @@ def test_systemd_learns_of_a_reload_and_of_its_refusal() -> None:
 
 def test_status_changes_are_logged(caplog: pytest.LogCaptureFixture, watched: Watched) -> None:
     caplog.set_level(logging.INFO, "cangauge")
-    for is_stale in (True, True, False):
-        watched.pipeline.heartbeat(is_stale=is_stale)
+    for silent_s in (3.0, 3.0, 0.0):
+        watched.pipeline.heartbeat(silent_s)
         watched.turn(0.3)
     changes = [each for each in caplog.records if getattr(each, "event", "") == "status.changed"]
     fields = [each.fields for each in changes]  # type: ignore[attr-defined] # extra of `emit`
@@ -249,7 +250,7 @@ def test_the_socket_and_the_command(watched: Watched, served: Path) -> None:
     ended = in_process("status", "--endpoint", served)
     assert ended.code == 0
     assert "± " in ended.out
-    watched.pipeline.heartbeat(is_stale=True)
+    watched.pipeline.heartbeat(3.0)
     watched.turn()
     ended = in_process("status", "--endpoint", served, "--json")
     assert (ended.code, ended.json["reasons"]) == (1, ["input_stale"])

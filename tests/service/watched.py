@@ -57,7 +57,7 @@ class Watched:
             for frame in encoder.encode(sample):
                 if self.pipeline.handle(frame):
                     self.monitor.stepped(frame.timestamp, 30e-6, self.now_s)
-        self.pipeline.heartbeat(is_stale=False)
+        self.pipeline.heartbeat()
 
     def turn(self, later_s: float = 1.0) -> None:
         self.now_s += later_s

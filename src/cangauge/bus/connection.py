@@ -16,7 +16,7 @@ import time
 from collections import Counter, deque
 from collections.abc import Sequence
 from contextlib import suppress
-from typing import Any, Final, Self
+from typing import Final, Self
 
 import can
 from can.interfaces.socketcan import SocketcanBus
@@ -107,8 +107,6 @@ class BusConnection:
     is_off, is_drained : bool
         Whether the controller reported bus-off, with no frame received since; whether the receive
         queue was empty after the latest call that received.
-    foreign, polls : int, `service.polling.PollCounts` or None
-        Set by the service's loop: frames of others with its ids; outcomes of its requests.
     """
 
     def __init__(
@@ -119,10 +117,9 @@ class BusConnection:
     ) -> None:
         self.name = name
         self.capabilities = capabilities
-        self.garbled = self.error_frames = self.unsent = self.foreign = 0
+        self.garbled = self.error_frames = self.unsent = 0
         self.error_kinds: Counter[str] = Counter()
         self.is_off = self.is_drained = False
-        self.polls: Any = None
         self._bus = bus
         self._failed: BusError | None = None
         self._posted: deque[tuple[float, can.Message]] = deque()

@@ -20,9 +20,12 @@ from typing import Final, Literal
 from xml.etree import ElementTree as ET
 
 import cantools.database
+import numpy as np
 from cantools.database.can import Database, Message, Signal
+from numpy.typing import NDArray
 
 from cangauge._files import MIB, read_bounded
+from cangauge._typing import FloatArray
 from cangauge.errors import InputError, closest
 
 MAX_DBC_BYTES: Final = 4 * MIB
@@ -201,6 +204,14 @@ class SignalCodec:
             high -= 1
         ends = [self.gain * (raw * self.factor + self.offset) + self.shift for raw in (low, high)]
         return min(ends), max(ends)
+
+    def fits(self, values: FloatArray) -> NDArray[np.bool_]:
+        """Return which values `encode_into` can send; NaN counts as one."""
+        if self.float_format:
+            return np.ones(values.shape, dtype=np.bool_)
+        raw = np.rint(((values - self.shift) / self.gain - self.offset) / self.factor)
+        low, high = self.raw_range
+        return ~((raw < low) | (raw > high) | np.isin(raw, list(self.not_available)))
 
     @property
     def half_step(self) -> float:

@@ -191,6 +191,8 @@ class SampleDecoder:
     pack : PackProperties, optional
         Pack properties from the model. Without them only stated limits apply and no signal counts
         as stuck: a capture with a wrong scale then shows as such, not as a missing signal.
+    statistics : FrameStatistics, optional
+        Counts to continue.
 
     Attributes
     ----------
@@ -202,9 +204,14 @@ class SampleDecoder:
         Latest cell voltages, where the vehicle has them.
     """
 
-    def __init__(self, vehicle: Vehicle, pack: PackProperties | None = None) -> None:
+    def __init__(
+        self,
+        vehicle: Vehicle,
+        pack: PackProperties | None = None,
+        statistics: FrameStatistics | None = None,
+    ) -> None:
         self.vehicle = vehicle
-        self.statistics = FrameStatistics()
+        self.statistics = FrameStatistics() if statistics is None else statistics
         self.health: dict[str, SignalHealth] = {}
         self.now_s = self._suspected_s = -math.inf
         self._pairing = Pairing(vehicle.pair_within_s, self.statistics)
@@ -262,7 +269,7 @@ class SampleDecoder:
         key = signal.key
         if key not in self._routes:
             message = self.vehicle.messages[key]
-            statistics = self.statistics.messages[key] = MessageStatistics()
+            statistics = self.statistics.messages.setdefault(key, MessageStatistics())
             checker = None if message.rule is None else FrameChecker(message.rule, message.period_s)
             self._routes[key] = _Route(signal.message, signal.length, checker, statistics)
         return self._routes[key]

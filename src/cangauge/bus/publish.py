@@ -22,11 +22,11 @@ from typing import Any, Final, NamedTuple
 
 import can
 from can.typechecking import CanFilter
-from cantools.database.can import Database
+from cantools.database.can import Message
 
 from cangauge._resources import shared_file
 from cangauge._text import plain
-from cangauge.bus.database import load_dbc, signal_codec
+from cangauge.bus.database import SignalCodec, load_dbc, signal_codec
 from cangauge.bus.protection import E2eRule
 from cangauge.bus.time_source import REPLAY_CLOCK_ID
 from cangauge.errors import InputError
@@ -179,29 +179,21 @@ NO_REPORT: Final[Mapping[str, Any]] = MappingProxyType(
 class _Layout:
     """A message of soc_estimate.dbc: codecs by signal, counter and CRC."""
 
-    def __init__(self, database: Database, name: str, path: Path) -> None:
-        message = database.get_message_by_name(name)
-        codecs = {
-            signal.name: signal_codec(message, signal, source=path, field=name)
-            for signal in message.signals
-            if not signal.name.startswith(("counter_", "crc_"))
-        }
-        self._codecs = [
-            ("reasons" if name == "reason" else name, codec, *codec.range)
-            for name, codec in codecs.items()
-        ]
-        attributes = getattr(message.dbc, "attributes", {})
-        data_ids = tuple(bytes.fromhex(str(attributes["E2EDataIdList"].value)))
-        self._rule = E2eRule("e2e_02", data_id_list=data_ids)
+    def __init__(self, message: Message, path: Path) -> None:
+        self._codecs: list[tuple[str, SignalCodec, float, float]] = []
+        for signal in message.signals:
+            if not signal.name.startswith(("counter_", "crc_")):
+                codec = signal_codec(message, signal, source=path, field=message.name)
+                name = "reasons" if signal.name == "reason" else signal.name
+                self._codecs.append((name, codec, *codec.range))
+        ids = getattr(message.dbc, "attributes", {})["E2EDataIdList"].value
+        self._rule = E2eRule("e2e_02", data_id_list=tuple(bytes.fromhex(str(ids))))
 
     def encode(self, counter: int, values: Mapping[str, float]) -> bytes:
         """Return the payload; values are clipped to the signal's range, NaN becomes its code."""
         payload = bytearray(_LENGTH)
-        for name, codec, low, high in self._codecs:
-            value = float(values[name])
-            if not math.isnan(value):
-                value = min(max(value, low), high)
-            codec.encode_into(payload, value)
+        for name, codec, low, high in self._codecs:  # the clip leaves NaN
+            codec.encode_into(payload, min(max(float(values[name]), low), high))
         return self._rule.protect(payload, counter)
 
     def decode(self, data: bytes | bytearray) -> dict[str, Any] | None:
@@ -209,15 +201,13 @@ class _Layout:
         if len(data) != _LENGTH or not self._rule.is_whole(data):
             return None
         values: dict[str, Any] = {name: codec.decode(data) for name, codec, _, _ in self._codecs}
-        for name in _KINDS.keys() & values:
-            values[name] = _KINDS[name](int(values[name]))
-        return values
+        return values | {name: _KINDS[name](int(values[name])) for name in _KINDS.keys() & values}
 
 
 def _layouts() -> dict[str, _Layout]:
     path = shared_file("dbc", "soc_estimate.dbc")
-    database = load_dbc(path)
-    return {name: _Layout(database, name.upper(), path) for name in _CONTENTS}
+    message = load_dbc(path).get_message_by_name
+    return {name: _Layout(message(name.upper()), path) for name in _CONTENTS}
 
 
 class SocPublisher:
@@ -233,11 +223,7 @@ class SocPublisher:
         self._layouts = _layouts()
         self._made = dict.fromkeys(self._layouts, 0)
         self._beats = self._acknowledged = 0
-        self.restart()
-
-    def restart(self) -> None:
-        """Reset the due times: a new log may begin earlier."""
-        self._estimate_due_s = self._detail_due_s = -math.inf
+        self._due_s = {ESTIMATE_EVERY_S: -math.inf, DETAIL_EVERY_S: -math.inf}
 
     def beat(
         self,
@@ -262,15 +248,23 @@ class SocPublisher:
         self, estimate: Estimate, samples: int, report: Callable[[], PackReport] | None = None
     ) -> list[can.Message]:
         """Return the frames due with a sample of a replayed log; arguments as in `beat`."""
-        now_s, frames = estimate.time_s, []
-        if now_s >= self._estimate_due_s - EARLY_S:
-            self._estimate_due_s = _next_due(self._estimate_due_s, ESTIMATE_EVERY_S, now_s)
-            frames.append(self.estimate_frame(estimate))
-        is_due = now_s >= self._detail_due_s - EARLY_S
-        if is_due:
-            self._detail_due_s = _next_due(self._detail_due_s, DETAIL_EVERY_S, now_s)
+        is_due = self._is_due(ESTIMATE_EVERY_S, estimate.time_s)
+        frames = [self.estimate_frame(estimate)] if is_due else []
+        is_due = self._is_due(DETAIL_EVERY_S, estimate.time_s)
         is_behind = samples - self._acknowledged >= (self._acknowledge_every or math.inf)
         return frames + self._slow_frames(estimate, samples, report, is_due, is_behind)
+
+    def _is_due(self, every_s: float, now_s: float) -> bool:
+        """Return whether a frame is due at a log time: on the grid, or on a new one.
+
+        The grid is a new one after a pause, and in a new log, which begins earlier.
+        """
+        due_s = self._due_s[every_s]
+        if not (now_s >= due_s - EARLY_S or now_s < due_s - every_s):
+            return False
+        is_on_grid = due_s - EARLY_S <= now_s < due_s + every_s
+        self._due_s[every_s] = every_s + (due_s if is_on_grid else now_s)
+        return True
 
     def _slow_frames(
         self,
@@ -286,33 +280,26 @@ class SocPublisher:
     def estimate_frame(self, estimate: Estimate, age_s: float = 0.0) -> can.Message:
         """Return SOC_ESTIMATE with the next counter; arguments as in `beat`."""
         age_s = age_s if math.isnan(age_s) else math.floor(age_s)
-        soc_pct, std_pct = estimate.soc_pct, estimate.soc_std_pct
-        return self._frame(
-            "soc_estimate",
-            SocEstimate(soc_pct, std_pct, estimate.status, reason_bits(estimate.reasons), age_s),
-        )
+        soc, reasons = estimate[1:3], reason_bits(estimate.reasons)
+        return self._frame("soc_estimate", SocEstimate(*soc, estimate.status, reasons, age_s))
 
     def detail_frame(self, estimate: Estimate, samples: int) -> can.Message:
         """Return SOC_DETAIL with the next counter."""
         self._acknowledged = samples
-        newton_pct, coulomb_pct = estimate.soc_newton_pct, estimate.soc_coulomb_pct
-        detail = SocDetail(newton_pct, coulomb_pct, estimate.residual_v, samples % SAMPLES_MODULO)
-        return self._frame("soc_detail", detail)
+        socs, count = estimate[3:5], samples % SAMPLES_MODULO
+        return self._frame("soc_detail", SocDetail(*socs, estimate.residual_v, count))
 
     def report_frames(self, report: PackReport) -> list[can.Message]:
         """Return SOC_HEALTH, SOC_POWER and, where there are cells, SOC_CELLS."""
-        able = report.power
-        energy_kwh, std_kwh = 1e-3 * able.energy_wh, 1e-3 * able.energy_std_wh
-        power = SocPower(*able[:4], energy_kwh, std_kwh)
+        energy_kwh = [1e-3 * each for each in report.power[4:6]]
         frames = [
             self._frame("soc_health", SocHealth(*report.health[:5])),
-            self._frame("soc_power", power),
+            self._frame("soc_power", SocPower(*report.power[:4], *energy_kwh)),
         ]
         if (cells := report.cells) is not None:
             weakest = math.nan if cells.weakest < 0 else float(cells.weakest)
             check = float(not math.isnan(cells.sum_error_v)) + cells.is_sum_wrong
-            content = SocCells(weakest, *cells[2:6], check)
-            frames.append(self._frame("soc_cells", content))
+            frames.append(self._frame("soc_cells", SocCells(weakest, *cells[2:6], check)))
         return frames
 
     def _frame(self, name: str, content: SocContent) -> can.Message:
@@ -320,12 +307,6 @@ class SocPublisher:
         data = self._layouts[name].encode(self._made[name], content._asdict())
         self._made[name] += 1
         return can.Message(arbitration_id=getattr(self.ids, name), is_extended_id=False, data=data)
-
-
-def _next_due(due_s: float, every_s: float, now_s: float) -> float:
-    """Return the next due time on the grid, or on a new one after a pause."""
-    following = due_s + every_s
-    return following if following > now_s else now_s + every_s
 
 
 class SocReader:

@@ -183,13 +183,13 @@ def capture_without_vehicle(path: str | PathLike[str]) -> InputError:
 # --- Captures by a vehicle
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, eq=False)
 class CaptureSamples:
-    """All samples of a capture, as the live service makes them without a model; shape (n,).
+    """All samples of a capture; shape (n,). Unlike a log's rows they may lack values (NaN).
 
-    With a model the service also drops values that are impossible for its pack. Times are bus
-    times, NaN stands for a missing value, `soc_pct` is the car's own SoC when the sample was made.
-    `statistics` are those of the chosen bus, `remarks` losses and refusals, for the user.
+    Times are bus times, `soc_pct` is the car's own SoC when the sample was made. Without a model no
+    value is refused as impossible for the pack. `statistics` are those of the chosen bus, `remarks`
+    losses and refusals, for the user.
     """
 
     time_s: FloatArray
@@ -197,6 +197,8 @@ class CaptureSamples:
     voltage_v: FloatArray
     temperature_c: FloatArray
     soc_pct: FloatArray
+    source: str
+    temperature_source: TemperatureSource
     statistics: FrameStatistics
     info: CaptureInfo
     remarks: tuple[str, ...]
@@ -204,6 +206,34 @@ class CaptureSamples:
     def __len__(self) -> int:
         """Return the number of samples."""
         return int(self.time_s.size)
+
+    @property
+    def name(self) -> str:
+        """Name of the file, without suffixes."""
+        return Path(self.source).name.split(".")[0]
+
+    @property
+    def duration_s(self) -> float:
+        """Time from the first sample to the last [s]."""
+        return float(self.time_s[-1] - self.time_s[0])
+
+    def as_log(self) -> Log | None:
+        """Return the samples with a voltage and a new time, at 0 °C; None if fewer than 2.
+
+        Enough to check the sign of the current.
+        """
+        rows = np.isfinite(self.voltage_v) & (np.diff(self.time_s, prepend=-np.inf) > 0.0)
+        if rows.sum() < 2:
+            return None
+        return Log(
+            self.time_s[rows],
+            self.current_a[rows],
+            self.voltage_v[rows],
+            np.zeros(int(rows.sum())),
+            self.soc_pct[rows],
+            name=self.name,
+            source=self.source,
+        )
 
 
 def open_vehicle_capture(path: str | PathLike[str], vehicle: Vehicle) -> Capture:
@@ -246,7 +276,7 @@ def capture_samples(
         remarks.append(f"the replay clock starts again {clock.beginnings} times")
     time_s, current_a, voltage_v, temperature_c, soc_pct = np.array(values).reshape(-1, 5).T
     return CaptureSamples(
-        time_s, current_a, voltage_v, temperature_c, soc_pct,
+        time_s, current_a, voltage_v, temperature_c, soc_pct, str(path), vehicle.temperature_source,
         statistics, capture.info, tuple(remarks),
     )  # fmt: skip
 

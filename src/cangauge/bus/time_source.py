@@ -43,11 +43,11 @@ class ReceiveTime:
     """Receive stamps.
 
     After a step back of more than `STEP_BACK_US` time continues from the latest stamp, so that
-    setting the clock does not stop the estimate (`steps_back`). A step forward is a gap.
+    setting the clock does not stop the estimate. A step forward is a gap.
     """
 
     def __init__(self) -> None:
-        self.beginnings = self.steps_back = 0
+        self.beginnings = 0
         self._latest_us: int | None = None
         self._shift_us = 0
 
@@ -61,7 +61,6 @@ class ReceiveTime:
         if latest_us is None or now_us >= latest_us:
             self._latest_us = now_us
         elif latest_us - now_us > STEP_BACK_US:
-            self.steps_back += 1
             self._shift_us += latest_us - now_us
             now_us = latest_us
         return now_us / MICROSECONDS

@@ -201,17 +201,17 @@ def config_parameters(*names: str) -> list[inspect.Parameter]:
     """Return the options of keys, such as "channel", as typer reads them; without names of all."""
     from cangauge.service.config import config_keys
 
-    keys = [key for key in config_keys() if key.info.option]
+    keys = [key for key in config_keys() if key.option]
     return [_parameter(key) for key in keys if not names or key.name in names]
 
 
 def _parameter(key: ConfigKey) -> inspect.Parameter:
-    kind: Any = Path if key.info.is_path else float if key.kind == "number" else str
+    kind: Any = Path if key.is_path else float if key.kind == "number" else str
     if key.name == "bus_options":
         kind = list[str]
     elif key.name == "initial_soc":  # "auto" is no number: checked by the configuration
         kind = str
-    flags, metavar = key.info.option.split(", "), key.info.metavar or None
+    flags, metavar = key.option.split(", "), key.metavar or None
     option = Annotated[kind | None, typer.Option(*flags, metavar=metavar, help=key.help)]
     keyword = inspect.Parameter.KEYWORD_ONLY
     return inspect.Parameter(key.name, keyword, default=None, annotation=option)

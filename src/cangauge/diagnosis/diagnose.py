@@ -2,20 +2,18 @@
 
 from __future__ import annotations
 
-import hashlib
 import logging
 import math
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cache, cached_property
+from functools import cached_property
 from typing import Any
 
 import numpy as np
-from threadpoolctl import ThreadpoolController
+from threadpoolctl import threadpool_limits
 
 from cangauge._extras import extra
-from cangauge._files import file_sha256
-from cangauge._typing import FloatArray
+from cangauge._files import file_sha256, text_sha256
 from cangauge.diagnosis import sentences
 from cangauge.diagnosis.answer import ALARM, GROUP_OF, NONE, UNKNOWN, Posterior, answer
 from cangauge.diagnosis.checks import check_logs
@@ -79,6 +77,7 @@ class Diagnosis:
 
     @cached_property
     def _extensions(self) -> dict[str, Extension]:
+        """The given model with each effect."""
         model, before = self.model.extended_model(), [log.before_v for log in self._without]
         return {
             name: Extension(model, self.known, self.columns, before, self.evidence.effects[name])
@@ -86,33 +85,24 @@ class Diagnosis:
         }
 
     @cached_property
-    def _without(self) -> tuple[LogErrors, ...]:
+    def _without(self) -> list[LogErrors]:
         """Errors of each log without a cause."""
         errors, model = [], self.model.extended_model()
         for log, of in zip(self.logs, self.columns, strict=True):
-            at, signals = of.rows, of.log
-            before = residual_v(model, signals)[at]
-            errors.append(
-                LogErrors(
-                    log.name, at.astype(np.float64), signals.current_a[at],
-                    signals.temperature_c[at], self.known.pack.soc(signals)[at], before, before,
-                    np.ones(len(at), dtype=bool),
-                )
-            )  # fmt: skip
-        return tuple(errors)
+            at, signals, every = of.rows, of.log, np.ones(len(of.rows), dtype=bool)
+            before_v, soc_pct = residual_v(model, signals)[at], self.known.pack.soc(signals)[at]
+            inputs = at.astype(np.float64), signals.current_a[at], signals.temperature_c[at]
+            errors.append(LogErrors(log.name, *inputs, soc_pct, before_v, before_v, every))
+        return errors
 
     @cached_property
-    def _with(self) -> dict[str, tuple[LogErrors, ...]]:
+    def _with(self) -> dict[str, list[LogErrors]]:
         """Errors of each log with each of the most probable effects."""
-        return {
-            name: tuple(
-                replace(log, after_v=after, judged=judged)
-                for log, after, judged in zip(
-                    self._without, *self._extensions[name].judge(), strict=True
-                )
-            )
-            for name in {*list(self.posterior.effects)[:CROSS_VALIDATED], self.posterior.members[0]}
-        }
+        found = {}
+        for name in {*list(self.posterior.effects)[:CROSS_VALIDATED], self.posterior.members[0]}:
+            judged = zip(self._without, *self._extensions[name].judge(), strict=True)
+            found[name] = [replace(log, after_v=after, judged=at) for log, after, at in judged]
+        return found
 
     @cached_property
     def likeliest(self) -> str | None:
@@ -134,9 +124,10 @@ class Diagnosis:
 
         None where no diagnosed log has a reference SoC.
         """
-        before = self._soc_error_pct(self.model)
-        if before is None or self.likeliest is None:
-            return None if before is None else (before, before)
+        if (before := self._soc_error_pct(self.model)) is None:
+            return None
+        if self.likeliest is None:
+            return before, before
         after = self._soc_error_pct(self._extended(self.likeliest))
         return before, math.inf if after is None else after
 
@@ -150,7 +141,7 @@ class Diagnosis:
         return None if after > WORSE_SOC * before + WORSE_SOC_PCT else self.likeliest
 
     @property
-    def log_errors(self) -> tuple[LogErrors, ...]:
+    def log_errors(self) -> list[LogErrors]:
         """Errors of each diagnosed log at 1 Hz, before and after."""
         return self._without if self.accepted is None else self._with[self.accepted]
 
@@ -175,18 +166,15 @@ class Diagnosis:
 
         None without a cause, or without a gap above the healthy error.
         """
-        return self._closed[0]
+        return None if self.accepted is None else self._closed(self.accepted)[0]
 
     @property
     def closed_fraction_ci(self) -> tuple[float, float] | None:
         """95 % interval of the closed fraction."""
-        return self._closed[1]
+        return None if self.accepted is None else self._closed(self.accepted)[1]
 
-    @cached_property
-    def _closed(self) -> tuple[float | None, tuple[float, float] | None]:
-        if self.accepted is None:
-            return None, None
-        return closed_part(self.log_errors, self.known.healthy_v2)
+    def _closed(self, effect: str) -> tuple[float | None, tuple[float, float] | None]:
+        return closed_part(self._with[effect], self.known.healthy_v2)
 
     @cached_property
     def where(self) -> list[dict[str, Any]]:
@@ -198,10 +186,9 @@ class Diagnosis:
         """Every effect, most probable first, as in `gap --json`; error of the likeliest few."""
         found = []
         for name, p in self.posterior.effects.items():
-            errors, rmse_v, closed, ci = self._with.get(name), None, None, None
-            if errors is not None:
-                rmse_v = rms(errors, after=True)
-                closed, ci = closed_part(errors, self.known.healthy_v2)
+            rmse_v, closed, ci = None, None, None
+            if name in self._with:
+                rmse_v, (closed, ci) = rms(self._with[name], after=True), self._closed(name)
             found.append({
                 "effect": name, "group": GROUP_OF[name], "probability": p, "rmse_v": rmse_v,
                 "closed_fraction": closed, "ci": ci and list(ci),
@@ -221,8 +208,7 @@ class Diagnosis:
         for name, least in self.posterior.visible_from.items():
             unit = self.evidence.effects[name].trial.unit
             unit, factor = ("%", 100.0) if unit == "1" else (unit, 1.0)
-            size = None if least is None else factor * least
-            sizes.append({"effect": name, "size": size, "unit": unit})
+            sizes.append({"effect": name, "size": least and factor * least, "unit": unit})
         return sizes
 
     @cached_property
@@ -238,7 +224,7 @@ class Diagnosis:
 
         After a step of resistance, if that is the cause: the extended model has it throughout.
         """
-        errors: list[FloatArray] = []
+        errors = [np.zeros(0)]
         places: tuple[float | None, ...] = (0.0,) * len(self.logs)
         if self.likeliest is not None:
             places = self.evidence.effects[self.likeliest].in_logs or places
@@ -246,14 +232,14 @@ class Diagnosis:
             if place is None or log.soc_pct is None or np.isfinite(log.soc_pct).mean() < 0.5:
                 continue
             signals, finite = of.log, np.isfinite(log.soc_pct)
-            first = round(place * len(signals.current_a))
             time_s = np.arange(len(signals.current_a), dtype=np.float64)
+            first = round(place * len(time_s))
             at_1_hz = Log(time_s, signals.current_a, signals.voltage_v, signals.temperature_c)
             table = estimate(at_1_hz.rows(slice(first, None)), model, initial_soc_pct="auto")
             own = np.interp(table.time_s, log.time_s[finite] - log.time_s[0], log.soc_pct[finite])
             kept = np.isfinite(table.soc_pct) & (table.time_s - first >= SETTLING_S)
             errors.append(np.abs(table.soc_pct - own)[kept & signals.measured[first:]])
-        together = np.concatenate(errors) if errors else np.zeros(0)
+        together = np.concatenate(errors)
         return float(together.mean()) if together.size else None
 
     @property
@@ -293,12 +279,11 @@ class Diagnosis:
             Path of the extended model's file, to be reported.
         """
         found, closed, ci = self.posterior, self.closed_fraction, self.closed_fraction_ci
-        accepted = []
         before_pct, after_pct = self.soc_errors_pct or (None, None)
+        accepted = []
         if self.accepted is not None:
             values = {name: item.value for name, item in self.parameters[self.accepted].items()}
             accepted = [{"effect": self.accepted, "parameters": values, "closed_fraction": closed}]
-        model = self.model.to_json().encode()
         return {
             "schema": 3,
             "gap": {
@@ -330,7 +315,7 @@ class Diagnosis:
             "summary": self.summary,
             "limits": self.caveats,
             "inputs": {
-                "model": {"name": self.model.name, "sha256": hashlib.sha256(model).hexdigest()},
+                "model": {"name": self.model.name, "sha256": text_sha256(self.model.to_json())},
                 "logs": _files(self.logs),
                 "references": _files(self.references),
             },
@@ -394,7 +379,7 @@ def diagnose(
     >>> print(found.headline)  # doctest: +SKIP
     The current reads 3.0 A (2.7 … 3.3) too high (current_offset, 71 %).
     """
-    with _one_thread():
+    with threadpool_limits(1):  # systems of fifty unknowns gain nothing from more threads
         logs, simulator = _as_logs(logs), None
         model = None if model is None else as_model(model)
         own = () if isinstance(references, References) else _as_logs(references)
@@ -406,16 +391,11 @@ def diagnose(
         check_logs(logs, own, model)
         _LOG.info("reading the references")
         traces, remarks = _traces(logs, model, initial_soc_pct)
-        if isinstance(references, References):
-            known = references
-        else:
+        known = references
+        if not isinstance(references, References):
             healthy, more = _traces(own, model)
             remarks += more
-            known = learn(
-                healthy or [_of_model(model, log) for log in traces],
-                model.capacity_ah,
-                model.noise.voltage_rmse_v,
-            )
+            known = _learn(healthy or [_of_model(model, log) for log in traces], model)
         _LOG.info("comparing the effects")
         of_logs = tuple(columns(known, log) for log in traces)
         evidence = analyse(known, of_logs)
@@ -436,16 +416,24 @@ def diagnose(
         return found
 
 
-def _as_logs(logs: Any) -> tuple[Log, ...]:
-    return tuple(as_log(log) for log in (logs if isinstance(logs, list | tuple) else [logs]))
-
-
 def learn_references(references: Sequence[Log], model: Model) -> References:
     """Learn what references, logs without a fault, show, for any number of diagnoses."""
-    with _one_thread():
+    with threadpool_limits(1):
         check_logs(references, (), model)
-        traces, _ = _traces(references, model)
-        return learn(traces, model.capacity_ah, model.noise.voltage_rmse_v)
+        return _learn(_traces(references, model)[0], model)
+
+
+def _learn(healthy: Sequence[Trace], model: Model) -> References:
+    return learn(healthy, model.capacity_ah, model.noise.voltage_rmse_v)
+
+
+def _of_model(model: Model, log: Trace) -> Trace:
+    """Return a log with the model's voltage: the reference where none is given."""
+    return replace(log, voltage_v=log.voltage_v - residual_v(model.extended_model(), log))
+
+
+def _as_logs(logs: Any) -> tuple[Log, ...]:
+    return tuple(as_log(log) for log in (logs if isinstance(logs, list | tuple) else [logs]))
 
 
 def _traces(
@@ -465,18 +453,3 @@ def _traces(
             )
         traces.append(trace(log, model.capacity_ah, start))
     return traces, remarks
-
-
-def _of_model(model: Model, log: Trace) -> Trace:
-    """Return a log with the model's voltage: the reference where none is given."""
-    return replace(log, voltage_v=log.voltage_v - residual_v(model.extended_model(), log))
-
-
-@cache
-def _threads() -> ThreadpoolController:
-    return ThreadpoolController()
-
-
-def _one_thread() -> Any:
-    """Return a context of one thread: systems of fifty unknowns gain nothing from more."""
-    return _threads().limit(limits=1)

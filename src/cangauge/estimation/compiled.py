@@ -158,21 +158,10 @@ class CompiledEstimator(Estimator):
         return cast("Estimate", self._core.estimate())
 
     @property
-    def time_s(self) -> float:
-        """The estimator's own time at the latest sample [s]: it always increases."""
-        return float(self._record["clock"]["last_s"])
-
-    @property
     def health(self) -> Health:
         """Capacity, resistance and current offset, with standard deviations."""
         self._pull()
         return super().health
-
-    @property
-    def verdict(self) -> str:
-        """What the voltage says of the last interval; see `Estimator.verdict`."""
-        self._pull()
-        return super().verdict
 
     def uncounted_std_pct(self, seconds: float) -> float:
         """Return what the SoC's standard deviation lacks [%] when no sample came for a time [s]."""

@@ -50,8 +50,6 @@ from cangauge.types import (
     status_of,
 )
 
-__all__ = ["Estimator", "EstimatorSettings"]
-
 REST_CURRENT_C_RATE: Final = 0.02
 """Below this current the pack is at rest [1/h]: 1.2 A at 60 Ah."""
 
@@ -83,8 +81,11 @@ class Estimator:
     settings : EstimatorSettings
     capacity_ah : float
         Charge from 100 to 0 % [Ah].
+    voltage_model : VoltageModel
     hypotheses : Hypotheses
         The filter, or two while a start is in doubt.
+    tests : tuple of int, float and float
+        Number of blocks tested together, and the limits of their innovations and of the strain.
     is_refused : bool
         Whether the latest sample was refused: without a plausible current, or not later.
 
@@ -105,24 +106,23 @@ class Estimator:
     """Implementation of the step: "python", or "compiled" (`compiled`)."""
 
     def __init__(self, model: Model | Any, settings: EstimatorSettings | None = None) -> None:
-        model = as_model(model)
-        self.model: Model = model
+        self.model: Model = as_model(model)
         self.settings = settings or EstimatorSettings()
-        self._online = model.online(self.settings.capacity_ah, self.settings.gap_s)
+        self._online = self.model.online(self.settings.capacity_ah, self.settings.gap_s)
         self.capacity_ah = self._online.capacity_ah
         self.voltage_model: VoltageModel = self._online.model
         self.hypotheses = Hypotheses(self._online)
-        self._block = OpenBlock()
-        self._counter = CoulombCounter(self.capacity_ah, self.settings.gap_s)
         self._clock = EstimatorClock()
-        self._power = PowerModel(self._online, self.settings.limits)
-        self._permanent_reasons = temperature_mismatch(
-            model.temperature_source, self.settings.temperature_source
-        )
-        self._tested_blocks = max(round(MISMATCH_S / model.noise.block_s), 1)
-        self._innovations_at_most = float(chdtri(self._tested_blocks, MISMATCH_ALARM))
-        self._strain_at_most = float(chdtri(self._online.functions.number + 4, MISMATCH_ALARM))
+        self._counter = CoulombCounter(self.capacity_ah, self.settings.gap_s)
+        self._block = OpenBlock()
         self._memory = EstimatorMemory()
+        self._power = PowerModel(self._online, self.settings.limits)
+        tested = max(round(MISMATCH_S / self.model.noise.block_s), 1)
+        strain_at_most = float(chdtri(self._online.functions.number + 4, MISMATCH_ALARM))
+        self.tests = tested, float(chdtri(tested, MISMATCH_ALARM)), strain_at_most
+        self._mismatch = temperature_mismatch(
+            self.model.temperature_source, self.settings.temperature_source
+        )
         self._implausible = Reason.NONE
         self.is_refused = False
         self._latest = Estimate.unknown(Reason.NO_INITIAL_SOC)
@@ -131,6 +131,8 @@ class Estimator:
         if self.settings.initial_soc_pct is not None:
             soc_pct = self._online.initial_soc_pct(self.settings.initial_soc_pct)
             self._start(soc_pct, self.settings.initial_soc_std_pct, is_doubtful=True)
+
+    # --- samples → estimates
 
     def step(self, sample: Sample) -> Estimate:
         """Process one sample and return the estimate after it; see `update`."""
@@ -158,11 +160,10 @@ class Estimator:
         self.is_refused = time_s is None
         if time_s is None:
             return
-        stamp_s = sample.time_s
+        memory, stamp_s = self._memory, sample.time_s
         sample, self._implausible = drop_implausible(
             sample._replace(time_s=time_s), self.voltage_model.nominal_v
         )
-        memory = self._memory
         if memory.samples == 0:
             memory.first_s = time_s
         memory.samples += 1
@@ -173,10 +174,6 @@ class Estimator:
             self._pending = Sample(*corrected[-1]), stamp_s, self._implausible
         else:
             self._latest = self._evaluate()._replace(time_s=stamp_s, samples=memory.samples)
-
-    def uncounted_std_pct(self, seconds: float) -> float:
-        """Return what the SoC's standard deviation lacks [%] when no sample came for a time [s]."""
-        return self._counter.uncounted_std_pct(seconds)
 
     @property
     def estimate(self) -> Estimate:
@@ -192,85 +189,58 @@ class Estimator:
         """Capacity, resistance and current offset, with standard deviations."""
         return health_of(self.hypotheses.likelier, self._temperature_c)
 
-    @property
-    def verdict(self) -> str:
-        """What the voltage says of the last interval without samples.
+    def power(self) -> Power:
+        """Return the currents possible for 10 s and the energy left, after the latest sample."""
+        soc_pct, std_pct = self._soc()
+        if math.isnan(soc_pct) or math.isnan(self._counter.state.time_s):
+            return Power()
+        return self._power.at(self.hypotheses.likelier, soc_pct, std_pct, self._temperature_c)
 
-        "open", "parked" or "moved"; empty without an interval.
-        """
-        if self._memory.doubt != "interval":
-            return ""
-        return {-1: "parked", 0: "open", 1: "moved"}[self.hypotheses.decision]
-
-    @property
-    def tests(self) -> tuple[int, float, float]:
-        """Blocks that are tested together, and the limits of innovations and strain."""
-        return self._tested_blocks, self._innovations_at_most, self._strain_at_most
-
-    @property
-    def time_s(self) -> float:
-        """The estimator's own time at the latest sample [s]: it always increases."""
-        return self._clock.state.last_s
+    def uncounted_std_pct(self, seconds: float) -> float:
+        """Return what the SoC's standard deviation lacks [%] when no sample came for a time [s]."""
+        return self._counter.uncounted_std_pct(seconds)
 
     def pack_tick(self, sample: Sample) -> PackTick:
         """Return what is known of the pack after its latest sample, for its cells."""
-        soc_pct, std_pct = self._soc_and_std_pct()
-        load_v = drop_v = math.nan
-        if not math.isnan(self._counter.state.time_s):
-            _, load_v, drop_v = self._load()
-        return PackTick(
-            sample.time_s,
-            soc_pct,
-            std_pct,
-            sample.voltage_v,
-            load_v,
-            drop_v,
-            self._counter.state.moved_pct,
-        )
+        counter = self._counter.state
+        is_counting = not math.isnan(counter.time_s)
+        load_v, drop_v = self._load()[1:] if is_counting else (math.nan, math.nan)
+        volts = sample.voltage_v, load_v, drop_v
+        return PackTick(sample.time_s, *self._soc(), *volts, counter.moved_pct)
 
     def current_changes(self, time_s: float, stamps_s: Sequence[float]) -> list[float]:
         """Return the current at a sample's time less that at other stamps [A]; NaN for NaN."""
         if math.isnan(self._counter.state.time_s):
             return [math.nan] * len(stamps_s)
         at = self._online.delay_line.current_at
-        known = {each: at(time_s - each) for each in set(stamps_s) if not math.isnan(each)}
-        return [at(0.0) - known[each] if each in known else math.nan for each in stamps_s]
+        return [each if math.isnan(each) else at(0.0) - at(time_s - each) for each in stamps_s]
 
-    def power(self) -> Power:
-        """Return the currents possible for 10 s and the energy left, after the latest sample."""
-        soc_pct, std_pct = self._soc_and_std_pct()
-        if math.isnan(soc_pct) or math.isnan(self._counter.state.time_s):
-            return Power()
-        return self._power.at(self.hypotheses.likelier, soc_pct, std_pct, self._temperature_c)
+    # --- one sample
 
     def _process(self, sample: Sample) -> None:
         """Count the charge of a corrected sample, and use its voltage where that is due."""
-        memory = self._memory
-        time_s, current_a, _, temperature_c = sample
+        memory, block = self._memory, self._block
+        time_s, current_a, voltage_v, temperature_c = sample
         number = math.floor((time_s - memory.first_s) / self.model.noise.block_s + 1e-9)
-        if number > self._block.state.number:
+        if number > block.state.number:
             self._close_block(time_s)
-            self._block.begin(number)
-        if self._implausible and math.isnan(sample.voltage_v):
+            block.begin(number)
+        if self._implausible and math.isnan(voltage_v):
             # Behind an open contactor; the block's other rows may be of a voltage that falls.
-            self._block.state.is_broken = True
+            block.state.is_broken = True
         charge = self._counter.step(time_s, self._online.counted(current_a))
         if not math.isnan(temperature_c):
             memory.temperature_c = temperature_c
         self._online.advance(time_s, current_a, memory.temperature_c)
         if charge.seconds > self.settings.gap_s:
-            self._block.state.is_broken = True
+            block.state.is_broken = True
             memory.gap_until_s = time_s + self._online.delay_line.longest_s
-        if charge.away_s:
-            self._propagate_to_now()
-            self.hypotheses.doubt(
-                moved_probability(charge.away_s),
-                moved_std_pct(charge.away_s),
-                charge.away_s,
-                charge.parked_std_pct,
-            )
+        if away_s := charge.away_s:
+            self._predict_to_now()
+            wide = moved_probability(away_s), moved_std_pct(away_s)
+            self.hypotheses.doubt(*wide, away_s, charge.parked_std_pct)
             memory.doubt = "interval"
-            memory.coulomb_var_pct2 += away_std_pct(charge.away_s) ** 2
+            memory.coulomb_var_pct2 += away_std_pct(away_s) ** 2
         if abs(current_a) > REST_CURRENT_C_RATE * self.capacity_ah:
             memory.rest_since_s = math.nan
         elif math.isnan(memory.rest_since_s):
@@ -297,7 +267,7 @@ class Estimator:
             charge = counter.counted_s, counter.discharged_pct
             volts = sample.voltage_v, temperature_c, drop_v
             self._block.add(Block(*charge, *volts, load, online.drives()))
-        soc_pct = self._soc_and_std_pct()[0]
+        soc_pct = self._soc()[0]
         memory.voltage_model_v = math.nan
         if not math.isnan(soc_pct):
             memory.voltage_model_v = online.curve(soc_pct)[0] + load_v
@@ -311,11 +281,11 @@ class Estimator:
         if block is None:
             return
         memory, hypotheses = self._memory, self.hypotheses
-        self._propagate(block.counted_s, block.discharged_pct)
+        self._predict(block.counted_s, block.discharged_pct)
         was_rejected = hypotheses.is_rejected
         hypotheses.update(block)
         if not hypotheses.is_valid():
-            hypotheses = self.hypotheses = Hypotheses(self._online)
+            self.hypotheses = Hypotheses(self._online)
             memory.resets += 1
             memory.contradicted_until_s = time_s + CONTRADICTED_S
         elif hypotheses.is_rejected and not was_rejected:
@@ -332,10 +302,11 @@ class Estimator:
         learned of a constant is at most as far from its prior mean as the prior allows.
         """
         memory, likelier = self._memory, self.hypotheses.likelier
-        memory.innovations = [*memory.innovations, likelier.normalised_innovation_squared]
-        memory.innovations = memory.innovations[-self._tested_blocks :]
-        is_lasting = sum(memory.innovations) > self._innovations_at_most
-        if is_lasting or likelier.strain() > self._strain_at_most:
+        blocks, innovations_at_most, strain_at_most = self.tests
+        innovations = [*memory.innovations, likelier.normalised_innovation_squared]
+        memory.innovations = innovations[-blocks:]
+        is_lasting = sum(memory.innovations) > innovations_at_most
+        if is_lasting or likelier.strain() > strain_at_most:
             memory.mismatch_until_s = time_s + MISMATCH_S
         if is_lasting:
             # The model may be right and the SoC wrong: charge that was not seen.
@@ -343,7 +314,7 @@ class Estimator:
             memory.doubt = "mismatch"
             self.hypotheses.doubt(WRONG_PRIOR, WRONG_STD_PCT)
 
-    def _propagate(self, counted_s: float, discharged_pct: float) -> None:
+    def _predict(self, counted_s: float, discharged_pct: float) -> None:
         """Predict the filter to a count of time [s] and charge [%]."""
         memory, gap_var_pct2 = self._memory, self._counter.state.gap_var_pct2
         self.hypotheses.predict(
@@ -355,20 +326,21 @@ class Estimator:
         memory.filter_discharged_pct = discharged_pct
         memory.filter_gap_var_pct2 = gap_var_pct2
 
-    def _propagate_to_now(self) -> None:
+    def _predict_to_now(self) -> None:
         """Predict the filter to the latest sample; the open block lies in part before it."""
-        self._propagate(self._counter.state.counted_s, self._counter.state.discharged_pct)
+        self._predict(self._counter.state.counted_s, self._counter.state.discharged_pct)
         self._block.state.is_broken = True
 
     def _correct(self, reference: SocReference) -> None:
         """Fuse an external SoC reference into count and filter, weighted by the variances."""
-        self._propagate_to_now()
-        self.hypotheses.correct(reference.soc_pct, reference.soc_std_pct)
+        self._predict_to_now()
+        self.hypotheses.correct(*reference)
         self._memory.is_known = True
-        if math.isnan(self._memory.coulomb_start_pct):
-            self._start_count(reference.soc_pct, reference.soc_std_pct)
+        soc_pct, std_pct = self._coulomb_soc()
+        if math.isnan(soc_pct):
+            self._start_count(*reference)
             return
-        soc_pct, var_pct2 = _clip(self._coulomb_pct()), self._coulomb_std_pct() ** 2
+        var_pct2 = std_pct**2
         gain = var_pct2 / (var_pct2 + reference.soc_std_pct**2)
         soc_pct += gain * (reference.soc_pct - soc_pct)
         self._start_count(soc_pct, math.sqrt((1.0 - gain) * var_pct2))
@@ -388,6 +360,8 @@ class Estimator:
         memory.coulomb_moved_pct = counter.moved_pct
         memory.coulomb_gap_var_pct2 = counter.gap_var_pct2
 
+    # --- the state after the latest sample
+
     @property
     def _temperature_c(self) -> float:
         """Latest known temperature [°C]; the model's reference before the first."""
@@ -395,42 +369,18 @@ class Estimator:
         return self.voltage_model.t_ref_c if math.isnan(known_c) else known_c
 
     def _load(self) -> tuple[FloatArray, float, float]:
-        """Return the load row at the latest sample, its voltage, and the resistances' part [V]."""
+        """Return the load row, its voltage, and the part of it by the resistances [V]."""
         load, theta = self._online.load(), self._online.load_coefficients
         return load, float(load @ theta), float(load[1:] @ theta[1:])
 
-    def _evaluate(self) -> Estimate:
-        """Return the estimate after the latest accepted sample."""
-        if self._pending is None:
-            return self._latest
-        (sample, stamp_s, implausible), self._pending = self._pending, None
-        memory = self._memory
-        soc_pct, std_pct = self._soc_and_std_pct()
-        reasons = self._reasons(sample, soc_pct, std_pct, implausible)
-        self._latest = Estimate(
-            stamp_s,
-            soc_pct,
-            std_pct,
-            memory.newton_pct,
-            _clip(self._coulomb_pct()),
-            memory.voltage_model_v,
-            memory.residual_v,
-            status_of(reasons),
-            reasons,
-            memory.samples,
-        )
-        return self._latest
-
-    def _soc_and_std_pct(self) -> tuple[float, float]:
+    def _soc(self) -> tuple[float, float]:
         """Return SoC and standard deviation [%] of the chosen method; NaN until known."""
         memory, method = self._memory, self.settings.method
         if method == "newton":
             return memory.newton_pct, memory.newton_std_pct
         if not memory.is_known:
             return math.nan, math.nan
-        if method == "coulomb":
-            return _clip(self._coulomb_pct()), self._coulomb_std_pct()
-        return self._filter_soc()
+        return self._coulomb_soc() if method == "coulomb" else self._filter_soc()
 
     def _filter_soc(self) -> tuple[float, float]:
         """Return SoC and standard deviation of the filter, counted to the latest sample [%]."""
@@ -442,38 +392,45 @@ class Estimator:
         )
         return _clip(soc_pct), std_pct
 
-    def _coulomb_pct(self) -> float:
-        """Return the SoC by counting alone [%], not clipped; NaN until counting has started."""
-        return self._memory.coulomb_start_pct - self._counter.state.discharged_pct
-
-    def _coulomb_std_pct(self) -> float:
+    def _coulomb_soc(self) -> tuple[float, float]:
+        """Return SoC and standard deviation by counting alone [%]; NaN until it has started."""
         memory, counter = self._memory, self._counter.state
-        return count_std_pct(
+        std_pct = count_std_pct(
             memory.coulomb_var_pct2 + counter.gap_var_pct2 - memory.coulomb_gap_var_pct2,
             counter.counted_s - memory.coulomb_counted_s,
             counter.moved_pct - memory.coulomb_moved_pct,
         )
+        return _clip(memory.coulomb_start_pct - counter.discharged_pct), std_pct
 
-    def _reasons(
-        self, sample: Sample, soc_pct: float, std_pct: float, implausible: Reason
-    ) -> Reason:
+    def _evaluate(self) -> Estimate:
+        """Return the estimate after the latest accepted sample."""
+        if self._pending is None:
+            return self._latest
+        (sample, stamp_s, implausible), self._pending = self._pending, None
+        memory, line, time_s = self._memory, self._online.delay_line, sample.time_s
+        soc_pct, std_pct = self._soc()
         # In plain bits: operations on flags are slow. Comparisons with NaN are false.
-        memory, line = self._memory, self._online.delay_line
-        bits = int(self._permanent_reasons) | int(implausible)
+        bits = int(self._mismatch) | int(implausible)
         for is_set, reason in (
             (math.isnan(soc_pct), Reason.NO_INITIAL_SOC),
             (std_pct > self.settings.valid_std_pct, Reason.SOC_UNCERTAIN),
             (line.filled_s < line.longest_s, Reason.DELAY_LINE_FILLING),
-            (sample.time_s < memory.gap_until_s, Reason.CURRENT_GAP),
+            (time_s < memory.gap_until_s, Reason.CURRENT_GAP),
             (math.isnan(sample.voltage_v), Reason.VOLTAGE_MISSING),
             (math.isnan(sample.temperature_c), Reason.TEMPERATURE_MISSING),
             (not memory.newton_inside, Reason.VOLTAGE_OUTSIDE_MODEL),
-            (sample.time_s < memory.contradicted_until_s, Reason.INNOVATION_LARGE),
-            (sample.time_s < memory.mismatch_until_s, Reason.MODEL_MISMATCH),
+            (time_s < memory.contradicted_until_s, Reason.INNOVATION_LARGE),
+            (time_s < memory.mismatch_until_s, Reason.MODEL_MISMATCH),
         ):
             if is_set:
                 bits |= int(reason)
-        return REASONS[bits | int(outside_model(self.voltage_model, soc_pct, sample))]
+        reasons = REASONS[bits | int(outside_model(self.voltage_model, soc_pct, sample))]
+        socs = soc_pct, std_pct, memory.newton_pct, self._coulomb_soc()[0]
+        volts = memory.voltage_model_v, memory.residual_v
+        self._latest = Estimate(stamp_s, *socs, *volts, status_of(reasons), reasons, memory.samples)
+        return self._latest
+
+    # --- restart, and another model
 
     def snapshot(self) -> EstimatorState:
         """Return a copy of everything needed to continue as if not interrupted."""
@@ -566,14 +523,12 @@ class Estimator:
         self._block.begin(state.block.number)
         self._block.state.is_broken = True
         memory.is_known, memory.coulomb_start_pct = False, math.nan
-        if math.isnan(state.soc_pct):
-            # The inverse has no SoC without a voltage; counting has.
-            if not math.isnan(state.estimate[4]):
-                self._start(state.estimate[4], UNKNOWN_STD_PCT, is_doubtful=False)
-        else:
+        if not math.isnan(state.soc_pct):
             self._start(state.soc_pct, state.soc_std_pct, is_doubtful=False)
+        elif not math.isnan(state.estimate[4]):  # counting has a SoC where the inverse has none
+            self._start(state.estimate[4], UNKNOWN_STD_PCT, is_doubtful=False)
 
 
 def _clip(soc_pct: float) -> float:
     """Return the SoC within 0–100 %; NaN stays NaN."""
-    return soc_pct if math.isnan(soc_pct) else min(max(soc_pct, 0.0), 100.0)
+    return min(max(soc_pct, 0.0), 100.0)

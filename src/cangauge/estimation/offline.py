@@ -94,12 +94,11 @@ class EstimateTable(ArrowExport):
     def of(cls, estimates: Iterable[Estimate]) -> EstimateTable:
         """Collect estimates into columns."""
         columns = list(zip(*estimates, strict=True)) or [()] * len(Estimate._fields)
-        by_name = dict(zip(Estimate._fields, columns, strict=True))
-        flags: dict[str, Any] = {
-            name: np.array(by_name[name], np.int64) for name in ("status", "reasons")
-        }
-        numbers: dict[str, Any] = {name: np.array(by_name[name], np.float64) for name in NUMBERS}
-        return cls(**numbers, **flags)
+        kinds = [np.float64] * len(NUMBERS) + [np.int64] * 2
+        arrays: list[Any] = [
+            np.array(column, kind) for column, kind in zip(columns, kinds, strict=False)
+        ]
+        return cls(*arrays)
 
     def __repr__(self) -> str:
         """Return the number of samples, the time and the SoC at both ends."""
@@ -236,17 +235,11 @@ def gap_of(log: Log) -> float:
 
 
 def estimate_log(
-    log: Log,
-    model: Model,
-    settings: EstimatorSettings,
-    *,
-    progress: Callable[[int], None] | None = None,
-    observe: Callable[[Estimator, Sample], None] | None = None,
-    at_end: Callable[[Estimator], None] | None = None,
+    log: Log, model: Model, settings: EstimatorSettings
 ) -> tuple[EstimateTable, Scores]:
     """Estimate a log with given settings, and score it; see `run_estimator` and `score`."""
     began = time.perf_counter()
-    table = run_estimator(log, model, settings, progress=progress, observe=observe, at_end=at_end)
+    table = run_estimator(log, model, settings)
     return table, score(table, log, time.perf_counter() - began)
 
 
@@ -257,44 +250,41 @@ def samples_of(log: Log) -> Iterator[Sample]:
 
 
 def run_estimator(
+    samples: Iterable[Sample] | Log, model: Model, settings: EstimatorSettings
+) -> EstimateTable:
+    """Return the estimates of all samples by a new estimator; see `step_all`."""
+    return step_all(make_estimator(model, settings), samples)
+
+
+def step_all(
+    estimator: Estimator,
     samples: Iterable[Sample] | Log,
-    model: Model,
-    settings: EstimatorSettings,
     *,
     progress: Callable[[int], None] | None = None,
-    observe: Callable[[Estimator, Sample], None] | None = None,
-    at_end: Callable[[Estimator], None] | None = None,
+    observe: Callable[[Sample], None] | None = None,
 ) -> EstimateTable:
     """Return the estimates of all samples, in order: the same step as live.
 
     Parameters
     ----------
+    estimator : Estimator
     samples : iterable of Sample, or Log
-    model : Model
-    settings : EstimatorSettings
     progress : callable, optional
         Called with the number of samples done, every `PROGRESS_EVERY`.
     observe : callable, optional
-        Called with estimator and sample after each sample.
-    at_end : callable, optional
-        Called with the estimator after the last sample.
+        Called with each sample after its step.
     """
-    estimator = make_estimator(model, settings)
     if isinstance(estimator, CompiledEstimator) and isinstance(samples, Log) and observe is None:
-        table = _run_columns(estimator, samples, progress)
-    else:
-        estimates = []
-        rows = samples_of(samples) if isinstance(samples, Log) else samples
-        for done, sample in enumerate(rows, start=1):
-            estimates.append(estimator.step(sample))
-            if observe is not None:
-                observe(estimator, sample)
-            if progress is not None and done % PROGRESS_EVERY == 0:
-                progress(done)
-        table = EstimateTable.of(estimates)
-    if at_end is not None:
-        at_end(estimator)
-    return table
+        return _run_columns(estimator, samples, progress)
+    estimates = []
+    rows = samples_of(samples) if isinstance(samples, Log) else samples
+    for done, sample in enumerate(rows, start=1):
+        estimates.append(estimator.step(sample))
+        if observe is not None:
+            observe(sample)
+        if progress is not None and done % PROGRESS_EVERY == 0:
+            progress(done)
+    return EstimateTable.of(estimates)
 
 
 def _run_columns(

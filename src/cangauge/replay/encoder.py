@@ -107,10 +107,9 @@ class FrameEncoder:
             column = LOG_COLUMNS[signal.role]
             if (values := getattr(log, column)) is None:
                 continue
-            (low, high), half = signal.codec.range, signal.codec.half_step
-            bad = np.flatnonzero((values < low - half) | (values > high + half))
+            bad = np.flatnonzero(~signal.codec.fits(values))
             if bad.size:
-                row = int(bad[0])
+                row, (low, high) = int(bad[0]), signal.codec.range
                 raise InputError(
                     f"does not fit into signal {signal.codec.name} of {signal.message}, which holds"
                     f" {low:g} to {high:g} {_UNITS[signal.role]}; the first such row is {row + 1}",

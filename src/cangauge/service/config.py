@@ -50,28 +50,14 @@ DEFAULT_VEHICLE: Final = "generic"
 """Default of `replay` as well, so that both commands work together without options."""
 
 
-@dataclass(frozen=True)
-class KeyInfo:
-    """What a key has beside its type, bounds and help.
-
-    `option` is that of `cangauge run`, such as "-m, --model" ("": a key of the file only),
-    `metavar` the placeholder of its value, `default_text` the default in words, where the field's
-    own is not enough. A reload does not apply a change of a key with `restart`; paths are relative
-    to the file that they are in.
-    """
-
-    option: str = ""
-    metavar: str = ""
-    unit: str = ""
-    default_text: str = ""
-    restart: bool = False
-    is_path: bool = False
-
-
 def key(default: Any, text: str, option: str = "", metavar: str = "", **more: Any) -> Any:
-    """Return the field of a key; further arguments are those of `KeyInfo`, or pydantic's bounds."""
-    info = {name: more.pop(name) for name in KeyInfo.__dataclass_fields__ if name in more}
-    about = {"option": option, "metavar": metavar, **info}
+    """Return the field of a key; further arguments are those of `ConfigKey`, or pydantic's bounds.
+
+    `default_text` is the default in words, where the field's own is not enough.
+    """
+    names = ("unit", "restart", "is_path", "default_text")
+    about = {name: more.pop(name) for name in names if name in more}
+    about |= {"option": option, "metavar": metavar}
     return Field(default, description=text, json_schema_extra={"key": about}, **more)
 
 
@@ -432,7 +418,7 @@ def load_config(
     for each in config_keys():
         *tables, name = each.name.split(".")
         table = reduce(lambda found, key: found.get(key, {}), tables, data)
-        if path is not None and each.info.is_path and name in table:
+        if path is not None and each.is_path and name in table:
             table[name] = str(Path(path).parent / table[name])
     if given.keys() & {"vehicle", "dbc", "map"}:  # replaces the file's vehicle as a whole
         data = {name: data[name] for name in data if name not in {"vehicle", "dbc", "map"}}
@@ -451,7 +437,7 @@ def _check_options(given: Mapping[str, Any]) -> None:
     try:
         validated(RunConfig, {"model": "-", **given}, "")
     except InputError as error:
-        options = {each.name: each.info.option for each in config_keys() if each.info.option}
+        options = {each.name: each.option for each in config_keys() if each.option}
         option = options.get(error.field or "", error.field or "").rpartition(", ")[2]
         raise InputError(error.problem, field=option, value=error.value, cure=error.cure) from error
 
@@ -463,7 +449,10 @@ def _check_options(given: Mapping[str, Any]) -> None:
 class ConfigKey:
     """A key of the configuration, for the reference and the command line, in words.
 
-    `name` is dotted, such as "ids.soc_detail"; `kind` is the type.
+    `name` is dotted, such as "ids.soc_detail"; `kind` is the type. `option` is that of `cangauge
+    run`, such as "-m, --model" ("": a key of the file only), `metavar` the placeholder of its
+    value. A reload does not apply a change of a key with `restart`; paths are relative to the file
+    that they are in.
     """
 
     name: str
@@ -471,7 +460,11 @@ class ConfigKey:
     default: str
     bounds: str
     text: str
-    info: KeyInfo
+    option: str
+    metavar: str
+    unit: str = ""
+    restart: bool = False
+    is_path: bool = False
 
     def value_in(self, table: Mapping[str, Any]) -> Any:
         """Return the value of the key in a table, or None."""
@@ -484,7 +477,7 @@ class ConfigKey:
     def help(self) -> str:
         """Help text of the option, with unit and default."""
         first, dot, more = self.text.partition(". ")
-        unit = f" [{self.info.unit}]" if self.info.unit else ""
+        unit = f" [{self.unit}]" if self.unit else ""
         text = f"{first}{unit}. {more}" if dot else f"{first.removesuffix('.')}{unit}."
         return f"{text} Default: {self.default}." if self.default else text
 
@@ -510,30 +503,28 @@ def _keys(table: dict[str, Any], tables: dict[str, Any], prefix: str) -> Iterato
         if inner.get("has_keys"):
             yield from _keys(inner, tables, f"{prefix}{name}.")
             continue
-        info, default = KeyInfo(**field["key"]), field.get("default")
+        about, default = dict(field["key"]), field.get("default")
+        if (text := about.pop("default_text", "")) or default is None or isinstance(default, dict):
+            default = text
+        elif isinstance(default, bool):
+            default = str(default).lower()
+        elif isinstance(default, float):
+            default = f"{default:.10g}"
+        elif about["metavar"] == "ID":
+            default = f"0x{default:X}"
         values = kind.get("enum")
         words = f"one of {', '.join(values)}" if values else _KINDS.get(kind.get("type"), "table")
         bounds = [f"{sign} {kind[bound]:g}" for bound, sign in _BOUNDS.items() if bound in kind]
-        text = info.default_text or _default(default, info)
-        yield ConfigKey(prefix + name, words, text, ", ".join(bounds), field["description"], info)
-
-
-def _default(value: Any, info: KeyInfo) -> str:
-    if value is None or isinstance(value, dict):
-        return ""
-    if isinstance(value, bool):
-        return str(value).lower()
-    if info.metavar == "ID":
-        return f"0x{value:X}"
-    return f"{value:.10g}" if isinstance(value, float) else str(value)
+        help_text = field["description"]
+        yield ConfigKey(prefix + name, words, str(default), ", ".join(bounds), help_text, **about)
 
 
 def reference() -> str:
     """Return the reference of all keys as a Markdown table."""
     rows = [("Key", "Option", "Type", "Default", "Unit", "Bounds", "Meaning"), ("---",) * 7]
     for each in config_keys():
-        option = ", ".join(f"`{name}`" for name in each.info.option.split(", ") if name)
-        about = (each.kind, each.default, each.info.unit, each.bounds, each.text)
+        option = ", ".join(f"`{name}`" for name in each.option.split(", ") if name)
+        about = (each.kind, each.default, each.unit, each.bounds, each.text)
         rows.append((f"`{each.name}`", option, *about))
     cells = [[cell.replace("|", "\\|") for cell in row] for row in rows]
     return "".join(f"| {' | '.join(row)} |\n" for row in cells)

@@ -58,19 +58,23 @@ def reload_on_hangup(reload: Callable[[], None]) -> Iterator[None]:
 
     As `stop_on_signals`; without effect on Windows, which has no SIGHUP.
     """
-    had_terminal = _has_terminal()
+    had_terminal = has_terminal()
 
     def handle(_number: int, _frame: FrameType | None) -> None:
-        if had_terminal and not _has_terminal():
+        if had_terminal and not has_terminal():
             signal.raise_signal(signal.SIGTERM)
         else:
             reload()
 
-    with _handler(handle, *([signal.SIGHUP] if hasattr(signal, "SIGHUP") else [])):
+    kinds = [signal.SIGHUP] if hasattr(signal, "SIGHUP") else []
+    with _handler(handle, *kinds):
+        if kinds:  # handle one that was held back while the service loaded (`__main__`)
+            signal.pthread_sigmask(signal.SIG_UNBLOCK, kinds)
         yield
 
 
-def _has_terminal() -> bool:
+def has_terminal() -> bool:
+    """Return whether this process has a controlling terminal."""
     try:
         os.close(os.open("/dev/tty", os.O_RDONLY | os.O_NOCTTY))
     except OSError:
@@ -133,7 +137,7 @@ class Notifier:
         self._socket.setblocking(False)
         timeout_us = given.get("WATCHDOG_USEC", "")
         is_ours = given.get("WATCHDOG_PID", str(os.getpid())) == str(os.getpid())
-        if is_ours and timeout_us.isdecimal():
+        if is_ours and timeout_us.isdecimal() and int(timeout_us):  # 0: no watchdog
             self.ping_every_s = int(timeout_us) / 1e6 / PINGS_PER_TIMEOUT
 
     def __enter__(self) -> Self:

@@ -13,6 +13,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Final
 
 import can
@@ -36,6 +37,7 @@ from cangauge.service.status import Monitor
 from cangauge.types import Estimate, Reason
 
 _LOG = logging.getLogger(__name__)
+_warn = partial(emit, _LOG, logging.WARNING)
 
 LATE_S: Final = 0.01
 """Longest delay of a heartbeat for a sample that is due, and shortest interval of housekeeping
@@ -46,7 +48,7 @@ SEND_WITHIN_S: Final = 0.1
 """Longest time that a frame waits for room in the transmit queue [s]: until the next one is due.
 The loop itself never waits: a full queue (no other node on the bus) costs frames, not the
 estimate."""
-SAID_FROM_S: Final = 1.0
+LOGGED_FROM_S: Final = 1.0
 """Smallest step of the stamps' clock that is logged [s]; smaller ones are its drift."""
 CHECKPOINT_EVERY_S: Final = 10.0
 """Interval of checkpoints [s]. A service that is killed and restarts within three seconds misses
@@ -107,8 +109,7 @@ class Loop:
         checkpoint: Callable[[], None] = lambda: None,
         reload: Callable[[], LoopSettings | None] = lambda: None,
     ) -> None:
-        self._port = port
-        self._pipeline = pipeline
+        self._port, self._pipeline = port, pipeline
         self._settings = settings or LoopSettings()
         self._outputs = list(outputs)
         self._samplers = [each for each in outputs if type(each).on_sample is not Output.on_sample]
@@ -117,24 +118,37 @@ class Loop:
         self._checkpoint, self._reload = checkpoint, reload
         self._own = OwnFrames(echoes=port.capabilities.echoes)
         self._asked = OwnFrames(echoes=port.capabilities.echoes)
-        # With receive stamps REPLAY_CLOCK is no input; it is received once, for a warning.
-        self._expects_clock = not pipeline.is_replay
         self._stamps_are_arrival = port.capabilities.stamps != "driver"
         self._stamps = StampLimiter(DRIVER_TOLERANCE_S)
         if self._stamps_are_arrival:
             self._stamps = StampLimiter(KERNEL_TOLERANCE_S, time.time() - steady_s())
         self._shift_s = 0.0
-        # Beginning of the latest turn that emptied the receive queue, after which the frames of
-        # the next turn arrived; time at which the latest turn received.
+        # Beginning of the latest step that emptied the receive queue, after which the frames of
+        # the next step arrived; time at which the latest step received.
         self._drained_s = self._received_s = steady_s()
         self._reported: set[str] = set()
+        self._clock_was_seen = False
         self._drops = 0
-        self._follow_pipeline()
+        self._configure()
         self._began_s = self._now_s = self._beat_s = self._keep_s = time.monotonic()
         self._save_s = self._began_s + min(FIRST_CHECKPOINT_S, self._settings.checkpoint_every_s)
         # Times at which the latest sample was processed and received. They differ while frames wait
         # in the socket, after the process was suspended or under load.
         self._sample_s = self._came_s = self._began_s
+
+    def _configure(self) -> None:
+        """Poll and receive for the pipeline's present vehicle, and what shows other senders."""
+        pipeline, every_s = self._pipeline, self._settings.poll_every_s
+        targets, ids = pipeline.vehicle.poll_targets, pipeline.settings.ids
+        self._poller = None if every_s is None or not targets else Poller(targets, every_s)
+        self._monitor.polls = None if self._poller is None else self._poller.counts
+        not_input = set(ids.published)
+        if self._poller is not None:
+            not_input |= self._poller.request_ids
+        if not pipeline.is_replay:
+            not_input.add(ids.replay_clock)
+        self._not_input = frozenset(not_input)
+        self._port.set_filters([*pipeline.filters, *map(standard_filter, sorted(not_input))])
 
     def run(self, stop: Callable[[], bool]) -> None:
         """Receive, estimate and publish until `stop()`, which is called every `LONGEST_WAIT_S`.
@@ -146,9 +160,9 @@ class Loop:
         """
         try:
             while not (stop() or self._is_over()):
-                self._turn()
+                self._step()
             if self._pipeline.finish():
-                self._tell_sample(self._pipeline.latest)
+                self._give_sample(self._pipeline.latest)
                 self._now_s = time.monotonic()
                 self._beat()  # with the silence since the sample before: this one waited
         finally:
@@ -160,11 +174,11 @@ class Loop:
         is_idle = idle_s is not None and self._now_s - self._sample_s >= idle_s
         return is_late or (is_idle and self._pipeline.samples > 0)
 
-    def _turn(self) -> None:
+    def _step(self) -> None:
         """Receive once, process the frames, and do what is due."""
         left_s = self._beat_s + LATE_S - self._now_s
         messages = self._port.receive_pending(min(max(left_s, 0.0), LONGEST_WAIT_S))
-        # Reading the clock may be a system call: once per turn, and again after samples.
+        # Reading the clock may be a system call: once per step, and again after samples.
         self._now_s, before, received_s = time.monotonic(), self._pipeline.samples, steady_s()
         if messages:
             self._process(messages, received_s)
@@ -178,7 +192,7 @@ class Loop:
             self._ask(self._poller.due(self._now_s))
         if self._now_s >= self._keep_s:
             self._keep_s = self._now_s + LATE_S
-            self._keep_house()
+            self._housekeep()
 
     def _process(self, messages: list[can.Message], now_s: float) -> None:
         pipeline, record, poller = self._pipeline, self._record, self._poller
@@ -197,7 +211,7 @@ class Loop:
             stamp_s = received_s
             if self._samplers or pipeline.is_replay:
                 estimate = pipeline.latest
-                self._tell_sample(estimate)
+                self._give_sample(estimate)
                 if frames := pipeline.acknowledgement(estimate):
                     self._send(frames)
                     self._beat_s = self._now_s + ESTIMATE_EVERY_S
@@ -205,44 +219,38 @@ class Loop:
             self._sample_s = self._now_s
         if taken := pipeline.taken - taken_before:
             began_s, self._now_s = self._now_s, time.monotonic()
-            step_s = (self._now_s - began_s) / taken
             self._came_s = began_s - lag_s if self._stamps_are_arrival else began_s
-            self._monitor.stepped(stamp_s, step_s, self._came_s)
+            self._monitor.stepped(stamp_s, (self._now_s - began_s) / taken, self._came_s)
 
     def _is_not_input(self, message: can.Message) -> bool:
         """Handle a frame with an id that is not the vehicle's; return False if it is input."""
+        frame_id, ids = message.arbitration_id, self._pipeline.settings.ids
         if message.is_extended_id:
             return False
-        settings, frame_id = self._pipeline.settings, message.arbitration_id
-        if frame_id in settings.ids.published:
+        if frame_id in ids.published:
             if not self._own.is_echo(message) and self._own.proves_another(self._now_s):
                 text = f"another node on this bus sends 0x{frame_id:X}, which this service"
                 text += " publishes: is a second service running? Give one of them other ids"
-                text += " ([ids] of the configuration)"
-                emit(_LOG, logging.WARNING, "bus.duplicate_sender", text)
-            self._port.foreign = self._own.foreign
-            return True
-        if self._poller is not None and frame_id in self._poller.request_ids:
+                _warn("bus.duplicate_sender", f"{text} ([ids] of the configuration)")
+            self._monitor.foreign = self._own.foreign
+        elif self._poller is not None and frame_id in self._poller.request_ids:
             if not self._asked.is_echo(message):
                 self._poller.note_other_tester(self._now_s)
-            return True
-        if is_clock(message, settings.ids.replay_clock) and not self._pipeline.is_replay:
-            if self._expects_clock:
-                self._expects_clock = False
-                self._listen()
-                text = "a replay sends its log's time on this bus (REPLAY_CLOCK), but this service"
-                text += " uses receive stamps; to use the log's time, run with"
-                text += " --time-source replay-clock"
-                emit(_LOG, logging.WARNING, "bus.replay_clock_ignored", text)
-            return True
-        return False
+        elif not is_clock(message, ids.replay_clock):
+            return False
+        elif not self._clock_was_seen:
+            self._clock_was_seen = True
+            text = "a replay sends its log's time on this bus (REPLAY_CLOCK), but this service"
+            text += " uses receive stamps; to use the log's time, run with"
+            _warn("bus.replay_clock_ignored", f"{text} --time-source replay-clock")
+        return True
 
-    def _tell_sample(self, estimate: Estimate) -> None:
+    def _give_sample(self, estimate: Estimate) -> None:
         for output in self._samplers:
-            self._tell(output, "on_sample", self._pipeline.latest_sample, estimate)
+            self._give(output, "on_sample", self._pipeline.latest_sample, estimate)
 
-    def _tell(self, output: Output, method: str, *news: object) -> None:
-        """Call an output; one that raises is told nothing more, and the estimate continues."""
+    def _give(self, output: Output, method: str, *news: object) -> None:
+        """Call an output; one that raises is called no more, and the estimate continues."""
         try:
             getattr(output, method)(*news)
         except Exception as error:  # noqa: BLE001 - whatever it is, the SoC frames continue
@@ -252,10 +260,8 @@ class Loop:
             self._samplers = [each for each in self._samplers if each is not output]
 
     def _beat(self) -> None:
-        silent_s = self._now_s - self._came_s
-        is_stale = silent_s > max(self._settings.timeout_s, self._pipeline.least_timeout_s)
-        reasons = self._report_findings()
-        self._send(self._pipeline.heartbeat(is_stale=is_stale, silent_s=silent_s, reasons=reasons))
+        silent_s, reasons = self._now_s - self._came_s, self._report_findings()
+        self._send(self._pipeline.heartbeat(silent_s, self._settings.timeout_s, reasons))
         # Stay on the clock's grid; skip beats missed while the process was suspended.
         missed = max(math.floor((self._now_s - self._beat_s) / ESTIMATE_EVERY_S), 0)
         self._beat_s += (missed + 1) * ESTIMATE_EVERY_S
@@ -266,10 +272,9 @@ class Loop:
         if stamps.shift_s != self._shift_s:
             step_s, self._shift_s = self._shift_s - stamps.shift_s, stamps.shift_s
             self._pipeline.stamp_shift_s = stamps.shift_s
-            if abs(step_s) >= SAID_FROM_S:
+            if abs(step_s) >= LOGGED_FROM_S:
                 text = f"the clock of the time stamps was set by {step_s:+.1f} s; bus time follows"
-                text += " the monotonic clock"
-                emit(_LOG, logging.WARNING, "bus.clock_set", text, step_s=step_s)
+                _warn("bus.clock_set", f"{text} the monotonic clock", step_s=step_s)
         if stamps.is_uncertain(steady_s()):
             reasons |= Reason.TIME_UNCERTAIN
             text = "the time stamps of the frames contradict the monotonic clock; the time of"
@@ -283,7 +288,7 @@ class Loop:
                 " the DBC states, give its shortest period_s in the map file)"
             )
         for event in found.keys() - self._reported:
-            emit(_LOG, logging.WARNING, event.split()[0], found[event], limit=event)
+            _warn(event.split()[0], found[event], limit=event)
         self._reported = set(found)
         return reasons
 
@@ -300,40 +305,23 @@ class Loop:
             self._asked.note_sent(frame)
             self._port.post(frame, SEND_WITHIN_S)
 
-    def _keep_house(self) -> None:
+    def _housekeep(self) -> None:
+        """Report lost frames, save, reload and show."""
         now_s, drops = self._now_s, self._port.queue_drops or 0
         if drops > self._drops:
             lost, self._drops = drops - self._drops, drops
             text = f"{self._port.name}: the receive queue overflowed: {lost} frames lost"
-            emit(_LOG, logging.WARNING, "bus.queue_overflow", f"{text} ({drops} so far)")
+            _warn("bus.queue_overflow", f"{text} ({drops} so far)")
         if now_s >= self._save_s:
             self._save_s = now_s + self._settings.checkpoint_every_s
             self._checkpoint()
         if (settings := self._reload()) is not None:
             self._settings = settings
             self._save_s = min(self._save_s, now_s + settings.checkpoint_every_s)
-            self._follow_pipeline()
+            self._configure()
         if self._monitor.turn(now_s):
             for output in self._outputs:
-                self._tell(output, "on_snapshot", self._monitor.latest)
-
-    def _follow_pipeline(self) -> None:
-        """Poll and receive for the pipeline's present vehicle."""
-        every_s, targets = self._settings.poll_every_s, self._pipeline.vehicle.poll_targets
-        self._poller = None if every_s is None or not targets else Poller(targets, every_s)
-        self._port.polls = None if self._poller is None else self._poller.counts
-        self._listen()
-
-    def _listen(self) -> None:
-        """Receive the vehicle's frames, and those that tell of other senders."""
-        settings = self._pipeline.settings
-        ids = set(settings.ids.published)
-        if self._poller is not None:
-            ids |= self._poller.request_ids
-        clock = {settings.ids.replay_clock}
-        self._not_input = frozenset(ids if self._pipeline.is_replay else ids | clock)
-        ids |= clock if self._expects_clock else set()
-        self._port.set_filters([*self._pipeline.filters, *map(standard_filter, sorted(ids))])
+                self._give(output, "on_snapshot", self._monitor.latest)
 
 
 class OwnFrames:

@@ -11,8 +11,8 @@ import time
 from array import array
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field, replace
+from functools import partial
 from os import PathLike
-from pathlib import Path
 from typing import Any, Final, Literal, cast
 
 import numpy as np
@@ -21,19 +21,20 @@ from can.typechecking import Channel
 from cangauge._text import rounded
 from cangauge._typing import FloatArray
 from cangauge.bus.publish import NO_REPORT, FrameIds, PackReport
-from cangauge.bus.recording import capture_samples, open_vehicle_capture
+from cangauge.bus.recording import CaptureSamples, capture_samples, open_vehicle_capture
 from cangauge.bus.time_source import REPLAY_CLOCK_ID, TimeSourceName, is_clock
 from cangauge.bus.vehicle import Vehicle
 from cangauge.errors import InputError
 from cangauge.estimation.cells import CellEstimator
+from cangauge.estimation.compiled import make_estimator
 from cangauge.estimation.estimator import Estimator
 from cangauge.estimation.offline import (
     EstimateTable,
     Scores,
-    estimate_log,
     gap_of,
     initial_soc_of,
     score,
+    step_all,
 )
 from cangauge.estimation.settings import EstimatorSettings
 from cangauge.logs.log import Log
@@ -57,55 +58,6 @@ DOUBTFUL_COVER: Final = 0.5
 
 Origin = Literal["given", "log", "voltage"]
 """Source of the initial SoC: an option, the log's soc_pct, or the first voltages."""
-
-
-@dataclass(frozen=True, eq=False)
-class RecordedCapture:
-    """Samples of a capture: unlike a log's rows, they may lack voltage and temperature (NaN).
-
-    Columns of shape (n,), as in a `Log`; time does not decrease.
-    """
-
-    time_s: FloatArray
-    current_a: FloatArray
-    voltage_v: FloatArray
-    temperature_c: FloatArray
-    soc_pct: FloatArray | None
-    name: str
-    source: str
-    temperature_source: str
-    remarks: tuple[str, ...] = ()
-
-    def __len__(self) -> int:
-        """Return the number of rows."""
-        return int(self.time_s.size)
-
-    @property
-    def duration_s(self) -> float:
-        """Time from the first row to the last [s]."""
-        return float(self.time_s[-1] - self.time_s[0])
-
-    def as_log(self) -> Log | None:
-        """Return the rows with a voltage and a new time, at 0 °C; None if there are fewer than 2.
-
-        Enough to check the sign of the current.
-        """
-        rows = np.isfinite(self.voltage_v)
-        rows[1:] &= np.diff(self.time_s) > 0.0
-        if rows.sum() < 2:
-            return None
-        return Log(
-            time_s=self.time_s[rows],
-            current_a=self.current_a[rows],
-            voltage_v=self.voltage_v[rows],
-            temperature_c=np.zeros(int(rows.sum())),
-            soc_pct=None if self.soc_pct is None else self.soc_pct[rows],
-            name=self.name,
-            source=self.source,
-        )
-
-
-Recorded = Log | RecordedCapture
 
 
 class PackHistory:
@@ -147,17 +99,13 @@ class PackHistory:
                 volts = cells.voltage_v[self._row].tolist()
                 self._cell_estimator.update(estimator.pack_tick(sample), volts, [0.0] * cells.count)
         self._row += 1
-        self.add(sample.time_s, lambda: self._report_of(estimator))
+        self.add(sample.time_s, lambda: self.report_of(estimator))
 
     def add(self, time_s: float, report: Callable[[], PackReport]) -> None:
         """Keep the report of a sample's time [s], if its interval has begun."""
         if self._keeps_rows and not self._due_s - self._every_s <= time_s < self._due_s:
             self._due_s = time_s + self._every_s
             self._reports.append((time_s, report()))
-
-    def take(self, estimator: Estimator) -> None:
-        """Take the estimator after the last sample of a log."""
-        self.report = self._report_of(estimator)
 
     @property
     def columns(self) -> dict[str, FloatArray]:
@@ -169,7 +117,8 @@ class PackHistory:
             rows.append({"time_s": time_s, **parts["health"], **parts["power"], **cells})
         return {name: np.array([row[name] for row in rows], np.float64) for name in rows[0]}
 
-    def _report_of(self, estimator: Estimator) -> PackReport:
+    def report_of(self, estimator: Estimator) -> PackReport:
+        """Return health and power after the estimator's latest sample, and the log's cells."""
         cells = None if self._cell_estimator is None else self._cell_estimator.report
         return PackReport(estimator.health, estimator.power(), cells)
 
@@ -180,7 +129,7 @@ class RecordedEstimate:
 
     Parameters
     ----------
-    recorded : Log or RecordedCapture
+    recorded : Log or CaptureSamples
         n samples.
     table : EstimateTable
         n estimates.
@@ -197,7 +146,7 @@ class RecordedEstimate:
         Health, power and cells.
     """
 
-    recorded: Recorded
+    recorded: Log | CaptureSamples
     table: EstimateTable
     scores: Scores
     model: Model
@@ -296,11 +245,12 @@ def estimate_recorded_log(
         origin = "log"
         start_pct = initial_soc_of(log, settings.capacity_ah or model.capacity_ah)
         settings = replace(settings, initial_soc_pct=start_pct)
+    began, estimator = time.perf_counter(), make_estimator(model, settings)
     history = PackHistory() if pack is None else pack
-    observe = history.observe if history.takes_samples else None
-    table, scores = estimate_log(
-        log, model, settings, progress=progress, observe=observe, at_end=history.take
-    )
+    observe = partial(history.observe, estimator) if history.takes_samples else None
+    table = step_all(estimator, log, progress=progress, observe=observe)
+    scores = score(table, log, time.perf_counter() - began)
+    history.report = history.report_of(estimator)
     return RecordedEstimate(log, table, scores, model, settings, origin, pack=history)
 
 
@@ -328,15 +278,15 @@ def estimate_capture(
     model: Model,
     settings: EstimatorSettings | None = None,
     *,
-    time_source: TimeSourceName | Literal["auto"] = "auto",
     clock_id: int = REPLAY_CLOCK_ID,
     keeps_pack: bool = False,
     progress: Callable[[int], None] | None = None,
 ) -> RecordedEstimate:
     """Estimate a capture, bit for bit as the service does with the same frames.
 
-    Like the service it starts from the first voltages unless `settings` holds an initial SoC; the
-    car's own SoC is the reference to compare with only.
+    Bus time is that of REPLAY_CLOCK if the capture holds one, else the receive stamps. Like the
+    service it starts from the first voltages unless `settings` holds an initial SoC; the car's own
+    SoC is the reference to compare with only.
 
     Parameters
     ----------
@@ -345,8 +295,6 @@ def estimate_capture(
         Its temperature source replaces an unknown one of `settings`.
     model : Model
     settings : EstimatorSettings, optional
-    time_source : {"auto", "receive", "replay-clock"}
-        "auto": the replay clock if the capture holds one, else the receive stamps.
     clock_id : int
         REPLAY_CLOCK's id.
     keeps_pack : bool
@@ -360,19 +308,17 @@ def estimate_capture(
         If the capture cannot be read, gives no sample, or its voltage is another pack's.
     """
     began = time.perf_counter()
-    settings, path = settings or EstimatorSettings(), Path(path)
-    if settings.temperature_source == "unknown":
-        settings = replace(settings, temperature_source=vehicle.temperature_source)
-    source: TimeSourceName = "receive" if time_source == "auto" else time_source
+    source: TimeSourceName = "receive"
     buses: dict[Channel | None, _Bus] = {}
     capture = open_vehicle_capture(path, vehicle)
     for number, message in enumerate(capture, start=1):
-        if time_source == "auto" and source == "receive" and is_clock(message, clock_id):
+        if source == "receive" and is_clock(message, clock_id):
             # Earlier frames have no log time; a live run starts here as well.
             source = "replay-clock"
             buses.clear()
         if message.channel not in buses:
-            chosen = PipelineSettings(settings, source, FrameIds(replay_clock=clock_id))
+            ids = FrameIds(replay_clock=clock_id)
+            chosen = PipelineSettings(settings or EstimatorSettings(), source, ids)
             pipeline = Pipeline(vehicle, model, chosen, publishes=False)
             buses[message.channel] = _Bus(pipeline, PackHistory(keeps_rows=keeps_pack))
         bus = buses[message.channel]
@@ -392,25 +338,21 @@ def estimate_capture(
             cure=f"check that this is the bus of {vehicle.name} (see `cangauge inspect`)",
         )
     best = max(found, key=lambda bus: len(bus.estimates))
-    best.pack.report = best.pipeline.report()
-    counts, table = best.pipeline.counts, EstimateTable.of(best.estimates)
+    pipeline, table = best.pipeline, EstimateTable.of(best.estimates)
+    best.pack.report, counts = pipeline.report(), pipeline.counts
+    settings = pipeline.estimator.settings
     time_s, current_a, voltage_v, temperature_c, soc_pct = np.array(best.values).reshape(-1, 5).T
+    time_s, remarks = _without_steps_back(time_s), _remarks(source, counts, len(found))
+    recorded = CaptureSamples(
+        time_s, current_a, voltage_v, temperature_c, soc_pct, str(path),
+        settings.temperature_source, pipeline.decoder.statistics, capture.info,
+        (*capture.info.remarks, *remarks),
+    )  # fmt: skip
     # With a model, another pack's voltage is implausible.
-    is_known = np.isfinite(voltage_v).any()
-    seen_v = voltage_v if is_known else capture_samples(path, vehicle).voltage_v
-    require_same_pack(seen_v, model, str(path))
-    recorded = RecordedCapture(
-        time_s=_without_steps_back(time_s),
-        current_a=current_a,
-        voltage_v=voltage_v,
-        temperature_c=temperature_c,
-        soc_pct=soc_pct if np.isfinite(soc_pct).any() else None,
-        name=path.name.split(".")[0],
-        source=str(path),
-        temperature_source=settings.temperature_source,
-        remarks=(*capture.info.remarks, *_remarks(source, counts, len(found))),
-    )
-    # `score` needs only columns that a recording has.
+    is_known = np.isfinite(recorded.voltage_v).any()
+    own = recorded if is_known else capture_samples(path, vehicle)
+    require_same_pack(own.voltage_v, model, str(path))
+    # `score` needs only columns that a capture has.
     scores = score(table, cast("Log", recorded), time.perf_counter() - began)
     origin: Origin = "voltage" if settings.initial_soc_pct is None else "given"
     return RecordedEstimate(

@@ -8,14 +8,14 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from dataclasses import astuple, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from typing import Final
 
 import can
 import numpy as np
 from can.typechecking import CanFilter
 
-from cangauge.bus.decoder import SampleDecoder
+from cangauge.bus.decoder import FrameStatistics, SampleDecoder
 from cangauge.bus.plausibility import MISSED_AT_LEAST, MISSED_UNTIL_OLD, PackProperties
 from cangauge.bus.publish import (
     ACKNOWLEDGE_EVERY,
@@ -50,22 +50,18 @@ class FrameCounts:
     first REPLAY_CLOCK, where that is the time source; each new log is a beginning.
     """
 
-    frames: int = 0
-    samples: int = 0
-    lost: int = 0
-    crc_errors: int = 0
-    repeated: int = 0
-    short: int = 0
-    not_available: int = 0
-    implausible: int = 0
-    stuck: int = 0
-    held_back: int = 0
-    untimed: int = 0
-    beginnings: int = 0
-
-    def __add__(self, other: FrameCounts) -> FrameCounts:
-        """Return the sums."""
-        return FrameCounts(*map(sum, zip(astuple(self), astuple(other), strict=True)))
+    frames: int
+    samples: int
+    lost: int
+    crc_errors: int
+    repeated: int
+    short: int
+    not_available: int
+    implausible: int
+    stuck: int
+    held_back: int
+    untimed: int
+    beginnings: int
 
 
 class SignWatch:
@@ -144,8 +140,12 @@ class Pipeline:
     vehicle, model, settings
         As in use; see `reconfigure`.
     decoder : SampleDecoder
-        Frame statistics, signal health and the vehicle's own SoC, of the current log.
+        Signal health and the vehicle's own SoC, of the current log; statistics of all logs.
     estimator : Estimator
+    cells : CellEstimator or None
+        Where the vehicle gives cell voltages.
+    sign : SignWatch
+        Whether the current has the wrong sign.
     samples, taken : int
         Samples handed to the estimator, over all logs, and those of them that it took: only these
         make an estimate fresh.
@@ -156,10 +156,6 @@ class Pipeline:
     latest_sample : Sample or None
     published : Estimate
         The one in the frames made last: `latest`, or at a heartbeat what is true of it then.
-    cells : CellEstimator or None
-        Where the vehicle gives cell voltages.
-    sign : SignWatch
-        Whether the current has the wrong sign.
 
     Raises
     ------
@@ -175,28 +171,26 @@ class Pipeline:
         *,
         publishes: bool = True,
     ) -> None:
-        self.vehicle = vehicle
-        self.model = model
-        self.settings = settings or PipelineSettings()
-        ids = self.settings.ids
-        self.is_replay = self.settings.time_source == "replay-clock"
+        self.vehicle, self.model = vehicle, model
+        self.settings = settings = settings or PipelineSettings()
+        self.is_replay = settings.time_source == "replay-clock"
         self._publisher: SocPublisher | None = None
         if publishes:
-            _check_ids(vehicle, ids)
-            self._publisher = SocPublisher(ids, ACKNOWLEDGE_EVERY if self.is_replay else None)
-        self._time = time_source(self.settings.time_source, ids.replay_clock)
-        self._earlier_counts = FrameCounts()
-        self._untimed = 0
-        self._refused = 0  # in a row
-        self._pack = _pack_of(model, self.settings.estimator.capacity_ah)
-        self.estimator = make_estimator(model, _with_source(self.settings.estimator, vehicle))
-        self._restart_decoder()
+            _check_ids(vehicle, settings.ids)
+            every = ACKNOWLEDGE_EVERY if self.is_replay else None
+            self._publisher = SocPublisher(settings.ids, every)
+        self._time = time_source(settings.time_source, settings.ids.replay_clock)
+        self._statistics = FrameStatistics()
+        self._beginnings = self._untimed = 0
         self.samples = self.taken = 0
+        self._refused = 0  # in a row
         self.stamp_shift_s = 0.0
         self.latest_sample: Sample | None = None
         self.published = NOTHING_YET
         self._estimate = NOTHING_YET  # after the latest sample, without the signals' health
         self._report: tuple[int, PackReport] | None = None
+        self.estimator = make_estimator(model, _with_source(settings.estimator, vehicle))
+        self._begin_signals()
 
     # --- frames → estimates
 
@@ -209,20 +203,20 @@ class Pipeline:
         if time_s is None:
             self._untimed += not is_clock(message, self.settings.ids.replay_clock)
             return False
-        if self._time.beginnings != self._earlier_counts.beginnings:
+        if self._time.beginnings != self._beginnings:
             self._begin_log()
         message.timestamp = time_s
         sample = self.decoder.handle(message)
         if sample is None:
             return False
-        self._take(sample)
+        self._estimate_after(sample)
         return True
 
     def finish(self) -> bool:
         """Release the last current if it is unpaired; return whether it completed a sample."""
         sample = self.decoder.flush()
         if sample is not None:
-            self._take(sample)
+            self._estimate_after(sample)
         return sample is not None
 
     @property
@@ -245,23 +239,24 @@ class Pipeline:
 
     @property
     def counts(self) -> FrameCounts:
-        """Frames and values by outcome so far, over all logs."""
-        now = self.decoder.statistics
-        return self._earlier_counts + FrameCounts(
-            frames=now.frames,
-            samples=now.samples,
-            lost=now.frames_lost,
-            crc_errors=now.crc_errors,
-            repeated=now.counter_repeats,
-            short=now.short,
-            not_available=now.not_available,
-            implausible=now.implausible,
-            stuck=now.stuck,
-            held_back=now.held_back,
+        """Frames and values by outcome so far."""
+        all_logs = self._statistics
+        return FrameCounts(
+            frames=all_logs.frames,
+            samples=all_logs.samples,
+            lost=all_logs.frames_lost,
+            crc_errors=all_logs.crc_errors,
+            repeated=all_logs.counter_repeats,
+            short=all_logs.short,
+            not_available=all_logs.not_available,
+            implausible=all_logs.implausible,
+            stuck=all_logs.stuck,
+            held_back=all_logs.held_back,
             untimed=self._untimed,
+            beginnings=self._time.beginnings,
         )
 
-    def _take(self, sample: Sample) -> None:
+    def _estimate_after(self, sample: Sample) -> None:
         self.samples += 1
         self.latest_sample = sample
         is_implausible = math.isnan(sample.voltage_v) and self.decoder.is_voltage_implausible
@@ -296,32 +291,37 @@ class Pipeline:
             return estimate
         return estimate._replace(reasons=reasons, status=status_of(reasons))
 
-    def _restart_decoder(self) -> None:
-        """Begin to decode anew, for the present vehicle, pack and estimator."""
-        self.decoder, self.sign = SampleDecoder(self.vehicle, self._pack), SignWatch()
-        self._restart_cells()
-
-    def _restart_cells(self) -> None:
-        signals, model = self.vehicle.cells, self.estimator.voltage_model
-        self.cells = None if signals is None else CellEstimator(model, signals.count, signals.first)
-
     def _begin_log(self) -> None:
-        """Restart decoder and estimator for the next log of a replay."""
-        self._earlier_counts = replace(self.counts, beginnings=self._time.beginnings)
-        self._untimed = self._refused = 0
-        if self._publisher is not None:
-            self._publisher.restart()
+        """Restart estimator and decoder for the next log of a replay."""
+        self._beginnings, self._refused = self._time.beginnings, 0
         self.estimator = make_estimator(self.model, self.estimator.settings)
-        self._restart_decoder()
+        self._begin_signals()
+
+    def _begin_signals(self) -> None:
+        """Begin to judge the signals anew, for the present vehicle, model and estimator."""
+        model, voltage_model = self.model, self.estimator.voltage_model
+        capacity_ah = self.estimator.settings.capacity_ah
+        resistances = voltage_model.resistance_ohm
+        pack = PackProperties(
+            resistance_ohm=abs(resistances[0]) if resistances else 0.0,
+            error_std_v=model.noise.residual_std_v,
+            capacity_ah=model.capacity_ah if capacity_ah is None else capacity_ah,
+            usual_v=voltage_model.pseudo_ocv_at(50.0)[0],
+        )
+        self.decoder = SampleDecoder(self.vehicle, pack, self._statistics)
+        self.sign = SignWatch()
+        cells = self.vehicle.cells
+        self.cells = None
+        if cells is not None:
+            self.cells = CellEstimator(voltage_model, cells.count, cells.first)
 
     # --- estimates → frames
 
     @property
     def filters(self) -> list[CanFilter]:
         """Filters for the vehicle's frames, and for REPLAY_CLOCK where that is the time source."""
-        if not self.is_replay:
-            return self.vehicle.filters
-        return [*self.vehicle.filters, standard_filter(self.settings.ids.replay_clock)]
+        clock = [standard_filter(self.settings.ids.replay_clock)]
+        return [*self.vehicle.filters, *(clock if self.is_replay else [])]
 
     def acknowledgement(self, estimate: Estimate) -> list[can.Message]:
         """Return the frames due with the latest sample's estimate in a replay, else none."""
@@ -331,20 +331,31 @@ class Pipeline:
         return self._publisher.publish(estimate, self.samples, self.report)
 
     def heartbeat(
-        self, *, is_stale: bool, silent_s: float = 0.0, reasons: Reason = Reason.NONE
+        self,
+        silent_s: float = 0.0,
+        timeout_s: float = math.inf,
+        reasons: Reason = Reason.NONE,
     ) -> list[can.Message]:
         """Return the frames due every `publish.ESTIMATE_EVERY_S`.
 
-        `is_stale`: no sample came within the service's time-out. `silent_s` is the time since the
-        latest sample that the estimator took [s]; with receive stamps a silence longer than the
-        current's own time-out is stale as well. `reasons` are the loop's own findings.
+        Parameters
+        ----------
+        silent_s : float
+            Time since the latest sample that the estimator took [s].
+        timeout_s : float
+            The estimate is stale after a longer silence [s]. With receive stamps it is not between
+            two samples of a slow source, and after the current's own time-out in any case.
+        reasons : Reason
+            Findings of the loop.
         """
         if self._publisher is None:
             return []
         estimate = self.estimate_now()
         if not self.is_replay:
-            is_stale = is_stale or silent_s > self.decoder.health["current"].timeout_s
-        if is_stale and self.taken:
+            current = self.decoder.health["current"]
+            slowest_s = MISSED_AT_LEAST * current.period_s  # NaN, which max drops, while not known
+            timeout_s = min(max(timeout_s, slowest_s), current.timeout_s)
+        if silent_s > timeout_s and self.taken:
             reasons |= Reason.INPUT_STALE
         if reasons:
             reasons |= estimate.reasons
@@ -359,12 +370,6 @@ class Pipeline:
         age_s = silent_s if self.taken else math.nan
         return self._publisher.beat(estimate, self.samples, age_s, self.report)
 
-    @property
-    def least_timeout_s(self) -> float:
-        """Lower bound of a time-out for samples [s]: a slow source is not stale between two."""
-        period_s = self.decoder.health["current"].period_s
-        return 0.0 if self.is_replay or math.isnan(period_s) else MISSED_AT_LEAST * period_s
-
     # --- reload and restart
 
     def reconfigure(self, vehicle: Vehicle, model: Model, settings: PipelineSettings) -> None:
@@ -375,32 +380,24 @@ class Pipeline:
         time source and REPLAY_CLOCK's id stay. InputError, and no change, if a frame to publish has
         the id of a vehicle's signal.
         """
-        old, started = self.settings, self.estimator.settings
+        old, before = self.settings, self.estimator
         ids = replace(settings.ids, replay_clock=old.ids.replay_clock)
         if self._publisher is not None:
             _check_ids(vehicle, ids)
-        estimator_settings = replace(
-            _with_source(settings.estimator, vehicle),
-            initial_soc_pct=started.initial_soc_pct,
-            initial_soc_std_pct=started.initial_soc_std_pct,
-        )
-        is_other_model = model != self.model
-        if is_other_model or estimator_settings != started:
-            before, self.model = self.estimator, model
-            self.estimator = make_estimator(model, estimator_settings)
-            self.estimator.take_over(before)
-        pack = _pack_of(model, estimator_settings.capacity_ah)
-        if vehicle != self.vehicle or pack != self._pack:
-            # The plausible range of a signal follows from both.
-            self._earlier_counts, self._untimed = self.counts, 0
-            self.vehicle, self._pack = vehicle, pack
-            self._restart_decoder()
-        elif is_other_model:
-            self._restart_cells()
-        self._report = None
-        self.settings = replace(settings, ids=ids, time_source=old.time_source)
-        if self._publisher is not None:
             self._publisher.ids = ids
+        self.settings = replace(settings, ids=ids, time_source=old.time_source)
+        chosen = replace(
+            _with_source(settings.estimator, vehicle),
+            initial_soc_pct=before.settings.initial_soc_pct,
+            initial_soc_std_pct=before.settings.initial_soc_std_pct,
+        )
+        judged_by = self.vehicle, self.model, before.settings.capacity_ah
+        if (model, chosen) != (self.model, before.settings):
+            self.estimator = make_estimator(model, chosen)
+            self.estimator.take_over(before)
+        self.vehicle, self.model, self._report = vehicle, model, None
+        if judged_by != (vehicle, model, chosen.capacity_ah):
+            self._begin_signals()
 
     def snapshot(self) -> EstimatorState | None:
         """Return the estimator's state; None while no SoC is known.
@@ -420,12 +417,11 @@ class Pipeline:
         """
         estimator = make_estimator(self.model, self.estimator.settings)
         latest = estimator.restore(state, age_s)
-        self.estimator = estimator
+        self.estimator, self._report = estimator, None
         if isinstance(self._time, ReplayClock):
             self._time.resume(latest.time_s)
         reasons = latest.reasons | Reason.INPUT_STALE
         self._estimate = latest._replace(status=Status.INVALID, reasons=reasons)
-        self._report = None
         return self._estimate
 
     def discard_initial_soc(self) -> bool:
@@ -442,17 +438,6 @@ class Pipeline:
         return True
 
 
-def _pack_of(model: Model, capacity_ah: float | None) -> PackProperties:
-    """Return the pack's properties by which its signals are judged."""
-    voltage = model.extended_model().model
-    return PackProperties(
-        resistance_ohm=abs(voltage.resistance_ohm[0]) if voltage.resistance_ohm else 0.0,
-        error_std_v=model.noise.residual_std_v,
-        capacity_ah=model.capacity_ah if capacity_ah is None else capacity_ah,
-        usual_v=voltage.pseudo_ocv_at(50.0)[0],
-    )
-
-
 def _with_source(settings: EstimatorSettings, vehicle: Vehicle) -> EstimatorSettings:
     """Return the settings with the vehicle's temperature source where theirs is unknown."""
     if settings.temperature_source != "unknown":
@@ -462,14 +447,11 @@ def _with_source(settings: EstimatorSettings, vehicle: Vehicle) -> EstimatorSett
 
 def _check_ids(vehicle: Vehicle, ids: FrameIds) -> None:
     published = ids.published | {ids.replay_clock: "replay_clock"}
-    used = {signal.key: signal.message for signal in vehicle.signals}
-    if vehicle.cells is not None:
-        used |= {cell.key: cell.message for cell in vehicle.cells.cells}
-    for key, message in used.items():  # the key of an extended id is no standard id
-        if key in published:
+    for signal in (*vehicle.signals, *(vehicle.cells.cells if vehicle.cells else ())):
+        if signal.key in published:  # the key of an extended id is no standard id
             raise InputError(
-                f"{message} of {vehicle.name} has this id",
-                field=f"ids.{published[key]}",
-                value=f"0x{key:X}",
+                f"{signal.message} of {vehicle.name} has this id",
+                field=f"ids.{published[signal.key]}",
+                value=f"0x{signal.key:X}",
                 cure="choose another one",
             )

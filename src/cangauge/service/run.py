@@ -272,7 +272,7 @@ def _log_changes(old: RunConfig, new: RunConfig) -> None:
     late = ", ".join(
         each.name
         for each in config_keys()
-        if each.info.restart and each.value_in(before) != each.value_in(after)
+        if each.restart and each.value_in(before) != each.value_in(after)
     )
     if late:
         text = f"{late}: takes effect after a restart of the service"
@@ -287,7 +287,7 @@ def _summary_line(pipeline: Pipeline, port: ReconnectingBus, status: dict[str, A
         "dropped in the receive queue": port.queue_drops,
         f"error frames ({kinds})": port.error_frames,
         "not sent": port.unsent,
-        "from another service with these ids": port.foreign,
+        "from another service with these ids": status["bus_counts"]["foreign"],
         f"bus losses ({port.away_s:.1f} s)": port.losses,
     }
     errors = "".join(f", {count} {what}" for what, count in found.items() if count)

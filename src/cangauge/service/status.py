@@ -24,6 +24,7 @@ from cangauge.bus.publish import NO_REPORT
 from cangauge.service.events import release_held
 from cangauge.service.lifecycle import Notifier
 from cangauge.service.pipeline import Pipeline
+from cangauge.service.polling import PollCounts
 from cangauge.service.status_client import BOUNDS_S, SCHEMA, Snapshot, reason_ids
 from cangauge.types import Estimate, Status, reason_sentences
 
@@ -41,7 +42,7 @@ CLOCKS_APART_S: Final = 60.0
 """A receive stamp further than this from the wall clock belongs to another clock [s]."""
 REPORT_EVERY_S: Final = 1.0
 """Interval of health, power and cells in the snapshots [s]."""
-BUS_COUNTS: Final = ("garbled", "error_frames", "unsent", "queue_drops", "losses", "foreign")
+BUS_COUNTS: Final = ("garbled", "error_frames", "unsent", "queue_drops", "losses")
 """Counts of a bus to report, where it has them."""
 
 _OF_VALUES: Final = {"not_available", "implausible", "stuck", "held_back"}
@@ -103,8 +104,9 @@ class Monitor:
 
     `latest` is immutable, hence readable from any thread. `model` (name of the file) and
     `sign_cure` (what to change if the current has the wrong sign) follow the configuration.
-    `record` returns the state of the recording, `troubles` what is wrong with the outputs, `clock`
-    monotonic time [s].
+    `foreign` (frames of others with the service's ids) and `polls` (outcomes of its requests) are
+    set by the loop. `record` returns the state of the recording, `troubles` what is wrong with the
+    outputs, `clock` monotonic time [s].
     """
 
     def __init__(
@@ -121,6 +123,8 @@ class Monitor:
         sign_cure: str = "set the other sign under [current] of the map file",
     ) -> None:
         self.model, self.sign_cure = model, sign_cure
+        self.foreign = 0
+        self.polls: PollCounts | None = None
         self._pipeline = pipeline
         self._port = port
         self._notifier = notifier or Notifier()
@@ -204,13 +208,11 @@ class Monitor:
             self._report_due_s = now_s + REPORT_EVERY_S
             self._report = pipeline.report().to_dict()
         statistics, settings = pipeline.decoder.statistics, pipeline.settings
-        rejects = {
-            name: sum(int(getattr(each, name)) for each in statistics.messages.values())
-            for name in _REJECTS
-        }
+        rejects = {name: getattr(statistics, name) for name in _REJECTS}
         rejected = sum(count for name, count in rejects.items() if name not in _OF_VALUES)
         counts = {name: getattr(port, name, None) for name in BUS_COUNTS}
-        polls, record = getattr(port, "polls", None), self._record()
+        counts["foreign"] = self.foreign
+        record = self._record()
         return {
             "schema": SCHEMA,
             "running": True,
@@ -244,9 +246,9 @@ class Monitor:
             "rejects": rejects,
             "stamps": port.capabilities.stamps,
             "bus_up": not any(getattr(port, name, False) for name in ("is_away", "is_off")),
-            "bus_counts": {name: int(n) for name, n in counts.items() if n is not None},
+            "bus_counts": {name: n for name, n in counts.items() if n is not None},
             "bus_trouble": getattr(port, "trouble", "") or None,
-            "polls": None if polls is None else asdict(polls),
+            "polls": None if self.polls is None else asdict(self.polls),
             "config": self._config,
             "latency": self._latency.to_dict(),
             "step": self._step.to_dict(),

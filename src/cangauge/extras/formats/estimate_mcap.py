@@ -11,8 +11,9 @@ from cangauge.extras.formats.mcap_messages import ESTIMATE, SAMPLE, McapTopics
 from cangauge.types import Estimate, Sample, Status, reason_names
 
 if TYPE_CHECKING:
+    from cangauge.bus.recording import CaptureSamples
     from cangauge.estimation.offline import EstimateTable
-    from cangauge.service.offline import Recorded
+    from cangauge.logs.log import Log
 
 SAMPLE_TOPIC: Final = "/sample"
 ESTIMATE_TOPIC: Final = "/soc_estimate"
@@ -47,13 +48,13 @@ def write_estimate(
     )
 
 
-def write_estimates_mcap(path: Path, recorded: Recorded, table: EstimateTable) -> None:
+def write_estimates_mcap(path: Path, recorded: Log | CaptureSamples, table: EstimateTable) -> None:
     """Write the samples of a recording and their estimates, without its frames.
 
     Parameters
     ----------
     path : Path
-    recorded : Log or RecordedCapture
+    recorded : Log or CaptureSamples
         n samples.
     table : EstimateTable
         n estimates.

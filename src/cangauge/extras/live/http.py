@@ -20,6 +20,7 @@ from tornado.iostream import IOStream
 from tornado.web import Application, RequestHandler
 
 from cangauge._logging import emit
+from cangauge._text import plain
 from cangauge.errors import InputError
 from cangauge.extras.live.addresses import is_loopback_name
 from cangauge.service.output import Output
@@ -161,9 +162,9 @@ class Handler(RequestHandler):
         self.refuse(status_code, f"{status_code} {self._reason}")
 
     def send_json(self, content: dict[str, Any]) -> None:
-        """Answer with a JSON object."""
+        """Answer with a JSON object; a number that is not finite is null."""
         self.set_header("Content-Type", "application/json")
-        self.finish(json.dumps(content, ensure_ascii=False) + "\n")
+        self.finish(json.dumps(plain(content), ensure_ascii=False) + "\n")
 
 
 class _Page(Handler):

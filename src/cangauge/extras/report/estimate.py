@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from cangauge._text import duration, number
 from cangauge._typing import FloatArray
+from cangauge.bus.recording import CaptureSamples
 from cangauge.estimation.offline import EstimateTable
 from cangauge.extras.report.charts import (
     AMBER,
@@ -29,7 +30,7 @@ from cangauge.extras.report.charts import (
 from cangauge.extras.report.page import Block, Page, Table, Tile, range_rows
 from cangauge.identify.rows import running_rows
 from cangauge.logs.log import Log
-from cangauge.service.offline import Recorded, RecordedEstimate
+from cangauge.service.offline import RecordedEstimate
 from cangauge.types import REASON_WORDS, Reason, Status, reason_name
 
 _METHODS: Final = {
@@ -200,7 +201,7 @@ def _tiles(estimate: RecordedEstimate) -> list[Tile]:
     ]
 
 
-def _reference(log: Recorded) -> FloatArray | None:
+def _reference(log: Log | CaptureSamples) -> FloatArray | None:
     """Return the reference SoC; None if it is no more than an initial value."""
     if log.soc_pct is None or np.isfinite(log.soc_pct).sum() < 2:
         return None
@@ -277,7 +278,7 @@ def _error_row(name: str, mae_pct: float | None, error: FloatArray) -> list[str]
     return [name, *(number(value, 2) for value in values)]
 
 
-def _voltage(log: Recorded, table: EstimateTable, time: TimeFigures) -> list[Block]:
+def _voltage(log: Log | CaptureSamples, table: EstimateTable, time: TimeFigures) -> list[Block]:
     at, running = log.time_s, np.isfinite(log.voltage_v)
     measured = int(running.sum())
     if measured:
@@ -311,7 +312,7 @@ def _voltage(log: Recorded, table: EstimateTable, time: TimeFigures) -> list[Blo
     return [both, residual]
 
 
-def _input(log: Recorded, time: TimeFigures) -> list[Block]:
+def _input(log: Log | CaptureSamples, time: TimeFigures) -> list[Block]:
     channels = (
         ("current", "A", log.current_a, BLUE, "Positive current discharges the pack."),
         ("temperature", "°C", log.temperature_c, ORANGE,
@@ -330,7 +331,7 @@ def _input(log: Recorded, time: TimeFigures) -> list[Block]:
 # --- Status
 
 
-def _status_figure(log: Recorded, table: EstimateTable, time: TimeFigures) -> Figure:
+def _status_figure(log: Log | CaptureSamples, table: EstimateTable, time: TimeFigures) -> Figure:
     """Return a row of bars for the status and one for each reason that occurs."""
     at = time.at(0, log.time_s)
     bars = [

@@ -21,9 +21,10 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from cangauge._files import file_sha256, text_sha256
 from cangauge._text import is_numeric, span
 from cangauge._version import __version__
+from cangauge.bus.recording import CaptureSamples
 from cangauge.extras.report.charts import MAX_POINTS, Figure
+from cangauge.logs.log import Log
 from cangauge.model.model_file import Model
-from cangauge.service.offline import Recorded
 
 Item = TypeVar("Item")
 
@@ -88,7 +89,7 @@ class Page:
     model : Model, optional
     model_path : Path, optional
         The model's file; without one the model is hashed as it would be written.
-    logs : sequence of Log or RecordedCapture
+    logs : sequence of Log or CaptureSamples
         Named with their SHA-256; a banner says so if one is a reconstruction.
     warnings : sequence of str
         Further banners at the top of the page.
@@ -102,7 +103,7 @@ class Page:
     folded: Mapping[str, Sequence[Block]] = field(default_factory=dict)
     model: Model | None = None
     model_path: Path | None = None
-    logs: Sequence[Recorded] = ()
+    logs: Sequence[Log | CaptureSamples] = ()
     warnings: Sequence[str] = ()
 
     @property
