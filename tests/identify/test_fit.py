@@ -93,7 +93,7 @@ def test_is_the_weighted_least_squares_of_all_rows() -> None:
     precision[:size, :size] = np.linalg.inv(prior.covariance)
     precision[size:, size:] = np.eye(logs) / (OXIDE.level_std * found.mean_v) ** 2
     datum = (found.residual_v**2 + (ADDED_STD * found.mean_v) ** 2) * SECONDS_PER_DATUM
-    mean = np.r_[prior.mean, np.zeros(logs)]
+    mean = np.r_[prior.coefficients, np.zeros(logs)]
     normal = (table * weight[:, None]).T @ table / datum + precision
     right = (table * weight[:, None]).T @ (volts - table @ mean) / datum
     expected = mean + np.linalg.solve(normal, right)

@@ -20,7 +20,7 @@ import numpy as np
 from cangauge._typing import FloatArray
 from cangauge.errors import InputError
 from cangauge.identify.rows import FitRows
-from cangauge.model.prior import RESIDUAL_STD, RESISTANCE_H, Chemistry, prior_of
+from cangauge.model.prior import RESIDUAL_STD, RESISTANCE_H, Chemistry, Distribution, prior_of
 from cangauge.model.voltage_model import (
     KNOTS_PCT,
     REFERENCE_C,
@@ -154,53 +154,23 @@ def log_sums(
     return LogSums(table.T @ (table * weight[:, None]), total, mean_soc)
 
 
-@dataclass(frozen=True, eq=False)
-class Solution:
-    """Posterior of the coefficients.
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Solution(Distribution):
+    """Posterior of the coefficients, the amplitudes of effects after b.
 
     Parameters
     ----------
-    coefficients : array of shape (p,)
-        Knots [V], kt [V/K], resistances [Ω], b [-], amplitudes of effects.
-    covariance : array of shape (p, p)
-        Theirs; scaled by left-out logs where `scale` says so.
     select : array of shape (p, q − 2)
         Maps the columns of the moments to the coefficients' columns.
-    arrhenius_ohm : array of shape (M,)
-        Resistances R⁰ that b scales [Ω].
-    residual_v : float
-        Rms residual [V].
-    mean_v, mean_c : float
-        Mean voltage V0 [V] and temperature T̄ [°C] of the logs.
-    scale : float
-        κ²: how much larger than stated the errors of left-out logs are.
     """
 
-    coefficients: FloatArray
-    covariance: FloatArray
     select: FloatArray
-    arrhenius_ohm: FloatArray
-    residual_v: float
-    mean_v: float
-    mean_c: float
-    scale: float = 1.0
 
     def mean_error(self, sums: LogSums) -> tuple[float, float]:
         """Return the mean residual of a log [V], and its variance by the coefficients [V²]."""
         row = self.select @ (sums.moments[:-2, -2] / sums.weight)
         error = float(sums.moments[-2, -1]) / sums.weight - float(row @ self.coefficients)
         return error, float(row @ self.covariance @ row)
-
-    def residual_v_of(self, columns: FloatArray, voltage_v: FloatArray) -> FloatArray:
-        """Return measured minus predicted voltage of rows [V], shape (m,).
-
-        Parameters
-        ----------
-        columns : array of shape (m, q − 2)
-            Those of the moments.
-        voltage_v : array of shape (m,)
-        """
-        return np.asarray(voltage_v - columns @ (self.select.T @ self.coefficients))
 
     def square_error(self, sums: LogSums) -> float:
         """Return the mean square residual of a log, its level included [V²]."""
@@ -234,14 +204,14 @@ def solve(
     prior = prior_of(chemistry, mean_v, mean_soc, capacity_ah)
     extra = np.zeros(0) if amplitude_std is None else amplitude_std
     size = P + extra.size
-    mean = np.r_[prior.mean, np.zeros(extra.size)]
+    mean = np.r_[prior.coefficients, np.zeros(extra.size)]
     precision = np.zeros((size, size))
     precision[:N, :N] = np.linalg.inv(prior.covariance[:N, :N])
     rest = np.arange(N, size)
     precision[rest, rest] = np.r_[1.0 / np.diag(prior.covariance)[N:], extra**-2.0]
     colder = np.maximum(1.0, resistance_factor(np.array([item.mean_c for item in sums])))
     level_std = chemistry.level_std * mean_v * colder**chemistry.cold_exponent
-    warm, ohm = float(resistance_factor(mean_c)), prior.resistance_ohm
+    warm, ohm = float(resistance_factor(mean_c)), prior.arrhenius_ohm
     for _ in range(2):  # the column of b needs the resistances: twice
         select = np.zeros((size, len(total) - 2))
         at = np.arange(N + 1 + M)
@@ -271,13 +241,14 @@ def solve(
         coefficients = mean + step
         fitted = coefficients[N + 1 : N + 1 + M]
         arrhenius_ohm = ohm
-        ohm = fitted if fitted.sum() < 0.0 else prior.resistance_ohm
+        ohm = fitted if fitted.sum() < 0.0 else prior.arrhenius_ohm
     covariance = np.linalg.inv(reduced)
     covariance = 0.5 * (covariance + covariance.T)
     covariance[P - 1, P - 1] += B_LEFT_STD**2
     return Solution(
-        coefficients, covariance, select, arrhenius_ohm, float(np.sqrt(residual2)), mean_v, mean_c
-    )
+        coefficients, covariance, arrhenius_ohm, float(np.sqrt(residual2)), mean_v, mean_c,
+        select=select,
+    )  # fmt: skip
 
 
 def folds(number: int) -> list[list[int]]:
