@@ -105,7 +105,7 @@ def fit_rows(
         the tolerance.
     """
     source = log.source or log.name
-    soc = counted_soc_pct(log, capacity_ah, None)
+    soc = counted_soc_pct(log, capacity_ah)
     low, high = float(soc.min()), float(soc.max())
     if low < -SOC_TOLERANCE_PCT or high > 100.0 + SOC_TOLERANCE_PCT:
         raise InputError(
