@@ -55,7 +55,6 @@ from cangauge.model.voltage_model import (
     HermiteCurve,
     PublishedCurve,
     VoltageModel,
-    hermite_slopes,
     resistance_factor,
 )
 
@@ -391,7 +390,7 @@ class Model(_Fields):
         value = np.array(self.functions.curve_v).reshape(-1, soc_pct.size).T
         columns = self.voltage_model().load_coefficients.size
         load = np.array(self.functions.load).reshape(-1, columns).T
-        return Functions(soc_pct, value, hermite_slopes(soc_pct, value), load)
+        return Functions(soc_pct, value, load)
 
     def extended_model(self) -> ExtendedModel:
         """Return the voltage model with the effects.
