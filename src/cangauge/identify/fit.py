@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import logging
 import os
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, Final, Literal, NamedTuple, get_args
@@ -68,20 +67,10 @@ from cangauge.model.model_file import (
 from cangauge.model.prior import CHEMISTRIES, DELAYS_S, ChemistryName, usual_loads
 from cangauge.model.voltage_model import KNOTS_PCT, REFERENCE_C, PublishedCurve
 
-_LOG = logging.getLogger(__name__)
-
 Equation = Literal["knots", "published"]
 
 EPSILON: Final = PublishedCurve.epsilon
 """Published margin of the scaled SoC [-]."""
-
-FROM_SOC: Final = "from-soc"
-
-FITTED_ROWS: Final = "the rows of the fit itself (too few logs to leave one out)"
-WHOLE_LOGS: Final = "whole logs left out in turn"
-
-LISTED_LOGS: Final = 4096
-"""Source logs that a model file lists; of more, only its name holds the number."""
 
 RELINEARIZED: Final = 4
 """Linearizations about the fitted effects: products of effects and resistances have converged."""
@@ -148,7 +137,7 @@ def fit(
     """
     require_choice(equation, get_args(Equation), "equation")
     require_choice(chemistry, (*CHEMISTRIES, None), "chemistry")
-    if capacity_ah not in (None, FROM_SOC):
+    if capacity_ah not in (None, "from-soc"):
         require_number(capacity_ah, "capacity_ah")
     recorded = [as_log(log) for log in (logs if isinstance(logs, list | tuple) else [logs])]
     _check_logs(recorded)
@@ -198,7 +187,7 @@ def fit(
                 "initial_soc_pct": stated_pct[0] if len({*stated_pct}) == 1 else None,
                 "effects": ", ".join(effect_ids) or None,
             },
-            logs=listed[:LISTED_LOGS],
+            logs=listed,
             fingerprint=text_sha256("".join(hashes)),
         )
         fields: dict[str, Any] = {
@@ -380,13 +369,16 @@ def _with_effects(
             )
             for log, item in zip(logs, plain.rows, strict=True)
         ]
-        sums = [log_sums(item.rows, chemistry, item.columns, item.features) for item in about]
+        columns = [np.column_stack([item.features, item.columns]) for item in about]
+        sums = [
+            log_sums(item.rows, chemistry, table)
+            for item, table in zip(about, columns, strict=True)
+        ]
         solution, without = solve_scaled(sums, capacity_ah, chemistry, std)
         solution = selected.clipped(solution)
         amplitudes = solution.coefficients[P:]
         effects = selected.effects(solution)
         extended = ExtendedModel(knots_file(solution, fields).voltage_model(), capacity_ah, effects)
-    columns = [np.column_stack([item.features, item.columns]) for item in about]
     return _Joint(solution, without, [item.rows for item in about], columns, effects)
 
 
@@ -493,13 +485,13 @@ def _judged(
         return {
             "voltage_mae_pct": 100.0 * (2.0 / np.pi) ** 0.5 * residual_v / mean_v,
             "voltage_rmse_v": residual_v,
-            "judged_on": FITTED_ROWS,
+            "judged_on": "the rows of the fit itself (too few logs to leave one out)",
         }
     volts = np.concatenate([item.voltage_v for item in rows])
     return {
         "voltage_mae_pct": 100.0 * float(np.nanmean(np.abs(error_v) / volts)),
         "voltage_rmse_v": float(np.sqrt(np.nanmean(error_v**2))),
-        "judged_on": WHOLE_LOGS,
+        "judged_on": "whole logs left out in turn",
     }
 
 

@@ -117,10 +117,11 @@ class Published(_Fields):
         delays_s: Sequence[float],
     ) -> Self:
         """Return the equation of the values k0 … k7, kt, R1 … Rn and their standard errors."""
-        units = {"kt": "V/K", "k": "V", "R": "ohm"}
+        names, n = _names(delays_s), len(BASIS_NAMES)
+        units = ["V"] * n + ["V/K"] + ["ohm"] * len(delays_s)
         coefficients = {
-            name: {"value": value, "std_error": error, "unit": units.get(name) or units[name[0]]}
-            for name, value, error in zip(_names(delays_s), values, std, strict=False)
+            name: {"value": value, "std_error": error, "unit": unit}
+            for name, value, error, unit in zip(names, values, std, units, strict=False)
         }
         return cls.model_validate({
             "coefficients": coefficients, "epsilon": epsilon, "t_ref_c": t_ref_c,
@@ -370,13 +371,12 @@ class Model(_Fields):
                 **ranges,
             )
         if self.equation == "published" and published is not None:
-            k = {name: item.value for name, item in published.coefficients.items()}
-            ocv_v = tuple(k[name] for name in BASIS_NAMES)
-            names = _names(published.delays_s)
+            names, n = _names(published.delays_s), len(BASIS_NAMES)
+            values = [published.coefficients[name].value for name in names]
             return VoltageModel(
-                PublishedCurve(ocv_v, published.epsilon, self.range.soc_pct),
-                kt_v_per_k=k["kt"],
-                resistance_ohm=tuple(k[name] for name in names[names.index("kt") + 1 :]),
+                PublishedCurve(tuple(values[:n]), published.epsilon, self.range.soc_pct),
+                kt_v_per_k=values[n],
+                resistance_ohm=tuple(values[n + 1 :]),
                 delay_s=tuple(published.delays_s),
                 t_ref_c=published.t_ref_c,
                 **ranges,

@@ -25,7 +25,6 @@ from cangauge.extras.fleet.run import Summary, run_id, run_job
 from cangauge.extras.fleet.sources import FleetLog
 from cangauge.identify.fit import (
     EPSILON,
-    LISTED_LOGS,
     ROWS_CHANNELS,
     common_name,
     knots_file,
@@ -47,6 +46,8 @@ from cangauge.model.model_file import Made, Model, Ranges, SourceLog
 from cangauge.model.prior import CHEMISTRIES, DELAYS_S, ChemistryName
 from cangauge.model.voltage_model import REFERENCE_C
 
+LISTED_LOGS: Final = 4096
+"""Source logs that a model file lists; of more, only its options hold the number."""
 _RATE_HZ: Final = 1.0
 """Rate of the rows [Hz], as that of `cangauge fit` by default."""
 _NUMBERS: Final = pa.list_(pa.float64())
