@@ -165,11 +165,8 @@ def capacity_from_full_discharge(logs: Sequence[Log], starts_pct: Sequence[float
 
 def _nearest(logs: Sequence[Log]) -> str:
     """Return the log whose own SoC spans most, and the charge per 100 % that it implies."""
-    spans = [
-        (float(np.nanmin(log.soc_pct)), float(np.nanmax(log.soc_pct)), log)
-        for log in logs
-        if log.soc_pct is not None and log.first_soc() is not None
-    ]
+    socs = [(_readings(log)[0], log) for log in logs]
+    spans = [(float(soc.min()), float(soc.max()), log) for soc, log in socs if soc.size]
     if not spans:
         return ""
     low, high, log = max(spans, key=lambda span: span[1] - span[0])

@@ -92,65 +92,62 @@ def hermite_slopes(soc_pct: FloatArray, values: FloatArray) -> FloatArray:
 
 
 class _Cubic(NamedTuple):
-    """Cubic between two knots at one SoC or many: members are numbers, or arrays of shape (n,).
+    """Hermite's cubic between two knots: weights of value and slope at the left, then the right.
 
-    Each tuple weighs value and slope at the left knot, then value and slope at the right one.
+    Of one SoC or of many: members are numbers, or arrays of shape (n,).
     """
 
     left: Any
     """Index of the left knot."""
     value: tuple[Any, Any, Any, Any]
+    """h00, h10, h01, h11: give the curve."""
     slope: tuple[Any, Any, Any, Any]
+    """Their derivatives: give its slope."""
 
     def sum(self, weights: tuple[Any, Any, Any, Any], value: Any, slope: Any) -> Any:
         """Return the weighted sum of values and slopes at the knots."""
-        a, b, c, d = weights
-        at_left = a * value[self.left] + b * slope[self.left]
-        return at_left + c * value[self.left + 1] + d * slope[self.left + 1]
+        h00, h10, h01, h11 = weights
+        at_left = h00 * value[self.left] + h10 * slope[self.left]
+        return at_left + h01 * value[self.left + 1] + h11 * slope[self.left + 1]
 
 
-def _cubic(left: Any, width: Any, f: Any, below: Any = 0.0, above: Any = 0.0) -> _Cubic:
-    """Return the cubic at a fraction f of an interval, or beyond the first and last knot [%]."""
-    back = 1.0 - f
-    turn = 6.0 * f * back / width
+def _cubic(left: Any, h: Any, t: Any, below: Any = 0.0, above: Any = 0.0) -> _Cubic:
+    """Return the cubic at a fraction t of an interval h, or beyond the first and last knot [%]."""
+    back = 1.0 - t
+    h00, h10 = (1.0 + 2.0 * t) * back * back, h * t * back * back
+    h01, h11 = t * t * (3.0 - 2.0 * t), h * t * t * back
+    by_h = 6.0 * t * back / h
     return _Cubic(
         left,
-        (
-            (1.0 + 2.0 * f) * back * back,
-            width * f * back * back + below,
-            f * f * (3.0 - 2.0 * f),
-            above - width * f * f * back,
-        ),
-        (-turn, back * (1.0 - 3.0 * f), turn, f * (3.0 * f - 2.0)),
+        (h00, h10 + below, h01, above - h11),
+        (-by_h, back * (1.0 - 3.0 * t), by_h, t * (3.0 * t - 2.0)),
     )
 
 
 def _cubics(knots: FloatArray, soc_pct: FloatArray) -> _Cubic:
     left = np.clip(np.searchsorted(knots, soc_pct, side="right") - 1, 0, knots.size - 2)
-    width = knots[left + 1] - knots[left]
     inside = np.clip(soc_pct, knots[0], knots[-1])
-    beyond = soc_pct - inside
-    f = (inside - knots[left]) / width
-    return _cubic(left, width, f, np.minimum(beyond, 0.0), np.maximum(beyond, 0.0))
+    h, beyond = knots[left + 1] - knots[left], soc_pct - inside
+    t = (inside - knots[left]) / h
+    return _cubic(left, h, t, np.minimum(beyond, 0.0), np.maximum(beyond, 0.0))
 
 
 def _cubic_at(knots: Sequence[float], soc_pct: float) -> _Cubic:
     """Return `_cubics` of one SoC, in plain numbers: it is asked for at every step."""
     inside = min(max(soc_pct, knots[0]), knots[-1])
     left = min(bisect_right(knots, inside) - 1, len(knots) - 2)
-    width, beyond = knots[left + 1] - knots[left], soc_pct - inside
-    return _cubic(left, width, (inside - knots[left]) / width, min(beyond, 0.0), max(beyond, 0.0))
+    h, beyond = knots[left + 1] - knots[left], soc_pct - inside
+    return _cubic(left, h, (inside - knots[left]) / h, min(beyond, 0.0), max(beyond, 0.0))
 
 
 def hermite_basis(soc_pct: FloatArray, knots_pct: FloatArray = KNOTS_PCT) -> FloatArray:
     """Return d g/d values at the knots [-], shape (n, knots), for SoC [%] of shape (n,)."""
     bend = hermite_slopes(knots_pct, np.eye(knots_pct.size))
-    left, (of_left, of_left_slope, of_right, of_right_slope), _ = _cubics(knots_pct, soc_pct)
-    basis = of_left_slope[:, None] * bend[left]
-    basis += of_right_slope[:, None] * bend[left + 1]
+    left, (h00, h10, h01, h11), _ = _cubics(knots_pct, soc_pct)
+    basis = h10[:, None] * bend[left] + h11[:, None] * bend[left + 1]
     row = np.arange(left.size)
-    basis[row, left] += of_left
-    basis[row, left + 1] += of_right
+    basis[row, left] += h00
+    basis[row, left + 1] += h01
     return np.asarray(basis)
 
 
@@ -178,8 +175,8 @@ class HermiteCurve:
         secant = np.diff(value) / np.diff(soc_pct)
         flatter = np.minimum(np.r_[secant[0], secant], np.r_[secant, secant[-1]])
         limited = np.clip(slope, FLATTEST_SECANT * flatter, STEEPEST_SECANT * flatter)
-        f = np.array([0.0, 0.25, 0.5, 0.75, 1.0])[:, None]
-        inner = _cubic(np.arange(secant.size), np.diff(soc_pct), f)
+        t = np.array([0.0, 0.25, 0.5, 0.75, 1.0])[:, None]
+        inner = _cubic(np.arange(secant.size), np.diff(soc_pct), t)
         across = inner.sum(inner.slope, value, slope)
         falls = (across <= 0.0).any(axis=0)
         beside = np.r_[falls, False] | np.r_[False, falls]
