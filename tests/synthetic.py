@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from cangauge.logs.gaps import discharged_ah
 from cangauge.logs.log import Log
-from cangauge.model.coulomb_counting import discharged_ah
 from cangauge.model.delay_line import delayed_currents
 from cangauge.model.published import CAPACITY_AH, leaf_2012_model
 from cangauge.model.voltage_model import VoltageModel

@@ -41,7 +41,7 @@ def folder(scenario: Scenario, tmp_path_factory: pytest.TempPathFactory) -> Path
         for number, drive in enumerate(drives):
             log = record_drive(scenario.plant, drive, (), name=f"trip{number}").log
             soc_pct = np.full(len(log), np.nan)
-            true_pct = counted_soc_pct(log, scenario.pack.capacity_ah, None)
+            true_pct = counted_soc_pct(log, scenario.pack.capacity_ah)
             soc_pct[::1200] = np.clip(true_pct, 0.0, 100.0)[::1200]
             path = root / f"car{vehicle}" / f"trip{number}.parquet"
             write_log(replace(log, soc_pct=soc_pct), path)

@@ -93,7 +93,7 @@ def test_is_the_weighted_least_squares_of_all_rows() -> None:
     precision[:size, :size] = np.linalg.inv(prior.covariance)
     precision[size:, size:] = np.eye(logs) / (OXIDE.level_std * found.mean_v) ** 2
     datum = (found.residual_v**2 + (ADDED_STD * found.mean_v) ** 2) * SECONDS_PER_DATUM
-    mean = np.r_[prior.mean, np.zeros(logs)]
+    mean = np.r_[prior.coefficients, np.zeros(logs)]
     normal = (table * weight[:, None]).T @ table / datum + precision
     right = (table * weight[:, None]).T @ (volts - table @ mean) / datum
     expected = mean + np.linalg.solve(normal, right)
@@ -215,10 +215,10 @@ def test_removes_start_up_and_shut_down_rows() -> None:
 
 def test_capacity_needs_a_log_from_full_to_empty() -> None:
     whole = replace(synthetic_log(end_pct=0.0), soc_pct=None)
-    assert capacity_from_full_discharge([whole], 100.0) == pytest.approx(CAPACITY_AH, rel=0.005)
+    assert capacity_from_full_discharge([whole], [100.0]) == pytest.approx(CAPACITY_AH, rel=0.005)
     part = replace(synthetic_log(end_pct=30.0), soc_pct=None)
     with pytest.raises(InputError, match="full to empty"):
-        capacity_from_full_discharge([part], 100.0)
+        capacity_from_full_discharge([part], [100.0])
     referenced = synthetic_log(start_pct=90.0, end_pct=30.0)
     with pytest.raises(InputError, match="--capacity-ah"):
         fit([referenced])
@@ -263,7 +263,7 @@ def test_capacity_counts_from_the_first_known_soc() -> None:
     at = 300
     reference = np.full(len(whole), np.nan)
     reference[at] = 100.0
-    late = capacity_from_full_discharge([replace(whole, soc_pct=reference)], None)
+    late = capacity_from_full_discharge([replace(whole, soc_pct=reference)], [None])
     out_ah = discharged_ah(whole.time_s, whole.current_a)
     assert late == pytest.approx(out_ah[-1] - out_ah[at])
 

@@ -45,7 +45,7 @@ def test_unknown_start_is_refused_with_the_cure() -> None:
     with pytest.raises(InputError, match=r"the log does not state its SoC .*--initial-soc P"):
         fit([log], capacity_ah=CAPACITY_AH)
     with pytest.raises(InputError, match="the SoC at the start is unknown"):
-        counted_soc_pct(log, CAPACITY_AH, None)
+        counted_soc_pct(log, CAPACITY_AH)
 
 
 def test_unknown_start_is_estimated_with_the_curve() -> None:
@@ -84,18 +84,18 @@ def test_partial_trip_is_no_full_discharge() -> None:
     part = trip(87.0, 76.0, 1)
     for log, initial in ((part, None), (without_soc(part), None), (without_soc(part), 100.0)):
         with pytest.raises(InputError, match=r"unknown capacity.*--capacity-ah A"):
-            capacity_from_full_discharge([log], initial)
+            capacity_from_full_discharge([log], [initial])
     with pytest.raises(InputError, match=r"nearest is .*: 7\d\.\d … 8\d\.\d %, .* Ah per 100 %"):
-        capacity_from_full_discharge([part], None)
+        capacity_from_full_discharge([part], [None])
 
 
 def test_full_discharge_is_proven_by_soc_or_by_knee() -> None:
     full = synthetic_log(hours=1.2, noise_v=0.5)
-    assert capacity_from_full_discharge([full], None) == pytest.approx(CAPACITY_AH, rel=0.01)
+    assert capacity_from_full_discharge([full], [None]) == pytest.approx(CAPACITY_AH, rel=0.01)
     bare = without_soc(full)
-    assert capacity_from_full_discharge([bare], 100.0) == pytest.approx(CAPACITY_AH, rel=0.02)
+    assert capacity_from_full_discharge([bare], [100.0]) == pytest.approx(CAPACITY_AH, rel=0.02)
     with pytest.raises(InputError, match="unknown capacity"):
-        capacity_from_full_discharge([bare], None)
+        capacity_from_full_discharge([bare], [None])
 
 
 def test_counted_soc_that_differs_tells_the_capacity() -> None:

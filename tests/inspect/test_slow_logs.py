@@ -9,9 +9,9 @@ import pytest
 
 from cangauge.identify.fit import fit
 from cangauge.inspect.log import LogInspection, inspect_log
-from cangauge.logs.gaps import split_where_moved
+from cangauge.logs.gaps import discharged_ah, split_where_moved
 from cangauge.logs.log import Log
-from cangauge.model.coulomb_counting import capacity_from_reference, discharged_ah
+from cangauge.model.coulomb_counting import capacity_from_reference
 from cangauge.model.delay_line import delayed_currents
 from cangauge.model.published import CAPACITY_AH, leaf_2012_model
 

@@ -13,10 +13,10 @@ import pytest
 
 from cangauge._resources import shared_file
 from cangauge.identify.rows import FitRows, decimate, fit_rows
+from cangauge.logs.gaps import discharged_ah
 from cangauge.logs.log import Log
 from cangauge.logs.read import read_log
 from cangauge.model import published
-from cangauge.model.coulomb_counting import discharged_ah
 
 VARIANTS = ("white", "correlated")
 FILES = tuple(f"leaf2012_reconstruction_{name}.parquet" for name in (*VARIANTS, "10min"))

@@ -16,9 +16,9 @@ from cangauge.estimation.health import Health
 from cangauge.estimation.offline import samples_of
 from cangauge.estimation.power import PackLimits
 from cangauge.estimation.settings import EstimatorSettings
+from cangauge.logs.gaps import discharged_ah
 from cangauge.logs.log import Log
 from cangauge.logs.read import read_log
-from cangauge.model.coulomb_counting import discharged_ah
 from cangauge.model.model_file import Model
 from chains import chain
 

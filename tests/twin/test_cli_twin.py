@@ -171,5 +171,5 @@ def test_full_discharge_gives_its_capacity(tmp_path: Path) -> None:
     """An end at 2.03 % SoC would not count as empty."""
     path = tmp_path / "full.parquet"
     simulated = run("--seed", "1", "--discharge", "--hours", "1", "-o", str(path))
-    found = capacity_from_full_discharge([read_log(path)], None)
+    found = capacity_from_full_discharge([read_log(path)], [None])
     assert found == pytest.approx(simulated["capacity_ah"], rel=0.01)

@@ -161,12 +161,27 @@ def note_reading(log: Log) -> None:
 
 
 def note_starts(logs: Iterable[Log], initial_soc_pct: float, capacity_ah: float | None) -> None:
-    """Print on stderr why a given SoC at the first row of logs is doubtful."""
-    from cangauge.model.coulomb_counting import doubt_of_start
+    """Print on stderr where a given SoC at the first row is doubtful: off the log's, a fraction.
+
+    `capacity_ah` counts a first SoC that comes later back to the first row [Ah].
+    """
+    from cangauge.logs.gaps import discharged_ah
+    from cangauge.model.coulomb_counting import DIFFERENT_PCT
 
     for log in logs:
-        if (doubt := doubt_of_start(log, initial_soc_pct, capacity_ah)) is not None:
-            note(f"warning: {doubt}")
+        doubts = []
+        if (first := log.first_soc()) is not None:
+            row, own_pct = first
+            if row and capacity_ah is not None:
+                out_ah = discharged_ah(log.time_s[: row + 1], log.current_a[: row + 1])[-1]
+                own_pct += 100.0 * float(out_ah) / capacity_ah
+            if abs(own_pct - initial_soc_pct) >= DIFFERENT_PCT:
+                doubts.append(f"its own SoC is {own_pct:.1f} %")
+        if 0.0 < initial_soc_pct <= 1.0:
+            doubts.append(f"a fraction is given in percent, as {100.0 * initial_soc_pct:g}")
+        if doubts:
+            stated = f"{log.name}: the initial SoC is {initial_soc_pct:g} % as given"
+            note(f"warning: {stated}; {', and '.join(doubts)}")
 
 
 def assumed_of(logs: Iterable[Log]) -> dict[str, list[str]]:

@@ -18,7 +18,7 @@ import math
 from typing import Final, NamedTuple
 
 from cangauge.estimation.state import ClockState, CounterState
-from cangauge.model.coulomb_counting import BRIDGE_S
+from cangauge.logs.gaps import BRIDGE_S
 
 USE_S = 120.0
 """How long the current before an unobserved interval may have continued into it [s]."""

@@ -226,7 +226,7 @@ def initial_soc_of(log: Log, capacity_ah: float) -> float:
     capacity_ah : float
         Capacity [Ah].
     """
-    return float(np.clip(counted_soc_pct(log, capacity_ah, None)[0], 0.0, 100.0))
+    return float(np.clip(counted_soc_pct(log, capacity_ah)[0], 0.0, 100.0))
 
 
 def gap_of(log: Log) -> float:

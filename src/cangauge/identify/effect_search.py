@@ -386,7 +386,8 @@ class Search:
         for number, (log, of_log) in enumerate(zip(logs, rows, strict=True), start=1):
             _LOG.debug("columns of the effects: log %d of %d", number, len(logs))
             linear = linearize(model, log, of_log, self._offered)
-            self._sums.append(log_sums(of_log, chemistry, linear.columns))
+            columns = np.column_stack([row_features(of_log), linear.columns])
+            self._sums.append(log_sums(of_log, chemistry, columns))
 
     def select(self) -> Selected:
         """Return the effects; those asked for by id are all taken, in their best shapes."""
@@ -411,12 +412,11 @@ class Search:
     def _solved(self, chosen: Sequence[int]) -> tuple[list[LogSums], dict[str, Any]]:
         columns = [place for number in chosen for place in self._places[number]]
         items = [self._offered[number] for number in chosen]
-        std = Selected(tuple(items), ()).amplitude_std if items else None
         sums = [item.with_columns(columns) for item in self._sums]
         return sums, {
             "capacity_ah": self._capacity_ah,
             "chemistry": self._chemistry,
-            "amplitude_std": std,
+            "amplitude_std": Selected(tuple(items), ()).amplitude_std,
         }
 
     def _left_out(self, chosen: Sequence[int]) -> FloatArray:

@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import hashlib
-import logging
 import os
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
-from typing import Any, Final, Literal, get_args
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any, Final, Literal, NamedTuple, get_args
 
 import numpy as np
 from threadpoolctl import threadpool_limits
@@ -35,7 +33,6 @@ from cangauge.identify.identification import (
 from cangauge.identify.least_squares import (
     BASE,
     LOGS_AT_LEAST,
-    LogSums,
     N,
     P,
     Solution,
@@ -53,47 +50,30 @@ from cangauge.identify.published import (
 from cangauge.identify.rows import LEAST_ROWS, FitRows, fit_rows, usable_delays
 from cangauge.identify.starts import find_starts, given_starts, with_start
 from cangauge.logs.gaps import discharged_ah
-from cangauge.logs.log import Log, TemperatureSource, as_log
-from cangauge.model.coulomb_counting import (
-    capacity_from_full_discharge,
-    capacity_from_reference,
-)
+from cangauge.logs.log import Log, as_log
+from cangauge.model.coulomb_counting import capacity_from_full_discharge, capacity_from_reference
 from cangauge.model.effects.base import Effect, Values
 from cangauge.model.effects.library import effect_entries
 from cangauge.model.extended import ExtendedModel
 from cangauge.model.model_file import (
+    FunctionFields,
     Information,
     Made,
     Model,
+    Noise,
     Ranges,
     SourceLog,
-    function_fields,
-    knots_model,
-    noise_of,
 )
-from cangauge.model.prior import (
-    CHEMISTRIES,
-    DELAYS_S,
-    Chemistry,
-    ChemistryName,
-    usual_loads,
-)
+from cangauge.model.prior import CHEMISTRIES, DELAYS_S, ChemistryName, usual_loads
 from cangauge.model.voltage_model import KNOTS_PCT, REFERENCE_C, PublishedCurve
-
-_LOG = logging.getLogger(__name__)
 
 Equation = Literal["knots", "published"]
 
 EPSILON: Final = PublishedCurve.epsilon
 """Published margin of the scaled SoC [-]."""
 
-FITTED_ROWS: Final = "the rows of the fit itself (too few logs to leave one out)"
-WHOLE_LOGS: Final = "whole logs left out in turn"
-
-FROM_SOC: Final = "from-soc"
-
-LISTED_LOGS: Final = 4096
-"""Source logs that a model file lists; of more, only its name holds the number."""
+RELINEARIZED: Final = 4
+"""Linearizations about the fitted effects: products of effects and resistances have converged."""
 
 
 def fit(
@@ -157,13 +137,13 @@ def fit(
     """
     require_choice(equation, get_args(Equation), "equation")
     require_choice(chemistry, (*CHEMISTRIES, None), "chemistry")
-    if capacity_ah not in (None, FROM_SOC):
+    if capacity_ah not in (None, "from-soc"):
         require_number(capacity_ah, "capacity_ah")
     recorded = [as_log(log) for log in (logs if isinstance(logs, list | tuple) else [logs])]
     _check_logs(recorded)
-    given = given_starts(initial_soc_pct, len(recorded))
+    stated_pct = given_starts(initial_soc_pct, len(recorded))
     if capacity_ah is None:
-        capacity_ah = capacity_from_full_discharge(recorded, given)
+        capacity_ah = capacity_from_full_discharge(recorded, stated_pct)
     elif isinstance(capacity_ah, str):
         capacity_ah = capacity_from_reference(recorded)
     if not capacity_ah > 0.0:
@@ -171,14 +151,17 @@ def fit(
             "the capacity must be positive", field="capacity_ah", value=capacity_ah,
             cure="check the sign of current: positive must discharge",
         )  # fmt: skip
-    ids = _effect_ids(effects, equation, len(recorded))
+    effect_ids = _effect_ids(effects, equation, len(recorded))
     stated = [
         log if value is None else with_start(log, value)
-        for log, value in zip(recorded, given, strict=True)
+        for log, value in zip(recorded, stated_pct, strict=True)
     ]
-    known, said = resolve_chemistry(stated, chemistry, cells, capacity_ah)
+    remarks: list[str] = []
+    if chemistry is None:
+        chemistry, remark = _likely_chemistry(stated, cells, capacity_ah)
+        remarks.append(remark)
     with threadpool_limits(limits=1):  # 40 columns: threads only wait for each other
-        starts = find_starts(recorded, given, capacity_ah, known)
+        starts = find_starts(recorded, stated_pct, capacity_ah, CHEMISTRIES[chemistry])
         knots = equation == "knots"
         delays = DELAYS_S if knots else usable_delays(starts.logs, delay_s)
         rows = [fit_rows(log, capacity_ah, rate_hz=rate_hz, delay_s=delays) for log in starts.logs]
@@ -189,52 +172,89 @@ def fit(
                 cure="give logs of drives over some hours and much of the SoC; `cangauge inspect`"
                 " lists what a log can identify",
             )
-        options = {
-            "capacity_ah": capacity_ah,
-            "rate_hz": rate_hz,
-            "chemistry": known.name,
-            "equation": equation,
-            "initial_soc_pct": given[0] if len({*given}) == 1 else None,
-            "effects": ", ".join(ids) or None,
-        }
+        hashes = [log_sha256(log) for log in starts.logs]
+        listed = [
+            SourceLog(name=item.name, rows=len(item), sha256=digest)
+            for item, digest in zip(rows, hashes, strict=True)
+        ]
+        made = Made(
+            by=f"cangauge {__version__}",
+            options={
+                "capacity_ah": capacity_ah,
+                "rate_hz": rate_hz,
+                "chemistry": chemistry,
+                "equation": equation,
+                "initial_soc_pct": stated_pct[0] if len({*stated_pct}) == 1 else None,
+                "effects": ", ".join(effect_ids) or None,
+            },
+            logs=listed,
+            fingerprint=text_sha256("".join(hashes)),
+        )
         fields: dict[str, Any] = {
             "name": common_name([log.name for log in recorded]),
-            "chemistry": known.name,
+            "chemistry": chemistry,
             "cells": cells,
             "capacity_ah": capacity_ah,
             "rate_hz": rate_hz,
             "temperature_source": recorded[0].temperature_source,
             "range": ranges_of(rows),
-            "made": made_of(starts.logs, rows, options),
+            "made": made,
         }
         if knots:
-            found = _fit_knots(starts.logs, rows, known, ids, fields)
+            fitted = _fit_knots(starts.logs, rows, effect_ids, fields)
         else:
-            equation_of = (epsilon, t_ref_c, tuple(delays))
-            found = _fit_published(rows, known, equation_of, fields)
-        model = found.model
-        extended = model.extended_model()
+            fitted = _fit_published(rows, epsilon, t_ref_c, delays, fields)
+        extended = fitted.model.extended_model()
         fits = tuple(
-            evaluate(extended, log, of_log) for log, of_log in zip(starts.logs, rows, strict=True)
+            evaluate(extended, log, item) for log, item in zip(starts.logs, rows, strict=True)
         )
     slope, expected = slope_resistances(fits, extended.model.resistance_ohm)
     return Identification(
-        model=model,
+        model=fitted.model,
         logs=starts.logs,
         fits=fits,
-        held_out_error_v=found.held_out_error_v,
-        published=found.published,
+        held_out_error_v=fitted.held_out_error_v,
+        published=fitted.published,
         energy=energy_balance(starts.logs, slope),
         slope_ohm=slope,
         slope_expected_ohm=expected,
         remarks=(
-            *said,
+            *remarks,
             *remarks_on_logs(rows, starts, recorded, delay_s, capacity_ah),
-            *remarks_on_effects(found.effects, model),
+            *remarks_on_effects(fitted.effects, fitted.model),
         ),
-        effects=found.effects,
+        effects=fitted.effects,
         starts=starts.starts,
     )
+
+
+def _check_logs(logs: Sequence[Log]) -> None:
+    if not logs:
+        raise InputError("no log given", cure="give at least one recorded log")
+    by_rows: dict[str, Log] = {}
+    for log in logs:
+        source = log.source or log.name
+        if len(log) < 2:
+            raise InputError(
+                "a single row cannot identify a model",
+                source=source,
+                cure="give a log of minutes or hours",
+            )
+        first = by_rows.setdefault(log_sha256(log, ROWS_CHANNELS), log)
+        if first is not log:
+            raise InputError(
+                f"same rows as {first.source or first.name}: they would count twice",
+                source=source,
+                cure="give each log once",
+            )
+    if len(sources := sorted({log.temperature_source for log in logs})) > 1:
+        raise InputError(
+            "the temperatures of the logs have different sources",
+            field="temperature_source",
+            value=sources,
+            cure="state it in a column temperature_source of the logs that do not, or fit logs of"
+            " one source together",
+        )
 
 
 def _effect_ids(
@@ -253,77 +273,51 @@ def _effect_ids(
     return ids
 
 
-def resolve_chemistry(
-    logs: Sequence[Log], chemistry: ChemistryName | None, cells: int | None, capacity_ah: float
-) -> tuple[Chemistry, list[str]]:
-    """Return the chemistry, and what is to be said about how it is known.
-
-    Parameters
-    ----------
-    logs : sequence of Log
-    chemistry : {"oxide", "lfp"}, optional
-    cells : int, optional
-        Cells in series.
-    capacity_ah : float
-        [Ah].
-    """
-    if chemistry is not None:
-        return CHEMISTRIES[chemistry], []
+def _likely_chemistry(
+    logs: Sequence[Log], cells: int | None, capacity_ah: float
+) -> tuple[ChemistryName, str]:
+    """Return the chemistry whose typical cell has the logs' mean voltage, and a remark on it."""
     if cells is None:
-        return CHEMISTRIES["oxide"], [
+        return "oxide", (
             "chemistry taken as oxide: say lfp for iron phosphate, or give the number of cells, and"
             " the volts per cell tell"
-        ]
+        )
     volts = float(np.mean(np.concatenate([log.voltage_v for log in logs]))) / cells
-    middles = []
+    socs = []
     for log in logs:
         out_pct = 100.0 * discharged_ah(log.time_s, log.current_a) / capacity_ah
         row, start_pct = log.first_soc() or (0, 50.0 + float(out_pct.mean()))
-        middles.append(np.clip(start_pct + out_pct[row] - out_pct, 0.0, 100.0))
-    middle = float(np.mean(np.concatenate(middles)))
+        socs.append(np.clip(start_pct + out_pct[row] - out_pct, 0.0, 100.0))
+    mean_pct = float(np.mean(np.concatenate(socs)))
 
     def distance_v(name: ChemistryName) -> float:
-        return abs(volts - float(np.interp(middle, KNOTS_PCT, CHEMISTRIES[name].curve_v)))
+        return abs(volts - float(np.interp(mean_pct, KNOTS_PCT, CHEMISTRIES[name].curve_v)))
 
     name = min(CHEMISTRIES, key=distance_v)
-    return CHEMISTRIES[name], [f"chemistry {name} by {volts:.2f} V per cell, of {cells} cells"]
+    return name, f"chemistry {name} by {volts:.2f} V per cell, of {cells} cells"
 
 
-@dataclass(frozen=True, eq=False)
-class _Fitted:
+class _Fitted(NamedTuple):
     model: Model
     published: PublishedFit
     held_out_error_v: tuple[FloatArray, ...]
     effects: Selected | None
 
 
-@dataclass(frozen=True, eq=False)
-class _Joint:
-    """Curve of knots, and effects if any, of some logs together and with each left out."""
+class _Joint(NamedTuple):
+    """Curve of knots, and effects if any, of all logs together and with each left out."""
 
+    solution: Solution
+    without: Sequence[Solution]
     rows: Sequence[FitRows]
     columns: Sequence[FloatArray]
     """Of the moments, on the rows of each log."""
-    solution: Solution
-    without: Sequence[Solution]
     effects: tuple[tuple[Effect, Values], ...] = ()
-
-    def held_out_error_v(self) -> tuple[FloatArray, ...]:
-        """Return the errors of each log by the others [V]; () for too few logs."""
-        return tuple(
-            _where_covered(
-                number,
-                self.rows,
-                other.residual_v_of(self.columns[number], self.rows[number].voltage_v),
-            )
-            for number, other in enumerate(self.without)
-        )
 
 
 def _fit_knots(
     logs: Sequence[Log],
     rows: Sequence[FitRows],
-    chemistry: Chemistry,
     effect_ids: Sequence[str],
     fields: dict[str, Any],
 ) -> _Fitted:
@@ -331,41 +325,41 @@ def _fit_knots(
     published = solve_published(pooled(factors), EPSILON)
     if usable_delays(logs, DELAYS_S) == DELAYS_S and published.identified:
         fields = fields | {"published": published.fields(EPSILON, REFERENCE_C, DELAYS_S)}
+    chemistry = CHEMISTRIES[fields["chemistry"]]
     sums = [log_sums(item, chemistry) for item in rows]
     solved = solve_scaled(sums, fields["capacity_ah"], chemistry)
-    joint = _Joint(rows, [row_features(item) for item in rows], *solved)
+    joint = _Joint(*solved, rows, [row_features(item) for item in rows])
     selected: Selected | None = None
     if effect_ids:
-        plain = knots_file(joint.solution, chemistry, fields).extended_model()
+        plain = knots_file(joint.solution, fields).extended_model()
         search = Search(plain, logs, rows, chemistry, effect_ids)
         while (selected := search.select()).chosen:
-            with_effects = _with_effects(joint, selected, logs, chemistry, fields)
+            with_effects = _with_effects(plain, joint, selected, logs, fields)
             at_bound = selected.at_bound(with_effects.solution)
             if not at_bound:
                 joint = with_effects
                 break
             search.refused += at_bound
-    fields = fields | {"effects": effect_entries(joint.effects)}
-    errors = joint.held_out_error_v()
-    model = knots_file(joint.solution, chemistry, fields, errors, joint.rows)
+    others = [other.select.T @ other.coefficients for other in joint.without]
+    errors = _held_out(joint.rows, joint.columns, others)
+    model = knots_file(
+        joint.solution,
+        fields | {"effects": effect_entries(joint.effects)},
+        _judged(errors, joint.rows, joint.solution.residual_v, joint.solution.mean_v),
+    )
     return _Fitted(model, published, errors, selected)
 
 
-RELINEARIZED: Final = 4
-"""Linearizations about the fitted effects: products of effects and resistances have converged."""
-
-
 def _with_effects(
+    extended: ExtendedModel,
     plain: _Joint,
     selected: Selected,
     logs: Sequence[Log],
-    chemistry: Chemistry,
     fields: dict[str, Any],
 ) -> _Joint:
     """Return the fit with the selected effects: Gauss–Newton from `plain`, without effects."""
-    capacity_ah = fields["capacity_ah"]
+    capacity_ah, chemistry = extended.capacity_ah, CHEMISTRIES[fields["chemistry"]]
     solution, std = plain.solution, selected.amplitude_std
-    extended = knots_file(solution, chemistry, fields).extended_model()
     amplitudes: FloatArray | None = None
     for _ in range(RELINEARIZED):
         coefficients = solution.select[:P, :BASE].T @ solution.coefficients[:P]
@@ -375,32 +369,21 @@ def _with_effects(
             )
             for log, item in zip(logs, plain.rows, strict=True)
         ]
-        sums = [log_sums(item.rows, chemistry, item.columns, item.features) for item in about]
+        columns = [np.column_stack([item.features, item.columns]) for item in about]
+        sums = [
+            log_sums(item.rows, chemistry, table)
+            for item, table in zip(about, columns, strict=True)
+        ]
         solution, without = solve_scaled(sums, capacity_ah, chemistry, std)
         solution = selected.clipped(solution)
         amplitudes = solution.coefficients[P:]
         effects = selected.effects(solution)
-        voltage = knots_file(solution, chemistry, fields).voltage_model()
-        extended = ExtendedModel(voltage, capacity_ah, effects)
-    columns = [np.column_stack([item.features, item.columns]) for item in about]
-    return _Joint([item.rows for item in about], columns, solution, without, effects)
-
-
-def _where_covered(number: int, rows: Sequence[FitRows], error_v: FloatArray) -> FloatArray:
-    """Return the errors of a log, NaN where the other logs have no SoC."""
-    others = [item.soc_pct for k, item in enumerate(rows) if k != number]
-    low = min(float(soc.min()) for soc in others)
-    high = max(float(soc.max()) for soc in others)
-    soc = rows[number].soc_pct
-    return np.where((soc >= low) & (soc <= high), error_v, np.nan)
+        extended = ExtendedModel(knots_file(solution, fields).voltage_model(), capacity_ah, effects)
+    return _Joint(solution, without, [item.rows for item in about], columns, effects)
 
 
 def knots_file(
-    solution: Solution,
-    chemistry: Chemistry,
-    fields: dict[str, Any],
-    held_out_error_v: Sequence[FloatArray] = (),
-    rows: Sequence[FitRows] = (),
+    solution: Solution, fields: dict[str, Any], judged: Mapping[str, Any] | None = None
 ) -> Model:
     """Return the model file of a solution.
 
@@ -408,82 +391,34 @@ def knots_file(
     ----------
     solution : Solution
         Its covariance and scale are final.
-    chemistry : Chemistry
     fields : dict
         The other fields of `Model`.
-    held_out_error_v : sequence of array
-        Errors of left-out logs [V].
-    rows : sequence of FitRows
-        Of the same logs.
+    judged : dict, optional
+        Errors of left-out logs (`Noise`); those of the fit itself by default.
     """
-    noise = noise_of(
-        chemistry,
-        solution.mean_v,
-        solution.residual_v,
-        scale=solution.scale,
-        **_judged(held_out_error_v, rows, solution.residual_v, solution.mean_v),
-    )
-    return knots_model(
-        solution.coefficients[:P],
-        solution.covariance[:P, :P],
-        arrhenius_ohm=solution.arrhenius_ohm,
-        mean_c=solution.mean_c,
-        noise=noise,
-        information=_information(solution),
-        **fields,
-    )
-
-
-def model_rmse(solutions: Sequence[Solution], sums: Sequence[LogSums]) -> float:
-    """Return the rms error of logs [V], each by a solution, weighted by their time."""
-    weight = sum(item.weight for item in sums)
-    pairs = zip(solutions, sums, strict=True)
-    square = sum(a.square_error(item) * item.weight for a, item in pairs)
-    return float((square / weight) ** 0.5)
-
-
-def _judged(
-    held_out_error_v: Sequence[FloatArray],
-    rows: Sequence[FitRows],
-    residual_v: float,
-    mean_v: float,
-) -> dict[str, Any]:
-    error_v = np.concatenate([*held_out_error_v, np.empty(0)])
-    if not np.isfinite(error_v).any():
-        return {
-            "voltage_mae_pct": 100.0 * (2.0 / np.pi) ** 0.5 * residual_v / mean_v,
-            "voltage_rmse_v": residual_v,
-            "judged_on": FITTED_ROWS,
-        }
-    volts = np.concatenate([item.voltage_v for item in rows])
-    return {
-        "voltage_mae_pct": 100.0 * float(np.nanmean(np.abs(error_v) / volts)),
-        "voltage_rmse_v": float(np.sqrt(np.nanmean(error_v**2))),
-        "judged_on": WHOLE_LOGS,
-    }
-
-
-def _information(solution: Solution) -> Information:
-    """Return the posterior of all coefficients as square root of its precision."""
+    # The square root of the precision, and the names of its columns.
     root = np.linalg.cholesky(np.linalg.inv(solution.covariance)).T
     names = [f"knot_{soc:g}" for soc in KNOTS_PCT.tolist()]
     names += ["kt", *(f"R{k}" for k in range(1, P - N - 1)), "b"]
     names += [f"amplitude_{k}" for k in range(1, solution.coefficients.size - P + 1)]
-    return Information(
+    information = Information(
         columns=names,
         root=np.triu(root).tolist(),
         projected=(root @ solution.coefficients).tolist(),
     )
+    if judged is None:
+        judged = _judged((), (), solution.residual_v, solution.mean_v)
+    return Model.of_knots(solution, judged, information=information, **fields)
 
 
 def _fit_published(
     rows: Sequence[FitRows],
-    chemistry: Chemistry,
-    equation: tuple[float, float, tuple[float, ...]],
+    epsilon: float,
+    t_ref_c: float,
+    delay_s: Sequence[float],
     fields: dict[str, Any],
 ) -> _Fitted:
-    epsilon, t_ref_c, delays = equation
-    factors = [factor_of(item, len(delays), epsilon, t_ref_c) for item in rows]
+    factors = [factor_of(item, len(delay_s), epsilon, t_ref_c) for item in rows]
     published = solve_published(pooled(factors), epsilon)
     if not published.identified:
         raise InputError(
@@ -493,76 +428,79 @@ def _fit_published(
             value="published",
             cure="leave out --equation published, or give logs over more SoC",
         )
-    volts = np.concatenate([item.voltage_v for item in rows])
-    mean_v = float(volts.mean())
-    errors: tuple[FloatArray, ...] = ()
+    others = []
     if len(rows) >= LOGS_AT_LEAST:
-        errors = tuple(
-            _where_covered(number, rows, item.voltage_v - columns @ other.coefficients)
-            for number, item in enumerate(rows)
-            for columns in (published_columns(item, len(delays), epsilon, t_ref_c),)
-            for other in (
-                solve_published(pooled(factors[:number] + factors[number + 1 :]), epsilon),
-            )
-        )
+        for number in range(len(rows)):
+            without = pooled(factors[:number] + factors[number + 1 :])
+            others.append(solve_published(without, epsilon).coefficients)
+    columns = [published_columns(item, len(delay_s), epsilon, t_ref_c) for item in rows]
+    errors = _held_out(rows, columns, others)
+    mean_v = float(np.concatenate([item.voltage_v for item in rows]).mean())
+    judged = _judged(errors, rows, published.residual_v, mean_v)
     jacobian = published.jacobian(epsilon)
     model = Model(
         equation="published",
-        published=published.fields(epsilon, t_ref_c, delays),
-        functions=function_fields(
+        published=published.fields(epsilon, t_ref_c, delay_s),
+        functions=FunctionFields.of(
             jacobian @ published.covariance @ jacobian.T,
-            usual_loads(fields["capacity_ah"], len(delays)),
+            usual_loads(fields["capacity_ah"], len(delay_s)),
         ),
-        noise=noise_of(
-            chemistry, mean_v, published.residual_v,
-            **_judged(errors, rows, published.residual_v, mean_v),
-        ),
+        noise=Noise.of(fields["chemistry"], mean_v, published.residual_v, judged),
         **fields,
-    )  # fmt: skip
+    )
     return _Fitted(model, published, errors, None)
 
 
-def _check_logs(logs: Sequence[Log]) -> None:
-    if not logs:
-        raise InputError("no log given", cure="give at least one recorded log")
-    first: dict[str, Log] = {}
-    for log in logs:
-        if len(log) < 2:
-            raise InputError(
-                "a single row cannot identify a model",
-                source=log.source or log.name,
-                cure="give a log of minutes or hours",
-            )
-        other = first.setdefault(signals_sha256(log), log)
-        if other is not log:
-            raise InputError(
-                f"same rows as {other.source or other.name}: they would count twice",
-                source=log.source or log.name,
-                cure="give each log once",
-            )
-    common_temperature_source(log.temperature_source for log in logs)
+def _held_out(
+    rows: Sequence[FitRows], columns: Sequence[FloatArray], others: Sequence[FloatArray]
+) -> tuple[FloatArray, ...]:
+    """Return the errors of each log by the other logs [V], NaN where these have no SoC.
+
+    Parameters
+    ----------
+    rows : sequence of FitRows
+    columns : sequence of array of shape (m, k)
+        Of each log.
+    others : sequence of array of shape (k,)
+        Their coefficients by the other logs; none for too few logs.
+    """
+    errors = []
+    for number, coefficients in enumerate(others):
+        socs = [item.soc_pct for k, item in enumerate(rows) if k != number]
+        low, high = min(float(soc.min()) for soc in socs), max(float(soc.max()) for soc in socs)
+        soc, error_v = rows[number].soc_pct, rows[number].voltage_v - columns[number] @ coefficients
+        errors.append(np.where((soc >= low) & (soc <= high), error_v, np.nan))
+    return tuple(errors)
 
 
-def common_temperature_source(sources: Iterable[TemperatureSource]) -> TemperatureSource:
-    """Return the source of all logs' temperatures; raise InputError if they differ."""
-    found = sorted(set(sources))
-    if len(found) > 1:
-        raise InputError(
-            "the temperatures of the logs have different sources",
-            field="temperature_source",
-            value=found,
-            cure="state it in a column temperature_source of the logs that do not, or fit logs of"
-            " one source together",
-        )
-    return found[0]
+def _judged(
+    held_out_error_v: Sequence[FloatArray],
+    rows: Sequence[FitRows],
+    residual_v: float,
+    mean_v: float,
+) -> dict[str, Any]:
+    """Return the error that a model file states: of left-out logs, or of the fit without any."""
+    error_v = np.concatenate([*held_out_error_v, np.empty(0)])
+    if not np.isfinite(error_v).any():
+        return {
+            "voltage_mae_pct": 100.0 * (2.0 / np.pi) ** 0.5 * residual_v / mean_v,
+            "voltage_rmse_v": residual_v,
+            "judged_on": "the rows of the fit itself (too few logs to leave one out)",
+        }
+    volts = np.concatenate([item.voltage_v for item in rows])
+    return {
+        "voltage_mae_pct": 100.0 * float(np.nanmean(np.abs(error_v) / volts)),
+        "voltage_rmse_v": float(np.sqrt(np.nanmean(error_v**2))),
+        "judged_on": "whole logs left out in turn",
+    }
 
 
 def ranges_of(rows: Sequence[FitRows]) -> Ranges:
-    """Return the ranges of SoC, temperature and current of some logs' rows."""
+    """Return the ranges of SoC, temperature, current and voltage of some logs' rows."""
 
     def span(values: Iterable[FloatArray]) -> tuple[float, float]:
-        ends = [(float(item.min()), float(item.max())) for item in values]
-        return min(low for low, _ in ends), max(high for _, high in ends)
+        every = np.concatenate(list(values))
+        return float(every.min()), float(every.max())
 
     return Ranges(
         soc_pct=span(item.soc_pct for item in rows),
@@ -572,35 +510,17 @@ def ranges_of(rows: Sequence[FitRows]) -> Ranges:
     )
 
 
-def made_of(logs: Sequence[Log], rows: Sequence[FitRows], options: dict[str, Any]) -> Made:
-    """Return how a model file was made."""
-    hashes = [log_sha256(log) for log in logs]
-    listed = [
-        SourceLog(name=log.name, rows=len(item), sha256=digest)
-        for log, item, digest in zip(logs, rows, hashes, strict=True)
-    ]
-    return Made(
-        by=f"cangauge {__version__}",
-        options=options,
-        logs=listed[:LISTED_LOGS],
-        fingerprint=text_sha256("".join(hashes)),
-    )
+ROWS_CHANNELS: Final = ("current_a", "voltage_v")
+"""Channels that identify the rows of a log, whatever else a copy of it states."""
 
 
-def signals_sha256(log: Log) -> str:
-    """Return what identifies the rows of a log: the SHA-256 of its current and voltage."""
-    return _sha256(log.current_a, log.voltage_v)
-
-
-def log_sha256(log: Log) -> str:
+def log_sha256(
+    log: Log, channels: Sequence[str] = ("time_s", "current_a", "voltage_v", "temperature_c")
+) -> str:
     """Return the SHA-256 of a log's channels in hexadecimal."""
-    return _sha256(log.time_s, log.current_a, log.voltage_v, log.temperature_c)
-
-
-def _sha256(*channels: FloatArray) -> str:
     digest = hashlib.sha256()
-    for channel in channels:
-        digest.update(np.ascontiguousarray(channel).data)
+    for name in channels:
+        digest.update(np.ascontiguousarray(getattr(log, name)).data)
     return digest.hexdigest()
 
 

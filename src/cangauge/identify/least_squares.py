@@ -20,7 +20,7 @@ import numpy as np
 from cangauge._typing import FloatArray
 from cangauge.errors import InputError
 from cangauge.identify.rows import FitRows
-from cangauge.model.prior import RESIDUAL_STD, RESISTANCE_H, Chemistry, prior_of
+from cangauge.model.prior import RESIDUAL_STD, RESISTANCE_H, Chemistry, Distribution, prior_of
 from cangauge.model.voltage_model import (
     KNOTS_PCT,
     REFERENCE_C,
@@ -114,22 +114,15 @@ def row_features(rows: FitRows) -> FloatArray:
     return np.concatenate([hermite_basis(rows.soc_pct), loads], axis=1)
 
 
-def log_sums(
-    rows: FitRows,
-    chemistry: Chemistry,
-    extra: FloatArray | None = None,
-    features: FloatArray | None = None,
-) -> LogSums:
+def log_sums(rows: FitRows, chemistry: Chemistry, columns: FloatArray | None = None) -> LogSums:
     """Return the sums of a log.
 
     Parameters
     ----------
     rows : FitRows
     chemistry : Chemistry
-    extra : array of shape (m, e), optional
-        Columns of effects.
-    features : array of shape (m, BASE), optional
-        Instead of `row_features`.
+    columns : array of shape (m, q − 2), optional
+        Those of the moments before 1 and voltage; `row_features`, without effects, by default.
 
     Raises
     ------
@@ -137,10 +130,6 @@ def log_sums(
         If every row lies so far outside 0–100 % that it has no weight.
     """
     weight = row_weights(rows.soc_pct, rows.seconds, chemistry)
-    columns = [row_features(rows) if features is None else features]
-    if extra is not None:
-        columns.append(extra)
-    table = np.column_stack([*columns, np.ones(len(rows)), rows.voltage_v])
     total = float(weight.sum())
     if not total:
         low, high = float(rows.soc_pct.min()), float(rows.soc_pct.max())
@@ -150,40 +139,24 @@ def log_sums(
             field="soc_pct",
             cure="check the SoC at the start (soc_pct, --initial-soc), or leave this log out",
         )
+    if columns is None:
+        columns = row_features(rows)
+    table = np.column_stack([columns, np.ones(len(rows)), rows.voltage_v])
     mean_soc = float(weight @ rows.soc_pct) / total
     return LogSums(table.T @ (table * weight[:, None]), total, mean_soc)
 
 
-@dataclass(frozen=True, eq=False)
-class Solution:
-    """Posterior of the coefficients.
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Solution(Distribution):
+    """Posterior of the coefficients, the amplitudes of effects after b.
 
     Parameters
     ----------
-    coefficients : array of shape (p,)
-        Knots [V], kt [V/K], resistances [Ω], b [-], amplitudes of effects.
-    covariance : array of shape (p, p)
-        Theirs; scaled by left-out logs where `scale` says so.
     select : array of shape (p, q − 2)
         Maps the columns of the moments to the coefficients' columns.
-    arrhenius_ohm : array of shape (M,)
-        Resistances R⁰ that b scales [Ω].
-    residual_v : float
-        Rms residual [V].
-    mean_v, mean_c : float
-        Mean voltage V0 [V] and temperature T̄ [°C] of the logs.
-    scale : float
-        κ²: how much larger than stated the errors of left-out logs are.
     """
 
-    coefficients: FloatArray
-    covariance: FloatArray
     select: FloatArray
-    arrhenius_ohm: FloatArray
-    residual_v: float
-    mean_v: float
-    mean_c: float
-    scale: float = 1.0
 
     def mean_error(self, sums: LogSums) -> tuple[float, float]:
         """Return the mean residual of a log [V], and its variance by the coefficients [V²]."""
@@ -191,30 +164,31 @@ class Solution:
         error = float(sums.moments[-2, -1]) / sums.weight - float(row @ self.coefficients)
         return error, float(row @ self.covariance @ row)
 
-    def residual_v_of(self, columns: FloatArray, voltage_v: FloatArray) -> FloatArray:
-        """Return measured minus predicted voltage of rows [V], shape (m,).
-
-        Parameters
-        ----------
-        columns : array of shape (m, q − 2)
-            Those of the moments.
-        voltage_v : array of shape (m,)
-        """
-        return np.asarray(voltage_v - columns @ (self.select.T @ self.coefficients))
-
     def square_error(self, sums: LogSums) -> float:
         """Return the mean square residual of a log, its level included [V²]."""
         back = np.r_[self.select.T @ self.coefficients, 0.0, -1.0]
         return float(back @ sums.moments @ back) / sums.weight
 
 
+NO_EFFECTS: Final = np.zeros(0)
+"""Standard deviations of the amplitudes of no effects."""
+
+
 def solve(
     sums: Sequence[LogSums],
     capacity_ah: float,
     chemistry: Chemistry,
-    amplitude_std: FloatArray | None = None,
+    amplitude_std: FloatArray = NO_EFFECTS,
 ) -> Solution:
     """Return the posterior of the coefficients for some logs.
+
+    With rows X of weights W and the prior N(θ₀, Λ⁻¹), θ = θ₀ + δ solves
+
+        [(A − Σl sl·al·alᵀ)/v + Λ]·δ = (r − Σl sl·rl·al)/v
+
+    with A = XᵀWX and r = XᵀW·(u − X·θ₀). al and rl are the sums over log l of its weighted rows and
+    errors, sl = 1/(wl + v/σl²) eliminates its level of prior N(0, σl²), and v is the noise variance
+    of a datum times its seconds.
 
     Parameters
     ----------
@@ -222,85 +196,85 @@ def solve(
     capacity_ah : float
         [Ah].
     chemistry : Chemistry
-    amplitude_std : array of shape (e,), optional
+    amplitude_std : array of shape (e,)
         Prior standard deviations of the effects' amplitudes, of mean 0.
     """
-    moments = np.array([item.moments for item in sums])
-    total, weights = moments.sum(axis=0), np.array([item.weight for item in sums])
-    weight = float(weights.sum())
+    moments, w = np.array([item.moments for item in sums]), np.array([item.weight for item in sums])
+    total, weight = moments.sum(axis=0), float(w.sum())
     mean_v = float(total[-2, -1]) / weight
     mean_c = REFERENCE_C + float(total[-2, N]) / weight
-    mean_soc = float(weights @ [item.mean_soc_pct for item in sums]) / weight
+    mean_soc = float(w @ [item.mean_soc_pct for item in sums]) / weight
     prior = prior_of(chemistry, mean_v, mean_soc, capacity_ah)
-    extra = np.zeros(0) if amplitude_std is None else amplitude_std
-    size = P + extra.size
-    mean = np.r_[prior.mean, np.zeros(extra.size)]
-    precision = np.zeros((size, size))
-    precision[:N, :N] = np.linalg.inv(prior.covariance[:N, :N])
-    rest = np.arange(N, size)
-    precision[rest, rest] = np.r_[1.0 / np.diag(prior.covariance)[N:], extra**-2.0]
+    theta0 = np.r_[prior.coefficients, np.zeros(amplitude_std.size)]
+    Lambda = np.diag(np.r_[1.0 / np.diag(prior.covariance), amplitude_std**-2.0])
+    Lambda[:N, :N] = np.linalg.inv(prior.covariance[:N, :N])
     colder = np.maximum(1.0, resistance_factor(np.array([item.mean_c for item in sums])))
     level_std = chemistry.level_std * mean_v * colder**chemistry.cold_exponent
-    warm, ohm = float(resistance_factor(mean_c)), prior.resistance_ohm
+    ohm = prior.arrhenius_ohm
     for _ in range(2):  # the column of b needs the resistances: twice
-        select = np.zeros((size, len(total) - 2))
-        at = np.arange(N + 1 + M)
-        select[at, at] = 1.0
-        select[P - 1, N + 1 : N + 1 + M] = -ohm
-        select[P - 1, N + 1 + M : BASE] = ohm / warm
-        select[np.arange(P, size), np.arange(BASE, BASE + extra.size)] = 1.0
-        normal = select @ total[:-2, :-2] @ select.T
-        right = select @ total[:-2, -1] - normal @ mean
-        of_log = moments[:, :-2, -2] @ select.T
-        log_right = moments[:, -2, -1] - of_log @ mean
-        square = float(total[-1, -1] - mean @ (select @ total[:-2, -1] + right))
+        arrhenius_ohm = ohm
+        select = _selection(arrhenius_ohm, float(resistance_factor(mean_c)), amplitude_std.size)
+        A = select @ total[:-2, :-2] @ select.T
+        XWu = select @ total[:-2, -1]
+        r = XWu - A @ theta0
+        a = moments[:, :-2, -2] @ select.T
+        r_log = moments[:, -2, -1] - a @ theta0
+        square = float(total[-1, -1] - theta0 @ (XWu + r))  # of the errors at θ₀
         variance = prior.residual_v**2
         for _ in range(ITERATIONS):
-            datum = variance * SECONDS_PER_DATUM
-            share = 1.0 / (weights + datum / level_std**2)  # of a log's level, eliminated
-            reduced = (normal - (of_log * share[:, None]).T @ of_log) / datum + precision
-            step = np.linalg.solve(reduced, (right - of_log.T @ (share * log_right)) / datum)
-            level = share * (log_right - of_log @ step)
-            left = square - 2.0 * float(step @ right) + float(step @ normal @ step)
-            left += float(level @ (weights * level - 2.0 * (log_right - of_log @ step)))
-            residual2 = max(left, 0.0) / weight
+            v = variance * SECONDS_PER_DATUM
+            s = 1.0 / (w + v / level_std**2)
+            precision = (A - (a * s[:, None]).T @ a) / v + Lambda
+            delta = np.linalg.solve(precision, (r - a.T @ (s * r_log)) / v)
+            left = r_log - a @ delta
+            level = s * left
+            square_left = square - 2.0 * float(delta @ r) + float(delta @ A @ delta)
+            square_left += float(level @ (w * level - 2.0 * left))
+            residual2 = max(square_left, 0.0) / weight
             following = residual2 + (ADDED_STD * mean_v) ** 2
             if abs(following / variance - 1.0) < CONVERGED:
                 break
             variance = following
-        coefficients = mean + step
-        fitted = coefficients[N + 1 : N + 1 + M]
-        arrhenius_ohm = ohm
-        ohm = fitted if fitted.sum() < 0.0 else prior.resistance_ohm
-    covariance = np.linalg.inv(reduced)
+        theta = theta0 + delta
+        fitted_ohm = theta[N + 1 : N + 1 + M]
+        ohm = fitted_ohm if fitted_ohm.sum() < 0.0 else prior.arrhenius_ohm
+    covariance = np.linalg.inv(precision)
     covariance = 0.5 * (covariance + covariance.T)
     covariance[P - 1, P - 1] += B_LEFT_STD**2
-    return Solution(
-        coefficients, covariance, select, arrhenius_ohm, float(np.sqrt(residual2)), mean_v, mean_c
-    )
+    residual_v = float(np.sqrt(residual2))
+    return Solution(theta, covariance, arrhenius_ohm, residual_v, mean_v, mean_c, select=select)
 
 
-def folds(number: int) -> list[list[int]]:
-    """Return the logs of each fold that is left out; none for fewer than `LOGS_AT_LEAST`."""
-    if number < LOGS_AT_LEAST:
-        return []
-    count = min(number, FOLDS_AT_MOST)
-    return [list(range(fold, number, count)) for fold in range(count)]
+def _selection(arrhenius_ohm: FloatArray, warm: float, amplitudes: int) -> FloatArray:
+    """Return `Solution.select`; `warm` is a(T̄), at which the resistances hold."""
+    select = np.zeros((P + amplitudes, BASE + amplitudes))
+    at = np.arange(N + 1 + M)
+    select[at, at] = 1.0
+    select[P - 1, N + 1 : N + 1 + M] = -arrhenius_ohm
+    select[P - 1, N + 1 + M : BASE] = arrhenius_ohm / warm
+    select[P:, BASE:] = np.eye(amplitudes)
+    return select
 
 
 def solve_without(
     sums: Sequence[LogSums],
     capacity_ah: float,
     chemistry: Chemistry,
-    amplitude_std: FloatArray | None = None,
+    amplitude_std: FloatArray = NO_EFFECTS,
 ) -> list[Solution]:
     """Return for each log the posterior of the logs outside its fold; [] for too few logs."""
-    found: dict[int, Solution] = {}
-    for left_out in folds(len(sums)):
-        others = [item for number, item in enumerate(sums) if number not in left_out]
-        solution = solve(others, capacity_ah, chemistry, amplitude_std)
-        found.update(dict.fromkeys(left_out, solution))
-    return [found[number] for number in sorted(found)]
+    number = len(sums)
+    if number < LOGS_AT_LEAST:
+        return []
+    count = min(number, FOLDS_AT_MOST)
+    by_fold = [
+        solve(
+            [item for k, item in enumerate(sums) if k % count != fold],
+            capacity_ah, chemistry, amplitude_std,
+        )
+        for fold in range(count)
+    ]  # fmt: skip
+    return [by_fold[k % count] for k in range(number)]
 
 
 def left_out_scale(
@@ -324,7 +298,7 @@ def solve_scaled(
     sums: Sequence[LogSums],
     capacity_ah: float,
     chemistry: Chemistry,
-    amplitude_std: FloatArray | None = None,
+    amplitude_std: FloatArray = NO_EFFECTS,
 ) -> tuple[Solution, list[Solution]]:
     """Return the posterior scaled by left-out logs, and those of `solve_without`."""
     solution = solve(sums, capacity_ah, chemistry, amplitude_std)

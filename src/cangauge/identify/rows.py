@@ -105,7 +105,7 @@ def fit_rows(
         the tolerance.
     """
     source = log.source or log.name
-    soc = counted_soc_pct(log, capacity_ah, None)
+    soc = counted_soc_pct(log, capacity_ah)
     low, high = float(soc.min()), float(soc.max())
     if low < -SOC_TOLERANCE_PCT or high > 100.0 + SOC_TOLERANCE_PCT:
         raise InputError(
@@ -124,12 +124,11 @@ def fit_rows(
             cure="give a longer log",
         )
     time_s = log.time_s
-    usual_s = usual_step_s(time_s[at])
     return FitRows(
         name=log.name,
         at=at,
         time_s=time_s[at],
-        seconds=np.full(at.size, usual_s),
+        seconds=np.full(at.size, usual_step_s(time_s[at])),
         voltage_v=log.voltage_v[at],
         temperature_c=log.temperature_c[at],
         dequantized_c=dequantize(log).temperature_c[at],
@@ -148,13 +147,10 @@ def decimate(time_s: FloatArray, rate_hz: float) -> NDArray[np.intp]:
 def running_rows(time_s: FloatArray, voltage_v: FloatArray) -> NDArray[np.bool_]:
     """Return the mask of rows that are neither start-up nor shut-down (rule 2), shape (n,)."""
     down = voltage_v < LOW_VOLTAGE * float(np.median(voltage_v))
-    if not down.any():
-        return ~down
-    at = time_s[down]
-    right = np.searchsorted(at, time_s)
-    to_next = np.where(right < at.size, at[np.minimum(right, at.size - 1)] - time_s, np.inf)
-    to_last = np.where(right > 0, time_s - at[np.maximum(right - 1, 0)], np.inf)
-    return np.asarray(np.minimum(to_next, to_last) > GUARD_S) & ~down
+    at_s = np.r_[-np.inf, time_s[down], np.inf]
+    following = np.searchsorted(at_s, time_s)
+    nearest_s = np.minimum(at_s[following] - time_s, time_s - at_s[following - 1])
+    return np.asarray(nearest_s > GUARD_S)
 
 
 def usable_delays(logs: Sequence[Log], delay_s: Sequence[float]) -> tuple[float, ...]:
@@ -170,11 +166,11 @@ def usable_delays(logs: Sequence[Log], delay_s: Sequence[float]) -> tuple[float,
         Increasing from 0 [s].
     """
     step_s = min(usual_step_s(log.time_s) for log in logs)
-    kept = [delay_s[0]]
+    usable = [delay_s[0]]
     for delay in delay_s[1:]:
-        if step_s <= delay - kept[-1] + 1e-9:
-            kept.append(delay)
-    return tuple(kept)
+        if step_s <= delay - usable[-1] + 1e-9:
+            usable.append(delay)
+    return tuple(usable)
 
 
 def usable_rows(

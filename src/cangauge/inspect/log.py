@@ -302,7 +302,7 @@ def _capacity(log: Log, charge: Charge, soc: Soc | None) -> tuple[Verdict, str]:
         return "no", f"{text} Ah, the capacity if the log runs from full to empty"
     span = soc.maximum_pct - soc.minimum_pct
     try:
-        whole_ah = capacity_from_full_discharge([log], None)
+        whole_ah = capacity_from_full_discharge([log], [None])
     except InputError:
         text = f"{soc.implied_capacity_ah:.4g} Ah per 100 % of reference SoC, over {span:.1f} %"
         return "yes" if span >= WIDE_SOC_PCT else "partly", text

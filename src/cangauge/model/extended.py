@@ -286,13 +286,6 @@ class OnlineModel:
         """Return the counted part of a corrected current [A]."""
         return self._counting.counted_at(current_a)
 
-    @property
-    def memory(self) -> list[tuple[float, float]]:
-        """Resistance [Ω] and time constant [s] of the effects' voltages from earlier currents."""
-        return [
-            item for effect, values in self.extended.effects for item in effect.rc_elements(values)
-        ]
-
     def correct(self, reading: Reading) -> Sequence[Reading]:
         """Return the corrected readings that are ready, usually one, in order."""
         if not self._corrects:

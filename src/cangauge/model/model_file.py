@@ -4,13 +4,21 @@ from __future__ import annotations
 
 import itertools
 import json
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from os import PathLike
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, Final, Literal, Self
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    ConfigDict,
+    Field,
+    NonNegativeFloat,
+    ValidationError,
+    model_validator,
+)
 
 from cangauge._config import schema_error
 from cangauge._files import MIB, as_path, read_bounded, write_text_atomic
@@ -31,8 +39,8 @@ from cangauge.model.prior import (
     LOW_PASS_S,
     SLOW_S,
     SLOW_SHARE,
-    Chemistry,
     ChemistryName,
+    Distribution,
     principal_functions,
     prior_of,
     usual_loads,
@@ -47,17 +55,25 @@ from cangauge.model.voltage_model import (
     HermiteCurve,
     PublishedCurve,
     VoltageModel,
-    hermite_slopes,
     resistance_factor,
 )
 
-PRIOR_MADE_BY = "prior of the chemistry"
+PRIOR_MADE_BY: Final = "prior of the chemistry"
 """`made.by` of a model without any log."""
-MODEL_FORMAT = "cangauge-model"
-MODEL_VERSION = 2
-_CURE = "create the file with `cangauge fit`"
+PRIOR_RANGE_C: Final = (-20.0, 50.0)
+"""Temperatures that the prior's cells are specified for, in typical data sheets [°C]."""
+PRIOR_C_RATE: Final = 3.0
+"""Current that they are specified for [1/h]."""
 
-_NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+_CURE: Final = "create the file with `cangauge fit`"
+
+
+def _increasing(values: list[float]) -> list[float]:
+    if any(high <= low for low, high in itertools.pairwise(values)):
+        raise ValueError("must increase")
+    return values
+
+
 # Wider than any pack needs, narrow enough that no voltage overflows.
 _Value = Annotated[float, Field(ge=-1e12, le=1e12)]
 _Soc = Annotated[float, Field(ge=-10, le=110)]
@@ -65,22 +81,24 @@ _Celsius = Annotated[float, Field(ge=-273.15, le=1000)]
 _Ampere = Annotated[float, Field(ge=-1e6, le=1e6)]
 _Volts = Annotated[float, Field(ge=0, le=1e6)]
 _Seconds = Annotated[float, Field(gt=0, le=1e5)]
-_Delays = Annotated[list[Annotated[float, Field(ge=0, le=3600)]], Field(min_length=1)]
+_Delay = Annotated[float, Field(ge=0, le=3600)]
+_Delays = Annotated[list[_Delay], Field(min_length=1), AfterValidator(_increasing)]
+_Knots = Annotated[list[_Soc], Field(min_length=2), AfterValidator(_increasing)]
 
 
-class _Strict(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
+class _Fields(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
 
-class Coefficient(_Strict):
+class Coefficient(_Fields):
     """One coefficient of the published equation."""
 
     value: _Value
-    std_error: _NotNegative | None = None
+    std_error: NonNegativeFloat | None = None
     unit: Literal["V", "V/K", "ohm"]
 
 
-class Published(_Strict):
+class Published(_Fields):
     """The published equation: k0 … k7, kt, R1 … Rn."""
 
     coefficients: dict[str, Coefficient]
@@ -97,12 +115,13 @@ class Published(_Strict):
         epsilon: float,
         t_ref_c: float,
         delays_s: Sequence[float],
-    ) -> Published:
+    ) -> Self:
         """Return the equation of the values k0 … k7, kt, R1 … Rn and their standard errors."""
-        units = {"kt": "V/K", "k": "V", "R": "ohm"}
+        names, n = _names(delays_s), len(BASIS_NAMES)
+        units = ["V"] * n + ["V/K"] + ["ohm"] * len(delays_s)
         coefficients = {
-            name: {"value": value, "std_error": error, "unit": units.get(name) or units[name[0]]}
-            for name, value, error in zip(published_names(len(delays_s)), values, std, strict=False)
+            name: {"value": value, "std_error": error, "unit": unit}
+            for name, value, error, unit in zip(names, values, std, units, strict=False)
         }
         return cls.model_validate({
             "coefficients": coefficients, "epsilon": epsilon, "t_ref_c": t_ref_c,
@@ -111,30 +130,25 @@ class Published(_Strict):
 
     @model_validator(mode="after")
     def _complete(self) -> Self:
-        _check_increasing(self.delays_s, "delays_s")
-        wanted, given = set(published_names(len(self.delays_s))), set(self.coefficients)
-        if given != wanted:
-            missing, extra = sorted(wanted - given), sorted(given - wanted)
-            words = [f"missing are {', '.join(missing)}"] if missing else []
-            words += [f"unknown are {', '.join(extra)}"] if extra else []
-            raise ValueError(f"coefficients: {'; '.join(words)}")
+        wanted, given = set(_names(self.delays_s)), set(self.coefficients)
+        for word, names in (("missing", wanted - given), ("unknown", given - wanted)):
+            if names:
+                raise ValueError(f"coefficients: {word} are {', '.join(sorted(names))}")
         return self
 
 
-class CurveKnots(_Strict):
+def _names(delays_s: Sequence[float]) -> list[str]:
+    return [*BASIS_NAMES, "kt", *(f"R{k}" for k, _ in enumerate(delays_s, start=1))]
+
+
+class CurveKnots(_Fields):
     """Curve of a `knots` model."""
 
-    soc_pct: Annotated[list[_Soc], Field(min_length=2)]
+    soc_pct: _Knots
     voltage_v: list[_Value]
 
-    @model_validator(mode="after")
-    def _shapes(self) -> Self:
-        _check_increasing(self.soc_pct, "soc_pct")
-        _check_length(self.voltage_v, len(self.soc_pct), "voltage_v")
-        return self
 
-
-class ArrheniusFields(_Strict):
+class ArrheniusFields(_Fields):
     """Change of the resistances with temperature (`voltage_model.Arrhenius`)."""
 
     factor: _Value
@@ -142,7 +156,7 @@ class ArrheniusFields(_Strict):
     mean_c: _Celsius
 
 
-class Loads(_Strict):
+class Loads(_Fields):
     """Temperature coefficient and resistances of a `knots` model."""
 
     t_ref_c: _Celsius
@@ -152,34 +166,25 @@ class Loads(_Strict):
     resistance_ohm: list[_Value]
     arrhenius: ArrheniusFields
 
-    @model_validator(mode="after")
-    def _shapes(self) -> Self:
-        _check_increasing(self.delays_s, "delays_s")
-        number = len(self.delays_s) + len(self.low_pass_s)
-        _check_length(self.resistance_ohm, number, "resistance_ohm")
-        _check_length(self.arrhenius.resistance_ohm, number, "arrhenius.resistance_ohm")
-        return self
 
-
-class FunctionFields(_Strict):
+class FunctionFields(_Fields):
     """Joint principal functions of the coefficients' covariance, of standard deviation 1."""
 
-    soc_pct: Annotated[list[_Soc], Field(min_length=2)]
+    soc_pct: _Knots
     curve_v: list[list[_Value]]
     """Part of each function in the curve at `soc_pct` [V]."""
     load: list[list[_Value]]
     """Part of each function in the coefficients of the load columns."""
 
-    @model_validator(mode="after")
-    def _shapes(self) -> Self:
-        _check_increasing(self.soc_pct, "soc_pct")
-        _check_length(self.load, len(self.curve_v), "load")
-        for function in self.curve_v:
-            _check_length(function, len(self.soc_pct), "curve_v: each function")
-        return self
+    @classmethod
+    def of(cls, covariance: FloatArray, loads: FloatArray) -> Self:
+        """Return a covariance of knots and load coefficients (`prior.principal_functions`)."""
+        functions, n = principal_functions(covariance, loads), KNOTS_PCT.size
+        curve_v, load = functions[:, :n].tolist(), functions[:, n:].tolist()
+        return cls(soc_pct=KNOTS_PCT.tolist(), curve_v=curve_v, load=load)
 
 
-class Noise(_Strict):
+class Noise(_Fields):
     """Errors of the voltage that the coefficients do not explain."""
 
     level_std_v: _Volts
@@ -197,17 +202,42 @@ class Noise(_Strict):
     """Rms residual of the rows of the fit."""
     left_out_scale: Annotated[float, Field(ge=1, le=1e6)] = 1.0
     """κ²: `level_std_v` and the covariance of the coefficients contain it already."""
-    voltage_mae_pct: _NotNegative
+    voltage_mae_pct: NonNegativeFloat
     voltage_rmse_v: _Volts
     """Errors of left-out logs."""
     judged_on: str
+
+    @classmethod
+    def of(
+        cls,
+        chemistry: ChemistryName,
+        mean_v: float,
+        residual_v: float,
+        judged: Mapping[str, Any],
+        scale: float = 1.0,
+    ) -> Self:
+        """Return the errors of a chemistry, of mean voltage V0 [V] and rms residual [V].
+
+        `judged` holds `voltage_mae_pct`, `voltage_rmse_v` and `judged_on`; `scale` is κ².
+        """
+        typical = CHEMISTRIES[chemistry]
+        return cls(
+            level_std_v=typical.level_std * mean_v * scale**0.5,
+            slow_std_v=float(np.hypot(typical.slow_std * mean_v, SLOW_SHARE * residual_v)),
+            fast_std_v=float(np.hypot(typical.fast_factor * residual_v, FAST_FLOOR * mean_v)),
+            soc_std_pct=typical.soc_std_pct,
+            cold_exponent=typical.cold_exponent,
+            residual_std_v=residual_v,
+            left_out_scale=scale,
+            **judged,
+        )
 
     def cold(self, temperature_c: float) -> float:
         """Return the growth of the voltage errors in the cold [-], 1 or more."""
         return float(max(1.0, float(resistance_factor(temperature_c))) ** self.cold_exponent)
 
 
-class Ranges(_Strict):
+class Ranges(_Fields):
     """Identified ranges; an estimate outside is flagged."""
 
     soc_pct: tuple[_Soc, _Soc]
@@ -217,7 +247,7 @@ class Ranges(_Strict):
     """Lowest and highest voltage of the logs, under their currents."""
 
 
-class Information(_Strict):
+class Information(_Fields):
     """Posterior of all coefficients: RᵀR is its precision, R·θ = `projected` its mean.
 
     The prior and the scale of left-out logs are in it. Rows of another log, divided by their noise,
@@ -228,18 +258,8 @@ class Information(_Strict):
     root: list[list[_Value]]
     projected: list[_Value]
 
-    @model_validator(mode="after")
-    def _shapes(self) -> Self:
-        _check_length(self.projected, len(self.columns), "projected")
-        _check_length(self.root, len(self.columns), "root")
-        for row in self.root:
-            _check_length(row, len(self.columns), "root: each row")
-        if any(any(row[:place]) for place, row in enumerate(self.root)):
-            raise ValueError("root: must be upper triangular")
-        return self
 
-
-class SourceLog(_Strict):
+class SourceLog(_Fields):
     """A log used for the identification."""
 
     name: str
@@ -247,7 +267,7 @@ class SourceLog(_Strict):
     sha256: str
 
 
-class Made(_Strict):
+class Made(_Fields):
     """How the model was made."""
 
     by: str
@@ -256,7 +276,7 @@ class Made(_Strict):
     fingerprint: str
 
 
-class Model(_Strict):
+class Model(_Fields):
     """A pack's identified model: coefficients, their covariance, effects, ranges and origin.
 
     Examples
@@ -286,14 +306,21 @@ class Model(_Strict):
     made: Made
 
     @model_validator(mode="after")
-    def _consistent(self) -> Self:
-        if self.equation == "published" and self.published is None:
-            raise ValueError("published: missing, though the equation is published")
-        if self.equation == "knots" and (self.curve is None or self.loads is None):
-            raise ValueError("curve, loads: missing, though the equation is knots")
-        columns = len(self.voltage_model().load_coefficients)
-        for function in self.functions.load:
-            _check_length(function, columns, "functions.load: each function")
+    def _sizes_agree(self) -> Self:
+        if (curve := self.curve) is not None:
+            _check_shape("curve.voltage_v", curve.voltage_v, len(curve.soc_pct))
+        if (loads := self.loads) is not None:
+            M = len(loads.delays_s) + len(loads.low_pass_s)
+            _check_shape("loads.resistance_ohm", loads.resistance_ohm, M)
+            _check_shape("loads.arrhenius.resistance_ohm", loads.arrhenius.resistance_ohm, M)
+        functions, columns = self.functions, self.voltage_model().load_coefficients.size
+        number = len(functions.curve_v)
+        _check_shape("functions.curve_v", functions.curve_v, number, len(functions.soc_pct))
+        _check_shape("functions.load", functions.load, number, columns)
+        if (information := self.information) is not None:
+            p = len(information.columns)
+            _check_shape("information.root", information.root, p, p)
+            _check_shape("information.projected", information.projected, p)
         return self
 
     def __repr__(self) -> str:
@@ -321,50 +348,49 @@ class Model(_Strict):
         Raises
         ------
         InputError
-            If the pseudo-OCV of a published equation does not rise with SoC.
+            If the fields of the equation are missing, or the pseudo-OCV of a published equation
+            does not rise with SoC.
         """
+        curve, loads, published = self.curve, self.loads, self.published
         ranges: dict[str, Any] = {
             "soc_range_pct": self.range.soc_pct,
             "temperature_range_c": self.range.temperature_c,
             "current_range_a": self.range.current_a,
             "voltage_range_v": self.range.voltage_v,
         }
-        if self.equation == "knots" and self.curve is not None and self.loads is not None:
-            soc_pct, volts = np.array(self.curve.soc_pct), np.array(self.curve.voltage_v)
-            colder = self.loads.arrhenius
+        if self.equation == "knots" and curve is not None and loads is not None:
+            colder = loads.arrhenius
             return VoltageModel(
-                HermiteCurve.rising(soc_pct, volts),
-                kt_v_per_k=self.loads.kt_v_per_k,
-                resistance_ohm=tuple(self.loads.resistance_ohm),
-                delay_s=tuple(self.loads.delays_s),
-                low_pass_s=tuple(self.loads.low_pass_s),
+                HermiteCurve.rising(np.array(curve.soc_pct), np.array(curve.voltage_v)),
+                kt_v_per_k=loads.kt_v_per_k,
+                resistance_ohm=tuple(loads.resistance_ohm),
+                delay_s=tuple(loads.delays_s),
+                low_pass_s=tuple(loads.low_pass_s),
                 arrhenius=Arrhenius(colder.factor, tuple(colder.resistance_ohm), colder.mean_c),
-                t_ref_c=self.loads.t_ref_c,
+                t_ref_c=loads.t_ref_c,
                 **ranges,
             )
-        fields = self.published
-        if fields is None:
-            raise ValueError("no published equation")
-        value = {name: item.value for name, item in fields.coefficients.items()}
-        names = published_names(len(fields.delays_s))
-        ocv_v = tuple(value[name] for name in BASIS_NAMES)
-        return VoltageModel(
-            PublishedCurve(ocv_v, fields.epsilon, self.range.soc_pct),
-            kt_v_per_k=value["kt"],
-            resistance_ohm=tuple(value[name] for name in names[len(BASIS_NAMES) + 1 :]),
-            delay_s=tuple(fields.delays_s),
-            t_ref_c=fields.t_ref_c,
-            **ranges,
-        )
+        if self.equation == "published" and published is not None:
+            names, n = _names(published.delays_s), len(BASIS_NAMES)
+            values = [published.coefficients[name].value for name in names]
+            return VoltageModel(
+                PublishedCurve(tuple(values[:n]), published.epsilon, self.range.soc_pct),
+                kt_v_per_k=values[n],
+                resistance_ohm=tuple(values[n + 1 :]),
+                delay_s=tuple(published.delays_s),
+                t_ref_c=published.t_ref_c,
+                **ranges,
+            )
+        lacking = "published" if self.equation == "published" else "curve, loads"
+        raise InputError(f"missing, though the equation is {self.equation}", field=lacking)
 
     def principal_functions(self) -> Functions:
         """Return the covariance of the coefficients in reduced form."""
-        number = len(self.functions.curve_v)
         soc_pct = np.array(self.functions.soc_pct)
-        value = np.array(self.functions.curve_v).reshape(number, soc_pct.size).T
-        columns = len(self.voltage_model().load_coefficients)
-        load = np.array(self.functions.load).reshape(number, columns).T
-        return Functions(soc_pct, value, hermite_slopes(soc_pct, value), load)
+        value = np.array(self.functions.curve_v).reshape(-1, soc_pct.size).T
+        columns = self.voltage_model().load_coefficients.size
+        load = np.array(self.functions.load).reshape(-1, columns).T
+        return Functions(soc_pct, value, load)
 
     def extended_model(self) -> ExtendedModel:
         """Return the voltage model with the effects.
@@ -392,93 +418,6 @@ class Model(_Strict):
         """
         functions = self.principal_functions()
         return OnlineModel(self.extended_model(), functions, self.noise, capacity_ah, gap_s)
-
-    @classmethod
-    def prior(cls, chemistry: ChemistryName, cells: int, capacity_ah: float) -> Model:
-        """Return a model of a pack without logs: the typical cell, with its honest uncertainty.
-
-        Parameters
-        ----------
-        chemistry : {"oxide", "lfp"}
-        cells : int
-            Cells in series.
-        capacity_ah : float
-            [Ah].
-
-        Examples
-        --------
-        >>> Model.prior("oxide", cells=96, capacity_ah=60.0).equation
-        'knots'
-        """
-        known = CHEMISTRIES[chemistry]
-        volts = cells * float(np.interp(50.0, KNOTS_PCT, known.curve_v))
-        prior = prior_of(known, volts, 50.0, capacity_ah)
-        return knots_model(
-            prior.mean,
-            prior.covariance,
-            arrhenius_ohm=prior.resistance_ohm,
-            mean_c=REFERENCE_C,
-            name=f"{cells} {chemistry} cells of {capacity_ah:g} Ah",
-            chemistry=chemistry,
-            cells=cells,
-            capacity_ah=capacity_ah,
-            noise=noise_of(known, volts, prior.residual_v),
-            temperature_source="unknown",
-            range=Ranges(soc_pct=(0.0, 100.0), temperature_c=PRIOR_RANGE_C,
-                         current_a=(-PRIOR_C_RATE * capacity_ah, PRIOR_C_RATE * capacity_ah)),
-            made=Made(by=PRIOR_MADE_BY, options={}, logs=[], fingerprint="prior"),
-        )  # fmt: skip
-
-    @classmethod
-    def load(cls, path: str | PathLike[str]) -> Model:
-        """Read and validate a model file, of this version or version 1.
-
-        Raises
-        ------
-        InputError
-            If the file cannot be read or does not describe a usable model; names the field.
-        """
-        path = as_path(path)
-        data = read_bounded(path, 4 * MIB, "a model file")
-        try:
-            raw = json.loads(data, parse_constant=_refuse_constant)
-            json.dumps(raw, ensure_ascii=False).encode()  # half of a surrogate pair is no text
-        except (ValueError, RecursionError) as error:
-            raise InputError(f"not JSON ({error})", source=path, cure=_CURE) from error
-        if not isinstance(raw, dict) or raw.get("format") != MODEL_FORMAT:
-            raise InputError(
-                "not a cangauge model",
-                source=path,
-                field="format",
-                value=raw.get("format") if isinstance(raw, dict) else type(raw).__name__,
-                cure=_CURE,
-            )
-        if raw.get("version") not in (1, MODEL_VERSION):  # no set: it may be a list
-            raise InputError(
-                f"this release reads versions 1 and {MODEL_VERSION}",
-                source=path,
-                field="version",
-                value=raw.get("version"),
-                cure=_CURE,
-            )
-        try:
-            model = cls.model_validate(upgraded(raw) if raw["version"] == 1 else raw)
-            model.extended_model()
-        except ValidationError as error:
-            raise schema_error(error, cls, path, _CURE) from error
-        except InputError as error:
-            raise InputError(
-                error.problem, source=path, field=error.field, value=error.value, cure=error.cure
-            ) from error
-        return model
-
-    def to_json(self) -> str:
-        """Return the text of the model file."""
-        return json.dumps(self.model_dump(mode="json"), indent=1, allow_nan=False) + "\n"
-
-    def save(self, path: Path | str) -> None:
-        """Write the model file; an existing file is replaced atomically."""
-        write_text_atomic(Path(path), self.to_json())
 
     def predict(
         self, log: Log | Path | str | Any, *, initial_soc_pct: float | None = None
@@ -516,11 +455,132 @@ class Model(_Strict):
         rows = np.arange(len(log))
         return self.extended_model().predict(signals, soc_pct, rows, initial_row=row)
 
+    @classmethod
+    def load(cls, path: str | PathLike[str]) -> Model:
+        """Read and validate a model file, of this version or version 1.
 
-PRIOR_RANGE_C = (-20.0, 50.0)
-"""Temperatures that the prior's cells are specified for, in typical data sheets [°C]."""
-PRIOR_C_RATE = 3.0
-"""Current that they are specified for [1/h]."""
+        Raises
+        ------
+        InputError
+            If the file cannot be read or does not describe a usable model; names the field.
+        """
+        path = as_path(path)
+        data = read_bounded(path, 4 * MIB, "a model file")
+        try:
+            raw = json.loads(data)
+            json.dumps(raw, ensure_ascii=False).encode()  # half of a surrogate pair is no text
+        except (ValueError, RecursionError) as error:
+            raise InputError(f"not JSON ({error})", source=path, cure=_CURE) from error
+        head = raw if isinstance(raw, dict) else {}
+        for field, known, problem in (
+            ("format", ("cangauge-model",), "not a cangauge model"),
+            ("version", (1, 2), "this release reads versions 1 and 2"),
+        ):
+            value = head.get(field)
+            if value not in known:
+                raise InputError(problem, source=path, field=field, value=value, cure=_CURE)
+        try:
+            model = cls.model_validate(upgraded(raw) if raw["version"] == 1 else raw)
+            model.extended_model()
+        except ValidationError as error:
+            raise schema_error(error, cls, path, _CURE) from error
+        except InputError as error:
+            raise InputError(
+                error.problem, source=path, field=error.field, value=error.value, cure=error.cure
+            ) from error
+        return model
+
+    def to_json(self) -> str:
+        """Return the text of the model file."""
+        return json.dumps(self.model_dump(mode="json"), indent=1, allow_nan=False) + "\n"
+
+    def save(self, path: Path | str) -> None:
+        """Write the model file; an existing file is replaced atomically."""
+        write_text_atomic(Path(path), self.to_json())
+
+    @classmethod
+    def of_knots(cls, known: Distribution, judged: Mapping[str, Any], **fields: Any) -> Model:
+        """Return the model of a curve of knots.
+
+        Parameters
+        ----------
+        known : Distribution
+            Prior or posterior; coefficients beyond b are ignored.
+        judged : dict
+            The errors of left-out logs (`Noise`).
+        fields
+            The other fields of `Model`.
+        """
+        n, p = KNOTS_PCT.size, KNOTS_PCT.size + known.arrhenius_ohm.size + 2
+        kt, *ohm, b = known.coefficients[n:p].tolist()
+        r0_ohm = known.arrhenius_ohm
+        loads = usual_loads(fields["capacity_ah"], len(ohm), r0_ohm)
+        return cls(
+            equation="knots",
+            curve=CurveKnots(soc_pct=KNOTS_PCT.tolist(), voltage_v=known.coefficients[:n].tolist()),
+            loads=Loads(
+                t_ref_c=REFERENCE_C,
+                kt_v_per_k=kt,
+                delays_s=list(DELAYS_S),
+                low_pass_s=list(LOW_PASS_S),
+                resistance_ohm=ohm,
+                arrhenius=ArrheniusFields(
+                    factor=b, resistance_ohm=r0_ohm.tolist(), mean_c=known.mean_c
+                ),
+            ),
+            functions=FunctionFields.of(known.covariance[:p, :p], loads),
+            noise=Noise.of(
+                fields["chemistry"], known.mean_v, known.residual_v, judged, known.scale
+            ),
+            **fields,
+        )
+
+    @classmethod
+    def prior(cls, chemistry: ChemistryName, cells: int, capacity_ah: float) -> Model:
+        """Return a model of a pack without logs: the typical cell, with its honest uncertainty.
+
+        Parameters
+        ----------
+        chemistry : {"oxide", "lfp"}
+        cells : int
+            Cells in series.
+        capacity_ah : float
+            [Ah].
+
+        Examples
+        --------
+        >>> Model.prior("oxide", cells=96, capacity_ah=60.0).equation
+        'knots'
+        """
+        typical = CHEMISTRIES[chemistry]
+        half_full_v = cells * float(np.interp(50.0, KNOTS_PCT, typical.curve_v))
+        prior = prior_of(typical, half_full_v, 50.0, capacity_ah)
+        judged = {
+            "voltage_mae_pct": 100.0 * prior.residual_v / half_full_v,
+            "voltage_rmse_v": prior.residual_v,
+            "judged_on": PRIOR_MADE_BY,
+        }
+        most_a = PRIOR_C_RATE * capacity_ah
+        return cls.of_knots(
+            prior,
+            judged,
+            name=f"{cells} {chemistry} cells of {capacity_ah:g} Ah",
+            chemistry=chemistry,
+            cells=cells,
+            capacity_ah=capacity_ah,
+            temperature_source="unknown",
+            range=Ranges(
+                soc_pct=(0.0, 100.0), temperature_c=PRIOR_RANGE_C, current_a=(-most_a, most_a)
+            ),
+            made=Made(by=PRIOR_MADE_BY, options={}, logs=[], fingerprint="prior"),
+        )
+
+
+def _check_shape(field: str, values: Sequence[Any], number: int, *inner: int) -> None:
+    if len(values) != number:
+        raise InputError(f"needs {number} values", field=field, value=len(values))
+    for place, row in enumerate(values) if inner else ():
+        _check_shape(f"{field}.{place}", row, *inner)
 
 
 def as_model(model: Any) -> Model:
@@ -532,111 +592,3 @@ def as_model(model: Any) -> Model:
         cure = "give a Model, the path of its file, or the result of fit"
         raise InputError("not a model", field="model", value=type(model).__name__, cure=cure)
     return found
-
-
-def noise_of(
-    chemistry: Chemistry, volts: float, residual_v: float, *, scale: float = 1.0, **judged: Any
-) -> Noise:
-    """Return the errors of a fitted or prior model.
-
-    Parameters
-    ----------
-    chemistry : Chemistry
-    volts : float
-        Mean voltage V0 [V].
-    residual_v : float
-        Rms residual of the fit [V].
-    scale : float
-        κ² of left-out logs.
-    judged
-        `voltage_mae_pct`, `voltage_rmse_v` and `judged_on`; the residual if left out.
-    """
-    fields: dict[str, Any] = {
-        "voltage_mae_pct": 100.0 * residual_v / volts,
-        "voltage_rmse_v": residual_v,
-        "judged_on": "prior of the chemistry",
-    }
-    return Noise(
-        level_std_v=chemistry.level_std * volts * scale**0.5,
-        slow_std_v=float(np.hypot(chemistry.slow_std * volts, SLOW_SHARE * residual_v)),
-        fast_std_v=float(np.hypot(chemistry.fast_factor * residual_v, FAST_FLOOR * volts)),
-        soc_std_pct=chemistry.soc_std_pct,
-        cold_exponent=chemistry.cold_exponent,
-        residual_std_v=residual_v,
-        left_out_scale=scale,
-        **(fields | judged),
-    )
-
-
-def knots_model(
-    coefficients: FloatArray,
-    covariance: FloatArray,
-    *,
-    arrhenius_ohm: FloatArray,
-    mean_c: float,
-    **fields: Any,
-) -> Model:
-    """Return the model file of fitted or prior coefficients of the curve of knots.
-
-    Parameters
-    ----------
-    coefficients : array of shape (p,)
-        Knots [V], kt [V/K], resistances [Ω], b [-].
-    covariance : array of shape (p, p)
-        Theirs.
-    arrhenius_ohm : array of shape (M,)
-        Resistances that b scales [Ω].
-    mean_c : float
-        Temperature at which the resistances hold [°C].
-    fields
-        The other fields of `Model`.
-    """
-    n = KNOTS_PCT.size
-    kt, *ohm, factor = coefficients[n:].tolist()
-    loads = usual_loads(fields["capacity_ah"], len(ohm), arrhenius_ohm)
-    return Model(
-        equation="knots",
-        curve=CurveKnots(soc_pct=KNOTS_PCT.tolist(), voltage_v=coefficients[:n].tolist()),
-        loads=Loads(
-            t_ref_c=REFERENCE_C,
-            kt_v_per_k=kt,
-            delays_s=list(DELAYS_S),
-            low_pass_s=list(LOW_PASS_S),
-            resistance_ohm=ohm,
-            arrhenius=ArrheniusFields(
-                factor=factor, resistance_ohm=arrhenius_ohm.tolist(), mean_c=mean_c
-            ),
-        ),
-        functions=function_fields(covariance, loads),
-        **fields,
-    )
-
-
-def function_fields(covariance: FloatArray, loads: FloatArray) -> FunctionFields:
-    """Return a covariance in reduced form (`prior.principal_functions`)."""
-    functions = principal_functions(covariance, loads)
-    n = KNOTS_PCT.size
-    return FunctionFields(
-        soc_pct=KNOTS_PCT.tolist(),
-        curve_v=functions[:, :n].tolist(),
-        load=functions[:, n:].tolist(),
-    )
-
-
-def published_names(delays: int) -> list[str]:
-    """Return k0 … k7, kt, R1 … Rn."""
-    return [*BASIS_NAMES, "kt", *(f"R{k}" for k in range(1, delays + 1))]
-
-
-def _check_increasing(values: list[float], name: str) -> None:
-    if any(high <= low for low, high in itertools.pairwise(values)):
-        raise ValueError(f"{name} must increase")
-
-
-def _check_length(values: list[Any], number: int, name: str) -> None:
-    if len(values) != number:
-        raise ValueError(f"{name} needs {number} values, not {len(values)}")
-
-
-def _refuse_constant(name: str) -> float:
-    raise ValueError(f"{name} is not a finite number")

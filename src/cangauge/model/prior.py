@@ -21,7 +21,7 @@ from typing import Final, Literal
 import numpy as np
 
 from cangauge._typing import FloatArray
-from cangauge.model.voltage_model import KNOTS_PCT, VoltageModel, hermite_basis
+from cangauge.model.voltage_model import KNOTS_PCT, REFERENCE_C, VoltageModel, hermite_basis
 
 ChemistryName = Literal["oxide", "lfp"]
 
@@ -160,15 +160,31 @@ lfp
 
 
 @dataclass(frozen=True, eq=False)
-class Prior:
-    """Normal distribution of the coefficients: knots [V], kt [V/K], resistances [Ω], b [-]."""
+class Distribution:
+    """Normal distribution of a pack's coefficients: the prior, or the posterior of its logs.
 
-    mean: FloatArray
+    Parameters
+    ----------
+    coefficients : array of shape (p,)
+        Means: knots [V], kt [V/K], resistances [Ω], b [-].
+    covariance : array of shape (p, p)
+    arrhenius_ohm : array of shape (M,)
+        Resistances R⁰ that b scales [Ω]; negative.
+    residual_v : float
+        Rms residual of the logs' rows, or that expected without logs [V].
+    mean_v, mean_c : float
+        Mean voltage V0 [V] and temperature T̄ [°C] of the logs.
+    scale : float
+        κ²: how much larger than stated the errors of left-out logs are.
+    """
+
+    coefficients: FloatArray
     covariance: FloatArray
-    resistance_ohm: FloatArray
-    """Typical resistances [Ω], negative."""
+    arrhenius_ohm: FloatArray
     residual_v: float
-    """Rms residual before any log [V]."""
+    mean_v: float
+    mean_c: float
+    scale: float = 1.0
 
 
 @lru_cache(maxsize=256)
@@ -193,7 +209,9 @@ def curve_covariance(start: float, chemistry: Chemistry) -> FloatArray:
     return np.asarray(integral @ slope @ integral.T + LEVEL_STD**2 + np.outer(knee, knee) + nugget)
 
 
-def prior_of(chemistry: Chemistry, mean_v: float, mean_soc_pct: float, capacity_ah: float) -> Prior:
+def prior_of(
+    chemistry: Chemistry, mean_v: float, mean_soc_pct: float, capacity_ah: float
+) -> Distribution:
     """Return the prior of a pack's coefficients.
 
     Parameters
@@ -213,7 +231,7 @@ def prior_of(chemistry: Chemistry, mean_v: float, mean_soc_pct: float, capacity_
     covariance[:n, :n] = curve_covariance(start, chemistry) * mean_v**2
     covariance[n:, n:] = np.diag(std**2)
     mean = np.r_[typical, 0.0, -h_mean, B_MEAN]
-    return Prior(mean, covariance, -h_mean, RESIDUAL_STD * mean_v)
+    return Distribution(mean, covariance, -h_mean, RESIDUAL_STD * mean_v, mean_v, REFERENCE_C)
 
 
 def principal_functions(covariance: FloatArray, loads: FloatArray) -> FloatArray:

@@ -21,7 +21,7 @@ from bisect import bisect_right
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -86,94 +86,69 @@ def resistance_factor(temperature_c: ArrayLike) -> FloatArray:
     return np.asarray(np.exp(ACTIVATION_K * colder))
 
 
-class Curve(Protocol):
-    """A pseudo-OCV that rises with SoC [%]."""
-
-    def at(self, soc_pct: float) -> tuple[float, float]:
-        """Return voltage [V] and slope [V per %] at one SoC."""
-
-    def values(self, soc_pct: FloatArray) -> FloatArray:
-        """Return voltages [V] at SoC of shape (n,)."""
-
-    def slopes(self, soc_pct: FloatArray) -> FloatArray:
-        """Return slopes [V per %] at SoC of shape (n,)."""
-
-
 def hermite_slopes(soc_pct: FloatArray, values: FloatArray) -> FloatArray:
     """Return the slopes at knots, by three points, of values of shape (knots,) or (knots, n)."""
     return np.asarray(np.gradient(values, soc_pct, axis=0))
 
 
-def hermite_basis(soc_pct: FloatArray, knots_pct: FloatArray = KNOTS_PCT) -> FloatArray:
-    """Return d g/d values at the knots [-], shape (n, knots), for SoC [%] of shape (n,)."""
-    one = np.eye(knots_pct.size)
-    bend = hermite_slopes(knots_pct, one)
-    left, (of_left, of_left_slope, of_right, of_right_slope), _ = _cubics(knots_pct, soc_pct)
-    basis = of_left_slope[:, None] * bend[left]
-    basis += of_right_slope[:, None] * bend[left + 1]
-    row = np.arange(left.size)
-    basis[row, left] += of_left
-    basis[row, left + 1] += of_right
-    return np.asarray(basis)
-
-
 class _Cubic(NamedTuple):
-    """Knot to the left, and weights of value and slope there and at the knot to the right.
+    """Hermite's cubic between two knots: weights of value and slope at the left, then the right.
 
-    Of one SoC or of many: all members are numbers, or arrays of shape (n,).
+    Of one SoC or of many: members are numbers, or arrays of shape (n,).
     """
 
     left: Any
+    """Index of the left knot."""
     value: tuple[Any, Any, Any, Any]
-    """For the value between them."""
+    """h00, h10, h01, h11: give the curve."""
     slope: tuple[Any, Any, Any, Any]
-    """For the slope there."""
+    """Their derivatives: give its slope."""
 
-    def curve(self, value: Any, slope: Any) -> Any:
-        """Return the curve through values and slopes at the knots."""
-        return self._sum(self.value, value, slope)
-
-    def curve_slope(self, value: Any, slope: Any) -> Any:
-        """Return the slope of that curve."""
-        return self._sum(self.slope, value, slope)
-
-    def _sum(self, weights: tuple[Any, Any, Any, Any], value: Any, slope: Any) -> Any:
-        a, b, c, d = weights
-        at_left = a * value[self.left] + b * slope[self.left]
-        return at_left + c * value[self.left + 1] + d * slope[self.left + 1]
+    def sum(self, weights: tuple[Any, Any, Any, Any], value: Any, slope: Any) -> Any:
+        """Return the weighted sum of values and slopes at the knots."""
+        h00, h10, h01, h11 = weights
+        at_left = h00 * value[self.left] + h10 * slope[self.left]
+        return at_left + h01 * value[self.left + 1] + h11 * slope[self.left + 1]
 
 
-def _cubic(left: Any, width: Any, f: Any, below: Any, above: Any) -> _Cubic:
-    """Return the weights at a fraction f of an interval, or beyond the first and last knot [%]."""
-    back = 1.0 - f
-    turn = 6.0 * f * back / width
+def _cubic(left: Any, h: Any, t: Any, below: Any = 0.0, above: Any = 0.0) -> _Cubic:
+    """Return the cubic at a fraction t of an interval h, or beyond the first and last knot [%]."""
+    back = 1.0 - t
+    h00, h10 = (1.0 + 2.0 * t) * back * back, h * t * back * back
+    h01, h11 = t * t * (3.0 - 2.0 * t), h * t * t * back
+    by_h = 6.0 * t * back / h
     return _Cubic(
         left,
-        (
-            (1.0 + 2.0 * f) * back * back,
-            width * f * back * back + below,
-            f * f * (3.0 - 2.0 * f),
-            above - width * f * f * back,
-        ),
-        (-turn, back * (1.0 - 3.0 * f), turn, f * (3.0 * f - 2.0)),
+        (h00, h10 + below, h01, above - h11),
+        (-by_h, back * (1.0 - 3.0 * t), by_h, t * (3.0 * t - 2.0)),
     )
 
 
 def _cubics(knots: FloatArray, soc_pct: FloatArray) -> _Cubic:
     left = np.clip(np.searchsorted(knots, soc_pct, side="right") - 1, 0, knots.size - 2)
-    width = knots[left + 1] - knots[left]
     inside = np.clip(soc_pct, knots[0], knots[-1])
-    beyond = soc_pct - inside
-    f = (inside - knots[left]) / width
-    return _cubic(left, width, f, np.minimum(beyond, 0.0), np.maximum(beyond, 0.0))
+    h, beyond = knots[left + 1] - knots[left], soc_pct - inside
+    t = (inside - knots[left]) / h
+    return _cubic(left, h, t, np.minimum(beyond, 0.0), np.maximum(beyond, 0.0))
 
 
 def _cubic_at(knots: Sequence[float], soc_pct: float) -> _Cubic:
+    """Return `_cubics` of one SoC, in plain numbers: it is asked for at every step."""
     inside = min(max(soc_pct, knots[0]), knots[-1])
     left = min(bisect_right(knots, inside) - 1, len(knots) - 2)
-    width = knots[left + 1] - knots[left]
-    beyond = soc_pct - inside
-    return _cubic(left, width, (inside - knots[left]) / width, min(beyond, 0.0), max(beyond, 0.0))
+    h, beyond = knots[left + 1] - knots[left], soc_pct - inside
+    return _cubic(left, h, (inside - knots[left]) / h, min(beyond, 0.0), max(beyond, 0.0))
+
+
+def hermite_basis(soc_pct: FloatArray, knots_pct: FloatArray = KNOTS_PCT) -> FloatArray:
+    """Return d g/d values at the knots [-], shape (n, knots), for SoC [%] of shape (n,)."""
+    bend = hermite_slopes(knots_pct, np.eye(knots_pct.size))
+    left, (h00, h10, h01, h11), _ = _cubics(knots_pct, soc_pct)
+    basis = h10[:, None] * bend[left] + h11[:, None] * bend[left + 1]
+    row = np.arange(left.size)
+    basis[row, left] += h00
+    basis[row, left + 1] += h01
+    return np.asarray(basis)
 
 
 @dataclass(frozen=True, eq=False)
@@ -200,9 +175,9 @@ class HermiteCurve:
         secant = np.diff(value) / np.diff(soc_pct)
         flatter = np.minimum(np.r_[secant[0], secant], np.r_[secant, secant[-1]])
         limited = np.clip(slope, FLATTEST_SECANT * flatter, STEEPEST_SECANT * flatter)
-        f = np.array([0.0, 0.25, 0.5, 0.75, 1.0])[:, None]
-        left = np.arange(secant.size)
-        across = _cubic(left, np.diff(soc_pct), f, 0.0, 0.0).curve_slope(value, slope)
+        t = np.array([0.0, 0.25, 0.5, 0.75, 1.0])[:, None]
+        inner = _cubic(np.arange(secant.size), np.diff(soc_pct), t)
+        across = inner.sum(inner.slope, value, slope)
         falls = (across <= 0.0).any(axis=0)
         beside = np.r_[falls, False] | np.r_[False, falls]
         return cls(soc_pct, value, np.where(beside, limited, slope))
@@ -215,15 +190,17 @@ class HermiteCurve:
         """Return voltage [V] and slope [V per %] at one SoC [%]."""
         knots, value, slope = self._lists
         cubic = _cubic_at(knots, soc_pct)
-        return cubic.curve(value, slope), cubic.curve_slope(value, slope)
+        return cubic.sum(cubic.value, value, slope), cubic.sum(cubic.slope, value, slope)
 
     def values(self, soc_pct: FloatArray) -> FloatArray:
         """Return voltages [V] at SoC [%] of shape (n,)."""
-        return np.asarray(_cubics(self.soc_pct, soc_pct).curve(self.value, self.slope))
+        cubics = _cubics(self.soc_pct, soc_pct)
+        return np.asarray(cubics.sum(cubics.value, self.value, self.slope))
 
     def slopes(self, soc_pct: FloatArray) -> FloatArray:
         """Return slopes [V per %] at SoC [%] of shape (n,)."""
-        return np.asarray(_cubics(self.soc_pct, soc_pct).curve_slope(self.value, self.slope))
+        cubics = _cubics(self.soc_pct, soc_pct)
+        return np.asarray(cubics.sum(cubics.slope, self.value, self.slope))
 
 
 @dataclass(frozen=True, eq=False)
@@ -233,16 +210,20 @@ class Functions:
     Parameters
     ----------
     soc_pct : array of shape (knots,)
-    value, slope : array of shape (knots, n)
-        Each function's part in the curve [V], and its slope [V per %].
+    value : array of shape (knots, n)
+        Each function's part in the curve [V].
     load : array of shape (k, n)
         Each function's part in the coefficients of the load columns.
     """
 
     soc_pct: FloatArray
     value: FloatArray
-    slope: FloatArray
     load: FloatArray
+
+    @cached_property
+    def slope(self) -> FloatArray:
+        """Slopes of the parts in the curve [V per %], shape (knots, n)."""
+        return hermite_slopes(self.soc_pct, self.value)
 
     @property
     def number(self) -> int:
@@ -258,8 +239,8 @@ class Functions:
         load : array of shape (k,)
             A row of `VoltageModel.load_columns`.
         """
-        curve = _cubic_at(self.soc_pct.tolist(), soc_pct).curve(self.value, self.slope)
-        return np.asarray(curve + load @ self.load)
+        cubic = _cubic_at(self.soc_pct.tolist(), soc_pct)
+        return np.asarray(cubic.sum(cubic.value, self.value, self.slope) + load @ self.load)
 
 
 def _scaled_soc(soc_pct: ArrayLike, epsilon: float) -> FloatArray:
@@ -269,20 +250,9 @@ def _scaled_soc(soc_pct: ArrayLike, epsilon: float) -> FloatArray:
 
 def ocv_basis(soc_pct: ArrayLike, epsilon: float) -> FloatArray:
     """Return the published pseudo-OCV's columns, shape (n, 8), for SoC [%] of shape (n,)."""
-    s = np.atleast_1d(_scaled_soc(soc_pct, epsilon))
+    s = _scaled_soc(soc_pct, epsilon)
     r = 1.0 / s
-    one = np.ones_like(s)
-    return np.column_stack([one, r, r**2, r**3, r**4, s, np.log(s), np.log1p(-s)])
-
-
-def ocv_basis_slope(soc_pct: ArrayLike, epsilon: float) -> FloatArray:
-    """Return the derivative of `ocv_basis` by SoC [1/%], shape (n, 8)."""
-    s = np.atleast_1d(_scaled_soc(soc_pct, epsilon))
-    r = 1.0 / s
-    zero, one = np.zeros_like(s), np.ones_like(s)
-    powers = [-order * r ** (order + 1) for order in (1, 2, 3, 4)]
-    gain = (1.0 - 2.0 * epsilon) / 100.0
-    return np.column_stack([zero, *powers, one, r, -1.0 / (1.0 - s)]) * gain
+    return np.column_stack([np.ones_like(s), r, r**2, r**3, r**4, s, np.log(s), np.log1p(-s)])
 
 
 @dataclass(frozen=True, eq=False)
@@ -309,8 +279,6 @@ class PublishedCurve:
     soc_range_pct: tuple[float, float] = (0.0, 100.0)
 
     def __post_init__(self) -> None:
-        if len(self.ocv_v) != len(BASIS_NAMES):
-            raise InputError("the pseudo-OCV has 8 coefficients", field="coefficients")
         if not 0.0 < self.epsilon < 0.5:
             raise InputError(
                 "must lie between 0 and 0.5, or the logarithms diverge",
@@ -375,9 +343,18 @@ class PublishedCurve:
     def slopes(self, soc_pct: FloatArray) -> FloatArray:
         """Return slopes [V per %] at SoC [%] of shape (n,)."""
         lo, hi = self.soc_range_pct
-        inside = ocv_basis_slope(np.clip(soc_pct, lo, hi), self.epsilon) @ self.ocv_v
+        s = _scaled_soc(np.clip(soc_pct, lo, hi), self.epsilon)
+        r = 1.0 / s
+        powers = [-order * r ** (order + 1) for order in (1, 2, 3, 4)]
+        zero, one = np.zeros_like(s), np.ones_like(s)
+        by_s = np.column_stack([zero, *powers, one, r, -1.0 / (1.0 - s)])
+        inside = by_s * ((1.0 - 2.0 * self.epsilon) / 100.0) @ self.ocv_v
         low, high = self.beyond
         return np.asarray(np.where(soc_pct < lo, low, np.where(soc_pct > hi, high, inside)))
+
+
+Curve = HermiteCurve | PublishedCurve
+"""A pseudo-OCV that rises with SoC: `at` one SoC, `values` and `slopes` at many."""
 
 
 def past_currents(

@@ -229,7 +229,7 @@ def test_a_reference_that_rises_while_discharging(refused: Callable[..., str]) -
         ({"capacity_a": 50.0}, "capacity_a: unknown key; did you mean capacity_ah?"),
         ({"range": {"soc_pc": [0, 100]}}, "range.soc_pc: unknown key; did you mean soc_pct?"),
         ({"published": {"epsilo": 0.05}}, "published.epsilo: unknown key; did you mean epsilon?"),
-        ({"published": {"delays_s": [70.0, 30.0, 10.0, 0.0]}}, "delays_s must increase"),
+        ({"published": {"delays_s": [70.0, 30.0, 10.0, 0.0]}}, "published.delays_s: must increase"),
         ({"published": {"delays_s": [0.0, 10.0]}}, "coefficients: unknown are R3, R4"),
         ({"capacity_ah": -1}, "capacity_ah: must be at least 0.001 (got -1"),
         ({"name": 3}, "name: must be a valid string (got 3)"),

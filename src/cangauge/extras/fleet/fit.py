@@ -25,13 +25,11 @@ from cangauge.extras.fleet.run import Summary, run_id, run_job
 from cangauge.extras.fleet.sources import FleetLog
 from cangauge.identify.fit import (
     EPSILON,
-    LISTED_LOGS,
+    ROWS_CHANNELS,
     common_name,
     knots_file,
     log_sha256,
-    model_rmse,
     ranges_of,
-    signals_sha256,
 )
 from cangauge.identify.least_squares import (
     LOGS_AT_LEAST,
@@ -48,6 +46,8 @@ from cangauge.model.model_file import Made, Model, Ranges, SourceLog
 from cangauge.model.prior import CHEMISTRIES, DELAYS_S, ChemistryName
 from cangauge.model.voltage_model import REFERENCE_C
 
+LISTED_LOGS: Final = 4096
+"""Source logs that a model file lists; of more, only its options hold the number."""
 _RATE_HZ: Final = 1.0
 """Rate of the rows [Hz], as that of `cangauge fit` by default."""
 _NUMBERS: Final = pa.list_(pa.float64())
@@ -109,7 +109,7 @@ class SumsJob(LogJob):
         return {
             "name": recorded.name,
             "data_sha256": log_sha256(recorded),
-            "signals_sha256": signals_sha256(recorded),
+            "signals_sha256": log_sha256(recorded, ROWS_CHANNELS),
             "temperature_source": recorded.temperature_source,
             "rows": len(rows),
             "row_s": factor.row_s,
@@ -231,12 +231,12 @@ def fit_fleet(job: SumsJob, logs: Sequence[FleetLog], out: str, client: Any) -> 
     sums = [LogSums(_square(r["moments"]), r["weight"], r["mean_soc_pct"]) for r in rows]
     solution, without = solve_scaled(sums, job.capacity_ah, CHEMISTRIES[job.chemistry])
     published = solve_published(pooled([_factor(row) for row in rows]), EPSILON)
-    model = _model(job, rows, solution, published, model_rmse(without, sums))
+    model = _model(job, rows, solution, published, _rmse(without, sums))
     return FleetFit(
         model=model,
         solution=solution,
         published=published,
-        voltage_rmse_v=model_rmse([solution] * len(sums), sums),
+        voltage_rmse_v=_rmse([solution] * len(sums), sums),
         rows=sum(row["rows"] for row in rows),
         logs_used=len(rows),
         summary=summary,
@@ -312,12 +312,17 @@ def _model(
     }
     if published.identified:
         fields["published"] = published.fields(EPSILON, REFERENCE_C, DELAYS_S)
-    model = knots_file(solution, CHEMISTRIES[job.chemistry], fields)
-    noise = model.noise.model_copy(
-        update={
-            "voltage_rmse_v": held_out_v,
-            "voltage_mae_pct": 100.0 * (2.0 / np.pi) ** 0.5 * held_out_v / solution.mean_v,
-            "judged_on": "logs left out in turn",
-        }
-    )
-    return model.model_copy(update={"noise": noise})
+    judged = {
+        "voltage_rmse_v": held_out_v,
+        "voltage_mae_pct": 100.0 * (2.0 / np.pi) ** 0.5 * held_out_v / solution.mean_v,
+        "judged_on": "logs left out in turn",
+    }
+    return knots_file(solution, fields, judged)
+
+
+def _rmse(solutions: Sequence[Solution], sums: Sequence[LogSums]) -> float:
+    """Return the rms error of logs [V], each by a solution, weighted by their time."""
+    weight = sum(item.weight for item in sums)
+    pairs = zip(solutions, sums, strict=True)
+    square = sum(a.square_error(item) * item.weight for a, item in pairs)
+    return float((square / weight) ** 0.5)
