@@ -55,9 +55,11 @@ def get(page: Live, path: str, **options: Any) -> tuple[int, dict[str, str], byt
 
 @pytest.fixture(scope="module")
 def page() -> Iterator[Live]:
-    with closing(Live(dashboard=http_address("127.0.0.1:0", None, {}))) as page:
-        page.on_snapshot(snapshot())
-        yield page
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(launch, "PAUSE_S", (0.05, 60.0))  # a process that ends starts again at once
+        with closing(Live(dashboard=http_address("127.0.0.1:0", None, {}))) as page:
+            page.on_snapshot(snapshot())
+            yield page
 
 
 @pytest.fixture(scope="module")

@@ -276,9 +276,10 @@ def test_is_fast_enough_for_a_search(effect: Effect) -> None:
         time_s, 25.0 + 30.0 * np.sin(time_s / 7.0), np.full(n, 370.0), 20.0 + time_s / 2000.0
     )
     extended = ExtendedModel(MODEL, CAPACITY_AH).with_effect(effect, middle(effect))
-    best = math.inf
-    for _ in range(5):
+
+    def seconds() -> float:
         began = time.perf_counter()
         extended.predict(signals, 100.0, np.arange(0, n, 10))
-        best = min(best, time.perf_counter() - began)
-    assert best < 0.5
+        return time.perf_counter() - began
+
+    assert any(seconds() < 0.5 for _ in range(5))
