@@ -12,7 +12,7 @@ import pytest
 
 import cangauge
 from cangauge.estimation.cells import CellEstimator
-from cangauge.estimation.estimator import Estimator
+from cangauge.estimation.compiled import make_estimator
 from cangauge.logs.log import Log
 from cangauge.model.delay_line import delayed_currents
 from cangauge.model.model_file import Model
@@ -28,7 +28,7 @@ def follow(
     model: Model, rows: Iterator[Sample], cells_v: np.ndarray, first: int = 1
 ) -> tuple[list[CellReport], np.ndarray]:
     """Return the reports of each minute and the cells' SoC at the end [%]."""
-    estimator = Estimator(model)
+    estimator = make_estimator(model)
     cells = CellEstimator(estimator.voltage_model, cells_v.shape[1], first)
     found = []
     for number, sample in enumerate(rows):

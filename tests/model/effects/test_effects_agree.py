@@ -26,6 +26,7 @@ from cangauge.model.effects.library import LIBRARY
 from cangauge.model.extended import ExtendedModel
 from cangauge.model.published import CAPACITY_AH
 from cangauge.model.voltage_model import PublishedCurve, VoltageModel
+from selection import nightly_except
 from synthetic import synthetic_log
 
 each_effect = pytest.mark.parametrize("effect", EFFECTS, ids=lambda effect: effect.id)
@@ -107,7 +108,7 @@ def test_neutral_values_change_nothing(effect: Effect) -> None:
 
 
 @each_effect
-@pytest.mark.parametrize("part", [0.3, 1.0])
+@pytest.mark.parametrize("part", nightly_except((0.3,), (0.3, 1.0)))
 def test_offline_equals_online_on_irregular_samples(effect: Effect, part: float) -> None:
     signals = irregular_signals(seed=int(10 * part) + 3)
     values = {item.name: within(item, part) for item in effect.parameters}
