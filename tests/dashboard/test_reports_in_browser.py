@@ -48,7 +48,7 @@ def browser() -> Iterator[Any]:
 
 
 @pytest.fixture(
-    scope="module", params=nightly_except(("fit", "gap"), ("fit", "estimate", "gap", "inspect"))
+    scope="module", params=nightly_except(("fit",), ("fit", "estimate", "gap", "inspect"))
 )
 def page(reports: Path, browser: Any, request: pytest.FixtureRequest) -> Any:
     """The browser once a report has drawn all its figures."""

@@ -83,16 +83,6 @@ def test_core_compiles_without_a_warning(folders: dict[str, Path], real: str) ->
 
 
 @needs_make
-@pytest.mark.nightly  # `test_no_sample_leaves_the_language` has these sanitizers too
-def test_sanitizers_find_nothing(folders: dict[str, Path]) -> None:
-    flags = [*STRICT, "-g", "-fsanitize=address,undefined", "-fno-sanitize-recover=all"]
-    own = ["pack_model.c", "frames.c", "test.c"]
-    folder = folders["effects"]
-    run(folder, "cc", *flags, "-DCANGAUGE_CONFIG", *CORE_SOURCES, *own, "-lm", "-o", "sanitized")
-    assert "PASSED" in run(folder, "./sanitized")
-
-
-@needs_make
 @pytest.mark.parametrize(
     ("which", "real"),
     nightly_except([("effects", "double")], [("knots", "float"), ("effects", "double")]),

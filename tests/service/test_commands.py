@@ -9,15 +9,10 @@ import time
 import zlib
 from pathlib import Path
 
-import numpy as np
 import pytest
 
-from cangauge.bus.vehicle import Vehicle
-from cangauge.estimation.offline import samples_of
 from cangauge.logs.canonical import write_log
-from cangauge.replay.encoder import FrameEncoder
-from cangauge.service.record import Recorder
-from live import Command, in_process, leaf_model_path, run_to_end, short_log
+from live import Command, in_process, leaf_model_path, short_log
 
 pytestmark = pytest.mark.slow
 
@@ -37,39 +32,6 @@ def log_path(tmp_path: Path) -> Path:
     path = tmp_path / "drive.parquet"
     write_log(short_log(120.0), path)
     return path
-
-
-@pytest.mark.nightly
-def test_a_capture_in_real_time(bus: list[str], tmp_path: Path) -> None:
-    # 2 s of a Leaf's battery, 100 frames a second and some others, not quite regular.
-    capture, again = tmp_path / "drive.log", tmp_path / "again.log"
-    rng = np.random.default_rng(8)
-    vehicle = Vehicle.load("leaf_aze0")
-    encoder = FrameEncoder(vehicle)
-    with Recorder(capture) as recorder:
-        for sample in samples_of(short_log(2.01, rate_hz=100.0)):
-            for frame in encoder.encode(sample):
-                # Within a millisecond, and the last exactly 2 s after the first.
-                late_s = float(rng.uniform(0.0, 0.001)) if 0.0 < sample.time_s < 2.0 else 0.0
-                frame.timestamp = 1.7e9 + sample.time_s + late_s
-                recorder.write(frame)
-    service = Command(
-        "run", *bus, *MODEL, "--vehicle", "leaf_aze0", "--record", again, "--until-idle", "1",
-        "--json",
-    )  # fmt: skip
-    service.wait_for("service.ready")
-    replayed = run_to_end("replay", capture, *bus, "--json")
-    assert replayed.json["seconds"] == pytest.approx(2.0, abs=0.1)
-    result = service.end().json
-    assert result["frames"]["received"] == replayed.json["frames"]
-    assert result["samples"] == 201
-    # As it was, and not only as long as it was.
-    stamps = [
-        np.array([float(stamp) for stamp in re.findall(r"^\(([\d.]+)\)", text, re.MULTILINE)])
-        for text in (capture.read_text(), again.read_text())
-    ]
-    late = (stamps[1] - stamps[1][0]) - (stamps[0] - stamps[0][0])
-    assert np.max(np.abs(late)) < 0.1
 
 
 @pytest.mark.skipif(not hasattr(signal, "SIGHUP"), reason="no SIGHUP on this system")

@@ -6,6 +6,7 @@ import copy
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cache
 
 import can
 import pytest
@@ -30,6 +31,7 @@ SIGNALS: dict[int, VehicleSignal] = {signal.key: signal for signal in VEHICLE.si
 Fault = Callable[[can.Message], None]
 
 
+@cache
 def recorded(seconds: float = 60.0, vehicle: Vehicle = VEHICLE) -> list[can.Message]:
     """Return the frames of a drive, temperature with every sample as from a cyclic sender."""
     log = short_log(seconds)
@@ -102,10 +104,11 @@ def run(frames: list[can.Message], settings: EstimatorSettings = START) -> Resul
 def with_fault(
     frame_id: int, fault: Fault, ends_s: float = ENDS_S, *, seconds: float = 60.0
 ) -> list[can.Message]:
-    frames = recorded(seconds)
-    for frame in frames:
+    frames = list(recorded(seconds))
+    for number, frame in enumerate(frames):
         if frame.arbitration_id == frame_id and BEGINS_S <= frame.timestamp < ends_s:
-            fault(frame)
+            frames[number] = copy.deepcopy(frame)
+            fault(frames[number])
     return frames
 
 
@@ -238,7 +241,7 @@ def test_stuck_voltage_is_found_and_charge_still_counted() -> None:
 
 
 def test_stuck_current_makes_the_estimate_invalid() -> None:
-    frames = recorded(130.0)
+    frames = copy.deepcopy(recorded(130.0))
     for frame in frames:
         if frame.arbitration_id == CURRENT and frame.timestamp >= 60.0:
             with_value(11.0)(frame)

@@ -20,6 +20,7 @@ from live import (
     short_log,
     waits,
 )
+from selection import nightly_except
 
 pytestmark = pytest.mark.slow
 
@@ -107,7 +108,7 @@ def test_a_whole_run(bus: list[str], tmp_path: Path) -> None:
         ('log_level = "loud"', "log_level"),
     ],
 )
-@pytest.mark.parametrize("log_format", ["text", "json"])
+@pytest.mark.parametrize("log_format", nightly_except(("json",), ("text", "json")))
 def test_what_cannot_be_served_is_one_line_and_exit_2(
     bus: list[str],
     folder: Path,
