@@ -146,7 +146,7 @@ def test_nothing_to_look_at_is_refused(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("name", "preset"),
     [
-        ("leaf_can/EV-CANeplus2.log.gz", "leaf_ze1_polled"),
+        pytest.param("leaf_can/EV-CANeplus2.log.gz", "leaf_ze1_polled", marks=pytest.mark.nightly),
         ("leaf_can/62kWh-Battery-only-EVcan.txt.gz", "leaf_ze1"),
         ("leaf_can/10bars.csv.gz", "leaf_ze0"),
         ("can_captures/bmw_i3_battery_only.trc.gz", "bmw_i3"),
@@ -179,12 +179,12 @@ def test_a_live_bus_is_listened_to(mitsubishi: Path, tmp_path: Path) -> None:
     thread = threading.Thread(target=send)
     thread.start()
     try:
-        done = init(*bus, "-o", tmp_path / "car", "--seconds", "3", "--json", *choice)
+        done = init(*bus, "-o", tmp_path / "car", "--seconds", "2", "--json", *choice)
     finally:
         stop.set()
         thread.join()
     assert done.code == 0, done.err
-    assert json.loads(done.out)["proof"]["samples"] > 500
+    assert json.loads(done.out)["proof"]["samples"] > 300
     config = load_config(tmp_path / "car" / "run.toml")
     assert config.interface == "udp_multicast"
     assert config.bus_options == {"port": port}

@@ -157,6 +157,7 @@ def module_model(folder: Path, times: int = 1) -> Model:
     return cangauge.fit(logs, capacity_ah=65.0).model
 
 
+@pytest.mark.nightly
 @pytest.mark.real
 def test_weakest_cells_of_a_real_module(shared_data: Path) -> None:
     model, table = module_model(shared_data), module_rows(shared_data, "1_0c")

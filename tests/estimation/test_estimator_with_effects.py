@@ -8,7 +8,7 @@ from functools import cache
 import numpy as np
 import pytest
 
-from cangauge.estimation.estimator import Estimator
+from cangauge.estimation.compiled import make_estimator
 from cangauge.estimation.offline import estimate_log, samples_of
 from cangauge.estimation.settings import EstimatorSettings
 from cangauge.logs.log import Log
@@ -108,7 +108,7 @@ def test_offset_is_found_with_polarisation_effect() -> None:
         temperature_c=np.append(log.temperature_c[0] * constant, log.temperature_c),
         soc_pct=np.append(START_PCT * constant, log.soc_pct),
     )
-    estimator = Estimator(model, EstimatorSettings(initial_soc_pct=START_PCT))
+    estimator = make_estimator(model, EstimatorSettings(initial_soc_pct=START_PCT))
     for sample, soc_pct in zip(samples_of(log), log.soc_pct, strict=True):
         found = estimator.step(sample)
         assert abs(found.soc_pct - soc_pct) < 2.0 * found.soc_std_pct

@@ -110,7 +110,7 @@ def test_neutral_values_change_nothing(effect: Effect) -> None:
 @each_effect
 @pytest.mark.parametrize("part", nightly_except((0.3,), (0.3, 1.0)))
 def test_offline_equals_online_on_irregular_samples(effect: Effect, part: float) -> None:
-    signals = irregular_signals(seed=int(10 * part) + 3)
+    signals = irregular_signals(1500, seed=int(10 * part) + 3)
     values = {item.name: within(item, part) for item in effect.parameters}
     if effect.id == "resistance_step":
         values["start_s"] = part * 3000.0
