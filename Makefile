@@ -54,6 +54,8 @@ demo: $(VENV)/installed
 # Matrices are small: where every worker's linear algebra has a thread a core, they wait for each other.
 test: export OMP_NUM_THREADS := 1
 test: export OPENBLAS_NUM_THREADS := 1
+# The tests are compiled once, not again in each worker of each run.
+test: export PYTHONDONTWRITEBYTECODE :=
 test: $(VENV)/installed-dev
 	$(BIN)/python -m pytest -n auto --dist loadfile --no-loadscope-reorder
 

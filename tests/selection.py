@@ -9,6 +9,14 @@ import pytest
 
 
 def nightly_except(in_suite: Container[Any], values: Iterable[Any]) -> list[Any]:
-    """Return all values as parameters, marked nightly where they are not of the suite."""
-    marks = {True: (), False: (pytest.mark.nightly,)}
-    return [pytest.param(value, marks=marks[value in in_suite]) for value in values]
+    """Return all values as parameters, marked nightly where they are not of the suite.
+
+    A tuple is a value for each of several names.
+    """
+    return [
+        pytest.param(
+            *(value if isinstance(value, tuple) else (value,)),
+            marks=() if value in in_suite else pytest.mark.nightly,
+        )
+        for value in values
+    ]

@@ -21,21 +21,25 @@ from cangauge.service.config import load_config
 from cangauge.service.setup import load_vehicle
 from drive_captures import CARS, capture
 from live import Ended, in_process
+from selection import nightly_except
 
 
 def init(*arguments: object) -> Ended:
     return in_process("init", *arguments)
 
 
-@pytest.fixture(scope="module")
-def mitsubishi(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    path = tmp_path_factory.mktemp("captures") / "drive.log"
+def write_drive(path: Path, seconds: float) -> Path:
     car = next(each for each in CARS if each.name == "mitsubishi")
     with can.CanutilsLogWriter(path) as writer:
-        for message in capture(car):
+        for message in capture(car, seconds=seconds):
             message.channel = "can0"
             writer.on_message_received(message)
     return path
+
+
+@pytest.fixture(scope="module")
+def mitsubishi(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_drive(tmp_path_factory.mktemp("captures") / "drive.log", 30.0)
 
 
 def test_an_unclear_pair_exits_with_one_and_names_three(mitsubishi: Path, tmp_path: Path) -> None:
@@ -59,7 +63,7 @@ def test_chosen_candidates_make_files_that_decode(mitsubishi: Path, tmp_path: Pa
     result = json.loads(done.out)
     assert result["method"] == "physics"
     assert len(result["candidates"]["current"]) == 3
-    assert result["proof"]["samples"] > 5900
+    assert result["proof"]["samples"] > 2900
     assert result["voltage_levels"] == []  # the stated voltage decides
     log = capture_to_log(mitsubishi, Vehicle.load(map=folder / "car.toml"))
     assert 280.0 < log.voltage_v.min() < log.voltage_v.max() < 350.0
@@ -91,16 +95,18 @@ def test_a_dbc_gives_signals_by_name(mitsubishi: Path, tmp_path: Path) -> None:
     )
 
 
-@pytest.mark.parametrize(("scale", "sign"), [("(0.01,-327.68)", 1), ("(-0.01,327.68)", -1)])
-def test_the_sign_of_a_dbc_s_current_is_proven(
-    mitsubishi: Path, tmp_path: Path, scale: str, sign: int
-) -> None:
+@pytest.mark.parametrize(
+    ("scale", "sign"),
+    nightly_except([("(-0.01,327.68)", -1)], [("(0.01,-327.68)", 1), ("(-0.01,327.68)", -1)]),
+)
+def test_the_sign_of_a_dbc_s_current_is_proven(tmp_path: Path, scale: str, sign: int) -> None:
+    minute = write_drive(tmp_path / "drive.log", 60.0)
     (tmp_path / "car.dbc").write_text(
         'VERSION "1"\nNS_ :\nBS_:\nBU_: V\nBO_ 883 BMS_Status: 8 V\n'
         f' SG_ PackCurrent : 23|16@0+ {scale} [0|0] "A" V\n'
         ' SG_ PackVoltage : 39|16@0+ (0.1,0) [0|0] "V" V\n'
     )
-    done = init(mitsubishi, "--dbc", tmp_path / "car.dbc", "-o", tmp_path / "out")
+    done = init(minute, "--dbc", tmp_path / "car.dbc", "-o", tmp_path / "out")
     assert done.code == 0, done.err
     assert f"The map has sign = {sign}." in done.err
     assert ("positive values charge on this bus" in done.err) == (sign < 0)
@@ -112,7 +118,7 @@ def test_the_sign_of_a_dbc_s_current_is_proven(
     assert "BMS_Status" in table
     assert "PackCurrent" in table
     assert "score" not in table
-    log = capture_to_log(mitsubishi, Vehicle.load(map=tmp_path / "out" / "car.toml"))
+    log = capture_to_log(minute, Vehicle.load(map=tmp_path / "out" / "car.toml"))
     assert sign_of_current(log).sign == 1
 
 
@@ -140,7 +146,7 @@ def test_nothing_to_look_at_is_refused(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("name", "preset"),
     [
-        ("leaf_can/EV-CANeplus2.log.gz", "leaf_ze1_polled"),
+        pytest.param("leaf_can/EV-CANeplus2.log.gz", "leaf_ze1_polled", marks=pytest.mark.nightly),
         ("leaf_can/62kWh-Battery-only-EVcan.txt.gz", "leaf_ze1"),
         ("leaf_can/10bars.csv.gz", "leaf_ze0"),
         ("can_captures/bmw_i3_battery_only.trc.gz", "bmw_i3"),
@@ -173,12 +179,12 @@ def test_a_live_bus_is_listened_to(mitsubishi: Path, tmp_path: Path) -> None:
     thread = threading.Thread(target=send)
     thread.start()
     try:
-        done = init(*bus, "-o", tmp_path / "car", "--seconds", "3", "--json", *choice)
+        done = init(*bus, "-o", tmp_path / "car", "--seconds", "2", "--json", *choice)
     finally:
         stop.set()
         thread.join()
     assert done.code == 0, done.err
-    assert json.loads(done.out)["proof"]["samples"] > 500
+    assert json.loads(done.out)["proof"]["samples"] > 300
     config = load_config(tmp_path / "car" / "run.toml")
     assert config.interface == "udp_multicast"
     assert config.bus_options == {"port": port}

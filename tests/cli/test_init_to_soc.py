@@ -56,8 +56,8 @@ def drive(folder: Path, name: str, *arguments: str) -> None:
 def car(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with captures, and what `init` and `fit` make of them."""
     folder = tmp_path_factory.mktemp("car")
-    drive(folder, "full", "--discharge", "--hours", "1")
-    drive(folder, "trip", "--day", "2", "--hours", "0.25")
+    drive(folder, "full", "--discharge", "--hours", "0.7")
+    drive(folder, "trip", "--day", "2", "--hours", "0.1")
     choice = ("--choose", "current=1", "--choose", "voltage=1", "--nominal-voltage", "420")
     trips, mine = (folder / "trip.log", folder / "full.log"), folder / "mycar"
     cangauge("init", *trips, "--no-presets", "-o", mine, *choice)

@@ -186,23 +186,18 @@ def test_any_value_can_be_told(
     assert (error["source"], error["field"], error["cure"]) == ("x.csv", "a", None)
 
 
-COMMAND = [sys.executable, "-m", "cangauge", "inspect"]
-
-
-def test_a_name_that_is_no_text(tmp_path: Path) -> None:
-    done = subprocess.run(
-        [*COMMAND, os.fsdecode(b"\xff\xe4.csv"), "--json"],
-        capture_output=True, check=False, cwd=tmp_path,
-    )  # fmt: skip
-    assert done.returncode == 2
-    assert strictly(done.stdout.decode("ascii"))["error"]["source"] == "\udcff\udce4.csv"
+def test_a_name_that_is_no_text(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    ended = in_process("inspect", os.fsdecode(b"\xff\xe4.csv"), "--json")
+    assert ended.out.isascii()
+    assert error_of(ended, 2)["source"] == "\udcff\udce4.csv"
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="no /dev/full here")
 def test_the_exit_code_stays_where_nobody_can_read(tmp_path: Path) -> None:
     with Path("/dev/full").open("w") as full:
         done = subprocess.run(
-            [*COMMAND, "none.csv", "--json"],
+            [sys.executable, "-m", "cangauge", "inspect", "none.csv", "--json"],
             stdout=full, stderr=subprocess.PIPE, text=True, check=False, cwd=tmp_path,
         )  # fmt: skip
     assert done.returncode == 2

@@ -19,7 +19,7 @@ Run = Callable[..., object]
 
 def drive(seed: int, start_pct: float, volts: float = 0.0) -> Log:
     log = synthetic_log(
-        hours=0.4, start_pct=start_pct, end_pct=start_pct - 12.0, noise_v=0.5, seed=seed,
+        hours=0.25, start_pct=start_pct, end_pct=start_pct - 8.0, noise_v=0.5, seed=seed,
         name=f"drive {seed}",
     )  # fmt: skip
     return replace(log, voltage_v=log.voltage_v + volts)

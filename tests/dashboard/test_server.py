@@ -19,7 +19,7 @@ from cangauge.bus.open import UNKNOWN_INTERFACE
 from cangauge.bus.vehicle import Vehicle
 from cangauge.errors import InputError
 from cangauge.extras.live import launch
-from cangauge.extras.live.addresses import HttpAddress, http_address
+from cangauge.extras.live.addresses import http_address
 from cangauge.extras.live.launch import Live
 from cangauge.service.pipeline import Pipeline
 from cangauge.service.run import Service
@@ -27,6 +27,8 @@ from cangauge.service.status import Monitor
 from cangauge.service.status_client import Snapshot
 from live import LoggedLines, leaf_model, leaf_model_path, waits
 
+AT_ONCE_S = (0.05, 60.0)
+"""Pauses before a process that has ended is started again [s]."""
 TOKEN = "a-token-of-some-length"  # noqa: S105 - made up
 
 
@@ -55,9 +57,11 @@ def get(page: Live, path: str, **options: Any) -> tuple[int, dict[str, str], byt
 
 @pytest.fixture(scope="module")
 def page() -> Iterator[Live]:
-    with closing(Live(dashboard=http_address("127.0.0.1:0", None, {}))) as page:
-        page.on_snapshot(snapshot())
-        yield page
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(launch, "PAUSE_S", AT_ONCE_S)
+        with closing(Live(dashboard=http_address("127.0.0.1:0", None, {}))) as page:
+            page.on_snapshot(snapshot())
+            yield page
 
 
 @pytest.fixture(scope="module")
@@ -65,9 +69,11 @@ def guarded(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Live]:
     file = tmp_path_factory.mktemp("token") / "token"
     file.write_text(TOKEN)
     file.chmod(0o600)
-    with closing(Live(dashboard=http_address("127.0.0.1:0", file, {}))) as page:
-        page.on_snapshot(snapshot())
-        yield page
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(launch, "PAUSE_S", AT_ONCE_S)
+        with closing(Live(dashboard=http_address("127.0.0.1:0", file, {}))) as page:
+            page.on_snapshot(snapshot())
+            yield page
 
 
 def test_the_latest_status_is_served(page: Live) -> None:
@@ -182,21 +188,33 @@ def test_the_browser_is_asked_for_the_token(guarded: Live) -> None:
     assert get(guarded, "/rows", headers={"Cookie": cookie.split(";")[0]})[0] == 200
 
 
-def test_the_cookie_outlives_a_restart_and_the_process_ends_with_the_service(
-    guarded: Live,
-) -> None:
+def restarted(page: Live, number: int) -> bool:
+    """Send the process a signal; return whether another takes its place."""
+    before = page.pid
+    assert before is not None
+    os.kill(before, number)
+    return waits(lambda: page.pid not in {None, before})
+
+
+def test_a_process_that_dies_is_started_again_and_the_cookie_holds(guarded: Live) -> None:
     form = {"Content-Type": "application/x-www-form-urlencoded"}
     _, headers, _ = get(guarded, "/enter", method="POST", body=f"token={TOKEN}", headers=form)
     cookie = headers["Set-Cookie"].split(";")[0]
-    again = HttpAddress("127.0.0.1", 0, TOKEN)
-    with closing(Live(dashboard=again)) as other:
-        assert get(other, "/rows", headers={"Cookie": cookie})[0] == 200
-        process = other.pid
+    with LoggedLines("cangauge.extras.live") as lines:
+        assert restarted(guarded, signal.SIGKILL)
+        assert get(guarded, "/rows", headers={"Cookie": cookie})[0] == 200  # the port is the same
+        assert "ended by itself" in guarded.trouble
+    assert sum("has ended" in line for line in lines.lines) == 1
+
+
+def test_the_process_ends_with_the_service(guarded: Live) -> None:
+    process = guarded.pid
     assert process is not None
+    guarded.close()
     with pytest.raises(ProcessLookupError):
         os.kill(process, 0)
     with pytest.raises(OSError, match="refused"):
-        socket.create_connection(("127.0.0.1", other.port), 1.0)
+        socket.create_connection(("127.0.0.1", guarded.port), 1.0)
 
 
 def test_an_address_in_use_is_refused(page: Live) -> None:
@@ -213,27 +231,18 @@ def test_beyond_loopback_needs_a_token(monkeypatch: pytest.MonkeyPatch) -> None:
         service.run()
 
 
-def test_a_process_that_dies_or_hangs_is_started_again(
-    page: Live, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_process_that_hangs_is_started_again(page: Live, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert get(page, "/rows")[0] == 200
+    before = page.pid
+    assert before is not None
+    monkeypatch.setattr(launch, "SILENT_S", 1.0)
+    os.kill(before, signal.SIGSTOP)
+    assert waits(lambda: "answer" in page.trouble, 20.0)
     monkeypatch.setattr(launch, "SILENT_S", 300.0)  # a busy machine is no reason
-    with LoggedLines("cangauge.extras.live") as lines:
-        page.on_snapshot(snapshot())
-        for number, words in ((signal.SIGKILL, "ended by itself"), (signal.SIGSTOP, "answer")):
-            assert get(page, "/rows")[0] == 200
-            assert page.pid is not None
-            before = page.pid
-            os.kill(before, number)
-            if number == signal.SIGSTOP:
-                monkeypatch.setattr(launch, "SILENT_S", 1.0)
-                assert waits(lambda: "answer" in page.trouble, 20.0)
-                monkeypatch.setattr(launch, "SILENT_S", 300.0)
-            assert waits(lambda before=before: page.pid not in {None, before}, 60.0)
-            page.on_snapshot(snapshot())
-            assert get(page, "/rows")[0] == 200  # the port is the same
-            assert words in page.trouble
-        assert sum("has ended" in line for line in lines.lines) == 2
-        assert "(2 so far)" in page.trouble
+    assert waits(lambda: page.pid not in {None, before})
+    page.on_snapshot(snapshot())
+    assert get(page, "/rows")[0] == 200
+    assert "so far)" in page.trouble
 
 
 def test_a_process_that_grows_is_ended(page: Live, monkeypatch: pytest.MonkeyPatch) -> None:

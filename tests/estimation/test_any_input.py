@@ -18,6 +18,7 @@ from cangauge.model.model_file import Model
 from cangauge.model.published import leaf_2012_model_file
 from cangauge.types import Estimate, Reason, Sample, Status
 from estimation.test_snapshot import extended_by
+from selection import nightly_except
 
 PLAIN = leaf_2012_model_file()
 TOGETHER = [
@@ -99,11 +100,17 @@ def run(model: Model, chosen: EstimatorSettings, samples: list[Sample]) -> None:
     again.restore(EstimatorState.model_validate(estimator.snapshot().model_dump(mode="json")))
 
 
+METHODS = ("ekf", "newton", "coulomb")
 RULES = {"full_charge": FullCharge(380.0, 10.0, 2.0), "long_rest": LongRest(60.0)}
 
 
-@pytest.mark.parametrize("method", ["ekf", "newton", "coulomb"])
-@pytest.mark.parametrize("which", ["plain", "together"])
+@pytest.mark.parametrize(
+    ("which", "method"),
+    nightly_except(
+        [("together", "ekf"), ("plain", "newton"), ("plain", "coulomb")],
+        [(which, method) for which in ("plain", "together") for method in METHODS],
+    ),
+)
 @settings(suppress_health_check=list(HealthCheck))
 @given(drawn=inputs, with_rules=st.booleans(), start=st.sampled_from([None, 0.0, 50.0, 100.0]))
 def test_estimates_stay_bounded_for_any_input(
@@ -115,6 +122,7 @@ def test_estimates_stay_bounded_for_any_input(
     run(MODELS[which], chosen, samples_of_rows(drawn))
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize("effect_id", LIBRARY)
 @settings(max_examples=4, suppress_health_check=list(HealthCheck))
 @given(drawn=inputs)
@@ -129,7 +137,9 @@ def test_estimates_stay_bounded_for_extreme_numbers(which: str, drawn: Any) -> N
     run(MODELS[which], EstimatorSettings(), [Sample(*row) for row in drawn])
 
 
-@pytest.mark.parametrize("zero", ["fast_std_v", "slow_std_v", "level_std_v", "all"])
+@pytest.mark.parametrize(
+    "zero", nightly_except(("all",), ("fast_std_v", "slow_std_v", "level_std_v", "all"))
+)
 def test_model_without_noise_is_accepted(zero: str) -> None:
     raw = PLAIN.model_dump()
     names = ["fast_std_v", "slow_std_v", "level_std_v"] if zero == "all" else [zero]
@@ -140,8 +150,13 @@ def test_model_without_noise_is_accepted(zero: str) -> None:
     run(model, EstimatorSettings(initial_soc_pct=50.0, initial_soc_std_pct=0.0), samples)
 
 
-@pytest.mark.parametrize("which", ["plain", "time_skew", "together"])
-@pytest.mark.parametrize("method", ["ekf", "newton", "coulomb"])
+@pytest.mark.parametrize(
+    ("which", "method"),
+    nightly_except(
+        [("plain", "coulomb"), ("time_skew", "newton"), ("together", "ekf")],
+        [(which, method) for which in ("plain", "time_skew", "together") for method in METHODS],
+    ),
+)
 @settings(suppress_health_check=list(HealthCheck))
 @given(drawn=inputs, asked_every=st.sampled_from([2, 3, 17]))
 def test_reading_the_estimate_changes_nothing(

@@ -12,7 +12,7 @@ import pytest
 
 import cangauge
 from cangauge.estimation.cells import CellEstimator
-from cangauge.estimation.estimator import Estimator
+from cangauge.estimation.compiled import make_estimator
 from cangauge.logs.log import Log
 from cangauge.model.delay_line import delayed_currents
 from cangauge.model.model_file import Model
@@ -28,7 +28,7 @@ def follow(
     model: Model, rows: Iterator[Sample], cells_v: np.ndarray, first: int = 1
 ) -> tuple[list[CellReport], np.ndarray]:
     """Return the reports of each minute and the cells' SoC at the end [%]."""
-    estimator = Estimator(model)
+    estimator = make_estimator(model)
     cells = CellEstimator(estimator.voltage_model, cells_v.shape[1], first)
     found = []
     for number, sample in enumerate(rows):
@@ -157,6 +157,7 @@ def module_model(folder: Path, times: int = 1) -> Model:
     return cangauge.fit(logs, capacity_ah=65.0).model
 
 
+@pytest.mark.nightly
 @pytest.mark.real
 def test_weakest_cells_of_a_real_module(shared_data: Path) -> None:
     model, table = module_model(shared_data), module_rows(shared_data, "1_0c")

@@ -22,8 +22,9 @@ from cangauge.estimation.settings import EstimatorSettings
 from cangauge.model.effects.library import LIBRARY
 from cangauge.model.model_file import Model
 from cangauge.types import Sample
-from estimation.test_any_input import MODELS, RULES, inputs, samples_of_rows
+from estimation.test_any_input import METHODS, MODELS, RULES, inputs, samples_of_rows
 from estimation.test_snapshot import eventful_samples
+from selection import nightly_except
 
 core = pytest.importorskip("cangauge._core", reason="the extension was not built: no C compiler")
 
@@ -104,8 +105,13 @@ def test_failed_build_leaves_no_earlier_extension(
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize("method", ["ekf", "newton", "coulomb"])
-@pytest.mark.parametrize("which", ["plain", "together"])
+@pytest.mark.parametrize(
+    ("which", "method"),
+    nightly_except(
+        [("together", "ekf"), ("plain", "newton"), ("plain", "coulomb")],
+        [(which, method) for which in ("plain", "together") for method in METHODS],
+    ),
+)
 @settings(max_examples=8, suppress_health_check=list(HealthCheck))
 @given(drawn=inputs, with_rules=st.booleans(), start=STARTS)
 def test_any_input_gives_the_same_numbers(

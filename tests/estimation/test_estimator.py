@@ -12,6 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from cangauge.errors import InputError
+from cangauge.estimation.compiled import make_estimator
 from cangauge.estimation.counting import CoulombCounter
 from cangauge.estimation.estimator import Estimator
 from cangauge.estimation.offline import estimate, estimate_log, run_estimator, samples_of
@@ -125,7 +126,7 @@ def test_filter_learns_the_current_offset(model: Model) -> None:
 
 def test_offset_is_found_once_the_pack_is_charged_too(model: Model) -> None:
     """While it is only discharged, another capacity would give the same voltages."""
-    estimator = Estimator(model, EstimatorSettings(initial_soc_pct=80.0))
+    estimator = make_estimator(model, EstimatorSettings(initial_soc_pct=80.0))
     drives = [(80.0, 30.0, 1), (30.0, 80.0, 2), (80.0, 30.0, 3), (30.0, 80.0, 4)]
     for k, (start_pct, end_pct, seed) in enumerate(drives):
         log = synthetic_log(start_pct=start_pct, end_pct=end_pct, noise_v=0.5, seed=seed, hours=1.0)

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
 
-from cangauge.estimation.estimator import Estimator
+from cangauge.estimation.compiled import make_estimator
 from cangauge.estimation.offline import estimate_log, samples_of
 from cangauge.estimation.settings import EstimatorSettings
 from cangauge.logs.log import Log
@@ -15,11 +16,16 @@ from cangauge.model.effects.base import Effect, Pack, Signals
 from cangauge.model.effects.library import LIBRARY, effect_entries
 from cangauge.model.model_file import Model
 from cangauge.model.published import CAPACITY_AH, leaf_2012_model, leaf_2012_model_file
+from selection import nightly_except
 from synthetic import synthetic_log
 
 START_PCT = 90.0
 PACK = Pack.of(leaf_2012_model(), CAPACITY_AH)
-each_effect = pytest.mark.parametrize("effect", LIBRARY.values(), ids=lambda effect: effect.id)
+IN_SUITE = (
+    "current_gain", "voltage_gain", "resistance_temperature", "slow_diffusion", "hysteresis",
+    "weak_cell",
+)  # fmt: skip
+"""An effect of each way to act; the others run in `make nightly`."""
 
 
 def upper_half(effect: Effect) -> dict[str, float]:
@@ -32,8 +38,10 @@ def upper_half(effect: Effect) -> dict[str, float]:
     return values | ({"skew_s": 0.7} if effect.id == "time_skew" else {})
 
 
-def log_and_model(effect: Effect) -> tuple[Log, Model]:
+@cache
+def log_and_model(effect_id: str) -> tuple[Log, Model]:
     """A log that only the effect explains, and the published model with the effect."""
+    effect = LIBRARY[effect_id]
     values = upper_half(effect)
     plain = leaf_2012_model_file()
     wide = {"soc_pct": (0.0, 100.0), "temperature_c": (-30.0, 60.0), "current_a": (-300.0, 300.0)}
@@ -50,37 +58,37 @@ def log_and_model(effect: Effect) -> tuple[Log, Model]:
     ), model
 
 
-@each_effect
-def test_online_voltage_equals_offline_voltage(effect: Effect) -> None:
-    log, model = log_and_model(effect)
+@pytest.mark.parametrize("effect_id", LIBRARY)
+def test_online_voltage_equals_offline_voltage(effect_id: str) -> None:
+    log, model = log_and_model(effect_id)
     table, _ = estimate_log(
         log, model, EstimatorSettings(method="coulomb", initial_soc_pct=START_PCT)
     )
     known = np.isfinite(table.residual_v)
     assert np.all(known[10:])
     assert np.abs(table.residual_v[known]).max() < 1e-6
-    late = 2 if effect.id == "time_skew" else 0
+    late = 2 if effect_id == "time_skew" else 0
     np.testing.assert_allclose(
         table.soc_coulomb_pct[late:], log.soc_pct[: len(log) - late], atol=1e-7
     )
 
 
-@each_effect
-def test_effect_improves_soc_over_plain_model(effect: Effect) -> None:
-    log, model = log_and_model(effect)
+@pytest.mark.parametrize("effect_id", nightly_except(IN_SUITE, LIBRARY))
+def test_effect_improves_soc_over_plain_model(effect_id: str) -> None:
+    log, model = log_and_model(effect_id)
     plain = Model.model_validate(model.model_dump() | {"effects": []})
     settings = EstimatorSettings(initial_soc_pct=START_PCT)
     extended = estimate_log(log, model, settings)[1]
     missed = estimate_log(log, plain, settings)[1]
     assert extended.soc_mae_pct < 0.05
     # With a skew, estimates are a sample or two late: 0.03 % here, as much as the effect costs.
-    assert extended.soc_mae_pct < 0.5 * missed.soc_mae_pct or effect.id == "time_skew"
+    assert extended.soc_mae_pct < 0.5 * missed.soc_mae_pct or effect_id == "time_skew"
     assert extended.voltage_mae_pct < missed.voltage_mae_pct
 
 
 def test_offset_is_found_with_polarisation_effect() -> None:
     """After a rest, as what currents before the log left in the effect is not known."""
-    log, model = log_and_model(LIBRARY["slow_diffusion"])
+    log, model = log_and_model("slow_diffusion")
     rest_s = np.arange(-3600.0, 0.0, 2.0)
     constant = np.ones(rest_s.size)
     rest_v = (
@@ -100,7 +108,7 @@ def test_offset_is_found_with_polarisation_effect() -> None:
         temperature_c=np.append(log.temperature_c[0] * constant, log.temperature_c),
         soc_pct=np.append(START_PCT * constant, log.soc_pct),
     )
-    estimator = Estimator(model, EstimatorSettings(initial_soc_pct=START_PCT))
+    estimator = make_estimator(model, EstimatorSettings(initial_soc_pct=START_PCT))
     for sample, soc_pct in zip(samples_of(log), log.soc_pct, strict=True):
         found = estimator.step(sample)
         assert abs(found.soc_pct - soc_pct) < 2.0 * found.soc_std_pct

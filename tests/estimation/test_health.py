@@ -8,7 +8,7 @@ from functools import cache
 import numpy as np
 import pytest
 
-from cangauge.estimation.estimator import Estimator
+from cangauge.estimation.compiled import make_estimator
 from cangauge.estimation.settings import EstimatorSettings
 from cangauge.model.delay_line import delayed_currents
 from cangauge.model.model_file import Model
@@ -79,7 +79,7 @@ def settings(wrong: float, **more: object) -> EstimatorSettings:
 @cache
 def learned(seed: int, wrong: float, *, offset_a: float = 0.0, resistance: float = 1.0) -> Health:
     """Return the health at the end, of an estimator whose capacity is wrong by a factor."""
-    estimator = Estimator(MODEL, settings(wrong))
+    estimator = make_estimator(MODEL, settings(wrong))
     for sample in samples_of_pack(seed, offset_a=offset_a, resistance=resistance):
         estimator.update(sample)
     return estimator.health
@@ -93,7 +93,7 @@ def apart(health: Health) -> tuple[float, float]:
 
 @pytest.mark.parametrize("wrong", [1.0, 1.05, 1.1])
 def test_three_charges_correct_a_wrong_capacity(wrong: float) -> None:
-    first = Estimator(MODEL, settings(wrong)).health
+    first = make_estimator(MODEL, settings(wrong)).health
     assert first.capacity_ah == pytest.approx(wrong * CAPACITY_AH)
     assert first.capacity_std_ah == pytest.approx(0.1 * wrong * CAPACITY_AH)
     last = learned(1, wrong)
@@ -117,21 +117,21 @@ def test_resistance_is_found_within_its_deviation(resistance: float) -> None:
 
 
 def test_nothing_is_learned_without_charge_or_voltage() -> None:
-    resting = Estimator(MODEL)
+    resting = make_estimator(MODEL)
     for second in range(1200):
         resting.update(Sample(float(second), 0.0, 380.0, 23.0))
     assert resting.health.capacity_ah == pytest.approx(CAPACITY_AH, rel=1e-3)
     assert resting.health.capacity_std_ah == pytest.approx(0.1 * CAPACITY_AH, rel=1e-3)
-    silent = Estimator(MODEL, EstimatorSettings(initial_soc_pct=80.0))
+    silent = make_estimator(MODEL, EstimatorSettings(initial_soc_pct=80.0))
     for second in range(1200):
         silent.update(Sample(float(second), 60.0, math.nan, 23.0))
-    assert silent.health == Estimator(MODEL).health
+    assert silent.health == make_estimator(MODEL).health
 
 
 @pytest.mark.parametrize("wrong", [1.05, 1.1])
 def test_deviation_of_the_soc_covers_a_wrong_capacity(wrong: float) -> None:
     """Three charges counted with another capacity: σ says how far that may be off."""
-    estimator = Estimator(MODEL, settings(wrong))
+    estimator = make_estimator(MODEL, settings(wrong))
     moved_pct, errors, covered = 0.0, [], []
     samples = samples_of_pack(1)
     for before, sample in zip([samples[0], *samples], samples, strict=False):
@@ -146,10 +146,10 @@ def test_deviation_of_the_soc_covers_a_wrong_capacity(wrong: float) -> None:
 
 
 def test_learned_capacity_survives_another_model_and_setting() -> None:
-    before = Estimator(MODEL, settings(1.1))
+    before = make_estimator(MODEL, settings(1.1))
     for sample in samples_of_pack(1):
         before.update(sample)
-    after = Estimator(model_with_noise(0.5), settings(1.0))
+    after = make_estimator(model_with_noise(0.5), settings(1.0))
     after.take_over(before)
     assert after.health.capacity_ah == pytest.approx(before.health.capacity_ah, rel=1e-9)
     assert after.health.capacity_std_ah == pytest.approx(before.health.capacity_std_ah, rel=0.02)

@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 from cangauge.errors import InputError
-from cangauge.estimation.estimator import Estimator, EstimatorSettings
+from cangauge.estimation.compiled import make_estimator
+from cangauge.estimation.estimator import EstimatorSettings
 from cangauge.estimation.offline import samples_of
 from cangauge.estimation.power import PackLimits
 from cangauge.identify.fit import fit
@@ -32,7 +33,7 @@ MOMENTS = range(400, 7000, 450)
 @cache
 def powers() -> dict[int, Power]:
     """Return the power at some rows of the drive."""
-    estimator = Estimator(leaf_2012_model_file(), EstimatorSettings(limits=LIMITS))
+    estimator = make_estimator(leaf_2012_model_file(), EstimatorSettings(limits=LIMITS))
     found = {}
     for row, sample in enumerate(samples_of(LOG)):
         estimator.update(sample)
@@ -82,7 +83,7 @@ def test_energy_left_is_the_energy_of_a_discharge() -> None:
 def test_a_pulse_just_before_lowers_what_is_possible() -> None:
     estimators = []
     for pulse_a in (0.0, 150.0):
-        estimator = Estimator(leaf_2012_model_file(), EstimatorSettings(limits=LIMITS))
+        estimator = make_estimator(leaf_2012_model_file(), EstimatorSettings(limits=LIMITS))
         current = np.where((np.arange(200) >= 160) & (np.arange(200) < 190), pulse_a, 0.0)
         rows = np.arange(200.0)
         drops = delayed_currents(rows, current, PACK.delay_s, rows) @ PACK.resistance_ohm
@@ -97,7 +98,7 @@ def test_a_pulse_just_before_lowers_what_is_possible() -> None:
 
 def test_current_limits_hold_with_a_smaller_deviation() -> None:
     low = PackLimits(335.0, 400.0, max_discharge_a=100.0, max_charge_a=0.0)
-    estimator = Estimator(leaf_2012_model_file(), EstimatorSettings(limits=low))
+    estimator = make_estimator(leaf_2012_model_file(), EstimatorSettings(limits=low))
     for sample in samples_of(LOG.rows(slice(0, 600))):
         estimator.update(sample)
     power = estimator.power()
@@ -125,11 +126,13 @@ def test_impossible_limits_are_refused(limits: dict[str, float]) -> None:
 
 def test_a_limit_beyond_the_models_other_end_is_refused() -> None:
     with pytest.raises(InputError, match="limits"):
-        Estimator(leaf_2012_model_file(), EstimatorSettings(limits=PackLimits(max_voltage_v=10.0)))
+        make_estimator(
+            leaf_2012_model_file(), EstimatorSettings(limits=PackLimits(max_voltage_v=10.0))
+        )
 
 
 def test_nothing_is_possible_to_say_before_the_soc() -> None:
-    estimator = Estimator(leaf_2012_model_file())
+    estimator = make_estimator(leaf_2012_model_file())
     assert all(math.isnan(each) for each in estimator.power())
     estimator.update(Sample(0.0, 10.0, math.nan, 23.0))
     assert all(math.isnan(each) for each in estimator.power())
@@ -142,7 +145,7 @@ def test_a_voltage_that_rises_with_the_current_limits_nothing(is_constant: bool)
     for name, more_ohm in (("R1", 0.9), ("R4", -0.9)):
         data["published"]["coefficients"][name]["value"] += more_ohm
     model = Model.model_validate(data)
-    estimator = Estimator(model, EstimatorSettings(limits=LIMITS))
+    estimator = make_estimator(model, EstimatorSettings(limits=LIMITS))
     rows = LOG.rows(slice(0, 600))
     if is_constant:
         drop_v = 20.0 * sum(PACK.resistance_ohm)
@@ -161,7 +164,7 @@ def test_energy_ends_at_the_stated_soc() -> None:
     found = []
     for cutoff in (0.0, 20.0, 100.0):
         limits = PackLimits(cutoff_soc_pct=cutoff)
-        estimator = Estimator(leaf_2012_model_file(), EstimatorSettings(limits=limits))
+        estimator = make_estimator(leaf_2012_model_file(), EstimatorSettings(limits=limits))
         for sample in samples_of(log):
             estimator.update(sample)
         found.append(estimator.power().energy_wh)
@@ -174,7 +177,7 @@ def test_the_possible_current_does_not_contradict_the_logs() -> None:
     model = fit(log, capacity_ah=CAPACITY_AH, effects="none").model
     mean_a = np.convolve(log.current_a, np.full(10, 0.1), mode="valid")[1:]
     heaviest = 1200 + int(np.argmax(mean_a[1200:]))
-    estimator = Estimator(model, EstimatorSettings(initial_soc_pct=84.0))
+    estimator = make_estimator(model, EstimatorSettings(initial_soc_pct=84.0))
     for sample in samples_of(log.rows(slice(0, heaviest + 1))):
         estimator.update(sample)
     power = estimator.power()

@@ -9,12 +9,14 @@ from typing import Any
 import pytest
 
 from cangauge.errors import InputError
+from cangauge.estimation.compiled import make_estimator
 from cangauge.estimation.counting import SET_BACK_SAMPLES, moved_probability
 from cangauge.estimation.estimator import Estimator
 from cangauge.estimation.offline import samples_of
 from cangauge.estimation.settings import EstimatorSettings, FullCharge, LongRest
 from cangauge.model.published import leaf_2012_model, leaf_2012_model_file
 from cangauge.types import Estimate, Reason, Sample, Status
+from selection import nightly_except
 from synthetic import synthetic_log
 
 MODEL = leaf_2012_model_file()
@@ -34,7 +36,7 @@ def after_interval(
     hours: float, before_pct: float, after_pct: float, *, bias_v: float = 0.0, seed: int = 3
 ) -> tuple[Estimate, list[Estimate], Estimator]:
     """Return the last estimate before an unobserved interval, those after it, and the estimator."""
-    estimator = Estimator(MODEL, EstimatorSettings(initial_soc_pct=before_pct + 3.0))
+    estimator = make_estimator(MODEL, EstimatorSettings(initial_soc_pct=before_pct + 3.0))
     for sample in drive(before_pct + 3.0, before_pct, 0.0, seed=seed):
         last = estimator.step(sample)
     begin_s = last.time_s + 3600.0 * hours
@@ -50,8 +52,13 @@ def errors(found: list[Estimate], after_pct: float) -> list[float]:
     return [each.soc_pct - true for each, true in zip(found, truth.tolist(), strict=True)]
 
 
-@pytest.mark.parametrize("hours", [0.03, 0.5, 8.0, 24.0])
-@pytest.mark.parametrize("bias_v", [0.0, -1.0, 1.0])
+@pytest.mark.parametrize(
+    ("hours", "bias_v"),
+    nightly_except(
+        [(0.03, 1.0), (8.0, -1.0)],
+        [(hours, bias_v) for hours in (0.03, 0.5, 8.0, 24.0) for bias_v in (0.0, -1.0, 1.0)],
+    ),
+)
 def test_parked_soc_stays_despite_biased_voltage(hours: float, bias_v: float) -> None:
     # 1 V is nearly 3 % SoC here; the standard deviation of the model's errors is 0.95 V.
     last, found, _ = after_interval(hours, 60.0, 60.0, bias_v=bias_v)
@@ -67,8 +74,11 @@ def test_parked_soc_stays_despite_biased_voltage(hours: float, bias_v: float) ->
 
 @pytest.mark.parametrize(
     ("hours", "before_pct", "after_pct"),
-    [(8.0, 30.0, 90.0), (8.0, 30.0, 60.0), (8.0, 30.0, 42.0), (0.35, 20.0, 70.0),
-     (24.0, 80.0, 20.0), (0.1, 40.0, 50.0)],
+    nightly_except(
+        [(8.0, 30.0, 42.0), (24.0, 80.0, 20.0), (0.1, 40.0, 50.0)],
+        [(8.0, 30.0, 90.0), (8.0, 30.0, 60.0), (8.0, 30.0, 42.0), (0.35, 20.0, 70.0),
+         (24.0, 80.0, 20.0), (0.1, 40.0, 50.0)],
+    ),
 )  # fmt: skip
 def test_unobserved_charge_is_found_within_minutes(
     hours: float, before_pct: float, after_pct: float
@@ -94,7 +104,7 @@ def test_small_unobserved_charge_stays_within_uncertainty() -> None:
 
 def test_offset_does_not_accumulate_while_unobserved() -> None:
     """An offset of 1 A counted over 10 h would be 19 % of the capacity."""
-    estimator = Estimator(MODEL, EstimatorSettings(initial_soc_pct=95.0))
+    estimator = make_estimator(MODEL, EstimatorSettings(initial_soc_pct=95.0))
     samples = drive(95.0, 45.0, 0.0, hours=2.0)
     for sample in samples:
         last = estimator.step(sample._replace(current_a=sample.current_a + 1.0))
@@ -104,7 +114,7 @@ def test_offset_does_not_accumulate_while_unobserved() -> None:
 
 
 def test_many_unobserved_intervals_keep_the_soc() -> None:
-    estimator = Estimator(MODEL, EstimatorSettings(initial_soc_pct=70.0))
+    estimator = make_estimator(MODEL, EstimatorSettings(initial_soc_pct=70.0))
     time_s = 0.0
     for number in range(30):
         for sample in drive(70.0, 69.9, time_s, hours=0.02, seed=number):
@@ -119,7 +129,7 @@ def test_many_unobserved_intervals_keep_the_soc() -> None:
 
 def test_swinging_voltage_is_a_mismatch_and_passes() -> None:
     """A loose wire: the voltage swings widely around a wrong mean."""
-    estimator = Estimator(MODEL, EstimatorSettings(initial_soc_pct=60.0))
+    estimator = make_estimator(MODEL, EstimatorSettings(initial_soc_pct=60.0))
     for sample in drive(60.0, 58.0, 0.0):
         last = estimator.step(sample)
     assert last.soc_std_pct < 2.0
@@ -147,7 +157,7 @@ def test_invalid_covariance_restarts_the_filter() -> None:
 
 
 def test_single_outlier_after_interval_is_no_contradiction() -> None:
-    estimator = Estimator(MODEL, EstimatorSettings(initial_soc_pct=60.0))
+    estimator = make_estimator(MODEL, EstimatorSettings(initial_soc_pct=60.0))
     for sample in drive(60.0, 58.0, 0.0):
         last = estimator.step(sample)
     later = drive(58.0, 56.0, last.time_s + 90.0)
@@ -160,9 +170,9 @@ def test_single_outlier_after_interval_is_no_contradiction() -> None:
 # --- clocks -----------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("jump_s", [-1e6, -3600.0, -5.0])
+@pytest.mark.parametrize("jump_s", nightly_except((-1e6, -5.0), (-1e6, -3600.0, -5.0)))
 def test_clock_set_back_is_followed(jump_s: float) -> None:
-    whole = [Estimator(MODEL, EstimatorSettings(initial_soc_pct=60.0)) for _ in range(2)]
+    whole = [make_estimator(MODEL, EstimatorSettings(initial_soc_pct=60.0)) for _ in range(2)]
     samples = drive(60.0, 50.0, 1e7)
     refused = 0
     for number, sample in enumerate(samples):
@@ -176,7 +186,7 @@ def test_clock_set_back_is_followed(jump_s: float) -> None:
 
 
 def test_single_future_stamp_costs_a_few_samples() -> None:
-    estimator = Estimator(MODEL, EstimatorSettings(initial_soc_pct=60.0))
+    estimator = make_estimator(MODEL, EstimatorSettings(initial_soc_pct=60.0))
     samples = drive(60.0, 50.0, 1e7)
     samples[900] = samples[900]._replace(time_s=5e9)
     found = [estimator.step(each) for each in samples]
@@ -199,8 +209,8 @@ def test_full_charge_rule_corrects_the_soc(method: Any) -> None:
     rule = FullCharge(voltage_v=388.0, current_a=2.0, hold_s=30.0, soc_std_pct=0.3)
     end_v = 388.2
     settings = {"method": method, "initial_soc_pct": 93.0, "initial_soc_std_pct": 2.0}
-    found = charging(Estimator(MODEL, EstimatorSettings(**settings, full_charge=rule)), end_v, 60, -1.5)  # fmt: skip  # noqa: E501
-    without = charging(Estimator(MODEL, EstimatorSettings(**settings)), end_v, 60, -1.5)
+    found = charging(make_estimator(MODEL, EstimatorSettings(**settings, full_charge=rule)), end_v, 60, -1.5)  # fmt: skip  # noqa: E501
+    without = charging(make_estimator(MODEL, EstimatorSettings(**settings)), end_v, 60, -1.5)
     assert [each.soc_pct for each in found[:150]] == [each.soc_pct for each in without[:150]]
     assert found[149].soc_pct < 98.5
     assert found[149].soc_std_pct > 0.4
@@ -208,8 +218,8 @@ def test_full_charge_rule_corrects_the_soc(method: Any) -> None:
     assert found[151].soc_std_pct < 0.35
     if method == "coulomb":
         assert without[151].soc_pct < 95.0
-    brief = charging(Estimator(MODEL, EstimatorSettings(**settings, full_charge=rule)), end_v, 29, -1.5)  # fmt: skip  # noqa: E501
-    strong = charging(Estimator(MODEL, EstimatorSettings(**settings, full_charge=rule)), end_v, 60, -2.5)  # fmt: skip  # noqa: E501
+    brief = charging(make_estimator(MODEL, EstimatorSettings(**settings, full_charge=rule)), end_v, 29, -1.5)  # fmt: skip  # noqa: E501
+    strong = charging(make_estimator(MODEL, EstimatorSettings(**settings, full_charge=rule)), end_v, 60, -2.5)  # fmt: skip  # noqa: E501
     assert max(each.soc_std_pct for each in brief[-2:]) > 0.4
     assert max(each.soc_std_pct for each in strong[-2:]) > 0.4
 
@@ -219,7 +229,7 @@ def test_long_rest_rule_corrects_the_count() -> None:
     rows = [Sample(float(k), 0.2, rest_v, 23.0) for k in range(0, 3000, 5)]
     settings = {"method": "coulomb", "initial_soc_pct": 62.0, "initial_soc_std_pct": 5.0}
     rule = LongRest(after_s=1800.0, soc_std_pct=1.0)
-    estimator = Estimator(MODEL, EstimatorSettings(**settings, long_rest=rule))
+    estimator = make_estimator(MODEL, EstimatorSettings(**settings, long_rest=rule))
     found = [estimator.step(each) for each in rows]
     assert found[350].soc_pct == pytest.approx(61.9, abs=0.1)
     assert found[370].soc_pct == pytest.approx(55.2, abs=0.3)

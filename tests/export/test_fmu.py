@@ -44,9 +44,15 @@ def repaired() -> Model:
 
 @pytest.fixture(scope="module")
 def units(tmp_path_factory: pytest.TempPathFactory) -> dict[Kind, Path]:
+    """The pack of the function, and the estimator of the command."""
     folder = tmp_path_factory.mktemp("units")
-    kinds: tuple[Kind, ...] = ("pack", "estimator")
-    return {kind: export_fmu(repaired(), folder / f"{kind}.fmu", kind=kind) for kind in kinds}
+    model, unit = folder / "model.json", folder / "estimator.fmu"
+    repaired().save(model)
+    done = CliRunner().invoke(
+        app, ["export-fmu", "-m", str(model), "-o", str(unit), "--kind", "estimator"]
+    )
+    assert done.exit_code == 0, done.output
+    return {"pack": export_fmu(repaired(), folder / "pack.fmu", kind="pack"), "estimator": unit}
 
 
 def simulate(
@@ -231,14 +237,8 @@ def test_options_in_cc_reach_the_compiler(monkeypatch: pytest.MonkeyPatch, tmp_p
         export_fmu(leaf_2012_model_file(), tmp_path / "pack.fmu")
 
 
-def test_the_command_writes_a_unit(tmp_path: Path) -> None:
-    model, unit = tmp_path / "model.json", tmp_path / "estimator.fmu"
-    leaf_2012_model_file().save(model)
-    done = CliRunner().invoke(
-        app, ["export-fmu", "-m", str(model), "-o", str(unit), "--kind", "estimator"]
-    )
-    assert done.exit_code == 0
-    description = fmpy.read_model_description(str(unit))
+def test_the_command_writes_a_unit(units: dict[Any, Path]) -> None:
+    description = fmpy.read_model_description(str(units["estimator"]))
     assert description.fmiVersion == "2.0"
     assert description.coSimulation.modelIdentifier.isidentifier()
     assert [item.name for item in description.modelVariables if item.causality == "input"] == [

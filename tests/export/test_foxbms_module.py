@@ -10,13 +10,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from untested import export_untested
 
 from cangauge._typing import FloatArray
 from cangauge.estimation.estimator import Estimator
 from cangauge.estimation.settings import EstimatorSettings
 from cangauge.estimation.state import DelayLineState
 from cangauge.extras.embedded.c_source import CORE_SOURCES
-from cangauge.extras.embedded.embedded import drive_with_events, export_c
+from cangauge.extras.embedded.embedded import drive_with_events
 from cangauge.model.model_file import Model
 from cangauge.model.published import leaf_2012_model_file
 from cangauge.types import Estimate, Sample
@@ -25,6 +26,7 @@ HERE = Path(__file__).parent / "foxbms"
 STRICT = ["-std=c99", "-O1", "-Wall", "-Wextra", "-Wconversion", "-Werror", "-ffp-contract=off"]
 MODEL = leaf_2012_model_file()
 CELLS = 96
+BLOCK = "-DCANGAUGE_FRAM_BLOCK=FRAM_BLOCK_ID_CANGAUGE"
 Row = tuple[int, int | None, int | None, int | None]
 """Time stamp [ms], current [mA], voltage [mV], temperature [0.1 °C]."""
 
@@ -32,7 +34,7 @@ pytestmark = pytest.mark.skipif(not shutil.which("cc"), reason="no C compiler")
 
 
 def built(folder: Path, model: Model, *defines: str) -> Path:
-    export_c(model, folder, period_s=0.1, platform="foxbms")
+    export_untested(model, folder, period_s=0.1, platform="foxbms")
     sources = [*CORE_SOURCES, "pack_model.c", str(HERE / "driver.c")]  # it includes foxbms_soc.c
     subprocess.run(
         ["cc", *STRICT, "-DCANGAUGE_CONFIG", *defines, f"-I{HERE}", "-I.", *sources, "-lm",
@@ -108,6 +110,12 @@ def driver(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
+def keeping(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The driver of a module with a block of the FRAM for itself."""
+    return built(tmp_path_factory.mktemp("keeping"), MODEL, BLOCK)
+
+
+@pytest.fixture(scope="module")
 def drive() -> list[Row]:
     rows = rounded(drive_with_events(MODEL, 0.1))
     return [(stamp, None if k % 83 == 11 else current, *rest)
@@ -149,10 +157,9 @@ def test_reset_continues_from_the_soc_in_fram(driver: Path, drive: list[Row]) ->
 
 
 def test_own_fram_block_keeps_the_whole_state(
-    driver: Path, drive: list[Row], tmp_path: Path
+    driver: Path, keeping: Path, drive: list[Row]
 ) -> None:
     """Written every 10 s, without the delay line."""
-    keeping = built(tmp_path, MODEL, "-DCANGAUGE_FRAM_BLOCK=FRAM_BLOCK_ID_CANGAUGE")
     reset = 1000
     later = from_zero(drive[reset - 1 :])
     found, _ = run(keeping, drive[: reset - 1] + later, reset)
@@ -169,16 +176,18 @@ def test_own_fram_block_keeps_the_whole_state(
     assert_published(found[reset - 1 :], expected)
 
 
-def test_saved_state_of_another_model_is_not_used(drive: list[Row], tmp_path: Path) -> None:
-    fram, block = tmp_path / "fram", "-DCANGAUGE_FRAM_BLOCK=FRAM_BLOCK_ID_CANGAUGE"
+def test_saved_state_of_another_model_is_not_used(
+    keeping: Path, drive: list[Row], tmp_path: Path
+) -> None:
+    fram = tmp_path / "fram"
     other = MODEL.model_copy(update={"capacity_ah": 0.9 * MODEL.capacity_ah})
-    old, new = built(tmp_path / "old", MODEL, block), built(tmp_path / "new", other, block)
-    before, _ = run(old, drive[:1000], fram=fram)
+    new = built(tmp_path / "new", other, BLOCK)
+    before, _ = run(keeping, drive[:1000], fram=fram)
     kept = fram.read_bytes()
     found, _ = run(new, drive, fram=fram)
     assert_published(found, estimated(drive, other, settings_after(before[-1])))
     fram.write_bytes(kept)
-    again, _ = run(old, drive, fram=fram)
+    again, _ = run(keeping, drive, fram=fram)
     assert np.any(again != estimated(drive, MODEL, settings_after(before[-1])))
 
 

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 import yaml
+from untested import export_untested
 
-from cangauge.extras.embedded.embedded import export_c
 from cangauge.extras.embedded.platforms import Platform
 from cangauge.model.model_file import Model
 
@@ -42,7 +42,7 @@ def exports(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     platforms: tuple[Platform, ...] = ("esp-idf", "zephyr", "arduino")
     folders = {each: tmp_path_factory.mktemp(each) for each in platforms}
     for platform, folder in folders.items():
-        export_c(Model.prior("oxide", 96, 60.0), folder, platform=platform)
+        export_untested(Model.prior("oxide", 96, 60.0), folder, platform=platform)
     return dict(folders)
 
 

@@ -307,27 +307,23 @@ def live(folder: Path, log: Path, model: Path) -> Iterator[tuple[str, dict[str, 
     """Yield what run, status and replay print, on a virtual bus in this process."""
     bus = ("--interface", "virtual", "--channel", "golden", "--vehicle", "generic")
     socket = folder / "status.sock"
-    run = threading.Thread(target=_serve, args=(folder, model))
+    # Not by the command: two commands at once in one process would share standard output.
+    config = folder / "run.toml"
+    config.write_text(
+        f'model = "{model}"\ninterface = "virtual"\nchannel = "golden"\nvehicle = "generic"\n'
+        f'time_source = "replay-clock"\nduration_s = 60.0\nstatus_socket = "{socket}"\n'
+    )
+    service, summary = cangauge.Service(config), list[dict[str, Any]]()
+    run = threading.Thread(target=lambda: summary.append(service.run()))
     run.start()
     until = time.monotonic() + 60.0
     while run.is_alive() and not socket.exists() and time.monotonic() < until:
         time.sleep(0.05)
     yield "replay", succeed("replay", log, *bus, "--speed", "max")
     yield "status", succeed("status", "--endpoint", socket)
+    service.stop()
     run.join()
-    yield "run", json.loads((folder / "run.out").read_text())
-
-
-def _serve(folder: Path, model: Path) -> None:
-    # Not by the command: two commands at once in one process would share standard output.
-    config = folder / "run.toml"
-    config.write_text(
-        f'model = "{model}"\ninterface = "virtual"\nchannel = "golden"\nvehicle = "generic"\n'
-        f'time_source = "replay-clock"\nuntil_idle_s = 3.0\nduration_s = 60.0\n'
-        f'status_socket = "{folder / "status.sock"}"\n'
-    )
-    summary = cangauge.Service(config).run()
-    (folder / "run.out").write_text(json.dumps(summary))
+    yield "run", json.loads(json.dumps(summary[0]))
 
 
 def command_records() -> dict[str, Any]:

@@ -46,8 +46,8 @@ def with_effect(log: Log, effect_id: str, values: dict[str, float]) -> Log:
     ("effect_id", "values"),
     [
         ("hysteresis", {"half_width_v": 1.5, "travel_pct": 2.0}),
-        ("slow_diffusion", {"ohm": 0.04, "tau_s": 1400.0}),
-        ("fast_polarization", {"ohm": 0.03, "tau_s": 3.5}),
+        pytest.param("slow_diffusion", {"ohm": 0.04, "tau_s": 1400.0}, marks=pytest.mark.nightly),
+        pytest.param("fast_polarization", {"ohm": 0.03, "tau_s": 3.5}, marks=pytest.mark.nightly),
     ],
 )
 def test_auto_finds_a_true_effect(effect_id: str, values: dict[str, float]) -> None:

@@ -71,7 +71,6 @@ def test_an_offset_is_named_with_size_and_moment(pack) -> None:
 @pytest.mark.parametrize(
     ("cause", "change"),
     [
-        ("start_or_reset", lambda log: {"soc_pct": log.soc_pct - 12.0}),
         ("voltage_sensor", lambda log: {"voltage_v": 1.02 * log.voltage_v}),
         (
             "count_scale",
@@ -85,9 +84,10 @@ def test_other_causes_are_named(pack, cause: str, change) -> None:
     assert (judgement.verdict, judgement.cause.verdict) == ("off", cause)
 
 
-def test_corrected_soc_follows_the_truth_where_the_gauge_does_not(pack) -> None:
+def test_a_wrong_start_is_named_and_the_corrected_soc_follows_the_truth(pack) -> None:
     model, logs = pack
     judgement = cangauge.judge([replace(log, soc_pct=log.soc_pct - 12.0) for log in logs], model)
+    assert (judgement.verdict, judgement.cause.verdict) == ("off", "start_or_reset")
     for log, soc, std in zip(
         logs, judgement.corrected_pct, judgement.corrected_std_pct, strict=True
     ):

@@ -27,7 +27,7 @@ FAULT = {fault.name: fault for fault in FAULTS}
 
 @pytest.fixture(scope="module")
 def drive() -> PlayedDrive:
-    log = synthetic_log(hours=0.3, rate_hz=1.0, start_pct=80.0, end_pct=60.0, noise_v=0.3)
+    log = synthetic_log(hours=0.15, rate_hz=1.0, start_pct=80.0, end_pct=70.0, noise_v=0.3)
     assert log.soc_pct is not None
     return PlayedDrive("drive", log, log.soc_pct, leaf_model())
 

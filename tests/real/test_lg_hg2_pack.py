@@ -11,7 +11,6 @@ import pytest
 
 import cangauge
 from cangauge.estimation.compiled import make_estimator
-from cangauge.estimation.estimator import Estimator
 from cangauge.estimation.health import Health
 from cangauge.estimation.offline import samples_of
 from cangauge.estimation.power import PackLimits
@@ -118,7 +117,7 @@ def test_possible_currents_are_those_of_real_pulses(model: Model, drives: list[L
     apart = []
     for log in drives[1:3]:
         events = {row: (end, mean_a) for row, end, mean_a in pulses(log)}
-        estimator = Estimator(model, EstimatorSettings(initial_soc_pct=100.0))
+        estimator = make_estimator(model, EstimatorSettings(initial_soc_pct=100.0))
         for row, sample in enumerate(samples_of(log)):
             estimator.update(sample)
             if row not in events:
@@ -132,7 +131,7 @@ def test_possible_currents_are_those_of_real_pulses(model: Model, drives: list[L
                 max_discharge_a=1e3,
                 max_charge_a=1e3,
             )
-            at_limit = Estimator(model, replace(estimator.settings, limits=limits))
+            at_limit = make_estimator(model, replace(estimator.settings, limits=limits))
             at_limit.restore(estimator.snapshot())
             power = at_limit.power()
             if mean_a > 0.0:

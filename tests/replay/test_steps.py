@@ -99,7 +99,7 @@ def test_several_replays_in_one_capture_are_refused(tmp_path: Path) -> None:
 def test_samples_of_a_real_capture_are_counted_as_the_receiver_does(shared_data: Path) -> None:
     from cangauge.bus.recording import capture_samples  # noqa: PLC0415 - needs the real data
 
-    path = shared_data / "leaf_can" / "ZE0w24kWhstock.log.gz"
+    path = shared_data / "leaf_can" / "10bars.csv.gz"
     vehicle = Vehicle.load("leaf_ze0")
     steps = list(CaptureSource(path, vehicle).steps(loop=False))
     assert steps[-1].samples == len(capture_samples(path, vehicle))

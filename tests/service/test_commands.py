@@ -9,16 +9,10 @@ import time
 import zlib
 from pathlib import Path
 
-import numpy as np
 import pytest
 
-from cangauge.bus.vehicle import Vehicle
-from cangauge.estimation.offline import samples_of
 from cangauge.logs.canonical import write_log
-from cangauge.replay.encoder import FrameEncoder
-from cangauge.service.offline import estimate_capture
-from cangauge.service.record import Recorder
-from live import Command, in_process, leaf_model, leaf_model_path, run_to_end, short_log
+from live import Command, in_process, leaf_model_path, short_log
 
 pytestmark = pytest.mark.slow
 
@@ -40,85 +34,8 @@ def log_path(tmp_path: Path) -> Path:
     return path
 
 
-def test_a_log_at_full_speed_from_one_process_to_the_other(
-    bus: list[str], log_path: Path, tmp_path: Path
-) -> None:
-    """By one configuration: bus, vehicle and ids of the replay are those of the service."""
-    config, record = tmp_path / "run.toml", tmp_path / "seen.log"
-    interface, channel, port = bus[1], bus[3], bus[5].partition("=")[2]
-    config.write_text(
-        f'model = "{MODEL[1]}"\ninterface = "{interface}"\nchannel = "{channel}"\n'
-        'vehicle = "leaf_aze0"\ntime_source = "replay-clock"\nuntil_idle_s = 1\n'
-        f"bus_options = {{ port = {port} }}\n"
-        "ids = { soc_estimate = 0x4A0, soc_detail = 0x4A1, replay_clock = 0x4AF }\n"
-    )
-    service = Command("run", "--config", config, "--json", "--record", record)
-    replayed = run_to_end("replay", log_path, "--config", config, "--speed", "max", "--json")
-    ended = service.end()
-    assert (replayed.code, ended.code) == (0, 0), replayed.err + ended.err
-    assert replayed.json["acknowledged"] == replayed.json["samples"] == 1200
-    assert replayed.json["quantisation"]["current_a"] == 0.25  # a Leaf's step is 0.5 A
-    result = ended.json
-    assert result["samples"] == 1200
-    assert result["frames"]["lost"] == result["rejects"]["crc_errors"] == 0
-    assert result["estimate"]["soc_pct"] == pytest.approx(replayed.json["soc_pct"], abs=0.01)
-    # Bit for bit: the recording, offline.
-    vehicle = Vehicle.load("leaf_aze0")
-    offline = estimate_capture(record, vehicle, leaf_model(), clock_id=0x4AF).table
-    assert offline.soc_pct.size == 1200
-    for name in ("time_s", "soc_pct", "soc_std_pct", "soc_newton_pct", "soc_coulomb_pct"):
-        assert result["estimate"][name] == getattr(offline, name)[-1], name
-    assert "samples, 0 lost, 0 CRC errors; last SoC" in ended.err
-
-
-@pytest.mark.nightly
-def test_a_capture_in_real_time(bus: list[str], tmp_path: Path) -> None:
-    # 2 s of a Leaf's battery, 100 frames a second and some others, not quite regular.
-    capture, again = tmp_path / "drive.log", tmp_path / "again.log"
-    rng = np.random.default_rng(8)
-    vehicle = Vehicle.load("leaf_aze0")
-    encoder = FrameEncoder(vehicle)
-    with Recorder(capture) as recorder:
-        for sample in samples_of(short_log(2.01, rate_hz=100.0)):
-            for frame in encoder.encode(sample):
-                # Within a millisecond, and the last exactly 2 s after the first.
-                late_s = float(rng.uniform(0.0, 0.001)) if 0.0 < sample.time_s < 2.0 else 0.0
-                frame.timestamp = 1.7e9 + sample.time_s + late_s
-                recorder.write(frame)
-    service = Command(
-        "run", *bus, *MODEL, "--vehicle", "leaf_aze0", "--record", again, "--until-idle", "1",
-        "--json",
-    )  # fmt: skip
-    service.wait_for("service.ready")
-    replayed = run_to_end("replay", capture, *bus, "--json")
-    assert replayed.json["seconds"] == pytest.approx(2.0, abs=0.1)
-    result = service.end().json
-    assert result["frames"]["received"] == replayed.json["frames"]
-    assert result["samples"] == 201
-    # As it was, and not only as long as it was.
-    stamps = [
-        np.array([float(stamp) for stamp in re.findall(r"^\(([\d.]+)\)", text, re.MULTILINE)])
-        for text in (capture.read_text(), again.read_text())
-    ]
-    late = (stamps[1] - stamps[1][0]) - (stamps[0] - stamps[0][0])
-    assert np.max(np.abs(late)) < 0.1
-
-
-def test_an_interrupt_ends_the_service_within_a_second(bus: list[str]) -> None:
-    service = Command("run", *bus, *MODEL, "--json")
-    service.wait_for("service.ready")
-    began = time.monotonic()
-    service.process.send_signal(signal.SIGINT)
-    ended = service.end(5.0)
-    assert time.monotonic() - began < 1.5  # the end of the interpreter included
-    assert ended.code == 0
-    assert ended.json["samples"] == 0
-    assert ended.json["estimate"]["soc_pct"] is None
-    assert "0 samples" in ended.err
-
-
 @pytest.mark.skipif(not hasattr(signal, "SIGHUP"), reason="no SIGHUP on this system")
-def test_a_hangup_reads_the_configuration_again_and_soc_goes_on(
+def test_a_hangup_reads_the_configuration_again_and_an_interrupt_ends_the_service(
     bus: list[str], tmp_path: Path
 ) -> None:
     path = tmp_path / "car.toml"
@@ -131,11 +48,16 @@ def test_a_hangup_reads_the_configuration_again_and_soc_goes_on(
     path.write_text("timeout_s = 0.5\n")
     service.process.send_signal(signal.SIGHUP)
     service.wait_for("config.reloaded")
-    service.process.terminate()
+    began = time.monotonic()
+    service.process.send_signal(signal.SIGINT)
     ended = service.end(5.0)
+    assert time.monotonic() - began < 1.5  # the end of the interpreter included
     assert ended.code == 0
     assert ended.json["stamps"] == "kernel"
     assert ended.json["bus_counts"]["foreign"] == 0  # its own frames come back on this bus
+    assert ended.json["samples"] == 0
+    assert ended.json["estimate"]["soc_pct"] is None
+    assert "0 samples" in ended.err
 
 
 def test_an_interrupted_replay_says_how_far_it_came(bus: list[str], log_path: Path) -> None:

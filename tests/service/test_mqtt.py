@@ -147,7 +147,7 @@ def test_a_broker_that_goes_costs_no_sample(
         assert waits(lambda: listener.availability == "online")
         broker.end()
         before, began_s = running.service.pipeline.samples, time.monotonic()
-        time.sleep(2.0)
+        time.sleep(1.0)
         rate = (running.service.pipeline.samples - before) / (time.monotonic() - began_s)
         listener.latest.clear()
         broker.start()

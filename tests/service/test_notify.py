@@ -103,7 +103,7 @@ def test_systemd_gets_ready_watchdog_and_stopping(
 ) -> None:
     assert "main" in COMMAND
     monkeypatch.setenv("NOTIFY_SOCKET", str(systemd.path))
-    monkeypatch.setenv("WATCHDOG_USEC", "2000000")
+    monkeypatch.setenv("WATCHDOG_USEC", "1000000")
     service = Command(
         "run", "-m", leaf_model_path(), "--interface", "udp_multicast", "--bus-option",
         "port=23123", "--status-socket", "off", "--json",
@@ -121,7 +121,7 @@ def test_systemd_gets_ready_watchdog_and_stopping(
     os.kill(service.process.pid, 19)
     time.sleep(0.3)
     systemd.drain()
-    time.sleep(1.0)
+    time.sleep(0.6)
     assert systemd.drain() == 0
     os.kill(service.process.pid, 18)
     systemd.until("WATCHDOG")

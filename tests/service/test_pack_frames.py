@@ -236,8 +236,8 @@ def test_a_wrong_sum_is_a_notice_with_its_size() -> None:
 
 def test_a_running_service_sends_them_every_second() -> None:
     with virtual_port("pack") as port, virtual_service("pack"):
-        frames = collect(port, 2.4)
+        frames = collect(port, 1.4)
     kinds = [type(SocReader().read(each)) for each in frames]
-    assert 2 <= kinds.count(SocHealth) <= 3
+    assert 1 <= kinds.count(SocHealth) <= 2
     assert kinds.count(SocPower) == kinds.count(SocHealth)
     assert SocCells not in kinds

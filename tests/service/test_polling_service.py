@@ -21,6 +21,7 @@ from polled_battery import (
     polling_service,
     temperature_and_cells_come,
 )
+from selection import nightly_except
 
 
 def test_temperature_and_cells_are_polled_over_udp() -> None:
@@ -28,7 +29,7 @@ def test_temperature_and_cells_are_polled_over_udp() -> None:
     temperature_and_cells_come(bus_address("udp_multicast", options={"port": port}))
 
 
-@pytest.mark.parametrize("manner", [NEGATIVE, PENDING, SILENT])
+@pytest.mark.parametrize("manner", nightly_except((NEGATIVE,), (NEGATIVE, PENDING, SILENT)))
 def test_a_battery_that_does_not_answer_costs_nothing(manner: str) -> None:
     address = BusAddress("virtual", f"polled {manner}")
     with Battery(address, manner) as battery, polling_service(address) as service:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 from collections.abc import Iterator
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 
 import can
@@ -27,6 +27,12 @@ from live import LoggedLines, leaf_model_path, short_log
 MAP = 'dbc = ["pack.dbc"]\nname = "car"\ntemperature_source = "pack"\n' + SIGNALS
 
 
+@cache
+def drive_frames() -> list[list[can.Message]]:
+    encoder = FrameEncoder(Vehicle.load("generic"))
+    return [encoder.encode(each) for each in samples_of(short_log(200.0))]
+
+
 class Car:
     """A pipeline with its configuration file, its frames, and what was said."""
 
@@ -38,8 +44,7 @@ class Car:
         self.service = Service(self.path)
         self.pipeline = self.service.pipeline
         self.logged = LoggedLines("cangauge.service.run")
-        encoder = FrameEncoder(Vehicle.load("generic"))
-        self.frames = [encoder.encode(each) for each in samples_of(short_log(200.0))]
+        self.frames = drive_frames()
 
     @property
     def said(self) -> list[str]:

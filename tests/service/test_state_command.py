@@ -54,29 +54,20 @@ def samples_kept(path: Path) -> int:
 
 
 @pytest.mark.slow
-def test_stopped_killed_and_started_again(tmp_path: Path) -> None:
+def test_killed_started_again_and_stopped(tmp_path: Path) -> None:
     path = tmp_path / "state.json"
     wanted = [standard_filter(0x5A0)]
     address = BusAddress("udp_multicast", ADDRESS, {"port": PORT})
     with BusConnection(open_bus(address, wanted), "bus") as port:
-        service = run(path)
-        drive(port, 0, 100)
-        assert waits(
-            lambda: samples_kept(path) == 100
-        )  # what still stands in the queue would be lost
-        service.process.send_signal(signal.SIGTERM)
-        ended = service.end()
-        assert ended.code == 0
-        assert ended.json["samples"] == 100
-        assert samples_kept(path) == 100
         # Killed: what was written by then is there.
         service = run(path)
-        drive(port, 100, 200)
+        drive(port, 0, 200)
         assert waits(lambda: samples_kept(path) == 200)
         drive(port, 200, 202)
         service.process.send_signal(signal.SIGKILL)
         service.process.wait()
-        assert 200 <= samples_kept(path) <= 202
+        kept = samples_kept(path)
+        assert 200 <= kept <= 202
         kept_pct = read_state(path).estimator.soc_pct
         service = run(path)
         while port.receive(0.0) is not None:
@@ -89,8 +80,11 @@ def test_stopped_killed_and_started_again(tmp_path: Path) -> None:
         assert told[-1].reasons & Reason.INPUT_STALE
         drive(port, 202, 210)
         assert waits(lambda: samples_kept(path) > 202)  # counted on, not anew
+        # Stopped: all is there.
         service.process.send_signal(signal.SIGTERM)
         ended = service.end()
+        assert (ended.code, ended.json["samples"]) == (0, 8)
+        assert samples_kept(path) == kept + 8
     assert "continuing from" in ended.err
     # The seconds that starting took are counted by the mean current before: 10 s at 60 A are 0.3 %.
     assert ended.json["estimate"]["soc_pct"] == pytest.approx(kept_pct, abs=1.0)

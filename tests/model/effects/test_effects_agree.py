@@ -26,6 +26,7 @@ from cangauge.model.effects.library import LIBRARY
 from cangauge.model.extended import ExtendedModel
 from cangauge.model.published import CAPACITY_AH
 from cangauge.model.voltage_model import PublishedCurve, VoltageModel
+from selection import nightly_except
 from synthetic import synthetic_log
 
 each_effect = pytest.mark.parametrize("effect", EFFECTS, ids=lambda effect: effect.id)
@@ -107,9 +108,9 @@ def test_neutral_values_change_nothing(effect: Effect) -> None:
 
 
 @each_effect
-@pytest.mark.parametrize("part", [0.3, 1.0])
+@pytest.mark.parametrize("part", nightly_except((0.3,), (0.3, 1.0)))
 def test_offline_equals_online_on_irregular_samples(effect: Effect, part: float) -> None:
-    signals = irregular_signals(seed=int(10 * part) + 3)
+    signals = irregular_signals(1500, seed=int(10 * part) + 3)
     values = {item.name: within(item, part) for item in effect.parameters}
     if effect.id == "resistance_step":
         values["start_s"] = part * 3000.0
@@ -127,9 +128,12 @@ def test_offline_equals_online_on_irregular_samples(effect: Effect, part: float)
     np.testing.assert_allclose(online.voltage_v, batch.voltage_v[:n], rtol=0.0, atol=1e-6)
 
 
+LONG = synthetic_log(hours=1.5, start_pct=90.0, end_pct=8.0)
+
+
 @each_effect
 def test_mid_range_is_visible_on_a_drive(effect: Effect) -> None:
-    log = synthetic_log(hours=1.5, start_pct=90.0, end_pct=8.0)
+    log = LONG
     # A pack that warms up, or the interior's temperature would not matter.
     warming_c = log.temperature_c - 15.0 + np.linspace(0.0, 8.0, log.time_s.size)
     signals = Signals(log.time_s, log.current_a, log.voltage_v, warming_c)
@@ -267,18 +271,22 @@ def test_missing_signals_affect_only_themselves(effect: Effect) -> None:
     assert np.array_equal(bad, np.isnan(found_rows[:, 3]))
 
 
-@each_effect
-def test_is_fast_enough_for_a_search(effect: Effect) -> None:
+@pytest.mark.parametrize(
+    "effect_id", nightly_except(("core_temperature", "slow_diffusion", "time_skew"), LIBRARY)
+)
+def test_is_fast_enough_for_a_search(effect_id: str) -> None:
     """90,000 rows (2.5 h at 10 Hz) take about 40 ms; the limit allows for a busy machine."""
     n = 90_000
     time_s = np.arange(n) * 0.1
     signals = Signals(
         time_s, 25.0 + 30.0 * np.sin(time_s / 7.0), np.full(n, 370.0), 20.0 + time_s / 2000.0
     )
+    effect = LIBRARY[effect_id]
     extended = ExtendedModel(MODEL, CAPACITY_AH).with_effect(effect, middle(effect))
-    best = math.inf
-    for _ in range(5):
+
+    def seconds() -> float:
         began = time.perf_counter()
         extended.predict(signals, 100.0, np.arange(0, n, 10))
-        best = min(best, time.perf_counter() - began)
-    assert best < 0.5
+        return time.perf_counter() - began
+
+    assert any(seconds() < 0.5 for _ in range(5))
