@@ -280,21 +280,24 @@ class SocPublisher:
     def estimate_frame(self, estimate: Estimate, age_s: float = 0.0) -> can.Message:
         """Return SOC_ESTIMATE with the next counter; arguments as in `beat`."""
         age_s = age_s if math.isnan(age_s) else math.floor(age_s)
-        soc, reasons = estimate[1:3], reason_bits(estimate.reasons)
-        return self._frame("soc_estimate", SocEstimate(*soc, estimate.status, reasons, age_s))
+        soc_pct, std_pct, reasons = estimate.soc_pct, estimate.soc_std_pct, estimate.reasons
+        content = SocEstimate(soc_pct, std_pct, estimate.status, reason_bits(reasons), age_s)
+        return self._frame("soc_estimate", content)
 
     def detail_frame(self, estimate: Estimate, samples: int) -> can.Message:
         """Return SOC_DETAIL with the next counter."""
         self._acknowledged = samples
-        socs, count = estimate[3:5], samples % SAMPLES_MODULO
-        return self._frame("soc_detail", SocDetail(*socs, estimate.residual_v, count))
+        newton_pct, coulomb_pct = estimate.soc_newton_pct, estimate.soc_coulomb_pct
+        detail = SocDetail(newton_pct, coulomb_pct, estimate.residual_v, samples % SAMPLES_MODULO)
+        return self._frame("soc_detail", detail)
 
     def report_frames(self, report: PackReport) -> list[can.Message]:
         """Return SOC_HEALTH, SOC_POWER and, where there are cells, SOC_CELLS."""
-        energy_kwh = [1e-3 * each for each in report.power[4:6]]
+        able = report.power
+        energy_kwh, std_kwh = 1e-3 * able.energy_wh, 1e-3 * able.energy_std_wh
         frames = [
             self._frame("soc_health", SocHealth(*report.health[:5])),
-            self._frame("soc_power", SocPower(*report.power[:4], *energy_kwh)),
+            self._frame("soc_power", SocPower(*able[:4], energy_kwh, std_kwh)),
         ]
         if (cells := report.cells) is not None:
             weakest = math.nan if cells.weakest < 0 else float(cells.weakest)
