@@ -2,24 +2,21 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
+import ast
+from importlib import import_module
+from importlib.util import find_spec
 from pathlib import Path
 
-CODE = """
-import importlib, pathlib, sys
-sys.path[:0] = ["benchmarks", "."]
-for path in sorted(pathlib.Path("benchmarks").glob("*.py")):
-    importlib.import_module(path.stem)
-for path in sorted(pathlib.Path("benchmarks").glob("*/__main__.py")):
-    package = "benchmarks." * (path.parent.name == "weights") + path.parent.name
-    importlib.import_module(f"{package}.__main__")
-"""
 
-
-def test_every_benchmark_imports(project: Path) -> None:
-    done = subprocess.run(
-        [sys.executable, "-c", CODE], cwd=project, capture_output=True, text=True,
-        check=False, timeout=120,
-    )  # fmt: skip
-    assert done.returncode == 0, done.stderr
+def test_every_benchmark_imports_what_the_package_has(project: Path) -> None:
+    names = {
+        (node.module, each.name)
+        for path in (project / "benchmarks").rglob("*.py")
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
+        if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("cangauge")
+        for each in node.names
+    }
+    assert len(names) > 100
+    for module, name in sorted(names):
+        found = hasattr(import_module(module), name) or find_spec(f"{module}.{name}")
+        assert found, f"{module} has no {name}"

@@ -17,13 +17,15 @@ from cangauge.bus.recording import (
     open_recording,
     read_log,
 )
-from cangauge.bus.time_source import ClockFrames, ReceiveTime
+from cangauge.bus.time_source import REPLAY_CLOCK_ID, ClockFrames, ReceiveTime
 from cangauge.bus.vehicle import Vehicle
 from cangauge.errors import InputError
 from cangauge.logs.canonical import write_log
 from cangauge.logs.log import Log
 from cangauge.logs.read import LogFile
+from cangauge.model.published import leaf_2012_model_file
 from cangauge.replay.encoder import FrameEncoder
+from cangauge.service.offline import estimate_capture
 from cangauge.types import Sample
 
 CURRENT_ID, VOLTAGE_ID, TEMPERATURE_ID = 0x400, 0x401, 0x402

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from cangauge.estimation.compiled import make_estimator
+from cangauge.estimation.power import PackLimits
 from cangauge.estimation.settings import EstimatorSettings
 from cangauge.model.delay_line import delayed_currents
 from cangauge.model.model_file import Model
@@ -114,6 +115,17 @@ def test_resistance_is_found_within_its_deviation(resistance: float) -> None:
     last = learned(3, 1.0, resistance=resistance)
     assert last.resistance_ratio == pytest.approx(resistance, abs=0.05)
     assert abs(last.resistance_ratio - resistance) < 3.0 * last.resistance_std
+
+
+def test_possible_current_follows_the_learned_resistance() -> None:
+    limits = PackLimits(335.0, 420.0, 2000.0, 2000.0)
+    found_a = []
+    for resistance in (1.0, 1.3):
+        estimator = make_estimator(MODEL, settings(1.0, limits=limits))
+        for sample in samples_of_pack(3, resistance=resistance):
+            estimator.update(sample)
+        found_a.append(estimator.power().discharge_a)
+    assert found_a[1] == pytest.approx(found_a[0] / 1.3, rel=0.1)
 
 
 def test_nothing_is_learned_without_charge_or_voltage() -> None:

@@ -58,6 +58,12 @@ def folders(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     return made
 
 
+@pytest.fixture
+def untested(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Exports have a short drive of their own tests."""
+    monkeypatch.setattr("cangauge.extras.embedded.embedded.GOLDEN_S", 10.0)
+
+
 def run(folder: Path, *command: str) -> str:
     done = subprocess.run(
         command, check=False, cwd=folder, capture_output=True, text=True, timeout=300
@@ -204,6 +210,7 @@ def test_the_table_is_the_published_equation() -> None:
     assert (error_v / curve.slopes(soc_pct)).max() < 1e-3  # [% SoC]
 
 
+@pytest.mark.usefixtures("untested")
 def test_a_pack_without_logs_is_exported_with_its_uncertainty(tmp_path: Path) -> None:
     given = ("--chemistry", "lfp", "--cells", "16", "--capacity-ah", "280")
     told = in_process("export-c", *given, "-o", tmp_path / "c", "--json")
@@ -279,6 +286,7 @@ def test_drive_of_the_tests_has_its_events() -> None:
     assert all(isinstance(sample, Sample) for sample in samples)
 
 
+@pytest.mark.usefixtures("untested")
 def test_a_file_in_place_of_the_folder_is_refused(tmp_path: Path) -> None:
     PLAIN.save(tmp_path / "pack.json")
     (tmp_path / "ecm.py").write_text("kept")
@@ -288,6 +296,7 @@ def test_a_file_in_place_of_the_folder_is_refused(tmp_path: Path) -> None:
     assert (tmp_path / "ecm.py").read_text() == "kept"
 
 
+@pytest.mark.usefixtures("untested")
 def test_a_folder_that_cannot_be_made_is_refused(tmp_path: Path) -> None:
     PLAIN.save(tmp_path / "pack.json")
     arguments = ["export-c", "-m", str(tmp_path / "pack.json"), "-o", str(tmp_path / ("x" * 300))]
@@ -295,6 +304,7 @@ def test_a_folder_that_cannot_be_made_is_refused(tmp_path: Path) -> None:
         CliRunner().invoke(app, arguments, catch_exceptions=False)
 
 
+@pytest.mark.usefixtures("untested")
 def test_own_files_are_kept(tmp_path: Path) -> None:
     (tmp_path / "Makefile").write_text("kept")
     with pytest.raises(InputError, match="not from an export") as error:
@@ -304,6 +314,7 @@ def test_own_files_are_kept(tmp_path: Path) -> None:
     assert (tmp_path / "Makefile").read_text() == "kept"
 
 
+@pytest.mark.usefixtures("untested")
 def test_command_renews_an_export_and_names_what_it_wrote(tmp_path: Path) -> None:
     PLAIN.save(tmp_path / "pack.json")
     arguments = ["export-c", "-m", str(tmp_path / "pack.json"), "-o", str(tmp_path / "c"), "--json"]

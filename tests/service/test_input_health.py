@@ -74,7 +74,7 @@ def cut(frame: can.Message) -> None:
 
 @dataclass
 class Result:
-    """Samples, estimates, and the heartbeat after every frame by the frame's stamp."""
+    """Samples, estimates, and the heartbeat after the frames of each stamp."""
 
     samples: list[Sample]
     estimates: list[Estimate]
@@ -88,13 +88,16 @@ class Result:
 def run(frames: list[can.Message], settings: EstimatorSettings = START) -> Result:
     pipeline, reader = Pipeline(VEHICLE, leaf_model(), PipelineSettings(settings)), SocReader()
     result = Result([], [], {}, pipeline)
-    for frame in copy.deepcopy(frames):
+    stamps = [frame.timestamp for frame in frames]
+    for frame, next_s in zip(copy.deepcopy(frames), [*stamps[1:], None], strict=True):
         before = pipeline.samples
         pipeline.handle(frame)
         if pipeline.samples != before:
             assert pipeline.latest_sample is not None
             result.samples.append(pipeline.latest_sample)
             result.estimates.append(pipeline.latest)
+        if frame.timestamp == next_s:
+            continue
         published = reader.read(pipeline.heartbeat()[0])
         assert isinstance(published, SocEstimate)
         result.published[frame.timestamp] = published

@@ -18,7 +18,13 @@ from cangauge.bus.captures import open_capture
 from cangauge.bus.decoder import SampleDecoder
 from cangauge.bus.publish import FrameIds
 from cangauge.bus.recording import open_vehicle_capture
-from cangauge.bus.time_source import MICROSECONDS, ReceiveTime, ReplayClock, is_clock, whole_us
+from cangauge.bus.time_source import (
+    MICROSECONDS,
+    ReceiveTime,
+    RecordedTime,
+    ReplayClock,
+    whole_us,
+)
 from cangauge.bus.vehicle import EXTENDED, Vehicle
 from cangauge.errors import InputError
 from cangauge.logs.gaps import usual_step_s

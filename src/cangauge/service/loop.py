@@ -27,6 +27,7 @@ from cangauge.bus.time_source import (
     KERNEL_TOLERANCE_S,
     StampLimiter,
     is_clock,
+    log_time_us,
     steady_s,
 )
 from cangauge.service.output import Output
