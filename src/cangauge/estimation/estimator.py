@@ -266,7 +266,7 @@ class Estimator:
             memory.newton_std_pct = inverse_std_pct(online, newton.soc_pct, temperature_c, load)
             charge = counter.counted_s, counter.discharged_pct
             volts = sample.voltage_v, temperature_c, drop_v
-            self._block.add(Block(*charge, *volts, load, online.drives()))
+            self._block.add(Block(*charge, *volts, load, online.drives))
         soc_pct = self._soc()[0]
         memory.voltage_model_v = math.nan
         if not math.isnan(soc_pct):
@@ -370,7 +370,7 @@ class Estimator:
 
     def _load(self) -> tuple[FloatArray, float, float]:
         """Return the load row, its voltage, and the part of it by the resistances [V]."""
-        load, theta = self._online.load(), self._online.load_coefficients
+        load, theta = self._online.load, self._online.load_coefficients
         return load, float(load @ theta), float(load[1:] @ theta[1:])
 
     def _soc(self) -> tuple[float, float]:
@@ -477,7 +477,7 @@ class Estimator:
         self._online.restore(state.online)
         if (state.method, state.capacity_ah) == (self.settings.method, self.capacity_ah):
             columns = self._online.load_coefficients.size
-            sums = len(Block._fields) - 2 + columns + self._online.drives().size
+            sums = len(Block._fields) - 2 + columns + self._online.drives.size
             if state.block.rows and (state.block.columns, len(state.block.sums)) != (columns, sums):
                 raise InputError(f"the model's blocks have {sums} sums", field="block.sums")
             self._block.restore(state.block)

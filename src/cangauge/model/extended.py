@@ -268,15 +268,18 @@ class OnlineModel:
             effect.context(values, self.model, extended.pack) for effect, values in extended.effects
         ]
         self._corrects = any(effect.corrects for effect, _ in extended.effects)
-        self._row = np.empty(0)
-        self._over_soc = [each for each in extended.effects if each[0].uses_soc]
-        self._drives = np.zeros(1 + len(self._over_soc))
-        self._slope_at_least = SLOPE_AT_LEAST * self.model.nominal_v
-
-    @property
-    def load_coefficients(self) -> FloatArray:
+        self.load_coefficients = self.model.load_coefficients
         """Coefficients of the load columns, shape (k,)."""
-        return self.model.load_coefficients
+        self.load = np.empty(0)
+        """The load columns at the latest reading, shape (k,)."""
+        self._over_soc = [each for each in extended.effects if each[0].uses_soc]
+        self.drives = np.zeros(1 + len(self._over_soc))
+        """The effects' drives at the latest reading, shape (1 + effects over SoC,).
+
+        The first is the voltage of effects that do not depend on the SoC [V]. The effects' voltage
+        is linear in the drives, so that a mean of readings has the mean of their drives.
+        """
+        self._slope_at_least = SLOPE_AT_LEAST * self.model.nominal_v
 
     def initial_soc_pct(self, assumed_pct: float) -> float:
         """Return the SoC at which to start for an assumed one, within 0–100 [%]."""
@@ -312,11 +315,11 @@ class OnlineModel:
         smooth = [float(lag.step(at, now)[0]) for lag in self.lags]
         currents = [*self.delay_line.currents(), *smooth]
         known_c = self.model.t_ref_c if math.isnan(temperature_c) else temperature_c
-        self._row = self.load_at(known_c, currents)
-        self._drives = np.zeros_like(self._drives)
+        self.load = self.load_at(known_c, currents)
+        self.drives = np.zeros_like(self.drives)
         if not self.extended.effects:
             return
-        drop_v = self._row[1:] @ self.load_coefficients[1:]
+        drop_v = self.load[1:] @ self.load_coefficients[1:]
         over = 0
         for (effect, values), context in zip(self.extended.effects, self._contexts, strict=True):
             of_history = any(isinstance(lag, Lag) and lag.is_lagging for lag in context.memory)
@@ -327,23 +330,11 @@ class OnlineModel:
             place = 1 + over if effect.uses_soc else 0
             over += effect.uses_soc
             if drive is not None and not math.isnan(drive[0]):
-                self._drives[place] += float(drive[0])
+                self.drives[place] += float(drive[0])
 
     def load_at(self, temperature_c: float, currents_a: Sequence[float] | FloatArray) -> FloatArray:
         """Return the load columns of given delayed and low-passed currents [A], shape (k,)."""
         return np.asarray(self.model.load_columns([temperature_c], np.array([currents_a]))[0])
-
-    def load(self) -> FloatArray:
-        """Return the load columns at the latest reading, shape (k,)."""
-        return self._row
-
-    def drives(self) -> FloatArray:
-        """Return the effects' drives at the latest reading, shape (1 + effects over SoC,).
-
-        The first is the voltage of effects that do not depend on the SoC [V]. The effects' voltage
-        is linear in the drives, so that a mean of readings has the mean of their drives.
-        """
-        return self._drives
 
     def pseudo_ocv_at(
         self, soc_pct: float, drives: FloatArray | None = None
@@ -357,7 +348,7 @@ class OnlineModel:
         charging).
         """
         volts, slope = self.model.curve.at(soc_pct)
-        drives = self._drives if drives is None else drives
+        drives = self.drives if drives is None else drives
         volts += float(drives[0])
         if self._over_soc:
             at = soc_pct + SLOPE_STEP_PCT * np.array([-1.0, 0.0, 1.0])
@@ -373,8 +364,8 @@ class OnlineModel:
 
     def curve_values(self, soc_pct: FloatArray) -> FloatArray:
         """Return curve and effects [V] of the latest reading at SoC [%] of shape (n,)."""
-        volts = self.model.curve.values(soc_pct) + float(self._drives[0])
-        for (effect, values), drive in zip(self._over_soc, self._drives[1:], strict=True):
+        volts = self.model.curve.values(soc_pct) + float(self.drives[0])
+        for (effect, values), drive in zip(self._over_soc, self.drives[1:], strict=True):
             volts += drive * effect.over_soc(soc_pct, values, self.model)
         return volts
 
@@ -405,8 +396,8 @@ class OnlineModel:
             `Effect.drive` of every effect there.
         """
         effects = zip(self.extended.effects, drives, strict=True)
-        self._row = load
-        self._drives = np.array([beside_v, *(v for (effect, _), v in effects if effect.uses_soc)])
+        self.load = load
+        self.drives = np.array([beside_v, *(v for (effect, _), v in effects if effect.uses_soc)])
 
     def state(self) -> list[list[float]]:
         """Return the low-passed currents' state, then that of each effect, for `restore`."""
