@@ -174,8 +174,6 @@ def _use_capture(path: Path, what: int) -> None:
         inspect_capture(path).to_dict()
     elif what == 1:
         inspect_capture(path, _vehicles()[0]).to_dict()
-    elif what == 2:
-        capture_to_log(path, _vehicles()[0], source="replay-clock")
     elif what <= 20:
         log = capture_to_log(path, _vehicles()[0])
         if len(log) <= ESTIMATED_ROWS:

@@ -17,7 +17,6 @@ CHROMIUM, DRIVER = (
     for names in (("chromium", "chromium-browser", "google-chrome"), ("chromedriver",))
 )
 MARKS = [
-    pytest.mark.slow,
     pytest.mark.skipif(
         CHROMIUM is None or DRIVER is None, reason="needs chromium and chromedriver"
     ),

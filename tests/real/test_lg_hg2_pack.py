@@ -21,7 +21,7 @@ from cangauge.logs.read import read_log
 from cangauge.model.model_file import Model
 from chains import chain
 
-pytestmark = [pytest.mark.real, pytest.mark.slow]
+pytestmark = pytest.mark.real
 
 CAPACITY_AH = 2.78
 """Charge of the cell at 25 °C from full to 2.5 V [Ah]."""

@@ -14,8 +14,6 @@ import pytest
 from cangauge.logs.canonical import write_log
 from live import Command, in_process, leaf_model_path, short_log
 
-pytestmark = pytest.mark.slow
-
 MODEL = ("-m", leaf_model_path())
 
 

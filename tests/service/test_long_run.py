@@ -19,7 +19,7 @@ from cangauge.replay.encoder import FrameEncoder
 from cangauge.types import Estimate, Sample, Status
 from restarts import EPOCH_S, EVERY_S, RATE_HZ, ServiceRun, drive
 
-pytestmark = [pytest.mark.slow, pytest.mark.nightly]
+pytestmark = pytest.mark.nightly
 
 FORK = multiprocessing.get_context("fork")
 KILLS, SHARE = 20, 0.01

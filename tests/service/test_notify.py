@@ -97,7 +97,6 @@ def test_a_full_queue_does_not_block(systemd: FakeSystemd) -> None:
     assert time.monotonic() - began < 5.0
 
 
-@pytest.mark.slow
 def test_systemd_gets_ready_watchdog_and_stopping(
     systemd: FakeSystemd, monkeypatch: pytest.MonkeyPatch
 ) -> None:

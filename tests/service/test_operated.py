@@ -22,8 +22,6 @@ from live import (
 )
 from selection import nightly_except
 
-pytestmark = pytest.mark.slow
-
 MODEL = ("-m", leaf_model_path())
 
 

@@ -53,7 +53,6 @@ def samples_kept(path: Path) -> int:
     return read_state(path).estimator.memory.samples if path.exists() else 0
 
 
-@pytest.mark.slow
 def test_killed_started_again_and_stopped(tmp_path: Path) -> None:
     path = tmp_path / "state.json"
     wanted = [standard_filter(0x5A0)]

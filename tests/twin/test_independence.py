@@ -7,8 +7,6 @@ import subprocess
 import sys
 from pathlib import Path
 
-import pytest
-
 UNDER_TEST = ("cangauge.model", "cangauge.diagnosis", "cangauge.identify", "cangauge.estimation")
 
 
@@ -40,7 +38,6 @@ def test_validation_does_not_import_effects(project: Path) -> None:
         assert not {n for n in imported(path) if n.startswith("cangauge.model.effects")}, path.name
 
 
-@pytest.mark.slow
 def test_twin_loads_nothing_under_test(project: Path) -> None:
     folder = project / "src/cangauge"
     names = [
@@ -58,7 +55,6 @@ def test_twin_loads_nothing_under_test(project: Path) -> None:
     assert done.stdout.strip() == "[]"
 
 
-@pytest.mark.slow
 def test_importing_validation_loads_nothing_heavy() -> None:
     code = (
         "import sys, cangauge.extras.validation;print(any('numpy' in name for name in sys.modules))"

@@ -38,7 +38,6 @@ def drive(plant: PybammPlant) -> Drive:
 
 
 @needs_pybamm
-@pytest.mark.slow
 @pytest.mark.parametrize("parameter_set", nightly_except(PARAMETER_SETS[:1], PARAMETER_SETS))
 def test_every_parameter_set_simulates_a_drive(parameter_set: str) -> None:
     rng = np.random.default_rng(5)
@@ -57,7 +56,6 @@ def test_every_parameter_set_simulates_a_drive(parameter_set: str) -> None:
 
 
 @needs_pybamm
-@pytest.mark.slow
 def test_faults_change_the_voltage(plant: PybammPlant, drive: Drive) -> None:
     clean = simulate_truth(plant, drive)
     rms = {}

@@ -27,7 +27,7 @@ from cangauge.bus.captures import (
     parts_of_run,
 )
 from cangauge.bus.decoder import FrameStatistics, SampleDecoder
-from cangauge.bus.time_source import ReceiveTime, TimeSourceName, time_source
+from cangauge.bus.time_source import RecordedTime, TimeSource, time_source
 from cangauge.bus.vehicle import LOG_COLUMNS, Vehicle
 from cangauge.errors import InputError
 from cangauge.logs.column_map import ColumnMap
@@ -243,21 +243,21 @@ def open_vehicle_capture(path: str | PathLike[str], vehicle: Vehicle) -> Capture
     return open_capture(path, clock=clock)
 
 
-def capture_samples(
-    path: str | PathLike[str], vehicle: Vehicle, *, source: TimeSourceName = "receive"
-) -> CaptureSamples:
+def capture_samples(path: str | PathLike[str], vehicle: Vehicle) -> CaptureSamples:
     """Return the samples of a capture, bit for bit those of the live service.
 
-    Each bus in the capture has its own decoder; the bus with most samples is returned. Bus time
-    (`source`) is the recorded stamps, or the log time in REPLAY_CLOCK frames. Raises InputError if
+    Each bus in the capture has its own decoder; the bus with most samples is returned. Bus time is
+    that of REPLAY_CLOCK if the capture holds one, else the recorded stamps. Raises InputError if
     the capture cannot be read, or gives no sample.
     """
-    capture, clock = open_vehicle_capture(path, vehicle), time_source(source)
+    capture, recorded = open_vehicle_capture(path, vehicle), RecordedTime()
     # Of each bus: its time (stamps of two buses can be of two adapters), decoder, and values.
-    buses: dict[Any, tuple[Any, SampleDecoder, array[float]]] = {}
+    buses: dict[Any, tuple[TimeSource, SampleDecoder, array[float]]] = {}
     for message in capture:
+        if recorded.begins_replay(message):
+            buses.clear()
         if message.channel not in buses:
-            own = ReceiveTime() if isinstance(clock, ReceiveTime) else clock
+            own = time_source(recorded.name)
             buses[message.channel] = own, SampleDecoder(vehicle), array("d")
         own, decoder, values = buses[message.channel]
         if (now_s := own.time_of(message)) is not None:
@@ -265,15 +265,17 @@ def capture_samples(
             _keep(decoder.handle(message), decoder, values)
     for _, decoder, values in buses.values():
         _keep(decoder.flush(), decoder, values)
-    channel, (_, decoder, values) = max(buses.items(), key=lambda item: len(item[1][2]))
+    channel, (own, decoder, values) = max(buses.items(), key=lambda item: len(item[1][2]))
     statistics = decoder.statistics
     if not values:
         raise _without_current(path, vehicle, statistics)
     remarks = [*capture.info.remarks, *_losses(statistics)]
     if sum(bool(each[2]) for each in buses.values()) > 1:
         remarks.append(f"several buses carry the frames; bus {channel} is used: most samples")
-    if clock.beginnings:
-        remarks.append(f"the replay clock starts again {clock.beginnings} times")
+    if recorded.name == "replay-clock":
+        remarks.append("a recorded replay: time is its log's (REPLAY_CLOCK)")
+    if own.beginnings:
+        remarks.append(f"the replay clock starts again {own.beginnings} times")
     time_s, current_a, voltage_v, temperature_c, soc_pct = np.array(values).reshape(-1, 5).T
     return CaptureSamples(
         time_s, current_a, voltage_v, temperature_c, soc_pct, str(path), vehicle.temperature_source,
@@ -309,9 +311,7 @@ def _losses(statistics: FrameStatistics) -> list[str]:
     return [f"{count} {text}" for text, count in counts.items() if count]
 
 
-def capture_to_log(
-    path: str | PathLike[str], vehicle: Vehicle, *, source: TimeSourceName = "receive"
-) -> Log:
+def capture_to_log(path: str | PathLike[str], vehicle: Vehicle) -> Log:
     """Return a capture as a log; `soc_pct` is the car's own, if it sends one.
 
     A log has every value in every row. Time stamps that do not increase are dropped; voltage is
@@ -319,14 +319,13 @@ def capture_to_log(
     the first. Remarks count these rows and the lost frames. Raises InputError as `capture_samples`,
     and without voltage or temperature, or for values that are not a battery's.
     """
-    samples, path = capture_samples(path, vehicle, source=source), Path(path)
+    samples, path = capture_samples(path, vehicle), Path(path)
     remarks, time_s = list(samples.remarks), samples.time_s
     keep = time_s > np.concatenate([[-np.inf], np.maximum.accumulate(time_s)[:-1]])
     dropped = np.count_nonzero(~keep)
     if dropped > 0.5 * keep.size:
         problem = "time runs backwards or does not advance in the capture"
-        cure = "split it where time starts again; record with absolute stamps (candump -l, not"
-        cure += " -td); of a replay at full speed, take the replay clock as time"
+        cure = "split it where time starts again; record with absolute stamps (candump -l, not -td)"
         raise InputError(problem, source=path, cure=cure)
     if dropped:
         remarks.append(f"{dropped} samples dropped whose time does not advance")

@@ -157,18 +157,17 @@ class ReplayClock:
 
     def __init__(self, frame_id: int = REPLAY_CLOCK_ID) -> None:
         self.beginnings = self.refused = 0
-        self._id, self._codec = frame_id, _clock_codec()
+        self._id = frame_id
         self._now_us: int | None = None
 
     def time_of(self, message: can.Message) -> float | None:
         """Return the log time of the latest REPLAY_CLOCK [s]; None before, and for the clock."""
         if not is_clock(message, self._id):
             return None if self._now_us is None else self._now_us / MICROSECONDS
-        data = message.data
-        if len(data) != 8 or not CRC_ONLY_RULE.is_whole(data):
+        now_us = log_time_us(message.data)
+        if now_us is None:
             self.refused += 1
             return None
-        now_us = int(self._codec.decode(data))
         if self._now_us is not None and now_us < self._now_us - STEP_BACK_US:
             self.beginnings += 1
         self._now_us = now_us
@@ -194,6 +193,33 @@ def is_clock(message: can.Message, clock_id: int = REPLAY_CLOCK_ID) -> bool:
     return message.arbitration_id == clock_id and not (
         message.is_extended_id or message.is_error_frame or message.is_remote_frame
     )
+
+
+def log_time_us(data: bytes | bytearray) -> int | None:
+    """Return the time in the payload of a REPLAY_CLOCK [µs]; None for a wrong CRC or length."""
+    is_whole = len(data) == 8 and CRC_ONLY_RULE.is_whole(data)
+    return int(_clock_codec().decode(data)) if is_whole else None
+
+
+class RecordedTime:
+    """Which bus time a capture has: log time, if its first frame with REPLAY_CLOCK's id is one.
+
+    A car's own message of that id has another CRC. `name` is known at the end of the capture.
+    """
+
+    def __init__(self, clock_id: int = REPLAY_CLOCK_ID) -> None:
+        self.name: TimeSourceName = "receive"
+        self._id, self._is_known = clock_id, False
+
+    def begins_replay(self, message: can.Message) -> bool:
+        """Return whether a replay begins with this frame: those before it have no log time."""
+        if self._is_known or not is_clock(message, self._id):
+            return False
+        self._is_known = True
+        if log_time_us(message.data) is None:
+            return False
+        self.name = "replay-clock"
+        return True
 
 
 class ClockFrames:

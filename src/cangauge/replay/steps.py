@@ -123,8 +123,8 @@ class CaptureSource:
         """Yield the frames to send, stamped with log time."""
         self.dropped = 0
         clock_id = self._ids.replay_clock
-        has_clock = any(is_clock(message, clock_id) for message in self._messages())
-        clock = ReplayClock(clock_id) if has_clock else None
+        is_replay = any(map(RecordedTime(clock_id).begins_replay, self._messages()))
+        clock = ReplayClock(clock_id) if is_replay else None
         # The stamps of two buses can be of two adapters.
         stamps: defaultdict[Channel | None, ReceiveTime] = defaultdict(ReceiveTime)
         own = {*self._ids.published, clock_id}

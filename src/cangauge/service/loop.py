@@ -239,7 +239,7 @@ class Loop:
                 self._poller.note_other_tester(self._now_s)
         elif not is_clock(message, ids.replay_clock):
             return False
-        elif not self._clock_was_seen:
+        elif not self._clock_was_seen and log_time_us(message.data) is not None:
             self._clock_was_seen = True
             text = "a replay sends its log's time on this bus (REPLAY_CLOCK), but this service"
             text += " uses receive stamps; to use the log's time, run with"

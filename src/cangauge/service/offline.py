@@ -22,7 +22,7 @@ from cangauge._text import rounded
 from cangauge._typing import FloatArray
 from cangauge.bus.publish import NO_REPORT, FrameIds, PackReport
 from cangauge.bus.recording import CaptureSamples, capture_samples, open_vehicle_capture
-from cangauge.bus.time_source import REPLAY_CLOCK_ID, TimeSourceName, is_clock
+from cangauge.bus.time_source import REPLAY_CLOCK_ID, RecordedTime, TimeSourceName
 from cangauge.bus.vehicle import Vehicle
 from cangauge.errors import InputError
 from cangauge.estimation.cells import CellEstimator
@@ -308,17 +308,15 @@ def estimate_capture(
         If the capture cannot be read, gives no sample, or its voltage is another pack's.
     """
     began = time.perf_counter()
-    source: TimeSourceName = "receive"
+    recorded_time = RecordedTime(clock_id)
     buses: dict[Channel | None, _Bus] = {}
     capture = open_vehicle_capture(path, vehicle)
     for number, message in enumerate(capture, start=1):
-        if source == "receive" and is_clock(message, clock_id):
-            # Earlier frames have no log time; a live run starts here as well.
-            source = "replay-clock"
-            buses.clear()
+        if recorded_time.begins_replay(message):
+            buses.clear()  # a live run starts here as well
         if message.channel not in buses:
             ids = FrameIds(replay_clock=clock_id)
-            chosen = PipelineSettings(settings or EstimatorSettings(), source, ids)
+            chosen = PipelineSettings(settings or EstimatorSettings(), recorded_time.name, ids)
             pipeline = Pipeline(vehicle, model, chosen, publishes=False)
             buses[message.channel] = _Bus(pipeline, PackHistory(keeps_rows=keeps_pack))
         bus = buses[message.channel]
@@ -342,7 +340,7 @@ def estimate_capture(
     best.pack.report, counts = pipeline.report(), pipeline.counts
     settings = pipeline.estimator.settings
     time_s, current_a, voltage_v, temperature_c, soc_pct = np.array(best.values).reshape(-1, 5).T
-    time_s, remarks = _without_steps_back(time_s), _remarks(source, counts, len(found))
+    time_s, remarks = _without_steps_back(time_s), _remarks(recorded_time.name, counts, len(found))
     recorded = CaptureSamples(
         time_s, current_a, voltage_v, temperature_c, soc_pct, str(path),
         settings.temperature_source, pipeline.decoder.statistics, capture.info,
@@ -356,7 +354,7 @@ def estimate_capture(
     scores = score(table, cast("Log", recorded), time.perf_counter() - began)
     origin: Origin = "voltage" if settings.initial_soc_pct is None else "given"
     return RecordedEstimate(
-        recorded, table, scores, model, settings, origin, source, counts, best.pack
+        recorded, table, scores, model, settings, origin, recorded_time.name, counts, best.pack
     )
 
 

@@ -16,8 +16,6 @@ from faults.line import udp
 from faults.process import Target, prepare
 from faults.run import Jobs, Result, run_all
 
-pytestmark = pytest.mark.slow
-
 BRIEF = Profile("brief", 75.0, 60.0, (12.0, 42.0), 8.0)
 """7.5 s; the fakes have no delay line to fill."""
 

@@ -14,7 +14,6 @@ from fuzzing.target import FindingError, Target, attempt
 from fuzzing.targets import targets
 
 
-@pytest.mark.slow
 def test_hangs_deaths_errors_and_growth_are_found() -> None:
     done: list[int] = []
     tallies = fuzz(
