@@ -26,25 +26,28 @@ help:
 	@echo "make bench     time and accuracy beside other packages, and how the cost grows (DATA=FOLDER, see README)"
 	@echo "make packs     SoC errors on recorded packs, with models from few logs (DATA=FOLDER)"
 
-# Bytecode is made where a module is first imported: compiling all of it takes longer than the job.
-INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile
+# Bytecode of what runs, with all cores; pip compiles the packages' own tests too, with one.
+define install
+$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile --editable '$(1)'
+$(BIN)/python -m compileall -q -j 0 -x '/tests?/' $(VENV)/lib
+endef
 
 $(VENV)/installed: pyproject.toml hatch_build.py $(wildcard core/*.[ch])
 	$(PYTHON) -c 'import sys; sys.exit("cangauge needs Python 3.11 or later (set PYTHON=…)" if sys.version_info < (3, 11) else 0)'
 	$(PYTHON) -m venv $(VENV)
-	$(INSTALL) --editable .
+	$(call install,.)
 	touch $@
 
 $(VENV)/installed-dev: $(VENV)/installed
-	$(INSTALL) --editable '.[dev]'
+	$(call install,.[dev])
 	touch $@
 
 $(VENV)/installed-nightly: $(VENV)/installed-dev
-	$(INSTALL) --editable '.[nightly]'
+	$(call install,.[nightly])
 	touch $@
 
 $(VENV)/installed-docs: $(VENV)/installed
-	$(INSTALL) --editable '.[docs]'
+	$(call install,.[docs])
 	touch $@
 
 demo: $(VENV)/installed
