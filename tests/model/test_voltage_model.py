@@ -148,6 +148,13 @@ def test_curve_passes_its_knots_and_falling_values_are_raised() -> None:
     assert np.all(np.diff(volts) > 0.0)
 
 
+@given(st.integers(0, 10**6))
+def test_a_curve_rises_between_its_knots_too(seed: int) -> None:
+    shares = np.random.default_rng(seed).dirichlet(np.full(KNOTS_PCT.size, 0.5))
+    curve = HermiteCurve.rising(KNOTS_PCT, 300.0 + 80.0 * np.cumsum(shares))
+    assert curve.slopes(np.linspace(-10.0, 110.0, 2401)).min() > 0.0
+
+
 def test_load_columns_are_the_equation() -> None:
     model = VoltageModel(
         HermiteCurve.rising(KNOTS_PCT, VOLTS), -0.02, (-0.06, -0.01, -0.02), (0.0, 10.0), (140.0,),

@@ -139,6 +139,8 @@ def fit(
     require_choice(chemistry, (*CHEMISTRIES, None), "chemistry")
     if capacity_ah not in (None, "from-soc"):
         require_number(capacity_ah, "capacity_ah")
+    if cells is not None and not cells >= 1:
+        raise InputError("a pack has at least one cell", field="cells", value=cells)
     recorded = [as_log(log) for log in (logs if isinstance(logs, list | tuple) else [logs])]
     _check_logs(recorded)
     stated_pct = given_starts(initial_soc_pct, len(recorded))

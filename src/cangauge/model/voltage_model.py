@@ -175,12 +175,17 @@ class HermiteCurve:
         secant = np.diff(value) / np.diff(soc_pct)
         flatter = np.minimum(np.r_[secant[0], secant], np.r_[secant, secant[-1]])
         limited = np.clip(slope, FLATTEST_SECANT * flatter, STEEPEST_SECANT * flatter)
-        t = np.array([0.0, 0.25, 0.5, 0.75, 1.0])[:, None]
-        inner = _cubic(np.arange(secant.size), np.diff(soc_pct), t)
-        across = inner.sum(inner.slope, value, slope)
-        falls = (across <= 0.0).any(axis=0)
-        beside = np.r_[falls, False] | np.r_[False, falls]
-        return cls(soc_pct, value, np.where(beside, limited, slope))
+        inner = _cubic(np.arange(secant.size), np.diff(soc_pct), np.array([0.0, 0.5, 1.0])[:, None])
+        for _ in soc_pct:  # a changed slope can make the next interval fall
+            # The slope between knots is a parabola in t: d0 + b t + a t², lowest at −b / 2a.
+            d0, middle, d1 = inner.sum(inner.slope, value, slope)
+            a, b = 2.0 * (d0 - 2.0 * middle + d1), 4.0 * middle - 3.0 * d0 - d1
+            t = np.clip(np.divide(-b, 2.0 * a, out=np.zeros_like(a), where=a > 0.0), 0.0, 1.0)
+            falls = np.minimum(np.minimum(d0, d1), d0 + (b + a * t) * t) <= 0.0
+            if not falls.any():
+                break
+            slope = np.where(np.r_[falls, False] | np.r_[False, falls], limited, slope)
+        return cls(soc_pct, value, slope)
 
     @cached_property
     def _lists(self) -> tuple[list[float], list[float], list[float]]:
