@@ -374,3 +374,26 @@ def test_a_wrong_map_of_cells_names_the_field(tmp_path: Path, cells: str, words:
         cell_car(tmp_path, cells)
     assert words in str(refused.value)
     assert "cells" in str(refused.value)
+
+
+TURNS = """VERSION ""
+BU_: BMS
+BO_ 256 Pack: 3 BMS
+ SG_ part M : 0|8@1+ (1,0) [0|1] "" X
+ SG_ I m0 : 8|16@1- (0.1,0) [-1000|1000] "A" X
+ SG_ U m1 : 8|16@1+ (0.1,0) [0|1000] "V" X
+BO_ 257 Cell: 1 BMS
+ SG_ T : 0|8@1+ (1,-40) [-40|215] "degC" X
+"""
+
+
+def test_current_and_voltage_take_turns_in_one_message(tmp_path: Path) -> None:
+    (tmp_path / "car.dbc").write_text(TURNS)
+    (tmp_path / "car.toml").write_text(
+        '[current]\nsignal = "I"\n[voltage]\nsignal = "U"\n[temperature]\nsignal = "T"\n'
+    )
+    decoder = SampleDecoder(Vehicle.load(dbc=tmp_path / "car.dbc", map=tmp_path / "car.toml"))
+    payloads = ((257, bytes([60])), (256, bytes([0, 100, 0])), (256, bytes([1, 0x74, 0x0E])))
+    turns = [frame(number, data, 0.1 * turn) for turn in range(10) for number, data in payloads]
+    samples = feed(decoder, turns)
+    assert [each[1:] for each in samples] == [(10.0, 370.0, 20.0)] * 10
