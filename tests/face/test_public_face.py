@@ -134,7 +134,7 @@ def test_a_log_and_a_model_are_taken_in_every_form(
         (lambda *_: cangauge.Model.load(7), "not a path .got 'int'"),
         (lambda *_: cangauge.Estimator(7), "not a model .got 'int'"),
         (lambda *_: cangauge.Log.from_dataframe(7), "not a log .got 'int'"),
-        (lambda *_: cangauge.Log(["a"], [1], [2], [3]), "a column of a log holds numbers"),
+        (lambda *_: cangauge.Log(["a"], [1], [2], [3]), "holds values that are not numbers"),
     ],
 )
 def test_a_wrong_type_is_one_line_with_a_cure(

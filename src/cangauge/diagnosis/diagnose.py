@@ -35,8 +35,8 @@ CROSS_VALIDATED = 5
 """Number of effects, the most probable ones, whose errors are found on held-out rows."""
 
 WORSE_SOC, WORSE_SOC_PCT = 1.25, 0.25
-"""A cause is not accepted with which the SoC error of these logs is larger than this many times
-that of the given model and this [%]: on healthy trips of one car it scatters by as much."""
+"""A cause is rejected if the SoC error of these logs with it exceeds `WORSE_SOC` times that of the
+given model plus `WORSE_SOC_PCT`: on healthy trips of one car it scatters by as much."""
 
 SETTLING_S = 300.0
 """Start of a log, with withheld initial SoC, that the SoC error leaves out [s]."""
@@ -389,7 +389,7 @@ def diagnose(
         if model is None:
             raise InputError("no model", field="model", cure="give a model, or a simulation")
         check_logs(logs, own, model)
-        _LOG.info("reading the references")
+        _LOG.info("reading the logs")
         traces, remarks = _traces(logs, model, initial_soc_pct)
         known = references
         if not isinstance(references, References):

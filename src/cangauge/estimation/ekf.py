@@ -18,10 +18,10 @@ Measurement, the mean voltage of a block of rows with mean load row L, at temper
     U = g(S) + L·θ + row(S, L)·c + A z + √((A·level)² + (δ·g′)²)·w + v,    A = A(T) ≥ 1
     R = var v = (A·fast)² + (δ·g′)²
 
-g′ is the slope of the curve, δ the lasting uncertainty of the SoC against voltage. The sizes are
-those of the model (`Noise`). While the SoC is uncertain by more than `LINEAR_PCT` the update is
-iterated (iterated extended Kalman filter; Jazwinski, Stochastic Processes and Filtering Theory,
-1970, ch. 8.3).
+g′ is the slope of the curve, δ the uncertainty of the SoC against voltage: one part of it lasts,
+an equal one is new in each block. The sizes are those of the model (`Noise`). While the SoC is
+uncertain by more than `LINEAR_PCT` the update is iterated (iterated extended Kalman filter;
+Jazwinski, Stochastic Processes and Filtering Theory, 1970, ch. 8.3).
 """
 
 from __future__ import annotations
@@ -55,9 +55,9 @@ CLOSE_PCT: Final = 0.05
 
 LOWEST_PCT: Final = -25.0
 HIGHEST_PCT: Final = 125.0
-"""Bounds of the SoC in the filter [%]. A stated capacity that is 20 % too small, two standard
-deviations of its prior, ends there. A state held back by a bound is not what the separate bias
-assumes: at −5 % a capacity stated 10 % too small was learned 6 % too small."""
+"""Bounds of the SoC in the filter [%]: as far as a capacity leads that is stated 20 % too small,
+two standard deviations of its prior. A bound that holds the state back falsifies the capacity that
+is learned: with −5 % a capacity stated 10 % too small was learned 6 % too small."""
 
 LEAST_SLOPE: Final = 1e-3
 """Least slope of the curve in the filter [V/%]: keeps the SoC observable in a plateau."""

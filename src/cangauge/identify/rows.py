@@ -40,7 +40,7 @@ ROWS_PER_COEFFICIENT = 4
 """Rows that a coefficient of the published equation needs."""
 
 LEAST_ROWS = ROWS_PER_COEFFICIENT * (len(BASIS_NAMES) + 1 + len(DELAYS_S))
-"""Fewest rows for a fit: so that its 13 coefficients have theirs."""
+"""Fewest rows for a fit: those of the 13 coefficients of the published equation."""
 
 TEMPERATURE_SPAN_K = 3.0
 """Least span of the temperature from which kt is identified [K]: sensors have steps of 1 K."""

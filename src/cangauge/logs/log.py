@@ -258,6 +258,6 @@ def _read_only(values: ArrayLike) -> FloatArray:
     try:
         array = np.array(values, dtype=np.float64, copy=True)
     except (TypeError, ValueError) as error:
-        raise InputError(f"a column of a log holds numbers ({error})") from error
+        raise InputError(f"a column holds values that are not numbers ({error})") from error
     array.flags.writeable = False
     return array

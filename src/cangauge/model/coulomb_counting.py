@@ -62,7 +62,7 @@ def counted_soc_pct(log: Log, capacity_ah: float) -> FloatArray:
 
 
 def difference_from_reference(log: Log, capacity_ah: float) -> str | None:
-    """Return how much the counted charge differs from the log's own SoC, in a phrase, or None.
+    """Return a phrase if counted charge and the log's own SoC disagree, or that is frozen; or None.
 
     Parameters
     ----------
@@ -73,8 +73,8 @@ def difference_from_reference(log: Log, capacity_ah: float) -> str | None:
     Returns
     -------
     str or None
-        The capacity that the log implies; None where both changes agree within `DIFFERENT_PCT`, or
-        the reference moves less than that without being frozen.
+        With the capacity that the log implies, unless its SoC is frozen. None where both changes
+        agree within `DIFFERENT_PCT`, or the reference moves less than that without being frozen.
     """
     soc_pct, out_ah = _readings(log)
     if soc_pct.size < 2:
@@ -201,7 +201,7 @@ def _whole_capacity_ah(log: Log, stated_pct: float | None) -> float | None:
 
 
 def _ends_in_the_knee(log: Log, out_ah: FloatArray) -> bool:
-    """Whether the voltage, less its drop over the resistance, falls steeply at the end."""
+    """Whether the voltage, with the drop over the resistance added, falls steeply at the end."""
     total_ah = float(out_ah[-1])
     running = log.voltage_v > 0.5 * np.median(log.voltage_v)
     if total_ah <= 0.0 or running.sum() < 100:

@@ -56,7 +56,7 @@ def filled_at(
 
 
 SPACING_S = 0.009
-"""Least spacing of every second sample kept [s]: it bounds the memory at any frame rate."""
+"""Least distance of two kept samples with one between them [s]: bounds the memory at any rate."""
 
 BLOCK = 512
 """Number of stale currents that are dropped at once."""
@@ -72,8 +72,8 @@ class DelayLine:
     gap_s : float
         A longer step between two samples empties the line [s].
     spacing_s : float
-        Least spacing of the samples kept, except the newest [s]: it bounds the memory at any frame
-        rate (70 s at 100 Hz are kept completely).
+        Least distance of two kept samples with one between them, except the newest [s]; see
+        `SPACING_S`. 70 s at 100 Hz are kept completely.
     """
 
     def __init__(

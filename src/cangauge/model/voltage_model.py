@@ -417,7 +417,7 @@ class VoltageModel:
     resistance_ohm : tuple of float
         Rm on the current at each delay, then on each low-passed current [Ω]; negative.
     delay_s : tuple of float
-        Delays [s], increasing from 0.
+        Delays [s], increasing, not negative.
     low_pass_s : tuple of float
         Time constants of the low-passed currents [s].
     arrhenius : Arrhenius, optional

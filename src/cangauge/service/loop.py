@@ -152,7 +152,7 @@ class Loop:
         self._port.set_filters([*pipeline.filters, *map(standard_filter, sorted(not_input))])
 
     def run(self, stop: Callable[[], bool]) -> None:
-        """Receive, estimate and publish until `stop()`, which is called every `LONGEST_WAIT_S`.
+        """Receive, estimate and publish until `stop()`, called at least every `LONGEST_WAIT_S`.
 
         Raises
         ------
