@@ -19,10 +19,11 @@ def main() -> None:
         # In a locale without "±" or "°C" the text is legible; otherwise it would be an error.
         sys.stdout.reconfigure(errors="backslashreplace")
     if sys.argv[1:2] == ["run"] and hasattr(signal, "SIGHUP"):
+        signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGHUP])
         from cangauge.service.lifecycle import has_terminal  # noqa: PLC0415 - for `run` only
 
-        if not has_terminal():  # else its default: closing the terminal ends the start as well
-            signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGHUP])
+        if has_terminal():  # closing the terminal ends the start as well
+            signal.pthread_sigmask(signal.SIG_UNBLOCK, [signal.SIGHUP])
     from cangauge.cli.app import main as command_line  # noqa: PLC0415 - takes a second
 
     command_line()

@@ -38,7 +38,9 @@ def read_toml(path: str | PathLike[str]) -> dict[str, Any]:
     try:
         return tomllib.loads(data.decode("utf-8-sig"))
     except (ValueError, RecursionError) as error:  # ValueError: also not UTF-8
-        raise InputError(f"not TOML: {error}", source=path) from error
+        is_deep = isinstance(error, RecursionError)
+        problem = "nested too deeply" if is_deep else str(error)
+        raise InputError(f"not TOML: {problem}", source=path) from error
 
 
 def validated(model: type[Model], data: object, source: str | PathLike[str]) -> Model:

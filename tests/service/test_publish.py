@@ -171,6 +171,14 @@ def test_jitter_does_not_halve_the_rate() -> None:
     assert sent == 1000
 
 
+def test_samples_of_one_log_time_send_one_estimate() -> None:
+    publisher = SocPublisher()
+    for sample in range(2000):
+        sent = [publisher.publish(estimate(0.1 * sample), sample) for _ in range(2)]
+        estimates = [[each.arbitration_id for each in frames].count(0x5A0) for frames in sent]
+        assert estimates == [1, 0]
+
+
 def test_samples_are_acknowledged_at_a_fixed_interval() -> None:
     publisher = SocPublisher(acknowledge_every=4)
     told = [

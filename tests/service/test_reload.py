@@ -135,6 +135,21 @@ def test_published_ids_change_and_their_counters_go_on(car: Car) -> None:
     assert estimate_counter(first) == (last + 1) % 16
 
 
+def test_a_reload_that_contradicts_the_model_changes_nothing(car: Car) -> None:
+    estimator = car.pipeline.estimator
+    text = 'method = "coulomb"\n[ids]\nsoc_estimate = 0x100\n[limits]\nmin_voltage_v = 500\n'
+    assert car.reload(text) is None
+    assert car.pipeline.estimator is estimator
+    assert {each.arbitration_id for each in car.drive(1000, 1020)} == {0x5A0, 0x5A1, *PACK_IDS}
+
+
+def test_another_name_of_the_model_keeps_the_signals_health(car: Car) -> None:
+    car.model.write_text(car.model.read_text().replace('"name": "', '"name": "second '))
+    decoder = car.pipeline.decoder
+    assert car.reload("") is not None
+    assert car.pipeline.decoder is decoder
+
+
 def estimate_counter(frame: can.Message) -> int:
     layout = load_dbc(shared_file("dbc", "soc_estimate.dbc")).get_message_by_name("SOC_ESTIMATE")
     values = layout.decode(frame.data, decode_choices=False)

@@ -282,8 +282,8 @@ SUSPECTED_AT: Final = 8.0
 """Frames out of sequence, repeated or too soon, from which a second sender is suspected: a sender
 that restarts makes one or two."""
 FORGIVEN: Final = 1.0 / 3.0
-"""Such frames forgiven by each period: two senders make at least one in a period, however many
-frames they send; lost frames in bursts (stamps of a batch are equal) make one in four or fewer."""
+"""Such frames forgiven by each frame in sequence: of two senders at least every second frame is out
+of sequence, of lost frames in bursts (stamps of a batch are equal) one in four or fewer."""
 
 
 class FrameChecker:
@@ -309,7 +309,7 @@ class FrameChecker:
         wrap_s = 2.0 * SILENCE_S if period_s is None else period_s * min(rule.modulus, WIDE)
         self._half_wrap_s = wrap_s / 2
         self._last, self._last_s = -1, 0.0
-        self._refused, self._odd, self._due_s = 0, 0.0, math.nan
+        self._refused, self._odd = 0, 0.0
         self._content: bytes | bytearray = b""
         self._is_repeated = False
         self.lost = 0
@@ -332,17 +332,13 @@ class FrameChecker:
         elapsed_s, self._last_s = time_s - self._last_s, time_s
         steps = (counter - last) % modulus
         self.lost = 0
-        is_next = steps == 1 or last < 0
-        if self._odd:
-            periods = max(elapsed_s, 0.0) / self._due_s if self._due_s > 0.0 else 1.0
-            self._odd = max(self._odd - FORGIVEN * periods, 0.0)
-        elif not is_next:
-            # The period from before the first doubt: a second sender would teach its own.
-            self._due_s = self.learned_period_s() if self._period_s is None else self._period_s
-        if is_next:
+        if steps == 1 or last < 0:
             self._is_repeated = False
+            if self._odd:
+                self._odd = max(self._odd - FORGIVEN, 0.0)
         else:
-            is_soon = 0.0 <= elapsed_s < SOON * self._due_s
+            period_s = self.learned_period_s() if self._period_s is None else self._period_s
+            is_soon = 0.0 <= elapsed_s < SOON * period_s
             was_repeated = self._is_repeated
             self._is_repeated = steps == 0 and elapsed_s <= self._half_wrap_s
             # The second repetition in a row is a stuck counter.

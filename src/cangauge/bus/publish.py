@@ -248,8 +248,9 @@ class SocPublisher:
         self, estimate: Estimate, samples: int, report: Callable[[], PackReport] | None = None
     ) -> list[can.Message]:
         """Return the frames due with a sample of a replayed log; arguments as in `beat`."""
-        is_due = self._is_due(ESTIMATE_EVERY_S, estimate.time_s)
-        frames = [self.estimate_frame(estimate)] if is_due else []
+        frames = []
+        if self._is_due(ESTIMATE_EVERY_S, estimate.time_s):
+            frames.append(self.estimate_frame(estimate))
         is_due = self._is_due(DETAIL_EVERY_S, estimate.time_s)
         is_behind = samples - self._acknowledged >= (self._acknowledge_every or math.inf)
         return frames + self._slow_frames(estimate, samples, report, is_due, is_behind)
@@ -260,7 +261,7 @@ class SocPublisher:
         The grid is a new one after a pause, and in a new log, which begins earlier.
         """
         due_s = self._due_s[every_s]
-        if not (now_s >= due_s - EARLY_S or now_s < due_s - every_s):
+        if not (now_s >= due_s - EARLY_S or now_s < due_s - every_s - EARLY_S):
             return False
         is_on_grid = due_s - EARLY_S <= now_s < due_s + every_s
         self._due_s[every_s] = every_s + (due_s if is_on_grid else now_s)

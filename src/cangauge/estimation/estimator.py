@@ -202,11 +202,18 @@ class Estimator:
 
     def pack_tick(self, sample: Sample) -> PackTick:
         """Return what is known of the pack after its latest sample, for its cells."""
-        counter = self._counter.state
+        counter, (soc_pct, std_pct) = self._counter.state, self._soc()
         is_counting = not math.isnan(counter.time_s)
-        load_v, drop_v = self._load()[1:] if is_counting else (math.nan, math.nan)
-        volts = sample.voltage_v, load_v, drop_v
-        return PackTick(sample.time_s, *self._soc(), *volts, counter.moved_pct)
+        _, load_v, drop_v = self._load() if is_counting else (None, math.nan, math.nan)
+        return PackTick(
+            time_s=sample.time_s,
+            soc_pct=soc_pct,
+            soc_std_pct=std_pct,
+            voltage_v=sample.voltage_v,
+            without_ocv_v=load_v,
+            drop_v=drop_v,
+            moved_pct=counter.moved_pct,
+        )
 
     def current_changes(self, time_s: float, stamps_s: Sequence[float]) -> list[float]:
         """Return the current at a sample's time less that at other stamps [A]; NaN for NaN."""
@@ -237,8 +244,8 @@ class Estimator:
             memory.gap_until_s = time_s + self._online.delay_line.longest_s
         if away_s := charge.away_s:
             self._predict_to_now()
-            wide = moved_probability(away_s), moved_std_pct(away_s)
-            self.hypotheses.doubt(*wide, away_s, charge.parked_std_pct)
+            probability, std_pct = moved_probability(away_s), moved_std_pct(away_s)
+            self.hypotheses.doubt(probability, std_pct, away_s, charge.parked_std_pct)
             memory.doubt = "interval"
             memory.coulomb_var_pct2 += away_std_pct(away_s) ** 2
         if abs(current_a) > REST_CURRENT_C_RATE * self.capacity_ah:
@@ -425,9 +432,18 @@ class Estimator:
             if is_set:
                 bits |= int(reason)
         reasons = REASONS[bits | int(outside_model(self.voltage_model, soc_pct, sample))]
-        socs = soc_pct, std_pct, memory.newton_pct, self._coulomb_soc()[0]
-        volts = memory.voltage_model_v, memory.residual_v
-        self._latest = Estimate(stamp_s, *socs, *volts, status_of(reasons), reasons, memory.samples)
+        self._latest = Estimate(
+            stamp_s,
+            soc_pct,
+            std_pct,
+            memory.newton_pct,
+            self._coulomb_soc()[0],
+            memory.voltage_model_v,
+            memory.residual_v,
+            status_of(reasons),
+            reasons,
+            memory.samples,
+        )
         return self._latest
 
     # --- restart, and another model

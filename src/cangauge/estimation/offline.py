@@ -94,11 +94,12 @@ class EstimateTable(ArrowExport):
     def of(cls, estimates: Iterable[Estimate]) -> EstimateTable:
         """Collect estimates into columns."""
         columns = list(zip(*estimates, strict=True)) or [()] * len(Estimate._fields)
-        kinds = [np.float64] * len(NUMBERS) + [np.int64] * 2
-        arrays: list[Any] = [
-            np.array(column, kind) for column, kind in zip(columns, kinds, strict=False)
-        ]
-        return cls(*arrays)
+        by_name = dict(zip(Estimate._fields, columns, strict=True))
+        flags: dict[str, Any] = {
+            name: np.array(by_name[name], np.int64) for name in ("status", "reasons")
+        }
+        numbers: dict[str, Any] = {name: np.array(by_name[name], np.float64) for name in NUMBERS}
+        return cls(**numbers, **flags)
 
     def __repr__(self) -> str:
         """Return the number of samples, the time and the SoC at both ends."""

@@ -71,8 +71,13 @@ class FrameEncoder:
         "not available". InputError is raised if a value does not fit into its signal, or has no
         such code.
         """
-        time_s, *pack = sample
-        values = dict(zip(_UNITS, (*pack, soc_reference_pct), strict=True))
+        time_s, current_a, voltage_v, temperature_c = sample
+        values = {
+            "current": current_a,
+            "voltage": voltage_v,
+            "temperature": temperature_c,
+            "soc_reference": soc_reference_pct,
+        }
         messages = []
         for frame in self._frames:
             if all(math.isnan(values[signal.role]) for signal in frame.signals):

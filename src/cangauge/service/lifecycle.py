@@ -68,9 +68,15 @@ def reload_on_hangup(reload: Callable[[], None]) -> Iterator[None]:
 
     kinds = [signal.SIGHUP] if hasattr(signal, "SIGHUP") else []
     with _handler(handle, *kinds):
-        if kinds:  # handle one that was held back while the service loaded (`__main__`)
-            signal.pthread_sigmask(signal.SIG_UNBLOCK, kinds)
-        yield
+        if not kinds:
+            yield
+            return
+        # Handle one that was held back while the service loaded (`__main__`).
+        before = signal.pthread_sigmask(signal.SIG_UNBLOCK, kinds)
+        try:
+            yield
+        finally:
+            signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def has_terminal() -> bool:

@@ -124,8 +124,8 @@ class Loop:
         if self._stamps_are_arrival:
             self._stamps = StampLimiter(KERNEL_TOLERANCE_S, time.time() - steady_s())
         self._shift_s = 0.0
-        # Beginning of the latest step that emptied the receive queue, after which the frames of
-        # the next step arrived; time at which the latest step received.
+        # Beginning of the latest turn that emptied the receive queue, after which the frames of
+        # the next turn arrived; time at which the latest turn received.
         self._drained_s = self._received_s = steady_s()
         self._reported: set[str] = set()
         self._clock_was_seen = False
@@ -161,7 +161,7 @@ class Loop:
         """
         try:
             while not (stop() or self._is_over()):
-                self._step()
+                self._turn()
             if self._pipeline.finish():
                 self._give_sample(self._pipeline.latest)
                 self._now_s = time.monotonic()
@@ -175,7 +175,7 @@ class Loop:
         is_idle = idle_s is not None and self._now_s - self._sample_s >= idle_s
         return is_late or (is_idle and self._pipeline.samples > 0)
 
-    def _step(self) -> None:
+    def _turn(self) -> None:
         """Receive once, process the frames, and do what is due."""
         left_s = self._beat_s + LATE_S - self._now_s
         messages = self._port.receive_pending(min(max(left_s, 0.0), LONGEST_WAIT_S))

@@ -29,6 +29,7 @@ from cangauge.bus.vehicle import Vehicle
 from cangauge.errors import InputError
 from cangauge.estimation.cells import CellEstimator
 from cangauge.estimation.compiled import make_estimator
+from cangauge.estimation.estimator import Estimator
 from cangauge.estimation.settings import EstimatorSettings
 from cangauge.estimation.state import EstimatorState
 from cangauge.logs.log import Log
@@ -190,6 +191,7 @@ class Pipeline:
         self._estimate = NOTHING_YET  # after the latest sample, without the signals' health
         self._report: tuple[int, PackReport] | None = None
         self.estimator = make_estimator(model, _with_source(settings.estimator, vehicle))
+        self._pack = _pack_of(self.estimator)
         self._begin_signals()
 
     # --- frames → estimates
@@ -298,22 +300,14 @@ class Pipeline:
         self._begin_signals()
 
     def _begin_signals(self) -> None:
-        """Begin to judge the signals anew, for the present vehicle, model and estimator."""
-        model, voltage_model = self.model, self.estimator.voltage_model
-        capacity_ah = self.estimator.settings.capacity_ah
-        resistances = voltage_model.resistance_ohm
-        pack = PackProperties(
-            resistance_ohm=abs(resistances[0]) if resistances else 0.0,
-            error_std_v=model.noise.residual_std_v,
-            capacity_ah=model.capacity_ah if capacity_ah is None else capacity_ah,
-            usual_v=voltage_model.pseudo_ocv_at(50.0)[0],
-        )
-        self.decoder = SampleDecoder(self.vehicle, pack, self._statistics)
+        """Begin to judge the signals anew, for the present vehicle and model."""
+        self.decoder = SampleDecoder(self.vehicle, self._pack, self._statistics)
         self.sign = SignWatch()
-        cells = self.vehicle.cells
-        self.cells = None
-        if cells is not None:
-            self.cells = CellEstimator(voltage_model, cells.count, cells.first)
+        self._begin_cells()
+
+    def _begin_cells(self) -> None:
+        cells, model = self.vehicle.cells, self.estimator.voltage_model
+        self.cells = None if cells is None else CellEstimator(model, cells.count, cells.first)
 
     # --- estimates → frames
 
@@ -353,8 +347,9 @@ class Pipeline:
         estimate = self.estimate_now()
         if not self.is_replay:
             current = self.decoder.health["current"]
-            slowest_s = MISSED_AT_LEAST * current.period_s  # NaN, which max drops, while not known
-            timeout_s = min(max(timeout_s, slowest_s), current.timeout_s)
+            if not math.isnan(current.period_s):
+                timeout_s = max(timeout_s, MISSED_AT_LEAST * current.period_s)
+            timeout_s = min(timeout_s, current.timeout_s)
         if silent_s > timeout_s and self.taken:
             reasons |= Reason.INPUT_STALE
         if reasons:
@@ -378,26 +373,30 @@ class Pipeline:
         Unchanged parts keep their state bit for bit. A changed model or estimator setting makes a
         new estimator, which takes over SoC and delay line. Initial SoC, its standard deviation, the
         time source and REPLAY_CLOCK's id stay. InputError, and no change, if a frame to publish has
-        the id of a vehicle's signal.
+        the id of a vehicle's signal, or settings contradict the model.
         """
         old, before = self.settings, self.estimator
         ids = replace(settings.ids, replay_clock=old.ids.replay_clock)
         if self._publisher is not None:
             _check_ids(vehicle, ids)
-            self._publisher.ids = ids
-        self.settings = replace(settings, ids=ids, time_source=old.time_source)
         chosen = replace(
             _with_source(settings.estimator, vehicle),
             initial_soc_pct=before.settings.initial_soc_pct,
             initial_soc_std_pct=before.settings.initial_soc_std_pct,
         )
-        judged_by = self.vehicle, self.model, before.settings.capacity_ah
-        if (model, chosen) != (self.model, before.settings):
+        is_other_model = model != self.model
+        if is_other_model or chosen != before.settings:
             self.estimator = make_estimator(model, chosen)
             self.estimator.take_over(before)
-        self.vehicle, self.model, self._report = vehicle, model, None
-        if judged_by != (vehicle, model, chosen.capacity_ah):
+        judged_by, pack = (self.vehicle, self._pack), _pack_of(self.estimator)
+        self.settings = replace(settings, ids=ids, time_source=old.time_source)
+        self.vehicle, self.model, self._pack, self._report = vehicle, model, pack, None
+        if self._publisher is not None:
+            self._publisher.ids = ids
+        if judged_by != (vehicle, pack):
             self._begin_signals()
+        elif is_other_model:
+            self._begin_cells()
 
     def snapshot(self) -> EstimatorState | None:
         """Return the estimator's state; None while no SoC is known.
@@ -436,6 +435,17 @@ class Pipeline:
         settings = replace(settings, initial_soc_pct=None, initial_soc_std_pct=std_pct)
         self.estimator = make_estimator(self.model, settings)
         return True
+
+
+def _pack_of(estimator: Estimator) -> PackProperties:
+    """Return the pack's properties by which its signals are judged."""
+    voltage, stated_ah = estimator.voltage_model, estimator.settings.capacity_ah
+    return PackProperties(
+        resistance_ohm=abs(voltage.resistance_ohm[0]) if voltage.resistance_ohm else 0.0,
+        error_std_v=estimator.model.noise.residual_std_v,
+        capacity_ah=estimator.model.capacity_ah if stated_ah is None else stated_ah,
+        usual_v=voltage.pseudo_ocv_at(50.0)[0],
+    )
 
 
 def _with_source(settings: EstimatorSettings, vehicle: Vehicle) -> EstimatorSettings:
