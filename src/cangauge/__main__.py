@@ -18,12 +18,9 @@ def main() -> None:
     if isinstance(sys.stdout, io.TextIOWrapper):  # not what a test or a notebook has in its place
         # In a locale without "±" or "°C" the text is legible; otherwise it would be an error.
         sys.stdout.reconfigure(errors="backslashreplace")
-    if sys.argv[1:2] == ["run"] and hasattr(signal, "SIGHUP"):
+    is_at_terminal = any(map(os.isatty, range(3)))  # closing it ends the start as well
+    if sys.argv[1:2] == ["run"] and hasattr(signal, "SIGHUP") and not is_at_terminal:
         signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGHUP])
-        from cangauge.service.lifecycle import has_terminal  # noqa: PLC0415 - for `run` only
-
-        if has_terminal():  # closing the terminal ends the start as well
-            signal.pthread_sigmask(signal.SIG_UNBLOCK, [signal.SIGHUP])
     from cangauge.cli.app import main as command_line  # noqa: PLC0415 - takes a second
 
     command_line()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import signal
 import sys
+import threading
 import time
 from pathlib import Path
 
@@ -83,7 +84,10 @@ def test_a_terminal_closed_during_the_start_ends_it() -> None:
     assert waits(lambda: b"\0cangauge\0" in (process / "cmdline").read_bytes(), 30.0)
     assert waits(lambda: "numpy" in (process / "maps").read_text(), 30.0)  # it loads
     os.close(terminal)
+    late = threading.Timer(30.0, os.kill, (child, signal.SIGKILL))
+    late.start()
     _, status = os.waitpid(child, 0)
+    late.cancel()
     assert os.waitstatus_to_exitcode(status) == -signal.SIGHUP
 
 

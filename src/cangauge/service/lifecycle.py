@@ -58,10 +58,10 @@ def reload_on_hangup(reload: Callable[[], None]) -> Iterator[None]:
 
     As `stop_on_signals`; without effect on Windows, which has no SIGHUP.
     """
-    had_terminal = has_terminal()
+    had_terminal = _has_terminal()
 
     def handle(_number: int, _frame: FrameType | None) -> None:
-        if had_terminal and not has_terminal():
+        if had_terminal and not _has_terminal():
             signal.raise_signal(signal.SIGTERM)
         else:
             reload()
@@ -79,8 +79,7 @@ def reload_on_hangup(reload: Callable[[], None]) -> Iterator[None]:
             signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
-def has_terminal() -> bool:
-    """Return whether this process has a controlling terminal."""
+def _has_terminal() -> bool:
     try:
         os.close(os.open("/dev/tty", os.O_RDONLY | os.O_NOCTTY))
     except OSError:
