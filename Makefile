@@ -3,7 +3,7 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 
-# Where SocketCAN is not to be had directly, a command that provides it (as in .ci/run).
+# Where SocketCAN is not to be had directly, a command that provides it.
 SOCKETCAN ?= $(wildcard ../shared/tools/with-socketcan)
 
 # Folder of the recorded logs (see README for their sources).
@@ -64,7 +64,7 @@ test: $(VENV)/installed-dev
 
 # On a kernel without CAN a guest is booted; without either these tests say that they are left out.
 socketcan: $(VENV)/installed-dev
-	$(SOCKETCAN) $(BIN)/python -m pytest -m socketcan tests/socketcan
+	$(SOCKETCAN) $(BIN)/python -m pytest -rs -m socketcan tests/socketcan
 
 nightly: $(VENV)/installed-nightly
 	$(BIN)/python benchmarks/nightly.py $(PART) $(if $(DATA),--data "$(DATA)") $(if $(SOCKETCAN),--socketcan "$(SOCKETCAN) -t 3600 -m 2G")

@@ -85,7 +85,7 @@ def commands(data: Path | None, socketcan: str) -> dict[str, list[list[str]] | s
             [python, *suite, python, "-m", "cangauge", *OWN_GAUGE.split()],
         ],
         "tests": [
-            [python, "-m", "pytest", "-m", "nightly", "tests"],
+            [python, "-m", "pytest", "-n", "auto", "--dist", "loadfile", "-m", "nightly", "tests"],
             [python, "-m", "pytest", "-m", "hypothesis", "--hypothesis-profile=nightly", "tests"],
         ],
         "long": [

@@ -99,7 +99,9 @@ def test_usage_that_typer_refuses(command: str) -> None:
 def test_more_usage_that_typer_refuses() -> None:
     assert failed("fit")["field"] == "LOG"
     assert failed("fit", "x.csv")["field"] == "-o/--output"
-    assert failed("fit", "x.csv", "-o", "m.json", "--rate-hz", "x")["field"] == "--rate-hz"
+    refused = failed("fit", "x.csv", "-o", "m.json", "--rate-hz", "x")
+    assert refused["field"] == "--rate-hz"
+    assert "must be a valid number" in refused["message"]
     assert "no such command" in failed("bogus")["message"]
     ended = in_process("fit", "x.csv", "-o", "m.json", "--json=yes")
     assert error_of(ended, 2)["field"] == "--json"

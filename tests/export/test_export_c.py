@@ -73,7 +73,7 @@ def run(folder: Path, *command: str) -> str:
 
 
 @needs_make
-@pytest.mark.parametrize("which", nightly_except(("effects",), ("knots", "effects")))
+@pytest.mark.parametrize("which", ["knots", "effects"])
 def test_exported_tests_pass(folders: dict[str, Path], which: str) -> None:
     output = run(folders[which], "make", "test")
     doubles, _, floats = output.partition("./test-float")
@@ -87,6 +87,16 @@ def test_core_compiles_without_a_warning(folders: dict[str, Path], real: str) ->
         run(
             folder, "cc", *STRICT, config, f"-DCANGAUGE_REAL={real}", "-fsyntax-only", *CORE_SOURCES
         )
+
+
+@needs_make
+@pytest.mark.nightly
+def test_sanitizers_find_nothing(folders: dict[str, Path]) -> None:
+    flags = [*STRICT, "-g", "-fsanitize=address,undefined", "-fno-sanitize-recover=all"]
+    own = ["pack_model.c", "frames.c", "test.c"]
+    folder = folders["effects"]
+    run(folder, "cc", *flags, "-DCANGAUGE_CONFIG", *CORE_SOURCES, *own, "-lm", "-o", "sanitized")
+    assert "PASSED" in run(folder, "./sanitized")
 
 
 @needs_make

@@ -23,7 +23,7 @@ IN_SUITE = (
     "10bars.csv.gz", "62kWh-Battery-only-EVcan.txt.gz", "AZE0w40kWhv2.48.log.gz",
     "bmw_i3_battery_only.trc.gz",
 )  # fmt: skip
-"""One capture of each make and format; the others, larger, are compared in `make nightly`."""
+"""Captures of three makes in four formats; `make nightly` compares the others too."""
 
 
 def recorded(name: str) -> dict[str, Any]:

@@ -123,6 +123,7 @@ def test_prediction_is_anchored_at_the_first_known_soc(model: Model, log: Log) -
         (lambda raw: raw.update(effects=[{"id": "hysteresis"}]), "effects.0"),
         (lambda raw: raw.update(surprise=1), "surprise"),
         (lambda raw: raw["information"]["root"].pop(), "information.root"),
+        (lambda raw: raw["information"]["root"].reverse(), "information.root"),
     ],
 )
 def test_names_the_invalid_field(model: Model, tmp_path: Path, break_it, field) -> None:
@@ -140,6 +141,16 @@ def test_names_the_invalid_field(model: Model, tmp_path: Path, break_it, field) 
 def test_refuses_other_files(tmp_path: Path, text: str) -> None:
     path = tmp_path / "x.json"
     path.write_text(text)
+    with pytest.raises(InputError):
+        Model.load(path)
+
+
+@pytest.mark.parametrize("noise", ["NaN", "0", '{"fast_time_s": NaN}'])
+def test_an_old_file_is_checked_before_it_is_read(tmp_path: Path, noise: str) -> None:
+    raw = json.loads(shared_file("replay", "leaf2012_published_model.json").read_text())
+    raw["noise"] = "here"
+    path = tmp_path / "old.json"
+    path.write_text(json.dumps(raw).replace('"here"', noise))
     with pytest.raises(InputError):
         Model.load(path)
 

@@ -175,7 +175,7 @@ def _usage(error: Any) -> tuple[str, str | None]:
         # The help page shows an argument by its metavar.
         is_option = parameter.param_type_name == "option"
         field = "/".join(parameter.opts) if is_option else parameter.metavar or parameter.name
-    text = " ".join(error.format_message().split())
+    text = " ".join(error.format_message().split()).replace("Input should be", "must be")
     if options := getattr(error, "possibilities", None):
         text = f"no such option: {field}" + _suggestion(str(field), options)
     if not text or type(error).__name__ == "NoArgsIsHelpError":

@@ -65,11 +65,15 @@ def gap_command(
     ----------
     logs : LOG
         Logs to diagnose; one cause is sought for all.
+    model : -m, --model MODEL
+        Model file; not needed for a simulator.
     reference : LOG
         Log without a fault; repeat the option. Without soc_pct its start is found from the voltage.
     initial_soc : P (0 … 100 %)
         SoC at the first row of each diagnosed log, e.g. 80. Default: its soc_pct, else found from
         the voltage.
+    capacity_ah : A (0.001 … 1e5 Ah)
+        Charge from 100 to 0 %, in place of the model's, for all logs.
     alarm : P (0 … 1)
         Report a fault where the probability of none is at most this.
     extended : MODEL.json
@@ -199,6 +203,8 @@ def load_function(text: str) -> Callable[..., Any]:
     """Return a function named `MODULE:FUNCTION` or `FILE.py:FUNCTION`; may raise InputError."""
     place, _, name = text.rpartition(":")
     cure = "give MODULE:FUNCTION or path/to/file.py:FUNCTION"
+    if not (place and name):
+        raise InputError("not a function", field="--simulator", value=text, cure=cure)
     sys.path.insert(0, "")  # modules of the working directory too
     try:
         is_file = place.endswith(".py")

@@ -89,10 +89,7 @@ class _Progress(logging.Handler):
             self.live.update(Text(text), refresh=True)
 
     def emit(self, record: logging.LogRecord) -> None:
-        text = record.getMessage()
-        if record.levelno >= logging.INFO:
-            note(text)
-        self.show(text)
+        (note if record.levelno >= logging.INFO else self.show)(record.getMessage())
 
 
 def finish(

@@ -370,7 +370,8 @@ def _start(log: Log, timing: Timing) -> tuple[Verdict, str]:
     within_s = max(DELAYS_S[1], timing.interval_median_s or 0.0)
     first = log.current_a[log.time_s - log.time_s[0] <= within_s]
     at_start = float(np.max(np.abs(first)))
-    text = f"up to {at_start:.3g} A in the first {within_s:.3g} s"
+    what = f"the first {within_s:.3g} s" if first.size > 1 else "the first row"
+    text = f"up to {at_start:.3g} A in {what}"
     if at_start > REST_SHARE * float(np.max(np.abs(log.current_a))):
         return "no", text
     return "yes", f"{text}: the first voltages are near rest"

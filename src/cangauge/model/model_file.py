@@ -321,6 +321,8 @@ class Model(_Fields):
             p = len(information.columns)
             _check_shape("information.root", information.root, p, p)
             _check_shape("information.projected", information.projected, p)
+            if np.any(np.tril(information.root, -1)):
+                raise InputError("must be upper triangular", field="information.root")
         return self
 
     def __repr__(self) -> str:
@@ -467,7 +469,7 @@ class Model(_Fields):
         path = as_path(path)
         data = read_bounded(path, 4 * MIB, "a model file")
         try:
-            raw = json.loads(data)
+            raw = json.loads(data, parse_constant=_refuse_constant)
             json.dumps(raw, ensure_ascii=False).encode()  # half of a surrogate pair is no text
         except (ValueError, RecursionError) as error:
             raise InputError(f"not JSON ({error})", source=path, cure=_CURE) from error
@@ -476,7 +478,7 @@ class Model(_Fields):
             ("format", ("cangauge-model",), "not a cangauge model"),
             ("version", (1, 2), "this release reads versions 1 and 2"),
         ):
-            value = head.get(field)
+            value = head.get(field) if head is raw else type(raw).__name__
             if value not in known:
                 raise InputError(problem, source=path, field=field, value=value, cure=_CURE)
         try:
@@ -486,7 +488,11 @@ class Model(_Fields):
             raise schema_error(error, cls, path, _CURE) from error
         except InputError as error:
             raise InputError(
-                error.problem, source=path, field=error.field, value=error.value, cure=error.cure
+                error.problem,
+                source=path,
+                field=error.field,
+                value=error.value,
+                cure=error.cure or _CURE,
             ) from error
         return model
 
@@ -581,6 +587,10 @@ def _check_shape(field: str, values: Sequence[Any], number: int, *inner: int) ->
         raise InputError(f"needs {number} values", field=field, value=len(values))
     for place, row in enumerate(values) if inner else ():
         _check_shape(f"{field}.{place}", row, *inner)
+
+
+def _refuse_constant(name: str) -> float:
+    raise ValueError(f"{name} is not a finite number")
 
 
 def as_model(model: Any) -> Model:

@@ -38,7 +38,7 @@ def upgraded(raw: Mapping[str, Any]) -> dict[str, Any]:
         return _upgraded(raw)
     except KeyError as error:
         raise InputError("required field is missing", field=str(error.args[0])) from error
-    except (TypeError, ValueError) as error:
+    except (AttributeError, TypeError, ValueError) as error:
         raise InputError(f"not a model of version 1 ({error})", field="noise") from error
 
 

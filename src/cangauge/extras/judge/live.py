@@ -86,7 +86,8 @@ class Stored:
         )
         result: dict[str, Any] = json.loads(ended.stdout or "{}")
         if ended.returncode != 0:
-            raise InputError(str(result.get("error", ended.stderr.strip()[-500:])))
+            problem = result.get("error", {}).get("message", ended.stderr.strip()[-500:])
+            raise InputError(problem)
         write_text_atomic(self.folder / RESULT, ended.stdout)
         return result
 

@@ -41,6 +41,8 @@ def gap_check_command(
         [columns] of the map file. Default: a simulated pack.
     capacity_ah : A (0.001 … 1e5 Ah)
         Charge of the logs' pack from 100 to 0 %; needed with LOGs.
+    cells : N (1 … 2000)
+        Cells in series of the logs' pack.
     at_most : N (1 … inf)
         Leave out at most this many logs.
     """
