@@ -84,6 +84,7 @@ def test_a_terminal_closed_during_the_start_ends_it() -> None:
     command = [sys.executable, "-m", "cangauge", "run", "-m", str(leaf_model_path())]
     child, terminal = pty.fork()
     if child == 0:
+        signal.signal(signal.SIGHUP, signal.SIG_DFL)  # the tests may run under nohup
         os.execv(sys.executable, command)  # noqa: S606 - no shell wanted
     process = Path(f"/proc/{child}")
     assert waits(lambda: b"\0cangauge\0" in (process / "cmdline").read_bytes(), 30.0)
