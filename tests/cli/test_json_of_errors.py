@@ -137,7 +137,7 @@ def test_a_disk_that_is_full(made: Path, tmp_path: Path, monkeypatch: pytest.Mon
         with atomic_path(tmp_path / "soc.csv"):
             raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("cangauge.service.estimate_table.write_estimates", full)
+    monkeypatch.setattr("cangauge.cli.estimate.write_estimates", full)
     error = failed(
         "estimate", made / "part.csv", "-m", made / "model.json", "-o", tmp_path / "soc.csv", code=1
     )

@@ -216,8 +216,9 @@ class SampleDecoder:
         self.now_s = self._suspected_s = -math.inf
         self._pairing = Pairing(vehicle.pair_within_s, self.statistics)
         # In one frame: each is a sample by itself.
-        places = [(each.key, each.codec.conditions) for each in (vehicle.current, vehicle.voltage)]
-        self._is_paired = places[0] == places[1]
+        current, voltage = vehicle.current, vehicle.voltage
+        has_same_turn = current.codec.conditions == voltage.codec.conditions
+        self._is_paired = current.key == voltage.key and has_same_turn
         fixed_c = vehicle.fixed_temperature_c
         self._fixed_c = math.nan if fixed_c is None else fixed_c
         self._routes: dict[int, _Route] = {}

@@ -192,8 +192,11 @@ class _Layout:
     def encode(self, counter: int, values: Mapping[str, float]) -> bytes:
         """Return the payload; values are clipped to the signal's range, NaN becomes its code."""
         payload = bytearray(_LENGTH)
-        for name, codec, low, high in self._codecs:  # the clip leaves NaN
-            codec.encode_into(payload, min(max(float(values[name]), low), high))
+        for name, codec, low, high in self._codecs:
+            value = float(values[name])
+            if not math.isnan(value):
+                value = min(max(value, low), high)
+            codec.encode_into(payload, value)
         return self._rule.protect(payload, counter)
 
     def decode(self, data: bytes | bytearray) -> dict[str, Any] | None:

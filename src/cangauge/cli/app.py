@@ -150,7 +150,7 @@ UsageError: Final[type[Any]] = typer.BadParameter.__mro__[1]
 
 
 def _failed(line: str, error: Mapping[str, Any], exit_code: int) -> int:
-    """Print an error on stderr; and as JSON on stdout if `--json` is given; return the code."""
+    """Print an error on stderr, and with `--json` as JSON on stdout; return the exit code."""
     if line:
         note(f"error: {line}")
     # Not from the parser: the error may be one of parsing.

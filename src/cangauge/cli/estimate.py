@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from contextlib import ExitStack
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -18,6 +19,7 @@ from cangauge.cli.status import pack_values
 from cangauge.types import REASON_WORDS, Reason
 
 if TYPE_CHECKING:
+    from cangauge._typing import FloatArray
     from cangauge.estimation.offline import EstimateTable
     from cangauge.estimation.settings import EstimatorSettings
     from cangauge.model.model_file import Model
@@ -85,7 +87,6 @@ def estimate_command(
     from cangauge.logs.log import Log
     from cangauge.logs.read import LogFile
     from cangauge.model.model_file import Model
-    from cangauge.service.estimate_table import write_estimates
 
     settings = EstimatorSettings(
         method=method,
@@ -117,6 +118,25 @@ def estimate_command(
     found = done.to_dict() | {"assumed": assumed_of(logs)}
     show = partial(_show, done.recorded.name, found, done.table)
     finish(found, show, files, as_json=json_output)
+
+
+def write_estimates(path: Path, time_s: FloatArray, table: EstimateTable) -> None:
+    """Write one row per sample, as CSV or Parquet by the suffix; a device gets CSV.
+
+    `time_s` are the samples' own times [s]: a refused sample's estimate is the one before. An
+    unknown value becomes empty (CSV) or null (Parquet).
+    """
+    import pyarrow.csv as pacsv
+    import pyarrow.parquet as pq
+
+    columns = replace(table, time_s=time_s).to_arrow()
+    if path.suffix.lower() == ".parquet":
+        pq.write_table(columns, path)
+        return
+    with path.open("wb") as file:
+        file.write((",".join(columns.column_names) + "\n").encode())  # pyarrow would quote them
+        options = pacsv.WriteOptions(include_header=False, quoting_style="none")
+        pacsv.write_csv(columns, file, options)
 
 
 def _of_log(

@@ -5,7 +5,7 @@ from __future__ import annotations
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from cangauge._extras import extra
 from cangauge._files import write_texts_atomic
@@ -107,15 +107,16 @@ def fit_command(
             cure="give one for all, or one for each log in order (auto where it is unknown)",
         )
     starts = [None if each == "auto" else each for each in initial_soc or ["auto"]]
-    published = {
-        "--delays": ("delay_s", None if delays is None else _delays_s(delays)),
-        "--epsilon": ("epsilon", epsilon),
-        "--t-ref": ("t_ref_c", t_ref),
+    published: dict[str, Any] = {
+        "delay_s": None if delays is None else _delays_s(delays),
+        "epsilon": epsilon,
+        "t_ref_c": t_ref,
     }
-    given = {option: item for option, item in published.items() if item[1] is not None}
-    if equation == "knots" and given:
+    published = {name: value for name, value in published.items() if value is not None}
+    if equation == "knots" and published:
+        option = {"delay_s": "--delays", "epsilon": "--epsilon", "t_ref_c": "--t-ref"}
         problem, cure = "belongs to the published equation", "add --equation published, or omit it"
-        raise InputError(problem, field=next(iter(given)), cure=cure)
+        raise InputError(problem, field=option[next(iter(published))], cure=cure)
     check_outputs([output, report], logs)
     with progress("cangauge.identify") as show:
         recorded = reading.load_all(logs, show)
@@ -128,7 +129,7 @@ def fit_command(
             cells=cells or _cells_of(recorded[0], reading),
             rate_hz=rate_hz,
             effects=parse_effect_ids(effects) if effects else None,
-            **dict(given.values()),  # type: ignore[arg-type] # names and values belong together
+            **published,
         )
         show("writing")
         texts = {output: result.model.to_json()}

@@ -89,7 +89,10 @@ class _Progress(logging.Handler):
             self.live.update(Text(text), refresh=True)
 
     def emit(self, record: logging.LogRecord) -> None:
-        (note if record.levelno >= logging.INFO else self.show)(record.getMessage())
+        if record.levelno >= logging.INFO:
+            note(record.getMessage())
+        else:
+            self.show(record.getMessage())
 
 
 def finish(

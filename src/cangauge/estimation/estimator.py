@@ -220,7 +220,10 @@ class Estimator:
         if math.isnan(self._counter.state.time_s):
             return [math.nan] * len(stamps_s)
         at = self._online.delay_line.current_at
-        return [each if math.isnan(each) else at(0.0) - at(time_s - each) for each in stamps_s]
+        now_a = at(0.0)
+        # Cells of one frame share its stamp.
+        changes = {each: now_a - at(time_s - each) for each in {*stamps_s} if not math.isnan(each)}
+        return [changes.get(each, math.nan) for each in stamps_s]
 
     # --- one sample
 

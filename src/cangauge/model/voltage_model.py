@@ -133,7 +133,7 @@ def _cubics(knots: FloatArray, soc_pct: FloatArray) -> _Cubic:
 
 
 def _cubic_at(knots: Sequence[float], soc_pct: float) -> _Cubic:
-    """Return `_cubics` of one SoC, in plain numbers: it is asked for at every step."""
+    """Return `_cubics` of one SoC, without arrays: the estimator needs it at each step."""
     inside = min(max(soc_pct, knots[0]), knots[-1])
     left = min(bisect_right(knots, inside) - 1, len(knots) - 2)
     h, beyond = knots[left + 1] - knots[left], soc_pct - inside

@@ -384,11 +384,12 @@ class Pipeline:
             initial_soc_pct=before.settings.initial_soc_pct,
             initial_soc_std_pct=before.settings.initial_soc_std_pct,
         )
-        is_other_model = model != self.model
+        estimator, is_other_model = before, model != self.model
         if is_other_model or chosen != before.settings:
-            self.estimator = make_estimator(model, chosen)
-            self.estimator.take_over(before)
-        judged_by, pack = (self.vehicle, self._pack), _pack_of(self.estimator)
+            estimator = make_estimator(model, chosen)
+            estimator.take_over(before)
+        judged_by, pack = (self.vehicle, self._pack), _pack_of(estimator)
+        self.estimator = estimator
         self.settings = replace(settings, ids=ids, time_source=old.time_source)
         self.vehicle, self.model, self._pack, self._report = vehicle, model, pack, None
         if self._publisher is not None:

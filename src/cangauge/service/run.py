@@ -138,9 +138,7 @@ class Service:
                 keeper = StateKeeper(self._state, pipeline, port.name, config.state_max_age_s)
                 stack.enter_context(keeper)
             if config.record is not None:
-                part_mb, keep_mb = config.record_part_mb, config.record_keep_mb
-                limits = [None if each is None else 1e6 * each for each in (part_mb, keep_mb)]
-                self.recorder = Recorder(config.record, *limits)
+                self.recorder = Recorder(config.record, *_recording_limits(config))
                 self._outputs.insert(0, self.recorder)
             for output in self._outputs:
                 stack.callback(output.close)
@@ -236,7 +234,13 @@ class Service:
         if self._state is not None:
             check_writable(self._state)
         if config.record is not None:
-            check_recording(Path(config.record), config.record_part_mb, config.record_keep_mb)
+            check_recording(Path(config.record), *_recording_limits(config))
+
+
+def _recording_limits(config: RunConfig) -> list[float | None]:
+    """Return the largest size of a part, and of all parts together [bytes]."""
+    limits_mb = config.record_part_mb, config.record_keep_mb
+    return [None if each is None else 1e6 * each for each in limits_mb]
 
 
 def _loop_settings(config: RunConfig) -> LoopSettings:

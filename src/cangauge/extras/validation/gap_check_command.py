@@ -66,10 +66,10 @@ def gap_check_command(
     left_out = min(at_most or len(pack.logs), len(pack.logs))
     note(f"at most {left_out * PER_LOG} diagnoses, about half a second each")
     findings = []
-    with progress() as tell:
+    with progress() as show_line:
         for finding in pack.findings(at_most):
             findings.append(finding)
-            tell(f"{len(findings)} diagnoses")
+            show_line(f"{len(findings)} diagnoses")
     result = summarize(findings)
 
     def show() -> None:
