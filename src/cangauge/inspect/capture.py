@@ -145,8 +145,10 @@ def inspect_capture(
     duration_s = max(stamps_s) - start_s
     gaps = np.flatnonzero(steps_s > GAP_S)[:LISTED_GAPS].tolist()
     summaries = tuple(frames.summary(*key) for key, frames in sorted(ids.items()))
-    # Of every preset the trial on the bus with most of its samples.
-    best = [max(each, key=len) for each in zip(*(buses.values() or [buses[""]]), strict=True)]
+    # Of every preset the trial on the bus with most of its samples; without a frame of any preset,
+    # that of an empty bus.
+    of_buses = buses.values() or [buses[""]]
+    best = [max(trials, key=len) for trials in zip(*of_buses, strict=True)]
     return CaptureInspection(
         path.name, str(path), capture.info, start_s, duration_s, error_frames, remote_frames,
         time_reversals=int((steps_s < 0.0).sum()),
@@ -279,7 +281,7 @@ def _wrong_period(preset: str, ids: Sequence[IdSummary], duration_s: float) -> s
 
 
 def _without_cold_relatives(matches: Iterable[PresetMatch]) -> tuple[PresetMatch, ...]:
-    """Drop a match where a related preset, which also finds its temperature, explains more."""
+    """Say of a match that it is none where a related preset finds the temperature as well."""
     found = list(matches)
     warm = {PRESETS[match.preset].dbc for match in found if match.temperature_c is not None}
     for place, match in enumerate(found):
