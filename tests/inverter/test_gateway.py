@@ -61,7 +61,7 @@ def pylon(request: pytest.FixtureRequest) -> Iterator[Gateway]:
 
 
 def confirm(found: Gateway, soc_pct: float | None, status: str = "valid") -> None:
-    for _ in range(2):
+    for _ in range(3):
         found.on_sample(SAMPLE, NO_ESTIMATE)
     found.on_snapshot(snapshot(soc_pct, status))
 
@@ -113,6 +113,15 @@ def test_what_is_not_confirmed_is_not_sent(pylon: Gateway) -> None:
     assert pylon.soc_pct(now_s + 1.2 * DOUBT_S) is None  # the service hangs, or samples end
     pylon.on_snapshot(Snapshot(now_s + 60.0, snapshot(71.6).status))
     assert pylon.soc_pct(now_s + 60.1) is None  # it turns, but no samples come
+
+
+def test_a_gap_does_not_make_silence_last(pylon: Gateway) -> None:
+    for time_s in (0.0, 0.1, 0.2, 2.1):
+        pylon.on_sample(SAMPLE._replace(time_s=time_s), NO_ESTIMATE)
+    now_s = time.monotonic()
+    pylon.on_snapshot(Snapshot(now_s + 60.0, snapshot(71.6).status))
+    assert pylon.soc_pct(now_s + 0.1 + 0.9 * DOUBT_S) == 71.6
+    assert pylon.soc_pct(now_s + 0.1 + 1.2 * DOUBT_S) is None
 
 
 @given(st.binary(max_size=8), st.floats(-1e3, 1e3), st.sampled_from(["pylontech", "victron"]))

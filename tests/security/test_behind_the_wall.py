@@ -83,7 +83,7 @@ def test_no_odd_soc_reaches_an_inverter(soc_pct: float) -> None:
     for bus in buses:
         bus.open()
     with closing(Gateway(*buses, soc_fields("pylontech"))) as gateway:
-        for _ in range(2):
+        for _ in range(3):
             gateway.on_sample(Sample(0.0, 1.0, 50.0, 20.0), NONE)
         status = {"status": "valid", "estimate": {"soc_pct": soc_pct}}
         gateway.on_snapshot(Snapshot(time.monotonic(), status))

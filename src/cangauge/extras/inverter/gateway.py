@@ -80,7 +80,8 @@ class Gateway(Output):
     ) -> None:
         self._battery, self._inverter = battery, inverter
         self._fields, self._own_ids = fields, own_ids
-        self._sampled_s, self._current_until_s = math.inf, -math.inf  # one sample has no interval
+        # A single interval may be a gap: from the third sample on the period is known.
+        self._sampled_s, self._interval_s, self._current_until_s = math.inf, -math.inf, -math.inf
         self._soc: tuple[float, float] | None = None  # [%], and until when it is confirmed
         self._done = threading.Event()
         self._replaces: bool | None = None
@@ -88,11 +89,12 @@ class Gateway(Output):
         self._thread.start()
 
     def on_sample(self, sample: Sample, estimate: Estimate) -> None:
-        """Note that samples come, and how often."""
-        del sample, estimate
-        now_s = time.monotonic()
-        self._current_until_s = now_s + (now_s - self._sampled_s) + DOUBT_S
-        self._sampled_s = now_s
+        """Note that samples come, and how often: one long interval is a gap, not a period."""
+        del estimate
+        interval_s = sample.time_s - self._sampled_s
+        period_s = min(interval_s, self._interval_s)
+        self._sampled_s, self._interval_s = sample.time_s, interval_s
+        self._current_until_s = time.monotonic() + period_s + DOUBT_S
 
     def on_snapshot(self, snapshot: Snapshot) -> None:
         """Take the SoC if it is valid, else none."""
