@@ -136,13 +136,17 @@ def _picks(given: Sequence[str]) -> dict[str, int]:
 
 def _check(output: Path, *, force: bool) -> None:
     """Raise InputError if a file exists in the folder, or cannot be written."""
+    try:
+        is_folder, has_parent = output.is_dir(), output.parent.is_dir()
+    except OSError as error:  # too long a name
+        raise InputError("cannot create this folder", source=output) from error
     for name in ("car.toml", "run.toml", "car.dbc"):
         if (output / name).is_file() and not force:
             cure = "give --force to overwrite it"
             raise InputError("exists", source=output / name, cure=cure)
-    if output.is_dir():
+    if is_folder:
         check_writable(output / "car.toml")
-    elif not output.parent.is_dir():
+    elif not has_parent:
         raise InputError("cannot create this folder", source=output)
 
 

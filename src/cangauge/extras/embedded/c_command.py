@@ -48,11 +48,6 @@ def export_c_command(
     period : S (0.001 … 60 s)
         Time between two currents that the delay line keeps: more samples cost no memory.
     """
-    try:
-        output.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        problem = f"this folder cannot be made: {error.strerror}"
-        raise InputError(problem, field="--output", value=str(output)) from error
     # Deferred, so that the help page does not wait for numpy and scipy.
     from cangauge.extras.embedded.embedded import export_c, std_at_rest_pct
     from cangauge.model.model_file import Model

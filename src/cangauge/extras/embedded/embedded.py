@@ -86,8 +86,8 @@ def export_c(
     Raises
     ------
     InputError
-        If the core lacks one of the model's effects, or a file of
-        the same name in the folder is not of an export.
+        If the core lacks one of the model's effects, a file of the same name in the folder is not
+        of an export, or the folder cannot be made.
     """
     model = TabulatedModel.of(model)
     constants = exported_constants(model)
@@ -113,8 +113,11 @@ def export_c(
     texts["golden.h"] = head.format("golden.h") + _golden(model, period_s)
     texts = arranged(platform, texts)
     _refuse_foreign_names(folder, texts)
-    for parent in {(folder / name).parent for name in texts}:
-        parent.mkdir(parents=True, exist_ok=True)
+    try:
+        for parent in {(folder / name).parent for name in texts}:
+            parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"cannot be made: {error.strerror}", source=folder) from error
     write_texts_atomic({folder / name: text for name, text in texts.items()})
     return Exported(folder, tuple(sorted(texts)), 8 * length)
 
