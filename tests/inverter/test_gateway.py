@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 from cangauge.bus.open import BusAddress
 from cangauge.bus.reconnecting import ReconnectingBus
 from cangauge.errors import InputError
-from cangauge.extras.inverter.gateway import DOUBT_S, Gateway, soc_fields
+from cangauge.extras.inverter.gateway import DOUBT_S, Gateway, make_output, soc_fields
 from cangauge.service.run import Service
 from cangauge.service.status_client import Snapshot
 from cangauge.types import Estimate, Reason, Sample, Status
@@ -51,7 +51,7 @@ def gateway(name: str, profile: str = "pylontech") -> Gateway:
     buses = [ReconnectingBus(BusAddress("virtual", f"{name} {side}"), []) for side in "bi"]
     for bus in buses:
         bus.open()
-    return Gateway(*buses, soc_fields(profile), frozenset({0x5A0}))
+    return Gateway(*buses, soc_fields(profile), lambda: {0x5A0})
 
 
 @pytest.fixture
@@ -155,6 +155,50 @@ def test_frames_are_handed_on_both_ways(pylon: Gateway, request: pytest.FixtureR
         assert alive is not None
         assert alive.arbitration_id == 0x305
         assert inverter.recv(0.1) is None  # nothing comes back, nothing of the service
+        extended = can.Message(arbitration_id=0x5A0, data=b"other")
+        battery.send(extended)
+        told = inverter.recv(2.0)
+        assert told is not None
+        assert told.equals(extended, timestamp_delta=None, check_channel=False)
+
+
+def test_a_frame_that_a_bus_cannot_carry_costs_nothing_else(
+    pylon: Gateway, request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def send(bus: can.BusABC, message: can.Message, timeout: float | None = None) -> None:
+        if message.is_fd and bus.channel_info.endswith(" i"):
+            raise can.CanOperationError("cannot send FD message over bus with CAN FD disabled")
+        as_before(bus, message, timeout)
+
+    name, virtual = request.node.name, type(pylon._battery._bus)
+    as_before = virtual.send
+    monkeypatch.setattr(virtual, "send", send)
+    with (
+        can.Bus(interface="virtual", channel=f"{name} b") as battery,
+        can.Bus(interface="virtual", channel=f"{name} i") as inverter,
+    ):
+        for number in range(20):
+            battery.send(can.Message(arbitration_id=0x7FF, is_fd=True, data=bytes(12)))
+            battery.send(frame(0x351, bytes([number])))
+        seen = [inverter.recv(2.0) for _ in range(20)]
+        assert [m.data[0] for m in seen if m] == list(range(20))
+
+
+def test_what_the_service_sends_is_not_for_the_inverter(tmp_path: Path) -> None:
+    publish = {"profile": "pylontech", "interface": "virtual", "channel": f"{tmp_path} i"}
+    options = {"interface": "virtual", "channel": f"{tmp_path} b", "vehicle": "leaf_ze1_polled"}
+    service = Service(
+        model=str(leaf_model_path()), **options, publish=publish, poll={"every_s": 60.0}
+    )
+    with closing(make_output(service)) as found:
+        asked = {each.request_id for each in service.pipeline.vehicle.poll_targets}
+        assert asked
+        assert found._own_ids() == {*range(0x5A0, 0x5A5), *asked}
+        other = Service(
+            model=str(leaf_model_path()), **options, publish=publish, ids={"soc_estimate": 0x6A0}
+        )
+        service.apply(other._setup)
+        assert found._own_ids() == {*range(0x5A1, 0x5A5), 0x6A0}
 
 
 def test_the_same_bus_is_refused() -> None:

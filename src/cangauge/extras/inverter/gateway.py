@@ -13,7 +13,7 @@ import logging
 import math
 import threading
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Container, Mapping
 from copy import copy
 from typing import TYPE_CHECKING, Final
 
@@ -67,8 +67,8 @@ class Gateway(Output):
         Open ones, of the gateway alone.
     fields : mapping
         Of `soc_fields`.
-    own_ids : set of int
-        Ids that the service itself sends on the battery's bus: not for the inverter.
+    own_ids : callable
+        Returns the ids that the service itself sends on the battery's bus: not for the inverter.
     """
 
     def __init__(
@@ -76,7 +76,7 @@ class Gateway(Output):
         battery: ReconnectingBus,
         inverter: ReconnectingBus,
         fields: Mapping[int, list[tuple[BitField, float]]],
-        own_ids: frozenset[int] = frozenset(),
+        own_ids: Callable[[], Container[int]] = frozenset,
     ) -> None:
         self._battery, self._inverter = battery, inverter
         self._fields, self._own_ids = fields, own_ids
@@ -146,12 +146,18 @@ class Gateway(Output):
 
     def _run(self) -> None:
         while not self._done.is_set():
-            for frame in self._battery.receive_pending(POLL_S):
-                if frame.arbitration_id not in self._own_ids and not frame.is_error_frame:
-                    self._inverter.post(self.replaced(frame, time.monotonic()))
+            frames, own_ids = self._battery.receive_pending(POLL_S), self._own_ids()
+            for frame in frames:
+                if frame.is_extended_id or frame.arbitration_id not in own_ids:
+                    _hand_on(self.replaced(frame, time.monotonic()), self._inverter)
             for frame in self._inverter.receive_pending(POLL_S):
-                if not frame.is_error_frame:
-                    self._battery.post(frame)
+                _hand_on(frame, self._battery)
+
+
+def _hand_on(frame: can.Message, bus: ReconnectingBus) -> None:
+    """Send what a bus can carry: a frame that it cannot would count as a lost bus."""
+    if bus.carries_fd or not frame.is_fd:
+        bus.post(frame)
 
 
 def make_output(service: Service) -> Gateway:
@@ -167,7 +173,13 @@ def make_output(service: Service) -> Gateway:
     except InputError:
         battery.close()
         raise
-    own_ids = frozenset(service.pipeline.settings.ids.published)
+
+    def own_ids() -> frozenset[int]:  # those of the present configuration
+        asked = service.pipeline.vehicle.poll_targets if service.config.poll else ()
+        return frozenset(service.pipeline.settings.ids.published).union(
+            target.request_id for target in asked
+        )
+
     text = f"frames are handed on between {battery.name} and the inverter on {inverter.name}"
     emit(_LOG, logging.INFO, "inverter.ready", text, profile=config.profile)
     return Gateway(battery, inverter, soc_fields(config.profile), own_ids)
