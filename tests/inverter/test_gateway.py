@@ -8,6 +8,7 @@ import time
 from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path
+from typing import Any
 
 import can
 import pytest
@@ -135,7 +136,7 @@ def test_any_frame_keeps_all_other_bits(data: bytes, soc_pct: float, profile: st
     if len(data) >= 2:
         wanted[:2] = struct.pack("<H", round(whole))
     if len(data) >= 6 and profile == "victron":
-        wanted[4:6] = struct.pack("<H", round(100.0 * whole))
+        wanted[4:6] = struct.pack("<H", round(whole / 0.01))
     assert told == bytes(wanted)
 
 
@@ -201,11 +202,27 @@ def test_what_the_service_sends_is_not_for_the_inverter(tmp_path: Path) -> None:
         assert found._own_ids() == {*range(0x5A1, 0x5A5), 0x6A0}
 
 
-def test_the_same_bus_is_refused() -> None:
-    same = {"interface": "virtual", "channel": "one"}
-    publish = {"profile": "pylontech", **same}
-    with pytest.raises(InputError, match=r"publish\.channel.*battery's bus"):
-        Service(model=str(leaf_model_path()), **same, publish=publish)
+@pytest.mark.parametrize(
+    ("battery", "inverter", "options", "problem"),
+    [
+        (("virtual", "one"), ("virtual", "one"), {}, "battery's bus"),
+        (("virtual", "one"), ("udp_multicast", "239.74.163.9"), {}, "go round for ever"),
+        (("udp_multicast", "239.74.163.9"), ("virtual", "one"), {}, "go round for ever"),
+        (("virtual", "b"), ("virtual", "i"), {"time_source": "replay-clock"}, "of a replay"),
+        (
+            ("virtual", "b"), ("virtual", "i"),
+            {"bus_options": {"receive_own_messages": True}}, "go round for ever",
+        ),
+    ],
+)  # fmt: skip
+def test_buses_that_cannot_be_joined_are_refused(
+    battery: tuple[str, str], inverter: tuple[str, str], options: dict[str, Any], problem: str
+) -> None:
+    names = ("interface", "channel")
+    publish = {"profile": "pylontech", **dict(zip(names, inverter, strict=True))}
+    bus = dict(zip(names, battery, strict=True))
+    with pytest.raises(InputError, match=rf"publish\.channel.*{problem}"):
+        Service(model=str(leaf_model_path()), **bus, **options, publish=publish)
 
 
 @pytest.mark.nightly  # VALID once the delay line is full: 70 s

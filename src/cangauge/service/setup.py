@@ -9,7 +9,7 @@ from typing import Self
 
 from cangauge._config import read_toml
 from cangauge.bus.mapping import Overrides
-from cangauge.bus.open import BusAddress, bus_address, is_multicast
+from cangauge.bus.open import BusAddress, backend_capabilities, bus_address, is_multicast
 from cangauge.bus.publish import FrameIds
 from cangauge.bus.vehicle import Vehicle
 from cangauge.errors import CangaugeError, InputError
@@ -114,16 +114,23 @@ def inverter_address(publish: PublishConfig) -> BusAddress:
 
 
 def _check_publish(config: RunConfig) -> None:
-    """Raise InputError if the inverter's bus is the battery's."""
+    """Raise InputError if an inverter cannot be told the SoC."""
     publish = config.publish
-    if publish is not None and str(inverter_address(publish)) == str(address_of(config)):
-        raise InputError(
-            "is the battery's bus: a frame cannot be replaced on the bus that carries it",
-            source=config.file,
-            field="publish.channel",
-            value=publish.channel,
-            cure="connect the inverter to a bus of its own",
-        )
+    if publish is None:
+        return
+    buses = address_of(config), inverter_address(publish)
+    problem = cure = ""
+    if str(buses[0]) == str(buses[1]):
+        problem = "is the battery's bus: a frame cannot be replaced on the bus that carries it"
+        cure = "connect the inverter to a bus of its own"
+    elif any(backend_capabilities(bus).echoes for bus in buses):
+        problem = "a bus returns the frames sent on it: they would go round for ever"
+        cure = "use SocketCAN, without receive_own_messages in both bus_options"
+    elif config.time_source == "replay-clock":
+        problem, cure = "the SoC of a replay is not the battery's", "remove time_source"
+    if problem:
+        where = {"source": config.file, "field": "publish.channel", "value": publish.channel}
+        raise InputError(problem, cure=cure, **where)
 
 
 def _check_poll(config: RunConfig, vehicle: Vehicle) -> None:
