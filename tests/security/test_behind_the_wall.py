@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import shutil
 import sys
 import time
@@ -34,6 +35,8 @@ TAKEN_OVER = {
     "no JSON": "print('x' * 100)",
     "a log of nonsense": "print('{\"log\": 3}')",
     "a line without an end": "import os\nwhile True: os.write(1, b'x' * 65536)",
+    "its lines without end": "while True: print('{\"alive\": true}')",
+    "a line that grows": "import os, time\nwhile True: os.write(1, b'x' * 9000); time.sleep(0.2)",
     "a crash": "raise SystemExit(9)",
     "a closed stdin": "import os, time; os.close(0); os.close(1); time.sleep(60)",
 }
@@ -56,6 +59,15 @@ def test_a_live_process_that_is_taken_over_is_ended(
         assert time.monotonic() - began_s < 1.0
         assert waits(lambda: "started again" in page.trouble, 20.0)
         assert page._thread.is_alive()
+
+
+def test_a_line_of_its_log_costs_no_memory() -> None:
+    log = {"logger": "other.name", "level": 30, "event": "e", "text": "a", "limit": "e"}
+    page = Live.__new__(Live)
+    with LoggedLines("cangauge") as logged:
+        page._hear({"log": {**log, "fields": {"text": 1}}})
+    assert logged.lines == ["warning: a"]
+    assert "other.name" not in logging.root.manager.loggerDict  # loggers are never freed
 
 
 FRAMES = [

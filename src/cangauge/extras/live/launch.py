@@ -48,7 +48,9 @@ PAUSE_S: Final = (1.0, 60.0)
 the longest begins with the first again."""
 END_WITHIN_S: Final = 0.5
 """Time limit for the process to end by itself [s]."""
-_LONGEST_LINE: Final = 1 << 16
+_MOST_BYTES: Final = 1 << 16
+"""Longest line of the process, and most that it may write in a second [bytes]: far more than it
+does, and too little to cost the estimate time."""
 
 _LOG = logging.getLogger(__name__)
 
@@ -178,10 +180,13 @@ class Live(Output):
 
     def _hear(self, told: dict[str, Any]) -> None:
         """Take a line of the process."""
-        if (log := told.get("log")) is not None:
-            logger = logging.getLogger(log["logger"])
-            fields = log["fields"] | {"limit": log["limit"]}
-            emit(logger, log["level"], log["event"], log["text"], **fields)
+        if (log := told.get("log")) is None:
+            return
+        extra = {name: log[name] for name in ("event", "limit", "fields")}
+        # Of its logger's name, without a logger: these are never freed.
+        line = (log["logger"], log["level"], __file__, 0, "%s", (log["text"],), None)
+        if _LOG.isEnabledFor(log["level"]):
+            _LOG.handle(_LOG.makeRecord(*line, extra=extra))
 
 
 class _Process:
@@ -210,7 +215,8 @@ class _Process:
         os.set_blocking(self._into.fileno(), False)
         self._woken, self.pid = woken, self._process.pid
         self._pending = self._received = b""
-        self._heard_s = time.monotonic()
+        self._heard_s = self._second_s = time.monotonic()
+        self._said_bytes = 0  # since `_second_s`
         self._has_ended = False
 
     def __enter__(self) -> Self:
@@ -245,9 +251,12 @@ class _Process:
             self._pending = self._pending[os.write(into, self._pending) :]
         if out not in readable:
             return []
-        data = os.read(out, _LONGEST_LINE)
+        data = os.read(out, _MOST_BYTES)
         self._has_ended = not data
         self._heard_s = time.monotonic()
+        if self._heard_s - self._second_s > 1.0:
+            self._second_s, self._said_bytes = self._heard_s, 0
+        self._said_bytes += len(data)
         *lines, self._received = (self._received + data).split(b"\n")
         return lines
 
@@ -256,7 +265,9 @@ class _Process:
         """Why the process must be ended; "" while it need not."""
         if self._has_ended:
             return "it ended by itself"
-        if time.monotonic() - self._heard_s > SILENT_S or len(self._received) > _LONGEST_LINE:
+        if max(self._said_bytes, len(self._received)) > _MOST_BYTES:
+            return f"it wrote more than {_MOST_BYTES >> 10} KiB in a line or a second"
+        if time.monotonic() - self._heard_s > SILENT_S:
             return f"it did not answer for {SILENT_S:g} s"
         if (size := _resident_bytes(self.pid)) > LARGEST_BYTES:
             return f"it took {size >> 20} MiB of memory"
