@@ -13,7 +13,7 @@ import logging
 import math
 import threading
 import time
-from collections.abc import Callable, Container, Mapping
+from collections.abc import Callable, Mapping
 from copy import copy
 from typing import TYPE_CHECKING, Final
 
@@ -76,10 +76,11 @@ class Gateway(Output):
         battery: ReconnectingBus,
         inverter: ReconnectingBus,
         fields: Mapping[int, list[tuple[BitField, float]]],
-        own_ids: Callable[[], Container[int]] = frozenset,
+        own_ids: Callable[[], frozenset[int]] = frozenset,
     ) -> None:
         self._battery, self._inverter = battery, inverter
         self._fields, self._own_ids = fields, own_ids
+        self._ever_own: set[int] = set()  # also those before a reload: their frames may still come
         # A single interval may be a gap: from the third sample on the period is known.
         self._sampled_s, self._interval_s, self._current_until_s = math.inf, -math.inf, -math.inf
         self._soc: tuple[float, float] | None = None  # [%], and until when it is confirmed
@@ -146,9 +147,10 @@ class Gateway(Output):
 
     def _run(self) -> None:
         while not self._done.is_set():
-            frames, own_ids = self._battery.receive_pending(POLL_S), self._own_ids()
+            frames = self._battery.receive_pending(POLL_S)
+            self._ever_own |= self._own_ids()
             for frame in frames:
-                if frame.is_extended_id or frame.arbitration_id not in own_ids:
+                if frame.is_extended_id or frame.arbitration_id not in self._ever_own:
                     _hand_on(self.replaced(frame, time.monotonic()), self._inverter)
             for frame in self._inverter.receive_pending(POLL_S):
                 _hand_on(frame, self._battery)
