@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 import shutil
 import sys
 import time
@@ -23,6 +24,7 @@ from cangauge.extras.judge.suite import FAULTS, PlayedDrive, run_suite
 from cangauge.extras.live import launch
 from cangauge.extras.live.addresses import http_address
 from cangauge.extras.live.launch import Live
+from cangauge.logs.read import read_log
 from cangauge.service.status_client import Snapshot
 from cangauge.types import Estimate, Reason, Sample, Status
 from live import LoggedLines, leaf_model, waits
@@ -178,3 +180,14 @@ def test_a_folder_of_the_judge_that_goes_away_costs_the_opinion_only(tmp_path: P
             judge.on_sample(Sample(float(second), 10.0, 380.0, 20.0), NONE)
         judge._end_stretch()
         assert waits(lambda: len(list(folder.glob("2*.parquet"))) == 1, 20.0)
+
+
+def test_a_battery_that_publishes_no_soc_leaves_a_log_that_can_be_read(tmp_path: Path) -> None:
+    published = iter([50.0, 655.35, -1.0, math.nan] * 150)
+    with closing(LiveJudge(Stored(tmp_path, 3, ("false",)), lambda: next(published))) as judge:
+        for second in range(600):
+            judge.on_sample(Sample(float(second), 10.0, 380.0, 20.0), NONE)
+    (stored,) = tmp_path.glob("*.parquet")
+    soc_pct = read_log(stored).soc_pct
+    assert soc_pct is not None
+    assert np.nanmin(soc_pct) == np.nanmax(soc_pct) == 50.0

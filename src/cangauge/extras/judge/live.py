@@ -99,7 +99,8 @@ class LiveJudge(Output):
     ----------
     stored : Stored
     published_pct : callable
-        Returns the SoC that the battery published last [%]; NaN before.
+        Returns the SoC that the battery published last [%]; NaN before. A value that is no SoC is
+        kept as NaN: a log with one would be refused, and with it the judgement of all.
     """
 
     def __init__(self, stored: Stored, published_pct: Callable[[], float]) -> None:
@@ -122,7 +123,8 @@ class LiveJudge(Output):
                 self._end_stretch()
             elif since_s < ROW_EVERY_S:
                 return
-        self._rows.append((*sample[:4], self._published_pct()))
+        soc_pct = self._published_pct()
+        self._rows.append((*sample[:4], soc_pct if 0.0 <= soc_pct <= 100.0 else math.nan))
 
     def on_snapshot(self, snapshot: Snapshot) -> None:
         """End the stretch in a pause."""
