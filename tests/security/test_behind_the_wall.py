@@ -162,6 +162,15 @@ def test_a_bad_gauge_is_silent_and_ends(
     assert time.monotonic() - began_s < 60.0
 
 
+def test_a_gauge_that_fails_to_start_again_is_silent(drive: PlayedDrive, tmp_path: Path) -> None:
+    mark = tmp_path / "mark"
+    once = f"import os, sys\nif os.path.exists('{mark}'): sys.exit('{{}}')\nopen('{mark}', 'w')\n"
+    command = [sys.executable, "-c", once + GAUGE.format(script="")]
+    command += ["{interface}", "{channel}", "{port}"]
+    scores = run_suite(command, [drive], FAULTS[:2])
+    assert [score.silent for score in scores] == [1.0, 1.0]
+
+
 def test_a_folder_of_the_judge_that_goes_away_costs_the_opinion_only(tmp_path: Path) -> None:
     folder = tmp_path / "opinion"
     folder.mkdir()

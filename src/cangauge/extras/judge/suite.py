@@ -13,7 +13,7 @@ import socket
 import subprocess
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final
@@ -252,6 +252,7 @@ class _Gauge:
             for name in ("soc_pct", "soc_std_pct")
         ]
         self._vehicle, self._clock = Vehicle.load("generic"), ClockFrames()
+        self._was_ready = False
 
     def play(self, drive: PlayedDrive, fault: CountFault) -> Reading:
         """Play a drive to a new gauge."""
@@ -264,15 +265,16 @@ class _Gauge:
             "port": self._address.options["port"],
             "model": model, "capacity_ah": f"{capacity_ah:g}", "soc": f"{start_pct:.2f}",
         }  # fmt: skip
-        command = [word.format(**places) for word in self._command]
+        command = [_filled(word, places) for word in self._command]
         with (self._folder / "gauge.log").open("wb") as log:
             try:
                 process = subprocess.Popen(command, stdout=log, stderr=log)  # noqa: S603 - given
             except OSError as error:
                 raise InputError(f"cannot be started: {error}", field="COMMAND") from error
             try:
-                self._wait_until_ready(process)
-                return self._readings(drive, fault)
+                is_ready = self._becomes_ready(process)
+                self._was_ready = True
+                return self._readings(drive, fault, is_ready=is_ready)
             finally:
                 process.terminate()
                 try:
@@ -280,7 +282,8 @@ class _Gauge:
                 except subprocess.TimeoutExpired:
                     process.kill()
 
-    def _wait_until_ready(self, process: subprocess.Popen[bytes]) -> None:
+    def _becomes_ready(self, process: subprocess.Popen[bytes]) -> bool:
+        """Wait until a gauge publishes; raise CangaugeError if none of this command ever did."""
         until_s = time.monotonic() + QUIET_S
         while time.monotonic() < until_s and self._bus.receive(0.0) is not None:
             pass  # of the gauge before
@@ -288,26 +291,27 @@ class _Gauge:
         while time.monotonic() < until_s and process.poll() is None:
             message = self._bus.receive(0.1)
             if message is not None and message.arbitration_id == self._id:
-                return
+                return True
+        if self._was_ready:
+            return False
         said = (self._folder / "gauge.log").read_text(errors="replace").strip()[-500:]
         ended = process.poll() is not None
         problem = "ended before" if ended else f"ran for {READY_WITHIN_S:g} s without"
         text = f"{' '.join(self._command)}: {problem} publishing SOC_ESTIMATE"
         raise CangaugeError(f"{text}; it said: {said}" if said else text)
 
-    def _readings(self, drive: PlayedDrive, fault: CountFault) -> Reading:
-        rows, values, silent = [], [], 0
-        for last, frames, samples in self._batches(drive, fault):
+    def _readings(self, drive: PlayedDrive, fault: CountFault, *, is_ready: bool) -> Reading:
+        values, silent = [], 0
+        for _, frames, samples in self._batches(drive, fault) if is_ready else ():
             for frame in frames:
                 self._bus.send(frame)
             values.append(self._answer(samples))
-            rows.append(last)
             silent = 0 if math.isfinite(values[-1][0]) else silent + 1
             if silent >= SILENT_AT_MOST:
                 break
         ends = [row for row, _, _ in self._batches(drive, fault)]
         soc = np.full((len(ends), 2), np.nan)
-        soc[: len(values)] = values
+        soc[: len(values)] = np.reshape(values, (-1, 2))
         return np.array(ends), soc[:, 0], soc[:, 1]
 
     def _batches(
@@ -343,6 +347,13 @@ class _Gauge:
                 soc_pct, std_pct = (codec.decode(message.data) for codec in self._codecs)
                 found = soc_pct, std_pct
         return found
+
+
+def _filled(word: str, places: Mapping[str, object]) -> str:
+    """Return a word of a command with its places filled; other braces are the command's own."""
+    for name, value in places.items():
+        word = word.replace(f"{{{name}}}", str(value))
+    return word
 
 
 def _score(fault: CountFault, drives: Sequence[PlayedDrive], runs: Sequence[Reading]) -> Score:
