@@ -294,3 +294,15 @@ def test_broken_databases_name_their_kind(tmp_path: Path, suffix: str) -> None:
     (tmp_path / f"pack.{suffix}").write_text("nonsense <")
     with pytest.raises(InputError, match=suffix.upper()):
         load_dbc(tmp_path / f"pack.{suffix}")
+
+
+@pytest.mark.parametrize("line", ["SG_MUL_VAL_ 256 B X 1-1;", "SG_MUL_VAL_ 256 B A 1-1;"])
+def test_a_multiplexer_that_is_missing_or_its_own_is_refused(tmp_path: Path, line: str) -> None:
+    path = tmp_path / "x.dbc"
+    path.write_text(
+        'VERSION ""\nNS_ :\nBS_:\nBU_: E\nBO_ 256 M: 8 E\n SG_ A m1M : 0|8@1+ (1,0) [0|0] "" E\n'
+        f' SG_ B m1M : 8|8@1+ (1,0) [0|0] "" E\nSG_MUL_VAL_ 256 A B 1-1;\n{line}\n'
+    )
+    message = load_dbc(path).messages[0]
+    with pytest.raises(InputError, match="multiplexer"):
+        signal_codec(message, message.signals[0], source=path, field="current")

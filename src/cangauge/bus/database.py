@@ -11,7 +11,7 @@ import logging
 import math
 import re
 import struct
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from os import PathLike
@@ -264,11 +264,8 @@ def signal_codec(
         return bits
 
     bits = bits_of(signal)
-    conditions: list[MultiplexCondition] = []
-    selector = signal
-    while (name := selector.multiplexer_signal) is not None:
-        values = frozenset(selector.multiplexer_ids or ())
-        selector = message.get_signal_by_name(name)
+    conditions = []
+    for selector, values in _selectors(message, signal, source, field):
         conditions.append(MultiplexCondition(bits_of(selector), values))
     for name, value in (when or {}).items():
         other = _signal(message, name)
@@ -289,6 +286,26 @@ def signal_codec(
         offset=float(conversion.offset),
         not_available=_codes_of_no_value(signal) | frozenset(not_available),
         conditions=tuple(conditions),
+    )
+
+
+def _selectors(
+    message: Message, signal: Signal, source: object, field: str
+) -> Iterator[tuple[Signal, frozenset[int]]]:
+    """Yield the multiplexers of a signal with the values that select it, the nearest first."""
+    selector = signal
+    for _ in message.signals:
+        if (name := selector.multiplexer_signal) is None:
+            return
+        values, above = frozenset(selector.multiplexer_ids or ()), _signal(message, name)
+        if above is None:
+            break
+        selector = above
+        yield selector, values
+    problem = f"its multiplexer {selector.multiplexer_signal} is missing, or its own"
+    where = f"{field}.signal"
+    raise InputError(
+        problem, source=str(source), field=where, value=signal.name, cure="correct the DBC"
     )
 
 
