@@ -487,3 +487,15 @@ def test_a_cut_pcap_names_the_byte(tmp_path: Path) -> None:
     path.write_bytes(path.read_bytes()[:30])
     with pytest.raises(InputError, match=r"cut\.pcap: the PCAP file is damaged .*at byte 30"):
         list(open_capture(path))
+
+
+def test_a_blf_with_an_object_of_no_size_is_damaged(tmp_path: Path) -> None:
+    path = tmp_path / "x.blf"
+    with can.BLFWriter(path) as writer:
+        writer.on_message_received(can.Message(timestamp=1e9, arbitration_id=0x123, data=bytes(8)))
+    inner = struct.pack("<4sHHII", b"LOBJ", 16, 3, 0, 86) + bytes(32)
+    outer = struct.pack("<H6xL4x", 0, len(inner)) + inner
+    header = struct.pack("<4sHHII", b"LOBJ", 16, 1, 16 + len(outer), 10)
+    path.write_bytes(path.read_bytes()[:144] + header + outer)
+    with pytest.raises(InputError, match="damaged"):
+        list(open_capture(path))

@@ -3,14 +3,19 @@
 from __future__ import annotations
 
 import io
+import struct
 from collections.abc import Callable, Iterator
 from importlib.util import find_spec
 from typing import Any, ClassVar, Final
 
 import can
+from can.io.blf import BLFParseError
 
 from cangauge.bus.readers import MAX_LINE, BinaryReader
 from cangauge.errors import InputError
+
+_OBJECT: Final = struct.Struct("<8sI4x")
+"""Header of an object in a BLF, with its size [bytes]."""
 
 
 class LibraryReader(BinaryReader):
@@ -78,10 +83,23 @@ class AscReader(LibraryReader):
         )
 
 
+class _EndingBlf(can.BLFReader):
+    """python-can's reader; it would read an object whose size leads to no next one for ever."""
+
+    def _parse_data(self, data: bytes) -> Iterator[can.Message]:
+        place = data.find(b"LOBJ", 0, 8)
+        while 0 <= place <= len(data) - _OBJECT.size:
+            _, size = _OBJECT.unpack_from(data, place)
+            if size < _OBJECT.size:
+                raise BLFParseError(f"an object of {size} bytes")
+            place = data.find(b"LOBJ", place + size, place + size + 8)
+        yield from super()._parse_data(data)
+
+
 class BlfReader(LibraryReader):
     """Vector BLF."""
 
-    name, library, is_text, marks = "Vector BLF", can.BLFReader, False, (b"LOGG",)
+    name, library, is_text, marks = "Vector BLF", _EndingBlf, False, (b"LOGG",)
 
 
 class TrcReader(LibraryReader):
