@@ -12,26 +12,22 @@ import json
 import logging
 import os
 import select
+import socket
 import subprocess
 import sys
 import threading
 import time
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import asdict
-from importlib.util import find_spec
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Self
 
+from tornado.netutil import bind_sockets
+
 from cangauge._logging import emit
 from cangauge.errors import InputError
-from cangauge.extras.live.addresses import (
-    HttpAddress,
-    MqttSettings,
-    http_address,
-    mqtt_settings,
-    open_tcp,
-)
+from cangauge.extras.live.addresses import HttpAddress, http_address, mqtt_options
 from cangauge.service.output import Output
 from cangauge.service.status_client import Snapshot
 
@@ -65,7 +61,8 @@ class Live(Output):
         Of `/status`, `/healthz` and `/metrics`.
     dashboard : HttpAddress, optional
         Of the live page.
-    mqtt : MqttSettings, optional
+    mqtt : dict, optional
+        Arguments of `MqttPublisher`.
 
     Attributes
     ----------
@@ -79,8 +76,7 @@ class Live(Output):
     Raises
     ------
     InputError
-        If an address cannot be bound, a package is missing, certificates cannot be read, or the
-        system cannot hand sockets to another process.
+        If an address cannot be bound, or the system cannot hand sockets to another process.
     """
 
     def __init__(
@@ -88,29 +84,22 @@ class Live(Output):
         *,
         http: HttpAddress | None = None,
         dashboard: HttpAddress | None = None,
-        mqtt: MqttSettings | None = None,
+        mqtt: dict[str, Any] | None = None,
     ) -> None:
         if os.name != "posix":
             problem = "page, status by HTTP and MQTT need Linux or macOS"
             raise InputError(problem, field="dashboard", cure="run without them")
         self._asks: dict[str, Any] = {"level": _LOG.getEffectiveLevel()}
-        self._sockets = []
+        self._sockets: list[socket.socket] = []
         for key, address in (("dashboard", dashboard), ("http", http)):
-            if address is None:
-                continue
-            sockets = open_tcp(address, key)
-            self._sockets += sockets
-            numbers = [each.fileno() for each in sockets]
-            self._asks[key] = {"token": address.token, "sockets": numbers}
-            _announce(key, address, sockets[0].getsockname()[1])
+            if address is not None:
+                sockets = _listen(key, address)
+                self._sockets += sockets
+                numbers = [each.fileno() for each in sockets]
+                self._asks[key] = {"token": address.token, "sockets": numbers}
         self.port = int(self._sockets[0].getsockname()[1]) if self._sockets else 0
         if mqtt is not None:
-            if find_spec("paho") is None:
-                problem = "MQTT needs the package paho-mqtt, which is not installed"
-                raise InputError(problem, field="mqtt", cure="pip install 'cangauge[mqtt]'")
-            if mqtt.tls:
-                mqtt.tls_context()  # certificates that cannot be read show at once
-            self._asks["mqtt"] = asdict(mqtt)
+            self._asks["mqtt"] = mqtt
         self._latest: Snapshot | None = None
         self._done = threading.Event()
         self._woken, self._wake = os.pipe()
@@ -271,13 +260,23 @@ def _resident_bytes(pid: int) -> int:
         return 0
 
 
-def _announce(key: str, address: HttpAddress, port: int) -> None:
-    host = f"[{address.host}]" if ":" in address.host else address.host
-    token = "with a token" if address.token else "without a token"
-    text = f"live page: http://{host}:{port}/, {token}"
-    if key == "http":
-        text = f"http://{host}:{port}/status, {token}"
+def _listen(key: str, address: HttpAddress) -> list[socket.socket]:
+    """Return listening sockets of a key's address; raise InputError if they cannot be bound."""
+    try:
+        sockets = bind_sockets(address.port, address.host)
+    except (OSError, UnicodeError) as error:
+        raise InputError(
+            f"cannot listen: {getattr(error, 'strerror', None) or error}",
+            field=key,
+            value=str(address),
+            cure="choose another port",
+        ) from error
+    port = sockets[0].getsockname()[1]
+    url = f"http://{replace(address, port=port)}/"
+    url = f"live page: {url}" if key == "dashboard" else f"{url}status"
+    text = f"{url}, {'with' if address.token else 'without'} a token"
     emit(_LOG, logging.INFO, f"{key}.listening", text, port=port)
+    return sockets
 
 
 def make_output(service: Service) -> Live:
@@ -288,5 +287,5 @@ def make_output(service: Service) -> Live:
         for key in ("http", "dashboard")
         if getattr(config, key) is not None
     }
-    mqtt = None if config.mqtt is None else mqtt_settings(config.mqtt, service.bus)
+    mqtt = None if config.mqtt is None else mqtt_options(config.mqtt, service.bus)
     return Live(**address, mqtt=mqtt)

@@ -12,7 +12,6 @@ import json
 import logging
 import os
 import signal
-import socket
 import threading
 from collections.abc import Mapping
 from typing import IO, Any, Final
@@ -60,24 +59,18 @@ class _Told(logging.Handler):
 def outputs_of(asks: Mapping[str, Any]) -> list[Output]:
     """Return what is asked for, each on the running loop; imported only where it is."""
     outputs: list[Output] = []
-    for key in ("http", "dashboard"):
-        if key in asks:
-            sockets = [socket.socket(fileno=number) for number in asks[key]["sockets"]]
-            for each in sockets:
-                each.setblocking(False)
-            if key == "http":
-                from cangauge.extras.live.http import StatusServer  # noqa: PLC0415
+    if "http" in asks:
+        from cangauge.extras.live.http import StatusServer  # noqa: PLC0415
 
-                outputs.append(StatusServer(sockets, asks[key]["token"]))
-            else:
-                from cangauge.extras.live.server import LivePage  # noqa: PLC0415
+        outputs.append(StatusServer(**asks["http"]))
+    if "dashboard" in asks:
+        from cangauge.extras.live.server import LivePage  # noqa: PLC0415
 
-                outputs.append(LivePage(sockets, asks[key]["token"]))
+        outputs.append(LivePage(**asks["dashboard"]))
     if "mqtt" in asks:
-        from cangauge.extras.live.addresses import MqttSettings  # noqa: PLC0415
         from cangauge.extras.live.mqtt import MqttPublisher  # noqa: PLC0415
 
-        outputs.append(MqttPublisher(MqttSettings(**asks["mqtt"])))
+        outputs.append(MqttPublisher(**asks["mqtt"]))
     return outputs
 
 
