@@ -28,8 +28,10 @@ from cangauge.bus.open import BusAddress, open_bus
 from cangauge.bus.time_source import MICROSECONDS
 from cangauge.bus.vehicle import LOG_COLUMNS, Vehicle
 from cangauge.cli.app import main
+from cangauge.estimation.offline import samples_of
 from cangauge.logs.log import Log
 from cangauge.model.model_file import Model
+from cangauge.replay.encoder import FrameEncoder
 from cangauge.service.events import RateLimitFilter
 from cangauge.service.loop import Loop, LoopSettings
 from cangauge.service.output import Output
@@ -59,6 +61,13 @@ def short_log(seconds: float = 100.0, rate_hz: float = 10.0, *, noise_v: float =
         noise_v=noise_v,
         seed=3,
     )
+
+
+def frames_of(log: Log, vehicle: Vehicle | None = None, shift_s: float = 0.0) -> list[can.Message]:
+    """Return the frames that carry a log, stamped with its time and a shift [s]."""
+    encoder = FrameEncoder(vehicle or Vehicle.load("generic"))
+    samples = (each._replace(time_s=each.time_s + shift_s) for each in samples_of(log))
+    return [frame for sample in samples for frame in encoder.encode(sample)]
 
 
 class LoggedLines(logging.Handler):

@@ -8,7 +8,9 @@ from pathlib import Path
 import pytest
 
 from cangauge.bus.protection import GENERIC_RULE, E2eRule, ProtectionRule
+from cangauge.bus.publish import FrameIds
 from cangauge.errors import InputError
+from cangauge.estimation.power import PackLimits
 from cangauge.service.config import config_keys, load_config, reference
 from cangauge.service.setup import address_of, load_vehicle, pipeline_settings
 from live import in_process, leaf_model_path
@@ -39,6 +41,10 @@ def test_a_whole_file(tmp_path: Path) -> None:
         fd = false
         [ids]
         soc_estimate = 0x123
+        soc_health = 0x124
+        [limits]
+        min_voltage_v = 300
+        max_charge_a = 40
         """,
     )
     config = load_config(path)
@@ -48,8 +54,8 @@ def test_a_whole_file(tmp_path: Path) -> None:
     assert (address.interface, address.channel) == ("socketcan", "can3")
     assert dict(address.options) == {"bitrate": 500000, "fd": False}
     settings = pipeline_settings(config)
-    assert settings.ids.soc_estimate == 0x123
-    assert settings.ids.soc_detail == 0x5A1
+    assert settings.ids == FrameIds(soc_estimate=0x123, soc_health=0x124)
+    assert settings.estimator.limits == PackLimits(min_voltage_v=300.0, max_charge_a=40.0)
     assert settings.time_source == "replay-clock"
     assert settings.estimator.method == "newton"
     assert settings.estimator.initial_soc_pct == 81.5
@@ -92,6 +98,7 @@ def test_options_take_precedence_over_the_file(tmp_path: Path) -> None:
         ('model = "m"\ntimeout_s = 0', "timeout_s", "must be greater than 0"),
         ('model = "m"\n[ids]\nsoc_detail = 0x800', "ids.soc_detail", "2047"),
         ('model = "m"\ntimeout_s = nan', "timeout_s", "finite"),
+        ('model = "m"\n[limits]\nmin_voltage_v = -3', "limits.min_voltage_v", "at least 0"),
         ('vehicle = "generic"', "model", "is missing"),
         ("model = 3", "model", "must be a valid string"),
         ("model = ", None, "not TOML"),

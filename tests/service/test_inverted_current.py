@@ -16,13 +16,12 @@ from cangauge.bus.vehicle import Vehicle
 from cangauge.estimation.offline import samples_of
 from cangauge.logs.log import Log
 from cangauge.logs.sign import sign_of_current
-from cangauge.replay.encoder import FrameEncoder
 from cangauge.replay.player import ReplaySettings, play
 from cangauge.replay.steps import LogSource
 from cangauge.service.pipeline import Pipeline
 from cangauge.service.run import Service
 from cangauge.types import Reason, Status
-from live import LoggedLines, leaf_model, leaf_model_path, never, short_log, virtual_port
+from live import LoggedLines, frames_of, leaf_model, leaf_model_path, never, short_log, virtual_port
 
 MAP = """dbc = ["pack.dbc"]
 name = "car"
@@ -42,11 +41,8 @@ def inverted(log: Log) -> Log:
 
 def driven(log: Log) -> Pipeline:
     pipeline = Pipeline(Vehicle.load("generic"), leaf_model())
-    encoder = FrameEncoder(pipeline.vehicle)
-    for sample in samples_of(log):
-        for frame in encoder.encode(sample):
-            frame.timestamp = 1.7e9 + sample.time_s
-            pipeline.handle(frame)
+    for frame in frames_of(log, shift_s=1.7e9):
+        pipeline.handle(frame)
     return pipeline
 
 

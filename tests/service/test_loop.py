@@ -38,6 +38,7 @@ from live import (
     BrokenBus,
     Rows,
     Service,
+    frames_of,
     leaf_model,
     network_down,
     never,
@@ -251,10 +252,8 @@ def test_checkpoints_come_soon_periodically_and_at_the_end(serve: Serve) -> None
 
 
 def send_log(port: BusConnection, seconds: float) -> None:
-    encoder = FrameEncoder(GENERIC)
-    for sample in samples_of(short_log(seconds)):
-        for frame in encoder.encode(sample):
-            port.send(frame)
+    for frame in frames_of(short_log(seconds)):
+        port.send(frame)
 
 
 def test_a_replay_clock_that_is_no_input_is_told_once() -> None:

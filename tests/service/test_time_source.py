@@ -26,6 +26,14 @@ def test_finer_stamps_are_rounded_to_the_microsecond() -> None:
     assert ReceiveTime().time_of(frame(1.23456789)) == 1.234568
 
 
+@pytest.mark.parametrize("stamp_s", [float("nan"), float("inf"), float("-inf"), 1e300])
+def test_stamp_that_is_no_time_is_the_latest_one(stamp_s: float) -> None:
+    source = ReceiveTime()
+    assert source.time_of(frame(stamp_s)) == 0.0
+    source.time_of(frame(5.0))
+    assert source.time_of(frame(stamp_s)) == 5.0
+
+
 def test_a_clock_set_back_goes_on_from_where_it_was() -> None:
     source = ReceiveTime()
     assert source.time_of(frame(5000.0)) == 5000.0
