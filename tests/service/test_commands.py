@@ -68,52 +68,45 @@ def test_an_interrupted_replay_says_how_far_it_came(bus: list[str], log_path: Pa
     assert 0 < ended.json["frames"] < 100
 
 
-@pytest.mark.parametrize(
-    ("arguments", "say"),
-    [
-        (["--interface", "socketcan", "--channel", "nosuch0"], "nosuch0|no SocketCAN"),
-        (["--interface", "carrier_pigeon"], "carrier_pigeon"),
-        (["--channel", "can7x"], "can7x"),
-        (["--interface", "pcan", "--channel", "PCAN_USBBUS1"], "pcan"),
-        (["--vehicle", "moped"], "moped"),
-        (["--bus-option", "fast"], "K=V"),
-    ],
-)
-@pytest.mark.parametrize("command", ["run", "replay"])
-def test_bad_options_of_both_commands(
-    log_path: Path, tmp_path: Path, command: str, arguments: list[str], say: str
-) -> None:
-    before = set(tmp_path.iterdir())
-    first = [*MODEL, "--record", tmp_path / "out.log"] if command == "run" else [log_path]
-    ended = in_process(command, *first, *arguments)
-    assert ended.code == 2
-    assert ended.out == ""
-    lines = ended.err.splitlines()
-    assert len(lines) == 1, ended.err
-    assert re.search(say, lines[0])
-    assert set(tmp_path.iterdir()) == before
+BAD_OPTIONS = [
+    (["--interface", "socketcan", "--channel", "nosuch0"], "nosuch0|no SocketCAN"),
+    (["--interface", "carrier_pigeon"], "carrier_pigeon"),
+    (["--channel", "can7x"], "can7x"),
+    (["--interface", "pcan", "--channel", "PCAN_USBBUS1"], "pcan"),
+    (["--vehicle", "moped"], "moped"),
+    (["--bus-option", "fast"], "K=V"),
+]
+"""Of both commands."""
+RUN, REPLAY = ["run", *MODEL, "--record", "out.log"], ["replay", leaf_model_path()]
 
 
 @pytest.mark.parametrize(
     ("arguments", "say"),
     [
+        *((RUN + bad, say) for bad, say in BAD_OPTIONS),
+        *((["replay", "drive.parquet", *bad], say) for bad, say in BAD_OPTIONS),
         (["run"], "--model"),
         (["run", "-m", "/nowhere/model.json"], "/nowhere/model.json"),
-        (["run", *MODEL, "--method", "magic"], "magic"),
-        (["run", *MODEL, "--initial-soc", "150"], "150"),
-        (["run", *MODEL, "--time-source", "sundial"], "sundial"),
-        (["run", *MODEL, "--config", "/nowhere/car.toml"], "/nowhere/car.toml"),
+        ([*RUN, "--method", "magic"], "magic"),
+        ([*RUN, "--initial-soc", "150"], "150"),
+        ([*RUN, "--time-source", "sundial"], "sundial"),
+        ([*RUN, "--config", "/nowhere/car.toml"], "/nowhere/car.toml"),
         (["run", *MODEL, "--record", "drive.asc"], r"drive\.asc"),
-        (["run", *MODEL, "--state", "/nowhere/s.json"], "/nowhere/s.json"),
+        ([*RUN, "--state", "/nowhere/s.json"], "/nowhere/s.json"),
+        ([*RUN, "--state", "out.log"], "--state: is another file of this service"),
         (["replay", "/nowhere/log.csv"], "/nowhere/log.csv"),
-        (["replay", leaf_model_path()], "not a known kind of log"),
-        (["replay", leaf_model_path(), "--speed", "fast"], "fast"),
-        (["replay", leaf_model_path(), "--speed", "0"], "--speed"),
+        (REPLAY, "not a known kind of log"),
+        ([*REPLAY, "--speed", "fast"], "fast"),
+        ([*REPLAY, "--speed", "0"], "--speed"),
     ],
 )
-def test_bad_input_is_one_line_and_exit_2(arguments: list[str], say: str) -> None:
+def test_bad_input_is_one_line_and_exit_2(
+    log_path: Path, monkeypatch: pytest.MonkeyPatch, arguments: list[str], say: str
+) -> None:
+    monkeypatch.chdir(log_path.parent)
     ended = in_process(*arguments)
     assert ended.code == 2
     assert ended.out == ""
     assert len(ended.err.splitlines()) == 1, ended.err
     assert re.search(say, ended.err)
+    assert list(log_path.parent.iterdir()) == [log_path]
