@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from typing import Self
 
 from cangauge._config import read_toml
-from cangauge.bus.mapping import Overrides
 from cangauge.bus.open import BusAddress, bus_address, is_multicast
 from cangauge.bus.publish import FrameIds
 from cangauge.bus.vehicle import Vehicle
@@ -75,7 +74,6 @@ def load_vehicle(config: RunConfig) -> Vehicle:
         config.map,
         temperature_c=config.temperature,
         pair_within_s=config.pair_within_s,
-        overrides=Overrides(config.file, config.messages, config.rules, dict(config.checks)),
     )
 
 
