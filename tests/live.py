@@ -83,13 +83,13 @@ class LoggedLines(logging.Handler):
     def __init__(self, logger: str = "cangauge", thread: threading.Thread | None = None) -> None:
         super().__init__(logging.INFO)
         self._logger = logging.getLogger(logger)
+        self._level = self._logger.level
         self._thread = thread
         self._limiter = RateLimitFilter(self.emit)
         self.addFilter(self._limiter)
         self.lines: list[str] = []
 
     def __enter__(self) -> Self:
-        self._level = self._logger.level
         self._logger.setLevel(logging.INFO)
         self._logger.addHandler(self)
         return self

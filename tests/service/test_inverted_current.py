@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pytest
 
 from cangauge._resources import shared_file
 from cangauge.bus.publish import SocEstimate, SocReader
@@ -74,15 +73,19 @@ def test_an_inverted_drive_through_the_service(tmp_path: Path) -> None:
     assert state.soc.reasons & Reason.IMPLAUSIBLE_INPUT
 
 
-def test_the_bits_of_the_frame_do_not_move() -> None:
+def test_the_frame_says_implausible_and_the_suspicion_ends_with_the_proof() -> None:
     pipeline = driven(inverted(short_log(700.0, rate_hz=2.0)))
     assert pipeline.latest.reasons & Reason.SIGN_SUSPECT
     assert not pipeline.latest.reasons & Reason.IMPLAUSIBLE_INPUT
     content = SocReader().read(pipeline.heartbeat()[0])
     assert isinstance(content, SocEstimate)
     assert content.status is Status.INVALID
+    # Its bits have been those of other reasons before: this one has none of its own.
     expected = pipeline.published.reasons & ~Reason.SIGN_SUSPECT | Reason.IMPLAUSIBLE_INPUT
     assert content.reasons == expected
+    for sample in samples_of(short_log(2400.0, rate_hz=1.0)):
+        pipeline.sign.add(sample._replace(time_s=2e9 + sample.time_s))
+    assert not pipeline.sign.evidence
 
 
 def test_a_right_sign_and_few_steps_prove_nothing() -> None:
@@ -95,21 +98,7 @@ def test_a_right_sign_and_few_steps_prove_nothing() -> None:
     assert not driven(steady).sign.evidence
 
 
-def test_the_suspicion_ends_once_the_data_prove_the_sign() -> None:
-    pipeline = driven(inverted(short_log(700.0, rate_hz=2.0)))
-    assert pipeline.sign.evidence
-    right = short_log(2400.0, rate_hz=1.0)
-    for sample in samples_of(right):
-        pipeline.sign.add(sample._replace(time_s=2e9 + sample.time_s))
-    assert not pipeline.sign.evidence
-
-
-@pytest.mark.parametrize("sign", [1, -1])
-def test_the_cure_names_the_line_of_the_map(tmp_path: Path, sign: int) -> None:
-    (tmp_path / "pack.dbc").write_bytes(shared_file("dbc", "generic_pack.dbc").read_bytes())
-    (tmp_path / "car.toml").write_text(MAP.format(sign=sign))
+def test_the_cure_where_there_is_no_map() -> None:
     options = {"interface": "virtual", "channel": "x", "status_socket": "off"}
-    service = Service(model=str(leaf_model_path()), map=str(tmp_path / "car.toml"), **options)
-    assert service._setup.sign_cure.startswith(f"set sign = {-sign} under [current] of ")
-    preset = Service(model=str(leaf_model_path()), **options)
-    assert preset._setup.sign_cure.startswith("use the preset of this car")
+    service = Service(model=str(leaf_model_path()), **options)
+    assert service._setup.sign_cure.startswith("use the preset of this car")
