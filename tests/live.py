@@ -32,7 +32,7 @@ from cangauge.estimation.offline import samples_of
 from cangauge.logs.log import Log
 from cangauge.model.model_file import Model
 from cangauge.replay.encoder import FrameEncoder
-from cangauge.service.events import RateLimitFilter
+from cangauge.service.events import RateLimitedHandler
 from cangauge.service.loop import Loop, LoopSettings
 from cangauge.service.output import Output
 from cangauge.service.pipeline import Pipeline, PipelineSettings
@@ -70,7 +70,7 @@ def frames_of(log: Log, vehicle: Vehicle | None = None, shift_s: float = 0.0) ->
     return [frame for sample in samples for frame in encoder.encode(sample)]
 
 
-class LoggedLines(logging.Handler):
+class LoggedLines(RateLimitedHandler):
     """Lines that a service would write, rate-limited as there; warnings begin with "warning: ".
 
     Parameters
@@ -81,12 +81,11 @@ class LoggedLines(logging.Handler):
     """
 
     def __init__(self, logger: str = "cangauge", thread: threading.Thread | None = None) -> None:
-        super().__init__(logging.INFO)
+        super().__init__()
+        self.setLevel(logging.INFO)
         self._logger = logging.getLogger(logger)
         self._level = self._logger.level
         self._thread = thread
-        self._limiter = RateLimitFilter(self.emit)
-        self.addFilter(self._limiter)
         self.lines: list[str] = []
 
     def __enter__(self) -> Self:
@@ -97,11 +96,7 @@ class LoggedLines(logging.Handler):
     def __exit__(self, *_: object) -> None:
         self._logger.removeHandler(self)
         self._logger.setLevel(self._level)
-        self.release_all()
-
-    def release_all(self) -> None:
-        """Add the lines that the rate limit holds back."""
-        self._limiter.release_due(everything=True)
+        self.release_due(everything=True)
 
     def emit(self, record: logging.LogRecord) -> None:
         if self._thread is None or record.thread == self._thread.ident:

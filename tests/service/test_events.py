@@ -11,7 +11,7 @@ from itertools import pairwise
 import pytest
 
 from cangauge._logging import emit
-from cangauge.service.events import LogFormat, RateLimitFilter, logging_to, release_held
+from cangauge.service.events import LogFormat, RateLimitedHandler, logging_to, release_held
 from live import waits
 
 LOG = logging.getLogger("cangauge.test")
@@ -60,31 +60,33 @@ def test_a_closed_stream_is_ignored(capsys: pytest.CaptureFixture[str]) -> None:
     assert capsys.readouterr().err == ""
 
 
-class Limited:
-    """A limiter on a clock, and what it releases."""
+class Limited(RateLimitedHandler):
+    """A handler on a clock that keeps what it writes."""
 
     def __init__(self, now_s: float = 0.0) -> None:
-        self.now_s, self.released = now_s, list[str]()
-        self.filter = RateLimitFilter(
-            lambda each: self.released.append(each.getMessage()), lambda: self.now_s
-        )
+        super().__init__(lambda: self.now_s)
+        self.now_s, self.written = now_s, list[tuple[float, str, int]]()
 
-    def passes(self, event: str = "bus.lost", text: str = "x") -> logging.LogRecord | None:
+    def emit(self, record: logging.LogRecord) -> None:
+        suppressed = getattr(record, "suppressed", 0)
+        self.written.append((self.now_s, record.getMessage(), suppressed))
+
+    def passes(self, event: str = "bus.lost", text: str = "x") -> bool:
         made = logging.LogRecord("cangauge.bus", logging.WARNING, "", 0, "%s", (text,), None)
         made.event = made.limit = event
-        return made if self.filter.filter(made) else None
+        return self.handle(made)
 
 
 def test_repetitions_are_written_at_growing_intervals() -> None:
-    limited, written = Limited(), []
+    limited = Limited()
     for tenth in range(10_000):
         limited.now_s = 0.1 * tenth
-        if (each := limited.passes()) is not None:
-            written.append((limited.now_s, getattr(each, "suppressed", 0)))
-    assert [round(time_s) for time_s, _ in written][:7] == [0, 1, 3, 7, 15, 31, 63]
-    assert written[1][1] == 9
-    assert sum(left + 1 for _, left in written) <= 10_000
-    assert all(later[0] - before[0] <= 60.2 for before, later in pairwise(written))
+        limited.passes()
+    times = [time_s for time_s, _, _ in limited.written]
+    assert [round(time_s) for time_s in times][:7] == [0, 1, 3, 7, 15, 31, 63]
+    assert limited.written[1][2] == 9
+    assert sum(left + 1 for _, _, left in limited.written) <= 10_000
+    assert all(later - before <= 60.2 for before, later in pairwise(times))
     limited.now_s += 61.0  # quiet for a minute: new again
     assert limited.passes()
 
@@ -95,7 +97,7 @@ def test_the_first_is_always_written_and_memory_is_bounded() -> None:
     assert not limited.passes()
     for number in range(5_000):
         assert limited.passes(f"made.up_{number}")
-    assert len(limited.filter._events) <= 256
+    assert len(limited._events) <= 256
 
 
 def test_the_latest_suppressed_record_follows_its_interval() -> None:
@@ -105,12 +107,12 @@ def test_the_latest_suppressed_record_follows_its_interval() -> None:
         limited.now_s += 0.1
         assert not limited.passes("bus.lost", f"try {number}")
     limited.now_s = 100.99
-    limited.filter.release_due()
-    assert limited.released == []
+    limited.release_due()
+    assert len(limited.written) == 1
     limited.now_s = 101.0
-    limited.filter.release_due()
-    limited.filter.release_due()
-    assert limited.released == ["try 4"]
+    limited.release_due()
+    limited.release_due()
+    assert limited.written[1:] == [(101.0, "try 4", 4)]
 
 
 def test_suppressed_records_are_written_when_due_and_at_the_end() -> None:

@@ -62,7 +62,7 @@ def test_an_inverted_drive_through_the_service(tmp_path: Path) -> None:
         state = play(port, source, ReplaySettings(speed=float("inf")), stop=never)
         service.stop()
         running.join(30.0)
-        logged.release_all()
+        logged.release_due(everything=True)
     # The status at the end, the log, and the frame on the bus.
     assert (found["status"], "sign_suspect" in found["reasons"]) == ("invalid", True)
     [notice] = found["notices"]

@@ -16,7 +16,7 @@ import threading
 from collections.abc import Mapping
 from typing import IO, Any, Final
 
-from cangauge.service.events import RateLimitFilter
+from cangauge.service.events import RateLimitedHandler
 from cangauge.service.output import Output
 from cangauge.service.status_client import Snapshot
 
@@ -36,7 +36,7 @@ def tell(**content: object) -> None:
             left = left[os.write(1, left) :]
 
 
-class _Told(logging.Handler):
+class _Told(RateLimitedHandler):
     """Hands the events of this process to the service, which writes them as its own."""
 
     def emit(self, record: logging.LogRecord) -> None:
@@ -74,7 +74,7 @@ def outputs_of(asks: Mapping[str, Any]) -> list[Output]:
     return outputs
 
 
-async def _serve(asks: Mapping[str, Any], lines: IO[bytes], limiter: RateLimitFilter) -> None:
+async def _serve(asks: Mapping[str, Any], lines: IO[bytes], told: RateLimitedHandler) -> None:
     reader = asyncio.StreamReader(limit=_LINE_BYTES)
     loop = asyncio.get_running_loop()
     await loop.connect_read_pipe(lambda: asyncio.StreamReaderProtocol(reader), lines)
@@ -82,7 +82,7 @@ async def _serve(asks: Mapping[str, Any], lines: IO[bytes], limiter: RateLimitFi
     async def tell_that_it_lives() -> None:
         while True:
             tell(alive=True)
-            limiter.release_due()
+            told.release_due()
             await asyncio.sleep(ALIVE_EVERY_S)
 
     living = asyncio.ensure_future(tell_that_it_lives())
@@ -104,11 +104,9 @@ def main() -> None:
     lines = open(0, "rb", buffering=0)  # noqa: SIM115 - stdin, which ends with the process
     asks: Mapping[str, Any] = json.loads(lines.readline())
     told = _Told()
-    limiter = RateLimitFilter(told.emit)
-    told.addFilter(limiter)
     logging.getLogger().handlers[:] = [told]
     logging.getLogger("cangauge").setLevel(asks["level"])
-    asyncio.run(_serve(asks, lines, limiter))
+    asyncio.run(_serve(asks, lines, told))
 
 
 if __name__ == "__main__":
