@@ -16,7 +16,7 @@ from cangauge._resources import shared_file
 from cangauge.service.config import load_config
 from cangauge.service.loop import LoopSettings
 from cangauge.service.run import Service
-from cangauge.service.setup import SetupReader
+from cangauge.service.setup import read_setup
 from cangauge.types import Reason
 from faults.large_dbc import SIGNALS
 from live import LoggedLines, frames_of, leaf_model_path, short_log
@@ -59,9 +59,7 @@ class Car:
         """Read the file, with another text if one is given, and apply it."""
         if text is not None:
             self.write(text)
-        reading = SetupReader(partial(load_config, self.path))
-        reading.join()
-        return self.service.apply(reading.result)[0]
+        return self.service.apply(read_setup(partial(load_config, self.path)))[0]
 
 
 @pytest.fixture
