@@ -445,13 +445,6 @@ class ConfigKey:
     restart: bool = False
     is_path: bool = False
 
-    def value_in(self, table: Mapping[str, Any]) -> Any:
-        """Return the value of the key in a table, or None."""
-        value: Any = table
-        for part in self.name.split("."):
-            value = value and value[part]
-        return value
-
     @property
     def help(self) -> str:
         """Help text of the option, with unit and default."""

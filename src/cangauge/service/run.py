@@ -29,7 +29,7 @@ from cangauge.service.record import Recorder, check_recording
 from cangauge.service.setup import Setup, address_of, read_setup
 from cangauge.service.state import StateKeeper, state_path
 from cangauge.service.status import PAGE_EVERY_S, SHOW_EVERY_S, Monitor
-from cangauge.service.status_client import StatusSocket, socket_path
+from cangauge.service.status_client import StatusSocket, socket_path, value_at
 
 OUTPUTS: Final = {
     "cangauge.extras.live.launch": ("http", "dashboard", "mqtt"),
@@ -297,7 +297,7 @@ def _log_changes(old: RunConfig, new: RunConfig) -> None:
     late = ", ".join(
         each.name
         for each in config_keys()
-        if each.restart and each.value_in(before) != each.value_in(after)
+        if each.restart and value_at(before, each.name) != value_at(after, each.name)
     )
     if late:
         text = f"{late}: takes effect after a restart of the service"
