@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -247,10 +248,15 @@ def test_a_wrong_section_is_refused_by_key(tmp_path: Path, lines: str, field: st
     assert caught.value.field == field
 
 
-def test_a_password_is_in_no_repr(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_defaults_and_a_password_that_is_in_no_repr(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setenv("CANGAUGE_MQTT_PASSWORD", PASSWORD)
     path = tmp_path / "run.toml"
-    path.write_text(f'model = "{leaf_model_path()}"\n[mqtt]\nbroker = "b"\nuser = "u"\n')
-    config = load_config(path)
-    assert options_in(path)["password"] == PASSWORD
-    assert PASSWORD not in repr(config)
+    for lines, port in (("", 1883), ("tls = true\n", 8883), ("port = 7\n", 7)):
+        path.write_text(f'model = "{leaf_model_path()}"\n[mqtt]\nbroker = "b"\nuser = "u"\n{lines}')
+        options = options_in(path)
+        assert options["port"] == port
+        assert options["password"] == PASSWORD
+        assert re.fullmatch(r"cangauge_[A-Za-z0-9_-]+_can0", options["device"])
+        assert PASSWORD not in repr(load_config(path))
