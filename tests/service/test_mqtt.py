@@ -134,6 +134,9 @@ def test_home_assistant_finds_sensors_and_states(
         assert kinds["energy_kwh"] == ("energy_storage", "kWh")
         assert kinds["status"] == ("enum", None)
         assert "initialising" in sensors["status"]["options"]
+        # An invalid SoC is unavailable; the current is not.
+        assert "'invalid'" in sensors["soc_pct"]["availability"][1]["value_template"]
+        assert len(sensors["current_a"]["availability"]) == 1
         late = Listener(broker)
         assert waits(lambda: "cangauge/bench/state" in late.retained)
         assert f"homeassistant/sensor/bench/{next(iter(sensors))}/config" in late.retained
@@ -156,6 +159,10 @@ def test_a_broker_that_goes_costs_no_sample(
         assert waits(lambda: listener.availability == "online", 10.0)
         assert waits(lambda: "soc_pct" in listener.state())
         assert "homeassistant/sensor/bench/soc_pct/config" in listener.latest
+        # The last will, of the process that publishes; another one takes its place.
+        os.kill(running.service._outputs[-1].pid, signal.SIGKILL)
+        assert waits(lambda: listener.availability == "offline")
+        assert waits(lambda: listener.availability == "online")
     assert rate == pytest.approx(20.0, rel=0.15)
     assert running.summary is not None
     assert running.summary["frames"]["lost"] == 0
@@ -172,7 +179,7 @@ def test_a_broker_that_hangs_delays_no_stop(tmp_path: Path, broker: Broker) -> N
     assert running.summary is not None
 
 
-def test_a_killed_service_is_offline_by_its_last_will(
+def test_a_killed_service_is_offline(
     tmp_path: Path, broker: Broker, listener: Listener
 ) -> None:
     path = tmp_path / "run.toml"
