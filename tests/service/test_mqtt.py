@@ -179,9 +179,7 @@ def test_a_broker_that_hangs_delays_no_stop(tmp_path: Path, broker: Broker) -> N
     assert running.summary is not None
 
 
-def test_a_killed_service_is_offline(
-    tmp_path: Path, broker: Broker, listener: Listener
-) -> None:
+def test_a_killed_service_is_offline(tmp_path: Path, broker: Broker, listener: Listener) -> None:
     path = tmp_path / "run.toml"
     path.write_text(
         f'model = "{leaf_model_path()}"\ninterface = "virtual"\nchannel = "x"\n'
