@@ -221,11 +221,8 @@ class Service:
 
     def _log_end(self, status: dict[str, Any]) -> None:
         """Log the end of a run: its frames, losses and last SoC, and what is missing."""
-        counts, latest, step_s = (
-            self.pipeline.counts,
-            self.pipeline.latest,
-            status["step"]["mean_s"],
-        )
+        counts, latest = self.pipeline.counts, self.pipeline.latest
+        step_s = status["step"]["mean_s"]
         errors = "".join(
             f", {count} {name.replace('_', ' ')}"
             for name, count in status["bus_counts"].items()
