@@ -105,6 +105,7 @@ def test_the_last_hour_is_a_log_that_begins_after_a_jump_back(tmp_path: Path) ->
         history.add(status(time_s, **sample))
     path = tmp_path / LOG_NAME
     path.write_text(last_hour(history))
+    assert "\n100.7" not in path.read_text()  # without a current
     log = read_log(path)
     assert log.time_s.tolist() == [*(0.1 * np.arange(50)).round(6), 100.0, 100.5, 101.0]
     assert set(log.current_a) == {12.5}
