@@ -16,6 +16,7 @@ import pytest
 from cangauge.bus.vehicle import Vehicle
 from cangauge.logs.canonical import write_log
 from cangauge.service.offline import estimate_capture
+from cangauge.service.status_client import fetch_status
 from live import Command, in_process, leaf_model, leaf_model_path, short_log, waits
 
 MODEL = ("-m", leaf_model_path())
@@ -95,11 +96,13 @@ def test_a_hangup_reads_the_configuration_again_and_an_interrupt_ends_the_servic
 ) -> None:
     path = tmp_path / "car.toml"
     path.write_text("timeout_s = 1\n")
-    service = Command("run", *bus, *MODEL, "--config", path, "--json")
+    sock = tmp_path / "status.sock"
+    service = Command("run", *bus, *MODEL, "--config", path, "--status-socket", sock, "--json")
     service.wait_for("service.ready")
     path.write_text("timeout_s = [")
     service.process.send_signal(signal.SIGHUP)
     service.wait_for("config.refused")
+    assert waits(lambda: "not TOML" in str(fetch_status(sock)["config"]["problem"]), 5.0)
     path.write_text("timeout_s = 0.5\n")
     service.process.send_signal(signal.SIGHUP)
     service.wait_for("config.reloaded")
