@@ -13,7 +13,7 @@ import can
 import pytest
 
 from cangauge._resources import shared_file
-from cangauge.service.config import load_config
+from cangauge.service.config import RunConfig, load_config
 from cangauge.service.loop import LoopSettings
 from cangauge.service.run import Service
 from cangauge.service.setup import read_setup
@@ -200,6 +200,13 @@ def test_an_invalid_configuration_or_model_is_refused_as_a_whole(
     )  # fmt: skip
     car.drive(1000, 1001)
     assert car.pipeline.samples == 1001
+
+
+def test_an_error_of_a_library_refuses_the_configuration() -> None:
+    def fail() -> RunConfig:
+        raise RuntimeError("deep inside")
+
+    assert "cannot be read: RuntimeError('deep inside')" in str(read_setup(fail))
 
 
 def test_keys_that_need_a_restart_are_logged_and_unchanged(car: Car) -> None:
