@@ -72,6 +72,8 @@ def test_the_files_hold_the_cars_own_scales(car: Path) -> None:
     assert "current_a : 16|16@1+ (0.1,-500)" in text
     assert "voltage_v : 0|16@1+ (0.1,0)" in text
     assert "soc_pct : 32|16@1+ (0.1,0)" in text
+    # Frames of 0.1 s pair within a little more than their period.
+    assert "pair_within_s = 0.12 " in (car / "mycar" / "car.toml").read_text(encoding="utf-8")
 
 
 def test_the_service_reaches_the_cars_soc(car: Path) -> None:
