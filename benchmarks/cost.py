@@ -44,7 +44,6 @@ from cangauge.estimation.cells import CellEstimator
 from cangauge.estimation.compiled import make_estimator
 from cangauge.estimation.offline import run_estimator
 from cangauge.estimation.settings import EstimatorSettings
-from cangauge.extras.embedded.equivalent_circuit import equivalent_circuit
 from cangauge.extras.validation import simulate
 from cangauge.identify.fit import fit
 from cangauge.logs.canonical import write_log
@@ -54,6 +53,7 @@ from cangauge.model.model_file import Coefficient, Model
 from cangauge.replay.encoder import FrameEncoder
 from cangauge.service.pipeline import Pipeline, PipelineSettings
 from cangauge.types import Sample
+from equivalent_circuit import equivalent_circuit
 from peer_filters import Circuit, bare_ekf, run
 from peers import step_us
 

@@ -158,7 +158,7 @@ def test_each_key_is_described_and_each_option_declared_once() -> None:
     assert len(flags) == len(set(flags))
     until = keys["until_idle_s"]
     assert (until.option, until.unit, until.bounds) == (
-        "--until-idle",
+        "",
         "s",
         "> 0, ≤ 1e+09",
     )
@@ -167,8 +167,8 @@ def test_each_key_is_described_and_each_option_declared_once() -> None:
 
 def test_an_error_of_an_option_names_it_as_it_is_written() -> None:
     with pytest.raises(InputError) as caught:
-        load_config(None, {"model": "m", "until_idle_s": -1.0})
-    assert caught.value.field == "--until-idle"
+        load_config(None, {"model": "m", "initial_soc_std": -1.0})
+    assert caught.value.field == "--initial-soc-std"
 
 
 def test_the_reference_page_is_generated_from_the_model(project: Path) -> None:

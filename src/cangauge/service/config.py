@@ -318,7 +318,7 @@ class RunConfig(Strict):
     duration_s: FiniteFloat | None = key(None, "Stop after this time.", unit="s", gt=0.0, le=1e9)
     until_idle_s: FiniteFloat | None = key(
         None, "Stop when no sample came for this time, after the first.",
-        "--until-idle", "S", unit="s", gt=0.0, le=1e9,
+        unit="s", gt=0.0, le=1e9,
     )  # fmt: skip
     state: str | None = key(
         None,

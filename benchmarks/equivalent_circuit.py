@@ -1,4 +1,4 @@
-"""Equivalent circuit of a model: tables for PyBaMM's Thevenin model and for `thevenin`.
+"""Equivalent circuit of a model: the tables that the peers of the benchmarks run on.
 
 Open-circuit voltage, series resistance and RC pairs over temperature, current and SoC. Capacity and
 open-circuit voltage are those of the model. Resistances are fitted to its step response: the
@@ -18,9 +18,7 @@ last current (hysteresis) enter as their mean response.
 from __future__ import annotations
 
 import itertools
-import json
-from collections.abc import Mapping, Sequence
-from importlib.resources import files
+from collections.abc import Sequence
 from typing import Any, Final
 
 import numpy as np
@@ -108,13 +106,6 @@ def equivalent_circuit(model: Model) -> dict[str, Any]:
         "pair_ohm": [ohm[..., k].tolist() for k in range(1, ohm.shape[-1])],
         "step_error_pct": 100.0 * error_ohm / usual[-1],
     }
-
-
-def module_of(tables: Mapping[str, Any]) -> str:
-    """Return a Python module with the tables and the parameters of both simulators."""
-    template = files("cangauge.extras.embedded") / "equivalent_circuit_module.py.txt"
-    text = f"TABLES: dict = {json.dumps(tables)}"
-    return template.read_text("utf-8").replace("TABLES: dict = {}", text, 1)
 
 
 def _rest_v(extended: ExtendedModel, soc_pct: FloatArray, temperature_c: float) -> FloatArray:
