@@ -33,10 +33,15 @@ def run(*arguments: str) -> dict[str, object]:
 
 
 def test_the_command_writes_what_simulate_returns(tmp_path: Path) -> None:
-    arguments = ("--seed", "4", "--pack", "leaf24", "--effect", "current_offset:offset_a=4")
+    arguments = (
+        "--seed", "4", "--day", "2", "--hours", "0.3", "--plant", "equation", "--pack", "leaf24",
+        "--effect", "current_offset:offset_a=4",
+    )  # fmt: skip
     paths = [tmp_path / name for name in ("a.parquet", "b.csv")]
     found = [run(*arguments, "-o", str(path)) for path in paths]
-    simulated = simulate("current_offset:offset_a=4", seed=4, pack="leaf24")
+    simulated = simulate(
+        "current_offset:offset_a=4", seed=4, drive=2, hours=0.3, plant="equation", pack="leaf24"
+    )
     assert simulated.to_dict().items() <= found[0].items()
     for path in paths:
         written = read_log(path)
@@ -96,6 +101,7 @@ def test_full_discharge_gives_its_capacity() -> None:
     [
         (("-o", "x.txt"), "suffix"),
         (("-o", "x.csv", "--seed", "-1"), "--seed"),
+        (("-o", "x.csv", "--hours", "99"), "--hours"),
         (("-o", "x.csv", "--pack", "tank"), "leaf24"),
         (("-o", "x.csv", "--effect", "gremlins"), "current_offset"),
         (("-o", "nowhere/x.csv"), "folder"),

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from cangauge.cli.declare import command
 from cangauge.cli.options import check_outputs
@@ -18,8 +18,11 @@ def twin_command(
     output: Path,
     seed: int = 0,
     effect: list[str] | None = None,
+    day: int = 1,
+    hours: float | None = None,
     discharge: bool = False,
     pack: str | None = None,
+    plant: Literal["twin", "equation"] = "twin",
     json_output: bool = False,
 ) -> None:
     """Simulate a pack, a drive, the weather and the sensors: a log whose truth is known.
@@ -28,14 +31,13 @@ def twin_command(
     open-circuit voltage, Butler–Volmer kinetics, diffusion, two thermal nodes, cell spread,
     quantized and jittered sensors. Positive current discharges.
 
-    Python's `cangauge.simulate` takes the same and more: further drives of a pack, their hours,
-    weather, SoC and speed, the chemistry, and another model of the cells.
+    Python's `cangauge.simulate` takes the same and more: weather, SoC, speed, the chemistry.
 
     Examples
     --------
     `cangauge twin --seed 1 --discharge -o full.parquet`
 
-    `cangauge twin --seed 1 --effect current_offset:offset_a=1.5 -o trip.parquet`
+    `cangauge twin --seed 1 --day 2 --effect current_offset:offset_a=1.5 -o trip.parquet`
 
     `cangauge twin --seed 1 --effect weak_cell:gap_v=1 --pack leaf24 -o cell.csv`
 
@@ -44,15 +46,21 @@ def twin_command(
     output : -o, --output LOG.parquet|.pq|.csv|.bdf
         Log to write.
     seed : N (0 … inf)
-        Selects pack, drive and weather. Same seed, same log.
+        Selects the pack. Same seed, same log.
     effect : ID[:parameter=value,…]
         Fault of the pack or its sensors; repeat for several. A wrong ID or parameter is answered
         with the known ones. `gap_v=V` in place of a size: the size that opens this RMS gap.
         Default: a gap of 0.3 % of the pack voltage.
+    day : N (1 … inf)
+        Number of the drive, with its weather.
+    hours : H (0.05 … 12 h)
+        Duration. Default: 0.5 to 2.5, drawn.
     discharge : --discharge
-        Drive from full to empty in 2.5 h: a log for `fit`.
+        Drive from full to empty within the hours (default 2.5 h): a log for `fit`.
     pack : KIND
         leaf24, leaf40, car60, car60lfp, compact or module12. Default: drawn.
+    plant : twin|equation
+        Model of the cells: the twin's, or the equation that cangauge identifies.
     """
     from cangauge.extras.validation.twin.simulation import simulate
     from cangauge.logs.canonical import write_log
@@ -62,7 +70,14 @@ def twin_command(
     with progress() as show:
         show("simulating")
         simulated = simulate(
-            effect or (), seed=seed, discharge=discharge, pack=pack, name=output.stem
+            effect or (),
+            seed=seed,
+            drive=day,
+            hours=hours,
+            discharge=discharge,
+            pack=pack,
+            plant=plant,
+            name=output.stem,
         )
     for scaled in simulated.limited:
         note(
