@@ -40,10 +40,7 @@ class FrameStatistics:
 
     messages: dict[int, MessageStatistics] = field(default_factory=dict)  # by key, see `vehicle`
     frames: int = 0  # received, wanted or not
-    ignored: int = 0  # error frames and remote frames
     samples: int = 0
-    current_unpaired: int = 0  # samples without a voltage (NaN)
-    time_reversals: int = 0  # wanted frames stamped before the last used one of their message
 
     def __getattr__(self, name: str) -> int:
         """Return the total of a statistic of the messages."""
@@ -64,13 +61,12 @@ class Pairing:
     - When time runs backwards by more than `within_s`, waiting values are released likewise.
 
     A value completes at most one sample. Samples keep the order of their currents. All times are
-    bus time [s]; `statistics` counts the currents left unpaired.
+    bus time [s].
     """
 
-    def __init__(self, within_s: float, statistics: FrameStatistics | None = None) -> None:
+    def __init__(self, within_s: float) -> None:
         # Slightly more than stated: stamps 20 ms apart must pair in spite of rounding.
         self._within_s = within_s + 1e-6
-        self.statistics = statistics or FrameStatistics()
         self._waiting: Sample | None = None
         self._voltage_s = self._voltage_v = math.nan  # NaN: no voltage waits
 
@@ -97,7 +93,6 @@ class Pairing:
     def flush(self) -> Sample | None:
         """Release the waiting current, if any, as a sample without voltage."""
         waiting, self._waiting = self._waiting, None
-        self.statistics.current_unpaired += waiting is not None
         return waiting
 
 
@@ -241,7 +236,7 @@ class SampleDecoder:
         self.statistics = FrameStatistics() if statistics is None else statistics
         self.health: dict[str, SignalHealth] = {}
         self.now_s = -math.inf
-        self._pairing = Pairing(vehicle.pair_within_s, self.statistics)
+        self._pairing = Pairing(vehicle.pair_within_s)
         current, voltage = vehicle.current, vehicle.voltage
         has_same_turn = current.codec.conditions == voltage.codec.conditions
         self._is_one_frame = current.key == voltage.key and has_same_turn
@@ -298,7 +293,6 @@ class SampleDecoder:
         """Decode one frame; return the sample that it completes, if any."""
         self.statistics.frames += 1
         if message.is_error_frame or message.is_remote_frame:
-            self.statistics.ignored += 1
             return None
         key, time_s, data = message.arbitration_id, message.timestamp, message.data
         if message.is_extended_id:
@@ -314,8 +308,10 @@ class SampleDecoder:
                     data = bytearray(reply)
             if route is None:
                 return None
-        if time_s < route.last_s:
-            self._rewind(route.last_s, time_s)
+        if time_s < route.last_s and route.last_s - time_s > self.vehicle.pair_within_s:
+            # A restarted log, or a clock that was set.
+            for health in self.health.values():
+                health.rewind(time_s)
         self.now_s = time_s
         payload = route.accept(data, time_s)
         return None if payload is None else self._values(route, payload, time_s)
@@ -339,21 +335,12 @@ class SampleDecoder:
             if self._temperature is not None:
                 temperature_c = self._temperature.value_at(time_s)
             sample = Sample(time_s, current_a, voltage_v, temperature_c)
-            if self._is_one_frame:
-                self.statistics.current_unpaired += math.isnan(voltage_v)
-            else:
+            if not self._is_one_frame:
                 sample = self._pairing.current(sample)
         elif not (math.isnan(voltage_v) or self._is_one_frame):
             sample = self._pairing.voltage(time_s, voltage_v)
         self.statistics.samples += sample is not None
         return sample
-
-    def _rewind(self, last_s: float, time_s: float) -> None:
-        """Handle time that runs backwards: a restarted log, or a clock that was set."""
-        self.statistics.time_reversals += 1
-        if last_s - time_s > self.vehicle.pair_within_s:
-            for health in self.health.values():
-                health.rewind(time_s)
 
     def flush(self) -> Sample | None:
         """Return the last current, if it is unpaired, as a sample without voltage."""
