@@ -98,6 +98,16 @@ def test_repeated_frames_are_refused_and_longer_ones_cut() -> None:
     assert decoder.statistics.counter_repeats == len(frames)
 
 
+def test_repeated_frames_do_not_stop_recovery() -> None:
+    decoder, frames = SampleDecoder(GENERIC), frames_of(GENERIC, 12)
+    frames = [each for each in frames if each.arbitration_id == CURRENT_ID]
+    for each in frames[1:6]:
+        each.data[0] ^= 0x10
+    # Two of the good values after the damage are held back.
+    twice = [each for each in frames for _ in range(2)]
+    assert [*currents(decoder, twice), 11.0] == [0.0, 8.0, 9.0, 10.0, 11.0]
+
+
 def test_neighbours_of_lost_frames_are_used() -> None:
     frames = [each for each in frames_of(GENERIC) if not 0.25 < each.timestamp < 0.55]
     decoder = SampleDecoder(GENERIC)
@@ -387,3 +397,16 @@ def test_current_and_voltage_take_turns_in_one_message(tmp_path: Path) -> None:
     turns = [frame(number, data, 0.1 * turn) for turn in range(10) for number, data in payloads]
     samples = feed(decoder, turns)
     assert [each[1:] for each in samples] == [(10.0, 370.0, 20.0)] * 10
+
+
+def test_a_sample_uses_the_temperature_of_its_own_frame(tmp_path: Path) -> None:
+    (tmp_path / "car.dbc").write_text(
+        "BO_ 256 Pack: 4 BMS\n"
+        ' SG_ T : 0|8@1+ (1,0) [0|255] "degC" X\n'
+        ' SG_ I : 8|8@1- (1,0) [-128|127] "A" X\n'
+        ' SG_ U : 16|16@1+ (0.1,0) [0|1000] "V" X\n'
+    )
+    (tmp_path / "car.toml").write_text('current = "I"\nvoltage = "U"\ntemperature = "T"\n')
+    decoder = SampleDecoder(Vehicle.load(dbc=tmp_path / "car.dbc", map=tmp_path / "car.toml"))
+    frames = [frame(256, bytes([warm, 100, 0x74, 0x0E]), 0.1 * warm) for warm in (20, 21)]
+    assert [each.temperature_c for each in feed(decoder, frames)] == [20.0, 21.0]

@@ -46,7 +46,9 @@ def test_any_frames_are_survived(frames: list[tuple[bytes, float]]) -> None:
         assert reply is None or len(reply) <= 4095
 
 
-@pytest.mark.parametrize("fault", ["missing", "swapped", "late", "restarted"])
+@pytest.mark.parametrize(
+    "fault", ["missing", "swapped", "late", "doubled", "interrupted", "restarted"]
+)
 def test_a_broken_reply_is_given_up(fault: str) -> None:
     frames = [(data, 0.01 * n) for n, data in enumerate(frames_of(bytes(range(40))))]
     if fault == "missing":
@@ -55,6 +57,10 @@ def test_a_broken_reply_is_given_up(fault: str) -> None:
         frames[2], frames[3] = frames[3], frames[2]
     elif fault == "late":
         frames = [*frames[:3], *((data, time_s + 5.0) for data, time_s in frames[3:])]
+    elif fault == "doubled":
+        frames.insert(3, frames[2])
+    elif fault == "interrupted":
+        frames.insert(3, (b"\x01\x61", 0.025))  # another reply, in a single frame
     else:
         frames = frames[:3] + frames
     reassembler = Reassembler()

@@ -265,20 +265,18 @@ class SampleDecoder:
 
     def _add(self, signal: VehicleSignal, pack: PackProperties | None) -> None:
         route, role = self._route(signal), signal.role
-        is_cyclic, is_multiplexed = role in {"current", "voltage"}, bool(signal.codec.conditions)
+        is_multiplexed = bool(signal.codec.conditions)
         health = self.health[role] = SignalHealth(
             signal.checks if pack is None else signal.checks.within_pack(role, pack),
             # A multiplexed signal is not in every frame of its message: its period is learned.
             None if is_multiplexed else self.vehicle.messages[signal.key].period_s,
-            is_cyclic=is_cyclic,
+            is_cyclic=role in {"current", "voltage"},
             statistics=route.statistics,
         )
         if route.checker is not None and not is_multiplexed:
             route.checker.learned_period_s = lambda: health.period_s
         is_present = signal.codec.is_in if is_multiplexed else None
-        # Slow signals first: a sample uses the temperature of its own frame.
-        place = len(route.inputs) if is_cyclic else 0
-        route.inputs.insert(place, _Input(signal.codec.decode, is_present, health))
+        route.inputs.append(_Input(signal.codec.decode, is_present, health))
 
     def _route(self, signal: VehicleSignal) -> _Route:
         key = signal.key
