@@ -87,6 +87,7 @@ class ReplayState:
     """
 
     frames: int = 0
+    clock_frames: int = 0
     samples: int = 0
     acknowledged: int | None = None
     lost: int = 0
@@ -214,6 +215,7 @@ class _Player:
         if self._clock is not None and step.is_wanted and step.time_us != self._clock_us:
             self._clock_us = step.time_us
             self._send(self._clock.at(step.time_us))
+            state.clock_frames += 1
         for frame in step.frames:
             self._send(frame)
         state.frames += len(step.frames)
