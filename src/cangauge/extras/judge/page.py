@@ -47,12 +47,15 @@ def judge_page(judgement: Judgement, model_path: Path | None = None) -> Page:
 
 
 def _jumps(judgement: Judgement) -> list[Block]:
-    columns = {
-        "log": lambda jump: judgement.logs[jump.log].name,
-        "hours since the first row": lambda jump: number(jump.since_start_s / 3600.0, 2),
-        "% SoC": lambda jump: number(jump.size_pct, 1),
-    }
-    return [Table.of(judgement.jumps, columns)] if judgement.jumps else []
+    entries = [
+        {
+            "log": judgement.logs[jump.log].name,
+            "hours since the first row": number(jump.since_start_s / 3600.0, 2),
+            "% SoC": number(jump.size_pct, 1),
+        }
+        for jump in judgement.jumps
+    ]
+    return [Table.of(entries)] if entries else []
 
 
 def _figure(judgement: Judgement) -> Figure:

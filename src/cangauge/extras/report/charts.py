@@ -305,6 +305,20 @@ class TimeFigures:
                 shown.plot.add_layout(label)
         return shown
 
+    def channel(
+        self,
+        name: str,
+        unit: str,
+        pieces: Pieces,
+        color: str,
+        caption: str,
+        *,
+        names: bool = False,
+    ) -> Figure:
+        """Return the figure of one quantity through all logs, named by it; see `figure`."""
+        shown = self.figure(name.capitalize(), f"{name} [{unit}]", caption, names=names)
+        return self.line(shown, name, pieces, color, line_width=1.0)
+
     def joined(self, pieces: Pieces) -> tuple[FloatArray, ...]:
         """Return positions and values of one line through all logs, NaN at gaps and between logs.
 
