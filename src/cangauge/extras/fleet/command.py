@@ -267,14 +267,15 @@ def gap_fleet_command(
         Logs without a fault, of any vehicles of the type; repeat the option. Or the column healthy
         of a manifest.
     """
-    from cangauge.extras.fleet.gap import GapJob
+    from cangauge.extras.fleet.gap import GapJob, gap_tasks
     from cangauge.extras.fleet.sources import find_logs
     from cangauge.model.model_file import Model
 
     known = {log.url: replace(log, healthy=True) for log in find_logs(reference or [])}
     among = [known.pop(log.url, log) for log in find_logs(logs)] + [*known.values()]
     _check_outputs([report], among, model, *map(Path, [*logs, *(reference or [])]))
-    job, tasks = GapJob(_read_options(reading), Model.load(model)).of_fleet(
+    job = GapJob(_read_options(reading), Model.load(model))
+    tasks = gap_tasks(
         [log for log in among if not log.healthy], [log for log in among if log.healthy]
     )
     _run(job, tasks, among, cluster, report, json_output=json_output)
