@@ -129,7 +129,6 @@ def fit_fleet_command(
 
 def _show_fit(result: FleetFit) -> None:
     from cangauge.extras.fleet.results import by_kind, reason_of
-    from cangauge.extras.fleet.sources import short_names
 
     by_log = result.by_log
     values = {
@@ -141,24 +140,12 @@ def _show_fit(result: FleetFit) -> None:
         "logs that do not fit": by_log.count_text,
     }
     print_values(f"Model {result.model.name}", values)
-    for what, rows in (("set aside", result.bad), ("left out", result.left_out)):
-        _note_reasons(what, [(reason_of(row), count) for row, count in by_kind(rows)])
-    if misfits := by_log.misfits[:_SHOWN_LOGS]:
-        names = short_names([by_log.logs[k] for k in misfits])
-        print_table(
-            "Logs that do not fit the others",
-            ["log", "mean error [V]", "RMSE [V]", "robust z"],
-            [
-                [
-                    name,
-                    significant(float(by_log.mean_v[k]), 3),
-                    significant(float(by_log.rmse_v[k]), 3),
-                    number(float(by_log.z[k]), 1),
-                ]
-                for name, k in zip(names, misfits, strict=True)
-            ],
-        )
-    if misfits or not by_log.is_known:
+    for what, unused in (("set aside", result.bad), ("left out", result.left_out)):
+        _note_reasons(what, [(reason_of(row), count) for row, count in by_kind(unused)])
+    head, rows = by_log.misfit_rows()
+    if rows:
+        print_table("Logs that do not fit the others", head, rows[:_SHOWN_LOGS])
+    if rows or not by_log.is_known:
         note(by_log.rule_text)
 
 

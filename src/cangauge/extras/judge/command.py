@@ -181,12 +181,8 @@ def _write_corrected(path: Path, judgement: Judgement) -> None:
 def _show(judgement: Judgement, written: Sequence[Path]) -> None:
     typer.echo(printable(judgement.headline))
     typer.echo(printable(f"Next step: {judgement.next_step}"))
-    print_table("Answers", ["answer", "probability", "size"], judgement.rows)
+    print_table("Answers", *judgement.answer_rows())
     if judgement.jumps:
-        rows = [
-            [judgement.logs[jump.log].name, number(jump.since_start_s, 0), number(jump.size_pct, 1)]
-            for jump in judgement.jumps
-        ]
-        print_table("Jumps that the charge does not explain", ["log", "s", "% SoC"], rows)
+        print_table("Jumps that the charge does not explain", *judgement.jump_rows())
     for path in written:
         note(f"wrote {path}")

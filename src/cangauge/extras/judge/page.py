@@ -9,7 +9,7 @@ import numpy as np
 from cangauge._text import number
 from cangauge.extras.judge.result import Judgement
 from cangauge.extras.report.charts import BLACK, BLUE, ORANGE, Figure, TimeFigures
-from cangauge.extras.report.page import Block, Page, Table, Tile, joined
+from cangauge.extras.report.page import Page, Table, Tile, joined
 
 
 def judge_page(judgement: Judgement, model_path: Path | None = None) -> Page:
@@ -22,6 +22,7 @@ def judge_page(judgement: Judgement, model_path: Path | None = None) -> Page:
         The model's file, to name it by its SHA-256.
     """
     logs = judgement.logs
+    jumps = [Table(*judgement.jump_rows())] if judgement.jumps else []
     std = number(judgement.error_std_pct, 1, "%")
     right = number(100.0 * judgement.probabilities["none"], 0, "%")
     return Page(
@@ -37,25 +38,13 @@ def judge_page(judgement: Judgement, model_path: Path | None = None) -> Page:
         sections={
             "Both states of charge": [_figure(judgement)],
             "What next": [[judgement.next_step]],
-            "All answers": [Table(["answer", "probability", "size (±1σ)"], judgement.rows)],
-            "Jumps that the charge does not explain": _jumps(judgement),
+            "All answers": [Table(*judgement.answer_rows())],
+            "Jumps that the charge does not explain": jumps,
         },
         model=judgement.model,
         model_path=model_path,
         logs=logs,
     )
-
-
-def _jumps(judgement: Judgement) -> list[Block]:
-    entries = [
-        {
-            "log": judgement.logs[jump.log].name,
-            "hours since the first row": number(jump.since_start_s / 3600.0, 2),
-            "% SoC": number(jump.size_pct, 1),
-        }
-        for jump in judgement.jumps
-    ]
-    return [Table.of(entries)] if entries else []
 
 
 def _figure(judgement: Judgement) -> Figure:

@@ -299,9 +299,8 @@ class Judgement:
             " until its end: it settles the SoC to about 2 %."
         )
 
-    @property
-    def rows(self) -> list[list[str]]:
-        """All answers with probability and size, the most probable first, as table rows."""
+    def answer_rows(self) -> tuple[list[str], list[list[str]]]:
+        """Return head and rows of the table of all answers, the most probable first."""
         rows = []
         for answer in self.explanations:
             size, unit = "–", UNITS.get(answer.name)
@@ -310,7 +309,19 @@ class Judgement:
                 size = f"{_signed(value, _digits(unit))} ± {number(std, _digits(unit))} {unit}"
             share = number(100.0 * self.probabilities[answer.name], 1, "%")
             rows.append([_WORDS[answer.name], share, size])
-        return rows
+        return ["answer", "probability", "size (±1σ)"], rows
+
+    def jump_rows(self) -> tuple[list[str], list[list[str]]]:
+        """Return head and rows of the table of jumps."""
+        rows = [
+            [
+                self.logs[jump.log].name,
+                number(jump.since_start_s / 3600.0, 2),
+                number(jump.size_pct, 1),
+            ]
+            for jump in self.jumps
+        ]
+        return ["log", "hours since the first row", "% SoC"], rows
 
 
 def _digits(unit: str) -> int:

@@ -198,8 +198,11 @@ def _set_aside(bad: Sequence[Mapping[str, Any]], heading: str = "command") -> li
 
 
 def _table(entries: Sequence[Mapping[str, str]]) -> Table:
-    note = f"{_SHOWN} of {len(entries)}; the results have all." if len(entries) > _SHOWN else ""
-    return Table.of(entries[:_SHOWN], note)
+    return Table.of(entries[:_SHOWN], _note(len(entries)))
+
+
+def _note(total: int) -> str:
+    return f"{_SHOWN} of {total}; the results have all." if total > _SHOWN else ""
 
 
 def fleet_fit_page(result: FleetFit) -> Page:
@@ -247,16 +250,8 @@ def fleet_fit_page(result: FleetFit) -> Page:
 
 def _misfits(result: FleetFit) -> list[Block]:
     by_log = result.by_log
-    entries = [
-        {
-            "vehicle": by_log.vehicles[k],
-            "log": by_log.logs[k],
-            "mean error [V]": significant(by_log.mean_v[k], 3),
-            "RMSE [V]": significant(by_log.rmse_v[k], 3),
-            "robust z": number(by_log.z[k], 1),
-        }
-        for k in by_log.misfits
-    ]
+    head, rows = by_log.misfit_rows()
+    table = Table(head, rows[:_SHOWN], _note(len(rows)))
     largest = by_log.order[:_BARS]
     names = short_names([by_log.logs[k] for k in largest])
     largest_errors = [
@@ -266,4 +261,4 @@ def _misfits(result: FleetFit) -> list[Block]:
     caption = f"The {len(largest)} farthest of {len(by_log.logs)}."
     title, label = "Mean error of each log under the model of all", "mean of measured − modelled"
     figure = bars(title, label, largest_errors, caption, unit="V", decimals=None)
-    return [*([_table(entries)] if entries else []), by_log.rule_text, figure]
+    return [*([table] if rows else []), by_log.rule_text, figure]
