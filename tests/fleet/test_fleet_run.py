@@ -260,20 +260,22 @@ def test_health_passes_from_log_to_log(logs: list[FleetLog], model: Model) -> No
 
 def test_references_come_from_all_vehicles(logs: list[FleetLog]) -> None:
     suspect = [log for log in logs if "trip1" in log.url]
-    healthy = [log for log in logs if "trip1" not in log.url]
-    tasks = {task.vehicle: task for task in gap_tasks(suspect, healthy)}
+    healthy = [replace(log, healthy=True) for log in logs if "trip1" not in log.url]
+    tasks = {task.vehicle: task for task in gap_tasks([*suspect, *healthy])}
     chosen = [log.vehicle for log in tasks["car1"].references]
     assert (chosen[0], chosen.count("car1"), set(chosen)) == (
         "car1", 1, {"car0", "car1", "car2", "car3"},
     )  # fmt: skip
-    assert {task.vehicle: task for task in gap_tasks(suspect[::-1], healthy)} == tasks
-    without = gap_tasks(suspect, [log for log in healthy if log.vehicle in {"car2", "car3"}])
-    assert [task.vehicle for task in without] == ["car0", "car1", "car2", "car3"]
+    again = gap_tasks([*suspect[::-1], *healthy])
+    assert {task.vehicle: task for task in again} == tasks
+    of_two = [log for log in healthy if log.vehicle in {"car0", "car1"}]
+    without = gap_tasks([*suspect, *of_two])
+    assert [task.vehicle for task in without] == ["car2", "car3", "car0", "car1"]
     assert without[0].references == without[1].references
-    assert [log.vehicle for log in without[2].references] == ["car2", "car3"]
-    for few, words in ((([], healthy), "every log is"), ((suspect, []), "known to be healthy")):
+    assert {log.vehicle for log in without[2].references} == {"car0", "car1"}
+    for few, words in ((healthy, "every log is"), (suspect, "known to be healthy")):
         with pytest.raises(InputError, match=words):
-            gap_tasks(*few)
+            gap_tasks(few)
 
 
 def test_logs_and_references_that_cannot_be_used_are_named(
@@ -283,16 +285,18 @@ def test_logs_and_references_that_cannot_be_used_are_named(
     broken.write_text("x\n")
     still = read_log(logs[6].url)
     write_log(replace(still, current_a=np.zeros(len(still))), dead)
-    unusable = FleetLog(str(broken), "car1", "s"), FleetLog(str(dead), "car0", "s")
+    broken_log = FleetLog(str(broken), "car1", "s")
+    dead_log = FleetLog(str(dead), "car0", "s", healthy=True)
     job = GapJob(ReadOptions(), model)
-    (task,) = gap_tasks([logs[3], unusable[0]], [unusable[1], logs[5], logs[7]])
+    good = [replace(log, healthy=True) for log in (dead_log, logs[5], logs[7])]
+    (task,) = gap_tasks([logs[3], broken_log, *good])
     (row,) = perform(job, task).rows
     assert (row["log"], row["references"], row["reference_vehicles"]) == ("car1", 2, 2)
     assert row["unread"][0].startswith(str(broken))
     assert "constant" in row["unread"][1]
-    (task,) = gap_tasks([logs[3]], unusable)
+    (task,) = gap_tasks([logs[3], replace(broken_log, healthy=True), dead_log])
     (aside,) = perform(job, task).bad
     assert "no reference can be used" in aside["reason"]
-    (task,) = gap_tasks([unusable[0]], [logs[5]])
+    (task,) = gap_tasks([broken_log, good[1]])
     (aside,) = perform(job, task).bad
     assert "none of its logs can be read" in aside["reason"]

@@ -9,7 +9,7 @@ same references: what these show is learned once, and a diagnosis then takes no 
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 from itertools import chain, islice, zip_longest
@@ -111,7 +111,7 @@ def _learned(job: GapJob, references: tuple[FleetLog, ...]) -> _Learned:
     raise InputError(f"no reference can be used: {unread[0]}", field="--reference")
 
 
-def gap_tasks(logs: Iterable[FleetLog], healthy: Iterable[FleetLog]) -> list[Task]:
+def gap_tasks(logs: Sequence[FleetLog]) -> list[Task]:
     """Return a task for each vehicle, with its references.
 
     References of a vehicle are its own healthy logs, at most half, then one of each other vehicle
@@ -120,8 +120,8 @@ def gap_tasks(logs: Iterable[FleetLog], healthy: Iterable[FleetLog]) -> list[Tas
 
     Parameters
     ----------
-    logs, healthy : iterable of FleetLog
-        Logs to diagnose, and logs without a fault, each in order of time. The latest of a vehicle
+    logs : sequence of FleetLog
+        Healthy logs and those to diagnose, each in order of time. The latest of a vehicle
         (`_LATEST`) are diagnosed together.
 
     Raises
@@ -129,8 +129,9 @@ def gap_tasks(logs: Iterable[FleetLog], healthy: Iterable[FleetLog]) -> list[Tas
     InputError
         If no log is healthy, or all are.
     """
-    good = {task.vehicle: sorted(task.logs, key=_order) for task in by_vehicle(healthy)}
-    suspect = by_vehicle(logs)
+    healthy = by_vehicle(log for log in logs if log.healthy)
+    suspect = by_vehicle(log for log in logs if not log.healthy)
+    good = {task.vehicle: sorted(task.logs, key=_order) for task in healthy}
     if not good:
         cure = "give --reference, or a manifest with the column `healthy`"
         raise InputError("no log is known to be healthy", field="--reference", cure=cure)

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
 from pathlib import Path
-from typing import Final, NamedTuple
+from typing import Final
 
 import numpy as np
 from bokeh.models import ColumnDataSource
@@ -106,43 +107,6 @@ def estimate_figure(table: EstimateTable, log: Log | None = None) -> Plot:
 # --- The result in a sentence
 
 
-class Period(NamedTuple):
-    """A time without a valid estimate, since the start of the log [s]."""
-
-    start_s: float
-    end_s: float
-    status: Status
-    reason: Reason
-    """The reason that applied to most of its samples."""
-
-    @property
-    def duration_s(self) -> float:
-        """Length [s]."""
-        return self.end_s - self.start_s
-
-
-def _clock(seconds: float) -> str:
-    minutes, rest = divmod(round(seconds), 60)
-    return f"{minutes // 60}:{minutes % 60:02d}:{rest:02d}"
-
-
-def periods(table: EstimateTable) -> list[Period]:
-    """Return the times that are degraded or invalid, in sequence."""
-    status, since_s = np.asarray(table.status), table.time_s - table.time_s[:1]
-    edges = np.flatnonzero(np.diff(status)) + 1
-    found = []
-    for begin, end in zip((0, *edges), (*edges, status.size), strict=True):
-        if begin == end or status[begin] not in {Status.DEGRADED, Status.INVALID}:
-            continue
-        reasons = np.asarray(table.reasons[begin:end]).astype(np.int64)
-        counts = {reason: int(np.count_nonzero(reasons & reason)) for reason in Reason}
-        most = max(counts, key=counts.__getitem__)
-        start_s, end_s = float(since_s[begin]), float(since_s[min(end, status.size - 1)])
-        reason = most if counts[most] else Reason.NONE
-        found.append(Period(start_s, end_s, Status(int(status[begin])), reason))
-    return found
-
-
 def estimate_verdict(estimate: RecordedEstimate) -> str:
     """Return how far the SoC is from the log's own, and when and why it is not valid."""
     table, scores = estimate.table, estimate.scores
@@ -160,13 +124,34 @@ def estimate_verdict(estimate: RecordedEstimate) -> str:
     share = number(min(max(100.0 * scores.valid_fraction, 0.1), 99.9), 1, "%")
     whole = {0.0: "never valid", 1.0: "valid throughout"}
     text += f"; {whole.get(scores.valid_fraction, f'valid in {share} of the samples')}"
-    if found := periods(table):
-        longest = max(found, key=lambda period: period.duration_s)
-        text += f"; {longest.status.name.lower()} from {_clock(longest.start_s)}"
-        text += f" to {_clock(longest.end_s)}"
-        text += f" because {REASON_WORDS[longest.reason]}" if longest.reason else ""
-        text += f", the longest of {len(found)} periods" if len(found) > 1 else ""
-    return f"{text}."
+    return f"{text}{_longest_period(table)}."
+
+
+def _longest_period(table: EstimateTable) -> str:
+    """Return the longest time that is degraded or invalid, with its main reason, as a clause."""
+    status, since_s = np.asarray(table.status), table.time_s - table.time_s[0]
+    edges = np.flatnonzero(np.diff(status)) + 1
+    periods = [
+        (float(since_s[begin]), float(since_s[min(end, status.size - 1)]), slice(begin, end))
+        for begin, end in pairwise([0, *edges, status.size])
+        if status[begin] in {Status.DEGRADED, Status.INVALID}
+    ]
+    if not periods:
+        return ""
+    start_s, end_s, rows = max(periods, key=lambda period: period[1] - period[0])
+    name = Status(int(status[rows.start])).name.lower()
+    reasons = np.asarray(table.reasons[rows]).astype(np.int64)
+    samples = {reason: int(np.count_nonzero(reasons & reason)) for reason in Reason}
+    main = max(samples, key=samples.__getitem__)
+    text = f"; {name} from {_clock(start_s)} to {_clock(end_s)}"
+    text += f" because {REASON_WORDS[main]}" if samples[main] else ""
+    return text + (f", the longest of {len(periods)} periods" if len(periods) > 1 else "")
+
+
+def _clock(seconds: float) -> str:
+    """Return a time as h:mm:ss."""
+    minutes, rest = divmod(round(seconds), 60)
+    return f"{minutes // 60}:{minutes % 60:02d}:{rest:02d}"
 
 
 def _tiles(estimate: RecordedEstimate) -> list[Tile]:
