@@ -266,6 +266,10 @@ def test_references_come_from_all_vehicles(logs: list[FleetLog]) -> None:
     assert (chosen[0], chosen.count("car1"), set(chosen)) == (
         "car1", 1, {"car0", "car1", "car2", "car3"},
     )  # fmt: skip
+    assert replace(tasks["car1"], references=()).stamp != tasks["car1"].stamp
+    many = [replace(suspect[0], url=f"{k}.csv") for k in range(5)]
+    (latest,) = gap_tasks([*many, *healthy])
+    assert latest.logs == tuple(many[-3:])
     again = gap_tasks([*suspect[::-1], *healthy])
     assert {task.vehicle: task for task in again} == tasks
     of_two = [log for log in healthy if log.vehicle in {"car0", "car1"}]
