@@ -229,7 +229,7 @@ def bars(
         hover="@name: @text",
         height=60 + 44 * len(entries),
         # Room for the text of the longest bar, also on a narrow screen.
-        x_range=models.Range1d(1.05 * low, 1.3 * high if high > 0.0 else 1.0),
+        x_range=models.Range1d(1.05 * low, high + 0.3 * (high - low) or 1.0),
         y_categories=names[::-1],
     )
     columns = {"name": names, "value": np.array(values), "color": colors}
