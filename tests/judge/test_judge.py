@@ -252,6 +252,10 @@ def test_a_coarse_soc_counts_at_its_changes_and_not_at_its_limits(pack) -> None:
     truth = np.interp(part.time_s, log.time_s, log.soc_pct) + shift
     assert 3 <= known.sum() < known.size / 2
     assert part.published_pct[known][1:] == pytest.approx(truth[known][1:], abs=0.3)
+    full = np.minimum(log.soc_pct - log.soc_pct[0] + 102.0, 100.0)
+    (part,) = Chain.of([replace(log, soc_pct=full)], model).stretches
+    assert np.isnan(part.published_pct[0])
+    assert np.isfinite(part.published_pct[-1])
 
 
 def test_a_pause_parts_a_log_and_days_without_dates_follow_one_another(pack) -> None:
