@@ -42,7 +42,7 @@ typedef double cg_wide;
 #endif
 #define CG_OCV 8
 #define CG_LAGS 5
-#define CG_VALUES 12
+#define CG_VALUES 8
 #define CG_TESTED 64 /* innovations that are tested together, at most */
 #define CG_CURRENTS (CG_DELAYS + CG_LOW_PASSES)
 #define CG_LOADS (CG_CURRENTS + 2)
@@ -67,8 +67,6 @@ typedef enum {
     CG_RC, /* activation_k, by_slope, mean_slope, ohm of each lag; lags: elements */
     CG_HYSTERESIS, /* half_width_v, travel_as */
     CG_ENTROPIC, /* level, slope, curve, t_ref_c; lag: interior */
-    CG_INNER_TEMPERATURE, /* voltage_v_per_k, drop_per_k; lag: interior */
-    CG_OCV_SHAPE, /* height of each bump */
     CG_WEAK_CELL /* fraction, ahead */
 } cg_effect_kind;
 
@@ -256,8 +254,6 @@ typedef struct {
     cg_real innovation2; /* of the last voltage, over its variance */
 } cg_ekf;
 
-typedef enum { CG_NO_DOUBT = 0, CG_START, CG_INTERVAL, CG_MISMATCH } cg_doubt;
-
 /* One or two hypotheses: the SoC is the stated one, or another. */
 typedef struct {
     cg_ekf ekf[2]; /* narrow, wide */
@@ -300,7 +296,6 @@ typedef struct {
     cg_time gap_until_s;
     cg_time contradicted_until_s;
     cg_time mismatch_until_s;
-    int32_t doubt; /* cg_doubt */
     int32_t innovations;
     cg_real innovation2[CG_TESTED]; /* the oldest first */
     cg_time rest_since_s;

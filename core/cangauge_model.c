@@ -16,17 +16,9 @@
 #define REFERENCE_C 25.0
 #define STEEPNESS_AT_MOST 5.0
 #define STALE_AT_MOST 64
-#define BUMPS 11
 
 #define ACTIVATION_K 3000.0
 #define RESISTANCE_REFERENCE_C 20.0
-
-static const cg_real CENTRES_PCT[BUMPS] = {
-    R(3.0), R(8.0), R(14.0), R(22.0), R(32.0), R(43.0), R(54.0), R(65.0), R(76.0), R(86.0), R(94.0),
-};
-static const cg_real WIDTHS_PCT[BUMPS] = {
-    R(3.0), R(3.5), R(4.5), R(5.5), R(6.5), R(7.0), R(7.0), R(7.0), R(6.5), R(5.5), R(4.5),
-};
 
 /* ------------------------------------------------------------------ delay line */
 
@@ -513,13 +505,6 @@ static cg_real advance_effect(const cg_effect *effect, cg_effect_state *state,
         at_c = lag_from(lag, effect->tau_s[0], sample->time_s, temperature_c);
         drive = cg_clip(at_c, R(COLDEST_C), R(HOTTEST_C)) - value[3];
         break;
-    case CG_INNER_TEMPERATURE:
-        at_c = lag_from(lag, effect->tau_s[0], sample->time_s, temperature_c);
-        drive = (value[0] + (value[1] * drop_v)) * (at_c - temperature_c);
-        break;
-    case CG_OCV_SHAPE:
-        drive = R(1.0);
-        break;
     case CG_WEAK_CELL:
         drive = value[0];
         break;
@@ -532,8 +517,7 @@ static cg_real advance_effect(const cg_effect *effect, cg_effect_state *state,
 static bool follows_temperature(const cg_effect *effect)
 {
     const int32_t kind = effect->kind;
-    return ((kind == (int32_t)CG_RESISTANCE_TEMPERATURE) || (kind == (int32_t)CG_ENTROPIC) ||
-            (kind == (int32_t)CG_INNER_TEMPERATURE)) &&
+    return ((kind == (int32_t)CG_RESISTANCE_TEMPERATURE) || (kind == (int32_t)CG_ENTROPIC)) &&
            (effect->tau_s[0] > R(NO_LAG_S));
 }
 
@@ -541,7 +525,7 @@ static bool depends_on_soc(const cg_effect *effect)
 {
     const int32_t kind = effect->kind;
     return (kind == (int32_t)CG_RESISTANCE_SOC) || (kind == (int32_t)CG_ENTROPIC) ||
-           (kind == (int32_t)CG_OCV_SHAPE) || (kind == (int32_t)CG_WEAK_CELL) ||
+           (kind == (int32_t)CG_WEAK_CELL) ||
            ((kind == (int32_t)CG_RC) && (effect->value[1] != R(0.0)));
 }
 
@@ -590,17 +574,6 @@ void cg_advance(cg_estimator *self, const cg_sample *sample, cg_real temperature
     }
 }
 
-static cg_real ocv_shape_v(const cg_real *height_v, cg_real soc_pct)
-{
-    const cg_real soc = cg_clip(soc_pct, R(0.0), R(100.0));
-    cg_real volts = R(0.0);
-    for (int32_t k = 0; k < BUMPS; ++k) {
-        const cg_real away = (soc - CENTRES_PCT[k]) / WIDTHS_PCT[k];
-        volts += height_v[k] * cg_exp(R(-0.5) * away * away);
-    }
-    return volts;
-}
-
 /* Factor on the drive of an effect that depends on the SoC, at one. */
 static cg_real over_soc(const cg_model *model, const cg_effect *effect, cg_real soc_pct)
 {
@@ -618,9 +591,6 @@ static cg_real over_soc(const cg_model *model, const cg_effect *effect, cg_real 
         factor = value[0] + (value[1] * x) + (value[2] * ((R(1.5) * x * x) - R(0.5)));
         break;
     }
-    case CG_OCV_SHAPE:
-        factor = ocv_shape_v(value, soc_pct);
-        break;
     case CG_WEAK_CELL:
         factor = curve_v(model, R(100.0) - ((R(100.0) - soc_pct) * value[1]), &slope) -
                  curve_v(model, soc_pct, &slope);

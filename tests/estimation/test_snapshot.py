@@ -111,9 +111,7 @@ def test_continues_bit_for_bit_with_untested_initial_soc(start_pct: float, at: i
 
 
 # Of those with a memory, the suite has the others together below.
-@pytest.mark.parametrize(
-    "effect_id", nightly_except(("inner_temperature", "weak_cell", "charge_transfer"), LIBRARY)
-)
+@pytest.mark.parametrize("effect_id", nightly_except(("weak_cell", "charge_transfer"), LIBRARY))
 def test_continues_bit_for_bit_with_each_effect(effect_id: str) -> None:
     check_continues(extended_by([effect_id]), EstimatorSettings(initial_soc_pct=80.0), 465)
 
@@ -169,7 +167,7 @@ def test_state_of_another_model_is_refused() -> None:
         (("hypotheses", "filters", 0, "bias", "v"), [[0.0, 0.0]]),
         (("hypotheses", "filters", 0, "x", 0), "nan"),
         (("counter", "discharged_pct"), None),
-        (("memory", "doubt"), "weather"),
+        (("memory", "tick"), "noon"),
         (("line", "current_a"), [1.0]),
         (("reasons",), -1),
         (("estimate",), [0.0]),
@@ -187,3 +185,14 @@ def test_state_of_another_shape_is_refused(part: tuple[Any, ...], value: object)
     at[part[-1]] = value
     with pytest.raises((InputError, ValueError)):
         Estimator(PLAIN).restore(EstimatorState.model_validate(data))
+
+
+def test_state_with_the_doubt_of_an_earlier_version_continues() -> None:
+    estimator = Estimator(PLAIN)
+    for sample in EVENTFUL[:300]:
+        estimator.step(sample)
+    data = json.loads(estimator.snapshot().model_dump_json())
+    data["memory"]["doubt"] = "interval"
+    again = Estimator(PLAIN)
+    again.restore(EstimatorState.model_validate(data))
+    assert same([again.step(EVENTFUL[300])], [estimator.step(EVENTFUL[300])])

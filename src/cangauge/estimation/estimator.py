@@ -187,10 +187,12 @@ class Estimator:
     @property
     def health(self) -> Health:
         """Capacity, resistance and current offset, with standard deviations."""
+        self._refresh()
         return health_of(self.hypotheses.likelier, self._temperature_c)
 
     def power(self) -> Power:
         """Return the currents possible for 10 s and the energy left, after the latest sample."""
+        self._refresh()
         soc_pct, std_pct = self._soc()
         if math.isnan(soc_pct) or math.isnan(self._counter.state.time_s):
             return Power()
@@ -202,6 +204,7 @@ class Estimator:
 
     def pack_tick(self, sample: Sample) -> PackTick:
         """Return what is known of the pack after its latest sample, for its cells."""
+        self._refresh()
         counter, (soc_pct, std_pct) = self._counter.state, self._soc()
         is_counting = not math.isnan(counter.time_s)
         _, load_v, drop_v = self._load() if is_counting else (None, math.nan, math.nan)
@@ -217,6 +220,7 @@ class Estimator:
 
     def current_changes(self, time_s: float, stamps_s: Sequence[float]) -> list[float]:
         """Return the current at a sample's time less that at other stamps [A]; NaN for NaN."""
+        self._refresh()
         if math.isnan(self._counter.state.time_s):
             return [math.nan] * len(stamps_s)
         at = self._online.delay_line.current_at
@@ -224,6 +228,9 @@ class Estimator:
         # Cells of one frame share its stamp.
         changes = {each: now_a - at(time_s - each) for each in {*stamps_s} if not math.isnan(each)}
         return [changes.get(each, math.nan) for each in stamps_s]
+
+    def _refresh(self) -> None:
+        """Bring the attributes to the latest sample, where the step is computed elsewhere."""
 
     # --- one sample
 
@@ -249,7 +256,6 @@ class Estimator:
             self._predict_to_now()
             probability, std_pct = moved_probability(away_s), moved_std_pct(away_s)
             self.hypotheses.doubt(probability, std_pct, away_s, charge.parked_std_pct)
-            memory.doubt = "interval"
             memory.coulomb_var_pct2 += away_std_pct(away_s) ** 2
         if abs(current_a) > REST_CURRENT_C_RATE * self.capacity_ah:
             memory.rest_since_s = math.nan
@@ -321,7 +327,6 @@ class Estimator:
         if is_lasting:
             # The model may be right and the SoC wrong: charge that was not seen.
             memory.innovations = []
-            memory.doubt = "mismatch"
             self.hypotheses.doubt(WRONG_PRIOR, WRONG_STD_PCT)
 
     def _predict(self, counted_s: float, discharged_pct: float) -> None:
@@ -359,7 +364,6 @@ class Estimator:
         """Start filter and count from a SoC and its standard deviation [%]."""
         self.hypotheses = Hypotheses(self._online, soc_pct, std_pct, is_doubtful=is_doubtful)
         self._memory.is_known = True
-        self._memory.doubt = "start" if is_doubtful else ""
         self._start_count(soc_pct, std_pct)
 
     def _start_count(self, soc_pct: float, std_pct: float) -> None:
@@ -490,6 +494,11 @@ class Estimator:
         InputError
             If the state does not fit the model; the estimator must then not be used.
         """
+        self._continue(state, age_s)
+        return self._latest
+
+    def _continue(self, state: EstimatorState, age_s: float | None) -> None:
+        """Continue from a state; without an interruption its age is None."""
         self._resume(state, age_s)
         line = state.line
         self._online.delay_line.fill(line.time_s, line.current_a, line.since_s)
@@ -503,7 +512,6 @@ class Estimator:
             self.hypotheses.restore(state.hypotheses)
         else:
             self._start_from(state)
-        return self._latest
 
     def take_over(self, before: Estimator) -> None:
         """Continue from another estimator, of another model or with other settings.
@@ -512,6 +520,7 @@ class Estimator:
         the ends of gaps, the learned capacity and the current's offset are carried over. What the
         filter has learned of the other model's voltage is not. An unknown SoC stays unknown.
         """
+        before._refresh()
         state = before.snapshot()
         self._resume(state, before._clock.age_s)
         self._online.take_over(before._online)

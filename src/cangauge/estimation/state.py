@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
-from typing import Annotated, Any, ClassVar, Literal, Self
+from typing import Annotated, Any, ClassVar, Self
 
 from pydantic import (
     BaseModel,
@@ -134,15 +134,14 @@ class HypothesesState:
     decision: Annotated[int, Field(strict=True, ge=-1, le=1)]
 
 
-Doubt = Literal["", "start", "interval", "mismatch"]
-"""Origin of the wide hypothesis: a given start, an interval without samples, a contradiction."""
-
-
 @dataclass
 class EstimatorMemory:
-    """State of the `Estimator` itself; NaN: not known, or never."""
+    """State of the `Estimator` itself; NaN: not known, or never.
 
-    __pydantic_config__: ClassVar[Any] = _NO_MORE
+    Files of earlier versions have a further field, `doubt`, which nothing reads.
+    """
+
+    __pydantic_config__: ClassVar[Any] = ConfigDict(extra="ignore")
     samples: _Count = 0
     """Accepted samples."""
     resets: _Count = 0
@@ -181,7 +180,6 @@ class EstimatorMemory:
     """Until when the last contradiction degrades the estimate [s]."""
     mismatch_until_s: _MaybeNan = math.nan
     """Until when the evidence that model and pack disagree lasts [s]."""
-    doubt: Doubt = ""
     innovations: list[_Finite] = field(default_factory=list)
     """Squares of the latest normalised innovations of the likelier filter."""
     rest_since_s: _MaybeNan = math.nan

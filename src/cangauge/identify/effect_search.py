@@ -57,7 +57,6 @@ NOT_IDENTIFIABLE: Final[Mapping[str, str]] = {
     "current_gain": "resistances and capacity absorb it: give --capacity-ah",
     "voltage_offset": "the curve absorbs it",
     "voltage_gain": "the coefficients absorb it",
-    "ocv_shape": "the curve's knots express it",
     "resistance_temperature": "the equation has it (b)",
 }
 """Effects that a fit cannot separate from its own coefficients, and why."""

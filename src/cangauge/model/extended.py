@@ -383,21 +383,9 @@ class OnlineModel:
         for lag in self.lags:
             lag.restore(known.get(lag.tau_s, []))
 
-    def resume(self, load: FloatArray, beside_v: float, drives: Sequence[float]) -> None:
-        """Continue after a reading that was advanced to elsewhere (the compiled step).
-
-        Parameters
-        ----------
-        load : array of shape (k,)
-            Load columns there.
-        beside_v : float
-            Voltage of the effects that do not depend on the SoC [V].
-        drives : sequence of float
-            `Effect.drive` of every effect there.
-        """
-        effects = zip(self.extended.effects, drives, strict=True)
-        self.load = load
-        self.drives = np.array([beside_v, *(v for (effect, _), v in effects if effect.uses_soc)])
+    def resume(self, load: FloatArray, drives: FloatArray) -> None:
+        """Continue after a reading that was advanced to elsewhere, given its `load`, `drives`."""
+        self.load, self.drives = load, drives
 
     def state(self) -> list[list[float]]:
         """Return the low-passed currents' state, then that of each effect, for `restore`."""

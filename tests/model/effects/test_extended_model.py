@@ -155,7 +155,6 @@ def test_newton_finds_a_root_with_all_effects(
 @pytest.mark.parametrize(
     ("effect_id", "values"),
     [
-        ("inner_temperature", {"voltage_v_per_k": 0.05, "tau_s": 3600.0}),
         ("resistance_temperature", {"lag_s": 1800.0}),
         ("entropic_coefficient", {"slope_v_per_k": 1e-3, "lag_s": 1800.0}),
     ],

@@ -279,8 +279,6 @@ class Effect:
         (values) → resistance [Ω] and time constant [s] of voltages from earlier currents.
     core_form : callable
         (values, model, pack) → form in the C core; None if it has none.
-    is_cause : bool
-        Whether a diagnosis may name it; otherwise it is structure, learned from references only.
     scales_drop : bool
         Whether the added voltage follows the model's drop over the resistances.
     """
@@ -299,7 +297,6 @@ class Effect:
     memory: Callable[[Values, Pack], Memories] = lambda *_: ()
     rc_elements: Callable[[Values], list[tuple[float, float]]] = lambda _: []
     core_form: Callable[[Values, VoltageModel, Pack], CoreForm | None] = _none
-    is_cause: bool = True
     scales_drop: bool = False
 
     @property

@@ -47,14 +47,6 @@ pack already contains the mean slope over the currents of a drive."""
 ACTIVATION_K: Final = 5000.0
 """Usual activation of the exchange current [K], about 42 kJ/mol; `exchange_a` holds at 25 °C."""
 
-CENTRES_PCT: Final = (3.0, 8.0, 14.0, 22.0, 32.0, 43.0, 54.0, 65.0, 76.0, 86.0, 94.0)
-WIDTHS_PCT: Final = (3.0, 3.5, 4.5, 5.5, 6.5, 7.0, 7.0, 7.0, 6.5, 5.5, 4.5)
-"""Centre and width of each bump [% SoC], narrower where the OCV of common chemistries bends."""
-BUMPS: Final = tuple(
-    Parameter(f"at_{centre:.0f}_pct_v", "V", -0.01, 0.01, scale="voltage")
-    for centre in CENTRES_PCT
-)  # fmt: skip
-
 
 def _of(values: Values, *names: str) -> tuple[float, ...]:
     return tuple(values[name] for name in names)
@@ -166,18 +158,6 @@ def _entropic_shape(soc_pct: FloatArray, values: Values, *_: object) -> FloatArr
     x = np.clip(soc_pct, 0.0, 100.0) / 50.0 - 1.0
     shape = values["level_v_per_k"] + values["slope_v_per_k"] * x
     return np.asarray(shape + values["curve_v_per_k"] * (1.5 * x * x - 0.5))
-
-
-def _inner_drive(load: Load, values: Values, at: Context) -> FloatArray:
-    per_k = values["voltage_v_per_k"] + values["drop_per_k"] * load.drop_v
-    away = at.memory[0].step(load.time_s, load.temperature_c) - load.temperature_c
-    return np.asarray(per_k * away)
-
-
-def _bumps(soc_pct: FloatArray, values: Values, *_: object) -> FloatArray:
-    away = (np.clip(soc_pct, 0.0, 100.0)[:, None] - CENTRES_PCT) / WIDTHS_PCT
-    heights = np.array([values[bump.name] for bump in BUMPS])
-    return np.asarray(np.exp(-0.5 * away * away) @ heights)
 
 
 def _ahead(values: Values) -> float:
@@ -421,50 +401,6 @@ VOLTAGES: Final = (
             (*_of(v, "level_v_per_k", "slope_v_per_k", "curve_v_per_k"), model.t_ref_c),
             (v["lag_s"],),
         ),
-    ),
-    # Every pack that is heated or cooled from outside has it, and larger cells have more of it: it
-    # is structure, not a fault. The diagnosis learns it from reference logs and never names it.
-    Effect(
-        id="inner_temperature",
-        family="thermal",
-        parameters=(
-            Parameter("voltage_v_per_k", "V/K", -5e-4, 5e-4, scale="voltage"),
-            Parameter("drop_per_k", "1/K", -0.04, 0.04),
-            Parameter("tau_s", "s", 100.0, 10000.0, neutral=None, grid=(400.0, 1200.0, 3600.0)),
-        ),
-        signature="in proportion to the recent change of temperature (minutes, hours), at any"
-        " current",
-        equation=(
-            "ΔU = (c + b·ΣRj·I(t − dj))·(T_τ − T),  τ·dT_τ/dt = T − T_τ, T_τ = T at the start"
-        ),
-        source="two-state thermal model, Forgez et al., J. Power Sources 195 (2010) 2961",
-        separated_by=(
-            "other logs that warm or cool: what all of them share belongs to the pack"
-        ),
-        scales_drop=True,
-        is_cause=False,
-        memory=lambda v, _: (Lag(v["tau_s"]),),
-        drive=_inner_drive,
-        core_form=lambda v, *_: CoreForm(
-            "inner_temperature", _of(v, "voltage_v_per_k", "drop_per_k"), (v["tau_s"],)
-        ),
-    ),
-    # A curve that the published formula cannot represent: structure of a chemistry, not a fault.
-    # The diagnosis learns it from reference logs and never names it.
-    Effect(
-        id="ocv_shape",
-        family="equilibrium",
-        parameters=BUMPS,
-        signature="a curve over SoC, the same at any current, temperature and time",
-        equation="ΔU = Σ vₖ·exp(−½((S − cₖ)/wₖ)²)",
-        source="radial basis functions, Broomhead, Lowe, Complex Systems 2 (1988) 321",
-        separated_by=(
-            "other logs over the same SoC: what all of them share belongs to the chemistry"
-        ),
-        is_cause=False,
-        drive=lambda load, *_: np.ones_like(load.current_a),
-        over_soc=_bumps,
-        core_form=lambda v, *_: CoreForm("ocv_shape", _of(v, *(bump.name for bump in BUMPS))),
     ),
     # From full the SoC of the weak cells falls faster. Below empty they follow the model's linear
     # extrapolation. A reversed cell falls faster, but a pack is switched off before that.
