@@ -141,11 +141,11 @@ def effects_page() -> str:
         " (discharge upwards), the voltage that the effect adds below, free of sensor noise."
         " `cangauge twin --effect ID` simulates it, `cangauge gap` looks for it.",
     ]
-    family = ""
-    for effect in sorted(LIBRARY.values(), key=lambda each: (each.family, each.id)):
-        if effect.family != family:
-            family = effect.family
-            parts.append(f"## {family.replace('_', ' ').capitalize()}")
+    group = ""
+    for effect in sorted(LIBRARY.values(), key=lambda each: (each.group, each.id)):
+        if effect.group != group:
+            group = effect.group
+            parts.append(f"## {group.replace('_', ' ').capitalize()}")
         parts += [
             f"### {effect.id}",
             inspect.cleandoc(type(effect).__doc__ or ""),

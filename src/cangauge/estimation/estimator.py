@@ -17,7 +17,6 @@ from scipy.special import chdtri
 
 from cangauge._typing import FloatArray
 from cangauge.errors import InputError
-from cangauge.estimation.blocks import OpenBlock
 from cangauge.estimation.cells import PackTick
 from cangauge.estimation.counting import (
     CoulombCounter,
@@ -27,12 +26,18 @@ from cangauge.estimation.counting import (
     moved_probability,
     moved_std_pct,
 )
-from cangauge.estimation.ekf import UNKNOWN_STD_PCT, Block, inverse_std_pct
+from cangauge.estimation.ekf import UNKNOWN_STD_PCT, inverse_std_pct
 from cangauge.estimation.health import health_of
 from cangauge.estimation.power import PowerModel
 from cangauge.estimation.settings import EstimatorSettings, SocReference, detect_references
 from cangauge.estimation.start import WRONG_PRIOR, WRONG_STD_PCT, Hypotheses
-from cangauge.estimation.state import DelayLineState, EstimatorMemory, EstimatorState
+from cangauge.estimation.state import (
+    Block,
+    BlockState,
+    DelayLineState,
+    EstimatorMemory,
+    EstimatorState,
+)
 from cangauge.estimation.validity import drop_implausible, outside_model, temperature_mismatch
 from cangauge.model.effects.base import Reading
 from cangauge.model.inverse import soc_from_ocv
@@ -114,7 +119,7 @@ class Estimator:
         self.hypotheses = Hypotheses(self._online)
         self._clock = EstimatorClock()
         self._counter = CoulombCounter(self.capacity_ah, self.settings.gap_s)
-        self._block = OpenBlock()
+        self._block = BlockState()
         self._memory = EstimatorMemory()
         self._power = PowerModel(self._online, self.settings.limits)
         tested = max(round(MISMATCH_S / self.model.noise.block_s), 1)
@@ -239,18 +244,18 @@ class Estimator:
         memory, block = self._memory, self._block
         time_s, current_a, voltage_v, temperature_c = sample
         number = math.floor((time_s - memory.first_s) / self.model.noise.block_s + 1e-9)
-        if number > block.state.number:
+        if number > block.number:
             self._close_block(time_s)
-            block.begin(number)
+            block = self._block = BlockState(number)
         if self._implausible and math.isnan(voltage_v):
             # Behind an open contactor; the block's other rows may be of a voltage that falls.
-            block.state.is_broken = True
+            block.is_broken = True
         charge = self._counter.step(time_s, self._online.counted(current_a))
         if not math.isnan(temperature_c):
             memory.temperature_c = temperature_c
         self._online.advance(time_s, current_a, memory.temperature_c)
         if charge.seconds > self.settings.gap_s:
-            block.state.is_broken = True
+            block.is_broken = True
             memory.gap_until_s = time_s + self._online.delay_line.longest_s
         if away_s := charge.away_s:
             self._predict_to_now()
@@ -286,14 +291,14 @@ class Estimator:
         soc_pct = self._soc()[0]
         memory.voltage_model_v = math.nan
         if not math.isnan(soc_pct):
-            memory.voltage_model_v = online.curve(soc_pct)[0] + load_v
+            memory.voltage_model_v = online.pseudo_ocv_at(soc_pct)[0] + load_v
         memory.residual_v = sample.voltage_v - memory.voltage_model_v
         for reference in detect_references(self.settings, memory, sample):
             self._correct(reference)
 
     def _close_block(self, time_s: float) -> None:
         """Correct the filter by the open block, and test its innovation."""
-        block = self._block.close()
+        block = self._block.mean()
         if block is None:
             return
         memory, hypotheses = self._memory, self.hypotheses
@@ -344,7 +349,7 @@ class Estimator:
     def _predict_to_now(self) -> None:
         """Predict the filter to the latest sample; the open block lies in part before it."""
         self._predict(self._counter.state.counted_s, self._counter.state.discharged_pct)
-        self._block.state.is_broken = True
+        self._block.is_broken = True
 
     def _correct(self, reference: SocReference) -> None:
         """Fuse an external SoC reference into count and filter, weighted by the variances."""
@@ -465,7 +470,7 @@ class Estimator:
             counter=replace(self._counter.state),
             line=DelayLineState(*self._online.delay_line.contents),
             online=self._online.state(),
-            block=self._block.snapshot(),
+            block=replace(self._block, sums=list(self._block.sums)),
             hypotheses=self.hypotheses.snapshot(),
             memory=replace(self._memory, innovations=list(self._memory.innovations)),
             estimate=list(latest[:7]),
@@ -508,7 +513,7 @@ class Estimator:
             sums = len(Block._fields) - 2 + columns + self._online.drives.size
             if state.block.rows and (state.block.columns, len(state.block.sums)) != (columns, sums):
                 raise InputError(f"the model's blocks have {sums} sums", field="block.sums")
-            self._block.restore(state.block)
+            self._block = replace(state.block, sums=list(state.block.sums))
             self.hypotheses.restore(state.hypotheses)
         else:
             self._start_from(state)
@@ -532,8 +537,8 @@ class Estimator:
 
         Without an interruption `age_s` is None, and the stamps of the samples give the time.
         """
-        self._clock.restore(replace(state.clock), age_s)
-        self._counter.restore(replace(state.counter))
+        self._clock.state, self._clock.age_s = replace(state.clock), age_s
+        self._counter.state, self._counter.is_restored = replace(state.counter), True
         self._memory = replace(state.memory, innovations=list(state.memory.innovations))
         reasons = Reason(state.reasons)
         self._latest = Estimate._make(
@@ -548,8 +553,7 @@ class Estimator:
         memory.filter_counted_s = counter.counted_s
         memory.filter_discharged_pct = counter.discharged_pct
         memory.filter_gap_var_pct2 = counter.gap_var_pct2
-        self._block.begin(state.block.number)
-        self._block.state.is_broken = True
+        self._block = BlockState(state.block.number, is_broken=True)
         memory.is_known, memory.coulomb_start_pct = False, math.nan
         if not math.isnan(state.soc_pct):
             self._start(state.soc_pct, state.soc_std_pct, is_doubtful=False)

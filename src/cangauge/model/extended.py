@@ -130,9 +130,7 @@ class ExtendedModel:
         model, effects, pack = self.model, self.effects, self.pack
         measured_a = signals.current_a
         for effect, values in effects:
-            context = effect.context(values, model, pack)
-            for item in context.memory:
-                item.whole = True
+            context = effect.context(values, model, pack)._replace(is_whole=True)
             signals = effect.correct(signals, values, context)
         soc = self.counted_soc(signals, initial_soc_pct, initial_row=initial_row)
         every = any(effect.adds_voltage for effect, _ in effects)
@@ -360,18 +358,12 @@ class OnlineModel:
             slope = max(slope, self._slope_at_least)
         return volts, slope
 
-    curve = pseudo_ocv_at
-
     def curve_values(self, soc_pct: FloatArray) -> FloatArray:
         """Return curve and effects [V] of the latest reading at SoC [%] of shape (n,)."""
         volts = self.model.curve.values(soc_pct) + float(self.drives[0])
         for (effect, values), drive in zip(self._over_soc, self.drives[1:], strict=True):
             volts += drive * effect.over_soc(soc_pct, values, self.model)
         return volts
-
-    def row(self, soc_pct: float, load: FloatArray) -> FloatArray:
-        """Return the change of voltage by each principal function [V], shape (n,)."""
-        return self.functions.row(soc_pct, load)
 
     def take_over(self, before: OnlineModel) -> None:
         """Take over the currents of another model's form; low-passed ones where τ is the same."""
@@ -412,5 +404,5 @@ class OnlineModel:
                     item.restore(list(islice(numbers, size)))
                 if next(numbers, None) is not None:
                     raise InputError("longer than the state of this effect", field="effects")
-            except (ValueError, TypeError) as error:
+            except (ValueError, TypeError, IndexError) as error:
                 raise InputError(str(error), field=f"effects.{number - 1}") from error

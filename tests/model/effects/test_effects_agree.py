@@ -31,33 +31,11 @@ from synthetic import synthetic_log
 
 each_effect = pytest.mark.parametrize("effect", EFFECTS, ids=lambda effect: effect.id)
 
-FAMILIES = {
-    "current_sensing": {"current_offset", "current_gain"},
-    "voltage_sensing": {"voltage_offset", "voltage_gain"},
-    "thermal": {"temperature_lag", "core_temperature"},
-    "timing": {"time_skew"},
-    "charge": {"capacity", "initial_soc", "coulombic_efficiency"},
-    "resistance": {
-        "resistance_temperature", "resistance_soc", "resistance_asymmetry", "resistance_step",
-    },
-    "dynamics": {"charge_transfer", "fast_polarization", "slow_diffusion"},
-    "equilibrium": {"hysteresis", "entropic_coefficient"},
-    "imbalance": {"weak_cell"},
-}  # fmt: skip
-
 CELL_OCV_V = (3.2, 0.0, 0.0, 0.0, 0.0, 0.9, 0.0, 0.0)
 CELL = VoltageModel(
     PublishedCurve(CELL_OCV_V), 0.0005, (-0.02, -0.01), (0.0, 10.0), t_ref_c=25.0,
     temperature_range_c=(0.0, 40.0),
 )  # fmt: skip
-
-
-def test_library_holds_every_effect_in_its_family() -> None:
-    found: dict[str, set[str]] = {}
-    for key, effect in LIBRARY.items():
-        assert key == effect.id
-        found.setdefault(effect.family, set()).add(effect.id)
-    assert found == FAMILIES
 
 
 @each_effect

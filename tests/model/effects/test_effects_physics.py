@@ -33,10 +33,9 @@ class PackState:
 def corrected(effect_id: str, signals: Signals, values: Values) -> Signals:
     """A whole log as ideal sensors would have shown it."""
     effect = LIBRARY[effect_id]
-    context = effect.context(values, MODEL, PACK)
-    for item in context.memory:
-        item.whole = True
-    return effect.correct(signals, values, context)
+    return effect.correct(
+        signals, values, effect.context(values, MODEL, PACK)._replace(is_whole=True)
+    )
 
 
 def steady(

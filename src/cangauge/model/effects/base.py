@@ -33,23 +33,15 @@ from cangauge.model.voltage_model import PLAUSIBLE_C, VoltageModel
 
 Scale = Literal["one", "capacity", "voltage", "resistance"]
 
-Family = Literal[
-    "current_sensing",
-    "voltage_sensing",
-    "thermal",
-    "timing",
-    "charge",
-    "resistance",
-    "dynamics",
-    "equilibrium",
-    "imbalance",
-]
+Group = Literal["sensors_and_count", "overpotential", "clock", "thermal", "weak_cell"]
+"""What an engineer would look at together."""
 
 Values = Mapping[str, float]
 """Parameter name → value, in the parameter's unit."""
 
 Memories = Sequence[Any]
-"""An effect's `Memory` objects, of its own kinds."""
+"""What an effect carries from sample to sample: objects such as `Lag`, each with `state()`, numbers
+that begin with a time [s] and are none before the first sample, and `restore(state)`."""
 
 RESISTANCE_AT_LEAST = 0.002
 """Lower limit of the resistance that bounds scale with, as voltage drop at 1 C relative to the
@@ -235,6 +227,8 @@ class Context(NamedTuple):
     pack: Pack
     memory: Memories = ()
     """Carried from sample to sample."""
+    is_whole: bool = False
+    """Whether a call gets a whole log, after which no sample comes."""
 
 
 def _same(signals: Signals, *_: object) -> Signals:
@@ -256,7 +250,7 @@ class Effect:
     Parameters
     ----------
     id : str
-    family : Family
+    group : Group
     parameters : tuple of Parameter
     equation, source : str
     signature : str
@@ -284,7 +278,7 @@ class Effect:
     """
 
     id: str
-    family: Family
+    group: Group
     parameters: tuple[Parameter, ...]
     equation: str
     source: str

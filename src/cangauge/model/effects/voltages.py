@@ -174,7 +174,7 @@ VOLTAGES: Final = (
     # added. The temperature is that of the cell interior, `lag_s` behind the measured one.
     Effect(
         id="resistance_temperature",
-        family="resistance",
+        group="overpotential",
         parameters=(
             Parameter("share", "1", 0.0, 3.0),
             Parameter(
@@ -210,7 +210,7 @@ VOLTAGES: Final = (
     # Decays exponentially from empty and from full.
     Effect(
         id="resistance_soc",
-        family="resistance",
+        group="overpotential",
         parameters=(
             Parameter("at_empty", "1", -0.4, 3.0),
             Parameter("at_full", "1", -0.4, 1.5),
@@ -235,7 +235,7 @@ VOLTAGES: Final = (
     # Additional (or missing) resistance to charging current.
     Effect(
         id="resistance_asymmetry",
-        family="resistance",
+        group="overpotential",
         parameters=(Parameter("charging_ohm", "ohm", -0.6, 1.5, scale="resistance"),),
         signature="min(I, 0): only while charging, in step with the current",
         equation="ΔU = −r·min(I, 0)",
@@ -252,7 +252,7 @@ VOLTAGES: Final = (
     # drives has `start_s` = 0.
     Effect(
         id="resistance_step",
-        family="resistance",
+        group="overpotential",
         parameters=(
             Parameter("step_ohm", "ohm", -0.4, 2.0, scale="resistance"),
             Parameter(
@@ -275,7 +275,7 @@ VOLTAGES: Final = (
     # per electrode (51 mV at 25 °C) times the cells in series; the bound allows two electrodes.
     Effect(
         id="charge_transfer",
-        family="dynamics",
+        group="overpotential",
         parameters=(
             Parameter("scale_v", "V", 0.0, 0.03, scale="voltage"),
             Parameter(
@@ -300,7 +300,7 @@ VOLTAGES: Final = (
     # Double layer and charge transfer, faster than the model's first delay.
     Effect(
         id="fast_polarization",
-        family="dynamics",
+        group="overpotential",
         parameters=(
             Parameter("ohm", "ohm", 0.0, 1.0, scale="resistance"),
             Parameter("tau_s", "s", 0.3, 9.0, neutral=None, grid=(0.5, 1.0, 2.0, 3.5, 6.0, 9.0)),
@@ -318,7 +318,7 @@ VOLTAGES: Final = (
     # voltage (`by_slope` 1); diffusion in the electrolyte is the same at every SoC (0).
     Effect(
         id="slow_diffusion",
-        family="dynamics",
+        group="overpotential",
         parameters=(
             Parameter("ohm", "ohm", 0.0, 1.5, scale="resistance"),
             Parameter(
@@ -349,7 +349,7 @@ VOLTAGES: Final = (
     # rest.
     Effect(
         id="hysteresis",
-        family="equilibrium",
+        group="overpotential",
         parameters=(
             Parameter("half_width_v", "V", 0.0, 0.01, scale="voltage"),
             Parameter("travel_pct", "%", 0.5, 12.0, neutral=None, grid=(1.0, 2.0, 4.0, 7.0, 11.0)),
@@ -376,7 +376,7 @@ VOLTAGES: Final = (
     # the cell interior, `lag_s` behind the measured one.
     Effect(
         id="entropic_coefficient",
-        family="equilibrium",
+        group="thermal",
         parameters=(
             Parameter("level_v_per_k", "V/K", -1.1e-4, 1.1e-4, scale="voltage"),
             Parameter("slope_v_per_k", "V/K", -1.1e-4, 1.1e-4, scale="voltage"),
@@ -406,7 +406,7 @@ VOLTAGES: Final = (
     # extrapolation. A reversed cell falls faster, but a pack is switched off before that.
     Effect(
         id="weak_cell",
-        family="imbalance",
+        group="weak_cell",
         parameters=(
             Parameter("fraction", "1", 0.0, 0.15),
             Parameter(
