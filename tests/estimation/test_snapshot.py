@@ -14,7 +14,7 @@ from cangauge.estimation.estimator import Estimator
 from cangauge.estimation.offline import samples_of
 from cangauge.estimation.settings import EstimatorSettings, FullCharge, LongRest
 from cangauge.estimation.state import EstimatorState
-from cangauge.model.effects.base import Pack
+from cangauge.model.effects.base import Effect, Pack
 from cangauge.model.effects.library import LIBRARY, effect_entries
 from cangauge.model.model_file import Model
 from cangauge.model.published import CAPACITY_AH, leaf_2012_model, leaf_2012_model_file
@@ -27,17 +27,19 @@ PLAIN = leaf_2012_model_file()
 RULES = {"full_charge": FullCharge(400.0, 5.0), "long_rest": LongRest(600.0)}
 
 
+def half_way(effect: Effect) -> dict[str, float]:
+    """Return amplitudes half way to the far bound, shapes in the middle."""
+    values = effect.neutral(PACK)
+    for parameter in effect.amplitudes:
+        low, high = parameter.bounds(PACK)
+        far = high if high > values[parameter.name] else low
+        values[parameter.name] = 0.5 * (values[parameter.name] + far)
+    return values | ({"skew_s": 0.7} if effect.id == "time_skew" else {})
+
+
 def extended_by(ids: list[str]) -> Model:
     """Return the published model with effects, half way to their bounds."""
-    chosen = []
-    for effect_id in ids:
-        effect = LIBRARY[effect_id]
-        values = effect.neutral(PACK)
-        for parameter in effect.amplitudes:
-            low, high = parameter.bounds(PACK)
-            far = high if high > values[parameter.name] else low
-            values[parameter.name] = 0.5 * (values[parameter.name] + far)
-        chosen.append((effect, values | ({"skew_s": 0.7} if effect_id == "time_skew" else {})))
+    chosen = [(LIBRARY[effect_id], half_way(LIBRARY[effect_id])) for effect_id in ids]
     return Model.model_validate(PLAIN.model_dump() | {"effects": effect_entries(chosen)})
 
 

@@ -18,7 +18,7 @@ from cangauge.model.model_file import Model
 from cangauge.model.voltage_model import HermiteCurve, PublishedCurve, resistance_factor
 
 DELAYS, LOW_PASSES, KNOTS, FUNCTIONS, EFFECTS, WAITING = 64, 4, 201, 16, 32, 8192
-OCV, LAGS, VALUES, TESTED = 8, 5, 8, 64
+OCV, LAGS, VALUES, TESTED = 8, 2, 5, 64
 CURRENTS: Final = DELAYS + LOW_PASSES
 LOADS: Final = CURRENTS + 2
 STATES: Final = FUNCTIONS + 4

@@ -122,9 +122,8 @@ def evaluate(model: ExtendedModel, log: Log, rows: FitRows) -> LogFit:
     first = log.first_soc()
     if first is None:
         raise ValueError("a log of a fit has a start")
-    signals = Signals(log.time_s, log.current_a, log.voltage_v, log.temperature_c)
     row, soc_pct = first
-    prediction = model.predict(signals, soc_pct, rows.at, initial_row=row)
+    prediction = model.predict(Signals.of(log), soc_pct, rows.at, initial_row=row)
     temperature_c = prediction.signals.temperature_c[rows.at]
     return LogFit(
         rows=rows,

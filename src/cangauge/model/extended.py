@@ -305,8 +305,8 @@ class OnlineModel:
         time_s, current_a : float
             Time [s] and current [A].
         temperature_c : float
-            Latest known temperature [°C]; NaN before the first. Until then the reference
-            temperature holds, and effects of the temperature's history are zero.
+            Latest known temperature [°C]; NaN before the first: then the reference temperature
+            holds.
         """
         self.delay_line.push(time_s, current_a)
         at, now = np.array([time_s]), np.array([current_a])
@@ -318,16 +318,13 @@ class OnlineModel:
         if not self.extended.effects:
             return
         drop_v = self.load[1:] @ self.load_coefficients[1:]
+        load = Load(at, now, np.array([known_c]), np.array([drop_v]))
         over = 0
         for (effect, values), context in zip(self.extended.effects, self._contexts, strict=True):
-            of_history = any(isinstance(lag, Lag) and lag.is_lagging for lag in context.memory)
-            follows = of_history and not effect.rc_elements(values)
-            celsius = np.array([temperature_c if follows else known_c])
-            load = Load(at, now, celsius, np.array([drop_v]))
             drive = effect.drive(load, values, context)
             place = 1 + over if effect.uses_soc else 0
             over += effect.uses_soc
-            if drive is not None and not math.isnan(drive[0]):
+            if drive is not None:
                 self.drives[place] += float(drive[0])
 
     def load_at(self, temperature_c: float, currents_a: Sequence[float] | FloatArray) -> FloatArray:

@@ -18,9 +18,6 @@ import numpy as np
 from cangauge._typing import FloatArray
 from cangauge.logs.gaps import BRIDGE_S
 
-NO_LAG_S = 1e-3
-"""A time constant up to this is no lag: output = input [s]."""
-
 BLOCK_TIME_CONSTANTS = 300.0
 """Time constants summed in one block: e³⁰⁰, times e⁵⁰ for a last step, does not overflow."""
 
@@ -62,7 +59,7 @@ class Lag:
     Parameters
     ----------
     tau_s : float
-        Time constant [s]; up to `NO_LAG_S` the output is the input.
+        Time constant [s].
     start : float, optional
         Output at the first sample; the first input by default.
     rest_s : float
@@ -76,19 +73,12 @@ class Lag:
         self._last: tuple[float, float, float] | None = None
 
     @property
-    def is_lagging(self) -> bool:
-        """Whether the output differs from the input."""
-        return self.tau_s > NO_LAG_S
-
-    @property
     def value(self) -> float:
         """Latest output."""
         return 0.0 if self._last is None else self._last[2]
 
     def step(self, time_s: FloatArray, values: FloatArray) -> FloatArray:
         """Advance to samples of shape (n,) and return the outputs there."""
-        if not self.is_lagging:
-            return values
         missing = np.isnan(values)
         if missing.any():
             result = np.full(values.size, math.nan)
