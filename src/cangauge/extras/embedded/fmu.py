@@ -66,7 +66,7 @@ VALUES: Final = {
     "resistance_asymmetry": ("charging_ohm",),
     "resistance_step": ("step_ohm", "start_s"),
     "charge_transfer": ("scale_v", "per_a", "bend_only", "activation_k", "zero_a"),
-    "rc": ("activation_k", "by_slope", "mean_slope", "ohm"),
+    "rc": ("activation_k", "by_slope", "mean_slope", "ohm_1"),
     "hysteresis": ("half_width_v", "travel_as"),
     "entropic": ("level", "slope", "curve", "t_ref_c"),
     "weak_cell": ("fraction", "ahead"),
