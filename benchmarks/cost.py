@@ -68,7 +68,7 @@ ROWS_A_LOG = 50_000
 EFFECTS = (
     {"id": "fast_polarization", "parameters": {"ohm": 0.01, "tau_s": 3.0, "activation_k": 0.0}},
     {"id": "resistance_temperature", "parameters": {
-        "share": 0.3, "activation_k": 2500.0, "delayed": 1.0, "reference_c": 23.0, "lag_s": 0.0}},
+        "share": 0.3, "activation_k": 2500.0, "delayed": 1.0, "reference_c": 23.0}},
     {"id": "resistance_soc", "parameters": {
         "at_empty": 0.5, "at_full": 0.1, "width_pct": 10.0, "delayed": 1.0}},
     {"id": "hysteresis", "parameters": {"half_width_v": 0.5, "travel_pct": 2.0}},

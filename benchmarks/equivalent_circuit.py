@@ -121,10 +121,8 @@ class _StepResponse:
 
     def __init__(self, extended: ExtendedModel) -> None:
         self._extended = extended
-        elements = [
-            tau for effect, values in extended.effects for _, tau in effect.rc_elements(values)
-        ]
-        own = {*elements, *extended.model.low_pass_s}
+        elements = (effect.rc_element(values) for effect, values in extended.effects)
+        own = {*(each[1] for each in elements if each is not None), *extended.model.low_pass_s}
         self._own_tau_s = sorted(tau for tau in own if tau >= FASTEST_S)
         delays = [delay for delay in extended.model.delay_s if delay > 0.0]
         self._last_s = LASTING * max([FASTEST_S, *delays, *self._own_tau_s])

@@ -176,8 +176,8 @@ def test_after_a_reboot_the_pause_may_have_been_long(machine: Machine) -> None:
     service = machine.start()
     service.drive(DRIVE[1000:1001])
     assert service.pipeline.latest.soc_std_pct >= same
-    state = service.pipeline.estimator.snapshot()
-    assert (state.memory.doubt, state.hypotheses.decision) == ("interval", 0)
+    hypotheses = service.pipeline.estimator.snapshot().hypotheses
+    assert (len(hypotheses.filters), hypotheses.decision) == (2, 0)
 
 
 def test_a_replayed_log_goes_on_and_another_one_begins_anew(machine: Machine) -> None:
