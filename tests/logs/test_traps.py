@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 
 from cangauge.errors import InputError
@@ -64,3 +66,84 @@ def test_rows_in_errors_are_those_of_the_file(tmp_path: Path) -> None:
     path.write_text("\n".join([head, *(f"{at},1,360,20" for at in stamps), ""]))
     with pytest.raises(InputError, match="row 61"):
         read_log(path)
+
+
+@pytest.mark.parametrize(
+    ("heading", "columns", "is_read"),
+    [
+        ("Current", "current=Current[mA]", True),
+        ("Current", "current=Current", True),
+        ("Current [A]", "current=Current [A][mA]", True),
+        ("Current", "current=Current[A]", False),
+        ("Current", {"current": {"heading": "Current", "unit": "A"}}, False),
+        ("Current [A]", None, False),
+    ],
+)
+def test_a_stated_unit_must_be_that_of_the_cells(
+    tmp_path: Path, heading: str, columns: Any, is_read: bool
+) -> None:
+    head = f"time [s],{heading},voltage [V],temp [°C]"
+    path = table(tmp_path / "t.csv", head, "{k},{amps}000 mA,360,20")
+    if is_read:
+        np.testing.assert_allclose(read_log(path, columns=columns).current_a, np.arange(ROWS) % 7)
+    else:
+        with pytest.raises(InputError, match=r"cells have another unit than the heading .got 'mA"):
+            read_log(path, columns=columns)
+
+
+def test_dates_without_a_time_have_their_zone(tmp_path: Path) -> None:
+    path = tmp_path / "t.csv"
+    rows = [f"2024-03-01+00:{59 - k:02d},{k % 7},360,20" for k in range(60)]
+    path.write_text("\n".join(["Date,Current,Voltage,Temp", *rows, ""]))
+    log = read_log(path)
+    assert log.assumed[0] == 'time = "Date" [date with zone]'
+    np.testing.assert_array_equal(log.time_s, 1_709_251_200.0 + 60.0 * (np.arange(60) - 59.0))
+
+
+@pytest.mark.parametrize("split", [False, True])
+def test_local_dates_of_a_zone_are_seconds_since_1970(tmp_path: Path, split: bool) -> None:
+    """In spring an hour is missing: it is no gap of the log."""
+    path, mark = tmp_path / "t.csv", "," if split else " "
+    stamps = ["2024-03-31 01:59:58", "2024-03-31 01:59:59", "2024-03-31 03:00:00"]
+    rows = [f"{stamp.replace(' ', mark)},{k},360,20" for k, stamp in enumerate(stamps)]
+    heading = "Day,Clock" if split else "Stamp"
+    path.write_text("\n".join([f"{heading},Current,Voltage,Temp", *rows, ""]))
+    log = read_log(path, columns=f"time={heading.replace(',', '+')}[Europe/Berlin]")
+    np.testing.assert_array_equal(log.time_s, 1_711_846_798.0 + np.arange(3.0))
+
+
+@pytest.mark.parametrize("kind", ["csv", "parquet", "frame"])
+@pytest.mark.parametrize(
+    ("doubled", "words"),
+    [
+        ("time_s,current_a,voltage_v,temperature_c,Voltage_V", "2 columns have this name"),
+        ("Time [s],Current [A],Voltage [V],Temp [C],Voltage [V]", "no plain heading of voltage"),
+        ("Time [s],Current [A],Voltage [V],Temp [C],Temp [C]", "holds no temperature"),
+        ("Time [s],Current [A],Voltage [V],Temp [C],x,x", ""),
+        ("time_s,current_a,voltage_v,temperature_c,x,x", ""),
+    ],
+)
+def test_doubled_headings_never_choose_a_column(
+    tmp_path: Path, kind: str, doubled: str, words: str
+) -> None:
+    headings = doubled.split(",")
+    values = [np.arange(60.0), np.arange(60.0) % 7.0, np.full(60, 360.0), np.full(60, 20.0)]
+    values += [np.full(60, 300.0)] * (len(headings) - 4)
+    frame = pa.Table.from_arrays([pa.array(each) for each in values], headings)
+
+    def read() -> Log:
+        if kind == "frame":
+            return Log.from_dataframe(frame)
+        if kind == "parquet":
+            pq.write_table(frame, tmp_path / "t.parquet")
+            return read_log(tmp_path / "t.parquet")
+        rows = [",".join(map(str, row)) for row in zip(*values, strict=True)]
+        (tmp_path / "t.csv").write_text("\n".join([doubled, *rows, ""]))
+        return read_log(tmp_path / "t.csv")
+
+    if words:
+        with pytest.raises(InputError, match=words):
+            read()
+    else:
+        assert read().voltage_v[0] == 360.0
+        assert "2 other columns ignored: x, x" in read().remarks
