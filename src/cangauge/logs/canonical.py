@@ -52,7 +52,7 @@ def open_parquet(head: Head) -> Iterator[ArrowTable]:
                 table.validate(full=True)  # damaged indices may exceed a dictionary
                 return table
 
-            yield arrow_table(file.schema_arrow, read)
+            yield arrow_table(file.schema_arrow, read, str(head.path))
         except (pa.ArrowException, OSError, ValueError) as error:
             reason = (str(error) or type(error).__name__).splitlines()[0]
             raise InputError(
@@ -62,11 +62,11 @@ def open_parquet(head: Head) -> Iterator[ArrowTable]:
             ) from error
 
 
-def arrow_table(schema: Any, read: Any) -> ArrowTable:
+def arrow_table(schema: Any, read: Any, source: str) -> ArrowTable:
     """Return a table of an Arrow schema with the temperature source of its metadata."""
     metadata: dict[bytes, bytes] = schema.metadata or {}
     word = metadata.get(_METADATA_KEY, b"").decode("utf-8", errors="replace")
-    return ArrowTable(schema.names, read, word)
+    return ArrowTable(schema.names, read, word, source)
 
 
 def build_table(

@@ -18,6 +18,8 @@ _SYNTAX: Final = (
     " time, current, voltage, temperature, soc"
 )
 _NEEDED: Final = ("time", "current", "voltage")
+_JOINED: Final = ("time", "temperature")
+"""Quantities of several columns: a date and its time; probes, whose median is taken."""
 _SPLIT: Final = re.compile(rf",\s*(?=(?:{'|'.join(FIELDS)})\s*=)", re.IGNORECASE)
 _FACTOR: Final = re.compile(r"^(?P<text>.*\S)\s*:\s*(?P<factor>[-+]?[\d.]+(?:[eE][-+]?\d+)?)$")
 _UNIT: Final = re.compile(r"^(?P<text>.*\S)\s*\[(?P<unit>[^\[\]]*)\]$")
@@ -133,16 +135,15 @@ class ChosenColumn:
     """Columns of a table that hold one quantity.
 
     Several places are a date and its time, or temperatures whose median is taken. The unit is the
-    user's, the heading's or that of the row of units. `others` are further times, in case that the
-    first does not increase.
+    user's, the heading's or that of the row of units. `others` are further columns of time: dates
+    beside a clock, or times in case that the first does not increase.
     """
 
     places: tuple[int, ...]
     unit: str = ""
     factor: float = 1.0
-    given: bool = False
     source: TemperatureSource = "unknown"
-    others: tuple[int, ...] = ()
+    others: tuple[tuple[int, Meaning], ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -211,8 +212,7 @@ def _choose(quantity: str, plain: list[tuple[int, Meaning]], choice: Choice) -> 
     if first.rank >= GUESS or siblings or one_of_many:
         choice.guesses[quantity] = place
     elif quantity == "time":
-        others = tuple(other for other, meaning in plain[1:] if meaning.rank < GUESS)
-        choice.chosen[quantity] = ChosenColumn((place,), first.unit, others=others)
+        choice.chosen[quantity] = ChosenColumn((place,), first.unit, others=tuple(plain[1:]))
     else:
         unit, source = best[0][1].unit, best[0][1].source
         choice.chosen[quantity] = ChosenColumn(tuple(p for p, _ in best), unit, source=source)
@@ -226,14 +226,20 @@ def _given_column(
     where: str,
 ) -> ChosenColumn:
     for reading in spec.readings():
-        places = _places(reading.text, headings)
-        if not places:
+        place = _place(reading.text, headings)
+        parts = (
+            [place]
+            if place is not None or quantity not in _JOINED
+            else [_place(part, headings) for part in reading.text.split("+")]
+        )
+        places = tuple(part for part in parts if part is not None)
+        if len(places) < len(parts):
             continue
         units = {_stated_unit(headings[place], meanings[place], quantity) for place in places}
         unit = reading.unit if reading.unit is not None else units.pop() if len(units) == 1 else ""
         first = meanings[places[0]]
         source = first.source if first is not None and quantity == "temperature" else "unknown"
-        return ChosenColumn(places, unit, reading.factor, given=True, source=source)
+        return ChosenColumn(places, unit, reading.factor, source)
     near = closest(spec.text, headings)
     raise InputError(
         f"no column has this heading (found: {shown_headings(headings)})",
@@ -251,27 +257,18 @@ def _stated_unit(heading: str, meaning: Meaning | None, quantity: str) -> str:
     return next((unit for unit in units if unit_of(FIELDS[quantity], unit) is not None), "")
 
 
-def _places(text: str, headings: Sequence[str]) -> tuple[int, ...]:
-    """Return the columns that a text names; none where it names no column, or not all."""
-    whole = _place(text, headings)
-    if whole is not None:
-        return (whole,)
-    places = [_place(part, headings) for part in text.split("+")]
-    found = tuple(place for place in places if place is not None)
-    return found if len(found) == len(places) > 1 else ()
-
-
 def _place(text: str, headings: Sequence[str]) -> int | None:
+    """Return the column that a text names: its heading, that without its unit, or its number."""
     if text in headings:  # `t` beside `T`
         return headings.index(text)
-    names = [_simple(heading) for heading in headings]
-    if _simple(text) in names:
-        return names.index(_simple(text))
+    name, names = _simple(text), [_simple(heading) for heading in headings]
+    if name in names:
+        return names.index(name)
     number = re.fullmatch(r"#(\d{1,5})", text.strip())
     if number and 1 <= int(number[1]) <= len(headings):
         return int(number[1]) - 1
     bare = [_simple(names_and_units(heading)[0][0]) for heading in headings]
-    return bare.index(_simple(text)) if bare.count(_simple(text)) == 1 else None
+    return bare.index(name) if bare.count(name) == 1 else None
 
 
 def _simple(text: str) -> str:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cache
 from importlib import import_module
 from importlib.metadata import entry_points
@@ -22,10 +22,10 @@ from cangauge.logs.column_map import DOCS, ColumnMap, unknown_columns
 from cangauge.logs.draft import DraftLog, Sign
 from cangauge.logs.headings import cell_number
 from cangauge.logs.log import Log, TemperatureSource
-from cangauge.logs.sign import resolve_sign
-from cangauge.logs.table import ArrowTable, draft_of_table, is_canonical, numbers_of
-from cangauge.logs.text import TextTable, find_table, is_of_frames, likely_header, table_below
+from cangauge.logs.table import ArrowTable, draft_of_table, is_canonical
+from cangauge.logs.text import TextTable, find_table, likely_header, table_below
 from cangauge.logs.units import COLDEST_C, HOTTEST_C, known_temperature_source
+from cangauge.logs.values import numbers_of
 
 KNOWN_LOGS: Final = (
     "canonical Parquet and CSV (time_s, current_a, voltage_v, temperature_c, soc_pct), ANL D3"
@@ -36,6 +36,8 @@ _FORMATS: Final = tuple(
     f"cangauge.extras.formats.{module}" for module in ("exports", "tables", "measurement")
 )
 """Modules with further readers, each in its tuple `READERS`; loaded when a log is opened."""
+_FRAME_WORDS: Final = frozenset({"id", "can id", "identifier", "dlc", "len", "data", "d1"})
+"""Headings of CAN frames: an id, a length or bytes."""
 GROUP: Final = "cangauge.readers"
 """Entry points of readers of other packages: a `LogReader`."""
 
@@ -133,7 +135,7 @@ class LogFile:
         _refuse_options(temperature_c, temperature_source, self.sign)
         try:
             draft = self.reader.read(self.head, self.columns)
-            log = _log_of(draft, temperature_c, temperature_source, self.sign, self.used)
+            log = draft.log(temperature_c, temperature_source, self.sign, self.used)
         except MemoryError as error:
             raise InputError(
                 "larger than the free memory", source=self.head.path, cure="split it"
@@ -157,23 +159,6 @@ def _refuse_options(
         raise InputError("not a sign", field="--sign", value=sign, cure=cure)
 
 
-def _log_of(
-    draft: DraftLog,
-    temperature_c: float | None,
-    temperature_source: TemperatureSource | None,
-    sign: Sign | None,
-    used: tuple[str, ...] = (),
-) -> Log:
-    """Return the checked log of a draft, with its sign of current."""
-    if sign is not None:
-        draft.state_sign(sign)
-    log = Log(**draft.checked(temperature_c, used))
-    if temperature_source is not None:
-        log = replace(log, temperature_source=temperature_source)
-    is_stated = sign is not None
-    return resolve_sign(log, stored_sign_unknown=draft.sign_unknown, is_stated=is_stated)
-
-
 def not_recognised(file: LogFile, problem: str, cure: str) -> InputError:
     """Return the error for a file of unknown format: its columns if it is a table."""
     head = file.head
@@ -181,7 +166,8 @@ def not_recognised(file: LogFile, problem: str, cure: str) -> InputError:
     if foreign is not None:
         return InputError(f"{problem}: it is {foreign[0]}", source=head.path, cure=foreign[1])
     headings, choice = likely_header(head)
-    if len(headings) >= 3 and not is_of_frames(headings):
+    is_of_frames = not _FRAME_WORDS.isdisjoint(text.strip().lower() for text in headings)
+    if len(headings) >= 3 and not is_of_frames:
         error = unknown_columns(str(head.path), headings, choice)
         return InputError(f"{problem}: {error.problem}", source=head.path, cure=error.cure)
     shown = head.first_line.strip()
@@ -261,9 +247,9 @@ def log_of_dataframe(
         table = table.rename_columns({times[0]: "time"})  # an unnamed pandas index
     table = table.drop_columns([c.name for c in indices if c.name in table.column_names])
     given = None if columns is None else ColumnMap.of(columns)
-    found = arrow_table(table.schema, table.select)
-    draft = draft_of_table(found, given, name=name, source="")
-    return _log_of(draft, temperature_c, temperature_source, sign)
+    columns_of = arrow_table(table.schema, table.select, name)
+    draft = draft_of_table(columns_of, given, name=name, source="")
+    return draft.log(temperature_c, temperature_source, sign)
 
 
 # --- Cells beside a log
