@@ -21,7 +21,9 @@ _NEEDED: Final = ("time", "current", "voltage")
 _JOINED: Final = ("time", "temperature")
 """Quantities of several columns: a date and its time; probes, whose median is taken."""
 _SPLIT: Final = re.compile(rf",\s*(?=(?:{'|'.join(FIELDS)})\s*=)", re.IGNORECASE)
-_FACTOR: Final = re.compile(r"^(?P<text>.*\S)\s*:\s*(?P<factor>[-+]?[\d.]+(?:[eE][-+]?\d+)?)$")
+_FACTOR: Final = re.compile(
+    r"^(?P<text>.*\S)\s*:\s*(?P<factor>[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)$"
+)
 _UNIT: Final = re.compile(r"^(?P<text>.*\S)\s*\[(?P<unit>[^\[\]]*)\]$")
 
 

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from functools import cache
 from importlib import import_module
 from importlib.metadata import entry_points
+from itertools import pairwise
 from os import PathLike
 from typing import Any, Final, Protocol
 
@@ -43,7 +44,7 @@ GROUP: Final = "cangauge.readers"
 
 
 class LogReader(Protocol):
-    """Reader of one format of logs; a `cangauge._files.Reader`."""
+    """Reader of one format of logs."""
 
     name: str
     takes_columns: bool
@@ -151,9 +152,9 @@ def _refuse_options(
         known_temperature_source(temperature_source)
     if temperature_c is not None:
         require_number(temperature_c, "--temperature")
-    if temperature_c is not None and not COLDEST_C <= temperature_c <= HOTTEST_C:
-        problem = f"must lie within {COLDEST_C:g} … {HOTTEST_C:g} °C"
-        raise InputError(problem, field="--temperature", value=temperature_c)
+        if not COLDEST_C <= temperature_c <= HOTTEST_C:
+            problem = f"must lie within {COLDEST_C:g} … {HOTTEST_C:g} °C"
+            raise InputError(problem, field="--temperature", value=temperature_c)
     if sign not in {None, "charge", "discharge"}:
         cure = "say what a positive current does: charge or discharge"
         raise InputError("not a sign", field="--sign", value=sign, cure=cure)
@@ -194,13 +195,14 @@ def open_log(
     InputError
         If the file is absent, empty, damaged or not a regular file.
     """
-    head = Head(path)
-    given = None if columns is None else ColumnMap.of(columns)
+    head, given = Head(path), None if columns is None else ColumnMap.of(columns)
     for reader in _readers():
-        is_offered = given is None or reader.takes_columns
-        if is_offered and (
-            (given is not None and isinstance(reader, LogTableReader)) or reader.matches(head)
-        ):
+        if given is None:
+            is_format = reader.matches(head)
+        else:  # the columns make a table of any file
+            is_table = isinstance(reader, LogTableReader)
+            is_format = is_table or (reader.takes_columns and reader.matches(head))
+        if is_format:
             return LogFile(head, reader, given, sign)
     return LogFile(head, None, given, sign)
 
@@ -289,19 +291,18 @@ def read_cells(
     columns : ColumnMap, optional
         The user's columns of the log.
     """
-    file = open_log(path, columns=columns)
+    file, source = open_log(path, columns=columns), str(path)
     if not isinstance(file.reader, LogTableReader):
         return None
-    source = str(path)
     with open_table(file.head, columns) as table:
-        places = _cells(table.headings, source)
-        if len(places) < 2:  # a single cell is its pack
+        cells = _cells(table.headings, source)
+        if len(cells) < 2:  # a single cell is its pack
             return None
-        cells = table.columns([place for place, _ in places.values()])
+        values = table.columns([place for place, _ in cells.values()])
         volts = np.column_stack(
             [
-                scale * numbers_of(cells[place], source, table.headings[place])[0]
-                for place, scale in places.values()
+                scale * numbers_of(values[place], source, table.headings[place])[0]
+                for place, scale in cells.values()
             ]
         )
         file_s = draft_of_table(table, columns, name=file.head.name, source=source).values["time_s"]
@@ -309,21 +310,21 @@ def read_cells(
         return None  # rows that hold only what changed
     order = np.argsort(file_s, kind="stable")
     rows = order[np.minimum(np.searchsorted(file_s[order], time_s), file_s.size - 1)]
-    return CellColumns(
-        min(places), np.where((file_s[rows] == time_s)[:, None], volts[rows], np.nan)
-    )
+    is_row = (file_s[rows] == time_s)[:, None]
+    return CellColumns(min(cells), np.where(is_row, volts[rows], np.nan))
 
 
 def _cells(headings: Sequence[str], source: str) -> dict[int, tuple[int, float]]:
     """Return the column and scale of each cell by its number, in order."""
-    found: dict[int, tuple[int, float]] = {}
+    cells: dict[int, tuple[int, float]] = {}
     for place, heading in enumerate(headings):
         cell = cell_number(heading)
         if cell is not None:
-            found.setdefault(cell[0], (place, cell[1]))
-    numbers = sorted(found)
-    missing = [k for k in range(numbers[0], numbers[-1]) if k not in found] if numbers else []
-    if missing:
-        problem, field = "the cells must be numbered without gaps", f"cell_{missing[0]}_v"
-        raise InputError(problem, source=source, field=field, cure="export all cells")
-    return {number: found[number] for number in numbers}
+            number, scale = cell
+            cells.setdefault(number, (place, scale))
+    numbers = sorted(cells)
+    for number, following in pairwise(numbers):
+        if following > number + 1:
+            problem, field = "the cells must be numbered without gaps", f"cell_{number + 1}_v"
+            raise InputError(problem, source=source, field=field, cure="export all cells")
+    return {number: cells[number] for number in numbers}
