@@ -171,3 +171,65 @@ def test_a_history_may_have_rows_without_an_entity(tmp_path: Path) -> None:
     lines = [f"{row.format(k=k)},2024-03-01T00:00:{k:02d}Z" for k in range(60) for row in rows]
     path.write_text("\n".join(["entity_id,state,last_changed", *lines, ""]))
     assert len(read_log(path)) == 60
+
+
+def test_cells_of_two_units_are_refused(tmp_path: Path) -> None:
+    rows = [f"{k},{k % 7} A,360 V,20" for k in range(59)] + ["59,500 mA,360 V,20"]
+    path = tmp_path / "t.csv"
+    path.write_text("\n".join(["Time,Current,Voltage,Temp", *rows, ""]))
+    with pytest.raises(InputError, match=r"Current: row 1 is not a number .got '0 A'"):
+        read_log(path)
+
+
+@pytest.mark.parametrize(
+    ("columns", "second_s"),
+    [("time=Time:0.02", 0.02), ("time=Time[ms]:20", 0.02), ("time=Time[min]:0.5", 30.0)],
+)
+def test_a_factor_of_time_is_that_of_its_unit(
+    tmp_path: Path, columns: str, second_s: float
+) -> None:
+    path = table(tmp_path / "t.csv", "Time,Current,Voltage,Temp", "{k},{amps},360,20")
+    assert read_log(path, columns=columns).time_s[1] == pytest.approx(second_s)
+
+
+@pytest.mark.parametrize("unit", ["s", "ms", "us", "ns"])
+@pytest.mark.parametrize("kind", [pa.timestamp, pa.duration])
+def test_arrow_times_have_their_own_unit(kind: Any, unit: str) -> None:
+    per_second = {"s": 1, "ms": 10**3, "us": 10**6, "ns": 10**9}[unit]
+    counts = pa.array(per_second * np.arange(60), pa.int64())
+    columns = {"current": np.arange(60.0) % 7, "voltage": np.full(60, 360.0)}
+    frame = pa.table({"time": counts.cast(kind(unit)), **columns})
+    log = Log.from_dataframe(frame, temperature_c=20.0)
+    np.testing.assert_array_equal(log.time_s, np.arange(60.0))
+
+
+@pytest.mark.parametrize("units", ["heading", "row"])
+def test_a_time_that_wraps_is_replaced_by_another_in_its_own_unit(
+    tmp_path: Path, units: str
+) -> None:
+    heads = {"heading": "Test Time [s],Time [ms],Current,Voltage,Temp",
+             "row": "Test Time,Time,Current,Voltage,Temp\ns,ms,A,V,degC"}  # fmt: skip
+    rows = [f"{k % 30},{20 * k},{k % 7},360,20" for k in range(60)]
+    path = tmp_path / "t.csv"
+    path.write_text("\n".join([heads[units], *rows, ""]))
+    np.testing.assert_allclose(read_log(path).time_s, 0.02 * np.arange(60))
+    path.write_text(
+        "\n".join(
+            [
+                heads[units],
+                *(f"{k},{row}" for k, row in enumerate(row.partition(",")[2] for row in rows)),
+                "",
+            ]
+        )
+    )
+    np.testing.assert_array_equal(read_log(path).time_s, np.arange(60.0))
+
+
+def test_a_factor_states_the_sign(tmp_path: Path) -> None:
+    rows = [f"{k},{50 * (k % 2)},{360 - 5 * (k % 2)},20" for k in range(60)]
+    path = tmp_path / "t.csv"
+    path.write_text("\n".join(["Time,Current,Voltage,Temp", *rows, ""]))
+    log = read_log(path, columns="current=Current:-1")
+    assert log.current_a.min() == -50.0
+    assert any(text.startswith("current looks inverted and was kept") for text in log.remarks)
+    assert read_log(path, columns="current=Current:0.5").current_a.max() == 25.0

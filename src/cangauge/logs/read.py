@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from importlib import import_module
@@ -18,7 +17,7 @@ import pyarrow as pa
 from cangauge._files import Head
 from cangauge._typing import FloatArray
 from cangauge.errors import InputError, require_number
-from cangauge.logs.canonical import arrow_table, open_parquet
+from cangauge.logs.canonical import arrow_table, parquet_table
 from cangauge.logs.column_map import DOCS, ColumnMap, unknown_columns
 from cangauge.logs.draft import DraftLog, Sign
 from cangauge.logs.headings import cell_number
@@ -69,8 +68,8 @@ class LogTableReader:
 
     def read(self, head: Head, columns: ColumnMap | None = None) -> DraftLog:
         """Read a log; see `LogReader`."""
-        with open_table(head, columns) as table:
-            return draft_of_table(table, columns, name=head.name, source=str(head.path))
+        table = open_table(head, columns)
+        return draft_of_table(table, columns, name=head.name, source=str(head.path))
 
 
 def _is_parquet(head: Head) -> bool:
@@ -82,18 +81,15 @@ def _canonical_text(head: Head) -> TextTable | None:
     return table if table is not None and is_canonical(table.headings) else None
 
 
-@contextmanager
-def open_table(head: Head, columns: ColumnMap | None) -> Iterator[TextTable | ArrowTable]:
-    """Open Parquet or a text as a table."""
+def open_table(head: Head, columns: ColumnMap | None) -> TextTable | ArrowTable:
+    """Return Parquet or a text as a table; raise InputError where it is none."""
     if _is_parquet(head):
-        with open_parquet(head) as found:
-            yield found
-        return
+        return parquet_table(head)
     table = _canonical_text(head) if columns is None else None
     table = table or find_table(head, columns)
     if table is None:
-        raise unknown_columns(str(head.path), *likely_header(head))
-    yield table
+        raise unknown_columns(str(head.path), *likely_header(head, columns))
+    return table
 
 
 @cache
@@ -294,18 +290,18 @@ def read_cells(
     file, source = open_log(path, columns=columns), str(path)
     if not isinstance(file.reader, LogTableReader):
         return None
-    with open_table(file.head, columns) as table:
-        cells = _cells(table.headings, source)
-        if len(cells) < 2:  # a single cell is its pack
-            return None
-        values = table.columns([place for place, _ in cells.values()])
-        volts = np.column_stack(
-            [
-                scale * numbers_of(values[place], source, table.headings[place])[0]
-                for place, scale in cells.values()
-            ]
-        )
-        file_s = draft_of_table(table, columns, name=file.head.name, source=source).values["time_s"]
+    table = open_table(file.head, columns)
+    cells = _cells(table.headings, source)
+    if len(cells) < 2:  # a single cell is its pack
+        return None
+    values = table.columns([place for place, _ in cells.values()])
+    volts = np.column_stack(
+        [
+            scale * numbers_of(values[place], source, table.headings[place])[0]
+            for place, scale in cells.values()
+        ]
+    )
+    file_s = draft_of_table(table, columns, name=file.head.name, source=source).values["time_s"]
     if file_s.size != volts.shape[0]:
         return None  # rows that hold only what changed
     order = np.argsort(file_s, kind="stable")

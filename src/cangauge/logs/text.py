@@ -16,7 +16,7 @@ import pyarrow.csv as pacsv
 
 from cangauge._files import Head, as_utf8
 from cangauge.errors import InputError
-from cangauge.logs.column_map import Choice, ColumnMap, choose_columns, unknown_columns
+from cangauge.logs.column_map import Choice, ColumnMap, choose_columns
 from cangauge.logs.headings import meaning_of
 from cangauge.logs.stamps import is_stamp
 from cangauge.logs.values import MISSING, is_number
@@ -148,13 +148,7 @@ def table_below(head: Head, header: str) -> TextTable:
 
 
 def find_table(head: Head, given: ColumnMap | None = None) -> TextTable | None:
-    """Return the table of a text in which time, current and voltage are known, or None.
-
-    Raises
-    ------
-    InputError
-        If a column of the user is in no line.
-    """
+    """Return the table of a text in which time, current and voltage are known, or None."""
     specs = given.specs.values() if given else ()
     if specs and all(spec.text.startswith("#") for spec in specs):
         table = _without_header(head)
@@ -162,14 +156,10 @@ def find_table(head: Head, given: ColumnMap | None = None) -> TextTable | None:
             return table
     for rows in (1, 2):  # the words of a header may be in two rows
         for number, delimiter, cells in _headers(head, rows):
-            with suppress(InputError):
+            with suppress(InputError):  # no column has a heading that the user names
                 if choose_columns(cells, (), given).is_complete:
                     return _below(head, number + rows, delimiter, cells, given)
-    if not specs:
-        return None
-    headings, _ = likely_header(head)
-    choice = choose_columns(headings, (), given)  # names a heading that is missing
-    raise unknown_columns(str(head.path), headings, choice)
+    return None
 
 
 def _headers(head: Head, rows: int = 1) -> Iterator[tuple[int, str, list[str]]]:
@@ -221,8 +211,14 @@ def _without_header(head: Head) -> TextTable | None:
     return None
 
 
-def likely_header(head: Head) -> tuple[list[str], Choice]:
-    """Return the likeliest header of a text and its incomplete choice, for messages."""
+def likely_header(head: Head, given: ColumnMap | None = None) -> tuple[list[str], Choice]:
+    """Return the likeliest header of a text and its incomplete choice, for messages.
+
+    Raises
+    ------
+    InputError
+        If the header has none of a column of the user.
+    """
     best: list[str] = []
     for number, delimiter, cells in _headers(head):
         if _values_in(cells) > 1:
@@ -232,4 +228,4 @@ def likely_header(head: Head) -> tuple[list[str], Choice]:
         known, most = (sum(map(bool, map(meaning_of, row))) for row in (cells, best))
         if has_data and (not best or known > most):
             best = cells
-    return best, choose_columns(best)
+    return best, choose_columns(best, (), given)

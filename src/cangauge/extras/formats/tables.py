@@ -43,7 +43,7 @@ class Workbook:
         sheet = _SheetText(head)
         table = find_table(sheet, columns)
         if table is None:
-            raise unknown_columns(str(head.path), *likely_header(sheet))
+            raise unknown_columns(str(head.path), *likely_header(sheet, columns))
         return draft_of_table(table, columns, name=head.name, source=str(head.path))
 
 
