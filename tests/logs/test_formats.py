@@ -146,6 +146,14 @@ def test_soc_against_the_charge_is_left_out(tmp_path: Path) -> None:
     assert any(text.startswith("SoC left out: it moves from 10") for text in log.remarks)
 
 
+def test_columns_of_the_user_make_a_table_of_any_format(tmp_path: Path) -> None:
+    path = tmp_path / "cell_P25_S1.csv"
+    path.write_bytes(content_of(CASES["arbin"]))
+    log = read_log(path, columns="current=Current(A):-2", temperature_c=20.0)
+    np.testing.assert_array_equal(log.current_a, 2.0 * CURRENT_A)
+    assert 'current = "Current(A)" × -2 [A]' in log.assumed
+
+
 def test_constant_temperature_in_place_of_the_files(tmp_path: Path) -> None:
     path = tmp_path / "x.csv"
     path.write_bytes(content_of(CASES["canonical"]))

@@ -233,3 +233,20 @@ def test_a_factor_states_the_sign(tmp_path: Path) -> None:
     assert log.current_a.min() == -50.0
     assert any(text.startswith("current looks inverted and was kept") for text in log.remarks)
     assert read_log(path, columns="current=Current:0.5").current_a.max() == 25.0
+
+
+def test_a_time_of_something_else_replaces_none(tmp_path: Path) -> None:
+    rows = [f"{k % 30},{k},{k % 7},360,20" for k in range(60)]
+    path = tmp_path / "t.csv"
+    path.write_text("\n".join(["Time [s],Charge Time [s],Current,Voltage,Temp", *rows, ""]))
+    with pytest.raises(InputError, match="runs backwards at row 31"):
+        read_log(path)
+
+
+def test_held_temperature_begins_with_its_first_value(tmp_path: Path) -> None:
+    rows = [
+        f"{k},,380,\n{k}.4,{k % 3},,\n{k}.5,,,{20 + k / 10 if k > 4 else ''}" for k in range(20)
+    ]
+    path = tmp_path / "t.csv"
+    path.write_text("\n".join(["Time,Current,Voltage,Temp", *rows, ""]))
+    assert read_log(path).temperature_c[:8].tolist() == [20.5] * 7 + [20.6]

@@ -278,28 +278,22 @@ def _simple(text: str) -> str:
 
 
 def unknown_columns(source: str, headings: Sequence[str], choice: Choice) -> InputError:
-    """Return the error for a table whose columns are not plain, with the option to paste."""
-    names = [name for name in _NEEDED if name not in choice.chosen]
-    missing = " and ".join(part for part in (", ".join(names[:-1]), *names[-1:]) if part)
+    """Return the error for a table whose columns are not plain, with the option to paste.
+
+    It has the likeliest column of each quantity, and `?` where none is likely.
+    """
+    needed = [name for name in _NEEDED if name not in choice.chosen]
+    missing = " and ".join(part for part in (", ".join(needed[:-1]), *needed[-1:]) if part)
+    likely = {quantity: headings[place] for quantity, place in choice.guesses.items()}
+    for quantity, column in choice.chosen.items():
+        likely[quantity] = "+".join(headings[place] for place in column.places)
+    names = [name for name in FIELDS if name in likely or name in _NEEDED]
+    columns = ",".join(f"{name}={likely.get(name, '?')}" for name in names).replace("'", "'\\''")
     return InputError(
         f"no plain heading of {missing} (found: {shown_headings(headings)})",
         source=source,
-        cure=f"name the columns, e.g. {suggestion(headings, choice)} ({DOCS})",
+        cure=f"name the columns, e.g. --columns '{columns}' ({DOCS})",
     )
-
-
-def suggestion(headings: Sequence[str], choice: Choice) -> str:
-    """Return the likeliest `--columns` option to paste; `?` where nothing is likely."""
-    parts = []
-    for quantity in FIELDS:
-        if quantity in choice.chosen:
-            places = choice.chosen[quantity].places
-            parts.append(f"{quantity}={'+'.join(headings[place] for place in places)}")
-        elif quantity in choice.guesses:
-            parts.append(f"{quantity}={headings[choice.guesses[quantity]]}")
-        elif quantity in _NEEDED:
-            parts.append(f"{quantity}=?")
-    return "--columns '" + ",".join(parts).replace("'", "'\\''") + "'"
 
 
 def shown_headings(headings: Sequence[str]) -> str:
