@@ -55,16 +55,15 @@ def numbers_of(column: Any, source: str, label: str) -> tuple[FloatArray, str]:
     InputError
         If a cell holds anything but a number, or the column has another type.
     """
+
+    def error(problem: str, value: object, cure: str) -> InputError:
+        return InputError(problem, source=source, field=label, value=value, cure=cure)
+
     of, kind = pa.types, column.type
-    if not (is_text(column) or of.is_integer(kind) or of.is_floating(kind) or of.is_decimal(kind)
-            or of.is_null(kind)):  # fmt: skip
-        raise InputError(
-            "the column does not hold numbers",
-            source=source,
-            field=label,
-            value=str(kind)[:60],
-            cure="store it as floating point",
-        )
+    is_numeric = of.is_integer(kind) or of.is_floating(kind) or of.is_decimal(kind)
+    if not (is_numeric or is_text(column) or of.is_null(kind)):
+        cure = "store it as floating point"
+        raise error("the column does not hold numbers", str(kind)[:60], cure)
     unit = ""
     try:
         try:
@@ -72,17 +71,12 @@ def numbers_of(column: Any, source: str, label: str) -> tuple[FloatArray, str]:
         except pa.ArrowInvalid:
             bare, unit = _without_unit(_with_decimal_point(present(column)))
             numbers = pc.cast(bare, pa.float64())
-    except pa.ArrowInvalid as error:
+    except pa.ArrowInvalid as problem:
         texts = enumerate(present(column).to_pylist(), start=1)
         wrong = ((k, text) for k, text in texts if text and not is_number(text))
         row, value = next(wrong, (1, None))
-        raise InputError(
-            f"row {row} is not a number",
-            source=source,
-            field=label,
-            value=value,
-            cure="correct the cell, or leave it empty where the value is unknown",
-        ) from error
+        cure = "correct the cell, or leave it empty where the value is unknown"
+        raise error(f"row {row} is not a number", value, cure) from problem
     return np.array(numbers.to_numpy(), dtype=np.float64), unit
 
 
