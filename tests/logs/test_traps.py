@@ -39,6 +39,28 @@ def test_a_unit_in_the_cells_of_one_probe_is_not_that_of_the_other(tmp_path: Pat
         read_log(path, columns="temperature=T1+T2")
 
 
+@pytest.mark.parametrize(
+    ("heads", "columns", "mean_c"),
+    [
+        ("T1 [°C],T2 [°F]", "temperature=T1+T2", None),
+        ("T1,T2 [K]", "temperature=T1+T2", None),
+        ("T1 [°C],T2", "temperature=T1+T2", 44.0),
+        ("T1 [°C],T2 [C]", "temperature=T1+T2", 44.0),
+        ("T1 [°F],T2 [°F]", "temperature=T1+T2", 20.0 / 3.0),
+        ("T1 [°C],T2 [°F]", "temperature=T1+T2[°F]", 20.0 / 3.0),
+    ],
+)
+def test_probes_that_the_user_joins_have_one_unit(
+    tmp_path: Path, heads: str, columns: str, mean_c: float | None
+) -> None:
+    path = table(tmp_path / "t.csv", f"Time,Current,Voltage,{heads}", "{k},{amps},360,20,68")
+    if mean_c is None:
+        with pytest.raises(InputError, match="the headings have different units"):
+            read_log(path, columns=columns)
+    else:
+        np.testing.assert_allclose(read_log(path, columns=columns).temperature_c, mean_c)
+
+
 def test_a_canonical_time_that_wraps_is_not_replaced_by_another_column(tmp_path: Path) -> None:
     path = tmp_path / "t.csv"
     head = "time_s,current_a,voltage_v,temperature_c,timestamp"

@@ -228,17 +228,19 @@ def _given_column(
     where: str,
 ) -> ChosenColumn:
     for reading in spec.readings():
-        place = _place(reading.text, headings)
-        parts = (
-            [place]
-            if place is not None or quantity not in _JOINED
-            else [_place(part, headings) for part in reading.text.split("+")]
-        )
-        places = tuple(part for part in parts if part is not None)
-        if len(places) < len(parts):
+        places = _places(reading.text, headings, is_joined=quantity in _JOINED)
+        if not places:
             continue
         units = {_stated_unit(headings[place], meanings[place], quantity) for place in places}
         unit = reading.unit if reading.unit is not None else units.pop() if len(units) == 1 else ""
+        scales = {unit_of("temperature_c", other or "C") for other in units}
+        if quantity == "temperature" and reading.unit is None and len(scales) > 1:
+            raise InputError(
+                f"the headings have different units: {', '.join(sorted(units))}",
+                field=f"{where} {quantity}",
+                value=spec.text,
+                cure="name columns of one unit",
+            )
         first = meanings[places[0]]
         source = first.source if first is not None and quantity == "temperature" else "unknown"
         return ChosenColumn(places, unit, reading.factor, source)
@@ -257,6 +259,16 @@ def _stated_unit(heading: str, meaning: Meaning | None, quantity: str) -> str:
         return meaning.unit
     units = (unit for _, unit in names_and_units(heading)[:-1])
     return next((unit for unit in units if unit_of(FIELDS[quantity], unit) is not None), "")
+
+
+def _places(text: str, headings: Sequence[str], *, is_joined: bool) -> tuple[int, ...]:
+    """Return the columns that a text names; none where it names no column, or not all."""
+    whole = _place(text, headings)
+    if whole is not None or not is_joined:
+        return () if whole is None else (whole,)
+    places = [_place(part, headings) for part in text.split("+")]
+    found = tuple(place for place in places if place is not None)
+    return found if len(found) == len(places) else ()
 
 
 def _place(text: str, headings: Sequence[str]) -> int | None:
