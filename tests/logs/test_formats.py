@@ -123,16 +123,6 @@ def test_a_voltage_is_held_for_a_second_where_rows_hold_changes(tmp_path: Path) 
     assert any("20 rows with a current kept, with the latest" in text for text in log.remarks)
 
 
-def test_offsets_of_dates_are_taken_into_account(tmp_path: Path) -> None:
-    stamps = ["2024-03-31T01:59:58+01:00", "2024-03-31T01:59:59+0100", "2024-03-31T03:00:00+02"]
-    rows = (f"{stamp},{amps},380,20" for stamp, amps in zip(stamps, (1, 2, 3), strict=True))
-    path = tmp_path / "x.csv"
-    path.write_text("\n".join(["Time,Current,Voltage,Temp", *rows]) + "\n")
-    log = read_log(path)
-    np.testing.assert_allclose(log.time_s - log.time_s[0], [0.0, 1.0, 2.0])
-    assert "date with zone" in log.assumed[0]
-
-
 def test_soc_against_the_charge_is_left_out(tmp_path: Path) -> None:
     rows = (
         f"{k},{40.0 if k % 4 < 2 else -4.0},{380.0 - (4.0 if k % 4 < 2 else -0.4)},21,{10 + k / 50}"

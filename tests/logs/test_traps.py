@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -17,26 +18,44 @@ from cangauge.logs.read import read_log
 ROWS = 600
 
 
-def table(path: Path, head: str, row: str, rows: int = ROWS) -> Path:
-    """Write a table whose rows are a format of their number `k`."""
-    lines = [row.format(k=k, ms=20 * k, us=20_000 * k, amps=k % 7) for k in range(rows)]
-    path.write_text("\n".join([head, *lines, ""]))
-    return path
+def read(folder: Path, head: str, rows: Iterable[str], columns: Any = None) -> Log:
+    """Read a table of a head and its rows."""
+    path = folder / "t.csv"
+    path.write_text("\n".join([head, *rows, ""]))
+    return read_log(path, columns=columns)
+
+
+def rows_of(row: str, rows: int = ROWS) -> list[str]:
+    """Return rows by a format of their number `k`, of ms, µs and amps."""
+    return [row.format(k=k, ms=20 * k, us=20_000 * k, amps=k % 7) for k in range(rows)]
+
+
+# ---- units
 
 
 @pytest.mark.parametrize(("heading", "cell"), [("TimeMS", "{ms}"), ("TimeUS", "{us}")])
 def test_a_time_of_milliseconds_or_microseconds_by_its_name(
     tmp_path: Path, heading: str, cell: str
 ) -> None:
-    path = table(tmp_path / "t.csv", f"{heading},Current,Voltage,Temp", cell + ",{amps},360,20")
-    assert read_log(path).duration_s == pytest.approx(0.02 * (ROWS - 1))
+    log = read(tmp_path, f"{heading},Current,Voltage,Temp", rows_of(cell + ",{amps},360,20"))
+    assert log.duration_s == pytest.approx(0.02 * (ROWS - 1))
+
+
+@pytest.mark.parametrize(
+    ("columns", "second_s"),
+    [("time=Time:0.02", 0.02), ("time=Time[ms]:20", 0.02), ("time=Time[min]:0.5", 30.0)],
+)
+def test_a_factor_of_time_is_that_of_its_unit(
+    tmp_path: Path, columns: str, second_s: float
+) -> None:
+    log = read(tmp_path, "Time,Current,Voltage,Temp", rows_of("{k},{amps},360,20"), columns)
+    assert log.time_s[1] == pytest.approx(second_s)
 
 
 def test_a_unit_in_the_cells_of_one_probe_is_not_that_of_the_other(tmp_path: Path) -> None:
-    path = table(tmp_path / "t.csv", "time [s],current [A],voltage [V],T1,T2",
-                 "{k},{amps},360,20 °C,68 °F")  # fmt: skip
+    head = "time [s],current [A],voltage [V],T1,T2"
     with pytest.raises(InputError):
-        read_log(path, columns="temperature=T1+T2")
+        read(tmp_path, head, rows_of("{k},{amps},360,20 °C,68 °F"), "temperature=T1+T2")
 
 
 @pytest.mark.parametrize(
@@ -53,41 +72,12 @@ def test_a_unit_in_the_cells_of_one_probe_is_not_that_of_the_other(tmp_path: Pat
 def test_probes_that_the_user_joins_have_one_unit(
     tmp_path: Path, heads: str, columns: str, mean_c: float | None
 ) -> None:
-    path = table(tmp_path / "t.csv", f"Time,Current,Voltage,{heads}", "{k},{amps},360,20,68")
+    head, rows = f"Time,Current,Voltage,{heads}", rows_of("{k},{amps},360,20,68")
     if mean_c is None:
         with pytest.raises(InputError, match="the headings have different units"):
-            read_log(path, columns=columns)
+            read(tmp_path, head, rows, columns)
     else:
-        np.testing.assert_allclose(read_log(path, columns=columns).temperature_c, mean_c)
-
-
-def test_a_canonical_time_that_wraps_is_not_replaced_by_another_column(tmp_path: Path) -> None:
-    path = tmp_path / "t.csv"
-    head = "time_s,current_a,voltage_v,temperature_c,timestamp"
-    lines = [f"{k % 300},{k % 7},360,20,{1.7e9 + k}" for k in range(ROWS)]
-    path.write_text("\n".join([head, *lines, ""]))
-    with pytest.raises(InputError, match="runs backwards at row 301"):
-        read_log(path)
-
-
-@pytest.mark.parametrize("name", ["time_s", "current_a", "soc_pct"])
-def test_doubled_canonical_names_are_refused(tmp_path: Path, name: str) -> None:
-    head = f"time_s,current_a,voltage_v,temperature_c,soc_pct,{name}"
-    path = table(tmp_path / "t.csv", head, "{k},{amps},360,20,50,{k}")
-    with pytest.raises(InputError, match=name):
-        read_log(path)
-    columns = [np.arange(9.0)] * 6
-    with pytest.raises(InputError, match=name):
-        Log.from_dataframe(pa.Table.from_arrays(list(map(pa.array, columns)), head.split(",")))
-
-
-def test_rows_in_errors_are_those_of_the_file(tmp_path: Path) -> None:
-    path = tmp_path / "t.csv"
-    head = "time_s,current_a,voltage_v,temperature_c"
-    stamps = [(k if k < 60 else k - 30) // 5 for k in range(100)]  # each second logged five times
-    path.write_text("\n".join([head, *(f"{at},1,360,20" for at in stamps), ""]))
-    with pytest.raises(InputError, match="row 61"):
-        read_log(path)
+        np.testing.assert_allclose(read(tmp_path, head, rows, columns).temperature_c, mean_c)
 
 
 @pytest.mark.parametrize(
@@ -104,114 +94,24 @@ def test_rows_in_errors_are_those_of_the_file(tmp_path: Path) -> None:
 def test_a_stated_unit_must_be_that_of_the_cells(
     tmp_path: Path, heading: str, columns: Any, is_read: bool
 ) -> None:
-    head = f"time [s],{heading},voltage [V],temp [°C]"
-    path = table(tmp_path / "t.csv", head, "{k},{amps}000 mA,360,20")
+    head, rows = f"time [s],{heading},voltage [V],temp [°C]", rows_of("{k},{amps}000 mA,360,20")
     if is_read:
-        np.testing.assert_allclose(read_log(path, columns=columns).current_a, np.arange(ROWS) % 7)
+        log = read(tmp_path, head, rows, columns)
+        np.testing.assert_allclose(log.current_a, np.arange(ROWS) % 7)
     else:
         with pytest.raises(InputError, match=r"cells have another unit than the heading .got 'mA"):
-            read_log(path, columns=columns)
-
-
-def test_dates_without_a_time_have_their_zone(tmp_path: Path) -> None:
-    path = tmp_path / "t.csv"
-    rows = [f"2024-03-01+00:{59 - k:02d},{k % 7},360,20" for k in range(60)]
-    path.write_text("\n".join(["Date,Current,Voltage,Temp", *rows, ""]))
-    log = read_log(path)
-    assert log.assumed[0] == 'time = "Date" [date with zone]'
-    np.testing.assert_array_equal(log.time_s, 1_709_251_200.0 + 60.0 * (np.arange(60) - 59.0))
-
-
-@pytest.mark.parametrize("split", [False, True])
-def test_local_dates_of_a_zone_are_seconds_since_1970(tmp_path: Path, split: bool) -> None:
-    """In spring an hour is missing: it is no gap of the log."""
-    path, mark = tmp_path / "t.csv", "," if split else " "
-    stamps = ["2024-03-31 01:59:58", "2024-03-31 01:59:59", "2024-03-31 03:00:00"]
-    rows = [f"{stamp.replace(' ', mark)},{k},360,20" for k, stamp in enumerate(stamps)]
-    heading = "Day,Clock" if split else "Stamp"
-    path.write_text("\n".join([f"{heading},Current,Voltage,Temp", *rows, ""]))
-    log = read_log(path, columns=f"time={heading.replace(',', '+')}[Europe/Berlin]")
-    np.testing.assert_array_equal(log.time_s, 1_711_846_798.0 + np.arange(3.0))
-
-
-@pytest.mark.parametrize("kind", ["csv", "parquet", "frame"])
-@pytest.mark.parametrize(
-    ("doubled", "words"),
-    [
-        ("time_s,current_a,voltage_v,temperature_c,Voltage_V", "2 columns have this name"),
-        ("Time [s],Current [A],Voltage [V],Temp [C],Voltage [V]", "no plain heading of voltage"),
-        ("Time [s],Current [A],Voltage [V],Temp [C],Temp [C]", "holds no temperature"),
-        ("Time [s],Current [A],Voltage [V],Temp [C],Time [s]", "2 columns have this name"),
-        ("Time [s],Current [A],Voltage [V],Temp [C],x,x", ""),
-        ("time_s,current_a,voltage_v,temperature_c,x,x", ""),
-    ],
-)
-def test_doubled_headings_never_choose_a_column(
-    tmp_path: Path, kind: str, doubled: str, words: str
-) -> None:
-    headings = doubled.split(",")
-    values = [np.arange(60.0), np.arange(60.0) % 7.0, np.full(60, 360.0), np.full(60, 20.0)]
-    values += [np.full(60, 300.0)] * (len(headings) - 4)
-    frame = pa.Table.from_arrays([pa.array(each) for each in values], headings)
-
-    def read() -> Log:
-        if kind == "frame":
-            return Log.from_dataframe(frame)
-        if kind == "parquet":
-            pq.write_table(frame, tmp_path / "t.parquet")
-            return read_log(tmp_path / "t.parquet")
-        rows = [",".join(map(str, row)) for row in zip(*values, strict=True)]
-        (tmp_path / "t.csv").write_text("\n".join([doubled, *rows, ""]))
-        return read_log(tmp_path / "t.csv")
-
-    if words and not (kind == "csv" and headings[0] == headings[-1]):  # the first increases
-        with pytest.raises(InputError, match=words):
-            read()
-    elif words:
-        assert read().duration_s == 59.0
-    else:
-        assert read().voltage_v[0] == 360.0
-        assert "2 other columns ignored: x, x" in read().remarks
-
-
-@pytest.mark.parametrize("columns", ["current=A+B", "voltage=Voltage+A,current=B", "soc=A+B"])
-def test_only_times_and_temperatures_are_joined(tmp_path: Path, columns: str) -> None:
-    path = table(tmp_path / "t.csv", "Time,A,B,Voltage,Temp", "{k},{amps},5,360,20")
-    with pytest.raises(InputError, match="no column has this heading"):
-        read_log(path, columns=columns)
-
-
-def test_a_row_of_units_can_show_that_a_heading_is_another_quantity(tmp_path: Path) -> None:
-    path = table(tmp_path / "t.csv", "t,Current,Voltage\n°C,A,V", "{k},{amps},360")
-    with pytest.raises(InputError, match="no plain heading of time"):
-        read_log(path)
-
-
-def test_a_history_may_have_rows_without_an_entity(tmp_path: Path) -> None:
-    path = tmp_path / "history.csv"
-    rows = ["battery_current,{k}", "battery_voltage,380", "battery_temperature,20", ",7"]
-    lines = [f"{row.format(k=k)},2024-03-01T00:00:{k:02d}Z" for k in range(60) for row in rows]
-    path.write_text("\n".join(["entity_id,state,last_changed", *lines, ""]))
-    assert len(read_log(path)) == 60
+            read(tmp_path, head, rows, columns)
 
 
 def test_cells_of_two_units_are_refused(tmp_path: Path) -> None:
-    rows = [f"{k},{k % 7} A,360 V,20" for k in range(59)] + ["59,500 mA,360 V,20"]
-    path = tmp_path / "t.csv"
-    path.write_text("\n".join(["Time,Current,Voltage,Temp", *rows, ""]))
+    rows = [*rows_of("{k},{amps} A,360 V,20", 59), "59,500 mA,360 V,20"]
     with pytest.raises(InputError, match=r"Current: row 1 is not a number .got '0 A'"):
-        read_log(path)
+        read(tmp_path, "Time,Current,Voltage,Temp", rows)
 
 
-@pytest.mark.parametrize(
-    ("columns", "second_s"),
-    [("time=Time:0.02", 0.02), ("time=Time[ms]:20", 0.02), ("time=Time[min]:0.5", 30.0)],
-)
-def test_a_factor_of_time_is_that_of_its_unit(
-    tmp_path: Path, columns: str, second_s: float
-) -> None:
-    path = table(tmp_path / "t.csv", "Time,Current,Voltage,Temp", "{k},{amps},360,20")
-    assert read_log(path, columns=columns).time_s[1] == pytest.approx(second_s)
+def test_a_row_of_units_can_show_that_a_heading_is_another_quantity(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="no plain heading of time"):
+        read(tmp_path, "t,Current,Voltage\n°C,A,V", rows_of("{k},{amps},360"))
 
 
 @pytest.mark.parametrize("unit", ["s", "ms", "us", "ns"])
@@ -225,50 +125,149 @@ def test_arrow_times_have_their_own_unit(kind: Any, unit: str) -> None:
     np.testing.assert_array_equal(log.time_s, np.arange(60.0))
 
 
-@pytest.mark.parametrize("units", ["heading", "row"])
-def test_a_time_that_wraps_is_replaced_by_another_in_its_own_unit(
-    tmp_path: Path, units: str
-) -> None:
-    heads = {"heading": "Test Time [s],Time [ms],Current,Voltage,Temp",
-             "row": "Test Time,Time,Current,Voltage,Temp\ns,ms,A,V,degC"}  # fmt: skip
-    rows = [f"{k % 30},{20 * k},{k % 7},360,20" for k in range(60)]
-    path = tmp_path / "t.csv"
-    path.write_text("\n".join([heads[units], *rows, ""]))
-    np.testing.assert_allclose(read_log(path).time_s, 0.02 * np.arange(60))
-    path.write_text(
-        "\n".join(
-            [
-                heads[units],
-                *(f"{k},{row}" for k, row in enumerate(row.partition(",")[2] for row in rows)),
-                "",
-            ]
-        )
-    )
-    np.testing.assert_array_equal(read_log(path).time_s, np.arange(60.0))
-
-
 def test_a_factor_states_the_sign(tmp_path: Path) -> None:
+    head = "Time,Current,Voltage,Temp"
     rows = [f"{k},{50 * (k % 2)},{360 - 5 * (k % 2)},20" for k in range(60)]
-    path = tmp_path / "t.csv"
-    path.write_text("\n".join(["Time,Current,Voltage,Temp", *rows, ""]))
-    log = read_log(path, columns="current=Current:-1")
+    log = read(tmp_path, head, rows, "current=Current:-1")
     assert log.current_a.min() == -50.0
     assert any(text.startswith("current looks inverted and was kept") for text in log.remarks)
-    assert read_log(path, columns="current=Current:0.5").current_a.max() == 25.0
+    assert read(tmp_path, head, rows, "current=Current:0.5").current_a.max() == 25.0
+
+
+# ---- the choice of columns
+
+
+@pytest.mark.parametrize("columns", ["current=A+B", "voltage=Voltage+A,current=B", "soc=A+B"])
+def test_only_times_and_temperatures_are_joined(tmp_path: Path, columns: str) -> None:
+    with pytest.raises(InputError, match="no column has this heading"):
+        read(tmp_path, "Time,A,B,Voltage,Temp", rows_of("{k},{amps},5,360,20"), columns)
+
+
+@pytest.mark.parametrize("name", ["time_s", "current_a", "soc_pct"])
+def test_doubled_canonical_names_are_refused(tmp_path: Path, name: str) -> None:
+    head = f"time_s,current_a,voltage_v,temperature_c,soc_pct,{name}"
+    with pytest.raises(InputError, match=name):
+        read(tmp_path, head, rows_of("{k},{amps},360,20,50,{k}"))
+    columns = [np.arange(9.0)] * 6
+    with pytest.raises(InputError, match=name):
+        Log.from_dataframe(pa.Table.from_arrays(list(map(pa.array, columns)), head.split(",")))
+
+
+@pytest.mark.parametrize("kind", ["csv", "parquet", "frame"])
+@pytest.mark.parametrize(
+    ("head", "words"),
+    [
+        ("time_s,current_a,voltage_v,temperature_c,Voltage_V", "2 columns have this name"),
+        ("Time [s],Current [A],Voltage [V],Temp [C],Voltage [V]", "no plain heading of voltage"),
+        ("Time [s],Current [A],Voltage [V],Temp [C],Temp [C]", "holds no temperature"),
+        ("Time [s],Current [A],Voltage [V],Temp [C],Time [s]", "2 columns have this name"),
+        ("Time [s],Current [A],Voltage [V],Temp [C],x,x", ""),
+        ("time_s,current_a,voltage_v,temperature_c,x,x", ""),
+    ],
+)
+def test_doubled_headings_never_choose_a_column(
+    tmp_path: Path, kind: str, head: str, words: str
+) -> None:
+    headings = head.split(",")
+    values = [np.arange(60.0), np.arange(60.0) % 7.0, np.full(60, 360.0), np.full(60, 20.0)]
+    values += [np.full(60, 300.0)] * (len(headings) - 4)
+    frame = pa.Table.from_arrays([pa.array(each) for each in values], headings)
+
+    def log() -> Log:
+        if kind == "frame":
+            return Log.from_dataframe(frame)
+        if kind == "parquet":
+            pq.write_table(frame, tmp_path / "t.parquet")
+            return read_log(tmp_path / "t.parquet")
+        rows = [",".join(map(str, row)) for row in zip(*values, strict=True)]
+        return read(tmp_path, head, rows)
+
+    if words and not (kind == "csv" and headings[0] == headings[-1]):
+        with pytest.raises(InputError, match=words):
+            log()
+    elif words:  # in a text the first time is taken: it increases
+        assert log().duration_s == 59.0
+    else:
+        assert log().voltage_v[0] == 360.0
+        assert "2 other columns ignored: x, x" in log().remarks
+
+
+def test_a_canonical_time_that_wraps_is_not_replaced_by_another_column(tmp_path: Path) -> None:
+    head = "time_s,current_a,voltage_v,temperature_c,timestamp"
+    rows = [f"{k % 300},{k % 7},360,20,{1.7e9 + k}" for k in range(ROWS)]
+    with pytest.raises(InputError, match="runs backwards at row 301"):
+        read(tmp_path, head, rows)
 
 
 def test_a_time_of_something_else_replaces_none(tmp_path: Path) -> None:
     rows = [f"{k % 30},{k},{k % 7},360,20" for k in range(60)]
-    path = tmp_path / "t.csv"
-    path.write_text("\n".join(["Time [s],Charge Time [s],Current,Voltage,Temp", *rows, ""]))
     with pytest.raises(InputError, match="runs backwards at row 31"):
-        read_log(path)
+        read(tmp_path, "Time [s],Charge Time [s],Current,Voltage,Temp", rows)
+
+
+@pytest.mark.parametrize(
+    "head",
+    ["Test Time [s],Time [ms],Current,Voltage,Temp",
+     "Test Time,Time,Current,Voltage,Temp\ns,ms,A,V,degC"],
+)  # fmt: skip
+def test_a_time_that_wraps_is_replaced_by_another_in_its_own_unit(
+    tmp_path: Path, head: str
+) -> None:
+    log = read(tmp_path, head, [f"{k % 30},{20 * k},{k % 7},360,20" for k in range(60)])
+    np.testing.assert_allclose(log.time_s, 0.02 * np.arange(60))
+    log = read(tmp_path, head, [f"{k},{20 * k},{k % 7},360,20" for k in range(60)])
+    np.testing.assert_array_equal(log.time_s, np.arange(60.0))
+
+
+# ---- rows
+
+
+def test_rows_in_errors_are_those_of_the_file(tmp_path: Path) -> None:
+    stamps = [(k if k < 60 else k - 30) // 5 for k in range(100)]  # each second logged five times
+    with pytest.raises(InputError, match="row 61"):
+        read(
+            tmp_path, "time_s,current_a,voltage_v,temperature_c", [f"{t},1,360,20" for t in stamps]
+        )
 
 
 def test_held_temperature_begins_with_its_first_value(tmp_path: Path) -> None:
     rows = [
         f"{k},,380,\n{k}.4,{k % 3},,\n{k}.5,,,{20 + k / 10 if k > 4 else ''}" for k in range(20)
     ]
-    path = tmp_path / "t.csv"
-    path.write_text("\n".join(["Time,Current,Voltage,Temp", *rows, ""]))
-    assert read_log(path).temperature_c[:8].tolist() == [20.5] * 7 + [20.6]
+    log = read(tmp_path, "Time,Current,Voltage,Temp", rows)
+    assert log.temperature_c[:8].tolist() == [20.5] * 7 + [20.6]
+
+
+def test_a_history_may_have_rows_without_an_entity(tmp_path: Path) -> None:
+    each = ["battery_current,{k}", "battery_voltage,380", "battery_temperature,20", ",7"]
+    rows = [f"{row.format(k=k)},2024-03-01T00:00:{k:02d}Z" for k in range(60) for row in each]
+    assert len(read(tmp_path, "entity_id,state,last_changed", rows)) == 60
+
+
+# ---- zones
+
+
+def test_dates_without_a_time_have_their_zone(tmp_path: Path) -> None:
+    rows = [f"2024-03-01+00:{59 - k:02d},{k % 7},360,20" for k in range(60)]
+    log = read(tmp_path, "Date,Current,Voltage,Temp", rows)
+    assert log.assumed[0] == 'time = "Date" [date with zone]'
+    np.testing.assert_array_equal(log.time_s, 1_709_251_200.0 + 60.0 * (np.arange(60) - 59.0))
+
+
+def test_offsets_of_dates_are_taken_into_account(tmp_path: Path) -> None:
+    stamps = ["2024-03-31T01:59:58+01:00", "2024-03-31T01:59:59+0100", "2024-03-31T03:00:00+02"]
+    rows = [f"{stamp},{amps},380,20" for stamp, amps in zip(stamps, (1, 2, 3), strict=True)]
+    log = read(tmp_path, "Time,Current,Voltage,Temp", rows)
+    np.testing.assert_array_equal(log.time_s, 1_711_846_798.0 + np.arange(3.0))
+    assert "date with zone" in log.assumed[0]
+
+
+@pytest.mark.parametrize("mark", [" ", ","])
+def test_local_dates_of_a_zone_are_seconds_since_1970(tmp_path: Path, mark: str) -> None:
+    """In spring an hour is missing: it is no gap of the log."""
+    heading = "Day,Clock" if mark == "," else "Stamp"
+    stamps = ["2024-03-31 01:59:58", "2024-03-31 01:59:59", "2024-03-31 03:00:00"]
+    rows = [f"{stamp.replace(' ', mark)},{k},360,20" for k, stamp in enumerate(stamps)]
+    columns = f"time={heading.replace(',', '+')}[Europe/Berlin]"
+    log = read(tmp_path, f"{heading},Current,Voltage,Temp", rows, columns)
+    np.testing.assert_array_equal(log.time_s, 1_711_846_798.0 + np.arange(3.0))
