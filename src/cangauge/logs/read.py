@@ -193,14 +193,10 @@ def open_log(
     """
     head, given = Head(path), None if columns is None else ColumnMap.of(columns)
     for reader in _readers():
-        if given is None:
-            is_format = reader.matches(head)
-        else:  # the columns make a table of any file
-            is_table = isinstance(reader, LogTableReader)
-            is_format = is_table or (reader.takes_columns and reader.matches(head))
-        if is_format:
+        if (given is None or reader.takes_columns) and reader.matches(head):
             return LogFile(head, reader, given, sign)
-    return LogFile(head, None, given, sign)
+    # The user's columns make a table of any text.
+    return LogFile(head, None if given is None else LogTableReader(), given, sign)
 
 
 def read_log(
