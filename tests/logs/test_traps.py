@@ -230,6 +230,14 @@ def test_rows_in_errors_are_those_of_the_file(tmp_path: Path) -> None:
         )
 
 
+def test_a_first_row_without_a_time_is_a_row(tmp_path: Path) -> None:
+    head, rows = "Time,Current,Voltage,Temp", [",1,360,20", *rows_of("{k},{amps},360,20", 59)]
+    log = read(tmp_path, head, rows)
+    assert any("1 row without time" in text and "is row 1)" in text for text in log.remarks)
+    with pytest.raises(InputError, match="row 61 is not a number"):
+        read(tmp_path, head, [*rows, "59,x,360,20"])
+
+
 def test_held_temperature_begins_with_its_first_value(tmp_path: Path) -> None:
     rows = [
         f"{k},,380,\n{k}.4,{k % 3},,\n{k}.5,,,{20 + k / 10 if k > 4 else ''}" for k in range(20)

@@ -186,11 +186,11 @@ def _below(
     A row of units gives one of the quantities another unit, or shows that it is none (`t`, °C).
     """
     chosen = choose_columns(cells, (), given).chosen
-    place = chosen["time"].places[-1]
+    measured = [chosen[name].places[-1] for name in ("time", "current", "voltage")]
     units: list[str] = []
     for number, line in enumerate(head.lines[first : first + _ROWS_ABOVE_DATA], start=first):
         row = split_cells(line, delimiter)
-        if place < len(row) and _is_value(row[place]):
+        if any(place < len(row) and _is_value(row[place]) for place in measured):
             return TextTable(head, delimiter, cells, units, number, [])
         again = choose_columns(cells, row, given).chosen
         if any(name not in again or again[name].unit != chosen[name].unit for name in chosen):
