@@ -102,6 +102,12 @@ def test_what_was_assumed_and_ignored_is_told(tmp_path: Path) -> None:
     assert "1 other column ignored: driver" in log.remarks
 
 
+def test_a_hot_temperature_may_be_in_fahrenheit(tmp_path: Path) -> None:
+    log = changed(tmp_path, "plain-without-units", r",21\.5,", ",70.7,")
+    words = "temperature 71 °C is unusually hot: .* --columns 'temperature=temperature.°F."
+    assert any(re.match(words, text) for text in log.remarks)
+
+
 def test_a_stated_sign_is_kept_and_a_doubt_is_told(tmp_path: Path) -> None:
     path = tmp_path / "x.csv"
     path.write_bytes(content_of(CASES["plain-with-brackets"]))
