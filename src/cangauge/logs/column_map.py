@@ -235,8 +235,9 @@ def _given_column(
         unit = reading.unit if reading.unit is not None else units.pop() if len(units) == 1 else ""
         scales = {unit_of("temperature_c", other or "C") for other in units}
         if quantity == "temperature" and reading.unit is None and len(scales) > 1:
+            shown = ", ".join(sorted(other or "none" for other in units))
             raise InputError(
-                f"the headings have different units: {', '.join(sorted(units))}",
+                f"the headings have different units: {shown}",
                 field=f"{where} {quantity}",
                 value=spec.text,
                 cure="name columns of one unit",

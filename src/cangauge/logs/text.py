@@ -190,7 +190,7 @@ def _below(
     units: list[str] = []
     for number, line in enumerate(head.lines[first : first + _ROWS_ABOVE_DATA], start=first):
         row = split_cells(line, delimiter)
-        if any(place < len(row) and _is_value(row[place]) for place in measured):
+        if _is_value(next((row[k] for k in measured if k < len(row) and row[k]), "")):
             return TextTable(head, delimiter, cells, units, number, [])
         again = choose_columns(cells, row, given).chosen
         if any(name not in again or again[name].unit != chosen[name].unit for name in chosen):
