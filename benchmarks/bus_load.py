@@ -70,7 +70,7 @@ def bus() -> BusAddress:
 
 def load(seconds: float) -> tuple[Result, list[Row]]:
     """Measure `cangauge run` and a bare loop on a saturated bus."""
-    with service(bus(), "--until-idle", "1.5") as process:
+    with service(bus(), until_idle_s=1.5) as process:
         sent = send_load(seconds)
         out, _ = process.communicate(timeout=60)
     run = json.loads(out)
@@ -158,7 +158,7 @@ def _count_frames(pipe: Any) -> None:
 def full_speed() -> tuple[Result, list[Row]]:
     """Measure a 2.5 h log through the bus."""
     path = shared_file("replay", "leaf2012_reconstruction_white.parquet")
-    with service(bus(), "--time-source", "replay-clock", "--until-idle", "1") as process:
+    with service(bus(), "--time-source", "replay-clock", until_idle_s=1.0) as process:
         done = subprocess.run(
             command(bus(), "replay", path, "--speed", "max"),
             capture_output=True,

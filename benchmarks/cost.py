@@ -44,7 +44,6 @@ from cangauge.estimation.cells import CellEstimator
 from cangauge.estimation.compiled import make_estimator
 from cangauge.estimation.offline import run_estimator
 from cangauge.estimation.settings import EstimatorSettings
-from cangauge.extras.embedded.equivalent_circuit import equivalent_circuit
 from cangauge.extras.validation import simulate
 from cangauge.identify.fit import fit
 from cangauge.logs.canonical import write_log
@@ -54,6 +53,7 @@ from cangauge.model.model_file import Coefficient, Model
 from cangauge.replay.encoder import FrameEncoder
 from cangauge.service.pipeline import Pipeline, PipelineSettings
 from cangauge.types import Sample
+from equivalent_circuit import equivalent_circuit
 from peer_filters import Circuit, bare_ekf, run
 from peers import step_us
 
@@ -68,7 +68,7 @@ ROWS_A_LOG = 50_000
 EFFECTS = (
     {"id": "fast_polarization", "parameters": {"ohm": 0.01, "tau_s": 3.0, "activation_k": 0.0}},
     {"id": "resistance_temperature", "parameters": {
-        "share": 0.3, "activation_k": 2500.0, "delayed": 1.0, "reference_c": 23.0, "lag_s": 0.0}},
+        "share": 0.3, "activation_k": 2500.0, "delayed": 1.0, "reference_c": 23.0}},
     {"id": "resistance_soc", "parameters": {
         "at_empty": 0.5, "at_full": 0.1, "width_pct": 10.0, "delayed": 1.0}},
     {"id": "hysteresis", "parameters": {"half_width_v": 0.5, "travel_pct": 2.0}},

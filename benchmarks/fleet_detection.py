@@ -43,7 +43,7 @@ def main() -> None:
     parser.add_argument("--json", type=Path, help="file of the sizes, a row for each number")
     parser.add_argument("--figure", type=Path, metavar="FILE", help="draw them (PNG)")
     options = parser.parse_args()
-    scenario = draw_scenario(SEED, climate="mild")
+    scenario = draw_scenario(SEED)
     tested = [vehicle_logs(scenario, 10_000 + k, 1, HOURS)[0] for k in range(options.tested)]
     sys.stdout.write(f"{'':26}{'  '.join(SHOWN)}\n")
     model = _model(scenario, MODEL_LOGS)

@@ -36,7 +36,7 @@ def main() -> None:
     parser.add_argument("--logs", type=int, default=600, help="logs, ten a vehicle")
     parser.add_argument("--hours", type=float, default=0.5, help="of each log")
     options = parser.parse_args()
-    scenario = draw_scenario(SEED, climate="mild")
+    scenario = draw_scenario(SEED)
     with tempfile.TemporaryDirectory() as folder:
         root = Path(folder)
         write_fleet(scenario, root / "logs", options.logs // 10, 10, options.hours)

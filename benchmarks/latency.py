@@ -209,7 +209,7 @@ def loss(
         name = "all wanted" if share == 1.0 else f"{100.0 * share:.0f} % wanted"
         rate_hz = highest_rate(address, share, highest_hz)
         sys.stderr.write(f"loss, {name}: {rate_hz:.0f} frames/s for {seconds:.0f} s …\n")
-        with service(address, "--until-idle", "5") as process:
+        with service(address, until_idle_s=5.0) as process:
             watched = multiprocessing.pool.ThreadPool(1).apply_async(_sizes_mb, (process,))
             sent = _send(address, rate_hz, seconds, share)
             out, _ = process.communicate(timeout=seconds + 120.0)

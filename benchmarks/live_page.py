@@ -157,9 +157,10 @@ def measure(number: int, case: str, seconds: float) -> dict[str, Any]:
     has_page, browsers, listeners = CASES[case]
     address = bus_address("udp_multicast", GROUP, {"port": BUS_PORT + number})
     port = PAGE_PORT + number
-    arguments = ["--until-idle", "3", "--initial-soc", "70", "--status-socket", "off"]
+    arguments = ["--initial-soc", "70", "--status-socket", "off"]
     arguments += ["--dashboard", str(port)] if has_page else []
-    with service(address, *arguments) as process, frames(address), ExitStack() as stack:
+    running = service(address, *arguments, until_idle_s=3.0)
+    with running as process, frames(address), ExitStack() as stack:
         time.sleep(5.0)
         groups = {"service": [process.pid]}
         if has_page:

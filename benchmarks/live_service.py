@@ -6,6 +6,7 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
+from tempfile import NamedTemporaryFile
 
 from cangauge._resources import shared_file
 from cangauge.bus.open import BusAddress
@@ -24,18 +25,24 @@ def command(address: BusAddress, name: str, *arguments: object) -> list[str]:
 
 
 @contextmanager
-def service(address: BusAddress, *arguments: object) -> Iterator[subprocess.Popen[str]]:
+def service(
+    address: BusAddress, *arguments: object, until_idle_s: float | None = None
+) -> Iterator[subprocess.Popen[str]]:
     """Run `cangauge run`; enter the block once it listens, and kill it afterwards."""
-    process = subprocess.Popen(
-        command(address, "run", "-m", MODEL, *arguments),
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
-    try:
-        if not any("listening" in line for line in process.stderr or ()):
-            raise SystemExit("cangauge run does not start")
-        yield process
-    finally:
-        process.kill()
-        process.communicate()
+    with NamedTemporaryFile("w", suffix=".toml") as config:
+        if until_idle_s is not None:
+            config.write(f"until_idle_s = {until_idle_s}\n")
+            config.flush()
+        process = subprocess.Popen(
+            command(address, "run", "--config", config.name, "-m", MODEL, *arguments),
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+        try:
+            if not any("listening" in line for line in process.stderr or ()):
+                raise SystemExit("cangauge run does not start")
+            yield process
+        finally:
+            process.kill()
+            process.communicate()

@@ -2,7 +2,7 @@
 
     python peer_filters.py NAME WORK.json
 
-WORK.json has the tables of `cangauge export-ecm`, the logs and what to do; the result is JSON on
+WORK.json has the tables of `equivalent_circuit`, the logs and what to do; the result is JSON on
 stdout. Called by `peers.py`; needs numpy, filterpy and the package of that name, not cangauge.
 Positive current discharges.
 """

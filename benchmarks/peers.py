@@ -4,11 +4,11 @@
     python benchmarks/peers.py --data FOLDER --peers ENVIRONMENT/bin/python [--json FILE]
 
 The peers' versions are in peers.txt. Packs: the i3's even trips, and every second piece of car1, at
-1 Hz, with models of ten training logs. The peers' circuit is `cangauge export-ecm` of the model of
-those logs; PyBatterySE identifies its own from them, and takes only the curve. All begin from the
-first voltage, σ 10 %; the MAE counts from the fifth minute on. Times are of the processor, of one
-process at a time, in turn, the median of the rounds. A sample at 10 Hz is 0.1 s; our filter uses
-the voltage once a second.
+1 Hz, with models of ten training logs. The peers' circuit is the `equivalent_circuit` of the model
+of those logs; PyBatterySE identifies its own from them, and takes only the curve. All begin from
+the first voltage, σ 10 %; the MAE counts from the fifth minute on. Times are of the processor, of
+one process at a time, in turn, the median of the rounds. A sample at 10 Hz is 0.1 s; our filter
+uses the voltage once a second.
 """
 
 from __future__ import annotations
@@ -32,11 +32,11 @@ from cangauge.estimation.compiled import make_estimator
 from cangauge.estimation.estimator import Estimator
 from cangauge.estimation.offline import run_estimator, samples_of
 from cangauge.estimation.settings import EstimatorSettings
-from cangauge.extras.embedded.equivalent_circuit import equivalent_circuit
 from cangauge.identify.fit import fit
 from cangauge.logs.log import Log
 from cangauge.logs.read import read_log
 from cangauge.model.model_file import Model
+from equivalent_circuit import equivalent_circuit
 from packs.recorded import load, one_hz
 
 PACKS = ("i3", "car1")

@@ -25,7 +25,6 @@ from rich.progress import track
 from rich.table import Table
 
 from cangauge.diagnosis import diagnose
-from cangauge.extras.validation.twin.injection import scaled_to_pack, with_initial_soc
 from cangauge.identify.fit import fit
 from cangauge.identify.starts import with_start
 from cangauge.logs.log import Log
@@ -213,8 +212,15 @@ def rms(parts: list[np.ndarray]) -> float:
 def _drive(folder: Path, name: str) -> Log:
     log = read_log(folder / "lg_hg2" / f"25degC__{name}.parquet")
     log = log.rows(np.unique(np.searchsorted(log.time_s, np.arange(*log.time_s[[0, -1]]))))
-    pack = scaled_to_pack(log, series=LG_SERIES, parallel=LG_PARALLEL)
-    return _above(with_initial_soc(pack, START_PCT))
+    assumed = np.full(len(log), np.nan)
+    assumed[0] = START_PCT
+    pack = replace(
+        log,
+        current_a=LG_PARALLEL * log.current_a,
+        voltage_v=LG_SERIES * log.voltage_v,
+        soc_pct=assumed,
+    )
+    return _above(pack)
 
 
 def _above(log: Log) -> Log:

@@ -305,7 +305,6 @@ static void test_model(cg_estimator *self, cg_time time_s)
     }
     if (is_lasting) {
         memory->innovations = 0;
-        memory->doubt = (int32_t)CG_MISMATCH;
         cg_filter_doubt(&self->state.filter, model, R(CG_WRONG_PRIOR), R(CG_WRONG_STD_PCT),
                         R(0.0), R(0.0));
     }
@@ -486,7 +485,6 @@ static void follow(cg_estimator *self, const cg_sample *sample, const charge_ste
         propagate_to_now(self);
         cg_filter_doubt(&self->state.filter, model, moved_probability(charge->away_s),
                         moved_std_pct(charge->away_s), charge->away_s, charge->parked_std_pct);
-        memory->doubt = (int32_t)CG_INTERVAL;
         memory->coulomb_var_pct2 += cg_square(cg_min(away_pct, R(CG_MOVED_STD_AT_MOST_PCT)));
     }
     if (cg_fabs(sample->current_a) > (R(REST_CURRENT_C_RATE) * model->capacity_ah)) {
@@ -745,7 +743,6 @@ void cg_init(cg_estimator *self, const cg_model *model, const cg_settings *setti
         const cg_real soc_pct = cg_clip_soc(given_pct + model->initial_offset_pct);
         cg_filter_start(&state->filter, model, soc_pct, settings->initial_soc_std_pct, true);
         state->memory.is_known = true;
-        state->memory.doubt = (int32_t)CG_START;
         start_count(state, soc_pct, settings->initial_soc_std_pct);
     }
 }
@@ -791,7 +788,6 @@ void cg_set_table(cg_estimator *self, const cg_model *model)
     cg_filter_take_over(&state->filter, model, soc_pct, std_pct,
                         model->capacity_ah / before->capacity_ah);
     if (memory->is_known) {
-        memory->doubt = (int32_t)CG_NO_DOUBT;
         start_count(state, soc_pct, std_pct);
     }
 }

@@ -41,8 +41,8 @@ typedef double cg_wide;
 #define CG_WAITING 8192 /* samples that an effect `time_skew` holds back */
 #endif
 #define CG_OCV 8
-#define CG_LAGS 5
-#define CG_VALUES 12
+#define CG_LAGS 2
+#define CG_VALUES 5
 #define CG_TESTED 64 /* innovations that are tested together, at most */
 #define CG_CURRENTS (CG_DELAYS + CG_LOW_PASSES)
 #define CG_LOADS (CG_CURRENTS + 2)
@@ -59,16 +59,14 @@ typedef enum {
     CG_TIME_SKEW, /* `skew_s` of the model */
     CG_TEMPERATURE_LAG, /* ahead; lag: smoothing */
     CG_CORE_TEMPERATURE, /* rise_k, late, capacity_ah; lags: Joule heat, temperature */
-    CG_RESISTANCE_TEMPERATURE, /* share, activation_k, delayed, reference_per_k, ohm; lag: inner */
+    CG_RESISTANCE_TEMPERATURE, /* share, activation_k, delayed, reference_per_k, ohm */
     CG_RESISTANCE_SOC, /* at_empty, at_full, width_pct, delayed, ohm */
     CG_RESISTANCE_ASYMMETRY, /* charging_ohm */
     CG_RESISTANCE_STEP, /* step_ohm, start_s */
     CG_CHARGE_TRANSFER, /* scale_v, per_a, bend_only, activation_k, zero_a */
-    CG_RC, /* activation_k, by_slope, mean_slope, ohm of each lag; lags: elements */
+    CG_RC, /* activation_k, by_slope, mean_slope, ohm; lag: the element */
     CG_HYSTERESIS, /* half_width_v, travel_as */
-    CG_ENTROPIC, /* level, slope, curve, t_ref_c; lag: interior */
-    CG_INNER_TEMPERATURE, /* voltage_v_per_k, drop_per_k; lag: interior */
-    CG_OCV_SHAPE, /* height of each bump */
+    CG_ENTROPIC, /* level, slope, curve, t_ref_c */
     CG_WEAK_CELL /* fraction, ahead */
 } cg_effect_kind;
 
@@ -256,8 +254,6 @@ typedef struct {
     cg_real innovation2; /* of the last voltage, over its variance */
 } cg_ekf;
 
-typedef enum { CG_NO_DOUBT = 0, CG_START, CG_INTERVAL, CG_MISMATCH } cg_doubt;
-
 /* One or two hypotheses: the SoC is the stated one, or another. */
 typedef struct {
     cg_ekf ekf[2]; /* narrow, wide */
@@ -300,7 +296,6 @@ typedef struct {
     cg_time gap_until_s;
     cg_time contradicted_until_s;
     cg_time mismatch_until_s;
-    int32_t doubt; /* cg_doubt */
     int32_t innovations;
     cg_real innovation2[CG_TESTED]; /* the oldest first */
     cg_time rest_since_s;

@@ -6,7 +6,6 @@
 #include "cangauge_internal.h"
 
 #define BRIDGE_S 60.0 /* over a longer step the current is unknown */
-#define NO_LAG_S 1e-3
 #define SLOPE_STEP_PCT 0.05
 #define SLOPE_AT_LEAST 2e-5
 #define STEPS_AT_MOST 80
@@ -16,17 +15,9 @@
 #define REFERENCE_C 25.0
 #define STEEPNESS_AT_MOST 5.0
 #define STALE_AT_MOST 64
-#define BUMPS 11
 
 #define ACTIVATION_K 3000.0
 #define RESISTANCE_REFERENCE_C 20.0
-
-static const cg_real CENTRES_PCT[BUMPS] = {
-    R(3.0), R(8.0), R(14.0), R(22.0), R(32.0), R(43.0), R(54.0), R(65.0), R(76.0), R(86.0), R(94.0),
-};
-static const cg_real WIDTHS_PCT[BUMPS] = {
-    R(3.0), R(3.5), R(4.5), R(5.5), R(6.5), R(7.0), R(7.0), R(7.0), R(6.5), R(5.5), R(4.5),
-};
 
 /* ------------------------------------------------------------------ delay line */
 
@@ -260,9 +251,6 @@ void cg_functions_row(const cg_model *model, cg_real soc_pct, const cg_real *loa
 
 static cg_real lag_step(cg_lag *lag, cg_real tau_s, cg_real rest_s, cg_time time_s, cg_real input)
 {
-    if (!(tau_s > R(NO_LAG_S))) {
-        return input;
-    }
     const cg_real seconds = (cg_real)(time_s - lag->time_s);
     const cg_real step = seconds / tau_s;
     const cg_real a = cg_exp(-step);
@@ -279,7 +267,7 @@ static cg_real lag_step(cg_lag *lag, cg_real tau_s, cg_real rest_s, cg_time time
 /* A lag that starts at its first input, or at a given value. */
 static cg_real lag_from(cg_lag *lag, cg_real tau_s, cg_time time_s, cg_real input)
 {
-    if (!lag->is_started && (tau_s > R(NO_LAG_S))) {
+    if (!lag->is_started) {
         lag->is_started = true;
         lag->time_s = time_s;
         lag->input = input;
@@ -291,7 +279,7 @@ static cg_real lag_from(cg_lag *lag, cg_real tau_s, cg_time time_s, cg_real inpu
 
 static cg_real lag_from_rest(cg_lag *lag, cg_real tau_s, cg_time time_s, cg_real input)
 {
-    if (!lag->is_started && (tau_s > R(NO_LAG_S))) {
+    if (!lag->is_started) {
         lag->is_started = true;
         lag->time_s = time_s;
         lag->input = input;
@@ -445,20 +433,15 @@ static void advance_hysteresis(const cg_effect *effect, cg_lag *lag, const cg_sa
     lag->input = sample->current_a;
 }
 
-static cg_real rc_volts(const cg_effect *effect, cg_effect_state *state, const cg_sample *sample,
+static cg_real rc_volts(const cg_effect *effect, cg_lag *lag, const cg_sample *sample,
                         cg_real temperature_c)
 {
-    for (int32_t j = 0; j < effect->lags; ++j) {
-        (void)lag_from_rest(&state->lag[j], effect->tau_s[j], sample->time_s, sample->current_a);
-    }
     const cg_real activation_k = effect->value[0];
     const cg_real colder =
         (activation_k != R(0.0)) ? arrhenius(temperature_c, activation_k) : R(1.0);
-    cg_real volts = R(0.0);
-    for (int32_t j = 0; j < effect->lags; ++j) {
-        volts += -effect->value[3 + j] * colder * state->lag[j].value;
-    }
-    return volts;
+    const cg_real smooth_a =
+        lag_from_rest(lag, effect->tau_s[0], sample->time_s, sample->current_a);
+    return -effect->value[3] * colder * smooth_a;
 }
 
 static cg_real charge_transfer_v(const cg_effect *effect, cg_real current_a, cg_real temperature_c)
@@ -477,12 +460,10 @@ static cg_real advance_effect(const cg_effect *effect, cg_effect_state *state,
     const cg_real current_a = sample->current_a;
     cg_lag *lag = &state->lag[0];
     cg_real drive = R(0.0);
-    cg_real at_c;
     switch (effect->kind) {
     case CG_RESISTANCE_TEMPERATURE:
-        at_c = lag_from(lag, effect->tau_s[0], sample->time_s, temperature_c);
         drive = value[0] * scaled_drop(drop_v, current_a, value[2], value[4]) *
-                       cg_expm1(value[1] * (inverse_k(at_c) - value[3]));
+                cg_expm1(value[1] * (inverse_k(temperature_c) - value[3]));
         break;
     case CG_RESISTANCE_SOC:
         drive = scaled_drop(drop_v, current_a, value[3], value[4]);
@@ -503,22 +484,14 @@ static cg_real advance_effect(const cg_effect *effect, cg_effect_state *state,
         drive = charge_transfer_v(effect, current_a, temperature_c);
         break;
     case CG_RC:
-        drive = rc_volts(effect, state, sample, temperature_c);
+        drive = rc_volts(effect, lag, sample, temperature_c);
         break;
     case CG_HYSTERESIS:
         advance_hysteresis(effect, lag, sample);
         drive = value[0] * lag->value;
         break;
     case CG_ENTROPIC:
-        at_c = lag_from(lag, effect->tau_s[0], sample->time_s, temperature_c);
-        drive = cg_clip(at_c, R(COLDEST_C), R(HOTTEST_C)) - value[3];
-        break;
-    case CG_INNER_TEMPERATURE:
-        at_c = lag_from(lag, effect->tau_s[0], sample->time_s, temperature_c);
-        drive = (value[0] + (value[1] * drop_v)) * (at_c - temperature_c);
-        break;
-    case CG_OCV_SHAPE:
-        drive = R(1.0);
+        drive = cg_clip(temperature_c, R(COLDEST_C), R(HOTTEST_C)) - value[3];
         break;
     case CG_WEAK_CELL:
         drive = value[0];
@@ -529,19 +502,11 @@ static cg_real advance_effect(const cg_effect *effect, cg_effect_state *state,
     return drive;
 }
 
-static bool follows_temperature(const cg_effect *effect)
-{
-    const int32_t kind = effect->kind;
-    return ((kind == (int32_t)CG_RESISTANCE_TEMPERATURE) || (kind == (int32_t)CG_ENTROPIC) ||
-            (kind == (int32_t)CG_INNER_TEMPERATURE)) &&
-           (effect->tau_s[0] > R(NO_LAG_S));
-}
-
 static bool depends_on_soc(const cg_effect *effect)
 {
     const int32_t kind = effect->kind;
     return (kind == (int32_t)CG_RESISTANCE_SOC) || (kind == (int32_t)CG_ENTROPIC) ||
-           (kind == (int32_t)CG_OCV_SHAPE) || (kind == (int32_t)CG_WEAK_CELL) ||
+           (kind == (int32_t)CG_WEAK_CELL) ||
            ((kind == (int32_t)CG_RC) && (effect->value[1] != R(0.0)));
 }
 
@@ -576,29 +541,15 @@ void cg_advance(cg_estimator *self, const cg_sample *sample, cg_real temperature
 {
     const cg_model *model = self->model;
     cg_state *state = &self->state;
-    const bool is_known = isfinite(temperature_c) != 0;
-    const cg_real known_c = is_known ? temperature_c : model->t_ref_c;
+    const cg_real known_c = (isfinite(temperature_c) != 0) ? temperature_c : model->t_ref_c;
     cg_line_push(&self->line, model->delay_s[model->delays - 1], is_gap, sample->time_s,
                  sample->current_a);
     advance_load(self, sample, known_c);
     for (int32_t k = 0; k < model->effects; ++k) {
         const cg_effect *effect = &model->effect[k];
-        if (is_known || !follows_temperature(effect)) {
-            state->drive[k] =
-                advance_effect(effect, &state->effect[k], sample, known_c, state->drop_v);
-        }
+        state->drive[k] =
+            advance_effect(effect, &state->effect[k], sample, known_c, state->drop_v);
     }
-}
-
-static cg_real ocv_shape_v(const cg_real *height_v, cg_real soc_pct)
-{
-    const cg_real soc = cg_clip(soc_pct, R(0.0), R(100.0));
-    cg_real volts = R(0.0);
-    for (int32_t k = 0; k < BUMPS; ++k) {
-        const cg_real away = (soc - CENTRES_PCT[k]) / WIDTHS_PCT[k];
-        volts += height_v[k] * cg_exp(R(-0.5) * away * away);
-    }
-    return volts;
 }
 
 /* Factor on the drive of an effect that depends on the SoC, at one. */
@@ -618,9 +569,6 @@ static cg_real over_soc(const cg_model *model, const cg_effect *effect, cg_real 
         factor = value[0] + (value[1] * x) + (value[2] * ((R(1.5) * x * x) - R(0.5)));
         break;
     }
-    case CG_OCV_SHAPE:
-        factor = ocv_shape_v(value, soc_pct);
-        break;
     case CG_WEAK_CELL:
         factor = curve_v(model, R(100.0) - ((R(100.0) - soc_pct) * value[1]), &slope) -
                  curve_v(model, soc_pct, &slope);

@@ -33,8 +33,6 @@ OUTSIDE_LINK = re.compile(
 
 # A drive of half an hour with stops, regeneration and a rest; the equation itself as the plant.
 DRIVE: dict[str, Any] = {"seed": 5, "drive": 3, "hours": 0.5, "plant": "equation"}
-STRUCTURE = {"ocv_shape", "inner_temperature"}
-"""Effects that are structure of a pack: never named as a cause, and no fault of the simulator."""
 
 
 def write_pages(folder: Path) -> None:
@@ -143,11 +141,11 @@ def effects_page() -> str:
         " (discharge upwards), the voltage that the effect adds below, free of sensor noise."
         " `cangauge twin --effect ID` simulates it, `cangauge gap` looks for it.",
     ]
-    family = ""
-    for effect in sorted(LIBRARY.values(), key=lambda each: (each.family, each.id)):
-        if effect.family != family:
-            family = effect.family
-            parts.append(f"## {family.replace('_', ' ').capitalize()}")
+    group = ""
+    for effect in sorted(LIBRARY.values(), key=lambda each: (each.group, each.id)):
+        if effect.group != group:
+            group = effect.group
+            parts.append(f"## {group.replace('_', ' ').capitalize()}")
         parts += [
             f"### {effect.id}",
             inspect.cleandoc(type(effect).__doc__ or ""),
@@ -155,9 +153,8 @@ def effects_page() -> str:
             f"```text\n{effect.equation}\n```",
             f"**Separated by** {effect.separated_by}",
             f"**Source.** {effect.source}",
+            signature_svg(effect.id),
         ]
-        if effect.id not in STRUCTURE:
-            parts.append(signature_svg(effect.id))
     return "\n\n".join(parts) + "\n"
 
 

@@ -28,9 +28,11 @@ from cangauge.bus.open import BusAddress, open_bus
 from cangauge.bus.time_source import MICROSECONDS
 from cangauge.bus.vehicle import LOG_COLUMNS, Vehicle
 from cangauge.cli.app import main
+from cangauge.estimation.offline import samples_of
 from cangauge.logs.log import Log
 from cangauge.model.model_file import Model
-from cangauge.service.events import RateLimitFilter
+from cangauge.replay.encoder import FrameEncoder
+from cangauge.service.events import RateLimitedHandler
 from cangauge.service.loop import Loop, LoopSettings
 from cangauge.service.output import Output
 from cangauge.service.pipeline import Pipeline, PipelineSettings
@@ -61,7 +63,14 @@ def short_log(seconds: float = 100.0, rate_hz: float = 10.0, *, noise_v: float =
     )
 
 
-class LoggedLines(logging.Handler):
+def frames_of(log: Log, vehicle: Vehicle | None = None, shift_s: float = 0.0) -> list[can.Message]:
+    """Return the frames that carry a log, stamped with its time and a shift [s]."""
+    encoder = FrameEncoder(vehicle or Vehicle.load("generic"))
+    samples = (each._replace(time_s=each.time_s + shift_s) for each in samples_of(log))
+    return [frame for sample in samples for frame in encoder.encode(sample)]
+
+
+class LoggedLines(RateLimitedHandler):
     """Lines that a service would write, rate-limited as there; warnings begin with "warning: ".
 
     Parameters
@@ -72,15 +81,14 @@ class LoggedLines(logging.Handler):
     """
 
     def __init__(self, logger: str = "cangauge", thread: threading.Thread | None = None) -> None:
-        super().__init__(logging.INFO)
+        super().__init__()
+        self.setLevel(logging.INFO)
         self._logger = logging.getLogger(logger)
+        self._level = self._logger.level
         self._thread = thread
-        self._limiter = RateLimitFilter(self.emit)
-        self.addFilter(self._limiter)
         self.lines: list[str] = []
 
     def __enter__(self) -> Self:
-        self._level = self._logger.level
         self._logger.setLevel(logging.INFO)
         self._logger.addHandler(self)
         return self
@@ -88,11 +96,7 @@ class LoggedLines(logging.Handler):
     def __exit__(self, *_: object) -> None:
         self._logger.removeHandler(self)
         self._logger.setLevel(self._level)
-        self.release_all()
-
-    def release_all(self) -> None:
-        """Add the lines that the rate limit holds back."""
-        self._limiter.release_due(everything=True)
+        self.release_due(everything=True)
 
     def emit(self, record: logging.LogRecord) -> None:
         if self._thread is None or record.thread == self._thread.ident:

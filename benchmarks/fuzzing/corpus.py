@@ -109,8 +109,6 @@ soc_detail = 1441
 
 OWN_CAR = 'model = "model.json"\ndbc = "car.dbc"\nmap = "car.toml"\ninitial_soc = 80\n'
 
-SPEED = "time_s,speed_kmh\n" + "".join(f"{k},{k % 7}.5\n" for k in range(ROWS))
-
 
 def current_a(row: int) -> float:
     """Return a stepping current, positive = discharge [A]."""

@@ -29,7 +29,6 @@ from cangauge.bus.vehicle import Vehicle
 from cangauge.estimation.estimator import Estimator
 from cangauge.estimation.offline import estimate_log
 from cangauge.estimation.settings import EstimatorSettings
-from cangauge.extras.validation.twin.drive import read_speed
 from cangauge.inspect.capture import inspect_capture
 from cangauge.inspect.log import inspect_log
 from cangauge.logs.log import Log
@@ -130,11 +129,6 @@ def _check_estimate(estimate: Estimate) -> None:
     _check_soc(estimate.soc_pct)
     if estimate.soc_std_pct < 0.0:
         raise FindingError(f"a standard deviation of {estimate.soc_std_pct} %")
-
-
-def _run_speed(data: bytes) -> bool:
-    with _file(data) as path:
-        return bool(read_speed(path).size)
 
 
 @cache
@@ -410,10 +404,7 @@ def targets() -> tuple[Target, ...]:
         Target("logs", _make_log, _run_log, 0.10, seeds=corpus.log_files),
         Target("model", _make_model, _run_model, 0.08),
         Target("config", _make_config, _run_config, 0.07),
-        Target("map", _make_map, _run_map, 0.06),
+        Target("map", _make_map, _run_map, 0.10),
         Target("dbc", _make_dbc, _run_dbc, 0.05, seeds=_dbc_seeds),
-        Target(
-            "speed", lambda rng: mutate(rng, corpus.SPEED.encode(), text=True), _run_speed, 0.04
-        ),
         Target("state", _make_state, _run_state, 0.05),
     )

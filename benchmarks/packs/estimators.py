@@ -10,6 +10,7 @@ import numpy as np
 
 import cangauge
 import peer_filters
+from equivalent_circuit import equivalent_circuit
 
 
 class Estimated(NamedTuple):
@@ -78,7 +79,7 @@ class CangaugeEffects(Cangauge):
 
 
 class BareEkf(Cangauge):
-    """filterpy's extended Kalman filter over the circuit that `export-ecm` makes of our model.
+    """filterpy's extended Kalman filter over the `equivalent_circuit` of our model.
 
     Nothing is tuned: noise of the voltage as the model states it, σ of a start 10 %, of the current
     1 A. An unknown start is that of the first voltage. It states no σ here.
@@ -86,8 +87,6 @@ class BareEkf(Cangauge):
 
     def fit(self, logs: Sequence[cangauge.Log], told: Told) -> Any:
         """Return the tables of the circuit."""
-        from cangauge.extras.embedded.equivalent_circuit import equivalent_circuit  # noqa: PLC0415
-
         model = super().fit(logs, told)
         return equivalent_circuit(model) | {"noise_v": model.noise.voltage_rmse_v}
 

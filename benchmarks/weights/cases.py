@@ -15,14 +15,15 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from benchmarks.pybamm_plant import draw_pybamm_plant
 from benchmarks.weights import engine, packs
 
 from cangauge.extras.validation.twin.drive import draw_drive
 from cangauge.extras.validation.twin.faults import Fault, fault_kind, fault_kinds
 from cangauge.extras.validation.twin.injection import fit_surrogate_pack, inject
-from cangauge.extras.validation.twin.pack import TwinPack
+from cangauge.extras.validation.twin.pack import TwinPack, draw_pack
+from cangauge.extras.validation.twin.plant import Plant, TwinPlant
 from cangauge.extras.validation.twin.recording import record_drive, rms
-from cangauge.extras.validation.twin.simulation import draw_plant
 from cangauge.logs.log import Log
 
 FLOORS = (0.4, 5.0)
@@ -195,7 +196,10 @@ def made_pack(plant_name: str, seed: int, folder: Path) -> tuple[packs.PackLogs,
     file = folder / f"{plant_name}_{seed}.pkl"
     if not file.exists():
         rng = np.random.default_rng([seed, 1])
-        plant = draw_plant(rng, name="twin" if plant_name == "simulated" else "pybamm")
+        drawn = draw_pack(rng)
+        plant: Plant = TwinPlant(drawn)
+        if plant_name == "pybamm":
+            plant = draw_pybamm_plant(rng, drawn)
         middle = 16.0 if plant_name == "pybamm" else rng.uniform(8.0, 25.0)
         ambient = rng.permutation(np.linspace(middle - 9.0, middle + 9.0, 9))
         drives = [

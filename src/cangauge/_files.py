@@ -20,7 +20,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
 from os import PathLike
 from pathlib import Path
-from typing import BinaryIO, Final, Protocol, TypeVar, cast
+from typing import BinaryIO, Final, cast
 
 from cangauge.errors import CangaugeError, InputError
 
@@ -213,23 +213,6 @@ class Head:
         """Return the unpacked content; InputError if damaged, or larger than a log may be."""
         with self.open() as file:
             return read_all(file, self.path, MAX_LOG_BYTES, "a log")
-
-
-Content_co = TypeVar("Content_co", covariant=True)
-
-
-class Reader(Protocol[Content_co]):
-    """Reader of one format of logs or captures."""
-
-    @property
-    def name(self) -> str:
-        """Name of the format, for messages."""
-
-    def matches(self, head: Head) -> bool:
-        """Return whether a file begins as this format does."""
-
-    def read(self, head: Head) -> Content_co:
-        """Read the file; raise InputError where it is damaged or lacks something."""
 
 
 def _only_member(archive: zipfile.ZipFile, path: Path) -> zipfile.ZipInfo:

@@ -21,11 +21,20 @@ class CangaugeError(Exception):
     exit_code = 1
     logged = False
     """Set once logged, to avoid reporting twice."""
+    source: str | None = None
+    field: str | None = None
+    value: object = None
+    cure: str | None = None
 
     def to_dict(self) -> dict[str, Any]:
         """Return the message and its parts for `--json`; unknown parts are None."""
-        parts = dict.fromkeys(("source", "field", "value", "cure"))
-        return {"message": str(self), **parts}
+        return {
+            "message": str(self),
+            "source": self.source,
+            "field": self.field and _short(self.field, _LONGEST_VALUE),
+            "value": _json_value(self.value),
+            "cure": self.cure and _short(self.cure),
+        }
 
 
 class InputError(CangaugeError):
@@ -79,16 +88,6 @@ class InputError(CangaugeError):
                 for char in text
             )
         )
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return the message and its parts for `--json`; unknown parts are None."""
-        return {
-            "message": str(self),
-            "source": self.source,
-            "field": self.field and _short(self.field, _LONGEST_VALUE),
-            "value": _json_value(self.value),
-            "cure": self.cure and _short(self.cure),
-        }
 
 
 _OPTION: Final = re.compile(r"--([a-z]+(?:-[a-z]+)*)( (?='))?")

@@ -1,4 +1,4 @@
-"""Codecs of signals against cantools; the project's DBC files; KCD, SYM and ARXML."""
+"""Codecs of signals against cantools; the project's DBC files."""
 
 from __future__ import annotations
 
@@ -252,48 +252,6 @@ def test_counter_and_crc_are_where_the_rule_has_them() -> None:
         values = message.decode(data, decode_choices=False)
         found = {key.partition("_")[0]: value for key, value in values.items()}
         assert (found["counter"], found["crc"]) == (11, data[-1])
-
-
-# --- Other kinds
-
-KCD = """<?xml version="1.0" encoding="UTF-8"?>
-<NetworkDefinition xmlns="http://kayak.2codeornot2code.org/1.0"><Document name="pack"/>
- <Bus name="hv"><Message id="0x123" name="Pack" length="8">
-  <Signal name="s" offset="0" length="16"><Value type="signed" slope="0.1" unit="A"/></Signal>
- </Message></Bus></NetworkDefinition>
-"""
-SYM = """FormatVersion=6.0 // a pack
-Title="pack"
-
-{SENDRECEIVE}
-
-[Pack]
-ID=123h
-Len=8
-Sig=s 0
-
-{SIGNALS}
-Sig=s signed 16 /u:A /f:0.1
-"""
-
-
-@pytest.mark.parametrize(("suffix", "text"), [("kcd", KCD), ("sym", SYM)])
-def test_signals_of_other_databases_decode(tmp_path: Path, suffix: str, text: str) -> None:
-    path = tmp_path / f"pack.{suffix}"
-    path.write_text(text)
-    (message,) = load_dbc(path).messages
-    found = signal_codec(message, message.signals[0], source=path, field="current")
-    assert found.decode((-123).to_bytes(2, "little", signed=True) + bytes(6)) == pytest.approx(
-        -12.3
-    )
-    assert (message.frame_id, found.unit) == (0x123, "A")
-
-
-@pytest.mark.parametrize("suffix", ["kcd", "sym", "arxml"])
-def test_broken_databases_name_their_kind(tmp_path: Path, suffix: str) -> None:
-    (tmp_path / f"pack.{suffix}").write_text("nonsense <")
-    with pytest.raises(InputError, match=suffix.upper()):
-        load_dbc(tmp_path / f"pack.{suffix}")
 
 
 @pytest.mark.parametrize("line", ["SG_MUL_VAL_ 256 B X 1-1;", "SG_MUL_VAL_ 256 B A 1-1;"])

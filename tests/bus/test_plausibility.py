@@ -203,7 +203,10 @@ def test_a_signal_that_changes_again_is_no_longer_stuck() -> None:
 
 
 def test_a_temperature_is_stuck_after_the_stated_time_alone() -> None:
-    health = SignalHealth(SignalChecks(stuck_after_s=60.0, valid_after=1), is_cyclic=False)
+    checks = SignalChecks(stuck_after_s=60.0, valid_after=1)
+    # A current or voltage needs its partner.
+    assert None not in passed(SignalHealth(checks), [20.0] * 170, 1.0)
+    health = SignalHealth(checks, is_cyclic=False)
     used = passed(health, [20.0 if t < 100 else 21.0 for t in range(170)], 1.0)
     assert [t for t, value in enumerate(used) if value is None] == [
         *range(60, 100),

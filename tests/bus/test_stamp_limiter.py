@@ -54,19 +54,17 @@ def errors(found: list[tuple[float, float]], from_s: float = 0.0) -> list[float]
 def test_honest_stamps_are_left_as_they_are() -> None:
     found, limiter = limited(lambda true_s, _: true_s)
     assert max(errors(found)) < 1e-6
-    assert limiter.limited == 0
     assert limiter.shift_s == 0.0
 
 
 def test_honest_stamps_are_kept_over_a_pause() -> None:
     # Suspended for 8 s: the frames wait in the socket.
-    found, limiter = limited(
+    found, _ = limited(
         lambda true_s, _: true_s,
         hold=lambda arrival_s: 118.0 if 110 < arrival_s < 118 else arrival_s,
     )
     assert len(found) == 2999
     assert max(errors(found)) < 1e-6
-    assert limiter.limited == 0
 
 
 BROKEN: dict[str, Stamp] = {
@@ -91,7 +89,6 @@ def test_unusable_stamps_become_the_time_of_receiving(name: str) -> None:
     assert max(errors(found)) <= KERNEL_TOLERANCE_S + STEP_S + READING_S
     times = [bus_s for _, bus_s in found]
     assert times[-1] - times[0] == pytest.approx(29.98, abs=0.05)
-    assert limiter.limited > 0
     assert limiter.is_uncertain(100.0 + 30.0)
 
 

@@ -9,6 +9,8 @@ import can
 import numpy as np
 import pytest
 
+from cangauge import simulate
+from cangauge.logs.canonical import write_log
 from frame_layouts import STEP_S, Bits, Frame, encode
 from live import Command, Ended, in_process
 
@@ -36,10 +38,10 @@ def cangauge(*arguments: object, codes: tuple[int, ...] = (0,)) -> Ended:
     return done
 
 
-def drive(folder: Path, name: str, *arguments: str) -> None:
+def drive(folder: Path, name: str, **options: float) -> None:
     """Write a capture NAME.log of a drive of the twin at 20 °C, and its truth as NAME.csv."""
     table = folder / f"{name}.csv"
-    cangauge("twin", "--seed", "5", "--ambient-c", "20", *arguments, "-o", table)
+    write_log(simulate(seed=5, ambient_c=20.0, **options).log, table)
     log = np.genfromtxt(table, delimiter=",", names=True, usecols=range(5))
     at = np.arange(log["time_s"][0], log["time_s"][-1], STEP_S)
     truth = {
@@ -56,8 +58,8 @@ def drive(folder: Path, name: str, *arguments: str) -> None:
 def car(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with captures, and what `init` and `fit` make of them."""
     folder = tmp_path_factory.mktemp("car")
-    drive(folder, "full", "--discharge", "--hours", "0.7")
-    drive(folder, "trip", "--day", "2", "--hours", "0.1")
+    drive(folder, "full", discharge=True, hours=0.7)
+    drive(folder, "trip", drive=2, hours=0.1)
     choice = ("--choose", "current=1", "--choose", "voltage=1", "--nominal-voltage", "420")
     trips, mine = (folder / "trip.log", folder / "full.log"), folder / "mycar"
     cangauge("init", *trips, "--no-presets", "-o", mine, *choice)
@@ -70,6 +72,8 @@ def test_the_files_hold_the_cars_own_scales(car: Path) -> None:
     assert "current_a : 16|16@1+ (0.1,-500)" in text
     assert "voltage_v : 0|16@1+ (0.1,0)" in text
     assert "soc_pct : 32|16@1+ (0.1,0)" in text
+    # Frames of 0.1 s pair within a little more than their period.
+    assert "pair_within_s = 0.12 " in (car / "mycar" / "car.toml").read_text(encoding="utf-8")
 
 
 def test_the_service_reaches_the_cars_soc(car: Path) -> None:

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 from statuses import Clock, driven, status
 
-from cangauge.extras.live.history import COLUMNS, History, Span, column
+from cangauge import read_log
+from cangauge.extras.live.history import COLUMNS, LOG_NAME, History, Span, column, last_hour
 
 
 def row(time_s: float) -> np.ndarray:
@@ -86,6 +89,29 @@ def test_a_service_that_stops_is_said_within_a_second() -> None:
     clock.now_s += 0.9
     assert history.troubles() == ["The service has not reported for 0.9 s. The values are old."]
     assert History(clock).troubles() == ["Waiting for the service."]
+
+
+def test_the_last_hour_is_a_log_that_begins_after_a_jump_back(tmp_path: Path) -> None:
+    clock = Clock()
+    history = driven(5.0, clock)
+    for time_s, sample in (
+        (100.0, {}),
+        (100.0, {}),
+        (100.5, {}),
+        (100.7, {"sample": None}),
+        (101.0, {}),
+    ):
+        clock.now_s += 0.1
+        history.add(status(time_s, **sample))
+    path = tmp_path / LOG_NAME
+    path.write_text(last_hour(history))
+    assert "\n100.7" not in path.read_text()  # without a current
+    log = read_log(path)
+    assert log.time_s.tolist() == [*(0.1 * np.arange(50)).round(6), 100.0, 100.5, 101.0]
+    assert set(log.current_a) == {12.5}
+    clock.now_s += 0.1
+    history.add(status(50.0))
+    assert last_hour(history).splitlines()[1:] == ["50.000000,12.5,380.1,20"]
 
 
 @pytest.mark.parametrize(

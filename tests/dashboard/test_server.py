@@ -17,12 +17,10 @@ from tornado.websocket import websocket_connect
 
 from cangauge.bus.open import UNKNOWN_INTERFACE
 from cangauge.bus.vehicle import Vehicle
-from cangauge.errors import InputError
 from cangauge.extras.live import launch
 from cangauge.extras.live.addresses import http_address
 from cangauge.extras.live.launch import Live
 from cangauge.service.pipeline import Pipeline
-from cangauge.service.run import Service
 from cangauge.service.status import Monitor
 from cangauge.service.status_client import Snapshot
 from live import LoggedLines, leaf_model, leaf_model_path, waits
@@ -92,7 +90,7 @@ def test_the_latest_status_is_served(page: Live) -> None:
     [
         "/rows?span=nonsense&after=x",
         "/rows?span=10min&key=x&after=-1e400",
-        "/range.csv?from=nan&to=x",
+        f"/rows?span=10min&after={'9' * 5000}",
         "/cangauge-last-hour.csv",
     ],
 )
@@ -103,11 +101,6 @@ def test_odd_questions_are_answered(page: Live, path: str) -> None:
 @pytest.mark.parametrize("path", ["/files/server.py", "/files/..", "/nothing", "/files/"])
 def test_nothing_else_is_served(page: Live, path: str) -> None:
     assert get(page, path)[0] == 404
-
-
-def test_a_page_under_another_name_is_refused(page: Live) -> None:
-    assert get(page, "/rows", headers={"Host": "evil.example"})[0] == 403
-    assert get(page, "/", headers={"Host": "evil.example"})[0] == 403
 
 
 def test_the_page_allows_no_content_from_elsewhere(page: Live) -> None:
@@ -165,7 +158,7 @@ def test_the_stream_sends_what_is_new(page: Live) -> None:
     assert known > found[0]["added"]
 
 
-@pytest.mark.parametrize("path", ["/rows", "/range.csv", "/cangauge-last-hour.csv"])
+@pytest.mark.parametrize("path", ["/rows", "/cangauge-last-hour.csv"])
 def test_a_token_is_needed(guarded: Live, path: str) -> None:
     assert get(guarded, path)[0] == 401
     assert get(guarded, path, headers={"Cookie": "cangauge=guess"})[0] == 401
@@ -215,20 +208,6 @@ def test_the_process_ends_with_the_service(guarded: Live) -> None:
         os.kill(process, 0)
     with pytest.raises(OSError, match="refused"):
         socket.create_connection(("127.0.0.1", guarded.port), 1.0)
-
-
-def test_an_address_in_use_is_refused(page: Live) -> None:
-    with pytest.raises(InputError, match=r"dashboard.*in use"):
-        Live(dashboard=http_address(f"127.0.0.1:{page.port}", None, {}, "dashboard"))
-
-
-def test_beyond_loopback_needs_a_token(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.delenv("CANGAUGE_HTTP_TOKEN", raising=False)
-    service = Service(
-        model=str(leaf_model_path()), dashboard="0.0.0.0:8642", interface="virtual", channel="page"
-    )
-    with pytest.raises(InputError, match=r"dashboard.*reachable from the network"):
-        service.run()
 
 
 def test_a_process_that_hangs_is_started_again(page: Live, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -163,6 +163,20 @@ def test_another_model_takes_over() -> None:
     follow(*after, samples[500:])
 
 
+def test_the_age_of_a_restored_state_survives_another_model() -> None:
+    """Stamps that begin anew are followed where the state is known to be old."""
+    chosen, samples = EstimatorSettings(initial_soc_pct=85.0), eventful_samples()
+    stopped = pair(MODELS["plain"], chosen)
+    follow(*stopped, samples[:300])
+    restored, after = pair(MODELS["plain"], chosen), pair(KNOTS, chosen)
+    for before, again, other in zip(stopped, restored, after, strict=True):
+        again.restore(before.snapshot(), 3600.0)
+        other.take_over(again)
+    follow(*after, samples[:100])
+    refused = 300 - stopped[1].snapshot().memory.samples
+    assert after[1].snapshot().memory.samples == 400 - refused
+
+
 def test_columns_give_the_same_bits_as_samples() -> None:
     columns = np.array(eventful_samples()).T
     (_, whole), (_, single) = (pair(KNOTS, EstimatorSettings()) for _ in range(2))

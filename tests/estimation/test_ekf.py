@@ -10,9 +10,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cangauge.estimation.ekf import OFFSET_STD_A, Block, SocFilter
+from cangauge.estimation.ekf import OFFSET_STD_A, SocFilter
 from cangauge.estimation.health import CAPACITY_STD, RESISTANCE_STD
 from cangauge.estimation.start import WRONG_PRIOR, WRONG_STD_PCT, Hypotheses
+from cangauge.estimation.state import Block
 
 CAPACITY_AH = 60.0
 LOAD = np.array([1.0, -40.0])
@@ -22,18 +23,16 @@ NO_EFFECTS = np.zeros(1)
 class LinearModel:
     """A voltage model that is linear in the SoC and in two functions."""
 
-    capacity_ah, functions = CAPACITY_AH, SimpleNamespace(number=2)
+    capacity_ah = CAPACITY_AH
+    functions = SimpleNamespace(number=2, row=lambda _, load: np.array([0.9, 0.01 * load[1]]))
     load_coefficients = np.array([0.3, 0.1])
     noise = SimpleNamespace(
         level_std_v=0.8, slow_std_v=0.6, slow_time_s=300.0, fast_std_v=0.3, soc_std_pct=0.3,
         cold=lambda temperature_c: 1.0 if temperature_c > 10.0 else 1.4,
     )  # fmt: skip
 
-    def curve(self, soc_pct: float, drives: Any = None) -> tuple[float, float]:
+    def pseudo_ocv_at(self, soc_pct: float, drives: Any = None) -> tuple[float, float]:
         return 300.0 + 0.7 * soc_pct, 0.7
-
-    def row(self, soc_pct: float, load: np.ndarray) -> np.ndarray:
-        return np.array([0.9, 0.01 * load[1]])
 
 
 def block(number: int, voltage_v: float, discharged_pct: float, load_a: float = 40.0) -> Block:

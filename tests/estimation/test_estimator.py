@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +16,13 @@ from cangauge.errors import InputError
 from cangauge.estimation.compiled import make_estimator
 from cangauge.estimation.counting import CoulombCounter
 from cangauge.estimation.estimator import Estimator
-from cangauge.estimation.offline import estimate, estimate_log, run_estimator, samples_of
+from cangauge.estimation.offline import (
+    EstimateTable,
+    estimate,
+    estimate_log,
+    run_estimator,
+    samples_of,
+)
 from cangauge.estimation.settings import EstimatorSettings
 from cangauge.model.inverse import soc_from_ocv
 from cangauge.model.model_file import Model
@@ -244,19 +251,23 @@ def test_setting_out_of_range_is_named() -> None:
         EstimatorSettings(initial_soc_pct=140.0)
 
 
-def test_open_contactors_do_not_disturb_the_filter(model: Model) -> None:
-    log = synthetic_log(start_pct=80.0, end_pct=70.0, noise_v=0.3, seed=6, hours=0.5)
-    down = (log.time_s >= 900.0) & (log.time_s < 930.0)
-    samples = [
-        item._replace(voltage_v=1.5) if off else item
-        for item, off in zip(samples_of(log), down, strict=True)
-    ]
-    settings_ = EstimatorSettings(initial_soc_pct=80.0)
-    table = run_estimator(samples, model, settings_)
-    whole = run_estimator(samples_of(log), model, settings_)
-    assert np.abs(table.soc_pct - whole.soc_pct).max() < 0.2
-    assert np.all(table.reasons[down] & Reason.IMPLAUSIBLE_INPUT)
-    assert not np.any(table.reasons & Reason.INNOVATION_LARGE)
+@pytest.mark.parametrize("make", [Estimator, make_estimator])
+def test_an_open_contactor_is_a_block_without_voltage(
+    model: Model, make: Callable[..., Estimator]
+) -> None:
+    """The voltage behind it falls over a second: its filter capacitor discharges."""
+    closed = [Sample(float(second), 0.0, 375.0, 23.0) for second in range(180)]
+    opened, absent = list(closed), list(closed)
+    opened[100:110] = [each._replace(voltage_v=3.0) for each in closed[100:110]]
+    opened[100] = closed[100]._replace(voltage_v=250.0)
+    absent[90:120] = [each._replace(voltage_v=math.nan) for each in closed[90:120]]
+    settings_ = EstimatorSettings(initial_soc_pct=60.0)
+    found, expected = (
+        EstimateTable.of(map(make(model, settings_).step, samples)) for samples in (opened, absent)
+    )
+    assert np.array_equal(found.soc_pct, expected.soc_pct)
+    assert np.all(found.reasons[101:110] & Reason.IMPLAUSIBLE_INPUT)
+    assert not np.any(found.reasons & Reason.INNOVATION_LARGE)
 
 
 def test_uncertain_soc_is_degraded(model: Model) -> None:

@@ -12,15 +12,15 @@ from cangauge.estimation.compiled import make_estimator
 from cangauge.estimation.offline import estimate_log, samples_of
 from cangauge.estimation.settings import EstimatorSettings
 from cangauge.logs.log import Log
-from cangauge.model.effects.base import Effect, Pack, Signals
+from cangauge.model.effects.base import Signals
 from cangauge.model.effects.library import LIBRARY, effect_entries
 from cangauge.model.model_file import Model
-from cangauge.model.published import CAPACITY_AH, leaf_2012_model, leaf_2012_model_file
+from cangauge.model.published import leaf_2012_model_file
+from estimation.test_snapshot import half_way
 from selection import nightly_except
 from synthetic import synthetic_log
 
 START_PCT = 90.0
-PACK = Pack.of(leaf_2012_model(), CAPACITY_AH)
 IN_SUITE = (
     "current_gain", "voltage_gain", "resistance_temperature", "slow_diffusion", "hysteresis",
     "weak_cell",
@@ -28,21 +28,11 @@ IN_SUITE = (
 """An effect of each way to act; the others run in `make nightly`."""
 
 
-def upper_half(effect: Effect) -> dict[str, float]:
-    """Amplitudes half way to the far bound, shapes in the middle."""
-    values = effect.neutral(PACK)
-    for parameter in effect.amplitudes:
-        low, high = parameter.bounds(PACK)
-        far = high if high > values[parameter.name] else low
-        values[parameter.name] = 0.5 * (values[parameter.name] + far)
-    return values | ({"skew_s": 0.7} if effect.id == "time_skew" else {})
-
-
 @cache
 def log_and_model(effect_id: str) -> tuple[Log, Model]:
     """A log that only the effect explains, and the published model with the effect."""
     effect = LIBRARY[effect_id]
-    values = upper_half(effect)
+    values = half_way(effect)
     plain = leaf_2012_model_file()
     wide = {"soc_pct": (0.0, 100.0), "temperature_c": (-30.0, 60.0), "current_a": (-300.0, 300.0)}
     raw = plain.model_dump() | {"effects": effect_entries([(effect, values)]), "range": wide}

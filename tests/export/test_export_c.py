@@ -34,7 +34,7 @@ from synthetic import synthetic_log
 PLAIN = leaf_2012_model_file()
 EFFECTS = [
     "current_offset", "voltage_gain", "time_skew", "core_temperature", "resistance_temperature",
-    "resistance_soc", "charge_transfer", "slow_diffusion", "hysteresis", "ocv_shape",
+    "resistance_soc", "charge_transfer", "slow_diffusion", "hysteresis", "weak_cell",
 ]  # fmt: skip
 STRICT = ["-std=c99", "-Wall", "-Wextra", "-Wconversion", "-Werror", "-ffp-contract=off"]
 

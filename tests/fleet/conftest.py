@@ -26,7 +26,7 @@ VEHICLES, LOGS = 4, 2
 
 @pytest.fixture(scope="session")
 def scenario() -> Scenario:
-    return draw_scenario(5, n_reference=3, climate="mild")
+    return draw_scenario(5)
 
 
 @pytest.fixture(scope="session")

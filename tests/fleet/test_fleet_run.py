@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, ClassVar, Self
+from typing import Any, ClassVar
 from urllib.error import HTTPError
 from urllib.request import urlopen
 
@@ -16,9 +15,9 @@ import pyarrow.dataset as pds
 import pyarrow.parquet as pq
 import pytest
 
-from cangauge.errors import CangaugeError, InputError
+from cangauge.errors import InputError
 from cangauge.extras.fleet import run as fleet_run
-from cangauge.extras.fleet.gap import GapJob
+from cangauge.extras.fleet.gap import GapJob, gap_tasks
 from cangauge.extras.fleet.jobs import TEXT, EstimateJob, HealthJob, Job, Task, by_log, by_vehicle
 from cangauge.extras.fleet.results import Results
 from cangauge.extras.fleet.run import Summary, connected, perform, run_id, run_job
@@ -41,10 +40,6 @@ class NotingJob(Job):
 
     def identity(self) -> dict[str, Any]:
         return {}
-
-    def parts(self, task: Task) -> Iterator[tuple[str, Callable[[], dict[str, Any]]]]:
-        for log in task.logs:
-            yield log.url, lambda log=log: self.row(log)  # type: ignore[misc]
 
     def row(self, log: FleetLog) -> dict[str, Any]:
         name = Path(log.url).stem
@@ -178,28 +173,6 @@ def test_an_interrupted_run_keeps_what_it_has_written(
     assert (fleet.run().skipped, len(fleet.texts())) == (2, 3)
 
 
-class Unprepared(NotingJob):
-    error: ClassVar[Exception] = InputError("no reference can be used", field="--reference")
-
-    def identity(self) -> dict[str, Any]:
-        return {"of": type(self.error).__name__}
-
-    def prepared(self) -> Self:
-        raise self.error
-
-
-@pytest.mark.parametrize("error", [Unprepared.error, MemoryError("full")])
-def test_a_job_that_cannot_be_prepared_writes_nothing(
-    fleet: Fleet, monkeypatch: pytest.MonkeyPatch, error: Exception
-) -> None:
-    fleet.run()
-    monkeypatch.setattr(Unprepared, "error", error)
-    with pytest.raises(CangaugeError, match=r"no reference can|MemoryError: full") as caught:
-        fleet.run(job=Unprepared())
-    assert caught.value.exit_code == getattr(error, "exit_code", 1)
-    assert fleet.texts() == ["a", "b", "c"]
-
-
 @pytest.mark.nightly
 def test_a_killed_worker_leaves_a_complete_result(
     logs: list[FleetLog], model: Model, tmp_path: Path
@@ -285,35 +258,49 @@ def test_health_passes_from_log_to_log(logs: list[FleetLog], model: Model) -> No
     assert "before the previous log of this vehicle ends" in early["reason"]
 
 
-def test_references_come_from_all_vehicles(logs: list[FleetLog], model: Model) -> None:
+def test_references_come_from_all_vehicles(logs: list[FleetLog]) -> None:
     suspect = [log for log in logs if "trip1" in log.url]
-    healthy = [log for log in logs if "trip1" not in log.url]
-    job, tasks = GapJob(ReadOptions(), model).of_fleet(suspect, healthy)
-    found = {task.vehicle: task for task in tasks}
-    chosen = [log.vehicle for log in found["car1"].references]
+    healthy = [replace(log, healthy=True) for log in logs if "trip1" not in log.url]
+    tasks = {task.vehicle: task for task in gap_tasks([*suspect, *healthy])}
+    chosen = [log.vehicle for log in tasks["car1"].references]
     assert (chosen[0], chosen.count("car1"), set(chosen)) == (
         "car1", 1, {"car0", "car1", "car2", "car3"},
     )  # fmt: skip
-    assert (job.common, job.prepared()) == ((), job)  # all have their own
-    again = GapJob(ReadOptions(), model).of_fleet(suspect[::-1], healthy)[1]
-    assert sorted(again, key=lambda task: task.vehicle) == tasks
-    for few, words in ((([], healthy), "every log is"), ((suspect, []), "known to be healthy")):
+    assert replace(tasks["car1"], references=()).stamp != tasks["car1"].stamp
+    many = [replace(suspect[0], url=f"{k}.csv") for k in range(5)]
+    (latest,) = gap_tasks([*many, *healthy])
+    assert latest.logs == tuple(many[-3:])
+    again = gap_tasks([*suspect[::-1], *healthy])
+    assert {task.vehicle: task for task in again} == tasks
+    of_two = [log for log in healthy if log.vehicle in {"car0", "car1"}]
+    without = gap_tasks([*suspect, *of_two])
+    assert [task.vehicle for task in without] == ["car2", "car3", "car0", "car1"]
+    assert without[0].references == without[1].references
+    assert {log.vehicle for log in without[2].references} == {"car0", "car1"}
+    for few, words in ((healthy, "every log is"), (suspect, "known to be healthy")):
         with pytest.raises(InputError, match=words):
-            GapJob(ReadOptions(), model).of_fleet(*few)
+            gap_tasks(few)
 
 
-def test_a_vehicle_without_own_references_has_the_common_ones(
+def test_logs_and_references_that_cannot_be_used_are_named(
     logs: list[FleetLog], model: Model, tmp_path: Path
 ) -> None:
     broken, dead = tmp_path / "broken.csv", tmp_path / "dead.parquet"
     broken.write_text("x\n")
     still = read_log(logs[6].url)
     write_log(replace(still, current_a=np.zeros(len(still))), dead)
-    suspect = [logs[3], FleetLog(str(broken), "car1", "s")]
-    healthy = [FleetLog(str(dead), "car0", "s"), logs[5], logs[7]]
-    job, (task,) = GapJob(ReadOptions(), model).of_fleet(suspect, healthy)
-    assert (len(job.common), task.references, task.common) == (3, (), job.common)
-    (row,) = perform(job.prepared(), task).rows
+    broken_log = FleetLog(str(broken), "car1", "s")
+    dead_log = FleetLog(str(dead), "car0", "s", healthy=True)
+    job = GapJob(ReadOptions(), model)
+    good = [replace(log, healthy=True) for log in (dead_log, logs[5], logs[7])]
+    (task,) = gap_tasks([logs[3], broken_log, *good])
+    (row,) = perform(job, task).rows
     assert (row["log"], row["references"], row["reference_vehicles"]) == ("car1", 2, 2)
     assert row["unread"][0].startswith(str(broken))
     assert "constant" in row["unread"][1]
+    (task,) = gap_tasks([logs[3], replace(broken_log, healthy=True), dead_log])
+    (aside,) = perform(job, task).bad
+    assert "no reference can be used" in aside["reason"]
+    (task,) = gap_tasks([broken_log, good[1]])
+    (aside,) = perform(job, task).bad
+    assert "none of its logs can be read" in aside["reason"]

@@ -37,6 +37,7 @@ from cangauge.__main__ import main
 from cangauge.bus.captures import open_capture
 from cangauge.bus.recording import capture_samples
 from cangauge.bus.vehicle import PRESETS
+from cangauge.logs.canonical import write_log
 from cangauge.replay.encoder import FrameEncoder
 from cangauge.service.pipeline import Pipeline, PipelineSettings
 
@@ -338,9 +339,12 @@ def command_records() -> dict[str, Any]:
             run = command if label == "error" else succeed
             found[label] = shape(run(*arguments))
 
-        keep("twin", "twin", "--seed", 3, "--hours", 0.3, "-o", drive)
-        keep("twin_effect", "twin", "--seed", 3, "--day", 2, "--hours", 0.3,
-             "--effect", "current_offset", "-o", reference)  # fmt: skip
+        simulated = folder / "simulated.csv"
+        keep("twin", "twin", "--seed", 3, "-o", simulated)
+        keep("twin_effect", "twin", "--seed", 3, "--effect", "current_offset", "-o", simulated)
+        write_log(cangauge.simulate(seed=3, hours=0.3).log, drive)
+        faulty = cangauge.simulate("current_offset", seed=3, drive=2, hours=0.3)
+        write_log(faulty.log, reference)
         keep("fit", "fit", drive, reference, "--capacity-ah", 55, "-o", folder / "model.json")
         keep("estimate", "estimate", drive, "-m", model, "-o", folder / "out.csv")
         keep("estimate_capture", "estimate", capture, "-m", model, "-o", folder / "out.csv",
@@ -350,7 +354,6 @@ def command_records() -> dict[str, Any]:
         keep("inspect_capture", "inspect", capture, "--vehicle", "generic")
         keep("init", "init", capture, "-o", folder / "car")
         keep("export-c", "export-c", "-m", model, "-o", folder / "c")
-        keep("export-ecm", "export-ecm", "-m", model, "-o", folder / "ecm.py")
         keep("export-fmu", "export-fmu", "-m", model, "-o", folder / "unit.fmu")
         keep("error", "estimate", drive, "-m", folder / "none.json", "-o", folder / "out.csv")
         with gzip.open(capture, "rt") as file:
@@ -372,8 +375,10 @@ def make_models() -> None:
         for label, pack in FROZEN.items():
             drives = [folder / f"{label}{day}.csv" for day in (1, 2, 3)]
             for day, path in enumerate(drives, 1):
-                succeed("twin", "--seed", 7, "--day", day, "--pack", pack, "--hours", 1.5,
-                        "--start-soc", 95, "--end-soc", 15, "-o", path)  # fmt: skip
+                simulated = cangauge.simulate(
+                    seed=7, drive=day, pack=pack, hours=1.5, start_soc_pct=95, end_soc_pct=15
+                )
+                write_log(simulated.log, path)
             truth = cangauge.read_log(drives[0])
             capacity = truth.soc_pct[0] - truth.soc_pct[-1]
             charge = np.trapezoid(truth.current_a, truth.time_s) / 3600.0
@@ -381,8 +386,8 @@ def make_models() -> None:
                     "--chemistry", label, "-o", HERE / f"{label}.json")  # fmt: skip
             plain = json.loads((HERE / f"{label}.json").read_text())
             (HERE / f"{label}.json").write_text(json.dumps(plain, ensure_ascii=False) + "\n")
-        succeed("twin", "--seed", 7, "--day", 4, "--pack", "leaf24", "--hours", 0.25,
-                "--start-soc", 70, "-o", folder / "day.csv")  # fmt: skip
+        simulated = cangauge.simulate(seed=7, drive=4, pack="leaf24", hours=0.25, start_soc_pct=70)
+        write_log(simulated.log, folder / "day.csv")
         write_day(folder / "day.csv")
 
 

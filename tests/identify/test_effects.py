@@ -31,7 +31,7 @@ def with_effect(log: Log, effect_id: str, values: dict[str, float]) -> Log:
     """The log as a pack with an effect would have given it."""
     effect = LIBRARY[effect_id]
     full = {**effect.neutral(BASE.pack), **values}
-    signals = Signals(log.time_s, log.current_a, log.voltage_v, log.temperature_c)
+    signals = Signals.of(log)
     rows = np.arange(len(log))
     start = log.first_soc()
     assert start is not None
@@ -93,9 +93,9 @@ def test_columns_are_the_derivative_of_the_voltage() -> None:
     log = trips(1)[0]
     rows = fit_rows(log, CAPACITY_AH, low_pass_s=())
     effect_ids = [effect_id for effect_id in LIBRARY if effect_id not in NOT_IDENTIFIABLE]
-    chosen = offered(effect_ids, BASE, log.time_s)
+    chosen = offered(effect_ids, BASE)
     linear = linearize(BASE, log, rows, chosen)
-    signals = Signals(log.time_s, log.current_a, log.voltage_v, log.temperature_c)
+    signals = Signals.of(log)
     start = log.first_soc()
     assert start is not None
 
@@ -116,7 +116,7 @@ def test_columns_are_the_derivative_of_the_voltage() -> None:
 def test_columns_of_the_equation_are_not_offered() -> None:
     taus = [
         item.shape["tau_s"]
-        for item in offered(SEARCHED, BASE, np.arange(3600.0))
+        for item in offered(SEARCHED, BASE)
         if item.effect.id in {"fast_polarization", "slow_diffusion"}
     ]
     assert taus

@@ -13,6 +13,8 @@ import pytest
 
 import cangauge
 from cangauge.__main__ import main
+from cangauge.extras.judge.causes import signatures_of
+from cangauge.extras.judge.chain import ERROR, FUNCTIONS, OFFSET, Chain
 from cangauge.logs.canonical import write_table
 from cangauge.logs.read import CellColumns
 
@@ -68,20 +70,47 @@ def test_an_offset_is_named_with_size_and_moment(pack) -> None:
     assert judgement.since_s == pytest.approx(sum(log.duration_s for log in logs[:2]), abs=120.0)
 
 
+def test_an_offset_that_goes_on_has_grown_by_the_next_log() -> None:
+    hours, starts = np.array([1.0, 2.0, 1.0]), np.full(3, 80.0)
+    sensor, *_ = signatures_of("current_offset", hours, starts, FUNCTIONS + 1, 50.0)
+    assert sensor.columns[:, OFFSET].tolist() == [1.0, 1.0, 1.0]
+    assert sensor.columns[:, ERROR].tolist() == [0.0, -2.0, -6.0]
+
+
 @pytest.mark.parametrize(
-    ("cause", "change"),
+    ("cause", "size", "change"),
     [
-        ("voltage_sensor", lambda log: {"voltage_v": 1.02 * log.voltage_v}),
+        ("voltage_sensor", 2.0, lambda log: {"voltage_v": 1.02 * log.voltage_v}),
         (
             "count_scale",
+            10.0,
             lambda log: {"soc_pct": log.soc_pct[0] + 1.1 * (log.soc_pct - log.soc_pct[0])},
         ),
     ],
 )
-def test_other_causes_are_named(pack, cause: str, change) -> None:
+def test_other_causes_are_named(pack, cause: str, size: float, change) -> None:
     model, logs = pack
     judgement = cangauge.judge([replace(log, **change(log)) for log in logs], model)
     assert (judgement.verdict, judgement.cause.verdict) == ("off", cause)
+    assert judgement.cause.size is not None
+    assert judgement.cause.size.value == pytest.approx(size, rel=0.3)
+
+
+def test_an_offset_of_the_sensor_is_taken_out_of_the_corrected_soc(pack) -> None:
+    model, logs = pack
+    offset_a = model.capacity_ah / 12.0
+    read = [
+        replace(log, current_a=log.current_a + offset_a)
+        for log in with_offset(logs, model, offset_a, 0)
+    ]
+    judgement = cangauge.judge(read, model)
+    assert (judgement.cause.verdict, judgement.since_s) == ("current_offset", 0.0)
+    assert judgement.cause.size is not None
+    assert judgement.cause.size.value == pytest.approx(offset_a, rel=0.3)
+    for log, soc in zip(logs, judgement.corrected_pct, strict=True):
+        known = np.isfinite(soc)
+        moved, truly = np.diff(soc[known][[0, -1]]), np.diff(log.soc_pct[known][[0, -1]])
+        assert moved == pytest.approx(truly, abs=1.5)  # the count alone: 4 % off
 
 
 def test_a_wrong_start_is_named_and_the_corrected_soc_follows_the_truth(pack) -> None:
@@ -109,9 +138,18 @@ def test_day_one_without_a_model_cannot_tell_a_small_error(pack) -> None:
 def test_a_jump_is_listed_with_its_size(pack) -> None:
     model, logs = pack
     soc = logs[1].soc_pct.copy()
-    soc[len(soc) // 2 :] += 6.0
+    middle = len(soc) // 2
+    soc[middle:] += 6.0
     judgement = cangauge.judge([logs[0], replace(logs[1], soc_pct=soc), *logs[2:3]], model)
-    assert [round(jump.size_pct) for jump in judgement.jumps] == [6]
+    (jump,) = judgement.jumps
+    assert (jump.log, round(jump.size_pct)) == (1, 6)
+    at_s = logs[0].duration_s + logs[1].time_s[middle] - logs[1].time_s[0]
+    assert jump.since_start_s == pytest.approx(at_s, abs=60.0)
+    later = [replace(log, soc_pct=log.soc_pct + 6.0) for log in logs[2:]]
+    judgement = cangauge.judge([logs[0], replace(logs[1], soc_pct=soc), *later], model)
+    assert (judgement.verdict, judgement.cause.verdict) == ("off", "start_or_reset")
+    assert judgement.since_s == pytest.approx(at_s, abs=60.0)
+    assert f"min into {logs[1].name}" in judgement.since
 
 
 def test_command_prints_schema_1_and_writes_all_files(
@@ -171,10 +209,66 @@ def test_a_weak_cell_is_named_with_its_number(pack, lack_pct: float, cause: str)
         assert judgement.cause.size.value == pytest.approx(lack_pct, abs=2.5)
 
 
-def test_logs_without_a_published_soc_are_refused(pack) -> None:
+def test_a_doubtful_gauge_is_not_off_and_several_faults_are_no_known_one(pack) -> None:
     model, logs = pack
+    little = [replace(log, soc_pct=log.soc_pct - 3.0) for log in logs[:2]]
+    judgement = cangauge.judge(little, model)
+    assert 0.05 < judgement.probabilities["none"] < 0.5
+    assert (judgement.verdict, judgement.cause.verdict) == ("agrees", "none")
+    mixed = [
+        replace(log, soc_pct=log.soc_pct + (3.0, -3.0)[day % 2]) for day, log in enumerate(logs)
+    ]
+    judgement = cangauge.judge(mixed, model)
+    assert (judgement.verdict, judgement.cause.verdict) == ("off", "unknown")
+    assert (judgement.since_s, judgement.cause.size) == (None, None)
+    assert "not known" in judgement.headline
+
+
+def test_the_gauges_own_count_gives_the_capacity(pack) -> None:
+    model, logs = pack
+    judgement = cangauge.judge(logs[:1], chemistry="oxide", cells=96)
+    assert judgement.model.capacity_ah == pytest.approx(model.capacity_ah, rel=1e-3)
+    level = replace(logs[0], soc_pct=np.full(len(logs[0]), 50.0))
+    with pytest.raises(cangauge.InputError, match="hardly changes"):
+        cangauge.judge([level], chemistry="oxide", cells=96)
+
+
+def test_logs_that_show_nothing_are_refused(pack) -> None:
+    model, (log, *_) = pack
     with pytest.raises(cangauge.InputError, match="publishes"):
-        cangauge.judge([replace(logs[0], soc_pct=None)], model)
+        cangauge.judge([replace(log, soc_pct=None)], model)
+    with pytest.raises(cangauge.InputError, match="no stretch"):
+        cangauge.judge([log.rows(log.time_s < log.time_s[0] + 239.0)], model)
+    with pytest.raises(cangauge.InputError, match="neither a model"):
+        cangauge.judge([log], cells=96)
+
+
+def test_a_coarse_soc_counts_at_its_changes_and_not_at_its_limits(pack) -> None:
+    model, (log, *_) = pack
+    shown = np.minimum(np.round(log.soc_pct), np.round(log.soc_pct[0]) - 2.0)
+    shift = 100.0 - shown.max()
+    (part,) = Chain.of([replace(log, soc_pct=shown + shift)], model).stretches
+    known = np.isfinite(part.published_pct)
+    truth = np.interp(part.time_s, log.time_s, log.soc_pct) + shift
+    assert 3 <= known.sum() < known.size / 2
+    assert part.published_pct[known][1:] == pytest.approx(truth[known][1:], abs=0.3)
+    full = np.minimum(log.soc_pct - log.soc_pct[0] + 102.0, 100.0)
+    (part,) = Chain.of([replace(log, soc_pct=full)], model).stretches
+    assert np.isnan(part.published_pct[0])
+    assert np.isfinite(part.published_pct[-1])
+
+
+def test_a_pause_parts_a_log_and_days_without_dates_follow_one_another(pack) -> None:
+    model, logs = pack
+    late = replace(logs[1], time_s=logs[1].time_s + 700.0 * (logs[1].time_s > 900.0))
+    assert [part.log for part in Chain.of([logs[0], late], model).stretches] == [0, 1, 1]
+    dated = [
+        replace(log, time_s=log.time_s + 1.7e9 - 86400.0 * day)
+        for day, log in enumerate(with_offset(logs, model, model.capacity_ah / 25.0, 2))
+    ]
+    judgement = cangauge.judge(dated[::-1], model)
+    assert [log.time_s[0] for log in judgement.logs] == sorted(log.time_s[0] for log in dated)
+    assert judgement.days == len(dated)
 
 
 def full_charge(error_pct: float) -> cangauge.Log:

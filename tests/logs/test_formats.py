@@ -102,6 +102,12 @@ def test_what_was_assumed_and_ignored_is_told(tmp_path: Path) -> None:
     assert "1 other column ignored: driver" in log.remarks
 
 
+def test_a_hot_temperature_may_be_in_fahrenheit(tmp_path: Path) -> None:
+    log = changed(tmp_path, "plain-without-units", r",21\.5,", ",70.7,")
+    words = "temperature 71 °C is unusually hot: .* --columns 'temperature=temperature.°F."
+    assert any(re.match(words, text) for text in log.remarks)
+
+
 def test_a_stated_sign_is_kept_and_a_doubt_is_told(tmp_path: Path) -> None:
     path = tmp_path / "x.csv"
     path.write_bytes(content_of(CASES["plain-with-brackets"]))
@@ -123,16 +129,6 @@ def test_a_voltage_is_held_for_a_second_where_rows_hold_changes(tmp_path: Path) 
     assert any("20 rows with a current kept, with the latest" in text for text in log.remarks)
 
 
-def test_offsets_of_dates_are_taken_into_account(tmp_path: Path) -> None:
-    stamps = ["2024-03-31T01:59:58+01:00", "2024-03-31T01:59:59+0100", "2024-03-31T03:00:00+02"]
-    rows = (f"{stamp},{amps},380,20" for stamp, amps in zip(stamps, (1, 2, 3), strict=True))
-    path = tmp_path / "x.csv"
-    path.write_text("\n".join(["Time,Current,Voltage,Temp", *rows]) + "\n")
-    log = read_log(path)
-    np.testing.assert_allclose(log.time_s - log.time_s[0], [0.0, 1.0, 2.0])
-    assert "date with zone" in log.assumed[0]
-
-
 def test_soc_against_the_charge_is_left_out(tmp_path: Path) -> None:
     rows = (
         f"{k},{40.0 if k % 4 < 2 else -4.0},{380.0 - (4.0 if k % 4 < 2 else -0.4)},21,{10 + k / 50}"
@@ -144,6 +140,14 @@ def test_soc_against_the_charge_is_left_out(tmp_path: Path) -> None:
     assert log.soc_pct is None
     assert log.current_a[0] == 40.0
     assert any(text.startswith("SoC left out: it moves from 10") for text in log.remarks)
+
+
+def test_columns_of_the_user_make_a_table_of_any_format(tmp_path: Path) -> None:
+    path = tmp_path / "cell_P25_S1.csv"
+    path.write_bytes(content_of(CASES["arbin"]))
+    log = read_log(path, columns="current=Current(A):-2", temperature_c=20.0)
+    np.testing.assert_array_equal(log.current_a, 2.0 * CURRENT_A)
+    assert 'current = "Current(A)" × -2 [A]' in log.assumed
 
 
 def test_constant_temperature_in_place_of_the_files(tmp_path: Path) -> None:

@@ -291,6 +291,9 @@ def test_cells_beside_a_log(
     assert found is not None
     assert (found.first, found.count) == (1, 16)
     np.testing.assert_allclose(found.voltage_v, cells[3:])
+    later = read_cells(path, log.time_s + 0.25)
+    assert later is not None
+    assert np.isnan(later.voltage_v).all()
     del columns[headings.format(5)]
     write_table(columns, path)
     with pytest.raises(InputError, match="cell_5_v: the cells must be numbered"):

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 
 from cangauge.errors import InputError
@@ -15,52 +18,264 @@ from cangauge.logs.read import read_log
 ROWS = 600
 
 
-def table(path: Path, head: str, row: str, rows: int = ROWS) -> Path:
-    """Write a table whose rows are a format of their number `k`."""
-    lines = [row.format(k=k, ms=20 * k, us=20_000 * k, amps=k % 7) for k in range(rows)]
-    path.write_text("\n".join([head, *lines, ""]))
-    return path
+def read(folder: Path, head: str, rows: Iterable[str], columns: Any = None) -> Log:
+    """Read a table of a head and its rows."""
+    path = folder / "t.csv"
+    path.write_text("\n".join([head, *rows, ""]))
+    return read_log(path, columns=columns)
+
+
+def rows_of(row: str, rows: int = ROWS) -> list[str]:
+    """Return rows by a format of their number `k`, of ms, µs and amps."""
+    return [row.format(k=k, ms=20 * k, us=20_000 * k, amps=k % 7) for k in range(rows)]
+
+
+# ---- units
 
 
 @pytest.mark.parametrize(("heading", "cell"), [("TimeMS", "{ms}"), ("TimeUS", "{us}")])
 def test_a_time_of_milliseconds_or_microseconds_by_its_name(
     tmp_path: Path, heading: str, cell: str
 ) -> None:
-    path = table(tmp_path / "t.csv", f"{heading},Current,Voltage,Temp", cell + ",{amps},360,20")
-    assert read_log(path).duration_s == pytest.approx(0.02 * (ROWS - 1))
+    log = read(tmp_path, f"{heading},Current,Voltage,Temp", rows_of(cell + ",{amps},360,20"))
+    assert log.duration_s == pytest.approx(0.02 * (ROWS - 1))
+
+
+@pytest.mark.parametrize(
+    ("columns", "second_s"),
+    [("time=Time:0.02", 0.02), ("time=Time[ms]:20", 0.02), ("time=Time[min]:0.5", 30.0)],
+)
+def test_a_factor_of_time_is_that_of_its_unit(
+    tmp_path: Path, columns: str, second_s: float
+) -> None:
+    log = read(tmp_path, "Time,Current,Voltage,Temp", rows_of("{k},{amps},360,20"), columns)
+    assert log.time_s[1] == pytest.approx(second_s)
 
 
 def test_a_unit_in_the_cells_of_one_probe_is_not_that_of_the_other(tmp_path: Path) -> None:
-    path = table(tmp_path / "t.csv", "time [s],current [A],voltage [V],T1,T2",
-                 "{k},{amps},360,20 °C,68 °F")  # fmt: skip
+    head = "time [s],current [A],voltage [V],T1,T2"
     with pytest.raises(InputError):
-        read_log(path, columns="temperature=T1+T2")
+        read(tmp_path, head, rows_of("{k},{amps},360,20 °C,68 °F"), "temperature=T1+T2")
 
 
-def test_a_canonical_time_that_wraps_is_not_replaced_by_another_column(tmp_path: Path) -> None:
-    path = tmp_path / "t.csv"
-    head = "time_s,current_a,voltage_v,temperature_c,timestamp"
-    lines = [f"{k % 300},{k % 7},360,20,{1.7e9 + k}" for k in range(ROWS)]
-    path.write_text("\n".join([head, *lines, ""]))
-    with pytest.raises(InputError, match="runs backwards at row 301"):
-        read_log(path)
+@pytest.mark.parametrize(
+    ("heads", "columns", "mean_c"),
+    [
+        ("T1 [°C],T2 [°F]", "temperature=T1+T2", None),
+        ("T1,T2 [K]", "temperature=T1+T2", None),
+        ("T1 [°C],T2", "temperature=T1+T2", 44.0),
+        ("T1 [°C],T2 [C]", "temperature=T1+T2", 44.0),
+        ("T1 [°F],T2 [°F]", "temperature=T1+T2", 20.0 / 3.0),
+        ("T1 [°C],T2 [°F]", "temperature=T1+T2[°F]", 20.0 / 3.0),
+    ],
+)
+def test_probes_that_the_user_joins_have_one_unit(
+    tmp_path: Path, heads: str, columns: str, mean_c: float | None
+) -> None:
+    head, rows = f"Time,Current,Voltage,{heads}", rows_of("{k},{amps},360,20,68")
+    if mean_c is None:
+        with pytest.raises(InputError, match="the headings have different units"):
+            read(tmp_path, head, rows, columns)
+    else:
+        np.testing.assert_allclose(read(tmp_path, head, rows, columns).temperature_c, mean_c)
+
+
+@pytest.mark.parametrize(
+    ("heading", "columns", "is_read"),
+    [
+        ("Current", "current=Current[mA]", True),
+        ("Current", "current=Current", True),
+        ("Current [A]", "current=Current [A][mA]", True),
+        ("Current", "current=Current[A]", False),
+        ("Current", {"current": {"heading": "Current", "unit": "A"}}, False),
+        ("Current [A]", None, False),
+    ],
+)
+def test_a_stated_unit_must_be_that_of_the_cells(
+    tmp_path: Path, heading: str, columns: Any, is_read: bool
+) -> None:
+    head, rows = f"time [s],{heading},voltage [V],temp [°C]", rows_of("{k},{amps}000 mA,360,20")
+    if is_read:
+        log = read(tmp_path, head, rows, columns)
+        np.testing.assert_allclose(log.current_a, np.arange(ROWS) % 7)
+    else:
+        with pytest.raises(InputError, match=r"cells have another unit than the heading .got 'mA"):
+            read(tmp_path, head, rows, columns)
+
+
+def test_cells_of_two_units_are_refused(tmp_path: Path) -> None:
+    rows = [*rows_of("{k},{amps} A,360 V,20", 59), "59,500 mA,360 V,20"]
+    with pytest.raises(InputError, match=r"Current: row 1 is not a number .got '0 A'"):
+        read(tmp_path, "Time,Current,Voltage,Temp", rows)
+
+
+def test_a_row_of_units_can_show_that_a_heading_is_another_quantity(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="no plain heading of time"):
+        read(tmp_path, "t,Current,Voltage\n°C,A,V", rows_of("{k},{amps},360"))
+
+
+@pytest.mark.parametrize("unit", ["s", "ms", "us", "ns"])
+@pytest.mark.parametrize("kind", [pa.timestamp, pa.duration])
+def test_arrow_times_have_their_own_unit(kind: Any, unit: str) -> None:
+    per_second = {"s": 1, "ms": 10**3, "us": 10**6, "ns": 10**9}[unit]
+    counts = pa.array(per_second * np.arange(60), pa.int64())
+    columns = {"current": np.arange(60.0) % 7, "voltage": np.full(60, 360.0)}
+    frame = pa.table({"time": counts.cast(kind(unit)), **columns})
+    log = Log.from_dataframe(frame, temperature_c=20.0)
+    np.testing.assert_array_equal(log.time_s, np.arange(60.0))
+
+
+def test_a_factor_states_the_sign(tmp_path: Path) -> None:
+    head = "Time,Current,Voltage,Temp"
+    rows = [f"{k},{50 * (k % 2)},{360 - 5 * (k % 2)},20" for k in range(60)]
+    log = read(tmp_path, head, rows, "current=Current:-1")
+    assert log.current_a.min() == -50.0
+    assert any(text.startswith("current looks inverted and was kept") for text in log.remarks)
+    assert read(tmp_path, head, rows, "current=Current:0.5").current_a.max() == 25.0
+
+
+# ---- the choice of columns
+
+
+@pytest.mark.parametrize("columns", ["current=A+B", "voltage=Voltage+A,current=B", "soc=A+B"])
+def test_only_times_and_temperatures_are_joined(tmp_path: Path, columns: str) -> None:
+    with pytest.raises(InputError, match="no column has this heading"):
+        read(tmp_path, "Time,A,B,Voltage,Temp", rows_of("{k},{amps},5,360,20"), columns)
 
 
 @pytest.mark.parametrize("name", ["time_s", "current_a", "soc_pct"])
 def test_doubled_canonical_names_are_refused(tmp_path: Path, name: str) -> None:
     head = f"time_s,current_a,voltage_v,temperature_c,soc_pct,{name}"
-    path = table(tmp_path / "t.csv", head, "{k},{amps},360,20,50,{k}")
     with pytest.raises(InputError, match=name):
-        read_log(path)
+        read(tmp_path, head, rows_of("{k},{amps},360,20,50,{k}"))
     columns = [np.arange(9.0)] * 6
     with pytest.raises(InputError, match=name):
         Log.from_dataframe(pa.Table.from_arrays(list(map(pa.array, columns)), head.split(",")))
 
 
+@pytest.mark.parametrize("kind", ["csv", "parquet", "frame"])
+@pytest.mark.parametrize(
+    ("head", "words"),
+    [
+        ("time_s,current_a,voltage_v,temperature_c,Voltage_V", "2 columns have this name"),
+        ("Time [s],Current [A],Voltage [V],Temp [C],Voltage [V]", "no plain heading of voltage"),
+        ("Time [s],Current [A],Voltage [V],Temp [C],Temp [C]", "holds no temperature"),
+        ("Time [s],Current [A],Voltage [V],Temp [C],Time [s]", "2 columns have this name"),
+        ("Time [s],Current [A],Voltage [V],Temp [C],x,x", ""),
+        ("time_s,current_a,voltage_v,temperature_c,x,x", ""),
+    ],
+)
+def test_doubled_headings_never_choose_a_column(
+    tmp_path: Path, kind: str, head: str, words: str
+) -> None:
+    headings = head.split(",")
+    values = [np.arange(60.0), np.arange(60.0) % 7.0, np.full(60, 360.0), np.full(60, 20.0)]
+    values += [np.full(60, 300.0)] * (len(headings) - 4)
+    frame = pa.Table.from_arrays([pa.array(each) for each in values], headings)
+
+    def log() -> Log:
+        if kind == "frame":
+            return Log.from_dataframe(frame)
+        if kind == "parquet":
+            pq.write_table(frame, tmp_path / "t.parquet")
+            return read_log(tmp_path / "t.parquet")
+        rows = [",".join(map(str, row)) for row in zip(*values, strict=True)]
+        return read(tmp_path, head, rows)
+
+    if words and not (kind == "csv" and headings[0] == headings[-1]):
+        with pytest.raises(InputError, match=words):
+            log()
+    elif words:  # in a text the first time is taken: it increases
+        assert log().duration_s == 59.0
+    else:
+        assert log().voltage_v[0] == 360.0
+        assert "2 other columns ignored: x, x" in log().remarks
+
+
+def test_a_canonical_time_that_wraps_is_not_replaced_by_another_column(tmp_path: Path) -> None:
+    head = "time_s,current_a,voltage_v,temperature_c,timestamp"
+    rows = [f"{k % 300},{k % 7},360,20,{1.7e9 + k}" for k in range(ROWS)]
+    with pytest.raises(InputError, match="runs backwards at row 301"):
+        read(tmp_path, head, rows)
+
+
+def test_a_time_of_something_else_replaces_none(tmp_path: Path) -> None:
+    rows = [f"{k % 30},{k},{k % 7},360,20" for k in range(60)]
+    with pytest.raises(InputError, match="runs backwards at row 31"):
+        read(tmp_path, "Time [s],Charge Time [s],Current,Voltage,Temp", rows)
+
+
+@pytest.mark.parametrize(
+    "head",
+    ["Test Time [s],Time [ms],Current,Voltage,Temp",
+     "Test Time,Time,Current,Voltage,Temp\ns,ms,A,V,degC"],
+)  # fmt: skip
+def test_a_time_that_wraps_is_replaced_by_another_in_its_own_unit(
+    tmp_path: Path, head: str
+) -> None:
+    log = read(tmp_path, head, [f"{k % 30},{20 * k},{k % 7},360,20" for k in range(60)])
+    np.testing.assert_allclose(log.time_s, 0.02 * np.arange(60))
+    log = read(tmp_path, head, [f"{k},{20 * k},{k % 7},360,20" for k in range(60)])
+    np.testing.assert_array_equal(log.time_s, np.arange(60.0))
+
+
+# ---- rows
+
+
 def test_rows_in_errors_are_those_of_the_file(tmp_path: Path) -> None:
-    path = tmp_path / "t.csv"
-    head = "time_s,current_a,voltage_v,temperature_c"
     stamps = [(k if k < 60 else k - 30) // 5 for k in range(100)]  # each second logged five times
-    path.write_text("\n".join([head, *(f"{at},1,360,20" for at in stamps), ""]))
     with pytest.raises(InputError, match="row 61"):
-        read_log(path)
+        read(
+            tmp_path, "time_s,current_a,voltage_v,temperature_c", [f"{t},1,360,20" for t in stamps]
+        )
+
+
+def test_a_first_row_without_a_time_is_a_row(tmp_path: Path) -> None:
+    head, rows = "Time,Current,Voltage,Temp", [",1,360,20", *rows_of("{k},{amps},360,20", 59)]
+    log = read(tmp_path, head, rows)
+    assert any("1 row without time" in text and "is row 1)" in text for text in log.remarks)
+    with pytest.raises(InputError, match="row 61 is not a number"):
+        read(tmp_path, head, [*rows, "59,x,360,20"])
+
+
+def test_held_temperature_begins_with_its_first_value(tmp_path: Path) -> None:
+    rows = [
+        f"{k},,380,\n{k}.4,{k % 3},,\n{k}.5,,,{20 + k / 10 if k > 4 else ''}" for k in range(20)
+    ]
+    log = read(tmp_path, "Time,Current,Voltage,Temp", rows)
+    assert log.temperature_c[:8].tolist() == [20.5] * 7 + [20.6]
+
+
+def test_a_history_may_have_rows_without_an_entity(tmp_path: Path) -> None:
+    each = ["battery_current,{k}", "battery_voltage,380", "battery_temperature,20", ",7"]
+    rows = [f"{row.format(k=k)},2024-03-01T00:00:{k:02d}Z" for k in range(60) for row in each]
+    assert len(read(tmp_path, "entity_id,state,last_changed", rows)) == 60
+
+
+# ---- zones
+
+
+def test_dates_without_a_time_have_their_zone(tmp_path: Path) -> None:
+    rows = [f"2024-03-01+00:{59 - k:02d},{k % 7},360,20" for k in range(60)]
+    log = read(tmp_path, "Date,Current,Voltage,Temp", rows)
+    assert log.assumed[0] == 'time = "Date" [date with zone]'
+    np.testing.assert_array_equal(log.time_s, 1_709_251_200.0 + 60.0 * (np.arange(60) - 59.0))
+
+
+def test_offsets_of_dates_are_taken_into_account(tmp_path: Path) -> None:
+    stamps = ["2024-03-31T01:59:58+01:00", "2024-03-31T01:59:59+0100", "2024-03-31T03:00:00+02"]
+    rows = [f"{stamp},{amps},380,20" for stamp, amps in zip(stamps, (1, 2, 3), strict=True)]
+    log = read(tmp_path, "Time,Current,Voltage,Temp", rows)
+    np.testing.assert_array_equal(log.time_s, 1_711_846_798.0 + np.arange(3.0))
+    assert "date with zone" in log.assumed[0]
+
+
+@pytest.mark.parametrize("mark", [" ", ","])
+def test_local_dates_of_a_zone_are_seconds_since_1970(tmp_path: Path, mark: str) -> None:
+    """In spring an hour is missing: it is no gap of the log."""
+    heading = "Day,Clock" if mark == "," else "Stamp"
+    stamps = ["2024-03-31 01:59:58", "2024-03-31 01:59:59", "2024-03-31 03:00:00"]
+    rows = [f"{stamp.replace(' ', mark)},{k},360,20" for k, stamp in enumerate(stamps)]
+    columns = f"time={heading.replace(',', '+')}[Europe/Berlin]"
+    log = read(tmp_path, f"{heading},Current,Voltage,Temp", rows, columns)
+    np.testing.assert_array_equal(log.time_s, 1_711_846_798.0 + np.arange(3.0))

@@ -9,6 +9,7 @@ import can
 import pytest
 
 from cangauge.bus.publish import SocPublisher
+from cangauge.bus.recording import capture_samples
 from cangauge.bus.time_source import ClockFrames
 from cangauge.bus.vehicle import Vehicle
 from cangauge.errors import InputError
@@ -96,13 +97,17 @@ def test_several_replays_in_one_capture_are_refused(tmp_path: Path) -> None:
 
 
 @pytest.mark.real
-def test_samples_of_a_real_capture_are_counted_as_the_receiver_does(shared_data: Path) -> None:
-    from cangauge.bus.recording import capture_samples  # noqa: PLC0415 - needs the real data
-
-    path = shared_data / "leaf_can" / "10bars.csv.gz"
-    vehicle = Vehicle.load("leaf_ze0")
+@pytest.mark.parametrize(
+    ("name", "preset"),
+    [("10bars.csv.gz", "leaf_ze0"), ("EV-CANeplus2.log.gz", "leaf_ze1_polled")],
+)
+def test_samples_of_a_real_capture_are_counted_as_the_receiver_does(
+    shared_data: Path, name: str, preset: str
+) -> None:
+    path, vehicle = shared_data / "leaf_can" / name, Vehicle.load(preset)
     steps = list(CaptureSource(path, vehicle).steps(loop=False))
     assert steps[-1].samples == len(capture_samples(path, vehicle))
+    # The clock goes ahead of them: also of a reply over ISO-TP.
     wanted = {each.frames[0].arbitration_id for each in steps if each.is_wanted}
     assert wanted == set(vehicle.wanted_ids)
 

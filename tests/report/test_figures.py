@@ -63,6 +63,7 @@ def test_estimate_plots_band_and_reference(drive: Log, identified: Identificatio
 def test_fit_plots_curve_and_residuals(identified: Identification) -> None:
     plot = identified.plot()
     (line,) = [each for each in plot.children[0].renderers if each.name == "pseudo-OCV"]
+    assert "measured, less drop" in names_drawn(plot.children[0])
     curve = line.data_source.data
     model = identified.voltage_model
     expected = model.pseudo_ocv(np.asarray(curve["x"], dtype=float))

@@ -1,18 +1,23 @@
-"""`cangauge run` and `cangauge replay`, each in a process of its own, over udp_multicast."""
+"""`cangauge run`, `replay` and `status` as commands, over udp_multicast."""
 
 from __future__ import annotations
 
+import json
 import os
 import re
 import signal
 import time
+import urllib.request
 import zlib
 from pathlib import Path
 
 import pytest
 
+from cangauge.bus.vehicle import Vehicle
 from cangauge.logs.canonical import write_log
-from live import Command, in_process, leaf_model_path, short_log
+from cangauge.service.offline import estimate_capture
+from cangauge.service.status_client import fetch_status
+from live import Command, in_process, leaf_model, leaf_model_path, short_log, waits
 
 MODEL = ("-m", leaf_model_path())
 
@@ -32,17 +37,73 @@ def log_path(tmp_path: Path) -> Path:
     return path
 
 
+def test_a_whole_run(bus: list[str], tmp_path: Path) -> None:
+    """By one configuration: bus, vehicle and ids of the replay are those of the service."""
+    log, sock = tmp_path / "drive.parquet", tmp_path / "status.sock"
+    write_log(short_log(120.0), log)
+    config = tmp_path / "run.toml"
+    config.write_text(
+        f'model = "{MODEL[1]}"\ninterface = "{bus[1]}"\nchannel = "{bus[3]}"\n'
+        'vehicle = "leaf_aze0"\ntime_source = "replay-clock"\nlog_format = "json"\n'
+        f'http = "127.0.0.1:0"\nstatus_socket = "{sock}"\n'
+        'record = "seen.log.gz"\nrecord_part_mb = 0.005\n'
+        f"bus_options = {{ port = {bus[5].partition('=')[2]} }}\n"
+        "ids = { soc_estimate = 0x4A0, soc_detail = 0x4A1, replay_clock = 0x4AF }\n"
+    )
+    service = Command("run", "--config", config, "--json")
+    service.wait_for("http.listening")
+    http_port = json.loads(service._stderr[-1])["port"]
+    service.wait_for("service.ready")
+    replayed = in_process("replay", log, "--config", config, "--speed", "max", "--json")
+    assert replayed.code == 0, replayed.err
+    assert replayed.json["acknowledged"] == replayed.json["samples"] == 1200
+    assert replayed.json["quantisation"]["current_a"] == 0.25  # a Leaf's step is 0.5 A
+    found = in_process("status", "--endpoint", sock, "--json")
+    assert found.json["samples"] == 1200
+    assert found.json["latency"]["count"] > 0
+    # Health and possible current are renewed once a second.
+    assert waits(lambda: "energy left" in in_process("status", "--endpoint", sock).out, 10.0)
+    shown = in_process("status", "--endpoint", sock).out
+    assert all(name in shown for name in ("capacity", "possible discharge, 10 s", "energy left"))
+    assert found.json["record"]["lost_frames"] == 0
+    with urllib.request.urlopen(f"http://127.0.0.1:{http_port}/metrics") as answer:
+        assert b"cangauge_samples_total 1200.0" in answer.read()
+    service.process.terminate()
+    ended = service.end(20.0)
+    assert ended.code == 0
+    assert not sock.exists()
+    told = {line["event"]: line["message"] for line in map(json.loads, ended.err.splitlines())}
+    assert {"http.listening", "service.ready", "status.changed"} <= told.keys()
+    assert "1200 samples, 0 lost, 0 CRC errors; last SoC " in told["service.stopped"]
+    assert ended.json["frames"]["lost"] == ended.json["rejects"]["crc_errors"] == 0
+    assert ended.json["estimate"]["soc_pct"] == pytest.approx(replayed.json["soc_pct"], abs=0.01)
+    assert ended.json["recording"] == str(tmp_path / "seen-0001.log.gz")
+    assert len(list(tmp_path.glob("seen-0001-*.log.gz"))) > 1
+    # Bit for bit: the recording, offline.
+    recorded = estimate_capture(
+        ended.json["recording"], Vehicle.load("leaf_aze0"), leaf_model(), clock_id=0x4AF
+    )
+    assert recorded.table.soc_pct.size == 1200
+    for name in ("time_s", "soc_pct", "soc_std_pct", "soc_newton_pct", "soc_coulomb_pct"):
+        assert ended.json["estimate"][name] == getattr(recorded.table, name)[-1], name
+    assert recorded.pack.report is not None
+    offline = json.loads(json.dumps(recorded.pack.report.to_dict()))
+    assert {name: ended.json[name] for name in offline} == offline
+
+
 @pytest.mark.skipif(not hasattr(signal, "SIGHUP"), reason="no SIGHUP on this system")
 def test_a_hangup_reads_the_configuration_again_and_an_interrupt_ends_the_service(
     bus: list[str], tmp_path: Path
 ) -> None:
     path = tmp_path / "car.toml"
     path.write_text("timeout_s = 1\n")
-    service = Command("run", *bus, *MODEL, "--config", path, "--json")
+    sock = tmp_path / "status.sock"
+    service = Command("run", *bus, *MODEL, "--config", path, "--status-socket", sock, "--json")
     service.wait_for("service.ready")
     path.write_text("timeout_s = [")
     service.process.send_signal(signal.SIGHUP)
     service.wait_for("config.refused")
+    assert waits(lambda: "not TOML" in str(fetch_status(sock)["config"]["problem"]), 5.0)
     path.write_text("timeout_s = 0.5\n")
     service.process.send_signal(signal.SIGHUP)
     service.wait_for("config.reloaded")
@@ -68,52 +129,66 @@ def test_an_interrupted_replay_says_how_far_it_came(bus: list[str], log_path: Pa
     assert 0 < ended.json["frames"] < 100
 
 
-@pytest.mark.parametrize(
-    ("arguments", "say"),
-    [
-        (["--interface", "socketcan", "--channel", "nosuch0"], "nosuch0|no SocketCAN"),
-        (["--interface", "carrier_pigeon"], "carrier_pigeon"),
-        (["--channel", "can7x"], "can7x"),
-        (["--interface", "pcan", "--channel", "PCAN_USBBUS1"], "pcan"),
-        (["--vehicle", "moped"], "moped"),
-        (["--bus-option", "fast"], "K=V"),
-    ],
-)
-@pytest.mark.parametrize("command", ["run", "replay"])
-def test_bad_options_of_both_commands(
-    log_path: Path, tmp_path: Path, command: str, arguments: list[str], say: str
-) -> None:
-    before = set(tmp_path.iterdir())
-    first = [*MODEL, "--record", tmp_path / "out.log"] if command == "run" else [log_path]
-    ended = in_process(command, *first, *arguments)
-    assert ended.code == 2
-    assert ended.out == ""
-    lines = ended.err.splitlines()
-    assert len(lines) == 1, ended.err
-    assert re.search(say, lines[0])
-    assert set(tmp_path.iterdir()) == before
+BAD_OPTIONS = [
+    (["--interface", "socketcan", "--channel", "nosuch0"], "nosuch0|no SocketCAN"),
+    (["--interface", "carrier_pigeon"], "carrier_pigeon"),
+    (["--channel", "can7x"], "can7x"),
+    (["--interface", "pcan", "--channel", "PCAN_USBBUS1"], "pcan"),
+    (["--vehicle", "moped"], "moped"),
+    (["--bus-option", "fast"], "K=V"),
+]
+"""Of both commands."""
+RUN, REPLAY = ["run", *MODEL, "--record", "out.log"], ["replay", leaf_model_path()]
 
 
 @pytest.mark.parametrize(
     ("arguments", "say"),
     [
+        *((RUN + bad, say) for bad, say in BAD_OPTIONS),
+        *((["replay", "drive.parquet", *bad], say) for bad, say in BAD_OPTIONS),
         (["run"], "--model"),
         (["run", "-m", "/nowhere/model.json"], "/nowhere/model.json"),
-        (["run", *MODEL, "--method", "magic"], "magic"),
-        (["run", *MODEL, "--initial-soc", "150"], "150"),
-        (["run", *MODEL, "--time-source", "sundial"], "sundial"),
-        (["run", *MODEL, "--config", "/nowhere/car.toml"], "/nowhere/car.toml"),
+        ([*RUN, "--method", "magic"], "magic"),
+        ([*RUN, "--initial-soc", "150"], "150"),
+        ([*RUN, "--time-source", "sundial"], "sundial"),
+        ([*RUN, "--config", "/nowhere/car.toml"], "/nowhere/car.toml"),
         (["run", *MODEL, "--record", "drive.asc"], r"drive\.asc"),
-        (["run", *MODEL, "--state", "/nowhere/s.json"], "/nowhere/s.json"),
+        ([*RUN, "--state", "/nowhere/s.json"], "/nowhere/s.json"),
+        ([*RUN, "--state", "out.log"], "--state: is another file of this service"),
         (["replay", "/nowhere/log.csv"], "/nowhere/log.csv"),
-        (["replay", leaf_model_path()], "not a known kind of log"),
-        (["replay", leaf_model_path(), "--speed", "fast"], "fast"),
-        (["replay", leaf_model_path(), "--speed", "0"], "--speed"),
+        (REPLAY, "not a known kind of log"),
+        ([*REPLAY, "--speed", "fast"], "fast"),
+        ([*REPLAY, "--speed", "0"], "--speed"),
     ],
 )
-def test_bad_input_is_one_line_and_exit_2(arguments: list[str], say: str) -> None:
+def test_bad_input_is_one_line_and_exit_2(
+    log_path: Path, monkeypatch: pytest.MonkeyPatch, arguments: list[str], say: str
+) -> None:
+    monkeypatch.chdir(log_path.parent)
     ended = in_process(*arguments)
-    assert ended.code == 2
-    assert ended.out == ""
-    assert len(ended.err.splitlines()) == 1, ended.err
+    assert (ended.code, ended.out, len(ended.err.splitlines())) == (2, "", 1), ended.err
     assert re.search(say, ended.err)
+    assert list(log_path.parent.iterdir()) == [log_path]
+
+
+@pytest.mark.parametrize(
+    ("text", "say"),
+    [
+        ('http = "0.0.0.0:9464"', "reachable from the network"),
+        ('dashboard = "here"', "HOST:PORT"),
+        ('http = "127.0.0.1:0"\nhttp_token_file = "/nowhere/token"', "/nowhere/token"),
+        ('status_socket = "/proc/x.sock"', "/proc/x.sock"),
+        ('record_keep_mb = 5\nrecord = "x.log"', "record_part_mb"),
+        ("record_part_mb = 0", "record_part_mb"),
+        ('log_level = "loud"', "log_level"),
+    ],
+)
+def test_what_cannot_be_served_is_one_line_and_exit_2(
+    bus: list[str], tmp_path: Path, text: str, say: str
+) -> None:
+    config = tmp_path / "run.toml"
+    config.write_text(f'log_format = "json"\n{text}\n')
+    ended = in_process("run", *bus, *MODEL, "--config", config)
+    assert (ended.code, ended.out, len(ended.err.splitlines())) == (2, "", 1), ended.err
+    assert say in ended.err
+    assert list(tmp_path.iterdir()) == [config]

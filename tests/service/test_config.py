@@ -7,8 +7,9 @@ from pathlib import Path
 
 import pytest
 
-from cangauge.bus.protection import GENERIC_RULE, E2eRule, ProtectionRule
+from cangauge.bus.publish import FrameIds
 from cangauge.errors import InputError
+from cangauge.estimation.power import PackLimits
 from cangauge.service.config import config_keys, load_config, reference
 from cangauge.service.setup import address_of, load_vehicle, pipeline_settings
 from live import in_process, leaf_model_path
@@ -39,6 +40,10 @@ def test_a_whole_file(tmp_path: Path) -> None:
         fd = false
         [ids]
         soc_estimate = 0x123
+        soc_health = 0x124
+        [limits]
+        min_voltage_v = 300
+        max_charge_a = 40
         """,
     )
     config = load_config(path)
@@ -48,8 +53,8 @@ def test_a_whole_file(tmp_path: Path) -> None:
     assert (address.interface, address.channel) == ("socketcan", "can3")
     assert dict(address.options) == {"bitrate": 500000, "fd": False}
     settings = pipeline_settings(config)
-    assert settings.ids.soc_estimate == 0x123
-    assert settings.ids.soc_detail == 0x5A1
+    assert settings.ids == FrameIds(soc_estimate=0x123, soc_health=0x124)
+    assert settings.estimator.limits == PackLimits(min_voltage_v=300.0, max_charge_a=40.0)
     assert settings.time_source == "replay-clock"
     assert settings.estimator.method == "newton"
     assert settings.estimator.initial_soc_pct == 81.5
@@ -92,6 +97,7 @@ def test_options_take_precedence_over_the_file(tmp_path: Path) -> None:
         ('model = "m"\ntimeout_s = 0', "timeout_s", "must be greater than 0"),
         ('model = "m"\n[ids]\nsoc_detail = 0x800', "ids.soc_detail", "2047"),
         ('model = "m"\ntimeout_s = nan', "timeout_s", "finite"),
+        ('model = "m"\n[limits]\nmin_voltage_v = -3', "limits.min_voltage_v", "at least 0"),
         ('vehicle = "generic"', "model", "is missing"),
         ("model = 3", "model", "must be a valid string"),
         ("model = ", None, "not TOML"),
@@ -135,64 +141,6 @@ def test_no_such_file() -> None:
         load_config("/nowhere/car.toml")
 
 
-def test_protection_and_checks_precede_the_vehicles(tmp_path: Path) -> None:
-    path = write(
-        tmp_path,
-        """
-        model = "leaf.json"
-        vehicle = "generic"
-        [messages.PACK_CURRENT]
-        protection = "e2e_05"
-        data_id = 0x1234
-        period_s = 0.05
-        [messages.0x401]
-        protection = "counter_of_mine"
-        [rules.counter_of_mine]
-        polynomial = 7
-        [checks.voltage]
-        lowest = 240
-        highest = 410
-        invalid_after = 7
-        [checks.temperature]
-        max_jump = 2
-        max_rate_per_s = 0.1
-        timeout_s = 3.5
-        """,
-    )
-    vehicle = load_vehicle(load_config(path))
-    assert vehicle.messages[0x400].rule == E2eRule("e2e_05", data_id=0x1234)
-    assert vehicle.messages[0x400].period_s == 0.05
-    assert vehicle.messages[0x401].rule == ProtectionRule(polynomial=7)
-    assert vehicle.messages[0x402].rule is GENERIC_RULE
-    checks = vehicle.voltage.checks
-    assert (checks.lowest, checks.highest, checks.invalid_after) == (240.0, 410.0, 7)
-    assert vehicle.temperature is not None
-    assert vehicle.temperature.checks.timeout_s == 3.5
-
-
-@pytest.mark.parametrize(
-    ("text", "field"),
-    [
-        ("[checks.voltage]\nlowest = 5\nhighest = 5", "checks.voltage"),
-        ("[checks.voltage]\nmax_jump = 5", "checks.voltage"),
-        ("[checks.volts]\nlowest = 5", "checks.volts"),
-        ("[checks.current]\nlowest = nan", "checks.current.lowest"),
-        ("[checks.current]\ninvalid_after = 0", "checks.current.invalid_after"),
-        ('[messages.PACK_CURRENT]\nprotection = "e2e_05"', "messages.PACK_CURRENT.data_id"),
-        ('[messages.PACK_CURENT]\nprotection = "leaf"', "messages.PACK_CURENT"),
-        ("[messages.PACK_CURRENT]\ndata_id = -1", "messages.PACK_CURRENT.data_id"),
-    ],
-)
-def test_errors_in_protection_and_checks_name_file_and_field(
-    tmp_path: Path, text: str, field: str
-) -> None:
-    path = write(tmp_path, f'model = "leaf.json"\n{text}\n')
-    with pytest.raises(InputError) as caught:
-        load_vehicle(load_config(path))
-    assert caught.value.field == field
-    assert field == "messages.PACK_CURENT" or caught.value.source == str(path)
-
-
 def test_the_interface_of_a_missing_bus_follows_from_its_name() -> None:
     waiting = load_config(None, {"model": "a.json", "channel": "can7", "wait_for_bus": True})
     assert str(address_of(waiting)) == "socketcan can7"
@@ -204,13 +152,13 @@ def test_the_interface_of_a_missing_bus_follows_from_its_name() -> None:
 
 def test_each_key_is_described_and_each_option_declared_once() -> None:
     keys = {key.name: key for key in config_keys()}
-    assert set(keys) > {"model", "ids.soc_estimate", "full_charge.voltage_v", "checks.voltage"}
+    assert set(keys) > {"model", "ids.soc_estimate", "full_charge.voltage_v"}
     assert all(key.text for key in keys.values())
     flags = [flag for key in keys.values() for flag in re.split(", ", key.option) if flag]
     assert len(flags) == len(set(flags))
     until = keys["until_idle_s"]
     assert (until.option, until.unit, until.bounds) == (
-        "--until-idle",
+        "",
         "s",
         "> 0, ≤ 1e+09",
     )
@@ -219,8 +167,8 @@ def test_each_key_is_described_and_each_option_declared_once() -> None:
 
 def test_an_error_of_an_option_names_it_as_it_is_written() -> None:
     with pytest.raises(InputError) as caught:
-        load_config(None, {"model": "m", "until_idle_s": -1.0})
-    assert caught.value.field == "--until-idle"
+        load_config(None, {"model": "m", "initial_soc_std": -1.0})
+    assert caught.value.field == "--initial-soc-std"
 
 
 def test_the_reference_page_is_generated_from_the_model(project: Path) -> None:

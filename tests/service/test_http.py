@@ -58,6 +58,7 @@ def test_status_and_health(http: Live, watched: Watched) -> None:
         time.monotonic(), watched.monitor.latest.status
     )
     http.on_snapshot(watched.monitor.latest)
+    assert waits(lambda: get(http.port, "/status")[0] == 200)  # it has just started before
     code, body, headers = get(http.port, "/status")
     assert (code, headers["Content-Type"]) == (200, "application/json")
     assert json.loads(body)["samples"] == 900

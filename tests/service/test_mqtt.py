@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -15,7 +16,7 @@ from typing import Any
 import pytest
 
 from cangauge.errors import InputError
-from cangauge.extras.live.addresses import MqttSettings, mqtt_settings
+from cangauge.extras.live.addresses import mqtt_options
 from cangauge.service.config import load_config
 from live import Command, leaf_model_path, waits
 from running import RunningService, free_port
@@ -133,6 +134,9 @@ def test_home_assistant_finds_sensors_and_states(
         assert kinds["energy_kwh"] == ("energy_storage", "kWh")
         assert kinds["status"] == ("enum", None)
         assert "initialising" in sensors["status"]["options"]
+        # An invalid SoC is unavailable; the current is not.
+        assert "'invalid'" in sensors["soc_pct"]["availability"][1]["value_template"]
+        assert len(sensors["current_a"]["availability"]) == 1
         late = Listener(broker)
         assert waits(lambda: "cangauge/bench/state" in late.retained)
         assert f"homeassistant/sensor/bench/{next(iter(sensors))}/config" in late.retained
@@ -155,6 +159,10 @@ def test_a_broker_that_goes_costs_no_sample(
         assert waits(lambda: listener.availability == "online", 10.0)
         assert waits(lambda: "soc_pct" in listener.state())
         assert "homeassistant/sensor/bench/soc_pct/config" in listener.latest
+        # The last will, of the process that publishes; another one takes its place.
+        os.kill(running.service._outputs[-1].pid, signal.SIGKILL)
+        assert waits(lambda: listener.availability == "offline")
+        assert waits(lambda: listener.availability == "online")
     assert rate == pytest.approx(20.0, rel=0.15)
     assert running.summary is not None
     assert running.summary["frames"]["lost"] == 0
@@ -171,9 +179,7 @@ def test_a_broker_that_hangs_delays_no_stop(tmp_path: Path, broker: Broker) -> N
     assert running.summary is not None
 
 
-def test_a_killed_service_is_offline_by_its_last_will(
-    tmp_path: Path, broker: Broker, listener: Listener
-) -> None:
+def test_a_killed_service_is_offline(tmp_path: Path, broker: Broker, listener: Listener) -> None:
     path = tmp_path / "run.toml"
     path.write_text(
         f'model = "{leaf_model_path()}"\ninterface = "virtual"\nchannel = "x"\n'
@@ -219,10 +225,10 @@ def test_password_and_tls_are_used(tmp_path: Path) -> None:
         broker.end()
 
 
-def settings_in(path: Path) -> MqttSettings:
+def options_in(path: Path) -> dict[str, Any]:
     config = load_config(path).mqtt
     assert config is not None
-    return mqtt_settings(config, "can0")
+    return mqtt_options(config, "can0")
 
 
 @pytest.mark.parametrize(
@@ -235,6 +241,7 @@ def settings_in(path: Path) -> MqttSettings:
         ('broker = "b"\npassword = "x"\n', "mqtt.password"),
         ('broker = "b"\npassword_file = "run.toml"\n', "mqtt.password_file"),
         ('broker = "b"\npassword_file = "short"\n', "mqtt.user"),
+        ('broker = "b"\ntls = true\nca_file = "short"\n', "mqtt.ca_file"),
     ],
 )
 def test_a_wrong_section_is_refused_by_key(tmp_path: Path, lines: str, field: str) -> None:
@@ -242,15 +249,19 @@ def test_a_wrong_section_is_refused_by_key(tmp_path: Path, lines: str, field: st
     path = tmp_path / "run.toml"
     path.write_text(f'model = "{leaf_model_path()}"\n[mqtt]\n{lines}')
     with pytest.raises(InputError) as caught:
-        settings_in(path)
+        options_in(path)
     assert caught.value.field == field
 
 
-def test_a_password_is_in_no_repr(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_defaults_and_a_password_that_is_in_no_repr(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setenv("CANGAUGE_MQTT_PASSWORD", PASSWORD)
     path = tmp_path / "run.toml"
-    path.write_text(f'model = "{leaf_model_path()}"\n[mqtt]\nbroker = "b"\nuser = "u"\n')
-    config = load_config(path)
-    settings = settings_in(path)
-    assert settings.password == PASSWORD
-    assert PASSWORD not in repr(settings) + repr(config)
+    for lines, port in (("", 1883), ("tls = true\n", 8883), ("port = 7\n", 7)):
+        path.write_text(f'model = "{leaf_model_path()}"\n[mqtt]\nbroker = "b"\nuser = "u"\n{lines}')
+        options = options_in(path)
+        assert options["port"] == port
+        assert options["password"] == PASSWORD
+        assert re.fullmatch(r"cangauge_[A-Za-z0-9_-]+_can0", options["device"])
+        assert PASSWORD not in repr(load_config(path))

@@ -13,10 +13,9 @@ from cangauge.errors import InputError
 from cangauge.estimation.offline import run_estimator, samples_of
 from cangauge.estimation.settings import EstimatorSettings
 from cangauge.logs.log import Log
-from cangauge.replay.encoder import FrameEncoder
 from cangauge.service.pipeline import Pipeline, PipelineSettings
 from cangauge.types import Estimate
-from live import leaf_model, quantized, short_log
+from live import frames_of, leaf_model, quantized, short_log
 
 START = EstimatorSettings(initial_soc_pct=80.0)
 
@@ -24,14 +23,6 @@ START = EstimatorSettings(initial_soc_pct=80.0)
 @pytest.fixture(scope="module")
 def log() -> Log:
     return short_log(150.0)
-
-
-def frames_of(log: Log, vehicle: Vehicle, shift_s: float = 0.0) -> list[can.Message]:
-    encoder = FrameEncoder(vehicle)
-    frames = []
-    for sample in samples_of(log):
-        frames += encoder.encode(sample._replace(time_s=sample.time_s + shift_s))
-    return frames
 
 
 def with_clock(frames: list[can.Message]) -> list[can.Message]:

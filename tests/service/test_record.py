@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import errno
 import os
 import signal
@@ -16,29 +17,32 @@ import numpy as np
 import pytest
 
 from cangauge.bus.captures import all_parts, open_capture, parts_of_run
+from cangauge.bus.time_source import ClockFrames
 from cangauge.bus.vehicle import Vehicle
 from cangauge.errors import InputError
-from cangauge.estimation.offline import samples_of
-from cangauge.replay.encoder import FrameEncoder
 from cangauge.service import record
-from cangauge.service.offline import estimate_capture
-from cangauge.service.pipeline import Pipeline
+from cangauge.service.offline import RecordedEstimate, estimate_capture
+from cangauge.service.pipeline import Pipeline, PipelineSettings
 from cangauge.service.record import Recorder
 from cangauge.service.status_client import Snapshot
-from live import in_process, leaf_model, leaf_model_path, short_log, waits
+from cangauge.types import Estimate
+from live import frames_of, in_process, leaf_model, leaf_model_path, short_log, waits
 
 SNAPSHOT = Snapshot(0.0, {})
 
 
-def frames(seconds: float, begin_s: float = 1.7e9) -> list[can.Message]:
-    encoder = FrameEncoder(Vehicle.load("generic"))
-    found = []
-    for number, sample in enumerate(samples_of(short_log(seconds))):
-        for frame in encoder.encode(sample):
-            # Stamps to the microsecond and below, as a kernel gives them.
-            frame.timestamp = begin_s + sample.time_s + 1.234567e-4 * (number % 7)
-            frame.channel = "vcan0"
-            found.append(frame)
+@pytest.fixture(autouse=True)
+def _patient(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let a busy machine take its time to complete the recording."""
+    monkeypatch.setattr(record, "CLOSE_WITHIN_S", 30.0)
+
+
+def frames(seconds: float, begin_s: float = 1.7e9, preset: str = "generic") -> list[can.Message]:
+    """Return a drive's frames as a kernel stamps them: to the microsecond and below."""
+    found = frames_of(short_log(seconds), Vehicle.load(preset), begin_s)
+    for number, frame in enumerate(found):
+        frame.timestamp += 1.234567e-4 * (number % 7)
+        frame.channel = "vcan0"
     return found
 
 
@@ -58,28 +62,79 @@ def write(recorder: Recorder, messages: list[can.Message]) -> None:
     recorder.on_snapshot(SNAPSHOT)
 
 
-@pytest.mark.parametrize("suffix", [".log", ".log.gz"])
-def test_parts_are_one_capture_and_give_the_live_numbers(tmp_path: Path, suffix: str) -> None:
-    messages = frames(60.0)
-    pipeline = Pipeline(Vehicle.load("generic"), leaf_model())
+def live_and_recorded(
+    path: Path, messages: list[can.Message], pipeline: Pipeline, part_bytes: float | None = None
+) -> tuple[list[Estimate], Recorder]:
+    """Handle frames as the loop does; return the estimates and the closed recorder."""
     live = []
-    with Recorder(tmp_path / f"drive{suffix}", part_bytes=5_000) as recorder:
+    with Recorder(path, part_bytes) as recorder:
         for number, message in enumerate(messages):
             recorder.write(message)
-            if number % 100 == 0:
+            if part_bytes and number % 100 == 0:
                 recorder.on_snapshot(SNAPSHOT)
                 assert waits(recorder._worker._jobs.empty)
             if pipeline.handle(message):
                 live.append(pipeline.latest)
-    assert recorder.state is not None
-    assert (recorder.state.lost_frames, recorder.state.frames) == (0, len(messages))
-    assert recorder.written == tmp_path / f"drive-0001{suffix}"
-    assert len(parts_of_run(recorder.written)) >= 3
-    assert content(recorder.written) == expected(messages)
-    offline = estimate_capture(recorder.written, Vehicle.load("generic"), leaf_model()).table
-    for name in ("time_s", "soc_pct", "soc_std_pct", "residual_v"):
+        if pipeline.finish():
+            live.append(pipeline.latest)
+    return live, recorder
+
+
+def assert_same(recorded: RecordedEstimate, live: list[Estimate]) -> None:
+    """Bit for bit."""
+    assert len(live) == recorded.table.soc_pct.size > 0
+    for name in ("time_s", "soc_pct", "soc_std_pct", "soc_newton_pct", "residual_v"):
         numbers = np.array([getattr(each, name) for each in live])
-        assert np.array_equal(getattr(offline, name), numbers, equal_nan=True), name
+        assert np.array_equal(getattr(recorded.table, name), numbers, equal_nan=True), name
+
+
+@pytest.mark.parametrize(
+    ("suffix", "preset", "part_bytes"),
+    [(".log", "leaf_aze0", None), (".log.gz", "generic", None), (".log.gz", "generic", 5e3)],
+)
+def test_a_recording_gives_the_live_numbers(
+    tmp_path: Path, suffix: str, preset: str, part_bytes: float | None
+) -> None:
+    """With a clock that is set back, voltages that are missing, and a current at the end."""
+    messages = frames(90.0, preset=preset)
+    for message in messages[len(messages) // 2 :]:
+        message.timestamp -= 4000.0
+    messages = [m for n, m in enumerate(messages) if m.arbitration_id != 0x401 or n % 3]
+    pipeline, sent = Pipeline(Vehicle.load(preset), leaf_model()), expected(messages)
+    live, recorder = live_and_recorded(tmp_path / f"x{suffix}", messages, pipeline, part_bytes)
+    assert (recorder.state.lost_frames, recorder.state.frames) == (0, len(messages))
+    if part_bytes:
+        assert recorder.written == tmp_path / f"x-0001{suffix}"
+        assert len(parts_of_run(recorder.written)) >= 3
+    assert content(recorder.written) == sent
+    recorded = estimate_capture(recorder.written, Vehicle.load(preset), leaf_model())
+    assert_same(recorded, live)
+    assert np.isnan(recorded.recorded.voltage_v).any() == (preset == "generic")
+
+
+def test_a_recorded_replay_uses_the_logs_time(tmp_path: Path) -> None:
+    """Of two replays in a row each log is estimated separately."""
+    clock, messages = ClockFrames(), list[can.Message]()
+    for frame in frames_of(short_log(30.0)) * 2:
+        messages += [clock.at(round(frame.timestamp * 1e6)), copy.copy(frame)]
+    for number, message in enumerate(messages):
+        message.timestamp = 1.7e9 + 1e-4 * number
+    settings = PipelineSettings(time_source="replay-clock")
+    pipeline = Pipeline(Vehicle.load("generic"), leaf_model(), settings)
+    live, recorder = live_and_recorded(tmp_path / "replayed.log", messages, pipeline)
+    recorded = estimate_capture(recorder.written, pipeline.vehicle, leaf_model())
+    assert_same(recorded, live)
+    assert recorded.time_source == "replay-clock"
+    assert recorded.counts is not None
+    assert recorded.counts.beginnings == 1
+    assert recorded.table.time_s[:3].tolist() == [0.0, 0.1, 0.2]
+
+
+def test_a_capture_of_another_bus_is_refused(tmp_path: Path) -> None:
+    with Recorder(tmp_path / "other.log") as recorder:
+        recorder.write(can.Message(timestamp=1.0, arbitration_id=5, data=b"1"))
+    with pytest.raises(InputError, match="no sample"):
+        estimate_capture(recorder.written, Vehicle.load("generic"), leaf_model())
 
 
 def test_a_command_takes_the_name_of_a_run(tmp_path: Path) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import signal
 import time
 from pathlib import Path
@@ -20,7 +19,6 @@ from cangauge.types import Reason, Status
 from live import (
     Command,
     collect,
-    in_process,
     leaf_model_path,
     short_log,
     waits,
@@ -88,13 +86,3 @@ def test_killed_started_again_and_stopped(tmp_path: Path) -> None:
     # The seconds that starting took are counted by the mean current before: 10 s at 60 A are 0.3 %.
     assert ended.json["estimate"]["soc_pct"] == pytest.approx(kept_pct, abs=1.0)
     assert [each.name for each in tmp_path.iterdir()] == ["state.json"]
-
-
-def test_the_state_is_no_other_file_of_the_service(tmp_path: Path) -> None:
-    model, record = tmp_path / "model.json", tmp_path / "x.log"
-    model.write_bytes(leaf_model_path().read_bytes())
-    ended = in_process("run", "-m", model, "--state", record, "--record", record)
-    assert (ended.code, record.exists()) == (2, False)
-    assert "--state: is another file of this service" in ended.err
-    assert in_process("run", "-m", model, "--state", model).code == 2
-    assert json.loads(model.read_text())["format"] == "cangauge-model"

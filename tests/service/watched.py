@@ -7,13 +7,11 @@ from typing import Any
 
 from cangauge.bus.open import UNKNOWN_INTERFACE, BackendCapabilities
 from cangauge.bus.vehicle import Vehicle
-from cangauge.estimation.offline import samples_of
 from cangauge.estimation.settings import EstimatorSettings
-from cangauge.replay.encoder import FrameEncoder
 from cangauge.service.lifecycle import Notifier
 from cangauge.service.pipeline import Pipeline, PipelineSettings
 from cangauge.service.status import Monitor
-from live import leaf_model, short_log
+from live import frames_of, leaf_model, short_log
 
 
 @dataclass
@@ -52,11 +50,9 @@ class Watched:
 
     def drive(self, seconds: float) -> None:
         """Handle the frames of a drive, publishing as the loop does."""
-        encoder = FrameEncoder(Vehicle.load("generic"))
-        for sample in samples_of(short_log(seconds)):
-            for frame in encoder.encode(sample):
-                if self.pipeline.handle(frame):
-                    self.monitor.stepped(frame.timestamp, 30e-6, self.now_s)
+        for frame in frames_of(short_log(seconds)):
+            if self.pipeline.handle(frame):
+                self.monitor.stepped(frame.timestamp, 30e-6, self.now_s)
         self.pipeline.heartbeat()
 
     def turn(self, later_s: float = 1.0) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import doctest
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,7 +15,6 @@ from typer.testing import CliRunner
 from cangauge.errors import InputError
 from cangauge.extras.validation import simulate
 from cangauge.extras.validation.twin import simulation
-from cangauge.extras.validation.twin.drive import read_speed
 from cangauge.extras.validation.twin.faults import parse_effect
 from cangauge.extras.validation.twin.pack import TwinPack
 from cangauge.extras.validation.twin_command import twin_command
@@ -32,39 +32,42 @@ def run(*arguments: str) -> dict[str, object]:
     return found
 
 
-def test_log_is_canonical_and_repeatable(tmp_path: Path) -> None:
-    paths = [tmp_path / name for name in ("a.parquet", "b.csv")]
-    found = [run("--seed", "4", "--hours", "0.3", "-o", str(path)) for path in paths]
-    logs = [read_log(path) for path in paths]
-    assert found[0]["rows"] == len(logs[0])
-    assert np.array_equal(logs[0].voltage_v, logs[1].voltage_v)
-    assert logs[0].temperature_source == "pack"
-    assert found[0]["gap_v"] == 0.0
-    other = run("--seed", "5", "--hours", "0.3", "-o", str(tmp_path / "c.csv"))
-    assert other["capacity_ah"] != found[0]["capacity_ah"]
-
-
-def test_another_day_has_the_same_pack(tmp_path: Path) -> None:
-    first, second = (
-        run("--seed", "4", "--day", str(day), "--hours", "0.3", "-o", str(tmp_path / f"{day}.csv"))
-        for day in (1, 2)
-    )
-    assert first["capacity_ah"] == second["capacity_ah"]
-    assert first["true_soc_pct"] != second["true_soc_pct"]
-
-
-def test_effect_has_the_given_size_or_gap(tmp_path: Path) -> None:
-    common = ("--seed", "4", "--hours", "0.5", "--pack", "leaf24")
-    clean, offset = tmp_path / "clean.csv", tmp_path / "offset.csv"
-    run(*common, "-o", str(clean))
-    found = run(
-        *common, "--effect", "current_offset:offset_a=2",
-        "--effect", "hysteresis:gap_v=0.7,reach=0.02", "-o", str(offset),
+def test_the_command_writes_what_simulate_returns(tmp_path: Path) -> None:
+    arguments = (
+        "--seed", "4", "--day", "2", "--hours", "0.3", "--plant", "equation", "--pack", "leaf24",
+        "--effect", "current_offset:offset_a=4",
     )  # fmt: skip
-    sizes = {item["effect"]: item for item in found["effects"]}  # type: ignore[attr-defined]
+    paths = [tmp_path / name for name in ("a.parquet", "b.csv")]
+    found = [run(*arguments, "-o", str(path)) for path in paths]
+    simulated = simulate(
+        "current_offset:offset_a=4", seed=4, drive=2, hours=0.3, plant="equation", pack="leaf24"
+    )
+    assert simulated.to_dict().items() <= found[0].items()
+    for path in paths:
+        written = read_log(path)
+        assert written.temperature_source == "pack"
+        for name in ("time_s", "current_a", "voltage_v", "temperature_c", "soc_pct"):
+            assert np.array_equal(getattr(simulated.log, name), getattr(written, name))
+
+
+def test_another_drive_has_the_same_pack_and_another_seed_another() -> None:
+    first, second, other = (
+        simulate(seed=seed, drive=drive, hours=0.3).to_dict()
+        for seed, drive in ((4, 1), (4, 2), (5, 1))
+    )
+    assert first["capacity_ah"] == second["capacity_ah"] != other["capacity_ah"]
+    assert first["true_soc_pct"] != second["true_soc_pct"]
+    assert first["gap_v"] == 0.0
+
+
+def test_effect_has_the_given_size_or_gap() -> None:
+    common = {"seed": 4, "hours": 0.5, "pack": "leaf24"}
+    effects = ["current_offset:offset_a=2", "hysteresis:gap_v=0.7,reach=0.02"]
+    clean, found = simulate(**common), simulate(effects, **common)
+    sizes = {item["effect"]: item for item in found.to_dict()["effects"]}
     assert sizes["current_offset"]["value"] == 2.0
     assert sizes["hysteresis"]["shape"]["reach"] == 0.02
-    shift = read_log(offset).current_a - read_log(clean).current_a
+    shift = found.log.current_a - clean.log.current_a
     assert np.mean(shift) == pytest.approx(2.0, abs=0.02)
 
 
@@ -78,33 +81,27 @@ def test_soc_is_true_after_the_assumed_initial_soc() -> None:
     assert np.isfinite(start).sum() == 1
 
 
-def test_driving_schedule_is_followed(tmp_path: Path) -> None:
-    schedule = tmp_path / "speed.csv"
+def test_speed_is_followed() -> None:
     speed = np.concatenate((np.zeros(100), np.linspace(0, 20, 20), np.full(80, 20.0)))
-    rows = "\n".join(f"{t},{3.6 * v}" for t, v in enumerate(speed))
-    schedule.write_text(f"time,speed_kmh\n{rows}\n")
-    np.testing.assert_allclose(read_speed(schedule), speed, atol=1e-9)
-    log = simulate(seed=4, hours=0.2, speed_ms=read_speed(schedule)).log
+    log = simulate(seed=4, hours=0.2, speed_ms=speed).log
     standing = (log.time_s % 200 > 5) & (log.time_s % 200 < 95)
     pulling = (log.time_s % 200 > 105) & (log.time_s % 200 < 118)
     assert log.current_a[pulling].mean() > 5.0 * log.current_a[standing].mean()
 
 
-@pytest.mark.real
-def test_public_schedule_is_read(shared_data: Path) -> None:
-    speed = read_speed(shared_data / "drive_schedules" / "udds.csv")
-    assert speed.size == pytest.approx(1370, abs=3)
-    assert speed.max() == pytest.approx(25.3, abs=0.2)
+def test_full_discharge_gives_its_capacity() -> None:
+    """An end at 2.03 % SoC would not count as empty."""
+    full = simulate(seed=1, discharge=True, hours=1.0)
+    found = capacity_from_full_discharge([full.log], [None])
+    assert found == pytest.approx(full.plant.pack.capacity_ah, rel=0.01)
 
 
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
         (("-o", "x.txt"), "suffix"),
+        (("-o", "x.csv", "--seed", "-1"), "--seed"),
         (("-o", "x.csv", "--hours", "99"), "--hours"),
-        (("-o", "x.csv", "--start-soc", "nan"), "--start-soc"),
-        (("-o", "x.csv", "--start-soc", "40", "--end-soc", "60"), "end"),
-        (("-o", "x.csv", "--ambient-c", "90"), "ambient"),
         (("-o", "x.csv", "--pack", "tank"), "leaf24"),
         (("-o", "x.csv", "--effect", "gremlins"), "current_offset"),
         (("-o", "nowhere/x.csv"), "folder"),
@@ -118,6 +115,21 @@ def test_bad_usage_is_refused(
     assert isinstance(result.exception, InputError)
     assert message in str(result.exception)
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"hours": 99.0}, "hours"),
+        ({"start_soc_pct": float("nan")}, "start SoC"),
+        ({"start_soc_pct": 40.0, "end_soc_pct": 60.0}, "give a lower end"),
+        ({"ambient_c": 90.0}, "ambient"),
+        ({"plant": "pybamm"}, "use one of: twin, equation"),
+    ],
+)
+def test_a_value_out_of_range_is_refused(options: dict[str, Any], message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        simulate(seed=1, **options)
 
 
 @pytest.mark.parametrize(
@@ -139,37 +151,5 @@ def test_invalid_effect_is_refused(text: str, message: str, pack: TwinPack) -> N
         parse_effect(text, pack, seed=1, default_gap_v=1.0)
 
 
-def test_simulate_returns_what_the_command_writes(tmp_path: Path) -> None:
-    path = tmp_path / "log.parquet"
-    found = run(
-        "--seed", "4", "--hours", "0.2", "--effect", "current_offset:offset_a=4", "-o", str(path)
-    )  # fmt: skip
-    simulated = simulate("current_offset:offset_a=4", seed=4, hours=0.2)
-    written = read_log(path)
-    for name in ("time_s", "current_a", "voltage_v", "temperature_c", "soc_pct"):
-        assert np.array_equal(getattr(simulated.log, name), getattr(written, name))
-    assert simulated.to_dict().items() <= found.items()
-
-
 def test_example_of_simulate_runs() -> None:
     assert doctest.testmod(simulation) == (0, 3)
-
-
-@pytest.mark.parametrize(
-    "content",
-    ["", "time,speed\n", "time,speed\n0,1\n0,2\n", "time,speed\n0,1\n1,-2\n",
-     "time,speed\n0,1\n1,300\n", "time,speed\n0,a\n1,b\n", "only\n1\n2\n"],
-)  # fmt: skip
-def test_invalid_speed_trace_is_refused(content: str, tmp_path: Path) -> None:
-    path = tmp_path / "speed.csv"
-    path.write_text(content)
-    with pytest.raises(InputError, match=r"speed\.csv"):
-        read_speed(path)
-
-
-def test_full_discharge_gives_its_capacity(tmp_path: Path) -> None:
-    """An end at 2.03 % SoC would not count as empty."""
-    path = tmp_path / "full.parquet"
-    simulated = run("--seed", "1", "--discharge", "--hours", "1", "-o", str(path))
-    found = capacity_from_full_discharge([read_log(path)], [None])
-    assert found == pytest.approx(simulated["capacity_ah"], rel=0.01)

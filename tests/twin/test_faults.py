@@ -41,9 +41,8 @@ IN_SUITE = ("current_offset", "time_skew", "slow_diffusion", "hysteresis", "weak
 """A fault of each way to act; the others run in `make nightly`."""
 
 
-@pytest.fixture(scope="module")
-def demanding_drive(pack: TwinPack) -> Drive:
-    """A cold drive with pack heating and a stop at a charger: it shows every fault."""
+def demanding_drive_of(pack: TwinPack) -> Drive:
+    """Return a cold drive with pack heating and a stop at a charger: it shows every fault."""
     drawn = draw_drive(
         np.random.default_rng(8),
         pack,
@@ -64,6 +63,11 @@ def demanding_drive(pack: TwinPack) -> Drive:
 
 
 @pytest.fixture(scope="module")
+def demanding_drive(pack: TwinPack) -> Drive:
+    return demanding_drive_of(pack)
+
+
+@pytest.fixture(scope="module")
 def healthy(plant: TwinPlant, demanding_drive: Drive) -> GroundTruth:
     return simulate_truth(plant, demanding_drive)
 
@@ -77,9 +81,8 @@ def test_faults_of_the_library_are_complete() -> None:
 def test_fault_is_scaled_to_the_gap(
     fault_id: str, plant: TwinPlant, demanding_drive: Drive, healthy: GroundTruth
 ) -> None:
-    scaled = scale_to_gap(
-        plant, [demanding_drive], Fault(fault_id, 1.0, seed=2), WANTED_V, [healthy]
-    )
+    wanted = Fault(fault_id, 1.0, seed=2)
+    scaled = scale_to_gap(plant, demanding_drive, wanted, WANTED_V, healthy)
     assert not scaled.limited
     assert scaled.reached_v == pytest.approx(WANTED_V, rel=0.05)
     low, high = scaled.fault.kind.limits(plant.pack)
@@ -106,7 +109,7 @@ def test_fault_of_size_zero_changes_nothing(fault_id: str, pack: TwinPack) -> No
 def test_negative_fault_opens_the_opposite_gap(
     fault_id: str, plant: TwinPlant, demanding_drive: Drive, healthy: GroundTruth
 ) -> None:
-    scaled = scale_to_gap(plant, [demanding_drive], Fault(fault_id, 1.0), 0.2, [healthy])
+    scaled = scale_to_gap(plant, demanding_drive, Fault(fault_id, 1.0), 0.2, healthy)
     gaps = []
     for sign in (1.0, -1.0):
         condition = apply_faults(plant.pack, (scaled.fault.sized(sign * scaled.fault.size),))
@@ -209,7 +212,9 @@ def test_intermittent_is_active_for_its_share() -> None:
 
 def test_unreachable_gap_is_reported_as_limited(plant: TwinPlant, pack: TwinPack) -> None:
     gentle = draw_drive(np.random.default_rng(1), pack, hours=0.5, ambient_c=25.0, start_soc=0.9)
-    scaled = scale_to_gap(plant, [gentle], Fault("temperature_lag", 1.0), 5.0)
+    scaled = scale_to_gap(
+        plant, gentle, Fault("temperature_lag", 1.0), 5.0, simulate_truth(plant, gentle)
+    )
     assert scaled.limited
     assert scaled.reached_v < 1.0
 

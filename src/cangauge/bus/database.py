@@ -17,7 +17,6 @@ from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
 from typing import Final, Literal
-from xml.etree import ElementTree as ET
 
 import cantools.database
 import numpy as np
@@ -40,7 +39,6 @@ _NOT_A_VALUE = re.compile(
     re.IGNORECASE,
 )
 _FLOATS: Final = {16: "e", 32: "f", 64: "d"}
-_KINDS: Final = {".arxml": "arxml", ".kcd": "kcd", ".sym": "sym"}  # besides DBC
 
 # cantools warns on stderr of messages defined twice; `find_message` reports the wanted ones.
 logging.getLogger("cantools").addHandler(logging.NullHandler())
@@ -321,13 +319,12 @@ def _codes_of_no_value(signal: Signal) -> frozenset[int]:
 
 
 def load_dbc(path: str | PathLike[str]) -> Database:
-    """Read a DBC file, or an ARXML, KCD or SYM file by its suffix.
+    """Read a DBC file.
 
     Overlapping signals are accepted: many files have some in messages that are not wanted.
     Raises InputError if the file is absent, larger than `MAX_DBC_BYTES`, or not a DBC.
     """
     path = Path(path)
-    kind = _KINDS.get(path.suffix.lower(), "dbc")
     data = read_bounded(path, MAX_DBC_BYTES, "a DBC")
     if not data.strip():
         raise InputError("the DBC is empty", source=path)
@@ -336,19 +333,18 @@ def load_dbc(path: str | PathLike[str]) -> Database:
     except UnicodeDecodeError:
         text = data.decode("cp1252", errors="replace")  # the encoding that most tools write
     try:
-        database = cantools.database.load_string(text, kind, strict=False)
+        database = cantools.database.load_string(text, "dbc", strict=False)
     except (
-        cantools.Error, ET.ParseError, LookupError, ValueError, TypeError, ArithmeticError,
-        AttributeError,
+        cantools.Error, LookupError, ValueError, TypeError, ArithmeticError, AttributeError,
         AssertionError,  # a multiplexed signal without a multiplexer
         RecursionError,  # signals multiplexed in a circle
     ) as error:  # fmt: skip
         first_line = (str(error) or type(error).__name__).splitlines()[0][:160]
-        problem = f"not a {kind.upper()} file that can be read: {first_line}"
-        cure = f"open it in a {kind.upper()} editor, which names the error"
+        problem = f"not a DBC file that can be read: {first_line}"
+        cure = "open it in a DBC editor, which names the error"
         raise InputError(problem, source=path, cure=cure) from error
     if not isinstance(database, Database) or not database.messages:
-        raise InputError(f"the {kind.upper()} defines no messages", source=path)
+        raise InputError("the DBC defines no messages", source=path)
     return database
 
 

@@ -15,7 +15,6 @@ from cangauge.bus.plausibility import (
     MessageStatistics,
     PackProperties,
     SignalHealth,
-    StuckDetector,
     stuck_detectors,
 )
 from cangauge.bus.protection import FrameChecker, Verdict
@@ -41,10 +40,7 @@ class FrameStatistics:
 
     messages: dict[int, MessageStatistics] = field(default_factory=dict)  # by key, see `vehicle`
     frames: int = 0  # received, wanted or not
-    ignored: int = 0  # error frames and remote frames
     samples: int = 0
-    current_unpaired: int = 0  # samples without a voltage (NaN)
-    time_reversals: int = 0  # wanted frames stamped before the last used one of their message
 
     def __getattr__(self, name: str) -> int:
         """Return the total of a statistic of the messages."""
@@ -65,13 +61,12 @@ class Pairing:
     - When time runs backwards by more than `within_s`, waiting values are released likewise.
 
     A value completes at most one sample. Samples keep the order of their currents. All times are
-    bus time [s]; `statistics` counts the currents left unpaired.
+    bus time [s].
     """
 
-    def __init__(self, within_s: float, statistics: FrameStatistics | None = None) -> None:
+    def __init__(self, within_s: float) -> None:
         # Slightly more than stated: stamps 20 ms apart must pair in spite of rounding.
         self._within_s = within_s + 1e-6
-        self.statistics = statistics or FrameStatistics()
         self._waiting: Sample | None = None
         self._voltage_s = self._voltage_v = math.nan  # NaN: no voltage waits
 
@@ -98,52 +93,47 @@ class Pairing:
     def flush(self) -> Sample | None:
         """Release the waiting current, if any, as a sample without voltage."""
         waiting, self._waiting = self._waiting, None
-        self.statistics.current_unpaired += waiting is not None
         return waiting
 
 
 class CellVoltages:
-    """Latest voltage of each cell and its bus time [V, s]; NaN before the first plausible value.
-
-    `refused` counts values out of range.
-    """
+    """Voltages of the cells, each used once."""
 
     def __init__(self, signals: CellSignals) -> None:
-        self.signals = signals
-        self.voltage_v = [math.nan] * signals.count
-        self.time_s = [math.nan] * signals.count
-        self.refused = 0
-        self._before_s = [math.nan] * signals.count
+        self._signals = signals
+        self._forget()
+
+    def _forget(self) -> None:
+        self._voltage_v = [math.nan] * self._signals.count
+        self._time_s = [math.nan] * self._signals.count
 
     def take(self, now_s: float) -> tuple[list[float], list[float]]:
-        """Return voltages [V] and bus times [s] that are new since the last call and not old.
+        """Return voltages [V] and bus times [s] that came since the last call and are not old.
 
         The others are NaN.
         """
-        oldest_s, before_s = now_s - self.signals.timeout_s, self._before_s
-        self._before_s = list(self.time_s)
-        new = [
-            (v, t) if t >= oldest_s and t != before else (math.nan, math.nan)
-            for v, t, before in zip(self.voltage_v, self.time_s, before_s, strict=True)
-        ]
-        return [v for v, _ in new], [t for _, t in new]
+        oldest_s = now_s - self._signals.timeout_s
+        voltage_v, time_s = self._voltage_v, self._time_s
+        for place, at_s in enumerate(time_s):
+            if at_s < oldest_s:
+                voltage_v[place] = time_s[place] = math.nan
+        self._forget()
+        return voltage_v, time_s
 
     def read(
         self, cells: Sequence[tuple[int, SignalCodec]], payload: bytearray, time_s: float
     ) -> None:
         """Read the cells (place and codec of each) of a payload at bus time `time_s` [s]."""
-        shift, signals = 0, self.signals
+        shift, signals = 0, self._signals
         if signals.index is not None:
             shift = (signals.index.get(payload) - signals.first_index) * len(signals.cells)
         for place, codec in cells:
             at = place + shift
-            if not (0 <= at < signals.count and codec.is_in(payload)):
-                continue  # the last group may be filled up
-            volts = codec.decode(payload)
-            if signals.lowest_v <= volts <= signals.highest_v:
-                self.voltage_v[at], self.time_s[at] = volts, time_s
-            elif not math.isnan(volts):
-                self.refused += 1
+            # The last group may be filled up.
+            if 0 <= at < signals.count and codec.is_in(payload):
+                volts = codec.decode(payload)
+                if signals.lowest_v <= volts <= signals.highest_v:
+                    self._voltage_v[at], self._time_s[at] = volts, time_s
 
 
 class _Input(NamedTuple):
@@ -152,8 +142,6 @@ class _Input(NamedTuple):
     decode: Callable[[bytes | bytearray], float]
     is_present: Callable[[bytes | bytearray], bool] | None
     health: SignalHealth
-    is_current: bool
-    is_voltage: bool
 
 
 @dataclass(slots=True)
@@ -169,11 +157,45 @@ class _Route:
     last_s: float = -math.inf
     suspected_s: float = -math.inf  # the last sign of a second sender
 
-    def refuse(self, reason: Reason, *, is_repeated: bool = False) -> bytearray | None:
-        """Record a refused frame as a failure of each of its signals; return no payload."""
+    def accept(self, payload: bytearray, time_s: float) -> bytearray | None:
+        """Return the payload, cut to the message's length; None for a refused frame."""
+        statistics, checker = self.statistics, self.checker
+        statistics.wanted += 1
+        if len(payload) < self.length:
+            statistics.short += 1
+            self._refuse(Reason.PROTECTION_FAILED)
+            return None
+        if len(payload) > self.length:
+            payload = payload[: self.length]
+        verdict = _GOOD if checker is None else checker.check(payload, time_s)
+        if verdict is not _GOOD and checker is not None:
+            if verdict is Verdict.CRC_WRONG:
+                statistics.crc_errors += 1
+                self._refuse(Reason.PROTECTION_FAILED)
+                return None
+            if checker.suspects_second_sender:
+                self.suspected_s = time_s
+            if verdict is Verdict.REPEATED:
+                statistics.counter_repeats += 1
+                self._refuse(Reason.PROTECTION_FAILED, is_repeated=True)
+                return None
+            statistics.counter_jumps += 1
+            statistics.frames_lost += checker.lost
+        if self.is_suspected(time_s):
+            statistics.two_senders += 1
+            self._refuse(_DUPLICATE)
+            return None
+        self.last_s = time_s
+        return payload
+
+    def is_suspected(self, now_s: float) -> bool:
+        """Return whether it seems to have two senders; not after the clock was set far back."""
+        return abs(now_s - self.suspected_s) < SUSPECTED_FOR_S
+
+    def _refuse(self, reason: Reason, *, is_repeated: bool = False) -> None:
+        """Record a refused frame as a failure of each of its signals."""
         for signal in self.inputs:
             signal.health.fail(reason, is_repeated=is_repeated)
-        return None
 
 
 class SampleDecoder:
@@ -213,43 +235,35 @@ class SampleDecoder:
         self.vehicle = vehicle
         self.statistics = FrameStatistics() if statistics is None else statistics
         self.health: dict[str, SignalHealth] = {}
-        self.now_s = self._suspected_s = -math.inf
-        self._pairing = Pairing(vehicle.pair_within_s, self.statistics)
-        # In one frame: each is a sample by itself.
+        self.now_s = -math.inf
+        self._pairing = Pairing(vehicle.pair_within_s)
         current, voltage = vehicle.current, vehicle.voltage
         has_same_turn = current.codec.conditions == voltage.codec.conditions
-        self._is_paired = current.key == voltage.key and has_same_turn
+        self._is_one_frame = current.key == voltage.key and has_same_turn
         fixed_c = vehicle.fixed_temperature_c
         self._fixed_c = math.nan if fixed_c is None else fixed_c
         self._routes: dict[int, _Route] = {}
         messages = vehicle.messages.items()
         self._by_pgn = {key & pgn_mask(key): key for key, each in messages if each.by_pgn}
         self._replies = {reply_id(key): Reassembler() for key, each in messages if each.is_reply}
-        detectors: dict[str, StuckDetector] = {}
-        if pack is not None:
-            both = (vehicle.current, vehicle.voltage)
-            steps = [(2.0 * each.codec.half_step, each.checks.stuck_after_s) for each in both]
-            detectors["current"], detectors["voltage"] = stuck_detectors(pack, *steps)
         for signal in vehicle.signals:
-            self._add(signal, pack, detectors.get(signal.role))
+            self._add(signal, pack)
+        if pack is not None:
+            both = (current, voltage)
+            steps = [(2.0 * each.codec.half_step, each.checks.stuck_after_s) for each in both]
+            for signal, detector in zip(both, stuck_detectors(pack, *steps), strict=True):
+                self.health[signal.role].is_stuck = detector.update
         self.cells: CellVoltages | None = None
         if vehicle.cells is not None:
             self.cells = CellVoltages(vehicle.cells)
             for place, cell in enumerate(vehicle.cells.cells):
                 self._route(cell).cells.append((place, cell.codec))
-        for route in self._routes.values():
-            # Slow signals first: a sample uses the temperature of its own frame.
-            route.inputs.sort(key=lambda each: each.is_current + 2 * each.is_voltage)
+        self._current, self._voltage = self.health["current"], self.health["voltage"]
         self._temperature = self.health.get("temperature")
         health = self.health
         self._needed = [(health[role], why) for role, why in _MISSING.items() if role in health]
 
-    def _add(
-        self,
-        signal: VehicleSignal,
-        pack: PackProperties | None,
-        detector: StuckDetector | None,
-    ) -> None:
+    def _add(self, signal: VehicleSignal, pack: PackProperties | None) -> None:
         route, role = self._route(signal), signal.role
         is_multiplexed = bool(signal.codec.conditions)
         health = self.health[role] = SignalHealth(
@@ -257,15 +271,12 @@ class SampleDecoder:
             # A multiplexed signal is not in every frame of its message: its period is learned.
             None if is_multiplexed else self.vehicle.messages[signal.key].period_s,
             is_cyclic=role in {"current", "voltage"},
-            is_stuck=None if detector is None else detector.update,
             statistics=route.statistics,
         )
         if route.checker is not None and not is_multiplexed:
             route.checker.learned_period_s = lambda: health.period_s
         is_present = signal.codec.is_in if is_multiplexed else None
-        route.inputs.append(
-            _Input(signal.codec.decode, is_present, health, role == "current", role == "voltage")
-        )
+        route.inputs.append(_Input(signal.codec.decode, is_present, health))
 
     def _route(self, signal: VehicleSignal) -> _Route:
         key = signal.key
@@ -280,7 +291,6 @@ class SampleDecoder:
         """Decode one frame; return the sample that it completes, if any."""
         self.statistics.frames += 1
         if message.is_error_frame or message.is_remote_frame:
-            self.statistics.ignored += 1
             return None
         key, time_s, data = message.arbitration_id, message.timestamp, message.data
         if message.is_extended_id:
@@ -296,51 +306,26 @@ class SampleDecoder:
                     data = bytearray(reply)
             if route is None:
                 return None
-        payload = self._accept(route, data, time_s)
-        return None if payload is None else self._values(route, payload, time_s)
-
-    def _accept(self, route: _Route, payload: bytearray, time_s: float) -> bytearray | None:
-        """Return the payload, cut to the message's length; None for a refused frame."""
-        statistics, checker = route.statistics, route.checker
-        statistics.wanted += 1
-        if time_s < route.last_s:
-            self._rewind(route.last_s, time_s)
+        if time_s < route.last_s and route.last_s - time_s > self.vehicle.pair_within_s:
+            # A restarted log, or a clock that was set.
+            for health in self.health.values():
+                health.rewind(time_s)
         self.now_s = time_s
-        if len(payload) < route.length:
-            statistics.short += 1
-            return route.refuse(Reason.PROTECTION_FAILED)
-        if len(payload) > route.length:
-            payload = payload[: route.length]
-        verdict = _GOOD if checker is None else checker.check(payload, time_s)
-        if verdict is not _GOOD and checker is not None:
-            if verdict is Verdict.CRC_WRONG:
-                statistics.crc_errors += 1
-                return route.refuse(Reason.PROTECTION_FAILED)
-            if checker.suspects_second_sender:
-                route.suspected_s = self._suspected_s = time_s
-            if verdict is Verdict.REPEATED:
-                statistics.counter_repeats += 1
-                return route.refuse(Reason.PROTECTION_FAILED, is_repeated=True)
-            statistics.counter_jumps += 1
-            statistics.frames_lost += checker.lost
-        if _is_suspected(route.suspected_s, time_s):
-            statistics.two_senders += 1
-            return route.refuse(_DUPLICATE)
-        route.last_s = time_s
-        return payload
+        payload = route.accept(data, time_s)
+        return None if payload is None else self._values(route, payload, time_s)
 
     def _values(self, route: _Route, payload: bytearray, time_s: float) -> Sample | None:
         """Check the values of an accepted payload; return the sample that they complete."""
         if route.cells and self.cells is not None:
             self.cells.read(route.cells, payload, time_s)
         current_a = voltage_v = math.nan
-        for decode, is_present, health, is_current, is_voltage in route.inputs:
+        for decode, is_present, health in route.inputs:
             if is_present is not None and not is_present(payload):
                 continue
             value = health.update(decode(payload), time_s)
-            if is_current:
+            if health is self._current:
                 current_a = value
-            elif is_voltage:
+            elif health is self._voltage:
                 voltage_v = value
         sample: Sample | None = None
         if not math.isnan(current_a):
@@ -348,21 +333,12 @@ class SampleDecoder:
             if self._temperature is not None:
                 temperature_c = self._temperature.value_at(time_s)
             sample = Sample(time_s, current_a, voltage_v, temperature_c)
-            if self._is_paired:
-                self.statistics.current_unpaired += math.isnan(voltage_v)
-            else:
+            if not self._is_one_frame:
                 sample = self._pairing.current(sample)
-        elif not (math.isnan(voltage_v) or self._is_paired):
+        elif not (math.isnan(voltage_v) or self._is_one_frame):
             sample = self._pairing.voltage(time_s, voltage_v)
         self.statistics.samples += sample is not None
         return sample
-
-    def _rewind(self, last_s: float, time_s: float) -> None:
-        """Handle time that runs backwards: a restarted log, or a clock that was set."""
-        self.statistics.time_reversals += 1
-        if last_s - time_s > self.vehicle.pair_within_s:
-            for health in self.health.values():
-                health.rewind(time_s)
 
     def flush(self) -> Sample | None:
         """Return the last current, if it is unpaired, as a sample without voltage."""
@@ -375,7 +351,10 @@ class SampleDecoder:
 
         One without a further reason is old, never came, or is sent as "not available".
         """
-        reasons = _DUPLICATE if _is_suspected(self._suspected_s, now_s) else _NO_REASON
+        reasons = _NO_REASON
+        for route in self._routes.values():
+            if route.is_suspected(now_s):
+                reasons |= _DUPLICATE
         for health, missing in self._needed:
             if not health.is_usable(now_s):
                 reasons |= missing
@@ -386,25 +365,16 @@ class SampleDecoder:
     @property
     def is_voltage_implausible(self) -> bool:
         """Whether the newest voltage was refused as implausible."""
-        health = self.health.get("voltage")
-        return health is not None and health.is_implausible
+        return self._voltage.is_implausible
 
     @property
     def two_sender_messages(self) -> tuple[str, ...]:
         """Names of the messages that seem to have two senders at present."""
-        return tuple(
-            route.name
-            for route in self._routes.values()
-            if _is_suspected(route.suspected_s, self.now_s)
-        )
+        routes = self._routes.values()
+        return tuple(route.name for route in routes if route.is_suspected(self.now_s))
 
     @property
     def reference_soc_pct(self) -> float:
         """The car's own state of charge [%]; NaN without a usable one."""
         health = self.health.get("soc_reference")
         return math.nan if health is None else health.value_at(self.now_s)
-
-
-def _is_suspected(sign_s: float, now_s: float) -> bool:
-    """Return whether a sign of a second sender counts; not after the clock was set far back."""
-    return abs(now_s - sign_s) < SUSPECTED_FOR_S

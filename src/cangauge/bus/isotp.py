@@ -32,13 +32,9 @@ def reply_id(key: int) -> int:
 
 
 class Reassembler:
-    """Replies of one sender, from its frames.
-
-    `lost` counts replies given up: a frame missing, out of order or late.
-    """
+    """Replies of one sender, from its frames; lost are those with one missing, late or swapped."""
 
     def __init__(self) -> None:
-        self.lost = 0
         self._payload = bytearray()
         self._length = self._sequence = 0
         self._last_s = 0.0
@@ -49,18 +45,17 @@ class Reassembler:
             return None
         kind, low = data[0] >> 4, data[0] & 0x0F
         if kind == SINGLE:
-            self._give_up()
+            self._length = 0
             # CAN FD: the length is in the second byte.
             start, length = (2, data[1]) if low == 0 and len(data) > 8 else (1, low)
             return bytes(data[start : start + length]) if 0 < length <= len(data) - start else None
         if kind == FIRST and len(data) >= 2:
-            self._give_up()
             self._payload, length = bytearray(data[2:]), low << 8 | data[1]
             self._length = length if length > len(self._payload) else 0
             self._sequence, self._last_s = 1, time_s
         elif kind == CONSECUTIVE and self._length:
             if low != self._sequence & 0x0F or not 0.0 <= time_s - self._last_s <= LONGEST_GAP_S:
-                self._give_up()
+                self._length = 0
                 return None
             self._sequence, self._last_s = self._sequence + 1, time_s
             self._payload += data[1:]
@@ -68,10 +63,6 @@ class Reassembler:
                 reply, self._length = bytes(self._payload[: self._length]), 0
                 return reply
         return None
-
-    def _give_up(self) -> None:
-        self.lost += self._length > 0
-        self._length = 0
 
 
 @dataclass(frozen=True, slots=True)

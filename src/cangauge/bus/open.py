@@ -42,6 +42,7 @@ _DEFAULT_CHANNELS: Final = {
     "socketcan": "vcan0", "udp_multicast": MULTICAST_CHANNEL, "virtual": "cangauge",
 }  # fmt: skip
 _ON_SOCKETS: Final = {"socketcan", "udp_multicast"}
+_NEW_VCAN: Final = "sudo ip link add dev vcan0 type vcan; sudo ip link set vcan0 up"
 
 # Those of a missing library or a wrong option too (NameError: kvaser without canlib).
 _DRIVER_ERRORS: Final = (
@@ -105,8 +106,7 @@ def _guess_interface(channel: str | None) -> str:
     if channel is None or is_multicast(channel):
         return "udp_multicast"
     problem = "there is no such SocketCAN interface on this machine"
-    cure = "bring it up (sudo ip link add dev vcan0 type vcan; sudo ip link set vcan0 up),"
-    cure += " or name the interface too, e.g. --interface udp_multicast"
+    cure = f"bring it up ({_NEW_VCAN}), or name the interface too, e.g. --interface udp_multicast"
     raise InputError(problem, field="--channel", value=channel, cure=cure)
 
 
@@ -211,7 +211,9 @@ def _refusal(address: BusAddress, error: BaseException) -> InputError:
         problem, cure = "this bus is down", f"bring it up: sudo ip link set {channel} up"
     elif code in {errno.ENODEV, errno.ENXIO, errno.ENOENT}:
         problem = f"{interface} has no such bus"
-        cure = f"check the name{_socketcan_names()}" if interface == "socketcan" else "check it"
+        cure = "check it"
+        if interface == "socketcan":
+            cure = f"check the name (ip link lists them), or make one: {_NEW_VCAN}"
     elif code in {errno.EPERM, errno.EACCES}:
         problem = f"no permission to open this bus ({interface})"
         cure = "run as a user with that permission"
@@ -228,15 +230,6 @@ def _refusal(address: BusAddress, error: BaseException) -> InputError:
         cure = "check channel and --bus-option"
     name, value = ("--interface", interface) if of_interface else ("--channel", channel)
     return kind(problem, field=name, value=value, cure=cure)
-
-
-def _socketcan_names() -> str:
-    """Return the CAN interfaces of this machine, as the end of a cure."""
-    with suppress(OSError):
-        names = [name for _, name in socket.if_nameindex() if "can" in name]
-        if names:
-            return f"; existing: {', '.join(names)}"
-    return "; none is up: sudo ip link add dev vcan0 type vcan && sudo ip link set vcan0 up"
 
 
 # --- Capabilities

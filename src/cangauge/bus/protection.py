@@ -145,11 +145,13 @@ LIST_LENGTH: Final = 16
 
 
 class Profile(NamedTuple):
-    """Header layout of an E2E profile, and the library's functions for it."""
+    """Header layout of an E2E profile, and the library's functions for it.
+
+    The counter is the low half of a byte, or as many bytes as `modulus` needs, big-endian.
+    """
 
     header: int  # bytes
     counter_at: int  # first byte of the counter in the header
-    counter_bytes: int  # big-endian; 0: the low half of the byte
     modulus: int  # profiles 1 and 11 leave 15 out
     id_bits: int  # width of the data id; 0: a list of 16 bytes
     modes: Mapping[str, int]  # of the data id in the CRC, where there is a choice
@@ -161,13 +163,13 @@ _MODES_01: Final = {"both": p01.E2E_P01_DATAID_BOTH, "alternating": p01.E2E_P01_
                     "low": p01.E2E_P01_DATAID_LOW, "nibble": p01.E2E_P01_DATAID_NIBBLE}  # fmt: skip
 _MODES_11: Final = {"both": p11.E2E_P11_DATAID_BOTH, "nibble": p11.E2E_P11_DATAID_NIBBLE}
 PROFILES: Final = {
-    "e2e_01": Profile(2, 1, 0, 15, 16, _MODES_01, p01.e2e_p01_check, p01.e2e_p01_protect),
-    "e2e_02": Profile(2, 1, 0, 16, 0, {}, p02.e2e_p02_check, p02.e2e_p02_protect),
-    "e2e_04": Profile(12, 2, 2, 1 << 16, 32, {}, p04.e2e_p04_check, p04.e2e_p04_protect),
-    "e2e_05": Profile(3, 2, 1, 256, 16, {}, p05.e2e_p05_check, p05.e2e_p05_protect),
-    "e2e_06": Profile(5, 4, 1, 256, 16, {}, p06.e2e_p06_check, p06.e2e_p06_protect),
-    "e2e_07": Profile(20, 12, 4, 1 << 32, 32, {}, p07.e2e_p07_check, p07.e2e_p07_protect),
-    "e2e_11": Profile(2, 1, 0, 15, 16, _MODES_11, p11.e2e_p11_check, p11.e2e_p11_protect),
+    "e2e_01": Profile(2, 1, 15, 16, _MODES_01, p01.e2e_p01_check, p01.e2e_p01_protect),
+    "e2e_02": Profile(2, 1, 16, 0, {}, p02.e2e_p02_check, p02.e2e_p02_protect),
+    "e2e_04": Profile(12, 2, 1 << 16, 32, {}, p04.e2e_p04_check, p04.e2e_p04_protect),
+    "e2e_05": Profile(3, 2, 256, 16, {}, p05.e2e_p05_check, p05.e2e_p05_protect),
+    "e2e_06": Profile(5, 4, 256, 16, {}, p06.e2e_p06_check, p06.e2e_p06_protect),
+    "e2e_07": Profile(20, 12, 1 << 32, 32, {}, p07.e2e_p07_check, p07.e2e_p07_protect),
+    "e2e_11": Profile(2, 1, 15, 16, _MODES_11, p11.e2e_p11_check, p11.e2e_p11_protect),
 }
 """By name in a map file. Profiles 4 and 7 need CAN FD, the others fit into 8 bytes."""
 
@@ -188,12 +190,11 @@ class E2eRule:
     data_id_mode: DataIdMode = "both"
     header_byte: int = 0
     protected_bytes: int = 0
-    _profile: Profile = field(init=False, repr=False, compare=False)
     _data_id: int | bytes = field(init=False, repr=False, compare=False)
     _arguments: dict[str, Any] = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
-        name, profile = self.name, PROFILES[self.name]
+        name, profile = self.name, self._profile
         bits, modes = profile.id_bits, profile.modes or {"both": 0}
         least, protected = self.header_byte + profile.header, self.protected_bytes
         wanted = "data_id" if bits else "data_id_list"
@@ -217,9 +218,12 @@ class E2eRule:
         if profile.modes:
             arguments["data_id_mode"] = modes[self.data_id_mode]
         data_id = self.data_id if self.data_id_list is None else bytes(self.data_id_list)
-        object.__setattr__(self, "_profile", profile)
         object.__setattr__(self, "_data_id", data_id)
         object.__setattr__(self, "_arguments", arguments)
+
+    @property
+    def _profile(self) -> Profile:
+        return PROFILES[self.name]
 
     @property
     def modulus(self) -> int:
@@ -238,22 +242,23 @@ class E2eRule:
 
     def counter(self, data: bytes | bytearray) -> int:
         """Return the counter of a payload."""
-        profile = self._profile
-        place = self.header_byte + profile.counter_at
-        if not profile.counter_bytes:
-            return data[place] & 0x0F
-        return int.from_bytes(data[place : place + profile.counter_bytes], "big")
+        place, mask = self._counter_place()
+        return int.from_bytes(data[place], "big") & mask
 
     def protect(self, data: bytes | bytearray, counter: int) -> bytes:
         """Return the payload with header, counter (modulo its width) and CRC set."""
         profile, out = self._profile, bytearray(data)
-        place, counter = self.header_byte + profile.counter_at, counter % profile.modulus
-        if size := profile.counter_bytes:
-            out[place : place + size] = counter.to_bytes(size, "big")
-        else:
-            out[place] = out[place] & 0xF0 | counter
+        place, mask = self._counter_place()
+        word = int.from_bytes(out[place], "big") & ~mask | counter % profile.modulus
+        out[place] = word.to_bytes(place.stop - place.start, "big")
         profile.protect(out, self._data_id, increment_counter=False, **self._arguments)
         return bytes(out)
+
+    def _counter_place(self) -> tuple[slice, int]:
+        """Return the bytes of the counter, and its bits in them."""
+        mask = max(0x0F, self.modulus - 1)
+        first = self.header_byte + self._profile.counter_at
+        return slice(first, first + (mask.bit_length() + 7) // 8), mask
 
 
 Protection = ProtectionRule | CounterRule | E2eRule

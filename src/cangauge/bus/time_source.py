@@ -91,13 +91,13 @@ class StampLimiter:
     ----------
     offset_s : float
         Stamps, and so bus time, minus monotonic time [s]; NaN: known from the first frame.
-    shift_s, limited : float, int
-        Added to the stamps at present [s]; number of stamps replaced.
+    shift_s : float
+        Added to the stamps at present [s].
     """
 
     def __init__(self, tolerance_s: float, offset_s: float = math.nan) -> None:
         self._tolerance_s, self.offset_s = tolerance_s, offset_s
-        self.shift_s, self.limited = 0.0, 0
+        self.shift_s = 0.0
         # Of the first of replaced stamps in a row that are off by the same amount.
         self._off_s = self._off_since_s = math.nan
         self._unusable_since_s = self._unusable_s = -math.inf
@@ -129,7 +129,6 @@ class StampLimiter:
         if math.isnan(self.offset_s):
             self.offset_s = (stamp_s if abs(stamp_s) <= LATEST_S else 0.0) - now_s
             return now_s + self.offset_s
-        self.limited += 1
         if now_s - self._unusable_s >= CERTAIN_AFTER_S:
             self._unusable_since_s = now_s
         self._unusable_s = now_s

@@ -18,7 +18,7 @@ from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache, cached_property
 from importlib.resources import files
-from typing import Final
+from typing import Final, get_args
 
 import numpy as np
 from scipy.special import logsumexp
@@ -27,26 +27,19 @@ from cangauge._typing import FloatArray
 from cangauge.diagnosis.columns import PLACES
 from cangauge.diagnosis.evidence import Evidence, References
 from cangauge.diagnosis.trials import STEP
+from cangauge.model.effects.base import Group
+from cangauge.model.effects.library import LIBRARY
 
 NONE: Final = "none"
 UNKNOWN: Final = "unknown"
 
 GROUPS: Final[Mapping[str, tuple[str, ...]]] = {
-    "sensors_and_count": (
-        "current_offset", "current_gain", "voltage_offset", "voltage_gain", "capacity",
-        "initial_soc", "coulombic_efficiency",
-    ),
-    "overpotential": (
-        "resistance_temperature", "resistance_soc", "resistance_asymmetry", "resistance_step",
-        "charge_transfer", "fast_polarization", "slow_diffusion", "hysteresis",
-    ),
-    "clock": ("time_skew",),
-    "thermal": ("temperature_lag", "core_temperature", "entropic_coefficient"),
-    "weak_cell": ("weak_cell",),
-}  # fmt: skip
-"""Group → its effects: what an engineer would look at together."""
+    group: tuple(name for name, effect in LIBRARY.items() if effect.group == group)
+    for group in get_args(Group)
+}
+"""Group → its effects."""
 
-GROUP_OF: Final = {effect: group for group, effects in GROUPS.items() for effect in effects}
+GROUP_OF: Final = {name: effect.group for name, effect in LIBRARY.items()}
 
 TITLES: Final[Mapping[str, str]] = {
     "sensors_and_count": "the sensors and the count of charge",

@@ -15,6 +15,7 @@ import numpy as np
 from cangauge.errors import InputError
 from cangauge.logs.gaps import discharged_ah
 from cangauge.logs.log import Log
+from cangauge.model.coulomb_counting import soc_at_first_row
 from cangauge.model.model_file import Model
 
 SHORTEST_S: Final = 300.0
@@ -76,12 +77,12 @@ _MEASURED: Final = ("current_a", "voltage_v")
 def _check_count(log: Log, capacity_ah: float) -> None:
     """Raise InputError if no start explains a log whose counted SoC leaves 0–100 %."""
     out = 100.0 * discharged_ah(log.time_s, log.current_a) / capacity_ah
-    first = log.first_soc()
-    start = 50.0 if first is None else first[1] + float(out[first[0]])
+    stated = soc_at_first_row(log, capacity_ah)
+    start = 50.0 if stated is None else stated
     low, high = start - float(out.max()), start - float(out.min())
     within = low >= -COUNT_TOLERANCE_PCT and high <= 100.0 + COUNT_TOLERANCE_PCT
     too_much = high - low > MOST_COUNTED_PCT
-    if within or (first is None and not too_much):
+    if within or (stated is None and not too_much):
         return
     # As the SoC rises so does the voltage, whatever the start.
     backwards = np.corrcoef(-out, log.voltage_v)[0, 1] < 0.0

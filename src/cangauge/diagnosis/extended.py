@@ -56,7 +56,7 @@ _SIGNAL: Final[dict[str, Callable[[float, float], dict[str, float]]]] = {
 
 _SHAPES: Final[dict[str, Callable[[float, References], list[dict[str, float]]]]] = {
     "resistance_temperature": lambda b, known: [
-        {"activation_k": b, "delayed": 1.0, "reference_c": known.pack.mean_c, "lag_s": 0.0}
+        {"activation_k": b, "delayed": 1.0, "reference_c": known.pack.mean_c}
     ],
     "resistance_soc": lambda _, __: [
         {"width_pct": width, "delayed": 1.0} for width in (5.0, 10.0, 20.0, 40.0)
@@ -68,10 +68,10 @@ _SHAPES: Final[dict[str, Callable[[float, References], list[dict[str, float]]]]]
     ],
     "fast_polarization": lambda tau_s, _: [{"tau_s": min(tau_s, 9.0), "activation_k": 0.0}],
     "slow_diffusion": lambda tau_s, _: [
-        {"tau_s": max(tau_s, 70.0), "spread": 0.0, "activation_k": 0.0, "by_slope": 0.0}
+        {"tau_s": max(tau_s, 70.0), "activation_k": 0.0, "by_slope": 0.0}
     ],
     "hysteresis": lambda part, _: [{"travel_pct": 100.0 * part}],
-    "entropic_coefficient": lambda _, __: [{"lag_s": 0.0}],
+    "entropic_coefficient": lambda _, __: [{}],
     "weak_cell": lambda _, __: [
         {"deficit_pct": deficit} for deficit in (4.0, 7.0, 11.0, 16.0, 23.0, 33.0, 48.0)
     ],

@@ -14,9 +14,10 @@ from scipy.interpolate import PchipInterpolator
 from scipy.signal import lfilter
 
 from cangauge._typing import BoolArray, FloatArray
-from cangauge.logs.gaps import bridge_s, discharged_ah
+from cangauge.logs.gaps import bridge_s
 from cangauge.logs.log import Log
 from cangauge.logs.resample import dequantize
+from cangauge.model.coulomb_counting import soc_at_first_row
 
 KNOTS = np.array([-12, 0, 2, 4, 6, 8, 10, *range(15, 101, 5), 112], float)
 """SoC of the OCV's knots [%]: close where the curves of common chemistries bend."""
@@ -79,11 +80,9 @@ def trace(log: Log, capacity_ah: float, start_pct: float | None = None) -> Trace
     """
     log = dequantize(log)
     if start_pct is None:
-        first = log.first_soc()
-        if first is None:
-            raise ValueError("unknown SoC at the start")
-        moved_ah = discharged_ah(log.time_s, log.current_a)[first[0]]
-        start_pct = first[1] + 100.0 * float(moved_ah) / capacity_ah
+        start_pct = soc_at_first_row(log, capacity_ah)
+    if start_pct is None:
+        raise ValueError("unknown SoC at the start")
     steps_s = np.diff(log.time_s)
     gap = steps_s > bridge_s(log.time_s)
     steps_s = np.where(gap, np.minimum(steps_s, MEMORY_S), steps_s)

@@ -1,7 +1,7 @@
 """Samples → estimates.
 
 `estimator` is the entry: it counts charge (`counting`) on every sample and updates a filter of SoC
-hypotheses (`hypothesis_filter`, `ekf`) with the voltage. `settings` are the user's choices,
-`validity` defines samples, estimates and status, `state` what survives a restart, and `offline`
+hypotheses (`start`, `ekf`) with the voltage. `settings` are the user's choices,
+`validity` which samples count, `state` what survives a restart, and `offline`
 runs an estimator over a whole log.
 """

@@ -1,22 +1,20 @@
 """The estimator with its step in C, some hundred times as fast and within 1e-9 of Python's.
 
-`Estimator` is the reference. `CompiledEstimator` hands each sample to the extension `_core`; what
-is rare (health, power, states to save) reads the core's state into the reference. It is used
-wherever the extension was built at installation, live and offline, unless `CANGAUGE_PURE_PYTHON` is
-set.
+`Estimator` is the reference. `CompiledEstimator` hands each sample to the extension `_core`. The
+core's memory and an `EstimatorState` hold the same; what is rare (health, power) is computed by the
+reference, restored from that state. It is used wherever the extension was built at installation,
+live and offline, unless `CANGAUGE_PURE_PYTHON` is set.
 """
 
 from __future__ import annotations
 
 import logging
-import math
 import os
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
-from dataclasses import asdict
+from collections.abc import Sequence
+from dataclasses import fields
 from importlib import import_module
 from pathlib import Path
-from typing import Any, ClassVar, Final, cast
+from typing import Any, ClassVar, Final, TypeVar, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,7 +23,6 @@ from cangauge._core_digest import sources_digest
 from cangauge._logging import emit
 from cangauge._typing import FloatArray
 from cangauge.estimation import core_layout as layout
-from cangauge.estimation.cells import PackTick
 from cangauge.estimation.estimator import Estimator
 from cangauge.estimation.settings import EstimatorSettings
 from cangauge.estimation.state import (
@@ -33,6 +30,7 @@ from cangauge.estimation.state import (
     BlockState,
     ClockState,
     CounterState,
+    DelayLineState,
     EstimatorMemory,
     EstimatorState,
     FilterState,
@@ -41,7 +39,7 @@ from cangauge.estimation.state import (
 from cangauge.model.delay_line import BLOCK, SPACING_S
 from cangauge.model.effects.base import CoreForm
 from cangauge.model.model_file import Model
-from cangauge.types import REASONS, Estimate, Health, Power, Reason, Sample, Status
+from cangauge.types import REASONS, Estimate, Sample, Status
 
 _LOG = logging.getLogger(__name__)
 
@@ -67,6 +65,7 @@ def _load(root: Path) -> Any:
 
 
 _core: Final = _load(Path(__file__).parents[3])
+_State = TypeVar("_State")
 _LAG: Final = ("time_s", "input", "value")
 
 
@@ -108,7 +107,7 @@ class CompiledEstimator(Estimator):
         super().__init__(model, settings)
         longest_s = self._online.delay_line.longest_s
         self._forms = forms
-        self._over_soc = [effect.uses_soc for effect, _ in self._online.extended.effects]
+        self._is_over_soc = np.array([e.uses_soc for e, _ in self._online.extended.effects], bool)
         self._core: Any = _core.Core(
             layout.model_constants(model, self._online, forms, self.tests).tobytes(),
             layout.settings_constants(model, settings).tobytes(),
@@ -120,7 +119,7 @@ class CompiledEstimator(Estimator):
             REASONS,
         )
         self._record = self._part("state", layout.STATE)[0]
-        self._is_pulled = False
+        self._is_current = False
 
     def _part(self, name: str, of: np.dtype[Any]) -> NDArray[Any]:
         """Return the core's memory of a part; it lives as long as the core."""
@@ -129,7 +128,7 @@ class CompiledEstimator(Estimator):
     def update(self, sample: Sample) -> None:
         """Process one sample; see `Estimator.update`."""
         self.is_refused = not self._core.update(sample)
-        self._is_pulled = False
+        self._is_current = False
 
     def run(self, columns: Sequence[FloatArray]) -> list[NDArray[Any]]:
         """Process whole columns; return those of the estimates.
@@ -149,7 +148,7 @@ class CompiledEstimator(Estimator):
         found: list[NDArray[Any]] = [np.empty(rows) for _ in range(7)]
         found += [np.empty(rows, np.int64) for _ in range(2)]
         self._core.run((*given, *found))
-        self._is_pulled = False
+        self._is_current = False
         return found
 
     @property
@@ -157,91 +156,111 @@ class CompiledEstimator(Estimator):
         """The estimate after the latest sample; see `Estimator.estimate`."""
         return cast("Estimate", self._core.estimate())
 
-    @property
-    def health(self) -> Health:
-        """Capacity, resistance and current offset, with standard deviations."""
-        self._pull()
-        return super().health
-
     def uncounted_std_pct(self, seconds: float) -> float:
         """Return what the SoC's standard deviation lacks [%] when no sample came for a time [s]."""
         return float(self._core.uncounted_std_pct(seconds))
 
-    def pack_tick(self, sample: Sample) -> PackTick:
-        """Return what is known of the pack after its latest sample, for its cells."""
-        self._pull()
-        return super().pack_tick(sample)
-
-    def current_changes(self, time_s: float, stamps_s: Sequence[float]) -> list[float]:
-        """Return the current at a sample's time less that at other stamps [A]; NaN for NaN."""
-        now_a, at = self._core.current_at(0.0), self._core.current_at
-        return [each if math.isnan(each) else now_a - at(time_s - each) for each in stamps_s]
-
-    def power(self) -> Power:
-        """Return the currents possible for 10 s and the energy left, after the latest sample."""
-        self._pull()
-        self._pull_model()
-        return super().power()
-
-    def snapshot(self) -> EstimatorState:
-        """Return a copy of everything needed to continue as if not interrupted."""
-        self._pull()
-        self._pull_model()
-        return super().snapshot()
-
     def restore(self, state: EstimatorState, age_s: float = 0.0) -> Estimate:
         """Continue from a state of the same model; see `Estimator.restore`."""
-        with self._changed():
-            return super().restore(state, age_s)
+        latest = super().restore(state, age_s)
+        self._write()
+        return latest
 
     def take_over(self, before: Estimator) -> None:
         """Continue from another estimator; see `Estimator.take_over`."""
-        with self._changed():
-            super().take_over(before)
+        super().take_over(before)
+        self._write()
 
-    @contextmanager
-    def _changed(self) -> Iterator[None]:
-        """Let the reference change its own state, which the core then continues from."""
-        yield
-        self._push()
+    def snapshot(self) -> EstimatorState:
+        """Return a copy of everything needed to continue as if not interrupted."""
+        self._core.estimate()  # computes the latest one in the record
+        record = self._record
+        memory, latest = record["memory"], record["latest"]
+        innovations = memory["innovation2"][: memory["innovations"]].tolist()
+        line = self._part("line", layout.LINE)[0]
+        places = (line["first"] + np.arange(line["count"])) % line["size"]
+        currents = self._part("currents", layout.CURRENT)[places]
+        lags = record["low_pass"][: len(self._online.lags)]
+        effects = [self._effect_state(number) for number in range(len(self._forms))]
+        return EstimatorState.model_construct(
+            method=self.settings.method,
+            capacity_ah=self.capacity_ah,
+            clock=_read(ClockState, record["clock"]),
+            counter=_read(CounterState, record["counter"]),
+            line=DelayLineState(
+                currents["time_s"].tolist(), currents["current_a"].tolist(), float(line["since_s"])
+            ),
+            online=[_numbers(lags, _LAG), *effects],
+            block=self._block_state(),
+            hypotheses=self._hypotheses_state(),
+            memory=_read(EstimatorMemory, memory, innovations=innovations),
+            estimate=[float(latest[name]) for name in Estimate._fields[:7]],
+            reasons=int(latest["reasons"]),
+        )
 
-    def _pull(self) -> None:
-        """Read the core's state, but for its voltage model, into the reference, once a sample."""
-        if self._is_pulled:
+    def _refresh(self) -> None:
+        """Restore the reference from the core, once a sample."""
+        if self._is_current:
             return
-        self._is_pulled = True
-        self._core.estimate()
-        record, self._pending = self._record, None
-        latest = _plain(record["latest"])
-        latest |= {"status": Status(latest["status"]), "reasons": Reason(latest["reasons"])}
-        self._latest = Estimate(**latest)
-        clock, counter, block = (_plain(record[name]) for name in ("clock", "counter", "block"))
-        age_s = clock.pop("age_s") if clock.pop("is_restored") else None
-        clock.pop("age_s", None)
-        self._clock.restore(ClockState(**clock), age_s)
-        is_restored = counter.pop("is_restored")
-        self._counter.restore(CounterState(**counter), is_restored=is_restored)
-        used = 5 + len(self._online.load_coefficients)
-        beside, over = self._split(block.pop("drive"))
-        if block["rows"]:
-            block["columns"], block["sums"] = used - 5, [*block["sums"][:used], beside, *over]
-        else:
-            block["sums"] = []
-        self._block.restore(BlockState(**block))
-        memory = _plain(record["memory"])
-        memory["doubt"] = layout.DOUBTS[memory["doubt"]]
-        memory["innovations"] = memory.pop("innovation2")[: memory["innovations"]]
-        self._memory = EstimatorMemory(**memory)
-        self.hypotheses.restore(self._hypotheses_state())
-        beside_v, _ = self._split(record["drive"].tolist())
-        drives = record["drive"][: len(self._forms)].tolist()
-        self._online.resume(record["load"][: used - 5].copy(), beside_v, drives)
+        self._is_current = True
+        record = self._record
+        clock, load = record["clock"], record["load"][: self._online.load_coefficients.size]
+        self._continue(self.snapshot(), float(clock["age_s"]) if clock["is_restored"] else None)
+        self._online.resume(load.copy(), np.array(self._drives(record["drive"])))
 
-    def _split(self, drives: Sequence[float]) -> tuple[float, list[float]]:
-        """Return the sum of the drives of effects beside the SoC, and those over it."""
-        pairs = list(zip(self._over_soc, drives, strict=False))
-        beside = sum(drive for is_over, drive in pairs if not is_over)
-        return beside, [drive for is_over, drive in pairs if is_over]
+    def _write(self) -> None:
+        """Let the core continue from the reference."""
+        record, state, age_s = self._record, super().snapshot(), self._clock.age_s
+        self._is_current = False
+        _set(record["clock"], vars(state.clock), age_s=age_s or 0.0, is_restored=age_s is not None)
+        _set(record["counter"], vars(state.counter), is_restored=self._counter.is_restored)
+        squares = state.memory.innovations
+        _set(record["memory"], vars(state.memory), innovations=len(squares))
+        record["memory"]["innovation2"][: len(squares)] = squares
+        _set(record["latest"], self._latest._asdict())
+        record["is_pending"] = record["is_refused"] = False
+        record["implausible"] = 0
+        record["drive"] = 0.0
+        self._write_block(state.block)
+        for ekf, each in zip(record["filter"]["ekf"], state.hypotheses.filters, strict=False):
+            n = len(each.x)
+            ekf["x"][:n], ekf["evidence"] = each.x, each.evidence
+            ekf["p"][: n * (n + 1) // 2] = np.array(each.p)[np.tril_indices(n)]
+            ekf["b"], ekf["b_p"], ekf["b_v"][:n] = each.bias.b, each.bias.p, each.bias.v
+        record["filter"]["hypotheses"] = len(state.hypotheses.filters)
+        record["filter"]["prior_log_odds"] = state.hypotheses.prior_log_odds
+        record["filter"]["decision"] = state.hypotheses.decision
+        line, storage = self._part("line", layout.LINE)[0], self._part("currents", layout.CURRENT)
+        count = min(len(state.line.time_s), storage.size)
+        storage["time_s"][:count] = state.line.time_s[-count:]
+        storage["current_a"][:count] = state.line.current_a[-count:]
+        line["first"], line["count"], line["since_s"] = 0, count, state.line.since_s
+        low_passed, *effects = state.online
+        _set_lags(record["low_pass"], low_passed, 3)
+        for number, numbers in enumerate(effects):
+            self._write_effect(number, numbers)
+
+    def _drives(self, of_effects: NDArray[Any]) -> list[float]:
+        """Return drives as the reference has them: those beside the SoC in one sum, the others."""
+        drives = of_effects[: self._is_over_soc.size]
+        return [sum(drives[~self._is_over_soc].tolist()), *drives[self._is_over_soc].tolist()]
+
+    def _block_state(self) -> BlockState:
+        block, columns = self._record["block"], self._online.load_coefficients.size
+        if not block["rows"]:
+            return _read(BlockState, block, columns=0, sums=[])
+        sums = [*block["sums"][: 5 + columns].tolist(), *self._drives(block["drive"])]
+        return _read(BlockState, block, columns=columns, sums=sums)
+
+    def _write_block(self, state: BlockState) -> None:
+        block, used, over = self._record["block"], 5 + state.columns, self._is_over_soc
+        for name in ("number", "rows", "is_broken"):
+            block[name] = getattr(state, name)
+        block["sums"] = block["drive"] = 0.0
+        if state.sums:
+            block["sums"][:used] = state.sums[:used]
+            block["drive"][np.flatnonzero(over)] = state.sums[used + 1 :]
+            block["drive"][np.flatnonzero(~over)[:1]] = state.sums[used]  # of all of them
 
     def _hypotheses_state(self) -> HypothesesState:
         record, n = self._record["filter"], 4 + self._online.functions.number
@@ -258,18 +277,6 @@ class CompiledEstimator(Estimator):
         ]
         return HypothesesState(filters, float(record["prior_log_odds"]), int(record["decision"]))
 
-    def _pull_model(self) -> None:
-        """Read delay line, low-passed currents and effects into the reference's voltage model."""
-        line, record = self._part("line", layout.LINE)[0], self._record
-        places = (line["first"] + np.arange(line["count"])) % line["size"]
-        currents = self._part("currents", layout.CURRENT)[places]
-        self._online.delay_line.fill(
-            currents["time_s"].tolist(), currents["current_a"].tolist(), float(line["since_s"])
-        )
-        lags = record["low_pass"][: len(self._online.lags)]
-        states = [self._effect_state(number) for number in range(len(self._forms))]
-        self._online.restore([_numbers(lags, _LAG), *states])
-
     def _effect_state(self, number: int) -> list[float]:
         """Return the state of an effect as its memory does."""
         kind = self._forms[number].kind
@@ -285,74 +292,31 @@ class CompiledEstimator(Estimator):
         lags = self._record["effect"][number]["lag"]
         return _numbers(lags, _LAG[:1] if kind == "resistance_step" else _LAG)
 
-    def _push(self) -> None:
-        """Let the core continue from the state of the reference."""
-        record, memory = self._record, asdict(self._memory)
-        age_s = self._clock.age_s
-        clock = {"age_s": age_s or 0.0, "is_restored": age_s is not None}
-        _set(record["clock"], asdict(self._clock.state) | clock)
-        is_restored = {"is_restored": self._counter.is_restored}
-        _set(record["counter"], asdict(self._counter.state) | is_restored)
-        memory["doubt"] = layout.DOUBTS.index(memory["doubt"])
-        squares = memory.pop("innovations")
-        record["memory"]["innovation2"][: len(squares)] = squares
-        _set(record["memory"], memory | {"innovations": len(squares)})
-        block = asdict(self._block.snapshot())
-        sums, columns = block.pop("sums"), block.pop("columns")
-        record["block"]["sums"] = record["block"]["drive"] = record["drive"] = 0.0
-        if sums:
-            used, over = 5 + columns, np.array(self._over_soc, dtype=bool)
-            record["block"]["sums"][:used] = sums[:used]
-            record["block"]["drive"][np.flatnonzero(over)] = sums[used + 1 :]
-            record["block"]["drive"][np.flatnonzero(~over)[:1]] = sums[used]
-        _set(record["block"], block)
-        _set(record["latest"], self._latest._asdict())
-        record["is_pending"] = record["is_refused"] = False
-        record["implausible"] = 0
-        hypotheses = self.hypotheses.snapshot()
-        for ekf, state in zip(record["filter"]["ekf"], hypotheses.filters, strict=False):
-            n = len(state.x)
-            ekf["x"][:n], ekf["evidence"] = state.x, state.evidence
-            ekf["p"][: n * (n + 1) // 2] = np.array(state.p)[np.tril_indices(n)]
-            ekf["b"], ekf["b_p"], ekf["b_v"][:n] = state.bias.b, state.bias.p, state.bias.v
-        record["filter"]["hypotheses"] = len(hypotheses.filters)
-        record["filter"]["prior_log_odds"] = hypotheses.prior_log_odds
-        record["filter"]["decision"] = hypotheses.decision
-        self._push_model()
-
-    def _push_model(self) -> None:
-        times, currents, since_s = self._online.delay_line.contents
-        line, storage = self._part("line", layout.LINE)[0], self._part("currents", layout.CURRENT)
-        count = min(len(times), storage.size)
-        storage["time_s"][:count] = times[len(times) - count :]
-        storage["current_a"][:count] = currents[len(times) - count :]
-        line["first"], line["count"], line["since_s"] = 0, count, since_s
-        low_passed, *effects = self._online.state()
-        _set_lags(self._record["low_pass"], low_passed, 3)
-        for number, state in enumerate(effects):
-            kind = self._forms[number].kind
-            if kind == "time_skew":
-                skew, waiting = self._part("skew", layout.SKEW)[0], int(state[0])
-                readings = np.array(state[1 : 1 + 4 * waiting]).reshape(waiting, 4)
-                kept = np.array(state[1 + 4 * waiting :]).reshape(2, -1)
-                count = skew["count"] = max(waiting, kept.shape[1])
-                skew["waiting"], skew["first"] = count - waiting, count - kept.shape[1]
-                at = skew["at"]
-                at["time_s"][skew["first"] : count], at["current_a"][skew["first"] : count] = kept
-                for column, name in enumerate(layout.SAMPLE.names or ()):
-                    at[name][skew["waiting"] : count] = readings[:, column]
-            else:
-                lags = self._record["effect"][number]["lag"]
-                _set_lags(lags, state, 1 if kind == "resistance_step" else 3)
+    def _write_effect(self, number: int, state: Sequence[float]) -> None:
+        kind = self._forms[number].kind
+        if kind != "time_skew":
+            lags = self._record["effect"][number]["lag"]
+            _set_lags(lags, state, 1 if kind == "resistance_step" else 3)
+            return
+        skew, waiting = self._part("skew", layout.SKEW)[0], int(state[0])
+        readings = np.array(state[1 : 1 + 4 * waiting]).reshape(waiting, 4)
+        kept = np.array(state[1 + 4 * waiting :]).reshape(2, -1)
+        count = skew["count"] = max(waiting, kept.shape[1])
+        skew["waiting"], skew["first"] = count - waiting, count - kept.shape[1]
+        at = skew["at"]
+        at["time_s"][skew["first"] : count], at["current_a"][skew["first"] : count] = kept
+        for column, name in enumerate(layout.SAMPLE.names or ()):
+            at[name][skew["waiting"] : count] = readings[:, column]
 
 
-def _plain(record: Any) -> dict[str, Any]:
-    """Return the fields of a record as numbers and lists."""
-    return {name: record[name].tolist() for name in record.dtype.names}
+def _read(of: type[_State], record: Any, **others: Any) -> _State:
+    """Return a state from the fields of a record that have its names, and others."""
+    names = (item.name for item in fields(cast("Any", of)) if item.name not in others)
+    return of(**{name: record[name].tolist() for name in names}, **others)
 
 
-def _set(record: Any, values: dict[str, Any]) -> None:
-    for name, value in values.items():
+def _set(record: Any, values: dict[str, Any], **others: Any) -> None:
+    for name, value in (values | others).items():
         record[name] = value
 
 

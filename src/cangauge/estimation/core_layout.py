@@ -18,7 +18,7 @@ from cangauge.model.model_file import Model
 from cangauge.model.voltage_model import HermiteCurve, PublishedCurve, resistance_factor
 
 DELAYS, LOW_PASSES, KNOTS, FUNCTIONS, EFFECTS, WAITING = 64, 4, 201, 16, 32, 8192
-OCV, LAGS, VALUES, TESTED = 8, 5, 12, 64
+OCV, LAGS, VALUES, TESTED = 8, 2, 5, 64
 CURRENTS: Final = DELAYS + LOW_PASSES
 LOADS: Final = CURRENTS + 2
 STATES: Final = FUNCTIONS + 4
@@ -29,14 +29,11 @@ SUMS: Final = LOADS + 5
 KINDS: Final = (
     "no_effect", "current_sensor", "voltage_sensor", "time_skew", "temperature_lag",
     "core_temperature", "resistance_temperature", "resistance_soc", "resistance_asymmetry",
-    "resistance_step", "charge_transfer", "rc", "hysteresis", "entropic", "inner_temperature",
-    "ocv_shape", "weak_cell",
+    "resistance_step", "charge_transfer", "rc", "hysteresis", "entropic", "weak_cell",
 )  # fmt: skip
 """Kinds of effects, in the order of `cg_effect_kind`."""
 METHODS: Final = ("ekf", "newton", "coulomb")
 """Methods, in the order of `cg_method`."""
-DOUBTS: Final = ("", "start", "interval", "mismatch")
-"""Doubts, in the order of `cg_doubt`."""
 
 
 _TYPES: Final = {"d": "f8", "i": "i4", "u": "u4", "l": "i8", "b": "?"}
@@ -99,7 +96,7 @@ STATE: Final = _structure(
         " b:newton_inside d:voltage_model_v d:residual_v b:is_known d:filter_discharged_pct"
         " d:filter_counted_s d:filter_gap_var_pct2 d:coulomb_start_pct d:coulomb_var_pct2"
         " d:coulomb_counted_s d:coulomb_moved_pct d:coulomb_gap_var_pct2 d:gap_until_s"
-        " d:contradicted_until_s d:mismatch_until_s i:doubt i:innovations d:innovation2[TESTED]"
+        " d:contradicted_until_s d:mismatch_until_s i:innovations d:innovation2[TESTED]"
         " d:rest_since_s d:full_since_s b:is_full b:is_rested"
     ),
     lag=LAG,

@@ -190,11 +190,6 @@ class CoulombCounter:
         rms_a = math.sqrt(max(state.mean_square_a2, state.current_a * state.current_a))
         return min(rms_a * seconds * self._pct_per_as, MOVED_STD_AT_MOST_PCT)
 
-    def restore(self, state: CounterState, *, is_restored: bool = True) -> None:
-        """Continue from a state after a restart; the counter works on it."""
-        self.state = state
-        self.is_restored = is_restored
-
 
 LATEST_S = 1e11
 """Largest stamp accepted [s] (the year 5138)."""
@@ -227,7 +222,8 @@ class EstimatorClock:
     ----------
     state : ClockState
     age_s : float or None
-        After `restore` and until the first sample: minimum age of the restored state [s].
+        Of a restored state, until the first sample: its minimum age [s], which overrides stamps
+        that show less; NaN if no clock measured it, None without an interruption.
     """
 
     def __init__(self) -> None:
@@ -263,19 +259,6 @@ class EstimatorClock:
         state.behind, state.behind_s = 0, math.nan
         state.last_s = time_s
         return time_s
-
-    def restore(self, state: ClockState, age_s: float | None) -> None:
-        """Continue from a state; the clock works on it.
-
-        Parameters
-        ----------
-        state : ClockState
-        age_s : float or None
-            Minimum age of the state [s]; NaN if no clock measured it. It overrides stamps that
-            show less. None: there was no interruption.
-        """
-        self.state = state
-        self.age_s = age_s
 
     def _is_set_back(self, stamp_s: float, step_s: float) -> bool:
         state = self.state

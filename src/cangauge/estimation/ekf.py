@@ -27,14 +27,14 @@ Jazwinski, Stochastic Processes and Filtering Theory, 1970, ch. 8.3).
 from __future__ import annotations
 
 import math
-from typing import Final, NamedTuple, Self
+from typing import Final, Self
 
 import numpy as np
 from filterpy.kalman import ExtendedKalmanFilter
 
 from cangauge._typing import FloatArray
 from cangauge.estimation.health import SeparateBias
-from cangauge.estimation.state import FilterState
+from cangauge.estimation.state import Block, FilterState
 from cangauge.model.extended import OnlineModel
 
 OFFSET_STD_A: Final = 1.0
@@ -68,23 +68,6 @@ decides."""
 
 SOC, OFFSET, SLOW, LEVEL, FUNCTIONS = range(5)
 """Index of S, o, z, w and c₁; further functions follow."""
-
-
-class Block(NamedTuple):
-    """Means over the rows of one block."""
-
-    counted_s: float
-    """Time since the first sample in which charge was counted [s]."""
-    discharged_pct: float
-    """Net charge taken out since the first sample [% of capacity]."""
-    voltage_v: float
-    temperature_c: float
-    drop_v: float
-    """Part of the load voltage that is proportional to the resistances [V]."""
-    load: FloatArray
-    """Load row, shape (k,)."""
-    drives: FloatArray
-    """Drives of the model's effects."""
 
 
 class SocFilter(ExtendedKalmanFilter):  # type: ignore[misc] # filterpy has no types
@@ -194,13 +177,13 @@ class SocFilter(ExtendedKalmanFilter):  # type: ignore[misc] # filterpy has no t
         """Return the voltage at a state [V], its gradient H and the variance R [V²]."""
         model, noise = self.model, self.model.noise
         A = model.noise.cold(block.temperature_c)
-        volts, slope = model.curve(float(x[SOC]), block.drives)
+        volts, slope = model.pseudo_ocv_at(float(x[SOC]), block.drives)
         slope = max(slope, LEAST_SLOPE)
         axis_v = noise.soc_std_pct * slope
         H = np.empty_like(x)
         H[SOC], H[OFFSET], H[SLOW] = slope, 0.0, A
         H[LEVEL] = math.hypot(A * noise.level_std_v, axis_v)
-        H[FUNCTIONS:] = model.row(float(x[SOC]), block.load)
+        H[FUNCTIONS:] = model.functions.row(float(x[SOC]), block.load)
         volts += float(block.load @ model.load_coefficients + H[SLOW:] @ x[SLOW:])
         return volts, H, (A * noise.fast_std_v) ** 2 + axis_v**2
 
@@ -277,8 +260,8 @@ def inverse_std_pct(
 ) -> float:
     """Return the standard deviation of the SoC by inverse of one row's voltage [%]."""
     noise, A = model.noise, model.noise.cold(temperature_c)
-    slope = max(model.curve(soc_pct)[1], LEAST_SLOPE)
-    row = model.row(soc_pct, load)
+    slope = max(model.pseudo_ocv_at(soc_pct)[1], LEAST_SLOPE)
+    row = model.functions.row(soc_pct, load)
     variance = row @ row + A**2 * (
         noise.level_std_v**2 + noise.slow_std_v**2 + noise.residual_std_v**2
     )

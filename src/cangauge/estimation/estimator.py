@@ -17,7 +17,6 @@ from scipy.special import chdtri
 
 from cangauge._typing import FloatArray
 from cangauge.errors import InputError
-from cangauge.estimation.blocks import OpenBlock
 from cangauge.estimation.cells import PackTick
 from cangauge.estimation.counting import (
     CoulombCounter,
@@ -27,12 +26,18 @@ from cangauge.estimation.counting import (
     moved_probability,
     moved_std_pct,
 )
-from cangauge.estimation.ekf import UNKNOWN_STD_PCT, Block, inverse_std_pct
+from cangauge.estimation.ekf import UNKNOWN_STD_PCT, inverse_std_pct
 from cangauge.estimation.health import health_of
 from cangauge.estimation.power import PowerModel
 from cangauge.estimation.settings import EstimatorSettings, SocReference, detect_references
 from cangauge.estimation.start import WRONG_PRIOR, WRONG_STD_PCT, Hypotheses
-from cangauge.estimation.state import DelayLineState, EstimatorMemory, EstimatorState
+from cangauge.estimation.state import (
+    Block,
+    BlockState,
+    DelayLineState,
+    EstimatorMemory,
+    EstimatorState,
+)
 from cangauge.estimation.validity import drop_implausible, outside_model, temperature_mismatch
 from cangauge.model.effects.base import Reading
 from cangauge.model.inverse import soc_from_ocv
@@ -114,7 +119,7 @@ class Estimator:
         self.hypotheses = Hypotheses(self._online)
         self._clock = EstimatorClock()
         self._counter = CoulombCounter(self.capacity_ah, self.settings.gap_s)
-        self._block = OpenBlock()
+        self._block = BlockState()
         self._memory = EstimatorMemory()
         self._power = PowerModel(self._online, self.settings.limits)
         tested = max(round(MISMATCH_S / self.model.noise.block_s), 1)
@@ -187,10 +192,12 @@ class Estimator:
     @property
     def health(self) -> Health:
         """Capacity, resistance and current offset, with standard deviations."""
+        self._refresh()
         return health_of(self.hypotheses.likelier, self._temperature_c)
 
     def power(self) -> Power:
         """Return the currents possible for 10 s and the energy left, after the latest sample."""
+        self._refresh()
         soc_pct, std_pct = self._soc()
         if math.isnan(soc_pct) or math.isnan(self._counter.state.time_s):
             return Power()
@@ -202,6 +209,7 @@ class Estimator:
 
     def pack_tick(self, sample: Sample) -> PackTick:
         """Return what is known of the pack after its latest sample, for its cells."""
+        self._refresh()
         counter, (soc_pct, std_pct) = self._counter.state, self._soc()
         is_counting = not math.isnan(counter.time_s)
         _, load_v, drop_v = self._load() if is_counting else (None, math.nan, math.nan)
@@ -217,6 +225,7 @@ class Estimator:
 
     def current_changes(self, time_s: float, stamps_s: Sequence[float]) -> list[float]:
         """Return the current at a sample's time less that at other stamps [A]; NaN for NaN."""
+        self._refresh()
         if math.isnan(self._counter.state.time_s):
             return [math.nan] * len(stamps_s)
         at = self._online.delay_line.current_at
@@ -225,6 +234,9 @@ class Estimator:
         changes = {each: now_a - at(time_s - each) for each in {*stamps_s} if not math.isnan(each)}
         return [changes.get(each, math.nan) for each in stamps_s]
 
+    def _refresh(self) -> None:
+        """Bring the attributes to the latest sample, where the step is computed elsewhere."""
+
     # --- one sample
 
     def _process(self, sample: Sample) -> None:
@@ -232,24 +244,23 @@ class Estimator:
         memory, block = self._memory, self._block
         time_s, current_a, voltage_v, temperature_c = sample
         number = math.floor((time_s - memory.first_s) / self.model.noise.block_s + 1e-9)
-        if number > block.state.number:
+        if number > block.number:
             self._close_block(time_s)
-            block.begin(number)
+            block = self._block = BlockState(number)
         if self._implausible and math.isnan(voltage_v):
             # Behind an open contactor; the block's other rows may be of a voltage that falls.
-            block.state.is_broken = True
+            block.is_broken = True
         charge = self._counter.step(time_s, self._online.counted(current_a))
         if not math.isnan(temperature_c):
             memory.temperature_c = temperature_c
         self._online.advance(time_s, current_a, memory.temperature_c)
         if charge.seconds > self.settings.gap_s:
-            block.state.is_broken = True
+            block.is_broken = True
             memory.gap_until_s = time_s + self._online.delay_line.longest_s
         if away_s := charge.away_s:
             self._predict_to_now()
             probability, std_pct = moved_probability(away_s), moved_std_pct(away_s)
             self.hypotheses.doubt(probability, std_pct, away_s, charge.parked_std_pct)
-            memory.doubt = "interval"
             memory.coulomb_var_pct2 += away_std_pct(away_s) ** 2
         if abs(current_a) > REST_CURRENT_C_RATE * self.capacity_ah:
             memory.rest_since_s = math.nan
@@ -280,14 +291,14 @@ class Estimator:
         soc_pct = self._soc()[0]
         memory.voltage_model_v = math.nan
         if not math.isnan(soc_pct):
-            memory.voltage_model_v = online.curve(soc_pct)[0] + load_v
+            memory.voltage_model_v = online.pseudo_ocv_at(soc_pct)[0] + load_v
         memory.residual_v = sample.voltage_v - memory.voltage_model_v
         for reference in detect_references(self.settings, memory, sample):
             self._correct(reference)
 
     def _close_block(self, time_s: float) -> None:
         """Correct the filter by the open block, and test its innovation."""
-        block = self._block.close()
+        block = self._block.mean()
         if block is None:
             return
         memory, hypotheses = self._memory, self.hypotheses
@@ -321,7 +332,6 @@ class Estimator:
         if is_lasting:
             # The model may be right and the SoC wrong: charge that was not seen.
             memory.innovations = []
-            memory.doubt = "mismatch"
             self.hypotheses.doubt(WRONG_PRIOR, WRONG_STD_PCT)
 
     def _predict(self, counted_s: float, discharged_pct: float) -> None:
@@ -339,7 +349,7 @@ class Estimator:
     def _predict_to_now(self) -> None:
         """Predict the filter to the latest sample; the open block lies in part before it."""
         self._predict(self._counter.state.counted_s, self._counter.state.discharged_pct)
-        self._block.state.is_broken = True
+        self._block.is_broken = True
 
     def _correct(self, reference: SocReference) -> None:
         """Fuse an external SoC reference into count and filter, weighted by the variances."""
@@ -359,7 +369,6 @@ class Estimator:
         """Start filter and count from a SoC and its standard deviation [%]."""
         self.hypotheses = Hypotheses(self._online, soc_pct, std_pct, is_doubtful=is_doubtful)
         self._memory.is_known = True
-        self._memory.doubt = "start" if is_doubtful else ""
         self._start_count(soc_pct, std_pct)
 
     def _start_count(self, soc_pct: float, std_pct: float) -> None:
@@ -461,7 +470,7 @@ class Estimator:
             counter=replace(self._counter.state),
             line=DelayLineState(*self._online.delay_line.contents),
             online=self._online.state(),
-            block=self._block.snapshot(),
+            block=replace(self._block, sums=list(self._block.sums)),
             hypotheses=self.hypotheses.snapshot(),
             memory=replace(self._memory, innovations=list(self._memory.innovations)),
             estimate=list(latest[:7]),
@@ -490,6 +499,11 @@ class Estimator:
         InputError
             If the state does not fit the model; the estimator must then not be used.
         """
+        self._continue(state, age_s)
+        return self._latest
+
+    def _continue(self, state: EstimatorState, age_s: float | None) -> None:
+        """Continue from a state; without an interruption its age is None."""
         self._resume(state, age_s)
         line = state.line
         self._online.delay_line.fill(line.time_s, line.current_a, line.since_s)
@@ -499,11 +513,10 @@ class Estimator:
             sums = len(Block._fields) - 2 + columns + self._online.drives.size
             if state.block.rows and (state.block.columns, len(state.block.sums)) != (columns, sums):
                 raise InputError(f"the model's blocks have {sums} sums", field="block.sums")
-            self._block.restore(state.block)
+            self._block = replace(state.block, sums=list(state.block.sums))
             self.hypotheses.restore(state.hypotheses)
         else:
             self._start_from(state)
-        return self._latest
 
     def take_over(self, before: Estimator) -> None:
         """Continue from another estimator, of another model or with other settings.
@@ -512,6 +525,7 @@ class Estimator:
         the ends of gaps, the learned capacity and the current's offset are carried over. What the
         filter has learned of the other model's voltage is not. An unknown SoC stays unknown.
         """
+        before._refresh()
         state = before.snapshot()
         self._resume(state, before._clock.age_s)
         self._online.take_over(before._online)
@@ -523,8 +537,8 @@ class Estimator:
 
         Without an interruption `age_s` is None, and the stamps of the samples give the time.
         """
-        self._clock.restore(replace(state.clock), age_s)
-        self._counter.restore(replace(state.counter))
+        self._clock.state, self._clock.age_s = replace(state.clock), age_s
+        self._counter.state, self._counter.is_restored = replace(state.counter), True
         self._memory = replace(state.memory, innovations=list(state.memory.innovations))
         reasons = Reason(state.reasons)
         self._latest = Estimate._make(
@@ -539,8 +553,7 @@ class Estimator:
         memory.filter_counted_s = counter.counted_s
         memory.filter_discharged_pct = counter.discharged_pct
         memory.filter_gap_var_pct2 = counter.gap_var_pct2
-        self._block.begin(state.block.number)
-        self._block.state.is_broken = True
+        self._block = BlockState(state.block.number, is_broken=True)
         memory.is_known, memory.coulomb_start_pct = False, math.nan
         if not math.isnan(state.soc_pct):
             self._start(state.soc_pct, state.soc_std_pct, is_doubtful=False)

@@ -133,7 +133,7 @@ def health_of(filter_: SocFilter, temperature_c: float) -> Health:
     count = len(model.model.resistance_ohm)
     rest = model.load_at(temperature_c, np.zeros(count))
     lasting = model.load_at(temperature_c, np.ones(count))
-    functions = model.row(50.0, lasting) - model.row(50.0, rest)
+    functions = model.functions.row(50.0, lasting) - model.functions.row(50.0, rest)
     row = np.zeros_like(x)  # of the ratio
     row[-2 - functions.size : -2] = functions / ((lasting - rest) @ model.load_coefficients)
     row[-1] = 1.0

@@ -24,7 +24,7 @@ from cangauge.estimation.settings import (
 )
 from cangauge.logs.gaps import usual_gap_s
 from cangauge.logs.log import Log, as_log
-from cangauge.model.coulomb_counting import counted_soc_pct
+from cangauge.model.coulomb_counting import soc_at_first_row
 from cangauge.model.delay_line import GAP_S
 from cangauge.model.model_file import Model, as_model
 from cangauge.types import Estimate, Sample, Status, reason_names
@@ -200,7 +200,7 @@ def estimate(
     (120, 80.0)
     """
     log, model = as_log(log), as_model(model)
-    if initial_soc_pct is None and log.first_soc() is not None:
+    if initial_soc_pct is None:
         initial_soc_pct = initial_soc_of(log, capacity_ah or model.capacity_ah)
     settings = EstimatorSettings(
         method=method,
@@ -217,17 +217,17 @@ def estimate(
     return replace(table, scores=scores)
 
 
-def initial_soc_of(log: Log, capacity_ah: float) -> float:
-    """Return the log's first reference SoC, counted back to its first row [%].
+def initial_soc_of(log: Log, capacity_ah: float) -> float | None:
+    """Return `soc_at_first_row` within 0–100 % [%]; None for a log without SoC.
 
     Parameters
     ----------
     log : Log
-        With a reference SoC.
     capacity_ah : float
         Capacity [Ah].
     """
-    return float(np.clip(counted_soc_pct(log, capacity_ah)[0], 0.0, 100.0))
+    soc_pct = soc_at_first_row(log, capacity_ah)
+    return None if soc_pct is None else min(max(soc_pct, 0.0), 100.0)
 
 
 def gap_of(log: Log) -> float:

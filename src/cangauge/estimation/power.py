@@ -238,7 +238,7 @@ class _Ahead:
 
     def slope_at(self, soc_pct: float) -> float:
         """Return the curve's slope [V per %], not less than the least."""
-        return max(self._model.curve(soc_pct)[1], LEAST_SLOPE)
+        return max(self._model.pseudo_ocv_at(soc_pct)[1], LEAST_SLOPE)
 
     def moment(self, seconds: float) -> _Moment:
         """Return the effect of a current after a time [s]."""
@@ -270,7 +270,7 @@ class _Ahead:
         ohm = float(moment.per_a @ self._theta)
         current_a = volt_per_a = 0.0
         for _ in range(_ITERATIONS):
-            volts, slope = self._model.curve(self.soc_pct - moment.pct_per_a * current_a)
+            volts, slope = self._model.pseudo_ocv_at(self.soc_pct - moment.pct_per_a * current_a)
             volt_per_a = slope * moment.pct_per_a - ohm
             step_a = (volts + fixed_v + ohm * current_a) / volt_per_a
             current_a += step_a
@@ -286,9 +286,9 @@ class _Ahead:
         model = self._model
         load = moment.base + current_a * moment.per_a
         after_pct = self.soc_pct - moment.pct_per_a * current_a
-        slope = model.curve(after_pct)[1]
+        slope = model.pseudo_ocv_at(after_pct)[1]
         drop_v = float(load[1:] @ model.load_coefficients[1:])
-        functions = model.row(after_pct, load).tolist()
+        functions = model.functions.row(after_pct, load).tolist()
         H = np.array([slope, 0.0, self._A, self._level_v, *functions, 0.0, drop_v])
         residual_v = self._A * model.noise.residual_std_v
         std_v = math.sqrt(H @ self._P @ H + residual_v**2 + moment.unknown_v**2)

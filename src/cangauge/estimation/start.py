@@ -19,8 +19,8 @@ from typing import Final
 import numpy as np
 
 from cangauge.errors import InputError
-from cangauge.estimation.ekf import UNKNOWN_STD_PCT, Block, SocFilter
-from cangauge.estimation.state import HypothesesState
+from cangauge.estimation.ekf import UNKNOWN_STD_PCT, SocFilter
+from cangauge.estimation.state import Block, HypothesesState
 from cangauge.model.extended import OnlineModel
 
 UNKNOWN_PCT: Final = 50.0

@@ -8,8 +8,9 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
-from typing import Annotated, Any, ClassVar, Literal, Self
+from typing import Annotated, Any, ClassVar, NamedTuple, Self
 
+import numpy as np
 from pydantic import (
     BaseModel,
     BeforeValidator,
@@ -19,6 +20,7 @@ from pydantic import (
     model_validator,
 )
 
+from cangauge._typing import FloatArray
 from cangauge.types import Reason
 
 LARGEST = 1e12
@@ -87,9 +89,31 @@ class DelayLineState:
     """Start of the gap-free stretch [s]."""
 
 
+class Block(NamedTuple):
+    """Means over the rows of one block."""
+
+    counted_s: float
+    """Time since the first sample in which charge was counted [s]."""
+    discharged_pct: float
+    """Net charge taken out since the first sample [% of capacity]."""
+    voltage_v: float
+    temperature_c: float
+    drop_v: float
+    """Part of the load voltage that is proportional to the resistances [V]."""
+    load: FloatArray
+    """Load row, shape (k,)."""
+    drives: FloatArray
+    """Drives of the model's effects."""
+
+
 @dataclass
 class BlockState:
-    """State of the open block: sums over its rows."""
+    """The block that is being filled: sums over its rows.
+
+    Blocks of 30 s are counted in time from the first sample; the voltage corrects the filter with
+    the mean of each. A log's errors last for minutes, so rows of one second repeat each other, and
+    the mean holds all that they know.
+    """
 
     __pydantic_config__: ClassVar[Any] = _NO_MORE
     number: _Count = 0
@@ -101,6 +125,21 @@ class BlockState:
     """Columns of the load row."""
     sums: list[_Finite] = field(default_factory=list)
     """Of the fields of a `Block`, in their order."""
+
+    def add(self, row: Block) -> None:
+        """Add one row, given as a block of its own."""
+        values = (*row[:5], *row.load.tolist(), *row.drives.tolist())
+        sums = self.sums or [0.0] * len(values)
+        self.columns = row.load.size
+        self.sums = [a + b for a, b in zip(sums, values, strict=True)]
+        self.rows += 1
+
+    def mean(self) -> Block | None:
+        """Return the mean of the rows; None without rows, or with a gap among them."""
+        if self.is_broken or not self.rows:
+            return None
+        numbers, load, drives = np.split(np.array(self.sums) / self.rows, [5, 5 + self.columns])
+        return Block._make([*numbers.tolist(), load, drives])
 
 
 @dataclass
@@ -134,15 +173,14 @@ class HypothesesState:
     decision: Annotated[int, Field(strict=True, ge=-1, le=1)]
 
 
-Doubt = Literal["", "start", "interval", "mismatch"]
-"""Origin of the wide hypothesis: a given start, an interval without samples, a contradiction."""
-
-
 @dataclass
 class EstimatorMemory:
-    """State of the `Estimator` itself; NaN: not known, or never."""
+    """State of the `Estimator` itself; NaN: not known, or never.
 
-    __pydantic_config__: ClassVar[Any] = _NO_MORE
+    Files of earlier versions have a further field, `doubt`, which nothing reads.
+    """
+
+    __pydantic_config__: ClassVar[Any] = ConfigDict(extra="ignore")
     samples: _Count = 0
     """Accepted samples."""
     resets: _Count = 0
@@ -181,7 +219,6 @@ class EstimatorMemory:
     """Until when the last contradiction degrades the estimate [s]."""
     mismatch_until_s: _MaybeNan = math.nan
     """Until when the evidence that model and pack disagree lasts [s]."""
-    doubt: Doubt = ""
     innovations: list[_Finite] = field(default_factory=list)
     """Squares of the latest normalised innovations of the likelier filter."""
     rest_since_s: _MaybeNan = math.nan

@@ -11,7 +11,6 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import product
 from typing import Any, Final
 
 import numpy as np
@@ -57,7 +56,6 @@ NOT_IDENTIFIABLE: Final[Mapping[str, str]] = {
     "current_gain": "resistances and capacity absorb it: give --capacity-ah",
     "voltage_offset": "the curve absorbs it",
     "voltage_gain": "the coefficients absorb it",
-    "ocv_shape": "the curve's knots express it",
     "resistance_temperature": "the equation has it (b)",
 }
 """Effects that a fit cannot separate from its own coefficients, and why."""
@@ -257,7 +255,7 @@ def linearize(
     if first is None:
         raise ValueError("a log of a fit has a start")
     row, start_pct = first
-    signals = Signals(log.time_s, log.current_a, log.voltage_v, dequantize(log).temperature_c)
+    signals = Signals.of(dequantize(log))
     currents = voltage.currents(log.time_s, log.current_a, slice(None))
     # Added voltages are linear in their amplitudes, so their columns give them too.
     correcting = replace(
@@ -330,21 +328,17 @@ def _by_drop(
     return added
 
 
-def offered(
-    effect_ids: Sequence[str], model: ExtendedModel, time_s: FloatArray
-) -> list[EffectCandidate]:
+def offered(effect_ids: Sequence[str], model: ExtendedModel) -> list[EffectCandidate]:
     """Return the candidates of some effects, without those whose column the equation has."""
     effects = [LIBRARY[effect_id] for effect_id in effect_ids]
-    return [
-        item
-        for item in candidates(effects, model.pack, time_s)
-        if not any(
-            max(tau_s / of_model, of_model / tau_s) <= TAU_RATIO
-            for (_, tau_s), of_model in product(
-                item.effect.rc_elements(item.values(item.steps)), LOW_PASS_S
-            )
-        )
-    ]
+    return [item for item in candidates(effects, model.pack) if not _repeats_a_low_pass(item)]
+
+
+def _repeats_a_low_pass(item: EffectCandidate) -> bool:
+    element = item.effect.rc_element(item.values(item.steps))
+    return element is not None and any(
+        max(element[1] / tau_s, tau_s / element[1]) <= TAU_RATIO for tau_s in LOW_PASS_S
+    )
 
 
 class Search:
@@ -372,7 +366,7 @@ class Search:
         self._capacity_ah, self._chemistry = model.capacity_ah, chemistry
         ids = SEARCHED if self._is_auto else effect_ids
         self._wanted = list(ids)
-        self._offered = offered(ids, model, logs[0].time_s)
+        self._offered = offered(ids, model)
         chance = SIGNIFICANCE / max(len({item.effect.id for item in self._offered}), 1)
         self._t_needed = float(stats.t.isf(chance, max(len(logs) - 1, 1)))
         widths = [len(item.amplitudes) for item in self._offered]

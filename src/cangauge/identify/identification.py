@@ -28,7 +28,7 @@ from cangauge.logs.log import Log
 from cangauge.model.coulomb_counting import difference_from_reference
 from cangauge.model.effects.base import Signals
 from cangauge.model.extended import ExtendedModel, newton_soc
-from cangauge.model.model_file import Coefficient, Model
+from cangauge.model.model_file import Model
 from cangauge.model.voltage_model import VoltageModel
 
 JOULE_PER_KWH = 3.6e6
@@ -122,9 +122,8 @@ def evaluate(model: ExtendedModel, log: Log, rows: FitRows) -> LogFit:
     first = log.first_soc()
     if first is None:
         raise ValueError("a log of a fit has a start")
-    signals = Signals(log.time_s, log.current_a, log.voltage_v, log.temperature_c)
     row, soc_pct = first
-    prediction = model.predict(signals, soc_pct, rows.at, initial_row=row)
+    prediction = model.predict(Signals.of(log), soc_pct, rows.at, initial_row=row)
     temperature_c = prediction.signals.temperature_c[rows.at]
     return LogFit(
         rows=rows,
@@ -337,15 +336,6 @@ def rounded(value: float, std_error: float | None) -> tuple[str, str]:
         return NONE_KNOWN, significant(std_error, 2)
     decimals = max(0, 1 - math.floor(math.log10(std_error)))
     return number(value, decimals), significant(std_error, 2)
-
-
-def coefficient_rows(coefficients: dict[str, Coefficient]) -> tuple[list[str], Rows]:
-    """Return headings and rows: the published equation's coefficients with their errors."""
-    rows = [
-        [name, *rounded(item.value, item.std_error), item.unit.replace("ohm", "Ω")]
-        for name, item in coefficients.items()
-    ]
-    return ["", "value", "std. error", "unit"], rows
 
 
 def effect_rows(result: Identification) -> tuple[list[str], Rows]:

@@ -30,6 +30,7 @@ from cangauge.identify.least_squares import (
 from cangauge.identify.rows import FitRows, fit_rows
 from cangauge.logs.gaps import discharged_ah, split_where_moved
 from cangauge.logs.log import Log
+from cangauge.model.coulomb_counting import soc_at_first_row
 from cangauge.model.effects.base import Signals
 from cangauge.model.model_file import Model
 from cangauge.model.prior import CHEMISTRIES, Chemistry
@@ -158,43 +159,39 @@ def find_starts(
     InputError
         If no log pins the curve, or a start is not determined.
     """
-    split = [split_where_moved(log) for log in logs]
-    given = [
-        value if k == 0 else None
-        for value, of_log in zip(given, split, strict=True)
-        for k in range(len(of_log))
+    stated = [
+        (piece, soc_pct if number == 0 else None)
+        for log, soc_pct in zip(logs, given, strict=True)
+        for number, piece in enumerate(split_where_moved(log))
     ]
-    pieces = [piece for of_log in split for piece in of_log]
-    known, starts = list(pieces), []
-    unknown: list[int] = []
-    for k, (log, value) in enumerate(zip(pieces, given, strict=True)):
-        first = log.first_soc()
-        if value is not None:
-            known[k] = with_start(log, value)
-            starts.append(Start(log.name, value, None, "given"))
-        elif first is not None:
-            counted = discharged_ah(log.time_s, log.current_a)[first[0]]
-            at_first_row = first[1] + 100.0 * float(counted) / capacity_ah
-            starts.append(Start(log.name, at_first_row, None, "log"))
+    pieces = [piece for piece, _ in stated]
+    known, starts, unknown = [], [], []
+    for place, (log, soc_pct) in enumerate(stated):
+        own_pct = soc_at_first_row(log, capacity_ah)
+        known.append(log if soc_pct is None else with_start(log, soc_pct))
+        if soc_pct is not None:
+            starts.append(Start(log.name, soc_pct, None, "given"))
+        elif own_pct is not None:
+            starts.append(Start(log.name, own_pct, None, "log"))
         else:
-            unknown.append(k)
             starts.append(Start(log.name, float("nan"), None, "estimated"))
+            unknown.append(place)
     if len(unknown) == len(pieces):
         raise unknown_start(pieces[0], others=len(pieces) > 1)
     if unknown:
-        pinned = [log for k, log in enumerate(known) if k not in unknown]
-        joint = _JointFit(pinned, [pieces[k] for k in unknown], capacity_ah, chemistry)
-        for k, start in zip(unknown, joint.solve(), strict=True):
-            starts[k] = start
+        pinned = [log for place, log in enumerate(known) if place not in unknown]
+        joint = _JointFit(pinned, [pieces[place] for place in unknown], capacity_ah, chemistry)
+        for place, start in zip(unknown, joint.solve(), strict=True):
+            log, starts[place] = pieces[place], start
             if start.std_pct is None or not start.std_pct <= STD_AT_MOST_PCT:
                 raise InputError(
                     "the SoC at the start is unknown, and the voltage determines it to"
                     f" ±{start.std_pct:.0f} % only",
-                    source=pieces[k].source or pieces[k].name,
+                    source=log.source or log.name,
                     field="soc_pct",
                     cure="give --initial-soc for this log, or logs whose SoC overlaps with it",
                 )
-            known[k] = with_start(pieces[k], start.soc_pct)
+            known[place] = with_start(log, start.soc_pct)
             _LOG.info("%s", start)
     return Starts(tuple(known), tuple(pieces), tuple(starts))
 
@@ -317,7 +314,7 @@ def start_by_model(log: Log, model: Model) -> Start:
         with_start(log, 0.5 * (low + high)), model.capacity_ah,
         delay_s=voltage.delay_s, low_pass_s=voltage.low_pass_s,
     )  # fmt: skip
-    signals = Signals(log.time_s, log.current_a, log.voltage_v, log.temperature_c)
+    signals = Signals.of(log)
 
     def error_v(start: float) -> float:
         return float(np.mean(np.abs(extended.predict(signals, start, rows.at).residual_v)))

@@ -28,31 +28,36 @@ from cangauge.logs.units import TemperatureSource
 _METADATA_KEY: Final = b"cangauge.temperature_source"
 
 
-@contextmanager
-def open_parquet(head: Head) -> Iterator[ArrowTable]:
-    """Open a Parquet file as a table that is read by column.
+def parquet_table(head: Head) -> ArrowTable:
+    """Return a Parquet file as a table that is read by column.
 
     Raises
     ------
     InputError
         If it is damaged, or larger than a log may be.
     """
+
+    def read(names: list[str]) -> Any:
+        with _opened(head) as file:
+            table = file.read(columns=names)
+            table.validate(full=True)  # damaged indices may exceed a dictionary
+            return table
+
+    with _opened(head) as file:
+        rows, columns = file.metadata.num_rows, file.metadata.num_columns
+        for what, count, limit in (("rows", rows, MAX_ROWS), ("columns", columns, MAX_COLUMNS)):
+            if count > limit:
+                problem = f"more than the {limit} {what} that a log may have"
+                raise InputError(problem, source=head.path, value=count, cure="split it")
+        return arrow_table(file.schema_arrow, read, str(head.path))
+
+
+@contextmanager
+def _opened(head: Head) -> Iterator[Any]:
     with head.open() as unpacked:
         stream = unpacked if unpacked.seekable() else pa.BufferReader(unpacked.read())
         try:
-            file = pq.ParquetFile(stream, page_checksum_verification=True)
-            rows, columns = file.metadata.num_rows, file.metadata.num_columns
-            for what, count, limit in (("rows", rows, MAX_ROWS), ("columns", columns, MAX_COLUMNS)):
-                if count > limit:
-                    problem = f"more than the {limit} {what} that a log may have"
-                    raise InputError(problem, source=head.path, value=count, cure="split it")
-
-            def read(names: list[str]) -> Any:
-                table = file.read(columns=names)
-                table.validate(full=True)  # damaged indices may exceed a dictionary
-                return table
-
-            yield arrow_table(file.schema_arrow, read)
+            yield pq.ParquetFile(stream, page_checksum_verification=True)
         except (pa.ArrowException, OSError, ValueError) as error:
             reason = (str(error) or type(error).__name__).splitlines()[0]
             raise InputError(
@@ -62,11 +67,11 @@ def open_parquet(head: Head) -> Iterator[ArrowTable]:
             ) from error
 
 
-def arrow_table(schema: Any, read: Any) -> ArrowTable:
+def arrow_table(schema: Any, read: Any, source: str) -> ArrowTable:
     """Return a table of an Arrow schema with the temperature source of its metadata."""
     metadata: dict[bytes, bytes] = schema.metadata or {}
     word = metadata.get(_METADATA_KEY, b"").decode("utf-8", errors="replace")
-    return ArrowTable(schema.names, read, word)
+    return ArrowTable(schema.names, read, word, source)
 
 
 def build_table(

@@ -18,8 +18,12 @@ _SYNTAX: Final = (
     " time, current, voltage, temperature, soc"
 )
 _NEEDED: Final = ("time", "current", "voltage")
+_JOINED: Final = ("time", "temperature")
+"""Quantities of several columns: a date and its time; probes, whose median is taken."""
 _SPLIT: Final = re.compile(rf",\s*(?=(?:{'|'.join(FIELDS)})\s*=)", re.IGNORECASE)
-_FACTOR: Final = re.compile(r"^(?P<text>.*\S)\s*:\s*(?P<factor>[-+]?[\d.]+(?:[eE][-+]?\d+)?)$")
+_FACTOR: Final = re.compile(
+    r"^(?P<text>.*\S)\s*:\s*(?P<factor>[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)$"
+)
 _UNIT: Final = re.compile(r"^(?P<text>.*\S)\s*\[(?P<unit>[^\[\]]*)\]$")
 
 
@@ -133,16 +137,15 @@ class ChosenColumn:
     """Columns of a table that hold one quantity.
 
     Several places are a date and its time, or temperatures whose median is taken. The unit is the
-    user's, the heading's or that of the row of units. `others` are further times, in case that the
-    first does not increase.
+    user's, the heading's or that of the row of units. `others` are further columns of time: dates
+    beside a clock, or times in case that the first does not increase.
     """
 
     places: tuple[int, ...]
     unit: str = ""
     factor: float = 1.0
-    given: bool = False
     source: TemperatureSource = "unknown"
-    others: tuple[int, ...] = ()
+    others: tuple[tuple[int, Meaning], ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -211,8 +214,7 @@ def _choose(quantity: str, plain: list[tuple[int, Meaning]], choice: Choice) -> 
     if first.rank >= GUESS or siblings or one_of_many:
         choice.guesses[quantity] = place
     elif quantity == "time":
-        others = tuple(other for other, meaning in plain[1:] if meaning.rank < GUESS)
-        choice.chosen[quantity] = ChosenColumn((place,), first.unit, others=others)
+        choice.chosen[quantity] = ChosenColumn((place,), first.unit, others=tuple(plain[1:]))
     else:
         unit, source = best[0][1].unit, best[0][1].source
         choice.chosen[quantity] = ChosenColumn(tuple(p for p, _ in best), unit, source=source)
@@ -226,14 +228,23 @@ def _given_column(
     where: str,
 ) -> ChosenColumn:
     for reading in spec.readings():
-        places = _places(reading.text, headings)
+        places = _places(reading.text, headings, is_joined=quantity in _JOINED)
         if not places:
             continue
         units = {_stated_unit(headings[place], meanings[place], quantity) for place in places}
         unit = reading.unit if reading.unit is not None else units.pop() if len(units) == 1 else ""
+        scales = {unit_of("temperature_c", other or "C") for other in units}
+        if quantity == "temperature" and reading.unit is None and len(scales) > 1:
+            shown = ", ".join(sorted(other or "none" for other in units))
+            raise InputError(
+                f"the headings have different units: {shown}",
+                field=f"{where} {quantity}",
+                value=spec.text,
+                cure="name columns of one unit",
+            )
         first = meanings[places[0]]
         source = first.source if first is not None and quantity == "temperature" else "unknown"
-        return ChosenColumn(places, unit, reading.factor, given=True, source=source)
+        return ChosenColumn(places, unit, reading.factor, source)
     near = closest(spec.text, headings)
     raise InputError(
         f"no column has this heading (found: {shown_headings(headings)})",
@@ -251,27 +262,28 @@ def _stated_unit(heading: str, meaning: Meaning | None, quantity: str) -> str:
     return next((unit for unit in units if unit_of(FIELDS[quantity], unit) is not None), "")
 
 
-def _places(text: str, headings: Sequence[str]) -> tuple[int, ...]:
+def _places(text: str, headings: Sequence[str], *, is_joined: bool) -> tuple[int, ...]:
     """Return the columns that a text names; none where it names no column, or not all."""
     whole = _place(text, headings)
-    if whole is not None:
-        return (whole,)
+    if whole is not None or not is_joined:
+        return () if whole is None else (whole,)
     places = [_place(part, headings) for part in text.split("+")]
     found = tuple(place for place in places if place is not None)
-    return found if len(found) == len(places) > 1 else ()
+    return found if len(found) == len(places) else ()
 
 
 def _place(text: str, headings: Sequence[str]) -> int | None:
+    """Return the column that a text names: its heading, that without its unit, or its number."""
     if text in headings:  # `t` beside `T`
         return headings.index(text)
-    names = [_simple(heading) for heading in headings]
-    if _simple(text) in names:
-        return names.index(_simple(text))
+    name, names = _simple(text), [_simple(heading) for heading in headings]
+    if name in names:
+        return names.index(name)
     number = re.fullmatch(r"#(\d{1,5})", text.strip())
     if number and 1 <= int(number[1]) <= len(headings):
         return int(number[1]) - 1
     bare = [_simple(names_and_units(heading)[0][0]) for heading in headings]
-    return bare.index(_simple(text)) if bare.count(_simple(text)) == 1 else None
+    return bare.index(name) if bare.count(name) == 1 else None
 
 
 def _simple(text: str) -> str:
@@ -279,28 +291,22 @@ def _simple(text: str) -> str:
 
 
 def unknown_columns(source: str, headings: Sequence[str], choice: Choice) -> InputError:
-    """Return the error for a table whose columns are not plain, with the option to paste."""
-    names = [name for name in _NEEDED if name not in choice.chosen]
-    missing = " and ".join(part for part in (", ".join(names[:-1]), *names[-1:]) if part)
+    """Return the error for a table whose columns are not plain, with the option to paste.
+
+    It has the likeliest column of each quantity, and `?` where none is likely.
+    """
+    needed = [name for name in _NEEDED if name not in choice.chosen]
+    missing = " and ".join(part for part in (", ".join(needed[:-1]), *needed[-1:]) if part)
+    likely = {quantity: headings[place] for quantity, place in choice.guesses.items()}
+    for quantity, column in choice.chosen.items():
+        likely[quantity] = "+".join(headings[place] for place in column.places)
+    names = [name for name in FIELDS if name in likely or name in _NEEDED]
+    columns = ",".join(f"{name}={likely.get(name, '?')}" for name in names).replace("'", "'\\''")
     return InputError(
         f"no plain heading of {missing} (found: {shown_headings(headings)})",
         source=source,
-        cure=f"name the columns, e.g. {suggestion(headings, choice)} ({DOCS})",
+        cure=f"name the columns, e.g. --columns '{columns}' ({DOCS})",
     )
-
-
-def suggestion(headings: Sequence[str], choice: Choice) -> str:
-    """Return the likeliest `--columns` option to paste; `?` where nothing is likely."""
-    parts = []
-    for quantity in FIELDS:
-        if quantity in choice.chosen:
-            places = choice.chosen[quantity].places
-            parts.append(f"{quantity}={'+'.join(headings[place] for place in places)}")
-        elif quantity in choice.guesses:
-            parts.append(f"{quantity}={headings[choice.guesses[quantity]]}")
-        elif quantity in _NEEDED:
-            parts.append(f"{quantity}=?")
-    return "--columns '" + ",".join(parts).replace("'", "'\\''") + "'"
 
 
 def shown_headings(headings: Sequence[str]) -> str:

@@ -1,10 +1,10 @@
-"""Columns that a reader found, and the checks that make a log of them."""
+"""The columns that a reader found, and the checks that make a log of them."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any, Final, Literal
+from typing import Final, Literal
 
 import numpy as np
 
@@ -13,6 +13,8 @@ from cangauge._typing import BoolArray, FloatArray
 from cangauge.errors import InputError
 from cangauge.logs.column_map import shown_headings
 from cangauge.logs.headings import cell_number
+from cangauge.logs.log import Log
+from cangauge.logs.sign import resolve_sign
 from cangauge.logs.units import REQUIRED, TemperatureSource, refuse_wrong_units
 
 Sign = Literal["charge", "discharge"]
@@ -71,25 +73,20 @@ class DraftLog:
         self.negated = not self.negated
         self.remarks.append(f"current negated: {because}")
 
-    def state_sign(self, sign: Sign) -> None:
-        """Apply the sign that the user states: what positive current in the file does."""
-        if (sign == "charge") is not self.negated:
-            self.negate_current(f"positive {sign}s in the file, as stated")
-        self.sign_unknown = False
-
     def take_probes(self, names: Sequence[str], probes_c: Sequence[FloatArray]) -> None:
         """Take the median of temperature probes [°C], shape (n,) each; remark where they differ."""
         self.values["temperature_c"] = probes_c[0]
         if len(probes_c) == 1:
             return
         values = np.vstack(probes_c)
-        known = np.isfinite(values)
-        rows = known.any(axis=0)
+        is_known = np.isfinite(values)
+        rows = is_known.any(axis=0)
         median = np.full(rows.size, np.nan)
         median[rows] = np.nanmedian(values[:, rows], axis=0)
         self.values["temperature_c"] = median
-        highest = np.max(np.where(known, values, -np.inf), axis=0)
-        apart = highest - np.min(np.where(known, values, np.inf), axis=0) > _PROBES_APART_K
+        highest = np.max(np.where(is_known, values, -np.inf), axis=0)
+        lowest = np.min(np.where(is_known, values, np.inf), axis=0)
+        apart = highest - lowest > _PROBES_APART_K
         if apart.any():
             row = int(np.argmax(apart))
             shown = " and ".join(f"{value:.4g}" for value in values[:, row])
@@ -98,18 +95,45 @@ class DraftLog:
                 " probes fails; name the good ones with --columns temperature=…"
             )
 
-    def checked(
-        self, temperature_c: float | None = None, used: Sequence[str] = ()
-    ) -> dict[str, Any]:
-        """Check all values and return the arguments of `Log`; see `read_log` for errors.
+    def log(
+        self,
+        temperature_c: float | None = None,
+        temperature_source: TemperatureSource | None = None,
+        sign: Sign | None = None,
+        used: Sequence[str] = (),
+    ) -> Log:
+        """Check all values and return the log, with its sign of current found or confirmed.
 
         Rows that lack a value or repeat the time stamp of the row before are dropped, with a
-        remark. `used` are columns that the caller reads besides.
+        remark. The first three arguments are the user's, as of `cangauge.read_log`; `used` are
+        columns that the caller reads besides.
         """
+        if sign is not None:
+            if (sign == "charge") is not self.negated:
+                self.negate_current(f"positive {sign}s in the file, as stated")
+            self.sign_unknown = False
         if not self.values["time_s"].size:
-            raise InputError(
-                "the log holds no rows", source=self.source or self.name, cure="check the export"
-            )
+            raise InputError("the log holds no rows", source=self._where, cure="check the export")
+        self._remark_ignored(used)
+        self._set_temperature(temperature_c)
+        if "soc_pct" in self.values:
+            self.values["soc_pct"][np.isinf(self.values["soc_pct"])] = np.nan
+        self._drop_incomplete()
+        self._drop_repeated()
+        for values in self.values.values():
+            values.flags.writeable = False  # the log need not copy them
+        self.remarks += refuse_wrong_units(self.values, source=self._where, labels=self.labels)
+        log = Log(
+            **self.values,
+            name=self.name,
+            source=self.source,
+            temperature_source=temperature_source or self.temperature_source,
+            remarks=tuple(self.remarks),
+            assumed=tuple(self.assumed),
+        )
+        return resolve_sign(log, stored_sign_unknown=self.sign_unknown, is_stated=sign is not None)
+
+    def _remark_ignored(self, used: Sequence[str]) -> None:
         ignored = [name for name in self.ignored if name not in used]
         cells = [name for name in ignored if cell_number(name) is not None]
         if len(cells) > 1:  # `read_cells`
@@ -118,23 +142,6 @@ class DraftLog:
         if ignored:
             shown = ", ".join(ignored[:6]) + (", …" if len(ignored) > 6 else "")
             self.remarks.append(f"{counted(len(ignored), 'other column')} ignored: {shown}")
-        self._set_temperature(temperature_c)
-        if "soc_pct" in self.values:
-            self.values["soc_pct"][np.isinf(self.values["soc_pct"])] = np.nan
-        self._drop_incomplete()
-        self._drop_repeated()
-        for values in self.values.values():
-            values.flags.writeable = False  # the log need not copy them
-        where = self.source or self.name
-        self.remarks.extend(refuse_wrong_units(self.values, source=where, labels=self.labels))
-        return {
-            **self.values,
-            "name": self.name,
-            "source": self.source,
-            "temperature_source": self.temperature_source,
-            "remarks": tuple(self.remarks),
-            "assumed": tuple(self.assumed),
-        }
 
     def _set_temperature(self, given_c: float | None) -> None:
         kind = "file" if self.source else "table"
@@ -182,11 +189,10 @@ class DraftLog:
             step != 0.0, f"with the time stamp of the row before dropped (the first is row {first})"
         )
 
+    @property
+    def _where(self) -> str:
+        return self.source or self.name
+
     def _error(self, name: str, problem: str, cure: str, value: float | None = None) -> InputError:
-        return InputError(
-            problem,
-            source=self.source or self.name,
-            field=self.labels.get(name, name),
-            value=value,
-            cure=cure,
-        )
+        label = self.labels.get(name, name)
+        return InputError(problem, source=self._where, field=label, value=value, cure=cure)

@@ -44,28 +44,20 @@ def bridge_s(time_s: FloatArray) -> float:
     return usual_gap_s(time_s, BRIDGE_S)
 
 
-def counted_steps_s(time_s: FloatArray) -> FloatArray:
-    """Return the time from each row to the next [s], shape (n − 1,); 0 over an uncounted gap."""
-    step_s = np.diff(time_s)
-    return np.where(step_s > bridge_s(time_s), 0.0, step_s)
-
-
-def discharged_ah(
-    time_s: FloatArray, current_a: FloatArray, step_s: FloatArray | None = None
-) -> FloatArray:
+def discharged_ah(time_s: FloatArray, current_a: FloatArray) -> FloatArray:
     """Return the charge discharged since the first row [Ah], shape (n,), by the trapezoidal rule.
 
     Parameters
     ----------
     time_s, current_a : array of shape (n,)
         Time [s] and current [A], positive = discharge. Steps longer than `bridge_s` count nothing.
-    step_s : array of shape (n − 1,), optional
-        `counted_steps_s` of the times, where they are known.
     """
+    step_s = np.diff(time_s)
+    step_s[step_s > bridge_s(time_s)] = 0.0
     total_ah = np.zeros(time_s.size)
     step_ah = total_ah[1:]  # in place: a log may have millions of rows
     np.add(current_a[1:], current_a[:-1], out=step_ah)
-    step_ah *= counted_steps_s(time_s) if step_s is None else step_s
+    step_ah *= step_s
     step_ah /= 7200.0
     np.cumsum(step_ah, out=step_ah)
     return total_ah

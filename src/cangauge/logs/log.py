@@ -87,26 +87,22 @@ class Log(ArrowExport):
     assumed: tuple[str, ...] = field(default=())
 
     def __post_init__(self) -> None:
+        where = self.source or self.name
         for channel in (*REQUIRED, "soc_pct"):
             values = getattr(self, channel)
             if values is not None:
                 object.__setattr__(self, channel, _read_only(values))
-        self._validate()
-
-    def _validate(self) -> None:
-        where = self.source or self.name
         n = self.time_s.size
         if n == 0:
             raise InputError("the log holds no rows", source=where, cure="check the export")
-        for channel in ("current_a", "voltage_v", "temperature_c", "soc_pct"):
+        for channel in (*REQUIRED, "soc_pct"):
             values = getattr(self, channel)
-            if values is not None and values.shape != (n,):
-                raise InputError(
-                    f"has {values.size} values where time_s has {n}", source=where, field=channel
-                )
-        for channel in REQUIRED:
-            values = getattr(self, channel)
-            bad = np.flatnonzero(~np.isfinite(values))
+            if values is None:
+                continue
+            if values.shape != (n,):
+                problem = f"has {values.size} values where time_s has {n}"
+                raise InputError(problem, source=where, field=channel)
+            bad = np.flatnonzero(~np.isfinite(values)) if channel in REQUIRED else np.empty(0)
             if bad.size:
                 raise InputError(
                     f"{bad.size} of {n} values are not finite, the first in row {bad[0] + 1}",

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from functools import cache
 from importlib import import_module
 from importlib.metadata import entry_points
+from itertools import pairwise
 from os import PathLike
 from typing import Any, Final, Protocol
 
@@ -17,15 +17,15 @@ import pyarrow as pa
 from cangauge._files import Head
 from cangauge._typing import FloatArray
 from cangauge.errors import InputError, require_number
-from cangauge.logs.canonical import arrow_table, open_parquet
+from cangauge.logs.canonical import arrow_table, parquet_table
 from cangauge.logs.column_map import DOCS, ColumnMap, unknown_columns
 from cangauge.logs.draft import DraftLog, Sign
 from cangauge.logs.headings import cell_number
 from cangauge.logs.log import Log, TemperatureSource
-from cangauge.logs.sign import resolve_sign
-from cangauge.logs.table import ArrowTable, draft_of_table, is_canonical, numbers_of
-from cangauge.logs.text import TextTable, find_table, is_of_frames, likely_header, table_below
+from cangauge.logs.table import ArrowTable, draft_of_table, is_canonical
+from cangauge.logs.text import TextTable, find_table, likely_header, table_below
 from cangauge.logs.units import COLDEST_C, HOTTEST_C, known_temperature_source
+from cangauge.logs.values import numbers_of
 
 KNOWN_LOGS: Final = (
     "canonical Parquet and CSV (time_s, current_a, voltage_v, temperature_c, soc_pct), ANL D3"
@@ -36,12 +36,14 @@ _FORMATS: Final = tuple(
     f"cangauge.extras.formats.{module}" for module in ("exports", "tables", "measurement")
 )
 """Modules with further readers, each in its tuple `READERS`; loaded when a log is opened."""
+_FRAME_WORDS: Final = frozenset({"id", "can id", "identifier", "dlc", "len", "data", "d1"})
+"""Headings of CAN frames: an id, a length or bytes."""
 GROUP: Final = "cangauge.readers"
 """Entry points of readers of other packages: a `LogReader`."""
 
 
 class LogReader(Protocol):
-    """Reader of one format of logs; a `cangauge._files.Reader`."""
+    """Reader of one format of logs."""
 
     name: str
     takes_columns: bool
@@ -66,8 +68,8 @@ class LogTableReader:
 
     def read(self, head: Head, columns: ColumnMap | None = None) -> DraftLog:
         """Read a log; see `LogReader`."""
-        with open_table(head, columns) as table:
-            return draft_of_table(table, columns, name=head.name, source=str(head.path))
+        table = open_table(head, columns)
+        return draft_of_table(table, columns, name=head.name, source=str(head.path))
 
 
 def _is_parquet(head: Head) -> bool:
@@ -79,18 +81,15 @@ def _canonical_text(head: Head) -> TextTable | None:
     return table if table is not None and is_canonical(table.headings) else None
 
 
-@contextmanager
-def open_table(head: Head, columns: ColumnMap | None) -> Iterator[TextTable | ArrowTable]:
-    """Open Parquet or a text as a table."""
+def open_table(head: Head, columns: ColumnMap | None) -> TextTable | ArrowTable:
+    """Return Parquet or a text as a table; raise InputError where it is none."""
     if _is_parquet(head):
-        with open_parquet(head) as found:
-            yield found
-        return
+        return parquet_table(head)
     table = _canonical_text(head) if columns is None else None
     table = table or find_table(head, columns)
     if table is None:
-        raise unknown_columns(str(head.path), *likely_header(head))
-    yield table
+        raise unknown_columns(str(head.path), *likely_header(head, columns))
+    return table
 
 
 @cache
@@ -133,7 +132,7 @@ class LogFile:
         _refuse_options(temperature_c, temperature_source, self.sign)
         try:
             draft = self.reader.read(self.head, self.columns)
-            log = _log_of(draft, temperature_c, temperature_source, self.sign, self.used)
+            log = draft.log(temperature_c, temperature_source, self.sign, self.used)
         except MemoryError as error:
             raise InputError(
                 "larger than the free memory", source=self.head.path, cure="split it"
@@ -149,29 +148,12 @@ def _refuse_options(
         known_temperature_source(temperature_source)
     if temperature_c is not None:
         require_number(temperature_c, "--temperature")
-    if temperature_c is not None and not COLDEST_C <= temperature_c <= HOTTEST_C:
-        problem = f"must lie within {COLDEST_C:g} … {HOTTEST_C:g} °C"
-        raise InputError(problem, field="--temperature", value=temperature_c)
+        if not COLDEST_C <= temperature_c <= HOTTEST_C:
+            problem = f"must lie within {COLDEST_C:g} … {HOTTEST_C:g} °C"
+            raise InputError(problem, field="--temperature", value=temperature_c)
     if sign not in {None, "charge", "discharge"}:
         cure = "say what a positive current does: charge or discharge"
         raise InputError("not a sign", field="--sign", value=sign, cure=cure)
-
-
-def _log_of(
-    draft: DraftLog,
-    temperature_c: float | None,
-    temperature_source: TemperatureSource | None,
-    sign: Sign | None,
-    used: tuple[str, ...] = (),
-) -> Log:
-    """Return the checked log of a draft, with its sign of current."""
-    if sign is not None:
-        draft.state_sign(sign)
-    log = Log(**draft.checked(temperature_c, used))
-    if temperature_source is not None:
-        log = replace(log, temperature_source=temperature_source)
-    is_stated = sign is not None
-    return resolve_sign(log, stored_sign_unknown=draft.sign_unknown, is_stated=is_stated)
 
 
 def not_recognised(file: LogFile, problem: str, cure: str) -> InputError:
@@ -181,7 +163,8 @@ def not_recognised(file: LogFile, problem: str, cure: str) -> InputError:
     if foreign is not None:
         return InputError(f"{problem}: it is {foreign[0]}", source=head.path, cure=foreign[1])
     headings, choice = likely_header(head)
-    if len(headings) >= 3 and not is_of_frames(headings):
+    is_of_frames = not _FRAME_WORDS.isdisjoint(text.strip().lower() for text in headings)
+    if len(headings) >= 3 and not is_of_frames:
         error = unknown_columns(str(head.path), headings, choice)
         return InputError(f"{problem}: {error.problem}", source=head.path, cure=error.cure)
     shown = head.first_line.strip()
@@ -208,15 +191,12 @@ def open_log(
     InputError
         If the file is absent, empty, damaged or not a regular file.
     """
-    head = Head(path)
-    given = None if columns is None else ColumnMap.of(columns)
+    head, given = Head(path), None if columns is None else ColumnMap.of(columns)
     for reader in _readers():
-        is_offered = given is None or reader.takes_columns
-        if is_offered and (
-            (given is not None and isinstance(reader, LogTableReader)) or reader.matches(head)
-        ):
+        if (given is None or reader.takes_columns) and reader.matches(head):
             return LogFile(head, reader, given, sign)
-    return LogFile(head, None, given, sign)
+    # The user's columns make a table of any text.
+    return LogFile(head, None if given is None else LogTableReader(), given, sign)
 
 
 def read_log(
@@ -261,9 +241,9 @@ def log_of_dataframe(
         table = table.rename_columns({times[0]: "time"})  # an unnamed pandas index
     table = table.drop_columns([c.name for c in indices if c.name in table.column_names])
     given = None if columns is None else ColumnMap.of(columns)
-    found = arrow_table(table.schema, table.select)
-    draft = draft_of_table(found, given, name=name, source="")
-    return _log_of(draft, temperature_c, temperature_source, sign)
+    columns_of = arrow_table(table.schema, table.select, name)
+    draft = draft_of_table(columns_of, given, name=name, source="")
+    return draft.log(temperature_c, temperature_source, sign)
 
 
 # --- Cells beside a log
@@ -303,41 +283,40 @@ def read_cells(
     columns : ColumnMap, optional
         The user's columns of the log.
     """
-    file = open_log(path, columns=columns)
+    file, source = open_log(path, columns=columns), str(path)
     if not isinstance(file.reader, LogTableReader):
         return None
-    source = str(path)
-    with open_table(file.head, columns) as table:
-        places = _cells(table.headings, source)
-        if len(places) < 2:  # a single cell is its pack
-            return None
-        cells = table.columns([place for place, _ in places.values()])
-        volts = np.column_stack(
-            [
-                scale * numbers_of(cells[place], source, table.headings[place])[0]
-                for place, scale in places.values()
-            ]
-        )
-        file_s = draft_of_table(table, columns, name=file.head.name, source=source).values["time_s"]
+    table = open_table(file.head, columns)
+    cells = _cells(table.headings, source)
+    if len(cells) < 2:  # a single cell is its pack
+        return None
+    values = table.columns([place for place, _ in cells.values()])
+    volts = np.column_stack(
+        [
+            scale * numbers_of(values[place], source, table.headings[place])[0]
+            for place, scale in cells.values()
+        ]
+    )
+    file_s = draft_of_table(table, columns, name=file.head.name, source=source).values["time_s"]
     if file_s.size != volts.shape[0]:
         return None  # rows that hold only what changed
     order = np.argsort(file_s, kind="stable")
     rows = order[np.minimum(np.searchsorted(file_s[order], time_s), file_s.size - 1)]
-    return CellColumns(
-        min(places), np.where((file_s[rows] == time_s)[:, None], volts[rows], np.nan)
-    )
+    is_row = (file_s[rows] == time_s)[:, None]
+    return CellColumns(min(cells), np.where(is_row, volts[rows], np.nan))
 
 
 def _cells(headings: Sequence[str], source: str) -> dict[int, tuple[int, float]]:
     """Return the column and scale of each cell by its number, in order."""
-    found: dict[int, tuple[int, float]] = {}
+    cells: dict[int, tuple[int, float]] = {}
     for place, heading in enumerate(headings):
         cell = cell_number(heading)
         if cell is not None:
-            found.setdefault(cell[0], (place, cell[1]))
-    numbers = sorted(found)
-    missing = [k for k in range(numbers[0], numbers[-1]) if k not in found] if numbers else []
-    if missing:
-        problem, field = "the cells must be numbered without gaps", f"cell_{missing[0]}_v"
-        raise InputError(problem, source=source, field=field, cure="export all cells")
-    return {number: found[number] for number in numbers}
+            number, scale = cell
+            cells.setdefault(number, (place, scale))
+    numbers = sorted(cells)
+    for number, following in pairwise(numbers):
+        if following > number + 1:
+            problem, field = "the cells must be numbered without gaps", f"cell_{number + 1}_v"
+            raise InputError(problem, source=source, field=field, cure="export all cells")
+    return {number: cells[number] for number in numbers}

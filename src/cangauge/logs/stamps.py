@@ -6,6 +6,7 @@ only differences matter.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any, Final
 from zoneinfo import ZoneInfo, ZoneInfoNotFoundError
 
@@ -16,6 +17,7 @@ import pyarrow.compute as pc
 from cangauge._typing import FloatArray
 from cangauge.errors import InputError
 from cangauge.logs.units import unit_of
+from cangauge.logs.values import first_text, is_number, is_text, numbers_of, present
 
 _CLOCK: Final = (
     r"(?P<h>\d{1,5}):(?P<m>\d{1,2})(?::(?P<s>\d{1,2}(?:[.,:]\d+)?))?"
@@ -42,6 +44,8 @@ _MONTHS: Final = {
     for number, names in enumerate(_MONTH_NAMES.split(), start=1)
     for name in names.split("/")
 }
+_ORDERS: Final = ("ymd", "dmy", "mdy")
+_PER_SECOND: Final = {"s": 1.0, "ms": 1e3, "us": 1e6, "ns": 1e9}
 _EPOCHS: Final = ((1e17, 1e-9, "ns"), (1e14, 1e-6, "µs"), (1e11, 1e-3, "ms"), (1e9, 1.0, "s"))
 """Smallest number since 1970 in each unit, its seconds, its name."""
 
@@ -68,9 +72,44 @@ def _spelled_alike(cells: Any) -> Any:
     return pc.utf8_trim_whitespace(cells)
 
 
-def is_time_format(unit: str) -> bool:
-    """Return whether a unit is an order of dates (dmy, mdy, ymd) or a time zone."""
-    return unit.lower() in {"ymd", "dmy", "mdy"} or _zone_of(unit) is not None
+def seconds_of(
+    parts: Sequence[Any], unit: str, factor: float, *, source: str, label: str
+) -> tuple[FloatArray, str]:
+    """Return a time column, or a date and its time of day, as seconds, and how it was read.
+
+    Parameters
+    ----------
+    parts : sequence of Arrow columns of n rows
+        Numbers, timestamps, durations, dates, or text of any of them; several are texts to join.
+    unit : str
+        Unit of numbers ("": seconds, or as the size of an epoch shows), order of dates (`dmy`,
+        `mdy`), or the zone of dates that state none (`Europe/Berlin`).
+    factor : float
+        Numbers times this are in the unit.
+    source, label : str
+        File and heading, for errors.
+
+    Raises
+    ------
+    InputError
+        If a cell is no time.
+    """
+    is_format = unit.lower() in _ORDERS or _zone_of(unit) is not None
+    kind = parts[0].type
+    if pa.types.is_timestamp(kind) or pa.types.is_duration(kind):
+        counts = parts[0].cast(pa.int64()).cast(pa.float64(), safe=False).to_numpy()
+        seconds = np.asarray(counts, dtype=np.float64) / _PER_SECOND[kind.unit]
+        return seconds, str(kind) if is_format or not unit else unit
+    if pa.types.is_date(kind):
+        parts = [parts[0].cast(pa.string()), *parts[1:]]
+    if len(parts) > 1:
+        cells = pc.binary_join_element_wise(*(part.cast(pa.string()) for part in parts), " ")
+    else:
+        cells = present(parts[0]) if is_text(parts[0]) else None
+        if cells is None or is_number(first_text(cells) or "0"):
+            values, _ = numbers_of(parts[0], source, label)
+            return _seconds_of_numbers(values * factor, "" if is_format else unit)
+    return seconds_of_text(cells, unit if is_format else "", source, label)
 
 
 def _zone_of(name: str) -> ZoneInfo | None:
@@ -82,8 +121,7 @@ def _zone_of(name: str) -> ZoneInfo | None:
         return None
 
 
-def seconds_of_numbers(values: FloatArray, unit: str) -> tuple[FloatArray, str]:
-    """Return numbers as seconds, and their unit as stated or as the size of an epoch shows."""
+def _seconds_of_numbers(values: FloatArray, unit: str) -> tuple[FloatArray, str]:
     if unit:
         return values * (unit_of("time_s", unit) or (1.0, 0.0))[0], unit
     finite = values[np.isfinite(values)]
@@ -95,15 +133,9 @@ def seconds_of_numbers(values: FloatArray, unit: str) -> tuple[FloatArray, str]:
 
 
 def seconds_of_text(cells: Any, unit: str, source: str, label: str) -> tuple[FloatArray, str]:
-    """Return stamps of text as seconds, NaN where empty, and how they were read.
+    """Return stamps of text as `seconds_of`, NaN where empty.
 
     All cells are clock times (`1:02:03.5`, `2d 01:02:03`), or dates with or without a time of day.
-    `unit` is an order of dates (`dmy`, `mdy`), or the zone of dates without one (`Europe/Berlin`).
-
-    Raises
-    ------
-    InputError
-        If a cell is no time.
     """
     cells = cells.combine_chunks() if isinstance(cells, pa.ChunkedArray) else cells
     spelled = _spelled_alike(cells)

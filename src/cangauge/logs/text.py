@@ -7,7 +7,7 @@ columns, and a last line that is cut off.
 from __future__ import annotations
 
 import csv
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from typing import Any, Final, NamedTuple
 
@@ -16,21 +16,19 @@ import pyarrow.csv as pacsv
 
 from cangauge._files import Head, as_utf8
 from cangauge.errors import InputError
-from cangauge.logs import stamps
-from cangauge.logs.column_map import Choice, ColumnMap, choose_columns, unknown_columns
+from cangauge.logs.column_map import Choice, ColumnMap, choose_columns
 from cangauge.logs.headings import meaning_of
+from cangauge.logs.stamps import is_stamp
+from cangauge.logs.values import MISSING, is_number
 
 MAX_ROWS: Final = 20_000_000
 """Rows of a log: 23 days at 10 Hz, 0.8 GB as float64."""
 MAX_COLUMNS: Final = 10_000
-_MISSING: Final = "nan na n/a #n/a null none - -- 1.#qnan -1.#ind unknown unavailable n.a."
-MISSING: Final = tuple(_MISSING.split())
-"""Cells without a value, in lower case."""
-_NULLS: Final = ["", *{s for text in MISSING for s in (text, text.upper(), text.title(), "NaN")}]
+_NULLS: Final = [spell(text) for text in MISSING for spell in (str.lower, str.upper, str.title)]
+_NULLS.append("NaN")
 _DELIMITERS: Final = ("\t", ";", ",", "|")
 _ROWS_ABOVE_DATA: Final = 4
 """Rows of units, types and remarks between a header and its data."""
-_FRAME_WORDS: Final = frozenset({"id", "can id", "identifier", "dlc", "len", "data", "d1"})
 
 
 class TextTable(NamedTuple):
@@ -53,12 +51,12 @@ class TextTable(NamedTuple):
         InputError
             If there is no row, or a row in the middle has the wrong number of cells.
         """
-        data, odd = as_utf8(self.head.read()), list[Any]()
+        data, odd_rows = as_utf8(self.head.read()), list[Any]()
         names = [f"c{place}" for place in range(self._width())]
         wanted = list(dict.fromkeys(names[place] for place in places))
 
         def skip(row: Any) -> str:
-            odd.append(row)
+            odd_rows.append(row)
             return "skip"
 
         try:
@@ -81,7 +79,7 @@ class TextTable(NamedTuple):
         except pa.ArrowInvalid as error:
             problem = f"the table cannot be read: {str(error).splitlines()[0]}"
             raise self._error(problem, "export it again") from error
-        self._remark_odd(odd, table.num_rows)
+        self._remark_odd(odd_rows, table.num_rows)
         if table.num_rows > MAX_ROWS:
             raise self._error(f"more than the {MAX_ROWS} rows that a log may have", "split it")
         if not table.num_rows:
@@ -107,11 +105,12 @@ class TextTable(NamedTuple):
             )
         return width
 
-    def _remark_odd(self, odd: list[Any], rows: int) -> None:
+    def _remark_odd(self, odd_rows: list[Any], rows: int) -> None:
         # pyarrow numbers rows from 1, skipped lines included; only the last ones may be odd.
-        last = self.skip_lines + rows + len(odd)
-        for row in odd:
-            if row.number > last - len(odd) and row.actual_columns == 1 and not is_number(row.text):
+        last = self.skip_lines + rows + len(odd_rows)
+        for row in odd_rows:
+            is_text = row.actual_columns == 1 and not is_number(row.text)
+            if is_text and row.number > last - len(odd_rows):
                 self.remarks.append(f"closing line omitted: {row.text.strip()[:60]!r}")
             elif row.number == last and row.actual_columns < row.expected_columns:
                 self.remarks.append(
@@ -134,17 +133,12 @@ def split_cells(line: str, delimiter: str) -> list[str]:
     return [cell.strip() for cell in next(reader, [])]
 
 
-def is_number(text: str) -> bool:
-    """Return whether a text is a number."""
-    try:
-        float(text)
-    except ValueError:
-        return False
-    return True
-
-
 def _is_value(cell: str) -> bool:
-    return is_number(cell.replace(",", ".")) or stamps.is_stamp(cell)
+    return is_number(cell) or is_stamp(cell)
+
+
+def _values_in(cells: Sequence[str]) -> int:
+    return sum(map(_is_value, cells))
 
 
 def table_below(head: Head, header: str) -> TextTable:
@@ -154,28 +148,18 @@ def table_below(head: Head, header: str) -> TextTable:
 
 
 def find_table(head: Head, given: ColumnMap | None = None) -> TextTable | None:
-    """Return the table of a text in which time, current and voltage are known, or None.
-
-    Raises
-    ------
-    InputError
-        If a column of the user is in no line.
-    """
+    """Return the table of a text in which time, current and voltage are known, or None."""
     specs = given.specs.values() if given else ()
     if specs and all(spec.text.startswith("#") for spec in specs):
-        found = _without_header(head)
-        if found is not None:
-            return found
+        table = _without_header(head)
+        if table is not None:
+            return table
     for rows in (1, 2):  # the words of a header may be in two rows
         for number, delimiter, cells in _headers(head, rows):
-            with suppress(InputError):
+            with suppress(InputError):  # no column has a heading that the user names
                 if choose_columns(cells, (), given).is_complete:
                     return _below(head, number + rows, delimiter, cells, given)
-    if not specs:
-        return None
-    headings, _ = likely_header(head)
-    choice = choose_columns(headings, (), given)  # names a heading that is missing
-    raise unknown_columns(str(head.path), headings, choice)
+    return None
 
 
 def _headers(head: Head, rows: int = 1) -> Iterator[tuple[int, str, list[str]]]:
@@ -185,9 +169,11 @@ def _headers(head: Head, rows: int = 1) -> Iterator[tuple[int, str, list[str]]]:
             cells = split_cells(line, delimiter) if delimiter in line else []
             for below in head.lines[number + 1 : number + rows]:
                 second = split_cells(below, delimiter)
-                is_words = len(second) == len(cells) and not any(map(_is_value, second[1:]))
-                pairs = zip(cells, second, strict=True) if is_words else ()
-                cells = [f"{one} {other}".strip() for one, other in pairs]
+                if len(second) != len(cells) or _values_in(second[1:]):
+                    cells = []
+                else:
+                    pairs = zip(cells, second, strict=True)
+                    cells = [f"{one} {other}".strip() for one, other in pairs]
             if len(cells) > 2:
                 yield number, delimiter, cells
 
@@ -195,18 +181,19 @@ def _headers(head: Head, rows: int = 1) -> Iterator[tuple[int, str, list[str]]]:
 def _below(
     head: Head, first: int, delimiter: str, cells: list[str], given: ColumnMap | None
 ) -> TextTable:
-    """Return the table below a header, with its row of units where there is one."""
-    choice = choose_columns(cells, (), given)
-    place = choice.chosen["time"].places[-1]
+    """Return the table below a header, with its row of units where there is one.
+
+    A row of units gives one of the quantities another unit, or shows that it is none (`t`, °C).
+    """
+    chosen = choose_columns(cells, (), given).chosen
+    measured = [chosen[name].places[-1] for name in ("time", "current", "voltage")]
     units: list[str] = []
     for number, line in enumerate(head.lines[first : first + _ROWS_ABOVE_DATA], start=first):
         row = split_cells(line, delimiter)
-        if place < len(row) and _is_value(row[place]):
+        if _is_value(next((row[k] for k in measured if k < len(row) and row[k]), "")):
             return TextTable(head, delimiter, cells, units, number, [])
-        again = choose_columns(cells, row, given).chosen if any(row) else {}
-        if len(again) >= len(choice.chosen) and any(
-            again[name].unit != column.unit for name, column in choice.chosen.items()
-        ):
+        again = choose_columns(cells, row, given).chosen
+        if any(name not in again or again[name].unit != chosen[name].unit for name in chosen):
             units = row
     return TextTable(head, delimiter, cells, units, first, [])
 
@@ -216,7 +203,7 @@ def _without_header(head: Head) -> TextTable | None:
     for number, line in enumerate(head.lines):
         for delimiter in _DELIMITERS:
             cells = split_cells(line, delimiter)
-            if len(cells) > 2 and 2 * sum(map(_is_value, cells)) > len(cells):
+            if len(cells) > 2 and 2 * _values_in(cells) > len(cells):
                 above = split_cells(head.lines[number - 1], delimiter) if number else []
                 headings = [f"column {k}" for k in range(1, len(cells) + 1)]
                 is_header = len(above) == len(cells)
@@ -224,20 +211,21 @@ def _without_header(head: Head) -> TextTable | None:
     return None
 
 
-def likely_header(head: Head) -> tuple[list[str], Choice]:
-    """Return the likeliest header of a text and its incomplete choice, for messages."""
+def likely_header(head: Head, given: ColumnMap | None = None) -> tuple[list[str], Choice]:
+    """Return the likeliest header of a text and its incomplete choice, for messages.
+
+    Raises
+    ------
+    InputError
+        If the header has none of a column of the user.
+    """
     best: list[str] = []
     for number, delimiter, cells in _headers(head):
-        if sum(map(_is_value, cells)) > 1:
+        if _values_in(cells) > 1:
             break
         below = head.lines[number + 1 : number + 1 + _ROWS_ABOVE_DATA]
-        has_data = any(sum(map(_is_value, split_cells(row, delimiter))) > 1 for row in below)
+        has_data = any(_values_in(split_cells(row, delimiter)) > 1 for row in below)
         known, most = (sum(map(bool, map(meaning_of, row))) for row in (cells, best))
         if has_data and (not best or known > most):
             best = cells
-    return best, choose_columns(best)
-
-
-def is_of_frames(headings: Iterable[str]) -> bool:
-    """Return whether headings are those of CAN frames: an id, a length or bytes."""
-    return bool(_FRAME_WORDS & {heading.strip().lower() for heading in headings})
+    return best, choose_columns(best, (), given)

@@ -34,6 +34,22 @@ DIFFERENT_PCT = 1.0
 resolution of a dashboard."""
 
 
+def soc_at_first_row(log: Log, capacity_ah: float) -> float | None:
+    """Return the log's first finite SoC, counted back to its first row [%]; None without one.
+
+    Parameters
+    ----------
+    log : Log
+    capacity_ah : float
+        Charge from 100 to 0 % [Ah].
+    """
+    start = log.first_soc()
+    if start is None:
+        return None
+    row, soc_pct = start
+    return soc_pct + 100.0 * float(discharged_ah(log.time_s, log.current_a)[row]) / capacity_ah
+
+
 def counted_soc_pct(log: Log, capacity_ah: float) -> FloatArray:
     """Return the SoC counted from the first finite value of the log's own [%], shape (n,).
 

@@ -130,9 +130,7 @@ class ExtendedModel:
         model, effects, pack = self.model, self.effects, self.pack
         measured_a = signals.current_a
         for effect, values in effects:
-            context = effect.context(values, model, pack)
-            for item in context.memory:
-                item.whole = True
+            context = effect.context(values, model, pack)._replace(is_whole=True)
             signals = effect.correct(signals, values, context)
         soc = self.counted_soc(signals, initial_soc_pct, initial_row=initial_row)
         every = any(effect.adds_voltage for effect, _ in effects)
@@ -307,8 +305,8 @@ class OnlineModel:
         time_s, current_a : float
             Time [s] and current [A].
         temperature_c : float
-            Latest known temperature [°C]; NaN before the first. Until then the reference
-            temperature holds, and effects of the temperature's history are zero.
+            Latest known temperature [°C]; NaN before the first: then the reference temperature
+            holds.
         """
         self.delay_line.push(time_s, current_a)
         at, now = np.array([time_s]), np.array([current_a])
@@ -320,16 +318,13 @@ class OnlineModel:
         if not self.extended.effects:
             return
         drop_v = self.load[1:] @ self.load_coefficients[1:]
+        load = Load(at, now, np.array([known_c]), np.array([drop_v]))
         over = 0
         for (effect, values), context in zip(self.extended.effects, self._contexts, strict=True):
-            of_history = any(isinstance(lag, Lag) and lag.is_lagging for lag in context.memory)
-            follows = of_history and not effect.rc_elements(values)
-            celsius = np.array([temperature_c if follows else known_c])
-            load = Load(at, now, celsius, np.array([drop_v]))
             drive = effect.drive(load, values, context)
             place = 1 + over if effect.uses_soc else 0
             over += effect.uses_soc
-            if drive is not None and not math.isnan(drive[0]):
+            if drive is not None:
                 self.drives[place] += float(drive[0])
 
     def load_at(self, temperature_c: float, currents_a: Sequence[float] | FloatArray) -> FloatArray:
@@ -360,18 +355,12 @@ class OnlineModel:
             slope = max(slope, self._slope_at_least)
         return volts, slope
 
-    curve = pseudo_ocv_at
-
     def curve_values(self, soc_pct: FloatArray) -> FloatArray:
         """Return curve and effects [V] of the latest reading at SoC [%] of shape (n,)."""
         volts = self.model.curve.values(soc_pct) + float(self.drives[0])
         for (effect, values), drive in zip(self._over_soc, self.drives[1:], strict=True):
             volts += drive * effect.over_soc(soc_pct, values, self.model)
         return volts
-
-    def row(self, soc_pct: float, load: FloatArray) -> FloatArray:
-        """Return the change of voltage by each principal function [V], shape (n,)."""
-        return self.functions.row(soc_pct, load)
 
     def take_over(self, before: OnlineModel) -> None:
         """Take over the currents of another model's form; low-passed ones where τ is the same."""
@@ -383,21 +372,9 @@ class OnlineModel:
         for lag in self.lags:
             lag.restore(known.get(lag.tau_s, []))
 
-    def resume(self, load: FloatArray, beside_v: float, drives: Sequence[float]) -> None:
-        """Continue after a reading that was advanced to elsewhere (the compiled step).
-
-        Parameters
-        ----------
-        load : array of shape (k,)
-            Load columns there.
-        beside_v : float
-            Voltage of the effects that do not depend on the SoC [V].
-        drives : sequence of float
-            `Effect.drive` of every effect there.
-        """
-        effects = zip(self.extended.effects, drives, strict=True)
-        self.load = load
-        self.drives = np.array([beside_v, *(v for (effect, _), v in effects if effect.uses_soc)])
+    def resume(self, load: FloatArray, drives: FloatArray) -> None:
+        """Continue after a reading that was advanced to elsewhere, given its `load`, `drives`."""
+        self.load, self.drives = load, drives
 
     def state(self) -> list[list[float]]:
         """Return the low-passed currents' state, then that of each effect, for `restore`."""
@@ -424,5 +401,5 @@ class OnlineModel:
                     item.restore(list(islice(numbers, size)))
                 if next(numbers, None) is not None:
                     raise InputError("longer than the state of this effect", field="effects")
-            except (ValueError, TypeError) as error:
+            except (ValueError, TypeError, IndexError) as error:
                 raise InputError(str(error), field=f"effects.{number - 1}") from error

@@ -18,9 +18,6 @@ import numpy as np
 from cangauge._typing import FloatArray
 from cangauge.logs.gaps import BRIDGE_S
 
-NO_LAG_S = 1e-3
-"""A time constant up to this is no lag: output = input [s]."""
-
 BLOCK_TIME_CONSTANTS = 300.0
 """Time constants summed in one block: e³⁰⁰, times e⁵⁰ for a last step, does not overflow."""
 
@@ -56,28 +53,13 @@ def decaying_sum(decay: FloatArray, drive: FloatArray, start: float) -> FloatArr
     return result
 
 
-class Memory:
-    """State that is carried from sample to sample, as numbers; see `Lag`."""
-
-    whole = False
-    """Whether a call gets a whole log, after which no sample comes."""
-
-    def state(self) -> list[float]:
-        """Return the state, beginning with a time [s]; empty before the first sample."""
-        raise NotImplementedError
-
-    def restore(self, state: Sequence[float]) -> None:
-        """Continue from a saved state; raise ValueError if it is malformed."""
-        raise NotImplementedError
-
-
-class Lag(Memory):
+class Lag:
     """A first-order lag; consecutive calls continue it.
 
     Parameters
     ----------
     tau_s : float
-        Time constant [s]; up to `NO_LAG_S` the output is the input.
+        Time constant [s].
     start : float, optional
         Output at the first sample; the first input by default.
     rest_s : float
@@ -91,19 +73,12 @@ class Lag(Memory):
         self._last: tuple[float, float, float] | None = None
 
     @property
-    def is_lagging(self) -> bool:
-        """Whether the output differs from the input."""
-        return self.tau_s > NO_LAG_S
-
-    @property
     def value(self) -> float:
         """Latest output."""
         return 0.0 if self._last is None else self._last[2]
 
     def step(self, time_s: FloatArray, values: FloatArray) -> FloatArray:
         """Advance to samples of shape (n,) and return the outputs there."""
-        if not self.is_lagging:
-            return values
         missing = np.isnan(values)
         if missing.any():
             result = np.full(values.size, math.nan)
@@ -135,14 +110,11 @@ class Lag(Memory):
         return [] if self._last is None else [*self._last]
 
     def restore(self, state: Sequence[float]) -> None:
-        """Continue from a saved state; raise ValueError if it is malformed."""
-        if not state:
-            self._last = None
-            return
-        time_s, latest, value = state
-        if not all(map(math.isfinite, state)):
-            raise ValueError("not finite")
-        self._last = (time_s, latest, value)
+        """Continue from a saved state; raise ValueError if it has another length."""
+        self._last = None
+        if state:
+            time_s, latest, value = state
+            self._last = time_s, latest, value
 
 
 class Turned(Lag):
@@ -162,14 +134,8 @@ class Turned(Lag):
         decay = np.where(seconds > BRIDGE_S, 0.0, np.abs(mean) * seconds / self.tau_s)
         return decay, np.sign(mean) * np.expm1(-decay)
 
-    def restore(self, state: Sequence[float]) -> None:
-        """Continue from a saved state; raise ValueError if it is malformed."""
-        super().restore(state)
-        if abs(self.value) > 1.0 + 1e-9:  # sums of decays are rounded
-            raise ValueError("the state lies within ±1")
 
-
-class First(Memory):
+class First:
     """Time of the first sample."""
 
     def __init__(self) -> None:
@@ -186,12 +152,10 @@ class First(Memory):
         return [] if self._first_s is None else [self._first_s]
 
     def restore(self, state: Sequence[float]) -> None:
-        """Continue from a saved state; raise ValueError if it is malformed."""
+        """Continue from a saved state; raise ValueError if it has another length."""
         self._first_s = None
         if state:
             (self._first_s,) = state
-            if not math.isfinite(self._first_s):
-                raise ValueError("not finite")
 
 
 def low_passed(

@@ -453,9 +453,8 @@ class Model(_Fields):
                 cure="give initial_soc_pct, or a log with soc_pct",
             )
         row, soc_pct = start
-        signals = Signals(log.time_s, log.current_a, log.voltage_v, log.temperature_c)
         rows = np.arange(len(log))
-        return self.extended_model().predict(signals, soc_pct, rows, initial_row=row)
+        return self.extended_model().predict(Signals.of(log), soc_pct, rows, initial_row=row)
 
     @classmethod
     def load(cls, path: str | PathLike[str]) -> Model:

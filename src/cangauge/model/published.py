@@ -20,11 +20,6 @@ FAST_TIME_S = 3.0
 # Figures of the paper, to compare results with.
 VOLTAGE_MAE_PCT = 0.25
 SOC_NEWTON_MAE_PCT = 2.5
-DRIVEN_KWH = 21.3
-REGENERATED_KWH = 3.2
-NET_KWH = 18.1
-HEAT_KWH = 0.41
-EFFICIENCY_PCT = 98.0
 
 
 def leaf_2012_model() -> VoltageModel:

@@ -25,7 +25,7 @@ from cangauge.bus.time_source import (
     ReplayClock,
     whole_us,
 )
-from cangauge.bus.vehicle import EXTENDED, Vehicle
+from cangauge.bus.vehicle import Vehicle
 from cangauge.errors import InputError
 from cangauge.logs.gaps import usual_step_s
 from cangauge.logs.log import Log
@@ -86,7 +86,8 @@ class CaptureSource:
     Frames of cangauge itself are dropped. If REPLAY_CLOCK is among them, log time is that of the
     replayed log, else the recorded stamps.
 
-    With a vehicle its frames are wanted; without one all are, and samples cannot be counted.
+    With a vehicle the frames that its decoder uses are wanted; without one all are, and samples
+    cannot be counted.
     """
 
     def __init__(
@@ -100,8 +101,7 @@ class CaptureSource:
     def steps(self, *, loop: bool) -> Iterator[Step]:
         """Yield a step per frame; repetitions follow 10 ms later."""
         decoder = None if self._vehicle is None else SampleDecoder(self._vehicle)
-        wanted = None if self._vehicle is None else self._vehicle.messages.keys()
-        samples = shift_us = 0
+        samples = wanted = shift_us = 0
         while True:
             first_us, last_us = None, 0
             for message in self._timed():
@@ -109,11 +109,12 @@ class CaptureSource:
                 first_us = time_us if first_us is None else first_us
                 last_us = max(last_us, time_us)
                 message.timestamp = (time_us + shift_us) / MICROSECONDS
+                is_wanted = True
                 if decoder is not None:
+                    before, statistics = wanted, decoder.statistics
                     decoder.handle(message)
-                    samples = decoder.statistics.samples
-                key = message.arbitration_id | (EXTENDED if message.is_extended_id else 0)
-                is_wanted = wanted is None or key in wanted
+                    samples, wanted = statistics.samples, statistics.wanted
+                    is_wanted = wanted != before
                 yield Step(time_us + shift_us, [message], samples, is_wanted)
             if not loop or first_us is None:
                 return

@@ -35,9 +35,6 @@ from pydantic import (
 )
 
 from cangauge._config import read_toml, validated
-from cangauge.bus.mapping import MessageMap
-from cangauge.bus.plausibility import SignalChecks
-from cangauge.bus.protection import ProtectionRule
 from cangauge.bus.time_source import TimeSourceName
 from cangauge.bus.vehicle import PRESETS
 from cangauge.errors import InputError
@@ -80,17 +77,6 @@ class IdsConfig(Strict):
     soc_health: int = _id(0x5A2, "SOC_HEALTH")
     soc_power: int = _id(0x5A3, "SOC_POWER")
     soc_cells: int = _id(0x5A4, "SOC_CELLS, sent where the vehicle gives cell voltages")
-
-
-class ChecksConfig(Strict):
-    """Plausibility checks by signal, as in a map file; see `SignalChecks`."""
-
-    current: SignalChecks = key(SignalChecks(), "Plausibility check of the current.")
-    voltage: SignalChecks = key(SignalChecks(), "Plausibility check of the voltage.")
-    temperature: SignalChecks = key(SignalChecks(), "Plausibility check of the temperature.")
-    soc_reference: SignalChecks = key(
-        SignalChecks(), "Plausibility check of the vehicle's own SoC."
-    )
 
 
 class FullChargeConfig(Strict):
@@ -313,13 +299,6 @@ class RunConfig(Strict):
         2.0, "Time without a sample after which the input is stale.", unit="s", gt=0.0, le=1e9
     )
     ids: IdsConfig = key(IdsConfig(), "Ids of the published frames.")
-    messages: dict[str, MessageMap] = key(
-        {}, "Protection and period of messages, by name or id; before those of the vehicle."
-    )
-    rules: dict[str, ProtectionRule] = key({}, "Further protection rules.")
-    checks: ChecksConfig = key(
-        ChecksConfig(), "Plausibility checks by signal; before those of the vehicle."
-    )
     record: str | None = key(
         None,
         "Record the received frames (candump .log or .log.gz): `cangauge estimate` on them"
@@ -339,7 +318,7 @@ class RunConfig(Strict):
     duration_s: FiniteFloat | None = key(None, "Stop after this time.", unit="s", gt=0.0, le=1e9)
     until_idle_s: FiniteFloat | None = key(
         None, "Stop when no sample came for this time, after the first.",
-        "--until-idle", "S", unit="s", gt=0.0, le=1e9,
+        unit="s", gt=0.0, le=1e9,
     )  # fmt: skip
     state: str | None = key(
         None,
@@ -465,13 +444,6 @@ class ConfigKey:
     unit: str = ""
     restart: bool = False
     is_path: bool = False
-
-    def value_in(self, table: Mapping[str, Any]) -> Any:
-        """Return the value of the key in a table, or None."""
-        value: Any = table
-        for part in self.name.split("."):
-            value = value and value[part]
-        return value
 
     @property
     def help(self) -> str:

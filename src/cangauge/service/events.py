@@ -28,6 +28,78 @@ EVENTS_KEPT: Final = 256
 """Most events whose repetitions are tracked, to bound the memory."""
 
 
+@dataclass(slots=True)
+class _Repetitions:
+    """State of one event; `held` is the latest suppressed record."""
+
+    latest_s: float = -math.inf
+    next_s: float = -math.inf
+    interval_s: float = 0.0
+    suppressed: int = 0
+    held: logging.LogRecord | None = None
+
+
+class RateLimitedHandler(logging.Handler):
+    """Limit each event to one record per interval; the latest suppressed one follows at its end.
+
+    It follows when `release_due` is called: no thread is started for it, which could fail. A
+    record's `suppressed` counts those of its event that were dropped before it. `clock` gives
+    monotonic time [s].
+    """
+
+    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
+        super().__init__()
+        self._clock = clock
+        self._events: dict[tuple[str, str], _Repetitions] = {}
+        self._turn = threading.RLock()
+
+    def handle(self, record: logging.LogRecord) -> bool:
+        """Write a record, or hold it; return whether it was written."""
+        key = (record.name, str(getattr(record, "limit", record.msg)))
+        with self._turn:
+            now_s = self._clock()
+            event = self._events[key] = self._events.pop(key, _Repetitions())
+            if len(self._events) > EVENTS_KEPT:
+                del self._events[next(iter(self._events))]  # the one quiet for longest
+            if now_s - event.latest_s > LONGEST_INTERVAL_S:
+                event.interval_s = 0.0
+            event.latest_s = now_s
+            if now_s < event.next_s:
+                event.suppressed += 1
+                event.held = record
+                return False
+            self._write(event, record, now_s)
+        return True
+
+    def release_due(self, *, everything: bool = False) -> None:
+        """Write the suppressed records whose interval has ended, or all of them."""
+        with self._turn:
+            now_s = self._clock()
+            held = [(each, each.held) for each in self._events.values() if each.held is not None]
+            for event, record in sorted(held, key=lambda each: each[1].created):
+                if everything or now_s >= event.next_s:
+                    event.suppressed -= 1
+                    self._write(event, record, now_s)
+
+    def _write(self, event: _Repetitions, record: logging.LogRecord, now_s: float) -> None:
+        if event.suppressed:
+            record.suppressed = event.suppressed
+        event.suppressed, event.held = 0, None
+        event.interval_s = min(2.0 * event.interval_s, LONGEST_INTERVAL_S) or FIRST_INTERVAL_S
+        event.next_s = now_s + event.interval_s
+        self.emit(record)
+
+
+class _Handler(RateLimitedHandler, logging.StreamHandler[TextIO]):
+    def emit(self, record: logging.LogRecord) -> None:
+        """Write a record; drop it if its reader is stopped, instead of waiting."""
+        if takes_text(self.stream):
+            super().emit(record)
+
+    def handleError(self, record: logging.LogRecord) -> None:  # noqa: N802 - logging's name
+        """Ignore errors: a closed stderr must not end the service, and cannot be reported."""
+
+
 @contextmanager
 def logging_to(
     log_format: LogFormat, level: LogLevel = "info", stream: TextIO | None = None
@@ -36,10 +108,9 @@ def logging_to(
 
     `level` is the lowest one written; other libraries are limited to errors, unless it is "debug".
     """
-    handler = _Handler(stream or sys.stderr)
+    handler = _Handler()
+    handler.stream = stream or sys.stderr
     handler.setFormatter(_JsonFormat() if log_format == "json" else _TextFormat())
-    limiter = RateLimitFilter(handler.write)
-    handler.addFilter(limiter)
     # python-can logs and raises the same error, at each attempt to open a missing bus.
     levels: dict[str, int | str] = {
         "": logging.ERROR, "cangauge": level.upper(), "can": logging.CRITICAL
@@ -55,7 +126,7 @@ def logging_to(
     try:
         yield
     finally:
-        limiter.release_due(everything=True)
+        handler.release_due(everything=True)
         root.handlers = before
         for logger, number in levels_before.items():
             logger.setLevel(number)
@@ -64,9 +135,8 @@ def logging_to(
 def release_held() -> None:
     """Write the suppressed records whose interval has ended; the receive loop calls this."""
     for handler in logging.getLogger().handlers:
-        for each in handler.filters:
-            if isinstance(each, RateLimitFilter):
-                each.release_due()
+        if isinstance(handler, RateLimitedHandler):
+            handler.release_due()
 
 
 def takes_text(stream: IO[str]) -> bool:
@@ -81,24 +151,6 @@ def takes_text(stream: IO[str]) -> bool:
         return bool(ready.poll(0))
     except (AttributeError, OSError, ValueError):  # Windows; no real file
         return True
-
-
-class _Handler(logging.StreamHandler[TextIO]):
-    def emit(self, record: logging.LogRecord) -> None:
-        """Write a record; drop it if its reader is stopped, instead of waiting."""
-        if takes_text(self.stream):
-            super().emit(record)
-
-    def write(self, record: logging.LogRecord) -> None:
-        """Write a record without filtering it."""
-        self.acquire()
-        try:
-            self.emit(record)
-        finally:
-            self.release()
-
-    def handleError(self, record: logging.LogRecord) -> None:  # noqa: N802 - logging's name
-        """Ignore errors: a closed stderr must not end the service, and cannot be reported."""
 
 
 class _TextFormat(logging.Formatter):
@@ -139,72 +191,3 @@ def _parts(record: logging.LogRecord) -> tuple[str, str, str, dict[str, Any]]:
     if hasattr(record, "suppressed"):
         fields["repeats_suppressed"] = record.suppressed
     return stamp.replace("+00:00", "Z"), str(getattr(record, "event", "log")), message, fields
-
-
-@dataclass(slots=True)
-class _Repetitions:
-    """State of one event."""
-
-    latest_s: float = -math.inf
-    next_s: float = -math.inf
-    interval_s: float = 0.0
-    suppressed: int = 0
-    held: logging.LogRecord | None = None
-
-    def write(self, record: logging.LogRecord, now_s: float) -> None:
-        """Note that a record is written."""
-        if self.suppressed:
-            record.suppressed = self.suppressed
-        self.suppressed, self.held = 0, None
-        self.interval_s = min(2.0 * self.interval_s, LONGEST_INTERVAL_S) or FIRST_INTERVAL_S
-        self.next_s = now_s + self.interval_s
-
-
-class RateLimitFilter(logging.Filter):
-    """Limit each event to one record per interval; the latest suppressed one follows at its end.
-
-    `release` writes it, when `release_due` is called: no thread is started for it, which could
-    fail. `clock` gives monotonic time [s].
-    """
-
-    def __init__(
-        self,
-        release: Callable[[logging.LogRecord], None],
-        clock: Callable[[], float] = time.monotonic,
-    ) -> None:
-        super().__init__()
-        self._release = release
-        self._clock = clock
-        self._lock = threading.Lock()
-        self._events: dict[tuple[str, str], _Repetitions] = {}
-
-    def filter(self, record: logging.LogRecord) -> bool:
-        """Return whether to write the record now; its `suppressed` counts those before it."""
-        key = (record.name, str(getattr(record, "limit", record.msg)))
-        with self._lock:
-            now_s = self._clock()
-            event = self._events[key] = self._events.pop(key, _Repetitions())
-            if len(self._events) > EVENTS_KEPT:
-                del self._events[next(iter(self._events))]  # the one quiet for longest
-            if now_s - event.latest_s > LONGEST_INTERVAL_S:
-                event.interval_s = 0.0
-            event.latest_s = now_s
-            if now_s < event.next_s:
-                event.suppressed += 1
-                event.held = record
-                return False
-            event.write(record, now_s)
-        return True
-
-    def release_due(self, *, everything: bool = False) -> None:
-        """Write the suppressed records whose interval has ended, or all of them."""
-        with self._lock:
-            now_s = self._clock()
-            due: list[logging.LogRecord] = []
-            for event in self._events.values():
-                if event.held is not None and (everything or now_s >= event.next_s):
-                    due.append(event.held)
-                    event.suppressed -= 1
-                    event.write(event.held, now_s)
-        for record in sorted(due, key=lambda each: each.created):
-            self._release(record)

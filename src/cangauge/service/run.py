@@ -7,6 +7,7 @@ import os
 import threading
 import time
 from collections.abc import Sequence
+from concurrent.futures import Future
 from contextlib import ExitStack
 from functools import partial
 from importlib import import_module
@@ -25,10 +26,10 @@ from cangauge.service.loop import Loop, LoopSettings
 from cangauge.service.output import Output
 from cangauge.service.pipeline import Pipeline
 from cangauge.service.record import Recorder, check_recording
-from cangauge.service.setup import Setup, SetupReader, address_of
+from cangauge.service.setup import Setup, address_of, read_setup
 from cangauge.service.state import StateKeeper, state_path
 from cangauge.service.status import PAGE_EVERY_S, SHOW_EVERY_S, Monitor
-from cangauge.service.status_client import StatusSocket, socket_path
+from cangauge.service.status_client import StatusSocket, socket_path, value_at
 
 OUTPUTS: Final = {
     "cangauge.extras.live.launch": ("http", "dashboard", "mqtt"),
@@ -95,7 +96,7 @@ class Service:
         self.bus = str(self.address)
         self._outputs = list(outputs)
         self._is_stopped = self._is_reload_due = False
-        self._reading: SetupReader | None = None
+        self._reading: Future[Setup | CangaugeError] | None = None
         self.recorder: Recorder | None = None
 
     def stop(self) -> None:
@@ -177,7 +178,7 @@ class Service:
         recording = None if self.recorder is None else str(self.recorder.written)
         used_s = {"cpu_seconds": time.process_time() - began_s}
         status = monitor.final() | used_s | {"recording": recording}
-        self._end(port, status)
+        self._log_end(status)
         return status
 
     def apply(self, new: Setup | CangaugeError) -> tuple[LoopSettings | None, str | None]:
@@ -199,27 +200,44 @@ class Service:
         return _loop_settings(new.config), None
 
     def _poll_reload(self, monitor: Monitor) -> LoopSettings | None:
-        """Begin to read on request; use what was read since the last call."""
+        """Begin to read on request, in a thread; use what was read since the last call."""
         if self._reading is None:
             if self._is_reload_due:
                 self._is_reload_due = False
-                self._reading = SetupReader(self._read)
+                self._reading = Future()
+                put = self._reading.set_result
+                threading.Thread(
+                    target=lambda: put(read_setup(self._read)), name="cangauge-reload", daemon=True
+                ).start()
                 monitor.reload_begins()
             return None
-        if self._reading.is_alive():
+        if not self._reading.done():
             return None
-        settings, problem = self.apply(self._reading.result)
+        settings, problem = self.apply(self._reading.result())
         self._reading = None
         monitor.model, monitor.sign_cure = self.config.model, self._setup.sign_cure
         monitor.reload_ends(problem)
         return settings
 
-    def _end(self, port: ReconnectingBus, status: dict[str, Any]) -> None:
-        """Log the end of a run."""
-        text = _summary_line(self.pipeline, port, status)
+    def _log_end(self, status: dict[str, Any]) -> None:
+        """Log the end of a run: its frames, losses and last SoC, and what is missing."""
+        counts, latest = self.pipeline.counts, self.pipeline.latest
+        step_s = status["step"]["mean_s"]
+        errors = "".join(
+            f", {count} {name.replace('_', ' ')}"
+            for name, count in status["bus_counts"].items()
+            if count
+        )
+        text = (
+            f"{status['uptime_s']:.1f} s, {counts.frames} frames, {counts.samples} samples,"
+            f" {counts.lost} lost, {counts.crc_errors} CRC errors{errors};"
+            f" last SoC {known_soc(latest.soc_pct, latest.soc_std_pct, 2)}"
+            f" ({latest.status.name.lower()});"
+            f" step {number(step_s and 1e6 * step_s, 0, 'µs')} (mean)"
+        )
         emit(_LOG, logging.INFO, "service.stopped", text)
-        if not self.pipeline.counts.frames:
-            text = f"{port.name}: no expected frame arrived; check channel, bit rate and vehicle"
+        if not counts.frames:
+            text = f"{self.bus}: no expected frame arrived; check channel, bit rate and vehicle"
             text += " (--vehicle or --map)"
             emit(_LOG, logging.WARNING, "bus.nothing_wanted", text)
         if (path := status["recording"]) is not None:
@@ -276,28 +294,8 @@ def _log_changes(old: RunConfig, new: RunConfig) -> None:
     late = ", ".join(
         each.name
         for each in config_keys()
-        if each.restart and each.value_in(before) != each.value_in(after)
+        if each.restart and value_at(before, each.name) != value_at(after, each.name)
     )
     if late:
         text = f"{late}: takes effect after a restart of the service"
         emit(_LOG, logging.WARNING, "config.needs_restart", text)
-
-
-def _summary_line(pipeline: Pipeline, port: ReconnectingBus, status: dict[str, Any]) -> str:
-    """Return a run's frames, losses and last SoC in one line."""
-    counts, latest, step_s = pipeline.counts, pipeline.latest, status["step"]["mean_s"]
-    kinds = ", ".join(f"{kind} {count}" for kind, count in port.error_kinds.most_common())
-    found = {
-        "dropped in the receive queue": port.queue_drops,
-        f"error frames ({kinds})": port.error_frames,
-        "not sent": port.unsent,
-        "from another service with these ids": status["bus_counts"]["foreign"],
-        f"bus losses ({port.away_s:.1f} s)": port.losses,
-    }
-    errors = "".join(f", {count} {what}" for what, count in found.items() if count)
-    soc = known_soc(latest.soc_pct, latest.soc_std_pct, 2)
-    return (
-        f"{status['uptime_s']:.1f} s, {counts.frames} frames, {counts.samples} samples,"
-        f" {counts.lost} lost, {counts.crc_errors} CRC errors{errors}; last SoC {soc}"
-        f" ({latest.status.name.lower()}); step {number(step_s and 1e6 * step_s, 0, 'µs')} (mean)"
-    )

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Self
 
 from cangauge._config import read_toml
-from cangauge.bus.mapping import Overrides
 from cangauge.bus.open import BusAddress, backend_capabilities, bus_address, is_multicast
 from cangauge.bus.publish import FrameIds
 from cangauge.bus.vehicle import Vehicle
@@ -42,26 +40,14 @@ class Setup:
         return cls(config, vehicle, model, pipeline_settings(config), _sign_cure(config))
 
 
-class SetupReader(threading.Thread):
-    """Read a configuration in a thread, while the old one is in use.
-
-    `result` is the new one, or why it is refused, once the thread has ended.
-    """
-
-    def __init__(self, read: Callable[[], RunConfig]) -> None:
-        super().__init__(name="cangauge-reload", daemon=True)
-        self._read = read
-        self.result: Setup | CangaugeError
-        self.start()
-
-    def run(self) -> None:
-        """Read; may take seconds for a large DBC."""
-        try:
-            self.result = Setup.of(self._read())
-        except CangaugeError as error:
-            self.result = error
-        except Exception as error:  # noqa: BLE001 - of a library that reads a file
-            self.result = InputError(f"cannot be read: {error!r}", cure="check the files")
+def read_setup(read: Callable[[], RunConfig]) -> Setup | CangaugeError:
+    """Return a configuration with its files, or why it is refused; may take seconds."""
+    try:
+        return Setup.of(read())
+    except CangaugeError as error:
+        return error
+    except Exception as error:  # noqa: BLE001 - of a library that reads a file
+        return InputError(f"cannot be read: {error!r}", cure="check the files")
 
 
 def load_vehicle(config: RunConfig) -> Vehicle:
@@ -75,7 +61,6 @@ def load_vehicle(config: RunConfig) -> Vehicle:
         config.map,
         temperature_c=config.temperature,
         pair_within_s=config.pair_within_s,
-        overrides=Overrides(config.file, config.messages, config.rules, dict(config.checks)),
     )
 
 

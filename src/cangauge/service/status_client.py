@@ -50,25 +50,21 @@ class Snapshot:
     made_s: float
     status: dict[str, Any]
 
-    def is_stuck(self, now_s: float) -> bool:
-        """Return whether the receive loop is stuck at a monotonic time [s]."""
-        return now_s - self.made_s > STUCK_S
-
     def at(self, now_s: float) -> dict[str, Any]:
         """Return the object of `/status` at a monotonic time [s]: older, stale once stuck."""
         status, later_s = dict(self.status), max(now_s - self.made_s, 0.0)
         status |= {"uptime_s": status["uptime_s"] + later_s, "loop_age_s": later_s}
         if status["sample"] is not None and status["sample"]["age_s"] is not None:
             status["sample"] = status["sample"] | {"age_s": status["sample"]["age_s"] + later_s}
-        if self.is_stuck(now_s):
+        if later_s > STUCK_S:
             status |= {"loop_stuck": True, "status": "invalid"}
             status["reasons"] = sorted({*status["reasons"], *reason_ids(Reason.INPUT_STALE)})
         return status
 
 
-def value_at(status: Mapping[str, Any], place: str) -> Any:
-    """Return the value at a place in a status, such as "sample.current_a"; None if not known."""
-    value: Any = status
+def value_at(table: Mapping[str, Any], place: str) -> Any:
+    """Return the value at a place in nested tables, such as "sample.current_a"; None if absent."""
+    value: Any = table
     for part in place.split("."):
         value = None if value is None else value.get(part)
     return value

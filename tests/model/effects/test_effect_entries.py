@@ -90,6 +90,18 @@ def test_bad_entries_name_the_field(entries: list[object], field: str, words: st
     assert error.value.field == field
 
 
+def test_retired_parameters_of_earlier_versions_may_be_zero() -> None:
+    effects = [(LIBRARY["slow_diffusion"], middle(LIBRARY["slow_diffusion"]))]
+    entries = effect_entries(effects)
+    for spread, is_refused in ((0.0, False), (0.5, True)):
+        earlier = [entries[0] | {"parameters": effects[0][1] | {"spread": spread}}]
+        if is_refused:
+            with pytest.raises(InputError, match="slow_diffusion has the parameters"):
+                parse_effects(earlier, PACK)
+        else:
+            assert parse_effects(earlier, PACK) == effects
+
+
 def test_an_unknown_id_lists_the_known_ones() -> None:
     with pytest.raises(InputError) as error:
         effect_of("current_ofset", "--effects")

@@ -33,10 +33,9 @@ class PackState:
 def corrected(effect_id: str, signals: Signals, values: Values) -> Signals:
     """A whole log as ideal sensors would have shown it."""
     effect = LIBRARY[effect_id]
-    context = effect.context(values, MODEL, PACK)
-    for item in context.memory:
-        item.whole = True
-    return effect.correct(signals, values, context)
+    return effect.correct(
+        signals, values, effect.context(values, MODEL, PACK)._replace(is_whole=True)
+    )
 
 
 def steady(
@@ -191,7 +190,7 @@ def at_onset(current_a: float, **state: float) -> PackState:
 
 def test_a_share_of_the_drop_follows_arrhenius() -> None:
     values = {
-        "share": 0.7, "activation_k": 4000.0, "delayed": 1.0, "reference_c": 23.0, "lag_s": 0.0
+        "share": 0.7, "activation_k": 4000.0, "delayed": 1.0, "reference_c": 23.0
     }  # fmt: skip
     at_23 = extra("resistance_temperature", steady(10.0, 50.0, temperature_c=23.0), values)
     np.testing.assert_allclose(at_23, 0.0, atol=1e-12)
@@ -202,28 +201,11 @@ def test_a_share_of_the_drop_follows_arrhenius() -> None:
     np.testing.assert_allclose(found, 0.7 * cold.drop_v * (factor - 1.0), rtol=1e-12)
 
 
-def test_resistance_follows_the_lagging_interior() -> None:
-    """The sensor steps from 23 to 0 °C; the interior is at 23·e^(−t/τ) °C."""
-    values = {
-        "share": 0.7, "activation_k": 4000.0, "delayed": 1.0, "reference_c": 23.0, "lag_s": 900.0
-    }  # fmt: skip
-    state = steady(2000.0, 50.0)
-    outside = np.where(state.time_s < 1.0, 23.0, 0.0)
-    found = extra("resistance_temperature", replace(state, temperature_c=outside), values)
-    assert found[0] == 0.0
-    for at in (100, 900, 2000):
-        # The sensor falls linearly in the first second: equivalent to a step half a second later.
-        inside = 23.0 * math.exp(-(at - 0.5) / 900.0)
-        factor = math.exp(4000.0 * (1.0 / (inside + 273.15) - 1.0 / 296.15))
-        expected = 0.7 * state.drop_v[at] * (factor - 1.0)
-        np.testing.assert_allclose(found[at], expected, rtol=1e-5)
-
-
 @pytest.mark.parametrize(
     ("effect_id", "values", "rise"),
     [
         ("resistance_temperature",
-         {"share": 0.5, "activation_k": 2500.0, "reference_c": 23.0, "lag_s": 0.0},
+         {"share": 0.5, "activation_k": 2500.0, "reference_c": 23.0},
          0.5 * math.expm1(2500.0 * (1.0 / 278.15 - 1.0 / 296.15))),
         ("resistance_soc", {"at_empty": 2.0, "at_full": 0.0, "width_pct": 10.0}, 2.0 / math.e),
     ],
@@ -263,31 +245,6 @@ def test_a_step_persists_from_its_change_point() -> None:
     np.testing.assert_allclose(found[300:], -2.0)
 
 
-def test_trial_change_points_lie_inside_the_log() -> None:
-    """Outside the log a step is not separable from a constant resistance, or from none."""
-    start = LIBRARY["resistance_step"].parameters[1]
-    for hours in (0.2, 3.0):
-        seconds = 3600.0 * hours
-        trials = start.trials(PACK, np.linspace(100.0, 100.0 + seconds, 50))
-        assert trials[0] == pytest.approx(0.05 * seconds)
-        assert trials[-1] == pytest.approx(0.95 * seconds)
-        np.testing.assert_allclose(np.diff(trials), 0.05 * seconds, rtol=1e-9)
-        low, high = start.bounds(PACK)
-        assert low <= trials[0] <= trials[-1] <= high
-
-
-def test_charge_transfer_bends_between_rest_and_1c() -> None:
-    current = PACK.capacity_ah * np.array([-3.0, -1.0, -0.2, 0.0, 0.2, 1.0, 3.0])
-    for temperature_c in (-10.0, 25.0):
-        state = with_current(steady(6.0, 0.0, temperature_c=temperature_c), current)
-        bent = {"scale_v": 5.0, "exchange_a": 3.0, "bend_only": 1.0, "activation_k": 5000.0}
-        found = extra("charge_transfer", state, bent)
-        np.testing.assert_allclose(found[[1, 3, 5]], 0.0, atol=1e-12)
-        np.testing.assert_allclose(found, -found[::-1], atol=1e-12)
-        assert found[4] < -1.0
-        assert found[6] > 1.0
-
-
 @pytest.mark.parametrize("activation_k", [0.0, 5000.0])
 @pytest.mark.parametrize("bend_only", [0.0, 1.0])
 @pytest.mark.parametrize("temperature_c", [-15.0, 25.0, 40.0])
@@ -313,25 +270,11 @@ POLARISATIONS = pytest.mark.parametrize("effect_id", ["fast_polarization", "slow
 
 
 @POLARISATIONS
-def test_polarisation_follows_its_time_constant(effect_id: str) -> None:
-    tau = 5.0 if effect_id == "fast_polarization" else 400.0
-    values = {"ohm": 0.02, "tau_s": tau, "spread": 0.0, "activation_k": 0.0}
-    state = steady(40.0 * tau, 50.0)
-    current = np.where(state.time_s < 20.0 * tau, 50.0, 0.0)
-    found = extra(effect_id, with_current(state, current), values)
-    assert found[0] == 0.0
-    assert found[int(tau)] == pytest.approx(-1.0 * (1.0 - math.exp(-1.0)), rel=1e-6)
-    assert found[int(20 * tau) - 1] == pytest.approx(-1.0, rel=1e-6)
-    ratio = found[int(23 * tau)] / found[int(22 * tau)]
-    assert ratio == pytest.approx(math.exp(-1.0), rel=1e-6)
-
-
-@POLARISATIONS
 def test_polarisation_follows_arrhenius_from_25_c(effect_id: str) -> None:
     tau = 5.0 if effect_id == "fast_polarization" else 400.0
     for temperature_c, activation_k in ((25.0, 3000.0), (0.0, 3000.0), (-10.0, 6000.0), (0.0, 0.0)):
         state = steady(3.0 * tau, 50.0, temperature_c=temperature_c)
-        values = {"ohm": 0.02, "tau_s": tau, "spread": 0.0, "activation_k": activation_k}
+        values = {"ohm": 0.02, "tau_s": tau, "activation_k": activation_k}
         colder = math.exp(activation_k * (1.0 / (temperature_c + 273.15) - 1.0 / 298.15))
         expected = -1.0 * colder * -np.expm1(-state.time_s / tau)
         np.testing.assert_allclose(extra(effect_id, state, values), expected, rtol=1e-9, atol=1e-12)
@@ -341,7 +284,7 @@ def test_polarisation_scales_with_the_present_temperature() -> None:
     """The resistance rises in the cold; the time constant does not."""
     state = steady(3000.0, 50.0, temperature_c=25.0)
     warming = replace(state, temperature_c=np.where(state.time_s < 2999.5, 0.0, 25.0))
-    values = {"ohm": 0.02, "tau_s": 400.0, "spread": 0.0, "activation_k": 3000.0}
+    values = {"ohm": 0.02, "tau_s": 400.0, "activation_k": 3000.0}
     cold, warm = extra("slow_diffusion", warming, values), extra("slow_diffusion", state, values)
     assert cold[-1] == warm[-1]
     assert cold[-2] == pytest.approx(
@@ -353,22 +296,10 @@ def test_polarisation_has_decayed_after_a_night() -> None:
     time_s = np.concatenate([np.arange(0.0, 3600.0), 3600.0 + 8 * 3600.0 + np.arange(10.0)])
     current = np.full_like(time_s, 50.0)
     state = PackState(time_s, current, current, current, current)
-    values = {"ohm": 0.02, "tau_s": 1000.0, "spread": 0.0, "activation_k": 0.0}
+    values = {"ohm": 0.02, "tau_s": 1000.0, "activation_k": 0.0}
     found = extra("slow_diffusion", state, values)
     assert found[3599] == pytest.approx(-1.0 * (1.0 - math.exp(-3.599)), rel=1e-3)
     assert abs(found[3600]) < 1e-6
-
-
-def test_spread_diffusion_is_faster_with_equal_final_resistance() -> None:
-    state = steady(30_000.0, 50.0)
-    values = {"ohm": 0.02, "tau_s": 1000.0, "activation_k": 0.0}
-    one = extra("slow_diffusion", state, values | {"spread": 0.0})
-    many = extra("slow_diffusion", state, values | {"spread": 1.0})
-    assert many[-1] == pytest.approx(-1.0, rel=1e-6)
-    assert one[-1] == pytest.approx(-1.0, rel=1e-6)
-    # At first it grows like diffusion, with the square root of time; one element grows with time.
-    assert many[80] / many[20] == pytest.approx(2.0, rel=0.1)
-    assert one[80] / one[20] == pytest.approx(4.0, rel=0.05)
 
 
 def test_particle_diffusion_follows_the_slope_of_the_ocv() -> None:
@@ -433,17 +364,6 @@ def test_the_entropic_level_is_constant_over_soc() -> None:
             state = steady(3.0, 60.0, soc_pct=soc_pct, temperature_c=MODEL.t_ref_c + kelvin)
             found = extra("entropic_coefficient", state, values)
             np.testing.assert_allclose(found, 0.02 * kelvin, rtol=1e-12, atol=1e-15)
-
-
-def test_entropy_follows_the_lagging_interior() -> None:
-    values = {"level_v_per_k": 0.02, "slope_v_per_k": 0.0, "curve_v_per_k": 0.0}
-    state = steady(5000.0, 0.0)
-    outside = np.where(state.time_s < 1.0, MODEL.t_ref_c, MODEL.t_ref_c + 10.0)
-    warmed = replace(state, temperature_c=outside)
-    found = extra("entropic_coefficient", warmed, values | {"lag_s": 1000.0})
-    assert found[0] == 0.0
-    assert found[1000] == pytest.approx(0.2 * (1.0 - math.exp(-1.0)), rel=1e-3)
-    assert found[5000] == pytest.approx(0.2 * (1.0 - math.exp(-5.0)), rel=1e-3)
 
 
 def test_entropic_slope_and_curve_average_to_zero_over_soc() -> None:

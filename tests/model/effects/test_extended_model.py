@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
 from pathlib import Path
 
@@ -150,27 +149,3 @@ def test_newton_finds_a_root_with_all_effects(
     assert 0.0 <= found.soc_pct <= 100.0
     if found.inside:
         assert online.pseudo_ocv_at(found.soc_pct)[0] == pytest.approx(wanted, abs=1e-6)
-
-
-@pytest.mark.parametrize(
-    ("effect_id", "values"),
-    [
-        ("inner_temperature", {"voltage_v_per_k": 0.05, "tau_s": 3600.0}),
-        ("resistance_temperature", {"lag_s": 1800.0}),
-        ("entropic_coefficient", {"slope_v_per_k": 1e-3, "lag_s": 1800.0}),
-    ],
-)
-def test_lagging_effects_start_at_the_first_known_temperature(
-    effect_id: str, values: dict[str, float]
-) -> None:
-    """Temperature frames are rarer than current frames: the first samples have none."""
-    extended = ExtendedModel(
-        MODEL, CAPACITY_AH, ((LIBRARY[effect_id], {**middle(LIBRARY[effect_id]), **values}),)
-    )
-    late, known = online_of(extended), online_of(extended)
-    for time_s in range(60):
-        late.advance(float(time_s), 80.0, math.nan if time_s < 5 else 0.0)
-        assert math.isfinite(late.pseudo_ocv_at(70.0)[0])
-        if time_s >= 5:
-            known.advance(float(time_s), 80.0, 0.0)
-    assert late.pseudo_ocv_at(70.0) == known.pseudo_ocv_at(70.0)

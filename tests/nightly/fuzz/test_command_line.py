@@ -37,7 +37,6 @@ VALID = {
     "inspect": ["absent.csv"],
     "twin": ["-o", "absent/out.csv"],
     "export-c": ["-m", "absent.json", "-o", "out"],
-    "export-ecm": ["-m", "absent.json", "-o", "out.py"],
     "export-fmu": ["-m", "absent.json", "-o", "out.fmu"],
 }
 
@@ -168,10 +167,9 @@ NUMBERS = {
     "fit": ("--capacity-ah", "--initial-soc", "--rate-hz", "--epsilon", "--t-ref", "--temperature"),
     "estimate": ("--initial-soc", "--initial-soc-std", "--capacity-ah", "--temperature"),
     "gap": ("--initial-soc", "--capacity-ah", "--temperature"),
-    "run": ("--temperature", "--initial-soc", "--initial-soc-std", "--until-idle"),
+    "run": ("--temperature", "--initial-soc", "--initial-soc-std"),
     "replay": ("--speed", "--temperature"),
     "inspect": ("--temperature",),
-    "twin": ("--hours", "--ambient-c", "--start-soc", "--end-soc"),
 }  # fmt: skip
 PRESENT = {
     "fit": ["log.csv", "-o", "out.json"],
@@ -180,7 +178,6 @@ PRESENT = {
     "run": ["-m", "model.json"],
     "replay": ["log.csv", "--vehicle", "generic"],
     "inspect": ["log.csv"],
-    "twin": ["-o", "out.csv"],
 }
 
 

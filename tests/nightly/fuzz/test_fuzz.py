@@ -50,6 +50,5 @@ def test_the_other_seeds_are_read() -> None:
         ("config", corpus.CONFIG),
         ("config", corpus.OWN_CAR),
         ("map", corpus.MAP),
-        ("speed", corpus.SPEED),
     ):
         assert attempt(TARGETS[name], text.encode()), name

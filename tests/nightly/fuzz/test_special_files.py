@@ -15,7 +15,6 @@ from cangauge.bus.database import load_dbc
 from cangauge.bus.vehicle import Vehicle
 from cangauge.errors import InputError
 from cangauge.extras.live.addresses import read_token
-from cangauge.extras.validation.twin.drive import read_speed
 from cangauge.logs.read import read_log
 from cangauge.model.model_file import Model
 from cangauge.service.config import load_config
@@ -27,7 +26,6 @@ READERS: dict[str, Callable[[Path], object]] = {
     "map": lambda path: Vehicle.load(map=path),
     "config": load_config,
     "model": Model.load,
-    "speed": read_speed,
     "token": lambda path: read_token(path, {}),
 }
 

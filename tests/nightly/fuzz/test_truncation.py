@@ -17,7 +17,6 @@ from cangauge.bus.database import load_dbc
 from cangauge.bus.recording import capture_to_log
 from cangauge.bus.vehicle import Vehicle
 from cangauge.errors import InputError
-from cangauge.extras.validation.twin.drive import read_speed
 from cangauge.logs.read import read_log
 from cangauge.model.model_file import Model
 from cangauge.service.config import load_config
@@ -78,7 +77,6 @@ TEXTS: dict[str, tuple[str, Callable[[Path], object]]] = {
         corpus.MAP.replace('dbc = "car.dbc"', 'dbc = "whole.dbc"'),
         lambda path: Vehicle.load(map=path),
     ),
-    "speed.csv": (corpus.SPEED, read_speed),
     "model.json": (
         json.dumps(corpus.model_tree() | {"effects": [], "information": None}),
         Model.load,

@@ -29,8 +29,8 @@ _OTHER = re.compile(
 _ROLES: Final = {
     "current": ("current_a", re.compile(r"cur|amp|strom|(^|_)i(_|$)|ibat", re.IGNORECASE)),
     "voltage": ("voltage_v", re.compile(r"volt|spann|(^|_)u(_|$)|_v$|ubat|vbat", re.IGNORECASE)),
-    "temperature": ("temperature_c", re.compile(r"temp", re.IGNORECASE)),
     "soc_reference": ("soc_pct", re.compile(r"soc|state_?of_?charge|ladezustand", re.IGNORECASE)),
+    "temperature": ("temperature_c", re.compile(r"temp", re.IGNORECASE)),
 }
 _RANGES: Final = {
     "current": (-2000.0, 2000.0),

@@ -123,11 +123,15 @@ class SignalCandidate:
         return self.stream.bits(self.place)
 
     @property
+    def bits_text(self) -> str:
+        """Bits as in a DBC, such as "7|11@0-"."""
+        order, sign = int(not self.place.is_motorola), "-" if self.place.is_signed else "+"
+        return f"{self.start}|{self.place.width}@{order}{sign}"
+
+    @property
     def name(self) -> str:
-        """Id and bits as in a DBC, such as "0x1DB 7|11@0-"."""
-        order = "0" if self.place.is_motorola else "1"
-        sign = "-" if self.place.is_signed else "+"
-        name = f"{self.stream.name} {self.start}|{self.place.width}@{order}{sign}"
+        """Id and bits, such as "0x1DB 7|11@0-"."""
+        name = f"{self.stream.name} {self.bits_text}"
         return name if self.stream.selector is None else f"{name} m{self.stream.selector.value}"
 
     @property

@@ -5,8 +5,9 @@ from __future__ import annotations
 import shutil
 import tempfile
 import time
-from collections.abc import Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
+from functools import partial
 from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
@@ -20,10 +21,7 @@ from cangauge.errors import CangaugeError, InputError
 if TYPE_CHECKING:
     import can
 
-    from cangauge.extras.discovery.by_name import NamedSignal
-    from cangauge.extras.discovery.candidate import Level, SignalCandidate
-
-    Candidate = SignalCandidate | NamedSignal
+    from cangauge.extras.discovery.proposal import Proposal
 
 _ROLES: Final = {
     "current": "current",
@@ -33,6 +31,10 @@ _ROLES: Final = {
 }
 """Roles by their names on the command line."""
 _NEEDED: Final = ("current", "voltage")
+_SCALE_CURES: Final = {
+    "voltage": "Give --nominal-voltage V (type plate, or a meter).",
+    "soc_reference": "Compare it with the car's display, and correct the factor in the DBC.",
+}
 
 
 @command(keys=lambda: config_parameters("interface", "channel", "bus_options"))
@@ -90,36 +92,27 @@ def init_command(
     _check(output, force=force)
     values = config_values(options)
     bus = {name: values[name] for name in ("interface", "channel", "bus_options")}
-    with tempfile.TemporaryDirectory(prefix="cangauge-init-") as folder:
-        paths = list(captures or [])
+    with tempfile.TemporaryDirectory(prefix="cangauge-init-") as name:
+        folder, paths = Path(name), list(captures or [])
         if bus["interface"] is not None or bus["channel"] is not None:
             if paths:
                 problem, cure = "given together with a capture", "omit one"
                 raise InputError(problem, field="--interface", cure=cure)
-            paths = [_listen(bus, seconds, Path(folder) / "live.log")]
+            paths = [_listen(bus, seconds, folder / "live.log")]
         if not paths and dbc is None:
             cure = "give a capture, --interface and --channel, or --dbc FILE"
             raise InputError("nothing to look at", field="CAPTURE", cure=cure)
-        found = _find(paths, dbc, nominal_voltage, presets=presets)
-        _choose(found, picks, output, quiet=json_output)
-        _prove(found, paths[:1], output, Path(folder), bus)
-    texts = found.texts(output, bus)
+        proposal = _find(paths, dbc, nominal_voltage, presets=presets)
+        if unclear := _choose(proposal, picks):
+            raise _undecided(proposal, unclear, output, quiet=json_output)
+        texts = proposal.texts(output, bus)
+        _prove(proposal, paths[0] if paths else None, texts, folder)
+        texts = proposal.texts(output, bus)  # a DBC's map states the sign that was proven
     output.mkdir(exist_ok=True)
     write_texts_atomic({output / name: text for name, text in texts.items()})
     files = [str(output / name) for name in texts]
-
-    def show() -> None:
-        _show(found)
-        _show_proof(found)
-        for path in files:
-            note(f"wrote {path}")
-        reading = found.reading(output)
-        note(
-            f"next: cangauge inspect DRIVE {reading}, then cangauge fit DRIVE … {reading}"
-            f" -o {output / 'model.json'}"
-        )
-
-    finish({**found.to_dict(), "files": files}, show, as_json=json_output)
+    show = partial(_show, proposal, files, proposal.reading(output), output / "model.json")
+    finish({**proposal.to_dict(), "files": files}, show, as_json=json_output)
 
 
 def _picks(given: Sequence[str]) -> dict[str, int]:
@@ -148,142 +141,6 @@ def _check(output: Path, *, force: bool) -> None:
         check_writable(output / "car.toml")
     elif not has_parent:
         raise InputError("cannot create this folder", source=output)
-
-
-@dataclass
-class _Found:
-    """What was found, and how.
-
-    Parameters
-    ----------
-    method : str
-        "preset", "dbc" or "physics".
-    candidates : mapping of str to sequence
-        By role, best first; of a preset none.
-    clear : collection of str
-        Roles whose first candidate is clearly ahead of the others.
-    head, remarks : tuple of str
-        What was looked at, for the head of the map; what the capture cannot show.
-    vehicle : str, optional
-        Name of the preset.
-    dbc : Path, optional
-        DBC whose signals are named.
-    nominal_v : float, optional
-        Voltage that the user states [V].
-    chosen : dict of str to int
-        Number of the candidate by role, from 0.
-    proof : dict
-        What the captures show when they are decoded with the files.
-    """
-
-    method: str
-    candidates: dict[str, Sequence[Candidate]] = field(default_factory=dict)
-    clear: Collection[str] = ()
-    head: tuple[str, ...] = ()
-    remarks: tuple[str, ...] = ()
-    vehicle: str | None = None
-    dbc: Path | None = None
-    nominal_v: float | None = None
-    chosen: dict[str, int] = field(default_factory=dict)
-    proof: dict[str, Any] = field(default_factory=dict)
-
-    @property
-    def signals(self) -> dict[str, Candidate]:
-        """Chosen candidates by role."""
-        return {role: self.candidates[role][number] for role, number in self.chosen.items()}
-
-    @property
-    def fixed_c(self) -> float | None:
-        """Temperature that the files assume [°C]; None where the bus has one."""
-        from cangauge.bus.vehicle import PRESETS
-        from cangauge.extras.discovery.proposal import FALLBACK_C
-
-        if self.vehicle is not None:
-            return FALLBACK_C if PRESETS[self.vehicle].lacks_temperature else None
-        return None if "temperature" in self.chosen else FALLBACK_C
-
-    @property
-    def is_sign_proven(self) -> bool:
-        """Whether the captures prove the sign of a named current."""
-        return self.method != "physics" and bool(self.proof.get("sign", {}).get("sign"))
-
-    @property
-    def sign_text(self) -> str:
-        """What the captures show of the sign of a current that a preset or a DBC names."""
-        if not self.is_sign_proven:
-            return "Sign of the current: not proven; `cangauge inspect DRIVE` proves it."
-        sign, text = self.proof["sign"]["sign"], self.proof["sign"]["text"]
-        if self.method == "dbc":
-            sign = self.signals["current"].sign
-            way = "positive values charge on this bus" if sign < 0 else "positive discharges"
-            return f"Sign of the current: {way}; {text}. The map has sign = {sign}."
-        if sign > 0:
-            return f"Sign of the current: as in the preset; {text}."
-        return (
-            f"warning: by this preset positive current charges ({text}): is it another car, or a"
-            " converter that turns the sign? --no-presets searches by physics."
-        )
-
-    def levels(self, role: str) -> list[Level]:
-        """Return what usual scales of a chosen field mean; empty where its scale is certain."""
-        return self.signals[role].levels(self.nominal_v) if role in self.chosen else []
-
-    def reading(self, folder: Path) -> str:
-        """Return the options with which a command reads captures of this car."""
-        if self.vehicle is None:
-            return f"--map {folder / 'car.toml'}"
-        fixed = "" if self.fixed_c is None else f" --temperature {self.fixed_c:g}"
-        return f"--vehicle {self.vehicle}{fixed}"
-
-    def texts(self, folder: Path, bus: Mapping[str, Any]) -> dict[str, str]:
-        """Return the text of each file to write to a folder."""
-        from cangauge.extras.discovery import proposal
-
-        texts, lines = {}, ['map = "car.toml"']
-        if self.vehicle is not None:
-            lines = [f'vehicle = "{self.vehicle}"  # recognised by its ids and CRC']
-            if self.fixed_c is not None:
-                lines.append(
-                    f"temperature = {self.fixed_c:g}  # assumed: not known on this bus [°C]"
-                )
-        else:
-            dbc, head, pair_s = "car.dbc", self.head, 0.1
-            if self.dbc is None:
-                texts[dbc] = proposal.dbc_text(self.signals.values())  # type: ignore[arg-type]
-                slowest_s = max(self.signals[role].stream.period_s for role in _NEEDED)  # type: ignore[union-attr]
-                pair_s = min(max(0.020, 1.2 * slowest_s), 1.0)
-            else:
-                own, head = self.dbc.resolve(), (*head, self.sign_text)
-                dbc = own.name if own.parent == folder.resolve() else str(own)
-            comments = {}
-            for role, signal in self.signals.items():
-                others = [each.name for each in self.candidates[role] if each is not signal]
-                comments[role] = signal.comments(self.nominal_v)
-                comments[role] += [f"Else: {', '.join(others)}."] if others else []
-            texts["car.toml"] = proposal.map_text(dbc, head, self.signals, comments, pair_s)
-        reading = self.reading(Path())
-        texts["run.toml"] = proposal.config_text(lines, **bus, reading=reading)
-        return texts
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return plain values for JSON."""
-        volts, socs = self.levels("voltage"), self.levels("soc_reference")
-        return {
-            "method": self.method,
-            "vehicle": self.vehicle,
-            "chosen": {role: number + 1 for role, number in self.chosen.items()},
-            "candidates": {
-                role: [candidate.to_dict() for candidate in self.candidates.get(role, ())]
-                for role in _ROLES.values()
-            },
-            "remarks": list(self.remarks),
-            "voltage_levels": [{"scale": each.scale, "voltage_v": each.value} for each in volts],
-            "soc_levels": [{"scale": each.scale, "highest_pct": each.value} for each in socs],
-            "proof": self.proof,
-        }
-
-
-# --- Finding and choosing
 
 
 def _listen(bus: Mapping[str, Any], seconds: float, path: Path) -> Path:
@@ -330,9 +187,11 @@ def _joined(paths: Sequence[Path]) -> Iterator[can.Message]:
 
 def _find(
     paths: Sequence[Path], dbc: Path | None, nominal_v: float | None, *, presets: bool
-) -> _Found:
+) -> Proposal:
+    """Find the signals by the names of a DBC, else by a preset, else by physics."""
     from cangauge.bus.captures import open_capture
     from cangauge.extras.discovery.by_name import is_clear, named_signals
+    from cangauge.extras.discovery.proposal import Proposal
     from cangauge.extras.discovery.search import search
 
     if dbc is not None:
@@ -340,15 +199,17 @@ def _find(
         named = named_signals(dbc, messages)
         clear = [role for role in _NEEDED if is_clear(named[role])]
         head = ("Signals found by their names and units in the DBC.",)
-        return _Found("dbc", {**named}, clear, head, dbc=dbc)
+        return Proposal("dbc", {**named}, clear, head, dbc=dbc)
     if presets and (known := _known(paths)) is not None:
-        return _Found("preset", vehicle=known)
+        return Proposal("preset", vehicle=known)
     with progress("cangauge.extras.discovery") as show:
         show("reading frames")
         found = search(_joined(paths), nominal_v)
-    candidates = {role: getattr(found, role) for role in _ROLES.values()}
     clear = [role for role in _NEEDED if found.is_clear(role)]
-    return _Found("physics", candidates, clear, found.comments, found.remarks, nominal_v=nominal_v)
+    candidates = {role: getattr(found, role) for role in _ROLES.values()}
+    return Proposal(
+        "physics", candidates, clear, found.comments, found.remarks, nominal_v=nominal_v
+    )
 
 
 def _known(paths: Sequence[Path]) -> str | None:
@@ -362,38 +223,39 @@ def _known(paths: Sequence[Path]) -> str | None:
     return common[0] if len(common) == 1 else None
 
 
-def _choose(found: _Found, picks: dict[str, int], output: Path, *, quiet: bool) -> None:
-    """Choose a candidate for each role: the user's, or the clear one.
-
-    Raises
-    ------
-    CangaugeError
-        If a needed role has no clear candidate; tables of them are printed first, if not `quiet`.
-    """
+def _choose(proposal: Proposal, picks: Mapping[str, int]) -> list[str]:
+    """Choose a candidate for each role: the user's, or the clear one; return unclear roles."""
     unclear = []
-    for name, role in () if found.method == "preset" else _ROLES.items():
-        count = len(found.candidates[role])
+    for name, role in _ROLES.items():
+        count = len(proposal.candidates.get(role, ()))
+        if proposal.method == "preset":
+            continue
         if role in picks:
             if picks[role] >= count:
                 value = f"{name}={picks[role] + 1}"
                 raise InputError(f"there are {count} candidates", field="--choose", value=value)
-            found.chosen[role] = picks[role]
-        elif role in _NEEDED and role not in found.clear:
+            proposal.chosen[role] = picks[role]
+        elif role in _NEEDED and role not in proposal.clear:
             unclear.append(role)
         # Slow and plausible is not enough: the user chooses a temperature, or none.
-        elif count and (role != "temperature" or found.method == "dbc"):
-            found.chosen[role] = 0
-    if not unclear:
-        return
+        elif count and (role != "temperature" or proposal.method == "dbc"):
+            proposal.chosen[role] = 0
+    return unclear
+
+
+def _undecided(
+    proposal: Proposal, unclear: Sequence[str], output: Path, *, quiet: bool
+) -> CangaugeError:
+    """Return the error of roles without a clear candidate; print their tables, if not `quiet`."""
     lines = [f"no {' and no '.join(unclear)} is clearly ahead of the others"]
-    if found.method == "physics" and found.nominal_v is None:
+    if proposal.method == "physics" and proposal.nominal_v is None:
         lines.append("the scale of the voltage is open (--nominal-voltage V decides it)")
     if not quiet:
-        _show(found)
+        _show_candidates(proposal)
     for role in unclear if quiet else ():
-        names = [f"{n}) {c.name}" for n, c in enumerate(found.candidates[role], 1)]
+        names = [f"{n}) {c.name}" for n, c in enumerate(proposal.candidates[role], 1)]
         lines.append(f"{role}: {', '.join(names)}")
-    raise CangaugeError(
+    return CangaugeError(
         f"{'; '.join(lines)}; nothing was written to {output}: choose by"
         f" {' '.join(f'--choose {role}=1' for role in unclear)}, or record a drive with current"
         " steps"
@@ -401,9 +263,9 @@ def _choose(found: _Found, picks: dict[str, int], output: Path, *, quiet: bool) 
 
 
 def _prove(
-    found: _Found, paths: Sequence[Path], output: Path, folder: Path, bus: Mapping[str, Any]
+    proposal: Proposal, capture: Path | None, texts: Mapping[str, str], folder: Path
 ) -> None:
-    """Decode the first capture by the files before they are saved; set `proof` and a named sign.
+    """Load the files before they are saved, and decode a capture by them; set `proof` and a sign.
 
     Raises
     ------
@@ -417,85 +279,86 @@ def _prove(
     from cangauge.logs.log import Log
     from cangauge.logs.sign import sign_of_current
 
-    if found.vehicle is not None:
-        car = Vehicle.load(found.vehicle, temperature_c=found.fixed_c)
+    if proposal.vehicle is not None:
+        car = Vehicle.load(proposal.vehicle, temperature_c=proposal.fixed_c)
     else:
-        for name, text in found.texts(output, bus).items():
+        for name, text in texts.items():
             (folder / name).write_text(text, encoding="utf-8")
-        if found.dbc is not None:
-            shutil.copy(found.dbc, folder / found.dbc.name)
+        if proposal.dbc is not None:
+            shutil.copy(proposal.dbc, folder / proposal.dbc.name)
         car = Vehicle.load(map=folder / "car.toml")
-    for path in paths:
-        samples = capture_samples(path, car)
-        if len(samples) < 2:
-            raise InputError(
-                "current and voltage found do not make samples: their frames are too far apart",
-                source=path,
-                cure="choose others by --choose",
-            )
-        good = np.isfinite(samples.voltage_v)
-        good &= np.diff(samples.time_s, prepend=-np.inf) > 0.0
-        amps, volts = samples.current_a, samples.voltage_v[good]
-        if len(volts):  # the sign needs no temperature
-            rows = (samples.time_s[good], amps[good], volts, np.zeros(len(volts)))
-            sign = sign_of_current(Log(*rows, soc_pct=samples.soc_pct[good]))
-            found.proof["sign"] = {
-                "sign": sign.sign, "confidence": sign.confidence, "text": sign.strongest.text,
-            }  # fmt: skip
-            if found.method == "dbc" and sign.sign == -1:  # the map says how its sign was found
-                turned = [replace(each, sign=-1) for each in found.candidates["current"]]
-                found.candidates["current"] = turned
-                amps = -amps
-        found.proof |= {
-            "samples": len(samples),
-            "current_a": [float(amps.min()), float(amps.max())],
-            "voltage_v": [float(volts.min()), float(volts.max())] if len(volts) else None,
-        }
+    if capture is None:
+        return
+    samples = capture_samples(capture, car)
+    if len(samples) < 2:
+        raise InputError(
+            "current and voltage found do not make samples: their frames are too far apart",
+            source=capture,
+            cure="choose others by --choose",
+        )
+    good = np.isfinite(samples.voltage_v) & (np.diff(samples.time_s, prepend=-np.inf) > 0.0)
+    amps, volts = samples.current_a, samples.voltage_v[good]
+    if len(volts):  # the sign needs no temperature
+        rows = (samples.time_s[good], amps[good], volts, np.zeros(len(volts)))
+        sign = sign_of_current(Log(*rows, soc_pct=samples.soc_pct[good]))
+        strongest = sign.strongest.text
+        proposal.proof["sign"] = {
+            "sign": sign.sign, "confidence": sign.confidence, "text": strongest,
+        }  # fmt: skip
+        if proposal.method == "dbc" and sign.sign == -1:  # the map says how its sign was found
+            turned = [replace(each, sign=-1) for each in proposal.candidates["current"]]
+            proposal.candidates["current"] = turned
+            amps = -amps
+    proposal.proof |= {
+        "samples": len(samples),
+        "current_a": [float(amps.min()), float(amps.max())],
+        "voltage_v": [float(volts.min()), float(volts.max())] if len(volts) else None,
+    }
 
 
-# --- What is shown
-
-
-def _show(found: _Found) -> None:
+def _show_candidates(proposal: Proposal) -> None:
     """Print the candidates of each role; a tick means that the data leave nothing of it open."""
-    for role in (role for role in _ROLES.values() if found.candidates.get(role)):
-        head = found.candidates[role][0].HEAD
+    for role, candidates in proposal.candidates.items():
         rows = []
-        for number, candidate in enumerate(found.candidates[role]):
+        for number, candidate in enumerate(candidates):
             mark = str(number + 1)
-            if found.chosen.get(role) == number:
-                is_open = found.levels(role) or (role == "current" and not found.is_sign_proven)
+            if proposal.chosen.get(role) == number:
+                is_open = proposal.levels(role) or (
+                    role == "current" and not proposal.is_sign_proven
+                )
                 mark += " ?" if is_open else " ✓"
             rows.append([mark, *candidate.cells])
-        print_table(role.replace("_reference", ""), ["", *head], rows)
-    for remark in found.remarks:
+        if candidates:
+            print_table(role.replace("_reference", ""), ["", *candidates[0].HEAD], rows)
+    for remark in proposal.remarks:
         note(f"note: {remark}")
 
 
-def _show_proof(found: _Found) -> None:
+def _show(proposal: Proposal, files: Sequence[str], reading: str, model: Path) -> None:
+    """Print the candidates, what the capture proves, what is assumed, and the next commands."""
     from cangauge.bus.vehicle import PRESETS
     from cangauge.extras.discovery.candidate import range_text
 
-    if found.vehicle is not None:
-        note(f"known vehicle: {found.vehicle}, {PRESETS[found.vehicle].about}")
-    if found.proof:
-        amps, volts = found.proof["current_a"], found.proof["voltage_v"]
+    _show_candidates(proposal)
+    if proposal.vehicle is not None:
+        note(f"known vehicle: {proposal.vehicle}, {PRESETS[proposal.vehicle].about}")
+    if proposal.proof:
+        amps, volts = proposal.proof["current_a"], proposal.proof["voltage_v"]
         shown = "no voltage" if volts is None else range_text(volts[0], volts[1], "V")
         shown = f"{range_text(amps[0], amps[1], 'A')}, {shown}"
-        note(f"decoded: {found.proof['samples']} samples of the first capture, {shown}")
-    if found.method != "physics":
-        note(found.sign_text)
-    if found.fixed_c is not None:
+        note(f"decoded: {proposal.proof['samples']} samples of the first capture, {shown}")
+    if proposal.method != "physics":
+        note(proposal.sign_text)
+    if proposal.fixed_c is not None:
         note(
-            f"note: no temperature was found or chosen: the files assume {found.fixed_c:g} °C;"
+            f"note: no temperature was found or chosen: the files assume {proposal.fixed_c:g} °C;"
             " some °C of error are worth several % SoC"
         )
-    cures = {
-        "voltage": "Give --nominal-voltage V (type plate, or a meter).",
-        "soc_reference": "Compare it with the car's display, and correct the factor in the DBC.",
-    }
-    for role, cure in cures.items():
-        if levels := found.levels(role):
+    for role, cure in _SCALE_CURES.items():
+        if levels := proposal.levels(role):
             quantity = "SoC" if role == "soc_reference" else role
             texts = ", ".join(level.text for level in levels)
             note(f"note: The bits do not tell the scale of the {quantity}: {texts}. {cure}")
+    for path in files:
+        note(f"wrote {path}")
+    note(f"next: cangauge inspect DRIVE {reading}, then cangauge fit DRIVE … {reading} -o {model}")

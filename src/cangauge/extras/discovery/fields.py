@@ -12,6 +12,7 @@ import math
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from operator import attrgetter
 from typing import Any, Final, NamedTuple
 
@@ -156,6 +157,57 @@ class Field:
     def best(self) -> Extent:
         """The likeliest reading."""
         return max(self.extents, key=attrgetter("nature"))
+
+    @cached_property
+    def statistics(self) -> Statistics:
+        """Of its numbers where they are available."""
+        return Statistics.of(self.raw[~self.missing])
+
+
+@dataclass(frozen=True)
+class Statistics:
+    """Values of a field in time, with the log prior of a measurement.
+
+    Parameters
+    ----------
+    low, high, count : float, float, int
+        Range and number of the distinct values.
+    steps, largest_step : int, float
+        Number of changes, and the largest.
+    resting : float
+        Most common value.
+    prior : float
+        Log prior that a measurement moves so [nats].
+    """
+
+    low: float
+    high: float
+    count: int
+    steps: int
+    largest_step: float
+    resting: float
+    prior: float
+
+    @classmethod
+    def of(cls, raw: Ints) -> Statistics:
+        """Return those of raw numbers in time."""
+        values, change = np.unique(raw), np.diff(raw)
+        steps = int(np.count_nonzero(change))
+        count, low, high = len(values), float(values[0]), float(values[-1])
+        filled = count / min(high - low + 1.0, len(raw) / 4.0 + 1.0)
+        both_ways = min(int((change > 0).sum()), int((change < 0).sum())) > 2
+        # A measurement moves up and down through neighbouring values; states jump between few.
+        prior = 1.5 if steps >= 8 and count >= 3 and filled > 0.5 and both_ways else 0.0
+        prior -= 2.0 if count < 3 else 1.5 if filled < 0.2 else 0.0
+        largest = float(np.abs(change).max(initial=0))
+        return cls(low, high, count, steps, largest, most_common(raw), prior)
+
+
+def most_common(values: Ints) -> float:
+    """Return the most common value, to a fiftieth of the range."""
+    counts, edges = np.histogram(values, bins=50)
+    most = int(counts.argmax())
+    return float(edges[most] + edges[most + 1]) / 2.0
 
 
 # --- Streams

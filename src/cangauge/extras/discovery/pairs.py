@@ -19,7 +19,7 @@ from scipy.signal import lfilter
 
 from cangauge._typing import BoolArray, FloatArray
 from cangauge.extras.discovery.candidate import CURRENT_SCALES, SignalCandidate
-from cangauge.extras.discovery.fields import Field, Ints, Place, Stream
+from cangauge.extras.discovery.fields import Field, Ints, Place, Stream, most_common
 
 MOST_ROWS: Final = 4000
 TREND_S: Final = 10.0
@@ -118,25 +118,23 @@ class Row:
         Log prior of the field in its role [nats].
     scale : float
         Of a voltage [V].
-    grid : Grid
     """
 
     field: Field
     place: Place
     constant: int
     missing: BoolArray
-    prior: float
-    scale: float
-    grid: Grid
+    prior: float = 0.0
+    scale: float = 1.0
 
     @cached_property
     def values(self) -> Ints:
         """Raw numbers by frame."""
         return self.field.raw[~self.missing] + self.constant
 
-    def values_on_grid(self) -> FloatArray:
+    def means_on(self, grid: Grid) -> FloatArray:
         """Return the means of the raw numbers by slot of time."""
-        return self.grid.means(self.field.stream, self.field.raw + self.constant, self.missing)
+        return grid.means(self.field.stream, self.field.raw + self.constant, self.missing)
 
     @property
     def steps(self) -> int:
@@ -209,14 +207,13 @@ class Pairs:
     Parameters
     ----------
     voltages, currents : sequence of Row
-    step_s : float
-        Interval of their grid [s].
+    grid : Grid
     """
 
-    def __init__(self, voltages: Sequence[Row], currents: Sequence[Row], step_s: float) -> None:
-        self._voltages, self._currents, self._step_s = voltages, currents, step_s
-        level = [np.array([row.values_on_grid() for row in rows]) for rows in (voltages, currents)]
-        self._u, self._i = (_Moves.of(each, step_s) for each in level)
+    def __init__(self, voltages: Sequence[Row], currents: Sequence[Row], grid: Grid) -> None:
+        self._voltages, self._currents, self._step_s = voltages, currents, grid.step_s
+        level = [np.array([row.means_on(grid) for row in rows]) for rows in (voltages, currents)]
+        self._u, self._i = (_Moves.of(each, grid.step_s) for each in level)
         self._rows = level[0].shape[1]
         self.r = _product(self._u.values, self._i.values)
         self.slope = np.abs(self.r) * self._u.std[:, None] / np.maximum(self._i.std[None, :], 1e-9)
@@ -378,13 +375,6 @@ class Pairs:
             ratio = both / power * float(self._u.std[a] / self._i.std[b]) if power else math.nan
             found.append(-ratio if self.r[a, b] < 0.0 else ratio)
         return found
-
-
-def most_common(values: Ints) -> float:
-    """Return the most common value, to a fiftieth of the range."""
-    counts, edges = np.histogram(values, bins=50)
-    most = int(counts.argmax())
-    return float(edges[most] + edges[most + 1]) / 2.0
 
 
 def round_zeros(low: float, high: float, width: int) -> list[float]:

@@ -32,7 +32,6 @@ from cangauge.extras.discovery.pairs import (
     Grid,
     Pairs,
     Row,
-    most_common,
     round_zeros,
 )
 
@@ -134,9 +133,13 @@ def search(messages: Iterable[can.Message], nominal_v: float | None = None) -> F
         raise InputError(
             "no id has enough frames to search", cure="record at least a minute, while driving"
         )
-    fields = fields_of(streams)
+    fields, grid = fields_of(streams), Grid(streams, GRID_S)
+    current, voltage, row = _pair(fields, grid, nominal_v)
+    soc: Candidates = []
+    temperature: Candidates = []
+    if row is not None:
+        soc, temperature = _slow(fields, grid, current[0], voltage[0], row)
     remarks = []
-    current, voltage, soc, temperature = _candidates(streams, fields, nominal_v)
     if not current:
         remarks.append("no field of this capture can be the current or the voltage of a pack")
     elif current[0].evidence < ENOUGH_NATS:
@@ -148,43 +151,50 @@ def search(messages: Iterable[can.Message], nominal_v: float | None = None) -> F
         remarks.append("no field falls with the charge: record a longer drive to find the SoC")
     if not temperature:
         remarks.append("no slow field looks like a temperature")
-    duration_s = Grid(streams, GRID_S).duration_s
     if next(frames, None) is not None:
-        remarks.append(f"ranges and steps are those of the first {duration(duration_s)}")
+        remarks.append(f"ranges and steps are those of the first {duration(grid.duration_s)}")
     return Findings(
-        current, voltage, soc, temperature, tuple(remarks), len(streams), len(fields), duration_s
-    )
+        current, voltage, soc, temperature, tuple(remarks), len(streams), len(fields),
+        grid.duration_s,
+    )  # fmt: skip
 
 
-def _candidates(
-    streams: Sequence[Stream], fields: Sequence[Field], nominal_v: float | None
-) -> tuple[Candidates, Candidates, Candidates, Candidates]:
-    """Return the candidates for current, voltage, SoC and temperature."""
-    grid = Grid(streams, GRID_S)
-    statistics = [_Statistics.of(field) for field in fields]
-    both = list(zip(fields, statistics, strict=True))
-    currents = [row for each in both if (row := _as_current(*each, grid))]
-    voltages = [row for each in both if (row := _as_voltage(*each, grid, nominal_v))]
+def _pair(
+    fields: Sequence[Field], grid: Grid, nominal_v: float | None
+) -> tuple[Candidates, Candidates, Row | None]:
+    """Return the candidates for current and voltage, and the field of the first current."""
+    currents = [row for field in fields if (row := _as_current(field))]
+    voltages = [row for field in fields if (row := _as_voltage(field, nominal_v))]
     if not currents or not voltages:
-        return [], [], [], []
+        return [], [], None
     # All pairs are held in memory: of the largest buses, the likelier fields.
     currents = sorted(currents, key=lambda row: -row.prior)[:MOST_CURRENTS]
     voltages = sorted(voltages, key=lambda row: -row.prior)[:MOST_VOLTAGES]
-    current, voltage, row = Pairs(voltages, currents, grid.step_s).best()
-    if row is None:
-        return [], [], [], []
-    amps = current[0].sign * (current[0].scale * row.values_on_grid() + current[0].offset)
-    drawn_ah = np.cumsum(amps) * grid.step_s / 3600.0
+    current, voltage, row = Pairs(voltages, currents, grid).best()
+    return ([], [], None) if row is None else (current, voltage, row)
+
+
+def _slow(
+    fields: Sequence[Field],
+    grid: Grid,
+    current: SignalCandidate,
+    voltage: SignalCandidate,
+    row: Row,
+) -> tuple[Candidates, Candidates]:
+    """Return the candidates for SoC, by the charge of a current, and for temperature."""
+    amps = current.sign * (current.scale * row.means_on(grid) + current.offset)
     span = grid.longest(0.5 * BETWEEN_S)
-    taken = current[0].bits | voltage[0].bits
-    socs = [made for each in both if (made := _as_charge(*each, grid, drawn_ah[span], span))]
-    buses = {each[0].stream.bus for each in (current, voltage)}
-    warm = [made for each in both for made in _as_temperature(*each, grid, buses)]
-    return current, voltage, _apart(socs, taken), _apart(warm, taken)
+    drawn_ah = (np.cumsum(amps) * grid.step_s / 3600.0)[span]
+    buses = {current.stream.bus, voltage.stream.bus}
+    socs = [made for field in fields if (made := _as_charge(field, grid, drawn_ah, span))]
+    warm = [made for field in fields for made in _as_temperature(field, buses)]
+    taken = current.bits | voltage.bits
+    return _apart(socs, taken), _apart(warm, taken)
 
 
-def _as_current(field: Field, seen: _Statistics, grid: Grid) -> Row | None:
+def _as_current(field: Field) -> Row | None:
     """Return a field as a current; None where it has too few values."""
+    seen = field.statistics
     place, nature, constant = field.best
     is_signed, full = place.is_signed, 1 << place.width
     if seen.count < 3 and not is_signed:
@@ -205,10 +215,10 @@ def _as_current(field: Field, seen: _Statistics, grid: Grid) -> Row | None:
             prior += 1.0
         # A pack's current has two signs: a number from zero upwards is none.
         prior -= 5.0 if not any(zeros) else 1.0 if rest > 0.15 * (high - low) else 0.0
-    return Row(field, place, constant, field.missing, prior, 1.0, grid)
+    return Row(field, place, constant, field.missing, prior)
 
 
-def _as_voltage(field: Field, seen: _Statistics, grid: Grid, nominal_v: float | None) -> Row | None:
+def _as_voltage(field: Field, nominal_v: float | None) -> Row | None:
     """Return the likeliest reading and scale of a field as a pack's voltage."""
     if field.best.place.is_signed:
         return None
@@ -226,19 +236,21 @@ def _as_voltage(field: Field, seen: _Statistics, grid: Grid, nominal_v: float | 
         if level > 0.95 * (1 << place.width):
             continue  # nearly all ones: a small negative number
         at_half = abs(level / (1 << (place.width - 1)) - 1.0) < AT_HALF
-        prior = nature + _rate_prior(field.stream) + seen.prior - (AT_HALF_NATS if at_half else 0.0)
+        prior = nature + _rate_prior(field.stream) + field.statistics.prior
+        prior -= AT_HALF_NATS if at_half else 0.0
         for scale, usual in VOLTAGE_SCALES.items():
             likely = _level_prior(level * scale, nominal_v)
             total = prior + usual + likely + _full_scale_prior(scale, place.width)
             if likely > IMPOSSIBLE and (best is None or total > best.prior):
-                best = Row(field, place, constant, missing, total, scale, grid)
+                best = Row(field, place, constant, missing, total, scale)
     return best
 
 
 def _as_charge(
-    field: Field, seen: _Statistics, grid: Grid, drawn_ah: FloatArray, span: slice
+    field: Field, grid: Grid, drawn_ah: FloatArray, span: slice
 ) -> SignalCandidate | None:
     """Return a field as a SoC, if it falls as the charge is drawn."""
+    seen = field.statistics
     if field.best.place.is_signed or seen.count < 4:
         return None
     values = grid.means(field.stream, field.raw, field.missing)[span]
@@ -251,7 +263,7 @@ def _as_charge(
     evidence = -0.5 * seen.count * math.log(1.0 - min(r * r, LARGEST_R2))
     best: SignalCandidate | None = None
     for place, nature, constant in field.extents:
-        row = Row(field, place, constant, field.missing, 0.0, 1.0, grid)
+        row = Row(field, place, constant, field.missing)
         for scale in SOC_SCALES:
             level = (values + constant) * scale
             capacity_ah = 100.0 * moved / (spread * scale)
@@ -267,14 +279,13 @@ def _as_charge(
     return best
 
 
-def _as_temperature(
-    field: Field, seen: _Statistics, grid: Grid, buses: set[str]
-) -> Iterator[SignalCandidate]:
+def _as_temperature(field: Field, buses: set[str]) -> Iterator[SignalCandidate]:
     """Yield the extents of a slow field in a plausible range, those of the pack's bus likelier."""
+    seen = field.statistics
     if seen.count > 12 or seen.largest_step > 4.0 or seen.steps > 0.1 * len(field.raw) + 4:
         return
     for place, nature, constant in field.extents:
-        row = Row(field, place, constant, field.missing, 0.0, 1.0, grid)
+        row = Row(field, place, constant, field.missing)
         for scale, offset, usual in (
             (1.0, -40.0, 0.0), (0.5, -40.0, -0.3), (1.0, 0.0, -0.7), (1.0, -50.0, -0.7),
             (0.1, 0.0, -0.7), (0.1, -40.0, -1.5),
@@ -286,33 +297,6 @@ def _as_temperature(
             score -= 0.2 * (high - low) + 0.5 * (((low + high) / 2.0 - 20.0) / 15.0) ** 2
             score -= 1.0 if place.width > 8 and scale == 1.0 else 0.0
             yield row.candidate("temperature", scale, offset, score=score)
-
-
-@dataclass(frozen=True)
-class _Statistics:
-    """Values of a field, with the log prior of a measurement."""
-
-    low: float
-    high: float
-    count: int
-    steps: int
-    largest_step: float
-    resting: float
-    prior: float
-
-    @classmethod
-    def of(cls, field: Field) -> _Statistics:
-        good = field.raw[~field.missing]
-        values, change = np.unique(good), np.diff(good)
-        steps = int(np.count_nonzero(change))
-        count, low, high = len(values), float(values[0]), float(values[-1])
-        filled = count / min(high - low + 1.0, len(good) / 4.0 + 1.0)
-        both_ways = min(int((change > 0).sum()), int((change < 0).sum())) > 2
-        # A measurement moves up and down through neighbouring values; states jump between few.
-        prior = 1.5 if steps >= 8 and count >= 3 and filled > 0.5 and both_ways else 0.0
-        prior -= 2.0 if count < 3 else 1.5 if filled < 0.2 else 0.0
-        largest = float(np.abs(change).max(initial=0))
-        return cls(low, high, count, steps, largest, most_common(good), prior)
 
 
 def _rate_prior(stream: Stream) -> float:

@@ -66,11 +66,9 @@ VALUES: Final = {
     "resistance_asymmetry": ("charging_ohm",),
     "resistance_step": ("step_ohm", "start_s"),
     "charge_transfer": ("scale_v", "per_a", "bend_only", "activation_k", "zero_a"),
-    "rc": ("activation_k", "by_slope", "mean_slope", *(f"ohm_{k}" for k in range(1, 6))),
+    "rc": ("activation_k", "by_slope", "mean_slope", "ohm_1"),
     "hysteresis": ("half_width_v", "travel_as"),
     "entropic": ("level", "slope", "curve", "t_ref_c"),
-    "inner_temperature": ("voltage_v_per_k", "drop_per_k"),
-    "ocv_shape": tuple(f"bump_{k}_v" for k in range(1, 12)),
     "weak_cell": ("fraction", "ahead"),
 }
 """Kind of effect → names of its values, in the order of `cg_effect_kind`."""

@@ -129,7 +129,6 @@ def fit_fleet_command(
 
 def _show_fit(result: FleetFit) -> None:
     from cangauge.extras.fleet.results import by_kind, reason_of
-    from cangauge.extras.fleet.sources import short_names
 
     by_log = result.by_log
     values = {
@@ -141,24 +140,12 @@ def _show_fit(result: FleetFit) -> None:
         "logs that do not fit": by_log.count_text,
     }
     print_values(f"Model {result.model.name}", values)
-    for what, rows in (("set aside", result.bad), ("left out", result.left_out)):
-        _note_reasons(what, [(reason_of(row), count) for row, count in by_kind(rows)])
-    if misfits := by_log.misfits[:_SHOWN_LOGS]:
-        names = short_names([by_log.logs[k] for k in misfits])
-        print_table(
-            "Logs that do not fit the others",
-            ["log", "mean error [V]", "RMSE [V]", "robust z"],
-            [
-                [
-                    name,
-                    significant(float(by_log.mean_v[k]), 3),
-                    significant(float(by_log.rmse_v[k]), 3),
-                    number(float(by_log.z[k]), 1),
-                ]
-                for name, k in zip(names, misfits, strict=True)
-            ],
-        )
-    if misfits or not by_log.is_known:
+    for what, unused in (("set aside", result.bad), ("left out", result.left_out)):
+        _note_reasons(what, [(reason_of(row), count) for row, count in by_kind(unused)])
+    head, rows = by_log.misfit_rows()
+    if rows:
+        print_table("Logs that do not fit the others", head, rows[:_SHOWN_LOGS])
+    if rows or not by_log.is_known:
         note(by_log.rule_text)
 
 
@@ -186,9 +173,13 @@ def estimate_fleet_command(
         Logs, captures or a manifest.
     """
     from cangauge.extras.fleet.jobs import EstimateJob, by_log
+    from cangauge.extras.fleet.sources import find_logs
 
-    job, found = _job(EstimateJob, logs, model, reading, report)
-    _run(job, by_log(found), found, cluster, report, json_output=json_output)
+    among = find_logs(logs)
+    _run(
+        EstimateJob, by_log, among, logs, model=model, cluster=cluster, reading=reading,
+        report=report, json_output=json_output,
+    )  # fmt: skip
 
 
 @fleet_app.command("health")
@@ -216,24 +207,13 @@ def health_fleet_command(
         Logs, captures or a manifest.
     """
     from cangauge.extras.fleet.jobs import HealthJob, by_vehicle
-
-    job, found = _job(HealthJob, logs, model, reading, report)
-    _run(job, by_vehicle(found), found, cluster, report, json_output=json_output)
-
-
-def _job(
-    kind: Callable[..., Job],
-    logs: Sequence[str],
-    model: Path,
-    reading: ReadingOptions,
-    report: Path | None,
-) -> tuple[Job, list[FleetLog]]:
     from cangauge.extras.fleet.sources import find_logs
-    from cangauge.model.model_file import Model
 
-    found = find_logs(logs)
-    _check_outputs([report], found, model, *map(Path, logs))
-    return kind(_read_options(reading), Model.load(model)), found
+    among = find_logs(logs)
+    _run(
+        HealthJob, by_vehicle, among, logs, model=model, cluster=cluster, reading=reading,
+        report=report, json_output=json_output,
+    )  # fmt: skip
 
 
 @fleet_app.command("gap")
@@ -267,17 +247,16 @@ def gap_fleet_command(
         Logs without a fault, of any vehicles of the type; repeat the option. Or the column healthy
         of a manifest.
     """
-    from cangauge.extras.fleet.gap import GapJob
+    from cangauge.extras.fleet.gap import GapJob, gap_tasks
     from cangauge.extras.fleet.sources import find_logs
-    from cangauge.model.model_file import Model
 
-    known = {log.url: replace(log, healthy=True) for log in find_logs(reference or [])}
-    among = [known.pop(log.url, log) for log in find_logs(logs)] + [*known.values()]
-    _check_outputs([report], among, model, *map(Path, [*logs, *(reference or [])]))
-    job, tasks = GapJob(_read_options(reading), Model.load(model)).of_fleet(
-        [log for log in among if not log.healthy], [log for log in among if log.healthy]
-    )
-    _run(job, tasks, among, cluster, report, json_output=json_output)
+    references = reference or []
+    healthy = {log.url: replace(log, healthy=True) for log in find_logs(references)}
+    among = [healthy.pop(log.url, log) for log in find_logs(logs)] + [*healthy.values()]
+    _run(
+        GapJob, gap_tasks, among, [*logs, *references], model=model, cluster=cluster,
+        reading=reading, report=report, json_output=json_output,
+    )  # fmt: skip
 
 
 def _read_options(reading: ReadingOptions) -> ReadOptions:
@@ -300,19 +279,29 @@ def _read_options(reading: ReadingOptions) -> ReadOptions:
 
 
 def _run(
-    job: Job,
-    tasks: Sequence[Task],
+    kind: Callable[..., Job],
+    tasks_of: Callable[[Sequence[FleetLog]], list[Task]],
     among: Sequence[FleetLog],
-    cluster: Cluster,
-    report: Path | None,
+    inputs: Sequence[str],
     *,
+    model: Path,
+    cluster: Cluster,
+    reading: ReadingOptions,
+    report: Path | None,
     json_output: bool,
 ) -> None:
-    """Run a job, and print and write what its results say of the logs in `among`."""
+    """Run a job on logs, and print and write what its results say of them.
+
+    `inputs` is what the user gave in place of the logs: it is not overwritten either.
+    """
     from cangauge.extras.fleet.overview import FleetOverview
     from cangauge.extras.fleet.results import Results
     from cangauge.extras.fleet.run import run_job
+    from cangauge.model.model_file import Model
 
+    _check_outputs([report], among, model, *map(Path, inputs))
+    job = kind(_read_options(reading), Model.load(model))
+    tasks = tasks_of(among)
     results = Results(cluster.out, job.kind, job.columns)
     summary = cluster.run(lambda client: run_job(job, tasks, results, client))
     found = FleetOverview.read(cluster.out, among)

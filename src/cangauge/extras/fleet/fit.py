@@ -18,7 +18,7 @@ from cangauge._files import text_sha256
 from cangauge._text import counted
 from cangauge._version import __version__
 from cangauge.errors import InputError
-from cangauge.extras.fleet.jobs import COUNT, REAL, TEXT, LogJob, by_log
+from cangauge.extras.fleet.jobs import COUNT, REAL, TEXT, Job, by_log
 from cangauge.extras.fleet.outliers import ErrorsByLog
 from cangauge.extras.fleet.results import Results, by_kind
 from cangauge.extras.fleet.run import Summary, run_id, run_job
@@ -57,7 +57,7 @@ Row = Mapping[str, Any]
 
 
 @dataclass(frozen=True, eq=False)
-class SumsJob(LogJob):
+class SumsJob(Job):
     """Sums of each log.
 
     Parameters

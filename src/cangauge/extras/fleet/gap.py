@@ -11,8 +11,9 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache, partial
 from itertools import chain, islice, zip_longest
-from typing import Any, ClassVar, Final, Self
+from typing import Any, ClassVar, Final, NamedTuple
 
 import pyarrow as pa
 
@@ -26,10 +27,9 @@ from cangauge.diagnosis import (
     learn_references,
 )
 from cangauge.errors import InputError
-from cangauge.extras.fleet.jobs import COUNT, REAL, TEXT, Job, Task, by_vehicle
+from cangauge.extras.fleet.jobs import COUNT, REAL, TEXT, ModelJob, Row, Task, by_vehicle
 from cangauge.extras.fleet.sources import FleetLog
 from cangauge.logs.log import Log
-from cangauge.model.model_file import Model
 
 _REFERENCES: Final = 30
 """References of a diagnosis; more gain little, and learning from a thousand takes 1.9 GB (see
@@ -40,25 +40,8 @@ _NAMES: Final = pa.list_(pa.string())
 
 
 @dataclass(frozen=True, eq=False)
-class GapJob(Job):
-    """Verdict on each vehicle.
-
-    Parameters
-    ----------
-    model : Model
-        Of the vehicles' type, such as from `fleet fit`.
-    common : tuple of FleetLog
-        References of every vehicle without healthy logs of its own.
-    learned : References, optional
-        From these.
-    unread : tuple of str
-        Those that could not be used, with the reason.
-    """
-
-    model: Model
-    common: tuple[FleetLog, ...] = ()
-    learned: References | None = None
-    unread: tuple[str, ...] = ()
+class GapJob(ModelJob):
+    """Verdict on each vehicle."""
 
     kind: ClassVar[str] = "gap"
     of: ClassVar[str] = "vehicles"
@@ -71,109 +54,101 @@ class GapJob(Job):
         "parameters": TEXT, "visible_from": TEXT, "summary": TEXT, "limits": _NAMES,
     }  # fmt: skip
 
-    def identity(self) -> dict[str, Any]:
-        """Return the model."""
-        return {"model": self.model.to_json()}
-
-    def of_fleet(
-        self, logs: Iterable[FleetLog], healthy: Iterable[FleetLog]
-    ) -> tuple[Self, list[Task]]:
-        """Return the job with the common references, and a task for each vehicle.
-
-        References of a vehicle are its own healthy logs, at most half, then one of each other
-        vehicle in turn; or the common ones.
-
-        Parameters
-        ----------
-        logs, healthy : iterable of FleetLog
-            Logs to diagnose, and logs without a fault, each in order of time. The latest of a
-            vehicle (`_LATEST`) are diagnosed together.
-
-        Raises
-        ------
-        InputError
-            If no log is healthy, or all are.
-        """
-        good = {task.vehicle: sorted(task.logs, key=_order) for task in by_vehicle(healthy)}
-        suspect = by_vehicle(logs)
-        if not good:
-            cure = "give --reference, or a manifest with the column `healthy`"
-            raise InputError("no log is known to be healthy", field="--reference", cure=cure)
-        if not suspect:
-            raise InputError("every log is a reference", cure="give logs to diagnose")
-        groups = sorted(good.values(), key=lambda of_vehicle: _order(of_vehicle[0]))
-        in_turn = [log for log in chain(*zip_longest(*groups)) if log is not None]
-        needed = any(task.vehicle not in good for task in suspect)
-        common = tuple(in_turn[:_REFERENCES]) if needed else ()
-        tasks = []
-        for task in suspect:
-            own = good.get(task.vehicle, [])[: _REFERENCES // 2]
-            others = [log for log in in_turn if log.vehicle != task.vehicle] if own else []
-            tasks.append(
-                replace(
-                    task,
-                    logs=task.logs[-_LATEST:],
-                    references=tuple(islice(chain(own, others), _REFERENCES)),
-                    common=() if own else common,
-                )
-            )
-        return replace(self, common=common), tasks
-
-    def prepared(self) -> Self:
-        """Return the job with what the common references show."""
-        unread: list[str] = []
-        logs = self._read_all(self.common, unread)
-        while logs:
-            try:
-                learned = learn_references(logs, self.model)
-            except InputError as error:
-                left = [log for log in logs if error.source not in {log.source, log.name}]
-                if len(left) == len(logs):
-                    raise
-                unread.append(str(error))
-                logs = left
-            else:
-                return replace(self, learned=learned, unread=tuple(unread))
-        if self.common:
-            raise InputError(f"no reference can be used: {unread[0]}", field="--reference")
-        return self
-
-    def parts(self, task: Task) -> Iterator[tuple[str, Callable[[], dict[str, Any]]]]:
+    def parts(self, task: Task) -> Iterator[tuple[str, Callable[[], Row]]]:
         """Yield the verdict on the vehicle."""
-        yield task.vehicle, lambda: self._row(task)
+        yield task.vehicle, partial(self._row, task)
 
-    def _row(self, task: Task) -> dict[str, Any]:
-        unread: list[str] = []
-        logs = self._read_all(task.logs, unread)
+    def _row(self, task: Task) -> Row:
+        logs, unread = self.read_all(task.logs)
         if not logs:
             raise InputError("none of its logs can be read", cure=f"the first: {unread[0]}")
-        of, bad = task.references or self.common, list(self.unread)
-        references: References | list[Log] | None = self.learned
-        if task.references or references is None:
-            bad = []
-            references = self._read_all(of, bad)
-        found = diagnose(logs, self.model, references)
-        unusable = {text.partition(": ")[0] for text in bad}
+        healthy = _learned(self, task.references)
+        found = diagnose([*logs.values()], self.model, healthy.references)
         return {
             "logs": [log.url for log in task.logs],
             "references": len(found.known.logs),
-            "reference_vehicles": len({log.vehicle for log in of if log.url not in unusable}),
-            "unread": [*unread, *bad],
+            "reference_vehicles": healthy.vehicles,
+            "unread": [*unread, *healthy.unread],
             **_columns_of(found),
         }
 
-    def _read_all(self, logs: Sequence[FleetLog], unread: list[str]) -> list[Log]:
-        """Read logs; those that cannot be read are named in `unread`."""
-        found = []
+    def read_all(self, logs: Iterable[FleetLog]) -> tuple[dict[FleetLog, Log], list[str]]:
+        """Return the logs that can be read, and why the others cannot."""
+        read, unread = {}, []
         for log in logs:
             try:
-                found.append(self.read(log))
+                read[log] = self.read(log)
             except InputError as error:
                 unread.append(f"{log.url}: {error.problem}")
-        return found
+        return read, unread
 
 
-def _columns_of(found: Diagnosis) -> dict[str, Any]:
+class _Learned(NamedTuple):
+    """What references show, of how many vehicles they are, and those that could not be used."""
+
+    references: References
+    vehicles: int
+    unread: list[str]
+
+
+@lru_cache(maxsize=1)
+def _learned(job: GapJob, references: tuple[FleetLog, ...]) -> _Learned:
+    """Learn from references on this worker, without those that cannot be used."""
+    logs, unread = job.read_all(references)
+    while logs:
+        try:
+            learned = learn_references([*logs.values()], job.model)
+        except InputError as error:
+            left = {
+                of: log for of, log in logs.items() if error.source not in {log.source, log.name}
+            }
+            if len(left) == len(logs):
+                raise
+            unread.append(str(error))
+            logs = left
+        else:
+            return _Learned(learned, len({log.vehicle for log in logs}), unread)
+    raise InputError(f"no reference can be used: {unread[0]}", field="--reference")
+
+
+def gap_tasks(logs: Sequence[FleetLog]) -> list[Task]:
+    """Return a task for each vehicle, with its references.
+
+    References of a vehicle are its own healthy logs, at most half, then one of each other vehicle
+    in turn. Vehicles without healthy logs of their own have the same, and come first: a worker then
+    learns from these once.
+
+    Parameters
+    ----------
+    logs : sequence of FleetLog
+        Healthy logs and those to diagnose, each in order of time. The latest of a vehicle
+        (`_LATEST`) are diagnosed together.
+
+    Raises
+    ------
+    InputError
+        If no log is healthy, or all are.
+    """
+    healthy = by_vehicle(log for log in logs if log.healthy)
+    suspect = by_vehicle(log for log in logs if not log.healthy)
+    good = {task.vehicle: sorted(task.logs, key=_order) for task in healthy}
+    if not good:
+        cure = "give --reference, or a manifest with the column `healthy`"
+        raise InputError("no log is known to be healthy", field="--reference", cure=cure)
+    if not suspect:
+        raise InputError("every log is a reference", cure="give logs to diagnose")
+    groups = sorted(good.values(), key=lambda of_vehicle: _order(of_vehicle[0]))
+    in_turn = [log for log in chain(*zip_longest(*groups)) if log is not None]
+    tasks = []
+    for task in sorted(suspect, key=lambda task: task.vehicle in good):
+        own = good.get(task.vehicle, [])[: _REFERENCES // 2]
+        others = (log for log in in_turn if log.vehicle != task.vehicle)
+        references = tuple(islice(chain(own, others), _REFERENCES))
+        tasks.append(replace(task, logs=task.logs[-_LATEST:], references=references))
+    return tasks
+
+
+def _columns_of(found: Diagnosis) -> Row:
     answer = found.posterior
     group, probability = next(iter(answer.groups.items()))
     return {

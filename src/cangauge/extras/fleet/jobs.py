@@ -6,7 +6,8 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar, Final, Self
+from functools import partial
+from typing import Any, ClassVar, Final
 
 import numpy as np
 import pyarrow as pa
@@ -40,6 +41,9 @@ _PARKED_S: Final = 8.0 * 3600.0
 """Time between two logs of a vehicle without a known start [s]: a car parked overnight."""
 
 
+Row = dict[str, Any]
+
+
 @dataclass(frozen=True, slots=True)
 class Task:
     """What one worker computes: a log, or the logs of a vehicle with their references."""
@@ -48,13 +52,11 @@ class Task:
     vehicle: str
     logs: tuple[FleetLog, ...]
     references: tuple[FleetLog, ...] = ()
-    common: tuple[FleetLog, ...] = ()
-    """References that it shares with other tasks."""
 
     @property
     def stamp(self) -> str:
         """Changes with the content of any of its logs, and with what a manifest states of them."""
-        logs = (*self.logs, *self.references, *self.common)
+        logs = (*self.logs, *self.references)
         told = (f"{log.url}{log.stamp}{log.start}{log.initial_soc_pct}" for log in logs)
         return text_sha256("\n".join((self.vehicle, *told)))[:16]
 
@@ -72,20 +74,21 @@ class Job(ABC):
     of: ClassVar[str] = "logs"
     """What its rows are about."""
 
-    def prepared(self) -> Self:
-        """Return the job with what all its rows share, computed once on a worker."""
-        return self
-
     @abstractmethod
     def identity(self) -> dict[str, Any]:
         """Return what the rows depend on beside the logs and how they are read, as JSON."""
 
-    @abstractmethod
-    def parts(self, task: Task) -> Iterator[tuple[str, Callable[[], dict[str, Any]]]]:
+    def parts(self, task: Task) -> Iterator[tuple[str, Callable[[], Row]]]:
         """Yield the name of each row, and the function that computes its columns.
 
         A function that raises sets its row aside; the others are computed all the same.
         """
+        for log in task.logs:
+            yield log.url, partial(self.row, log)
+
+    def row(self, log: FleetLog) -> Row:
+        """Return the columns of a log that depends on no other."""
+        raise NotImplementedError
 
     def read(self, log: FleetLog) -> Log:
         """Read a log of the fleet (`ReadOptions.read`)."""
@@ -93,17 +96,15 @@ class Job(ABC):
             return self.options.read(log, path)
 
 
-class LogJob(Job):
-    """A job with one row for each log, independent of all others."""
+@dataclass(frozen=True, eq=False)
+class ModelJob(Job):
+    """A job by a model of the vehicles' type, such as from `fleet fit`."""
 
-    def parts(self, task: Task) -> Iterator[tuple[str, Callable[[], dict[str, Any]]]]:
-        """Yield the row of each log."""
-        for log in task.logs:
-            yield log.url, lambda log=log: self.row(log)  # type: ignore[misc]
+    model: Model
 
-    @abstractmethod
-    def row(self, log: FleetLog) -> dict[str, Any]:
-        """Return the columns of a log."""
+    def identity(self) -> dict[str, Any]:
+        """Return the model."""
+        return {"model": self.model.to_json()}
 
 
 def by_log(logs: Iterable[FleetLog]) -> list[Task]:
@@ -123,10 +124,8 @@ def by_vehicle(logs: Iterable[FleetLog]) -> list[Task]:
 
 
 @dataclass(frozen=True, eq=False)
-class EstimateJob(LogJob):
+class EstimateJob(ModelJob):
     """State of charge of each log, as `cangauge estimate` computes it."""
-
-    model: Model
 
     kind: ClassVar[str] = "estimate"
     columns: ClassVar[Mapping[str, Any]] = {
@@ -139,11 +138,7 @@ class EstimateJob(LogJob):
         "reasons": TEXT, "warnings": TEXT,
     }  # fmt: skip
 
-    def identity(self) -> dict[str, Any]:
-        """Return the model."""
-        return {"model": self.model.to_json()}
-
-    def row(self, log: FleetLog) -> dict[str, Any]:
+    def row(self, log: FleetLog) -> Row:
         """Return SoC at both ends, errors where the log has SoC, and the shares of each status."""
         done = self._estimate(log)
         table, recorded = done.table, done.recorded
@@ -193,14 +188,12 @@ def mean_of(values: FloatArray | Sequence[float | None]) -> float | None:
 
 
 @dataclass(frozen=True, eq=False)
-class HealthJob(Job):
+class HealthJob(ModelJob):
     """Capacity and resistance of each vehicle after each of its logs.
 
     The estimator's state passes from a log to the vehicle's next one, as over the restarts of a
     service, so that the capacity is learned over the whole life that was recorded.
     """
-
-    model: Model
 
     kind: ClassVar[str] = "health"
     columns: ClassVar[Mapping[str, Any]] = {
@@ -209,17 +202,13 @@ class HealthJob(Job):
         "resistance_std": REAL, "offset_a": REAL, "offset_std_a": REAL, "soc_pct": REAL,
     }  # fmt: skip
 
-    def identity(self) -> dict[str, Any]:
-        """Return the model."""
-        return {"model": self.model.to_json()}
-
-    def parts(self, task: Task) -> Iterator[tuple[str, Callable[[], dict[str, Any]]]]:
+    def parts(self, task: Task) -> Iterator[tuple[str, Callable[[], Row]]]:
         """Yield the row of each log, in order of time."""
         states: list[EstimatorState] = []
         for log in task.logs:
-            yield log.url, lambda log=log: self._row(log, states)  # type: ignore[misc]
+            yield log.url, partial(self._row, log, states)
 
-    def _row(self, log: FleetLog, states: list[EstimatorState]) -> dict[str, Any]:
+    def _row(self, log: FleetLog, states: list[EstimatorState]) -> Row:
         recorded = self.read(log)
         require_same_pack(recorded.voltage_v, self.model, recorded.source or recorded.name)
         before = states[-1] if states else None

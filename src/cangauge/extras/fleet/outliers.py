@@ -8,8 +8,9 @@ from typing import Any, Final
 
 import numpy as np
 
-from cangauge._text import NONE_KNOWN
+from cangauge._text import NONE_KNOWN, number, significant
 from cangauge._typing import FloatArray
+from cangauge.extras.fleet.sources import short_names
 from cangauge.model.model_file import Noise
 
 OUTLIER_Z: Final = 3.5
@@ -111,6 +112,22 @@ class ErrorsByLog:
             f" without {self.logs[self.misfits[0]]}. The farthest first, since it also distorts the"
             " errors of the others."
         )
+
+    def misfit_rows(self) -> tuple[list[str], list[list[str]]]:
+        """Return head and rows of the table of the logs that do not fit the others."""
+        z, misfits = self.z, self.misfits
+        names = short_names([self.logs[k] for k in misfits])
+        rows = [
+            [
+                self.vehicles[k],
+                name,
+                significant(self.mean_v[k], 3),
+                significant(self.rmse_v[k], 3),
+                number(z[k], 1),
+            ]
+            for name, k in zip(names, misfits, strict=True)
+        ]
+        return ["vehicle", "log", "mean error [V]", "RMSE [V]", "robust z"], rows
 
     def to_dict(self) -> dict[str, Any]:
         """Return the logs that do not fit as JSON; None if that is not known."""

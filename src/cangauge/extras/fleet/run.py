@@ -178,7 +178,7 @@ def run_job(job: Job, tasks: Sequence[Task], results: Results, client: Any) -> S
     Raises
     ------
     CangaugeError
-        If the scheduler is lost, or the job cannot be prepared; finished rows are kept.
+        If the scheduler is lost; finished rows are kept.
     """
     began, run = time.monotonic(), run_id(job)
     known = results.known(run)
@@ -229,7 +229,7 @@ def _computed(
     if not todo:
         return
     # A task, not scattered data: it is computed again if its worker is lost.
-    prepared = client.submit(_prepared, job, key=f"job-{run}")
+    shared = client.submit(_as_it_is, job, key=f"job-{run}")
     done = as_completed(loop=client.loop, with_results=True, raise_errors=False)
     queue, in_flight = iter(todo), dict[str, Task]()
     asked, wanted = -_ASK_S, 2
@@ -243,32 +243,22 @@ def _computed(
         while len(in_flight) < wanted and (task := next(queue, None)) is not None:
             key = f"{job.kind}-{text_sha256(f'{run}{task.name}{task.stamp}')[:24]}"
             in_flight[key] = task
-            done.add(client.submit(perform, prepared, task, key=key, pure=False))
+            done.add(client.submit(perform, shared, task, key=key, pure=False))
         if not in_flight:
             return
         future, result = next(done)
         task = in_flight.pop(future.key)
         if not isinstance(result, Finished):
-            result = _failed(future, result, task, prepared)
+            if future.status in {"cancelled", "lost"}:
+                raise CangaugeError(_LOST)
+            # distributed gives type, error and traceback.
+            error = result[1] if isinstance(result, tuple) else future.exception()
+            result = Finished(bad=[set_aside(task.name, error)])
         yield task, result
 
 
-def _failed(future: Any, result: Any, task: Task, prepared: Any) -> Finished:
-    """Return the logs of a task that could not run as set aside; raise if none can."""
-    if future.status in {"cancelled", "lost"}:
-        raise CangaugeError(_LOST)
-    if prepared.status == "error":
-        error = prepared.exception()
-        if isinstance(error, CangaugeError):
-            raise error
-        raise CangaugeError(f"the job cannot be prepared: {type(error).__name__}: {error}")
-    # distributed gives type, error and traceback.
-    error = result[1] if isinstance(result, tuple) else future.exception()
-    return Finished(bad=[set_aside(task.name, error)])
-
-
-def _prepared(job: Job) -> Job:
-    return job.prepared()
+def _as_it_is(job: Job) -> Job:
+    return job
 
 
 def perform(job: Job, task: Task) -> Finished:

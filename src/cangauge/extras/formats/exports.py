@@ -16,9 +16,9 @@ from cangauge.errors import InputError
 from cangauge.logs.column_map import ColumnMap, shown_headings
 from cangauge.logs.draft import DraftLog
 from cangauge.logs.headings import LONGEST
-from cangauge.logs.table import numbers_of
 from cangauge.logs.text import TextTable, split_cells
 from cangauge.logs.units import REQUIRED, convert
+from cangauge.logs.values import numbers_of
 
 # One heading of the i3 trips misspells the unit's bracket: `max. SoC [%)`; D3's units follow `__`.
 _HEADING: Final = re.compile(

@@ -43,7 +43,7 @@ class Workbook:
         sheet = _SheetText(head)
         table = find_table(sheet, columns)
         if table is None:
-            raise unknown_columns(str(head.path), *likely_header(sheet))
+            raise unknown_columns(str(head.path), *likely_header(sheet, columns))
         return draft_of_table(table, columns, name=head.name, source=str(head.path))
 
 
@@ -114,7 +114,7 @@ class EntityHistory:
         order = np.argsort(stamps, kind="stable")
         stamps = stamps[order]
         entity, values = entity.take(order), _as_numbers(state).take(order)
-        headings = ["time", *entity.unique().to_pylist()]
+        headings = ["time", *entity.unique().drop_null().to_pylist()]
         choice = choose_columns(headings, (), columns)
         if not choice.is_complete:
             raise unknown_columns(source, headings, choice)

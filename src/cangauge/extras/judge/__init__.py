@@ -2,7 +2,9 @@
 
 chain      logs of several days as one linear Gaussian model
 causes     what may be wrong, and the evidence of each
-judgement  the answer, its sentences and its JSON
+weak       a weak cell, from the cell voltages
+judgement  all answers as one judgement
+result     its sentences and its JSON
 page       the page with both SoCs
 command    `cangauge judge`
 """

@@ -33,13 +33,11 @@ from cangauge.extras.judge.chain import (
     STEP,
     VOLTAGE,
     VOLTAGE_SCALES,
+    Chain,
     Design,
     GaugeNoise,
     Stretch,
-    Voltage,
-    design_of,
 )
-from cangauge.model.model_file import Model
 
 UNITS: Final = {
     "current_offset": "A", "count_scale": "%", "pack_capacity": "%", "start_or_reset": "% SoC",
@@ -51,7 +49,7 @@ NAMES: Final = ("none", "unknown", *UNITS)
 PRIOR_NONE: Final = 0.5
 """Prior probability that the gauge is right: whoever asks has a reason. The other answers share
 the rest alike."""
-LOCAL: Final = (START, LEVEL, ERROR, STEP, COUNT_OFFSET, COUNT_SCALE)
+LOCAL: Final = [START, LEVEL, ERROR, STEP, COUNT_OFFSET, COUNT_SCALE]
 """Columns with a size of their own in each stretch."""
 FREE_PCT: Final = 60.0
 """Standard deviation of the SoC at the start of a stretch [%]: unknown."""
@@ -70,8 +68,11 @@ WINDOW_PCT: Final = 5.0
 """Standard deviation of the zero of a gauge beside the typical oxide cell [% SoC]: cars show the
 usable part of a pack, which leaves up to a tenth of the cells' charge at either end. A gauge of LFP
 cells is set to 100 % at the end of a charge."""
-GRID: Final = [(v, y) for v in range(len(VOLTAGE_SCALES)) for y in range(len(GAUGES))]
-"""Sizes of the noise of voltage and gauge, equally likely before the logs."""
+
+Point = tuple[int, int]
+"""Sizes of the noise of voltage and gauge: places in `VOLTAGE_SCALES` and `GAUGES`."""
+GRID: Final[list[Point]] = [(v, y) for v in range(len(VOLTAGE_SCALES)) for y in range(len(GAUGES))]
+"""All of them, equally likely before the logs."""
 
 
 @dataclass(frozen=True)
@@ -106,14 +107,14 @@ class Priors:
         }
 
     def fault(self, cause: str) -> float:
-        """Return the standard deviation of a fault's size, in `UNITS`."""
+        """Return the standard deviation of a fault's size, in `UNITS`; 1 for no cause."""
         return {
             "current_offset": self.capacity_ah / 25.0,  # 1 % of a sensor's range of 4 C
             "count_scale": 5.0,  # a wrong capacity in the gauge's configuration, or gain
             "pack_capacity": 6.0,  # what ageing takes between two updates of a gauge
             "start_or_reset": 10.0,
             "voltage_sensor": 1.5,
-        }[cause]
+        }.get(cause, 1.0)
 
 
 class Signature(NamedTuple):
@@ -125,65 +126,68 @@ class Signature(NamedTuple):
     """Whether it begins at the step within that stretch."""
     weight: float
     """Prior probability within its cause."""
-    std: float
     columns: FloatArray
     """Coefficients in each stretch, shape (L, columns)."""
 
 
 def signatures_of(  # noqa: C901 - a table of causes
-    name: str, chain: Sequence[Stretch], starts: FloatArray, columns: int, priors: Priors
+    name: str, hours: FloatArray, starts: FloatArray, columns: int, capacity_ah: float
 ) -> list[Signature]:
     """Return the signatures of an answer; of `none` and `unknown` an empty one.
 
     Parameters
     ----------
     name : str
-    chain : sequence of Stretch
-    starts : array of shape (L,)
-        SoC at the start of each stretch [%].
+    hours, starts : array of shape (L,)
+        Duration of each stretch [h], and the SoC at its start [%].
     columns : int
         Number of columns.
-    priors : Priors
+    capacity_ah : float
+        [Ah].
     """
-    L = len(chain)
+    L = len(hours)
     if name not in UNITS:
         # An error that differs between stretches needs some: of one it is that of the start.
         weight = 1.0 if name == "none" else max(1.0 - 1.0 / L, 1e-9)
-        return [Signature(0, False, weight, 1.0, np.zeros((L, columns)))]
-    counted = np.array([part.counted_h for part in chain])
+        return [Signature(0, False, weight, np.zeros((L, columns)))]
+    counted_h = np.concatenate(([0.0], np.cumsum(hours)[:-1]))
     one = np.ones(L)
-    found = []
+    result = []
 
-    def add(m: int, weight: float, *parts: tuple[int, FloatArray], inside: bool = False) -> None:
+    def add(m: int, weight: float, parts: dict[int, FloatArray], *, inside: bool = False) -> None:
         table = np.zeros((L, columns))
-        for column, value in parts:
-            table[m:, column] += value[m:]
-        found.append(Signature(m, inside, weight, priors.fault(name), table))
-
-    def begins(m: int) -> float:
-        """Return the prior probability that it began with stretch m: half of it before all."""
-        return 1.0 if L == 1 else 0.5 if m == 0 else 0.5 / (L - 1)
+        for column, value in parts.items():
+            table[m:, column] = value[m:]
+        result.append(Signature(m, inside, weight, table))
 
     for m in range(L):
-        grown = -100.0 / priors.capacity_ah * (counted - counted[m])
+        begins = 1.0 if L == 1 else 0.5 if m == 0 else 0.5 / (L - 1)  # half of it before all
         if name == "current_offset":
+            grown = -100.0 / capacity_ah * (counted_h - counted_h[m])
             for column in (OFFSET, COUNT_OFFSET):  # in the sensor, or in the count alone
-                add(m, 0.35 * begins(m), (column, one), (ERROR, grown))
-                add(m, 0.15 * begins(m), (column, one))  # the gauge corrects itself when parked
-        if name in {"count_scale", "pack_capacity"} and m == 0:  # not of one day to the next
-            column = COUNT_SCALE if name == "count_scale" else CAPACITY
-            add(m, 0.4, (column, one), (ERROR, (starts - starts[m]) / 100.0))
-            add(m, 0.3, (column, one), (ERROR, (starts - 100.0) / 100.0))  # right when full
-            add(m, 0.3, (column, one))
-        if name == "voltage_sensor":
-            add(m, 0.6 * begins(m), (VOLTAGE, one))  # as logged; the gauge counts
-            if m == 0:
-                add(m, 0.4, (BY_VOLTAGE, one))  # in a gauge that reads the voltage
-        if name == "start_or_reset":
+                add(m, 0.35 * begins, {column: one, ERROR: grown})
+                add(m, 0.15 * begins, {column: one})  # the gauge corrects itself when parked
+        elif name == "start_or_reset":
             here = np.eye(L)[m]
-            add(m, 0.8 * begins(m), (ERROR, one))
-            add(m, 0.2 / L, (STEP, here), (ERROR, one - here), inside=True)
-    return found
+            add(m, 0.8 * begins, {ERROR: one})
+            add(m, 0.2 / L, {STEP: here, ERROR: one - here}, inside=True)
+        elif name == "voltage_sensor":
+            add(m, 0.6 * begins, {VOLTAGE: one})  # as logged; the gauge counts
+            if m == 0:
+                add(m, 0.4, {BY_VOLTAGE: one})  # in a gauge that reads the voltage
+    if name in {"count_scale", "pack_capacity"}:  # not of one day to the next
+        column = COUNT_SCALE if name == "count_scale" else CAPACITY
+        add(0, 0.4, {column: one, ERROR: (starts - starts[0]) / 100.0})
+        add(0, 0.3, {column: one, ERROR: (starts - 100.0) / 100.0})  # right when full
+        add(0, 0.3, {column: one})
+    return result
+
+
+class Track(NamedTuple):
+    """SoC of a stretch and its standard deviation at each block [%]."""
+
+    soc_pct: FloatArray
+    std_pct: FloatArray
 
 
 class Sums(NamedTuple):
@@ -204,110 +208,13 @@ class Sums(NamedTuple):
     log_evidence: float
 
 
-def sums_of(
-    designs: Sequence[Design],
-    chain: Sequence[Stretch],
-    grid: tuple[int, int],
-    classes: Sequence[int],
-    priors: Priors,
-    *,
-    unknown: bool,
-) -> Sums:
-    """Integrate out what each stretch has of its own, and collect what all share.
+class Weighed(NamedTuple):
+    """All signatures of an answer at one size of the noise; arrays of shape (signatures,)."""
 
-    Parameters
-    ----------
-    grid : pair of int
-        Size of the voltage's noise, and of the gauge's as it usually is.
-    classes : sequence of int
-        Size of the gauge's noise in each stretch.
-    """
-    v, y = grid
-    own = list(LOCAL)
-    M = np.array(
-        [design.voltage[v] + design.gauge[c] for design, c in zip(designs, classes, strict=True)]
-    )
-    prior = np.array(
-        [
-            _local(part, v, c, priors, unknown=unknown)
-            for part, c in zip(chain, classes, strict=True)
-        ]
-    )
-    A = M[:, own][:, :, own] + np.eye(len(own)) * prior[:, None] ** -2.0
-    inverse = np.linalg.inv(A)
-    back = inverse @ M[:, own]
-    gram: FloatArray = M - M[:, :, own] @ back
-    log_evidence = sum(
-        part.whiten_voltage[v].log_norm + part.whiten_gauge[c].log_norm + _log_stray(c, y)
-        for part, c in zip(chain, classes, strict=True)
-    )
-    log_evidence -= 0.5 * float(np.linalg.slogdet(A)[1].sum()) + float(np.log(prior).sum())
-    total = gram.sum(axis=0)
-    healthy = priors.healthy(GAUGES[y])
-    at = [*healthy, *range(FUNCTIONS, total.shape[0] - 1)]
-    shared = np.array([healthy.get(column, 1.0) for column in at]) ** -2.0
-    A = total[np.ix_(at, at)] + np.diag(shared)
-    b = total[at, -1]
-    log_evidence += 0.5 * (float(b @ np.linalg.solve(A, b)) - float(total[-1, -1]))
-    log_evidence -= 0.5 * (np.linalg.slogdet(A)[1] - float(np.log(shared).sum()))
-    return Sums(gram, np.asarray(inverse), back, at, A, b, log_evidence)
-
-
-def _local(part: Stretch, v: int, c: int, priors: Priors, *, unknown: bool) -> FloatArray:
-    """Return the standard deviations of the columns that a stretch has of its own."""
-    gauge = GAUGES[c]
-    drift_a = gauge.drift_pct / 100.0 * priors.capacity_ah / np.sqrt(max(part.hours_long, 1.0))
-    error_pct = UNKNOWN_PCT if unknown else gauge.error_pct
-    return np.array(
-        [FREE_PCT, VOLTAGE_SCALES[v], error_pct, gauge.error_pct, drift_a, gauge.scale_pct]
-    )
-
-
-def _log_stray(c: int, y: int) -> float:
-    """Return the log prior of a stretch's size of noise, where the gauge's usual one is y."""
-    larger = len(GAUGES) - 1 - y
-    return float(np.log(1.0 - STRAYS if c == y else STRAYS / larger)) if larger else 0.0
-
-
-def straying(
-    designs: Sequence[Design],
-    chain: Sequence[Stretch],
-    grid: tuple[int, int],
-    shared: FloatArray,
-    priors: Priors,
-    *,
-    unknown: bool,
-) -> list[int]:
-    """Return the likeliest size of the gauge's noise in each stretch.
-
-    Parameters
-    ----------
-    shared : array of shape (L, columns)
-        What all stretches share, and the cause, in the columns of each stretch.
-    """
-    (v, y), own = grid, list(LOCAL)
-    found = []
-    for design, part, theta in zip(designs, chain, shared, strict=True):
-        scores = []
-        for c in range(y, len(GAUGES)):
-            M = design.voltage[v] + design.gauge[c]
-            prior = _local(part, v, c, priors, unknown=unknown)
-            A = M[np.ix_(own, own)] + np.diag(prior**-2.0)
-            left = np.r_[-theta, 1.0]
-            b = M[own] @ left
-            fit = float(left @ M @ left) - float(b @ np.linalg.solve(A, b))
-            norm = part.whiten_gauge[c].log_norm - float(np.log(prior).sum())
-            norm -= 0.5 * float(np.linalg.slogdet(A)[1])
-            scores.append(norm - 0.5 * fit + _log_stray(c, y))
-        found.append(y + int(np.argmax(scores)))
-    return found
-
-
-class Track(NamedTuple):
-    """SoC of a stretch and its standard deviation at each block [%]."""
-
-    soc_pct: FloatArray
-    std_pct: FloatArray
+    log_evidence: FloatArray
+    size: FloatArray
+    variance: FloatArray
+    sums: Sums
 
 
 @dataclass(frozen=True, eq=False)
@@ -327,7 +234,7 @@ class Explanation:
         SoC of each stretch under the most probable signature; of `none`, as if the gauge's zero
         were free, so that the gauge does not confirm itself.
     sums : Sums
-    point : pair of int
+    point : Point
         Sums at the likeliest sizes of the noise, and which those are.
     functions, covariance : array of shape (c,), (c, c)
         Principal functions of the curve after the logs.
@@ -341,7 +248,7 @@ class Explanation:
     std: FloatArray
     tracks: list[Track]
     sums: Sums
-    point: tuple[int, int]
+    point: Point
     functions: FloatArray
     covariance: FloatArray
 
@@ -351,156 +258,221 @@ class Explanation:
         return int(np.argmax(self.share))
 
 
-def explain(chain: Sequence[Stretch], model: Model, priors: Priors) -> list[Explanation]:
+def explain(chain: Chain, priors: Priors) -> list[Explanation]:
     """Return all answers, each linearised at its own SoC."""
-    first = [part.linear_pct for part in chain]
-    voltage = Voltage.of(model)
-    found = []
+    stretches, result = chain.stretches, list[Explanation]()
     for name in NAMES:
-        for part, linear_pct in zip(chain, first, strict=True):
-            part.linear_pct = linear_pct
-        points: Sequence[tuple[int, int]] = GRID
+        points, linear = GRID, [part.fitting_pct for part in stretches]
         for _ in range(ITERATIONS):
-            designs = [design_of(part, voltage) for part in chain]
-            explanation = _explanation(name, chain, designs, priors, points)
+            designs = [chain.design(*of) for of in zip(stretches, linear, strict=True)]
+            answer = Answer(name, stretches, designs, priors)
+            explanation = answer.explanation(points)
             points = [explanation.point]
-            moved_pct = 0.0
-            for part, track in zip(chain, explanation.tracks, strict=True):
-                step = np.clip(track.soc_pct, -3.0, 103.0) - part.linear_pct
-                part.linear_pct = part.linear_pct + DAMPING * step
-                moved_pct = max(moved_pct, float(np.abs(step).max()))
-            if moved_pct < SETTLED_PCT:
+            steps = [
+                np.clip(track.soc_pct, -3.0, 103.0) - soc_pct
+                for track, soc_pct in zip(explanation.tracks, linear, strict=True)
+            ]
+            if max(float(np.abs(step).max()) for step in steps) < SETTLED_PCT:
                 break
-        explanation = _explanation(name, chain, designs, priors, GRID)
+            linear = [a + DAMPING * step for a, step in zip(linear, steps, strict=True)]
+        explanation = answer.explanation(GRID)
         if name == "none":
             # Not by the gauge itself: the SoC that the voltage alone would have shown.
             free = np.zeros_like(explanation.signatures[0].columns)
             free[:, ERROR] = 1.0
-            apart = Signature(0, False, 1.0, priors.fault("start_or_reset"), free)
-            tracks, *_ = _tracks(chain, designs, explanation.sums, apart, priors)
+            tracks, *_ = answer.tracks(explanation.sums, free, priors.fault("start_or_reset"))
             explanation = replace(explanation, tracks=tracks)
-        found.append(explanation)
-        if name != "none":
+        else:
             # The null hypothesis may use any linearisation: no curvature accuses a gauge.
-            null = _explanation("none", chain, designs, priors, GRID).log_evidence
-            found[0] = replace(found[0], log_evidence=max(found[0].log_evidence, null))
-    return found
+            null = Answer("none", stretches, designs, priors).explanation(GRID).log_evidence
+            result[0] = replace(result[0], log_evidence=max(result[0].log_evidence, null))
+        result.append(explanation)
+    return result
 
 
-class _OfPoint(NamedTuple):
-    """All signatures of an answer at some sizes of the noise."""
+class Answer:
+    """An answer at one linearisation.
 
-    logs: FloatArray
-    """Logarithm of the evidence."""
-    size: FloatArray
-    variance: FloatArray
-    sums: Sums
+    Parameters
+    ----------
+    name : str
+    stretches : sequence of Stretch
+    designs : sequence of Design
+        Of each stretch.
+    priors : Priors
+    """
 
+    def __init__(
+        self, name: str, stretches: Sequence[Stretch], designs: Sequence[Design], priors: Priors
+    ) -> None:
+        self._name, self._priors, self._std = name, priors, priors.fault(name)
+        self._stretches, self._designs = stretches, designs
+        self._columns = designs[0].gauge[0].shape[0] - 1
+        hours = np.array([part.hours[-1] for part in stretches])
+        starts = np.array([design.start_pct for design in designs])
+        self._signatures = signatures_of(name, hours, starts, self._columns, priors.capacity_ah)
 
-def _explanation(
-    name: str,
-    chain: Sequence[Stretch],
-    designs: Sequence[Design],
-    priors: Priors,
-    points: Sequence[tuple[int, int]],
-) -> Explanation:
-    """Return an answer at one linearisation, with its noise integrated over some points."""
-    starts = np.array([design.start_pct for design in designs])
-    columns = designs[0].gauge[0].shape[0] - 1
-    signatures = signatures_of(name, chain, starts, columns, priors)
-    W = np.array([each.columns for each in signatures])
-    std = np.array([each.std for each in signatures])
-    log_weight = np.log([each.weight for each in signatures])
+    def explanation(self, points: Sequence[Point]) -> Explanation:
+        """Return the explanation, with the noise integrated over some points."""
+        weighed = [self._weighed(point) for point in points]
+        table = np.array([of_point.log_evidence for of_point in weighed])
+        sizes = np.array([of_point.size for of_point in weighed])
+        variances = np.array([of_point.variance for of_point in weighed])
+        top = float(table.max())
+        weights = np.exp(table - top)
+        share = weights.sum(axis=0)
+        within = np.exp(table - table.max(axis=0))
+        within /= within.sum(axis=0)
+        size = (within * sizes).sum(axis=0)
+        square = (within * (variances + sizes**2)).sum(axis=0)
+        best = int(np.argmax(share))
+        likeliest = int(np.argmax(table[:, best]))
+        sums = weighed[likeliest].sums
+        tracks, functions, covariance = self.tracks(sums, self._signatures[best].columns, self._std)
+        prior = PRIOR_NONE if self._name == "none" else (1.0 - PRIOR_NONE) / (len(NAMES) - 1)
+        return Explanation(
+            self._name,
+            float(np.log(prior * weights.sum() / len(GRID))) + top,
+            self._signatures,
+            share / share.sum(),
+            size,
+            np.sqrt(np.maximum(square - size**2, 0.0)),
+            tracks,
+            sums,
+            points[likeliest],
+            functions,
+            covariance,
+        )
 
-    def _at(point: tuple[int, int], classes: list[int]) -> _OfPoint:
-        sums = sums_of(designs, chain, point, classes, priors, unknown=name == "unknown")
+    def tracks(
+        self, sums: Sums, W: FloatArray, std: float
+    ) -> tuple[list[Track], FloatArray, FloatArray]:
+        """Return the SoC under a signature, and the curve's functions with their covariance.
+
+        Parameters
+        ----------
+        sums : Sums
+        W : array of shape (L, columns)
+            Columns of the signature.
+        std : float
+            Prior standard deviation of its size.
+        """
+        p = len(sums.at)
+        theta, V = _posterior(sums, W, std)
+        tracks = []
+        for k, part in enumerate(self._stretches):
+            inverse, back = sums.inverse[k], sums.back[k]
+            C = np.zeros((self._columns, p + 1))
+            C[sums.at, range(p)] = 1.0
+            C[:, p] = W[k]
+            X = np.outer(100.0 * part.hours / self._priors.capacity_ah, C[OFFSET])
+            X += np.outer(part.drawn_pct / 100.0, C[CAPACITY]) - back[0, :-1] @ C
+            start_pct = self._designs[k].start_pct + back[0, -1]
+            variance = inverse[0, 0] + np.einsum("ni,ij,nj->n", X, V, X)
+            tracks.append(Track(start_pct - part.drawn_pct + X @ theta, np.sqrt(variance)))
+        functions = slice(p - (self._columns - FUNCTIONS), p)
+        return tracks, theta[functions], V[functions, functions]
+
+    def _weighed(self, point: Point) -> Weighed:
+        """Return the signatures at a size of the noise; stretches may stray if that is likelier."""
+        usual = [point[1]] * len(self._stretches)
+        weighed = self._at(point, usual)
+        best = self._signatures[int(np.argmax(weighed.log_evidence))].columns
+        theta, _ = _posterior(weighed.sums, best, self._std)
+        shared = best * theta[-1]
+        shared[:, weighed.sums.at] += theta[:-1]
+        classes = self._straying(point, shared)
+        if classes == usual:
+            return weighed
+        strayed = self._at(point, classes)
+        return max(weighed, strayed, key=lambda of: float(of.log_evidence.max()))
+
+    def _at(self, point: Point, classes: Sequence[int]) -> Weighed:
+        """Return the signatures with a size of the gauge's noise (class) for each stretch."""
+        W = np.array([signature.columns for signature in self._signatures])
+        log_weight = np.log([signature.weight for signature in self._signatures])
+        sums = self._sums(point, classes)
         MW = np.einsum("lcd,hld->hlc", sums.gram[:, :-1, :-1], W)
         cross = MW.sum(axis=1)[:, sums.at]
         solved = np.linalg.solve(sums.precision, cross.T)
         K = np.einsum("hlc,hlc->h", MW, W) - np.einsum("hs,sh->h", cross, solved)
         g = np.einsum("hlc,lc->h", W, sums.gram[:, :-1, -1]) - sums.gradient @ solved
-        precision = np.maximum(K, 0.0) + std**-2
-        factor = 0.5 * g**2 / precision - 0.5 * np.log(precision * std**2)
-        return _OfPoint(
-            sums.log_evidence + log_weight + factor, g / precision, 1.0 / precision, sums
+        precision = np.maximum(K, 0.0) + self._std**-2
+        log_factor = 0.5 * g**2 / precision - 0.5 * np.log(precision * self._std**2)
+        log_evidence = sums.log_evidence + log_weight + log_factor
+        return Weighed(log_evidence, g / precision, 1.0 / precision, sums)
+
+    def _sums(self, point: Point, classes: Sequence[int]) -> Sums:
+        """Integrate out what each stretch has of its own, and collect what all share."""
+        v, y = point
+        M = np.array(
+            [of.voltage[v] + of.gauge[c] for of, c in zip(self._designs, classes, strict=True)]
         )
+        stretches = list(zip(self._stretches, classes, strict=True))
+        prior = np.array([self._local_std(part, v, c) for part, c in stretches])
+        A = M[:, LOCAL][:, :, LOCAL] + np.eye(len(LOCAL)) * prior[:, None] ** -2.0
+        inverse = np.linalg.inv(A)
+        back = inverse @ M[:, LOCAL]
+        gram: FloatArray = M - M[:, :, LOCAL] @ back
+        log_evidence = sum(
+            part.whiten_voltage[v].log_norm + part.whiten_gauge[c].log_norm + _log_stray(c, y)
+            for part, c in stretches
+        )
+        log_evidence -= 0.5 * float(np.linalg.slogdet(A)[1].sum()) + float(np.log(prior).sum())
+        total = gram.sum(axis=0)
+        healthy = self._priors.healthy(GAUGES[y])
+        at = [*healthy, *range(FUNCTIONS, self._columns)]
+        shared = np.array([healthy.get(column, 1.0) for column in at]) ** -2.0
+        A = total[np.ix_(at, at)] + np.diag(shared)
+        b = total[at, -1]
+        log_evidence += 0.5 * (float(b @ np.linalg.solve(A, b)) - float(total[-1, -1]))
+        log_evidence -= 0.5 * (np.linalg.slogdet(A)[1] - float(np.log(shared).sum()))
+        return Sums(gram, np.asarray(inverse), back, at, A, b, log_evidence)
 
-    logs, sizes, variances, all_sums = [], [], [], []
-    for point in points:
-        of_point = _at(point, [point[1]] * len(chain))
-        best = int(np.argmax(of_point.logs))
-        theta, _ = _posterior(of_point.sums, signatures[best])
-        shared = np.zeros((len(chain), columns))
-        shared[:, of_point.sums.at] = theta[:-1]
-        shared += signatures[best].columns * theta[-1]
-        classes = straying(designs, chain, point, shared, priors, unknown=name == "unknown")
-        if any(c != point[1] for c in classes):
-            strayed = _at(point, classes)
-            of_point = strayed if strayed.logs.max() > of_point.logs.max() else of_point
-        logs.append(of_point.logs)
-        sizes.append(of_point.size)
-        variances.append(of_point.variance)
-        all_sums.append(of_point.sums)
-    table = np.array(logs)
-    top = float(table.max())
-    weights = np.exp(table - top)
-    share = weights.sum(axis=0)
-    within = np.exp(table - table.max(axis=0))
-    within /= within.sum(axis=0)
-    size = (within * np.array(sizes)).sum(axis=0)
-    square = (within * (np.array(variances) + np.array(sizes) ** 2)).sum(axis=0)
-    best = int(np.argmax(share))
-    likeliest = int(np.argmax(table[:, best]))
-    sums = all_sums[likeliest]
-    tracks, functions, covariance = _tracks(chain, designs, sums, signatures[best], priors)
-    prior = PRIOR_NONE if name == "none" else (1.0 - PRIOR_NONE) / (len(NAMES) - 1)
-    return Explanation(
-        name,
-        float(np.log(prior * weights.sum() / len(GRID))) + top,
-        signatures,
-        share / share.sum(),
-        size,
-        np.sqrt(np.maximum(square - size**2, 0.0)),
-        tracks,
-        sums,
-        points[likeliest],
-        functions,
-        covariance,
-    )
+    def _straying(self, point: Point, shared: FloatArray) -> list[int]:
+        """Return the likeliest size of the gauge's noise in each stretch.
 
+        `shared` is what all stretches share, and the cause, shape (L, columns).
+        """
+        v, y = point
+        classes = range(y, len(GAUGES))
+        result = []
+        for part, design, theta in zip(self._stretches, self._designs, shared, strict=True):
+            left = np.r_[-theta, 1.0]
+            scores = []
+            for c in classes:
+                M = design.voltage[v] + design.gauge[c]
+                prior = self._local_std(part, v, c)
+                A = M[np.ix_(LOCAL, LOCAL)] + np.diag(prior**-2.0)
+                b = M[LOCAL] @ left
+                misfit = float(left @ M @ left) - float(b @ np.linalg.solve(A, b))
+                norm = part.whiten_gauge[c].log_norm - float(np.log(prior).sum())
+                norm -= 0.5 * float(np.linalg.slogdet(A)[1])
+                scores.append(norm - 0.5 * misfit + _log_stray(c, y))
+            result.append(classes[int(np.argmax(scores))])
+        return result
 
-def _tracks(
-    chain: Sequence[Stretch],
-    designs: Sequence[Design],
-    sums: Sums,
-    signature: Signature,
-    priors: Priors,
-) -> tuple[list[Track], FloatArray, FloatArray]:
-    """Return the SoC under one signature, and the curve's functions with their covariance."""
-    p, columns = len(sums.at), sums.gram.shape[1] - 1
-    W = signature.columns
-    theta, V = _posterior(sums, signature)
-    tracks = []
-    for k, (design, part) in enumerate(zip(designs, chain, strict=True)):
-        inverse, back = sums.inverse[k], sums.back[k]
-        C = np.zeros((columns, p + 1))
-        C[sums.at, range(p)] = 1.0
-        C[:, p] = W[k]
-        X = np.outer(100.0 * part.hours / priors.capacity_ah, C[OFFSET])
-        X += np.outer(part.drawn_pct / 100.0, C[CAPACITY]) - back[0, :-1] @ C
-        soc_pct = design.start_pct + back[0, -1] - part.drawn_pct + X @ theta
-        variance = inverse[0, 0] + np.einsum("ni,ij,nj->n", X, V, X)
-        tracks.append(Track(soc_pct, np.sqrt(variance)))
-    functions = slice(p - (columns - FUNCTIONS), p)
-    return tracks, theta[functions], V[functions, functions]
+    def _local_std(self, part: Stretch, v: int, c: int) -> FloatArray:
+        """Return the standard deviations of the columns that a stretch has of its own."""
+        gauge = GAUGES[c]
+        hours = np.sqrt(max(part.hours[-1], 1.0))
+        drift_a = gauge.drift_pct / 100.0 * self._priors.capacity_ah / hours
+        error_pct = UNKNOWN_PCT if self._name == "unknown" else gauge.error_pct
+        level = VOLTAGE_SCALES[v]
+        return np.array([FREE_PCT, level, error_pct, gauge.error_pct, drift_a, gauge.scale_pct])
 
 
-def _posterior(sums: Sums, signature: Signature) -> tuple[FloatArray, FloatArray]:
-    """Return mean and covariance of what all stretches share, and of the cause's size."""
-    W = signature.columns
+def _log_stray(c: int, y: int) -> float:
+    """Return the log prior of a stretch's size of noise, where the gauge's usual one is y."""
+    larger = len(GAUGES) - 1 - y
+    return float(np.log(1.0 - STRAYS if c == y else STRAYS / larger)) if larger else 0.0
+
+
+def _posterior(sums: Sums, W: FloatArray, std: float) -> tuple[FloatArray, FloatArray]:
+    """Return mean and covariance of what all stretches share, and of a signature's size."""
     MW = np.einsum("lcd,ld->lc", sums.gram[:, :-1, :-1], W)
     cross = MW.sum(axis=0)[sums.at]
-    own = np.array([[float(np.sum(MW * W)) + signature.std**-2]])
+    own = np.array([[float(np.sum(MW * W)) + std**-2]])
     V = np.linalg.inv(np.block([[sums.precision, cross[:, None]], [cross[None], own]]))
     theta = V @ np.r_[sums.gradient, float(np.sum(W * sums.gram[:, :-1, -1]))]
     return np.asarray(theta), np.asarray(V)

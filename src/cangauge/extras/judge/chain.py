@@ -16,17 +16,17 @@ curve, are the same in every stretch: what repeats from day to day is not counte
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Any, Final, NamedTuple
 
 import numpy as np
 from scipy.linalg import solve_triangular
 
-from cangauge._typing import BoolArray, FloatArray
+from cangauge._typing import BoolArray, FloatArray, IntArray
 from cangauge.logs.log import Log
 from cangauge.model.extended import ExtendedModel
-from cangauge.model.model_file import Model, Noise
+from cangauge.model.model_file import Model
 from cangauge.model.voltage_model import Functions, hermite_basis, resistance_factor
 
 (START, LEVEL, ERROR, COUNT_OFFSET, COUNT_SCALE, OFFSET, CAPACITY, VOLTAGE, BY_VOLTAGE, STEP,
@@ -67,252 +67,6 @@ SECANT_PCT: Final = 1.0
 LEAST_SLOPE: Final = 0.1
 """Least slope of the curve, relative to its mean, for a SoC read from a voltage [-]."""
 
-
-class Whitening(NamedTuple):
-    """Inverse root of the covariance of some blocks' noise."""
-
-    has: BoolArray
-    """Blocks with a value."""
-    root: FloatArray
-    log_norm: float
-    """Logarithm of the normalisation."""
-
-    @classmethod
-    def of(cls, has: BoolArray, covariance: FloatArray) -> Whitening:
-        """Factorise a covariance."""
-        root = np.linalg.cholesky(covariance)
-        inverse = solve_triangular(root, np.eye(len(root)), lower=True) if root.size else root
-        return cls(has, np.asarray(inverse), -float(np.log(np.diag(root)).sum()))
-
-
-@dataclass(eq=False)
-class Stretch:
-    """Blocks of uninterrupted samples; arrays of shape (n,) unless stated.
-
-    Attributes
-    ----------
-    log : int
-        Number of its log.
-    time_s : array
-        Stamp of each block [s].
-    hours, drawn_pct : array
-        Since the start of the stretch: h [h] and Q [%].
-    voltage_v, published_pct, temperature_c : array
-        Means; NaN where not used.
-    full : array of int
-        Blocks at which a full charge has ended.
-    counted_h : float
-        Time counted in earlier stretches [h].
-    linear_pct : array
-        SoC at which the voltage is linearised [%].
-    axis_slope : array
-        Slope of the curve by which an error of SoC against voltage counts [V/%]. It is the same
-        under all causes, or they would differ by the size of their noise.
-    """
-
-    log: int
-    time_s: FloatArray
-    hours: FloatArray
-    drawn_pct: FloatArray
-    voltage_v: FloatArray
-    published_pct: FloatArray
-    temperature_c: FloatArray
-    load: FloatArray
-    """Load columns, shape (n, k)."""
-    prediction: Any
-    """The model's prediction with means over blocks, for `ExtendedModel.voltage_at`."""
-    soc_step_pct: float
-    full: FloatArray
-    step_at: int = 0
-    """Block before which the published SoC departs most from the count."""
-    counted_h: float = 0.0
-    linear_pct: FloatArray = field(default_factory=lambda: np.empty(0))
-    axis_slope: FloatArray = field(default_factory=lambda: np.empty(0))
-    whiten_voltage: list[Whitening] = field(default_factory=list)
-    whiten_gauge: list[Whitening] = field(default_factory=list)
-
-    @property
-    def hours_long(self) -> float:
-        """Duration [h]."""
-        return float(self.hours[-1])
-
-
-def stretches_of(logs: Sequence[Log], model: Model) -> list[Stretch]:
-    """Return the stretches of a chain of logs, in order."""
-    chain = [part for number, log in enumerate(logs) for part in _parts(number, log, model)]
-    counted_h, extended = 0.0, model.extended_model()
-    for part in chain:
-        part.counted_h = counted_h
-        counted_h += part.hours_long
-        part.linear_pct = _start_pct(part, extended) - part.drawn_pct
-        part.axis_slope = _slope(part, extended)
-        _set_noise(part, model.noise)
-    return chain
-
-
-def _parts(number: int, log: Log, model: Model) -> Iterator[Stretch]:
-    gap_s = max(PARTED_S, 10.0 * float(np.median(np.diff(log.time_s))))
-    edges = [0, *(np.flatnonzero(np.diff(log.time_s) > gap_s) + 1), len(log)]
-    step = _soc_step(log)
-    for first, last in pairwise(edges):
-        rows = slice(first, last)
-        if last - first > 4 and log.time_s[last - 1] - log.time_s[first] >= SHORTEST_S:
-            yield _stretch(number, log.rows(rows), model, step)
-
-
-def _soc_step(log: Log) -> float:
-    """Return the resolution of the published SoC [%]."""
-    known = np.unique(np.round(_published(log), 4))
-    known = known[np.isfinite(known)]
-    return float(np.quantile(np.diff(known), 0.1)) if known.size > 1 else 1.0
-
-
-def _published(log: Log) -> FloatArray:
-    return np.full(len(log), np.nan) if log.soc_pct is None else log.soc_pct
-
-
-def _stretch(number: int, log: Log, model: Model, step: float) -> Stretch:
-    prediction = model.predict(log, initial_soc_pct=50.0)
-    elapsed = log.time_s - log.time_s[0]
-    block = np.floor(elapsed / BLOCK_S).astype(np.intp)
-    stride = max(1, -(-int(block[-1] + 1) // BLOCKS_AT_MOST))
-    first = np.flatnonzero(np.diff(block, prepend=-1) > 0)
-    counts = np.diff([*first, len(log)])
-
-    def mean(values: FloatArray) -> FloatArray:
-        sums = np.add.reduceat(values, first, axis=0)
-        return np.asarray((sums.T / counts).T[::stride])
-
-    published = _published(log)
-    drawn = 50.0 - prediction.soc_pct
-    if step >= COARSE_PCT:
-        published = _at_changes(published)
-    published = np.where(
-        (published > PEGGED_PCT) & (published < 100.0 - PEGGED_PCT), published, np.nan
-    )
-    # The median: a jump within a block stays one jump.
-    blocks = [each[np.isfinite(each)] for each in np.split(published + drawn, first[1:])[::stride]]
-    counted = np.array([np.median(each) if each.size else np.nan for each in blocks])
-    drawn_mean = mean(drawn)
-    voltage = mean(prediction.signals.voltage_v)
-    hours = mean(elapsed) / 3600.0
-    part = Stretch(
-        number,
-        mean(log.time_s),
-        hours,
-        drawn_mean,
-        np.where(hours * 3600.0 < SETTLING_S, np.nan, voltage),
-        counted - drawn_mean,
-        mean(prediction.signals.temperature_c),
-        mean(_load(model, prediction)),
-        replace(
-            prediction,
-            beside_v=mean(prediction.beside_v),
-            over_soc=[
-                (effect, values, mean(drive)) for effect, values, drive in prediction.over_soc
-            ],
-        ),
-        step,
-        _full_charges(mean(prediction.signals.current_a), voltage, model),
-    )
-    count = part.published_pct + part.drawn_pct
-    change = np.abs(np.diff(count, prepend=count[:1]))
-    part.step_at = int(np.nanargmax(change)) if np.isfinite(change).any() else 0
-    return part
-
-
-def _load(model: Model, prediction: Any) -> FloatArray:
-    columns = model.voltage_model().load_columns(
-        prediction.signals.temperature_c[prediction.rows], prediction.currents_a
-    )
-    return np.asarray(columns)
-
-
-def _at_changes(published: FloatArray) -> FloatArray:
-    """Return a coarse SoC half-way at its changes, else NaN; its first if there are none."""
-    result = np.full_like(published, np.nan)
-    known = np.flatnonzero(np.isfinite(published))
-    value = published[known]
-    change = np.flatnonzero(np.diff(value) != 0.0)
-    result[known[change + 1]] = 0.5 * (value[change] + value[change + 1])
-    if not change.size and known.size:
-        result[known[0]] = value[0]
-    return result
-
-
-def _full_charges(current_a: FloatArray, voltage_v: FloatArray, model: Model) -> FloatArray:
-    """Return the blocks at which a charge ended full: tapered at constant, high voltage."""
-    high_v = max(
-        FULL_VOLTAGE * float(voltage_v.max()), float(model.voltage_model().pseudo_ocv([98.0])[0])
-    )
-    charge = -current_a
-    held = (voltage_v >= high_v) & (charge > 0.0)
-    ends = []
-    for k in np.flatnonzero(held & ~np.append(held[1:], False)):
-        begin = k
-        while begin > 0 and held[begin - 1]:
-            begin -= 1
-        low = FULL_C_RATE * model.capacity_ah
-        if charge[k] < low and charge[k] < FULL_TAPER * charge[begin : k + 1].max():
-            ends.append(k)
-    return np.array(ends, dtype=np.intp)
-
-
-def _set_noise(part: Stretch, noise: Noise) -> None:
-    """Set the noise of voltage and gauge, for each size."""
-    has = np.isfinite(part.voltage_v)
-    cold = _cold(part, noise)[has]
-    axis_v = noise.soc_std_pct * part.axis_slope[has]
-    level_v = np.hypot(cold * noise.level_std_v, axis_v)
-    gap_s = 3600.0 * np.abs(part.hours[has, None] - part.hours[has])
-    scaled = np.outer(cold, cold) * noise.slow_std_v**2 * np.exp(-gap_s / noise.slow_time_s)
-    scaled += np.outer(level_v, level_v) * np.exp(-gap_s / WANDER_S)
-    scaled += np.diag((cold * noise.fast_std_v) ** 2)
-    axis = np.diag(axis_v**2 + (1e-6 * np.nanmean(part.voltage_v)) ** 2)
-    part.whiten_voltage = [Whitening.of(has, size**2 * scaled + axis) for size in VOLTAGE_SCALES]
-    has = np.isfinite(part.published_pct)
-    walk = np.minimum(part.hours[has, None], part.hours[has])
-    white = np.eye(len(walk)) * (SOC_NOISE_PCT**2 + part.soc_step_pct**2 / 12.0)
-    part.whiten_gauge = [Whitening.of(has, each.walk_pct**2 * walk + white) for each in GAUGES]
-
-
-def _cold(part: Stretch, noise: Noise) -> FloatArray:
-    """Return the growth of the voltage's errors in the cold [-]."""
-    factor = np.maximum(1.0, resistance_factor(part.temperature_c))
-    return np.asarray(factor**noise.cold_exponent)
-
-
-def _slope(part: Stretch, extended: ExtendedModel) -> FloatArray:
-    """Return the slope of the voltage over SoC at the linearisation [V/%]."""
-    low, high = part.linear_pct - SECANT_PCT, part.linear_pct + SECANT_PCT
-    volts = extended.voltage_at(high, part.prediction) - extended.voltage_at(low, part.prediction)
-    return np.asarray(volts / (2.0 * SECANT_PCT))
-
-
-def _start_pct(part: Stretch, extended: ExtendedModel) -> float:
-    """Return the start at which the model's voltage fits best [%]."""
-    starts = np.arange(1.0, 100.0, 1.0)
-    errors = [
-        np.nanmean(
-            (part.voltage_v - extended.voltage_at(start - part.drawn_pct, part.prediction)) ** 2
-        )
-        for start in starts
-    ]
-    return float(starts[int(np.argmin(errors))])
-
-
-@dataclass(frozen=True, eq=False)
-class Design:
-    """Whitened sums of a stretch, for sizes of the voltage's and the gauge's noise."""
-
-    voltage: list[FloatArray]
-    """XᵀX of the voltage for each `VOLTAGE_SCALES`, shape (columns + 1, columns + 1)."""
-    gauge: list[FloatArray]
-    """XᵀX of the published SoC for each `GAUGES`."""
-    start_pct: float
-    """s at the linearisation [%]: columns and residual are relative to it."""
-
-
 VOLTAGE_SCALES: Final = (0.5, 1.0, 2.0, 4.0)
 """Factors on the model's errors of the voltage: a pack on other days may follow its model worse
 than left-out logs did."""
@@ -341,62 +95,280 @@ GAUGES: Final = (
 it is, the logs tell; a gauge that does not count is not held to the count."""
 
 
-class Voltage(NamedTuple):
-    """The parts of a model that a design needs."""
+class Whitening(NamedTuple):
+    """Inverse root of the covariance of some blocks' noise."""
 
-    extended: ExtendedModel
-    functions: Functions
-    noise: Noise
-    capacity_ah: float
+    has: BoolArray
+    """Blocks with a value."""
+    root: FloatArray
+    log_norm: float
+    """Logarithm of the normalisation."""
 
     @classmethod
-    def of(cls, model: Model) -> Voltage:
-        """Build them once."""
-        functions = model.principal_functions()
-        return cls(model.extended_model(), functions, model.noise, model.capacity_ah)
+    def of(cls, has: BoolArray, covariance: FloatArray) -> Whitening:
+        """Factorise a covariance."""
+        root = np.linalg.cholesky(covariance)
+        inverse = solve_triangular(root, np.eye(len(root)), lower=True) if root.size else root
+        return cls(has, np.asarray(inverse), -float(np.log(np.diag(root)).sum()))
+
+    def gram(self, rows: FloatArray) -> FloatArray:
+        """Return XᵀX of the whitened rows of all blocks, shape (n, columns)."""
+        white = self.root @ rows[self.has]
+        return np.asarray(white.T @ white)
 
 
-def design_of(part: Stretch, voltage: Voltage) -> Design:
-    """Return the whitened sums of a stretch at its present linearisation."""
-    extended, functions, noise, capacity_ah = voltage
-    S, n = part.linear_pct, part.hours.size
-    U = extended.voltage_at(S, part.prediction)
-    slope = _slope(part, extended)
-    columns = FUNCTIONS + functions.number
-    start = float(S[0] + part.drawn_pct[0])
-    per_a = 100.0 * part.hours / capacity_ah
-    cold = _cold(part, noise)
-    V = np.zeros((n, columns + 1))
-    V[:, START] = slope
-    axis_v = noise.soc_std_pct * part.axis_slope
-    V[:, LEVEL] = np.hypot(cold * noise.level_std_v, axis_v)
-    V[:, OFFSET] = slope * per_a
-    V[:, CAPACITY] = slope * part.drawn_pct / 100.0
-    V[:, VOLTAGE] = part.voltage_v / 100.0
-    V[:, FUNCTIONS:-1] = hermite_basis(S, functions.soc_pct) @ functions.value
-    V[:, FUNCTIONS:-1] += part.load @ functions.load
-    V[:, -1] = part.voltage_v - U + slope * (S + part.drawn_pct - start)
-    Y = np.zeros((n, columns + 1))
-    Y[:, START] = Y[:, ERROR] = 1.0
-    Y[:, COUNT_OFFSET], Y[:, COUNT_SCALE] = -per_a, -part.drawn_pct / 100.0
-    typical = extended.model.nominal_v
-    mean_slope = float(np.ptp(extended.model.pseudo_ocv([5.0, 95.0]))) / 90.0
-    Y[:, BY_VOLTAGE] = typical / 100.0 / np.maximum(slope, LEAST_SLOPE * mean_slope)
-    Y[part.step_at :, STEP] = 1.0
-    Y[:, -1] = part.published_pct + part.drawn_pct - start
-    F = np.zeros((part.full.size, columns + 1))
-    F[:, START], F[:, OFFSET] = 1.0, per_a[part.full]
-    F[:, CAPACITY] = part.drawn_pct[part.full] / 100.0
-    F[:, -1] = 100.0 + part.drawn_pct[part.full] - start
-    of_full = F.T @ F / FULL_STD_PCT**2
+@dataclass(frozen=True, eq=False)
+class Stretch:
+    """Blocks of uninterrupted samples; arrays of shape (n,) unless stated.
 
-    return Design(
-        [_whitened(V, each) + of_full for each in part.whiten_voltage],
-        [_whitened(Y, each) for each in part.whiten_gauge],
-        start,
+    Attributes
+    ----------
+    log : int
+        Number of its log.
+    time_s : array
+        Stamp of each block [s].
+    hours, drawn_pct : array
+        Since the start of the stretch: h [h] and Q [%].
+    voltage_v, published_pct : array
+        Means; NaN where not used.
+    soc_step_pct : float
+        Resolution of the published SoC [%].
+    step_at : int
+        Block before which the published SoC departs most from the count.
+    full : array of int
+        Blocks at which a full charge has ended.
+    load : array of shape (n, k)
+        Load columns of the voltage model.
+    prediction : Prediction
+        The model's, with means over blocks, for `ExtendedModel.voltage_at`.
+    fitting_pct : array
+        SoC with the start at which the model's voltage fits best [%].
+    level_v : array
+        Standard deviation of the level of the voltage's error [V].
+    whiten_voltage, whiten_gauge : list of Whitening
+        For each of `VOLTAGE_SCALES` and `GAUGES`.
+    """
+
+    log: int
+    time_s: FloatArray
+    hours: FloatArray
+    drawn_pct: FloatArray
+    voltage_v: FloatArray
+    published_pct: FloatArray
+    soc_step_pct: float
+    step_at: int
+    full: IntArray
+    load: FloatArray
+    prediction: Any
+    fitting_pct: FloatArray
+    level_v: FloatArray
+    whiten_voltage: list[Whitening]
+    whiten_gauge: list[Whitening]
+
+
+class Design(NamedTuple):
+    """Whitened sums XᵀX of a stretch at a linearisation, shape (columns + 1, columns + 1)."""
+
+    voltage: list[FloatArray]
+    """Of the voltage, for each of `VOLTAGE_SCALES`."""
+    gauge: list[FloatArray]
+    """Of the published SoC, for each of `GAUGES`."""
+    start_pct: float
+    """s at the linearisation [%]: columns and residual are relative to it."""
+
+
+@dataclass(frozen=True, eq=False)
+class Chain:
+    """The stretches of the logs of a pack, in order, and its model."""
+
+    stretches: list[Stretch]
+    extended: ExtendedModel
+    functions: Functions
+
+    @classmethod
+    def of(cls, logs: Sequence[Log], model: Model) -> Chain:
+        """Cut logs into stretches."""
+        extended = model.extended_model()
+        stretches = [
+            _stretch(number, part, _soc_step(log), model, extended)
+            for number, log in enumerate(logs)
+            for part in _uninterrupted(log)
+        ]
+        return cls(stretches, extended, model.principal_functions())
+
+    def design(self, part: Stretch, linear_pct: FloatArray) -> Design:
+        """Return the sums of a stretch whose voltage is linearised at a SoC [%], shape (n,)."""
+        model, functions = self.extended.model, self.functions
+        slope = _slope(self.extended, part.prediction, linear_pct)
+        start = float(linear_pct[0] + part.drawn_pct[0])
+        per_a = 100.0 * part.hours / self.extended.capacity_ah
+        columns = FUNCTIONS + functions.number
+        V = np.zeros((linear_pct.size, columns + 1))
+        V[:, START], V[:, LEVEL] = slope, part.level_v
+        V[:, OFFSET] = slope * per_a
+        V[:, CAPACITY] = slope * part.drawn_pct / 100.0
+        V[:, VOLTAGE] = part.voltage_v / 100.0
+        V[:, FUNCTIONS:-1] = hermite_basis(linear_pct, functions.soc_pct) @ functions.value
+        V[:, FUNCTIONS:-1] += part.load @ functions.load
+        U = self.extended.voltage_at(linear_pct, part.prediction)
+        V[:, -1] = part.voltage_v - U + slope * (linear_pct + part.drawn_pct - start)
+        Y = np.zeros_like(V)
+        Y[:, START] = Y[:, ERROR] = 1.0
+        Y[:, COUNT_OFFSET], Y[:, COUNT_SCALE] = -per_a, -part.drawn_pct / 100.0
+        mean_slope = float(np.ptp(model.pseudo_ocv([5.0, 95.0]))) / 90.0
+        Y[:, BY_VOLTAGE] = model.nominal_v / 100.0 / np.maximum(slope, LEAST_SLOPE * mean_slope)
+        Y[part.step_at :, STEP] = 1.0
+        Y[:, -1] = part.published_pct + part.drawn_pct - start
+        F = np.zeros((part.full.size, columns + 1))
+        F[:, START], F[:, OFFSET] = 1.0, per_a[part.full]
+        F[:, CAPACITY] = part.drawn_pct[part.full] / 100.0
+        F[:, -1] = 100.0 + part.drawn_pct[part.full] - start
+        of_full = F.T @ F / FULL_STD_PCT**2
+        return Design(
+            [whitening.gram(V) + of_full for whitening in part.whiten_voltage],
+            [whitening.gram(Y) for whitening in part.whiten_gauge],
+            start,
+        )
+
+
+def published_pct(log: Log) -> FloatArray:
+    """Return the SoC that the gauge published at each row [%]; NaN where it did not."""
+    return np.full(len(log), np.nan) if log.soc_pct is None else log.soc_pct
+
+
+def _soc_step(log: Log) -> float:
+    """Return the resolution of the published SoC [%]."""
+    values = np.unique(np.round(published_pct(log), 4))
+    values = values[np.isfinite(values)]
+    return float(np.quantile(np.diff(values), 0.1)) if values.size > 1 else 1.0
+
+
+def _uninterrupted(log: Log) -> Iterator[Log]:
+    """Yield the parts of a log between its pauses that are long enough."""
+    step_s = np.diff(log.time_s)
+    pauses = np.flatnonzero(step_s > max(PARTED_S, 10.0 * float(np.median(step_s))))
+    for first, last in pairwise([0, *(pauses + 1), len(log)]):
+        if last - first > 4 and log.time_s[last - 1] - log.time_s[first] >= SHORTEST_S:
+            yield log.rows(slice(first, last))
+
+
+def _stretch(
+    number: int, log: Log, step_pct: float, model: Model, extended: ExtendedModel
+) -> Stretch:
+    """Return the blocks of a log without a pause."""
+    prediction = model.predict(log, initial_soc_pct=50.0)
+    signals, elapsed_s = prediction.signals, log.time_s - log.time_s[0]
+    block = np.floor(elapsed_s / BLOCK_S).astype(np.intp)
+    stride = max(1, -(-int(block[-1] + 1) // BLOCKS_AT_MOST))
+    first = np.flatnonzero(np.diff(block, prepend=-1) > 0)
+    rows = np.diff([*first, len(log)])
+
+    def mean(values: FloatArray) -> FloatArray:
+        sums = np.add.reduceat(values, first, axis=0)
+        return np.asarray((sums.T / rows).T[::stride])
+
+    drawn = 50.0 - prediction.soc_pct
+    drawn_pct = mean(drawn)
+    counts = np.split(_usable(published_pct(log), step_pct) + drawn, first[1:])[::stride]
+    # The median: a jump within a block stays one jump.
+    published = np.array([_median(count) for count in counts]) - drawn_pct
+    count = published + drawn_pct
+    change = np.abs(np.diff(count, prepend=count[:1]))
+    hours, voltage = mean(elapsed_s) / 3600.0, mean(signals.voltage_v)
+    settled_v = np.where(hours * 3600.0 < SETTLING_S, np.nan, voltage)
+    load = model.voltage_model().load_columns(
+        signals.temperature_c[prediction.rows], prediction.currents_a
+    )
+    over_soc = [(effect, values, mean(drive)) for effect, values, drive in prediction.over_soc]
+    of_blocks = replace(prediction, beside_v=mean(prediction.beside_v), over_soc=over_soc)
+    fitting_pct = _start_pct(extended, of_blocks, settled_v, drawn_pct) - drawn_pct
+
+    noise = model.noise
+    cold = np.maximum(1.0, resistance_factor(mean(signals.temperature_c))) ** noise.cold_exponent
+    # The slope is the same under all causes, or they would differ by the size of their noise.
+    axis_v = noise.soc_std_pct * _slope(extended, of_blocks, fitting_pct)
+    level_v = np.hypot(cold * noise.level_std_v, axis_v)
+    has = np.isfinite(settled_v)
+    gap_s = 3600.0 * np.abs(hours[has, None] - hours[has])
+    scaled = np.outer(cold[has], cold[has]) * noise.slow_std_v**2
+    scaled *= np.exp(-gap_s / noise.slow_time_s)
+    scaled += np.outer(level_v[has], level_v[has]) * np.exp(-gap_s / WANDER_S)
+    scaled += np.diag((cold[has] * noise.fast_std_v) ** 2)
+    axis = np.diag(axis_v[has] ** 2 + (1e-6 * np.nanmean(settled_v)) ** 2)
+    counted = np.isfinite(published)
+    walk = np.minimum(hours[counted, None], hours[counted])
+    white = np.eye(len(walk)) * (SOC_NOISE_PCT**2 + step_pct**2 / 12.0)
+    return Stretch(
+        log=number,
+        time_s=mean(log.time_s),
+        hours=hours,
+        drawn_pct=drawn_pct,
+        voltage_v=settled_v,
+        published_pct=published,
+        soc_step_pct=step_pct,
+        step_at=int(np.nanargmax(change)) if np.isfinite(change).any() else 0,
+        full=_full_charges(mean(signals.current_a), voltage, model),
+        load=mean(np.asarray(load)),
+        prediction=of_blocks,
+        fitting_pct=fitting_pct,
+        level_v=level_v,
+        whiten_voltage=[Whitening.of(has, k**2 * scaled + axis) for k in VOLTAGE_SCALES],
+        whiten_gauge=[Whitening.of(counted, of.walk_pct**2 * walk + white) for of in GAUGES],
     )
 
 
-def _whitened(rows: FloatArray, whitening: Whitening) -> FloatArray:
-    white = whitening.root @ rows[whitening.has]
-    return np.asarray(white.T @ white)
+def _usable(published: FloatArray, step_pct: float) -> FloatArray:
+    """Return the published SoC where it is a count: not at its limits, a coarse one at its changes.
+
+    A coarse SoC is half-way at its changes, or is used at its first row if there are none.
+    """
+    if step_pct >= COARSE_PCT:
+        fine = np.full_like(published, np.nan)
+        known = np.flatnonzero(np.isfinite(published))
+        value = published[known]
+        change = np.flatnonzero(np.diff(value) != 0.0)
+        fine[known[change + 1]] = 0.5 * (value[change] + value[change + 1])
+        if not change.size:
+            fine[known[:1]] = value[:1]
+        published = fine
+    is_count = (published > PEGGED_PCT) & (published < 100.0 - PEGGED_PCT)
+    return np.where(is_count, published, np.nan)
+
+
+def _median(values: FloatArray) -> float:
+    """Return the median of the known values; NaN without any."""
+    known = values[np.isfinite(values)]
+    return float(np.median(known)) if known.size else np.nan
+
+
+def _full_charges(current_a: FloatArray, voltage_v: FloatArray, model: Model) -> IntArray:
+    """Return the blocks at which a charge ended full: tapered at constant, high voltage."""
+    knee_v = float(model.voltage_model().pseudo_ocv([98.0])[0])
+    high_v = max(FULL_VOLTAGE * float(voltage_v.max()), knee_v)
+    held = (voltage_v >= high_v) & (current_a < 0.0)
+    edges = np.flatnonzero(np.diff(held, prepend=False, append=False)).reshape(-1, 2)
+    ends = []
+    for first, last in edges:
+        charge = -current_a[first:last]
+        if charge[-1] < min(FULL_C_RATE * model.capacity_ah, FULL_TAPER * charge.max()):
+            ends.append(last - 1)
+    return np.array(ends, dtype=np.intp)
+
+
+def _slope(extended: ExtendedModel, prediction: Any, soc_pct: FloatArray) -> FloatArray:
+    """Return the slope of the voltage over SoC [V/%]."""
+    high_v = extended.voltage_at(soc_pct + SECANT_PCT, prediction)
+    low_v = extended.voltage_at(soc_pct - SECANT_PCT, prediction)
+    return np.asarray((high_v - low_v) / (2.0 * SECANT_PCT))
+
+
+def _start_pct(
+    extended: ExtendedModel, prediction: Any, voltage_v: FloatArray, drawn_pct: FloatArray
+) -> float:
+    """Return the start at which the model's voltage fits best [%]."""
+    starts = np.arange(1.0, 100.0, 1.0)
+    errors = [
+        np.nanmean((voltage_v - extended.voltage_at(start - drawn_pct, prediction)) ** 2)
+        for start in starts
+    ]
+    return float(starts[int(np.argmin(errors))])

@@ -20,7 +20,7 @@ from cangauge.cli.output import finish, note, print_table, progress
 from cangauge.errors import InputError
 
 if TYPE_CHECKING:
-    from cangauge.extras.judge.judgement import Judgement
+    from cangauge.extras.judge.result import Judgement
 
 
 @command()
@@ -179,16 +179,10 @@ def _write_corrected(path: Path, judgement: Judgement) -> None:
 
 
 def _show(judgement: Judgement, written: Sequence[Path]) -> None:
-    from cangauge.extras.judge.judgement import rows_of
-
     typer.echo(printable(judgement.headline))
     typer.echo(printable(f"Next step: {judgement.next_step}"))
-    print_table("Answers", ["answer", "probability", "size"], rows_of(judgement))
+    print_table("Answers", *judgement.answer_rows())
     if judgement.jumps:
-        rows = [
-            [judgement.logs[jump.log].name, number(jump.since_start_s, 0), number(jump.size_pct, 1)]
-            for jump in judgement.jumps
-        ]
-        print_table("Jumps that the charge does not explain", ["log", "s", "% SoC"], rows)
+        print_table("Jumps that the charge does not explain", *judgement.jump_rows())
     for path in written:
         note(f"wrote {path}")

@@ -133,13 +133,10 @@ class LiveJudge(Output):
 
     def close(self) -> None:
         """Write what is kept; it is judged after the next stretch."""
-        self._submit(is_judged=False)
+        self._end_stretch(is_judged=False)
         self._worker.close(CLOSE_WITHIN_S)
 
-    def _end_stretch(self) -> None:
-        self._submit(is_judged=True)
-
-    def _submit(self, *, is_judged: bool) -> None:
+    def _end_stretch(self, *, is_judged: bool = True) -> None:
         rows, self._rows = self._rows, []
         if not rows or rows[-1][0] - rows[0][0] < SHORTEST_S:
             return

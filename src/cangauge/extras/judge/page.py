@@ -7,11 +7,9 @@ from pathlib import Path
 import numpy as np
 
 from cangauge._text import number
-from cangauge.extras.judge.judgement import Judgement, rows_of, text_of_days
+from cangauge.extras.judge.result import Judgement
 from cangauge.extras.report.charts import BLACK, BLUE, ORANGE, Figure, TimeFigures
-from cangauge.extras.report.page import Block, Page, Table, Tile, joined
-
-_VERDICTS = {"agrees": "agrees", "off": "off", "cannot_tell": "cannot tell"}
+from cangauge.extras.report.page import Page, Table, Tile, joined
 
 
 def judge_page(judgement: Judgement, model_path: Path | None = None) -> Page:
@@ -24,14 +22,15 @@ def judge_page(judgement: Judgement, model_path: Path | None = None) -> Page:
         The model's file, to name it by its SHA-256.
     """
     logs = judgement.logs
+    jumps = [Table(*judgement.jump_rows())] if judgement.jumps else []
     std = number(judgement.error_std_pct, 1, "%")
     right = number(100.0 * judgement.probabilities["none"], 0, "%")
     return Page(
         title=f"Second opinion on the gauge of {joined([log.name for log in logs])}",
         lead=judgement.headline,
-        subtitle=f"{text_of_days(judgement)}, judged by {judgement.model.name}.",
+        subtitle=f"{judgement.extent}, judged by {judgement.model.name}.",
         tiles=[
-            Tile("Verdict", _VERDICTS[judgement.verdict], text_of_days(judgement)),
+            Tile("Verdict", judgement.verdict.replace("_", " "), judgement.extent),
             Tile("Error at the end", number(judgement.error_pct, 1, "% SoC"), f"σ {std}"),
             Tile("Largest error", number(judgement.worst_pct, 1, "% SoC"), "relative to its σ"),
             Tile("P(the gauge is right)", right, "off from 5 % down"),
@@ -39,22 +38,13 @@ def judge_page(judgement: Judgement, model_path: Path | None = None) -> Page:
         sections={
             "Both states of charge": [_figure(judgement)],
             "What next": [[judgement.next_step]],
-            "All answers": [Table(["answer", "probability", "size (±1σ)"], rows_of(judgement))],
-            "Jumps that the charge does not explain": _jumps(judgement),
+            "All answers": [Table(*judgement.answer_rows())],
+            "Jumps that the charge does not explain": jumps,
         },
         model=judgement.model,
         model_path=model_path,
         logs=logs,
     )
-
-
-def _jumps(judgement: Judgement) -> list[Block]:
-    columns = {
-        "log": lambda jump: judgement.logs[jump.log].name,
-        "hours since the first row": lambda jump: number(jump.since_start_s / 3600.0, 2),
-        "% SoC": lambda jump: number(jump.size_pct, 1),
-    }
-    return [Table.of(judgement.jumps, columns)] if judgement.jumps else []
 
 
 def _figure(judgement: Judgement) -> Figure:
@@ -78,9 +68,8 @@ def _figure(judgement: Judgement) -> Figure:
     time.line(figure, "corrected", corrected, BLUE, line_width=2.0)
     time.line(figure, "published", list(published), BLACK, line_width=2.0)
     moments = [(jump.log, jump.time_s) for jump in judgement.jumps]
-    cause = judgement.cause
-    if judgement.verdict == "off" and cause.onset is not None:
-        moments.append(judgement.moment_s(cause.onset, inside=cause.inside))
+    if judgement.onset is not None:
+        moments.append(judgement.onset)
     for log_number, time_s in moments:
         at = float(time.at(log_number, np.array([time_s]))[0])
         figure.mark("height", at, ORANGE, line_dash="dashed", line_width=2)

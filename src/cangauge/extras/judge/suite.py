@@ -13,16 +13,15 @@ import socket
 import subprocess
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
-import can
 import numpy as np
 
 from cangauge._resources import shared_file
-from cangauge._typing import FloatArray
+from cangauge._typing import BoolArray, FloatArray, IntArray
 from cangauge.bus.connection import BusConnection
 from cangauge.bus.database import SignalCodec, find_message, load_dbc, signal_codec
 from cangauge.bus.open import BusAddress, bus_address, has_socketcan, open_bus
@@ -117,7 +116,7 @@ class CountFault:
         limit_a = self.limit_c * capacity_ah
         return np.asarray(np.clip(current, -limit_a, limit_a))
 
-    def sent(self, log: Log) -> np.ndarray[Any, np.dtype[np.bool_]]:
+    def sent(self, log: Log) -> BoolArray:
         """Return whether the frames of each row are sent; the first ones always are."""
         since_s = log.time_s - log.time_s[0]
         begin_s = 0.25 * since_s[-1]
@@ -163,7 +162,7 @@ def simulated_drives() -> list[PlayedDrive]:
     """Return twelve drives of four simulated packs, with models of other drives of theirs."""
     found = []
     for seed in PACKS:
-        scenario = draw_scenario(seed, n_training=3, n_reference=2, climate="mild")
+        scenario = draw_scenario(seed, n_training=3, n_reference=2)
         training = [replace(each.log, soc_pct=each.true_soc_pct) for each in scenario.training]
         model = fit(training, capacity_ah=scenario.pack.capacity_ah).model
         drives = scenario.draw_drives(np.random.default_rng(seed), DRIVES_A_PACK, HOURS)
@@ -234,7 +233,7 @@ def run_suite(
     return scores
 
 
-Reading = tuple[FloatArray, FloatArray, FloatArray]
+Reading = tuple[IntArray, FloatArray, FloatArray]
 """Row of the drive, SoC and σ [%] of each reading; NaN where the gauge said nothing."""
 
 
@@ -301,36 +300,27 @@ class _Gauge:
         raise CangaugeError(f"{text}; it said: {said}" if said else text)
 
     def _readings(self, drive: PlayedDrive, fault: CountFault, *, is_ready: bool) -> Reading:
-        values, silent = [], 0
-        for _, frames, samples in self._batches(drive, fault) if is_ready else ():
-            for frame in frames:
-                self._bus.send(frame)
-            values.append(self._answer(samples))
-            silent = 0 if math.isfinite(values[-1][0]) else silent + 1
-            if silent >= SILENT_AT_MOST:
-                break
-        ends = [row for row, _, _ in self._batches(drive, fault)]
-        soc = np.full((len(ends), 2), np.nan)
-        soc[: len(values)] = np.reshape(values, (-1, 2))
-        return np.array(ends), soc[:, 0], soc[:, 1]
-
-    def _batches(
-        self, drive: PlayedDrive, fault: CountFault
-    ) -> Iterator[tuple[int, list[can.Message], int]]:
-        """Yield the last row, the frames and the number of samples of each `ANSWER_EVERY_S`."""
+        """Send a drive to a gauge that is ready, and read it every `ANSWER_EVERY_S`."""
         log, encoder = drive.log, FrameEncoder(self._vehicle)
         current_a = fault.current_a(log, drive.model.capacity_ah)
         sent = fault.sent(log)
         since_s = log.time_s - log.time_s[0]
-        part = (since_s / ANSWER_EVERY_S).astype(int)
-        for rows in np.split(np.arange(len(log)), np.flatnonzero(np.diff(part)) + 1):
-            frames: list[can.Message] = []
+        parted = np.flatnonzero(np.diff((since_s / ANSWER_EVERY_S).astype(int))) + 1
+        batches = np.split(np.arange(len(log)), parted)
+        readings, silent = np.full((len(batches), 2), np.nan), 0
+        for number, rows in enumerate(batches if is_ready else ()):
             for row in rows[sent[rows]]:
                 values = (log.time_s, current_a, log.voltage_v, log.temperature_c)
                 sample = Sample(*(float(column[row]) for column in values))
-                frames.append(self._clock.at(round(since_s[row] * MICROSECONDS)))
-                frames += encoder.encode(sample)
-            yield int(rows[-1]), frames, int(sent[rows].sum())
+                self._bus.send(self._clock.at(round(since_s[row] * MICROSECONDS)))
+                for frame in encoder.encode(sample):
+                    self._bus.send(frame)
+            readings[number] = self._answer(int(sent[rows].sum()))
+            silent = 0 if math.isfinite(readings[number, 0]) else silent + 1
+            if silent >= SILENT_AT_MOST:
+                break
+        ends = np.array([rows[-1] for rows in batches])
+        return ends, readings[:, 0], readings[:, 1]
 
     def _answer(self, samples: int) -> tuple[float, float]:
         """Return SoC and σ after so many samples; NaN if the gauge said nothing."""
@@ -359,8 +349,7 @@ def _filled(word: str, places: Mapping[str, object]) -> str:
 def _score(fault: CountFault, drives: Sequence[PlayedDrive], runs: Sequence[Reading]) -> Score:
     errors, recoveries, jumps, hours, covered = [], [], 0, 0.0, []
     silent = np.concatenate([np.isnan(soc) for _, soc, _ in runs])
-    for drive, (rows, soc_pct, std_pct) in zip(drives, runs, strict=True):
-        at = rows.astype(int)
+    for drive, (at, soc_pct, std_pct) in zip(drives, runs, strict=True):
         error = soc_pct - drive.true_pct[at]
         known = np.isfinite(error)
         errors.append(error[known])

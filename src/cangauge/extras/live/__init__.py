@@ -1,5 +1,5 @@
-"""The live page of a running service: its own process, fed through a pipe, read by browsers.
+"""What a running service offers over networks, in a process of its own that is fed through a pipe.
 
-`launch` starts the process, `server` answers browsers, `history` keeps the rows, `comparison` holds
-the residual against the model's stated error, `charts` describes the figures that `page` draws.
+`launch` starts and watches the process, `process` is it. `http` serves status and metrics, `server`
+the live page, whose rows `history` keeps and whose figures `charts` describes. `mqtt` publishes.
 """

@@ -15,10 +15,9 @@ import ssl
 import stat
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from importlib.util import find_spec
 from os import PathLike
-from typing import TYPE_CHECKING, Final
-
-from tornado.netutil import bind_sockets
+from typing import TYPE_CHECKING, Any, Final
 
 from cangauge._files import open_regular
 from cangauge._logging import emit
@@ -57,62 +56,6 @@ class HttpAddress:
     def __str__(self) -> str:
         """Return the address as in a URL."""
         return f"[{self.host}]:{self.port}" if ":" in self.host else f"{self.host}:{self.port}"
-
-
-@dataclass(frozen=True, slots=True)
-class MqttSettings:
-    """Broker and topics.
-
-    Parameters
-    ----------
-    broker : str
-    port : int
-    tls : bool
-    ca_file : str or None
-        Certificates that sign the broker's; None: the system's.
-    user, password : str or None
-    topic_prefix : str
-        Topics are `PREFIX/DEVICE/state` and `PREFIX/DEVICE/availability`.
-    discovery_prefix : str
-        Home Assistant's; "" without discovery.
-    device : str
-        Identifies this service among those of the broker: letters, digits, "_" and "-".
-    every_s : float
-        Interval of the states [s].
-    """
-
-    broker: str
-    port: int
-    tls: bool
-    ca_file: str | None
-    user: str | None
-    password: str | None = field(repr=False)
-    topic_prefix: str
-    discovery_prefix: str
-    device: str
-    every_s: float
-
-    @property
-    def state_topic(self) -> str:
-        """Topic of the state: one JSON object, retained."""
-        return f"{self.topic_prefix}/{self.device}/state"
-
-    @property
-    def availability_topic(self) -> str:
-        """Topic of "online" or "offline", retained; "offline" is the last will."""
-        return f"{self.topic_prefix}/{self.device}/availability"
-
-    def tls_context(self) -> ssl.SSLContext:
-        """Return the certificates that are trusted; raise InputError if they cannot be read."""
-        try:
-            return ssl.create_default_context(cafile=self.ca_file)
-        except (OSError, ssl.SSLError) as error:
-            raise InputError(
-                f"no certificates can be read: {error}",
-                field="mqtt.ca_file",
-                value=self.ca_file,
-                cure="name a PEM file",
-            ) from error
 
 
 def http_address(
@@ -175,19 +118,6 @@ def is_loopback_name(host: str) -> bool:
         return False
 
 
-def open_tcp(address: HttpAddress, field: str = "http") -> list[socket.socket]:
-    """Return listening sockets; raise InputError, with this field, if they cannot be bound."""
-    try:
-        return bind_sockets(address.port, address.host)
-    except (OSError, UnicodeError) as error:
-        raise InputError(
-            f"cannot listen: {getattr(error, 'strerror', None) or error}",
-            field=field,
-            value=str(address),
-            cure="choose another port",
-        ) from error
-
-
 def read_token(path: str | PathLike[str] | None, environment: Mapping[str, str]) -> str | None:
     """Return the token in a file, or in the environment; None if there is neither.
 
@@ -213,18 +143,45 @@ def read_token(path: str | PathLike[str] | None, environment: Mapping[str, str])
     return token
 
 
-def read_mqtt_password(
-    path: str | PathLike[str] | None, environment: Mapping[str, str]
-) -> str | None:
-    """Return the password in a file, or in the environment; None if there is neither.
+def mqtt_options(config: MqttConfig, bus: str) -> dict[str, Any]:
+    """Return the arguments of `MqttPublisher` for a bus of this name.
+
+    They are the keys of `[mqtt]` with their defaults, and the password in place of its file.
 
     Raises
     ------
     InputError
-        If it cannot be read, or is empty, too long or not UTF-8 text of one line.
+        If paho-mqtt is not installed, or certificates or password cannot be used.
     """
+    if find_spec("paho") is None:
+        problem = "MQTT needs the package paho-mqtt, which is not installed"
+        raise InputError(problem, field="mqtt", cure="pip install 'cangauge[mqtt]'")
+    name = re.sub(r"[^A-Za-z0-9_-]+", "_", f"cangauge_{socket.gethostname()}_{bus}")
+    options = config.model_dump(exclude={"password_file"}) | {
+        "port": config.port or (8883 if config.tls else 1883),
+        "device": config.device or name,
+        "password": _mqtt_password(config.password_file),
+    }
+    if options["password"] is not None and config.user is None:
+        cure = "name the user whose password is given"
+        raise InputError("is missing", field="mqtt.user", cure=cure)
+    try:
+        if config.tls:
+            ssl.create_default_context(cafile=config.ca_file)
+    except OSError as error:
+        raise InputError(
+            f"no certificates can be read: {error}",
+            field="mqtt.ca_file",
+            value=config.ca_file,
+            cure="name a PEM file",
+        ) from error
+    return options
+
+
+def _mqtt_password(path: str | None) -> str | None:
+    """Return the password in a file, or in the environment; None if there is neither."""
     if path is None:
-        return environment.get(MQTT_PASSWORD_VARIABLE)
+        return os.environ.get(MQTT_PASSWORD_VARIABLE)
     text = _read_secret(path, "mqtt.password_exposed", "password", "mqtt.password_file")
     password = text.rstrip("\r\n")
     if not 0 < len(password) <= LONGEST_TOKEN or not password.isprintable():
@@ -247,17 +204,3 @@ def _read_secret(path: str | PathLike[str], event: str, kind: str, key: str) -> 
         return data.decode("utf-8")
     except UnicodeDecodeError as error:
         raise InputError("not UTF-8 text", source=path, field=key) from error
-
-
-def mqtt_settings(config: MqttConfig, bus: str) -> MqttSettings:
-    """Return the broker of a configuration for a bus of this name; may raise InputError."""
-    given = config.model_dump(exclude={"password_file"})
-    given["port"] = config.port or (8883 if config.tls else 1883)
-    name = f"cangauge_{socket.gethostname()}_{bus}"
-    given["device"] = config.device or re.sub(r"[^A-Za-z0-9_-]+", "_", name)
-    password = read_mqtt_password(config.password_file, os.environ)
-    if password is not None and config.user is None:
-        raise InputError(
-            "is missing", field="mqtt.user", cure="name the user whose password is given"
-        )
-    return MqttSettings(**given, password=password)

@@ -243,13 +243,11 @@ def column(rows: FloatArray, name: str) -> FloatArray:
 
 def shown_columns(rows: FloatArray) -> dict[str, list[float | None]]:
     """Return rows as columns of rounded numbers; None where a value is unknown."""
-    return {
-        name: [None if value != value else value for value in column.tolist()]  # noqa: PLR0124 - NaN
-        for (name, digits), column in zip(
-            COLUMNS.items(), (np.round(rows[:, i], d) for i, d in enumerate(COLUMNS.values())),
-            strict=True,
-        )
-    }  # fmt: skip
+    shown = {}
+    for place, (name, digits) in enumerate(COLUMNS.items()):
+        values = np.round(rows[:, place], digits).tolist()
+        shown[name] = [None if math.isnan(value) else value for value in values]
+    return shown
 
 
 def _age_s(status: Mapping[str, Any]) -> float:

@@ -12,7 +12,7 @@ import logging
 import socket
 import time
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any, Final
 
 from tornado.httpserver import HTTPServer
@@ -33,6 +33,8 @@ MAX_CLIENTS: Final = 32
 oldest of the peer that has most: a client with many connections cannot starve health checks."""
 REQUEST_WITHIN_S: Final = 3.0
 """Time limit for receiving a request [s]."""
+PING_S: Final = 10.0
+"""Interval at which a viewer of the live page must show that it still listens [s]."""
 _LOG = logging.getLogger(__name__)
 
 
@@ -41,8 +43,8 @@ class StatusServer(Output):
 
     Parameters
     ----------
-    sockets : sequence of socket
-        Listening ones.
+    sockets : list of int
+        Descriptors of listening sockets.
     token : str or None
         Bearer token that requests need.
 
@@ -52,37 +54,45 @@ class StatusServer(Output):
         None before the first.
     """
 
-    def __init__(self, sockets: Sequence[socket.socket], token: str | None) -> None:
+    def __init__(self, sockets: list[int], token: str | None) -> None:
         self.token = token
         self.latest: Snapshot | None = None
         pages = {"/status": _StatusPage, "/healthz": _Health, "/metrics": _Metrics}
-        server = _Server(
-            application_of(self, pages, _Nothing, log_function=_log_failure),
-            no_keep_alive=True,
-            max_header_size=MAX_HEADER_BYTES,
-            max_body_size=MAX_BODY_BYTES,
-            max_buffer_size=MAX_HEADER_BYTES + MAX_BODY_BYTES,
-            idle_connection_timeout=REQUEST_WITHIN_S,
-            body_timeout=REQUEST_WITHIN_S,
-        )
-        server.add_sockets(sockets)
+        limits = {
+            "no_keep_alive": True,
+            "max_buffer_size": MAX_HEADER_BYTES + MAX_BODY_BYTES,
+            "idle_connection_timeout": REQUEST_WITHIN_S,
+            "body_timeout": REQUEST_WITHIN_S,
+        }
+        serve(self, sockets, pages, _Server, limits)
 
     def on_snapshot(self, snapshot: Snapshot) -> None:
         """Make a snapshot the latest one."""
         self.latest = snapshot
 
 
-def application_of(
-    server: Output, pages: Mapping[str, type[Handler]], default: type[Handler], **settings: Any
-) -> Application:
-    """Return the pages of a server by their paths; other paths get the default page."""
+def serve(
+    server: Output,
+    sockets: list[int],
+    pages: Mapping[str, type[Handler]],
+    kind: type[HTTPServer],
+    limits: Mapping[str, Any],
+) -> None:
+    """Serve pages by their paths on listening sockets, with limits of tornado's `HTTPServer`."""
     context = {"server": server}
-    return Application(
+    application = Application(
         [(path, page, context) for path, page in pages.items()],
-        default_handler_class=default,
+        default_handler_class=_Nothing,
         default_handler_args=context,
-        **settings,
+        log_function=lambda _: None,
+        websocket_ping_interval=PING_S,
+        websocket_max_message_size=MAX_BODY_BYTES,
     )
+    listening = [socket.socket(fileno=number) for number in sockets]
+    for each in listening:
+        each.setblocking(False)
+    sizes = {"max_header_size": MAX_HEADER_BYTES, "max_body_size": MAX_BODY_BYTES}
+    kind(application, **sizes, **limits).add_sockets(listening)
 
 
 class _Server(HTTPServer):
@@ -113,13 +123,10 @@ def has_token(header: str, token: str) -> bool:
     return same and scheme.lower() == "bearer"
 
 
-def _log_failure(handler: RequestHandler) -> None:
-    if handler.get_status() >= 500:
-        _LOG.debug("%s: %s", handler.request.path, handler.get_status())
-
-
 class Handler(RequestHandler):
     """Access control and plain-text errors of all pages."""
+
+    needs_token = True
 
     def initialize(self, server: Any) -> None:
         """Take the server, which has the token."""
@@ -137,7 +144,7 @@ class Handler(RequestHandler):
         # Against DNS rebinding: a web page could otherwise read this under another name.
         if token is None and not is_loopback_name(self.request.host_name):
             self.refuse(403, "request this by a loopback address")
-        elif token is not None and not self.is_known(token):
+        elif token is not None and self.needs_token and not self.is_known(token):
             self.refuse_unknown()
 
     def is_known(self, token: str) -> bool:
@@ -206,8 +213,8 @@ class _Metrics(_Page):
         self.finish(body)
 
 
-class _Nothing(_Page):
+class _Nothing(Handler):
     def prepare(self) -> None:
         super().prepare()
         if not self._finished:
-            self.refuse(404, "available: /status, /healthz, /metrics")
+            self.refuse(404, "there is nothing here")

@@ -12,26 +12,22 @@ import json
 import logging
 import os
 import select
+import socket
 import subprocess
 import sys
 import threading
 import time
-from collections.abc import Sequence
-from contextlib import suppress
-from dataclasses import asdict
-from importlib.util import find_spec
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, Self
+from typing import TYPE_CHECKING, Any, Final
+
+from tornado.netutil import bind_sockets
 
 from cangauge._logging import emit
 from cangauge.errors import InputError
-from cangauge.extras.live.addresses import (
-    HttpAddress,
-    MqttSettings,
-    http_address,
-    mqtt_settings,
-    open_tcp,
-)
+from cangauge.extras.live.addresses import HttpAddress, http_address, mqtt_options
 from cangauge.service.output import Output
 from cangauge.service.status_client import Snapshot
 
@@ -67,7 +63,8 @@ class Live(Output):
         Of `/status`, `/healthz` and `/metrics`.
     dashboard : HttpAddress, optional
         Of the live page.
-    mqtt : MqttSettings, optional
+    mqtt : dict, optional
+        Arguments of `MqttPublisher`.
 
     Attributes
     ----------
@@ -81,8 +78,7 @@ class Live(Output):
     Raises
     ------
     InputError
-        If an address cannot be bound, a package is missing, certificates cannot be read, or the
-        system cannot hand sockets to another process.
+        If an address cannot be bound, or the system cannot hand sockets to another process.
     """
 
     def __init__(
@@ -90,29 +86,22 @@ class Live(Output):
         *,
         http: HttpAddress | None = None,
         dashboard: HttpAddress | None = None,
-        mqtt: MqttSettings | None = None,
+        mqtt: dict[str, Any] | None = None,
     ) -> None:
         if os.name != "posix":
             problem = "page, status by HTTP and MQTT need Linux or macOS"
             raise InputError(problem, field="dashboard", cure="run without them")
         self._asks: dict[str, Any] = {"level": _LOG.getEffectiveLevel()}
-        self._sockets = []
+        self._sockets: list[socket.socket] = []
         for key, address in (("dashboard", dashboard), ("http", http)):
-            if address is None:
-                continue
-            sockets = open_tcp(address, key)
-            self._sockets += sockets
-            numbers = [each.fileno() for each in sockets]
-            self._asks[key] = {"token": address.token, "sockets": numbers}
-            _announce(key, address, sockets[0].getsockname()[1])
+            if address is not None:
+                sockets = _listen(key, address)
+                self._sockets += sockets
+                numbers = [each.fileno() for each in sockets]
+                self._asks[key] = {"token": address.token, "sockets": numbers}
         self.port = int(self._sockets[0].getsockname()[1]) if self._sockets else 0
         if mqtt is not None:
-            if find_spec("paho") is None:
-                problem = "MQTT needs the package paho-mqtt, which is not installed"
-                raise InputError(problem, field="mqtt", cure="pip install 'cangauge[mqtt]'")
-            if mqtt.tls:
-                mqtt.tls_context()  # certificates that cannot be read show at once
-            self._asks["mqtt"] = asdict(mqtt)
+            self._asks["mqtt"] = mqtt
         self._latest: Snapshot | None = None
         self._done = threading.Event()
         self._woken, self._wake = os.pipe()
@@ -165,17 +154,27 @@ class Live(Output):
 
     def _serve(self) -> str:
         """Start the process and feed it; return why it has ended, or had to be."""
-        with _Process([each.fileno() for each in self._sockets], self._woken) as process:
-            self.pid = process.pid
-            process.send(self._asks)
+        with _process([each.fileno() for each in self._sockets]) as (self.pid, into, out):
+            pending, received = _line(self._asks), _Received()
             while not self._done.is_set():
-                for line in process.exchange():
-                    self._hear(json.loads(line))
-                if process.is_idle and self._latest is not None:
+                if not pending and self._latest is not None:
                     snapshot, self._latest = self._latest, None
-                    process.send({"made_s": snapshot.made_s, "status": snapshot.status})
-                if why := process.trouble:
+                    pending = _line({"made_s": snapshot.made_s, "status": snapshot.status})
+                writes = [into] if pending else []
+                readable, writable, _ = select.select([self._woken, out], writes, [], 1.0)
+                if self._woken in readable:
+                    os.read(self._woken, 4096)
+                if writable:
+                    pending = pending[os.write(into, pending) :]
+                if out in readable:
+                    if not (data := os.read(out, _MOST_BYTES)):
+                        return "it ended by itself"
+                    for each in received.lines(data):
+                        self._hear(json.loads(each))
+                if why := received.trouble():
                     return why
+                if (size := _resident_bytes(self.pid)) > LARGEST_BYTES:
+                    return f"it took {size >> 20} MiB of memory"
         return ""
 
     def _hear(self, told: dict[str, Any]) -> None:
@@ -189,89 +188,60 @@ class Live(Output):
             _LOG.handle(_LOG.makeRecord(*line, extra=extra))
 
 
-class _Process:
-    """The process with its two pipes; it ends with the block.
+class _Received:
+    """What the process has written: lines, and whether it is silent or floods."""
 
-    Parameters
-    ----------
-    sockets : sequence of int
-        Descriptors that it inherits.
-    woken : int
-        Descriptor of which input ends a wait.
-    """
-
-    def __init__(self, sockets: Sequence[int], woken: int) -> None:
-        self._process = subprocess.Popen(
-            # -P: modules do not come from the working folder
-            [sys.executable, "-P", "-m", "cangauge.extras.live.process"],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            pass_fds=sockets,
-            env=os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
-        )
-        assert self._process.stdin is not None  # noqa: S101 - as it was made
-        assert self._process.stdout is not None  # noqa: S101
-        self._into, self._out = self._process.stdin, self._process.stdout
-        os.set_blocking(self._into.fileno(), False)
-        self._woken, self.pid = woken, self._process.pid
-        self._pending = self._received = b""
+    def __init__(self) -> None:
+        self._rest = b""
         self._heard_s = self._second_s = time.monotonic()
-        self._said_bytes = 0  # since `_second_s`
-        self._has_ended = False
+        self._bytes = 0  # since `_second_s`
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        with suppress(OSError):  # what is still to be written is lost
-            self._into.close()
-        with suppress(subprocess.TimeoutExpired):
-            self._process.wait(END_WITHIN_S)
-        self._process.kill()
-        self._process.wait()
-        self._out.close()
-
-    def send(self, content: object) -> None:
-        """Add a line to what `exchange` writes."""
-        self._pending += json.dumps(content).encode() + b"\n"
-
-    @property
-    def is_idle(self) -> bool:
-        """Whether all lines are written."""
-        return not self._pending
-
-    def exchange(self) -> list[bytes]:
-        """Write and read what is possible, waiting for at most a second; return whole lines."""
-        into, out = self._into.fileno(), self._out.fileno()
-        writes = [into] if self._pending else []
-        readable, writable, _ = select.select([self._woken, out], writes, [], 1.0)
-        if self._woken in readable:
-            os.read(self._woken, 4096)
-        if writable:
-            self._pending = self._pending[os.write(into, self._pending) :]
-        if out not in readable:
-            return []
-        data = os.read(out, _MOST_BYTES)
-        self._has_ended = not data
+    def lines(self, data: bytes) -> list[bytes]:
+        """Add what was read; return the lines that are whole by it."""
         self._heard_s = time.monotonic()
         if self._heard_s - self._second_s > 1.0:
-            self._second_s, self._said_bytes = self._heard_s, 0
-        self._said_bytes += len(data)
-        *lines, self._received = (self._received + data).split(b"\n")
-        return lines
+            self._second_s, self._bytes = self._heard_s, 0
+        self._bytes += len(data)
+        *whole, self._rest = (self._rest + data).split(b"\n")
+        return whole
 
-    @property
     def trouble(self) -> str:
-        """Why the process must be ended; "" while it need not."""
-        if self._has_ended:
-            return "it ended by itself"
-        if max(self._said_bytes, len(self._received)) > _MOST_BYTES:
+        """Return why the process must be ended; "" while it need not."""
+        if max(self._bytes, len(self._rest)) > _MOST_BYTES:
             return f"it wrote more than {_MOST_BYTES >> 10} KiB in a line or a second"
         if time.monotonic() - self._heard_s > SILENT_S:
             return f"it did not answer for {SILENT_S:g} s"
-        if (size := _resident_bytes(self.pid)) > LARGEST_BYTES:
-            return f"it took {size >> 20} MiB of memory"
         return ""
+
+
+@contextmanager
+def _process(sockets: Sequence[int]) -> Iterator[tuple[int, int, int]]:
+    """Run the process, which inherits sockets; give its id, and where to write and to read."""
+    process = subprocess.Popen(
+        # -P: modules do not come from the working folder
+        [sys.executable, "-P", "-m", "cangauge.extras.live.process"],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        pass_fds=sockets,
+        env=os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
+    )
+    assert process.stdin is not None  # noqa: S101 - as it was made
+    assert process.stdout is not None  # noqa: S101
+    os.set_blocking(process.stdin.fileno(), False)
+    try:
+        yield process.pid, process.stdin.fileno(), process.stdout.fileno()
+    finally:
+        with suppress(OSError):  # what is still to be written is lost
+            process.stdin.close()
+        with suppress(subprocess.TimeoutExpired):
+            process.wait(END_WITHIN_S)
+        process.kill()
+        process.wait()
+        process.stdout.close()
+
+
+def _line(content: object) -> bytes:
+    return json.dumps(content).encode() + b"\n"
 
 
 def _resident_bytes(pid: int) -> int:
@@ -282,13 +252,23 @@ def _resident_bytes(pid: int) -> int:
         return 0
 
 
-def _announce(key: str, address: HttpAddress, port: int) -> None:
-    host = f"[{address.host}]" if ":" in address.host else address.host
-    token = "with a token" if address.token else "without a token"
-    text = f"live page: http://{host}:{port}/, {token}"
-    if key == "http":
-        text = f"http://{host}:{port}/status, {token}"
+def _listen(key: str, address: HttpAddress) -> list[socket.socket]:
+    """Return listening sockets of a key's address; raise InputError if they cannot be bound."""
+    try:
+        sockets = bind_sockets(address.port, address.host)
+    except (OSError, UnicodeError) as error:
+        raise InputError(
+            f"cannot listen: {getattr(error, 'strerror', None) or error}",
+            field=key,
+            value=str(address),
+            cure="choose another port",
+        ) from error
+    port = sockets[0].getsockname()[1]
+    url = f"http://{replace(address, port=port)}/"
+    url = f"live page: {url}" if key == "dashboard" else f"{url}status"
+    text = f"{url}, {'with' if address.token else 'without'} a token"
     emit(_LOG, logging.INFO, f"{key}.listening", text, port=port)
+    return sockets
 
 
 def make_output(service: Service) -> Live:
@@ -299,5 +279,5 @@ def make_output(service: Service) -> Live:
         for key in ("http", "dashboard")
         if getattr(config, key) is not None
     }
-    mqtt = None if config.mqtt is None else mqtt_settings(config.mqtt, service.bus)
+    mqtt = None if config.mqtt is None else mqtt_options(config.mqtt, service.bus)
     return Live(**address, mqtt=mqtt)

@@ -39,8 +39,6 @@ _GAUGES: Final = {
     "sample.current_a": ("current_amperes", "Pack current, positive = discharge."),
     "sample.voltage_v": ("voltage_volts", "Pack voltage."),
     "sample.temperature_c": ("temperature_celsius", "Temperature."),
-}
-_REPORT: Final = {
     "health.capacity_ah": ("capacity_ah", "Charge from 100 to 0 % [Ah]."),
     "health.capacity_std_ah": ("capacity_std_ah", "Standard deviation of the capacity [Ah]."),
     "health.resistance_ratio": ("resistance_ratio", "Resistance relative to the model's."),
@@ -136,8 +134,6 @@ class _Status(Collector):
         ):  # fmt: skip
             yield GaugeMetricFamily(f"cangauge_{name}", text, value)
         for key, (name, text) in _GAUGES.items():
-            yield GaugeMetricFamily(f"cangauge_{name}", text, _number(status, key))
-        for key, (name, text) in _REPORT.items():
             if status[key.partition(".")[0]] is not None:
                 yield GaugeMetricFamily(f"cangauge_{name}", text, _number(status, key))
         for key, (name, text) in _COUNTERS.items():
@@ -147,15 +143,16 @@ class _Status(Collector):
             is_failing = record["problem"] is not None
             text = "1 while the disk rejects data."
             yield GaugeMetricFamily("cangauge_record_failing", text, is_failing)
+        gauge, counter = GaugeMetricFamily, CounterMetricFamily
         statuses = {each.name.lower(): each.name.lower() == status["status"] for each in Status}
-        yield _gauges("status", "1 for the present status.", "status", statuses)
+        yield _labelled(gauge, "status", "1 for the present status.", "status", statuses)
         reasons = {name: name in status["reasons"] for name in reason_ids(~Reason.NONE)}
-        yield _gauges("reason", "1 for present reasons.", "reason", reasons)
+        yield _labelled(gauge, "reason", "1 for present reasons.", "reason", reasons)
         text = "Rejected frames and values, by reason."
-        yield _counters("rejects", text, "reason", status["rejects"])
+        yield _labelled(counter, "rejects", text, "reason", status["rejects"])
         if status["polls"] is not None:
             text = "Requests over ISO-TP, and what came of them."
-            yield _counters("polls", text, "kind", status["polls"])
+            yield _labelled(counter, "polls", text, "kind", status["polls"])
         for key, (name, text) in _HISTOGRAMS.items():
             yield _histogram(f"cangauge_{name}", text, status[key])
 
@@ -166,15 +163,14 @@ def _number(status: Mapping[str, Any], key: str) -> float:
     return math.nan if value is None else float(value)
 
 
-def _gauges(name: str, text: str, label: str, values: Mapping[str, bool]) -> Metric:
-    family = GaugeMetricFamily(f"cangauge_{name}", text, labels=[label])
-    for key, value in values.items():
-        family.add_metric([key], float(value))
-    return family
-
-
-def _counters(name: str, text: str, label: str, values: Mapping[str, int]) -> Metric:
-    family = CounterMetricFamily(f"cangauge_{name}", text, labels=[label])
+def _labelled(
+    kind: type[GaugeMetricFamily | CounterMetricFamily],
+    name: str,
+    text: str,
+    label: str,
+    values: Mapping[str, float],
+) -> Metric:
+    family = kind(f"cangauge_{name}", text, labels=[label])
     for key, value in values.items():
         family.add_metric([key], value)
     return family

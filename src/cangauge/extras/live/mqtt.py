@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import logging
+import ssl
 import threading
 import time
 from collections.abc import Mapping
@@ -19,7 +20,7 @@ from paho.mqtt.enums import CallbackAPIVersion
 
 from cangauge._logging import emit
 from cangauge._version import __version__
-from cangauge.extras.live.addresses import MqttSettings, is_loopback_name
+from cangauge.extras.live.addresses import is_loopback_name
 from cangauge.service.output import Output
 from cangauge.service.status_client import Snapshot, value_at
 from cangauge.types import Status
@@ -81,76 +82,52 @@ def state(status: Mapping[str, Any]) -> dict[str, Any]:
     return values | {"reasons": status["reasons"]}
 
 
-def discovery(settings: MqttSettings, status: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
-    """Return Home Assistant's configuration of each sensor by its topic."""
-    about = {
-        "identifiers": [settings.device],
-        "name": f"Battery on {status['bus']}",
-        "manufacturer": "cangauge",
-        "model": status["vehicle"],
-        "sw_version": __version__,
-    }
-    online = {"topic": settings.availability_topic}
-    # An invalid SoC is shown as unavailable, never as a number that looks sound.
-    known = {
-        "topic": settings.state_topic,
-        "value_template": "{{ 'offline' if value_json.status == 'invalid' else 'online' }}",
-    }
-    found = {}
-    for sensor in _SENSORS:
-        content: dict[str, Any] = {
-            "name": sensor.name,
-            "unique_id": f"{settings.device}_{sensor.key}",
-            "state_topic": settings.state_topic,
-            "value_template": f"{{{{ value_json.{sensor.key} }}}}",
-            "availability": [online, known] if sensor.needs_soc else [online],
-            "availability_mode": "all",
-            "device": about,
-            "unit_of_measurement": sensor.unit,
-            "device_class": sensor.device_class,
-            "suggested_display_precision": sensor.digits,
-        }
-        if sensor.device_class == "enum":
-            content["options"] = [each.name.lower() for each in Status]
-            content["json_attributes_topic"] = settings.state_topic
-            content["json_attributes_template"] = "{{ {'reasons': value_json.reasons} | tojson }}"
-        elif sensor.key != "weakest_cell":
-            content["state_class"] = "measurement"
-        topic = f"{settings.discovery_prefix}/sensor/{settings.device}/{sensor.key}/config"
-        found[topic] = {key: value for key, value in content.items() if value is not None}
-    return found
-
-
 class MqttPublisher(Output):
-    """Publish the latest snapshot from a thread.
+    """Publish the latest snapshot from a thread, every `every_s` [s].
 
-    Parameters
-    ----------
-    settings : MqttSettings
+    The arguments are the keys of `[mqtt]`, with `password` in place of its file. The state is one
+    JSON object at `TOPIC_PREFIX/DEVICE/state`. `TOPIC_PREFIX/DEVICE/availability` is "online" or,
+    also by the last will, "offline". Both are retained. Without a `discovery_prefix` Home Assistant
+    finds nothing.
     """
 
-    def __init__(self, settings: MqttSettings) -> None:
+    def __init__(
+        self,
+        *,
+        broker: str,
+        port: int,
+        tls: bool,
+        ca_file: str | None,
+        user: str | None,
+        password: str | None,
+        topic_prefix: str,
+        discovery_prefix: str,
+        device: str,
+        every_s: float,
+    ) -> None:
+        self._place = f"{broker}:{port}"
+        self._device, self._every_s, self._discovery_prefix = device, every_s, discovery_prefix
+        self._state_topic = f"{topic_prefix}/{device}/state"
+        self._availability_topic = f"{topic_prefix}/{device}/availability"
         self._latest: Snapshot | None = None
-        self._settings = settings
         self._done = threading.Event()
         self._is_new = threading.Event()
-        self._client = client = Client(
-            CallbackAPIVersion.VERSION2, client_id=f"cangauge-{settings.device}"
-        )
+        self._client = client = Client(CallbackAPIVersion.VERSION2, client_id=f"cangauge-{device}")
         client.connect_timeout = CONNECT_WITHIN_S
         client.reconnect_delay_set(*RETRY_S)
-        client.will_set(settings.availability_topic, "offline", qos=1, retain=True)
+        client.will_set(self._availability_topic, "offline", qos=1, retain=True)
         client.max_queued_messages_set(1)
-        if settings.user is not None:
-            client.username_pw_set(settings.user, settings.password)
-        if settings.tls:
-            client.tls_set_context(settings.tls_context())
-        elif settings.password is not None and not is_loopback_name(settings.broker):
+        if user is not None:
+            client.username_pw_set(user, password)
+        if tls:
+            client.tls_set_context(ssl.create_default_context(cafile=ca_file))
+        elif password is not None and not is_loopback_name(broker):
             text = f"the password for {self._place} is sent unencrypted: set tls = true in [mqtt]"
             emit(_LOG, logging.WARNING, "mqtt.unencrypted", text)
         client.on_connect = self._on_connect
         client.on_disconnect = self._on_disconnect
         client.on_connect_fail = self._on_connect_fail
+        client.connect_async(broker, port, KEEPALIVE_S)
         self._thread = threading.Thread(target=self._run, name="cangauge-mqtt", daemon=True)
         self._thread.start()
 
@@ -163,18 +140,16 @@ class MqttPublisher(Output):
         self._done.set()
         self._thread.join(2.0 * LEAVE_WITHIN_S)
 
-    @property
-    def _place(self) -> str:
-        return f"{self._settings.broker}:{self._settings.port}"
-
     def _run(self) -> None:
         try:
-            self._client.connect_async(self._settings.broker, self._settings.port, KEEPALIVE_S)
             self._client.loop_start()
-            while not self._done.wait(self._settings.every_s):
+            while not self._done.wait(self._every_s):
                 self._publish()
-            self._leave()
-        except Exception as error:  # noqa: BLE001 - an error here must not end the estimate
+            if self._client.is_connected():
+                # A clean end makes the broker forget the last will.
+                self._send(self._availability_topic, "offline").wait_for_publish(LEAVE_WITHIN_S)
+            self._client.disconnect()
+        except Exception as error:  # noqa: BLE001 - an error here must not end the page
             emit(_LOG, logging.ERROR, "mqtt.failed", f"MQTT has ended: {error!r}")
 
     def _publish(self) -> None:
@@ -183,23 +158,49 @@ class MqttPublisher(Output):
         status = self._latest.at(time.monotonic())
         if self._is_new.is_set():
             self._is_new.clear()
-            if self._settings.discovery_prefix:
-                for topic, content in discovery(self._settings, status).items():
-                    self._send(topic, json.dumps(content, ensure_ascii=False))
-            self._send(self._settings.availability_topic, "online")
-        self._send(self._settings.state_topic, json.dumps(state(status), ensure_ascii=False))
+            if self._discovery_prefix:
+                for sensor in _SENSORS:
+                    topic = f"{self._discovery_prefix}/sensor/{self._device}/{sensor.key}/config"
+                    self._send(topic, json.dumps(self._found(sensor, status), ensure_ascii=False))
+            self._send(self._availability_topic, "online")
+        self._send(self._state_topic, json.dumps(state(status), ensure_ascii=False))
+
+    def _found(self, sensor: _Sensor, status: Mapping[str, Any]) -> dict[str, Any]:
+        """Return Home Assistant's configuration of a sensor."""
+        availability = [{"topic": self._availability_topic}]
+        if sensor.needs_soc:
+            # An invalid SoC is shown as unavailable, never as a number that looks sound.
+            template = "{{ 'offline' if value_json.status == 'invalid' else 'online' }}"
+            availability.append({"topic": self._state_topic, "value_template": template})
+        content: dict[str, Any] = {
+            "name": sensor.name,
+            "unique_id": f"{self._device}_{sensor.key}",
+            "state_topic": self._state_topic,
+            "value_template": f"{{{{ value_json.{sensor.key} }}}}",
+            "availability": availability,
+            "availability_mode": "all",
+            "device": {
+                "identifiers": [self._device],
+                "name": f"Battery on {status['bus']}",
+                "manufacturer": "cangauge",
+                "model": status["vehicle"],
+                "sw_version": __version__,
+            },
+            "unit_of_measurement": sensor.unit,
+            "device_class": sensor.device_class,
+            "suggested_display_precision": sensor.digits,
+        }
+        if sensor.device_class == "enum":
+            content["options"] = [each.name.lower() for each in Status]
+            content["json_attributes_topic"] = self._state_topic
+            content["json_attributes_template"] = "{{ {'reasons': value_json.reasons} | tojson }}"
+        elif sensor.key != "weakest_cell":
+            content["state_class"] = "measurement"
+        return {key: value for key, value in content.items() if value is not None}
 
     def _send(self, topic: str, text: str) -> MQTTMessageInfo:
         # QoS 0: unlike the others it is never queued for a broker that is away.
         return self._client.publish(topic, text, qos=0, retain=True)
-
-    def _leave(self) -> None:
-        if self._client.is_connected():
-            # A clean end makes the broker forget the last will.
-            self._send(self._settings.availability_topic, "offline").wait_for_publish(
-                LEAVE_WITHIN_S
-            )
-        self._client.disconnect()
 
     def _on_connect(
         self, _client: Client, _userdata: object, _flags: object, reason: Any, _properties: object

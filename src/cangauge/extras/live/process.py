@@ -12,12 +12,11 @@ import json
 import logging
 import os
 import signal
-import socket
 import threading
 from collections.abc import Mapping
 from typing import IO, Any, Final
 
-from cangauge.service.events import RateLimitFilter
+from cangauge.service.events import RateLimitedHandler
 from cangauge.service.output import Output
 from cangauge.service.status_client import Snapshot
 
@@ -37,7 +36,7 @@ def tell(**content: object) -> None:
             left = left[os.write(1, left) :]
 
 
-class _Told(logging.Handler):
+class _Told(RateLimitedHandler):
     """Hands the events of this process to the service, which writes them as its own."""
 
     def emit(self, record: logging.LogRecord) -> None:
@@ -60,28 +59,22 @@ class _Told(logging.Handler):
 def outputs_of(asks: Mapping[str, Any]) -> list[Output]:
     """Return what is asked for, each on the running loop; imported only where it is."""
     outputs: list[Output] = []
-    for key in ("http", "dashboard"):
-        if key in asks:
-            sockets = [socket.socket(fileno=number) for number in asks[key]["sockets"]]
-            for each in sockets:
-                each.setblocking(False)
-            if key == "http":
-                from cangauge.extras.live.http import StatusServer  # noqa: PLC0415
+    if "http" in asks:
+        from cangauge.extras.live.http import StatusServer  # noqa: PLC0415
 
-                outputs.append(StatusServer(sockets, asks[key]["token"]))
-            else:
-                from cangauge.extras.live.server import LivePage  # noqa: PLC0415
+        outputs.append(StatusServer(**asks["http"]))
+    if "dashboard" in asks:
+        from cangauge.extras.live.server import LivePage  # noqa: PLC0415
 
-                outputs.append(LivePage(sockets, asks[key]["token"]))
+        outputs.append(LivePage(**asks["dashboard"]))
     if "mqtt" in asks:
-        from cangauge.extras.live.addresses import MqttSettings  # noqa: PLC0415
         from cangauge.extras.live.mqtt import MqttPublisher  # noqa: PLC0415
 
-        outputs.append(MqttPublisher(MqttSettings(**asks["mqtt"])))
+        outputs.append(MqttPublisher(**asks["mqtt"]))
     return outputs
 
 
-async def _serve(asks: Mapping[str, Any], lines: IO[bytes], limiter: RateLimitFilter) -> None:
+async def _serve(asks: Mapping[str, Any], lines: IO[bytes], told: RateLimitedHandler) -> None:
     reader = asyncio.StreamReader(limit=_LINE_BYTES)
     loop = asyncio.get_running_loop()
     await loop.connect_read_pipe(lambda: asyncio.StreamReaderProtocol(reader), lines)
@@ -89,7 +82,7 @@ async def _serve(asks: Mapping[str, Any], lines: IO[bytes], limiter: RateLimitFi
     async def tell_that_it_lives() -> None:
         while True:
             tell(alive=True)
-            limiter.release_due()
+            told.release_due()
             await asyncio.sleep(ALIVE_EVERY_S)
 
     living = asyncio.ensure_future(tell_that_it_lives())
@@ -111,11 +104,9 @@ def main() -> None:
     lines = open(0, "rb", buffering=0)  # noqa: SIM115 - stdin, which ends with the process
     asks: Mapping[str, Any] = json.loads(lines.readline())
     told = _Told()
-    limiter = RateLimitFilter(told.emit)
-    told.addFilter(limiter)
     logging.getLogger().handlers[:] = [told]
     logging.getLogger("cangauge").setLevel(asks["level"])
-    asyncio.run(_serve(asks, lines, limiter))
+    asyncio.run(_serve(asks, lines, told))
 
 
 if __name__ == "__main__":

@@ -10,39 +10,20 @@ import asyncio
 import hashlib
 import hmac
 import json
-import math
 import secrets
-import socket
 import time
-from collections.abc import Sequence
 from contextlib import suppress
-from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any, Final, cast
+from typing import Any, Final
 
 from bokeh.resources import Resources
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from tornado.httpserver import HTTPServer
 from tornado.websocket import WebSocketClosedError, WebSocketHandler
 
-from cangauge._typing import FloatArray
 from cangauge.extras.live.charts import CHARTS, STATUS_COLOURS, STATUS_NAMES, chart_parts
-from cangauge.extras.live.history import (
-    COLUMNS,
-    LOG_NAME,
-    REASONS,
-    History,
-    column,
-    last_hour,
-    shown_columns,
-)
-from cangauge.extras.live.http import (
-    MAX_BODY_BYTES,
-    MAX_HEADER_BYTES,
-    Handler,
-    application_of,
-    has_token,
-)
+from cangauge.extras.live.history import LOG_NAME, REASONS, History, last_hour, shown_columns
+from cangauge.extras.live.http import Handler, has_token, serve
 from cangauge.service.output import Output
 from cangauge.service.status_client import Snapshot
 
@@ -51,8 +32,6 @@ IDLE_S: Final = 30.0
 """Time after which a connection without a request is closed [s]."""
 ALIVE_S: Final = 0.25
 """Longest time without a message to a viewer [s]."""
-PING_S: Final = 10.0
-"""Interval at which a viewer must show that it still listens [s]."""
 _FILES: Final = Path(__file__).with_name("page")
 _OWN: Final = ("enter.html", "live.js", "live.css")
 _BOKEH: Final = "bokeh.min.js"
@@ -67,13 +46,13 @@ class LivePage(Output):
 
     Parameters
     ----------
-    sockets : sequence of socket
-        Listening ones.
+    sockets : list of int
+        Descriptors of listening sockets.
     token : str or None
         Token that a viewer must know.
     """
 
-    def __init__(self, sockets: Sequence[socket.socket], token: str | None) -> None:
+    def __init__(self, sockets: list[int], token: str | None) -> None:
         self.token = token
         self.history = History()
         self.id = secrets.token_hex(8)
@@ -82,31 +61,16 @@ class LivePage(Output):
         self.pass_word = "" if token is None else _cookie_of(token)
         self._news = asyncio.Event()
         self.texts = self._texts()
-        pages: dict[str, type[_LiveHandler]] = {
+        pages: dict[str, type[Handler]] = {
             "/": _Live,
             "/enter": _Enter,
             r"/files/([a-z.]+)": _StaticFile,
             "/rows": _Rows,
             "/stream": _Stream,
-            "/range.csv": _Range,
             f"/{LOG_NAME}": _LastHour,
         }
-        application = application_of(
-            self,
-            pages,
-            _NotFound,
-            log_function=lambda _: None,
-            websocket_ping_interval=PING_S,
-            websocket_max_message_size=MAX_BODY_BYTES,
-        )
-        server = HTTPServer(
-            application,
-            max_header_size=MAX_HEADER_BYTES,
-            max_body_size=MAX_BODY_BYTES,
-            idle_connection_timeout=IDLE_S,
-            body_timeout=IDLE_S,
-        )
-        server.add_sockets(sockets)
+        limits = {"idle_connection_timeout": IDLE_S, "body_timeout": IDLE_S}
+        serve(self, sockets, pages, HTTPServer, limits)
 
     def _texts(self) -> dict[str, str]:
         """Return the files of the page by their names."""
@@ -170,9 +134,7 @@ class LivePage(Output):
 
 
 class _LiveHandler(Handler):
-    """Access control of all pages: by a cookie, or a bearer token."""
-
-    needs_token = True
+    """A page that takes the cookie as well as a bearer token."""
 
     def set_default_headers(self) -> None:
         super().set_default_headers()
@@ -181,33 +143,14 @@ class _LiveHandler(Handler):
 
     def is_known(self, token: str) -> bool:
         given = self.get_cookie(COOKIE, "") or ""
-        return (
-            not self.needs_token
-            or hmac.compare_digest(given.encode(), self.server.pass_word.encode())
-            or super().is_known(token)
-        )
-
-    def refuse_unknown(self) -> None:
-        if self.request.path == "/":
-            self.redirect("/enter")
-        else:
-            self.refuse(401, "a token is required")
-
-    def send_csv(self, name: str, text: str) -> None:
-        self.set_header("Content-Type", "text/csv; charset=utf-8")
-        self.set_header("Content-Disposition", f'attachment; filename="{name}"')
-        self.finish(text)
-
-    def argument(self, name: str, default: float) -> float:
-        """Return a number of the query, or the default where it is none."""
-        try:
-            value = float(self.get_query_argument(name, ""))
-        except ValueError:
-            return default
-        return value if math.isfinite(value) else default
+        same = hmac.compare_digest(given.encode(), self.server.pass_word.encode())
+        return same or super().is_known(token)
 
 
 class _Live(_LiveHandler):
+    def refuse_unknown(self) -> None:
+        self.redirect("/enter")
+
     def get(self) -> None:
         self.finish(self.server.texts["live.html"])
 
@@ -247,8 +190,9 @@ class _StaticFile(_LiveHandler):
 class _Rows(_LiveHandler):
     def get(self) -> None:
         """Return the status, what is wrong, and the rows of a span after those already known."""
-        key, after = self.get_query_argument("key", ""), int(self.argument("after", 0.0))
-        self.send_json(self.server.answer(self.get_query_argument("span", ""), key, after))
+        name, key, after = (self.get_query_argument(part, "") for part in ("span", "key", "after"))
+        number = int(after) if after.isdecimal() and len(after) < 16 else 0
+        self.send_json(self.server.answer(name, key, number))
 
 
 class _Stream(_LiveHandler, WebSocketHandler):
@@ -287,49 +231,11 @@ class _Stream(_LiveHandler, WebSocketHandler):
                 await self.server.news()
 
 
-class _Range(_LiveHandler):
-    def get(self) -> None:
-        """Return the rows of a span between two wall-clock times [ms] as CSV."""
-        history = self.server.history
-        span = history.spans.get(self.get_query_argument("span", ""), history.hour)
-        rows = span.rows()
-        time_ms = column(rows, "time_ms")
-        start, end = self.argument("from", -math.inf), self.argument("to", math.inf)
-        self.send_csv("cangauge-live.csv", _csv(rows[(time_ms >= start) & (time_ms <= end)]))
-
-
 class _LastHour(_LiveHandler):
     def get(self) -> None:
-        self.send_csv(LOG_NAME, last_hour(self.server.history))
-
-
-class _NotFound(_LiveHandler):
-    needs_token = False
-
-    def get(self) -> None:
-        self.refuse(404, "there is nothing here: the live page is at /")
-
-
-def _csv(rows: FloatArray) -> str:
-    """Return rows as CSV: UTC time, bus time, the values, status and reasons in words."""
-    names = [name for name in COLUMNS if name not in {"time_ms", "status", "reasons"}]
-    lines = [",".join(["utc", *names, "status", "reasons"])]
-    columns = shown_columns(rows)
-    for row in range(len(rows)):
-        stamp = datetime.fromtimestamp(1e-3 * cast("float", columns["time_ms"][row]), UTC)
-        values = [columns[name][row] for name in names]
-        reasons = int(columns["reasons"][row] or 0)
-        lines.append(
-            ",".join(
-                [
-                    stamp.isoformat(timespec="milliseconds"),
-                    *("" if value is None else str(value) for value in values),
-                    STATUS_NAMES[int(columns["status"][row] or 0)],
-                    '"' + "; ".join(w for bit, w in REASONS.items() if int(bit) & reasons) + '"',
-                ]
-            )
-        )
-    return "\n".join(lines) + "\n"
+        self.set_header("Content-Type", "text/csv; charset=utf-8")
+        self.set_header("Content-Disposition", f'attachment; filename="{LOG_NAME}"')
+        self.finish(last_hour(self.server.history))
 
 
 def _cookie_of(token: str) -> str:

@@ -229,7 +229,7 @@ def bars(
         hover="@name: @text",
         height=60 + 44 * len(entries),
         # Room for the text of the longest bar, also on a narrow screen.
-        x_range=models.Range1d(1.05 * low, 1.3 * high if high > 0.0 else 1.0),
+        x_range=models.Range1d(1.05 * low, high + 0.3 * (high - low) or 1.0),
         y_categories=names[::-1],
     )
     columns = {"name": names, "value": np.array(values), "color": colors}
@@ -304,6 +304,20 @@ class TimeFigures:
                 label.update(angle=1.5708, text_font_size="10px", text_color="#55606e")
                 shown.plot.add_layout(label)
         return shown
+
+    def channel(
+        self,
+        name: str,
+        unit: str,
+        pieces: Pieces,
+        color: str,
+        caption: str,
+        *,
+        names: bool = False,
+    ) -> Figure:
+        """Return the figure of one quantity through all logs, named by it; see `figure`."""
+        shown = self.figure(name.capitalize(), f"{name} [{unit}]", caption, names=names)
+        return self.line(shown, name, pieces, color, line_width=1.0)
 
     def joined(self, pieces: Pieces) -> tuple[FloatArray, ...]:
         """Return positions and values of one line through all logs, NaN at gaps and between logs.

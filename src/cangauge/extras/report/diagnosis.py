@@ -180,18 +180,18 @@ def _next_step(plan: Plan) -> list[Block]:
 
 def _compared(found: Diagnosis) -> Table:
     both = (("log", found.logs), ("reference", found.references))
-    return Table.of(
-        [(role, log) for role, logs in both for log in logs],
+    entries = [
         {
-            "": lambda item: item[0],
-            "name": lambda item: item[1].name,
-            "duration [min]": lambda item: number(item[1].duration_s / 60.0, 0),
-            "temperature [°C]": lambda item: span(
-                float(item[1].temperature_c.min()), float(item[1].temperature_c.max()), 0
-            ),
-            "SHA-256": lambda item: (file_sha256(item[1].source) or NONE_KNOWN)[:12],
-        },
-    )
+            "": role,
+            "name": log.name,
+            "duration [min]": number(log.duration_s / 60.0, 0),
+            "temperature [°C]": span(log.temperature_c.min(), log.temperature_c.max(), 0),
+            "SHA-256": (file_sha256(log.source) or NONE_KNOWN)[:12],
+        }
+        for role, logs in both
+        for log in logs
+    ]
+    return Table.of(entries)
 
 
 def _over_time(found: Diagnosis) -> list[Block]:

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from itertools import pairwise
 from pathlib import Path
-from typing import Final, NamedTuple
+from typing import Final
 
 import numpy as np
 from bokeh.models import ColumnDataSource
@@ -48,8 +48,6 @@ _NEWTON: Final = {"line_width": 0.8, "line_alpha": 0.6, "visible": False}
 """Style of the SoC by voltage alone: noisy, and hidden until its legend entry is clicked."""
 _MAX_BARS: Final = 500
 """Gaps shorter than the time axis over this number are closed: no screen resolves them."""
-_LISTED_PERIODS: Final = 20
-"""Most periods without a valid estimate to list, the longest ones."""
 
 
 def estimate_page(estimate: RecordedEstimate, model_path: Path | None = None) -> Page:
@@ -63,12 +61,11 @@ def estimate_page(estimate: RecordedEstimate, model_path: Path | None = None) ->
     """
     log, model, table = estimate.recorded, estimate.model, estimate.table
     time = TimeFigures([log.time_s])
-    found = periods(table)
     reference = _reference(log)
     settings = [_settings(estimate), *(("Remarks on the log:", log.remarks) if log.remarks else ())]
     return Page(
         title=f"State of charge of {log.name}",
-        lead=estimate_verdict(estimate, found),
+        lead=estimate_verdict(estimate),
         subtitle=f"{duration(log.duration_s)}, {len(log):,} samples, estimated by"
         f" {_METHODS[estimate.settings.method]} with the model {model.name}.",
         tiles=_tiles(estimate),
@@ -79,7 +76,7 @@ def estimate_page(estimate: RecordedEstimate, model_path: Path | None = None) ->
             ],
             "Voltage": _voltage(log, table, time),
             "Input": _input(log, time),
-            "Status": [_status_figure(log, table, time), *_periods(found), _reasons(table)],
+            "Status": [_status_figure(log, table, time), _reasons(table)],
             "Model and settings": settings,
         },
         model=model,
@@ -110,48 +107,7 @@ def estimate_figure(table: EstimateTable, log: Log | None = None) -> Plot:
 # --- The result in a sentence
 
 
-class Period(NamedTuple):
-    """A time without a valid estimate, since the start of the log [s]."""
-
-    start_s: float
-    end_s: float
-    status: Status
-    reason: Reason
-    """The reason that applied to most of its samples."""
-
-    @property
-    def duration_s(self) -> float:
-        """Length [s]."""
-        return self.end_s - self.start_s
-
-    def when(self, template: str = "{} … {}") -> str:
-        """Return the times as h:mm:ss."""
-        return template.format(_clock(self.start_s), _clock(self.end_s))
-
-
-def _clock(seconds: float) -> str:
-    minutes, rest = divmod(round(seconds), 60)
-    return f"{minutes // 60}:{minutes % 60:02d}:{rest:02d}"
-
-
-def periods(table: EstimateTable) -> list[Period]:
-    """Return the times that are degraded or invalid, in sequence."""
-    status, since_s = np.asarray(table.status), table.time_s - table.time_s[:1]
-    edges = np.flatnonzero(np.diff(status)) + 1
-    found = []
-    for begin, end in zip((0, *edges), (*edges, status.size), strict=True):
-        if begin == end or status[begin] not in {Status.DEGRADED, Status.INVALID}:
-            continue
-        reasons = np.asarray(table.reasons[begin:end]).astype(np.int64)
-        counts = {reason: int(np.count_nonzero(reasons & reason)) for reason in Reason}
-        most = max(counts, key=counts.__getitem__)
-        start_s, end_s = float(since_s[begin]), float(since_s[min(end, status.size - 1)])
-        reason = most if counts[most] else Reason.NONE
-        found.append(Period(start_s, end_s, Status(int(status[begin])), reason))
-    return found
-
-
-def estimate_verdict(estimate: RecordedEstimate, found: Sequence[Period]) -> str:
+def estimate_verdict(estimate: RecordedEstimate) -> str:
     """Return how far the SoC is from the log's own, and when and why it is not valid."""
     table, scores = estimate.table, estimate.scores
     known = np.flatnonzero(np.isfinite(table.soc_pct))
@@ -168,12 +124,34 @@ def estimate_verdict(estimate: RecordedEstimate, found: Sequence[Period]) -> str
     share = number(min(max(100.0 * scores.valid_fraction, 0.1), 99.9), 1, "%")
     whole = {0.0: "never valid", 1.0: "valid throughout"}
     text += f"; {whole.get(scores.valid_fraction, f'valid in {share} of the samples')}"
-    if found:
-        longest = max(found, key=lambda period: period.duration_s)
-        text += f"; {longest.status.name.lower()} {longest.when('from {} to {}')}"
-        text += f" because {REASON_WORDS[longest.reason]}" if longest.reason else ""
-        text += f", the longest of {len(found)} periods" if len(found) > 1 else ""
-    return f"{text}."
+    return f"{text}{_longest_period(table)}."
+
+
+def _longest_period(table: EstimateTable) -> str:
+    """Return the longest time that is degraded or invalid, with its main reason, as a clause."""
+    status, since_s = np.asarray(table.status), table.time_s - table.time_s[0]
+    edges = np.flatnonzero(np.diff(status)) + 1
+    periods = [
+        (float(since_s[begin]), float(since_s[min(end, status.size - 1)]), slice(begin, end))
+        for begin, end in pairwise([0, *edges, status.size])
+        if status[begin] in {Status.DEGRADED, Status.INVALID}
+    ]
+    if not periods:
+        return ""
+    start_s, end_s, rows = max(periods, key=lambda period: period[1] - period[0])
+    name = Status(int(status[rows.start])).name.lower()
+    reasons = np.asarray(table.reasons[rows]).astype(np.int64)
+    samples = {reason: int(np.count_nonzero(reasons & reason)) for reason in Reason}
+    main = max(samples, key=samples.__getitem__)
+    text = f"; {name} from {_clock(start_s)} to {_clock(end_s)}"
+    text += f" because {REASON_WORDS[main]}" if samples[main] else ""
+    return text + (f", the longest of {len(periods)} periods" if len(periods) > 1 else "")
+
+
+def _clock(seconds: float) -> str:
+    """Return a time as h:mm:ss."""
+    minutes, rest = divmod(round(seconds), 60)
+    return f"{minutes // 60}:{minutes % 60:02d}:{rest:02d}"
 
 
 def _tiles(estimate: RecordedEstimate) -> list[Tile]:
@@ -313,19 +291,13 @@ def _voltage(log: Log | CaptureSamples, table: EstimateTable, time: TimeFigures)
 
 
 def _input(log: Log | CaptureSamples, time: TimeFigures) -> list[Block]:
-    channels = (
-        ("current", "A", log.current_a, BLUE, "Positive current discharges the pack."),
-        ("temperature", "°C", log.temperature_c, ORANGE,
-         f"Measured on: {log.temperature_source}. An estimate is valid only at temperatures that"
-         " the model was identified at."),
-    )  # fmt: skip
+    current, temperature = [(log.time_s, log.current_a)], [(log.time_s, log.temperature_c)]
+    caption = f"Measured on: {log.temperature_source}. An estimate is valid only at temperatures"
+    caption += " that the model was identified at."
     return [
-        time.line(
-            time.figure(name.capitalize(), f"{name} [{unit}]", caption),
-            name, [(log.time_s, values)], color, line_width=1.0,
-        )
-        for name, unit, values, color, caption in channels
-    ]  # fmt: skip
+        time.channel("current", "A", current, BLUE, "Positive current discharges the pack."),
+        time.channel("temperature", "°C", temperature, ORANGE, caption),
+    ]
 
 
 # --- Status
@@ -384,31 +356,16 @@ def _reason_masks(table: EstimateTable) -> list[tuple[str, NDArray[np.bool_], st
 def _reasons(table: EstimateTable) -> Table:
     """Return the share of samples with each status and each reason, with its meaning."""
     shares = [(status.name.lower(), table.status == status, "") for status in Status]
-    return Table.of(
-        [share for share in (*shares, *_reason_masks(table)) if share[1].any()],
+    entries = [
         {
-            "status or reason": lambda share: share[0],
-            "share of samples": lambda share: number(100.0 * float(share[1].mean()), 1, "%"),
-            "meaning": lambda share: share[2],
-        },
-    )
-
-
-def _periods(found: Sequence[Period]) -> list[Block]:
-    """Return the table of the periods without a valid estimate."""
-    if not found:
-        return []
-    longest = sorted(found, key=lambda period: -period.duration_s)[:_LISTED_PERIODS]
-    note = "h:mm:ss since the start of the log."
-    if len(found) > len(longest):
-        note += f" The longest {len(longest)} of {len(found):,} periods."
-    columns = {
-        "period": Period.when,
-        "duration": lambda period: duration(period.duration_s),
-        "status": lambda period: period.status.name.lower(),
-        "main reason": lambda period: REASON_WORDS.get(period.reason, ""),
-    }
-    return [Table.of(sorted(longest), columns, note)]
+            "status or reason": name,
+            "share of samples": number(100.0 * float(mask.mean()), 1, "%"),
+            "meaning": meaning,
+        }
+        for name, mask, meaning in (*shares, *_reason_masks(table))
+        if mask.any()
+    ]
+    return Table.of(entries)
 
 
 def _settings(estimate: RecordedEstimate) -> Table:

@@ -131,20 +131,34 @@ def _voltage_figure(result: Identification, time: TimeFigures) -> Figure:
 def _ocv_figure(result: Identification) -> Figure:
     model = result.voltage_model
     effects = ", effects" if result.model.effects else ""
+    caption = (
+        f"Dots: the measured voltage minus the model's resistances{effects} and temperature term."
+        f" The logs cover {span(*model.soc_range_pct, 1, '%')}; in the shaded part the curve"
+        f" {result.beyond}."
+    )
+    soc = np.concatenate([item.rows.soc_pct for item in result.fits])
+    residual = np.concatenate([item.residual_v for item in result.fits])
+    return curve_figure(model, caption, (soc, residual + model.pseudo_ocv(soc)))
+
+
+def curve_figure(
+    model: VoltageModel, caption: str, measured: tuple[FloatArray, FloatArray] | None = None
+) -> Figure:
+    """Return the pseudo-OCV over SoC, with dots at measured SoC [%] and voltage [V]."""
     figure = Figure(
         "Pseudo-OCV against SoC",
         "state of charge [%]",
         "voltage [V]",
-        f"Dots: the measured voltage minus the model's resistances{effects} and temperature term."
-        f" The logs cover {span(*model.soc_range_pct, 1, '%')}; in the shaded part the curve"
-        f" {result.beyond}.",
+        caption,
         hover="$name: @y{0.00} V<br>at @x{0.0} %",
         height=340,
     )
-    soc = np.concatenate([item.rows.soc_pct for item in result.fits])
-    residual = np.concatenate([item.residual_v for item in result.fits])
-    figure.cloud("measured, less drop", soc, residual + model.pseudo_ocv(soc), GREY)
-    grid = np.linspace(min(0.0, soc.min()), max(100.0, soc.max()), 401)
+    low, high = 0.0, 100.0
+    if measured is not None:
+        soc, voltage_v = measured
+        figure.cloud("measured, less drop", soc, voltage_v, GREY)
+        low, high = min(low, soc.min()), max(high, soc.max())
+    grid = np.linspace(low, high, 401)
     figure.line("pseudo-OCV", grid, model.pseudo_ocv(grid), BLUE, line_width=2.2)
     figure.shade_outside(*model.soc_range_pct)
     return figure
@@ -284,23 +298,18 @@ def _recorded_figures(result: Identification, time: TimeFigures) -> list[Block]:
     )
     is_limited = running.size < sum(map(len, logs))
     below = " Start-up and shut-down rows lie below the figure." if is_limited else ""
-    channels = (
-        ("current", "A", "current_a", BLUE,
-         "Positive current discharges the pack, negative charges it."),
-        ("voltage", "V", "voltage_v", BLACK,
-         f"The voltage falls with the charge and dips under load.{below}"),
-        ("temperature", "°C", "temperature_c", ORANGE,
-         f"Measured on: {result.model.temperature_source}. A temperature that hardly changes"
-         " does not identify kt."),
-    )  # fmt: skip
-    figures: list[Block] = []
-    for name, unit, column, color, caption in channels:
-        figure = time.figure(name.capitalize(), f"{name} [{unit}]", caption, names=not figures)
-        pieces = [(log.time_s, getattr(log, column)) for log in logs]
-        figures.append(time.line(figure, name, pieces, color, line_width=1.0))
-        if is_limited and unit == "V":
-            figure.set_y_limits(float(running.min()), float(running.max()))
-    return figures
+    caption = "Positive current discharges the pack, negative charges it."
+    pieces = [(log.time_s, log.current_a) for log in logs]
+    current = time.channel("current", "A", pieces, BLUE, caption, names=True)
+    caption = f"The voltage falls with the charge and dips under load.{below}"
+    pieces = [(log.time_s, log.voltage_v) for log in logs]
+    voltage = time.channel("voltage", "V", pieces, BLACK, caption)
+    if is_limited:
+        voltage.set_y_limits(float(running.min()), float(running.max()))
+    caption = f"Measured on: {result.model.temperature_source}. A temperature that hardly changes"
+    caption += " does not identify kt."
+    pieces = [(log.time_s, log.temperature_c) for log in logs]
+    return [current, voltage, time.channel("temperature", "°C", pieces, ORANGE, caption)]
 
 
 # --- Tables
@@ -406,26 +415,22 @@ def _logs(result: Identification) -> Table:
         f"{count:,} {_REMOVED_BY.get(rule, rule)}" for rule, count in removed.items()
     )
     errors = result.held_out_error_v or [np.full(len(item.rows), np.nan) for item in result.fits]
-    held_out_pct = []
-    for item, error_v in zip(result.fits, errors, strict=True):
-        judged = np.isfinite(error_v)
+    entries = []
+    for log, item, error_v in zip(result.logs, result.fits, errors, strict=True):
+        soc, judged = item.rows.soc_pct, np.isfinite(error_v)
         relative = np.abs(error_v[judged]) / item.rows.voltage_v[judged]
-        held_out_pct.append(100.0 * float(relative.mean()) if judged.any() else None)
-    return Table.of(
-        list(zip(result.logs, result.fits, held_out_pct, strict=True)),
-        {
-            "log": lambda of: of[0].name,
-            "duration": lambda of: duration(of[0].duration_s),
-            "rows": lambda of: str(len(of[0])),
-            "rows used": lambda of: str(len(of[1].rows)),
-            "SoC [%]": lambda of: span(of[1].rows.soc_pct.max(), of[1].rows.soc_pct.min(), 1),
-            "temperature [°C]": lambda of: span(
-                of[0].temperature_c.min(), of[0].temperature_c.max(), 1
-            ),
-            "current [A]": lambda of: span(of[0].current_a.min(), of[0].current_a.max(), 0),
-            "U MAE [%]": lambda of: number(of[1].voltage_mae_pct, 2),
-            "U MAE held out [%]": lambda of: number(of[2], 2),
-            "SoC by Newton MAE [%]": lambda of: number(of[1].soc_newton_mae_pct, 2),
-        },
-        f"Rows not used: {unused}." if unused else "",
-    )
+        held_out_pct = 100.0 * float(relative.mean()) if judged.any() else None
+        entry = {
+            "log": log.name,
+            "duration": duration(log.duration_s),
+            "rows": str(len(log)),
+            "rows used": str(len(item.rows)),
+            "SoC [%]": span(soc.max(), soc.min(), 1),
+            "temperature [°C]": span(log.temperature_c.min(), log.temperature_c.max(), 1),
+            "current [A]": span(log.current_a.min(), log.current_a.max(), 0),
+            "U MAE [%]": number(item.voltage_mae_pct, 2),
+            "U MAE held out [%]": number(held_out_pct, 2),
+            "SoC by Newton MAE [%]": number(item.soc_newton_mae_pct, 2),
+        }
+        entries.append(entry)
+    return Table.of(entries, f"Rows not used: {unused}." if unused else "")

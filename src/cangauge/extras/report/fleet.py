@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
 from typing import Any, Final
 
@@ -16,7 +16,12 @@ from cangauge.extras.fleet.overview import QUANTITIES, FleetOverview
 from cangauge.extras.fleet.results import by_kind, reason_of
 from cangauge.extras.fleet.sources import short_names
 from cangauge.extras.report.charts import BLUE, GREY, ORANGE, Figure, bars
-from cangauge.extras.report.fit import coefficient_tables, settings_table, slope_figure
+from cangauge.extras.report.fit import (
+    coefficient_tables,
+    curve_figure,
+    settings_table,
+    slope_figure,
+)
 from cangauge.extras.report.page import Block, Page, Table, Tile, joined
 
 _SHOWN: Final = 200
@@ -86,20 +91,21 @@ def _tiles(found: FleetOverview) -> list[Tile]:
 
 
 def _gaps(found: FleetOverview) -> list[Block]:
-    table = _table(
-        [(name, found.gaps[name]) for name in found.by_gap],
+    rows = [(name, found.gaps[name]) for name in found.by_gap]
+    entries = [
         {
-            "vehicle": lambda of: of[0],
-            "alarm": lambda of: "gap" if of[1]["detected"] else "–",
-            "verdict": lambda of: of[1]["verdict"],
-            "its probability": lambda of: number(of[1]["probability"], 2),
-            "P(no fault)": lambda of: number(of[1]["probability_none"], 3),
-            "error [V]": lambda of: number(of[1]["baseline_rmse_v"], 2),
-            "of references [V]": lambda of: number(of[1]["healthy_rmse_v"], 2),
-            "closed [%]": lambda of: _percent(of[1]["closed_fraction"]),
-            "90 % set": lambda of: ", ".join(of[1]["credible_set"]),
-        },
-    )
+            "vehicle": name,
+            "alarm": "gap" if row["detected"] else "–",
+            "verdict": row["verdict"],
+            "its probability": number(row["probability"], 2),
+            "P(no fault)": number(row["probability_none"], 3),
+            "error [V]": number(row["baseline_rmse_v"], 2),
+            "of references [V]": number(row["healthy_rmse_v"], 2),
+            "closed [%]": _percent(row["closed_fraction"]),
+            "90 % set": ", ".join(row["credible_set"]),
+        }
+        for name, row in rows
+    ]
     ratios = {
         name: row["baseline_rmse_v"] / row["healthy_rmse_v"] for name, row in found.gaps.items()
     }
@@ -109,7 +115,7 @@ def _gaps(found: FleetOverview) -> list[Block]:
     ]
     caption = f"The {len(largest)} largest. Orange: P(no fault) is below the alarm's limit."
     label = "error of the model over that of the references"
-    return [table, bars("Size of the gaps", label, largest, caption)]
+    return [_table(entries), bars("Size of the gaps", label, largest, caption)]
 
 
 def _percent(share: float | None) -> str:
@@ -117,17 +123,22 @@ def _percent(share: float | None) -> str:
 
 
 def _health(found: FleetOverview) -> list[Block]:
-    rows = []
-    for vehicle, quantity, z in found.outlying[:_SHOWN]:
+    entries = []
+    for vehicle, quantity, z in found.outlying:
         label, unit, digits = _LABELS[quantity]
         last = found.health[vehicle][-1]
         values = [of_vehicle[-1][quantity] for of_vehicle in found.health.values()]
         middle = float(np.median([value for value in values if value is not None]))
-        numbers = (last[quantity], last[QUANTITIES[quantity]], middle)
-        shown = [number(value, digits, unit) for value in numbers]
-        rows.append([vehicle, label, *shown, number(z, 1)])
-    head = ["vehicle", "outlier in", "value", "σ", "median of the fleet", "robust z"]
-    outliers = Table(head, rows, _note(len(found.outlying))) if rows else found.no_outlier_text
+        entry = {
+            "vehicle": vehicle,
+            "outlier in": label,
+            "value": number(last[quantity], digits, unit),
+            "σ": number(last[QUANTITIES[quantity]], digits, unit),
+            "median of the fleet": number(middle, digits, unit),
+            "robust z": number(z, 1),
+        }
+        entries.append(entry)
+    outliers = _table(entries) if entries else found.no_outlier_text
     return [outliers, *(_over_time(found, quantity) for quantity in QUANTITIES)]
 
 
@@ -159,38 +170,35 @@ def _over_time(found: FleetOverview, quantity: str) -> Figure:
 
 def _estimates(found: FleetOverview) -> Table:
     """Return the errors of each vehicle, the worst first."""
-
-    def mean(rows: Sequence[Mapping[str, Any]], column: str) -> float | None:
-        return mean_of([row[column] for row in rows])
-
-    def worst(rows: Sequence[Mapping[str, Any]]) -> float | None:
+    entries = []
+    for vehicle, rows in found.estimates.items():
         errors = [row["soc_mae_pct"] for row in rows if row["soc_mae_pct"] is not None]
-        return max(errors, default=None)
-
-    return _table(
-        sorted(found.estimates.items(), key=lambda of: -(mean(of[1], "soc_mae_pct") or 0.0)),
-        {
-            "vehicle": lambda of: of[0],
-            "logs": lambda of: str(len(of[1])),
-            "hours": lambda of: number(sum(row["duration_s"] for row in of[1]) / 3600.0, 1),
-            "SoC MAE [%]": lambda of: number(mean(of[1], "soc_mae_pct"), 2),
-            "worst log [%]": lambda of: number(worst(of[1]), 2),
-            "mean σ [%]": lambda of: number(mean(of[1], "mean_soc_std_pct"), 2),
-            "within 2σ [%]": lambda of: _percent(mean(of[1], "cover_2sigma")),
-            "valid [%]": lambda of: _percent(mean(of[1], "valid_share")),
-        },
-    )
+        mean_error_pct = mean_of(errors)
+        entry = {
+            "vehicle": vehicle,
+            "logs": str(len(rows)),
+            "hours": number(sum(row["duration_s"] for row in rows) / 3600.0, 1),
+            "SoC MAE [%]": number(mean_error_pct, 2),
+            "worst log [%]": number(max(errors, default=None), 2),
+            "mean σ [%]": number(mean_of([row["mean_soc_std_pct"] for row in rows]), 2),
+            "within 2σ [%]": _percent(mean_of([row["cover_2sigma"] for row in rows])),
+            "valid [%]": _percent(mean_of([row["valid_share"] for row in rows])),
+        }
+        entries.append((mean_error_pct or 0.0, entry))
+    return _table([entry for _, entry in sorted(entries, key=lambda item: -item[0])])
 
 
 def _set_aside(bad: Sequence[Mapping[str, Any]], heading: str = "command") -> list[Block]:
     """Return a table of the reasons for which logs were set aside, if any were."""
-    rows = [[row["table"], str(count), reason_of(row), row["log"]] for row, count in by_kind(bad)]
-    head = [heading, "logs", "reason", "for example"]
-    return [Table(head, rows[:_SHOWN], _note(len(rows)))] if rows else []
+    entries = [
+        {heading: row["table"], "logs": str(n), "reason": reason_of(row), "for example": row["log"]}
+        for row, n in by_kind(bad)
+    ]
+    return [_table(entries)] if entries else []
 
 
-def _table(items: Sequence[Any], columns: Mapping[str, Callable[[Any], str]]) -> Table:
-    return Table.of(items[:_SHOWN], columns, _note(len(items)))
+def _table(entries: Sequence[Mapping[str, str]]) -> Table:
+    return Table.of(entries[:_SHOWN], _note(len(entries)))
 
 
 def _note(total: int) -> str:
@@ -204,17 +212,11 @@ def fleet_fit_page(result: FleetFit) -> Page:
         *(row | {"table": "set aside"} for row in result.bad),
         *(row | {"table": "left out"} for row in result.left_out),
     ]
-    grid, equation = np.linspace(0.0, 100.0, 401), model.voltage_model()
-    curve = Figure(
-        "Pseudo-OCV against SoC",
-        "state of charge [%]",
-        "voltage [V]",
-        "The curve of all logs.",
-        hover="@y{0.00} V<br>at @x{0.0} %",
-        height=340,
+    curve = curve_figure(
+        model.voltage_model(), "The curve of all logs, which cover the part that is not shaded."
     )
-    curve.line("pseudo-OCV", grid, equation.pseudo_ocv(grid), BLUE, line_width=2.2)
-    slope = slope_figure(equation, "A voltage error divided by this slope is the SoC error.")
+    caption = "A voltage error divided by this slope is the SoC error."
+    slope = slope_figure(model.voltage_model(), caption)
     figures = result.to_dict()
     names = [by_log.logs[k] for k in by_log.misfits]
     verb = "does" if len(names) == 1 else "do"
@@ -248,23 +250,15 @@ def fleet_fit_page(result: FleetFit) -> Page:
 
 def _misfits(result: FleetFit) -> list[Block]:
     by_log = result.by_log
-    table = _table(
-        by_log.misfits,
-        {
-            "vehicle": lambda k: by_log.vehicles[k],
-            "log": lambda k: by_log.logs[k],
-            "mean error [V]": lambda k: significant(float(by_log.mean_v[k]), 3),
-            "RMSE [V]": lambda k: significant(float(by_log.rmse_v[k]), 3),
-            "robust z": lambda k: number(float(by_log.z[k]), 1),
-        },
-    )
+    head, rows = by_log.misfit_rows()
+    table = Table(head, rows[:_SHOWN], _note(len(rows)))
     largest = by_log.order[:_BARS]
     names = short_names([by_log.logs[k] for k in largest])
-    entries = [
+    largest_errors = [
         (name, float(by_log.mean_v[k]), ORANGE if k in by_log.misfits else GREY)
         for name, k in zip(names, largest, strict=True)
     ]
     caption = f"The {len(largest)} farthest of {len(by_log.logs)}."
     title, label = "Mean error of each log under the model of all", "mean of measured − modelled"
-    figure = bars(title, label, entries, caption, unit="V", decimals=None)
-    return [*([table] if table.rows else []), by_log.rule_text, figure]
+    figure = bars(title, label, largest_errors, caption, unit="V", decimals=None)
+    return [*([table] if rows else []), by_log.rule_text, figure]

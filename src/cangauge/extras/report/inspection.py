@@ -54,21 +54,17 @@ def log_figure(log: Log) -> Plot:
 
 def channel_figures(log: Log) -> list[Figure]:
     """Return current, voltage, temperature and, where known, SoC over time."""
-    time = TimeFigures([log.time_s])
-    channels = [
-        ("Current", "A", log.current_a, BLUE, "Positive current discharges."),
-        ("Voltage", "V", log.voltage_v, ORANGE, "At the terminals."),
-        ("Temperature", "°C", log.temperature_c, PURPLE, f"Measured on: {log.temperature_source}."),
+    at, time = log.time_s, TimeFigures([log.time_s])
+    measured_on = f"Measured on: {log.temperature_source}."
+    figures = [
+        time.channel("current", "A", [(at, log.current_a)], BLUE, "Positive current discharges."),
+        time.channel("voltage", "V", [(at, log.voltage_v)], ORANGE, "At the terminals."),
+        time.channel("temperature", "°C", [(at, log.temperature_c)], PURPLE, measured_on),
     ]
     if log.first_soc() is not None and log.soc_pct is not None:
-        channels.append(("State of charge", "%", log.soc_pct, GREEN, "The log's own."))
-    return [
-        time.line(
-            time.figure(name, f"{name.lower()} [{unit}]", caption),
-            name.lower(), [(log.time_s, values)], color, line_width=1.0,
-        )
-        for name, unit, values, color, caption in channels
-    ]  # fmt: skip
+        soc = [(at, log.soc_pct)]
+        figures.append(time.channel("state of charge", "%", soc, GREEN, "The log's own."))
+    return figures
 
 
 def inspect_verdict(found: LogInspection) -> str:

@@ -6,11 +6,11 @@ no network and stays readable.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any, Final, TypeVar
+from typing import Any, Final
 
 from bokeh.document import Document
 from bokeh.embed import components
@@ -25,8 +25,6 @@ from cangauge.bus.recording import CaptureSamples
 from cangauge.extras.report.charts import MAX_POINTS, Figure
 from cangauge.logs.log import Log
 from cangauge.model.model_file import Model
-
-Item = TypeVar("Item")
 
 _RECONSTRUCTION: Final = (
     "This is a reconstruction: the log was computed from a published equation and published"
@@ -53,12 +51,10 @@ class Table:
     note: str = ""
 
     @classmethod
-    def of(
-        cls, items: Iterable[Item], columns: Mapping[str, Callable[[Item], str]], note: str = ""
-    ) -> Table:
-        """Return a table with a row for each item; `columns` maps a heading to a cell's text."""
-        rows = [[text(item) for text in columns.values()] for item in items]
-        return cls(list(columns), rows, note)
+    def of(cls, entries: Sequence[Mapping[str, str]], note: str = "") -> Table:
+        """Return a table with a row for each entry, a mapping of heading to text."""
+        head = list(entries[0]) if entries else []
+        return cls(head, [list(entry.values()) for entry in entries], note)
 
     @property
     def is_numeric(self) -> list[bool]:

@@ -18,11 +18,10 @@ if TYPE_CHECKING:
         FaultKind,
         Simulation,
         fault_kinds,
-        read_speed,
         simulate,
     )
 
-__all__ = ["Fault", "FaultKind", "Simulation", "fault_kinds", "read_speed", "simulate"]
+__all__ = ["Fault", "FaultKind", "Simulation", "fault_kinds", "simulate"]
 
 
 def __getattr__(name: str) -> Any:

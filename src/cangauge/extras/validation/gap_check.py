@@ -15,12 +15,12 @@ from typing import Any, Final
 import numpy as np
 
 from cangauge._text import NONE_KNOWN, number, significant
-from cangauge.diagnosis.answer import GROUP_OF, NONE, Posterior, answer
-from cangauge.diagnosis.evidence import References, analyse, columns, learn
+from cangauge.diagnosis.answer import GROUP_OF, NONE, answer
+from cangauge.diagnosis.evidence import analyse, columns, learn
 from cangauge.diagnosis.pack_fit import trace
 from cangauge.errors import InputError
 from cangauge.extras.validation.twin.drive import draw_drive
-from cangauge.extras.validation.twin.faults import Fault, fault_kind, fault_kinds
+from cangauge.extras.validation.twin.faults import Fault, fault_kinds
 from cangauge.extras.validation.twin.injection import fit_surrogate_pack, inject, scale_injection
 from cangauge.extras.validation.twin.pack import TwinPack
 from cangauge.extras.validation.twin.recording import record_drive
@@ -84,12 +84,9 @@ class CheckedPack:
             If there are too few logs, or one has no SoC.
         """
         if len(logs) < LEAST_LOGS:
-            raise InputError(
-                f"{len(logs)} healthy logs are too few: one is diagnosed, the others are its"
-                " references",
-                field="--logs",
-                cure=f"give at least {LEAST_LOGS}",
-            )
+            problem = f"{len(logs)} healthy logs are too few"
+            problem += ": one is diagnosed, the others are its references"
+            raise InputError(problem, field="--logs", cure=f"give at least {LEAST_LOGS}")
         pack = fit_surrogate_pack(logs, capacity_ah=capacity_ah, cells=cells)
         return cls(tuple(logs), capacity_ah, pack)
 
@@ -97,22 +94,22 @@ class CheckedPack:
     def simulated(cls) -> CheckedPack:
         """Return a simulated pack with a discharge and five drives."""
         plant, rng = draw_plant(np.random.default_rng([1, 1])), np.random.default_rng([1, 2])
-        pack, ambient_c = plant.pack, rng.uniform(8.0, 25.0)
+        pack, ambient_c = plant.pack, float(rng.uniform(8.0, 25.0))
         drives = [
             draw_drive(
-                rng, pack, hours=2.0, ambient_c=float(ambient_c), start_soc=1.0, end_soc=0.05,
+                rng, pack, hours=2.0, ambient_c=ambient_c, start_soc=1.0, end_soc=0.05,
                 discharge=True,
-            ),
-            *[
-                draw_drive(rng, pack, hours=0.8, ambient_c=float(ambient_c + away))
-                for away in np.linspace(-7.0, 7.0, SIMULATED_LOGS - 1)
-            ],
+            )
         ]  # fmt: skip
-        logs = tuple(
+        drives += [
+            draw_drive(rng, pack, hours=0.8, ambient_c=float(ambient_c + away))
+            for away in np.linspace(-7.0, 7.0, SIMULATED_LOGS - 1)
+        ]
+        logs = [
             record_drive(plant, drive, (), name=f"drive_{k}").log
-            for k, drive in enumerate(drives, start=1)
-        )
-        return cls(logs, pack.capacity_ah, pack)
+            for k, drive in enumerate(drives, 1)
+        ]
+        return cls(tuple(logs), pack.capacity_ah, pack)
 
     def findings(self, at_most: int | None = None) -> Iterator[Finding]:
         """Yield the diagnoses of each log left out: as it is, then with every effect.
@@ -127,43 +124,35 @@ class CheckedPack:
             k = round(float(place))
             others = [*self.logs[:k], *self.logs[k + 1 :]]
             known = learn([trace(log, self.capacity_ah) for log in others], self.capacity_ah)
-            yield self._finding(known, self.logs[k], None)
-            for kind in fault_kinds():
-                for floors in FLOORS:
-                    found = self._injected(known, self.logs[k], kind.id, floors)
-                    if found is None:
-                        break  # no larger size is possible
-                    yield found
+            for log, fault, floors in self._cases(self.logs[k], known.healthy_v2**0.5):
+                found = answer(
+                    known, analyse(known, [columns(known, trace(log, self.capacity_ah))])
+                )
+                truth = NONE if fault is None else fault.id
+                yield Finding(
+                    log=log.name,
+                    effect=None if fault is None else fault.id,
+                    floors=floors,
+                    size=0.0 if fault is None else fault.size,
+                    unit="" if fault is None else fault.kind.unit,
+                    group_right=found.stated_groups[0] == GROUP_OF.get(truth),
+                    name_right=found.verdict == truth,
+                    detected=found.detected,
+                    probability=found.probabilities[truth],
+                )
 
-    def _injected(self, known: References, log: Log, effect: str, floors: float) -> Finding | None:
-        kind, sign = fault_kind(effect), -1.0 if effect == "initial_soc" else 1.0
-        shape = {"at_s": 0.4 * log.duration_s} if "at_s" in kind.shape else {}
-        floor_v = known.healthy_v2**0.5
-        fault = Fault(effect, sign, shape, seed=0)
-        scaled = scale_injection([log], fault, floors * floor_v, self.pack)
-        if scaled.reached_v < _REACHED * floors * floor_v:
-            return None
-        injected = inject(log, [scaled.fault], self.pack).log
-        return self._finding(known, injected, scaled.fault, scaled.reached_v / floor_v)
-
-    def _finding(
-        self, known: References, log: Log, fault: Fault | None, floors: float = 0.0
-    ) -> Finding:
-        evidence = analyse(known, [columns(known, trace(log, self.capacity_ah))])
-        found: Posterior = answer(known, evidence)
-        truth = NONE if fault is None else fault.id
-        first = found.stated_groups[0]
-        return Finding(
-            log=log.name,
-            effect=None if fault is None else fault.id,
-            floors=floors,
-            size=0.0 if fault is None else fault.size,
-            unit="" if fault is None else fault.kind.unit,
-            group_right=first == GROUP_OF.get(truth),
-            name_right=found.verdict == truth,
-            detected=found.detected,
-            probability=found.probabilities[truth],
-        )
+    def _cases(self, log: Log, floor_v: float) -> Iterator[tuple[Log, Fault | None, float]]:
+        """Yield a log as it is, then with every effect at each possible size [floors]."""
+        yield log, None, 0.0
+        for kind in fault_kinds():
+            shape = {"at_s": 0.4 * log.duration_s} if "at_s" in kind.shape else {}
+            wanted = Fault(kind.id, -1.0 if kind.id == "initial_soc" else 1.0, shape, seed=0)
+            for floors in FLOORS:
+                scaled = scale_injection([log], wanted, floors * floor_v, self.pack)
+                if scaled.reached_v < _REACHED * floors * floor_v:
+                    break  # no larger size is possible
+                injected = inject(log, [scaled.fault], self.pack).log
+                yield injected, scaled.fault, scaled.reached_v / floor_v
 
 
 PER_LOG: Final = 1 + len(fault_kinds()) * len(FLOORS)
@@ -173,25 +162,6 @@ PER_LOG: Final = 1 + len(fault_kinds()) * len(FLOORS)
 def summarize(findings: Sequence[Finding]) -> dict[str, Any]:
     """Return the result as one JSON object."""
     healthy = [item for item in findings if item.effect is None]
-    effects = []
-    for kind in fault_kinds():
-        mine = [item for item in findings if item.effect == kind.id]
-        sizes = [
-            {
-                "floors": floors,
-                "size": float(np.mean([abs(item.size) for item in of])),
-                "of": len(of),
-                "group_right": sum(item.group_right for item in of),
-                "named": sum(item.name_right for item in of),
-                "detected": sum(item.detected for item in of),
-                "probability": float(np.mean([item.probability for item in of])),
-            }
-            for floors in FLOORS
-            if (of := [x for x in mine if _REACHED * floors <= x.floors < floors / _REACHED])
-        ]
-        effects.append(
-            {"effect": kind.id, "group": GROUP_OF[kind.id], "unit": kind.unit, "sizes": sizes}
-        )
     return {
         "schema": SCHEMA,
         "healthy": {
@@ -199,26 +169,48 @@ def summarize(findings: Sequence[Finding]) -> dict[str, Any]:
             "alarms": sum(item.detected for item in healthy),
             "probability_none": float(np.mean([item.probability for item in healthy])),
         },
-        "effects": effects,
+        "effects": [
+            {
+                "effect": kind.id,
+                "group": GROUP_OF[kind.id],
+                "unit": kind.unit,
+                "sizes": _sizes([item for item in findings if item.effect == kind.id]),
+            }
+            for kind in fault_kinds()
+        ],
         "cases": [asdict(item) for item in findings],
     }
+
+
+def _sizes(findings: Sequence[Finding]) -> list[dict[str, Any]]:
+    """Return how often an effect was found at each size at which it was injected."""
+    return [
+        {
+            "floors": floors,
+            "size": float(np.mean([abs(item.size) for item in of])),
+            "of": len(of),
+            "group_right": sum(item.group_right for item in of),
+            "named": sum(item.name_right for item in of),
+            "detected": sum(item.detected for item in of),
+            "probability": float(np.mean([item.probability for item in of])),
+        }
+        for floors in FLOORS
+        if (of := [x for x in findings if _REACHED * floors <= x.floors < floors / _REACHED])
+    ]
 
 
 def table(result: dict[str, Any]) -> tuple[list[str], list[list[str]]]:
     """Return headings and rows: how often the group and the name of each effect are right."""
     rows = []
     for item in result["effects"]:
-        cells = []
-        for floors in FLOORS:
-            of = next((each for each in item["sizes"] if each["floors"] == floors), None)
-            if of is None:
-                cells.append(NONE_KNOWN)
-                continue
-            unit = "" if item["unit"] == "-" else item["unit"]
-            cells.append(
-                f"{significant(of['size'], 2, unit)}: {of['group_right']}/{of['of']},"
-                f" {of['named']}/{of['of']}"
-            )
+        unit, by_floors = item["unit"].replace("-", ""), {of["floors"]: of for of in item["sizes"]}
+        cells = [
+            f"{significant(of['size'], 2, unit)}: {of['group_right']}/{of['of']},"
+            f" {of['named']}/{of['of']}"
+            if (of := by_floors.get(floors))
+            else NONE_KNOWN
+            for floors in FLOORS
+        ]
         rows.append([item["effect"], *cells])
     return ["effect", *(f"{floors:g} floor{'s' * (floors > 1)}" for floors in FLOORS)], rows
 

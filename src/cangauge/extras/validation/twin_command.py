@@ -20,12 +20,9 @@ def twin_command(
     effect: list[str] | None = None,
     day: int = 1,
     hours: float | None = None,
-    ambient_c: float | None = None,
-    start_soc: float | None = None,
-    end_soc: float | None = None,
     discharge: bool = False,
     pack: str | None = None,
-    plant: Literal["twin", "equation", "published", "pybamm"] = "twin",
+    plant: Literal["twin", "equation"] = "twin",
     json_output: bool = False,
 ) -> None:
     """Simulate a pack, a drive, the weather and the sensors: a log whose truth is known.
@@ -34,13 +31,15 @@ def twin_command(
     open-circuit voltage, Butler–Volmer kinetics, diffusion, two thermal nodes, cell spread,
     quantized and jittered sensors. Positive current discharges.
 
+    Python's `cangauge.simulate` takes the same and more: weather, SoC, speed, the chemistry.
+
     Examples
     --------
     `cangauge twin --seed 1 --discharge -o full.parquet`
 
     `cangauge twin --seed 1 --day 2 --effect current_offset:offset_a=1.5 -o trip.parquet`
 
-    `cangauge twin --seed 1 --day 3 --effect weak_cell:gap_v=1 --ambient-c -5 -o cold.csv`
+    `cangauge twin --seed 1 --effect weak_cell:gap_v=1 --pack leaf24 -o cell.csv`
 
     Parameters
     ----------
@@ -56,18 +55,12 @@ def twin_command(
         Number of the drive, with its weather.
     hours : H (0.05 … 12 h)
         Duration. Default: 0.5 to 2.5, drawn.
-    ambient_c : C (-30 … 50 °C)
-        Ambient temperature. Default: -10 to 35, drawn.
-    start_soc : P (0 … 100 %)
-        Initial SoC. Default: drawn.
-    end_soc : P (0 … 100 %)
-        SoC at which the drive ends.
     discharge : --discharge
         Drive from full to empty within the hours (default 2.5 h): a log for `fit`.
     pack : KIND
         leaf24, leaf40, car60, car60lfp, compact or module12. Default: drawn.
-    plant : twin|equation|published|pybamm
-        Model of the cells; pybamm needs the extra cangauge[pybamm].
+    plant : twin|equation
+        Model of the cells: the twin's, or the equation that cangauge identifies.
     """
     from cangauge.extras.validation.twin.simulation import simulate
     from cangauge.logs.canonical import write_log
@@ -81,9 +74,6 @@ def twin_command(
             seed=seed,
             drive=day,
             hours=hours,
-            ambient_c=ambient_c,
-            start_soc_pct=start_soc,
-            end_soc_pct=end_soc,
             discharge=discharge,
             pack=pack,
             plant=plant,

@@ -29,27 +29,20 @@ from typing import Any, Final, Literal, NamedTuple
 import numpy as np
 
 from cangauge._typing import FloatArray
+from cangauge.logs.log import Log
 from cangauge.model.voltage_model import PLAUSIBLE_C, VoltageModel
 
 Scale = Literal["one", "capacity", "voltage", "resistance"]
 
-Family = Literal[
-    "current_sensing",
-    "voltage_sensing",
-    "thermal",
-    "timing",
-    "charge",
-    "resistance",
-    "dynamics",
-    "equilibrium",
-    "imbalance",
-]
+Group = Literal["sensors_and_count", "overpotential", "clock", "thermal", "weak_cell"]
+"""What an engineer would look at together."""
 
 Values = Mapping[str, float]
 """Parameter name → value, in the parameter's unit."""
 
 Memories = Sequence[Any]
-"""An effect's `Memory` objects, of its own kinds."""
+"""What an effect carries from sample to sample: objects such as `Lag`, each with `state()`, numbers
+that begin with a time [s] and are none before the first sample, and `restore(state)`."""
 
 RESISTANCE_AT_LEAST = 0.002
 """Lower limit of the resistance that bounds scale with, as voltage drop at 1 C relative to the
@@ -104,8 +97,6 @@ class Parameter:
         Trial values of a shape; None for an amplitude.
     from_pack : {"temperature_c"}, optional
         Marks a constant: this size of the pack at the time the effect is added, fixed afterwards.
-    is_change_point : bool
-        Whether this shape is the time of a step: its trial values spread over each log.
     """
 
     name: str
@@ -116,7 +107,6 @@ class Parameter:
     scale: Scale = "one"
     grid: tuple[float, ...] | None = None
     from_pack: Literal["temperature_c"] | None = None
-    is_change_point: bool = False
 
     def factor(self, pack: Pack) -> float:
         """Return the factor from units of `scale` to the parameter's unit."""
@@ -139,15 +129,8 @@ class Parameter:
             low, high = (low * margin if low < 0.0 else low / margin), high * margin
         return low, high
 
-    def trials(self, pack: Pack, time_s: FloatArray | None = None) -> tuple[float, ...]:
-        """Return the trial values of a shape in its unit; none for an amplitude.
-
-        On a log with times `time_s` [s], change points spread evenly over it, without its ends. The
-        k-th value has the same meaning on every log of a group with one cause.
-        """
-        if self.is_change_point and time_s is not None:
-            duration = float(time_s[-1] - time_s[0])
-            return tuple(duration * part / 20.0 for part in range(1, 20))
+    def trials(self, pack: Pack) -> tuple[float, ...]:
+        """Return the trial values of a shape in its unit; none for an amplitude."""
         factor = self.factor(pack)
         return tuple(value * factor for value in self.grid or ())
 
@@ -156,9 +139,6 @@ DELAYED: Final = Parameter("delayed", "1", 0.0, 1.0, neutral=None, grid=(1.0, 0.
 """Whether an effect scales the whole drop of the voltage model (1) or only that of the present
 current over the sum of the resistances (0): contacts and electrolyte respond at once, diffusion
 does not. Values in between mix both."""
-
-LAG: Final = Parameter("lag_s", "s", 0.0, 10000.0, neutral=None, grid=(0.0,))
-"""Time constant of the cell interior behind the measured temperature (0: none)."""
 
 
 class Reading(NamedTuple):
@@ -178,6 +158,11 @@ class Signals(NamedTuple):
     current_a: FloatArray
     voltage_v: FloatArray
     temperature_c: FloatArray
+
+    @classmethod
+    def of(cls, log: Log) -> Signals:
+        """Return the signals of a log."""
+        return cls(log.time_s, log.current_a, log.voltage_v, log.temperature_c)
 
 
 class Load(NamedTuple):
@@ -235,6 +220,8 @@ class Context(NamedTuple):
     pack: Pack
     memory: Memories = ()
     """Carried from sample to sample."""
+    is_whole: bool = False
+    """Whether a call gets a whole log, after which no sample comes."""
 
 
 def _same(signals: Signals, *_: object) -> Signals:
@@ -256,7 +243,7 @@ class Effect:
     Parameters
     ----------
     id : str
-    family : Family
+    group : Group
     parameters : tuple of Parameter
     equation, source : str
     signature : str
@@ -275,18 +262,16 @@ class Effect:
         (soc_pct, values, model) → factor on `drive` at SoC [%] of shape (n,).
     memory : callable
         (values, pack) → what is carried from sample to sample, before the first one.
-    rc_elements : callable
-        (values) → resistance [Ω] and time constant [s] of voltages from earlier currents.
+    rc_element : callable
+        (values) → resistance [Ω] and time constant [s] of an RC element; None if it is none.
     core_form : callable
         (values, model, pack) → form in the C core; None if it has none.
-    is_cause : bool
-        Whether a diagnosis may name it; otherwise it is structure, learned from references only.
     scales_drop : bool
         Whether the added voltage follows the model's drop over the resistances.
     """
 
     id: str
-    family: Family
+    group: Group
     parameters: tuple[Parameter, ...]
     equation: str
     source: str
@@ -297,9 +282,8 @@ class Effect:
     drive: Callable[[Load, Values, Context], FloatArray | None] = _none
     over_soc: Callable[[FloatArray, Values, VoltageModel], FloatArray | float] = _at_every_soc
     memory: Callable[[Values, Pack], Memories] = lambda *_: ()
-    rc_elements: Callable[[Values], list[tuple[float, float]]] = lambda _: []
+    rc_element: Callable[[Values], tuple[float, float] | None] = _none
     core_form: Callable[[Values, VoltageModel, Pack], CoreForm | None] = _none
-    is_cause: bool = True
     scales_drop: bool = False
 
     @property

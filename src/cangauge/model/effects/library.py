@@ -20,6 +20,13 @@ LIBRARY: Mapping[str, Effect] = {effect.id: effect for effect in (*CORRECTIONS, 
 LARGEST = 1e30
 """Upper limit of any parameter in a model file, in any unit."""
 
+RETIRED: Mapping[str, tuple[str, ...]] = {
+    "resistance_temperature": ("lag_s",),
+    "entropic_coefficient": ("lag_s",),
+    "slow_diffusion": ("spread",),
+}
+"""Effect → parameters of earlier versions, which no search gave another value than 0."""
+
 STEP = 0.02
 """Finite-difference step, relative to the width of an amplitude's bounds or to a shape."""
 
@@ -95,6 +102,9 @@ def shape_key(effect: Effect, values: Values) -> tuple[object, ...]:
 
 def _parse_values(effect: Effect, given: object, pack: Pack, field: str) -> Values:
     names = [parameter.name for parameter in effect.parameters]
+    if isinstance(given, Mapping):
+        retired = {name for name in RETIRED.get(effect.id, ()) if given.get(name) == 0.0}
+        given = {name: value for name, value in given.items() if name not in retired}
     if not isinstance(given, Mapping) or set(given) != set(names):
         raise InputError(
             f"{effect.id} has the parameters {', '.join(names)}",
@@ -149,16 +159,8 @@ class EffectCandidate:
         return {**dict(zip(self.amplitudes, total, strict=True)), **self.shape}
 
 
-def candidates(effects: Sequence[Effect], pack: Pack, time_s: FloatArray) -> list[EffectCandidate]:
-    """Return every effect with every combination of trial values of its shapes.
-
-    Parameters
-    ----------
-    effects : sequence of Effect
-    pack : Pack
-    time_s : array
-        Times of a log [s]; the k-th shape has the same meaning on every log of a group.
-    """
+def candidates(effects: Sequence[Effect], pack: Pack) -> list[EffectCandidate]:
+    """Return every effect with every combination of trial values of its shapes."""
     result = []
     for effect in effects:
         neutral = effect.neutral(pack)
@@ -169,7 +171,7 @@ def candidates(effects: Sequence[Effect], pack: Pack, time_s: FloatArray) -> lis
         small = STEP * (bounds[:, 1] - bounds[:, 0])
         steps = np.where(small > bounds[:, 1], -small, small)
         shapes = effect.shapes if effect.amplitudes else ()
-        grids = [parameter.trials(pack, time_s) for parameter in shapes]
+        grids = [parameter.trials(pack) for parameter in shapes]
         for choice in itertools.product(*grids):
             shape = dict(zip((item.name for item in shapes), choice, strict=True))
             shape |= effect.constants(pack)

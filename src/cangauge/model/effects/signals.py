@@ -5,7 +5,6 @@ The rows stand in the order of correction: sensors before quantities computed fr
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
@@ -24,7 +23,7 @@ from cangauge.model.effects.base import (
     Signals,
     Values,
 )
-from cangauge.model.first_order import Lag, Memory
+from cangauge.model.first_order import Lag
 
 SMOOTHING_S: Final = 200.0
 """Time constant of the smoothed derivative [s]: short against the warming of a pack, long against
@@ -57,7 +56,7 @@ def _linear_sensor(
     is_offset = error == "offset"
     return Effect(
         id=f"{signal}_{error}",
-        family="current_sensing" if signal == "current" else "voltage_sensing",
+        group="sensors_and_count",
         parameters=(parameter,),
         signature=signature,
         equation=f"{symbol} = {symbol}_measured " + ("− b" if is_offset else "/ (1 + g)"),
@@ -68,7 +67,7 @@ def _linear_sensor(
     )
 
 
-class _Waiting(Memory):
+class _Waiting:
     """Rows that wait for their current, and the currents that later rows need."""
 
     def __init__(self, skew_s: float) -> None:
@@ -76,13 +75,13 @@ class _Waiting(Memory):
         self._waiting = np.empty((4, 0))
         self._currents = np.empty((2, 0))
 
-    def step(self, signals: Signals) -> Signals:
-        """Append rows and return those whose current has come."""
+    def step(self, signals: Signals, *, is_last: bool) -> Signals:
+        """Append rows and return those whose current has come; all of them at the end."""
         self._waiting = np.concatenate([self._waiting, np.stack(signals)], axis=1)
         self._currents = np.concatenate([self._currents, np.stack(signals[:2])], axis=1)
         times, currents = self._currents
         at_s = self._waiting[0] + self._skew_s
-        ready = at_s.size if self.whole else int(np.searchsorted(at_s, times[-1], side="right"))
+        ready = at_s.size if is_last else int(np.searchsorted(at_s, times[-1], side="right"))
         time_s, _, voltage_v, temperature_c = self._waiting[:, :ready]
         skewed = np.interp(at_s[:ready], times, currents)
         self._waiting = self._waiting[:, ready:]
@@ -97,27 +96,13 @@ class _Waiting(Memory):
         return [float(self._waiting.shape[1]), *waiting, *self._currents.ravel().tolist()]
 
     def restore(self, state: Sequence[float]) -> None:
-        waiting = int(state[0]) if state else -1
-        first = 1 + 4 * waiting
-        kept, odd = divmod(len(state) - first, 2)
-        if waiting < 0 or kept < 0 or odd:
-            raise ValueError("not the waiting readings followed by times and as many currents")
-        times = state[first : first + kept]
-        stamps = state[1:first:4]
-        if not all(map(math.isfinite, [*state[first:], *stamps])):
-            raise ValueError("not finite")
-        if any(np.any(np.diff(kind) <= 0.0) for kind in (times, stamps)):
-            raise ValueError("times must increase")
-        # The waiting readings are the latest samples, and the kept times end with the same ones.
-        both = min(waiting, kept)
-        if list(stamps[waiting - both :]) != list(times[kept - both :]) or (waiting and not kept):
-            raise ValueError("the waiting readings do not match the times")
-        self._waiting = np.array(state[1:first]).reshape(waiting, 4).T
-        self._currents = np.array(state[first:]).reshape(2, kept)
+        readings = 4 * int(state[0])
+        self._waiting = np.array(state[1 : 1 + readings]).reshape(-1, 4).T
+        self._currents = np.array(state[1 + readings :]).reshape(2, -1)
 
 
 def _time_skew(signals: Signals, _: Values, at: Context) -> Signals:
-    return at.memory[0].step(signals) if at.memory else signals
+    return at.memory[0].step(signals, is_last=at.is_whole) if at.memory else signals
 
 
 def _temperature_lag(signals: Signals, values: Values, at: Context) -> Signals:
@@ -189,7 +174,7 @@ CORRECTIONS: Final = (
     # current never arrives, use the last current.
     Effect(
         id="time_skew",
-        family="timing",
+        group="clock",
         parameters=(
             Parameter(
                 "skew_s", "s", -4.0, 4.0,
@@ -211,7 +196,7 @@ CORRECTIONS: Final = (
     # Undone with a causal smoothed derivative.
     Effect(
         id="temperature_lag",
-        family="thermal",
+        group="thermal",
         parameters=(Parameter("tau_s", "s", 0.0, 2000.0),),
         signature="kt·τ·dT/dt: while the pack warms or cools, zero at constant temperature",
         equation="T = T_measured + τ·dT_measured/dt, the derivative smoothed over 200 s",
@@ -231,7 +216,7 @@ CORRECTIONS: Final = (
     # effect that uses the temperature.
     Effect(
         id="core_temperature",
-        family="thermal",
+        group="thermal",
         parameters=(
             Parameter("rise_k", "K", 0.0, 25.0),
             Parameter("late", "1", 0.0, 1.0),
@@ -265,7 +250,7 @@ COUNTS: Final = (
     # By ageing, cold or a wrong data sheet.
     Effect(
         id="capacity",
-        family="charge",
+        group="sensors_and_count",
         parameters=(Parameter("change_pct", "%", -35.0, 35.0),),
         signature="OCV′·(Ah since the start): a slope over charge, steep in the knee near empty",
         equation="S = S₀ − 100·∫I dt / (C·(1 + x))",
@@ -283,7 +268,7 @@ COUNTS: Final = (
     # an initial SoC from the first voltage needs no correction.
     Effect(
         id="initial_soc",
-        family="charge",
+        group="sensors_and_count",
         parameters=(Parameter("offset_pct", "%", -12.0, 12.0),),
         signature="OCV′(S): larger where the OCV is steep, at any current and time",
         equation="S₀ = S₀_assumed + x",
@@ -301,7 +286,7 @@ COUNTS: Final = (
     # charge that bypasses it, with the same signature.
     Effect(
         id="coulombic_efficiency",
-        family="charge",
+        group="sensors_and_count",
         parameters=(Parameter("efficiency", "1", 0.7, 1.0, neutral=1.0),),
         signature="OCV′·(Ah charged since the start): a drift that grows with regeneration only",
         equation="S = S₀ − 100·∫(I⁺ + η·I⁻)dt / C",

@@ -11,7 +11,6 @@ from cangauge._typing import FloatArray
 from cangauge.logs.gaps import BRIDGE_S
 from cangauge.model.effects.base import (
     DELAYED,
-    LAG,
     Context,
     CoreForm,
     Effect,
@@ -29,13 +28,6 @@ REFERENCE_C: Final = 25.0
 ACTIVATION: Final = Parameter("activation_k", "K", 0.0, 6000.0, neutral=None, grid=(0.0, 3000.0))
 """Arrhenius activation of an RC element's resistance, which is stated at 25 °C."""
 
-# Spread of slow diffusion over RC elements.
-ELEMENTS: Final = 5
-"""RC elements of a spread: with the slowest at 2400 s the fastest has 9 s."""
-TAU_RATIO: Final = 4.0
-"""Ratio of the time constants of neighbouring elements."""
-RESISTANCE_RATIO: Final = 2.0
-"""Ratio of their resistances: that of diffusion scales with the square root of time."""
 MEAN_SLOPE_PCT: Final = (10.0, 90.0)
 """SoC between which the mean slope of the open-circuit voltage is taken [%]."""
 STEEPNESS_AT_MOST: Final = 5.0
@@ -46,14 +38,6 @@ BEND_ZERO_C_RATE: Final = 1.0
 pack already contains the mean slope over the currents of a drive."""
 ACTIVATION_K: Final = 5000.0
 """Usual activation of the exchange current [K], about 42 kJ/mol; `exchange_a` holds at 25 °C."""
-
-CENTRES_PCT: Final = (3.0, 8.0, 14.0, 22.0, 32.0, 43.0, 54.0, 65.0, 76.0, 86.0, 94.0)
-WIDTHS_PCT: Final = (3.0, 3.5, 4.5, 5.5, 6.5, 7.0, 7.0, 7.0, 6.5, 5.5, 4.5)
-"""Centre and width of each bump [% SoC], narrower where the OCV of common chemistries bends."""
-BUMPS: Final = tuple(
-    Parameter(f"at_{centre:.0f}_pct_v", "V", -0.01, 0.01, scale="voltage")
-    for centre in CENTRES_PCT
-)  # fmt: skip
 
 
 def _of(values: Values, *names: str) -> tuple[float, ...]:
@@ -69,8 +53,7 @@ def arrhenius(temperature_c: FloatArray, activation_k: float) -> FloatArray:
 
 
 def _colder_drop(load: Load, values: Values, at: Context) -> FloatArray:
-    interior_c = at.memory[0].step(load.time_s, load.temperature_c)
-    colder = inverse_k(interior_c) - inverse_k(values["reference_c"])
+    colder = inverse_k(load.temperature_c) - inverse_k(values["reference_c"])
     scaled_v = load.scaled_drop_v(values["delayed"], at.pack)
     return np.asarray(values["share"] * scaled_v * np.expm1(values["activation_k"] * colder))
 
@@ -102,37 +85,25 @@ def _bend_form(values: Values, _: VoltageModel, pack: Pack) -> CoreForm:
     return CoreForm("charge_transfer", (values["scale_v"], 0.5 / values["exchange_a"], *rest))
 
 
-def _rc_elements(values: Values) -> list[tuple[float, float]]:
-    """Return resistance [Ω] and time constant [s] of RC elements in series; one without spread."""
-    weights = [(values.get("spread", 0.0) / RESISTANCE_RATIO) ** k for k in range(ELEMENTS)]
-    return [
-        (values["ohm"] * weight / sum(weights), values["tau_s"] / TAU_RATIO**k)
-        for k, weight in enumerate(weights)
-        if weight > 0.0
-    ]
-
-
 def _rc_voltage(load: Load, values: Values, at: Context) -> FloatArray:
-    volts = np.zeros_like(load.current_a)
-    for (ohm, _), lag in zip(_rc_elements(values), at.memory, strict=True):
-        volts -= ohm * lag.step(load.time_s, load.current_a)
-    return volts * arrhenius(load.temperature_c, values["activation_k"])
+    volts = -values["ohm"] * at.memory[0].step(load.time_s, load.current_a)
+    return np.asarray(volts * arrhenius(load.temperature_c, values["activation_k"]))
 
 
 def _rc_form(values: Values, model: VoltageModel, _: Pack) -> CoreForm:
-    ohm, tau_s = zip(*_rc_elements(values), strict=True)
     by_slope = values.get("by_slope", 0.0)
     mean_slope = _mean_slope(model) if by_slope else 1.0
-    return CoreForm("rc", (values["activation_k"], by_slope, mean_slope, *ohm), tau_s)
+    constants = (values["activation_k"], by_slope, mean_slope, values["ohm"])
+    return CoreForm("rc", constants, (values["tau_s"],))
 
 
 _RC: Final[Mapping[str, Any]] = {
-    "memory": lambda v, _: tuple(Lag(tau, 0.0, rest_s=BRIDGE_S) for _, tau in _rc_elements(v)),
-    "rc_elements": _rc_elements,
+    "memory": lambda v, _: (Lag(v["tau_s"], 0.0, rest_s=BRIDGE_S),),
+    "rc_element": lambda v: (v["ohm"], v["tau_s"]),
     "drive": _rc_voltage,
     "core_form": _rc_form,
 }
-"""RC elements in series on the current, at rest before the first sample."""
+"""An RC element on the current, at rest before the first sample."""
 
 
 def _mean_slope(model: VoltageModel) -> float:
@@ -158,26 +129,13 @@ def _travel_as(values: Values, pack: Pack) -> float:
 
 
 def _entropic_drive(load: Load, _: Values, at: Context) -> FloatArray:
-    interior_c = at.memory[0].step(load.time_s, load.temperature_c)
-    return np.asarray(np.clip(interior_c, *PLAUSIBLE_C) - at.model.t_ref_c)
+    return np.asarray(np.clip(load.temperature_c, *PLAUSIBLE_C) - at.model.t_ref_c)
 
 
 def _entropic_shape(soc_pct: FloatArray, values: Values, *_: object) -> FloatArray:
     x = np.clip(soc_pct, 0.0, 100.0) / 50.0 - 1.0
     shape = values["level_v_per_k"] + values["slope_v_per_k"] * x
     return np.asarray(shape + values["curve_v_per_k"] * (1.5 * x * x - 0.5))
-
-
-def _inner_drive(load: Load, values: Values, at: Context) -> FloatArray:
-    per_k = values["voltage_v_per_k"] + values["drop_per_k"] * load.drop_v
-    away = at.memory[0].step(load.time_s, load.temperature_c) - load.temperature_c
-    return np.asarray(per_k * away)
-
-
-def _bumps(soc_pct: FloatArray, values: Values, *_: object) -> FloatArray:
-    away = (np.clip(soc_pct, 0.0, 100.0)[:, None] - CENTRES_PCT) / WIDTHS_PCT
-    heights = np.array([values[bump.name] for bump in BUMPS])
-    return np.asarray(np.exp(-0.5 * away * away) @ heights)
 
 
 def _ahead(values: Values) -> float:
@@ -191,10 +149,10 @@ def _weak_less_healthy(soc_pct: FloatArray, values: Values, model: VoltageModel)
 
 VOLTAGES: Final = (
     # Zero at `reference_c`, the middle of the identified temperature range when the effect was
-    # added. The temperature is that of the cell interior, `lag_s` behind the measured one.
+    # added.
     Effect(
         id="resistance_temperature",
-        family="resistance",
+        group="overpotential",
         parameters=(
             Parameter("share", "1", 0.0, 3.0),
             Parameter(
@@ -202,12 +160,11 @@ VOLTAGES: Final = (
             ),
             DELAYED,
             Parameter("reference_c", "°C", *PLAUSIBLE_C, neutral=None, from_pack="temperature_c"),
-            LAG,
         ),
         signature="the drop over the resistance, growing with (T₀ − T)",
         equation=(
             "ΔU = a·ΣRj·I(t − dj)·(exp(B·(1/T − 1/T₀)) − 1), T₀ = reference_c;"
-            " or ΣRj·I in place of ΣRj·I(t − dj); τ·dT/dt = T_measured − T, τ = lag_s"
+            " or ΣRj·I in place of ΣRj·I(t − dj)"
         ),
         source="Waag, Käbitz, Sauer, Applied Energy 102 (2013) 885",
         separated_by=(
@@ -215,7 +172,6 @@ VOLTAGES: Final = (
             " together it is not separable from resistance_soc"
         ),
         scales_drop=True,
-        memory=lambda v, _: (Lag(v["lag_s"]),),
         drive=_colder_drop,
         core_form=lambda v, _, pack: CoreForm(
             "resistance_temperature",
@@ -224,13 +180,12 @@ VOLTAGES: Final = (
                 float(inverse_k(v["reference_c"])),
                 pack.resistance_ohm,
             ),
-            (v["lag_s"],),
         ),
     ),
     # Decays exponentially from empty and from full.
     Effect(
         id="resistance_soc",
-        family="resistance",
+        group="overpotential",
         parameters=(
             Parameter("at_empty", "1", -0.4, 3.0),
             Parameter("at_full", "1", -0.4, 1.5),
@@ -255,7 +210,7 @@ VOLTAGES: Final = (
     # Additional (or missing) resistance to charging current.
     Effect(
         id="resistance_asymmetry",
-        family="resistance",
+        group="overpotential",
         parameters=(Parameter("charging_ohm", "ohm", -0.6, 1.5, scale="resistance"),),
         signature="min(I, 0): only while charging, in step with the current",
         equation="ΔU = −r·min(I, 0)",
@@ -272,13 +227,10 @@ VOLTAGES: Final = (
     # drives has `start_s` = 0.
     Effect(
         id="resistance_step",
-        family="resistance",
+        group="overpotential",
         parameters=(
             Parameter("step_ohm", "ohm", -0.4, 2.0, scale="resistance"),
-            Parameter(
-                "start_s", "s", 0.0, 1e7, neutral=None, is_change_point=True,
-                grid=(0.0, 300.0, 600.0, 1200.0, 1800.0, 2700.0, 3600.0, 5400.0, 7200.0),
-            ),
+            Parameter("start_s", "s", 0.0, 1e7, neutral=None, grid=(1800.0,)),
         ),
         signature="I·1(t > t₀): the drop over the resistance changes in a step and stays changed",
         equation="ΔU = −r·I for t − t_first ≥ t₀, else 0",
@@ -295,7 +247,7 @@ VOLTAGES: Final = (
     # per electrode (51 mV at 25 °C) times the cells in series; the bound allows two electrodes.
     Effect(
         id="charge_transfer",
-        family="dynamics",
+        group="overpotential",
         parameters=(
             Parameter("scale_v", "V", 0.0, 0.03, scale="voltage"),
             Parameter(
@@ -320,7 +272,7 @@ VOLTAGES: Final = (
     # Double layer and charge transfer, faster than the model's first delay.
     Effect(
         id="fast_polarization",
-        family="dynamics",
+        group="overpotential",
         parameters=(
             Parameter("ohm", "ohm", 0.0, 1.0, scale="resistance"),
             Parameter("tau_s", "s", 0.3, 9.0, neutral=None, grid=(0.5, 1.0, 2.0, 3.5, 6.0, 9.0)),
@@ -338,26 +290,22 @@ VOLTAGES: Final = (
     # voltage (`by_slope` 1); diffusion in the electrolyte is the same at every SoC (0).
     Effect(
         id="slow_diffusion",
-        family="dynamics",
+        group="overpotential",
         parameters=(
             Parameter("ohm", "ohm", 0.0, 1.5, scale="resistance"),
             Parameter(
                 "tau_s", "s", 70.0, 2500.0, neutral=None,
                 grid=(80.0, 130.0, 220.0, 400.0, 750.0, 1400.0, 2400.0),
             ),
-            Parameter("spread", "1", 0.0, 1.0, neutral=None, grid=(0.0,)),
             ACTIVATION,
             Parameter("by_slope", "1", 0.0, 1.0, neutral=None, grid=(0.0,)),
         ),
         signature="low-passed current over 70–2500 s: it decays through a rest after a drive",
         equation=(
-            "ΔU = −R·f(S)·Σ wₖ·yₖ·exp(B·(1/T − 1/T₂₅)), (τ/4ᵏ)·dyₖ/dt = I − yₖ, wₖ ∝ (spread/2)ᵏ,"
-            " k = 0…4; f = 1 − b + b·U₀′(S)/mean U₀′, b = by_slope"
+            "ΔU = −R·f(S)·y·exp(B·(1/T − 1/T₂₅)), τ·dy/dt = I − y;"
+            " f = 1 − b + b·U₀′(S)/mean U₀′, b = by_slope"
         ),
-        source=(
-            "Plett, Battery Management Systems vol. I, Artech House 2015, ch. 2; elements spread"
-            " like diffusion's: Oldham, J. Electroanal. Chem. 72 (1976) 371"
-        ),
+        source="Plett, Battery Management Systems vol. I, Artech House 2015, ch. 2",
         separated_by=(
             "a rest of an hour after a drive: hysteresis persists, this decays;"
             " core_temperature is even in the current"
@@ -369,7 +317,7 @@ VOLTAGES: Final = (
     # rest.
     Effect(
         id="hysteresis",
-        family="equilibrium",
+        group="overpotential",
         parameters=(
             Parameter("half_width_v", "V", 0.0, 0.01, scale="voltage"),
             Parameter("travel_pct", "%", 0.5, 12.0, neutral=None, grid=(1.0, 2.0, 4.0, 7.0, 11.0)),
@@ -392,85 +340,34 @@ VOLTAGES: Final = (
             "hysteresis", (v["half_width_v"], _travel_as(v, pack))
         ),
     ),
-    # In addition to the model's kt. The bounds are ±0.4 mV/K per cell. The temperature is that of
-    # the cell interior, `lag_s` behind the measured one.
+    # In addition to the model's kt. The bounds are ±0.4 mV/K per cell.
     Effect(
         id="entropic_coefficient",
-        family="equilibrium",
+        group="thermal",
         parameters=(
             Parameter("level_v_per_k", "V/K", -1.1e-4, 1.1e-4, scale="voltage"),
             Parameter("slope_v_per_k", "V/K", -1.1e-4, 1.1e-4, scale="voltage"),
             Parameter("curve_v_per_k", "V/K", -1.1e-4, 1.1e-4, scale="voltage"),
-            LAG,
         ),
         signature="(T − T_r)·f(S), at any current",
-        equation=(
-            "ΔU = (T − T_r)·(c + a·x + b·(3x² − 1)/2), x = S/50 − 1; τ·dT/dt = T_measured − T,"
-            " τ = lag_s"
-        ),
+        equation="ΔU = (T − T_r)·(c + a·x + b·(3x² − 1)/2), x = S/50 − 1",
         source="Reynier, Yazami, Fultz, J. Power Sources 119–121 (2003) 850",
         separated_by=(
             "the same SoC, rested, at two temperatures; at one temperature it is not separable from"
             " any other change of the OCV with SoC"
         ),
-        memory=lambda v, _: (Lag(v["lag_s"]),),
         drive=_entropic_drive,
         over_soc=_entropic_shape,
         core_form=lambda v, model, _: CoreForm(
             "entropic",
             (*_of(v, "level_v_per_k", "slope_v_per_k", "curve_v_per_k"), model.t_ref_c),
-            (v["lag_s"],),
         ),
-    ),
-    # Every pack that is heated or cooled from outside has it, and larger cells have more of it: it
-    # is structure, not a fault. The diagnosis learns it from reference logs and never names it.
-    Effect(
-        id="inner_temperature",
-        family="thermal",
-        parameters=(
-            Parameter("voltage_v_per_k", "V/K", -5e-4, 5e-4, scale="voltage"),
-            Parameter("drop_per_k", "1/K", -0.04, 0.04),
-            Parameter("tau_s", "s", 100.0, 10000.0, neutral=None, grid=(400.0, 1200.0, 3600.0)),
-        ),
-        signature="in proportion to the recent change of temperature (minutes, hours), at any"
-        " current",
-        equation=(
-            "ΔU = (c + b·ΣRj·I(t − dj))·(T_τ − T),  τ·dT_τ/dt = T − T_τ, T_τ = T at the start"
-        ),
-        source="two-state thermal model, Forgez et al., J. Power Sources 195 (2010) 2961",
-        separated_by=(
-            "other logs that warm or cool: what all of them share belongs to the pack"
-        ),
-        scales_drop=True,
-        is_cause=False,
-        memory=lambda v, _: (Lag(v["tau_s"]),),
-        drive=_inner_drive,
-        core_form=lambda v, *_: CoreForm(
-            "inner_temperature", _of(v, "voltage_v_per_k", "drop_per_k"), (v["tau_s"],)
-        ),
-    ),
-    # A curve that the published formula cannot represent: structure of a chemistry, not a fault.
-    # The diagnosis learns it from reference logs and never names it.
-    Effect(
-        id="ocv_shape",
-        family="equilibrium",
-        parameters=BUMPS,
-        signature="a curve over SoC, the same at any current, temperature and time",
-        equation="ΔU = Σ vₖ·exp(−½((S − cₖ)/wₖ)²)",
-        source="radial basis functions, Broomhead, Lowe, Complex Systems 2 (1988) 321",
-        separated_by=(
-            "other logs over the same SoC: what all of them share belongs to the chemistry"
-        ),
-        is_cause=False,
-        drive=lambda load, *_: np.ones_like(load.current_a),
-        over_soc=_bumps,
-        core_form=lambda v, *_: CoreForm("ocv_shape", _of(v, *(bump.name for bump in BUMPS))),
     ),
     # From full the SoC of the weak cells falls faster. Below empty they follow the model's linear
     # extrapolation. A reversed cell falls faster, but a pack is switched off before that.
     Effect(
         id="weak_cell",
-        family="imbalance",
+        group="weak_cell",
         parameters=(
             Parameter("fraction", "1", 0.0, 0.15),
             Parameter(

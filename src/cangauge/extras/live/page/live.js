@@ -299,9 +299,6 @@
     at("out").addEventListener("click", () => move(2, 0));
     at("back").addEventListener("click", () => move(1, -0.5));
     at("forth").addEventListener("click", () => move(1, 0.5));
-    at("csv").addEventListener("click", () => {
-      at("csv").href = `/range.csv?span=${span}&from=${time.start - SHIFT_MS}&to=${time.end - SHIFT_MS}`;
-    });
     const tabs = [...document.querySelectorAll("[role=tab]")];
     tabs.forEach((tab, index) => {
       tab.addEventListener("click", () => choose(tab));

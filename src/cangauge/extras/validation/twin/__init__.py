@@ -7,8 +7,7 @@ states it.
 
 from __future__ import annotations
 
-from cangauge.extras.validation.twin.drive import read_speed
 from cangauge.extras.validation.twin.faults import Fault, FaultKind, fault_kinds
 from cangauge.extras.validation.twin.simulation import Simulation, simulate
 
-__all__ = ["Fault", "FaultKind", "Simulation", "fault_kinds", "read_speed", "simulate"]
+__all__ = ["Fault", "FaultKind", "Simulation", "fault_kinds", "simulate"]

@@ -179,5 +179,11 @@ class Condition:
     remanence_a: float = 0.0
     temperature_hold: float = 0.0
 
+    def current_through_cells(self, time_s: FloatArray, current_a: FloatArray) -> FloatArray:
+        """Return the current of a drive with that of a hidden load [A], shape (n,)."""
+        if self.hidden_load is None:
+            return current_a
+        return current_a + self.hidden_load.size * self.hidden_load.is_active(time_s)
+
 
 HEALTHY: Final = Condition()

@@ -3,16 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from os import PathLike
 from typing import Final
 
 import numpy as np
-import pyarrow as pa
-import pyarrow.csv as pacsv
 from scipy.ndimage import gaussian_filter1d
 from scipy.signal import lfilter
 
-from cangauge._files import MIB, read_bounded
 from cangauge._typing import FloatArray
 from cangauge.errors import InputError
 from cangauge.extras.validation.twin.pack import TwinPack
@@ -23,14 +19,6 @@ _STYLES: Final = {
     "country": ((15.0, 26.0), (30.0, 240.0), (2.0, 25.0)),
     "motorway": ((24.0, 36.0), (120.0, 900.0), (2.0, 20.0)),
 }
-# Unit in the column name → factor to m/s.
-_UNITS: Final = {"kmh": 1.0 / 3.6, "kph": 1.0 / 3.6, "km/h": 1.0 / 3.6, "mph": 0.44704}
-_MAX_SPEED_MS: Final = 85.0
-_MAX_DURATION_S: Final = 1e6
-_CURE: Final = (
-    "give two columns with a header: time [s] and speed [m/s], or speed_kmh, or speed_mph"
-)
-
 _REFERENCE_KWH: Final = 38.0
 """Pack of the car that the road load describes; packs below 15 kWh get a smaller car."""
 _G: Final = 9.81
@@ -153,60 +141,6 @@ def draw_drive(
         history=float(rng.choice((-1.0, -1.0, rng.uniform(-1.0, 1.0), 1.0))),
         seed=int(rng.integers(2**31)),
     )
-
-
-def read_speed(path: str | PathLike[str]) -> FloatArray:
-    """Read a driving schedule and return its speed at 1 Hz [m/s], shape (n,).
-
-    Parameters
-    ----------
-    path : path-like
-        CSV with a header: time [s], then speed in m/s, or in km/h or mph if its name has the unit.
-
-    Raises
-    ------
-    InputError
-        If the file cannot be read, time does not increase, or a speed is negative or above 85 m/s.
-    """
-    data = read_bounded(path, 64 * MIB, "a speed trace")
-    try:
-        data.decode("utf-8")
-        table = pacsv.read_csv(pa.BufferReader(data))
-        if table.num_columns < 2 or table.num_rows < 2:
-            raise InputError("not a speed trace", source=path, cure=_CURE)
-        time_s = np.asarray(table.column(0).cast(pa.float64()).to_numpy())
-        speed = np.asarray(table.column(1).cast(pa.float64()).to_numpy())
-    except (pa.ArrowException, ValueError) as error:
-        reason = (str(error) or type(error).__name__).splitlines()[0]
-        raise InputError(f"not a speed trace ({reason})", source=path, cure=_CURE) from error
-    heading = table.column_names[1]
-    compact = heading.lower().replace("_", "").replace(" ", "")
-    factor = next((value for unit, value in _UNITS.items() if unit in compact), 1.0)
-    speed = factor * speed
-    if not (np.all(np.isfinite(time_s)) and np.all(np.diff(time_s) > 0.0)):
-        raise InputError(
-            "time does not increase", source=path, field=table.column_names[0], cure=_CURE
-        )
-    if time_s[-1] - time_s[0] > _MAX_DURATION_S:
-        raise InputError(
-            f"longer than {_MAX_DURATION_S:g} s",
-            source=path,
-            field=table.column_names[0],
-            value=float(time_s[-1]),
-            cure=_CURE,
-        )
-    bad = np.flatnonzero(~((speed >= 0.0) & (speed < _MAX_SPEED_MS)))
-    if bad.size:
-        raise InputError(
-            f"row {bad[0] + 1}: speed outside 0–{_MAX_SPEED_MS:g} m/s",
-            source=path,
-            field=heading,
-            value=float(speed[bad[0]]),
-            cure=_CURE,
-        )
-    seconds = np.arange(time_s[0], time_s[-1] + 0.5)
-    trace: FloatArray = np.interp(seconds, time_s, speed)
-    return trace
 
 
 def _draw_speed(rng: np.random.Generator, seconds: int) -> FloatArray:

@@ -57,12 +57,8 @@ def soc_of(log: Log, capacity_ah: float) -> FloatArray:
     """
     first = log.first_soc()
     if first is None or log.soc_pct is None:
-        raise InputError(
-            "no initial SoC",
-            source=log.source or log.name,
-            field="soc_pct",
-            cure="give a log with its initial SoC",
-        )
+        source, cure = log.source or log.name, "give a log with its initial SoC"
+        raise InputError("no initial SoC", source=source, field="soc_pct", cure=cure)
     finite = np.isfinite(log.soc_pct)
     if finite.mean() > 0.5:
         return np.asarray(np.interp(log.time_s, log.time_s[finite], log.soc_pct[finite] / 100.0))
@@ -228,20 +224,13 @@ def inject(log: Log, faults: Sequence[Fault], pack: TwinPack, *, seed: int = 0) 
         If the log has no SoC or is too short, or a fault is unknown.
     """
     if log.duration_s < _MIN_DURATION_S:
-        raise InputError(
-            f"shorter than {_MIN_DURATION_S:g} s",
-            source=log.source or log.name,
-            value=log.duration_s,
-        )
+        problem, source = f"shorter than {_MIN_DURATION_S:g} s", log.source or log.name
+        raise InputError(problem, source=source, value=log.duration_s)
     condition = apply_faults(pack, tuple(faults))
     drive, recorded_c = _drive(log, pack, seed)
     plant = TwinPlant(pack)
     clean = plant.respond(drive, HEALTHY, drive.current_a, recorded_c)
-    current = drive.current_a
-    if condition.hidden_load is not None:
-        current = current + condition.hidden_load.size * condition.hidden_load.is_active(
-            drive.time_s
-        )
+    current = condition.current_through_cells(drive.time_s, drive.current_a)
     core = recorded_c
     if condition.insulation:
         hot, _ = temperatures(pack, drive, clean.heat_w, condition.insulation)
@@ -253,22 +242,14 @@ def inject(log: Log, faults: Sequence[Fault], pack: TwinPack, *, seed: int = 0) 
     voltage = measured_voltage(condition, rows, log.voltage_v + changed)
     recorded_current = measured_current(condition, rows, log.current_a)
     shift = measured_temperature(pack, condition, drive, recorded_c) - recorded_c
-    healthy_current = (
-        condition.current_offset_a == 0.0
-        and condition.current_gain == 0.0
-        and condition.current_skew_s == 0.0
-        and condition.remanence_a == 0.0
-        and condition.clip_share == 1.0
-    )
-    if healthy_current and not np.any(shift):
+    if recorded_current is log.current_a and not np.any(shift):
         expected = log.voltage_v
     else:
         read_a = measured_current(condition, drive, drive.current_a)
         predicted = plant.respond(drive, HEALTHY, read_a, recorded_c + shift)
         expected = log.voltage_v + _at(log, drive, predicted.voltage_v - clean.voltage_v)
-    start = log.first_soc()
     assumed = np.full(len(log), np.nan)
-    if start is not None:
+    if (start := log.first_soc()) is not None:
         assumed[start[0]] = start[1]
     sensors = pack.sensors
     result = replace(
@@ -297,26 +278,6 @@ def scale_injection(
         return rms(np.concatenate(gaps))
 
     return find_size(gap_of, fault, target_v, fault.kind.limits(pack))
-
-
-def scaled_to_pack(log: Log, *, series: int, parallel: int) -> Log:
-    """Return the log of a cell as that of a pack of equal cells.
-
-    Raises
-    ------
-    InputError
-        For fewer than one cell in series or in parallel.
-    """
-    if series < 1 or parallel < 1:
-        raise InputError("a pack has at least one cell", value=(series, parallel))
-    return replace(log, current_a=parallel * log.current_a, voltage_v=series * log.voltage_v)
-
-
-def with_initial_soc(log: Log, soc_pct: float) -> Log:
-    """Return the log with an initial SoC [%] as its only SoC reference."""
-    assumed = np.full(len(log), np.nan)
-    assumed[0] = soc_pct
-    return replace(log, soc_pct=assumed)
 
 
 def _drive(log: Log, pack: TwinPack, seed: int) -> tuple[Drive, FloatArray]:

@@ -203,8 +203,6 @@ class TwinPack:
     core_surface_w_k, surface_ambient_w_k : float
         Thermal conductances [W/K].
     sensors : Sensors
-    reports_core : bool
-        Whether the reported temperature is that of the healthy core instead of the surface.
     """
 
     name: str
@@ -232,7 +230,6 @@ class TwinPack:
     core_surface_w_k: float
     surface_ambient_w_k: float
     sensors: Sensors
-    reports_core: bool = False
 
     @property
     def one_c_a(self) -> float:

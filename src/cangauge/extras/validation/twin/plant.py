@@ -31,8 +31,6 @@ _EDGE: Final = 0.05
 """Distance of an empty and of a full pack from the poles of the equation [-]."""
 _DELAYS_S: Final = (0.0, 10.0, 30.0, 70.0)
 _DELAYED_SHARES: Final = (0.60, 0.20, 0.12, 0.08)
-_FINE_PROBABILITY, _FINE_STEP_K, _FINE_LAG_S = 0.5, 0.05, 0.1
-"""Temperature sensor whose errors stay below a millivolt in the equation."""
 _EQUATION_REFERENCE_C: Final = 20.0
 
 
@@ -160,11 +158,11 @@ class EquationPlant:
         Pack resistance to the current 0, 10, 30 and 70 s ago [Ω].
     """
 
+    name = "equation"
     temperature_tolerance_k = 0.05
 
     def __init__(self, pack: TwinPack, temperature_v_k: float, resistance_ohm: FloatArray) -> None:
         self.pack = pack
-        self.name = "published" if pack.reports_core else "equation"
         self._temperature_v_k = temperature_v_k
         self._resistance_ohm = resistance_ohm
 
@@ -224,21 +222,8 @@ class EquationPlant:
         return np.asarray(self.pack.cells * _GAS_OVER_FARADAY_V_K * kelvin * (after - before))
 
 
-def draw_equation_plant(
-    rng: np.random.Generator, pack: TwinPack, *, reports_core: bool = False
-) -> EquationPlant:
-    """Draw a pack that obeys the published equation.
-
-    Parameters
-    ----------
-    rng : Generator
-    pack : TwinPack
-        Size, thermal masses, kinetics and sensors.
-    reports_core : bool
-        Report the core temperature, which the equation uses, and draw the temperature coefficient
-        up to the published value. In half of the packs the temperature is also reported finely
-        and without lag: there a healthy log differs from the equation by noise alone.
-    """
+def draw_equation_plant(rng: np.random.Generator, pack: TwinPack) -> EquationPlant:
+    """Draw a pack of given size, thermal masses and sensors that obeys the published equation."""
     drawn = pack.chemistry
     inner = np.clip(_EDGE + (1.0 - 2.0 * _EDGE) * drawn.grid, 0.5 * _EDGE, 1.0 - 0.5 * _EDGE)
     bend = rng.uniform(0.75, 1.25, 4)
@@ -257,15 +242,10 @@ def draw_equation_plant(
     table = CellChemistry("equation", drawn.grid, volts, np.zeros_like(drawn.grid))
     shares = np.array(_DELAYED_SHARES) * rng.uniform(0.7, 1.3, len(_DELAYED_SHARES))
     resistance = pack.resistance_ohm * shares / shares.sum()
-    # By default the size of the entropy coefficient. The published −7.7 mV/K per cell, fitted to
-    # one log, turns the few kelvin between core and surface into volts.
-    low, high = (1e-3, 8e-3) if reports_core else (1e-4, 1e-3)
-    temperature = -pack.cells * float(np.exp(rng.uniform(np.log(low), np.log(high))))
-    own = replace(pack, chemistry=table, reports_core=reports_core)
-    if reports_core and rng.random() < _FINE_PROBABILITY:
-        fine = replace(pack.sensors, temperature_step_k=_FINE_STEP_K, temperature_lag_s=_FINE_LAG_S)
-        own = replace(own, sensors=fine)
-    return EquationPlant(own, temperature, resistance)
+    # The size of the entropy coefficient. The published −7.7 mV/K per cell, fitted to one log,
+    # turns the few kelvin between core and surface into volts.
+    temperature = -pack.cells * float(np.exp(rng.uniform(np.log(1e-4), np.log(1e-3))))
+    return EquationPlant(replace(pack, chemistry=table), temperature, resistance)
 
 
 def relax(signal: FloatArray, step_s: float, tau_s: FloatArray) -> FloatArray:

@@ -69,8 +69,8 @@ class Recording:
         `soc_pct` holds the assumed initial SoC in the first row, NaN elsewhere.
     sensor_error_v : array of shape (n,)
         Voltage error of a perfect model by noise, quantization and the assumed initial SoC [V].
-    true_soc_pct, true_voltage_v : array of shape (n,)
-        True SoC [%] and terminal voltage [V].
+    true_soc_pct : array of shape (n,)
+        True SoC [%].
     expected_voltage_v : array of shape (n,)
         Prediction of a perfect model of the healthy pack from the measured signals [V].
     gap_v : array of shape (n,)
@@ -80,7 +80,6 @@ class Recording:
     log: Log
     sensor_error_v: FloatArray
     true_soc_pct: FloatArray
-    true_voltage_v: FloatArray
     expected_voltage_v: FloatArray
     gap_v: FloatArray
 
@@ -103,11 +102,7 @@ def simulate_truth(
         its temperatures are kept, so that the voltages differ by the condition alone.
     """
     pack = plant.pack
-    current = drive.current_a
-    if condition.hidden_load is not None:
-        current = current + condition.hidden_load.size * condition.hidden_load.is_active(
-            drive.time_s
-        )
+    current = condition.current_through_cells(drive.time_s, drive.current_a)
     if near is None:
         kelvin = np.full_like(current, drive.start_c + KELVIN)
         heat = pack.resistance_ohm * 1.3 * ohmic_factor(pack, kelvin) * current**2
@@ -123,9 +118,6 @@ def simulate_truth(
         response = plant.respond(drive, condition, current, core)
     empty_v = _EMPTY_V["lfp" if pack.chemistry.name == "lfp" else "other"]
     empty = np.flatnonzero(response.lowest_v < empty_v)
-    reported = surface
-    if pack.reports_core:
-        reported = surface + (core - surface) / (1.0 + condition.insulation)
     return GroundTruth(
         time_s=drive.time_s,
         current_a=current,
@@ -138,7 +130,7 @@ def simulate_truth(
         rows=int(empty[0]) if empty.size else current.size,
         measured_current_a=measured_current(condition, drive, drive.current_a),
         measured_voltage_v=measured_voltage(condition, drive, response.voltage_v),
-        measured_temperature_c=measured_temperature(pack, condition, drive, reported),
+        measured_temperature_c=measured_temperature(pack, condition, drive, surface),
     )
 
 
@@ -228,7 +220,6 @@ def record_drive(
         log=log,
         sensor_error_v=error,
         true_soc_pct=true_soc,
-        true_voltage_v=sampling.at(truth.voltage_v),
         expected_voltage_v=sampling.at(expected_v),
         gap_v=sampling.at(truth.measured_voltage_v - expected_v),
     )

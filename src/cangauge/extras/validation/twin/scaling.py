@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Final
 
@@ -28,7 +28,7 @@ class ScaledFault:
     ----------
     fault : Fault
     target_v, reached_v : float
-        RMS gap over all drives, wanted and reached [V].
+        RMS gap, wanted and reached [V].
     limited : bool
         Whether the physical limits of the size prevent the wanted gap.
     """
@@ -39,49 +39,23 @@ class ScaledFault:
     limited: bool
 
 
-def _rms_gap_v(
-    plant: Plant, drives: Sequence[Drive], healthy: Sequence[GroundTruth], faults: tuple[Fault, ...]
-) -> float:
-    """Return the RMS gap of faults over some drives [V]; inf if the pack is empty too early."""
-    condition = apply_faults(plant.pack, faults)
-    total, rows = 0.0, 0
-    for drive, clean in zip(drives, healthy, strict=True):
-        truth = simulate_truth(plant, drive, condition, clean)
+def scale_to_gap(
+    plant: Plant, drive: Drive, fault: Fault, target_v: float, healthy: GroundTruth
+) -> ScaledFault:
+    """Scale a fault to an RMS gap [V] over a simulated drive.
+
+    The size of `fault` gives the sign; `healthy` is the drive without it.
+    """
+
+    def gap_of(sized: Fault) -> float:
+        condition = apply_faults(plant.pack, (sized,))
+        truth = simulate_truth(plant, drive, condition, healthy)
         if truth.rows * drive.step_s < min(_MIN_DURATION_S, 0.5 * float(drive.time_s[-1])):
             return float("inf")
-        gap = gap_v(plant, drive, truth, clean)
-        total += float(np.sum(gap**2)) * drive.step_s
-        rows += round(truth.rows * drive.step_s)
-    return float(np.sqrt(total / max(rows, 1)))
+        total = float(np.sum(gap_v(plant, drive, truth, healthy) ** 2)) * drive.step_s
+        return float(np.sqrt(total / max(round(truth.rows * drive.step_s), 1)))
 
-
-def scale_to_gap(
-    plant: Plant,
-    drives: Sequence[Drive],
-    fault: Fault,
-    target_v: float,
-    healthy: Sequence[GroundTruth] | None = None,
-) -> ScaledFault:
-    """Scale a fault to an RMS gap over simulated drives.
-
-    Parameters
-    ----------
-    plant : Plant
-    drives : sequence of Drive
-    fault : Fault
-        Its size gives the sign.
-    target_v : float
-        RMS gap over all drives [V].
-    healthy : sequence of GroundTruth, optional
-        The drives without a fault, if known already.
-    """
-    clean = [simulate_truth(plant, drive) for drive in drives] if healthy is None else healthy
-    return find_size(
-        lambda sized: _rms_gap_v(plant, drives, clean, (sized,)),
-        fault,
-        target_v,
-        fault.kind.limits(plant.pack),
-    )
+    return find_size(gap_of, fault, target_v, fault.kind.limits(plant.pack))
 
 
 def find_size(
@@ -103,55 +77,39 @@ def find_size(
         Smallest and largest size, positive.
     """
     sign = -1.0 if fault.size < 0.0 else 1.0
-    low, high = (float(np.log(limit)) for limit in limits)
+    low, high = float(np.log(limits[0])), float(np.log(limits[1]))
     target = float(np.log(target_v))
-    below: tuple[float, float] | None = None
-    above: tuple[float, float] | None = None
-    best: tuple[float, float, float] | None = None
-    at = 0.5 * (low + high)
-    slope = 1.0
-    previous: tuple[float, float] | None = None
+    first, last = low, high
+    has_smaller = has_larger = False  # sizes whose gap is too small, and too large
+    tried: list[tuple[float, float, float]] = []  # log size, log gap, gap
+    at, slope = 0.5 * (low + high), 1.0
     for _ in range(_MAX_EVALUATIONS):
         gap = gap_of(fault.sized(sign * float(np.exp(at))))
         level = float(np.log(max(gap, 1e-9)))
-        away = abs(level - target)
-        if np.isfinite(level) and (best is None or away < best[0]):
-            best = (away, at, gap)
-        if away < _TOLERANCE:
+        following = low
+        if np.isfinite(level):
+            if tried and abs(at - tried[-1][0]) > 1e-6:
+                secant = (level - tried[-1][1]) / (at - tried[-1][0])
+                slope = float(np.clip(secant, 0.3, 4.0))
+            tried.append((at, level, gap))
+            following = at + (target - level) / slope
+        if abs(level - target) < _TOLERANCE:
             break
         if level < target:
-            below = (at, level) if below is None or at > below[0] else below
+            first, has_smaller = max(first, at), True
         else:
-            above = (at, level) if above is None or at < above[0] else above
+            last, has_larger = min(last, at), True
         if (level < target and at >= high) or (level > target and at <= low):
             break
-        if previous is not None and np.isfinite(level) and abs(at - previous[0]) > 1e-6:
-            slope = float(np.clip((level - previous[1]) / (at - previous[0]), 0.3, 4.0))
-        if np.isfinite(level):
-            previous = (at, level)
-        step_to = at + (target - level) / slope if np.isfinite(level) else low
-        at = _inside(step_to, below, above, low, high)
-    if best is None:  # even the smallest size is impossible
-        return ScaledFault(fault.sized(0.0), target_v, 0.0, limited=True)
-    return ScaledFault(
-        fault.sized(sign * float(np.exp(best[1]))),
-        target_v,
-        best[2],
-        limited=best[0] > 2.0 * _TOLERANCE,
-    )
-
-
-def _inside(
-    at: float,
-    below: tuple[float, float] | None,
-    above: tuple[float, float] | None,
-    low: float,
-    high: float,
-) -> float:
-    """Return `at` if it lies within the bracket, else the middle of the bracket."""
-    first = low if below is None else below[0]
-    last = high if above is None else above[0]
-    if below is not None and above is not None:
         margin = 0.02 * (last - first)
-        return at if first + margin < at < last - margin else 0.5 * (first + last)
-    return float(np.clip(at, first, last))
+        if not (has_smaller and has_larger):
+            at = float(np.clip(following, first, last))
+        elif first + margin < following < last - margin:
+            at = following
+        else:
+            at = 0.5 * (first + last)
+    if not tried:  # even the smallest size is impossible
+        return ScaledFault(fault.sized(0.0), target_v, 0.0, limited=True)
+    at, level, gap = min(tried, key=lambda each: abs(each[1] - target))
+    sized = fault.sized(sign * float(np.exp(at)))
+    return ScaledFault(sized, target_v, gap, limited=abs(level - target) > 2.0 * _TOLERANCE)

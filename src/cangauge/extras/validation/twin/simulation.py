@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Final, Literal
+from typing import Any, Final, Literal, get_args
 
 import numpy as np
 
 from cangauge._typing import FloatArray
-from cangauge.errors import InputError, require_number
+from cangauge.errors import require_choice, require_number
 from cangauge.extras.validation.twin.drive import draw_drive
 from cangauge.extras.validation.twin.faults import Fault, parse_effect
 from cangauge.extras.validation.twin.pack import draw_pack
@@ -18,7 +18,7 @@ from cangauge.extras.validation.twin.recording import Recording, record_drive, r
 from cangauge.extras.validation.twin.scaling import ScaledFault, scale_to_gap
 from cangauge.logs.log import Log
 
-PlantName = Literal["twin", "equation", "published", "pybamm"]
+PlantName = Literal["twin", "equation"]
 
 _DEFAULT_GAP: Final = 0.003
 """RMS gap of an effect without a size, relative to the nominal voltage [-]."""
@@ -118,11 +118,12 @@ def simulate(
     discharge : bool
         Drive from full to empty, by default in 2.5 h: a log to identify a model on.
     speed_ms : array of shape (m,), optional
-        Speed trace at 1 Hz [m/s], repeated as needed (see `cangauge.extras.validation.read_speed`).
+        Speed trace at 1 Hz [m/s], repeated as needed; of a driving schedule in CSV, the second
+        column of `numpy.loadtxt(path, delimiter=",", skiprows=1)`.
     pack : {"leaf24", "leaf40", "car60", "car60lfp", "compact", "module12"}, optional
     chemistry : {"nmc", "lmo", "nca", "lfp"}, optional
-    plant : {"twin", "equation", "published", "pybamm"}
-        Model of the cells; `pybamm` needs the extra of that name.
+    plant : {"twin", "equation"}
+        Model of the cells: their kinetics and diffusion, or the published voltage equation.
     name : str
         Name of the log.
 
@@ -165,7 +166,7 @@ def simulate(
             default_gap_v=_DEFAULT_GAP * model.pack.nominal_v,
         )
         if gap_v is not None:
-            scaled = scale_to_gap(model, [load], fault, gap_v, [healthy])
+            scaled = scale_to_gap(model, load, fault, gap_v, healthy)
             fault = scaled.fault
             if scaled.limited:
                 limited.append(scaled)
@@ -184,21 +185,7 @@ def draw_plant(
     chemistry_name: str | None = None,
     name: PlantName = "twin",
 ) -> Plant:
-    """Draw a pack and the model of its cells (parameters as in `simulate`).
-
-    Raises
-    ------
-    InputError
-        For an unknown name, or if PyBaMM is needed and not installed.
-    """
+    """Draw a pack and the model of its cells (parameters as in `simulate`)."""
+    require_choice(name, get_args(PlantName), "plant")
     pack = draw_pack(rng, kind, chemistry_name)
-    if name == "twin":
-        return TwinPlant(pack)
-    if name in {"equation", "published"}:
-        return draw_equation_plant(rng, pack, reports_core=name == "published")
-    if name == "pybamm":
-        # An extra, and slow to import.
-        from cangauge.extras.validation.twin.pybamm_plant import draw_pybamm_plant  # noqa: PLC0415
-
-        return draw_pybamm_plant(rng, pack)
-    raise InputError("unknown plant", value=name, cure="use twin, equation, published or pybamm")
+    return TwinPlant(pack) if name == "twin" else draw_equation_plant(rng, pack)

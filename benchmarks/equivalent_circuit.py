@@ -1,4 +1,4 @@
-"""Equivalent circuit of a model: tables for PyBaMM's Thevenin model and for `thevenin`.
+"""Equivalent circuit of a model: the tables that the peers of the benchmarks run on.
 
 Open-circuit voltage, series resistance and RC pairs over temperature, current and SoC. Capacity and
 open-circuit voltage are those of the model. Resistances are fitted to its step response: the
@@ -18,9 +18,7 @@ last current (hysteresis) enter as their mean response.
 from __future__ import annotations
 
 import itertools
-import json
-from collections.abc import Mapping, Sequence
-from importlib.resources import files
+from collections.abc import Sequence
 from typing import Any, Final
 
 import numpy as np
@@ -110,13 +108,6 @@ def equivalent_circuit(model: Model) -> dict[str, Any]:
     }
 
 
-def module_of(tables: Mapping[str, Any]) -> str:
-    """Return a Python module with the tables and the parameters of both simulators."""
-    template = files("cangauge.extras.embedded") / "equivalent_circuit_module.py.txt"
-    text = f"TABLES: dict = {json.dumps(tables)}"
-    return template.read_text("utf-8").replace("TABLES: dict = {}", text, 1)
-
-
 def _rest_v(extended: ExtendedModel, soc_pct: FloatArray, temperature_c: float) -> FloatArray:
     """Return the voltage after a long rest [V], shape (n,)."""
     celsius = np.full_like(soc_pct, temperature_c)
@@ -130,10 +121,8 @@ class _StepResponse:
 
     def __init__(self, extended: ExtendedModel) -> None:
         self._extended = extended
-        elements = [
-            tau for effect, values in extended.effects for _, tau in effect.rc_elements(values)
-        ]
-        own = {*elements, *extended.model.low_pass_s}
+        elements = (effect.rc_element(values) for effect, values in extended.effects)
+        own = {*(each[1] for each in elements if each is not None), *extended.model.low_pass_s}
         self._own_tau_s = sorted(tau for tau in own if tau >= FASTEST_S)
         delays = [delay for delay in extended.model.delay_s if delay > 0.0]
         self._last_s = LASTING * max([FASTEST_S, *delays, *self._own_tau_s])

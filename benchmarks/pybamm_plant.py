@@ -1,8 +1,8 @@
-"""Plant whose cells are simulated by PyBaMM's single-particle model with electrolyte (SPMe).
+"""Plant of the twin whose cells are PyBaMM's single-particle model with electrolyte (SPMe).
 
 Independent physics: porous electrodes, particles, electrolyte. Capacity, exchange current and
 initial SoC change its parameters; faults around the cells (contacts, hysteresis, relaxations) are
-added as in the other plants. Needs the extra `pybamm` (https://www.pybamm.org, BSD; Sulzer et al.
+added as in the other plants. Needs `pip install pybamm` (https://www.pybamm.org, BSD; Sulzer et al.
 2021).
 """
 
@@ -229,12 +229,8 @@ def import_pybamm() -> Any:
     try:
         return importlib.import_module("pybamm")
     except ImportError as error:
-        raise InputError(
-            "PyBaMM is not installed",
-            field="plant",
-            value="pybamm",
-            cure="install cangauge[pybamm], or use the plant twin",
-        ) from error
+        cure = "pip install pybamm"
+        raise InputError("PyBaMM is not installed", field="plant", cure=cure) from error
 
 
 def draw_pybamm_plant(

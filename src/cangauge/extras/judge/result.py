@@ -1,0 +1,333 @@
+"""What a judgement holds, its sentences and its JSON."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Final, Literal, NamedTuple
+
+import numpy as np
+
+from cangauge._text import counted, duration, number
+from cangauge._typing import FloatArray
+from cangauge.extras.judge.causes import UNITS as PACK_UNITS
+from cangauge.extras.judge.causes import Explanation
+from cangauge.extras.judge.chain import Stretch, published_pct
+from cangauge.extras.judge.weak import WeakestCell
+from cangauge.logs.log import Log
+from cangauge.model.model_file import Model
+
+Verdict = Literal["agrees", "off", "cannot_tell"]
+
+UNITS: Final = {**PACK_UNITS, "weak_cell": "%"}
+"""Units of the sizes of all causes."""
+USEFUL_PCT: Final = 5.0
+"""A gauge agrees only where an error of this size would have been seen [% SoC]."""
+JUMP_PCT: Final = 1.0
+"""Least jump of the published SoC against the charge that is listed [%]: a dashboard shows it."""
+SEVERAL: Final = 6.0
+"""A jump is also this many times the usual change against the charge."""
+DAY_S: Final = 86400.0
+EPOCH_S: Final = 1e8
+"""Stamps from here on are absolute [s since 1970]; smaller ones count from the log's own start."""
+
+_WORDS: Final = {
+    "none": "the gauge is right",
+    "current_offset": "offset of the current",
+    "count_scale": "the gauge counts with a wrong scale",
+    "pack_capacity": "the pack has another capacity than the gauge counts with",
+    "start_or_reset": "wrong start or reset",
+    "voltage_sensor": "voltage sensor",
+    "weak_cell": "weak cell",
+    "unknown": "another cause, or several",
+}
+_NEXT: Final = {
+    "current_offset": "Read the current with contactors open or everything off: what it then shows"
+    " is the offset. Log one hour of it: that settles it.",
+    "count_scale": "Compare the capacity in the gauge's configuration with the pack's, and the"
+    " current with a clamp meter under load. A log of one drive of 40 % settles it.",
+    "pack_capacity": "Log one full discharge or charge, or a drive of 40 % or more that ends with"
+    " an hour of rest: charge over SoC then gives the capacity.",
+    "start_or_reset": "Charge until full once, so that the gauge resets itself, and judge again:"
+    " if the error is gone it was the start.",
+    "voltage_sensor": "Put a meter on the pack's terminals at rest and compare with the logged"
+    " voltage. Until then the published SoC may be the right one.",
+    "weak_cell": "Log one full charge and discharge with cell voltages, and balance the pack.",
+    "unknown": "Log one hour of rest and one full charge until its end: they settle whether the"
+    " SoC, the current or the voltage is wrong.",
+}
+
+
+class Jump(NamedTuple):
+    """A jump of the published SoC that the charge does not explain."""
+
+    log: int
+    time_s: float
+    since_start_s: float
+    size_pct: float
+
+
+class Size(NamedTuple):
+    """Size of a cause with its interval of 95 %."""
+
+    value: float
+    ci: tuple[float, float]
+    unit: str
+
+
+class Cause(NamedTuple):
+    """The most probable reason of a gauge's error."""
+
+    verdict: str
+    """`current_offset`, `count_scale`, `pack_capacity`, `start_or_reset`, `voltage_sensor`,
+    `weak_cell`, `none` or `unknown`."""
+    probability: float
+    size: Size | None = None
+    onset: int = 0
+    """Stretch with which it begins; the first one: before all."""
+    earliest: int = 0
+    latest: int = 0
+    """First and last stretch with which it may have begun (90 %)."""
+    inside: bool = False
+    """Whether it begins at the step within that stretch, not before it."""
+
+
+@dataclass(frozen=True, eq=False)
+class Judgement:
+    """A second opinion on a gauge.
+
+    Attributes
+    ----------
+    logs : tuple of Log
+        In order of time.
+    model : Model
+    error_pct, error_std_pct : float
+        Published SoC minus the SoC that all logs imply, at the end, and its σ [% SoC].
+    worst_pct : float
+        The largest such difference, relative to its σ [% SoC].
+    verdict : {"agrees", "off", "cannot_tell"}
+    cause : Cause
+    probabilities : dict
+        Of `none`, `unknown` and each cause.
+    corrected_pct, corrected_std_pct : list of array
+        Corrected SoC and its σ at each row of each log [%]; NaN where not known.
+    chain : list of Stretch
+    explanations : list of Explanation
+        All answers, the most probable first.
+    weakest : WeakestCell, optional
+    """
+
+    logs: tuple[Log, ...]
+    model: Model
+    error_pct: float
+    error_std_pct: float
+    worst_pct: float
+    verdict: Verdict
+    cause: Cause
+    probabilities: dict[str, float]
+    corrected_pct: list[FloatArray]
+    corrected_std_pct: list[FloatArray]
+    chain: list[Stretch]
+    explanations: list[Explanation]
+    weakest: WeakestCell | None = None
+
+    @property
+    def published_pct(self) -> list[FloatArray]:
+        """Published SoC at each row of each log [%]; NaN where a log has none."""
+        return [published_pct(log) for log in self.logs]
+
+    @property
+    def jumps(self) -> list[Jump]:
+        """Jumps of the published SoC within stretches that the charge does not explain."""
+        result = []
+        for part in self.chain:
+            count = part.published_pct + part.drawn_pct
+            known = np.flatnonzero(np.isfinite(count))
+            change = np.diff(count[known])
+            if not change.size:
+                continue
+            usual = 1.5 * float(np.median(np.abs(change)))
+            least = max(JUMP_PCT, SEVERAL * usual, 2.0 * part.soc_step_pct)
+            for k in np.flatnonzero(np.abs(change) >= least):
+                time_s = float(part.time_s[known[k + 1]])
+                since_s = self.elapsed_s(part.log, time_s)
+                result.append(Jump(part.log, time_s, since_s, float(change[k])))
+        return result
+
+    @property
+    def days(self) -> int:
+        """Days with logs: by their stamps, or one for each log."""
+        if any(log.time_s[0] < EPOCH_S for log in self.logs):
+            return len(self.logs)
+        stamps = np.concatenate([log.time_s for log in self.logs])
+        return int(np.unique(np.floor(stamps / DAY_S)).size)
+
+    @property
+    def extent(self) -> str:
+        """How much was judged."""
+        hours = duration(sum(log.duration_s for log in self.logs))
+        return f"{counted(len(self.logs), 'log')}, {counted(self.days, 'day')}, {hours}"
+
+    def elapsed_s(self, log: int, time_s: float) -> float:
+        """Return the time since the first row of the first log [s].
+
+        Logs without absolute stamps follow one another without a pause.
+        """
+        if self.logs[0].time_s[0] >= EPOCH_S and self.logs[log].time_s[0] >= EPOCH_S:
+            return float(time_s - self.logs[0].time_s[0])
+        before = sum(earlier.duration_s for earlier in self.logs[:log])
+        return float(before + time_s - self.logs[log].time_s[0])
+
+    @property
+    def onset(self) -> tuple[int, float] | None:
+        """Log and stamp [s] with which the cause begins; None: before the first log, or unknown."""
+        cause = self.cause
+        if cause.onset == 0 and not cause.inside:
+            return None
+        part = self.chain[cause.onset]
+        return part.log, float(part.time_s[part.step_at if cause.inside else 0])
+
+    @property
+    def since_s(self) -> float | None:
+        """Moment from which on a cause holds, since the first row [s]; None without a cause."""
+        if self.cause.size is None:
+            return None
+        return 0.0 if self.onset is None else self.elapsed_s(*self.onset)
+
+    def to_dict(self, corrected: str | None = None) -> dict[str, Any]:
+        """Return the object of `--json`, schema 1."""
+        size = self.cause.size
+        return {
+            "schema": 1,
+            "gauge": {
+                "error_pct": self.error_pct,
+                "error_std_pct": self.error_std_pct,
+                "verdict": self.verdict,
+                "since_s": self.since_s,
+                "worst_pct": self.worst_pct,
+                "jumps": [
+                    {
+                        "log": self.logs[jump.log].name,
+                        "since_s": jump.since_start_s,
+                        "size_pct": jump.size_pct,
+                    }
+                    for jump in self.jumps
+                ],
+            },
+            "cause": {
+                "verdict": self.cause.verdict,
+                "probability": self.cause.probability,
+                "size": None if size is None else size._asdict() | {"ci": list(size.ci)},
+            },
+            "next_step": self.next_step,
+            "days": self.days,
+            "corrected": corrected,
+        }
+
+    @property
+    def headline(self) -> str:
+        """The answer in one sentence."""
+        std = number(self.error_std_pct, 1)
+        error = f"{_signed(self.error_pct)} ± {std} % SoC"
+        if self.verdict == "cannot_tell":
+            return (
+                f"Cannot tell: the gauge differs by {error} from the SoC that voltage and charge"
+                f" imply, and an error of {USEFUL_PCT:g} % would not have been seen."
+            )
+        if self.verdict == "agrees":
+            return f"The gauge agrees with voltage and charge: difference {error} (1σ)."
+        if self.cause.verdict == "voltage_sensor":
+            reads = "and the logged voltage contradict each other"
+        elif self.cause.verdict == "weak_cell":
+            reads = "holds for the mean cell, not for the weakest"
+        elif abs(self.error_pct) > 2.0 * self.error_std_pct:
+            high = "too high" if self.error_pct > 0.0 else "too low"
+            reads = f"reads {number(abs(self.error_pct), 1)} ± {std} % SoC {high}"
+        else:
+            reads = f"is not right, though its SoC at the end may be ({error})"
+        return f"The gauge {reads}. {self.reason}"
+
+    @property
+    def reason(self) -> str:
+        """Cause, size and moment as sentences."""
+        cause = self.cause
+        if cause.size is None:
+            likely = ", ".join(
+                f"{_WORDS[name]} {number(100.0 * share, 0, '%')}"
+                for name, share in sorted(self.probabilities.items(), key=lambda item: -item[1])
+                if name in UNITS and share >= 0.05
+            )
+            return f"The cause is not known{f' (possible: {likely})' if likely else ''}."
+        value, (low, high), unit = cause.size
+        digits = _digits(unit)
+        words = _WORDS[cause.verdict]
+        if cause.verdict == "weak_cell" and self.weakest is not None:
+            words = f"weak cell, number {self.weakest.number}"
+        percent = number(100.0 * cause.probability, 0, "%")
+        text = f"Cause: {words} ({percent}), {_signed(value, digits)} {unit}"
+        text += f" ({_signed(low, digits)} … {_signed(high, digits)} {unit}, 95 %)"
+        return f"{text}, {self.since}."
+
+    @property
+    def since(self) -> str:
+        """Since when, with its interval."""
+        begin = "since before the first log"
+        if self.onset is not None:
+            log, time_s = self.onset
+            after_s = time_s - self.logs[log].time_s[0]
+            where = f"{duration(after_s)} into" if after_s > 60.0 else "the start of"
+            begin = f"since {where} {self.logs[log].name}"
+        if self.cause.earliest == self.cause.latest:
+            return begin
+        first = self.logs[self.chain[self.cause.earliest].log].name
+        last = self.logs[self.chain[self.cause.latest].log].name
+        return f"{begin} (it may have begun between {first} and {last})"
+
+    @property
+    def next_step(self) -> str:
+        """What to do next, and what it settles."""
+        if self.verdict == "agrees":
+            return "Nothing. Judge again after a full charge or a drive of 40 % or more."
+        if self.verdict == "off":
+            return _NEXT[self.cause.verdict]
+        if self.model.chemistry == "lfp":
+            return (
+                "Add a log of one full charge until its end: between the knees the voltage of an"
+                " LFP cell says nothing, at full it settles the SoC."
+            )
+        return (
+            "Add a log with an hour of rest after a drive of 40 % or more, or of one full charge"
+            " until its end: it settles the SoC to about 2 %."
+        )
+
+    def answer_rows(self) -> tuple[list[str], list[list[str]]]:
+        """Return head and rows of the table of all answers, the most probable first."""
+        rows = []
+        for answer in self.explanations:
+            size, unit = "–", UNITS.get(answer.name)
+            if unit is not None:
+                value, std = float(answer.size[answer.best]), float(answer.std[answer.best])
+                size = f"{_signed(value, _digits(unit))} ± {number(std, _digits(unit))} {unit}"
+            share = number(100.0 * self.probabilities[answer.name], 1, "%")
+            rows.append([_WORDS[answer.name], share, size])
+        return ["answer", "probability", "size (±1σ)"], rows
+
+    def jump_rows(self) -> tuple[list[str], list[list[str]]]:
+        """Return head and rows of the table of jumps."""
+        rows = [
+            [
+                self.logs[jump.log].name,
+                number(jump.since_start_s / 3600.0, 2),
+                number(jump.size_pct, 1),
+            ]
+            for jump in self.jumps
+        ]
+        return ["log", "hours since the first row", "% SoC"], rows
+
+
+def _digits(unit: str) -> int:
+    return 2 if unit == "A" else 1
+
+
+def _signed(value: float, digits: int = 1) -> str:
+    text = number(value, digits)
+    return text if value < 0.0 else f"+{text}"

@@ -1,0 +1,113 @@
+"""Faults injected into recorded logs, and the table of what the diagnosis finds of them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from cangauge.errors import InputError
+from cangauge.extras.validation import gap_check, simulate
+from cangauge.extras.validation.cases import draw_scenario
+from cangauge.extras.validation.twin.faults import Fault, fault_kind
+from cangauge.extras.validation.twin.injection import (
+    Injected,
+    fit_surrogate_pack,
+    inject,
+    scale_injection,
+)
+from cangauge.extras.validation.twin.pack import TwinPack
+from cangauge.extras.validation.twin.recording import rms
+from cangauge.logs.log import Log
+
+CAPACITY_AH = 60.0
+
+
+@pytest.fixture(scope="module")
+def log() -> Log:
+    return simulate(seed=4, pack="leaf24", hours=0.3, start_soc_pct=80.0).log
+
+
+@pytest.fixture(scope="module")
+def surrogate(log: Log) -> TwinPack:
+    found = fit_surrogate_pack([log], capacity_ah=CAPACITY_AH, cells=96)
+    return replace(found, sensors=replace(found.sensors, current_step_a=0.0, voltage_step_v=0.0))
+
+
+def injected(log: Log, surrogate: TwinPack, *faults: Fault) -> Injected:
+    return inject(log, faults, surrogate)
+
+
+def test_a_sensor_fault_is_added_to_its_signal_alone(log: Log, surrogate: TwinPack) -> None:
+    by_voltage = injected(log, surrogate, Fault("voltage_offset", 2.0))
+    assert np.allclose(by_voltage.log.voltage_v, log.voltage_v + 2.0)
+    assert np.allclose(by_voltage.gap_v, 2.0)
+    by_current = injected(log, surrogate, Fault("current_offset", 3.0))
+    assert np.allclose(by_current.log.current_a, log.current_a + 3.0)
+    assert np.allclose(by_current.log.voltage_v, log.voltage_v)
+    # A perfect model is told 3 A too much, expects less voltage, and counts away from the truth.
+    assert by_current.gap_v.min() > 0.0
+    assert by_current.true_soc_pct[-1] == pytest.approx(log.soc_pct[-1], abs=0.2)
+
+
+def test_a_hidden_load_discharges_the_pack(log: Log, surrogate: TwinPack) -> None:
+    shape = {"on_s": 400.0, "off_s": 100.0}
+    found = injected(log, surrogate, Fault("parasitic_switching", 15.0, shape, seed=2))
+    assert np.array_equal(found.log.current_a, log.current_a)
+    assert found.true_soc_pct[-1] < log.soc_pct[-1] - 0.5
+    assert found.gap_v.min() < -0.3
+
+
+def test_relaxations_of_two_faults_add_up(log: Log, surrogate: TwinPack) -> None:
+    fast, slow = Fault("fast_polarization", 0.03), Fault("slow_diffusion", 0.05)
+    alone = [injected(log, surrogate, each).gap_v for each in (fast, slow)]
+    assert min(map(rms, alone)) > 0.05
+    both = injected(log, surrogate, fast, slow).gap_v
+    assert rms(both - alone[0] - alone[1]) < 0.05 * rms(both)
+
+
+def test_an_injection_is_scaled_to_its_gap(log: Log, surrogate: TwinPack) -> None:
+    scaled = scale_injection([log], Fault("initial_soc", -1.0), 0.8, surrogate)
+    assert scaled.fault.size < 0.0
+    assert not scaled.limited
+    assert rms(injected(log, surrogate, scaled.fault).gap_v) == pytest.approx(0.8, rel=0.04)
+
+
+def test_further_drives_stay_within_the_weather() -> None:
+    scenario = draw_scenario(3, n_reference=1)
+    low, high = scenario.ambient_c
+    assert high - low == pytest.approx(4.0)  # one temperature is widened
+    drives = scenario.draw_drives(np.random.default_rng(1), 6, 0.1)
+    assert all(low <= drive.ambient_c[0] <= high for drive in drives)
+
+
+def test_a_check_counts_what_was_found_at_each_size() -> None:
+    def finding(effect: str | None, floors: float, *, right: bool) -> gap_check.Finding:
+        return gap_check.Finding(
+            "log", effect, floors, -2.0 * floors, "A", right, right, right, 0.5
+        )
+
+    found = [finding("current_offset", floors, right=right)
+             for floors, right in ((1.1, False), (0.9, True), (2.0, True))]  # fmt: skip
+    result = gap_check.summarize([*found, finding(None, 0.0, right=False)])
+    assert result["healthy"] == {"logs": 1, "alarms": 0, "probability_none": 0.5}
+    offset = next(item for item in result["effects"] if item["effect"] == "current_offset")
+    assert [(of["floors"], of["size"], of["group_right"], of["of"]) for of in offset["sizes"]] == [
+        (1.0, pytest.approx(2.0), 1, 2), (2.0, 4.0, 1, 1),
+    ]  # fmt: skip
+    head, rows = gap_check.table(result)
+    assert head == ["effect", "1 floor", "2 floors", "4 floors"]
+    assert ["current_offset", "2.0 A: 1/2, 1/2", "4.0 A: 1/1, 1/1", "–"] in rows
+    assert "first in 67 % of 3 injected effects" in gap_check.summary(result)
+    with pytest.raises(InputError, match="3 healthy logs are too few"):
+        gap_check.CheckedPack.of_logs([simulate(seed=1, hours=0.1).log] * 3, 60.0, 96)
+
+
+def test_each_log_is_left_out_in_turn() -> None:
+    """The first log as it is, then with the first effect at one floor."""
+    findings = gap_check.CheckedPack.simulated().findings(1)
+    healthy, faulty = next(findings), next(findings)
+    assert (healthy.effect, healthy.detected) == (None, False)
+    assert (faulty.effect, faulty.unit) == ("current_offset", fault_kind("current_offset").unit)
+    assert faulty.floors == pytest.approx(1.0, rel=0.1)
