@@ -11,8 +11,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from cangauge.bus.database import BitField
-from cangauge.bus.mapping import MessageMap, Overrides
-from cangauge.bus.plausibility import SignalChecks
 from cangauge.bus.protection import (
     CRC_ONLY_RULE,
     GENERIC_RULE,
@@ -207,10 +205,10 @@ temperature = "Temperature"
 """
 
 
-def load(folder: Path, more: str = "", overrides: Overrides | None = None) -> Vehicle:
+def load(folder: Path, more: str = "") -> Vehicle:
     (folder / "car.dbc").write_text(DBC)
     (folder / "car.toml").write_text(MAP + more)
-    return Vehicle.load(map=folder / "car.toml", overrides=overrides or Overrides())
+    return Vehicle.load(map=folder / "car.toml")
 
 
 def test_a_map_file_chooses_the_rule_of_each_message(tmp_path: Path) -> None:
@@ -224,21 +222,6 @@ def test_a_map_file_chooses_the_rule_of_each_message(tmp_path: Path) -> None:
     assert rule is not None
     assert rule.counter(b"\0\x0e" + bytes(6)) == 14
     assert not rule.is_whole(b"\0\x0f" + bytes(6))
-
-
-def test_a_configuration_overrides_the_map_file(tmp_path: Path) -> None:
-    more = '[messages.Fast]\nprotection = "e2e_01"\ndata_id = 291\nperiod_s = 0.1\n'
-    overrides = Overrides(
-        "run.toml",
-        messages={"0x100": MessageMap(protection="e2e_02", data_id_list=IDS)},
-        checks={"voltage": SignalChecks(highest=410.0)},
-    )
-    vehicle = load(tmp_path, more, overrides)
-    assert vehicle.messages[0x100][:2] == (RULES["02"], 0.1)
-    assert vehicle.voltage.checks.highest == 410.0
-    slower = Overrides("run.toml", messages={"BATTERY_1DB": MessageMap(period_s=0.02)})
-    leaf = Vehicle.load("leaf_aze0", overrides=slower)
-    assert leaf.messages[0x1DB][:2] == (LEAF_RULE, 0.02)
 
 
 @pytest.mark.parametrize(
@@ -270,7 +253,3 @@ def test_mistakes_in_protection_name_field_and_file(
         load(tmp_path, f"[messages.Fast]\n{more}\n")
     assert caught.value.field == f"messages.Fast.{field}"
     assert caught.value.source == str(tmp_path / "car.toml")
-    overrides = Overrides("run.toml", messages={"Fast": MessageMap(protection="e2e_05")})
-    with pytest.raises(InputError, match="data_id") as caught:
-        load(tmp_path, "", overrides)
-    assert caught.value.source == "run.toml"

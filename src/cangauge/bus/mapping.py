@@ -5,8 +5,7 @@ A TOML file, for any car with a DBC; `docs/map-file.md` shows each key.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal, Self
 
@@ -273,37 +272,3 @@ def columns_of_map(path: Path | str) -> ColumnMap | None:
     if not isinstance(columns, dict):
         raise InputError("must be a table", field=where, cure='write [columns], then time = "…"')
     return ColumnMap.of(columns, where)
-
-
-@dataclass(frozen=True, slots=True)
-class Overrides:
-    """Protection and checks of a service configuration, which override the car's map file.
-
-    `source` is the file, for error messages. Messages go by name or id, checks by role; missing
-    fields are taken from the map file.
-    """
-
-    source: str = ""
-    messages: Mapping[str, MessageMap] = field(default_factory=dict)
-    rules: Mapping[str, ProtectionRule] = field(default_factory=dict)
-    checks: Mapping[str, SignalChecks] = field(default_factory=dict)
-
-    def merged_messages(
-        self, mapping: VehicleMap, source: str, key_of: Callable[[str], int]
-    ) -> dict[int, tuple[MessageMap, str]]:
-        """Return [messages] of both files by message key, with the file that states each.
-
-        Another protection replaces all protection fields of the map file; the period stays.
-        """
-        merged = {key_of(name): (each, source) for name, each in mapping.messages.items()}
-        for name, each in self.messages.items():
-            key = key_of(name)
-            base = merged[key][0] if key in merged else MessageMap()
-            if each.protection is not None:
-                base = MessageMap(period_s=base.period_s)
-            given = {name: getattr(each, name) for name in each.model_fields_set}
-            merged[key] = (base.model_copy(update=given), self.source)
-        return merged
-
-
-NO_OVERRIDES: Final = Overrides()

@@ -28,14 +28,7 @@ from cangauge.bus.database import (
     signal_codec,
 )
 from cangauge.bus.isotp import PollTarget, reply_id
-from cangauge.bus.mapping import (
-    NO_OVERRIDES,
-    CellsMap,
-    MessageMap,
-    Overrides,
-    SignalMap,
-    VehicleMap,
-)
+from cangauge.bus.mapping import CellsMap, MessageMap, SignalMap, VehicleMap
 from cangauge.bus.plausibility import SignalChecks
 from cangauge.bus.protection import Protection
 from cangauge.errors import InputError, closest
@@ -153,7 +146,6 @@ class Vehicle:
         *,
         temperature_c: float | None = None,
         pair_within_s: float | None = None,
-        overrides: Overrides = NO_OVERRIDES,
     ) -> Vehicle:
         """Load a vehicle by the name of a preset, or by a DBC and a map file.
 
@@ -167,8 +159,6 @@ class Vehicle:
             Fixed temperature instead of the signal [°C]; its source is then unknown.
         pair_within_s : float, optional
             Largest distance between paired current and voltage [s]; default: from the map file.
-        overrides : Overrides, optional
-            Protection and checks that override the map file.
 
         Raises
         ------
@@ -195,7 +185,7 @@ class Vehicle:
                 problem = "no pack temperature is known on the bus of this car"
                 cure = "give --temperature °C"
                 raise InputError(problem, field="--vehicle", value=preset, cure=cure)
-            return known.vehicle(temperature_c, pair_within_s, overrides)
+            return known.vehicle(temperature_c, pair_within_s)
         if map is None:
             if dbc is None:
                 cure = f"give --vehicle ({', '.join(PRESETS)}), or --map FILE"
@@ -213,7 +203,7 @@ class Vehicle:
         if mapping.temperature is None and temperature_c is None:
             cure = "name its signal, or give --temperature °C"
             raise InputError("is missing", source=map, field="temperature", cure=cure)
-        return _Binder(mapping, files, str(map), overrides).vehicle(temperature_c, pair_within_s)
+        return _Binder(mapping, files, str(map)).vehicle(temperature_c, pair_within_s)
 
     @property
     def signals(self) -> tuple[VehicleSignal, ...]:
@@ -262,10 +252,8 @@ class _Binder:
     `source` is the map file, for error messages.
     """
 
-    def __init__(
-        self, mapping: VehicleMap, files: Sequence[Path], source: str, overrides: Overrides
-    ) -> None:
-        self._mapping, self._source, self._overrides = mapping, source, overrides
+    def __init__(self, mapping: VehicleMap, files: Sequence[Path], source: str) -> None:
+        self._mapping, self._source = mapping, source
         self._databases = [(load_dbc(path), path) for path in files]
         self._messages: dict[int, Message] = {}
 
@@ -335,11 +323,7 @@ class _Binder:
         # A stated offset is in the canonical unit and keeps its sign.
         gain, shift = wanted.sign * wanted.scale * factor, wanted.offset + wanted.sign * offset
         codec = dataclasses.replace(codec, gain=gain, shift=shift)
-        override = self._overrides.checks.get(role, SignalChecks())
-        stated = {
-            **wanted.model_dump(exclude_unset=True),
-            **override.model_dump(exclude_unset=True),
-        }
+        stated = wanted.model_dump(exclude_unset=True)
         stated = {name: stated[name] for name in SignalChecks.model_fields.keys() & stated}
         checks = validated(SignalChecks, stated, f"{self._source}: {role}")
         return VehicleSignal(role, key, message.name, message.length, codec, checks)
@@ -363,16 +347,15 @@ class _Binder:
 
     def _protections(self) -> dict[int, MessageProtection]:
         """Return protection and period of the messages with a signal."""
-        stated = self._overrides.merged_messages(self._mapping, self._source, self._message_key)
-        rules = {**self._mapping.rules, **self._overrides.rules}
+        stated = {self._message_key(name): each for name, each in self._mapping.messages.items()}
         protections = {}
         for key, message in self._messages.items():
-            each, source = stated.get(key, (MessageMap(), self._source))
+            each = stated.get(key, MessageMap())
             cycle_ms, period_s = message.cycle_time, each.period_s
             # In some DBC files it is not a number.
             if period_s is None and isinstance(cycle_ms, int | float) and 0 < cycle_ms < math.inf:
                 period_s = cycle_ms / 1000.0
-            rule = each.rule(message, rules, source=source)
+            rule = each.rule(message, self._mapping.rules, source=self._source)
             protections[key] = MessageProtection(
                 rule, period_s, each.isotp, each.j1939, each.request_id
             )
@@ -412,16 +395,11 @@ class Preset:
         return self.mapping.temperature is None
 
     def vehicle(
-        self,
-        temperature_c: float | None = None,
-        pair_within_s: float | None = None,
-        overrides: Overrides = NO_OVERRIDES,
+        self, temperature_c: float | None = None, pair_within_s: float | None = None
     ) -> Vehicle:
         """Return the vehicle, with or without a temperature; arguments as in `Vehicle.load`."""
         dbc = shared_file("dbc", self.dbc)
-        return _Binder(self.mapping, [dbc], str(dbc), overrides).vehicle(
-            temperature_c, pair_within_s
-        )
+        return _Binder(self.mapping, [dbc], str(dbc)).vehicle(temperature_c, pair_within_s)
 
 
 def _presets() -> dict[str, Preset]:
