@@ -142,8 +142,9 @@ class Notifier:
         self._socket.setblocking(False)
         timeout_us = given.get("WATCHDOG_USEC", "")
         is_ours = given.get("WATCHDOG_PID", str(os.getpid())) == str(os.getpid())
-        if is_ours and timeout_us.isdecimal() and int(timeout_us):  # 0: no watchdog
-            self.ping_every_s = int(timeout_us) / 1e6 / PINGS_PER_TIMEOUT
+        # 0: no watchdog. A float, since int() refuses more than 4,300 digits.
+        if is_ours and timeout_us.isdecimal() and (seconds := float(timeout_us) / 1e6) > 0.0:
+            self.ping_every_s = seconds / PINGS_PER_TIMEOUT
 
     def __enter__(self) -> Self:
         return self
