@@ -1,10 +1,12 @@
-"""Files of known formats that are not read here, and how each becomes a table.
+"""Files of known formats that are not read here, and how each becomes a table or a capture.
 
-Cyclers' own binary files have readers of their own; those libraries export CSV.
+Cyclers' own binary files have readers of their own; those libraries export CSV. SavvyCAN reads many
+formats of captures (its `framefileio.cpp` lists them).
 """
 
 from __future__ import annotations
 
+import re
 from typing import Final
 
 _READ_PACKED: Final = "; .gz, .bz2 and .zip are read as they are"
@@ -29,9 +31,28 @@ _FORMATS: Final = (
     (0, b"\x28\xb5\x2f\xfd", "packed by zstd", f"unpack it (unzstd FILE){_READ_PACKED}"),
     (0, b"7z\xbc\xaf", "a 7z archive", f"unpack it{_READ_PACKED}"),
     (0, b"Rar!", "a RAR archive", f"unpack it{_READ_PACKED}"),
+    (0, "date ".encode("utf-16"), "a Vector ASC in UTF-16",
+     "convert it: iconv -f UTF-16 -t UTF-8 FILE > drive.asc"),
     (0, b'{"', "JSON, a record a line",
      "make a table of it: pandas.read_json(file, lines=True).to_csv('log.csv', index=False)"),
 )  # fmt: skip
+
+
+_BY_SAVVYCAN: Final = "open it in SavvyCAN, and save it as a GVRET log"
+_CAPTURES: Final = (
+    (rb"\*\*\*BUSMASTER", "a BUSMASTER log", _BY_SAVVYCAN),
+    (rb"Chn +Identifier +Flg", "a Kvaser CanKing log", _BY_SAVVYCAN),
+    (rb"# Logger type: CAN", "a CSS Electronics CLX000 log", _BY_SAVVYCAN),
+    (rb"\d+\.\d+;[RT]X;0x", "a Microchip CAN analyser log", _BY_SAVVYCAN),
+    (rb"(t[0-9A-F]{3}|T[0-9A-F]{8})[0-8]([0-9A-F]{2})*\r?\n", "slcan (Lawicel) text",
+     _BY_SAVVYCAN),
+    (rb'"No\."', "Wireshark's list of packets, without their bytes",
+     "save the packets themselves (File > Save As) as pcapng"),
+    (rb">?(AT|ST) ?M", "what an ELM327 shows, without time stamps",
+     "record with a CAN adapter whose program stamps the frames, such as SavvyCAN or candump -l"),
+)  # fmt: skip
+_FRAME_IDS: Final = {"id", "can id", "arb id", "identifier", "帧id"}
+_FRAME_BYTES: Final = {"d0", "d1", "b1", "data", "data bytes", "数据(hex)"}
 
 
 def foreign_format(data: bytes) -> tuple[str, str] | None:
@@ -39,4 +60,14 @@ def foreign_format(data: bytes) -> tuple[str, str] | None:
     for at, mark, name, cure in _FORMATS:
         if data[at : at + len(mark)] == mark:
             return name, cure
+    for pattern, name, cure in _CAPTURES:
+        if re.match(pattern, data):
+            return name, cure
+    for line in data[:4000].decode(errors="replace").lower().splitlines()[:10]:
+        cells = {cell.strip(' "') for cell in re.split("[,;\t]", line)}
+        if cells & _FRAME_IDS and cells & _FRAME_BYTES:
+            return "a table of CAN frames, not of a known form", (
+                f"{_BY_SAVVYCAN}; or write its columns as cabana's CSV: the heading"
+                " time,addr,bus,data, then seconds, id (0x…), number of the bus, bytes (0x…)"
+            )
     return None

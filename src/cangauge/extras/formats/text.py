@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import re
+from collections import Counter
 from collections.abc import Sequence
+from contextlib import suppress
+from datetime import datetime
 from typing import Any, ClassVar, Final
 
 import can
@@ -12,16 +15,28 @@ from cangauge.bus.readers import LineReader, PatternReader, Stamps, candump_fram
 
 
 class SpacedReader(PatternReader):
-    """Seconds, id, length, bytes: traces of older CAN Hackers, with or without their header."""
+    """Time, id, length, bytes: traces of older CAN Hackers, and of loggers on microcontrollers."""
 
     name = "seconds, id, length, bytes"
     # 0000.004429 000001DB 8 FD A0 BA AA 00 00 01 A8
-    pattern = re.compile(r"(\d+\.\d+) ++([0-9A-Fa-f]{8}) ++(\d{1,2})((?: [0-9A-Fa-f]{2})*)\s*$")
+    # 1512293  5F1  8  A8 16 65 9 0 0 0 0
+    pattern = re.compile(
+        r"(\d++(?:\.\d++)?) ++([0-9A-Fa-f]{1,8}) ++(\d{1,2})"
+        r"((?: ++(?:[0-9A-Fa-f]{2}|[0-9A-Fa-f](?=\s)))*+)\s*$"  # a cut byte is none of one digit
+    )
     other = re.compile(r"Time\s++ID\s++DLC\b")
+
+    def prepare(self, head: Sequence[str]) -> bool:
+        """Find the unit of the stamps: whole ones are milliseconds."""
+        first = next(filter(None, map(self.pattern.match, head)), None)
+        if first is not None and "." not in first[1]:
+            self.stamps = "ms"
+        return first is not None
 
     def _frame(self, *groups: Any) -> can.Message:
         time, number, length, data = groups
-        return frame(time, number, data, length)
+        time_s = float(time) / (1e3 if self.stamps == "ms" else 1.0)
+        return frame(time_s, number, "".join(f"{byte:0>2}" for byte in data.split()), length)
 
 
 class TableReader(LineReader):
@@ -78,23 +93,41 @@ class CrtdReader(PatternReader):
         )
 
 
+class BatteryEmulatorReader(PatternReader):
+    """Log of Battery-Emulator's web page: its ids are not padded, else it looks like candump's."""
+
+    name = "Battery-Emulator log"
+    # (216.112) RX0 7A [8] 00 00 D2 B6 BC 5E 00 00
+    pattern = re.compile(
+        r"\((\d++\.\d++)\) ([RTrt][Xx]\d++) ([0-9A-Fa-f]{1,8}) \[(\d++)\]((?: [0-9A-Fa-f]{2}\b)*)"
+    )
+
+    def _frame(self, *groups: Any) -> can.Message:
+        time, channel, number, length, data = groups
+        return frame(time, number, data, length, channel=channel, is_rx=channel[0] in "Rr")
+
+
 class CandumpReader(PatternReader):
-    """Screen output of candump with stamps."""
+    """Screen output of candump with stamps: absolute, or dates, which are taken as UTC."""
 
     name = "candump with stamps"
     has_stamps: ClassVar[bool] = True
     #  (1436509052.249713)  can0  1DB   [8]  00 04 C2 62 00 00 03 B6
+    #  (2015-07-09 06:17:32.249713)  can0  1DB   [8]  00 04 C2 62 00 00 03 B6
     # Possessive (++): no backtracking over a line of 16,000 blanks.
     pattern = re.compile(
-        r"\s*+(?:\((\d++\.\d++)\)\s*+)?(\S++)\s++(?:[RT]X(?:\s++[-BE](?=\s))*+\s++)?"
+        r"\s*+(?:\(((\d{4}-\d\d-\d\d \d\d:\d\d:)?\d++\.\d++)\)\s*+)?"
+        r"(\S++)\s++(?:[RT]X(?:\s++[-BE](?=\s))*+\s++)?"
         r"([0-9A-Fa-f]{3}|[0-9A-Fa-f]{8})"
         r"\s++\[(\d++)\]\s++(remote request|(?:[0-9A-Fa-f]{2}\b ?)*)"
     )
 
     def _frame(self, *groups: Any) -> can.Message:
-        time, channel, number, length, data = groups
+        time, date, channel, number, length, data = groups
         if (time is not None) is not self.has_stamps:
             raise ValueError("only some lines have stamps")
+        if date:
+            time = f"{datetime.fromisoformat(f'{time}+00:00').timestamp():.6f}"
         content = None if data == "remote request" else data
         return candump_frame(time or "0", channel, number, content, length)
 
@@ -107,10 +140,10 @@ class UnstampedCandumpReader(CandumpReader):
     has_stamps = False
 
 
-_SHORTEST_FRAME_S: Final = 47e-6
-"""A standard frame without data, with the pause after it: 47 bits at 1 Mbit/s, the fastest [s]."""
 _FRAMES_FOR_UNIT: Final = 100
 """Frames of one bus from which stamps in milliseconds are distinguished from bursts."""
+_FASTEST_MESSAGE_S: Final = 1e-3
+"""Periodic messages are not sent more often; transfers in many frames are [s]."""
 
 
 class GvretReader(LineReader):
@@ -134,13 +167,30 @@ class GvretReader(LineReader):
         self._places = [headings.index(name) for name in (*self._COLUMNS, length_name)]
         self._way = headings.index("Dir") if "Dir" in headings else None
         self._per_s = 1e6
-        if _is_too_fast(head[1:], self._places[0], self._places[3]):
+        self._find_unit([each for line in head[1:] if (each := self._parsed(line)) is not None])
+        return True
+
+    def _parsed(self, line: str) -> can.Message | None:
+        with suppress(ValueError, OverflowError):
+            return self.parse(line)
+        return None
+
+    def _find_unit(self, frames: Sequence[can.Message]) -> None:
+        """Take stamps as milliseconds where microseconds would be too fast for a bus."""
+        buses = {each.channel: [f for f in frames if f.channel == each.channel] for each in frames}
+        if any(map(_is_too_fast, buses.values())):
             self._per_s = 1e3
             self.stamps = "ms"
-            self.remarks.append(
-                "too many frames per microsecond for any bus: time stamps are taken as milliseconds"
-            )
-        return True
+            remark = "too many frames per microsecond for any bus: time stamps are taken as"
+            self.remarks.insert(0, f"{remark} milliseconds")
+            return
+        for number, count in Counter(f.arbitration_id for f in frames).most_common(1):
+            period_s = _duration_s(frames) / max(count - 1, 1)
+            if count > 1 and period_s < _FASTEST_MESSAGE_S:
+                self.remarks.append(
+                    f"time stamps are taken as microseconds, by which 0x{number:X} comes every"
+                    f" {1e3 * period_s:.2g} ms; if they are milliseconds, multiply them by 1000"
+                )
 
     def parse(self, line: str) -> can.Message | None:
         """Return the frame of a line."""
@@ -172,18 +222,25 @@ class GvretReader(LineReader):
         return f"{match[1]}E{match[2]}"
 
 
-def _is_too_fast(lines: Sequence[str], time: int, bus: int) -> bool:
-    """Return whether stamps in microseconds would exceed the capacity of a bus."""
-    stamps: dict[str, list[int]] = {}
-    for line in lines:
-        cells = line.split(",")
-        if len(cells) > max(time, bus) and cells[time].isdecimal() and len(cells[time]) < 20:
-            stamps.setdefault(cells[bus], []).append(int(cells[time]))
-    return any(
-        len(each) >= _FRAMES_FOR_UNIT
-        and max(each) - min(each) < (len(each) - 1) * _SHORTEST_FRAME_S * 1e6
-        for each in stamps.values()
+def _is_too_fast(frames: Sequence[can.Message]) -> bool:
+    """Return whether a bus is too slow for these frames, at 1 Mbit/s and without stuff bits."""
+    if len(frames) < _FRAMES_FOR_UNIT:
+        return False
+    # ISO 11898-1: a frame without data, with the pause after it, has 47 bits, with a long id 67. Of
+    # CAN FD, 30 or 49 of them are not sent at the rate of the data, which may be higher.
+    is_fd = any(frame.is_fd for frame in frames)
+    bits = sum(
+        (49 if frame.is_extended_id else 30)
+        if is_fd
+        else (67 if frame.is_extended_id else 47) + 8 * len(frame.data)
+        for frame in frames[1:]
     )
+    return _duration_s(frames) < bits * 1e-6
+
+
+def _duration_s(frames: Sequence[can.Message]) -> float:
+    times_s = [frame.timestamp for frame in frames]
+    return max(times_s) - min(times_s)
 
 
 class IdDataReader(PatternReader):
@@ -202,6 +259,26 @@ class IdDataReader(PatternReader):
 
     def _frame(self, *groups: Any) -> can.Message:
         return frame(0.0, *groups)
+
+
+class CabanaReader(PatternReader):
+    """CSV of openpilot's cabana: seconds, id (decimal without 0x), bus, bytes."""
+
+    name = "cabana CSV"
+    states_length = False
+    # 15.460,0x440,1,0x4000800000000000
+    pattern = re.compile(
+        r"(\d+(?:\.\d+)?),(0x[0-9A-Fa-f]{1,8}|\d{1,9}),(\d{1,9}),(?:0x)?((?:[0-9A-Fa-f]{2}){0,64})\s*$"
+    )
+    other = re.compile("time,addr,bus,data")
+
+    def prepare(self, head: Sequence[str]) -> bool:
+        """Check the headings."""
+        return self.other.match(head[0]) is not None
+
+    def _frame(self, *groups: Any) -> can.Message:
+        time, number, bus, data = groups
+        return frame(time, int(number, 0), data, channel=int(bus))
 
 
 class CarbusReader(LineReader):
