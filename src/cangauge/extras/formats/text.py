@@ -167,29 +167,28 @@ class GvretReader(LineReader):
         self._places = [headings.index(name) for name in (*self._COLUMNS, length_name)]
         self._way = headings.index("Dir") if "Dir" in headings else None
         self._per_s = 1e6
-        self._find_unit([each for line in head[1:] if (each := self._parsed(line)) is not None])
+        frames: list[can.Message] = []
+        for line in head[1:]:
+            with suppress(ValueError, OverflowError):
+                frames += filter(None, [self.parse(line)])
+        self._find_unit(frames)
         return True
-
-    def _parsed(self, line: str) -> can.Message | None:
-        with suppress(ValueError, OverflowError):
-            return self.parse(line)
-        return None
 
     def _find_unit(self, frames: Sequence[can.Message]) -> None:
         """Take stamps as milliseconds where microseconds would be too fast for a bus."""
-        buses = {each.channel: [f for f in frames if f.channel == each.channel] for each in frames}
-        if any(map(_is_too_fast, buses.values())):
+        channels = {each.channel for each in frames}
+        if any(_is_too_fast([each for each in frames if each.channel == one]) for one in channels):
             self._per_s = 1e3
             self.stamps = "ms"
             remark = "too many frames per microsecond for any bus: time stamps are taken as"
             self.remarks.insert(0, f"{remark} milliseconds")
             return
-        for number, count in Counter(f.arbitration_id for f in frames).most_common(1):
-            period_s = _duration_s(frames) / max(count - 1, 1)
-            if count > 1 and period_s < _FASTEST_MESSAGE_S:
+        for number, count in Counter(each.arbitration_id for each in frames).most_common(1):
+            if _duration_s(frames) < _FASTEST_MESSAGE_S * (count - 1):
+                period_ms = 1e3 * _duration_s(frames) / (count - 1)
                 self.remarks.append(
                     f"time stamps are taken as microseconds, by which 0x{number:X} comes every"
-                    f" {1e3 * period_s:.2g} ms; if they are milliseconds, multiply them by 1000"
+                    f" {period_ms:.2g} ms; if they are milliseconds, multiply them by 1000"
                 )
 
     def parse(self, line: str) -> can.Message | None:
@@ -281,28 +280,25 @@ class CabanaReader(PatternReader):
         return frame(time, int(number, 0), data, channel=int(bus))
 
 
-class CarbusReader(LineReader):
+class CarbusReader(PatternReader):
     """CARBUS Analyzer (canhacker.ru): seconds and microseconds; before version 3 milliseconds."""
 
     name = "CARBUS Analyzer trace"
     # @ TEXT @ 3 @ 64 @ 0 @ 1149 @ 7459 @ 00:00:07.459 @
     # 26,641405 <tab> 1 <tab> 00000004 <tab> 112 <tab> 8 <tab> 00 20 C1 0E 01 72 89 00 <tab> …
+    pattern = re.compile(r"(\d+),(\d+)\t(\d+)\t[^\t]*\t(\w+)\t(\d+)\t([^\t]*)")
+    other = re.compile("[@#]")
     _HEADER: Final = re.compile(r"@ TEXT @ (\d) @")
 
     def prepare(self, head: Sequence[str]) -> bool:
         """Find the version."""
         match = self._HEADER.match(head[0])
-        if match is None:
-            return False
-        self.stamps = "us" if int(match[1]) >= 3 else "ms"
-        return True
+        if match is not None and int(match[1]) < 3:
+            self.stamps = "ms"
+        return match is not None
 
-    def parse(self, line: str) -> can.Message | None:
-        """Return the frame of a line."""
-        if line.startswith(("@", "#")):
-            return None
-        time, channel, _, number, length, data, *_ = line.split("\t")
-        seconds, fraction = time.split(",")
+    def _frame(self, *groups: Any) -> can.Message:
+        seconds, fraction, channel, number, length, data = groups
         time_s = int(seconds) + int(fraction) / (1e6 if self.stamps == "us" else 1e3)
         return frame(time_s, number, data, length, channel=int(channel))
 
@@ -310,33 +306,26 @@ class CarbusReader(LineReader):
 _HALF_A_DAY_S: Final = 43200.0
 
 
-class CanHackerReader(LineReader):
+class CanHackerReader(PatternReader):
     """CAN Hacker log: time of day in milliseconds."""
 
     name = "CAN Hacker log"
     stamps: Stamps = "ms"
     # > <tab> 2 <tab>  17:18:39.355:2240.00 <tab> St <tab> 0x112 <tab> 0 <tab> 8 <tab> … <tab> p:2
     # Minutes, seconds and milliseconds are not padded (17:19:9.69 is 9.069 s); after them stand
-    # the microseconds since the frame before.
-    _TIME: Final = re.compile(r"\s*(\d{1,2}):(\d{1,2}):(\d{1,2})\.(\d{1,3})(?::\d+(?:\.\d+)?)?$")
+    # the microseconds since the frame before. Bytes that a frame lacks are blank.
+    pattern = re.compile(
+        r">\t[^\t]*\t\s*(\d{1,2}):(\d{1,2}):(\d{1,2})\.(\d{1,3})(?::\d+(?:\.\d+)?)?\t(St|Ext)"
+        r"\t(\w+)\t[^\t]*\t(\d+)((?:\t[0-9A-Fa-f]{2})*)(?:\t *)*?\tp:(\d+)\s*$"
+    )
+    other = re.compile("CAN speed")
     _day_s = _latest_s = 0.0
 
-    def parse(self, line: str) -> can.Message | None:
-        """Return the frame of a line."""
-        cells = line.rstrip("\r\n").split("\t")
-        if cells[0] != ">" and line.startswith("CAN speed"):
-            return None
-        match = self._TIME.match(cells[2]) if cells[0] == ">" and len(cells) > 7 else None
-        if match is None or cells[3] not in {"St", "Ext"}:
-            raise ValueError("not a frame")
-        return frame(
-            self._time_s(*map(int, match.groups())),
-            cells[4],
-            "".join(cells[7 : 7 + int(cells[6])]),
-            cells[6],
-            is_extended=cells[3] != "St" or None,
-            channel=int(cells[-1].removeprefix("p:")),
-        )
+    def _frame(self, *groups: Any) -> can.Message:
+        hours, minutes, seconds, milliseconds, kind, number, length, data, channel = groups
+        time_s = self._time_s(int(hours), int(minutes), int(seconds), int(milliseconds))
+        is_extended = kind == "Ext" or None
+        return frame(time_s, number, data, length, is_extended=is_extended, channel=int(channel))
 
     def _time_s(self, hours: int, minutes: int, seconds: int, milliseconds: int) -> float:
         time_s = self._day_s + 3600 * hours + 60 * minutes + seconds + milliseconds / 1e3
