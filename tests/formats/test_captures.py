@@ -189,17 +189,22 @@ def test_gvret_filtered_to_an_id(
     assert remark in capture.info.remarks[-1]
 
 
-@pytest.mark.parametrize(("bits", "read"), [(49, "us"), (50, "ms")])
-def test_gvret_of_can_fd_counts_what_the_nominal_rate_sends(
-    tmp_path: Path, bits: int, read: str
+@pytest.mark.parametrize(
+    ("number", "length", "bits"),
+    [("112", 0, 47), ("112", 8, 111), ("18ff0001", 0, 67), ("18ff0001", 8, 131),
+     ("112", 64, 30), ("18ff0001", 64, 49)],
+)  # fmt: skip
+def test_gvret_in_microseconds_leaves_time_for_the_bits(
+    tmp_path: Path, number: str, length: int, bits: int
 ) -> None:
-    """Of a frame of 64 bytes with a 29-bit id, 49 bits are not sent at the rate of the data."""
-    data = ",".join(["ff"] * 64)
-    rows = "".join(f"{k * (98 - bits)},18ff0001,1,1,64,{data}\n" for k in range(200))
-    text = GVRET_WITHOUT_DIRECTION.splitlines(keepends=True)[0] + rows
-    capture = open_capture(write(tmp_path, text))
-    list(capture)
-    assert capture.info.stamps == read
+    """Of CAN FD, the bits that are not sent at the rate of the data."""
+    for gap_us, read in ((bits - 1, "ms"), (bits + 1, "us")):
+        data = ",".join(["ff"] * max(length, 1))
+        rows = "".join(f"{gap_us * k},{number},0,1,{length},{data}\n" for k in range(200))
+        text = GVRET_WITHOUT_DIRECTION.splitlines(keepends=True)[0] + rows
+        capture = open_capture(write(tmp_path, text))
+        list(capture)
+        assert capture.info.stamps == read
 
 
 def test_traces_of_can_hacker_and_carbus(tmp_path: Path) -> None:
@@ -233,7 +238,7 @@ def test_cabana_in_both_spellings(tmp_path: Path) -> None:
 
 def test_relative_stamps_of_asc_that_rise_count_from_the_start(tmp_path: Path) -> None:
     text = "date Wed Mar 13 23:50:00 2024\nbase hex  timestamps relative\n" + "".join(
-        f"{k / 100 - 0.002 * (k % 5 == 3):.3f} 1 1DB Rx d 1 AA\n" for k in range(300)
+        f"{k / 100 - 0.012 * (k % 5 == 3):.3f} 1 1DB Rx d 1 AA\n" for k in range(300)
     )  # every fifth frame is written after the one that follows it
     capture = open_capture(write(tmp_path, text))
     assert [each.timestamp for each in capture][-1] == 2.99
