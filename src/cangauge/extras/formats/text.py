@@ -39,35 +39,22 @@ class SpacedReader(PatternReader):
         return frame(time_s, number, "".join(f"{byte:0>2}" for byte in data.split()), length)
 
 
-class TableReader(LineReader):
-    """Tab-separated, columns by their headings, time in whole milliseconds."""
+class TableReader(PatternReader):
+    """Tab-separated table, time in whole milliseconds."""
 
     name = "tab-separated table"
     stamps: Stamps = "ms"
     # ParserFlags <tab> Ch <tab> Counter <tab> T/R <tab> Time <tab> Flags <tab> CAN ID <tab> Len …
-    _COLUMNS: Final = ("Ch", "T/R", "Time", "CAN ID", "Len", "Data")
+    # 1 <tab> 0 <tab> 14767 <tab> RX <tab> 1052620673 <tab> <tab> 0x000001da <tab> 8 <tab> 0xc8 …
+    pattern = re.compile(
+        r"[^\t]*\t(\d+)\t[^\t]*\t(\w+)\t(\d+)\t[^\t]*\t(0x\w+)\t(\d+)\t(?:0x)?([0-9A-Fa-f ]*)\s"
+    )
+    other = re.compile("ParserFlags\t")
 
-    def prepare(self, head: Sequence[str]) -> bool:
-        """Find the columns."""
-        headings = [cell.strip() for cell in head[0].split("\t")]
-        if any(name not in headings for name in self._COLUMNS):
-            return False
-        self._first = headings[0]
-        self._places = [headings.index(name) for name in self._COLUMNS]
-        return True
-
-    def parse(self, line: str) -> can.Message | None:
-        """Return the frame of a line."""
-        cells = [cell.strip() for cell in line.split("\t")]
-        if cells[0] == self._first:
-            return None
-        if len(cells) <= max(self._places):
-            raise ValueError("not a frame")
-        channel, way, time, number, length, data = (cells[place] for place in self._places)
-        return frame(
-            int(time) / 1000.0, number, data.removeprefix("0x"), length,
-            channel=int(channel), is_rx=way != "TX",
-        )  # fmt: skip
+    def _frame(self, *groups: Any) -> can.Message:
+        channel, way, time, number, length, data = groups
+        is_rx = way != "TX"
+        return frame(int(time) / 1e3, number, data, length, channel=int(channel), is_rx=is_rx)
 
 
 class CrtdReader(PatternReader):
