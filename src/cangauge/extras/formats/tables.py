@@ -55,12 +55,12 @@ class _SheetText(Head):
     def __init__(self, head: Head) -> None:
         self.path, self.name = head.path, head.name
         sheets = _sheets(head)
-        longest = max(sheets, key=lambda title: len(sheets[title]))
-        others = [f"{title!r} ({len(rows)} rows)" for title, rows in sheets.items()
-                  if rows and title != longest]  # fmt: skip
+        longest, rows = max(sheets.items(), key=lambda sheet: len(sheet[1]), default=("", []))
+        others = [f"{title!r} ({len(each)} rows)" for title, each in sheets.items()
+                  if each and title != longest]  # fmt: skip
         remark = f"sheet {longest!r} is read, the longest; not read: {', '.join(others)}"
         self.remarks = [remark] if others else []
-        self._text = "\n".join([*sheets[longest], ""]).encode()
+        self._text = "\n".join([*rows, ""]).encode()
         self.data = self._text[: 1 << 16]
         self.lines = tuple(self.data.decode(errors="ignore").splitlines()[:160])
 
