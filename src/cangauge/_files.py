@@ -216,10 +216,10 @@ class Head:
 
 
 def _only_member(archive: zipfile.ZipFile, path: Path) -> zipfile.ZipInfo:
-    files = [
+    files = [  # but those that macOS adds: ".DS_Store", "__MACOSX/._trip.csv"
         info
         for info in archive.infolist()
-        if info.filename and not info.is_dir() and not info.filename.startswith("__MACOSX")
+        if not info.is_dir() and Path(info.filename).name[:1] not in {"", "."}
     ]
     # A vehicle's zip of the ANL D3 data base holds documents beside the test data.
     chosen = [info for info in files if info.filename.lower().endswith(_D3_MEMBER)] or files

@@ -5,6 +5,7 @@ from __future__ import annotations
 import gzip
 import struct
 from collections.abc import Callable, Iterable, Sequence
+from datetime import UTC, datetime
 from pathlib import Path
 from random import Random
 from typing import ClassVar
@@ -184,6 +185,28 @@ class TestCandumpScreen(Lines):
         return f" ({f.timestamp:.6f})  can{f.channel}  {number}   [{f.dlc}]  {_hex(f)}\n"
 
 
+class TestCandumpWithDates(TestCandumpScreen):
+    @staticmethod
+    def line(f: can.Message) -> str:
+        date = datetime.fromtimestamp(f.timestamp, UTC).isoformat(" ", "microseconds")[:26]
+        return f" ({date})  " + TestCandumpScreen.line(f).split(")  ", 1)[1]
+
+
+class TestBatteryEmulator(Lines):
+    reader = text.BatteryEmulatorReader
+    resolution_s = 1e-3
+    kinds: ClassVar = {"fd": True}
+
+    @staticmethod
+    def line(f: can.Message) -> str:
+        data = f" {_hex(f)}" if f.data else " "
+        return f"({f.timestamp:.3f}) RX{f.channel} {f.arbitration_id:X} [{len(f.data)}]{data}\n"
+
+    def facts(self, frames: Iterable[can.Message]) -> list[tuple[object, ...]]:
+        # No bit rate switch, and the direction is written in the channel.
+        return [(*each[:5], *each[6:8], f"{each[8]}"[-1]) for each in super().facts(frames)]
+
+
 class TestCandumpWithoutStamps(Lines):
     reader = text.UnstampedCandumpReader
     resolution_s = None
@@ -227,6 +250,16 @@ class TestIdAndData(Lines):
     @staticmethod
     def line(f: can.Message) -> str:
         return f"{f.arbitration_id:08X},{_hex(f)} \n"
+
+
+class TestCabana(Lines):
+    reader = text.CabanaReader
+    header = "time,addr,bus,data\n"
+    resolution_s = 1e-3
+
+    @staticmethod
+    def line(f: can.Message) -> str:
+        return f"{f.timestamp:.3f},0x{f.arbitration_id:x},{f.channel},0x{f.data.hex().upper()}\n"
 
 
 class TestCarbus(Lines):
@@ -283,6 +316,17 @@ class TestSpaced(Lines):
         return f"{f.timestamp:.6f} {f.arbitration_id:08X} {f.dlc}{data}\r\n"
 
 
+class TestSpacedInMilliseconds(Lines):
+    reader = text.SpacedReader
+    has_channels = False
+    resolution_s = 1e-3
+
+    @staticmethod
+    def line(f: can.Message) -> str:
+        data = " ".join(f"{byte:X}" for byte in f.data)
+        return f"{round(1000 * f.timestamp)}  {f.arbitration_id:X}  {f.dlc}  {data} \n"
+
+
 class Written(Conformance):
     """A format that a writer of python-can's shape writes."""
 
@@ -300,6 +344,29 @@ class TestAsc(Written):
     kinds: ClassVar = {"remote": True, "fd": True}
     is_relative = True
     resolution_s = 1e-3  # python-can rounds the start to whole milliseconds
+
+
+class TestAscOfDifferences(Conformance):
+    """Relative time stamps, as Vector writes them: since the event before, frame or not."""
+
+    reader = library.AscReader
+    is_relative = True
+
+    def write(self, path: Path, frames: Iterable[can.Message]) -> None:
+        lines = ["date Wed Mar 13 11:50:00.000 pm 2024", "base hex  timestamps relative",
+                 "internal events logged", "Begin Triggerblock Wed Mar 13 11:50:00.000 pm 2024",
+                 "   0.000000 Start of measurement"]  # fmt: skip
+        before_s = START_S - 0.5
+        for number, frame in enumerate(frames):
+            gap_s = frame.timestamp - before_s
+            if number % 3 == 2:
+                lines.append(f"{gap_s / 4:11.6f} 1  Statistic: D 12 R 0 XD 0 XR 0 E 0 O 0 B 3.01%")
+                gap_s *= 3 / 4
+            name = f"{frame.arbitration_id:X}{'x' * frame.is_extended_id}"
+            where = f"{frame.channel + 1}  {name:15} Rx   d {frame.dlc}"
+            lines.append(f"{gap_s:11.6f} {where} {_hex(frame)}")
+            before_s = frame.timestamp
+        path.write_text("\n".join([*lines, "End TriggerBlock", ""]))
 
 
 class TestBlf(Written):

@@ -11,6 +11,7 @@ import can
 import pytest
 
 from cangauge.bus.captures import find_capture, open_capture
+from cangauge.bus.recording import open_recording
 from cangauge.errors import InputError
 
 SPACED = (
@@ -167,6 +168,45 @@ def test_gvret_stamps_too_fast_for_a_bus_are_milliseconds(tmp_path: Path) -> Non
     assert (times[0], times[-1]) == (5.0, 5.099)
 
 
+@pytest.mark.parametrize(
+    ("per_s", "length", "read", "remark"),
+    [
+        (10, 8, "ms", "too many frames per microsecond"),  # 111 bits each 100 us: over 1 Mbit/s
+        (10, 2, "us", "0x112 comes every 0.1 ms"),  # 63 bits: possible
+        (2, 8, "us", "0x112 comes every 0.5 ms; if they are milliseconds, multiply them"),
+    ],
+)
+def test_gvret_filtered_to_an_id(
+    tmp_path: Path, per_s: int, length: int, read: str, remark: str
+) -> None:
+    data = ",".join(["ff"] * length)
+    rows = "".join(f"{5000 + k * 1000 // per_s},112,0,1,{length},{data}\n" for k in range(200))
+    text = GVRET_WITHOUT_DIRECTION.splitlines(keepends=True)[0] + rows
+    capture = open_capture(write(tmp_path, text))
+    times = [each.timestamp for each in capture]
+    assert times[-1] - times[0] == pytest.approx(199 / per_s / (1 if read == "ms" else 1000))
+    assert capture.info.stamps == read
+    assert remark in capture.info.remarks[-1]
+
+
+@pytest.mark.parametrize(
+    ("number", "length", "bits"),
+    [("112", 0, 47), ("112", 8, 111), ("18ff0001", 0, 67), ("18ff0001", 8, 131),
+     ("112", 64, 30), ("18ff0001", 64, 49)],
+)  # fmt: skip
+def test_gvret_in_microseconds_leaves_time_for_the_bits(
+    tmp_path: Path, number: str, length: int, bits: int
+) -> None:
+    """Of CAN FD, the bits that are not sent at the rate of the data."""
+    for gap_us, read in ((bits - 1, "ms"), (bits + 1, "us")):
+        data = ",".join(["ff"] * max(length, 1))
+        rows = "".join(f"{gap_us * k},{number},0,1,{length},{data}\n" for k in range(200))
+        text = GVRET_WITHOUT_DIRECTION.splitlines(keepends=True)[0] + rows
+        capture = open_capture(write(tmp_path, text))
+        list(capture)
+        assert capture.info.stamps == read
+
+
 def test_traces_of_can_hacker_and_carbus(tmp_path: Path) -> None:
     first, second = open_capture(write(tmp_path, CARBUS))
     assert facts(first) == (26.641405, 0x112, False, "0020c10e01728900")
@@ -177,6 +217,82 @@ def test_traces_of_can_hacker_and_carbus(tmp_path: Path) -> None:
     assert facts(first) == (86399.303, 0x197, False, "64e09ec0")
     assert facts(second) == (86409.069, 0x10B, False, "ba0dfc")  # past midnight
     assert (third.is_extended_id, third.channel) == (True, 2)
+
+
+def test_battery_emulator_does_not_pad_ids(tmp_path: Path) -> None:
+    lines = "(216.112) RX0 7A [8] 00 00 D2 B6 BC 5E 00 00\n(216.116) tx1 a5b [2] 01 f4\n"
+    first, second, *_ = open_capture(write(tmp_path, "ets Jul 29 2019 12:21:46\n" + 2 * lines))
+    assert facts(first) == (216.112, 0x7A, False, "0000d2b6bc5e0000")
+    assert facts(second) == (216.116, 0xA5B, True, "01f4")
+    assert (first.channel, first.is_rx, second.is_rx) == ("RX0", True, False)
+    with pytest.raises(InputError, match="not a known kind"):  # candump pads them
+        open_capture(write(tmp_path, lines.replace("RX0", "can0").replace("tx1", "can1")))
+
+
+def test_cabana_in_both_spellings(tmp_path: Path) -> None:
+    text = "time,addr,bus,data\n0.061,308,0,08007c630a00d064\n15,0x18ff50e5,129,0x4A\n"
+    first, second = open_capture(write(tmp_path, text))
+    assert facts(first) == (0.061, 308, False, "08007c630a00d064")
+    assert facts(second) == (15.0, 0x18FF50E5, True, "4a")
+
+
+def test_relative_stamps_of_asc_that_rise_count_from_the_start(tmp_path: Path) -> None:
+    text = "date Wed Mar 13 23:50:00 2024\nbase hex  timestamps relative\n" + "".join(
+        f"{k / 100 - 0.012 * (k % 5 == 3):.3f} 1 1DB Rx d 1 AA\n" for k in range(300)
+    )  # every fifth frame is written after the one that follows it
+    capture = open_capture(write(tmp_path, text))
+    assert [each.timestamp for each in capture][-1] == 2.99
+    assert capture.info.remarks == ("relative time stamps rise: taken as time since the start",)
+
+
+PEAK = {
+    # As PEAK's description of the format has them.
+    "1.2": (
+        "     1)      1059.900  1  Rx         0300  7  00 00 00 00 04 00 00 \n"
+        "     5)      1346.834  1  Warng  FFFFFFFF  4  00 00 00 04  BUSLIGHT\n"
+        "     7)      1352.743  2  Tx     18EFC034  3  RTR\n"
+    ),
+    "2.1": (
+        "      1      1059.900 DT 1      0300 Rx -  7    00 00 00 00 04 00 00\n"
+        "      5      1334.416 FD 2  18EFC034 Tx -  9    01 02 03 04 05 06 07 08 09 0A 0B 0C\n"
+    ),
+}
+
+
+@pytest.mark.parametrize("version", list(PEAK))
+def test_versions_of_peak_trc(tmp_path: Path, version: str) -> None:
+    columns = ";$COLUMNS=N,O,T,B,I,d,R,L,D\n" if version == "2.1" else ""
+    head = f";$FILEVERSION={version}\n;$STARTTIME=39878.6772258947;\n{columns};\n"
+    first, second = open_capture(write(tmp_path, head + PEAK[version]))
+    assert first.timestamp == pytest.approx(1236356112.317302 + 1.0599, abs=2e-6)
+    assert facts(first)[1:] == (0x300, False, "00000000040000")
+    assert (second.arbitration_id, second.is_rx, second.channel) == (0x18EFC034, False, 2)
+    assert second.is_remote_frame if version == "1.2" else second.dlc == 12
+
+
+@pytest.mark.parametrize(
+    ("content", "name", "cure"),
+    [
+        (b"***BUSMASTER Ver 3.2.2***\n", "BUSMASTER", "SavvyCAN"),
+        (b"Chn Identifier Flg   DLC  D0...1...2\n", "Kvaser", "SavvyCAN"),
+        (b"# Logger type: CANLogger1000\n", "CLX000", "SavvyCAN"),
+        (b"0.0005;RX;0x305;2;0x1F;0x03;\n", "Microchip", "SavvyCAN"),
+        (b"t30521F030000\r\nT18FF50E514A0016\r\n", "slcan", "SavvyCAN"),
+        (b'"No.","Time","Source","Info"\n"1","0.5","","ID: 773"\n', "Wireshark", "pcapng"),
+        (b"ATMA\r\n305 1F 03 20 10\r\n", "ELM327", "stamps the frames"),
+        ("date Wed Mar 13 23:50:00 2024\nbase hex\n".encode("utf-16"), "UTF-16", "iconv"),
+        (b"LOGFILEVERSION\nLine,Abs Time(Sec),Arb ID,B1,B2\n1,0.5,305,1F,3\n", "table of CAN",
+         "time,addr,bus,data"),
+        ("序号,时间标识,帧ID,数据(HEX)\n0,23:50:00,0x305,1F 03\n".encode(), "table of CAN",
+         "time,addr,bus,data"),
+    ],
+)  # fmt: skip
+def test_captures_that_are_not_read_name_the_conversion(
+    tmp_path: Path, content: bytes, name: str, cure: str
+) -> None:
+    with pytest.raises(InputError, match=name) as caught:
+        open_recording(write(tmp_path, content))
+    assert cure in str(caught.value.cure)
 
 
 def test_without_stamps_frames_of_the_clock_count_time(tmp_path: Path) -> None:

@@ -74,6 +74,7 @@ def zipped(name: str, data: bytes) -> bytes:
     with zipfile.ZipFile(packed, "w", zipfile.ZIP_DEFLATED) as archive:
         archive.writestr(name, data)
         archive.writestr("__MACOSX/._x", b"")
+        archive.writestr("trips/.DS_Store", b"")
     return packed.getvalue()
 
 

@@ -176,6 +176,7 @@ def test_workbook_reads_as_its_longest_sheet(tmp_path: Path) -> None:
     log = read_log(path)
     np.testing.assert_allclose(log.time_s - log.time_s[0], TIME_S)
     np.testing.assert_array_equal(log.current_a, CURRENT_A)
+    assert "sheet 'Channel_1' is read, the longest; not read: 'Sheet' (1 rows)" in log.remarks
     path.write_bytes(path.read_bytes()[:-300])
     with pytest.raises(InputError, match=r"log\.xlsx: the zip file is cut off or damaged"):
         read_log(path)

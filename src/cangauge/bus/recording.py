@@ -325,7 +325,7 @@ def capture_to_log(path: str | PathLike[str], vehicle: Vehicle) -> Log:
     dropped = np.count_nonzero(~keep)
     if dropped > 0.5 * keep.size:
         problem = "time runs backwards or does not advance in the capture"
-        cure = "split it where time starts again; record with absolute stamps (candump -l, not -td)"
+        cure = "split it where time starts again; record with stamps that increase (candump -l)"
         raise InputError(problem, source=path, cure=cure)
     if dropped:
         remarks.append(f"{dropped} samples dropped whose time does not advance")

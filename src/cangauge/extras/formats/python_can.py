@@ -3,19 +3,32 @@
 from __future__ import annotations
 
 import io
+import re
 import struct
 from collections.abc import Callable, Iterator
 from importlib.util import find_spec
 from typing import Any, ClassVar, Final
 
 import can
+import numpy as np
 from can.io.blf import BLFParseError
+from can.util import dlc2len
 
+from cangauge._files import HEAD_BYTES
 from cangauge.bus.readers import MAX_LINE, BinaryReader
 from cangauge.errors import InputError
 
 _OBJECT: Final = struct.Struct("<8sI4x")
 """Header of an object in a BLF, with its size [bytes]."""
+
+
+def _whole_lines(raw: Any) -> Iterator[str]:
+    """Yield the lines of a text; a cut one is damage, because it may read as a frame."""
+    text = io.TextIOWrapper(raw, "utf-8", errors="replace")
+    while line := text.readline(MAX_LINE):
+        if not line.endswith("\n"):
+            raise EOFError("it ends in a line")
+        yield line
 
 
 class LibraryReader(BinaryReader):
@@ -24,7 +37,7 @@ class LibraryReader(BinaryReader):
     Attributes
     ----------
     library : callable
-        Class of python-can that takes a file object.
+        Class of python-can, or a function, that takes a file object or lines, and yields frames.
     is_text : bool
     marks : tuple of bytes
         One of these begins a file.
@@ -39,9 +52,13 @@ class LibraryReader(BinaryReader):
         """Return whether the file begins with the format's mark."""
         return head.startswith(cls.marks)
 
+    def content(self) -> Any:
+        """Return what the class of python-can reads."""
+        return _whole_lines(self.raw) if self.is_text else self.raw
+
     def read(self) -> Iterator[can.Message]:
         """Yield the frames, without those whose length contradicts their DLC."""
-        for message in type(self).library(_WholeLines(self.raw) if self.is_text else self.raw):
+        for message in type(self).library(self.content()):
             is_whole = message.is_remote_frame or len(message.data) == message.dlc
             if is_whole or message.is_error_frame:
                 yield message
@@ -49,29 +66,16 @@ class LibraryReader(BinaryReader):
                 self.skip(None)
 
 
-class _WholeLines:
-    """The lines of a text for python-can's readers; a cut one is damage: it may read as a frame."""
-
-    def __init__(self, raw: io.BufferedIOBase) -> None:
-        self._text = io.TextIOWrapper(raw, "utf-8", errors="replace")  # type: ignore[type-var]
-        self.close = self._text.close
-
-    def __iter__(self) -> Iterator[str]:
-        return self
-
-    def __next__(self) -> str:
-        line = self._text.readline(MAX_LINE)
-        if line and not line.endswith("\n"):
-            raise EOFError("it ends in a line")
-        if not line:
-            raise StopIteration
-        return line
-
-
 class AscReader(LibraryReader):
-    """Vector ASC."""
+    """Vector ASC.
+
+    Under a header of relative time stamps, Vector writes the time since the event before, frame or
+    not. Other programs write the time since the start, which does not fall.
+    """
 
     name, library = "Vector ASC", can.ASCReader
+    _RELATIVE: Final = re.compile(r"(?im)^\s*base\s+\w+\s+timestamps\s+relative")
+    _STAMP: Final = re.compile(r"(?m)^[ \t]*(\d+\.\d+)(?=\s)")
 
     @classmethod
     def matches(cls, head: bytes) -> bool:
@@ -81,6 +85,28 @@ class AscReader(LibraryReader):
         return head[:5].lower() == b"date " and any(
             line.strip().startswith(bases) for line in lines
         )
+
+    def content(self) -> Iterator[str]:
+        """Return the lines; time since the event before is added up."""
+        raw = io.BufferedReader(self.raw, HEAD_BYTES)
+        head = raw.peek().decode("latin-1")
+        lines = _whole_lines(raw)
+        if self._RELATIVE.search(head) is None:
+            return lines
+        steps_s = np.diff([float(stamp) for stamp in self._STAMP.findall(head)])
+        # Differences fall as much as they rise; a clock does not fall, but for buses out of order.
+        if -2.0 * steps_s[steps_s < 0.0].sum() <= steps_s[steps_s > 0.0].sum():
+            self.remarks.append("relative time stamps rise: taken as time since the start")
+            return lines
+        self.remarks.append("relative time stamps: each is added to the one before")
+        return self._added_up(lines)
+
+    def _added_up(self, lines: Iterator[str]) -> Iterator[str]:
+        time_s = 0.0
+        for line in lines:
+            stamp = self._STAMP.match(line)
+            time_s += float(stamp[1]) if stamp else 0.0
+            yield f"{time_s:.9f}{line[stamp.end() :]}" if stamp else line
 
 
 class _EndingBlf(can.BLFReader):
@@ -102,16 +128,38 @@ class BlfReader(LibraryReader):
     name, library, is_text, marks = "Vector BLF", _EndingBlf, False, (b"LOGG",)
 
 
-class TrcReader(LibraryReader):
-    """PEAK TRC."""
+def _trc_frames(lines: Iterator[str]) -> Iterator[can.Message]:
+    for message in can.TRCReader(lines):  # type: ignore[arg-type]
+        if message.is_fd:  # python-can leaves the code of the length
+            message.dlc = dlc2len(message.dlc)
+        yield message
 
-    name, library = "PEAK TRC", can.TRCReader
+
+class TrcReader(LibraryReader):
+    """PEAK TRC; version 1.2, which python-can does not know, lacks the sixth column of 1.3."""
+
+    name, library = "PEAK TRC", _trc_frames
 
     @classmethod
     def matches(cls, head: bytes) -> bool:
         """Return whether it begins with PEAK's comments."""
         begin = head[:4000]
         return head.startswith(b";") and (b";$FILEVERSION=" in begin or b"PCAN" in begin)
+
+    def content(self) -> Iterator[str]:
+        """Yield the lines as of a version that python-can knows."""
+        is_1_2 = False
+        for line in _whole_lines(self.raw):
+            cells = line.split()
+            if line.startswith(";$FILEVERSION=1.2"):
+                is_1_2 = True
+                yield ";$FILEVERSION=1.3\n"
+            elif line.startswith(";$STARTTIME="):
+                yield line.rstrip("; \r\n")
+            elif is_1_2 and len(cells) > 5 and cells[5] != "-":
+                yield " ".join([*cells[:5], "-", *cells[5:]])
+            else:
+                yield line
 
 
 class CsvReader(LibraryReader):

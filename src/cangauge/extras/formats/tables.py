@@ -44,7 +44,9 @@ class Workbook:
         table = find_table(sheet, columns)
         if table is None:
             raise unknown_columns(str(head.path), *likely_header(sheet, columns))
-        return draft_of_table(table, columns, name=head.name, source=str(head.path))
+        draft = draft_of_table(table, columns, name=head.name, source=str(head.path))
+        draft.remarks.extend(sheet.remarks)
+        return draft
 
 
 class _SheetText(Head):
@@ -52,7 +54,13 @@ class _SheetText(Head):
 
     def __init__(self, head: Head) -> None:
         self.path, self.name = head.path, head.name
-        self._text = _longest_sheet(head).encode()
+        sheets = _sheets(head)
+        longest, rows = max(sheets.items(), key=lambda sheet: len(sheet[1]), default=("", []))
+        others = [f"{title!r} ({len(each)} rows)" for title, each in sheets.items()
+                  if each and title != longest]  # fmt: skip
+        remark = f"sheet {longest!r} is read, the longest; not read: {', '.join(others)}"
+        self.remarks = [remark] if others else []
+        self._text = "\n".join([*rows, ""]).encode()
         self.data = self._text[: 1 << 16]
         self.lines = tuple(self.data.decode(errors="ignore").splitlines()[:160])
 
@@ -60,7 +68,8 @@ class _SheetText(Head):
         return self._text
 
 
-def _longest_sheet(head: Head) -> str:
+def _sheets(head: Head) -> dict[str, list[str]]:
+    """Return the rows of each sheet by its title."""
     try:
         import openpyxl  # noqa: PLC0415 - an extra
     except ImportError as error:
@@ -72,14 +81,13 @@ def _longest_sheet(head: Head) -> str:
     try:
         with head.open() as file:
             book = openpyxl.load_workbook(file, read_only=True, data_only=True)
-            sheets = [_rows(sheet) for sheet in book.worksheets]
+            return {sheet.title: _rows(sheet) for sheet in book.worksheets}
     except Exception as error:  # openpyxl raises whatever a damaged part provokes
         raise InputError(
             f"the workbook is damaged ({type(error).__name__})",
             source=head.path,
             cure="save it again, or export the sheet as CSV",
         ) from error
-    return "\n".join([*max(sheets, key=len, default=[]), ""])
 
 
 def _rows(sheet: Any) -> list[str]:

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import re
+from collections import Counter
 from collections.abc import Sequence
+from contextlib import suppress
+from datetime import datetime
 from typing import Any, ClassVar, Final
 
 import can
@@ -12,47 +15,46 @@ from cangauge.bus.readers import LineReader, PatternReader, Stamps, candump_fram
 
 
 class SpacedReader(PatternReader):
-    """Seconds, id, length, bytes: traces of older CAN Hackers, with or without their header."""
+    """Time, id, length, bytes: traces of older CAN Hackers, and of loggers on microcontrollers."""
 
     name = "seconds, id, length, bytes"
     # 0000.004429 000001DB 8 FD A0 BA AA 00 00 01 A8
-    pattern = re.compile(r"(\d+\.\d+) ++([0-9A-Fa-f]{8}) ++(\d{1,2})((?: [0-9A-Fa-f]{2})*)\s*$")
+    # 1512293  5F1  8  A8 16 65 9 0 0 0 0
+    pattern = re.compile(
+        r"(\d++(?:\.\d++)?) ++([0-9A-Fa-f]{1,8}) ++(\d{1,2})"
+        r"((?: ++(?:[0-9A-Fa-f]{2}|[0-9A-Fa-f](?=\s)))*+)\s*$"  # a cut byte is none of one digit
+    )
     other = re.compile(r"Time\s++ID\s++DLC\b")
+
+    def prepare(self, head: Sequence[str]) -> bool:
+        """Find the unit of the stamps: whole ones are milliseconds."""
+        first = next(filter(None, map(self.pattern.match, head)), None)
+        if first is not None and "." not in first[1]:
+            self.stamps = "ms"
+        return first is not None
 
     def _frame(self, *groups: Any) -> can.Message:
         time, number, length, data = groups
-        return frame(time, number, data, length)
+        time_s = float(time) / (1e3 if self.stamps == "ms" else 1.0)
+        return frame(time_s, number, "".join(f"{byte:0>2}" for byte in data.split()), length)
 
 
-class TableReader(LineReader):
-    """Tab-separated, columns by their headings, time in whole milliseconds."""
+class TableReader(PatternReader):
+    """Tab-separated table, time in whole milliseconds."""
 
     name = "tab-separated table"
     stamps: Stamps = "ms"
     # ParserFlags <tab> Ch <tab> Counter <tab> T/R <tab> Time <tab> Flags <tab> CAN ID <tab> Len …
-    _COLUMNS: Final = ("Ch", "T/R", "Time", "CAN ID", "Len", "Data")
+    # 1 <tab> 0 <tab> 14767 <tab> RX <tab> 1052620673 <tab> <tab> 0x000001da <tab> 8 <tab> 0xc8 …
+    pattern = re.compile(
+        r"[^\t]*\t(\d+)\t[^\t]*\t(\w+)\t(\d+)\t[^\t]*\t(0x\w+)\t(\d+)\t(?:0x)?([0-9A-Fa-f ]*)\s"
+    )
+    other = re.compile("ParserFlags\t")
 
-    def prepare(self, head: Sequence[str]) -> bool:
-        """Find the columns."""
-        headings = [cell.strip() for cell in head[0].split("\t")]
-        if any(name not in headings for name in self._COLUMNS):
-            return False
-        self._first = headings[0]
-        self._places = [headings.index(name) for name in self._COLUMNS]
-        return True
-
-    def parse(self, line: str) -> can.Message | None:
-        """Return the frame of a line."""
-        cells = [cell.strip() for cell in line.split("\t")]
-        if cells[0] == self._first:
-            return None
-        if len(cells) <= max(self._places):
-            raise ValueError("not a frame")
-        channel, way, time, number, length, data = (cells[place] for place in self._places)
-        return frame(
-            int(time) / 1000.0, number, data.removeprefix("0x"), length,
-            channel=int(channel), is_rx=way != "TX",
-        )  # fmt: skip
+    def _frame(self, *groups: Any) -> can.Message:
+        channel, way, time, number, length, data = groups
+        is_rx = way != "TX"
+        return frame(int(time) / 1e3, number, data, length, channel=int(channel), is_rx=is_rx)
 
 
 class CrtdReader(PatternReader):
@@ -78,23 +80,41 @@ class CrtdReader(PatternReader):
         )
 
 
+class BatteryEmulatorReader(PatternReader):
+    """Log of Battery-Emulator's web page: its ids are not padded, else it looks like candump's."""
+
+    name = "Battery-Emulator log"
+    # (216.112) RX0 7A [8] 00 00 D2 B6 BC 5E 00 00
+    pattern = re.compile(
+        r"\((\d++\.\d++)\) ([RTrt][Xx]\d++) ([0-9A-Fa-f]{1,8}) \[(\d++)\]((?: [0-9A-Fa-f]{2}\b)*)"
+    )
+
+    def _frame(self, *groups: Any) -> can.Message:
+        time, channel, number, length, data = groups
+        return frame(time, number, data, length, channel=channel, is_rx=channel[0] in "Rr")
+
+
 class CandumpReader(PatternReader):
-    """Screen output of candump with stamps."""
+    """Screen output of candump with stamps: absolute, or dates, which are taken as UTC."""
 
     name = "candump with stamps"
     has_stamps: ClassVar[bool] = True
     #  (1436509052.249713)  can0  1DB   [8]  00 04 C2 62 00 00 03 B6
+    #  (2015-07-09 06:17:32.249713)  can0  1DB   [8]  00 04 C2 62 00 00 03 B6
     # Possessive (++): no backtracking over a line of 16,000 blanks.
     pattern = re.compile(
-        r"\s*+(?:\((\d++\.\d++)\)\s*+)?(\S++)\s++(?:[RT]X(?:\s++[-BE](?=\s))*+\s++)?"
+        r"\s*+(?:\(((\d{4}-\d\d-\d\d \d\d:\d\d:)?\d++\.\d++)\)\s*+)?"
+        r"(\S++)\s++(?:[RT]X(?:\s++[-BE](?=\s))*+\s++)?"
         r"([0-9A-Fa-f]{3}|[0-9A-Fa-f]{8})"
         r"\s++\[(\d++)\]\s++(remote request|(?:[0-9A-Fa-f]{2}\b ?)*)"
     )
 
     def _frame(self, *groups: Any) -> can.Message:
-        time, channel, number, length, data = groups
+        time, date, channel, number, length, data = groups
         if (time is not None) is not self.has_stamps:
             raise ValueError("only some lines have stamps")
+        if date:
+            time = f"{datetime.fromisoformat(f'{time}+00:00').timestamp():.6f}"
         content = None if data == "remote request" else data
         return candump_frame(time or "0", channel, number, content, length)
 
@@ -107,10 +127,10 @@ class UnstampedCandumpReader(CandumpReader):
     has_stamps = False
 
 
-_SHORTEST_FRAME_S: Final = 47e-6
-"""A standard frame without data, with the pause after it: 47 bits at 1 Mbit/s, the fastest [s]."""
 _FRAMES_FOR_UNIT: Final = 100
 """Frames of one bus from which stamps in milliseconds are distinguished from bursts."""
+_FASTEST_MESSAGE_S: Final = 1e-3
+"""Periodic messages are not sent more often; transfers in many frames are [s]."""
 
 
 class GvretReader(LineReader):
@@ -134,13 +154,29 @@ class GvretReader(LineReader):
         self._places = [headings.index(name) for name in (*self._COLUMNS, length_name)]
         self._way = headings.index("Dir") if "Dir" in headings else None
         self._per_s = 1e6
-        if _is_too_fast(head[1:], self._places[0], self._places[3]):
+        frames: list[can.Message] = []
+        for line in head[1:]:
+            with suppress(ValueError, OverflowError):
+                frames += filter(None, [self.parse(line)])
+        self._find_unit(frames)
+        return True
+
+    def _find_unit(self, frames: Sequence[can.Message]) -> None:
+        """Take stamps as milliseconds where microseconds would be too fast for a bus."""
+        channels = {each.channel for each in frames}
+        if any(_is_too_fast([each for each in frames if each.channel == one]) for one in channels):
             self._per_s = 1e3
             self.stamps = "ms"
-            self.remarks.append(
-                "too many frames per microsecond for any bus: time stamps are taken as milliseconds"
-            )
-        return True
+            remark = "too many frames per microsecond for any bus: time stamps are taken as"
+            self.remarks.insert(0, f"{remark} milliseconds")
+            return
+        for number, count in Counter(each.arbitration_id for each in frames).most_common(1):
+            if _duration_s(frames) < _FASTEST_MESSAGE_S * (count - 1):
+                period_ms = 1e3 * _duration_s(frames) / (count - 1)
+                self.remarks.append(
+                    f"time stamps are taken as microseconds, by which 0x{number:X} comes every"
+                    f" {period_ms:.2g} ms; if they are milliseconds, multiply them by 1000"
+                )
 
     def parse(self, line: str) -> can.Message | None:
         """Return the frame of a line."""
@@ -172,18 +208,25 @@ class GvretReader(LineReader):
         return f"{match[1]}E{match[2]}"
 
 
-def _is_too_fast(lines: Sequence[str], time: int, bus: int) -> bool:
-    """Return whether stamps in microseconds would exceed the capacity of a bus."""
-    stamps: dict[str, list[int]] = {}
-    for line in lines:
-        cells = line.split(",")
-        if len(cells) > max(time, bus) and cells[time].isdecimal() and len(cells[time]) < 20:
-            stamps.setdefault(cells[bus], []).append(int(cells[time]))
-    return any(
-        len(each) >= _FRAMES_FOR_UNIT
-        and max(each) - min(each) < (len(each) - 1) * _SHORTEST_FRAME_S * 1e6
-        for each in stamps.values()
+def _is_too_fast(frames: Sequence[can.Message]) -> bool:
+    """Return whether a bus is too slow for these frames, at 1 Mbit/s and without stuff bits."""
+    if len(frames) < _FRAMES_FOR_UNIT:
+        return False
+    # ISO 11898-1: a frame without data, with the pause after it, has 47 bits, with a long id 67. Of
+    # CAN FD, 30 or 49 of them are not sent at the rate of the data, which may be higher.
+    is_fd = any(frame.is_fd for frame in frames)
+    bits = sum(
+        (49 if frame.is_extended_id else 30)
+        if is_fd
+        else (67 if frame.is_extended_id else 47) + 8 * len(frame.data)
+        for frame in frames[1:]
     )
+    return _duration_s(frames) < bits * 1e-6
+
+
+def _duration_s(frames: Sequence[can.Message]) -> float:
+    times_s = [frame.timestamp for frame in frames]
+    return max(times_s) - min(times_s)
 
 
 class IdDataReader(PatternReader):
@@ -204,28 +247,45 @@ class IdDataReader(PatternReader):
         return frame(0.0, *groups)
 
 
-class CarbusReader(LineReader):
+class CabanaReader(PatternReader):
+    """CSV of openpilot's cabana: seconds, id (decimal without 0x), bus, bytes."""
+
+    name = "cabana CSV"
+    states_length = False
+    # 15.460,0x440,1,0x4000800000000000
+    pattern = re.compile(
+        r"(\d+(?:\.\d+)?),(0x[0-9A-Fa-f]{1,8}|\d{1,9}),(\d{1,9}),(?:0x)?((?:[0-9A-Fa-f]{2}){0,64})\s*$"
+    )
+    other = re.compile("time,addr,bus,data")
+
+    def prepare(self, head: Sequence[str]) -> bool:
+        """Check the headings."""
+        return self.other.match(head[0]) is not None
+
+    def _frame(self, *groups: Any) -> can.Message:
+        time, number, bus, data = groups
+        return frame(time, int(number, 0), data, channel=int(bus))
+
+
+class CarbusReader(PatternReader):
     """CARBUS Analyzer (canhacker.ru): seconds and microseconds; before version 3 milliseconds."""
 
     name = "CARBUS Analyzer trace"
     # @ TEXT @ 3 @ 64 @ 0 @ 1149 @ 7459 @ 00:00:07.459 @
     # 26,641405 <tab> 1 <tab> 00000004 <tab> 112 <tab> 8 <tab> 00 20 C1 0E 01 72 89 00 <tab> …
+    pattern = re.compile(r"(\d+),(\d+)\t(\d+)\t[^\t]*\t(\w+)\t(\d+)\t([^\t]*)")
+    other = re.compile("[@#]")
     _HEADER: Final = re.compile(r"@ TEXT @ (\d) @")
 
     def prepare(self, head: Sequence[str]) -> bool:
         """Find the version."""
         match = self._HEADER.match(head[0])
-        if match is None:
-            return False
-        self.stamps = "us" if int(match[1]) >= 3 else "ms"
-        return True
+        if match is not None and int(match[1]) < 3:
+            self.stamps = "ms"
+        return match is not None
 
-    def parse(self, line: str) -> can.Message | None:
-        """Return the frame of a line."""
-        if line.startswith(("@", "#")):
-            return None
-        time, channel, _, number, length, data, *_ = line.split("\t")
-        seconds, fraction = time.split(",")
+    def _frame(self, *groups: Any) -> can.Message:
+        seconds, fraction, channel, number, length, data = groups
         time_s = int(seconds) + int(fraction) / (1e6 if self.stamps == "us" else 1e3)
         return frame(time_s, number, data, length, channel=int(channel))
 
@@ -233,33 +293,26 @@ class CarbusReader(LineReader):
 _HALF_A_DAY_S: Final = 43200.0
 
 
-class CanHackerReader(LineReader):
+class CanHackerReader(PatternReader):
     """CAN Hacker log: time of day in milliseconds."""
 
     name = "CAN Hacker log"
     stamps: Stamps = "ms"
     # > <tab> 2 <tab>  17:18:39.355:2240.00 <tab> St <tab> 0x112 <tab> 0 <tab> 8 <tab> … <tab> p:2
     # Minutes, seconds and milliseconds are not padded (17:19:9.69 is 9.069 s); after them stand
-    # the microseconds since the frame before.
-    _TIME: Final = re.compile(r"\s*(\d{1,2}):(\d{1,2}):(\d{1,2})\.(\d{1,3})(?::\d+(?:\.\d+)?)?$")
+    # the microseconds since the frame before. Bytes that a frame lacks are blank.
+    pattern = re.compile(
+        r">\t[^\t]*\t\s*(\d{1,2}):(\d{1,2}):(\d{1,2})\.(\d{1,3})(?::\d+(?:\.\d+)?)?\t(St|Ext)"
+        r"\t(\w+)\t[^\t]*\t(\d+)((?:\t[0-9A-Fa-f]{2})*)(?:\t *)*?\tp:(\d+)\s*$"
+    )
+    other = re.compile("CAN speed")
     _day_s = _latest_s = 0.0
 
-    def parse(self, line: str) -> can.Message | None:
-        """Return the frame of a line."""
-        cells = line.rstrip("\r\n").split("\t")
-        if cells[0] != ">" and line.startswith("CAN speed"):
-            return None
-        match = self._TIME.match(cells[2]) if cells[0] == ">" and len(cells) > 7 else None
-        if match is None or cells[3] not in {"St", "Ext"}:
-            raise ValueError("not a frame")
-        return frame(
-            self._time_s(*map(int, match.groups())),
-            cells[4],
-            "".join(cells[7 : 7 + int(cells[6])]),
-            cells[6],
-            is_extended=cells[3] != "St" or None,
-            channel=int(cells[-1].removeprefix("p:")),
-        )
+    def _frame(self, *groups: Any) -> can.Message:
+        hours, minutes, seconds, milliseconds, kind, number, length, data, channel = groups
+        time_s = self._time_s(int(hours), int(minutes), int(seconds), int(milliseconds))
+        is_extended = kind == "Ext" or None
+        return frame(time_s, number, data, length, is_extended=is_extended, channel=int(channel))
 
     def _time_s(self, hours: int, minutes: int, seconds: int, milliseconds: int) -> float:
         time_s = self._day_s + 3600 * hours + 60 * minutes + seconds + milliseconds / 1e3
