@@ -288,8 +288,7 @@ SUSPECTED_AT: Final = 8.0
 that restarts makes one or two."""
 FORGIVEN: Final = 1.0 / 3.0
 """Such frames forgiven by each frame in sequence: of two senders at least every second frame is out
-of sequence, of lost frames in bursts (stamps of a batch are equal) one in four or fewer. A period
-forgives no more, but that bursts have those of `SILENCE_S`: one sender is not more frequent."""
+of sequence, of lost frames in bursts (stamps of a batch are equal) one in four or fewer."""
 
 
 class FrameChecker:
@@ -316,7 +315,6 @@ class FrameChecker:
         self._half_wrap_s = wrap_s / 2
         self._last, self._last_s = -1, 0.0
         self._refused, self._odd = 0, 0.0
-        self._learned_s, self._credit, self._credit_s = math.nan, 0.0, -math.inf
         self._content: bytes | bytearray = b""
         self._is_repeated = False
         self.lost = 0
@@ -326,26 +324,6 @@ class FrameChecker:
     def suspects_second_sender(self) -> bool:
         """Whether the latest frames came from two senders."""
         return self._odd >= SUSPECTED_AT
-
-    @property
-    def _usual_s(self) -> float:
-        """The period [s]; NaN while it is not known."""
-        if self._period_s is not None:
-            return self._period_s
-        return self.learned_period_s() if math.isnan(self._learned_s) else self._learned_s
-
-    def _forgive(self, time_s: float) -> None:
-        """Take a frame in sequence for one of a single sender, as far as time allows."""
-        periods = SILENCE_S / self._usual_s
-        if periods > 1.0:  # false for NaN
-            gained = FORGIVEN * (time_s - self._credit_s) * periods / SILENCE_S
-            self._credit = min(self._credit + max(gained, 0.0), FORGIVEN * periods)
-            self._credit_s = time_s
-        else:
-            self._credit = FORGIVEN
-        forgiven = min(self._credit, FORGIVEN)
-        self._credit -= forgiven
-        self._odd = max(self._odd - forgiven, 0.0)
 
     def check(self, data: bytes | bytearray, time_s: float) -> Verdict:
         """Check a payload of the message's own length, received at bus time `time_s` [s]."""
@@ -361,13 +339,10 @@ class FrameChecker:
         self.lost = 0
         if steps == 1 or last < 0:
             self._is_repeated = False
-            # Of frames that come too soon, among them those of a flood, no period is learned.
-            if self._period_s is None and not elapsed_s < SOON * self._learned_s:
-                self._learned_s = self.learned_period_s()
             if self._odd:
-                self._forgive(time_s)
+                self._odd = max(self._odd - FORGIVEN, 0.0)
         else:
-            period_s = self._usual_s
+            period_s = self.learned_period_s() if self._period_s is None else self._period_s
             is_soon = 0.0 <= elapsed_s < SOON * period_s
             was_repeated = self._is_repeated
             self._is_repeated = steps == 0 and elapsed_s <= self._half_wrap_s
