@@ -4,7 +4,7 @@
     python benchmarks/fuzz.py --again TARGET NUMBER      # one input, with its traceback
 
 Inputs are mutants of small valid files of every format (bus frames, captures, logs, model and state
-files, configurations, maps, DBC files, speed traces). Each must be accepted, or refused by an
+files, configurations, maps, DBC files). Each must be accepted, or refused by an
 `InputError` with a one-line message. Anything else is a finding: another exception, a numpy
 warning, more than 2 s of CPU time, more than 128 MB of memory, a SoC outside 0–100 %, a process
 that dies or hangs. Exit status 1 on a finding. The same seed gives the same inputs.

@@ -24,8 +24,13 @@ import numpy as np
 
 import cangauge
 from cangauge.extras.judge.judgement import ALARM
+from cangauge.extras.validation.twin.drive import draw_drive
+from cangauge.extras.validation.twin.pack import draw_pack
+from cangauge.extras.validation.twin.plant import TwinPlant
+from cangauge.extras.validation.twin.recording import record_drive
 from cangauge.logs.read import CellColumns
 from packs.recorded import Pack, counted_ah, load, one_hz
+from pybamm_plant import draw_pybamm_plant
 
 DATA = Path(__file__).resolve().parents[3] / "shared" / "data"
 DAYS = (1, 3, 7, 15)
@@ -115,20 +120,26 @@ def chains(pack: Pack, number: int, seed: int) -> Iterator[tuple[cangauge.Model,
         yield model, [logs[name] for name in order[training:]], capacity_ah
 
 
-def twin_chains(number: int, seed: int, plant: str) -> Iterator[tuple[cangauge.Model, list, float]]:
+def twin_chains(
+    number: int, seed: int, *, with_pybamm: bool
+) -> Iterator[tuple[cangauge.Model, list, float]]:
     """Yield the same of simulated LFP packs, a pack a chain."""
     for chain in range(number):
         rng = np.random.default_rng([seed, chain])
-        runs = [
-            cangauge.simulate(
-                seed=seed + chain, drive=day, hours=float(rng.uniform(0.5, 1.5)), chemistry="lfp",
-                ambient_c=float(rng.uniform(10.0, 30.0)), start_soc_pct=float(rng.uniform(60, 100)),
-                plant=plant,
+        pack_rng = np.random.default_rng([seed + chain, 1])
+        pack = draw_pack(pack_rng, chemistry_name="lfp")
+        plant = draw_pybamm_plant(pack_rng, pack) if with_pybamm else TwinPlant(pack)
+        logs = []
+        for day in range(1, 11):
+            drive = draw_drive(
+                np.random.default_rng([seed + chain, 4, day]),
+                plant.pack,
+                hours=float(rng.uniform(0.5, 1.5)),
+                ambient_c=float(rng.uniform(10.0, 30.0)),
+                start_soc=float(rng.uniform(60, 100)) / 100.0,
             )
-            for day in range(1, 11)
-        ]  # fmt: skip
-        logs = [replace(run.log, soc_pct=run.recording.true_soc_pct) for run in runs]
-        pack = runs[0].plant.pack
+            run = record_drive(plant, drive, ())
+            logs.append(replace(run.log, soc_pct=run.true_soc_pct))
         model = cangauge.fit(
             logs[:3], capacity_ah=pack.capacity_ah, chemistry="lfp", cells=pack.cells
         ).model
@@ -139,8 +150,8 @@ def run(name: str, arguments: argparse.Namespace) -> None:
     """Judge the chains of a pack, and print a line for each judgement."""
     number = max(arguments.chains, arguments.healthy)
     if name in {"twin_lfp", "pybamm_lfp"}:
-        plant = name.removesuffix("_lfp")
-        drawn = twin_chains(number, 100 + 1000 * (arguments.seed - 1), plant)
+        seed = 100 + 1000 * (arguments.seed - 1)
+        drawn = twin_chains(number, seed, with_pybamm=name == "pybamm_lfp")
     else:
         pack, *winter = load(arguments.data, ["i3", "i3_winter"] if name == "i3" else [name])
         pack = replace(pack, judged=[*pack.judged, *(log for one in winter for log in one.judged)])

@@ -125,6 +125,9 @@ def test_bad_usage_is_refused(
         ({"start_soc_pct": 40.0, "end_soc_pct": 60.0}, "give a lower end"),
         ({"ambient_c": 90.0}, "ambient"),
         ({"plant": "pybamm"}, "use one of: twin, equation"),
+        ({"speed_ms": [[0.0, 5.0], [1.0, 6.0]]}, "speed_ms"),
+        ({"speed_ms": [3.0, -1.0]}, "speed_ms"),
+        ({"speed_ms": []}, "speed_ms"),
     ],
 )
 def test_a_value_out_of_range_is_refused(options: dict[str, Any], message: str) -> None:

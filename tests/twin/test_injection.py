@@ -75,7 +75,7 @@ def test_an_injection_is_scaled_to_its_gap(log: Log, surrogate: TwinPack) -> Non
 
 
 def test_further_drives_stay_within_the_weather() -> None:
-    scenario = draw_scenario(3, n_reference=1)
+    scenario = draw_scenario(3, n_temperatures=1)
     low, high = scenario.ambient_c
     assert high - low == pytest.approx(4.0)  # one temperature is widened
     drives = scenario.draw_drives(np.random.default_rng(1), 6, 0.1)

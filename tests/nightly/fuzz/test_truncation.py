@@ -1,7 +1,6 @@
 """Every format, cut off after every byte: the remaining rows, or an `InputError`.
 
-`tests/logs/test_log_read.py` does it for every text format of logs, `tests/bus/test_captures.py`
-for every format of captures; here are those packed in other ways, and all that configures.
+The suite cuts text formats; here are those packed in other ways, and all that configures.
 """
 
 from __future__ import annotations

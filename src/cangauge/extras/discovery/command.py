@@ -105,9 +105,8 @@ def init_command(
         proposal = _find(paths, dbc, nominal_voltage, presets=presets)
         if unclear := _choose(proposal, picks):
             raise _undecided(proposal, unclear, output, quiet=json_output)
+        _prove(proposal, paths[0] if paths else None, output, bus, folder)
         texts = proposal.texts(output, bus)
-        _prove(proposal, paths[0] if paths else None, texts, folder)
-        texts = proposal.texts(output, bus)  # a DBC's map states the sign that was proven
     output.mkdir(exist_ok=True)
     write_texts_atomic({output / name: text for name, text in texts.items()})
     files = [str(output / name) for name in texts]
@@ -225,11 +224,11 @@ def _known(paths: Sequence[Path]) -> str | None:
 
 def _choose(proposal: Proposal, picks: Mapping[str, int]) -> list[str]:
     """Choose a candidate for each role: the user's, or the clear one; return unclear roles."""
+    if proposal.method == "preset":
+        return []
     unclear = []
     for name, role in _ROLES.items():
         count = len(proposal.candidates.get(role, ()))
-        if proposal.method == "preset":
-            continue
         if role in picks:
             if picks[role] >= count:
                 value = f"{name}={picks[role] + 1}"
@@ -263,9 +262,15 @@ def _undecided(
 
 
 def _prove(
-    proposal: Proposal, capture: Path | None, texts: Mapping[str, str], folder: Path
+    proposal: Proposal,
+    capture: Path | None,
+    output: Path,
+    bus: Mapping[str, Any],
+    folder: Path,
 ) -> None:
-    """Load the files before they are saved, and decode a capture by them; set `proof` and a sign.
+    """Load what will be saved from a temporary folder, and decode a capture by it.
+
+    Sets `proof`, and the sign of a DBC's current, which the saved map then states.
 
     Raises
     ------
@@ -282,7 +287,7 @@ def _prove(
     if proposal.vehicle is not None:
         car = Vehicle.load(proposal.vehicle, temperature_c=proposal.fixed_c)
     else:
-        for name, text in texts.items():
+        for name, text in proposal.texts(output, bus).items():
             (folder / name).write_text(text, encoding="utf-8")
         if proposal.dbc is not None:
             shutil.copy(proposal.dbc, folder / proposal.dbc.name)

@@ -231,7 +231,7 @@ def gap_fleet_command(
     """Diagnose each vehicle against references of the whole fleet.
 
     Its own healthy logs come first, then one of each other vehicle in turn, 30 at most. Vehicles
-    without healthy logs of their own have common references, which are learned from once. Logs to
+    without healthy logs of their own share references; a worker learns from them once. Logs to
     diagnose are the latest three of a vehicle.
 
     Examples

@@ -63,6 +63,8 @@ class GapJob(ModelJob):
         if not logs:
             raise InputError("none of its logs can be read", cure=f"the first: {unread[0]}")
         healthy = _learned(self, task.references)
+        if isinstance(healthy, InputError):
+            raise healthy
         found = diagnose([*logs.values()], self.model, healthy.references)
         return {
             "logs": [log.url for log in task.logs],
@@ -92,8 +94,11 @@ class _Learned(NamedTuple):
 
 
 @lru_cache(maxsize=1)
-def _learned(job: GapJob, references: tuple[FleetLog, ...]) -> _Learned:
-    """Learn from references on this worker, without those that cannot be used."""
+def _learned(job: GapJob, references: tuple[FleetLog, ...]) -> _Learned | InputError:
+    """Learn from references on this worker, without those that cannot be used.
+
+    An error is returned, so that it is kept too: other vehicles have the same references.
+    """
     logs, unread = job.read_all(references)
     while logs:
         try:
@@ -103,12 +108,12 @@ def _learned(job: GapJob, references: tuple[FleetLog, ...]) -> _Learned:
                 of: log for of, log in logs.items() if error.source not in {log.source, log.name}
             }
             if len(left) == len(logs):
-                raise
+                return error
             unread.append(str(error))
             logs = left
         else:
             return _Learned(learned, len({log.vehicle for log in logs}), unread)
-    raise InputError(f"no reference can be used: {unread[0]}", field="--reference")
+    return InputError(f"no reference can be used: {unread[0]}", field="--reference")
 
 
 def gap_tasks(logs: Sequence[FleetLog]) -> list[Task]:

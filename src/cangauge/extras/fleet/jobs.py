@@ -87,7 +87,7 @@ class Job(ABC):
             yield log.url, partial(self.row, log)
 
     def row(self, log: FleetLog) -> Row:
-        """Return the columns of a log that depends on no other."""
+        """Return the columns of a log that depends on no other; needed unless `parts` is own."""
         raise NotImplementedError
 
     def read(self, log: FleetLog) -> Log:

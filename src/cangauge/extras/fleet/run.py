@@ -228,8 +228,7 @@ def _computed(
 
     if not todo:
         return
-    # A task, not scattered data: it is computed again if its worker is lost.
-    shared = client.submit(_as_it_is, job, key=f"job-{run}")
+    shared = client.submit(_share, job, key=f"job-{run}")
     done = as_completed(loop=client.loop, with_results=True, raise_errors=False)
     queue, in_flight = iter(todo), dict[str, Task]()
     asked, wanted = -_ASK_S, 2
@@ -251,13 +250,16 @@ def _computed(
         if not isinstance(result, Finished):
             if future.status in {"cancelled", "lost"}:
                 raise CangaugeError(_LOST)
+            if shared.status == "error":
+                raise CangaugeError(f"the workers cannot load the job: {shared.exception()!r}")
             # distributed gives type, error and traceback.
             error = result[1] if isinstance(result, tuple) else future.exception()
             result = Finished(bad=[set_aside(task.name, error)])
         yield task, result
 
 
-def _as_it_is(job: Job) -> Job:
+def _share(job: Job) -> Job:
+    """Return the job: as the result of a task it is sent again if its worker is lost."""
     return job
 
 

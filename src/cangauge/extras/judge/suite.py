@@ -162,7 +162,7 @@ def simulated_drives() -> list[PlayedDrive]:
     """Return twelve drives of four simulated packs, with models of other drives of theirs."""
     found = []
     for seed in PACKS:
-        scenario = draw_scenario(seed, n_training=3, n_reference=2)
+        scenario = draw_scenario(seed, n_training=3, n_temperatures=2)
         training = [replace(each.log, soc_pct=each.true_soc_pct) for each in scenario.training]
         model = fit(training, capacity_ah=scenario.pack.capacity_ah).model
         drives = scenario.draw_drives(np.random.default_rng(seed), DRIVES_A_PACK, HOURS)

@@ -54,14 +54,14 @@ class Scenario:
         )
 
 
-def draw_scenario(seed: int, *, n_reference: int = 3, n_training: int = 1) -> Scenario:
+def draw_scenario(seed: int, *, n_temperatures: int = 3, n_training: int = 1) -> Scenario:
     """Draw a pack with training logs.
 
     Parameters
     ----------
     seed : int
-    n_reference : int
-        Number of drawn temperatures, between whose extremes further drives take place.
+    n_temperatures : int
+        Number of drawn temperatures, at least 1, between whose extremes further drives take place.
     n_training : int
         Logs to identify the model on: the first from full to empty.
     """
@@ -84,7 +84,7 @@ def draw_scenario(seed: int, *, n_reference: int = 3, n_training: int = 1) -> Sc
         for _ in range(n_training - 1)
     ]
     # One temperature from each of as many equal ranges, at least 4 K apart in all.
-    edges = np.linspace(low, high, n_reference + 1)
+    edges = np.linspace(low, high, n_temperatures + 1)
     temperatures = rng.uniform(edges[:-1], edges[1:])
     coldest, warmest = float(temperatures.min()), float(temperatures.max())
     if warmest - coldest <= 4.0:

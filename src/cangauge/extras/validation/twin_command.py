@@ -39,7 +39,7 @@ def twin_command(
 
     `cangauge twin --seed 1 --day 2 --effect current_offset:offset_a=1.5 -o trip.parquet`
 
-    `cangauge twin --seed 1 --effect weak_cell:gap_v=1 --pack leaf24 -o cell.csv`
+    `cangauge twin --seed 1 --effect weak_cell:gap_v=1 --pack leaf24 -o weak.csv`
 
     Parameters
     ----------

@@ -110,7 +110,11 @@ def draw_drive(
     if speed_ms is None:
         speed = _draw_speed(rng, seconds)
     else:
-        speed = np.resize(np.asarray(speed_ms, dtype=np.float64), seconds)
+        speed = np.asarray(speed_ms, dtype=np.float64)
+        if speed.ndim != 1 or not speed.size or not np.all((speed >= 0.0) & (speed < 85.0)):
+            problem, cure = "is not a trace of speeds from 0 to 85 m/s", "give one speed a second"
+            raise InputError(problem, field="speed_ms", cure=cure)
+        speed = np.resize(speed, seconds)
     if speed_ms is None and not discharge:
         _park(rng, speed)
     # Auxiliary power, with a cabin heater in the cold.
