@@ -31,7 +31,7 @@ from cangauge.logs.headings import GUESS, meaning_of
 from cangauge.logs.stamps import is_clock, is_stamp, seconds_of
 from cangauge.logs.text import TextTable
 from cangauge.logs.units import FIELDS, REQUIRED, convert, known_temperature_source, unit_of
-from cangauge.logs.values import first_text, is_number, numbers_of
+from cangauge.logs.values import first_text, is_number, numbers_of, with_decimal_points
 
 SOURCE: Final = "temperature_source"
 """Column or metadata of a canonical log: the location of the temperature sensor."""
@@ -115,7 +115,7 @@ def draft_of_table(
     words = [k for k, text in enumerate(headings) if is_defined and text.strip().lower() == SOURCE]
     wanted = [place for column in chosen.values() for place in column.places]
     wanted += [place for place, _ in chosen["time"].others]
-    cells = table.columns([*dict.fromkeys([*wanted, *words])])
+    cells = with_decimal_points(table.columns([*dict.fromkeys([*wanted, *words])]))
     draft = DraftLog(name, source, headings=tuple(headings), remarks=[*table.remarks])
     time_s, unit_of_time, chosen["time"] = _time(cells, chosen["time"], headings, where)
     draft.values["time_s"] = time_s
