@@ -43,7 +43,9 @@ def row_of(case: dict[str, Any], k: int) -> str:
     swiss_ma = thousand_ma.translate(str.maketrans(",-", "'\u2212"))
     hms = f"00:00:{k:02d}"
     values |= {"hms": hms, "when": when, "german_ma": german_ma, "thousand_ma": thousand_ma,
-               "thousand_mv": thousand_mv, "swiss_ma": swiss_ma}  # fmt: skip
+               "thousand_mv": thousand_mv, "swiss_ma": swiss_ma,
+               "filetime": int(10_000_000 * (START.timestamp() + k + 11_644_473_600)),
+               "net_ticks": int(10_000_000 * (START.timestamp() + k + 62_135_596_800))}  # fmt: skip
     return template.format(k=k, **values)
 
 
