@@ -134,6 +134,47 @@ def test_a_factor_states_the_sign(tmp_path: Path) -> None:
     assert read(tmp_path, head, rows, "current=Current:0.5").current_a.max() == 25.0
 
 
+@pytest.mark.parametrize(
+    ("step", "is_read"),
+    [("{k}", True), ("{k}.5", True), ("{k}e-1", True), ("{sixtieth}", False), ("{ms}", False)],
+)
+def test_numbers_without_a_unit_are_seconds_if_only_they_fit(
+    tmp_path: Path, step: str, *, is_read: bool
+) -> None:
+    rows = [
+        step.format(k=k, ms=20 * k, sixtieth=round(k / 60, 5)) + f",{k % 7},360,20"
+        for k in range(ROWS)
+    ]
+    if is_read:
+        read(tmp_path, "Time,Current,Voltage,Temp", rows)
+    else:
+        with pytest.raises(InputError, match="in seconds or another unit"):
+            read(tmp_path, "Time,Current,Voltage,Temp", rows)
+    read(tmp_path, "Time,Current,Voltage,Temp", rows, "time=Time[s]")
+
+
+@pytest.mark.parametrize(
+    ("head", "row"),
+    [
+        ("Time,Current (0.1A),Voltage (10mV),Temp (0.1C),SoC (0.1%)", "{k},{amps}0,36000,200,500"),
+        ("Time,Current x10 (A),Voltage x100,Temp,SoC", "{k},{amps}0,36000,20,50"),
+        ("Time,Current (uA),Voltage (uV),Temp (1C),SoC", "{k},{amps}000000,360000000,20,50"),
+    ],
+)
+def test_the_unit_of_a_bit_in_the_heading(tmp_path: Path, head: str, row: str) -> None:
+    log = read(tmp_path, head, rows_of(row))
+    np.testing.assert_allclose(log.current_a, np.arange(ROWS) % 7)
+    assert log.soc_pct is not None
+    ends = [log.voltage_v[-1], log.temperature_c[-1], log.soc_pct[-1]]
+    np.testing.assert_allclose(ends, [360.0, 20.0, 50.0])
+
+
+def test_percents_below_one_are_read_if_the_user_says_so(tmp_path: Path) -> None:
+    head, rows = "Time,Current,Voltage,Temp,SoC [%]", rows_of("{k},{amps},360,20,0.5")
+    log = read(tmp_path, head, rows, "soc=SoC [%][%]")
+    assert log.first_soc() == (0, 0.5)
+
+
 # ---- the choice of columns
 
 

@@ -138,13 +138,15 @@ class ChosenColumn:
 
     Several places are a date and its time, or temperatures whose median is taken. The unit is the
     user's, the heading's or that of the row of units. `others` are further columns of time: dates
-    beside a clock, or times in case that the first does not increase.
+    beside a clock, or times in case that the first does not increase. `is_stated`: with the
+    user's unit or factor.
     """
 
     places: tuple[int, ...]
     unit: str = ""
     factor: float = 1.0
     source: TemperatureSource = "unknown"
+    is_stated: bool = False
     others: tuple[tuple[int, Meaning], ...] = ()
 
 
@@ -244,7 +246,8 @@ def _given_column(
             )
         first = meanings[places[0]]
         source = first.source if first is not None and quantity == "temperature" else "unknown"
-        return ChosenColumn(places, unit, reading.factor, source)
+        is_stated = reading.unit is not None or reading.factor != 1.0
+        return ChosenColumn(places, unit, reading.factor, source, is_stated)
     near = closest(spec.text, headings)
     raise InputError(
         f"no column has this heading (found: {shown_headings(headings)})",

@@ -42,6 +42,9 @@ class DraftLog:
         Location of the temperature sensor.
     sign_unknown, negated : bool
         The format does not define the sign; the file stores discharge as negative.
+    in_seconds, stated
+        Whether a unit of time is stated, and columns whose unit the user states; see
+        `refuse_wrong_units`.
     assumed, remarks : list of str
         How the columns were understood; changes and findings.
     headings, ignored : tuple of str
@@ -55,6 +58,8 @@ class DraftLog:
     temperature_source: TemperatureSource = "unknown"
     sign_unknown: bool = False
     negated: bool = False
+    in_seconds: bool | None = False
+    stated: set[str] = field(default_factory=set)
     assumed: list[str] = field(default_factory=list)
     remarks: list[str] = field(default_factory=list)
     headings: tuple[str, ...] = ()
@@ -122,7 +127,13 @@ class DraftLog:
         self._drop_repeated()
         for values in self.values.values():
             values.flags.writeable = False  # the log need not copy them
-        self.remarks += refuse_wrong_units(self.values, source=self._where, labels=self.labels)
+        self.remarks += refuse_wrong_units(
+            self.values,
+            source=self._where,
+            labels=self.labels,
+            in_seconds=self.in_seconds,
+            stated=self.stated,
+        )
         log = Log(
             **self.values,
             name=self.name,

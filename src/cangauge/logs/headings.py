@@ -13,7 +13,7 @@ import unicodedata
 from functools import lru_cache
 from typing import Final, NamedTuple
 
-from cangauge.logs.units import FIELDS, FOREIGN_UNITS, TemperatureSource, unit_of
+from cangauge.logs.units import CANONICAL_UNIT, FIELDS, FOREIGN_UNITS, TemperatureSource, unit_of
 
 
 def _words(text: str) -> frozenset[str]:
@@ -89,6 +89,8 @@ _UNIT_FORMS: Final = (
     re.compile(r"^(?P<name>.*\S?)(?:,\s*|__|_|\s+)(?P<unit>[^\s_,]+)\s*$"),
 )
 """`Name [unit]`, `Name/unit`, `Name_unit`."""
+_TIMES: Final = re.compile(r"[\s_*(]*x\s?(10+)\b\)?")
+"""`Voltage x100`: the cells are a hundred times the voltage."""
 _CELL_VOLTAGE: Final = re.compile(
     r"(?:cell|zelle)[\s_#-]*(?:voltage|volt|v|u)?[\s_#-]*0*(?P<number>\d{1,4})"
     r"[\s_]*(?:voltage|volts?)?[\s_]*[\[(]?(?P<unit>m?v)?[\])]?",
@@ -121,6 +123,11 @@ def meaning_of(heading: str, unit_below: str = "") -> Meaning | None:
         return None
     # Measurement tools qualify a signal: `Bus::Message::Signal`, `Signal\\Device:1`.
     heading = re.sub(r"\\[^\[(]*", "", heading.rpartition("::")[2])
+    times = _TIMES.search(heading)
+    if times:
+        found = meaning_of(heading.replace(times[0], " "), unit_below)
+        unit = found and (found.unit or CANONICAL_UNIT[found.quantity])
+        return found and found._replace(unit=f"{1.0 / float(times[1]):g}{unit}")
     readings = (_meaning(name, unit) for name, unit in names_and_units(heading, unit_below))
     return next((found for found in readings if found is not None), None)
 

@@ -30,13 +30,19 @@ from cangauge.logs.draft import MAX_INCOMPLETE, DraftLog
 from cangauge.logs.headings import GUESS, meaning_of
 from cangauge.logs.stamps import is_clock, is_stamp, seconds_of
 from cangauge.logs.text import TextTable
-from cangauge.logs.units import FIELDS, REQUIRED, convert, known_temperature_source, unit_of
+from cangauge.logs.units import (
+    CANONICAL_UNIT,
+    FIELDS,
+    REQUIRED,
+    convert,
+    known_temperature_source,
+    unit_of,
+)
 from cangauge.logs.values import first_text, is_number, numbers_of, with_decimal_points
 
 SOURCE: Final = "temperature_source"
 """Column or metadata of a canonical log: the location of the temperature sensor."""
 _CANONICAL: Final = (*FIELDS.values(), SOURCE)
-_CANONICAL_UNIT: Final = dict(zip(FIELDS, ("s", "A", "V", "°C", "%"), strict=True))
 _HOLD_S: Final = 1.0
 """Longest time that a voltage is held to the next row with a current [s], where rows hold only the
 channels that changed: a bus repeats both within it."""
@@ -119,6 +125,9 @@ def draft_of_table(
     draft = DraftLog(name, source, headings=tuple(headings), remarks=[*table.remarks])
     time_s, unit_of_time, chosen["time"] = _time(cells, chosen["time"], headings, where)
     draft.values["time_s"] = time_s
+    draft.stated = {FIELDS[quantity] for quantity, column in chosen.items() if column.is_stated}
+    if unit_of_time == "s, assumed" and "time_s" not in draft.stated:
+        draft.in_seconds = None
     for quantity, column in chosen.items():
         label = " + ".join(headings[place] for place in column.places)
         draft.labels[FIELDS[quantity]] = label
@@ -157,7 +166,7 @@ def _canonical_columns(headings: Sequence[str], where: str) -> dict[str, ChosenC
                 " temperature_c [s, A, V, °C]",
             )
     return {
-        quantity: ChosenColumn((names.index(name),), _CANONICAL_UNIT[quantity])
+        quantity: ChosenColumn((names.index(name),), CANONICAL_UNIT[quantity])
         for quantity, name in FIELDS.items()
         if name in names
     }
@@ -195,7 +204,8 @@ def _take(draft: DraftLog, quantity: str, column: ChosenColumn, cells: dict[int,
     if quantity == "soc":
         soc = parts[0]
         finite = soc[np.isfinite(soc)]
-        if not unit and finite.size and finite.min() >= 0.0 and 0.0 < finite.max() <= 1.0:
+        is_fraction = np.any(finite % 1.0) and finite.min() >= 0.0 and finite.max() <= 1.0
+        if not unit and is_fraction:  # 1, then 0, may also be an empty pack's percents
             draft.values[name] = 100.0 * soc
             return "0–1, from its range"
         if _LEAF_SPY.issubset(draft.headings) and np.nanmedian(soc) > 110.0:
@@ -206,7 +216,7 @@ def _take(draft: DraftLog, quantity: str, column: ChosenColumn, cells: dict[int,
         draft.take_probes(headings, converted)
     else:
         draft.values[name] = converted[0]
-    return unit or f"{_CANONICAL_UNIT[quantity]}, assumed"
+    return unit or f"{CANONICAL_UNIT[quantity]}, assumed"
 
 
 # --- Time
