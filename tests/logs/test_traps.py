@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -258,6 +259,82 @@ def test_a_time_that_wraps_is_replaced_by_another_in_its_own_unit(
     np.testing.assert_allclose(log.time_s, 0.02 * np.arange(60))
     log = read(tmp_path, head, [f"{k},{20 * k},{k % 7},360,20" for k in range(60)])
     np.testing.assert_array_equal(log.time_s, np.arange(60.0))
+
+
+# ---- directions of current
+
+
+@pytest.mark.parametrize(
+    ("heading", "charge", "discharge", "is_read"),
+    [
+        ("State", "C", "D", True),
+        ("Step Type", "CC Chg", "CC DChg", True),
+        ("Mode", "Charging", "discharging", True),
+        ("Status", "CHA", "DCH", True),
+        ("Direction", "1", "2", False),
+        ("Mode", "CHA", "7", None),
+        ("Comment", "C", "D", None),
+    ],
+)
+def test_an_unsigned_current_has_the_direction_of_its_state(
+    tmp_path: Path, heading: str, charge: str, discharge: str, *, is_read: bool | None
+) -> None:
+    head = f"Time [s],Current [A],Voltage [V],Temp [°C],{heading}"
+    amps = np.arange(ROWS) % 7 - 3.0
+    words = {-1.0: charge, 0.0: "R", 1.0: discharge}
+    rows = [f"{k},{abs(a)},{360 - a},20,{words[np.sign(a)]}" for k, a in enumerate(amps)]
+    if is_read is False:
+        with pytest.raises(InputError, match="Direction: row 1 does not say whether the unsigned"):
+            read(tmp_path, head, rows)
+        return
+    log = read(tmp_path, head, rows)
+    np.testing.assert_array_equal(log.current_a, amps if is_read else np.abs(amps))
+    assert (f'current charges where "{heading}" says so' in log.assumed) is bool(is_read)
+
+
+@pytest.mark.parametrize(
+    ("charge", "discharge", "factor"),
+    [
+        ("Charge Current (A)", "Discharge Current (A)", 1.0),
+        ("Battery charging current (mA)", "Battery discharging current (mA)", 1e-3),
+        ("Chg Current", "DisChg Current", -1.0),
+    ],
+)
+def test_currents_of_each_direction_are_joined(
+    tmp_path: Path, charge: str, discharge: str, factor: float
+) -> None:
+    amps = np.arange(ROWS) % 7 - 3.0
+    rows = [
+        f"{k},{max(-a, 0) / factor},{max(a, 0) / abs(factor)},360,20" for k, a in enumerate(amps)
+    ]
+    log = read(tmp_path, f"Time [s],{charge},{discharge},Voltage,Temp", rows)
+    np.testing.assert_allclose(log.current_a, amps)
+    assert any(text.startswith(f'current = "{discharge} − {charge}"') for text in log.assumed)
+
+
+@pytest.mark.parametrize(
+    ("others", "found"),
+    [
+        ("Charge Current Limit [A],Discharge Current Limit [A]", "no plain heading of current"),
+        ("Charge Current [A],Discharge Current [A],Current [A]", '"Current .A."'),
+        ("Charge Current [A],Discharge Current [mA]", "no plain heading of current"),
+        ("Current [A],Charge Current [A]", '"Current .A."'),
+    ],
+)
+def test_other_pairs_of_currents_are_not_joined(tmp_path: Path, others: str, found: str) -> None:
+    rows = rows_of("{k},360,20," + ",".join(["{amps}"] * (1 + others.count(","))))
+    head = f"Time [s],Voltage [V],Temp [°C],{others}"
+    if found.startswith("no"):
+        with pytest.raises(InputError, match=found):
+            read(tmp_path, head, rows)
+    else:
+        assert re.search(found, " ".join(read(tmp_path, head, rows).assumed))
+
+
+def test_currents_of_both_signs_are_not_of_one_direction(tmp_path: Path) -> None:
+    rows = [f"{k},{k % 3 - 1},{k % 2},360,20" for k in range(ROWS)]
+    with pytest.raises(InputError, match="Discharge Current − Charge Current: these are no"):
+        read(tmp_path, "Time [s],Charge Current,Discharge Current,Voltage,Temp", rows)
 
 
 # ---- rows

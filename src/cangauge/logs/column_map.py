@@ -24,6 +24,7 @@ _SPLIT: Final = re.compile(rf",\s*(?=(?:{'|'.join(FIELDS)})\s*=)", re.IGNORECASE
 _FACTOR: Final = re.compile(
     r"^(?P<text>.*\S)\s*:\s*(?P<factor>[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)$"
 )
+_DIRECTION: Final = re.compile(r"(?P<dis>dis?|de)?[-_ ]?(?:charg(?:ed|e|ing)|chg)", re.IGNORECASE)
 _UNIT: Final = re.compile(r"^(?P<text>.*\S)\s*\[(?P<unit>[^\[\]]*)\]$")
 
 
@@ -136,7 +137,8 @@ def _spec_of(quantity: str, value: Any, where: str) -> ColumnSpec:
 class ChosenColumn:
     """Columns of a table that hold one quantity.
 
-    Several places are a date and its time, or temperatures whose median is taken. The unit is the
+    Several places are a date and its time, temperatures whose median is taken, or the currents of
+    discharge and charge, whose difference is taken. The unit is the
     user's, the heading's or that of the row of units. `others` are further columns of time: dates
     beside a clock, or times in case that the first does not increase. `is_stated`: with the
     user's unit or factor.
@@ -196,9 +198,29 @@ def choose_columns(
             for place, meaning in enumerate(meanings)
             if meaning is not None and meaning.quantity == quantity and place not in owner
         ]
-        if quantity not in given.specs and plain:
+        pair = _directions(headings, plain) if quantity == "current" else None
+        if pair is not None and "current" not in given.specs:
+            choice.chosen["current"] = pair
+        elif quantity not in given.specs and plain:
             _choose(quantity, sorted(plain, key=lambda item: item[1].rank), choice)
     return choice
+
+
+def _directions(
+    headings: Sequence[str], plain: Sequence[tuple[int, Meaning]]
+) -> ChosenColumn | None:
+    """Return the currents of discharge and charge, in this order, if they alone are plain."""
+    found: dict[tuple[str, str], dict[bool, int]] = {}
+    for place, meaning in plain:
+        match = _DIRECTION.search(headings[place])
+        rest = _simple(headings[place].replace(match[0], "")) if match else ""
+        without = meaning_of(rest) if match else meaning
+        if without is not None and without.quantity == "current" and without.rank < GUESS:
+            found.setdefault((rest, meaning.unit), {})[bool(match and match["dis"])] = place
+    if len(found) != 1:
+        return None
+    ((_, unit), places), *_ = found.items()
+    return ChosenColumn((places[True], places[False]), unit) if len(places) == 2 else None
 
 
 def _choose(quantity: str, plain: list[tuple[int, Meaning]], choice: Choice) -> None:

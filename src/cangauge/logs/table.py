@@ -8,6 +8,7 @@ only those that changed.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
@@ -38,7 +39,13 @@ from cangauge.logs.units import (
     known_temperature_source,
     unit_of,
 )
-from cangauge.logs.values import first_text, is_number, numbers_of, with_decimal_points
+from cangauge.logs.values import (
+    first_text,
+    is_number,
+    numbers_of,
+    present,
+    with_decimal_points,
+)
 
 SOURCE: Final = "temperature_source"
 """Column or metadata of a canonical log: the location of the temperature sensor."""
@@ -46,6 +53,10 @@ _CANONICAL: Final = (*FIELDS.values(), SOURCE)
 _HOLD_S: Final = 1.0
 """Longest time that a voltage is held to the next row with a current [s], where rows hold only the
 channels that changed: a bus repeats both within it."""
+_STATES: Final = frozenset({"state", "status", "md", "mode", "direction", "dir", "type"})
+"""Words of a heading that may tell the direction of an unsigned current."""
+_CHARGES: Final = r"(?:^|[^a-z])(?:c|ch|cha[a-z]*|chg[a-z]*)(?:$|[^a-z])"
+_DISCHARGES: Final = r"(?:^|[^a-z])(?:d|dis[a-z]*|dch[a-z]*)(?:$|[^a-z])"
 _LEAF_SPY: Final = {"Gids", "AHr", "Pack Volts"}
 _LEAF_SPY_SOC: Final = 1e-4
 """LeafSpy writes SoC in ten-thousandths of a percent."""
@@ -129,7 +140,8 @@ def draft_of_table(
     if unit_of_time == "s, assumed" and "time_s" not in draft.stated:
         draft.in_seconds = None
     for quantity, column in chosen.items():
-        label = " + ".join(headings[place] for place in column.places)
+        joint = " − " if quantity == "current" else " + "
+        label = joint.join(headings[place] for place in column.places)
         draft.labels[FIELDS[quantity]] = label
         unit = unit_of_time if quantity == "time" else _take(draft, quantity, column, cells)
         if quantity == "temperature" and len(column.places) > 1:
@@ -145,7 +157,10 @@ def draft_of_table(
         word = word or getattr(table, "word", "") or "unknown"
         draft.temperature_source = known_temperature_source(word, source=where, field=SOURCE)
     else:
-        draft.sign_unknown = chosen["current"].factor > 0.0
+        current = chosen["current"]
+        draft.sign_unknown = current.factor > 0.0 and len(current.places) == 1
+        if draft.sign_unknown and not np.any(draft.values["current_a"] < 0.0):
+            _sign_by_state(draft, table)
         if "temperature" in chosen:
             draft.temperature_source = chosen["temperature"].source
         _hold_changes(draft)
@@ -214,9 +229,55 @@ def _take(draft: DraftLog, quantity: str, column: ChosenColumn, cells: dict[int,
     converted = [convert(part, name, unit, source=where, label=label)[0] for part in parts]
     if quantity == "temperature":
         draft.take_probes(headings, converted)
+    elif len(converted) == 2:
+        both = [np.abs(part) for part in converted]
+        if any(np.any(part < 0.0) and np.any(part > 0.0) for part in converted):
+            cure = "name the one that holds both directions: --columns 'current=?'"
+            problem = "these are no currents of one direction each: one has both signs"
+            raise InputError(problem, source=where, field=label, cure=cure)
+        draft.values[name] = both[0] - both[1]
     else:
         draft.values[name] = converted[0]
     return unit or f"{CANONICAL_UNIT[quantity]}, assumed"
+
+
+def _sign_by_state(draft: DraftLog, table: TextTable | ArrowTable) -> None:
+    """Make an unsigned current negative where a column of words says that it charges.
+
+    Raises
+    ------
+    InputError
+        If the words do not tell the direction of each current.
+    """
+    current, headings = draft.values["current_a"], list(draft.headings)
+    places = [
+        place
+        for place, text in enumerate(headings)
+        if headings.count(text) == 1 and not _STATES.isdisjoint(re.findall("[a-z]+", text.lower()))
+    ]
+    for place, column in table.columns(places).items() if places else ():
+        cells = pc.fill_null(pc.utf8_lower(present(column)), "")
+        charges, discharges = (
+            np.asarray(pc.match_substring_regex(cells, words), dtype=bool) & (current > 0.0)
+            for words in (_CHARGES, _DISCHARGES)
+        )
+        is_direction = "direction" in headings[place].lower() and len(pc.unique(cells)) > 1
+        if not (charges.any() and discharges.any()) and not is_direction:
+            continue
+        unclear = (current > 0.0) & (charges == discharges)
+        if unclear.any():
+            row = int(np.argmax(unclear))
+            raise InputError(
+                f"row {row + 1} does not say whether the unsigned current charges or discharges",
+                source=draft.source or draft.name,
+                field=headings[place],
+                value=cells[row].as_py(),
+                cure="write it as charge or discharge, or give the current a sign",
+            )
+        draft.values["current_a"] = np.where(charges, -current, current)
+        draft.sign_unknown = False
+        draft.assumed.append(f'current charges where "{headings[place]}" says so')
+        return
 
 
 # --- Time
