@@ -154,10 +154,10 @@ class ChosenColumn:
 
 @dataclass(frozen=True, slots=True)
 class Choice:
-    """Columns of a table by quantity, and the likeliest column of each that is not plain."""
+    """Columns of a table by quantity, and the likely columns of each that is not plain."""
 
     chosen: dict[str, ChosenColumn] = field(default_factory=dict)
-    guesses: dict[str, int] = field(default_factory=dict)
+    guesses: dict[str, list[int]] = field(default_factory=dict)
 
     @property
     def is_complete(self) -> bool:
@@ -236,7 +236,8 @@ def _choose(quantity: str, plain: list[tuple[int, Meaning]], choice: Choice) -> 
     are_probes = quantity == "temperature" and all(meaning.numbered for _, meaning in best)
     one_of_many = len(best) > 1 and quantity != "time" and not are_probes
     if first.rank >= GUESS or siblings or one_of_many:
-        choice.guesses[quantity] = place
+        rank = GUESS if siblings else min(first.rank, GUESS)
+        choice.guesses[quantity] = [p for p, meaning in plain if meaning.rank <= rank]
     elif quantity == "time":
         choice.chosen[quantity] = ChosenColumn((place,), first.unit, others=tuple(plain[1:]))
     else:
@@ -318,11 +319,16 @@ def _simple(text: str) -> str:
 def unknown_columns(source: str, headings: Sequence[str], choice: Choice) -> InputError:
     """Return the error for a table whose columns are not plain, with the option to paste.
 
-    It has the likeliest column of each quantity, and `?` where none is likely.
+    It has the likely column of each quantity, and `?` where none or several are likely.
     """
     needed = [name for name in _NEEDED if name not in choice.chosen]
     missing = " and ".join(part for part in (", ".join(needed[:-1]), *needed[-1:]) if part)
-    likely = {quantity: headings[place] for quantity, place in choice.guesses.items()}
+    guesses = {
+        name: [headings[k] if headings.count(headings[k]) == 1 else f"#{k + 1}" for k in places]
+        for name, places in choice.guesses.items()
+    }
+    likely = {quantity: found[0] for quantity, found in guesses.items() if len(found) == 1}
+    several = [f"{name} is {' or '.join(found)}" for name, found in guesses.items() if found[1:]]
     for quantity, column in choice.chosen.items():
         likely[quantity] = "+".join(headings[place] for place in column.places)
     names = [name for name in FIELDS if name in likely or name in _NEEDED]
@@ -330,7 +336,7 @@ def unknown_columns(source: str, headings: Sequence[str], choice: Choice) -> Inp
     return InputError(
         f"no plain heading of {missing} (found: {shown_headings(headings)})",
         source=source,
-        cure=f"name the columns, e.g. --columns '{columns}' ({DOCS})",
+        cure="; ".join([f"name the columns, e.g. --columns '{columns}' ({DOCS})", *several]),
     )
 
 

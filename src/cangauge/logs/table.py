@@ -129,7 +129,7 @@ def draft_of_table(
         if not choice.is_complete:
             raise unknown_columns(where, headings, choice)
         chosen = choice.chosen
-    words = [k for k, text in enumerate(headings) if is_defined and text.strip().lower() == SOURCE]
+    words = [k for k, text in enumerate(headings) if text.strip().lower() == SOURCE][:1]
     wanted = [place for column in chosen.values() for place in column.places]
     wanted += [place for place, _ in chosen["time"].others]
     cells = with_decimal_points(table.columns([*dict.fromkeys([*wanted, *words])]))
@@ -151,18 +151,20 @@ def draft_of_table(
         draft.assumed.append(f'{quantity} = "{shown}"{factor} [{unit}]')
     used = {*words, *(place for column in chosen.values() for place in column.places)}
     draft.ignored = tuple(text for k, text in enumerate(headings) if text and k not in used)
+    word = _only_word(cells[words[0]], where) if words else ""
+    word = word or (getattr(table, "word", "") if is_defined else "")
+    if not word and "temperature" in chosen:
+        word = chosen["temperature"].source
+    draft.temperature_source = known_temperature_source(
+        word or "unknown", source=where, field=SOURCE
+    )
     if is_defined:
         draft.assumed = []
-        word = _only_word(cells[words[0]], where) if words else ""
-        word = word or getattr(table, "word", "") or "unknown"
-        draft.temperature_source = known_temperature_source(word, source=where, field=SOURCE)
     else:
         current = chosen["current"]
         draft.sign_unknown = current.factor > 0.0 and len(current.places) == 1
         if draft.sign_unknown and not np.any(draft.values["current_a"] < 0.0):
             _sign_by_state(draft, table)
-        if "temperature" in chosen:
-            draft.temperature_source = chosen["temperature"].source
         _hold_changes(draft)
     return draft
 
@@ -320,7 +322,8 @@ def _date_beside(cells: dict[int, Any], column: ChosenColumn) -> int | None:
 
 def _increases(time_s: FloatArray) -> bool:
     finite = time_s[np.isfinite(time_s)]
-    return finite.size > 1 and bool(np.all(np.diff(finite) >= 0.0)) and finite[-1] > finite[0]
+    steps = np.diff(finite)
+    return steps.size > 0 and bool(np.all(steps >= 0.0)) and float(np.median(steps)) > 0.0
 
 
 # --- Rows that hold only what changed

@@ -162,6 +162,11 @@ def convert(
     return values * factor + offset, f"{label}: converted from {unit} to {field}"
 
 
+def _is_code(number: int) -> bool:
+    """Return whether all bits of a number are set (65535), or but the last or the highest."""
+    return number > 254 and any((number + k) & (number + k - 1) == 0 for k in (0, 1, 2))
+
+
 def _fitting(interval: float, units: str) -> str:
     """Return those of the units in which rows are as far apart as a log's."""
     seconds = {unit: interval * _UNITS["time_s"][unit][0] for unit in units.split()}
@@ -221,7 +226,8 @@ def refuse_wrong_units(
     large = np.abs(current) > _MAX_CURRENT_A
     peak = int(np.argmax(np.abs(current)))
     milli_a = "mA" if abs(current[peak]) <= 1e3 * _MAX_CURRENT_A else "uA"
-    are_codes = np.mean(large) < _RARE and current.size > 1000
+    digits = [int(f"{amps:f}".replace(".", "").strip("0")) for amps in set(abs(current[large]))]
+    are_codes = (np.mean(large) < _RARE and current.size > 1000) or all(map(_is_code, digits))
     soc = values.get("soc_pct", np.empty(0))
     soc = soc[np.isfinite(soc)] if np.isfinite(soc).any() else np.full(1, 50.0)
     most, least = float(np.max(soc)), float(np.min(soc))
@@ -251,7 +257,7 @@ def refuse_wrong_units(
         (middle <= 0.0, u, middle, "the median voltage is not positive",
          "check column and polarity", ""),
         (middle < 1.0, u, middle, "voltage looks like kilovolts", "convert it to volts", "kV"),
-        odd_row(u, np.abs(voltage) > _MAX_VOLTAGE_V, "a battery's voltage"),
+        odd_row(u, (np.abs(voltage) > _MAX_VOLTAGE_V) | (voltage == 0.0), "a battery's voltage"),
         odd_row(i, large & are_codes, "a battery's current"),
         (large.any(), i, current[peak],
          f"current exceeds {_MAX_CURRENT_A:g} A in row {peak + 1}: it looks like {_WORDS[milli_a]}",
