@@ -176,6 +176,39 @@ def test_percents_below_one_are_read_if_the_user_says_so(tmp_path: Path) -> None
     assert log.first_soc() == (0, 0.5)
 
 
+@pytest.mark.parametrize("time", ["s", "ms", "us", "Julian day", "day since 1900"])
+@pytest.mark.parametrize("amps", [1.0, 1e3, 1e6])
+@pytest.mark.parametrize("volts", [1e-3, 1.0, 1e3, 1e6])
+@pytest.mark.parametrize("kelvin", [0.0, 273.15])
+def test_cures_taken_literally_lead_to_the_truth(
+    tmp_path: Path, time: str, amps: float, volts: float, kelvin: float
+) -> None:
+    rate, start = {"s": (1, 0), "ms": (1e3, 0), "us": (1e6, 31e6)}.get(time, (1 / 86400, 45364))
+    start += 2_415_020 * time.startswith("Julian")
+    current = 10.0 + 10.0 * (np.arange(ROWS) % 7)
+    rows = [
+        f"{start + k * rate:.9f},{i * amps},{(380 - i / 10) * volts},{20 + kelvin}"
+        for k, i in enumerate(current)
+    ]
+    columns: dict[str, str] = {}
+    errors: list[str] = []
+    while True:
+        try:
+            log = read(tmp_path, "Time,Current,Voltage,Temp", rows, columns or None)
+            break
+        except InputError as error:
+            text = str(error)
+        assert text not in errors
+        errors.append(text)
+        option = re.search(r"--columns '(\w+)=(.*?)'", text)
+        assert option is not None, errors
+        columns[option[1]] = option[2]
+    np.testing.assert_allclose(log.time_s - log.time_s[0], np.arange(ROWS), atol=1e-2)
+    np.testing.assert_allclose(log.current_a, current)
+    np.testing.assert_allclose(log.voltage_v, 380.0 - current / 10.0)
+    np.testing.assert_allclose(log.temperature_c, 20.0)
+
+
 # ---- the choice of columns
 
 

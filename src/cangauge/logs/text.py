@@ -90,9 +90,9 @@ class TextTable(NamedTuple):
                 "the last line has no line end: if the file was cut off, its last value may be"
                 " short"
             )
-        return {place: self._without_header(table.column(f"c{place}"), place) for place in places}
+        return {place: self._values(table.column(f"c{place}"), place) for place in places}
 
-    def _without_header(self, cells: Any, place: int) -> Any:
+    def _values(self, cells: Any, place: int) -> Any:
         """Return cells, null where a restarted logger wrote its header again."""
         heading = self.headings[place] if place < len(self.headings) else ""
         is_heading = pc.equal(pc.utf8_trim_whitespace(cells), heading)

@@ -200,7 +200,7 @@ def refuse_wrong_units(
 
     def odd_row(field: str, wrong: BoolArray, kind: str) -> _Check:
         row = int(np.argmax(wrong))
-        cure = "remove the row: codes such as 255 and 65535 mean 'not available'"
+        cure = "remove the row: codes such as 0, 255 and 65535 mean 'not available'"
         return wrong.any(), field, values[field][row], f"row {row + 1} is not {kind}", cure, ""
 
     time, current = values["time_s"], values["current_a"]
@@ -211,12 +211,13 @@ def refuse_wrong_units(
     finer, coarser = _fitting(interval, "ns us ms"), _fitting(interval, "min h d")
     coarser = "d" if time[0] > _EXCEL_1990 else coarser
     apart = f"rows are {interval:g} apart: time looks like"
-    # Seconds have steps below 10, or decimal ones: 0.016667 are 60 Hz or 1 s in minutes.
-    mean = float(step.mean())
+    # Seconds have steps below 10, or decimal ones: 0.016667 are 60 Hz, or 1 s in minutes.
     is_whole = np.all(time % 1.0 == 0.0) and np.min(step) >= 10.0
-    is_even = np.max(np.abs(step - mean)) < 0.1 * mean and abs(3600.0 * mean % 1.0 - 0.5) > 0.499
-    is_even = is_even and abs(1000.0 * mean % 1.0 - 0.5) < 0.49
-    in_doubt = in_seconds is None and ((is_whole and finer) or (is_even and coarser))
+    mean = float(step.mean())
+    parts = [1000.0 * mean, *(mean * _UNITS["time_s"][unit][0] for unit in coarser.split())]
+    are_whole = [abs(part - round(part)) < 1e-3 for part in parts]
+    is_coarse = any(are_whole) and not are_whole[0] and np.ptp(step) < 0.2 * mean
+    in_doubt = in_seconds is None and ((is_whole and finer) or is_coarse)
     middle, middle_c = float(np.median(voltage)), float(np.median(temperature))
     is_low = COLDEST_C <= middle <= _UNUSUALLY_HOT_C
     # Before the voltage: a temperature in its place looks like kilovolts. A constant is a code.
