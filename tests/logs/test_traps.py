@@ -137,17 +137,33 @@ def test_a_factor_states_the_sign(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("step", "is_read"),
-    [("{k}", True), ("{k}.5", True), ("{k}e-1", True), ("{sixtieth}", False), ("{ms}", False)],
+    [
+        ("{k}", True),
+        ("{k}.5", True),
+        ("{k}e-1", True),
+        ("{clock_with_a_gap}", True),
+        ("{sparse}", True),
+        ("{sixtieth}", False),
+        ("{ms}", False),
+    ],
 )
 def test_numbers_without_a_unit_are_seconds_if_only_they_fit(
     tmp_path: Path, step: str, *, is_read: bool
 ) -> None:
     rows = [
-        step.format(k=k, ms=20 * k, sixtieth=round(k / 60, 5)) + f",{k % 7},360,20"
+        step.format(
+            k=k,
+            ms=20 * k,
+            sixtieth=round(k / 60, 5),
+            clock_with_a_gap=k % 30 + 3600 * (k // 30),
+            sparse=20 * k - 15 * (k > 30),
+        )
+        + f",{k % 7},360,20"
         for k in range(ROWS)
     ]
     if is_read:
-        read(tmp_path, "Time,Current,Voltage,Temp", rows)
+        log = read(tmp_path, "Time,Current,Voltage,Temp", rows)
+        assert 'time = "Time" [s, assumed]' in log.assumed
     else:
         with pytest.raises(InputError, match="in seconds or another unit"):
             read(tmp_path, "Time,Current,Voltage,Temp", rows)
@@ -185,7 +201,7 @@ def test_cures_taken_literally_lead_to_the_truth(
 ) -> None:
     rate, start = {"s": (1, 0), "ms": (1e3, 0), "us": (1e6, 31e6)}.get(time, (1 / 86400, 45364))
     start += 2_415_020 * time.startswith("Julian")
-    current = 10.0 + 10.0 * (np.arange(ROWS) % 7)
+    current = 10.37 + 10.0 * (np.arange(ROWS) % 7)
     rows = [
         f"{start + k * rate:.9f},{i * amps},{(380 - i / 10) * volts},{20 + kelvin}"
         for k, i in enumerate(current)
@@ -292,6 +308,26 @@ def test_a_time_that_wraps_is_replaced_by_another_in_its_own_unit(
     np.testing.assert_allclose(log.time_s, 0.02 * np.arange(60))
     log = read(tmp_path, head, [f"{k},{20 * k},{k % 7},360,20" for k in range(60)])
     np.testing.assert_array_equal(log.time_s, np.arange(60.0))
+
+
+@pytest.mark.parametrize(
+    ("current", "voltage", "ends"),
+    [
+        ("1,800", "380.5", (1800.0, 380.5)),  # one mark is decimal in this table
+        ("1.800", "380,5", (1800.0, 380.5)),
+        ("1,800", "380", (1.8, 380.0)),  # nothing tells
+        ("1,80", "380.5", (1.8, 380.5)),  # each column its own
+        ("1,800", "380.500", (1.8, 380.5)),
+    ],
+)
+def test_a_mark_separates_thousands_if_the_other_is_decimal(
+    tmp_path: Path, current: str, voltage: str, ends: tuple[float, float]
+) -> None:
+    stamp = "13.03.2024;23:59:{k:02d}"
+    rows = rows_of(f"{stamp};{current};{voltage};20", 60)
+    log = read(tmp_path, "Datum;Zeit;Strom;Spannung;Temperatur", rows)
+    assert (log.current_a[0], log.voltage_v[0]) == ends
+    assert log.time_s[0] == 1_710_374_340.0
 
 
 # ---- directions of current

@@ -57,7 +57,7 @@ _ELAPSED: Final = _words(
 _WORDS: Final[dict[str, frozenset[str]]] = {
     "time": _words(
         "time realtime zeit timestamp timestamps datetime date datum elapsed tiempo tempo seconds"
-        " sec clock uhrzeit stamp tstamp stempel zeitstempel tick ticks uptime utc"
+        " sec clock uhrzeit stamp tstamp stempel zeitstempel tick ticks uptime"
         " changed 时间 总时间 测试时间 日期 绝对时间"
     ),
     "current": _words(
@@ -205,7 +205,8 @@ def _quantity(words: list[str], name: str, unit: str) -> tuple[str | None, list[
         return quantity, ["(date)"] if words and set(words) <= _DATES else others
     if named:
         return None, words
-    if words and unit and unit_of("time_s", unit) and set(words) <= _ELAPSED:
+    is_elapsed = words and unit and unit_of("time_s", unit) and set(words) <= _ELAPSED
+    if is_elapsed or words == ["utc"]:
         return "time", words
     return _symbol(words, name, unit)
 

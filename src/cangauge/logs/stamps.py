@@ -171,12 +171,15 @@ def _seconds_of_numbers(
         cure = f"state it: --columns 'time={label}[?]', with s, ms, us, ns, min, h or d for ?"
         problem = "the unit of time is not stated, and no epoch has a year of 1991 to 2099"
         raise InputError(problem, source=source, field=label, value=typical, cure=cure)
-    # Of a count of seconds over a hundred, rows closer than 40 s hold some of 60 to 99.
-    passes = finite.size > 1 and np.ptp(finite) >= 100.0 and np.median(np.diff(finite)) < 40.0
     hours, minutes, seconds = values // 10_000.0, values // 100.0 % 100.0, values % 100.0
     spells = (hours >= 0.0) & (hours < 24.0) & (minutes < 60.0) & (seconds < 60.0)
-    if passes and np.all(spells | np.isnan(values)):
-        return _over_midnight(hours * 3600.0 + minutes * 60.0 + seconds), "hhmmss, from its digits"
+    clock_s = _over_midnight(hours * 3600.0 + minutes * 60.0 + seconds)
+    # A count of seconds has some of 60 to 99 of each hundred; a clock has none, and no gap there.
+    steps, clock_steps = np.diff(finite), np.diff(clock_s[np.isfinite(values)])
+    usual = float(np.median(steps)) if steps.size else np.inf
+    jumps = (np.abs(steps) > 40.0) & (clock_steps > 0.0) & (clock_steps <= 2.0 * usual)
+    if usual < 40.0 and jumps.any() and np.all(spells | np.isnan(values)):
+        return clock_s, "hhmmss, from its digits"
     return values, "s, assumed"
 
 
