@@ -200,7 +200,7 @@ def refuse_wrong_units(
 
     def odd_row(field: str, wrong: BoolArray, kind: str) -> _Check:
         row = int(np.argmax(wrong))
-        cure = "remove the row: codes such as 0, 255 and 65535 mean 'not available'"
+        cure = "remove the row: codes such as 255 and 65535 mean 'not available'"
         return wrong.any(), field, values[field][row], f"row {row + 1} is not {kind}", cure, ""
 
     time, current = values["time_s"], values["current_a"]
@@ -258,7 +258,7 @@ def refuse_wrong_units(
         (middle <= 0.0, u, middle, "the median voltage is not positive",
          "check column and polarity", ""),
         (middle < 1.0, u, middle, "voltage looks like kilovolts", "convert it to volts", "kV"),
-        odd_row(u, (np.abs(voltage) > _MAX_VOLTAGE_V) | (voltage == 0.0), "a battery's voltage"),
+        odd_row(u, np.abs(voltage) > _MAX_VOLTAGE_V, "a battery's voltage"),
         odd_row(i, large & are_codes, "a battery's current"),
         (large.any(), i, current[peak],
          f"current exceeds {_MAX_CURRENT_A:g} A in row {peak + 1}: it looks like {_WORDS[milli_a]}",
