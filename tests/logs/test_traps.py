@@ -318,13 +318,15 @@ def test_a_time_that_wraps_is_replaced_by_another_in_its_own_unit(
         ("1,800", "380", (1.8, 380.0)),  # nothing tells
         ("1,80", "380.5", (1.8, 380.5)),  # each column its own
         ("1,800", "380.500", (1.8, 380.5)),
+        ("1,800;20,5", "380.5", (1.8, 380.5)),  # both are decimal
     ],
 )
 def test_a_mark_separates_thousands_if_the_other_is_decimal(
     tmp_path: Path, current: str, voltage: str, ends: tuple[float, float]
 ) -> None:
     stamp = "13.03.2024;23:59:{k:02d}"
-    rows = rows_of(f"{stamp};{current};{voltage};20", 60)
+    current, _, celsius = current.partition(";")
+    rows = rows_of(f"{stamp};{current};{voltage};{celsius or 20}", 60)
     log = read(tmp_path, "Datum;Zeit;Strom;Spannung;Temperatur", rows)
     assert (log.current_a[0], log.voltage_v[0]) == ends
     assert log.time_s[0] == 1_710_374_340.0
