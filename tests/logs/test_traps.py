@@ -318,7 +318,7 @@ def test_a_time_that_wraps_is_replaced_by_another_in_its_own_unit(
         ("1,800", "380", (1.8, 380.0)),  # nothing tells
         ("1,80", "380.5", (1.8, 380.5)),  # each column its own
         ("1,800", "380.500", (1.8, 380.5)),
-        ("1,800;20,5", "380.5", (1.8, 380.5)),  # both are decimal
+        ("1.800;20,5", "380.5", (1.8, 380.5)),  # both are decimal
     ],
 )
 def test_a_mark_separates_thousands_if_the_other_is_decimal(
