@@ -39,8 +39,14 @@ def row_of(case: dict[str, Any], k: int) -> str:
     if "decimal" in case:
         values = {name: str(value).replace(".", ",") for name, value in values.items()}
     german_ma = f"{1e3 * i:,.1f}".translate(str.maketrans(",.", ".,"))
+    thousand_ma, thousand_mv = f"{1e3 * i:,.0f}", f"{1e3 * u:,.0f}"
+    swiss_ma = thousand_ma.translate(str.maketrans(",-", "'\u2212"))
     hms = f"00:00:{k:02d}"
-    return template.format(k=k, hms=hms, when=when, german_ma=german_ma, **values)
+    values |= {"hms": hms, "when": when, "german_ma": german_ma, "thousand_ma": thousand_ma,
+               "thousand_mv": thousand_mv, "swiss_ma": swiss_ma,
+               "filetime": int(10_000_000 * (START.timestamp() + k + 11_644_473_600)),
+               "net_ticks": int(10_000_000 * (START.timestamp() + k + 62_135_596_800))}  # fmt: skip
+    return template.format(k=k, **values)
 
 
 def content_of(case: dict[str, Any]) -> bytes:

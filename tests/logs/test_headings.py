@@ -46,7 +46,7 @@ SPELLINGS = {
     "BioLogic": (
         "mode,ox/red,error,control changes,time/s,control/V/mA,Ewe/V,I/mA,dq/mA.h,(Q-Qo)/mA.h,"
         "Ece/V,P/W,control/V,control/mA,Ewe-Ece/V",
-        "time/s|I/mA|Ewe/V||",
+        "time/s|I/mA|Ewe-Ece/V||",
     ),
     "Basytec": (
         "~Time[h],DataSet,Date,Time,t-Step[h],t-Set[h],Line,Command,U[V],I[A],Ah[Ah],T1[°C],R-DC",
@@ -109,8 +109,9 @@ def test_several_of_a_kind_are_left_to_the_user() -> None:
     headings = ["Time [s]", "Battery Current [A]", "Battery Current [A]", "Voltage 1", "Voltage 2"]
     choice = choose_columns(headings)
     assert set(choice.chosen) == {"time"}
-    option = "--columns 'time=Time [s],current=Battery Current [A],voltage=Voltage 1'"
-    assert option in str(unknown_columns("x.csv", headings, choice))
+    error = str(unknown_columns("x.csv", headings, choice))
+    assert "--columns 'time=Time [s],current=?,voltage=?'" in error
+    assert error.endswith("; current is #2 or #3; voltage is Voltage 1 or Voltage 2")
 
 
 @pytest.mark.parametrize(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -134,6 +135,96 @@ def test_a_factor_states_the_sign(tmp_path: Path) -> None:
     assert read(tmp_path, head, rows, "current=Current:0.5").current_a.max() == 25.0
 
 
+@pytest.mark.parametrize(
+    ("step", "is_read"),
+    [
+        ("{k}", True),
+        ("{k}.5", True),
+        ("{k}e-1", True),
+        ("{clock_with_a_gap}", True),
+        ("{sparse}", True),
+        ("{sixtieth}", False),
+        ("{ms}", False),
+    ],
+)
+def test_numbers_without_a_unit_are_seconds_if_only_they_fit(
+    tmp_path: Path, step: str, *, is_read: bool
+) -> None:
+    rows = [
+        step.format(
+            k=k,
+            ms=20 * k,
+            sixtieth=round(k / 60, 5),
+            clock_with_a_gap=k % 30 + 3600 * (k // 30),
+            sparse=20 * k - 15 * (k > 30),
+        )
+        + f",{k % 7},360,20"
+        for k in range(ROWS)
+    ]
+    if is_read:
+        log = read(tmp_path, "Time,Current,Voltage,Temp", rows)
+        assert 'time = "Time" [s, assumed]' in log.assumed
+    else:
+        with pytest.raises(InputError, match="in seconds or another unit"):
+            read(tmp_path, "Time,Current,Voltage,Temp", rows)
+    read(tmp_path, "Time,Current,Voltage,Temp", rows, "time=Time[s]")
+
+
+@pytest.mark.parametrize(
+    ("head", "row"),
+    [
+        ("Time,Current (0.1A),Voltage (10mV),Temp (0.1C),SoC (0.1%)", "{k},{amps}0,36000,200,500"),
+        ("Time,Current x10 (A),Voltage x100,Temp,SoC", "{k},{amps}0,36000,20,50"),
+        ("Time,Current (uA),Voltage (uV),Temp (1C),SoC", "{k},{amps}000000,360000000,20,50"),
+    ],
+)
+def test_the_unit_of_a_bit_in_the_heading(tmp_path: Path, head: str, row: str) -> None:
+    log = read(tmp_path, head, rows_of(row))
+    np.testing.assert_allclose(log.current_a, np.arange(ROWS) % 7)
+    assert log.soc_pct is not None
+    ends = [log.voltage_v[-1], log.temperature_c[-1], log.soc_pct[-1]]
+    np.testing.assert_allclose(ends, [360.0, 20.0, 50.0])
+
+
+def test_percents_below_one_are_read_if_the_user_says_so(tmp_path: Path) -> None:
+    head, rows = "Time,Current,Voltage,Temp,SoC [%]", rows_of("{k},{amps},360,20,0.5")
+    log = read(tmp_path, head, rows, "soc=SoC [%][%]")
+    assert log.first_soc() == (0, 0.5)
+
+
+@pytest.mark.parametrize("time", ["s", "ms", "us", "Julian day", "day since 1900"])
+@pytest.mark.parametrize("amps", [1.0, 1e3, 1e6])
+@pytest.mark.parametrize("volts", [1e-3, 1.0, 1e3, 1e6])
+@pytest.mark.parametrize("kelvin", [0.0, 273.15])
+def test_cures_taken_literally_lead_to_the_truth(
+    tmp_path: Path, time: str, amps: float, volts: float, kelvin: float
+) -> None:
+    rate, start = {"s": (1, 0), "ms": (1e3, 0), "us": (1e6, 31e6)}.get(time, (1 / 86400, 45364))
+    start += 2_415_020 * time.startswith("Julian")
+    current = 10.37 + 10.0 * (np.arange(ROWS) % 7)
+    rows = [
+        f"{start + k * rate:.9f},{i * amps},{(380 - i / 10) * volts},{20 + kelvin}"
+        for k, i in enumerate(current)
+    ]
+    columns: dict[str, str] = {}
+    errors: list[str] = []
+    while True:
+        try:
+            log = read(tmp_path, "Time,Current,Voltage,Temp", rows, columns or None)
+            break
+        except InputError as error:
+            text = str(error)
+        assert text not in errors
+        errors.append(text)
+        option = re.search(r"--columns '(\w+)=(.*?)'", text)
+        assert option is not None, errors
+        columns[option[1]] = option[2]
+    np.testing.assert_allclose(log.time_s - log.time_s[0], np.arange(ROWS), atol=1e-2)
+    np.testing.assert_allclose(log.current_a, current)
+    np.testing.assert_allclose(log.voltage_v, 380.0 - current / 10.0)
+    np.testing.assert_allclose(log.temperature_c, 20.0)
+
+
 # ---- the choice of columns
 
 
@@ -217,6 +308,104 @@ def test_a_time_that_wraps_is_replaced_by_another_in_its_own_unit(
     np.testing.assert_allclose(log.time_s, 0.02 * np.arange(60))
     log = read(tmp_path, head, [f"{k},{20 * k},{k % 7},360,20" for k in range(60)])
     np.testing.assert_array_equal(log.time_s, np.arange(60.0))
+
+
+@pytest.mark.parametrize(
+    ("current", "voltage", "ends"),
+    [
+        ("1,800", "380.5", (1800.0, 380.5)),  # one mark is decimal in this table
+        ("1.800", "380,5", (1800.0, 380.5)),
+        ("1,800", "380", (1.8, 380.0)),  # nothing tells
+        ("1,80", "380.5", (1.8, 380.5)),  # each column its own
+        ("1,800", "380.500", (1.8, 380.5)),
+        ("1.800;20,5", "380.5", (1.8, 380.5)),  # both are decimal
+    ],
+)
+def test_a_mark_separates_thousands_if_the_other_is_decimal(
+    tmp_path: Path, current: str, voltage: str, ends: tuple[float, float]
+) -> None:
+    stamp = "13.03.2024;23:59:{k:02d}"
+    current, _, celsius = current.partition(";")
+    rows = rows_of(f"{stamp};{current};{voltage};{celsius or 20}", 60)
+    log = read(tmp_path, "Datum;Zeit;Strom;Spannung;Temperatur", rows)
+    assert (log.current_a[0], log.voltage_v[0]) == ends
+    assert log.time_s[0] == 1_710_374_340.0
+
+
+# ---- directions of current
+
+
+@pytest.mark.parametrize(
+    ("heading", "charge", "discharge", "is_read"),
+    [
+        ("State", "C", "D", True),
+        ("Step Type", "CC Chg", "CC DChg", True),
+        ("Mode", "Charging", "discharging", True),
+        ("Status", "CHA", "DCH", True),
+        ("Direction", "1", "2", False),
+        ("Mode", "CHA", "7", None),
+        ("Comment", "C", "D", None),
+    ],
+)
+def test_an_unsigned_current_has_the_direction_of_its_state(
+    tmp_path: Path, heading: str, charge: str, discharge: str, *, is_read: bool | None
+) -> None:
+    head = f"Time [s],Current [A],Voltage [V],Temp [°C],{heading}"
+    amps = np.arange(ROWS) % 7 - 3.0
+    words = {-1.0: charge, 0.0: "R", 1.0: discharge}
+    rows = [f"{k},{abs(a)},{360 - a},20,{words[np.sign(a)]}" for k, a in enumerate(amps)]
+    if is_read is False:
+        with pytest.raises(InputError, match="Direction: row 1 does not say whether the unsigned"):
+            read(tmp_path, head, rows)
+        return
+    log = read(tmp_path, head, rows)
+    np.testing.assert_array_equal(log.current_a, amps if is_read else np.abs(amps))
+    assert (f'current charges where "{heading}" says so' in log.assumed) is bool(is_read)
+
+
+@pytest.mark.parametrize(
+    ("charge", "discharge", "factor"),
+    [
+        ("Charge Current (A)", "Discharge Current (A)", 1.0),
+        ("Battery charging current (mA)", "Battery discharging current (mA)", 1e-3),
+        ("Chg Current", "DisChg Current", -1.0),
+    ],
+)
+def test_currents_of_each_direction_are_joined(
+    tmp_path: Path, charge: str, discharge: str, factor: float
+) -> None:
+    amps = np.arange(ROWS) % 7 - 3.0
+    rows = [
+        f"{k},{max(-a, 0) / factor},{max(a, 0) / abs(factor)},360,20" for k, a in enumerate(amps)
+    ]
+    log = read(tmp_path, f"Time [s],{charge},{discharge},Voltage,Temp", rows)
+    np.testing.assert_allclose(log.current_a, amps)
+    assert any(text.startswith(f'current = "{discharge} − {charge}"') for text in log.assumed)
+
+
+@pytest.mark.parametrize(
+    ("others", "found"),
+    [
+        ("Charge Current Limit [A],Discharge Current Limit [A]", "no plain heading of current"),
+        ("Charge Current [A],Discharge Current [A],Current [A]", '"Current .A."'),
+        ("Charge Current [A],Discharge Current [mA]", "no plain heading of current"),
+        ("Current [A],Charge Current [A]", '"Current .A."'),
+    ],
+)
+def test_other_pairs_of_currents_are_not_joined(tmp_path: Path, others: str, found: str) -> None:
+    rows = rows_of("{k},360,20," + ",".join(["{amps}"] * (1 + others.count(","))))
+    head = f"Time [s],Voltage [V],Temp [°C],{others}"
+    if found.startswith("no"):
+        with pytest.raises(InputError, match=found):
+            read(tmp_path, head, rows)
+    else:
+        assert re.search(found, " ".join(read(tmp_path, head, rows).assumed))
+
+
+def test_currents_of_both_signs_are_not_of_one_direction(tmp_path: Path) -> None:
+    rows = [f"{k},{k % 3 - 1},{k % 2},360,20" for k in range(ROWS)]
+    with pytest.raises(InputError, match="Discharge Current − Charge Current: these are no"):
+        read(tmp_path, "Time [s],Charge Current,Discharge Current,Voltage,Temp", rows)
 
 
 # ---- rows

@@ -24,6 +24,7 @@ _SPLIT: Final = re.compile(rf",\s*(?=(?:{'|'.join(FIELDS)})\s*=)", re.IGNORECASE
 _FACTOR: Final = re.compile(
     r"^(?P<text>.*\S)\s*:\s*(?P<factor>[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)$"
 )
+_DIRECTION: Final = re.compile(r"(?P<dis>dis?|de)?[-_ ]?(?:charg(?:ed|e|ing)|chg)", re.IGNORECASE)
 _UNIT: Final = re.compile(r"^(?P<text>.*\S)\s*\[(?P<unit>[^\[\]]*)\]$")
 
 
@@ -136,24 +137,27 @@ def _spec_of(quantity: str, value: Any, where: str) -> ColumnSpec:
 class ChosenColumn:
     """Columns of a table that hold one quantity.
 
-    Several places are a date and its time, or temperatures whose median is taken. The unit is the
+    Several places are a date and its time, temperatures whose median is taken, or the currents of
+    discharge and charge, whose difference is taken. The unit is the
     user's, the heading's or that of the row of units. `others` are further columns of time: dates
-    beside a clock, or times in case that the first does not increase.
+    beside a clock, or times in case that the first does not increase. `is_stated`: with the
+    user's unit or factor.
     """
 
     places: tuple[int, ...]
     unit: str = ""
     factor: float = 1.0
     source: TemperatureSource = "unknown"
+    is_stated: bool = False
     others: tuple[tuple[int, Meaning], ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
 class Choice:
-    """Columns of a table by quantity, and the likeliest column of each that is not plain."""
+    """Columns of a table by quantity, and the likely columns of each that is not plain."""
 
     chosen: dict[str, ChosenColumn] = field(default_factory=dict)
-    guesses: dict[str, int] = field(default_factory=dict)
+    guesses: dict[str, list[int]] = field(default_factory=dict)
 
     @property
     def is_complete(self) -> bool:
@@ -194,9 +198,29 @@ def choose_columns(
             for place, meaning in enumerate(meanings)
             if meaning is not None and meaning.quantity == quantity and place not in owner
         ]
-        if quantity not in given.specs and plain:
+        pair = _directions(headings, plain) if quantity == "current" else None
+        if pair is not None and "current" not in given.specs:
+            choice.chosen["current"] = pair
+        elif quantity not in given.specs and plain:
             _choose(quantity, sorted(plain, key=lambda item: item[1].rank), choice)
     return choice
+
+
+def _directions(
+    headings: Sequence[str], plain: Sequence[tuple[int, Meaning]]
+) -> ChosenColumn | None:
+    """Return the currents of discharge and charge, in this order, if they alone are plain."""
+    found: dict[tuple[str, str], dict[bool, int]] = {}
+    for place, meaning in plain:
+        match = _DIRECTION.search(headings[place])
+        rest = _simple(headings[place].replace(match[0], "")) if match else ""
+        without = meaning_of(rest) if match else meaning
+        if without is not None and without.quantity == "current" and without.rank < GUESS:
+            found.setdefault((rest, meaning.unit), {})[bool(match and match["dis"])] = place
+    if len(found) != 1:
+        return None
+    ((_, unit), places), *_ = found.items()
+    return ChosenColumn((places[True], places[False]), unit) if len(places) == 2 else None
 
 
 def _choose(quantity: str, plain: list[tuple[int, Meaning]], choice: Choice) -> None:
@@ -212,7 +236,8 @@ def _choose(quantity: str, plain: list[tuple[int, Meaning]], choice: Choice) -> 
     are_probes = quantity == "temperature" and all(meaning.numbered for _, meaning in best)
     one_of_many = len(best) > 1 and quantity != "time" and not are_probes
     if first.rank >= GUESS or siblings or one_of_many:
-        choice.guesses[quantity] = place
+        rank = GUESS if siblings else min(first.rank, GUESS)
+        choice.guesses[quantity] = [p for p, meaning in plain if meaning.rank <= rank]
     elif quantity == "time":
         choice.chosen[quantity] = ChosenColumn((place,), first.unit, others=tuple(plain[1:]))
     else:
@@ -244,7 +269,8 @@ def _given_column(
             )
         first = meanings[places[0]]
         source = first.source if first is not None and quantity == "temperature" else "unknown"
-        return ChosenColumn(places, unit, reading.factor, source)
+        is_stated = reading.unit is not None or reading.factor != 1.0
+        return ChosenColumn(places, unit, reading.factor, source, is_stated)
     near = closest(spec.text, headings)
     raise InputError(
         f"no column has this heading (found: {shown_headings(headings)})",
@@ -293,11 +319,16 @@ def _simple(text: str) -> str:
 def unknown_columns(source: str, headings: Sequence[str], choice: Choice) -> InputError:
     """Return the error for a table whose columns are not plain, with the option to paste.
 
-    It has the likeliest column of each quantity, and `?` where none is likely.
+    It has the likely column of each quantity, and `?` where none or several are likely.
     """
     needed = [name for name in _NEEDED if name not in choice.chosen]
     missing = " and ".join(part for part in (", ".join(needed[:-1]), *needed[-1:]) if part)
-    likely = {quantity: headings[place] for quantity, place in choice.guesses.items()}
+    guesses = {
+        name: [headings[k] if headings.count(headings[k]) == 1 else f"#{k + 1}" for k in places]
+        for name, places in choice.guesses.items()
+    }
+    likely = {quantity: found[0] for quantity, found in guesses.items() if len(found) == 1}
+    several = [f"{name} is {' or '.join(found)}" for name, found in guesses.items() if found[1:]]
     for quantity, column in choice.chosen.items():
         likely[quantity] = "+".join(headings[place] for place in column.places)
     names = [name for name in FIELDS if name in likely or name in _NEEDED]
@@ -305,7 +336,7 @@ def unknown_columns(source: str, headings: Sequence[str], choice: Choice) -> Inp
     return InputError(
         f"no plain heading of {missing} (found: {shown_headings(headings)})",
         source=source,
-        cure=f"name the columns, e.g. --columns '{columns}' ({DOCS})",
+        cure="; ".join([f"name the columns, e.g. --columns '{columns}' ({DOCS})", *several]),
     )
 
 

@@ -42,6 +42,9 @@ class DraftLog:
         Location of the temperature sensor.
     sign_unknown, negated : bool
         The format does not define the sign; the file stores discharge as negative.
+    in_seconds, stated
+        Whether a unit of time is stated, and columns whose unit the user states; see
+        `refuse_wrong_units`.
     assumed, remarks : list of str
         How the columns were understood; changes and findings.
     headings, ignored : tuple of str
@@ -55,6 +58,8 @@ class DraftLog:
     temperature_source: TemperatureSource = "unknown"
     sign_unknown: bool = False
     negated: bool = False
+    in_seconds: bool | None = False
+    stated: set[str] = field(default_factory=set)
     assumed: list[str] = field(default_factory=list)
     remarks: list[str] = field(default_factory=list)
     headings: tuple[str, ...] = ()
@@ -122,7 +127,13 @@ class DraftLog:
         self._drop_repeated()
         for values in self.values.values():
             values.flags.writeable = False  # the log need not copy them
-        self.remarks += refuse_wrong_units(self.values, source=self._where, labels=self.labels)
+        self.remarks += refuse_wrong_units(
+            self.values,
+            source=self._where,
+            labels=self.labels,
+            in_seconds=self.in_seconds,
+            stated=self.stated,
+        )
         log = Log(
             **self.values,
             name=self.name,
@@ -177,16 +188,26 @@ class DraftLog:
         back = np.flatnonzero(step < 0.0)
         if back.size:
             row = int(back[0])
+            is_reversed = 2 * back.size > step.size
             raise self._error(
                 "time_s",
                 f"time runs backwards at row {row + 1} ({back.size} such rows;"
                 f" the row before has {time[row - 1]:.6f} s)",
-                "sort the rows by time, or split the file into one log each",
+                "sort the rows by time"
+                if is_reversed
+                else "split the file there into one log each: the clock was set back or restarted",
                 float(time[row]),
             )
-        first = int(np.argmax(step == 0.0)) + 1
+        repeats = step == 0.0
+        row = int(np.argmax(repeats))
+        differs = np.any([np.diff(v, prepend=v[0]) != 0.0 for v in self.values.values()], axis=0)
+        count = int(np.sum(repeats & differs))
+        if count > MAX_INCOMPLETE * time.size:
+            problem = f"{count} of {time.size} rows have the time stamp of the row before"
+            cure = f"export fractions of a second, or one row per time: the first is row {row + 1}"
+            raise self._error("time_s", problem, cure)
         self.keep(
-            step != 0.0, f"with the time stamp of the row before dropped (the first is row {first})"
+            ~repeats, f"with the time stamp of the row before dropped (the first is row {row + 1})"
         )
 
     @property

@@ -13,7 +13,7 @@ import unicodedata
 from functools import lru_cache
 from typing import Final, NamedTuple
 
-from cangauge.logs.units import FIELDS, FOREIGN_UNITS, TemperatureSource, unit_of
+from cangauge.logs.units import CANONICAL_UNIT, FIELDS, FOREIGN_UNITS, TemperatureSource, unit_of
 
 
 def _words(text: str) -> frozenset[str]:
@@ -22,7 +22,7 @@ def _words(text: str) -> frozenset[str]:
 
 _PACK: Final = _words(
     "pack packs batt bat battery batterie batteries akku accu hv hvb hvbatt traction traktion bms"
-    " ess storage"
+    " ess storage ece"  # Ewe-Ece: the cell between its electrodes
 )
 _NEUTRAL: Final = _words(
     "terminal surface skin absolute abs mid measured meas actual act value val signal avg average"
@@ -31,6 +31,7 @@ _NEUTRAL: Final = _words(
     " overall current present averaged volume gesamt klemmen klemm"
 )
 _CELL: Final = _words("cell cells module mod zelle zellen zell string")
+_DERIVED: Final = _words("avg average averaged mean mid raw")
 _DISPLAY: Final = _words("display displayed disp dash dashboard anzeige")
 _AMBIENT: Final = _words(
     "ambient chamber room environment env umgebung umgebungs raum kammer lab oven klimakammer"
@@ -74,6 +75,7 @@ _WORDS: Final[dict[str, frozenset[str]]] = {
 }
 _BY_UNIT: Final = {"temps": "time", "vol": "voltage"}
 """Words that are another quantity's too (French; volume): the unit decides."""
+_SOC: Final = re.compile(r"(?:\b[RU])?S[oO]C")
 _DEGREES: Final = _words("celsius fahrenheit kelvin degc degf")
 """Units that name the quantity where no word does: `celsius`, `battery_celsius`."""
 _SYMBOLS: Final = {"i": "current", "u": "voltage", "v": "voltage", "e": "voltage", "t": "time"}
@@ -89,6 +91,8 @@ _UNIT_FORMS: Final = (
     re.compile(r"^(?P<name>.*\S?)(?:,\s*|__|_|\s+)(?P<unit>[^\s_,]+)\s*$"),
 )
 """`Name [unit]`, `Name/unit`, `Name_unit`."""
+_TIMES: Final = re.compile(r"[\s_*(]*x\s?(10+)\b\)?")
+"""`Voltage x100`: the cells are a hundred times the voltage."""
 _CELL_VOLTAGE: Final = re.compile(
     r"(?:cell|zelle)[\s_#-]*(?:voltage|volt|v|u)?[\s_#-]*0*(?P<number>\d{1,4})"
     r"[\s_]*(?:voltage|volts?)?[\s_]*[\[(]?(?P<unit>m?v)?[\])]?",
@@ -121,6 +125,11 @@ def meaning_of(heading: str, unit_below: str = "") -> Meaning | None:
         return None
     # Measurement tools qualify a signal: `Bus::Message::Signal`, `Signal\\Device:1`.
     heading = re.sub(r"\\[^\[(]*", "", heading.rpartition("::")[2])
+    times = _TIMES.search(heading)
+    if times:
+        found = meaning_of(heading.replace(times[0], " "), unit_below)
+        unit = found and (found.unit or CANONICAL_UNIT[found.quantity])
+        return found and found._replace(unit=f"{1.0 / float(times[1]):g}{unit}")
     readings = (_meaning(name, unit) for name, unit in names_and_units(heading, unit_below))
     return next((found for found in readings if found is not None), None)
 
@@ -136,7 +145,7 @@ def cell_number(heading: str) -> tuple[int, float] | None:
 def names_and_units(heading: str, unit_below: str = "") -> list[tuple[str, str]]:
     """Return (name, unit) as a heading may be meant, the most explicit first, the whole last."""
     heading = heading.strip()
-    if heading.lower() in _DEGREES:
+    if heading.lower() in {*_DEGREES, "millis"}:
         return [("", heading)]
     if len(heading) > LONGEST:
         return [(heading, "")]
@@ -157,7 +166,7 @@ def _is_unit(text: str) -> bool:
 
 def _meaning(name: str, unit: str) -> Meaning | None:
     """Return the meaning of a name with this unit; None if the unit belongs to another quantity."""
-    plain = unicodedata.normalize("NFKD", name.replace("SoC", "Soc").replace("SOC", "Soc"))
+    plain = unicodedata.normalize("NFKD", _SOC.sub(lambda soc: soc[0].capitalize(), name))
     plain = "".join(char for char in plain if not unicodedata.combining(char))
     quantity, others = _quantity([word.lower() for word in _TOKEN.findall(plain)], name, unit)
     if quantity is None:
@@ -196,7 +205,8 @@ def _quantity(words: list[str], name: str, unit: str) -> tuple[str | None, list[
         return quantity, ["(date)"] if words and set(words) <= _DATES else others
     if named:
         return None, words
-    if words and unit and unit_of("time_s", unit) and set(words) <= _ELAPSED:
+    is_elapsed = words and unit and unit_of("time_s", unit) and set(words) <= _ELAPSED
+    if is_elapsed or words == ["utc"]:
         return "time", words
     return _symbol(words, name, unit)
 
@@ -205,6 +215,8 @@ def _symbol(words: list[str], name: str, unit: str) -> tuple[str | None, list[st
     """Return the quantity of a unit, or of a formula letter alone or with a word for the pack."""
     if unit.lower() in _DEGREES:
         return "temperature", words
+    if not name and unit:
+        return "time", words
     symbols = [word for word in words if word in _SYMBOLS]
     others = [word for word in words if word not in _SYMBOLS]
     plain = _PACK | _CELL | _DISPLAY | {"avg", "average", "mean"}
@@ -239,7 +251,8 @@ def _rank(quantity: str, others: list[str]) -> tuple[int, bool, TemperatureSourc
     elif unknown or (numbered and not is_temperature):
         rank = 3
     else:
-        rank = 2 if words & (_CELL | _DISPLAY) else 0 if words & _PACK else 1
+        less = _CELL | _DISPLAY | (frozenset() if is_temperature else _DERIVED)
+        rank = 2 if words & less else 0 if words & _PACK else 1
     return rank, numbered, source
 
 

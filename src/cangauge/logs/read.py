@@ -25,7 +25,7 @@ from cangauge.logs.log import Log, TemperatureSource
 from cangauge.logs.table import ArrowTable, draft_of_table, is_canonical
 from cangauge.logs.text import TextTable, find_table, likely_header, table_below
 from cangauge.logs.units import COLDEST_C, HOTTEST_C, known_temperature_source
-from cangauge.logs.values import numbers_of
+from cangauge.logs.values import numbers_of, with_decimal_points
 
 KNOWN_LOGS: Final = (
     "canonical Parquet and CSV (time_s, current_a, voltage_v, temperature_c, soc_pct), ANL D3"
@@ -290,7 +290,7 @@ def read_cells(
     cells = _cells(table.headings, source)
     if len(cells) < 2:  # a single cell is its pack
         return None
-    values = table.columns([place for place, _ in cells.values()])
+    values = with_decimal_points(table.columns([place for place, _ in cells.values()]))
     volts = np.column_stack(
         [
             scale * numbers_of(values[place], source, table.headings[place])[0]

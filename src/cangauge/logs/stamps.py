@@ -37,6 +37,11 @@ _SPELLINGS: Final = (
         r"\2-\1-\3 ",
     ),
     (r"^(\d{1,2})\.?\s+([A-Za-z]{3})[a-z]*\.?,?\s+(\d{4}),?\s*", r"\1-\2-\3 "),
+    # `20240313T235000Z`, `240313235000`; days and a clock time: `1.23:50:00`, `073:23:50:00`.
+    (r"^(\d{4})(\d{2})(\d{2})T?(\d{2})(\d{2})(\d{2})([Z.,]|$)", r"\1-\2-\3 \4:\5:\6\7"),
+    (r"^(\d{2})(\d{2})(\d{2})(\d{2})(\d{2})(\d{2})$", r"20\1-\2-\3 \4:\5:\6"),
+    (r"^(\d+)\.(\d{2}:\d{2}:\d{2})", r"\1d \2"),
+    (r"^(\d{3}):(\d{2}:\d{2}:\d{2})$", r"\1d \2"),
 )
 _MONTH_NAMES: Final = "jan feb mar/mrz apr may/mai jun jul aug sep oct/okt nov dec/dez"
 _MONTHS: Final = {
@@ -46,8 +51,22 @@ _MONTHS: Final = {
 }
 _ORDERS: Final = ("ymd", "dmy", "mdy")
 _PER_SECOND: Final = {"s": 1.0, "ms": 1e3, "us": 1e6, "ns": 1e9}
-_EPOCHS: Final = ((1e17, 1e-9, "ns"), (1e14, 1e-6, "µs"), (1e11, 1e-3, "ms"), (1e9, 1.0, "s"))
-"""Smallest number since 1970 in each unit, its seconds, its name."""
+_EPOCHS: Final = (
+    (1e-9, 0.0, "ns since 1970"),
+    (1e-6, 0.0, "µs since 1970"),
+    (1e-3, 0.0, "ms since 1970"),
+    (1e-7, 11_644_473_600.0, "100 ns since 1601"),
+    (1e-7, 62_135_596_800.0, "100 ns since the year 1"),
+)
+"""Seconds of a tick, seconds from its origin to 1970, and its name."""
+_CAN_LOGS_S: Final = (662_688_000.0, 4_102_444_800.0)
+"""1991, the first car with CAN, and 2100 [s since 1970]; no two of the epochs overlap in them."""
+_LEAST_EPOCH: Final = 1e11
+"""Least number that is ticks since a date: milliseconds, of 1973."""
+_DIGITS: Final = (
+    r"^(?:19|20)?\d{2}(?:0[1-9]|1[0-2])(?:[0-2]\d|3[01])(?:[01]\d|2[0-3])(?:[0-5]\d){2}$"
+)
+"""`20240313235000` and `240313235000`."""
 
 
 def is_stamp(text: str) -> bool:
@@ -108,7 +127,10 @@ def seconds_of(
         cells = present(parts[0]) if is_text(parts[0]) else None
         if cells is None or is_number(first_text(cells) or "0"):
             values, _ = numbers_of(parts[0], source, label)
-            return _seconds_of_numbers(values * factor, "" if is_format else unit)
+            cells = _spelled_in_digits(values) if not unit or is_format else None
+            if cells is None:
+                values, unit = values * factor, "" if is_format else unit
+                return _seconds_of_numbers(values, unit, source, label)
     return seconds_of_text(cells, unit if is_format else "", source, label)
 
 
@@ -121,14 +143,43 @@ def _zone_of(name: str) -> ZoneInfo | None:
         return None
 
 
-def _seconds_of_numbers(values: FloatArray, unit: str) -> tuple[FloatArray, str]:
+def _spelled_in_digits(values: FloatArray) -> Any:
+    """Return numbers that spell dates as text, or None."""
+    known = np.isfinite(values) & (np.abs(values) < 1e15)
+    if not known.any() or np.any(values[known] < _LEAST_EPOCH / 10.0):
+        return None
+    digits = pa.array(np.where(known, values, 0.0).astype(np.int64), mask=~known).cast(pa.string())
+    are_dates = pc.all(pc.match_substring_regex(digits, _DIGITS)).as_py()
+    return digits if are_dates and np.all(values[known] % 1.0 == 0.0) else None
+
+
+def _seconds_of_numbers(
+    values: FloatArray, unit: str, source: str, label: str
+) -> tuple[FloatArray, str]:
     if unit:
         return values * (unit_of("time_s", unit) or (1.0, 0.0))[0], unit
     finite = values[np.isfinite(values)]
     typical = float(np.median(finite)) if finite.size else 0.0
-    for least, factor, name in _EPOCHS:
-        if typical >= least:
-            return values * factor, f"{name} since 1970, from its size"
+    first_s, last_s = _CAN_LOGS_S
+    if first_s <= typical <= last_s:
+        return values, "s since 1970, from its size"
+    for tick_s, origin_s, name in _EPOCHS:
+        if first_s <= typical * tick_s - origin_s <= last_s:
+            ticks = values - origin_s / tick_s  # before scaling: 100 ns of 2000 years need 63 bits
+            return ticks * tick_s, f"{name}, from its size"
+    if typical >= _LEAST_EPOCH:
+        cure = f"state it: --columns 'time={label}[?]', with s, ms, us, ns, min, h or d for ?"
+        problem = "the unit of time is not stated, and no epoch has a year of 1991 to 2099"
+        raise InputError(problem, source=source, field=label, value=typical, cure=cure)
+    hours, minutes, seconds = values // 10_000.0, values // 100.0 % 100.0, values % 100.0
+    spells = (hours >= 0.0) & (hours < 24.0) & (minutes < 60.0) & (seconds < 60.0)
+    clock_s = _over_midnight(hours * 3600.0 + minutes * 60.0 + seconds)
+    # A count of seconds has some of 60 to 99 of each hundred; a clock has none, and no gap there.
+    steps, clock_steps = np.diff(finite), np.diff(clock_s[np.isfinite(values)])
+    usual = float(np.median(steps)) if steps.size else np.inf
+    jumps = (np.abs(steps) > 40.0) & (clock_steps > 0.0) & (clock_steps <= 2.0 * usual)
+    if usual < 40.0 and jumps.any() and np.all(spells | np.isnan(values)):
+        return clock_s, "hhmmss, from its digits"
     return values, "s, assumed"
 
 
@@ -159,8 +210,14 @@ def seconds_of_text(cells: Any, unit: str, source: str, label: str) -> tuple[Flo
     if not is_clock(first):
         return _dates(parts, of_day_s, unit)
     values = np.nan_to_num(_numbers(parts, "d")) * 86400.0 + of_day_s
-    values[read] += np.cumsum(np.diff(values[read], prepend=0.0) < -43200.0) * 86400.0  # midnights
-    return values, "clock time"
+    return _over_midnight(values), "clock time"
+
+
+def _over_midnight(of_day_s: FloatArray) -> FloatArray:
+    """Return times of day [s] with the days that pass at each midnight, NaN where missing."""
+    values, read = of_day_s.copy(), np.isfinite(of_day_s)
+    values[read] += np.cumsum(np.diff(values[read], prepend=0.0) < -43200.0) * 86400.0
+    return values
 
 
 def _dates(parts: Any, of_day_s: FloatArray, unit: str) -> tuple[FloatArray, str]:

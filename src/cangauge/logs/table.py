@@ -8,6 +8,7 @@ only those that changed.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
@@ -30,16 +31,32 @@ from cangauge.logs.draft import MAX_INCOMPLETE, DraftLog
 from cangauge.logs.headings import GUESS, meaning_of
 from cangauge.logs.stamps import is_clock, is_stamp, seconds_of
 from cangauge.logs.text import TextTable
-from cangauge.logs.units import FIELDS, REQUIRED, convert, known_temperature_source, unit_of
-from cangauge.logs.values import first_text, is_number, numbers_of
+from cangauge.logs.units import (
+    CANONICAL_UNIT,
+    FIELDS,
+    REQUIRED,
+    convert,
+    known_temperature_source,
+    unit_of,
+)
+from cangauge.logs.values import (
+    first_text,
+    is_number,
+    numbers_of,
+    present,
+    with_decimal_points,
+)
 
 SOURCE: Final = "temperature_source"
 """Column or metadata of a canonical log: the location of the temperature sensor."""
 _CANONICAL: Final = (*FIELDS.values(), SOURCE)
-_CANONICAL_UNIT: Final = dict(zip(FIELDS, ("s", "A", "V", "°C", "%"), strict=True))
 _HOLD_S: Final = 1.0
 """Longest time that a voltage is held to the next row with a current [s], where rows hold only the
 channels that changed: a bus repeats both within it."""
+_STATES: Final = frozenset({"state", "status", "md", "mode", "direction", "dir", "type"})
+"""Words of a heading that may tell the direction of an unsigned current."""
+_CHARGES: Final = r"(?:^|[^a-z])(?:c|ch|cha[a-z]*|chg[a-z]*)(?:$|[^a-z])"
+_DISCHARGES: Final = r"(?:^|[^a-z])(?:d|dis[a-z]*|dch[a-z]*)(?:$|[^a-z])"
 _LEAF_SPY: Final = {"Gids", "AHr", "Pack Volts"}
 _LEAF_SPY_SOC: Final = 1e-4
 """LeafSpy writes SoC in ten-thousandths of a percent."""
@@ -112,15 +129,19 @@ def draft_of_table(
         if not choice.is_complete:
             raise unknown_columns(where, headings, choice)
         chosen = choice.chosen
-    words = [k for k, text in enumerate(headings) if is_defined and text.strip().lower() == SOURCE]
+    words = [k for k, text in enumerate(headings) if text.strip().lower() == SOURCE][:1]
     wanted = [place for column in chosen.values() for place in column.places]
     wanted += [place for place, _ in chosen["time"].others]
-    cells = table.columns([*dict.fromkeys([*wanted, *words])])
+    cells = with_decimal_points(table.columns([*dict.fromkeys([*wanted, *words])]))
     draft = DraftLog(name, source, headings=tuple(headings), remarks=[*table.remarks])
     time_s, unit_of_time, chosen["time"] = _time(cells, chosen["time"], headings, where)
     draft.values["time_s"] = time_s
+    draft.stated = {FIELDS[quantity] for quantity, column in chosen.items() if column.is_stated}
+    if unit_of_time == "s, assumed" and "time_s" not in draft.stated:
+        draft.in_seconds = None
     for quantity, column in chosen.items():
-        label = " + ".join(headings[place] for place in column.places)
+        joint = " − " if quantity == "current" else " + "
+        label = joint.join(headings[place] for place in column.places)
         draft.labels[FIELDS[quantity]] = label
         unit = unit_of_time if quantity == "time" else _take(draft, quantity, column, cells)
         if quantity == "temperature" and len(column.places) > 1:
@@ -130,15 +151,20 @@ def draft_of_table(
         draft.assumed.append(f'{quantity} = "{shown}"{factor} [{unit}]')
     used = {*words, *(place for column in chosen.values() for place in column.places)}
     draft.ignored = tuple(text for k, text in enumerate(headings) if text and k not in used)
+    word = _only_word(cells[words[0]], where) if words else ""
+    word = word or (getattr(table, "word", "") if is_defined else "")
+    if not word and "temperature" in chosen:
+        word = chosen["temperature"].source
+    draft.temperature_source = known_temperature_source(
+        word or "unknown", source=where, field=SOURCE
+    )
     if is_defined:
         draft.assumed = []
-        word = _only_word(cells[words[0]], where) if words else ""
-        word = word or getattr(table, "word", "") or "unknown"
-        draft.temperature_source = known_temperature_source(word, source=where, field=SOURCE)
     else:
-        draft.sign_unknown = chosen["current"].factor > 0.0
-        if "temperature" in chosen:
-            draft.temperature_source = chosen["temperature"].source
+        current = chosen["current"]
+        draft.sign_unknown = current.factor > 0.0 and len(current.places) == 1
+        if draft.sign_unknown and not np.any(draft.values["current_a"] < 0.0):
+            _sign_by_state(draft, table)
         _hold_changes(draft)
     return draft
 
@@ -157,7 +183,7 @@ def _canonical_columns(headings: Sequence[str], where: str) -> dict[str, ChosenC
                 " temperature_c [s, A, V, °C]",
             )
     return {
-        quantity: ChosenColumn((names.index(name),), _CANONICAL_UNIT[quantity])
+        quantity: ChosenColumn((names.index(name),), CANONICAL_UNIT[quantity])
         for quantity, name in FIELDS.items()
         if name in names
     }
@@ -195,7 +221,8 @@ def _take(draft: DraftLog, quantity: str, column: ChosenColumn, cells: dict[int,
     if quantity == "soc":
         soc = parts[0]
         finite = soc[np.isfinite(soc)]
-        if not unit and finite.size and finite.min() >= 0.0 and 0.0 < finite.max() <= 1.0:
+        is_fraction = np.any(finite % 1.0) and finite.min() >= 0.0 and finite.max() <= 1.0
+        if not unit and is_fraction:  # 1, then 0, may also be an empty pack's percents
             draft.values[name] = 100.0 * soc
             return "0–1, from its range"
         if _LEAF_SPY.issubset(draft.headings) and np.nanmedian(soc) > 110.0:
@@ -204,9 +231,55 @@ def _take(draft: DraftLog, quantity: str, column: ChosenColumn, cells: dict[int,
     converted = [convert(part, name, unit, source=where, label=label)[0] for part in parts]
     if quantity == "temperature":
         draft.take_probes(headings, converted)
+    elif len(converted) == 2:
+        both = [np.abs(part) for part in converted]
+        if any(np.any(part < 0.0) and np.any(part > 0.0) for part in converted):
+            cure = "name the one that holds both directions: --columns 'current=?'"
+            problem = "these are no currents of one direction each: one has both signs"
+            raise InputError(problem, source=where, field=label, cure=cure)
+        draft.values[name] = both[0] - both[1]
     else:
         draft.values[name] = converted[0]
-    return unit or f"{_CANONICAL_UNIT[quantity]}, assumed"
+    return unit or f"{CANONICAL_UNIT[quantity]}, assumed"
+
+
+def _sign_by_state(draft: DraftLog, table: TextTable | ArrowTable) -> None:
+    """Make an unsigned current negative where a column of words says that it charges.
+
+    Raises
+    ------
+    InputError
+        If the words do not tell the direction of each current.
+    """
+    current, headings = draft.values["current_a"], list(draft.headings)
+    places = [
+        place
+        for place, text in enumerate(headings)
+        if headings.count(text) == 1 and not _STATES.isdisjoint(re.findall("[a-z]+", text.lower()))
+    ]
+    for place, column in table.columns(places).items() if places else ():
+        cells = pc.fill_null(pc.utf8_lower(present(column)), "")
+        charges, discharges = (
+            np.asarray(pc.match_substring_regex(cells, words), dtype=bool) & (current > 0.0)
+            for words in (_CHARGES, _DISCHARGES)
+        )
+        is_direction = "direction" in headings[place].lower() and len(pc.unique(cells)) > 1
+        if not (charges.any() and discharges.any()) and not is_direction:
+            continue
+        unclear = (current > 0.0) & (charges == discharges)
+        if unclear.any():
+            row = int(np.argmax(unclear))
+            raise InputError(
+                f"row {row + 1} does not say whether the unsigned current charges or discharges",
+                source=draft.source or draft.name,
+                field=headings[place],
+                value=cells[row].as_py(),
+                cure="write it as charge or discharge, or give the current a sign",
+            )
+        draft.values["current_a"] = np.where(charges, -current, current)
+        draft.sign_unknown = False
+        draft.assumed.append(f'current charges where "{headings[place]}" says so')
+        return
 
 
 # --- Time
@@ -249,7 +322,8 @@ def _date_beside(cells: dict[int, Any], column: ChosenColumn) -> int | None:
 
 def _increases(time_s: FloatArray) -> bool:
     finite = time_s[np.isfinite(time_s)]
-    return finite.size > 1 and bool(np.all(np.diff(finite) >= 0.0)) and finite[-1] > finite[0]
+    steps = np.diff(finite)
+    return steps.size > 0 and bool(np.all(steps >= 0.0)) and float(np.median(steps)) > 0.0
 
 
 # --- Rows that hold only what changed

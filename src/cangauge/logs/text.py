@@ -12,6 +12,7 @@ from contextlib import suppress
 from typing import Any, Final, NamedTuple
 
 import pyarrow as pa
+import pyarrow.compute as pc
 import pyarrow.csv as pacsv
 
 from cangauge._files import Head, as_utf8
@@ -89,7 +90,13 @@ class TextTable(NamedTuple):
                 "the last line has no line end: if the file was cut off, its last value may be"
                 " short"
             )
-        return {place: table.column(f"c{place}") for place in places}
+        return {place: self._values(table.column(f"c{place}"), place) for place in places}
+
+    def _values(self, cells: Any, place: int) -> Any:
+        """Return cells, null where a restarted logger wrote its header again."""
+        heading = self.headings[place] if place < len(self.headings) else ""
+        is_heading = pc.equal(pc.utf8_trim_whitespace(cells), heading)
+        return pc.if_else(is_heading, None, cells) if pc.any(is_heading).as_py() else cells
 
     def _width(self) -> int:
         """Return the number of cells of the first row: headers can be shorter than rows."""

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+from collections.abc import Collection
 from typing import Any, Final, Literal, cast, get_args
 
 import numpy as np
@@ -20,21 +22,33 @@ FIELDS: Final[dict[str, str]] = {
     "soc": "soc_pct",
 }
 """Canonical column by the name that users write."""
+CANONICAL_UNIT: Final = dict(zip(FIELDS, ("s", "A", "V", "°C", "%"), strict=True))
 REQUIRED: Final = ("time_s", "current_a", "voltage_v", "temperature_c")
 """Columns of every log."""
 
 _SPELLINGS: Final[dict[str, dict[tuple[float, float], str]]] = {
     "time_s": {
         (1.0, 0.0): "s|sec|secs|second|seconds|sek|sekunden",
-        (1e-3, 0.0): "ms|msec|millis|milliseconds",
-        (1e-6, 0.0): "us|µs|μs|usec|microseconds",
+        (1e-3, 0.0): "ms|msec|millis|millisecond|milliseconds",
+        (1e-6, 0.0): "us|µs|μs|usec|microsecond|microseconds",
         (1e-9, 0.0): "ns|nanoseconds",
         (60.0, 0.0): "min|mins|minutes|minuten",
         (3600.0, 0.0): "h|hr|hrs|hours|stunden",
         (86400.0, 0.0): "d|days",
     },
-    "current_a": {(1.0, 0.0): "a|amp|amps|amper|ampere|adc", (1e-3, 0.0): "ma", (1e3, 0.0): "ka"},
-    "voltage_v": {(1.0, 0.0): "v|volt|volts|vdc", (1e-3, 0.0): "mv", (1e3, 0.0): "kv"},
+    "current_a": {
+        (1.0, 0.0): "a|amp|amps|amper|ampere|adc",
+        (1e-2, 0.0): "ca",
+        (1e-3, 0.0): "ma",
+        (1e-6, 0.0): "ua|µa|μa",
+        (1e3, 0.0): "ka",
+    },
+    "voltage_v": {
+        (1.0, 0.0): "v|volt|volts|vdc",
+        (1e-3, 0.0): "mv",
+        (1e-6, 0.0): "uv|µv|μv",
+        (1e3, 0.0): "kv",
+    },
     "temperature_c": {
         (1.0, 0.0): "c|°c|degc|deg c|deg. c|deg_c|celsius|grad c|grad celsius|℃|º c|ºc|â°c|\ufffdc",
         (1.0, -273.15): "k|kelvin",
@@ -51,6 +65,13 @@ _UNITS: Final = {
     field: {name: unit for unit, names in units.items() for name in names.split("|")}
     for field, units in _SPELLINGS.items()
 }
+_WORDS: Final = {
+    "mA": "milliamperes", "uA": "microamperes", "mV": "millivolts", "uV": "microvolts",
+    "ms": "milliseconds", "us": "microseconds", "us ms": "milliseconds or microseconds",
+    "d": "days (dates of a spreadsheet)", "h d": "hours or days", "": "another unit",
+}  # fmt: skip
+_SCALED: Final = re.compile(r"(?P<scale>0?[.,]\d+|1|10+(?=\s*[mµμu]))\s*(?P<unit>\D+)$")
+"""A unit of a bit: 0.1V, 10mV; 500A is the range of a sensor."""
 _FOREIGN: Final = (
     "w|kw|wh|kwh|ah|mah|as|nm|rpm|km/h|kmh|mph|hz|khz|pa|bar|mbar|ohm|mohm|ω|mω|v/s|a/s|k/s|wh/kg"
     "|ah/kg|mah/g|m|m/s|kg|l|deg"
@@ -64,10 +85,12 @@ _MAX_CURRENT_A: Final = 2000.0
 _MAX_INTERVAL_S: Final = 90.0
 """Usual time between rows of a log that counts charge [s]: cyclers log every 60 s at rest."""
 _MAX_RATE_HZ: Final = 2000.0
+_FASTEST_S: Final = 0.01
+"""Shortest cycle of a battery's message on a bus [s]: what fits a time without a unit."""
 _MAX_DAYS: Final = 366.0
 """First to last row [d]: setting the clock within a log can add decades."""
-_MAX_STAMP_S: Final = 1e11
-"""Largest time of a row [s]: the year 5138, counted from 1970; in ms since 1970, 1973."""
+_MAX_STAMP_S: Final = 5e11
+"""Largest time of a row [s]: a Julian date has 2e11; in ms since 1970, 1985."""
 COLDEST_C: Final = -60.0
 HOTTEST_C: Final = 120.0
 _UNUSUALLY_HOT_C: Final = 62.0
@@ -77,7 +100,7 @@ _RARE: Final = 1e-3
 """Fraction of impossible currents up to which they are codes, not another unit [-]."""
 
 _Check = tuple[Any, str, float, str, str, str]
-"""Whether a value is wrong; field, value, problem, cure, and the unit that the user may state."""
+"""Whether a value is wrong; field, value, problem, cure, and the units that the user may state."""
 
 
 def known_temperature_source(
@@ -102,8 +125,15 @@ def unit_of(field: str, unit: str) -> tuple[float, float] | None:
     --------
     >>> unit_of("current_a", "mA")
     (0.001, 0.0)
+    >>> unit_of("voltage_v", "0.1V")
+    (0.1, 0.0)
     """
-    return _UNITS[field].get(" ".join(unit.lower().removeprefix("unit_").split()))
+    name = " ".join(unit.lower().removeprefix("unit_").split())
+    scale = _SCALED.match(name)
+    if name in _UNITS[field] or scale is None or scale["unit"] not in _UNITS[field]:
+        return _UNITS[field].get(name)
+    factor, offset = _UNITS[field][scale["unit"]]
+    return factor * float(scale["scale"].replace(",", ".")), offset
 
 
 def convert(
@@ -132,12 +162,24 @@ def convert(
     return values * factor + offset, f"{label}: converted from {unit} to {field}"
 
 
+def _is_code(number: int) -> bool:
+    """Return whether all bits of a number are set (65535), or but the last or the highest."""
+    return number > 254 and any((number + k) & (number + k - 1) == 0 for k in (0, 1, 2))
+
+
+def _fitting(interval: float, units: str) -> str:
+    """Return those of the units in which rows are as far apart as a log's."""
+    seconds = {unit: interval * _UNITS["time_s"][unit][0] for unit in units.split()}
+    return " ".join(k for k, step_s in seconds.items() if _FASTEST_S <= step_s <= _MAX_INTERVAL_S)
+
+
 def refuse_wrong_units(
     values: dict[str, FloatArray],
     *,
     source: object,
     labels: dict[str, str],
-    in_seconds: bool = False,
+    in_seconds: bool | None = False,
+    stated: Collection[str] = (),
 ) -> tuple[str, ...]:
     """Raise InputError if the values cannot be in the canonical units; return remarks.
 
@@ -149,9 +191,11 @@ def refuse_wrong_units(
         Arrays of shape (n,) and headings by canonical column; only `soc_pct` may hold NaN.
     source : object
         File, for messages.
-    in_seconds : bool
+    in_seconds : bool, optional
         Whether the format fixes the unit of time, as a capture's does: rows may then be as close
-        as an accelerated replay makes them.
+        as an accelerated replay makes them. None: nothing states it.
+    stated : collection of str
+        Columns whose unit the user states.
     """
 
     def odd_row(field: str, wrong: BoolArray, kind: str) -> _Check:
@@ -164,17 +208,27 @@ def refuse_wrong_units(
     step = np.diff(time) if time.size > 1 else np.ones(1)
     interval, days, last = float(np.median(step)), step.sum() / 86400.0, int(np.argmax(step)) + 1
     too_close = not in_seconds and 0.0 < interval < 1.0 / _MAX_RATE_HZ
-    in_days = time[0] > _EXCEL_1990
-    looks = "days (dates of a spreadsheet)" if in_days else "hours or days"
+    finer, coarser = _fitting(interval, "ns us ms"), _fitting(interval, "min h d")
+    coarser = "d" if time[0] > _EXCEL_1990 else coarser
     apart = f"rows are {interval:g} apart: time looks like"
+    # Seconds have steps below 10, or decimal ones: 0.016667 are 60 Hz, or 1 s in minutes.
+    is_whole = np.all(time % 1.0 == 0.0) and np.min(step) >= 10.0
+    mean = float(step.mean())
+    parts = [1000.0 * mean, *(mean * _UNITS["time_s"][unit][0] for unit in coarser.split())]
+    are_whole = [abs(part - round(part)) < 1e-3 for part in parts]
+    is_coarse = any(are_whole) and not are_whole[0] and np.ptp(step) < 0.2 * mean
+    in_doubt = in_seconds is None and ((is_whole and finer) or is_coarse)
     middle, middle_c = float(np.median(voltage)), float(np.median(temperature))
     is_low = COLDEST_C <= middle <= _UNUSUALLY_HOT_C
     # Before the voltage: a temperature in its place looks like kilovolts. A constant is a code.
     hottest_k = max(HOTTEST_C, 273.15 + _UNUSUALLY_HOT_C)
     swapped = is_low and hottest_k < middle_c <= _MAX_VOLTAGE_V and np.ptp(temperature) > 0.0
+    milli_v = "mV" if middle <= 1e3 * _MAX_VOLTAGE_V else "uV"
     large = np.abs(current) > _MAX_CURRENT_A
     peak = int(np.argmax(np.abs(current)))
-    are_codes = np.mean(large) < _RARE and current.size > 1000
+    milli_a = "mA" if abs(current[peak]) <= 1e3 * _MAX_CURRENT_A else "uA"
+    digits = [int(f"{amps:f}".replace(".", "").strip("0")) for amps in set(abs(current[large]))]
+    are_codes = (np.mean(large) < _RARE and current.size > 1000) or all(map(_is_code, digits))
     soc = values.get("soc_pct", np.empty(0))
     soc = soc[np.isfinite(soc)] if np.isfinite(soc).any() else np.full(1, 50.0)
     most, least = float(np.max(soc)), float(np.min(soc))
@@ -186,42 +240,53 @@ def refuse_wrong_units(
         (time[0] > _MAX_STAMP_S, t, time[0], "time looks like milliseconds since 1970", by_1000,
          "ms"),
         odd_row(t, np.abs(time) > _MAX_STAMP_S, "a time in seconds"),
+        (interval > _MAX_INTERVAL_S, t, interval, f"{apart} {_WORDS.get(finer, finer)}",
+         f"{by_1000 if finer == 'ms' else 'convert it to seconds'} (a log with a row every 90 s or"
+         " more cannot be used)", finer),
+        (too_close, t, interval, f"{apart} {_WORDS.get(coarser, coarser)}",
+         "convert it to seconds", coarser),
+        (in_doubt, t, interval, f"rows are {interval:g} apart, in seconds or another unit",
+         "name the unit in the heading", f"s {finer if is_whole else coarser}"),
         (days > _MAX_DAYS, t, time[min(last, time.size - 1)],
          f"the log lasts {days:.0f} days; its longest step ends at row {last + 1}",
          "if the clock was set there, split the log there", ""),
-        (interval > _MAX_INTERVAL_S, t, interval, f"{apart} milliseconds",
-         f"{by_1000} (a log with a row every 90 s or more cannot be used)", "ms"),
-        (too_close, t, interval, f"{apart} {looks}", "convert it to seconds",
-         "d" if in_days else "h"),
         (swapped, c, middle_c,
          f"it looks like a pack's voltage, and {labels.get(u, u)} like a temperature",
          "the two columns (or signals) look swapped: exchange them", ""),
-        (middle > _MAX_VOLTAGE_V, u, middle, "voltage looks like millivolts", by_1000, "mV"),
+        (middle > _MAX_VOLTAGE_V, u, middle, f"voltage looks like {_WORDS[milli_v]}",
+         by_1000 if milli_v == "mV" else "convert it to volts", milli_v),
         (middle <= 0.0, u, middle, "the median voltage is not positive",
          "check column and polarity", ""),
         (middle < 1.0, u, middle, "voltage looks like kilovolts", "convert it to volts", "kV"),
         odd_row(u, np.abs(voltage) > _MAX_VOLTAGE_V, "a battery's voltage"),
         odd_row(i, large & are_codes, "a battery's current"),
         (large.any(), i, current[peak],
-         f"current exceeds {_MAX_CURRENT_A:g} A in row {peak + 1}: it looks like milliamperes",
-         by_1000, "mA"),
-        (least >= 0.0 and 0.0 < most <= 1.0, "soc_pct", most,
+         f"current exceeds {_MAX_CURRENT_A:g} A in row {peak + 1}: it looks like {_WORDS[milli_a]}",
+         by_1000 if milli_a == "mA" else "convert it to amperes", milli_a),
+        (least >= 0.0 and 0.0 < most <= 1.0 and "soc_pct" not in stated, "soc_pct", most,
          "SoC looks like a fraction of 1",
-         "multiply it by 100 (or leave it out if it stays below 1 %)", "-"),
+         "multiply it by 100 (or leave it out if it stays below 1 %)", "- %"),
         (not -10.0 <= odd_soc <= 110.0, "soc_pct", odd_soc,
          f"SoC of row {soc_row + 1} is not within 0–100 %", "convert it to %", ""),
         (200.0 <= middle_c <= 400.0, c, middle_c, "temperature looks like kelvin",
          "subtract 273.15"
-         + (", or exchange it with the voltage if the two are swapped" if is_low else ""), "K"),
+         + (", or exchange it with the voltage if the two are swapped" if is_low else ""),
+         "K" if np.any(temperature % 1.0) else "K 0.1°C"),
         (not COLDEST_C <= middle_c <= HOTTEST_C, c, middle_c,
          "this is not a battery's temperature in °C", "convert it to °C", ""),
         odd_row(c, ~celsius, "a battery's temperature in °C"),
     )  # fmt: skip
     for wrong, field, value, problem, cure, unit in checks:
         if wrong:
-            label = labels.get(field, field)
-            option = f"--columns '{field.rpartition('_')[0]}={label}[{unit}]'"
-            also = f" (or state the unit: {option})" if unit and label.lower() != field else ""
+            label, units = labels.get(field, field), unit.split()
+            is_tick = field == t and "tick" in label.lower()
+            shown = unit if len(units) == 1 and not is_tick else "?"
+            option = f"--columns '{field.rpartition('_')[0]}={label}[{shown}]'"
+            if shown == "?":
+                option += f", with {' or '.join(units)} for ?"
+                option += " and a factor, such as [ms]:10 for ticks of 10 ms" if is_tick else ""
+            is_open = bool(units) and label.lower() != field and field not in stated
+            also = f" (or state the unit: {option})" if is_open else ""
             raise InputError(
                 problem, source=str(source), field=label, value=float(value), cure=cure + also
             )

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+from collections.abc import Mapping
 from typing import Any, Final
 
 import numpy as np
@@ -15,8 +17,12 @@ _WORDS: Final = "nan na n/a #n/a null none - -- 1.#qnan -1.#ind unknown unavaila
 MISSING: Final = ("", *_WORDS.split())
 """Cells without a value, in lower case."""
 _WITH_UNIT: Final = r"^(?P<number>[-+]?[\d.]+(?:[eE][-+]?\d+)?)\s*(?P<unit>\D{1,4})$"
-_POINT_BEFORE_COMMA: Final = r"^[^,]*,[^,.]*$"
-"""Of a cell with both marks: 1.234,5."""
+_NUMBER: Final = r"^[-+]?[\d.,]*\d[\d.,]*(?:[eE][-+]?\d+)?\s*\D{0,4}$"
+_SPELLINGS: Final = (("[\u2212\u2013]", "-"), ("['\u2019\u00a0\u202f](\\d{3})", r"\1"))
+"""A typographic minus; 1'800."""
+_THOUSANDS: Final = r"^[-+]?[1-9]\d{{0,2}}(?:[{}]\d{{3}})+\D{{0,5}}$"
+_MARKS: Final = {",": ".", ".": ","}
+"""What separates decimals, and what then may separate thousands."""
 
 
 def is_number(text: str) -> bool:
@@ -69,7 +75,7 @@ def numbers_of(column: Any, source: str, label: str) -> tuple[FloatArray, str]:
         try:
             numbers = pc.cast(column, pa.float64(), safe=False)
         except pa.ArrowInvalid:
-            bare, unit = _without_unit(_with_decimal_point(present(column)))
+            bare, unit = _without_unit(present(with_decimal_points({0: column})[0]))
             numbers = pc.cast(bare, pa.float64())
     except pa.ArrowInvalid as problem:
         texts = enumerate(present(column).to_pylist(), start=1)
@@ -80,14 +86,43 @@ def numbers_of(column: Any, source: str, label: str) -> tuple[FloatArray, str]:
     return np.array(numbers.to_numpy(), dtype=np.float64), unit
 
 
-def _with_decimal_point(cells: Any) -> Any:
-    """Return cells with `.` as the decimal mark; the other mark separates thousands."""
-    both = pc.and_(pc.match_substring(cells, ","), pc.match_substring(cells, "."))
-    if pc.any(both).as_py():
-        with_both = pc.filter(cells, both)
-        is_comma = pc.any(pc.match_substring_regex(with_both, _POINT_BEFORE_COMMA)).as_py()
-        cells = pc.replace_substring(cells, "." if is_comma else ",", "")
-    return pc.replace_substring(cells, ",", ".")
+def with_decimal_points(columns: Mapping[int, Any]) -> dict[int, Any]:
+    """Return the columns of one table with `-` as minus and `.` as the only mark in numbers.
+
+    A mark separates thousands in a column where each of its uses fits that (`1,800`), if the other
+    mark is decimal: it follows in the same cell, or the table's numbers use it and not this one.
+    """
+    texts: dict[int, Any] = {}
+    for place, column in columns.items():
+        if is_text(column):
+            cells = column.cast(pa.string())
+            for pattern, replacement in _SPELLINGS:
+                cells = pc.replace_substring_regex(cells, pattern, replacement)
+            if re.match(_NUMBER, first_text(present(cells))):
+                texts[place] = cells
+    if not any(_any(cells, ",") for cells in texts.values()):
+        return {**columns, **texts}
+    one_mark = r"^[^.,]*[{}][^.,]*$"
+    used = {mark for mark in _MARKS for cells in texts.values() if _odd(cells, one_mark, mark)}
+    for place, cells in texts.items():
+        for mark, other in _MARKS.items():
+            follows = _any(cells, rf"[{other}][^{other}]*[{mark}][^{mark}{other}]*$")
+            if follows or (used == {mark} and not _odd(cells, "[{}]", other)):
+                texts[place] = pc.replace_substring(cells, other, "")
+                break
+        texts[place] = pc.replace_substring(texts[place], ",", ".")
+    return {**columns, **texts}
+
+
+def _any(cells: Any, pattern: str) -> bool:
+    return bool(pc.any(pc.match_substring_regex(cells, pattern)).as_py())
+
+
+def _odd(cells: Any, pattern: str, mark: str) -> bool:
+    """Return whether a mark stands as in a pattern where it cannot separate thousands."""
+    has_mark = pc.match_substring_regex(cells, pattern.format(mark))
+    fits = pc.match_substring_regex(cells, _THOUSANDS.format(mark))
+    return bool(pc.any(pc.and_not(has_mark, fits)).as_py())
 
 
 def _without_unit(cells: Any) -> tuple[Any, str]:
