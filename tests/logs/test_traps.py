@@ -170,6 +170,31 @@ def test_numbers_without_a_unit_are_seconds_if_only_they_fit(
     read(tmp_path, "Time,Current,Voltage,Temp", rows, "time=Time[s]")
 
 
+@pytest.mark.parametrize(("step_s", "per_row"), [(20.0, 20), (0.02, 20), (1.0, 1)])
+def test_a_soc_tells_seconds_from_milliseconds(tmp_path: Path, step_s: float, per_row: int) -> None:
+    """Of a pack of 60 Ah at 60 A, by rows of 20 s or of 20 ms."""
+    rows = [
+        f"{per_row * k},{60 + k % 7},360,20,{90 - 100 * step_s * k / 3600:.3f}" for k in range(60)
+    ]
+    if step_s == per_row:
+        log = read(tmp_path, "Time,Current,Voltage,Temp,SoC", rows)
+        assert log.time_s[1] - log.time_s[0] == step_s
+    else:
+        with pytest.raises(InputError, match="in seconds or another unit"):
+            read(tmp_path, "Time,Current,Voltage,Temp,SoC", rows)
+
+
+def test_stamps_of_whole_seconds_at_2_hz_are_read_and_of_whole_minutes_refused(
+    tmp_path: Path,
+) -> None:
+    head = "Time [s],Current,Voltage,Temp"
+    log = read(tmp_path, head, [f"{k // 2},{k % 7},360,20" for k in range(ROWS)])
+    assert len(log) == ROWS / 2
+    assert any("300 rows with the time stamp of the row before" in text for text in log.remarks)
+    with pytest.raises(InputError, match="export fractions of a second"):
+        read(tmp_path, head, [f"{k // 60 * 60},{k % 7},360,20" for k in range(ROWS)])
+
+
 @pytest.mark.parametrize(
     ("head", "row"),
     [

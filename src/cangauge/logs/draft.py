@@ -23,6 +23,8 @@ Sign = Literal["charge", "discharge"]
 MAX_INCOMPLETE: Final = 0.05
 """Largest fraction of incomplete rows that are dropped [-]: beyond it the export is damaged, or its
 rows hold only what changed."""
+_COARSE_S: Final = 2.0
+"""Interval above which the current between rows is a gap [s]."""
 _PROBES_APART_K: Final = 20.0
 """Difference of a pack's temperature probes from which one of them fails [K]: packs are cooled so
 that their cells differ by less than 5 K (Pesaran, J. Power Sources 110, 2002)."""
@@ -202,7 +204,8 @@ class DraftLog:
         row = int(np.argmax(repeats))
         differs = np.any([np.diff(v, prepend=v[0]) != 0.0 for v in self.values.values()], axis=0)
         count = int(np.sum(repeats & differs))
-        if count > MAX_INCOMPLETE * time.size:
+        apart_s = float(np.median(np.diff(time[~repeats]))) if count else 0.0
+        if count > MAX_INCOMPLETE * time.size and apart_s > _COARSE_S:  # stamps of whole minutes
             problem = f"{count} of {time.size} rows have the time stamp of the row before"
             cure = f"export fractions of a second, or one row per time: the first is row {row + 1}"
             raise self._error("time_s", problem, cure)

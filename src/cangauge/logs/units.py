@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Collection
 from typing import Any, Final, Literal, cast, get_args
@@ -87,6 +88,8 @@ _MAX_INTERVAL_S: Final = 90.0
 _MAX_RATE_HZ: Final = 2000.0
 _FASTEST_S: Final = 0.01
 """Shortest cycle of a battery's message on a bus [s]: what fits a time without a unit."""
+_FASTEST_C: Final = 60.0
+"""Highest RMS current by capacity [1/h]: no battery is emptied in a minute."""
 _MAX_DAYS: Final = 366.0
 """First to last row [d]: setting the clock within a log can add decades."""
 _MAX_STAMP_S: Final = 5e11
@@ -173,6 +176,39 @@ def _fitting(interval: float, units: str) -> str:
     return " ".join(k for k, step_s in seconds.items() if _FASTEST_S <= step_s <= _MAX_INTERVAL_S)
 
 
+def _c_rate(values: dict[str, FloatArray]) -> float:
+    """Return RMS current by the capacity that the log's SoC implies, time being in seconds [1/h].
+
+    NaN without a SoC that moves.
+    """
+    if "soc_pct" not in values:
+        return math.nan
+    known = np.isfinite(values["soc_pct"])
+    time, current, soc = (values[name][known] for name in ("time_s", "current_a", "soc_pct"))
+    if not soc.size or np.ptp(soc) == 0.0:
+        return math.nan
+    between = slice(*sorted((int(np.argmin(soc)), int(np.argmax(soc)))))
+    charge_ah = abs(np.sum(current[between] * np.diff(time, append=time[-1])[between])) / 3600.0
+    rms_a = math.sqrt(np.mean(current**2))
+    return rms_a * np.ptp(soc) / 100.0 / charge_ah if charge_ah else math.nan
+
+
+def _other_units(values: dict[str, FloatArray], finer: str, coarser: str) -> str:
+    """Return those of the units that time may be in as well as in seconds."""
+    time = values["time_s"]
+    step = np.diff(time) if time.size > 1 else np.ones(1)
+    # Seconds have steps below 10, or decimal ones: 0.016667 are 60 Hz, or 1 s in minutes.
+    if finer and np.all(time % 1.0 == 0.0) and np.min(step) >= 10.0:
+        # A SoC settles it: the charge in a finer unit would be too little for it.
+        scale = _UNITS["time_s"][finer.rsplit(maxsplit=1)[-1]][0]
+        return "" if _c_rate(values) / scale > _FASTEST_C else finer
+    mean = float(step.mean())
+    parts = [1000.0 * mean, *(mean * _UNITS["time_s"][unit][0] for unit in coarser.split())]
+    are_whole = [abs(part - round(part)) < 1e-3 for part in parts]
+    is_coarse = any(are_whole) and not are_whole[0] and np.ptp(step) < 0.2 * mean
+    return coarser if is_coarse else ""
+
+
 def refuse_wrong_units(
     values: dict[str, FloatArray],
     *,
@@ -211,13 +247,7 @@ def refuse_wrong_units(
     finer, coarser = _fitting(interval, "ns us ms"), _fitting(interval, "min h d")
     coarser = "d" if time[0] > _EXCEL_1990 else coarser
     apart = f"rows are {interval:g} apart: time looks like"
-    # Seconds have steps below 10, or decimal ones: 0.016667 are 60 Hz, or 1 s in minutes.
-    is_whole = np.all(time % 1.0 == 0.0) and np.min(step) >= 10.0
-    mean = float(step.mean())
-    parts = [1000.0 * mean, *(mean * _UNITS["time_s"][unit][0] for unit in coarser.split())]
-    are_whole = [abs(part - round(part)) < 1e-3 for part in parts]
-    is_coarse = any(are_whole) and not are_whole[0] and np.ptp(step) < 0.2 * mean
-    in_doubt = in_seconds is None and ((is_whole and finer) or is_coarse)
+    others = _other_units(values, finer, coarser) if in_seconds is None else ""
     middle, middle_c = float(np.median(voltage)), float(np.median(temperature))
     is_low = COLDEST_C <= middle <= _UNUSUALLY_HOT_C
     # Before the voltage: a temperature in its place looks like kilovolts. A constant is a code.
@@ -245,8 +275,8 @@ def refuse_wrong_units(
          " more cannot be used)", finer),
         (too_close, t, interval, f"{apart} {_WORDS.get(coarser, coarser)}",
          "convert it to seconds", coarser),
-        (in_doubt, t, interval, f"rows are {interval:g} apart, in seconds or another unit",
-         "name the unit in the heading", f"s {finer if is_whole else coarser}"),
+        (others, t, interval, f"rows are {interval:g} apart, in seconds or another unit",
+         "name the unit in the heading", f"s {others}"),
         (days > _MAX_DAYS, t, time[min(last, time.size - 1)],
          f"the log lasts {days:.0f} days; its longest step ends at row {last + 1}",
          "if the clock was set there, split the log there", ""),
