@@ -190,6 +190,13 @@ def test_a_frame_that_a_bus_cannot_carry_costs_nothing_else(
     assert "20 frames could not be handed on" in unsent
 
 
+def test_frames_for_a_bus_that_is_away_are_counted(pylon: Gateway) -> None:
+    away = ReconnectingBus(BusAddress("virtual", "away"), [])
+    with LoggedLines("cangauge.extras.inverter") as log:
+        pylon._hand_on(can.Message(arbitration_id=0x7FF, is_fd=True, data=bytes(12)), away)
+    assert (away.unsent, log.lines) == (1, [])
+
+
 def test_what_the_service_sends_is_not_for_the_inverter(tmp_path: Path) -> None:
     publish = {"profile": "pylontech", "interface": "virtual", "channel": f"{tmp_path} i"}
     options = {"interface": "virtual", "channel": f"{tmp_path} b", "vehicle": "leaf_ze1_polled"}
