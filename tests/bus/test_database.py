@@ -254,6 +254,14 @@ def test_counter_and_crc_are_where_the_rule_has_them() -> None:
         assert (found["counter"], found["crc"]) == (11, data[-1])
 
 
+@pytest.mark.parametrize("suffix", ["arxml", "kcd", "SYM"])
+def test_other_databases_are_refused_with_their_conversion(tmp_path: Path, suffix: str) -> None:
+    path = tmp_path / f"car.{suffix}"
+    path.write_text('<?xml version="1.0"?>\n<NetworkDefinition/>\n')
+    with pytest.raises(InputError, match=r"python -m cantools convert .*car\.\w+ car\.dbc"):
+        load_dbc(path)
+
+
 @pytest.mark.parametrize("line", ["SG_MUL_VAL_ 256 B X 1-1;", "SG_MUL_VAL_ 256 B A 1-1;"])
 def test_a_multiplexer_that_is_missing_or_its_own_is_refused(tmp_path: Path, line: str) -> None:
     path = tmp_path / "x.dbc"

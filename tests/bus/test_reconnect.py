@@ -164,6 +164,17 @@ def test_a_missing_driver_is_not_waited_for() -> None:
         open_bus(BusAddress("pcan", "PCAN_USBBUS1"))
 
 
+def test_a_bus_that_opens_after_the_end_is_shut_down(log: BusLog) -> None:
+    def slow() -> BrokenBus:
+        port.close()  # as another thread, while the driver opens
+        return late
+
+    late = BrokenBus([FRAME])
+    port = port_on(Opener(BrokenBus([network_down()]), slow))
+    pump(port, 2.0, until=lambda: late.closed == 1)
+    assert (late.closed, port.is_away, log.events) == (1, False, ["bus.lost"])
+
+
 def test_bus_off_and_its_end_are_logged(log: BusLog) -> None:
     def error_frame(classes: int) -> can.Message:
         return can.Message(

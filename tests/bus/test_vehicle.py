@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -132,6 +133,25 @@ def test_the_map_file_may_name_dbc_files(own: Path) -> None:
 
 
 KELVIN = bytes([0]) + (2931).to_bytes(2, "little") + bytes(5)
+
+
+def test_a_map_may_begin_with_a_preset(own: Path) -> None:
+    preset = Vehicle.load("leaf_aze0")
+    (own / "car.toml").write_text('like = "Leaf-AZE0"\n[current]\ntimeout_s = 1.0\n')
+    vehicle = Vehicle.load(map=own / "car.toml")
+    checks = preset.current.checks.model_copy(update={"timeout_s": 1.0})
+    assert vehicle == replace(preset, current=replace(preset.current, checks=checks))
+    (own / "car.toml").write_text(
+        'like = "leaf_aze0"\nname = "mine"\nsoc = {signal = "PackCurrent", scale = 1}\n'
+        'voltage = {signal = "voltage_v", highest = 9}\ntemperature = {fixed_c = 21.0}\n'
+        '[messages.0x1DB]\nprotection = "crc_only"\n'
+    )
+    with pytest.raises(InputError, match=r"soc_reference\.signal.*no such signal"):
+        Vehicle.load(map=own / "car.toml")
+    vehicle = Vehicle.load(dbc=own / "car.dbc", map=own / "car.toml")
+    assert vehicle.soc_reference is not None
+    assert (vehicle.name, vehicle.soc_reference.codec.name) == ("mine", "PackCurrent")
+    assert (vehicle.fixed_temperature_c, vehicle.voltage.checks.highest) == (21.0, 9.0)
 
 
 def test_units_of_the_dbc_are_converted_before_the_sign(own: Path) -> None:

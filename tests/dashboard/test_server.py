@@ -103,6 +103,16 @@ def test_nothing_else_is_served(page: Live, path: str) -> None:
     assert get(page, path)[0] == 404
 
 
+def test_what_a_browser_asks_by_itself_is_no_refusal(guarded: Live) -> None:
+    with LoggedLines("cangauge.extras.live") as log:
+        code, _, body = get(guarded, "/favicon.ico")
+        assert (code, body) == (404, b"there is nothing here: the live page is at /\n")
+        assert get(guarded, "/rows")[0] == 401
+        assert waits(lambda: bool(log.lines))
+    (line,) = log.lines
+    assert "missing or wrong token" in line
+
+
 def test_the_page_allows_no_content_from_elsewhere(page: Live) -> None:
     code, headers, body = get(page, "/")
     assert code == 200

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gzip
 import struct
+import tracemalloc
 from collections.abc import Callable, Iterable, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
@@ -554,6 +555,21 @@ def test_a_cut_pcap_names_the_byte(tmp_path: Path) -> None:
     path.write_bytes(path.read_bytes()[:30])
     with pytest.raises(InputError, match=r"cut\.pcap: the PCAP file is damaged .*at byte 30"):
         list(open_capture(path))
+
+
+def test_a_blf_object_takes_no_more_memory_than_the_file(tmp_path: Path) -> None:
+    path = tmp_path / "x.blf"
+    with can.BLFWriter(path) as writer:
+        writer.on_message_received(can.Message(timestamp=1e9, arbitration_id=0x123, data=bytes(8)))
+    data = bytearray(path.read_bytes())
+    struct.pack_into("<I", data, 144 + 8, 0xD0DC00C2)
+    path.write_bytes(data)
+    tracemalloc.start()
+    try:
+        assert len(list(open_capture(path))) == 1
+        assert tracemalloc.get_traced_memory()[1] < 64 << 20
+    finally:
+        tracemalloc.stop()
 
 
 def test_a_blf_with_an_object_of_no_size_is_damaged(tmp_path: Path) -> None:

@@ -22,7 +22,7 @@ from cangauge.extras.inverter.gateway import DOUBT_S, Gateway, make_output, soc_
 from cangauge.service.run import Service
 from cangauge.service.status_client import Snapshot
 from cangauge.types import Estimate, Reason, Sample, Status
-from live import leaf_model_path, waits
+from live import LoggedLines, leaf_model_path, waits
 from running import RunningService
 
 SAMPLE = Sample(0.0, 1.0, 50.0, 20.0)
@@ -175,6 +175,7 @@ def test_a_frame_that_a_bus_cannot_carry_costs_nothing_else(
     as_before = virtual.send
     monkeypatch.setattr(virtual, "send", send)
     with (
+        LoggedLines("cangauge.extras.inverter") as log,
         can.Bus(interface="virtual", channel=f"{name} b") as battery,
         can.Bus(interface="virtual", channel=f"{name} i") as inverter,
     ):
@@ -183,6 +184,17 @@ def test_a_frame_that_a_bus_cannot_carry_costs_nothing_else(
             battery.send(frame(0x351, bytes([number])))
         seen = [inverter.recv(2.0) for _ in range(20)]
         assert [m.data[0] for m in seen if m] == list(range(20))
+        pylon.close()
+    dropped, unsent = log.lines
+    assert "not open for CAN FD: frames such as 0x7FF are dropped" in dropped
+    assert "20 frames could not be handed on" in unsent
+
+
+def test_frames_for_a_bus_that_is_away_are_counted(pylon: Gateway) -> None:
+    away = ReconnectingBus(BusAddress("virtual", "away"), [])
+    with LoggedLines("cangauge.extras.inverter") as log:
+        pylon._hand_on(can.Message(arbitration_id=0x7FF, is_fd=True, data=bytes(12)), away)
+    assert (away.unsent, log.lines) == (1, [])
 
 
 def test_what_the_service_sends_is_not_for_the_inverter(tmp_path: Path) -> None:
@@ -208,7 +220,7 @@ def test_what_the_service_sends_is_not_for_the_inverter(tmp_path: Path) -> None:
         (("virtual", "one"), ("virtual", "one"), {}, "battery's bus"),
         (("virtual", "one"), ("udp_multicast", "239.74.163.9"), {}, "go round for ever"),
         (("udp_multicast", "239.74.163.9"), ("virtual", "one"), {}, "go round for ever"),
-        (("virtual", "b"), ("virtual", "i"), {"time_source": "replay-clock"}, "of a replay"),
+        (("virtual", "b"), ("virtual", "i"), {"time_source": "replay-clock"}, "SoC of a replay"),
         (
             ("virtual", "b"), ("virtual", "i"),
             {"bus_options": {"receive_own_messages": True}}, "go round for ever",
@@ -221,8 +233,31 @@ def test_buses_that_cannot_be_joined_are_refused(
     names = ("interface", "channel")
     publish = {"profile": "pylontech", **dict(zip(names, inverter, strict=True))}
     bus = dict(zip(names, battery, strict=True))
-    with pytest.raises(InputError, match=rf"publish\.channel.*{problem}"):
+    with pytest.raises(InputError, match=problem) as caught:
         Service(model=str(leaf_model_path()), **bus, **options, publish=publish)
+    assert caught.value.field == ("time_source" if "time_source" in options else "publish.channel")
+
+
+def test_a_gateway_that_fails_says_so(request: pytest.FixtureRequest) -> None:
+    class Broken(ReconnectingBus):
+        def post(self, *_: object) -> None:
+            raise ValueError("no such controller")
+
+    name = request.node.name
+    battery, inverter = (
+        kind(BusAddress("virtual", f"{name} {side}"), [])
+        for kind, side in ((ReconnectingBus, "b"), (Broken, "i"))
+    )
+    battery.open()
+    inverter.open()
+    with (
+        LoggedLines("cangauge.extras.inverter") as log,
+        closing(Gateway(battery, inverter, soc_fields("pylontech"))) as found,
+        can.Bus(interface="virtual", channel=f"{name} b") as bus,
+    ):
+        bus.send(frame(0x351, V12[0x351]))
+        assert waits(lambda: "no such controller" in found.trouble)
+        assert log.lines == [f"warning: {found.trouble}"]
 
 
 @pytest.mark.nightly  # VALID once the delay line is full: 70 s

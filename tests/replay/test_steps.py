@@ -8,6 +8,7 @@ from pathlib import Path
 import can
 import pytest
 
+from cangauge.bus.decoder import SampleDecoder
 from cangauge.bus.publish import SocPublisher
 from cangauge.bus.recording import capture_samples
 from cangauge.bus.time_source import ClockFrames
@@ -110,6 +111,44 @@ def test_samples_of_a_real_capture_are_counted_as_the_receiver_does(
     # The clock goes ahead of them: also of a reply over ISO-TP.
     wanted = {each.frames[0].arbitration_id for each in steps if each.is_wanted}
     assert wanted == set(vehicle.wanted_ids)
+
+
+def test_each_frame_of_a_reply_gets_the_clock(tmp_path: Path) -> None:
+    reply = ("100F610402011401", "21FF14020C13020E", "2213130000000000")
+    frames = [
+        frame(1.5 * ask + 0.01 * number, 0x7BB, bytes.fromhex(data))
+        for ask in range(40)
+        for number, data in enumerate(reply)
+    ]
+    path, vehicle = (
+        write(tmp_path / "a.log", [*frames, frame(60.0)]),
+        Vehicle.load("leaf_ze1_polled"),
+    )
+    live, clock_s = SampleDecoder(vehicle), 0.0
+    for step in CaptureSource(path, vehicle).steps(loop=False):
+        clock_s = 1e-6 * step.time_us if step.is_wanted else clock_s
+        step.frames[0].timestamp = clock_s
+        live.handle(step.frames[0])
+        assert step.is_wanted is (step.frames[0].arbitration_id != 0x123)
+    assert sum(each.wanted for each in live.statistics.messages.values()) == 40
+    assert live.health["temperature"].latest == 20.0
+
+
+def test_a_pgn_is_wanted_from_any_address(tmp_path: Path) -> None:
+    dbc = f'VERSION ""\nBO_ {0x98FF0B7E} HVESSD1: 8 X\n'
+    dbc += ' SG_ U : 0|16@1+ (0.05,0) [0|0] "V" X\n SG_ I : 16|16@1- (0.05,0) [0|0] "A" X\n'
+    (tmp_path / "car.dbc").write_text(dbc)
+    (tmp_path / "car.toml").write_text(
+        'dbc = "car.dbc"\ncurrent = "I"\nvoltage = "U"\ntemperature = {fixed_c = 20}\n'
+        "[messages.HVESSD1]\nj1939 = true\n"
+    )
+    ids = (0x18FF0B7E, 0x18FF0B11, 0x18FF0C7E)
+    path = write(
+        tmp_path / "a.log",
+        [can.Message(timestamp=1.0, arbitration_id=each, data=bytes(8)) for each in ids],
+    )
+    steps = CaptureSource(path, Vehicle.load(map=tmp_path / "car.toml")).steps(loop=False)
+    assert [step.is_wanted for step in steps] == [True, True, False]
 
 
 def test_a_captures_repetition_follows_10_ms_later(tmp_path: Path) -> None:

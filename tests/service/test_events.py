@@ -99,6 +99,14 @@ def test_repetitions_are_written_at_growing_intervals() -> None:
     assert limited.passes()
 
 
+def test_a_filtered_record_is_not_written() -> None:
+    limited = Limited()
+    limited.addFilter(lambda record: "secret" not in record.getMessage())
+    assert not limited.passes(text="a secret")
+    assert limited.passes(text="x")
+    assert [text for _, text, _ in limited.written] == ["x"]
+
+
 def test_the_first_is_always_written_and_memory_is_bounded() -> None:
     limited = Limited(-1e9)
     assert limited.passes()

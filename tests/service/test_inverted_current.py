@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pytest
 
 from cangauge._resources import shared_file
 from cangauge.bus.publish import SocEstimate, SocReader
@@ -17,8 +18,10 @@ from cangauge.logs.log import Log
 from cangauge.logs.sign import sign_of_current
 from cangauge.replay.player import ReplaySettings, play
 from cangauge.replay.steps import LogSource
+from cangauge.service.config import RunConfig
 from cangauge.service.pipeline import Pipeline
 from cangauge.service.run import Service
+from cangauge.service.setup import Setup
 from cangauge.types import Reason, Status
 from live import LoggedLines, frames_of, leaf_model, leaf_model_path, never, short_log, virtual_port
 
@@ -71,6 +74,21 @@ def test_an_inverted_drive_through_the_service(tmp_path: Path) -> None:
     assert state.soc is not None
     assert state.soc.status is Status.INVALID
     assert state.soc.reasons & Reason.IMPLAUSIBLE_INPUT
+
+
+@pytest.mark.parametrize(
+    ("text", "sign"),
+    [
+        ('like = "leaf_aze0"', 1),
+        ('like = "generic"', -1),
+        ('like = "generic"\ncurrent = "current_a"', -1),
+        ('like = "leaf_aze0"\n[current]\nscale = 2.0', 1),
+    ],
+)
+def test_the_sign_to_set_is_the_other_one(tmp_path: Path, text: str, sign: int) -> None:
+    (tmp_path / "car.toml").write_text(text)
+    setup = Setup.of(RunConfig(model=str(leaf_model_path()), map=str(tmp_path / "car.toml")))
+    assert f"set sign = {sign} under [current]" in setup.sign_cure
 
 
 def test_the_frame_says_implausible_and_the_suspicion_ends_with_the_proof() -> None:

@@ -16,7 +16,7 @@ from typing import Any
 import pytest
 
 from cangauge.errors import InputError
-from cangauge.extras.live.addresses import mqtt_options
+from cangauge.extras.live.addresses import MqttOptions, mqtt_options
 from cangauge.service.config import load_config
 from live import Command, leaf_model_path, waits
 from running import RunningService, free_port
@@ -225,7 +225,7 @@ def test_password_and_tls_are_used(tmp_path: Path) -> None:
         broker.end()
 
 
-def options_in(path: Path) -> dict[str, Any]:
+def options_in(path: Path) -> MqttOptions:
     config = load_config(path).mqtt
     assert config is not None
     return mqtt_options(config, "can0")
@@ -261,7 +261,7 @@ def test_defaults_and_a_password_that_is_in_no_repr(
     for lines, port in (("", 1883), ("tls = true\n", 8883), ("port = 7\n", 7)):
         path.write_text(f'model = "{leaf_model_path()}"\n[mqtt]\nbroker = "b"\nuser = "u"\n{lines}')
         options = options_in(path)
-        assert options["port"] == port
-        assert options["password"] == PASSWORD
-        assert re.fullmatch(r"cangauge_[A-Za-z0-9_-]+_can0", options["device"])
-        assert PASSWORD not in repr(load_config(path))
+        assert options.port == port
+        assert options.password == PASSWORD
+        assert re.fullmatch(r"cangauge_[A-Za-z0-9_-]+_can0", options.device)
+        assert PASSWORD not in f"{load_config(path)!r} {options!r}"

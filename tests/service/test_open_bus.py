@@ -65,8 +65,11 @@ def test_without_socketcan_the_default_is_multicast(monkeypatch: pytest.MonkeyPa
     monkeypatch.setattr(opening, "has_socketcan", lambda _channel: False)
     assert bus_address().interface == "udp_multicast"
     assert bus_address(None, "239.1.1.1").channel == "239.1.1.1"
-    with pytest.raises(InputError, match="no such SocketCAN interface"):
-        bus_address(None, "can0")
+    monkeypatch.setattr(socket, "if_nameindex", lambda: [(1, "lo"), (2, "can0")])
+    with pytest.raises(InputError, match=r"no such SocketCAN interface.*this machine has can0;"):
+        bus_address(None, "can1")
+    with pytest.raises(InputError, match="sudo ip link add dev vcan7 type vcan"):
+        bus_address(None, "vcan7")
     monkeypatch.setattr(opening, "has_socketcan", lambda channel: channel == "vcan0")
     assert (bus_address().interface, bus_address().channel) == ("socketcan", "vcan0")
 

@@ -262,6 +262,7 @@ DAMAGE: dict[str, tuple[Callable[[Path], object], str]] = {
              "damaged"),
     "unknown key": (edited("more", value=1), "more"),
     "no soc": (edited("estimator", "estimate", 1, value=None), "has no SoC"),
+    "a negative deviation": (edited("estimator", "estimate", 2, value=-1.0), "is negative"),
     "a word": (edited("estimator", "memory", value="many"), "estimator"),
 }  # fmt: skip
 

@@ -32,6 +32,9 @@ MAX_DBC_BYTES: Final = 4 * MIB
 
 Decode = Callable[[bytes | bytearray], float]
 
+_CONVERTED: Final = {".arxml", ".kcd", ".sym"}
+"""Suffixes of formats that cantools converts to a DBC."""
+
 # Names in value tables for codes without a value.
 _NOT_A_VALUE = re.compile(
     r"^(sna|n/?a|no data|invalid|error|fault|fehler|undefined|unknown|init)$"
@@ -342,6 +345,8 @@ def load_dbc(path: str | PathLike[str]) -> Database:
         first_line = (str(error) or type(error).__name__).splitlines()[0][:160]
         problem = f"not a DBC file that can be read: {first_line}"
         cure = "open it in a DBC editor, which names the error"
+        if path.suffix.lower() in _CONVERTED:
+            cure = f"convert it: python -m cantools convert {path} car.dbc"
         raise InputError(problem, source=path, cure=cure) from error
     if not isinstance(database, Database) or not database.messages:
         raise InputError("the DBC defines no messages", source=path)

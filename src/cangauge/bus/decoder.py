@@ -15,6 +15,7 @@ from cangauge.bus.plausibility import (
     MessageStatistics,
     PackProperties,
     SignalHealth,
+    StuckDetector,
     stuck_detectors,
 )
 from cangauge.bus.protection import FrameChecker, Verdict
@@ -235,7 +236,7 @@ class SampleDecoder:
         self.vehicle = vehicle
         self.statistics = FrameStatistics() if statistics is None else statistics
         self.health: dict[str, SignalHealth] = {}
-        self.now_s = -math.inf
+        self.now_s = self._suspected_s = -math.inf  # the last sign of a second sender
         self._pairing = Pairing(vehicle.pair_within_s)
         current, voltage = vehicle.current, vehicle.voltage
         has_same_turn = current.codec.conditions == voltage.codec.conditions
@@ -246,13 +247,13 @@ class SampleDecoder:
         messages = vehicle.messages.items()
         self._by_pgn = {key & pgn_mask(key): key for key, each in messages if each.by_pgn}
         self._replies = {reply_id(key): Reassembler() for key, each in messages if each.is_reply}
-        for signal in vehicle.signals:
-            self._add(signal, pack)
+        detectors: dict[str, StuckDetector] = {}
         if pack is not None:
             both = (current, voltage)
             steps = [(2.0 * each.codec.half_step, each.checks.stuck_after_s) for each in both]
-            for signal, detector in zip(both, stuck_detectors(pack, *steps), strict=True):
-                self.health[signal.role].is_stuck = detector.update
+            detectors["current"], detectors["voltage"] = stuck_detectors(pack, *steps)
+        for signal in vehicle.signals:
+            self._add(signal, pack, detectors.get(signal.role))
         self.cells: CellVoltages | None = None
         if vehicle.cells is not None:
             self.cells = CellVoltages(vehicle.cells)
@@ -263,7 +264,9 @@ class SampleDecoder:
         health = self.health
         self._needed = [(health[role], why) for role, why in _MISSING.items() if role in health]
 
-    def _add(self, signal: VehicleSignal, pack: PackProperties | None) -> None:
+    def _add(
+        self, signal: VehicleSignal, pack: PackProperties | None, detector: StuckDetector | None
+    ) -> None:
         route, role = self._route(signal), signal.role
         is_multiplexed = bool(signal.codec.conditions)
         health = self.health[role] = SignalHealth(
@@ -271,6 +274,7 @@ class SampleDecoder:
             # A multiplexed signal is not in every frame of its message: its period is learned.
             None if is_multiplexed else self.vehicle.messages[signal.key].period_s,
             is_cyclic=role in {"current", "voltage"},
+            is_stuck=None if detector is None else detector.update,
             statistics=route.statistics,
         )
         if route.checker is not None and not is_multiplexed:
@@ -306,13 +310,20 @@ class SampleDecoder:
                     data = bytearray(reply)
             if route is None:
                 return None
-        if time_s < route.last_s and route.last_s - time_s > self.vehicle.pair_within_s:
-            # A restarted log, or a clock that was set.
-            for health in self.health.values():
-                health.rewind(time_s)
+        if time_s < route.last_s:
+            self._rewind(route.last_s, time_s)
         self.now_s = time_s
         payload = route.accept(data, time_s)
-        return None if payload is None else self._values(route, payload, time_s)
+        if payload is None:
+            self._suspected_s = time_s if route.suspected_s == time_s else self._suspected_s
+            return None
+        return self._values(route, payload, time_s)
+
+    def _rewind(self, last_s: float, time_s: float) -> None:
+        """Handle time that runs backwards: a restarted log, or a clock that was set."""
+        if last_s - time_s > self.vehicle.pair_within_s:
+            for health in self.health.values():
+                health.rewind(time_s)
 
     def _values(self, route: _Route, payload: bytearray, time_s: float) -> Sample | None:
         """Check the values of an accepted payload; return the sample that they complete."""
@@ -351,10 +362,8 @@ class SampleDecoder:
 
         One without a further reason is old, never came, or is sent as "not available".
         """
-        reasons = _NO_REASON
-        for route in self._routes.values():
-            if route.is_suspected(now_s):
-                reasons |= _DUPLICATE
+        is_suspected = abs(now_s - self._suspected_s) < SUSPECTED_FOR_S
+        reasons = _DUPLICATE if is_suspected else _NO_REASON
         for health, missing in self._needed:
             if not health.is_usable(now_s):
                 reasons |= missing

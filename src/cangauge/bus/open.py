@@ -42,7 +42,6 @@ _DEFAULT_CHANNELS: Final = {
     "socketcan": "vcan0", "udp_multicast": MULTICAST_CHANNEL, "virtual": "cangauge",
 }  # fmt: skip
 _ON_SOCKETS: Final = {"socketcan", "udp_multicast"}
-_NEW_VCAN: Final = "sudo ip link add dev vcan0 type vcan; sudo ip link set vcan0 up"
 
 # Those of a missing library or a wrong option too (NameError: kvaser without canlib).
 _DRIVER_ERRORS: Final = (
@@ -106,7 +105,7 @@ def _guess_interface(channel: str | None) -> str:
     if channel is None or is_multicast(channel):
         return "udp_multicast"
     problem = "there is no such SocketCAN interface on this machine"
-    cure = f"bring it up ({_NEW_VCAN}), or name the interface too, e.g. --interface udp_multicast"
+    cure = f"{_cure_of_missing(channel)}; or name the interface too: --interface udp_multicast"
     raise InputError(problem, field="--channel", value=channel, cure=cure)
 
 
@@ -213,7 +212,7 @@ def _refusal(address: BusAddress, error: BaseException) -> InputError:
         problem = f"{interface} has no such bus"
         cure = "check it"
         if interface == "socketcan":
-            cure = f"check the name (ip link lists them), or make one: {_NEW_VCAN}"
+            cure = _cure_of_missing(channel)
     elif code in {errno.EPERM, errno.EACCES}:
         problem = f"no permission to open this bus ({interface})"
         cure = "run as a user with that permission"
@@ -230,6 +229,16 @@ def _refusal(address: BusAddress, error: BaseException) -> InputError:
         cure = "check channel and --bus-option"
     name, value = ("--interface", interface) if of_interface else ("--channel", channel)
     return kind(problem, field=name, value=value, cure=cure)
+
+
+def _cure_of_missing(channel: str) -> str:
+    """Return what to do about a SocketCAN interface that does not exist."""
+    if channel.startswith("vcan"):
+        return f"make it: sudo ip link add dev {channel} type vcan; sudo ip link set {channel} up"
+    names = []
+    with suppress(OSError):
+        names = [name for _, name in socket.if_nameindex() if "can" in name]
+    return f"check adapter and name; this machine has {', '.join(names) or 'no CAN interface'}"
 
 
 # --- Capabilities

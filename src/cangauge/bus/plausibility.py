@@ -127,7 +127,8 @@ class SignalHealth:
     """Check the values of one signal in order of time.
 
     `period_s` is the stated period of its values [s]; by default it is learned. `is_cyclic`: it is
-    sent every period even when it does not change.
+    sent every period even when it does not change. `is_stuck` takes a value and its bus time [s];
+    by default a signal that is not cyclic is stuck after a stated time, and a cyclic one never.
 
     Attributes
     ----------
@@ -135,9 +136,6 @@ class SignalHealth:
         Whether it failed too often since its latest good value; why it failed last, if it did.
     latest, latest_s : float
         Latest good value and its bus time [s]; NaN before the first.
-    is_stuck : callable, optional
-        Takes a value and its bus time [s]. By default a signal that is not cyclic is stuck after a
-        stated time, and a cyclic one never.
     """
 
     def __init__(
@@ -146,6 +144,7 @@ class SignalHealth:
         period_s: float | None = None,
         *,
         is_cyclic: bool = True,
+        is_stuck: Callable[[float, float], bool] | None = None,
         statistics: MessageStatistics | None = None,
     ) -> None:
         self._checks = checks
@@ -155,10 +154,9 @@ class SignalHealth:
         self._stated_timeout_s = checks.timeout_s
         self._period_s, self._is_cyclic = period_s, is_cyclic
         self._statistics = statistics or MessageStatistics()
-        is_watched = not is_cyclic and checks.stuck_after_s is not None
-        self.is_stuck: Callable[[float, float], bool] | None = None
-        if is_watched:
-            self.is_stuck = self._is_constant
+        self._is_stuck = is_stuck
+        if not is_cyclic and checks.stuck_after_s is not None:  # it has no partner
+            self._is_stuck = self._is_constant
         self.is_invalid = False
         self.reason = Reason.NONE
         self.latest = self.latest_s = math.nan
@@ -180,7 +178,7 @@ class SignalHealth:
         if not self._lowest <= value <= self._highest or abs(value - self.latest) > most:
             self._statistics.implausible += 1
             return self.fail(_IMPLAUSIBLE)
-        if self.is_stuck is not None and self.is_stuck(value, time_s):
+        if self._is_stuck is not None and self._is_stuck(value, time_s):
             self._statistics.stuck += 1
             return self.fail(Reason.SIGNAL_STUCK)
         self._failures = 0

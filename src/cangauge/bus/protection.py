@@ -190,11 +190,14 @@ class E2eRule:
     data_id_mode: DataIdMode = "both"
     header_byte: int = 0
     protected_bytes: int = 0
+    _profile: Profile = field(init=False, repr=False, compare=False)
+    _place: slice = field(init=False, repr=False, compare=False)  # bytes of the counter
+    _mask: int = field(init=False, repr=False, compare=False)  # its bits in them
     _data_id: int | bytes = field(init=False, repr=False, compare=False)
     _arguments: dict[str, Any] = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
-        name, profile = self.name, self._profile
+        name, profile = self.name, PROFILES[self.name]
         bits, modes = profile.id_bits, profile.modes or {"both": 0}
         least, protected = self.header_byte + profile.header, self.protected_bytes
         wanted = "data_id" if bits else "data_id_list"
@@ -218,12 +221,13 @@ class E2eRule:
         if profile.modes:
             arguments["data_id_mode"] = modes[self.data_id_mode]
         data_id = self.data_id if self.data_id_list is None else bytes(self.data_id_list)
+        mask, first = max(0x0F, profile.modulus - 1), self.header_byte + profile.counter_at
+        place = slice(first, first + (mask.bit_length() + 7) // 8)
+        object.__setattr__(self, "_profile", profile)
+        object.__setattr__(self, "_place", place)
+        object.__setattr__(self, "_mask", mask)
         object.__setattr__(self, "_data_id", data_id)
         object.__setattr__(self, "_arguments", arguments)
-
-    @property
-    def _profile(self) -> Profile:
-        return PROFILES[self.name]
 
     @property
     def modulus(self) -> int:
@@ -242,23 +246,15 @@ class E2eRule:
 
     def counter(self, data: bytes | bytearray) -> int:
         """Return the counter of a payload."""
-        place, mask = self._counter_place()
-        return int.from_bytes(data[place], "big") & mask
+        return int.from_bytes(data[self._place], "big") & self._mask
 
     def protect(self, data: bytes | bytearray, counter: int) -> bytes:
         """Return the payload with header, counter (modulo its width) and CRC set."""
-        profile, out = self._profile, bytearray(data)
-        place, mask = self._counter_place()
-        word = int.from_bytes(out[place], "big") & ~mask | counter % profile.modulus
+        profile, place, out = self._profile, self._place, bytearray(data)
+        word = int.from_bytes(out[place], "big") & ~self._mask | counter % profile.modulus
         out[place] = word.to_bytes(place.stop - place.start, "big")
         profile.protect(out, self._data_id, increment_counter=False, **self._arguments)
         return bytes(out)
-
-    def _counter_place(self) -> tuple[slice, int]:
-        """Return the bytes of the counter, and its bits in them."""
-        mask = max(0x0F, self.modulus - 1)
-        first = self.header_byte + self._profile.counter_at
-        return slice(first, first + (mask.bit_length() + 7) // 8), mask
 
 
 Protection = ProtectionRule | CounterRule | E2eRule

@@ -170,6 +170,9 @@ class ReconnectingBus(BusConnection):
         away_s, self._since_s = now_s - self._since_s, now_s
         self._away_s += away_s
         self._bus = bus
+        if self._is_closed:  # in another thread, while the driver opened it
+            super().close()
+            return
         text = f"{'back' if self.losses else 'available'} after {away_s:.1f} s"
         self._log("bus.back", logging.INFO, text)
 

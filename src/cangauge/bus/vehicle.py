@@ -11,7 +11,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
-from typing import Final, Literal, NamedTuple, TypeVar
+from typing import Any, Final, Literal, NamedTuple, TypeVar
 
 import numpy as np
 from can.typechecking import CanFilter
@@ -180,7 +180,7 @@ class Vehicle:
             if dbc is not None or map is not None:
                 problem, cure = "given together with a DBC or a map", "give one or the other"
                 raise InputError(problem, field="--vehicle", value=preset, cure=cure)
-            known = _find_preset(preset)
+            known = _find_preset(preset, field="--vehicle")
             if known.lacks_temperature and temperature_c is None:
                 problem = "no pack temperature is known on the bus of this car"
                 cure = "give --temperature °C"
@@ -194,7 +194,7 @@ class Vehicle:
             cure = "give --map FILE, which names three signals; to write one:"
             cure += f" cangauge init CAPTURE --dbc {dbc} -o mycar"
             raise InputError(problem, source=str(dbc), field="--map", cure=cure)
-        mapping = validated(VehicleMap, read_toml(map), map)
+        mapping = validated(VehicleMap, _with_preset(read_toml(map), map), map)
         files = [] if dbc is None else [Path(dbc)]
         files += [Path(map).parent / name for name in mapping.dbc]
         if not files:
@@ -402,11 +402,24 @@ class Preset:
         return _Binder(self.mapping, [dbc], str(dbc)).vehicle(temperature_c, pair_within_s)
 
 
+_NAMES_A_SIGNAL: Final = {"signal", "index", "fixed_c"}
+
+
+def _added(base: Any, own: Any) -> Any:
+    """Return tables with those of another map added; one that names a signal replaces the first's.
+
+    So a map that changes a check keeps the signal, and one with another signal keeps no sign.
+    """
+    if not isinstance(base, dict) or not isinstance(own, dict) or _NAMES_A_SIGNAL & own.keys():
+        return own
+    return base | {key: _added(base.get(key), value) for key, value in own.items()}
+
+
 def _presets() -> dict[str, Preset]:
     path = shared_file("dbc", "presets.toml")
     tables, presets = read_toml(path), {}
     for name, own in tables.items():
-        table = {**tables.get(own.get("like", name), {}), **own}
+        table = _added(tables.get(own.get("like"), {}), own)
         table.pop("like", None)
         dbc, about = table.pop("dbc"), table.pop("about")
         periods_s = {int(key, 0): value for key, value in table.pop("periods_s", {}).items()}
@@ -418,12 +431,27 @@ PRESETS: Final = _presets()
 """By the name that `--vehicle` takes."""
 
 
-def _find_preset(name: str) -> Preset:
-    """Return the preset of that name; case does not matter, nor does `-` for `_`."""
+def _find_preset(name: str, *, field: str, source: str | PathLike[str] | None = None) -> Preset:
+    """Return the preset of that name; case does not matter, nor does `-` for `_`.
+
+    Raises InputError with `field` and `source` if there is none.
+    """
     preset = PRESETS.get(name.strip().lower().replace("-", "_"))
     if preset is not None:
         return preset
     near = closest(name, PRESETS)
     known = f"known are {', '.join(PRESETS)}; for another car give --map FILE"
     cure = f"did you mean {near}?" if near else known
-    raise InputError("unknown vehicle", field="--vehicle", value=name, cure=cure)
+    raise InputError("unknown vehicle", source=source, field=field, value=name, cure=cure)
+
+
+def _with_preset(own: dict[str, Any], source: str | PathLike[str]) -> dict[str, Any]:
+    """Return the tables of a map file, added to those of the preset that it is `like`, if any."""
+    if "like" not in own:
+        return own
+    preset = _find_preset(str(own.pop("like")), source=source, field="like")
+    if "soc" in own:
+        own["soc_reference"] = own.pop("soc")
+    tables = preset.mapping.model_dump(exclude_unset=True)
+    tables["dbc"] = str(shared_file("dbc", preset.dbc))
+    return dict(_added(tables, own))

@@ -252,6 +252,8 @@ class EstimatorState(BaseModel):
     def _check_shapes(self) -> Self:
         if len(self.line.time_s) != len(self.line.current_a):
             raise ValueError("the delay line needs one current per time")
+        if self.soc_std_pct < 0.0:
+            raise ValueError("the standard deviation of the SoC is negative")
         for each in self.hypotheses.filters:
             for matrix in (each.p, each.bias.p, each.bias.v):
                 if len({len(row) for row in matrix}) != 1:

@@ -6,6 +6,7 @@ import math
 from collections import defaultdict
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
+from functools import cache
 from itertools import count
 from pathlib import Path
 from typing import NamedTuple
@@ -86,8 +87,8 @@ class CaptureSource:
     Frames of cangauge itself are dropped. If REPLAY_CLOCK is among them, log time is that of the
     replayed log, else the recorded stamps.
 
-    With a vehicle the frames that its decoder uses are wanted; without one all are, and samples
-    cannot be counted.
+    With a vehicle the frames that pass its filters are wanted, and with them each frame of a reply;
+    without one all are, and samples cannot be counted.
     """
 
     def __init__(
@@ -101,7 +102,16 @@ class CaptureSource:
     def steps(self, *, loop: bool) -> Iterator[Step]:
         """Yield a step per frame; repetitions follow 10 ms later."""
         decoder = None if self._vehicle is None else SampleDecoder(self._vehicle)
-        samples = wanted = shift_us = 0
+        filters = [] if self._vehicle is None else self._vehicle.filters
+        samples = shift_us = 0
+
+        @cache
+        def is_wanted(number: int, is_extended: bool) -> bool:
+            return not filters or any(
+                each["extended"] is is_extended and not (number ^ each["can_id"]) & each["can_mask"]
+                for each in filters
+            )
+
         while True:
             first_us, last_us = None, 0
             for message in self._timed():
@@ -109,13 +119,11 @@ class CaptureSource:
                 first_us = time_us if first_us is None else first_us
                 last_us = max(last_us, time_us)
                 message.timestamp = (time_us + shift_us) / MICROSECONDS
-                is_wanted = True
                 if decoder is not None:
-                    before, statistics = wanted, decoder.statistics
                     decoder.handle(message)
-                    samples, wanted = statistics.samples, statistics.wanted
-                    is_wanted = wanted != before
-                yield Step(time_us + shift_us, [message], samples, is_wanted)
+                    samples = decoder.statistics.samples
+                needs_clock = is_wanted(message.arbitration_id, message.is_extended_id)
+                yield Step(time_us + shift_us, [message], samples, needs_clock)
             if not loop or first_us is None:
                 return
             shift_us += last_us - first_us + _CAPTURE_LOOP_GAP_US

@@ -382,6 +382,15 @@ class RunConfig(Strict):
         return self
 
 
+_MAP_CURE: Final = "in the file of `map`; a map of three lines changes a preset (docs/map-file.md)"
+_IN_THE_MAP: Final = {
+    "messages": f"state [messages] {_MAP_CURE}",
+    "rules": f"state [rules] {_MAP_CURE}",
+    "checks": f"state those of [checks.current] under [current] {_MAP_CURE}",
+}
+"""Tables that a configuration could hold before, and where they are now."""
+
+
 def load_config(
     path: str | PathLike[str] | None, overrides: Mapping[str, Any] | None = None
 ) -> RunConfig:
@@ -393,6 +402,8 @@ def load_config(
     given = {name: value for name, value in (overrides or {}).items() if value not in (None, {})}
     _check_options(given)  # separately, so that an error names the source of the value
     data = {} if path is None else read_toml(path)
+    for name in _IN_THE_MAP.keys() & data:
+        raise InputError("belongs to the map file", source=path, field=name, cure=_IN_THE_MAP[name])
     validated(RunConfig, {"model": "-", **data}, path or "")
     for each in config_keys():
         *tables, name = each.name.split(".")

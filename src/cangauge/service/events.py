@@ -7,7 +7,6 @@ import logging
 import math
 import select
 import sys
-import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -51,12 +50,13 @@ class RateLimitedHandler(logging.Handler):
         super().__init__()
         self._clock = clock
         self._events: dict[tuple[str, str], _Repetitions] = {}
-        self._turn = threading.RLock()
 
     def handle(self, record: logging.LogRecord) -> bool:
         """Write a record, or hold it; return whether it was written."""
+        if not self.filter(record):
+            return False
         key = (record.name, str(getattr(record, "limit", record.msg)))
-        with self._turn:
+        with self.lock:  # type: ignore[union-attr] # made by Handler
             now_s = self._clock()
             event = self._events[key] = self._events.pop(key, _Repetitions())
             if len(self._events) > EVENTS_KEPT:
@@ -73,7 +73,7 @@ class RateLimitedHandler(logging.Handler):
 
     def release_due(self, *, everything: bool = False) -> None:
         """Write the suppressed records whose interval has ended, or all of them."""
-        with self._turn:
+        with self.lock:  # type: ignore[union-attr] # made by Handler
             now_s = self._clock()
             held = [(each, each.held) for each in self._events.values() if each.held is not None]
             for event, record in sorted(held, key=lambda each: each[1].created):

@@ -38,6 +38,15 @@ OUTPUTS: Final = {
 }
 """Modules with an output, and the keys that ask for it; imported only then. Each has
 `make_output(service)`."""
+_COUNTED: Final = {
+    "garbled": "packets that are no frames",
+    "error_frames": "error frames",
+    "unsent": "frames not sent",
+    "queue_drops": "frames dropped in the receive queue",
+    "losses": "bus losses",
+    "foreign": "frames of another service with these ids",
+}
+"""Words for the counts of a bus, at the end of a run."""
 _LOG = logging.getLogger(__name__)
 
 
@@ -224,7 +233,7 @@ class Service:
         counts, latest = self.pipeline.counts, self.pipeline.latest
         step_s = status["step"]["mean_s"]
         errors = "".join(
-            f", {count} {name.replace('_', ' ')}"
+            f", {count} {_COUNTED.get(name, name)}"
             for name, count in status["bus_counts"].items()
             if count
         )

@@ -6,7 +6,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Self
 
-from cangauge._config import read_toml
 from cangauge.bus.open import BusAddress, backend_capabilities, bus_address, is_multicast
 from cangauge.bus.publish import FrameIds
 from cangauge.bus.vehicle import Vehicle
@@ -37,7 +36,7 @@ class Setup:
         vehicle, model = load_vehicle(config), Model.load(config.model)
         _check_poll(config, vehicle)
         _check_publish(config)
-        return cls(config, vehicle, model, pipeline_settings(config), _sign_cure(config))
+        return cls(config, vehicle, model, pipeline_settings(config), _sign_cure(config, vehicle))
 
 
 def read_setup(read: Callable[[], RunConfig]) -> Setup | CangaugeError:
@@ -103,19 +102,24 @@ def _check_publish(config: RunConfig) -> None:
     publish = config.publish
     if publish is None:
         return
-    buses = address_of(config), inverter_address(publish)
-    problem = cure = ""
+    channel, buses = publish.channel, (address_of(config), inverter_address(publish))
     if str(buses[0]) == str(buses[1]):
         problem = "is the battery's bus: a frame cannot be replaced on the bus that carries it"
         cure = "connect the inverter to a bus of its own"
-    elif any(backend_capabilities(bus).echoes for bus in buses):
+        raise InputError(
+            problem, source=config.file, field="publish.channel", value=channel, cure=cure
+        )
+    if any(backend_capabilities(bus).echoes for bus in buses):
         problem = "a bus returns the frames sent on it: they would go round for ever"
-        cure = "use SocketCAN, without receive_own_messages in both bus_options"
-    elif config.time_source == "replay-clock":
-        problem, cure = "the SoC of a replay is not the battery's", "remove time_source"
-    if problem:
-        where = {"source": config.file, "field": "publish.channel", "value": publish.channel}
-        raise InputError(problem, cure=cure, **where)
+        cure = "use SocketCAN on both buses, and remove receive_own_messages"
+        raise InputError(
+            problem, source=config.file, field="publish.channel", value=channel, cure=cure
+        )
+    if config.time_source == "replay-clock":
+        problem, cure = "the SoC of a replay is not the battery's", "remove it, or [publish]"
+        raise InputError(
+            problem, source=config.file, field="time_source", value="replay-clock", cure=cure
+        )
 
 
 def _check_poll(config: RunConfig, vehicle: Vehicle) -> None:
@@ -138,8 +142,8 @@ def _check_poll(config: RunConfig, vehicle: Vehicle) -> None:
         raise InputError(problem, source=config.file, field="poll", cure=cure)
 
 
-def _sign_cure(config: RunConfig) -> str:
+def _sign_cure(config: RunConfig, vehicle: Vehicle) -> str:
     if config.map is None:
         return "use the preset of this car, or a map file (`cangauge init` writes one)"
-    sign = -read_toml(config.map).get("current", {}).get("sign", 1)
+    sign = 1 if vehicle.current.codec.gain < 0.0 else -1
     return f"set sign = {sign} under [current] of {config.map}"

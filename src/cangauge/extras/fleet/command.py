@@ -264,7 +264,9 @@ def _read_options(reading: ReadingOptions) -> ReadOptions:
     from cangauge.extras.fleet.sources import ReadOptions
 
     mapped, car = reading.mapped_columns(), None
-    is_map_of_columns = mapped is not None and "dbc" not in read_toml(str(reading.map_file))
+    is_map_of_columns = mapped is not None and not (
+        {"dbc", "like"} & read_toml(str(reading.map_file)).keys()
+    )
     if reading.names_vehicle and (reading.vehicle or reading.dbc or not is_map_of_columns):
         car = reading.car()
     paths: list[str] = []

@@ -109,6 +109,23 @@ class AscReader(LibraryReader):
             yield f"{time_s:.9f}{line[stamp.end() :]}" if stamp else line
 
 
+class _InPieces:
+    """A file whose `read` takes memory as the data come, whatever length a damaged file states."""
+
+    _PIECE: Final = 1 << 20
+
+    def __init__(self, raw: Any) -> None:
+        self._raw, self.close = raw, raw.close
+
+    def read(self, size: int) -> bytes:
+        if size < 0:
+            raise BLFParseError("a length that is negative")
+        data = bytearray()
+        while piece := self._raw.read(min(size - len(data), self._PIECE)):
+            data += piece
+        return bytes(data)
+
+
 class _EndingBlf(can.BLFReader):
     """python-can's reader; it would read an object whose size leads to no next one for ever."""
 
@@ -126,6 +143,10 @@ class BlfReader(LibraryReader):
     """Vector BLF."""
 
     name, library, is_text, marks = "Vector BLF", _EndingBlf, False, (b"LOGG",)
+
+    def content(self) -> _InPieces:
+        """Return the file, read in pieces."""
+        return _InPieces(self.raw)
 
 
 def _trc_frames(lines: Iterator[str]) -> Iterator[can.Message]:

@@ -84,6 +84,7 @@ class Gateway(Output):
         # A single interval may be a gap: from the third sample on the period is known.
         self._sampled_s, self._interval_s, self._current_until_s = math.inf, -math.inf, -math.inf
         self._soc: tuple[float, float] | None = None  # [%], and until when it is confirmed
+        self._without_fd: list[ReconnectingBus] = []  # told in the log, each once
         self._done = threading.Event()
         self._replaces: bool | None = None
         self._thread = threading.Thread(target=self._run, name="cangauge-inverter", daemon=True)
@@ -106,11 +107,14 @@ class Gateway(Output):
             self._soc = soc_pct, snapshot.made_s + DOUBT_S
 
     def close(self) -> None:
-        """End the gateway."""
+        """End the gateway; log how many frames each bus could not take."""
         self._done.set()
         self._thread.join(CLOSE_WITHIN_S)
-        self._battery.close()
-        self._inverter.close()
+        for bus in (self._battery, self._inverter):
+            bus.close()
+            if bus.unsent:
+                text = f"{bus.unsent} frames could not be handed on to {bus.name}"
+                emit(_LOG, logging.WARNING, "inverter.unsent", text)
 
     def soc_pct(self, now_s: float) -> float | None:
         """Return the SoC that may be sent at a monotonic time [s]; None: the battery's own."""
@@ -146,20 +150,36 @@ class Gateway(Output):
         emit(_LOG, logging.INFO if is_replaced else logging.WARNING, "inverter.soc", text)
 
     def _run(self) -> None:
-        while not self._done.is_set():
-            frames = self._battery.receive_pending(POLL_S)
-            self._ever_own |= self._own_ids()
-            for frame in frames:
-                if frame.is_extended_id or frame.arbitration_id not in self._ever_own:
-                    _hand_on(self.replaced(frame, time.monotonic()), self._inverter)
-            for frame in self._inverter.receive_pending(POLL_S):
-                _hand_on(frame, self._battery)
+        try:
+            while not self._done.is_set():
+                self._hand_on_pending()
+        except Exception as error:  # noqa: BLE001 - of a driver; the thread would end unnoticed
+            if not self._done.is_set():
+                self.trouble = (
+                    f"the inverter gets no frames any more: {error!r}; restart the service"
+                )
+                emit(_LOG, logging.ERROR, "inverter.failed", self.trouble)
 
+    def _hand_on_pending(self) -> None:
+        """Hand on what has come in both directions."""
+        frames = self._battery.receive_pending(POLL_S)
+        self._ever_own |= self._own_ids()
+        for frame in frames:
+            if frame.is_extended_id or frame.arbitration_id not in self._ever_own:
+                self._hand_on(self.replaced(frame, time.monotonic()), self._inverter)
+        for frame in self._inverter.receive_pending(POLL_S):
+            self._hand_on(frame, self._battery)
 
-def _hand_on(frame: can.Message, bus: ReconnectingBus) -> None:
-    """Send what a bus can carry: a frame that it cannot would count as a lost bus."""
-    if bus.carries_fd or not frame.is_fd:
-        bus.post(frame)
+    def _hand_on(self, frame: can.Message, bus: ReconnectingBus) -> None:
+        """Send what a bus can carry: a frame that it cannot would count as a lost bus."""
+        if bus.carries_fd or bus.is_away or not frame.is_fd:
+            bus.post(frame)
+            return
+        bus.unsent += 1
+        if bus not in self._without_fd:
+            self._without_fd.append(bus)
+            text = f"{bus.name} is not open for CAN FD: frames such as 0x{frame.arbitration_id:X}"
+            emit(_LOG, logging.WARNING, "inverter.no_fd", f"{text} are dropped")
 
 
 def make_output(service: Service) -> Gateway:

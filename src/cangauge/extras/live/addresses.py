@@ -17,7 +17,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from importlib.util import find_spec
 from os import PathLike
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Final
 
 from cangauge._files import open_regular
 from cangauge._logging import emit
@@ -143,10 +143,24 @@ def read_token(path: str | PathLike[str] | None, environment: Mapping[str, str])
     return token
 
 
-def mqtt_options(config: MqttConfig, bus: str) -> dict[str, Any]:
-    """Return the arguments of `MqttPublisher` for a bus of this name.
+@dataclass(frozen=True, slots=True)
+class MqttOptions:
+    """Keys of `[mqtt]` with their defaults, and the password in place of its file."""
 
-    They are the keys of `[mqtt]` with their defaults, and the password in place of its file.
+    broker: str
+    port: int
+    tls: bool
+    ca_file: str | None
+    user: str | None
+    password: str | None = field(repr=False)
+    topic_prefix: str
+    discovery_prefix: str
+    device: str
+    every_s: float
+
+
+def mqtt_options(config: MqttConfig, bus: str) -> MqttOptions:
+    """Return the options of `[mqtt]` for a bus of this name.
 
     Raises
     ------
@@ -157,12 +171,12 @@ def mqtt_options(config: MqttConfig, bus: str) -> dict[str, Any]:
         problem = "MQTT needs the package paho-mqtt, which is not installed"
         raise InputError(problem, field="mqtt", cure="pip install 'cangauge[mqtt]'")
     name = re.sub(r"[^A-Za-z0-9_-]+", "_", f"cangauge_{socket.gethostname()}_{bus}")
-    options = config.model_dump(exclude={"password_file"}) | {
+    given = config.model_dump(exclude={"password_file"}) | {
         "port": config.port or (8883 if config.tls else 1883),
         "device": config.device or name,
-        "password": _mqtt_password(config.password_file),
     }
-    if options["password"] is not None and config.user is None:
+    options = MqttOptions(**given, password=_mqtt_password(config.password_file))
+    if options.password is not None and config.user is None:
         cure = "name the user whose password is given"
         raise InputError("is missing", field="mqtt.user", cure=cure)
     try:

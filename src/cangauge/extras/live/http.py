@@ -57,7 +57,12 @@ class StatusServer(Output):
     def __init__(self, sockets: list[int], token: str | None) -> None:
         self.token = token
         self.latest: Snapshot | None = None
-        pages = {"/status": _StatusPage, "/healthz": _Health, "/metrics": _Metrics}
+        pages: dict[str, type[Handler]] = {
+            "/status": _StatusPage,
+            "/healthz": _Health,
+            "/metrics": _Metrics,
+            ".*": Nothing,
+        }
         limits = {
             "no_keep_alive": True,
             "max_buffer_size": MAX_HEADER_BYTES + MAX_BODY_BYTES,
@@ -78,12 +83,13 @@ def serve(
     kind: type[HTTPServer],
     limits: Mapping[str, Any],
 ) -> None:
-    """Serve pages by their paths on listening sockets, with limits of tornado's `HTTPServer`."""
+    """Serve pages by patterns of their paths, with limits of tornado's `HTTPServer`.
+
+    `sockets` are listening. The first pattern that matches counts.
+    """
     context = {"server": server}
     application = Application(
         [(path, page, context) for path, page in pages.items()],
-        default_handler_class=_Nothing,
-        default_handler_args=context,
         log_function=lambda _: None,
         websocket_ping_interval=PING_S,
         websocket_max_message_size=MAX_BODY_BYTES,
@@ -213,8 +219,13 @@ class _Metrics(_Page):
         self.finish(body)
 
 
-class _Nothing(Handler):
+class Nothing(Handler):
+    """Answer of all other paths."""
+
+    text = "available: /status, /healthz, /metrics"
+
     def prepare(self) -> None:
+        """Refuse any request."""
         super().prepare()
         if not self._finished:
-            self.refuse(404, "there is nothing here")
+            self.refuse(404, self.text)

@@ -19,7 +19,7 @@ import threading
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
@@ -27,7 +27,7 @@ from tornado.netutil import bind_sockets
 
 from cangauge._logging import emit
 from cangauge.errors import InputError
-from cangauge.extras.live.addresses import HttpAddress, http_address, mqtt_options
+from cangauge.extras.live.addresses import HttpAddress, MqttOptions, http_address, mqtt_options
 from cangauge.service.output import Output
 from cangauge.service.status_client import Snapshot
 
@@ -63,8 +63,8 @@ class Live(Output):
         Of `/status`, `/healthz` and `/metrics`.
     dashboard : HttpAddress, optional
         Of the live page.
-    mqtt : dict, optional
-        Arguments of `MqttPublisher`.
+    mqtt : MqttOptions, optional
+        Broker, and what to publish there.
 
     Attributes
     ----------
@@ -86,7 +86,7 @@ class Live(Output):
         *,
         http: HttpAddress | None = None,
         dashboard: HttpAddress | None = None,
-        mqtt: dict[str, Any] | None = None,
+        mqtt: MqttOptions | None = None,
     ) -> None:
         if os.name != "posix":
             problem = "page, status by HTTP and MQTT need Linux or macOS"
@@ -216,7 +216,7 @@ class _Received:
 
 @contextmanager
 def _process(sockets: Sequence[int]) -> Iterator[tuple[int, int, int]]:
-    """Run the process, which inherits sockets; give its id, and where to write and to read."""
+    """Run the process; yield its pid and the descriptors of its stdin and stdout."""
     process = subprocess.Popen(
         # -P: modules do not come from the working folder
         [sys.executable, "-P", "-m", "cangauge.extras.live.process"],
@@ -241,7 +241,7 @@ def _process(sockets: Sequence[int]) -> Iterator[tuple[int, int, int]]:
 
 
 def _line(content: object) -> bytes:
-    return json.dumps(content).encode() + b"\n"
+    return json.dumps(content, default=asdict).encode() + b"\n"
 
 
 def _resident_bytes(pid: int) -> int:

@@ -20,7 +20,7 @@ from paho.mqtt.enums import CallbackAPIVersion
 
 from cangauge._logging import emit
 from cangauge._version import __version__
-from cangauge.extras.live.addresses import is_loopback_name
+from cangauge.extras.live.addresses import MqttOptions, is_loopback_name
 from cangauge.service.output import Output
 from cangauge.service.status_client import Snapshot, value_at
 from cangauge.types import Status
@@ -85,49 +85,37 @@ def state(status: Mapping[str, Any]) -> dict[str, Any]:
 class MqttPublisher(Output):
     """Publish the latest snapshot from a thread, every `every_s` [s].
 
-    The arguments are the keys of `[mqtt]`, with `password` in place of its file. The state is one
-    JSON object at `TOPIC_PREFIX/DEVICE/state`. `TOPIC_PREFIX/DEVICE/availability` is "online" or,
-    also by the last will, "offline". Both are retained. Without a `discovery_prefix` Home Assistant
-    finds nothing.
+    The state is one JSON object at `TOPIC_PREFIX/DEVICE/state`.
+    `TOPIC_PREFIX/DEVICE/availability` is "online" or, also by the last will, "offline". Both are
+    retained. Without a `discovery_prefix` Home Assistant finds nothing.
     """
 
-    def __init__(
-        self,
-        *,
-        broker: str,
-        port: int,
-        tls: bool,
-        ca_file: str | None,
-        user: str | None,
-        password: str | None,
-        topic_prefix: str,
-        discovery_prefix: str,
-        device: str,
-        every_s: float,
-    ) -> None:
-        self._place = f"{broker}:{port}"
-        self._device, self._every_s, self._discovery_prefix = device, every_s, discovery_prefix
-        self._state_topic = f"{topic_prefix}/{device}/state"
-        self._availability_topic = f"{topic_prefix}/{device}/availability"
+    def __init__(self, options: MqttOptions) -> None:
+        self._place = f"{options.broker}:{options.port}"
+        self._device, self._every_s = options.device, options.every_s
+        self._discovery_prefix = options.discovery_prefix
+        self._state_topic = f"{options.topic_prefix}/{options.device}/state"
+        self._availability_topic = f"{options.topic_prefix}/{options.device}/availability"
         self._latest: Snapshot | None = None
         self._done = threading.Event()
         self._is_new = threading.Event()
-        self._client = client = Client(CallbackAPIVersion.VERSION2, client_id=f"cangauge-{device}")
+        name = f"cangauge-{options.device}"
+        self._client = client = Client(CallbackAPIVersion.VERSION2, client_id=name)
         client.connect_timeout = CONNECT_WITHIN_S
         client.reconnect_delay_set(*RETRY_S)
         client.will_set(self._availability_topic, "offline", qos=1, retain=True)
         client.max_queued_messages_set(1)
-        if user is not None:
-            client.username_pw_set(user, password)
-        if tls:
-            client.tls_set_context(ssl.create_default_context(cafile=ca_file))
-        elif password is not None and not is_loopback_name(broker):
+        if options.user is not None:
+            client.username_pw_set(options.user, options.password)
+        if options.tls:
+            client.tls_set_context(ssl.create_default_context(cafile=options.ca_file))
+        elif options.password is not None and not is_loopback_name(options.broker):
             text = f"the password for {self._place} is sent unencrypted: set tls = true in [mqtt]"
             emit(_LOG, logging.WARNING, "mqtt.unencrypted", text)
         client.on_connect = self._on_connect
         client.on_disconnect = self._on_disconnect
         client.on_connect_fail = self._on_connect_fail
-        client.connect_async(broker, port, KEEPALIVE_S)
+        client.connect_async(options.broker, options.port, KEEPALIVE_S)
         self._thread = threading.Thread(target=self._run, name="cangauge-mqtt", daemon=True)
         self._thread.start()
 

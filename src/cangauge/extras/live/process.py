@@ -68,9 +68,10 @@ def outputs_of(asks: Mapping[str, Any]) -> list[Output]:
 
         outputs.append(LivePage(**asks["dashboard"]))
     if "mqtt" in asks:
+        from cangauge.extras.live.addresses import MqttOptions  # noqa: PLC0415
         from cangauge.extras.live.mqtt import MqttPublisher  # noqa: PLC0415
 
-        outputs.append(MqttPublisher(**asks["mqtt"]))
+        outputs.append(MqttPublisher(MqttOptions(**asks["mqtt"])))
     return outputs
 
 

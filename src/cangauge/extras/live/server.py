@@ -23,7 +23,7 @@ from tornado.websocket import WebSocketClosedError, WebSocketHandler
 
 from cangauge.extras.live.charts import CHARTS, STATUS_COLOURS, STATUS_NAMES, chart_parts
 from cangauge.extras.live.history import LOG_NAME, REASONS, History, last_hour, shown_columns
-from cangauge.extras.live.http import Handler, has_token, serve
+from cangauge.extras.live.http import Handler, Nothing, has_token, serve
 from cangauge.service.output import Output
 from cangauge.service.status_client import Snapshot
 
@@ -68,6 +68,7 @@ class LivePage(Output):
             "/rows": _Rows,
             "/stream": _Stream,
             f"/{LOG_NAME}": _LastHour,
+            ".*": _Elsewhere,
         }
         limits = {"idle_connection_timeout": IDLE_S, "body_timeout": IDLE_S}
         serve(self, sockets, pages, HTTPServer, limits)
@@ -236,6 +237,11 @@ class _LastHour(_LiveHandler):
         self.set_header("Content-Type", "text/csv; charset=utf-8")
         self.set_header("Content-Disposition", f'attachment; filename="{LOG_NAME}"')
         self.finish(last_hour(self.server.history))
+
+
+class _Elsewhere(_LiveHandler, Nothing):
+    needs_token = False  # browsers ask for /favicon.ico by themselves
+    text = "there is nothing here: the live page is at /"
 
 
 def _cookie_of(token: str) -> str:
