@@ -356,6 +356,10 @@ def test_a_coarse_soc_counts_at_its_changes_and_not_at_its_limits(pack) -> None:
     assert 3 <= known.sum() < known.size / 2
     assert part.published_pct[known][1:-1] == pytest.approx(truth[known][1:-1], abs=0.3)
     assert part.published_pct[-1] == pytest.approx(truth[-1], abs=0.5)  # the last row
+    (part,) = Chain.of([stuck(log, 1.0, 0)], model).stretches
+    assert np.isfinite(part.published_pct[[0, -1]]).all()
+    known = np.isfinite(part.published_pct)
+    assert known.sum() == pytest.approx(2 + part.held_pct // 2.0, abs=1.0)  # each two steps
     full = np.minimum(log.soc_pct - log.soc_pct[0] + 102.0, 100.0)
     (part,) = Chain.of([replace(log, soc_pct=full)], model).stretches
     assert np.isnan(part.published_pct[0])
