@@ -15,6 +15,7 @@ import cangauge
 from cangauge.__main__ import main
 from cangauge.extras.judge.causes import signatures_of
 from cangauge.extras.judge.chain import ERROR, FUNCTIONS, OFFSET, Chain
+from cangauge.extras.judge.judgement import Judgement
 from cangauge.logs.canonical import write_table
 from cangauge.logs.read import CellColumns
 
@@ -152,6 +153,27 @@ def test_a_jump_is_listed_with_its_size(pack) -> None:
     assert f"min into {logs[1].name}" in judgement.since
 
 
+@pytest.mark.parametrize("step_pct", [0.1, 0.5, 1.0])
+@pytest.mark.parametrize("place", [0.5, 0.95])
+def test_sentence_and_table_state_the_moment_of_a_jump(pack, step_pct: float, place: float) -> None:
+    model, logs = pack
+    named = [replace(log, name=f"day{number}") for number, log in enumerate(logs)]
+    changed = []
+    for number, log in enumerate(named):
+        late = np.arange(len(log)) >= place * len(log)
+        error = -10.0 * (late if number == 3 else number > 3)
+        changed.append(replace(log, soc_pct=np.round((log.soc_pct + error) / step_pct) * step_pct))
+    judgement = cangauge.judge(changed, model)
+    assert judgement.cause.verdict == "start_or_reset"
+    (jump,) = judgement.jumps
+    assert jump.size_pct == pytest.approx(-10.0, abs=1.0)
+    after_s = place * named[3].duration_s
+    assert jump.time_s - named[3].time_s[0] == pytest.approx(after_s, abs=60.0)
+    _, [[moment, _]] = judgement.jump_rows()
+    assert moment.endswith("min into day3")
+    assert judgement.since.startswith(f"since {moment}")
+
+
 def test_command_prints_schema_1_and_writes_all_files(
     pack, tmp_path: Path, capsys, monkeypatch
 ) -> None:
@@ -243,6 +265,87 @@ def test_logs_that_show_nothing_are_refused(pack) -> None:
         cangauge.judge([log], cells=96)
 
 
+def stuck(log: cangauge.Log, step_pct: float, from_row: int) -> cangauge.Log:
+    """Return the log of a gauge that shows steps, and stands still from a row on."""
+    shown = np.round(log.soc_pct / step_pct) * step_pct
+    shown[from_row:] = shown[from_row]
+    return replace(log, soc_pct=shown)
+
+
+def pegged(log: cangauge.Log, at_pct: float) -> cangauge.Log:
+    return replace(log, soc_pct=np.full(len(log), at_pct))
+
+
+@pytest.mark.parametrize(
+    ("change", "last"),
+    [
+        (lambda logs: [stuck(logs[3], 1.0, 0)], 3),
+        (lambda logs: [stuck(log, 1.0, 0) for log in logs], 4),
+        (lambda logs: [*logs[:4], stuck(logs[4], 1.0, 0)], 4),
+        (lambda logs: [*logs[:4], stuck(logs[4], 1.0, len(logs[4]) // 3)], 4),
+        (lambda logs: [stuck(logs[1], 0.1, len(logs[1]) // 3)], 1),
+        (lambda logs: [*logs[:4], stuck(logs[4], 0.1, len(logs[4]) // 3)], 4),
+        (lambda logs: [stuck(logs[0], 1.0, 0), *logs[1:]], 4),
+        (lambda logs: [pegged(logs[4], 100.0)], 4),
+    ],
+    ids=["one", "all", "last", "part", "fine", "fine last", "first", "full"],
+)
+def test_a_stuck_gauge_does_not_agree(pack, change, last: int) -> None:
+    model, logs = pack
+    changed = change(logs)
+    judgement = cangauge.judge(changed, model)
+    assert (judgement.verdict, judgement.cause.verdict) == ("off", "unknown")
+    assert "stands at" in judgement.headline
+    assert "stands still" in judgement.next_step
+    at_end = changed[-1].soc_pct[-1] - logs[last].soc_pct[-1]
+    assert judgement.error_pct == pytest.approx(at_end, abs=3.0)
+    assert sum(judgement.probabilities.values()) == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize("empty_from", [0.0, 0.8])
+def test_a_gauge_that_shows_empty_is_compared_at_the_end(pack, empty_from: float) -> None:
+    model, logs = pack
+    log = logs[4]
+    late = np.arange(len(log)) >= empty_from * len(log)
+    soc = np.where(late, 0.0, np.round(log.soc_pct))
+    judgement = cangauge.judge([*logs[:4], replace(log, soc_pct=soc)], model)
+    assert judgement.verdict == "off"
+    assert judgement.error_pct == pytest.approx(-log.soc_pct[-1], abs=3.0)
+    assert judgement.stands == ""  # the charge flows towards the limit
+
+
+def agrees_beyond_its_std(judgement: Judgement) -> list[float]:
+    """Return errors at the ends of logs that are surely above 5 % although the gauge agrees."""
+    if judgement.verdict != "agrees":
+        return []
+    ends = [
+        (log.soc_pct[-1] - soc[-1], np.hypot(std[-1], 0.5))
+        for log, soc, std in zip(
+            judgement.logs, judgement.corrected_pct, judgement.corrected_std_pct, strict=True
+        )
+    ]
+    return [error for error, std in ends if abs(error) > 5.3 + 1.645 * std]
+
+
+@pytest.mark.parametrize("step_pct", [0.1, 1.0])
+@pytest.mark.parametrize("size_pct", [4.0, 8.0, 16.0])
+def test_no_gauge_agrees_beside_an_error_that_its_std_excludes(
+    pack, step_pct: float, size_pct: float
+) -> None:
+    model, logs = pack
+
+    def bent(log: cangauge.Log, error_pct: np.ndarray) -> cangauge.Log:
+        soc = np.round((log.soc_pct + error_pct) / step_pct) * step_pct
+        return replace(log, soc_pct=np.clip(soc, 0.0, 100.0))
+
+    log = logs[3]
+    part = np.linspace(0.0, 1.0, len(log))
+    shapes = [size_pct * (part > 0.95), size_pct * part**4, -size_pct * np.clip(3 * part - 2, 0, 1)]
+    for shape in shapes:
+        for chain in ([bent(log, shape)], [*logs[1:3], bent(log, shape), logs[4]]):
+            assert agrees_beyond_its_std(cangauge.judge(chain, model)) == []
+
+
 def test_a_coarse_soc_counts_at_its_changes_and_not_at_its_limits(pack) -> None:
     model, (log, *_) = pack
     shown = np.minimum(np.round(log.soc_pct), np.round(log.soc_pct[0]) - 2.0)
@@ -251,7 +354,12 @@ def test_a_coarse_soc_counts_at_its_changes_and_not_at_its_limits(pack) -> None:
     known = np.isfinite(part.published_pct)
     truth = np.interp(part.time_s, log.time_s, log.soc_pct) + shift
     assert 3 <= known.sum() < known.size / 2
-    assert part.published_pct[known][1:] == pytest.approx(truth[known][1:], abs=0.3)
+    assert part.published_pct[known][1:-1] == pytest.approx(truth[known][1:-1], abs=0.3)
+    assert part.published_pct[-1] == pytest.approx(truth[-1], abs=0.5)  # the last row
+    (part,) = Chain.of([stuck(log, 1.0, 0)], model).stretches
+    assert np.isfinite(part.published_pct[[0, -1]]).all()
+    known = np.isfinite(part.published_pct)
+    assert known.sum() == pytest.approx(2 + part.held_pct // 2.0, abs=1.0)  # each two steps
     full = np.minimum(log.soc_pct - log.soc_pct[0] + 102.0, 100.0)
     (part,) = Chain.of([replace(log, soc_pct=full)], model).stretches
     assert np.isnan(part.published_pct[0])

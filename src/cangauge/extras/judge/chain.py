@@ -37,8 +37,8 @@ principal functions c [-]; the residual stands last."""
 BLOCK_S: Final = 30.0
 """Length of a block of samples whose means are used [s], as in the filter."""
 BLOCKS_AT_MOST: Final = 240
-"""Blocks of a stretch; of a longer one every k-th is used: over minutes the slow error of the
-voltage (300 s) hides what more blocks could tell."""
+"""Blocks of a stretch; of a longer one every k-th and the last is used: over minutes the slow error
+of the voltage (300 s) hides what more blocks could tell."""
 PARTED_S: Final = 600.0
 """Interval without samples that ends a stretch [s]: the car may have been charged or driven."""
 SHORTEST_S: Final = 240.0
@@ -48,7 +48,7 @@ SETTLING_S: Final = 90.0
 SOC_NOISE_PCT: Final = 0.05
 """Noise of the published SoC beside its steps [%]: rounding in the gauge and time of sending."""
 COARSE_PCT: Final = 0.2
-"""From this step on only the moments are used at which the published SoC changes [%]."""
+"""From this step on only rows are used at which the published SoC tells the gauge's count [%]."""
 PEGGED_PCT: Final = 0.05
 """A published SoC as close to 0 or 100 % is a limit, not a count [%]."""
 FULL_STD_PCT: Final = 1.5
@@ -129,12 +129,19 @@ class Stretch:
         Stamp of each block [s].
     hours, drawn_pct : array
         Since the start of the stretch: h [h] and Q [%].
-    voltage_v, published_pct : array
+    voltage_v : array
         Means; NaN where not used.
+    shown_pct : array
+        Published SoC; NaN where there is none.
+    published_pct : array
+        The same where it tells the gauge's count; NaN elsewhere.
     soc_step_pct : float
         Resolution of the published SoC [%].
     step_at : int
         Block before which the published SoC departs most from the count.
+    held_since_s, held_pct : float
+        Stamp since which the last published SoC is held [s], and the charge that flowed since [%];
+        0 if it flowed towards the limit that is shown.
     full : array of int
         Blocks at which a full charge has ended.
     load : array of shape (n, k)
@@ -154,9 +161,12 @@ class Stretch:
     hours: FloatArray
     drawn_pct: FloatArray
     voltage_v: FloatArray
+    shown_pct: FloatArray
     published_pct: FloatArray
     soc_step_pct: float
     step_at: int
+    held_since_s: float
+    held_pct: float
     full: IntArray
     load: FloatArray
     prediction: Any
@@ -164,6 +174,12 @@ class Stretch:
     level_v: FloatArray
     whiten_voltage: list[Whitening]
     whiten_gauge: list[Whitening]
+
+    @property
+    def end(self) -> int | None:
+        """Last block with a published SoC; None without any."""
+        shown = np.flatnonzero(np.isfinite(self.shown_pct))
+        return int(shown[-1]) if shown.size else None
 
 
 class Design(NamedTuple):
@@ -262,18 +278,24 @@ def _stretch(
     stride = max(1, -(-int(block[-1] + 1) // BLOCKS_AT_MOST))
     first = np.flatnonzero(np.diff(block, prepend=-1) > 0)
     rows = np.diff([*first, len(log)])
+    used = np.unique([*range(0, len(first), stride), len(first) - 1])
 
     def mean(values: FloatArray) -> FloatArray:
         sums = np.add.reduceat(values, first, axis=0)
-        return np.asarray((sums.T / rows).T[::stride])
+        return np.asarray((sums.T / rows).T[used])
 
     drawn = 50.0 - prediction.soc_pct
     drawn_pct = mean(drawn)
-    counts = np.split(_usable(published_pct(log), step_pct) + drawn, first[1:])[::stride]
-    # The median: a jump within a block stays one jump.
-    published = np.array([_median(count) for count in counts]) - drawn_pct
-    count = published + drawn_pct
-    change = np.abs(np.diff(count, prepend=count[:1]))
+
+    def median(published: FloatArray) -> FloatArray:
+        # Of the count, not its mean: a jump within a block stays one jump.
+        counts = np.split(published + drawn, first[1:])
+        return np.array([_median(counts[block]) for block in used]) - drawn_pct
+
+    shown = published_pct(log)
+    published = median(_telling(shown, drawn, step_pct))
+    at, change = count_changes(published, drawn_pct)
+    held_since_s, held_pct = _held(log.time_s, shown, drawn)
     hours, voltage = mean(elapsed_s) / 3600.0, mean(signals.voltage_v)
     settled_v = np.where(hours * 3600.0 < SETTLING_S, np.nan, voltage)
     load = model.voltage_model().load_columns(
@@ -304,9 +326,12 @@ def _stretch(
         hours=hours,
         drawn_pct=drawn_pct,
         voltage_v=settled_v,
+        shown_pct=median(shown),
         published_pct=published,
         soc_step_pct=step_pct,
-        step_at=int(np.nanargmax(change)) if np.isfinite(change).any() else 0,
+        step_at=int(at[np.argmax(np.abs(change))]) if at.size else 0,
+        held_since_s=held_since_s,
+        held_pct=held_pct,
         full=_full_charges(mean(signals.current_a), voltage, model),
         load=mean(np.asarray(load)),
         prediction=of_blocks,
@@ -317,28 +342,54 @@ def _stretch(
     )
 
 
-def _usable(published: FloatArray, step_pct: float) -> FloatArray:
-    """Return the published SoC where it is a count: not at its limits, a coarse one at its changes.
+def count_changes(published: FloatArray, drawn_pct: FloatArray) -> tuple[IntArray, FloatArray]:
+    """Return the blocks with a published SoC after another one, and the change of the count [%]."""
+    known = np.flatnonzero(np.isfinite(published))
+    return known[1:], np.diff((published + drawn_pct)[known])
 
-    A coarse SoC is half-way at its changes, or is used at its first row if there are none.
+
+def _telling(shown: FloatArray, drawn_pct: FloatArray, step_pct: float) -> FloatArray:
+    """Return the published SoC at the rows at which it tells the gauge's count; NaN elsewhere [%].
+
+    A coarse SoC that changes by one step is half-way between two. It is known to half a step where
+    it changes by more, at its first and last row, and whenever charge of two further steps has
+    flowed without a change. A limit is not a count, unless nothing else is shown.
     """
-    if step_pct >= COARSE_PCT:
-        fine = np.full_like(published, np.nan)
-        known = np.flatnonzero(np.isfinite(published))
-        value = published[known]
-        change = np.flatnonzero(np.diff(value) != 0.0)
-        fine[known[change + 1]] = 0.5 * (value[change] + value[change + 1])
-        if not change.size:
-            fine[known[:1]] = value[:1]
-        published = fine
-    is_count = (published > PEGGED_PCT) & (published < 100.0 - PEGGED_PCT)
-    return np.where(is_count, published, np.nan)
+    told, known = shown, np.flatnonzero(np.isfinite(shown))
+    if step_pct >= COARSE_PCT and known.size:
+        value, drawn = shown[known], drawn_pct[known]
+        change = np.diff(value, prepend=value[0])
+        is_change = change != 0.0
+        held = np.cumsum(is_change)  # number of the value that is held
+        since = np.flatnonzero(np.diff(held, prepend=-1))[held]
+        steps = np.floor(np.abs(drawn - drawn[since]) / (2.0 * step_pct))
+        most = np.maximum.accumulate(held * (1.0 + steps.max()) + steps)
+        tells = np.diff(most, prepend=-1.0) > 0.0
+        tells[-1] = True
+        is_crossing = np.round(np.abs(change) / step_pct) == 1.0
+        told = np.full_like(shown, np.nan)
+        told[known[tells]] = (value - np.where(is_crossing, 0.5 * change, 0.0))[tells]
+    is_count = (told > PEGGED_PCT) & (told < 100.0 - PEGGED_PCT)
+    return np.where(is_count, told, np.nan) if is_count.any() else told
+
+
+def _held(time_s: FloatArray, shown: FloatArray, drawn_pct: FloatArray) -> tuple[float, float]:
+    """Return since when the last published SoC is held [s], and what charge flowed since [%]."""
+    known = np.flatnonzero(np.isfinite(shown))
+    if not known.size:
+        return float(time_s[-1]), 0.0
+    changes = np.flatnonzero(np.diff(shown[known]))
+    first, last = known[changes[-1] + 1 if changes.size else 0], known[-1]
+    flowed = float(drawn_pct[last] - drawn_pct[first])
+    limit = PEGGED_PCT if flowed > 0.0 else 100.0 - PEGGED_PCT
+    is_limited = (shown[last] - limit) * flowed <= 0.0
+    return float(time_s[first]), 0.0 if is_limited else abs(flowed)
 
 
 def _median(values: FloatArray) -> float:
-    """Return the median of the known values; NaN without any."""
+    """Return the median of the known values, of two the later; NaN without any."""
     known = values[np.isfinite(values)]
-    return float(np.median(known)) if known.size else np.nan
+    return float(np.median(known[-1:] if known.size == 2 else known)) if known.size else np.nan
 
 
 def _full_charges(current_a: FloatArray, voltage_v: FloatArray, model: Model) -> IntArray:

@@ -7,6 +7,7 @@ from dataclasses import replace
 from typing import Any, Final
 
 import numpy as np
+from scipy.special import ndtr
 from threadpoolctl import threadpool_limits
 
 from cangauge._typing import FloatArray
@@ -29,6 +30,7 @@ from cangauge.extras.judge.result import (
     Judgement,
     Size,
     Verdict,
+    standing,
 )
 from cangauge.extras.judge.weak import WeakestCell, weak_cell
 from cangauge.logs.gaps import discharged_ah
@@ -40,7 +42,8 @@ from cangauge.model.prior import ChemistryName
 __all__ = ["Judgement", "judge", "narrowed"]
 
 ALARM: Final = 0.05
-"""The gauge is off where the probability that it is right is at most this, as in `gap`."""
+"""The gauge is off where the probability that it is right, or that no log ends with an error above
+`USEFUL_PCT`, is at most this, as in `gap`."""
 NAMED: Final = 0.6
 """A cause is named from this probability among all answers but `none`, as in `gap`."""
 FITTED_STD_PCT: Final = 1.5
@@ -123,7 +126,7 @@ def judge(
         weakest = _weakest(judged, cell_voltages, pack, chain, answers)
     if weakest is not None:
         answers.append(_of_weak_cell(answers[0], weakest))
-    return _judgement(judged, pack, chain, answers, weakest)
+    return _judgement(judged, pack, chain, answers, weakest, zero_std_pct=zero_std_pct)
 
 
 def _capacity_ah(logs: Sequence[Log]) -> float:
@@ -186,8 +189,13 @@ def _judgement(
     chain: Chain,
     answers: Sequence[Explanation],
     weakest: WeakestCell | None,
+    *,
+    zero_std_pct: float,
 ) -> Judgement:
-    """Return what all answers together say, each by its probability."""
+    """Return what all answers together say, each by its probability.
+
+    `zero_std_pct` is that of the gauge's own zero, which a right gauge may have [% SoC].
+    """
     stretches = chain.stretches
     scores = np.array([answer.log_evidence for answer in answers])
     share = np.exp(scores - scores.max())
@@ -195,7 +203,7 @@ def _judgement(
     probabilities = {answer.name: float(p) for answer, p in zip(answers, share, strict=True)}
     corrected = [np.full(len(log), np.nan) for log in logs]
     std = [np.full(len(log), np.nan) for log in logs]
-    errors, deviations = [], []
+    errors, deviations, useful = [], [], 1.0
     for k, part in enumerate(stretches):
         track = _mixture([answer.tracks[k] for answer in answers], share)
         time_s = logs[part.log].time_s
@@ -204,20 +212,29 @@ def _judgement(
         soc_pct = np.interp(at, part.time_s, track.soc_pct)
         corrected[part.log][first:last] = np.clip(soc_pct, 0.0, 100.0)
         std[part.log][first:last] = np.interp(at, part.time_s, track.std_pct)
-        errors.append(part.published_pct - track.soc_pct)
+        error = part.shown_pct - np.clip(track.soc_pct, 0.0, 100.0)
+        if part.end is not None:
+            deviation = float(np.hypot(track.std_pct[part.end], zero_std_pct))
+            useful = min(useful, _within_useful(float(error[part.end]), deviation))
+        errors.append(error)
         deviations.append(track.std_pct)
-    error, deviation = np.concatenate(errors), np.concatenate(deviations)
+    error, std_at = np.concatenate(errors), np.concatenate(deviations)
     end = int(np.flatnonzero(np.isfinite(error))[-1])
-    worst = int(np.nanargmax(np.abs(error) / deviation))
-    verdict: Verdict = "agrees" if 2.0 * deviation[end] <= USEFUL_PCT else "cannot_tell"
+    worst = int(np.nanargmax(np.abs(error) / std_at))
+    if useful <= ALARM < probabilities["none"]:  # no answer explains the error
+        probabilities["unknown"] += probabilities["none"] - useful
+        probabilities["none"] = useful
+    verdict: Verdict = "agrees" if 2.0 * std_at[end] <= USEFUL_PCT else "cannot_tell"
     cause = Cause("none", probabilities["none"])
     if probabilities["none"] <= ALARM:
-        verdict, cause = "off", _cause(answers, probabilities)
+        verdict, cause = "off", Cause("unknown", probabilities["unknown"])
+        if standing(stretches) is None:  # no cause is a gauge that stands still
+            cause = _cause(answers, probabilities)
     return Judgement(
         logs,
         model,
         float(error[end]),
-        float(deviation[end]),
+        float(std_at[end]),
         float(error[worst]),
         verdict,
         cause,
@@ -225,9 +242,14 @@ def _judgement(
         corrected,
         std,
         stretches,
-        sorted(answers, key=lambda answer: -answer.log_evidence),
+        sorted(answers, key=lambda answer: -probabilities[answer.name]),
         weakest,
     )
+
+
+def _within_useful(error_pct: float, std_pct: float) -> float:
+    """Return the probability that an error is at most `USEFUL_PCT`, by its estimate and σ [%]."""
+    return float(np.diff(ndtr((np.array([-USEFUL_PCT, USEFUL_PCT]) - error_pct) / std_pct))[0])
 
 
 def _mixture(tracks: Sequence[Track], share: FloatArray) -> Track:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Final, Literal, NamedTuple
 
@@ -11,7 +12,7 @@ from cangauge._text import counted, duration, number
 from cangauge._typing import FloatArray
 from cangauge.extras.judge.causes import UNITS as PACK_UNITS
 from cangauge.extras.judge.causes import Explanation
-from cangauge.extras.judge.chain import Stretch, published_pct
+from cangauge.extras.judge.chain import Stretch, count_changes, published_pct
 from cangauge.extras.judge.weak import WeakestCell
 from cangauge.logs.log import Log
 from cangauge.model.model_file import Model
@@ -91,6 +92,15 @@ class Cause(NamedTuple):
     """Whether it begins at the step within that stretch, not before it."""
 
 
+def standing(chain: Sequence[Stretch]) -> Stretch | None:
+    """Return the stretch that ends with a published SoC that stands still while charge flows.
+
+    Of several, that with the most charge; None without any.
+    """
+    stands = [part for part in chain if part.held_pct >= max(JUMP_PCT, 2.0 * part.soc_step_pct)]
+    return max(stands, key=lambda part: part.held_pct, default=None)
+
+
 @dataclass(frozen=True, eq=False)
 class Judgement:
     """A second opinion on a gauge.
@@ -140,15 +150,14 @@ class Judgement:
         """Jumps of the published SoC within stretches that the charge does not explain."""
         result = []
         for part in self.chain:
-            count = part.published_pct + part.drawn_pct
-            known = np.flatnonzero(np.isfinite(count))
-            change = np.diff(count[known])
+            at, change = count_changes(part.published_pct, part.drawn_pct)
             if not change.size:
                 continue
+            _, moved = count_changes(part.published_pct, np.zeros_like(part.drawn_pct))
             usual = 1.5 * float(np.median(np.abs(change)))
             least = max(JUMP_PCT, SEVERAL * usual, 2.0 * part.soc_step_pct)
-            for k in np.flatnonzero(np.abs(change) >= least):
-                time_s = float(part.time_s[known[k + 1]])
+            for k in np.flatnonzero(np.minimum(np.abs(change), np.abs(moved)) >= least):
+                time_s = float(part.time_s[at[k]])
                 since_s = self.elapsed_s(part.log, time_s)
                 result.append(Jump(part.log, time_s, since_s, float(change[k])))
         return result
@@ -234,7 +243,8 @@ class Judgement:
                 f" imply, and an error of {USEFUL_PCT:g} % would not have been seen."
             )
         if self.verdict == "agrees":
-            return f"The gauge agrees with voltage and charge: difference {error} (1σ)."
+            agrees = f"The gauge agrees with voltage and charge: difference {error} (1σ)."
+            return f"{agrees} {self.stands}".rstrip()
         if self.cause.verdict == "voltage_sensor":
             reads = "and the logged voltage contradict each other"
         elif self.cause.verdict == "weak_cell":
@@ -244,7 +254,19 @@ class Judgement:
             reads = f"reads {number(abs(self.error_pct), 1)} ± {std} % SoC {high}"
         else:
             reads = f"is not right, though its SoC at the end may be ({error})"
-        return f"The gauge {reads}. {self.reason}"
+        return " ".join(filter(None, [f"The gauge {reads}.", self.stands, self.reason]))
+
+    @property
+    def stands(self) -> str:
+        """Since when the published SoC stands still, as a sentence; empty if it does not."""
+        part = standing(self.chain)
+        if part is None or part.end is None:
+            return ""
+        at = number(float(part.shown_pct[part.end]), 1, "%")
+        return (
+            f"The published SoC stands at {at} from {self._moment(part.log, part.held_since_s)} on,"
+            f" while {number(part.held_pct, 1, '%')} of the charge flowed."
+        )
 
     @property
     def reason(self) -> str:
@@ -273,18 +295,27 @@ class Judgement:
         begin = "since before the first log"
         if self.onset is not None:
             log, time_s = self.onset
-            after_s = time_s - self.logs[log].time_s[0]
-            where = f"{duration(after_s)} into" if after_s > 60.0 else "the start of"
-            begin = f"since {where} {self.logs[log].name}"
+            begin = f"since {self._moment(log, time_s)}"
         if self.cause.earliest == self.cause.latest:
             return begin
         first = self.logs[self.chain[self.cause.earliest].log].name
         last = self.logs[self.chain[self.cause.latest].log].name
         return f"{begin} (it may have begun between {first} and {last})"
 
+    def _moment(self, log: int, time_s: float) -> str:
+        """Return a stamp [s] as the time into its log."""
+        after_s = time_s - self.logs[log].time_s[0]
+        where = f"{duration(after_s)} into" if after_s > 60.0 else "the start of"
+        return f"{where} {self.logs[log].name}"
+
     @property
     def next_step(self) -> str:
         """What to do next, and what it settles."""
+        if self.stands and self.cause.size is None and self.verdict != "cannot_tell":
+            return (
+                "See whether the gauge itself stands still, or only what is logged of it, and judge"
+                " again by a log in which its SoC moves."
+            )
         if self.verdict == "agrees":
             return "Nothing. Judge again after a full charge or a drive of 40 % or more."
         if self.verdict == "off":
@@ -314,14 +345,9 @@ class Judgement:
     def jump_rows(self) -> tuple[list[str], list[list[str]]]:
         """Return head and rows of the table of jumps."""
         rows = [
-            [
-                self.logs[jump.log].name,
-                number(jump.since_start_s / 3600.0, 2),
-                number(jump.size_pct, 1),
-            ]
-            for jump in self.jumps
+            [self._moment(jump.log, jump.time_s), number(jump.size_pct, 1)] for jump in self.jumps
         ]
-        return ["log", "hours since the first row", "% SoC"], rows
+        return ["moment", "% SoC"], rows
 
 
 def _digits(unit: str) -> int:
