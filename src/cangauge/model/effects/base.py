@@ -43,7 +43,8 @@ Values = Mapping[str, float]
 Memories = Sequence[Any]
 """What an effect carries from sample to sample: objects such as `Lag`.
 
-Each has `state()` and `restore(state)`. A state is a list of finite numbers."""
+`state()` returns the numbers that one needs to go on, and `restore(state)` takes them. A lag has
+none before the first sample."""
 
 RESISTANCE_AT_LEAST = 0.002
 """Lower limit of the resistance that bounds scale with, as voltage drop at 1 C relative to the
