@@ -173,6 +173,7 @@ def test_state_of_another_model_is_refused() -> None:
         (("counter", "discharged_pct"), None),
         (("memory", "tick"), "noon"),
         (("memory", "weather"), "rain"),
+        (("memory", "first_s"), None),
         (("estimate", 1), 100.1),
         (("estimate", 2), -1.0),
         (("line", "current_a"), [1.0]),

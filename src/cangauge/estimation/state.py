@@ -258,6 +258,8 @@ class EstimatorState(BaseModel):
             raise ValueError("the SoC must lie within 0 … 100 %")
         if self.soc_std_pct < 0.0:
             raise ValueError("the standard deviation of the SoC must not be negative")
+        if self.memory.samples > 0 and math.isnan(self.memory.first_s):
+            raise ValueError("the time of the first sample is missing")
         if len(self.line.time_s) != len(self.line.current_a):
             raise ValueError("the delay line needs one current per time")
         for each in self.hypotheses.filters:
