@@ -121,8 +121,8 @@ class _StepResponse:
 
     def __init__(self, extended: ExtendedModel) -> None:
         self._extended = extended
-        elements = (effect.rc_element(values) for effect, values in extended.effects)
-        own = {*(each[1] for each in elements if each is not None), *extended.model.low_pass_s}
+        of_effects = (effect.rc_tau_s(values) for effect, values in extended.effects)
+        own = {*(tau for tau in of_effects if tau is not None), *extended.model.low_pass_s}
         self._own_tau_s = sorted(tau for tau in own if tau >= FASTEST_S)
         delays = [delay for delay in extended.model.delay_s if delay > 0.0]
         self._last_s = LASTING * max([FASTEST_S, *delays, *self._own_tau_s])

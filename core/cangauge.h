@@ -72,7 +72,6 @@ typedef enum {
 
 typedef struct {
     int32_t kind; /* cg_effect_kind */
-    int32_t lags;
     cg_real value[CG_VALUES]; /* in the order stated above */
     cg_real tau_s[CG_LAGS];
 } cg_effect;

@@ -184,12 +184,6 @@ static PyObject *Core_run(Core *self, PyObject *columns)
     return PyErr_Occurred() ? NULL : Py_NewRef(Py_None);
 }
 
-static PyObject *Core_current_at(Core *self, PyObject *ago)
-{
-    const double ago_s = PyFloat_AsDouble(ago);
-    return PyErr_Occurred() ? NULL : PyFloat_FromDouble(cg_line_at(&self->estimator.line, ago_s));
-}
-
 static PyObject *Core_uncounted_std_pct(Core *self, PyObject *seconds)
 {
     const double given = PyFloat_AsDouble(seconds);
@@ -228,7 +222,6 @@ static PyMethodDef METHODS[] = {
     {"update", (PyCFunction)Core_update, METH_O, "Process one sample, a tuple of four numbers."},
     {"estimate", (PyCFunction)Core_estimate, METH_NOARGS, "Return the latest estimate."},
     {"run", (PyCFunction)Core_run, METH_O, "Step over columns: 4 in, 7 + 2 out."},
-    {"current_at", (PyCFunction)Core_current_at, METH_O, "Return an earlier current [A]."},
     {"uncounted_std_pct", (PyCFunction)Core_uncounted_std_pct, METH_O, "After a silence [%]."},
     {"memory", (PyCFunction)Core_memory, METH_VARARGS, "Return the memory of a part."},
     {NULL, NULL, 0, NULL},

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import json
 import math
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 import pytest
 
 from cangauge.errors import InputError
+from cangauge.estimation.compiled import make_estimator
 from cangauge.estimation.estimator import Estimator
 from cangauge.estimation.offline import samples_of
 from cangauge.estimation.settings import EstimatorSettings, FullCharge, LongRest
@@ -170,6 +172,10 @@ def test_state_of_another_model_is_refused() -> None:
         (("hypotheses", "filters", 0, "x", 0), "nan"),
         (("counter", "discharged_pct"), None),
         (("memory", "tick"), "noon"),
+        (("memory", "weather"), "rain"),
+        (("memory", "first_s"), None),
+        (("estimate", 1), 100.1),
+        (("estimate", 2), -1.0),
         (("line", "current_a"), [1.0]),
         (("reasons",), -1),
         (("estimate",), [0.0]),
@@ -187,6 +193,62 @@ def test_state_of_another_shape_is_refused(part: tuple[Any, ...], value: object)
     at[part[-1]] = value
     with pytest.raises((InputError, ValueError)):
         Estimator(PLAIN).restore(EstimatorState.model_validate(data))
+
+
+@pytest.mark.parametrize("make", [Estimator, make_estimator])
+@pytest.mark.parametrize(
+    ("effect_id", "places"),
+    [
+        ("time_skew", (0, 1, 3, -1)),  # the number of readings that wait, a time, a voltage
+        ("core_temperature", (0, 1, 5)),
+        ("hysteresis", (0, 2)),
+        ("resistance_step", (0,)),
+    ],
+)
+def test_damaged_state_of_an_effect_is_refused(
+    make: Any, effect_id: str, places: Sequence[int]
+) -> None:
+    model = extended_by([effect_id])
+    estimator = make(model)
+    for sample in EVENTFUL[:300]:
+        estimator.step(sample)
+    state = estimator.snapshot()
+    currents, numbers = state.online
+    damaged = [[*numbers, 1.0]]
+    for place in places:
+        damaged.append(list(numbers))
+        damaged[-1][place] = math.inf
+    damaged.append([math.nan, *numbers[1:]])
+    for each in damaged:
+        with pytest.raises(InputError, match=r"^effects\.0: the saved state is "):
+            make(model).restore(state.model_copy(update={"online": [currents, each]}))
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda numbers: [numbers[0] + 1.0, *numbers[1:]],
+        lambda numbers: [numbers[0], numbers[1] + 1e6, *numbers[2:]],
+        lambda numbers: [*numbers[:5], numbers[5] + 0.01, *numbers[6:]],
+        lambda numbers: [*numbers[:9], numbers[9] + 1e6, *numbers[10:]],
+    ],
+    ids=[
+        "another number waits",
+        "waiting times turn",
+        "the last has no current",
+        "times of currents turn",
+    ],
+)
+def test_readings_that_wait_are_in_order(change: Any) -> None:
+    model = extended_by(["time_skew"])
+    estimator = Estimator(model)
+    for sample in EVENTFUL[:300]:
+        estimator.step(sample)
+    state = estimator.snapshot()
+    assert state.online[1][0] == 2.0
+    online = [state.online[0], change(state.online[1])]
+    with pytest.raises(InputError, match=r"^effects\.0: the saved state is damaged"):
+        Estimator(model).restore(state.model_copy(update={"online": online}))
 
 
 def test_state_with_the_doubt_of_an_earlier_version_continues() -> None:

@@ -34,7 +34,7 @@ from synthetic import synthetic_log
 PLAIN = leaf_2012_model_file()
 EFFECTS = [
     "current_offset", "voltage_gain", "time_skew", "core_temperature", "resistance_temperature",
-    "resistance_soc", "charge_transfer", "slow_diffusion", "hysteresis", "weak_cell",
+    "resistance_soc", "charge_transfer", "slow_diffusion", "hysteresis",
 ]  # fmt: skip
 STRICT = ["-std=c99", "-Wall", "-Wextra", "-Wconversion", "-Werror", "-ffp-contract=off"]
 
@@ -301,8 +301,9 @@ def test_a_file_in_place_of_the_folder_is_refused(tmp_path: Path) -> None:
     PLAIN.save(tmp_path / "pack.json")
     (tmp_path / "ecm.py").write_text("kept")
     arguments = ["export-c", "-m", str(tmp_path / "pack.json"), "-o", str(tmp_path / "ecm.py")]
-    with pytest.raises(InputError, match="File exists"):
+    with pytest.raises(InputError, match="this folder cannot be made: File exists") as error:
         CliRunner().invoke(app, arguments, catch_exceptions=False)
+    assert (error.value.field, error.value.value) == ("--output", arguments[-1])
     assert (tmp_path / "ecm.py").read_text() == "kept"
 
 

@@ -11,7 +11,7 @@ from test_fit import CELLS
 
 from cangauge.errors import InputError
 from cangauge.identify.fit import fit
-from cangauge.identify.starts import start_by_model
+from cangauge.identify.starts import find_starts, start_by_model
 from cangauge.logs.log import Log
 from cangauge.logs.read import read_log
 from cangauge.model.coulomb_counting import (
@@ -20,6 +20,7 @@ from cangauge.model.coulomb_counting import (
     difference_from_reference,
     discharged_ah,
 )
+from cangauge.model.prior import CHEMISTRIES
 from cangauge.model.published import CAPACITY_AH
 from synthetic import synthetic_log
 
@@ -38,6 +39,13 @@ def trip(start_pct: float, end_pct: float, seed: int, hours: float = 0.5) -> Log
         model=CELLS,
         name=f"t{seed}",
     )
+
+
+def joined(first: Log, later: Log) -> Log:
+    """Return the rows of two logs as one, of the name of the first."""
+    names = ("time_s", "current_a", "voltage_v", "temperature_c", "soc_pct")
+    columns = {n: np.concatenate([getattr(first, n), getattr(later, n)]) for n in names}
+    return replace(first, **columns)
 
 
 def test_unknown_start_is_refused_with_the_cure() -> None:
@@ -78,6 +86,16 @@ def test_one_stated_start_pins_the_others() -> None:
     found = fit(logs, capacity_ah=CAPACITY_AH, initial_soc_pct=[90.0, None])
     assert [start.origin for start in found.starts] == ["given", "estimated"]
     assert found.starts[1].soc_pct == pytest.approx(75.0, abs=1.0)
+
+
+def test_a_stated_start_is_that_of_the_first_piece_alone() -> None:
+    first, later = trip(90.0, 60.0, 1), trip(80.0, 50.0, 2)
+    charged_s = first.time_s[-1] - later.time_s[0] + 7200.0
+    log = joined(first, replace(later, time_s=later.time_s + charged_s))
+    found = find_starts([log], [88.0], CAPACITY_AH, CHEMISTRIES["oxide"])
+    assert [piece.name for piece in found.pieces] == ["t1 part 1", "t1 part 2"]
+    assert [start.origin for start in found.starts] == ["given", "log"]
+    assert [start.soc_pct for start in found.starts] == pytest.approx([88.0, 80.0], abs=0.1)
 
 
 def test_partial_trip_is_no_full_discharge() -> None:

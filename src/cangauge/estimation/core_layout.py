@@ -52,7 +52,7 @@ def _structure(fields: str, **nested: np.dtype[Any]) -> np.dtype[Any]:
     return np.dtype(found, align=True)
 
 
-EFFECT: Final = _structure("i:kind i:lags d:value[VALUES] d:tau_s[LAGS]")
+EFFECT: Final = _structure("i:kind d:value[VALUES] d:tau_s[LAGS]")
 MODEL: Final = _structure(
     "d:ocv_v[OCV] d:epsilon d:slope_beyond[2] i:knots d:knot_pct[KNOTS] d:knot_v[KNOTS]"
     " d:knot_slope[KNOTS] d:t_ref_c d:temperature_limits_c[2] i:delays d:delay_s[DELAYS]"
@@ -181,7 +181,7 @@ def model_constants(
     of["functions"], of["function_knots"] = functions.number, functions.soc_pct.size
     of["effects"] = len(forms)
     for effect, form in zip(of["effect"], forms, strict=False):
-        effect["kind"], effect["lags"] = KINDS.index(form.kind), len(form.tau_s)
+        effect["kind"] = KINDS.index(form.kind)
         _fill(effect, value=form.values, tau_s=form.tau_s)
         if form.kind == "time_skew":
             of["skew_s"] = form.values[0]

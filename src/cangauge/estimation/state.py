@@ -175,12 +175,9 @@ class HypothesesState:
 
 @dataclass
 class EstimatorMemory:
-    """State of the `Estimator` itself; NaN: not known, or never.
+    """State of the `Estimator` itself; NaN: not known, or never."""
 
-    Files of earlier versions have a further field, `doubt`, which nothing reads.
-    """
-
-    __pydantic_config__: ClassVar[Any] = ConfigDict(extra="ignore")
+    __pydantic_config__: ClassVar[Any] = _NO_MORE
     samples: _Count = 0
     """Accepted samples."""
     resets: _Count = 0
@@ -229,6 +226,13 @@ class EstimatorMemory:
     is_rested: _Flag = False
 
 
+def _without_doubt(memory: object) -> object:
+    """Return a memory without `doubt`, a field of earlier versions that nothing reads."""
+    if not isinstance(memory, dict):
+        return memory
+    return {name: value for name, value in memory.items() if name != "doubt"}
+
+
 class EstimatorState(BaseModel):
     """Everything in an `Estimator` but its model and settings."""
 
@@ -243,17 +247,21 @@ class EstimatorState(BaseModel):
     """State of the voltage model: low-passed currents, then each effect."""
     block: BlockState
     hypotheses: HypothesesState
-    memory: EstimatorMemory
+    memory: Annotated[EstimatorMemory, BeforeValidator(_without_doubt)]
     estimate: Annotated[list[_MaybeNan], Field(min_length=7, max_length=7)]
     """Numbers of the last `Estimate`, in its order, from `time_s` to `residual_v`."""
     reasons: Annotated[int, Field(strict=True, ge=0, lt=2 * max(Reason))]
 
     @model_validator(mode="after")
-    def _check_shapes(self) -> Self:
-        if len(self.line.time_s) != len(self.line.current_a):
-            raise ValueError("the delay line needs one current per time")
+    def _check(self) -> Self:
+        if not (math.isnan(self.soc_pct) or 0.0 <= self.soc_pct <= 100.0):
+            raise ValueError("the SoC must lie within 0 … 100 %")
         if self.soc_std_pct < 0.0:
             raise ValueError("the standard deviation of the SoC is negative")
+        if self.memory.samples > 0 and math.isnan(self.memory.first_s):
+            raise ValueError("the time of the first sample is missing")
+        if len(self.line.time_s) != len(self.line.current_a):
+            raise ValueError("the delay line needs one current per time")
         for each in self.hypotheses.filters:
             for matrix in (each.p, each.bias.p, each.bias.v):
                 if len({len(row) for row in matrix}) != 1:

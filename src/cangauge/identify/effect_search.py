@@ -335,9 +335,9 @@ def offered(effect_ids: Sequence[str], model: ExtendedModel) -> list[EffectCandi
 
 
 def _repeats_a_low_pass(item: EffectCandidate) -> bool:
-    element = item.effect.rc_element(item.values(item.steps))
-    return element is not None and any(
-        max(element[1] / tau_s, tau_s / element[1]) <= TAU_RATIO for tau_s in LOW_PASS_S
+    own_s = item.effect.rc_tau_s(item.values(item.steps))
+    return own_s is not None and any(
+        max(own_s / tau_s, tau_s / own_s) <= TAU_RATIO for tau_s in LOW_PASS_S
     )
 
 

@@ -387,19 +387,20 @@ class OnlineModel:
         Raises
         ------
         InputError
-            If the state does not belong to this model or is malformed; names the effect.
+            If the state does not belong to this model, or is damaged. Names the effect.
         """
         if len(state) != 1 + len(self._contexts):
             raise InputError(f"the model has {len(self._contexts)} effects", field="effects")
-        for number, (memory, saved) in enumerate(
-            zip([self.lags, *(at.memory for at in self._contexts)], state, strict=True)
-        ):
+        effects = (f"effects.{number}" for number in range(len(self._contexts)))
+        memories = [self.lags, *(at.memory for at in self._contexts)]
+        for part, memory, saved in zip(["low_pass", *effects], memories, state, strict=True):
             size = LAG_NUMBERS if len(memory) > 1 else len(saved)  # several are lags
             numbers = iter(saved)
             try:
                 for item in memory:
                     item.restore(list(islice(numbers, size)))
-                if next(numbers, None) is not None:
-                    raise InputError("longer than the state of this effect", field="effects")
-            except (ValueError, TypeError, IndexError) as error:
-                raise InputError(str(error), field=f"effects.{number - 1}") from error
+                is_whole = next(numbers, None) is None
+            except (ValueError, TypeError):
+                is_whole = False
+            if not is_whole:
+                raise InputError("the saved state is damaged, or of another model", field=part)

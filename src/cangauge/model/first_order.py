@@ -110,10 +110,10 @@ class Lag:
         return [] if self._last is None else [*self._last]
 
     def restore(self, state: Sequence[float]) -> None:
-        """Continue from a saved state; raise ValueError if it has another length."""
+        """Continue from a saved state; raise ValueError if it is none."""
         self._last = None
         if state:
-            time_s, latest, value = state
+            time_s, latest, value = finite(state)
             self._last = time_s, latest, value
 
 
@@ -152,10 +152,17 @@ class First:
         return [] if self._first_s is None else [self._first_s]
 
     def restore(self, state: Sequence[float]) -> None:
-        """Continue from a saved state; raise ValueError if it has another length."""
+        """Continue from a saved state; raise ValueError if it is none."""
         self._first_s = None
         if state:
-            (self._first_s,) = state
+            (self._first_s,) = finite(state)
+
+
+def finite(numbers: Sequence[float]) -> Sequence[float]:
+    """Return the numbers; raise ValueError if one is not finite."""
+    if not all(map(math.isfinite, numbers)):
+        raise ValueError("not finite")
+    return numbers
 
 
 def low_passed(

@@ -73,6 +73,9 @@ def test_the_margin_keeps_a_bound_of_zero() -> None:
         ([OFFSET | {"note": ""}], "effects.0", "parameters only"),
         ([{"id": "gremlin", "parameters": {}}], "effects.0.id", "known are current_offset"),
         ([{"id": ["x"], "parameters": {}}], "effects.0.id", "unknown effect"),
+        ([{"id": "inner_temperature", "parameters": {"tau_s": 400.0}}], "effects.0.id",
+         "^effects.0.id: inner_temperature is an effect of an earlier version; fit again$"),
+        ([OFFSET, {"id": "ocv_shape", "parameters": {}}], "effects.1.id", "fit again"),
         ([OFFSET, OFFSET], "effects.1.id", "twice"),
         ([OFFSET | {"parameters": {}}], "effects.0.parameters", "offset_a"),
         ([OFFSET | {"parameters": [1]}], "effects.0.parameters", "offset_a"),
@@ -90,16 +93,27 @@ def test_bad_entries_name_the_field(entries: list[object], field: str, words: st
     assert error.value.field == field
 
 
-def test_retired_parameters_of_earlier_versions_may_be_zero() -> None:
-    effects = [(LIBRARY["slow_diffusion"], middle(LIBRARY["slow_diffusion"]))]
-    entries = effect_entries(effects)
-    for spread, is_refused in ((0.0, False), (0.5, True)):
-        earlier = [entries[0] | {"parameters": effects[0][1] | {"spread": spread}}]
-        if is_refused:
-            with pytest.raises(InputError, match="slow_diffusion has the parameters"):
-                parse_effects(earlier, PACK)
-        else:
-            assert parse_effects(earlier, PACK) == effects
+@pytest.mark.parametrize(
+    ("effect_id", "name"),
+    [
+        ("resistance_temperature", "lag_s"),
+        ("entropic_coefficient", "lag_s"),
+        ("slow_diffusion", "spread"),
+    ],
+)
+def test_a_parameter_of_earlier_versions_must_be_zero(effect_id: str, name: str) -> None:
+    values = middle(LIBRARY[effect_id])
+
+    def parsed(value: object) -> object:
+        return parse_effects([{"id": effect_id, "parameters": values | {name: value}}], PACK)
+
+    for zero in (0.0, 0):
+        assert parsed(zero) == [(LIBRARY[effect_id], values)]
+    for value in (600.0, False, None, "0"):
+        with pytest.raises(InputError, match=r"of an earlier version.*fit again") as error:
+            parsed(value)
+        assert error.value.field == f"effects.0.parameters.{name}"
+        assert error.value.value == value
 
 
 def test_an_unknown_id_lists_the_known_ones() -> None:

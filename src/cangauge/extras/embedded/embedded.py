@@ -13,6 +13,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
+import numpy as np
+
 from cangauge._files import text_sha256, write_texts_atomic
 from cangauge._resources import shared_file
 from cangauge._version import __version__
@@ -86,8 +88,9 @@ def export_c(
     Raises
     ------
     InputError
-        If the core lacks one of the model's effects, a file of the same name in the folder is not
-        of an export, or the folder cannot be made.
+        If the core lacks one of the model's effects.
+        If the folder has a file of the same name that is not of an export.
+        If the folder cannot be made.
     """
     model = TabulatedModel.of(model)
     constants = exported_constants(model)
@@ -117,7 +120,8 @@ def export_c(
         for parent in {(folder / name).parent for name in texts}:
             parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise InputError(f"cannot be made: {error.strerror}", source=folder) from error
+        problem = f"this folder cannot be made: {error.strerror}"
+        raise InputError(problem, field="--output", value=str(folder)) from error
     write_texts_atomic({folder / name: text for name, text in texts.items()})
     return Exported(folder, tuple(sorted(texts)), 8 * length)
 
@@ -180,14 +184,19 @@ extern const cg_model pack_model;
 
 
 def _golden(model: Model, period_s: float) -> str:
-    """Return the drive of the tests, and what this package estimates on it."""
+    """Return the drive of the tests, and what this package estimates on it.
+
+    A frame holds the numbers rounded to floats, so that both precisions of the core pack the same.
+    """
     reference, publisher = Estimator(model, EstimatorSettings()), SocPublisher()
     rows: list[str] = []
     for sample in drive_with_events(model, period_s):
         found = reference.step(sample)
         flags = int(found.status), f"{int(found.reasons)}U"
-        frame = list(publisher.estimate_frame(found).data)
-        row = [*sample, list(found[1:5]), *flags, frame]
+        packed = np.array(found[1:3], dtype=np.float32).tolist()
+        rounded = found._replace(soc_pct=packed[0], soc_std_pct=packed[1])
+        frame = list(publisher.estimate_frame(rounded).data)
+        row = [*sample, list(found[1:5]), *flags, packed, frame]
         rows.append(f"    {initialiser(row, 'golden')},\n")
     head = f"#define GOLDEN_SAMPLES {len(rows)}\nstatic const golden golden_samples[] = {{\n"
     return f"{head}{''.join(rows)}}};\n"

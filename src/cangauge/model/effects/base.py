@@ -41,8 +41,10 @@ Values = Mapping[str, float]
 """Parameter name → value, in the parameter's unit."""
 
 Memories = Sequence[Any]
-"""What an effect carries from sample to sample: objects such as `Lag`, each with `state()`, numbers
-that begin with a time [s] and are none before the first sample, and `restore(state)`."""
+"""What an effect carries from sample to sample: objects such as `Lag`.
+
+`state()` returns the numbers that one needs to go on, and `restore(state)` takes them. A lag has
+none before the first sample."""
 
 RESISTANCE_AT_LEAST = 0.002
 """Lower limit of the resistance that bounds scale with, as voltage drop at 1 C relative to the
@@ -262,8 +264,8 @@ class Effect:
         (soc_pct, values, model) → factor on `drive` at SoC [%] of shape (n,).
     memory : callable
         (values, pack) → what is carried from sample to sample, before the first one.
-    rc_element : callable
-        (values) → resistance [Ω] and time constant [s] of an RC element; None if it is none.
+    rc_tau_s : callable
+        (values) → time constant of an RC element [s]; None if it is none.
     core_form : callable
         (values, model, pack) → form in the C core; None if it has none.
     scales_drop : bool
@@ -282,7 +284,7 @@ class Effect:
     drive: Callable[[Load, Values, Context], FloatArray | None] = _none
     over_soc: Callable[[FloatArray, Values, VoltageModel], FloatArray | float] = _at_every_soc
     memory: Callable[[Values, Pack], Memories] = lambda *_: ()
-    rc_element: Callable[[Values], tuple[float, float] | None] = _none
+    rc_tau_s: Callable[[Values], float | None] = _none
     core_form: Callable[[Values, VoltageModel, Pack], CoreForm | None] = _none
     scales_drop: bool = False
 

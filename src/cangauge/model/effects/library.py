@@ -20,12 +20,15 @@ LIBRARY: Mapping[str, Effect] = {effect.id: effect for effect in (*CORRECTIONS, 
 LARGEST = 1e30
 """Upper limit of any parameter in a model file, in any unit."""
 
-RETIRED: Mapping[str, tuple[str, ...]] = {
-    "resistance_temperature": ("lag_s",),
-    "entropic_coefficient": ("lag_s",),
-    "slow_diffusion": ("spread",),
+RETIRED = ("inner_temperature", "ocv_shape")
+"""Effects of earlier versions. A model file with one is refused."""
+
+RETIRED_PARAMETERS: Mapping[str, str] = {
+    "resistance_temperature": "lag_s",
+    "entropic_coefficient": "lag_s",
+    "slow_diffusion": "spread",
 }
-"""Effect → parameters of earlier versions, which no search gave another value than 0."""
+"""Effect → parameter of earlier versions. At 0 it changes nothing and is dropped."""
 
 STEP = 0.02
 """Finite-difference step, relative to the width of an amplitude's bounds or to a shape."""
@@ -59,8 +62,8 @@ def parse_effects(entries: Sequence[object], pack: Pack) -> list[tuple[Effect, V
     Raises
     ------
     InputError
-        If an entry is malformed or repeated with the same shape, or a parameter is missing,
-        unknown, not a number or outside its physical bounds; names the field.
+        If an entry is malformed, of an earlier version, or repeated with the same shape. If a
+        parameter is missing, unknown, not a number or outside its physical bounds. Names the field.
     """
     parsed: list[tuple[Effect, Values]] = []
     seen: set[tuple[object, ...]] = set()
@@ -71,6 +74,12 @@ def parse_effects(entries: Sequence[object], pack: Pack) -> list[tuple[Effect, V
                 "an effect has the fields id and parameters only",
                 field=field,
                 value=sorted(map(str, entry)) if isinstance(entry, Mapping) else entry,
+            )
+        if entry["id"] in RETIRED:
+            raise InputError(
+                f"{entry['id']} is an effect of an earlier version",
+                field=f"{field}.id",
+                cure="fit again",
             )
         effect = effect_of(entry["id"], f"{field}.id")
         values = _parse_values(effect, entry["parameters"], pack, f"{field}.parameters")
@@ -102,9 +111,17 @@ def shape_key(effect: Effect, values: Values) -> tuple[object, ...]:
 
 def _parse_values(effect: Effect, given: object, pack: Pack, field: str) -> Values:
     names = [parameter.name for parameter in effect.parameters]
-    if isinstance(given, Mapping):
-        retired = {name for name in RETIRED.get(effect.id, ()) if given.get(name) == 0.0}
-        given = {name: value for name, value in given.items() if name not in retired}
+    retired = RETIRED_PARAMETERS.get(effect.id)
+    if isinstance(given, Mapping) and retired in given:
+        value = given[retired]
+        if isinstance(value, bool) or value != 0.0:
+            raise InputError(
+                "a parameter of an earlier version, which must be 0",
+                field=f"{field}.{retired}",
+                value=value,
+                cure="fit again",
+            )
+        given = {name: each for name, each in given.items() if name != retired}
     if not isinstance(given, Mapping) or set(given) != set(names):
         raise InputError(
             f"{effect.id} has the parameters {', '.join(names)}",

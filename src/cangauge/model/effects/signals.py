@@ -23,7 +23,7 @@ from cangauge.model.effects.base import (
     Signals,
     Values,
 )
-from cangauge.model.first_order import Lag
+from cangauge.model.first_order import Lag, finite
 
 SMOOTHING_S: Final = 200.0
 """Time constant of the smoothed derivative [s]: short against the warming of a pack, long against
@@ -96,9 +96,17 @@ class _Waiting:
         return [float(self._waiting.shape[1]), *waiting, *self._currents.ravel().tolist()]
 
     def restore(self, state: Sequence[float]) -> None:
-        readings = 4 * int(state[0])
-        self._waiting = np.array(state[1 : 1 + readings]).reshape(-1, 4).T
-        self._currents = np.array(state[1 + readings :]).reshape(2, -1)
+        """Continue from a saved state; raise ValueError if it is none."""
+        count = int(*finite(state[:1]))
+        readings = np.array(state[1 : 1 + 4 * count]).reshape(count, 4)
+        currents = np.array(state[1 + 4 * count :]).reshape(2, -1)
+        finite([*readings[:, :2].ravel(), *currents.ravel()])  # the others may be missing
+        waiting_s, times_s = readings[:, 0], currents[0]
+        is_in_order = (np.diff(waiting_s) > 0.0).all() and (np.diff(times_s) > 0.0).all()
+        ends_together = count == 0 or np.array_equal(waiting_s[-1:], times_s[-1:])
+        if np.isinf(readings).any() or not (is_in_order and ends_together):
+            raise ValueError("not readings that wait and their currents")
+        self._waiting, self._currents = readings.T, currents
 
 
 def _time_skew(signals: Signals, _: Values, at: Context) -> Signals:

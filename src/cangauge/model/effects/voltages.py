@@ -99,7 +99,7 @@ def _rc_form(values: Values, model: VoltageModel, _: Pack) -> CoreForm:
 
 _RC: Final[Mapping[str, Any]] = {
     "memory": lambda v, _: (Lag(v["tau_s"], 0.0, rest_s=BRIDGE_S),),
-    "rc_element": lambda v: (v["ohm"], v["tau_s"]),
+    "rc_tau_s": lambda v: v["tau_s"],
     "drive": _rc_voltage,
     "core_form": _rc_form,
 }
