@@ -349,7 +349,7 @@ def test_overflow_signals_and_a_bus_that_is_down(tmp_path: Path) -> None:
     assert result["frames"]["received"] + drops == burst
     assert result["stamps"] == "kernel"
     assert result["bus_counts"]["losses"] == 1
-    assert f"{drops} dropped in the receive queue" in ended.err
+    assert f"{drops} frames dropped in the receive queue" in ended.err
 
 
 def _wait_until_worked_off() -> None:
