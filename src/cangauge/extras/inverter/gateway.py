@@ -84,7 +84,7 @@ class Gateway(Output):
         # A single interval may be a gap: from the third sample on the period is known.
         self._sampled_s, self._interval_s, self._current_until_s = math.inf, -math.inf, -math.inf
         self._soc: tuple[float, float] | None = None  # [%], and until when it is confirmed
-        self._without_fd: list[ReconnectingBus] = []  # told in the log, each once
+        self._without_fd: list[ReconnectingBus] = []  # already logged
         self._done = threading.Event()
         self._replaces: bool | None = None
         self._thread = threading.Thread(target=self._run, name="cangauge-inverter", daemon=True)

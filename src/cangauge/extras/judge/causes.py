@@ -374,7 +374,7 @@ class Answer:
         return tracks, theta[functions], V[functions, functions]
 
     def _weighed(self, point: Point) -> Weighed:
-        """Return the signatures at a size of the noise; stretches may stray if that is likelier."""
+        """Weigh the signatures; stretches get a larger noise where that raises the evidence."""
         usual = [point[1]] * len(self._stretches)
         weighed = self._at(point, usual)
         best = self._signatures[int(np.argmax(weighed.log_evidence))].columns

@@ -37,8 +37,8 @@ principal functions c [-]; the residual stands last."""
 BLOCK_S: Final = 30.0
 """Length of a block of samples whose means are used [s], as in the filter."""
 BLOCKS_AT_MOST: Final = 240
-"""Blocks of a stretch; of a longer one every k-th and the last is used: over minutes the slow error
-of the voltage (300 s) hides what more blocks could tell."""
+"""Most blocks used of a stretch; a longer one is thinned to every k-th block and its last. The
+voltage error is correlated over 300 s, so denser blocks would add little information."""
 PARTED_S: Final = 600.0
 """Interval without samples that ends a stretch [s]: the car may have been charged or driven."""
 SHORTEST_S: Final = 240.0
@@ -48,7 +48,7 @@ SETTLING_S: Final = 90.0
 SOC_NOISE_PCT: Final = 0.05
 """Noise of the published SoC beside its steps [%]: rounding in the gauge and time of sending."""
 COARSE_PCT: Final = 0.2
-"""From this step on only rows are used at which the published SoC tells the gauge's count [%]."""
+"""Resolution from which the published SoC is used only at the rows that `_observed` selects [%]."""
 PEGGED_PCT: Final = 0.05
 """A published SoC as close to 0 or 100 % is a limit, not a count [%]."""
 FULL_STD_PCT: Final = 1.5
@@ -73,7 +73,7 @@ than left-out logs did."""
 
 
 class GaugeNoise(NamedTuple):
-    """How far a healthy gauge strays from the charge, as standard deviations."""
+    """Errors of a healthy gauge relative to counted charge, as standard deviations."""
 
     walk_pct: float
     """Random walk in an hour [%]."""
@@ -91,8 +91,8 @@ GAUGES: Final = (
     GaugeNoise(0.5, 1.0, 10.0, 1.5),
     GaugeNoise(1.5, 3.0, 30.0, 3.0),
 )
-"""From a pure counter (a BMW i3's) to a gauge that follows the voltage (`batic_car1`'s). Which one
-it is, the logs tell; a gauge that does not count is not held to the count."""
+"""From a pure counter (a BMW i3's) to a gauge that follows the voltage (`batic_car1`'s). The
+logs select one, so that a gauge that follows the voltage is not expected to match the charge."""
 
 
 class Whitening(NamedTuple):
@@ -134,7 +134,7 @@ class Stretch:
     shown_pct : array
         Published SoC; NaN where there is none.
     published_pct : array
-        The same where it tells the gauge's count; NaN elsewhere.
+        The same at the rows that are used; NaN elsewhere.
     soc_step_pct : float
         Resolution of the published SoC [%].
     step_at : int
@@ -293,7 +293,7 @@ def _stretch(
         return np.array([_median(counts[block]) for block in used]) - drawn_pct
 
     shown = published_pct(log)
-    published = median(_telling(shown, drawn, step_pct))
+    published = median(_observed(shown, drawn, step_pct))
     at, change = count_changes(published, drawn_pct)
     held_since_s, held_pct = _held(log.time_s, shown, drawn)
     hours, voltage = mean(elapsed_s) / 3600.0, mean(signals.voltage_v)
@@ -348,8 +348,8 @@ def count_changes(published: FloatArray, drawn_pct: FloatArray) -> tuple[IntArra
     return known[1:], np.diff((published + drawn_pct)[known])
 
 
-def _telling(shown: FloatArray, drawn_pct: FloatArray, step_pct: float) -> FloatArray:
-    """Return the published SoC at the rows at which it tells the gauge's count; NaN elsewhere [%].
+def _observed(shown: FloatArray, drawn_pct: FloatArray, step_pct: float) -> FloatArray:
+    """Return the published SoC at the rows that are used, NaN elsewhere [%].
 
     A coarse SoC that changes by one step is half-way between two. It is known to half a step where
     it changes by more, at its first and last row, and whenever charge of two further steps has
