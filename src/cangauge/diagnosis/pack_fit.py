@@ -14,9 +14,9 @@ from scipy.interpolate import PchipInterpolator
 from scipy.signal import lfilter
 
 from cangauge._typing import BoolArray, FloatArray
+from cangauge.identify.rows import dequantize
 from cangauge.logs.gaps import bridge_s
 from cangauge.logs.log import Log
-from cangauge.logs.resample import dequantize
 from cangauge.model.coulomb_counting import soc_at_first_row
 
 KNOTS = np.array([-12, 0, 2, 4, 6, 8, 10, *range(15, 101, 5), 112], float)

@@ -30,9 +30,8 @@ from cangauge.identify.least_squares import (
     solve,
     solve_without,
 )
-from cangauge.identify.rows import FitRows
+from cangauge.identify.rows import FitRows, dequantize
 from cangauge.logs.log import Log
-from cangauge.logs.resample import dequantize
 from cangauge.model.effects.base import Effect, Load, Signals, Values
 from cangauge.model.effects.library import LIBRARY, EffectCandidate, candidates, effect_of
 from cangauge.model.extended import ExtendedModel, Prediction

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from cangauge.identify.rows import dequantize
 from cangauge.logs.log import Log
-from cangauge.logs.resample import dequantize, usual_step_k
 
 FloatArray = NDArray[np.float64]
 
@@ -54,9 +54,3 @@ def test_a_fine_or_constant_temperature_stays_what_it_is() -> None:
     np.testing.assert_allclose(dequantize(log_of(true)).temperature_c, true, atol=1e-3)
     log = log_of(np.full(100, 21.0))
     assert dequantize(log) is log
-
-
-@pytest.mark.parametrize("step_c", [0.25, 1.0])
-def test_the_step_is_what_the_report_changes_by_at_once(step_c: float) -> None:
-    assert usual_step_k(log_of(reported(warming(), step_c, 0.03))) == step_c
-    assert usual_step_k(log_of(np.full(100, 21.0))) == 0.0
