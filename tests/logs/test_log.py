@@ -224,7 +224,7 @@ def test_units_signs_and_factors_round_trip(units: tuple[str, ...], factor: floa
     columns = {
         "time": f"a[{units[0]}]",
         "current": f"b[{units[1]}]:{factor!r}",
-        "voltage": {"heading": "c", "unit": units[2]},
+        "voltage": f"c[{units[2]}]",
         "temperature": f"d[{units[3]}]",
     }
     log = Log.from_dataframe(frame, columns=columns, sign="discharge")

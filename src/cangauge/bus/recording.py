@@ -49,7 +49,7 @@ def read_log(
     *,
     temperature_c: float | None = None,
     temperature_source: TemperatureSource | None = None,
-    columns: Mapping[str, Any] | str | None = None,
+    columns: Mapping[str, str] | str | None = None,
     sign: Sign | None = None,
 ) -> Log:
     """Read a log, or a CAN capture by its vehicle; the format is recognised by content.

@@ -184,12 +184,12 @@ def _column_of(log: Log, heading: str, reading: ReadingOptions) -> FloatArray:
     """
     import numpy as np
 
-    from cangauge.logs.column_map import ColumnMap, ColumnSpec
+    from cangauge.logs.column_map import ColumnMap
     from cangauge.logs.read import open_log
 
-    specs = dict(ColumnMap.of(reading.columns or {}, "--columns").specs)
-    specs["voltage"] = ColumnSpec(heading)
-    file = open_log(log.source, columns=ColumnMap(specs, "--simulated"))
+    texts = ColumnMap.of(reading.columns or {}, "--columns").texts
+    columns = ColumnMap({**texts, "voltage": heading}, "--simulated")
+    file = open_log(log.source, columns=columns)
     simulated = file.read(temperature_c=reading.temperature)
     if not np.array_equal(simulated.time_s, log.time_s):
         raise InputError(

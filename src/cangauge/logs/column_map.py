@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Final
+from typing import Final, NamedTuple
 
 from cangauge.errors import InputError, closest
 from cangauge.logs.headings import GUESS, Meaning, meaning_of, names_and_units
@@ -29,54 +29,20 @@ _UNIT: Final = re.compile(r"^(?P<text>.*\S)\s*\[(?P<unit>[^\[\]]*)\]$")
 
 
 @dataclass(frozen=True, slots=True)
-class ColumnSpec:
-    """One column as the user gives it.
-
-    Parameters
-    ----------
-    text : str
-        Heading, or headings joined by `+` (a date and its time; the median of temperatures), or
-        `#3` for the third column; then `[UNIT]` and `:FACTOR`, both optional.
-    unit : str, optional
-        Unit of the column, in place of the heading's.
-    factor : float
-        The column times this is in its unit; its sign inverts.
-    """
-
-    text: str
-    unit: str | None = None
-    factor: float = 1.0
-
-    def readings(self) -> list[ColumnSpec]:
-        """Return the readings of the text: the whole, then without factor, without unit."""
-        found = [self]
-        if match := _FACTOR.match(self.text):
-            found.append(ColumnSpec(match["text"], self.unit, self.factor * float(match["factor"])))
-        if self.unit is None:
-            found += [
-                ColumnSpec(match["text"], match["unit"].strip(), item.factor)
-                for item in list(found)
-                if (match := _UNIT.match(item.text))
-            ]
-        return found
-
-
-@dataclass(frozen=True, slots=True)
 class ColumnMap:
     """The user's columns by quantity: time, current, voltage, temperature, soc.
 
+    `texts` are `HEADING`, `HEADING[UNIT]` or `HEADING[UNIT]:FACTOR`; a heading may be `#3` for the
+    third column, or several joined by `+` (a date and its time; the median of temperatures).
     `where` is the option or file that states them, for messages.
     """
 
-    specs: Mapping[str, ColumnSpec] = field(default_factory=dict)
+    texts: Mapping[str, str] = field(default_factory=dict)
     where: str = "--columns"
 
     @classmethod
-    def of(cls, given: ColumnMap | Mapping[str, Any] | str, where: str = "columns") -> ColumnMap:
+    def of(cls, given: ColumnMap | Mapping[str, str] | str, where: str = "columns") -> ColumnMap:
         """Return the map of a text (`time=t,current=I[mA]:-1`) or of a mapping.
-
-        Values of a mapping are texts, or mappings with `heading` and optionally `unit`, `sign` and
-        `scale`.
 
         Raises
         ------
@@ -85,52 +51,47 @@ class ColumnMap:
 
         Examples
         --------
-        >>> ColumnMap.of("time=t,current=I, pack[mA]:-1").specs["current"].text
+        >>> ColumnMap.of("time=t,current=I, pack[mA]:-1").texts["current"]
         'I, pack[mA]:-1'
         """
         if isinstance(given, ColumnMap):
             return given
         if not isinstance(given, Mapping | str):
             raise InputError("not columns", field=where, value=given, cure=_SYNTAX)
-        pairs = given.items() if isinstance(given, Mapping) else _pairs(given, where)
-        specs: dict[str, ColumnSpec] = {}
-        for name, value in pairs:
+        if isinstance(given, str):
+            parts = [part.partition("=") for part in _SPLIT.split(given)]
+            pairs = [(name.strip(), text) for name, _, text in parts]
+        else:
+            pairs = [*given.items()]
+        texts: dict[str, str] = {}
+        for name, text in pairs:
             quantity = str(name).lower()
-            if quantity in specs:
-                raise InputError("is given twice", field=where, value=name)
-            specs[quantity] = _spec_of(quantity, value, where)
-        return cls(specs, where)
+            if not isinstance(text, str) or not text.strip():
+                raise InputError("not a column", field=where, value=text or name, cure=_SYNTAX)
+            if quantity not in FIELDS:
+                cure = f"known are {', '.join(FIELDS)}"
+                raise InputError("not a quantity of a log", field=where, value=quantity, cure=cure)
+            if quantity in texts:
+                raise InputError("is given twice", field=where, value=quantity)
+            texts[quantity] = text.strip()
+        return cls(texts, where)
 
 
-def _pairs(text: str, where: str) -> list[tuple[str, str]]:
-    parts = [(part, *part.partition("=")) for part in _SPLIT.split(text)]
-    for part, _, equals, value in parts:
-        if not equals or not value.strip():
-            raise InputError("not a column", field=where, value=part, cure=_SYNTAX)
-    return [(name.strip(), value.strip()) for _, name, _, value in parts]
+class _Reading(NamedTuple):
+    """A reading of a user's column: its heading, its unit if stated, and its factor."""
+
+    heading: str
+    unit: str | None = None
+    factor: float = 1.0
 
 
-def _spec_of(quantity: str, value: Any, where: str) -> ColumnSpec:
-    if quantity not in FIELDS:
-        cure = f"known are {', '.join(FIELDS)}"
-        raise InputError("not a quantity of a log", field=where, value=quantity, cure=cure)
-    if isinstance(value, ColumnSpec):
-        return value
-    if isinstance(value, str) and value.strip():
-        return ColumnSpec(value.strip())
-    if isinstance(value, Mapping) and isinstance(value.get("heading"), str):
-        unit, sign, scale = value.get("unit"), value.get("sign", 1), value.get("scale", 1.0)
-        is_number = isinstance(scale, int | float) and not isinstance(scale, bool) and scale > 0.0
-        known = set(value) <= {"heading", "unit", "sign", "scale"}
-        if known and is_number and sign in {1, -1} and isinstance(unit, str | None):
-            return ColumnSpec(value["heading"], unit, float(sign * scale))
-    raise InputError(
-        "not a column",
-        field=f"{where}.{quantity}",
-        value=value,
-        cure='give a text such as "Pack Current[mA]:-1", or { heading = …, unit = …, sign = ±1,'
-        " scale = … }",
-    )
+def _readings(text: str) -> list[_Reading]:
+    """Return the readings of a text: the whole is a heading, or ends in a factor, or a unit."""
+    found = [_Reading(text)]
+    if match := _FACTOR.match(text):
+        found.append(_Reading(match["text"], factor=float(match["factor"])))
+    units = [(item, match) for item in found if (match := _UNIT.match(item.heading))]
+    return found + [_Reading(m["text"], m["unit"].strip(), item.factor) for item, m in units]
 
 
 @dataclass(frozen=True, slots=True)
@@ -180,28 +141,28 @@ def choose_columns(
     given = given or ColumnMap()
     choice = Choice()
     owner: dict[int, str] = {}
-    for quantity, spec in given.specs.items():
-        found = _given_column(quantity, spec, headings, meanings, given.where)
-        for place in found.places:
+    for quantity, text in given.texts.items():
+        column = _given_column(quantity, text, headings, meanings, given.where)
+        for place in column.places:
             if place in owner:
                 raise InputError(
                     f"is the column of {owner[place]} too",
                     field=f"{given.where} {quantity}",
-                    value=spec.text,
+                    value=text,
                     cure="give each quantity a column of its own, as headings or as #1, #2, …",
                 )
-        owner |= dict.fromkeys(found.places, quantity)
-        choice.chosen[quantity] = found
-    for quantity in FIELDS:
+        owner |= dict.fromkeys(column.places, quantity)
+        choice.chosen[quantity] = column
+    for quantity in [name for name in FIELDS if name not in given.texts]:
         plain = [
             (place, meaning)
             for place, meaning in enumerate(meanings)
             if meaning is not None and meaning.quantity == quantity and place not in owner
         ]
         pair = _directions(headings, plain) if quantity == "current" else None
-        if pair is not None and "current" not in given.specs:
+        if pair is not None:
             choice.chosen["current"] = pair
-        elif quantity not in given.specs and plain:
+        elif plain:
             _choose(quantity, sorted(plain, key=lambda item: item[1].rank), choice)
     return choice
 
@@ -247,35 +208,34 @@ def _choose(quantity: str, plain: list[tuple[int, Meaning]], choice: Choice) -> 
 
 def _given_column(
     quantity: str,
-    spec: ColumnSpec,
+    text: str,
     headings: Sequence[str],
     meanings: Sequence[Meaning | None],
     where: str,
 ) -> ChosenColumn:
-    for reading in spec.readings():
-        places = _places(reading.text, headings, is_joined=quantity in _JOINED)
+    for reading in _readings(text):
+        places = _places(reading.heading, headings, is_joined=quantity in _JOINED)
         if not places:
             continue
-        units = {_stated_unit(headings[place], meanings[place], quantity) for place in places}
-        unit = reading.unit if reading.unit is not None else units.pop() if len(units) == 1 else ""
-        scales = {unit_of("temperature_c", other or "C") for other in units}
-        if quantity == "temperature" and reading.unit is None and len(scales) > 1:
-            shown = ", ".join(sorted(other or "none" for other in units))
+        units = sorted({_stated_unit(headings[k], meanings[k], quantity) for k in places})
+        is_mixed = len({unit_of("temperature_c", unit or "C") for unit in units}) > 1
+        if quantity == "temperature" and reading.unit is None and is_mixed:
             raise InputError(
-                f"the headings have different units: {shown}",
+                f"the headings have different units: {', '.join(unit or 'none' for unit in units)}",
                 field=f"{where} {quantity}",
-                value=spec.text,
+                value=text,
                 cure="name columns of one unit",
             )
+        unit = reading.unit if reading.unit is not None else units[0] if len(units) == 1 else ""
         first = meanings[places[0]]
         source = first.source if first is not None and quantity == "temperature" else "unknown"
         is_stated = reading.unit is not None or reading.factor != 1.0
         return ChosenColumn(places, unit, reading.factor, source, is_stated)
-    near = closest(spec.text, headings)
+    near = closest(text, headings)
     raise InputError(
         f"no column has this heading (found: {shown_headings(headings)})",
         field=f"{where} {quantity}",
-        value=spec.text,
+        value=text,
         cure=f"did you mean {near}?" if near else _SYNTAX,
     )
 
@@ -291,24 +251,23 @@ def _stated_unit(heading: str, meaning: Meaning | None, quantity: str) -> str:
 def _places(text: str, headings: Sequence[str], *, is_joined: bool) -> tuple[int, ...]:
     """Return the columns that a text names; none where it names no column, or not all."""
     whole = _place(text, headings)
-    if whole is not None or not is_joined:
-        return () if whole is None else (whole,)
-    places = [_place(part, headings) for part in text.split("+")]
-    found = tuple(place for place in places if place is not None)
-    return found if len(found) == len(places) else ()
+    if whole is not None:
+        return (whole,)
+    places = [_place(part, headings) for part in text.split("+")] if is_joined else []
+    return () if None in places else tuple(place for place in places if place is not None)
 
 
 def _place(text: str, headings: Sequence[str]) -> int | None:
-    """Return the column that a text names: its heading, that without its unit, or its number."""
+    """Return the column of a text: its heading, its number, or the heading without the unit."""
     if text in headings:  # `t` beside `T`
         return headings.index(text)
     name, names = _simple(text), [_simple(heading) for heading in headings]
+    bare = [_simple(names_and_units(heading)[0][0]) for heading in headings]
+    number = re.fullmatch(r"#(\d{1,5})", text.strip())
     if name in names:
         return names.index(name)
-    number = re.fullmatch(r"#(\d{1,5})", text.strip())
     if number and 1 <= int(number[1]) <= len(headings):
         return int(number[1]) - 1
-    bare = [_simple(names_and_units(heading)[0][0]) for heading in headings]
     return bare.index(name) if bare.count(name) == 1 else None
 
 

@@ -132,7 +132,7 @@ class Log(ArrowExport):
         name: str = "log",
         temperature_c: float | None = None,
         temperature_source: TemperatureSource | None = None,
-        columns: Mapping[str, Any] | str | None = None,
+        columns: Mapping[str, str] | str | None = None,
         sign: Literal["charge", "discharge"] | None = None,
     ) -> Log:
         """Return the log of a pandas, polars or pyarrow table.

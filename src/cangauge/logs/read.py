@@ -181,7 +181,7 @@ def not_recognised(file: LogFile, problem: str, cure: str) -> InputError:
 def open_log(
     path: str | PathLike[str],
     *,
-    columns: ColumnMap | Mapping[str, Any] | str | None = None,
+    columns: ColumnMap | Mapping[str, str] | str | None = None,
     sign: Sign | None = None,
 ) -> LogFile:
     """Read the beginning of a file and find its format; parameters as of `read_log`.
@@ -204,7 +204,7 @@ def read_log(
     *,
     temperature_c: float | None = None,
     temperature_source: TemperatureSource | None = None,
-    columns: ColumnMap | Mapping[str, Any] | str | None = None,
+    columns: ColumnMap | Mapping[str, str] | str | None = None,
     sign: Sign | None = None,
 ) -> Log:
     """Read a log of any known format, plain, packed by gzip or bzip2, or in a zip.
@@ -221,7 +221,7 @@ def log_of_dataframe(
     name: str,
     temperature_c: float | None,
     temperature_source: TemperatureSource | None,
-    columns: ColumnMap | Mapping[str, Any] | str | None,
+    columns: ColumnMap | Mapping[str, str] | str | None,
     sign: Sign | None,
 ) -> Log:
     """Return the log of a data frame; see `Log.from_dataframe`."""

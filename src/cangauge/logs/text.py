@@ -156,8 +156,8 @@ def table_below(head: Head, header: str) -> TextTable:
 
 def find_table(head: Head, given: ColumnMap | None = None) -> TextTable | None:
     """Return the table of a text in which time, current and voltage are known, or None."""
-    specs = given.specs.values() if given else ()
-    if specs and all(spec.text.startswith("#") for spec in specs):
+    texts = given.texts.values() if given else ()
+    if texts and all(text.startswith("#") for text in texts):
         table = _without_header(head)
         if table is not None:
             return table
