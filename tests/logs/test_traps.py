@@ -88,7 +88,6 @@ def test_probes_that_the_user_joins_have_one_unit(
         ("Current", "current=Current", True),
         ("Current [A]", "current=Current [A][mA]", True),
         ("Current", "current=Current[A]", False),
-        ("Current", {"current": {"heading": "Current", "unit": "A"}}, False),
         ("Current [A]", None, False),
     ],
 )
