@@ -342,6 +342,16 @@ def test_a_gzip_cut_at_every_byte_gives_what_can_be_read(tmp_path: Path) -> None
     assert f"cut off after {frames} frames" in capture.info.remarks[-1]
 
 
+def test_a_capture_of_a_thousand_buses_is_one_of_the_first(tmp_path: Path) -> None:
+    # Whoever reaches a UDP port may name another bus in each packet, and each takes a decoder.
+    path = tmp_path / "x.log"
+    names = [*["can0"] * 1000, *(f"x{number}" for number in range(900))]
+    path.write_text("".join(f"({n}.000000) {name} 123#00\n" for n, name in enumerate(names)))
+    capture = open_capture(path)
+    assert {message.channel for message in capture} == {"can0", *(f"x{n}" for n in range(63))}
+    assert capture.info.malformed == 900 - 63
+
+
 def test_a_few_malformed_lines_are_skipped_and_counted(tmp_path: Path) -> None:
     lines = SPACED.splitlines(keepends=True) * 5
     lines[3] = "0000.022044 000001FF 2 AA\r\n"  # a byte is missing
