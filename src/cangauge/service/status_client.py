@@ -11,7 +11,6 @@ import logging
 import os
 import re
 import socket
-import threading
 import time
 from collections.abc import Callable, Mapping
 from contextlib import suppress
@@ -21,6 +20,7 @@ from typing import Any, Final, cast
 
 from cangauge._logging import emit
 from cangauge.errors import CangaugeError, InputError
+from cangauge.service.worker import start_thread
 from cangauge.types import Reason, reason_name
 
 SCHEMA: Final = 1
@@ -125,7 +125,11 @@ class StatusSocket:
                 field="status_socket",
                 cure="name another one, or off",
             ) from error
-        threading.Thread(target=self._serve, name="cangauge-status", daemon=True).start()
+        try:
+            start_thread(self._serve, "cangauge-status")
+        except CangaugeError:
+            self.close()
+            raise
 
     def close(self) -> None:
         """Remove the socket; the thread ends."""
