@@ -173,7 +173,7 @@ class Gateway(Output):
     def _hand_on(self, frame: can.Message, bus: ReconnectingBus) -> None:
         """Send what a bus can carry: a frame that it cannot would count as a lost bus."""
         if bus.carries_fd or bus.is_away or not frame.is_fd:
-            bus.post(frame)
+            bus.post(frame, DOUBT_S)
             return
         bus.unsent += 1
         if bus not in self._without_fd:
