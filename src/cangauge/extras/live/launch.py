@@ -133,6 +133,8 @@ class Live(Output):
             began_s = time.monotonic()
             try:
                 why = self._serve()
+            except BrokenPipeError:
+                why = "it ended by itself"
             except Exception as error:  # noqa: BLE001 - no process, or lines that are not ours
                 why = f"it failed: {error!r}"
             if self._done.is_set():
@@ -170,8 +172,7 @@ class Live(Output):
                     for each in received.lines(data):
                         self._hear(json.loads(each))
                 if writable:
-                    with suppress(BrokenPipeError):  # the end of `out` tells
-                        pending = pending[os.write(into, pending) :]
+                    pending = pending[os.write(into, pending) :]
                 if why := received.trouble():
                     return why
                 if (size := _resident_bytes(self.pid)) > LARGEST_BYTES:
