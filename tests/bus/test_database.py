@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import pickle
 import re
+import tracemalloc
 import warnings
 from pathlib import Path
 
@@ -272,3 +273,23 @@ def test_a_multiplexer_that_is_missing_or_its_own_is_refused(tmp_path: Path, lin
     message = load_dbc(path).messages[0]
     with pytest.raises(InputError, match="multiplexer"):
         signal_codec(message, message.signals[0], source=path, field="current")
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        'BO_ 1 M: 8 E\n SG_ A : 2566844926|8@0+ (1,0) [0|0] "" E\n',
+        'BO_ 1 M: 8 E\n SG_ A : 0 | +99999999999@1- (1,0) [0|0] "" E\n',
+        'BO_ 1 M: 3000000000 E\n SG_ A : 0|8@1+ (1,0) [0|0] "" E\n',
+        "SG_MUL_VAL_ 256 A B 1-2, 3-4000000000;\n",
+    ],
+    ids=["start", "length", "message", "multiplexer"],
+)
+def test_numbers_that_would_take_gigabytes_are_refused_before(tmp_path: Path, line: str) -> None:
+    path = tmp_path / "x.dbc"
+    path.write_text(f'VERSION ""\nNS_ :\nBS_:\nBU_: E\n{line}')
+    tracemalloc.start()
+    with pytest.raises(InputError, match="more than"):
+        load_dbc(path)
+    assert tracemalloc.get_traced_memory()[1] < 4e6
+    tracemalloc.stop()

@@ -141,6 +141,9 @@ def test_a_map_may_begin_with_a_preset(own: Path) -> None:
     vehicle = Vehicle.load(map=own / "car.toml")
     checks = preset.current.checks.model_copy(update={"timeout_s": 1.0})
     assert vehicle == replace(preset, current=replace(preset.current, checks=checks))
+    (own / "car.toml").write_text('like = "leaf_aze0"\n[messages.0x1DB]\nperiod_s = 0.02\n')
+    slower = preset.messages[0x1DB]._replace(period_s=0.02)
+    assert Vehicle.load(map=own / "car.toml").messages == preset.messages | {0x1DB: slower}
     (own / "car.toml").write_text(
         'like = "leaf_aze0"\nname = "mine"\nsoc = {signal = "PackCurrent", scale = 1}\n'
         'voltage = {signal = "voltage_v", highest = 9}\ntemperature = {fixed_c = 21.0}\n'

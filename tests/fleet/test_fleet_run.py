@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import os
+import stat
+import sys
+import tempfile
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, ClassVar
@@ -212,9 +215,31 @@ def test_nobody_without_its_certificate_reaches_a_local_cluster() -> None:
         ):
             with pytest.raises(OSError, match=r"(?i)timed out|closed|certificate|unknown ca"):
                 distributed.Client(address, security=security, timeout=1.0, set_as_default=False)
-        page = client.cluster.dashboard_link.replace("/status", "/info/main/workers.html")
-        with pytest.raises(HTTPError, match="404"):
-            urlopen(page, timeout=5.0)  # noqa: S310 - http
+        for name in ("/status", "/info/main/workers.html"):
+            page = client.cluster.dashboard_link.replace("/status", name)
+            with pytest.raises(HTTPError, match="404"):
+                urlopen(page, timeout=5.0)  # noqa: S310 - http
+
+
+@pytest.mark.skipif(os.name != "posix", reason="no rights of other users")
+def test_no_other_user_gives_a_local_cluster_modules_or_pickles(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("distributed")
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    (tmp_path / "dask-scratch-space").mkdir()
+    (tmp_path / "dask-scratch-space").chmod(0o777)  # as made by another user, before
+    with connected("1") as client:
+        (found,) = client.run(imports_from).values()
+        folders = {Path(each) for each in (*found, *imports_from())}
+        ours = {each for each in folders if each.is_relative_to(tmp_path)}
+        (root,) = {tmp_path / each.relative_to(tmp_path).parts[0] for each in ours}
+        assert stat.S_IMODE(root.stat().st_mode) == 0o700
+    assert not root.exists()
+
+
+def imports_from() -> list[str]:
+    return sys.path
 
 
 def test_a_scheduler_that_does_not_answer_is_bad_input(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -236,6 +236,17 @@ def test_cabana_in_both_spellings(tmp_path: Path) -> None:
     assert facts(second) == (15.0, 0x18FF50E5, True, "4a")
 
 
+def test_relative_stamps_of_asc_beyond_all_numbers_are_no_frames(tmp_path: Path) -> None:
+    head = (
+        "date Wed Mar 13 23:50:00 2024\nbase hex  timestamps relative\nno internal events logged\n"
+    )
+    line = " 1  1DB  Rx  d 1 00\n"
+    huge = "9" * 400 + ".0"
+    path = tmp_path / "x.asc"
+    path.write_text(head + "".join(stamp + line for stamp in ("0.1", huge, huge, "0.2", "0.1")))
+    assert [message.timestamp for message in open_capture(path)] == pytest.approx([0.1, 0.3, 0.4])
+
+
 def test_relative_stamps_of_asc_that_rise_count_from_the_start(tmp_path: Path) -> None:
     text = "date Wed Mar 13 23:50:00 2024\nbase hex  timestamps relative\n" + "".join(
         f"{k / 100 - 0.012 * (k % 5 == 3):.3f} 1 1DB Rx d 1 AA\n" for k in range(300)
@@ -340,6 +351,16 @@ def test_a_gzip_cut_at_every_byte_gives_what_can_be_read(tmp_path: Path) -> None
     frames = sum(1 for _ in capture)
     assert capture.info.cut_off
     assert f"cut off after {frames} frames" in capture.info.remarks[-1]
+
+
+def test_a_capture_of_a_thousand_buses_is_one_of_the_first(tmp_path: Path) -> None:
+    # Whoever reaches a UDP port may name another bus in each packet, and each takes a decoder.
+    path = tmp_path / "x.log"
+    names = [*["can0"] * 1000, *(f"x{number}" for number in range(900))]
+    path.write_text("".join(f"({n}.000000) {name} 123#00\n" for n, name in enumerate(names)))
+    capture = open_capture(path)
+    assert {message.channel for message in capture} == {"can0", *(f"x{n}" for n in range(63))}
+    assert capture.info.malformed == 900 - 63
 
 
 def test_a_few_malformed_lines_are_skipped_and_counted(tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import struct
 import threading
 import time
@@ -22,7 +23,7 @@ from cangauge.extras.inverter.gateway import DOUBT_S, Gateway, make_output, soc_
 from cangauge.service.run import Service
 from cangauge.service.status_client import Snapshot
 from cangauge.types import Estimate, Reason, Sample, Status
-from live import LoggedLines, leaf_model_path, waits
+from live import BrokenBus, LoggedLines, leaf_model_path, waits
 from running import RunningService
 
 SAMPLE = Sample(0.0, 1.0, 50.0, 20.0)
@@ -114,6 +115,33 @@ def test_what_is_not_confirmed_is_not_sent(pylon: Gateway) -> None:
     assert pylon.soc_pct(now_s + 1.2 * DOUBT_S) is None  # the service hangs, or samples end
     pylon.on_snapshot(Snapshot(now_s + 60.0, snapshot(71.6).status))
     assert pylon.soc_pct(now_s + 60.1) is None  # it turns, but no samples come
+
+
+def test_a_frame_that_waits_for_room_is_not_sent_long_after_a_doubt() -> None:
+    class Full(BrokenBus):
+        is_full = True
+
+        def send(self, message: can.Message) -> None:
+            if self.is_full:
+                raise can.CanOperationError("full", errno.ENOBUFS)
+            super().send(message)
+
+    full, own = Full([]), frame(0x355, V12[0x355])
+    battery, inverter = (
+        ReconnectingBus(BusAddress("virtual", "full"), [], lambda *_, bus=bus: bus)  # type: ignore[misc]
+        for bus in (BrokenBus([]), full)
+    )
+    for bus in (battery, inverter):
+        bus.open()
+    found = Gateway.__new__(Gateway)
+    found._battery, found._inverter, found._without_fd = battery, inverter, []
+    found._hand_on(own, inverter)
+    time.sleep(1.2 * DOUBT_S)
+    full.is_full = False
+    inverter.receive_pending(0.0)
+    assert not full.sent
+    found._hand_on(own, inverter)
+    assert len(full.sent) == 1
 
 
 def test_a_gap_does_not_make_silence_last(pylon: Gateway) -> None:

@@ -26,7 +26,7 @@ from cangauge.service.pipeline import Pipeline, PipelineSettings
 from cangauge.service.record import Recorder
 from cangauge.service.status_client import Snapshot
 from cangauge.types import Estimate
-from live import frames_of, in_process, leaf_model, leaf_model_path, short_log, waits
+from live import LoggedLines, frames_of, in_process, leaf_model, leaf_model_path, short_log, waits
 
 SNAPSHOT = Snapshot(0.0, {})
 
@@ -170,6 +170,17 @@ def test_the_oldest_parts_are_removed(tmp_path: Path) -> None:
     assert {part.run for part in parts} <= {2, 3}
     assert 30_000 < sum(part.path.stat().st_size for part in parts) < 40_000 + 3 * 4_500
     assert recorder.written.name == "drive-0003.log"
+
+
+def test_an_old_part_that_cannot_be_removed_ends_no_start(tmp_path: Path) -> None:
+    (tmp_path / "r-0001-000001.log").mkdir()
+    (tmp_path / "r-0001-000002.log").write_bytes(bytes(2000))
+    with LoggedLines("cangauge.service.record") as logged:
+        recorder = Recorder(tmp_path / "r.log", 1000.0, 1000.0)
+        recorder.write(can.Message())
+        recorder.close()
+    assert recorder.state.lost_frames == 1
+    assert any("writing is retried" in line for line in logged.lines)
 
 
 def test_impossible_recordings_are_refused(tmp_path: Path) -> None:

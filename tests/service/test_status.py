@@ -10,6 +10,7 @@ import stat
 import threading
 import time
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -53,6 +54,15 @@ def watched() -> Watched:
     found.drive(90.0)
     found.turn(0.5)
     return found
+
+
+def test_a_name_that_is_no_utf_8_is_written_out(watched: Watched, tmp_path: Path) -> None:
+    watched.monitor.model = os.fsdecode(b"caf\xe9.json")
+    watched.turn()
+    path = tmp_path / "status.sock"
+    server = StatusSocket(path, lambda: watched.status)
+    assert fetch_status(path)["model"] == "caf\\udce9.json"
+    server.close()
 
 
 def test_the_keys_of_a_status(watched: Watched) -> None:
@@ -315,6 +325,25 @@ def test_services_are_found_in_the_runtime_folder(
     second.close()
     with pytest.raises(NotRunningError):
         find_socket()
+
+
+@pytest.mark.skipif(not hasattr(os, "geteuid"), reason="no owners on this system")
+def test_a_runtime_folder_that_another_user_has_made_is_not_used(
+    watched: Watched, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("RUNTIME_DIRECTORY", str(tmp_path))
+    path = socket_path("socketcan can0")
+    server = StatusSocket(path, lambda: watched.status)
+    owner = os.geteuid()
+    if owner == 0:
+        os.chown(tmp_path, 1234, -1)
+    else:
+        monkeypatch.setattr(os, "geteuid", lambda: owner + 1)
+    with pytest.raises(InputError, match="another user has made its folder"):
+        StatusSocket(socket_path("socketcan can1"), lambda: watched.status)
+    with suppress(NotRunningError, InputError):
+        assert find_socket() != path
+    server.close()
 
 
 @pytest.mark.parametrize("answer", [b"", b'{"schema": 99}'])

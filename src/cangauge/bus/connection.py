@@ -251,10 +251,10 @@ class BusConnection:
         now_s = time.monotonic()
         while self._posted:
             until_s, message = self._posted[0]
-            if not self._try_to_send(message):
-                if now_s < until_s:
-                    return
+            if now_s >= until_s:
                 self.unsent += 1
+            elif not self._try_to_send(message):
+                return
             self._posted.popleft()
 
     def _count_error(self, message: can.Message) -> None:

@@ -39,6 +39,8 @@ HEAD_LINES: Final = 400
 """First lines, by which a text format is recognised."""
 FEW_MALFORMED: Final = 100
 """A file with more malformed lines than this, and than frames, is refused at once."""
+MOST_BUSES: Final = 64
+"""Most buses in a file, each of which has its own decoder; frames of further ones are malformed."""
 MAX_ID: Final = 0x1FFFFFFF
 MAX_STANDARD_ID: Final = 0x7FF
 MAX_BYTES: Final = 64
@@ -104,13 +106,16 @@ class CaptureReader(MessageReader, ABC):
         """Yield the frames; raise one of `DAMAGE` where the file breaks off."""
 
     def messages(self) -> Iterator[can.Message]:
-        """Yield the frames with usable stamps, as far as the file can be read.
+        """Yield the frames of known buses with usable stamps, as far as the file can be read.
 
         Raises InputError if most lines are malformed; it names the first.
         """
+        buses = set[Any]()
         try:
             for message in self.read():
-                if abs(message.timestamp) <= MAX_STAMP_S:  # false for NaN
+                is_known = message.channel in buses or len(buses) < MOST_BUSES
+                if is_known and abs(message.timestamp) <= MAX_STAMP_S:  # false for NaN
+                    buses.add(message.channel)
                     self.frames += 1
                     yield message
                 else:

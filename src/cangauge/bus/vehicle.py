@@ -347,8 +347,11 @@ class _Binder:
 
     def _protections(self) -> dict[int, MessageProtection]:
         """Return protection and period of the messages with a signal."""
-        stated = {self._message_key(name): each for name, each in self._mapping.messages.items()}
-        protections = {}
+        stated, protections = dict[int, MessageMap](), {}
+        for name, table in self._mapping.messages.items():
+            key = self._message_key(name)  # a preset may name what the map gives by its id
+            own = table.model_dump(exclude_unset=True)
+            stated[key] = stated.get(key, MessageMap()).model_copy(update=own)
         for key, message in self._messages.items():
             each = stated.get(key, MessageMap())
             cycle_ms, period_s = message.cycle_time, each.period_s

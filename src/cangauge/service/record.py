@@ -191,9 +191,9 @@ class _RecordFile:
             os.close(descriptor)
 
     def _next_part(self) -> None:
-        self._remove_oldest()
         part = self._part + 1
         self.current = part_path(self._base, self._run, part) if self._in_parts else self._base
+        self._remove_oldest()
         self.close()
         flags = os.O_WRONLY | os.O_CREAT | os.O_CLOEXEC | (os.O_EXCL if self._in_parts else 0)
         self._descriptor = os.open(self.current, flags, _RIGHTS)

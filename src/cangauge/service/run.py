@@ -30,6 +30,7 @@ from cangauge.service.setup import Setup, address_of, read_setup
 from cangauge.service.state import StateKeeper, state_path
 from cangauge.service.status import PAGE_EVERY_S, SHOW_EVERY_S, Monitor
 from cangauge.service.status_client import StatusSocket, socket_path, value_at
+from cangauge.service.worker import start_thread
 
 OUTPUTS: Final = {
     "cangauge.extras.live.launch": ("http", "dashboard", "mqtt"),
@@ -215,10 +216,11 @@ class Service:
                 self._is_reload_due = False
                 self._reading = Future()
                 put = self._reading.set_result
-                threading.Thread(
-                    target=lambda: put(read_setup(self._read)), name="cangauge-reload", daemon=True
-                ).start()
                 monitor.reload_begins()
+                try:
+                    start_thread(lambda: put(read_setup(self._read)), "cangauge-reload")
+                except CangaugeError as error:
+                    put(error)
             return None
         if not self._reading.done():
             return None
@@ -288,7 +290,7 @@ def _serve_status(config: RunConfig, monitor: Monitor, stack: ExitStack) -> None
     try:
         server = StatusSocket(path, lambda: monitor.latest.at(time.monotonic()))
         stack.callback(server.close)
-    except InputError as error:
+    except CangaugeError as error:
         if not is_auto:
             raise
         # Not requested explicitly: the service runs without it.

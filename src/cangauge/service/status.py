@@ -99,6 +99,11 @@ class Histogram:
         return BOUNDS_S[place] if count and place < len(BOUNDS_S) else None
 
 
+def _as_utf8(name: str) -> str:
+    r"""Return a name with its bytes that are no UTF-8 written out ("\udce9")."""
+    return name.encode(errors="backslashreplace").decode()
+
+
 class Monitor:
     """Collect counts in the receive loop; its methods are for the loop's thread.
 
@@ -217,9 +222,9 @@ class Monitor:
             "schema": SCHEMA,
             "running": True,
             "version": __version__,
-            "bus": port.name,
+            "bus": _as_utf8(port.name),
             "vehicle": pipeline.vehicle.name,
-            "model": self.model,
+            "model": _as_utf8(self.model),
             "method": settings.estimator.method,
             "time_source": settings.time_source,
             "core": pipeline.estimator.core,
@@ -252,7 +257,9 @@ class Monitor:
             "config": self._config,
             "latency": self._latency.to_dict(),
             "step": self._step.to_dict(),
-            "record": None if record is None else asdict(record),
+            "record": None
+            if record is None
+            else asdict(record) | {"path": _as_utf8(record.path)},
         }  # fmt: skip
 
     def _line(self) -> str:

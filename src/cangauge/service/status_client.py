@@ -11,7 +11,6 @@ import logging
 import os
 import re
 import socket
-import threading
 import time
 from collections.abc import Callable, Mapping
 from contextlib import suppress
@@ -21,6 +20,7 @@ from typing import Any, Final, cast
 
 from cangauge._logging import emit
 from cangauge.errors import CangaugeError, InputError
+from cangauge.service.worker import start_thread
 from cangauge.types import Reason, reason_name
 
 SCHEMA: Final = 1
@@ -89,6 +89,14 @@ def runtime_folders() -> list[Path]:
     return [*folders, Path("/tmp") / f"cangauge-{user}"]  # noqa: S108 - private: mode 0700
 
 
+def _is_anothers(folder: Path) -> bool:
+    """Return whether a folder is another user's, who can replace the sockets in it."""
+    try:
+        return folder.lstat().st_uid not in {0, os.geteuid()}
+    except (OSError, AttributeError):  # none there; Windows
+        return False
+
+
 def socket_path(bus: str) -> Path:
     """Return the socket of a service on a bus, such as "socketcan can0"."""
     name = re.sub(r"[^A-Za-z0-9.]+", "-", bus).strip("-.")[:40]
@@ -110,6 +118,8 @@ class StatusSocket:
             if not hasattr(socket, "AF_UNIX"):
                 raise OSError("this system has no unix sockets in Python")  # noqa: TRY301 - as below
             path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+            if path.parent in runtime_folders() and _is_anothers(path.parent):
+                raise OSError("another user has made its folder")  # noqa: TRY301 - as below
             if is_served(path):
                 raise OSError("another service uses this socket")  # noqa: TRY301 - as below
             if path.is_socket():
@@ -125,7 +135,11 @@ class StatusSocket:
                 field="status_socket",
                 cure="name another one, or off",
             ) from error
-        threading.Thread(target=self._serve, name="cangauge-status", daemon=True).start()
+        try:
+            start_thread(self._serve, "cangauge-status")
+        except CangaugeError:
+            self.close()
+            raise
 
     def close(self) -> None:
         """Remove the socket; the thread ends."""
@@ -162,7 +176,8 @@ def find_socket() -> Path:
     """Return the socket of the running service; NotRunningError: none, InputError: several."""
     found: list[Path] = []
     with suppress(OSError):  # a folder that this user may not read
-        for folder in (*runtime_folders(), SYSTEM_FOLDER, *SYSTEM_FOLDER.glob("*")):
+        own = [each for each in runtime_folders() if not _is_anothers(each)]
+        for folder in (*own, SYSTEM_FOLDER, *SYSTEM_FOLDER.glob("*")):
             found += [each for each in sorted(folder.glob("*.sock")) if is_served(each)]
     found = list(dict.fromkeys(found))
     if not found:

@@ -6,7 +6,20 @@ import queue
 import threading
 from collections.abc import Callable
 
+from cangauge.errors import CangaugeError
+
 Job = Callable[[], None]
+
+
+def start_thread(run: Callable[[], object], name: str) -> threading.Thread:
+    """Start and return a daemon thread; raise CangaugeError where the system starts none."""
+    thread = threading.Thread(target=run, name=name, daemon=True)
+    try:
+        thread.start()
+    except RuntimeError as error:
+        cure = "raise the limit of threads (ulimit -u, TasksMax=)"
+        raise CangaugeError(f"{name}: {error}; {cure}") from error
+    return thread
 
 
 class Worker:
@@ -25,8 +38,7 @@ class Worker:
     def __init__(self, name: str, on_error: Callable[[Exception], None], jobs_at_most: int) -> None:
         self._on_error = on_error
         self._jobs: queue.Queue[Job | None] = queue.Queue(jobs_at_most)
-        self._thread = threading.Thread(target=self._run, name=name, daemon=True)
-        self._thread.start()
+        self._thread = start_thread(self._run, name)
 
     def submit(self, job: Job) -> bool:
         """Add a job without waiting; return False if too many wait."""

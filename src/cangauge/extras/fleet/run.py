@@ -15,6 +15,7 @@ import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from tempfile import TemporaryDirectory
 from typing import Any, Final
 
 from cangauge._files import text_sha256
@@ -112,18 +113,21 @@ def connected(workers: str | None = None) -> Iterator[Any]:
         logging.getLogger(name).setLevel(logging.CRITICAL)
     if "://" not in number:
         # Whoever reaches a scheduler runs code as its user: a certificate of this run keeps other
-        # users of the machine out, and no page is served.
+        # users of the machine out, and no page is served. Dask imports modules from its folder and
+        # keeps pickles there: by default one that any user can make first.
         closed: dict[str, Any] = {
             f"distributed.{of}.http.routes": [] for of in ("scheduler", "worker")
         }
         with (
-            dask.config.set(closed),
+            TemporaryDirectory(prefix="cangauge-fleet-") as own,
+            dask.config.set(closed | {"temporary-directory": own}),
             LocalCluster(
                 n_workers=int(number),
                 threads_per_worker=1,
                 processes=True,
                 security=True,
                 dashboard_address="127.0.0.1:0",
+                scheduler_kwargs={"dashboard": False},
                 silence_logs=logging.CRITICAL,
             ) as cluster,
             Client(cluster, set_as_default=False) as client,

@@ -75,7 +75,7 @@ class AscReader(LibraryReader):
 
     name, library = "Vector ASC", can.ASCReader
     _RELATIVE: Final = re.compile(r"(?im)^\s*base\s+\w+\s+timestamps\s+relative")
-    _STAMP: Final = re.compile(r"(?m)^[ \t]*(\d+\.\d+)(?=\s)")
+    _STAMP: Final = re.compile(r"(?m)^[ \t]*(\d{1,12}\.\d+)(?=\s)")
 
     @classmethod
     def matches(cls, head: bytes) -> bool:

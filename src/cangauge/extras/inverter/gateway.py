@@ -27,6 +27,7 @@ from cangauge.errors import InputError
 from cangauge.service.output import Output
 from cangauge.service.setup import inverter_address
 from cangauge.service.status_client import Snapshot
+from cangauge.service.worker import start_thread
 from cangauge.types import Estimate, Sample
 
 if TYPE_CHECKING:
@@ -87,8 +88,7 @@ class Gateway(Output):
         self._without_fd: list[ReconnectingBus] = []  # already logged
         self._done = threading.Event()
         self._replaces: bool | None = None
-        self._thread = threading.Thread(target=self._run, name="cangauge-inverter", daemon=True)
-        self._thread.start()
+        self._thread = start_thread(self._run, "cangauge-inverter")
 
     def on_sample(self, sample: Sample, estimate: Estimate) -> None:
         """Note that samples come, and how often: one long interval is a gap, not a period."""
@@ -173,7 +173,7 @@ class Gateway(Output):
     def _hand_on(self, frame: can.Message, bus: ReconnectingBus) -> None:
         """Send what a bus can carry: a frame that it cannot would count as a lost bus."""
         if bus.carries_fd or bus.is_away or not frame.is_fd:
-            bus.post(frame)
+            bus.post(frame, DOUBT_S)
             return
         bus.unsent += 1
         if bus not in self._without_fd:

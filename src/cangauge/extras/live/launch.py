@@ -30,6 +30,7 @@ from cangauge.errors import InputError
 from cangauge.extras.live.addresses import HttpAddress, MqttOptions, http_address, mqtt_options
 from cangauge.service.output import Output
 from cangauge.service.status_client import Snapshot
+from cangauge.service.worker import start_thread
 
 if TYPE_CHECKING:
     from cangauge.service.run import Service
@@ -108,8 +109,7 @@ class Live(Output):
         os.set_blocking(self._wake, False)
         self.trouble = ""
         self.pid: int | None = None
-        self._thread = threading.Thread(target=self._run, name="cangauge-live", daemon=True)
-        self._thread.start()
+        self._thread = start_thread(self._run, "cangauge-live")
 
     def on_snapshot(self, snapshot: Snapshot) -> None:
         """Make a snapshot the latest one; returns at once."""
@@ -133,6 +133,8 @@ class Live(Output):
             began_s = time.monotonic()
             try:
                 why = self._serve()
+            except BrokenPipeError:
+                why = "it ended by itself"
             except Exception as error:  # noqa: BLE001 - no process, or lines that are not ours
                 why = f"it failed: {error!r}"
             if self._done.is_set():
@@ -164,13 +166,13 @@ class Live(Output):
                 readable, writable, _ = select.select([self._woken, out], writes, [], 1.0)
                 if self._woken in readable:
                     os.read(self._woken, 4096)
-                if writable:
-                    pending = pending[os.write(into, pending) :]
-                if out in readable:
+                if out in readable:  # before what is written: it may have said why it ended
                     if not (data := os.read(out, _MOST_BYTES)):
                         return "it ended by itself"
                     for each in received.lines(data):
                         self._hear(json.loads(each))
+                if writable:
+                    pending = pending[os.write(into, pending) :]
                 if why := received.trouble():
                     return why
                 if (size := _resident_bytes(self.pid)) > LARGEST_BYTES:

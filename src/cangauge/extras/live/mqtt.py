@@ -116,6 +116,7 @@ class MqttPublisher(Output):
         client.on_disconnect = self._on_disconnect
         client.on_connect_fail = self._on_connect_fail
         client.connect_async(options.broker, options.port, KEEPALIVE_S)
+        client.loop_start()
         self._thread = threading.Thread(target=self._run, name="cangauge-mqtt", daemon=True)
         self._thread.start()
 
@@ -130,7 +131,6 @@ class MqttPublisher(Output):
 
     def _run(self) -> None:
         try:
-            self._client.loop_start()
             while not self._done.wait(self._every_s):
                 self._publish()
             if self._client.is_connected():

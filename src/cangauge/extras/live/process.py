@@ -16,6 +16,7 @@ import threading
 from collections.abc import Mapping
 from typing import IO, Any, Final
 
+from cangauge._logging import emit
 from cangauge.service.events import RateLimitedHandler
 from cangauge.service.output import Output
 from cangauge.service.status_client import Snapshot
@@ -25,6 +26,7 @@ NICE: Final = 5
 ALIVE_EVERY_S: Final = 1.0
 _LINE_BYTES: Final = 1 << 20
 
+_LOG = logging.getLogger("cangauge.extras.live")  # this module is `__main__`
 _TELLING: Final = threading.Lock()
 
 
@@ -107,7 +109,10 @@ def main() -> None:
     told = _Told()
     logging.getLogger().handlers[:] = [told]
     logging.getLogger("cangauge").setLevel(asks["level"])
-    asyncio.run(_serve(asks, lines, told))
+    try:
+        asyncio.run(_serve(asks, lines, told))
+    except RuntimeError as error:  # no thread can be started; the service tries again
+        emit(_LOG, logging.ERROR, "live.failed", str(error))
 
 
 if __name__ == "__main__":
