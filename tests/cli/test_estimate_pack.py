@@ -10,13 +10,12 @@ import pyarrow.csv
 import pyarrow.parquet
 import pytest
 
-from cangauge.errors import InputError
 from cangauge.estimation.estimator import Estimator
 from cangauge.estimation.offline import samples_of
 from cangauge.estimation.settings import EstimatorSettings
 from cangauge.logs.canonical import write_log
 from cangauge.logs.log import Log
-from cangauge.logs.read import read_cells, read_log
+from cangauge.logs.read import read_log
 from cangauge.model.model_file import Model
 from cells_bus import CELLS_ON_BUS
 from live import succeeds
@@ -83,28 +82,6 @@ def test_pack_rows_are_those_of_the_estimator(made: Path, minutes: Log, tmp_path
         rows.append([*estimator.health, *estimator.power()])
     found = np.array([table[name].to_pylist() for name in [*HEALTH, *POWER]], dtype=float)
     np.testing.assert_allclose(found.T, np.array(rows, dtype=float), rtol=1e-9)
-
-
-def test_a_log_without_cells_has_none(made: Path) -> None:
-    assert read_cells(made / "part.csv", read_log(made / "part.csv").time_s) is None
-    assert read_cells(made / "full.parquet", np.arange(3.0)) is None
-
-
-def test_rows_that_the_reader_dropped_do_not_shift_the_cells(made: Path, tmp_path: Path) -> None:
-    log = read_log(made / "part.csv")
-    doubled = pa.concat_tables([table_with_cells(log).slice(0, 10), table_with_cells(log).slice(9)])
-    pa.parquet.write_table(doubled, tmp_path / "doubled.parquet")
-    found = read_cells(tmp_path / "doubled.parquet", log.time_s)
-    assert found is not None
-    assert np.array_equal(found.voltage_v, cells_of(log))
-    assert found.first == 1
-
-
-def test_a_gap_in_the_numbers_is_refused(minutes: Log, tmp_path: Path) -> None:
-    table = table_with_cells(minutes).drop_columns(["cell_05_v"])
-    pa.parquet.write_table(table, tmp_path / "gap.parquet")
-    with pytest.raises(InputError, match="cell_5_v"):
-        read_cells(tmp_path / "gap.parquet", np.arange(3.0))
 
 
 def test_rows_of_a_long_log_are_limited_and_reach_its_end(

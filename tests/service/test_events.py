@@ -99,7 +99,7 @@ def test_repetitions_are_written_at_growing_intervals() -> None:
     assert limited.passes()
 
 
-def test_the_first_is_written_unless_filtered_and_memory_is_bounded() -> None:
+def test_the_first_is_written_unless_filtered_in_bounded_memory() -> None:
     limited = Limited(-1e9)
     limited.addFilter(lambda record: "secret" not in record.getMessage())
     assert not limited.passes(text="a secret")

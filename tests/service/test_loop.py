@@ -159,7 +159,7 @@ class Failing(Output):
         raise RuntimeError("broken")
 
 
-def test_a_failing_output_and_a_replay_clock_that_is_no_input_are_told_once(
+def test_a_failing_output_and_an_idle_replay_clock_are_told_once(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
     pipeline, failing, rows = Pipeline(GENERIC, leaf_model()), Failing(), Rows([])
