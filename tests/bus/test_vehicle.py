@@ -194,6 +194,7 @@ def test_the_map_file_adds_codes_conditions_and_rules(own: Path) -> None:
         ("sign = -1", "singn = -1", "current.singn", "did you mean sign"),
         ("sign = -1", "when = { Nonsense = 1 }", "current.when", "no such signal"),
         ('"pack"', '"battery"', "temperature_source", "'battery'"),
+        ('[voltage]\nsignal = "PackVoltage"\n', "", "voltage", "is missing"),
         ('signal = "PackTemperature"', "", "temperature", "either signal or fixed_c"),
     ],
 )

@@ -10,10 +10,7 @@ import pytest
 from simulated import EPOCH_S, SimulatedPort, frames_every, simulate
 
 from cangauge.bus.connection import BusConnection, BusError
-from cangauge.bus.open import (
-    BackendCapabilities,
-    Stamps,
-)
+from cangauge.bus.open import BackendCapabilities, Stamps
 from cangauge.bus.publish import SocDetail, SocReader
 from cangauge.bus.time_source import ClockFrames
 from cangauge.bus.vehicle import Vehicle

@@ -50,7 +50,7 @@ def cells_of(log: Log, row: int) -> list[float]:
 
 
 def test_live_health_power_and_cells_equal_offline_ones(tmp_path: Path) -> None:
-    log, car = short_log(120.0, rate_hz=2.0), car_with_cells(tmp_path)
+    log, car = short_log(120.0, rate_hz=1.0), car_with_cells(tmp_path)
     log = quantized(car, log)
     pipeline = Pipeline(car, leaf_model(), PipelineSettings())
     offline = make_estimator(leaf_model())

@@ -6,7 +6,7 @@ import can
 import numpy as np
 import pytest
 
-from cangauge.bus.publish import FrameIds
+from cangauge.bus.publish import ACKNOWLEDGE_EVERY, FrameIds, SocDetail, SocReader
 from cangauge.bus.time_source import ClockFrames
 from cangauge.bus.vehicle import Vehicle
 from cangauge.errors import InputError
@@ -65,6 +65,18 @@ def test_no_estimate_before_the_first_replay_clock(log: Log) -> None:
     frames = frames_of(log, vehicle)[:50]
     assert estimates(pipeline, frames) == []
     assert pipeline.counts.untimed == 50
+
+
+def test_samples_of_a_replay_are_acknowledged_while_they_come(log: Log) -> None:
+    vehicle = Vehicle.load("generic")
+    pipeline = Pipeline(vehicle, leaf_model(), PipelineSettings(START, "replay-clock"))
+    reader, told = SocReader(), [0]
+    for frame in with_clock(frames_of(log.rows(slice(0, 100)), vehicle)):
+        for sent in pipeline.acknowledgement(pipeline.latest) if pipeline.handle(frame) else []:
+            content = reader.read(sent)
+            told += [content.samples] if isinstance(content, SocDetail) else []
+        assert pipeline.samples - told[-1] < ACKNOWLEDGE_EVERY
+    assert told == sorted(told)
 
 
 def test_published_id_of_a_vehicle_signal_is_refused() -> None:

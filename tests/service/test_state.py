@@ -24,13 +24,7 @@ from cangauge.model.model_file import Model
 from cangauge.replay.encoder import FrameEncoder
 from cangauge.service import state as state_file
 from cangauge.service.pipeline import Pipeline, PipelineSettings
-from cangauge.service.state import (
-    FILE_NAME,
-    STATE_VERSION,
-    StateKeeper,
-    read_state,
-    state_path,
-)
+from cangauge.service.state import FILE_NAME, STATE_VERSION, StateKeeper, read_state, state_path
 from cangauge.types import Estimate, Reason, Sample, Status
 from live import LoggedLines, leaf_model, short_log, waits
 
