@@ -217,7 +217,8 @@ def test_an_open_page_survives_a_restart(bench: Bench, page: Any) -> None:
     before = page.execute_script(TIMES_MS)
     assert text(page, "recording").startswith(f"Recording to {bench.record}: ")
     bench.stop()
-    assert is_shown(page, "The service does not answer")
+    # Longer than the page draws a line over.
+    assert is_shown(page, "The service does not answer for 3 s", 20.0)
     bench.start()
     assert waits(lambda: text(page, "troubles") == "", 20.0)
     assert tile(page, "Current") == f"{CURRENT_A:.2f} A"
