@@ -330,6 +330,23 @@ def in_process(*arguments: object) -> Ended:
     return Ended(code, out.getvalue(), err.getvalue())
 
 
+def succeeds(*arguments: object) -> Ended:
+    """Run a short command in this process that must end with exit code 0."""
+    ended = in_process(*arguments)
+    assert ended.code == 0, ended.err
+    return ended
+
+
+def refused(ended: Ended, *words: str) -> None:
+    """Check for exit code 2, an empty stdout, and one line of error that has these words."""
+    assert (ended.code, ended.out) == (2, ""), ended
+    errors = [line for line in ended.err.splitlines() if line.startswith("error: ")]
+    assert len(errors) == 1, ended.err
+    assert "Traceback" not in ended.err
+    for word in words:
+        assert word in errors[0]
+
+
 def waits(condition: Callable[[], bool], seconds: float = 60.0) -> bool:
     """Return whether a condition becomes true in time."""
     until = time.monotonic() + seconds

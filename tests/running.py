@@ -5,7 +5,9 @@ from __future__ import annotations
 import socket
 import threading
 import time
+from collections.abc import Iterable
 from contextlib import suppress
+from itertools import count
 from pathlib import Path
 from typing import Any, Self
 
@@ -16,6 +18,7 @@ from cangauge.bus.vehicle import Vehicle
 from cangauge.estimation.offline import samples_of
 from cangauge.replay.encoder import FrameEncoder
 from cangauge.service.run import Service
+from cangauge.types import Sample
 from cells_bus import ALL_CELLS, CAR, CELLS_DBC, CELLS_ON_BUS, all_cell_frames
 from live import leaf_model_path, short_log, virtual_port, waits
 
@@ -41,14 +44,22 @@ class RunningService:
         Of HTTP.
     with_cells : bool
         A car that gives the voltages of 96 cells, the 40th of them lower.
+    steady : Sample, optional
+        Sent all the time, in place of a drive.
     """
 
     def __init__(
-        self, folder: Path, text: str = "", port: int | None = None, *, with_cells: bool = False
+        self,
+        folder: Path,
+        text: str = "",
+        port: int | None = None,
+        *,
+        with_cells: bool = False,
+        steady: Sample | None = None,
     ) -> None:
         self.port = port or free_port()
         self._channel = folder.name
-        self._with_cells = with_cells
+        self._with_cells, self._steady = with_cells, steady
         if with_cells:
             (folder / "cells.dbc").write_text(CELLS_DBC)
             (folder / "car.toml").write_text(CAR + ALL_CELLS)
@@ -85,7 +96,9 @@ class RunningService:
 
     def _play(self) -> None:
         encoder = FrameEncoder(Vehicle.load("generic"))
-        samples = list(samples_of(short_log(300.0, 1.0 / SAMPLE_S)))
+        samples: Iterable[Sample] = samples_of(short_log(300.0, 1.0 / SAMPLE_S))
+        if self._steady is not None:
+            samples = (self._steady._replace(time_s=SAMPLE_S * row) for row in count())
         bus = virtual_port(self._channel)
         due_s = time.monotonic()
         for sample in samples:

@@ -52,9 +52,14 @@ def test_frames_that_pass_the_filters_are_received(carries_fd: bool) -> None:
         BusConnection(open_bus(multicast(fd=carries_fd), FILTERS), "rx") as port,
         open_bus(multicast()) as sender,
     ):
+        before_s = time.time()
         for frame in [*others, *wanted, fd, *others]:
             sender.send(frame)
+        sent_s = time.time()
+        time.sleep(0.2)
         found = port.receive_pending(1.0)
+        # Stamped by the kernel on arrival.
+        assert all(before_s - 0.001 <= each.timestamp <= sent_s + 0.1 for each in found)
         expected = [*wanted, *([fd] if carries_fd else [])]
         assert all(
             one.equals(two, timestamp_delta=None, check_direction=False)
@@ -83,23 +88,6 @@ def test_many_pending_frames_come_in_batches_in_order() -> None:
 
 
 @linux_only
-def test_packets_that_are_no_frames_are_counted() -> None:
-    address = multicast()
-    junk = [b"", b"\xff", b"\x01", b"\x90", b"\x81\xa1x\x01", bytes(5000)]
-    with (
-        BusConnection(open_bus(address), "ours") as ours,
-        open_bus(address) as sender,
-        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as raw,
-    ):
-        raw.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_TTL, 0)
-        for each in junk:
-            raw.sendto(each, (address.channel, int(address.options["port"])))
-        sender.send(FRAME)
-        assert len(ours.receive_pending(0.2)) == 1
-        assert ours.garbled == len(junk)
-
-
-@linux_only
 def test_every_frame_is_received_or_counted_as_dropped() -> None:
     sent = 4000
     with (
@@ -119,29 +107,12 @@ def test_every_frame_is_received_or_counted_as_dropped() -> None:
     assert port.queue_drops == dropped  # also when it is closed
 
 
-@linux_only
-def test_the_kernel_stamps_multicast_on_arrival() -> None:
-    with (
-        BusConnection(open_bus(multicast()), "receiver") as port,
-        BusConnection(open_bus(multicast()), "sender") as tx,
-    ):
-        before_s = time.time()
-        tx.send(FRAME)
-        sent_s = time.time()
-        time.sleep(0.2)
-        message = port.receive(1.0)
-    assert message is not None
-    assert before_s - 0.001 <= message.timestamp <= sent_s + 0.1
-
-
-def test_a_bus_that_is_no_socket_counts_no_drops() -> None:
-    with BusConnection(open_bus(BusAddress("virtual", "drops")), "virtual") as port:
-        assert port.queue_drops is None
-
-
 def test_capabilities_by_interface() -> None:
-    virtual = backend_capabilities(BusAddress("virtual", "x"))
+    address = BusAddress("virtual", "x")
+    virtual = backend_capabilities(address)
     assert (virtual.stamps, virtual.echoes) == ("sender", False)
+    with BusConnection(open_bus(address), "virtual") as port:
+        assert port.queue_drops is None  # it is no socket
     pcan = backend_capabilities(BusAddress("pcan", "PCAN_USBBUS1", {"receive_own_messages": True}))
     assert (pcan.stamps, pcan.echoes, pcan.has_error_classes) == ("driver", True, False)
     socketcan = backend_capabilities(BusAddress("socketcan", "can0"))

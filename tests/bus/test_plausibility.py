@@ -61,16 +61,13 @@ def test_an_invalid_signal_is_not_usable_and_has_a_reason() -> None:
     assert [math.isnan(value) for value in used] == [True, True, False]
 
 
-def test_values_out_of_range_are_refused() -> None:
-    health = SignalHealth(SignalChecks(lowest=-1.0, highest=5.0))
+def test_values_out_of_range_and_spikes_are_refused() -> None:
     values = [-1.0, 5.0, 5.1, -1.1, math.inf, 0.0]
-    assert passed(health, values) == [-1.0, 5.0, None, None, None, 0.0]
-
-
-def test_a_spike_is_refused_and_a_lasting_step_accepted() -> None:
+    limited = SignalHealth(SignalChecks(lowest=-1.0, highest=5.0))
+    assert passed(limited, values) == [-1.0, 5.0, None, None, None, 0.0]
     checks = SignalChecks(max_jump=5.0, max_rate_per_s=1.0)
     assert passed(SignalHealth(checks), [20.0, 60.0, 20.5, 21.0]) == [20.0, None, 20.5, 21.0]
-    # 28 is possible 3 s after the latest good value; then three are needed.
+    # A lasting step: 28 is possible 3 s after the latest good value; then three are needed.
     assert passed(SignalHealth(checks), [20.0, *[28.0] * 40]).index(28.0) == 30 + 2
     health = SignalHealth(checks)
     health.update(20.0, 0.0)

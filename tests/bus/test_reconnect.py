@@ -17,7 +17,7 @@ from cangauge.bus.open import BusAddress, DriverMissingError, open_bus
 from cangauge.bus.publish import standard_filter
 from cangauge.bus.reconnecting import FIRST_PAUSE_S, ReconnectingBus
 from cangauge.errors import InputError
-from live import BrokenBus, network_down, unpack_error
+from live import BrokenBus, network_down
 
 ADDRESS = BusAddress("socketcan", "can9")
 FRAME = can.Message(arbitration_id=0x123, is_extended_id=False, data=b"12345678")
@@ -111,12 +111,6 @@ def test_a_failed_send_is_a_loss_and_later_frames_are_counted(log: BusLog) -> No
     assert port.unsent == 1001
     assert "sending failed" in log.lines[0]
     port.close()
-
-
-def test_a_bad_packet_is_no_loss() -> None:
-    port = port_on(Opener(BrokenBus([unpack_error(), FRAME])))
-    assert len(pump(port, 0.1)) == 1
-    assert (port.garbled, port.losses) == (1, 0)
 
 
 def test_pauses_grow_to_a_limit_and_reset_when_steady(

@@ -76,32 +76,26 @@ def decoded(vehicle: Vehicle, frames: list[can.Message]) -> tuple[SampleDecoder,
 
 
 @pytest.mark.parametrize(
-    ("vehicle", "ahead", "later", "within"),
+    ("vehicle", "ahead", "later", "begins", "within"),
     [
-        *((LEAF, ahead, later, 30) for ahead in range(4) for later in (-0.1, 0.2, 0.5, 0.7)),
+        *((LEAF, ahead, later, FROM, 30) for ahead in range(4) for later in (-0.1, 0.2, 0.5, 0.7)),
         # Without a stated period it is learned.
-        *(
-            (GENERIC, ahead, later, 60)
-            for ahead, later in ((0, -0.1), (1, 0.2), (2, 0.3), (7, 0.3))
-        ),
+        (GENERIC, 0, -0.1, FROM, 60),
+        (GENERIC, 1, 0.2, FROM, 60),
+        (GENERIC, 2, 0.3, FROM, 60),
+        (GENERIC, 7, 0.3, FROM, 60),
+        *((GENERIC, ahead, 0.2, 0, 60) for ahead in (2, 3, 8)),
     ],
 )
 def test_a_second_sender_is_reported_whatever_its_counter(
-    vehicle: Vehicle, ahead: int, later: float, within: int
+    vehicle: Vehicle, ahead: int, later: float, begins: int, within: int
 ) -> None:
-    decoder, first = decoded(vehicle, attacked(vehicle, ahead, later))
-    assert FROM <= first <= FROM + within
+    decoder, first = decoded(vehicle, attacked(vehicle, ahead, later, begins))
+    assert begins <= first <= begins + within
     assert decoder.reasons(decoder.now_s) & Reason.DUPLICATE_SENDER
     assert decoder.two_sender_messages == (vehicle.current.message,)
     # Nothing of the mixture is used.
     assert math.isnan(decoder.health["current"].value_at(decoder.now_s))
-
-
-@pytest.mark.parametrize("ahead", [2, 3, 8])
-def test_a_second_sender_from_the_start_is_reported(ahead: int) -> None:
-    decoder, first = decoded(GENERIC, attacked(GENERIC, ahead, 0.2, begins=0))
-    assert first <= 60
-    assert decoder.two_sender_messages == (GENERIC.current.message,)
 
 
 def test_message_is_used_again_after_the_second_sender() -> None:

@@ -2,21 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
 from cangauge.identify.fit import fit
 from cangauge.logs.canonical import write_log
-from live import Ended, in_process
 from synthetic import synthetic_log
-
-
-@pytest.fixture
-def run() -> Callable[..., Ended]:
-    """Run `cangauge ARG…` through its own `main`: exit code, stdout and stderr."""
-    return in_process
 
 
 @pytest.fixture(scope="session")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,116 +14,88 @@ import pyarrow.csv
 import pyarrow.parquet
 import pytest
 
+from cangauge._resources import shared_file
 from cangauge.bus.vehicle import Vehicle
 from cangauge.cli.estimate import write_estimates
 from cangauge.estimation.offline import estimate_log, samples_of
 from cangauge.estimation.settings import EstimatorSettings
 from cangauge.logs.canonical import write_log
+from cangauge.logs.log import Log
 from cangauge.logs.read import read_log
 from cangauge.model.model_file import Model
 from cangauge.replay.encoder import FrameEncoder
 from cangauge.service.offline import estimate_capture
 from cangauge.types import Sample, reason_names
+from cells_bus import ALL_CELLS, CELLS_DBC, CELLS_ON_BUS, all_cell_frames
+from live import in_process, refused, succeeds
 
-Run = Callable[..., object]
-
-COLUMNS = [
-    "time_s",
+NUMBERS = [
     "soc_pct",
     "soc_std_pct",
     "soc_newton_pct",
     "soc_coulomb_pct",
     "voltage_model_v",
     "residual_v",
-    "status",
-    "reasons",
 ]
-CONTRACT = {
-    "rows",
-    "seconds",
-    "voltage_mae_pct",
-    "soc_mae_pct",
-    "soc_max_pct",
-    "soc_newton_mae_pct",
-    "soc_coulomb_mae_pct",
-    "cover_2sigma",
-}
 
 
-def refused(ran: object, *words: str) -> None:
-    assert ran.code == 2
-    assert ran.out == ""
-    errors = [line for line in ran.err.splitlines() if line.startswith("error: ")]
-    assert len(errors) == 1
-    for word in words:
-        assert word in errors[0]
+@pytest.fixture
+def part(made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Log:
+    """The log part.csv, beside the model model.json in the working folder."""
+    monkeypatch.chdir(tmp_path)
+    for name in ("part.csv", "model.json"):
+        shutil.copy(made / name, tmp_path)
+    return read_log("part.csv")
 
 
-@pytest.mark.parametrize("suffix", [".csv", ".parquet"])
-def test_one_row_per_sample_bit_for_bit(run: Run, made: Path, tmp_path: Path, suffix: str) -> None:
-    out = tmp_path / f"soc{suffix}"
-    ran = run("estimate", made / "part.csv", "-m", made / "model.json", "-o", out)
-    assert ran.code == 0, ran.err
-    read = pa.csv.read_csv if suffix == ".csv" else pa.parquet.read_table
-    table = read(out)
-    assert table.column_names == COLUMNS
-    log = read_log(made / "part.csv")
-    settings = EstimatorSettings(initial_soc_pct=log.soc_pct[0], temperature_source="room")
-    expected, _ = estimate_log(log, Model.load(made / "model.json"), settings)
-    assert table["time_s"].to_numpy().tolist() == log.time_s.tolist()
-    for name in COLUMNS[1:7]:
+def read_table(path: str) -> pa.Table:
+    return (pa.csv.read_csv if path.endswith(".csv") else pa.parquet.read_table)(path)
+
+
+@pytest.mark.parametrize("out", ["soc.csv", "soc.parquet"])
+def test_one_row_per_sample_bit_for_bit_and_its_scores(part: Log, out: str) -> None:
+    found = succeeds("estimate", "part.csv", "-m", "model.json", "-o", out, "--json").json
+    table = read_table(out)
+    assert table.column_names == ["time_s", *NUMBERS, "status", "reasons"]
+    assert part.soc_pct is not None
+    settings = EstimatorSettings(initial_soc_pct=part.soc_pct[0], temperature_source="room")
+    expected, _ = estimate_log(part, Model.load("model.json"), settings)
+    assert table["time_s"].to_numpy().tolist() == part.time_s.tolist()
+    for name in NUMBERS:
         assert table[name].to_numpy().tolist() == getattr(expected, name).tolist()
     assert set(table["status"].to_pylist()) == {"degraded", "valid"}
     words = [each or "" for each in table["reasons"].to_pylist()]
     assert words[0] == "delay line filling; soc uncertain"
     assert words == [reason_names(each) for each in expected.reasons.tolist()]
-
-
-def test_json_is_one_object_that_keeps_the_contract(run: Run, made: Path, tmp_path: Path) -> None:
-    out = tmp_path / "soc.csv"
-    ran = run("estimate", made / "part.csv", "-m", made / "model.json", "-o", out, "--json")
-    assert ran.code == 0, ran.err
-    found = json.loads(ran.out)
-    assert set(found) >= CONTRACT
-    assert found["rows"] == len(read_log(made / "part.csv"))
-    assert found["initial_soc_from"] == "log"
+    assert (found["rows"], found["initial_soc_from"]) == (len(part), "log")
     assert found["soc_mae_pct"] < 1.0
     assert 0.0 <= found["cover_2sigma"] <= 1.0
     assert found["reasons"]["delay line filling"] == pytest.approx(70.0 / 1440.0, abs=1e-3)
 
 
-def test_without_reference_the_scores_are_null(run: Run, made: Path, tmp_path: Path) -> None:
-    log = replace(read_log(made / "part.csv"), soc_pct=None)
-    write_log(log, tmp_path / "bare.parquet")
-    ran = run(
-        "estimate", tmp_path / "bare.parquet", "-m", made / "model.json", "-o",
-        tmp_path / "soc.csv", "--report", tmp_path / "soc.html", "--json",
-    )  # fmt: skip
-    assert ran.code == 0, ran.err
-    found = json.loads(ran.out)
+def test_without_reference_the_scores_are_null(part: Log) -> None:
+    write_log(replace(part, soc_pct=None), "bare.parquet")
+    options = ("-m", "model.json", "-o", "soc.csv", "--report", "soc.html", "--json")
+    found = succeeds("estimate", "bare.parquet", *options).json
     assert found["soc_mae_pct"] is None
     assert found["cover_2sigma"] is None
     assert found["initial_soc_from"] == "voltage"
     assert found["voltage_mae_pct"] < 1.0
-    assert "no reference SoC" in (tmp_path / "soc.html").read_text(encoding="utf-8")
+    assert "no reference SoC" in Path("soc.html").read_text(encoding="utf-8")
 
 
-def test_the_first_reference_is_counted_back_to_the_first_row(
-    run: Run, made: Path, tmp_path: Path
-) -> None:
-    log = read_log(made / "part.csv")
-    soc = log.soc_pct.copy()
-    soc[:600] = np.nan
-    write_log(replace(log, soc_pct=soc), tmp_path / "late.parquet")
-    ran = run(
-        "estimate", tmp_path / "late.parquet", "-m", made / "model.json", "-o",
-        tmp_path / "soc.csv", "--capacity-ah", "51.5", "--json",
-    )  # fmt: skip
-    assert json.loads(ran.out)["initial_soc_pct"] == pytest.approx(log.soc_pct[0], abs=1e-6)
+def test_the_first_reference_is_counted_back_to_the_first_row(part: Log) -> None:
+    assert part.soc_pct is not None
+    late_pct = np.where(np.arange(len(part)) < 600, np.nan, part.soc_pct)
+    write_log(replace(part, soc_pct=late_pct), "late.parquet")
+    options = ("-m", "model.json", "-o", "soc.csv", "--capacity-ah", "51.5", "--json")
+    found = succeeds("estimate", "late.parquet", *options).json
+    assert found["initial_soc_pct"] == pytest.approx(part.soc_pct[0], abs=1e-6)
 
 
+@pytest.mark.usefixtures("part")
 @pytest.mark.parametrize(
-    "case",
+    ("given", "start_pct", "origin", "doubt"),
     [
         ("auto", None, "voltage", ""),
         ("80.4", 80.4, "given", ""),
@@ -131,225 +103,176 @@ def test_the_first_reference_is_counted_back_to_the_first_row(
         ("0.8", 0.8, "given", "a fraction is given in percent, as 80"),
     ],
 )
-def test_initial_soc(
-    run: Run, made: Path, tmp_path: Path, case: tuple[str, float | None, str, str]
-) -> None:
-    given, start, origin, doubt = case
-    ran = run(
-        "estimate", made / "part.csv", "-m", made / "model.json", "-o", tmp_path / "soc.parquet",
-        "--initial-soc", given, "--initial-soc-std", "20", "--json",
-    )  # fmt: skip
-    found = json.loads(ran.out)
-    assert (found["initial_soc_pct"], found["initial_soc_from"]) == (start, origin)
-    counted = (
-        pa.parquet.read_table(tmp_path / "soc.parquet")["soc_coulomb_pct"].drop_null()[0].as_py()
-    )
-    assert counted == pytest.approx(start or 80.0, abs=1e-9 if start else 10.0)
+def test_initial_soc(given: str, start_pct: float | None, origin: str, doubt: str) -> None:
+    options = ("--initial-soc", given, "--initial-soc-std", "20", "--json")
+    ran = succeeds("estimate", "part.csv", "-m", "model.json", "-o", "soc.parquet", *options)
+    found = ran.json
+    assert (found["initial_soc_pct"], found["initial_soc_from"]) == (start_pct, origin)
+    counted = read_table("soc.parquet")["soc_coulomb_pct"].drop_null()[0].as_py()
+    assert counted == pytest.approx(start_pct or 80.0, abs=1e-9 if start_pct else 10.0)
     assert doubt in ran.err
     assert ("the initial SoC is" in ran.err) is bool(doubt)
 
 
-def test_each_method_gives_its_own_soc(run: Run, made: Path, tmp_path: Path) -> None:
-    for method in ("newton", "coulomb"):
-        out = tmp_path / f"{method}.parquet"
-        ran = run(
-            "estimate", made / "part.csv", "-m", made / "model.json", "-o", out, "--method", method
-        )
-        assert ran.code == 0, ran.err
-        table = pa.parquet.read_table(out)
-        assert table["soc_pct"].to_pylist() == table[f"soc_{method}_pct"].to_pylist()
+@pytest.mark.usefixtures("part")
+@pytest.mark.parametrize("method", ["newton", "coulomb"])
+def test_each_method_gives_its_own_soc(method: str) -> None:
+    options = ("-m", "model.json", "-o", "soc.parquet", "--method", method)
+    succeeds("estimate", "part.csv", *options)
+    table = read_table("soc.parquet")
+    assert table["soc_pct"].to_pylist() == table[f"soc_{method}_pct"].to_pylist()
 
 
-def test_unknown_values_are_empty(run: Run, made: Path, tmp_path: Path) -> None:
-    log = read_log(made / "part.csv")
-    volts = log.voltage_v.copy()
-    volts[:5] = 0.0
-    write_log(replace(log, voltage_v=volts, soc_pct=None), tmp_path / "start.parquet")
-    for suffix, read in ((".csv", pa.csv.read_csv), (".parquet", pa.parquet.read_table)):
-        out = tmp_path / f"soc{suffix}"
-        ran = run("estimate", tmp_path / "start.parquet", "-m", made / "model.json", "-o", out)
-        assert ran.code == 0, ran.err
-        table = read(out)
-        assert table["soc_pct"].null_count == 60  # an implausible voltage drops the first block
-        assert table["time_s"].to_numpy().tolist() == log.time_s.tolist()
-        assert table["status"].to_pylist()[:61] == ["initialising"] * 60 + ["degraded"]
-    assert "nan" not in (tmp_path / "soc.csv").read_text(encoding="utf-8").lower()
+@pytest.mark.parametrize("out", ["soc.csv", "soc.parquet"])
+def test_unknown_values_are_empty(part: Log, out: str) -> None:
+    voltage_v = np.where(np.arange(len(part)) < 5, 0.0, part.voltage_v)
+    write_log(replace(part, voltage_v=voltage_v, soc_pct=None), "start.parquet")
+    succeeds("estimate", "start.parquet", "-m", "model.json", "-o", out)
+    table = read_table(out)
+    assert table["soc_pct"].null_count == 60  # an implausible voltage drops the first block
+    assert table["time_s"].to_numpy().tolist() == part.time_s.tolist()
+    assert table["status"].to_pylist()[:61] == ["initialising"] * 60 + ["degraded"]
+    assert b"nan" not in Path(out).read_bytes().lower() or out.endswith(".parquet")
 
 
-def test_a_refused_sample_keeps_its_own_time(made: Path, tmp_path: Path) -> None:
-    log = read_log(made / "part.csv").rows(slice(0, 50))
-    amperes = log.current_a.copy()
-    amperes[20] = 1e5
-    wild = replace(log, current_a=amperes)
-    table, _ = estimate_log(wild, Model.load(made / "model.json"), EstimatorSettings())
+def test_a_refused_sample_keeps_its_own_time(part: Log) -> None:
+    log = part.rows(slice(0, 50))
+    wild = replace(log, current_a=np.where(np.arange(50) == 20, 1e5, log.current_a))
+    table, _ = estimate_log(wild, Model.load("model.json"), EstimatorSettings())
     assert table.time_s[20] == log.time_s[19]
-    write_estimates(tmp_path / "soc.parquet", wild.time_s, table)
-    written = pa.parquet.read_table(tmp_path / "soc.parquet")
+    write_estimates(Path("soc.parquet"), wild.time_s, table)
+    written = read_table("soc.parquet")
     assert written["time_s"].to_numpy().tolist() == log.time_s.tolist()
     assert "implausible input" in written["reasons"][20].as_py()
     assert written.equals(replace(table, time_s=wild.time_s).to_arrow())
 
 
-def test_a_slow_log_has_no_gaps_by_default(run: Run, made: Path, tmp_path: Path) -> None:
-    log = read_log(made / "full.parquet")
-    write_log(log.rows(slice(None, None, 5)), tmp_path / "slow.parquet")
-    args = ("estimate", tmp_path / "slow.parquet", "-m", made / "model.json", "--json")
-    usual = run(*args, "-o", tmp_path / "a.csv")
-    assert json.loads(usual.out)["max_gap_s"] == 15.0
-    assert "15 s count as gaps" in usual.err
-    assert "current gap" not in json.loads(usual.out)["reasons"]
+@pytest.mark.usefixtures("part")
+def test_a_slow_log_has_no_gaps_by_default(made: Path) -> None:
+    write_log(read_log(made / "full.parquet").rows(slice(None, None, 5)), "slow.parquet")
+    options = ("-m", "model.json", "-o", "a.csv", "--json")
+    ran = succeeds("estimate", "slow.parquet", *options)
+    assert ran.json["max_gap_s"] == 15.0
+    assert "15 s count as gaps" in ran.err
+    assert "current gap" not in ran.json["reasons"]
 
 
+@pytest.mark.usefixtures("part")
 @pytest.mark.parametrize(
-    "case",
+    ("options", "words"),
     [
-        (["--method", "ukf"], ["'--method'", "'ukf' is not one of 'ekf', 'newton', 'coulomb'"]),
-        (["--initial-soc", "half"], ["--initial-soc", "half"]),
-        (["--initial-soc", "101"], ["--initial-soc", "101"]),
-        (["--initial-soc-std", "-1"], ["--initial-soc-std", "-1"]),
-        (["--capacity-ah", "0"], ["--capacity-ah"]),
-        (["-o", "soc.txt"], ["soc.txt", ".csv, .parquet or .mcap"]),
-        (["--pack", "pack.mcap"], ["--pack", ".csv or .parquet"]),
-        (["--report", "soc.csv"], ["--report", ".html"]),
-        (["-o", "no/such/soc.csv"], ["no/such/soc.csv"]),
-        (["-m", "none.json"], ["none.json", "no such file"]),
-        (["--pack", "soc.csv"], ["two outputs"]),
+        ("--method ukf", ["'--method'", "'ukf' is not one of 'ekf', 'newton', 'coulomb'"]),
+        ("--initial-soc half", ["--initial-soc", "half"]),
+        ("--initial-soc 101", ["--initial-soc", "101"]),
+        ("--initial-soc-std -1", ["--initial-soc-std", "-1"]),
+        ("--capacity-ah 0", ["--capacity-ah"]),
+        ("-o soc.txt", ["soc.txt", ".csv, .parquet or .mcap"]),
+        ("-o no/such/soc.csv", ["no/such/soc.csv"]),
+        ("-o part.csv", ["part.csv", "also an input"]),
+        ("-m none.json", ["none.json", "no such file"]),
+        ("--pack pack.mcap", ["--pack", ".csv or .parquet"]),
+        ("--pack soc.csv", ["two outputs"]),
+        ("--report soc.csv", ["--report", ".html"]),
     ],
 )
 def test_bad_options_get_one_line_and_write_nothing(
-    run: Run,
-    made: Path,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    case: tuple[list[str], list[str]],
+    tmp_path: Path, options: str, words: list[str]
 ) -> None:
-    options, words = case
-    monkeypatch.chdir(tmp_path)
-    usual = ["-m", made / "model.json", "-o", "soc.csv"]
-    ran = run("estimate", made / "part.csv", *usual, *options)
-    refused(ran, *words)
-    assert list(tmp_path.iterdir()) == []
+    before = {path: path.read_bytes() for path in tmp_path.iterdir()}
+    usual = ("-m", "model.json", "-o", "soc.csv")
+    refused(in_process("estimate", "part.csv", *usual, *options.split()), *words)
+    assert {path: path.read_bytes() for path in tmp_path.iterdir()} == before
 
 
-def test_the_model_of_another_pack_is_refused(run: Run, made: Path, tmp_path: Path) -> None:
-    log = read_log(made / "part.csv")
-    write_log(replace(log, voltage_v=log.voltage_v / 2.0), tmp_path / "half.parquet")
-    out = tmp_path / "soc.csv"
-    ran = run("estimate", tmp_path / "half.parquet", "-m", made / "model.json", "-o", out)
+def test_a_log_of_another_pack_or_of_inverted_current_is_refused(part: Log) -> None:
+    write_log(replace(part, voltage_v=part.voltage_v / 2.0), "half.parquet")
+    write_log(replace(part, current_a=-part.current_a), "turned.parquet")
+    given = ("-m", "model.json", "-o", "soc.csv")
+    ran = in_process("estimate", "half.parquet", *given)
     refused(ran, "half.parquet", "voltage_v", "median", "-m")
-    assert not out.exists()
+    refused(in_process("estimate", "turned.parquet", *given), "turned.parquet", "current_a")
+    assert not Path("soc.csv").exists()
+    ran = in_process("fit", "turned.parquet", "-o", "new.json", "--capacity-ah", "51")
+    refused(ran, "turned.parquet", "current_a", "multiply the column by -1")
+    assert not Path("new.json").exists()
 
 
-def test_turned_current_is_refused(run: Run, made: Path, tmp_path: Path) -> None:
-    log = read_log(made / "part.csv")
-    write_log(replace(log, current_a=-log.current_a), tmp_path / "turned.parquet")
-    out = tmp_path / "soc.csv"
-    ran = run("estimate", tmp_path / "turned.parquet", "-m", made / "model.json", "-o", out)
-    refused(ran, "turned.parquet", "current_a")
-    assert not out.exists()
+# --- Captures
 
-
-def test_outputs_must_not_overwrite_input(run: Run, made: Path) -> None:
-    before = (made / "part.csv").read_bytes()
-    ran = run("estimate", made / "part.csv", "-m", made / "model.json", "-o", made / "part.csv")
-    refused(ran, "also an input")
-    assert (made / "part.csv").read_bytes() == before
+CAR = f'like = "generic"\ndbc = ["{shared_file("dbc", "generic_pack.dbc")}", "cells.dbc"]\n'
 
 
 @pytest.fixture(scope="module")
-def capture(made: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Part of a discharge, as frames of the generic pack."""
+def drive(made: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Part of a discharge as frames of the generic pack, with cells, the 12th of them lower."""
     log = read_log(made / "part.csv")
+    assert log.soc_pct is not None
     path = tmp_path_factory.mktemp("capture") / "drive.log"
     encoder = FrameEncoder(Vehicle.load("generic"))
-    with can.Logger(path) as writer:
-        for sample, soc in zip(samples_of(log), log.soc_pct.tolist(), strict=True):
-            for frame in encoder.encode(sample, soc):
-                frame.timestamp = 1e6 + sample.time_s
+    with can.CanutilsLogWriter(path) as writer:
+        for sample, soc_pct in zip(samples_of(log), log.soc_pct.tolist(), strict=True):
+            stamped = sample._replace(time_s=1e6 + sample.time_s)
+            cells_v = [sample.voltage_v / CELLS_ON_BUS] * CELLS_ON_BUS
+            cells_v[11] -= 0.030
+            frames = encoder.encode(stamped, soc_pct)
+            for frame in [*all_cell_frames(cells_v, stamped.time_s), *frames]:
                 writer.on_message_received(frame)
     return path
 
 
-def test_a_capture_is_estimated_as_the_service_does(
-    run: Run, made: Path, tmp_path: Path, capture: Path
-) -> None:
-    out = tmp_path / "soc.parquet"
-    ran = run(
-        "estimate", capture, "--vehicle", "generic", "-m", made / "model.json", "-o", out,
-        "--report", tmp_path / "soc.html", "--json",
-    )  # fmt: skip
-    assert ran.code == 0, ran.err
-    found = json.loads(ran.out)
+def test_a_capture_is_estimated_as_the_service_does(part: Log, drive: Path) -> None:
+    Path("cells.dbc").write_text(CELLS_DBC)
+    Path("car.toml").write_text(CAR + ALL_CELLS)
+    outputs = ("-o", "soc.parquet", "--pack", "pack.parquet", "--report", "soc.html")
+    given = ("--map", "car.toml", "-m", "model.json", *outputs, "--json")
+    found = succeeds("estimate", drive, *given).json
     assert found["initial_soc_from"] == "voltage"
     assert found["frames"]["lost"] == 0
     assert found["soc_mae_pct"] is not None
-    table = pa.parquet.read_table(out)
-    live = estimate_capture(capture, Vehicle.load("generic"), Model.load(made / "model.json")).table
-    assert len(table) == found["rows"] == len(read_log(made / "part.csv"))
-    for name in COLUMNS[1:7]:
-        assert np.array_equal(table[name].to_numpy(), getattr(live, name), equal_nan=True)
+    table = read_table("soc.parquet")
+    live = estimate_capture(drive, Vehicle.load(map="car.toml"), Model.load("model.json"))
+    assert len(table) == found["rows"] == len(part)
+    for name in NUMBERS:
+        assert np.array_equal(table[name].to_numpy(), getattr(live.table, name), equal_nan=True)
+    assert live.pack.report is not None
+    report = json.loads(json.dumps(live.pack.report.to_dict()))
+    assert {name: found[name] for name in report} == report
+    assert report["cells"]["weakest"] == 12
+    assert read_table("pack.parquet")["cell_soc_pct"].to_pylist()[-1] == report["cells"]["soc_pct"]
 
 
-@pytest.mark.parametrize("command", ["estimate", "inspect"])
-def test_sign_of_a_capture_is_refused(
-    run: Run, made: Path, tmp_path: Path, capture: Path, command: str
-) -> None:
-    more = ("-m", made / "model.json", "-o", tmp_path / "soc.csv") if command == "estimate" else ()
-    ran = run(command, capture, "--vehicle", "generic", "--sign", "discharge", *more)
-    refused(ran, "drive.log", "--sign", "under [current]")
-
-
-def test_a_capture_of_another_pack_is_refused(run: Run, made: Path, tmp_path: Path) -> None:
+@pytest.mark.usefixtures("part")
+def test_a_capture_that_does_not_fit_is_refused(drive: Path) -> None:
+    model = ("-m", "model.json", "-o", "soc.csv")
+    for command, more in (("estimate", model), ("fit", ("-o", "x.json"))):
+        words = ("CAN capture", "--vehicle generic matches it")
+        refused(in_process(command, drive, *more), *words)
+    for command, more in (("estimate", model), ("inspect", ())):
+        ran = in_process(command, drive, "--vehicle", "generic", "--sign", "discharge", *more)
+        refused(ran, "drive.log", "--sign", "under [current]")
+    Path("turned.toml").write_text(
+        'like = "generic"\ncurrent = {signal = "current_a", sign = -1}\ntemperature.fixed_c = 23\n'
+    )
+    ran = in_process("estimate", drive, "--map", "turned.toml", *model)
+    refused(ran, "drive.log", "current_a", "sign = -1 under [current]")
     encoder = FrameEncoder(Vehicle.load("generic"))
-    with can.Logger(tmp_path / "low.log") as writer:
+    with can.CanutilsLogWriter("low.log") as writer:
         for k in range(100):
             for frame in encoder.encode(Sample(1e6 + k / 10.0, 10.0, 38.0 + k / 100.0, 23.0), 80.0):
                 writer.on_message_received(frame)
-    model = ("-m", made / "model.json", "-o", tmp_path / "soc.csv")
-    ran = run("estimate", tmp_path / "low.log", "--vehicle", "generic", *model)
+    ran = in_process("estimate", "low.log", "--vehicle", "generic", *model)
     refused(ran, "low.log", "38 … 38.99 V", "but the model", "is of a pack of")
-    assert not (tmp_path / "soc.csv").exists()
-
-
-def test_turned_current_in_a_capture_is_refused(
-    run: Run, made: Path, tmp_path: Path, capture: Path
-) -> None:
-    model = ("-m", made / "model.json", "-o", tmp_path / "soc.csv")
-    for command in ("estimate", "fit"):
-        more = model if command == "estimate" else ("-o", tmp_path / "x.json")
-        refused(run(command, capture, *more), "CAN capture", "--vehicle generic matches it")
-    vehicle = Vehicle.load("generic")
-    current = vehicle.current
-    text = f"""
-name = "turned"
-dbc = ["{vehicle.dbc_files[0]}"]
-[current]
-message = "{current.message}"
-signal = "{current.codec.name}"
-sign = -1
-[voltage]
-message = "{vehicle.voltage.message}"
-signal = "{vehicle.voltage.codec.name}"
-[temperature]
-fixed_c = 23.0
-"""
-    (tmp_path / "turned.toml").write_text(text, encoding="utf-8")
-    ran = run("estimate", capture, "--map", tmp_path / "turned.toml", *model)
-    refused(ran, "drive.log", "current_a", "sign = -1 under [current]")
-    assert not (tmp_path / "soc.csv").exists()
+    assert not Path("soc.csv").exists()
 
 
 @pytest.mark.real
 @pytest.mark.nightly
-def test_a_real_capture(run: Run, shared_data: Path, project: Path, tmp_path: Path) -> None:
+def test_a_real_capture(shared_data: Path, project: Path, tmp_path: Path) -> None:
     capture = shared_data / "leaf_can" / "ZE0w24kWhstock.log.gz"
     model = project / "replay" / "leaf2012_published_model.json"
-    ran = run(
-        "estimate", capture, "--vehicle", "leaf_ze0", "-m", model, "-o", tmp_path / "soc.csv",
-        "--report", tmp_path / "soc.html", "--json",
-    )  # fmt: skip
-    assert ran.code == 0, ran.err
-    found = json.loads(ran.out)
+    outputs = ("-o", tmp_path / "soc.csv", "--report", tmp_path / "soc.html")
+    given = ("--vehicle", "leaf_ze0", "-m", model, *outputs, "--json")
+    found = succeeds("estimate", capture, *given).json
     assert found["frames"]["crc_errors"] == 0
     assert found["reasons"]["temperature source mismatch"] == 1.0
-    assert found["rows"] == len(pa.csv.read_csv(tmp_path / "soc.csv"))
+    assert found["rows"] == len(read_table(str(tmp_path / "soc.csv")))

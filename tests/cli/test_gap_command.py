@@ -1,73 +1,81 @@
-"""`cangauge gap`: JSON, files, texts, refusals."""
+"""`cangauge gap`: JSON, files, texts, refusals; a plan of tests, and what an added test changed."""
 
 from __future__ import annotations
 
 import html
-import json
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from cangauge.logs.canonical import write_log
 from cangauge.logs.log import Log
 from cangauge.model.model_file import Model
+from live import in_process, refused, succeeds
 from synthetic import synthetic_log
 
-Run = Callable[..., object]
 
-
-def day(seed: int) -> Log:
-    return synthetic_log(
-        hours=0.6, start_pct=85.0, end_pct=65.0, noise_v=0.5, seed=seed, name=f"day {seed}"
-    )
+def drive(seed: int, start_pct: float, extra_v: float = 0.0) -> Log:
+    end_pct = start_pct - 8.0
+    log = synthetic_log(hours=0.25, start_pct=start_pct, end_pct=end_pct, noise_v=0.5, seed=seed)
+    return replace(log, voltage_v=log.voltage_v + extra_v, name=f"drive {seed}")
 
 
 @pytest.fixture(scope="module")
-def days(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Folder with three days without a fault and one on which the voltage reads 6 V too high."""
-    folder = tmp_path_factory.mktemp("days")
-    for seed in (11, 12, 13):
-        write_log(day(seed), folder / f"good{seed}.parquet")
-    log = day(21)
-    write_log(replace(log, voltage_v=log.voltage_v + 6.0), folder / "trip.csv")
+def drives(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Folder with three drives without a fault, and one on which the voltage reads 4 V too high."""
+    folder = tmp_path_factory.mktemp("drives")
+    for seed, start_pct in ((11, 85.0), (12, 70.0), (13, 55.0)):
+        write_log(drive(seed, start_pct), folder / f"good{seed}.parquet")
+    write_log(drive(21, 80.0, 4.0), folder / "trip.csv")
     return folder
 
 
-def references(days: Path) -> list[object]:
-    return [
-        word for path in sorted(days.glob("good*.parquet")) for word in ("--reference", path)
-    ]  # fmt: skip
+@pytest.fixture
+def faulty(made: Path, drives: Path) -> list[object]:
+    """`gap` on the drive with the fault, beside the others."""
+    references = sorted(drives.glob("good*.parquet"))
+    words: list[object] = ["gap", drives / "trip.csv", "-m", made / "model.json"]
+    return words + [word for path in references for word in ("--reference", path)]
 
 
-def test_json_report_and_a_model_that_runs(
-    run: Run, made: Path, days: Path, tmp_path: Path
+def test_json_report_plan_and_a_model_that_runs(
+    faulty: list[object], drives: Path, tmp_path: Path
 ) -> None:
     better, page = tmp_path / "better.json", tmp_path / "gap.html"
-    ran = run(
-        "gap", days / "trip.csv", "-m", made / "model.json", *references(days),
-        "--json", "--extended", better, "--report", page,
-    )  # fmt: skip
-    assert ran.code == 0
-    found = json.loads(ran.out)
+    options = ("--plan", "--extended", better, "--report", page, "--json")
+    found = succeeds(*faulty, *options).json
     assert found["schema"] == 3
     assert found["cause"]["groups"][0]["group"] == "sensors_and_count"
     assert found["extended_model"] == str(better)
+    plan = found["plan"]
+    gains = [step["gain"] for step in plan["steps"]]
+    assert gains == sorted(gains, reverse=True)
+    assert len(plan["between"]) == 2
+    assert all(0.0 <= step["after"] <= 1.0 for step in plan["steps"])
     text = html.unescape(page.read_text(encoding="utf-8"))
     assert found["summary"].splitlines()[0] in text
     assert found["cause"]["check_first"] in text
     assert "How far it shrinks" in text
+    assert plan["steps"][0]["name"] in text
     assert [entry["id"] for entry in Model.load(better).effects]
-    ran = run("estimate", days / "trip.csv", "-m", better, "-o", tmp_path / "soc.csv")
-    assert ran.code == 0
+    succeeds("estimate", drives / "trip.csv", "-m", better, "-o", tmp_path / "soc.csv")
 
 
-def test_text_begins_with_the_verdict(run: Run, made: Path, days: Path, tmp_path: Path) -> None:
-    extended = ("--extended", tmp_path / "same.json")
-    ran = run("gap", days / "good11.parquet", "-m", made / "model.json", *extended)
-    assert ran.code == 0
+def test_an_added_test_reports_its_change(faulty: list[object], tmp_path: Path) -> None:
+    write_log(drive(22, 55.0, 4.0), tmp_path / "further.csv")
+    found = succeeds(*faulty, "--add-test", tmp_path / "further.csv", "--json").json
+    assert found["added_test"]["logs"] == ["further"]
+    assert [log["name"] for log in found["inputs"]["logs"]] == ["trip", "further"]
+    after = {item["effect"]: item["probability"] for item in found["cause"]["candidates"]}
+    before = found["added_test"]["before"]
+    sensing = ("voltage_offset", "voltage_gain")
+    assert sum(after[name] for name in sensing) > sum(before[name] for name in sensing)
+
+
+def test_text_begins_with_the_verdict(made: Path, drives: Path, tmp_path: Path) -> None:
+    given = (drives / "good11.parquet", "-m", made / "model.json")
+    ran = succeeds("gap", *given, "--extended", tmp_path / "same.json")
     assert "same.json: the model as given, since no cause is accepted" in ran.err
     assert ran.out.startswith("No significant gap")
     assert "P(no fault) = " in ran.out
@@ -76,28 +84,20 @@ def test_text_begins_with_the_verdict(run: Run, made: Path, days: Path, tmp_path
     assert {"cause", "unknown", "none"} <= table
 
 
-def test_the_alarm_is_a_choice_of_the_user(run: Run, made: Path, days: Path) -> None:
-    given = ("gap", days / "good11.parquet", "-m", made / "model.json", "--json")
-    never, always = (json.loads(run(*given, "--alarm", alarm).out)["cause"] for alarm in ("0", "1"))
+def test_the_alarm_is_a_choice_of_the_user(made: Path, drives: Path) -> None:
+    given = ("gap", drives / "good11.parquet", "-m", made / "model.json", "--json", "--alarm")
+    never, always = (succeeds(*given, alarm).json["cause"] for alarm in ("0", "1"))
     assert (never["detected"], always["detected"]) == (False, True)
     assert never["verdict"] == always["verdict"]
-    assert run(*given, "--alarm", "2").code == 2
+    assert in_process(*given, "2").code == 2
 
 
-def test_a_log_that_is_its_own_reference_is_refused(run: Run, made: Path, days: Path) -> None:
-    ran = run(
-        "gap", days / "trip.csv", "-m", made / "model.json", *references(days),
-        "--reference", days / "trip.csv", "--extended", days / "never.json",
-    )  # fmt: skip
-    assert ran.code == 2
-    assert "trip.csv" in ran.err
-    assert "is both a LOG and a reference" in ran.err
-    assert not (days / "never.json").exists()
-
-
-def test_a_minute_of_data_concludes_nothing(run: Run, made: Path, tmp_path: Path) -> None:
-    log = day(21)
-    write_log(log.rows(np.arange(60)), tmp_path / "stub.csv")
-    ran = run("gap", tmp_path / "stub.csv", "-m", made / "model.json")
-    assert ran.code == 2
-    assert "too short for a diagnosis" in ran.err
+def test_a_log_that_is_its_own_reference_or_too_short_is_refused(
+    made: Path, faulty: list[object], drives: Path, tmp_path: Path
+) -> None:
+    options = ("--reference", drives / "trip.csv", "--extended", tmp_path / "never.json")
+    refused(in_process(*faulty, *options), "trip.csv", "is both a LOG and a reference")
+    assert not (tmp_path / "never.json").exists()
+    write_log(drive(21, 80.0).rows(slice(0, 60)), tmp_path / "stub.csv")
+    ran = in_process("gap", tmp_path / "stub.csv", "-m", made / "model.json")
+    refused(ran, "too short for a diagnosis")

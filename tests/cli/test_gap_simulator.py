@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,9 +11,8 @@ import pytest
 from cangauge.cli.gap import load_function
 from cangauge.logs.canonical import write_table
 from cangauge.model.published import CAPACITY_AH
+from live import in_process, refused, succeeds
 from synthetic import synthetic_log
-
-Run = Callable[..., object]
 
 SIMULATOR = f"""
 import numpy as np
@@ -54,33 +51,26 @@ def drives(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.fixture
 def given(drives: Path) -> list[object]:
+    """`gap` on the drive with the fault, beside the others."""
     references = sorted(drives.glob("good*.csv"))
-    words: list[object] = [drives / "trip.csv", "--capacity-ah", CAPACITY_AH]
+    words = ["gap", drives / "trip.csv", "--capacity-ah", CAPACITY_AH, "--sign", "discharge"]
     return words + [word for path in references for word in ("--reference", path)]
 
 
-def test_a_column_is_diagnosed(run: Run, drives: Path) -> None:
-    ran = run("gap", *given(drives), "--simulated", "U model [V]", "--sign", "discharge", "--json")
-    assert ran.code == 0, ran.err
-    found = json.loads(ran.out)
-    cause = found["cause"]
+def test_a_column_is_diagnosed_as_the_function_that_gave_it(
+    given: list[object], drives: Path
+) -> None:
+    by_column = succeeds(*given, "--simulated", "U model [V]", "--json")
+    assert "ignored: U model" not in by_column.err
+    cause, gap = by_column.json["cause"], by_column.json["gap"]
     assert {"voltage_offset", "voltage_gain"} & {cause["verdict"], *cause["ambiguous_with"]}
-    assert found["gap"]["baseline_rmse_v"] == pytest.approx(5.0, abs=0.3)
-    assert found["gap"]["extended_rmse_v"] < 0.5
-    assert "ignored: U model" not in ran.err
-
-
-def test_a_function_gives_the_same_as_its_column(run: Run, drives: Path) -> None:
-    words = [*given(drives), "--sign", "discharge", "--json"]
-    by_column = run("gap", *words, "--simulated", "U model [V]")
-    by_function = run("gap", *words, "--simulator", f"{drives / 'cell.py'}:simulate")
-    assert by_column.code == by_function.code == 0, by_function.err
-    column, function = (json.loads(ran.out) for ran in (by_column, by_function))
-    assert function["cause"]["verdict"] == column["cause"]["verdict"]
-    assert function["gap"]["baseline_rmse_v"] == pytest.approx(
-        column["gap"]["baseline_rmse_v"], rel=1e-3
-    )
+    assert gap["baseline_rmse_v"] == pytest.approx(5.0, abs=0.3)
+    assert gap["extended_rmse_v"] < 0.5
+    function = succeeds(*given, "--simulator", f"{drives / 'cell.py'}:simulate", "--json").json
+    assert function["cause"]["verdict"] == cause["verdict"]
+    assert function["gap"]["baseline_rmse_v"] == pytest.approx(gap["baseline_rmse_v"], rel=1e-3)
 
 
 @pytest.mark.parametrize(
@@ -99,19 +89,21 @@ def test_a_function_gives_the_same_as_its_column(run: Run, drives: Path) -> None
     ],
 )
 def test_what_cannot_be_simulated_is_refused(
-    run: Run, drives: Path, words: list[str], problem: str, monkeypatch: pytest.MonkeyPatch
+    given: list[object],
+    drives: Path,
+    words: list[str],
+    problem: str,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.chdir(drives)
     (drives / "leaves.py").write_text("raise SystemExit(0)\n", encoding="utf-8")
-    ran = run("gap", *given(drives), "--sign", "discharge", *words)
-    assert ran.code == 2
-    assert problem in " ".join(ran.err.split())
+    refused(in_process(*given, *words), problem)
 
 
-def test_a_start_that_is_not_the_logs_own_is_told(run: Run, drives: Path, made: Path) -> None:
-    ran = run(
-        "gap", *given(drives), "--sign", "discharge", "-m", made / "model.json",
-        "--simulator", f"{drives / 'cell.py'}:broken", "--initial-soc", "0.85",
-    )  # fmt: skip
+def test_a_start_that_is_not_the_logs_own_is_told(
+    given: list[object], drives: Path, made: Path
+) -> None:
+    simulator = ("--simulator", f"{drives / 'cell.py'}:broken")
+    ran = in_process(*given, "-m", made / "model.json", *simulator, "--initial-soc", "0.85")
     assert "trip: the initial SoC is 0.85 % as given; its own SoC is 85.0 %" in ran.err
     assert "as 85" in ran.err

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import re
 import threading
@@ -20,12 +19,8 @@ from cangauge.logs.sign import sign_of_current
 from cangauge.service.config import load_config
 from cangauge.service.setup import load_vehicle
 from drive_captures import CARS, capture
-from live import Ended, in_process
+from live import in_process, refused, succeeds
 from selection import nightly_except
-
-
-def init(*arguments: object) -> Ended:
-    return in_process("init", *arguments)
 
 
 def write_drive(path: Path, seconds: float) -> Path:
@@ -42,8 +37,11 @@ def mitsubishi(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_drive(tmp_path_factory.mktemp("captures") / "drive.log", 30.0)
 
 
+CHOICE = ("--choose", "current=1", "--choose", "voltage=1")
+
+
 def test_an_unclear_pair_exits_with_one_and_names_three(mitsubishi: Path, tmp_path: Path) -> None:
-    done = init(mitsubishi, "-o", tmp_path / "car")
+    done = in_process("init", mitsubishi, "-o", tmp_path / "car")
     assert done.code == 1
     assert "1   0x373 23|16@0+" in done.out
     assert "no current and no voltage is clearly ahead" in done.err
@@ -51,79 +49,59 @@ def test_an_unclear_pair_exits_with_one_and_names_three(mitsubishi: Path, tmp_pa
     assert "0x373" not in done.err  # the tables name them
     assert "by halves" not in done.out
     assert "voltage falls when" in done.out
-    assert "--choose current=1 --choose voltage=1" in done.err
+    assert " ".join(CHOICE) in done.err
     assert not list((tmp_path / "car").glob("*"))
 
 
 def test_chosen_candidates_make_files_that_decode(mitsubishi: Path, tmp_path: Path) -> None:
-    folder = tmp_path / "car"
-    choice = ("--choose", "current=1", "--choose", "voltage=1", "--nominal-voltage", 330)
-    done = init(mitsubishi, "-o", folder, *choice, "--json")
-    assert done.code == 0, done.err
-    result = json.loads(done.out)
+    given = ("init", mitsubishi, "-o", tmp_path / "car", *CHOICE, "--nominal-voltage", 330)
+    result = succeeds(*given, "--json").json
     assert result["method"] == "physics"
     assert len(result["candidates"]["current"]) == 3
     assert result["proof"]["samples"] > 2900
     assert result["voltage_levels"] == []  # the stated voltage decides
-    log = capture_to_log(mitsubishi, Vehicle.load(map=folder / "car.toml"))
+    log = capture_to_log(mitsubishi, Vehicle.load(map=tmp_path / "car" / "car.toml"))
     assert 280.0 < log.voltage_v.min() < log.voltage_v.max() < 350.0
     assert log.current_a.max() - log.current_a.min() > 200.0
-    config = load_config(folder / "run.toml")
+    config = load_config(tmp_path / "car" / "run.toml")
     assert Path(str(config.map)).name == "car.toml"
-    again = init(mitsubishi, "-o", folder, *choice)
-    assert again.code == 2
-    assert "--force" in again.err
-
-
-def test_a_dbc_gives_signals_by_name(mitsubishi: Path, tmp_path: Path) -> None:
-    (tmp_path / "car.dbc").write_text(
-        'VERSION "1"\nNS_ :\nBS_:\nBU_: V\nBO_ 883 BMS_Status: 8 V\n'
-        ' SG_ PackCurrent : 23|16@0+ (0.01,-327.68) [0|0] "A" V\n'
-        ' SG_ PackVoltage : 39|16@0+ (0.1,0) [0|0] "V" V\n'
-        ' SG_ MaxChargeCurrent : 7|8@0+ (1,0) [0|0] "A" V\n'
-        ' SG_ MinCellVoltage : 15|8@0+ (0.02,0) [0|0] "V" V\n'
-    )
-    done = init(mitsubishi, "--dbc", tmp_path / "car.dbc", "-o", tmp_path / "out", "--json")
-    assert done.code == 0, done.err
-    chosen = json.loads(done.out)["candidates"]
-    assert chosen["current"][0]["signal"] == "PackCurrent"
-    assert chosen["voltage"][0]["signal"] == "PackVoltage"
-    car = Vehicle.load(map=tmp_path / "out" / "car.toml")
-    assert car.current.codec.name == "PackCurrent"
-    assert (
-        init(mitsubishi, "--dbc", tmp_path / "car.dbc", "-o", tmp_path / "out", "--force").code == 0
-    )
+    assert "--force" in in_process(*given).err
+    succeeds(*given, "--force")
 
 
 @pytest.mark.parametrize(
     ("scale", "sign"),
     nightly_except([("(-0.01,327.68)", -1)], [("(0.01,-327.68)", 1), ("(-0.01,327.68)", -1)]),
 )
-def test_the_sign_of_a_dbc_s_current_is_proven(tmp_path: Path, scale: str, sign: int) -> None:
+def test_a_dbc_gives_signals_by_name_and_their_sign_is_proven(
+    tmp_path: Path, scale: str, sign: int
+) -> None:
     minute = write_drive(tmp_path / "drive.log", 60.0)
     (tmp_path / "car.dbc").write_text(
         'VERSION "1"\nNS_ :\nBS_:\nBU_: V\nBO_ 883 BMS_Status: 8 V\n'
         f' SG_ PackCurrent : 23|16@0+ {scale} [0|0] "A" V\n'
         ' SG_ PackVoltage : 39|16@0+ (0.1,0) [0|0] "V" V\n'
+        ' SG_ MaxChargeCurrent : 7|8@0+ (1,0) [0|0] "A" V\n'
+        ' SG_ MinCellVoltage : 15|8@0+ (0.02,0) [0|0] "V" V\n'
     )
-    done = init(minute, "--dbc", tmp_path / "car.dbc", "-o", tmp_path / "out")
-    assert done.code == 0, done.err
+    done = succeeds("init", minute, "--dbc", tmp_path / "car.dbc", "-o", tmp_path / "out")
     assert f"The map has sign = {sign}." in done.err
     assert ("positive values charge on this bus" in done.err) == (sign < 0)
     assert "the files assume 20 °C" in done.err
     table = done.out.partition("voltage")[0]
-    (ends,) = re.findall(r"(\S+ … \S+ A)", table)
+    ends, *_ = re.findall(r"(\S+ … \S+ A)", table)
     assert ends in done.err  # one range, of one sign, of the whole capture
     assert ends in (tmp_path / "out" / "car.toml").read_text(encoding="utf-8")
     assert "BMS_Status" in table
     assert "PackCurrent" in table
     assert "score" not in table
-    log = capture_to_log(minute, Vehicle.load(map=tmp_path / "out" / "car.toml"))
-    assert sign_of_current(log).sign == 1
+    car = Vehicle.load(map=tmp_path / "out" / "car.toml")
+    assert (car.current.codec.name, car.voltage.codec.name) == ("PackCurrent", "PackVoltage")
+    assert sign_of_current(capture_to_log(minute, car)).sign == 1
 
 
 def test_an_open_scale_is_listed_and_not_ticked(mitsubishi: Path, tmp_path: Path) -> None:
-    done = init(mitsubishi, "-o", tmp_path, "--choose", "current=1", "--choose", "voltage=1")
+    done = in_process("init", mitsubishi, "-o", tmp_path, *CHOICE)
     assert "1 ?" in done.out
     assert "1 ✓" not in done.out
     assert "V at 0.1 V a step (about" in done.err
@@ -134,12 +112,9 @@ def test_an_open_scale_is_listed_and_not_ticked(mitsubishi: Path, tmp_path: Path
 
 
 def test_nothing_to_look_at_is_refused(tmp_path: Path) -> None:
-    done = init("-o", tmp_path)
-    assert done.code == 2
-    assert "give a capture" in done.err
-    assert init("x.log").code == 2
-    wrong = init("x.log", "-o", tmp_path, "--choose", "speed=1")
-    assert "not ROLE=N" in wrong.err
+    refused(in_process("init", "-o", tmp_path), "give a capture")
+    assert in_process("init", "x.log").code == 2
+    refused(in_process("init", "x.log", "-o", tmp_path, "--choose", "speed=1"), "not ROLE=N")
 
 
 @pytest.mark.real
@@ -150,14 +125,14 @@ def test_nothing_to_look_at_is_refused(tmp_path: Path) -> None:
         ("leaf_can/62kWh-Battery-only-EVcan.txt.gz", "leaf_ze1"),
         ("leaf_can/10bars.csv.gz", "leaf_ze0"),
         ("can_captures/bmw_i3_battery_only.trc.gz", "bmw_i3"),
+        ("can_captures/kona_2019_power_on_gvret.csv.gz", "hyundai_kona_64"),
     ],
 )
 def test_known_vehicles_are_recognised(
     shared_data: Path, tmp_path: Path, name: str, preset: str
 ) -> None:
-    done = init(shared_data / name, "-o", tmp_path, "--json")
-    assert done.code == 0, done.err
-    assert json.loads(done.out)["vehicle"] == preset
+    done = succeeds("init", shared_data / name, "-o", tmp_path, "--json")
+    assert done.json["vehicle"] == preset
     config = load_config(tmp_path / "run.toml")
     assert load_vehicle(config).name == Vehicle.load(preset, temperature_c=20.0).name
 
@@ -165,7 +140,6 @@ def test_known_vehicles_are_recognised(
 def test_a_live_bus_is_listened_to(mitsubishi: Path, tmp_path: Path) -> None:
     port = 20_000 + (os.getpid() + 311) % 20_000
     bus = ("--interface", "udp_multicast", "--bus-option", f"port={port}")
-    choice = ("--choose", "current=1", "--choose", "voltage=1")
     stop = threading.Event()
 
     def send() -> None:
@@ -179,12 +153,11 @@ def test_a_live_bus_is_listened_to(mitsubishi: Path, tmp_path: Path) -> None:
     thread = threading.Thread(target=send)
     thread.start()
     try:
-        done = init(*bus, "-o", tmp_path / "car", "--seconds", "2", "--json", *choice)
+        done = succeeds("init", *bus, "-o", tmp_path / "car", "--seconds", "2", "--json", *CHOICE)
     finally:
         stop.set()
         thread.join()
-    assert done.code == 0, done.err
-    assert json.loads(done.out)["proof"]["samples"] > 300
+    assert done.json["proof"]["samples"] > 300
     config = load_config(tmp_path / "car" / "run.toml")
     assert config.interface == "udp_multicast"
     assert config.bus_options == {"port": port}

@@ -83,12 +83,6 @@ def test_a_missing_model(made: Path, tmp_path: Path, command: str) -> None:
     assert error["cure"] == "check the path"
 
 
-def test_a_value_keeps_its_kind(made: Path) -> None:
-    gap = ("gap", made / "part.csv", "-m", made / "model.json")
-    assert failed(*gap, "--initial-soc", "150")["value"] == 150.0
-    assert failed("replay", made / "part.csv", "--speed", "fast")["value"] == "fast"
-
-
 @pytest.mark.parametrize("command", nightly_except(("fit", "run"), COMMANDS))
 def test_usage_that_typer_refuses(command: str) -> None:
     assert failed(command, "--bogus")["field"] == "--bogus"
@@ -96,19 +90,27 @@ def test_usage_that_typer_refuses(command: str) -> None:
     assert failed(command, "--hel")["field"] == "--hel"
 
 
-def test_more_usage_that_typer_refuses() -> None:
-    assert failed("fit")["field"] == "LOG"
-    assert failed("fit", "x.csv")["field"] == "-o/--output"
-    refused = failed("fit", "x.csv", "-o", "m.json", "--rate-hz", "x")
-    assert refused["field"] == "--rate-hz"
-    assert "must be a valid number" in refused["message"]
-    assert "no such command" in failed("bogus")["message"]
+@pytest.mark.parametrize(
+    ("words", "field", "say"),
+    [
+        ("fit", "LOG", ""),
+        ("fit x.csv", "-o/--output", ""),
+        ("fit x.csv -o m.json --rate-hz x", "--rate-hz", "must be a valid number"),
+        ("bogus", None, "no such command"),
+    ],
+)
+def test_more_usage_that_typer_refuses(words: str, field: str | None, say: str) -> None:
+    error = failed(*words.split())
+    assert error["field"] == field
+    assert say in error["message"]
+
+
+def test_json_takes_no_value_and_after_two_dashes_it_is_a_name(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
     ended = in_process("fit", "x.csv", "-o", "m.json", "--json=yes")
     assert error_of(ended, 2)["field"] == "--json"
-
-
-def test_after_two_dashes_it_is_a_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
     ended = in_process("inspect", "--", "--json")
     assert (ended.code, ended.out) == (2, "")
 

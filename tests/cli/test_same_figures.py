@@ -5,7 +5,6 @@ from __future__ import annotations
 import html
 import json
 import re
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,9 +12,8 @@ import numpy as np
 import pytest
 
 from cangauge.logs.canonical import write_log
+from live import succeeds
 from synthetic import synthetic_log
-
-Run = Callable[..., object]
 
 
 @pytest.fixture(scope="module")
@@ -30,18 +28,18 @@ def trip(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-def test_inspect_and_fit_state_one_capacity(run: Run, trip: Path, tmp_path: Path) -> None:
-    inspected = json.loads(run("inspect", trip, "--json").out)
+def test_inspect_and_fit_state_one_capacity(trip: Path, tmp_path: Path) -> None:
+    inspected = succeeds("inspect", trip, "--json").json
     options = ("-o", tmp_path / "m.json", "--capacity-ah", "from-soc", "--json")
-    fitted = json.loads(run("fit", trip, *options).out)
-    assert fitted["capacity_ah"] == pytest.approx(inspected["soc"]["implied_capacity_ah"], rel=1e-9)
+    fitted_ah = succeeds("fit", trip, *options).json["capacity_ah"]
+    assert fitted_ah == pytest.approx(inspected["soc"]["implied_capacity_ah"], rel=1e-9)
     (ability,) = [each for each in inspected["abilities"] if each["topic"] == "capacity"]
-    assert f"{fitted['capacity_ah']:.2f} Ah" in ability["text"]
+    assert f"{fitted_ah:.2f} Ah" in ability["text"]
 
 
-def test_terminal_page_and_model_state_one_soc_range(run: Run, trip: Path, tmp_path: Path) -> None:
+def test_terminal_page_and_model_state_one_soc_range(trip: Path, tmp_path: Path) -> None:
     model, page = tmp_path / "m.json", tmp_path / "m.html"
-    ran = run("fit", trip, "-o", model, "--capacity-ah", "from-soc", "--report", page)
+    ran = succeeds("fit", trip, "-o", model, "--capacity-ah", "from-soc", "--report", page)
     low, high = json.loads(model.read_text(encoding="utf-8"))["range"]["soc_pct"]
     (shown,) = re.findall(r"identified at SoC\s+(\S+) … (\S+)", ran.out)
     assert shown == (f"{low:.1f}", f"{high:.1f}")
@@ -52,11 +50,9 @@ def test_terminal_page_and_model_state_one_soc_range(run: Run, trip: Path, tmp_p
     assert sentence in text
 
 
-def test_table_of_estimates_ends_where_the_terminal_says(
-    run: Run, made: Path, tmp_path: Path
-) -> None:
+def test_table_of_estimates_ends_where_the_terminal_says(made: Path, tmp_path: Path) -> None:
     table = tmp_path / "soc.csv"
-    ran = run("estimate", made / "part.csv", "-m", made / "model.json", "-o", table)
+    ran = succeeds("estimate", made / "part.csv", "-m", made / "model.json", "-o", table)
     names, *_, last = table.read_text(encoding="utf-8").splitlines()
     row = dict(zip(names.split(","), last.split(","), strict=True))
     (end,) = re.findall(r"SoC at the end\s+(\S+)", ran.out)

@@ -4,95 +4,49 @@ from __future__ import annotations
 
 import importlib
 import json
-import socket
-import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, Self
+from typing import Any
 
 import cantools
 import pytest
 from headless import MARKS, chromium, faults, set_scheme
 
 from cangauge._resources import shared_file
-from cangauge.bus.open import BusAddress, bus_address, open_bus
-from cangauge.bus.vehicle import Vehicle
-from cangauge.replay.encoder import FrameEncoder
 from cangauge.types import Sample
-from live import Command, leaf_model_path, waits
+from live import virtual_port, waits
+from running import RunningService, free_port
 from selection import nightly_except
 
 pytestmark = MARKS
 
-GROUP = "239.74.163.91"
 CURRENT_A, VOLTAGE_V, TEMPERATURE_C = 12.5, 378.2, 23.0
 TIMES_MS = "return Bokeh.documents[0].get_model_by_name('rows').data.time_ms"
 
 
-def free_port(kind: socket.SocketKind = socket.SOCK_STREAM) -> int:
-    with socket.socket(socket.AF_INET, kind) as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
-
-
-class Car:
-    """Sends one steady sample ten times a second while it drives."""
-
-    def __init__(self, address: BusAddress) -> None:
-        self._bus = open_bus(address)
-        self._end, self.drives = threading.Event(), threading.Event()
-        self.drives.set()
-        self._thread = threading.Thread(target=self._run)
-
-    def __enter__(self) -> Self:
-        self._thread.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._end.set()
-        self._thread.join()
-        self._bus.shutdown()
-
-    def _run(self) -> None:
-        encoder = FrameEncoder(Vehicle.load("generic"))
-        while not self._end.wait(0.1):
-            if self.drives.is_set():
-                sample = Sample(time.time(), CURRENT_A, VOLTAGE_V, TEMPERATURE_C)
-                for frame in encoder.encode(sample):
-                    self._bus.send(frame)
-
-
 class Bench:
-    """A car, a service with its page, and where they are."""
+    """A service with its page, and a car that sends one steady sample."""
 
     def __init__(self, folder: Path) -> None:
-        self.record = folder / "drive.log"
-        self.address = bus_address("udp_multicast", GROUP, {"port": free_port(socket.SOCK_DGRAM)})
-        self.port = free_port()
-        self.url = f"http://127.0.0.1:{self.port}/"
-        self.car = Car(self.address)
+        self._folder, self.record, self._port = folder, folder / "drive.log", free_port()
+        self.url = f"http://127.0.0.1:{self._port}/"
+        self.start()
 
     def start(self) -> None:
-        self._service = Command(
-            "run", "-m", leaf_model_path(), "--interface", "udp_multicast", "--channel", GROUP,
-            "--bus-option", f"port={self.address.options['port']}", "--status-socket", "off",
-            "--initial-soc", "75", "--dashboard", self.port, "--record", self.record,
-        )  # fmt: skip
-        self._service.wait_for("listening on")
+        text = f'dashboard = "127.0.0.1:{self._port}"\nrecord = "drive.log"\n'
+        steady = Sample(0.0, CURRENT_A, VOLTAGE_V, TEMPERATURE_C)
+        self.running = RunningService(self._folder, text, steady=steady).__enter__()
 
     def stop(self) -> None:
-        self._service.process.terminate()
-        self._service.end()
+        self.running.__exit__()
 
 
 @pytest.fixture(scope="module")
 def bench(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bench]:
     bench = Bench(tmp_path_factory.mktemp("recordings"))
-    with bench.car:
-        bench.start()
-        yield bench
-        bench.stop()
+    yield bench
+    bench.stop()
 
 
 @pytest.fixture(scope="module")
@@ -126,16 +80,13 @@ def published(bench: Bench) -> dict[str, Any]:
     """Return the signals of the next SOC_ESTIMATE on the bus."""
     database = cantools.database.load_file(shared_file("dbc", "soc_estimate.dbc"))
     message = database.get_message_by_name("SOC_ESTIMATE")
-    bus = open_bus(bench.address)
-    try:
+    with virtual_port(bench.record.parent.name) as bus:
         while True:
-            frame = bus.recv(2.0)
+            frame = bus.receive(2.0)
             assert frame is not None, "no SOC_ESTIMATE"
             if frame.arbitration_id == message.frame_id:
                 decoded: dict[str, Any] = message.decode(bytes(frame.data))
                 return decoded
-    finally:
-        bus.shutdown()
 
 
 def is_shown(browser: Any, words: str, seconds: float = 5.0) -> bool:
@@ -177,7 +128,7 @@ def test_the_values_come_ten_times_a_second(page: Any) -> None:
 
 
 def test_a_silent_bus_is_shown_within_a_second(bench: Bench, page: Any) -> None:
-    bench.car.drives.clear()
+    bench.running.silent.set()
     try:
         page.execute_script(
             "new MutationObserver(() => { window.first ??= "
@@ -189,7 +140,7 @@ def test_a_silent_bus_is_shown_within_a_second(bench: Bench, page: Any) -> None:
         first_s = float(page.execute_script("return window.first").split(" for ")[1].split(" ")[0])
         assert first_s <= 1.0
     finally:
-        bench.car.drives.set()
+        bench.running.silent.clear()
     assert waits(lambda: text(page, "troubles") == "", 10.0)
 
 
@@ -266,7 +217,8 @@ def test_an_open_page_survives_a_restart(bench: Bench, page: Any) -> None:
     before = page.execute_script(TIMES_MS)
     assert text(page, "recording").startswith(f"Recording to {bench.record}: ")
     bench.stop()
-    assert is_shown(page, "The service does not answer")
+    # Longer than the page draws a line over.
+    assert is_shown(page, "The service does not answer for 3 s", 20.0)
     bench.start()
     assert waits(lambda: text(page, "troubles") == "", 20.0)
     assert tile(page, "Current") == f"{CURRENT_A:.2f} A"

@@ -9,7 +9,9 @@ import os
 import signal
 import socket
 from collections.abc import Iterator
-from contextlib import closing
+from contextlib import closing, contextmanager
+from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -30,16 +32,10 @@ AT_ONCE_S = (0.05, 60.0)
 TOKEN = "a-token-of-some-length"  # noqa: S105 - made up
 
 
-class Nowhere:
-    """A port without counts."""
-
-    name = "virtual x"
-    capabilities = UNKNOWN_INTERFACE
-
-
 def snapshot() -> Snapshot:
+    port = SimpleNamespace(name="virtual x", capabilities=UNKNOWN_INTERFACE)
     pipeline = Pipeline(Vehicle.load("generic"), leaf_model())
-    return Monitor(pipeline, Nowhere(), str(leaf_model_path())).latest  # type: ignore[arg-type] # no port
+    return Monitor(pipeline, port, str(leaf_model_path())).latest  # type: ignore[arg-type] # no bus
 
 
 def get(page: Live, path: str, **options: Any) -> tuple[int, dict[str, str], bytes]:
@@ -53,13 +49,20 @@ def get(page: Live, path: str, **options: Any) -> tuple[int, dict[str, str], byt
         connection.close()
 
 
-@pytest.fixture(scope="module")
-def page() -> Iterator[Live]:
+@contextmanager
+def live_page(token_file: Path | None = None) -> Iterator[Live]:
+    """Serve a page of one snapshot, by a process that is started again at once."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(launch, "PAUSE_S", AT_ONCE_S)
-        with closing(Live(dashboard=http_address("127.0.0.1:0", None, {}))) as page:
+        with closing(Live(dashboard=http_address("127.0.0.1:0", token_file, {}))) as page:
             page.on_snapshot(snapshot())
             yield page
+
+
+@pytest.fixture(scope="module")
+def page() -> Iterator[Live]:
+    with live_page() as page:
+        yield page
 
 
 @pytest.fixture(scope="module")
@@ -67,11 +70,8 @@ def guarded(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Live]:
     file = tmp_path_factory.mktemp("token") / "token"
     file.write_text(TOKEN)
     file.chmod(0o600)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(launch, "PAUSE_S", AT_ONCE_S)
-        with closing(Live(dashboard=http_address("127.0.0.1:0", file, {}))) as page:
-            page.on_snapshot(snapshot())
-            yield page
+    with live_page(file) as page:
+        yield page
 
 
 def test_the_latest_status_is_served(page: Live) -> None:
@@ -86,21 +86,22 @@ def test_the_latest_status_is_served(page: Live) -> None:
 
 
 @pytest.mark.parametrize(
-    "path",
+    ("path", "code"),
     [
-        "/rows?span=nonsense&after=x",
-        "/rows?span=10min&key=x&after=-1e400",
-        f"/rows?span=10min&after={'9' * 5000}",
-        "/cangauge-last-hour.csv",
+        ("/rows?span=nonsense&after=x", 200),
+        ("/rows?span=10min&key=x&after=-1e400", 200),
+        (f"/rows?span=10min&after={'9' * 5000}", 200),
+        ("/cangauge-last-hour.csv", 200),
+        ("/files/server.py", 404),
+        ("/files/..", 404),
+        ("/files/", 404),
+        ("/nothing", 404),
     ],
 )
-def test_odd_questions_are_answered(page: Live, path: str) -> None:
-    assert get(page, path)[0] == 200
-
-
-@pytest.mark.parametrize("path", ["/files/server.py", "/files/..", "/nothing", "/files/"])
-def test_nothing_else_is_served(page: Live, path: str) -> None:
-    assert get(page, path)[0] == 404
+def test_odd_questions_are_answered_and_nothing_else_is_served(
+    page: Live, path: str, code: int
+) -> None:
+    assert get(page, path)[0] == code
 
 
 def test_what_a_browser_asks_by_itself_is_no_refusal(guarded: Live) -> None:
@@ -168,43 +169,39 @@ def test_the_stream_sends_what_is_new(page: Live) -> None:
     assert known > found[0]["added"]
 
 
-@pytest.mark.parametrize("path", ["/rows", "/cangauge-last-hour.csv"])
-def test_a_token_is_needed(guarded: Live, path: str) -> None:
-    assert get(guarded, path)[0] == 401
-    assert get(guarded, path, headers={"Cookie": "cangauge=guess"})[0] == 401
-    assert get(guarded, path, headers={"Authorization": f"Bearer {TOKEN}"})[0] == 200
+FORM = {"Content-Type": "application/x-www-form-urlencoded"}
 
 
-def test_the_browser_is_asked_for_the_token(guarded: Live) -> None:
+def entered(page: Live, token: str) -> tuple[int, str]:
+    """Give a token to the form; return the code, and the cookie of an answer that has one."""
+    options = {"method": "POST", "body": f"token={token}", "headers": FORM}
+    code, headers, _ = get(page, "/enter", **options)
+    return code, headers.get("Set-Cookie", "")
+
+
+def test_a_token_is_needed_for_which_the_browser_is_asked(guarded: Live) -> None:
+    for path in ("/rows", "/cangauge-last-hour.csv"):
+        assert get(guarded, path)[0] == 401
+        assert get(guarded, path, headers={"Cookie": "cangauge=guess"})[0] == 401
+        assert get(guarded, path, headers={"Authorization": f"Bearer {TOKEN}"})[0] == 200
     code, headers, _ = get(guarded, "/")
     assert (code, headers["Location"]) == (302, "/enter")
-    form = {"Content-Type": "application/x-www-form-urlencoded"}
-    code, headers, _ = get(guarded, "/enter", method="POST", body="token=wrong", headers=form)
-    assert code == 401
-    assert "Set-Cookie" not in headers
-    code, headers, _ = get(guarded, "/enter", method="POST", body=f"token={TOKEN}", headers=form)
+    assert entered(guarded, "wrong") == (401, "")
+    code, cookie = entered(guarded, TOKEN)
     assert code == 302
-    cookie = headers["Set-Cookie"]
     assert TOKEN not in cookie
     assert "HttpOnly" in cookie
     assert "SameSite=Strict" in cookie
     assert get(guarded, "/rows", headers={"Cookie": cookie.split(";")[0]})[0] == 200
 
 
-def restarted(page: Live, number: int) -> bool:
-    """Send the process a signal; return whether another takes its place."""
-    before = page.pid
-    assert before is not None
-    os.kill(before, number)
-    return waits(lambda: page.pid not in {None, before})
-
-
 def test_a_process_that_dies_is_started_again_and_the_cookie_holds(guarded: Live) -> None:
-    form = {"Content-Type": "application/x-www-form-urlencoded"}
-    _, headers, _ = get(guarded, "/enter", method="POST", body=f"token={TOKEN}", headers=form)
-    cookie = headers["Set-Cookie"].split(";")[0]
+    cookie = entered(guarded, TOKEN)[1].split(";")[0]
     with LoggedLines("cangauge.extras.live") as lines:
-        assert restarted(guarded, signal.SIGKILL)
+        before = guarded.pid
+        assert before is not None
+        os.kill(before, signal.SIGKILL)
+        assert waits(lambda: guarded.pid not in {None, before})
         assert get(guarded, "/rows", headers={"Cookie": cookie})[0] == 200  # the port is the same
         assert "ended by itself" in guarded.trouble
     assert sum("has ended" in line for line in lines.lines) == 1

@@ -7,6 +7,7 @@ import math
 import shutil
 import sys
 import time
+from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path
 from typing import Any
@@ -31,7 +32,6 @@ from live import LoggedLines, leaf_model, waits
 from synthetic import synthetic_log
 
 NONE = Estimate(*[0.0] * 7, Status.VALID, Reason.NONE, 1)
-VALID = {"status": "valid", "estimate": {"soc_pct": 70.0}}
 # What a process that an attacker has taken over may write in place of its own lines.
 TAKEN_OVER = {
     "no JSON": "print('x' * 100)",
@@ -98,29 +98,34 @@ def test_the_gateway_changes_nothing_else(frame: can.Message) -> None:
     assert told.equals(frame, timestamp_delta=None)
 
 
-@pytest.mark.parametrize("soc_pct", [float("nan"), float("inf"), -5.0, 1e9])
-def test_no_odd_soc_reaches_an_inverter(soc_pct: float) -> None:
-    name = f"odd {soc_pct}"
-    buses = [ReconnectingBus(BusAddress("virtual", f"{name} {side}"), []) for side in "bi"]
+@pytest.fixture
+def gateway(request: pytest.FixtureRequest) -> Iterator[Gateway]:
+    """Between the virtual buses of a battery, "b", and an inverter, "i"."""
+    buses = [ReconnectingBus(BusAddress("virtual", f"{request.node.name} {side}"), [])
+             for side in "bi"]  # fmt: skip
     for bus in buses:
         bus.open()
     with closing(Gateway(*buses, soc_fields("pylontech"))) as gateway:
-        for _ in range(3):
-            gateway.on_sample(Sample(0.0, 1.0, 50.0, 20.0), NONE)
-        status = {"status": "valid", "estimate": {"soc_pct": soc_pct}}
-        gateway.on_snapshot(Snapshot(time.monotonic(), status))
-        own = can.Message(arbitration_id=0x355, is_extended_id=False, data=b"\x0b\x00\x5e\x00")
-        assert 0 <= gateway.replaced(own, time.monotonic()).data[0] <= 100
+        yield gateway
 
 
-def test_a_flood_on_the_batterys_bus_does_not_stop_the_inverters() -> None:
-    buses = [ReconnectingBus(BusAddress("virtual", f"flood {side}"), []) for side in "bi"]
-    for bus in buses:
-        bus.open()
+@pytest.mark.parametrize("soc_pct", [math.nan, math.inf, -5.0, 1e9])
+def test_no_odd_soc_reaches_an_inverter(gateway: Gateway, soc_pct: float) -> None:
+    for _ in range(3):
+        gateway.on_sample(Sample(0.0, 1.0, 50.0, 20.0), NONE)
+    status = {"status": "valid", "estimate": {"soc_pct": soc_pct}}
+    gateway.on_snapshot(Snapshot(time.monotonic(), status))
+    own = can.Message(arbitration_id=0x355, is_extended_id=False, data=b"\x0b\x00\x5e\x00")
+    assert 0 <= gateway.replaced(own, time.monotonic()).data[0] <= 100
+
+
+@pytest.mark.usefixtures("gateway")
+def test_a_flood_on_the_batterys_bus_does_not_stop_the_inverters(
+    request: pytest.FixtureRequest,
+) -> None:
     with (
-        closing(Gateway(*buses, soc_fields("pylontech"))),
-        can.Bus(interface="virtual", channel="flood b") as battery,
-        can.Bus(interface="virtual", channel="flood i") as inverter,
+        can.Bus(interface="virtual", channel=f"{request.node.name} b") as battery,
+        can.Bus(interface="virtual", channel=f"{request.node.name} i") as inverter,
     ):
         inverter.send(can.Message(arbitration_id=0x305, is_extended_id=False, data=bytes(8)))
         for number in range(5000):
@@ -129,10 +134,7 @@ def test_a_flood_on_the_batterys_bus_does_not_stop_the_inverters() -> None:
         alive = battery.recv(5.0)
         assert alive is not None
         assert alive.arbitration_id == 0x305
-        seen = 0
-        while seen < 5000 and inverter.recv(5.0) is not None:
-            seen += 1
-        assert seen == 5000
+        assert all(inverter.recv(5.0) is not None for _ in range(5000))
 
 
 @pytest.fixture(scope="module")
@@ -156,15 +158,17 @@ GAUGES = {
 }
 
 
+def gauge(code: str) -> list[str]:
+    return [sys.executable, "-c", code, "{interface}", "{channel}", "{port}"]
+
+
 @pytest.mark.parametrize("script", GAUGES.values(), ids=GAUGES.keys())
 def test_a_bad_gauge_is_silent_and_ends(
     monkeypatch: pytest.MonkeyPatch, drive: PlayedDrive, script: str
 ) -> None:
     monkeypatch.setattr(suite, "ANSWER_WITHIN_S", 0.3)
-    command = [sys.executable, "-c", GAUGE.format(script=script)]
-    command += ["{interface}", "{channel}", "{port}"]
     began_s = time.monotonic()
-    (score,) = run_suite(command, [drive], FAULTS[:1])
+    (score,) = run_suite(gauge(GAUGE.format(script=script)), [drive], FAULTS[:1])
     assert score.silent == 1.0
     assert np.isnan(score.mae_pct)
     assert time.monotonic() - began_s < 60.0
@@ -173,10 +177,13 @@ def test_a_bad_gauge_is_silent_and_ends(
 def test_a_gauge_that_fails_to_start_again_is_silent(drive: PlayedDrive, tmp_path: Path) -> None:
     mark = tmp_path / "mark"
     once = f"import os, sys\nif os.path.exists('{mark}'): sys.exit('{{}}')\nopen('{mark}', 'w')\n"
-    command = [sys.executable, "-c", once + GAUGE.format(script="")]
-    command += ["{interface}", "{channel}", "{port}"]
-    scores = run_suite(command, [drive], FAULTS[:2])
+    scores = run_suite(gauge(once + GAUGE.format(script="")), [drive], FAULTS[:2])
     assert [score.silent for score in scores] == [1.0, 1.0]
+
+
+def ten_minutes(judge: LiveJudge) -> None:
+    for second in range(600):
+        judge.on_sample(Sample(float(second), 10.0, 380.0, 20.0), NONE)
 
 
 def test_a_folder_of_the_judge_that_goes_away_costs_the_opinion_only(tmp_path: Path) -> None:
@@ -187,14 +194,12 @@ def test_a_folder_of_the_judge_that_goes_away_costs_the_opinion_only(tmp_path: P
         closing(LiveJudge(Stored(folder, 3, ("false",)), lambda: 50.0)) as judge,
     ):
         shutil.rmtree(folder)
-        for second in range(600):
-            judge.on_sample(Sample(float(second), 10.0, 380.0, 20.0), NONE)
+        ten_minutes(judge)
         judge._end_stretch()
         assert waits(lambda: any("was not judged" in line for line in lines.lines), 20.0)
         folder.mkdir()
         (folder / "junk.parquet").write_bytes(b"PAR1")
-        for second in range(600):
-            judge.on_sample(Sample(float(second), 10.0, 380.0, 20.0), NONE)
+        ten_minutes(judge)
         judge._end_stretch()
         assert waits(lambda: len(list(folder.glob("2*.parquet"))) == 1, 20.0)
 
@@ -202,8 +207,7 @@ def test_a_folder_of_the_judge_that_goes_away_costs_the_opinion_only(tmp_path: P
 def test_a_battery_that_publishes_no_soc_leaves_a_log_that_can_be_read(tmp_path: Path) -> None:
     published = iter([50.0, 655.35, -1.0, math.nan] * 150)
     with closing(LiveJudge(Stored(tmp_path, 3, ("false",)), lambda: next(published))) as judge:
-        for second in range(600):
-            judge.on_sample(Sample(float(second), 10.0, 380.0, 20.0), NONE)
+        ten_minutes(judge)
     (stored,) = tmp_path.glob("*.parquet")
     soc_pct = read_log(stored).soc_pct
     assert soc_pct is not None

@@ -16,7 +16,6 @@ import pytest
 from cangauge.bus.vehicle import Vehicle
 from cangauge.logs.canonical import write_log
 from cangauge.service.offline import estimate_capture
-from cangauge.service.status_client import fetch_status
 from live import Command, in_process, leaf_model, leaf_model_path, short_log, waits
 
 MODEL = ("-m", leaf_model_path())
@@ -58,16 +57,17 @@ def test_a_whole_run(bus: list[str], tmp_path: Path) -> None:
     assert replayed.code == 0, replayed.err
     assert replayed.json["acknowledged"] == replayed.json["samples"] == 1200
     assert replayed.json["quantisation"]["current_a"] == 0.25  # a Leaf's step is 0.5 A
-    found = in_process("status", "--endpoint", sock, "--json")
-    assert found.json["samples"] == 1200
+    # The status is renewed four times a second; health and possible current once a second.
+    status = ("status", "--endpoint", sock)
+    assert waits(lambda: in_process(*status, "--json").json["samples"] == 1200, 10.0)
+    found = in_process(*status, "--json")
     assert found.json["latency"]["count"] > 0
-    # Health and possible current are renewed once a second.
-    assert waits(lambda: "energy left" in in_process("status", "--endpoint", sock).out, 10.0)
-    shown = in_process("status", "--endpoint", sock).out
+    assert waits(lambda: "energy left" in in_process(*status).out, 10.0)
+    shown = in_process(*status).out
     assert all(name in shown for name in ("capacity", "possible discharge, 10 s", "energy left"))
     assert found.json["record"]["lost_frames"] == 0
-    with urllib.request.urlopen(f"http://127.0.0.1:{http_port}/metrics") as answer:
-        assert b"cangauge_samples_total 1200.0" in answer.read()
+    url, counted = f"http://127.0.0.1:{http_port}/metrics", b"cangauge_samples_total 1200.0"
+    assert waits(lambda: counted in urllib.request.urlopen(url).read(), 10.0)
     service.process.terminate()
     ended = service.end(20.0)
     assert ended.code == 0
@@ -91,34 +91,6 @@ def test_a_whole_run(bus: list[str], tmp_path: Path) -> None:
     assert {name: ended.json[name] for name in offline} == offline
 
 
-@pytest.mark.skipif(not hasattr(signal, "SIGHUP"), reason="no SIGHUP on this system")
-def test_a_hangup_reads_the_configuration_again_and_an_interrupt_ends_the_service(
-    bus: list[str], tmp_path: Path
-) -> None:
-    path = tmp_path / "car.toml"
-    path.write_text("timeout_s = 1\n")
-    sock = tmp_path / "status.sock"
-    service = Command("run", *bus, *MODEL, "--config", path, "--status-socket", sock, "--json")
-    service.wait_for("service.ready")
-    path.write_text("timeout_s = [")
-    service.process.send_signal(signal.SIGHUP)
-    service.wait_for("config.refused")
-    assert waits(lambda: "not TOML" in str(fetch_status(sock)["config"]["problem"]), 5.0)
-    path.write_text("timeout_s = 0.5\n")
-    service.process.send_signal(signal.SIGHUP)
-    service.wait_for("config.reloaded")
-    began = time.monotonic()
-    service.process.send_signal(signal.SIGINT)
-    ended = service.end(5.0)
-    assert time.monotonic() - began < 1.5  # the end of the interpreter included
-    assert ended.code == 0
-    assert ended.json["stamps"] == "kernel"
-    assert ended.json["bus_counts"]["foreign"] == 0  # its own frames come back on this bus
-    assert ended.json["samples"] == 0
-    assert ended.json["estimate"]["soc_pct"] is None
-    assert "0 samples" in ended.err
-
-
 def test_an_interrupted_replay_says_how_far_it_came(bus: list[str], log_path: Path) -> None:
     replay = Command("replay", log_path, *bus, "--json")
     replay.wait_for("playing")
@@ -130,10 +102,7 @@ def test_an_interrupted_replay_says_how_far_it_came(bus: list[str], log_path: Pa
 
 
 BAD_OPTIONS = [
-    (["--interface", "socketcan", "--channel", "nosuch0"], "nosuch0|no SocketCAN"),
-    (["--interface", "carrier_pigeon"], "carrier_pigeon"),
     (["--channel", "can7x"], "can7x"),
-    (["--interface", "pcan", "--channel", "PCAN_USBBUS1"], "pcan"),
     (["--vehicle", "moped"], "moped"),
     (["--bus-option", "fast"], "K=V"),
 ]
@@ -148,9 +117,7 @@ RUN, REPLAY = ["run", *MODEL, "--record", "out.log"], ["replay", leaf_model_path
         *((["replay", "drive.parquet", *bad], say) for bad, say in BAD_OPTIONS),
         (["run"], "--model"),
         (["run", "-m", "/nowhere/model.json"], "/nowhere/model.json"),
-        ([*RUN, "--method", "magic"], "magic"),
         ([*RUN, "--initial-soc", "150"], "150"),
-        ([*RUN, "--time-source", "sundial"], "sundial"),
         ([*RUN, "--config", "/nowhere/car.toml"], "/nowhere/car.toml"),
         (["run", *MODEL, "--record", "drive.asc"], r"drive\.asc"),
         ([*RUN, "--state", "/nowhere/s.json"], "/nowhere/s.json"),
@@ -174,11 +141,9 @@ def test_bad_input_is_one_line_and_exit_2(
 @pytest.mark.parametrize(
     ("text", "say"),
     [
-        ('http = "0.0.0.0:9464"', "reachable from the network"),
         ('dashboard = "here"', "HOST:PORT"),
         ('http = "127.0.0.1:0"\nhttp_token_file = "/nowhere/token"', "/nowhere/token"),
         ('status_socket = "/proc/x.sock"', "/proc/x.sock"),
-        ('record_keep_mb = 5\nrecord = "x.log"', "record_part_mb"),
         ("record_part_mb = 0", "record_part_mb"),
         ('log_level = "loud"', "log_level"),
     ],

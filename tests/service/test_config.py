@@ -68,17 +68,8 @@ def test_options_take_precedence_over_the_file(tmp_path: Path) -> None:
         'model = "a.json"\nvehicle = "leaf_aze0"\ninitial_soc = 50\n'
         "[ids]\nsoc_estimate = 0x10\nsoc_detail = 0x11\n",
     )
-    config = load_config(
-        path,
-        {
-            "model": "b.json",
-            "dbc": "car.dbc",
-            "map": "car.toml",
-            "initial_soc": "auto",
-            "method": None,
-            "ids": {"soc_detail": 0x99},
-        },
-    )
+    options = {"model": "b.json", "dbc": "car.dbc", "map": "car.toml", "initial_soc": "auto"}
+    config = load_config(path, options | {"method": None, "ids": {"soc_detail": 0x99}})
     assert config.model == "b.json"
     assert config.vehicle is None  # the file's car is not mixed with another one's DBC
     assert config.dbc == "car.dbc"
@@ -123,6 +114,7 @@ def test_errors_name_file_field_and_value(
     [
         ({"model": "m", "method": "magic"}, "--method"),
         ({"model": "m", "initial_soc": "x"}, "--initial-soc"),
+        ({"model": "m", "initial_soc_std": -1.0}, "--initial-soc-std"),
         ({"model": "m", "ids": {"soc_estimate": -1}}, "ids.soc_estimate"),
         ({}, "-m/--model"),
     ],
@@ -133,13 +125,10 @@ def test_errors_of_the_command_line_name_the_option(options: dict[str, object], 
     assert caught.value.field == field
 
 
-def test_equal_ids_are_refused(tmp_path: Path) -> None:
+def test_equal_ids_and_a_missing_file_are_refused(tmp_path: Path) -> None:
     config = load_config(write(tmp_path, 'model = "m"\n[ids]\nsoc_detail = 0x5A0\n'))
     with pytest.raises(InputError, match="same id"):
         pipeline_settings(config)
-
-
-def test_no_such_file() -> None:
     with pytest.raises(InputError, match="no such file"):
         load_config("/nowhere/car.toml")
 
@@ -160,18 +149,7 @@ def test_each_key_is_described_and_each_option_declared_once() -> None:
     flags = [flag for key in keys.values() for flag in re.split(", ", key.option) if flag]
     assert len(flags) == len(set(flags))
     until = keys["until_idle_s"]
-    assert (until.option, until.unit, until.bounds) == (
-        "",
-        "s",
-        "> 0, ≤ 1e+09",
-    )
-    assert "| `ids.soc_detail` |  | whole number | 0x5A1 |" in reference()
-
-
-def test_an_error_of_an_option_names_it_as_it_is_written() -> None:
-    with pytest.raises(InputError) as caught:
-        load_config(None, {"model": "m", "initial_soc_std": -1.0})
-    assert caught.value.field == "--initial-soc-std"
+    assert (until.option, until.unit, until.bounds) == ("", "s", "> 0, ≤ 1e+09")
 
 
 def test_the_reference_page_is_generated_from_the_model(project: Path) -> None:

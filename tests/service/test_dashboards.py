@@ -148,20 +148,16 @@ def test_alerts_fire_when_they_should(tmp_path: Path) -> None:
         "CangaugeBusSilent": (60, 100),
         "CangaugeGone": (110, 160),
     }
-    lines = ["rule_files: [alerts.yml]", "evaluation_interval: 10s", "tests:", "  - interval: 10s"]
-    lines.append("    input_series:")
-    lines += [f"      - {{series: '{name}', values: '{text}'}}" for name, text in series.items()]
-    lines.append("    promql_expr_test:")
+    checks = [{"expr": 'count(ALERTS{alertname="CangaugeLoopStuck"})', "eval_time": "130s"}]
     for name, (quiet_s, firing_s) in expected.items():
-        firing = f'ALERTS{{alertname="{name}", alertstate="firing"}}'
-        lines += [
-            f"      - {{expr: 'count({firing})', eval_time: {quiet_s}s, exp_samples: []}}",
-            f"      - {{expr: 'count({firing})', eval_time: {firing_s}s,"
-            " exp_samples: [{labels: '{}', value: 1}]}",
-        ]
-    stuck = 'count(ALERTS{alertname="CangaugeLoopStuck"})'
-    lines.append(f"      - {{expr: '{stuck}', eval_time: 130s, exp_samples: []}}")
-    (tmp_path / "test.yml").write_text("\n".join(lines))
+        count = f'count(ALERTS{{alertname="{name}", alertstate="firing"}})'
+        one = [{"labels": "{}", "value": 1}]
+        checks.append({"expr": count, "eval_time": f"{quiet_s}s"})
+        checks.append({"expr": count, "eval_time": f"{firing_s}s", "exp_samples": one})
+    inputs = [{"series": name, "values": values} for name, values in series.items()]
+    test = {"interval": "10s", "input_series": inputs, "promql_expr_test": checks}
+    content = {"rule_files": ["alerts.yml"], "evaluation_interval": "10s", "tests": [test]}
+    (tmp_path / "test.yml").write_text(json.dumps(content))  # JSON is YAML
     done = subprocess.run(
         ["promtool", "test", "rules", tmp_path / "test.yml"],
         check=False, capture_output=True, text=True,

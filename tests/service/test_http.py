@@ -23,6 +23,7 @@ from cangauge.extras.live.addresses import http_address, read_token
 from cangauge.extras.live.http import MAX_CLIENTS
 from cangauge.extras.live.launch import Live
 from cangauge.model.published import CAPACITY_AH
+from cangauge.service.status_client import Snapshot
 from live import waits
 
 TOKEN = "a-token-of-some-length"  # noqa: S105 - made up
@@ -54,11 +55,12 @@ def get(port: int, path: str, **headers: str) -> tuple[int, bytes, Any]:
 
 
 def test_status_and_health(http: Live, watched: Watched) -> None:
+    def show(age_s: float = 0.0, **changed: object) -> None:
+        status = watched.monitor.latest.status | changed
+        http.on_snapshot(Snapshot(time.monotonic() - age_s, status))
+
     assert waits(lambda: get(http.port, "/status")[0] == 200)  # after seconds on a busy machine
-    watched.monitor.latest = type(watched.monitor.latest)(
-        time.monotonic(), watched.monitor.latest.status
-    )
-    http.on_snapshot(watched.monitor.latest)
+    show()
     code, body, headers = get(http.port, "/status")
     assert (code, headers["Content-Type"]) == (200, "application/json")
     assert json.loads(body)["samples"] == 900
@@ -66,19 +68,12 @@ def test_status_and_health(http: Live, watched: Watched) -> None:
     assert json.loads(get(http.port, "/healthz")[1])["ok"]
     for path in ("/", "/../etc/passwd"):
         assert get(http.port, path)[:2] == (404, b"available: /status, /healthz, /metrics\n")
-
-
-def test_a_number_that_is_not_finite_is_null(http: Live, watched: Watched) -> None:
-    latest = watched.monitor.latest
-    broken = latest.status | {"samples_per_s": math.nan, "estimate": {"soc_pct": math.inf}}
-    http.on_snapshot(type(latest)(time.monotonic(), broken))
+    # A number that is not finite is null.
+    show(samples_per_s=math.nan, estimate={"soc_pct": math.inf})
     assert waits(lambda: b'"soc_pct": null' in get(http.port, "/status")[1])
     assert b'"samples_per_s": null' in get(http.port, "/status")[1]
-
-
-def test_a_loop_that_does_not_turn_is_not_healthy(http: Live, watched: Watched) -> None:
-    latest = watched.monitor.latest
-    http.on_snapshot(type(latest)(time.monotonic() - 60.0, latest.status))
+    # A loop that does not turn is not healthy.
+    show(age_s=60.0)
     assert waits(lambda: get(http.port, "/healthz")[0] == 503)
     assert json.loads(get(http.port, "/healthz")[1]) == {"ok": False, "status": "invalid"}
 
@@ -110,19 +105,15 @@ def test_metrics_are_what_prometheus_reads(http: Live) -> None:
     assert open_metrics[1].endswith(b"# EOF\n")
 
 
-def test_before_the_first_snapshot_the_service_has_just_started() -> None:
-    with contextlib.closing(Live(http=http_address("127.0.0.1:0", None, {}))) as server:
-        assert get(server.port, "/status")[0] == 503
-
-
-def test_without_prometheus_client_the_page_says_so(
+def test_before_the_first_snapshot_and_without_prometheus_client(
     watched: Watched, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (tmp_path / "prometheus_client.py").write_text("raise ImportError\n")
     monkeypatch.syspath_prepend(str(tmp_path))
     with contextlib.closing(Live(http=http_address("127.0.0.1:0", None, {}))) as server:
+        assert get(server.port, "/status")[:2] == (503, b"the service has just started\n")
         server.on_snapshot(watched.monitor.latest)
-        assert get(server.port, "/status")[0] == 200
+        assert waits(lambda: get(server.port, "/status")[0] == 200)
         code, body, _ = get(server.port, "/metrics")
     assert code == 404
     assert b"cangauge[metrics]" in body

@@ -77,18 +77,20 @@ def test_an_inverted_drive_through_the_service(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("text", "sign"),
+    ("text", "cure"),
     [
-        ('like = "leaf_aze0"', 1),
-        ('like = "generic"', -1),
-        ('like = "generic"\ncurrent = "current_a"', -1),
-        ('like = "leaf_aze0"\n[current]\nscale = 2.0', 1),
+        ('like = "leaf_aze0"', "set sign = 1 under [current]"),
+        ('like = "generic"', "set sign = -1 under [current]"),
+        ('like = "generic"\ncurrent = "current_a"', "set sign = -1 under [current]"),
+        ('like = "leaf_aze0"\n[current]\nscale = 2.0', "set sign = 1 under [current]"),
+        (None, "use the preset of this car"),
     ],
 )
-def test_the_sign_to_set_is_the_other_one(tmp_path: Path, text: str, sign: int) -> None:
-    (tmp_path / "car.toml").write_text(text)
-    setup = Setup.of(RunConfig(model=str(leaf_model_path()), map=str(tmp_path / "car.toml")))
-    assert f"set sign = {sign} under [current]" in setup.sign_cure
+def test_the_sign_to_set_is_the_other_one(tmp_path: Path, text: str | None, cure: str) -> None:
+    path = tmp_path / "car.toml"
+    path.write_text(text or "")
+    config = RunConfig(model=str(leaf_model_path()), map=str(path) if text else None)
+    assert cure in Setup.of(config).sign_cure
 
 
 def test_the_frame_says_implausible_and_the_suspicion_ends_with_the_proof() -> None:
@@ -114,9 +116,3 @@ def test_a_right_sign_and_few_steps_prove_nothing() -> None:
     steady = replace(few, current_a=level_a, voltage_v=380.0 + 0.1 * level_a)
     assert sign_of_current(steady).sign == -1
     assert not driven(steady).sign.evidence
-
-
-def test_the_cure_where_there_is_no_map() -> None:
-    options = {"interface": "virtual", "channel": "x", "status_socket": "off"}
-    service = Service(model=str(leaf_model_path()), **options)
-    assert service._setup.sign_cure.startswith("use the preset of this car")

@@ -1,9 +1,10 @@
-"""Notifications to systemd, of the class and of the real service."""
+"""Notifications to systemd, of the class and of the real service, which it reloads and stops."""
 
 from __future__ import annotations
 
 import contextlib
 import os
+import signal
 import socket
 import time
 from collections.abc import Iterator
@@ -12,7 +13,8 @@ from pathlib import Path
 import pytest
 
 from cangauge.service.lifecycle import Notifier
-from live import Command, leaf_model_path
+from cangauge.service.status_client import fetch_status
+from live import Command, leaf_model_path, waits
 
 
 class FakeSystemd:
@@ -36,10 +38,10 @@ class FakeSystemd:
         self.socket.settimeout(20.0)
         return taken
 
-    def until(self, key: str) -> list[dict[str, str]]:
-        heard = [self.next()]
-        while key not in heard[-1]:
-            heard.append(self.next())
+    def until(self, key: str) -> dict[str, str]:
+        """Return the next message with this key."""
+        while key not in (heard := self.next()):
+            pass
         return heard
 
 
@@ -86,32 +88,51 @@ def test_what_the_environment_asks_for(
         notifier.send(WATCHDOG=1)  # where nobody listens, nothing happens
 
 
-def test_systemd_gets_ready_watchdog_and_stopping(
-    systemd: FakeSystemd, monkeypatch: pytest.MonkeyPatch
+def test_a_service_is_watched_reloaded_and_stopped(
+    systemd: FakeSystemd, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("NOTIFY_SOCKET", str(systemd.path))
     monkeypatch.setenv("WATCHDOG_USEC", "1000000")
+    config, status = tmp_path / "car.toml", tmp_path / "status.sock"
+    config.write_text("timeout_s = 1\n")
     service = Command(
         "run", "-m", leaf_model_path(), "--interface", "udp_multicast", "--bus-option",
-        "port=23123", "--status-socket", "off", "--json",
+        f"port={20_000 + os.getpid() % 20_000}", "--config", config, "--status-socket", status,
+        "--json",
     )  # fmt: skip
-    heard = systemd.until("READY")
-    assert "listening" in heard[-1]["STATUS"]
+    process = service.process
+    assert "listening" in systemd.until("READY")["STATUS"]
     began = time.monotonic()
     heard = [systemd.next() for _ in range(12)]
-    pings = [each for each in heard if "WATCHDOG" in each]
-    status = [each["STATUS"] for each in heard if "STATUS" in each]
-    assert len(pings) > 5
     assert time.monotonic() - began < 10.0
-    assert "initialising" in status[-1]
+    assert sum("WATCHDOG" in each for each in heard) > 5
+    assert "initialising" in [each["STATUS"] for each in heard if "STATUS" in each][-1]
     # Stopped in its loop, it gives no sign of life, so that systemd would act.
-    os.kill(service.process.pid, 19)
+    process.send_signal(signal.SIGSTOP)
     time.sleep(0.3)
     systemd.drain()
     time.sleep(0.6)
     assert systemd.drain() == 0
-    os.kill(service.process.pid, 18)
+    process.send_signal(signal.SIGCONT)
     systemd.until("WATCHDOG")
-    service.process.terminate()
+    # A hangup reads the configuration again.
+    config.write_text("timeout_s = [")
+    process.send_signal(signal.SIGHUP)
+    assert int(systemd.until("RELOADING")["MONOTONIC_USEC"]) > 0
+    assert "REFUSED" in systemd.until("READY")["STATUS"]
+    service.wait_for("config.refused")
+    assert waits(lambda: "not TOML" in str(fetch_status(status)["config"]["problem"]), 5.0)
+    config.write_text("timeout_s = 0.5\n")
+    process.send_signal(signal.SIGHUP)
+    service.wait_for("config.reloaded")
+    # An interrupt ends the service.
+    began = time.monotonic()
+    process.send_signal(signal.SIGINT)
     systemd.until("STOPPING")
-    assert service.end().code == 0
+    ended = service.end(5.0)
+    assert time.monotonic() - began < 1.5  # the end of the interpreter included
+    assert ended.code == 0
+    assert ended.json["stamps"] == "kernel"
+    assert ended.json["bus_counts"]["foreign"] == 0  # its own frames come back on this bus
+    assert (ended.json["samples"], ended.json["estimate"]["soc_pct"]) == (0, None)
+    assert "0 samples" in ended.err

@@ -48,19 +48,6 @@ def test_the_receive_buffer_is_as_large_as_the_system_allows() -> None:
     assert 2 * min(RECEIVE_BUFFER_BYTES, allowed) <= size <= 2 * RECEIVE_BUFFER_BYTES
 
 
-def test_two_multicast_buses_receive_each_other() -> None:
-    address = bus_address("udp_multicast", options={"port": 43987})
-    first, second = open_bus(address), open_bus(address)
-    try:
-        first.send(can.Message(arbitration_id=0x42, is_extended_id=False, data=b"hi"))
-        message = second.recv(2.0)
-        assert message is not None
-        assert bytes(message.data) == b"hi"
-    finally:
-        first.shutdown()
-        second.shutdown()
-
-
 def test_without_socketcan_the_default_is_multicast(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(opening, "has_socketcan", lambda _channel: False)
     assert bus_address().interface == "udp_multicast"

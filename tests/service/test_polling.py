@@ -10,7 +10,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from cangauge.bus.isotp import PollTarget
-from cangauge.bus.vehicle import Vehicle
 from cangauge.service.polling import (
     EXCHANGE_WITHIN_S,
     OTHER_TESTER_S,
@@ -145,8 +144,3 @@ def test_any_frames_are_survived(frames: list[tuple[bytes, float]]) -> None:
         assert control is None or control.data[0] == 0x30
     asks = [poller.due(now_s + wait_s) for wait_s in (EXCHANGE_WITHIN_S, 2.0 * SLOWEST_S)]
     assert any(ask is not None for ask in asks)
-
-
-def test_the_leaf_has_two_replies_to_ask_for() -> None:
-    assert set(Vehicle.load("leaf_ze1_polled").poll_targets) == {PROBES_OF_LEAF, CELLS_OF_LEAF}
-    assert Vehicle.load("leaf_ze1", temperature_c=20.0).poll_targets == []

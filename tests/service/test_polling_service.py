@@ -30,7 +30,7 @@ def test_temperature_and_cells_are_polled_over_udp() -> None:
 
 
 @pytest.mark.parametrize("manner", nightly_except((NEGATIVE,), (NEGATIVE, PENDING, SILENT)))
-def test_a_battery_that_does_not_answer_costs_nothing(manner: str) -> None:
+def test_silence_and_other_testers_cost_no_more_than_the_replies(manner: str) -> None:
     address = BusAddress("virtual", f"polled {manner}")
     with Battery(address, manner) as battery, polling_service(address) as service:
         polls = service.monitor.polls
@@ -42,22 +42,16 @@ def test_a_battery_that_does_not_answer_costs_nothing(manner: str) -> None:
         assert waits(lambda: polls.answers >= (4 if manner == PENDING else 2), 12.0)
         assert len(battery.requests) - before <= 8
         assert battery.early == 0
-    assert service.error is None
-
-
-def test_another_tester_pauses_the_requests() -> None:
-    address = BusAddress("virtual", "two testers")
-    with Battery(address) as battery, polling_service(address) as service:
-        polls = service.monitor.polls
-        assert polls is not None
-        assert waits(lambda: polls.answers >= 2)
+        temperature = service.pipeline.decoder.health["temperature"]
+        assert waits(lambda: temperature.value_at(time.time()) == 20.0)
+        # Another tester pauses the requests.
         battery.ask(4)
         assert waits(lambda: polls.other_tester >= 1)
         time.sleep(0.3)
         requests = polls.requests
         time.sleep(1.5)
         assert polls.requests == requests
-        assert service.pipeline.decoder.health["temperature"].value_at(time.time()) == 20.0
+    assert service.error is None
 
 
 def read(tmp_path: Path, text: str) -> Setup:

@@ -145,13 +145,6 @@ def test_a_command_takes_the_name_of_a_run(tmp_path: Path) -> None:
     assert (ended.code, ended.json["rows"]) == (0, 200), ended.err
 
 
-def test_a_clock_that_is_set_back_is_recorded(tmp_path: Path) -> None:
-    messages = frames(5.0) + frames(5.0, begin_s=1.6e9) + frames(5.0, begin_s=12.0)
-    with Recorder(tmp_path / "drive.log") as recorder:
-        write(recorder, messages)
-    assert content(recorder.written) == expected(messages)
-
-
 def test_an_existing_recording_is_never_replaced(tmp_path: Path) -> None:
     names = ("drive.log", "drive-0001.log", "drive-0002.log")
     for number, name in enumerate(names):

@@ -17,29 +17,24 @@ from live import leaf_model_path, waits
 pytestmark = pytest.mark.skipif(not hasattr(signal, "SIGHUP"), reason="no SIGHUP on this system")
 
 
-def test_a_hangup_reloads() -> None:
-    before = signal.getsignal(signal.SIGHUP)
-    calls = list[str]()
-    with (
-        stop_on_signals(lambda: calls.append("stop")),
-        reload_on_hangup(lambda: calls.append("reload")),
-    ):
-        signal.raise_signal(signal.SIGHUP)
-        assert calls == ["reload"]
-    assert signal.getsignal(signal.SIGHUP) == before
-
-
-def test_a_hangup_held_back_during_the_start_reloads_after_it() -> None:
-    calls = list[str]()
+def test_a_hangup_reloads_also_one_held_back_during_the_start() -> None:
+    handler, calls = signal.getsignal(signal.SIGHUP), list[str]()
     before = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGHUP])
     try:
         signal.raise_signal(signal.SIGHUP)
-        with reload_on_hangup(lambda: calls.append("reload")):
+        assert calls == []
+        with (
+            stop_on_signals(lambda: calls.append("stop")),
+            reload_on_hangup(lambda: calls.append("reload")),
+        ):
             assert calls == ["reload"]
+            signal.raise_signal(signal.SIGHUP)
+            assert calls == ["reload", "reload"]
         # Held back again: one that comes at the end does not kill the process before its result.
         assert signal.SIGHUP in signal.pthread_sigmask(signal.SIG_BLOCK, [])
     finally:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
+    assert signal.getsignal(signal.SIGHUP) == handler
 
 
 LOOP = """
@@ -58,6 +53,12 @@ open(sys.argv[1], "w").write("stopped" if stops else "went on")
 """
 
 
+def read_until(terminal: int, text: bytes) -> None:
+    found = b""
+    while text not in found:
+        found += os.read(terminal, 1024)
+
+
 @pytest.mark.skipif(sys.platform == "win32", reason="no terminals of that kind")
 def test_a_closed_terminal_stops_the_process(tmp_path: Path) -> None:
     import pty  # noqa: PLC0415 - not on every system
@@ -66,10 +67,10 @@ def test_a_closed_terminal_stops_the_process(tmp_path: Path) -> None:
     child, terminal = pty.fork()
     if child == 0:
         os.execv(sys.executable, [sys.executable, "-c", LOOP, str(said)])  # noqa: S606 - no shell wanted
-    assert _reads(terminal, b"ready")
+    read_until(terminal, b"ready")
     os.kill(child, signal.SIGHUP)
     # With its end: a terminal takes the line in parts, and one that is closed in between fails it.
-    assert _reads(terminal, b"again\r\n")
+    read_until(terminal, b"again\r\n")
     os.close(terminal)
     began_s = time.monotonic()
     os.waitpid(child, 0)
@@ -96,10 +97,3 @@ def test_a_terminal_closed_during_the_start_ends_it() -> None:
     late.cancel()
     # 0: the service was up already on a machine that is slow to see it load.
     assert os.waitstatus_to_exitcode(status) in {-signal.SIGHUP, 0}
-
-
-def _reads(terminal: int, text: bytes) -> bool:
-    found = b""
-    while text not in found:
-        found += os.read(terminal, 1024)
-    return True

@@ -11,7 +11,7 @@ import threading
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import pytest
 
@@ -24,13 +24,7 @@ from cangauge.model.model_file import Model
 from cangauge.replay.encoder import FrameEncoder
 from cangauge.service import state as state_file
 from cangauge.service.pipeline import Pipeline, PipelineSettings
-from cangauge.service.state import (
-    FILE_NAME,
-    STATE_VERSION,
-    StateKeeper,
-    read_state,
-    state_path,
-)
+from cangauge.service.state import FILE_NAME, STATE_VERSION, StateKeeper, read_state, state_path
 from cangauge.types import Estimate, Reason, Sample, Status
 from live import LoggedLines, leaf_model, short_log, waits
 
@@ -43,45 +37,39 @@ DRIVE = [each._replace(time_s=each.time_s + EPOCH_S) for each in samples_of(shor
 
 @dataclass
 class Machine:
-    """Services one after another on the same file."""
+    """Services one after another on the same file; `start` begins the next one."""
 
     path: Path
     wall_s: float = EPOCH_S
-    logged: LoggedLines = field(default_factory=lambda: LoggedLines("cangauge.service.state"))
     model: Model = MODEL
     settings: PipelineSettings = KNOWN
     bus: str = "virtual x"
+    logged: LoggedLines = field(default_factory=lambda: LoggedLines("cangauge.service.state"))
 
-    def start(self) -> Service:
+    def start(self) -> Self:
         self.logged.__exit__()
         self.logged = LoggedLines("cangauge.service.state").__enter__()
-        pipeline = Pipeline(VEHICLE, self.model, self.settings)
-        keeper = StateKeeper(self.path, pipeline, self.bus, 86400.0, wall_s=lambda: self.wall_s)
-        keeper.__enter__()
-        return Service(self, pipeline, keeper)
-
-    @property
-    def text(self) -> str:
-        return "\n".join(self.logged.lines)
-
-
-@dataclass
-class Service:
-    machine: Machine
-    pipeline: Pipeline
-    keeper: StateKeeper
-    encoder: FrameEncoder = field(default_factory=lambda: FrameEncoder(VEHICLE))
+        self.encoder = FrameEncoder(VEHICLE)
+        self.pipeline = Pipeline(VEHICLE, self.model, self.settings)
+        clock = lambda: self.wall_s  # noqa: E731
+        self.keeper = StateKeeper(self.path, self.pipeline, self.bus, 86400.0, wall_s=clock)
+        self.keeper.__enter__()
+        return self
 
     def drive(self, samples: Iterable[Sample]) -> list[Estimate]:
         found: list[Estimate] = []
         for sample in samples:
             handled = map(self.pipeline.handle, self.encoder.encode(sample))
             found += [self.pipeline.latest for is_complete in handled if is_complete]
-            self.machine.wall_s = max(self.machine.wall_s, sample.time_s)
+            self.wall_s = max(self.wall_s, sample.time_s)
         return found
 
     def stop(self) -> None:
         self.keeper.__exit__()
+
+    @property
+    def text(self) -> str:
+        return "\n".join(self.logged.lines)
 
 
 @pytest.fixture(autouse=True)
@@ -99,9 +87,8 @@ def machine(tmp_path: Path) -> Iterator[Machine]:
 
 def kept(machine: Machine, samples: int = 1000) -> list[Estimate]:
     """Let a service drive and end; return its estimates."""
-    service = machine.start()
-    found = service.drive(DRIVE[:samples])
-    service.stop()
+    found = machine.start().drive(DRIVE[:samples])
+    machine.stop()
     return found
 
 
@@ -124,29 +111,28 @@ def test_a_restart_at_once_is_no_restart(machine: Machine) -> None:
     whole = Machine(machine.path.with_name("other.json")).start().drive(DRIVE)
     first = kept(machine, 1003)
     json.loads(machine.path.read_text(), parse_constant=pytest.fail)  # no NaN: plain JSON
-    service = machine.start()
-    assert service.keeper.restored
+    machine.start()
+    assert machine.keeper.restored
     assert "continuing from" in machine.text
-    latest = service.pipeline.latest  # stale until the first sample
+    latest = machine.pipeline.latest  # stale until the first sample
     assert (latest.soc_pct, latest.status) == (first[-1].soc_pct, Status.INVALID)
     assert latest.reasons & Reason.INPUT_STALE
-    again = service.drive(DRIVE[1003:])
+    again = machine.drive(DRIVE[1003:])
     assert repr(numbers(first + again)) == repr(numbers(whole))
     assert again[-1] == whole[-1]
 
 
 def test_the_state_is_written_only_after_new_samples(machine: Machine) -> None:
-    service = machine.start()
-    service.keeper.checkpoint()
-    service.drive(DRIVE[:50])
+    machine.start().keeper.checkpoint()
+    machine.drive(DRIVE[:50])
     assert not machine.path.exists()
-    service.keeper.checkpoint()
+    machine.keeper.checkpoint()
     assert waits(machine.path.exists)
     first = machine.path.read_bytes()
     machine.wall_s += 3600.0
-    service.stop()
+    machine.stop()
     assert machine.path.read_bytes() == first
-    assert read_state(machine.path).estimator.estimate[1] == service.pipeline.latest.soc_pct
+    assert read_state(machine.path).estimator.estimate[1] == machine.pipeline.latest.soc_pct
 
 
 @pytest.mark.parametrize(
@@ -159,9 +145,10 @@ def test_stamps_of_another_clock_after_a_restart(
 ) -> None:
     last = kept(machine)[-1]
     machine.wall_s += clock_s
-    found = machine.start().drive(
-        [each._replace(time_s=each.time_s + stamps_s) for each in DRIVE[1000:]]
-    )
+    machine.start()
+    # Written in the future, by a clock that is wrong now or was then.
+    assert ("of unknown age" in machine.text) is (clock_s < 0.0)
+    found = machine.drive([each._replace(time_s=each.time_s + stamps_s) for each in DRIVE[1000:]])
     assert len(found) == 1000
     assert not any(each.reasons & Reason.IMPLAUSIBLE_INPUT for each in found)
     assert found[0].soc_pct == pytest.approx(last.soc_pct, abs=0.5)
@@ -173,10 +160,9 @@ def test_after_a_reboot_the_pause_may_have_been_long(machine: Machine) -> None:
     kept(machine)
     same = machine.start().pipeline.latest.soc_std_pct
     rewritten(machine.path, lambda content: content.update(boot_id="another"))
-    service = machine.start()
-    service.drive(DRIVE[1000:1001])
-    assert service.pipeline.latest.soc_std_pct >= same
-    hypotheses = service.pipeline.estimator.snapshot().hypotheses
+    machine.start().drive(DRIVE[1000:1001])
+    assert machine.pipeline.latest.soc_std_pct >= same
+    hypotheses = machine.pipeline.estimator.snapshot().hypotheses
     assert (len(hypotheses.filters), hypotheses.decision) == (2, 0)
 
 
@@ -184,7 +170,7 @@ def test_a_replayed_log_goes_on_and_another_one_begins_anew(machine: Machine) ->
     machine.settings = replace(machine.settings, time_source="replay-clock")
     clock = ClockFrames()
 
-    def play(service: Service, samples: list[Sample]) -> Estimate:
+    def play(service: Machine, samples: list[Sample]) -> Estimate:
         for sample in samples:
             service.pipeline.handle(clock.at(round((sample.time_s - EPOCH_S) * 1e6)))
             for frame in service.encoder.encode(sample):
@@ -192,29 +178,27 @@ def test_a_replayed_log_goes_on_and_another_one_begins_anew(machine: Machine) ->
         return service.pipeline.latest
 
     whole = play(Machine(machine.path.with_name("b"), settings=machine.settings).start(), DRIVE)
-    service = machine.start()
-    play(service, DRIVE[:1000])
-    service.stop()
+    play(machine.start(), DRIVE[:1000])
+    machine.stop()
     machine.wall_s += 300.0  # which has no say
     assert play(machine.start(), DRIVE[1000:]) == whole
-    service = machine.start()
-    assert play(service, DRIVE[:100]).samples == 100
-    assert service.pipeline.counts.beginnings == 1
+    assert play(machine.start(), DRIVE[:100]).samples == 100
+    assert machine.pipeline.counts.beginnings == 1
 
 
 # --- Refused
 
 
 def check_refused(machine: Machine, reason: str) -> None:
-    service = machine.start()
-    assert not service.keeper.restored
+    machine.start()
+    assert not machine.keeper.restored
     assert len(machine.logged.lines) == 1
     assert machine.text.startswith("warning: state refused")
     assert reason in machine.text
     assert machine.path.with_name(machine.path.name + ".refused").exists()
     assert not machine.path.exists()
-    service.drive(DRIVE[:700])
-    service.stop()
+    machine.drive(DRIVE[:700])
+    machine.stop()
     assert machine.start().keeper.restored
 
 
@@ -250,8 +234,6 @@ def edited(*place: Any, value: Any) -> Callable[[Path], None]:
 
 DAMAGE: dict[str, tuple[Callable[[Path], object], str]] = {
     "empty": (lambda path: path.write_bytes(b""), "not a cangauge state"),
-    "zeros": (lambda path: path.write_bytes(bytes(4096)), "not a cangauge state"),
-    "half": (lambda path: path.write_bytes(path.read_bytes()[:2000]), "not a cangauge state"),
     "one bit": (flip, ""),
     "a list": (lambda path: path.write_text("[]"), "not a cangauge state"),
     "nested": (lambda path: path.write_text("[" * 200_000), "not a cangauge state"),
@@ -287,17 +269,16 @@ def test_a_state_truncated_at_any_byte_is_refused(machine: Machine) -> None:
 def test_a_refused_state_discards_the_initial_soc(machine: Machine) -> None:
     given = EstimatorSettings(initial_soc_pct=40.0, initial_soc_std_pct=1.0)
     machine.settings = PipelineSettings(estimator=given)
-    first = machine.start()
     # It is used at a first start: the drive begins at 80 %, so this shows.
-    assert first.drive(DRIVE[:3])[-1].soc_pct == pytest.approx(40.0, abs=2.0)
-    first.stop()
+    assert machine.start().drive(DRIVE[:3])[-1].soc_pct == pytest.approx(40.0, abs=2.0)
+    machine.stop()
     machine.path.write_bytes(b"")
-    again = machine.start()
+    machine.start()
     assert "starting from the voltage, since the given initial SoC is outdated" in machine.text
-    assert again.drive(DRIVE[:1000])[-1].soc_pct == pytest.approx(79.0, abs=4.0)
+    assert machine.drive(DRIVE[:1000])[-1].soc_pct == pytest.approx(79.0, abs=4.0)
     # Nor does it come back when the configuration is read again.
-    again.pipeline.reconfigure(VEHICLE, machine.model, machine.settings)
-    assert again.drive(DRIVE[1000:1010])[-1].soc_pct == pytest.approx(79.0, abs=4.0)
+    machine.pipeline.reconfigure(VEHICLE, machine.model, machine.settings)
+    assert machine.drive(DRIVE[1000:1010])[-1].soc_pct == pytest.approx(79.0, abs=4.0)
 
 
 # --- Paths and disks
@@ -325,9 +306,8 @@ def test_where_the_file_is_and_what_is_refused_there(tmp_path: Path) -> None:
 def test_a_full_disk_keeps_the_last_state(
     machine: Machine, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    service = machine.start()
-    service.drive(DRIVE[:100])
-    service.keeper.checkpoint()
+    machine.start().drive(DRIVE[:100])
+    machine.keeper.checkpoint()
     assert waits(machine.path.exists)
     before = machine.path.read_bytes()
 
@@ -338,13 +318,13 @@ def test_a_full_disk_keeps_the_last_state(
     with monkeypatch.context() as disk:
         disk.setattr(state_file.os, "fsync", full)
         disk.setattr(machine.logged, "handle", failures.append)
-        service.drive(DRIVE[100:110])
-        service.keeper.checkpoint()
+        machine.drive(DRIVE[100:110])
+        machine.keeper.checkpoint()
         assert waits(lambda: bool(failures))
         assert "No space left" in failures[0].getMessage()
         assert machine.path.read_bytes() == before
-    service.drive(DRIVE[110:120])
-    service.stop()
+    machine.drive(DRIVE[110:120])
+    machine.stop()
     assert machine.path.read_bytes() != before
     assert machine.path.stat().st_mode & 0o777 == 0o600
     assert [each.name for each in machine.path.parent.iterdir()] == [FILE_NAME]
@@ -354,14 +334,14 @@ def test_a_hanging_disk_delays_nothing(machine: Machine, monkeypatch: pytest.Mon
     monkeypatch.setattr(state_file, "CLOSE_WITHIN_S", 0.1)
     free = threading.Event()
     monkeypatch.setattr(state_file.os, "fsync", lambda _: free.wait(300.0))
-    service = machine.start()
+    machine.start()
     ended = threading.Event()
 
     def run() -> None:
         for end in (10, 20, 30, 40):
-            service.drive(DRIVE[end - 10 : end])
-            service.keeper.checkpoint()
-        service.stop()
+            machine.drive(DRIVE[end - 10 : end])
+            machine.keeper.checkpoint()
+        machine.stop()
         ended.set()
 
     threading.Thread(target=run, daemon=True).start()

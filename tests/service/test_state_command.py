@@ -16,13 +16,7 @@ from cangauge.estimation.offline import samples_of
 from cangauge.replay.encoder import FrameEncoder
 from cangauge.service.state import read_state
 from cangauge.types import Reason, Status
-from live import (
-    Command,
-    collect,
-    leaf_model_path,
-    short_log,
-    waits,
-)
+from live import Command, collect, leaf_model_path, short_log, waits
 
 MODEL = ("-m", leaf_model_path())
 ADDRESS = "239.74.163.2"

@@ -8,7 +8,6 @@ from typing import Any
 from cangauge.bus.open import UNKNOWN_INTERFACE, BackendCapabilities
 from cangauge.bus.vehicle import Vehicle
 from cangauge.estimation.settings import EstimatorSettings
-from cangauge.service.lifecycle import Notifier
 from cangauge.service.pipeline import Pipeline, PipelineSettings
 from cangauge.service.status import Monitor
 from live import frames_of, leaf_model, short_log
@@ -31,7 +30,6 @@ class StandInPort:
 class Watched:
     now_s: float = 100.0
     port: Any = field(default_factory=StandInPort)
-    notifier: Notifier = field(default_factory=Notifier)
 
     def __post_init__(self) -> None:
         known = PipelineSettings(EstimatorSettings(initial_soc_pct=80.0))
@@ -40,7 +38,6 @@ class Watched:
             self.pipeline,
             self.port,
             "leaf.json",
-            notifier=self.notifier,
             clock=lambda: self.now_s,
         )
 
