@@ -21,7 +21,7 @@ from cangauge.estimation.offline import samples_of
 from cangauge.estimation.settings import EstimatorSettings
 from cangauge.logs.canonical import write_log
 from cangauge.logs.log import Log
-from cangauge.logs.read import read_cells, read_log
+from cangauge.logs.read import open_log, read_log
 from cangauge.model.model_file import Model
 from cangauge.replay.encoder import FrameEncoder
 from cangauge.service.pipeline import Pipeline
@@ -130,15 +130,15 @@ def test_a_capture_with_cells_as_live(run: Run, made: Path, tmp_path: Path) -> N
 
 
 def test_a_log_without_cells_has_none(made: Path) -> None:
-    assert read_cells(made / "part.csv", read_log(made / "part.csv").time_s) is None
-    assert read_cells(made / "full.parquet", np.arange(3.0)) is None
+    assert open_log(made / "part.csv").cells(read_log(made / "part.csv").time_s) is None
+    assert open_log(made / "full.parquet").cells(np.arange(3.0)) is None
 
 
 def test_rows_that_the_reader_dropped_do_not_shift_the_cells(made: Path, tmp_path: Path) -> None:
     log = read_log(made / "part.csv")
     doubled = pa.concat_tables([table_with_cells(log).slice(0, 10), table_with_cells(log).slice(9)])
     pa.parquet.write_table(doubled, tmp_path / "doubled.parquet")
-    found = read_cells(tmp_path / "doubled.parquet", log.time_s)
+    found = open_log(tmp_path / "doubled.parquet").cells(log.time_s)
     assert found is not None
     assert np.array_equal(found.voltage_v, cells_of(log))
     assert found.first == 1
@@ -148,7 +148,7 @@ def test_a_gap_in_the_numbers_is_refused(made: Path, tmp_path: Path) -> None:
     table = table_with_cells(read_log(made / "part.csv")).drop_columns(["cell_05_v"])
     pa.parquet.write_table(table, tmp_path / "gap.parquet")
     with pytest.raises(InputError, match="cell_5_v"):
-        read_cells(tmp_path / "gap.parquet", np.arange(3.0))
+        open_log(tmp_path / "gap.parquet").cells(np.arange(3.0))
 
 
 def test_the_pack_table_needs_a_known_suffix(run: Run, made: Path, tmp_path: Path) -> None:

@@ -91,24 +91,11 @@ def build_table(
 def write_log(log: Log, path: str | PathLike[str]) -> None:
     """Write a canonical log as `.parquet` or `.csv`, all or nothing; values read back exactly.
 
-    `.bdf`, `.bdf.csv` and `.bdf.parquet` are the Battery Data Format, which has no SoC.
-
     Raises
     ------
     InputError
         If the suffix is another one, or the folder is absent or not writable.
     """
-    if ".bdf" in Path(path).suffixes[-2:]:
-        place = "Ambient" if log.temperature_source == "room" else "Surface"
-        number = "" if place == "Ambient" else " T1"
-        columns = {
-            "Test Time / s": log.time_s,
-            "Voltage / V": log.voltage_v,
-            "Current / A": 0.0 - log.current_a,  # positive charges
-            f"{place} Temperature{number} / degC": log.temperature_c,
-        }
-        write_table(columns, path)
-        return
     table = log.to_arrow()
     if Path(path).suffix.lower() == ".csv" and log.temperature_source != "unknown":
         table = table.append_column(SOURCE, [[log.temperature_source] * len(log)])
@@ -122,14 +109,14 @@ def write_table(columns: Mapping[str, Any], path: str | PathLike[str]) -> None:
 
 def _write(table: Any, path: str | PathLike[str]) -> None:
     suffix = Path(path).suffix.lower()
-    if suffix not in {".parquet", ".pq", ".csv", ".bdf"}:
+    if suffix not in {".parquet", ".pq", ".csv"}:
         cure = "use .parquet or .csv"
         raise InputError("unknown suffix for a table", source=path, value=suffix, cure=cure)
     with atomic_path(path) as part:
-        if suffix in {".csv", ".bdf"}:
-            with part.open("wb") as file:
-                file.write((",".join(table.column_names) + "\n").encode())
-                options = pacsv.WriteOptions(include_header=False, quoting_style="needed")
-                pacsv.write_csv(table, file, options)
-        else:
+        if suffix != ".csv":
             pq.write_table(table, part, write_page_checksum=True)
+            return
+        with part.open("wb") as file:
+            file.write((",".join(table.column_names) + "\n").encode())
+            options = pacsv.WriteOptions(include_header=False, quoting_style="needed")
+            pacsv.write_csv(table, file, options)

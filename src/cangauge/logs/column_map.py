@@ -5,11 +5,12 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import chain, repeat
 from typing import Final, NamedTuple
 
 from cangauge.errors import InputError, closest
 from cangauge.logs.headings import GUESS, Meaning, meaning_of, names_and_units
-from cangauge.logs.units import FIELDS, TemperatureSource, unit_of
+from cangauge.logs.units import FIELDS, REQUIRED, TemperatureSource, unit_of
 
 DOCS: Final = "docs/logs.md"
 """Page that explains the columns of a log."""
@@ -18,6 +19,7 @@ _SYNTAX: Final = (
     " time, current, voltage, temperature, soc"
 )
 _NEEDED: Final = ("time", "current", "voltage")
+_CANONICAL: Final = (*FIELDS.values(), "temperature_source")
 _JOINED: Final = ("time", "temperature")
 """Quantities of several columns: a date and its time; probes, whose median is taken."""
 _SPLIT: Final = re.compile(rf",\s*(?=(?:{'|'.join(FIELDS)})\s*=)", re.IGNORECASE)
@@ -115,31 +117,35 @@ class ChosenColumn:
 
 @dataclass(frozen=True, slots=True)
 class Choice:
-    """Columns of a table by quantity, and the likely columns of each that is not plain."""
+    """Columns of a table by quantity, and the likely columns of each that is not plain.
+
+    `is_canonical`: by the names of the canonical log, which define the sign of the current.
+    """
 
     chosen: dict[str, ChosenColumn] = field(default_factory=dict)
     guesses: dict[str, list[int]] = field(default_factory=dict)
+    is_canonical: bool = False
 
     @property
     def is_complete(self) -> bool:
-        """Whether time, current and voltage are known (a temperature may be given)."""
-        return set(_NEEDED) <= set(self.chosen)
+        """Whether time, current and voltage are known or named (a temperature may be given)."""
+        return self.is_canonical or set(_NEEDED) <= set(self.chosen)
 
 
 def choose_columns(
     headings: Sequence[str], units_below: Sequence[str] = (), given: ColumnMap | None = None
 ) -> Choice:
-    """Choose the columns of a table: the user's first, then plain headings.
+    """Choose the columns of a table: the user's first, then the canonical or plain headings.
 
     Raises
     ------
     InputError
         If a column of the user is not in the table, or is named for two quantities.
     """
-    below = [*units_below, *[""] * (len(headings) - len(units_below))]
-    meanings = [meaning_of(text, unit) for text, unit in zip(headings, below, strict=False)]
+    units = chain(units_below, repeat(""))
+    meanings = [meaning_of(text, unit) for text, unit in zip(headings, units, strict=False)]
+    choice = Choice(is_canonical=given is None and _are_canonical(headings, meanings))
     given = given or ColumnMap()
-    choice = Choice()
     owner: dict[int, str] = {}
     for quantity, text in given.texts.items():
         column = _given_column(quantity, text, headings, meanings, given.where)
@@ -159,12 +165,47 @@ def choose_columns(
             for place, meaning in enumerate(meanings)
             if meaning is not None and meaning.quantity == quantity and place not in owner
         ]
+        if choice.is_canonical:
+            plain = [item for item in plain if _simple(headings[item[0]]) == FIELDS[quantity]][:1]
         pair = _directions(headings, plain) if quantity == "current" else None
         if pair is not None:
             choice.chosen["current"] = pair
         elif plain:
             _choose(quantity, sorted(plain, key=lambda item: item[1].rank), choice)
     return choice
+
+
+def _are_canonical(headings: Sequence[str], meanings: Sequence[Meaning | None]) -> bool:
+    """Return whether columns have the names of a canonical log's, possibly an incomplete one.
+
+    A temperature of another name is not a missing one: such a table is a logger's own.
+    """
+    names = [_simple(heading) for heading in headings]
+    has_other_temperature = any(
+        name not in _CANONICAL
+        and ("temperature" in name or (meaning is not None and meaning.quantity == "temperature"))
+        for name, meaning in zip(names, meanings, strict=True)
+    )
+    is_whole = "temperature_c" in names or not has_other_temperature
+    return len(set(REQUIRED).intersection(names)) >= 2 and is_whole
+
+
+def refuse_odd_names(headings: Sequence[str], source: str) -> None:
+    """Raise InputError if a column of the canonical log is missing, or if two have its name."""
+    names = [_simple(heading) for heading in headings]
+    for name in _CANONICAL:
+        if names.count(name) > 1:
+            problem, cure = (
+                f"{names.count(name)} columns have this name",
+                "rename or drop all but one",
+            )
+        elif name in REQUIRED[:3] and name not in names:
+            problem = f"this column is missing (found: {shown_headings(headings)})"
+            cure = "a log needs time_s, current_a (positive = discharge), voltage_v,"
+            cure += " temperature_c [s, A, V, °C]"
+        else:
+            continue
+        raise InputError(problem, source=source, field=name, cure=cure)
 
 
 def _directions(

@@ -4,18 +4,29 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Final, Literal
+from typing import TYPE_CHECKING, Final, Literal
 
 import numpy as np
 
 from cangauge._text import counted
 from cangauge._typing import BoolArray, FloatArray
-from cangauge.errors import InputError
+from cangauge.errors import InputError, require_number
 from cangauge.logs.column_map import shown_headings
 from cangauge.logs.headings import cell_number
 from cangauge.logs.log import Log
 from cangauge.logs.sign import resolve_sign
-from cangauge.logs.units import REQUIRED, TemperatureSource, refuse_wrong_units
+from cangauge.logs.units import (
+    COLDEST_C,
+    HOTTEST_C,
+    REQUIRED,
+    TemperatureSource,
+    known_temperature_source,
+    refuse_wrong_units,
+)
+
+if TYPE_CHECKING:
+    from cangauge.logs.table import ArrowTable
+    from cangauge.logs.text import TextTable
 
 Sign = Literal["charge", "discharge"]
 """What a positive current in the file does."""
@@ -51,6 +62,8 @@ class DraftLog:
         How the columns were understood; changes and findings.
     headings, ignored : tuple of str
         All columns of the file, and those that hold no quantity of the log, for messages.
+    table : TextTable or ArrowTable, optional
+        The table that was read, for further columns of it.
     """
 
     name: str
@@ -66,6 +79,7 @@ class DraftLog:
     remarks: list[str] = field(default_factory=list)
     headings: tuple[str, ...] = ()
     ignored: tuple[str, ...] = ()
+    table: TextTable | ArrowTable | None = None
 
     def keep(self, rows: BoolArray, remark: str) -> None:
         """Keep the rows of a mask of shape (n,); remark on the number of the others, if any."""
@@ -115,6 +129,7 @@ class DraftLog:
         remark. The first three arguments are the user's, as of `cangauge.read_log`; `used` are
         columns that the caller reads besides.
         """
+        _refuse_options(temperature_c, temperature_source, sign)
         if sign is not None:
             if (sign == "charge") is not self.negated:
                 self.negate_current(f"positive {sign}s in the file, as stated")
@@ -149,7 +164,7 @@ class DraftLog:
     def _remark_ignored(self, used: Sequence[str]) -> None:
         ignored = [name for name in self.ignored if name not in used]
         cells = [name for name in ignored if cell_number(name) is not None]
-        if len(cells) > 1:  # `read_cells`
+        if len(cells) > 1:  # `LogFile.cells`
             self.remarks.append(f"{len(cells)} cells: {cells[0]} … {cells[-1]}")
             ignored = [name for name in ignored if name not in cells]
         if ignored:
@@ -220,3 +235,18 @@ class DraftLog:
     def _error(self, name: str, problem: str, cure: str, value: float | None = None) -> InputError:
         label = self.labels.get(name, name)
         return InputError(problem, source=self._where, field=label, value=value, cure=cure)
+
+
+def _refuse_options(
+    temperature_c: float | None, temperature_source: str | None, sign: str | None
+) -> None:
+    if temperature_source is not None:
+        known_temperature_source(temperature_source)
+    if temperature_c is not None:
+        require_number(temperature_c, "--temperature")
+        if not COLDEST_C <= temperature_c <= HOTTEST_C:
+            problem = f"must lie within {COLDEST_C:g} … {HOTTEST_C:g} °C"
+            raise InputError(problem, field="--temperature", value=temperature_c)
+    if sign not in {None, "charge", "discharge"}:
+        cure = "say what a positive current does: charge or discharge"
+        raise InputError("not a sign", field="--sign", value=sign, cure=cure)

@@ -15,11 +15,7 @@ from cangauge._extras import extra
 from cangauge._text import duration
 from cangauge._typing import BoolArray, FloatArray, IntArray
 from cangauge.errors import InputError, naming_arguments
-from cangauge.logs.units import (
-    REQUIRED,
-    TEMPERATURE_SOURCES,
-    TemperatureSource,
-)
+from cangauge.logs.units import REQUIRED, TEMPERATURE_SOURCES, TemperatureSource
 
 __all__ = ["TEMPERATURE_SOURCES", "Log", "TemperatureSource"]
 
@@ -89,16 +85,13 @@ class Log(ArrowExport):
     def __post_init__(self) -> None:
         where = self.source or self.name
         for channel in (*REQUIRED, "soc_pct"):
-            values = getattr(self, channel)
-            if values is not None:
-                object.__setattr__(self, channel, _read_only(values))
-        n = self.time_s.size
-        if n == 0:
-            raise InputError("the log holds no rows", source=where, cure="check the export")
-        for channel in (*REQUIRED, "soc_pct"):
-            values = getattr(self, channel)
-            if values is None:
+            if getattr(self, channel) is None:
                 continue
+            values = _read_only(getattr(self, channel))
+            object.__setattr__(self, channel, values)
+            n = self.time_s.size
+            if n == 0:
+                raise InputError("the log holds no rows", source=where, cure="check the export")
             if values.shape != (n,):
                 problem = f"has {values.size} values where time_s has {n}"
                 raise InputError(problem, source=where, field=channel)
@@ -164,16 +157,10 @@ class Log(ArrowExport):
         array([380., 379.])
         """
         # Deferred: the service runs where pyarrow is not installed.
-        from cangauge.logs.read import log_of_dataframe  # noqa: PLC0415
+        from cangauge.logs.read import draft_of_dataframe  # noqa: PLC0415
 
-        return log_of_dataframe(
-            table,
-            name=name,
-            temperature_c=temperature_c,
-            temperature_source=temperature_source,
-            columns=columns,
-            sign=sign,
-        )
+        draft = draft_of_dataframe(table, name, columns)
+        return draft.log(temperature_c, temperature_source, sign)
 
     def to_arrow(self) -> Any:
         """Return a pyarrow.Table of the columns; missing SoC is null.
@@ -189,14 +176,8 @@ class Log(ArrowExport):
 
     def __repr__(self) -> str:
         """Return one line of what the log holds."""
-        spans = [
-            f"{values.min():.4g} … {values.max():.4g} {unit}"
-            for values, unit in (
-                (self.current_a, "A"),
-                (self.voltage_v, "V"),
-                (self.temperature_c, "°C"),
-            )
-        ]
+        channels = {"A": self.current_a, "V": self.voltage_v, "°C": self.temperature_c}
+        spans = [f"{v.min():.4g} … {v.max():.4g} {unit}" for unit, v in channels.items()]
         text = f"{self.name!r}: {len(self):,} rows in {duration(self.duration_s)}"
         soc = np.empty(0) if self.soc_pct is None else self.soc_pct[np.isfinite(self.soc_pct)]
         if soc.size:

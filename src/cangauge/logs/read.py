@@ -16,15 +16,14 @@ import pyarrow as pa
 
 from cangauge._files import Head
 from cangauge._typing import FloatArray
-from cangauge.errors import InputError, require_number
+from cangauge.errors import InputError
 from cangauge.logs.canonical import arrow_table, parquet_table
-from cangauge.logs.column_map import DOCS, ColumnMap, unknown_columns
+from cangauge.logs.column_map import DOCS, ColumnMap, choose_columns, unknown_columns
 from cangauge.logs.draft import DraftLog, Sign
 from cangauge.logs.headings import cell_number
 from cangauge.logs.log import Log, TemperatureSource
-from cangauge.logs.table import ArrowTable, draft_of_table, is_canonical
-from cangauge.logs.text import TextTable, find_table, likely_header, table_below
-from cangauge.logs.units import COLDEST_C, HOTTEST_C, known_temperature_source
+from cangauge.logs.table import draft_of_table
+from cangauge.logs.text import find_table, likely_header
 from cangauge.logs.values import numbers_of, with_decimal_points
 
 KNOWN_LOGS: Final = (
@@ -56,40 +55,36 @@ class LogReader(Protocol):
         """Read the file; raise InputError where it is damaged or lacks something."""
 
 
-class LogTableReader:
-    """Canonical Parquet or CSV, or any such table with plain headings or the user's columns."""
+class AnyTable:
+    """A text with canonical or plain headings, or the user's columns of it."""
 
     name = "table"
     takes_columns = True
 
     def matches(self, head: Head) -> bool:
-        """Return whether the file is Parquet, or a text with time, current and voltage."""
-        return _is_parquet(head) or bool(_canonical_text(head) or find_table(head))
+        """Return whether a text has a table with time, current and voltage."""
+        return find_table(head) is not None
 
     def read(self, head: Head, columns: ColumnMap | None = None) -> DraftLog:
-        """Read a log; see `LogReader`."""
-        table = open_table(head, columns)
+        """Read the table; see `LogReader`."""
+        table = find_table(head, columns)
+        if table is None:
+            raise unknown_columns(str(head.path), *likely_header(head, columns))
         return draft_of_table(table, columns, name=head.name, source=str(head.path))
 
 
-def _is_parquet(head: Head) -> bool:
-    return head.data.startswith(b"PAR1")
+class _Parquet:
+    """Parquet, canonical or with any plain headings or the user's columns."""
 
+    name = "Parquet"
+    takes_columns = True
 
-def _canonical_text(head: Head) -> TextTable | None:
-    table = table_below(head, head.first_line) if head.first_line else None
-    return table if table is not None and is_canonical(table.headings) else None
+    def matches(self, head: Head) -> bool:
+        return head.data.startswith(b"PAR1")
 
-
-def open_table(head: Head, columns: ColumnMap | None) -> TextTable | ArrowTable:
-    """Return Parquet or a text as a table; raise InputError where it is none."""
-    if _is_parquet(head):
-        return parquet_table(head)
-    table = _canonical_text(head) if columns is None else None
-    table = table or find_table(head, columns)
-    if table is None:
-        raise unknown_columns(str(head.path), *likely_header(head, columns))
-    return table
+    def read(self, head: Head, columns: ColumnMap | None = None) -> DraftLog:
+        table = parquet_table(head)
+        return draft_of_table(table, columns, name=head.name, source=str(head.path))
 
 
 @cache
@@ -97,7 +92,28 @@ def _readers() -> tuple[LogReader, ...]:
     """Return all readers, in the order in which a file is offered to them."""
     others = [entry.load()() for entry in entry_points(group=GROUP)]
     formats = [reader for name in _FORMATS for reader in import_module(name).READERS]
-    return (*others, *formats, LogTableReader())
+    return (*others, *formats, _Parquet(), AnyTable())
+
+
+@dataclass(frozen=True, eq=False)
+class CellColumns:
+    """Voltages of the cells of a log.
+
+    Parameters
+    ----------
+    first : int
+        Number of the first cell.
+    voltage_v : array of shape (n, cells)
+        Voltage [V] at the log's rows; NaN where missing.
+    """
+
+    first: int
+    voltage_v: FloatArray
+
+    @property
+    def count(self) -> int:
+        """Number of cells."""
+        return int(self.voltage_v.shape[1])
 
 
 @dataclass(frozen=True, slots=True)
@@ -116,9 +132,9 @@ class LogFile:
 
     @property
     def is_any_table(self) -> bool:
-        """Whether the file is a table of plain headings, not of a format that defines them."""
-        is_text = isinstance(self.reader, LogTableReader) and not _is_parquet(self.head)
-        return is_text and _canonical_text(self.head) is None
+        """Whether the file is a text of plain headings, not of a format that defines them."""
+        table = find_table(self.head) if isinstance(self.reader, AnyTable) else None
+        return table is not None and not choose_columns(table.headings).is_canonical
 
     def read(
         self,
@@ -127,12 +143,8 @@ class LogFile:
         temperature_source: TemperatureSource | None = None,
     ) -> Log:
         """Read the log; see `read_log`."""
-        if self.reader is None:
-            raise not_recognised(self, "not a known kind of log", f"known are: {KNOWN_LOGS}")
-        _refuse_options(temperature_c, temperature_source, self.sign)
         try:
-            draft = self.reader.read(self.head, self.columns)
-            log = draft.log(temperature_c, temperature_source, self.sign, self.used)
+            log = self._draft().log(temperature_c, temperature_source, self.sign, self.used)
         except MemoryError as error:
             raise InputError(
                 "larger than the free memory", source=self.head.path, cure="split it"
@@ -140,20 +152,37 @@ class LogFile:
         pa.default_memory_pool().release_unused()
         return log
 
+    def _draft(self) -> DraftLog:
+        if self.reader is None:
+            raise not_recognised(self, "not a known kind of log", f"known are: {KNOWN_LOGS}")
+        return self.reader.read(self.head, self.columns)
 
-def _refuse_options(
-    temperature_c: float | None, temperature_source: str | None, sign: str | None
-) -> None:
-    if temperature_source is not None:
-        known_temperature_source(temperature_source)
-    if temperature_c is not None:
-        require_number(temperature_c, "--temperature")
-        if not COLDEST_C <= temperature_c <= HOTTEST_C:
-            problem = f"must lie within {COLDEST_C:g} … {HOTTEST_C:g} °C"
-            raise InputError(problem, field="--temperature", value=temperature_c)
-    if sign not in {None, "charge", "discharge"}:
-        cure = "say what a positive current does: charge or discharge"
-        raise InputError("not a sign", field="--sign", value=sign, cure=cure)
+    def cells(self, time_s: FloatArray) -> CellColumns | None:
+        """Return the cell voltages beside the log; None where it has none.
+
+        Parameters
+        ----------
+        time_s : array of shape (n,)
+            Times of the log's rows, some of which the reader may have dropped [s].
+        """
+        draft = self._draft()
+        cells = _cells(draft.headings, draft.source)
+        if len(cells) < 2 or draft.table is None:  # a single cell is its pack
+            return None
+        columns = with_decimal_points(draft.table.columns([place for place, _ in cells.values()]))
+        volts = np.column_stack(
+            [
+                scale * numbers_of(columns[place], draft.source, draft.headings[place])[0]
+                for place, scale in cells.values()
+            ]
+        )
+        file_s = draft.values["time_s"]
+        if file_s.size != volts.shape[0]:
+            return None  # rows that hold only what changed
+        order = np.argsort(file_s, kind="stable")
+        rows = order[np.minimum(np.searchsorted(file_s[order], time_s), file_s.size - 1)]
+        is_row = (file_s[rows] == time_s)[:, None]
+        return CellColumns(min(cells), np.where(is_row, volts[rows], np.nan))
 
 
 def not_recognised(file: LogFile, problem: str, cure: str) -> InputError:
@@ -196,7 +225,7 @@ def open_log(
         if (given is None or reader.takes_columns) and reader.matches(head):
             return LogFile(head, reader, given, sign)
     # The user's columns make a table of any text.
-    return LogFile(head, None if given is None else LogTableReader(), given, sign)
+    return LogFile(head, None if given is None else AnyTable(), given, sign)
 
 
 def read_log(
@@ -215,17 +244,10 @@ def read_log(
     return file.read(temperature_c=temperature_c, temperature_source=temperature_source)
 
 
-def log_of_dataframe(
-    frame: Any,
-    *,
-    name: str,
-    temperature_c: float | None,
-    temperature_source: TemperatureSource | None,
-    columns: ColumnMap | Mapping[str, str] | str | None,
-    sign: Sign | None,
-) -> Log:
-    """Return the log of a data frame; see `Log.from_dataframe`."""
-    _refuse_options(temperature_c, temperature_source, sign)
+def draft_of_dataframe(
+    frame: Any, name: str, columns: ColumnMap | Mapping[str, str] | str | None
+) -> DraftLog:
+    """Return the draft of the log in a data frame; see `Log.from_dataframe`."""
     try:
         table = pa.table(frame)
     except (TypeError, ValueError, pa.ArrowException) as error:
@@ -242,68 +264,7 @@ def log_of_dataframe(
     table = table.drop_columns([c.name for c in indices if c.name in table.column_names])
     given = None if columns is None else ColumnMap.of(columns)
     columns_of = arrow_table(table.schema, table.select, name)
-    draft = draft_of_table(columns_of, given, name=name, source="")
-    return draft.log(temperature_c, temperature_source, sign)
-
-
-# --- Cells beside a log
-
-
-@dataclass(frozen=True, eq=False)
-class CellColumns:
-    """Voltages of the cells of a log.
-
-    Parameters
-    ----------
-    first : int
-        Number of the first cell.
-    voltage_v : array of shape (n, cells)
-        Voltage [V] at the log's rows; NaN where missing.
-    """
-
-    first: int
-    voltage_v: FloatArray
-
-    @property
-    def count(self) -> int:
-        """Number of cells."""
-        return int(self.voltage_v.shape[1])
-
-
-def read_cells(
-    path: str | PathLike[str], time_s: FloatArray, columns: ColumnMap | None = None
-) -> CellColumns | None:
-    """Return the cell voltages beside a log in its file; None where it has none.
-
-    Parameters
-    ----------
-    path : path-like
-    time_s : array of shape (n,)
-        Times of the log's rows, some of which the reader may have dropped [s].
-    columns : ColumnMap, optional
-        The user's columns of the log.
-    """
-    file, source = open_log(path, columns=columns), str(path)
-    if not isinstance(file.reader, LogTableReader):
-        return None
-    table = open_table(file.head, columns)
-    cells = _cells(table.headings, source)
-    if len(cells) < 2:  # a single cell is its pack
-        return None
-    values = with_decimal_points(table.columns([place for place, _ in cells.values()]))
-    volts = np.column_stack(
-        [
-            scale * numbers_of(values[place], source, table.headings[place])[0]
-            for place, scale in cells.values()
-        ]
-    )
-    file_s = draft_of_table(table, columns, name=file.head.name, source=source).values["time_s"]
-    if file_s.size != volts.shape[0]:
-        return None  # rows that hold only what changed
-    order = np.argsort(file_s, kind="stable")
-    rows = order[np.minimum(np.searchsorted(file_s[order], time_s), file_s.size - 1)]
-    is_row = (file_s[rows] == time_s)[:, None]
-    return CellColumns(min(cells), np.where(is_row, volts[rows], np.nan))
+    return draft_of_table(columns_of, given, name=name, source="")
 
 
 def _cells(headings: Sequence[str], source: str) -> dict[int, tuple[int, float]]:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import csv
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
+from itertools import chain, product
 from typing import Any, Final, NamedTuple
 
 import pyarrow as pa
@@ -158,63 +159,57 @@ def find_table(head: Head, given: ColumnMap | None = None) -> TextTable | None:
     """Return the table of a text in which time, current and voltage are known, or None."""
     texts = given.texts.values() if given else ()
     if texts and all(text.startswith("#") for text in texts):
-        table = _without_header(head)
-        if table is not None:
-            return table
-    for rows in (1, 2):  # the words of a header may be in two rows
-        for number, delimiter, cells in _headers(head, rows):
-            with suppress(InputError):  # no column has a heading that the user names
-                if choose_columns(cells, (), given).is_complete:
-                    return _below(head, number + rows, delimiter, cells, given)
+        bare = _without_header(head)
+        if bare is not None:
+            return bare
+    for table in chain(_headed(head, rows=1), _headed(head, rows=2)):
+        with suppress(InputError):  # no column has a heading that the user names
+            if choose_columns(table.headings, (), given).is_complete:
+                return _above_data(table, given)
     return None
 
 
-def _headers(head: Head, rows: int = 1) -> Iterator[tuple[int, str, list[str]]]:
-    """Yield number, delimiter and cells of what may be a header of one or two rows."""
-    for number, line in enumerate(head.lines):
-        for delimiter in _DELIMITERS:
-            cells = split_cells(line, delimiter) if delimiter in line else []
-            for below in head.lines[number + 1 : number + rows]:
-                second = split_cells(below, delimiter)
-                if len(second) != len(cells) or _values_in(second[1:]):
-                    cells = []
-                else:
-                    pairs = zip(cells, second, strict=True)
-                    cells = [f"{one} {other}".strip() for one, other in pairs]
-            if len(cells) > 2:
-                yield number, delimiter, cells
+def _headed(head: Head, rows: int) -> Iterator[TextTable]:
+    """Yield a table below every line or two, if the words of a header are in two rows."""
+    for number, delimiter in product(range(len(head.lines) - rows + 1), _DELIMITERS):
+        if delimiter not in head.lines[number]:
+            continue
+        first, *second = (split_cells(row, delimiter) for row in head.lines[number : number + rows])
+        if any(len(row) != len(first) or _values_in(row[1:]) for row in second):
+            continue
+        headings = [" ".join(cells).strip() for cells in zip(first, *second, strict=True)]
+        if len(headings) > 2:
+            yield TextTable(head, delimiter, headings, (), number + rows, [])
 
 
-def _below(
-    head: Head, first: int, delimiter: str, cells: list[str], given: ColumnMap | None
-) -> TextTable:
-    """Return the table below a header, with its row of units where there is one.
+def _above_data(table: TextTable, given: ColumnMap | None) -> TextTable:
+    """Return a table less the rows above its data, of which one may hold units.
 
     A row of units gives one of the quantities another unit, or shows that it is none (`t`, °C).
     """
-    chosen = choose_columns(cells, (), given).chosen
-    measured = [chosen[name].places[-1] for name in ("time", "current", "voltage")]
-    units: list[str] = []
-    for number, line in enumerate(head.lines[first : first + _ROWS_ABOVE_DATA], start=first):
-        row = split_cells(line, delimiter)
+    chosen = choose_columns(table.headings, (), given).chosen
+    needed = [chosen[name] for name in ("time", "current", "voltage") if name in chosen]
+    measured = [column.places[-1] for column in needed]
+    units, first = list[str](), table.skip_lines
+    for number, line in enumerate(table.head.lines[first : first + _ROWS_ABOVE_DATA], start=first):
+        row = split_cells(line, table.delimiter)
         if _is_value(next((row[k] for k in measured if k < len(row) and row[k]), "")):
-            return TextTable(head, delimiter, cells, units, number, [])
-        again = choose_columns(cells, row, given).chosen
+            return table._replace(units=units, skip_lines=number)
+        again = choose_columns(table.headings, row, given).chosen
         if any(name not in again or again[name].unit != chosen[name].unit for name in chosen):
             units = row
-    return TextTable(head, delimiter, cells, units, first, [])
+    return table._replace(units=units)
 
 
 def _without_header(head: Head) -> TextTable | None:
     """Return the table of a text that has no header, for columns given by number."""
-    for number, line in enumerate(head.lines):
-        for delimiter in _DELIMITERS:
-            cells = split_cells(line, delimiter)
-            if len(cells) > 2 and 2 * _values_in(cells) > len(cells):
-                above = split_cells(head.lines[number - 1], delimiter) if number else []
-                headings = [f"column {k}" for k in range(1, len(cells) + 1)]
-                is_header = len(above) == len(cells)
-                return None if is_header else TextTable(head, delimiter, headings, (), number, [])
+    for number, delimiter in product(range(len(head.lines)), _DELIMITERS):
+        cells = split_cells(head.lines[number], delimiter)
+        if len(cells) > 2 and 2 * _values_in(cells) > len(cells):
+            above = split_cells(head.lines[number - 1], delimiter) if number else []
+            headings = [f"column {k}" for k in range(1, len(cells) + 1)]
+            is_header = len(above) == len(cells)
+            return None if is_header else TextTable(head, delimiter, headings, (), number, [])
     return None
 
 
@@ -227,12 +222,12 @@ def likely_header(head: Head, given: ColumnMap | None = None) -> tuple[list[str]
         If the header has none of a column of the user.
     """
     best: list[str] = []
-    for number, delimiter, cells in _headers(head):
-        if _values_in(cells) > 1:
+    for table in _headed(head, rows=1):
+        if _values_in(table.headings) > 1:
             break
-        below = head.lines[number + 1 : number + 1 + _ROWS_ABOVE_DATA]
-        has_data = any(_values_in(split_cells(row, delimiter)) > 1 for row in below)
-        known, most = (sum(map(bool, map(meaning_of, row))) for row in (cells, best))
+        below = head.lines[table.skip_lines : table.skip_lines + _ROWS_ABOVE_DATA]
+        has_data = any(_values_in(split_cells(row, table.delimiter)) > 1 for row in below)
+        known, most = (sum(map(bool, map(meaning_of, row))) for row in (table.headings, best))
         if has_data and (not best or known > most):
-            best = cells
+            best = [*table.headings]
     return best, choose_columns(best, (), given)
