@@ -6,7 +6,7 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import chain, repeat
-from typing import Final, NamedTuple
+from typing import Final
 
 from cangauge.errors import InputError, closest
 from cangauge.logs.headings import GUESS, Meaning, meaning_of, names_and_units
@@ -79,21 +79,13 @@ class ColumnMap:
         return cls(texts, where)
 
 
-class _Reading(NamedTuple):
-    """A reading of a user's column: its heading, its unit if stated, and its factor."""
-
-    heading: str
-    unit: str | None = None
-    factor: float = 1.0
-
-
-def _readings(text: str) -> list[_Reading]:
-    """Return the readings of a text: the whole is a heading, or ends in a factor, or a unit."""
-    found = [_Reading(text)]
+def _readings(text: str) -> list[tuple[str, str | None, float]]:
+    """Return (heading, unit, factor) as a text may be meant: the whole, less a factor, a unit."""
+    found: list[tuple[str, str | None, float]] = [(text, None, 1.0)]
     if match := _FACTOR.match(text):
-        found.append(_Reading(match["text"], factor=float(match["factor"])))
-    units = [(item, match) for item in found if (match := _UNIT.match(item.heading))]
-    return found + [_Reading(m["text"], m["unit"].strip(), item.factor) for item, m in units]
+        found.append((match["text"], None, float(match["factor"])))
+    units = [(match, factor) for each, _, factor in found if (match := _UNIT.match(each))]
+    return found + [(match["text"], match["unit"].strip(), factor) for match, factor in units]
 
 
 @dataclass(frozen=True, slots=True)
@@ -142,9 +134,10 @@ def choose_columns(
     InputError
         If a column of the user is not in the table, or is named for two quantities.
     """
-    units = chain(units_below, repeat(""))
+    is_canonical = given is None and _are_canonical(headings)
+    units = chain(() if is_canonical else units_below, repeat(""))
     meanings = [meaning_of(text, unit) for text, unit in zip(headings, units, strict=False)]
-    choice = Choice(is_canonical=given is None and _are_canonical(headings, meanings))
+    choice = Choice(is_canonical=is_canonical)
     given = given or ColumnMap()
     owner: dict[int, str] = {}
     for quantity, text in given.texts.items():
@@ -175,36 +168,40 @@ def choose_columns(
     return choice
 
 
-def _are_canonical(headings: Sequence[str], meanings: Sequence[Meaning | None]) -> bool:
+def _are_canonical(headings: Sequence[str]) -> bool:
     """Return whether columns have the names of a canonical log's, possibly an incomplete one.
 
     A temperature of another name is not a missing one: such a table is a logger's own.
     """
-    names = [_simple(heading) for heading in headings]
+    names = {_simple(heading) for heading in headings}
+    others = {name: meaning_of(name) for name in names.difference(_CANONICAL)}
     has_other_temperature = any(
-        name not in _CANONICAL
-        and ("temperature" in name or (meaning is not None and meaning.quantity == "temperature"))
-        for name, meaning in zip(names, meanings, strict=True)
+        "temperature" in name or (meaning is not None and meaning.quantity == "temperature")
+        for name, meaning in others.items()
     )
     is_whole = "temperature_c" in names or not has_other_temperature
-    return len(set(REQUIRED).intersection(names)) >= 2 and is_whole
+    return len(names.intersection(REQUIRED)) >= 2 and is_whole
 
 
 def refuse_odd_names(headings: Sequence[str], source: str) -> None:
     """Raise InputError if a column of the canonical log is missing, or if two have its name."""
     names = [_simple(heading) for heading in headings]
     for name in _CANONICAL:
-        if names.count(name) > 1:
-            problem, cure = (
-                f"{names.count(name)} columns have this name",
-                "rename or drop all but one",
+        refuse_doubled(name, names, source)
+        if name in REQUIRED[:3] and name not in names:
+            raise InputError(
+                f"this column is missing (found: {shown_headings(headings)})",
+                source=source,
+                field=name,
+                cure="a log needs time_s, current_a (positive = discharge), voltage_v,"
+                " temperature_c [s, A, V, °C]",
             )
-        elif name in REQUIRED[:3] and name not in names:
-            problem = f"this column is missing (found: {shown_headings(headings)})"
-            cure = "a log needs time_s, current_a (positive = discharge), voltage_v,"
-            cure += " temperature_c [s, A, V, °C]"
-        else:
-            continue
+
+
+def refuse_doubled(name: str, names: Sequence[str], source: str | None) -> None:
+    """Raise InputError if several columns have a name."""
+    if (count := list(names).count(name)) > 1:
+        problem, cure = f"{count} columns have this name", "rename or drop all but one"
         raise InputError(problem, source=source, field=name, cure=cure)
 
 
@@ -254,24 +251,23 @@ def _given_column(
     meanings: Sequence[Meaning | None],
     where: str,
 ) -> ChosenColumn:
-    for reading in _readings(text):
-        places = _places(reading.heading, headings, is_joined=quantity in _JOINED)
+    for heading, stated, factor in _readings(text):
+        places = _places(heading, headings, is_joined=quantity in _JOINED)
         if not places:
             continue
         units = sorted({_stated_unit(headings[k], meanings[k], quantity) for k in places})
         is_mixed = len({unit_of("temperature_c", unit or "C") for unit in units}) > 1
-        if quantity == "temperature" and reading.unit is None and is_mixed:
+        if quantity == "temperature" and stated is None and is_mixed:
             raise InputError(
                 f"the headings have different units: {', '.join(unit or 'none' for unit in units)}",
                 field=f"{where} {quantity}",
                 value=text,
                 cure="name columns of one unit",
             )
-        unit = reading.unit if reading.unit is not None else units[0] if len(units) == 1 else ""
-        first = meanings[places[0]]
-        source = first.source if first is not None and quantity == "temperature" else "unknown"
-        is_stated = reading.unit is not None or reading.factor != 1.0
-        return ChosenColumn(places, unit, reading.factor, source, is_stated)
+        unit = stated if stated is not None else units[0] if len(units) == 1 else ""
+        first = meanings[places[0]] if quantity == "temperature" else None
+        source = first.source if first is not None else "unknown"
+        return ChosenColumn(places, unit, factor, source, stated is not None or factor != 1.0)
     near = closest(text, headings)
     raise InputError(
         f"no column has this heading (found: {shown_headings(headings)})",

@@ -16,8 +16,6 @@ from cangauge.logs.headings import cell_number
 from cangauge.logs.log import Log
 from cangauge.logs.sign import resolve_sign
 from cangauge.logs.units import (
-    COLDEST_C,
-    HOTTEST_C,
     REQUIRED,
     TemperatureSource,
     known_temperature_source,
@@ -100,14 +98,12 @@ class DraftLog:
         if len(probes_c) == 1:
             return
         values = np.vstack(probes_c)
-        is_known = np.isfinite(values)
-        rows = is_known.any(axis=0)
-        median = np.full(rows.size, np.nan)
-        median[rows] = np.nanmedian(values[:, rows], axis=0)
+        values[np.isinf(values)] = np.nan
+        known = np.isfinite(values).any(axis=0)
+        median = np.full(known.size, np.nan)
+        median[known] = np.nanmedian(values[:, known], axis=0)
         self.values["temperature_c"] = median
-        highest = np.max(np.where(is_known, values, -np.inf), axis=0)
-        lowest = np.min(np.where(is_known, values, np.inf), axis=0)
-        apart = highest - lowest > _PROBES_APART_K
+        apart = np.fmax.reduce(values) - np.fmin.reduce(values) > _PROBES_APART_K
         if apart.any():
             row = int(np.argmax(apart))
             shown = " and ".join(f"{value:.4g}" for value in values[:, row])
@@ -121,23 +117,25 @@ class DraftLog:
         temperature_c: float | None = None,
         temperature_source: TemperatureSource | None = None,
         sign: Sign | None = None,
-        used: Sequence[str] = (),
     ) -> Log:
         """Check all values and return the log, with its sign of current found or confirmed.
 
         Rows that lack a value or repeat the time stamp of the row before are dropped, with a
-        remark. The first three arguments are the user's, as of `cangauge.read_log`; `used` are
-        columns that the caller reads besides.
+        remark. Arguments and errors as of `cangauge.read_log`.
         """
-        _refuse_options(temperature_c, temperature_source, sign)
         if sign is not None:
+            if sign not in {"charge", "discharge"}:
+                cure = "say what a positive current does: charge or discharge"
+                raise InputError("not a sign", field="--sign", value=sign, cure=cure)
             if (sign == "charge") is not self.negated:
                 self.negate_current(f"positive {sign}s in the file, as stated")
             self.sign_unknown = False
         if not self.values["time_s"].size:
             raise InputError("the log holds no rows", source=self._where, cure="check the export")
-        self._remark_ignored(used)
+        self._remark_ignored()
         self._set_temperature(temperature_c)
+        if temperature_source is not None:
+            self.temperature_source = known_temperature_source(temperature_source)
         if "soc_pct" in self.values:
             self.values["soc_pct"][np.isinf(self.values["soc_pct"])] = np.nan
         self._drop_incomplete()
@@ -155,18 +153,17 @@ class DraftLog:
             **self.values,
             name=self.name,
             source=self.source,
-            temperature_source=temperature_source or self.temperature_source,
+            temperature_source=self.temperature_source,
             remarks=tuple(self.remarks),
             assumed=tuple(self.assumed),
         )
         return resolve_sign(log, stored_sign_unknown=self.sign_unknown, is_stated=sign is not None)
 
-    def _remark_ignored(self, used: Sequence[str]) -> None:
-        ignored = [name for name in self.ignored if name not in used]
-        cells = [name for name in ignored if cell_number(name) is not None]
+    def _remark_ignored(self) -> None:
+        cells = [name for name in self.ignored if cell_number(name) is not None]
         if len(cells) > 1:  # `LogFile.cells`
             self.remarks.append(f"{len(cells)} cells: {cells[0]} … {cells[-1]}")
-            ignored = [name for name in ignored if name not in cells]
+        ignored = [name for name in self.ignored if len(cells) < 2 or name not in cells]
         if ignored:
             shown = ", ".join(ignored[:6]) + (", …" if len(ignored) > 6 else "")
             self.remarks.append(f"{counted(len(ignored), 'other column')} ignored: {shown}")
@@ -174,9 +171,12 @@ class DraftLog:
     def _set_temperature(self, given_c: float | None) -> None:
         kind = "file" if self.source else "table"
         if given_c is not None:
+            require_number(given_c, "--temperature")
             replaced = f" in place of the {kind}'s" if "temperature_c" in self.values else ""
             self.remarks.append(f"temperature {given_c:g} °C as given{replaced}")
             self.values["temperature_c"] = np.full(self.values["time_s"].size, float(given_c))
+            self.labels["temperature_c"] = "--temperature"
+            self.stated.add("temperature_c")
             self.temperature_source = "unknown"
         elif "temperature_c" not in self.values:
             found = f" (found: {shown_headings(self.headings)})" if self.headings else ""
@@ -235,18 +235,3 @@ class DraftLog:
     def _error(self, name: str, problem: str, cure: str, value: float | None = None) -> InputError:
         label = self.labels.get(name, name)
         return InputError(problem, source=self._where, field=label, value=value, cure=cure)
-
-
-def _refuse_options(
-    temperature_c: float | None, temperature_source: str | None, sign: str | None
-) -> None:
-    if temperature_source is not None:
-        known_temperature_source(temperature_source)
-    if temperature_c is not None:
-        require_number(temperature_c, "--temperature")
-        if not COLDEST_C <= temperature_c <= HOTTEST_C:
-            problem = f"must lie within {COLDEST_C:g} … {HOTTEST_C:g} °C"
-            raise InputError(problem, field="--temperature", value=temperature_c)
-    if sign not in {None, "charge", "discharge"}:
-        cure = "say what a positive current does: charge or discharge"
-        raise InputError("not a sign", field="--sign", value=sign, cure=cure)

@@ -144,7 +144,9 @@ class LogFile:
     ) -> Log:
         """Read the log; see `read_log`."""
         try:
-            log = self._draft().log(temperature_c, temperature_source, self.sign, self.used)
+            draft = self._draft()
+            draft.ignored = tuple(name for name in draft.ignored if name not in self.used)
+            log = draft.log(temperature_c, temperature_source, self.sign)
         except MemoryError as error:
             raise InputError(
                 "larger than the free memory", source=self.head.path, cure="split it"

@@ -24,6 +24,7 @@ from cangauge.logs.column_map import (
     ChosenColumn,
     ColumnMap,
     choose_columns,
+    refuse_doubled,
     refuse_odd_names,
     unknown_columns,
 )
@@ -79,14 +80,7 @@ class ArrowTable:
         """Return columns by place; raise InputError if another column has one of their names."""
         names = [self.headings[place] for place in places]
         for name in names:
-            count = list(self.headings).count(name)
-            if count > 1:
-                raise InputError(
-                    f"{count} columns have this name",
-                    source=self.source,
-                    field=name,
-                    cure="rename or drop all but one",
-                )
+            refuse_doubled(name, self.headings, self.source)
         table = self.read(names)
         return {place: table.column(name) for place, name in zip(places, names, strict=True)}
 
