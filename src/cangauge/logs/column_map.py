@@ -78,6 +78,11 @@ class ColumnMap:
             texts[quantity] = text.strip()
         return cls(texts, where)
 
+    def error(self, quantity: str, problem: str, cure: str) -> InputError:
+        """Return the error for the column of a quantity."""
+        field, text = f"{self.where} {quantity}", self.texts[quantity]
+        return InputError(problem, field=field, value=text, cure=cure)
+
 
 def _readings(text: str) -> list[tuple[str, str | None, float]]:
     """Return (heading, unit, factor) as a text may be meant: the whole, less a factor, a unit."""
@@ -139,24 +144,19 @@ def choose_columns(
     meanings = [meaning_of(text, unit) for text, unit in zip(headings, units, strict=False)]
     choice = Choice(is_canonical=is_canonical)
     given = given or ColumnMap()
-    owner: dict[int, str] = {}
-    for quantity, text in given.texts.items():
-        column = _given_column(quantity, text, headings, meanings, given.where)
-        for place in column.places:
-            if place in owner:
-                raise InputError(
-                    f"is the column of {owner[place]} too",
-                    field=f"{given.where} {quantity}",
-                    value=text,
-                    cure="give each quantity a column of its own, as headings or as #1, #2, …",
-                )
-        owner |= dict.fromkeys(column.places, quantity)
+    for quantity in given.texts:
+        column = _given_column(quantity, given, headings, meanings)
+        for other, chosen in choice.chosen.items():
+            if not set(column.places).isdisjoint(chosen.places):
+                cure = "give each quantity a column of its own, as headings or as #1, #2, …"
+                raise given.error(quantity, f"is the column of {other} too", cure)
         choice.chosen[quantity] = column
+    taken = {place for column in choice.chosen.values() for place in column.places}
     for quantity in [name for name in FIELDS if name not in given.texts]:
         plain = [
             (place, meaning)
             for place, meaning in enumerate(meanings)
-            if meaning is not None and meaning.quantity == quantity and place not in owner
+            if meaning is not None and meaning.quantity == quantity and place not in taken
         ]
         if choice.is_canonical:
             plain = [item for item in plain if _simple(headings[item[0]]) == FIELDS[quantity]][:1]
@@ -189,13 +189,10 @@ def refuse_odd_names(headings: Sequence[str], source: str) -> None:
     for name in _CANONICAL:
         refuse_doubled(name, names, source)
         if name in REQUIRED[:3] and name not in names:
-            raise InputError(
-                f"this column is missing (found: {shown_headings(headings)})",
-                source=source,
-                field=name,
-                cure="a log needs time_s, current_a (positive = discharge), voltage_v,"
-                " temperature_c [s, A, V, °C]",
-            )
+            problem = f"this column is missing (found: {shown_headings(headings)})"
+            cure = "a log needs time_s, current_a (positive = discharge), voltage_v,"
+            cure += " temperature_c [s, A, V, °C]"
+            raise InputError(problem, source=source, field=name, cure=cure)
 
 
 def refuse_doubled(name: str, names: Sequence[str], source: str | None) -> None:
@@ -245,36 +242,25 @@ def _choose(quantity: str, plain: list[tuple[int, Meaning]], choice: Choice) -> 
 
 
 def _given_column(
-    quantity: str,
-    text: str,
-    headings: Sequence[str],
-    meanings: Sequence[Meaning | None],
-    where: str,
+    quantity: str, given: ColumnMap, headings: Sequence[str], meanings: Sequence[Meaning | None]
 ) -> ChosenColumn:
-    for heading, stated, factor in _readings(text):
+    for heading, stated, factor in _readings(given.texts[quantity]):
         places = _places(heading, headings, is_joined=quantity in _JOINED)
         if not places:
             continue
         units = sorted({_stated_unit(headings[k], meanings[k], quantity) for k in places})
         is_mixed = len({unit_of("temperature_c", unit or "C") for unit in units}) > 1
         if quantity == "temperature" and stated is None and is_mixed:
-            raise InputError(
-                f"the headings have different units: {', '.join(unit or 'none' for unit in units)}",
-                field=f"{where} {quantity}",
-                value=text,
-                cure="name columns of one unit",
-            )
+            shown = ", ".join(unit or "none" for unit in units)
+            problem = f"the headings have different units: {shown}"
+            raise given.error(quantity, problem, "name columns of one unit")
         unit = stated if stated is not None else units[0] if len(units) == 1 else ""
         first = meanings[places[0]] if quantity == "temperature" else None
         source = first.source if first is not None else "unknown"
         return ChosenColumn(places, unit, factor, source, stated is not None or factor != 1.0)
-    near = closest(text, headings)
-    raise InputError(
-        f"no column has this heading (found: {shown_headings(headings)})",
-        field=f"{where} {quantity}",
-        value=text,
-        cure=f"did you mean {near}?" if near else _SYNTAX,
-    )
+    near = closest(given.texts[quantity], headings)
+    problem = f"no column has this heading (found: {shown_headings(headings)})"
+    raise given.error(quantity, problem, f"did you mean {near}?" if near else _SYNTAX)
 
 
 def _stated_unit(heading: str, meaning: Meaning | None, quantity: str) -> str:

@@ -131,7 +131,7 @@ class DraftLog:
                 self.negate_current(f"positive {sign}s in the file, as stated")
             self.sign_unknown = False
         if not self.values["time_s"].size:
-            raise InputError("the log holds no rows", source=self._where, cure="check the export")
+            raise InputError("the log holds no rows", source=self.where, cure="check the export")
         self._remark_ignored()
         self._set_temperature(temperature_c)
         if temperature_source is not None:
@@ -144,7 +144,7 @@ class DraftLog:
             values.flags.writeable = False  # the log need not copy them
         self.remarks += refuse_wrong_units(
             self.values,
-            source=self._where,
+            source=self.where,
             labels=self.labels,
             in_seconds=self.in_seconds,
             stated=self.stated,
@@ -183,20 +183,20 @@ class DraftLog:
             named = "name its column with --columns temperature=…" if found else "add this column"
             option = "--temperature" if self.source else "temperature_c"
             cure = f"{named} [°C], or give a constant with {option}"
-            raise self._error("temperature_c", f"the {kind} holds no temperature{found}", cure)
+            raise self.error("temperature_c", f"the {kind} holds no temperature{found}", cure)
 
     def _drop_incomplete(self) -> None:
         lacks = {name: ~np.isfinite(self.values[name]) for name in REQUIRED}
         incomplete = np.any([*lacks.values()], axis=0)
         for name, rows in lacks.items():
             if rows.all():
-                raise self._error(name, "the column is empty", "check the export")
+                raise self.error(name, "the column is empty", "check the export")
         count, row = int(incomplete.sum()), int(np.argmax(incomplete))
         lacking = "time, current, voltage or temperature"
         if count > MAX_INCOMPLETE * incomplete.size:
             name = next(name for name, rows in lacks.items() if rows[row])
             problem = f"{count} of {incomplete.size} rows lack {lacking}"
-            raise self._error(name, problem, f"check the export: the first is row {row + 1}")
+            raise self.error(name, problem, f"check the export: the first is row {row + 1}")
         self.keep(~incomplete, f"without {lacking} dropped (the first is row {row + 1})")
 
     def _drop_repeated(self) -> None:
@@ -206,7 +206,7 @@ class DraftLog:
         if back.size:
             row = int(back[0])
             is_reversed = 2 * back.size > step.size
-            raise self._error(
+            raise self.error(
                 "time_s",
                 f"time runs backwards at row {row + 1} ({back.size} such rows;"
                 f" the row before has {time[row - 1]:.6f} s)",
@@ -223,15 +223,17 @@ class DraftLog:
         if count > MAX_INCOMPLETE * time.size and apart_s > _COARSE_S:  # stamps of whole minutes
             problem = f"{count} of {time.size} rows have the time stamp of the row before"
             cure = f"export fractions of a second, or one row per time: the first is row {row + 1}"
-            raise self._error("time_s", problem, cure)
+            raise self.error("time_s", problem, cure)
         self.keep(
             ~repeats, f"with the time stamp of the row before dropped (the first is row {row + 1})"
         )
 
     @property
-    def _where(self) -> str:
+    def where(self) -> str:
+        """The file, or the name of a table in memory, for messages."""
         return self.source or self.name
 
-    def _error(self, name: str, problem: str, cure: str, value: float | None = None) -> InputError:
+    def error(self, name: str, problem: str, cure: str, value: object = None) -> InputError:
+        """Return the error for a column, by its canonical name or, of others, its heading."""
         label = self.labels.get(name, name)
-        return InputError(problem, source=self._where, field=label, value=value, cure=cure)
+        return InputError(problem, source=self.where, field=label, value=value, cure=cure)

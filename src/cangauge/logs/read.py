@@ -44,7 +44,6 @@ GROUP: Final = "cangauge.readers"
 class LogReader(Protocol):
     """Reader of one format of logs."""
 
-    name: str
     takes_columns: bool
     """Whether the user may name the columns of this format."""
 
@@ -58,7 +57,6 @@ class LogReader(Protocol):
 class AnyTable:
     """A text with canonical or plain headings, or the user's columns of it."""
 
-    name = "table"
     takes_columns = True
 
     def matches(self, head: Head) -> bool:
@@ -76,7 +74,6 @@ class AnyTable:
 class _Parquet:
     """Parquet, canonical or with any plain headings or the user's columns."""
 
-    name = "Parquet"
     takes_columns = True
 
     def matches(self, head: Head) -> bool:

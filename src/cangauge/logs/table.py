@@ -151,7 +151,7 @@ def _only_word(column: Any, where: str) -> str:
 
 def _take(draft: DraftLog, quantity: str, column: ChosenColumn, cells: dict[int, Any]) -> str:
     """Take a quantity in its canonical unit; return the unit that was read or assumed."""
-    name, where, unit = FIELDS[quantity], draft.source or draft.name, column.unit
+    name, where, unit = FIELDS[quantity], draft.where, column.unit
     headings = [draft.headings[place] for place in column.places]
     read = [
         numbers_of(cells[place], where, heading)
@@ -159,13 +159,9 @@ def _take(draft: DraftLog, quantity: str, column: ChosenColumn, cells: dict[int,
     ]
     for in_cells in sorted({unit for _, unit in read if unit}):
         if unit and unit_of(name, in_cells) != unit_of(name, unit):
-            raise InputError(
-                "the cells have another unit than the heading",
-                source=where,
-                field=draft.labels[name],
-                value=f"{in_cells}, heading {unit}",
-                cure=f"state the right one: --columns '{quantity}=HEADING[UNIT]'",
-            )
+            problem = "the cells have another unit than the heading"
+            cure = f"state the right one: --columns '{quantity}=HEADING[UNIT]'"
+            raise draft.error(name, problem, cure, f"{in_cells}, heading {unit}")
         unit = unit or in_cells
     parts = [numbers * column.factor for numbers, _ in read]
     shown = unit or f"{CANONICAL_UNIT[quantity]}, assumed"
@@ -188,12 +184,9 @@ def _take(draft: DraftLog, quantity: str, column: ChosenColumn, cells: dict[int,
 def _discharge_less_charge(draft: DraftLog, parts: Sequence[FloatArray]) -> FloatArray:
     """Return the difference of two currents of one direction each, whatever their signs."""
     if any(np.any(part < 0.0) and np.any(part > 0.0) for part in parts):
-        raise InputError(
-            "these are no currents of one direction each: one has both signs",
-            source=draft.source or draft.name,
-            field=draft.labels["current_a"],
-            cure="name the one that holds both directions: --columns 'current=?'",
-        )
+        problem = "these are no currents of one direction each: one has both signs"
+        cure = "name the one that holds both directions: --columns 'current=?'"
+        raise draft.error("current_a", problem, cure)
     return np.abs(parts[0]) - np.abs(parts[1])
 
 
@@ -223,13 +216,11 @@ def _sign_by_state(draft: DraftLog, table: TextTable | ArrowTable) -> None:
         unclear = (current > 0.0) & (charges == discharges)
         if unclear.any():
             row = int(np.argmax(unclear))
-            raise InputError(
-                f"row {row + 1} does not say whether the unsigned current charges or discharges",
-                source=draft.source or draft.name,
-                field=headings[place],
-                value=cells[row].as_py(),
-                cure="write it as charge or discharge, or give the current a sign",
+            problem = (
+                f"row {row + 1} does not say whether the unsigned current charges or discharges"
             )
+            cure = "write it as charge or discharge, or give the current a sign"
+            raise draft.error(headings[place], problem, cure, cells[row].as_py())
         draft.values["current_a"] = np.where(charges, -current, current)
         draft.sign_unknown = False
         draft.assumed.append(f'current charges where "{headings[place]}" says so')

@@ -149,12 +149,6 @@ def _values_in(cells: Sequence[str]) -> int:
     return sum(map(_is_value, cells))
 
 
-def table_below(head: Head, header: str) -> TextTable:
-    """Return the table below a known line, with the first delimiter of tab, `;` and `,` in it."""
-    mark = next((mark for mark in _DELIMITERS[:3] if mark in header), ",")
-    return TextTable(head, mark, split_cells(header, mark), (), head.lines.index(header) + 1, [])
-
-
 def find_table(head: Head, given: ColumnMap | None = None) -> TextTable | None:
     """Return the table of a text in which time, current and voltage are known, or None."""
     texts = given.texts.values() if given else ()

@@ -66,11 +66,6 @@ _UNITS: Final = {
     field: {name: unit for unit, names in units.items() for name in names.split("|")}
     for field, units in _SPELLINGS.items()
 }
-_NAMES: Final = {
-    "ms": "milliseconds", "us": "microseconds", "ns": "nanoseconds", "min": "minutes",
-    "h": "hours", "d": "days", "mA": "milliamperes", "uA": "microamperes", "mV": "millivolts",
-    "uV": "microvolts",
-}  # fmt: skip
 _SCALED: Final = re.compile(r"(?P<scale>0?[.,]\d+|1|10+(?=\s*[mµμu]))\s*(?P<unit>\D+)$")
 """A unit of a bit: 0.1V, 10mV; 500A is the range of a sensor."""
 _FOREIGN: Final = (
@@ -101,8 +96,6 @@ _EXCEL_1990: Final = 32_874.0
 """1990-01-01 as a spreadsheet's date [d since 1899-12-30]; as hours, nearly four years."""
 _RARE: Final = 1e-3
 """Fraction of impossible currents up to which they are codes, not another unit [-]."""
-
-_BY_1000: Final = "divide it by 1000"
 
 _Wrong = tuple[float, str, str, list[str]]
 """A value that contradicts its unit, the problem, the cure, and units that the user may state."""
@@ -204,12 +197,10 @@ def refuse_wrong_units(
             raise InputError(
                 problem, source=str(source), field=label, value=float(value), cure=cure + also
             )
-    typical_c = float(np.median(temperature))
     option = _option("temperature_c", labels.get("temperature_c", "temperature_c"), ["°F"])
-    remark = (
-        f"temperature {typical_c:.0f} °C is unusually hot: if it is °F, state the unit: {option}"
-    )
-    return (remark,) if typical_c > _UNUSUALLY_HOT_C else ()
+    typical, doubt = float(np.median(temperature)), f"if it is °F, state the unit: {option}"
+    remark = f"temperature {typical:.0f} °C is unusually hot: {doubt}"
+    return (remark,) if typical > _UNUSUALLY_HOT_C else ()
 
 
 def _option(field: str, label: str, units: list[str]) -> str:
@@ -230,16 +221,17 @@ def _odd_row(values: FloatArray, wrong: BoolArray, kind: str) -> Iterator[_Wrong
 
 
 def _in_finer_unit(value: float, limit: float, unit: str, what: str) -> _Wrong:
-    """Return what is wrong with a value above the limit of its unit: it is in milli or micro."""
+    """Return what is wrong with a value above the limit [V or A]: it is in milli or micro."""
     is_milli = abs(value) <= 1e3 * limit
-    finer, cure = (f"m{unit}", _BY_1000) if is_milli else (f"u{unit}", "divide it by 1,000,000")
-    return value, f"{what} looks like {_NAMES[finer]}", cure, [finer]
+    prefix, divisor = ("milli", "1000") if is_milli else ("micro", "1,000,000")
+    symbol = f"{'m' if is_milli else 'u'}{unit[0].upper()}"
+    return value, f"{what} looks like {prefix}{unit}", f"divide it by {divisor}", [symbol]
 
 
 def _wrong_time(values: dict[str, FloatArray], *, in_seconds: bool | None) -> Iterator[_Wrong]:
     time = values["time_s"]
     if time[0] > _MAX_STAMP_S:
-        yield time[0], "time looks like milliseconds since 1970", _BY_1000, ["ms"]
+        yield time[0], "time looks like milliseconds since 1970", "divide it by 1000", ["ms"]
     yield from _odd_row(time, np.abs(time) > _MAX_STAMP_S, "a time in seconds")
     step = np.diff(time) if time.size > 1 else np.ones(1)
     interval, days = float(np.median(step)), step.sum() / 86400.0
@@ -247,11 +239,11 @@ def _wrong_time(values: dict[str, FloatArray], *, in_seconds: bool | None) -> It
     finer = _fitting(interval, ("ms", "us", "ns"))
     coarser = ["d"] if time[0] > _EXCEL_1990 else _fitting(interval, ("min", "h", "d"))
     if interval > _MAX_INTERVAL_S:
-        cure = _BY_1000 if finer == ["ms"] else "convert it to seconds"
-        cure += " (a log with a row every 90 s or more cannot be used)"
-        yield interval, f"{apart}: time looks like {_names(finer)}", cure, finer
+        problem = f"{apart}: time looks like {' or '.join(finer) or 'another unit'}"
+        cure = "convert it to seconds (a log with a row every 90 s or more cannot be used)"
+        yield interval, problem, cure, finer
     if not in_seconds and 0.0 < interval < 1.0 / _MAX_RATE_HZ:
-        problem = f"{apart}: time looks like {_names(coarser)}"
+        problem = f"{apart}: time looks like {' or '.join(coarser) or 'another unit'}"
         yield interval, problem, "convert it to seconds", coarser
     if in_seconds is None and (others := _other_units(values, finer, coarser)):
         problem = f"{apart}, in seconds or another unit"
@@ -260,10 +252,6 @@ def _wrong_time(values: dict[str, FloatArray], *, in_seconds: bool | None) -> It
         row = int(np.argmax(step)) + 1
         problem = f"the log lasts {days:.0f} days; its longest step ends at row {row + 1}"
         yield time[row], problem, "if the clock was set there, split the log there", []
-
-
-def _names(units: list[str]) -> str:
-    return " or ".join(_NAMES[unit] for unit in units) or "another unit"
 
 
 def _fitting(interval: float, units: Sequence[str]) -> list[str]:
@@ -307,7 +295,7 @@ def _c_rate(values: dict[str, FloatArray]) -> float:
 def _wrong_voltage(voltage: FloatArray) -> Iterator[_Wrong]:
     typical = float(np.median(voltage))
     if typical > _MAX_VOLTAGE_V:
-        yield _in_finer_unit(typical, _MAX_VOLTAGE_V, "V", "voltage")
+        yield _in_finer_unit(typical, _MAX_VOLTAGE_V, "volts", "voltage")
     if typical <= 0.0:
         yield typical, "the median voltage is not positive", "check column and polarity", []
     if typical < 1.0:
@@ -323,7 +311,7 @@ def _wrong_current(current: FloatArray) -> Iterator[_Wrong]:
         yield from _odd_row(current, large, "a battery's current")
     if large.any():
         what = f"current exceeds {_MAX_CURRENT_A:g} A in row {peak + 1}: it"
-        yield _in_finer_unit(float(current[peak]), _MAX_CURRENT_A, "A", what)
+        yield _in_finer_unit(float(current[peak]), _MAX_CURRENT_A, "amperes", what)
 
 
 def _is_code(number: int) -> bool:
