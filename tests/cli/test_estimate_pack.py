@@ -14,6 +14,7 @@ import pyarrow.parquet
 import pytest
 
 from cangauge._resources import shared_file
+from cangauge.bus.recording import read_log
 from cangauge.bus.vehicle import Vehicle
 from cangauge.errors import InputError
 from cangauge.estimation.estimator import Estimator
@@ -21,7 +22,7 @@ from cangauge.estimation.offline import samples_of
 from cangauge.estimation.settings import EstimatorSettings
 from cangauge.logs.canonical import write_log
 from cangauge.logs.log import Log
-from cangauge.logs.read import open_log, read_log
+from cangauge.logs.read import open_log
 from cangauge.model.model_file import Model
 from cangauge.replay.encoder import FrameEncoder
 from cangauge.service.pipeline import Pipeline

@@ -10,9 +10,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from cangauge.bus.recording import read_log
 from cangauge.errors import CangaugeError
 from cangauge.logs.canonical import write_log
-from cangauge.logs.read import read_log
 from cangauge.model.model_file import Model
 from cangauge.model.published import CAPACITY_AH
 from synthetic import synthetic_log

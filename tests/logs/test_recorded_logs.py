@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from cangauge.bus.recording import read_log
 from cangauge.errors import InputError
 from cangauge.logs.gaps import discharged_ah
-from cangauge.logs.read import read_log
 from cangauge.logs.sign import sign_of_current
 from selection import nightly_except
 

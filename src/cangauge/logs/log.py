@@ -221,9 +221,9 @@ def as_log(log: Any) -> Log:
     if isinstance(log, Log):
         return log
     if isinstance(log, str | PathLike):
-        from cangauge.logs.read import read_log  # noqa: PLC0415 - pyarrow, as above
+        from cangauge.logs.read import open_log  # noqa: PLC0415 - pyarrow, as above
 
-        return read_log(log)
+        return open_log(log).read()
     return Log.from_dataframe(log)
 
 

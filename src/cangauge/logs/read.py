@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from functools import cache
 from importlib import import_module
 from importlib.metadata import entry_points
-from itertools import pairwise
 from os import PathLike
 from typing import Any, Final, Protocol
 
@@ -35,6 +34,7 @@ _FORMATS: Final = tuple(
     f"cangauge.extras.formats.{module}" for module in ("exports", "tables", "measurement")
 )
 """Modules with further readers, each in its tuple `READERS`; loaded when a log is opened."""
+_PARQUET: Final = b"PAR1"
 _FRAME_WORDS: Final = frozenset({"id", "can id", "identifier", "dlc", "len", "data", "d1"})
 """Headings of CAN frames: an id, a length or bytes."""
 GROUP: Final = "cangauge.readers"
@@ -54,33 +54,21 @@ class LogReader(Protocol):
         """Read the file; raise InputError where it is damaged or lacks something."""
 
 
-class AnyTable:
-    """A text with canonical or plain headings, or the user's columns of it."""
+class LogTableReader:
+    """Parquet or text with canonical or plain headings, or the user's columns of it."""
 
     takes_columns = True
 
     def matches(self, head: Head) -> bool:
-        """Return whether a text has a table with time, current and voltage."""
-        return find_table(head) is not None
+        """Return whether the file is Parquet, or a text with time, current and voltage."""
+        return head.data.startswith(_PARQUET) or find_table(head) is not None
 
     def read(self, head: Head, columns: ColumnMap | None = None) -> DraftLog:
         """Read the table; see `LogReader`."""
-        table = find_table(head, columns)
+        is_parquet = head.data.startswith(_PARQUET)
+        table = parquet_table(head) if is_parquet else find_table(head, columns)
         if table is None:
             raise unknown_columns(str(head.path), *likely_header(head, columns))
-        return draft_of_table(table, columns, name=head.name, source=str(head.path))
-
-
-class _Parquet:
-    """Parquet, canonical or with any plain headings or the user's columns."""
-
-    takes_columns = True
-
-    def matches(self, head: Head) -> bool:
-        return head.data.startswith(b"PAR1")
-
-    def read(self, head: Head, columns: ColumnMap | None = None) -> DraftLog:
-        table = parquet_table(head)
         return draft_of_table(table, columns, name=head.name, source=str(head.path))
 
 
@@ -89,7 +77,7 @@ def _readers() -> tuple[LogReader, ...]:
     """Return all readers, in the order in which a file is offered to them."""
     others = [entry.load()() for entry in entry_points(group=GROUP)]
     formats = [reader for name in _FORMATS for reader in import_module(name).READERS]
-    return (*others, *formats, _Parquet(), AnyTable())
+    return (*others, *formats, LogTableReader())
 
 
 @dataclass(frozen=True, eq=False)
@@ -130,7 +118,7 @@ class LogFile:
     @property
     def is_any_table(self) -> bool:
         """Whether the file is a text of plain headings, not of a format that defines them."""
-        table = find_table(self.head) if isinstance(self.reader, AnyTable) else None
+        table = find_table(self.head) if isinstance(self.reader, LogTableReader) else None
         return table is not None and not choose_columns(table.headings).is_canonical
 
     def read(
@@ -139,7 +127,7 @@ class LogFile:
         temperature_c: float | None = None,
         temperature_source: TemperatureSource | None = None,
     ) -> Log:
-        """Read the log; see `read_log`."""
+        """Read the log; arguments and errors as of `cangauge.read_log`."""
         try:
             draft = self._draft()
             draft.ignored = tuple(name for name in draft.ignored if name not in self.used)
@@ -212,7 +200,9 @@ def open_log(
     columns: ColumnMap | Mapping[str, str] | str | None = None,
     sign: Sign | None = None,
 ) -> LogFile:
-    """Read the beginning of a file and find its format; parameters as of `read_log`.
+    """Read the beginning of a file and find its format.
+
+    Arguments as of `cangauge.read_log`.
 
     Raises
     ------
@@ -224,23 +214,7 @@ def open_log(
         if (given is None or reader.takes_columns) and reader.matches(head):
             return LogFile(head, reader, given, sign)
     # The user's columns make a table of any text.
-    return LogFile(head, None if given is None else AnyTable(), given, sign)
-
-
-def read_log(
-    path: str | PathLike[str],
-    *,
-    temperature_c: float | None = None,
-    temperature_source: TemperatureSource | None = None,
-    columns: ColumnMap | Mapping[str, str] | str | None = None,
-    sign: Sign | None = None,
-) -> Log:
-    """Read a log of any known format, plain, packed by gzip or bzip2, or in a zip.
-
-    Arguments and errors as of `cangauge.read_log`, which also reads captures.
-    """
-    file = open_log(path, columns=columns, sign=sign)
-    return file.read(temperature_c=temperature_c, temperature_source=temperature_source)
+    return LogFile(head, None if given is None else LogTableReader(), given, sign)
 
 
 def draft_of_dataframe(
@@ -270,13 +244,12 @@ def _cells(headings: Sequence[str], source: str) -> dict[int, tuple[int, float]]
     """Return the column and scale of each cell by its number, in order."""
     cells: dict[int, tuple[int, float]] = {}
     for place, heading in enumerate(headings):
-        cell = cell_number(heading)
-        if cell is not None:
+        if (cell := cell_number(heading)) is not None:
             number, scale = cell
             cells.setdefault(number, (place, scale))
-    numbers = sorted(cells)
-    for number, following in pairwise(numbers):
-        if following > number + 1:
-            problem, field = "the cells must be numbered without gaps", f"cell_{number + 1}_v"
+    first = min(cells, default=0)
+    for number in range(first, first + len(cells)):
+        if number not in cells:
+            problem, field = "the cells must be numbered without gaps", f"cell_{number}_v"
             raise InputError(problem, source=source, field=field, cure="export all cells")
-    return {number: cells[number] for number in numbers}
+    return dict(sorted(cells.items()))

@@ -13,7 +13,7 @@ from cangauge._files import Head
 from cangauge.errors import InputError
 from cangauge.logs.column_map import ColumnMap, choose_columns, unknown_columns
 from cangauge.logs.draft import DraftLog
-from cangauge.logs.read import AnyTable
+from cangauge.logs.read import LogTableReader
 from cangauge.logs.stamps import seconds_of_text
 from cangauge.logs.table import ArrowTable, draft_of_table, held
 from cangauge.logs.text import MAX_ROWS, TextTable, split_cells
@@ -42,7 +42,7 @@ class Workbook:
             If openpyxl is not installed, or the workbook is damaged or holds no log.
         """
         sheet = _SheetText(head)
-        draft = AnyTable().read(sheet, columns)
+        draft = LogTableReader().read(sheet, columns)
         draft.remarks.extend(sheet.remarks)
         return draft
 
