@@ -98,10 +98,9 @@ class ChosenColumn:
     """Columns of a table that hold one quantity.
 
     Several places are a date and its time, temperatures whose median is taken, or the currents of
-    discharge and charge, whose difference is taken. The unit is the
-    user's, the heading's or that of the row of units. `others` are further columns of time: dates
-    beside a clock, or times in case that the first does not increase. `is_stated`: with the
-    user's unit or factor.
+    discharge and charge, whose difference is taken. The unit is the user's, the heading's or that
+    of the row of units. `others` are further columns of time: dates beside a clock, or times in
+    case that the first does not increase. `is_stated`: with the user's unit or factor.
     """
 
     places: tuple[int, ...]

@@ -205,16 +205,11 @@ class DraftLog:
         back = np.flatnonzero(step < 0.0)
         if back.size:
             row = int(back[0])
-            is_reversed = 2 * back.size > step.size
-            raise self.error(
-                "time_s",
-                f"time runs backwards at row {row + 1} ({back.size} such rows;"
-                f" the row before has {time[row - 1]:.6f} s)",
-                "sort the rows by time"
-                if is_reversed
-                else "split the file there into one log each: the clock was set back or restarted",
-                float(time[row]),
-            )
+            before = f"the row before has {time[row - 1]:.6f} s"
+            problem = f"time runs backwards at row {row + 1} ({back.size} such rows; {before})"
+            cure = "split the file there into one log each: the clock was set back or restarted"
+            cure = "sort the rows by time" if 2 * back.size > step.size else cure
+            raise self.error("time_s", problem, cure, float(time[row]))
         repeats = step == 0.0
         row = int(np.argmax(repeats))
         differs = np.any([np.diff(v, prepend=v[0]) != 0.0 for v in self.values.values()], axis=0)
@@ -224,9 +219,8 @@ class DraftLog:
             problem = f"{count} of {time.size} rows have the time stamp of the row before"
             cure = f"export fractions of a second, or one row per time: the first is row {row + 1}"
             raise self.error("time_s", problem, cure)
-        self.keep(
-            ~repeats, f"with the time stamp of the row before dropped (the first is row {row + 1})"
-        )
+        remark = f"with the time stamp of the row before dropped (the first is row {row + 1})"
+        self.keep(~repeats, remark)
 
     @property
     def where(self) -> str:

@@ -84,10 +84,8 @@ class Log(ArrowExport):
 
     def __post_init__(self) -> None:
         where = self.source or self.name
-        for channel in (*REQUIRED, "soc_pct"):
-            if getattr(self, channel) is None:
-                continue
-            values = _read_only(getattr(self, channel))
+        for channel, given in self._channels().items():
+            values = _read_only(given)
             object.__setattr__(self, channel, values)
             n = self.time_s.size
             if n == 0:
@@ -97,24 +95,19 @@ class Log(ArrowExport):
                 raise InputError(problem, source=where, field=channel)
             bad = np.flatnonzero(~np.isfinite(values)) if channel in REQUIRED else np.empty(0)
             if bad.size:
-                raise InputError(
-                    f"{bad.size} of {n} values are not finite, the first in row {bad[0] + 1}",
-                    source=where,
-                    field=channel,
-                    value=float(values[bad[0]]),
-                    cure="fill or drop these rows",
-                )
+                problem = f"{bad.size} of {n} values are not finite, the first in row {bad[0] + 1}"
+                value, cure = float(values[bad[0]]), "fill or drop these rows"
+                raise InputError(problem, source=where, field=channel, value=value, cure=cure)
         back = np.flatnonzero(np.diff(self.time_s) <= 0.0)
         if back.size:
             row = int(back[0]) + 1
-            raise InputError(
-                f"time does not increase at row {row + 1} ({back.size} such rows;"
-                f" the row before has {self.time_s[row - 1]:.6f} s)",
-                source=where,
-                field="time_s",
-                value=float(self.time_s[row]),
-                cure="sort the rows by time and drop duplicated stamps",
+            before = f"the row before has {self.time_s[row - 1]:.6f} s"
+            problem = f"time does not increase at row {row + 1} ({back.size} such rows; {before})"
+            value, cure = (
+                float(self.time_s[row]),
+                "sort the rows by time and drop duplicated stamps",
             )
+            raise InputError(problem, source=where, field="time_s", value=value, cure=cure)
 
     @classmethod
     @naming_arguments
@@ -169,10 +162,7 @@ class Log(ArrowExport):
         """
         from cangauge.logs.canonical import build_table  # noqa: PLC0415 - pyarrow, as above
 
-        columns = {channel: getattr(self, channel) for channel in REQUIRED}
-        if self.soc_pct is not None:
-            columns["soc_pct"] = self.soc_pct
-        return build_table(columns, self.temperature_source)
+        return build_table(self._channels(), self.temperature_source)
 
     def __repr__(self) -> str:
         """Return one line of what the log holds."""
@@ -206,14 +196,13 @@ class Log(ArrowExport):
 
     def rows(self, keep: BoolArray | IntArray | slice) -> Self:
         """Return the log of the rows that `keep` selects (mask, indices or slice)."""
-        return replace(
-            self,
-            time_s=self.time_s[keep],
-            current_a=self.current_a[keep],
-            voltage_v=self.voltage_v[keep],
-            temperature_c=self.temperature_c[keep],
-            soc_pct=None if self.soc_pct is None else self.soc_pct[keep],
-        )
+        kept: dict[str, Any] = {name: values[keep] for name, values in self._channels().items()}
+        return replace(self, **kept)
+
+    def _channels(self) -> dict[str, FloatArray]:
+        """Return the columns that the log has, by name."""
+        channels = {name: getattr(self, name) for name in (*REQUIRED, "soc_pct")}
+        return {name: values for name, values in channels.items() if values is not None}
 
 
 def as_log(log: Any) -> Log:

@@ -133,9 +133,8 @@ class LogFile:
             draft.ignored = tuple(name for name in draft.ignored if name not in self.used)
             log = draft.log(temperature_c, temperature_source, self.sign)
         except MemoryError as error:
-            raise InputError(
-                "larger than the free memory", source=self.head.path, cure="split it"
-            ) from error
+            problem, cure = "larger than the free memory", "split it"
+            raise InputError(problem, source=self.head.path, cure=cure) from error
         pa.default_memory_pool().release_unused()
         return log
 
@@ -157,12 +156,11 @@ class LogFile:
         if len(cells) < 2 or draft.table is None:  # a single cell is its pack
             return None
         columns = with_decimal_points(draft.table.columns([place for place, _ in cells.values()]))
-        volts = np.column_stack(
-            [
-                scale * numbers_of(columns[place], draft.source, draft.headings[place])[0]
-                for place, scale in cells.values()
-            ]
-        )
+        each_v = [
+            scale * numbers_of(columns[place], draft.source, draft.headings[place])[0]
+            for place, scale in cells.values()
+        ]
+        volts = np.column_stack(each_v)
         file_s = draft.values["time_s"]
         if file_s.size != volts.shape[0]:
             return None  # rows that hold only what changed
@@ -185,13 +183,9 @@ def not_recognised(file: LogFile, problem: str, cure: str) -> InputError:
         return InputError(f"{problem}: {error.problem}", source=head.path, cure=error.cure)
     shown = head.first_line.strip()
     is_text = bool(shown) and shown.isprintable()
-    return InputError(
-        problem,
-        source=head.path,
-        field="first line" if is_text else None,
-        value=shown[:80] if is_text else None,
-        cure=f"{cure}; other tables: --columns ({DOCS})",
-    )
+    field, value = ("first line", shown[:80]) if is_text else (None, None)
+    cure += f"; other tables: --columns ({DOCS})"
+    return InputError(problem, source=head.path, field=field, value=value, cure=cure)
 
 
 def open_log(
@@ -224,12 +218,9 @@ def draft_of_dataframe(
     try:
         table = pa.table(frame)
     except (TypeError, ValueError, pa.ArrowException) as error:
-        raise InputError(
-            "not a log",
-            value=type(frame).__name__,
-            cure="give a Log, the path of one, or a DataFrame with time, current, voltage and"
-            " temperature",
-        ) from error
+        cure = "give a Log, the path of one, or a DataFrame with time, current, voltage and"
+        cure += " temperature"
+        raise InputError("not a log", value=type(frame).__name__, cure=cure) from error
     indices = [column for column in table.schema if column.name.startswith("__index_level_")]
     times = [column.name for column in indices if pa.types.is_timestamp(column.type)]
     if len(times) == 1 and not {"time", "time_s"} & {n.lower() for n in table.column_names}:

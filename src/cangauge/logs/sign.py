@@ -111,12 +111,8 @@ def require_discharge_positive(log: Log, *, is_capture: bool = False) -> None:
             cure = "use the preset of this car, or set sign = -1 under [current] of the map file"
         elif finding.strongest.kind == "soc":
             cure += "; or, if the current is right, correct soc_pct or leave it out"
-        raise InputError(
-            f"the sign of current is inverted: {finding.strongest.text}",
-            source=log.source or log.name,
-            field="current_a",
-            cure=cure,
-        )
+        problem, where = f"the sign of current is inverted: {finding.strongest.text}", log.source
+        raise InputError(problem, source=where or log.name, field="current_a", cure=cure)
 
 
 def current_steps(log: Log) -> tuple[FloatArray, FloatArray]:
@@ -205,7 +201,7 @@ def resolve_sign(log: Log, *, stored_sign_unknown: bool, is_stated: bool = False
     proves is left out.
     """
     finding = sign_of_current(log)
-    remarks, assumed = list(log.remarks), ""
+    remarks = list(log.remarks)
     voltage, soc = _finding(finding.evidence[:2]), finding.evidence[2]
     contradicts = abs(soc.weight) >= 1.0 and soc.weight * voltage.sign < 0.0
     if log.soc_pct is not None and not finding.sign and contradicts:
@@ -216,7 +212,14 @@ def resolve_sign(log: Log, *, stored_sign_unknown: bool, is_stated: bool = False
             " discharge?"
         )
         log, finding = replace(log, soc_pct=None), voltage
-    if not stored_sign_unknown and finding.sign < 0:
+    if stored_sign_unknown and log.assumed:
+        way = "charges" if finding.sign < 0 else "discharges"
+        how = "found from the data" if finding.sign else "not confirmed by the data"
+        log = replace(log, assumed=(*log.assumed, f"positive current {way}, {how}"))
+    if stored_sign_unknown and finding.sign < 0:
+        log = replace(log, current_a=0.0 - log.current_a)
+        remarks.append(f"current negated, sign found from the data: {finding.strongest.text}")
+    elif finding.sign < 0:
         what, how = ("the stated sign of current", "stated") if is_stated else ("current", "stored")
         remarks.append(f"{what} looks inverted and was kept as {how}: {finding.sentence}")
     elif stored_sign_unknown and not finding.sign:
@@ -224,12 +227,4 @@ def resolve_sign(log: Log, *, stored_sign_unknown: bool, is_stated: bool = False
             "sign of current unknown and undetermined by the data: kept as stored (--sign charge"
             " inverts it)"
         )
-        assumed = "positive current discharges, not confirmed by the data"
-    elif stored_sign_unknown:
-        way = "discharges" if finding.sign > 0 else "charges"
-        assumed = f"positive current {way}, found from the data"
-        if finding.sign < 0:
-            log = replace(log, current_a=0.0 - log.current_a)
-            remarks.append(f"current negated, sign found from the data: {finding.strongest.text}")
-    stated = (assumed,) if assumed and log.assumed else ()
-    return replace(log, remarks=tuple(remarks), assumed=(*log.assumed, *stated))
+    return replace(log, remarks=tuple(remarks))

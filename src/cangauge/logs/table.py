@@ -107,9 +107,8 @@ def draft_of_table(
     wanted += [place for place, _ in chosen["time"].others] + words
     cells = with_decimal_points(table.columns([*dict.fromkeys(wanted)]))
     draft = DraftLog(name, source, headings=tuple(headings), remarks=[*table.remarks], table=table)
-    draft.values["time_s"], unit_of_time, chosen["time"] = _time(
-        cells, chosen["time"], headings, where
-    )
+    time_s, unit_of_time, chosen["time"] = _time(cells, chosen["time"], headings, where)
+    draft.values["time_s"] = time_s
     draft.stated = {FIELDS[quantity] for quantity, column in chosen.items() if column.is_stated}
     if unit_of_time == "s, assumed" and "time_s" not in draft.stated:
         draft.in_seconds = None
@@ -124,13 +123,11 @@ def draft_of_table(
             draft.assumed.append(f'{quantity} = "{shown}"{factor} [{unit}]')
     used = {*words, *(place for column in chosen.values() for place in column.places)}
     draft.ignored = tuple(text for k, text in enumerate(headings) if text and k not in used)
-    word = _only_word(cells[words[0]], where) if words else ""
-    word = word or (getattr(table, "word", "") if choice.is_canonical else "")
-    if not word and "temperature" in chosen:
-        word = chosen["temperature"].source
-    draft.temperature_source = known_temperature_source(
-        word or "unknown", source=where, field=SOURCE
-    )
+    in_cells = _only_word(cells[words[0]], where) if words else ""
+    in_metadata = getattr(table, "word", "") if choice.is_canonical else ""
+    in_heading = chosen["temperature"].source if "temperature" in chosen else "unknown"
+    word = in_cells or in_metadata or in_heading
+    draft.temperature_source = known_temperature_source(word, source=where)
     if not choice.is_canonical:
         current = chosen["current"]
         draft.sign_unknown = current.factor > 0.0 and len(current.places) == 1

@@ -61,23 +61,17 @@ class TextTable(NamedTuple):
             odd_rows.append(row)
             return "skip"
 
+        # One thread: otherwise pyarrow does not number odd rows.
+        how = pacsv.ReadOptions(use_threads=False, column_names=names, skip_rows=self.skip_lines)
+        rows = pacsv.ParseOptions(delimiter=self.delimiter, invalid_row_handler=skip)
+        cells = pacsv.ConvertOptions(
+            include_columns=wanted,
+            column_types=dict.fromkeys(wanted, pa.string()),
+            null_values=_NULLS,
+            strings_can_be_null=True,
+        )
         try:
-            table = pacsv.read_csv(
-                pa.BufferReader(data),
-                # One thread: otherwise pyarrow does not number odd rows.
-                read_options=pacsv.ReadOptions(
-                    use_threads=False, column_names=names, skip_rows=self.skip_lines
-                ),
-                parse_options=pacsv.ParseOptions(
-                    delimiter=self.delimiter, invalid_row_handler=skip
-                ),
-                convert_options=pacsv.ConvertOptions(
-                    include_columns=wanted,
-                    column_types=dict.fromkeys(wanted, pa.string()),
-                    null_values=_NULLS,
-                    strings_can_be_null=True,
-                ),
-            )
+            table = pacsv.read_csv(pa.BufferReader(data), how, rows, cells)
         except pa.ArrowInvalid as error:
             problem = f"the table cannot be read: {str(error).splitlines()[0]}"
             raise self._error(problem, "export it again") from error
@@ -87,10 +81,8 @@ class TextTable(NamedTuple):
         if not table.num_rows:
             raise self._error("there are no rows below the header", "check the export")
         if not data.endswith((b"\n", b"\r")):
-            self.remarks.append(
-                "the last line has no line end: if the file was cut off, its last value may be"
-                " short"
-            )
+            doubt = "if the file was cut off, its last value may be short"
+            self.remarks.append(f"the last line has no line end: {doubt}")
         return {place: self._values(table.column(f"c{place}"), place) for place in places}
 
     def _values(self, cells: Any, place: int) -> Any:
@@ -107,10 +99,9 @@ class TextTable(NamedTuple):
         width = len(split_cells(first, self.delimiter))
         named = max((k + 1 for k, name in enumerate(self.headings) if name), default=0)
         if not named <= width <= MAX_COLUMNS:
-            raise self._error(
-                f"row 1 has {width} cells where the header has {named} (at most {MAX_COLUMNS})",
-                "the file looks cut off or has another delimiter: export it again",
-            )
+            problem = f"row 1 has {width} cells where the header has {named}"
+            cure = "the file looks cut off or has another delimiter: export it again"
+            raise self._error(f"{problem} (at most {MAX_COLUMNS})", cure)
         return width
 
     def _remark_odd(self, odd_rows: list[Any], rows: int) -> None:
@@ -121,15 +112,12 @@ class TextTable(NamedTuple):
             if is_text and row.number > last - len(odd_rows):
                 self.remarks.append(f"closing line omitted: {row.text.strip()[:60]!r}")
             elif row.number == last and row.actual_columns < row.expected_columns:
-                self.remarks.append(
-                    "the last line is cut off and was omitted: the file may be incomplete"
-                )
+                remark = "the last line is cut off and was omitted: the file may be incomplete"
+                self.remarks.append(remark)
             else:
-                raise self._error(
-                    f"row {row.number - self.skip_lines} has {row.actual_columns} cells where the"
-                    f" others have {row.expected_columns}",
-                    "export the file again",
-                )
+                problem = f"row {row.number - self.skip_lines} has {row.actual_columns} cells"
+                problem += f" where the others have {row.expected_columns}"
+                raise self._error(problem, "export the file again")
 
     def _error(self, problem: str, cure: str) -> InputError:
         return InputError(problem, source=self.head.path, cure=cure)

@@ -101,18 +101,12 @@ _Wrong = tuple[float, str, str, list[str]]
 """A value that contradicts its unit, the problem, the cure, and units that the user may state."""
 
 
-def known_temperature_source(
-    word: str, *, source: str | None = None, field: str = "temperature_source"
-) -> TemperatureSource:
+def known_temperature_source(word: str, *, source: str | None = None) -> TemperatureSource:
     """Return the word if it names a temperature source, else raise InputError."""
     if word not in TEMPERATURE_SOURCES:
-        raise InputError(
-            "not a known temperature source",
-            source=source,
-            field=field,
-            value=word,
-            cure=f"use one of: {', '.join(TEMPERATURE_SOURCES)}",
-        )
+        problem, field = "not a known temperature source", "temperature_source"
+        cure = f"use one of: {', '.join(TEMPERATURE_SOURCES)}"
+        raise InputError(problem, source=source, field=field, value=word, cure=cure)
     return cast("TemperatureSource", word)
 
 
@@ -144,13 +138,9 @@ def convert(values: FloatArray, field: str, unit: str, *, source: object, label:
     """
     scale = unit_of(field, unit) if unit.strip() else (1.0, 0.0)
     if scale is None:
-        raise InputError(
-            f"the unit is not known for {field}",
-            source=str(source),
-            field=label,
-            value=unit,
-            cure=f"convert it to one of: {', '.join(_UNITS[field])}",
-        )
+        problem = f"the unit is not known for {field}"
+        cure = f"convert it to one of: {', '.join(_UNITS[field])}"
+        raise InputError(problem, source=str(source), field=label, value=unit, cure=cure)
     return values if scale == (1.0, 0.0) else values * scale[0] + scale[1]
 
 
