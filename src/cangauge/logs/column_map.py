@@ -314,11 +314,9 @@ def unknown_columns(source: str, headings: Sequence[str], choice: Choice) -> Inp
         likely[quantity] = "+".join(headings[place] for place in column.places)
     names = [name for name in FIELDS if name in likely or name in _NEEDED]
     columns = ",".join(f"{name}={likely.get(name, '?')}" for name in names).replace("'", "'\\''")
-    return InputError(
-        f"no plain heading of {missing} (found: {shown_headings(headings)})",
-        source=source,
-        cure="; ".join([f"name the columns, e.g. --columns '{columns}' ({DOCS})", *several]),
-    )
+    problem = f"no plain heading of {missing} (found: {shown_headings(headings)})"
+    cure = "; ".join([f"name the columns, e.g. --columns '{columns}' ({DOCS})", *several])
+    return InputError(problem, source=source, cure=cure)
 
 
 def shown_headings(headings: Sequence[str]) -> str:

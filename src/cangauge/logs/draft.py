@@ -107,10 +107,9 @@ class DraftLog:
         if apart.any():
             row = int(np.argmax(apart))
             shown = " and ".join(f"{value:.4g}" for value in values[:, row])
-            self.remarks.append(
-                f"temperature: {' and '.join(names)} are {shown} °C in row {row + 1}: one of the"
-                " probes fails; name the good ones with --columns temperature=…"
-            )
+            apart_c = f"{' and '.join(names)} are {shown} °C in row {row + 1}"
+            cure = "one of the probes fails; name the good ones with --columns temperature=…"
+            self.remarks.append(f"temperature: {apart_c}: {cure}")
 
     def log(
         self,

@@ -103,10 +103,8 @@ class Log(ArrowExport):
             row = int(back[0]) + 1
             before = f"the row before has {self.time_s[row - 1]:.6f} s"
             problem = f"time does not increase at row {row + 1} ({back.size} such rows; {before})"
-            value, cure = (
-                float(self.time_s[row]),
-                "sort the rows by time and drop duplicated stamps",
-            )
+            value = float(self.time_s[row])
+            cure = "sort the rows by time and drop duplicated stamps"
             raise InputError(problem, source=where, field="time_s", value=value, cure=cure)
 
     @classmethod

@@ -218,8 +218,7 @@ def draft_of_dataframe(
     try:
         table = pa.table(frame)
     except (TypeError, ValueError, pa.ArrowException) as error:
-        cure = "give a Log, the path of one, or a DataFrame with time, current, voltage and"
-        cure += " temperature"
+        cure = "give a Log, the path of one, or a table of time, current, voltage, temperature"
         raise InputError("not a log", value=type(frame).__name__, cure=cure) from error
     indices = [column for column in table.schema if column.name.startswith("__index_level_")]
     times = [column.name for column in indices if pa.types.is_timestamp(column.type)]

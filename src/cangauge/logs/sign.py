@@ -223,8 +223,6 @@ def resolve_sign(log: Log, *, stored_sign_unknown: bool, is_stated: bool = False
         what, how = ("the stated sign of current", "stated") if is_stated else ("current", "stored")
         remarks.append(f"{what} looks inverted and was kept as {how}: {finding.sentence}")
     elif stored_sign_unknown and not finding.sign:
-        remarks.append(
-            "sign of current unknown and undetermined by the data: kept as stored (--sign charge"
-            " inverts it)"
-        )
+        remark = "sign of current unknown and undetermined by the data: kept as stored"
+        remarks.append(f"{remark} (--sign charge inverts it)")
     return replace(log, remarks=tuple(remarks))

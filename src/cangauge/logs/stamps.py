@@ -128,10 +128,9 @@ def seconds_of(
     if cells is not None and not is_number(first_text(cells) or "0"):
         return seconds_of_text(cells, order_or_zone, source, label)
     values, _ = numbers_of(column, source, label)
-    if not unit or is_format:
-        digits = _spelled_in_digits(values)
-        if digits is not None:
-            return seconds_of_text(digits, order_or_zone, source, label)
+    digits = _spelled_in_digits(values) if not unit or is_format else None
+    if digits is not None:
+        return seconds_of_text(digits, order_or_zone, source, label)
     return _seconds_of_numbers(values * factor, "" if is_format else unit, source, label)
 
 

@@ -40,13 +40,7 @@ from cangauge.logs.units import (
     known_temperature_source,
     unit_of,
 )
-from cangauge.logs.values import (
-    first_text,
-    is_number,
-    numbers_of,
-    present,
-    with_decimal_points,
-)
+from cangauge.logs.values import first_text, is_number, numbers_of, present, with_decimal_points
 
 SOURCE: Final = "temperature_source"
 """Column or metadata of a canonical log: the location of the temperature sensor."""
@@ -291,10 +285,9 @@ def _hold_changes(draft: DraftLog) -> None:
     is_known = np.isfinite(temperature)
     if is_known.any():  # before the first value, the first
         temperature[~is_known] = temperature[is_known][0]
-    draft.remarks.append(
-        f"rows hold only what changed: {at.size} rows with a current kept, with the latest voltage"
-        f" (at most {float(age_s[near].max()):.2g} s old) and temperature"
-    )
+    latest = f"the latest voltage (at most {float(age_s[near].max()):.2g} s old) and temperature"
+    kept = f"{at.size} rows with a current kept, with {latest}"
+    draft.remarks.append(f"rows hold only what changed: {kept}")
 
 
 def held(time: FloatArray, values: FloatArray, at: IntArray) -> tuple[FloatArray, FloatArray]:

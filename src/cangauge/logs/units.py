@@ -246,8 +246,8 @@ def _wrong_time(values: dict[str, FloatArray], *, in_seconds: bool | None) -> It
 
 def _fitting(interval: float, units: Sequence[str]) -> list[str]:
     """Return those of the units in which rows are as far apart as a log's."""
-    seconds = {unit: interval * _UNITS["time_s"][unit][0] for unit in units}
-    return [unit for unit, step_s in seconds.items() if _FASTEST_S <= step_s <= _MAX_INTERVAL_S]
+    step_s = {unit: interval * _UNITS["time_s"][unit][0] for unit in units}
+    return [unit for unit in units if _FASTEST_S <= step_s[unit] <= _MAX_INTERVAL_S]
 
 
 def _other_units(values: dict[str, FloatArray], finer: list[str], coarser: list[str]) -> list[str]:
