@@ -170,6 +170,8 @@ def test_table_of_any_types_and_columns() -> None:
     )
     with pytest.raises(InputError, match="no rows"):
         Log.from_dataframe(table().slice(0, 0))
+    with pytest.raises(InputError, match="not a known temperature source"):
+        Log.from_dataframe(table(), temperature_source="oven")
     with pytest.raises(InputError, match=r"not a log .got 'int'.; give a Log, the path of one"):
         Log.from_dataframe(7)
 
@@ -263,6 +265,13 @@ def test_tables_of_any_columns(tmp_path: Path) -> None:
     assert (tmp_path / "x.csv").read_text() == 'time_s,status,soc\n0,"valid",\n1,"a,b",0.1\n'
 
 
+def test_names_of_a_canonical_log_define_its_units(tmp_path: Path, drive: Log) -> None:
+    write_log(drive, tmp_path / "x.csv")
+    head, rows = (tmp_path / "x.csv").read_text().split("\n", 1)
+    (tmp_path / "x.csv").write_text(f"{head}\ns,mA,mV,K,%,cell\n{rows}")
+    assert_same(read_log(tmp_path / "x.csv"), drive)
+
+
 @pytest.mark.parametrize(
     ("headings", "scale", "kind"),
     [("cell_{:02d}_v", 1.0, "csv"), ("Cell {} [V]", 1.0, "csv"), ("Zelle {} (mV)", 1e3, "parquet")],
@@ -293,6 +302,7 @@ def test_cells_beside_a_log(
         open_log(path).cells(log.time_s)
 
 
-def test_log_without_cells_has_none(tmp_path: Path, drive: Log) -> None:
-    write_log(drive, tmp_path / "x.csv")
-    assert open_log(tmp_path / "x.csv").cells(drive.time_s) is None
+def test_log_without_cells_or_with_one_has_none(tmp_path: Path, drive: Log) -> None:
+    for columns in (drive.to_arrow(), drive.to_arrow().append_column("cell_1_v", [[3.7] * 60])):
+        write_table(columns, tmp_path / "x.csv")
+        assert open_log(tmp_path / "x.csv").cells(drive.time_s) is None

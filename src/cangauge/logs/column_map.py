@@ -158,7 +158,7 @@ def choose_columns(
             if meaning is not None and meaning.quantity == quantity and place not in taken
         ]
         if choice.is_canonical:
-            plain = [item for item in plain if _simple(headings[item[0]]) == FIELDS[quantity]][:1]
+            plain = [item for item in plain if _simple(headings[item[0]]) == FIELDS[quantity]]
         pair = _directions(headings, plain) if quantity == "current" else None
         if pair is not None:
             choice.chosen["current"] = pair
