@@ -36,11 +36,11 @@ from rich.table import Table
 
 from cangauge._resources import shared_file
 from cangauge.bus.open import BusAddress, bus_address, open_bus
+from cangauge.bus.recording import read_log
 from cangauge.bus.vehicle import Vehicle
 from cangauge.estimation.offline import estimate_log
 from cangauge.estimation.settings import EstimatorSettings
 from cangauge.logs.log import Log
-from cangauge.logs.read import read_log
 from cangauge.model.model_file import Model
 from cangauge.replay.encoder import FrameEncoder
 from cangauge.replay.player import Pacer

@@ -29,12 +29,12 @@ from rich.table import Table
 from cangauge.bus.connection import BusConnection
 from cangauge.bus.open import BusAddress, backend_capabilities, bus_address, open_bus
 from cangauge.bus.publish import standard_filter
+from cangauge.bus.recording import read_log
 from cangauge.bus.vehicle import Vehicle
 from cangauge.estimation.offline import run_estimator, samples_of
 from cangauge.estimation.settings import EstimatorSettings
 from cangauge.identify.fit import fit
 from cangauge.logs.log import Log
-from cangauge.logs.read import read_log
 from cangauge.model.coulomb_counting import capacity_from_reference
 from cangauge.model.model_file import Model
 from cangauge.replay.player import ReplaySettings, play

@@ -34,6 +34,7 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
+from cangauge.bus.recording import read_log
 from cangauge.errors import InputError
 from cangauge.estimation.compiled import CompiledEstimator, make_estimator
 from cangauge.estimation.estimator import Estimator
@@ -42,7 +43,6 @@ from cangauge.estimation.settings import EstimatorSettings
 from cangauge.extras.embedded.embedded import PERIOD_S, export_c
 from cangauge.identify.fit import fit
 from cangauge.logs.log import Log
-from cangauge.logs.read import read_log
 from cangauge.model.model_file import Model
 from cangauge.model.published import leaf_2012_model_file
 from cangauge.types import Sample

@@ -37,6 +37,7 @@ from rich.console import Console
 from rich.table import Table
 
 from cangauge._resources import shared_file
+from cangauge.bus.recording import read_log
 from cangauge.bus.vehicle import Vehicle
 from cangauge.cli.app import COMMANDS
 from cangauge.diagnosis import diagnose
@@ -48,7 +49,6 @@ from cangauge.extras.validation import simulate
 from cangauge.identify.fit import fit
 from cangauge.logs.canonical import write_log
 from cangauge.logs.log import Log
-from cangauge.logs.read import read_log
 from cangauge.model.model_file import Coefficient, Model
 from cangauge.replay.encoder import FrameEncoder
 from cangauge.service.pipeline import Pipeline, PipelineSettings

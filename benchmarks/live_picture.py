@@ -21,9 +21,9 @@ from PIL import Image
 
 from cangauge._resources import shared_file
 from cangauge.bus.open import bus_address
+from cangauge.bus.recording import read_log
 from cangauge.extras.report.charts import AMBER, BLUE, GREEN, ORANGE
 from cangauge.identify.fit import fit
-from cangauge.logs.read import read_log
 from live_page import PAGE_PORT, chromium
 from live_service import command, service
 

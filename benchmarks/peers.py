@@ -27,6 +27,7 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
+from cangauge.bus.recording import read_log
 from cangauge.errors import InputError
 from cangauge.estimation.compiled import make_estimator
 from cangauge.estimation.estimator import Estimator
@@ -34,7 +35,6 @@ from cangauge.estimation.offline import run_estimator, samples_of
 from cangauge.estimation.settings import EstimatorSettings
 from cangauge.identify.fit import fit
 from cangauge.logs.log import Log
-from cangauge.logs.read import read_log
 from cangauge.model.model_file import Model
 from equivalent_circuit import equivalent_circuit
 from packs.recorded import load, one_hz

@@ -24,11 +24,11 @@ from rich.console import Console
 from rich.progress import track
 from rich.table import Table
 
+from cangauge.bus.recording import read_log
 from cangauge.diagnosis import diagnose
 from cangauge.identify.fit import fit
 from cangauge.identify.starts import with_start
 from cangauge.logs.log import Log
-from cangauge.logs.read import read_log
 
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 REFERENCES = ("551_LA92", "551_US06", "552_Mixed3", "552_Mixed5")

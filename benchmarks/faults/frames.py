@@ -16,10 +16,10 @@ import can
 
 from cangauge._resources import shared_file
 from cangauge.bus.protection import ProtectionRule
+from cangauge.bus.recording import read_log
 from cangauge.bus.time_source import ClockFrames
 from cangauge.bus.vehicle import Vehicle
 from cangauge.estimation.offline import samples_of
-from cangauge.logs.read import read_log
 from cangauge.replay.encoder import FrameEncoder
 from cangauge.types import Sample
 

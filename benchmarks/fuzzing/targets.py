@@ -23,7 +23,7 @@ from cangauge.bus.captures import find_capture, open_capture
 from cangauge.bus.database import load_dbc
 from cangauge.bus.protection import GENERIC_RULE
 from cangauge.bus.publish import SocPublisher, SocReader
-from cangauge.bus.recording import capture_to_log
+from cangauge.bus.recording import capture_to_log, read_log
 from cangauge.bus.time_source import ClockFrames, StampLimiter
 from cangauge.bus.vehicle import Vehicle
 from cangauge.estimation.estimator import Estimator
@@ -32,7 +32,6 @@ from cangauge.estimation.settings import EstimatorSettings
 from cangauge.inspect.capture import inspect_capture
 from cangauge.inspect.log import inspect_log
 from cangauge.logs.log import Log
-from cangauge.logs.read import read_log
 from cangauge.model.model_file import Model
 from cangauge.replay.encoder import FrameEncoder
 from cangauge.service import state as state_file

@@ -15,8 +15,8 @@ from pathlib import Path
 
 import numpy as np
 
+from cangauge.bus.recording import read_log
 from cangauge.logs.log import Log
-from cangauge.logs.read import read_log
 
 PARTS = ("weights", "frozen")
 LG_SERIES, LG_PARALLEL, LG_AH = 96, 17, 2.78

@@ -15,6 +15,7 @@ from cangauge.bus.time_source import REPLAY_CLOCK_ID, ClockFrames
 from cangauge.bus.vehicle import Vehicle
 from cangauge.errors import InputError
 from cangauge.logs.canonical import write_log
+from cangauge.logs.column_map import ColumnMap
 from cangauge.logs.log import Log
 from cangauge.logs.read import LogFile
 from cangauge.model.published import leaf_2012_model_file
@@ -58,6 +59,16 @@ def test_content_decides_between_log_and_capture(tmp_path: Path, generic: Vehicl
     by_capture, by_log = read_log(capture, generic), read_log(log)
     for channel in ("time_s", "current_a", "voltage_v", "temperature_c", "soc_pct"):
         np.testing.assert_array_equal(getattr(by_capture, channel), getattr(by_log, channel))
+
+
+def test_columns_of_a_map_are_not_those_of_a_canonical_log(tmp_path: Path) -> None:
+    mapped = ColumnMap.of("current=I,voltage=U")
+    write_log(Log([0, 1], [10, 30], [380, 378], [21, 21]), tmp_path / "log.csv")
+    (tmp_path / "table.csv").write_text("Time,Current,I,U,Temp\n0,1,10,380,21\n1,3,30,378,21\n")
+    for name in ("log.csv", "table.csv"):
+        found = open_recording(tmp_path / name, mapped=mapped)
+        assert isinstance(found, LogFile)
+        assert found.read().current_a.tolist() == [10.0, 30.0]
 
 
 def test_a_log_needs_no_vehicle(tmp_path: Path, generic: Vehicle) -> None:

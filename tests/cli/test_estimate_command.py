@@ -15,13 +15,13 @@ import pyarrow.parquet
 import pytest
 
 from cangauge._resources import shared_file
+from cangauge.bus.recording import read_log
 from cangauge.bus.vehicle import Vehicle
 from cangauge.cli.estimate import write_estimates
 from cangauge.estimation.offline import estimate_log, samples_of
 from cangauge.estimation.settings import EstimatorSettings
 from cangauge.logs.canonical import write_log
 from cangauge.logs.log import Log
-from cangauge.logs.read import read_log
 from cangauge.model.model_file import Model
 from cangauge.replay.encoder import FrameEncoder
 from cangauge.service.offline import estimate_capture

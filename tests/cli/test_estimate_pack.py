@@ -10,12 +10,12 @@ import pyarrow.csv
 import pyarrow.parquet
 import pytest
 
+from cangauge.bus.recording import read_log
 from cangauge.estimation.estimator import Estimator
 from cangauge.estimation.offline import samples_of
 from cangauge.estimation.settings import EstimatorSettings
 from cangauge.logs.canonical import write_log
 from cangauge.logs.log import Log
-from cangauge.logs.read import read_log
 from cangauge.model.model_file import Model
 from cells_bus import CELLS_ON_BUS
 from live import succeeds

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
+from cangauge.bus.recording import read_log
 from cangauge.bus.vehicle import Vehicle
-from cangauge.logs.read import read_log
 from cangauge.replay.steps import CaptureSource
 from fuzzing import corpus
 from live import in_process, leaf_model_path

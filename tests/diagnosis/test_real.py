@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from cangauge.bus.recording import read_log
 from cangauge.diagnosis import Diagnosis, References, diagnose, learn_references
 from cangauge.identify.fit import fit
 from cangauge.logs.log import Log
-from cangauge.logs.read import read_log
 from cangauge.model.model_file import Model
 
 TRIPS = Path(__file__).parents[3] / "shared" / "data" / "bmw_i3"

@@ -14,6 +14,7 @@ import pytest
 from typer.testing import CliRunner
 from untested import export_untested
 
+from cangauge.bus.recording import read_log
 from cangauge.cli.app import app
 from cangauge.errors import InputError
 from cangauge.estimation.estimator import Estimator
@@ -22,7 +23,6 @@ from cangauge.estimation.settings import EstimatorSettings
 from cangauge.extras.embedded.c_source import CORE_HEADERS, CORE_SOURCES, TabulatedModel
 from cangauge.extras.embedded.embedded import drive_with_events, export_c
 from cangauge.identify.fit import fit
-from cangauge.logs.read import read_log
 from cangauge.model.model_file import Model
 from cangauge.model.published import leaf_2012_model_file
 from cangauge.types import Reason, Sample

@@ -154,8 +154,9 @@ def test_errors_in_python_name_its_arguments(tmp_path: Path) -> None:
         cangauge.read_log(path)
     with pytest.raises(cangauge.InputError, match=r"unit: columns='voltage=Voltage\[mV\]'"):
         cangauge.read_log(path, temperature_c=20.0)
-    with pytest.raises(cangauge.InputError, match=r"^temperature_c: must lie within"):
-        cangauge.read_log(path, temperature_c=500.0)
+    path.write_text("Time,Current,Voltage\n0,1,380\n1,2,380\n")
+    with pytest.raises(cangauge.InputError, match=r"temperature_c: .*kelvin .got 293.0.; subtract"):
+        cangauge.read_log(path, temperature_c=293.0)
 
 
 def test_a_fit_is_shown_in_ten_lines(fitted: cangauge.Identification) -> None:

@@ -11,13 +11,13 @@ from typing import Any
 import numpy as np
 import pytest
 
+from cangauge.bus.recording import read_log
 from cangauge.extras.fleet import run as fleet_run
 from cangauge.extras.fleet.sources import FleetLog, find_logs
 from cangauge.extras.validation.cases import Scenario, draw_scenario
 from cangauge.extras.validation.twin.recording import record_drive
 from cangauge.identify.fit import fit
 from cangauge.logs.canonical import write_log
-from cangauge.logs.read import read_log
 from cangauge.model.coulomb_counting import counted_soc_pct
 from cangauge.model.model_file import Model
 

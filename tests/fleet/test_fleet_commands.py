@@ -13,6 +13,7 @@ import fsspec
 import numpy as np
 import pytest
 
+from cangauge.bus.recording import read_log
 from cangauge.extras.fleet.gap import GapJob
 from cangauge.extras.fleet.jobs import Task
 from cangauge.extras.fleet.outliers import ErrorsByLog
@@ -21,7 +22,6 @@ from cangauge.extras.fleet.sources import FleetLog
 from cangauge.extras.report.fleet import fleet_page
 from cangauge.extras.validation.cases import Scenario
 from cangauge.logs.canonical import write_log
-from cangauge.logs.read import read_log
 from cangauge.model.model_file import Model
 from live import Ended, in_process
 from report_html import Html

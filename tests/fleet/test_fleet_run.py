@@ -18,6 +18,7 @@ import pyarrow.dataset as pds
 import pyarrow.parquet as pq
 import pytest
 
+from cangauge.bus.recording import read_log
 from cangauge.errors import InputError
 from cangauge.extras.fleet import run as fleet_run
 from cangauge.extras.fleet.gap import GapJob, gap_tasks
@@ -26,7 +27,6 @@ from cangauge.extras.fleet.results import Results
 from cangauge.extras.fleet.run import Summary, connected, perform, run_id, run_job
 from cangauge.extras.fleet.sources import FleetLog, ReadOptions, find_logs
 from cangauge.logs.canonical import write_log
-from cangauge.logs.read import read_log
 from cangauge.model.model_file import Model
 
 FAILS: dict[str, Exception] = {}

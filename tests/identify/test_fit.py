@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 import cangauge
+from cangauge.bus.recording import read_log
 from cangauge.errors import InputError
 from cangauge.identify.fit import common_name, fit
 from cangauge.identify.least_squares import (
@@ -23,7 +24,6 @@ from cangauge.identify.least_squares import (
 )
 from cangauge.identify.rows import FitRows, fit_rows
 from cangauge.logs.log import Log
-from cangauge.logs.read import read_log
 from cangauge.model.coulomb_counting import (
     capacity_from_full_discharge,
     capacity_from_reference,

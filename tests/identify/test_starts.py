@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from test_fit import CELLS
 
+from cangauge.bus.recording import read_log
 from cangauge.errors import InputError
 from cangauge.identify.fit import fit
 from cangauge.identify.starts import find_starts, start_by_model
 from cangauge.logs.log import Log
-from cangauge.logs.read import read_log
 from cangauge.model.coulomb_counting import (
     capacity_from_full_discharge,
     counted_soc_pct,

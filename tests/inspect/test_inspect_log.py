@@ -12,10 +12,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from cangauge._text import plain
+from cangauge.bus.recording import read_log
 from cangauge.inspect.channels import quantum_of
 from cangauge.inspect.log import LogInspection, inspect_log
 from cangauge.logs.log import Log
-from cangauge.logs.read import read_log
 
 
 def drive(minutes: float = 30.0, *, rate_hz: float = 10.0, seed: int = 1) -> Log:

@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 
 from cangauge._resources import shared_file
+from cangauge.bus.recording import read_log
 from cangauge.errors import InputError
 from cangauge.estimation.offline import samples_of
 from cangauge.extras.judge.live import PAGE, RESULT, LiveJudge, Stored, make_output
 from cangauge.logs.log import Log
-from cangauge.logs.read import read_log
 from cangauge.service.run import Service
 from cangauge.service.status_client import Snapshot
 from cangauge.types import Estimate, Reason, Status

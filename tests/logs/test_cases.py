@@ -25,9 +25,9 @@ from log_cases import (
     options_of,
 )
 
+from cangauge.bus.recording import read_log
 from cangauge.errors import InputError
 from cangauge.logs.log import Log
-from cangauge.logs.read import read_log
 from selection import nightly_except
 
 ERRORS: list[dict[str, Any]] = tomllib.loads((HERE / "errors.toml").read_text("utf-8"))["case"]
@@ -120,7 +120,7 @@ def test_what_cannot_be_read_is_refused_with_the_cure(tmp_path: Path, case: dict
         (b"\0\1\0\0Standard Jet DB\0", r"Arbin.*mdb-export"),
         (b"\xfd7zXZ\0", "unxz"),
         (b"\x28\xb5\x2f\xfd", "unzstd"),
-        (b"\x00\x01\x02", "not a known kind of log; known are: canonical Parquet"),
+        (b"\x00\x01\x02", "not a known kind of log, nor of capture; known logs: canonical Par"),
         (b"\x1f\x8bnot gzip", "packed file is cut off or damaged"),
         (b"PK\x03\x04not zip", "zip file is cut off or damaged"),
         (b"PAR1not parquet", "Parquet file is cut off or damaged"),

@@ -13,9 +13,9 @@ import numpy as np
 import pytest
 from log_cases import CASES, CURRENT_A, START, TIME_S, VOLTAGE_V, content_of
 
+from cangauge.bus.recording import read_log
 from cangauge.errors import InputError
 from cangauge.logs.log import Log
-from cangauge.logs.read import read_log
 
 
 def changed(folder: Path, name: str, old: str, new: str, file_name: str = "") -> Log:

@@ -14,10 +14,11 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from log_cases import CURRENT_A, SOC_PCT, TIME_S, VOLTAGE_V
 
+from cangauge.bus.recording import read_log
 from cangauge.errors import InputError
 from cangauge.logs.canonical import write_log, write_table
 from cangauge.logs.log import TEMPERATURE_SOURCES, Log
-from cangauge.logs.read import read_cells, read_log
+from cangauge.logs.read import open_log
 
 CHANNELS = ("time_s", "current_a", "voltage_v", "temperature_c", "soc_pct")
 
@@ -63,14 +64,6 @@ def test_log_reads_back_exactly(log: Log, suffix: str | None, tmp_path: Path) ->
         assert back.name == "log"
     assert_same(back, log)
     assert not [text for text in back.remarks if not text.startswith("current looks inverted")]
-
-
-def test_log_in_the_battery_data_format_has_no_soc(tmp_path: Path, drive: Log) -> None:
-    write_log(drive, tmp_path / "drive.bdf.csv")
-    assert (tmp_path / "drive.bdf.csv").read_text().startswith("Test Time / s,Voltage / V,Current")
-    back = read_log(tmp_path / "drive.bdf.csv")
-    np.testing.assert_array_equal(back.current_a, drive.current_a)
-    assert (back.soc_pct, back.temperature_source, back.name) == (None, "cell", "drive")
 
 
 @pytest.mark.parametrize(
@@ -177,6 +170,8 @@ def test_table_of_any_types_and_columns() -> None:
     )
     with pytest.raises(InputError, match="no rows"):
         Log.from_dataframe(table().slice(0, 0))
+    with pytest.raises(InputError, match="not a known temperature source"):
+        Log.from_dataframe(table(), temperature_source="oven")
     with pytest.raises(InputError, match=r"not a log .got 'int'.; give a Log, the path of one"):
         Log.from_dataframe(7)
 
@@ -270,6 +265,13 @@ def test_tables_of_any_columns(tmp_path: Path) -> None:
     assert (tmp_path / "x.csv").read_text() == 'time_s,status,soc\n0,"valid",\n1,"a,b",0.1\n'
 
 
+def test_names_of_a_canonical_log_define_its_units(tmp_path: Path, drive: Log) -> None:
+    write_log(drive, tmp_path / "x.csv")
+    head, rows = (tmp_path / "x.csv").read_text().split("\n", 1)
+    (tmp_path / "x.csv").write_text(f"{head}\ns,mA,mV,K,%,cell\n{rows}")
+    assert_same(read_log(tmp_path / "x.csv"), drive)
+
+
 @pytest.mark.parametrize(
     ("headings", "scale", "kind"),
     [("cell_{:02d}_v", 1.0, "csv"), ("Cell {} [V]", 1.0, "csv"), ("Zelle {} (mV)", 1e3, "parquet")],
@@ -287,19 +289,20 @@ def test_cells_beside_a_log(
     write_table(columns, path)
     log = read_log(path)
     np.testing.assert_array_equal(log.voltage_v, drive.voltage_v)
-    found = read_cells(path, log.time_s[3:])
+    found = open_log(path).cells(log.time_s[3:])
     assert found is not None
     assert (found.first, found.count) == (1, 16)
     np.testing.assert_allclose(found.voltage_v, cells[3:])
-    later = read_cells(path, log.time_s + 0.25)
+    later = open_log(path).cells(log.time_s + 0.25)
     assert later is not None
     assert np.isnan(later.voltage_v).all()
     del columns[headings.format(5)]
     write_table(columns, path)
     with pytest.raises(InputError, match="cell_5_v: the cells must be numbered"):
-        read_cells(path, log.time_s)
+        open_log(path).cells(log.time_s)
 
 
-def test_log_without_cells_has_none(tmp_path: Path, drive: Log) -> None:
-    write_log(drive, tmp_path / "x.csv")
-    assert read_cells(tmp_path / "x.csv", drive.time_s) is None
+def test_log_without_cells_or_with_one_has_none(tmp_path: Path, drive: Log) -> None:
+    for columns in (drive.to_arrow(), drive.to_arrow().append_column("cell_1_v", [[3.7] * 60])):
+        write_table(columns, tmp_path / "x.csv")
+        assert open_log(tmp_path / "x.csv").cells(drive.time_s) is None

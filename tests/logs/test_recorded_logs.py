@@ -8,9 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from cangauge.bus.recording import read_log
 from cangauge.errors import InputError
-from cangauge.logs.read import read_log
-from cangauge.logs.sign import charge_ah, sign_of_current
+from cangauge.logs.gaps import discharged_ah
+from cangauge.logs.sign import sign_of_current
 from selection import nightly_except
 
 pytestmark = pytest.mark.real
@@ -43,7 +44,7 @@ def test_every_file_has_its_charge_and_sign(shared_data: Path, pattern: str, eve
     for path in paths[::every]:
         log = read_log(path)
         assert log.temperature_source in {source, "unknown"}, path.name
-        assert low_ah <= np.ptp(charge_ah(log)) < high_ah, path.name
+        assert low_ah <= np.ptp(discharged_ah(log.time_s, log.current_a)) < high_ah, path.name
         sign = 0 if path.name in UNDECIDED else 1
         assert sign_of_current(log).sign == sign, path.name
         assert sign_of_current(replace(log, current_a=-log.current_a)).sign == -sign, path.name
@@ -58,7 +59,7 @@ def test_values_that_single_files_have(shared_data: Path) -> None:
         assert log.temperature_c[0] == float(path.name.split("_P")[1][:2])
         if path.name.lower().endswith(("s1.csv.gz", "s3.csv.gz")):  # discharge and charge scripts
             way = 1.0 if "s1" in path.name.lower() else -1.0
-            assert 1.9 < way * charge_ah(log)[-1] < 2.2
+            assert 1.9 < way * discharged_ah(log.time_s, log.current_a)[-1] < 2.2
     trip = read_log(shared_data / "bmw_i3" / "TripA01.csv.gz")
     assert trip.soc_pct is not None
     assert trip.soc_pct[0] - np.nanmin(trip.soc_pct) > 2.0

@@ -12,9 +12,9 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
+from cangauge.bus.recording import read_log
 from cangauge.errors import InputError
 from cangauge.logs.log import Log
-from cangauge.logs.read import read_log
 
 ROWS = 600
 

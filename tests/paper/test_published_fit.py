@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from cangauge._resources import shared_file
+from cangauge.bus.recording import read_log
 from cangauge.identify.fit import fit
 from cangauge.identify.identification import Identification
-from cangauge.logs.read import read_log
 from cangauge.model import published
 
 MODEL = published.leaf_2012_model()

@@ -12,10 +12,10 @@ import pyarrow.parquet as pq
 import pytest
 
 from cangauge._resources import shared_file
+from cangauge.bus.recording import read_log
 from cangauge.identify.rows import FitRows, decimate, fit_rows
 from cangauge.logs.gaps import discharged_ah
 from cangauge.logs.log import Log
-from cangauge.logs.read import read_log
 from cangauge.model import published
 
 VARIANTS = ("white", "correlated")

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 import cangauge
+from cangauge.bus.recording import read_log
 from cangauge.estimation.compiled import make_estimator
 from cangauge.estimation.health import Health
 from cangauge.estimation.offline import samples_of
@@ -17,7 +18,6 @@ from cangauge.estimation.power import PackLimits
 from cangauge.estimation.settings import EstimatorSettings
 from cangauge.logs.gaps import discharged_ah
 from cangauge.logs.log import Log
-from cangauge.logs.read import read_log
 from cangauge.model.model_file import Model
 from chains import chain
 

@@ -14,7 +14,7 @@ from markupsafe import escape
 from cangauge._version import __version__
 from cangauge.bus.captures import CaptureInfo
 from cangauge.bus.decoder import FrameStatistics
-from cangauge.bus.recording import CaptureSamples
+from cangauge.bus.recording import CaptureSamples, read_log
 from cangauge.estimation.offline import estimate_log
 from cangauge.estimation.settings import EstimatorSettings
 from cangauge.extras.report.charts import Figure, TimeFigures
@@ -25,7 +25,6 @@ from cangauge.identify.fit import fit
 from cangauge.identify.identification import Identification
 from cangauge.logs.canonical import write_log
 from cangauge.logs.log import Log
-from cangauge.logs.read import read_log
 from cangauge.model.model_file import Model
 from cangauge.service.offline import RecordedEstimate
 from cangauge.types import REASON_WORDS, Reason

@@ -18,6 +18,7 @@ import pytest
 
 from cangauge.bus.open import BusAddress
 from cangauge.bus.reconnecting import ReconnectingBus
+from cangauge.bus.recording import read_log
 from cangauge.extras.inverter.gateway import Gateway, soc_fields
 from cangauge.extras.judge import suite
 from cangauge.extras.judge.live import LiveJudge, Stored
@@ -25,7 +26,6 @@ from cangauge.extras.judge.suite import FAULTS, PlayedDrive, run_suite
 from cangauge.extras.live import launch
 from cangauge.extras.live.addresses import http_address
 from cangauge.extras.live.launch import Live
-from cangauge.logs.read import read_log
 from cangauge.service.status_client import Snapshot
 from cangauge.types import Estimate, Reason, Sample, Status
 from live import LoggedLines, leaf_model, waits

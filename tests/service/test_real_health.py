@@ -9,11 +9,10 @@ from pathlib import Path
 import can
 import pytest
 
-from cangauge.bus.recording import open_vehicle_capture
+from cangauge.bus.recording import open_vehicle_capture, read_log
 from cangauge.bus.vehicle import Vehicle
 from cangauge.estimation.offline import run_estimator, samples_of
 from cangauge.estimation.settings import EstimatorSettings
-from cangauge.logs.read import read_log
 from cangauge.replay.encoder import FrameEncoder
 from cangauge.service.pipeline import Pipeline, PipelineSettings
 from cangauge.types import Estimate, Reason, Status

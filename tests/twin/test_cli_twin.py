@@ -12,13 +12,13 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
+from cangauge.bus.recording import read_log
 from cangauge.errors import InputError
 from cangauge.extras.validation import simulate
 from cangauge.extras.validation.twin import simulation
 from cangauge.extras.validation.twin.faults import parse_effect
 from cangauge.extras.validation.twin.pack import TwinPack
 from cangauge.extras.validation.twin_command import twin_command
-from cangauge.logs.read import read_log
 from cangauge.model.coulomb_counting import capacity_from_full_discharge
 
 app = typer.Typer()

@@ -332,7 +332,7 @@ class _Binder:
         """Return factor and offset from the DBC's unit to the canonical one."""
         column, source = LOG_COLUMNS[role], self._source
         try:
-            ends, _ = convert(
+            ends = convert(
                 np.array([0.0, 1.0]), column, codec.unit, source=source, label=codec.name
             )
         except InputError as error:

@@ -64,7 +64,7 @@ def demo_command(*, folder: Path = Path("out/demo"), json_output: bool = False) 
     from cangauge.estimation.settings import EstimatorSettings
     from cangauge.identify.fit import fit
     from cangauge.logs.canonical import write_log
-    from cangauge.logs.read import read_log
+    from cangauge.logs.read import open_log
     from cangauge.replay.steps import quantization_bound
     from cangauge.service.offline import RecordedEstimate, estimate_capture
 
@@ -77,12 +77,12 @@ def demo_command(*, folder: Path = Path("out/demo"), json_output: bool = False) 
     files = {"model": "model.json", "fit_page": "fit.html", "soc_page": "soc.html"}
     paths = {name: folder / file for name, file in files.items()}
     note("1/4  fit the voltage model to 2.6 h of the reconstructed Leaf test")
-    identification = fit([read_log(shared_file("replay", TRAINED_ON))], equation="published")
+    identification = fit([open_log(shared_file("replay", TRAINED_ON)).read()], equation="published")
     model = identification.model
     model.save(paths["model"])
     write_text_atomic(paths["fit_page"], extra("report.fit:fit_page")(identification).html())
     note("2/4  replay another 2.6 h on the bus at full speed, and estimate its SoC live")
-    log = read_log(shared_file("replay", PLAYED))
+    log = open_log(shared_file("replay", PLAYED)).read()
     log = replace(log, current_a=log.current_a + SENSOR_OFFSET_A)
     write_log(log, folder / PLAYED)
     for old in folder.glob("live*.log"):  # a recording is never overwritten

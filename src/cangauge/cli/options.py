@@ -134,11 +134,10 @@ class ReadingOptions:
 
     def cells_of(self, log: Log) -> CellColumns | None:
         """Return the cell voltages beside a log in its file; None for a capture or without any."""
-        from cangauge.logs.read import LogFile, read_cells
+        from cangauge.logs.read import LogFile
 
-        if not isinstance(self.open(Path(log.source)), LogFile):
-            return None
-        return read_cells(log.source, log.time_s, self.given_columns())
+        recording = self.open(Path(log.source))
+        return recording.cells(log.time_s) if isinstance(recording, LogFile) else None
 
     def car_of(self, capture: Path) -> Vehicle:
         """Return the vehicle; without one, raise an InputError that names the preset to give."""

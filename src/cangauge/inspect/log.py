@@ -18,12 +18,11 @@ from cangauge.identify.rows import (
     usable_rows,
 )
 from cangauge.inspect.channels import Channel, describe_channels
-from cangauge.logs.gaps import uncounted_gaps, usual_gap_s, usual_step_s
+from cangauge.logs.gaps import discharged_ah, uncounted_gaps, usual_gap_s, usual_step_s
 from cangauge.logs.log import Log
 from cangauge.logs.sign import (
     STEP_SPACING_S,
     SignFinding,
-    charge_ah,
     correlation,
     current_steps,
     sign_of_current,
@@ -210,7 +209,7 @@ def _timing(log: Log) -> Timing:
 
 
 def _charge(log: Log, gap_limit_s: float) -> Charge:
-    state, step = charge_ah(log), np.diff(log.time_s)
+    state, step = discharged_ah(log.time_s, log.current_a), np.diff(log.time_s)
     part, uncounted = np.diff(state), uncounted_gaps(log.time_s)
     return Charge(
         float(part[part > 0.0].sum()), float(np.abs(part[part < 0.0]).sum()),
@@ -230,11 +229,11 @@ def _soc(log: Log) -> Soc | None:
 
 
 def _resistance(log: Log) -> Resistance | None:
-    steps = current_steps(log)
-    if steps.current_a.size < MIN_STEPS:
+    current, voltage = current_steps(log)
+    if current.size < MIN_STEPS:
         return None
-    ohm = np.quantile(-steps.voltage_v / steps.current_a, [0.5, 0.25, 0.75]).tolist()
-    return Resistance(ohm[0], ohm[1], ohm[2], int(steps.current_a.size))
+    ohm = np.quantile(-voltage / current, [0.5, 0.25, 0.75]).tolist()
+    return Resistance(ohm[0], ohm[1], ohm[2], current.size)
 
 
 # --- Warnings
@@ -360,7 +359,7 @@ def _temperature(log: Log) -> tuple[Verdict, str]:
     }.get(log.temperature_source, f" ({log.temperature_source})")
     if span < TEMPERATURE_SPAN_K:
         return "no", f"temperature {f'spans only {span:.1f} K' if span else 'never changes'}{where}"
-    alike = correlation(charge_ah(log), log.temperature_c)
+    alike = correlation(discharged_ah(log.time_s, log.current_a), log.temperature_c)
     text = f"temperature spans {span:.1f} K, correlated with charge by {alike:+.2f}{where}"
     is_doubtful = abs(alike) > CORRELATED or where.startswith(";")
     return "partly" if is_doubtful else "yes", text

@@ -60,11 +60,8 @@ def _opened(head: Head) -> Iterator[Any]:
             yield pq.ParquetFile(stream, page_checksum_verification=True)
         except (pa.ArrowException, OSError, ValueError) as error:
             reason = (str(error) or type(error).__name__).splitlines()[0]
-            raise InputError(
-                f"the Parquet file is cut off or damaged ({reason})",
-                source=head.path,
-                cure="export again",
-            ) from error
+            problem = f"the Parquet file is cut off or damaged ({reason})"
+            raise InputError(problem, source=head.path, cure="export again") from error
 
 
 def arrow_table(schema: Any, read: Any, source: str) -> ArrowTable:
@@ -79,9 +76,7 @@ def build_table(
 ) -> Any:
     """Return a pyarrow.Table; NaN becomes null, a known temperature source becomes metadata."""
     arrays = {
-        name: pa.array(values, from_pandas=True)
-        if isinstance(values, np.ndarray) and np.issubdtype(values.dtype, np.floating)
-        else values
+        name: pa.array(values, from_pandas=True) if isinstance(values, np.ndarray) else values
         for name, values in columns.items()
     }
     metadata = {_METADATA_KEY: temperature_source} if temperature_source != "unknown" else None
@@ -91,45 +86,29 @@ def build_table(
 def write_log(log: Log, path: str | PathLike[str]) -> None:
     """Write a canonical log as `.parquet` or `.csv`, all or nothing; values read back exactly.
 
-    `.bdf`, `.bdf.csv` and `.bdf.parquet` are the Battery Data Format, which has no SoC.
-
     Raises
     ------
     InputError
         If the suffix is another one, or the folder is absent or not writable.
     """
-    if ".bdf" in Path(path).suffixes[-2:]:
-        place = "Ambient" if log.temperature_source == "room" else "Surface"
-        number = "" if place == "Ambient" else " T1"
-        columns = {
-            "Test Time / s": log.time_s,
-            "Voltage / V": log.voltage_v,
-            "Current / A": 0.0 - log.current_a,  # positive charges
-            f"{place} Temperature{number} / degC": log.temperature_c,
-        }
-        write_table(columns, path)
-        return
     table = log.to_arrow()
     if Path(path).suffix.lower() == ".csv" and log.temperature_source != "unknown":
         table = table.append_column(SOURCE, [[log.temperature_source] * len(log)])
-    _write(table, path)
+    write_table(table, path)
 
 
-def write_table(columns: Mapping[str, Any], path: str | PathLike[str]) -> None:
-    """Write arrays of one length as `.parquet` or `.csv`, all or nothing; NaN becomes missing."""
-    _write(build_table(columns), path)
-
-
-def _write(table: Any, path: str | PathLike[str]) -> None:
+def write_table(columns: Mapping[str, Any] | pa.Table, path: str | PathLike[str]) -> None:
+    """Write a table or arrays as `.parquet` or `.csv`, all or nothing; NaN becomes missing."""
+    table = columns if isinstance(columns, pa.Table) else build_table(columns)
     suffix = Path(path).suffix.lower()
-    if suffix not in {".parquet", ".pq", ".csv", ".bdf"}:
+    if suffix not in {".parquet", ".pq", ".csv"}:
         cure = "use .parquet or .csv"
         raise InputError("unknown suffix for a table", source=path, value=suffix, cure=cure)
     with atomic_path(path) as part:
-        if suffix in {".csv", ".bdf"}:
-            with part.open("wb") as file:
-                file.write((",".join(table.column_names) + "\n").encode())
-                options = pacsv.WriteOptions(include_header=False, quoting_style="needed")
-                pacsv.write_csv(table, file, options)
-        else:
+        if suffix != ".csv":
             pq.write_table(table, part, write_page_checksum=True)
+            return
+        with part.open("wb") as file:
+            file.write((",".join(table.column_names) + "\n").encode())
+            options = pacsv.WriteOptions(include_header=False, quoting_style="needed")
+            pacsv.write_csv(table, file, options)

@@ -5,11 +5,12 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Final, NamedTuple
+from itertools import chain, repeat
+from typing import Final
 
 from cangauge.errors import InputError, closest
 from cangauge.logs.headings import GUESS, Meaning, meaning_of, names_and_units
-from cangauge.logs.units import FIELDS, TemperatureSource, unit_of
+from cangauge.logs.units import FIELDS, REQUIRED, TemperatureSource, unit_of
 
 DOCS: Final = "docs/logs.md"
 """Page that explains the columns of a log."""
@@ -18,6 +19,7 @@ _SYNTAX: Final = (
     " time, current, voltage, temperature, soc"
 )
 _NEEDED: Final = ("time", "current", "voltage")
+_CANONICAL: Final = (*FIELDS.values(), "temperature_source")
 _JOINED: Final = ("time", "temperature")
 """Quantities of several columns: a date and its time; probes, whose median is taken."""
 _SPLIT: Final = re.compile(rf",\s*(?=(?:{'|'.join(FIELDS)})\s*=)", re.IGNORECASE)
@@ -76,22 +78,19 @@ class ColumnMap:
             texts[quantity] = text.strip()
         return cls(texts, where)
 
-
-class _Reading(NamedTuple):
-    """A reading of a user's column: its heading, its unit if stated, and its factor."""
-
-    heading: str
-    unit: str | None = None
-    factor: float = 1.0
+    def error(self, quantity: str, problem: str, cure: str) -> InputError:
+        """Return the error for the column of a quantity."""
+        field, text = f"{self.where} {quantity}", self.texts[quantity]
+        return InputError(problem, field=field, value=text, cure=cure)
 
 
-def _readings(text: str) -> list[_Reading]:
-    """Return the readings of a text: the whole is a heading, or ends in a factor, or a unit."""
-    found = [_Reading(text)]
+def _readings(text: str) -> list[tuple[str, str | None, float]]:
+    """Return (heading, unit, factor) as a text may be meant: the whole, less a factor, a unit."""
+    found: list[tuple[str, str | None, float]] = [(text, None, 1.0)]
     if match := _FACTOR.match(text):
-        found.append(_Reading(match["text"], factor=float(match["factor"])))
-    units = [(item, match) for item in found if (match := _UNIT.match(item.heading))]
-    return found + [_Reading(m["text"], m["unit"].strip(), item.factor) for item, m in units]
+        found.append((match["text"], None, float(match["factor"])))
+    units = [(match, factor) for each, _, factor in found if (match := _UNIT.match(each))]
+    return found + [(match["text"], match["unit"].strip(), factor) for match, factor in units]
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,10 +98,9 @@ class ChosenColumn:
     """Columns of a table that hold one quantity.
 
     Several places are a date and its time, temperatures whose median is taken, or the currents of
-    discharge and charge, whose difference is taken. The unit is the
-    user's, the heading's or that of the row of units. `others` are further columns of time: dates
-    beside a clock, or times in case that the first does not increase. `is_stated`: with the
-    user's unit or factor.
+    discharge and charge, whose difference is taken. The unit is the user's, the heading's or that
+    of the row of units. `others` are further columns of time: dates beside a clock, or times in
+    case that the first does not increase. `is_stated`: with the user's unit or factor.
     """
 
     places: tuple[int, ...]
@@ -115,56 +113,92 @@ class ChosenColumn:
 
 @dataclass(frozen=True, slots=True)
 class Choice:
-    """Columns of a table by quantity, and the likely columns of each that is not plain."""
+    """Columns of a table by quantity, and the likely columns of each that is not plain.
+
+    `is_canonical`: by the names of the canonical log, which define the sign of the current.
+    """
 
     chosen: dict[str, ChosenColumn] = field(default_factory=dict)
     guesses: dict[str, list[int]] = field(default_factory=dict)
+    is_canonical: bool = False
 
     @property
     def is_complete(self) -> bool:
-        """Whether time, current and voltage are known (a temperature may be given)."""
-        return set(_NEEDED) <= set(self.chosen)
+        """Whether time, current and voltage are known or named (a temperature may be given)."""
+        return self.is_canonical or set(_NEEDED) <= set(self.chosen)
 
 
 def choose_columns(
     headings: Sequence[str], units_below: Sequence[str] = (), given: ColumnMap | None = None
 ) -> Choice:
-    """Choose the columns of a table: the user's first, then plain headings.
+    """Choose the columns of a table: the user's first, then the canonical or plain headings.
 
     Raises
     ------
     InputError
         If a column of the user is not in the table, or is named for two quantities.
     """
-    below = [*units_below, *[""] * (len(headings) - len(units_below))]
-    meanings = [meaning_of(text, unit) for text, unit in zip(headings, below, strict=False)]
+    is_canonical = given is None and _are_canonical(headings)
+    units = chain(() if is_canonical else units_below, repeat(""))
+    meanings = [meaning_of(text, unit) for text, unit in zip(headings, units, strict=False)]
+    choice = Choice(is_canonical=is_canonical)
     given = given or ColumnMap()
-    choice = Choice()
-    owner: dict[int, str] = {}
-    for quantity, text in given.texts.items():
-        column = _given_column(quantity, text, headings, meanings, given.where)
-        for place in column.places:
-            if place in owner:
-                raise InputError(
-                    f"is the column of {owner[place]} too",
-                    field=f"{given.where} {quantity}",
-                    value=text,
-                    cure="give each quantity a column of its own, as headings or as #1, #2, …",
-                )
-        owner |= dict.fromkeys(column.places, quantity)
+    for quantity in given.texts:
+        column = _given_column(quantity, given, headings, meanings)
+        for other, chosen in choice.chosen.items():
+            if not set(column.places).isdisjoint(chosen.places):
+                cure = "give each quantity a column of its own, as headings or as #1, #2, …"
+                raise given.error(quantity, f"is the column of {other} too", cure)
         choice.chosen[quantity] = column
+    taken = {place for column in choice.chosen.values() for place in column.places}
     for quantity in [name for name in FIELDS if name not in given.texts]:
         plain = [
             (place, meaning)
             for place, meaning in enumerate(meanings)
-            if meaning is not None and meaning.quantity == quantity and place not in owner
+            if meaning is not None and meaning.quantity == quantity and place not in taken
         ]
+        if choice.is_canonical:
+            plain = [item for item in plain if _simple(headings[item[0]]) == FIELDS[quantity]]
         pair = _directions(headings, plain) if quantity == "current" else None
         if pair is not None:
             choice.chosen["current"] = pair
         elif plain:
             _choose(quantity, sorted(plain, key=lambda item: item[1].rank), choice)
     return choice
+
+
+def _are_canonical(headings: Sequence[str]) -> bool:
+    """Return whether columns have the names of a canonical log's, possibly an incomplete one.
+
+    A temperature of another name is not a missing one: such a table is a logger's own.
+    """
+    names = {_simple(heading) for heading in headings}
+    others = {name: meaning_of(name) for name in names.difference(_CANONICAL)}
+    has_other_temperature = any(
+        "temperature" in name or (meaning is not None and meaning.quantity == "temperature")
+        for name, meaning in others.items()
+    )
+    is_whole = "temperature_c" in names or not has_other_temperature
+    return len(names.intersection(REQUIRED)) >= 2 and is_whole
+
+
+def refuse_odd_names(headings: Sequence[str], source: str) -> None:
+    """Raise InputError if a column of the canonical log is missing, or if two have its name."""
+    names = [_simple(heading) for heading in headings]
+    for name in _CANONICAL:
+        refuse_doubled(name, names, source)
+        if name in REQUIRED[:3] and name not in names:
+            problem = f"this column is missing (found: {shown_headings(headings)})"
+            cure = "a log needs time_s, current_a (positive = discharge), voltage_v,"
+            cure += " temperature_c [s, A, V, °C]"
+            raise InputError(problem, source=source, field=name, cure=cure)
+
+
+def refuse_doubled(name: str, names: Sequence[str], source: str | None) -> None:
+    """Raise InputError if several columns have a name."""
+    if (count := list(names).count(name)) > 1:
+        problem, cure = f"{count} columns have this name", "rename or drop all but one"
+        raise InputError(problem, source=source, field=name, cure=cure)
 
 
 def _directions(
@@ -207,37 +241,25 @@ def _choose(quantity: str, plain: list[tuple[int, Meaning]], choice: Choice) -> 
 
 
 def _given_column(
-    quantity: str,
-    text: str,
-    headings: Sequence[str],
-    meanings: Sequence[Meaning | None],
-    where: str,
+    quantity: str, given: ColumnMap, headings: Sequence[str], meanings: Sequence[Meaning | None]
 ) -> ChosenColumn:
-    for reading in _readings(text):
-        places = _places(reading.heading, headings, is_joined=quantity in _JOINED)
+    for heading, stated, factor in _readings(given.texts[quantity]):
+        places = _places(heading, headings, is_joined=quantity in _JOINED)
         if not places:
             continue
         units = sorted({_stated_unit(headings[k], meanings[k], quantity) for k in places})
         is_mixed = len({unit_of("temperature_c", unit or "C") for unit in units}) > 1
-        if quantity == "temperature" and reading.unit is None and is_mixed:
-            raise InputError(
-                f"the headings have different units: {', '.join(unit or 'none' for unit in units)}",
-                field=f"{where} {quantity}",
-                value=text,
-                cure="name columns of one unit",
-            )
-        unit = reading.unit if reading.unit is not None else units[0] if len(units) == 1 else ""
-        first = meanings[places[0]]
-        source = first.source if first is not None and quantity == "temperature" else "unknown"
-        is_stated = reading.unit is not None or reading.factor != 1.0
-        return ChosenColumn(places, unit, reading.factor, source, is_stated)
-    near = closest(text, headings)
-    raise InputError(
-        f"no column has this heading (found: {shown_headings(headings)})",
-        field=f"{where} {quantity}",
-        value=text,
-        cure=f"did you mean {near}?" if near else _SYNTAX,
-    )
+        if quantity == "temperature" and stated is None and is_mixed:
+            shown = ", ".join(unit or "none" for unit in units)
+            problem = f"the headings have different units: {shown}"
+            raise given.error(quantity, problem, "name columns of one unit")
+        unit = stated if stated is not None else units[0] if len(units) == 1 else ""
+        first = meanings[places[0]] if quantity == "temperature" else None
+        source = first.source if first is not None else "unknown"
+        return ChosenColumn(places, unit, factor, source, stated is not None or factor != 1.0)
+    near = closest(given.texts[quantity], headings)
+    problem = f"no column has this heading (found: {shown_headings(headings)})"
+    raise given.error(quantity, problem, f"did you mean {near}?" if near else _SYNTAX)
 
 
 def _stated_unit(heading: str, meaning: Meaning | None, quantity: str) -> str:
@@ -292,11 +314,9 @@ def unknown_columns(source: str, headings: Sequence[str], choice: Choice) -> Inp
         likely[quantity] = "+".join(headings[place] for place in column.places)
     names = [name for name in FIELDS if name in likely or name in _NEEDED]
     columns = ",".join(f"{name}={likely.get(name, '?')}" for name in names).replace("'", "'\\''")
-    return InputError(
-        f"no plain heading of {missing} (found: {shown_headings(headings)})",
-        source=source,
-        cure="; ".join([f"name the columns, e.g. --columns '{columns}' ({DOCS})", *several]),
-    )
+    problem = f"no plain heading of {missing} (found: {shown_headings(headings)})"
+    cure = "; ".join([f"name the columns, e.g. --columns '{columns}' ({DOCS})", *several])
+    return InputError(problem, source=source, cure=cure)
 
 
 def shown_headings(headings: Sequence[str]) -> str:

@@ -10,12 +10,17 @@ import numpy as np
 
 from cangauge._text import counted
 from cangauge._typing import BoolArray, FloatArray
-from cangauge.errors import InputError
+from cangauge.errors import InputError, require_number
 from cangauge.logs.column_map import shown_headings
 from cangauge.logs.headings import cell_number
 from cangauge.logs.log import Log
 from cangauge.logs.sign import resolve_sign
-from cangauge.logs.units import REQUIRED, TemperatureSource, refuse_wrong_units
+from cangauge.logs.units import (
+    REQUIRED,
+    TemperatureSource,
+    known_temperature_source,
+    refuse_wrong_units,
+)
 
 Sign = Literal["charge", "discharge"]
 """What a positive current in the file does."""
@@ -86,43 +91,43 @@ class DraftLog:
         if len(probes_c) == 1:
             return
         values = np.vstack(probes_c)
-        is_known = np.isfinite(values)
-        rows = is_known.any(axis=0)
-        median = np.full(rows.size, np.nan)
-        median[rows] = np.nanmedian(values[:, rows], axis=0)
+        values[np.isinf(values)] = np.nan
+        known = np.isfinite(values).any(axis=0)
+        median = np.full(known.size, np.nan)
+        median[known] = np.nanmedian(values[:, known], axis=0)
         self.values["temperature_c"] = median
-        highest = np.max(np.where(is_known, values, -np.inf), axis=0)
-        lowest = np.min(np.where(is_known, values, np.inf), axis=0)
-        apart = highest - lowest > _PROBES_APART_K
+        apart = np.fmax.reduce(values) - np.fmin.reduce(values) > _PROBES_APART_K
         if apart.any():
             row = int(np.argmax(apart))
             shown = " and ".join(f"{value:.4g}" for value in values[:, row])
-            self.remarks.append(
-                f"temperature: {' and '.join(names)} are {shown} °C in row {row + 1}: one of the"
-                " probes fails; name the good ones with --columns temperature=…"
-            )
+            apart_c = f"{' and '.join(names)} are {shown} °C in row {row + 1}"
+            cure = "one of the probes fails; name the good ones with --columns temperature=…"
+            self.remarks.append(f"temperature: {apart_c}: {cure}")
 
     def log(
         self,
         temperature_c: float | None = None,
         temperature_source: TemperatureSource | None = None,
         sign: Sign | None = None,
-        used: Sequence[str] = (),
     ) -> Log:
         """Check all values and return the log, with its sign of current found or confirmed.
 
         Rows that lack a value or repeat the time stamp of the row before are dropped, with a
-        remark. The first three arguments are the user's, as of `cangauge.read_log`; `used` are
-        columns that the caller reads besides.
+        remark. Arguments and errors as of `cangauge.read_log`.
         """
         if sign is not None:
+            if sign not in {"charge", "discharge"}:
+                cure = "say what a positive current does: charge or discharge"
+                raise InputError("not a sign", field="--sign", value=sign, cure=cure)
             if (sign == "charge") is not self.negated:
                 self.negate_current(f"positive {sign}s in the file, as stated")
             self.sign_unknown = False
         if not self.values["time_s"].size:
-            raise InputError("the log holds no rows", source=self._where, cure="check the export")
-        self._remark_ignored(used)
+            raise InputError("the log holds no rows", source=self.where, cure="check the export")
+        self._remark_ignored()
         self._set_temperature(temperature_c)
+        if temperature_source is not None:
+            self.temperature_source = known_temperature_source(temperature_source)
         if "soc_pct" in self.values:
             self.values["soc_pct"][np.isinf(self.values["soc_pct"])] = np.nan
         self._drop_incomplete()
@@ -131,7 +136,7 @@ class DraftLog:
             values.flags.writeable = False  # the log need not copy them
         self.remarks += refuse_wrong_units(
             self.values,
-            source=self._where,
+            source=self.where,
             labels=self.labels,
             in_seconds=self.in_seconds,
             stated=self.stated,
@@ -140,18 +145,17 @@ class DraftLog:
             **self.values,
             name=self.name,
             source=self.source,
-            temperature_source=temperature_source or self.temperature_source,
+            temperature_source=self.temperature_source,
             remarks=tuple(self.remarks),
             assumed=tuple(self.assumed),
         )
         return resolve_sign(log, stored_sign_unknown=self.sign_unknown, is_stated=sign is not None)
 
-    def _remark_ignored(self, used: Sequence[str]) -> None:
-        ignored = [name for name in self.ignored if name not in used]
-        cells = [name for name in ignored if cell_number(name) is not None]
-        if len(cells) > 1:  # `read_cells`
+    def _remark_ignored(self) -> None:
+        cells = [name for name in self.ignored if cell_number(name) is not None]
+        if len(cells) > 1:  # `LogFile.cells`
             self.remarks.append(f"{len(cells)} cells: {cells[0]} … {cells[-1]}")
-            ignored = [name for name in ignored if name not in cells]
+        ignored = [name for name in self.ignored if len(cells) < 2 or name not in cells]
         if ignored:
             shown = ", ".join(ignored[:6]) + (", …" if len(ignored) > 6 else "")
             self.remarks.append(f"{counted(len(ignored), 'other column')} ignored: {shown}")
@@ -159,29 +163,32 @@ class DraftLog:
     def _set_temperature(self, given_c: float | None) -> None:
         kind = "file" if self.source else "table"
         if given_c is not None:
+            require_number(given_c, "--temperature")
             replaced = f" in place of the {kind}'s" if "temperature_c" in self.values else ""
             self.remarks.append(f"temperature {given_c:g} °C as given{replaced}")
             self.values["temperature_c"] = np.full(self.values["time_s"].size, float(given_c))
+            self.labels["temperature_c"] = "--temperature"
+            self.stated.add("temperature_c")
             self.temperature_source = "unknown"
         elif "temperature_c" not in self.values:
             found = f" (found: {shown_headings(self.headings)})" if self.headings else ""
             named = "name its column with --columns temperature=…" if found else "add this column"
             option = "--temperature" if self.source else "temperature_c"
             cure = f"{named} [°C], or give a constant with {option}"
-            raise self._error("temperature_c", f"the {kind} holds no temperature{found}", cure)
+            raise self.error("temperature_c", f"the {kind} holds no temperature{found}", cure)
 
     def _drop_incomplete(self) -> None:
         lacks = {name: ~np.isfinite(self.values[name]) for name in REQUIRED}
         incomplete = np.any([*lacks.values()], axis=0)
         for name, rows in lacks.items():
             if rows.all():
-                raise self._error(name, "the column is empty", "check the export")
+                raise self.error(name, "the column is empty", "check the export")
         count, row = int(incomplete.sum()), int(np.argmax(incomplete))
         lacking = "time, current, voltage or temperature"
         if count > MAX_INCOMPLETE * incomplete.size:
             name = next(name for name, rows in lacks.items() if rows[row])
             problem = f"{count} of {incomplete.size} rows lack {lacking}"
-            raise self._error(name, problem, f"check the export: the first is row {row + 1}")
+            raise self.error(name, problem, f"check the export: the first is row {row + 1}")
         self.keep(~incomplete, f"without {lacking} dropped (the first is row {row + 1})")
 
     def _drop_repeated(self) -> None:
@@ -190,16 +197,11 @@ class DraftLog:
         back = np.flatnonzero(step < 0.0)
         if back.size:
             row = int(back[0])
-            is_reversed = 2 * back.size > step.size
-            raise self._error(
-                "time_s",
-                f"time runs backwards at row {row + 1} ({back.size} such rows;"
-                f" the row before has {time[row - 1]:.6f} s)",
-                "sort the rows by time"
-                if is_reversed
-                else "split the file there into one log each: the clock was set back or restarted",
-                float(time[row]),
-            )
+            before = f"the row before has {time[row - 1]:.6f} s"
+            problem = f"time runs backwards at row {row + 1} ({back.size} such rows; {before})"
+            cure = "split the file there into one log each: the clock was set back or restarted"
+            cure = "sort the rows by time" if 2 * back.size > step.size else cure
+            raise self.error("time_s", problem, cure, float(time[row]))
         repeats = step == 0.0
         row = int(np.argmax(repeats))
         differs = np.any([np.diff(v, prepend=v[0]) != 0.0 for v in self.values.values()], axis=0)
@@ -208,15 +210,16 @@ class DraftLog:
         if count > MAX_INCOMPLETE * time.size and apart_s > _COARSE_S:  # stamps of whole minutes
             problem = f"{count} of {time.size} rows have the time stamp of the row before"
             cure = f"export fractions of a second, or one row per time: the first is row {row + 1}"
-            raise self._error("time_s", problem, cure)
-        self.keep(
-            ~repeats, f"with the time stamp of the row before dropped (the first is row {row + 1})"
-        )
+            raise self.error("time_s", problem, cure)
+        remark = f"with the time stamp of the row before dropped (the first is row {row + 1})"
+        self.keep(~repeats, remark)
 
     @property
-    def _where(self) -> str:
+    def where(self) -> str:
+        """The file, or the name of a table in memory, for messages."""
         return self.source or self.name
 
-    def _error(self, name: str, problem: str, cure: str, value: float | None = None) -> InputError:
+    def error(self, name: str, problem: str, cure: str, value: object = None) -> InputError:
+        """Return the error for a column, by its canonical name or, of others, its heading."""
         label = self.labels.get(name, name)
-        return InputError(problem, source=self._where, field=label, value=value, cure=cure)
+        return InputError(problem, source=self.where, field=label, value=value, cure=cure)

@@ -17,14 +17,11 @@ from cangauge.logs.log import Log
 
 BRIDGE_S: Final = 60.0
 """No charge is counted over a longer gap in the current [s]: the pack is assumed to rest."""
-
 USUAL_STEPS: Final = 3.0
 """A step is a gap, whatever its length, above this many usual steps [-]: two rows lost."""
-
 MOVED_PCT: Final = 1.0
 """Change of a log's own SoC over an uncounted gap from which the pack was used in it [%]: the
 resolution of a dashboard."""
-
 PIECE_S: Final = 300.0
 """Shortest piece of a split log that is kept [s]: the delay line fills for 70 s of it."""
 

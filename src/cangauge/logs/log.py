@@ -15,11 +15,7 @@ from cangauge._extras import extra
 from cangauge._text import duration
 from cangauge._typing import BoolArray, FloatArray, IntArray
 from cangauge.errors import InputError, naming_arguments
-from cangauge.logs.units import (
-    REQUIRED,
-    TEMPERATURE_SOURCES,
-    TemperatureSource,
-)
+from cangauge.logs.units import REQUIRED, TEMPERATURE_SOURCES, TemperatureSource
 
 __all__ = ["TEMPERATURE_SOURCES", "Log", "TemperatureSource"]
 
@@ -88,40 +84,28 @@ class Log(ArrowExport):
 
     def __post_init__(self) -> None:
         where = self.source or self.name
-        for channel in (*REQUIRED, "soc_pct"):
-            values = getattr(self, channel)
-            if values is not None:
-                object.__setattr__(self, channel, _read_only(values))
-        n = self.time_s.size
-        if n == 0:
-            raise InputError("the log holds no rows", source=where, cure="check the export")
-        for channel in (*REQUIRED, "soc_pct"):
-            values = getattr(self, channel)
-            if values is None:
-                continue
+        for channel, given in self._channels().items():
+            values = _read_only(given)
+            object.__setattr__(self, channel, values)
+            n = self.time_s.size
+            if n == 0:
+                raise InputError("the log holds no rows", source=where, cure="check the export")
             if values.shape != (n,):
                 problem = f"has {values.size} values where time_s has {n}"
                 raise InputError(problem, source=where, field=channel)
             bad = np.flatnonzero(~np.isfinite(values)) if channel in REQUIRED else np.empty(0)
             if bad.size:
-                raise InputError(
-                    f"{bad.size} of {n} values are not finite, the first in row {bad[0] + 1}",
-                    source=where,
-                    field=channel,
-                    value=float(values[bad[0]]),
-                    cure="fill or drop these rows",
-                )
+                problem = f"{bad.size} of {n} values are not finite, the first in row {bad[0] + 1}"
+                value, cure = float(values[bad[0]]), "fill or drop these rows"
+                raise InputError(problem, source=where, field=channel, value=value, cure=cure)
         back = np.flatnonzero(np.diff(self.time_s) <= 0.0)
         if back.size:
             row = int(back[0]) + 1
-            raise InputError(
-                f"time does not increase at row {row + 1} ({back.size} such rows;"
-                f" the row before has {self.time_s[row - 1]:.6f} s)",
-                source=where,
-                field="time_s",
-                value=float(self.time_s[row]),
-                cure="sort the rows by time and drop duplicated stamps",
-            )
+            before = f"the row before has {self.time_s[row - 1]:.6f} s"
+            problem = f"time does not increase at row {row + 1} ({back.size} such rows; {before})"
+            value = float(self.time_s[row])
+            cure = "sort the rows by time and drop duplicated stamps"
+            raise InputError(problem, source=where, field="time_s", value=value, cure=cure)
 
     @classmethod
     @naming_arguments
@@ -164,16 +148,10 @@ class Log(ArrowExport):
         array([380., 379.])
         """
         # Deferred: the service runs where pyarrow is not installed.
-        from cangauge.logs.read import log_of_dataframe  # noqa: PLC0415
+        from cangauge.logs.read import draft_of_dataframe  # noqa: PLC0415
 
-        return log_of_dataframe(
-            table,
-            name=name,
-            temperature_c=temperature_c,
-            temperature_source=temperature_source,
-            columns=columns,
-            sign=sign,
-        )
+        draft = draft_of_dataframe(table, name, columns)
+        return draft.log(temperature_c, temperature_source, sign)
 
     def to_arrow(self) -> Any:
         """Return a pyarrow.Table of the columns; missing SoC is null.
@@ -182,21 +160,12 @@ class Log(ArrowExport):
         """
         from cangauge.logs.canonical import build_table  # noqa: PLC0415 - pyarrow, as above
 
-        columns = {channel: getattr(self, channel) for channel in REQUIRED}
-        if self.soc_pct is not None:
-            columns["soc_pct"] = self.soc_pct
-        return build_table(columns, self.temperature_source)
+        return build_table(self._channels(), self.temperature_source)
 
     def __repr__(self) -> str:
         """Return one line of what the log holds."""
-        spans = [
-            f"{values.min():.4g} … {values.max():.4g} {unit}"
-            for values, unit in (
-                (self.current_a, "A"),
-                (self.voltage_v, "V"),
-                (self.temperature_c, "°C"),
-            )
-        ]
+        channels = {"A": self.current_a, "V": self.voltage_v, "°C": self.temperature_c}
+        spans = [f"{v.min():.4g} … {v.max():.4g} {unit}" for unit, v in channels.items()]
         text = f"{self.name!r}: {len(self):,} rows in {duration(self.duration_s)}"
         soc = np.empty(0) if self.soc_pct is None else self.soc_pct[np.isfinite(self.soc_pct)]
         if soc.size:
@@ -225,14 +194,13 @@ class Log(ArrowExport):
 
     def rows(self, keep: BoolArray | IntArray | slice) -> Self:
         """Return the log of the rows that `keep` selects (mask, indices or slice)."""
-        return replace(
-            self,
-            time_s=self.time_s[keep],
-            current_a=self.current_a[keep],
-            voltage_v=self.voltage_v[keep],
-            temperature_c=self.temperature_c[keep],
-            soc_pct=None if self.soc_pct is None else self.soc_pct[keep],
-        )
+        kept: dict[str, Any] = {name: values[keep] for name, values in self._channels().items()}
+        return replace(self, **kept)
+
+    def _channels(self) -> dict[str, FloatArray]:
+        """Return the columns that the log has, by name."""
+        channels = {name: getattr(self, name) for name in (*REQUIRED, "soc_pct")}
+        return {name: values for name, values in channels.items() if values is not None}
 
 
 def as_log(log: Any) -> Log:
@@ -240,9 +208,9 @@ def as_log(log: Any) -> Log:
     if isinstance(log, Log):
         return log
     if isinstance(log, str | PathLike):
-        from cangauge.logs.read import read_log  # noqa: PLC0415 - pyarrow, as above
+        from cangauge.logs.read import open_log  # noqa: PLC0415 - pyarrow, as above
 
-        return read_log(log)
+        return open_log(log).read()
     return Log.from_dataframe(log)
 
 

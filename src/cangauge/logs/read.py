@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from functools import cache
 from importlib import import_module
 from importlib.metadata import entry_points
-from itertools import pairwise
 from os import PathLike
 from typing import Any, Final, Protocol
 
@@ -16,15 +15,14 @@ import pyarrow as pa
 
 from cangauge._files import Head
 from cangauge._typing import FloatArray
-from cangauge.errors import InputError, require_number
+from cangauge.errors import InputError
 from cangauge.logs.canonical import arrow_table, parquet_table
-from cangauge.logs.column_map import DOCS, ColumnMap, unknown_columns
+from cangauge.logs.column_map import DOCS, ColumnMap, choose_columns, unknown_columns
 from cangauge.logs.draft import DraftLog, Sign
 from cangauge.logs.headings import cell_number
 from cangauge.logs.log import Log, TemperatureSource
-from cangauge.logs.table import ArrowTable, draft_of_table, is_canonical
-from cangauge.logs.text import TextTable, find_table, likely_header, table_below
-from cangauge.logs.units import COLDEST_C, HOTTEST_C, known_temperature_source
+from cangauge.logs.table import ArrowTable, draft_of_table
+from cangauge.logs.text import TextTable, find_table, likely_header
 from cangauge.logs.values import numbers_of, with_decimal_points
 
 KNOWN_LOGS: Final = (
@@ -36,6 +34,7 @@ _FORMATS: Final = tuple(
     f"cangauge.extras.formats.{module}" for module in ("exports", "tables", "measurement")
 )
 """Modules with further readers, each in its tuple `READERS`; loaded when a log is opened."""
+_PARQUET: Final = b"PAR1"
 _FRAME_WORDS: Final = frozenset({"id", "can id", "identifier", "dlc", "len", "data", "d1"})
 """Headings of CAN frames: an id, a length or bytes."""
 GROUP: Final = "cangauge.readers"
@@ -45,7 +44,6 @@ GROUP: Final = "cangauge.readers"
 class LogReader(Protocol):
     """Reader of one format of logs."""
 
-    name: str
     takes_columns: bool
     """Whether the user may name the columns of this format."""
 
@@ -57,39 +55,27 @@ class LogReader(Protocol):
 
 
 class LogTableReader:
-    """Canonical Parquet or CSV, or any such table with plain headings or the user's columns."""
+    """Parquet or text with canonical or plain headings, or the user's columns of it."""
 
-    name = "table"
     takes_columns = True
 
     def matches(self, head: Head) -> bool:
         """Return whether the file is Parquet, or a text with time, current and voltage."""
-        return _is_parquet(head) or bool(_canonical_text(head) or find_table(head))
+        return head.data.startswith(_PARQUET) or find_table(head) is not None
 
     def read(self, head: Head, columns: ColumnMap | None = None) -> DraftLog:
-        """Read a log; see `LogReader`."""
-        table = open_table(head, columns)
-        return draft_of_table(table, columns, name=head.name, source=str(head.path))
+        """Read the table; see `LogReader`."""
+        return draft_of_table(
+            self.table(head, columns), columns, name=head.name, source=str(head.path)
+        )
 
-
-def _is_parquet(head: Head) -> bool:
-    return head.data.startswith(b"PAR1")
-
-
-def _canonical_text(head: Head) -> TextTable | None:
-    table = table_below(head, head.first_line) if head.first_line else None
-    return table if table is not None and is_canonical(table.headings) else None
-
-
-def open_table(head: Head, columns: ColumnMap | None) -> TextTable | ArrowTable:
-    """Return Parquet or a text as a table; raise InputError where it is none."""
-    if _is_parquet(head):
-        return parquet_table(head)
-    table = _canonical_text(head) if columns is None else None
-    table = table or find_table(head, columns)
-    if table is None:
-        raise unknown_columns(str(head.path), *likely_header(head, columns))
-    return table
+    def table(self, head: Head, columns: ColumnMap | None) -> TextTable | ArrowTable:
+        """Return the table, of which only the headings are read yet."""
+        is_parquet = head.data.startswith(_PARQUET)
+        table = parquet_table(head) if is_parquet else find_table(head, columns)
+        if table is None:
+            raise unknown_columns(str(head.path), *likely_header(head, columns))
+        return table
 
 
 @cache
@@ -98,155 +84,6 @@ def _readers() -> tuple[LogReader, ...]:
     others = [entry.load()() for entry in entry_points(group=GROUP)]
     formats = [reader for name in _FORMATS for reader in import_module(name).READERS]
     return (*others, *formats, LogTableReader())
-
-
-@dataclass(frozen=True, slots=True)
-class LogFile:
-    """A file that may be a log, recognised by its beginning.
-
-    `reader` is None if it is not a log. `columns` and `sign` are the user's; `used` are columns
-    that the caller reads besides.
-    """
-
-    head: Head
-    reader: LogReader | None
-    columns: ColumnMap | None = None
-    sign: Sign | None = None
-    used: tuple[str, ...] = ()
-
-    @property
-    def is_any_table(self) -> bool:
-        """Whether the file is a table of plain headings, not of a format that defines them."""
-        is_text = isinstance(self.reader, LogTableReader) and not _is_parquet(self.head)
-        return is_text and _canonical_text(self.head) is None
-
-    def read(
-        self,
-        *,
-        temperature_c: float | None = None,
-        temperature_source: TemperatureSource | None = None,
-    ) -> Log:
-        """Read the log; see `read_log`."""
-        if self.reader is None:
-            raise not_recognised(self, "not a known kind of log", f"known are: {KNOWN_LOGS}")
-        _refuse_options(temperature_c, temperature_source, self.sign)
-        try:
-            draft = self.reader.read(self.head, self.columns)
-            log = draft.log(temperature_c, temperature_source, self.sign, self.used)
-        except MemoryError as error:
-            raise InputError(
-                "larger than the free memory", source=self.head.path, cure="split it"
-            ) from error
-        pa.default_memory_pool().release_unused()
-        return log
-
-
-def _refuse_options(
-    temperature_c: float | None, temperature_source: str | None, sign: str | None
-) -> None:
-    if temperature_source is not None:
-        known_temperature_source(temperature_source)
-    if temperature_c is not None:
-        require_number(temperature_c, "--temperature")
-        if not COLDEST_C <= temperature_c <= HOTTEST_C:
-            problem = f"must lie within {COLDEST_C:g} … {HOTTEST_C:g} °C"
-            raise InputError(problem, field="--temperature", value=temperature_c)
-    if sign not in {None, "charge", "discharge"}:
-        cure = "say what a positive current does: charge or discharge"
-        raise InputError("not a sign", field="--sign", value=sign, cure=cure)
-
-
-def not_recognised(file: LogFile, problem: str, cure: str) -> InputError:
-    """Return the error for a file of unknown format: its columns if it is a table."""
-    head = file.head
-    foreign = import_module("cangauge.extras.formats.foreign").foreign_format(head.data)
-    if foreign is not None:
-        return InputError(f"{problem}: it is {foreign[0]}", source=head.path, cure=foreign[1])
-    headings, choice = likely_header(head)
-    is_of_frames = not _FRAME_WORDS.isdisjoint(text.strip().lower() for text in headings)
-    if len(headings) >= 3 and not is_of_frames:
-        error = unknown_columns(str(head.path), headings, choice)
-        return InputError(f"{problem}: {error.problem}", source=head.path, cure=error.cure)
-    shown = head.first_line.strip()
-    is_text = bool(shown) and shown.isprintable()
-    return InputError(
-        problem,
-        source=head.path,
-        field="first line" if is_text else None,
-        value=shown[:80] if is_text else None,
-        cure=f"{cure}; other tables: --columns ({DOCS})",
-    )
-
-
-def open_log(
-    path: str | PathLike[str],
-    *,
-    columns: ColumnMap | Mapping[str, str] | str | None = None,
-    sign: Sign | None = None,
-) -> LogFile:
-    """Read the beginning of a file and find its format; parameters as of `read_log`.
-
-    Raises
-    ------
-    InputError
-        If the file is absent, empty, damaged or not a regular file.
-    """
-    head, given = Head(path), None if columns is None else ColumnMap.of(columns)
-    for reader in _readers():
-        if (given is None or reader.takes_columns) and reader.matches(head):
-            return LogFile(head, reader, given, sign)
-    # The user's columns make a table of any text.
-    return LogFile(head, None if given is None else LogTableReader(), given, sign)
-
-
-def read_log(
-    path: str | PathLike[str],
-    *,
-    temperature_c: float | None = None,
-    temperature_source: TemperatureSource | None = None,
-    columns: ColumnMap | Mapping[str, str] | str | None = None,
-    sign: Sign | None = None,
-) -> Log:
-    """Read a log of any known format, plain, packed by gzip or bzip2, or in a zip.
-
-    Arguments and errors as of `cangauge.read_log`, which also reads captures.
-    """
-    file = open_log(path, columns=columns, sign=sign)
-    return file.read(temperature_c=temperature_c, temperature_source=temperature_source)
-
-
-def log_of_dataframe(
-    frame: Any,
-    *,
-    name: str,
-    temperature_c: float | None,
-    temperature_source: TemperatureSource | None,
-    columns: ColumnMap | Mapping[str, str] | str | None,
-    sign: Sign | None,
-) -> Log:
-    """Return the log of a data frame; see `Log.from_dataframe`."""
-    _refuse_options(temperature_c, temperature_source, sign)
-    try:
-        table = pa.table(frame)
-    except (TypeError, ValueError, pa.ArrowException) as error:
-        raise InputError(
-            "not a log",
-            value=type(frame).__name__,
-            cure="give a Log, the path of one, or a DataFrame with time, current, voltage and"
-            " temperature",
-        ) from error
-    indices = [column for column in table.schema if column.name.startswith("__index_level_")]
-    times = [column.name for column in indices if pa.types.is_timestamp(column.type)]
-    if len(times) == 1 and not {"time", "time_s"} & {n.lower() for n in table.column_names}:
-        table = table.rename_columns({times[0]: "time"})  # an unnamed pandas index
-    table = table.drop_columns([c.name for c in indices if c.name in table.column_names])
-    given = None if columns is None else ColumnMap.of(columns)
-    columns_of = arrow_table(table.schema, table.select, name)
-    draft = draft_of_table(columns_of, given, name=name, source="")
-    return draft.log(temperature_c, temperature_source, sign)
-
-
-# --- Cells beside a log
 
 
 @dataclass(frozen=True, eq=False)
@@ -270,53 +107,145 @@ class CellColumns:
         return int(self.voltage_v.shape[1])
 
 
-def read_cells(
-    path: str | PathLike[str], time_s: FloatArray, columns: ColumnMap | None = None
-) -> CellColumns | None:
-    """Return the cell voltages beside a log in its file; None where it has none.
+@dataclass(frozen=True, slots=True)
+class LogFile:
+    """A file that may be a log, recognised by its beginning.
 
-    Parameters
-    ----------
-    path : path-like
-    time_s : array of shape (n,)
-        Times of the log's rows, some of which the reader may have dropped [s].
-    columns : ColumnMap, optional
-        The user's columns of the log.
+    `reader` is None if it is not a log. `columns` and `sign` are the user's; `used` are columns
+    that the caller reads besides.
     """
-    file, source = open_log(path, columns=columns), str(path)
-    if not isinstance(file.reader, LogTableReader):
-        return None
-    table = open_table(file.head, columns)
-    cells = _cells(table.headings, source)
-    if len(cells) < 2:  # a single cell is its pack
-        return None
-    values = with_decimal_points(table.columns([place for place, _ in cells.values()]))
-    volts = np.column_stack(
-        [
-            scale * numbers_of(values[place], source, table.headings[place])[0]
+
+    head: Head
+    reader: LogReader | None
+    columns: ColumnMap | None = None
+    sign: Sign | None = None
+    used: tuple[str, ...] = ()
+
+    @property
+    def is_any_table(self) -> bool:
+        """Whether the file is a text of plain headings, not of a format that defines them."""
+        table = find_table(self.head) if isinstance(self.reader, LogTableReader) else None
+        return table is not None and not choose_columns(table.headings).is_canonical
+
+    def read(
+        self,
+        *,
+        temperature_c: float | None = None,
+        temperature_source: TemperatureSource | None = None,
+    ) -> Log:
+        """Read the log; arguments and errors as of `cangauge.read_log`."""
+        try:
+            if self.reader is None:
+                raise not_recognised(self, "not a known kind of log", f"known are: {KNOWN_LOGS}")
+            draft = self.reader.read(self.head, self.columns)
+            draft.ignored = tuple(name for name in draft.ignored if name not in self.used)
+            log = draft.log(temperature_c, temperature_source, self.sign)
+        except MemoryError as error:
+            problem, cure = "larger than the free memory", "split it"
+            raise InputError(problem, source=self.head.path, cure=cure) from error
+        pa.default_memory_pool().release_unused()
+        return log
+
+    def cells(self, time_s: FloatArray) -> CellColumns | None:
+        """Return the cell voltages beside a log in a table; None where it has none.
+
+        Parameters
+        ----------
+        time_s : array of shape (n,)
+            Times of the log's rows, some of which the reader may have dropped [s].
+        """
+        if not isinstance(self.reader, LogTableReader):
+            return None
+        table, source = self.reader.table(self.head, self.columns), str(self.head.path)
+        cells = _cells(table.headings, source)
+        if len(cells) < 2:  # a single cell is its pack
+            return None
+        columns = with_decimal_points(table.columns([place for place, _ in cells.values()]))
+        each_v = [
+            scale * numbers_of(columns[place], source, table.headings[place])[0]
             for place, scale in cells.values()
         ]
-    )
-    file_s = draft_of_table(table, columns, name=file.head.name, source=source).values["time_s"]
-    if file_s.size != volts.shape[0]:
-        return None  # rows that hold only what changed
-    order = np.argsort(file_s, kind="stable")
-    rows = order[np.minimum(np.searchsorted(file_s[order], time_s), file_s.size - 1)]
-    is_row = (file_s[rows] == time_s)[:, None]
-    return CellColumns(min(cells), np.where(is_row, volts[rows], np.nan))
+        volts = np.column_stack(each_v)
+        draft = draft_of_table(table, self.columns, name=self.head.name, source=source)
+        file_s = draft.values["time_s"]
+        if file_s.size != volts.shape[0]:
+            return None  # rows that hold only what changed
+        order = np.argsort(file_s, kind="stable")
+        rows = order[np.minimum(np.searchsorted(file_s[order], time_s), file_s.size - 1)]
+        is_row = (file_s[rows] == time_s)[:, None]
+        return CellColumns(min(cells), np.where(is_row, volts[rows], np.nan))
+
+
+def not_recognised(file: LogFile, problem: str, cure: str) -> InputError:
+    """Return the error for a file of unknown format: its columns if it is a table."""
+    head = file.head
+    foreign = import_module("cangauge.extras.formats.foreign").foreign_format(head.data)
+    if foreign is not None:
+        return InputError(f"{problem}: it is {foreign[0]}", source=head.path, cure=foreign[1])
+    headings, choice = likely_header(head)
+    is_of_frames = not _FRAME_WORDS.isdisjoint(text.strip().lower() for text in headings)
+    if len(headings) >= 3 and not is_of_frames:
+        error = unknown_columns(str(head.path), headings, choice)
+        return InputError(f"{problem}: {error.problem}", source=head.path, cure=error.cure)
+    shown = head.first_line.strip()
+    is_text = bool(shown) and shown.isprintable()
+    field, value = ("first line", shown[:80]) if is_text else (None, None)
+    cure += f"; other tables: --columns ({DOCS})"
+    return InputError(problem, source=head.path, field=field, value=value, cure=cure)
+
+
+def open_log(
+    path: str | PathLike[str],
+    *,
+    columns: ColumnMap | Mapping[str, str] | str | None = None,
+    sign: Sign | None = None,
+) -> LogFile:
+    """Read the beginning of a file and find its format.
+
+    Arguments as of `cangauge.read_log`.
+
+    Raises
+    ------
+    InputError
+        If the file is absent, empty, damaged or not a regular file.
+    """
+    head, given = Head(path), None if columns is None else ColumnMap.of(columns)
+    for reader in _readers():
+        if (given is None or reader.takes_columns) and reader.matches(head):
+            return LogFile(head, reader, given, sign)
+    # The user's columns make a table of any text.
+    return LogFile(head, None if given is None else LogTableReader(), given, sign)
+
+
+def draft_of_dataframe(
+    frame: Any, name: str, columns: ColumnMap | Mapping[str, str] | str | None
+) -> DraftLog:
+    """Return the draft of the log in a data frame; see `Log.from_dataframe`."""
+    try:
+        table = pa.table(frame)
+    except (TypeError, ValueError, pa.ArrowException) as error:
+        cure = "give a Log, the path of one, or a table of time, current, voltage, temperature"
+        raise InputError("not a log", value=type(frame).__name__, cure=cure) from error
+    indices = [column for column in table.schema if column.name.startswith("__index_level_")]
+    times = [column.name for column in indices if pa.types.is_timestamp(column.type)]
+    if len(times) == 1 and not {"time", "time_s"} & {n.lower() for n in table.column_names}:
+        table = table.rename_columns({times[0]: "time"})  # an unnamed pandas index
+    table = table.drop_columns([c.name for c in indices if c.name in table.column_names])
+    given = None if columns is None else ColumnMap.of(columns)
+    columns_of = arrow_table(table.schema, table.select, name)
+    return draft_of_table(columns_of, given, name=name, source="")
 
 
 def _cells(headings: Sequence[str], source: str) -> dict[int, tuple[int, float]]:
     """Return the column and scale of each cell by its number, in order."""
     cells: dict[int, tuple[int, float]] = {}
     for place, heading in enumerate(headings):
-        cell = cell_number(heading)
-        if cell is not None:
+        if (cell := cell_number(heading)) is not None:
             number, scale = cell
             cells.setdefault(number, (place, scale))
-    numbers = sorted(cells)
-    for number, following in pairwise(numbers):
-        if following > number + 1:
-            problem, field = "the cells must be numbered without gaps", f"cell_{number + 1}_v"
+    first = min(cells, default=0)
+    for number in range(first, first + len(cells)):
+        if number not in cells:
+            problem, field = "the cells must be numbered without gaps", f"cell_{number}_v"
             raise InputError(problem, source=source, field=field, cure="export all cells")
-    return {number: cells[number] for number in numbers}
+    return dict(sorted(cells.items()))

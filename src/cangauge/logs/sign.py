@@ -15,7 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
-from typing import Any, Final, Literal, NamedTuple
+from typing import Any, Final, Literal
 
 import numpy as np
 from scipy import special
@@ -38,14 +38,6 @@ _CLEAR_SHARE: Final = 0.75
 """Least share of agreeing votes for steps to count [-]."""
 _SURE_WEIGHT: Final = 2.0
 """Least weight for a sign (confidence 0.99); below it the sign stays open."""
-
-
-class Steps(NamedTuple):
-    """Rows of the later samples, and changes of current [A] and voltage [V], shape (k,) each."""
-
-    row: IntArray
-    current_a: FloatArray
-    voltage_v: FloatArray
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,7 +89,8 @@ class SignFinding:
 
 def sign_of_current(log: Log) -> SignFinding:
     """Determine from the data whether positive current discharges; either sign is accepted."""
-    return _finding((_from_steps(log), _from_charge(log), _from_soc(log)))
+    taken_ah = discharged_ah(log.time_s, log.current_a)
+    return _finding((_from_steps(log), _from_charge(log, taken_ah), _from_soc(log, taken_ah)))
 
 
 def _finding(evidence: Sequence[SignEvidence]) -> SignFinding:
@@ -118,30 +111,25 @@ def require_discharge_positive(log: Log, *, is_capture: bool = False) -> None:
             cure = "use the preset of this car, or set sign = -1 under [current] of the map file"
         elif finding.strongest.kind == "soc":
             cure += "; or, if the current is right, correct soc_pct or leave it out"
-        raise InputError(
-            f"the sign of current is inverted: {finding.strongest.text}",
-            source=log.source or log.name,
-            field="current_a",
-            cure=cure,
-        )
+        problem, where = f"the sign of current is inverted: {finding.strongest.text}", log.source
+        raise InputError(problem, source=where or log.name, field="current_a", cure=cure)
 
 
-def current_steps(log: Log) -> Steps:
-    """Return the clear steps of current, at most 400 of the largest ones."""
+def current_steps(log: Log) -> tuple[FloatArray, FloatArray]:
+    """Return the clear steps, at most 400 of the largest: changes of current [A], voltage [V]."""
     rows = spaced_rows(log.time_s, STEP_SPACING_S)
     change = np.diff(log.current_a[rows])
     near = np.diff(log.time_s[rows]) <= _STEP_LIMIT_S
     clear = np.abs(change) >= _STEP_SHARE * np.ptp(log.current_a)
     chosen = np.flatnonzero(near & clear & (change != 0.0))
     if chosen.size > _MAX_STEPS:
-        largest = np.argpartition(-np.abs(change[chosen]), _MAX_STEPS)[:_MAX_STEPS]
-        chosen = np.sort(chosen[largest])
-    return Steps(rows[chosen + 1], change[chosen], np.diff(log.voltage_v[rows])[chosen])
+        chosen = chosen[np.argpartition(-np.abs(change[chosen]), _MAX_STEPS)[:_MAX_STEPS]]
+    return change[chosen], np.diff(log.voltage_v[rows])[chosen]
 
 
 def _from_steps(log: Log) -> SignEvidence:
-    steps = current_steps(log)
-    votes = -np.sign(steps.current_a * steps.voltage_v)
+    current, voltage = current_steps(log)
+    votes = -np.sign(current * voltage)
     fell, rose = int((votes > 0).sum()), int((votes < 0).sum())
     if not fell + rose:
         return SignEvidence("steps", 0.0, "no clear step of current")
@@ -155,9 +143,9 @@ def _from_steps(log: Log) -> SignEvidence:
     return SignEvidence("steps", weight if fell >= rose else -weight, text)
 
 
-def _from_charge(log: Log) -> SignEvidence:
+def _from_charge(log: Log, taken_ah: FloatArray) -> SignEvidence:
     rows = spaced_rows(log.time_s, log.duration_s / 200.0)
-    voltage, taken = log.voltage_v[rows], charge_ah(log)[rows]
+    voltage, taken = log.voltage_v[rows], taken_ah[rows]
     span = float(np.ptp(voltage))
     if rows.size < 20 or np.ptp(taken) <= 0.0 or span <= 0.0:
         return SignEvidence("charge", 0.0, "no voltage trend over charge")
@@ -168,11 +156,11 @@ def _from_charge(log: Log) -> SignEvidence:
     return SignEvidence("charge", -float(np.sign(rank)) * (weight if clear else 0.0), text)
 
 
-def _from_soc(log: Log) -> SignEvidence:
+def _from_soc(log: Log, taken_ah: FloatArray) -> SignEvidence:
     if log.soc_pct is None:
         return SignEvidence("soc", 0.0, "no reference SoC")
     known = np.flatnonzero(np.isfinite(log.soc_pct))
-    soc, taken = log.soc_pct[known], charge_ah(log)[known]
+    soc, taken = log.soc_pct[known], taken_ah[known]
     span = float(np.ptp(soc)) if known.size > 10 else 0.0
     if span < 1.0 or np.ptp(taken) <= 0.0:
         return SignEvidence("soc", 0.0, f"reference SoC moves by only {span:.1f} %")
@@ -197,11 +185,6 @@ def _ranks(values: FloatArray) -> FloatArray:
     return np.asarray((np.cumsum(count) - (count + 1) / 2.0)[place], dtype=np.float64)
 
 
-def charge_ah(log: Log) -> FloatArray:
-    """Return the charge taken out since the first row [Ah], shape (n,); see `discharged_ah`."""
-    return discharged_ah(log.time_s, log.current_a)
-
-
 def spaced_rows(time_s: FloatArray, spacing_s: float) -> IntArray:
     """Return the first row of every slot of `spacing_s` that holds any."""
     if spacing_s <= 0.0:
@@ -218,32 +201,28 @@ def resolve_sign(log: Log, *, stored_sign_unknown: bool, is_stated: bool = False
     proves is left out.
     """
     finding = sign_of_current(log)
-    remarks, assumed = list(log.remarks), ""
-    voltage = _finding(finding.evidence[:2])
-    soc = finding.evidence[2]
-    if not finding.sign and abs(soc.weight) >= 1.0 and soc.weight * voltage.sign < 0.0:
-        _, first = log.first_soc() or (0, np.nan)
-        last = log.soc_pct[np.isfinite(log.soc_pct)][-1] if log.soc_pct is not None else np.nan
+    remarks = list(log.remarks)
+    voltage, soc = _finding(finding.evidence[:2]), finding.evidence[2]
+    contradicts = abs(soc.weight) >= 1.0 and soc.weight * voltage.sign < 0.0
+    if log.soc_pct is not None and not finding.sign and contradicts:
+        first, last = log.soc_pct[np.isfinite(log.soc_pct)][[0, -1]]
         remarks.append(
             f"SoC left out: it moves from {first:.4g} to {last:.4g} % against the charge, by the"
             f" sign of current that the voltage proves ({voltage.strongest.text}); is it a depth of"
             " discharge?"
         )
         log, finding = replace(log, soc_pct=None), voltage
+    if stored_sign_unknown and log.assumed:
+        way = "charges" if finding.sign < 0 else "discharges"
+        how = "found from the data" if finding.sign else "not confirmed by the data"
+        log = replace(log, assumed=(*log.assumed, f"positive current {way}, {how}"))
     if stored_sign_unknown and finding.sign < 0:
         log = replace(log, current_a=0.0 - log.current_a)
         remarks.append(f"current negated, sign found from the data: {finding.strongest.text}")
-        assumed = "positive current charges, found from the data"
-    elif stored_sign_unknown and finding.sign > 0:
-        assumed = "positive current discharges, found from the data"
-    elif stored_sign_unknown:
-        remarks.append(
-            "sign of current unknown and undetermined by the data: kept as stored (--sign charge"
-            " inverts it)"
-        )
-        assumed = "positive current discharges, not confirmed by the data"
     elif finding.sign < 0:
         what, how = ("the stated sign of current", "stated") if is_stated else ("current", "stored")
         remarks.append(f"{what} looks inverted and was kept as {how}: {finding.sentence}")
-    stated = (assumed,) if assumed and log.assumed else ()
-    return replace(log, remarks=tuple(remarks), assumed=(*log.assumed, *stated))
+    elif stored_sign_unknown and not finding.sign:
+        remark = "sign of current unknown and undetermined by the data: kept as stored"
+        remarks.append(f"{remark} (--sign charge inverts it)")
+    return replace(log, remarks=tuple(remarks))

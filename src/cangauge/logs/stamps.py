@@ -26,7 +26,7 @@ _CLOCK: Final = (
 _DATE: Final = (
     r"(?:[A-Za-z]{3},?\s+)?(?P<a>\d{1,4})[-/.](?P<b>\d{1,2}|[A-Za-z]{3})[-/.](?P<c>\d{1,4})"
 )
-_ZONE: Final = r"(?P<z>Z|z|UTC|GMT|[+-]\d{2}:?\d{2}|[+-]\d{2})?"
+_ZONE: Final = r"(?P<z>Z|z|UTC|GMT|(?P<sign>[+-])(?P<zh>\d{2}):?(?P<zm>\d{2})?)?"
 _DATE_TIME: Final = rf"^{_DATE}(?:(?:[T,_]|\s)\s*{_CLOCK})?\s*{_ZONE}$"
 _CLOCK_TIME: Final = rf"^(?:(?P<d>\d+)\s*(?:[dD]|[dD]ays?)?\s+)?{_CLOCK}$"
 _SPELLINGS: Final = (
@@ -52,6 +52,7 @@ _MONTHS: Final = {
 _ORDERS: Final = ("ymd", "dmy", "mdy")
 _PER_SECOND: Final = {"s": 1.0, "ms": 1e3, "us": 1e6, "ns": 1e9}
 _EPOCHS: Final = (
+    (1.0, 0.0, "s since 1970"),
     (1e-9, 0.0, "ns since 1970"),
     (1e-6, 0.0, "µs since 1970"),
     (1e-3, 0.0, "ms since 1970"),
@@ -63,9 +64,7 @@ _CAN_LOGS_S: Final = (662_688_000.0, 4_102_444_800.0)
 """1991, the first car with CAN, and 2100 [s since 1970]; no two of the epochs overlap in them."""
 _LEAST_EPOCH: Final = 1e11
 """Least number that is ticks since a date: milliseconds, of 1973."""
-_DIGITS: Final = (
-    r"^(?:19|20)?\d{2}(?:0[1-9]|1[0-2])(?:[0-2]\d|3[01])(?:[01]\d|2[0-3])(?:[0-5]\d){2}$"
-)
+_DIGITS: Final = r"^(19|20)?\d{2}(0[1-9]|1[0-2])([0-2]\d|3[01])([01]\d|2[0-3])([0-5]\d){2}$"
 """`20240313235000` and `240313235000`."""
 
 
@@ -114,24 +113,25 @@ def seconds_of(
         If a cell is no time.
     """
     is_format = unit.lower() in _ORDERS or _zone_of(unit) is not None
-    kind = parts[0].type
+    order_or_zone = unit if is_format else ""
+    column, kind = parts[0], parts[0].type
     if pa.types.is_timestamp(kind) or pa.types.is_duration(kind):
-        counts = parts[0].cast(pa.int64()).cast(pa.float64(), safe=False).to_numpy()
+        counts = column.cast(pa.int64()).cast(pa.float64(), safe=False).to_numpy()
         seconds = np.asarray(counts, dtype=np.float64) / _PER_SECOND[kind.unit]
         return seconds, str(kind) if is_format or not unit else unit
-    if pa.types.is_date(kind):
-        parts = [parts[0].cast(pa.string()), *parts[1:]]
     if len(parts) > 1:
-        cells = pc.binary_join_element_wise(*(part.cast(pa.string()) for part in parts), " ")
-    else:
-        cells = present(parts[0]) if is_text(parts[0]) else None
-        if cells is None or is_number(first_text(cells) or "0"):
-            values, _ = numbers_of(parts[0], source, label)
-            cells = _spelled_in_digits(values) if not unit or is_format else None
-            if cells is None:
-                values, unit = values * factor, "" if is_format else unit
-                return _seconds_of_numbers(values, unit, source, label)
-    return seconds_of_text(cells, unit if is_format else "", source, label)
+        joined = pc.binary_join_element_wise(*(part.cast(pa.string()) for part in parts), " ")
+        return seconds_of_text(joined, order_or_zone, source, label)
+    if pa.types.is_date(kind):
+        column = column.cast(pa.string())
+    cells = present(column) if is_text(column) else None
+    if cells is not None and not is_number(first_text(cells) or "0"):
+        return seconds_of_text(cells, order_or_zone, source, label)
+    values, _ = numbers_of(column, source, label)
+    digits = _spelled_in_digits(values) if not unit or is_format else None
+    if digits is not None:
+        return seconds_of_text(digits, order_or_zone, source, label)
+    return _seconds_of_numbers(values * factor, "" if is_format else unit, source, label)
 
 
 def _zone_of(name: str) -> ZoneInfo | None:
@@ -161,8 +161,6 @@ def _seconds_of_numbers(
     finite = values[np.isfinite(values)]
     typical = float(np.median(finite)) if finite.size else 0.0
     first_s, last_s = _CAN_LOGS_S
-    if first_s <= typical <= last_s:
-        return values, "s since 1970, from its size"
     for tick_s, origin_s, name in _EPOCHS:
         if first_s <= typical * tick_s - origin_s <= last_s:
             ticks = values - origin_s / tick_s  # before scaling: 100 ns of 2000 years need 63 bits
@@ -196,13 +194,9 @@ def seconds_of_text(cells: Any, unit: str, source: str, label: str) -> tuple[Flo
     read = np.asarray(pc.is_valid(parts).to_numpy(zero_copy_only=False), dtype=bool)
     if np.any(known & ~read):
         row = int(np.argmax(known & ~read))
-        raise InputError(
-            f"row {row + 1} is not a time",
-            source=source,
-            field=label,
-            value=cells[row].as_py(),
-            cure="seconds, hh:mm:ss or dates are read; name another column with --columns time=…",
-        )
+        problem, value = f"row {row + 1} is not a time", cells[row].as_py()
+        cure = "seconds, hh:mm:ss or dates are read; name another column with --columns time=…"
+        raise InputError(problem, source=source, field=label, value=value, cure=cure)
     hours, minutes, seconds = (np.nan_to_num(_numbers(parts, name)) for name in "hms")
     half = _words(parts, "half")
     hours = np.where(half == "", hours, hours % 12 + np.where(half == "p", 12.0, 0.0))
@@ -230,10 +224,10 @@ def _dates(parts: Any, of_day_s: FloatArray, unit: str) -> tuple[FloatArray, str
     values = np.full(known.size, np.nan)
     values[known] = _day_numbers(fields[:, known], order) * 86400.0
     values += of_day_s
-    zones = _words(parts, "z")
-    if np.any(zones != ""):
-        offset_s = {zone: _offset_s(zone) for zone in set(zones)}
-        return values - np.array([offset_s[zone] for zone in zones]), f"date{how} with zone"
+    if np.any(_words(parts, "z") != ""):
+        hours, minutes = (np.nan_to_num(_numbers(parts, name)) for name in ("zh", "zm"))
+        sign = np.where(_words(parts, "sign") == "-", -1.0, 1.0)
+        return values - sign * (hours * 3600.0 + minutes * 60.0), f"date{how} with zone"
     zone = _zone_of(unit)
     if zone is None:
         return values, f"date{how} without zone"
@@ -266,22 +260,12 @@ def _day_numbers(fields: FloatArray, order: str) -> FloatArray:
     return np.asarray(first.astype(np.int64) + day - 1, dtype=np.float64)
 
 
-def _offset_s(zone: str) -> float:
-    """Return the offset from UTC that a stamp states [s]: `+02:00`, `-0530`, `z`."""
-    digits = zone[1:].replace(":", "")
-    if not digits.isdigit():
-        return 0.0
-    seconds = int(digits[:2]) * 3600.0 + int(digits[2:] or 0) * 60.0
-    return -seconds if zone[0] == "-" else seconds
-
-
 def _numbers(parts: Any, name: str) -> FloatArray:
     """Return a group as numbers, NaN where it is empty; `59:123` is 59.123."""
     text = pc.replace_substring_regex(parts.field(name), "[,:]", ".")
-    valid = pc.fill_null(pc.match_substring_regex(text, r"^\d+(\.\d+)?$"), fill_value=False)
-    text = pc.if_else(valid, text, pa.scalar(None, pa.string()))
-    numbers = pc.cast(text, pa.float64()).to_numpy(zero_copy_only=False)
-    return np.asarray(numbers, dtype=np.float64)
+    is_number = pc.match_substring_regex(text, r"^\d+(\.\d+)?$")
+    numbers = pc.cast(pc.if_else(is_number, text, pa.scalar(None, pa.string())), pa.float64())
+    return np.asarray(numbers.to_numpy(zero_copy_only=False), dtype=np.float64)
 
 
 def _words(parts: Any, name: str) -> Any:

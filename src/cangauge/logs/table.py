@@ -24,11 +24,12 @@ from cangauge.logs.column_map import (
     ChosenColumn,
     ColumnMap,
     choose_columns,
-    shown_headings,
+    refuse_doubled,
+    refuse_odd_names,
     unknown_columns,
 )
 from cangauge.logs.draft import MAX_INCOMPLETE, DraftLog
-from cangauge.logs.headings import GUESS, meaning_of
+from cangauge.logs.headings import GUESS
 from cangauge.logs.stamps import is_clock, is_stamp, seconds_of
 from cangauge.logs.text import TextTable
 from cangauge.logs.units import (
@@ -39,17 +40,10 @@ from cangauge.logs.units import (
     known_temperature_source,
     unit_of,
 )
-from cangauge.logs.values import (
-    first_text,
-    is_number,
-    numbers_of,
-    present,
-    with_decimal_points,
-)
+from cangauge.logs.values import first_text, is_number, numbers_of, present, with_decimal_points
 
 SOURCE: Final = "temperature_source"
 """Column or metadata of a canonical log: the location of the temperature sensor."""
-_CANONICAL: Final = (*FIELDS.values(), SOURCE)
 _HOLD_S: Final = 1.0
 """Longest time that a voltage is held to the next row with a current [s], where rows hold only the
 channels that changed: a bus repeats both within it."""
@@ -80,34 +74,9 @@ class ArrowTable:
         """Return columns by place; raise InputError if another column has one of their names."""
         names = [self.headings[place] for place in places]
         for name in names:
-            _refuse_doubled(name, self.headings, self.source)
+            refuse_doubled(name, self.headings, self.source)
         table = self.read(names)
         return {place: table.column(name) for place, name in zip(places, names, strict=True)}
-
-
-def _refuse_doubled(name: str, names: Sequence[str], where: str | None) -> None:
-    if names.count(name) > 1:
-        raise InputError(
-            f"{names.count(name)} columns have this name",
-            source=where,
-            field=name,
-            cure="rename or drop all but one",
-        )
-
-
-def is_canonical(headings: Sequence[str]) -> bool:
-    """Return whether columns have the names of a canonical log's, possibly an incomplete one.
-
-    A temperature of another name is not a missing one: such a table is a logger's own.
-    """
-    names = {name.strip().lower() for name in headings}
-    meanings = {name: meaning_of(name) for name in names.difference(_CANONICAL)}
-    has_other_temperature = any(
-        "temperature" in name or (meaning is not None and meaning.quantity == "temperature")
-        for name, meaning in meanings.items()
-    )
-    is_whole = "temperature_c" in names or not has_other_temperature
-    return len(names.intersection(REQUIRED)) >= 2 and is_whole
 
 
 def draft_of_table(
@@ -121,18 +90,16 @@ def draft_of_table(
         If a column is not found, or holds anything but values of its quantity.
     """
     where, headings = source or name, list(table.headings)
-    is_defined = given is None and is_canonical(headings)
-    if is_defined:
-        chosen = _canonical_columns(headings, where)
-    else:
-        choice = choose_columns(headings, table.units, given)
-        if not choice.is_complete:
-            raise unknown_columns(where, headings, choice)
-        chosen = choice.chosen
+    choice = choose_columns(headings, table.units, given)
+    if choice.is_canonical:
+        refuse_odd_names(headings, where)
+    if not choice.is_complete:
+        raise unknown_columns(where, headings, choice)
+    chosen = choice.chosen
     words = [k for k, text in enumerate(headings) if text.strip().lower() == SOURCE][:1]
     wanted = [place for column in chosen.values() for place in column.places]
-    wanted += [place for place, _ in chosen["time"].others]
-    cells = with_decimal_points(table.columns([*dict.fromkeys([*wanted, *words])]))
+    wanted += [place for place, _ in chosen["time"].others] + words
+    cells = with_decimal_points(table.columns([*dict.fromkeys(wanted)]))
     draft = DraftLog(name, source, headings=tuple(headings), remarks=[*table.remarks])
     time_s, unit_of_time, chosen["time"] = _time(cells, chosen["time"], headings, where)
     draft.values["time_s"] = time_s
@@ -144,49 +111,24 @@ def draft_of_table(
         label = joint.join(headings[place] for place in column.places)
         draft.labels[FIELDS[quantity]] = label
         unit = unit_of_time if quantity == "time" else _take(draft, quantity, column, cells)
-        if quantity == "temperature" and len(column.places) > 1:
-            unit += ", the median"
         factor = "" if column.factor == 1.0 else f" × {column.factor:g}"
         shown = label if len(label) <= 80 else f"{label[:80]}…"
-        draft.assumed.append(f'{quantity} = "{shown}"{factor} [{unit}]')
+        if not choice.is_canonical:
+            draft.assumed.append(f'{quantity} = "{shown}"{factor} [{unit}]')
     used = {*words, *(place for column in chosen.values() for place in column.places)}
     draft.ignored = tuple(text for k, text in enumerate(headings) if text and k not in used)
-    word = _only_word(cells[words[0]], where) if words else ""
-    word = word or (getattr(table, "word", "") if is_defined else "")
-    if not word and "temperature" in chosen:
-        word = chosen["temperature"].source
-    draft.temperature_source = known_temperature_source(
-        word or "unknown", source=where, field=SOURCE
-    )
-    if is_defined:
-        draft.assumed = []
-    else:
+    in_cells = _only_word(cells[words[0]], where) if words else ""
+    in_metadata = getattr(table, "word", "") if choice.is_canonical else ""
+    in_heading = chosen["temperature"].source if "temperature" in chosen else "unknown"
+    word = in_cells or in_metadata or in_heading
+    draft.temperature_source = known_temperature_source(word, source=where)
+    if not choice.is_canonical:
         current = chosen["current"]
         draft.sign_unknown = current.factor > 0.0 and len(current.places) == 1
         if draft.sign_unknown and not np.any(draft.values["current_a"] < 0.0):
             _sign_by_state(draft, table)
         _hold_changes(draft)
     return draft
-
-
-def _canonical_columns(headings: Sequence[str], where: str) -> dict[str, ChosenColumn]:
-    """Return the columns of a canonical log by their names."""
-    names = [name.strip().lower() for name in headings]
-    for name in _CANONICAL:
-        _refuse_doubled(name, names, where)
-        if name in REQUIRED[:3] and name not in names:
-            raise InputError(
-                f"this column is missing (found: {shown_headings(headings)})",
-                source=where,
-                field=name,
-                cure="a log needs time_s, current_a (positive = discharge), voltage_v,"
-                " temperature_c [s, A, V, °C]",
-            )
-    return {
-        quantity: ChosenColumn((names.index(name),), CANONICAL_UNIT[quantity])
-        for quantity, name in FIELDS.items()
-        if name in names
-    }
 
 
 def _only_word(column: Any, where: str) -> str:
@@ -200,47 +142,43 @@ def _only_word(column: Any, where: str) -> str:
 
 def _take(draft: DraftLog, quantity: str, column: ChosenColumn, cells: dict[int, Any]) -> str:
     """Take a quantity in its canonical unit; return the unit that was read or assumed."""
-    name, where = FIELDS[quantity], draft.source or draft.name
-    label, unit = draft.labels[name], column.unit
+    name, where, unit = FIELDS[quantity], draft.where, column.unit
     headings = [draft.headings[place] for place in column.places]
-    parts, units_in_cells = [], set()
-    for place, heading in zip(column.places, headings, strict=True):
-        numbers, in_cells = numbers_of(cells[place], where, heading)
-        parts.append(numbers * column.factor)
-        units_in_cells.add(in_cells)
-    for in_cells in sorted(units_in_cells - {""}):
+    read = [
+        numbers_of(cells[place], where, heading)
+        for place, heading in zip(column.places, headings, strict=True)
+    ]
+    for in_cells in sorted({unit for _, unit in read if unit}):
         if unit and unit_of(name, in_cells) != unit_of(name, unit):
-            raise InputError(
-                "the cells have another unit than the heading",
-                source=where,
-                field=label,
-                value=f"{in_cells}, heading {unit}",
-                cure=f"state the right one: --columns '{quantity}=HEADING[UNIT]'",
-            )
+            problem = "the cells have another unit than the heading"
+            cure = f"state the right one: --columns '{quantity}=HEADING[UNIT]'"
+            raise draft.error(name, problem, cure, f"{in_cells}, heading {unit}")
         unit = unit or in_cells
+    parts = [numbers * column.factor for numbers, _ in read]
+    shown = unit or f"{CANONICAL_UNIT[quantity]}, assumed"
     if quantity == "soc":
-        soc = parts[0]
-        finite = soc[np.isfinite(soc)]
+        finite = parts[0][np.isfinite(parts[0])]
         is_fraction = np.any(finite % 1.0) and finite.min() >= 0.0 and finite.max() <= 1.0
         if not unit and is_fraction:  # 1, then 0, may also be an empty pack's percents
-            draft.values[name] = 100.0 * soc
-            return "0–1, from its range"
-        if _LEAF_SPY.issubset(draft.headings) and np.nanmedian(soc) > 110.0:
+            unit, shown = "0-1", "0–1, from its range"
+        elif _LEAF_SPY.issubset(draft.headings) and np.nanmedian(finite) > 110.0:
             draft.remarks.append("LeafSpy log: SoC in 0.0001 %")
-            parts = [soc * _LEAF_SPY_SOC]
-    converted = [convert(part, name, unit, source=where, label=label)[0] for part in parts]
+            parts = [parts[0] * _LEAF_SPY_SOC]
+    parts = [convert(part, name, unit, source=where, label=draft.labels[name]) for part in parts]
     if quantity == "temperature":
-        draft.take_probes(headings, converted)
-    elif len(converted) == 2:
-        both = [np.abs(part) for part in converted]
-        if any(np.any(part < 0.0) and np.any(part > 0.0) for part in converted):
-            cure = "name the one that holds both directions: --columns 'current=?'"
-            problem = "these are no currents of one direction each: one has both signs"
-            raise InputError(problem, source=where, field=label, cure=cure)
-        draft.values[name] = both[0] - both[1]
-    else:
-        draft.values[name] = converted[0]
-    return unit or f"{CANONICAL_UNIT[quantity]}, assumed"
+        draft.take_probes(headings, parts)
+        return f"{shown}, the median" if len(parts) > 1 else shown
+    draft.values[name] = parts[0] if len(parts) == 1 else _discharge_less_charge(draft, parts)
+    return shown
+
+
+def _discharge_less_charge(draft: DraftLog, parts: Sequence[FloatArray]) -> FloatArray:
+    """Return the difference of two currents of one direction each, whatever their signs."""
+    if any(np.any(part < 0.0) and np.any(part > 0.0) for part in parts):
+        problem = "these are no currents of one direction each: one has both signs"
+        cure = "name the one that holds both directions: --columns 'current=?'"
+        raise draft.error("current_a", problem, cure)
+    return np.abs(parts[0]) - np.abs(parts[1])
 
 
 def _sign_by_state(draft: DraftLog, table: TextTable | ArrowTable) -> None:
@@ -269,13 +207,11 @@ def _sign_by_state(draft: DraftLog, table: TextTable | ArrowTable) -> None:
         unclear = (current > 0.0) & (charges == discharges)
         if unclear.any():
             row = int(np.argmax(unclear))
-            raise InputError(
-                f"row {row + 1} does not say whether the unsigned current charges or discharges",
-                source=draft.source or draft.name,
-                field=headings[place],
-                value=cells[row].as_py(),
-                cure="write it as charge or discharge, or give the current a sign",
+            problem = (
+                f"row {row + 1} does not say whether the unsigned current charges or discharges"
             )
+            cure = "write it as charge or discharge, or give the current a sign"
+            raise draft.error(headings[place], problem, cure, cells[row].as_py())
         draft.values["current_a"] = np.where(charges, -current, current)
         draft.sign_unknown = False
         draft.assumed.append(f'current charges where "{headings[place]}" says so')
@@ -349,10 +285,9 @@ def _hold_changes(draft: DraftLog) -> None:
     is_known = np.isfinite(temperature)
     if is_known.any():  # before the first value, the first
         temperature[~is_known] = temperature[is_known][0]
-    draft.remarks.append(
-        f"rows hold only what changed: {at.size} rows with a current kept, with the latest voltage"
-        f" (at most {float(age_s[near].max()):.2g} s old) and temperature"
-    )
+    latest = f"the latest voltage (at most {float(age_s[near].max()):.2g} s old) and temperature"
+    kept = f"{at.size} rows with a current kept, with {latest}"
+    draft.remarks.append(f"rows hold only what changed: {kept}")
 
 
 def held(time: FloatArray, values: FloatArray, at: IntArray) -> tuple[FloatArray, FloatArray]:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import csv
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
+from itertools import chain, product
 from typing import Any, Final, NamedTuple
 
 import pyarrow as pa
@@ -60,23 +61,17 @@ class TextTable(NamedTuple):
             odd_rows.append(row)
             return "skip"
 
+        # One thread: otherwise pyarrow does not number odd rows.
+        how = pacsv.ReadOptions(use_threads=False, column_names=names, skip_rows=self.skip_lines)
+        rows = pacsv.ParseOptions(delimiter=self.delimiter, invalid_row_handler=skip)
+        cells = pacsv.ConvertOptions(
+            include_columns=wanted,
+            column_types=dict.fromkeys(wanted, pa.string()),
+            null_values=_NULLS,
+            strings_can_be_null=True,
+        )
         try:
-            table = pacsv.read_csv(
-                pa.BufferReader(data),
-                # One thread: otherwise pyarrow does not number odd rows.
-                read_options=pacsv.ReadOptions(
-                    use_threads=False, column_names=names, skip_rows=self.skip_lines
-                ),
-                parse_options=pacsv.ParseOptions(
-                    delimiter=self.delimiter, invalid_row_handler=skip
-                ),
-                convert_options=pacsv.ConvertOptions(
-                    include_columns=wanted,
-                    column_types=dict.fromkeys(wanted, pa.string()),
-                    null_values=_NULLS,
-                    strings_can_be_null=True,
-                ),
-            )
+            table = pacsv.read_csv(pa.BufferReader(data), how, rows, cells)
         except pa.ArrowInvalid as error:
             problem = f"the table cannot be read: {str(error).splitlines()[0]}"
             raise self._error(problem, "export it again") from error
@@ -86,10 +81,8 @@ class TextTable(NamedTuple):
         if not table.num_rows:
             raise self._error("there are no rows below the header", "check the export")
         if not data.endswith((b"\n", b"\r")):
-            self.remarks.append(
-                "the last line has no line end: if the file was cut off, its last value may be"
-                " short"
-            )
+            doubt = "if the file was cut off, its last value may be short"
+            self.remarks.append(f"the last line has no line end: {doubt}")
         return {place: self._values(table.column(f"c{place}"), place) for place in places}
 
     def _values(self, cells: Any, place: int) -> Any:
@@ -106,10 +99,9 @@ class TextTable(NamedTuple):
         width = len(split_cells(first, self.delimiter))
         named = max((k + 1 for k, name in enumerate(self.headings) if name), default=0)
         if not named <= width <= MAX_COLUMNS:
-            raise self._error(
-                f"row 1 has {width} cells where the header has {named} (at most {MAX_COLUMNS})",
-                "the file looks cut off or has another delimiter: export it again",
-            )
+            problem = f"row 1 has {width} cells where the header has {named}"
+            cure = "the file looks cut off or has another delimiter: export it again"
+            raise self._error(f"{problem} (at most {MAX_COLUMNS})", cure)
         return width
 
     def _remark_odd(self, odd_rows: list[Any], rows: int) -> None:
@@ -120,15 +112,12 @@ class TextTable(NamedTuple):
             if is_text and row.number > last - len(odd_rows):
                 self.remarks.append(f"closing line omitted: {row.text.strip()[:60]!r}")
             elif row.number == last and row.actual_columns < row.expected_columns:
-                self.remarks.append(
-                    "the last line is cut off and was omitted: the file may be incomplete"
-                )
+                remark = "the last line is cut off and was omitted: the file may be incomplete"
+                self.remarks.append(remark)
             else:
-                raise self._error(
-                    f"row {row.number - self.skip_lines} has {row.actual_columns} cells where the"
-                    f" others have {row.expected_columns}",
-                    "export the file again",
-                )
+                problem = f"row {row.number - self.skip_lines} has {row.actual_columns} cells"
+                problem += f" where the others have {row.expected_columns}"
+                raise self._error(problem, "export the file again")
 
     def _error(self, problem: str, cure: str) -> InputError:
         return InputError(problem, source=self.head.path, cure=cure)
@@ -148,73 +137,61 @@ def _values_in(cells: Sequence[str]) -> int:
     return sum(map(_is_value, cells))
 
 
-def table_below(head: Head, header: str) -> TextTable:
-    """Return the table below a known line, with the first delimiter of tab, `;` and `,` in it."""
-    mark = next((mark for mark in _DELIMITERS[:3] if mark in header), ",")
-    return TextTable(head, mark, split_cells(header, mark), (), head.lines.index(header) + 1, [])
-
-
 def find_table(head: Head, given: ColumnMap | None = None) -> TextTable | None:
     """Return the table of a text in which time, current and voltage are known, or None."""
     texts = given.texts.values() if given else ()
     if texts and all(text.startswith("#") for text in texts):
-        table = _without_header(head)
-        if table is not None:
-            return table
-    for rows in (1, 2):  # the words of a header may be in two rows
-        for number, delimiter, cells in _headers(head, rows):
-            with suppress(InputError):  # no column has a heading that the user names
-                if choose_columns(cells, (), given).is_complete:
-                    return _below(head, number + rows, delimiter, cells, given)
+        bare = _without_header(head)
+        if bare is not None:
+            return bare
+    for table in chain(_headed(head, rows=1), _headed(head, rows=2)):
+        with suppress(InputError):  # no column has a heading that the user names
+            if choose_columns(table.headings, (), given).is_complete:
+                return _above_data(table, given)
     return None
 
 
-def _headers(head: Head, rows: int = 1) -> Iterator[tuple[int, str, list[str]]]:
-    """Yield number, delimiter and cells of what may be a header of one or two rows."""
-    for number, line in enumerate(head.lines):
-        for delimiter in _DELIMITERS:
-            cells = split_cells(line, delimiter) if delimiter in line else []
-            for below in head.lines[number + 1 : number + rows]:
-                second = split_cells(below, delimiter)
-                if len(second) != len(cells) or _values_in(second[1:]):
-                    cells = []
-                else:
-                    pairs = zip(cells, second, strict=True)
-                    cells = [f"{one} {other}".strip() for one, other in pairs]
-            if len(cells) > 2:
-                yield number, delimiter, cells
+def _headed(head: Head, rows: int) -> Iterator[TextTable]:
+    """Yield a table below every line or two, if the words of a header are in two rows."""
+    for number, delimiter in product(range(len(head.lines) - rows + 1), _DELIMITERS):
+        if delimiter not in head.lines[number]:
+            continue
+        first, *second = (split_cells(row, delimiter) for row in head.lines[number : number + rows])
+        if any(len(row) != len(first) or _values_in(row[1:]) for row in second):
+            continue
+        headings = [" ".join(cells).strip() for cells in zip(first, *second, strict=True)]
+        if len(headings) > 2:
+            yield TextTable(head, delimiter, headings, (), number + rows, [])
 
 
-def _below(
-    head: Head, first: int, delimiter: str, cells: list[str], given: ColumnMap | None
-) -> TextTable:
-    """Return the table below a header, with its row of units where there is one.
+def _above_data(table: TextTable, given: ColumnMap | None) -> TextTable:
+    """Return a table less the rows above its data, of which one may hold units.
 
     A row of units gives one of the quantities another unit, or shows that it is none (`t`, °C).
     """
-    chosen = choose_columns(cells, (), given).chosen
-    measured = [chosen[name].places[-1] for name in ("time", "current", "voltage")]
-    units: list[str] = []
-    for number, line in enumerate(head.lines[first : first + _ROWS_ABOVE_DATA], start=first):
-        row = split_cells(line, delimiter)
+    chosen = choose_columns(table.headings, (), given).chosen
+    needed = [chosen[name] for name in ("time", "current", "voltage") if name in chosen]
+    measured = [column.places[-1] for column in needed]
+    units, first = list[str](), table.skip_lines
+    for number, line in enumerate(table.head.lines[first : first + _ROWS_ABOVE_DATA], start=first):
+        row = split_cells(line, table.delimiter)
         if _is_value(next((row[k] for k in measured if k < len(row) and row[k]), "")):
-            return TextTable(head, delimiter, cells, units, number, [])
-        again = choose_columns(cells, row, given).chosen
+            return table._replace(units=units, skip_lines=number)
+        again = choose_columns(table.headings, row, given).chosen
         if any(name not in again or again[name].unit != chosen[name].unit for name in chosen):
             units = row
-    return TextTable(head, delimiter, cells, units, first, [])
+    return table._replace(units=units)
 
 
 def _without_header(head: Head) -> TextTable | None:
     """Return the table of a text that has no header, for columns given by number."""
-    for number, line in enumerate(head.lines):
-        for delimiter in _DELIMITERS:
-            cells = split_cells(line, delimiter)
-            if len(cells) > 2 and 2 * _values_in(cells) > len(cells):
-                above = split_cells(head.lines[number - 1], delimiter) if number else []
-                headings = [f"column {k}" for k in range(1, len(cells) + 1)]
-                is_header = len(above) == len(cells)
-                return None if is_header else TextTable(head, delimiter, headings, (), number, [])
+    for number, delimiter in product(range(len(head.lines)), _DELIMITERS):
+        cells = split_cells(head.lines[number], delimiter)
+        if len(cells) > 2 and 2 * _values_in(cells) > len(cells):
+            above = split_cells(head.lines[number - 1], delimiter) if number else []
+            headings = [f"column {k}" for k in range(1, len(cells) + 1)]
+            is_header = len(above) == len(cells)
+            return None if is_header else TextTable(head, delimiter, headings, (), number, [])
     return None
 
 
@@ -227,12 +204,12 @@ def likely_header(head: Head, given: ColumnMap | None = None) -> tuple[list[str]
         If the header has none of a column of the user.
     """
     best: list[str] = []
-    for number, delimiter, cells in _headers(head):
-        if _values_in(cells) > 1:
+    for table in _headed(head, rows=1):
+        if _values_in(table.headings) > 1:
             break
-        below = head.lines[number + 1 : number + 1 + _ROWS_ABOVE_DATA]
-        has_data = any(_values_in(split_cells(row, delimiter)) > 1 for row in below)
-        known, most = (sum(map(bool, map(meaning_of, row))) for row in (cells, best))
+        below = head.lines[table.skip_lines : table.skip_lines + _ROWS_ABOVE_DATA]
+        has_data = any(_values_in(split_cells(row, table.delimiter)) > 1 for row in below)
+        known, most = (sum(map(bool, map(meaning_of, row))) for row in (table.headings, best))
         if has_data and (not best or known > most):
-            best = cells
+            best = [*table.headings]
     return best, choose_columns(best, (), given)

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Collection
-from typing import Any, Final, Literal, cast, get_args
+from collections.abc import Collection, Iterator, Sequence
+from typing import Final, Literal, cast, get_args
 
 import numpy as np
 
@@ -66,11 +66,6 @@ _UNITS: Final = {
     field: {name: unit for unit, names in units.items() for name in names.split("|")}
     for field, units in _SPELLINGS.items()
 }
-_WORDS: Final = {
-    "mA": "milliamperes", "uA": "microamperes", "mV": "millivolts", "uV": "microvolts",
-    "ms": "milliseconds", "us": "microseconds", "us ms": "milliseconds or microseconds",
-    "d": "days (dates of a spreadsheet)", "h d": "hours or days", "": "another unit",
-}  # fmt: skip
 _SCALED: Final = re.compile(r"(?P<scale>0?[.,]\d+|1|10+(?=\s*[mµμu]))\s*(?P<unit>\D+)$")
 """A unit of a bit: 0.1V, 10mV; 500A is the range of a sensor."""
 _FOREIGN: Final = (
@@ -102,22 +97,16 @@ _EXCEL_1990: Final = 32_874.0
 _RARE: Final = 1e-3
 """Fraction of impossible currents up to which they are codes, not another unit [-]."""
 
-_Check = tuple[Any, str, float, str, str, str]
-"""Whether a value is wrong; field, value, problem, cure, and the units that the user may state."""
+_Wrong = tuple[float, str, str, list[str]]
+"""A value that contradicts its unit, the problem, the cure, and units that the user may state."""
 
 
-def known_temperature_source(
-    word: str, *, source: str | None = None, field: str = "temperature_source"
-) -> TemperatureSource:
+def known_temperature_source(word: str, *, source: str | None = None) -> TemperatureSource:
     """Return the word if it names a temperature source, else raise InputError."""
     if word not in TEMPERATURE_SOURCES:
-        raise InputError(
-            "not a known temperature source",
-            source=source,
-            field=field,
-            value=word,
-            cure=f"use one of: {', '.join(TEMPERATURE_SOURCES)}",
-        )
+        problem, field = "not a known temperature source", "temperature_source"
+        cure = f"use one of: {', '.join(TEMPERATURE_SOURCES)}"
+        raise InputError(problem, source=source, field=field, value=word, cure=cure)
     return cast("TemperatureSource", word)
 
 
@@ -139,74 +128,23 @@ def unit_of(field: str, unit: str) -> tuple[float, float] | None:
     return factor * float(scale["scale"].replace(",", ".")), offset
 
 
-def convert(
-    values: FloatArray, field: str, unit: str, *, source: object, label: str
-) -> tuple[FloatArray, str | None]:
-    """Convert values of shape (n,) from a stated unit ("": the canonical one).
-
-    Returns the values, and a remark where they were converted.
+def convert(values: FloatArray, field: str, unit: str, *, source: object, label: str) -> FloatArray:
+    """Return values of shape (n,) in the canonical unit, from a stated one ("": the canonical).
 
     Raises
     ------
     InputError
         If the unit is not known for this quantity.
     """
-    factor, offset = (1.0, 0.0) if not unit.strip() else unit_of(field, unit) or (0.0, 0.0)
-    if not factor:
-        raise InputError(
-            f"the unit is not known for {field}",
-            source=str(source),
-            field=label,
-            value=unit,
-            cure=f"convert it to one of: {', '.join(_UNITS[field])}",
-        )
-    if (factor, offset) == (1.0, 0.0):
-        return values, None
-    return values * factor + offset, f"{label}: converted from {unit} to {field}"
+    scale = unit_of(field, unit) if unit.strip() else (1.0, 0.0)
+    if scale is None:
+        problem = f"the unit is not known for {field}"
+        cure = f"convert it to one of: {', '.join(_UNITS[field])}"
+        raise InputError(problem, source=str(source), field=label, value=unit, cure=cure)
+    return values if scale == (1.0, 0.0) else values * scale[0] + scale[1]
 
 
-def _is_code(number: int) -> bool:
-    """Return whether all bits of a number are set (65535), or but the last or the highest."""
-    return number > 254 and any((number + k) & (number + k - 1) == 0 for k in (0, 1, 2))
-
-
-def _fitting(interval: float, units: str) -> str:
-    """Return those of the units in which rows are as far apart as a log's."""
-    seconds = {unit: interval * _UNITS["time_s"][unit][0] for unit in units.split()}
-    return " ".join(k for k, step_s in seconds.items() if _FASTEST_S <= step_s <= _MAX_INTERVAL_S)
-
-
-def _c_rate(values: dict[str, FloatArray]) -> float:
-    """Return RMS current by the capacity that the log's SoC implies, time being in seconds [1/h].
-
-    NaN without a SoC that moves.
-    """
-    if "soc_pct" not in values:
-        return math.nan
-    known = np.isfinite(values["soc_pct"])
-    time, current, soc = (values[name][known] for name in ("time_s", "current_a", "soc_pct"))
-    if not soc.size or np.ptp(soc) == 0.0:
-        return math.nan
-    between = slice(*sorted((int(np.argmin(soc)), int(np.argmax(soc)))))
-    charge_ah = abs(np.sum(current[between] * np.diff(time, append=time[-1])[between])) / 3600.0
-    rms_a = math.sqrt(np.mean(current**2))
-    return rms_a * np.ptp(soc) / 100.0 / charge_ah if charge_ah else math.nan
-
-
-def _other_units(values: dict[str, FloatArray], finer: str, coarser: str) -> str:
-    """Return those of the units that time may be in as well as in seconds."""
-    time = values["time_s"]
-    step = np.diff(time) if time.size > 1 else np.ones(1)
-    # Seconds have steps below 10, or decimal ones: 0.016667 are 60 Hz, or 1 s in minutes.
-    if finer and np.all(time % 1.0 == 0.0) and np.min(step) >= 10.0:
-        # A SoC settles it: the charge in a finer unit would be too little for it.
-        scale = _UNITS["time_s"][finer.rsplit(maxsplit=1)[-1]][0]
-        return "" if _c_rate(values) / scale > _FASTEST_C else finer
-    mean = float(step.mean())
-    parts = [1000.0 * mean, *(mean * _UNITS["time_s"][unit][0] for unit in coarser.split())]
-    are_whole = [abs(part - round(part)) < 1e-3 for part in parts]
-    is_coarse = any(are_whole) and not are_whole[0] and np.ptp(step) < 0.2 * mean
-    return coarser if is_coarse else ""
+# --- Values that contradict a unit
 
 
 def refuse_wrong_units(
@@ -233,93 +171,170 @@ def refuse_wrong_units(
     stated : collection of str
         Columns whose unit the user states.
     """
-
-    def odd_row(field: str, wrong: BoolArray, kind: str) -> _Check:
-        row = int(np.argmax(wrong))
-        cure = "remove the row: codes such as 255 and 65535 mean 'not available'"
-        return wrong.any(), field, values[field][row], f"row {row + 1} is not {kind}", cure, ""
-
-    time, current = values["time_s"], values["current_a"]
     voltage, temperature = values["voltage_v"], values["temperature_c"]
-    step = np.diff(time) if time.size > 1 else np.ones(1)
-    interval, days, last = float(np.median(step)), step.sum() / 86400.0, int(np.argmax(step)) + 1
-    too_close = not in_seconds and 0.0 < interval < 1.0 / _MAX_RATE_HZ
-    finer, coarser = _fitting(interval, "ns us ms"), _fitting(interval, "min h d")
-    coarser = "d" if time[0] > _EXCEL_1990 else coarser
-    apart = f"rows are {interval:g} apart: time looks like"
-    others = _other_units(values, finer, coarser) if in_seconds is None else ""
-    middle, middle_c = float(np.median(voltage)), float(np.median(temperature))
-    is_low = COLDEST_C <= middle <= _UNUSUALLY_HOT_C
-    # Before the voltage: a temperature in its place looks like kilovolts. A constant is a code.
-    hottest_k = max(HOTTEST_C, 273.15 + _UNUSUALLY_HOT_C)
-    swapped = is_low and hottest_k < middle_c <= _MAX_VOLTAGE_V and np.ptp(temperature) > 0.0
-    milli_v = "mV" if middle <= 1e3 * _MAX_VOLTAGE_V else "uV"
-    large = np.abs(current) > _MAX_CURRENT_A
-    peak = int(np.argmax(np.abs(current)))
-    milli_a = "mA" if abs(current[peak]) <= 1e3 * _MAX_CURRENT_A else "uA"
-    digits = [int(f"{amps:f}".replace(".", "").strip("0")) for amps in set(abs(current[large]))]
-    are_codes = (np.mean(large) < _RARE and current.size > 1000) or all(map(_is_code, digits))
-    soc = values.get("soc_pct", np.empty(0))
-    soc = soc[np.isfinite(soc)] if np.isfinite(soc).any() else np.full(1, 50.0)
-    most, least = float(np.max(soc)), float(np.min(soc))
-    odd_soc = most if most > 110.0 else least
-    soc_row = int(np.argmax(values.get("soc_pct", soc) == odd_soc))
-    celsius = (temperature >= COLDEST_C) & (temperature <= HOTTEST_C)
-    t, u, i, c, by_1000 = "time_s", "voltage_v", "current_a", "temperature_c", "divide it by 1000"
-    checks: tuple[_Check, ...] = (
-        (time[0] > _MAX_STAMP_S, t, time[0], "time looks like milliseconds since 1970", by_1000,
-         "ms"),
-        odd_row(t, np.abs(time) > _MAX_STAMP_S, "a time in seconds"),
-        (interval > _MAX_INTERVAL_S, t, interval, f"{apart} {_WORDS.get(finer, finer)}",
-         f"{by_1000 if finer == 'ms' else 'convert it to seconds'} (a log with a row every 90 s or"
-         " more cannot be used)", finer),
-        (too_close, t, interval, f"{apart} {_WORDS.get(coarser, coarser)}",
-         "convert it to seconds", coarser),
-        (others, t, interval, f"rows are {interval:g} apart, in seconds or another unit",
-         "name the unit in the heading", f"s {others}"),
-        (days > _MAX_DAYS, t, time[min(last, time.size - 1)],
-         f"the log lasts {days:.0f} days; its longest step ends at row {last + 1}",
-         "if the clock was set there, split the log there", ""),
-        (swapped, c, middle_c,
-         f"it looks like a pack's voltage, and {labels.get(u, u)} like a temperature",
-         "the two columns (or signals) look swapped: exchange them", ""),
-        (middle > _MAX_VOLTAGE_V, u, middle, f"voltage looks like {_WORDS[milli_v]}",
-         by_1000 if milli_v == "mV" else "convert it to volts", milli_v),
-        (middle <= 0.0, u, middle, "the median voltage is not positive",
-         "check column and polarity", ""),
-        (middle < 1.0, u, middle, "voltage looks like kilovolts", "convert it to volts", "kV"),
-        odd_row(u, np.abs(voltage) > _MAX_VOLTAGE_V, "a battery's voltage"),
-        odd_row(i, large & are_codes, "a battery's current"),
-        (large.any(), i, current[peak],
-         f"current exceeds {_MAX_CURRENT_A:g} A in row {peak + 1}: it looks like {_WORDS[milli_a]}",
-         by_1000 if milli_a == "mA" else "convert it to amperes", milli_a),
-        (least >= 0.0 and 0.0 < most <= 1.0 and "soc_pct" not in stated, "soc_pct", most,
-         "SoC looks like a fraction of 1",
-         "multiply it by 100 (or leave it out if it stays below 1 %)", "- %"),
-        (not -10.0 <= odd_soc <= 110.0, "soc_pct", odd_soc,
-         f"SoC of row {soc_row + 1} is not within 0–100 %", "convert it to %", ""),
-        (200.0 <= middle_c <= 400.0, c, middle_c, "temperature looks like kelvin",
-         "subtract 273.15"
-         + (", or exchange it with the voltage if the two are swapped" if is_low else ""),
-         "K" if np.any(temperature % 1.0) else "K 0.1°C"),
-        (not COLDEST_C <= middle_c <= HOTTEST_C, c, middle_c,
-         "this is not a battery's temperature in °C", "convert it to °C", ""),
-        odd_row(c, ~celsius, "a battery's temperature in °C"),
-    )  # fmt: skip
-    for wrong, field, value, problem, cure, unit in checks:
-        if wrong:
-            label, units = labels.get(field, field), unit.split()
-            is_tick = field == t and "tick" in label.lower()
-            shown = unit if len(units) == 1 and not is_tick else "?"
-            option = f"--columns '{field.rpartition('_')[0]}={label}[{shown}]'"
-            if shown == "?":
-                option += f", with {' or '.join(units)} for ?"
-                option += " and a factor, such as [ms]:10 for ticks of 10 ms" if is_tick else ""
+    checks = (
+        ("time_s", _wrong_time(values, in_seconds=in_seconds)),
+        ("voltage_v", _wrong_voltage(voltage)),
+        ("current_a", _wrong_current(values["current_a"])),
+        ("soc_pct", _wrong_soc(values.get("soc_pct"), is_stated="soc_pct" in stated)),
+        ("temperature_c", _wrong_temperature(temperature, voltage)),
+    )
+    for field, found in checks:
+        label = labels.get(field, field)
+        for value, problem, cure, units in found:  # the first is raised
             is_open = bool(units) and label.lower() != field and field not in stated
-            also = f" (or state the unit: {option})" if is_open else ""
+            also = f" (or state the unit: {_option(field, label, units)})" if is_open else ""
             raise InputError(
                 problem, source=str(source), field=label, value=float(value), cure=cure + also
             )
-    remark = f"temperature {middle_c:.0f} °C is unusually hot: if it is °F, state the unit:"
-    remark += f" --columns 'temperature={labels.get(c, c)}[°F]'"
-    return (remark,) if middle_c > _UNUSUALLY_HOT_C else ()
+    option = _option("temperature_c", labels.get("temperature_c", "temperature_c"), ["°F"])
+    typical, doubt = float(np.median(temperature)), f"if it is °F, state the unit: {option}"
+    remark = f"temperature {typical:.0f} °C is unusually hot: {doubt}"
+    return (remark,) if typical > _UNUSUALLY_HOT_C else ()
+
+
+def _option(field: str, label: str, units: list[str]) -> str:
+    """Return the option that states the unit of a column, "?" where several are possible."""
+    column = f"{field.rpartition('_')[0]}={label}"
+    is_tick = field == "time_s" and "tick" in label.lower()
+    if len(units) == 1 and not is_tick:
+        return f"--columns '{column}[{units[0]}]'"
+    factor = " and a factor, such as [ms]:10 for ticks of 10 ms" if is_tick else ""
+    return f"--columns '{column}[?]', with {' or '.join(units)} for ?{factor}"
+
+
+def _odd_row(values: FloatArray, wrong: BoolArray, kind: str) -> Iterator[_Wrong]:
+    """Yield the first row whose value is impossible."""
+    for row in np.flatnonzero(wrong)[:1]:
+        cure = "remove the row: codes such as 255 and 65535 mean 'not available'"
+        yield values[row], f"row {row + 1} is not {kind}", cure, []
+
+
+def _in_finer_unit(value: float, limit: float, unit: str, what: str) -> _Wrong:
+    """Return what is wrong with a value above the limit [V or A]: it is in milli or micro."""
+    is_milli = abs(value) <= 1e3 * limit
+    prefix, divisor = ("milli", "1000") if is_milli else ("micro", "1,000,000")
+    symbol = f"{'m' if is_milli else 'u'}{unit[0].upper()}"
+    return value, f"{what} looks like {prefix}{unit}", f"divide it by {divisor}", [symbol]
+
+
+def _wrong_time(values: dict[str, FloatArray], *, in_seconds: bool | None) -> Iterator[_Wrong]:
+    time = values["time_s"]
+    if time[0] > _MAX_STAMP_S:
+        yield time[0], "time looks like milliseconds since 1970", "divide it by 1000", ["ms"]
+    yield from _odd_row(time, np.abs(time) > _MAX_STAMP_S, "a time in seconds")
+    step = np.diff(time) if time.size > 1 else np.ones(1)
+    interval, days = float(np.median(step)), step.sum() / 86400.0
+    apart = f"rows are {interval:g} apart"
+    finer = _fitting(interval, ("ms", "us", "ns"))
+    coarser = ["d"] if time[0] > _EXCEL_1990 else _fitting(interval, ("min", "h", "d"))
+    if interval > _MAX_INTERVAL_S:
+        problem = f"{apart}: time looks like {' or '.join(finer) or 'another unit'}"
+        cure = "convert it to seconds (a log with a row every 90 s or more cannot be used)"
+        yield interval, problem, cure, finer
+    if not in_seconds and 0.0 < interval < 1.0 / _MAX_RATE_HZ:
+        problem = f"{apart}: time looks like {' or '.join(coarser) or 'another unit'}"
+        yield interval, problem, "convert it to seconds", coarser
+    if in_seconds is None and (others := _other_units(values, finer, coarser)):
+        problem = f"{apart}, in seconds or another unit"
+        yield interval, problem, "name the unit in the heading", ["s", *others]
+    if days > _MAX_DAYS:
+        row = int(np.argmax(step)) + 1
+        problem = f"the log lasts {days:.0f} days; its longest step ends at row {row + 1}"
+        yield time[row], problem, "if the clock was set there, split the log there", []
+
+
+def _fitting(interval: float, units: Sequence[str]) -> list[str]:
+    """Return those of the units in which rows are as far apart as a log's."""
+    step_s = {unit: interval * _UNITS["time_s"][unit][0] for unit in units}
+    return [unit for unit in units if _FASTEST_S <= step_s[unit] <= _MAX_INTERVAL_S]
+
+
+def _other_units(values: dict[str, FloatArray], finer: list[str], coarser: list[str]) -> list[str]:
+    """Return those of the units that time may be in as well as in seconds."""
+    time, scale = values["time_s"], _UNITS["time_s"]
+    step = np.diff(time) if time.size > 1 else np.ones(1)
+    # Seconds have steps below 10, or decimal ones: 0.016667 are 60 Hz, or 1 s in minutes.
+    if finer and np.all(time % 1.0 == 0.0) and np.min(step) >= 10.0:
+        # A SoC settles it: the charge in a finer unit would be too little for it.
+        return [] if _c_rate(values) / scale[finer[0]][0] > _FASTEST_C else finer
+    mean = float(step.mean())
+    parts = [1000.0 * mean, *(mean * scale[unit][0] for unit in coarser)]
+    are_whole = [abs(part - round(part)) < 1e-3 for part in parts]
+    is_coarse = any(are_whole) and not are_whole[0] and np.ptp(step) < 0.2 * mean
+    return coarser if is_coarse else []
+
+
+def _c_rate(values: dict[str, FloatArray]) -> float:
+    """Return RMS current by the capacity that the log's SoC implies, time being in seconds [1/h].
+
+    NaN without a SoC that moves.
+    """
+    if "soc_pct" not in values:
+        return math.nan
+    known = np.isfinite(values["soc_pct"])
+    time, current, soc = (values[name][known] for name in ("time_s", "current_a", "soc_pct"))
+    if not soc.size or np.ptp(soc) == 0.0:
+        return math.nan
+    between = slice(*sorted((int(np.argmin(soc)), int(np.argmax(soc)))))
+    charge_ah = abs(np.sum(current[between] * np.diff(time, append=time[-1])[between])) / 3600.0
+    rms_a = math.sqrt(np.mean(current**2))
+    return rms_a * np.ptp(soc) / 100.0 / charge_ah if charge_ah else math.nan
+
+
+def _wrong_voltage(voltage: FloatArray) -> Iterator[_Wrong]:
+    typical = float(np.median(voltage))
+    if typical > _MAX_VOLTAGE_V:
+        yield _in_finer_unit(typical, _MAX_VOLTAGE_V, "volts", "voltage")
+    if typical <= 0.0:
+        yield typical, "the median voltage is not positive", "check column and polarity", []
+    if typical < 1.0:
+        yield typical, "voltage looks like kilovolts", "convert it to volts", ["kV"]
+    yield from _odd_row(voltage, np.abs(voltage) > _MAX_VOLTAGE_V, "a battery's voltage")
+
+
+def _wrong_current(current: FloatArray) -> Iterator[_Wrong]:
+    size = np.abs(current)
+    large, peak = size > _MAX_CURRENT_A, int(np.argmax(size))
+    digits = [int(f"{amps:f}".replace(".", "").strip("0")) for amps in set(size[large])]
+    if (np.mean(large) < _RARE and current.size > 1000) or all(map(_is_code, digits)):
+        yield from _odd_row(current, large, "a battery's current")
+    if large.any():
+        what = f"current exceeds {_MAX_CURRENT_A:g} A in row {peak + 1}: it"
+        yield _in_finer_unit(float(current[peak]), _MAX_CURRENT_A, "amperes", what)
+
+
+def _is_code(number: int) -> bool:
+    """Return whether all bits of a number are set (65535), or but the last or the highest."""
+    return number > 254 and any((number + k) & (number + k - 1) == 0 for k in (0, 1, 2))
+
+
+def _wrong_soc(soc: FloatArray | None, *, is_stated: bool) -> Iterator[_Wrong]:
+    if soc is None or not np.isfinite(soc).any():
+        return
+    known = soc[np.isfinite(soc)]
+    least, most = float(known.min()), float(known.max())
+    if least >= 0.0 and 0.0 < most <= 1.0 and not is_stated:
+        cure = "multiply it by 100 (or leave it out if it stays below 1 %)"
+        yield most, "SoC looks like a fraction of 1", cure, ["-", "%"]
+    odd = most if most > 110.0 else least
+    if not -10.0 <= odd <= 110.0:
+        row = int(np.argmax(soc == odd))
+        yield odd, f"SoC of row {row + 1} is not within 0–100 %", "convert it to %", []
+
+
+def _wrong_temperature(temperature: FloatArray, voltage: FloatArray) -> Iterator[_Wrong]:
+    typical, other = float(np.median(temperature)), float(np.median(voltage))
+    may_be_swapped = COLDEST_C <= other <= _UNUSUALLY_HOT_C  # the voltage, as a temperature
+    is_high = 273.15 + _UNUSUALLY_HOT_C < typical <= _MAX_VOLTAGE_V
+    if may_be_swapped and is_high and np.ptp(temperature) > 0.0:  # a constant is a code
+        problem = "it looks like a pack's voltage, and the voltage like a temperature"
+        yield typical, problem, "the two columns (or signals) look swapped: exchange them", []
+    if 200.0 <= typical <= 400.0:
+        also = ", or exchange it with the voltage if the two are swapped" if may_be_swapped else ""
+        units = ["K"] if np.any(temperature % 1.0) else ["K", "0.1°C"]
+        yield typical, "temperature looks like kelvin", f"subtract 273.15{also}", units
+    if not COLDEST_C <= typical <= HOTTEST_C:
+        yield typical, "this is not a battery's temperature in °C", "convert it to °C", []
+    odd = (temperature < COLDEST_C) | (temperature > HOTTEST_C)
+    yield from _odd_row(temperature, odd, "a battery's temperature in °C")

@@ -61,15 +61,11 @@ def numbers_of(column: Any, source: str, label: str) -> tuple[FloatArray, str]:
     InputError
         If a cell holds anything but a number, or the column has another type.
     """
-
-    def error(problem: str, value: object, cure: str) -> InputError:
-        return InputError(problem, source=source, field=label, value=value, cure=cure)
-
     of, kind = pa.types, column.type
     is_numeric = of.is_integer(kind) or of.is_floating(kind) or of.is_decimal(kind)
     if not (is_numeric or is_text(column) or of.is_null(kind)):
-        cure = "store it as floating point"
-        raise error("the column does not hold numbers", str(kind)[:60], cure)
+        problem, cure = "the column does not hold numbers", "store it as floating point"
+        raise InputError(problem, source=source, field=label, value=str(kind)[:60], cure=cure)
     unit = ""
     try:
         try:
@@ -77,12 +73,13 @@ def numbers_of(column: Any, source: str, label: str) -> tuple[FloatArray, str]:
         except pa.ArrowInvalid:
             bare, unit = _without_unit(present(with_decimal_points({0: column})[0]))
             numbers = pc.cast(bare, pa.float64())
-    except pa.ArrowInvalid as problem:
+    except pa.ArrowInvalid as error:
         texts = enumerate(present(column).to_pylist(), start=1)
         wrong = ((k, text) for k, text in texts if text and not is_number(text))
         row, value = next(wrong, (1, None))
         cure = "correct the cell, or leave it empty where the value is unknown"
-        raise error(f"row {row} is not a number", value, cure) from problem
+        problem = f"row {row} is not a number"
+        raise InputError(problem, source=source, field=label, value=value, cure=cure) from error
     return np.array(numbers.to_numpy(), dtype=np.float64), unit
 
 

@@ -11,10 +11,10 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 from stepping import EFFECTS, MODEL, irregular_signals, middle, online_of, step_through
 
+from cangauge.bus.recording import read_log
 from cangauge.identify.rows import fit_rows
 from cangauge.identify.starts import with_start
 from cangauge.logs.log import Log
-from cangauge.logs.read import read_log
 from cangauge.model.effects.base import Reading, Signals
 from cangauge.model.effects.library import LIBRARY
 from cangauge.model.extended import ExtendedModel

@@ -17,8 +17,8 @@ import pyarrow.parquet as pq
 import pytest
 
 from cangauge.bus.captures import open_capture
+from cangauge.bus.recording import read_log
 from cangauge.errors import InputError
-from cangauge.logs.read import read_log
 from cangauge.model.effects.library import LIBRARY
 from cangauge.model.model_file import Model
 from cangauge.service.config import load_config

@@ -12,10 +12,10 @@ import pytest
 
 from cangauge.bus.captures import open_capture
 from cangauge.bus.database import load_dbc
+from cangauge.bus.recording import read_log
 from cangauge.bus.vehicle import Vehicle
 from cangauge.errors import InputError
 from cangauge.extras.live.addresses import read_token
-from cangauge.logs.read import read_log
 from cangauge.model.model_file import Model
 from cangauge.service.config import load_config
 

@@ -73,8 +73,9 @@ class _Text:
         source, label = self.draft.source, self.wanted[name].text
         numbers, _ = numbers_of(self.cells(name), source, label)
         unit = self.wanted[name].unit
-        values, remark = convert(numbers, field, unit, source=source, label=label)
-        self.draft.remarks.extend([remark] if remark else [])
+        values = convert(numbers, field, unit, source=source, label=label)
+        if values is not numbers:
+            self.draft.remarks.append(f"{label}: converted from {unit} to {field}")
         return values
 
     def take(self, field: str, name: str = "", values: FloatArray | None = None) -> None:

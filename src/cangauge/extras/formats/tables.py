@@ -13,9 +13,10 @@ from cangauge._files import Head
 from cangauge.errors import InputError
 from cangauge.logs.column_map import ColumnMap, choose_columns, unknown_columns
 from cangauge.logs.draft import DraftLog
+from cangauge.logs.read import LogTableReader
 from cangauge.logs.stamps import seconds_of_text
 from cangauge.logs.table import ArrowTable, draft_of_table, held
-from cangauge.logs.text import MAX_ROWS, find_table, likely_header, split_cells, table_below
+from cangauge.logs.text import MAX_ROWS, TextTable, split_cells
 
 HOLD_ENTITY_S: Final = 60.0
 """Longest time that a stored value is held [s], as long as charge is counted over a gap: a recorder
@@ -41,10 +42,7 @@ class Workbook:
             If openpyxl is not installed, or the workbook is damaged or holds no log.
         """
         sheet = _SheetText(head)
-        table = find_table(sheet, columns)
-        if table is None:
-            raise unknown_columns(str(head.path), *likely_header(sheet, columns))
-        draft = draft_of_table(table, columns, name=head.name, source=str(head.path))
+        draft = LogTableReader().read(sheet, columns)
         draft.remarks.extend(sheet.remarks)
         return draft
 
@@ -112,8 +110,9 @@ class EntityHistory:
 
     def read(self, head: Head, columns: ColumnMap | None = None) -> DraftLog:
         """Read a history: a row for every time at which the current or the voltage changed."""
-        text = table_below(head, head.first_line)
-        lower = [cell.lower() for cell in text.headings]
+        names, first = split_cells(head.first_line, ","), head.lines.index(head.first_line) + 1
+        text = TextTable(head, ",", names, (), first, [])
+        lower = [cell.lower() for cell in names]
         places = [lower.index(name) for name in self._NAMES]
         cells = text.columns(places)
         entity, state, changed = (cells[place].cast(pa.string()) for place in places)

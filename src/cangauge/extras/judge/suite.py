@@ -33,7 +33,7 @@ from cangauge.extras.validation.twin.recording import record_drive
 from cangauge.identify.fit import fit
 from cangauge.logs.gaps import discharged_ah
 from cangauge.logs.log import Log
-from cangauge.logs.read import read_log
+from cangauge.logs.read import open_log
 from cangauge.model.model_file import Model
 from cangauge.replay.encoder import FrameEncoder
 from cangauge.types import Sample
@@ -179,7 +179,7 @@ def recorded_drives(paths: Sequence[Path], model: Model) -> list[PlayedDrive]:
     """Return drives of recorded logs of a model's pack; may raise InputError."""
     found = []
     for path in paths:
-        log = read_log(path)
+        log = open_log(path).read()
         if log.soc_pct is None or not np.isfinite(log.soc_pct).all():
             cure = "give logs with the true SoC in each row"
             raise InputError("the true SoC is missing", source=path, field="soc_pct", cure=cure)

@@ -43,7 +43,7 @@ def twin_command(
 
     Parameters
     ----------
-    output : -o, --output LOG.parquet|.pq|.csv|.bdf
+    output : -o, --output LOG.parquet|.pq|.csv
         Log to write.
     seed : N (0 … inf)
         Selects the pack. Same seed, same log.
