@@ -212,8 +212,9 @@ class SampleDecoder:
     ----------
     vehicle : Vehicle
     pack : PackProperties, optional
-        Pack properties from the model. Without them only stated limits apply and no signal counts
-        as stuck: a capture with a wrong scale then shows as such, not as a missing signal.
+        Pack properties from the model. Without them only stated limits apply, and those of a SoC,
+        and no signal counts as stuck: a capture with a wrong scale then shows as such, not as a
+        missing signal.
     statistics : FrameStatistics, optional
         Counts to continue.
 
@@ -270,7 +271,7 @@ class SampleDecoder:
         route, role = self._route(signal), signal.role
         is_multiplexed = bool(signal.codec.conditions)
         health = self.health[role] = SignalHealth(
-            signal.checks if pack is None else signal.checks.within_pack(role, pack),
+            signal.checks.within_pack(role, pack),
             # A multiplexed signal is not in every frame of its message: its period is learned.
             None if is_multiplexed else self.vehicle.messages[signal.key].period_s,
             is_cyclic=role in {"current", "voltage"},

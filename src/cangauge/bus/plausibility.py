@@ -19,7 +19,13 @@ from typing import Annotated, Final, Self
 
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, model_validator
 
-from cangauge.types import CURRENT_AT_MOST_A, TEMPERATURE_WITHIN_C, VOLTAGE_WITHIN, Reason
+from cangauge.types import (
+    CURRENT_AT_MOST_A,
+    SOC_WITHIN_PCT,
+    TEMPERATURE_WITHIN_C,
+    VOLTAGE_WITHIN,
+    Reason,
+)
 
 INVALID_AFTER: Final = 5
 VALID_AFTER: Final = 3
@@ -86,10 +92,18 @@ class SignalChecks(BaseModel):
             raise ValueError("max_jump and max_rate_per_s need each other")
         return self
 
-    def within_pack(self, role: str, pack: PackProperties) -> SignalChecks:
-        """Return the checks with the physical limits of a pack where none are stated."""
+    def within_pack(self, role: str, pack: PackProperties | None) -> SignalChecks:
+        """Return the checks with the physical limits of a pack where none are stated.
+
+        Without a pack only a SoC has some.
+        """
         limits: dict[str, float] = {}
-        if role == "current":
+        if role == "soc_reference":
+            low, high = SOC_WITHIN_PCT
+            limits = {"lowest": low, "highest": high}
+        elif pack is None:
+            return self
+        elif role == "current":
             limits = {"lowest": -CURRENT_AT_MOST_A, "highest": CURRENT_AT_MOST_A}
         elif role == "voltage":
             low, high = VOLTAGE_WITHIN

@@ -188,8 +188,8 @@ class CaptureSamples:
     """All samples of a capture; shape (n,). Unlike a log's rows they may lack values (NaN).
 
     Times are bus times, `soc_pct` is the car's own SoC when the sample was made. Without a model no
-    value is refused as impossible for the pack. `statistics` are those of the chosen bus, `remarks`
-    losses and refusals, for the user.
+    value is refused as impossible for the pack, but a SoC outside 0–100 % is. `statistics` are
+    those of the chosen bus, `remarks` losses and refusals, for the user.
     """
 
     time_s: FloatArray
@@ -306,6 +306,7 @@ def _losses(statistics: FrameStatistics) -> list[str]:
         "frames refused: too short": statistics.short,
         "frames refused: two senders use their id": statistics.two_senders,
         "values refused: code for 'not available'": statistics.not_available,
+        "values refused: outside their limits (of a SoC: 0–100 %)": statistics.implausible,
         f"counter jumps: at least {statistics.frames_lost} frames lost": statistics.counter_jumps,
     }
     return [f"{count} {text}" for text, count in counts.items() if count]
