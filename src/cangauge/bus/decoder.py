@@ -10,7 +10,7 @@ from typing import Final, NamedTuple
 import can
 
 from cangauge.bus.database import SignalCodec
-from cangauge.bus.isotp import Reassembler, reply_id, reply_key
+from cangauge.bus.isotp import READ_BY_IDENTIFIER, Reassembler, reply_id
 from cangauge.bus.plausibility import (
     MessageStatistics,
     PackProperties,
@@ -247,7 +247,8 @@ class SampleDecoder:
         self._routes: dict[int, _Route] = {}
         messages = vehicle.messages.items()
         self._by_pgn = {key & pgn_mask(key): key for key, each in messages if each.by_pgn}
-        self._replies = {reply_id(key): Reassembler() for key, each in messages if each.is_reply}
+        self._replies = {reply_id(key): Reassembler() for key, each in messages if each.reply}
+        self._by_reply = {(reply_id(key), each.reply): key for key, each in messages if each.reply}
         detectors: dict[str, StuckDetector] = {}
         if pack is not None:
             both = (current, voltage)
@@ -306,8 +307,9 @@ class SampleDecoder:
                 route = self._routes.get(self._by_pgn.get(key & pgn_mask(key), -1))
             elif key in self._replies:
                 reply = self._replies[key].take(data, time_s)
-                if reply is not None and len(reply) >= 2:
-                    route = self._routes.get(reply_key(key, reply) | EXTENDED)
+                if reply is not None:
+                    start = reply[: 3 if reply[0] == READ_BY_IDENTIFIER else 2]
+                    route = self._routes.get(self._by_reply.get((key, start), -1))
                     data = bytearray(reply)
             if route is None:
                 return None
