@@ -157,11 +157,27 @@ class _Route:
     cells: list[tuple[int, SignalCodec]] = field(default_factory=list)
     last_s: float = -math.inf
     suspected_s: float = -math.inf  # the last sign of a second sender
+    by_pgn: bool = False
+    source: int = -1  # latest source address (J1939), and when it was seen
+    source_s: float = -math.inf
 
-    def accept(self, payload: bytearray, time_s: float) -> bytearray | None:
-        """Return the payload, cut to the message's length; None for a refused frame."""
+    def _note_source(self, address: int, time_s: float) -> None:
+        """Suspect two senders where two source addresses send the PGN: two packs, for instance."""
+        if address != self.source:
+            if abs(time_s - self.source_s) < SUSPECTED_FOR_S:
+                self.suspected_s = time_s
+            self.source = address
+        self.source_s = time_s
+
+    def accept(self, payload: bytearray, time_s: float, source: int) -> bytearray | None:
+        """Return the payload, cut to the message's length; None for a refused frame.
+
+        `source` is the source address of a J1939 frame.
+        """
         statistics, checker = self.statistics, self.checker
         statistics.wanted += 1
+        if self.by_pgn:
+            self._note_source(source, time_s)
         if len(payload) < self.length:
             statistics.short += 1
             self._refuse(Reason.PROTECTION_FAILED)
@@ -203,10 +219,10 @@ class SampleDecoder:
     """Decode a vehicle's frames to samples; a pure function of frames and time stamps.
 
     Refused are: frames with a wrong CRC, a repeated alive counter or too few bytes; all frames of a
-    message that seems to have two senders, since a mixture of both is worse than a gap; values that
-    are not available or implausible (see `plausibility`). A jump of the alive counter counts as a
-    loss, and the frame is used. The temperature of a sample is the latest value while it is usable,
-    else NaN.
+    message that seems to have two senders, or a PGN that two source addresses send, since a mixture
+    of both is worse than a gap; values that are not available or implausible (see `plausibility`).
+    A jump of the alive counter counts as a loss, and the frame is used. The temperature of a sample
+    is the latest value while it is usable, else NaN.
 
     Parameters
     ----------
@@ -290,7 +306,9 @@ class SampleDecoder:
             message = self.vehicle.messages[key]
             statistics = self.statistics.messages.setdefault(key, MessageStatistics())
             checker = None if message.rule is None else FrameChecker(message.rule, message.period_s)
-            self._routes[key] = _Route(signal.message, signal.length, checker, statistics)
+            self._routes[key] = _Route(
+                signal.message, signal.length, checker, statistics, by_pgn=message.by_pgn
+            )
         return self._routes[key]
 
     def handle(self, message: can.Message) -> Sample | None:
@@ -316,7 +334,7 @@ class SampleDecoder:
         if time_s < route.last_s:
             self._rewind(route.last_s, time_s)
         self.now_s = time_s
-        payload = route.accept(data, time_s)
+        payload = route.accept(data, time_s, key & 0xFF)
         if payload is None:
             self._suspected_s = time_s if route.suspected_s == time_s else self._suspected_s
             return None

@@ -169,7 +169,9 @@ def open_recording(
 def refuse_single_row(recorded: Sized) -> None:
     """Raise InputError for a log of one row: no charge can be counted."""
     if len(recorded) < 2:
+        why = "; ".join(getattr(recorded, "remarks", ()))
         problem = "a single row: charge is counted from one row to the next"
+        problem += f" ({why})" if why else ""
         source, cure = getattr(recorded, "source", None), "give a log of minutes or hours"
         raise InputError(problem, source=source, cure=cure)
 
@@ -296,6 +298,9 @@ def _without_current(
     if not statistics.messages[vehicle.current.key].wanted:
         problem = f"the capture holds no frames of {name}, which carries the current"
     cure = "check the vehicle; `cangauge inspect` lists the frames of a capture"
+    if statistics.two_senders and vehicle.messages[vehicle.current.key].by_pgn:
+        cure = "two source addresses send it: number it in the DBC with the pack's own, and remove"
+        cure += " j1939 = true"
     return InputError(problem, source=path, cure=cure)
 
 
@@ -304,7 +309,7 @@ def _losses(statistics: FrameStatistics) -> list[str]:
         "frames refused: wrong CRC": statistics.crc_errors,
         "frames refused: repeated counter": statistics.counter_repeats,
         "frames refused: too short": statistics.short,
-        "frames refused: two senders use their id": statistics.two_senders,
+        "frames refused: two senders use their id or PGN": statistics.two_senders,
         "values refused: code for 'not available'": statistics.not_available,
         "values refused: outside their limits (of a SoC: 0–100 %)": statistics.implausible,
         f"counter jumps: at least {statistics.frames_lost} frames lost": statistics.counter_jumps,

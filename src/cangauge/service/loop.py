@@ -286,7 +286,8 @@ class Loop:
             found[f"bus.two_senders {name}"] = (
                 f"two senders use the id of {name}: its frames are refused until one of them"
                 " stops; is somebody else on the bus? (If one sender sends it more often than"
-                " the DBC states, give its shortest period_s in the map file)"
+                " the DBC states, give its shortest period_s in the map file; with j1939 = true,"
+                " number it in the DBC with the pack's source address, and remove that line)"
             )
         for event in found.keys() - self._reported:
             _warn(event.split()[0], found[event], limit=event)
