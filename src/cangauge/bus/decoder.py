@@ -404,6 +404,17 @@ class SampleDecoder:
         return tuple(route.name for route in routes if route.is_suspected(self.now_s))
 
     @property
+    def wrong_periods(self) -> dict[str, str]:
+        """Messages that come much more often than the map or the DBC states, and what to do."""
+        return {
+            route.name: f"{route.name} comes each {each.health.period_s:.2g} s: its stated period"
+            " is much longer, and is not used; period_s in the map file is in seconds"
+            for route in self._routes.values()
+            for each in route.inputs
+            if each.health.is_faster_than_stated
+        }
+
+    @property
     def reference_soc_pct(self) -> float:
         """The car's own state of charge [%]; NaN without a usable one."""
         health = self.health.get("soc_reference")

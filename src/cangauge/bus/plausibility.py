@@ -47,6 +47,10 @@ LEARN_FROM: Final = 8
 intervals than four periods enter as four: a pause is not a period."""
 
 
+FASTER: Final = 5.0
+"""Stated period / learned one from which the stated one is wrong: 10 ms that stand as 10 s."""
+
+
 @dataclass(frozen=True, slots=True)
 class PackProperties:
     """Pack properties used for plausibility, taken from its model.
@@ -252,10 +256,21 @@ class SignalHealth:
 
     @property
     def period_s(self) -> float:
-        """Period of the values, stated or learned [s]; NaN while not known."""
-        if self._period_s is not None:
-            return self._period_s
-        return self._learned_s if self._intervals >= LEARN_FROM else math.nan
+        """Period of the values, stated or learned [s]; NaN while not known.
+
+        A stated one that is much too long does not count: a silent bus would seem alive.
+        """
+        stated_s = self._period_s
+        if self._intervals >= LEARN_FROM and (stated_s is None or self.is_faster_than_stated):
+            return self._learned_s
+        return math.nan if stated_s is None else stated_s
+
+    @property
+    def is_faster_than_stated(self) -> bool:
+        """Whether the values come much more often than a stated period says."""
+        stated_s = self._period_s
+        is_known = stated_s is not None and self._intervals >= LEARN_FROM
+        return is_known and FASTER * self._learned_s < (stated_s or 0.0)
 
     @property
     def timeout_s(self) -> float:

@@ -289,6 +289,8 @@ class Loop:
                 " the DBC states, give its shortest period_s in the map file; with j1939 = true,"
                 " number it in the DBC with the pack's source address, and remove that line)"
             )
+        for name, text in self._pipeline.decoder.wrong_periods.items():
+            found[f"bus.wrong_period {name}"] = text
         for event in found.keys() - self._reported:
             _warn(event.split()[0], found[event], limit=event)
         self._reported = set(found)
