@@ -374,5 +374,27 @@ def capture_to_log(path: str | PathLike[str], vehicle: Vehicle) -> Log:
     )
     names = {LOG_COLUMNS[each.role]: each.codec.name for each in vehicle.signals}
     labels = {"time_s": "time stamps", **names}
-    refuse_wrong_units(values, source=path, labels=labels, in_seconds=True)
+    try:
+        refuse_wrong_units(values, source=path, labels=labels, in_seconds=True)
+    except InputError as error:
+        raise _of_capture(error, vehicle) from error
     return resolve_sign(log, stored_sign_unknown=False)
+
+
+def _of_capture(error: InputError, vehicle: Vehicle) -> InputError:
+    """Return an error about values with a cure in the map file, as a capture has no columns."""
+    named = {each.codec.name: each for each in vehicle.signals}
+    signal, value = named.get(error.field or ""), error.value
+    if signal is None or not isinstance(value, float):
+        return error
+    table = f"under [{signal.role}] of the map file"
+    cure = f"state scale and offset {table}: they replace the DBC's unit"
+    if "swapped" in (error.cure or ""):
+        cure = "exchange the two signals in the map file"
+    elif error.problem.startswith("row "):
+        codec = signal.codec
+        raw = round(((value - codec.shift) / codec.gain - codec.offset) / codec.factor)
+        cure = f"if it is a code without a value, state not_available = [{raw}] {table}"
+        if codec.float_format:
+            cure = f"state lowest and highest {table}"
+    return InputError(error.problem, source=error.source, field=error.field, value=value, cure=cure)
