@@ -24,6 +24,8 @@ def reasons_after(first_s: float, *, shift_s: float, every: int = 1) -> dict[flo
     pipeline, found = Pipeline(Vehicle.load("generic"), leaf_model(), settings), {}
     for frame in sorted(frames, key=lambda each: each.timestamp):
         if pipeline.handle(frame) and pipeline.latest_sample is not None:
+            is_missing = bool(pipeline.latest.reasons & Reason.VOLTAGE_MISSING)
+            assert pipeline.is_unpaired is is_missing
             found[pipeline.latest_sample.time_s] = pipeline.latest.reasons
     return found
 

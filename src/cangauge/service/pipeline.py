@@ -290,6 +290,12 @@ class Pipeline:
         is_old = sample.time_s - self._voltage_s > self.decoder.health["voltage"].timeout_s
         self._lacks_voltage = is_old and self._without_voltage >= MISSED_AT_LEAST
 
+    @property
+    def is_unpaired(self) -> bool:
+        """Whether good voltages come, but no longer with a current."""
+        is_good = self.decoder.health["voltage"].is_usable(self.decoder.now_s)
+        return self._lacks_voltage and is_good
+
     def _with_health(self, now_s: float) -> Estimate:
         """Return the latest estimate, marked by the health of the signals at bus time `now_s`.
 
