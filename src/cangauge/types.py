@@ -10,6 +10,8 @@ CURRENT_AT_MOST_A = 5000.0
 """Largest plausible absolute current [A]."""
 TEMPERATURE_WITHIN_C = (-60.0, 120.0)
 """Plausible temperatures [°C]."""
+SOC_WITHIN_PCT = (-0.5, 100.5)
+"""Plausible values of a car's own SoC [%]: a step of 1 % rounds by half of it."""
 VOLTAGE_WITHIN = (0.5, 1.5)
 """Plausible voltages, relative to the pack's at half charge."""
 

@@ -14,7 +14,7 @@ from cangauge._resources import shared_file
 from cangauge.bus.captures import open_capture
 from cangauge.bus.database import load_dbc
 from cangauge.bus.decoder import SampleDecoder
-from cangauge.bus.isotp import Reassembler, reply_key
+from cangauge.bus.isotp import Reassembler
 from cangauge.bus.recording import capture_to_log
 from cangauge.bus.vehicle import Vehicle
 from cangauge.errors import InputError
@@ -99,7 +99,7 @@ def test_polled_replies_of_a_40_kwh_leaf(shared_data: Path) -> None:
         reply = reassembler.take(message.data, message.timestamp)
         if reply is None or reply[1] not in {1, 2, 4}:
             continue
-        owner = leaf.get_message_by_frame_id(reply_key(0x7BB, reply))
+        owner = leaf.get_message_by_frame_id(0x7BB << 16 | reply[0] << 8 | reply[1])
         values = owner.decode(reply[: owner.length], scaling=True)
         if reply[1] == 1:
             volts.append(values["reply_voltage_v"])

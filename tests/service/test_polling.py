@@ -19,8 +19,8 @@ from cangauge.service.polling import (
 )
 from polled_battery import CELLS, PROBES
 
-PROBES_OF_LEAF = PollTarget(0x79B, 0x7BB, (0x61, 0x04))
-CELLS_OF_LEAF = PollTarget(0x79B, 0x7BB, (0x61, 0x02))
+PROBES_OF_LEAF = PollTarget(0x79B, 0x7BB, b"\x61\x04")
+CELLS_OF_LEAF = PollTarget(0x79B, 0x7BB, b"\x61\x02")
 
 
 def reply(data: bytes) -> can.Message:

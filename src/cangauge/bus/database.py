@@ -113,7 +113,7 @@ class SignalCodec:
     field, is_signed, float_format : BitField, bool, str
         Bits; `float_format` is the `struct` format of an IEEE float, "" for integers.
     not_available : frozenset of int
-        Raw codes without a value.
+        Raw codes without a value, negative where those of a signed signal are.
     conditions : tuple of MultiplexCondition
         All must hold for the signal to be present in a frame.
 
@@ -247,14 +247,15 @@ def signal_codec(
     source, field : object, str
         For error messages: the file, and the name of the entry in the map file.
     not_available : tuple of int
-        Raw codes without a value, besides those that the value table names so.
+        Raw codes without a value, besides those that the value table names so. That of a signed
+        signal may be written as its bits are: 0x8000 is −32768 of 16 bits.
     when : dict of str to int, optional
         Further conditions: raw values of other signals of the message.
 
     Raises
     ------
     InputError
-        If the signal does not fit into its message or cannot be a number.
+        If the signal does not fit into its message or cannot be a number, or never has a code.
     """
 
     def bits_of(each: Signal) -> BitField:
@@ -288,17 +289,47 @@ def signal_codec(
         raw = value & ((1 << other_bits.width) - 1)
         conditions.append(MultiplexCondition(other_bits, frozenset({raw})))
     conversion = signal.conversion
+    is_signed = signal.is_signed and not conversion.is_float
     return SignalCodec(
         name=signal.name,
         unit=(signal.unit or "").strip(),
         field=bits,
-        is_signed=signal.is_signed and not conversion.is_float,
+        is_signed=is_signed,
         float_format=_FLOATS[signal.length] if conversion.is_float else "",
         factor=float(conversion.scale),
         offset=float(conversion.offset),
-        not_available=_codes_of_no_value(signal) | frozenset(not_available),
+        not_available=_codes(signal, is_signed, not_available, str(source), field),
         conditions=tuple(conditions),
     )
+
+
+def _codes(
+    signal: Signal, is_signed: bool, stated: tuple[int, ...], source: str, field: str
+) -> frozenset[int]:
+    """Return the codes of the value table and the stated ones, which must be possible."""
+    width, field = signal.length, f"{field}.not_available"
+    for code in stated:
+        if signal.conversion.is_float:
+            problem, cure = "a float has no codes", "remove it: NaN and infinite are no values"
+            raise InputError(problem, source=source, field=field, value=code, cure=cure)
+        if _as_sent(code, width, is_signed) is None:
+            problem = f"a signal of {width} bits never has this code"
+            low = -(1 << (width - 1)) if is_signed else 0
+            cure = f"state the raw code, within {low} to {(1 << width) - 1}"
+            raise InputError(problem, source=source, field=field, value=code, cure=cure)
+    codes = (_as_sent(code, width, is_signed) for code in (*_codes_of_no_value(signal), *stated))
+    return frozenset(code for code in codes if code is not None)
+
+
+def _as_sent(code: int, width: int, is_signed: bool) -> int | None:
+    """Return a raw code as the number that its bits are in a frame; None if none can be it.
+
+    The bits of a signed signal may be stated unsigned, as most value tables do.
+    """
+    low = -(1 << (width - 1)) if is_signed else 0
+    if not low <= code < 1 << width:
+        return None
+    return code - (1 << width) if is_signed and code >= -low else code
 
 
 def _selectors(

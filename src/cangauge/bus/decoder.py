@@ -10,7 +10,7 @@ from typing import Final, NamedTuple
 import can
 
 from cangauge.bus.database import SignalCodec
-from cangauge.bus.isotp import Reassembler, reply_id, reply_key
+from cangauge.bus.isotp import READ_BY_IDENTIFIER, Reassembler, reply_id
 from cangauge.bus.plausibility import (
     MessageStatistics,
     PackProperties,
@@ -157,11 +157,27 @@ class _Route:
     cells: list[tuple[int, SignalCodec]] = field(default_factory=list)
     last_s: float = -math.inf
     suspected_s: float = -math.inf  # the last sign of a second sender
+    by_pgn: bool = False
+    source: int = -1  # latest source address (J1939), and when it was seen
+    source_s: float = -math.inf
 
-    def accept(self, payload: bytearray, time_s: float) -> bytearray | None:
-        """Return the payload, cut to the message's length; None for a refused frame."""
+    def _note_source(self, address: int, time_s: float) -> None:
+        """Suspect two senders where two source addresses send the PGN: two packs, for instance."""
+        if address != self.source:
+            if abs(time_s - self.source_s) < SUSPECTED_FOR_S:
+                self.suspected_s = time_s
+            self.source = address
+        self.source_s = time_s
+
+    def accept(self, payload: bytearray, time_s: float, source: int) -> bytearray | None:
+        """Return the payload, cut to the message's length; None for a refused frame.
+
+        `source` is the source address of a J1939 frame.
+        """
         statistics, checker = self.statistics, self.checker
         statistics.wanted += 1
+        if self.by_pgn:
+            self._note_source(source, time_s)
         if len(payload) < self.length:
             statistics.short += 1
             self._refuse(Reason.PROTECTION_FAILED)
@@ -203,17 +219,18 @@ class SampleDecoder:
     """Decode a vehicle's frames to samples; a pure function of frames and time stamps.
 
     Refused are: frames with a wrong CRC, a repeated alive counter or too few bytes; all frames of a
-    message that seems to have two senders, since a mixture of both is worse than a gap; values that
-    are not available or implausible (see `plausibility`). A jump of the alive counter counts as a
-    loss, and the frame is used. The temperature of a sample is the latest value while it is usable,
-    else NaN.
+    message that seems to have two senders, or a PGN that two source addresses send, since a mixture
+    of both is worse than a gap; values that are not available or implausible (see `plausibility`).
+    A jump of the alive counter counts as a loss, and the frame is used. The temperature of a sample
+    is the latest value while it is usable, else NaN.
 
     Parameters
     ----------
     vehicle : Vehicle
     pack : PackProperties, optional
-        Pack properties from the model. Without them only stated limits apply and no signal counts
-        as stuck: a capture with a wrong scale then shows as such, not as a missing signal.
+        Pack properties from the model. Without them only stated limits apply, and those of a SoC,
+        and no signal counts as stuck: a capture with a wrong scale then shows as such, not as a
+        missing signal.
     statistics : FrameStatistics, optional
         Counts to continue.
 
@@ -246,7 +263,8 @@ class SampleDecoder:
         self._routes: dict[int, _Route] = {}
         messages = vehicle.messages.items()
         self._by_pgn = {key & pgn_mask(key): key for key, each in messages if each.by_pgn}
-        self._replies = {reply_id(key): Reassembler() for key, each in messages if each.is_reply}
+        self._replies = {reply_id(key): Reassembler() for key, each in messages if each.reply}
+        self._by_reply = {(reply_id(key), each.reply): key for key, each in messages if each.reply}
         detectors: dict[str, StuckDetector] = {}
         if pack is not None:
             both = (current, voltage)
@@ -270,7 +288,7 @@ class SampleDecoder:
         route, role = self._route(signal), signal.role
         is_multiplexed = bool(signal.codec.conditions)
         health = self.health[role] = SignalHealth(
-            signal.checks if pack is None else signal.checks.within_pack(role, pack),
+            signal.checks.within_pack(role, pack),
             # A multiplexed signal is not in every frame of its message: its period is learned.
             None if is_multiplexed else self.vehicle.messages[signal.key].period_s,
             is_cyclic=role in {"current", "voltage"},
@@ -288,7 +306,9 @@ class SampleDecoder:
             message = self.vehicle.messages[key]
             statistics = self.statistics.messages.setdefault(key, MessageStatistics())
             checker = None if message.rule is None else FrameChecker(message.rule, message.period_s)
-            self._routes[key] = _Route(signal.message, signal.length, checker, statistics)
+            self._routes[key] = _Route(
+                signal.message, signal.length, checker, statistics, by_pgn=message.by_pgn
+            )
         return self._routes[key]
 
     def handle(self, message: can.Message) -> Sample | None:
@@ -305,15 +325,16 @@ class SampleDecoder:
                 route = self._routes.get(self._by_pgn.get(key & pgn_mask(key), -1))
             elif key in self._replies:
                 reply = self._replies[key].take(data, time_s)
-                if reply is not None and len(reply) >= 2:
-                    route = self._routes.get(reply_key(key, reply) | EXTENDED)
+                if reply is not None:
+                    start = reply[: 3 if reply[0] == READ_BY_IDENTIFIER else 2]
+                    route = self._routes.get(self._by_reply.get((key, start), -1))
                     data = bytearray(reply)
             if route is None:
                 return None
         if time_s < route.last_s:
             self._rewind(route.last_s, time_s)
         self.now_s = time_s
-        payload = route.accept(data, time_s)
+        payload = route.accept(data, time_s, key & 0xFF)
         if payload is None:
             self._suspected_s = time_s if route.suspected_s == time_s else self._suspected_s
             return None
@@ -381,6 +402,17 @@ class SampleDecoder:
         """Names of the messages that seem to have two senders at present."""
         routes = self._routes.values()
         return tuple(route.name for route in routes if route.is_suspected(self.now_s))
+
+    @property
+    def wrong_periods(self) -> dict[str, str]:
+        """Messages that come much more often than the map or the DBC states, and what to do."""
+        return {
+            route.name: f"{route.name} comes each {each.health.period_s:.2g} s: its stated period"
+            " is much longer, and is not used; period_s in the map file is in seconds"
+            for route in self._routes.values()
+            for each in route.inputs
+            if each.health.is_faster_than_stated
+        }
 
     @property
     def reference_soc_pct(self) -> float:

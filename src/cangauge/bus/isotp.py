@@ -16,18 +16,22 @@ LONGEST_GAP_S: Final = 1.0
 SINGLE, FIRST, CONSECUTIVE = range(3)
 """Kinds of frames, in the upper half of their first byte."""
 _REPLY_OFFSET = 0x40
+READ_BY_IDENTIFIER: Final = 0x62
+"""First byte of a reply to ReadDataByIdentifier (22), before two bytes of the data identifier."""
 
 
-def reply_key(reply_id: int, payload: bytes | bytearray) -> int:
-    """Return the id of a reply's message in a DBC: the frames' id, then two bytes of the payload.
+def reply_start(key: int, is_uds: bool) -> bytes:
+    """Return the first bytes of the reply that a message of the DBC is.
 
-    A reply `61 04 …` on 0x7BB is the message 0x7BB6104.
+    Its id is the frames' id, then two bytes of the reply: 0x7BB6104 is a reply `61 04 …` on 0x7BB.
+    Where `is_uds`, they are a data identifier: 0x7EC0101 is a reply `62 01 01 …` on 0x7EC.
     """
-    return reply_id << 16 | payload[0] << 8 | payload[1]
+    low = (key & 0xFFFF).to_bytes(2, "big")
+    return bytes([READ_BY_IDENTIFIER]) + low if is_uds else low
 
 
 def reply_id(key: int) -> int:
-    """Return the id of the frames that carry a reply; see `reply_key`."""
+    """Return the id of the frames that carry a reply; see `reply_start`."""
     return key >> 16 & 0x7FF
 
 
@@ -67,16 +71,16 @@ class Reassembler:
 
 @dataclass(frozen=True, slots=True)
 class PollTarget:
-    """A reply to ask for: standard ids of the frames, and the first two bytes of the reply.
+    """A reply to ask for: standard ids of the frames, and the first bytes of the reply.
 
-    The request for a reply (0x61, 0x04) is `21 04`.
+    The request for a reply `61 04` is `21 04`.
     """
 
     request_id: int
     reply_id: int
-    reply: tuple[int, int]
+    reply: bytes
 
     @property
     def request(self) -> bytes:
         """Payload of the request."""
-        return bytes([self.reply[0] - _REPLY_OFFSET, self.reply[1]])
+        return bytes([self.reply[0] - _REPLY_OFFSET]) + self.reply[1:]

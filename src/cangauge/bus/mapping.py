@@ -142,13 +142,14 @@ class MessageMap(_MapTable):
     `protection` is one of `protection.RULES`, of [rules] or of `protection.PROFILES` (see `E2eRule`
     for their keys), or "counter", with its signal and the number of its values, by default all that
     its bits can hold. `j1939`: its PGN identifies it, from any source address and at any priority.
-    `isotp`: it is a reply over ISO-TP, with the id of `isotp.reply_key` in the DBC, which the
-    service may ask for on `request_id`.
+    `isotp`: it is a reply over ISO-TP, `uds`: one to ReadDataByIdentifier, each with the id of
+    `isotp.reply_start` in the DBC; the service may ask for it on `request_id`.
     """
 
     protection: str | None = None
     j1939: bool = False
     isotp: bool = False
+    uds: bool = False
     request_id: Annotated[int, Field(ge=0, le=0x7FF)] | None = None
     period_s: _Positive | None = None
     data_id: Annotated[int, Field(ge=0, lt=1 << 32)] | None = None

@@ -37,7 +37,12 @@ RECEIVE_BUFFER_BYTES: Final = 16 << 20
 """Requested receive buffer of sockets, for pauses: Linux's default holds about 270 frames. Without
 CAP_NET_ADMIN the system limits it to net.core.rmem_max."""
 
-_SO_RCVBUFFORCE: Final = 33  # Linux; not in Python's socket module
+_SO_RCVBUFFORCE: Final = 33  # Linux; not in Python's socket module, as the two below
+_OWN_GROUP_ONLY: Final = {
+    socket.AF_INET: (socket.IPPROTO_IP, 49), socket.AF_INET6: (socket.IPPROTO_IPV6, 29),
+}  # fmt: skip
+"""IP_MULTICAST_ALL and IPV6_MULTICAST_ALL: while set, as by default, a socket receives the packets
+of every group that any program of the machine has joined. Other systems have no such option."""
 _DEFAULT_CHANNELS: Final = {
     "socketcan": "vcan0", "udp_multicast": MULTICAST_CHANNEL, "virtual": "cangauge",
 }  # fmt: skip
@@ -317,13 +322,17 @@ class CheckedUdpBus(UdpMulticastBus):
     """python-can's bus, with checked packets.
 
     `local_only` drops packets whose sender is not an address of this machine. (The kernel drops
-    packets from the network that pretend to be.)
+    packets from the network that pretend to be.) Packets of another group are another bus's.
     """
 
     def __init__(self, *args: Any, local_only: bool = False, **kwargs: Any) -> None:
         self._local_only = local_only
         self._local_host = ""
         super().__init__(*args, **kwargs)
+        if sys.platform == "linux":
+            # Kernels before 4.20 have none for IPv6.
+            with suppress(OSError), socket.socket(fileno=os.dup(self.fileno())) as own:
+                own.setsockopt(*_OWN_GROUP_ONLY[own.family], 0)
 
     def _recv_internal(self, timeout: float | None) -> tuple[can.Message | None, bool]:
         carries_fd = self.protocol is can.CanProtocol.CAN_FD

@@ -19,7 +19,13 @@ from typing import Annotated, Final, Self
 
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, model_validator
 
-from cangauge.types import CURRENT_AT_MOST_A, TEMPERATURE_WITHIN_C, VOLTAGE_WITHIN, Reason
+from cangauge.types import (
+    CURRENT_AT_MOST_A,
+    SOC_WITHIN_PCT,
+    TEMPERATURE_WITHIN_C,
+    VOLTAGE_WITHIN,
+    Reason,
+)
 
 INVALID_AFTER: Final = 5
 VALID_AFTER: Final = 3
@@ -39,6 +45,10 @@ TIMEOUT_AT_LEAST_S: Final = 0.5
 LEARN_FROM: Final = 8
 """Frame intervals from which a period counts as learned, by a mean over about 16 of them; longer
 intervals than four periods enter as four: a pause is not a period."""
+
+
+FASTER: Final = 5.0
+"""Stated period / learned one from which the stated one is wrong: 10 ms that stand as 10 s."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,10 +96,18 @@ class SignalChecks(BaseModel):
             raise ValueError("max_jump and max_rate_per_s need each other")
         return self
 
-    def within_pack(self, role: str, pack: PackProperties) -> SignalChecks:
-        """Return the checks with the physical limits of a pack where none are stated."""
+    def within_pack(self, role: str, pack: PackProperties | None) -> SignalChecks:
+        """Return the checks with the physical limits of a pack where none are stated.
+
+        Without a pack only a SoC has some.
+        """
         limits: dict[str, float] = {}
-        if role == "current":
+        if role == "soc_reference":
+            low, high = SOC_WITHIN_PCT
+            limits = {"lowest": low, "highest": high}
+        elif pack is None:
+            return self
+        elif role == "current":
             limits = {"lowest": -CURRENT_AT_MOST_A, "highest": CURRENT_AT_MOST_A}
         elif role == "voltage":
             low, high = VOLTAGE_WITHIN
@@ -238,10 +256,21 @@ class SignalHealth:
 
     @property
     def period_s(self) -> float:
-        """Period of the values, stated or learned [s]; NaN while not known."""
-        if self._period_s is not None:
-            return self._period_s
-        return self._learned_s if self._intervals >= LEARN_FROM else math.nan
+        """Period of the values, stated or learned [s]; NaN while not known.
+
+        A stated one that is much too long does not count: a silent bus would seem alive.
+        """
+        stated_s = self._period_s
+        if self._intervals >= LEARN_FROM and (stated_s is None or self.is_faster_than_stated):
+            return self._learned_s
+        return math.nan if stated_s is None else stated_s
+
+    @property
+    def is_faster_than_stated(self) -> bool:
+        """Whether the values come much more often than a stated period says."""
+        stated_s = self._period_s
+        is_known = stated_s is not None and self._intervals >= LEARN_FROM
+        return is_known and FASTER * self._learned_s < (stated_s or 0.0)
 
     @property
     def timeout_s(self) -> float:

@@ -30,7 +30,8 @@ class ProtectionRule:
     """CRC-8 (not reflected) over all other bytes, and a counter of `counter_bits` (0: none).
 
     `crc_byte` and `counter_byte` are places, negative ones from the end; `counter_shift` is the
-    counter's lowest bit.
+    counter's lowest bit. `counter_modulus` is the number of counter values, by default all that its
+    bits can hold; AUTOSAR's counters of four bits often leave 15 out.
     """
 
     polynomial: _Byte
@@ -40,6 +41,7 @@ class ProtectionRule:
     counter_bits: Annotated[int, Field(ge=0, le=8)] = 4
     counter_byte: _Place = -2
     counter_shift: Annotated[int, Field(ge=0, le=7)] = 0
+    counter_modulus: Annotated[int, Field(ge=3, le=256)] | None = None
 
     _table: bytes = field(init=False, repr=False, compare=False)
 
@@ -48,6 +50,9 @@ class ProtectionRule:
             raise ValueError("counter_bits must be 0, or from 2 to 8 with counter_shift")
         if self.counter_bits and self.counter_byte == self.crc_byte:
             raise ValueError("counter_byte and crc_byte cannot be the same")
+        most = 1 << self.counter_bits
+        if self.counter_modulus is not None and self.counter_modulus > most:
+            raise ValueError(f"counter_modulus is at most {most} with these counter_bits")
         table: Sequence[int] = range(256)
         for _ in range(8):
             table = [(v << 1 & 0xFF) ^ (self.polynomial if v & 0x80 else 0) for v in table]
@@ -56,7 +61,7 @@ class ProtectionRule:
     @property
     def modulus(self) -> int:
         """Number of counter values; 0 without a counter."""
-        return 1 << self.counter_bits if self.counter_bits else 0
+        return (self.counter_modulus or 1 << self.counter_bits) if self.counter_bits else 0
 
     def fits(self, length: int) -> bool:
         """Return whether a payload of `length` bytes has both bytes, and they differ."""
@@ -72,20 +77,21 @@ class ProtectionRule:
         return crc ^ self.xor_out
 
     def is_whole(self, data: bytes | bytearray) -> bool:
-        """Return whether the CRC agrees."""
-        return self.crc(data) == data[self.crc_byte]
+        """Return whether the CRC agrees, and the counter value is a possible one."""
+        is_possible = self.counter_modulus is None or self.counter(data) < self.counter_modulus
+        return self.crc(data) == data[self.crc_byte] and is_possible
 
     def counter(self, data: bytes | bytearray) -> int:
         """Return the counter of a payload; 0 without a counter."""
         return (data[self.counter_byte] >> self.counter_shift) & ((1 << self.counter_bits) - 1)
 
     def protect(self, data: bytes | bytearray, counter: int) -> bytes:
-        """Return the payload with counter (modulo its width) and CRC set."""
+        """Return the payload with counter (modulo `modulus`) and CRC set."""
         out = bytearray(data)
         if self.counter_bits:
             mask = ((1 << self.counter_bits) - 1) << self.counter_shift
-            place = self.counter_byte
-            out[place] = (out[place] & ~mask) | ((counter << self.counter_shift) & mask)
+            place, value = self.counter_byte, counter % self.modulus
+            out[place] = (out[place] & ~mask) | value << self.counter_shift
         out[self.crc_byte] = self.crc(out)
         return bytes(out)
 

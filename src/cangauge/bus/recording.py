@@ -169,7 +169,9 @@ def open_recording(
 def refuse_single_row(recorded: Sized) -> None:
     """Raise InputError for a log of one row: no charge can be counted."""
     if len(recorded) < 2:
+        why = "; ".join(getattr(recorded, "remarks", ()))
         problem = "a single row: charge is counted from one row to the next"
+        problem += f" ({why})" if why else ""
         source, cure = getattr(recorded, "source", None), "give a log of minutes or hours"
         raise InputError(problem, source=source, cure=cure)
 
@@ -188,8 +190,8 @@ class CaptureSamples:
     """All samples of a capture; shape (n,). Unlike a log's rows they may lack values (NaN).
 
     Times are bus times, `soc_pct` is the car's own SoC when the sample was made. Without a model no
-    value is refused as impossible for the pack. `statistics` are those of the chosen bus, `remarks`
-    losses and refusals, for the user.
+    value is refused as impossible for the pack, but a SoC outside 0–100 % is. `statistics` are
+    those of the chosen bus, `remarks` losses and refusals, for the user.
     """
 
     time_s: FloatArray
@@ -269,7 +271,7 @@ def capture_samples(path: str | PathLike[str], vehicle: Vehicle) -> CaptureSampl
     statistics = decoder.statistics
     if not values:
         raise _without_current(path, vehicle, statistics)
-    remarks = [*capture.info.remarks, *_losses(statistics)]
+    remarks = [*capture.info.remarks, *_losses(statistics), *decoder.wrong_periods.values()]
     if sum(bool(each[2]) for each in buses.values()) > 1:
         remarks.append(f"several buses carry the frames; bus {channel} is used: most samples")
     if recorded.name == "replay-clock":
@@ -296,6 +298,9 @@ def _without_current(
     if not statistics.messages[vehicle.current.key].wanted:
         problem = f"the capture holds no frames of {name}, which carries the current"
     cure = "check the vehicle; `cangauge inspect` lists the frames of a capture"
+    if statistics.two_senders and vehicle.messages[vehicle.current.key].by_pgn:
+        cure = "two source addresses send it: number it in the DBC with the pack's own, and remove"
+        cure += " j1939 = true"
     return InputError(problem, source=path, cure=cure)
 
 
@@ -304,8 +309,9 @@ def _losses(statistics: FrameStatistics) -> list[str]:
         "frames refused: wrong CRC": statistics.crc_errors,
         "frames refused: repeated counter": statistics.counter_repeats,
         "frames refused: too short": statistics.short,
-        "frames refused: two senders use their id": statistics.two_senders,
+        "frames refused: two senders use their id or PGN": statistics.two_senders,
         "values refused: code for 'not available'": statistics.not_available,
+        "values refused: outside their limits (of a SoC: 0–100 %)": statistics.implausible,
         f"counter jumps: at least {statistics.frames_lost} frames lost": statistics.counter_jumps,
     }
     return [f"{count} {text}" for text, count in counts.items() if count]
@@ -368,5 +374,27 @@ def capture_to_log(path: str | PathLike[str], vehicle: Vehicle) -> Log:
     )
     names = {LOG_COLUMNS[each.role]: each.codec.name for each in vehicle.signals}
     labels = {"time_s": "time stamps", **names}
-    refuse_wrong_units(values, source=path, labels=labels, in_seconds=True)
+    try:
+        refuse_wrong_units(values, source=path, labels=labels, in_seconds=True)
+    except InputError as error:
+        raise _of_capture(error, vehicle) from error
     return resolve_sign(log, stored_sign_unknown=False)
+
+
+def _of_capture(error: InputError, vehicle: Vehicle) -> InputError:
+    """Return an error about values with a cure in the map file, as a capture has no columns."""
+    named = {each.codec.name: each for each in vehicle.signals}
+    signal, value = named.get(error.field or ""), error.value
+    if signal is None or not isinstance(value, float):
+        return error
+    table = f"under [{signal.role}] of the map file"
+    cure = f"state scale and offset {table}: they replace the DBC's unit"
+    if "swapped" in (error.cure or ""):
+        cure = "exchange the two signals in the map file"
+    elif error.problem.startswith("row "):
+        codec = signal.codec
+        raw = round(((value - codec.shift) / codec.gain - codec.offset) / codec.factor)
+        cure = f"if it is a code without a value, state not_available = [{raw}] {table}"
+        if codec.float_format:
+            cure = f"state lowest and highest {table}"
+    return InputError(error.problem, source=error.source, field=error.field, value=value, cure=cure)

@@ -27,7 +27,7 @@ from cangauge.bus.database import (
     load_dbc,
     signal_codec,
 )
-from cangauge.bus.isotp import PollTarget, reply_id
+from cangauge.bus.isotp import READ_BY_IDENTIFIER, PollTarget, reply_id, reply_start
 from cangauge.bus.mapping import CellsMap, MessageMap, SignalMap, VehicleMap
 from cangauge.bus.plausibility import SignalChecks
 from cangauge.bus.protection import Protection
@@ -105,13 +105,13 @@ class CellSignals:
 class MessageProtection(NamedTuple):
     """Protection and period [s] of one message, where known, and how it is identified.
 
-    `is_reply`: over ISO-TP; `request_id`: on which the reply may be asked for; `by_pgn`: from any
-    source address (J1939).
+    `reply`: first bytes of a reply over ISO-TP; b"" for other messages. `request_id`: on which it
+    may be asked for; `by_pgn`: from any source address (J1939).
     """
 
     rule: Protection | None
     period_s: float | None
-    is_reply: bool = False
+    reply: bytes = b""
     by_pgn: bool = False
     request_id: int | None = None
 
@@ -216,7 +216,7 @@ class Vehicle:
         """Ids of the frames with a wanted signal, plus `EXTENDED`, each once."""
         keys = [signal.key for signal in self.signals]
         keys += () if self.cells is None else self.cells.keys
-        ids = (reply_id(key) if self.messages[key].is_reply else key for key in keys)
+        ids = (reply_id(key) if self.messages[key].reply else key for key in keys)
         return tuple(dict.fromkeys(ids))
 
     @property
@@ -228,9 +228,9 @@ class Vehicle:
     def poll_targets(self) -> list[PollTarget]:
         """The replies that may be asked for."""
         return [
-            PollTarget(each.request_id, reply_id(key), (key >> 8 & 0xFF, key & 0xFF))
+            PollTarget(each.request_id, reply_id(key), each.reply)
             for key, each in self.messages.items()
-            if each.is_reply and each.request_id is not None
+            if each.reply and each.request_id is not None
         ]
 
     @property
@@ -244,6 +244,12 @@ class Vehicle:
                 mask = pgn_mask(key)
             filters.append({"can_id": key & ~EXTENDED, "can_mask": mask, "extended": is_extended})
         return filters
+
+
+_EXTENDED_KINDS: Final = {
+    "j1939": "0x18F08AF3", "isotp": "0x7BB6104 for 61 04 on 0x7BB",
+    "uds": "0x7EC0101 for 62 01 01 on 0x7EC",
+}  # fmt: skip
 
 
 class _Binder:
@@ -359,10 +365,32 @@ class _Binder:
             if period_s is None and isinstance(cycle_ms, int | float) and 0 < cycle_ms < math.inf:
                 period_s = cycle_ms / 1000.0
             rule = each.rule(message, self._mapping.rules, source=self._source)
-            protections[key] = MessageProtection(
-                rule, period_s, each.isotp, each.j1939, each.request_id
-            )
+            self._refuse_kind(message, each)
+            is_reply = each.isotp or each.uds
+            reply = reply_start(message.frame_id, each.uds) if is_reply else b""
+            protections[key] = MessageProtection(rule, period_s, reply, each.j1939, each.request_id)
         return protections
+
+    def _refuse_kind(self, message: Message, stated: MessageMap) -> None:
+        """Raise InputError if the message's id cannot be what the map says of it."""
+        number, where = message.frame_id, f"messages.{message.name}"
+        for kind, example in _EXTENDED_KINDS.items():
+            if getattr(stated, kind) and not message.is_extended_frame:
+                problem = f"{kind} needs an extended id"
+                cure = f"give it that number in the DBC, as {example}"
+                raise InputError(
+                    problem, source=self._source, field=f"{where}.{kind}",
+                    value=f"0x{number:X}", cure=cure,
+                )  # fmt: skip
+        if stated.isotp and not stated.uds and number >> 8 & 0xFF == READ_BY_IDENTIFIER:
+            sender = f"0x{reply_id(number):X}"
+            problem = "replies that begin with 62 differ in two further bytes"
+            cure = f"state uds = true, and number it {sender} and both bytes: {sender}0101 for"
+            cure += " 62 01 01"
+            raise InputError(
+                problem, source=self._source, field=f"{where}.isotp",
+                value=f"0x{number:X}", cure=cure,
+            )  # fmt: skip
 
     def _message_key(self, name: str) -> int:
         """Return the key of the message for a name or id in [messages]."""

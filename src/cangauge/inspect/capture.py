@@ -17,7 +17,8 @@ import numpy as np
 from cangauge._typing import FloatArray
 from cangauge.bus.captures import CaptureInfo, open_capture
 from cangauge.bus.decoder import SampleDecoder
-from cangauge.bus.protection import RULES, FrameChecker, Verdict
+from cangauge.bus.mapping import COUNTER
+from cangauge.bus.protection import RULES, CounterRule, E2eRule, FrameChecker, Protection, Verdict
 from cangauge.bus.recording import capture_to_log, open_vehicle_capture
 from cangauge.bus.vehicle import PRESETS, Vehicle
 from cangauge.inspect.log import Gap, LogInspection, inspect_log
@@ -49,8 +50,8 @@ Span = tuple[float, float] | None
 class IdSummary:
     """Frames of one id on one bus.
 
-    `protection` is the rule whose CRCs agree, or "". Counts by it are None without one, those of
-    the counter also where the counter is elsewhere in the frame.
+    `protection` is the vehicle's rule, or the one whose CRCs agree, or "". Counts by it are None
+    without one, those of the counter also where the counter is elsewhere in the frame.
     """
 
     id: str
@@ -144,7 +145,10 @@ def inspect_capture(
     start_s, steps_s = min(stamps_s), np.diff(stamps_s)
     duration_s = max(stamps_s) - start_s
     gaps = np.flatnonzero(steps_s > GAP_S)[:LISTED_GAPS].tolist()
-    summaries = tuple(frames.summary(*key) for key, frames in sorted(ids.items()))
+    rules = {} if vehicle is None else _rules_of(vehicle)
+    summaries = tuple(
+        frames.summary(*key, rules.get(key[1:])) for key, frames in sorted(ids.items())
+    )
     # Of every preset the trial on the bus with most of its samples; without a frame of any preset,
     # that of an empty bus.
     of_buses = buses.values() or [buses[""]]
@@ -159,7 +163,21 @@ def inspect_capture(
     )  # fmt: skip
 
 
-# --- Frames by id, without a vehicle
+# --- Frames by id
+
+_Rule = tuple[Protection, int]
+"""A protection that a vehicle states, and the length of its message."""
+
+
+def _rules_of(vehicle: Vehicle) -> dict[tuple[int, bool], _Rule]:
+    """Return the stated protections by id, and whether it is extended."""
+    cells = () if vehicle.cells is None else vehicle.cells.cells
+    signals = [(each, vehicle.messages[each.key].rule) for each in (*vehicle.signals, *cells)]
+    return {
+        (each.arbitration_id, each.is_extended): (rule, each.length)
+        for each, rule in signals
+        if rule is not None
+    }
 
 
 @dataclass(slots=True)
@@ -176,7 +194,7 @@ class _Frames:
         if len(self.lengths) == 1:
             self.payloads += message.data
 
-    def summary(self, bus: str, number: int, is_extended: bool) -> IdSummary:
+    def summary(self, bus: str, number: int, is_extended: bool, stated: _Rule | None) -> IdSummary:
         name = f"{number:08X}" if is_extended else f"{number:03X}"
         lengths, intervals_s = ", ".join(map(str, sorted(self.lengths))), np.diff(self.stamps_s)
         known: dict[str, Any] = {}
@@ -185,21 +203,35 @@ class _Frames:
                 "period_s": float(np.median(intervals_s)),
                 "longest_s": float(intervals_s.max()),
             }
-            known |= self._protection(intervals_s)
+            known |= self._protection(intervals_s, stated)
         return IdSummary(name, bus, len(self.stamps_s), lengths, **known)
 
-    def _protection(self, intervals_s: FloatArray) -> dict[str, Any]:
-        """Return the fields of `IdSummary` by the first rule whose CRCs agree; {} without one."""
+    def _protection(self, intervals_s: FloatArray, stated: _Rule | None) -> dict[str, Any]:
+        """Return the fields of `IdSummary` by the stated rule, or the first whose CRCs agree.
+
+        {} without one.
+        """
         length = max(self.lengths)
-        if len(self.lengths) > 1 or length < 3:
+        if len(self.lengths) > 1 or length < (3 if stated is None else stated[1]):
             return {}
         payloads = [self.payloads[at : at + length] for at in range(0, len(self.payloads), length)]
-        if len(set(map(bytes, payloads))) < PAYLOADS:
-            return {}
         # Lost frames lengthen intervals: the lower quartile is the period; 0 for equal stamps.
         period_s = float(np.quantile(intervals_s, 0.25)) or None
+        if stated is not None:
+            rule, length = stated
+            payloads = [data[:length] for data in payloads]
+            return _counts_by(rule, _name_of(rule), payloads, self.stamps_s, period_s)
+        if len(set(map(bytes, payloads))) < PAYLOADS:
+            return {}
         tried = (_by_rule(each, payloads, self.stamps_s, period_s) for each in ("leaf", "generic"))
         return next(filter(None, tried), {})
+
+
+def _name_of(rule: Protection) -> str:
+    if isinstance(rule, E2eRule):
+        return rule.name
+    known = (name for name, each in RULES.items() if each == rule)
+    return next(known, COUNTER if isinstance(rule, CounterRule) else "own rule")
 
 
 def _by_rule(
@@ -209,6 +241,19 @@ def _by_rule(
     rule, first = RULES[name], payloads[:LEARN_FRAMES]
     if 2 * sum(map(rule.is_whole, first)) < len(first):
         return {}
+    found = _counts_by(rule, name, payloads, stamps_s, period_s)
+    if found["crc_errors"] > DAMAGED * len(payloads):
+        return {}
+    most = MIXED_SHARE if found["two_senders"] else REPEATED_SHARE
+    if found["counter_repeats"] > most * len(payloads):
+        return {"protection": name, "crc_errors": found["crc_errors"]}
+    return found
+
+
+def _counts_by(
+    rule: Protection, name: str, payloads: list[bytearray], stamps_s: array[float],
+    period_s: float | None,
+) -> dict[str, Any]:  # fmt: skip
     checker, lost, two_senders = FrameChecker(rule, period_s), 0, False
     verdicts = dict.fromkeys(Verdict, 0)
     for data, time_s in zip(payloads, stamps_s, strict=True):
@@ -216,16 +261,12 @@ def _by_rule(
         verdicts[verdict] += 1
         lost += checker.lost if verdict is Verdict.AFTER_LOSS else 0
         two_senders |= checker.suspects_second_sender
-    crc_errors, repeats = verdicts[Verdict.CRC_WRONG], verdicts[Verdict.REPEATED]
-    if crc_errors > DAMAGED * len(payloads):
-        return {}
-    found = {"protection": name, "crc_errors": crc_errors}
-    if repeats > (MIXED_SHARE if two_senders else REPEATED_SHARE) * len(payloads):
-        return found
-    return found | {
+    return {
+        "protection": name,
+        "crc_errors": verdicts[Verdict.CRC_WRONG],
         "counter_jumps": verdicts[Verdict.AFTER_LOSS],
         "frames_lost": lost,
-        "counter_repeats": repeats,
+        "counter_repeats": verdicts[Verdict.REPEATED],
         "two_senders": two_senders,
     }
 

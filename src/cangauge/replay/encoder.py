@@ -43,7 +43,7 @@ class FrameEncoder:
     """
 
     def __init__(self, vehicle: Vehicle) -> None:
-        if any(each.is_reply for each in vehicle.messages.values()):
+        if any(each.reply for each in vehicle.messages.values()):
             problem = "replies over ISO-TP are received only"
             cure = "use a vehicle without them, and --temperature"
             raise InputError(problem, source=vehicle.name, cure=cure)

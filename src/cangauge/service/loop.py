@@ -286,8 +286,17 @@ class Loop:
             found[f"bus.two_senders {name}"] = (
                 f"two senders use the id of {name}: its frames are refused until one of them"
                 " stops; is somebody else on the bus? (If one sender sends it more often than"
-                " the DBC states, give its shortest period_s in the map file)"
+                " the DBC states, give its shortest period_s in the map file; with j1939 = true,"
+                " number it in the DBC with the pack's source address, and remove that line)"
             )
+        if self._pipeline.is_unpaired:
+            within_s = self._pipeline.vehicle.pair_within_s
+            found["bus.unpaired"] = (
+                f"voltages come, but not within {within_s:g} s of a current: they are not used;"
+                " give a longer pair_within_s in the map file"
+            )
+        for name, text in self._pipeline.decoder.wrong_periods.items():
+            found[f"bus.wrong_period {name}"] = text
         for event in found.keys() - self._reported:
             _warn(event.split()[0], found[event], limit=event)
         self._reported = set(found)

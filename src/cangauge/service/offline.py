@@ -340,7 +340,8 @@ def estimate_capture(
     best.pack.report, counts = pipeline.report(), pipeline.counts
     settings = pipeline.estimator.settings
     time_s, current_a, voltage_v, temperature_c, soc_pct = np.array(best.values).reshape(-1, 5).T
-    time_s, remarks = _without_steps_back(time_s), _remarks(recorded_time.name, counts, len(found))
+    time_s, two_senders = _without_steps_back(time_s), pipeline.decoder.statistics.two_senders
+    remarks = _remarks(recorded_time.name, counts, two_senders, len(found))
     recorded = CaptureSamples(
         time_s, current_a, voltage_v, temperature_c, soc_pct, str(path),
         settings.temperature_source, pipeline.decoder.statistics, capture.info,
@@ -384,7 +385,9 @@ class _Bus:
             self.pack.add(sample.time_s, self.pipeline.report)
 
 
-def _remarks(time_source: TimeSourceName, counts: FrameCounts, buses: int) -> list[str]:
+def _remarks(
+    time_source: TimeSourceName, counts: FrameCounts, two_senders: int, buses: int
+) -> list[str]:
     remarks = []
     if time_source == "replay-clock":
         remarks.append("a recorded replay: time is its log's (REPLAY_CLOCK)")
@@ -394,6 +397,8 @@ def _remarks(time_source: TimeSourceName, counts: FrameCounts, buses: int) -> li
         remarks.append(f"{counts.crc_errors} frames refused: wrong CRC")
     if counts.lost:
         remarks.append(f"{counts.lost} frames lost, by their alive counters")
+    if two_senders:
+        remarks.append(f"{two_senders} frames refused: two senders use their id or PGN")
     if buses > 1:
         remarks.append("several buses carry the frames; the one with most samples is used")
     return remarks

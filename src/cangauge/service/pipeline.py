@@ -265,6 +265,7 @@ class Pipeline:
         # The estimator treats a refused voltage otherwise than one that never came, as offline.
         self.estimator.update(sample._replace(voltage_v=math.inf) if is_implausible else sample)
         self._estimate = self.estimator.estimate
+        self._note_voltage(sample)
         self._refused = self._refused + 1 if self.estimator.is_refused else 0
         self.taken += not self.estimator.is_refused
         self.sign.add(sample)
@@ -274,16 +275,37 @@ class Pipeline:
             changes = self.estimator.current_changes(sample.time_s, times)
             cells.update(self.estimator.pack_tick(sample), volts, changes)
 
+    def _note_voltage(self, sample: Sample) -> None:
+        """Judge whether samples lack the voltage lastingly, though its frames may come.
+
+        They do when several in a row have none and the last one that had is too old for a voltage:
+        one that is sent less often than the current is in few samples.
+        """
+        if not math.isnan(sample.voltage_v):
+            self._voltage_s, self._without_voltage = sample.time_s, 0
+            self._lacks_voltage = False
+            return
+        self._voltage_s = min(self._voltage_s, sample.time_s)  # time may run backwards
+        self._without_voltage += 1
+        is_old = sample.time_s - self._voltage_s > self.decoder.health["voltage"].timeout_s
+        self._lacks_voltage = is_old and self._without_voltage >= MISSED_AT_LEAST
+
+    @property
+    def is_unpaired(self) -> bool:
+        """Whether good voltages come, but no longer with a current."""
+        is_good = self.decoder.health["voltage"].is_usable(self.decoder.now_s)
+        return self._lacks_voltage and is_good
+
     def _with_health(self, now_s: float) -> Estimate:
         """Return the latest estimate, marked by the health of the signals at bus time `now_s`.
 
-        A single voltage that failed or has not come yet is not missing; several consecutive ones
-        are, or one that is too old. Samples that are refused one after the other do not make an
-        estimate fresh.
+        A single voltage that failed, has not come yet or pairs with no current is not missing;
+        several consecutive ones are, or one that is too old. Samples that are refused one after the
+        other do not make an estimate fresh.
         """
-        estimate, reasons = self._estimate, self._estimate.reasons
-        if self.latest_sample is not None and math.isnan(self.latest_sample.voltage_v):
-            reasons &= ~Reason.VOLTAGE_MISSING
+        estimate, reasons = self._estimate, self._estimate.reasons & ~Reason.VOLTAGE_MISSING
+        if self._lacks_voltage:
+            reasons |= Reason.VOLTAGE_MISSING
         reasons |= self.decoder.reasons(now_s)
         if self._refused >= MISSED_UNTIL_OLD:
             reasons |= Reason.INPUT_STALE
@@ -303,6 +325,7 @@ class Pipeline:
         """Begin to judge the signals anew, for the present vehicle and model."""
         self.decoder = SampleDecoder(self.vehicle, self._pack, self._statistics)
         self.sign = SignWatch()
+        self._voltage_s, self._without_voltage, self._lacks_voltage = math.inf, 0, False
         self._begin_cells()
 
     def _begin_cells(self) -> None:

@@ -105,11 +105,11 @@ class Poller:
             kind = message.data[0] >> 4
             if kind in {FIRST, CONSECUTIVE}:
                 self._give_up_s = min(now_s + REPLY_WITHIN_S, self._exchange_ends_s)
-            is_ours = kind == FIRST and tuple(message.data[2:4]) == target.reply
+            is_ours = kind == FIRST and message.data[2:].startswith(target.reply)
             if is_ours and self._may_continue:  # once: a node may repeat its first frame for ever
                 self._may_continue = False
                 return _frame(target.request_id, _CONTINUE)
-        elif reply[:2] == bytes(target.reply):
+        elif reply.startswith(target.reply):
             self.counts.answers += 1
             self._end(turn, now_s, failed=False)
         elif reply[:3] == bytes([_NEGATIVE, target.request[0], _RESPONSE_PENDING]):
