@@ -157,6 +157,8 @@ class Pipeline:
     latest_sample : Sample or None
     published : Estimate
         The one in the frames made last: `latest`, or at a heartbeat what is true of it then.
+    published_samples : int
+        `samples` then.
 
     Raises
     ------
@@ -187,7 +189,7 @@ class Pipeline:
         self._refused = 0  # in a row
         self.stamp_shift_s = 0.0
         self.latest_sample: Sample | None = None
-        self.published = NOTHING_YET
+        self.published, self.published_samples = NOTHING_YET, 0
         self._estimate = NOTHING_YET  # after the latest sample, without the signals' health
         self._report: tuple[int, PackReport] | None = None
         self.estimator = make_estimator(model, _with_source(settings.estimator, vehicle))
@@ -321,7 +323,7 @@ class Pipeline:
         """Return the frames due with the latest sample's estimate in a replay, else none."""
         if not self.is_replay or self._publisher is None:
             return []
-        self.published = estimate
+        self.published, self.published_samples = estimate, self.samples
         return self._publisher.publish(estimate, self.samples, self.report)
 
     def heartbeat(
@@ -361,7 +363,7 @@ class Pipeline:
             missing_pct = self.estimator.uncounted_std_pct(silent_s)
             std_pct = math.hypot(estimate.soc_std_pct, missing_pct)
             estimate = estimate._replace(soc_std_pct=std_pct)
-        self.published = estimate
+        self.published, self.published_samples = estimate, self.samples
         age_s = silent_s if self.taken else math.nan
         return self._publisher.beat(estimate, self.samples, age_s, self.report)
 

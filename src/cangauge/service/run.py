@@ -232,7 +232,7 @@ class Service:
 
     def _log_end(self, status: dict[str, Any]) -> None:
         """Log the end of a run: its frames, losses and last SoC, and what is missing."""
-        counts, latest = self.pipeline.counts, self.pipeline.latest
+        counts, last = self.pipeline.counts, self.pipeline.published
         step_s = status["step"]["mean_s"]
         errors = "".join(
             f", {count} {_COUNTED.get(name, name)}"
@@ -242,8 +242,8 @@ class Service:
         text = (
             f"{status['uptime_s']:.1f} s, {counts.frames} frames, {counts.samples} samples,"
             f" {counts.lost} lost, {counts.crc_errors} CRC errors{errors};"
-            f" last SoC {known_soc(latest.soc_pct, latest.soc_std_pct, 2)}"
-            f" ({latest.status.name.lower()});"
+            f" last SoC {known_soc(last.soc_pct, last.soc_std_pct, 2)}"
+            f" ({last.status.name.lower()});"
             f" step {number(step_s and 1e6 * step_s, 0, 'µs')} (mean)"
         )
         emit(_LOG, logging.INFO, "service.stopped", text)
