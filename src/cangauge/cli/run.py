@@ -105,8 +105,9 @@ class _LiveLine(Output):
 def check_command(config: Path, *, json_output: bool = False) -> None:
     """Check a configuration as `cangauge run` would read it, without opening the bus.
 
-    Reads model, DBC and map, and checks ids, bus and output files. Exit code 2 and one line
-    with file, key, value and cure, if `run` or a reload would refuse it.
+    Reads model, DBC, map, token and password, and checks ids, bus, addresses and output files.
+    Exit code 2 and one line with file, key, value and cure, if `run` or a reload would refuse it.
+    Whether a port or a bus is free shows when `run` opens it.
 
     Examples
     --------

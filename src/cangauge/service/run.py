@@ -10,7 +10,6 @@ from collections.abc import Sequence
 from concurrent.futures import Future
 from contextlib import ExitStack
 from functools import partial
-from importlib import import_module
 from os import PathLike
 from pathlib import Path
 from typing import Any, Final
@@ -32,13 +31,6 @@ from cangauge.service.status import PAGE_EVERY_S, SHOW_EVERY_S, Monitor
 from cangauge.service.status_client import StatusSocket, socket_path, value_at
 from cangauge.service.worker import start_thread
 
-OUTPUTS: Final = {
-    "cangauge.extras.live.launch": ("http", "dashboard", "mqtt"),
-    "cangauge.extras.inverter.gateway": ("publish",),
-    "cangauge.extras.judge.live": ("judge",),
-}
-"""Modules with an output, and the keys that ask for it; imported only then. Each has
-`make_output(service)`."""
 _COUNTED: Final = {
     "garbled": "packets that are no frames",
     "error_frames": "error frames",
@@ -98,11 +90,12 @@ class Service:
             else partial(load_config, config, options)
         )
         self.config = self._read()
-        self._state = state_path(self.config.state, os.environ)
-        self._check_files()
-        self._setup = setup = Setup.of(self.config)
-        self.pipeline = Pipeline(setup.vehicle, setup.model, setup.settings)
-        self.address = address_of(self.config)
+        with self.config.naming_keys():
+            self._state = state_path(self.config.state, os.environ)
+            self._check_files()
+            self._setup = setup = Setup.of(self.config)
+            self.pipeline = Pipeline(setup.vehicle, setup.model, setup.settings)
+            self.address = address_of(self.config)
         self.bus = str(self.address)
         self._outputs = list(outputs)
         self._is_stopped = self._is_reload_due = False
@@ -164,10 +157,9 @@ class Service:
                 show_every_s=SHOW_EVERY_S if config.dashboard is None else PAGE_EVERY_S,
                 sign_cure=self._setup.sign_cure,
             )
-            for module, keys in OUTPUTS.items():
-                if any(getattr(config, key) is not None for key in keys):
-                    self._outputs.append(import_module(module).make_output(self))
-                    stack.callback(self._outputs[-1].close)
+            for make_output in self._setup.outputs:
+                self._outputs.append(make_output(self))
+                stack.callback(self._outputs[-1].close)
             _serve_status(config, monitor, stack)
             text = f"listening on {port.name}; time source: {config.time_source}; Ctrl-C ends"
             about = {"bus": port.name, "vehicle": pipeline.vehicle.name, "model": config.model}
@@ -200,7 +192,8 @@ class Service:
         try:
             if isinstance(new, CangaugeError):
                 raise new
-            self.pipeline.reconfigure(new.vehicle, new.model, new.settings)
+            with new.config.naming_keys():
+                self.pipeline.reconfigure(new.vehicle, new.model, new.settings)
         except CangaugeError as error:
             text = f"new configuration refused, the old one stays: {error}"
             emit(_LOG, logging.WARNING, "config.refused", text)
