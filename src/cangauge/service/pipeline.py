@@ -373,9 +373,11 @@ class Pipeline:
         """Continue with another configuration, from the SoC known so far.
 
         Unchanged parts keep their state bit for bit. A changed model or estimator setting makes a
-        new estimator, which takes over SoC and delay line. Initial SoC, its standard deviation, the
-        time source and REPLAY_CLOCK's id stay. InputError, and no change, if a frame to publish has
-        the id of a vehicle's signal, or settings contradict the model.
+        new estimator, which takes over SoC and delay line. Where current or voltage are decoded
+        otherwise, that SoC is of another battery, or wrong: the first voltages give it. Initial
+        SoC, its standard deviation, the time source and REPLAY_CLOCK's id stay. InputError, and no
+        change, if a frame to publish has the id of a vehicle's signal, or settings contradict the
+        model.
         """
         old, before = self.settings, self.estimator
         ids = replace(settings.ids, replay_clock=old.ids.replay_clock)
@@ -387,7 +389,9 @@ class Pipeline:
             initial_soc_std_pct=before.settings.initial_soc_std_pct,
         )
         estimator, is_other_model = before, model != self.model
-        if is_other_model or chosen != before.settings:
+        if vehicle.battery != self.vehicle.battery:
+            estimator, self._estimate = make_estimator(model, _from_voltage(chosen)), NOTHING_YET
+        elif is_other_model or chosen != before.settings:
             estimator = make_estimator(model, chosen)
             estimator.take_over(before)
         judged_by, pack = (self.vehicle, self._pack), _pack_of(estimator)
@@ -434,9 +438,7 @@ class Pipeline:
         settings = self.estimator.settings
         if settings.initial_soc_pct is None:
             return False
-        std_pct = EstimatorSettings().initial_soc_std_pct
-        settings = replace(settings, initial_soc_pct=None, initial_soc_std_pct=std_pct)
-        self.estimator = make_estimator(self.model, settings)
+        self.estimator = make_estimator(self.model, _from_voltage(settings))
         return True
 
 
@@ -449,6 +451,12 @@ def _pack_of(estimator: Estimator) -> PackProperties:
         capacity_ah=estimator.model.capacity_ah if stated_ah is None else stated_ah,
         usual_v=voltage.pseudo_ocv_at(50.0)[0],
     )
+
+
+def _from_voltage(settings: EstimatorSettings) -> EstimatorSettings:
+    """Return the settings without an initial SoC."""
+    std_pct = EstimatorSettings().initial_soc_std_pct
+    return replace(settings, initial_soc_pct=None, initial_soc_std_pct=std_pct)
 
 
 def _with_source(settings: EstimatorSettings, vehicle: Vehicle) -> EstimatorSettings:

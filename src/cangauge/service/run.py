@@ -40,6 +40,7 @@ _COUNTED: Final = {
     "foreign": "frames of another service with these ids",
 }
 """Words for the counts of a bus, at the end of a run."""
+_OF_THE_VEHICLE: Final = {"vehicle", "dbc", "map", "temperature", "pair_within_s"}
 _LOG = logging.getLogger(__name__)
 
 
@@ -187,7 +188,8 @@ class Service:
         """Use another configuration as a whole, or log why not; return its settings, or that.
 
         Model, vehicle, method, capacity, gaps, time-outs and published ids change at once; the SoC
-        continues, and the initial SoC is ignored. Other keys need a restart, which is logged.
+        continues unless current or voltage are decoded otherwise, and the initial SoC is ignored.
+        Other keys need a restart, which is logged.
         """
         try:
             if isinstance(new, CangaugeError):
@@ -198,7 +200,7 @@ class Service:
             text = f"new configuration refused, the old one stays: {error}"
             emit(_LOG, logging.WARNING, "config.refused", text)
             return None, str(error)
-        _log_changes(self.config, new.config)
+        _log_changes(self._setup, new)
         self._setup, self.config = new, new.config
         return _loop_settings(new.config), None
 
@@ -290,10 +292,16 @@ def _serve_status(config: RunConfig, monitor: Monitor, stack: ExitStack) -> None
         emit(_LOG, logging.WARNING, "status.unavailable", f"no status socket: {error}")
 
 
-def _log_changes(old: RunConfig, new: RunConfig) -> None:
-    before, after = old.model_dump(), new.model_dump()
-    changed = ", ".join(name for name in after if after[name] != before[name])
-    text = f"configuration reloaded; changed: {changed or 'no option'}"
+def _log_changes(old: Setup, new: Setup) -> None:
+    before, after = old.config.model_dump(), new.config.model_dump()
+    changed = [name for name in after if after[name] != before[name]]
+    if old.vehicle != new.vehicle and not _OF_THE_VEHICLE & set(changed):
+        changed.append("content of map or DBC")
+    if old.model != new.model and "model" not in changed:
+        changed.append("content of the model")
+    text = f"configuration reloaded; changed: {', '.join(changed) or 'nothing'}"
+    if old.vehicle.battery != new.vehicle.battery:
+        text += "; current or voltage are decoded otherwise: the SoC starts anew from the voltage"
     emit(_LOG, logging.INFO, "config.reloaded", text)
     late = ", ".join(
         each.name
