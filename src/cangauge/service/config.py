@@ -306,7 +306,8 @@ class RunConfig(Strict):
     record: str | None = key(
         None,
         "Record the received frames (candump .log or .log.gz): `cangauge estimate` on them"
-        " gives the live numbers, bit for bit. A kill loses the last half second. A full disk costs"
+        " gives the live numbers, bit for bit, if the keys that are no option of it have their"
+        " defaults (docs/service.md). A kill loses the last half second. A full disk costs"
         " frames of the recording, never the estimate. An existing recording is kept: the next run"
         " is FILE-0001, FILE-0002, …",
         "--record", "FILE", restart=True, is_path=True,
@@ -386,7 +387,6 @@ class RunConfig(Strict):
         self._file, self._options = str(file), frozenset(options)
         return self
 
-
     @contextmanager
     def naming_keys(self) -> Iterator[None]:
         """Let errors of the values name file and key, not the option that was not given."""
@@ -399,6 +399,7 @@ class RunConfig(Strict):
             raise InputError(
                 error.problem, source=self._file, field=key, value=error.value, cure=error.cure
             ) from error
+
 
 _MAP_CURE: Final = "in the file of `map`; a map of three lines changes a preset (docs/map-file.md)"
 _IN_THE_MAP: Final = {
