@@ -379,7 +379,7 @@ def _state_text() -> str:
     return state_file.state_text(
         state_file.StateContent(
             saved_s=1.7e9, boot_id="x", model=text_sha256(_model().to_json()),
-            model_name="x", bus="can0", vehicle="x", time_source="receive",
+            model_name="x", bus="can0", battery="x", vehicle_name="x", time_source="receive",
             estimator=estimator.snapshot(),
         )
     )  # fmt: skip

@@ -14,7 +14,7 @@ from cangauge._resources import shared_file
 from cangauge.bus.recording import read_log
 from cangauge.errors import InputError
 from cangauge.estimation.offline import samples_of
-from cangauge.extras.judge.live import PAGE, RESULT, LiveJudge, Stored, make_output
+from cangauge.extras.judge.live import PAGE, RESULT, LiveJudge, Stored
 from cangauge.logs.log import Log
 from cangauge.service.run import Service
 from cangauge.service.status_client import Snapshot
@@ -120,13 +120,12 @@ def test_a_vehicle_without_a_soc_is_refused(tmp_path: Path) -> None:
         '[current]\nsignal = "current_a"\n[voltage]\nsignal = "voltage_v"\n'
         "[temperature]\nfixed_c = 20\n"
     )
-    service = Service(
-        model=str(leaf_model_path()), interface="virtual", channel="none",
-        dbc=str(shared_file("dbc", "generic_pack.dbc")), map=str(tmp_path / "car.toml"),
-        judge={"folder": str(tmp_path / "judge")},
-    )  # fmt: skip
     with pytest.raises(InputError, match="no SoC of its own"):
-        make_output(service)
+        Service(
+            model=str(leaf_model_path()), interface="virtual", channel="none",
+            dbc=str(shared_file("dbc", "generic_pack.dbc")), map=str(tmp_path / "car.toml"),
+            judge={"folder": str(tmp_path / "judge")},
+        )  # fmt: skip
 
 
 def test_a_service_keeps_what_it_receives(tmp_path: Path) -> None:

@@ -210,7 +210,7 @@ def test_identical_foreign_frames_are_noticed(echoes: bool) -> None:
     proofs = []
     for number in range(4):
         mine = can.Message(arbitration_id=0x5A0, is_extended_id=False, data=[number])
-        own.note_sent(mine)
+        own.note_sent(mine, 1.0)
         assert own.is_echo(mine) == echoes
         assert not own.is_echo(mine)
         proofs.append(own.proves_another(1.0 + number))
@@ -223,7 +223,7 @@ def test_rare_foreign_frames_prove_nothing_and_a_lost_echo_is_none() -> None:
     own = OwnFrames(echoes=True)
     assert [own.proves_another(10.0 * number) for number in range(4)] == [False] * 4
     for number in range(3):
-        own.note_sent(can.Message(arbitration_id=0x5A0, is_extended_id=False, data=[number]))
+        own.note_sent(can.Message(arbitration_id=0x5A0, is_extended_id=False, data=[number]), 1.0)
     assert own.is_echo(can.Message(arbitration_id=0x5A0, is_extended_id=False, data=[2]))
     assert own.foreign == 4
 

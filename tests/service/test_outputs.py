@@ -6,12 +6,12 @@ import subprocess
 import sys
 from importlib import import_module
 
-from cangauge.service.run import OUTPUTS
+from cangauge.service.setup import OUTPUTS
 
 
 def test_each_output_is_made_by_its_module() -> None:
     for module in OUTPUTS:
-        assert callable(import_module(module).make_output)
+        assert callable(import_module(module).output_of)
 
 
 def test_a_service_without_outputs_needs_the_light_install_alone() -> None:

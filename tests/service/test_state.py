@@ -210,8 +210,8 @@ def test_a_state_of_another_use_is_refused(machine: Machine) -> None:
     check_refused(machine, f"of another model ({MODEL.name})")
     machine.bus = "virtual y"
     check_refused(machine, "of another bus (virtual x)")
-    rewritten(machine.path, lambda content: content.update(vehicle="moped"))
-    check_refused(machine, "of another vehicle (moped)")
+    rewritten(machine.path, lambda content: content.update(battery="", vehicle_name="moped"))
+    check_refused(machine, "of another battery (moped)")
     rewritten(machine.path, lambda content: content.update(time_source="replay-clock"))
     check_refused(machine, "of another time source (replay-clock)")
 

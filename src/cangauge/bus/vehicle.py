@@ -212,6 +212,16 @@ class Vehicle:
         return tuple(signal for signal in signals if signal is not None)
 
     @property
+    def battery(self) -> str:
+        """What a SoC belongs to: messages, bits, sign and scale of current and voltage."""
+        parts = []
+        for key, codec in ((each.key, each.codec) for each in (self.current, self.voltage)):
+            pages = [(each.field, sorted(each.values)) for each in codec.conditions]
+            scale = codec.gain * codec.factor, codec.gain * codec.offset + codec.shift
+            parts.append((key, codec.field, codec.is_signed, codec.float_format, pages, scale))
+        return repr(parts)
+
+    @property
     def frame_keys(self) -> tuple[int, ...]:
         """Ids of the frames with a wanted signal, plus `EXTENDED`, each once."""
         keys = [signal.key for signal in self.signals]

@@ -36,9 +36,9 @@ def run_command(*, config: Path | None = None, json_output: bool = False, **opti
     possible currents [A]; energy left [kWh]. Ctrl-C or SIGTERM stops it with a summary. Positive
     current discharges.
 
-    SIGHUP reloads configuration, model and vehicle: the SoC continues, an invalid configuration
-    is refused (`cangauge check` tests it before). Changes of the bus, the time source and the
-    recording need a restart.
+    SIGHUP reloads configuration, model and vehicle: the SoC continues unless current or voltage
+    are decoded otherwise. An invalid configuration is refused (`cangauge check` tests it before).
+    Changes of the bus, the time source and the recording need a restart.
 
     Examples
     --------
@@ -48,7 +48,8 @@ def run_command(*, config: Path | None = None, json_output: bool = False, **opti
     `cangauge replay trip.parquet --speed max`)
 
     `cangauge run --config car.toml --record drive.log`  (then `cangauge estimate drive.log -m
-    leaf.json --vehicle leaf_aze0 -o soc.parquet` writes the live estimates, bit for bit)
+    leaf.json --vehicle leaf_aze0 -o soc.parquet` writes the live estimates, bit for bit, unless
+    the configuration changes keys that `estimate` has no option for)
 
     `cangauge run --config car.toml --state /var/lib/cangauge`
 
@@ -105,8 +106,9 @@ class _LiveLine(Output):
 def check_command(config: Path, *, json_output: bool = False) -> None:
     """Check a configuration as `cangauge run` would read it, without opening the bus.
 
-    Reads model, DBC and map, and checks ids, bus and output files. Exit code 2 and one line
-    with file, key, value and cure, if `run` or a reload would refuse it.
+    Reads model, DBC, map, token and password, and checks ids, bus, addresses and output files.
+    Exit code 2 and one line with file, key, value and cure, if `run` or a reload would refuse it.
+    Whether a port or a bus is free shows when `run` opens it.
 
     Examples
     --------

@@ -17,7 +17,8 @@ precedence over the file; paths in a file are relative to it::
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cache, reduce
 from os import PathLike
@@ -200,6 +201,9 @@ class PublishConfig(Strict):
     )
 
 
+_NO_FILE: Final = "the configuration"
+
+
 def _none_for_auto(value: object) -> object:
     if value == "auto":
         return None
@@ -302,7 +306,8 @@ class RunConfig(Strict):
     record: str | None = key(
         None,
         "Record the received frames (candump .log or .log.gz): `cangauge estimate` on them"
-        " gives the live numbers, bit for bit. A kill loses the last half second. A full disk costs"
+        " gives the live numbers, bit for bit, if the keys that are no option of it have their"
+        " defaults (docs/service.md). A kill loses the last half second. A full disk costs"
         " frames of the recording, never the estimate. An existing recording is kept: the next run"
         " is FILE-0001, FILE-0002, …",
         "--record", "FILE", restart=True, is_path=True,
@@ -369,17 +374,31 @@ class RunConfig(Strict):
     )  # fmt: skip
     log_format: LogFormat = key("text", "Format of the events on stderr, one a line.", restart=True)
     log_level: LogLevel = key("info", "Lowest level of the events.", restart=True)
-    _file: str = PrivateAttr("the configuration")
+    _file: str = PrivateAttr(_NO_FILE)
+    _options: frozenset[str] = PrivateAttr(frozenset())
 
     @property
     def file(self) -> str:
         """File that messages name."""
         return self._file
 
-    def named(self, file: str | PathLike[str]) -> Self:
-        """Set the file that messages name; return self."""
-        self._file = str(file)
+    def named(self, file: str | PathLike[str], options: Iterable[str] = ()) -> Self:
+        """Set the file that messages name, and the keys given as options; return self."""
+        self._file, self._options = str(file), frozenset(options)
         return self
+
+    @contextmanager
+    def naming_keys(self) -> Iterator[None]:
+        """Let errors of the values name file and key, not the option that was not given."""
+        try:
+            yield
+        except InputError as error:
+            key = (error.field or "").removeprefix("--").replace("-", "_")
+            if error.source is not None or key in self._options or self._file == _NO_FILE:
+                raise
+            raise InputError(
+                error.problem, source=self._file, field=key, value=error.value, cure=error.cure
+            ) from error
 
 
 _MAP_CURE: Final = "in the file of `map`; a map of three lines changes a preset (docs/map-file.md)"
@@ -420,7 +439,7 @@ def load_config(
         cure = "give -m MODEL (made by `cangauge fit`)"
         raise InputError("is missing", source=path, field=field, cure=cure)
     config = validated(RunConfig, merged, path or "")
-    return config if path is None else config.named(path)
+    return config if path is None else config.named(path, given)
 
 
 def _check_options(given: Mapping[str, Any]) -> None:

@@ -59,8 +59,9 @@ FIRST_CHECKPOINT_S: Final = 1.0
 FOREIGN_FRAMES: Final = 3
 FOREIGN_WITHIN_S: Final = 5.0
 """Foreign frames with own ids within this time [s] that prove another sender."""
-_SENT_KEPT: Final = 1024
-"""Own frames whose echoes are awaited: a replay at full speed has hundreds on the way."""
+ECHO_WITHIN_S: Final = 1.0
+"""Time after which the echo of a sent frame has arrived [s], transmit queue included. It may wait
+longer in the receive queue."""
 
 
 @dataclass(frozen=True)
@@ -164,8 +165,9 @@ class Loop:
                 self._turn()
             if self._pipeline.finish():
                 self._give_sample(self._pipeline.latest)
+            if self._pipeline.published_samples != self._pipeline.samples:
                 self._now_s = time.monotonic()
-                self._beat()  # with the silence since the sample before: this one waited
+                self._beat()  # a sample that waited counts as silence
         finally:
             self._checkpoint()
 
@@ -185,6 +187,8 @@ class Loop:
             self._process(messages, received_s)
         if self._port.is_drained:
             self._drained_s = self._received_s
+            for own in (self._own, self._asked):
+                own.forget(self._received_s - ECHO_WITHIN_S)
         self._received_s = received_s
         late_s = 0.0 if self._pipeline.samples != before else LATE_S
         if self._now_s >= self._beat_s + late_s:
@@ -304,7 +308,7 @@ class Loop:
 
     def _send(self, frames: list[can.Message]) -> None:
         for frame in frames:
-            self._own.note_sent(frame)
+            self._own.note_sent(frame, steady_s())
             self._port.post(frame, SEND_WITHIN_S)
         if frames:
             self._monitor.sent()
@@ -312,7 +316,7 @@ class Loop:
     def _ask(self, frame: can.Message | None) -> None:
         """Send a request or a flow control, if there is one."""
         if frame is not None:
-            self._asked.note_sent(frame)
+            self._asked.note_sent(frame, steady_s())
             self._port.post(frame, SEND_WITHIN_S)
 
     def _housekeep(self) -> None:
@@ -351,14 +355,22 @@ class OwnFrames:
     def __init__(self, *, echoes: bool) -> None:
         self.foreign = 0
         self._echoes = echoes
-        self._sent: deque[tuple[int, bytes]] = deque(maxlen=_SENT_KEPT)
+        self._sent: deque[tuple[int, bytes]] = deque()
+        self._sent_s: deque[float] = deque()
         self._foreign_s: deque[float] = deque(maxlen=FOREIGN_FRAMES)
         self._shared_until_s = -math.inf
 
-    def note_sent(self, message: can.Message) -> None:
-        """Record an own frame, whose echo may be received."""
+    def note_sent(self, message: can.Message, now_s: float) -> None:
+        """Record an own frame, whose echo may be received, and the steady time [s]."""
         if self._echoes:
             self._sent.append((message.arbitration_id, bytes(message.data)))
+            self._sent_s.append(now_s)
+
+    def forget(self, before_s: float) -> None:
+        """Await no echo any more of what was sent before a steady time [s]."""
+        while self._sent_s and self._sent_s[0] < before_s:
+            self._sent_s.popleft()
+            self._sent.popleft()
 
     def is_echo(self, message: can.Message) -> bool:
         """Return whether a received frame is the echo of an own one, which is then forgotten."""
@@ -367,8 +379,10 @@ class OwnFrames:
             return False
         # Each echo comes once and in order; skipped ones are lost. So identical frames of another
         # sender are detected as well: as surplus echoes.
-        while self._sent.popleft() != frame:
-            pass
+        is_found = False
+        while not is_found:
+            self._sent_s.popleft()
+            is_found = self._sent.popleft() == frame
         return True
 
     def proves_another(self, now_s: float) -> bool:

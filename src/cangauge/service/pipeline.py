@@ -157,6 +157,8 @@ class Pipeline:
     latest_sample : Sample or None
     published : Estimate
         The one in the frames made last: `latest`, or at a heartbeat what is true of it then.
+    published_samples : int
+        `samples` then.
 
     Raises
     ------
@@ -187,7 +189,7 @@ class Pipeline:
         self._refused = 0  # in a row
         self.stamp_shift_s = 0.0
         self.latest_sample: Sample | None = None
-        self.published = NOTHING_YET
+        self.published, self.published_samples = NOTHING_YET, 0
         self._estimate = NOTHING_YET  # after the latest sample, without the signals' health
         self._report: tuple[int, PackReport] | None = None
         self.estimator = make_estimator(model, _with_source(settings.estimator, vehicle))
@@ -344,7 +346,7 @@ class Pipeline:
         """Return the frames due with the latest sample's estimate in a replay, else none."""
         if not self.is_replay or self._publisher is None:
             return []
-        self.published = estimate
+        self.published, self.published_samples = estimate, self.samples
         return self._publisher.publish(estimate, self.samples, self.report)
 
     def heartbeat(
@@ -384,7 +386,7 @@ class Pipeline:
             missing_pct = self.estimator.uncounted_std_pct(silent_s)
             std_pct = math.hypot(estimate.soc_std_pct, missing_pct)
             estimate = estimate._replace(soc_std_pct=std_pct)
-        self.published = estimate
+        self.published, self.published_samples = estimate, self.samples
         age_s = silent_s if self.taken else math.nan
         return self._publisher.beat(estimate, self.samples, age_s, self.report)
 
@@ -394,9 +396,11 @@ class Pipeline:
         """Continue with another configuration, from the SoC known so far.
 
         Unchanged parts keep their state bit for bit. A changed model or estimator setting makes a
-        new estimator, which takes over SoC and delay line. Initial SoC, its standard deviation, the
-        time source and REPLAY_CLOCK's id stay. InputError, and no change, if a frame to publish has
-        the id of a vehicle's signal, or settings contradict the model.
+        new estimator, which takes over SoC and delay line. Where current or voltage are decoded
+        otherwise, that SoC is of another battery, or wrong: the first voltages give it. Initial
+        SoC, its standard deviation, the time source and REPLAY_CLOCK's id stay. InputError, and no
+        change, if a frame to publish has the id of a vehicle's signal, or settings contradict the
+        model.
         """
         old, before = self.settings, self.estimator
         ids = replace(settings.ids, replay_clock=old.ids.replay_clock)
@@ -408,7 +412,9 @@ class Pipeline:
             initial_soc_std_pct=before.settings.initial_soc_std_pct,
         )
         estimator, is_other_model = before, model != self.model
-        if is_other_model or chosen != before.settings:
+        if vehicle.battery != self.vehicle.battery:
+            estimator, self._estimate = make_estimator(model, _from_voltage(chosen)), NOTHING_YET
+        elif is_other_model or chosen != before.settings:
             estimator = make_estimator(model, chosen)
             estimator.take_over(before)
         judged_by, pack = (self.vehicle, self._pack), _pack_of(estimator)
@@ -455,9 +461,7 @@ class Pipeline:
         settings = self.estimator.settings
         if settings.initial_soc_pct is None:
             return False
-        std_pct = EstimatorSettings().initial_soc_std_pct
-        settings = replace(settings, initial_soc_pct=None, initial_soc_std_pct=std_pct)
-        self.estimator = make_estimator(self.model, settings)
+        self.estimator = make_estimator(self.model, _from_voltage(settings))
         return True
 
 
@@ -470,6 +474,12 @@ def _pack_of(estimator: Estimator) -> PackProperties:
         capacity_ah=estimator.model.capacity_ah if stated_ah is None else stated_ah,
         usual_v=voltage.pseudo_ocv_at(50.0)[0],
     )
+
+
+def _from_voltage(settings: EstimatorSettings) -> EstimatorSettings:
+    """Return the settings without an initial SoC."""
+    std_pct = EstimatorSettings().initial_soc_std_pct
+    return replace(settings, initial_soc_pct=None, initial_soc_std_pct=std_pct)
 
 
 def _with_source(settings: EstimatorSettings, vehicle: Vehicle) -> EstimatorSettings:

@@ -10,7 +10,6 @@ from collections.abc import Sequence
 from concurrent.futures import Future
 from contextlib import ExitStack
 from functools import partial
-from importlib import import_module
 from os import PathLike
 from pathlib import Path
 from typing import Any, Final
@@ -32,13 +31,6 @@ from cangauge.service.status import PAGE_EVERY_S, SHOW_EVERY_S, Monitor
 from cangauge.service.status_client import StatusSocket, socket_path, value_at
 from cangauge.service.worker import start_thread
 
-OUTPUTS: Final = {
-    "cangauge.extras.live.launch": ("http", "dashboard", "mqtt"),
-    "cangauge.extras.inverter.gateway": ("publish",),
-    "cangauge.extras.judge.live": ("judge",),
-}
-"""Modules with an output, and the keys that ask for it; imported only then. Each has
-`make_output(service)`."""
 _COUNTED: Final = {
     "garbled": "packets that are no frames",
     "error_frames": "error frames",
@@ -48,6 +40,7 @@ _COUNTED: Final = {
     "foreign": "frames of another service with these ids",
 }
 """Words for the counts of a bus, at the end of a run."""
+_OF_THE_VEHICLE: Final = {"vehicle", "dbc", "map", "temperature", "pair_within_s"}
 _LOG = logging.getLogger(__name__)
 
 
@@ -98,11 +91,12 @@ class Service:
             else partial(load_config, config, options)
         )
         self.config = self._read()
-        self._state = state_path(self.config.state, os.environ)
-        self._check_files()
-        self._setup = setup = Setup.of(self.config)
-        self.pipeline = Pipeline(setup.vehicle, setup.model, setup.settings)
-        self.address = address_of(self.config)
+        with self.config.naming_keys():
+            self._state = state_path(self.config.state, os.environ)
+            self._check_files()
+            self._setup = setup = Setup.of(self.config)
+            self.pipeline = Pipeline(setup.vehicle, setup.model, setup.settings)
+            self.address = address_of(self.config)
         self.bus = str(self.address)
         self._outputs = list(outputs)
         self._is_stopped = self._is_reload_due = False
@@ -164,10 +158,9 @@ class Service:
                 show_every_s=SHOW_EVERY_S if config.dashboard is None else PAGE_EVERY_S,
                 sign_cure=self._setup.sign_cure,
             )
-            for module, keys in OUTPUTS.items():
-                if any(getattr(config, key) is not None for key in keys):
-                    self._outputs.append(import_module(module).make_output(self))
-                    stack.callback(self._outputs[-1].close)
+            for make_output in self._setup.outputs:
+                self._outputs.append(make_output(self))
+                stack.callback(self._outputs[-1].close)
             _serve_status(config, monitor, stack)
             text = f"listening on {port.name}; time source: {config.time_source}; Ctrl-C ends"
             about = {"bus": port.name, "vehicle": pipeline.vehicle.name, "model": config.model}
@@ -195,17 +188,19 @@ class Service:
         """Use another configuration as a whole, or log why not; return its settings, or that.
 
         Model, vehicle, method, capacity, gaps, time-outs and published ids change at once; the SoC
-        continues, and the initial SoC is ignored. Other keys need a restart, which is logged.
+        continues unless current or voltage are decoded otherwise, and the initial SoC is ignored.
+        Other keys need a restart, which is logged.
         """
         try:
             if isinstance(new, CangaugeError):
                 raise new
-            self.pipeline.reconfigure(new.vehicle, new.model, new.settings)
+            with new.config.naming_keys():
+                self.pipeline.reconfigure(new.vehicle, new.model, new.settings)
         except CangaugeError as error:
             text = f"new configuration refused, the old one stays: {error}"
             emit(_LOG, logging.WARNING, "config.refused", text)
             return None, str(error)
-        _log_changes(self.config, new.config)
+        _log_changes(self._setup, new)
         self._setup, self.config = new, new.config
         return _loop_settings(new.config), None
 
@@ -232,7 +227,7 @@ class Service:
 
     def _log_end(self, status: dict[str, Any]) -> None:
         """Log the end of a run: its frames, losses and last SoC, and what is missing."""
-        counts, latest = self.pipeline.counts, self.pipeline.latest
+        counts, last = self.pipeline.counts, self.pipeline.published
         step_s = status["step"]["mean_s"]
         errors = "".join(
             f", {count} {_COUNTED.get(name, name)}"
@@ -242,8 +237,8 @@ class Service:
         text = (
             f"{status['uptime_s']:.1f} s, {counts.frames} frames, {counts.samples} samples,"
             f" {counts.lost} lost, {counts.crc_errors} CRC errors{errors};"
-            f" last SoC {known_soc(latest.soc_pct, latest.soc_std_pct, 2)}"
-            f" ({latest.status.name.lower()});"
+            f" last SoC {known_soc(last.soc_pct, last.soc_std_pct, 2)}"
+            f" ({last.status.name.lower()});"
             f" step {number(step_s and 1e6 * step_s, 0, 'µs')} (mean)"
         )
         emit(_LOG, logging.INFO, "service.stopped", text)
@@ -297,10 +292,16 @@ def _serve_status(config: RunConfig, monitor: Monitor, stack: ExitStack) -> None
         emit(_LOG, logging.WARNING, "status.unavailable", f"no status socket: {error}")
 
 
-def _log_changes(old: RunConfig, new: RunConfig) -> None:
-    before, after = old.model_dump(), new.model_dump()
-    changed = ", ".join(name for name in after if after[name] != before[name])
-    text = f"configuration reloaded; changed: {changed or 'no option'}"
+def _log_changes(old: Setup, new: Setup) -> None:
+    before, after = old.config.model_dump(), new.config.model_dump()
+    changed = [name for name in after if after[name] != before[name]]
+    if old.vehicle != new.vehicle and not _OF_THE_VEHICLE & set(changed):
+        changed.append("content of map or DBC")
+    if old.model != new.model and "model" not in changed:
+        changed.append("content of the model")
+    text = f"configuration reloaded; changed: {', '.join(changed) or 'nothing'}"
+    if old.vehicle.battery != new.vehicle.battery:
+        text += "; current or voltage are decoded otherwise: the SoC starts anew from the voltage"
     emit(_LOG, logging.INFO, "config.reloaded", text)
     late = ", ".join(
         each.name

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Self
+from importlib import import_module
+from typing import TYPE_CHECKING, Final, Self
 
 from cangauge.bus.open import BusAddress, backend_capabilities, bus_address, is_multicast
 from cangauge.bus.publish import FrameIds
@@ -14,14 +15,28 @@ from cangauge.estimation.power import PackLimits
 from cangauge.estimation.settings import EstimatorSettings, FullCharge, LongRest
 from cangauge.model.model_file import Model
 from cangauge.service.config import DEFAULT_VEHICLE, PublishConfig, RunConfig
+from cangauge.service.output import Output
 from cangauge.service.pipeline import PipelineSettings
+
+if TYPE_CHECKING:
+    from cangauge.service.run import Service
+
+OUTPUTS: Final = {
+    "cangauge.extras.live.launch": ("http", "dashboard", "mqtt"),
+    "cangauge.extras.inverter.gateway": ("publish",),
+    "cangauge.extras.judge.live": ("judge",),
+}
+"""Modules with an output, and the keys that ask for it; imported only then. In each,
+`output_of(config, vehicle)` reads what the output needs (addresses, secrets) and returns what makes
+it for a service, or raises InputError."""
 
 
 @dataclass(frozen=True)
 class Setup:
     """A configuration with the files that it names.
 
-    `sign_cure` is what to change if the current has the wrong sign.
+    `sign_cure` is what to change if the current has the wrong sign; `outputs` make what a service
+    that runs serves, sends or stores.
     """
 
     config: RunConfig
@@ -29,14 +44,26 @@ class Setup:
     model: Model
     settings: PipelineSettings
     sign_cure: str
+    outputs: tuple[Callable[[Service], Output], ...]
 
     @classmethod
     def of(cls, config: RunConfig) -> Self:
-        """Read the model and the vehicle of a configuration; may raise InputError."""
+        """Read all that a configuration names, without opening a bus; may raise InputError."""
+        with config.naming_keys():
+            return cls._of(config)
+
+    @classmethod
+    def _of(cls, config: RunConfig) -> Self:
         vehicle, model = load_vehicle(config), Model.load(config.model)
         _check_poll(config, vehicle)
         _check_publish(config)
-        return cls(config, vehicle, model, pipeline_settings(config), _sign_cure(config, vehicle))
+        outputs = tuple(
+            import_module(module).output_of(config, vehicle)
+            for module, keys in OUTPUTS.items()
+            if any(getattr(config, key) is not None for key in keys)
+        )
+        cure = _sign_cure(config, vehicle)
+        return cls(config, vehicle, model, pipeline_settings(config), cure, outputs)
 
 
 def read_setup(read: Callable[[], RunConfig]) -> Setup | CangaugeError:

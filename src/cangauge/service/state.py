@@ -1,6 +1,6 @@
 """The service's state across restarts: restored at the start, saved while it runs.
 
-    {"format": "cangauge-state", "version": 3, "sha256": "…", "content": {…}}
+    {"format": "cangauge-state", "version": 4, "sha256": "…", "content": {…}}
 
 The hash is that of the content, written without spaces and with sorted keys. A file that cannot be
 used is set aside; one that cannot be written never stops the estimator.
@@ -30,8 +30,8 @@ from cangauge.service.pipeline import Pipeline
 from cangauge.service.worker import Worker
 
 STATE_FORMAT: Final = "cangauge-state"
-STATE_VERSION: Final = 3
-"""To be increased with every change of the estimator's state."""
+STATE_VERSION: Final = 4
+"""To be increased with every change of the content."""
 LARGEST_BYTES: Final = 8 << 20
 """Largest state file that is read [bytes]; a full delay line takes 0.3 MB."""
 FILE_NAME: Final = "cangauge-state.json"
@@ -49,7 +49,7 @@ class StateContent(BaseModel):
     """Content of the file, without its hash.
 
     `saved_s` is Unix time [s], `boot_id` the boot of the machine (None: unknown), `model` the hash
-    of the model's content; a bus is interface and channel.
+    of the model's content, `battery` that of `Vehicle.battery`; a bus is interface and channel.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
@@ -59,7 +59,8 @@ class StateContent(BaseModel):
     model: str
     model_name: str
     bus: str
-    vehicle: str
+    battery: str
+    vehicle_name: str
     time_source: str
     estimator: EstimatorState
 
@@ -158,6 +159,7 @@ class StateKeeper:
             saved_s=self._wall_s(),
             boot_id=self._boot_id,
             model_name=pipeline.model.name,
+            vehicle_name=pipeline.vehicle.name,
             estimator=state,
         )
         if self._worker.submit(partial(self._write, content)):
@@ -170,14 +172,14 @@ class StateKeeper:
             self._hashed = (pipeline.model, text_sha256(pipeline.model.to_json()))
         return {
             "model": self._hashed[1],
-            "vehicle": pipeline.vehicle.name,
+            "battery": text_sha256(pipeline.vehicle.battery),
             "bus": self._bus,
             "time_source": pipeline.settings.time_source,
         }
 
     def _age_s(self, content: StateContent) -> float:
         """Return the age of a state that may be used [s]; NaN: unknown. Else raise InputError."""
-        path, names = self._path, {"model": content.model_name}
+        path, names = self._path, {"model": content.model_name, "battery": content.vehicle_name}
         for field, wanted in self._uses().items():
             if (owner := getattr(content, field)) != wanted:
                 text = f"of another {field.replace('_', ' ')} ({names.get(field, owner)})"

@@ -196,8 +196,7 @@ class Monitor:
         return True
 
     def final(self) -> dict[str, Any]:
-        """Return the object of `/status` after the run, with the estimate of the latest sample."""
-        self._pipeline.published = self._pipeline.latest
+        """Return the object of `/status` after the run, with the estimate published last."""
         self._report_due_s = -math.inf
         return self._object(self._clock()) | {"running": False}
 

@@ -31,6 +31,8 @@ from cangauge.service.worker import start_thread
 from cangauge.types import Estimate, Sample
 
 if TYPE_CHECKING:
+    from cangauge.bus.vehicle import Vehicle
+    from cangauge.service.config import RunConfig
     from cangauge.service.run import Service
 
 DOUBT_S: Final = 0.5
@@ -182,8 +184,13 @@ class Gateway(Output):
             emit(_LOG, logging.WARNING, "inverter.no_fd", f"{text} are dropped")
 
 
+def output_of(_config: RunConfig, _vehicle: Vehicle) -> Callable[[Service], Gateway]:
+    """Return what makes the gateway; `Setup` has checked the buses."""
+    return make_output
+
+
 def make_output(service: Service) -> Gateway:
-    """Return the gateway that a service's configuration asks for; may raise InputError."""
+    """Open both buses and return the gateway; may raise InputError."""
     config = service.config.publish
     if config is None:
         raise ValueError("no [publish]")

@@ -33,6 +33,8 @@ from cangauge.service.worker import Worker
 from cangauge.types import Estimate, Sample
 
 if TYPE_CHECKING:
+    from cangauge.bus.vehicle import Vehicle
+    from cangauge.service.config import RunConfig
     from cangauge.service.run import Service
 
 ROW_EVERY_S: Final = 1.0
@@ -168,17 +170,22 @@ class LiveJudge(Output):
         emit(_LOG, logging.WARNING, "judge.failed", text)
 
 
-def make_output(service: Service) -> LiveJudge:
-    """Return what a service's configuration asks for; may raise InputError."""
-    config = service.config
-    if config.judge is None:
-        raise ValueError("no [judge]")
-    if service.pipeline.vehicle.soc_reference is None:
+def output_of(_config: RunConfig, vehicle: Vehicle) -> Callable[[Service], LiveJudge]:
+    """Return what makes the judge that a configuration asks for; may raise InputError."""
+    if vehicle.soc_reference is None:
         raise InputError(
             "the vehicle has no SoC of its own",
             field="judge",
             cure="name its signal under [soc] of the map file",
         )
+    return make_output
+
+
+def make_output(service: Service) -> LiveJudge:
+    """Make the folder and return the judge; may raise InputError."""
+    config = service.config
+    if config.judge is None:
+        raise ValueError("no [judge]")
     folder = Path(config.judge.folder)
     try:
         folder.mkdir(parents=True, exist_ok=True)

@@ -17,7 +17,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -29,10 +29,13 @@ from cangauge._logging import emit
 from cangauge.errors import InputError
 from cangauge.extras.live.addresses import HttpAddress, MqttOptions, http_address, mqtt_options
 from cangauge.service.output import Output
+from cangauge.service.setup import address_of
 from cangauge.service.status_client import Snapshot
 from cangauge.service.worker import start_thread
 
 if TYPE_CHECKING:
+    from cangauge.bus.vehicle import Vehicle
+    from cangauge.service.config import RunConfig
     from cangauge.service.run import Service
 
 SILENT_S: Final = 60.0
@@ -273,13 +276,12 @@ def _listen(key: str, address: HttpAddress) -> list[socket.socket]:
     return sockets
 
 
-def make_output(service: Service) -> Live:
-    """Return what a service's configuration asks for; may raise InputError."""
-    config = service.config
+def output_of(config: RunConfig, _vehicle: Vehicle) -> Callable[[Service], Live]:
+    """Read addresses and secrets of a configuration; may raise InputError."""
     address = {
         key: http_address(str(getattr(config, key)), config.http_token_file, field=key)
         for key in ("http", "dashboard")
         if getattr(config, key) is not None
     }
-    mqtt = None if config.mqtt is None else mqtt_options(config.mqtt, service.bus)
-    return Live(**address, mqtt=mqtt)
+    mqtt = None if config.mqtt is None else mqtt_options(config.mqtt, str(address_of(config)))
+    return lambda _: Live(**address, mqtt=mqtt)
