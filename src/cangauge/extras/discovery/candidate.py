@@ -72,6 +72,8 @@ class SignalCandidate:
     partner : str
     capacity_ah : float
         Charge of 100 % of a SoC [Ah]; else NaN.
+    others : tuple of Level
+        Other readings of a voltage that fit the stated one as well.
     """
 
     HEAD: ClassVar = ("field", "scale", "range", "score", "evidence")
@@ -93,6 +95,7 @@ class SignalCandidate:
     halves_ohm: tuple[float, float] = (math.nan, math.nan)
     partner: str = ""
     capacity_ah: float = math.nan
+    others: tuple[Level, ...] = ()
 
     @property
     def is_repeated(self) -> bool:
@@ -116,6 +119,11 @@ class SignalCandidate:
     def start(self) -> int:
         """Start bit as in a DBC."""
         return self.place.start(self.stream.length)
+
+    @property
+    def period_s(self) -> float:
+        """Median interval of its frames [s]."""
+        return self.stream.period_s
 
     @property
     def bits(self) -> frozenset[tuple[int, bool, int]]:
@@ -158,11 +166,15 @@ class SignalCandidate:
         """Return what usual scales mean, its own first; empty where nothing but its own may be.
 
         Bits and the relation to the current are the same by every scale. A stated nominal voltage
-        decides that of the voltage.
+        decides that of the voltage, unless other bits of the field fit it as well.
         """
         found = []
+        middle = (self.low + self.high) / 2.0 / self.scale
+        if self.others:
+            own_v = self.scale * middle
+            text = f"{own_v:.3g} V at {self.scale:g} V a step of {self.place.width} bits"
+            return [Level(self.scale, own_v, text), *self.others]
         if self.role == "voltage" and nominal_v is None:
-            middle = (self.low + self.high) / 2.0 / self.scale
             for scale in VOLTAGE_SCALES:
                 volts = scale * middle
                 text = f"{volts:.3g} V at {scale:g} V a step"
@@ -190,8 +202,8 @@ class SignalCandidate:
             lines.append(f"{factor} usual one that gives a plausible R; others fit as well.")
             lines.append(f"No current at raw {round(-self.offset / self.scale)}.")
         elif self.role == "voltage" and nominal_v is not None:
-            lines.append(f"{factor} usual one nearest to the stated {nominal_v:g} V.")
-        elif others := "; ".join(level.text for level in self.levels(nominal_v)[1:]):
+            lines.append(f"{factor} one that fits the stated {nominal_v:g} V.")
+        if others := "; ".join(level.text for level in self.levels(nominal_v)[1:]):
             lines.append(f"{factor} likeliest; the data fit as well: {others}.")
         return lines
 

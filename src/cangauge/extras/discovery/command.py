@@ -8,7 +8,6 @@ import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
-from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
@@ -32,7 +31,7 @@ _ROLES: Final = {
 """Roles by their names on the command line."""
 _NEEDED: Final = ("current", "voltage")
 _SCALE_CURES: Final = {
-    "voltage": "Give --nominal-voltage V (type plate, or a meter).",
+    "voltage": "Give --nominal-voltage V (by a meter; a type plate is less sure).",
     "soc_reference": "Compare it with the car's display, and correct the factor in the DBC.",
 }
 
@@ -188,27 +187,28 @@ def _find(
     paths: Sequence[Path], dbc: Path | None, nominal_v: float | None, *, presets: bool
 ) -> Proposal:
     """Find the signals by the names of a DBC, else by a preset, else by physics."""
-    from cangauge.bus.captures import open_capture
-    from cangauge.extras.discovery.by_name import is_clear, named_signals
+    from cangauge.extras.discovery.by_name import clear_roles, named_signals
     from cangauge.extras.discovery.proposal import Proposal
-    from cangauge.extras.discovery.search import search
+    from cangauge.extras.discovery.search import ENOUGH_NATS, search
 
     if dbc is not None:
-        messages = chain.from_iterable(open_capture(path) for path in paths)
-        named = named_signals(dbc, messages)
-        clear = [role for role in _NEEDED if is_clear(named[role])]
+        named = named_signals(dbc, _joined(paths))
+        clear = clear_roles(named)
         head = ("Signals found by their names and units in the DBC.",)
-        return Proposal("dbc", {**named}, clear, head, dbc=dbc)
+        has_steps = any(each.evidence > 0.5 for each in named["current"])
+        return Proposal("dbc", {**named}, clear, head, dbc=dbc, has_steps=has_steps)
     if presets and (known := _known(paths)) is not None:
         return Proposal("preset", vehicle=known)
     with progress("cangauge.extras.discovery") as show:
         show("reading frames")
         found = search(_joined(paths), nominal_v)
     clear = [role for role in _NEEDED if found.is_clear(role)]
+    clear += ["soc_reference"] if found.soc_reference else []
     candidates = {role: getattr(found, role) for role in _ROLES.values()}
     return Proposal(
-        "physics", candidates, clear, found.comments, found.remarks, nominal_v=nominal_v
-    )
+        "physics", candidates, clear, found.comments, found.remarks, nominal_v=nominal_v,
+        has_steps=any(each.evidence >= ENOUGH_NATS for each in found.current),
+    )  # fmt: skip
 
 
 def _known(paths: Sequence[Path]) -> str | None:
@@ -234,11 +234,10 @@ def _choose(proposal: Proposal, picks: Mapping[str, int]) -> list[str]:
                 value = f"{name}={picks[role] + 1}"
                 raise InputError(f"there are {count} candidates", field="--choose", value=value)
             proposal.chosen[role] = picks[role]
-        elif role in _NEEDED and role not in proposal.clear:
-            unclear.append(role)
-        # Slow and plausible is not enough: the user chooses a temperature, or none.
-        elif count and (role != "temperature" or proposal.method == "dbc"):
+        elif role in proposal.clear:
             proposal.chosen[role] = 0
+        elif role in _NEEDED:
+            unclear.append(role)
     return unclear
 
 
@@ -254,11 +253,9 @@ def _undecided(
     for role in unclear if quiet else ():
         names = [f"{n}) {c.name}" for n, c in enumerate(proposal.candidates[role], 1)]
         lines.append(f"{role}: {', '.join(names)}")
-    return CangaugeError(
-        f"{'; '.join(lines)}; nothing was written to {output}: choose by"
-        f" {' '.join(f'--choose {role}=1' for role in unclear)}, or record a drive with current"
-        " steps"
-    )
+    cure = f"choose by {' '.join(f'--choose {role}=N' for role in unclear)}"
+    cure += "" if proposal.has_steps else ", or record a drive with current steps"
+    return CangaugeError(f"{'; '.join(lines)}; nothing was written to {output}: {cure}")
 
 
 def _prove(
@@ -295,29 +292,28 @@ def _prove(
     if capture is None:
         return
     samples = capture_samples(capture, car)
-    if len(samples) < 2:
+    good = np.isfinite(samples.voltage_v) & (np.diff(samples.time_s, prepend=-np.inf) > 0.0)
+    amps, volts = samples.current_a, samples.voltage_v[good]
+    if len(volts) < 2:
         raise InputError(
             "current and voltage found do not make samples: their frames are too far apart",
             source=capture,
             cure="choose others by --choose",
         )
-    good = np.isfinite(samples.voltage_v) & (np.diff(samples.time_s, prepend=-np.inf) > 0.0)
-    amps, volts = samples.current_a, samples.voltage_v[good]
-    if len(volts):  # the sign needs no temperature
-        rows = (samples.time_s[good], amps[good], volts, np.zeros(len(volts)))
-        sign = sign_of_current(Log(*rows, soc_pct=samples.soc_pct[good]))
-        strongest = sign.strongest.text
-        proposal.proof["sign"] = {
-            "sign": sign.sign, "confidence": sign.confidence, "text": strongest,
-        }  # fmt: skip
-        if proposal.method == "dbc" and sign.sign == -1:  # the map says how its sign was found
-            turned = [replace(each, sign=-1) for each in proposal.candidates["current"]]
-            proposal.candidates["current"] = turned
-            amps = -amps
+    # The sign needs no temperature.
+    rows = (samples.time_s[good], amps[good], volts, np.zeros(len(volts)))
+    sign = sign_of_current(Log(*rows, soc_pct=samples.soc_pct[good]))
+    proposal.proof["sign"] = {
+        "sign": sign.sign, "confidence": sign.confidence, "text": sign.strongest.text,
+    }  # fmt: skip
+    if proposal.method == "dbc" and sign.sign == -1:  # the map says how its sign was found
+        turned = [replace(each, sign=-1) for each in proposal.candidates["current"]]
+        proposal.candidates["current"] = turned
+        amps = -amps
     proposal.proof |= {
         "samples": len(samples),
         "current_a": [float(amps.min()), float(amps.max())],
-        "voltage_v": [float(volts.min()), float(volts.max())] if len(volts) else None,
+        "voltage_v": [float(volts.min()), float(volts.max())],
     }
 
 
@@ -329,7 +325,8 @@ def _show_candidates(proposal: Proposal) -> None:
             mark = str(number + 1)
             if proposal.chosen.get(role) == number:
                 is_open = proposal.levels(role) or (
-                    role == "current" and not proposal.is_sign_proven
+                    role == "current"
+                    and (proposal.method == "physics" or not proposal.is_sign_proven)
                 )
                 mark += " ?" if is_open else " ✓"
             rows.append([mark, *candidate.cells])
@@ -349,8 +346,7 @@ def _show(proposal: Proposal, files: Sequence[str], reading: str, model: Path) -
         note(f"known vehicle: {proposal.vehicle}, {PRESETS[proposal.vehicle].about}")
     if proposal.proof:
         amps, volts = proposal.proof["current_a"], proposal.proof["voltage_v"]
-        shown = "no voltage" if volts is None else range_text(volts[0], volts[1], "V")
-        shown = f"{range_text(amps[0], amps[1], 'A')}, {shown}"
+        shown = f"{range_text(amps[0], amps[1], 'A')}, {range_text(volts[0], volts[1], 'V')}"
         note(f"decoded: {proposal.proof['samples']} samples of the first capture, {shown}")
     if proposal.method != "physics":
         note(proposal.sign_text)

@@ -18,7 +18,7 @@ import numpy as np
 from scipy.signal import lfilter
 
 from cangauge._typing import BoolArray, FloatArray
-from cangauge.extras.discovery.candidate import CURRENT_SCALES, SignalCandidate
+from cangauge.extras.discovery.candidate import CURRENT_SCALES, Level, SignalCandidate
 from cangauge.extras.discovery.fields import Field, Ints, Place, Stream, most_common
 
 MOST_ROWS: Final = 4000
@@ -40,6 +40,9 @@ MANY_MOVES: Final = 20.0
 """With more independent moves than this, a voltage shows its polarisation: what follows a current
 closer than COPY_R2 is the same quantity."""
 COPY_R2: Final = 0.9985
+ROUNDING: Final = 0.15
+"""Variance by which two roundings of one number differ, by the sum of their steps squared: a sixth
+of a step squared on average, a quarter where they are half a step apart."""
 RESISTANCE_OHM: Final = (0.008, 1.2)
 TYPICAL_OHM: Final = 0.12
 RESISTANCE_SPREAD: Final = 1.2
@@ -118,6 +121,8 @@ class Row:
         Log prior of the field in its role [nats].
     scale : float
         Of a voltage [V].
+    others : tuple of Level
+        Other readings of a voltage that fit the stated one as well.
     """
 
     field: Field
@@ -126,6 +131,7 @@ class Row:
     missing: BoolArray
     prior: float = 0.0
     scale: float = 1.0
+    others: tuple[Level, ...] = ()
 
     @cached_property
     def values(self) -> Ints:
@@ -140,6 +146,13 @@ class Row:
     def steps(self) -> int:
         """Number of changes."""
         return int(np.count_nonzero(np.diff(self.values)))
+
+    @property
+    def step(self) -> float:
+        """Most common change: of bits in a wrong order it is more than 1."""
+        changes, counts = np.unique(np.abs(np.diff(self.values)), return_counts=True)
+        counts[changes == 0] = 0
+        return float(max(changes[counts.argmax()], 1))
 
     @cached_property
     def bits(self) -> frozenset[tuple[int, bool, int]]:
@@ -280,12 +293,11 @@ class Pairs:
     def _are_copies(self, count: FloatArray) -> BoolArray:
         """Return which pairs are one quantity twice: no residual but quantization."""
         lost = (1.0 - np.minimum(self.r**2, 1.0)) * self._u.std[:, None] ** 2
-        # Of rounding: a twelfth of a step squared in each, the current's by the slope.
-        alike = (self.slope > 1.0 / ALIKE) & (self.slope < ALIKE)
-        return np.asarray(
-            (self.r**2 > COPY_R2)
-            & ((alike & (lost < 0.1 * (1.0 + self.slope**2))) | (count > MANY_MOVES))
-        )
+        u_step = np.array([row.step for row in self._voltages])[:, None]
+        i_step = self.slope * np.array([row.step for row in self._currents])
+        alike = (i_step > u_step / ALIKE) & (i_step < u_step * ALIKE)
+        rounded = alike & (lost < ROUNDING * (u_step**2 + i_step**2))
+        return np.asarray(rounded | ((self.r**2 > COPY_R2) & (count > MANY_MOVES)))
 
     def _polarisation(self, current: FloatArray) -> FloatArray:
         """Return the evidence that the voltage sags on under a sustained current.
@@ -361,7 +373,7 @@ class Pairs:
             zero = min(zeros or [0.0], key=lambda each: abs(each - most_common(i.values)))
         sign = 1 if r < 0.0 else -1
         current = i.candidate("current", amps, -amps * zero, sign=sign, **facts)
-        voltage = u.candidate("voltage", u.scale, 0.0, **facts)
+        voltage = u.candidate("voltage", u.scale, 0.0, others=u.others, **facts)
         return replace(current, partner=voltage.name), replace(voltage, partner=current.name)
 
     def _halves(self, a: int, b: int) -> list[float]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -41,6 +42,8 @@ class Proposal:
         Voltage that the user states [V].
     chosen : dict of str to int
         Number of the candidate by role, from 0.
+    has_steps : bool
+        Whether a voltage of the captures follows a current.
     proof : dict
         What the captures show when they are decoded with the files.
     """
@@ -53,6 +56,7 @@ class Proposal:
     vehicle: str | None = None
     dbc: Path | None = None
     nominal_v: float | None = None
+    has_steps: bool = False
     chosen: dict[str, int] = field(default_factory=dict)
     proof: dict[str, Any] = field(default_factory=dict)
 
@@ -70,8 +74,9 @@ class Proposal:
 
     @property
     def is_sign_proven(self) -> bool:
-        """Whether the captures prove the sign of a named current."""
-        return self.method != "physics" and bool(self.proof.get("sign", {}).get("sign"))
+        """Whether the captures prove the sign of the current."""
+        sign = self.proof.get("sign", {}).get("sign", 0)
+        return sign > 0 or (sign < 0 and self.method != "physics")
 
     @property
     def sign_text(self) -> str:
@@ -132,14 +137,18 @@ class Proposal:
         }
 
     def _map_lines(self, folder: Path) -> Iterator[str]:
-        dbc, head, pair_s = "car.dbc", self.head, 0.1
+        dbc, head = "car.dbc", self.head
         if self.dbc is not None:
             own, head = self.dbc.resolve(), (*head, self.sign_text)
             dbc = own.name if own.parent == folder.resolve() else str(own)
-        else:
-            pair = (self.signals[role] for role in ("current", "voltage"))
-            periods_s = [x.stream.period_s for x in pair if isinstance(x, SignalCandidate)]
-            pair_s = min(max(PAIR_S[0], 1.2 * max(periods_s)), PAIR_S[1])
+            for role in ("soc_reference", "temperature"):
+                if role not in self.chosen and (found := self.candidates[role]):
+                    named = ", ".join(f"{each.name} ({each.range_text})" for each in found)
+                    head = (*head, f"Not clear, so not used, {SIGNALS[role][0]}: {named}.")
+        periods_s = [self.signals[role].period_s for role in ("current", "voltage")]
+        pair_s = min(max(PAIR_S[0], 1.2 * max(periods_s)), PAIR_S[1])
+        if math.isnan(sum(periods_s)):  # a DBC without a capture
+            pair_s = 0.1
         yield from (f"# {line}" for line in head)
         yield ""
         yield f"dbc = {json.dumps(dbc)}"  # a basic string of TOML has JSON's escapes
@@ -162,7 +171,9 @@ class Proposal:
             yield f"signal = {json.dumps(signal.signal)}"
             if role == "current":
                 way = "positive current discharges" if signal.sign > 0 else "negative discharges"
-                yield f"sign = {signal.sign}  # {way}"
+                yield f"sign = {signal.sign}  # {way if self.is_sign_proven else 'not proven'}"
+            if isinstance(signal, NamedSignal) and signal.not_available:
+                yield f"not_available = {list(signal.not_available)}  # at an end of its codes"
         if "temperature" not in self.chosen:
             yield ""
             yield (

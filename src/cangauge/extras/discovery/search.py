@@ -21,6 +21,7 @@ from cangauge.errors import InputError
 from cangauge.extras.discovery.candidate import (
     SOC_SCALES,
     VOLTAGE_SCALES,
+    Level,
     SignalCandidate,
     is_capacity,
 )
@@ -49,9 +50,11 @@ CLEARLY_NATS: Final = 3.0
 RIVAL: Final = 0.6
 """Share of the first candidate's evidence with which another leaves the choice to the user: the
 evidence of loads that hang together differs by less than its saturation."""
-NOMINAL_SPREAD: Final = 0.06
-"""Log spread of a pack's voltage about the nominal one: between 10 and 90 % SoC cells have 3.4 to
-4.1 V at 3.7 V nominal."""
+NOMINAL_SPREAD: Final = 0.03
+"""Log spread of a pack's middle voltage about the stated one."""
+ALIKE: Final = 0.01
+UNLIKELY: Final = 5.0
+"""Readings of a field that differ by less are one; less likely ones [nats] are none."""
 AT_HALF: Final = 0.03
 AT_HALF_NATS: Final = 3.0
 """A number that rests at half its range, to this share, is a torque, a yaw rate or the like with
@@ -222,8 +225,8 @@ def _as_voltage(field: Field, nominal_v: float | None) -> Row | None:
     """Return the likeliest reading and scale of a field as a pack's voltage."""
     if field.best.place.is_signed:
         return None
-    best: Row | None = None
     zero = (field.raw == 0) & ~field.missing
+    readings: list[tuple[Row, float]] = []
     for place, nature, constant in field.extents:
         # Zero: before the contactors close.
         missing = field.missing | zero if constant == 0 else field.missing
@@ -238,11 +241,23 @@ def _as_voltage(field: Field, nominal_v: float | None) -> Row | None:
         at_half = abs(level / (1 << (place.width - 1)) - 1.0) < AT_HALF
         prior = nature + _rate_prior(field.stream) + field.statistics.prior
         prior -= AT_HALF_NATS if at_half else 0.0
-        for scale, usual in VOLTAGE_SCALES.items():
-            likely = _level_prior(level * scale, nominal_v)
-            total = prior + usual + likely + _full_scale_prior(scale, place.width)
-            if likely > IMPOSSIBLE and (best is None or total > best.prior):
-                best = Row(field, place, constant, missing, total, scale)
+        for scale in VOLTAGE_SCALES:
+            likely = _scale_prior(scale, level * scale, place.width, nominal_v)
+            row = Row(field, place, constant, missing, prior + likely, scale)
+            readings.append((row, level * scale))
+    return _likeliest(readings, nominal_v)
+
+
+def _likeliest(readings: Sequence[tuple[Row, float]], nominal_v: float | None) -> Row | None:
+    """Return the likeliest reading, with the others that fit a stated voltage as well."""
+    best, best_v = max(readings, key=lambda each: each[0].prior, default=(None, 0.0))
+    if best is None or best.prior < IMPOSSIBLE / 2.0:
+        return None
+    for row, volts in readings if nominal_v else ():
+        near = abs(math.log(volts / (nominal_v or volts))) < 2.0 * NOMINAL_SPREAD
+        if near and abs(volts / best_v - 1.0) > ALIKE and row.prior > best.prior - UNLIKELY:
+            text = f"{volts:.3g} V at {row.scale:g} V a step of {row.place.width} bits"
+            best.others += (Level(row.scale, volts, text),)
     return best
 
 
@@ -308,10 +323,15 @@ def _rate_prior(stream: Stream) -> float:
     return 0.0 if stream.period_s < 0.3 else -1.0
 
 
-def _level_prior(volts: float, nominal_v: float | None = None) -> float:
-    """Return the log prior of a pack's voltage [nats]: most cars have 250–450 V."""
+def _scale_prior(scale: float, volts: float, width: int, nominal_v: float | None) -> float:
+    """Return the log prior of a voltage's scale [nats]: a stated voltage decides it alone."""
     if nominal_v is not None:
-        return -0.5 * (math.log(volts / nominal_v) / NOMINAL_SPREAD) ** 2
+        return max(-0.5 * (math.log(volts / nominal_v) / NOMINAL_SPREAD) ** 2, IMPOSSIBLE)
+    return VOLTAGE_SCALES[scale] + _level_prior(volts) + _full_scale_prior(scale, width)
+
+
+def _level_prior(volts: float) -> float:
+    """Return the log prior of a pack's voltage [nats]: most cars have 250–450 V."""
     if 250.0 <= volts <= 450.0:
         return 0.0
     if 450.0 < volts <= 900.0:

@@ -1,0 +1,138 @@
+"""What decides between signals: physics beside names, the stated voltage; what decides nothing."""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Iterator
+from pathlib import Path
+
+import can
+import numpy as np
+import pytest
+
+from cangauge.extras.discovery.candidate import SignalCandidate
+from cangauge.extras.discovery.search import search
+from live import in_process
+
+SECONDS = 120
+CODES = 30  # frames at the start that hold the code for no value
+
+
+def load(seed: int) -> np.ndarray:
+    """Return a current in steps of some seconds [A], at 10 Hz."""
+    rng = np.random.default_rng(seed)
+    return np.repeat(rng.uniform(-80.0, 150.0, SECONDS // 2), 20) + rng.normal(0, 0.3, 10 * SECONDS)
+
+
+def walk(seed: int) -> np.ndarray:
+    """Return what drifts, at 10 Hz."""
+    way = np.cumsum(0.05 * np.random.default_rng(seed).normal(size=10 * SECONDS))
+    return way - way.mean()
+
+
+def frames(layout: dict[int, list[np.ndarray]], late_s: float = 0.0) -> Iterator[can.Message]:
+    """Yield frames of little-endian words; odd ids come later."""
+    for row in range(10 * SECONDS):
+        for number, words in layout.items():
+            data = b"".join(int(word[row]).to_bytes(2, "little") for word in words)
+            stamp = 0.1 * row + late_s * (number % 2)
+            yield can.Message(stamp, number, data=data, is_extended_id=False, channel="can0")
+
+
+def raw(values: np.ndarray, scale: float, offset: float = 0.0) -> np.ndarray:
+    return np.rint((values - offset) / scale).astype(int)
+
+
+def write(folder: Path, messages: Iterator[can.Message], signals: dict[int, list[str]]) -> None:
+    with can.CanutilsLogWriter(folder / "d.log") as writer:
+        for message in messages:
+            writer.on_message_received(message)
+    lines = ['VERSION "1"', "NS_ :", "BS_:", "BU_: V"]
+    for number, texts in signals.items():
+        lines.append(f"BO_ {number} {texts[0]}: {2 * len(texts) - 2} V")
+        lines += [
+            f" SG_ {text.split()[0]} : {16 * place}|16@1+ {' '.join(text.split()[1:])} V"
+            for place, text in enumerate(texts[1:])
+        ]
+    (folder / "car.dbc").write_text("\n".join([*lines, ""]))
+
+
+AMPS, VOLTS = '(0.1,-500) [0|0] "A"', '(0.1,0) [0|0] "V"'
+
+
+@pytest.fixture(scope="module")
+def car(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("car")
+    amps, still = load(1), np.full(10 * SECONDS, 250)
+    pack = [raw(-amps, 0.1, -500.0), raw(370.0 - 0.1 * amps, 0.1), raw(70 + walk(3), 0.1)]
+    for word in pack:
+        word[:CODES] = 0xFFFF
+    others = [raw(load(2) / 10.0, 0.1, -500.0), still, still, still]
+    write(folder, frames({0x100: [*pack, still], 0x102: others}), {
+        0x100: ["One", f"One_I {AMPS}",
+                f"One_U {VOLTS}", 'One_SoC (0.1,0) [0|0] "%"', 'One_Temp (0.1,0) [0|0] "degC"'],
+        0x102: ["Two", f"Two_I {AMPS}", 'LvBatt_SoC (0.1,0) [0|0] "%"',
+                'CabinTemp (0.1,0) [0|0] "degC"', 'BatCoolantTemp (0.1,0) [0|0] "degC"'],
+    })  # fmt: skip
+    return folder
+
+
+def test_a_voltage_that_follows_decides_between_like_names(car: Path, tmp_path: Path) -> None:
+    done = in_process("init", car / "d.log", "--dbc", car / "car.dbc", "-o", tmp_path / "out")
+    assert done.code == 0, done.err
+    text = (tmp_path / "out" / "car.toml").read_text(encoding="utf-8")
+    made = tomllib.loads(text)
+    roles = ("current", "voltage", "soc", "soc_reference", "temperature")
+    named = {role: made[role]["signal"] for role in roles if role in made}
+    assert named["current"] == "One_I"
+    assert named["temperature"] == "One_Temp"  # of no other part
+    assert "LvBatt_SoC" not in named.values()
+    assert made["current"]["not_available"] == made["voltage"]["not_available"] == [0xFFFF]
+    assert (made["current"]["sign"], "not proven" in text) == (-1, False)
+    assert "370" not in done.err
+    assert "6553.5" not in done.out
+
+
+def test_two_packs_are_left_to_the_user_and_pair_beyond_their_periods(tmp_path: Path) -> None:
+    amps = load(1)
+    layout, signals = {}, {}
+    for number, part in ((0x100, "A"), (0x200, "B")):
+        layout[number] = [raw(370.0 - 0.1 * amps, 0.1)]
+        layout[number + 1] = [raw(amps, 0.1, -500.0)]
+        signals[number] = [f"U{part}", f"Pack{part}_U {VOLTS}"]
+        signals[number + 1] = [f"I{part}", f"Pack{part}_I {AMPS}"]
+    stretched = list(frames(layout, late_s=0.05))
+    for each in stretched:
+        each.timestamp *= 5.0  # every 0.5 s, voltage 0.25 s before current
+    write(tmp_path, iter(stretched), signals)
+    call = ("init", tmp_path / "d.log", "--dbc", tmp_path / "car.dbc", "-o", tmp_path / "out")
+    done = in_process(*call)
+    assert done.code == 1
+    assert "record a drive" not in done.err
+    done = in_process(*call, "--choose", "current=1", "--choose", "voltage=1")
+    assert done.code == 0, done.err
+    made = tomllib.loads((tmp_path / "out" / "car.toml").read_text(encoding="utf-8"))
+    assert made["pair_within_s"] == pytest.approx(0.6)
+    assert (made["current"]["signal"], made["voltage"]["signal"]) == ("PackA_I", "PackA_U")
+
+
+@pytest.mark.parametrize("seed", [1, 3])
+def test_two_limits_that_move_together_are_no_pair(seed: int) -> None:
+    drift = walk(seed)
+    limits = [raw(drift + 305.0, 0.1), raw(drift + 102.03, 0.1)]
+    found = search(frames({0x2A3: limits, 0x310: [np.arange(10 * SECONDS) % 256]}))
+    assert not (found.is_clear("current") and found.is_clear("voltage"))
+    assert all(each.evidence < 1.0 for each in found.current)
+
+
+def pack(nominal_v: float) -> SignalCandidate:
+    amps = load(1)
+    words = [raw(amps + 800.0, 0.05), raw(375.0 - 0.1 * amps, 0.05)]
+    return search(frames({0x2A1: words}), nominal_v).voltage[0]
+
+
+def test_the_stated_voltage_decides_and_what_else_fits_is_listed() -> None:
+    sure = pack(373.0)
+    assert (sure.scale, sure.levels(373.0)) == (0.05, [])
+    open_ = pack(350.0)
+    assert len(open_.levels(350.0)) > 1
