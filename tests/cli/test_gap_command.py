@@ -27,12 +27,12 @@ def day(seed: int) -> Log:
 
 @pytest.fixture(scope="module")
 def days(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Folder with three days without a fault and one on which the voltage reads 6 V too high."""
+    """Folder with three days without a fault and one on which the voltage reads 8 V too high."""
     folder = tmp_path_factory.mktemp("days")
     for seed in (11, 12, 13):
         write_log(day(seed), folder / f"good{seed}.parquet")
     log = day(21)
-    write_log(replace(log, voltage_v=log.voltage_v + 6.0), folder / "trip.csv")
+    write_log(replace(log, voltage_v=log.voltage_v + 8.0), folder / "trip.csv")
     return folder
 
 
@@ -62,6 +62,31 @@ def test_json_report_and_a_model_that_runs(
     assert [entry["id"] for entry in Model.load(better).effects]
     ran = run("estimate", days / "trip.csv", "-m", better, "-o", tmp_path / "soc.csv")
     assert ran.code == 0
+
+
+def test_a_cause_in_the_log_leaves_the_model_as_given(run: Run, made: Path, tmp_path: Path) -> None:
+    given: list[object] = []
+    for seed, (start_pct, end_pct) in enumerate([(60.0, 30.0)] * 3 + [(90.0, 50.0), (50.0, 5.0)]):
+        path = tmp_path / f"good{seed}.csv"
+        write_log(
+            synthetic_log(
+                hours=0.8, start_pct=start_pct, end_pct=end_pct, noise_v=0.5, seed=11 + seed
+            ),
+            path,
+        )
+        given += ["--reference", path]
+    log = synthetic_log(hours=0.8, start_pct=60.0, end_pct=30.0, noise_v=0.5, seed=20)
+    assert log.soc_pct is not None
+    write_log(replace(log, soc_pct=log.soc_pct - 14.0), tmp_path / "today.csv")
+    better = tmp_path / "better.json"
+    ran = run(
+        "gap", tmp_path / "today.csv", "-m", made / "model.json", *given, "--extended", better
+    )
+    assert ran.code == 0
+    assert "The assumed initial SoC is 1" in ran.out
+    assert "better.json: the model as given, since the cause, initial_soc (probability " in ran.err
+    assert "is in these logs" in ran.err
+    assert not Model.load(better).effects
 
 
 def test_text_begins_with_the_verdict(run: Run, made: Path, days: Path, tmp_path: Path) -> None:
