@@ -22,6 +22,8 @@ from pathlib import Path
 import numpy as np
 from benchmarks.weights import cases, evidence, fit, packs, score
 
+from cangauge.errors import InputError
+
 ROOT = Path(__file__).parents[2]
 FROZEN = Path(__file__).with_name("frozen.json")
 SHIPPED = ROOT / "src/cangauge/diagnosis/weights.json"
@@ -37,7 +39,7 @@ def draw_all(items: list[dict[str, object]], part: str, data: Path, folder: Path
         began = time.monotonic()
         try:
             cases.draw_one(items, number, part, data, folder)
-        except (ImportError, ValueError, RuntimeError) as error:  # PyBaMM absent, its solver
+        except (InputError, ValueError, RuntimeError) as error:  # PyBaMM absent, its solver
             print(f"{number:3d} {item['pack']}: not drawn: {error}", flush=True)
             continue
         print(f"{number:3d} {item['pack']:10s} {time.monotonic() - began:6.1f} s", flush=True)

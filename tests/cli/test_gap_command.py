@@ -16,18 +16,18 @@ from synthetic import synthetic_log
 
 
 def drive(seed: int, start_pct: float, extra_v: float = 0.0) -> Log:
-    end_pct = start_pct - 8.0
-    log = synthetic_log(hours=0.25, start_pct=start_pct, end_pct=end_pct, noise_v=0.5, seed=seed)
+    end_pct = start_pct - 20.0
+    log = synthetic_log(hours=0.6, start_pct=start_pct, end_pct=end_pct, noise_v=0.5, seed=seed)
     return replace(log, voltage_v=log.voltage_v + extra_v, name=f"drive {seed}")
 
 
 @pytest.fixture(scope="module")
 def drives(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Folder with three drives without a fault, and one on which the voltage reads 4 V too high."""
+    """Folder with three drives without a fault, and one on which the voltage reads 8 V too high."""
     folder = tmp_path_factory.mktemp("drives")
-    for seed, start_pct in ((11, 85.0), (12, 70.0), (13, 55.0)):
-        write_log(drive(seed, start_pct), folder / f"good{seed}.parquet")
-    write_log(drive(21, 80.0, 4.0), folder / "trip.csv")
+    for seed in (11, 12, 13):
+        write_log(drive(seed, 85.0), folder / f"good{seed}.parquet")
+    write_log(drive(21, 85.0, 8.0), folder / "trip.csv")
     return folder
 
 
@@ -63,14 +63,39 @@ def test_json_report_plan_and_a_model_that_runs(
 
 
 def test_an_added_test_reports_its_change(faulty: list[object], tmp_path: Path) -> None:
-    write_log(drive(22, 55.0, 4.0), tmp_path / "further.csv")
-    found = succeeds(*faulty, "--add-test", tmp_path / "further.csv", "--json").json
+    write_log(drive(21, 85.0, 2.5), tmp_path / "trip.csv")
+    write_log(drive(22, 55.0, 2.5), tmp_path / "further.csv")
+    again = ("gap", tmp_path / "trip.csv", *faulty[2:])
+    found = succeeds(*again, "--add-test", tmp_path / "further.csv", "--json").json
     assert found["added_test"]["logs"] == ["further"]
     assert [log["name"] for log in found["inputs"]["logs"]] == ["trip", "further"]
     after = {item["effect"]: item["probability"] for item in found["cause"]["candidates"]}
     before = found["added_test"]["before"]
     sensing = ("voltage_offset", "voltage_gain")
     assert sum(after[name] for name in sensing) > sum(before[name] for name in sensing)
+
+
+def test_a_cause_in_the_log_leaves_the_model_as_given(made: Path, tmp_path: Path) -> None:
+    def made_drive(seed: int, start_pct: float, end_pct: float) -> Log:
+        return synthetic_log(
+            hours=0.8, start_pct=start_pct, end_pct=end_pct, noise_v=0.5, seed=seed
+        )
+
+    given: list[object] = []
+    for seed, (start_pct, end_pct) in enumerate([(60.0, 30.0)] * 3 + [(90.0, 50.0), (50.0, 5.0)]):
+        path = tmp_path / f"good{seed}.csv"
+        write_log(made_drive(11 + seed, start_pct, end_pct), path)
+        given += ["--reference", path]
+    log = made_drive(20, 60.0, 30.0)
+    assert log.soc_pct is not None
+    write_log(replace(log, soc_pct=log.soc_pct - 14.0), tmp_path / "today.csv")
+    better = tmp_path / "better.json"
+    today = ("gap", tmp_path / "today.csv", "-m", made / "model.json", *given)
+    ran = succeeds(*today, "--extended", better)
+    assert "The assumed initial SoC is 1" in ran.out
+    assert "better.json: the model as given, since the cause, initial_soc (probability " in ran.err
+    assert "is in these logs" in ran.err
+    assert not Model.load(better).effects
 
 
 def test_text_begins_with_the_verdict(made: Path, drives: Path, tmp_path: Path) -> None:

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from days import FAULTS, day, late, more_amperes, more_volts
+from days import FAULTS, day, late, more_amperes, more_volts, wrong_start
 from scipy.integrate import quad
 from scipy.stats import norm
 
@@ -178,3 +178,21 @@ def test_held_out_sizes_are_near_the_size_of_all(known: References) -> None:
         sizes = held_out_sizes(known, of_logs, item)
         assert [len(each) for each in sizes] == [len(each.rows) for each in of_logs]
         assert np.concatenate(sizes) == pytest.approx(item.size, rel=0.35)
+
+
+def test_a_start_beyond_a_bend_of_the_curve_is_found() -> None:
+    """Its tangent shows no evidence: the assumed SoC lies beyond the bend at 30 %."""
+
+    def drive(seed: int, start_pct: float, end_pct: float) -> Log:
+        return synthetic_log(
+            hours=0.8, start_pct=start_pct, end_pct=end_pct, noise_v=0.5, seed=seed
+        )
+
+    references = [drive(11, 45.0, 20.0), drive(12, 45.0, 20.0), drive(13, 90.0, 50.0)]
+    references.append(drive(14, 50.0, 5.0))
+    known = learn([trace(log, CAPACITY_AH) for log in references], CAPACITY_AH)
+    log = wrong_start(drive(20, 45.0, 20.0), 10.0)
+    evidence = analyse(known, [columns(known, trace(log, CAPACITY_AH))])
+    found = evidence.effects["initial_soc"]
+    assert found.size == pytest.approx(-10.0, abs=2.0 * found.std)
+    assert found.left_v2 < 0.2 * evidence.gap_v2

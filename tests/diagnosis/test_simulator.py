@@ -46,7 +46,7 @@ def test_a_simulator_that_is_off_everywhere_is_told_first(logs: list[Log], model
 
 def test_a_corrected_simulator_is_better(logs: list[Log], model: Model) -> None:
     references = [day(seed) for seed in (33, 34, 35)]
-    faulty = [replace(log, voltage_v=log.voltage_v + 4.0) for log in logs]
+    faulty = [replace(log, voltage_v=log.voltage_v + 8.0) for log in logs]
     found = diagnose(faulty, model, references, simulation=Simulator())
     assert found.accepted in {"voltage_offset", "voltage_gain"}
     assert "To correct the simulator" in found.summary

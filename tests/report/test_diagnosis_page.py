@@ -38,7 +38,7 @@ def known(model: Model) -> References:
 @pytest.fixture(scope="module")
 def found(model: Model, known: References) -> Diagnosis:
     log = day(21)
-    return diagnose([replace(log, voltage_v=log.voltage_v + 6.0)], model, known)
+    return diagnose([replace(log, voltage_v=log.voltage_v + 8.0)], model, known)
 
 
 @pytest.fixture(scope="module")

@@ -228,7 +228,7 @@ def _show(
     written: Iterable[Path],
 ) -> None:
     """Print the answer, the candidates, what the logs cannot show, and the next steps."""
-    from cangauge.diagnosis.sentences import SHOWN, candidate_rows, percent, plan_rows
+    from cangauge.diagnosis.sentences import SHOWN, candidate_rows, plan_rows
 
     say(found.summary)
     if before is not None:
@@ -240,8 +240,19 @@ def _show(
         say(steps.sentence)
         if steps.steps:
             print_table("Possible next steps, best first", *plan_rows(steps))
-    held = ": the model as given, since no cause is accepted"
-    if (cause := found.accepted) is not None:
-        held = f": the model with {cause} (probability {percent(found.posterior.effects[cause])})"
+    held = _content(found)
     for path in written:
-        note(f"wrote {path}{held if str(path) == result['extended_model'] else ''}")
+        note(f"wrote {path}{f': {held}' if str(path) == result['extended_model'] else ''}")
+
+
+def _content(found: Diagnosis) -> str:
+    """Return what the file of the extended model holds."""
+    from cangauge.diagnosis.extended import LOG_EFFECTS
+    from cangauge.diagnosis.sentences import percent
+
+    if (cause := found.accepted) is None:
+        return "the model as given, since no cause is accepted"
+    sure = f"{cause} (probability {percent(found.posterior.effects[cause])})"
+    if cause in LOG_EFFECTS:
+        return f"the model as given, since the cause, {sure}, is in these logs"
+    return f"the model with {sure}"

@@ -34,9 +34,12 @@ _LOG = logging.getLogger(__name__)
 CROSS_VALIDATED = 5
 """Number of effects, the most probable ones, whose errors are found on held-out rows."""
 
-WORSE_SOC, WORSE_SOC_PCT = 1.25, 0.25
-"""A cause is rejected if the SoC error of these logs with it exceeds `WORSE_SOC` times that of the
-given model plus `WORSE_SOC_PCT`: on healthy trips of one car it scatters by as much."""
+WORSE_SOC_PCT = 0.25
+"""A cause is rejected if the SoC error of these logs grows by more with it [%]: on healthy trips of
+one car it scatters by as much."""
+
+PROVED_BY_SOC = 0.5
+"""A cause that does not stand out is accepted if it leaves at most this part of the SoC error."""
 
 SETTLING_S = 300.0
 """Start of a log, with withheld initial SoC, that the SoC error leaves out [s]."""
@@ -118,12 +121,19 @@ class Diagnosis:
         better = all(rms(some, after=True) < rms(some) for some in (errors, every))
         return effect if better else None
 
+    @property
+    def start_is_suspect(self) -> bool:
+        """Whether a gap is reported that a wrong start of these logs may explain."""
+        return self.posterior.detected and "initial_soc" in self.posterior.credible_set
+
     @cached_property
     def soc_errors_pct(self) -> tuple[float, float] | None:
         """SoC errors of the estimator, initial SoC withheld: as given, and with `likeliest` [%].
 
-        None where no diagnosed log has a reference SoC.
+        None where no diagnosed log has a reference SoC, or its start may be the cause.
         """
+        if self.start_is_suspect:
+            return None
         if (before := self._soc_error_pct(self.model)) is None:
             return None
         if self.likeliest is None:
@@ -135,10 +145,15 @@ class Diagnosis:
     def accepted(self) -> str | None:
         """The effect that the extended model has; None without one.
 
-        It is `likeliest`, unless the SoC of these logs becomes worse with it.
+        It is `likeliest` if it stands out in its group and the SoC error of these logs grows by no
+        more than its scatter with it, or if it leaves at most `PROVED_BY_SOC` of that error.
         """
-        before, after = self.soc_errors_pct or (0.0, 0.0)
-        return None if after > WORSE_SOC * before + WORSE_SOC_PCT else self.likeliest
+        stands_out = self.posterior.name is not None
+        if self.soc_errors_pct is None:
+            return self.likeliest if stands_out else None
+        before, after = self.soc_errors_pct
+        most = before + WORSE_SOC_PCT if stands_out else PROVED_BY_SOC * before
+        return self.likeliest if after <= most else None
 
     @property
     def log_errors(self) -> list[LogErrors]:

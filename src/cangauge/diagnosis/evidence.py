@@ -72,11 +72,16 @@ AFTER = 2.0
 MIN_PLACE = 0.01
 """A step of resistance is placed this closely, in parts of its log."""
 
+START_PARTS = 0.5, 1.0
+"""Parts of its bounds from which a wrong start is simulated: it moves all rows at once, beyond a
+bend of the OCV curve."""
+
 MOVES_SOC = ("current_offset", "current_gain", "capacity", "initial_soc", "coulombic_efficiency")
 """Effects that change the counted SoC."""
 
 RESIMULATED_PART = 0.15
-"""An effect with less than this part of the best one's evidence is not re-simulated."""
+"""An effect that does not move the SoC is re-simulated from this part of the best one's evidence.
+Effects that move it always are: beyond a bend of the OCV curve their tangent tells nothing."""
 
 
 @dataclass(frozen=True)
@@ -296,12 +301,16 @@ def analyse(known: References, logs: Sequence[Columns], *, exact: bool = True) -
         if name == STEP.effect:
             of_log = [int(place[top]) - len(known.trials) for place in at]
             places = tuple(PLACES[k] if k >= 0 else None for k in of_log)
-        if exact and gain[top] > RESIMULATED_PART * gain.max():
+        if exact and name in MOVES_SOC:
+            starts = [amplitude]
+            if name == "initial_soc":
+                starts += [part * end for end in (low[top], high[top]) for part in START_PARTS]
+            amplitude, nats, left_v2 = _resimulated(known, logs, trial, starts)
+            starts = [amplitude, low[top] / 3.0, high[top] / 3.0]
+            amplitude = _resimulated(known, logs, trial, starts, moved=True)[0]
+        elif exact and gain[top] > RESIMULATED_PART * gain.max():
             if trial.changes_signal and trial.effect != "voltage_offset":
                 amplitude, nats, left_v2 = _resimulated(known, logs, trial, [amplitude])
-                if trial.effect in MOVES_SOC:
-                    starts = [amplitude, low[top] / 3.0, high[top] / 3.0]
-                    amplitude = _resimulated(known, logs, trial, starts, moved=True)[0]
             elif places:
                 places, amplitude, nats, left_v2 = _step_refined(known, logs, places)
         if left_v2 is None:
@@ -331,7 +340,7 @@ def _tried(known: References, logs: Sequence[Trace]) -> tuple[list[Trial], list[
     """Return what is tried, and for each log the column of each trial, −1 for none.
 
     No log starts beyond full or empty. A step of resistance happens at one place of one log and
-    lasts through the later ones.
+    lasts through the later ones. At the start of the first it happened before these logs.
     """
     n, starts = len(known.trials), [log.start_pct for log in logs]
     least = min(max(starts) - 100.0 - COVER_PCT, 0.0)
@@ -345,10 +354,9 @@ def _tried(known: References, logs: Sequence[Trace]) -> tuple[list[Trial], list[
     at = [list(range(n)) for _ in logs]
     for j in range(len(logs)):
         for k in range(len(PLACES)):
-            if j or k:
-                tried.append(replace(STEP, shape=PLACES[k]))
-                for log in range(len(logs)):
-                    at[log].append(-1 if log < j else n + (k if log == j else 0))
+            tried.append(replace(STEP, shape=PLACES[k]))
+            for log in range(len(logs)):
+                at[log].append(-1 if log < j else n + (k if log == j else 0))
     return tried, [np.array(place, dtype=np.intp) for place in at]
 
 

@@ -43,6 +43,13 @@ SIZES: Final[Mapping[str, tuple[str, str, str, str]]] = {
 }  # fmt: skip
 """Effect → its main parameter, a sentence, and the words for a positive and a negative value."""
 
+GROWN: Final = ("step_ohm", "The resistance has {sign} by {size} Ω", "grown", "fallen")
+"""In place of a step, where it happened before the first log."""
+
+AT_START: Final = 0.05
+"""A step in this first part of a log is taken to have happened before it: half the distance between
+the places that are tried."""
+
 SHORT_S: Final = 600.0
 """Duration below which slow effects hardly develop [s]."""
 
@@ -59,11 +66,17 @@ COMMON: Final = ("current_offset", "voltage_offset", "initial_soc", "time_skew")
 """Effects whose visible size the summary lists first: what a user suspects first."""
 
 
-def size_sentence(effect: str, parameters: Mapping[str, Quantity]) -> str:
-    """Return the size of an effect with its 95 % interval; "" if it has no single number."""
+def size_sentence(
+    effect: str, parameters: Mapping[str, Quantity], place: float | None = None
+) -> str:
+    """Return the size of an effect with its 95 % interval; "" if it has no single number.
+
+    `place` is that of a step in the first log, in parts of it.
+    """
     if effect not in SIZES:
         return ""
-    name, sentence, positive, negative = SIZES[effect]
+    grown = place is not None and place < AT_START
+    name, sentence, positive, negative = GROWN if grown else SIZES[effect]
     value, ci = parameters[name].value, parameters[name].ci
     size = significant(abs(value), 2)
     if ci is not None:
@@ -86,7 +99,8 @@ def headline(found: Diagnosis) -> str:
     name = answer.name
     if answer.leading_group == UNKNOWN or name is None:
         return f"There is a gap. {_where_to_look(answer)}"
-    size = size_sentence(name, found.parameters[name])
+    place = (found.evidence.effects[name].in_logs or (None,))[0]
+    size = size_sentence(name, found.parameters[name], place)
     sure = f"{name}, {percent(answer.probabilities[name])}"
     return f"{size} ({sure})." if size else f"The most likely cause is {sure}."
 
@@ -135,15 +149,15 @@ def size_text(found: Diagnosis) -> str:
     what = "model" if found.simulator is None else "simulator"
     text = f"The {what} misses the voltage by {significant(found.baseline_rmse_v, 2, 'V')} RMS"
     expected, answer = math.sqrt(found.evidence.gap_v2), found.posterior
-    only_likely = answer.likely and not answer.detected and answer.leading_group != UNKNOWN
-    if found.has_references and (only_likely or found.baseline_rmse_v > MISFIT * expected):
+    left_open = answer.likely and found.accepted is None and answer.leading_group != UNKNOWN
+    if found.has_references and (left_open or found.baseline_rmse_v > MISFIT * expected):
         text += f" ({significant(expected, 2, 'V')} with what the references show of this pack)"
     text += f"; {healthy} {significant(found.healthy_rmse_v, 2, 'V')}."
     if found.accepted is not None:
         all_rows = all(log.judged.all() for log in found.log_errors)
         text += f" With {found.accepted}: {significant(found.extended_rmse_v, 2, 'V')}"
         text += "." if all_rows else ", on the rows that it can change."
-    elif only_likely:
+    elif left_open:
         left_v = math.sqrt(found.evidence.effects[answer.members[0]].left_v2)
         text += f" {answer.members[0]}, the likeliest cause, would leave"
         text += f" {significant(left_v, 2, 'V')}."
@@ -151,17 +165,28 @@ def size_text(found: Diagnosis) -> str:
 
 
 def soc_text(found: Diagnosis) -> str:
-    """Return what the cause does to the SoC error of these logs; "" where that is not known."""
-    if found.soc_errors_pct is None or found.likeliest in {None, *LOG_EFFECTS}:
+    """Return what the cause does to the SoC error of these logs, and why none is accepted."""
+    if (cause := found.likeliest) in {None, *LOG_EFFECTS}:
         return ""
-    before, after = (number(error, 2) for error in found.soc_errors_pct)
-    if found.accepted is None:
+    refused, errors = found.accepted is None, found.soc_errors_pct
+    if errors is None:
+        text = f" No extended model: {cause} does not stand out." if refused else ""
+        if found.start_is_suspect:
+            text += " The start of these logs may be the cause, so their SoC proves nothing."
+        return text
+    before, after = (number(error, 2) for error in errors)
+    if not refused:
+        better = errors[1] < errors[0]
+        return f" SoC error, start withheld: {before} → {after} %{'' if better else ', no better'}."
+    if errors[1] >= errors[0]:
         return (
-            f" No extended model: with {found.likeliest} the SoC error, start withheld, would rise"
-            f" from {before} to {after} %."
+            f" No extended model: with {cause} the SoC error, start withheld, would rise from"
+            f" {before} to {after} %."
         )
-    better = found.soc_errors_pct[1] < found.soc_errors_pct[0]
-    return f" SoC error, start withheld: {before} → {after} %{'' if better else ', no better'}."
+    return (
+        f" No extended model: {cause} does not stand out, and the SoC error, start withheld, would"
+        f" only fall from {before} to {after} %."
+    )
 
 
 def visible_text(found: Diagnosis) -> str:
@@ -273,7 +298,8 @@ EXPLAINED: Final = {
     "resistance_temperature": "the resistance rises more (or less) in the cold than modelled",
     "resistance_soc": "the resistance rises towards empty or full",
     "resistance_asymmetry": "charging meets another resistance than discharging",
-    "resistance_step": "the resistance changes at one moment, as by a loose contact",
+    "resistance_step": "the resistance changes at one moment, as by a loose contact, or has changed"
+    " before these logs",
     "charge_transfer": "the voltage drop is not in proportion to the current: steep at small ones",
     "fast_polarization": "the voltage needs seconds to follow a change of load",
     "slow_diffusion": "the voltage needs minutes to recover after a load",
