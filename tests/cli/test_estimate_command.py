@@ -196,8 +196,15 @@ def test_a_slow_log_has_no_gaps_by_default(run: Run, made: Path, tmp_path: Path)
     args = ("estimate", tmp_path / "slow.parquet", "-m", made / "model.json", "--json")
     usual = run(*args, "-o", tmp_path / "a.csv")
     assert json.loads(usual.out)["max_gap_s"] == 15.0
-    assert "15 s count as gaps" in usual.err
+    assert "its usual step is 5 s; steps over 15 s count as gaps" in usual.err
     assert "current gap" not in json.loads(usual.out)["reasons"]
+
+
+def test_a_log_of_one_second_needs_no_note_of_gaps(run: Run, made: Path, tmp_path: Path) -> None:
+    args = ("estimate", made / "full.parquet", "-m", made / "model.json", "--json")
+    ran = run(*args, "-o", tmp_path / "a.csv")
+    assert json.loads(ran.out)["max_gap_s"] == 3.0
+    assert "count as gaps" not in ran.err
 
 
 @pytest.mark.parametrize(

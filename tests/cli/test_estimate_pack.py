@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Callable
 from pathlib import Path
 
@@ -32,7 +33,10 @@ HEALTH = [
     "capacity_ah", "capacity_std_ah", "resistance_ratio", "resistance_std", "offset_a",
     "offset_std_a",
 ]  # fmt: skip
-POWER = ["discharge_a", "discharge_std_a", "charge_a", "charge_std_a", "energy_wh", "energy_std_wh"]
+POWER = [
+    "discharge_a", "discharge_std_a", "charge_a", "charge_std_a", "energy_wh", "energy_std_wh",
+    "energy_to_soc_pct",
+]  # fmt: skip
 
 
 def cells_of(log: Log) -> np.ndarray:
@@ -66,7 +70,7 @@ def test_a_log_with_cell_columns(run: Run, made: Path, tmp_path: Path, suffix: s
     assert found["cells"]["cells"] == CELLS_ON_BUS
     assert found["notices"] == []
     columns = pa.parquet.read_table(pack)
-    assert columns.column_names[:13] == ["time_s", *HEALTH, *POWER]
+    assert columns.column_names[:14] == ["time_s", *HEALTH, *POWER]
     assert columns["cell_weakest"].to_pylist()[-1] == 12
     # The last row is that of the last second.
     assert columns["capacity_ah"].to_pylist()[-1] == found["health"]["capacity_ah"]
@@ -81,7 +85,8 @@ def test_pack_rows_are_those_of_the_estimator(run: Run, made: Path, tmp_path: Pa
     ran = run("estimate", tmp_path / "part.parquet", "-m", made / "model.json", "-o",
               tmp_path / "soc.csv", "--pack", pack)  # fmt: skip
     assert ran.code == 0, ran.err
-    assert "energy left" in ran.out
+    low_pct = Model.load(made / "model.json").voltage_model().soc_range_pct[0]
+    assert re.search(rf"energy left .* to {low_pct:.0f} % SoC", ran.out)
     table = pa.csv.read_csv(pack)
     assert table.column_names == ["time_s", *HEALTH, *POWER]
     settings = EstimatorSettings(initial_soc_pct=log.soc_pct[0], temperature_source="room")

@@ -177,10 +177,10 @@ def test_doubt_keeps_the_odds_of_an_open_question() -> None:
 class SteppedModel(LinearModel):
     """A flat curve with a step of 1.4 V at 60 %, as that of 100 LFP cells."""
 
-    functions = SimpleNamespace(number=0, row=lambda _, load: np.zeros(0))
+    functions = SimpleNamespace(number=0, row=lambda *_: np.zeros(0))
     noise = SimpleNamespace(
         level_std_v=0.3, slow_std_v=0.3, slow_time_s=300.0, fast_std_v=0.1, soc_std_pct=3.0,
-        cold=lambda temperature_c: 1.0,
+        cold=lambda _: 1.0,
     )  # fmt: skip
 
     def pseudo_ocv_at(self, soc_pct: float, drives: Any = None) -> tuple[float, float]:
