@@ -20,6 +20,7 @@
 #define DAY_S 86400.0
 
 #define UNKNOWN_PCT 50.0
+#define FOUND_STD_PCT 3.0
 #define DROPPED_LOG_ODDS 20.0
 #define CLEAR_LOG_ODDS 4.605170185988092 /* ln 100 */
 #define LEAST_VAR_PCT2 1e-6
@@ -241,13 +242,17 @@ cg_real cg_strain(const cg_ekf *ekf, const cg_model *model)
 
 static cg_sum log_odds_of(cg_sum probability) { return log(probability / (1.0 - probability)); }
 
-/* Of the wide hypothesis. */
+/* Of the wide hypothesis: not below the prior ones until it has found the SoC. */
 static cg_sum log_odds(const cg_filter *filter)
 {
     if (filter->hypotheses == 1) {
         return -(cg_sum)INFINITY;
     }
-    return filter->prior_log_odds + filter->ekf[1].evidence - filter->ekf[0].evidence;
+    cg_sum gained = filter->ekf[1].evidence - filter->ekf[0].evidence;
+    if ((gained < 0.0) && (var_of(&filter->ekf[1], CG_X_SOC) > cg_square(R(FOUND_STD_PCT)))) {
+        gained = 0.0;
+    }
+    return filter->prior_log_odds + gained;
 }
 
 const cg_ekf *cg_likelier(const cg_filter *filter)
@@ -341,8 +346,9 @@ void cg_filter_doubt(cg_filter *filter, const cg_model *model, cg_real probabili
     const cg_sum now = log_odds(filter);
     if ((filter->hypotheses == 2) && (fabs(now) < CLEAR_LOG_ODDS)) {
         const cg_sum before = 1.0 / (1.0 + exp(-now));
-        filter->prior_log_odds +=
-            log_odds_of(1.0 - ((1.0 - before) * (1.0 - (cg_sum)probability))) - now;
+        filter->prior_log_odds =
+            log_odds_of(1.0 - ((1.0 - before) * (1.0 - (cg_sum)probability)));
+        filter->ekf[1].evidence = filter->ekf[0].evidence; /* it is in the prior now */
     } else {
         keep_likelier(filter);
         filter->ekf[1] = filter->ekf[0];

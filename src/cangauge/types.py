@@ -184,6 +184,8 @@ class Power(NamedTuple):
     energy_wh: float = math.nan
     """Energy left to the cut-off [Wh]."""
     energy_std_wh: float = math.nan
+    energy_to_soc_pct: float = math.nan
+    """SoC at which that energy ends [%]."""
 
 
 class CellReport(NamedTuple):

@@ -148,12 +148,13 @@ def test_a_refused_sample_keeps_its_own_time(part: Log) -> None:
 
 
 @pytest.mark.usefixtures("part")
-def test_a_slow_log_has_no_gaps_by_default(made: Path) -> None:
-    write_log(read_log(made / "full.parquet").rows(slice(None, None, 5)), "slow.parquet")
+@pytest.mark.parametrize(("every", "gap_s"), [(1, 3.0), (5, 15.0)])
+def test_only_a_slow_log_notes_its_gaps(made: Path, every: int, gap_s: float) -> None:
+    write_log(read_log(made / "full.parquet").rows(slice(None, None, every)), "slow.parquet")
     options = ("-m", "model.json", "-o", "a.csv", "--json")
     ran = succeeds("estimate", "slow.parquet", *options)
-    assert ran.json["max_gap_s"] == 15.0
-    assert "15 s count as gaps" in ran.err
+    assert ran.json["max_gap_s"] == gap_s
+    assert ("15 s count as gaps" in ran.err) is (every == 5)
     assert "current gap" not in ran.json["reasons"]
 
 

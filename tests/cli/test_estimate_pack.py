@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -24,7 +25,10 @@ HEALTH = [
     "capacity_ah", "capacity_std_ah", "resistance_ratio", "resistance_std", "offset_a",
     "offset_std_a",
 ]  # fmt: skip
-POWER = ["discharge_a", "discharge_std_a", "charge_a", "charge_std_a", "energy_wh", "energy_std_wh"]
+POWER = [
+    "discharge_a", "discharge_std_a", "charge_a", "charge_std_a", "energy_wh", "energy_std_wh",
+    "energy_to_soc_pct",
+]  # fmt: skip
 
 
 def cells_of(log: Log) -> np.ndarray:
@@ -58,7 +62,7 @@ def test_a_log_with_cell_columns(made: Path, minutes: Log, tmp_path: Path, suffi
     assert (found["cells"]["weakest"], found["cells"]["cells"]) == (12, CELLS_ON_BUS)
     assert found["notices"] == []
     columns = pa.parquet.read_table(pack)
-    assert columns.column_names[:13] == ["time_s", *HEALTH, *POWER]
+    assert columns.column_names[:14] == ["time_s", *HEALTH, *POWER]
     assert columns["cell_weakest"].to_pylist()[-1] == 12
     # The last row is that of the last second.
     assert columns["capacity_ah"].to_pylist()[-1] == found["health"]["capacity_ah"]
@@ -70,7 +74,9 @@ def test_pack_rows_are_those_of_the_estimator(made: Path, minutes: Log, tmp_path
     pack = tmp_path / "pack.csv"
     write_log(minutes, tmp_path / "part.parquet")
     options = ("-m", made / "model.json", "-o", tmp_path / "soc.csv", "--pack", pack)
-    assert "energy left" in succeeds("estimate", tmp_path / "part.parquet", *options).out
+    low_pct = Model.load(made / "model.json").voltage_model().soc_range_pct[0]
+    out = succeeds("estimate", tmp_path / "part.parquet", *options).out
+    assert re.search(rf"energy left .* to {low_pct:.0f} % SoC", out)
     table = pa.csv.read_csv(pack)
     assert table.column_names == ["time_s", *HEALTH, *POWER]
     assert minutes.soc_pct is not None

@@ -172,3 +172,31 @@ def test_doubt_keeps_the_odds_of_an_open_question() -> None:
     narrow, wide = hypotheses.filters
     assert narrow.P[0, 0] == pytest.approx(1.0 + 0.01)
     assert wide.P[0, 0] == pytest.approx(WRONG_STD_PCT**2 + 100.0)
+
+
+class SteppedModel(LinearModel):
+    """A flat curve with a step of 1.4 V at 60 %, as that of 100 LFP cells."""
+
+    functions = SimpleNamespace(number=0, row=lambda *_: np.zeros(0))
+    noise = SimpleNamespace(
+        level_std_v=0.3, slow_std_v=0.3, slow_time_s=300.0, fast_std_v=0.1, soc_std_pct=3.0,
+        cold=lambda _: 1.0,
+    )  # fmt: skip
+
+    def pseudo_ocv_at(self, soc_pct: float, drives: Any = None) -> tuple[float, float]:
+        step = np.tanh((soc_pct - 60.0) / 3.0)
+        return 340.0 + 0.01 * soc_pct + 0.7 * step, 0.01 + 0.7 / 3.0 * (1.0 - step**2)
+
+
+@pytest.mark.parametrize(("start_pct", "is_right"), [(55.0, False), (70.0, True)])
+def test_a_step_of_the_curve_proves_no_wrong_start(start_pct: float, is_right: bool) -> None:
+    hypotheses, model = Hypotheses(SteppedModel(), start_pct, 1.0), SteppedModel()
+    for number in range(80):
+        voltage_v = model.pseudo_ocv_at(70.0 - 0.1 * (number + 1))[0]
+        drive = block(number, voltage_v + LOAD @ model.load_coefficients, 0.0)
+        hypotheses.predict(30.0, 0.1)
+        hypotheses.update(drive)
+    soc_pct, std_pct = hypotheses.soc_after(0.0, 0.0)
+    assert abs(soc_pct - 62.0) < 2.0 * std_pct
+    assert (std_pct < 3.0) == is_right
+    assert hypotheses.decision == 0

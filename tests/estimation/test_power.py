@@ -78,6 +78,7 @@ def test_energy_left_is_the_energy_of_a_discharge() -> None:
         true_wh = volts[:last].sum() * step_ah
         assert abs(power.energy_wh - true_wh) < 2.0 * power.energy_std_wh
         assert power.energy_wh == pytest.approx(true_wh, rel=0.06, abs=120.0)
+        assert power.energy_to_soc_pct == pytest.approx(soc_pct[last - 1], abs=1.5)
 
 
 def test_a_pulse_just_before_lowers_what_is_possible() -> None:

@@ -97,14 +97,14 @@ def test_a_capped_current_is_a_least_one_and_a_small_energy_in_wh(watched: Watch
     status = json.loads(json.dumps(watched.status))
     status["power"] |= {"discharge_a": 200.0, "discharge_std_a": 0.0}
     status["power"] |= {"charge_a": 45.2, "charge_std_a": 3.1}
-    status["power"] |= {"energy_wh": 9.613, "energy_std_wh": 0.0418}
+    status["power"] |= {"energy_wh": 9.613, "energy_std_wh": 0.0418, "energy_to_soc_pct": 53.8}
     status["record"] = {
         "path": "a.log", "frames": 12, "written_bytes": 9947, "lost_frames": 0, "problem": None,
     }  # fmt: skip
     rows = dict(status_values(status))
     assert rows["possible discharge, 10 s"] == "at least 200 A"
     assert rows["possible charge, 10 s"] == "45.2 ± 3.1 A"
-    assert rows["energy left"] == "9.613 ± 0.042 Wh"
+    assert rows["energy left"] == "9.613 ± 0.042 Wh to 54 % SoC"
     assert rows["recording"] == "a.log, 0 frames lost"
 
 

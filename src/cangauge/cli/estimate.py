@@ -53,8 +53,8 @@ def estimate_command(
 
     PACK has one row per second, of a log over an hour 3,600 rows: capacity_ah, resistance_ratio,
     offset_a, discharge_a and charge_a (possible for 10 s), energy_wh (left), with standard
-    deviations; and, where the log has cell voltages (columns cell_1_v, cell_2_v, …, or [cells] of
-    the map file), the weakest cell.
+    deviations; energy_to_soc_pct, at which that energy ends; and, where the log has cell voltages
+    (columns cell_1_v, cell_2_v, …, or [cells] of the map file), the weakest cell.
 
     Examples
     --------
@@ -148,6 +148,7 @@ def _of_log(
     soc_from_log: bool,
     keeps_pack: bool,
 ) -> RecordedEstimate:
+    from cangauge.logs.gaps import USUAL_STEPS
     from cangauge.model.delay_line import GAP_S
     from cangauge.service.offline import PackHistory, estimate_recorded_log
 
@@ -165,9 +166,9 @@ def _of_log(
             pack=history,
             progress=lambda count: show(f"{log.name}: {count} of {len(log)} samples"),
         )
-    if (gap_s := done.settings.gap_s) > GAP_S:
+    if (gap_s := done.settings.gap_s) >= USUAL_STEPS * GAP_S:  # else the usual step is no gap
         note(
-            f"note: {log.source}: its usual step is {rounded(gap_s / 3.0, 2)} s;"
+            f"note: {log.source}: its usual step is {rounded(gap_s / USUAL_STEPS, 2)} s;"
             f" steps over {rounded(gap_s, 2)} s count as gaps"
         )
     return done

@@ -176,7 +176,9 @@ def pack_values(report: Mapping[str, Any]) -> dict[str, str]:
         for way in ("discharge", "charge"):
             currents = power[f"{way}_a"], power[f"{way}_std_a"]
             values[f"possible {way}, 10 s"] = possible(*currents, "A")
-        values["energy left"] = energy_text(power["energy_wh"], power["energy_std_wh"])
+        left = energy_text(power["energy_wh"], power["energy_std_wh"])
+        to_pct = power.get("energy_to_soc_pct")  # services of earlier releases do not state it
+        values["energy left"] = left if to_pct is None else f"{left} to {to_pct:.0f} % SoC"
     if cells is not None:
         weakest = "" if cells["weakest"] is None else f"number {cells['weakest']}: "
         less = uncertain(cells["sum_error_v"], cells["sum_std_v"], "V")

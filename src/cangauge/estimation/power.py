@@ -168,8 +168,8 @@ class PowerModel:
             *self._energy(ahead, soc_std_pct),
         )
 
-    def _energy(self, ahead: _Ahead, soc_std_pct: float) -> tuple[float, float]:
-        """Return the energy left and its standard deviation [Wh]."""
+    def _energy(self, ahead: _Ahead, soc_std_pct: float) -> tuple[float, float, float]:
+        """Return the energy left, its standard deviation [Wh] and the SoC at which it ends [%]."""
         health, limits = ahead.health, self.limits
         end_pct = min(limits.cutoff_soc_pct, ahead.soc_pct)
         soc_pct = np.linspace(ahead.soc_pct, end_pct, ENERGY_STEPS + 1)
@@ -179,16 +179,18 @@ class PowerModel:
         last = int(low[0]) if low.size else ENERGY_STEPS
         # Part of each step above the lowest voltage: all of it, but for the last.
         part, drop_v = np.ones(last), volts[:last] - volts[1 : last + 1]
-        unknown_pct = 0.0
+        unknown_pct, to_pct = 0.0, limits.cutoff_soc_pct
         if low.size:
             unknown_pct = ahead.std_v / ahead.slope_at(float(soc_pct[last]))
             part[-1:] = (volts[last - 1] - limits.min_voltage_v) / drop_v[-1:]
+            to_pct = ahead.soc_pct - float(part.sum()) * step_pct
         mean_v = volts[:last] - 0.5 * part * drop_v
         energy_wh = float(mean_v @ part) * step_pct / 100.0 * health.capacity_ah
-        return energy_wh, math.hypot(
+        std_wh = math.hypot(
             float(volts[0]) * math.hypot(soc_std_pct, unknown_pct) / 100.0 * health.capacity_ah,
             energy_wh * health.capacity_std_ah / health.capacity_ah,
         )
+        return energy_wh, std_wh, to_pct
 
 
 class _Moment(NamedTuple):

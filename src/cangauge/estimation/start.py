@@ -9,6 +9,11 @@ wide one (it is not), each with a filter of its own that uses every voltage. Wit
 the result is the mean weighted by both probabilities, and its variance includes the spread between
 them (static multiple model; Bar-Shalom, Li, Kirubarajan, Estimation with Applications to Tracking
 and Navigation, 2001, ch. 11.6). A hypothesis is dropped once its probability no longer counts.
+
+A filter linearises the curve at one SoC. While the wide one is still uncertain, a bend of the curve
+costs it evidence, although another SoC may agree with all voltages: on the plateau of LFP a start
+20 % off was thus "proved". So the odds do not fall below the prior ones until the wide filter has
+found the SoC by the voltages (`FOUND_STD_PCT`). Evidence against the narrow one counts at once.
 """
 
 from __future__ import annotations
@@ -19,7 +24,7 @@ from typing import Final
 import numpy as np
 
 from cangauge.errors import InputError
-from cangauge.estimation.ekf import UNKNOWN_STD_PCT, SocFilter
+from cangauge.estimation.ekf import SOC, UNKNOWN_STD_PCT, SocFilter
 from cangauge.estimation.state import Block, HypothesesState
 from cangauge.model.extended import OnlineModel
 
@@ -31,6 +36,10 @@ WRONG_STD_PCT: Final = 25.0
 
 WRONG_PRIOR: Final = 0.3
 """Prior probability that a given start is wrong (development packs)."""
+
+FOUND_STD_PCT: Final = 3.0
+"""Standard deviation of the wide hypothesis up to which its evidence can prove the narrow one right
+[%]: that of a valid SoC."""
 
 DROPPED_LOG_ODDS: Final = 20.0
 """A hypothesis is dropped at these odds: one in 5·10⁸ moves no result by 1e-6 %."""
@@ -85,7 +94,10 @@ class Hypotheses:
         if len(self.filters) == 1:
             return -math.inf
         narrow, wide = self.filters
-        return self.prior_log_odds + wide.evidence - narrow.evidence
+        gained = wide.evidence - narrow.evidence
+        if wide.P[SOC, SOC] > FOUND_STD_PCT**2:
+            gained = max(gained, 0.0)
+        return self.prior_log_odds + gained
 
     @property
     def is_rejected(self) -> bool:
@@ -137,8 +149,8 @@ class Hypotheses:
         """
         if len(self.filters) == 2 and abs(self.log_odds) < CLEAR_LOG_ODDS:
             before = 1.0 / (1.0 + math.exp(-self.log_odds))
-            odds = _log_odds(1.0 - (1.0 - before) * (1.0 - probability))
-            self.prior_log_odds += odds - self.log_odds
+            self.prior_log_odds = _log_odds(1.0 - (1.0 - before) * (1.0 - probability))
+            self.filters[1].evidence = self.filters[0].evidence  # it is in the prior now
         else:
             wide = SocFilter(self.model, UNKNOWN_PCT, UNKNOWN_STD_PCT)
             self.filters = [self.likelier, wide.restore(self.likelier.snapshot())]
