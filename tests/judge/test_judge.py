@@ -85,7 +85,7 @@ def test_an_offset_that_goes_on_has_grown_by_the_next_log() -> None:
         (
             "count_scale",
             10.0,
-            lambda log: {"soc_pct": log.soc_pct[0] + 1.1 * (log.soc_pct - log.soc_pct[0])},
+            lambda log: {"soc_pct": counting(log, 1.1).soc_pct},
         ),
     ],
 )
@@ -114,6 +114,30 @@ def test_an_offset_of_the_sensor_is_taken_out_of_the_corrected_soc(pack) -> None
         assert moved == pytest.approx(truly, abs=1.5)  # the count alone: 4 % off
 
 
+def counting(log: cangauge.Log, scale: float) -> cangauge.Log:
+    """Return the log of a gauge that counts too much from its start on."""
+    return replace(log, soc_pct=log.soc_pct[0] + scale * (log.soc_pct - log.soc_pct[0]))
+
+
+def test_a_right_gauge_of_an_aged_pack_agrees_and_the_pack_has_its_capacity(pack) -> None:
+    model, logs = pack
+    judgement = cangauge.judge(logs, model, capacity_ah=1.12 * model.capacity_ah)
+    assert (judgement.verdict, judgement.cause.verdict) == ("agrees", "model_capacity")
+    assert abs(judgement.error_pct) < 3.0 * judgement.error_std_pct
+    assert judgement.pack_ah == pytest.approx(model.capacity_ah, rel=0.02)
+    assert "Ah, as the gauge counts; the model has" in judgement.headline
+    assert f"--capacity-ah {judgement.pack_ah:.1f}" in judgement.next_step
+
+
+def test_a_small_scale_error_may_be_the_models_capacity(pack) -> None:
+    model, logs = pack
+    judgement = cangauge.judge([counting(log, 1.03) for log in logs], model)
+    assert (judgement.verdict, judgement.cause.verdict) == ("cannot_tell", "unknown")
+    assert judgement.probabilities["none"] < 0.05 < judgement.probabilities["model_capacity"]
+    assert "either the gauge is wrong, or it is right" in judgement.headline
+    assert "capacity" in judgement.next_step
+
+
 def test_a_wrong_start_is_named_and_the_corrected_soc_follows_the_truth(pack) -> None:
     model, logs = pack
     judgement = cangauge.judge([replace(log, soc_pct=log.soc_pct - 12.0) for log in logs], model)
@@ -134,6 +158,18 @@ def test_day_one_without_a_model_cannot_tell_a_small_error(pack) -> None:
         [short], chemistry="oxide", cells=cells, capacity_ah=model.capacity_ah
     )
     assert judgement.verdict == "cannot_tell"
+
+
+def test_without_a_model_the_stated_std_contains_the_free_zero(pack) -> None:
+    model, logs = pack
+    cells = round(float(logs[0].voltage_v.mean()) / 3.7)
+    high = [replace(log, soc_pct=log.soc_pct + 6.0) for log in logs]
+    judgement = cangauge.judge(high, chemistry="oxide", cells=cells, capacity_ah=model.capacity_ah)
+    assert judgement.error_pct > 6.0
+    assert judgement.error_std_pct > 5.0
+    assert np.nanmin(judgement.corrected_std_pct[-1]) > 5.0
+    assert (judgement.verdict, judgement.cause.verdict) == ("cannot_tell", "none")
+    assert "do not settle" in judgement.headline
 
 
 def test_a_jump_is_listed_with_its_size(pack) -> None:
@@ -319,7 +355,7 @@ def agrees_beyond_its_std(judgement: Judgement) -> list[float]:
     if judgement.verdict != "agrees":
         return []
     ends = [
-        (log.soc_pct[-1] - soc[-1], np.hypot(std[-1], 0.5))
+        (log.soc_pct[-1] - soc[-1], std[-1])
         for log, soc, std in zip(
             judgement.logs, judgement.corrected_pct, judgement.corrected_std_pct, strict=True
         )

@@ -41,10 +41,12 @@ from cangauge.extras.judge.chain import (
 
 UNITS: Final = {
     "current_offset": "A", "count_scale": "%", "pack_capacity": "%", "start_or_reset": "% SoC",
-    "voltage_sensor": "%",
+    "voltage_sensor": "%", "model_capacity": "%",
 }  # fmt: skip
 """Causes that the pack's signals can show, and the unit of their size."""
 NAMES: Final = ("none", "unknown", *UNITS)
+RIGHT: Final = ("none", "model_capacity")
+"""Answers in which the gauge is right; in the second, the pack has aged and the gauge knows it."""
 
 PRIOR_NONE: Final = 0.5
 """Prior probability that the gauge is right: whoever asks has a reason. The other answers share
@@ -114,6 +116,7 @@ class Priors:
             "pack_capacity": 6.0,  # what ageing takes between two updates of a gauge
             "start_or_reset": 10.0,
             "voltage_sensor": 1.5,
+            "model_capacity": 10.0,  # what ageing takes in the life of a model
         }.get(cause, 1.0)
 
 
@@ -180,6 +183,8 @@ def signatures_of(  # noqa: C901 - a table of causes
         add(0, 0.4, {column: one, ERROR: (starts - starts[0]) / 100.0})
         add(0, 0.3, {column: one, ERROR: (starts - 100.0) / 100.0})  # right when full
         add(0, 0.3, {column: one})
+    elif name == "model_capacity":  # the gauge counts with what the pack has
+        add(0, 1.0, {CAPACITY: one, COUNT_SCALE: -one})
     return result
 
 
@@ -231,8 +236,8 @@ class Explanation:
     share, size, std : array of shape (signatures,)
         Probability of each within the answer; its size and standard deviation.
     tracks : list of Track
-        SoC of each stretch under the most probable signature; of `none`, as if the gauge's zero
-        were free, so that the gauge does not confirm itself.
+        SoC of each stretch under the most probable signature; where the gauge is `RIGHT`, as if
+        its zero were free, so that the gauge does not confirm itself.
     sums : Sums
     point : Point
         Sums at the likeliest sizes of the noise, and which those are.
@@ -276,13 +281,9 @@ def explain(chain: Chain, priors: Priors) -> list[Explanation]:
                 break
             linear = [a + DAMPING * step for a, step in zip(linear, steps, strict=True)]
         explanation = answer.explanation(GRID)
-        if name == "none":
-            # Not by the gauge itself: the SoC that the voltage alone would have shown.
-            free = np.zeros_like(explanation.signatures[0].columns)
-            free[:, ERROR] = 1.0
-            tracks, *_ = answer.tracks(explanation.sums, free, priors.fault("start_or_reset"))
-            explanation = replace(explanation, tracks=tracks)
-        else:
+        if name in RIGHT:
+            explanation = replace(explanation, tracks=answer.unconfirmed(explanation))
+        if name != "none":
             # The null hypothesis may use any linearisation: no curvature accuses a gauge.
             null = Answer("none", stretches, designs, priors).explanation(GRID).log_evidence
             result[0] = replace(result[0], log_evidence=max(result[0].log_evidence, null))
@@ -343,6 +344,17 @@ class Answer:
             functions,
             covariance,
         )
+
+    def unconfirmed(self, explanation: Explanation) -> list[Track]:
+        """Return the SoC that the voltage alone would have shown: the gauge's zero is free."""
+        sums = explanation.sums
+        zero = sums.at.index(ERROR)
+        known = self._priors.zero_std_pct
+        free = np.hypot(known, self._priors.fault("start_or_reset"))
+        precision = sums.precision.copy()
+        precision[zero, zero] += free**-2.0 - known**-2.0
+        best = explanation.signatures[explanation.best].columns
+        return self.tracks(sums._replace(precision=precision), best, self._std)[0]
 
     def tracks(
         self, sums: Sums, W: FloatArray, std: float

@@ -15,6 +15,7 @@ from cangauge.errors import InputError
 from cangauge.extras.judge.causes import (
     NAMES,
     PRIOR_NONE,
+    RIGHT,
     WINDOW_PCT,
     Explanation,
     Priors,
@@ -42,8 +43,8 @@ from cangauge.model.prior import ChemistryName
 __all__ = ["Judgement", "judge", "narrowed"]
 
 ALARM: Final = 0.05
-"""The gauge is off where the probability that it is right, or that no log ends with an error above
-`USEFUL_PCT`, is at most this, as in `gap`."""
+"""The gauge is off where the probability that it is right (one of `RIGHT`), or that no log ends
+with an error above `USEFUL_PCT`, is at most this, as in `gap`."""
 NAMED: Final = 0.6
 """A cause is named from this probability among all answers but `none`, as in `gap`."""
 FITTED_STD_PCT: Final = 1.5
@@ -52,6 +53,9 @@ STATED_STD_PCT: Final = 3.0
 """… of one that is stated without a model [%], …"""
 COUNTED_STD_PCT: Final = 10.0
 """… and of one that only the gauge's own count states [%]."""
+LIKELY: Final = 0.5
+"""A gauge agrees where the probability that no log ends with an error above `USEFUL_PCT` is at
+least this."""
 SURE: Final = 1.96
 """Half width of an interval of 95 % in standard deviations."""
 
@@ -194,7 +198,8 @@ def _judgement(
 ) -> Judgement:
     """Return what all answers together say, each by its probability.
 
-    `zero_std_pct` is that of the gauge's own zero, which a right gauge may have [% SoC].
+    `zero_std_pct` is that of the gauge's own zero, which a right gauge may have [% SoC]. The stated
+    σ contain it: they are of the SoC on the gauge's scale.
     """
     stretches = chain.stretches
     scores = np.array([answer.log_evidence for answer in answers])
@@ -203,33 +208,42 @@ def _judgement(
     probabilities = {answer.name: float(p) for answer, p in zip(answers, share, strict=True)}
     corrected = [np.full(len(log), np.nan) for log in logs]
     std = [np.full(len(log), np.nan) for log in logs]
-    errors, deviations, useful = [], [], 1.0
+    errors, known_stds, stds, useful = [], [], [], 1.0
     for k, part in enumerate(stretches):
         track = _mixture([answer.tracks[k] for answer in answers], share)
+        in_its_scale = np.hypot(track.std_pct, zero_std_pct)
         time_s = logs[part.log].time_s
         first, last = np.searchsorted(time_s, part.time_s[[0, -1]] + np.array([-60.0, 60.0]))
         at = time_s[first:last]
         soc_pct = np.interp(at, part.time_s, track.soc_pct)
         corrected[part.log][first:last] = np.clip(soc_pct, 0.0, 100.0)
-        std[part.log][first:last] = np.interp(at, part.time_s, track.std_pct)
+        std[part.log][first:last] = np.interp(at, part.time_s, in_its_scale)
         error = part.shown_pct - np.clip(track.soc_pct, 0.0, 100.0)
         if part.end is not None:
-            deviation = float(np.hypot(track.std_pct[part.end], zero_std_pct))
+            deviation = float(in_its_scale[part.end])
             useful = min(useful, _within_useful(float(error[part.end]), deviation))
         errors.append(error)
-        deviations.append(track.std_pct)
-    error, std_at = np.concatenate(errors), np.concatenate(deviations)
+        known_stds.append(track.std_pct)
+        stds.append(in_its_scale)
+    error, known_std, std_at = map(np.concatenate, (errors, known_stds, stds))
     end = int(np.flatnonzero(np.isfinite(error))[-1])
     worst = int(np.nanargmax(np.abs(error) / std_at))
-    if useful <= ALARM < probabilities["none"]:  # no answer explains the error
-        probabilities["unknown"] += probabilities["none"] - useful
-        probabilities["none"] = useful
-    verdict: Verdict = "agrees" if 2.0 * std_at[end] <= USEFUL_PCT else "cannot_tell"
+    right = sum(probabilities[name] for name in RIGHT)
+    if useful <= ALARM < right:  # no answer explains the error
+        probabilities["unknown"] += right - useful
+        probabilities |= {name: probabilities[name] * useful / right for name in RIGHT}
+        right = useful
+    is_known = 2.0 * known_std[end] <= USEFUL_PCT and useful >= LIKELY
+    verdict: Verdict = "agrees" if is_known else "cannot_tell"
     cause = Cause("none", probabilities["none"])
     if probabilities["none"] <= ALARM:
-        verdict, cause = "off", Cause("unknown", probabilities["unknown"])
+        cause = Cause("unknown", probabilities["unknown"])
         if standing(stretches) is None:  # no cause is a gauge that stands still
             cause = _cause(answers, probabilities)
+        if right <= ALARM:
+            verdict = "off"
+        elif cause.verdict not in RIGHT:  # the gauge is wrong, or the model
+            verdict, cause = "cannot_tell", Cause("unknown", probabilities["unknown"])
     return Judgement(
         logs,
         model,

@@ -8,7 +8,7 @@ from typing import Any, Final, Literal, NamedTuple
 
 import numpy as np
 
-from cangauge._text import counted, duration, number
+from cangauge._text import counted, duration, number, rounded
 from cangauge._typing import FloatArray
 from cangauge.extras.judge.causes import UNITS as PACK_UNITS
 from cangauge.extras.judge.causes import Explanation
@@ -38,10 +38,12 @@ _WORDS: Final = {
     "pack_capacity": "the pack has another capacity than the gauge counts with",
     "start_or_reset": "wrong start or reset",
     "voltage_sensor": "voltage sensor",
+    "model_capacity": "the gauge is right, and the pack has another capacity than the model",
     "weak_cell": "weak cell",
     "unknown": "another cause, or several",
 }
 _NEXT: Final = {
+    "none": "Nothing. Judge again after a full charge or a drive of 40 % or more.",
     "current_offset": "Read the current with contactors open or everything off: what it then shows"
     " is the offset. Log one hour of it: that settles it.",
     "count_scale": "Compare the capacity in the gauge's configuration with the pack's, and the"
@@ -80,7 +82,7 @@ class Cause(NamedTuple):
 
     verdict: str
     """`current_offset`, `count_scale`, `pack_capacity`, `start_or_reset`, `voltage_sensor`,
-    `weak_cell`, `none` or `unknown`."""
+    `model_capacity`, `weak_cell`, `none` or `unknown`."""
     probability: float
     size: Size | None = None
     onset: int = 0
@@ -111,7 +113,8 @@ class Judgement:
         In order of time.
     model : Model
     error_pct, error_std_pct : float
-        Published SoC minus the SoC that all logs imply, at the end, and its σ [% SoC].
+        Published SoC minus the SoC that all logs imply, at the end, and its σ with that of the
+        gauge's own zero [% SoC].
     worst_pct : float
         The largest such difference, relative to its σ [% SoC].
     verdict : {"agrees", "off", "cannot_tell"}
@@ -119,7 +122,8 @@ class Judgement:
     probabilities : dict
         Of `none`, `unknown` and each cause.
     corrected_pct, corrected_std_pct : list of array
-        Corrected SoC and its σ at each row of each log [%]; NaN where not known.
+        Corrected SoC and its σ at each row of each log, with that of the gauge's own zero [%]; NaN
+        where not known.
     chain : list of Stretch
     explanations : list of Explanation
         All answers, the most probable first.
@@ -237,14 +241,21 @@ class Judgement:
         """The answer in one sentence."""
         std = number(self.error_std_pct, 1)
         error = f"{_signed(self.error_pct)} ± {std} % SoC"
+        if self.verdict == "cannot_tell" and self.cause.verdict == "unknown":
+            either = (
+                "Cannot tell: either the gauge is wrong, or it is right and the pack has another"
+                f" capacity than the model. It differs by {error} from the SoC that voltage and"
+                " charge imply."
+            )
+            return " ".join(filter(None, [either, self.stands, self.reason]))
         if self.verdict == "cannot_tell":
             return (
                 f"Cannot tell: the gauge differs by {error} from the SoC that voltage and charge"
-                f" imply, and an error of {USEFUL_PCT:g} % would not have been seen."
+                f" imply, and the logs do not settle whether its error is below {USEFUL_PCT:g} %."
             )
         if self.verdict == "agrees":
             agrees = f"The gauge agrees with voltage and charge: difference {error} (1σ)."
-            return f"{agrees} {self.stands}".rstrip()
+            return " ".join(filter(None, [agrees, self.aged, self.stands]))
         if self.cause.verdict == "voltage_sensor":
             reads = "and the logged voltage contradict each other"
         elif self.cause.verdict == "weak_cell":
@@ -255,6 +266,22 @@ class Judgement:
         else:
             reads = f"is not right, though its SoC at the end may be ({error})"
         return " ".join(filter(None, [f"The gauge {reads}.", self.stands, self.reason]))
+
+    @property
+    def pack_ah(self) -> float | None:
+        """Capacity that the pack has where it is not the model's [Ah]; None where it is."""
+        if self.cause.verdict != "model_capacity" or self.cause.size is None:
+            return None
+        return self.model.capacity_ah / (1.0 - self.cause.size.value / 100.0)
+
+    @property
+    def aged(self) -> str:
+        """That the pack has another capacity than the model, as a sentence; empty if not."""
+        if self.pack_ah is None:
+            return ""
+        has, model = (rounded(ah) for ah in (self.pack_ah, self.model.capacity_ah))
+        percent = number(100.0 * self.cause.probability, 0, "%")
+        return f"The pack has {has} Ah, as the gauge counts; the model has {model} Ah ({percent})."
 
     @property
     def stands(self) -> str:
@@ -316,9 +343,14 @@ class Judgement:
                 "See whether the gauge itself stands still, or only what is logged of it, and judge"
                 " again by a log in which its SoC moves."
             )
-        if self.verdict == "agrees":
-            return "Nothing. Judge again after a full charge or a drive of 40 % or more."
-        if self.verdict == "off":
+        if self.verdict == "cannot_tell" and self.cause.verdict == "unknown":
+            return _NEXT["pack_capacity"]
+        if self.pack_ah is not None:
+            return (
+                f"Judge again with the pack's capacity (--capacity-ah {rounded(self.pack_ah)}), and"
+                " fit a new model to logs of these days."
+            )
+        if self.verdict != "cannot_tell":
             return _NEXT[self.cause.verdict]
         if self.model.chemistry == "lfp":
             return (
