@@ -442,3 +442,56 @@ def test_the_flat_part_of_an_lfp_pack_cannot_be_told() -> None:
     judgement = cangauge.judge([drive], chemistry="lfp", cells=16, capacity_ah=100.0)
     assert judgement.verdict == "cannot_tell"
     assert "LFP" in judgement.next_step
+
+
+def lfp_drives(shown_pct) -> list[cangauge.Log]:
+    """Return four hours of even load on the flat part of 16 LFP cells, by what a gauge shows."""
+    model = cangauge.Model.prior("lfp", 16, 100.0)
+    logs = []
+    for day in range(4):
+        time_s = np.arange(0.0, 3600.0, 5.0)
+        amps = 12.0 + 8.0 * np.sin(time_s / 100.0)
+        log = cangauge.Log(time_s, amps, np.full(time_s.size, 52.0), np.full(time_s.size, 25.0))
+        soc = 75.0 - 2.0 * day - drawn_ah(log)
+        volts = model.predict(log, initial_soc_pct=float(soc[0])).voltage_v
+        logs.append(replace(log, voltage_v=volts, soc_pct=shown_pct(day, time_s / 3600.0, soc)))
+    return logs
+
+
+def test_the_corrected_soc_is_mixed_from_all_moments_and_ways_of_a_cause() -> None:
+    # The count drifts, and is right again at each start: whether it was is not in the logs.
+    logs = lfp_drives(lambda _, hours, soc: soc - 2.0 * hours)
+    judgement = cangauge.judge(logs, chemistry="lfp", cells=16, capacity_ah=100.0)
+    assert (judgement.verdict, judgement.cause.verdict) == ("off", "current_offset")
+    (answer,) = [each for each in judgement.explanations if each.name == "current_offset"]
+    assert 0.05 < answer.share.max() < 0.95
+    assert abs(judgement.error_pct + 2.0) < 2.0 * judgement.error_std_pct
+
+
+def test_a_gauge_that_stood_still_and_jumped_back_was_not_reset() -> None:
+    def shown(day: int, hours: np.ndarray, soc: np.ndarray) -> np.ndarray:
+        is_held = (day == 2) & (hours > 0.3) & (hours < 0.8)
+        return np.where(is_held, soc[np.searchsorted(hours, 0.3)], soc)
+
+    judgement = cangauge.judge(lfp_drives(shown), chemistry="lfp", cells=16, capacity_ah=100.0)
+    assert judgement.verdict != "off"
+    assert judgement.probabilities["none"] > 0.5
+    assert abs(judgement.error_pct) < 2.0 * judgement.error_std_pct
+    (stand,) = judgement.chain[2].stood
+    assert stand.flowed_pct == pytest.approx(6.0, abs=1.0)
+    assert stand.until_s - stand.since_s == pytest.approx(1800.0, abs=60.0)
+    assert "for 29.9 min from 18.0 min into" in judgement.stands
+
+
+def test_dusk_is_no_full_charge_where_the_fit_has_no_knee() -> None:
+    log = full_charge(0.0)
+    sun = replace(log, voltage_v=np.minimum(log.voltage_v, 53.55))  # the flat part: 3.347 V a cell
+    (part,) = Chain.of([log], cangauge.Model.prior("lfp", 16, 100.0)).stretches
+    assert part.full.size == 1
+    model = cangauge.Model.prior("lfp", 16, 100.0)
+    assert model.curve is not None
+    flat = model.curve.model_copy(
+        update={"voltage_v": [min(v, 53.44) for v in model.curve.voltage_v]}
+    )
+    (part,) = Chain.of([sun], model.model_copy(update={"curve": flat})).stretches
+    assert part.full.size == 0

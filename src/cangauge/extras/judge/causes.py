@@ -48,6 +48,8 @@ NAMES: Final = ("none", "unknown", *UNITS)
 RIGHT: Final = ("none", "model_capacity")
 """Answers in which the gauge is right; in the second, the pack has aged and the gauge knows it."""
 
+LEAST_SHARE: Final = 0.01
+"""Least probability of a signature within its answer whose SoC is mixed in."""
 PRIOR_NONE: Final = 0.5
 """Prior probability that the gauge is right: whoever asks has a reason. The other answers share
 the rest alike."""
@@ -195,6 +197,14 @@ class Track(NamedTuple):
     std_pct: FloatArray
 
 
+def mixture(tracks: Sequence[Track], share: FloatArray) -> Track:
+    """Return mean and standard deviation of the SoC over tracks of some probability each."""
+    soc = np.array([track.soc_pct for track in tracks])
+    var = np.array([track.std_pct for track in tracks]) ** 2
+    mean = share @ soc
+    return Track(mean, np.sqrt(share @ (var + (soc - mean) ** 2)))
+
+
 class Sums(NamedTuple):
     """Sums of all stretches with the local columns integrated out, and what brings them back."""
 
@@ -236,8 +246,8 @@ class Explanation:
     share, size, std : array of shape (signatures,)
         Probability of each within the answer; its size and standard deviation.
     tracks : list of Track
-        SoC of each stretch under the most probable signature; where the gauge is `RIGHT`, as if
-        its zero were free, so that the gauge does not confirm itself.
+        SoC of each stretch over all signatures; where the gauge is `RIGHT`, as if its zero were
+        free, so that the gauge does not confirm itself.
     sums : Sums
     point : Point
         Sums at the likeliest sizes of the noise, and which those are.
@@ -281,8 +291,7 @@ def explain(chain: Chain, priors: Priors) -> list[Explanation]:
                 break
             linear = [a + DAMPING * step for a, step in zip(linear, steps, strict=True)]
         explanation = answer.explanation(GRID)
-        if name in RIGHT:
-            explanation = replace(explanation, tracks=answer.unconfirmed(explanation))
+        explanation = replace(explanation, tracks=answer.mixed_tracks(explanation))
         if name != "none":
             # The null hypothesis may use any linearisation: no curvature accuses a gauge.
             null = Answer("none", stretches, designs, priors).explanation(GRID).log_evidence
@@ -345,16 +354,20 @@ class Answer:
             covariance,
         )
 
-    def unconfirmed(self, explanation: Explanation) -> list[Track]:
-        """Return the SoC that the voltage alone would have shown: the gauge's zero is free."""
+    def mixed_tracks(self, explanation: Explanation) -> list[Track]:
+        """Return the SoC of each stretch over all signatures, each by its probability."""
         sums = explanation.sums
-        zero = sums.at.index(ERROR)
-        known = self._priors.zero_std_pct
-        free = np.hypot(known, self._priors.fault("start_or_reset"))
-        precision = sums.precision.copy()
-        precision[zero, zero] += free**-2.0 - known**-2.0
-        best = explanation.signatures[explanation.best].columns
-        return self.tracks(sums._replace(precision=precision), best, self._std)[0]
+        if self._name in RIGHT:  # the SoC that the voltage alone would have shown
+            zero, known = sums.at.index(ERROR), self._priors.zero_std_pct
+            free = np.hypot(known, self._priors.fault("start_or_reset"))
+            precision = sums.precision.copy()
+            precision[zero, zero] += free**-2.0 - known**-2.0
+            sums = sums._replace(precision=precision)
+        likely = np.flatnonzero(explanation.share >= LEAST_SHARE)
+        share = explanation.share[likely] / explanation.share[likely].sum()
+        columns = [explanation.signatures[k].columns for k in likely]
+        of_each = [self.tracks(sums, W, self._std)[0] for W in columns]
+        return [mixture(tracks, share) for tracks in zip(*of_each, strict=True)]
 
     def tracks(
         self, sums: Sums, W: FloatArray, std: float

@@ -10,7 +10,6 @@ import numpy as np
 from scipy.special import ndtr
 from threadpoolctl import threadpool_limits
 
-from cangauge._typing import FloatArray
 from cangauge.errors import InputError
 from cangauge.extras.judge.causes import (
     NAMES,
@@ -19,8 +18,8 @@ from cangauge.extras.judge.causes import (
     WINDOW_PCT,
     Explanation,
     Priors,
-    Track,
     explain,
+    mixture,
 )
 from cangauge.extras.judge.chain import Chain, published_pct
 from cangauge.extras.judge.result import (
@@ -210,7 +209,7 @@ def _judgement(
     std = [np.full(len(log), np.nan) for log in logs]
     errors, known_stds, stds, useful = [], [], [], 1.0
     for k, part in enumerate(stretches):
-        track = _mixture([answer.tracks[k] for answer in answers], share)
+        track = mixture([answer.tracks[k] for answer in answers], share)
         in_its_scale = np.hypot(track.std_pct, zero_std_pct)
         time_s = logs[part.log].time_s
         first, last = np.searchsorted(time_s, part.time_s[[0, -1]] + np.array([-60.0, 60.0]))
@@ -264,14 +263,6 @@ def _judgement(
 def _within_useful(error_pct: float, std_pct: float) -> float:
     """Return the probability that an error is at most `USEFUL_PCT`, by its estimate and σ [%]."""
     return float(np.diff(ndtr((np.array([-USEFUL_PCT, USEFUL_PCT]) - error_pct) / std_pct))[0])
-
-
-def _mixture(tracks: Sequence[Track], share: FloatArray) -> Track:
-    """Return mean and standard deviation of the SoC over all answers."""
-    soc = np.array([track.soc_pct for track in tracks])
-    var = np.array([track.std_pct for track in tracks]) ** 2
-    mean = share @ soc
-    return Track(mean, np.sqrt(share @ (var + (soc - mean) ** 2)))
 
 
 def _cause(answers: Sequence[Explanation], probabilities: dict[str, float]) -> Cause:

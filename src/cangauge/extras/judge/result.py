@@ -12,7 +12,7 @@ from cangauge._text import counted, duration, number, rounded
 from cangauge._typing import FloatArray
 from cangauge.extras.judge.causes import UNITS as PACK_UNITS
 from cangauge.extras.judge.causes import Explanation
-from cangauge.extras.judge.chain import Stretch, count_changes, published_pct
+from cangauge.extras.judge.chain import HELD_PCT, Stretch, count_changes, published_pct
 from cangauge.extras.judge.weak import WeakestCell
 from cangauge.logs.log import Log
 from cangauge.model.model_file import Model
@@ -99,7 +99,7 @@ def standing(chain: Sequence[Stretch]) -> Stretch | None:
 
     Of several, that with the most charge; None without any.
     """
-    stands = [part for part in chain if part.held_pct >= max(JUMP_PCT, 2.0 * part.soc_step_pct)]
+    stands = [part for part in chain if part.held_pct >= max(HELD_PCT, 2.0 * part.soc_step_pct)]
     return max(stands, key=lambda part: part.held_pct, default=None)
 
 
@@ -285,10 +285,20 @@ class Judgement:
 
     @property
     def stands(self) -> str:
-        """Since when the published SoC stands still, as a sentence; empty if it does not."""
+        """Where the published SoC stands or stood still, as a sentence; empty if it does not."""
         part = standing(self.chain)
         if part is None or part.end is None:
-            return ""
+            stood = [(each, part.log) for part in self.chain for each in part.stood]
+            if not stood:
+                return ""
+            longest, log = max(stood, key=lambda found: found[0].flowed_pct)
+            return (
+                f"The published SoC stood at {number(longest.shown_pct, 1, '%')} for"
+                f" {duration(longest.until_s - longest.since_s)} from"
+                f" {self._moment(log, longest.since_s)} on, while"
+                f" {number(longest.flowed_pct, 1, '%')} of the charge flowed, and then jumped to"
+                " what it had missed."
+            )
         at = number(float(part.shown_pct[part.end]), 1, "%")
         return (
             f"The published SoC stands at {at} from {self._moment(part.log, part.held_since_s)} on,"
