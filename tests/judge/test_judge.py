@@ -134,7 +134,7 @@ def test_a_small_scale_error_may_be_the_models_capacity(pack) -> None:
     judgement = cangauge.judge([counting(log, 1.03) for log in logs], model)
     assert (judgement.verdict, judgement.cause.verdict) == ("cannot_tell", "unknown")
     assert judgement.probabilities["none"] < 0.05 < judgement.probabilities["model_capacity"]
-    assert "either the gauge is wrong, or it is right" in judgement.headline
+    assert "either it is wrong, or it is right and the pack" in judgement.headline
     assert "capacity" in judgement.next_step
 
 
@@ -170,6 +170,7 @@ def test_without_a_model_the_stated_std_contains_the_free_zero(pack) -> None:
     assert np.nanmin(judgement.corrected_std_pct[-1]) > 5.0
     assert (judgement.verdict, judgement.cause.verdict) == ("cannot_tell", "none")
     assert "do not settle" in judgement.headline
+    assert judgement.next_step.endswith("that needs a model (-m).")
 
 
 def test_a_jump_is_listed_with_its_size(pack) -> None:
@@ -295,10 +296,20 @@ def test_logs_that_show_nothing_are_refused(pack) -> None:
     model, (log, *_) = pack
     with pytest.raises(cangauge.InputError, match="publishes"):
         cangauge.judge([replace(log, soc_pct=None)], model)
-    with pytest.raises(cangauge.InputError, match="no stretch"):
+    with pytest.raises(cangauge.InputError, match="at least 4 minutes"):
         cangauge.judge([log.rows(log.time_s < log.time_s[0] + 239.0)], model)
     with pytest.raises(cangauge.InputError, match="neither a model"):
         cangauge.judge([log], cells=96)
+    with pytest.raises(cangauge.InputError, match="count twice"):
+        cangauge.judge([log, log], model)
+
+
+@pytest.mark.parametrize(("chemistry", "cells"), [("lfp", 97), ("oxide", 130), ("oxide", 75)])
+def test_a_pack_of_other_cells_is_refused_without_a_model(pack, chemistry, cells: int) -> None:
+    _, logs = pack
+    with pytest.raises(cangauge.InputError, match="V per cell") as refused:
+        cangauge.judge(logs[:2], chemistry=chemistry, cells=cells)
+    assert "check --chemistry and --cells" in str(refused.value)
 
 
 def stuck(log: cangauge.Log, step_pct: float, from_row: int) -> cangauge.Log:

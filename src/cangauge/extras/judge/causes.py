@@ -118,7 +118,7 @@ class Priors:
             "pack_capacity": 6.0,  # what ageing takes between two updates of a gauge
             "start_or_reset": 10.0,
             "voltage_sensor": 1.5,
-            "model_capacity": 10.0,  # what ageing takes in the life of a model
+            "model_capacity": 5.0,  # as `count_scale`: only the voltage tells them apart
         }.get(cause, 1.0)
 
 
@@ -186,7 +186,7 @@ def signatures_of(  # noqa: C901 - a table of causes
         add(0, 0.3, {column: one, ERROR: (starts - 100.0) / 100.0})  # right when full
         add(0, 0.3, {column: one})
     elif name == "model_capacity":  # the gauge counts with what the pack has
-        add(0, 1.0, {CAPACITY: one, COUNT_SCALE: -one})
+        add(0, 0.3, {CAPACITY: one, COUNT_SCALE: -one})  # as often as the count alone
     return result
 
 

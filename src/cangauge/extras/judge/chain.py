@@ -176,7 +176,9 @@ class Stretch:
     prediction : Prediction
         The model's, with means over blocks, for `ExtendedModel.voltage_at`.
     fitting_pct : array
-        SoC with the start at which the model's voltage fits best [%].
+        SoC with the start at which the model's voltage fits best [%], …
+    misfit_v : float
+        … and the mean error of the voltage that this start leaves [V].
     level_v : array
         Standard deviation of the level of the voltage's error [V].
     whiten_voltage, whiten_gauge : list of Whitening
@@ -199,6 +201,7 @@ class Stretch:
     load: FloatArray
     prediction: Any
     fitting_pct: FloatArray
+    misfit_v: float
     level_v: FloatArray
     whiten_voltage: list[Whitening]
     whiten_gauge: list[Whitening]
@@ -369,6 +372,7 @@ def _stretch(
         load=mean(np.asarray(load)),
         prediction=of_blocks,
         fitting_pct=fitting_pct,
+        misfit_v=float(np.nanmean(settled_v - extended.voltage_at(fitting_pct, of_blocks))),
         level_v=level_v,
         whiten_voltage=[Whitening.of(has, k**2 * scaled + axis) for k in VOLTAGE_SCALES],
         whiten_gauge=[Whitening.of(counted, of.walk_pct**2 * walk + white) for of in GAUGES],

@@ -10,6 +10,8 @@ import numpy as np
 from scipy.special import ndtr
 from threadpoolctl import threadpool_limits
 
+from cangauge._text import number
+from cangauge.diagnosis.checks import check_given_once
 from cangauge.errors import InputError
 from cangauge.extras.judge.causes import (
     NAMES,
@@ -21,7 +23,7 @@ from cangauge.extras.judge.causes import (
     explain,
     mixture,
 )
-from cangauge.extras.judge.chain import Chain, published_pct
+from cangauge.extras.judge.chain import SHORTEST_S, Chain, published_pct
 from cangauge.extras.judge.result import (
     EPOCH_S,
     UNITS,
@@ -45,7 +47,8 @@ ALARM: Final = 0.05
 """The gauge is off where the probability that it is right (one of `RIGHT`), or that no log ends
 with an error above `USEFUL_PCT`, is at most this, as in `gap`."""
 NAMED: Final = 0.6
-"""A cause is named from this probability among all answers but `none`, as in `gap`."""
+"""A cause is named from this probability among all answers but `none`, as in `gap`; that the gauge
+is right and the model's capacity is not, from all but `ALARM` on."""
 FITTED_STD_PCT: Final = 1.5
 """Standard deviation of the capacity of a model that was fitted [%], …"""
 STATED_STD_PCT: Final = 3.0
@@ -55,6 +58,9 @@ COUNTED_STD_PCT: Final = 10.0
 LIKELY: Final = 0.5
 """A gauge agrees where the probability that no log ends with an error above `USEFUL_PCT` is at
 least this."""
+MISFIT_V: Final = 0.1
+"""Without a model: mean error of the voltage at the best start that no cell of the chemistry has
+[V per cell]."""
 SURE: Final = 1.96
 """Half width of an interval of 95 % in standard deviations."""
 
@@ -92,11 +98,13 @@ def judge(
     Raises
     ------
     InputError
-        If no log has a published SoC, or neither model nor chemistry and cells are given.
+        If no log has a published SoC, a log is given twice, neither model nor chemistry and cells
+        are given, or the voltage is not that of such cells.
     """
     judged = tuple(as_log(log) for log in logs)
     if all(log.time_s[0] >= EPOCH_S for log in judged):
         judged = tuple(sorted(judged, key=lambda log: float(log.time_s[0])))
+    check_given_once(judged, cure="give each log once")
     if not any(np.isfinite(published_pct(log)).sum() > 1 for log in judged):
         raise InputError(
             "no log has the SoC that the gauge publishes",
@@ -121,8 +129,11 @@ def judge(
         if not any(np.isfinite(part.published_pct).any() for part in chain.stretches):
             raise InputError(
                 "no stretch of samples is long enough",
-                cure="give logs of at least 10 minutes, better half an hour with changing load",
+                cure=f"give logs of at least {SHORTEST_S / 60.0:.0f} minutes, better half an hour"
+                " with changing load",
             )
+        if pack.made.by == PRIOR_MADE_BY:
+            _check_cells(chain, pack)
         typical = pack.made.by == PRIOR_MADE_BY and pack.chemistry == "oxide"
         zero_std_pct = WINDOW_PCT if typical else Priors.zero_std_pct
         answers = explain(chain, Priors(pack.capacity_ah, std_pct, zero_std_pct))
@@ -149,6 +160,19 @@ def _capacity_ah(logs: Sequence[Log]) -> float:
             cure="give the pack's capacity",
         )
     return 100.0 * covariance / variance
+
+
+def _check_cells(chain: Chain, typical: Model) -> None:
+    """Raise InputError if the voltage is not that of typical cells at any SoC."""
+    cells = typical.cells or 1
+    misfit_v = float(np.median([part.misfit_v for part in chain.stretches])) / cells
+    if abs(misfit_v) > MISFIT_V:
+        raise InputError(
+            f"at no SoC is the voltage that of {cells} {typical.chemistry} cells: the best start"
+            f" leaves {number(misfit_v, 2, 'V')} per cell",
+            field="--chemistry/--cells",
+            cure="check --chemistry and --cells, or fit a model of the pack",
+        )
 
 
 def _weakest(
@@ -272,7 +296,8 @@ def _cause(answers: Sequence[Explanation], probabilities: dict[str, float]) -> C
         key=lambda answer: probabilities[answer.name],
     )
     probability = probabilities[best.name]
-    if probability < NAMED * (1.0 - probabilities["none"]):
+    named = 1.0 - ALARM if best.name in RIGHT else NAMED
+    if probability < named * (1.0 - probabilities["none"]):
         return Cause("unknown", probabilities["unknown"])
     size = float(best.share @ best.size)
     spread = float(best.share @ (best.std**2 + (best.size - size) ** 2)) ** 0.5

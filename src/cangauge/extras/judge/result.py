@@ -10,12 +10,12 @@ import numpy as np
 
 from cangauge._text import counted, duration, number, rounded
 from cangauge._typing import FloatArray
+from cangauge.extras.judge.causes import RIGHT, Explanation
 from cangauge.extras.judge.causes import UNITS as PACK_UNITS
-from cangauge.extras.judge.causes import Explanation
 from cangauge.extras.judge.chain import HELD_PCT, Stretch, count_changes, published_pct
 from cangauge.extras.judge.weak import WeakestCell
 from cangauge.logs.log import Log
-from cangauge.model.model_file import Model
+from cangauge.model.model_file import PRIOR_MADE_BY, Model
 
 Verdict = Literal["agrees", "off", "cannot_tell"]
 
@@ -47,7 +47,9 @@ _NEXT: Final = {
     "current_offset": "Read the current with contactors open or everything off: what it then shows"
     " is the offset. Log one hour of it: that settles it.",
     "count_scale": "Compare the capacity in the gauge's configuration with the pack's, and the"
-    " current with a clamp meter under load. A log of one drive of 40 % settles it.",
+    " current with a clamp meter under load. A log of one drive of 40 % settles it. A gauge that"
+    " shows the usable part of the cells as 0 to 100 % also moves more than the cells do: then"
+    " nothing is wrong.",
     "pack_capacity": "Log one full discharge or charge, or a drive of 40 % or more that ends with"
     " an hour of rest: charge over SoC then gives the capacity.",
     "start_or_reset": "Charge until full once, so that the gauge resets itself, and judge again:"
@@ -238,34 +240,36 @@ class Judgement:
 
     @property
     def headline(self) -> str:
-        """The answer in one sentence."""
+        """The answer in a few sentences."""
+        reason = "" if self.cause.verdict in RIGHT else self.reason
+        return " ".join(filter(None, [self._found, self.aged, self.stands, reason]))
+
+    @property
+    def _found(self) -> str:
+        """The verdict with the error, as a sentence."""
         std = number(self.error_std_pct, 1)
         error = f"{_signed(self.error_pct)} ± {std} % SoC"
-        if self.verdict == "cannot_tell" and self.cause.verdict == "unknown":
-            either = (
-                "Cannot tell: either the gauge is wrong, or it is right and the pack has another"
-                f" capacity than the model. It differs by {error} from the SoC that voltage and"
-                " charge imply."
-            )
-            return " ".join(filter(None, [either, self.stands, self.reason]))
+        if self.verdict == "agrees":
+            return f"The gauge agrees with voltage and charge: difference {error} (1σ)."
         if self.verdict == "cannot_tell":
+            open_ = f"and the logs do not settle whether its error is below {USEFUL_PCT:g} %"
+            if self.cause.verdict == "unknown":
+                open_ = (
+                    "and either it is wrong, or it is right and the pack has another capacity than"
+                    " the model"
+                )
             return (
                 f"Cannot tell: the gauge differs by {error} from the SoC that voltage and charge"
-                f" imply, and the logs do not settle whether its error is below {USEFUL_PCT:g} %."
+                f" imply, {open_}."
             )
-        if self.verdict == "agrees":
-            agrees = f"The gauge agrees with voltage and charge: difference {error} (1σ)."
-            return " ".join(filter(None, [agrees, self.aged, self.stands]))
         if self.cause.verdict == "voltage_sensor":
-            reads = "and the logged voltage contradict each other"
-        elif self.cause.verdict == "weak_cell":
-            reads = "holds for the mean cell, not for the weakest"
-        elif abs(self.error_pct) > 2.0 * self.error_std_pct:
+            return "The gauge and the logged voltage contradict each other."
+        if self.cause.verdict == "weak_cell":
+            return "The gauge holds for the mean cell, not for the weakest."
+        if abs(self.error_pct) > 2.0 * self.error_std_pct:
             high = "too high" if self.error_pct > 0.0 else "too low"
-            reads = f"reads {number(abs(self.error_pct), 1)} ± {std} % SoC {high}"
-        else:
-            reads = f"is not right, though its SoC at the end may be ({error})"
-        return " ".join(filter(None, [f"The gauge {reads}.", self.stands, self.reason]))
+            return f"The gauge reads {number(abs(self.error_pct), 1)} ± {std} % SoC {high}."
+        return f"The gauge is not right, though its SoC at the end may be ({error})."
 
     @property
     def pack_ah(self) -> float | None:
@@ -367,9 +371,11 @@ class Judgement:
                 "Add a log of one full charge until its end: between the knees the voltage of an"
                 " LFP cell says nothing, at full it settles the SoC."
             )
+        zero = ", but for the zero of the gauge: that needs a model (-m)"
         return (
             "Add a log with an hour of rest after a drive of 40 % or more, or of one full charge"
-            " until its end: it settles the SoC to about 2 %."
+            " until its end: it settles the SoC to about 2 %"
+            f"{zero if self.model.made.by == PRIOR_MADE_BY else ''}."
         )
 
     def answer_rows(self) -> tuple[list[str], list[list[str]]]:
