@@ -23,7 +23,6 @@ from pathlib import Path
 import numpy as np
 
 import cangauge
-from cangauge.extras.judge.judgement import ALARM
 from cangauge.extras.validation.twin.drive import draw_drive
 from cangauge.extras.validation.twin.pack import draw_pack
 from cangauge.extras.validation.twin.plant import TwinPlant
@@ -196,15 +195,17 @@ def table(paths: Sequence[str]) -> None:
     cells: dict[tuple[str, str], dict[int, list]] = defaultdict(lambda: defaultdict(list))
     for line in lines:
         cells[line["pack"], line["fault"]][line["days"]].append(line)
-    print(f"Alarm at P(none) ≤ {ALARM}. Each cell: seen / rightly named / cannot tell, of all.\n")
+    print("Each cell: off / rightly named / cannot tell, of all.\n")
     print("| pack | fault | " + " | ".join(f"{days} d" for days in DAYS) + " |")
     print("|---|---|" + "---|" * len(DAYS))
     for (pack, fault), of_days in cells.items():
         shown = []
         for days in DAYS:
             group = of_days.get(days, [])
-            seen = sum(line["none"] <= ALARM for line in group)
-            right = sum(line["named"] == line["cause"] and line["none"] <= ALARM for line in group)
+            seen = sum(line["verdict"] == "off" for line in group)
+            right = sum(
+                line["named"] == line["cause"] and line["verdict"] == "off" for line in group
+            )
             open_ = sum(line["verdict"] == "cannot_tell" for line in group)
             text = f"{seen} / {open_} of {len(group)}" if fault.startswith("none") else ""
             shown.append(text or f"{seen} / {right} / {open_} of {len(group)}" if group else "–")

@@ -99,6 +99,21 @@ def test_a_gauge_that_is_right_is_no_trouble_and_logs_outlive_a_restart(
     assert not old.exists()
 
 
+def test_a_right_gauge_of_an_aged_pack_is_no_trouble_and_its_capacity_is_said(
+    tmp_path: Path,
+) -> None:
+    aged = OPINION | {"cause": {"verdict": "model_capacity"}, "next_step": "Fit a new model."}
+    with (
+        LoggedLines("cangauge.extras.judge") as lines,
+        closing(LiveJudge(Stored(tmp_path, 2, printing(aged)), lambda: 50.0)) as judge,
+    ):
+        drive(judge, {"soc": 50.0}, 1, 0.0)
+        judge._end_stretch()
+        assert waits(lambda: any("second opinion" in line for line in lines.lines))
+        assert judge.trouble == ""
+    assert any("model capacity. Fit a new model." in line for line in lines.lines)
+
+
 def test_a_judgement_that_fails_says_why(tmp_path: Path) -> None:
     stored = Stored(
         tmp_path, 2, printing({"error": {"message": "no log has the SoC"}, "exit_code": 2}, 2)

@@ -62,16 +62,21 @@ def check_logs(logs: Sequence[Log], references: Sequence[Log], model: Model) -> 
                 cure="use the model of this pack",
             )  # fmt: skip
         _check_count(log, model.capacity_ah)
-    for one, other in itertools.combinations((*logs, *references), 2):
+    check_given_once((*logs, *references), cure="give each log once, either as LOG or as reference")
+
+
+_MEASURED: Final = ("current_a", "voltage_v")
+
+
+def check_given_once(logs: Sequence[Log], *, cure: str) -> None:
+    """Raise InputError if two logs have the same rows."""
+    for one, other in itertools.combinations(logs, 2):
         if all(np.array_equal(getattr(one, k), getattr(other, k)) for k in _MEASURED):
             raise InputError(
                 f"same rows as {other.source or other.name}: they would count twice",
                 source=one.source or one.name,
-                cure="give each log once, either as LOG or as reference",
+                cure=cure,
             )
-
-
-_MEASURED: Final = ("current_a", "voltage_v")
 
 
 def _check_count(log: Log, capacity_ah: float) -> None:

@@ -41,11 +41,15 @@ from cangauge.extras.judge.chain import (
 
 UNITS: Final = {
     "current_offset": "A", "count_scale": "%", "pack_capacity": "%", "start_or_reset": "% SoC",
-    "voltage_sensor": "%",
+    "voltage_sensor": "%", "model_capacity": "%",
 }  # fmt: skip
 """Causes that the pack's signals can show, and the unit of their size."""
 NAMES: Final = ("none", "unknown", *UNITS)
+RIGHT: Final = ("none", "model_capacity")
+"""Answers in which the gauge is right; in the second, the pack has aged and the gauge knows it."""
 
+LEAST_SHARE: Final = 0.01
+"""Least probability of a signature within its answer whose SoC is mixed in."""
 PRIOR_NONE: Final = 0.5
 """Prior probability that the gauge is right: whoever asks has a reason. The other answers share
 the rest alike."""
@@ -114,6 +118,7 @@ class Priors:
             "pack_capacity": 6.0,  # what ageing takes between two updates of a gauge
             "start_or_reset": 10.0,
             "voltage_sensor": 1.5,
+            "model_capacity": 5.0,  # as `count_scale`: only the voltage tells them apart
         }.get(cause, 1.0)
 
 
@@ -180,6 +185,9 @@ def signatures_of(  # noqa: C901 - a table of causes
         add(0, 0.4, {column: one, ERROR: (starts - starts[0]) / 100.0})
         add(0, 0.3, {column: one, ERROR: (starts - 100.0) / 100.0})  # right when full
         add(0, 0.3, {column: one})
+    elif name == "model_capacity":  # the gauge counts with what the pack has
+        # Seldom: a model is of the pack as it is (i3_dev, twin_lfp, simulated packs that aged).
+        add(0, 0.01, {CAPACITY: one, COUNT_SCALE: -one})
     return result
 
 
@@ -188,6 +196,14 @@ class Track(NamedTuple):
 
     soc_pct: FloatArray
     std_pct: FloatArray
+
+
+def mixture(tracks: Sequence[Track], share: FloatArray) -> Track:
+    """Return mean and standard deviation of the SoC over tracks of some probability each."""
+    soc = np.array([track.soc_pct for track in tracks])
+    var = np.array([track.std_pct for track in tracks]) ** 2
+    mean = share @ soc
+    return Track(mean, np.sqrt(share @ (var + (soc - mean) ** 2)))
 
 
 class Sums(NamedTuple):
@@ -231,8 +247,8 @@ class Explanation:
     share, size, std : array of shape (signatures,)
         Probability of each within the answer; its size and standard deviation.
     tracks : list of Track
-        SoC of each stretch under the most probable signature; of `none`, as if the gauge's zero
-        were free, so that the gauge does not confirm itself.
+        SoC of each stretch over all signatures; where the gauge is `RIGHT`, as if its zero were
+        free, so that the gauge does not confirm itself.
     sums : Sums
     point : Point
         Sums at the likeliest sizes of the noise, and which those are.
@@ -276,13 +292,8 @@ def explain(chain: Chain, priors: Priors) -> list[Explanation]:
                 break
             linear = [a + DAMPING * step for a, step in zip(linear, steps, strict=True)]
         explanation = answer.explanation(GRID)
-        if name == "none":
-            # Not by the gauge itself: the SoC that the voltage alone would have shown.
-            free = np.zeros_like(explanation.signatures[0].columns)
-            free[:, ERROR] = 1.0
-            tracks, *_ = answer.tracks(explanation.sums, free, priors.fault("start_or_reset"))
-            explanation = replace(explanation, tracks=tracks)
-        else:
+        explanation = replace(explanation, tracks=answer.mixed_tracks(explanation))
+        if name != "none":
             # The null hypothesis may use any linearisation: no curvature accuses a gauge.
             null = Answer("none", stretches, designs, priors).explanation(GRID).log_evidence
             result[0] = replace(result[0], log_evidence=max(result[0].log_evidence, null))
@@ -343,6 +354,21 @@ class Answer:
             functions,
             covariance,
         )
+
+    def mixed_tracks(self, explanation: Explanation) -> list[Track]:
+        """Return the SoC of each stretch over all signatures, each by its probability."""
+        sums = explanation.sums
+        if self._name in RIGHT:  # the SoC that the voltage alone would have shown
+            zero, known = sums.at.index(ERROR), self._priors.zero_std_pct
+            free = np.hypot(known, self._priors.fault("start_or_reset"))
+            precision = sums.precision.copy()
+            precision[zero, zero] += free**-2.0 - known**-2.0
+            sums = sums._replace(precision=precision)
+        likely = np.flatnonzero(explanation.share >= LEAST_SHARE)
+        share = explanation.share[likely] / explanation.share[likely].sum()
+        columns = [explanation.signatures[k].columns for k in likely]
+        of_each = [self.tracks(sums, W, self._std)[0] for W in columns]
+        return [mixture(tracks, share) for tracks in zip(*of_each, strict=True)]
 
     def tracks(
         self, sums: Sums, W: FloatArray, std: float

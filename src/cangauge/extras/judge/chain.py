@@ -27,7 +27,8 @@ from cangauge._typing import BoolArray, FloatArray, IntArray
 from cangauge.logs.log import Log
 from cangauge.model.extended import ExtendedModel
 from cangauge.model.model_file import Model
-from cangauge.model.voltage_model import Functions, hermite_basis, resistance_factor
+from cangauge.model.prior import CHEMISTRIES
+from cangauge.model.voltage_model import KNOTS_PCT, Functions, hermite_basis, resistance_factor
 
 (START, LEVEL, ERROR, COUNT_OFFSET, COUNT_SCALE, OFFSET, CAPACITY, VOLTAGE, BY_VOLTAGE, STEP,
  FUNCTIONS) = range(11)  # fmt: skip
@@ -58,7 +59,13 @@ FULL_TAPER: Final = 0.5
 FULL_C_RATE: Final = 0.1
 """… to less than this [1/h], …"""
 FULL_VOLTAGE: Final = 0.998
-"""… the voltage within this of its highest, and of the curve at 98 %."""
+"""… the voltage within this of its highest, and above the curve at `KNEE_PCT`: the model's and the
+typical cell's, since a fit whose logs never reached the top has no knee."""
+KNEE_PCT: Final = 98.0
+"""Where the curve turns up towards full [%]."""
+HELD_PCT: Final = 1.0
+"""A published SoC stands still that is held while this charge, and that of two of its steps, flows
+[%]: a dashboard shows it."""
 WANDER_S: Final = 1200.0
 """Time over which the level of the voltage also wanders [s]: the curve's features pass by, and the
 pack warms up."""
@@ -118,6 +125,24 @@ class Whitening(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
+class Stand:
+    """A published SoC that is held while charge flows.
+
+    Attributes
+    ----------
+    since_s, until_s : float
+        Stamps of its first and last row [s].
+    shown_pct, flowed_pct : float
+        The SoC, and the charge that flowed [%].
+    """
+
+    since_s: float
+    until_s: float
+    shown_pct: float
+    flowed_pct: float
+
+
+@dataclass(frozen=True, eq=False)
 class Stretch:
     """Blocks of uninterrupted samples; arrays of shape (n,) unless stated.
 
@@ -142,6 +167,8 @@ class Stretch:
     held_since_s, held_pct : float
         Stamp since which the last published SoC is held [s], and the charge that flowed since [%];
         0 if it flowed towards the limit that is shown.
+    stood : list of Stand
+        Within the stretch, each followed by a jump of the charge that flowed.
     full : array of int
         Blocks at which a full charge has ended.
     load : array of shape (n, k)
@@ -149,7 +176,9 @@ class Stretch:
     prediction : Prediction
         The model's, with means over blocks, for `ExtendedModel.voltage_at`.
     fitting_pct : array
-        SoC with the start at which the model's voltage fits best [%].
+        SoC with the start at which the model's voltage fits best [%], …
+    misfit_v : float
+        … and the mean error of the voltage that this start leaves [V].
     level_v : array
         Standard deviation of the level of the voltage's error [V].
     whiten_voltage, whiten_gauge : list of Whitening
@@ -167,10 +196,12 @@ class Stretch:
     step_at: int
     held_since_s: float
     held_pct: float
+    stood: list[Stand]
     full: IntArray
     load: FloatArray
     prediction: Any
     fitting_pct: FloatArray
+    misfit_v: float
     level_v: FloatArray
     whiten_voltage: list[Whitening]
     whiten_gauge: list[Whitening]
@@ -293,7 +324,11 @@ def _stretch(
         return np.array([_median(counts[block]) for block in used]) - drawn_pct
 
     shown = published_pct(log)
-    published = median(_observed(shown, drawn, step_pct))
+    stood = _stands(log.time_s, shown, drawn, step_pct)
+    moving = shown.copy()
+    for stand in stood:  # a jump back is no reset: the count went on
+        moving[(log.time_s > stand.since_s) & (log.time_s <= stand.until_s)] = np.nan
+    published = median(_observed(moving, drawn, step_pct))
     at, change = count_changes(published, drawn_pct)
     held_since_s, held_pct = _held(log.time_s, shown, drawn)
     hours, voltage = mean(elapsed_s) / 3600.0, mean(signals.voltage_v)
@@ -332,10 +367,12 @@ def _stretch(
         step_at=int(at[np.argmax(np.abs(change))]) if at.size else 0,
         held_since_s=held_since_s,
         held_pct=held_pct,
+        stood=stood,
         full=_full_charges(mean(signals.current_a), voltage, model),
         load=mean(np.asarray(load)),
         prediction=of_blocks,
         fitting_pct=fitting_pct,
+        misfit_v=float(np.nanmean(settled_v - extended.voltage_at(fitting_pct, of_blocks))),
         level_v=level_v,
         whiten_voltage=[Whitening.of(has, k**2 * scaled + axis) for k in VOLTAGE_SCALES],
         whiten_gauge=[Whitening.of(counted, of.walk_pct**2 * walk + white) for of in GAUGES],
@@ -373,6 +410,23 @@ def _observed(shown: FloatArray, drawn_pct: FloatArray, step_pct: float) -> Floa
     return np.where(is_count, told, np.nan) if is_count.any() else told
 
 
+def _stands(
+    time_s: FloatArray, shown: FloatArray, drawn_pct: FloatArray, step_pct: float
+) -> list[Stand]:
+    """Return where the published SoC stood still, and then jumped to what it would have been."""
+    known = np.flatnonzero(np.isfinite(shown))
+    first = known[np.flatnonzero(np.diff(shown[known], prepend=np.nan) != 0.0)]
+    last = known[np.searchsorted(known, first[1:]) - 1]
+    flowed = np.diff(drawn_pct[first])
+    missed = np.abs(np.diff(shown[first]) + flowed)
+    least = max(HELD_PCT, 2.0 * step_pct)
+    is_stand = (np.abs(flowed) >= least) & (missed < 0.5 * np.abs(flowed))
+    return [
+        Stand(float(time_s[a]), float(time_s[b]), float(shown[a]), float(abs(charge)))
+        for a, b, charge in zip(first[:-1][is_stand], last[is_stand], flowed[is_stand], strict=True)
+    ]
+
+
 def _held(time_s: FloatArray, shown: FloatArray, drawn_pct: FloatArray) -> tuple[float, float]:
     """Return since when the last published SoC is held [s], and what charge flowed since [%]."""
     known = np.flatnonzero(np.isfinite(shown))
@@ -394,7 +448,10 @@ def _median(values: FloatArray) -> float:
 
 def _full_charges(current_a: FloatArray, voltage_v: FloatArray, model: Model) -> IntArray:
     """Return the blocks at which a charge ended full: tapered at constant, high voltage."""
-    knee_v = float(model.voltage_model().pseudo_ocv([98.0])[0])
+    knee_v = float(model.voltage_model().pseudo_ocv([KNEE_PCT])[0])
+    if model.cells is not None:
+        typical = CHEMISTRIES[model.chemistry].curve_v
+        knee_v = max(knee_v, model.cells * float(np.interp(KNEE_PCT, KNOTS_PCT, typical)))
     high_v = max(FULL_VOLTAGE * float(voltage_v.max()), knee_v)
     held = (voltage_v >= high_v) & (current_a < 0.0)
     edges = np.flatnonzero(np.diff(held, prepend=False, append=False)).reshape(-1, 2)

@@ -10,18 +10,20 @@ import numpy as np
 from scipy.special import ndtr
 from threadpoolctl import threadpool_limits
 
-from cangauge._typing import FloatArray
+from cangauge._text import number
+from cangauge.diagnosis.checks import check_given_once
 from cangauge.errors import InputError
 from cangauge.extras.judge.causes import (
     NAMES,
     PRIOR_NONE,
+    RIGHT,
     WINDOW_PCT,
     Explanation,
     Priors,
-    Track,
     explain,
+    mixture,
 )
-from cangauge.extras.judge.chain import Chain, published_pct
+from cangauge.extras.judge.chain import SHORTEST_S, Chain, published_pct
 from cangauge.extras.judge.result import (
     EPOCH_S,
     UNITS,
@@ -42,16 +44,23 @@ from cangauge.model.prior import ChemistryName
 __all__ = ["Judgement", "judge", "narrowed"]
 
 ALARM: Final = 0.05
-"""The gauge is off where the probability that it is right, or that no log ends with an error above
-`USEFUL_PCT`, is at most this, as in `gap`."""
+"""The gauge is off where the probability that it is right (one of `RIGHT`), or that no log ends
+with an error above `USEFUL_PCT`, is at most this, as in `gap`."""
 NAMED: Final = 0.6
-"""A cause is named from this probability among all answers but `none`, as in `gap`."""
+"""A cause is named from this probability among all answers but `none`, as in `gap`; that the gauge
+is right and the model's capacity is not, from all but `ALARM` on."""
 FITTED_STD_PCT: Final = 1.5
 """Standard deviation of the capacity of a model that was fitted [%], …"""
 STATED_STD_PCT: Final = 3.0
 """… of one that is stated without a model [%], …"""
 COUNTED_STD_PCT: Final = 10.0
 """… and of one that only the gauge's own count states [%]."""
+LIKELY: Final = 0.5
+"""A gauge agrees where the probability that no log ends with an error above `USEFUL_PCT` is at
+least this."""
+MISFIT_V: Final = 0.1
+"""Without a model: mean error of the voltage at the best start that no cell of the chemistry has
+[V per cell]."""
 SURE: Final = 1.96
 """Half width of an interval of 95 % in standard deviations."""
 
@@ -89,11 +98,13 @@ def judge(
     Raises
     ------
     InputError
-        If no log has a published SoC, or neither model nor chemistry and cells are given.
+        If no log has a published SoC, a log is given twice, neither model nor chemistry and cells
+        are given, or the voltage is not that of such cells.
     """
     judged = tuple(as_log(log) for log in logs)
     if all(log.time_s[0] >= EPOCH_S for log in judged):
         judged = tuple(sorted(judged, key=lambda log: float(log.time_s[0])))
+    check_given_once(judged, cure="give each log once")
     if not any(np.isfinite(published_pct(log)).sum() > 1 for log in judged):
         raise InputError(
             "no log has the SoC that the gauge publishes",
@@ -118,8 +129,11 @@ def judge(
         if not any(np.isfinite(part.published_pct).any() for part in chain.stretches):
             raise InputError(
                 "no stretch of samples is long enough",
-                cure="give logs of at least 10 minutes, better half an hour with changing load",
+                cure=f"give logs of at least {SHORTEST_S / 60.0:.0f} minutes, better half an hour"
+                " with changing load",
             )
+        if pack.made.by == PRIOR_MADE_BY:
+            _check_cells(chain, pack)
         typical = pack.made.by == PRIOR_MADE_BY and pack.chemistry == "oxide"
         zero_std_pct = WINDOW_PCT if typical else Priors.zero_std_pct
         answers = explain(chain, Priors(pack.capacity_ah, std_pct, zero_std_pct))
@@ -146,6 +160,19 @@ def _capacity_ah(logs: Sequence[Log]) -> float:
             cure="give the pack's capacity",
         )
     return 100.0 * covariance / variance
+
+
+def _check_cells(chain: Chain, typical: Model) -> None:
+    """Raise InputError if the voltage is not that of typical cells at any SoC."""
+    cells = typical.cells or 1
+    misfit_v = float(np.median([part.misfit_v for part in chain.stretches])) / cells
+    if abs(misfit_v) > MISFIT_V:
+        raise InputError(
+            f"at no SoC is the voltage that of {cells} {typical.chemistry} cells: the best start"
+            f" leaves {number(misfit_v, 2, 'V')} per cell",
+            field="--chemistry/--cells",
+            cure="check --chemistry and --cells, or fit a model of the pack",
+        )
 
 
 def _weakest(
@@ -194,7 +221,8 @@ def _judgement(
 ) -> Judgement:
     """Return what all answers together say, each by its probability.
 
-    `zero_std_pct` is that of the gauge's own zero, which a right gauge may have [% SoC].
+    `zero_std_pct` is that of the gauge's own zero, which a right gauge may have [% SoC]. The stated
+    σ contain it: they are of the SoC on the gauge's scale.
     """
     stretches = chain.stretches
     scores = np.array([answer.log_evidence for answer in answers])
@@ -203,33 +231,42 @@ def _judgement(
     probabilities = {answer.name: float(p) for answer, p in zip(answers, share, strict=True)}
     corrected = [np.full(len(log), np.nan) for log in logs]
     std = [np.full(len(log), np.nan) for log in logs]
-    errors, deviations, useful = [], [], 1.0
+    errors, known_stds, stds, useful = [], [], [], 1.0
     for k, part in enumerate(stretches):
-        track = _mixture([answer.tracks[k] for answer in answers], share)
+        track = mixture([answer.tracks[k] for answer in answers], share)
+        in_its_scale = np.hypot(track.std_pct, zero_std_pct)
         time_s = logs[part.log].time_s
         first, last = np.searchsorted(time_s, part.time_s[[0, -1]] + np.array([-60.0, 60.0]))
         at = time_s[first:last]
         soc_pct = np.interp(at, part.time_s, track.soc_pct)
         corrected[part.log][first:last] = np.clip(soc_pct, 0.0, 100.0)
-        std[part.log][first:last] = np.interp(at, part.time_s, track.std_pct)
+        std[part.log][first:last] = np.interp(at, part.time_s, in_its_scale)
         error = part.shown_pct - np.clip(track.soc_pct, 0.0, 100.0)
         if part.end is not None:
-            deviation = float(np.hypot(track.std_pct[part.end], zero_std_pct))
+            deviation = float(in_its_scale[part.end])
             useful = min(useful, _within_useful(float(error[part.end]), deviation))
         errors.append(error)
-        deviations.append(track.std_pct)
-    error, std_at = np.concatenate(errors), np.concatenate(deviations)
+        known_stds.append(track.std_pct)
+        stds.append(in_its_scale)
+    error, known_std, std_at = map(np.concatenate, (errors, known_stds, stds))
     end = int(np.flatnonzero(np.isfinite(error))[-1])
     worst = int(np.nanargmax(np.abs(error) / std_at))
-    if useful <= ALARM < probabilities["none"]:  # no answer explains the error
-        probabilities["unknown"] += probabilities["none"] - useful
-        probabilities["none"] = useful
-    verdict: Verdict = "agrees" if 2.0 * std_at[end] <= USEFUL_PCT else "cannot_tell"
+    right = sum(probabilities[name] for name in RIGHT)
+    if useful <= ALARM < right:  # no answer explains the error
+        probabilities["unknown"] += right - useful
+        probabilities |= {name: probabilities[name] * useful / right for name in RIGHT}
+        right = useful
+    is_known = 2.0 * known_std[end] <= USEFUL_PCT and useful >= LIKELY
+    verdict: Verdict = "agrees" if is_known else "cannot_tell"
     cause = Cause("none", probabilities["none"])
     if probabilities["none"] <= ALARM:
-        verdict, cause = "off", Cause("unknown", probabilities["unknown"])
+        cause = Cause("unknown", probabilities["unknown"])
         if standing(stretches) is None:  # no cause is a gauge that stands still
             cause = _cause(answers, probabilities)
+        if right <= ALARM:
+            verdict = "off"
+        elif cause.verdict not in RIGHT:  # the gauge is wrong, or the model
+            verdict, cause = "cannot_tell", Cause("unknown", probabilities["unknown"])
     return Judgement(
         logs,
         model,
@@ -252,14 +289,6 @@ def _within_useful(error_pct: float, std_pct: float) -> float:
     return float(np.diff(ndtr((np.array([-USEFUL_PCT, USEFUL_PCT]) - error_pct) / std_pct))[0])
 
 
-def _mixture(tracks: Sequence[Track], share: FloatArray) -> Track:
-    """Return mean and standard deviation of the SoC over all answers."""
-    soc = np.array([track.soc_pct for track in tracks])
-    var = np.array([track.std_pct for track in tracks]) ** 2
-    mean = share @ soc
-    return Track(mean, np.sqrt(share @ (var + (soc - mean) ** 2)))
-
-
 def _cause(answers: Sequence[Explanation], probabilities: dict[str, float]) -> Cause:
     """Return the most probable cause, or that it is unknown, if none stands out."""
     best = max(
@@ -267,7 +296,8 @@ def _cause(answers: Sequence[Explanation], probabilities: dict[str, float]) -> C
         key=lambda answer: probabilities[answer.name],
     )
     probability = probabilities[best.name]
-    if probability < NAMED * (1.0 - probabilities["none"]):
+    named = 1.0 - ALARM if best.name in RIGHT else NAMED
+    if probability < named * (1.0 - probabilities["none"]):
         return Cause("unknown", probabilities["unknown"])
     size = float(best.share @ best.size)
     spread = float(best.share @ (best.std**2 + (best.size - size) ** 2)) ** 0.5

@@ -159,7 +159,7 @@ class LiveJudge(Output):
             f" {gauge['error_pct']:+.1f} ± {gauge['error_std_pct']:.1f} %"
         )
         is_off = gauge["verdict"] == "off"
-        if is_off:
+        if is_off or cause == "model_capacity":
             text += f", cause: {cause.replace('_', ' ')}. {result['next_step']}"
         self.trouble = text if is_off else ""
         emit(_LOG, logging.WARNING if is_off else logging.INFO, "judge.result", text)

@@ -8,14 +8,14 @@ from typing import Any, Final, Literal, NamedTuple
 
 import numpy as np
 
-from cangauge._text import counted, duration, number
+from cangauge._text import counted, duration, number, rounded
 from cangauge._typing import FloatArray
+from cangauge.extras.judge.causes import RIGHT, Explanation
 from cangauge.extras.judge.causes import UNITS as PACK_UNITS
-from cangauge.extras.judge.causes import Explanation
-from cangauge.extras.judge.chain import Stretch, count_changes, published_pct
+from cangauge.extras.judge.chain import HELD_PCT, Stretch, count_changes, published_pct
 from cangauge.extras.judge.weak import WeakestCell
 from cangauge.logs.log import Log
-from cangauge.model.model_file import Model
+from cangauge.model.model_file import PRIOR_MADE_BY, Model
 
 Verdict = Literal["agrees", "off", "cannot_tell"]
 
@@ -38,14 +38,18 @@ _WORDS: Final = {
     "pack_capacity": "the pack has another capacity than the gauge counts with",
     "start_or_reset": "wrong start or reset",
     "voltage_sensor": "voltage sensor",
+    "model_capacity": "the gauge is right, and the pack has another capacity than the model",
     "weak_cell": "weak cell",
     "unknown": "another cause, or several",
 }
 _NEXT: Final = {
+    "none": "Nothing. Judge again after a full charge or a drive of 40 % or more.",
     "current_offset": "Read the current with contactors open or everything off: what it then shows"
     " is the offset. Log one hour of it: that settles it.",
     "count_scale": "Compare the capacity in the gauge's configuration with the pack's, and the"
-    " current with a clamp meter under load. A log of one drive of 40 % settles it.",
+    " current with a clamp meter under load. A log of one drive of 40 % settles it. A gauge that"
+    " shows the usable part of the cells as 0 to 100 % also moves more than the cells do: then"
+    " nothing is wrong.",
     "pack_capacity": "Log one full discharge or charge, or a drive of 40 % or more that ends with"
     " an hour of rest: charge over SoC then gives the capacity.",
     "start_or_reset": "Charge until full once, so that the gauge resets itself, and judge again:"
@@ -80,7 +84,7 @@ class Cause(NamedTuple):
 
     verdict: str
     """`current_offset`, `count_scale`, `pack_capacity`, `start_or_reset`, `voltage_sensor`,
-    `weak_cell`, `none` or `unknown`."""
+    `model_capacity`, `weak_cell`, `none` or `unknown`."""
     probability: float
     size: Size | None = None
     onset: int = 0
@@ -97,7 +101,7 @@ def standing(chain: Sequence[Stretch]) -> Stretch | None:
 
     Of several, that with the most charge; None without any.
     """
-    stands = [part for part in chain if part.held_pct >= max(JUMP_PCT, 2.0 * part.soc_step_pct)]
+    stands = [part for part in chain if part.held_pct >= max(HELD_PCT, 2.0 * part.soc_step_pct)]
     return max(stands, key=lambda part: part.held_pct, default=None)
 
 
@@ -111,7 +115,8 @@ class Judgement:
         In order of time.
     model : Model
     error_pct, error_std_pct : float
-        Published SoC minus the SoC that all logs imply, at the end, and its σ [% SoC].
+        Published SoC minus the SoC that all logs imply, at the end, and its σ with that of the
+        gauge's own zero [% SoC].
     worst_pct : float
         The largest such difference, relative to its σ [% SoC].
     verdict : {"agrees", "off", "cannot_tell"}
@@ -119,7 +124,8 @@ class Judgement:
     probabilities : dict
         Of `none`, `unknown` and each cause.
     corrected_pct, corrected_std_pct : list of array
-        Corrected SoC and its σ at each row of each log [%]; NaN where not known.
+        Corrected SoC and its σ at each row of each log, with that of the gauge's own zero [%]; NaN
+        where not known.
     chain : list of Stretch
     explanations : list of Explanation
         All answers, the most probable first.
@@ -234,34 +240,69 @@ class Judgement:
 
     @property
     def headline(self) -> str:
-        """The answer in one sentence."""
+        """The answer in a few sentences."""
+        reason = "" if self.cause.verdict in RIGHT else self.reason
+        return " ".join(filter(None, [self._found, self.aged, self.stands, reason]))
+
+    @property
+    def _found(self) -> str:
+        """The verdict with the error, as a sentence."""
         std = number(self.error_std_pct, 1)
         error = f"{_signed(self.error_pct)} ± {std} % SoC"
+        if self.verdict == "agrees":
+            return f"The gauge agrees with voltage and charge: difference {error} (1σ)."
         if self.verdict == "cannot_tell":
+            open_ = f"and the logs do not settle whether its error is below {USEFUL_PCT:g} %"
+            if self.cause.verdict == "unknown":
+                open_ = (
+                    "and either it is wrong, or it is right and the pack has another capacity than"
+                    " the model"
+                )
             return (
                 f"Cannot tell: the gauge differs by {error} from the SoC that voltage and charge"
-                f" imply, and an error of {USEFUL_PCT:g} % would not have been seen."
+                f" imply, {open_}."
             )
-        if self.verdict == "agrees":
-            agrees = f"The gauge agrees with voltage and charge: difference {error} (1σ)."
-            return f"{agrees} {self.stands}".rstrip()
         if self.cause.verdict == "voltage_sensor":
-            reads = "and the logged voltage contradict each other"
-        elif self.cause.verdict == "weak_cell":
-            reads = "holds for the mean cell, not for the weakest"
-        elif abs(self.error_pct) > 2.0 * self.error_std_pct:
+            return "The gauge and the logged voltage contradict each other."
+        if self.cause.verdict == "weak_cell":
+            return "The gauge holds for the mean cell, not for the weakest."
+        if abs(self.error_pct) > 2.0 * self.error_std_pct:
             high = "too high" if self.error_pct > 0.0 else "too low"
-            reads = f"reads {number(abs(self.error_pct), 1)} ± {std} % SoC {high}"
-        else:
-            reads = f"is not right, though its SoC at the end may be ({error})"
-        return " ".join(filter(None, [f"The gauge {reads}.", self.stands, self.reason]))
+            return f"The gauge reads {number(abs(self.error_pct), 1)} ± {std} % SoC {high}."
+        return f"The gauge is not right, though its SoC at the end may be ({error})."
+
+    @property
+    def pack_ah(self) -> float | None:
+        """Capacity that the pack has where it is not the model's [Ah]; None where it is."""
+        if self.cause.verdict != "model_capacity" or self.cause.size is None:
+            return None
+        return self.model.capacity_ah / (1.0 - self.cause.size.value / 100.0)
+
+    @property
+    def aged(self) -> str:
+        """That the pack has another capacity than the model, as a sentence; empty if not."""
+        if self.pack_ah is None:
+            return ""
+        has, model = (rounded(ah) for ah in (self.pack_ah, self.model.capacity_ah))
+        percent = number(100.0 * self.cause.probability, 0, "%")
+        return f"The pack has {has} Ah, as the gauge counts; the model has {model} Ah ({percent})."
 
     @property
     def stands(self) -> str:
-        """Since when the published SoC stands still, as a sentence; empty if it does not."""
+        """Where the published SoC stands or stood still, as a sentence; empty if it does not."""
         part = standing(self.chain)
         if part is None or part.end is None:
-            return ""
+            stood = [(each, part.log) for part in self.chain for each in part.stood]
+            if not stood:
+                return ""
+            longest, log = max(stood, key=lambda found: found[0].flowed_pct)
+            return (
+                f"The published SoC stood at {number(longest.shown_pct, 1, '%')} for"
+                f" {duration(longest.until_s - longest.since_s)} from"
+                f" {self._moment(log, longest.since_s)} on, while"
+                f" {number(longest.flowed_pct, 1, '%')} of the charge flowed, and then jumped to"
+                " what it had missed."
+            )
         at = number(float(part.shown_pct[part.end]), 1, "%")
         return (
             f"The published SoC stands at {at} from {self._moment(part.log, part.held_since_s)} on,"
@@ -316,18 +357,25 @@ class Judgement:
                 "See whether the gauge itself stands still, or only what is logged of it, and judge"
                 " again by a log in which its SoC moves."
             )
-        if self.verdict == "agrees":
-            return "Nothing. Judge again after a full charge or a drive of 40 % or more."
-        if self.verdict == "off":
+        if self.verdict == "cannot_tell" and self.cause.verdict == "unknown":
+            return _NEXT["pack_capacity"]
+        if self.pack_ah is not None:
+            return (
+                f"Judge again with the pack's capacity (--capacity-ah {rounded(self.pack_ah)}), and"
+                " fit a new model to logs of these days."
+            )
+        if self.verdict != "cannot_tell":
             return _NEXT[self.cause.verdict]
         if self.model.chemistry == "lfp":
             return (
                 "Add a log of one full charge until its end: between the knees the voltage of an"
                 " LFP cell says nothing, at full it settles the SoC."
             )
+        zero = ", but for the zero of the gauge: that needs a model (-m)"
         return (
             "Add a log with an hour of rest after a drive of 40 % or more, or of one full charge"
-            " until its end: it settles the SoC to about 2 %."
+            " until its end: it settles the SoC to about 2 %"
+            f"{zero if self.model.made.by == PRIOR_MADE_BY else ''}."
         )
 
     def answer_rows(self) -> tuple[list[str], list[list[str]]]:
