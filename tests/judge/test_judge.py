@@ -129,9 +129,9 @@ def test_a_right_gauge_of_an_aged_pack_agrees_and_the_pack_has_its_capacity(pack
     assert f"--capacity-ah {judgement.pack_ah:.1f}" in judgement.next_step
 
 
-def test_a_small_scale_error_may_be_the_models_capacity(pack) -> None:
+def test_a_pack_that_aged_a_little_may_be_a_wrong_scale(pack) -> None:
     model, logs = pack
-    judgement = cangauge.judge([counting(log, 1.03) for log in logs], model)
+    judgement = cangauge.judge(logs, model, capacity_ah=1.08 * model.capacity_ah)
     assert (judgement.verdict, judgement.cause.verdict) == ("cannot_tell", "unknown")
     assert judgement.probabilities["none"] < 0.05 < judgement.probabilities["model_capacity"]
     assert "either it is wrong, or it is right and the pack" in judgement.headline

@@ -186,7 +186,7 @@ def signatures_of(  # noqa: C901 - a table of causes
         add(0, 0.3, {column: one, ERROR: (starts - 100.0) / 100.0})  # right when full
         add(0, 0.3, {column: one})
     elif name == "model_capacity":  # the gauge counts with what the pack has
-        # Seldom: a model is of the pack as it is (i3_dev, twin_lfp, simulated packs that aged).
+        # Seldom: a model is of the pack as it is. Chosen on i3_dev, twin_lfp and aged packs.
         add(0, 0.01, {CAPACITY: one, COUNT_SCALE: -one})
     return result
 
