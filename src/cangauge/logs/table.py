@@ -218,9 +218,6 @@ def _sign_by_state(draft: DraftLog, table: TextTable | ArrowTable) -> None:
         return
 
 
-# --- Time
-
-
 def _time(
     cells: dict[int, Any], column: ChosenColumn, headings: Sequence[str], where: str
 ) -> tuple[FloatArray, str, ChosenColumn]:
@@ -260,9 +257,6 @@ def _increases(time_s: FloatArray) -> bool:
     finite = time_s[np.isfinite(time_s)]
     steps = np.diff(finite)
     return steps.size > 0 and bool(np.all(steps >= 0.0)) and float(np.median(steps)) > 0.0
-
-
-# --- Rows that hold only what changed
 
 
 def _hold_changes(draft: DraftLog) -> None:

@@ -144,9 +144,6 @@ def convert(values: FloatArray, field: str, unit: str, *, source: object, label:
     return values if scale == (1.0, 0.0) else values * scale[0] + scale[1]
 
 
-# --- Values that contradict a unit
-
-
 def refuse_wrong_units(
     values: dict[str, FloatArray],
     *,
@@ -172,12 +169,16 @@ def refuse_wrong_units(
         Columns whose unit the user states.
     """
     voltage, temperature = values["voltage_v"], values["temperature_c"]
+    voltage_label = labels.get("voltage_v", "voltage_v")
+    is_low = bool(COLDEST_C <= np.median(voltage) <= _UNUSUALLY_HOT_C)  # as a temperature
     checks = (
         ("time_s", _wrong_time(values, in_seconds=in_seconds)),
+        # Before the voltage: a temperature in its place looks like kilovolts.
+        ("temperature_c", _swapped(temperature, voltage_label) if is_low else ()),
         ("voltage_v", _wrong_voltage(voltage)),
         ("current_a", _wrong_current(values["current_a"])),
         ("soc_pct", _wrong_soc(values.get("soc_pct"), is_stated="soc_pct" in stated)),
-        ("temperature_c", _wrong_temperature(temperature, voltage)),
+        ("temperature_c", _wrong_temperature(temperature, may_be_swapped=is_low)),
     )
     for field, found in checks:
         label = labels.get(field, field)
@@ -323,13 +324,16 @@ def _wrong_soc(soc: FloatArray | None, *, is_stated: bool) -> Iterator[_Wrong]:
         yield odd, f"SoC of row {row + 1} is not within 0–100 %", "convert it to %", []
 
 
-def _wrong_temperature(temperature: FloatArray, voltage: FloatArray) -> Iterator[_Wrong]:
-    typical, other = float(np.median(temperature)), float(np.median(voltage))
-    may_be_swapped = COLDEST_C <= other <= _UNUSUALLY_HOT_C  # the voltage, as a temperature
+def _swapped(temperature: FloatArray, label: str) -> Iterator[_Wrong]:
+    typical = float(np.median(temperature))
     is_high = 273.15 + _UNUSUALLY_HOT_C < typical <= _MAX_VOLTAGE_V
-    if may_be_swapped and is_high and np.ptp(temperature) > 0.0:  # a constant is a code
-        problem = "it looks like a pack's voltage, and the voltage like a temperature"
+    if is_high and np.ptp(temperature) > 0.0:  # a constant is a code
+        problem = f"it looks like a pack's voltage, and {label} like a temperature"
         yield typical, problem, "the two columns (or signals) look swapped: exchange them", []
+
+
+def _wrong_temperature(temperature: FloatArray, *, may_be_swapped: bool) -> Iterator[_Wrong]:
+    typical = float(np.median(temperature))
     if 200.0 <= typical <= 400.0:
         also = ", or exchange it with the voltage if the two are swapped" if may_be_swapped else ""
         units = ["K"] if np.any(temperature % 1.0) else ["K", "0.1°C"]
