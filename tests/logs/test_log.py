@@ -254,6 +254,9 @@ def test_no_flipped_bit_in_parquet_changes_a_value(tmp_path: Path, drive: Log) -
 def test_writing_needs_a_known_suffix_and_leaves_nothing(tmp_path: Path, drive: Log) -> None:
     with pytest.raises(InputError, match=r"'\.xlsx'.*\.parquet or \.csv"):
         write_log(drive, tmp_path / "x.xlsx")
+    for name in ("x.bdf.csv", "x.BDF.parquet"):
+        with pytest.raises(InputError, match=r"'\.bdf'.*use \.parquet or \.csv"):
+            write_log(drive, tmp_path / name)
     with pytest.raises(InputError, match="folder of this file does not exist"):
         write_log(drive, tmp_path / "absent" / "x.csv")
     assert list(tmp_path.iterdir()) == []

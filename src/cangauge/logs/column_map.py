@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import repeat
-from typing import Final
+from typing import Any, Final
 
 from cangauge.errors import InputError, closest
 from cangauge.logs.headings import GUESS, Meaning, meaning_of, names_and_units
@@ -60,21 +60,21 @@ class ColumnMap:
             return given
         if not isinstance(given, Mapping | str):
             raise InputError("not columns", field=where, value=given, cure=_SYNTAX)
-        if isinstance(given, str):
-            parts = [part.partition("=") for part in _SPLIT.split(given)]
-            pairs = [(name.strip(), text) for name, _, text in parts]
-        else:
-            pairs = [*given.items()]
         texts: dict[str, str] = {}
-        for name, text in pairs:
-            quantity = str(name).lower()
-            if not isinstance(text, str) or not text.strip():
-                raise InputError("not a column", field=where, value=text or name, cure=_SYNTAX)
+        items: Iterable[Any] = _SPLIT.split(given) if isinstance(given, str) else given.items()
+        for part in items:
+            name, text = part.partition("=")[::2] if isinstance(part, str) else part
+            quantity = str(name).strip().lower()
+            if isinstance(part, str) and not text.strip():
+                raise InputError("not a column", field=where, value=part, cure=_SYNTAX)
             if quantity not in FIELDS:
                 cure = f"known are {', '.join(FIELDS)}"
                 raise InputError("not a quantity of a log", field=where, value=quantity, cure=cure)
             if quantity in texts:
                 raise InputError("is given twice", field=where, value=quantity)
+            if not isinstance(text, str) or not text.strip():
+                cure, place = 'write it as text: "Wert b[V]:-1"', f"{where}.{quantity}"
+                raise InputError("not a column", field=place, value=text, cure=cure)
             texts[quantity] = text.strip()
         return cls(texts, where)
 

@@ -207,9 +207,8 @@ def _sign_by_state(draft: DraftLog, table: TextTable | ArrowTable) -> None:
         unclear = (current > 0.0) & (charges == discharges)
         if unclear.any():
             row = int(np.argmax(unclear))
-            problem = (
-                f"row {row + 1} does not say whether the unsigned current charges or discharges"
-            )
+            lacks = "does not say whether the unsigned current charges or discharges"
+            problem = f"row {row + 1} {lacks}"
             cure = "write it as charge or discharge, or give the current a sign"
             raise draft.error(headings[place], problem, cure, cells[row].as_py())
         draft.values["current_a"] = np.where(charges, -current, current)
