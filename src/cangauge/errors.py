@@ -145,6 +145,21 @@ def require_number(value: object, field: str) -> None:
         raise InputError("not a number", field=field, value=value, cure="give it without a unit")
 
 
+COLDEST_C: Final = -60.0
+HOTTEST_C: Final = 120.0
+"""Temperatures of a battery lie between [°C]."""
+
+
+def require_temperature(value_c: float | None) -> None:
+    """Raise InputError if the constant temperature that a user gives is none of a battery."""
+    if value_c is None:
+        return
+    require_number(value_c, "--temperature")
+    if not COLDEST_C <= value_c <= HOTTEST_C:
+        problem = f"must lie within {COLDEST_C:g} … {HOTTEST_C:g} °C"
+        raise InputError(problem, field="--temperature", value=value_c)
+
+
 # Text quoted from a file may have any length [characters].
 _LONGEST_VALUE: Final = 160
 _LONGEST_TEXT: Final = 600

@@ -95,6 +95,12 @@ def test_temperature_and_its_source_can_be_given(
     assert set(log.temperature_c) == {7.0}
     assert log.temperature_source == "room"
     assert read_log(path, generic, temperature_c=7.0).temperature_source == "unknown"
+    for value_c in (500.0, float("nan")):
+        with pytest.raises(
+            InputError, match=r"^--temperature: must lie within -60 … 120 °C"
+        ) as caught:
+            read_log(path, generic, temperature_c=value_c)
+        assert caught.value.source is None
     with pytest.raises(InputError, match="not a known temperature source"):
         read_log(path, generic, temperature_source="oven")  # type: ignore[arg-type]
 

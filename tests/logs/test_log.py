@@ -254,6 +254,9 @@ def test_no_flipped_bit_in_parquet_changes_a_value(tmp_path: Path, drive: Log) -
 def test_writing_needs_a_known_suffix_and_leaves_nothing(tmp_path: Path, drive: Log) -> None:
     with pytest.raises(InputError, match=r"'\.xlsx'.*\.parquet or \.csv"):
         write_log(drive, tmp_path / "x.xlsx")
+    for name in ("x.bdf.csv", "x.BDF.parquet"):
+        with pytest.raises(InputError, match=r"'\.bdf'.*use \.parquet or \.csv"):
+            write_log(drive, tmp_path / name)
     with pytest.raises(InputError, match="folder of this file does not exist"):
         write_log(drive, tmp_path / "absent" / "x.csv")
     assert list(tmp_path.iterdir()) == []
@@ -265,11 +268,30 @@ def test_tables_of_any_columns(tmp_path: Path) -> None:
     assert (tmp_path / "x.csv").read_text() == 'time_s,status,soc\n0,"valid",\n1,"a,b",0.1\n'
 
 
-def test_names_of_a_canonical_log_define_its_units(tmp_path: Path, drive: Log) -> None:
+@pytest.mark.parametrize(
+    ("units", "words"),
+    [
+        ("s,A,V,°C,%,cell", None),
+        ("[s],(A),[V],degC,,", None),
+        ("f8,f8,float64,double,f4,\ns,A,V,°C,%,cell", None),
+        ("s,mA,V,degC,%", "time_s: row 1 is not a time .got 's'"),
+        ("s,A,mV,°C,%", "time_s: row 1 is not a time .got 's'"),
+        ("s,A,V,K,%", "time_s: row 1 is not a time .got 's'"),
+        ("abc,5,300,20,50", "time_s: row 1 is not a time .got 'abc'"),
+        (",mA,,,", "current_a: row 1 is not a number .got 'mA'"),
+    ],
+)
+def test_names_of_a_canonical_log_define_its_units(
+    tmp_path: Path, drive: Log, units: str, words: str | None
+) -> None:
     write_log(drive, tmp_path / "x.csv")
     head, rows = (tmp_path / "x.csv").read_text().split("\n", 1)
-    (tmp_path / "x.csv").write_text(f"{head}\ns,mA,mV,K,%,cell\n{rows}")
-    assert_same(read_log(tmp_path / "x.csv"), drive)
+    (tmp_path / "x.csv").write_text(f"{head}\n{units}\n{rows}", encoding="utf-8")
+    if words is None:
+        assert_same(read_log(tmp_path / "x.csv"), drive)
+    else:
+        with pytest.raises(InputError, match=words):
+            read_log(tmp_path / "x.csv")
 
 
 @pytest.mark.parametrize(

@@ -29,7 +29,7 @@ from cangauge.bus.captures import (
 from cangauge.bus.decoder import FrameStatistics, SampleDecoder
 from cangauge.bus.time_source import RecordedTime, TimeSource, time_source
 from cangauge.bus.vehicle import LOG_COLUMNS, Vehicle
-from cangauge.errors import InputError
+from cangauge.errors import InputError, require_temperature
 from cangauge.logs.column_map import ColumnMap
 from cangauge.logs.draft import Sign
 from cangauge.logs.log import Log, TemperatureSource
@@ -117,6 +117,7 @@ def log_of(
     temperature_source: TemperatureSource | None = None,
 ) -> Log:
     """Read an opened recording; arguments as in `read_log`."""
+    require_temperature(temperature_c)
     if temperature_source is not None:
         known_temperature_source(temperature_source)
     if isinstance(recording, LogFile):

@@ -31,7 +31,7 @@ from cangauge.bus.isotp import READ_BY_IDENTIFIER, PollTarget, reply_id, reply_s
 from cangauge.bus.mapping import CellsMap, MessageMap, SignalMap, VehicleMap
 from cangauge.bus.plausibility import SignalChecks
 from cangauge.bus.protection import Protection
-from cangauge.errors import InputError, closest
+from cangauge.errors import InputError, closest, require_temperature
 from cangauge.logs.log import TemperatureSource
 from cangauge.logs.units import convert
 
@@ -173,9 +173,7 @@ class Vehicle:
         >>> vehicle.name, vehicle.current.codec.name, hex(vehicle.current.arbitration_id)
         ('Nissan Leaf AZE0', 'current_a', '0x1db')
         """
-        if temperature_c is not None and not -60.0 <= temperature_c <= 120.0:
-            problem = "is not a battery temperature in °C"
-            raise InputError(problem, field="--temperature", value=temperature_c)
+        require_temperature(temperature_c)
         if preset is not None:
             if dbc is not None or map is not None:
                 problem, cure = "given together with a DBC or a map", "give one or the other"

@@ -101,6 +101,7 @@ def write_table(columns: Mapping[str, Any] | pa.Table, path: str | PathLike[str]
     """Write a table or arrays as `.parquet` or `.csv`, all or nothing; NaN becomes missing."""
     table = columns if isinstance(columns, pa.Table) else build_table(columns)
     suffix = Path(path).suffix.lower()
+    suffix = ".bdf" if ".bdf" in Path(Path(path).name.lower()).suffixes else suffix
     if suffix not in {".parquet", ".pq", ".csv"}:
         cure = "use .parquet or .csv"
         raise InputError("unknown suffix for a table", source=path, value=suffix, cure=cure)

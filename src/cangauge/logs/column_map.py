@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from itertools import chain, repeat
-from typing import Final
+from itertools import repeat
+from typing import Any, Final
 
 from cangauge.errors import InputError, closest
 from cangauge.logs.headings import GUESS, Meaning, meaning_of, names_and_units
-from cangauge.logs.units import FIELDS, REQUIRED, TemperatureSource, unit_of
+from cangauge.logs.units import CANONICAL_UNIT, FIELDS, REQUIRED, TemperatureSource, unit_of
 
 DOCS: Final = "docs/logs.md"
 """Page that explains the columns of a log."""
@@ -60,21 +60,21 @@ class ColumnMap:
             return given
         if not isinstance(given, Mapping | str):
             raise InputError("not columns", field=where, value=given, cure=_SYNTAX)
-        if isinstance(given, str):
-            parts = [part.partition("=") for part in _SPLIT.split(given)]
-            pairs = [(name.strip(), text) for name, _, text in parts]
-        else:
-            pairs = [*given.items()]
         texts: dict[str, str] = {}
-        for name, text in pairs:
-            quantity = str(name).lower()
-            if not isinstance(text, str) or not text.strip():
-                raise InputError("not a column", field=where, value=text or name, cure=_SYNTAX)
+        items: Iterable[Any] = _SPLIT.split(given) if isinstance(given, str) else given.items()
+        for part in items:
+            name, text = part.partition("=")[::2] if isinstance(part, str) else part
+            quantity = str(name).strip().lower()
+            if isinstance(part, str) and not text.strip():
+                raise InputError("not a column", field=where, value=part, cure=_SYNTAX)
             if quantity not in FIELDS:
                 cure = f"known are {', '.join(FIELDS)}"
                 raise InputError("not a quantity of a log", field=where, value=quantity, cure=cure)
             if quantity in texts:
                 raise InputError("is given twice", field=where, value=quantity)
+            if not isinstance(text, str) or not text.strip():
+                cure, place = 'write it as text: "Wert b[V]:-1"', f"{where}.{quantity}"
+                raise InputError("not a column", field=place, value=text, cure=cure)
             texts[quantity] = text.strip()
         return cls(texts, where)
 
@@ -125,7 +125,7 @@ class Choice:
     @property
     def is_complete(self) -> bool:
         """Whether time, current and voltage are known or named (a temperature may be given)."""
-        return self.is_canonical or set(_NEEDED) <= set(self.chosen)
+        return set(_NEEDED) <= set(self.chosen)
 
 
 def choose_columns(
@@ -138,11 +138,14 @@ def choose_columns(
     InputError
         If a column of the user is not in the table, or is named for two quantities.
     """
-    is_canonical = given is None and _are_canonical(headings)
-    units = chain(() if is_canonical else units_below, repeat(""))
+    if given is None and are_canonical(headings):
+        names = [*map(_simple, headings)]
+        places = {q: names.index(name) for q, name in FIELDS.items() if name in names}
+        columns = {q: ChosenColumn((k,), CANONICAL_UNIT[q]) for q, k in places.items()}
+        return Choice(columns, is_canonical=True)
+    units = [*units_below, *repeat("", len(headings))]
     meanings = [meaning_of(text, unit) for text, unit in zip(headings, units, strict=False)]
-    choice = Choice(is_canonical=is_canonical)
-    given = given or ColumnMap()
+    choice, given = Choice(), given or ColumnMap()
     for quantity in given.texts:
         column = _given_column(quantity, given, headings, meanings)
         for other, chosen in choice.chosen.items():
@@ -157,8 +160,6 @@ def choose_columns(
             for place, meaning in enumerate(meanings)
             if meaning is not None and meaning.quantity == quantity and place not in taken
         ]
-        if choice.is_canonical:
-            plain = [item for item in plain if _simple(headings[item[0]]) == FIELDS[quantity]]
         pair = _directions(headings, plain) if quantity == "current" else None
         if pair is not None:
             choice.chosen["current"] = pair
@@ -167,19 +168,15 @@ def choose_columns(
     return choice
 
 
-def _are_canonical(headings: Sequence[str]) -> bool:
+def are_canonical(headings: Sequence[str]) -> bool:
     """Return whether columns have the names of a canonical log's, possibly an incomplete one.
 
     A temperature of another name is not a missing one: such a table is a logger's own.
     """
     names = {_simple(heading) for heading in headings}
-    others = {name: meaning_of(name) for name in names.difference(_CANONICAL)}
-    has_other_temperature = any(
-        "temperature" in name or (meaning is not None and meaning.quantity == "temperature")
-        for name, meaning in others.items()
-    )
-    is_whole = "temperature_c" in names or not has_other_temperature
-    return len(names.intersection(REQUIRED)) >= 2 and is_whole
+    others = [(name, meaning_of(name)) for name in names.difference(_CANONICAL)]
+    has_other = any("temperature" in n or (m and m.quantity == "temperature") for n, m in others)
+    return len(names.intersection(REQUIRED)) >= 2 and ("temperature_c" in names or not has_other)
 
 
 def refuse_odd_names(headings: Sequence[str], source: str) -> None:

@@ -10,7 +10,7 @@ import numpy as np
 
 from cangauge._text import counted
 from cangauge._typing import BoolArray, FloatArray
-from cangauge.errors import InputError, require_number
+from cangauge.errors import InputError
 from cangauge.logs.column_map import shown_headings
 from cangauge.logs.headings import cell_number
 from cangauge.logs.log import Log
@@ -163,7 +163,6 @@ class DraftLog:
     def _set_temperature(self, given_c: float | None) -> None:
         kind = "file" if self.source else "table"
         if given_c is not None:
-            require_number(given_c, "--temperature")
             replaced = f" in place of the {kind}'s" if "temperature_c" in self.values else ""
             self.remarks.append(f"temperature {given_c:g} °C as given{replaced}")
             self.values["temperature_c"] = np.full(self.values["time_s"].size, float(given_c))

@@ -14,7 +14,7 @@ from cangauge._dataframes import ArrowExport
 from cangauge._extras import extra
 from cangauge._text import duration
 from cangauge._typing import BoolArray, FloatArray, IntArray
-from cangauge.errors import InputError, naming_arguments
+from cangauge.errors import InputError, naming_arguments, require_temperature
 from cangauge.logs.units import REQUIRED, TEMPERATURE_SOURCES, TemperatureSource
 
 __all__ = ["TEMPERATURE_SOURCES", "Log", "TemperatureSource"]
@@ -150,6 +150,7 @@ class Log(ArrowExport):
         # Deferred: the service runs where pyarrow is not installed.
         from cangauge.logs.read import draft_of_dataframe  # noqa: PLC0415
 
+        require_temperature(temperature_c)
         draft = draft_of_dataframe(table, name, columns)
         return draft.log(temperature_c, temperature_source, sign)
 

@@ -15,7 +15,7 @@ import pyarrow as pa
 
 from cangauge._files import Head
 from cangauge._typing import FloatArray
-from cangauge.errors import InputError
+from cangauge.errors import InputError, require_temperature
 from cangauge.logs.canonical import arrow_table, parquet_table
 from cangauge.logs.column_map import DOCS, ColumnMap, choose_columns, unknown_columns
 from cangauge.logs.draft import DraftLog, Sign
@@ -134,6 +134,7 @@ class LogFile:
         temperature_source: TemperatureSource | None = None,
     ) -> Log:
         """Read the log; arguments and errors as of `cangauge.read_log`."""
+        require_temperature(temperature_c)
         try:
             if self.reader is None:
                 raise not_recognised(self, "not a known kind of log", f"known are: {KNOWN_LOGS}")

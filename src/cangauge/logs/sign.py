@@ -206,11 +206,9 @@ def resolve_sign(log: Log, *, stored_sign_unknown: bool, is_stated: bool = False
     contradicts = abs(soc.weight) >= 1.0 and soc.weight * voltage.sign < 0.0
     if log.soc_pct is not None and not finding.sign and contradicts:
         first, last = log.soc_pct[np.isfinite(log.soc_pct)][[0, -1]]
-        remarks.append(
-            f"SoC left out: it moves from {first:.4g} to {last:.4g} % against the charge, by the"
-            f" sign of current that the voltage proves ({voltage.strongest.text}); is it a depth of"
-            " discharge?"
-        )
+        why = f"by the sign of current that the voltage proves ({voltage.strongest.text})"
+        moves = f"it moves from {first:.4g} to {last:.4g} % against the charge, {why}"
+        remarks.append(f"SoC left out: {moves}; is it a depth of discharge?")
         log, finding = replace(log, soc_pct=None), voltage
     if stored_sign_unknown and log.assumed:
         way = "charges" if finding.sign < 0 else "discharges"

@@ -207,18 +207,14 @@ def _sign_by_state(draft: DraftLog, table: TextTable | ArrowTable) -> None:
         unclear = (current > 0.0) & (charges == discharges)
         if unclear.any():
             row = int(np.argmax(unclear))
-            problem = (
-                f"row {row + 1} does not say whether the unsigned current charges or discharges"
-            )
+            lacks = "does not say whether the unsigned current charges or discharges"
+            problem = f"row {row + 1} {lacks}"
             cure = "write it as charge or discharge, or give the current a sign"
             raise draft.error(headings[place], problem, cure, cells[row].as_py())
         draft.values["current_a"] = np.where(charges, -current, current)
         draft.sign_unknown = False
         draft.assumed.append(f'current charges where "{headings[place]}" says so')
         return
-
-
-# --- Time
 
 
 def _time(
@@ -260,9 +256,6 @@ def _increases(time_s: FloatArray) -> bool:
     finite = time_s[np.isfinite(time_s)]
     steps = np.diff(finite)
     return steps.size > 0 and bool(np.all(steps >= 0.0)) and float(np.median(steps)) > 0.0
-
-
-# --- Rows that hold only what changed
 
 
 def _hold_changes(draft: DraftLog) -> None:

@@ -18,9 +18,10 @@ import pyarrow.csv as pacsv
 
 from cangauge._files import Head, as_utf8
 from cangauge.errors import InputError
-from cangauge.logs.column_map import Choice, ColumnMap, choose_columns
+from cangauge.logs.column_map import Choice, ColumnMap, are_canonical, choose_columns
 from cangauge.logs.headings import meaning_of
 from cangauge.logs.stamps import is_stamp
+from cangauge.logs.units import FIELDS, unit_of
 from cangauge.logs.values import MISSING, is_number
 
 MAX_ROWS: Final = 20_000_000
@@ -31,6 +32,7 @@ _NULLS.append("NaN")
 _DELIMITERS: Final = ("\t", ";", ",", "|")
 _ROWS_ABOVE_DATA: Final = 4
 """Rows of units, types and remarks between a header and its data."""
+_TYPES: Final = frozenset({"f4", "f8", "float", "float32", "float64", "double"})
 
 
 class TextTable(NamedTuple):
@@ -144,11 +146,14 @@ def find_table(head: Head, given: ColumnMap | None = None) -> TextTable | None:
         bare = _without_header(head)
         if bare is not None:
             return bare
+    canonical = None
     for table in chain(_headed(head, rows=1), _headed(head, rows=2)):
         with suppress(InputError):  # no column has a heading that the user names
-            if choose_columns(table.headings, (), given).is_complete:
+            choice = choose_columns(table.headings, (), given)
+            if choice.is_complete:
                 return _above_data(table, given)
-    return None
+            canonical = canonical or (table if choice.is_canonical else None)
+    return canonical and _above_data(canonical, given)
 
 
 def _headed(head: Head, rows: int) -> Iterator[TextTable]:
@@ -160,7 +165,7 @@ def _headed(head: Head, rows: int) -> Iterator[TextTable]:
         if any(len(row) != len(first) or _values_in(row[1:]) for row in second):
             continue
         headings = [" ".join(cells).strip() for cells in zip(first, *second, strict=True)]
-        if len(headings) > 2:
+        if len(headings) > 2 or are_canonical(headings):
             yield TextTable(head, delimiter, headings, (), number + rows, [])
 
 
@@ -168,19 +173,29 @@ def _above_data(table: TextTable, given: ColumnMap | None) -> TextTable:
     """Return a table less the rows above its data, of which one may hold units.
 
     A row of units gives one of the quantities another unit, or shows that it is none (`t`, °C).
+    Below canonical names, it repeats their units; any other row is data.
     """
-    chosen = choose_columns(table.headings, (), given).chosen
-    needed = [chosen[name] for name in ("time", "current", "voltage") if name in chosen]
-    measured = [column.places[-1] for column in needed]
+    choice = choose_columns(table.headings, (), given)
+    chosen = choice.chosen
+    measured = [chosen[k].places[-1] for k in ("time", "current", "voltage") if k in chosen]
     units, first = list[str](), table.skip_lines
     for number, line in enumerate(table.head.lines[first : first + _ROWS_ABOVE_DATA], start=first):
         row = split_cells(line, table.delimiter)
-        if _is_value(next((row[k] for k in measured if k < len(row) and row[k]), "")):
+        cell = next((row[k] for k in measured if k < len(row) and row[k]), "")
+        if not _repeats_units(row, choice) if choice.is_canonical else _is_value(cell):
             return table._replace(units=units, skip_lines=number)
         again = choose_columns(table.headings, row, given).chosen
         if any(name not in again or again[name].unit != chosen[name].unit for name in chosen):
             units = row
     return table._replace(units=units)
+
+
+def _repeats_units(row: Sequence[str], choice: Choice) -> bool:
+    """Return whether a row holds the units of the canonical log, or types, and nothing else."""
+    fields = {column.places[0]: FIELDS[name] for name, column in choice.chosen.items()}
+    cells = [(fields[k], cell.strip("()[]")) for k, cell in enumerate(row) if k in fields and cell]
+    is_unit = (unit_of(name, cell) == (1.0, 0.0) or cell.lower() in _TYPES for name, cell in cells)
+    return bool(cells) and all(is_unit)
 
 
 def _without_header(head: Head) -> TextTable | None:

@@ -10,7 +10,7 @@ from typing import Final, Literal, cast, get_args
 import numpy as np
 
 from cangauge._typing import BoolArray, FloatArray
-from cangauge.errors import InputError
+from cangauge.errors import COLDEST_C, HOTTEST_C, InputError
 
 TemperatureSource = Literal["cell", "pack", "coolant", "room", "unknown"]
 TEMPERATURE_SOURCES: Final[tuple[str, ...]] = get_args(TemperatureSource)
@@ -33,8 +33,8 @@ _SPELLINGS: Final[dict[str, dict[tuple[float, float], str]]] = {
         (1e-3, 0.0): "ms|msec|millis|millisecond|milliseconds",
         (1e-6, 0.0): "us|µs|μs|usec|microsecond|microseconds",
         (1e-9, 0.0): "ns|nanoseconds",
-        (60.0, 0.0): "min|mins|minutes|minuten",
-        (3600.0, 0.0): "h|hr|hrs|hours|stunden",
+        (60.0, 0.0): "min|mins|minuten|minutes",
+        (3600.0, 0.0): "h|hr|hrs|stunden|hours",
         (86400.0, 0.0): "d|days",
     },
     "current_a": {
@@ -66,6 +66,9 @@ _UNITS: Final = {
     field: {name: unit for unit, names in units.items() for name in names.split("|")}
     for field, units in _SPELLINGS.items()
 }
+_WORDS: Final = {
+    names.partition("|")[0]: names.rpartition("|")[2] for names in _SPELLINGS["time_s"].values()
+} | {"d": "days (dates of a spreadsheet)"}
 _SCALED: Final = re.compile(r"(?P<scale>0?[.,]\d+|1|10+(?=\s*[mµμu]))\s*(?P<unit>\D+)$")
 """A unit of a bit: 0.1V, 10mV; 500A is the range of a sensor."""
 _FOREIGN: Final = (
@@ -89,8 +92,6 @@ _MAX_DAYS: Final = 366.0
 """First to last row [d]: setting the clock within a log can add decades."""
 _MAX_STAMP_S: Final = 5e11
 """Largest time of a row [s]: a Julian date has 2e11; in ms since 1970, 1985."""
-COLDEST_C: Final = -60.0
-HOTTEST_C: Final = 120.0
 _UNUSUALLY_HOT_C: Final = 62.0
 _EXCEL_1990: Final = 32_874.0
 """1990-01-01 as a spreadsheet's date [d since 1899-12-30]; as hours, nearly four years."""
@@ -144,9 +145,6 @@ def convert(values: FloatArray, field: str, unit: str, *, source: object, label:
     return values if scale == (1.0, 0.0) else values * scale[0] + scale[1]
 
 
-# --- Values that contradict a unit
-
-
 def refuse_wrong_units(
     values: dict[str, FloatArray],
     *,
@@ -172,24 +170,28 @@ def refuse_wrong_units(
         Columns whose unit the user states.
     """
     voltage, temperature = values["voltage_v"], values["temperature_c"]
+    voltage_label = labels.get("voltage_v", "voltage_v")
+    is_low = bool(COLDEST_C <= np.median(voltage) <= _UNUSUALLY_HOT_C)  # as a temperature
     checks = (
         ("time_s", _wrong_time(values, in_seconds=in_seconds)),
+        # Before the voltage: a temperature in its place looks like kilovolts.
+        ("temperature_c", _swapped(temperature, voltage_label) if is_low else ()),
         ("voltage_v", _wrong_voltage(voltage)),
         ("current_a", _wrong_current(values["current_a"])),
         ("soc_pct", _wrong_soc(values.get("soc_pct"), is_stated="soc_pct" in stated)),
-        ("temperature_c", _wrong_temperature(temperature, voltage)),
+        ("temperature_c", _wrong_temperature(temperature, may_be_swapped=is_low)),
     )
     for field, found in checks:
         label = labels.get(field, field)
         for value, problem, cure, units in found:  # the first is raised
-            is_open = bool(units) and label.lower() != field and field not in stated
-            also = f" (or state the unit: {_option(field, label, units)})" if is_open else ""
-            raise InputError(
-                problem, source=str(source), field=label, value=float(value), cure=cure + also
-            )
+            if units and label.lower() != field and field not in stated:
+                cure = f"{cure} (or state the unit: {_option(field, label, units)})"  # noqa: PLW2901
+            where = str(source)
+            raise InputError(problem, source=where, field=label, value=float(value), cure=cure)
     option = _option("temperature_c", labels.get("temperature_c", "temperature_c"), ["°F"])
-    typical, doubt = float(np.median(temperature)), f"if it is °F, state the unit: {option}"
-    remark = f"temperature {typical:.0f} °C is unusually hot: {doubt}"
+    doubt = "" if "temperature_c" in stated else f": if it is °F, state the unit: {option}"
+    typical = float(np.median(temperature))
+    remark = f"temperature {typical:.0f} °C is unusually hot{doubt}"
     return (remark,) if typical > _UNUSUALLY_HOT_C else ()
 
 
@@ -228,12 +230,13 @@ def _wrong_time(values: dict[str, FloatArray], *, in_seconds: bool | None) -> It
     apart = f"rows are {interval:g} apart"
     finer = _fitting(interval, ("ms", "us", "ns"))
     coarser = ["d"] if time[0] > _EXCEL_1990 else _fitting(interval, ("min", "h", "d"))
+    words = [" or ".join(_WORDS[each] for each in units) for units in (finer, coarser)]
     if interval > _MAX_INTERVAL_S:
-        problem = f"{apart}: time looks like {' or '.join(finer) or 'another unit'}"
+        problem = f"{apart}: time looks like {words[0] or 'another unit'}"
         cure = "convert it to seconds (a log with a row every 90 s or more cannot be used)"
         yield interval, problem, cure, finer
     if not in_seconds and 0.0 < interval < 1.0 / _MAX_RATE_HZ:
-        problem = f"{apart}: time looks like {' or '.join(coarser) or 'another unit'}"
+        problem = f"{apart}: time looks like {words[1] or 'another unit'}"
         yield interval, problem, "convert it to seconds", coarser
     if in_seconds is None and (others := _other_units(values, finer, coarser)):
         problem = f"{apart}, in seconds or another unit"
@@ -323,13 +326,16 @@ def _wrong_soc(soc: FloatArray | None, *, is_stated: bool) -> Iterator[_Wrong]:
         yield odd, f"SoC of row {row + 1} is not within 0–100 %", "convert it to %", []
 
 
-def _wrong_temperature(temperature: FloatArray, voltage: FloatArray) -> Iterator[_Wrong]:
-    typical, other = float(np.median(temperature)), float(np.median(voltage))
-    may_be_swapped = COLDEST_C <= other <= _UNUSUALLY_HOT_C  # the voltage, as a temperature
+def _swapped(temperature: FloatArray, label: str) -> Iterator[_Wrong]:
+    typical = float(np.median(temperature))
     is_high = 273.15 + _UNUSUALLY_HOT_C < typical <= _MAX_VOLTAGE_V
-    if may_be_swapped and is_high and np.ptp(temperature) > 0.0:  # a constant is a code
-        problem = "it looks like a pack's voltage, and the voltage like a temperature"
+    if is_high and np.ptp(temperature) > 0.0:  # a constant is a code
+        problem = f"it looks like a pack's voltage, and {label} like a temperature"
         yield typical, problem, "the two columns (or signals) look swapped: exchange them", []
+
+
+def _wrong_temperature(temperature: FloatArray, *, may_be_swapped: bool) -> Iterator[_Wrong]:
+    typical = float(np.median(temperature))
     if 200.0 <= typical <= 400.0:
         also = ", or exchange it with the voltage if the two are swapped" if may_be_swapped else ""
         units = ["K"] if np.any(temperature % 1.0) else ["K", "0.1°C"]

@@ -97,7 +97,6 @@ class _Text:
 class BmwI3Trip:
     """A trip of "Battery and Heating Data in Real Driving Cycles"; its SoC is the car's own."""
 
-    name = "BMW i3 trip"
     takes_columns = False
     _FIELDS: Final = {
         "time_s": "time",
@@ -133,7 +132,6 @@ class D3Test:
     test room. Rows before time 0 (the wait before the test) are dropped.
     """
 
-    name = "ANL D3 test"
     takes_columns = False
     _CAN: Final = "car's CAN"
     # In order of preference: instruments before copies from CAN, the 500 A clamp before the other.

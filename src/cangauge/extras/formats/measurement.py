@@ -105,7 +105,6 @@ def _on_raster(
 class Mf4Signals:
     """MF4 with signals, as CANape and INCA write them; one with bus logging is a capture."""
 
-    name = "MF4 signals"
     takes_columns = True
     _BUS_LOGGING: Final = b"CAN_DataFrame"
     """Channel name of the standard for bus logging, stored uncompressed."""
@@ -183,7 +182,6 @@ def _signal(file: Any, group: int, index: int) -> MeasuredChannel:
 class McapSamples:
     """The samples of an MCAP recording, or the numbers in JSON messages of any schema."""
 
-    name = "MCAP samples"
     takes_columns = True
     _DAMAGE: Final = (ValueError, LookupError, ArithmeticError, EOFError, OSError, RecursionError)
     _FIRST_MESSAGES: Final = 1000

@@ -26,7 +26,6 @@ stores a value when it changes."""
 class Workbook:
     """The longest sheet of an Excel workbook (.xlsx)."""
 
-    name = "Excel workbook"
     takes_columns = True
 
     def matches(self, head: Head) -> bool:
@@ -100,7 +99,6 @@ def _rows(sheet: Any) -> list[str]:
 class EntityHistory:
     """A row per entity and change, as Home Assistant exports: the entity is the heading."""
 
-    name = "history of entities"
     takes_columns = True
     _NAMES: Final = ("entity_id", "state", "last_changed")
 
