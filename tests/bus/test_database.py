@@ -263,9 +263,12 @@ def test_a_multiplexer_that_is_missing_or_its_own_is_refused(tmp_path: Path, lin
         'BO_ 1 M: 8 E\n SG_ A : 2566844926|8@0+ (1,0) [0|0] "" E\n',
         'BO_ 1 M: 8 E\n SG_ A : 0 | +99999999999@1- (1,0) [0|0] "" E\n',
         'BO_ 1 M: 3000000000 E\n SG_ A : 0|8@1+ (1,0) [0|0] "" E\n',
+        'BO_ 1 M: 5000 E\n SG_ A : 0|8@1+ (1,0) [0|0] "" E\n',
         "SG_MUL_VAL_ 256 A B 1-2, 3-4000000000;\n",
+        "SG_MUL_VAL_ 256 A B 4000000000-0, 0-4000000000;\n",
+        f"SG_MUL_VAL_ 256 A B 1{'0' * 400}-{'9' * 401};\n",
     ],
-    ids=["start", "length", "message", "multiplexer"],
+    ids=["start", "length", "message", "bytes", "multiplexer", "reversed", "digits"],
 )
 def test_numbers_that_would_take_gigabytes_are_refused_before(tmp_path: Path, line: str) -> None:
     path = tmp_path / "x.dbc"
@@ -275,3 +278,11 @@ def test_numbers_that_would_take_gigabytes_are_refused_before(tmp_path: Path, li
         load_dbc(path)
     assert tracemalloc.get_traced_memory()[1] < 4e6
     tracemalloc.stop()
+
+
+def test_a_comment_may_hold_any_numbers(tmp_path: Path) -> None:
+    (tmp_path / "x.dbc").write_text(
+        'VERSION ""\nNS_ :\nBS_:\nBU_: E\nBO_ 1 M: 8 E\n SG_ A : 0|8@1+ (1,0) [0|0] "" E\n'
+        'CM_ BO_ 1 "40000|8@1 \\"SG_MUL_VAL_ 1-4000000000";\n'
+    )
+    assert load_dbc(tmp_path / "x.dbc").messages[0].name == "M"

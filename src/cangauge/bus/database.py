@@ -30,14 +30,14 @@ from cangauge.errors import InputError, closest
 MAX_DBC_BYTES: Final = 4 * MIB
 """Parsing takes 1–6 s a megabyte; the largest files in use are smaller."""
 
-_MOST_BITS: Final = 8 * 4095
+_MOST_BYTES: Final = 4095
 """Of a message: a reply over ISO-TP."""
 _MOST_SELECTED: Final = 1 << 20
 """Most values of multiplexers in a DBC; cantools keeps each of a range."""
-_SIZES: Final = re.compile(
-    r"\bBO_\s++\d++\s++\w++\s*+:\s*+\+?(\d++)|(?<!\d)(\d++)\s*+\|\s*+\+?(\d++)\s*+@"
-)
-"""Length of a message; start bit and length of a signal."""
+_TEXT: Final = re.compile(r'"(?:[^"\\]|\\.)*+"')
+_LENGTH: Final = re.compile(r"\bBO_\s++\d++\s++\w++\s*+:\s*+\+?(\d++)")
+_BITS: Final = re.compile(r"(?<!\d)(\d++)\s*+\|\s*+\+?(\d++)\s*+@")
+"""Start bit and length of a signal."""
 _SELECTED: Final = re.compile(r"\bSG_MUL_VAL_\s[^;]*+")
 _RANGE: Final = re.compile(r"(?<!\d)(\d++)\s*+[-+](\d++)")
 
@@ -398,13 +398,17 @@ def load_dbc(path: str | PathLike[str]) -> Database:
 
 def _refuse_huge(text: str, path: Path) -> None:
     """Raise InputError for the numbers of a damaged DBC for which cantools would take gigabytes."""
-    cure = "open it in a DBC editor, and correct the number"
-    for match in _SIZES.finditer(text):
-        if max(float(size) for size in match.groups("0")) > _MOST_BITS:
-            problem = f"a message of more than {_MOST_BITS} bits is not possible"
-            raise InputError(problem, source=path, value=match[0], cure=cure)
+    cure, text = "open it in a DBC editor, and correct the number", _TEXT.sub("", text)
+    for pattern, most in ((_LENGTH, _MOST_BYTES), (_BITS, 8 * _MOST_BYTES)):
+        for match in pattern.finditer(text):
+            if max(map(float, match.groups())) > most:
+                problem = f"a message of more than {_MOST_BYTES} bytes is not possible"
+                raise InputError(problem, source=path, value=match[0], cure=cure)
     ranges = (each for some in _SELECTED.findall(text) for each in _RANGE.findall(some))
-    if sum(float(high) - float(low) for low, high in ranges) > _MOST_SELECTED:
+    counts = (
+        math.inf if len(high) > 20 else max(float(high) - float(low), 0.0) for low, high in ranges
+    )
+    if sum(counts) > _MOST_SELECTED:
         problem = f"SG_MUL_VAL_ selects by more than {_MOST_SELECTED} values"
         raise InputError(problem, source=path, cure=cure)
 
