@@ -175,7 +175,7 @@ def named_signals(
         message.frame_id | (EXTENDED if message.is_extended_frame else 0): message
         for message in load_dbc(dbc).messages
     }
-    frames: dict[int, _Frames] = defaultdict(_Frames)
+    frames: dict[int, _NamedFrames] = defaultdict(_NamedFrames)
     is_capture = False
     for each in messages:
         is_capture = True
@@ -233,7 +233,7 @@ def clear_roles(found: Mapping[str, Sequence[NamedSignal]]) -> list[str]:
 
 
 @dataclass
-class _Frames:
+class _NamedFrames:
     """Frames of one message: their times, and which of its distinct payloads each holds."""
 
     time_s: array[float] = field(default_factory=lambda: array("d"))
