@@ -23,6 +23,15 @@ def test_the_time_out_is_of_the_frames(stated_s: float, timeout_s: float) -> Non
     assert math.isnan(SignalHealth(SignalChecks()).period_s)
 
 
+def test_a_burst_does_not_contradict_a_right_period() -> None:
+    """As of an adapter that hands on what it has collected, six frames of 0.1 s every 0.6 s."""
+    health = SignalHealth(SignalChecks(), 0.1)
+    for number in range(120):
+        health.update(20.0, 0.6 * (number // 6) + 3e-4 * (number % 6))
+        assert not health.is_faster_than_stated
+    assert health.timeout_s == pytest.approx(1.0)
+
+
 def test_the_message_is_named() -> None:
     vehicle = Vehicle.load("generic")
     for stated_s, named in [(100.0, ["PACK_CURRENT"]), (0.1, [])]:

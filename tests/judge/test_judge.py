@@ -114,6 +114,15 @@ def test_an_offset_of_the_sensor_is_taken_out_of_the_corrected_soc(pack) -> None
         assert moved == pytest.approx(truly, abs=1.5)  # the count alone: 4 % off
 
 
+def test_parked_days_may_be_alike_but_no_drives(pack) -> None:
+    model, logs = pack
+    still = (np.arange(900.0), np.zeros(900), np.full(900, logs[-1].voltage_v[-1]))
+    parked = cangauge.Log(*still, np.full(900, 20.0), soc_pct=np.full(900, logs[-1].soc_pct[-1]))
+    assert len(cangauge.judge([*logs, parked, parked], model).logs) == len(logs) + 2
+    with pytest.raises(cangauge.InputError, match="same rows"):
+        cangauge.judge([logs[0], logs[0]], model)
+
+
 def counting(log: cangauge.Log, scale: float) -> cangauge.Log:
     """Return the log of a gauge that counts too much from its start on."""
     return replace(log, soc_pct=log.soc_pct[0] + scale * (log.soc_pct - log.soc_pct[0]))

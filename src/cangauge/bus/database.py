@@ -34,7 +34,7 @@ _MOST_BYTES: Final = 4095
 """Of a message: a reply over ISO-TP."""
 _MOST_SELECTED: Final = 1 << 20
 """Most values of multiplexers in a DBC; cantools keeps each of a range."""
-_TEXT: Final = re.compile(r'"(?:[^"\\]|\\.)*+"')
+_TEXT: Final = re.compile(r'"(?:[^"\\]|\\.)*+"', re.DOTALL)
 _LENGTH: Final = re.compile(r"\bBO_\s++\d++\s++\w++\s*+:\s*+\+?(\d++)")
 _BITS: Final = re.compile(r"(?<!\d)(\d++)\s*+\|\s*+\+?(\d++)\s*+@")
 """Start bit and length of a signal."""

@@ -220,7 +220,9 @@ class SignalHealth:
         if self._intervals == 1:
             self._learned_s = interval_s
         else:
-            self._learned_s = learned_s + (min(interval_s, 4.0 * learned_s) - learned_s) / 16.0
+            # A pause counts as a few periods; frames may come in bursts of many.
+            longest_s = max(4.0 * learned_s, 10.0 * (self._period_s or 0.0))
+            self._learned_s = learned_s + (min(interval_s, longest_s) - learned_s) / 16.0
 
     def fail(self, reason: Reason, *, is_repeated: bool = False) -> float:
         """Record a failed value or frame; return NaN. A repeated one does not stop recovery."""

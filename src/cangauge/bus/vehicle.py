@@ -211,12 +211,12 @@ class Vehicle:
 
     @property
     def battery(self) -> str:
-        """What a SoC belongs to: messages, bits, sign and scale of current and voltage."""
+        """What a SoC belongs to: messages, bits and sign of current and voltage."""
         parts = []
         for key, codec in ((each.key, each.codec) for each in (self.current, self.voltage)):
             pages = [(each.field, sorted(each.values)) for each in codec.conditions]
-            scale = codec.gain * codec.factor, codec.gain * codec.offset + codec.shift
-            parts.append((key, codec.field, codec.is_signed, codec.float_format, pages, scale))
+            sign = codec.gain * codec.factor > 0.0
+            parts.append((key, codec.field, codec.is_signed, codec.float_format, pages, sign))
         return repr(parts)
 
     @property

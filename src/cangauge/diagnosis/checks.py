@@ -69,8 +69,9 @@ _MEASURED: Final = ("current_a", "voltage_v")
 
 
 def check_given_once(logs: Sequence[Log], *, cure: str) -> None:
-    """Raise InputError if two logs have the same rows."""
-    for one, other in itertools.combinations(logs, 2):
+    """Raise InputError if two logs have the same rows; those of a parked pack may be alike."""
+    moving = [log for log in logs if any(np.ptp(getattr(log, k)) > 0.0 for k in _MEASURED)]
+    for one, other in itertools.combinations(moving, 2):
         if all(np.array_equal(getattr(one, k), getattr(other, k)) for k in _MEASURED):
             raise InputError(
                 f"same rows as {other.source or other.name}: they would count twice",

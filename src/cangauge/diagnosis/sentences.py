@@ -171,7 +171,7 @@ def soc_text(found: Diagnosis) -> str:
     refused, errors = found.accepted is None, found.soc_errors_pct
     if errors is None:
         text = f" No extended model: {cause} does not stand out." if refused else ""
-        if found.start_is_suspect:
+        if found.start_is_suspect and any(log.soc_pct is not None for log in found.logs):
             text += " The start of these logs may be the cause, so their SoC proves nothing."
         return text
     before, after = (number(error, 2) for error in errors)

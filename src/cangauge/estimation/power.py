@@ -179,7 +179,7 @@ class PowerModel:
         last = int(low[0]) if low.size else ENERGY_STEPS
         # Part of each step above the lowest voltage: all of it, but for the last.
         part, drop_v = np.ones(last), volts[:last] - volts[1 : last + 1]
-        unknown_pct, to_pct = 0.0, limits.cutoff_soc_pct
+        unknown_pct, to_pct = 0.0, end_pct
         if low.size:
             unknown_pct = ahead.std_v / ahead.slope_at(float(soc_pct[last]))
             part[-1:] = (volts[last - 1] - limits.min_voltage_v) / drop_v[-1:]

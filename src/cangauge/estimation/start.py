@@ -13,7 +13,8 @@ and Navigation, 2001, ch. 11.6). A hypothesis is dropped once its probability no
 A filter linearises the curve at one SoC. While the wide one is still uncertain, a bend of the curve
 costs it evidence, although another SoC may agree with all voltages: on the plateau of LFP a start
 20 % off was thus "proved". So the odds do not fall below the prior ones until the wide filter has
-found the SoC by the voltages (`FOUND_STD_PCT`). Evidence against the narrow one counts at once.
+found the SoC by the voltages (`FOUND_STD_PCT`). Evidence against the narrow one counts as soon as
+it prevails.
 """
 
 from __future__ import annotations

@@ -16,6 +16,7 @@ precedence over the file; paths in a file are relative to it::
 
 from __future__ import annotations
 
+import re
 import sys
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
@@ -396,8 +397,11 @@ class RunConfig(Strict):
             key = (error.field or "").removeprefix("--").replace("-", "_")
             if error.source is not None or key in self._options or self._file == _NO_FILE:
                 raise
+            cure = error.cure and re.sub(
+                "--([a-z][a-z-]*)", lambda option: option[1].replace("-", "_") + " =", error.cure
+            )
             raise InputError(
-                error.problem, source=self._file, field=key, value=error.value, cure=error.cure
+                error.problem, source=self._file, field=key, value=error.value, cure=cure
             ) from error
 
 

@@ -59,6 +59,8 @@ FIRST_CHECKPOINT_S: Final = 1.0
 FOREIGN_FRAMES: Final = 3
 FOREIGN_WITHIN_S: Final = 5.0
 """Foreign frames with own ids within this time [s] that prove another sender."""
+_ECHOES_KEPT: Final = 1024
+"""Latest own frames whose echoes are always awaited: they wait on a bus without a receiver."""
 ECHO_WITHIN_S: Final = 1.0
 """Time after which the echo of a sent frame has arrived [s], transmit queue included. It may wait
 longer in the receive queue."""
@@ -367,8 +369,8 @@ class OwnFrames:
             self._sent_s.append(now_s)
 
     def forget(self, before_s: float) -> None:
-        """Await no echo any more of what was sent before a steady time [s]."""
-        while self._sent_s and self._sent_s[0] < before_s:
+        """Await no echo of what was sent before a steady time [s], but of the latest frames."""
+        while len(self._sent) > _ECHOES_KEPT and self._sent_s[0] < before_s:
             self._sent_s.popleft()
             self._sent.popleft()
 

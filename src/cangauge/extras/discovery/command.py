@@ -352,8 +352,8 @@ def _show(proposal: Proposal, files: Sequence[str], reading: str, model: Path) -
         note(proposal.sign_text)
     if proposal.fixed_c is not None:
         note(
-            f"note: no temperature was found or chosen: the files assume {proposal.fixed_c:g} °C;"
-            " some °C of error are worth several % SoC"
+            "note: no temperature is clearly the pack's or chosen: the files assume"
+            f" {proposal.fixed_c:g} °C; some °C of error are worth several % SoC"
         )
     for role, cure in _SCALE_CURES.items():
         if levels := proposal.levels(role):

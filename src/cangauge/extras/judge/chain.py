@@ -417,10 +417,10 @@ def _stands(
     known = np.flatnonzero(np.isfinite(shown))
     first = known[np.flatnonzero(np.diff(shown[known], prepend=np.nan) != 0.0)]
     last = known[np.searchsorted(known, first[1:]) - 1]
-    flowed = np.diff(drawn_pct[first])
+    flowed, held = np.diff(drawn_pct[first]), drawn_pct[last] - drawn_pct[first[:-1]]
     missed = np.abs(np.diff(shown[first]) + flowed)
     least = max(HELD_PCT, 2.0 * step_pct)
-    is_stand = (np.abs(flowed) >= least) & (missed < 0.5 * np.abs(flowed))
+    is_stand = (np.abs(held) >= least) & (missed < 0.5 * np.abs(flowed))
     return [
         Stand(float(time_s[a]), float(time_s[b]), float(shown[a]), float(abs(charge)))
         for a, b, charge in zip(first[:-1][is_stand], last[is_stand], flowed[is_stand], strict=True)

@@ -265,8 +265,10 @@ def _judgement(
             cause = _cause(answers, probabilities)
         if right <= ALARM:
             verdict = "off"
-        elif cause.verdict not in RIGHT:  # the gauge is wrong, or the model
-            verdict, cause = "cannot_tell", Cause("unknown", probabilities["unknown"])
+        elif cause.verdict not in RIGHT:
+            verdict = "cannot_tell"
+            if cause.verdict == "count_scale":  # the gauge is wrong, or the model
+                cause = Cause("unknown", probabilities["unknown"])
     return Judgement(
         logs,
         model,

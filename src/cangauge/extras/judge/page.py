@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from cangauge._text import number
+from cangauge.extras.judge.causes import RIGHT
 from cangauge.extras.judge.result import Judgement
 from cangauge.extras.report.charts import BLACK, BLUE, ORANGE, Figure, TimeFigures
 from cangauge.extras.report.page import Page, Table, Tile, joined
@@ -24,7 +25,7 @@ def judge_page(judgement: Judgement, model_path: Path | None = None) -> Page:
     logs = judgement.logs
     jumps = [Table(*judgement.jump_rows())] if judgement.jumps else []
     std = number(judgement.error_std_pct, 1, "%")
-    right = number(100.0 * judgement.probabilities["none"], 0, "%")
+    right = number(100.0 * sum(judgement.probabilities[name] for name in RIGHT), 0, "%")
     return Page(
         title=f"Second opinion on the gauge of {joined([log.name for log in logs])}",
         lead=judgement.headline,

@@ -256,7 +256,7 @@ class Judgement:
             if self.cause.verdict == "unknown":
                 open_ = (
                     "and either it is wrong, or it is right and the pack has another capacity than"
-                    " the model"
+                    " assumed"
                 )
             return (
                 f"Cannot tell: the gauge differs by {error} from the SoC that voltage and charge"
@@ -352,7 +352,8 @@ class Judgement:
     @property
     def next_step(self) -> str:
         """What to do next, and what it settles."""
-        if self.stands and self.cause.size is None and self.verdict != "cannot_tell":
+        is_open = self.cause.size is None and self.verdict != "cannot_tell"
+        if standing(self.chain) is not None and is_open:
             return (
                 "See whether the gauge itself stands still, or only what is logged of it, and judge"
                 " again by a log in which its SoC moves."
@@ -361,8 +362,8 @@ class Judgement:
             return _NEXT["pack_capacity"]
         if self.pack_ah is not None:
             return (
-                f"Judge again with the pack's capacity (--capacity-ah {rounded(self.pack_ah)}), and"
-                " fit a new model to logs of these days."
+                f"Judge again with the pack's capacity (--capacity-ah {rounded(self.pack_ah)};"
+                " of a service: capacity_ah), and fit a new model to logs of these days."
             )
         if self.verdict != "cannot_tell":
             return _NEXT[self.cause.verdict]
