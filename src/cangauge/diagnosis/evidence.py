@@ -81,7 +81,7 @@ MOVES_SOC = ("current_offset", "current_gain", "capacity", "initial_soc", "coulo
 
 RESIMULATED_PART = 0.15
 """An effect that does not move the SoC is re-simulated from this part of the best one's evidence.
-Effects that move it always are: beyond a bend of the OCV curve their tangent tells nothing."""
+Effects that move it always are: linearised gain is meaningless beyond a bend of the OCV curve."""
 
 
 @dataclass(frozen=True)

@@ -118,7 +118,7 @@ class Priors:
             "pack_capacity": 6.0,  # what ageing takes between two updates of a gauge
             "start_or_reset": 10.0,
             "voltage_sensor": 1.5,
-            "model_capacity": 5.0,  # as `count_scale`: only the voltage tells them apart
+            "model_capacity": 5.0,  # as `count_scale`: only the voltage separates the two
         }.get(cause, 1.0)
 
 

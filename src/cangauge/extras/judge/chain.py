@@ -392,7 +392,7 @@ def _observed(shown: FloatArray, drawn_pct: FloatArray, step_pct: float) -> Floa
     it changes by more, at its first and last row, and whenever charge of two further steps has
     flowed without a change. A limit is not a count, unless nothing else is shown.
     """
-    told, known = shown, np.flatnonzero(np.isfinite(shown))
+    used_pct, known = shown, np.flatnonzero(np.isfinite(shown))
     if step_pct >= COARSE_PCT and known.size:
         value, drawn = shown[known], drawn_pct[known]
         change = np.diff(value, prepend=value[0])
@@ -401,13 +401,13 @@ def _observed(shown: FloatArray, drawn_pct: FloatArray, step_pct: float) -> Floa
         since = np.flatnonzero(np.diff(held, prepend=-1))[held]
         steps = np.floor(np.abs(drawn - drawn[since]) / (2.0 * step_pct))
         most = np.maximum.accumulate(held * (1.0 + steps.max()) + steps)
-        tells = np.diff(most, prepend=-1.0) > 0.0
-        tells[-1] = True
+        is_used = np.diff(most, prepend=-1.0) > 0.0
+        is_used[-1] = True
         is_crossing = np.round(np.abs(change) / step_pct) == 1.0
-        told = np.full_like(shown, np.nan)
-        told[known[tells]] = (value - np.where(is_crossing, 0.5 * change, 0.0))[tells]
-    is_count = (told > PEGGED_PCT) & (told < 100.0 - PEGGED_PCT)
-    return np.where(is_count, told, np.nan) if is_count.any() else told
+        used_pct = np.full_like(shown, np.nan)
+        used_pct[known[is_used]] = (value - np.where(is_crossing, 0.5 * change, 0.0))[is_used]
+    is_count = (used_pct > PEGGED_PCT) & (used_pct < 100.0 - PEGGED_PCT)
+    return np.where(is_count, used_pct, np.nan) if is_count.any() else used_pct
 
 
 def _stands(
