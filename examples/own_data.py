@@ -1,6 +1,6 @@
-"""Eleven kinds of files, each from file to SoC plot in at most three commands.
+"""Ten kinds of files, each from file to SoC plot in at most three commands.
 
-    pip install 'cangauge[mf4,mcap]' scapy batterydf pandas
+    pip install 'cangauge[mf4]' scapy batterydf pandas
     python examples/own_data.py FOLDER
 
 Makes each file by a tool of its kind, where that is installed, and takes one real export from the
@@ -146,32 +146,6 @@ def write_carbus(log: cangauge.Log, path: Path) -> None:
             )
 
 
-def write_mcap(log: cangauge.Log, path: Path) -> None:
-    """Write JSON messages of a robot's battery by mcap; the fields are ROS's BatteryState."""
-    from mcap.writer import Writer
-
-    assert log.soc_pct is not None
-    with path.open("wb") as file:
-        writer = Writer(file)
-        writer.start()
-        schema = writer.register_schema("BatteryState", "jsonschema", b'{"type":"object"}')
-        topic = writer.register_channel("/battery", "json", schema)
-        columns = (log.time_s, log.current_a, log.voltage_v, log.temperature_c, log.soc_pct)
-        for time_s, current, voltage, temperature, soc in zip(
-            *(each.tolist() for each in columns), strict=True
-        ):
-            fields = {
-                "voltage": voltage,
-                "current": -current,  # negative when discharging
-                "temperature": temperature,
-                "percentage": soc / 100.0,
-                "present": True,
-            }
-            time_ns = round(1e9 * time_s)
-            writer.add_message(topic, time_ns, json.dumps(fields).encode(), time_ns)
-        writer.finish()
-
-
 def write_bdf(log: cangauge.Log, path: Path) -> None:
     """Write the Battery Data Format by its own package."""
     import pandas as pd
@@ -232,7 +206,6 @@ KINDS = {
     "PCAPNG": Kind(write_pcapng, ".pcapng", ["--vehicle", "leaf_aze0"]),
     "SavvyCAN GVRET": Kind(write_gvret, ".csv", ["--vehicle", "leaf_aze0"]),
     "CARBUS trace": Kind(write_carbus, ".trc", ["--map", "mycar.toml"]),
-    "MCAP": Kind(write_mcap, ".mcap", ["--columns", "soc=/battery percentage"]),
     "German CSV": Kind(write_german, ".csv", []),
     "UTF-16 text": Kind(write_utf16, ".txt", []),
     "CSV in bzip2": Kind(write_bzip2, ".csv.bz2", []),

@@ -8,7 +8,7 @@ import json
 import struct
 import tempfile
 import zipfile
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -16,12 +16,9 @@ from typing import Any
 import can
 import pyarrow as pa
 import pyarrow.parquet as pq
-from mcap.writer import CompressionType, Writer
 
 from cangauge._resources import shared_file
 from cangauge.bus.vehicle import Vehicle
-from cangauge.extras.formats.mcap import frame_content, frame_topic
-from cangauge.extras.formats.mcap_messages import FRAME, SAMPLE
 from cangauge.model.effects.base import Pack, Parameter
 from cangauge.model.effects.library import LIBRARY, effect_entries
 from cangauge.model.model_file import Model
@@ -211,18 +208,6 @@ def log_files() -> dict[str, bytes]:
     )
     for spelling, (head, row) in d3.items():
         files[f"{spelling} Test Data.txt"] = _table(head, row, "\r\n")
-    samples = [
-        dict(
-            zip(("time_s", "current_a", "voltage_v", "temperature_c", "soc_pct"), row, strict=True)
-        )
-        for row in log_rows()
-    ]
-    files["samples.mcap"] = _mcap(
-        ("/sample", SAMPLE, row["time_s"], json.dumps(row).encode()) for row in samples
-    )
-    files["others.mcap"] = _mcap(
-        ("/bms", "Battery", row["time_s"], json.dumps({"pack": row}).encode()) for row in samples
-    )
     files["log.csv.gz"] = gzip.compress(files["log.csv"], mtime=0)
     files["leaf.zip"] = zipped("61201019 Test Data.txt", files["2012 Test Data.txt"])
     return files
@@ -319,10 +304,6 @@ def capture_files() -> dict[str, bytes]:
     files["candump.log.gz"] = gzip.compress(files["candump.log"], mtime=0)
     files["x.pcap"] = _pcap()
     files["x.pcapng"] = _pcapng()
-    files["x.mcap"] = _mcap(
-        (frame_topic(frame), FRAME, frame.timestamp, frame_content(frame))
-        for frame in leaf_frames()
-    )
     mf4 = _mf4()
     return files if mf4 is None else files | {"x.mf4": mf4}
 
@@ -375,22 +356,6 @@ def _pcapng() -> bytes:
         head = struct.pack("<IIIII", 0, high, low, len(packet), len(packet))
         out.append(block(6, head + packet))
     return b"".join(out)
-
-
-def _mcap(messages: Iterable[tuple[str, str, float, bytes]]) -> bytes:
-    """Return an MCAP file without compression and checksums, so that mutants reach its content."""
-    out = io.BytesIO()
-    writer = Writer(out, compression=CompressionType.NONE, enable_crcs=False)
-    writer.start()
-    channels: dict[str, int] = {}
-    for topic, schema, time_s, content in messages:
-        if topic not in channels:
-            number = writer.register_schema(schema, "jsonschema", b"{}")
-            channels[topic] = writer.register_channel(topic, "json", number)
-        time_ns = round(1e9 * time_s)
-        writer.add_message(channels[topic], time_ns, content, time_ns)
-    writer.finish()
-    return out.getvalue()
 
 
 def _mf4() -> bytes | None:

@@ -91,7 +91,7 @@ def _make_log(rng: Random) -> bytes:
         return mutate(rng, signals, [signals])
     name = rng.choice(list(files))
     data = files[name]
-    if name.endswith((".mcap", ".parquet", ".gz", ".zip", "utf16.csv")):
+    if name.endswith((".parquet", ".gz", ".zip", "utf16.csv")):
         return mutate(rng, data, list(files.values()))
     mutant = mutate(rng, data, [files["log.csv"], files["TripA01.csv"]], text=True)
     if name.startswith("2012") and rng.randrange(8) == 0:
@@ -146,7 +146,7 @@ def _make_capture(rng: Random) -> bytes:
     name = rng.choice([name for name in files if name != "x.mf4"])
     if "x.mf4" in files and rng.randrange(MF4_EVERY) == 0:
         name = "x.mf4"
-    is_text = not name.endswith((".blf", ".gz", ".mf4", ".mcap", ".pcap", ".pcapng"))
+    is_text = not name.endswith((".blf", ".gz", ".mf4", ".pcap", ".pcapng"))
     mutant = mutate(rng, files[name], list(files.values()), text=is_text)
     return _packed(rng, mutant) if is_text else mutant
 

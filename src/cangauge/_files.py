@@ -39,7 +39,7 @@ _D3_MEMBER: Final = "test data.txt"
 _SUFFIXES: Final = frozenset(
     f".{suffix}"
     for suffix in ("gz", "bz2", "zip", "csv", "txt", "tsv", "parquet", "pq", "dat", "xlsx", "mpt",
-                   "bdf", "mf4", "mcap")
+                   "bdf", "mf4")
 )  # fmt: skip
 
 

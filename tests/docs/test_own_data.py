@@ -13,7 +13,7 @@ pytestmark = pytest.mark.nightly
 PROJECT = Path(__file__).parents[2]
 
 
-@pytest.mark.parametrize("kind", ["CARBUS trace", "MCAP"])
+@pytest.mark.parametrize("kind", ["CARBUS trace", "UTF-16 text"])
 def test_from_file_to_soc_plot_in_three_commands(tmp_path: Path, kind: str) -> None:
     ended = subprocess.run(
         [sys.executable, PROJECT / "examples" / "own_data.py", tmp_path, "--kind", kind,

@@ -19,7 +19,7 @@ from cangauge.bus import readers
 from cangauge.bus.captures import open_capture
 from cangauge.bus.readers import CandumpLogReader, CaptureReader, LineReader, capture_readers
 from cangauge.errors import InputError
-from cangauge.extras.formats import mcap, pcap, text
+from cangauge.extras.formats import pcap, text
 from cangauge.extras.formats import python_can as library
 
 START_S = 1436509052.25
@@ -391,12 +391,6 @@ class TestCsv(Written):
     has_channels = False
 
 
-class TestMcap(Written):
-    reader = mcap.McapReader
-    writer = mcap.McapWriter
-    kinds: ClassVar = {"remote": True, "error": True, "fd": True}
-
-
 def _socketcan(frame: can.Message, order: str = ">") -> bytes:
     """Return a frame as SocketCAN hands it to libpcap."""
     flags = 0x80000000 * frame.is_extended_id | 0x40000000 * frame.is_remote_frame
@@ -492,11 +486,9 @@ class TestPcapngBigEndian(TestPcapng):
     order = ">"
 
 
-@pytest.mark.parametrize("suffix", [".crtd", ".pcap", ".pcapng", ".mcap"])
+@pytest.mark.parametrize("suffix", [".crtd", ".pcap", ".pcapng"])
 def test_python_can_finds_our_readers(tmp_path: Path, suffix: str) -> None:
-    made = {
-        ".crtd": TestCrtd, ".pcap": TestPcap, ".pcapng": TestPcapng, ".mcap": TestMcap
-    }[suffix]()  # fmt: skip
+    made = {".crtd": TestCrtd, ".pcap": TestPcap, ".pcapng": TestPcapng}[suffix]()
     path = tmp_path / f"drive{suffix}"
     made.write(path, frames_of())
     packed = tmp_path / f"drive{suffix}.gz"

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import datetime as dt
 import gzip
-import json
 import re
 from pathlib import Path
 from typing import Any
@@ -159,7 +158,7 @@ def test_constant_temperature_in_place_of_the_files(tmp_path: Path) -> None:
     assert "temperature -5 °C as given in place of the file's" in log.remarks
 
 
-# ---- workbooks, MF4, MCAP
+# ---- workbooks, MF4
 
 
 def test_workbook_reads_as_its_longest_sheet(tmp_path: Path) -> None:
@@ -213,54 +212,6 @@ def test_mf4_signals_of_several_rasters_become_a_log(tmp_path: Path) -> None:
         read_log(path, columns="voltage=BMS_Voltag")
     path.write_bytes(path.read_bytes()[:3000])
     with pytest.raises(InputError, match=r"trip\.mf4: "):
-        read_log(path)
-
-
-def write_mcap(
-    path: Path, schema: str, topic: str, rows: list[dict[str, Any]], step_ns: int = 10**9
-) -> None:
-    module = pytest.importorskip("mcap.writer")
-    with path.open("wb") as file:
-        writer = module.Writer(file)
-        writer.start()
-        number = writer.register_schema(schema, "jsonschema", b'{"type":"object"}')
-        channel = writer.register_channel(topic, "json", number)
-        for k, row in enumerate(rows):
-            writer.add_message(channel, k * step_ns, json.dumps(row).encode(), k * step_ns)
-        writer.finish()
-
-
-def test_mcap_samples_are_a_log_up_to_a_cut(tmp_path: Path) -> None:
-    rows: list[dict[str, Any]] = [
-        {"time_s": 7.0 + t, "current_a": i} | ({"voltage_v": 380.0 + t} if k % 4 != 1 else {})
-        for k, (t, i) in enumerate(zip(0.4 * TIME_S, CURRENT_A, strict=True))
-    ]
-    rows[5]["temperature_c"] = 21.5
-    path = tmp_path / "x.mcap"
-    write_mcap(path, "cangauge.Sample", "/sample", rows, 400_000_000)
-    log = read_log(path)
-    np.testing.assert_allclose(log.time_s, 7.0 + 0.4 * TIME_S)
-    np.testing.assert_allclose(log.voltage_v, 380.0 + 0.4 * TIME_S)  # filled over 0.8 s
-    assert set(log.temperature_c) == {21.5}
-    path.write_bytes(path.read_bytes()[:400])
-    with pytest.raises(InputError, match=r"x\.mcap: the MCAP file is damaged"):
-        read_log(path)  # its only chunk is cut
-
-
-def test_numbers_of_any_mcap_are_channels(tmp_path: Path) -> None:
-    rows = [
-        {"pack": {"current_A": i, "voltage_V": u}, "temperature_C": 20.0, "state": "drive"}
-        for i, u in zip(CURRENT_A, VOLTAGE_V, strict=True)
-    ]
-    path = tmp_path / "robot.mcap"
-    write_mcap(path, "Battery", "/battery", rows)
-    columns = "current=/battery pack.current_A,voltage=/battery pack.voltage_V"
-    log = read_log(path, columns=columns)
-    np.testing.assert_array_equal(log.time_s, TIME_S)
-    np.testing.assert_array_equal(log.current_a, CURRENT_A)
-    assert log.temperature_c[0] == 20.0
-    path.write_bytes(path.read_bytes()[:60])
-    with pytest.raises(InputError, match="the MCAP file is damaged"):
         read_log(path)
 
 

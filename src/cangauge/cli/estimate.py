@@ -49,7 +49,7 @@ def estimate_command(
     OUT has one row per sample: time_s [s], soc_pct, soc_std_pct, soc_newton_pct, soc_coulomb_pct
     [%], voltage_model_v, residual_v (measured − model) [V], status (initialising, valid, degraded,
     invalid) and reasons (separated by "; "). An unknown value is empty (CSV) or null (Parquet).
-    An .mcap holds samples and estimates for Foxglove and PlotJuggler. Positive current discharges.
+    Positive current discharges.
 
     PACK has one row per second, of a log over an hour 3,600 rows: capacity_ah, resistance_ratio,
     offset_a, discharge_a and charge_a (possible for 10 s), energy_wh (left), with standard
@@ -68,7 +68,7 @@ def estimate_command(
     ----------
     log_path : LOG
         Recorded log or capture.
-    output : -o, --output OUT.csv|.parquet|.mcap
+    output : -o, --output OUT.csv|.parquet
         Table of estimates.
     method : ekf|newton|coulomb
         Method of soc_pct: Kalman filter over voltage and charge (ekf), voltage alone (newton), or
@@ -103,11 +103,7 @@ def estimate_command(
     page = extra("report.estimate:estimate_page")(done, model).html() if report else ""
     with ExitStack() as all_of_them:
         parts = {what: all_of_them.enter_context(atomic_path(p)) for what, p in files.items() if p}
-        if output.suffix.lower() == ".mcap":
-            write = extra("formats.estimate_mcap:write_estimates_mcap")
-            write(parts["output"], done.recorded, done.table)
-        else:
-            write_estimates(parts["output"], done.recorded.time_s, done.table)
+        write_estimates(parts["output"], done.recorded.time_s, done.table)
         if pack is not None:
             write_table(done.pack.columns, parts["pack"])
         if report is not None:

@@ -28,7 +28,7 @@ from cangauge.logs.values import numbers_of, with_decimal_points
 KNOWN_LOGS: Final = (
     "canonical Parquet and CSV (time_s, current_a, voltage_v, temperature_c, soc_pct), ANL D3"
     " tests, BMW i3 trips, Arbin, Bitrode and VisuaLCN exports, Battery Data Format, MF4"
-    " signals, MCAP samples, any table with plain headings"
+    " signals, any table with plain headings"
 )
 _FORMATS: Final = tuple(
     f"cangauge.extras.formats.{module}" for module in ("exports", "tables", "measurement")

@@ -1,4 +1,4 @@
-"""Measurement files with channels on several rasters: MF4 signals, MCAP messages.
+"""Measurement files with channels on several rasters: MF4 signals.
 
 Channels are chosen by name and unit as the columns of a table. The log's rows are those of the
 current: voltage is interpolated to them, temperature and SoC are held, as for captures.
@@ -6,8 +6,7 @@ current: voltage is interpolated to them, temperature and SoC are held, as for c
 
 from __future__ import annotations
 
-from array import array
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -15,13 +14,11 @@ import numpy as np
 from cangauge._files import MIB, Head
 from cangauge._typing import FloatArray
 from cangauge.errors import InputError
-from cangauge.extras.formats.mcap_messages import FRAME, MAGIC, SAMPLE, McapMessage, read_messages
 from cangauge.logs.canonical import build_table
 from cangauge.logs.column_map import ColumnMap, choose_columns, unknown_columns
 from cangauge.logs.draft import DraftLog
 from cangauge.logs.table import ArrowTable, draft_of_table
 from cangauge.logs.text import MAX_COLUMNS, MAX_ROWS
-from cangauge.logs.units import FIELDS
 
 VOLTAGE_FILL_S: Final = 1.0
 """Longest time between two values of a channel for interpolation [s], as in captures."""
@@ -179,108 +176,4 @@ def _signal(file: Any, group: int, index: int) -> MeasuredChannel:
     return MeasuredChannel(np.asarray(signal.timestamps, dtype=np.float64)[: numbers.size], numbers)
 
 
-class McapSamples:
-    """The samples of an MCAP recording, or the numbers in JSON messages of any schema."""
-
-    takes_columns = True
-    _DAMAGE: Final = (ValueError, LookupError, ArithmeticError, EOFError, OSError, RecursionError)
-    _FIRST_MESSAGES: Final = 1000
-    """Messages among which a file with CAN frames shows one."""
-
-    def matches(self, head: Head) -> bool:
-        """Return whether the file is an MCAP without CAN frames."""
-        if not head.data.startswith(MAGIC):
-            return False
-        with head.open() as file:
-            try:
-                for number, message in enumerate(read_messages(file, head.path)):
-                    if message.schema == FRAME:
-                        return False
-                    if number > self._FIRST_MESSAGES:
-                        break
-            except self._DAMAGE:
-                return True
-        return True
-
-    def read(self, head: Head, columns: ColumnMap | None = None) -> DraftLog:
-        """Read the samples or numbers; a column is `TOPIC FIELD`.
-
-        Raises
-        ------
-        InputError
-            If it is damaged before its end, a field is not found, or mcap is not installed.
-        """
-        channels: dict[str, tuple[array[float], array[float]]] = {}
-        damage, has_samples = "", False
-        with head.open() as file:
-            try:
-                for message in read_messages(file, head.path):
-                    is_sample = message.schema == SAMPLE
-                    if message.encoding != "json" or message.schema == FRAME:
-                        continue
-                    if is_sample and not has_samples:
-                        has_samples, channels = True, {}
-                    if is_sample or not has_samples:
-                        _collect(channels, message, head, "" if is_sample else message.topic)
-            except self._DAMAGE as error:
-                damage = f"{type(error).__name__}: {error}".splitlines()[0][:200]
-        if not channels:
-            problem = f"the MCAP file is damaged ({damage})" if damage else ""
-            problem = problem or "the MCAP file holds no numbers"
-            raise InputError(problem, source=head.path, cure="record it again")
-        found = {
-            name: MeasuredChannel(np.array(t), np.array(v)) for name, (t, v) in channels.items()
-        }
-        if has_samples:
-            draft = _draft_of_samples(head, found)
-        else:
-            draft = _draft_of_channels(head, list(found), columns, lambda _: found)
-        if damage:
-            draft.remarks.append(f"the file is cut off or damaged ({damage})")
-        return draft
-
-
-def _collect(
-    channels: dict[str, tuple[array[float], array[float]]],
-    message: McapMessage,
-    head: Head,
-    topic: str,
-) -> None:
-    for field, value in _numbers(message.fields(), ""):
-        name = f"{topic} {field}".strip()
-        if name not in channels and len(channels) >= MAX_COLUMNS:
-            continue
-        times, values = channels.setdefault(name, (array("d"), array("d")))
-        if len(times) >= MAX_ROWS:
-            problem = f"more than the {MAX_ROWS} rows that a log may have"
-            raise InputError(problem, source=head.path, cure="split it")
-        times.append(message.time_ns / 1_000_000_000)
-        values.append(value)
-
-
-def _numbers(fields: Mapping[str, Any], before: str) -> Iterator[tuple[str, float]]:
-    """Yield the numbers of an object and of objects in it, by their dotted names."""
-    for name, value in fields.items():
-        if isinstance(value, dict):
-            yield from _numbers(value, f"{before}{name}.")
-        elif isinstance(value, int | float) and not isinstance(value, bool):
-            yield f"{before}{name}", float(value)
-
-
-def _draft_of_samples(head: Head, found: Mapping[str, MeasuredChannel]) -> DraftLog:
-    """Return the samples of a recording; a value that one lacks is filled from its neighbours."""
-    draft = DraftLog(head.name, str(head.path))
-    rows = found.get("time_s")
-    if rows is None or "current_a" not in found or "voltage_v" not in found:
-        problem = "the samples lack time, current or voltage"
-        raise InputError(problem, source=head.path, cure="record it again")
-    draft.values["time_s"] = rows.values
-    for field in FIELDS.values():
-        if field in found and field != "time_s":
-            is_held = field in {"temperature_c", "soc_pct"}
-            draft.values[field], _ = _on_raster(rows.time_s, found[field], field, is_held=is_held)
-        draft.labels[field] = f"/sample {field}"
-    return draft
-
-
-READERS: Final = (Mf4Signals(), McapSamples())
+READERS: Final = (Mf4Signals(),)
