@@ -100,17 +100,18 @@ def read_beginning(file: io.BufferedReader, size: int) -> bytes:
 
 def read_all(file: BinaryIO, path: str | PathLike[str], limit: int, what: str) -> bytes:
     """Return the rest of an open file; raise InputError if it has more than `limit` bytes."""
-    data = bytearray()
-    while len(data) <= limit and (piece := file.read(MIB)):
-        data += piece
-    if len(data) > limit:
+    pieces, size_read = list[bytes](), 0
+    while size_read <= limit and (piece := file.read(MIB)):
+        pieces.append(piece)
+        size_read += len(piece)
+    if size_read > limit:
         size = f"{limit // MIB} MB" if limit >= MIB else f"{limit // 1024} kB"
         raise InputError(
             f"larger than the {size} that {what} may have",
             source=path,
             cure="check that this is the right file, or split it",
         )
-    return bytes(data)
+    return b"".join(pieces)
 
 
 def read_bounded(path: str | PathLike[str], limit: int, what: str) -> bytes:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
 
@@ -492,3 +493,35 @@ def test_local_dates_of_a_zone_are_seconds_since_1970(tmp_path: Path, mark: str)
     columns = f"time={heading.replace(',', '+')}[Europe/Berlin]"
     log = read(tmp_path, f"{heading},Current,Voltage,Temp", rows, columns)
     np.testing.assert_array_equal(log.time_s, 1_711_846_798.0 + np.arange(3.0))
+
+
+# ---- numbers first, spellings where that fails
+
+
+@pytest.mark.parametrize(
+    ("cell", "amps"),
+    [("\u22127", -7.0), ("7 A", 7.0), ("1'800", 1800.0), ("Current", np.nan), ("n/a", np.nan)],
+)
+def test_a_spelling_far_below_the_first_rows(tmp_path: Path, cell: str, amps: float) -> None:
+    rows = [f"{k},{k % 7},360,20" for k in range(ROWS)]
+    if cell.endswith("A"):
+        rows = [f"{k},{k % 7} A,360,20" for k in range(ROWS)]
+    rows[500] = f"500,{cell},360,20"
+    log = read(tmp_path, "Time [s],Current,Voltage [V],Temp [°C]", rows, "current=Current:1.0001")
+    at = np.flatnonzero(log.time_s == 500.0)
+    np.testing.assert_allclose(log.current_a[at], [] if np.isnan(amps) else [amps], rtol=1e-3)
+    assert len(log) == ROWS - int(np.isnan(amps))
+
+
+def test_marks_of_one_column_tell_those_of_another(tmp_path: Path) -> None:
+    rows = [f'{k},"{1000 + k:,}",{360 + k % 5 / 10},20' for k in range(ROWS)]
+    log = read(tmp_path, "Time [s],Current [mA],Voltage [V],Temp [°C]", rows)
+    np.testing.assert_allclose(log.current_a, 1.0 + 1e-3 * np.arange(ROWS))
+
+
+@pytest.mark.parametrize("stamp", ["%Y-%m-%d %H:%M:%S", "%Y-%m-%dT%H:%M:%SZ", "%d.%m.%Y %H:%M:%S"])
+def test_dates_are_read_alike_however_they_are_spelled(tmp_path: Path, stamp: str) -> None:
+    start = datetime(2024, 3, 13, 23, 55, tzinfo=UTC)
+    rows = [f"{start + timedelta(seconds=k):{stamp}},{k % 7},360,20" for k in range(ROWS)]
+    log = read(tmp_path, "Time,Current [A],Voltage [V],Temp [°C]", rows)
+    np.testing.assert_array_equal(log.time_s, start.timestamp() + np.arange(ROWS))

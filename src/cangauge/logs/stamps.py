@@ -7,6 +7,7 @@ only differences matter.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
 from typing import Any, Final
 from zoneinfo import ZoneInfo, ZoneInfoNotFoundError
 
@@ -187,6 +188,9 @@ def seconds_of_text(cells: Any, unit: str, source: str, label: str) -> tuple[Flo
     All cells are clock times (`1:02:03.5`, `2d 01:02:03`), or dates with or without a time of day.
     """
     cells = cells.combine_chunks() if isinstance(cells, pa.ChunkedArray) else cells
+    iso = _iso_dates(cells, unit)
+    if iso is not None:
+        return iso
     spelled = _spelled_alike(cells)
     known = np.asarray(pc.is_valid(spelled).to_numpy(zero_copy_only=False), dtype=bool)
     first = spelled[int(np.argmax(known))].as_py() if known.any() else ""
@@ -205,6 +209,23 @@ def seconds_of_text(cells: Any, unit: str, source: str, label: str) -> tuple[Flo
         return _dates(parts, of_day_s, unit)
     values = np.nan_to_num(_numbers(parts, "d")) * 86400.0 + of_day_s
     return _over_midnight(values), "clock time"
+
+
+def _iso_dates(cells: Any, unit: str) -> tuple[FloatArray, str] | None:
+    """Return ISO dates as `seconds_of_text`, at a tenth of the cost; None if any is spelled else.
+
+    Examples
+    --------
+    >>> _iso_dates(pa.array(["2024-03-13T23:59:30.5Z"]), "")
+    (array([1.71037437e+09]), 'date with zone')
+    """
+    for zone in (None, "UTC"):
+        with suppress(pa.ArrowInvalid):
+            stamps = pc.cast(cells, pa.timestamp("us", zone))
+            micros = stamps.cast(pa.int64()).cast(pa.float64())
+            values = np.asarray(micros.to_numpy(zero_copy_only=False), dtype=np.float64) / 1e6
+            return (values, "date with zone") if zone else _in_zone(values, "date", unit)
+    return None
 
 
 def _over_midnight(of_day_s: FloatArray) -> FloatArray:
@@ -228,13 +249,18 @@ def _dates(parts: Any, of_day_s: FloatArray, unit: str) -> tuple[FloatArray, str
         hours, minutes = (np.nan_to_num(_numbers(parts, name)) for name in ("zh", "zm"))
         sign = np.where(_words(parts, "sign") == "-", -1.0, 1.0)
         return values - sign * (hours * 3600.0 + minutes * 60.0), f"date{how} with zone"
+    return _in_zone(values, f"date{how}", unit)
+
+
+def _in_zone(values: FloatArray, how: str, unit: str) -> tuple[FloatArray, str]:
+    """Return dates without a zone as seconds since 1970 (UTC), and how they were read."""
     zone = _zone_of(unit)
     if zone is None:
-        return values, f"date{how} without zone"
+        return values, f"{how} without zone"
     local = pa.array(values * 1e6, from_pandas=True).cast(pa.int64()).cast(pa.timestamp("us"))
     utc = pc.assume_timezone(local, zone.key, ambiguous="earliest", nonexistent="latest")
     micros = utc.cast(pa.int64()).cast(pa.float64()).to_numpy(zero_copy_only=False)
-    return np.asarray(micros) / 1e6, f"date{how} in {zone.key}"
+    return np.asarray(micros) / 1e6, f"{how} in {zone.key}"
 
 
 def _order(fields: FloatArray, unit: str, *, is_word: bool) -> tuple[str, str]:

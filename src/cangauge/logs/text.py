@@ -7,7 +7,7 @@ columns, and a last line that is cut off.
 from __future__ import annotations
 
 import csv
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from itertools import chain, product
 from typing import Any, Final, NamedTuple
@@ -22,7 +22,7 @@ from cangauge.logs.column_map import Choice, ColumnMap, are_canonical, choose_co
 from cangauge.logs.headings import meaning_of
 from cangauge.logs.stamps import is_stamp
 from cangauge.logs.units import FIELDS, unit_of
-from cangauge.logs.values import MISSING, is_number
+from cangauge.logs.values import MISSING, is_bare, is_number, is_spelled, is_text
 
 MAX_ROWS: Final = 20_000_000
 """Rows of a log: 23 days at 10 Hz, 0.8 GB as float64."""
@@ -46,37 +46,24 @@ class TextTable(NamedTuple):
     remarks: list[str]
 
     def columns(self, places: Sequence[int]) -> dict[int, Any]:
-        """Read columns as text, null where there is no value.
+        """Read columns as numbers, or as text where their cells are spelled otherwise.
 
-        A cut last line and closing remarks of the exporter are left out, with a remark.
+        Null stands where there is no value. A cut last line and closing remarks of the exporter
+        are left out, with a remark.
 
         Raises
         ------
         InputError
             If there is no row, or a row in the middle has the wrong number of cells.
         """
-        data, odd_rows = as_utf8(self.head.read()), list[Any]()
-        names = [f"c{place}" for place in range(self._width())]
-        wanted = list(dict.fromkeys(names[place] for place in places))
-
-        def skip(row: Any) -> str:
-            odd_rows.append(row)
-            return "skip"
-
-        # One thread: otherwise pyarrow does not number odd rows.
-        how = pacsv.ReadOptions(use_threads=False, column_names=names, skip_rows=self.skip_lines)
-        rows = pacsv.ParseOptions(delimiter=self.delimiter, invalid_row_handler=skip)
-        cells = pacsv.ConvertOptions(
-            include_columns=wanted,
-            column_types=dict.fromkeys(wanted, pa.string()),
-            null_values=_NULLS,
-            strings_can_be_null=True,
-        )
+        data = as_utf8(self.head.read())
+        width = self._width()
+        kinds = self._kinds(places)
         try:
-            table = pacsv.read_csv(pa.BufferReader(data), how, rows, cells)
-        except pa.ArrowInvalid as error:
-            problem = f"the table cannot be read: {str(error).splitlines()[0]}"
-            raise self._error(problem, "export it again") from error
+            table, odd_rows = self._read(data, width, kinds)
+        except pa.ArrowInvalid:  # a cell that is no bare number: read the spellings
+            kinds = dict.fromkeys(kinds, pa.string())
+            table, odd_rows = self._read_text(data, width, kinds)
         self._remark_odd(odd_rows, table.num_rows)
         if table.num_rows > MAX_ROWS:
             raise self._error(f"more than the {MAX_ROWS} rows that a log may have", "split it")
@@ -85,11 +72,61 @@ class TextTable(NamedTuple):
         if not data.endswith((b"\n", b"\r")):
             doubt = "if the file was cut off, its last value may be short"
             self.remarks.append(f"the last line has no line end: {doubt}")
-        return {place: self._values(table.column(f"c{place}"), place) for place in places}
+        return {place: self._values(table.column(f"c{place}"), place) for place in kinds}
+
+    def _kinds(self, places: Sequence[int]) -> dict[int, Any]:
+        """Return the type by which each column is read: numbers, unless a first cell is spelled.
+
+        Decimal commas, thousands and units concern the numbers of the whole table, which is then
+        text.
+        """
+        rows = [split_cells(line, self.delimiter) for line in self.head.lines[self.skip_lines :]]
+        first = {place: _first_value(rows, place) for place in places}
+        if any(map(is_spelled, first.values())):
+            return dict.fromkeys(first, pa.string())
+        return {
+            place: pa.float64() if is_bare(cell) or not cell else pa.string()
+            for place, cell in first.items()
+        }
+
+    def _read(self, data: bytes, width: int, kinds: Mapping[int, Any]) -> tuple[Any, list[Any]]:
+        """Return columns by their types, and the rows of another width."""
+        odd_rows = list[Any]()
+
+        def skip(row: Any) -> str:
+            odd_rows.append(row)
+            return "skip"
+
+        types = {f"c{place}": kind for place, kind in kinds.items()}
+        # One thread: otherwise pyarrow does not number odd rows.
+        how = pacsv.ReadOptions(
+            use_threads=False,
+            column_names=[f"c{place}" for place in range(width)],
+            skip_rows=self.skip_lines,
+        )
+        rows = pacsv.ParseOptions(delimiter=self.delimiter, invalid_row_handler=skip)
+        cells = pacsv.ConvertOptions(
+            include_columns=[*types],
+            column_types=types,
+            null_values=_NULLS,
+            strings_can_be_null=True,
+        )
+        return pacsv.read_csv(pa.BufferReader(data), how, rows, cells), odd_rows
+
+    def _read_text(
+        self, data: bytes, width: int, kinds: Mapping[int, Any]
+    ) -> tuple[Any, list[Any]]:
+        try:
+            return self._read(data, width, kinds)
+        except pa.ArrowInvalid as error:
+            problem = f"the table cannot be read: {str(error).splitlines()[0]}"
+            raise self._error(problem, "export it again") from error
 
     def _values(self, cells: Any, place: int) -> Any:
         """Return cells, null where a restarted logger wrote its header again."""
         heading = self.headings[place] if place < len(self.headings) else ""
+        if not is_text(cells):
+            return cells
         is_heading = pc.equal(pc.utf8_trim_whitespace(cells), heading)
         return pc.if_else(is_heading, None, cells) if pc.any(is_heading).as_py() else cells
 
@@ -129,6 +166,11 @@ def split_cells(line: str, delimiter: str) -> list[str]:
     """Split a line into cells, without enclosing blanks and quotes."""
     reader = csv.reader([line], delimiter=delimiter, skipinitialspace=True)
     return [cell.strip() for cell in next(reader, [])]
+
+
+def _first_value(rows: Sequence[Sequence[str]], place: int) -> str:
+    cells = (row[place] for row in rows if place < len(row))
+    return next((cell for cell in cells if cell.lower() not in MISSING), "")
 
 
 def _is_value(cell: str) -> bool:

@@ -17,6 +17,7 @@ _WORDS: Final = "nan na n/a #n/a null none - -- 1.#qnan -1.#ind unknown unavaila
 MISSING: Final = ("", *_WORDS.split())
 """Cells without a value, in lower case."""
 _WITH_UNIT: Final = r"^(?P<number>[-+]?[\d.]+(?:[eE][-+]?\d+)?)\s*(?P<unit>\D{1,4})$"
+_BARE: Final = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?")
 _NUMBER: Final = r"^[-+]?[\d.,]*\d[\d.,]*(?:[eE][-+]?\d+)?\s*\D{0,4}$"
 _SPELLINGS: Final = (("[\u2212\u2013]", "-"), ("['\u2019\u00a0\u202f](\\d{3})", r"\1"))
 """A typographic minus; 1'800."""
@@ -32,6 +33,18 @@ def is_number(text: str) -> bool:
     except ValueError:
         return False
     return True
+
+
+def is_bare(text: str) -> bool:
+    """Return whether a cell is a number as programs write it."""
+    return _BARE.fullmatch(text) is not None
+
+
+def is_spelled(text: str) -> bool:
+    """Return whether a cell is a number of another spelling: `1.800,5`, `53.2 V`, `−7`."""
+    for pattern, replacement in _SPELLINGS:
+        text = re.sub(pattern, replacement, text)
+    return re.match(_NUMBER, text) is not None and not is_bare(text)
 
 
 def is_text(column: Any) -> bool:
