@@ -2,7 +2,7 @@
 
     python benchmarks/nightly.py [PART…] [--data FOLDER] [--socketcan COMMAND]
 
-fuzz     every reader on 300,000 mutants of small valid files, and the tests of `tests/nightly`
+inputs   the tests of `tests/nightly`: any frames on the bus, damaged files, wrong use of commands
 faults   the table of faults on a live bus
 grade    the estimator on recorded packs, and the diagnosis on its frozen cases (need --data)
 suite    the score cards of three gauges: our service, a counter, filterpy's filter
@@ -52,10 +52,7 @@ def commands(data: Path | None, socketcan: str) -> dict[str, list[list[str]] | s
     )
     missing = "no folder of recorded logs: --data FOLDER"
     return {
-        "fuzz": [
-            [python, "-m", "pytest", "tests/nightly"],
-            [python, "benchmarks/fuzz.py", "--inputs", "300000"],
-        ],
+        "inputs": [[python, "-m", "pytest", "tests/nightly"]],
         "faults": [[python, "-m", "faults", *bus]],
         "grade": [
             [python, "-m", "packs", "--data", str(data)],

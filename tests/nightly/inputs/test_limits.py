@@ -16,13 +16,13 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
+import small_files
 from cangauge.bus.captures import open_capture
 from cangauge.bus.recording import read_log
 from cangauge.errors import InputError
 from cangauge.model.effects.library import LIBRARY
 from cangauge.model.model_file import Model
 from cangauge.service.config import load_config
-from fuzzing import corpus
 
 HEADER = b"time_s,current_a,voltage_v,temperature_c\n"
 FRAME = b"(1436509052.249713) can0 1DB#0004C262000003B6\n"
@@ -89,7 +89,7 @@ def test_configurations(tmp_path: Path, text: str) -> None:
 )
 def test_models(tmp_path: Path, change: dict[str, object]) -> None:
     path = tmp_path / "x.json"
-    tree = json.loads(json.dumps(corpus.model_tree()))
+    tree = json.loads(json.dumps(small_files.model_tree()))
     path.write_text(json.dumps(tree))
     assert len(Model.load(path).effects) == len(LIBRARY)
     for key, value in change.items():
@@ -103,9 +103,9 @@ def test_stamps_that_are_no_time_are_malformed(tmp_path: Path) -> None:
     for stamp in (b"9" * 400 + b".0", b"9" * 12 + b".0"):
         path.write_bytes(FRAME * 3 + FRAME.replace(b"1436509052.249713", stamp))
         assert sum(1 for _ in open_capture(path)) == 3
-    table = corpus.capture_files()["table.csv"]
+    table = small_files.capture_files()["table.csv"]
     path.write_bytes(table + table.splitlines()[-1].replace(b"1001100", b"9" * 400) + b"\n")
-    assert sum(1 for _ in open_capture(path)) == len(corpus.leaf_frames())
+    assert sum(1 for _ in open_capture(path)) == len(small_files.leaf_frames())
 
 
 def test_python_cans_log_lines_are_not_printed(tmp_path: Path) -> None:

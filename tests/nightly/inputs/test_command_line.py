@@ -11,11 +11,11 @@ from typing import Any, NamedTuple
 
 import pytest
 
+import small_files
 from cangauge._resources import shared_file
 from cangauge.cli import app as line
 from cangauge.cli.app import load_command, main
 from cangauge.model.model_file import Model
-from fuzzing import corpus
 
 # `status` answers 1 where no service runs, `gap-check` draws its own cases, and `fleet` has
 # commands of its own: see tests/service, tests/cli, tests/validation and tests/fleet.
@@ -67,7 +67,7 @@ def run(
     Path("model.json").write_text(model_text)
     Path("file.txt").write_text("x\n")
     Path("one.csv").write_text("time_s,current_a,voltage_v,temperature_c\n0,1,380,20\n")
-    Path("log.csv").write_bytes(corpus.csv_log())
+    Path("log.csv").write_bytes(small_files.csv_log())
 
     def call(*args: str) -> Ran:
         monkeypatch.setattr(sys, "argv", ["cangauge", *args])
