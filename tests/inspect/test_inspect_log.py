@@ -13,9 +13,9 @@ from hypothesis import strategies as st
 
 from cangauge._text import plain
 from cangauge.bus.recording import read_log
-from cangauge.inspect.channels import quantum_of
 from cangauge.inspect.log import LogInspection, inspect_log
 from cangauge.logs.log import Log
+from cangauge.logs.resolution import quantum_of
 
 
 def drive(minutes: float = 30.0, *, rate_hz: float = 10.0, seed: int = 1) -> Log:

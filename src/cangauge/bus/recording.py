@@ -34,8 +34,13 @@ from cangauge.logs.column_map import ColumnMap
 from cangauge.logs.draft import Sign
 from cangauge.logs.log import Log, TemperatureSource
 from cangauge.logs.read import KNOWN_LOGS, LogFile, not_recognised, open_log
-from cangauge.logs.sign import resolve_sign
-from cangauge.logs.units import known_temperature_source, refuse_wrong_units
+from cangauge.logs.sign import require_discharge_positive, resolve_sign
+from cangauge.logs.units import (
+    WRAPPED,
+    known_temperature_source,
+    refuse_wrapped,
+    refuse_wrong_units,
+)
 from cangauge.types import Sample
 
 VOLTAGE_FILL_S: Final = 1.0
@@ -382,6 +387,19 @@ def capture_to_log(path: str | PathLike[str], vehicle: Vehicle) -> Log:
     return resolve_sign(log, stored_sign_unknown=False)
 
 
+def refuse_odd_current(samples: CaptureSamples, vehicle: Vehicle) -> None:
+    """Raise InputError if the current of a capture was read unsigned, or is inverted."""
+    log = samples.as_log()
+    if log is None:
+        return
+    try:
+        name = vehicle.current.codec.name
+        refuse_wrapped(log.current_a, log.voltage_v, samples.source, name)
+    except InputError as error:
+        raise _of_capture(error, vehicle) from error
+    require_discharge_positive(log, is_capture=True)
+
+
 def _of_capture(error: InputError, vehicle: Vehicle) -> InputError:
     """Return an error about values with a cure in the map file, as a capture has no columns."""
     named = {each.codec.name: each for each in vehicle.signals}
@@ -392,6 +410,8 @@ def _of_capture(error: InputError, vehicle: Vehicle) -> InputError:
     cure = f"state scale and offset {table}: they replace the DBC's unit"
     if "swapped" in (error.cure or ""):
         cure = "exchange the two signals in the map file"
+    elif error.problem.endswith(WRAPPED):
+        cure = f"state signed = true {table}"
     elif error.problem.startswith("row "):
         codec = signal.codec
         raw = round(((value - codec.shift) / codec.gain - codec.offset) / codec.factor)

@@ -16,22 +16,12 @@ from cangauge.bus.plausibility import (
     stuck_detectors,
 )
 from cangauge.logs.log import Log
+from cangauge.logs.resolution import quantum_of
 
 CURRENT_SHARE: Final = 0.05
 """Smallest swing of current that must move the voltage, of its range [-]."""
 VOLTAGE_SHARE: Final = 0.002
 """Smallest swing of voltage that must move the current, relative to its median [-]."""
-
-_FREQUENT: Final = (3, 6, 12, 50)
-"""Numbers of most frequent values whose differences are candidates for the quantum."""
-_MIN_PLACES: Final = 4
-"""Fewest occupied places of a grid."""
-_ON_PLACE: Final = 0.9
-"""Least share of the rows on a grid that hold the main value of their place."""
-_ON_GRID: Final = 0.95
-"""Least share of the rows on a grid."""
-_OFF_GRID: Final = 0.05
-"""Largest distance from a place of the grid, in quanta."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,37 +73,6 @@ def _described(values: FloatArray, unit: str) -> Channel:
     low, high, median = float(finite.min()), float(finite.max()), float(np.median(finite))
     levels, missing = int(np.unique(finite).size), int(values.size - finite.size)
     return Channel(unit, low, high, median, quantum_of(finite), levels, missing)
-
-
-def quantum_of(values: FloatArray) -> float | None:
-    """Return the quantization step of finite values, shape (n,), or None if there is none.
-
-    It is the largest step on whose grid (through the most frequent value) 95 % of the values lie,
-    so that a few interpolated rows do not hide it. Candidates are differences between
-    neighbouring values, of the frequent ones and of all.
-    """
-    distinct, count = np.unique(values, return_counts=True)
-    if distinct.size < _MIN_PLACES:
-        return None
-    noise = 1e-9 * max(abs(float(distinct[0])), abs(float(distinct[-1])))
-    by_count = distinct[np.argsort(-count, kind="stable")]
-    groups = (*(by_count[:k] for k in _FREQUENT), distinct)
-    steps = [np.quantile(np.diff(np.sort(each)), [0.0, 0.02, 0.1, 0.5]) for each in groups]
-    for step in sorted({float(step) for each in steps for step in each}, reverse=True):
-        if step <= noise:
-            break
-        offset = (distinct - by_count[0]) / step
-        near = np.abs(offset - np.rint(offset)) < _OFF_GRID
-        place, weight = np.rint(offset[near]), count[near]
-        places, first = np.unique(place, return_index=True)
-        if places.size < _MIN_PLACES or weight.sum() < _ON_GRID * values.size:
-            continue
-        # Several values at one place (64.98 and 65.00 on a grid of 65) mean a finer step.
-        if np.maximum.reduceat(weight, first).sum() >= _ON_PLACE * weight.sum():
-            from_origin = distinct[near] - by_count[0]
-            fitted = np.sum(weight * place * from_origin) / np.sum(weight * place * place)
-            return float(f"{fitted:.5g}")
-    return None
 
 
 def _stuck(

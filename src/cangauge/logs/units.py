@@ -11,6 +11,7 @@ import numpy as np
 
 from cangauge._typing import BoolArray, FloatArray
 from cangauge.errors import COLDEST_C, HOTTEST_C, InputError
+from cangauge.logs.resolution import wrapped_current
 
 TemperatureSource = Literal["cell", "pack", "coolant", "room", "unknown"]
 TEMPERATURE_SOURCES: Final[tuple[str, ...]] = get_args(TemperatureSource)
@@ -98,6 +99,9 @@ _EXCEL_1990: Final = 32_874.0
 _RARE: Final = 1e-3
 """Fraction of impossible currents up to which they are codes, not another unit [-]."""
 
+WRAPPED: Final = "a signed value was read as unsigned"
+"""What is wrong with a current of one sign that wraps."""
+
 _Wrong = tuple[float, str, str, list[str]]
 """A value that contradicts its unit, the problem, the cure, and units that the user may state."""
 
@@ -169,7 +173,8 @@ def refuse_wrong_units(
     stated : collection of str
         Columns whose unit the user states.
     """
-    voltage, temperature = values["voltage_v"], values["temperature_c"]
+    current, voltage = values["current_a"], values["voltage_v"]
+    temperature = values["temperature_c"]
     voltage_label = labels.get("voltage_v", "voltage_v")
     is_low = bool(COLDEST_C <= np.median(voltage) <= _UNUSUALLY_HOT_C)  # as a temperature
     checks = (
@@ -177,10 +182,11 @@ def refuse_wrong_units(
         # Before the voltage: a temperature in its place looks like kilovolts.
         ("temperature_c", _swapped(temperature, voltage_label) if is_low else ()),
         ("voltage_v", _wrong_voltage(voltage)),
-        ("current_a", _wrong_current(values["current_a"])),
+        ("current_a", _wrong_current(current)),
         ("soc_pct", _wrong_soc(values.get("soc_pct"), is_stated="soc_pct" in stated)),
         ("temperature_c", _wrong_temperature(temperature, may_be_swapped=is_low)),
     )
+    refuse_wrapped(current, voltage, source, labels.get("current_a", "current_a"))
     for field, found in checks:
         label = labels.get(field, field)
         for value, problem, cure, units in found:  # the first is raised
@@ -294,6 +300,17 @@ def _wrong_voltage(voltage: FloatArray) -> Iterator[_Wrong]:
     if typical < 1.0:
         yield typical, "voltage looks like kilovolts", "convert it to volts", ["kV"]
     yield from _odd_row(voltage, np.abs(voltage) > _MAX_VOLTAGE_V, "a battery's voltage")
+
+
+def refuse_wrapped(current: FloatArray, voltage: FloatArray, source: object, label: str) -> None:
+    """Raise InputError if a signed current was read as unsigned; shape (n,) in A and V."""
+    found = wrapped_current(current, voltage)
+    if found is not None:
+        field = f"{found.bits} bits unsigned of {found.step_a:g} A"
+        problem = f"the current wraps at {found.wraps_at_a:.7g} A ({field}): {WRAPPED}"
+        cure = f"read it as signed: {found.wraps_at_a:.7g} A less, from half of that on"
+        value = found.reading_a
+        raise InputError(problem, source=str(source), field=label, value=value, cure=cure)
 
 
 def _wrong_current(current: FloatArray) -> Iterator[_Wrong]:

@@ -1,0 +1,122 @@
+"""Resolution of a channel: its quantization step, and a current read without its sign."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import product
+from typing import Final
+
+import numpy as np
+
+from cangauge._typing import FloatArray
+
+_FREQUENT: Final = (3, 6, 12, 50)
+"""Numbers of most frequent values whose differences are candidates for the quantum."""
+_MIN_PLACES: Final = 4
+"""Fewest occupied places of a grid."""
+_ON_PLACE: Final = 0.9
+"""Least share of the rows on a grid that hold the main value of their place."""
+_ON_GRID: Final = 0.95
+"""Least share of the rows on a grid."""
+_OFF_GRID: Final = 0.05
+"""Largest distance from a place of the grid, in quanta."""
+_HUGS: Final = 0.05
+"""Largest distance of the reading nearest to zero from it, relative to the range [-]."""
+_FIELDS: Final = tuple(
+    product((16, 15, 32, 14, 13, 12, 11, 10), (0.1, 0.01, 0.001, 1.0, 0.05, 0.5, 0.02, 0.025, 0.25))
+)
+"""Width [bit] and step [A] of a current's field on a bus, the usual ones first."""
+_USUAL_BITS: Final = (16, 15, 32)
+"""Widths by which readings that never come near zero are those of a field [bit]."""
+
+
+@dataclass(frozen=True, slots=True)
+class WrappedCurrent:
+    """A signed current that was read as unsigned: below zero it continues from `wraps_at_a`.
+
+    `wraps_at_a` is `2**bits * step_a` [A], `reading_a` the largest reading [A].
+    """
+
+    wraps_at_a: float
+    bits: int
+    step_a: float
+    reading_a: float
+
+
+def wrapped_current(current_a: FloatArray, voltage_v: FloatArray) -> WrappedCurrent | None:
+    """Return where a current wraps, or None if it does not.
+
+    The readings have one sign. Less `wraps_at_a` where they exceed its half, some come near zero,
+    and the voltage follows their steps better than those of the readings: it does not move where
+    a current passes zero, which is a step of `wraps_at_a` in the readings.
+
+    Parameters
+    ----------
+    current_a, voltage_v : array of shape (n,)
+        Readings [A], of either sign, and voltage [V].
+    """
+    is_negative = bool(np.all(current_a <= 0.0))
+    if not is_negative and np.any(current_a < 0.0):
+        return None
+    readings = np.abs(current_a)
+    largest = float(readings.max())
+    steps = np.diff(readings)
+    passes_zero = bool(np.any(np.abs(steps) > 0.5 * largest))
+    if not passes_zero and readings.min() <= 0.5 * largest:
+        return None
+    is_high = readings > 0.5 * largest
+    range_a = float(np.ptp(np.where(is_high, readings - largest, readings)))
+    fields = (
+        (bits, step_a)
+        for bits, step_a in _FIELDS
+        if 0.0 <= 2.0**bits * step_a * (1.0 + 1e-9) - largest <= _HUGS * range_a
+    )
+    bits, step_a = next(fields, (0, 0.0))
+    if not bits:
+        return None
+    wraps_at_a = 2.0**bits * step_a
+    if passes_zero:
+        unwrapped = np.where(is_high, readings - wraps_at_a, readings)
+        moved_v = np.diff(voltage_v)
+        is_wrapped = _explained(np.diff(unwrapped), moved_v) > _explained(steps, moved_v)
+    else:
+        is_wrapped = bits in _USUAL_BITS
+    reading_a = -largest if is_negative else largest
+    return WrappedCurrent(wraps_at_a, bits, step_a, reading_a) if is_wrapped else None
+
+
+def _explained(steps_a: FloatArray, moved_v: FloatArray) -> float:
+    """Return the share of the voltage's steps that follows steps of a current [-]."""
+    size = float(np.sum(steps_a**2) * np.sum(moved_v**2))
+    return float(np.sum(steps_a * moved_v)) ** 2 / size if size else 0.0
+
+
+def quantum_of(values: FloatArray) -> float | None:
+    """Return the quantization step of finite values, shape (n,), or None if there is none.
+
+    It is the largest step on whose grid (through the most frequent value) 95 % of the values lie,
+    so that a few interpolated rows do not hide it. Candidates are differences between
+    neighbouring values, of the frequent ones and of all.
+    """
+    distinct, count = np.unique(values, return_counts=True)
+    if distinct.size < _MIN_PLACES:
+        return None
+    noise = 1e-9 * max(abs(float(distinct[0])), abs(float(distinct[-1])))
+    by_count = distinct[np.argsort(-count, kind="stable")]
+    groups = (*(by_count[:k] for k in _FREQUENT), distinct)
+    steps = [np.quantile(np.diff(np.sort(each)), [0.0, 0.02, 0.1, 0.5]) for each in groups]
+    for step in sorted({float(step) for each in steps for step in each}, reverse=True):
+        if step <= noise:
+            break
+        offset = (distinct - by_count[0]) / step
+        near = np.abs(offset - np.rint(offset)) < _OFF_GRID
+        place, weight = np.rint(offset[near]), count[near]
+        places, first = np.unique(place, return_index=True)
+        if places.size < _MIN_PLACES or weight.sum() < _ON_GRID * values.size:
+            continue
+        # Several values at one place (64.98 and 65.00 on a grid of 65) mean a finer step.
+        if np.maximum.reduceat(weight, first).sum() >= _ON_PLACE * weight.sum():
+            from_origin = distinct[near] - by_count[0]
+            fitted = np.sum(weight * place * from_origin) / np.sum(weight * place * place)
+            return float(f"{fitted:.5g}")
+    return None
