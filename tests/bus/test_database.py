@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import pickle
 import re
+import time
 import tracemalloc
 import warnings
 from pathlib import Path
@@ -286,3 +287,50 @@ def test_a_comment_may_hold_any_numbers(tmp_path: Path) -> None:
         'CM_ BO_ 1 "40000|8@1 \\"SG_MUL_VAL_ 1-4000000000";\n'
     )
     assert load_dbc(tmp_path / "x.dbc").messages[0].name == "M"
+
+
+PACK = (
+    'VERSION ""\nNS_ :\nBS_:\nBU_: E\nBO_ 854 PACK: 8 E\n'
+    ' SG_ U : 0|16@1+ (0.1,0) [0|0] "V" E\n SG_ I : 16|16@1- (0.1,0) [0|0] "A" E\n'
+)
+
+
+@pytest.mark.parametrize(
+    ("lines", "remark"),
+    [
+        ('VAL_ 854 Renamed 1 "on;" 0 "off" ;\n', "of a signal that is gone: Renamed"),
+        ('VAL_ 855 U 1 "on" ;\nSIG_VALTYPE_ 854 X : 1;\n', "of signals that are gone: U, X"),
+        ('BO_ 3221225472 VECTOR__INDEPENDENT_SIG_MSG: 0 Vector__XXX\n'
+         ' SG_ Old : 0|8@1+ (1,0) [0|0] "" E\nVAL_ 3221225472 Old 1 "on" ;\n', "gone: Old"),
+        ('CM_ SG_ 854 U "VAL_ 854 Renamed 1;";\n', ""),
+        ('BO_ 103727155 LEFT: 8 E\n SG_ A : 0|8@1+ (1,0) [0|0] "" E\n'
+         'VAL_ 103727155 A 1 "on" ;\n', "more than 11 bits are taken as extended"),
+    ],
+    ids=["value", "type", "unassigned", "comment", "flag"],
+)  # fmt: skip
+def test_lines_that_editors_leave_are_read_over(tmp_path: Path, lines: str, remark: str) -> None:
+    path, remarks = tmp_path / "x.dbc", list[str]()
+    path.write_text(PACK + lines)
+    read = load_dbc(path, remarks)
+    assert [each.name for each in read.messages[0].signals] == ["U", "I"]
+    assert all(each.is_extended_frame for each in read.messages[1:])
+    assert len(remarks) == bool(remark)
+    assert remark in "".join(remarks)
+
+
+@pytest.mark.parametrize("pages", [2, 4, 256])
+def test_nested_multiplexers_take_bounded_time(tmp_path: Path, pages: int) -> None:
+    path, depth = tmp_path / "x.dbc", 12
+    signals = [f' SG_ S{k} m0M : {2 * k}|2@1+ (1,0) [0|0] "" E\n' for k in range(1, depth)]
+    lines = [f"SG_MUL_VAL_ 256 S{k} S{k - 1} 0-{pages - 1};\n" for k in range(1, depth)]
+    path.write_text(
+        'VERSION ""\nNS_ :\nBS_:\nBU_: E\nBO_ 256 M: 64 E\n SG_ S0 M : 0|2@1+ (1,0) [0|0] "" E\n'
+        + "".join(signals + lines)
+    )
+    began_s = time.process_time()
+    if pages == 2:
+        assert len(load_dbc(path).messages[0].signals) == depth
+    else:
+        with pytest.raises(InputError, match="multiplexers select more than"):
+            load_dbc(path)
+    assert time.process_time() - began_s < 2.0

@@ -25,21 +25,11 @@ from numpy.typing import NDArray
 
 from cangauge._files import MIB, read_bounded
 from cangauge._typing import FloatArray
+from cangauge.bus.dbc_text import prepared
 from cangauge.errors import InputError, closest
 
 MAX_DBC_BYTES: Final = 4 * MIB
 """Parsing takes 1–6 s a megabyte; the largest files in use are smaller."""
-
-_MOST_BYTES: Final = 4095
-"""Of a message: a reply over ISO-TP."""
-_MOST_SELECTED: Final = 1 << 20
-"""Most values of multiplexers in a DBC; cantools keeps each of a range."""
-_TEXT: Final = re.compile(r'"(?:[^"\\]|\\.)*+"', re.DOTALL)
-_LENGTH: Final = re.compile(r"\bBO_\s++\d++\s++\w++\s*+:\s*+\+?(\d++)")
-_BITS: Final = re.compile(r"(?<!\d)(\d++)\s*+\|\s*+\+?(\d++)\s*+@")
-"""Start bit and length of a signal."""
-_SELECTED: Final = re.compile(r"\bSG_MUL_VAL_\s[^;]*+")
-_RANGE: Final = re.compile(r"(?<!\d)(\d++)\s*+[-+](\d++)")
 
 Decode = Callable[[bytes | bytearray], float]
 
@@ -363,11 +353,12 @@ def _codes_of_no_value(signal: Signal) -> frozenset[int]:
     return frozenset(int(raw) for raw, name in names.items() if _NOT_A_VALUE.search(str(name)))
 
 
-def load_dbc(path: str | PathLike[str]) -> Database:
+def load_dbc(path: str | PathLike[str], remarks: list[str] | None = None) -> Database:
     """Read a DBC file.
 
-    Overlapping signals are accepted: many files have some in messages that are not wanted.
-    Raises InputError if the file is absent, larger than `MAX_DBC_BYTES`, or not a DBC.
+    Overlapping signals are accepted: many files have some in messages that are not wanted. What is
+    read otherwise than it is written (`dbc_text.prepared`) is added to `remarks`. Raises InputError
+    if the file is absent, larger than `MAX_DBC_BYTES`, or not a DBC.
     """
     path = Path(path)
     data = read_bounded(path, MAX_DBC_BYTES, "a DBC")
@@ -377,40 +368,25 @@ def load_dbc(path: str | PathLike[str]) -> Database:
         text = data.decode("utf-8-sig")
     except UnicodeDecodeError:
         text = data.decode("cp1252", errors="replace")  # the encoding that most tools write
-    _refuse_huge(text, path)
     try:
+        text, changes = prepared(text, path)
         database = cantools.database.load_string(text, "dbc", strict=False)
     except (
         cantools.Error, LookupError, ValueError, TypeError, ArithmeticError, AttributeError,
         AssertionError,  # a multiplexed signal without a multiplexer
         RecursionError,  # signals multiplexed in a circle
     ) as error:  # fmt: skip
-        first_line = (str(error) or type(error).__name__).splitlines()[0][:160]
-        problem = f"not a DBC file that can be read: {first_line}"
+        words = " ".join((str(error) or type(error).__name__).split())[:160]
+        problem = f"not a DBC file that can be read: {words}"
         cure = "open it in a DBC editor, which names the error"
         if path.suffix.lower() in _CONVERTED:
             cure = f"convert it: python -m cantools convert {path} car.dbc"
         raise InputError(problem, source=path, cure=cure) from error
     if not isinstance(database, Database) or not database.messages:
         raise InputError("the DBC defines no messages", source=path)
+    if remarks is not None:
+        remarks += changes
     return database
-
-
-def _refuse_huge(text: str, path: Path) -> None:
-    """Raise InputError for the numbers of a damaged DBC for which cantools would take gigabytes."""
-    cure, text = "open it in a DBC editor, and correct the number", _TEXT.sub("", text)
-    for pattern, most in ((_LENGTH, _MOST_BYTES), (_BITS, 8 * _MOST_BYTES)):
-        for match in pattern.finditer(text):
-            if max(map(float, match.groups())) > most:
-                problem = f"a message of more than {_MOST_BYTES} bytes is not possible"
-                raise InputError(problem, source=path, value=match[0], cure=cure)
-    ranges = (each for some in _SELECTED.findall(text) for each in _RANGE.findall(some))
-    counts = (
-        math.inf if len(high) > 20 else max(float(high) - float(low), 0.0) for low, high in ranges
-    )
-    if sum(counts) > _MOST_SELECTED:
-        problem = f"SG_MUL_VAL_ selects by more than {_MOST_SELECTED} values"
-        raise InputError(problem, source=path, cure=cure)
 
 
 def find_message(database: Database, message: str | int, *, source: object, field: str) -> Message:

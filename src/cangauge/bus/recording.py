@@ -277,7 +277,8 @@ def capture_samples(path: str | PathLike[str], vehicle: Vehicle) -> CaptureSampl
     statistics = decoder.statistics
     if not values:
         raise _without_current(path, vehicle, statistics)
-    remarks = [*capture.info.remarks, *_losses(statistics), *decoder.wrong_periods.values()]
+    remarks = [*vehicle.remarks, *capture.info.remarks]
+    remarks += [*_losses(statistics), *decoder.wrong_periods.values()]
     if sum(bool(each[2]) for each in buses.values()) > 1:
         remarks.append(f"several buses carry the frames; bus {channel} is used: most samples")
     if recorded.name == "replay-clock":

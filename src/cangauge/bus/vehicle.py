@@ -122,7 +122,8 @@ class Vehicle:
 
     `fixed_temperature_c` is the temperature where no signal has it [°C]. `pair_within_s` is the
     largest distance in bus time between paired current and voltage [s]. `messages` has every
-    message with a wanted signal, by key (id, plus `EXTENDED`).
+    message with a wanted signal, by key (id, plus `EXTENDED`). `remarks` say what of the DBC files
+    is read otherwise than it is written.
     """
 
     name: str
@@ -136,6 +137,7 @@ class Vehicle:
     messages: dict[int, MessageProtection]
     dbc_files: tuple[str, ...]
     cells: CellSignals | None = None
+    remarks: tuple[str, ...] = ()
 
     @classmethod
     def load(
@@ -268,7 +270,8 @@ class _Binder:
 
     def __init__(self, mapping: VehicleMap, files: Sequence[Path], source: str) -> None:
         self._mapping, self._source = mapping, source
-        self._databases = [(load_dbc(path), path) for path in files]
+        self._remarks: list[str] = []
+        self._databases = [(load_dbc(path, self._remarks), path) for path in files]
         self._messages: dict[int, Message] = {}
 
     def vehicle(self, temperature_c: float | None, pair_within_s: float | None) -> Vehicle:
@@ -292,6 +295,7 @@ class _Binder:
             pair_within_s=within_s,
             messages=self._protections(),
             dbc_files=tuple(str(path) for _, path in self._databases),
+            remarks=tuple(self._remarks),
         )
 
     def _cells(self, wanted: CellsMap) -> CellSignals:

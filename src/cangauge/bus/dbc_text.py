@@ -1,0 +1,172 @@
+"""The text of a DBC before cantools reads it: what would take too long, and what it would refuse.
+
+cantools keeps a table of signals for each way through nested multiplexers. It refuses a file for
+one line about a signal that is gone, and for an extended id without its flag; many files in use
+have both.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections import defaultdict
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+from cangauge.errors import InputError
+
+MOST_BYTES: Final = 4095
+"""Of a message: a reply over ISO-TP."""
+_MOST_ENTRIES: Final = 1 << 17
+"""Most entries in cantools' tables of multiplexed signals, of which it makes 60,000 a second: two
+signals for every value of 16 bits."""
+_EXTENDED_FLAG: Final = 1 << 31
+_UNASSIGNED: Final = "VECTOR__INDEPENDENT_SIG_MSG"
+"""Message of editors for signals that are in no message; cantools leaves it out."""
+
+_QUOTED: Final = re.compile(r'"(?:[^"\\]|\\.)*+"', re.DOTALL)
+_LENGTH: Final = re.compile(r"\bBO_\s++\d++\s++\w++\s*+:\s*+\+?(\d++)")
+_BITS: Final = re.compile(r"(?<!\d)(\d++)\s*+\|\s*+\+?(\d++)\s*+@")
+"""Start bit and length of a signal."""
+_ID: Final = re.compile(
+    r"\b(?:BO_|SG_|VAL_|SIG_VALTYPE_|SG_MUL_VAL_|SIG_GROUP_|BO_TX_BU_)\s++(\d{4,10})\b"
+)
+_DEFINED: Final = re.compile(
+    r"\bBO_\s++(?P<id>\d++)\s++(?P<message>\w++)\s*+:"
+    r"|\bSG_\s++(?P<signal>\w++)\s*+(?P<mark>m\d++M?|M)?\s*+:"
+)
+_ABOUT: Final = re.compile(r"\b(VAL_|SIG_VALTYPE_)\s++(\d++)\s++(\w++)[^;]*+;")
+_SELECTED: Final = re.compile(r"\bSG_MUL_VAL_\s++(\d++)\s++(\w++)\s++(\w++)\s++([^;]*+)")
+_RANGE: Final = re.compile(r"(?<!\d)(\d++)\s*+[-+](\d++)")
+
+
+def prepared(text: str, path: Path) -> tuple[str, list[str]]:
+    """Return the text of a DBC as cantools reads it, and what was changed in it.
+
+    Lines about signals that are gone are left out, and ids of more than 11 bits get the flag of
+    extended ones. Raises InputError for a text that would take gigabytes or minutes.
+    """
+    remarks = []
+    bare = _without_content(text)
+    _refuse_numbers(bare, path)
+    unflagged = [each for each in _ID.finditer(bare) if 0x7FF < int(each[1]) < 0x20000000]
+    if unflagged:
+        text = _with_flags(text, unflagged)
+        bare = _without_content(text)
+        remarks.append("ids of more than 11 bits are taken as extended")
+    messages = _outline(bare)
+    gone = []
+    for match in _ABOUT.finditer(bare):
+        kind, number, name = match.groups()
+        if name not in messages.get(number, {}):
+            gone.append(match)
+        elif kind == "VAL_":
+            messages[number][name].named = match[0].count('"') // 2
+    _refuse_nesting(messages, bare, path)
+    for match in reversed(gone):
+        text = text[: match.start()] + text[match.end() :]
+    if gone:
+        names = list(dict.fromkeys(match[3] for match in gone))
+        shown = ", ".join(names[:3]) + (f" and {len(names) - 3} more" if len(names) > 3 else "")
+        what = "a signal that is" if len(gone) == 1 else "signals that are"
+        remarks.append(f"read without what it says of {what} gone: {shown}")
+    return text, [f"{path}: {remark}" for remark in remarks]
+
+
+def _without_content(text: str) -> str:
+    """Return a text whose quoted parts are blank: places in it are places in the original."""
+    return _QUOTED.sub(lambda match: '"' + " " * (len(match[0]) - 2) + '"', text)
+
+
+def _with_flags(text: str, ids: list[re.Match[str]]) -> str:
+    parts, place = [], 0
+    for match in ids:
+        parts += [text[place : match.start(1)], str(int(match[1]) | _EXTENDED_FLAG)]
+        place = match.end(1)
+    return "".join([*parts, text[place:]])
+
+
+def _refuse_numbers(bare: str, path: Path) -> None:
+    """Raise InputError for the numbers of a damaged DBC for which cantools would take gigabytes."""
+    for pattern, most in ((_LENGTH, MOST_BYTES), (_BITS, 8 * MOST_BYTES)):
+        for match in pattern.finditer(bare):
+            if max(map(float, match.groups())) > most:
+                problem = f"a message of more than {MOST_BYTES} bytes is not possible"
+                cure = "open it in a DBC editor, and correct the number"
+                raise InputError(problem, source=path, value=match[0], cure=cure)
+
+
+# --- Multiplexers
+
+
+@dataclass
+class _Signal:
+    """A signal in the text.
+
+    `selector` is the multiplexer that selects it, by `values` of its own; "": it is in every frame.
+    `named` is the number of its codes that have a name.
+    """
+
+    selector: str = ""
+    values: float = 1.0
+    named: int = 0
+
+
+_Messages = dict[str, dict[str, _Signal]]
+"""Signals by name, of all messages by id as it is written."""
+
+
+def _outline(bare: str) -> _Messages:
+    """Return the signals of all messages."""
+    messages: _Messages = {}
+    selectors: dict[str, str] = {}
+    marked: list[tuple[str, _Signal]] = []
+    number = ""
+    for match in _DEFINED.finditer(bare):
+        if match["id"]:
+            number = "" if match["message"] == _UNASSIGNED else match["id"]
+            continue
+        signal = messages.setdefault(number, {})[match["signal"]] = _Signal()
+        if match["mark"] == "M":
+            selectors[number] = match["signal"]
+        elif match["mark"]:
+            marked.append((number, signal))
+    messages.pop("", None)
+    for number, signal in marked:
+        signal.selector = selectors.get(number, "")
+    for number, name, selector, ranges in _SELECTED.findall(bare):
+        if name in messages.get(number, {}):
+            messages[number][name] = _Signal(selector, _count(ranges))
+    return messages
+
+
+def _count(ranges: str) -> float:
+    """Return how many values the ranges of a SG_MUL_VAL_ line have."""
+    count = 0.0
+    for low, high in _RANGE.findall(ranges):
+        count += math.inf if len(high) > 20 else max(float(high) - float(low) + 1.0, 0.0)
+    return count
+
+
+def _refuse_nesting(messages: _Messages, bare: str, path: Path) -> None:
+    """Raise InputError for multiplexers whose tables cantools would not make in seconds."""
+    listed = sum(_count(ranges) for *_, ranges in _SELECTED.findall(bare))
+    if max(listed, sum(map(_entries, messages.values()))) > _MOST_ENTRIES:
+        problem = f"its multiplexers select more than {_MOST_ENTRIES} signals"
+        cure = "remove the messages that are not wanted in a DBC editor"
+        raise InputError(problem, source=path, cure=cure)
+
+
+def _entries(signals: Mapping[str, _Signal]) -> float:
+    """Return how many entries the tables of a message's multiplexed signals have."""
+    selected = defaultdict[str, list[str]](list)
+    for name, signal in signals.items():
+        selected[signal.selector].append(name)
+
+    def below(name: str) -> float:
+        own = sum(signals[each].values * (1.0 + below(each)) for each in selected.pop(name, ()))
+        return own + (signals[name].named if own else 0)
+
+    return sum(below(name) for name in selected.pop("", ()))
