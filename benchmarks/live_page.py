@@ -157,7 +157,7 @@ def measure(number: int, case: str, seconds: float) -> dict[str, Any]:
     has_page, browsers, listeners = CASES[case]
     address = bus_address("udp_multicast", GROUP, {"port": BUS_PORT + number})
     port = PAGE_PORT + number
-    arguments = ["--initial-soc", "70", "--status-socket", "off"]
+    arguments = ["--initial-soc", "70", "--status-socket", f"/tmp/live-page-{number}.sock"]  # noqa: S108
     arguments += ["--dashboard", str(port)] if has_page else []
     running = service(address, *arguments, until_idle_s=3.0)
     with running as process, frames(address), ExitStack() as stack:

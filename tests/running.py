@@ -67,7 +67,8 @@ class RunningService:
         path = folder / "run.toml"
         path.write_text(
             f'model = "{leaf_model_path()}"\ninterface = "virtual"\nchannel = "{folder.name}"\n'
-            f'initial_soc = 80\nhttp = "127.0.0.1:{self.port}"\nstatus_socket = "off"\n{text}'
+            f'initial_soc = 80\nhttp = "127.0.0.1:{self.port}"\n'
+            f'status_socket = "{folder}/s.sock"\n{text}'
         )
         self.service = Service(path)
         self.silent = threading.Event()
@@ -83,6 +84,7 @@ class RunningService:
         for thread in self._threads:
             thread.start()
         assert waits(lambda: self.service.pipeline.samples > 5)
+        assert waits(self._is_served)
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -90,6 +92,13 @@ class RunningService:
         self.service.stop()
         for thread in self._threads:
             thread.join(10.0)
+
+    def _is_served(self) -> bool:
+        try:
+            socket.create_connection(("127.0.0.1", self.port)).close()
+        except OSError:
+            return False
+        return True
 
     def _serve(self) -> None:
         self.summary = self.service.run()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import subprocess
 import sys
 import threading
 from collections.abc import Callable
@@ -17,13 +18,11 @@ from cangauge.bus.open import BusAddress
 from cangauge.bus.reconnecting import ReconnectingBus
 from cangauge.errors import CangaugeError
 from cangauge.extras.inverter.gateway import Gateway
-from cangauge.extras.live import launch
-from cangauge.extras.live.addresses import http_address, mqtt_options
-from cangauge.extras.live.launch import Live
-from cangauge.service.config import MqttConfig
+from cangauge.extras.live.addresses import http_address
+from cangauge.extras.live.serve import Offer, to_json
 from cangauge.service.record import Recorder
-from cangauge.service.status_client import StatusSocket
-from live import LoggedLines, waits
+from cangauge.service.status_client import SCHEMA, StatusSocket
+from live import waits
 from running import RunningService
 
 REFUSED = "can't start new thread"
@@ -39,7 +38,6 @@ def closed_bus() -> ReconnectingBus:
 
 STARTS: dict[str, Callable[[Path], object]] = {
     "recording": lambda folder: Recorder(folder / "r.log"),
-    "page": lambda _: Live(http=http_address("127.0.0.1:0", None, {})),
     "gateway": lambda _: Gateway(closed_bus(), closed_bus(), {}),
     "status": lambda folder: StatusSocket(folder / "s.sock", dict),
 }
@@ -75,30 +73,21 @@ def test_a_reload_without_threads_is_refused_and_the_service_goes_on(
     assert running.summary is not None
 
 
-def test_a_live_process_without_threads_says_so_and_is_started_again(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    pytest.importorskip("paho.mqtt.client")
-    popen, places = launch.subprocess.Popen, iter(range(100))
-
-    def without_threads(_: list[str], **options: Any) -> Any:
-        script = (
-            "import threading; from cangauge.extras.live.process import main\n"
-            "places, start = iter(range(9)), threading._start_new_thread\n"
-            "def refuse(*given):\n"
-            f"    if next(places) >= {next(places)}: raise RuntimeError({REFUSED!r})\n"
-            "    return start(*given)\n"
-            "threading._start_new_thread = refuse\nmain()"
+def test_what_serves_networks_without_threads_ends_and_says_so(tmp_path: Path) -> None:
+    script = (
+        "import threading; from cangauge.extras.live.serve import main\n"
+        f"def refuse(*_): raise RuntimeError({REFUSED!r})\n"
+        "threading._start_new_thread = refuse\nmain()"
+    )
+    with closing(StatusSocket(tmp_path / "s.sock", lambda: {"schema": SCHEMA})):
+        offer = Offer(http=http_address("127.0.0.1:0", None, {}))
+        found = subprocess.run(
+            [sys.executable, "-c", script],
+            input=to_json(tmp_path / "s.sock", offer, "text", "info"),
+            capture_output=True,
+            text=True,
+            timeout=60.0,
+            check=False,
         )
-        return popen([sys.executable, "-c", script], **options)
-
-    monkeypatch.setattr(launch.subprocess, "Popen", without_threads)
-    monkeypatch.setattr(launch, "PAUSE_S", (0.05, 60.0))
-    options = mqtt_options(MqttConfig(broker="127.0.0.1", port=1), "virtual x")
-    with LoggedLines("cangauge.extras.live") as logged, closing(Live(mqtt=options)) as page:
-        # Neither of its two threads; then one; then both.
-        assert waits(lambda: "started again (2 so far)" in page.trouble, 30.0)
-        assert waits(lambda: any("not reachable" in line for line in logged.lines), 30.0)
-        logged.release_due(everything=True)
-    assert sum(REFUSED in line for line in logged.lines) == 2
-    assert "it ended by itself" in page.trouble
+    assert found.returncode == 1
+    assert REFUSED in found.stderr.splitlines()[-1]

@@ -50,14 +50,14 @@ def test_a_whole_run(bus: list[str], tmp_path: Path) -> None:
         "ids = { soc_estimate = 0x4A0, soc_detail = 0x4A1, replay_clock = 0x4AF }\n"
     )
     service = Command("run", "--config", config, "--json")
+    service.wait_for("service.ready")
     service.wait_for("http.listening")
     http_port = json.loads(service._stderr[-1])["port"]
-    service.wait_for("service.ready")
     replayed = in_process("replay", log, "--config", config, "--speed", "max", "--json")
     assert replayed.code == 0, replayed.err
     assert replayed.json["acknowledged"] == replayed.json["samples"] == 1200
     assert replayed.json["quantisation"]["current_a"] == 0.25  # a Leaf's step is 0.5 A
-    # The status is renewed four times a second; health and possible current once a second.
+    # The status is renewed ten times a second; health and possible current once a second.
     status = ("status", "--endpoint", sock)
     assert waits(lambda: in_process(*status, "--json").json["samples"] == 1200, 10.0)
     found = in_process(*status, "--json")

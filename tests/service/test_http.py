@@ -21,10 +21,11 @@ from watched import Watched
 from cangauge.errors import InputError
 from cangauge.extras.live.addresses import http_address, read_token
 from cangauge.extras.live.http import MAX_CLIENTS
-from cangauge.extras.live.launch import Live
+from cangauge.extras.live.serve import Offer
 from cangauge.model.published import CAPACITY_AH
 from cangauge.service.status_client import Snapshot
 from live import waits
+from served import Served
 
 TOKEN = "a-token-of-some-length"  # noqa: S105 - made up
 
@@ -39,9 +40,10 @@ def watched() -> Watched:
 
 
 @pytest.fixture(scope="module")
-def http(watched: Watched) -> Iterator[Live]:
-    with contextlib.closing(Live(http=http_address("127.0.0.1:0", None, {}))) as server:
-        server.on_snapshot(watched.monitor.latest)
+def http(watched: Watched) -> Iterator[Served]:
+    with Served(
+        Offer(http=http_address("127.0.0.1:0", None, {})), watched.monitor.latest
+    ) as server:
         yield server
 
 
@@ -54,10 +56,10 @@ def get(port: int, path: str, **headers: str) -> tuple[int, bytes, Any]:
         return error.code, error.read(), error.headers
 
 
-def test_status_and_health(http: Live, watched: Watched) -> None:
+def test_status_and_health(http: Served, watched: Watched) -> None:
     def show(age_s: float = 0.0, **changed: object) -> None:
         status = watched.monitor.latest.status | changed
-        http.on_snapshot(Snapshot(time.monotonic() - age_s, status))
+        http.show(Snapshot(time.monotonic() - age_s, status))
 
     assert waits(lambda: get(http.port, "/status")[0] == 200)  # after seconds on a busy machine
     show()
@@ -78,7 +80,7 @@ def test_status_and_health(http: Live, watched: Watched) -> None:
     assert json.loads(get(http.port, "/healthz")[1]) == {"ok": False, "status": "invalid"}
 
 
-def test_metrics_are_what_prometheus_reads(http: Live) -> None:
+def test_metrics_are_what_prometheus_reads(http: Served) -> None:
     code, body, headers = get(http.port, "/metrics")
     assert code == 200
     assert "text/plain" in headers["Content-Type"]
@@ -105,14 +107,14 @@ def test_metrics_are_what_prometheus_reads(http: Live) -> None:
     assert open_metrics[1].endswith(b"# EOF\n")
 
 
-def test_before_the_first_snapshot_and_without_prometheus_client(
+def test_without_prometheus_client(
     watched: Watched, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (tmp_path / "prometheus_client.py").write_text("raise ImportError\n")
-    monkeypatch.syspath_prepend(str(tmp_path))
-    with contextlib.closing(Live(http=http_address("127.0.0.1:0", None, {}))) as server:
-        assert get(server.port, "/status")[:2] == (503, b"the service has just started\n")
-        server.on_snapshot(watched.monitor.latest)
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    with Served(
+        Offer(http=http_address("127.0.0.1:0", None, {})), watched.monitor.latest
+    ) as server:
         assert waits(lambda: get(server.port, "/status")[0] == 200)
         code, body, _ = get(server.port, "/metrics")
     assert code == 404
@@ -122,8 +124,8 @@ def test_before_the_first_snapshot_and_without_prometheus_client(
 def test_a_token_is_required_where_there_is_one(watched: Watched) -> None:
     address = http_address("127.0.0.1:0", None, {"CANGAUGE_HTTP_TOKEN": TOKEN})
     assert TOKEN not in repr(address)
-    with contextlib.closing(Live(http=address)) as server:
-        server.on_snapshot(watched.monitor.latest)
+    with Served(Offer(http=address), watched.monitor.latest) as server:
+        assert waits(lambda: get(server.port, "/status", Authorization=f"Bearer {TOKEN}")[0] == 200)
         for path in ("/status", "/healthz", "/metrics", "/nothing"):
             code, body, headers = get(server.port, path)
             assert (code, headers["WWW-Authenticate"]) == (401, "Bearer")
@@ -133,7 +135,7 @@ def test_a_token_is_required_where_there_is_one(watched: Watched) -> None:
         assert get(server.port, "/status", Authorization=f"Bearer {TOKEN}")[0] == 200
 
 
-def test_without_a_token_only_loopback_names_are_answered(http: Live) -> None:
+def test_without_a_token_only_loopback_names_are_answered(http: Served) -> None:
     assert get(http.port, "/status", Host="evil.example")[0] == 403
     assert get(http.port, "/status", Host="localhost:1")[0] == 200
 
@@ -156,7 +158,7 @@ def test_addresses_that_are_refused(text: str, say: str) -> None:
     assert caught.value.field == "http"
 
 
-def test_addresses_and_tokens(tmp_path: Path, http: Live) -> None:
+def test_addresses_and_tokens(tmp_path: Path, http: Served) -> None:
     assert str(http_address("9464", None, {})) == "127.0.0.1:9464"
     assert str(http_address("[::1]:9464", None, {})) == "[::1]:9464"
     path = tmp_path / "token"
@@ -168,10 +170,10 @@ def test_addresses_and_tokens(tmp_path: Path, http: Live) -> None:
             read_token(path, {})
         assert not content or content not in str(caught.value)
     with pytest.raises(InputError, match="cannot listen"):
-        Live(http=http_address(f"127.0.0.1:{http.port}", None, {}))
+        http_address(f"127.0.0.1:{http.port}", None, {}).listen()
 
 
-def test_slow_clients_leave_a_place_for_a_probe(http: Live) -> None:
+def test_slow_clients_leave_a_place_for_a_probe(http: Served) -> None:
     slow = [socket.create_connection(("127.0.0.1", http.port)) for _ in range(2 * MAX_CLIENTS)]
     begun = ("", "GET /healthz HTTP/1.1\r\nX: ", "POST / HTTP/1.1\r\nContent-Length: 9\r\n\r\n")
     for each, first in zip(slow, itertools.cycle(begun), strict=False):
@@ -188,7 +190,7 @@ def test_slow_clients_leave_a_place_for_a_probe(http: Live) -> None:
         each.close()
 
 
-def test_a_header_without_end_is_cut_off(http: Live) -> None:
+def test_a_header_without_end_is_cut_off(http: Served) -> None:
     greedy = socket.create_connection(("127.0.0.1", http.port), 60.0)
     with greedy, contextlib.suppress(OSError):
         greedy.sendall(b"GET /status HTTP/1.1\r\nX: " + b"y" * 100_000)

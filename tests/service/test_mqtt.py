@@ -14,12 +14,15 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from watched import Watched
 
 from cangauge.errors import InputError
 from cangauge.extras.live.addresses import MqttOptions, mqtt_options
+from cangauge.extras.live.serve import Offer
 from cangauge.service.config import load_config
 from live import Command, leaf_model_path, waits
 from running import RunningService, free_port
+from served import Served
 
 MOSQUITTO = shutil.which("mosquitto", path=f"{os.environ['PATH']}:/usr/sbin")
 if MOSQUITTO is None:
@@ -159,10 +162,6 @@ def test_a_broker_that_goes_or_hangs_costs_no_sample(
         assert waits(lambda: listener.availability == "online", 10.0)
         assert waits(lambda: "soc_pct" in listener.state())
         assert "homeassistant/sensor/bench/soc_pct/config" in listener.latest
-        # The last will, of the process that publishes; another one takes its place.
-        os.kill(running.service._outputs[-1].pid, signal.SIGKILL)
-        assert waits(lambda: listener.availability == "offline")
-        assert waits(lambda: listener.availability == "online")
         # A broker that hangs delays no stop.
         broker.process.send_signal(signal.SIGSTOP)
         time.sleep(0.5)
@@ -177,7 +176,7 @@ def test_a_killed_service_is_offline(tmp_path: Path, broker: Broker, listener: L
     path = tmp_path / "run.toml"
     path.write_text(
         f'model = "{leaf_model_path()}"\ninterface = "virtual"\nchannel = "x"\n'
-        f'status_socket = "off"\n{section(broker.port)}'
+        f'status_socket = "{tmp_path / "s.sock"}"\n{section(broker.port)}'
     )
     service = Command("run", "--config", path)
     try:
@@ -186,6 +185,18 @@ def test_a_killed_service_is_offline(tmp_path: Path, broker: Broker, listener: L
         service.process.kill()
         service.end()
     assert waits(lambda: listener.availability == "offline")
+
+
+def test_the_last_will_of_a_killed_publisher(
+    tmp_path: Path, broker: Broker, listener: Listener
+) -> None:
+    path = tmp_path / "mqtt.toml"
+    path.write_text(f'model = "{leaf_model_path()}"\n{section(broker.port)}')
+    status = Watched().monitor.latest
+    with Served(Offer(mqtt=options_in(path)), status) as served:
+        assert waits(lambda: listener.availability == "online")
+        served.process.kill()
+        assert waits(lambda: listener.availability == "offline")
 
 
 def test_password_and_tls_are_used(tmp_path: Path) -> None:

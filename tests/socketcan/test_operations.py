@@ -16,7 +16,7 @@ from cangauge.bus.open import BusAddress, has_socketcan, open_bus
 from cangauge.bus.vehicle import Vehicle
 from cangauge.estimation.offline import samples_of
 from cangauge.extras.live.addresses import http_address
-from cangauge.extras.live.launch import Live
+from cangauge.extras.live.serve import Offer
 from cangauge.replay.encoder import FrameEncoder
 from cangauge.service.loop import Loop
 from cangauge.service.offline import estimate_capture
@@ -25,6 +25,7 @@ from cangauge.service.record import Recorder
 from cangauge.service.status import Monitor
 from cangauge.types import Estimate
 from live import Rows, leaf_model, short_log, waits
+from served import Served, Shown
 
 pytestmark = pytest.mark.socketcan
 
@@ -49,8 +50,8 @@ def test_scraped_and_recorded_by_kernel_stamps(tmp_path: Path) -> None:
         Recorder(tmp_path / "seen.log", part_bytes=5_000) as recorder,
     ):
         monitor = Monitor(pipeline, port, record=lambda: recorder.state)
-        server = Live(http=http_address("127.0.0.1:0"))
-        outputs = [Rows(rows), recorder, server]
+        server = Served(Offer(http=http_address("127.0.0.1:0", None, {})), monitor.latest)
+        outputs = [Rows(rows), recorder, Shown(server)]
         loop = Loop(port, pipeline, outputs=outputs, record=recorder, monitor=monitor)
         thread = threading.Thread(target=loop.run, args=(stop.is_set,))
         thread.start()

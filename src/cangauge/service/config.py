@@ -369,6 +369,12 @@ class RunConfig(Strict):
         " loopback needs a token, as with --http.",
         "--dashboard", "HOST:PORT", restart=True,
     )  # fmt: skip
+    live: Literal["child", "unit"] = key(
+        "child",
+        "What serves `dashboard`, `http` and `mqtt`: a child process of the service, or `cangauge"
+        " live CONFIG` as a unit of its own.",
+        restart=True,
+    )
     status_socket: str = key(
         "auto", "Unix socket for `cangauge status`; auto: in the user's runtime folder.",
         "--status-socket", "PATH|auto|off", restart=True,

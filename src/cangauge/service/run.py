@@ -27,7 +27,7 @@ from cangauge.service.pipeline import Pipeline
 from cangauge.service.record import Recorder, check_recording
 from cangauge.service.setup import Setup, address_of, read_setup
 from cangauge.service.state import StateKeeper, state_path
-from cangauge.service.status import PAGE_EVERY_S, SHOW_EVERY_S, Monitor
+from cangauge.service.status import Monitor
 from cangauge.service.status_client import StatusSocket, socket_path, value_at
 from cangauge.service.worker import start_thread
 
@@ -66,6 +66,8 @@ class Service:
         The recording, while `run` runs.
     address, bus : BusAddress, str
         Interface and channel.
+    endpoint : Path or None
+        The status socket, while `run` runs.
 
     Raises
     ------
@@ -102,6 +104,7 @@ class Service:
         self._is_stopped = self._is_reload_due = False
         self._reading: Future[Setup | CangaugeError] | None = None
         self.recorder: Recorder | None = None
+        self.endpoint: Path | None = None
 
     def stop(self) -> None:
         """Make `run` return; from any thread."""
@@ -155,13 +158,12 @@ class Service:
                 notifier=notifier,
                 record=lambda: None if self.recorder is None else self.recorder.state,
                 troubles=lambda: [text for each in self._outputs if (text := each.trouble)],
-                show_every_s=SHOW_EVERY_S if config.dashboard is None else PAGE_EVERY_S,
                 sign_cure=self._setup.sign_cure,
             )
+            self.endpoint = _serve_status(config, monitor, stack)
             for make_output in self._setup.outputs:
                 self._outputs.append(make_output(self))
                 stack.callback(self._outputs[-1].close)
-            _serve_status(config, monitor, stack)
             text = f"listening on {port.name}; time source: {config.time_source}; Ctrl-C ends"
             about = {"bus": port.name, "vehicle": pipeline.vehicle.name, "model": config.model}
             emit(_LOG, logging.INFO, "service.ready", text, **about)
@@ -277,19 +279,22 @@ def _loop_settings(config: RunConfig) -> LoopSettings:
     )
 
 
-def _serve_status(config: RunConfig, monitor: Monitor, stack: ExitStack) -> None:
+def _serve_status(config: RunConfig, monitor: Monitor, stack: ExitStack) -> Path | None:
+    """Open the status socket; return its path, or None if it is off or not to be had."""
     if config.status_socket == "off":
-        return
+        return None
     is_auto = config.status_socket == "auto"
     path = socket_path(monitor.latest.status["bus"]) if is_auto else Path(config.status_socket)
     try:
         server = StatusSocket(path, lambda: monitor.latest.at(time.monotonic()))
-        stack.callback(server.close)
     except CangaugeError as error:
         if not is_auto:
             raise
         # Not requested explicitly: the service runs without it.
         emit(_LOG, logging.WARNING, "status.unavailable", f"no status socket: {error}")
+        return None
+    stack.callback(server.close)
+    return path
 
 
 def _log_changes(old: Setup, new: Setup) -> None:

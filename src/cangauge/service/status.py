@@ -25,15 +25,17 @@ from cangauge.service.events import release_held
 from cangauge.service.lifecycle import Notifier
 from cangauge.service.pipeline import Pipeline
 from cangauge.service.polling import PollCounts
-from cangauge.service.status_client import BOUNDS_S, SCHEMA, Snapshot, reason_ids
+from cangauge.service.status_client import (
+    BOUNDS_S,
+    SCHEMA,
+    SHOW_EVERY_S,
+    Snapshot,
+    reason_ids,
+)
 from cangauge.types import Estimate, Status, reason_sentences
 
 _LOG = logging.getLogger(__name__)
 
-SHOW_EVERY_S: Final = 0.25
-"""Interval of the snapshots [s]."""
-PAGE_EVERY_S: Final = 0.1
-"""The same while the live page is served [s]: that of SOC_ESTIMATE."""
 NOTIFY_EVERY_S: Final = 1.0
 """Interval of status lines to systemd [s]."""
 RATE_OVER_S: Final = 2.0
@@ -124,7 +126,6 @@ class Monitor:
         record: Callable[[], RecordState | None] = lambda: None,
         troubles: Callable[[], list[str]] = list,
         clock: Callable[[], float] = time.monotonic,
-        show_every_s: float = SHOW_EVERY_S,
         sign_cure: str = "set the other sign under [current] of the map file",
     ) -> None:
         self.model, self.sign_cure = model, sign_cure
@@ -134,7 +135,6 @@ class Monitor:
         self._port = port
         self._notifier = notifier or Notifier()
         self._record, self._troubles = record, troubles
-        self._show_every_s = show_every_s
         self._clock = clock
         self._began_s = now_s = clock()
         self._latency = Histogram()
@@ -182,13 +182,13 @@ class Monitor:
         """Record a turn of the loop (monotonic time [s]); return whether `latest` is new."""
         if now_s < self._due_s:
             return False
-        self._due_s = now_s + self._show_every_s
+        self._due_s = now_s + SHOW_EVERY_S
         self.latest = Snapshot(now_s, self._object(now_s))
         self._log_changes(self._pipeline.published)
         release_held()
         ping_every_s = self._notifier.ping_every_s
         if ping_every_s is not None and now_s >= self._ping_s:
-            self._ping_s = now_s + ping_every_s - self._show_every_s
+            self._ping_s = now_s + ping_every_s - SHOW_EVERY_S
             self._notifier.send(WATCHDOG=1)
         if self._notifier.active and now_s >= self._notify_s:
             self._notify_s = now_s + NOTIFY_EVERY_S

@@ -25,6 +25,8 @@ from cangauge.types import Reason, reason_name
 
 SCHEMA: Final = 1
 """Version of the JSON object of `/status`. This module imports no estimator."""
+SHOW_EVERY_S: Final = 0.1
+"""Interval of the snapshots [s]: that of SOC_ESTIMATE."""
 STUCK_S: Final = 2.0
 """Age of a snapshot above which the receive loop counts as stuck, and its SoC as stale [s]."""
 BOUNDS_S: Final = (
@@ -45,18 +47,21 @@ _LOG = logging.getLogger(__name__)
 
 @dataclass(frozen=True, slots=True)
 class Snapshot:
-    """The object of `/status` (finite numbers, text and None) at a monotonic time [s]."""
+    """The object of `/status` (finite numbers, text and None) as of a monotonic time [s]."""
 
     made_s: float
     status: dict[str, Any]
 
     def at(self, now_s: float) -> dict[str, Any]:
         """Return the object of `/status` at a monotonic time [s]: older, stale once stuck."""
-        status, later_s = dict(self.status), max(now_s - self.made_s, 0.0)
-        status |= {"uptime_s": status["uptime_s"] + later_s, "loop_age_s": later_s}
-        if status["sample"] is not None and status["sample"]["age_s"] is not None:
-            status["sample"] = status["sample"] | {"age_s": status["sample"]["age_s"] + later_s}
-        if later_s > STUCK_S:
+        status = dict(self.status)
+        later_s = max(now_s - self.made_s, 0.0)
+        status["uptime_s"] += later_s
+        status["loop_age_s"] += later_s
+        sample = status["sample"]
+        if sample is not None and sample["age_s"] is not None:
+            status["sample"] = sample | {"age_s": sample["age_s"] + later_s}
+        if status["loop_age_s"] > STUCK_S:
             status |= {"loop_stuck": True, "status": "invalid"}
             status["reasons"] = sorted({*status["reasons"], *reason_ids(Reason.INPUT_STALE)})
         return status
@@ -77,6 +82,10 @@ def reason_ids(reasons: Reason) -> list[str]:
 
 class NotRunningError(CangaugeError):
     """No service answers."""
+
+
+class EndedError(NotRunningError):
+    """Nothing listens on the socket, or it is gone: the service has ended."""
 
 
 def runtime_folders() -> list[Path]:
@@ -200,7 +209,7 @@ def fetch_status(path: Path) -> dict[str, Any]:
     Raises
     ------
     NotRunningError
-        If no service answers.
+        If no service answers; `EndedError` if nothing listens.
     CangaugeError
         If the answer is not a status.
     """
@@ -210,8 +219,9 @@ def fetch_status(path: Path) -> dict[str, Any]:
             while len(answer) < LARGEST_ANSWER and (part := connection.recv(1 << 16)):
                 answer += part
     except OSError as error:
-        text = f"{path}: no service answers: {error.strerror or error}"
-        raise NotRunningError(text) from error
+        has_ended = isinstance(error, (ConnectionRefusedError, FileNotFoundError))
+        kind = EndedError if has_ended else NotRunningError
+        raise kind(f"{path}: no service answers: {error.strerror or error}") from error
     try:
         content = json.loads(answer)
         if content["schema"] == SCHEMA:

@@ -42,20 +42,36 @@ class HttpAddress:
     Parameters
     ----------
     host : str
-        IP address, or "localhost".
+        IP address.
     port : int
         0: any free one.
     token : str or None
         Bearer token that requests need.
+    key : str
+        Key of the configuration, for messages.
     """
 
     host: str
     port: int
     token: str | None = field(default=None, repr=False)
+    key: str = "http"
 
     def __str__(self) -> str:
         """Return the address as in a URL."""
         return f"[{self.host}]:{self.port}" if ":" in self.host else f"{self.host}:{self.port}"
+
+    def listen(self) -> socket.socket:
+        """Return a listening socket; raise InputError if the address cannot be bound."""
+        family = socket.AF_INET6 if ":" in self.host else socket.AF_INET
+        try:
+            return socket.create_server((self.host, self.port), family=family, backlog=128)
+        except OSError as error:
+            raise InputError(
+                f"cannot listen: {error.strerror or error}",
+                field=self.key,
+                value=str(self),
+                cure="choose another port",
+            ) from error
 
 
 def http_address(
@@ -84,9 +100,10 @@ def http_address(
     """
     host, colon, port = text.strip().rpartition(":")
     host = host.removeprefix("[").removesuffix("]") if colon else LOOPBACK
+    if host.lower() == "localhost":
+        host = LOOPBACK
     try:
-        if host.lower() != "localhost":
-            ipaddress.ip_address(host)
+        ipaddress.ip_address(host)
         number = int(port)
     except ValueError:
         number = -1
@@ -106,7 +123,7 @@ def http_address(
             cure=f"put a token into a file for http_token_file or into {TOKEN_VARIABLE},"
             f" or listen on {LOOPBACK}:{number}",
         )
-    return HttpAddress(host, number, token)
+    return HttpAddress(host, number, token, field)
 
 
 def is_loopback_name(host: str) -> bool:

@@ -22,7 +22,7 @@ from tornado.web import Application, RequestHandler
 from cangauge._logging import emit
 from cangauge._text import plain
 from cangauge.errors import InputError
-from cangauge.extras.live.addresses import is_loopback_name
+from cangauge.extras.live.addresses import HttpAddress, is_loopback_name
 from cangauge.service.output import Output
 from cangauge.service.status_client import Snapshot
 
@@ -43,10 +43,10 @@ class StatusServer(Output):
 
     Parameters
     ----------
-    sockets : list of int
-        Descriptors of listening sockets.
-    token : str or None
-        Bearer token that requests need.
+    address : HttpAddress
+        Its token is needed by requests.
+    listening : socket
+        Bound to it.
 
     Attributes
     ----------
@@ -54,8 +54,8 @@ class StatusServer(Output):
         None before the first.
     """
 
-    def __init__(self, sockets: list[int], token: str | None) -> None:
-        self.token = token
+    def __init__(self, address: HttpAddress, listening: socket.socket) -> None:
+        self.token = address.token
         self.latest: Snapshot | None = None
         pages: dict[str, type[Handler]] = {
             "/status": _StatusPage,
@@ -69,7 +69,7 @@ class StatusServer(Output):
             "idle_connection_timeout": REQUEST_WITHIN_S,
             "body_timeout": REQUEST_WITHIN_S,
         }
-        serve(self, sockets, pages, _Server, limits)
+        serve(self, listening, pages, _Server, limits)
 
     def on_snapshot(self, snapshot: Snapshot) -> None:
         """Make a snapshot the latest one."""
@@ -78,14 +78,14 @@ class StatusServer(Output):
 
 def serve(
     server: Output,
-    sockets: list[int],
+    listening: socket.socket,
     pages: Mapping[str, type[Handler]],
     kind: type[HTTPServer],
     limits: Mapping[str, Any],
 ) -> None:
     """Serve pages by patterns of their paths, with limits of tornado's `HTTPServer`.
 
-    `sockets` are listening. The first pattern that matches counts.
+    The first pattern that matches counts.
     """
     context = {"server": server}
     application = Application(
@@ -94,11 +94,9 @@ def serve(
         websocket_ping_interval=PING_S,
         websocket_max_message_size=MAX_BODY_BYTES,
     )
-    listening = [socket.socket(fileno=number) for number in sockets]
-    for each in listening:
-        each.setblocking(False)
+    listening.setblocking(False)
     sizes = {"max_header_size": MAX_HEADER_BYTES, "max_body_size": MAX_BODY_BYTES}
-    kind(application, **sizes, **limits).add_sockets(listening)
+    kind(application, **sizes, **limits).add_socket(listening)
 
 
 class _Server(HTTPServer):

@@ -14,6 +14,7 @@ import secrets
 import time
 from contextlib import suppress
 from pathlib import Path
+from socket import socket
 from typing import Any, Final
 
 from bokeh.resources import Resources
@@ -21,6 +22,7 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from tornado.httpserver import HTTPServer
 from tornado.websocket import WebSocketClosedError, WebSocketHandler
 
+from cangauge.extras.live.addresses import HttpAddress
 from cangauge.extras.live.charts import CHARTS, STATUS_COLOURS, STATUS_NAMES, chart_parts
 from cangauge.extras.live.history import LOG_NAME, REASONS, History, last_hour, shown_columns
 from cangauge.extras.live.http import Handler, Nothing, has_token, serve
@@ -46,14 +48,14 @@ class LivePage(Output):
 
     Parameters
     ----------
-    sockets : list of int
-        Descriptors of listening sockets.
-    token : str or None
-        Token that a viewer must know.
+    address : HttpAddress
+        A viewer must know its token.
+    listening : socket
+        Bound to it.
     """
 
-    def __init__(self, sockets: list[int], token: str | None) -> None:
-        self.token = token
+    def __init__(self, address: HttpAddress, listening: socket) -> None:
+        self.token = token = address.token
         self.history = History()
         self.id = secrets.token_hex(8)
         """Key of this run; another one means that the row numbers start again."""
@@ -71,7 +73,7 @@ class LivePage(Output):
             ".*": _Elsewhere,
         }
         limits = {"idle_connection_timeout": IDLE_S, "body_timeout": IDLE_S}
-        serve(self, sockets, pages, HTTPServer, limits)
+        serve(self, listening, pages, HTTPServer, limits)
 
     def _texts(self) -> dict[str, str]:
         """Return the files of the page by their names."""

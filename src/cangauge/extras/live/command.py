@@ -1,0 +1,42 @@
+"""`cangauge live`: live page, status by HTTP and MQTT of a service, as a program of its own."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from cangauge.cli.declare import command
+
+
+@command()
+def live_command(config: Path, *, endpoint: Path | None = None) -> None:
+    """Serve the live page, the status by HTTP and MQTT of a running service.
+
+    Reads `dashboard`, `http`, `http_token_file` and `[mqtt]` of the service's configuration. With
+    `live = "unit"` there, `cangauge run` leaves them to this program. It ends when the service
+    ends: systemd starts both (contrib/systemd/cangauge-live@.service).
+
+    Examples
+    --------
+    `cangauge live /etc/cangauge/can0.toml --endpoint /run/cangauge/can0/status.sock`
+
+    Parameters
+    ----------
+    config : FILE.toml
+        Configuration of `cangauge run`.
+    endpoint : PATH
+        Unix socket of the service. Default: the service running on this machine.
+    """
+    from cangauge.errors import InputError
+    from cangauge.extras.live.launch import offer_of
+    from cangauge.extras.live.serve import serve
+    from cangauge.service.config import load_config
+    from cangauge.service.events import logging_to
+    from cangauge.service.status_client import find_socket
+
+    loaded = load_config(config)
+    if loaded.http is None and loaded.dashboard is None and loaded.mqtt is None:
+        cure = 'add dashboard = "8642", http = "9464" or [mqtt]'
+        raise InputError("serves nothing", source=config, cure=cure)
+    with logging_to(loaded.log_format, loaded.log_level), loaded.naming_keys():
+        offer = offer_of(loaded)
+        serve(endpoint or find_socket(), offer)
