@@ -10,6 +10,8 @@ from contextlib import suppress
 from itertools import count
 from pathlib import Path
 from typing import Any, Self
+from urllib.error import HTTPError
+from urllib.request import urlopen
 
 import can
 
@@ -95,7 +97,9 @@ class RunningService:
 
     def _is_served(self) -> bool:
         try:
-            socket.create_connection(("127.0.0.1", self.port)).close()
+            urlopen(f"{self.endpoint}/status").close()  # noqa: S310 - http
+        except HTTPError as error:
+            return error.code == 401
         except OSError:
             return False
         return True
