@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import bz2
 import errno
+import glob
 import gzip
 import hashlib
 import io
@@ -254,6 +255,10 @@ def _stem(name: str) -> str:
 
 # --- Writing
 
+NO_LINK: Final = getattr(os, "O_NOFOLLOW", 0)
+"""Flag with which a name is opened, never the file that a link of this name points to."""
+LINKS_AT_MOST: Final = 40
+"""Links that a path may follow, as in Linux (path_resolution(7))."""
 FULL: Final = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO}
 """Errors of a full or failing disk, which can be temporary."""
 _WRITE_ERRORS: Final[dict[int, tuple[str, str]]] = {
@@ -267,12 +272,13 @@ _WRITE_ERRORS: Final[dict[int, tuple[str, str]]] = {
 
 
 @contextmanager
-def atomic_path(path: str | PathLike[str]) -> Iterator[Path]:
+def atomic_path(path: str | PathLike[str], rights: int = 0o666) -> Iterator[Path]:
     """Yield a temporary path beside `path` and rename it to `path` when the block succeeds.
 
     If the block raises, `path` is unchanged. The content is synced to disk before the rename: a
-    power cut leaves the old file or the new one. A symbolic link is followed, permissions are kept,
-    and a device or pipe (`/dev/stdout`), which cannot be replaced, is yielded itself.
+    power cut leaves the old file or the new one. A new file gets `rights` less the umask, an own
+    one keeps its rights. Links are followed as by `written_name`. A device or pipe (`/dev/stdout`)
+    cannot be replaced and is yielded itself.
 
     Raises
     ------
@@ -281,17 +287,14 @@ def atomic_path(path: str | PathLike[str]) -> Iterator[Path]:
     CangaugeError
         If the disk is full or fails while writing.
     """
-    if _is_device(Path(path)):
-        yield Path(path)
+    target = written_name(path)
+    if is_device(target):
+        yield target
         return
-    target = Path(os.path.realpath(path))
-    part = _create_beside(target, path)
+    part = _create_beside(target, path, rights)
     try:
         yield part
-        with part.open("rb") as written:
-            os.fsync(written.fileno())
-        if target.exists():
-            part.chmod(stat.S_IMODE(target.stat().st_mode))
+        _sync(part, target)
         part.replace(target)
     except OSError as error:
         if error.errno not in FULL:
@@ -302,13 +305,70 @@ def atomic_path(path: str | PathLike[str]) -> Iterator[Path]:
         part.unlink(missing_ok=True)
 
 
-def _create_beside(target: Path, shown: str | PathLike[str]) -> Path:
+def remove_parts(path: str | PathLike[str]) -> None:
+    """Remove what a killed process left beside a file that only this process writes."""
+    target = written_name(path)
+    left = f".{glob.escape(target.stem)}.????????{glob.escape(target.suffix)}"
+    for part in target.parent.glob(left):
+        with suppress(OSError):
+            part.unlink()
+
+
+def written_name(path: str | PathLike[str]) -> Path:
+    """Return the file that writing to `path` replaces.
+
+    Links of this user and of root are followed. The name of another user's link is returned
+    itself: writing replaces the link, not the file to which it points.
+
+    Raises
+    ------
+    InputError
+        If a link that another user made in a folder of a third one leads to the folder.
+    """
+    found = Path(Path(path).absolute().anchor)
+    left = list(Path(path).absolute().parts[:0:-1])
+    links = 0
+    while left:
+        name = found / left.pop()
+        if not os.path.islink(name):  # noqa: PTH114 - never raises
+            found = found.parent if name.name == ".." else name
+            continue
+        if not _is_trusted(name, is_folder=bool(left)):
+            if not left:
+                return name
+            problem, cure = f"{name} is a link of another user", "name the folder itself"
+            raise InputError(problem, source=path, cure=cure)
+        links += 1
+        if links > LINKS_AT_MOST:
+            raise InputError("a link to itself", source=path, cure="name the file itself")
+        link = name.readlink()
+        if name.exists() and not (found / link).exists():
+            return name  # /proc/self/fd/1 may be a link to a pipe, which has no name
+        left += link.parts[link.is_absolute() :][::-1]
+        found = Path(link.anchor or found)
+    return found
+
+
+def is_own(info: os.stat_result) -> bool:
+    """Return whether a file belongs to this user or to root; always true on Windows."""
+    return not hasattr(os, "geteuid") or info.st_uid in {0, os.geteuid()}
+
+
+def _is_trusted(link: Path, *, is_folder: bool) -> bool:
+    info = link.lstat()
+    # As the kernel's protected_symlinks: whoever owns a folder may arrange it.
+    return is_own(info) or (is_folder and info.st_uid == link.parent.stat().st_uid)
+
+
+def _create_beside(target: Path, shown: str | PathLike[str], rights: int = 0o666) -> Path:
     # The suffix stays last: writers such as pyarrow and bokeh choose the format by it.
     part = target.with_name(f".{target.stem}.{secrets.token_hex(4)}{target.suffix}")
     try:
-        if target.is_dir():
+        if target.is_dir() and not target.is_symlink():
             raise InputError("this is a folder", source=shown, cure="name a file in it")
-        part.touch(exist_ok=False)
+        if os.path.lexists(target) and _is_kept_by_another(target):
+            raise InputError("another user has made it", source=shown, cure="name another file")
+        part.touch(0o600 if target.exists() else rights, exist_ok=False)
     except OSError as error:
         problem, cure = _WRITE_ERRORS.get(
             error.errno or 0, (f"cannot be written: {error.strerror}", "name another path")
@@ -317,12 +377,32 @@ def _create_beside(target: Path, shown: str | PathLike[str]) -> Path:
     return part
 
 
-def _is_device(path: Path) -> bool:
+def _is_kept_by_another(name: Path) -> bool:
+    """Return whether a file cannot be replaced: another user's in a folder such as /tmp."""
+    info, folder = name.lstat(), name.parent.stat()
+    is_sticky = bool(folder.st_mode & stat.S_ISVTX)
+    return is_sticky and os.geteuid() not in {0, info.st_uid, folder.st_uid}
+
+
+def _sync(part: Path, target: Path) -> None:
+    """Sync a written file to disk, with the rights of the own file that it replaces."""
+    written = os.open(part, os.O_RDONLY | NO_LINK)
     try:
-        mode = path.stat().st_mode
+        os.fsync(written)
+        if target.is_file() and not target.is_symlink() and is_own(target.stat()):
+            part.chmod(stat.S_IMODE(target.stat().st_mode))
+    finally:
+        os.close(written)
+
+
+def is_device(path: Path) -> bool:
+    try:
+        info, target = path.lstat(), path.stat()
     except (OSError, ValueError):  # absent, or an impossible path: creating it reports which
         return False
-    return not stat.S_ISREG(mode) and not stat.S_ISDIR(mode)
+    if not is_own(info) and not stat.S_ISCHR(info.st_mode):  # a planted link or pipe
+        return False
+    return not stat.S_ISREG(target.st_mode) and not stat.S_ISDIR(target.st_mode)
 
 
 def write_text_atomic(path: str | PathLike[str], text: str) -> None:
@@ -340,8 +420,9 @@ def write_texts_atomic(texts: Mapping[Path, str]) -> None:
 
 def check_writable(path: str | PathLike[str]) -> None:
     """Raise the InputError that writing `path` would raise, before any long work is done."""
-    if not _is_device(Path(path)):
-        _create_beside(Path(os.path.realpath(path)), path).unlink()
+    target = written_name(path)
+    if not is_device(target):
+        _create_beside(target, path).unlink()
 
 
 def require_suffix(path: str | PathLike[str], *suffixes: str, field: str) -> None:
@@ -350,7 +431,7 @@ def require_suffix(path: str | PathLike[str], *suffixes: str, field: str) -> Non
     Suffixes are in lower case, with their dot; `field` is the option that names the file.
     """
     output = Path(path)
-    if output.suffix.lower() in suffixes or _is_device(output):
+    if output.suffix.lower() in suffixes or is_device(output):
         return
     names = " or ".join(filter(None, (", ".join(suffixes[:-1]), suffixes[-1])))
     raise InputError(

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
+import time
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
@@ -93,6 +96,35 @@ def test_of_many_that_start_at_once_one_writes(tmp_path: Path) -> None:
     assert sorted(lines) == [b""] * 5 + [b"held\n"]
     for each in crowd:
         each.communicate()
+
+
+def enter_often(path: Path, marker: Path, times: int) -> int:
+    """Return how often this process and another one held a file at once."""
+    both = 0
+    for _ in range(times):
+        with suppress(InputError), sole_writer(path):
+            try:
+                os.close(os.open(marker, os.O_CREAT | os.O_EXCL))
+                time.sleep(0.0005)
+                marker.unlink()
+            except FileExistsError:
+                both += 1
+    return both
+
+
+def test_services_that_come_and_go_never_share_a_file(tmp_path: Path) -> None:
+    crowd = []
+    for _ in range(4):
+        child = os.fork()
+        if child == 0:
+            code = 99
+            try:
+                code = min(enter_often(tmp_path / "x.log", tmp_path / "marker", 400), 98)
+            finally:
+                os._exit(code)
+        crowd.append(child)
+    assert [os.waitstatus_to_exitcode(os.waitpid(each, 0)[1]) for each in crowd] == [0] * 4
+    assert not list(tmp_path.iterdir())
 
 
 def test_a_lock_file_with_any_content_is_quoted_safely(tmp_path: Path) -> None:

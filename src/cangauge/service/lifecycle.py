@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import signal
 import socket
@@ -10,8 +11,9 @@ from contextlib import ExitStack, contextmanager, suppress
 from os import PathLike
 from pathlib import Path
 from types import FrameType
-from typing import Final, Self
+from typing import BinaryIO, Final, Self
 
+from cangauge._files import NO_LINK, is_own, written_name
 from cangauge._text import printable
 from cangauge.errors import InputError
 
@@ -91,35 +93,60 @@ def _has_terminal() -> bool:
 def sole_writer(path: str | PathLike[str]) -> Iterator[None]:
     """Hold a file for this process while the block runs, by a lock on a hidden file beside it.
 
-    The kernel releases the lock at the latest when the process ends. Where there can be no lock (a
-    read-only disk, a network file system without locks, Windows) the block runs without.
+    The kernel releases the lock at the latest when the process ends. The block runs without a lock
+    where there can be none (a read-only disk, a network file system without locks, Windows), and
+    where another user, who owns neither file nor folder, has taken its name.
 
     Raises
     ------
     InputError
         If another process holds it; names that process.
     """
-    target = Path(os.path.realpath(path))
+    target = written_name(path)
+    lock = target.with_name(f".{target.name}.lock")
     with ExitStack() as stack:
-        try:
-            lock = target.with_name(f".{target.name}.lock")
-            held = os.open(lock, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
-            stack.callback(os.close, held)
-            if fcntl is not None:
-                fcntl.flock(held, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        # Without a lock where there can be none; where nothing can be written, writing reports it.
+        with suppress(OSError):
+            stack.enter_context(_locked(lock, path))
             stack.callback(lock.unlink, missing_ok=True)
-            os.ftruncate(held, 0)
-            os.write(held, str(os.getpid()).encode())
-        except BlockingIOError as error:
-            holder = os.read(held, 20).decode("ascii", "replace")
-            raise InputError(
-                f"another service{f' (process {holder})' if holder else ''} writes this file",
-                source=path,
-                cure="stop that one, or name another file",
-            ) from error
-        except OSError:  # no lock here; where nothing can be written, writing reports it
-            pass
         yield
+
+
+def _locked(lock: Path, shown: str | PathLike[str]) -> BinaryIO:
+    """Return an open lock file that is locked and has its name; may raise OSError."""
+    if fcntl is None:
+        raise OSError(errno.ENOLCK, "no file locks")
+    while True:
+        flags = os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | NO_LINK
+        with ExitStack() as closing:
+            file = closing.enter_context(open(os.open(lock, flags, 0o600), "r+b", buffering=0))  # noqa: PTH123
+            info = os.fstat(file.fileno())
+            if not is_own(info) and info.st_uid != lock.parent.stat().st_uid:
+                raise OSError(errno.EPERM, "another user's file")
+            try:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError as error:
+                pid = file.read(20).decode("ascii", "replace")
+                holder = f" (process {pid})" if pid else ""
+                raise InputError(
+                    f"another service{holder} writes this file",
+                    source=shown,
+                    cure="stop that one, or name another file",
+                ) from error
+            # Its holder removes the name before the lock ends: then it is made anew.
+            if _has_name(info, lock):
+                closing.pop_all()
+                with suppress(OSError):  # a full disk: without the process in messages
+                    file.truncate(0)
+                    file.write(str(os.getpid()).encode())
+                return file
+
+
+def _has_name(info: os.stat_result, path: Path) -> bool:
+    try:
+        return os.path.samestat(info, path.lstat())
+    except FileNotFoundError:
+        return False
 
 
 class Notifier:

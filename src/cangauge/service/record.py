@@ -23,7 +23,7 @@ from typing import Final
 
 import can
 
-from cangauge._files import FULL, check_writable
+from cangauge._files import FULL, check_writable, is_device, written_name
 from cangauge._logging import emit
 from cangauge.bus.captures import all_parts, part_path, run_path
 from cangauge.bus.time_source import whole_us
@@ -146,7 +146,9 @@ class _RecordFile:
     """The file or the parts of one recording, written batch by batch; methods may raise OSError."""
 
     def __init__(self, base: Path, part_bytes: float | None, keep_bytes: float | None) -> None:
-        exists = base.is_file() and base.stat().st_size > 0
+        base = written_name(base) if base.is_symlink() else base
+        self._is_device = is_device(base)
+        exists = os.path.lexists(base) and not self._is_device
         self._base, self._part_bytes, self._keep_bytes = base, part_bytes, keep_bytes
         self._in_parts = part_bytes is not None or exists
         self._run = max((each.run for each in all_parts(base)), default=0) + 1
@@ -195,7 +197,8 @@ class _RecordFile:
         self.current = part_path(self._base, self._run, part) if self._in_parts else self._base
         self._remove_oldest()
         self.close()
-        flags = os.O_WRONLY | os.O_CREAT | os.O_CLOEXEC | (os.O_EXCL if self._in_parts else 0)
+        # Made anew: another user may have made a file or a link of this name.
+        flags = os.O_WRONLY | os.O_CLOEXEC | (0 if self._is_device else os.O_CREAT | os.O_EXCL)
         self._descriptor = os.open(self.current, flags, _RIGHTS)
         self._part, self._bytes = part, 0
         self._text = io.StringIO(newline="")

@@ -21,7 +21,14 @@ from typing import Any, Final, Self
 from pydantic import BaseModel, ConfigDict
 
 from cangauge._config import validated
-from cangauge._files import open_regular, read_bounded, text_sha256
+from cangauge._files import (
+    atomic_path,
+    is_own,
+    open_regular,
+    read_bounded,
+    remove_parts,
+    text_sha256,
+)
 from cangauge._logging import emit
 from cangauge._text import duration, number
 from cangauge.errors import InputError
@@ -125,11 +132,14 @@ class StateKeeper:
         self.restored = False
 
     def __enter__(self) -> Self:
+        remove_parts(self._path)
         if not os.path.exists(self._path):  # noqa: PTH110 - never raises
             text = f"{self._path}: no saved state; starting without one"
             emit(_LOG, logging.INFO, "state.none", text)
             return self
         try:
+            if not is_own(self._path.stat()):
+                raise InputError("belongs to another user", source=self._path)  # noqa: TRY301
             content = read_state(self._path)
             age_s = self._age_s(content)
             latest = self._pipeline.restore(content.estimator, age_s)
@@ -213,16 +223,8 @@ class StateKeeper:
         emit(_LOG, logging.WARNING, "state.refused", text)
 
     def _write(self, content: StateContent) -> None:
-        """Replace the file atomically; a power cut leaves the old one or the new one."""
-        path = Path(os.path.realpath(self._path))
-        # The same name each time: what a killed service left is overwritten.
-        part = path.with_name(f".{path.name}.part")
-        flags = os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC
-        with os.fdopen(os.open(part, flags, 0o600), "w", encoding="utf-8") as file:
-            file.write(state_text(content))
-            file.flush()
-            os.fsync(file.fileno())
-        part.replace(path)
+        with atomic_path(self._path, rights=0o600) as part:
+            part.write_text(state_text(content), encoding="utf-8")
 
     def _failed(self, error: Exception) -> None:
         text = f"state not written: {self._path}: {error}"

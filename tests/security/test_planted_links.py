@@ -1,0 +1,192 @@
+"""What another user planted under a name that we write: his link is replaced or refused."""
+
+from __future__ import annotations
+
+import os
+import sys
+import tempfile
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from cangauge._files import write_text_atomic
+from cangauge.bus.vehicle import Vehicle
+from cangauge.errors import InputError
+from cangauge.logs.canonical import write_log
+from cangauge.service.lifecycle import sole_writer
+from cangauge.service.pipeline import Pipeline
+from cangauge.service.state import StateKeeper, read_state
+from live import frames_of, in_process, leaf_model, leaf_model_path, short_log
+
+fcntl = pytest.importorskip("fcntl")
+IS_ROOT = sys.platform != "win32" and os.geteuid() == 0
+pytestmark = pytest.mark.skipif(not IS_ROOT, reason="root plants links as another user")
+ANOTHER = 65534
+VICTIM = 65533
+BRIEF = Path(__file__).with_name("brief.toml")
+RUN = ("run", "-m", leaf_model_path(), "--interface", "virtual", "--channel", "planted")
+
+
+def planted(link: Path, target: Path, owner: int = ANOTHER) -> None:
+    link.symlink_to(target)
+    os.lchown(link, owner, owner)
+
+
+@pytest.fixture
+def shared() -> Iterator[Path]:
+    """Make a folder as `/tmp` is: everybody writes, nobody removes another's files."""
+    with tempfile.TemporaryDirectory() as name:
+        Path(name).chmod(0o1777)
+        yield Path(name)
+
+
+@pytest.fixture
+def drive(tmp_path: Path) -> Path:
+    write_log(short_log(), tmp_path / "drive.csv")
+    return tmp_path / "drive.csv"
+
+
+@pytest.mark.parametrize(
+    ("name", "arguments"),
+    [
+        ("log.csv", ("twin", "--seed", 1, "--hours", 0.05, "-o")),
+        ("soc.csv", ("estimate", "DRIVE", "-m", leaf_model_path(), "-o")),
+        ("soc.parquet", ("estimate", "DRIVE", "-m", leaf_model_path(), "-o")),
+        ("page.html", ("inspect", "DRIVE", "--report")),
+    ],
+)
+def test_a_command_does_not_write_through_a_planted_link(
+    name: str, arguments: tuple[object, ...], shared: Path, drive: Path
+) -> None:
+    mine = shared / "mine"
+    mine.write_text("mine")
+    planted(shared / name, mine)
+    given = [drive if each == "DRIVE" else each for each in arguments]
+    assert in_process(*given, shared / name).code == 0
+    assert mine.read_text() == "mine"
+
+
+def test_a_recording_does_not_begin_in_a_file_of_another_name(shared: Path) -> None:
+    planted(shared / "drive.log", shared / "victims.log")
+    assert in_process(*RUN, "--config", BRIEF, "--record", shared / "drive.log").code == 0
+    assert not (shared / "victims.log").exists()
+
+
+@pytest.mark.parametrize("name", ["s.json", ".s.json.part", ".s.json.lock"])
+def test_state_and_lock_do_not_follow_a_planted_link(name: str, shared: Path) -> None:
+    mine, state = shared / "mine", shared / "s.json"
+    mine.write_text('{"format": "cangauge-state", "mine": 1}')
+    before = mine.read_bytes()
+    planted(shared / name, mine)
+    pipeline = Pipeline(Vehicle.load("generic"), leaf_model())
+    with sole_writer(state), StateKeeper(state, pipeline, "virtual x", 86400.0):
+        for frame in frames_of(short_log()):
+            pipeline.handle(frame)
+    assert mine.read_bytes() == before
+    assert read_state(state).bus == "virtual x"
+
+
+def test_rights_of_a_planted_file_are_not_taken_over(shared: Path) -> None:
+    path = shared / "model.json"
+    path.touch()
+    path.chmod(0o666)
+    os.chown(path, ANOTHER, ANOTHER)
+    leaf_model().save(path)
+    assert path.stat().st_uid == 0
+    assert path.stat().st_mode & 0o022 == 0
+
+
+def test_a_planted_pipe_is_replaced(shared: Path) -> None:
+    os.mkfifo(shared / "x.txt")
+    os.chown(shared / "x.txt", ANOTHER, ANOTHER)
+    write_text_atomic(shared / "x.txt", "text")
+    assert (shared / "x.txt").is_file()
+
+
+def test_a_planted_folder_is_refused(shared: Path, tmp_path: Path) -> None:
+    planted(shared / "out", tmp_path)
+    with pytest.raises(InputError, match=r"out is a link of another user"):
+        write_text_atomic(shared / "out" / "x.txt", "text")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_an_own_link_that_leads_to_a_planted_one_stops_there(shared: Path, tmp_path: Path) -> None:
+    mine = tmp_path / "mine"
+    mine.write_text("mine")
+    planted(shared / "x.txt", mine)
+    (tmp_path / "link.txt").symlink_to(shared / "x.txt")
+    write_text_atomic(tmp_path / "link.txt", "text")
+    assert mine.read_text() == "mine"
+    assert (shared / "x.txt").read_text() == "text"
+
+
+def test_own_links_are_followed(tmp_path: Path) -> None:
+    (tmp_path / "folder").mkdir()
+    (tmp_path / "names").symlink_to("folder")
+    (tmp_path / "link.txt").symlink_to("names/../folder/mine.txt")
+    write_text_atomic(tmp_path / "link.txt", "text")
+    assert (tmp_path / "folder" / "mine.txt").read_text() == "text"
+    assert (tmp_path / "link.txt").is_symlink()
+
+
+def test_a_link_to_itself_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "x.txt").symlink_to("x.txt")
+    with pytest.raises(InputError, match="a link to itself"):
+        write_text_atomic(tmp_path / "x.txt", "text")
+
+
+def as_victim(work: Callable[[], None]) -> int:
+    """Run `work` as a user without rights; return 0 if it raises nothing, 1 for InputError."""
+    child = os.fork()
+    if child == 0:
+        code = 9
+        try:
+            os.setresgid(VICTIM, VICTIM, VICTIM)
+            os.setresuid(VICTIM, VICTIM, VICTIM)
+            work()
+            code = 0
+        except InputError as error:
+            code = 1 if "another user" in str(error) else 2
+        finally:
+            os._exit(code)
+    return os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
+
+
+def test_a_user_without_rights_is_told_of_a_planted_link(shared: Path) -> None:
+    mine = shared / "mine"
+    mine.write_text("mine")
+    os.chown(mine, VICTIM, VICTIM)
+    planted(shared / "x.txt", mine)
+    assert as_victim(lambda: write_text_atomic(shared / "x.txt", "text")) == 1
+    assert mine.read_text() == "mine"
+    assert sorted(each.name for each in shared.iterdir()) == ["mine", "x.txt"]
+
+
+def test_a_lock_of_another_user_stops_no_start(shared: Path) -> None:
+
+    own = shared / "own"
+    own.mkdir()
+    lock = own / ".s.json.lock"
+    lock.touch()
+    lock.chmod(0o666)
+    for path in (own, lock):
+        os.chown(path, VICTIM, VICTIM)
+    os.chown(lock, ANOTHER, ANOTHER)
+
+    def start() -> None:
+        with sole_writer(own / "s.json"):
+            pass
+
+    with lock.open() as held:
+        fcntl.flock(held, fcntl.LOCK_EX)
+        assert as_victim(start) == 0
+
+
+def test_a_state_of_another_user_is_not_trusted(shared: Path) -> None:
+    state = shared / "cangauge-state.json"
+    state.write_text('{"format": "cangauge-state"}')
+    os.chown(state, ANOTHER, ANOTHER)
+    ended = in_process(*RUN, "--config", BRIEF, "--state", state)
+    assert ended.code == 0
+    assert "belongs to another user" in ended.err
