@@ -192,6 +192,7 @@ class Pipeline:
         self.published, self.published_samples = NOTHING_YET, 0
         self._estimate = NOTHING_YET  # after the latest sample, without the signals' health
         self._report: tuple[int, PackReport] | None = None
+        self._findings: tuple[Reason, Reason, bool, bool, bool] | None = None
         self.estimator = make_estimator(model, _with_source(settings.estimator, vehicle))
         self._pack = _pack_of(self.estimator)
         self._begin_signals()
@@ -305,17 +306,21 @@ class Pipeline:
         several consecutive ones are, or one that is too old. Samples that are refused one after the
         other do not make an estimate fresh.
         """
-        estimate, reasons = self._estimate, self._estimate.reasons & ~Reason.VOLTAGE_MISSING
-        if self._lacks_voltage:
-            reasons |= Reason.VOLTAGE_MISSING
-        reasons |= self.decoder.reasons(now_s)
-        if self._refused >= MISSED_UNTIL_OLD:
-            reasons |= Reason.INPUT_STALE
-        if self.sign.evidence:
-            reasons |= Reason.SIGN_SUSPECT
-        if reasons == estimate.reasons:
+        estimate = self._estimate
+        findings = (
+            estimate.reasons,
+            self.decoder.reasons(now_s),
+            self._lacks_voltage,
+            self._refused >= MISSED_UNTIL_OLD,
+            self.sign.evidence != "",
+        )
+        if findings != self._findings:  # they change seldom, and flags are slow
+            self._findings = findings
+            self._reasons = _all_reasons(*findings)
+            self._status = status_of(self._reasons)
+        if self._reasons == estimate.reasons:
             return estimate
-        return estimate._replace(reasons=reasons, status=status_of(reasons))
+        return estimate._replace(reasons=self._reasons, status=self._status)
 
     def _begin_log(self) -> None:
         """Restart estimator and decoder for the next log of a replay."""
@@ -480,6 +485,24 @@ def _from_voltage(settings: EstimatorSettings) -> EstimatorSettings:
     """Return the settings without an initial SoC."""
     std_pct = EstimatorSettings().initial_soc_std_pct
     return replace(settings, initial_soc_pct=None, initial_soc_std_pct=std_pct)
+
+
+def _all_reasons(
+    estimate: Reason,
+    signals: Reason,
+    lacks_voltage: bool,
+    is_refused: bool,
+    is_sign_wrong: bool,
+) -> Reason:
+    """Return the reasons of an estimate, with the findings about its inputs."""
+    reasons = (estimate & ~Reason.VOLTAGE_MISSING) | signals
+    if lacks_voltage:
+        reasons |= Reason.VOLTAGE_MISSING
+    if is_refused:
+        reasons |= Reason.INPUT_STALE
+    if is_sign_wrong:
+        reasons |= Reason.SIGN_SUSPECT
+    return reasons
 
 
 def _with_source(settings: EstimatorSettings, vehicle: Vehicle) -> EstimatorSettings:
