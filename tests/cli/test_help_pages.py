@@ -12,10 +12,9 @@ from cangauge.diagnosis import ALARM
 
 SLOW_TO_IMPORT = {
     "numpy", "scipy", "pandas", "pyarrow", "bokeh", "matplotlib", "clarabel", "can", "cantools",
-    "dask", "distributed", "fsspec", "jinja2", "asyncio", "multiprocessing", "concurrent",
+    "dask", "distributed", "jinja2", "asyncio", "multiprocessing", "concurrent",
     "cangauge.service", "cangauge.bus", "cangauge.model", "cangauge.diagnosis",
 }  # fmt: skip
-FLEET = ("fit", "estimate", "gap", "health")
 ALL_PAGES = """
 import contextlib, io, json, sys
 from cangauge.cli.app import main
@@ -37,7 +36,7 @@ ON_A_BUS = ("check", "init", "replay", "run")
 
 def test_no_help_page_imports_what_computes() -> None:
     names = [name for name in COMMANDS if name not in ON_A_BUS]
-    pages = [[], *([name] for name in names), *(["fleet", name] for name in FLEET)]
+    pages = [[], *([name] for name in names)]
     given = json.dumps([sorted(SLOW_TO_IMPORT), {}]), json.dumps(pages)
     done = subprocess.run(
         [sys.executable, "-c", ALL_PAGES, *given],
@@ -46,7 +45,7 @@ def test_no_help_page_imports_what_computes() -> None:
     assert done.returncode == 0, done.stderr
     found = json.loads(done.stdout)
     assert {page: names for page, names in found.items() if names} == {}
-    assert len(found) == len(names) + len(FLEET) + 1
+    assert len(found) == len(names) + 1
 
 
 def test_help_pages_repeat_the_probability_of_an_alarm_truly() -> None:

@@ -82,13 +82,10 @@ class LazyGroup(TyperGroup):
 
 def load_command(name: str) -> Any:
     """Import a command and return it as typer runs it."""
-    function = COMMANDS[name].load()
-    if (group := getattr(function, "group", None)) is not None:
-        return build_command(group)
     alone = typer.Typer(
         rich_markup_mode="markdown", add_completion=False, context_settings=_CONTEXT
     )
-    alone.command(name)(function)
+    alone.command(name)(COMMANDS[name].load())
     return build_command(alone)
 
 

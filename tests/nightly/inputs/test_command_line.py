@@ -17,8 +17,8 @@ from cangauge.cli import app as line
 from cangauge.cli.app import load_command, main
 from cangauge.model.model_file import Model
 
-# `status` answers 1 where no service runs, `gap-check` draws its own cases, and `fleet` has
-# commands of its own: see tests/service, tests/cli, tests/validation and tests/fleet.
+# `status` answers 1 where no service runs, `gap-check` draws its own cases, and an absent log is a
+# row of `fleet`: see tests/service, tests/validation and tests/fleet.
 ELSEWHERE = {"status", "gap-check", "fleet"}
 COMMANDS: dict[str, Any] = {
     name: load_command(name) for name in line.COMMANDS if name not in ELSEWHERE

@@ -1,0 +1,110 @@
+"""`cangauge fleet`: a row of each log, with the numbers of the command on that log alone."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+
+import cangauge
+from cangauge.diagnosis import diagnose
+from cangauge.extras.judge.judgement import judge
+from cangauge.logs.canonical import write_log
+from live import in_process, refused
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Four drives of a pack, the last one with a fault; a model of the first two; a broken file."""
+    root = tmp_path_factory.mktemp("fleet")
+    for number in range(4):
+        faults = ("voltage_offset:offset_v=4",) if number == 3 else ()
+        drive = cangauge.simulate(*faults, seed=3, drive=number, hours=0.4)
+        write_log(drive.log, root / f"drive{number}.parquet")
+    healthy = [cangauge.read_log(root / f"drive{number}.parquet") for number in range(3)]
+    cangauge.fit(healthy[:2], capacity_ah=60.0).model.save(root / "type.json")
+    (root / "broken.parquet").write_bytes(b"PAR1")
+    return root
+
+
+def drives(folder: Path) -> list[Path]:
+    return sorted(folder.glob("drive*.parquet"))
+
+
+def table_of(folder: Path, answer: str, logs: list[Path], *more: object) -> dict[str, list[Any]]:
+    output = folder / f"{answer}.parquet"
+    ended = in_process("fleet", answer, *logs, "-m", folder / "type.json", "-o", output, *more)
+    assert ended.code == 0, ended.err
+    return pq.read_table(output).to_pydict()
+
+
+def test_estimates_are_those_of_each_log_alone(folder: Path) -> None:
+    table = table_of(folder, "estimate", drives(folder))
+    assert table["log"] == [str(path) for path in drives(folder)]
+    for path, error_pct in zip(drives(folder), table["soc_mae_pct"], strict=True):
+        alone = in_process(
+            "estimate", path, "-m", folder / "type.json", "-o", folder / "soc.csv", "--json"
+        )
+        assert error_pct == alone.json["soc_mae_pct"]
+
+
+def test_a_log_that_fails_is_a_row_with_its_error(folder: Path) -> None:
+    logs = [*drives(folder)[:1], folder / "broken.parquet", folder / "absent.csv"]
+    table = table_of(folder, "estimate", logs)
+    assert [Path(log).name for log in table["log"]] == [
+        "absent.csv", "broken.parquet", "drive0.parquet",
+    ]  # fmt: skip
+    assert "no such file" in table["error"][0]
+    assert "broken.parquet" in table["error"][1]
+    assert table["error"][2] is None
+    assert np.isfinite(table["soc_mae_pct"][2])
+    assert table["soc_mae_pct"][:2] == [None, None]
+
+
+def test_no_answer_at_all_fails(folder: Path) -> None:
+    output = folder / "none.parquet"
+    ended = in_process(
+        "fleet", "estimate", folder / "absent.csv", "-m", folder / "type.json", "-o", output,
+        "--json",
+    )  # fmt: skip
+    assert ended.code == 1
+    assert ended.json["failed"] == 1
+    assert output.exists()
+
+
+def test_gaps_are_those_of_each_log_alone(folder: Path) -> None:
+    *references, faulty = drives(folder)
+    given = [word for path in references for word in ("--reference", path)]
+    table = table_of(folder, "gap", [faulty], *given)
+    model = cangauge.Model.load(folder / "type.json")
+    alone = diagnose([faulty], model, references).to_json()
+    assert table["gap.baseline_rmse_v"] == [alone["gap"]["baseline_rmse_v"]]
+
+
+def test_judgements_are_those_of_each_log_alone(folder: Path) -> None:
+    path = drives(folder)[3]
+    table = table_of(folder, "judge", [path])
+    alone = judge([path], folder / "type.json").to_dict()
+    assert table["gauge.error_pct"] == [alone["gauge"]["error_pct"]]
+
+
+def test_a_dask_scheduler_gives_the_same_rows(folder: Path) -> None:
+    distributed = pytest.importorskip("distributed")
+    here = table_of(folder, "estimate", drives(folder))
+    with distributed.LocalCluster(
+        n_workers=1, threads_per_worker=1, processes=False, dashboard_address=None
+    ) as cluster:
+        scheduler = cluster.scheduler_address
+        there = table_of(folder, "estimate", drives(folder), "--scheduler", scheduler)
+    assert there | {"seconds": None} == here | {"seconds": None}
+
+
+def test_references_belong_to_gap(folder: Path) -> None:
+    log, model = drives(folder)[0], folder / "type.json"
+    ended = in_process(
+        "fleet", "judge", log, "-m", model, "-o", folder / "x.parquet", "--reference", log
+    )
+    refused(ended, "--reference", "judge")
