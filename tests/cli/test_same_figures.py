@@ -34,7 +34,7 @@ def test_inspect_and_fit_state_one_capacity(trip: Path, tmp_path: Path) -> None:
     fitted_ah = succeeds("fit", trip, *options).json["capacity_ah"]
     assert fitted_ah == pytest.approx(inspected["soc"]["implied_capacity_ah"], rel=1e-9)
     (ability,) = [each for each in inspected["abilities"] if each["topic"] == "capacity"]
-    assert f"{fitted_ah:.2f} Ah" in ability["text"]
+    assert f"{fitted_ah:.2f} ± " in ability["text"]
 
 
 def test_terminal_page_and_model_state_one_soc_range(trip: Path, tmp_path: Path) -> None:

@@ -50,7 +50,8 @@ def test_the_table_shows_the_main_findings(path: Path) -> None:
     result = CliRunner().invoke(app, [str(path)])
     assert result.exit_code == 0
     for words in (
-        "drive [1]: 6000 rows, 10.0 min, 10 Hz (regular), temperature of: pack",
+        "drive [1]: good for an estimate; a fit needs --capacity-ah and",
+        "6000 rows, 10.0 min, 10 Hz (regular), temperature of: pack",
         "Sign: positive current discharges",
         "voltage moved against current in",
         "ohmic resistance",

@@ -144,11 +144,14 @@ def _of_log(
     soc_from_log: bool,
     keeps_pack: bool,
 ) -> RecordedEstimate:
+    from cangauge.logs.charge import refuse_contradictions
     from cangauge.logs.gaps import USUAL_STEPS
     from cangauge.model.delay_line import GAP_S
     from cangauge.service.offline import PackHistory, estimate_recorded_log
 
     log = reading.load(path)
+    if soc_from_log:  # a stated start needs no SoC of the log
+        refuse_contradictions([log], settings.capacity_ah or model.capacity_ah)
     if settings.initial_soc_pct is not None:
         note_starts([log], settings.initial_soc_pct, settings.capacity_ah or model.capacity_ah)
     cells = reading.cells_of(log)

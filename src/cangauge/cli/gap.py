@@ -157,8 +157,10 @@ def _refuse(
 
 
 def _note_differences(logs: list[Log], capacity_ah: float) -> None:
+    from cangauge.logs.charge import refuse_contradictions
     from cangauge.model.coulomb_counting import difference_from_reference
 
+    refuse_contradictions(logs, capacity_ah)
     for difference in filter(None, (difference_from_reference(log, capacity_ah) for log in logs)):
         note(f"warning: {difference}")
 

@@ -102,8 +102,9 @@ def _show_log(found: LogInspection) -> None:
     if timing.rate_hz:
         exact = f"{timing.rate_hz:.4g} Hz (regular)"
         rate = exact if timing.regular else f"about {rounded(timing.rate_hz, 2)} Hz (irregular)"
+    say(f"{found.name}: {found.answer}.")
     say(
-        f"{found.name}: {found.rows} rows, {timing.duration_s / 60.0:.1f} min, {rate},"
+        f"{found.rows} rows, {timing.duration_s / 60.0:.1f} min, {rate},"
         f" temperature of: {found.temperature_source}"
     )
     print_table("Channels", *channel_rows(found))

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import asdict, dataclass
 from typing import Any, Final, Literal
 
 import numpy as np
 
-from cangauge._text import counted, duration, rounded, significant
+from cangauge._text import counted, duration, rounded, significant, uncertain
 from cangauge.errors import InputError
 from cangauge.identify.rows import (
     LEAST_ROWS,
@@ -18,6 +19,7 @@ from cangauge.identify.rows import (
     usable_rows,
 )
 from cangauge.inspect.channels import Channel, describe_channels
+from cangauge.logs.charge import MIN_SPAN_PCT, contradiction, implied_capacity
 from cangauge.logs.gaps import discharged_ah, uncounted_gaps, usual_gap_s, usual_step_s
 from cangauge.logs.log import Log
 from cangauge.logs.sign import (
@@ -28,7 +30,7 @@ from cangauge.logs.sign import (
     sign_of_current,
     spaced_rows,
 )
-from cangauge.model.coulomb_counting import capacity_from_full_discharge, capacity_from_reference
+from cangauge.model.coulomb_counting import capacity_from_full_discharge
 from cangauge.model.delay_line import GAP_S
 from cangauge.model.prior import DELAYS_S
 
@@ -37,8 +39,6 @@ Verdict = Literal["yes", "partly", "no"]
 LISTED: Final = 10
 FIT_RATE_HZ: Final = 1.0
 """Rate of a fit by default [Hz]."""
-MIN_SOC_SPAN_PCT: Final = 5.0
-"""Least span of the reference SoC for a capacity [%]: below, its quantization dominates."""
 MIN_STEPS: Final = 8
 """Fewest clear steps of current for a resistance."""
 CORRELATED: Final = 0.9
@@ -98,7 +98,8 @@ class Charge:
 class Soc:
     """The reference SoC: share of rows with a value [-], values [%].
 
-    `implied_capacity_ah` is the charge per 100 %, by least squares; None below a span of 5 %.
+    `implied_capacity_ah` is the charge per 100 %, by least squares, with its standard deviation;
+    None below a span of 5 %, and where charge and SoC contradict each other.
     """
 
     coverage: float
@@ -107,11 +108,12 @@ class Soc:
     minimum_pct: float
     maximum_pct: float
     implied_capacity_ah: float | None
+    implied_capacity_std_ah: float | None
 
 
 @dataclass(frozen=True, slots=True)
 class Resistance:
-    """Median and quartiles of −ΔU/ΔI over steps of current [Ω]; negative at an inverted sign."""
+    """Median and quartiles of −ΔU/ΔI over steps of current [Ω], of the current's right sign."""
 
     median_ohm: float
     lower_ohm: float
@@ -130,7 +132,10 @@ class Ability:
 
 @dataclass(frozen=True, slots=True)
 class LogInspection:
-    """Findings of `inspect_log`; `soc` is None without a reference, `resistance` without steps."""
+    """Findings of `inspect_log`; `soc` is None without a reference, `resistance` without steps.
+
+    `contradiction` says that charge and SoC of the log contradict each other; else it is None.
+    """
 
     name: str
     source: str
@@ -142,28 +147,49 @@ class LogInspection:
     soc: Soc | None
     resistance: Resistance | None
     sign: SignFinding
+    contradiction: str | None
     abilities: tuple[Ability, ...]
     remarks: tuple[str, ...]
     warnings: tuple[str, ...]
+
+    @property
+    def answer(self) -> str:
+        """What the log is good for, or what stands against it."""
+        if self.contradiction is not None:
+            return self.contradiction
+        if self.sign.sign < 0:
+            return f"{self.sign.sentence}; --sign charge inverts it"
+        assessed = {item.topic: item for item in self.abilities}
+        for topic in ("rows for a fit", "voltage curve over SoC"):
+            if assessed[topic].verdict == "no":
+                return f"good for an estimate, not for a fit: {assessed[topic].text}"
+        if self.soc is None:
+            needed = "--capacity-ah and, of one log, --initial-soc"
+            return f"good for an estimate; a fit needs {needed}, as the log has no SoC"
+        covered = f"{self.soc.minimum_pct:.0f} … {self.soc.maximum_pct:.0f} % SoC"
+        return f"good for a fit over {covered}, and for an estimate"
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain values for JSON."""
         plain = asdict(self)
         del plain["sign"]
-        return {"kind": "log", **plain, "sign_of_current": self.sign.to_dict()}
+        found = {"sign_of_current": self.sign.to_dict(), "answer": self.answer}
+        return {"kind": "log", **plain, **found}
 
 
 def inspect_log(log: Log) -> LogInspection:
     """Inspect a log; the sign of its current is one of the findings."""
-    timing, soc, sign = _timing(log), _soc(log), sign_of_current(log)
+    timing, sign = _timing(log), sign_of_current(log)
+    contradicts = None if sign.sign < 0 else contradiction(log)
+    soc = _soc(log, sign, contradicts)
     charge = _charge(log, timing.gap_limit_s)
-    resistance = _resistance(log)
+    resistance = _resistance(log, sign)
     channels = describe_channels(log, resistance.median_ohm if resistance else None)
     warnings = tuple(_warnings(log, timing, channels, charge, sign))
     assessed: dict[str, tuple[Verdict, str]] = {
         "sign of current": ("yes" if sign.sign else "no", sign.sentence),
         "voltage curve over SoC": _curve(charge, soc),
-        "capacity": _capacity(log, charge, soc),
+        "capacity": ("no", contradicts) if contradicts else _capacity(log, charge, soc),
         "ohmic resistance": _ohmic(resistance, max(STEP_SPACING_S, usual_step_s(log.time_s))),
         "delayed current terms": _delays(log, timing),
         "rows for a fit": _rows(log, timing),
@@ -174,7 +200,7 @@ def inspect_log(log: Log) -> LogInspection:
     abilities = tuple(Ability(topic, *each) for topic, each in assessed.items())
     return LogInspection(
         log.name, log.source, log.temperature_source, len(log), timing, channels, charge, soc,
-        resistance, sign, abilities, log.remarks, warnings,
+        resistance, sign, contradicts, abilities, log.remarks, warnings,
     )  # fmt: skip
 
 
@@ -218,22 +244,28 @@ def _charge(log: Log, gap_limit_s: float) -> Charge:
     )  # fmt: skip
 
 
-def _soc(log: Log) -> Soc | None:
+def _soc(log: Log, sign: SignFinding, contradicts: str | None) -> Soc | None:
     if log.soc_pct is None or not np.isfinite(log.soc_pct).any():
         return None
     soc = log.soc_pct[np.isfinite(log.soc_pct)]
-    is_wide = np.ptp(soc) >= MIN_SOC_SPAN_PCT
-    capacity_ah = abs(capacity_from_reference([log])) if is_wide else None
+    capacity_ah = std_ah = None
+    if contradicts is None and np.ptp(soc) >= MIN_SPAN_PCT:
+        with suppress(InputError):
+            found = implied_capacity([log])
+            capacity_ah = found.capacity_ah * (sign.sign or 1)
+            std_ah = found.std_ah
+    if capacity_ah is not None and capacity_ah <= 0.0:
+        capacity_ah = std_ah = None
     first, last, low, high = (float(each) for each in (soc[0], soc[-1], soc.min(), soc.max()))
-    return Soc(soc.size / len(log), first, last, low, high, capacity_ah)
+    return Soc(soc.size / len(log), first, last, low, high, capacity_ah, std_ah)
 
 
-def _resistance(log: Log) -> Resistance | None:
+def _resistance(log: Log, sign: SignFinding) -> Resistance | None:
     current, voltage = current_steps(log)
     if current.size < MIN_STEPS:
         return None
-    ohm = np.quantile(-voltage / current, [0.5, 0.25, 0.75]).tolist()
-    return Resistance(ohm[0], ohm[1], ohm[2], current.size)
+    ohm = np.quantile(-voltage / current * (sign.sign or 1), [0.5, 0.25, 0.75]).tolist()
+    return Resistance(ohm[0], ohm[1], ohm[2], current.size) if ohm[0] > 0.0 else None
 
 
 # --- Warnings
@@ -297,13 +329,14 @@ def _curve(charge: Charge, soc: Soc | None) -> tuple[Verdict, str]:
 
 def _capacity(log: Log, charge: Charge, soc: Soc | None) -> tuple[Verdict, str]:
     if soc is None or soc.implied_capacity_ah is None:
-        text = f"no reference SoC that spans {MIN_SOC_SPAN_PCT:g} %; at least {charge.span_ah:.3g}"
+        text = f"no reference SoC that spans {MIN_SPAN_PCT:g} %; at least {charge.span_ah:.3g}"
         return "no", f"{text} Ah, the capacity if the log runs from full to empty"
     span = soc.maximum_pct - soc.minimum_pct
     try:
         whole_ah = capacity_from_full_discharge([log], [None])
     except InputError:
-        text = f"{soc.implied_capacity_ah:.4g} Ah per 100 % of reference SoC, over {span:.1f} %"
+        per_100 = uncertain(soc.implied_capacity_ah, soc.implied_capacity_std_ah, "Ah")
+        text = f"{per_100} per 100 % of reference SoC, over {span:.1f} %"
         return "yes" if span >= WIDE_SOC_PCT else "partly", text
     return "yes", f"{whole_ah:.4g} Ah: the log runs from full to empty"
 

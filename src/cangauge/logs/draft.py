@@ -21,6 +21,7 @@ from cangauge.logs.units import (
     known_temperature_source,
     refuse_wrong_units,
 )
+from cangauge.types import SOC_WITHIN_PCT
 
 Sign = Literal["charge", "discharge"]
 """What a positive current in the file does."""
@@ -132,6 +133,7 @@ class DraftLog:
             self.values["soc_pct"][np.isinf(self.values["soc_pct"])] = np.nan
         self._drop_incomplete()
         self._drop_repeated()
+        self._remark_values()
         for values in self.values.values():
             values.flags.writeable = False  # the log need not copy them
         self.remarks += refuse_wrong_units(
@@ -212,6 +214,21 @@ class DraftLog:
             raise self.error("time_s", problem, cure)
         remark = f"with the time stamp of the row before dropped (the first is row {row + 1})"
         self.keep(~repeats, remark)
+
+    def _remark_values(self) -> None:
+        """Remark on a SoC that leaves 0–100 %, and on rows without voltage."""
+        soc = self.values.get("soc_pct", np.empty(0))
+        least, most = SOC_WITHIN_PCT
+        wrong = (soc < least) | (soc > most)
+        if wrong.any():
+            shown = f"{float(np.nanmin(soc)):.4g} … {float(np.nanmax(soc)):.4g} %"
+            problem = f"SoC {shown} is not within 0–100 % in {counted(int(wrong.sum()), 'row')}"
+            self.remarks.append(f"{problem}: its scale or offset is wrong, and it is no start")
+        off = self.values["voltage_v"] == 0.0
+        if off.any():
+            row = int(np.argmax(off))
+            rows = counted(int(off.sum()), "row")
+            self.remarks.append(f"0 V in {rows} (the first is row {row + 1}): no voltage was read")
 
     @property
     def where(self) -> str:

@@ -16,6 +16,7 @@ from cangauge._text import duration
 from cangauge._typing import BoolArray, FloatArray, IntArray
 from cangauge.errors import InputError, naming_arguments, require_temperature
 from cangauge.logs.units import REQUIRED, TEMPERATURE_SOURCES, TemperatureSource
+from cangauge.types import SOC_WITHIN_PCT
 
 __all__ = ["TEMPERATURE_SOURCES", "Log", "TemperatureSource"]
 
@@ -187,11 +188,18 @@ class Log(ArrowExport):
         return float(self.time_s[-1] - self.time_s[0])
 
     def first_soc(self) -> tuple[int, float] | None:
-        """Return row and value [%] of the first finite reference SoC, or None."""
+        """Return row and value [%] of the first finite reference SoC, or None.
+
+        A SoC that leaves 0–100 % somewhere has a wrong scale or offset, and gives no start.
+        """
         if self.soc_pct is None:
             return None
         rows = np.flatnonzero(np.isfinite(self.soc_pct))
-        return (int(rows[0]), float(self.soc_pct[rows[0]])) if rows.size else None
+        least, most = SOC_WITHIN_PCT
+        known = self.soc_pct[rows]
+        if not rows.size or known.min() < least or known.max() > most:
+            return None
+        return int(rows[0]), float(known[0])
 
     def rows(self, keep: BoolArray | IntArray | slice) -> Self:
         """Return the log of the rows that `keep` selects (mask, indices or slice)."""

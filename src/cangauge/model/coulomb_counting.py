@@ -14,6 +14,7 @@ import numpy as np
 from cangauge._text import rounded
 from cangauge._typing import BoolArray, FloatArray
 from cangauge.errors import InputError
+from cangauge.logs.charge import implied_capacity
 from cangauge.logs.gaps import discharged_ah, split_where_moved
 from cangauge.logs.log import Log
 
@@ -114,28 +115,14 @@ def difference_from_reference(log: Log, capacity_ah: float) -> str | None:
 
 
 def capacity_from_reference(logs: Sequence[Log]) -> float:
-    """Return the charge per 100 % of reference SoC [Ah], by regression pooled over the logs.
+    """Return the charge per 100 % of reference SoC [Ah]; see `logs.charge.implied_capacity`.
 
     Raises
     ------
     InputError
         If no log has a reference SoC that moves by at least 1 %.
     """
-    covariance = variance = 0.0
-    for log in [piece for whole in logs for piece in split_where_moved(whole)]:
-        soc_pct, out_ah = _readings(log)
-        if not soc_pct.size or np.ptp(soc_pct) < 1.0:
-            continue
-        away_pct = soc_pct - soc_pct.mean()
-        covariance += float(np.sum(away_pct * (out_ah - out_ah.mean())))
-        variance += float(np.sum(away_pct**2))
-    if variance == 0.0:
-        raise InputError(
-            "no log has a reference SoC that moves by 1 % or more",
-            field="soc_pct",
-            cure="give the capacity in Ah with --capacity-ah",
-        )
-    return -100.0 * covariance / variance
+    return implied_capacity(logs, least_pct=1.0).capacity_ah
 
 
 def _readings(log: Log) -> tuple[FloatArray, FloatArray]:

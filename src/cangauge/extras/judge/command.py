@@ -84,6 +84,7 @@ def judge_command(
         simulated ones.
     """
     from cangauge.extras.judge.judgement import judge, narrowed
+    from cangauge.logs.charge import refuse_contradictions
     from cangauge.model.model_file import Model
 
     if suite:
@@ -95,9 +96,11 @@ def judge_command(
     check_outputs([output, corrected, report], [*paths, *([model] if model else [])])
     with progress() as show:
         loaded = reading.load_all(paths, show)
+    pack = None if model is None else Model.load(model)
+    refuse_contradictions(loaded, pack.capacity_ah if pack and not capacity_ah else capacity_ah)
     judgement = judge(
         loaded,
-        None if model is None else Model.load(model),
+        pack,
         chemistry=chemistry,
         cells=cells,
         capacity_ah=capacity_ah,

@@ -1,0 +1,204 @@
+"""Charge against the log's own SoC: the capacity that both imply, and whether they agree at all.
+
+Momentary currents count the charge between two rows only as well as the current is smooth. The
+deviation of each current from the mean of its neighbours measures that, so that a capacity has a
+standard deviation: sampling of the current, and resolution of the SoC.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Final
+
+import numpy as np
+
+from cangauge._text import rounded
+from cangauge._typing import FloatArray
+from cangauge.errors import InputError
+from cangauge.logs.gaps import bridge_s, discharged_ah, split_where_moved
+from cangauge.logs.log import Log
+
+MIN_SPAN_PCT: Final = 5.0
+"""Least span of the reference SoC for a capacity [%]: below, its quantization dominates."""
+CONTRADICTION: Final = 2.0
+"""Ratio of two capacities from which charge and SoC contradict each other [-]."""
+SURE: Final = 3.0
+"""Standard deviations by which a contradiction exceeds the error by sampling [-]."""
+JUMP_PCT: Final = 3.0
+"""Least step of a SoC that its gauge corrected [%]: no dashboard shows coarser steps …"""
+USUAL_STEPS: Final = 5.0
+"""… and the number of its usual steps that a correction exceeds [-]."""
+
+
+@dataclass(frozen=True, slots=True)
+class ImpliedCapacity:
+    """Charge per 100 % of reference SoC, with its standard deviation [Ah].
+
+    Negative where the SoC rises as charge is taken out.
+    """
+
+    capacity_ah: float
+    std_ah: float
+
+
+@dataclass(frozen=True, slots=True)
+class _Count:
+    """SoC [%] without jumps and discharged charge [Ah] at the rows with a SoC, shape (k,).
+
+    `std_ah` is the error of the charge by sampling, `step_pct` the resolution of the SoC.
+    """
+
+    soc_pct: FloatArray
+    out_ah: FloatArray
+    std_ah: float
+    step_pct: float
+
+    @property
+    def span_pct(self) -> float:
+        return float(np.ptp(self.soc_pct))
+
+    def covariance(self) -> tuple[float, float]:
+        """Return covariance of SoC and charge, and variance of the SoC, both times k."""
+        away_pct = self.soc_pct - self.soc_pct.mean()
+        covariance = float(np.sum(away_pct * (self.out_ah - self.out_ah.mean())))
+        return covariance, float(np.sum(away_pct**2))
+
+    def halves(self) -> tuple[_Count, _Count]:
+        """Return the parts before and after half of the movement of the SoC."""
+        moved_pct = np.cumsum(np.abs(np.diff(self.soc_pct)))
+        middle = 1 + int(np.searchsorted(moved_pct, 0.5 * moved_pct[-1]))
+        parts = slice(None, middle + 1), slice(middle, None)
+        first, second = (
+            _Count(self.soc_pct[part], self.out_ah[part], self.std_ah, self.step_pct)
+            for part in parts
+        )
+        return first, second
+
+
+def implied_capacity(logs: Sequence[Log], least_pct: float = MIN_SPAN_PCT) -> ImpliedCapacity:
+    """Return the capacity that charge and SoC imply, by regression pooled over the logs.
+
+    Parameters
+    ----------
+    logs : sequence of Log
+        Gaps over which the SoC moved, and jumps of it, are left out.
+    least_pct : float
+        Least span of a SoC that counts [%].
+
+    Raises
+    ------
+    InputError
+        If no log has a reference SoC with this span.
+    """
+    counts = [each for log in logs for each in _counts(log) if each.span_pct >= least_pct]
+    found = _implied(counts)
+    if found is None:
+        raise InputError(
+            f"no log has a reference SoC that moves by {least_pct:g} % or more",
+            field="soc_pct",
+            cure="give the capacity in Ah with --capacity-ah",
+        )
+    return found
+
+
+def contradiction(log: Log, capacity_ah: float | None = None) -> str | None:
+    """Return a sentence if charge and SoC of a log contradict each other by a factor of two.
+
+    Parameters
+    ----------
+    log : Log
+    capacity_ah : float, optional
+        Capacity of the pack [Ah]. Without it, the parts of the log are compared with each other.
+    """
+    counts = [each for each in _counts(log) if each.span_pct >= MIN_SPAN_PCT]
+    whole = _implied(counts)
+    if whole is None:
+        return None
+    begins = "charge and SoC contradict each other"
+    if capacity_ah is not None and _contradict(whole, capacity_ah):
+        stated = f"the pack has {rounded(capacity_ah, 3)} Ah"
+        return f"{begins}: {_per_100(whole.capacity_ah)}; {stated}"
+    halves = [half for count in counts for half in count.halves() if half.span_pct >= MIN_SPAN_PCT]
+    parts = [found for half in halves if (found := _implied([half])) is not None]
+    for first, second in pairwise(parts):
+        if _contradict(first, second.capacity_ah) and _contradict(second, first.capacity_ah):
+            return (
+                f"{begins}: {_per_100(first.capacity_ah)} in one part of the log,"
+                f" {rounded(second.capacity_ah, 3)} Ah in the next"
+            )
+    return None
+
+
+def refuse_contradictions(logs: Sequence[Log], capacity_ah: float | None = None) -> None:
+    """Raise InputError if charge and SoC of a log contradict each other by a factor of two."""
+    for log in logs:
+        found = contradiction(log, capacity_ah)
+        if found is not None:
+            cure = "check unit, scale and sign of the current, the SoC, and the capacity"
+            raise InputError(found, source=log.source or log.name, field="current_a", cure=cure)
+
+
+def _per_100(capacity_ah: float) -> str:
+    return f"{rounded(capacity_ah, 3)} Ah per 100 %"
+
+
+def _contradict(implied: ImpliedCapacity, other_ah: float) -> bool:
+    """Return whether a capacity is another one by a factor of two, whatever its sampling error."""
+    least_ah = implied.capacity_ah - SURE * implied.std_ah
+    most_ah = implied.capacity_ah + SURE * implied.std_ah
+    return least_ah > CONTRADICTION * other_ah or CONTRADICTION * most_ah < other_ah
+
+
+def _implied(counts: Sequence[_Count]) -> ImpliedCapacity | None:
+    sums = [count.covariance() for count in counts]
+    covariance, variance = (sum(column) for column in zip(*sums, strict=True)) if sums else (0, 0)
+    if not variance:
+        return None
+    capacity_ah = -100.0 * covariance / variance
+    charge_ah = sum(float(np.ptp(count.out_ah)) for count in counts)
+    span_pct = sum(count.span_pct for count in counts)
+    by_sampling_ah = float(np.sqrt(sum(count.std_ah**2 for count in counts)))
+    # Two roundings, of the first value and of the last.
+    by_steps_pct = float(np.sqrt(sum(count.step_pct**2 for count in counts) / 6.0))
+    share = np.hypot(by_sampling_ah / charge_ah if charge_ah else 0.0, by_steps_pct / span_pct)
+    return ImpliedCapacity(capacity_ah, abs(capacity_ah) * float(share))
+
+
+def _counts(log: Log) -> Iterator[_Count]:
+    """Yield the count of each piece of a log with a SoC that moves."""
+    for piece in split_where_moved(log):
+        soc_pct = np.full(len(piece), np.nan) if piece.soc_pct is None else piece.soc_pct
+        rows = np.isfinite(soc_pct)
+        steps = np.abs(np.diff(soc_pct[rows]))
+        if not np.any(steps > 0.0):
+            continue
+        step_pct = float(np.median(steps[steps > 0.0]))
+        out_ah = discharged_ah(piece.time_s, piece.current_a)[rows]
+        known_pct = _without_jumps(soc_pct[rows], step_pct)
+        yield _Count(known_pct, out_ah, _sampling_std_ah(piece), step_pct)
+
+
+def _without_jumps(soc_pct: FloatArray, usual_pct: float) -> FloatArray:
+    """Return a SoC [%] less the steps by which its gauge corrected it."""
+    steps = np.diff(soc_pct)
+    jumps = np.abs(steps) > max(JUMP_PCT, USUAL_STEPS * usual_pct)
+    corrected = np.cumsum(np.where(jumps, steps, 0.0))
+    return np.concatenate([soc_pct[:1], soc_pct[1:] - corrected])
+
+
+def _sampling_std_ah(log: Log) -> float:
+    """Return the standard deviation of a log's charge by the sampling of its current [Ah].
+
+    A current that is independent from row to row deviates from the mean of its neighbours by
+    sqrt(3/2) of its standard deviation; each row stands for half of the two steps beside it.
+    """
+    if len(log) < 3:
+        return 0.0
+    step_s = np.diff(log.time_s)
+    step_s[step_s > bridge_s(log.time_s)] = 0.0
+    current = log.current_a
+    apart_a = current[1:-1] - 0.5 * (current[:-2] + current[2:])
+    stands_for_s = 0.5 * (step_s[:-1] + step_s[1:])
+    return float(np.sqrt(np.sum((apart_a * stands_for_s) ** 2) / 1.5) / 3600.0)

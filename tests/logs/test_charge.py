@@ -1,0 +1,100 @@
+"""Charge against the log's own SoC: capacity with its error, jumps, contradictions, values."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from cangauge.bus.recording import read_log
+from cangauge.errors import InputError
+from cangauge.logs.charge import contradiction, implied_capacity, refuse_contradictions
+from cangauge.logs.log import Log
+
+CAPACITY_AH = 60.0
+
+
+def drive(seed: int = 0, hours: float = 1.5) -> Log:
+    """Return a drive at 1 Hz, whose SoC has steps of 0.5 %."""
+    rng = np.random.default_rng(seed)
+    time_s = np.arange(round(3600 * hours), dtype=float)
+    current_a = np.repeat(rng.normal(20.0, 30.0, time_s.size // 6 + 1), 6)[: time_s.size]
+    out_ah = np.concatenate([[0.0], np.cumsum(0.5 * (current_a[1:] + current_a[:-1]))]) / 3600.0
+    soc_pct = np.round(2.0 * (90.0 - 100.0 * out_ah / CAPACITY_AH)) / 2.0
+    voltage_v = 380.0 - 0.1 * current_a - out_ah
+    return Log(time_s, current_a, voltage_v, np.full(time_s.size, 20.0), soc_pct, name="drive")
+
+
+def test_a_capacity_has_the_error_of_momentary_currents() -> None:
+    errors, shares = [], []
+    for seed in range(40):
+        found = implied_capacity([drive(seed).rows(slice(None, None, 17))])
+        errors.append((found.capacity_ah - CAPACITY_AH) / found.std_ah)
+        shares.append(found.std_ah / found.capacity_ah)
+    assert 0.7 < np.sqrt(np.mean(np.square(errors))) < 1.4
+    assert 0.04 < np.median(shares) < 0.2
+    exact = implied_capacity([drive()])
+    assert exact.std_ah < 0.02 * exact.capacity_ah
+
+
+def test_a_jump_of_the_soc_is_no_charge() -> None:
+    log = drive()
+    assert log.soc_pct is not None
+    corrected = log.soc_pct + np.where(log.time_s < 2000.0, -12.0, 0.0)
+    found = implied_capacity([replace(log, soc_pct=corrected)])
+    assert found.capacity_ah == pytest.approx(CAPACITY_AH, rel=0.03)
+
+
+@pytest.mark.parametrize("factor", [0.4, 2.5, 10.0])
+def test_a_factor_of_two_is_a_contradiction(factor: float) -> None:
+    log = drive()
+    wrong = replace(log, current_a=factor * log.current_a)
+    assert contradiction(wrong) is None  # consistent in itself
+    found = contradiction(wrong, CAPACITY_AH)
+    assert found is not None
+    assert found.startswith("charge and SoC contradict each other: ")
+    with pytest.raises(InputError, match="the pack has 60 Ah"):
+        refuse_contradictions([log, wrong], CAPACITY_AH)
+
+
+def test_parts_of_a_log_contradict_each_other() -> None:
+    log = drive(hours=4.0)
+    late = log.time_s > 7200.0
+    wrong = replace(log, current_a=np.where(late, 0.3 * log.current_a, log.current_a))
+    assert "in one part of the log" in (contradiction(wrong) or "")
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_a_right_log_is_no_contradiction(seed: int) -> None:
+    for rows in (slice(None), slice(None, None, 17), slice(None, None, 60)):
+        log = drive(seed).rows(rows)
+        assert contradiction(log) is None
+        for capacity_ah in (0.6 * CAPACITY_AH, CAPACITY_AH, 1.6 * CAPACITY_AH):
+            assert contradiction(log, capacity_ah) is None
+
+
+def written(folder: Path, voltage: list[float], soc: list[float]) -> Path:
+    """Write a table with these voltages and SoC."""
+    columns = zip(voltage, soc, strict=True)
+    rows = [f"{k},{10 * (k % 3)},{u},20,{s}" for k, (u, s) in enumerate(columns)]
+    path = folder / "log.csv"
+    header = "time_s,current_a,voltage_v,temperature_c,soc_pct"
+    path.write_text("\n".join([header, *rows, ""]))
+    return path
+
+
+def test_a_soc_above_full_is_remarked_and_no_start(tmp_path: Path) -> None:
+    right = read_log(written(tmp_path, [380.0] * 50, [100.4 - k for k in range(50)]))
+    assert right.first_soc() == (0, 100.4)
+    assert right.remarks == ()
+    wrong = read_log(written(tmp_path, [380.0] * 50, [109.1 - k for k in range(50)]))
+    assert wrong.first_soc() is None
+    (remark,) = wrong.remarks
+    assert remark.startswith("SoC 60.1 … 109.1 % is not within 0–100 % in 9 rows")
+
+
+def test_rows_without_voltage_are_remarked(tmp_path: Path) -> None:
+    log = read_log(written(tmp_path, [0.0] * 3 + [380.0] * 47, [50.0] * 50))
+    assert log.remarks == ("0 V in 3 rows (the first is row 1): no voltage was read",)
