@@ -134,6 +134,25 @@ def test_requests_stop_while_another_tester_asks() -> None:
     assert poller.due(0.3 + OTHER_TESTER_S) is not None
 
 
+@pytest.mark.parametrize(
+    "reply_bytes",
+    [b"\x02\x61\x04", b"\x02\x61\x02", b"\x03\x7f\x21\x11", b"\x03\x7f\x21\x78", b"\x01\x7f"],
+)
+def test_a_node_is_asked_once_a_second_whatever_it_answers(reply_bytes: bytes) -> None:
+    poller = Poller([PROBES_OF_LEAF, CELLS_OF_LEAF], every_s=1.0)
+    other = PollTarget(0x7E4, 0x7EC, b"\x62\x01\x01")
+    asked = list[float]()
+    for step in range(2000):
+        now_s = 0.01 * step
+        if step == 1000:  # the configuration is read again
+            poller = Poller([PROBES_OF_LEAF, CELLS_OF_LEAF, other], 1.0, poller.asked_s)
+        if (request := poller.due(now_s)) is not None and request.arbitration_id == 0x79B:
+            asked.append(now_s)
+        poller.take(reply(reply_bytes), now_s)
+    assert len(asked) > 3
+    assert min(later - before for before, later in pairwise(asked)) > 0.99
+
+
 @given(st.lists(st.tuples(st.binary(max_size=8), st.floats(0.0, 2.0)), max_size=40))
 def test_any_frames_are_survived(frames: list[tuple[bytes, float]]) -> None:
     poller, now_s = Poller([PROBES_OF_LEAF], every_s=1.0), 0.0

@@ -133,6 +133,7 @@ class Loop:
         self._reported: set[str] = set()
         self._clock_was_seen = False
         self._drops = 0
+        self._poller: Poller | None = None
         self._configure()
         self._began_s = self._now_s = self._beat_s = self._keep_s = time.monotonic()
         self._save_s = self._began_s + min(FIRST_CHECKPOINT_S, self._settings.checkpoint_every_s)
@@ -144,7 +145,10 @@ class Loop:
         """Poll and receive for the pipeline's present vehicle, and what shows other senders."""
         pipeline, every_s = self._pipeline, self._settings.poll_every_s
         targets, ids = pipeline.vehicle.poll_targets, pipeline.settings.ids
-        self._poller = None if every_s is None or not targets else Poller(targets, every_s)
+        asked_s = {} if self._poller is None else self._poller.asked_s
+        self._poller = None
+        if every_s is not None and targets:
+            self._poller = Poller(targets, every_s, asked_s)
         self._monitor.polls = None if self._poller is None else self._poller.counts
         not_input = set(ids.published)
         if self._poller is not None:

@@ -17,10 +17,12 @@ from cangauge.bus.isotp import CONSECUTIVE, FIRST, PollTarget, Reassembler
 
 REPLY_WITHIN_S: Final = 1.0
 EXCHANGE_WITHIN_S: Final = 5.0
-BETWEEN_S: Final = 0.05
 """Wait for the next frame of a reply [s]: N_Cr of ISO 15765-2; from a request to its whole reply,
-also after "response pending": P2* of ISO 14229-2; from the end of one exchange to the next request:
-P2."""
+also after "response pending": P2* of ISO 14229-2."""
+BETWEEN_S: Final = 0.05
+PER_NODE_S: Final = 1.0
+"""Shortest wait from the end of an exchange to the next request: P2 of ISO 14229-2; interval of the
+requests to one node, whatever it answers [s]: drivers' apps ask a node as often."""
 SLOWEST_S: Final = 60.0
 OTHER_TESTER_S: Final = 30.0
 """Longest interval between requests for a reply that does not come [s]: one a minute burdens no
@@ -58,6 +60,8 @@ class Poller:
     every_s : float
         Interval between requests for the same reply [s]; doubled after each failure, up to
         `SLOWEST_S`.
+    asked_s : dict of int to float, optional
+        When each node was asked last, of an earlier poller on the same bus.
 
     Attributes
     ----------
@@ -65,9 +69,15 @@ class Poller:
     request_ids, reply_ids : frozenset of int
     """
 
-    def __init__(self, targets: Iterable[PollTarget], every_s: float) -> None:
+    def __init__(
+        self,
+        targets: Iterable[PollTarget],
+        every_s: float,
+        asked_s: dict[int, float] | None = None,
+    ) -> None:
         self._turns = [_Turn(target) for target in targets]
         self._every_s = every_s
+        self.asked_s = asked_s or {}
         self._waiting: _Turn | None = None
         self._give_up_s = self._exchange_ends_s = math.inf
         self._quiet_until_s = -math.inf
@@ -84,15 +94,20 @@ class Poller:
                 return None
             self.counts.unanswered += 1
             self._end(self._waiting, now_s, failed=True)
-        turn = min(self._turns, key=lambda each: each.due_s)
-        if now_s < max(turn.due_s, self._quiet_until_s):
+        turn = min(self._turns, key=self._next_s)
+        if now_s < max(self._next_s(turn), self._quiet_until_s):
             return None
+        self.asked_s[turn.target.request_id] = now_s
         self._waiting, self._give_up_s = turn, now_s + REPLY_WITHIN_S
         self._exchange_ends_s, self._may_continue = now_s + EXCHANGE_WITHIN_S, True
         self._reassembler = Reassembler()
         self.counts.requests += 1
         request = turn.target.request
         return _frame(turn.target.request_id, bytes([len(request)]) + request)
+
+    def _next_s(self, turn: _Turn) -> float:
+        last_s = self.asked_s.get(turn.target.request_id, -math.inf)
+        return max(turn.due_s, last_s + PER_NODE_S)
 
     def take(self, message: can.Message, now_s: float) -> can.Message | None:
         """Take a frame of a reply; return the flow control to send."""
