@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import http.client
 import json
+import select
 import signal
 import socket
 from collections.abc import Iterator
@@ -242,3 +243,82 @@ def test_an_address_that_is_taken_is_refused_at_the_start(page: Served) -> None:
     with pytest.raises(InputError, match="cannot listen") as caught:
         Offer(dashboard=http_address(f"127.0.0.1:{page.port}", None, {}, "dashboard")).check_free()
     assert caught.value.field == "dashboard"
+
+
+@pytest.fixture(scope="module")
+def both(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
+    """Serve health checks, on `port`, and the live page with a token."""
+    file = tmp_path_factory.mktemp("token") / "token"
+    file.write_text(TOKEN)
+    file.chmod(0o600)
+    addresses = {
+        "http": http_address("127.0.0.1:0", None, {}),
+        "dashboard": http_address("127.0.0.1:0", file, {}),
+    }
+    with Served(Offer(**addresses), snapshot()) as served:
+        assert waits(lambda: served.said("live page: "))
+        yield served
+
+
+def connected(port: int, request: bytes) -> socket.socket:
+    client = socket.create_connection(("127.0.0.1", port), 60.0)
+    client.sendall(request)
+    return client
+
+
+def page_port(served: Served) -> int:
+    return int([line["port"] for line in served.lines if "port" in line][1])
+
+
+def test_a_health_check_comes_before_many_viewers(both: Served) -> None:
+    assert waits(lambda: b"ok" in get(both, "/healthz")[2])
+    ask = (
+        f"GET /cangauge-last-hour.csv HTTP/1.1\r\nHost: x\r\nAuthorization: Bearer {TOKEN}\r\n\r\n"
+    )
+    answered = []
+    for _ in range(5):  # a busy machine may hold this process back
+        both.process.send_signal(signal.SIGSTOP)  # so that all ask at once
+        viewers = [connected(page_port(both), ask.encode()) for _ in range(120)]
+        probe = connected(both.port, b"GET /healthz HTTP/1.1\r\nHost: localhost\r\n\r\n")
+        both.process.send_signal(signal.SIGCONT)
+        assert probe.recv(9) == b"HTTP/1.1 "
+        answered.append(len(select.select(viewers, [], [], 0.0)[0]))
+        for viewer in viewers:
+            assert viewer.recv(12) == b"HTTP/1.1 200"
+            viewer.close()
+        probe.close()
+    assert min(answered) < 60, answered
+
+
+def test_connections_are_limited(both: Served) -> None:
+    clients = [connected(page_port(both), b"GET / HTTP/1.1\r\nX: ") for _ in range(230)]
+    pid = both.process.pid
+    assert waits(lambda: len(list(Path(f"/proc/{pid}/fd").iterdir())) > 150)
+    assert b"ok" in get(both, "/healthz")[2]
+    open_ones = len(list(Path(f"/proc/{pid}/fd").iterdir()))
+    assert open_ones < 225
+    for client in clients:
+        client.close()
+
+
+def test_guesses_of_the_token_are_slowed_down(both: Served) -> None:
+    def answer(path: str, body: bytes, header: str = "") -> int:
+        head = f"{path} HTTP/1.1\r\nHost: x\r\n{header}Content-Length: {len(body)}\r\n\r\n"
+        with connected(page_port(both), head.encode() + body) as client:
+            return int(client.recv(12).split()[1])
+
+    def entered(token: str) -> int:
+        form = "Content-Type: application/x-www-form-urlencoded\r\n"
+        return answer("POST /enter", f"token={token}".encode(), form)
+
+    assert [entered("guess") for _ in range(20)][-1] == 429
+    assert entered(TOKEN) == 429  # or a guess that is right would show
+    bearer = [answer("GET /rows", b"", "Authorization: Bearer guess\r\n") for _ in range(60)]
+    assert bearer[0] == 401
+    assert bearer[-1] == 429
+
+
+@pytest.mark.parametrize("origin", ["http://[", "http://[::1", "http://a]b"])
+def test_an_origin_that_is_no_address_is_a_bad_request(page: Served, origin: str) -> None:
+    assert get(page, "/stream", headers=UPGRADE | {"Origin": origin})[0] == 400
+    assert get(page, "/rows", headers={"Origin": origin})[0] == 400

@@ -14,10 +14,11 @@ import time
 from collections import Counter
 from collections.abc import Mapping
 from typing import Any, Final
+from urllib.parse import urlsplit
 
 from tornado.httpserver import HTTPServer
 from tornado.iostream import IOStream
-from tornado.web import Application, RequestHandler
+from tornado.web import Application, HTTPError, RequestHandler
 
 from cangauge._logging import emit
 from cangauge._text import plain
@@ -28,9 +29,16 @@ from cangauge.service.status_client import Snapshot
 
 MAX_HEADER_BYTES: Final = 8192
 MAX_BODY_BYTES: Final = 1024
-MAX_CLIENTS: Final = 32
-"""Most simultaneous connections, to save file descriptors. A further one takes the place of the
-oldest of the peer that has most: a client with many connections cannot starve health checks."""
+MAX_CLIENTS: Final = 200
+"""Most simultaneous connections of an address: two fit in the usual 1,024 file descriptors. A
+further one takes the place of the oldest of the peer that has most: a client with many connections
+cannot starve health checks."""
+WRONG_FORMS: Final = 3
+WRONG_HEADERS: Final = 30
+"""Wrong tokens of one peer before it waits a second for each further one: typed into the form, and
+sent by a program. A token of 16 characters is then not found by trying."""
+PEERS_AT_MOST: Final = 1000
+"""Peers whose wrong tokens are counted."""
 REQUEST_WITHIN_S: Final = 3.0
 """Time limit for receiving a request [s]."""
 PING_S: Final = 10.0
@@ -56,6 +64,7 @@ class StatusServer(Output):
 
     def __init__(self, address: HttpAddress, listening: socket.socket) -> None:
         self.token = address.token
+        self.brake = Brake()
         self.latest: Snapshot | None = None
         pages: dict[str, type[Handler]] = {
             "/status": _StatusPage,
@@ -69,7 +78,7 @@ class StatusServer(Output):
             "idle_connection_timeout": REQUEST_WITHIN_S,
             "body_timeout": REQUEST_WITHIN_S,
         }
-        serve(self, listening, pages, _Server, limits)
+        serve(self, listening, pages, limits)
 
     def on_snapshot(self, snapshot: Snapshot) -> None:
         """Make a snapshot the latest one."""
@@ -80,7 +89,6 @@ def serve(
     server: Output,
     listening: socket.socket,
     pages: Mapping[str, type[Handler]],
-    kind: type[HTTPServer],
     limits: Mapping[str, Any],
 ) -> None:
     """Serve pages by patterns of their paths, with limits of tornado's `HTTPServer`.
@@ -96,7 +104,7 @@ def serve(
     )
     listening.setblocking(False)
     sizes = {"max_header_size": MAX_HEADER_BYTES, "max_body_size": MAX_BODY_BYTES}
-    kind(application, **sizes, **limits).add_socket(listening)
+    _Server(application, **sizes, **limits).add_socket(listening)
 
 
 class _Server(HTTPServer):
@@ -118,6 +126,25 @@ class _Server(HTTPServer):
     def on_close(self, server_conn: Any) -> None:
         self._clients.pop(server_conn.stream, None)
         super().on_close(server_conn)
+
+
+class Brake:
+    """Let a peer try tokens slowly: each wrong one counts for a second."""
+
+    def __init__(self) -> None:
+        self._until_s: dict[str, float] = {}
+
+    def check(self, peer: str, wrong_at_most: int) -> None:
+        """Raise the HTTP error 429 if a peer has given too many wrong tokens lately."""
+        if self._until_s.get(peer, 0.0) - time.monotonic() > wrong_at_most:
+            raise HTTPError(429, reason="Too many wrong tokens: wait a second")
+
+    def note_wrong(self, peer: str) -> None:
+        """Count a wrong token."""
+        now_s = time.monotonic()
+        self._until_s[peer] = max(self._until_s.pop(peer, now_s), now_s) + 1.0
+        if len(self._until_s) > PEERS_AT_MOST:
+            del self._until_s[next(iter(self._until_s))]
 
 
 def has_token(header: str, token: str) -> bool:
@@ -144,6 +171,11 @@ class Handler(RequestHandler):
 
     def prepare(self) -> None:
         """Refuse a request that lacks the token, or is by a foreign name."""
+        try:
+            urlsplit(self.request.headers.get("Origin", ""))
+        except ValueError:  # tornado would fail on it
+            self.refuse(400, "the origin is no address")
+            return
         token = self.server.token
         # Against DNS rebinding: a web page could otherwise read this under another name.
         if token is None and not is_loopback_name(self.request.host_name):
@@ -153,7 +185,14 @@ class Handler(RequestHandler):
 
     def is_known(self, token: str) -> bool:
         """Return whether the request bears the token."""
-        return has_token(self.request.headers.get("Authorization", ""), token)
+        header, peer = self.request.headers.get("Authorization", ""), str(self.request.remote_ip)
+        if not header:
+            return False
+        self.server.brake.check(peer, WRONG_HEADERS)
+        if has_token(header, token):
+            return True
+        self.server.brake.note_wrong(peer)
+        return False
 
     def refuse_unknown(self) -> None:
         """Answer a request without the token."""

@@ -19,13 +19,12 @@ from typing import Any, Final
 
 from bokeh.resources import Resources
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
-from tornado.httpserver import HTTPServer
 from tornado.websocket import WebSocketClosedError, WebSocketHandler
 
 from cangauge.extras.live.addresses import HttpAddress
 from cangauge.extras.live.charts import CHARTS, STATUS_COLOURS, STATUS_NAMES, chart_parts
 from cangauge.extras.live.history import LOG_NAME, REASONS, History, last_hour, shown_columns
-from cangauge.extras.live.http import Handler, Nothing, has_token, serve
+from cangauge.extras.live.http import WRONG_FORMS, Brake, Handler, Nothing, has_token, serve
 from cangauge.service.output import Output
 from cangauge.service.status_client import Snapshot
 
@@ -56,6 +55,8 @@ class LivePage(Output):
 
     def __init__(self, address: HttpAddress, listening: socket) -> None:
         self.token = token = address.token
+        self.brake = Brake()
+        self._turn = asyncio.Lock()
         self.history = History()
         self.id = secrets.token_hex(8)
         """Key of this run; another one means that the row numbers start again."""
@@ -73,7 +74,7 @@ class LivePage(Output):
             ".*": _Elsewhere,
         }
         limits = {"idle_connection_timeout": IDLE_S, "body_timeout": IDLE_S}
-        serve(self, listening, pages, HTTPServer, limits)
+        serve(self, listening, pages, limits)
 
     def _texts(self) -> dict[str, str]:
         """Return the files of the page by their names."""
@@ -106,6 +107,11 @@ class LivePage(Output):
         """Wait for the next status, at most `ALIVE_S`."""
         with suppress(TimeoutError):
             await asyncio.wait_for(self._news.wait(), ALIVE_S)
+
+    async def in_turn(self) -> None:
+        """Wait until the answers asked for before are made, and health checks had their turn."""
+        async with self._turn:
+            await asyncio.sleep(0.0)
 
     def answer(self, name: str, key: str, after: int) -> dict[str, Any]:
         """Return the status, what is wrong, and the rows of a span that are new to a viewer.
@@ -166,8 +172,10 @@ class _Enter(_LiveHandler):
 
     def post(self) -> None:
         token = self.server.token
-        given = self.get_body_argument("token", "")
+        given, peer = self.get_body_argument("token", ""), str(self.request.remote_ip)
+        self.server.brake.check(peer, WRONG_FORMS)
         if token is not None and not has_token(f"Bearer {given}", token):
+            self.server.brake.note_wrong(peer)
             self.set_status(401)
             self.finish(self.server.texts["enter.html"])
             return
@@ -191,10 +199,11 @@ class _StaticFile(_LiveHandler):
 
 
 class _Rows(_LiveHandler):
-    def get(self) -> None:
+    async def get(self) -> None:
         """Return the status, what is wrong, and the rows of a span after those already known."""
         name, key, after = (self.get_query_argument(part, "") for part in ("span", "key", "after"))
         number = int(after) if after.isdecimal() and len(after) < 16 else 0
+        await self.server.in_turn()
         self.send_json(self.server.answer(name, key, number))
 
 
@@ -228,6 +237,7 @@ class _Stream(_LiveHandler, WebSocketHandler):
                 question = self._question
                 name, key, after = (question.get(part) for part in ("span", "key", "after"))
                 number = after if isinstance(after, int) and after >= 0 else 0
+                await self.server.in_turn()
                 answer = self.server.answer(str(name), str(key), number)
                 self._question = question | {"key": answer.get("key"), "after": answer.get("added")}
                 await self.write_message(json.dumps(answer, ensure_ascii=False, allow_nan=False))
@@ -235,9 +245,10 @@ class _Stream(_LiveHandler, WebSocketHandler):
 
 
 class _LastHour(_LiveHandler):
-    def get(self) -> None:
+    async def get(self) -> None:
         self.set_header("Content-Type", "text/csv; charset=utf-8")
         self.set_header("Content-Disposition", f'attachment; filename="{LOG_NAME}"')
+        await self.server.in_turn()
         self.finish(last_hour(self.server.history))
 
 
