@@ -53,7 +53,7 @@ def with_effect(log: Log, effect_id: str, values: dict[str, float]) -> Log:
 def test_auto_finds_a_true_effect(effect_id: str, values: dict[str, float]) -> None:
     logs = [with_effect(log, effect_id, values) for log in trips(9)]
     plain = fit(logs, capacity_ah=CAPACITY_AH, effects="none")
-    found = fit(logs, capacity_ah=CAPACITY_AH)
+    found = fit(logs, capacity_ah=CAPACITY_AH, effects="auto")
     ids = [entry["id"] for entry in found.model.effects]
     assert effect_id in ids
     assert found.model.noise.voltage_rmse_v < plain.model.noise.voltage_rmse_v
@@ -65,15 +65,15 @@ def test_auto_finds_a_true_effect(effect_id: str, values: dict[str, float]) -> N
 
 
 def test_auto_takes_nothing_on_logs_without_effects() -> None:
-    found = fit(trips(8), capacity_ah=CAPACITY_AH)
+    found = fit(trips(8), capacity_ah=CAPACITY_AH, effects="auto")
     assert found.model.effects == []
     assert any("no effect lowers the error" in text for text in found.remarks)
 
 
-def test_auto_is_the_default_from_five_logs_on() -> None:
-    assert fit(trips(4), capacity_ah=CAPACITY_AH).effects is None
-    assert fit(trips(5), capacity_ah=CAPACITY_AH).effects is not None
+def test_effects_are_searched_only_where_asked_for() -> None:
+    assert fit(trips(5), capacity_ah=CAPACITY_AH).effects is None
     assert fit(trips(5), capacity_ah=CAPACITY_AH, effects="none").effects is None
+    assert fit(trips(5), capacity_ah=CAPACITY_AH, effects="auto").effects is not None
 
 
 def test_named_effects_are_all_taken_and_reported() -> None:

@@ -95,7 +95,7 @@ def fit_command(
         Reference temperature T_r, by default 20; with --equation published.
     effects : ID…|auto|none
         Effects to add to the model, separated by commas, e.g. hysteresis; `auto` adds those that
-        lower the error of left-out logs significantly. Default: auto from five logs on.
+        lower the error of left-out logs significantly. Default: none.
     """
     from cangauge.identify.effect_search import parse_effect_ids
     from cangauge.identify.fit import fit

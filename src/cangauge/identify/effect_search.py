@@ -59,8 +59,6 @@ NOT_IDENTIFIABLE: Final[Mapping[str, str]] = {
 }
 """Effects that a fit cannot separate from its own coefficients, and why."""
 
-AUTO_LOGS: Final = 5
-"""Logs from which on `auto` is the default: with fewer the error of the mean gain is unknown."""
 EFFECTS_AT_MOST: Final = 6
 COMPARED: Final = 4
 """Candidates of a round that are compared on left-out logs, the best fits first."""

@@ -15,8 +15,6 @@ from cangauge._typing import FloatArray
 from cangauge._version import __version__
 from cangauge.errors import InputError, require_choice, require_number
 from cangauge.identify.effect_search import (
-    AUTO,
-    AUTO_LOGS,
     Search,
     Selected,
     linearize,
@@ -116,8 +114,8 @@ def fit(
         Delays of the current [s], margin ε of the scaled SoC and reference temperature T_r [°C] of
         the published equation.
     effects : str or sequence of str, optional
-        Effect ids; "auto": those that reduce the error of left-out logs significantly; "none". By
-        default auto from five logs on. Only for knots.
+        Effect ids, or "auto": those that reduce the error of left-out logs significantly. By
+        default "none". Only for knots.
 
     Returns
     -------
@@ -153,7 +151,7 @@ def fit(
             "the capacity must be positive", field="capacity_ah", value=capacity_ah,
             cure="check the sign of current: positive must discharge",
         )  # fmt: skip
-    effect_ids = _effect_ids(effects, equation, len(recorded))
+    effect_ids = _effect_ids(effects, equation)
     stated = [
         log if value is None else with_start(log, value)
         for log, value in zip(recorded, stated_pct, strict=True)
@@ -259,11 +257,7 @@ def _check_logs(logs: Sequence[Log]) -> None:
         )
 
 
-def _effect_ids(
-    effects: str | Sequence[str] | None, equation: Equation, logs: int
-) -> tuple[str, ...]:
-    if effects is None:
-        return (AUTO,) if equation == "knots" and logs >= AUTO_LOGS else ()
+def _effect_ids(effects: str | Sequence[str] | None, equation: Equation) -> tuple[str, ...]:
     ids = parse_effect_ids([effects] if isinstance(effects, str) else effects) if effects else ()
     if ids and equation == "published":
         raise InputError(

@@ -45,7 +45,6 @@ from cangauge.model.prior import (
     prior_of,
     usual_loads,
 )
-from cangauge.model.version1 import upgraded
 from cangauge.model.voltage_model import (
     BASIS_NAMES,
     KNOTS_PCT,
@@ -458,7 +457,7 @@ class Model(_Fields):
 
     @classmethod
     def load(cls, path: str | PathLike[str]) -> Model:
-        """Read and validate a model file, of this version or version 1.
+        """Read and validate a model file.
 
         Raises
         ------
@@ -475,13 +474,13 @@ class Model(_Fields):
         head = raw if isinstance(raw, dict) else {}
         for field, known, problem in (
             ("format", ("cangauge-model",), "not a cangauge model"),
-            ("version", (1, 2), "this release reads versions 1 and 2"),
+            ("version", (2,), "this release reads version 2: fit again"),
         ):
             value = head.get(field) if head is raw else type(raw).__name__
             if value not in known:
                 raise InputError(problem, source=path, field=field, value=value, cure=_CURE)
         try:
-            model = cls.model_validate(upgraded(raw) if raw["version"] == 1 else raw)
+            model = cls.model_validate(raw)
             model.extended_model()
         except ValidationError as error:
             raise schema_error(error, cls, path, _CURE) from error

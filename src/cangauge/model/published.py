@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 from cangauge.model.model_file import FunctionFields, Made, Model, Noise, Published, Ranges
-from cangauge.model.version1 import block_share
+from cangauge.model.prior import BLOCK_S
 from cangauge.model.voltage_model import KNOTS_PCT, PublishedCurve, VoltageModel
 
 CAPACITY_AH = 51.5
@@ -42,6 +42,7 @@ def leaf_2012_model_file() -> Model:
     model = leaf_2012_model()
     rmse_v = VOLTAGE_MAE_PCT / 100.0 * MEAN_VOLTAGE_V * math.sqrt(math.pi / 2.0)
     part_v = rmse_v / math.sqrt(3.0)
+    block_share = math.sqrt((1.0 + 2.0 * FAST_TIME_S) / BLOCK_S)  # as many independent values
     curve = model.curve
     if not isinstance(curve, PublishedCurve):
         raise TypeError("the published model has the published curve")
@@ -61,7 +62,7 @@ def leaf_2012_model_file() -> Model:
         noise=Noise(
             level_std_v=part_v,
             slow_std_v=part_v,
-            fast_std_v=block_share(FAST_TIME_S) * part_v,
+            fast_std_v=block_share * part_v,
             soc_std_pct=0.0,
             cold_exponent=0.0,
             residual_std_v=rmse_v,
