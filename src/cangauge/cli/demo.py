@@ -9,13 +9,13 @@ import sys
 import time
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 from cangauge._extras import extra
 from cangauge._files import write_text_atomic
 from cangauge._resources import shared_file
 from cangauge._text import number, significant
-from cangauge.cli.declare import command
+from cangauge.cli.options import JSON, option
 from cangauge.cli.output import finish, note, print_table
 from cangauge.errors import CangaugeError, InputError
 
@@ -34,8 +34,13 @@ EXIT_WITHIN_S = 33.0
 """Longest wait for the service to exit after the replay: its idle time and half a minute [s]."""
 
 
-@command()
-def demo_command(*, folder: Path = Path("out/demo"), json_output: bool = False) -> None:
+def demo_command(
+    *,
+    folder: Annotated[
+        Path, option("--folder", "DIR", "Folder for the model and the pages.")
+    ] = Path("out/demo"),
+    json_output: Annotated[bool, JSON] = False,
+) -> None:
     """Fit a model, replay a log on a bus, estimate its SoC live, and report the errors.
 
     The shipped log is a reconstruction of the published 2012 Leaf test, computed from its equation,
@@ -49,11 +54,6 @@ def demo_command(*, folder: Path = Path("out/demo"), json_output: bool = False) 
     `cangauge demo`
 
     `cangauge demo --folder /tmp/demo --json`
-
-    Parameters
-    ----------
-    folder : DIR
-        Folder for the model and the pages.
     """
     from dataclasses import replace
 

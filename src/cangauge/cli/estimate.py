@@ -7,13 +7,24 @@ from contextlib import ExitStack
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from cangauge._extras import extra
 from cangauge._files import atomic_path
 from cangauge._text import NONE_KNOWN, number, rounded, uncertain
-from cangauge.cli.declare import command
-from cangauge.cli.options import ReadingOptions, assumed_of, check_outputs, note_starts
+from cangauge.cli.options import (
+    CAPACITY_AH,
+    JSON,
+    MODEL,
+    REPORT,
+    ReadingOptions,
+    argument,
+    assumed_of,
+    check_outputs,
+    command,
+    note_starts,
+    option,
+)
 from cangauge.cli.output import finish, note, print_values, progress
 from cangauge.cli.status import pack_values
 from cangauge.types import REASON_WORDS, Reason
@@ -31,18 +42,60 @@ _ORIGINS = {"given": "given", "log": "from the log's soc_pct", "voltage": "found
 
 @command()
 def estimate_command(
-    log_path: Path,
+    log_path: Annotated[Path, argument("LOG", "Recorded log or capture.")],
     *,
-    model: Path,
-    output: Path,
-    method: Literal["ekf", "newton", "coulomb"] = "ekf",
-    initial_soc: float | Literal["auto"] | None = None,
-    initial_soc_std: float = 1.0,
-    capacity_ah: float | None = None,
+    model: Annotated[Path, MODEL],
+    output: Annotated[
+        Path,
+        option(
+            "-o, --output", "OUT.csv|.parquet", "Table of estimates.", suffixes=(".csv", ".parquet")
+        ),
+    ],
+    method: Annotated[
+        Literal["ekf", "newton", "coulomb"],
+        option(
+            "--method",
+            "ekf|newton|coulomb",
+            "Method of soc_pct: Kalman filter over voltage and charge (ekf), voltage alone"
+            " (newton), or counting alone (coulomb).",
+        ),
+    ] = "ekf",
+    initial_soc: Annotated[
+        Any,
+        option(
+            "--initial-soc",
+            "P|auto",
+            "SoC at the first sample, e.g. 80; `auto` takes it from the first voltages. Default:"
+            " the first soc_pct of a log, counted back to its first row; else, and for a capture"
+            " (as live), auto.",
+            within=(0, 100),
+            unit="%",
+            words=("auto",),
+        ),
+    ] = None,
+    initial_soc_std: Annotated[
+        float,
+        option(
+            "--initial-soc-std",
+            "X",
+            "Standard deviation of the initial SoC.",
+            within=(0, 100),
+            unit="%",
+        ),
+    ] = 1.0,
+    capacity_ah: Annotated[float | None, CAPACITY_AH] = None,
     reading: ReadingOptions,
-    pack: Path | None = None,
-    report: Path | None = None,
-    json_output: bool = False,
+    pack: Annotated[
+        Path | None,
+        option(
+            "--pack",
+            "PACK.csv|.parquet",
+            "Table of health, power and cells, once a second.",
+            suffixes=(".csv", ".parquet"),
+        ),
+    ] = None,
+    report: Annotated[Path | None, REPORT] = None,
+    json_output: Annotated[bool, JSON] = False,
 ) -> None:
     """Estimate the state of charge of a recorded log or capture, offline.
 
@@ -63,24 +116,6 @@ def estimate_command(
     `cangauge estimate trip.csv -m pack.json -o soc.parquet --initial-soc auto`
 
     `cangauge estimate drive.log --vehicle leaf_ze0 -m leaf.json -o soc.csv --method newton`
-
-    Parameters
-    ----------
-    log_path : LOG
-        Recorded log or capture.
-    output : -o, --output OUT.csv|.parquet
-        Table of estimates.
-    method : ekf|newton|coulomb
-        Method of soc_pct: Kalman filter over voltage and charge (ekf), voltage alone (newton), or
-        counting alone (coulomb).
-    initial_soc : P|auto (0 … 100 %)
-        SoC at the first sample, e.g. 80; `auto` takes it from the first voltages. Default: the
-        first soc_pct of a log, counted back to its first row; else, and for a capture (as live),
-        auto.
-    initial_soc_std : X (0 … 100 %)
-        Standard deviation of the initial SoC.
-    pack : PACK.csv|.parquet
-        Table of health, power and cells, once a second.
     """
     from cangauge.estimation.settings import EstimatorSettings
     from cangauge.logs.canonical import write_table

@@ -5,13 +5,21 @@ from __future__ import annotations
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from cangauge._extras import extra
 from cangauge._files import write_texts_atomic
 from cangauge._text import NONE_KNOWN, number, significant, span
-from cangauge.cli.declare import command
-from cangauge.cli.options import ReadingOptions, assumed_of, check_outputs
+from cangauge.cli.options import (
+    JSON,
+    REPORT,
+    ReadingOptions,
+    argument,
+    assumed_of,
+    check_outputs,
+    command,
+    option,
+)
 from cangauge.cli.output import finish, note, print_values, progress
 from cangauge.errors import InputError
 
@@ -26,22 +34,112 @@ more or less in 16 makes three times as much."""
 
 @command()
 def fit_command(
-    logs: list[Path],
+    logs: Annotated[list[Path], argument("LOG", "Recorded logs or captures of one pack.")],
     *,
-    output: Path,
-    capacity_ah: float | Literal["from-soc"] | None = None,
-    initial_soc: list[float | Literal["auto"]] | None = None,
-    equation: Literal["knots", "published"] = "knots",
-    chemistry: Literal["oxide", "lfp"] | None = None,
-    cells: int | None = None,
-    rate_hz: float = 1.0,
-    delays: str | None = None,
-    epsilon: float | None = None,
-    t_ref: float | None = None,
-    effects: list[str] | None = None,
+    output: Annotated[
+        Path, option("-o, --output", "MODEL.json", "Model file to write.", suffixes=(".json",))
+    ],
+    capacity_ah: Annotated[
+        Any,
+        option(
+            "--capacity-ah",
+            "A|from-soc",
+            "Charge from 100 to 0 %, e.g. 51.5; `from-soc` takes the charge per 100 % of the logs'"
+            " soc_pct. Default: from a log that runs from full to empty.",
+            within=(0.001, 1e5),
+            unit="Ah",
+            words=("from-soc",),
+        ),
+    ] = None,
+    initial_soc: Annotated[
+        list[Any] | None,
+        option(
+            "--initial-soc",
+            "P|auto",
+            "SoC at the first row; once for all logs, or repeated, once for each in order. Default,"
+            " and auto: its soc_pct; a log without is estimated together with the curve, if another"
+            " log pins it.",
+            within=(0, 100),
+            unit="%",
+            words=("auto",),
+        ),
+    ] = None,
+    equation: Annotated[
+        Literal["knots", "published"],
+        option(
+            "--equation",
+            "knots|published",
+            "knots: a curve around the typical cell of the chemistry; published: the published"
+            " equation by plain least squares.",
+        ),
+    ] = "knots",
+    chemistry: Annotated[
+        Literal["oxide", "lfp"] | None,
+        option(
+            "--chemistry",
+            "oxide|lfp",
+            "Chemistry of the cells: layered oxides or manganese spinel, or iron phosphate."
+            " Default: from the volts per cell where their number is known, else oxide.",
+        ),
+    ] = None,
+    cells: Annotated[
+        int | None,
+        option(
+            "--cells",
+            "N",
+            "Cells in series. Default: the columns of cells of the first log, if it has all.",
+            within=(1, 2000),
+        ),
+    ] = None,
+    rate_hz: Annotated[
+        float,
+        option(
+            "--rate-hz",
+            "HZ",
+            "Rate of the fit; faster logs are decimated.",
+            within=(0.01, 1000),
+            unit="Hz",
+        ),
+    ] = 1.0,
+    delays: Annotated[
+        str | None,
+        option(
+            "--delays",
+            "S,S,…",
+            "Delays of the current [s], by default 0,10,30,70; with --equation published.",
+        ),
+    ] = None,
+    epsilon: Annotated[
+        float | None,
+        option(
+            "--epsilon",
+            "E",
+            "Margin ε of the scaled SoC, by default 0.05; with --equation published.",
+            within=(0.0001, 0.49),
+        ),
+    ] = None,
+    t_ref: Annotated[
+        float | None,
+        option(
+            "--t-ref",
+            "C",
+            "Reference temperature T_r, by default 20; with --equation published.",
+            within=(-60, 120),
+            unit="°C",
+        ),
+    ] = None,
+    effects: Annotated[
+        list[str] | None,
+        option(
+            "--effects",
+            "ID…|auto|none",
+            "Effects to add to the model, separated by commas, e.g. hysteresis; `auto` adds those"
+            " that lower the error of left-out logs significantly. Default: none.",
+        ),
+    ] = None,
     reading: ReadingOptions,
-    report: Path | None = None,
-    json_output: bool = False,
+    report: Annotated[Path | None, REPORT] = None,
+    json_output: Annotated[bool, JSON] = False,
 ) -> None:
     """Identify the voltage model of a pack from recorded logs.
 
@@ -63,39 +161,6 @@ def fit_command(
     auto`
 
     Model file and report are written together, or neither.
-
-    Parameters
-    ----------
-    logs : LOG
-        Recorded logs or captures of one pack.
-    output : -o, --output MODEL.json
-        Model file to write.
-    capacity_ah : A|from-soc (0.001 … 1e5 Ah)
-        Charge from 100 to 0 %, e.g. 51.5; `from-soc` takes the charge per 100 % of the logs'
-        soc_pct. Default: from a log that runs from full to empty.
-    initial_soc : P|auto (0 … 100 %)
-        SoC at the first row; once for all logs, or repeated, once for each in order. Default, and
-        auto: its soc_pct; a log without is estimated together with the curve, if another log pins
-        it.
-    equation : knots|published
-        knots: a curve around the typical cell of the chemistry; published: the published equation
-        by plain least squares.
-    chemistry : oxide|lfp
-        Chemistry of the cells: layered oxides or manganese spinel, or iron phosphate. Default: from
-        the volts per cell where their number is known, else oxide.
-    cells : N (1 … 2000)
-        Cells in series. Default: the columns of cells of the first log, if it has all.
-    rate_hz : HZ (0.01 … 1000 Hz)
-        Rate of the fit; faster logs are decimated.
-    delays : S,S,…
-        Delays of the current [s], by default 0,10,30,70; with --equation published.
-    epsilon : E (0.0001 … 0.49)
-        Margin ε of the scaled SoC, by default 0.05; with --equation published.
-    t_ref : C (-60 … 120 °C)
-        Reference temperature T_r, by default 20; with --equation published.
-    effects : ID…|auto|none
-        Effects to add to the model, separated by commas, e.g. hysteresis; `auto` adds those that
-        lower the error of left-out logs significantly. Default: none.
     """
     from cangauge.identify.effect_search import parse_effect_ids
     from cangauge.identify.fit import fit

@@ -8,12 +8,22 @@ from collections.abc import Callable, Iterable, Mapping
 from functools import partial
 from pathlib import Path
 from runpy import run_path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 from cangauge._extras import extra
 from cangauge._files import write_texts_atomic
-from cangauge.cli.declare import command
-from cangauge.cli.options import ALARM, ReadingOptions, assumed_of, check_outputs, note_starts
+from cangauge.cli.options import (
+    ALARM,
+    JSON,
+    REPORT,
+    ReadingOptions,
+    argument,
+    assumed_of,
+    check_outputs,
+    command,
+    note_starts,
+    option,
+)
 from cangauge.cli.output import finish, note, print_table, progress, say
 from cangauge.errors import InputError
 
@@ -26,21 +36,98 @@ if TYPE_CHECKING:
 
 @command()
 def gap_command(
-    logs: list[Path],
+    logs: Annotated[list[Path], argument("LOG", "Logs to diagnose; one cause is sought for all.")],
     *,
-    model: Path | None = None,
-    reference: list[Path] | None = None,
-    initial_soc: float | None = None,
-    capacity_ah: float | None = None,
-    extended: Path | None = None,
-    simulated: str | None = None,
-    simulator: str | None = None,
-    alarm: float = ALARM,
-    plan: bool = False,
-    add_test: list[Path] | None = None,
+    model: Annotated[
+        Path | None, option("-m, --model", "MODEL", "Model file; not needed for a simulator.")
+    ] = None,
+    reference: Annotated[
+        list[Path] | None,
+        option(
+            "--reference",
+            "LOG",
+            "Log without a fault; repeat the option. Without soc_pct its start is found from the"
+            " voltage.",
+        ),
+    ] = None,
+    initial_soc: Annotated[
+        float | None,
+        option(
+            "--initial-soc",
+            "P",
+            "SoC at the first row of each diagnosed log, e.g. 80. Default: its soc_pct, else found"
+            " from the voltage.",
+            within=(0, 100),
+            unit="%",
+        ),
+    ] = None,
+    capacity_ah: Annotated[
+        float | None,
+        option(
+            "--capacity-ah",
+            "A",
+            "Charge from 100 to 0 %, in place of the model's, for all logs.",
+            within=(0.001, 1e5),
+            unit="Ah",
+        ),
+    ] = None,
+    extended: Annotated[
+        Path | None,
+        option(
+            "--extended",
+            "MODEL.json",
+            "Write the model, extended by the cause.",
+            suffixes=(".json",),
+        ),
+    ] = None,
+    simulated: Annotated[
+        str | None,
+        option(
+            "--simulated",
+            "HEADING",
+            "Column of every log with a simulator's voltage for the same current and temperature:"
+            " what it misses is diagnosed, in place of a model's gap.",
+        ),
+    ] = None,
+    simulator: Annotated[
+        str | None,
+        option(
+            "--simulator",
+            "MODULE:FUNCTION",
+            "The same by a Python function, also FILE.py:FUNCTION, called with time [s], current"
+            " [A, positive = discharge], temperature [°C], SoC of the first row [%]; it returns the"
+            " voltage [V].",
+        ),
+    ] = None,
+    alarm: Annotated[
+        float,
+        option(
+            "--alarm",
+            "P",
+            "Report a fault where the probability of none is at most this.",
+            within=(0, 1),
+        ),
+    ] = ALARM,
+    plan: Annotated[
+        bool,
+        option(
+            "--plan",
+            "",
+            "Propose the drive or measurement that best separates the two likeliest causes.",
+        ),
+    ] = False,
+    add_test: Annotated[
+        list[Path] | None,
+        option(
+            "--add-test",
+            "LOG",
+            "Log of a further test of the same cause, beside the LOGs of the first diagnosis:"
+            " diagnoses both together and reports what the test changed; repeat the option.",
+        ),
+    ] = None,
     reading: ReadingOptions,
-    report: Path | None = None,
-    json_output: bool = False,
+    report: Annotated[Path | None, REPORT] = None,
+    json_output: Annotated[bool, JSON] = False,
 ) -> None:
     """Diagnose the gap between a model and logs: how large, where, what to check first.
 
@@ -60,36 +147,6 @@ def gap_command(
 
     `cangauge gap day1.csv --simulated "V sim [V]" --capacity-ah 60 --reference good1.csv
     --reference good2.csv --reference good3.csv`
-
-    Parameters
-    ----------
-    logs : LOG
-        Logs to diagnose; one cause is sought for all.
-    model : -m, --model MODEL
-        Model file; not needed for a simulator.
-    reference : LOG
-        Log without a fault; repeat the option. Without soc_pct its start is found from the voltage.
-    initial_soc : P (0 … 100 %)
-        SoC at the first row of each diagnosed log, e.g. 80. Default: its soc_pct, else found from
-        the voltage.
-    capacity_ah : A (0.001 … 1e5 Ah)
-        Charge from 100 to 0 %, in place of the model's, for all logs.
-    alarm : P (0 … 1)
-        Report a fault where the probability of none is at most this.
-    extended : MODEL.json
-        Write the model, extended by the cause.
-    simulated : HEADING
-        Column of every log with a simulator's voltage for the same current and temperature: what it
-        misses is diagnosed, in place of a model's gap.
-    simulator : MODULE:FUNCTION
-        The same by a Python function, also FILE.py:FUNCTION, called with time [s], current [A,
-        positive = discharge], temperature [°C], SoC of the first row [%]; it returns the voltage
-        [V].
-    plan : --plan
-        Propose the drive or measurement that best separates the two likeliest causes.
-    add_test : LOG
-        Log of a further test of the same cause, beside the LOGs of the first diagnosis: diagnoses
-        both together and reports what the test changed; repeat the option.
     """
     from cangauge.diagnosis import diagnose
     from cangauge.diagnosis.planner import plan as plan_next

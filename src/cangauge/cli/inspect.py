@@ -6,13 +6,20 @@ import shlex
 from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
 
 from cangauge._extras import extra
 from cangauge._files import write_texts_atomic
 from cangauge._text import rounded
-from cangauge.cli.declare import command
-from cangauge.cli.options import ReadingOptions, assumed_of, check_outputs
+from cangauge.cli.options import (
+    JSON,
+    REPORT,
+    ReadingOptions,
+    argument,
+    assumed_of,
+    check_outputs,
+    command,
+)
 from cangauge.cli.output import finish, note, print_table, say
 from cangauge.errors import InputError
 
@@ -33,11 +40,18 @@ _RANGES = {"current_a": "A", "voltage_v": "V", "temperature_c": "°C", "soc_pct"
 
 @command()
 def inspect_command(
-    path: Path,
+    path: Annotated[
+        Path,
+        argument(
+            "LOG|CAPTURE",
+            "Log (canonical Parquet or CSV, ANL D3 test, BMW i3 trip, cycler export, or any table"
+            " with a heading for each column; also gzipped or zipped) or CAN capture.",
+        ),
+    ],
     *,
     reading: ReadingOptions,
-    report: Path | None = None,
-    json_output: bool = False,
+    report: Annotated[Path | None, REPORT] = None,
+    json_output: Annotated[bool, JSON] = False,
 ) -> None:
     """Show what a log or capture holds, and the sign of its current.
 
@@ -59,12 +73,6 @@ def inspect_command(
     `cangauge inspect logger.csv --columns 'time=Stamp,current=I_batt[mA]:-1,voltage=U_batt'`
 
     `cangauge inspect capture.log --vehicle leaf_ze0`
-
-    Parameters
-    ----------
-    path : LOG|CAPTURE
-        Log (canonical Parquet or CSV, ANL D3 test, BMW i3 trip, cycler export, or any table with a
-        heading for each column; also gzipped or zipped) or CAN capture.
     """
     # Deferred: the readers and the decoder take half a second to import.
     from cangauge.inspect.capture import inspect_capture

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, is_dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, cast
+from typing import TYPE_CHECKING, Annotated, Any, Final, cast
 
 import typer
 
-from cangauge._files import check_writable
+from cangauge._files import check_writable, require_suffix
 from cangauge.cli.output import note
 from cangauge.errors import InputError
 
@@ -31,36 +31,186 @@ ALARM = 0.05
 """`cangauge.diagnosis.ALARM`: a help page imports nothing that computes."""
 
 
-@dataclass(frozen=True, slots=True)
-class ReadingOptions:
-    """The options of every command that reads a log or a capture.
+# --- Declaration of arguments and options, as typer reads them
+
+
+def argument(metavar: str, text: str) -> Any:
+    """Return an argument, with the placeholder of its value and its help."""
+    return typer.Argument(metavar=metavar, help=text, show_default=False)
+
+
+def option(
+    flags: str,
+    metavar: str,
+    text: str,
+    *,
+    within: tuple[float, float] | None = None,
+    unit: str = "",
+    words: Sequence[str] = (),
+    suffixes: Sequence[str] = (),
+) -> Any:
+    """Return an option.
 
     Parameters
     ----------
-    vehicle : PRESET
-        For a capture: the car's preset (a DBC and a map that ship with cangauge).
-    dbc : FILE
-        For a capture: the bus's DBC, where the map names none.
-    map_file : --map FILE
-        For a capture: which signals are current, voltage and temperature, and their DBC.
-    columns : NAME=HEADING,…
-        For a table of other headings: time, current, voltage, temperature, soc, each
-        NAME=HEADING[UNIT]:FACTOR; unit and factor only where the heading leaves them open.
-        'current=I_batt[mA]:-1' (mA, discharge negative); 'time=Date+Time' joins two columns;
-        'temperature=T1+T2' takes the median; '#3' is the third column. See docs/logs.md.
-    sign : charge|discharge
-        What a positive current in the file does. Default: as its format defines it, else found
-        from the data.
-    temperature : C
-        Constant temperature [°C], where the input has none.
+    flags : str
+        Such as "-m, --model".
+    metavar : str
+        Placeholder of the value.
+    text : str
+        Help.
+    within : tuple of float, optional
+        Least and largest number, both allowed; with their `unit`.
+    words : sequence of str
+        May stand in place of a number. The annotation is then `Any`: a float or the word.
+    suffixes : sequence of str
+        One of which a file to write must have.
     """
 
-    vehicle: str | None = None
-    dbc: Path | None = None
-    map_file: Path | None = None
-    columns: str | None = None
-    sign: str | None = None
-    temperature: float | None = None
+    def checked(parameter: typer.CallbackParam, value: Any) -> Any:
+        field = parameter.opts[-1]
+        if isinstance(value, list):
+            return [checked(parameter, each) for each in value]
+        if value is None or value in words:
+            return value
+        if suffixes:
+            require_suffix(value, *suffixes, field=field)
+            return value
+        number = value if isinstance(value, int | float) else _number(value, field, words, unit)
+        if within is not None and not within[0] <= number <= within[1]:  # NaN too
+            problem = f"must lie within {within[0]:g} … {within[1]:g} {unit}".rstrip()
+            raise InputError(problem, field=field, value=number)
+        return number
+
+    if within is not None:
+        bounds = " … ".join(f"{bound:.10g}" for bound in within)
+        text = f"{text} (within {f'{bounds} {unit}'.rstrip()})"
+    more: dict[str, Any] = {"callback": checked} if within or suffixes else {}
+    if words:
+        more["parser"] = str
+    return typer.Option(*flags.split(", "), metavar=metavar or None, help=text, **more)
+
+
+def _number(text: str, field: str, words: Sequence[str], unit: str) -> float:
+    try:
+        return float(text)
+    except ValueError as error:
+        word, of = " or ".join(words), f" of {unit}" if unit else ""
+        problem, cure = f"neither a number nor {word}", f"give a number{of}, or {word}"
+        raise InputError(problem, field=field, value=text, cure=cure) from error
+
+
+MODEL: Final = option("-m, --model", "MODEL", "Model file of `cangauge fit`.")
+CHEMISTRY: Final = option("--chemistry", "oxide|lfp", "Chemistry of the cells.")
+CELLS: Final = option("--cells", "N", "Cells in series.", within=(1, 2000))
+CAPACITY_AH: Final = option(
+    "--capacity-ah",
+    "A",
+    "Charge from 100 to 0 %. Default: the model's.",
+    within=(1e-3, 1e5),
+    unit="Ah",
+)
+REPORT: Final = option(
+    "--report",
+    "FILE.html|.htm",
+    "Write a report as one self-contained page.",
+    suffixes=(".html", ".htm"),
+)
+JSON: Final = option("--json", "", "Print exactly one JSON object on stdout, also for an error.")
+
+
+def command(
+    *omitted: str, keys: Callable[[], list[inspect.Parameter]] | None = None
+) -> Callable[[Callable[..., None]], Callable[..., None]]:
+    """Return the decorator of a command with options that several commands share.
+
+    A parameter that is a dataclass stands for its fields, and `**options` for keys of the
+    configuration.
+
+    Parameters
+    ----------
+    *omitted : str
+        Fields that are no options of this command, but keep their defaults.
+    keys : callable, optional
+        Returns the parameters that `**options` stands for.
+    """
+
+    def decorate(function: Callable[..., None]) -> Callable[..., None]:
+        groups: dict[str, tuple[type, list[str]]] = {}
+        made: list[inspect.Parameter] = []
+        for parameter in inspect.signature(function, eval_str=True).parameters.values():
+            kind = parameter.annotation
+            if parameter.kind is parameter.VAR_KEYWORD:
+                made += [] if keys is None else keys()
+            elif isinstance(kind, type) and is_dataclass(kind):
+                fields = inspect.signature(kind, eval_str=True).parameters.values()
+                shared = [field for field in fields if field.name not in omitted]
+                groups[parameter.name] = kind, [field.name for field in shared]
+                made += [field.replace(kind=field.KEYWORD_ONLY) for field in shared]
+            else:
+                made.append(parameter)
+
+        def run(**given: Any) -> None:
+            for name, (kind, names) in groups.items():
+                given[name] = kind(**{each: given.pop(each) for each in names})
+            function(**given)
+
+        run.__doc__ = function.__doc__
+        run.__signature__ = inspect.Signature(made)  # type: ignore[attr-defined]
+        run.__annotations__ = {each.name: each.annotation for each in made}
+        return run
+
+    return decorate
+
+
+@dataclass(frozen=True, slots=True)
+class ReadingOptions:
+    """The options of every command that reads a log or a capture."""
+
+    vehicle: Annotated[
+        str | None,
+        option(
+            "--vehicle",
+            "PRESET",
+            "For a capture: the car's preset (a DBC and a map that ship with cangauge).",
+        ),
+    ] = None
+    dbc: Annotated[
+        Path | None,
+        option("--dbc", "FILE", "For a capture: the bus's DBC, where the map names none."),
+    ] = None
+    map_file: Annotated[
+        Path | None,
+        option(
+            "--map",
+            "FILE",
+            "For a capture: which signals are current, voltage and temperature, and their DBC.",
+        ),
+    ] = None
+    columns: Annotated[
+        str | None,
+        option(
+            "--columns",
+            "NAME=HEADING,…",
+            "For a table of other headings: time, current, voltage, temperature, soc, each"
+            " NAME=HEADING[UNIT]:FACTOR; unit and factor only where the heading leaves them open."
+            " 'current=I_batt[mA]:-1' (mA, discharge negative); 'time=Date+Time' joins two columns;"
+            " 'temperature=T1+T2' takes the median; '#3' is the third column. See docs/logs.md.",
+        ),
+    ] = None
+    sign: Annotated[
+        str | None,
+        option(
+            "--sign",
+            "charge|discharge",
+            "What a positive current in the file does. Default: as its format defines it, else"
+            " found from the data.",
+        ),
+    ] = None
+    temperature: Annotated[
+        float | None,
+        option("--temperature", "C", "Constant temperature [°C], where the input has none."),
+    ] = None
 
     @property
     def names_vehicle(self) -> bool:

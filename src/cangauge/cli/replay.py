@@ -5,16 +5,19 @@ from __future__ import annotations
 import math
 from contextlib import ExitStack
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any
 
 from cangauge._text import duration, number
-from cangauge.cli.declare import command
 from cangauge.cli.options import (
+    JSON,
     ReadingOptions,
+    argument,
     assumed_of,
+    command,
     config_parameters,
     config_values,
     note_reading,
+    option,
 )
 from cangauge.cli.output import emit_json, note, progress
 
@@ -32,13 +35,39 @@ if TYPE_CHECKING:
     )
 )
 def replay_command(
-    recorded: Path,
+    recorded: Annotated[Path, argument("LOG|CAPTURE", "Recorded log, or recorded frames.")],
     *,
-    config: Path | None = None,
-    columns: str | None = None,
-    speed: float | Literal["max"] = 1.0,
-    loop: bool = False,
-    json_output: bool = False,
+    config: Annotated[
+        Path | None,
+        option(
+            "--config",
+            "FILE",
+            "Configuration of the `cangauge run` that listens: its bus, vehicle and ids.",
+        ),
+    ] = None,
+    columns: Annotated[
+        str | None,
+        option(
+            "--columns",
+            "NAME=HEADING,…",
+            "Columns of a table of other headings, as of `cangauge inspect`.",
+        ),
+    ] = None,
+    speed: Annotated[
+        Any,
+        option(
+            "--speed",
+            "1|N|max",
+            "1: real time; N: N times faster; max: as fast as `cangauge run` acknowledges, without"
+            " loss.",
+            within=(0.001, 1e6),
+            words=("max",),
+        ),
+    ] = 1.0,
+    loop: Annotated[
+        bool, option("--loop", "", "Repeat until Ctrl-C, with increasing log time.")
+    ] = False,
+    json_output: Annotated[bool, JSON] = False,
     **options: Any,
 ) -> None:
     """Play a recorded log or capture on a bus.
@@ -55,19 +84,6 @@ def replay_command(
     `cangauge replay trip.parquet --speed max --vehicle leaf_aze0`
 
     `cangauge replay candump.log.gz --speed 10 --interface socketcan --channel vcan0 --loop`
-
-    Parameters
-    ----------
-    recorded : LOG|CAPTURE
-        Recorded log, or recorded frames.
-    config : FILE
-        Configuration of the `cangauge run` that listens: its bus, vehicle and ids.
-    columns : NAME=HEADING,…
-        Columns of a table of other headings, as of `cangauge inspect`.
-    speed : 1|N|max (0.001 … 1e6)
-        1: real time; N: N times faster; max: as fast as `cangauge run` acknowledges, without loss.
-    loop : --loop
-        Repeat until Ctrl-C, with increasing log time.
     """
     from cangauge.bus.connection import BusConnection
     from cangauge.bus.open import open_bus

@@ -7,13 +7,12 @@ import logging
 from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 from rich.live import Live
 
 from cangauge._logging import emit
-from cangauge.cli.declare import command
-from cangauge.cli.options import config_parameters, config_values
+from cangauge.cli.options import JSON, argument, command, config_parameters, config_values, option
 from cangauge.cli.output import console, emit_json, finish, print_values
 from cangauge.cli.status import live_text
 from cangauge.errors import CangaugeError
@@ -27,7 +26,20 @@ _LOG = logging.getLogger(__name__)
 
 
 @command(keys=config_parameters)
-def run_command(*, config: Path | None = None, json_output: bool = False, **options: Any) -> None:
+def run_command(
+    *,
+    config: Annotated[
+        Path | None,
+        option(
+            "--config",
+            "FILE",
+            "Configuration in TOML; its keys are in docs/configuration.md. Options given here take"
+            " precedence.",
+        ),
+    ] = None,
+    json_output: Annotated[bool, JSON] = False,
+    **options: Any,
+) -> None:
     """Estimate the state of charge from a bus, and publish it there.
 
     Publishes SOC_ESTIMATE (0x5A0) every 100 ms, and SOC_DETAIL (0x5A1), SOC_HEALTH (0x5A2),
@@ -54,12 +66,6 @@ def run_command(*, config: Path | None = None, json_output: bool = False, **opti
     `cangauge run --config car.toml --state /var/lib/cangauge`
 
     `cangauge run --config car.toml --dashboard 8642`  (the live page at http://127.0.0.1:8642/)
-
-    Parameters
-    ----------
-    config : FILE
-        Configuration in TOML; its keys are in docs/configuration.md. Options given here take
-        precedence.
     """
     from cangauge.service.config import load_config
     from cangauge.service.run import Service
@@ -102,8 +108,11 @@ class _LiveLine(Output):
             self._live.stop()
 
 
-@command()
-def check_command(config: Path, *, json_output: bool = False) -> None:
+def check_command(
+    config: Annotated[Path, argument("FILE.toml", "Configuration of `cangauge run`.")],
+    *,
+    json_output: Annotated[bool, JSON] = False,
+) -> None:
     """Check a configuration as `cangauge run` would read it, without opening the bus.
 
     Reads model, DBC, map, token and password, and checks ids, bus, addresses and output files.
@@ -113,11 +122,6 @@ def check_command(config: Path, *, json_output: bool = False) -> None:
     Examples
     --------
     `cangauge check car.toml && systemctl reload cangauge@can0`
-
-    Parameters
-    ----------
-    config : FILE.toml
-        Configuration of `cangauge run`.
     """
     from cangauge.service.run import Service
 

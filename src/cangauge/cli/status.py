@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping
 from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
-from typing import Any, Final, NoReturn
+from typing import Annotated, Any, Final, NoReturn
 
 import typer
 from rich.console import RenderableType
@@ -22,7 +22,7 @@ from cangauge._text import (
     possible,
     uncertain,
 )
-from cangauge.cli.declare import command
+from cangauge.cli.options import JSON, option
 from cangauge.cli.output import (
     PlainConsole,
     emit_json,
@@ -39,9 +39,21 @@ WATCH_EVERY_S: Final = 0.5
 _STYLE: Final = {"initialising": "yellow", "valid": "green", "degraded": "yellow", "invalid": "red"}
 
 
-@command()
 def status_command(
-    *, endpoint: Path | None = None, watch: bool = False, json_output: bool = False
+    *,
+    endpoint: Annotated[
+        Path | None,
+        option(
+            "--endpoint",
+            "PATH",
+            "Unix socket of the service. Default: the service running on this machine. From"
+            ' another machine: `curl -H "Authorization: Bearer TOKEN" http://HOST:PORT/status`.',
+        ),
+    ] = None,
+    watch: Annotated[
+        bool, option("--watch", "", "Show it again every half second, until Ctrl-C.")
+    ] = False,
+    json_output: Annotated[bool, JSON] = False,
 ) -> None:
     """Show the state of a running service: SoC ± standard deviation [%], inputs, bus.
 
@@ -56,14 +68,6 @@ def status_command(
     `cangauge status --watch`
 
     `cangauge status --endpoint /run/cangauge/can0/status.sock --json`
-
-    Parameters
-    ----------
-    endpoint : PATH
-        Unix socket of the service. Default: the service running on this machine. From another
-        machine: `curl -H "Authorization: Bearer TOKEN" http://HOST:PORT/status`.
-    watch : --watch
-        Show it again every half second, until Ctrl-C.
     """
     from cangauge.service.status_client import NotRunningError, fetch_status, find_socket
 

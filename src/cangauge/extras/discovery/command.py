@@ -9,11 +9,10 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Annotated, Any, Final
 
 from cangauge._files import check_writable, write_texts_atomic
-from cangauge.cli.declare import command
-from cangauge.cli.options import config_parameters, config_values
+from cangauge.cli.options import JSON, argument, command, config_parameters, config_values, option
 from cangauge.cli.output import finish, note, print_table, progress
 from cangauge.errors import CangaugeError, InputError
 
@@ -38,16 +37,37 @@ _SCALE_CURES: Final = {
 
 @command(keys=lambda: config_parameters("interface", "channel", "bus_options"))
 def init_command(
-    captures: list[Path] | None = None,
+    captures: Annotated[
+        list[Path] | None, argument("[CAPTURE]…", "Captures of one car, of a drive.")
+    ] = None,
     *,
-    output: Path,
-    dbc: Path | None = None,
-    choose: list[str] | None = None,
-    nominal_voltage: float | None = None,
-    presets: bool = True,
-    seconds: float = 60.0,
-    force: bool = False,
-    json_output: bool = False,
+    output: Annotated[Path, option("-o, --output", "DIR", "Folder for run.toml and the others.")],
+    dbc: Annotated[
+        Path | None, option("--dbc", "FILE", "DBC of the car: signals by name and unit.")
+    ] = None,
+    choose: Annotated[
+        list[str] | None,
+        option("--choose", "ROLE=N", "Take candidate N for current, voltage, soc or temperature."),
+    ] = None,
+    nominal_voltage: Annotated[
+        float | None,
+        option(
+            "--nominal-voltage",
+            "V",
+            "Voltage of the pack, nominal or as a meter shows it: decides its scale.",
+            within=(10, 1500),
+            unit="V",
+        ),
+    ] = None,
+    presets: Annotated[
+        bool, option("--presets/--no-presets", "", "Look for known vehicles.")
+    ] = True,
+    seconds: Annotated[
+        float,
+        option("--seconds", "S", "Time to listen to a live bus.", within=(1, 86400), unit="s"),
+    ] = 60.0,
+    force: Annotated[bool, option("--force", "", "Overwrite existing files.")] = False,
+    json_output: Annotated[bool, JSON] = False,
     **options: Any,
 ) -> None:
     """Find the car's signals, check them against each other, and write a map and a configuration.
@@ -67,25 +87,6 @@ def init_command(
     `cangauge init drive.log --dbc car.dbc -o mycar`
 
     `cangauge init drive.log --choose current=2 -o mycar`
-
-    Parameters
-    ----------
-    captures : [CAPTURE]…
-        Captures of one car, of a drive.
-    output : -o, --output DIR
-        Folder for run.toml and the others.
-    dbc : FILE
-        DBC of the car: signals by name and unit.
-    choose : ROLE=N
-        Take candidate N for current, voltage, soc or temperature.
-    nominal_voltage : V (10 … 1500 V)
-        Voltage of the pack, nominal or as a meter shows it: decides its scale.
-    presets : --presets/--no-presets
-        Look for known vehicles.
-    seconds : S (1 … 86400 s)
-        Time to listen to a live bus.
-    force : --force
-        Overwrite existing files.
     """
     picks = _picks(choose or [])
     _check(output, force=force)

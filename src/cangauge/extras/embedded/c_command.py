@@ -4,24 +4,59 @@ from __future__ import annotations
 
 from functools import partial
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
-from cangauge.cli.declare import command
+from cangauge.cli.options import JSON, MODEL, option
 from cangauge.cli.output import finish, note
 from cangauge.errors import InputError
 
 
-@command()
 def export_c_command(
     *,
-    model: Path | None = None,
-    output: Path,
-    chemistry: Literal["oxide", "lfp"] = "oxide",
-    cells: int | None = None,
-    capacity_ah: float | None = None,
-    platform: Literal["generic", "esp-idf", "zephyr", "arduino", "foxbms"] = "generic",
-    period: float = 0.5,
-    json_output: bool = False,
+    model: Annotated[Path | None, MODEL] = None,
+    output: Annotated[
+        Path,
+        option(
+            "-o, --output", "DIR", "Folder for the sources: empty, of an earlier export, or made."
+        ),
+    ],
+    chemistry: Annotated[
+        Literal["oxide", "lfp"],
+        option("--chemistry", "oxide|lfp", "Without a model: the cells' chemistry, …"),
+    ] = "oxide",
+    cells: Annotated[
+        int | None, option("--cells", "N", "… how many are in series, …", within=(1, 2000))
+    ] = None,
+    capacity_ah: Annotated[
+        float | None,
+        option(
+            "--capacity-ah",
+            "A",
+            "… and the charge from 100 to 0 %.",
+            within=(0.001, 1e5),
+            unit="Ah",
+        ),
+    ] = None,
+    platform: Annotated[
+        Literal["generic", "esp-idf", "zephyr", "arduino", "foxbms"],
+        option(
+            "--platform",
+            "generic|esp-idf|zephyr|arduino|foxbms",
+            "What the folder is to be: sources with a Makefile and tests, an ESP-IDF component, a"
+            " Zephyr module, an Arduino library, or the SoC module of foxBMS 2; with an example.",
+        ),
+    ] = "generic",
+    period: Annotated[
+        float,
+        option(
+            "--period",
+            "S",
+            "Time between two currents that the delay line keeps: more samples cost no memory.",
+            within=(0.001, 60),
+            unit="s",
+        ),
+    ] = 0.5,
+    json_output: Annotated[bool, JSON] = False,
 ) -> None:
     """Write a model and the estimator as C sources, with tests, for a microcontroller.
 
@@ -31,22 +66,6 @@ def export_c_command(
 
     `cangauge export-c --chemistry lfp --cells 16 --capacity-ah 280 -o pack_c`  (no log yet: the
     typical cell, with the uncertainty that belongs to it)
-
-    Parameters
-    ----------
-    output : -o, --output DIR
-        Folder for the sources: empty, of an earlier export, or made.
-    chemistry : oxide|lfp
-        Without a model: the cells' chemistry, …
-    cells : N (1 … 2000)
-        … how many are in series, …
-    capacity_ah : A (0.001 … 1e5 Ah)
-        … and the charge from 100 to 0 %.
-    platform : generic|esp-idf|zephyr|arduino|foxbms
-        What the folder is to be: sources with a Makefile and tests, an ESP-IDF component, a Zephyr
-        module, an Arduino library, or the SoC module of foxBMS 2; with an example.
-    period : S (0.001 … 60 s)
-        Time between two currents that the delay line keeps: more samples cost no memory.
     """
     # Deferred, so that the help page does not wait for numpy and scipy.
     from cangauge.extras.embedded.embedded import export_c, std_at_rest_pct

@@ -4,20 +4,28 @@ from __future__ import annotations
 
 from functools import partial
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
-from cangauge.cli.declare import command
-from cangauge.cli.options import check_outputs
+from cangauge.cli.options import JSON, MODEL, check_outputs, option
 from cangauge.cli.output import finish, note
 
 
-@command()
 def export_fmu_command(
     *,
-    model: Path,
-    output: Path,
-    kind: Literal["pack", "estimator"] = "pack",
-    json_output: bool = False,
+    model: Annotated[Path, MODEL],
+    output: Annotated[
+        Path, option("-o, --output", "FILE.fmu", "Unit to write.", suffixes=(".fmu",))
+    ],
+    kind: Annotated[
+        Literal["pack", "estimator"],
+        option(
+            "--kind",
+            "pack|estimator",
+            "pack: current and temperature in, voltage and SoC out; estimator: voltage too in, SoC,"
+            " σ and status out.",
+        ),
+    ] = "pack",
+    json_output: Annotated[bool, JSON] = False,
 ) -> None:
     """Write a model as a functional mock-up unit (FMI 2.0, co-simulation).
 
@@ -28,14 +36,6 @@ def export_fmu_command(
     `cangauge export-fmu -m pack.json -o pack.fmu`
 
     `cangauge export-fmu -m pack.json -o estimator.fmu --kind estimator`
-
-    Parameters
-    ----------
-    output : -o, --output FILE.fmu
-        Unit to write.
-    kind : pack|estimator
-        pack: current and temperature in, voltage and SoC out; estimator: voltage too in, SoC, σ and
-        status out.
     """
     check_outputs([output], [model])
     # Deferred, so that the help page does not wait for numpy and scipy.

@@ -6,13 +6,20 @@ from collections import Counter
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
 
 import typer
 
 from cangauge._text import number
-from cangauge.cli.declare import command
-from cangauge.cli.options import ReadingOptions, check_outputs
+from cangauge.cli.options import (
+    JSON,
+    MODEL,
+    ReadingOptions,
+    argument,
+    check_outputs,
+    command,
+    option,
+)
 from cangauge.cli.output import finish, note, print_table, progress, say
 from cangauge.errors import InputError
 
@@ -31,15 +38,35 @@ _SHOWN_ROWS: Final = 20
 
 @command()
 def fleet_command(
-    answer: Literal["estimate", "gap", "judge"],
-    logs: list[Path],
+    answer: Annotated[
+        Literal["estimate", "gap", "judge"],
+        argument("estimate|gap|judge", "Command whose answer a row holds."),
+    ],
+    logs: Annotated[list[Path], argument("LOG", "Logs or captures.")],
     *,
-    model: Path,
-    output: Path,
-    reference: list[Path] | None = None,
-    scheduler: str | None = None,
+    model: Annotated[Path, MODEL],
+    output: Annotated[
+        Path, option("-o, --output", "OUT.parquet", "Table to write.", suffixes=(".parquet",))
+    ],
+    reference: Annotated[
+        list[Path] | None,
+        option(
+            "--reference",
+            "LOG",
+            "For gap: log without a fault, of any of the vehicles; repeat the option.",
+        ),
+    ] = None,
+    scheduler: Annotated[
+        str | None,
+        option(
+            "--scheduler",
+            "ADDRESS",
+            "Dask scheduler that computes the rows, e.g. tcp://10.0.0.5:8786; for more than a"
+            " thousand logs. Needs the extra `fleet`.",
+        ),
+    ] = None,
     reading: ReadingOptions,
-    json_output: bool = False,
+    json_output: Annotated[bool, JSON] = False,
 ) -> None:
     """Estimate, diagnose or judge each of many logs: one row of a Parquet table each.
 
@@ -55,20 +82,6 @@ def fleet_command(
     gaps.parquet`
 
     `cangauge fleet judge day*.csv -m pack.json -o judged.parquet --scheduler tcp://10.0.0.5:8786`
-
-    Parameters
-    ----------
-    answer : estimate|gap|judge
-        Command whose answer a row holds.
-    logs : LOG
-        Logs or captures.
-    output : -o, --output OUT.parquet
-        Table to write.
-    reference : LOG
-        For gap: log without a fault, of any of the vehicles; repeat the option.
-    scheduler : ADDRESS
-        Dask scheduler that computes the rows, e.g. tcp://10.0.0.5:8786; for more than a thousand
-        logs. Needs the extra `fleet`.
     """
     from cangauge.extras.fleet.rows import FleetJob, run, write_rows
     from cangauge.model.model_file import Model

@@ -8,14 +8,22 @@ from contextlib import ExitStack
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
 from cangauge._files import atomic_path, write_texts_atomic
 from cangauge._text import number, printable
-from cangauge.cli.declare import command
-from cangauge.cli.options import ReadingOptions, check_outputs
+from cangauge.cli.options import (
+    JSON,
+    MODEL,
+    REPORT,
+    ReadingOptions,
+    argument,
+    check_outputs,
+    command,
+    option,
+)
 from cangauge.cli.output import finish, note, print_table, progress
 from cangauge.errors import InputError
 
@@ -25,19 +33,62 @@ if TYPE_CHECKING:
 
 @command()
 def judge_command(
-    logs: list[str],
+    logs: Annotated[
+        list[str], argument("LOG", "Logs or captures in order of time, with the published SoC.")
+    ],
     *,
-    model: Path | None = None,
-    chemistry: Literal["oxide", "lfp"] | None = None,
-    cells: int | None = None,
-    capacity_ah: float | None = None,
-    output: Path | None = None,
-    corrected: Path | None = None,
-    suite: bool = False,
-    data: Path | None = None,
+    model: Annotated[Path | None, MODEL] = None,
+    chemistry: Annotated[
+        Literal["oxide", "lfp"] | None,
+        option("--chemistry", "oxide|lfp", "Without a model: the cells' chemistry, …"),
+    ] = None,
+    cells: Annotated[
+        int | None, option("--cells", "N", "… and how many are in series.", within=(1, 2000))
+    ] = None,
+    capacity_ah: Annotated[
+        float | None,
+        option(
+            "--capacity-ah",
+            "A",
+            "Charge from 100 to 0 % that the gauge should count with. Default: the model's; without"
+            " a model, from the gauge's own count.",
+            within=(0.001, 1e5),
+            unit="Ah",
+        ),
+    ] = None,
+    output: Annotated[
+        Path | None,
+        option(
+            "-o, --output",
+            "MODEL.json",
+            "Write the model, narrowed by these logs.",
+            suffixes=(".json",),
+        ),
+    ] = None,
+    corrected: Annotated[
+        Path | None,
+        option(
+            "--corrected",
+            "FILE.csv|.parquet",
+            "Write published and corrected SoC of every row.",
+            suffixes=(".csv", ".parquet"),
+        ),
+    ] = None,
+    suite: Annotated[
+        bool, option("--suite", "", "Play drives with faults to the gauge that is started by LOG …")
+    ] = False,
+    data: Annotated[
+        Path | None,
+        option(
+            "--data",
+            "FOLDER",
+            "With --suite: recorded logs of the model's pack, with their true SoC, in place of the"
+            " simulated ones.",
+        ),
+    ] = None,
     reading: ReadingOptions,
-    report: Path | None = None,
-    json_output: bool = False,
+    report: Annotated[Path | None, REPORT] = None,
+    json_output: Annotated[bool, JSON] = False,
 ) -> None:
     """Judge the SoC that a battery gauge publishes: is it right, since when not, and why.
 
@@ -61,27 +112,6 @@ def judge_command(
 
     `cangauge judge --suite -- cangauge run --interface {interface} --channel {channel} --bus-option
     port={port} -m {model} --initial-soc {soc} --time-source replay-clock`
-
-    Parameters
-    ----------
-    logs : LOG
-        Logs or captures in order of time, with the published SoC.
-    chemistry : oxide|lfp
-        Without a model: the cells' chemistry, …
-    cells : N (1 … 2000)
-        … and how many are in series.
-    capacity_ah : A (0.001 … 1e5 Ah)
-        Charge from 100 to 0 % that the gauge should count with. Default: the model's; without a
-        model, from the gauge's own count.
-    output : -o, --output MODEL.json
-        Write the model, narrowed by these logs.
-    corrected : FILE.csv|.parquet
-        Write published and corrected SoC of every row.
-    suite : --suite
-        Play drives with faults to the gauge that is started by LOG …
-    data : FOLDER
-        With --suite: recorded logs of the model's pack, with their true SoC, in place of the
-        simulated ones.
     """
     from cangauge.extras.judge.judgement import judge, narrowed
     from cangauge.logs.charge import refuse_contradictions

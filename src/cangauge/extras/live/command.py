@@ -3,12 +3,23 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Annotated
 
-from cangauge.cli.declare import command
+from cangauge.cli.options import argument, option
 
 
-@command()
-def live_command(config: Path, *, endpoint: Path | None = None) -> None:
+def live_command(
+    config: Annotated[Path, argument("FILE.toml", "Configuration of `cangauge run`.")],
+    *,
+    endpoint: Annotated[
+        Path | None,
+        option(
+            "--endpoint",
+            "PATH",
+            "Unix socket of the service. Default: the service running on this machine.",
+        ),
+    ] = None,
+) -> None:
     """Serve the live page, the status by HTTP and MQTT of a running service.
 
     Reads `dashboard`, `http`, `http_token_file` and `[mqtt]` of the service's configuration. With
@@ -18,13 +29,6 @@ def live_command(config: Path, *, endpoint: Path | None = None) -> None:
     Examples
     --------
     `cangauge live /etc/cangauge/can0.toml --endpoint /run/cangauge/can0/status.sock`
-
-    Parameters
-    ----------
-    config : FILE.toml
-        Configuration of `cangauge run`.
-    endpoint : PATH
-        Unix socket of the service. Default: the service running on this machine.
     """
     from cangauge.errors import InputError
     from cangauge.extras.live.launch import offer_of

@@ -2,25 +2,47 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
+from typing import Annotated
 
 import typer
 
-from cangauge.cli.declare import command
-from cangauge.cli.options import ReadingOptions, assumed_of
+from cangauge.cli.options import JSON, ReadingOptions, argument, assumed_of, command, option
 from cangauge.cli.output import finish, note, print_table, progress
 from cangauge.errors import InputError
 
 
 @command("columns", "sign", "temperature")
 def gap_check_command(
-    logs: list[Path] | None = None,
+    logs: Annotated[
+        list[Path] | None,
+        argument(
+            "[LOG]…",
+            "Your own logs without a fault, four at least, whose headings are plain or named by"
+            " [columns] of the map file. Default: a simulated pack.",
+        ),
+    ] = None,
     *,
-    capacity_ah: float | None = None,
-    cells: int = 96,
-    at_most: int | None = None,
+    capacity_ah: Annotated[
+        float | None,
+        option(
+            "--capacity-ah",
+            "A",
+            "Charge of the logs' pack from 100 to 0 %; needed with LOGs.",
+            within=(0.001, 1e5),
+            unit="Ah",
+        ),
+    ] = None,
+    cells: Annotated[
+        int, option("--cells", "N", "Cells in series of the logs' pack.", within=(1, 2000))
+    ] = 96,
+    at_most: Annotated[
+        int | None,
+        option("--at-most", "N", "Leave out at most this many logs.", within=(1, math.inf)),
+    ] = None,
     reading: ReadingOptions,
-    json_output: bool = False,
+    json_output: Annotated[bool, JSON] = False,
 ) -> None:
     """Measure what `gap` would find: every effect injected into healthy logs of a pack.
 
@@ -33,18 +55,6 @@ def gap_check_command(
     `cangauge gap-check mine/*.csv --capacity-ah 60 --cells 96`
 
     `cangauge gap-check --at-most 2`
-
-    Parameters
-    ----------
-    logs : [LOG]…
-        Your own logs without a fault, four at least, whose headings are plain or named by
-        [columns] of the map file. Default: a simulated pack.
-    capacity_ah : A (0.001 … 1e5 Ah)
-        Charge of the logs' pack from 100 to 0 %; needed with LOGs.
-    cells : N (1 … 2000)
-        Cells in series of the logs' pack.
-    at_most : N (1 … inf)
-        Leave out at most this many logs.
     """
     from cangauge.extras.validation.gap_check import (
         PER_LOG,

@@ -2,28 +2,74 @@
 
 from __future__ import annotations
 
+import math
 import time
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
-from cangauge.cli.declare import command
-from cangauge.cli.options import check_outputs
+from cangauge.cli.options import JSON, check_outputs, option
 from cangauge.cli.output import finish, note, print_table, progress
 
 
-@command()
 def twin_command(
     *,
-    output: Path,
-    seed: int = 0,
-    effect: list[str] | None = None,
-    day: int = 1,
-    hours: float | None = None,
-    discharge: bool = False,
-    pack: str | None = None,
-    plant: Literal["twin", "equation"] = "twin",
-    json_output: bool = False,
+    output: Annotated[
+        Path,
+        option(
+            "-o, --output",
+            "LOG.parquet|.pq|.csv",
+            "Log to write.",
+            suffixes=(".parquet", ".pq", ".csv"),
+        ),
+    ],
+    seed: Annotated[
+        int, option("--seed", "N", "Selects the pack. Same seed, same log.", within=(0, math.inf))
+    ] = 0,
+    effect: Annotated[
+        list[str] | None,
+        option(
+            "--effect",
+            "ID[:parameter=value,…]",
+            "Fault of the pack or its sensors; repeat for several. A wrong ID or parameter is"
+            " answered with the known ones. `gap_v=V` in place of a size: the size that opens this"
+            " RMS gap. Default: a gap of 0.3 % of the pack voltage.",
+        ),
+    ] = None,
+    day: Annotated[
+        int, option("--day", "N", "Number of the drive, with its weather.", within=(1, math.inf))
+    ] = 1,
+    hours: Annotated[
+        float | None,
+        option(
+            "--hours", "H", "Duration. Default: 0.5 to 2.5, drawn.", within=(0.05, 12), unit="h"
+        ),
+    ] = None,
+    discharge: Annotated[
+        bool,
+        option(
+            "--discharge",
+            "",
+            "Drive from full to empty within the hours (default 2.5 h): a log for `fit`.",
+        ),
+    ] = False,
+    pack: Annotated[
+        str | None,
+        option(
+            "--pack",
+            "KIND",
+            "leaf24, leaf40, car60, car60lfp, compact or module12. Default: drawn.",
+        ),
+    ] = None,
+    plant: Annotated[
+        Literal["twin", "equation"],
+        option(
+            "--plant",
+            "twin|equation",
+            "Model of the cells: the twin's, or the equation that cangauge identifies.",
+        ),
+    ] = "twin",
+    json_output: Annotated[bool, JSON] = False,
 ) -> None:
     """Simulate a pack, a drive, the weather and the sensors: a log whose truth is known.
 
@@ -40,27 +86,6 @@ def twin_command(
     `cangauge twin --seed 1 --day 2 --effect current_offset:offset_a=1.5 -o trip.parquet`
 
     `cangauge twin --seed 1 --effect weak_cell:gap_v=1 --pack leaf24 -o weak.csv`
-
-    Parameters
-    ----------
-    output : -o, --output LOG.parquet|.pq|.csv
-        Log to write.
-    seed : N (0 … inf)
-        Selects the pack. Same seed, same log.
-    effect : ID[:parameter=value,…]
-        Fault of the pack or its sensors; repeat for several. A wrong ID or parameter is answered
-        with the known ones. `gap_v=V` in place of a size: the size that opens this RMS gap.
-        Default: a gap of 0.3 % of the pack voltage.
-    day : N (1 … inf)
-        Number of the drive, with its weather.
-    hours : H (0.05 … 12 h)
-        Duration. Default: 0.5 to 2.5, drawn.
-    discharge : --discharge
-        Drive from full to empty within the hours (default 2.5 h): a log for `fit`.
-    pack : KIND
-        leaf24, leaf40, car60, car60lfp, compact or module12. Default: drawn.
-    plant : twin|equation
-        Model of the cells: the twin's, or the equation that cangauge identifies.
     """
     from cangauge.extras.validation.twin.simulation import simulate
     from cangauge.logs.canonical import write_log

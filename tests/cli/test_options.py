@@ -1,16 +1,16 @@
-"""Commands declared by docstrings: what the user types, and what the function gets."""
+"""Declared options: what the user types, and what the function of a command gets."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any
 
 import pytest
 import typer
 from typer.testing import CliRunner
 
-from cangauge.cli.declare import command
+from cangauge.cli.options import CELLS, JSON, argument, command, option
 from cangauge.errors import InputError
 
 GOT: dict[str, Any] = {}
@@ -18,18 +18,10 @@ GOT: dict[str, Any] = {}
 
 @dataclass(frozen=True, kw_only=True)
 class Shared:
-    """Options of several commands.
+    """Options of several commands."""
 
-    Parameters
-    ----------
-    out : -o, --out DIR
-        Folder.
-    rate : HZ (0.5 … 10 Hz)
-        Rate.
-    """
-
-    out: str
-    rate: float = 1.0
+    out: Annotated[str, option("-o, --out", "DIR", "Folder.")]
+    rate: Annotated[float, option("--rate", "HZ", "Rate.", within=(0.5, 10.0), unit="Hz")] = 1.0
 
 
 @command("rate")
@@ -40,26 +32,27 @@ def narrow_command(*, shared: Shared) -> None:
 
 @command()
 def wide_command(
-    logs: list[Path],
+    logs: Annotated[list[Path], argument("LOG", "Logs.")],
     *,
-    table: Path | None = None,
-    starts: list[float | Literal["auto"]] | None = None,
-    cells: int = 4,
+    table: Annotated[
+        Path | None, option("--table", "TABLE", "Table.", suffixes=(".csv", ".parquet"))
+    ] = None,
+    starts: Annotated[
+        list[Any] | None,
+        option(
+            "--start",
+            "P|auto",
+            "SoC at the first row, repeated.",
+            within=(0.0, 100.0),
+            unit="%",
+            words=("auto",),
+        ),
+    ] = None,
+    cells: Annotated[int, CELLS] = 4,
     shared: Shared,
-    json_output: bool = False,
+    json_output: Annotated[bool, JSON] = False,
 ) -> None:
     """Take everything.
-
-    Parameters
-    ----------
-    logs : LOG
-        Logs.
-    table : TABLE.csv|.parquet
-        Table.
-    starts : --start P|auto (0 … 100 %)
-        SoC at the first row, repeated.
-    cells : N (1 … 2000)
-        Cells in series.
 
     Notes
     -----
@@ -105,24 +98,9 @@ def test_what_is_out_of_bounds_is_refused_by_its_option(words: str, says: str) -
     assert not GOT
 
 
-def test_the_help_page_has_bounds_and_no_section_of_parameters() -> None:
+def test_the_help_page_has_bounds_and_the_whole_docstring() -> None:
     page = " ".join(run(wide_command, "--help").output.replace("│", " ").split())
     for words in ("--start", "P|auto", "within 0 … 100 %", "within 0.5 … 10 Hz", "The end."):
         assert words in page
-    assert "Parameters" not in page
     assert "--rate" not in run(narrow_command, "--help").output
     assert run(narrow_command, "--out", "y", "--rate", "2").exit_code == 2
-
-
-def test_a_docstring_that_is_no_declaration_fails_at_import() -> None:
-    def wrong_command(*, gain: float = 1.0) -> None:
-        """Scale.
-
-        Parameters
-        ----------
-        gain : X of what
-            Factor.
-        """
-
-    with pytest.raises(ValueError, match="gain : X of what"):
-        command()(wrong_command)
