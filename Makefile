@@ -96,8 +96,8 @@ bench: export OMP_NUM_THREADS := 1
 bench: export OPENBLAS_NUM_THREADS := 1
 bench: data $(VENV)/installed-dev $(PEERS)/installed
 	mkdir -p $(BENCH)
-	$(BIN)/python benchmarks/peers.py --data "$(DATA)" --peers $(PEERS)/bin/python --json $(BENCH)/peers.json --figure $(BENCH)/peers.png
-	$(BIN)/python benchmarks/cost.py --json $(BENCH)/cost.json
+	$(BIN)/python benchmarks/peers.py --data "$(DATA)" --peers $(PEERS)/bin/python --figure $(BENCH)/peers.png
+	$(BIN)/python benchmarks/cost.py
 
 # Warns, never fails.
 bench-check: export OMP_NUM_THREADS := 1

@@ -1,6 +1,6 @@
-"""What cangauge costs, how it grows, and whether it became slower than the ratios that are kept.
+"""What cangauge costs in time, and how it grows.
 
-    python benchmarks/cost.py [--only NAME]… [--json FILE] [--keep] [--check]
+    python benchmarks/cost.py [--only NAME]… [--keep]
 
 ratios    a step at 10 and 1 Hz, a row offline, and a wanted frame, as multiples of what does the
           same at its barest in the same run (filterpy's extended Kalman filter of an equivalent
@@ -9,15 +9,11 @@ growth    with delays, effects, cells, frames/s.
 fit       processor time and memory of `cangauge fit` by rows, read from Parquet and from CSV.
 diagnosis by its logs, references and effects.
 start     `--help` of every command.
-
---keep writes the ratios to `ratios.json`; --check measures them alone and warns where one is 20 %
-above the kept one. It never fails: other work on the machine slows one of two things at times.
 """
 
 from __future__ import annotations
 
 import argparse
-import json
 import os
 import resource
 import statistics
@@ -33,7 +29,6 @@ from typing import Any
 import can
 import cantools
 import numpy as np
-from rich.console import Console
 from rich.table import Table
 
 from cangauge._resources import shared_file
@@ -54,12 +49,10 @@ from cangauge.replay.encoder import FrameEncoder
 from cangauge.service.pipeline import Pipeline, PipelineSettings
 from cangauge.types import Sample
 from equivalent_circuit import equivalent_circuit
+from figures import publish
 from peer_filters import Circuit, bare_ekf, run
 from peers import step_us
 
-KEPT = Path(__file__).with_name("ratios.json")
-WORSE = 1.2
-"""Factor on a kept ratio from which a warning is given."""
 ROUNDS = 7
 ROWS = 2000
 """Rows of a timed log: 200 s at 10 Hz."""
@@ -165,15 +158,6 @@ def ratios(rounds: int = ROUNDS) -> Result:
         name: dict(zip(("ratio", "us", "bare_us"), row, strict=True))
         for name, row in medians.items()
     }
-
-
-def slower(found: Result, kept: dict[str, float]) -> list[str]:
-    """Return a warning for each ratio that is more than 20 % above the kept one."""
-    return [
-        f"warning: {name} costs {row['ratio']:.2f} × its barest form; kept is {kept[name]:.2f}"
-        for name, row in found.items()
-        if name in kept and row["ratio"] > WORSE * kept[name]
-    ]
 
 
 def with_delays(known: Model, number: int) -> Model:
@@ -331,14 +315,16 @@ PARTS: dict[str, Callable[[], Result]] = {
 }  # fmt: skip
 
 
-def show(result: Result, console: Console) -> None:
-    """Print each part as a table of names and values."""
+def tables_of(result: Result) -> list[Table]:
+    """Return each part as a table of names and values."""
+    tables = []
     for part, rows in result.items():
-        table = Table("", "", title=part)
+        table = Table(part, "")
         for name, value in rows.items():
             fields = value.items() if isinstance(value, dict) else [("", value)]
             table.add_row(str(name), "; ".join(f"{key} {_short(item)}" for key, item in fields))
-        console.print(table)
+        tables.append(table)
+    return tables
 
 
 def _short(value: float) -> str:
@@ -346,30 +332,17 @@ def _short(value: float) -> str:
 
 
 def main() -> None:
-    """Measure, print, keep or compare."""
+    """Measure and print."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawTextHelpFormatter
     )
     parser.add_argument("--only", action="append", choices=list(PARTS), help="repeat for several")
-    parser.add_argument("--json", type=Path, metavar="FILE", help="write the figures here too")
-    parser.add_argument("--keep", action="store_true", help=f"write the ratios to {KEPT.name}")
-    parser.add_argument("--check", action="store_true", help="compare with the kept ratios")
+    parser.add_argument("--keep", action="store_true", help="keep the figures for the page")
     options = parser.parse_args()
-    if options.check:
-        kept = json.loads(KEPT.read_text(encoding="utf-8"))
-        lines = slower(ratios(), kept)
-        sys.stdout.write("\n".join(lines or ["no ratio is 20 % above the kept one"]) + "\n")
-        return
-    result = {}
     for name in options.only or PARTS:
         sys.stderr.write(f"measuring: {name} …\n")
-        result[name] = PARTS[name]()
-        if options.json:
-            options.json.write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
-    show(result, Console(width=130))
-    if options.keep:
-        kept = {name: round(row["ratio"], 3) for name, row in result["ratios"].items()}
-        KEPT.write_text(json.dumps(kept, indent=1) + "\n", encoding="utf-8")
+        tables = tables_of({name: PARTS[name]()})
+        publish(f"cost-{name}", tables, ["src/cangauge", "core"], keeps=options.keep)
 
 
 if __name__ == "__main__":

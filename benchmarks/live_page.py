@@ -1,6 +1,6 @@
 """CPU time and memory of the live page, beside the service without it.
 
-    python benchmarks/live_page.py [--minutes 10] [--case NAME]... [--json]
+    python benchmarks/live_page.py [--minutes 10] [--case NAME]... [--keep]
 
 1,000 wanted frames/s by UDP multicast on this machine; `cangauge run` without the page, with it and
 no viewer, with it and one viewer in headless Chromium, with it and four of which three only listen.
@@ -25,7 +25,6 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any, Final
 
-from rich.console import Console
 from rich.table import Table
 from tornado.websocket import websocket_connect
 
@@ -34,6 +33,7 @@ from cangauge.bus.vehicle import Vehicle
 from cangauge.replay.encoder import FrameEncoder
 from cangauge.replay.player import Pacer
 from cangauge.types import Sample
+from figures import publish
 from live_service import service
 
 FRAMES_PER_S: Final = 1000
@@ -186,7 +186,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--minutes", type=float, default=10.0)
     parser.add_argument("--case", choices=CASES, action="append", help="default: all")
-    parser.add_argument("--json", action="store_true")
+    parser.add_argument("--keep", action="store_true", help="keep the figures for the page")
     given = parser.parse_args()
     cases = given.case or list(CASES)
     with ThreadPoolExecutor(len(cases)) as pool:
@@ -195,9 +195,6 @@ def main() -> None:
             for number, case in enumerate(cases)
         ]
         results = {case: job.result() for case, job in zip(cases, jobs, strict=True)}
-    if given.json:
-        print(json.dumps(results))
-        return
     table = Table(
         "",
         "service",
@@ -214,7 +211,8 @@ def main() -> None:
             for name in ("service", "page", "browser")
         ]
         table.add_row(case, *cells)
-    Console().print(table)
+    describes = ["src/cangauge/service", "src/cangauge/extras/live"]
+    publish("live-page", [table], describes, keeps=given.keep)
 
 
 if __name__ == "__main__":

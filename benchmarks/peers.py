@@ -1,7 +1,7 @@
 """Time of a step and accuracy beside other packages, each fitted to the same training logs.
 
     make bench DATA=FOLDER                          # or
-    python benchmarks/peers.py --data FOLDER --peers ENVIRONMENT/bin/python [--json FILE]
+    python benchmarks/peers.py --data FOLDER --peers ENVIRONMENT/bin/python [--keep]
 
 The peers' versions are in peers.txt. Packs: the i3's even trips, and every second piece of car1, at
 1 Hz, with models of ten training logs. The peers' circuit is the `equivalent_circuit` of the model
@@ -24,7 +24,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from rich.console import Console
 from rich.table import Table
 
 from cangauge.bus.recording import read_log
@@ -37,6 +36,7 @@ from cangauge.identify.fit import fit
 from cangauge.logs.log import Log
 from cangauge.model.model_file import Model
 from equivalent_circuit import equivalent_circuit
+from figures import publish
 from packs.recorded import load, one_hz
 
 PACKS = ("i3", "car1")
@@ -168,10 +168,10 @@ def _add_peer(
     }
 
 
-def show(found: Result, console: Console) -> None:
-    """Print the table."""
+def table_of(found: Result) -> Table:
+    """Return the table."""
     ours = found[OURS]["us"]
-    table = Table(title="A sample with its estimate, and the SoC's error from the fifth minute on")
+    table = Table()
     for heading in ("", "µs, 10 Hz", "ratio", "µs, 1 Hz", "ratio", "MAE i3 %", "MAE car1 %"):
         table.add_column(heading, justify="right" if heading else "left")
     for name, row in found.items():
@@ -181,7 +181,7 @@ def show(found: Result, console: Console) -> None:
             cells += ["–", "–"] if us is None else [f"{us:.1f}", f"{us / ours[rate]:.1f}"]
         cells += [_percent(row["mae_pct"].get(pack)) for pack in PACKS]
         table.add_row(name + (f" ({row['failure']})" if "failure" in row else ""), *cells)
-    console.print(table)
+    return table
 
 
 def draw(found: Result, path: Path) -> None:
@@ -224,18 +224,17 @@ def main() -> None:
     parser.add_argument("--data", type=Path, required=True, help="folder of the recorded logs")
     parser.add_argument("--peers", type=Path, required=True, help="Python with the peers")
     parser.add_argument("--rounds", type=int, default=3)
-    parser.add_argument("--json", type=Path, metavar="FILE", help="write the figures here too")
+    parser.add_argument("--keep", action="store_true", help="keep the figures for the page")
     parser.add_argument("--figure", type=Path, metavar="FILE", help="draw them (PNG)")
     options = parser.parse_args()
     try:
         found = compare(options.data, options.peers, options.rounds)
     except InputError as error:
         parser.error(str(error))
-    if options.json:
-        options.json.write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
     if options.figure:
         draw(found, options.figure)
-    show(found, Console(width=130))
+    describes = [f"src/cangauge/{name}" for name in ("model", "estimation")]
+    publish("peers", [table_of(found)], [*describes, "core"], keeps=options.keep)
 
 
 if __name__ == "__main__":

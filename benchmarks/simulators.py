@@ -14,9 +14,8 @@ after the correction.
 from __future__ import annotations
 
 import argparse
-import json
 from collections.abc import Callable, Iterator
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -29,6 +28,7 @@ from cangauge.diagnosis import diagnose
 from cangauge.identify.fit import fit
 from cangauge.identify.starts import with_start
 from cangauge.logs.log import Log
+from figures import publish
 
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 REFERENCES = ("551_LA92", "551_US06", "552_Mixed3", "552_Mixed5")
@@ -229,16 +229,13 @@ def _above(log: Log) -> Log:
 
 
 def main() -> None:
-    """Print the table, or JSON."""
+    """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n", maxsplit=1)[0])
     parser.add_argument("--data", type=Path, default=DATA, help="folder of the recorded logs")
-    parser.add_argument("--json", action="store_true", help="print JSON instead of a table")
+    parser.add_argument("--keep", action="store_true", help="keep the figures for the page")
     options = parser.parse_args()
     found = list(rows(options.data))
-    if options.json:
-        print(json.dumps([asdict(row) for row in found], indent=1))
-        return
-    table = Table(title="Measured drives against foreign simulators")
+    table = Table()
     for heading in (
         "simulator", "fault", "verdict", "P", "P(truth)", "simulated RMSE [V]", "corrected [V]",
     ):  # fmt: skip
@@ -253,7 +250,8 @@ def main() -> None:
             f"{row.simulated_rmse_v:.2f}",
             f"{row.corrected_rmse_v:.2f}",
         )
-    Console(width=150).print(table)
+    describes = ["src/cangauge/diagnosis", "src/cangauge/model", "src/cangauge/identify"]
+    publish("simulators", [table], describes, keeps=options.keep, width=150)
 
 
 if __name__ == "__main__":

@@ -15,11 +15,11 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from rich.console import Console
 from rich.table import Table
 
 import cangauge
 from cangauge.types import Status
+from figures import publish
 from packs.recorded import Pack, load
 
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
@@ -78,6 +78,7 @@ def main() -> None:
     parser.add_argument("--data", type=Path, default=DATA)
     parser.add_argument("--draws", type=int, default=3)
     parser.add_argument("--logs", type=int, default=8, help="of each draw")
+    parser.add_argument("--keep", action="store_true", help="keep the figures for the page")
     options = parser.parse_args()
     packs = {pack.name: pack for pack in load(options.data, [*OTHER, "lg_hg2_from_25c"])}
     rows: dict[tuple[str, str, str], list[dict[str, float]]] = defaultdict(list)
@@ -104,7 +105,8 @@ def main() -> None:
             f"{100 * np.mean(within):.0f} %" if within else "–",
             f"{len(ends)} of {len(found)}", f"{np.median(ends):.0f} min" if ends else "–",
         )  # fmt: skip
-    Console(width=130).print(table)
+    describes = [f"src/cangauge/{name}" for name in ("model", "identify", "estimation")]
+    publish("wrong-models", [table], describes, keeps=options.keep)
 
 
 if __name__ == "__main__":

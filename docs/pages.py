@@ -26,6 +26,9 @@ from cangauge.model.effects.library import LIBRARY
 from cangauge.types import REASON_WORDS, reason_name
 
 ROOT = Path(__file__).parent.parent
+sys.path.insert(0, str(ROOT / "benchmarks"))
+from figures import with_figures  # noqa: E402 - a module beside the package
+
 OUTSIDE_LINK = re.compile(
     r"\[([^\]]*)\]\((?:\.\./)+(?:src|dbc|replay|contrib|examples|benchmarks|tests|[A-Z]+\.md)[^)]*\)"
 )
@@ -50,7 +53,7 @@ def write_pages(folder: Path) -> None:
         target.parent.mkdir(exist_ok=True)
         target.write_text(text, encoding="utf-8")
     for page in folder.rglob("*.md"):  # the site does not hold the files of the repository
-        text = page.read_text(encoding="utf-8")
+        text = with_figures(page.read_text(encoding="utf-8"))
         page.write_text(OUTSIDE_LINK.sub(r"\1", text), encoding="utf-8")
 
 
