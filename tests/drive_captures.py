@@ -44,10 +44,12 @@ def drive(seed: int, volts: float, ohm: float, seconds: float = 60.0) -> dict[st
         wanted = np.clip(0.8 * (target[k] - speed[k - 1]), -2.5, 2.2)
         acceleration[k] = acceleration[k - 1] + 0.04 * (wanted - acceleration[k - 1])
         speed[k] = max(speed[k - 1] + acceleration[k] * dt, 0.0)
-    force = 1600.0 * acceleration + 0.5 * speed**2 + 150.0 * (speed > 0.1)
+    # A pack of fewer cells drives a smaller vehicle.
+    force = volts / 360.0 * (1600.0 * acceleration + 0.5 * speed**2 + 150.0 * (speed > 0.1))
     power = force * speed
     power = np.where(power > 0.0, power / 0.88, power * 0.75)
-    power += 600.0 + 400.0 * (np.sin(np.arange(n) * dt / 7.0) > 0.5)  # heater, 12 V
+    heater = 600.0 + 400.0 * (np.sin(np.arange(n) * dt / 7.0) > 0.5)
+    power += volts / 360.0 * heater
     current = power / volts + rng.normal(0.0, 0.4, n)
     polar = np.zeros(n)
     for k in range(1, n):

@@ -37,6 +37,13 @@ def mitsubishi(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_drive(tmp_path_factory.mktemp("captures") / "drive.log", 30.0)
 
 
+DBC = (
+    'VERSION "1"\nNS_ :\nBS_:\nBU_: V\nBO_ 883 BMS_Status: 8 V\n'
+    ' SG_ PackCurrent : 23|16@0+ {scale} [0|0] "A" V\n'
+    ' SG_ PackVoltage : 39|16@0+ (0.1,0) [0|0] "V" V\n'
+    ' SG_ MaxChargeCurrent : 7|8@0+ (1,0) [0|0] "A" V\n'
+    ' SG_ MinCellVoltage : 15|8@0+ (0.02,0) [0|0] "V" V\n'
+)
 CHOICE = ("--choose", "current=1", "--choose", "voltage=1")
 
 
@@ -44,7 +51,7 @@ def test_an_unclear_pair_exits_with_one_and_names_three(mitsubishi: Path, tmp_pa
     done = in_process("init", mitsubishi, "-o", tmp_path / "car")
     assert done.code == 1
     assert "1   0x373 23|16@0+" in done.out
-    assert "no current and no voltage is clearly ahead" in done.err
+    assert done.out.startswith("No map: no current and no voltage is clearly the pack's")
     assert "the scale of the voltage is open (--nominal-voltage V decides it)" in done.err
     assert "0x373" not in done.err  # the tables name them
     assert "by halves" not in done.out
@@ -77,18 +84,14 @@ def test_a_dbc_gives_signals_by_name_and_their_sign_is_proven(
     tmp_path: Path, scale: str, sign: int
 ) -> None:
     minute = write_drive(tmp_path / "drive.log", 60.0)
-    (tmp_path / "car.dbc").write_text(
-        'VERSION "1"\nNS_ :\nBS_:\nBU_: V\nBO_ 883 BMS_Status: 8 V\n'
-        f' SG_ PackCurrent : 23|16@0+ {scale} [0|0] "A" V\n'
-        ' SG_ PackVoltage : 39|16@0+ (0.1,0) [0|0] "V" V\n'
-        ' SG_ MaxChargeCurrent : 7|8@0+ (1,0) [0|0] "A" V\n'
-        ' SG_ MinCellVoltage : 15|8@0+ (0.02,0) [0|0] "V" V\n'
-    )
+    (tmp_path / "car.dbc").write_text(DBC.format(scale=scale))
     done = succeeds("init", minute, "--dbc", tmp_path / "car.dbc", "-o", tmp_path / "out")
     assert f"The map has sign = {sign}." in done.err
     assert ("positive values charge on this bus" in done.err) == (sign < 0)
     assert "the files assume 20 °C" in done.err
-    table = done.out.partition("voltage")[0]
+    answer, _, tables = done.out.partition("\n")
+    assert answer.startswith("Found by names: current BMS_Status.PackCurrent, voltage BMS_Status")
+    table = tables.partition("voltage")[0]
     ends, *_ = re.findall(r"(\S+ … \S+ A)", table)
     assert ends in done.err  # one range, of one sign, of the whole capture
     assert ends in (tmp_path / "out" / "car.toml").read_text(encoding="utf-8")
@@ -150,10 +153,12 @@ def test_a_live_bus_is_listened_to(mitsubishi: Path, tmp_path: Path) -> None:
                     return
                 sender.send(frame)
 
+    (tmp_path / "car.dbc").write_text(DBC.format(scale="(-0.01,327.68)"))
     thread = threading.Thread(target=send)
     thread.start()
     try:
-        done = succeeds("init", *bus, "-o", tmp_path / "car", "--seconds", "2", "--json", *CHOICE)
+        named = ("--dbc", tmp_path / "car.dbc", "-o", tmp_path / "car")
+        done = succeeds("init", *bus, *named, "--seconds", "2", "--json")
     finally:
         stop.set()
         thread.join()

@@ -7,6 +7,7 @@ from pathlib import Path
 import can
 import pytest
 
+from cangauge.bus.database import load_dbc
 from cangauge.extras.discovery.by_name import named_signals
 
 # make: signals with their units; the first two are current and voltage of the pack
@@ -62,7 +63,7 @@ def test_the_packs_signals_come_first_by_name(make: str, tmp_path: Path) -> None
         lines.append(f"BO_ {256 + number} M{number}: 8 V")
         lines.append(f' SG_ {name} : 7|16@0+ (0.1,0) [0|0] "{unit}" V')
     (tmp_path / "car.dbc").write_text("\n".join([*lines, ""]))
-    found = named_signals(tmp_path / "car.dbc", [])
+    found = named_signals(load_dbc(tmp_path / "car.dbc"), [])
     assert found["current"][0].signal == PUBLIC[make][0][0]
     assert found["voltage"][0].signal == PUBLIC[make][1][0]
 
@@ -78,6 +79,6 @@ def test_a_temperature_is_found_by_its_unit(tmp_path: Path) -> None:
         can.Message(arbitration_id=256, data=[hot, 24, 60, 0, 0, 0, 0, 0], is_extended_id=False)
         for hot in (*[25] * 3000, 31)
     ]
-    found = named_signals(tmp_path / "car.dbc", frames)["temperature"]
+    found = named_signals(load_dbc(tmp_path / "car.dbc"), frames)["temperature"]
     assert [each.signal for each in found] == ["TModMax", "TModMin"]
     assert (found[0].low, found[0].high) == (25.0, 31.0)  # of the whole capture

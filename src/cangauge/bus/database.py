@@ -31,6 +31,10 @@ from cangauge.errors import InputError, closest
 MAX_DBC_BYTES: Final = 4 * MIB
 """Parsing takes 1–6 s a megabyte; the largest files in use are smaller."""
 
+_FEW_CODES: Final = 4
+"""Values at the upper end of a range from which on they are no codes for "not available", of which
+signals have up to three."""
+
 Decode = Callable[[bytes | bytearray], float]
 
 _CONVERTED: Final = {".arxml", ".kcd", ".sym"}
@@ -211,9 +215,30 @@ class SignalCodec:
         """Return which values `encode_into` can send; NaN counts as one."""
         if self.float_format:
             return np.ones(values.shape, dtype=np.bool_)
-        raw = np.rint(((values - self.shift) / self.gain - self.offset) / self.factor)
+        raw = self.raw_numbers(values)
         low, high = self.raw_range
         return ~((raw < low) | (raw > high) | np.isin(raw, list(self.not_available)))
+
+    def raw_numbers(self, values: FloatArray) -> FloatArray:
+        """Return the raw numbers of values, NaN for NaN."""
+        raw: FloatArray = np.rint(((values - self.shift) / self.gain - self.offset) / self.factor)
+        return raw
+
+    def is_wrapped(self, values: FloatArray) -> bool:
+        """Return whether values read as unsigned numbers are those of a signed signal.
+
+        They lie at both ends of its range, where negative ones wrap, and none in its middle half.
+        """
+        if self.float_format or self.is_signed or self.offset:
+            return False
+        raw = self.raw_numbers(values[np.isfinite(values)])
+        quarter = 1 << self.field.width >> 2
+        negative = np.unique(raw[raw >= 3 * quarter])
+        return (
+            len(negative) >= _FEW_CODES
+            and bool((raw < quarter).any())
+            and bool(((raw < quarter) | (raw >= 3 * quarter)).all())
+        )
 
     @property
     def half_step(self) -> float:
@@ -229,6 +254,7 @@ def signal_codec(
     field: str,
     not_available: tuple[int, ...] = (),
     when: dict[str, int] | None = None,
+    signed: bool = False,
 ) -> SignalCodec:
     """Build the codec of a signal.
 
@@ -241,6 +267,8 @@ def signal_codec(
         signal may be written as its bits are: 0x8000 is −32768 of 16 bits.
     when : dict of str to int, optional
         Further conditions: raw values of other signals of the message.
+    signed : bool
+        Whether it is a signed number, also where the DBC says unsigned.
 
     Raises
     ------
@@ -279,7 +307,7 @@ def signal_codec(
         raw = value & ((1 << other_bits.width) - 1)
         conditions.append(MultiplexCondition(other_bits, frozenset({raw})))
     conversion = signal.conversion
-    is_signed = signal.is_signed and not conversion.is_float
+    is_signed = (signal.is_signed or signed) and not conversion.is_float
     return SignalCodec(
         name=signal.name,
         unit=(signal.unit or "").strip(),

@@ -48,14 +48,16 @@ class SignalMap(SignalChecks):
     """One signal of the DBC: value = sign × scale × (DBC value) + offset.
 
     `message` is a name or id, optional where the signal's name is unique. `sign` is −1 where the
-    bus has the opposite sign (current: negative = discharge). Stating `scale` or `offset` overrides
-    the DBC's unit. `when` are raw values that other signals of the frame must have (multiplexers
-    missing in the DBC), `not_available` raw codes without a value besides those of the value table.
+    bus has the opposite sign (current: negative = discharge). `signed` reads the bits as a signed
+    number where the DBC does not. Stating `scale` or `offset` overrides the DBC's unit. `when` are
+    raw values that other signals of the frame must have (multiplexers missing in the DBC),
+    `not_available` raw codes without a value besides those of the value table.
     """
 
     message: str | int | None = None
     signal: str
     sign: Literal[1, -1] = 1
+    signed: bool = False
     scale: _Positive = 1.0
     offset: FiniteFloat = 0.0
     when: dict[str, int] = Field(default_factory=dict)

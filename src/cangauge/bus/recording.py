@@ -286,6 +286,7 @@ def capture_samples(path: str | PathLike[str], vehicle: Vehicle) -> CaptureSampl
     if own.beginnings:
         remarks.append(f"the replay clock starts again {own.beginnings} times")
     time_s, current_a, voltage_v, temperature_c, soc_pct = np.array(values).reshape(-1, 5).T
+    _refuse_wrapped(current_a, vehicle, path)
     return CaptureSamples(
         time_s, current_a, voltage_v, temperature_c, soc_pct, str(path), vehicle.temperature_source,
         statistics, capture.info, tuple(remarks),
@@ -309,6 +310,18 @@ def _without_current(
         cure = "two source addresses send it: number it in the DBC with the pack's own, and remove"
         cure += " j1939 = true"
     return InputError(problem, source=path, cure=cure)
+
+
+def _refuse_wrapped(current_a: FloatArray, vehicle: Vehicle, path: str | PathLike[str]) -> None:
+    """Raise InputError for a current whose negative numbers are read as large ones."""
+    codec = vehicle.current.codec
+    if codec.is_wrapped(current_a):
+        top_a = (1 << codec.field.width) * abs(codec.gain * codec.factor)
+        wrapped = int((2.0 * np.abs(current_a) > top_a).sum())
+        problem = f"{wrapped} of {current_a.size} currents lie just below {top_a:.6g} A, where"
+        problem += f" negative ones of {codec.field.width} bits are that are read unsigned"
+        cure = "state signed = true under [current] of the map file"
+        raise InputError(problem, source=path, field=codec.name, cure=cure)
 
 
 def _losses(statistics: FrameStatistics) -> list[str]:

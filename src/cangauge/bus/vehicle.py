@@ -333,7 +333,7 @@ class _Binder:
         )
         codec = signal_codec(
             message, signal, source=file, field=role,
-            not_available=wanted.not_available, when=wanted.when,
+            not_available=wanted.not_available, when=wanted.when, signed=wanted.signed,
         )  # fmt: skip
         key = _key(message)
         self._messages[key] = message

@@ -1,6 +1,7 @@
 """Current, voltage, SoC and temperature among the signals of a DBC, by names, units and values.
 
-A voltage that follows a current, ΔU = −R·ΔI, is evidence for both, beside their names.
+Words are whole words of a name. A voltage that follows a current, ΔU = −R·ΔI, is evidence for both;
+without it, names must leave nothing open.
 """
 
 from __future__ import annotations
@@ -9,67 +10,92 @@ import math
 import re
 from array import array
 from collections import defaultdict
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from itertools import product
-from pathlib import Path
 from statistics import median
 from typing import Any, ClassVar, Final
 
 import can
 import numpy as np
-from cantools.database.can import Message, Signal
+from cantools.database.can import Database, Message, Signal
 
 from cangauge._typing import FloatArray
-from cangauge.bus.database import load_dbc, signal_codec
+from cangauge.bus.database import SignalCodec, signal_codec
 from cangauge.bus.vehicle import EXTENDED
 from cangauge.errors import InputError
-from cangauge.extras.discovery.candidate import Level, range_text
-from cangauge.extras.discovery.pairs import FEW_MOVES
+from cangauge.extras.discovery.candidate import MOST_A, Level, range_text
+from cangauge.extras.discovery.fields import LEAST_BITS
+from cangauge.extras.discovery.pairs import FEW_MOVES, SHOWN
 from cangauge.logs.sign import correlation
-from cangauge.logs.units import convert
+from cangauge.logs.units import unit_of
 
-_PACK = re.compile(
-    r"(?<!lv)(?<!lv_)bat|bms|pack|traction|hv(?!ac)|hochvolt|esu|(^|_)(ess|bmc)|rechargeable",
-    re.IGNORECASE,
-)
-_PART = re.compile(
-    r"12v|lv_?|aux|charger|obc|dcdc|motor|mcu|inv|cabin|ambient|outside|hvac|cool|inlet|outlet",
-    re.IGNORECASE,
-)
-"""Other parts of a car: their SoC and temperature are not the pack's."""
-_OTHER = re.compile(
-    r"lim|max|min|allow|req|target|set_?point|dem(and)?|cell|peak|nom|_nv$|ulo|rated|avail"
-    r"|cap(acity)?|err|fault|delta|dev|isol|pre_?ch|full|remain|energy|power|" + _PART.pattern,
-    re.IGNORECASE,
-)
-_ROLES: Final = {
-    "current": (
-        "current_a",
-        re.compile(r"cur|amp|strom|(^|_)i(_|$)|ibat|(?-i:(?<=[a-z])I(_|$))", re.IGNORECASE),
-    ),
+
+def _words(text: str) -> frozenset[str]:
+    return frozenset(text.split())
+
+
+_QUANTITIES: Final = {
+    "current": ("current_a", _words("current curr cur crnt amp amps ampere strom i ibat ibatt")),
     "voltage": (
         "voltage_v",
-        re.compile(r"volt|spann|(^|_)u(_|$)|_v$|ubat|vbat|(?-i:(?<=[a-z])U(_|$))", re.IGNORECASE),
+        _words("voltage volt volts vlt vol spannung u v ubat ubatt vbat vbatt"),
     ),
-    "soc_reference": ("soc_pct", re.compile(r"soc|state_?of_?charge|ladezustand", re.IGNORECASE)),
-    "temperature": ("temperature_c", re.compile(r"temp", re.IGNORECASE)),
+    "soc_reference": ("soc_pct", _words("soc stateofcharge ladezustand")),
+    "temperature": ("temperature_c", _words("temperature temperatur temp temps")),
 }
+"""Column of a log and words by role."""
+_MEASURED: Final = frozenset[str]().union(*(words for _, words in _QUANTITIES.values()))
+_ANY_BATTERY: Final = _words("battery batt bat batteries batterie ibat ibatt ubat ubatt vbat vbatt")
+_HIGH: Final = _words("hv hvlt highvoltage hochvolt")
+"""With one of these it is the pack. Alone they may be any part of a high voltage."""
+_BATTERY: Final = _ANY_BATTERY | _words(
+    "hvbattery pack pck bms bmu bmc becm"
+    " hvb hvbat hvbatt traction trac ess ress esu lb rechargeable"
+)
+_PARTS: Final = _words(
+    "lv lo low aux charger chrg obc dcdc ldc apm motor mtr mcu inv inverter cabin ambient outside"
+    " air hvac cool cooling coolant inlet outlet heater compressor pump light gear"
+)
+"""Other parts of a car, whose current, SoC and temperature are not the pack's."""
+_EXTREMES: Final = _words("max min cell cells")
+"""Words that the pack's temperature may hold in its name: that of its warmest cell."""
+_LIMITS: Final = _EXTREMES | _words(
+    "lim limit limits mx mn maximum minimum allow allowed req rq request requested target set"
+    " setpoint soll dem demand cmd peak nom nominal nv rated rat avail available cap capacity err"
+    " error fault delta dev isol isolation pre precharge full remain remaining energy power est"
+    " pred draw"
+)
+"""What is said of another value than the measured one."""
+_PIECES: Final = re.compile(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+|\d+")
+_RUNS: Final = re.compile(r"[a-z]+")
+_KNOWN: Final = re.compile(
+    "|".join(
+        word
+        for word in sorted(_BATTERY | _HIGH | _PARTS | _LIMITS | _MEASURED, key=len, reverse=True)
+        if len(word) > 1
+    )
+)
+_JOINED: Final = re.compile(f"(?:{_KNOWN.pattern})+")
 _RANGES: Final = {
-    "current": (-2000.0, 2000.0),
+    "current": (-MOST_A, MOST_A),
     "voltage": (30.0, 1000.0),
     "temperature": (-30.0, 60.0),
     "soc_reference": (0.0, 100.0),
 }
 """Plausible medians of the distinct values [A, V, °C, %]."""
+_HIGH_V: Final = 65.536
+"""Range of a signal beyond which it is of a high voltage (over 60 V): 16 bits of a millivolt, with
+which batteries of 12–48 V are measured."""
 _CLEARLY: Final = 1.0
 """Distance in score of the first signal that makes it clear: one matching word."""
 _FOLLOWED: Final = 2.0
 """What the physics is worth at most: two matching words."""
+_PROVEN: Final = 0.5
+"""Share of a voltage's changes by a current from which on the two need no names."""
 _CODES_APART: Final = 1.0 / 16.0
 """Least distance of a code from the measured numbers, as a share of the signal's range."""
-_EXTREME = re.compile(r"max|min|cell", re.IGNORECASE)
-"""Words that the pack's temperature may hold in its name: that of its warmest cell."""
 
 
 @dataclass(frozen=True)
@@ -79,12 +105,18 @@ class NamedSignal:
     Parameters
     ----------
     message, signal, unit : str
+    bits, holds : int, tuple of float
+        Length and range that the DBC gives it; the range in its unit.
     score : float
         Larger is likelier; in units of one matching word.
+    against : tuple of str
+        Why it may not have the role.
     low, high : float
         Range of its values in the whole capture, in the DBC's unit; NaN without frames.
     sign : int
         −1 where positive values charge.
+    is_wrapped : bool
+        Whether the DBC reads a signed number as an unsigned one.
     evidence : float
         Share of the voltage's changes that follow the current, by the best partner.
     period_s : float
@@ -95,15 +127,19 @@ class NamedSignal:
         Its values in the capture.
     """
 
-    HEAD: ClassVar = ("signal, by name and unit", "range")
+    HEAD: ClassVar = ("signal, by name and unit", "range", "against it")
 
     message: str
     signal: str
     unit: str
-    score: float
-    low: float
-    high: float
+    bits: int
+    holds: tuple[float, float]
+    score: float = 0.0
+    against: tuple[str, ...] = ()
+    low: float = math.nan
+    high: float = math.nan
     sign: int = 1
+    is_wrapped: bool = False
     evidence: float = 0.0
     period_s: float = math.nan
     not_available: tuple[int, ...] = ()
@@ -116,6 +152,16 @@ class NamedSignal:
         return f"{self.message}.{self.signal}"
 
     @property
+    def is_followed(self) -> bool:
+        """Whether the physics proves it: the voltage follows the current."""
+        return self.evidence > _PROVEN
+
+    @property
+    def is_fit(self) -> bool:
+        """Whether nothing speaks against it, or the physics for it."""
+        return not self.against or self.is_followed
+
+    @property
     def range_text(self) -> str:
         """Range of its values, discharge positive; "" without frames."""
         if math.isnan(self.low):
@@ -125,7 +171,9 @@ class NamedSignal:
     @property
     def cells(self) -> tuple[str, ...]:
         """Cells of a table under `HEAD`."""
-        return f"{self.message}\n{self.signal}", self.range_text
+        against = "" if self.is_fit else "; ".join(self.against)
+        holds = f"by DBC {range_text(*self.holds, self.unit)}"
+        return f"{self.message}\n{self.signal}", self.range_text or holds, against
 
     def levels(self, nominal_v: float | None) -> list[Level]:  # noqa: ARG002 - as of a field
         """Return nothing: a DBC states the scale."""
@@ -134,7 +182,7 @@ class NamedSignal:
     def comments(self, nominal_v: float | None) -> list[str]:  # noqa: ARG002 - as of a field
         """Return the lines that the map states of it."""
         ends = self.range_text
-        lines = [f"By name and unit: {f'{ends} in' if ends else 'not in'} the capture."]
+        lines = [f"By name and unit{f'; {ends} in the capture' if ends else ', in no capture'}."]
         if self.evidence:
             share = f"{100.0 * self.evidence:.0f} %"
             lines.append(f"Voltage falls when current rises: {share} of the voltage's changes.")
@@ -147,33 +195,39 @@ class NamedSignal:
             "signal": self.signal,
             "unit": self.unit,
             "score": self.score,
+            "against": list(self.against),
             "evidence": self.evidence,
             "not_available": list(self.not_available),
             "range": None if math.isnan(self.low) else [self.low, self.high],
         }
 
+    def is_of_one_source(self, other: NamedSignal) -> bool:
+        """Whether two signals are of one message, or of one pack by a word of both names."""
+        shared = _words_of(self.name) & _words_of(other.name) & _BATTERY
+        return self.message == other.message or bool(shared - _ANY_BATTERY)
+
 
 def named_signals(
-    dbc: Path, messages: Iterable[can.Message], shown: int = 3
+    database: Database, messages: Iterable[can.Message], nominal_v: float | None = None
 ) -> dict[str, tuple[NamedSignal, ...]]:
     """Return the likeliest signals of each role, best first.
 
     Parameters
     ----------
-    dbc : Path
+    database : Database
     messages : iterable of can.Message
         A capture of the car; empty: by names and units alone.
-    shown : int
-        Most signals of a role.
+    nominal_v : float, optional
+        Voltage of the pack, as the user states it [V].
 
     Raises
     ------
     InputError
-        If the DBC cannot be read, or no message of it is in the capture.
+        If no message of the DBC is in the capture.
     """
     of_dbc = {
         message.frame_id | (EXTENDED if message.is_extended_frame else 0): message
-        for message in load_dbc(dbc).messages
+        for message in database.messages
     }
     frames: dict[int, _NamedFrames] = defaultdict(_NamedFrames)
     is_capture = False
@@ -184,30 +238,25 @@ def named_signals(
             frames[key].add(each)
     if is_capture and not frames:
         cure = "is it of this car and this bus?"
-        raise InputError("no message of this DBC is in the capture", source=dbc, cure=cure)
-    found: dict[str, list[NamedSignal]] = {role: [] for role in _ROLES}
+        raise InputError("no message of this DBC is in the capture", field="--dbc", cure=cure)
+    found: dict[str, list[NamedSignal]] = {role: [] for role in _QUANTITIES}
     for key in list(frames) if is_capture else of_dbc:
-        for signal in of_dbc[key].signals:
-            scores = {role: _name_score(role, of_dbc[key], signal) for role in _ROLES}
-            roles = [role for role, score in scores.items() if score > 0.0]
-            if not roles:
-                continue
-            made = frames[key].signal(dbc, of_dbc[key], signal)
-            values = np.unique(made.value)
-            for role in roles:
-                lowest, highest = _RANGES[role]
-                if len(values) and not lowest <= median(values) <= highest:
-                    continue
-                score = scores[role] - (1.0 if is_capture and not len(values) else 0.0)
-                score -= 0.5 if role == "current" and made.low == made.high else 0.0
-                found[role].append(replace(made, score=score))
+        for made in frames[key].signals(of_dbc[key]):
+            for role in _QUANTITIES:
+                if judged := _judged(role, made, nominal_v):
+                    is_missing = is_capture and not len(made.value)
+                    is_still = role == "current" and made.low == made.high
+                    score = judged.score - 1.0 * is_missing - 0.5 * is_still
+                    found[role].append(replace(judged, score=score))
     for each_role in found.values():
         each_role.sort(key=lambda one: -one.score)
     _weigh(found["current"], found["voltage"])
-    return {
-        role: tuple(sorted(each, key=lambda one: -one.score)[:shown])
-        for role, each in found.items()
-    }
+    current, voltage = found["current"], found["voltage"]
+    found["current"] = _partnerless(current, voltage, "voltage")
+    found["voltage"] = _partnerless(voltage, current, "current")
+    for each_role in found.values():
+        each_role.sort(key=lambda one: (not one.is_fit, -one.score))
+    return {role: tuple(each[:SHOWN]) for role, each in found.items()}
 
 
 def clear_roles(found: Mapping[str, Sequence[NamedSignal]]) -> list[str]:
@@ -215,15 +264,16 @@ def clear_roles(found: Mapping[str, Sequence[NamedSignal]]) -> list[str]:
 
     Sensors in one message measure one part; a SoC that stands still shows no battery at work.
     """
-    pack = {found[role][0].message for role in ("current", "voltage") if found[role]}
+    fit = {role: [each for each in signals if each.is_fit] for role, signals in found.items()}
+    pack = {fit[role][0].message for role in ("current", "voltage") if fit[role]}
     clear = []
-    for role, signals in found.items():
+    for role, signals in fit.items():
         if not signals:
             continue
         first = signals[0]
         near = [each for each in signals[1:] if first.score - each.score < _CLEARLY]
         if role == "temperature":
-            is_packs = first.message in pack or _PACK.search(first.name) is not None
+            is_packs = first.message in pack or bool(_words_of(first.name) & _BATTERY)
             is_clear = is_packs and all(each.message == first.message for each in near)
         else:
             is_clear = not near and not (role == "soc_reference" and first.low == first.high)
@@ -245,42 +295,68 @@ class _NamedFrames:
         self.time_s.append(message.timestamp)
         self.number.append(self.payloads.setdefault(bytes(message.data), len(self.payloads)))
 
-    def signal(self, dbc: Path, message: Message, signal: Signal) -> NamedSignal:
-        """Return a signal with its values; none where it does not fit into its message."""
-        name, unit = (message.name, signal.name), (signal.unit or "").strip()
-        nothing = NamedSignal(*name, unit, 0.0, math.nan, math.nan)
-        try:
-            codec = signal_codec(message, signal, source=dbc, field=signal.name)
-        except InputError:
-            return nothing
-        cut = [each[: message.length] for each in self.payloads]
-        known = [len(each) == message.length and codec.is_in(each) for each in cut]
-        decoded = np.array(
-            [
-                codec.decode(each) if good else math.nan
-                for each, good in zip(cut, known, strict=True)
-            ]
-        )
-        codes = []
-        if not codec.float_format:
-            lowest, highest = codec.raw_range
-            raw = np.rint((decoded - codec.offset) / codec.factor)
-            for code in (lowest, highest) if codec.is_signed else (highest,):
-                far = np.abs(raw - code)
-                far = far[far > 0.0]
-                if (raw == code).any() and not (far < _CODES_APART * (highest - lowest)).any():
-                    codes.append(code)
-            decoded[np.isin(raw, codes)] = math.nan
+    def signals(self, message: Message) -> Iterator[NamedSignal]:
+        """Yield the signals that fit into the message, with their values."""
+        for signal in message.signals:
+            with suppress(InputError):
+                codec = signal_codec(message, signal, source="", field=signal.name)
+                yield self._signal(message, signal, codec)
+
+    def _signal(self, message: Message, signal: Signal, codec: SignalCodec) -> NamedSignal:
+        """Return a signal with its values."""
+        low, high = codec.range
+        if signal.minimum is not None and signal.maximum is not None:
+            low, high = max(low, float(signal.minimum)), min(high, float(signal.maximum))
+        bits = codec.field.width
+        nothing = NamedSignal(message.name, signal.name, codec.unit, bits, (low, high))
+        decoded = self._decoded(codec, message.length)
+        is_wrapped = codec.is_wrapped(decoded)
+        if is_wrapped:
+            codec = replace(codec, is_signed=True)
+            decoded = self._decoded(codec, message.length)
+        codes = _codes(codec, decoded)
+        decoded[np.isin(codec.raw_numbers(decoded), codes)] = math.nan
         value, time_s = decoded[np.array(self.number)], np.array(self.time_s)
         good = np.isfinite(value)
         if not good.any():
             return nothing
         value, time_s = value[good], time_s[good]
+        period_s = float(np.median(np.diff(time_s))) if len(time_s) > 1 else math.nan
         return replace(
-            nothing, low=float(value.min()), high=float(value.max()), time_s=time_s, value=value,
-            period_s=float(np.median(np.diff(time_s))) if len(time_s) > 1 else math.nan,
+            nothing,
+            low=float(value.min()),
+            high=float(value.max()),
+            is_wrapped=is_wrapped,
+            period_s=period_s,
             not_available=tuple(codes),
-        )  # fmt: skip
+            time_s=time_s,
+            value=value,
+        )
+
+    def _decoded(self, codec: SignalCodec, length: int) -> FloatArray:
+        """Return the value of each payload; NaN where it is too short or holds none."""
+        return np.array(
+            [
+                codec.decode(payload[:length])
+                if len(payload) >= length and codec.is_in(payload[:length])
+                else math.nan
+                for payload in self.payloads
+            ]
+        )
+
+
+def _codes(codec: SignalCodec, values: FloatArray) -> list[int]:
+    """Return the codes at the ends of a signal's range that lie far from all measured numbers."""
+    if codec.float_format:
+        return []
+    codes, raw = [], codec.raw_numbers(values)
+    lowest, highest = codec.raw_range
+    for code in (lowest, highest) if codec.is_signed else (highest,):
+        far = np.abs(raw - code)
+        far = far[far > 0.0]
+        if (raw == code).any() and not (far < _CODES_APART * (highest - lowest)).any():
+            codes.append(code)
+    return codes
 
 
 def _weigh(currents: list[NamedSignal], voltages: list[NamedSignal]) -> None:
@@ -294,6 +370,19 @@ def _weigh(currents: list[NamedSignal], voltages: list[NamedSignal]) -> None:
             best = max((share for pair, share in shares.items() if pair[axis] == number), default=0)
             score = each.score + _FOLLOWED * round(4.0 * best) / 4.0  # equal of equal packs
             signals[number] = replace(each, score=score, evidence=best)
+
+
+def _partnerless(
+    signals: Sequence[NamedSignal], partners: Sequence[NamedSignal], role: str
+) -> list[NamedSignal]:
+    """Return signals of which those without a partner of their source say so."""
+    fit = [each for each in partners if each.is_fit]
+    return [
+        each
+        if any(each.is_of_one_source(other) for other in fit)
+        else replace(each, against=(*each.against, f"no {role} of its source"))
+        for each in signals
+    ]
 
 
 def _followed(current: NamedSignal, voltage: NamedSignal) -> float:
@@ -316,29 +405,86 @@ def _followed(current: NamedSignal, voltage: NamedSignal) -> float:
     return max(1.0 - (1.0 - share) * (moves - 1.0) / (moves - 2.0), 0.0)
 
 
-def _name_score(role: str, message: Message, signal: Signal) -> float:
-    """Return how well names and unit fit a role; 0 where they do not."""
-    column, word = _ROLES[role]
-    unit = (signal.unit or "").strip()
-    named = word.search(signal.name) is not None
-    suits = False
-    if unit:
-        try:
-            convert(np.array([0.0]), column, unit, source="", label=signal.name)
-            suits = True
-        except InputError:
+def _words_of(name: str) -> frozenset[str]:
+    """Return the words of a name, split at case, digit and underscore.
+
+    A run of letters that consists of known words alone is split into them: "hvbattcurrent".
+    """
+    words = {piece.lower() for piece in _PIECES.findall(name)}
+    for run in _RUNS.findall(name.lower()):
+        if _JOINED.fullmatch(run):
+            words.update(_KNOWN.findall(run))
+    if words & _HIGH and words & _ANY_BATTERY:
+        words.add("hvbattery")
+    return frozenset(words)
+
+
+@dataclass(frozen=True)
+class _Names:
+    """What the names and the unit of a signal say of a role: words of signal and message."""
+
+    role: str
+    own: frozenset[str]
+    of: frozenset[str]
+    unit: tuple[float, float] | None
+
+    @property
+    def is_named(self) -> bool:
+        """Whether the signal's name has a word of the role."""
+        _, quantity = _QUANTITIES[self.role]
+        is_soc = self.role == "soc_reference" and {"state", "charge"} <= self.own
+        return bool(self.own & quantity) or is_soc
+
+    @property
+    def others(self) -> frozenset[str]:
+        """Words of another value, or of another part, in the signal's name."""
+        extremes = _EXTREMES if self.role == "temperature" else frozenset[str]()
+        return self.own & ((_LIMITS | _PARTS) - extremes)
+
+    def score(self) -> float:
+        """Return how well they fit, in matching words; 0 where they do not."""
+        is_other_part = bool((self.own | self.of) & _PARTS)
+        if self.role == "temperature" and (self.others or is_other_part):
             return 0.0
-    if not named and not (suits and role != "soc_reference"):
-        return 0.0
-    score = 2.0 * named + 1.0 * suits
-    score += 1.0 * (_PACK.search(signal.name) is not None)
-    score += 0.5 * (_PACK.search(message.name) is not None)
-    if role == "temperature":  # by its unit as well; of another part, it is no guess at all
-        score += 2.0 * (suits and not named)
-        score -= 9.0 * (_OTHER.search(_EXTREME.sub("", signal.name)) is not None)
-    else:
-        score -= 1.5 * (_OTHER.search(signal.name) is not None)
-    if role in {"soc_reference", "temperature"}:
-        score -= 9.0 * (_PART.search(f"{message.name} {signal.name}") is not None)
-    score -= 0.5 * (_OTHER.search(message.name) is not None)
-    return score
+        if self.role == "soc_reference" and (is_other_part or not self.is_named):
+            return 0.0
+        return (
+            2.0 * (self.is_named or self.role == "temperature")
+            + 1.0 * (self.unit is not None)
+            + 1.0 * bool(self.own & _BATTERY)
+            + 0.5 * bool(self.of & _BATTERY)
+            - 1.5 * bool(self.others)
+            - 0.5 * bool(self.of & (_LIMITS | _PARTS))
+        )
+
+    def against(self, signal: NamedSignal, nominal_v: float | None) -> list[str]:
+        """Return what speaks against a signal."""
+        against = [] if self.unit else ["no unit"]
+        if signal.bits < LEAST_BITS:
+            against.append(f"{signal.bits} bits")
+        if self.role in {"current", "voltage"}:
+            if not self.is_named:
+                against.append(f"no word for a {self.role} in its name")
+            if not (self.own | self.of) & _BATTERY:
+                against.append("no word for a pack in its name")
+        if other := self.others or (self.of & _PARTS if not self.own & _BATTERY else ()):
+            against.append(f"of another value: {', '.join(sorted(other))}")
+        if self.role == "voltage" and self.unit:
+            top_v = self.unit[0] * signal.holds[1] + self.unit[1]
+            if top_v <= (nominal_v or _HIGH_V):
+                against.append(f"holds up to {top_v:.4g} V")
+        return against
+
+
+def _judged(role: str, signal: NamedSignal, nominal_v: float | None) -> NamedSignal | None:
+    """Return a signal with its score for a role and what speaks against it; None: it has none."""
+    column, _ = _QUANTITIES[role]
+    unit = unit_of(column, signal.unit) if signal.unit else None
+    names = _Names(role, _words_of(signal.signal), _words_of(signal.message), unit)
+    lowest, highest = _RANGES[role]
+    is_possible = not len(signal.value) or lowest <= median(np.unique(signal.value)) <= highest
+    is_known = unit is not None or (not signal.unit and names.is_named)
+    if not (is_known and is_possible and names.score() > 0.0):
+        return None
+    against = tuple(names.against(signal, nominal_v))
+    return replace(signal, score=names.score(), against=against)

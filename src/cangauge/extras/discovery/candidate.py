@@ -28,6 +28,17 @@ SOC_SCALES: Final = (0.1, 0.5, 0.01, 1.0, 0.05, 0.025, 0.02, 0.4)
 """Usual scales of a SoC [%]."""
 NOMINAL_CELL_V: Final = 3.7
 """Nominal voltage of an oxide cell [V], to count the cells that a scale implies."""
+MOST_A: Final = 1500.0
+"""Largest current of a pack [A]: the fastest cars draw 1,500 A."""
+LEAST_HOURS: Final = 1.0 / 20.0
+"""Least capacity by the largest current [h]: no car is driven at more than 20 C."""
+MOST_SAG: Final = 0.2
+"""Largest share of its voltage by which a pack sags: inverters switch off below."""
+SOC_AGREES: Final = 0.1
+"""Largest relative difference of the capacities that SoC and charge have by two halves."""
+MOVES: Final = 5
+MOVE: Final = 0.1
+"""Steps of a current without which nothing proves it, and their size as a share of its range."""
 LARGEST_RATIO: Final = 2.0
 """Largest ratio of the resistances by two halves of a capture: a coincidence does not repeat."""
 
@@ -59,8 +70,8 @@ class SignalCandidate:
         −1 where positive values charge.
     low, high : float
         Range of the values.
-    steps : int
-        Number of changes in the capture.
+    steps, moves : int
+        Number of changes in the capture, and of those by a share `MOVE` of the range.
     not_available : int or None
         Raw code in the capture that means "no value".
     score, evidence : float
@@ -86,6 +97,7 @@ class SignalCandidate:
     low: float
     high: float
     steps: int
+    moves: int
     not_available: int | None
     score: float
     evidence: float = 0.0

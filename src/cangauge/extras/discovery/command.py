@@ -13,12 +13,13 @@ from typing import TYPE_CHECKING, Annotated, Any, Final
 
 from cangauge._files import check_writable, write_texts_atomic
 from cangauge.cli.options import JSON, argument, command, config_parameters, config_values, option
-from cangauge.cli.output import finish, note, print_table, progress
+from cangauge.cli.output import finish, note, print_table, progress, say
 from cangauge.errors import CangaugeError, InputError
 
 if TYPE_CHECKING:
     import can
 
+    from cangauge._typing import FloatArray
     from cangauge.extras.discovery.proposal import Proposal
 
 _ROLES: Final = {
@@ -103,11 +104,12 @@ def init_command(
             cure = "give a capture, --interface and --channel, or --dbc FILE"
             raise InputError("nothing to look at", field="CAPTURE", cure=cure)
         proposal = _find(paths, dbc, nominal_voltage, presets=presets)
-        if unclear := _choose(proposal, picks):
+        unclear = _choose(proposal, picks)
+        if unclear or (proposal.method == "physics" and not proposal.has_steps):
             raise _undecided(proposal, unclear, output, quiet=json_output)
         _prove(proposal, paths[0] if paths else None, output, bus, folder)
         texts = proposal.texts(output, bus)
-    output.mkdir(exist_ok=True)
+    output.mkdir(parents=True, exist_ok=True)
     write_texts_atomic({output / name: text for name, text in texts.items()})
     files = [str(output / name) for name in texts]
     show = partial(_show, proposal, files, proposal.reading(output), output / "model.json")
@@ -129,17 +131,17 @@ def _picks(given: Sequence[str]) -> dict[str, int]:
 def _check(output: Path, *, force: bool) -> None:
     """Raise InputError if a file exists in the folder, or cannot be written."""
     try:
-        is_folder, has_parent = output.is_dir(), output.parent.is_dir()
+        existing = next(folder for folder in (output, *output.parents) if folder.exists())
+        is_folder = existing.is_dir()
     except OSError as error:  # too long a name
         raise InputError("cannot create this folder", source=output) from error
+    if not is_folder:
+        raise InputError(f"cannot create this folder: {existing} is a file", source=output)
     for name in ("car.toml", "run.toml", "car.dbc"):
         if (output / name).is_file() and not force:
             cure = "give --force to overwrite it"
             raise InputError("exists", source=output / name, cure=cure)
-    if is_folder:
-        check_writable(output / "car.toml")
-    elif not has_parent:
-        raise InputError("cannot create this folder", source=output)
+    check_writable(existing / "car.toml")
 
 
 def _listen(bus: Mapping[str, Any], seconds: float, path: Path) -> Path:
@@ -188,16 +190,23 @@ def _find(
     paths: Sequence[Path], dbc: Path | None, nominal_v: float | None, *, presets: bool
 ) -> Proposal:
     """Find the signals by the names of a DBC, else by a preset, else by physics."""
+    from cangauge.bus.database import load_dbc
     from cangauge.extras.discovery.by_name import clear_roles, named_signals
     from cangauge.extras.discovery.proposal import Proposal
-    from cangauge.extras.discovery.search import ENOUGH_NATS, search
+    from cangauge.extras.discovery.search import search
 
     if dbc is not None:
-        named = named_signals(dbc, _joined(paths))
-        clear = clear_roles(named)
-        head = ("Signals found by their names and units in the DBC.",)
-        has_steps = any(each.evidence > 0.5 for each in named["current"])
-        return Proposal("dbc", {**named}, clear, head, dbc=dbc, has_steps=has_steps)
+        remarks: list[str] = []
+        named = named_signals(load_dbc(dbc, remarks), _joined(paths), nominal_v)
+        return Proposal(
+            "dbc",
+            {**named},
+            clear_roles(named),
+            ("Signals found by their names and units in the DBC.",),
+            tuple(remarks),
+            dbc=dbc,
+            has_steps=any(each.is_followed for each in named["current"]),
+        )
     if presets and (known := _known(paths)) is not None:
         return Proposal("preset", vehicle=known)
     with progress("cangauge.extras.discovery") as show:
@@ -207,9 +216,14 @@ def _find(
     clear += ["soc_reference"] if found.soc_reference else []
     candidates = {role: getattr(found, role) for role in _ROLES.values()}
     return Proposal(
-        "physics", candidates, clear, found.comments, found.remarks, nominal_v=nominal_v,
-        has_steps=any(each.evidence >= ENOUGH_NATS for each in found.current),
-    )  # fmt: skip
+        "physics",
+        candidates,
+        clear,
+        found.comments,
+        found.remarks,
+        nominal_v=nominal_v,
+        has_steps=found.has_steps,
+    )
 
 
 def _known(paths: Sequence[Path]) -> str | None:
@@ -245,18 +259,26 @@ def _choose(proposal: Proposal, picks: Mapping[str, int]) -> list[str]:
 def _undecided(
     proposal: Proposal, unclear: Sequence[str], output: Path, *, quiet: bool
 ) -> CangaugeError:
-    """Return the error of roles without a clear candidate; print their tables, if not `quiet`."""
-    lines = [f"no {' and no '.join(unclear)} is clearly ahead of the others"]
-    if proposal.method == "physics" and proposal.nominal_v is None:
-        lines.append("the scale of the voltage is open (--nominal-voltage V decides it)")
+    """Return the error of a map that cannot be made; print the candidates, if not `quiet`."""
+    absent = [role for role in unclear if not proposal.candidates[role]]
+    problem = f"no {' and no '.join(unclear)} is clearly the pack's"
+    if absent:
+        problem = f"nothing can be the {' or the '.join(absent)}"
+    cure = f"choose by {' '.join(f'--choose {role}=N' for role in unclear)}"
+    if not proposal.has_steps:
+        cure = "record a drive" if absent else f"record a drive, or {cure}"
+        if proposal.method == "physics":
+            problem = "no voltage follows a current in steps, so that nothing proves the signals"
+            cure = "record a drive"
+    elif proposal.method == "physics" and proposal.nominal_v is None:
+        problem += ", and the scale of the voltage is open (--nominal-voltage V decides it)"
     if not quiet:
+        say(f"No map: {problem}.")
         _show_candidates(proposal)
     for role in unclear if quiet else ():
         names = [f"{n}) {c.name}" for n, c in enumerate(proposal.candidates[role], 1)]
-        lines.append(f"{role}: {', '.join(names)}")
-    cure = f"choose by {' '.join(f'--choose {role}=N' for role in unclear)}"
-    cure += "" if proposal.has_steps else ", or record a drive with current steps"
-    return CangaugeError(f"{'; '.join(lines)}; nothing was written to {output}: {cure}")
+        problem += f"; {role}: {', '.join(names)}"
+    return CangaugeError(f"{problem}; nothing was written to {output}: {cure}")
 
 
 def _prove(
@@ -312,10 +334,42 @@ def _prove(
         proposal.candidates["current"] = turned
         amps = -amps
     proposal.proof |= {
+        "soc": _soc_by_charge(samples.time_s, samples.soc_pct, sign.sign * samples.current_a),
         "samples": len(samples),
         "current_a": [float(amps.min()), float(amps.max())],
         "voltage_v": [float(volts.min()), float(volts.max())],
     }
+
+
+def _soc_by_charge(
+    time_s: FloatArray, soc_pct: FloatArray, current_a: FloatArray
+) -> dict[str, Any]:
+    """Return the capacity that SoC and charge have by each half [Ah], and whether they agree."""
+    import numpy as np
+
+    from cangauge.extras.discovery.candidate import (
+        LEAST_HOURS,
+        SOC_AGREES,
+        is_capacity,
+    )
+    from cangauge.logs.gaps import discharged_ah
+
+    known = np.flatnonzero(np.isfinite(soc_pct))
+    if len(known) < 2:
+        return {}
+    drawn_ah, fallen = discharged_ah(time_s, current_a)[known], -soc_pct[known]
+    ends = [0, len(known) // 2, len(known) - 1]
+    drawn_ah, fallen = np.diff(drawn_ah[ends]), np.diff(fallen[ends])
+    steps = np.abs(np.diff(soc_pct[known]))
+    step = float(steps[steps > 0.0].min(initial=100.0))
+    if (np.abs(fallen) * SOC_AGREES < step).any():
+        return {"agrees": False, "why": "it moves by too few steps to tell"}
+    by_half = [float(each) for each in 100.0 * drawn_ah / fallen]
+    least_ah = LEAST_HOURS * float(np.abs(current_a).max())
+    agrees = all(is_capacity(each) and each >= least_ah for each in by_half)
+    agrees &= max(by_half) <= (1.0 + SOC_AGREES) * min(by_half)
+    halves = " and ".join(f"{each:.3g}" for each in by_half)
+    return {"agrees": agrees, "why": f"by charge, 100 % are {halves} Ah in the two halves"}
 
 
 def _show_candidates(proposal: Proposal) -> None:
@@ -325,10 +379,7 @@ def _show_candidates(proposal: Proposal) -> None:
         for number, candidate in enumerate(candidates):
             mark = str(number + 1)
             if proposal.chosen.get(role) == number:
-                is_open = proposal.levels(role) or (
-                    role == "current"
-                    and (proposal.method == "physics" or not proposal.is_sign_proven)
-                )
+                is_open = bool(proposal.levels(role)) or not proposal.is_proven(role)
                 mark += " ?" if is_open else " ✓"
             rows.append([mark, *candidate.cells])
         if candidates:
@@ -339,18 +390,22 @@ def _show_candidates(proposal: Proposal) -> None:
 
 def _show(proposal: Proposal, files: Sequence[str], reading: str, model: Path) -> None:
     """Print the candidates, what the capture proves, what is assumed, and the next commands."""
-    from cangauge.bus.vehicle import PRESETS
+    from cangauge.extras.discovery.by_name import NamedSignal
     from cangauge.extras.discovery.candidate import range_text
 
+    say(f"{proposal.answer}: wrote {' and '.join(files)}.")
     _show_candidates(proposal)
-    if proposal.vehicle is not None:
-        note(f"known vehicle: {proposal.vehicle}, {PRESETS[proposal.vehicle].about}")
     if proposal.proof:
         amps, volts = proposal.proof["current_a"], proposal.proof["voltage_v"]
         shown = f"{range_text(amps[0], amps[1], 'A')}, {range_text(volts[0], volts[1], 'V')}"
         note(f"decoded: {proposal.proof['samples']} samples of the first capture, {shown}")
     if proposal.method != "physics":
         note(proposal.sign_text)
+    current = proposal.signals.get("current")
+    if isinstance(current, NamedSignal) and current.is_wrapped:
+        note("note: the DBC reads negative currents as large ones; the map has signed = true")
+    if why := proposal.proof.get("soc", {}).get("why"):
+        note(f"SoC: {why}.")
     if proposal.fixed_c is not None:
         note(
             "note: no temperature is clearly the pack's or chosen: the files assume"
@@ -361,6 +416,4 @@ def _show(proposal: Proposal, files: Sequence[str], reading: str, model: Path) -
             quantity = "SoC" if role == "soc_reference" else role
             texts = ", ".join(level.text for level in levels)
             note(f"note: The bits do not tell the scale of the {quantity}: {texts}. {cure}")
-    for path in files:
-        note(f"wrote {path}")
     note(f"next: cangauge inspect DRIVE {reading}, then cangauge fit DRIVE … {reading} -o {model}")

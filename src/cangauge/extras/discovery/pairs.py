@@ -18,7 +18,14 @@ import numpy as np
 from scipy.signal import lfilter
 
 from cangauge._typing import BoolArray, FloatArray
-from cangauge.extras.discovery.candidate import CURRENT_SCALES, Level, SignalCandidate
+from cangauge.extras.discovery.candidate import (
+    CURRENT_SCALES,
+    MOST_A,
+    MOST_SAG,
+    MOVE,
+    Level,
+    SignalCandidate,
+)
 from cangauge.extras.discovery.fields import Field, Ints, Place, Stream, most_common
 
 MOST_ROWS: Final = 4000
@@ -147,6 +154,22 @@ class Row:
         """Number of changes."""
         return int(np.count_nonzero(np.diff(self.values)))
 
+    @cached_property
+    def away(self) -> float:
+        """Largest distance from the most common number."""
+        values = self.values.astype(np.float64)
+        return float(np.abs(values - most_common(self.values)).max())
+
+    @property
+    def moves(self) -> int:
+        """Number of changes by a share `MOVE` of the range, at once or little by little."""
+        least = MOVE * float(np.ptp(self.values))
+        count, from_ = 0, self.values[0]
+        for value in self.values[1:].tolist():
+            if abs(value - from_) >= least:
+                count, from_ = count + 1, value
+        return count
+
     @property
     def step(self) -> float:
         """Most common change: of bits in a wrong order it is more than 1."""
@@ -170,7 +193,7 @@ class Row:
             code = int(codes[counts.argmax()]) if is_signed else (1 << self.place.width) - 1
         return SignalCandidate(
             role, self.field.stream, self.place, scale, offset, float(ends.min()),
-            float(ends.max()), self.steps, code, **more,
+            float(ends.max()), self.steps, self.moves, code, **more,
         )  # fmt: skip
 
 
@@ -233,20 +256,26 @@ class Pairs:
         evidence = self._likelihood()
         scale = np.array([row.scale for row in voltages])[:, None]
         widths = np.array([row.place.width for row in currents])
+        away = np.array([row.away for row in currents])
         likely = np.full(self.r.shape, IMPOSSIBLE)
         self.current_scale = np.ones(self.r.shape)
         for amps, usual in CURRENT_SCALES.items():
             prior = _resistance_prior(self.slope * scale / amps) + usual
             prior = prior - _narrow(amps * 2.0 ** (widths - 1))
+            prior = np.where(amps * away > MOST_A, IMPOSSIBLE, prior)
             self.current_scale = np.where(prior > likely, amps, self.current_scale)
             likely = np.maximum(prior, likely)
         evidence = np.where(likely <= IMPOSSIBLE + 5.0, 0.0, evidence)
         # Without evidence the slope is chance and constrains neither scale nor resistance.
         unknown = evidence < 1.0
         likely = np.where(unknown, -1.0, np.maximum(likely, -3.0))
-        guessed = [max(CURRENT_SCALES, key=lambda each: _guess(each, width)) for width in widths]
+        guessed = [
+            max(CURRENT_SCALES, key=lambda each: _guess(each, *row))
+            for row in zip(widths, away, strict=True)
+        ]
         self.current_scale = np.where(unknown, np.array(guessed)[None, :], self.current_scale)
         middle = [np.median(each, axis=1) for each in level]
+        sags = self.slope * away > MOST_SAG * middle[0][:, None]
         is_copy = (np.abs(self.slope * middle[1] / middle[0][:, None] - 1.0) < 0.25) & (
             self.r > 0.5
         )
@@ -260,7 +289,7 @@ class Pairs:
             + np.array([row.prior for row in currents])
             + likely
             + np.where(ids[0][:, None] == ids[1], SAME_FRAME_NATS, 0.0)
-            + np.where(is_copy, IMPOSSIBLE, 0.0)
+            + np.where(is_copy | (sags & ~unknown), IMPOSSIBLE, 0.0)
             - 1.5 * self._has_sibling(middle[0])[:, None]
         )
 
@@ -404,10 +433,11 @@ def _narrow(full_a: FloatArray) -> FloatArray:
     return np.where(full_a < 60.0, 3.0, np.where(full_a < 150.0, 1.0, 0.0))
 
 
-def _guess(scale: float, width: int) -> float:
-    """Return the log prior of a scale [A] for a field of this width, without evidence."""
+def _guess(scale: float, width: int, away: float) -> float:
+    """Return the log prior of a scale [A] for a field of this width and reach, without evidence."""
     full_a = np.array(scale * 2.0 ** (width - 1))
-    return CURRENT_SCALES[scale] - float(_narrow(full_a)) - (1.0 if full_a > 2000.0 else 0.0)
+    prior = CURRENT_SCALES[scale] - float(_narrow(full_a)) - (1.0 if full_a > 2000.0 else 0.0)
+    return prior + (IMPOSSIBLE if scale * away > MOST_A else 0.0)
 
 
 def _are_siblings(one: SignalCandidate, two: SignalCandidate) -> bool:

@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final, Literal
 
+from cangauge._text import printable
 from cangauge.bus.vehicle import EXTENDED, PRESETS
 from cangauge.extras.discovery.by_name import NamedSignal
 from cangauge.extras.discovery.candidate import SIGNALS, Level, SignalCandidate
@@ -77,6 +78,27 @@ class Proposal:
         """Whether the captures prove the sign of the current."""
         sign = self.proof.get("sign", {}).get("sign", 0)
         return sign > 0 or (sign < 0 and self.method != "physics")
+
+    @property
+    def answer(self) -> str:
+        """The vehicle, or the signals found, in a phrase."""
+        if self.vehicle is not None:
+            return f"{PRESETS[self.vehicle].about} (--vehicle {self.vehicle})"
+        found = [
+            f"{role.removesuffix('_reference')} {signal.name}"
+            + ("" if self.is_proven(role) and not self.levels(role) else " (?)")
+            for role, signal in self.signals.items()
+        ]
+        way = "names" if self.method == "dbc" else "physics"
+        return f"Found by {way}: {', '.join(found)}"
+
+    def is_proven(self, role: str) -> bool:
+        """Whether the captures leave nothing of a signal open but its scale."""
+        if role == "current":
+            return self.method != "physics" and self.is_sign_proven
+        if role == "soc_reference":
+            return bool(self.proof.get("soc", {}).get("agrees"))
+        return True
 
     @property
     def sign_text(self) -> str:
@@ -149,9 +171,9 @@ class Proposal:
         pair_s = min(max(PAIR_S[0], 1.2 * max(periods_s)), PAIR_S[1])
         if math.isnan(sum(periods_s)):  # a DBC without a capture
             pair_s = 0.1
-        yield from (f"# {line}" for line in head)
+        yield from map(_comment, head)
         yield ""
-        yield f"dbc = {json.dumps(dbc)}"  # a basic string of TOML has JSON's escapes
+        yield f"dbc = {_toml(dbc)}"
         yield (
             'temperature_source = "unknown"'
             "  # where the sensor is: cell, pack, coolant, room, unknown"
@@ -161,19 +183,8 @@ class Proposal:
             "  # current and voltage at most this far apart make a sample [s]"
         )
         for role, signal in self.signals.items():
-            others = [each.name for each in self.candidates[role] if each is not signal]
             yield ""
-            yield from (f"# {line}" for line in signal.comments(self.nominal_v))
-            if others:
-                yield f"# Else: {', '.join(others)}."
-            yield f"[{role}]"
-            yield f"message = {json.dumps(signal.message)}"
-            yield f"signal = {json.dumps(signal.signal)}"
-            if role == "current":
-                way = "positive current discharges" if signal.sign > 0 else "negative discharges"
-                yield f"sign = {signal.sign}  # {way if self.is_sign_proven else 'not proven'}"
-            if isinstance(signal, NamedSignal) and signal.not_available:
-                yield f"not_available = {list(signal.not_available)}  # at an end of its codes"
+            yield from self._signal_lines(role, signal)
         if "temperature" not in self.chosen:
             yield ""
             yield (
@@ -183,6 +194,22 @@ class Proposal:
             yield "# worth several % SoC: name a signal here when you find one."
             yield "[temperature]"
             yield f"fixed_c = {FALLBACK_C:g}"
+
+    def _signal_lines(self, role: str, signal: Candidate) -> Iterator[str]:
+        others = [each.name for each in self.candidates[role] if each is not signal]
+        yield from map(_comment, signal.comments(self.nominal_v))
+        if others:
+            yield _comment(f"Else: {', '.join(others)}.")
+        yield f"[{role}]"
+        yield f"message = {_toml(signal.message)}"
+        yield f"signal = {_toml(signal.signal)}"
+        if role == "current":
+            way = "positive current discharges" if signal.sign > 0 else "negative discharges"
+            yield f"sign = {signal.sign}  # {way if self.is_sign_proven else 'not proven'}"
+        if isinstance(signal, NamedSignal) and signal.is_wrapped:
+            yield "signed = true  # the DBC reads negative values as large ones"
+        if isinstance(signal, NamedSignal) and signal.not_available:
+            yield f"not_available = {list(signal.not_available)}  # at an end of its codes"
 
     def _config_lines(
         self, interface: str | None, channel: str | None, bus_options: Mapping[str, object]
@@ -203,8 +230,8 @@ class Proposal:
                 yield f"temperature = {self.fixed_c:g}  # assumed: not known on this bus [°C]"
         shown = "" if interface else "# "
         yield ""
-        yield f"{shown}interface = {json.dumps(interface or 'socketcan')}"
-        yield f"{shown}channel = {json.dumps(channel or 'can0')}"
+        yield f"{shown}interface = {_toml(interface or 'socketcan')}"
+        yield f"{shown}channel = {_toml(channel or 'can0')}"
         yield ""
         same = "`cangauge estimate` gives the same"
         yield f'# record = "drive.log"  # keep the received frames: {same}'
@@ -212,8 +239,18 @@ class Proposal:
         yield ""
         if bus_options:
             yield "[bus_options]"
-            yield from (f"{key} = {json.dumps(value)}" for key, value in bus_options.items())
+            yield from (f"{key} = {_toml(value)}" for key, value in bus_options.items())
             yield ""
+
+
+def _toml(value: object) -> str:
+    """Return a text, or a plain value, as TOML writes it."""
+    return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
+
+
+def _comment(text: str) -> str:
+    """Return a text as a comment, on one line whatever names it holds."""
+    return f"# {' '.join(printable(text).splitlines())}"
 
 
 def _dbc_text(chosen: Sequence[SignalCandidate]) -> str:

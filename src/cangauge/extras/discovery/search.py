@@ -19,6 +19,8 @@ from cangauge._text import duration
 from cangauge._typing import FloatArray
 from cangauge.errors import InputError
 from cangauge.extras.discovery.candidate import (
+    LEAST_HOURS,
+    MOVES,
     SOC_SCALES,
     VOLTAGE_SCALES,
     Level,
@@ -103,6 +105,11 @@ class Findings:
             "The bits do not determine the factors: compare voltage and current with a",
             "meter or the car's display, and correct factor and offset in the DBC.",
         )
+
+    @property
+    def has_steps(self) -> bool:
+        """Whether a voltage follows steps of a current."""
+        return any(each.evidence >= ENOUGH_NATS and each.moves >= MOVES for each in self.current)
 
     def is_clear(self, role: str) -> bool:
         """Whether the first candidate is certain enough to be taken without the user."""
@@ -189,7 +196,9 @@ def _slow(
     span = grid.longest(0.5 * BETWEEN_S)
     drawn_ah = (np.cumsum(amps) * grid.step_s / 3600.0)[span]
     buses = {current.stream.bus, voltage.stream.bus}
+    least_ah = LEAST_HOURS * float(np.abs(amps).max())
     socs = [made for field in fields if (made := _as_charge(field, grid, drawn_ah, span))]
+    socs = [each for each in socs if each.capacity_ah >= least_ah]
     warm = [made for field in fields for made in _as_temperature(field, buses)]
     taken = current.bits | voltage.bits
     return _apart(socs, taken), _apart(warm, taken)
