@@ -38,7 +38,7 @@ from rich.table import Table
 
 from cangauge._resources import shared_file
 from cangauge.bus.open import BusAddress, open_bus
-from cangauge.bus.publish import FrameIds, SocEstimate, SocReader
+from cangauge.bus.publish import SocEstimate, SocReader
 from cangauge.bus.vehicle import Vehicle
 from cangauge.estimation.settings import EstimatorSettings
 from cangauge.model.model_file import Model
@@ -46,6 +46,7 @@ from cangauge.replay.encoder import FrameEncoder
 from cangauge.service.loop import CHECKPOINT_EVERY_S, FIRST_CHECKPOINT_S
 from cangauge.service.pipeline import Pipeline, PipelineSettings
 from cangauge.service.state import StateKeeper
+from cangauge.settings import FrameIds
 from cangauge.types import Estimate, Reason, Sample
 from live_service import ENTRY
 

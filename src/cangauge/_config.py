@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import dataclasses
 import tomllib
 from collections.abc import Iterator
 from os import PathLike
-from typing import Any, Final, TypeVar, get_args
+from typing import Any, Final, TypeVar, get_args, get_type_hints
 
 from pydantic import BaseModel, ValidationError
 
@@ -49,6 +50,10 @@ def validated(model: type[Model], data: object, source: str | PathLike[str]) -> 
         return model.model_validate(data)
     except ValidationError as error:
         raise schema_error(error, model, source) from error
+    except InputError as error:  # of a table that compares its values
+        raise InputError(
+            error.problem, source=source, field=error.field, value=error.value, cure=error.cure
+        ) from error
 
 
 def schema_error(
@@ -97,16 +102,26 @@ def _known_keys(model: type[BaseModel], place: list[int | str]) -> list[str]:
         inner = [
             each
             for owner in owners
-            if part in owner.__pydantic_fields__
-            for each in _models_in(owner.__pydantic_fields__[str(part)].annotation)
+            if part in _fields(owner)
+            for each in _models_in(_fields(owner)[str(part)])
         ]
         owners = inner or owners
-    return list(dict.fromkeys(key for owner in owners for key in owner.__pydantic_fields__))
+    return list(dict.fromkeys(key for owner in owners for key in _fields(owner)))
+
+
+def _fields(owner: Any) -> dict[str, Any]:
+    """Return the annotations of a model or a dataclass by field."""
+    if dataclasses.is_dataclass(owner):
+        hints = get_type_hints(owner)
+        return {field.name: hints[field.name] for field in dataclasses.fields(owner)}
+    return {name: field.annotation for name, field in owner.__pydantic_fields__.items()}
 
 
 def _models_in(annotation: Any) -> Iterator[Any]:
-    """Yield the models and checked dataclasses of an annotation."""
-    if isinstance(annotation, type) and hasattr(annotation, "__pydantic_fields__"):
+    """Yield the models and dataclasses of an annotation."""
+    if isinstance(annotation, type) and (
+        hasattr(annotation, "__pydantic_fields__") or dataclasses.is_dataclass(annotation)
+    ):
         yield annotation
     for part in get_args(annotation):
         yield from _models_in(part)

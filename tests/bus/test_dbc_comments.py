@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from cangauge._resources import shared_file
-from cangauge.estimation.settings import VALID_STD_PCT
+from cangauge.settings import VALID_STD_PCT
 
 
 def test_the_limit_of_a_valid_soc_is_the_default() -> None:

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from cangauge.bus.recording import capture_samples, capture_to_log, open_recording, read_log
-from cangauge.bus.time_source import REPLAY_CLOCK_ID, ClockFrames
+from cangauge.bus.time_source import ClockFrames
 from cangauge.bus.vehicle import Vehicle
 from cangauge.errors import InputError
 from cangauge.logs.canonical import write_log
@@ -21,6 +21,7 @@ from cangauge.logs.read import LogFile
 from cangauge.model.published import leaf_2012_model_file
 from cangauge.replay.encoder import FrameEncoder
 from cangauge.service.offline import estimate_capture
+from cangauge.settings import REPLAY_CLOCK_ID
 from cangauge.types import Sample
 
 CURRENT_ID, VOLTAGE_ID, TEMPERATURE_ID = 0x400, 0x401, 0x402

@@ -11,11 +11,12 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from cangauge.estimation.estimator import Estimator
-from cangauge.estimation.settings import EstimatorSettings, FullCharge, LongRest
+from cangauge.estimation.settings import EstimatorSettings
 from cangauge.estimation.state import EstimatorState
 from cangauge.model.effects.library import LIBRARY
 from cangauge.model.model_file import Model
 from cangauge.model.published import leaf_2012_model_file
+from cangauge.settings import FullCharge, LongRest
 from cangauge.types import Estimate, Reason, Sample, Status
 from estimation.test_snapshot import extended_by
 from selection import nightly_except

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 from cangauge.estimation.compiled import make_estimator
-from cangauge.estimation.power import PackLimits
 from cangauge.estimation.settings import EstimatorSettings
 from cangauge.model.delay_line import delayed_currents
 from cangauge.model.model_file import Model
 from cangauge.model.published import CAPACITY_AH, leaf_2012_model, leaf_2012_model_file
+from cangauge.settings import PackLimits
 from cangauge.types import Health, Sample
 from synthetic import drive_current
 

@@ -13,12 +13,13 @@ from cangauge.errors import InputError
 from cangauge.estimation.compiled import make_estimator
 from cangauge.estimation.estimator import EstimatorSettings
 from cangauge.estimation.offline import samples_of
-from cangauge.estimation.power import PackLimits
+from cangauge.estimation.power import KnownLimits
 from cangauge.identify.fit import fit
 from cangauge.logs.log import Log
 from cangauge.model.delay_line import delayed_currents
 from cangauge.model.model_file import Model
 from cangauge.model.published import CAPACITY_AH, leaf_2012_model, leaf_2012_model_file
+from cangauge.settings import PackLimits
 from cangauge.types import Power, Sample
 from synthetic import synthetic_log
 
@@ -108,7 +109,7 @@ def test_current_limits_hold_with_a_smaller_deviation() -> None:
 
 
 def test_limits_default_to_the_identified_range() -> None:
-    known = PackLimits().of_model(PACK)
+    known = KnownLimits.of(PackLimits(), PACK)
     assert known.min_voltage_v == PACK.pseudo_ocv_at(0.0)[0]
     assert known.max_voltage_v == PACK.pseudo_ocv_at(100.0)[0]
     assert (known.max_discharge_a, known.max_charge_a) == (200.0, 50.0)

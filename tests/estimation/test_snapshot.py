@@ -14,12 +14,13 @@ from cangauge.errors import InputError
 from cangauge.estimation.compiled import make_estimator
 from cangauge.estimation.estimator import Estimator
 from cangauge.estimation.offline import samples_of
-from cangauge.estimation.settings import EstimatorSettings, FullCharge, LongRest
+from cangauge.estimation.settings import EstimatorSettings
 from cangauge.estimation.state import EstimatorState
 from cangauge.model.effects.base import Effect, Pack
 from cangauge.model.effects.library import LIBRARY, effect_entries
 from cangauge.model.model_file import Model
 from cangauge.model.published import CAPACITY_AH, leaf_2012_model, leaf_2012_model_file
+from cangauge.settings import FullCharge, LongRest
 from cangauge.types import Estimate, Sample
 from selection import nightly_except
 from synthetic import synthetic_log

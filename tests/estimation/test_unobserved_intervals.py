@@ -13,8 +13,9 @@ from cangauge.estimation.compiled import make_estimator
 from cangauge.estimation.counting import SET_BACK_SAMPLES, moved_probability
 from cangauge.estimation.estimator import Estimator
 from cangauge.estimation.offline import samples_of
-from cangauge.estimation.settings import EstimatorSettings, FullCharge, LongRest
+from cangauge.estimation.settings import EstimatorSettings
 from cangauge.model.published import leaf_2012_model, leaf_2012_model_file
+from cangauge.settings import FullCharge, LongRest
 from cangauge.types import Estimate, Reason, Sample, Status
 from selection import nightly_except
 from synthetic import synthetic_log

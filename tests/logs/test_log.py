@@ -17,8 +17,9 @@ from log_cases import CURRENT_A, SOC_PCT, TIME_S, VOLTAGE_V
 from cangauge.bus.recording import read_log
 from cangauge.errors import InputError
 from cangauge.logs.canonical import write_log, write_table
-from cangauge.logs.log import TEMPERATURE_SOURCES, Log
+from cangauge.logs.log import Log
 from cangauge.logs.read import open_log
+from cangauge.settings import TEMPERATURE_SOURCES
 
 CHANNELS = ("time_s", "current_a", "voltage_v", "temperature_c", "soc_pct")
 

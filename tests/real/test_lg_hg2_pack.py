@@ -14,11 +14,11 @@ from cangauge.bus.recording import read_log
 from cangauge.estimation.compiled import make_estimator
 from cangauge.estimation.health import Health
 from cangauge.estimation.offline import samples_of
-from cangauge.estimation.power import PackLimits
 from cangauge.estimation.settings import EstimatorSettings
 from cangauge.logs.gaps import discharged_ah
 from cangauge.logs.log import Log
 from cangauge.model.model_file import Model
+from cangauge.settings import PackLimits
 from chains import chain
 
 pytestmark = pytest.mark.real

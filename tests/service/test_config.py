@@ -7,11 +7,10 @@ from pathlib import Path
 
 import pytest
 
-from cangauge.bus.publish import FrameIds
 from cangauge.errors import InputError
-from cangauge.estimation.power import PackLimits
 from cangauge.service.config import config_keys, load_config, reference
 from cangauge.service.setup import address_of, load_vehicle, pipeline_settings
+from cangauge.settings import FrameIds, PackLimits
 from live import in_process, leaf_model_path
 
 
@@ -126,9 +125,9 @@ def test_errors_of_the_command_line_name_the_option(options: dict[str, object], 
 
 
 def test_equal_ids_and_a_missing_file_are_refused(tmp_path: Path) -> None:
-    config = load_config(write(tmp_path, 'model = "m"\n[ids]\nsoc_detail = 0x5A0\n'))
-    with pytest.raises(InputError, match="same id"):
-        pipeline_settings(config)
+    path = write(tmp_path, 'model = "m"\n[ids]\nsoc_detail = 0x5A0\n')
+    with pytest.raises(InputError, match=r"car.toml: ids.soc_detail: soc_estimate has the same id"):
+        load_config(path)
     with pytest.raises(InputError, match="no such file"):
         load_config("/nowhere/car.toml")
 

@@ -9,7 +9,6 @@ import pytest
 
 from cangauge._resources import shared_file
 from cangauge.bus.publish import (
-    FrameIds,
     PackReport,
     SocCells,
     SocDetail,
@@ -26,6 +25,7 @@ from cangauge.estimation.offline import samples_of
 from cangauge.logs.log import Log
 from cangauge.replay.encoder import FrameEncoder
 from cangauge.service.pipeline import Pipeline, PipelineSettings
+from cangauge.settings import FrameIds
 from cangauge.types import CellReport, Health, Power
 from cells_bus import ALL_CELLS, CAR, CELLS_DBC, CELLS_ON_BUS, all_cell_frames
 from live import leaf_model, quantized, short_log

@@ -6,7 +6,7 @@ import can
 import numpy as np
 import pytest
 
-from cangauge.bus.publish import ACKNOWLEDGE_EVERY, FrameIds, SocDetail, SocReader
+from cangauge.bus.publish import ACKNOWLEDGE_EVERY, SocDetail, SocReader
 from cangauge.bus.time_source import ClockFrames
 from cangauge.bus.vehicle import Vehicle
 from cangauge.errors import InputError
@@ -14,6 +14,7 @@ from cangauge.estimation.offline import run_estimator, samples_of
 from cangauge.estimation.settings import EstimatorSettings
 from cangauge.logs.log import Log
 from cangauge.service.pipeline import Pipeline, PipelineSettings
+from cangauge.settings import FrameIds
 from cangauge.types import Estimate
 from live import frames_of, leaf_model, quantized, short_log
 

@@ -15,9 +15,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from cangauge._resources import shared_file
-from cangauge.bus.publish import FrameIds, PackReport, SocEstimate, SocPublisher, SocReader
+from cangauge.bus.publish import PackReport, SocEstimate, SocPublisher, SocReader
 from cangauge.errors import InputError
 from cangauge.estimation.cells import UNKNOWN
+from cangauge.settings import FrameIds
 from cangauge.types import CellReport, Estimate, Health, Power, Reason, Status
 
 NAN = math.nan

@@ -85,7 +85,7 @@ def test_another_model_in_the_same_file_takes_soc_over(car: Car) -> None:
     before = car.pipeline.latest
     text = json.loads(car.model.read_text())
     text["capacity_ah"] *= 0.9
-    text["coefficients"]["k0"]["value"] += 1.0
+    text["published"]["coefficients"]["k0"]["value"] += 1.0
     car.model.write_text(json.dumps(text))
     assert car.reload("") is not None
     car.drive(1000, 1001)

@@ -28,7 +28,7 @@ from cangauge.bus.protection import (
 from cangauge.errors import InputError
 from cangauge.estimation.cells import CELLS_AT_MOST
 from cangauge.logs.column_map import ColumnMap
-from cangauge.logs.log import TemperatureSource
+from cangauge.settings import TemperatureSource
 
 PAIR_WITHIN_S: Final = 0.020
 """Largest distance in bus time between paired current and voltage [s] (DESIGN: configurable)."""

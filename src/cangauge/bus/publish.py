@@ -15,7 +15,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, Final, NamedTuple
@@ -28,8 +27,7 @@ from cangauge._resources import shared_file
 from cangauge._text import plain
 from cangauge.bus.database import SignalCodec, load_dbc, signal_codec
 from cangauge.bus.protection import E2eRule
-from cangauge.bus.time_source import REPLAY_CLOCK_ID
-from cangauge.errors import InputError
+from cangauge.settings import FrameIds
 from cangauge.types import REASONS, CellReport, Estimate, Health, Power, Reason, Status
 
 ESTIMATE_EVERY_S: Final = 0.1
@@ -44,31 +42,6 @@ ACKNOWLEDGE_EVERY: Final = 4
 """Most samples between two SOC_DETAIL under the replay clock: `replay` waits for them."""
 
 _LENGTH: Final = 8
-
-
-@dataclass(frozen=True)
-class FrameIds:
-    """Standard ids of the frames; InputError if two are equal."""
-
-    soc_estimate: int = 0x5A0
-    soc_detail: int = 0x5A1
-    replay_clock: int = REPLAY_CLOCK_ID
-    soc_health: int = 0x5A2
-    soc_power: int = 0x5A3
-    soc_cells: int = 0x5A4
-
-    @property
-    def published(self) -> dict[int, str]:
-        """Names of the frames that the service sends, by id."""
-        return {getattr(self, name): name for name in _CONTENTS}
-
-    def __post_init__(self) -> None:
-        names: dict[int, str] = {}
-        for name, value in vars(self).items():
-            if value in names:
-                problem = f"{names[value]} has the same id"
-                raise InputError(problem, field=f"ids.{name}", value=f"0x{value:X}")
-            names[value] = name
 
 
 # Contents of the frames: fields are the DBC's signals (`reason` is `reasons`); NaN: not available.

@@ -32,7 +32,7 @@ from cangauge.bus.vehicle import LOG_COLUMNS, Vehicle
 from cangauge.errors import InputError, require_temperature
 from cangauge.logs.column_map import ColumnMap
 from cangauge.logs.draft import Sign
-from cangauge.logs.log import Log, TemperatureSource
+from cangauge.logs.log import Log
 from cangauge.logs.read import KNOWN_LOGS, LogFile, not_recognised, open_log
 from cangauge.logs.sign import require_discharge_positive, resolve_sign
 from cangauge.logs.units import (
@@ -41,6 +41,7 @@ from cangauge.logs.units import (
     refuse_wrapped,
     refuse_wrong_units,
 )
+from cangauge.settings import TemperatureSource
 from cangauge.types import Sample
 
 VOLTAGE_FILL_S: Final = 1.0

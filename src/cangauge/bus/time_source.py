@@ -14,7 +14,7 @@ import math
 import time
 from collections.abc import Iterable
 from functools import lru_cache
-from typing import Final, Literal
+from typing import Final
 
 import can
 
@@ -22,10 +22,8 @@ from cangauge._resources import shared_file
 from cangauge.bus.database import SignalCodec, load_dbc, signal_codec
 from cangauge.bus.protection import CRC_ONLY_RULE
 from cangauge.estimation.counting import LATEST_S
+from cangauge.settings import REPLAY_CLOCK_ID, TimeSourceName
 
-TimeSourceName = Literal["receive", "replay-clock"]
-
-REPLAY_CLOCK_ID: Final = 0x5AF
 MICROSECONDS: Final = 1e6
 """Unit of REPLAY_CLOCK [1/s]."""
 

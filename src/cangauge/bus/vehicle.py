@@ -32,8 +32,8 @@ from cangauge.bus.mapping import CellsMap, MessageMap, SignalMap, VehicleMap
 from cangauge.bus.plausibility import SignalChecks
 from cangauge.bus.protection import Protection
 from cangauge.errors import InputError, closest, require_temperature
-from cangauge.logs.log import TemperatureSource
 from cangauge.logs.units import convert
+from cangauge.settings import TemperatureSource
 
 _T = TypeVar("_T")
 Role = Literal["current", "voltage", "temperature", "soc_reference", "cells"]

@@ -181,8 +181,8 @@ def _of_log(
 ) -> RecordedEstimate:
     from cangauge.logs.charge import refuse_contradictions
     from cangauge.logs.gaps import USUAL_STEPS
-    from cangauge.model.delay_line import GAP_S
     from cangauge.service.offline import PackHistory, estimate_recorded_log
+    from cangauge.settings import GAP_S
 
     log = reading.load(path)
     if soc_from_log:  # a stated start needs no SoC of the log

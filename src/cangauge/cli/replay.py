@@ -23,10 +23,10 @@ from cangauge.cli.output import emit_json, note, progress
 
 if TYPE_CHECKING:
     from cangauge.bus.connection import BusConnection
-    from cangauge.bus.publish import FrameIds
     from cangauge.replay.player import ReplayState
     from cangauge.replay.steps import Source
     from cangauge.service.config import RunConfig
+    from cangauge.settings import FrameIds
 
 
 @command(
@@ -87,14 +87,14 @@ def replay_command(
     """
     from cangauge.bus.connection import BusConnection
     from cangauge.bus.open import open_bus
-    from cangauge.bus.publish import FrameIds, standard_filter
+    from cangauge.bus.publish import standard_filter
     from cangauge.replay.player import ReplaySettings, play
     from cangauge.service.config import load_config
     from cangauge.service.lifecycle import stop_on_signals
     from cangauge.service.setup import address_of
 
     loaded = load_config(config, {"model": "-", **config_values(options)})
-    ids = FrameIds(**loaded.ids.model_dump())
+    ids = loaded.ids
     source, address = _source(recorded, columns, loaded, ids), address_of(loaded)
     stopped: list[bool] = []
     factor = math.inf if speed == "max" else speed

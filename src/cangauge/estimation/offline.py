@@ -15,18 +15,12 @@ from cangauge._extras import extra
 from cangauge._typing import FloatArray
 from cangauge.estimation.compiled import CompiledEstimator, make_estimator
 from cangauge.estimation.estimator import Estimator
-from cangauge.estimation.settings import (
-    VALID_STD_PCT,
-    EstimatorSettings,
-    FullCharge,
-    LongRest,
-    Method,
-)
+from cangauge.estimation.settings import EstimatorSettings
 from cangauge.logs.gaps import usual_gap_s
 from cangauge.logs.log import Log, as_log
 from cangauge.model.coulomb_counting import soc_at_first_row
-from cangauge.model.delay_line import GAP_S
 from cangauge.model.model_file import Model, as_model
+from cangauge.settings import GAP_S, VALID_STD_PCT, FullCharge, LongRest, Method
 from cangauge.types import Estimate, Sample, Status, reason_names
 
 PROGRESS_EVERY = 5000

@@ -13,8 +13,7 @@ test of traction cells (IEC 62660-1), to a SoC or to the lowest voltage, whichev
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from typing import Final, NamedTuple
+from typing import Final, NamedTuple, Self
 
 import numpy as np
 
@@ -24,6 +23,7 @@ from cangauge.estimation.ekf import FUNCTIONS, LEAST_SLOPE, LEVEL, SLOW, SocFilt
 from cangauge.estimation.health import health_of
 from cangauge.model.extended import OnlineModel
 from cangauge.model.voltage_model import HermiteCurve, VoltageModel
+from cangauge.settings import PackLimits
 from cangauge.types import Health, Power
 
 HORIZON_S: Final = 10.0
@@ -42,53 +42,18 @@ _ITERATIONS: Final = 6
 _CLOSE_A: Final = 1e-3
 
 
-@dataclass(frozen=True)
-class PackLimits:
-    """Limits of voltage and current; None: from the range that the model was identified on.
+class KnownLimits(NamedTuple):
+    """`PackLimits`, all known."""
 
-    Parameters
-    ----------
-    min_voltage_v, max_voltage_v : float, optional
-        Pack voltage [V]; by default the pseudo-OCV at the ends of the identified SoC, or what the
-        logs reached under load: the answer does not contradict them.
-    max_discharge_a, max_charge_a : float, optional
-        Largest currents, both positive [A]; by default the ends of the identified current.
-    cutoff_soc_pct : float, optional
-        SoC at which the energy ends [%]; by default the lower end of the identified SoC.
+    min_voltage_v: float
+    max_voltage_v: float
+    max_discharge_a: float
+    max_charge_a: float
+    cutoff_soc_pct: float
 
-    Raises
-    ------
-    InputError
-        If a value is out of range, or the voltages contradict each other.
-    """
-
-    min_voltage_v: float | None = None
-    max_voltage_v: float | None = None
-    max_discharge_a: float | None = None
-    max_charge_a: float | None = None
-    cutoff_soc_pct: float | None = None
-
-    def __post_init__(self) -> None:
-        for name, high in (
-            ("min_voltage_v", 1e4),
-            ("max_voltage_v", 1e4),
-            ("max_discharge_a", 1e4),
-            ("max_charge_a", 1e4),
-            ("cutoff_soc_pct", 100.0),
-        ):
-            value = getattr(self, name)
-            if value is not None and not 0.0 <= value <= high:
-                raise InputError(
-                    f"must lie within 0 … {high:g}", field=f"limits.{name}", value=value
-                )
-        low, high_v = self.min_voltage_v, self.max_voltage_v
-        if low is not None and high_v is not None and low >= high_v:
-            raise InputError(
-                "is not below limits.max_voltage_v", field="limits.min_voltage_v", value=low
-            )
-
-    def of_model(self, model: VoltageModel) -> KnownLimits:
-        """Return the limits with those of the model where none are stated.
+    @classmethod
+    def of(cls, stated: PackLimits, model: VoltageModel) -> Self:
+        """Return the stated limits, and those of the model where none are stated.
 
         Raises
         ------
@@ -101,12 +66,12 @@ class PackLimits:
         if model.voltage_range_v is not None:
             low_v = min(low_v, model.voltage_range_v[0])
             high_v = max(high_v, model.voltage_range_v[1])
-        known = KnownLimits(
-            _or(self.min_voltage_v, low_v),
-            _or(self.max_voltage_v, high_v),
-            _or(self.max_discharge_a, max(high_a, 0.0)),
-            _or(self.max_charge_a, max(-low_a, 0.0)),
-            _or(self.cutoff_soc_pct, max(low_pct, 0.0)),
+        known = cls(
+            _or(stated.min_voltage_v, low_v),
+            _or(stated.max_voltage_v, high_v),
+            _or(stated.max_discharge_a, max(high_a, 0.0)),
+            _or(stated.max_charge_a, max(-low_a, 0.0)),
+            _or(stated.cutoff_soc_pct, max(low_pct, 0.0)),
         )
         if known.min_voltage_v >= known.max_voltage_v:
             raise InputError(
@@ -116,16 +81,6 @@ class PackLimits:
                 cure="state both min_voltage_v and max_voltage_v",
             )
         return known
-
-
-class KnownLimits(NamedTuple):
-    """`PackLimits`, all known."""
-
-    min_voltage_v: float
-    max_voltage_v: float
-    max_discharge_a: float
-    max_charge_a: float
-    cutoff_soc_pct: float
 
 
 class PowerModel:
@@ -138,7 +93,7 @@ class PowerModel:
     """
 
     def __init__(self, model: OnlineModel, limits: PackLimits) -> None:
-        self.limits = limits.of_model(model.model)
+        self.limits = KnownLimits.of(limits, model.model)
         self._model = model
 
     def at(

@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 from typing import Final
 
-from cangauge.logs.log import TemperatureSource
 from cangauge.model.voltage_model import VoltageModel
+from cangauge.settings import TemperatureSource
 from cangauge.types import TEMPERATURE_WITHIN_C, VOLTAGE_WITHIN, Reason, Sample
 
 SOC_MARGIN_PCT: Final = 1.0

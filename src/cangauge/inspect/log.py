@@ -31,8 +31,8 @@ from cangauge.logs.sign import (
     spaced_rows,
 )
 from cangauge.model.coulomb_counting import capacity_from_full_discharge
-from cangauge.model.delay_line import GAP_S
 from cangauge.model.prior import DELAYS_S
+from cangauge.settings import GAP_S
 
 Verdict = Literal["yes", "partly", "no"]
 

@@ -23,7 +23,7 @@ from cangauge.errors import InputError
 from cangauge.logs.log import Log
 from cangauge.logs.table import SOURCE, ArrowTable
 from cangauge.logs.text import MAX_COLUMNS, MAX_ROWS
-from cangauge.logs.units import TemperatureSource
+from cangauge.settings import TemperatureSource
 
 _METADATA_KEY: Final = b"cangauge.temperature_source"
 

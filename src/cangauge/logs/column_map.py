@@ -10,7 +10,8 @@ from typing import Any, Final
 
 from cangauge.errors import InputError, closest
 from cangauge.logs.headings import GUESS, Meaning, meaning_of, names_and_units
-from cangauge.logs.units import CANONICAL_UNIT, FIELDS, REQUIRED, TemperatureSource, unit_of
+from cangauge.logs.units import CANONICAL_UNIT, FIELDS, REQUIRED, unit_of
+from cangauge.settings import TemperatureSource
 
 DOCS: Final = "docs/logs.md"
 """Page that explains the columns of a log."""

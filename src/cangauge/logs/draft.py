@@ -15,12 +15,8 @@ from cangauge.logs.column_map import shown_headings
 from cangauge.logs.headings import cell_number
 from cangauge.logs.log import Log
 from cangauge.logs.sign import resolve_sign
-from cangauge.logs.units import (
-    REQUIRED,
-    TemperatureSource,
-    known_temperature_source,
-    refuse_wrong_units,
-)
+from cangauge.logs.units import REQUIRED, known_temperature_source, refuse_wrong_units
+from cangauge.settings import TemperatureSource
 from cangauge.types import SOC_WITHIN_PCT
 
 Sign = Literal["charge", "discharge"]

@@ -13,7 +13,8 @@ import unicodedata
 from functools import lru_cache
 from typing import Final, NamedTuple
 
-from cangauge.logs.units import CANONICAL_UNIT, FIELDS, FOREIGN_UNITS, TemperatureSource, unit_of
+from cangauge.logs.units import CANONICAL_UNIT, FIELDS, FOREIGN_UNITS, unit_of
+from cangauge.settings import TemperatureSource
 
 
 def _words(text: str) -> frozenset[str]:

@@ -20,10 +20,11 @@ from cangauge.logs.canonical import arrow_table, parquet_table
 from cangauge.logs.column_map import DOCS, ColumnMap, choose_columns, unknown_columns
 from cangauge.logs.draft import DraftLog, Sign
 from cangauge.logs.headings import cell_number
-from cangauge.logs.log import Log, TemperatureSource
+from cangauge.logs.log import Log
 from cangauge.logs.table import ArrowTable, draft_of_table
 from cangauge.logs.text import TextTable, find_table, likely_header
 from cangauge.logs.values import numbers_of, with_decimal_points
+from cangauge.settings import TemperatureSource
 
 KNOWN_LOGS: Final = (
     "canonical Parquet and CSV (time_s, current_a, voltage_v, temperature_c, soc_pct), ANL D3"

@@ -5,16 +5,14 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Collection, Iterator, Sequence
-from typing import Final, Literal, cast, get_args
+from typing import Final, cast
 
 import numpy as np
 
 from cangauge._typing import BoolArray, FloatArray
 from cangauge.errors import COLDEST_C, HOTTEST_C, InputError
 from cangauge.logs.resolution import wrapped_current
-
-TemperatureSource = Literal["cell", "pack", "coolant", "room", "unknown"]
-TEMPERATURE_SOURCES: Final[tuple[str, ...]] = get_args(TemperatureSource)
+from cangauge.settings import TEMPERATURE_SOURCES, TemperatureSource
 
 FIELDS: Final[dict[str, str]] = {
     "time": "time_s",

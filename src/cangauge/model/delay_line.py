@@ -14,9 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from cangauge._typing import FloatArray
-
-GAP_S = 2.0
-"""A gap in the current longer than this empties the delay line [s]."""
+from cangauge.settings import GAP_S
 
 
 def delayed_currents(

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from cangauge._typing import FloatArray
 from cangauge.errors import InputError
 from cangauge.logs.gaps import BRIDGE_S, discharged_ah
-from cangauge.model.delay_line import GAP_S, DelayLine
+from cangauge.model.delay_line import DelayLine
 from cangauge.model.effects.base import (
     Counting,
     Effect,
@@ -34,6 +34,7 @@ from cangauge.model.effects.library import LIBRARY
 from cangauge.model.first_order import Lag
 from cangauge.model.inverse import socs_from_ocv
 from cangauge.model.voltage_model import SLOPE_AT_LEAST, Functions, VoltageModel
+from cangauge.settings import GAP_S
 
 if TYPE_CHECKING:
     from cangauge.model.model_file import Noise

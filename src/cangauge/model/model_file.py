@@ -25,8 +25,7 @@ from cangauge._files import MIB, as_path, read_bounded, write_text_atomic
 from cangauge._text import number, significant, span
 from cangauge._typing import FloatArray
 from cangauge.errors import InputError
-from cangauge.logs.log import Log, TemperatureSource, as_log
-from cangauge.model.delay_line import GAP_S
+from cangauge.logs.log import Log, as_log
 from cangauge.model.effects.base import Pack, Signals
 from cangauge.model.effects.library import parse_effects
 from cangauge.model.extended import ExtendedModel, OnlineModel, Prediction
@@ -56,6 +55,7 @@ from cangauge.model.voltage_model import (
     VoltageModel,
     resistance_factor,
 )
+from cangauge.settings import GAP_S, TemperatureSource
 
 PRIOR_MADE_BY: Final = "prior of the chemistry"
 """`made.by` of a model without any log."""

@@ -23,7 +23,6 @@ from cangauge.bus.connection import BusConnection
 from cangauge.bus.publish import (
     ACKNOWLEDGE_EVERY,
     SAMPLES_MODULO,
-    FrameIds,
     SocDetail,
     SocEstimate,
     SocReader,
@@ -31,6 +30,7 @@ from cangauge.bus.publish import (
 from cangauge.bus.time_source import MICROSECONDS, ClockFrames
 from cangauge.errors import CangaugeError, InputError
 from cangauge.replay.steps import Source, Step
+from cangauge.settings import FrameIds
 
 _LOG = logging.getLogger(__name__)
 

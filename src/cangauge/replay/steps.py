@@ -17,7 +17,6 @@ from can.typechecking import Channel
 
 from cangauge.bus.captures import open_capture
 from cangauge.bus.decoder import SampleDecoder
-from cangauge.bus.publish import FrameIds
 from cangauge.bus.recording import open_vehicle_capture
 from cangauge.bus.time_source import (
     MICROSECONDS,
@@ -32,6 +31,7 @@ from cangauge.logs.gaps import usual_step_s
 from cangauge.logs.log import Log
 from cangauge.model.model_file import Model
 from cangauge.replay.encoder import FrameEncoder
+from cangauge.settings import FrameIds
 from cangauge.types import Sample
 
 _CAPTURE_LOOP_GAP_US = 10_000

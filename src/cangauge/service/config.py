@@ -30,76 +30,50 @@ from pydantic import (
     BaseModel,
     BeforeValidator,
     ConfigDict,
-    Field,
     FiniteFloat,
     PrivateAttr,
     StrictBool,
 )
 
 from cangauge._config import read_toml, validated
-from cangauge.bus.time_source import TimeSourceName
-from cangauge.bus.vehicle import PRESETS
+from cangauge._resources import shared_file
 from cangauge.errors import InputError
-from cangauge.estimation.settings import VALID_STD_PCT, Method
-from cangauge.logs.log import TEMPERATURE_SOURCES, TemperatureSource
-from cangauge.model.delay_line import GAP_S
 from cangauge.service.events import LogFormat, LogLevel
+from cangauge.settings import (
+    GAP_S,
+    START_STD_PCT,
+    STRICT,
+    TEMPERATURE_SOURCES,
+    VALID_STD_PCT,
+    CapacityAh,
+    FrameIds,
+    FullCharge,
+    GapSeconds,
+    LongRest,
+    Method,
+    PackLimits,
+    StartPct,
+    StartStdPct,
+    TemperatureSource,
+    TimeSourceName,
+    ValidStdPct,
+    setting,
+)
 
+_PRESETS: Final = ", ".join(read_toml(shared_file("dbc", "presets.toml")))
 DEFAULT_VEHICLE: Final = "generic"
 """Default of `replay` as well, so that both commands work together without options."""
 
 
 def key(default: Any, text: str, option: str = "", metavar: str = "", **more: Any) -> Any:
-    """Return the field of a key; further arguments are those of `ConfigKey`, or pydantic's bounds.
-
-    `default_text` is the default in words, where the field's own is not enough.
-    """
-    names = ("unit", "restart", "is_path", "default_text")
-    about = {name: more.pop(name) for name in names if name in more}
-    about |= {"option": option, "metavar": metavar}
-    return Field(default, description=text, json_schema_extra={"key": about}, **more)
+    """Return the field of a key with its default; further arguments as of `setting`."""
+    return setting(text, default=default, option=option, metavar=metavar, **more)
 
 
 class Strict(BaseModel):
     """A table of keys; unknown ones are refused."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True, json_schema_extra={"has_keys": True})
-
-
-def _id(default: int, name: str, *, restart: bool = False) -> Any:
-    return key(default, f"Id of {name}.", metavar="ID", ge=0, le=0x7FF, restart=restart)
-
-
-class IdsConfig(Strict):
-    """Standard ids of the published frames and of the replay clock."""
-
-    soc_estimate: int = _id(0x5A0, "SOC_ESTIMATE")
-    soc_detail: int = _id(0x5A1, "SOC_DETAIL")
-    replay_clock: int = _id(0x5AF, "REPLAY_CLOCK", restart=True)
-    soc_health: int = _id(0x5A2, "SOC_HEALTH")
-    soc_power: int = _id(0x5A3, "SOC_POWER")
-    soc_cells: int = _id(0x5A4, "SOC_CELLS, sent where the vehicle gives cell voltages")
-
-
-class FullChargeConfig(Strict):
-    """Condition of a full pack; see `FullCharge`."""
-
-    voltage_v: FiniteFloat = key(..., "Least voltage.", unit="V", gt=0.0, le=1e4)
-    current_a: FiniteFloat = key(..., "Largest absolute current.", unit="A", ge=0.0, le=5e3)
-    hold_s: FiniteFloat = key(60.0, "Duration of both.", unit="s", ge=0.0, le=86400.0)
-    soc_pct: FiniteFloat = key(100.0, "SoC then.", unit="%", ge=0.0, le=100.0)
-    soc_std_pct: FiniteFloat = key(0.5, "Its standard deviation.", unit="%", ge=0.01, le=100.0)
-
-
-class LongRestConfig(Strict):
-    """Condition of an open-circuit voltage at rest; see `LongRest`."""
-
-    after_s: FiniteFloat = key(
-        7200.0, "Least duration of the rest.", unit="s", ge=60.0, le=30.0 * 86400.0
-    )
-    soc_std_pct: FiniteFloat = key(
-        2.0, "Standard deviation of the SoC by its voltage.", unit="%", ge=0.01, le=100.0
-    )
+    model_config = ConfigDict(**STRICT, frozen=True)
 
 
 class PollConfig(Strict):
@@ -110,31 +84,6 @@ class PollConfig(Strict):
         "Interval between requests for the same reply. One is sent at a time; without an answer"
         " the interval doubles, up to a minute; while another tester asks, none is sent.",
         unit="s", ge=1.0, le=3600.0,
-    )  # fmt: skip
-
-
-def _limit(text: str, default: str, unit: str, le: float = 1e4) -> Any:
-    return key(None, text, unit=unit, default_text=default, ge=0.0, le=le)
-
-
-class LimitsConfig(Strict):
-    """Limits for the possible currents and the energy left; see `PackLimits`."""
-
-    min_voltage_v: FiniteFloat | None = _limit(
-        "Lowest pack voltage.", "the pseudo-OCV at the lower end of the identified SoC", "V"
-    )
-    max_voltage_v: FiniteFloat | None = _limit(
-        "Highest pack voltage.", "the pseudo-OCV at the upper end of the identified SoC", "V"
-    )
-    max_discharge_a: FiniteFloat | None = _limit(
-        "Largest discharge current.", "the largest that the model was identified on", "A"
-    )
-    max_charge_a: FiniteFloat | None = _limit(
-        "Largest charge current, positive.", "the largest that the model was identified on", "A"
-    )
-    cutoff_soc_pct: FiniteFloat | None = _limit(
-        "SoC at which the energy ends; it also ends at the lowest voltage.",
-        "the lower end of the identified SoC", "%", 100.0,
     )  # fmt: skip
 
 
@@ -241,7 +190,7 @@ class RunConfig(Strict):
         restart=True,
     )
     vehicle: str | None = key(
-        None, f"Vehicle preset: {', '.join(PRESETS)}.", "--vehicle", "PRESET",
+        None, f"Vehicle preset: {_PRESETS}.", "--vehicle", "PRESET",
         default_text=f"{DEFAULT_VEHICLE}, without a map",
     )  # fmt: skip
     dbc: str | None = key(
@@ -272,24 +221,11 @@ class RunConfig(Strict):
         " counting (coulomb).",
         "--method", "ekf|newton|coulomb",
     )  # fmt: skip
-    initial_soc: Annotated[FiniteFloat | None, BeforeValidator(_none_for_auto)] = key(
-        None, "SoC at the first sample, or auto: by the first voltages.",
-        "--initial-soc", "P|auto", unit="%", default_text="auto", ge=0.0, le=100.0,
-    )  # fmt: skip
-    initial_soc_std: FiniteFloat = key(
-        1.0, "Standard deviation of the initial SoC.",
-        "--initial-soc-std", "X", unit="%", ge=0.0, le=100.0,
-    )  # fmt: skip
-    valid_std: FiniteFloat = key(
-        VALID_STD_PCT, "Standard deviation above which the SoC is published as degraded.",
-        unit="%", ge=0.01, le=100.0,
-    )  # fmt: skip
-    capacity_ah: FiniteFloat | None = key(
-        None, "Capacity.", unit="Ah", default_text="the model's", ge=1e-3, le=1e5
-    )
-    max_gap_s: FiniteFloat = key(
-        GAP_S, "Longest step between samples that is not a gap.", unit="s", ge=1e-3, le=3600.0
-    )
+    initial_soc: Annotated[StartPct | None, BeforeValidator(_none_for_auto)] = None
+    initial_soc_std: StartStdPct = START_STD_PCT
+    valid_std: ValidStdPct = VALID_STD_PCT
+    capacity_ah: CapacityAh | None = None
+    max_gap_s: GapSeconds = GAP_S
     pair_within_s: FiniteFloat | None = key(
         None, "Largest time between current and voltage of one sample.",
         unit="s", default_text="0.02", ge=0.0, le=1.0,
@@ -303,7 +239,7 @@ class RunConfig(Strict):
     timeout_s: FiniteFloat = key(
         2.0, "Time without a sample after which the input is stale.", unit="s", gt=0.0, le=1e9
     )
-    ids: IdsConfig = key(IdsConfig(), "Ids of the published frames.")
+    ids: FrameIds = key(FrameIds(), "Ids of the published frames.")
     record: str | None = key(
         None,
         "Record the received frames (candump .log or .log.gz): `cangauge estimate` on them"
@@ -340,9 +276,9 @@ class RunConfig(Strict):
     state_every_s: FiniteFloat = key(
         10.0, "Interval between writes of the state.", unit="s", ge=0.1, le=86400.0
     )
-    full_charge: FullChargeConfig | None = key(None, "Set the SoC when the pack is full.")
-    long_rest: LongRestConfig | None = key(None, "Correct the SoC by the voltage of long rests.")
-    limits: LimitsConfig = key(LimitsConfig(), "Limits of the possible currents.")
+    full_charge: FullCharge | None = key(None, "Set the SoC when the pack is full.")
+    long_rest: LongRest | None = key(None, "Correct the SoC by the voltage of long rests.")
+    limits: PackLimits = key(PackLimits(), "Limits of the possible currents.")
     poll: PollConfig | None = key(
         None, "Ask the battery controller for its replies over ISO-TP: the service then sends."
     )
@@ -479,8 +415,8 @@ class ConfigKey:
     default: str
     bounds: str
     text: str
-    option: str
-    metavar: str
+    option: str = ""
+    metavar: str = ""
     unit: str = ""
     restart: bool = False
     is_path: bool = False
@@ -512,22 +448,22 @@ def _keys(table: dict[str, Any], tables: dict[str, Any], prefix: str) -> Iterato
         # The type of an optional key is one of two; the other one is null.
         kind = field.get("anyOf", [field])[0]
         inner = tables.get(kind.get("$ref", "").rpartition("/")[2], {})
-        if inner.get("has_keys"):
+        if "properties" in inner:
             yield from _keys(inner, tables, f"{prefix}{name}.")
             continue
-        about, default = dict(field["key"]), field.get("default")
+        about, default = kind.get("key", {}) | field.get("key", {}), field.get("default")
         if (text := about.pop("default_text", "")) or default is None or isinstance(default, dict):
             default = text
         elif isinstance(default, bool):
             default = str(default).lower()
         elif isinstance(default, float):
             default = f"{default:.10g}"
-        elif about["metavar"] == "ID":
+        elif about.get("metavar") == "ID":
             default = f"0x{default:X}"
         values = kind.get("enum")
         words = f"one of {', '.join(values)}" if values else _KINDS.get(kind.get("type"), "table")
         bounds = [f"{sign} {kind[bound]:g}" for bound, sign in _BOUNDS.items() if bound in kind]
-        help_text = field["description"]
+        help_text = field.get("description") or kind["description"]
         yield ConfigKey(prefix + name, words, str(default), ", ".join(bounds), help_text, **about)
 
 

@@ -20,9 +20,9 @@ from can.typechecking import Channel
 
 from cangauge._text import rounded
 from cangauge._typing import FloatArray
-from cangauge.bus.publish import NO_REPORT, FrameIds, PackReport
+from cangauge.bus.publish import NO_REPORT, PackReport
 from cangauge.bus.recording import CaptureSamples, capture_samples, open_vehicle_capture
-from cangauge.bus.time_source import REPLAY_CLOCK_ID, RecordedTime, TimeSourceName
+from cangauge.bus.time_source import RecordedTime
 from cangauge.bus.vehicle import Vehicle
 from cangauge.errors import InputError
 from cangauge.estimation.cells import CellEstimator
@@ -42,6 +42,7 @@ from cangauge.logs.read import CellColumns
 from cangauge.model.coulomb_counting import difference_from_reference
 from cangauge.model.model_file import Model
 from cangauge.service.pipeline import FrameCounts, Pipeline, PipelineSettings
+from cangauge.settings import REPLAY_CLOCK_ID, FrameIds, TimeSourceName
 from cangauge.types import Estimate, Reason, Sample, reason_name, reason_sentences
 
 PROGRESS_EVERY: Final = 50_000

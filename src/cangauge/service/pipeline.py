@@ -17,14 +17,8 @@ from can.typechecking import CanFilter
 
 from cangauge.bus.decoder import FrameStatistics, SampleDecoder
 from cangauge.bus.plausibility import MISSED_AT_LEAST, MISSED_UNTIL_OLD, PackProperties
-from cangauge.bus.publish import (
-    ACKNOWLEDGE_EVERY,
-    FrameIds,
-    PackReport,
-    SocPublisher,
-    standard_filter,
-)
-from cangauge.bus.time_source import ReplayClock, TimeSourceName, is_clock, time_source
+from cangauge.bus.publish import ACKNOWLEDGE_EVERY, PackReport, SocPublisher, standard_filter
+from cangauge.bus.time_source import ReplayClock, is_clock, time_source
 from cangauge.bus.vehicle import Vehicle
 from cangauge.errors import InputError
 from cangauge.estimation.cells import CellEstimator
@@ -35,6 +29,7 @@ from cangauge.estimation.state import EstimatorState
 from cangauge.logs.log import Log
 from cangauge.logs.sign import sign_of_current
 from cangauge.model.model_file import Model
+from cangauge.settings import FrameIds, TimeSourceName
 from cangauge.types import Estimate, Reason, Sample, Status, status_of
 
 NOTHING_YET: Final = Estimate.unknown(Reason.NO_INITIAL_SOC | Reason.INPUT_STALE)

@@ -8,11 +8,9 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Final, Self
 
 from cangauge.bus.open import BusAddress, backend_capabilities, bus_address, is_multicast
-from cangauge.bus.publish import FrameIds
 from cangauge.bus.vehicle import Vehicle
 from cangauge.errors import CangaugeError, InputError
-from cangauge.estimation.power import PackLimits
-from cangauge.estimation.settings import EstimatorSettings, FullCharge, LongRest
+from cangauge.estimation.settings import EstimatorSettings
 from cangauge.model.model_file import Model
 from cangauge.service.config import DEFAULT_VEHICLE, PublishConfig, RunConfig
 from cangauge.service.output import Output
@@ -92,7 +90,6 @@ def load_vehicle(config: RunConfig) -> Vehicle:
 
 def pipeline_settings(config: RunConfig) -> PipelineSettings:
     """Return the settings of the estimator and its frames; may raise InputError."""
-    full, rest = config.full_charge, config.long_rest
     return PipelineSettings(
         estimator=EstimatorSettings(
             method=config.method,
@@ -102,12 +99,12 @@ def pipeline_settings(config: RunConfig) -> PipelineSettings:
             capacity_ah=config.capacity_ah,
             gap_s=config.max_gap_s,
             temperature_source=config.temperature_source or "unknown",
-            full_charge=None if full is None else FullCharge(**full.model_dump()),
-            long_rest=None if rest is None else LongRest(**rest.model_dump()),
-            limits=PackLimits(**config.limits.model_dump()),
+            full_charge=config.full_charge,
+            long_rest=config.long_rest,
+            limits=config.limits,
         ),
         time_source=config.time_source,
-        ids=FrameIds(**config.ids.model_dump()),
+        ids=config.ids,
     )
 
 

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from cangauge._text import number, significant
 from cangauge._typing import FloatArray
 from cangauge.logs.gaps import usual_gap_s
-from cangauge.model.delay_line import GAP_S
+from cangauge.settings import GAP_S
 
 Plot = Any
 """A bokeh figure; bokeh ships no types that mypy could follow."""
