@@ -339,10 +339,11 @@ def main() -> None:
     parser.add_argument("--only", action="append", choices=list(PARTS), help="repeat for several")
     parser.add_argument("--keep", action="store_true", help="keep the figures for the page")
     options = parser.parse_args()
+    found = {}
     for name in options.only or PARTS:
         sys.stderr.write(f"measuring: {name} …\n")
-        tables = tables_of({name: PARTS[name]()})
-        publish(f"cost-{name}", tables, ["src/cangauge", "core"], keeps=options.keep)
+        found[name] = PARTS[name]()
+    publish("cost", tables_of(found), ["src/cangauge", "core"], keeps=options.keep)
 
 
 if __name__ == "__main__":
