@@ -172,7 +172,7 @@ def _seconds_of_numbers(
         raise InputError(problem, source=source, field=label, value=typical, cure=cure)
     hours, minutes, seconds = values // 10_000.0, values // 100.0 % 100.0, values % 100.0
     spells = (hours >= 0.0) & (hours < 24.0) & (minutes < 60.0) & (seconds < 60.0)
-    clock_s = _over_midnight(hours * 3600.0 + minutes * 60.0 + seconds)
+    clock_s = over_midnight(hours * 3600.0 + minutes * 60.0 + seconds)
     # A count of seconds has some of 60 to 99 of each hundred; a clock has none, and no gap there.
     steps, clock_steps = np.diff(finite), np.diff(clock_s[np.isfinite(values)])
     usual = float(np.median(steps)) if steps.size else np.inf
@@ -208,7 +208,7 @@ def seconds_of_text(cells: Any, unit: str, source: str, label: str) -> tuple[Flo
     if not is_clock(first):
         return _dates(parts, of_day_s, unit)
     values = np.nan_to_num(_numbers(parts, "d")) * 86400.0 + of_day_s
-    return _over_midnight(values), "clock time"
+    return over_midnight(values), "clock time"
 
 
 def _iso_dates(cells: Any, unit: str) -> tuple[FloatArray, str] | None:
@@ -228,7 +228,7 @@ def _iso_dates(cells: Any, unit: str) -> tuple[FloatArray, str] | None:
     return None
 
 
-def _over_midnight(of_day_s: FloatArray) -> FloatArray:
+def over_midnight(of_day_s: FloatArray) -> FloatArray:
     """Return times of day [s] with the days that pass at each midnight, NaN where missing."""
     values, read = of_day_s.copy(), np.isfinite(of_day_s)
     values[read] += np.cumsum(np.diff(values[read], prepend=0.0) < -43200.0) * 86400.0

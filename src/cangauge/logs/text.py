@@ -189,7 +189,7 @@ def find_table(head: Head, given: ColumnMap | None = None) -> TextTable | None:
         if bare is not None:
             return bare
     canonical = None
-    for table in chain(_headed(head, rows=1), _headed(head, rows=2)):
+    for table in chain(headed(head, rows=1), headed(head, rows=2)):
         with suppress(InputError):  # no column has a heading that the user names
             choice = choose_columns(table.headings, (), given)
             if choice.is_complete:
@@ -198,7 +198,7 @@ def find_table(head: Head, given: ColumnMap | None = None) -> TextTable | None:
     return canonical and _above_data(canonical, given)
 
 
-def _headed(head: Head, rows: int) -> Iterator[TextTable]:
+def headed(head: Head, rows: int) -> Iterator[TextTable]:
     """Yield a table below every line or two, if the words of a header are in two rows."""
     for number, delimiter in product(range(len(head.lines) - rows + 1), _DELIMITERS):
         if delimiter not in head.lines[number]:
@@ -261,7 +261,7 @@ def likely_header(head: Head, given: ColumnMap | None = None) -> tuple[list[str]
         If the header has none of a column of the user.
     """
     best: list[str] = []
-    for table in _headed(head, rows=1):
+    for table in headed(head, rows=1):
         if _values_in(table.headings) > 1:
             break
         below = head.lines[table.skip_lines : table.skip_lines + _ROWS_ABOVE_DATA]

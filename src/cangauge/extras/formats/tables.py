@@ -1,7 +1,9 @@
-"""Tables in other clothes: a workbook's longest sheet, the history of Home Assistant."""
+"""Tables in other clothes: a workbook's longest sheet, a row per value."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import dataclass
 from itertools import islice
 from typing import Any, Final
 
@@ -10,17 +12,26 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from cangauge._files import Head
+from cangauge._typing import FloatArray
 from cangauge.errors import InputError
 from cangauge.logs.column_map import ColumnMap, choose_columns, unknown_columns
 from cangauge.logs.draft import DraftLog
+from cangauge.logs.headings import meaning_of
 from cangauge.logs.read import LogTableReader
-from cangauge.logs.stamps import seconds_of_text
-from cangauge.logs.table import ArrowTable, draft_of_table, held
-from cangauge.logs.text import MAX_ROWS, TextTable, split_cells
+from cangauge.logs.stamps import over_midnight, seconds_of
+from cangauge.logs.table import ArrowTable, draft_of_table
+from cangauge.logs.text import MAX_ROWS, TextTable, headed
+from cangauge.logs.values import is_text
 
-HOLD_ENTITY_S: Final = 60.0
-"""Longest time that a stored value is held [s], as long as charge is counted over a gap: a recorder
-stores a value when it changes."""
+HOLD_S: Final = 60.0
+"""Longest time that a current or voltage is held [s], as long as charge is counted over a gap: a
+recorder stores a value when it changes."""
+POLLED_SHARE: Final = 0.1
+"""Share of values that repeat the one before from which they are polled, not stored on change [-]:
+of many series some, such as the temperature, hardly move."""
+DAY_S: Final = 86_400.0
+_TIME: Final = "time"
+"""Heading of the rows' time."""
 
 
 class Workbook:
@@ -96,63 +107,178 @@ def _rows(sheet: Any) -> list[str]:
     return [line for line in islice(lines, MAX_ROWS) if line.strip()]
 
 
-class EntityHistory:
-    """A row per entity and change, as Home Assistant exports: the entity is the heading."""
+class LongTable:
+    """A row per value: a name, a value and a time, pivoted on time; the names are the headings.
+
+    Car Scanner (`PID`, `VALUE`), InfluxDB (`_field`, `_value`), Home Assistant (`entity_id`,
+    `state`). Some store a value when it changes, others whenever they ask for it.
+    """
 
     takes_columns = True
-    _NAMES: Final = ("entity_id", "state", "last_changed")
+    _NAMES: Final = (
+        *("pid", "entity_id", "_measurement", "_field", "field", "name", "signal", "channel"),
+        *("sensor", "parameter", "variable", "metric", "topic", "key", "series", "tag"),
+    )
+    _VALUES: Final = ("value", "_value", "state")
+    _UNITS: Final = frozenset({"unit", "units", "unit_of_measurement"})
 
     def matches(self, head: Head) -> bool:
-        """Return whether the header is that of a history."""
-        return set(self._NAMES) <= {cell.lower() for cell in split_cells(head.first_line, ",")}
+        """Return whether the header has a name, a value and a time."""
+        return self._text(head) is not None
 
     def read(self, head: Head, columns: ColumnMap | None = None) -> DraftLog:
-        """Read a history: a row for every time at which the current or the voltage changed."""
-        names, first = split_cells(head.first_line, ","), head.lines.index(head.first_line) + 1
-        text = TextTable(head, ",", names, (), first, [])
-        lower = [cell.lower() for cell in names]
-        places = [lower.index(name) for name in self._NAMES]
-        cells = text.columns(places)
-        entity, state, changed = (cells[place].cast(pa.string()) for place in places)
-        source = str(head.path)
-        stamps, how = seconds_of_text(changed, "", source, "last_changed")
-        order = np.argsort(stamps, kind="stable")
-        stamps = stamps[order]
-        entity, values = entity.take(order), _as_numbers(state).take(order)
-        headings = ["time", *entity.unique().drop_null().to_pylist()]
+        """Read the values: a row for each current, or for each change."""
+        text = self._text(head)
+        if text is None:
+            raise InputError("no header with a name, a value and a time", source=head.path)
+        series = self._series(text)
+        headings = [_TIME, *series.headings]
         choice = choose_columns(headings, (), columns)
         if not choice.is_complete:
-            raise unknown_columns(source, headings, choice)
-        of_entity = {
-            name: np.where(pc.equal(entity, name).to_numpy(), values.to_numpy(), np.nan)
-            for name in headings[1:]
-        }
-        driving = [
-            headings[place] for q in ("current", "voltage") for place in choice.chosen[q].places
-        ]
-        is_change = np.any([np.isfinite(of_entity[name]) for name in driving], axis=0)
-        last = np.append(np.flatnonzero(np.diff(stamps) > 0.0), stamps.size - 1)
-        at = last[np.isin(stamps[last], stamps[is_change])]
-        table: dict[str, Any] = {"time": stamps[at]}
-        for name, column in of_entity.items():
-            latest, age_s = held(stamps, column, at)
-            is_old = (age_s > HOLD_ENTITY_S) & (name in driving)
-            table[name] = np.where(is_old, np.nan, latest)
-        known = np.all([np.isfinite(table[name]) for name in driving], axis=0)
-        frame = pa.table({name: each[known] for name, each in table.items()})
-        draft = draft_of_table(
-            ArrowTable(headings, frame.select), columns, name=head.name, source=source
+            raise unknown_columns(str(head.path), headings, choice)
+        current, voltage = (
+            [headings[place] for place in choice.chosen[quantity].places]
+            for quantity in ("current", "voltage")
         )
-        draft.assumed[0] = f'time = "last_changed" [{how}]'
-        draft.labels["time_s"] = "last_changed"
-        draft.ignored = ()
+        rows_s = series.stamps_of(current if series.is_polled else [*current, *voltage])
+
+        def read(wanted: list[str]) -> Any:
+            table = {}
+            for name in wanted:
+                if name == _TIME:
+                    table[name] = rows_s
+                elif name in voltage and series.is_polled:
+                    table[name] = series.nearest(name, rows_s)
+                else:
+                    is_driving = name in current or name in voltage
+                    table[name] = series.latest(name, rows_s, HOLD_S if is_driving else np.inf)
+            return pa.table(table)
+
+        draft = draft_of_table(
+            ArrowTable(headings, read), columns, name=head.name, source=str(head.path)
+        )
+        known = np.isfinite(draft.values["current_a"] + draft.values["voltage_v"])
+        draft.values = {name: values[known] for name, values in draft.values.items()}
+        draft.assumed[0] = f'time = "{series.time}" [{series.how}]'
+        draft.labels["time_s"] = series.time
+        each = "the current" if series.is_polled else "current and voltage, which are held"
+        pivoted = f"{len(series.headings)} series of {series.name} pivoted on time"
+        draft.remarks.append(f"a row per value: {pivoted}; a row for each value of {each}")
         return draft
+
+    def _text(self, head: Head) -> TextTable | None:
+        """Return the table of values; None where a row holds all quantities of one time."""
+        for text in headed(head, rows=1):
+            lower = {cell.lower() for cell in text.headings}
+            is_long = lower.intersection(self._NAMES) and lower.intersection(self._VALUES)
+            if is_long and not choose_columns(text.headings).is_complete and _time_of(text):
+                return text
+        return None
+
+    def _series(self, text: TextTable) -> _Series:
+        lower = [cell.lower() for cell in text.headings]
+        value = next(lower.index(name) for name in self._VALUES if name in lower)
+        named = [place for place, name in enumerate(lower) if name in self._NAMES]
+        units = [place for place, name in enumerate(lower) if name in self._UNITS]
+        time = text.headings.index(_time_of(text))
+        cells = text.columns([value, time, *named, *units])
+        # Rows of words ("unavailable"), and headers that are repeated for each table.
+        values = _as_numbers(cells[value])
+        known = pc.and_(pc.is_finite(values), pc.is_valid(cells[time]))
+        cells = {place: column.filter(known) for place, column in cells.items()}
+        words = {place: cells[place].cast(pa.string()) for place in [*named, *units]}
+        varying = [place for place in named if len(pc.unique(words[place])) > 1]
+        varying = varying or named[:1]
+        source, label = str(text.head.path), text.headings[time]
+        stamps, how = seconds_of([cells[time]], "", 1.0, source=source, label=label)
+        parts = [words[place] for place in varying]
+        parts += [
+            pc.binary_join_element_wise("[", pc.fill_null(words[place], ""), "]", "")
+            for place in units
+        ]
+        parts = [pc.fill_null(part, "") for part in parts]
+        names = pc.utf8_trim_whitespace(pc.binary_join_element_wise(*parts, " "))
+        names = pc.replace_substring(names, " []", "").combine_chunks().dictionary_encode()
+        if np.max(stamps, initial=0.0) < DAY_S:  # seconds of the day
+            stamps = over_midnight(stamps)
+        label_of_names = " and ".join(text.headings[place] for place in varying)
+        return _Series(
+            label_of_names, label, how, _by_name(names, stamps, values.filter(known).to_numpy())
+        )
+
+
+def _by_name(
+    names: Any, stamps_s: FloatArray, values: FloatArray
+) -> dict[str, tuple[FloatArray, FloatArray]]:
+    """Return times and values of each series, in the order of time."""
+    order = np.argsort(stamps_s, kind="stable")
+    codes = names.indices.to_numpy()[order]
+    order = order[np.argsort(codes, kind="stable")]
+    ends = np.cumsum(np.bincount(codes))
+    parts = zip(np.split(stamps_s[order], ends), np.split(values[order], ends), strict=True)
+    named = zip(names.dictionary.to_pylist(), parts, strict=False)  # the last part is empty
+    return {name: part for name, part in named if name}
+
+
+@dataclass(frozen=True, slots=True)
+class _Series:
+    """Times [s] and values of each series of a long table, in the order of time.
+
+    `name` and `time` are the headings of the names and the times, `how` tells how times are read.
+    """
+
+    name: str
+    time: str
+    how: str
+    by_name: dict[str, tuple[FloatArray, FloatArray]]
+
+    @property
+    def headings(self) -> list[str]:
+        """The names of the series."""
+        return [*self.by_name]
+
+    @property
+    def is_polled(self) -> bool:
+        """Whether values are stored whether or not they changed."""
+        repeats = [np.diff(values) == 0.0 for _, values in self.by_name.values()]
+        return bool(np.mean(np.concatenate(repeats)) > POLLED_SHARE)
+
+    def stamps_of(self, names: Sequence[str]) -> FloatArray:
+        """Return the times of all values of some series [s]."""
+        return np.unique(np.concatenate([self.by_name[name][0] for name in names]))
+
+    def latest(self, name: str, at_s: FloatArray, longest_s: float) -> FloatArray:
+        """Return the latest value at some times, NaN where it is older than `longest_s`."""
+        stamps_s, values = self.by_name[name]
+        before = np.searchsorted(stamps_s, at_s, side="right") - 1
+        age_s = at_s - stamps_s[np.maximum(before, 0)]
+        is_known = (before >= 0) & (age_s <= longest_s)
+        return np.where(is_known, values[np.maximum(before, 0)], np.nan)
+
+    def nearest(self, name: str, at_s: FloatArray) -> FloatArray:
+        """Return the value nearest to some times, NaN where it is farther than `HOLD_S`."""
+        stamps_s, values = self.by_name[name]
+        after = np.clip(np.searchsorted(stamps_s, at_s), 0, stamps_s.size - 1)
+        before = np.maximum(after - 1, 0)
+        is_before = at_s - stamps_s[before] <= np.abs(stamps_s[after] - at_s)
+        place = np.where(is_before, before, after)
+        return np.where(np.abs(stamps_s[place] - at_s) <= HOLD_S, values[place], np.nan)
+
+
+def _time_of(text: TextTable) -> str:
+    """Return the most direct heading of time, "" without any."""
+    meanings = [(meaning_of(heading), heading) for heading in text.headings]
+    times = [(m.rank, heading) for m, heading in meanings if m and m.quantity == "time"]
+    return min(times, key=lambda item: item[0], default=(0, ""))[1]
 
 
 def _as_numbers(cells: Any) -> Any:
-    is_number = pc.match_substring_regex(cells, r"^\s*[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?\s*$")
-    numbers = pc.if_else(is_number, pc.utf8_trim_whitespace(cells), pa.scalar(None, pa.string()))
-    return pc.fill_null(pc.cast(numbers, pa.float64()), float("nan"))
+    if not is_text(cells):
+        return cells.combine_chunks()
+    trimmed = pc.utf8_trim_whitespace(pc.replace_substring(cells.cast(pa.string()), ",", "."))
+    is_number = pc.match_substring_regex(trimmed, r"^[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?$")
+    numbers = pc.if_else(is_number, trimmed, pa.scalar(None, pa.string()))
+    return pc.fill_null(pc.cast(numbers, pa.float64()), float("nan")).combine_chunks()
 
 
-READERS: Final = (Workbook(), EntityHistory())
+READERS: Final = (Workbook(), LongTable())
