@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import pytest
 
-from cangauge.logs.column_map import ColumnMap, choose_columns, unknown_columns
+from cangauge.logs.column_map import ColumnMap
+from cangauge.logs.columns import UnknownColumnsError, choose_columns
 from cangauge.logs.headings import meaning_of
+from cangauge.logs.proposals import proposing
 
 SPELLINGS = {
     "Arbin": (
@@ -109,7 +111,8 @@ def test_several_of_a_kind_are_left_to_the_user() -> None:
     headings = ["Time [s]", "Battery Current [A]", "Battery Current [A]", "Voltage 1", "Voltage 2"]
     choice = choose_columns(headings)
     assert set(choice.chosen) == {"time"}
-    error = str(unknown_columns("x.csv", headings, choice))
+    unknown = UnknownColumnsError("x.csv", headings, choice, None)
+    error = str(proposing(unknown, lambda _: True))
     assert "--columns 'time=Time [s],current=?,voltage=?'" in error
     assert error.endswith("; current is #2 or #3; voltage is Voltage 1 or Voltage 2")
 

@@ -11,8 +11,8 @@ import numpy as np
 from cangauge._text import counted
 from cangauge._typing import BoolArray, FloatArray
 from cangauge.errors import InputError
-from cangauge.logs.column_map import shown_headings
-from cangauge.logs.headings import cell_number
+from cangauge.logs.columns import shown_headings
+from cangauge.logs.headings import Rank, cell_number, meaning_of
 from cangauge.logs.log import Log
 from cangauge.logs.sign import resolve_sign
 from cangauge.logs.units import REQUIRED, known_temperature_source, refuse_wrong_units
@@ -169,9 +169,10 @@ class DraftLog:
             self.temperature_source = "unknown"
         elif "temperature_c" not in self.values:
             found = f" (found: {shown_headings(self.headings)})" if self.headings else ""
-            named = "name its column with --columns temperature=…" if found else "add this column"
-            option = "--temperature" if self.source else "temperature_c"
-            cure = f"{named} [°C], or give a constant with {option}"
+            cure = "give a constant: --temperature 25"
+            likely = [text for text in self.ignored if _may_be_temperature(text)]
+            if likely:
+                cure = f"name its column: --columns 'temperature={likely[0]}'"
             raise self.error("temperature_c", f"the {kind} holds no temperature{found}", cure)
 
     def _drop_incomplete(self) -> None:
@@ -179,7 +180,11 @@ class DraftLog:
         incomplete = np.any([*lacks.values()], axis=0)
         for name, rows in lacks.items():
             if rows.all():
-                raise self.error(name, "the column is empty", "check the export")
+                quantity = name.rpartition("_")[0]
+                cure = f"name another one: --columns {quantity}=…"
+                if name == "temperature_c":
+                    cure = "give a constant: --temperature 25"
+                raise self.error(name, "the column is empty", cure)
         count, row = int(incomplete.sum()), int(np.argmax(incomplete))
         lacking = "time, current, voltage or temperature"
         if count > MAX_INCOMPLETE * incomplete.size:
@@ -235,3 +240,9 @@ class DraftLog:
         """Return the error for a column, by its canonical name or, of others, its heading."""
         label = self.labels.get(name, name)
         return InputError(problem, source=self.where, field=label, value=value, cure=cure)
+
+
+def _may_be_temperature(heading: str) -> bool:
+    """Return whether a heading is a temperature that only the user can confirm."""
+    meaning = meaning_of(heading)
+    return bool(meaning and meaning.quantity == "temperature" and meaning.rank == Rank.GUESS)

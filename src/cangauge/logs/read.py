@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, partial
 from importlib import import_module
 from importlib.metadata import entry_points
 from os import PathLike
@@ -17,10 +17,12 @@ from cangauge._files import Head
 from cangauge._typing import FloatArray
 from cangauge.errors import InputError, require_temperature
 from cangauge.logs.canonical import arrow_table, parquet_table
-from cangauge.logs.column_map import DOCS, ColumnMap, choose_columns, unknown_columns
+from cangauge.logs.column_map import DOCS, ColumnMap
+from cangauge.logs.columns import UnknownColumnsError, choose_columns
 from cangauge.logs.draft import DraftLog, Sign
 from cangauge.logs.headings import cell_number
 from cangauge.logs.log import Log
+from cangauge.logs.proposals import Beginning, proposing
 from cangauge.logs.table import ArrowTable, draft_of_table
 from cangauge.logs.text import TextTable, find_table, likely_header
 from cangauge.logs.values import numbers_of, with_decimal_points
@@ -75,7 +77,7 @@ class LogTableReader:
         is_parquet = head.data.startswith(_PARQUET)
         table = parquet_table(head) if is_parquet else find_table(head, columns)
         if table is None:
-            raise unknown_columns(str(head.path), *likely_header(head, columns))
+            raise UnknownColumnsError(str(head.path), *likely_header(head, columns), columns)
         return table
 
 
@@ -139,7 +141,7 @@ class LogFile:
         try:
             if self.reader is None:
                 raise not_recognised(self, "not a known kind of log", f"known are: {KNOWN_LOGS}")
-            draft = self.reader.read(self.head, self.columns)
+            draft = self._draft(self.reader)
             draft.ignored = tuple(name for name in draft.ignored if name not in self.used)
             log = draft.log(temperature_c, temperature_source, self.sign)
         except MemoryError as error:
@@ -147,6 +149,22 @@ class LogFile:
             raise InputError(problem, source=self.head.path, cure=cure) from error
         pa.default_memory_pool().release_unused()
         return log
+
+    def _draft(self, reader: LogReader) -> DraftLog:
+        try:
+            return reader.read(self.head, self.columns)
+        except UnknownColumnsError as error:
+            raise proposing(error, partial(self.reads, reader)) from error
+
+    def reads(self, reader: LogReader, columns: ColumnMap) -> bool:
+        """Return whether a reader makes a log of the file's beginning by these columns."""
+        head = Beginning(self.head) if self.head.lines else self.head
+        constant_c = None if "temperature" in columns.texts else 20.0
+        try:
+            draft = reader.read(head, columns)
+            return len(draft.log(constant_c, None, self.sign)) > 1
+        except InputError:
+            return False
 
     def cells(self, time_s: FloatArray) -> CellColumns | None:
         """Return the cell voltages beside a log in a table; None where it has none.
@@ -187,7 +205,8 @@ def not_recognised(file: LogFile, problem: str, cure: str) -> InputError:
     headings, choice = likely_header(head)
     is_of_frames = not _FRAME_WORDS.isdisjoint(text.strip().lower() for text in headings)
     if len(headings) >= 3 and not is_of_frames:
-        error = unknown_columns(str(head.path), headings, choice)
+        unknown = UnknownColumnsError(str(head.path), headings, choice, None)
+        error = proposing(unknown, partial(file.reads, LogTableReader()))
         return InputError(f"{problem}: {error.problem}", source=head.path, cure=error.cure)
     shown = head.first_line.strip()
     is_text = bool(shown) and shown.isprintable()

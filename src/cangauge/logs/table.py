@@ -20,16 +20,16 @@ import pyarrow.compute as pc
 
 from cangauge._typing import FloatArray, IntArray
 from cangauge.errors import InputError
-from cangauge.logs.column_map import (
+from cangauge.logs.column_map import ColumnMap
+from cangauge.logs.columns import (
     ChosenColumn,
-    ColumnMap,
+    UnknownColumnsError,
     choose_columns,
     refuse_doubled,
     refuse_odd_names,
-    unknown_columns,
 )
 from cangauge.logs.draft import MAX_INCOMPLETE, DraftLog
-from cangauge.logs.headings import GUESS
+from cangauge.logs.headings import Rank
 from cangauge.logs.stamps import is_clock, is_stamp, seconds_of
 from cangauge.logs.text import TextTable
 from cangauge.logs.units import (
@@ -94,7 +94,7 @@ def draft_of_table(
     if choice.is_canonical:
         refuse_odd_names(headings, where)
     if not choice.is_complete:
-        raise unknown_columns(where, headings, choice)
+        raise UnknownColumnsError(where, headings, choice, given)
     chosen = choice.chosen
     words = [k for k, text in enumerate(headings) if text.strip().lower() == SOURCE][:1]
     wanted = [place for column in chosen.values() for place in column.places]
@@ -231,13 +231,20 @@ def _time(
     if date is not None:
         column = replace(column, places=(date, *column.places), others=())
     time_s, how = read(column)
-    others = [item for item in column.others if item[1].rank < GUESS]
+    others = [item for item in column.others if item[1].rank < Rank.GUESS]
     for place, meaning in () if _increases(time_s) else others:
         other = replace(column, places=(place,), unit=meaning.unit)
         with suppress(InputError):
             other_s, other_how = read(other)
             if _increases(other_s):
                 return other_s, other_how, other
+    finite = time_s[np.isfinite(time_s)]
+    if finite.size > 1 and np.ptp(finite) == 0.0:
+        label = " + ".join(headings[place] for place in column.places)
+        problem = "this column does not move: it is no time"
+        cure = "name another one: --columns time=…"
+        value = float(finite[0])
+        raise InputError(problem, source=where, field=label, value=value, cure=cure)
     return time_s, how, column
 
 

@@ -18,7 +18,8 @@ import pyarrow.csv as pacsv
 
 from cangauge._files import Head, as_utf8
 from cangauge.errors import InputError
-from cangauge.logs.column_map import Choice, ColumnMap, are_canonical, choose_columns
+from cangauge.logs.column_map import ColumnMap
+from cangauge.logs.columns import Choice, are_canonical, choose_columns
 from cangauge.logs.headings import meaning_of
 from cangauge.logs.stamps import is_stamp
 from cangauge.logs.units import FIELDS, unit_of

@@ -13,7 +13,8 @@ import pyarrow.compute as pc
 from cangauge._files import Head
 from cangauge._typing import FloatArray
 from cangauge.errors import InputError
-from cangauge.logs.column_map import ColumnMap, shown_headings
+from cangauge.logs.column_map import ColumnMap
+from cangauge.logs.columns import shown_headings
 from cangauge.logs.draft import DraftLog
 from cangauge.logs.headings import LONGEST
 from cangauge.logs.text import TextTable, split_cells

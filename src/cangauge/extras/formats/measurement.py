@@ -15,7 +15,8 @@ from cangauge._files import MIB, Head
 from cangauge._typing import FloatArray
 from cangauge.errors import InputError
 from cangauge.logs.canonical import build_table
-from cangauge.logs.column_map import ColumnMap, choose_columns, unknown_columns
+from cangauge.logs.column_map import ColumnMap
+from cangauge.logs.columns import UnknownColumnsError, choose_columns
 from cangauge.logs.draft import DraftLog
 from cangauge.logs.table import ArrowTable, draft_of_table
 from cangauge.logs.text import MAX_COLUMNS, MAX_ROWS
@@ -55,7 +56,7 @@ def _draft_of_channels(
     names = [_TIME, *(name for name in headings if name != _TIME)]
     choice = choose_columns(names, (), given)
     if not choice.is_complete:
-        raise unknown_columns(source, names, choice)
+        raise UnknownColumnsError(source, names, choice, given)
     held = {names[p] for q in ("temperature", "soc") if q in choice.chosen
             for p in choice.chosen[q].places}  # fmt: skip
     current = names[choice.chosen["current"].places[0]]

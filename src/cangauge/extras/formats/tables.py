@@ -14,7 +14,8 @@ import pyarrow.compute as pc
 from cangauge._files import Head
 from cangauge._typing import FloatArray
 from cangauge.errors import InputError
-from cangauge.logs.column_map import ColumnMap, choose_columns, unknown_columns
+from cangauge.logs.column_map import ColumnMap
+from cangauge.logs.columns import UnknownColumnsError, choose_columns
 from cangauge.logs.draft import DraftLog
 from cangauge.logs.headings import meaning_of
 from cangauge.logs.read import LogTableReader
@@ -135,7 +136,7 @@ class LongTable:
         headings = [_TIME, *series.headings]
         choice = choose_columns(headings, (), columns)
         if not choice.is_complete:
-            raise unknown_columns(str(head.path), headings, choice)
+            raise UnknownColumnsError(str(head.path), headings, choice, columns)
         current, voltage = (
             [headings[place] for place in choice.chosen[quantity].places]
             for quantity in ("current", "voltage")
@@ -143,15 +144,12 @@ class LongTable:
         rows_s = series.stamps_of(current if series.is_polled else [*current, *voltage])
 
         def read(wanted: list[str]) -> Any:
+            at_rows = series.nearest if series.is_polled else series.latest
             table = {}
             for name in wanted:
-                if name == _TIME:
-                    table[name] = rows_s
-                elif name in voltage and series.is_polled:
-                    table[name] = series.nearest(name, rows_s)
-                else:
-                    is_driving = name in current or name in voltage
-                    table[name] = series.latest(name, rows_s, HOLD_S if is_driving else np.inf)
+                is_driving = name in current or name in voltage
+                longest_s = HOLD_S if is_driving else np.inf
+                table[name] = rows_s if name == _TIME else at_rows(name, rows_s, longest_s)
             return pa.table(table)
 
         draft = draft_of_table(
@@ -248,21 +246,24 @@ class _Series:
         return np.unique(np.concatenate([self.by_name[name][0] for name in names]))
 
     def latest(self, name: str, at_s: FloatArray, longest_s: float) -> FloatArray:
-        """Return the latest value at some times, NaN where it is older than `longest_s`."""
-        stamps_s, values = self.by_name[name]
-        before = np.searchsorted(stamps_s, at_s, side="right") - 1
-        age_s = at_s - stamps_s[np.maximum(before, 0)]
-        is_known = (before >= 0) & (age_s <= longest_s)
-        return np.where(is_known, values[np.maximum(before, 0)], np.nan)
+        """Return the latest value at some times, NaN where it is older than `longest_s`.
 
-    def nearest(self, name: str, at_s: FloatArray) -> FloatArray:
-        """Return the value nearest to some times, NaN where it is farther than `HOLD_S`."""
+        Without such a limit the first value also holds before it.
+        """
+        stamps_s, values = self.by_name[name]
+        place = np.maximum(np.searchsorted(stamps_s, at_s, side="right") - 1, 0)
+        age_s = at_s - stamps_s[place]
+        is_known = (age_s >= 0.0) & (age_s <= longest_s)
+        return np.where(is_known | np.isinf(longest_s), values[place], np.nan)
+
+    def nearest(self, name: str, at_s: FloatArray, longest_s: float) -> FloatArray:
+        """Return the value nearest to some times, NaN where it is farther than `longest_s`."""
         stamps_s, values = self.by_name[name]
         after = np.clip(np.searchsorted(stamps_s, at_s), 0, stamps_s.size - 1)
         before = np.maximum(after - 1, 0)
-        is_before = at_s - stamps_s[before] <= np.abs(stamps_s[after] - at_s)
+        is_before = np.abs(at_s - stamps_s[before]) <= np.abs(stamps_s[after] - at_s)
         place = np.where(is_before, before, after)
-        return np.where(np.abs(stamps_s[place] - at_s) <= HOLD_S, values[place], np.nan)
+        return np.where(np.abs(stamps_s[place] - at_s) <= longest_s, values[place], np.nan)
 
 
 def _time_of(text: TextTable) -> str:

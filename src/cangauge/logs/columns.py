@@ -1,0 +1,315 @@
+"""Which columns of a table hold which quantity: the user's, else by plain headings."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from itertools import repeat
+from typing import Final
+
+from cangauge.errors import InputError, closest
+from cangauge.logs.column_map import DOCS, SYNTAX, ColumnMap, meant_by
+from cangauge.logs.headings import Meaning, Rank, meaning_of, names_and_units
+from cangauge.logs.units import CANONICAL_UNIT, FIELDS, REQUIRED, unit_of
+from cangauge.settings import TemperatureSource
+
+NEEDED: Final = ("time", "current", "voltage")
+"""Quantities that every table holds; a temperature may be given as a constant."""
+_CANONICAL: Final = (*FIELDS.values(), "temperature_source")
+_JOINED: Final = ("time", "temperature")
+"""Quantities of several columns: a date and its time; probes, whose median is taken."""
+_DIRECTION: Final = re.compile(r"(?P<dis>dis?|de)?[-_ ]?(?:charg(?:ed|e|ing)|chg)", re.IGNORECASE)
+
+_Found = tuple[int, Meaning]
+"""Place and meaning of a column."""
+
+
+@dataclass(frozen=True, slots=True)
+class ChosenColumn:
+    """Columns of a table that hold one quantity.
+
+    Several places are a date and its time, temperatures whose median is taken, or the currents of
+    discharge and charge, whose difference is taken. The unit is the user's, the heading's or that
+    of the row of units. `others` are further columns of time: dates beside a clock, or times in
+    case that the first does not increase. `is_stated`: with the user's unit or factor.
+    """
+
+    places: tuple[int, ...]
+    unit: str = ""
+    factor: float = 1.0
+    source: TemperatureSource = "unknown"
+    is_stated: bool = False
+    others: tuple[_Found, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class Choice:
+    """Columns of a table by quantity, and the likely columns of each that is not plain.
+
+    `is_canonical`: by the names of the canonical log, which define the sign of the current.
+    """
+
+    chosen: dict[str, ChosenColumn] = field(default_factory=dict)
+    guesses: dict[str, list[_Found]] = field(default_factory=dict)
+    is_canonical: bool = False
+
+    @property
+    def is_complete(self) -> bool:
+        """Whether time, current and voltage are known or named."""
+        return set(NEEDED) <= set(self.chosen)
+
+
+class UnknownColumnsError(InputError):
+    """A table whose columns are not plain, with the likely ones of each quantity.
+
+    `likely` are texts as a user would state them, `stated` those that the user states.
+    """
+
+    def __init__(
+        self, source: str, headings: Sequence[str], choice: Choice, given: ColumnMap | None
+    ) -> None:
+        needed = [name for name in NEEDED if name not in choice.chosen]
+        missing = " and ".join(filter(None, (", ".join(needed[:-1]), *needed[-1:])))
+        problem = f"no plain heading of {missing} (found: {shown_headings(headings)})"
+        super().__init__(problem, source=source, cure=f"name the columns with --columns ({DOCS})")
+        self.stated = {} if given is None else dict(given.texts)
+        self.likely = _likely(headings, choice)
+
+
+def _likely(headings: Sequence[str], choice: Choice) -> dict[str, list[str]]:
+    """Return the likely columns of each quantity, as texts of `--columns`."""
+
+    def text_of(place: int, meaning: Meaning | None = None) -> str:
+        text = headings[place] if headings.count(headings[place]) == 1 else f"#{place + 1}"
+        unit = "" if meaning is None else meaning.unit
+        return text if unit in {"", names_and_units(headings[place])[0][1]} else f"{text}[{unit}]"
+
+    likely = {}
+    for quantity in FIELDS:
+        found: list[str] = []
+        if quantity in choice.chosen:
+            column = choice.chosen[quantity]
+            found.append("+".join(text_of(place) for place in column.places))
+            found += [text_of(place, meaning) for place, meaning in column.others]
+        found += [text_of(place, meaning) for place, meaning in choice.guesses.get(quantity, ())]
+        if found:
+            likely[quantity] = found
+    return likely
+
+
+def choose_columns(
+    headings: Sequence[str], units_below: Sequence[str] = (), given: ColumnMap | None = None
+) -> Choice:
+    """Choose the columns of a table: the user's first, then the canonical or plain headings.
+
+    Raises
+    ------
+    InputError
+        If a column of the user is not in the table, or is named for two quantities.
+    """
+    if given is None and are_canonical(headings):
+        return _canonical(headings)
+    units = [*units_below, *repeat("", len(headings))]
+    meanings = [meaning_of(text, unit) for text, unit in zip(headings, units, strict=False)]
+    choice = Choice()
+    stated = ColumnMap() if given is None else given
+    for quantity in stated.texts:
+        column = _given_column(quantity, stated, headings, meanings)
+        _refuse_taken(column, quantity, choice, stated)
+        choice.chosen[quantity] = column
+    taken = {place for column in choice.chosen.values() for place in column.places}
+    for quantity in FIELDS:
+        if quantity in stated.texts:
+            continue
+        found = [
+            (place, meaning)
+            for place, meaning in enumerate(meanings)
+            if meaning is not None and meaning.quantity == quantity and place not in taken
+        ]
+        found.sort(key=lambda item: item[1].rank)
+        if found:
+            _choose(quantity, found, headings, choice)
+    return choice
+
+
+def _canonical(headings: Sequence[str]) -> Choice:
+    names = [_simple(heading) for heading in headings]
+    chosen = {
+        quantity: ChosenColumn((names.index(name),), CANONICAL_UNIT[quantity])
+        for quantity, name in FIELDS.items()
+        if name in names
+    }
+    return Choice(chosen, is_canonical=True)
+
+
+def are_canonical(headings: Sequence[str]) -> bool:
+    """Return whether columns have the names of a canonical log's, possibly an incomplete one.
+
+    A temperature of another name is not a missing one: such a table is a logger's own.
+    """
+    names = {_simple(heading) for heading in headings}
+    if len(names.intersection(REQUIRED)) < 2:
+        return False
+    return "temperature_c" in names or not any(map(_is_temperature, names.difference(_CANONICAL)))
+
+
+def _is_temperature(name: str) -> bool:
+    meaning = meaning_of(name)
+    return "temperature" in name or (meaning is not None and meaning.quantity == "temperature")
+
+
+def refuse_odd_names(headings: Sequence[str], source: str) -> None:
+    """Raise InputError if a column of the canonical log is missing, or if two have its name."""
+    names = [_simple(heading) for heading in headings]
+    for name in _CANONICAL:
+        refuse_doubled(name, names, source)
+        if name in REQUIRED[:3] and name not in names:
+            problem = f"this column is missing (found: {shown_headings(headings)})"
+            cure = "a log needs time_s, current_a (positive = discharge), voltage_v,"
+            cure += " temperature_c [s, A, V, °C]"
+            raise InputError(problem, source=source, field=name, cure=cure)
+
+
+def refuse_doubled(name: str, names: Sequence[str], source: str | None) -> None:
+    """Raise InputError if several columns have a name."""
+    count = list(names).count(name)
+    if count > 1:
+        problem = f"{count} columns have this name"
+        raise InputError(problem, source=source, field=name, cure="rename or drop all but one")
+
+
+# --- By plain headings
+
+
+def _choose(
+    quantity: str, found: Sequence[_Found], headings: Sequence[str], choice: Choice
+) -> None:
+    """Choose among the columns of a quantity, the most direct of which is first; or guess."""
+    place, first = found[0]
+    pair = _directions(headings, found) if quantity == "current" else None
+    best = _best(quantity, found)
+    are_siblings = _are_siblings(quantity, found)
+    if pair is not None:
+        choice.chosen[quantity] = pair
+    elif first.rank >= Rank.GUESS or are_siblings or not best:
+        rank = Rank.GUESS if are_siblings else min(first.rank, Rank.GUESS)
+        choice.guesses[quantity] = [item for item in found if item[1].rank <= rank]
+    elif quantity == "time":
+        choice.chosen[quantity] = ChosenColumn((place,), first.unit, others=tuple(found[1:]))
+    else:
+        places = tuple(place for place, _ in best)
+        meaning = best[0][1]
+        choice.chosen[quantity] = ChosenColumn(places, meaning.unit, source=meaning.source)
+
+
+def _best(quantity: str, found: Sequence[_Found]) -> list[_Found]:
+    """Return the most direct columns, none where several compete for one quantity."""
+    first = found[0][1]
+    best = [item for item in found if item[1].rank == first.rank]
+    if quantity == "temperature" and len(best) > 1:  # of one unit, °C first; T beside T1, T2 is it
+        celsius = [item for item in best if unit_of("temperature_c", item[1].unit) == (1.0, 0.0)]
+        best = celsius or [item for item in best if item[1].unit == first.unit]
+        best = [item for item in best if not item[1].numbered] or best
+    are_probes = quantity == "temperature" and all(meaning.numbered for _, meaning in best)
+    return best if len(best) == 1 or are_probes or quantity == "time" else []
+
+
+def _are_siblings(quantity: str, found: Sequence[_Found]) -> bool:
+    """Return whether the most direct column is one of several that differ by their numbers."""
+    numbered = [meaning.numbered for _, meaning in found if meaning.rank <= Rank.GUESS]
+    return quantity in {"current", "voltage"} and found[0][1].numbered and sum(numbered) > 1
+
+
+def _directions(headings: Sequence[str], found: Sequence[_Found]) -> ChosenColumn | None:
+    """Return the currents of discharge and charge, in this order, if they alone are plain."""
+    pairs: dict[tuple[str, str], dict[bool, int]] = {}
+    for place, meaning in found:
+        match = _DIRECTION.search(headings[place])
+        rest = "" if match is None else _simple(headings[place].replace(match[0], ""))
+        without = meaning if match is None else meaning_of(rest)
+        if without is None or without.quantity != "current" or without.rank >= Rank.GUESS:
+            continue
+        is_discharge = bool(match and match["dis"])
+        pairs.setdefault((rest, meaning.unit), {})[is_discharge] = place
+    if len(pairs) != 1:
+        return None
+    ((_, unit), places), *_ = pairs.items()
+    return ChosenColumn((places[True], places[False]), unit) if len(places) == 2 else None
+
+
+# --- By the user
+
+
+def _given_column(
+    quantity: str, given: ColumnMap, headings: Sequence[str], meanings: Sequence[Meaning | None]
+) -> ChosenColumn:
+    for heading, stated, factor in meant_by(given.texts[quantity]):
+        places = _places(heading, headings, is_joined=quantity in _JOINED)
+        if not places:
+            continue
+        units = sorted({_stated_unit(headings[k], meanings[k], quantity) for k in places})
+        is_mixed = len({unit_of("temperature_c", unit or "C") for unit in units}) > 1
+        if quantity == "temperature" and stated is None and is_mixed:
+            shown = ", ".join(unit or "none" for unit in units)
+            problem = f"the headings have different units: {shown}"
+            raise given.error(quantity, problem, "name columns of one unit")
+        unit = units[0] if len(units) == 1 else ""
+        unit = unit if stated is None else stated
+        first = meanings[places[0]] if quantity == "temperature" else None
+        source = first.source if first is not None else "unknown"
+        is_stated = stated is not None or factor != 1.0
+        return ChosenColumn(places, unit, factor, source, is_stated)
+    near = closest(given.texts[quantity], headings)
+    problem = f"no column has this heading (found: {shown_headings(headings)})"
+    raise given.error(quantity, problem, f"did you mean {near}?" if near else SYNTAX)
+
+
+def _refuse_taken(column: ChosenColumn, quantity: str, choice: Choice, given: ColumnMap) -> None:
+    for other, chosen in choice.chosen.items():
+        if not set(column.places).isdisjoint(chosen.places):
+            cure = "give each quantity a column of its own, as headings or as #1, #2, …"
+            raise given.error(quantity, f"is the column of {other} too", cure)
+
+
+def _stated_unit(heading: str, meaning: Meaning | None, quantity: str) -> str:
+    """Return the unit of this quantity that a heading states, whatever its words; "" if none."""
+    if meaning is not None and meaning.quantity == quantity:
+        return meaning.unit
+    units = (unit for _, unit in names_and_units(heading)[:-1])
+    return next((unit for unit in units if unit_of(FIELDS[quantity], unit) is not None), "")
+
+
+def _places(text: str, headings: Sequence[str], *, is_joined: bool) -> tuple[int, ...]:
+    """Return the columns that a text names; none where it names no column, or not all."""
+    whole = _place(text, headings)
+    if whole is not None:
+        return (whole,)
+    places = [_place(part, headings) for part in text.split("+")] if is_joined else []
+    return () if None in places else tuple(place for place in places if place is not None)
+
+
+def _place(text: str, headings: Sequence[str]) -> int | None:
+    """Return the column of a text: its heading, its number, or the heading without the unit."""
+    if text in headings:  # `t` beside `T`
+        return headings.index(text)
+    name = _simple(text)
+    names = [_simple(heading) for heading in headings]
+    if name in names:
+        return names.index(name)
+    number = re.fullmatch(r"#(\d{1,5})", text.strip())
+    if number and 1 <= int(number[1]) <= len(headings):
+        return int(number[1]) - 1
+    bare = [_simple(names_and_units(heading)[0][0]) for heading in headings]
+    return bare.index(name) if bare.count(name) == 1 else None
+
+
+def _simple(text: str) -> str:
+    return " ".join(text.split()).casefold()
+
+
+def shown_headings(headings: Sequence[str]) -> str:
+    """Return the first headings of a table for a message."""
+    names = [name for name in headings if name]
+    more = f", … ({len(names)} in all)" if len(names) > 12 else ""
+    return ", ".join(names[:12]) + more
