@@ -34,11 +34,10 @@ from cangauge.logs.column_map import ColumnMap
 from cangauge.logs.draft import Sign
 from cangauge.logs.log import Log
 from cangauge.logs.read import KNOWN_LOGS, LogFile, not_recognised, open_log
-from cangauge.logs.sign import require_discharge_positive, resolve_sign
+from cangauge.logs.sign import resolve_sign
 from cangauge.logs.units import (
     WRAPPED,
     known_temperature_source,
-    refuse_wrapped,
     refuse_wrong_units,
 )
 from cangauge.settings import TemperatureSource
@@ -400,19 +399,6 @@ def capture_to_log(path: str | PathLike[str], vehicle: Vehicle) -> Log:
     except InputError as error:
         raise _of_capture(error, vehicle) from error
     return resolve_sign(log, stored_sign_unknown=False)
-
-
-def refuse_odd_current(samples: CaptureSamples, vehicle: Vehicle) -> None:
-    """Raise InputError if the current of a capture was read unsigned, or is inverted."""
-    log = samples.as_log()
-    if log is None:
-        return
-    try:
-        name = vehicle.current.codec.name
-        refuse_wrapped(log.current_a, log.voltage_v, samples.source, name)
-    except InputError as error:
-        raise _of_capture(error, vehicle) from error
-    require_discharge_positive(log, is_capture=True)
 
 
 def _of_capture(error: InputError, vehicle: Vehicle) -> InputError:

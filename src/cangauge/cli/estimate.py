@@ -217,7 +217,8 @@ def _of_capture(
     keeps_pack: bool,
 ) -> RecordedEstimate:
     """Estimate a capture; InputError if it has one sample, or inverted current."""
-    from cangauge.bus.recording import CaptureSamples, refuse_odd_current, refuse_single_row
+    from cangauge.bus.recording import CaptureSamples, refuse_single_row
+    from cangauge.logs.sign import require_discharge_positive
     from cangauge.service.offline import estimate_capture
 
     car = reading.car_of(path)
@@ -234,8 +235,8 @@ def _of_capture(
     refuse_single_row(recorded)
     for remark in recorded.remarks:
         note(f"{recorded.source}: {remark}")
-    if isinstance(recorded, CaptureSamples):
-        refuse_odd_current(recorded, car)
+    if isinstance(recorded, CaptureSamples) and (log := recorded.as_log()) is not None:
+        require_discharge_positive(log, is_capture=True)
     return done
 
 

@@ -184,7 +184,7 @@ def refuse_wrong_units(
         ("soc_pct", _wrong_soc(values.get("soc_pct"), is_stated="soc_pct" in stated)),
         ("temperature_c", _wrong_temperature(temperature, may_be_swapped=is_low)),
     )
-    refuse_wrapped(current, voltage, source, labels.get("current_a", "current_a"))
+    _refuse_wrapped(current, voltage, source, labels.get("current_a", "current_a"))
     for field, found in checks:
         label = labels.get(field, field)
         for value, problem, cure, units in found:  # the first is raised
@@ -300,7 +300,7 @@ def _wrong_voltage(voltage: FloatArray) -> Iterator[_Wrong]:
     yield from _odd_row(voltage, np.abs(voltage) > _MAX_VOLTAGE_V, "a battery's voltage")
 
 
-def refuse_wrapped(current: FloatArray, voltage: FloatArray, source: object, label: str) -> None:
+def _refuse_wrapped(current: FloatArray, voltage: FloatArray, source: object, label: str) -> None:
     """Raise InputError if a signed current was read as unsigned; shape (n,) in A and V."""
     found = wrapped_current(current, voltage)
     if found is not None:
