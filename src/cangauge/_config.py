@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import re
 import tomllib
 from collections.abc import Iterator
 from os import PathLike
@@ -14,6 +15,7 @@ from cangauge._files import read_bounded
 from cangauge.errors import InputError, closest
 
 MAX_TOML_BYTES: Final = 64 * 1024
+_LONG_KEY: Final = re.compile(rb"""(?<![\w"'.-])(?:["']?[\w-]+["']?[ \t]*\.[ \t]*){200}""")
 _UNION_TAGS: Final = {"bool", "int", "float", "str", "constrained-int", "constrained-float"}
 _UNKNOWN_KEY: Final = {"extra_forbidden", "unexpected_keyword_argument"}  # of models, dataclasses
 # Wording of pydantic, and the shorter one of our messages.
@@ -36,6 +38,8 @@ def read_toml(path: str | PathLike[str]) -> dict[str, Any]:
         If it is absent, too large or not TOML (with line and column).
     """
     data = read_bounded(path, MAX_TOML_BYTES, "a TOML file")
+    if _LONG_KEY.search(data):  # tomllib's time grows with the square of the parts
+        raise InputError("a key has hundreds of parts", source=path, cure="check the file")
     try:
         return tomllib.loads(data.decode("utf-8-sig"))
     except (ValueError, RecursionError) as error:  # ValueError: also not UTF-8

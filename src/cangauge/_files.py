@@ -175,6 +175,13 @@ class Head:
         if not self.data.strip():
             raise InputError("the file is empty", source=self.path, cure="check the export")
         self.lines = _lines(self.data)
+        is_cut = len(self.data) == HEAD_BYTES and not {10, 13} & {*self.data}
+        if self.lines and is_cut and self.data[:1] not in b"[{<":
+            raise InputError(
+                f"the first line is longer than {HEAD_BYTES // 1024} kB",
+                source=self.path,
+                cure="keep the columns of time, current, voltage, temperature and SoC",
+            )
 
     @property
     def first_line(self) -> str:

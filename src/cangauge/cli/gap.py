@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import os
 import sys
 from collections.abc import Callable, Iterable, Mapping
 from functools import partial
@@ -207,8 +208,8 @@ def _refuse(
         raise InputError("no model", field="--model", cure=cure)
     if None not in models[1:]:
         raise InputError("two simulators", field="--simulator", value=models[2], cure="give one")
-    known = {path.resolve() for path in references}
-    for path in (path for path in logs if path.resolve() in known):
+    known = {os.path.realpath(path) for path in references}
+    for path in (path for path in logs if os.path.realpath(path) in known):
         problem = "is both a LOG and a reference, which must be without the fault"
         raise InputError(problem, source=path, field="--reference", cure="give it as one of them")
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import os
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, is_dataclass, replace
 from pathlib import Path
@@ -343,10 +344,10 @@ def check_outputs(outputs: Iterable[Path | None], inputs: Iterable[Path]) -> Non
 
     None stands for an output that is not wanted.
     """
-    read = {path.resolve() for path in inputs}
+    read = {Path(os.path.realpath(path)) for path in inputs}
     written: set[Path] = set()
     for output in filter(None, outputs):
-        place = output.resolve()
+        place = Path(os.path.realpath(output))
         if place in read:
             problem, cure = "this output is also an input", "name another file for it"
             raise InputError(problem, source=output, cure=cure)

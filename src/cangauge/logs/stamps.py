@@ -15,7 +15,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from cangauge._typing import FloatArray
+from cangauge._typing import BoolArray, FloatArray
 from cangauge.errors import InputError
 from cangauge.logs.units import unit_of
 from cangauge.logs.values import first_text, is_number, is_text, numbers_of, present
@@ -69,19 +69,25 @@ _DIGITS: Final = r"^(19|20)?\d{2}(0[1-9]|1[0-2])([0-2]\d|3[01])([01]\d|2[0-3])([
 """`20240313235000` and `240313235000`."""
 
 
+def count_stamps(cells: Sequence[str]) -> int:
+    """Return how many cells hold a date or a clock time."""
+    return int(np.count_nonzero(_match(cells, _DATE_TIME) | _match(cells, _CLOCK_TIME)))
+
+
 def is_stamp(text: str) -> bool:
     """Return whether a cell holds a date or a clock time."""
-    return _matches(text, _DATE_TIME) or _matches(text, _CLOCK_TIME)
+    return count_stamps([text]) == 1
 
 
 def is_clock(text: str) -> bool:
     """Return whether a cell holds a clock time without a date."""
-    return _matches(text, _CLOCK_TIME)
+    return bool(_match([text], _CLOCK_TIME)[0])
 
 
-def _matches(text: str, pattern: str) -> bool:
-    cell = _spelled_alike(pa.array([text], pa.string()))
-    return bool(pc.match_substring_regex(cell, pattern)[0].as_py())
+def _match(cells: Sequence[str], pattern: str) -> BoolArray:
+    alike = _spelled_alike(pa.array(cells, pa.string()))
+    found: BoolArray = pc.match_substring_regex(alike, pattern).to_numpy(zero_copy_only=False)
+    return found
 
 
 def _spelled_alike(cells: Any) -> Any:

@@ -21,7 +21,7 @@ from cangauge.errors import InputError
 from cangauge.logs.column_map import ColumnMap
 from cangauge.logs.columns import Choice, are_canonical, choose_columns
 from cangauge.logs.headings import meaning_of
-from cangauge.logs.stamps import is_stamp
+from cangauge.logs.stamps import count_stamps, is_stamp
 from cangauge.logs.units import FIELDS, unit_of
 from cangauge.logs.values import MISSING, is_bare, is_number, is_spelled, is_text
 
@@ -179,7 +179,8 @@ def _is_value(cell: str) -> bool:
 
 
 def _values_in(cells: Sequence[str]) -> int:
-    return sum(map(_is_value, cells))
+    others = [cell for cell in cells if not is_number(cell)]
+    return len(cells) - len(others) + count_stamps(others)
 
 
 def find_table(head: Head, given: ColumnMap | None = None) -> TextTable | None:

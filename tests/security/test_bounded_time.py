@@ -1,0 +1,139 @@
+"""Every file is read, or refused in one line, within two seconds of processor time."""
+
+from __future__ import annotations
+
+import gzip
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from cangauge.bus.captures import open_capture
+from cangauge.bus.database import load_dbc
+from cangauge.bus.readers import capture_readers
+from cangauge.bus.vehicle import Vehicle
+from cangauge.errors import InputError
+from cangauge.extras.live.addresses import read_token
+from cangauge.logs.read import open_log
+from cangauge.model.model_file import Model
+from cangauge.service.config import load_config
+from cangauge.service.state import read_state
+from live import in_process
+
+PARTS, HEADINGS, WITHIN_S = 20_000, 40_000, 2.0
+
+
+def table(*names: str, rows: int = 20) -> bytes:
+    row = ",".join("1" for _ in names)
+    return "\n".join([",".join(names), *[row] * rows, ""]).encode()
+
+
+def wide(pattern: str, count: int = HEADINGS) -> bytes:
+    return table(*[pattern.format(number) for number in range(count)])
+
+
+def nested_multiplexers(depth: int = 12) -> bytes:
+    """Return a DBC in which each of four values of a multiplexer selects another one."""
+    below = range(1, depth)
+    signals = [f' SG_ S{k} m0M : {2 * k}|2@1+ (1,0) [0|0] "" E\n' for k in below]
+    values = [f"SG_MUL_VAL_ 256 S{k} S{k - 1} 0-3;\n" for k in below]
+    first = ' SG_ S0 M : 0|2@1+ (1,0) [0|0] "" E\n'
+    head = f'VERSION ""\nNS_ :\nBS_:\nBU_: E\nBO_ 256 M: 64 E\n{first}'
+    return "".join([head, *signals, *values]).encode()
+
+
+LOG = table("time_s", "current_a", "voltage_v", "temperature_c")
+FILES: dict[str, bytes] = {
+    "nothing": b"",
+    "zeros": bytes(1 << 22),
+    "a long line": b"a" * (1 << 22),
+    "long numbers": b"9" * (1 << 21),
+    "brackets": b"[" * 100_000,
+    "tables in tables": b"a = " + b"{a=" * 15_000,
+    "objects in objects": b'{"a":' * 100_000,
+    "a dotted key": ".".join(["a"] * PARTS).encode() + b" = 1\n",
+    "a dotted table": b"[" + ".".join(["a"] * PARTS).encode() + b"]\nx = 1\n",
+    "a dotted key of quotes": ".".join(["'a'"] * (PARTS // 2)).encode() + b" = 1\n",
+    "plain headings": wide("c{}"),
+    "headings of numbers": wide("{}"),
+    "headings of times": wide("Time {} [s]"),
+    "headings of dates": wide("2024-03-13 {}"),
+    "headings of volts": table(
+        "time_s", "current_a", "voltage_v", *[f"Voltage {n} [V]" for n in range(HEADINGS)]
+    ),
+    "headings in 64 kB": wide("c{}", 9_000),
+    "many commas": (b"," * 60_000 + b"\n") * 20,
+    "frames without ends": b"(1.0) can0 123#" + b"00" * (1 << 21),
+    "multiplexers": nested_multiplexers(),
+    "packed twice": gzip.compress(gzip.compress(LOG)),
+    "a packed table": gzip.compress(wide("c{}")),
+}
+
+
+def a_log(path: Path) -> object:
+    return open_log(path).read()
+
+
+def a_capture(path: Path) -> object:
+    return sum(1 for _ in open_capture(path))
+
+
+READERS: dict[str, Callable[[Path], object]] = {
+    "log": a_log,
+    "capture": a_capture,
+    "DBC": load_dbc,
+    "map": lambda path: Vehicle.load(map=path),
+    "configuration": load_config,
+    "model": Model.load,
+    "state": read_state,
+    "token": lambda path: read_token(path, {}),
+} | {
+    kind.name: (lambda path, kind=kind: sum(1 for _ in kind(path))) for kind in capture_readers()
+}  # fmt: skip
+
+
+def refusal(read: Callable[[Path], object], path: Path) -> str:
+    """Return why a file is refused; empty if it is read."""
+    try:
+        read(path)
+    except InputError as error:
+        return str(error)
+    return ""
+
+
+@pytest.fixture(scope="module", autouse=True)
+def imported(tmp_path_factory: pytest.TempPathFactory) -> None:
+    """Import what the readers import when they are first used."""
+    path = tmp_path_factory.mktemp("log") / "log.csv"
+    path.write_bytes(LOG)
+    for read in READERS.values():
+        refusal(read, path)
+
+
+@pytest.mark.parametrize("content", FILES)
+def test_every_reader_takes_bounded_time(content: str, tmp_path: Path) -> None:
+    path = tmp_path / "file"
+    path.write_bytes(FILES[content])
+    for name, read in READERS.items():
+        began_s = time.process_time()
+        why = refusal(read, path)
+        assert time.process_time() - began_s < WITHIN_S, name
+        assert len(why.splitlines()) <= 1
+        assert len(why) < 1000
+
+
+@pytest.mark.parametrize("reader", READERS)
+def test_a_link_to_itself_is_refused(reader: str, tmp_path: Path) -> None:
+    path = tmp_path / "file"
+    path.symlink_to(path)
+    with pytest.raises(InputError, match="cannot be read: Too many levels"):
+        READERS[reader](path)
+
+
+def test_a_command_refuses_a_link_to_itself(tmp_path: Path) -> None:
+    path = tmp_path / "log.csv"
+    path.symlink_to(path)
+    for command in (("inspect", path), ("fit", path, "-o", tmp_path / "m.json"), ("gap", path)):
+        ended = in_process(*command)
+        assert (ended.code, len(ended.err.splitlines())) == (2, 1), ended.err
