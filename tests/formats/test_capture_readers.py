@@ -276,6 +276,38 @@ class TestCarbus(Lines):
         )
 
 
+class TestUsbCan(Lines):
+    reader = text.UsbCanReader
+    kinds: ClassVar = {"remote": True}
+    header = "NO    Direction  Time Scale  Frame Type  Frame Format  Frame ID  Length  Data\n"
+    has_channels = False
+    is_relative = True
+    resolution_s = 1e-3
+
+    @staticmethod
+    def line(f: can.Message) -> str:
+        clock = datetime.fromtimestamp(f.timestamp, UTC).strftime("%H:%M:%S:%f")[:-3]
+        kind = "Remote" if f.is_remote_frame else "Data"
+        form = "Extended" if f.is_extended_id else "Standard"
+        return (
+            f"7      Receive      {clock}      {kind} frame      {form} frame"
+            f"      {f.arbitration_id:08x}      {f.dlc}      {_hex(f).lower()}       \n"
+        )
+
+
+class TestSlcan(Lines):
+    reader = text.SlcanReader
+    has_channels = False
+    is_relative = True
+    resolution_s = 1e-3
+
+    @staticmethod
+    def line(f: can.Message) -> str:
+        number = f"T{f.arbitration_id:08X}" if f.is_extended_id else f"t{f.arbitration_id:03X}"
+        stamp_ms = round(1000.0 * f.timestamp) % 60_000
+        return f"{number}{f.dlc}{_hex(f, '')}{stamp_ms:04X}\r"
+
+
 class TestCanHacker(Lines):
     reader = text.CanHackerReader
     header = "CAN speed 1: 500k CAN speed 2: 500k Id format: HEX | Data format: HEX\n\t \n"
@@ -340,7 +372,7 @@ class Written(Conformance):
 
 
 class TestAsc(Written):
-    reader = library.AscReader
+    reader = text.AscReader
     writer = can.ASCWriter
     kinds: ClassVar = {"remote": True, "fd": True}
     is_relative = True
@@ -350,7 +382,7 @@ class TestAsc(Written):
 class TestAscOfDifferences(Conformance):
     """Relative time stamps, as Vector writes them: since the event before, frame or not."""
 
-    reader = library.AscReader
+    reader = text.AscReader
     is_relative = True
 
     def write(self, path: Path, frames: Iterable[can.Message]) -> None:

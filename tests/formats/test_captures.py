@@ -288,7 +288,7 @@ def test_versions_of_peak_trc(tmp_path: Path, version: str) -> None:
         (b"Chn Identifier Flg   DLC  D0...1...2\n", "Kvaser", "SavvyCAN"),
         (b"# Logger type: CANLogger1000\n", "CLX000", "SavvyCAN"),
         (b"0.0005;RX;0x305;2;0x1F;0x03;\n", "Microchip", "SavvyCAN"),
-        (b"t30521F030000\r\nT18FF50E514A0016\r\n", "slcan", "SavvyCAN"),
+        (b"t30521F03\r\nT18FF50E514A\r\n", "slcan", "Z1"),
         (b'"No.","Time","Source","Info"\n"1","0.5","","ID: 773"\n', "Wireshark", "pcapng"),
         (b"ATMA\r\n305 1F 03 20 10\r\n", "ELM327", "stamps the frames"),
         ("date Wed Mar 13 23:50:00 2024\nbase hex\n".encode("utf-16"), "UTF-16", "iconv"),

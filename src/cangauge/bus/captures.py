@@ -21,9 +21,9 @@ CLOCK: Final = (0x1DB, 0.010)
 
 KNOWN_CAPTURES: Final = (
     "candump (log, and screen output), CRTD, SavvyCAN's GVRET CSV, cabana's CSV, Battery-Emulator's"
-    " log, CAN Hacker and CARBUS traces, Vector ASC and BLF, PEAK TRC, PCAP and PCAPNG, ASAM MF4,"
-    " python-can's CSV, tab-separated tables, and text of seconds, id, length, bytes; each"
-    " may be gzipped"
+    " log, CAN Hacker and CARBUS traces, text of CANalyst-II's tool and of slcan, Vector ASC and"
+    " BLF, PEAK TRC, PCAP and PCAPNG, ASAM MF4, python-can's CSV, tab-separated tables,"
+    " and text of seconds, id, length, bytes; each may be gzipped"
 )
 _CURE: Final = f"known are: {KNOWN_CAPTURES}"
 

@@ -8,16 +8,18 @@ in `cangauge.extras.formats`; those of other packages join by the entry point gr
 from __future__ import annotations
 
 import io
+import math
 import os
 import re
 import struct
 import zlib
 from abc import ABC, abstractmethod
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from functools import cache
 from importlib import import_module
 from importlib.metadata import entry_points
-from itertools import chain, islice
+from itertools import chain, islice, pairwise
 from pathlib import Path
 from typing import IO, Any, ClassVar, Final, Literal, cast
 
@@ -39,6 +41,16 @@ HEAD_LINES: Final = 400
 """First lines, by which a text format is recognised."""
 FEW_MALFORMED: Final = 100
 """A file with more malformed lines than this, and than frames, is refused at once."""
+PERIODS_S: Final = (1.0, 60.0, 3600.0, 2.0**32 / 1e6, 86400.0)
+"""Times after which clocks of loggers start again [s]: fractions of a second, seconds of a minute
+(slcan, CARBUS), minutes of an hour, 32 bits of microseconds, and times of day."""
+OUT_OF_ORDER_S: Final = 1.0
+"""Largest step back of frames that a logger writes out of order [s]."""
+STALE_FRAMES: Final = 100
+STALE_S: Final = 86400.0
+"""First frames that a logger's buffer may have kept from before, and the least time before [s]."""
+PAUSE_S: Final = 100.0
+"""Pause that is put between sessions in one file [s]: no charge is counted over it."""
 MOST_BUSES: Final = 64
 """Most buses in a file, each of which has its own decoder; frames of further ones are malformed."""
 MAX_ID: Final = 0x1FFFFFFF
@@ -108,14 +120,16 @@ class CaptureReader(MessageReader, ABC):
     def messages(self) -> Iterator[can.Message]:
         """Yield the frames of known buses with usable stamps, as far as the file can be read.
 
-        Raises InputError if most lines are malformed; it names the first.
+        Of each bus, time goes on where its clock starts again, and stale frames at the head are
+        left out. Raises InputError if most lines are malformed; it names the first.
         """
-        buses = set[Any]()
+        buses, clock = set[Any](), _Clock()
         try:
-            for message in self.read():
+            for message in self._current(self.read()):
                 is_known = message.channel in buses or len(buses) < MOST_BUSES
                 if is_known and abs(message.timestamp) <= MAX_STAMP_S:  # false for NaN
                     buses.add(message.channel)
+                    message.timestamp = clock.running_s(message.channel, message.timestamp)
                     self.frames += 1
                     yield message
                 else:
@@ -123,6 +137,31 @@ class CaptureReader(MessageReader, ABC):
         except DAMAGE as error:
             self.cut_off = True
             self.damage = f"{type(error).__name__}: {error}"
+        self.remarks += clock.remarks()
+
+    def _current(self, frames: Iterator[can.Message]) -> Iterator[can.Message]:
+        """Yield frames without those at the head that a logger's buffer has kept from before."""
+        head: list[can.Message] = []
+        damage: Exception | None = None
+        try:
+            head.extend(islice(frames, STALE_FRAMES))
+        except DAMAGE as error:
+            damage = error
+        stale = 0
+        for place, (one, two) in enumerate(pairwise(head[: len(head) // 2]), start=1):
+            step_s = two.timestamp - one.timestamp
+            is_jump = step_s < -OUT_OF_ORDER_S or step_s > STALE_S
+            is_turn = _Clock.turn_s(one.timestamp, two.timestamp, OUT_OF_ORDER_S) > 0.0
+            is_usable = abs(two.timestamp) <= MAX_STAMP_S and one.channel == two.channel
+            if is_usable and is_jump and not is_turn:
+                stale = place
+        if stale:
+            others = "1 frame" if stale == 1 else f"{stale} frames"
+            self.remarks.append(f"{others} at the head left out, with stamps of another time")
+        yield from head[stale:]
+        if damage is not None:
+            raise damage
+        yield from frames
 
     def __iter__(self) -> Iterator[can.Message]:
         """Yield the frames as `messages`; raise InputError for damage before the first one."""
@@ -145,6 +184,64 @@ class CaptureReader(MessageReader, ABC):
             problem = f"{self.malformed} {self.unit} are no frames of {self.name}{where}"
             problem += f", and only {self.frames} are"
             raise InputError(problem, source=self.source, cure="record or export it again")
+
+
+class _Clock:
+    """Stamps of a file as one running time."""
+
+    def __init__(self) -> None:
+        self._shift_s = self._longest_s = self._turn_s = 0.0
+        self._last_s = self._latest_s = -math.inf
+        """Latest stamp, and largest running time."""
+        self._buses: dict[Any, tuple[float, float]] = {}
+        """Latest stamp of each bus, and its shift: two adapters may have two clocks."""
+        self._turns: Counter[float] = Counter()
+        self._sessions = 1
+
+    @staticmethod
+    def turn_s(last_s: float, stamp_s: float, longest_s: float) -> float:
+        """Return the period after which the clock has started again; 0 where it has not.
+
+        The step is then about as long as others, of which `longest_s` is the longest [s].
+        """
+        for period_s in PERIODS_S:
+            if 0.0 <= stamp_s < last_s < period_s:
+                step_s = stamp_s + period_s - last_s
+                if step_s <= max(3.0 * longest_s, 0.01 * period_s):
+                    return period_s
+        return 0.0
+
+    def running_s(self, bus: Any, stamp_s: float) -> float:
+        """Return a stamp as time that goes on where the clock starts again [s]."""
+        time_s = stamp_s + self._shift_s
+        if self._turn_s and time_s > self._latest_s + 0.5 * self._turn_s:
+            return time_s - self._turn_s  # late, of before the turn
+        if turn_s := self.turn_s(self._last_s, stamp_s, self._longest_s):
+            self._shift_s += turn_s
+            self._turn_s = turn_s
+            self._turns[turn_s] += 1
+            self._buses.clear()
+        before_s, shift_s = self._buses.get(bus, (stamp_s, self._shift_s))
+        if stamp_s < before_s - OUT_OF_ORDER_S:
+            if shift_s == self._shift_s:
+                self._shift_s = self._latest_s + PAUSE_S - stamp_s
+                self._sessions += 1
+            shift_s = self._shift_s
+        self._longest_s = max(self._longest_s, stamp_s - before_s)
+        self._buses[bus] = stamp_s, shift_s
+        self._last_s = stamp_s
+        self._latest_s = max(self._latest_s, stamp_s + shift_s)
+        return stamp_s + shift_s
+
+    def remarks(self) -> Iterator[str]:
+        """Yield what was found, for the user."""
+        for period_s, count in self._turns.items():
+            yield f"the clock starts again every {period_s:.6g} s ({count} times): time goes on"
+        if self._sessions > 1:
+            yield (
+                f"time starts again: {self._sessions} sessions in one file, which follow each other"
+                f" after {PAUSE_S:g} s"
+            )
 
 
 class BinaryReader(CaptureReader, BinaryIOMessageReader):

@@ -1,34 +1,23 @@
-"""Captures in the formats that python-can reads: ASC, BLF, TRC, MF4, CSV."""
+"""Captures in the formats that python-can reads: BLF, TRC, MF4, CSV."""
 
 from __future__ import annotations
 
 import io
-import re
 import struct
 from collections.abc import Callable, Iterator
 from importlib.util import find_spec
 from typing import Any, ClassVar, Final
 
 import can
-import numpy as np
 from can.io.blf import BLFParseError
 from can.util import dlc2len
 
-from cangauge._files import HEAD_BYTES
+from cangauge._text import counted
 from cangauge.bus.readers import MAX_LINE, BinaryReader
 from cangauge.errors import InputError
 
 _OBJECT: Final = struct.Struct("<8sI4x")
 """Header of an object in a BLF, with its size [bytes]."""
-
-
-def _whole_lines(raw: Any) -> Iterator[str]:
-    """Yield the lines of a text; a cut one is damage, because it may read as a frame."""
-    text = io.TextIOWrapper(raw, "utf-8", errors="replace")
-    while line := text.readline(MAX_LINE):
-        if not line.endswith("\n"):
-            raise EOFError("it ends in a line")
-        yield line
 
 
 class LibraryReader(BinaryReader):
@@ -41,11 +30,17 @@ class LibraryReader(BinaryReader):
     is_text : bool
     marks : tuple of bytes
         One of these begins a file.
+    comments : tuple of str
+        One of these begins a line that states no frame.
+    given : int
+        Other lines that python-can was given: it is silent about those that it leaves out.
     """
 
     library: ClassVar[Callable[..., Any]]
     is_text: ClassVar[bool] = True
     marks: ClassVar[tuple[bytes, ...]]
+    comments: ClassVar[tuple[str, ...]] = (";",)
+    given = 0
 
     @classmethod
     def matches(cls, head: bytes) -> bool:
@@ -54,59 +49,34 @@ class LibraryReader(BinaryReader):
 
     def content(self) -> Any:
         """Return what the class of python-can reads."""
-        return _whole_lines(self.raw) if self.is_text else self.raw
+        return self.lines() if self.is_text else self.raw
+
+    def lines(self) -> Iterator[str]:
+        """Yield the lines of a text; a cut one is damage, because it may read as a frame."""
+        raw: Any = self.raw
+        text = io.TextIOWrapper(raw, "utf-8", errors="replace")
+        while line := text.readline(MAX_LINE):
+            if not line.endswith("\n"):
+                raise EOFError("it ends in a line")
+            self.given += not line.isspace() and not line.startswith(self.comments)
+            yield line
 
     def read(self) -> Iterator[can.Message]:
         """Yield the frames, without those whose length contradicts their DLC."""
-        for message in type(self).library(self.content()):
+        source, taken = type(self).library(self.content()), 0
+        for message in source:
+            taken += 1
             is_whole = message.is_remote_frame or len(message.data) == message.dlc
             if is_whole or message.is_error_frame:
                 yield message
             else:
                 self.skip(None)
-
-
-class AscReader(LibraryReader):
-    """Vector ASC.
-
-    Under a header of relative time stamps, Vector writes the time since the event before, frame or
-    not. Other programs write the time since the start, which does not fall.
-    """
-
-    name, library = "Vector ASC", can.ASCReader
-    _RELATIVE: Final = re.compile(r"(?im)^\s*base\s+\w+\s+timestamps\s+relative")
-    _STAMP: Final = re.compile(r"(?m)^[ \t]*(\d{1,12}\.\d+)(?=\s)")
-
-    @classmethod
-    def matches(cls, head: bytes) -> bool:
-        """Return whether it begins with a date and a base."""
-        lines = head[:2000].lower().splitlines()[:10]
-        bases = (b"base hex", b"base dec")
-        return head[:5].lower() == b"date " and any(
-            line.strip().startswith(bases) for line in lines
-        )
-
-    def content(self) -> Iterator[str]:
-        """Return the lines; time since the event before is added up."""
-        raw = io.BufferedReader(self.raw, HEAD_BYTES)
-        head = raw.peek().decode("latin-1")
-        lines = _whole_lines(raw)
-        if self._RELATIVE.search(head) is None:
-            return lines
-        steps_s = np.diff([float(stamp) for stamp in self._STAMP.findall(head)])
-        # Differences fall as much as they rise; a clock does not fall, but for buses out of order.
-        if -2.0 * steps_s[steps_s < 0.0].sum() <= steps_s[steps_s > 0.0].sum():
-            self.remarks.append("relative time stamps rise: taken as time since the start")
-            return lines
-        self.remarks.append("relative time stamps: each is added to the one before")
-        return self._added_up(lines)
-
-    def _added_up(self, lines: Iterator[str]) -> Iterator[str]:
-        time_s = 0.0
-        for line in lines:
-            stamp = self._STAMP.match(line)
-            time_s += float(stamp[1]) if stamp else 0.0
-            yield f"{time_s:.9f}{line[stamp.end() :]}" if stamp else line
+        left_out = getattr(source, "objects", self.given) - taken
+        if left_out > 0:
+            what = "line" if self.is_text else "object"
+            self.remarks.append(
+                f"{counted(left_out, what)} left out, which python-can does not read"
+            )
 
 
 class _InPieces:
@@ -129,12 +99,15 @@ class _InPieces:
 class _EndingBlf(can.BLFReader):
     """python-can's reader; it would read an object whose size leads to no next one for ever."""
 
+    objects = 0
+
     def _parse_data(self, data: bytes) -> Iterator[can.Message]:
         place = data.find(b"LOBJ", 0, 8)
         while 0 <= place <= len(data) - _OBJECT.size:
             _, size = _OBJECT.unpack_from(data, place)
             if size < _OBJECT.size:
                 raise BLFParseError(f"an object of {size} bytes")
+            self.objects += place + size <= len(data)  # else it is in the next container too
             place = data.find(b"LOBJ", place + size, place + size + 8)
         yield from super()._parse_data(data)
 
@@ -170,7 +143,7 @@ class TrcReader(LibraryReader):
     def content(self) -> Iterator[str]:
         """Yield the lines as of a version that python-can knows."""
         is_1_2 = False
-        for line in _whole_lines(self.raw):
+        for line in self.lines():
             cells = line.split()
             if line.startswith(";$FILEVERSION=1.2"):
                 is_1_2 = True
@@ -188,6 +161,7 @@ class CsvReader(LibraryReader):
 
     name, library = "python-can CSV", can.CSVReader
     marks = (b"timestamp,arbitration_id,extended,remote,error,dlc,data",)
+    comments = ("timestamp,arbitration_id",)
 
 
 class Mf4Reader(LibraryReader):
@@ -208,4 +182,4 @@ class Mf4Reader(LibraryReader):
         yield from super().read()
 
 
-READERS: Final = (AscReader, BlfReader, TrcReader, Mf4Reader, CsvReader)
+READERS: Final = (BlfReader, TrcReader, Mf4Reader, CsvReader)

@@ -7,6 +7,7 @@ from collections import Counter
 from collections.abc import Sequence
 from contextlib import suppress
 from datetime import datetime
+from itertools import pairwise
 from typing import Any, ClassVar, Final
 
 import can
@@ -290,9 +291,6 @@ class CarbusReader(PatternReader):
         return frame(time_s, number, data, length, channel=int(channel))
 
 
-_HALF_A_DAY_S: Final = 43200.0
-
-
 class CanHackerReader(PatternReader):
     """CAN Hacker log: time of day in milliseconds."""
 
@@ -306,18 +304,166 @@ class CanHackerReader(PatternReader):
         r"\t(\w+)\t[^\t]*\t(\d+)((?:\t[0-9A-Fa-f]{2})*)(?:\t *)*?\tp:(\d+)\s*$"
     )
     other = re.compile("CAN speed")
-    _day_s = _latest_s = 0.0
 
     def _frame(self, *groups: Any) -> can.Message:
         hours, minutes, seconds, milliseconds, kind, number, length, data, channel = groups
-        time_s = self._time_s(int(hours), int(minutes), int(seconds), int(milliseconds))
+        time_s = 3600 * int(hours) + 60 * int(minutes) + int(seconds) + int(milliseconds) / 1e3
         is_extended = kind == "Ext" or None
         return frame(time_s, number, data, length, is_extended=is_extended, channel=int(channel))
 
-    def _time_s(self, hours: int, minutes: int, seconds: int, milliseconds: int) -> float:
-        time_s = self._day_s + 3600 * hours + 60 * minutes + seconds + milliseconds / 1e3
-        if time_s < self._latest_s - _HALF_A_DAY_S:  # past midnight
-            self._day_s += 2 * _HALF_A_DAY_S
-            time_s += 2 * _HALF_A_DAY_S
-        self._latest_s = time_s
-        return time_s
+
+class UsbCanReader(PatternReader):
+    """Text of the tool of CANalyst-II and its kin: time of day in milliseconds."""
+
+    name = "USB-CAN tool text"
+    stamps: Stamps = "ms"
+    # NO    Direction  Time Scale        Frame Type      Frame Format     Frame ID  Length  Data
+    # 0     Receive    18:00:00:125      Data frame      Standard frame   00000356  8       f2 0e …
+    pattern = re.compile(
+        r"\s*+\d+[\s,]++(Receive|Send|Transmit)[\s,]++(\d{1,2}):(\d\d):(\d\d)[:.](\d{1,6})[\s,]++"
+        r"(Data|Remote) frame[\s,]++(Standard|Extended) frame[\s,]++(?:0x)?([0-9A-Fa-f]{1,8})"
+        r"[\s,]++(?:0x)?(\d{1,2})[\s,]*+((?:[0-9A-Fa-f]{2} ?)*+)\s*$",
+        re.IGNORECASE,
+    )
+    other = re.compile(r"\s*(?:NO\b|Index\b)", re.IGNORECASE)
+
+    def _frame(self, *groups: Any) -> can.Message:
+        way, hours, minutes, seconds, fraction, kind, form, number, length, data = groups
+        time_s = 3600 * int(hours) + 60 * int(minutes) + int(seconds) + float(f"0.{fraction}")
+        content = data if kind.lower() == "data" else None
+        is_extended = form.lower() == "extended"
+        is_rx = way.lower() == "receive"
+        return frame(time_s, number, content, length, is_extended=is_extended, is_rx=is_rx)
+
+
+class SlcanReader(PatternReader):
+    """Text of slcan (Lawicel) adapters with stamps: milliseconds of a minute, in four digits."""
+
+    name = "slcan text with stamps"
+    stamps: Stamps = "ms"
+    # t35680EFA003EA000009AB0
+    pattern = re.compile(
+        r"(?:t([0-9A-F]{3})|T([0-9A-F]{8}))([0-8])((?:[0-9A-F]{2})*)([0-9A-F]{4})\s*$",
+        re.IGNORECASE,
+    )
+    other = re.compile(r"[rRzZFVNCOSMm][0-9A-F]*\s*$")
+
+    def _frame(self, *groups: Any) -> can.Message:
+        standard, extended, length, data, stamp = groups
+        is_extended = standard is None
+        return frame(
+            int(stamp, 16) / 1e3, extended or standard, data, length, is_extended=is_extended
+        )
+
+
+class AscReader(LineReader):
+    """Vector ASC, of other programs too.
+
+    Under a header of relative time stamps, Vector writes the time since the event before, frame or
+    not. Other programs write the time since the start, which does not fall.
+    """
+
+    name = "Vector ASC"
+    # date Mon May 15 09:00:00.000 am 2026
+    # base hex  timestamps absolute
+    # -0.012000 1  1DBx  Rx   d 8 F2 0E FA 00 3E A0 00 00  Length = 124000 BitCount = 64 ID = 475
+    # 0.016000 CANFD   1 Rx  1DB  Name  1 0 9 12 01 02 03 04 05 06 07 08 09 0A 0B 0C  130000 130 …
+    _HEAD: Final = re.compile(r"(?im)^\s*base\s+(hex|dec)(?:\s+timestamps\s+(relative|absolute))?")
+    _STAMP: Final = re.compile(r"\s*+(-?\d{1,12}\.\d+)\s++(.*)")
+    _CLASSIC: Final = re.compile(
+        r"(\d+)\s++(\w+?)(x?)\s++(Rx|Tx|TxRq)\s++([dr])(?:\s++([0-9A-Fa-f]{1,2}))?(?=\s|$)(.*)"
+    )
+    _FD: Final = re.compile(
+        r"CANFD\s++(\d+)\s++(Rx|Tx|TxRq)\s++(\w+?)(x?)\s++(?:[^\s\d]\S*+\s++)?([01])\s++([01])"
+        r"\s++([0-9A-Fa-f]{1,2})\s++(\d{1,2})(?=\s|$)(.*)"
+    )
+    _ERROR: Final = re.compile(r"(?:CANFD\s++)?(\d+)\s++(?:(?:Rx|Tx)\s++)?ErrorFrame\b")
+    _OF_FRAME: Final = re.compile(r"CANFD\b|\d+\s++\S++\s++(?:Rx|Tx|TxRq)\b")
+    _OTHER: Final = re.compile(
+        r"(?i)\s*(?:date\s|base\s|(?:no\s+)?internal\s+events|//|(?:begin|end)\s+trigger"
+        r"|previous\s+log)"
+    )
+    _base = 16
+    _is_added = False
+    _time_s = 0.0
+
+    @classmethod
+    def matches(cls, head: bytes) -> bool:
+        """Return whether it begins with a date and a base."""
+        begin = head[:2000].decode("latin-1")
+        return begin[:5].lower() == "date " and cls._HEAD.search(begin) is not None
+
+    def prepare(self, head: Sequence[str]) -> bool:
+        """Find the base of the numbers, and whether stamps count from the event before."""
+        match = self._HEAD.search("".join(head))
+        if match is None:
+            return False
+        self._base = 16 if match[1].lower() == "hex" else 10
+        if (match[2] or "").lower() == "relative":
+            stamps_s = [float(each[1]) for line in head if (each := self._STAMP.match(line))]
+            steps_s = [two - one for one, two in pairwise(stamps_s)]
+            # Differences fall as much as they rise; a clock does not, but for buses out of order.
+            rise_s = sum(max(each, 0.0) for each in steps_s)
+            self._is_added = 2.0 * (rise_s - sum(steps_s)) > rise_s
+            remark = " rise: taken as time since the start"
+            if self._is_added:
+                remark = ": each is added to the one before"
+            self.remarks.append(f"relative time stamps{remark}")
+        return True
+
+    def parse(self, line: str) -> can.Message | None:
+        """Return the frame of a line."""
+        stamp = self._STAMP.match(line)
+        if stamp is None:
+            if self._OTHER.match(line):
+                return None
+            raise ValueError("not a frame")
+        time_s, event = float(stamp[1]), stamp[2]
+        more: dict[str, bool] = {}
+        if self._is_added:
+            self._time_s += time_s
+            time_s = self._time_s
+        if match := self._ERROR.match(event):
+            return frame(time_s, 0, "", channel=int(match[1]) - 1, is_error_frame=True)
+        if match := self._CLASSIC.match(event):
+            channel, number, extended, way, kind, length, rest = match.groups()
+            if kind == "d" and length is None:
+                raise ValueError("its length is missing")
+            size = min(int(length or "0", self._base), 8)
+            data = self._data(rest, size, line) if kind == "d" else None
+        elif match := self._FD.match(event):
+            channel, way, number, extended, switch, state, code, length, rest = match.groups()
+            size = int(length)
+            is_remote = size == 0 and code != "0"
+            data = None if is_remote else self._data(rest, size, line)
+            size = int(code, 16) if is_remote else size
+            more = {
+                "is_fd": True,
+                "bitrate_switch": switch == "1",
+                "error_state_indicator": state == "1",
+            }
+        elif self._OF_FRAME.match(event):
+            raise ValueError("not a frame")
+        else:
+            return None
+        return frame(
+            time_s,
+            int(number, self._base),
+            data,
+            size,
+            is_extended=bool(extended),
+            channel=int(channel) - 1,
+            is_rx=way == "Rx",
+            **more,
+        )
+
+    def _data(self, rest: str, size: int, line: str) -> str:
+        """Return the bytes of a frame in hexadecimal; raise ValueError for a byte that is cut."""
+        cells = rest.split()[:size]
+        if self._base == 16:
+            if len(cells) < size or any(len(each) != 2 for each in cells):
+                raise ValueError("a byte is missing or cut")
+            return "".join(cells)
+        if not line.endswith("\n"):
+            raise ValueError("a byte may be cut")
+        return bytes(int(each) for each in cells).hex()
