@@ -9,7 +9,7 @@ COPY src src
 COPY core core
 COPY dbc dbc
 COPY replay replay
-RUN python -m venv /opt/cangauge && /opt/cangauge/bin/pip install --no-cache-dir '.[metrics,mf4]'
+RUN python -m venv /opt/cangauge && /opt/cangauge/bin/pip install --no-cache-dir '.[live,metrics,mf4]'
 
 FROM python:3.13-slim
 COPY --from=build /opt/cangauge /opt/cangauge

@@ -35,7 +35,7 @@ endef
 $(VENV)/installed: pyproject.toml hatch_build.py $(wildcard core/*.[ch])
 	$(PYTHON) -c 'import sys; sys.exit("cangauge needs Python 3.11 or later (set PYTHON=…)" if sys.version_info < (3, 11) else 0)'
 	$(PYTHON) -m venv $(VENV)
-	$(call install,.)
+	$(call install,.[live])
 	touch $@
 
 $(VENV)/installed-dev: $(VENV)/installed

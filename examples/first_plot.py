@@ -61,7 +61,7 @@ def main() -> int:
         steps: dict[str, tuple[object, ...]] = {
             "clone": ("git", "clone", "--quiet", "--depth", "1", project.as_uri(), clone),
             "environment": (sys.executable, "-m", "venv", environment),
-            "install": (programs / "python", "-m", "pip", "install", "--quiet", clone),
+            "install": (programs / "python", "-m", "pip", "install", "--quiet", f"{clone}[report]"),
             "inspect": (cangauge, "inspect", logs[-1]),
             "fit": (cangauge, "fit", *logs[:-1], "-o", model, *capacity),
             "estimate": (

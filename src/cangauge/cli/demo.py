@@ -11,7 +11,7 @@ from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
-from cangauge._extras import extra
+from cangauge._extras import extra, require_extra
 from cangauge._files import write_text_atomic
 from cangauge._resources import shared_file
 from cangauge._text import number, significant
@@ -68,6 +68,7 @@ def demo_command(
     from cangauge.replay.steps import quantization_bound
     from cangauge.service.offline import RecordedEstimate, estimate_capture
 
+    require_extra("report")
     began = time.monotonic()
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -126,6 +127,7 @@ def _play(folder: Path, log: Path) -> float:
     cangauge = [sys.executable, "-P", "-m", "cangauge"]  # -P: no modules of the working folder
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
     service = [*cangauge, "run", "--config", str(config)]
+    require_extra("report")
     began = time.monotonic()
     with subprocess.Popen(  # noqa: S603 - our own commands
         service, stderr=subprocess.PIPE, text=True, env=environment

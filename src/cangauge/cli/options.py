@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Final, cast
 
 import typer
 
+from cangauge._extras import require_extra
 from cangauge._files import check_writable, require_suffix
 from cangauge.cli.output import note
 from cangauge.errors import InputError
@@ -49,6 +50,7 @@ def option(
     unit: str = "",
     words: Sequence[str] = (),
     suffixes: Sequence[str] = (),
+    needs: str | None = None,
 ) -> Any:
     """Return an option.
 
@@ -66,6 +68,8 @@ def option(
         May stand in place of a number. The annotation is then `Any`: a float or the word.
     suffixes : sequence of str
         One of which a file to write must have.
+    needs : str, optional
+        Extra of the package without which the file cannot be written.
     """
 
     def checked(parameter: typer.CallbackParam, value: Any) -> Any:
@@ -76,6 +80,8 @@ def option(
             return value
         if suffixes:
             require_suffix(value, *suffixes, field=field)
+            if needs is not None:
+                require_extra(needs, field)
             return value
         number = value if isinstance(value, int | float) else _number(value, field, words, unit)
         if within is not None and not within[0] <= number <= within[1]:  # NaN too
@@ -116,6 +122,7 @@ REPORT: Final = option(
     "FILE.html|.htm",
     "Write a report as one self-contained page.",
     suffixes=(".html", ".htm"),
+    needs="report",
 )
 JSON: Final = option("--json", "", "Print exactly one JSON object on stdout, also for an error.")
 

@@ -290,7 +290,7 @@ class RunConfig(Strict):
     )
     http: str | None = key(
         None,
-        "Serve /status, /healthz and /metrics (extra `metrics`) there, e.g. 127.0.0.1:9464. An"
+        "Serve /status, /healthz and /metrics there (extra `metrics`), e.g. 127.0.0.1:9464. An"
         " address beyond loopback needs a token.",
         "--http", "HOST:PORT", restart=True,
     )  # fmt: skip
@@ -301,8 +301,8 @@ class RunConfig(Strict):
     mqtt: MqttConfig | None = key(None, "MQTT broker that takes the state (extra `mqtt`).")
     dashboard: str | None = key(
         None,
-        "Address of the live page. A port alone, such as 8642, serves this machine only. One beyond"
-        " loopback needs a token, as with --http.",
+        "Address of the live page (extra `live`). A port alone, such as 8642, serves this machine"
+        " only. One beyond loopback needs a token, as with --http.",
         "--dashboard", "HOST:PORT", restart=True,
     )  # fmt: skip
     live: Literal["child", "unit"] = key(

@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any, Final, Literal
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from cangauge._extras import require_extra
 from cangauge._files import atomic_path
 from cangauge._text import plain
 from cangauge.cli.options import ReadingOptions
@@ -166,11 +167,9 @@ def _pool(scheduler: str | None, logs: int) -> Iterator[Executor]:
         with ProcessPoolExecutor(min(logs, os.cpu_count() or 1), get_context("spawn")) as pool:
             yield pool
         return
-    try:
-        from distributed import Client
-    except ImportError as error:
-        cure = "pip install 'cangauge[fleet]'"
-        raise InputError("Dask is not installed", field="--scheduler", cure=cure) from error
+    require_extra("fleet", "--scheduler")
+    from distributed import Client
+
     try:
         client = Client(scheduler, timeout=CONNECT_S, set_as_default=False)
     except (OSError, ValueError) as error:

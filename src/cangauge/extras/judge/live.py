@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
+from cangauge._extras import require_extra
 from cangauge._files import write_text_atomic
 from cangauge._logging import emit
 from cangauge.errors import InputError
@@ -178,6 +179,7 @@ def output_of(_config: RunConfig, vehicle: Vehicle) -> Callable[[Service], LiveJ
             field="judge",
             cure="name its signal under [soc] of the map file",
         )
+    require_extra("report", "judge")
     return make_output
 
 

@@ -15,10 +15,10 @@ import ssl
 import stat
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from importlib.util import find_spec
 from os import PathLike
 from typing import TYPE_CHECKING, Final
 
+from cangauge._extras import require_extra
 from cangauge._files import open_regular
 from cangauge._logging import emit
 from cangauge.errors import InputError
@@ -184,9 +184,7 @@ def mqtt_options(config: MqttConfig, bus: str) -> MqttOptions:
     InputError
         If paho-mqtt is not installed, or certificates or password cannot be used.
     """
-    if find_spec("paho") is None:
-        problem = "MQTT needs the package paho-mqtt, which is not installed"
-        raise InputError(problem, field="mqtt", cure="pip install 'cangauge[mqtt]'")
+    require_extra("mqtt", "mqtt")
     name = re.sub(r"[^A-Za-z0-9_-]+", "_", f"cangauge_{socket.gethostname()}_{bus}")
     given = config.model_dump(exclude={"password_file"}) | {
         "port": config.port or (8883 if config.tls else 1883),

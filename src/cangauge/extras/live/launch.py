@@ -10,6 +10,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from typing import TYPE_CHECKING, Final
 
+from cangauge._extras import require_extra
 from cangauge._logging import emit
 from cangauge.errors import InputError
 from cangauge.extras.live.addresses import http_address, mqtt_options
@@ -75,6 +76,9 @@ def offer_of(config: RunConfig) -> Offer:
     if config.status_socket == "off":
         problem = "live page, status by HTTP and MQTT read the status socket"
         raise InputError(problem, field="status_socket", value="off", cure="remove it")
+    for key, needed in (("http", "metrics"), ("dashboard", "live")):
+        if getattr(config, key) is not None:
+            require_extra(needed, key)
     addresses = {
         key: http_address(str(getattr(config, key)), config.http_token_file, field=key)
         for key in ("http", "dashboard")
