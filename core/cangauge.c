@@ -10,10 +10,7 @@
 #define USE_S 120.0
 #define DRAIN_PCT_PER_HOUR 0.05
 #define DRAIN_AT_MOST_PCT 5.0
-#define AWAY_PCT_PER_HOUR 20.0
-#define MOVED_AT_MOST 0.3
-#define MOVED_TIME_S 1800.0
-#define SHORTEST_S 1.0
+#define MOVED_PRIOR 0.5
 #define FASTEST_PCT_PER_HOUR 150.0
 #define OFFSET_STD_PER_AH 0.025
 #define CAPACITY_STD 0.05
@@ -37,9 +34,12 @@
 #define CONTRADICTED_S 300.0
 #define MISMATCH_S 600.0
 #define CURRENT_AT_MOST_A 5000.0
-#define SOC_MARGIN_PCT 1.0
-#define OUTSIDE_MARGIN_K 1.0
-#define CURRENT_MARGIN 1.1
+#define SIGN_LOG_ODDS 13.815510557964274 /* ln 1e6 */
+
+/* Reasons that the standard deviation contains. */
+#define NOTES                                                                                      \
+    (CG_TEMPERATURE_MISSING | CG_VOLTAGE_OUTSIDE_MODEL | CG_SOC_OUTSIDE_MODEL |                    \
+     CG_TEMPERATURE_OUTSIDE_MODEL | CG_CURRENT_OUTSIDE_MODEL)
 
 /* ------------------------------------------------------------------ clock */
 
@@ -117,7 +117,7 @@ static cg_real parked_std_pct(cg_real seconds, cg_real rms_pct_per_s)
     const cg_real drain_pct =
         cg_min(R(DRAIN_PCT_PER_HOUR) * seconds / R(3600.0), R(DRAIN_AT_MOST_PCT));
     const cg_real use_pct =
-        cg_min(rms_pct_per_s * cg_min(seconds, R(USE_S)), R(CG_MOVED_STD_AT_MOST_PCT));
+        cg_min(rms_pct_per_s * cg_min(seconds, R(USE_S)), cg_sqrt(R(CG_UNKNOWN_VAR_PCT2)));
     return cg_sqrt(cg_square(drain_pct) + cg_square(use_pct));
 }
 
@@ -160,6 +160,9 @@ static charge_step count(cg_estimator *self, cg_time time_s, cg_real current_a)
     const cg_real out_pct = across_a * seconds * per_as;
     counter->discharged_pct += (cg_sum)out_pct;
     counter->moved_pct += (cg_sum)cg_fabs(out_pct);
+    const cg_real turned_a = cg_expm1(-seconds / R(HELD_S)) * (current_a - last_a);
+    counter->turned_a2 = R(0.5) * cg_square(turned_a);
+    counter->gap_var_pct2 += (cg_sum)(counter->turned_a2 * cg_square(seconds * per_as));
     if (seconds > gap_s) {
         const cg_real ends_a2 = R(0.5) * ((current_a * current_a) + (last_a * last_a));
         const cg_real gap_pct = cg_sqrt(cg_max(square_a2, ends_a2)) * seconds * per_as;
@@ -175,17 +178,12 @@ cg_real cg_uncounted_std_pct(const cg_estimator *self, cg_real seconds)
         return R(0.0);
     }
     const cg_real rms_a = cg_sqrt(cg_max(counter->mean_square_a2, cg_square(counter->current_a)));
-    return cg_min(rms_a * seconds * cg_pct_per_as(self->model), R(CG_MOVED_STD_AT_MOST_PCT));
+    return cg_min(rms_a * seconds * cg_pct_per_as(self->model), cg_sqrt(R(CG_UNKNOWN_VAR_PCT2)));
 }
 
 static cg_real moved_std_pct(cg_real seconds)
 {
-    return cg_min(R(FASTEST_PCT_PER_HOUR) * seconds / R(3600.0), R(CG_MOVED_STD_AT_MOST_PCT));
-}
-
-static cg_real moved_probability(cg_real seconds)
-{
-    return R(-MOVED_AT_MOST) * cg_expm1(-cg_max(seconds, R(SHORTEST_S)) / R(MOVED_TIME_S));
+    return cg_min(R(FASTEST_PCT_PER_HOUR) * seconds / R(3600.0), cg_sqrt(R(CG_UNKNOWN_VAR_PCT2)));
 }
 
 /* ------------------------------------------------------------------ SoC of each method */
@@ -286,7 +284,7 @@ static void test_model(cg_estimator *self, cg_time time_s)
 {
     const cg_model *model = self->model;
     cg_memory *memory = &self->state.memory;
-    const cg_ekf *likelier = cg_likelier(&self->state.filter);
+    const cg_ekf *likelier = cg_likelier(&self->state.filter, model);
     if (memory->innovations == model->tested_blocks) {
         memory->innovations -= 1;
         for (int32_t k = 0; k < memory->innovations; ++k) {
@@ -327,20 +325,21 @@ static void close_block(cg_estimator *self, cg_time time_s)
     means.voltage_v = (cg_real)(block->sums[2] / rows);
     means.temperature_c = (cg_real)(block->sums[3] / rows);
     means.drop_v = (cg_real)(block->sums[4] / rows);
+    means.unseen_v2 = (cg_real)(block->sums[5] / rows);
     for (int32_t k = 0; k < cg_loads(model); ++k) {
-        means.load[k] = (cg_real)(block->sums[5 + k] / rows);
+        means.load[k] = (cg_real)(block->sums[6 + k] / rows);
     }
     for (int32_t k = 0; k < model->effects; ++k) {
         means.drive[k] = (cg_real)(block->drive[k] / rows);
     }
     propagate(self, means.counted_s, means.discharged_pct);
-    const bool was_rejected = cg_filter_is_rejected(filter);
+    const bool was_rejected = cg_filter_is_rejected(filter, model);
     cg_filter_update(filter, model, &means);
     if (!cg_filter_is_valid(filter, model)) {
         cg_filter_start(filter, model, CG_NAN, R(0.0), false);
         memory->resets += 1;
         memory->contradicted_until_s = time_s + CONTRADICTED_S;
-    } else if (cg_filter_is_rejected(filter) && !was_rejected) {
+    } else if (cg_filter_is_rejected(filter, model) && !was_rejected) {
         memory->contradicted_until_s = time_s + CONTRADICTED_S;
     }
     memory->is_known = true;
@@ -430,6 +429,30 @@ static cg_real inverse_std_pct(const cg_estimator *self, cg_real soc_pct, cg_rea
                   cg_sqrt(R(CG_UNKNOWN_VAR_PCT2)));
 }
 
+/* Voltage by earlier currents, which a slow log shows in part. */
+static cg_real unseen_v_per_a(const cg_model *model)
+{
+    cg_real total = R(0.0);
+    for (int32_t k = 2; k <= cg_currents(model); ++k) {
+        total += model->load[k];
+    }
+    return total;
+}
+
+/* Weigh a step of the voltage: it goes with that of the model, or against it. */
+static void watch_sign(const cg_model *model, cg_memory *memory, cg_real voltage_v, cg_real drop_v)
+{
+    const cg_real error_v2 = cg_square(model->residual_std_v) + cg_square(model->level_std_v);
+    const cg_real steps_v2 = (voltage_v - memory->row_v) * (drop_v - memory->row_drop_v);
+    memory->row_v = voltage_v;
+    memory->row_drop_v = drop_v;
+    if (!isnan(steps_v2)) {
+        const cg_real most = R(2.0 * SIGN_LOG_ODDS);
+        memory->sign_log_odds = cg_clip(
+            memory->sign_log_odds + (R(2.0) * steps_v2 / error_v2), -most, most);
+    }
+}
+
 /* Compare a row's voltage with the model, and add it to the open block. */
 static void use_row(cg_estimator *self, const cg_sample *sample)
 {
@@ -444,7 +467,7 @@ static void use_row(cg_estimator *self, const cg_sample *sample)
     memory->newton_inside = true;
     if (!isnan(sample->voltage_v)) {
         const cg_real temperature_c =
-            isnan(memory->temperature_c) ? model->t_ref_c : memory->temperature_c;
+            isnan(memory->temperature_c) ? model->usual_c : memory->temperature_c;
         cg_sum *sums = state->block.sums;
         memory->newton_pct = cg_newton(self, sample->voltage_v - state->load_v, guess_pct,
                                        &memory->newton_inside);
@@ -452,15 +475,17 @@ static void use_row(cg_estimator *self, const cg_sample *sample)
         sums[0] += state->counter.counted_s;
         sums[1] += state->counter.discharged_pct;
         sums[2] += (cg_sum)sample->voltage_v;
-        sums[3] += (cg_sum)temperature_c;
+        sums[3] += (cg_sum)memory->temperature_c;
         sums[4] += (cg_sum)state->drop_v;
+        sums[5] += (cg_sum)(cg_square(unseen_v_per_a(model)) * state->counter.turned_a2);
         for (int32_t k = 0; k < cg_loads(model); ++k) {
-            sums[5 + k] += (cg_sum)state->load[k];
+            sums[6 + k] += (cg_sum)state->load[k];
         }
         for (int32_t k = 0; k < model->effects; ++k) {
             state->block.drive[k] += (cg_sum)state->drive[k];
         }
         state->block.rows += 1;
+        watch_sign(model, memory, sample->voltage_v, state->drop_v);
     }
     const cg_real soc_pct = soc_now(self, &std_pct);
     memory->voltage_model_v = CG_NAN;
@@ -478,14 +503,15 @@ static void follow(cg_estimator *self, const cg_sample *sample, const charge_ste
     cg_memory *memory = &self->state.memory;
     if (charge->seconds > self->settings.gap_s) {
         self->state.block.is_broken = true;
+        memory->row_v = CG_NAN;
         memory->gap_until_s = sample->time_s + (cg_time)model->delay_s[model->delays - 1];
     }
     if (charge->away_s != R(0.0)) {
-        const cg_real away_pct = R(AWAY_PCT_PER_HOUR) * charge->away_s / R(3600.0);
+        const cg_real std_pct = moved_std_pct(charge->away_s);
         propagate_to_now(self);
-        cg_filter_doubt(&self->state.filter, model, moved_probability(charge->away_s),
-                        moved_std_pct(charge->away_s), charge->away_s, charge->parked_std_pct);
-        memory->coulomb_var_pct2 += cg_square(cg_min(away_pct, R(CG_MOVED_STD_AT_MOST_PCT)));
+        cg_filter_doubt(&self->state.filter, model, R(MOVED_PRIOR), std_pct, charge->away_s,
+                        charge->parked_std_pct);
+        memory->coulomb_var_pct2 += R(MOVED_PRIOR) * cg_square(std_pct);
     }
     if (cg_fabs(sample->current_a) > (R(REST_CURRENT_C_RATE) * model->capacity_ah)) {
         memory->rest_since_s = (cg_time)NAN;
@@ -517,7 +543,7 @@ static void process(cg_estimator *self, const cg_sample *sample)
         counted_a = model->charge_efficiency * counted_a;
     }
     const charge_step charge = count(self, sample->time_s, counted_a);
-    if (!isnan(sample->temperature_c)) {
+    if (!isnan(sample->temperature_c) || (charge.away_s != R(0.0))) {
         memory->temperature_c = sample->temperature_c;
     }
     cg_advance(self, sample, memory->temperature_c, charge.seconds > self->settings.gap_s);
@@ -591,22 +617,9 @@ bool cg_update(cg_estimator *self, const cg_sample *sample)
 
 /* ------------------------------------------------------------------ estimate */
 
-static uint32_t outside_model(const cg_model *model, cg_real soc_pct, const cg_sample *sample)
+static bool is_outside(cg_real value, const cg_real *range)
 {
-    uint32_t reasons = 0U;
-    if ((soc_pct < (model->soc_range_pct[0] - R(SOC_MARGIN_PCT))) ||
-        (soc_pct > (model->soc_range_pct[1] + R(SOC_MARGIN_PCT)))) {
-        reasons |= CG_SOC_OUTSIDE_MODEL;
-    }
-    if ((sample->temperature_c < (model->temperature_range_c[0] - R(OUTSIDE_MARGIN_K))) ||
-        (sample->temperature_c > (model->temperature_range_c[1] + R(OUTSIDE_MARGIN_K)))) {
-        reasons |= CG_TEMPERATURE_OUTSIDE_MODEL;
-    }
-    if ((sample->current_a < (R(CURRENT_MARGIN) * model->current_range_a[0])) ||
-        (sample->current_a > (R(CURRENT_MARGIN) * model->current_range_a[1]))) {
-        reasons |= CG_CURRENT_OUTSIDE_MODEL;
-    }
-    return reasons;
+    return (value < range[0]) || (value > range[1]);
 }
 
 static uint32_t reason_if(bool is_set, uint32_t reason)
@@ -631,18 +644,24 @@ static uint32_t reasons_now(const cg_estimator *self, const cg_sample *sample, c
     reasons |= reason_if(!memory->newton_inside, CG_VOLTAGE_OUTSIDE_MODEL);
     reasons |= reason_if(time_s < memory->contradicted_until_s, CG_INNOVATION_LARGE);
     reasons |= reason_if(time_s < memory->mismatch_until_s, CG_MODEL_MISMATCH);
-    return reasons | outside_model(model, soc_pct, sample);
+    reasons |= reason_if(memory->sign_log_odds < -R(SIGN_LOG_ODDS), CG_SIGN_SUSPECT);
+    reasons |= reason_if(is_outside(soc_pct, model->soc_range_pct), CG_SOC_OUTSIDE_MODEL);
+    reasons |= reason_if(is_outside(sample->temperature_c, model->temperature_range_c),
+                         CG_TEMPERATURE_OUTSIDE_MODEL);
+    reasons |= reason_if(is_outside(sample->current_a, model->current_range_a),
+                         CG_CURRENT_OUTSIDE_MODEL);
+    return reasons;
 }
 
 static int32_t status_of(uint32_t reasons)
 {
-    if (reasons == 0U) {
+    if ((reasons & ~NOTES) == 0U) {
         return (int32_t)CG_VALID;
     }
     if ((reasons & CG_NO_INITIAL_SOC) != 0U) {
         return (int32_t)CG_INITIALISING;
     }
-    if ((reasons & (CG_INPUT_STALE | CG_CURRENT_MISSING | CG_MODEL_MISMATCH)) != 0U) {
+    if ((reasons & (CG_INPUT_STALE | CG_CURRENT_MISSING | CG_MODEL_MISMATCH | CG_SIGN_SUSPECT)) != 0U) {
         return (int32_t)CG_INVALID;
     }
     return (int32_t)CG_DEGRADED;
@@ -683,7 +702,7 @@ cg_settings cg_default_settings(void)
     settings.method = (int32_t)CG_EKF;
     settings.initial_soc_pct = CG_NAN;
     settings.initial_soc_std_pct = R(1.0);
-    settings.valid_std_pct = R(3.0);
+    settings.valid_std_pct = R(5.0);
     settings.gap_s = R(2.0);
     settings.full_voltage_v = CG_NAN;
     settings.rest_after_s = CG_NAN;
@@ -700,6 +719,8 @@ static void forget(cg_state *state)
     state->memory.first_s = (cg_time)NAN;
     state->memory.tick = -1;
     state->memory.temperature_c = nan;
+    state->memory.row_v = nan;
+    state->memory.row_drop_v = nan;
     state->memory.newton_pct = nan;
     state->memory.newton_inside = true;
     state->memory.newton_std_pct = nan;
@@ -785,8 +806,7 @@ void cg_set_table(cg_estimator *self, const cg_model *model)
     memory->mismatch_until_s = (cg_time)NAN;
     memory->innovations = 0;
     memory->is_known = !isnan(soc_pct);
-    cg_filter_take_over(&state->filter, model, soc_pct, std_pct,
-                        model->capacity_ah / before->capacity_ah);
+    cg_filter_take_over(&state->filter, model, before, soc_pct, std_pct);
     if (memory->is_known) {
         start_count(state, soc_pct, std_pct);
     }

@@ -48,7 +48,7 @@ typedef double cg_wide;
 #define CG_LOADS (CG_CURRENTS + 2)
 #define CG_STATES (CG_FUNCTIONS + 4)
 #define CG_PAIRS (CG_STATES * (CG_STATES + 1) / 2)
-#define CG_SUMS (CG_LOADS + 5)
+#define CG_SUMS (CG_LOADS + 6)
 
 /* ------------------------------------------------------------------ constants of a model */
 
@@ -99,6 +99,7 @@ typedef struct {
     int32_t has_arrhenius;
     cg_real arrhenius_ohm[CG_CURRENTS]; /* R0m */
     cg_real arrhenius_mean; /* a(mean) */
+    cg_real usual_c; /* temperature where none is known */
     cg_real load[CG_LOADS]; /* coefficients of the load columns: kt, R1 ... RM and b */
     cg_real soc_range_pct[2]; /* identified ranges */
     cg_real temperature_range_c[2];
@@ -158,7 +159,7 @@ typedef struct {
     cg_real rest_soc_std_pct;
 } cg_settings;
 
-/* 2 s, 1 %, 3 %, extended Kalman filter, no rules. */
+/* 2 s, 1 %, 5 %, extended Kalman filter, no rules. */
 cg_settings cg_default_settings(void);
 
 /* ------------------------------------------------------------------ samples and estimates */
@@ -177,7 +178,8 @@ typedef enum {
     CG_INVALID = 3
 } cg_status;
 
-/* Bits of `reasons`: why an estimate is not valid. */
+/* Bits of `reasons`: why an estimate is not valid. The notes leave it valid: what they say, the
+ * standard deviation contains. */
 #define CG_DELAY_LINE_FILLING (UINT32_C(1) << 0)
 #define CG_CURRENT_GAP (UINT32_C(1) << 1)
 #define CG_VOLTAGE_MISSING (UINT32_C(1) << 2)
@@ -194,6 +196,7 @@ typedef enum {
 #define CG_CURRENT_MISSING (UINT32_C(1) << 15)
 #define CG_SOC_UNCERTAIN (UINT32_C(1) << 16)
 #define CG_MODEL_MISMATCH (UINT32_C(1) << 18)
+#define CG_SIGN_SUSPECT (UINT32_C(1) << 20)
 
 typedef struct {
     cg_time time_s;
@@ -224,6 +227,7 @@ typedef struct {
     cg_real current_a;
     cg_real mean_square_a2;
     cg_real mean_a;
+    cg_real turned_a2; /* variance of the current between the last two samples */
     cg_sum discharged_pct;
     cg_sum moved_pct;
     cg_sum counted_s;
@@ -231,8 +235,8 @@ typedef struct {
     bool is_restored;
 } cg_counter;
 
-/* Sums of the rows of the open block: counted time, charge, voltage, temperature, drop, loads; and
- * of the effects' drives. */
+/* Sums of the rows of the open block: counted time, charge, voltage, temperature, drop, variance of the
+ * load between samples, loads; and of the effects' drives. */
 typedef struct {
     int64_t number;
     int32_t rows;
@@ -278,6 +282,9 @@ typedef struct {
     cg_time first_s;
     int64_t tick;
     cg_real temperature_c;
+    cg_real row_v; /* voltage of the last row, and its part over the resistances */
+    cg_real row_drop_v;
+    cg_real sign_log_odds; /* that positive current discharges */
     cg_real newton_pct;
     cg_real newton_std_pct;
     bool newton_inside;

@@ -6,7 +6,10 @@
 #include "cangauge_internal.h"
 
 #define OFFSET_STD_A 1.0
+#define LEVEL_TIME_S (4.0 * 3600.0)
+#define LEARNED_TIME_S (72.0 * 3600.0)
 #define DRIFT_PCT2_PER_S 1e-6
+#define OUTSIDE_PCT_PER_K 0.2
 #define LINEAR_PCT 1.0
 #define ITERATIONS_AT_MOST 8
 #define CLOSE_PCT 0.05
@@ -31,16 +34,40 @@
 static int32_t pair(int32_t i, int32_t j) { return (i * (i + 1) / 2) + j; }
 static cg_real var_of(const cg_ekf *ekf, int32_t k) { return ekf->p[pair(k, k)]; }
 
+/* Variance of a state before any voltage, but of the SoC. */
+static cg_real prior_var(const cg_model *model, int32_t k)
+{
+    cg_real variance = R(1.0);
+    if (k == CG_X_OFFSET) {
+        variance = cg_square(R(OFFSET_STD_A));
+    } else if (k == CG_X_SLOW) {
+        variance = cg_square(model->slow_std_v);
+    }
+    return variance;
+}
+
+/* Time constant with which a state returns to its prior. */
+static cg_real time_of(const cg_model *model, int32_t k)
+{
+    cg_real time_s = R(LEARNED_TIME_S);
+    if (k == CG_X_SOC) {
+        time_s = R(INFINITY);
+    } else if (k == CG_X_SLOW) {
+        time_s = model->slow_time_s;
+    } else if (k == CG_X_LEVEL) {
+        time_s = R(LEVEL_TIME_S);
+    }
+    return time_s;
+}
+
 static void ekf_start(cg_ekf *ekf, const cg_model *model, cg_real soc_pct, cg_real var_pct2)
 {
     *ekf = (cg_ekf){0};
     ekf->x[CG_X_SOC] = soc_pct;
-    for (int32_t k = 0; k < cg_states(model); ++k) {
-        ekf->p[pair(k, k)] = R(1.0);
+    for (int32_t k = CG_X_OFFSET; k < cg_states(model); ++k) {
+        ekf->p[pair(k, k)] = prior_var(model, k);
     }
     ekf->p[pair(CG_X_SOC, CG_X_SOC)] = var_pct2;
-    ekf->p[pair(CG_X_OFFSET, CG_X_OFFSET)] = cg_square(R(OFFSET_STD_A));
-    ekf->p[pair(CG_X_SLOW, CG_X_SLOW)] = cg_square(model->slow_std_v);
     ekf->b_p[CG_B_CAPACITY][CG_B_CAPACITY] = cg_square(R(CAPACITY_STD));
     ekf->b_p[CG_B_RESISTANCE][CG_B_RESISTANCE] = cg_square(R(RESISTANCE_STD));
 }
@@ -50,36 +77,42 @@ static cg_real offset_gain(const cg_model *model, cg_real seconds)
     return R(100.0) * seconds / (R(3600.0) * model->capacity_ah);
 }
 
-/* P <- F P F' + Q with F = 1 but for F[SoC][offset] and F[slow][slow]; V <- F V + G. */
+/* P <- F P F' + Q; V <- F V + G. The SoC takes up the offset; all others return to their priors. */
 static void ekf_predict(cg_ekf *ekf, const cg_model *model, const cg_passed *passed,
                         cg_real variance_pct2)
 {
     const int32_t size = cg_states(model);
     const cg_real gain = offset_gain(model, passed->seconds);
-    const cg_real keep = cg_exp(-(passed->seconds + passed->away_s) / model->slow_time_s);
+    const cg_real all_s = passed->seconds + passed->away_s;
+    cg_real *offset_var = &ekf->p[pair(CG_X_OFFSET, CG_X_OFFSET)];
+    cg_real *p = ekf->p;
+    cg_real keep[CG_STATES];
     ekf->x[CG_X_SOC] += (gain * ekf->x[CG_X_OFFSET]) - passed->discharged_pct;
-    ekf->x[CG_X_SLOW] *= keep;
-    ekf->p[pair(CG_X_SOC, CG_X_SOC)] += gain * ekf->p[pair(CG_X_OFFSET, CG_X_SOC)];
-    for (int32_t i = CG_X_OFFSET; i < size; ++i) {
+    ekf->p[pair(CG_X_SOC, CG_X_SOC)] +=
+        (R(2.0) * gain * ekf->p[pair(CG_X_OFFSET, CG_X_SOC)]) + (gain * gain * *offset_var);
+    ekf->p[pair(CG_X_OFFSET, CG_X_SOC)] += gain * *offset_var;
+    for (int32_t i = CG_X_SLOW; i < size; ++i) {
         ekf->p[pair(i, CG_X_SOC)] += gain * ekf->p[pair(i, CG_X_OFFSET)];
     }
-    ekf->p[pair(CG_X_SOC, CG_X_SOC)] += gain * ekf->p[pair(CG_X_OFFSET, CG_X_SOC)];
-    for (int32_t k = 0; k < size; ++k) {
-        ekf->p[(k < CG_X_SLOW) ? pair(CG_X_SLOW, k) : pair(k, CG_X_SLOW)] *= keep;
+    for (int32_t i = 0; i < size; ++i) {
+        keep[i] = cg_exp(-all_s / time_of(model, i));
+        for (int32_t j = 0; j <= i; ++j, ++p) {
+            *p *= keep[i] * keep[j];
+        }
+        p[-1] += (R(1.0) - cg_square(keep[i])) * prior_var(model, i);
+        ekf->x[i] *= keep[i];
     }
-    ekf->p[pair(CG_X_SLOW, CG_X_SLOW)] *= keep;
     ekf->p[pair(CG_X_SOC, CG_X_SOC)] += (R(DRIFT_PCT2_PER_S) * passed->seconds) + variance_pct2;
-    ekf->p[pair(CG_X_SLOW, CG_X_SLOW)] +=
-        (R(1.0) - cg_square(keep)) * cg_square(model->slow_std_v);
     for (int32_t k = 0; k < 2; ++k) {
         ekf->b_v[CG_X_SOC][k] += gain * ekf->b_v[CG_X_OFFSET][k];
-        ekf->b_v[CG_X_SLOW][k] *= keep;
+        for (int32_t i = CG_X_OFFSET; i < size; ++i) {
+            ekf->b_v[i][k] *= keep[i];
+        }
     }
     ekf->b_v[CG_X_SOC][CG_B_CAPACITY] -= passed->discharged_pct;
-    ekf->b_p[CG_B_CAPACITY][CG_B_CAPACITY] +=
-        cg_square(R(CAPACITY_WALK)) / R(DAY_S) * passed->seconds;
+    ekf->b_p[CG_B_CAPACITY][CG_B_CAPACITY] += cg_square(R(CAPACITY_WALK)) / R(DAY_S) * all_s;
     ekf->b_p[CG_B_RESISTANCE][CG_B_RESISTANCE] +=
-        cg_square(R(RESISTANCE_WALK)) / R(DAY_S) * passed->seconds;
+        cg_square(R(RESISTANCE_WALK)) / R(DAY_S) * all_s;
 }
 
 /* One linearised measurement: gradient, spread P H', gain. */
@@ -146,7 +179,9 @@ static void condition(cg_ekf *ekf, const linear *at, int32_t size, cg_real drop_
 static cg_real measurement(const cg_model *model, const cg_real *x, const cg_means *block,
                            cg_real *h, cg_real *noise)
 {
-    const cg_real cold = cg_cold(model, block->temperature_c);
+    const bool is_missing = isnan(block->temperature_c) != 0;
+    const cg_real temperature_c = is_missing ? model->usual_c : block->temperature_c;
+    const cg_real cold = cg_cold(model, temperature_c);
     const int32_t size = cg_states(model);
     cg_real slope;
     cg_real volts = cg_curve_at(model, block->drive, x[CG_X_SOC], &slope);
@@ -155,11 +190,17 @@ static cg_real measurement(const cg_model *model, const cg_real *x, const cg_mea
     h[CG_X_SOC] = slope;
     h[CG_X_OFFSET] = R(0.0);
     h[CG_X_SLOW] = cold;
-    h[CG_X_LEVEL] = cg_sqrt(cg_square(cold * model->level_std_v) + cg_square(axis_v));
+    const cg_real *range = model->temperature_range_c;
+    const cg_real outside_k =
+        cg_max(cg_max(range[0] - temperature_c, temperature_c - range[1]), R(0.0));
+    const cg_real unknown_v = is_missing ? cg_unknown_temperature_v(model, block->load) : R(0.0);
+    h[CG_X_LEVEL] = cg_sqrt(cg_square(cold * model->level_std_v) + cg_square(axis_v) +
+                            cg_square(R(OUTSIDE_PCT_PER_K) * outside_k * slope) +
+                            cg_square(unknown_v));
     cg_functions_row(model, x[CG_X_SOC], block->load, &h[CG_X_FUNCTIONS]);
     volts += cg_dot(block->load, model->load, cg_loads(model));
     volts += cg_dot(&h[CG_X_SLOW], &x[CG_X_SLOW], size - CG_X_SLOW);
-    *noise = cg_square(cold * model->fast_std_v) + cg_square(axis_v);
+    *noise = cg_square(cold * model->fast_std_v) + cg_square(axis_v) + block->unseen_v2;
     return volts;
 }
 
@@ -187,7 +228,8 @@ static void ekf_update(const cg_model *model, cg_ekf *ekf, const cg_means *block
         const cg_real to_pct = cg_clip(ekf->x[CG_X_SOC] + (at.gain[CG_X_SOC] * at.innovation),
                                        R(LOWEST_PCT), R(HIGHEST_PCT));
         const cg_real step_pct = to_pct - x[CG_X_SOC];
-        part *= ((step_pct * last_pct) < (R(-0.5) * cg_square(last_pct))) ? R(0.5) : R(1.0); /* it went too far */
+        /* Damp: full Newton steps oscillate across a kink. */
+        part *= ((step_pct * last_pct) < (R(-0.5) * cg_square(last_pct))) ? R(0.5) : R(1.0);
         last_pct = step_pct;
         for (int32_t k = 0; k < size; ++k) {
             const cg_real to =
@@ -242,32 +284,33 @@ cg_real cg_strain(const cg_ekf *ekf, const cg_model *model)
 
 static cg_sum log_odds_of(cg_sum probability) { return log(probability / (1.0 - probability)); }
 
-/* Of the wide hypothesis: not below the prior ones until it has found the SoC. */
-static cg_sum log_odds(const cg_filter *filter)
+/* Of the wide hypothesis: on a plateau not below the prior ones until it has found the SoC. */
+static cg_sum log_odds(const cg_filter *filter, const cg_model *model)
 {
     if (filter->hypotheses == 1) {
         return -(cg_sum)INFINITY;
     }
     cg_sum gained = filter->ekf[1].evidence - filter->ekf[0].evidence;
-    if ((gained < 0.0) && (var_of(&filter->ekf[1], CG_X_SOC) > cg_square(R(FOUND_STD_PCT)))) {
+    if ((gained < 0.0) && (model->soc_std_pct > R(LINEAR_PCT)) &&
+        (var_of(&filter->ekf[1], CG_X_SOC) > cg_square(R(FOUND_STD_PCT)))) {
         gained = 0.0;
     }
     return filter->prior_log_odds + gained;
 }
 
-const cg_ekf *cg_likelier(const cg_filter *filter)
+const cg_ekf *cg_likelier(const cg_filter *filter, const cg_model *model)
 {
-    return &filter->ekf[(log_odds(filter) > 0.0) ? 1 : 0];
+    return &filter->ekf[(log_odds(filter, model) > 0.0) ? 1 : 0];
 }
 
-bool cg_filter_is_rejected(const cg_filter *filter)
+bool cg_filter_is_rejected(const cg_filter *filter, const cg_model *model)
 {
-    return (filter->hypotheses == 2) ? (log_odds(filter) > 0.0) : (filter->decision > 0);
+    return (filter->hypotheses == 2) ? (log_odds(filter, model) > 0.0) : (filter->decision > 0);
 }
 
-static void keep_likelier(cg_filter *filter)
+static void keep_likelier(cg_filter *filter, const cg_model *model)
 {
-    if (log_odds(filter) > 0.0) {
+    if (log_odds(filter, model) > 0.0) {
         filter->ekf[0] = filter->ekf[1];
     }
     filter->hypotheses = 1;
@@ -292,13 +335,13 @@ void cg_filter_start(cg_filter *filter, const cg_model *model, cg_real soc_pct, 
     }
 }
 
-/* Begin with another model: keep the offset of the current, and the capacity, whose reference becomes
- * so many times as large. */
-void cg_filter_take_over(cg_filter *filter, const cg_model *model, cg_real soc_pct,
-                         cg_real std_pct, cg_real capacity_ratio)
+/* Begin with another model: keep the offset of the current, and the capacity. */
+void cg_filter_take_over(cg_filter *filter, const cg_model *model, const cg_model *model_before,
+                         cg_real soc_pct, cg_real std_pct)
 {
     cg_ekf *ekf = &filter->ekf[0];
-    const cg_ekf *before = cg_likelier(filter);
+    const cg_ekf *before = cg_likelier(filter, model_before);
+    const cg_real capacity_ratio = model->capacity_ah / model_before->capacity_ah;
     const cg_real *v = before->b_v[CG_X_OFFSET];
     const cg_real spread[2] = {cg_dot(before->b_p[0], v, 2), cg_dot(before->b_p[1], v, 2)};
     const cg_real offset_a = before->x[CG_X_OFFSET] + cg_dot(v, before->b, 2);
@@ -324,17 +367,17 @@ void cg_filter_update(cg_filter *filter, const cg_model *model, const cg_means *
     for (int32_t k = 0; k < filter->hypotheses; ++k) {
         ekf_update(model, &filter->ekf[k], block);
     }
-    if ((filter->hypotheses == 2) && (fabs(log_odds(filter)) > CLEAR_LOG_ODDS)) {
-        filter->decision = (log_odds(filter) > 0.0) ? 1 : -1;
-        if (fabs(log_odds(filter)) > DROPPED_LOG_ODDS) {
-            keep_likelier(filter);
+    if ((filter->hypotheses == 2) && (fabs(log_odds(filter, model)) > CLEAR_LOG_ODDS)) {
+        filter->decision = (log_odds(filter, model) > 0.0) ? 1 : -1;
+        if (fabs(log_odds(filter, model)) > DROPPED_LOG_ODDS) {
+            keep_likelier(filter, model);
         }
     }
 }
 
 void cg_filter_correct(cg_filter *filter, const cg_model *model, cg_real soc_pct, cg_real std_pct)
 {
-    keep_likelier(filter);
+    keep_likelier(filter, model);
     ekf_correct(&filter->ekf[0], cg_states(model), soc_pct, std_pct);
 }
 
@@ -343,14 +386,14 @@ void cg_filter_doubt(cg_filter *filter, const cg_model *model, cg_real probabili
                      cg_real std_pct, cg_real away_s, cg_real parked_std_pct)
 {
     const cg_passed passed = {R(0.0), R(0.0), R(0.0), away_s};
-    const cg_sum now = log_odds(filter);
+    const cg_sum now = log_odds(filter, model);
     if ((filter->hypotheses == 2) && (fabs(now) < CLEAR_LOG_ODDS)) {
         const cg_sum before = 1.0 / (1.0 + exp(-now));
         filter->prior_log_odds =
             log_odds_of(1.0 - ((1.0 - before) * (1.0 - (cg_sum)probability)));
         filter->ekf[1].evidence = filter->ekf[0].evidence; /* it is in the prior now */
     } else {
-        keep_likelier(filter);
+        keep_likelier(filter, model);
         filter->ekf[1] = filter->ekf[0];
         filter->hypotheses = 2;
         filter->prior_log_odds = log_odds_of((cg_sum)probability);
@@ -369,7 +412,7 @@ cg_real cg_filter_soc(const cg_filter *filter, const cg_model *model, const cg_p
     if (filter->hypotheses == 2) {
         cg_real wide_var;
         const cg_real wide_pct = soc_after(&filter->ekf[1], model, passed, &wide_var);
-        const cg_real p = (cg_real)(1.0 / (1.0 + exp(-log_odds(filter))));
+        const cg_real p = (cg_real)(1.0 / (1.0 + exp(-log_odds(filter, model))));
         const cg_real mean_pct = ((R(1.0) - p) * soc_pct) + (p * wide_pct);
         variance = ((R(1.0) - p) * (variance + cg_square(soc_pct - mean_pct))) +
                    (p * (wide_var + cg_square(wide_pct - mean_pct)));

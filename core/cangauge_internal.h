@@ -56,8 +56,7 @@ static inline cg_real cg_square(cg_real value) { return value * value; }
 
 #define CG_UNKNOWN_VAR_PCT2 2000.0 /* of an unknown SoC */
 #define CG_WRONG_STD_PCT 25.0 /* of a given start that is wrong */
-#define CG_WRONG_PRIOR 0.3
-#define CG_MOVED_STD_AT_MOST_PCT 30.0
+#define CG_WRONG_PRIOR 0.2
 #define CG_LEAST_SLOPE 1e-3
 
 static inline cg_real cg_pct_per_as(const cg_model *model)
@@ -94,6 +93,7 @@ void cg_line_lengthen(cg_line *line);
 /* voltage model */
 cg_real cg_cold(const cg_model *model, cg_real temperature_c);
 void cg_functions_row(const cg_model *model, cg_real soc_pct, const cg_real *load, cg_real *row);
+cg_real cg_unknown_temperature_v(const cg_model *model, const cg_real *load);
 cg_real cg_curve_at(const cg_model *model, const cg_real *drive, cg_real soc_pct, cg_real *slope);
 cg_real cg_newton(const cg_estimator *self, cg_real ocv_v, cg_real guess_pct, bool *inside);
 
@@ -110,8 +110,9 @@ typedef struct {
     cg_sum counted_s;
     cg_sum discharged_pct;
     cg_real voltage_v;
-    cg_real temperature_c;
+    cg_real temperature_c; /* NAN: missing */
     cg_real drop_v;
+    cg_real unseen_v2;
     cg_real load[CG_LOADS];
     cg_real drive[CG_EFFECTS];
 } cg_means;
@@ -127,18 +128,18 @@ typedef struct {
 /* filter */
 void cg_filter_start(cg_filter *filter, const cg_model *model, cg_real soc_pct, cg_real std_pct,
                      bool is_doubtful);
-void cg_filter_take_over(cg_filter *filter, const cg_model *model, cg_real soc_pct,
-                         cg_real std_pct, cg_real capacity_ratio);
+void cg_filter_take_over(cg_filter *filter, const cg_model *model, const cg_model *model_before,
+                         cg_real soc_pct, cg_real std_pct);
 void cg_filter_predict(cg_filter *filter, const cg_model *model, const cg_passed *passed);
 void cg_filter_update(cg_filter *filter, const cg_model *model, const cg_means *block);
 void cg_filter_correct(cg_filter *filter, const cg_model *model, cg_real soc_pct, cg_real std_pct);
 void cg_filter_doubt(cg_filter *filter, const cg_model *model, cg_real probability,
                      cg_real std_pct, cg_real away_s, cg_real parked_std_pct);
 bool cg_filter_is_valid(const cg_filter *filter, const cg_model *model);
-bool cg_filter_is_rejected(const cg_filter *filter);
+bool cg_filter_is_rejected(const cg_filter *filter, const cg_model *model);
 cg_real cg_filter_soc(const cg_filter *filter, const cg_model *model, const cg_passed *passed,
                       cg_real *std_pct);
-const cg_ekf *cg_likelier(const cg_filter *filter);
+const cg_ekf *cg_likelier(const cg_filter *filter, const cg_model *model);
 cg_real cg_strain(const cg_ekf *ekf, const cg_model *model);
 
 #endif

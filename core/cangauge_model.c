@@ -18,6 +18,7 @@
 
 #define ACTIVATION_K 3000.0
 #define RESISTANCE_REFERENCE_C 20.0
+#define UNKNOWN_STD_K 8.0
 
 /* ------------------------------------------------------------------ delay line */
 
@@ -245,6 +246,38 @@ void cg_functions_row(const cg_model *model, cg_real soc_pct, const cg_real *loa
             }
         }
     }
+}
+
+/* Load columns at a temperature that depend on it: the first, and the Arrhenius change. */
+static void warm_columns(const cg_model *model, cg_real temperature_c, cg_real *load)
+{
+    const int32_t currents = cg_currents(model);
+    const cg_real bounded =
+        cg_clip(temperature_c, model->temperature_limits_c[0], model->temperature_limits_c[1]);
+    load[0] = bounded - model->t_ref_c;
+    if (model->has_arrhenius != 0) {
+        const cg_real colder = (resistance_factor(bounded) / model->arrhenius_mean) - R(1.0);
+        load[1 + currents] = colder * cg_dot(&load[1], model->arrhenius_ohm, currents);
+    }
+}
+
+/* Standard deviation of the voltage by an unknown temperature, of a load row at the usual one. */
+cg_real cg_unknown_temperature_v(const cg_model *model, const cg_real *load)
+{
+    const int32_t last = cg_loads(model) - 1;
+    cg_real warmer[CG_LOADS];
+    for (int32_t k = 0; k <= last; ++k) {
+        warmer[k] = load[k];
+    }
+    warm_columns(model, model->usual_c + R(UNKNOWN_STD_K), warmer);
+    const cg_real by_k = warmer[0] - load[0];
+    const cg_real by_ohm = (model->has_arrhenius != 0) ? (warmer[last] - load[last]) : R(0.0);
+    cg_real variance = cg_square((by_k * model->load[0]) + (by_ohm * model->load[last]));
+    for (int32_t j = 0; j < model->functions; ++j) {
+        variance += cg_square((by_k * model->function_load[0][j]) +
+                              (by_ohm * model->function_load[last][j]));
+    }
+    return cg_sqrt(variance);
 }
 
 /* ------------------------------------------------------------------ effects */
@@ -515,11 +548,7 @@ static void advance_load(cg_estimator *self, const cg_sample *sample, cg_real te
 {
     const cg_model *model = self->model;
     cg_state *state = &self->state;
-    const int32_t currents = cg_currents(model);
     cg_real *load = state->load;
-    const cg_real bounded =
-        cg_clip(temperature_c, model->temperature_limits_c[0], model->temperature_limits_c[1]);
-    load[0] = bounded - model->t_ref_c;
     for (int32_t j = 0; j < model->delays; ++j) {
         load[1 + j] = cg_line_at(&self->line, model->delay_s[j]);
     }
@@ -527,10 +556,7 @@ static void advance_load(cg_estimator *self, const cg_sample *sample, cg_real te
         load[1 + model->delays + j] = lag_from_rest(&state->low_pass[j], model->low_pass_s[j],
                                                     sample->time_s, sample->current_a);
     }
-    if (model->has_arrhenius != 0) {
-        const cg_real colder = (resistance_factor(bounded) / model->arrhenius_mean) - R(1.0);
-        load[1 + currents] = colder * cg_dot(&load[1], model->arrhenius_ohm, currents);
-    }
+    warm_columns(model, temperature_c, load);
     state->load_v = cg_dot(load, model->load, cg_loads(model));
     state->drop_v = cg_dot(&load[1], &model->load[1], cg_loads(model) - 1);
 }
@@ -541,7 +567,7 @@ void cg_advance(cg_estimator *self, const cg_sample *sample, cg_real temperature
 {
     const cg_model *model = self->model;
     cg_state *state = &self->state;
-    const cg_real known_c = (isfinite(temperature_c) != 0) ? temperature_c : model->t_ref_c;
+    const cg_real known_c = (isfinite(temperature_c) != 0) ? temperature_c : model->usual_c;
     cg_line_push(&self->line, model->delay_s[model->delays - 1], is_gap, sample->time_s,
                  sample->current_a);
     advance_load(self, sample, known_c);

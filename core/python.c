@@ -165,8 +165,13 @@ static PyObject *Core_run(Core *self, PyObject *columns)
             ((const double *)column[0].buf)[k], ((const double *)column[1].buf)[k],
             ((const double *)column[2].buf)[k], ((const double *)column[3].buf)[k],
         };
+        const int64_t before = self->estimator.state.memory.tick;
         (void)cg_update(&self->estimator, &now);
-        const cg_estimate found = cg_evaluate(&self->estimator);
+        cg_estimate found = cg_evaluate(&self->estimator);
+        if (self->estimator.state.memory.tick == before) { /* they are of an earlier row */
+            found.voltage_model_v = (cg_real)NAN;
+            found.residual_v = (cg_real)NAN;
+        }
         numbers_of(&found, number);
         for (int j = 0; j < NUMBERS_OUT; ++j) {
             ((double *)column[COLUMNS_IN + j].buf)[k] = number[j];

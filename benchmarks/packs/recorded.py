@@ -7,6 +7,7 @@ of `leaf_module` and `a123_lfp` alone development knows no log at all.
 
 from __future__ import annotations
 
+import math
 import zlib
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -62,6 +63,12 @@ class Pack:
                 drawn.add(chosen)
                 yield draw, training, judged
 
+    def months(self, size: int) -> tuple[list, list]:
+        """Return the first training logs and all later ones, at 1 Hz, in time order."""
+        logs = {log.name: log for log in [*self.training, *self.judged]}
+        ordered = [one_hz(logs[name]) for name in sorted(logs)]
+        return ordered[:size], ordered[size:]
+
     def capacity_of(self, training: Sequence[cangauge.Log]) -> float:
         """Return the capacity of models of some training logs [Ah]."""
         return self.capacity_ah or _capacity_from_reference(training)
@@ -100,6 +107,12 @@ def _i3(folder: Path, trips: Sequence[str], role: str) -> Pack:
 
     odd = [read(f"A{number:02d}") for number in range(1, 22, 2)]
     return Pack("", "", role, "oxide", 96, odd, _judged(map(read, trips)))
+
+
+def _i3_months(folder: Path) -> Pack:
+    logs = [cangauge.read_log(path) for path in sorted(folder.glob("Trip*.csv.gz"))]
+    judged = [log for log in logs if log.name.removeprefix("Trip")[:3] not in _ODD]
+    return Pack("", "", "judged", "oxide", 96, logs, judged, sizes=())
 
 
 def _car1(folder: Path, role: str) -> Pack:
@@ -169,8 +182,33 @@ def _judged(logs: Iterable[cangauge.Log]) -> list[cangauge.Log]:
 
 def one_hz(log: cangauge.Log) -> cangauge.Log:
     """Return the first row of each second."""
-    second = np.floor(log.time_s - log.time_s[0] + 1e-6)
-    return log.rows(np.flatnonzero(np.diff(second, prepend=-1.0) > 0.0))
+    return first_of_each(log, 1.0)
+
+
+def first_of_each(log: cangauge.Log, seconds: float) -> cangauge.Log:
+    """Return the first row of each interval [s]."""
+    number = np.floor((log.time_s - log.time_s[0]) / seconds + 1e-6)
+    return log.rows(np.flatnonzero(np.diff(number, prepend=-1.0) > 0.0))
+
+
+STOP_S, NIGHT_S = (600.0, 6 * 3600.0), (8 * 3600.0, 96 * 3600.0)
+"""Time between drives [s]: where the SoC goes on, and where it does not: the car was charged, or
+driven, without a log."""
+SAME_PCT = 1.0
+"""The SoC goes on if it differs by less [%]."""
+
+
+def on_one_clock(logs: Sequence[cangauge.Log], seed: Sequence[int]) -> list[cangauge.Log]:
+    """Return logs in their order on one clock, with stops and nights of random length between."""
+    rng = np.random.default_rng(seed)
+    days, end_s, end_pct = [], 0.0, math.nan
+    for log in logs:
+        soc_pct = log.soc_pct[np.isfinite(log.soc_pct)]
+        low, high = STOP_S if abs(soc_pct[0] - end_pct) < SAME_PCT else NIGHT_S
+        begin_s = end_s + float(np.exp(rng.uniform(np.log(low), np.log(high))))
+        days.append(replace(log, time_s=log.time_s - log.time_s[0] + begin_s))
+        end_s, end_pct = days[-1].time_s[-1], float(soc_pct[-1])
+    return days
 
 
 _ODD = [f"A{number:02d}" for number in range(1, 22, 2)]
@@ -198,6 +236,7 @@ PACKS: dict[str, tuple[str, Callable[[Path, str], Pack]]] = {
         ),
     ),
     "i3": ("bmw_i3", lambda at, _: _i3(at, _EVEN, "judged")),
+    "i3_months": ("bmw_i3", lambda at, _: _i3_months(at)),
     "i3_winter": ("bmw_i3", lambda at, _: _i3(at, WINTER, "judged")),
     "car1": ("batic_car1", lambda at, _: _car1(at, "judged")),
     "lg_hg2": (
@@ -223,4 +262,7 @@ PACKS: dict[str, tuple[str, Callable[[Path, str], Pack]]] = {
     for celsius in (0, 10, 25, 40)
 }  # fmt: skip
 """Pack → folder and reader. `_dev`: the part that constants may be chosen on. `i3_winter` and
-`lg_hg2_from_25c` are judged at temperatures that their models have not seen."""
+`lg_hg2_from_25c` are judged at temperatures that their models have not seen. `i3_months` has all
+trips, summer and winter, for `--months` alone."""
+MONTHS = ("i3_dev", "car1_dev", "lg_temps_dev", "i3_months", "car1")
+"""Cars that are estimated in time order; the order of names is that of time."""

@@ -109,6 +109,14 @@ class _Reasons(dict[int, Reason]):
 
 REASONS: Final = _Reasons()
 """Sets of reasons by their bits: slow to combine, and read for every sample."""
+_NOTE_BITS: Final = int(
+    Reason.TEMPERATURE_MISSING
+    | Reason.VOLTAGE_OUTSIDE_MODEL
+    | Reason.SOC_OUTSIDE_MODEL
+    | Reason.TEMPERATURE_OUTSIDE_MODEL
+    | Reason.CURRENT_OUTSIDE_MODEL
+)
+"""Reasons that the standard deviation contains: they leave an estimate valid."""
 _UNKNOWN_BITS: Final = int(Reason.NO_INITIAL_SOC)
 _INVALID_BITS: Final = int(
     Reason.INPUT_STALE | Reason.CURRENT_MISSING | Reason.MODEL_MISMATCH | Reason.SIGN_SUSPECT
@@ -209,7 +217,7 @@ class CellReport(NamedTuple):
 
 def status_of(reasons: Reason) -> Status:
     """Return the status that follows from the reasons."""
-    bits = int(reasons)
+    bits = int(reasons) & ~_NOTE_BITS
     if not bits:
         return Status.VALID
     if bits & _UNKNOWN_BITS:

@@ -181,8 +181,11 @@ def test_columns_give_the_same_bits_as_samples() -> None:
     columns = np.array(eventful_samples()).T
     (_, whole), (_, single) = (pair(KNOTS, EstimatorSettings()) for _ in range(2))
     found = np.array(whole.run(columns)).T
-    expected = np.array([single.step(Sample._make(row))[:9] for row in columns.T.tolist()])
-    np.testing.assert_array_equal(found, expected)
+    for got, sample in zip(found, columns.T.tolist(), strict=True):
+        row, expected = single.row, np.array(single.step(Sample._make(sample))[:9])
+        if single.row == row:
+            expected[5:7] = np.nan  # voltage and residual stand in the rows of their own alone
+        np.testing.assert_array_equal(got, expected)
 
 
 def test_environment_switches_the_core_off(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -10,22 +10,32 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cangauge.estimation.ekf import OFFSET_STD_A, SocFilter
+from cangauge.estimation.ekf import (
+    LEARNED_TIME_S,
+    LEVEL,
+    LEVEL_TIME_S,
+    OFFSET_STD_A,
+    OUTSIDE_PCT_PER_K,
+    SocFilter,
+)
 from cangauge.estimation.health import CAPACITY_STD, RESISTANCE_STD
 from cangauge.estimation.start import WRONG_PRIOR, WRONG_STD_PCT, Hypotheses
 from cangauge.estimation.state import Block
 
 CAPACITY_AH = 60.0
 LOAD = np.array([1.0, -40.0])
+LOAD_COEFFICIENTS = np.array([0.3, 0.1])
 NO_EFFECTS = np.zeros(1)
+START_STD_PCT = 20.0
 
 
 class LinearModel:
     """A voltage model that is linear in the SoC and in two functions."""
 
     capacity_ah = CAPACITY_AH
+    model = SimpleNamespace(usual_c=20.0, temperature_range_c=(10.0, 30.0))
     functions = SimpleNamespace(number=2, row=lambda _, load: np.array([0.9, 0.01 * load[1]]))
-    load_coefficients = np.array([0.3, 0.1])
+    load_coefficients = LOAD_COEFFICIENTS
     noise = SimpleNamespace(
         level_std_v=0.8, slow_std_v=0.6, slow_time_s=300.0, fast_std_v=0.3, soc_std_pct=0.3,
         cold=lambda temperature_c: 1.0 if temperature_c > 10.0 else 1.4,
@@ -34,10 +44,15 @@ class LinearModel:
     def pseudo_ocv_at(self, soc_pct: float, drives: Any = None) -> tuple[float, float]:
         return 300.0 + 0.7 * soc_pct, 0.7
 
+    def unknown_temperature_v(self, load: np.ndarray) -> float:
+        return 5.0
+
 
 def block(number: int, voltage_v: float, discharged_pct: float, load_a: float = 40.0) -> Block:
     load = np.array([1.0, -load_a])
-    return Block(30.0 * number, discharged_pct, voltage_v, 20.0, 0.1 * load[1], load, NO_EFFECTS)
+    return Block(
+        30.0 * number, discharged_pct, voltage_v, 20.0, 0.1 * load[1], 0.0, load, NO_EFFECTS
+    )
 
 
 def voltages(count: int, seed: int) -> list[tuple[float, float, float]]:
@@ -59,39 +74,52 @@ def augmented(
 ) -> tuple[np.ndarray, np.ndarray, float]:
     """State, covariance and log-likelihood of the whole problem at once, by dense conditioning.
 
-    The unknowns are those of the start, (S, o, w, c, c, g, r), and z at each block.
+    The unknowns are (S, o, w, c, c, g, r) after the last block. o, w and c are processes that
+    return to zero; each has a value at the start and at every block.
     """
     noise, count = LinearModel.noise, len(rows)
-    prior = np.array([20.0, OFFSET_STD_A, 1.0, 1.0, 1.0, CAPACITY_STD, RESISTANCE_STD])
-    if not with_biases:
-        prior[-2:] = 0.0
-    gap = np.abs(np.subtract.outer(np.arange(count), np.arange(count)))
-    slow = noise.slow_std_v**2 * np.exp(-30.0 / noise.slow_time_s * gap)
-    drift = 1e-6 * 30.0 * (np.minimum.outer(np.arange(count), np.arange(count)) + 1)
+    times = np.arange(count + 1)
+    gap = np.abs(np.subtract.outer(times, times))
+    time_s = [LEARNED_TIME_S, LEVEL_TIME_S, LEARNED_TIME_S, LEARNED_TIME_S]
+    sizes = [OFFSET_STD_A, 1.0, 1.0, 1.0]
+    processes = [
+        size**2 * np.exp(-30.0 / tau_s * gap) for size, tau_s in zip(sizes, time_s, strict=True)
+    ]
+    slow = noise.slow_std_v**2 * np.exp(-30.0 / noise.slow_time_s * gap[1:, 1:])
+    drift = 1e-6 * 30.0 * np.minimum.outer(times[1:], times[1:])
     rate = 100.0 * 30.0 / 3600.0 / CAPACITY_AH
-    A = np.zeros((count, 7))
+    slope = 0.7
+    seen = np.zeros((4, count, count + 1))
+    of_biases = np.zeros((count, 2))
     expected, charge = np.empty(count), 0.0
-    for k, (_, charge_pct, current_a) in enumerate(rows):
+    for k, (_, charge_pct, current_a) in enumerate(rows, start=1):
         charge += charge_pct
         load = np.array([1.0, -current_a])
-        slope = 0.7
+        seen[0, k - 1, :k] = slope * rate
         level = np.hypot(noise.level_std_v, noise.soc_std_pct * slope)
-        A[k] = [slope, slope * rate * (k + 1), level, 0.9, 0.01 * load[1], -slope * charge,
-                0.1 * load[1]]  # fmt: skip
-        expected[k] = 300.0 + slope * (start_pct - charge) + load @ LinearModel.load_coefficients
-    fast = noise.fast_std_v**2 + (noise.soc_std_pct * 0.7) ** 2
-    covariance = (A * prior**2) @ A.T + slow + 0.7**2 * drift + fast * np.eye(count)
-    gain = (A * prior**2).T @ np.linalg.inv(covariance)
+        seen[1:, k - 1, k] = level, 0.9, 0.01 * load[1]
+        of_biases[k - 1] = -slope * charge, 0.1 * load[1]
+        expected[k - 1] = 300.0 + slope * (start_pct - charge) + load @ LOAD_COEFFICIENTS
+    biases = np.array([CAPACITY_STD, RESISTANCE_STD]) if with_biases else np.zeros(2)
+    fast = noise.fast_std_v**2 + (noise.soc_std_pct * slope) ** 2
+    covariance = slow + slope**2 * drift + fast * np.eye(count) + (slope * START_STD_PCT) ** 2
+    covariance += (of_biases * biases**2) @ of_biases.T
+    for each, process in zip(seen, processes, strict=True):
+        covariance += each @ process @ each.T
+    cross = [process[-1] @ each.T for each, process in zip(seen, processes, strict=True)]
+    cross = np.vstack([np.zeros(count), *cross, (of_biases * biases**2).T])
     error = np.array([volts for volts, _, _ in rows]) - expected
-    posterior = np.diag(prior**2) - gain @ (A * prior**2)
+    solved = np.linalg.solve(covariance, np.column_stack([error, cross.T]))
+    prior = np.diag(np.r_[0.0, np.array(sizes) ** 2, biases**2])
     logdet = np.linalg.slogdet(covariance)[1]
-    return gain @ error, posterior, -0.5 * (error @ np.linalg.solve(covariance, error) + logdet)
+    evidence = -0.5 * (error @ solved[:, 0] + logdet)
+    return cross @ solved[:, 0], prior - cross @ solved[:, 1:], evidence
 
 
 @pytest.mark.parametrize("seed", [1, 2, 3])
 def test_linear_filter_equals_the_batch_solution(seed: int) -> None:
     rows = voltages(25, seed)
-    filter_ = SocFilter(LinearModel(), 60.0, 20.0)
+    filter_ = SocFilter(LinearModel(), 60.0, START_STD_PCT)
     run(filter_, rows)
     mean, covariance, evidence = augmented(rows, 60.0, with_biases=False)
     found = filter_.x[[1, 3, 4, 5]]
@@ -105,7 +133,7 @@ def test_linear_filter_equals_the_batch_solution(seed: int) -> None:
 @pytest.mark.parametrize("seed", [1, 2])
 def test_separate_biases_equal_the_augmented_problem(seed: int) -> None:
     rows = voltages(25, seed)
-    filter_ = SocFilter(LinearModel(), 60.0, 20.0)
+    filter_ = SocFilter(LinearModel(), 60.0, START_STD_PCT)
     run(filter_, rows)
     mean, covariance, _ = augmented(rows, 60.0, with_biases=True)
     x, P = filter_.joint()
@@ -162,6 +190,25 @@ def test_a_rejected_start_leaves_only_the_wide_hypothesis() -> None:
     run(hypotheses, rows)
     assert (len(hypotheses.filters), hypotheses.decision) == (1, 1)
     assert abs(hypotheses.soc_after(0.0, 0.0)[0] - 80.0) < 3.0
+
+
+def test_what_is_learned_returns_to_the_prior_while_the_car_is_away() -> None:
+    filter_ = SocFilter(LinearModel(), 60.0, START_STD_PCT)
+    run(filter_, voltages(25, 1))
+    filter_.predict(0.0, 0.0, away_s=30.0 * LEARNED_TIME_S)
+    fresh = SocFilter(LinearModel(), 60.0, START_STD_PCT)
+    np.testing.assert_allclose(filter_.x[1:], fresh.x[1:], atol=1e-9)
+    np.testing.assert_allclose(filter_.P[1:, 1:], fresh.P[1:, 1:], atol=1e-9)
+
+
+def test_an_unknown_temperature_and_one_outside_the_fit_widen_what_lasts() -> None:
+    filter_ = SocFilter(LinearModel(), 60.0, START_STD_PCT)
+    known = block(1, 340.0, 0.0)
+    level_v = filter_.measurement(filter_.x, known)[1][LEVEL]
+    outside_v = filter_.measurement(filter_.x, known._replace(temperature_c=40.0))[1][LEVEL]
+    unknown_v = filter_.measurement(filter_.x, known._replace(temperature_c=np.nan))[1][LEVEL]
+    assert outside_v == pytest.approx(np.hypot(level_v, OUTSIDE_PCT_PER_K * 10.0 * 0.7))
+    assert unknown_v == pytest.approx(np.hypot(level_v, 5.0))
 
 
 def test_doubt_keeps_the_odds_of_an_open_question() -> None:

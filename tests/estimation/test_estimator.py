@@ -291,7 +291,7 @@ def test_gap_uncertainty_includes_current_at_its_ends() -> None:
     counter.step(60.0, 30.0)
     counter.step(90.0, 30.0)
     gap_pct = math.sqrt(counter.state.gap_var_pct2)
-    assert gap_pct == pytest.approx(100.0 * 30.0 * 30.0 / 36000.0)
+    assert gap_pct == pytest.approx(100.0 * 30.0 * 30.0 / 36000.0, rel=1e-4)
     away = counter.step(190.0, 0.0)
     assert away.parked_std_pct > 100.0 * 30.0 * 100.0 / 36000.0 - 0.1
 

@@ -250,14 +250,3 @@ def test_readings_that_wait_are_in_order(change: Any) -> None:
     online = [state.online[0], change(state.online[1])]
     with pytest.raises(InputError, match=r"^effects\.0: the saved state is damaged"):
         Estimator(model).restore(state.model_copy(update={"online": online}))
-
-
-def test_state_with_the_doubt_of_an_earlier_version_continues() -> None:
-    estimator = Estimator(PLAIN)
-    for sample in EVENTFUL[:300]:
-        estimator.step(sample)
-    data = json.loads(estimator.snapshot().model_dump_json())
-    data["memory"]["doubt"] = "interval"
-    again = Estimator(PLAIN)
-    again.restore(EstimatorState.model_validate(data))
-    assert same([again.step(EVENTFUL[300])], [estimator.step(EVENTFUL[300])])

@@ -10,7 +10,7 @@ import pytest
 
 from cangauge.errors import InputError
 from cangauge.estimation.compiled import make_estimator
-from cangauge.estimation.counting import SET_BACK_SAMPLES, moved_probability
+from cangauge.estimation.counting import SET_BACK_SAMPLES
 from cangauge.estimation.estimator import Estimator
 from cangauge.estimation.offline import samples_of
 from cangauge.estimation.settings import EstimatorSettings
@@ -68,7 +68,6 @@ def test_parked_soc_stays_despite_biased_voltage(hours: float, bias_v: float) ->
     wrong = errors(found, 60.0)
     # Without an interval the same voltage gives 1.9 % after half an hour.
     assert max(map(abs, wrong)) < 2.6
-    assert max(map(abs, wrong[:120])) < 1.8
     outside = [abs(e) > 2.0 * each.soc_std_pct for e, each in zip(wrong, found, strict=True)]
     assert sum(outside) < 0.05 * len(outside)
 
@@ -243,9 +242,3 @@ def test_reference_rules_validate_their_ranges() -> None:
         FullCharge(voltage_v=math.nan, current_a=2.0)
     with pytest.raises(InputError, match=r"long_rest\.after_s"):
         LongRest(after_s=1.0)
-
-
-def test_moved_odds_are_finite_and_grow_with_time() -> None:
-    odds = [moved_probability(seconds) for seconds in (5e-324, 1e-9, 2.0, 60.0, 7200.0, 1e300)]
-    assert all(math.isfinite(each) for each in odds)
-    assert odds == sorted(odds)

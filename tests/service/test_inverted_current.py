@@ -13,9 +13,9 @@ import pytest
 from cangauge._resources import shared_file
 from cangauge.bus.publish import SocEstimate, SocReader
 from cangauge.bus.vehicle import Vehicle
-from cangauge.estimation.offline import samples_of
+from cangauge.estimation.offline import run_estimator, samples_of
+from cangauge.estimation.settings import EstimatorSettings
 from cangauge.logs.log import Log
-from cangauge.logs.sign import sign_of_current
 from cangauge.replay.player import ReplaySettings, play
 from cangauge.replay.steps import LogSource
 from cangauge.service.config import RunConfig
@@ -103,16 +103,25 @@ def test_the_frame_says_implausible_and_the_suspicion_ends_with_the_proof() -> N
     # Its bits have been those of other reasons before: this one has none of its own.
     expected = pipeline.published.reasons & ~Reason.SIGN_SUSPECT | Reason.IMPLAUSIBLE_INPUT
     assert content.reasons == expected
-    for sample in samples_of(short_log(2400.0, rate_hz=1.0)):
-        pipeline.sign.add(sample._replace(time_s=2e9 + sample.time_s))
-    assert not pipeline.sign.evidence
+    for sample in samples_of(short_log(300.0, rate_hz=1.0)):
+        pipeline.estimator.update(sample._replace(time_s=2e9 + sample.time_s))
+    assert not pipeline.estimator.estimate.reasons & Reason.SIGN_SUSPECT
 
 
-def test_a_right_sign_and_few_steps_prove_nothing() -> None:
-    assert not driven(short_log(700.0, rate_hz=2.0)).sign.evidence
-    few = inverted(short_log(1200.0, rate_hz=1.0))
-    # 40 levels of half a minute: enough for a log, which is tested once.
-    level_a = np.repeat(few.current_a[::30], 30)
-    steady = replace(few, current_a=level_a, voltage_v=380.0 + 0.1 * level_a)
-    assert sign_of_current(steady).sign == -1
-    assert not driven(steady).sign.evidence
+def test_a_right_sign_and_a_charge_at_constant_power_prove_nothing() -> None:
+    log = short_log(700.0, rate_hz=2.0)
+    assert not driven(log).latest.reasons & Reason.SIGN_SUSPECT
+    voltage_v = np.linspace(370.0, 400.0, len(log))  # both rise, a current that charges too
+    steady = replace(log, current_a=-7000.0 / voltage_v, voltage_v=voltage_v)
+    assert not driven(steady).latest.reasons & Reason.SIGN_SUSPECT
+
+
+def test_a_sign_that_turns_is_found_within_seconds() -> None:
+    log = short_log(700.0, rate_hz=2.0)
+    turned = replace(log, current_a=np.where(log.time_s < 350.0, 1.0, -1.0) * log.current_a)
+    table = run_estimator(turned, leaf_model(), EstimatorSettings())
+    suspect = (table.reasons & Reason.SIGN_SUSPECT) != 0
+    first_s = turned.time_s[np.argmax(suspect)]
+    assert 350.0 <= first_s < 410.0
+    assert np.all(suspect[turned.time_s > first_s])
+    assert np.all(table.status[suspect] == Status.INVALID)

@@ -26,6 +26,7 @@ from cangauge.estimation import core_layout as layout
 from cangauge.estimation.estimator import Estimator
 from cangauge.estimation.settings import EstimatorSettings
 from cangauge.estimation.state import (
+    SCALARS,
     BiasState,
     BlockState,
     ClockState,
@@ -156,6 +157,11 @@ class CompiledEstimator(Estimator):
         """The estimate after the latest sample; see `Estimator.estimate`."""
         return cast("Estimate", self._core.estimate())
 
+    @property
+    def row(self) -> int:
+        """Number of the row whose voltage was compared with the model last; −1 before any."""
+        return int(self._record["memory"]["tick"])
+
     def uncounted_std_pct(self, seconds: float) -> float:
         """Return what the SoC's standard deviation lacks [%] when no sample came for a time [s]."""
         return float(self._core.uncounted_std_pct(seconds))
@@ -249,11 +255,11 @@ class CompiledEstimator(Estimator):
         block, columns = self._record["block"], self._online.load_coefficients.size
         if not block["rows"]:
             return _read(BlockState, block, columns=0, sums=[])
-        sums = [*block["sums"][: 5 + columns].tolist(), *self._drives(block["drive"])]
+        sums = [*block["sums"][: SCALARS + columns].tolist(), *self._drives(block["drive"])]
         return _read(BlockState, block, columns=columns, sums=sums)
 
     def _write_block(self, state: BlockState) -> None:
-        block, used, over = self._record["block"], 5 + state.columns, self._is_over_soc
+        block, used, over = self._record["block"], SCALARS + state.columns, self._is_over_soc
         for name in ("number", "rows", "is_broken"):
             block[name] = getattr(state, name)
         block["sums"] = block["drive"] = 0.0

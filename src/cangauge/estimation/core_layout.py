@@ -23,7 +23,7 @@ CURRENTS: Final = DELAYS + LOW_PASSES
 LOADS: Final = CURRENTS + 2
 STATES: Final = FUNCTIONS + 4
 PAIRS: Final = STATES * (STATES + 1) // 2
-SUMS: Final = LOADS + 5
+SUMS: Final = LOADS + 6
 """Upper limits of a model, as in the header."""
 
 KINDS: Final = (
@@ -57,7 +57,7 @@ MODEL: Final = _structure(
     "d:ocv_v[OCV] d:epsilon d:slope_beyond[2] i:knots d:knot_pct[KNOTS] d:knot_v[KNOTS]"
     " d:knot_slope[KNOTS] d:t_ref_c d:temperature_limits_c[2] i:delays d:delay_s[DELAYS]"
     " i:low_passes d:low_pass_s[LOW_PASSES] i:has_arrhenius d:arrhenius_ohm[CURRENTS]"
-    " d:arrhenius_mean d:load[LOADS] d:soc_range_pct[2] d:temperature_range_c[2]"
+    " d:arrhenius_mean d:usual_c d:load[LOADS] d:soc_range_pct[2] d:temperature_range_c[2]"
     " d:current_range_a[2] d:rate_hz d:capacity_ah d:charge_efficiency d:initial_offset_pct"
     " d:nominal_v d:level_std_v d:slow_std_v d:slow_time_s d:fast_std_v d:soc_std_pct"
     " d:cold_exponent d:residual_std_v d:block_s i:tested_blocks d:innovations_at_most"
@@ -86,14 +86,15 @@ STATE: Final = _structure(
     " b:is_refused u:implausible d:load[LOADS] d:load_v d:drop_v d:drive[EFFECTS]",
     clock=_structure("d:last_s d:shift_s l:behind d:behind_s d:age_s b:is_restored"),
     counter=_structure(
-        "d:time_s d:current_a d:mean_square_a2 d:mean_a d:discharged_pct d:moved_pct d:counted_s"
-        " d:gap_var_pct2 b:is_restored"
+        "d:time_s d:current_a d:mean_square_a2 d:mean_a d:turned_a2 d:discharged_pct d:moved_pct"
+        " d:counted_s d:gap_var_pct2 b:is_restored"
     ),
     block=_structure("l:number i:rows b:is_broken d:sums[SUMS] d:drive[EFFECTS]"),
     filter=_structure("ekf:ekf[2] i:hypotheses i:decision d:prior_log_odds", ekf=_EKF),
     memory=_structure(
-        "l:samples l:resets d:first_s l:tick d:temperature_c d:newton_pct d:newton_std_pct"
-        " b:newton_inside d:voltage_model_v d:residual_v b:is_known d:filter_discharged_pct"
+        "l:samples l:resets d:first_s l:tick d:temperature_c d:row_v d:row_drop_v"
+        " d:sign_log_odds d:newton_pct d:newton_std_pct b:newton_inside"
+        " d:voltage_model_v d:residual_v b:is_known d:filter_discharged_pct"
         " d:filter_counted_s d:filter_gap_var_pct2 d:coulomb_start_pct d:coulomb_var_pct2"
         " d:coulomb_counted_s d:coulomb_moved_pct d:coulomb_gap_var_pct2 d:gap_until_s"
         " d:contradicted_until_s d:mismatch_until_s i:innovations d:innovation2[TESTED]"
@@ -148,7 +149,7 @@ def model_constants(
     tests : tuple
         Number of blocks that are tested together, and the limits of innovations and strain.
     """
-    voltage, noise, functions = online.model, model.noise, online.functions
+    voltage, noise, functions = online.model, online.noise, online.functions
     counting, arrhenius = online.extended.counting(0.0), online.model.arrhenius
     record = np.zeros(1, MODEL)
     of = record[0]
@@ -168,8 +169,15 @@ def model_constants(
         load=voltage.load_coefficients, function_pct=functions.soc_pct,
         function_v=functions.value, function_slope=functions.slope, function_load=functions.load,
     )  # fmt: skip
-    for name in ("t_ref_c", "temperature_limits_c", "soc_range_pct", "temperature_range_c",
-                 "current_range_a", "nominal_v"):  # fmt: skip
+    for name in (
+        "t_ref_c",
+        "usual_c",
+        "temperature_limits_c",
+        "soc_range_pct",
+        "temperature_range_c",
+        "current_range_a",
+        "nominal_v",
+    ):
         of[name] = getattr(voltage, name)
     for name in ("level_std_v", "slow_std_v", "slow_time_s", "fast_std_v", "soc_std_pct",
                  "cold_exponent", "residual_std_v", "block_s"):  # fmt: skip

@@ -1,15 +1,18 @@
 """Coulomb counting over irregular samples, unobserved intervals, and the estimator's time.
 
-Steps up to `gap_s` count by the trapezoidal rule. Longer steps up to `BRIDGE_S` count as well, but
-their charge is uncertain by the whole recent current. Across a restart, the currents at both ends
-of the gap count for as long as a driver holds a current, and the mean of the last minute for the
-rest.
+Steps up to `gap_s` count by the trapezoidal rule. A change of the current between two samples may
+have come at any time between them, the more so the longer they are apart: each step adds
+
+    ½·((1 − exp(−Δt/HELD_S))·ΔI·Δt)²
+
+to the variance of the charge. Longer steps up to `BRIDGE_S` count as well, but their charge is
+uncertain by the whole recent current. Across a restart, the currents at both ends of the gap count
+for as long as a driver holds a current, and the mean of the last minute for the rest.
 
 A longer step is an *unobserved interval*: the bus was asleep, or the service not running. No charge
-is counted, and there are two hypotheses. *Parked*: self-discharge and small consumers only, so the
-SoC has hardly changed. *Moved*: the car was charged or driven, by at most the rate of a fast
-charger. The prior probability of *moved* grows with the length of the interval; the voltages after
-it test both (see `start`).
+is counted, and there are two hypotheses, as likely as each other. *Parked*: self-discharge and
+small consumers only, so the SoC has hardly changed. *Moved*: the car was charged or driven, by at
+most the rate of a fast charger. The voltages after the interval test both (see `start`).
 """
 
 from __future__ import annotations
@@ -23,28 +26,20 @@ from cangauge.logs.gaps import BRIDGE_S
 USE_S = 120.0
 """How long the current before an unobserved interval may have continued into it [s]."""
 
+UNKNOWN_STD_PCT: Final = math.sqrt(2000.0)
+"""Standard deviation of an unknown SoC [%]: wider than 0–100 % (uniform: 29 %), so that the voltage
+decides."""
+
 DRAIN_PCT_PER_HOUR = 0.05
 DRAIN_AT_MOST_PCT = 5.0
 """Self-discharge and consumers of a parked car [% per hour; %]: 1.2 % a day."""
 
-MOVED_AT_MOST = 0.3
-"""Prior probability that the car was charged or driven in a long unobserved interval: an
-assumption, to which the result is insensitive after a few voltages."""
-
-MOVED_TIME_S = 1800.0
-"""Time constant with which that probability grows [s]."""
-
-SHORTEST_S = 1.0
-"""Lower bound of the interval's length in that probability [s]; keeps the odds finite."""
+MOVED_PRIOR = 0.5
+"""Prior probability that the car was charged or driven in an unobserved interval: nothing is known
+of it, and the result is insensitive to it after a few voltages."""
 
 FASTEST_PCT_PER_HOUR = 150.0
 """Fastest unobserved change of SoC [% per hour]: a fast charger."""
-
-MOVED_STD_AT_MOST_PCT = 30.0
-"""Standard deviation of an unknown SoC [%] (uniform over 0–100: 29 %)."""
-
-AWAY_PCT_PER_HOUR = 20.0
-"""Change of SoC in an unobserved interval, for counting alone [% per hour]: a slow charger."""
 
 MEAN_SQUARE_MEMORY_S = 300.0
 """Memory of the mean square current, from which a gap's uncertainty follows [s]."""
@@ -67,23 +62,13 @@ def parked_std_pct(seconds: float, rms_pct_per_s: float) -> float:
         Recent RMS current before it [% of capacity per s].
     """
     drain_pct = min(DRAIN_PCT_PER_HOUR * seconds / 3600.0, DRAIN_AT_MOST_PCT)
-    use_pct = min(rms_pct_per_s * min(seconds, USE_S), MOVED_STD_AT_MOST_PCT)
+    use_pct = min(rms_pct_per_s * min(seconds, USE_S), UNKNOWN_STD_PCT)
     return math.sqrt(drain_pct * drain_pct + use_pct * use_pct)
 
 
 def moved_std_pct(seconds: float) -> float:
     """Return the standard deviation of the SoC [%] if the car was charged or driven."""
-    return min(FASTEST_PCT_PER_HOUR * seconds / 3600.0, MOVED_STD_AT_MOST_PCT)
-
-
-def away_std_pct(seconds: float) -> float:
-    """Return the standard deviation of the SoC by counting alone after an interval [%]."""
-    return min(AWAY_PCT_PER_HOUR * seconds / 3600.0, MOVED_STD_AT_MOST_PCT)
-
-
-def moved_probability(seconds: float) -> float:
-    """Return the prior probability that the car was charged or driven in an interval [s]."""
-    return -MOVED_AT_MOST * math.expm1(-max(seconds, SHORTEST_S) / MOVED_TIME_S)
+    return min(FASTEST_PCT_PER_HOUR * seconds / 3600.0, UNKNOWN_STD_PCT)
 
 
 OFFSET_STD_PER_AH: Final = 0.025
@@ -176,6 +161,8 @@ class CoulombCounter:
         out_pct = across_a * seconds * self._pct_per_as
         state.discharged_pct += out_pct
         state.moved_pct += abs(out_pct)
+        state.turned_a2 = 0.5 * (-math.expm1(-seconds / HELD_S) * (current_a - last_a)) ** 2
+        state.gap_var_pct2 += state.turned_a2 * (seconds * self._pct_per_as) ** 2
         if seconds > self._gap_s:
             across_a2 = 0.5 * (current_a * current_a + last_a * last_a)
             gap_pct = math.sqrt(max(mean_square_a2, across_a2)) * seconds * self._pct_per_as
@@ -188,7 +175,7 @@ class CoulombCounter:
         if math.isnan(state.time_s):
             return 0.0
         rms_a = math.sqrt(max(state.mean_square_a2, state.current_a * state.current_a))
-        return min(rms_a * seconds * self._pct_per_as, MOVED_STD_AT_MOST_PCT)
+        return min(rms_a * seconds * self._pct_per_as, UNKNOWN_STD_PCT)
 
 
 LATEST_S = 1e11

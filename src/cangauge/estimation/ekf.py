@@ -6,33 +6,37 @@ State, with C the capacity:
     S  state of charge [%]
     o  offset of the current sensor, measured − true [A]
     z  voltage error that lasts minutes [V]
-    w  voltage error that lasts the whole log (standard normal)
+    w  voltage error that lasts a drive (standard normal)
     c  principal functions of the fit's covariance (standard normal)
 
-Prediction over the time dt and the counted charge dq [% of C]:
+Prediction over the time dt and the counted charge dq [% of C]. All but S return to their priors,
+each with its time constant τ, so that no drive teaches for ever:
 
-    S ← S − dq + 100·o·dt/(3600 C),    z ← z·exp(−dt/τ),    P ← F P Fᵀ + Q
+    S ← S − dq + 100·o·dt/(3600 C),    xᵢ ← xᵢ·exp(−dt/τᵢ),    P ← F P Fᵀ + Q
+    Qᵢᵢ = (1 − exp(−2 dt/τᵢ))·(prior variance of xᵢ)
 
 Measurement, the mean voltage of a block of rows with mean load row L, at temperature T:
 
-    U = g(S) + L·θ + row(S, L)·c + A z + √((A·level)² + (δ·g′)²)·w + v,    A = A(T) ≥ 1
-    R = var v = (A·fast)² + (δ·g′)²
+    U = g(S) + L·θ + row(S, L)·c + A z + √((A·level)² + (δ·g′)² + (ε·g′)² + τ²)·w + v
+    R = var v = (A·fast)² + (δ·g′)² + var of the load between slow samples,   A = A(T) ≥ 1
 
 g′ is the slope of the curve, δ the uncertainty of the SoC against voltage: one part of it lasts,
-an equal one is new in each block. The sizes are those of the model (`Noise`). While the SoC is
-uncertain by more than `LINEAR_PCT` the update is iterated (iterated extended Kalman filter;
-Jazwinski, Stochastic Processes and Filtering Theory, 1970, ch. 8.3).
+an equal one is new in each block. Outside the temperatures of the fit it lasts with ε more, and
+without a temperature the voltage is uncertain by τ. The sizes are those of the model (`Noise`).
+While the SoC is uncertain by more than `LINEAR_PCT` the update is iterated (iterated extended
+Kalman filter; Jazwinski, Stochastic Processes and Filtering Theory, 1970, ch. 8.3).
 """
 
 from __future__ import annotations
 
 import math
-from typing import Final, Self
+from functools import cached_property
+from typing import Any, Final, Self
 
 import numpy as np
-from filterpy.kalman import ExtendedKalmanFilter
 
 from cangauge._typing import FloatArray
+from cangauge.estimation.counting import UNKNOWN_STD_PCT
 from cangauge.estimation.health import SeparateBias
 from cangauge.estimation.state import Block, FilterState
 from cangauge.model.extended import OnlineModel
@@ -41,9 +45,23 @@ OFFSET_STD_A: Final = 1.0
 """Prior standard deviation of the current sensor's offset [A]: data sheets of pack sensors state
 0.3 to 1 % of a range of ±200 A or more."""
 
+LEVEL_TIME_S: Final = 4.0 * 3600.0
+"""Time constant of the voltage error that lasts a drive [s]. From 4 to 24 h all are better than
+none on development months; the shortest is the least sure of itself."""
+
+LEARNED_TIME_S: Final = 72.0 * 3600.0
+"""Time constant of the offset and of the functions [s]: temperature and use of a car change within
+days, and with them the errors of its model. On development months 6 to 240 h are all better than
+none; this one has the fewest wrong valid estimates."""
+
 DRIFT_PCT2_PER_S: Final = 1e-6
 """Growth of the SoC's variance by self-discharge and unmeasured consumers [%²/s]: 0.06 % in the
 first hour (prototype of the filter, development packs)."""
+
+OUTSIDE_PCT_PER_K: Final = 0.2
+"""Uncertainty of the SoC against voltage by the distance from the temperatures of the fit [%/K]: a
+cell gives a tenth to a quarter less charge at −20 °C than at 25 °C (data sheets), and packs that
+the models of warm logs estimate in the cold (development packs)."""
 
 LINEAR_PCT: Final = 1.0
 """Standard deviation of the SoC up to which one linearisation is enough [%]: the slope of a curve
@@ -62,18 +80,15 @@ is learned: with −5 % a capacity stated 10 % too small was learned 6 % too sma
 LEAST_SLOPE: Final = 1e-3
 """Least slope of the curve in the filter [V/%]: keeps the SoC observable in a plateau."""
 
-UNKNOWN_STD_PCT: Final = math.sqrt(2000.0)
-"""Standard deviation of an unknown SoC [%]: wider than 0–100 % (uniform: 29 %), so that the voltage
-decides."""
-
 SOC, OFFSET, SLOW, LEVEL, FUNCTIONS = range(5)
 """Index of S, o, z, w and c₁; further functions follow."""
 
 
-class SocFilter(ExtendedKalmanFilter):  # type: ignore[misc] # filterpy has no types
+class SocFilter:
     """Kalman filter from one start, in filterpy's names: x, P, F, Q, H, R, K, y and S.
 
-    Only `predict` is filterpy's. `update` takes a block and repeats itself where the curve bends.
+    The prediction is filterpy's, which is imported with the first one: a service whose steps are
+    compiled never makes one here. `update` takes a block and repeats itself where the curve bends.
 
     Parameters
     ----------
@@ -83,6 +98,11 @@ class SocFilter(ExtendedKalmanFilter):  # type: ignore[misc] # filterpy has no t
 
     Attributes
     ----------
+    x : array of shape (n,)
+    P : array of shape (n, n)
+        State and covariance.
+    y, S : float
+        Latest innovation and its variance.
     evidence : float
         Sum of the log-likelihoods of all voltages, which compares starts.
     bias : SeparateBias
@@ -91,22 +111,27 @@ class SocFilter(ExtendedKalmanFilter):  # type: ignore[misc] # filterpy has no t
 
     def __init__(self, model: OnlineModel, soc_pct: float, soc_std_pct: float) -> None:
         n = FUNCTIONS + model.functions.number
-        super().__init__(dim_x=n, dim_z=1)
-        noise = model.noise
         self.model = model
+        self._time_s = np.full(n, LEARNED_TIME_S)
+        self._time_s[[SOC, SLOW, LEVEL]] = math.inf, model.noise.slow_time_s, LEVEL_TIME_S
+        self._prior_var = np.ones(n)
+        self._prior_var[[OFFSET, SLOW]] = OFFSET_STD_A**2, model.noise.slow_std_v**2
         self.x = np.zeros(n)
         self.x[SOC] = soc_pct
-        self.P = np.eye(n)
+        self.P = np.diag(self._prior_var)
         self.P[SOC, SOC] = soc_std_pct**2
-        self.P[OFFSET, OFFSET] = OFFSET_STD_A**2
-        self.P[SLOW, SLOW] = noise.slow_std_v**2
-        self.B = np.zeros(n)
-        self.B[SOC] = -1.0
-        self.Q = np.zeros((n, n))
-        self.H = np.zeros(n)
         self.y, self.S = 0.0, 1.0
         self.evidence = 0.0
         self.bias = SeparateBias(n)
+
+    @cached_property
+    def _kalman(self) -> Any:
+        from filterpy.kalman import ExtendedKalmanFilter  # noqa: PLC0415 - a second and 50 MB
+
+        kalman = ExtendedKalmanFilter(dim_x=self.x.size, dim_z=1)
+        kalman.B = np.zeros(self.x.size)
+        kalman.B[SOC] = -1.0
+        return kalman
 
     def predict(
         self,
@@ -128,14 +153,16 @@ class SocFilter(ExtendedKalmanFilter):  # type: ignore[misc] # filterpy has no t
         away_s : float
             Further time without samples [s].
         """
-        noise = self.model.noise
-        keep = math.exp(-(seconds + away_s) / noise.slow_time_s)
-        self.F[SOC, OFFSET] = 100.0 * seconds / (3600.0 * self.model.capacity_ah)
-        self.F[SLOW, SLOW] = keep
-        self.Q[SOC, SOC] = DRIFT_PCT2_PER_S * seconds + variance_pct2
-        self.Q[SLOW, SLOW] = (1.0 - keep**2) * noise.slow_std_v**2
-        super().predict(discharged_pct)
-        self.bias.predict(self.F, discharged_pct, seconds)
+        kalman = self._kalman
+        keep = np.exp(-(seconds + away_s) / self._time_s)
+        kalman.F = np.diag(keep)
+        kalman.F[SOC, OFFSET] = 100.0 * seconds / (3600.0 * self.model.capacity_ah)
+        kalman.Q = np.diag((1.0 - keep**2) * self._prior_var)
+        kalman.Q[SOC, SOC] = DRIFT_PCT2_PER_S * seconds + variance_pct2
+        kalman.x, kalman.P = self.x, self.P
+        kalman.predict(discharged_pct)
+        self.x, self.P = kalman.x, kalman.P
+        self.bias.predict(kalman.F, discharged_pct, seconds + away_s)
 
     def update(self, block: Block) -> None:
         """Correct the state by the mean voltage of a block."""
@@ -143,49 +170,59 @@ class SocFilter(ExtendedKalmanFilter):  # type: ignore[misc] # filterpy has no t
         iterations = ITERATIONS_AT_MOST if self.P[SOC, SOC] > LINEAR_PCT**2 else 1
         part, last_pct = 1.0, 0.0
         for _ in range(iterations):
-            voltage_v, self.H, self.R = self.measurement(x, block)
-            PHt = self.P @ self.H
-            self.S = float(self.H @ PHt) + self.R
-            self.K = PHt / self.S
-            self.y = block.voltage_v - voltage_v - float(self.H @ (prior - x))
-            to = prior + self.K * self.y
+            voltage_v, H, R = self.measurement(x, block)
+            PHt = self.P @ H
+            self.S = float(H @ PHt) + R
+            K = PHt / self.S
+            self.y = block.voltage_v - voltage_v - float(H @ (prior - x))
+            to = prior + K * self.y
             to[SOC] = min(max(to[SOC], LOWEST_PCT), HIGHEST_PCT)
             step_pct = float(to[SOC] - x[SOC])
             if step_pct * last_pct < -0.5 * last_pct**2:
-                part *= 0.5  # it went too far: where the slope changes, full steps circle
+                part *= 0.5  # Damp: full Newton steps oscillate across a kink.
             last_pct = step_pct
             x = to if part == 1.0 else x + part * (to - x)
             if abs(step_pct) < CLOSE_PCT:
                 break
         self.x = x
-        self._condition(PHt, block.drop_v)
-        log_var = math.log(self.S) if self.S > 0.0 else math.nan  # `is_valid` tells
+        self._condition(H, PHt, K, block.drop_v)
+        log_var = math.log(self.S) if self.S > 0.0 else math.nan  # `is_valid` tests it
         self.evidence -= 0.5 * (self.y**2 / self.S + log_var)
 
     def correct(self, soc_pct: float, soc_std_pct: float) -> None:
         """Correct the state by a SoC that is known otherwise, with its standard deviation [%]."""
-        self.H = np.zeros_like(self.x)
-        self.H[SOC], self.R = 1.0, soc_std_pct**2
-        PHt = self.P @ self.H
-        self.S = float(self.H @ PHt) + self.R
-        self.K = PHt / self.S
+        H = np.zeros_like(self.x)
+        H[SOC] = 1.0
+        PHt = self.P @ H
+        self.S = float(H @ PHt) + soc_std_pct**2
+        K = PHt / self.S
         self.y = soc_pct - float(self.x[SOC])
-        self.x = self.x + self.K * self.y
-        self._condition(PHt, 0.0)
+        self.x = self.x + K * self.y
+        self._condition(H, PHt, K, 0.0)
 
     def measurement(self, x: FloatArray, block: Block) -> tuple[float, FloatArray, float]:
         """Return the voltage at a state [V], its gradient H and the variance R [V²]."""
         model, noise = self.model, self.model.noise
-        A = model.noise.cold(block.temperature_c)
+        is_missing = math.isnan(block.temperature_c)
+        temperature_c = model.model.usual_c if is_missing else block.temperature_c
+        A = noise.cold(temperature_c)
         volts, slope = model.pseudo_ocv_at(float(x[SOC]), block.drives)
         slope = max(slope, LEAST_SLOPE)
         axis_v = noise.soc_std_pct * slope
+        low_c, high_c = model.model.temperature_range_c
+        outside_k = max(low_c - temperature_c, temperature_c - high_c, 0.0)
+        lasting_v = (
+            A * noise.level_std_v,
+            axis_v,
+            OUTSIDE_PCT_PER_K * outside_k * slope,
+            model.unknown_temperature_v(block.load) if is_missing else 0.0,
+        )
         H = np.empty_like(x)
         H[SOC], H[OFFSET], H[SLOW] = slope, 0.0, A
-        H[LEVEL] = math.hypot(A * noise.level_std_v, axis_v)
+        H[LEVEL] = math.hypot(*lasting_v)
         H[FUNCTIONS:] = model.functions.row(float(x[SOC]), block.load)
         volts += float(block.load @ model.load_coefficients + H[SLOW:] @ x[SLOW:])
-        return volts, H, (A * noise.fast_std_v) ** 2 + axis_v**2
+        return volts, H, (A * noise.fast_std_v) ** 2 + axis_v**2 + block.unseen_v2
 
     def soc_after(
         self, seconds: float, discharged_pct: float, variance_pct2: float = 0.0
@@ -248,11 +285,11 @@ class SocFilter(ExtendedKalmanFilter):  # type: ignore[misc] # filterpy has no t
         self.x[OFFSET], self.P[OFFSET, OFFSET] = x[OFFSET], P[OFFSET, OFFSET]
         self.bias.take_over(before.bias, self.model.capacity_ah / before.model.capacity_ah)
 
-    def _condition(self, PHt: FloatArray, drop_v: float) -> None:
+    def _condition(self, H: FloatArray, PHt: FloatArray, K: FloatArray, drop_v: float) -> None:
         """Update covariance and biases after the state."""
-        P = self.P - np.outer(self.K, PHt)
+        P = self.P - np.outer(K, PHt)
         self.P = 0.5 * (P + P.T)
-        self.bias.update(self.H, self.K, self.y, self.S, drop_v)
+        self.bias.update(H, K, self.y, self.S, drop_v)
 
 
 def inverse_std_pct(

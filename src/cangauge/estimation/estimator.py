@@ -19,19 +19,21 @@ from cangauge._typing import FloatArray
 from cangauge.errors import InputError
 from cangauge.estimation.cells import PackTick
 from cangauge.estimation.counting import (
+    MOVED_PRIOR,
+    UNKNOWN_STD_PCT,
+    ChargeStep,
     CoulombCounter,
     EstimatorClock,
-    away_std_pct,
     count_std_pct,
-    moved_probability,
     moved_std_pct,
 )
-from cangauge.estimation.ekf import UNKNOWN_STD_PCT, inverse_std_pct
+from cangauge.estimation.ekf import inverse_std_pct
 from cangauge.estimation.health import health_of
 from cangauge.estimation.power import PowerModel
 from cangauge.estimation.settings import EstimatorSettings, SocReference, detect_references
 from cangauge.estimation.start import WRONG_PRIOR, WRONG_STD_PCT, Hypotheses
 from cangauge.estimation.state import (
+    SCALARS,
     Block,
     BlockState,
     DelayLineState,
@@ -68,8 +70,12 @@ MISMATCH_S: Final = 2.0 * SLOW_S
 """Time over which innovations are tested against the model, and for which a failed test makes the
 estimate invalid [s]: twice the memory of the voltage's slow error."""
 
-MISMATCH_ALARM: Final = 1e-6
-"""Probability of a failed test on a pack that agrees with its model."""
+ALARM: Final = 1e-6
+"""Probability of a failed test on a pack that agrees with its model and current."""
+
+SIGN_LOG_ODDS: Final = -math.log(ALARM)
+"""Log-odds from which the current's sign counts as wrong. The sum stays within twice as much, so
+that a sign which turns is noticed after a few steps of the current."""
 
 
 class Estimator:
@@ -113,7 +119,9 @@ class Estimator:
     def __init__(self, model: Model | Any, settings: EstimatorSettings | None = None) -> None:
         self.model: Model = as_model(model)
         self.settings = settings or EstimatorSettings()
-        self._online = self.model.online(self.settings.capacity_ah, self.settings.gap_s)
+        self._online = self.model.online(
+            self.settings.capacity_ah, self.settings.gap_s, self.settings.voltage_accuracy_pct
+        )
         self.capacity_ah = self._online.capacity_ah
         self.voltage_model: VoltageModel = self._online.model
         self.hypotheses = Hypotheses(self._online)
@@ -123,8 +131,8 @@ class Estimator:
         self._memory = EstimatorMemory()
         self._power = PowerModel(self._online, self.settings.limits)
         tested = max(round(MISMATCH_S / self.model.noise.block_s), 1)
-        strain_at_most = float(chdtri(self._online.functions.number + 4, MISMATCH_ALARM))
-        self.tests = tested, float(chdtri(tested, MISMATCH_ALARM)), strain_at_most
+        strain_at_most = float(chdtri(self._online.functions.number + 4, ALARM))
+        self.tests = tested, float(chdtri(tested, ALARM)), strain_at_most
         self._mismatch = temperature_mismatch(
             self.model.temperature_source, self.settings.temperature_source
         )
@@ -190,6 +198,11 @@ class Estimator:
         return latest._replace(reasons=reasons, status=status_of(reasons))
 
     @property
+    def row(self) -> int:
+        """Number of the row whose voltage was compared with the model last; −1 before any."""
+        return self._memory.tick
+
+    @property
     def health(self) -> Health:
         """Capacity, resistance and current offset, with standard deviations."""
         self._refresh()
@@ -251,17 +264,11 @@ class Estimator:
             # Behind an open contactor; the block's other rows may be of a voltage that falls.
             block.is_broken = True
         charge = self._counter.step(time_s, self._online.counted(current_a))
-        if not math.isnan(temperature_c):
+        if not math.isnan(temperature_c) or charge.away_s:
             memory.temperature_c = temperature_c
         self._online.advance(time_s, current_a, memory.temperature_c)
         if charge.seconds > self.settings.gap_s:
-            block.is_broken = True
-            memory.gap_until_s = time_s + self._online.delay_line.longest_s
-        if away_s := charge.away_s:
-            self._predict_to_now()
-            probability, std_pct = moved_probability(away_s), moved_std_pct(away_s)
-            self.hypotheses.doubt(probability, std_pct, away_s, charge.parked_std_pct)
-            memory.coulomb_var_pct2 += away_std_pct(away_s) ** 2
+            self._note_gap(time_s, charge)
         if abs(current_a) > REST_CURRENT_C_RATE * self.capacity_ah:
             memory.rest_since_s = math.nan
         elif math.isnan(memory.rest_since_s):
@@ -273,6 +280,18 @@ class Estimator:
             memory.tick = tick
             self._use_row(sample)
 
+    def _note_gap(self, time_s: float, charge: ChargeStep) -> None:
+        """Follow a gap in the current that ends now, or an unobserved interval."""
+        memory, away_s = self._memory, charge.away_s
+        self._block.is_broken = True
+        memory.row_v = math.nan
+        memory.gap_until_s = time_s + self._online.delay_line.longest_s
+        if away_s > 0.0:
+            self._predict_to_now()
+            std_pct = moved_std_pct(away_s)
+            self.hypotheses.doubt(MOVED_PRIOR, std_pct, away_s, charge.parked_std_pct)
+            memory.coulomb_var_pct2 += MOVED_PRIOR * std_pct**2
+
     def _use_row(self, sample: Sample) -> None:
         """Compare a row's voltage with the model, and add it to the open block."""
         memory, online, counter = self._memory, self._online, self._counter.state
@@ -283,11 +302,22 @@ class Estimator:
         if not math.isnan(sample.voltage_v):
             newton = soc_from_ocv(online, sample.voltage_v - load_v, guess_pct)
             memory.newton_pct, memory.newton_inside = newton
-            temperature_c = self._temperature_c
-            memory.newton_std_pct = inverse_std_pct(online, newton.soc_pct, temperature_c, load)
-            charge = counter.counted_s, counter.discharged_pct
-            volts = sample.voltage_v, temperature_c, drop_v
-            self._block.add(Block(*charge, *volts, load, online.drives))
+            memory.newton_std_pct = inverse_std_pct(
+                online, newton.soc_pct, self._temperature_c, load
+            )
+            self._block.add(
+                Block(
+                    counter.counted_s,
+                    counter.discharged_pct,
+                    sample.voltage_v,
+                    memory.temperature_c,
+                    drop_v,
+                    online.unseen_v_per_a**2 * counter.turned_a2,
+                    load,
+                    online.drives,
+                )
+            )
+            self._watch_sign(sample.voltage_v, drop_v)
         soc_pct = self._soc()[0]
         memory.voltage_model_v = math.nan
         if not math.isnan(soc_pct):
@@ -295,6 +325,21 @@ class Estimator:
         memory.residual_v = sample.voltage_v - memory.voltage_model_v
         for reference in detect_references(self.settings, memory, sample):
             self._correct(reference)
+
+    def _watch_sign(self, voltage_v: float, drop_v: float) -> None:
+        """Weigh a step of the voltage: it goes with that of the model, or against it.
+
+        Under either sign the step is that of the model, with this sign, and an error no larger than
+        that of a voltage.
+        """
+        memory = self._memory
+        steps_v2 = (voltage_v - memory.row_v) * (drop_v - memory.row_drop_v)
+        memory.row_v, memory.row_drop_v = voltage_v, drop_v
+        if not math.isnan(steps_v2):
+            noise = self._online.noise
+            error_v2 = noise.residual_std_v**2 + noise.level_std_v**2
+            log_odds = memory.sign_log_odds + 2.0 * steps_v2 / error_v2
+            memory.sign_log_odds = min(max(log_odds, -2.0 * SIGN_LOG_ODDS), 2.0 * SIGN_LOG_ODDS)
 
     def _close_block(self, time_s: float) -> None:
         """Correct the filter by the open block, and test its innovation."""
@@ -383,9 +428,9 @@ class Estimator:
 
     @property
     def _temperature_c(self) -> float:
-        """Latest known temperature [°C]; the model's reference before the first."""
+        """Latest known temperature [°C]; the model's usual one where there is none."""
         known_c = self._memory.temperature_c
-        return self.voltage_model.t_ref_c if math.isnan(known_c) else known_c
+        return self.voltage_model.usual_c if math.isnan(known_c) else known_c
 
     def _load(self) -> tuple[FloatArray, float, float]:
         """Return the load row, its voltage, and the part of it by the resistances [V]."""
@@ -440,6 +485,7 @@ class Estimator:
             (not memory.newton_inside, Reason.VOLTAGE_OUTSIDE_MODEL),
             (time_s < memory.contradicted_until_s, Reason.INNOVATION_LARGE),
             (time_s < memory.mismatch_until_s, Reason.MODEL_MISMATCH),
+            (memory.sign_log_odds < -SIGN_LOG_ODDS, Reason.SIGN_SUSPECT),
         ):
             if is_set:
                 bits |= int(reason)
@@ -510,7 +556,7 @@ class Estimator:
         self._online.restore(state.online)
         if (state.method, state.capacity_ah) == (self.settings.method, self.capacity_ah):
             columns = self._online.load_coefficients.size
-            sums = len(Block._fields) - 2 + columns + self._online.drives.size
+            sums = SCALARS + columns + self._online.drives.size
             if state.block.rows and (state.block.columns, len(state.block.sums)) != (columns, sums):
                 raise InputError(f"the model's blocks have {sums} sums", field="block.sums")
             self._block = replace(state.block, sums=list(state.block.sums))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
@@ -66,7 +67,8 @@ class EstimateTable(ArrowExport):
     soc_newton_pct, soc_coulomb_pct : array of shape (n,)
         State of charge by inverse of the voltage model and by counting alone [%].
     voltage_model_v, residual_v : array of shape (n,)
-        Predicted voltage, and measured minus predicted voltage [V].
+        Predicted voltage, and measured minus predicted voltage [V]; NaN between the rows in which
+        both were compared.
     status, reasons : array of int, shape (n,)
         `Status` and `Reason` bits.
     scores : Scores, optional
@@ -274,7 +276,10 @@ def step_all(
     estimates = []
     rows = samples_of(samples) if isinstance(samples, Log) else samples
     for done, sample in enumerate(rows, start=1):
-        estimates.append(estimator.step(sample))
+        row, estimate = estimator.row, estimator.step(sample)
+        if estimator.row == row:
+            estimate = estimate._replace(voltage_model_v=math.nan, residual_v=math.nan)
+        estimates.append(estimate)
         if observe is not None:
             observe(sample)
         if progress is not None and done % PROGRESS_EVERY == 0:

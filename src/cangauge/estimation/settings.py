@@ -16,6 +16,7 @@ from cangauge.settings import (
     GAP_S,
     START_STD_PCT,
     VALID_STD_PCT,
+    VOLTAGE_ACCURACY_PCT,
     CapacityAh,
     FullCharge,
     GapSeconds,
@@ -26,6 +27,7 @@ from cangauge.settings import (
     StartStdPct,
     TemperatureSource,
     ValidStdPct,
+    VoltageAccuracyPct,
     check_settings,
 )
 from cangauge.types import Sample
@@ -51,6 +53,8 @@ class EstimatorSettings:
         A longer step between samples is a gap in the current [s].
     temperature_source : str
         Where the input's temperature is measured.
+    voltage_accuracy_pct : float
+        Standard deviation of the voltage sensor's lasting error [% of the voltage].
     full_charge : FullCharge, optional
     long_rest : LongRest, optional
         Rules for an external SoC reference; None is off.
@@ -70,6 +74,7 @@ class EstimatorSettings:
     capacity_ah: CapacityAh | None = None
     gap_s: GapSeconds = GAP_S
     temperature_source: TemperatureSource = "unknown"
+    voltage_accuracy_pct: VoltageAccuracyPct = VOLTAGE_ACCURACY_PCT
     full_charge: FullCharge | None = None
     long_rest: LongRest | None = None
     limits: PackLimits = field(default_factory=PackLimits)

@@ -10,11 +10,11 @@ the result is the mean weighted by both probabilities, and its variance includes
 them (static multiple model; Bar-Shalom, Li, Kirubarajan, Estimation with Applications to Tracking
 and Navigation, 2001, ch. 11.6). A hypothesis is dropped once its probability no longer counts.
 
-A filter linearises the curve at one SoC. While the wide one is still uncertain, a bend of the curve
-costs it evidence, although another SoC may agree with all voltages: on the plateau of LFP a start
-20 % off was thus "proved". So the odds do not fall below the prior ones until the wide filter has
-found the SoC by the voltages (`FOUND_STD_PCT`). Evidence against the narrow one counts as soon as
-it prevails.
+A filter linearises the curve at one SoC. On a plateau, where the SoC is uncertain against voltage
+by more than `LINEAR_PCT`, a bend of the curve costs the wide one evidence, although another SoC may
+agree with all voltages: a start 20 % off was thus "proved" on LFP. There the odds do not fall below
+the prior ones until the wide filter has found the SoC by the voltages (`FOUND_STD_PCT`). Evidence
+against the narrow one counts as soon as it prevails.
 """
 
 from __future__ import annotations
@@ -25,7 +25,8 @@ from typing import Final
 import numpy as np
 
 from cangauge.errors import InputError
-from cangauge.estimation.ekf import SOC, UNKNOWN_STD_PCT, SocFilter
+from cangauge.estimation.counting import UNKNOWN_STD_PCT
+from cangauge.estimation.ekf import LINEAR_PCT, SOC, SocFilter
 from cangauge.estimation.state import Block, HypothesesState
 from cangauge.model.extended import OnlineModel
 
@@ -35,12 +36,13 @@ UNKNOWN_PCT: Final = 50.0
 WRONG_STD_PCT: Final = 25.0
 """Standard deviation of a given start that is wrong [%]: about that of any SoC."""
 
-WRONG_PRIOR: Final = 0.3
-"""Prior probability that a given start is wrong (development packs)."""
+WRONG_PRIOR: Final = 0.2
+"""Prior probability that a given start is wrong: with 0.3 right starts are doubted too long, with
+0.1 wrong ones are believed too long (development packs)."""
 
 FOUND_STD_PCT: Final = 3.0
 """Standard deviation of the wide hypothesis up to which its evidence can prove the narrow one right
-[%]: that of a valid SoC."""
+[%]: half a step between neighbouring bends of an LFP curve."""
 
 DROPPED_LOG_ODDS: Final = 20.0
 """A hypothesis is dropped at these odds: one in 5·10⁸ moves no result by 1e-6 %."""
@@ -96,7 +98,8 @@ class Hypotheses:
             return -math.inf
         narrow, wide = self.filters
         gained = wide.evidence - narrow.evidence
-        if wide.P[SOC, SOC] > FOUND_STD_PCT**2:
+        is_plateau = self.model.noise.soc_std_pct > LINEAR_PCT
+        if is_plateau and wide.P[SOC, SOC] > FOUND_STD_PCT**2:
             gained = max(gained, 0.0)
         return self.prior_log_odds + gained
 

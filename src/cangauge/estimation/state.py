@@ -68,6 +68,8 @@ class CounterState:
     """Running mean square of the current [A²]."""
     mean_a: _Finite = 0.0
     """Running mean of the current [A]."""
+    turned_a2: _NotNegative = 0.0
+    """Variance of the current between the last two samples [A²]."""
     discharged_pct: _Finite = 0.0
     """Net charge taken out since the first sample [% of capacity]."""
     moved_pct: _NotNegative = 0.0
@@ -75,7 +77,7 @@ class CounterState:
     counted_s: _NotNegative = 0.0
     """Time since the first sample in which charge was counted [s]."""
     gap_var_pct2: _NotNegative = 0.0
-    """Variance of the charge of gaps since the first sample [%²]."""
+    """Variance of the charge between samples since the first [%²]."""
 
 
 @dataclass
@@ -98,12 +100,19 @@ class Block(NamedTuple):
     """Net charge taken out since the first sample [% of capacity]."""
     voltage_v: float
     temperature_c: float
+    """NaN without one."""
     drop_v: float
     """Part of the load voltage that is proportional to the resistances [V]."""
+    unseen_v2: float
+    """Variance of the load voltage by currents between the samples [V²]."""
     load: FloatArray
     """Load row, shape (k,)."""
     drives: FloatArray
     """Drives of the model's effects."""
+
+
+SCALARS = len(Block._fields) - 2
+"""Fields of a block that are numbers; load row and drives follow."""
 
 
 @dataclass
@@ -123,12 +132,12 @@ class BlockState:
     """Whether a gap in the current lies in it."""
     columns: _Count = 0
     """Columns of the load row."""
-    sums: list[_Finite] = field(default_factory=list)
+    sums: list[_MaybeNan] = field(default_factory=list)
     """Of the fields of a `Block`, in their order."""
 
     def add(self, row: Block) -> None:
         """Add one row, given as a block of its own."""
-        values = (*row[:5], *row.load.tolist(), *row.drives.tolist())
+        values = (*row[:SCALARS], *row.load.tolist(), *row.drives.tolist())
         sums = self.sums or [0.0] * len(values)
         self.columns = row.load.size
         self.sums = [a + b for a, b in zip(sums, values, strict=True)]
@@ -138,7 +147,9 @@ class BlockState:
         """Return the mean of the rows; None without rows, or with a gap among them."""
         if self.is_broken or not self.rows:
             return None
-        numbers, load, drives = np.split(np.array(self.sums) / self.rows, [5, 5 + self.columns])
+        numbers, load, drives = np.split(
+            np.array(self.sums) / self.rows, [SCALARS, SCALARS + self.columns]
+        )
         return Block._make([*numbers.tolist(), load, drives])
 
 
@@ -187,7 +198,12 @@ class EstimatorMemory:
     tick: Annotated[int, Field(strict=True, ge=-1, le=1 << 62)] = -1
     """Number of the last row since the first sample."""
     temperature_c: _MaybeNan = math.nan
-    """Last known temperature [°C]."""
+    """Last known temperature since the last unobserved interval [°C]."""
+    row_v: _MaybeNan = math.nan
+    row_drop_v: _MaybeNan = math.nan
+    """Voltage of the last row, and its part over the resistances; NaN after a gap [V]."""
+    sign_log_odds: _Finite = 0.0
+    """Log-odds that positive current discharges, by the steps of the voltage."""
     newton_pct: _MaybeNan = math.nan
     """SoC by inverse of the voltage model at the last row [%]."""
     newton_std_pct: _MaybeNan = math.nan
@@ -226,13 +242,6 @@ class EstimatorMemory:
     is_rested: _Flag = False
 
 
-def _without_doubt(memory: object) -> object:
-    """Return a memory without `doubt`, a field of earlier versions that nothing reads."""
-    if not isinstance(memory, dict):
-        return memory
-    return {name: value for name, value in memory.items() if name != "doubt"}
-
-
 class EstimatorState(BaseModel):
     """Everything in an `Estimator` but its model and settings."""
 
@@ -247,7 +256,7 @@ class EstimatorState(BaseModel):
     """State of the voltage model: low-passed currents, then each effect."""
     block: BlockState
     hypotheses: HypothesesState
-    memory: Annotated[EstimatorMemory, BeforeValidator(_without_doubt)]
+    memory: EstimatorMemory
     estimate: Annotated[list[_MaybeNan], Field(min_length=7, max_length=7)]
     """Numbers of the last `Estimate`, in its order, from `time_s` to `residual_v`."""
     reasons: Annotated[int, Field(strict=True, ge=0, lt=2 * max(Reason))]

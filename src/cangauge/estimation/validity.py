@@ -9,11 +9,6 @@ from cangauge.model.voltage_model import VoltageModel
 from cangauge.settings import TemperatureSource
 from cangauge.types import TEMPERATURE_WITHIN_C, VOLTAGE_WITHIN, Reason, Sample
 
-SOC_MARGIN_PCT: Final = 1.0
-MARGIN_K: Final = 1.0
-CURRENT_MARGIN: Final = 1.1
-"""How far outside the identified range still counts as inside [%, K, relative]."""
-
 _NO_REASON: Final = Reason.NONE  # used for every sample; looking up an enum member is slow
 
 
@@ -37,16 +32,13 @@ def drop_implausible(sample: Sample, nominal_v: float) -> tuple[Sample, Reason]:
 def outside_model(model: VoltageModel, soc_pct: float, sample: Sample) -> Reason:
     """Return which of SoC, temperature and current the model was not identified at (NaN: none)."""
     reasons = _NO_REASON
-    low, high = model.soc_range_pct
-    if soc_pct < low - SOC_MARGIN_PCT or soc_pct > high + SOC_MARGIN_PCT:
-        reasons |= Reason.SOC_OUTSIDE_MODEL
-    low, high = model.temperature_range_c
-    cold, hot = low - MARGIN_K, high + MARGIN_K
-    if sample.temperature_c < cold or sample.temperature_c > hot:
-        reasons |= Reason.TEMPERATURE_OUTSIDE_MODEL
-    low, high = model.current_range_a
-    if sample.current_a < CURRENT_MARGIN * low or sample.current_a > CURRENT_MARGIN * high:
-        reasons |= Reason.CURRENT_OUTSIDE_MODEL
+    for value, (low, high), reason in (
+        (soc_pct, model.soc_range_pct, Reason.SOC_OUTSIDE_MODEL),
+        (sample.temperature_c, model.temperature_range_c, Reason.TEMPERATURE_OUTSIDE_MODEL),
+        (sample.current_a, model.current_range_a, Reason.CURRENT_OUTSIDE_MODEL),
+    ):
+        if value < low or value > high:
+            reasons |= reason
     return reasons
 
 

@@ -42,6 +42,10 @@ if TYPE_CHECKING:
 LAG_NUMBERS = 3
 """Numbers of the state of a lag that has started."""
 
+UNKNOWN_STD_K = 8.0
+"""Standard deviation of an unknown temperature about the mean of the model's logs [K]: that of the
+days of a year in a temperate climate."""
+
 SLOPE_STEP_PCT = 0.05
 """Half step of the finite difference of the effects' voltage over SoC [%]."""
 
@@ -269,6 +273,9 @@ class OnlineModel:
         self._corrects = any(effect.corrects for effect, _ in extended.effects)
         self.load_coefficients = self.model.load_coefficients
         """Coefficients of the load columns, shape (k,)."""
+        currents = len(self.model.delay_s) + len(self.model.low_pass_s)
+        self.unseen_v_per_a = float(np.sum(self.load_coefficients[2 : 1 + currents]))
+        """Voltage by earlier currents, which a slow log shows in part [V/A]."""
         self.load = np.empty(0)
         """The load columns at the latest reading, shape (k,)."""
         self._over_soc = [each for each in extended.effects if each[0].uses_soc]
@@ -306,14 +313,13 @@ class OnlineModel:
         time_s, current_a : float
             Time [s] and current [A].
         temperature_c : float
-            Latest known temperature [°C]; NaN before the first: then the reference temperature
-            holds.
+            Latest known temperature [°C]; NaN without one: then the usual temperature holds.
         """
         self.delay_line.push(time_s, current_a)
         at, now = np.array([time_s]), np.array([current_a])
         smooth = [float(lag.step(at, now)[0]) for lag in self.lags]
         currents = [*self.delay_line.currents(), *smooth]
-        known_c = self.model.t_ref_c if math.isnan(temperature_c) else temperature_c
+        known_c = self.model.usual_c if math.isnan(temperature_c) else temperature_c
         self.load = self.load_at(known_c, currents)
         self.drives = np.zeros_like(self.drives)
         if not self.extended.effects:
@@ -331,6 +337,19 @@ class OnlineModel:
     def load_at(self, temperature_c: float, currents_a: Sequence[float] | FloatArray) -> FloatArray:
         """Return the load columns of given delayed and low-passed currents [A], shape (k,)."""
         return np.asarray(self.model.load_columns([temperature_c], np.array([currents_a]))[0])
+
+    def unknown_temperature_v(self, load: FloatArray) -> float:
+        """Return the standard deviation of the voltage by an unknown temperature [V].
+
+        Parameters
+        ----------
+        load : array of shape (k,)
+            Load row at the usual temperature.
+        """
+        currents = load[1 : 1 + len(self.model.delay_s) + len(self.model.low_pass_s)]
+        change = self.load_at(self.model.usual_c + UNKNOWN_STD_K, currents) - load
+        by_functions = change @ self.functions.load
+        return math.hypot(float(change @ self.load_coefficients), *by_functions.tolist())
 
     def pseudo_ocv_at(
         self, soc_pct: float, drives: FloatArray | None = None

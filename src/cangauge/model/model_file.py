@@ -55,7 +55,7 @@ from cangauge.model.voltage_model import (
     VoltageModel,
     resistance_factor,
 )
-from cangauge.settings import GAP_S, TemperatureSource
+from cangauge.settings import GAP_S, VOLTAGE_ACCURACY_PCT, TemperatureSource
 
 PRIOR_MADE_BY: Final = "prior of the chemistry"
 """`made.by` of a model without any log."""
@@ -407,7 +407,12 @@ class Model(_Fields):
         effects = parse_effects(self.effects, Pack.of(model, self.capacity_ah))
         return ExtendedModel(model, self.capacity_ah, tuple(effects))
 
-    def online(self, capacity_ah: float | None = None, gap_s: float = GAP_S) -> OnlineModel:
+    def online(
+        self,
+        capacity_ah: float | None = None,
+        gap_s: float = GAP_S,
+        voltage_accuracy_pct: float = VOLTAGE_ACCURACY_PCT,
+    ) -> OnlineModel:
         """Return the model one sample at a time, before the first sample.
 
         Parameters
@@ -416,9 +421,15 @@ class Model(_Fields):
             Capacity set by the user [Ah]; effects do not change it.
         gap_s : float
             A longer step between two samples empties the delay line [s].
+        voltage_accuracy_pct : float
+            Least standard deviation of the voltage's lasting error [% of the voltage]. The logs of
+            a fit do not show that of their sensor: one made them all.
         """
-        functions = self.principal_functions()
-        return OnlineModel(self.extended_model(), functions, self.noise, capacity_ah, gap_s)
+        extended, functions = self.extended_model(), self.principal_functions()
+        least_v = 0.01 * voltage_accuracy_pct * extended.model.nominal_v
+        level_v = max(self.noise.level_std_v, least_v)
+        noise = self.noise.model_copy(update={"level_std_v": level_v})
+        return OnlineModel(extended, functions, noise, capacity_ah, gap_s)
 
     def predict(
         self, log: Log | Path | str | Any, *, initial_soc_pct: float | None = None

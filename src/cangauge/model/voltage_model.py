@@ -473,6 +473,11 @@ class VoltageModel:
         """Pseudo-OCV at 50 % [V]."""
         return self.curve.at(50.0)[0]
 
+    @property
+    def usual_c(self) -> float:
+        """Temperature where none is known [°C]: the mean of the logs, or T_r."""
+        return self.t_ref_c if self.arrhenius is None else self.arrhenius.mean_c
+
     @cached_property
     def temperature_limits_c(self) -> tuple[float, float]:
         """Temperatures beyond which the load columns are constant [°C]."""

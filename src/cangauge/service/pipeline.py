@@ -7,12 +7,10 @@ the same stamps give the same numbers. `loop` runs it on a bus, `offline` over a
 from __future__ import annotations
 
 import math
-from collections import deque
 from dataclasses import dataclass, field, replace
 from typing import Final
 
 import can
-import numpy as np
 from can.typechecking import CanFilter
 
 from cangauge.bus.decoder import FrameStatistics, SampleDecoder
@@ -26,8 +24,6 @@ from cangauge.estimation.compiled import make_estimator
 from cangauge.estimation.estimator import Estimator
 from cangauge.estimation.settings import EstimatorSettings
 from cangauge.estimation.state import EstimatorState
-from cangauge.logs.log import Log
-from cangauge.logs.sign import sign_of_current
 from cangauge.model.model_file import Model
 from cangauge.settings import FrameIds, TimeSourceName
 from cangauge.types import Estimate, Reason, Sample, Status, status_of
@@ -58,51 +54,6 @@ class FrameCounts:
     held_back: int
     untimed: int
     beginnings: int
-
-
-class SignWatch:
-    """Test the sign of the current while the service runs, as the commands test it in a log.
-
-    Attributes
-    ----------
-    evidence : str
-        Why the sign must be inverted; "" while nothing proves it.
-    """
-
-    ROW_S: Final = 1.0
-    """Interval of the rows [s]: that of the steps which the test counts."""
-    ROWS: Final = 1800
-    """Latest rows that are tested: half an hour."""
-    TEST_EVERY_S: Final = 60.0
-    SURE_WEIGHT: Final = 5.0
-    """Decades of odds that the steps alone must give: about 55 unanimous ones. A log is tested
-    once and asks for two; here the test is repeated every minute."""
-
-    def __init__(self) -> None:
-        self.evidence = ""
-        self._rows: deque[tuple[float, float, float]] = deque(maxlen=self.ROWS)
-        self._row_s = self._test_s = -math.inf
-
-    def add(self, sample: Sample) -> None:
-        """Take a sample; test once a minute of bus time."""
-        time_s, current_a, voltage_v, _ = sample
-        if not time_s >= self._row_s or not math.isfinite(current_a + voltage_v):
-            return
-        self._row_s = time_s + self.ROW_S
-        self._rows.append((time_s, current_a, voltage_v))
-        if time_s >= self._test_s:
-            self._test_s = time_s + self.TEST_EVERY_S
-            if len(self._rows) > 1:
-                self._test()
-
-    def _test(self) -> None:
-        time_s, current_a, voltage_v = np.array(self._rows).T
-        finding = sign_of_current(Log(time_s, current_a, voltage_v, np.zeros(time_s.size)))
-        steps = next(each for each in finding.evidence if each.kind == "steps")
-        if finding.sign < 0 and steps.weight <= -self.SURE_WEIGHT:
-            self.evidence = steps.text
-        elif finding.sign > 0:
-            self.evidence = ""
 
 
 @dataclass(frozen=True)
@@ -140,8 +91,6 @@ class Pipeline:
     estimator : Estimator
     cells : CellEstimator or None
         Where the vehicle gives cell voltages.
-    sign : SignWatch
-        Whether the current has the wrong sign.
     samples, taken : int
         Samples handed to the estimator, over all logs, and those of them that it took: only these
         make an estimate fresh.
@@ -187,7 +136,7 @@ class Pipeline:
         self.published, self.published_samples = NOTHING_YET, 0
         self._estimate = NOTHING_YET  # after the latest sample, without the signals' health
         self._report: tuple[int, PackReport] | None = None
-        self._findings: tuple[Reason, Reason, bool, bool, bool] | None = None
+        self._findings: tuple[Reason, Reason, bool, bool] | None = None
         self.estimator = make_estimator(model, _with_source(settings.estimator, vehicle))
         self._pack = _pack_of(self.estimator)
         self._begin_signals()
@@ -266,7 +215,6 @@ class Pipeline:
         self._note_voltage(sample)
         self._refused = self._refused + 1 if self.estimator.is_refused else 0
         self.taken += not self.estimator.is_refused
-        self.sign.add(sample)
         cells, received = self.cells, self.decoder.cells
         if cells is not None and received is not None and cells.is_due(sample.time_s):
             volts, times = received.take(sample.time_s)
@@ -307,7 +255,6 @@ class Pipeline:
             self.decoder.reasons(now_s),
             self._lacks_voltage,
             self._refused >= MISSED_UNTIL_OLD,
-            self.sign.evidence != "",
         )
         if findings != self._findings:  # they change seldom, and flags are slow
             self._findings = findings
@@ -326,7 +273,6 @@ class Pipeline:
     def _begin_signals(self) -> None:
         """Begin to judge the signals anew, for the present vehicle and model."""
         self.decoder = SampleDecoder(self.vehicle, self._pack, self._statistics)
-        self.sign = SignWatch()
         self._voltage_s, self._without_voltage, self._lacks_voltage = math.inf, 0, False
         self._begin_cells()
 
@@ -487,7 +433,6 @@ def _all_reasons(
     signals: Reason,
     lacks_voltage: bool,
     is_refused: bool,
-    is_sign_wrong: bool,
 ) -> Reason:
     """Return the reasons of an estimate, with the findings about its inputs."""
     reasons = (estimate & ~Reason.VOLTAGE_MISSING) | signals
@@ -495,8 +440,6 @@ def _all_reasons(
         reasons |= Reason.VOLTAGE_MISSING
     if is_refused:
         reasons |= Reason.INPUT_STALE
-    if is_sign_wrong:
-        reasons |= Reason.SIGN_SUSPECT
     return reasons
 
 

@@ -1,6 +1,6 @@
 """The service's state across restarts: restored at the start, saved while it runs.
 
-    {"format": "cangauge-state", "version": 4, "sha256": "…", "content": {…}}
+    {"format": "cangauge-state", "version": 5, "sha256": "…", "content": {…}}
 
 The hash is that of the content, written without spaces and with sorted keys. A file that cannot be
 used is set aside; one that cannot be written never stops the estimator.
@@ -37,7 +37,7 @@ from cangauge.service.pipeline import Pipeline
 from cangauge.service.worker import Worker
 
 STATE_FORMAT: Final = "cangauge-state"
-STATE_VERSION: Final = 4
+STATE_VERSION: Final = 5
 """To be increased with every change of the content."""
 LARGEST_BYTES: Final = 8 << 20
 """Largest state file that is read [bytes]; a full delay line takes 0.3 MB."""
@@ -255,8 +255,13 @@ def read_state(path: Path) -> StateContent:
     except (ValueError, KeyError, TypeError, RecursionError) as error:
         raise InputError("not a cangauge state file", source=path) from error
     if found[:2] != (STATE_FORMAT, STATE_VERSION):
-        text = f"this release reads version {STATE_VERSION}"
-        raise InputError(text, source=path, field="version", value=found[1])
+        raise InputError(
+            f"this release reads version {STATE_VERSION}",
+            source=path,
+            field="version",
+            value=found[1],
+            cure="remove the file: the start is then --initial-soc, or found by the first voltages",
+        )
     if found[2] != digest:
         raise InputError("damaged: the hash does not match", source=path, field="sha256")
     return validated(StateContent, content, path)

@@ -32,7 +32,7 @@ from cangauge.service.status_client import (
     Snapshot,
     reason_ids,
 )
-from cangauge.types import Estimate, Status, reason_sentences
+from cangauge.types import REASON_WORDS, Estimate, Reason, Status, reason_sentences
 
 _LOG = logging.getLogger(__name__)
 
@@ -272,10 +272,10 @@ class Monitor:
     def _find_notices(self) -> dict[str, str]:
         """Return what the user should look after, by event: one sentence each."""
         found = {"cells.sum_differs": " ".join(self._report["notices"])}
-        if evidence := self._pipeline.sign.evidence:
+        if self._pipeline.latest.reasons & Reason.SIGN_SUSPECT:
             found["sign.suspect"] = (
-                f"the current has the wrong sign: {evidence}; the SoC is wrong. Positive current"
-                f" must discharge: {self.sign_cure}"
+                f"{REASON_WORDS[Reason.SIGN_SUSPECT]}; the SoC is wrong. Positive current must"
+                f" discharge: {self.sign_cure}"
             )
         return {event: text for event, text in found.items() if text}
 
