@@ -173,6 +173,18 @@ def test_a_failing_output_and_an_idle_replay_clock_are_told_once(
     assert any("--time-source replay-clock" in line for line in told)
 
 
+def test_a_signal_that_never_comes_is_logged_after_a_minute(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    frames = frames_every(1.0, 70.0)  # without a SoC
+    for until_s, count in ((59.0, 0), (70.0, 1)):
+        caplog.clear()
+        simulate(SimulatedPort(frames), until_s)
+        said = [each for each in caplog.records if "never" in each.getMessage()]
+        assert len(said) == count
+    assert said[0].getMessage() == "soc: PACK_SOC was never seen: no frames of 0x403"
+
+
 @pytest.mark.parametrize(
     ("bus", "say"),
     [

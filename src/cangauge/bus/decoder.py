@@ -415,6 +415,24 @@ class SampleDecoder:
         }
 
     @property
+    def never_decoded(self) -> dict[str, str]:
+        """Signals that have had no good value yet, by role, and what came instead."""
+        found = {}
+        for signal in self.vehicle.signals:
+            if not math.isnan(self.health[signal.role].latest_s):
+                continue
+            role, key = signal.role.removesuffix("_reference"), signal.key
+            number, wanted = signal.arbitration_id, self.statistics.messages[key].wanted
+            name, count = f"{signal.codec.name} of {signal.message} was never decoded", wanted
+            if self.vehicle.messages[key].reply and not wanted:
+                number = reply_id(key)
+                name, count = f"{signal.message} was never seen", self._replies[number].frames
+            found[role] = f"{role}: {name} in {count} frames of 0x{number:X}"
+            if not count:
+                found[role] = f"{role}: {signal.message} was never seen: no frames of 0x{number:X}"
+        return found
+
+    @property
     def reference_soc_pct(self) -> float:
         """The car's own state of charge [%]; NaN without a usable one."""
         health = self.health.get("soc_reference")

@@ -15,6 +15,8 @@ LONGEST_GAP_S: Final = 1.0
 
 SINGLE, FIRST, CONSECUTIVE = range(3)
 """Kinds of frames, in the upper half of their first byte."""
+_LARGEST_START: Final = 0x3F
+"""Largest first byte of a frame: that of flow control."""
 _REPLY_OFFSET = 0x40
 READ_BY_IDENTIFIER: Final = 0x62
 """First byte of a reply to ReadDataByIdentifier (22), before two bytes of the data identifier."""
@@ -36,15 +38,23 @@ def reply_id(key: int) -> int:
 
 
 class Reassembler:
-    """Replies of one sender, from its frames; lost are those with one missing, late or swapped."""
+    """Replies of one sender, from its frames; lost are those with one missing, late or swapped.
+
+    A first byte that is no kind of frame is the receiver's address (extended addressing, such as
+    BMW's 0x607 to the tester 0xF1): the frame begins after it. `frames` counts them.
+    """
 
     def __init__(self) -> None:
+        self.frames = 0
         self._payload = bytearray()
         self._length = self._sequence = 0
         self._last_s = 0.0
 
     def take(self, data: bytes | bytearray, time_s: float) -> bytes | None:
         """Take a frame at bus time `time_s` [s]; return the reply that it completes, if any."""
+        self.frames += 1
+        if data and data[0] > _LARGEST_START:
+            data = data[1:]
         if not data:
             return None
         kind, low = data[0] >> 4, data[0] & 0x0F

@@ -279,6 +279,7 @@ def capture_samples(path: str | PathLike[str], vehicle: Vehicle) -> CaptureSampl
         raise _without_current(path, vehicle, statistics)
     remarks = [*vehicle.remarks, *capture.info.remarks]
     remarks += [*_losses(statistics), *decoder.wrong_periods.values()]
+    remarks += decoder.never_decoded.values()
     if sum(bool(each[2]) for each in buses.values()) > 1:
         remarks.append(f"several buses carry the frames; bus {channel} is used: most samples")
     if recorded.name == "replay-clock":

@@ -54,6 +54,8 @@ LOGGED_FROM_S: Final = 1.0
 CHECKPOINT_EVERY_S: Final = 10.0
 """Interval of checkpoints [s]. A service that is killed and restarts within three seconds misses
 less than half a minute of charge; 20 kB per checkpoint make 0.2 GB a day."""
+NEVER_SEEN_S: Final = 60.0
+"""Time after which a signal that never came is logged [s]: replies are asked for once a minute."""
 FIRST_CHECKPOINT_S: Final = 1.0
 """Time of the first checkpoint [s]: early, for a service that is killed repeatedly."""
 FOREIGN_FRAMES: Final = 3
@@ -305,12 +307,20 @@ class Loop:
                 f"voltages come, but not within {within_s:g} s of a current: they are not used;"
                 " give a longer pair_within_s in the map file"
             )
-        for name, text in self._pipeline.decoder.wrong_periods.items():
-            found[f"bus.wrong_period {name}"] = text
+        found |= self._of_signals()
         for event in found.keys() - self._reported:
             _warn(event.split()[0], found[event], limit=event)
         self._reported = set(found)
         return reasons
+
+    def _of_signals(self) -> dict[str, str]:
+        """Return what is wrong with single signals, by event."""
+        decoder = self._pipeline.decoder
+        found = {f"bus.wrong_period {name}": text for name, text in decoder.wrong_periods.items()}
+        if self._now_s - self._began_s > NEVER_SEEN_S:
+            never = decoder.never_decoded.items()
+            found |= {f"bus.never_seen {role}": text for role, text in never}
+        return found
 
     def _send(self, frames: list[can.Message]) -> None:
         for frame in frames:

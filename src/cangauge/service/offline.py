@@ -341,15 +341,17 @@ def estimate_capture(
     best.pack.report, counts = pipeline.report(), pipeline.counts
     settings = pipeline.estimator.settings
     time_s, current_a, voltage_v, temperature_c, soc_pct = np.array(best.values).reshape(-1, 5).T
-    time_s, two_senders = _without_steps_back(time_s), pipeline.decoder.statistics.two_senders
-    remarks = _remarks(recorded_time.name, counts, two_senders, len(found))
+    time_s, statistics = _without_steps_back(time_s), pipeline.decoder.statistics
+    unseen = pipeline.decoder.never_decoded
+    remarks = _remarks(recorded_time.name, counts, statistics.two_senders, len(found))
     recorded = CaptureSamples(
         time_s, current_a, voltage_v, temperature_c, soc_pct, str(path),
-        settings.temperature_source, pipeline.decoder.statistics, capture.info,
-        (*capture.info.remarks, *remarks),
+        settings.temperature_source, statistics, capture.info,
+        (*vehicle.remarks, *capture.info.remarks, *remarks, *unseen.values()),
     )  # fmt: skip
-    # With a model, another pack's voltage is implausible.
-    is_known = np.isfinite(recorded.voltage_v).any()
+    # With a model, another pack's voltage is implausible, and a current that wraps.
+    wraps = statistics.messages[vehicle.current.key].implausible > 0
+    is_known = np.isfinite(recorded.voltage_v).any() and not wraps
     own = recorded if is_known else capture_samples(path, vehicle)
     require_same_pack(own.voltage_v, model, str(path))
     # `score` needs only columns that a capture has.
