@@ -23,6 +23,7 @@ import typer
 from cangauge.cli.app import COMMANDS, load_command
 from cangauge.extras.validation import simulate
 from cangauge.model.effects.library import LIBRARY
+from cangauge.service.config import reference
 from cangauge.types import REASON_WORDS, reason_name
 
 ROOT = Path(__file__).parent.parent
@@ -46,6 +47,7 @@ def write_pages(folder: Path) -> None:
     )
     for path, text in (
         ("reference/commands.md", commands_page()),
+        ("reference/configuration.md", configuration_page()),
         ("reference/frames.md", frames_page()),
         ("explanation/effects.md", effects_page()),
     ):
@@ -74,6 +76,15 @@ def commands_page() -> str:
         rows.extend(_option_row(parameter) for parameter in command.get_params(context))
         parts.append("\n".join(rows))
     return "\n\n".join(parts) + "\n"
+
+
+def configuration_page() -> str:
+    """Return the reference of the service's configuration."""
+    return (
+        "# Configuration of the service\n\nKeys of `cangauge run --config FILE.toml`, and its options."
+        " Paths are relative to the file. An option takes precedence over its key.\n\n"
+        + reference()
+    )
 
 
 def _option_row(parameter: Any) -> str:

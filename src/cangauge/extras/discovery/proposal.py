@@ -216,7 +216,7 @@ class Proposal:
     ) -> Iterator[str]:
         """Yield the lines of a configuration of the service; without a bus, it is a comment."""
         use = "`cangauge run --config THIS_FILE`"
-        yield f"# Configuration of {use}; all keys: docs/configuration.md."
+        yield f"# Configuration of {use}; `python -m cangauge.service.config` prints all keys."
         yield ""
         yield "# The voltage model of the pack: make it of your own drives, such as"
         yield f"# cangauge fit drive.log {self.reading(Path())} -o model.json"
