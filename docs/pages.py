@@ -80,11 +80,11 @@ def commands_page() -> str:
 
 def configuration_page() -> str:
     """Return the reference of the service's configuration."""
-    return (
-        "# Configuration of the service\n\nKeys of `cangauge run --config FILE.toml`, and its options."
-        " Paths are relative to the file. An option takes precedence over its key.\n\n"
-        + reference()
+    text = (
+        "# Configuration of the service\n\nKeys of `cangauge run --config FILE.toml`, and its"
+        " options. Paths are relative to the file. An option takes precedence over its key.\n\n"
     )
+    return text + reference()
 
 
 def _option_row(parameter: Any) -> str:

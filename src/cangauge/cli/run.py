@@ -33,8 +33,8 @@ def run_command(
         option(
             "--config",
             "FILE",
-            "Configuration in TOML; `python -m cangauge.service.config` prints its keys. Options given"
-            " here take precedence.",
+            "Configuration in TOML; `python -m cangauge.service.config` prints its keys. Options"
+            " given here take precedence.",
         ),
     ] = None,
     json_output: Annotated[bool, JSON] = False,
