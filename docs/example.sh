@@ -5,11 +5,11 @@ set -eu
 docs=$(cd "$(dirname "$0")" && pwd)
 mkdir -p "$1" && cd "$1"
 
-cangauge twin --plant equation --seed 5 --discharge -o full.csv >/dev/null
+cangauge twin --pack leaf40 --seed 4 --discharge -o full.csv >/dev/null
 for day in 1 2 3; do
-    cangauge twin --plant equation --seed 5 --day $day --hours 1 -o good$day.csv >/dev/null
+    cangauge twin --pack leaf40 --seed 4 --day $day --hours 1 -o good$day.csv >/dev/null
 done
-cangauge twin --plant equation --seed 5 --day 9 --hours 1 --effect resistance_step:step_ohm=0.05 -o today.csv >/dev/null
+cangauge twin --pack leaf40 --seed 4 --day 9 --hours 1 --effect resistance_step:step_ohm=0.04 -o today.csv >/dev/null
 cangauge fit full.csv good1.csv good2.csv good3.csv -o pack.json --report fit.html >/dev/null
 cangauge estimate today.csv -m pack.json -o soc.csv --report estimate.html >/dev/null
 cangauge gap today.csv -m pack.json --reference good1.csv --reference good2.csv --reference good3.csv \

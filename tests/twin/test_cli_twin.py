@@ -34,14 +34,12 @@ def run(*arguments: str) -> dict[str, object]:
 
 def test_the_command_writes_what_simulate_returns(tmp_path: Path) -> None:
     arguments = (
-        "--seed", "4", "--day", "2", "--hours", "0.3", "--plant", "equation", "--pack", "leaf24",
+        "--seed", "4", "--day", "2", "--hours", "0.3", "--pack", "leaf24",
         "--effect", "current_offset:offset_a=4",
     )  # fmt: skip
     paths = [tmp_path / name for name in ("a.parquet", "b.csv")]
     found = [run(*arguments, "-o", str(path)) for path in paths]
-    simulated = simulate(
-        "current_offset:offset_a=4", seed=4, drive=2, hours=0.3, plant="equation", pack="leaf24"
-    )
+    simulated = simulate("current_offset:offset_a=4", seed=4, drive=2, hours=0.3, pack="leaf24")
     assert simulated.to_dict().items() <= found[0].items()
     for path in paths:
         written = read_log(path)
@@ -124,7 +122,6 @@ def test_bad_usage_is_refused(
         ({"start_soc_pct": float("nan")}, "start SoC"),
         ({"start_soc_pct": 40.0, "end_soc_pct": 60.0}, "give a lower end"),
         ({"ambient_c": 90.0}, "ambient"),
-        ({"plant": "pybamm"}, "use one of: twin, equation"),
         ({"speed_ms": [[0.0, 5.0], [1.0, 6.0]]}, "speed_ms"),
         ({"speed_ms": [3.0, -1.0]}, "speed_ms"),
         ({"speed_ms": []}, "speed_ms"),

@@ -6,7 +6,7 @@ import math
 import time
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 from cangauge.cli.options import JSON, check_outputs, option
 from cangauge.cli.output import finish, note, print_table, progress
@@ -61,14 +61,6 @@ def twin_command(
             "leaf24, leaf40, car60, car60lfp, compact or module12. Default: drawn.",
         ),
     ] = None,
-    plant: Annotated[
-        Literal["twin", "equation"],
-        option(
-            "--plant",
-            "twin|equation",
-            "Model of the cells: the twin's, or the equation that cangauge identifies.",
-        ),
-    ] = "twin",
     json_output: Annotated[bool, JSON] = False,
 ) -> None:
     """Simulate a pack, a drive, the weather and the sensors: a log whose truth is known.
@@ -101,7 +93,6 @@ def twin_command(
             hours=hours,
             discharge=discharge,
             pack=pack,
-            plant=plant,
             name=output.stem,
         )
     for scaled in simulated.limited:

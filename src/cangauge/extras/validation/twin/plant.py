@@ -1,14 +1,12 @@
-"""Plants: models of a pack that return voltage, state of charge and heat for a current.
+"""Plant: model of a pack that returns voltage, state of charge and heat for a current.
 
 `TwinPlant` simulates the cells by tabulated open-circuit voltage, asymmetric Butler–Volmer
-kinetics, diffusion and cell spread. A healthy `EquationPlant` obeys the published voltage equation,
-so that its logs differ from the model only by sensor errors and the temperature of the core. Both
-share the thermal model and the faults around the cells.
+kinetics, diffusion and cell spread.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Final, Protocol
 
 import numpy as np
@@ -17,7 +15,7 @@ from scipy.signal import lfilter
 from cangauge._typing import FloatArray
 from cangauge.extras.validation.twin.condition import Condition
 from cangauge.extras.validation.twin.drive import Drive
-from cangauge.extras.validation.twin.pack import KELVIN, CellChemistry, TwinPack
+from cangauge.extras.validation.twin.pack import KELVIN, TwinPack
 
 REFERENCE_K: Final = 298.15
 _GLASS_K: Final = 230.0
@@ -26,12 +24,6 @@ _BEND_A: Final = 3.0
 _VOGEL_ZERO_K: Final = 170.0
 _GAS_OVER_FARADAY_V_K: Final = 8.617333e-5
 _THERMAL_STEP_S: Final = 5.0
-
-_EDGE: Final = 0.05
-"""Distance of an empty and of a full pack from the poles of the equation [-]."""
-_DELAYS_S: Final = (0.0, 10.0, 30.0, 70.0)
-_DELAYED_SHARES: Final = (0.60, 0.20, 0.12, 0.08)
-_EQUATION_REFERENCE_C: Final = 20.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -143,109 +135,6 @@ class TwinPlant:
             heat_w=current_a * drop + reversible,
             lowest_v=np.min(equilibrium - loss, axis=0),
         )
-
-
-class EquationPlant:
-    """Published equation: pseudo-OCV, temperature coefficient and four delayed resistances.
-
-    Parameters
-    ----------
-    pack : TwinPack
-        With the equation's open-circuit voltage.
-    temperature_v_k : float
-        Temperature coefficient of the pack [V/K].
-    resistance_ohm : array of shape (4,)
-        Pack resistance to the current 0, 10, 30 and 70 s ago [Ω].
-    """
-
-    name = "equation"
-    temperature_tolerance_k = 0.05
-
-    def __init__(self, pack: TwinPack, temperature_v_k: float, resistance_ohm: FloatArray) -> None:
-        self.pack = pack
-        self._temperature_v_k = temperature_v_k
-        self._resistance_ohm = resistance_ohm
-
-    def respond(
-        self, drive: Drive, condition: Condition, current_a: FloatArray, core_c: FloatArray
-    ) -> Response:
-        """Return the response to a current (see `Plant.respond`)."""
-        pack, kelvin = self.pack, core_c + KELVIN
-        charge = discharged(drive, current_a, condition.charge_loss) / pack.capacity_ah
-        start = drive.start_soc + condition.start_soc_shift
-        soc = start - charge / condition.capacity_factor
-        open_v = pack.cells * pack.chemistry.ocv(soc)
-        open_v = open_v + self._temperature_v_k * (core_c - _EQUATION_REFERENCE_C)
-        lowest_v = open_v / pack.cells
-        weak = condition.weak
-        if weak is not None:
-            factor = condition.capacity_factor * (1.0 - weak.loss)
-            of_weak = pack.chemistry.ocv(start - weak.deficit - charge / factor)
-            lack = of_weak - pack.chemistry.ocv(soc)
-            open_v, lowest_v = open_v + weak.count * lack, lowest_v + np.minimum(lack, 0.0)
-        if condition.entropy_shift_v_k is not None:
-            shift = np.interp(soc, pack.chemistry.grid, condition.entropy_shift_v_k)
-            open_v = open_v + pack.cells * shift * (kelvin - REFERENCE_K)
-        drop = self._delayed_drop(drive, current_a)
-        drop = (
-            drop
-            * cold_resistance_factor(condition, kelvin)
-            * (1.0 + soc_resistance_rise(condition, soc))
-        )
-        drop = drop + self._slower_transfer(condition, current_a, kelvin)
-        if condition.string_loss is not None:
-            on = condition.string_loss.is_active(drive.time_s)
-            drop = drop * (1.0 + condition.string_loss.size * on)
-        drop = drop + fault_drop(drive, condition, current_a, kelvin)
-        hysteresis = hysteresis_drop(drive, condition, charge) if condition.hysteresis_v else 0.0
-        return Response(
-            voltage_v=open_v - drop - hysteresis,
-            soc=soc,
-            equilibrium_v=open_v,
-            heat_w=current_a * drop,
-            lowest_v=lowest_v - drop / pack.cells,
-        )
-
-    def _delayed_drop(self, drive: Drive, current_a: FloatArray) -> FloatArray:
-        delayed = [np.interp(drive.time_s - delay, drive.time_s, current_a) for delay in _DELAYS_S]
-        return np.asarray(self._resistance_ohm @ np.array(delayed))
-
-    def _slower_transfer(
-        self, condition: Condition, current_a: FloatArray, kelvin: FloatArray
-    ) -> FloatArray | float:
-        if not condition.transfer_slowdown:
-            return 0.0
-        ratio, eta = _overpotential_table(self.pack.anodic)
-        before = np.interp(current_a / self.pack.exchange_a, ratio, eta)
-        slower = 1.0 + condition.transfer_slowdown
-        after = np.interp(current_a * slower / self.pack.exchange_a, ratio, eta)
-        return np.asarray(self.pack.cells * _GAS_OVER_FARADAY_V_K * kelvin * (after - before))
-
-
-def draw_equation_plant(rng: np.random.Generator, pack: TwinPack) -> EquationPlant:
-    """Draw a pack of given size, thermal masses and sensors that obeys the published equation."""
-    drawn = pack.chemistry
-    inner = np.clip(_EDGE + (1.0 - 2.0 * _EDGE) * drawn.grid, 0.5 * _EDGE, 1.0 - 0.5 * _EDGE)
-    bend = rng.uniform(0.75, 1.25, 4)
-    volts = (
-        3.52
-        + 0.45 * bend[0] * inner
-        - 0.012 * bend[1] / inner
-        + 0.03 * bend[2] * np.log(inner)
-        - 0.024 * bend[3] * np.log(1.0 - inner)
-    )
-    # Linear extrapolation beyond both ends.
-    slope = np.gradient(volts, drawn.grid)
-    beyond = np.clip(drawn.grid, 0.0, 1.0)
-    ends = np.interp(beyond, drawn.grid, volts)
-    volts = ends + np.interp(beyond, drawn.grid, slope) * (drawn.grid - beyond)
-    table = CellChemistry("equation", drawn.grid, volts, np.zeros_like(drawn.grid))
-    shares = np.array(_DELAYED_SHARES) * rng.uniform(0.7, 1.3, len(_DELAYED_SHARES))
-    resistance = pack.resistance_ohm * shares / shares.sum()
-    # The size of the entropy coefficient. The published −7.7 mV/K per cell, fitted to one log,
-    # turns the few kelvin between core and surface into volts.
-    temperature = -pack.cells * float(np.exp(rng.uniform(np.log(1e-4), np.log(1e-3))))
-    return EquationPlant(replace(pack, chemistry=table), temperature, resistance)
 
 
 def relax(signal: FloatArray, step_s: float, tau_s: FloatArray) -> FloatArray:

@@ -4,21 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Final, Literal, get_args
+from typing import Any, Final
 
 import numpy as np
 
 from cangauge._typing import FloatArray
-from cangauge.errors import require_choice, require_number
+from cangauge.errors import require_number
 from cangauge.extras.validation.twin.drive import draw_drive
 from cangauge.extras.validation.twin.faults import Fault, parse_effect
 from cangauge.extras.validation.twin.pack import draw_pack
-from cangauge.extras.validation.twin.plant import Plant, TwinPlant, draw_equation_plant
+from cangauge.extras.validation.twin.plant import Plant, TwinPlant
 from cangauge.extras.validation.twin.recording import Recording, record_drive, rms, simulate_truth
 from cangauge.extras.validation.twin.scaling import ScaledFault, scale_to_gap
 from cangauge.logs.log import Log
-
-PlantName = Literal["twin", "equation"]
 
 _DEFAULT_GAP: Final = 0.003
 """RMS gap of an effect without a size, relative to the nominal voltage [-]."""
@@ -57,7 +55,6 @@ class Simulation:
         return {
             "rows": len(log),
             "hours": log.duration_s / 3600.0,
-            "plant": self.plant.name,
             "pack": pack.name,
             "chemistry": pack.chemistry.name,
             "cells": pack.cells,
@@ -93,7 +90,6 @@ def simulate(
     speed_ms: FloatArray | None = None,
     pack: str | None = None,
     chemistry: str | None = None,
-    plant: PlantName = "twin",
     name: str = "log",
 ) -> Simulation:
     """Simulate a drive of a pack with known faults.
@@ -122,8 +118,6 @@ def simulate(
         column of `numpy.loadtxt(path, delimiter=",", skiprows=1)`.
     pack : {"leaf24", "leaf40", "car60", "car60lfp", "compact", "module12"}, optional
     chemistry : {"nmc", "lmo", "nca", "lfp"}, optional
-    plant : {"twin", "equation"}
-        Model of the cells: their kinetics and diffusion, or the published voltage equation.
     name : str
         Name of the log.
 
@@ -144,7 +138,7 @@ def simulate(
         hours = _DISCHARGE_HOURS if hours is None else hours
         start_soc_pct = 100.0 if start_soc_pct is None else start_soc_pct
         end_soc_pct = 100.0 * _EMPTY if end_soc_pct is None else end_soc_pct
-    model = draw_plant(np.random.default_rng([seed, 1]), pack, chemistry, plant)
+    model = draw_plant(np.random.default_rng([seed, 1]), pack, chemistry)
     load = draw_drive(
         np.random.default_rng([seed, 4, drive]),
         model.pack,
@@ -180,12 +174,7 @@ def simulate(
 
 
 def draw_plant(
-    rng: np.random.Generator,
-    kind: str | None = None,
-    chemistry_name: str | None = None,
-    name: PlantName = "twin",
-) -> Plant:
+    rng: np.random.Generator, kind: str | None = None, chemistry_name: str | None = None
+) -> TwinPlant:
     """Draw a pack and the model of its cells (parameters as in `simulate`)."""
-    require_choice(name, get_args(PlantName), "plant")
-    pack = draw_pack(rng, kind, chemistry_name)
-    return TwinPlant(pack) if name == "twin" else draw_equation_plant(rng, pack)
+    return TwinPlant(draw_pack(rng, kind, chemistry_name))
