@@ -203,7 +203,7 @@ def not_recognised(file: LogFile, problem: str, cure: str) -> InputError:
     if foreign is not None:
         return InputError(f"{problem}: it is {foreign[0]}", source=head.path, cure=foreign[1])
     headings, choice = likely_header(head)
-    is_of_frames = not _FRAME_WORDS.isdisjoint(text.strip().lower() for text in headings)
+    is_of_frames = len(_FRAME_WORDS.intersection(text.strip().lower() for text in headings)) > 1
     if len(headings) >= 3 and not is_of_frames:
         unknown = UnknownColumnsError(str(head.path), headings, choice, None)
         error = proposing(unknown, partial(file.reads, LogTableReader()))

@@ -36,7 +36,11 @@ _FORMATS: Final = (
      "convert it: iconv -f UTF-16 -t UTF-8 FILE > drive.asc"),
     (rb'\{"', "JSON, a record a line",
      "make a table of it: pandas.read_json(file, lines=True).to_csv('log.csv', index=False)"),
+    (rb"\[[\d:.]+\]\[[A-Z]\]\[", "a log of ESPHome",
+     "read the sensors from the history of Home Assistant or of InfluxDB, as CSV"),
     # Captures
+    (rb" *\([\d.]+\) +\S+ +[0-9A-F]+ +\[\d+\].*::", "what cantools decode prints",
+     "give the capture itself, with --map"),
     (rb"\*\*\*BUSMASTER", "a BUSMASTER log", _BY_SAVVYCAN),
     (rb"Chn +Identifier +Flg", "a Kvaser CanKing log", _BY_SAVVYCAN),
     (rb"# Logger type: CAN", "a CSS Electronics CLX000 log", _BY_SAVVYCAN),
