@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import re
+import subprocess
+import sys
 from pathlib import Path
 
 import can
@@ -186,3 +188,15 @@ def test_one_map_reads_captures_by_signals_and_tables_by_columns(
     found = json.loads(capture.stdout)
     assert found["log"]["channels"]["current_a"]["maximum"] == 40.0
     assert found["log"]["soc"]["first_pct"] == pytest.approx(80.0)
+
+
+def test_the_answer_is_the_first_line_and_remarks_follow(tmp_path: Path) -> None:
+    path = tmp_path / "log.csv"
+    rows = [f"{k},{40 - 50 * (k % 2)},{376 + 5 * (k % 2)},21,x" for k in range(400)]
+    path.write_text("\n".join(["Time [s],Current [A],Voltage [V],Temp [C],Odo", *rows, ""]))
+    command = [sys.executable, "-m", "cangauge", "inspect", str(path)]
+    lines = subprocess.run(
+        command, check=True, text=True, stdout=subprocess.PIPE, stderr=subprocess.STDOUT
+    ).stdout.splitlines()
+    assert lines[0].startswith("log: good for an estimate")
+    assert lines[-1].startswith(f"{path}: read as time = ")

@@ -21,7 +21,7 @@ from typer.main import get_command as build_command
 
 from cangauge._files import FULL
 from cangauge._version import __version__
-from cangauge.cli.output import emit_json, note
+from cangauge.cli.output import emit_json, hold_remarks, note, print_remarks
 from cangauge.errors import CangaugeError, closest
 
 FIRST: Final = (
@@ -121,8 +121,10 @@ def main() -> None:
     # Before numpy is imported: on thousands of small systems threads wait for each other.
     for name in THREADS:
         os.environ.setdefault(name, "1")
+    hold_remarks()
     try:
         code = app(standalone_mode=False, prog_name="cangauge")
+        print_remarks()
     except CangaugeError as error:
         sys.exit(_failed("" if error.logged else str(error), error.to_dict(), error.exit_code))
     except UsageError as error:
@@ -148,6 +150,7 @@ UsageError: Final[type[Any]] = typer.BadParameter.__mro__[1]
 
 def _failed(line: str, error: Mapping[str, Any], exit_code: int) -> int:
     """Print an error on stderr, and with `--json` as JSON on stdout; return the exit code."""
+    print_remarks()
     if line:
         note(f"error: {line}")
     # Not from the parser: the error may be one of parsing.

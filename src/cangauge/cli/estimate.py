@@ -25,7 +25,7 @@ from cangauge.cli.options import (
     note_starts,
     option,
 )
-from cangauge.cli.output import finish, note, print_values, progress
+from cangauge.cli.output import finish, print_values, progress, remark, say
 from cangauge.cli.status import pack_values
 from cangauge.types import REASON_WORDS, Reason
 
@@ -144,7 +144,7 @@ def estimate_command(
         if report is not None:
             parts["report"].write_text(page, encoding="utf-8")
     for warning in done.warnings:
-        note(f"warning: {done.recorded.source}: {warning}")
+        remark(f"warning: {done.recorded.source}: {warning}")
     logs = [done.recorded] if isinstance(done.recorded, Log) else []
     found = done.to_dict() | {"assumed": assumed_of(logs)}
     show = partial(_show, done.recorded.name, found, done.table)
@@ -201,7 +201,7 @@ def _of_log(
             progress=lambda count: show(f"{log.name}: {count} of {len(log)} samples"),
         )
     if (gap_s := done.settings.gap_s) >= USUAL_STEPS * GAP_S:  # else the usual step is no gap
-        note(
+        remark(
             f"note: {log.source}: its usual step is {rounded(gap_s / USUAL_STEPS, 2)} s;"
             f" steps over {rounded(gap_s, 2)} s count as gaps"
         )
@@ -233,8 +233,8 @@ def _of_capture(
         )
     recorded = done.recorded
     refuse_single_row(recorded)
-    for remark in recorded.remarks:
-        note(f"{recorded.source}: {remark}")
+    for text in recorded.remarks:
+        remark(f"{recorded.source}: {text}")
     if isinstance(recorded, CaptureSamples) and (log := recorded.as_log()) is not None:
         require_discharge_positive(log, is_capture=True)
     return done
@@ -258,6 +258,9 @@ def _show(name: str, found: Mapping[str, Any], table: EstimateTable) -> None:
         f"{REASON_WORDS[Reason[name.upper().replace(' ', '_')]]} {percent(share)}"
         for name, share in found["reasons"].items()
     ]
+    off = found["soc_mae_pct"]
+    compared = "" if off is None else f"; {number(off, 2, '%')} off the log's own SoC on average"
+    say(f"{name}: {soc_at(-1)} SoC at the end, from {start} ({_ORIGINS[origin]}){compared}.")
     values = {
         "initial SoC": f"{start} ({_ORIGINS[origin]})",
         "SoC at the end": soc_at(-1),

@@ -20,7 +20,7 @@ from cangauge.cli.options import (
     command,
     option,
 )
-from cangauge.cli.output import finish, note, print_values, progress
+from cangauge.cli.output import finish, print_values, progress, remark, say
 from cangauge.errors import InputError
 
 if TYPE_CHECKING:
@@ -233,9 +233,9 @@ def _delays_s(given: str) -> tuple[float, ...]:
 def _show(result: Identification) -> None:
     """Print how well the model fits, and where it holds; the report has the coefficients."""
     model = result.model
-    note(result.verdict)
-    for remark in result.remarks:
-        note(f"note: {remark}")
+    say(result.verdict)
+    for text in result.remarks:
+        remark(f"note: {text}")
     held_out = number(model.noise.voltage_mae_pct, 3, "%") if result.is_held_out else NONE_KNOWN
     print_values(
         f"Model {model.name}",

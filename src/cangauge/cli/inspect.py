@@ -20,7 +20,7 @@ from cangauge.cli.options import (
     check_outputs,
     command,
 )
-from cangauge.cli.output import finish, note, print_table, say
+from cangauge.cli.output import finish, note, print_table, remark, say
 from cangauge.errors import InputError
 
 if TYPE_CHECKING:
@@ -85,7 +85,7 @@ def inspect_command(
         reading.note_log(path)
         logs = [log := recording.read(temperature_c=reading.temperature)]
         if log.assumed:
-            note(f"{path}: read as {', '.join(log.assumed)}")
+            remark(f"{path}: read as {', '.join(log.assumed)}")
         of_log = inspect_log(log)
         found, show = of_log.to_dict(), partial(_show_log, of_log)
         if report is not None:

@@ -13,7 +13,7 @@ import typer
 
 from cangauge._extras import require_extra
 from cangauge._files import check_writable, require_suffix
-from cangauge.cli.output import note
+from cangauge.cli.output import remark
 from cangauge.errors import InputError
 
 if TYPE_CHECKING:
@@ -254,7 +254,7 @@ class ReadingOptions:
     def note_log(self, path: Path) -> None:
         """Print on stderr that options for captures do not apply to a log."""
         if self.names_vehicle and self.mapped_columns() is None:
-            note(f"{path}: a log, not a capture: --vehicle, --dbc and --map do not apply to it")
+            remark(f"{path}: a log, not a capture: --vehicle, --dbc and --map do not apply to it")
 
     def load(self, path: Path, used: Sequence[str] = ()) -> Log:
         """Read a log, or decode a capture; print the reader's remarks on stderr.
@@ -312,9 +312,9 @@ class ReadingOptions:
 
 def note_reading(log: Log) -> None:
     """Print on stderr what was assumed of a log's columns, in one line, and the remarks."""
-    remarks = [f"read as {', '.join(log.assumed)}"] if log.assumed else []
-    for remark in (*remarks, *log.remarks):
-        note(f"{log.source or log.name}: {remark}")
+    assumed = [f"read as {', '.join(log.assumed)}"] if log.assumed else []
+    for text in (*assumed, *log.remarks):
+        remark(f"{log.source or log.name}: {text}")
 
 
 def note_starts(logs: Iterable[Log], initial_soc_pct: float, capacity_ah: float | None) -> None:
@@ -338,7 +338,7 @@ def note_starts(logs: Iterable[Log], initial_soc_pct: float, capacity_ah: float 
             doubts.append(f"a fraction is given in percent, as {100.0 * initial_soc_pct:g}")
         if doubts:
             stated = f"{log.name}: the initial SoC is {initial_soc_pct:g} % as given"
-            note(f"warning: {stated}; {', and '.join(doubts)}")
+            remark(f"warning: {stated}; {', and '.join(doubts)}")
 
 
 def assumed_of(logs: Iterable[Log]) -> dict[str, list[str]]:

@@ -9,6 +9,7 @@ import sys
 import textwrap
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
+from contextvars import ContextVar
 from pathlib import Path
 from typing import Any, TextIO
 
@@ -43,6 +44,31 @@ def note(text: str) -> None:
     if sys.stderr is not None:
         with suppress(OSError):  # a full disk behind it: the exit code reports the failure
             _print(text, sys.stderr)
+
+
+_REMARKS: ContextVar[list[str]] = ContextVar("remarks")
+
+
+def hold_remarks() -> None:
+    """Hold remarks until the result, or the error, of a command is printed."""
+    _REMARKS.set([])
+
+
+def remark(text: str) -> None:
+    """Print lines on stderr, below the result of the command."""
+    held = _REMARKS.get(None)
+    if held is None:
+        note(text)
+    else:
+        held.append(text)
+
+
+def print_remarks() -> None:
+    """Print the remarks that are held."""
+    held = _REMARKS.get(None) or []
+    for text in held:
+        note(text)
+    held.clear()
 
 
 def say(text: str) -> None:
@@ -109,8 +135,10 @@ def finish(
     named = {what: path and str(path) for what, path in (files or {}).items()}
     if as_json:
         emit_json({**result, **named})
+        print_remarks()
         return
     show()
+    print_remarks()
     for what, path in named.items():
         if path:
             note(f"{what}: {path}")

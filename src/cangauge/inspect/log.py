@@ -33,6 +33,7 @@ from cangauge.logs.sign import (
 from cangauge.model.coulomb_counting import capacity_from_full_discharge
 from cangauge.model.prior import DELAYS_S
 from cangauge.settings import GAP_S
+from cangauge.types import SOC_WITHIN_PCT
 
 Verdict = Literal["yes", "partly", "no"]
 
@@ -167,6 +168,9 @@ class LogInspection:
             needed = "--capacity-ah and, of one log, --initial-soc"
             return f"good for an estimate; a fit needs {needed}, as the log has no SoC"
         covered = f"{self.soc.minimum_pct:.0f} … {self.soc.maximum_pct:.0f} % SoC"
+        least, most = SOC_WITHIN_PCT
+        if self.soc.minimum_pct < least or self.soc.maximum_pct > most:
+            return f"good for an estimate, not for a fit: {covered} is a wrong scale or offset"
         return f"good for a fit over {covered}, and for an estimate"
 
     def to_dict(self) -> dict[str, Any]:
