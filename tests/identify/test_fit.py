@@ -9,9 +9,11 @@ import numpy as np
 import pytest
 
 import cangauge
+from cangauge._typing import FloatArray
 from cangauge.bus.recording import read_log
 from cangauge.errors import InputError
 from cangauge.identify.fit import common_name, fit
+from cangauge.identify.identification import Identification
 from cangauge.identify.least_squares import (
     ADDED_STD,
     B_LEFT_STD,
@@ -29,13 +31,14 @@ from cangauge.model.coulomb_counting import (
     capacity_from_reference,
     discharged_ah,
 )
-from cangauge.model.prior import CHEMISTRIES, prior_of
+from cangauge.model.prior import CHEMISTRIES, PackPrior
 from cangauge.model.published import CAPACITY_AH, leaf_2012_model
 from cangauge.model.voltage_model import KNOTS_PCT, HermiteCurve, VoltageModel
 from synthetic import synthetic_log
 
 TRUTH = leaf_2012_model()
 OXIDE = CHEMISTRIES["oxide"]
+PACK = PackPrior(OXIDE, CAPACITY_AH)
 
 CELLS = VoltageModel(
     HermiteCurve.rising(KNOTS_PCT, 96.0 * OXIDE.curve_v), kt_v_per_k=-0.02,
@@ -64,23 +67,39 @@ def test_recovers_curve_and_resistance_of_a_pack() -> None:
     assert found.model.noise.voltage_rmse_v == pytest.approx(0.3, rel=0.1)
 
 
+def curve_std_v(found: Identification, soc_pct: FloatArray) -> FloatArray:
+    functions = found.model.principal_functions()
+    zero = np.zeros(len(found.voltage_model.load_coefficients))
+    return np.array([np.linalg.norm(functions.row(soc, zero)) for soc in soc_pct.tolist()])
+
+
 def test_beyond_its_logs_the_curve_follows_the_typical_cell() -> None:
     found = fit(trips(1), capacity_ah=CAPACITY_AH)
     soc = np.linspace(5.0, 50.0, 20)
     error_v = found.voltage_model.pseudo_ocv(soc) - CELLS.pseudo_ocv(soc)
     assert np.abs(error_v).max() < 5.0
-    functions = found.model.principal_functions()
-    zero = np.zeros(len(found.voltage_model.load_coefficients))
-    std_v = [float(np.sqrt(np.sum(functions.row(s, zero) ** 2))) for s in soc.tolist()]
-    assert np.all(np.abs(error_v) < 3.0 * np.array(std_v))
+    assert np.all(np.abs(error_v) < 3.0 * curve_std_v(found, soc))
     assert "Add a drive below" in found.verdict
     assert "there the curve follows the typical cell" in found.verdict
+
+
+@pytest.mark.parametrize("curve_v", [OXIDE.curve_v, OXIDE.other_v], ids=["layered", "spinel"])
+@pytest.mark.parametrize("start_pct", [95.0, 60.0])
+def test_either_typical_cell_is_a_usual_one(curve_v: FloatArray, start_pct: float) -> None:
+    cells = replace(CELLS, curve=HermiteCurve.rising(KNOTS_PCT, 96.0 * curve_v))
+    log = synthetic_log(
+        start_pct=start_pct, end_pct=start_pct - 15.0, hours=0.6, noise_v=0.3, model=cells
+    )
+    found = fit(log, capacity_ah=CAPACITY_AH, cells=96)
+    soc = np.linspace(15.0, 100.0, 20)
+    error_v = np.abs(found.voltage_model.pseudo_ocv(soc) - cells.pseudo_ocv(soc))
+    assert np.all(error_v < 1.2 * curve_std_v(found, soc))
 
 
 def test_is_the_weighted_least_squares_of_all_rows() -> None:
     """The sums of the logs against one dense system with a column for the level of each log."""
     rows = [fit_rows(log, CAPACITY_AH) for log in trips(3)]
-    found = solve([log_sums(item, OXIDE) for item in rows], CAPACITY_AH, OXIDE)
+    found = solve([log_sums(item, OXIDE) for item in rows], PACK)
     size, logs = found.coefficients.size, len(rows)
     weight = np.concatenate([row_weights(r.soc_pct, r.seconds, OXIDE) for r in rows])
     columns = np.concatenate([row_features(r) @ found.select.T for r in rows])
@@ -88,7 +107,7 @@ def test_is_the_weighted_least_squares_of_all_rows() -> None:
     table = np.column_stack([columns, owner[:, None] == np.arange(logs)])
     volts = np.concatenate([r.voltage_v for r in rows])
     soc = np.concatenate([r.soc_pct for r in rows])
-    prior = prior_of(OXIDE, found.mean_v, float(weight @ soc / weight.sum()), CAPACITY_AH)
+    prior = PACK.coefficients(found.mean_v, float(weight @ soc / weight.sum()))
     precision = np.zeros((size + logs, size + logs))
     precision[:size, :size] = np.linalg.inv(prior.covariance)
     precision[size:, size:] = np.eye(logs) / (OXIDE.level_std * found.mean_v) ** 2
@@ -115,7 +134,7 @@ def test_left_out_logs_widen_the_covariance() -> None:
             for k, item in enumerate(rows)
         ]
         sums = [log_sums(item, OXIDE) for item in moved]
-        return solve_scaled(sums, CAPACITY_AH, OXIDE)[0].scale
+        return solve_scaled(sums, PACK)[0].scale
 
     assert scale(0.0) == 1.0
     assert scale(10.0) > 3.0
@@ -328,10 +347,10 @@ def test_a_log_that_leaves_the_sign_of_the_resistance_open_is_fitted(
 
 
 def test_a_log_wholly_above_full_is_refused_by_name() -> None:
-    trip = trips(1)[0]
-    full = replace(
-        trip, current_a=0.01 * trip.current_a, soc_pct=np.full(len(trip), 102.0), name="full"
-    )
+    trip = trips(1)[0].rows(slice(0, 90))  # of which 70 s fill the delay line
+    soc_pct = np.full(len(trip), np.nan)
+    soc_pct[0] = 100.4
+    full = replace(trip, current_a=np.full(len(trip), -50.0), soc_pct=soc_pct, name="full")
     assert fit_rows(full, CAPACITY_AH).soc_pct.min() > 101.0  # within the tolerance
     with pytest.raises(InputError, match=r"full: soc_pct: the counted SoC stays outside 0–100 %"):
         fit([*trips(2), full], capacity_ah=CAPACITY_AH)

@@ -20,7 +20,7 @@ from cangauge.model.coulomb_counting import (
     difference_from_reference,
     discharged_ah,
 )
-from cangauge.model.prior import CHEMISTRIES
+from cangauge.model.prior import CHEMISTRIES, PackPrior
 from cangauge.model.published import CAPACITY_AH
 from synthetic import synthetic_log
 
@@ -92,7 +92,7 @@ def test_a_stated_start_is_that_of_the_first_piece_alone() -> None:
     first, later = trip(90.0, 60.0, 1), trip(80.0, 50.0, 2)
     charged_s = first.time_s[-1] - later.time_s[0] + 7200.0
     log = joined(first, replace(later, time_s=later.time_s + charged_s))
-    found = find_starts([log], [88.0], CAPACITY_AH, CHEMISTRIES["oxide"])
+    found = find_starts([log], [88.0], PackPrior(CHEMISTRIES["oxide"], CAPACITY_AH))
     assert [piece.name for piece in found.pieces] == ["t1 part 1", "t1 part 2"]
     assert [start.origin for start in found.starts] == ["given", "log"]
     assert [start.soc_pct for start in found.starts] == pytest.approx([88.0, 80.0], abs=0.1)

@@ -71,8 +71,8 @@ def test_prior_is_a_model_of_its_chemistry() -> None:
     assert model.noise.level_std_v == pytest.approx(0.008 * 16 * 3.29, rel=0.01)
     functions = model.principal_functions()
     zero = np.zeros(len(model.voltage_model().load_coefficients))
-    std_v = float(np.sqrt(np.sum(functions.row(50.0, zero) ** 2)))
-    assert std_v == pytest.approx(0.05 * 16 * 3.29, rel=0.05)
+    std_v = float(np.sqrt(np.sum(functions.row(100.0, zero) ** 2)))
+    assert std_v == pytest.approx(0.02 * 16 * 3.29, rel=0.05)
 
 
 def test_the_shipped_model_loads() -> None:

@@ -11,7 +11,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 from scipy import stats
@@ -35,7 +35,7 @@ from cangauge.logs.log import Log
 from cangauge.model.effects.base import Effect, Load, Signals, Values
 from cangauge.model.effects.library import LIBRARY, EffectCandidate, candidates, effect_of
 from cangauge.model.extended import ExtendedModel, Prediction
-from cangauge.model.prior import LOW_PASS_S, Chemistry
+from cangauge.model.prior import LOW_PASS_S, PackPrior
 
 _LOG = logging.getLogger(__name__)
 
@@ -346,7 +346,7 @@ class Search:
     model : ExtendedModel
         Fitted without effects.
     logs, rows : sequences of Log and FitRows
-    chemistry : Chemistry
+    pack : PackPrior
     effect_ids : sequence of str
         Ids to add in their best shape, or `AUTO`.
     """
@@ -356,11 +356,11 @@ class Search:
         model: ExtendedModel,
         logs: Sequence[Log],
         rows: Sequence[FitRows],
-        chemistry: Chemistry,
+        pack: PackPrior,
         effect_ids: Sequence[str],
     ) -> None:
         self._is_auto = tuple(effect_ids) == (AUTO,)
-        self._capacity_ah, self._chemistry = model.capacity_ah, chemistry
+        self._pack = pack
         ids = SEARCHED if self._is_auto else effect_ids
         self._wanted = list(ids)
         self._offered = offered(ids, model)
@@ -378,7 +378,7 @@ class Search:
             _LOG.debug("columns of the effects: log %d of %d", number, len(logs))
             linear = linearize(model, log, of_log, self._offered)
             columns = np.column_stack([row_features(of_log), linear.columns])
-            self._sums.append(log_sums(of_log, chemistry, columns))
+            self._sums.append(log_sums(of_log, pack.chemistry, columns))
 
     def select(self) -> Selected:
         """Return the effects; those asked for by id are all taken, in their best shapes."""
@@ -400,20 +400,17 @@ class Search:
             chosen.append(number)
         return Selected(tuple(self._offered[number] for number in chosen), tuple(steps))
 
-    def _solved(self, chosen: Sequence[int]) -> tuple[list[LogSums], dict[str, Any]]:
+    def _of(self, chosen: Sequence[int]) -> tuple[list[LogSums], PackPrior, FloatArray]:
+        """Return the arguments of `solve` for some candidates."""
         columns = [place for number in chosen for place in self._places[number]]
         items = [self._offered[number] for number in chosen]
         sums = [item.with_columns(columns) for item in self._sums]
-        return sums, {
-            "capacity_ah": self._capacity_ah,
-            "chemistry": self._chemistry,
-            "amplitude_std": Selected(tuple(items), ()).amplitude_std,
-        }
+        return sums, self._pack, Selected(tuple(items), ()).amplitude_std
 
     def _left_out(self, chosen: Sequence[int]) -> FloatArray:
         """Return the mean square error of each left-out log [V²]; of the fit for too few logs."""
-        sums, options = self._solved(chosen)
-        without = solve_without(sums, **options) or [solve(sums, **options)] * len(sums)
+        sums, pack, std = self._of(chosen)
+        without = solve_without(sums, pack, std) or [solve(sums, pack, std)] * len(sums)
         return np.array(
             [other.square_error(item) for item, other in zip(sums, without, strict=True)]
         )
@@ -427,8 +424,7 @@ class Search:
         for number, item in enumerate(self._offered):
             if item.effect.id in taken or item in self.refused:
                 continue
-            sums, options = self._solved([*chosen, number])
-            solution = solve(sums, **options)
+            solution = solve(*self._of([*chosen, number]))
             chosen_now = tuple(self._offered[place] for place in [*chosen, number])
             if not Selected(chosen_now, ()).at_bound(solution):
                 fits.append((solution.residual_v, number))

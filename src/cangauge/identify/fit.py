@@ -62,7 +62,7 @@ from cangauge.model.model_file import (
     Ranges,
     SourceLog,
 )
-from cangauge.model.prior import CHEMISTRIES, DELAYS_S, ChemistryName, usual_loads
+from cangauge.model.prior import CHEMISTRIES, DELAYS_S, ChemistryName, PackPrior, usual_loads
 from cangauge.model.voltage_model import KNOTS_PCT, REFERENCE_C, PublishedCurve
 
 Equation = Literal["knots", "published"]
@@ -161,7 +161,8 @@ def fit(
         chemistry, remark = _likely_chemistry(stated, cells, capacity_ah)
         remarks.append(remark)
     with threadpool_limits(limits=1):  # 40 columns: threads only wait for each other
-        starts = find_starts(recorded, stated_pct, capacity_ah, CHEMISTRIES[chemistry])
+        pack = PackPrior(CHEMISTRIES[chemistry], capacity_ah, cells)
+        starts = find_starts(recorded, stated_pct, pack)
         knots = equation == "knots"
         delays = DELAYS_S if knots else usable_delays(starts.logs, delay_s)
         rows = [fit_rows(log, capacity_ah, rate_hz=rate_hz, delay_s=delays) for log in starts.logs]
@@ -201,7 +202,7 @@ def fit(
             "made": made,
         }
         if knots:
-            fitted = _fit_knots(starts.logs, rows, effect_ids, fields)
+            fitted = _fit_knots(starts.logs, rows, pack, effect_ids, fields)
         else:
             fitted = _fit_published(rows, epsilon, t_ref_c, delays, fields)
         extended = fitted.model.extended_model()
@@ -314,6 +315,7 @@ class _Joint(NamedTuple):
 def _fit_knots(
     logs: Sequence[Log],
     rows: Sequence[FitRows],
+    pack: PackPrior,
     effect_ids: Sequence[str],
     fields: dict[str, Any],
 ) -> _Fitted:
@@ -321,16 +323,16 @@ def _fit_knots(
     published = solve_published(pooled(factors), EPSILON)
     if usable_delays(logs, DELAYS_S) == DELAYS_S and published.identified:
         fields = fields | {"published": published.fields(EPSILON, REFERENCE_C, DELAYS_S)}
-    chemistry = CHEMISTRIES[fields["chemistry"]]
-    sums = [log_sums(item, chemistry) for item in rows]
-    solved = solve_scaled(sums, fields["capacity_ah"], chemistry)
+    sums = [log_sums(item, pack.chemistry) for item in rows]
+    solved = solve_scaled(sums, pack)
     joint = _Joint(*solved, rows, [row_features(item) for item in rows])
     selected: Selected | None = None
     if effect_ids:
-        plain = knots_file(joint.solution, fields).extended_model()
-        search = Search(plain, logs, rows, chemistry, effect_ids)
+        search = Search(
+            knots_file(joint.solution, fields).extended_model(), logs, rows, pack, effect_ids
+        )
         while (selected := search.select()).chosen:
-            with_effects = _with_effects(plain, joint, selected, logs, fields)
+            with_effects = _with_effects(joint, selected, logs, pack, fields)
             at_bound = selected.at_bound(with_effects.solution)
             if not at_bound:
                 joint = with_effects
@@ -347,15 +349,15 @@ def _fit_knots(
 
 
 def _with_effects(
-    extended: ExtendedModel,
     plain: _Joint,
     selected: Selected,
     logs: Sequence[Log],
+    pack: PackPrior,
     fields: dict[str, Any],
 ) -> _Joint:
     """Return the fit with the selected effects: Gauss–Newton from `plain`, without effects."""
-    capacity_ah, chemistry = extended.capacity_ah, CHEMISTRIES[fields["chemistry"]]
     solution, std = plain.solution, selected.amplitude_std
+    extended = knots_file(solution, fields).extended_model()
     amplitudes: FloatArray | None = None
     for _ in range(RELINEARIZED):
         coefficients = solution.select[:P, :BASE].T @ solution.coefficients[:P]
@@ -367,14 +369,16 @@ def _with_effects(
         ]
         columns = [np.column_stack([item.features, item.columns]) for item in about]
         sums = [
-            log_sums(item.rows, chemistry, table)
+            log_sums(item.rows, pack.chemistry, table)
             for item, table in zip(about, columns, strict=True)
         ]
-        solution, without = solve_scaled(sums, capacity_ah, chemistry, std)
+        solution, without = solve_scaled(sums, pack, std)
         solution = selected.clipped(solution)
         amplitudes = solution.coefficients[P:]
         effects = selected.effects(solution)
-        extended = ExtendedModel(knots_file(solution, fields).voltage_model(), capacity_ah, effects)
+        extended = ExtendedModel(
+            knots_file(solution, fields).voltage_model(), pack.capacity_ah, effects
+        )
     return _Joint(solution, without, [item.rows for item in about], columns, effects)
 
 

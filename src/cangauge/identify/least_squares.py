@@ -20,7 +20,7 @@ import numpy as np
 from cangauge._typing import FloatArray
 from cangauge.errors import InputError
 from cangauge.identify.rows import FitRows
-from cangauge.model.prior import RESIDUAL_STD, RESISTANCE_H, Chemistry, Distribution, prior_of
+from cangauge.model.prior import RESIDUAL_STD, RESISTANCE_H, Chemistry, Distribution, PackPrior
 from cangauge.model.voltage_model import (
     KNOTS_PCT,
     REFERENCE_C,
@@ -176,8 +176,7 @@ NO_EFFECTS: Final = np.zeros(0)
 
 def solve(
     sums: Sequence[LogSums],
-    capacity_ah: float,
-    chemistry: Chemistry,
+    pack: PackPrior,
     amplitude_std: FloatArray = NO_EFFECTS,
 ) -> Solution:
     """Return the posterior of the coefficients for some logs.
@@ -193,9 +192,7 @@ def solve(
     Parameters
     ----------
     sums : sequence of LogSums, one or more
-    capacity_ah : float
-        [Ah].
-    chemistry : Chemistry
+    pack : PackPrior
     amplitude_std : array of shape (e,)
         Prior standard deviations of the effects' amplitudes, of mean 0.
     """
@@ -204,12 +201,12 @@ def solve(
     mean_v = float(total[-2, -1]) / weight
     mean_c = REFERENCE_C + float(total[-2, N]) / weight
     mean_soc = float(w @ [item.mean_soc_pct for item in sums]) / weight
-    prior = prior_of(chemistry, mean_v, mean_soc, capacity_ah)
+    prior = pack.coefficients(mean_v, mean_soc)
     theta0 = np.r_[prior.coefficients, np.zeros(amplitude_std.size)]
     Lambda = np.diag(np.r_[1.0 / np.diag(prior.covariance), amplitude_std**-2.0])
     Lambda[:N, :N] = np.linalg.inv(prior.covariance[:N, :N])
     colder = np.maximum(1.0, resistance_factor(np.array([item.mean_c for item in sums])))
-    level_std = chemistry.level_std * mean_v * colder**chemistry.cold_exponent
+    level_std = pack.chemistry.level_std * mean_v * colder**pack.chemistry.cold_exponent
     ohm = prior.arrhenius_ohm
     for _ in range(2):  # the column of b needs the resistances: twice
         arrhenius_ohm = ohm
@@ -258,8 +255,7 @@ def _selection(arrhenius_ohm: FloatArray, warm: float, amplitudes: int) -> Float
 
 def solve_without(
     sums: Sequence[LogSums],
-    capacity_ah: float,
-    chemistry: Chemistry,
+    pack: PackPrior,
     amplitude_std: FloatArray = NO_EFFECTS,
 ) -> list[Solution]:
     """Return for each log the posterior of the logs outside its fold; [] for too few logs."""
@@ -268,12 +264,9 @@ def solve_without(
         return []
     count = min(number, FOLDS_AT_MOST)
     by_fold = [
-        solve(
-            [item for k, item in enumerate(sums) if k % count != fold],
-            capacity_ah, chemistry, amplitude_std,
-        )
+        solve([item for k, item in enumerate(sums) if k % count != fold], pack, amplitude_std)
         for fold in range(count)
-    ]  # fmt: skip
+    ]
     return [by_fold[k % count] for k in range(number)]
 
 
@@ -296,12 +289,11 @@ def left_out_scale(
 
 def solve_scaled(
     sums: Sequence[LogSums],
-    capacity_ah: float,
-    chemistry: Chemistry,
+    pack: PackPrior,
     amplitude_std: FloatArray = NO_EFFECTS,
 ) -> tuple[Solution, list[Solution]]:
     """Return the posterior scaled by left-out logs, and those of `solve_without`."""
-    solution = solve(sums, capacity_ah, chemistry, amplitude_std)
-    without = solve_without(sums, capacity_ah, chemistry, amplitude_std)
-    scale = left_out_scale(sums, without, chemistry)
+    solution = solve(sums, pack, amplitude_std)
+    without = solve_without(sums, pack, amplitude_std)
+    scale = left_out_scale(sums, without, pack.chemistry)
     return replace(solution, covariance=solution.covariance * scale, scale=scale), without

@@ -33,7 +33,7 @@ from cangauge.logs.log import Log
 from cangauge.model.coulomb_counting import soc_at_first_row
 from cangauge.model.effects.base import Signals
 from cangauge.model.model_file import Model
-from cangauge.model.prior import CHEMISTRIES, Chemistry
+from cangauge.model.prior import CHEMISTRIES, PackPrior
 from cangauge.model.voltage_model import KNOTS_PCT, SLOPE_AT_LEAST, HermiteCurve
 
 _LOG = logging.getLogger(__name__)
@@ -140,9 +140,7 @@ def given_starts(
     return given
 
 
-def find_starts(
-    logs: Sequence[Log], given: Sequence[float | None], capacity_ah: float, chemistry: Chemistry
-) -> Starts:
+def find_starts(logs: Sequence[Log], given: Sequence[float | None], pack: PackPrior) -> Starts:
     """Return the logs with a known start: given, their own, or estimated with the curve.
 
     Parameters
@@ -150,9 +148,7 @@ def find_starts(
     logs : sequence of Log
     given : sequence of float or None
         SoC at the first row of each log [%].
-    capacity_ah : float
-        [Ah].
-    chemistry : Chemistry
+    pack : PackPrior
 
     Raises
     ------
@@ -167,7 +163,7 @@ def find_starts(
     pieces = [piece for piece, _ in stated]
     known, starts, unknown = [], [], []
     for place, (log, soc_pct) in enumerate(stated):
-        own_pct = soc_at_first_row(log, capacity_ah)
+        own_pct = soc_at_first_row(log, pack.capacity_ah)
         known.append(log if soc_pct is None else with_start(log, soc_pct))
         if soc_pct is not None:
             starts.append(Start(log.name, soc_pct, None, "given"))
@@ -180,7 +176,7 @@ def find_starts(
         raise unknown_start(pieces[0], others=len(pieces) > 1)
     if unknown:
         pinned = [log for place, log in enumerate(known) if place not in unknown]
-        joint = _JointFit(pinned, [pieces[place] for place in unknown], capacity_ah, chemistry)
+        joint = _JointFit(pinned, [pieces[place] for place in unknown], pack)
         for place, start in zip(unknown, joint.solve(), strict=True):
             log, starts[place] = pieces[place], start
             if start.std_pct is None or not start.std_pct <= STD_AT_MOST_PCT:
@@ -212,12 +208,10 @@ def unknown_start(log: Log, *, others: bool) -> InputError:
 class _JointFit:
     """Fit of the curve and of unknown starts in turn."""
 
-    def __init__(
-        self, pinned: Sequence[Log], unknown: Sequence[Log], capacity_ah: float,
-        chemistry: Chemistry,
-    ) -> None:  # fmt: skip
-        self._capacity_ah, self._chemistry = capacity_ah, chemistry
-        self._pinned = [log_sums(fit_rows(log, capacity_ah), chemistry) for log in pinned]
+    def __init__(self, pinned: Sequence[Log], unknown: Sequence[Log], pack: PackPrior) -> None:
+        self._pack, self._chemistry = pack, pack.chemistry
+        capacity_ah = pack.capacity_ah
+        self._pinned = [log_sums(fit_rows(log, capacity_ah), pack.chemistry) for log in pinned]
         self._logs = unknown
         self._limits = [_limits(log, capacity_ah) for log in unknown]
         self._rows = [
@@ -229,7 +223,7 @@ class _JointFit:
         sums = self._pinned
         values = [float("nan")] * len(self._logs)
         for _ in range(STEPS_AT_MOST):
-            solution = solve(sums, self._capacity_ah, self._chemistry)
+            solution = solve(sums, self._pack)
             before = values
             values = [self._best(number, solution) for number in range(len(self._logs))]
             sums = self._pinned + [
@@ -239,7 +233,7 @@ class _JointFit:
             moved = np.abs(np.array(values) - before)
             if np.all(moved < CONVERGED_PCT):
                 break
-        pinned = solve(self._pinned, self._capacity_ah, self._chemistry)
+        pinned = solve(self._pinned, self._pack)
         return [
             Start(log.name, value, self._std_pct(of_log, pinned), "estimated")
             for log, value, of_log in zip(

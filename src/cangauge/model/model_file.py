@@ -40,8 +40,8 @@ from cangauge.model.prior import (
     SLOW_SHARE,
     ChemistryName,
     Distribution,
+    PackPrior,
     principal_functions,
-    prior_of,
     usual_loads,
 )
 from cangauge.model.voltage_model import (
@@ -569,7 +569,7 @@ class Model(_Fields):
         """
         typical = CHEMISTRIES[chemistry]
         half_full_v = cells * float(np.interp(50.0, KNOTS_PCT, typical.curve_v))
-        prior = prior_of(typical, half_full_v, 50.0, capacity_ah)
+        prior = PackPrior(typical, capacity_ah, cells).coefficients(half_full_v, 50.0)
         judged = {
             "voltage_mae_pct": 100.0 * prior.residual_v / half_full_v,
             "voltage_rmse_v": prior.residual_v,

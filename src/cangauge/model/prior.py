@@ -1,14 +1,18 @@
-"""Prior of a model's coefficients: the typical cell of a chemistry, and how far packs differ.
+"""Prior of a model's coefficients: typical cells of a chemistry, and how far packs differ.
 
-    knots of the curve   N(V0·m(S)/m(S0), V0²·K)
-        K = 0.05² + ∫∫ from S0 of slope errors + (0.06·e^(−S/5 %))² + (3·10⁻⁴)²·1
+    knots of the curve   N(cells·m(S), V0²·K)
+        K = 0.02² + ∫∫ from 100 % of slope errors + (0.06·e^(−S/5 %))² + (3·10⁻⁴)²·1
+        slope errors: (σ² + e(S)·e(S′)/3)·exp(−½·((S − S′)/20 %)²) + …
     kt                   N(0, (2.5·10⁻⁴·V0)²)
     resistances          N(h·V0/C, …), as in `RESISTANCE_H`
     factor b             N(1, 0.5²)
 
-V0 and S0 are mean voltage and SoC of the logs, m is the voltage of a typical cell, C the capacity.
-Everything scales with the pack, so that one prior serves a cell and an 800 V pack. Constants
-without another source were chosen on recorded development trips and kept for all others.
+V0 and S0 are mean voltage and SoC of the logs, m is the voltage of a typical cell, C the capacity,
+and e the slope of a second typical cell minus that of m: the share of the second cell in a pack is
+uniform between 0 and 1 (mean square 1/3), and may change with SoC. Where the number of cells is
+unknown, m is scaled to V0 at S0, slope errors count from there, and the level has 0.05². Everything
+scales with the pack, so that one prior serves a cell and an 800 V pack. Constants without another
+source were chosen on recorded development trips and kept for all others.
 """
 
 from __future__ import annotations
@@ -21,7 +25,15 @@ from typing import Final, Literal
 import numpy as np
 
 from cangauge._typing import FloatArray
-from cangauge.model.voltage_model import KNOTS_PCT, REFERENCE_C, VoltageModel, hermite_basis
+from cangauge.model.voltage_model import (
+    KNOTS_PCT,
+    LEAF_2012_CELLS,
+    LEAF_2012_OCV_V,
+    REFERENCE_C,
+    PublishedCurve,
+    VoltageModel,
+    hermite_basis,
+)
 
 ChemistryName = Literal["oxide", "lfp"]
 
@@ -32,9 +44,13 @@ LOW_PASS_S: Final = (10.0, 140.0)
 minutes, and 70 s of delays cannot express it."""
 
 LEVEL_STD: Final = 0.05
-"""Standard deviation of the curve's level relative to V0: cells of one chemistry differ by 5 %."""
+"""Standard deviation of the curve's level relative to V0, at S0, where the number of cells is
+unknown: the two typical oxide cells differ by 4 % at half charge."""
+FULL_STD: Final = 0.02
+"""Standard deviation of the full cells' voltage relative to V0, where their number is known: a
+gauge's 100 % is up to 0.1 V per cell below the 4.2 V that oxide cells are charged to."""
 SLOPE_SPAN_PCT: Final = 20.0
-"""Span of the slope error of `Chemistry.slope_std` [% SoC]: a phase of the electrodes."""
+"""Span of the slope errors [% SoC]: a phase of the electrodes."""
 ROUGH_STD: Final = 2e-4
 """Second slope error [V0/%], …"""
 ROUGH_SPAN_PCT: Final = 5.0
@@ -89,7 +105,9 @@ class Chemistry:
     ----------
     name : {"oxide", "lfp"}
     curve_v : array of shape (knots,)
-        Open-circuit voltage of a typical cell at `KNOTS_PCT` [V]; only its shape is used.
+        Open-circuit voltage of a typical cell at `KNOTS_PCT` [V].
+    other_v : array of shape (knots,)
+        That of a second typical cell [V].
     slope_std : float
         Standard deviation of the curve's slope error [V0/%].
     soc_std_pct : float
@@ -105,6 +123,7 @@ class Chemistry:
 
     name: ChemistryName
     curve_v: FloatArray
+    other_v: FloatArray
     slope_std: float
     soc_std_pct: float
     level_std: float
@@ -113,15 +132,69 @@ class Chemistry:
     cold_exponent: float
 
 
+def _curve(table: Mapping[float, float]) -> FloatArray:
+    """Return voltages at `KNOTS_PCT` [V] from those at some SoC [%]."""
+    return np.interp(KNOTS_PCT, list(table), list(table.values()))
+
+
+_LAYERED_V: Final = _curve(
+    {
+        0: 3.08,
+        2.5: 3.255,
+        5: 3.36,
+        10: 3.465,
+        20: 3.565,
+        30: 3.625,
+        40: 3.675,
+        50: 3.735,
+        60: 3.815,
+        70: 3.895,
+        80: 3.975,
+        90: 4.055,
+        100: 4.14,
+    }
+)
+_SPINEL_V: Final = PublishedCurve(LEAF_2012_OCV_V).values(KNOTS_PCT) / LEAF_2012_CELLS
+_PHOSPHATE_V: Final = _curve(
+    {
+        0: 2.70,
+        1: 2.90,
+        2.5: 3.05,
+        5: 3.13,
+        10: 3.20,
+        20: 3.25,
+        30: 3.28,
+        40: 3.29,
+        50: 3.295,
+        60: 3.305,
+        70: 3.325,
+        80: 3.333,
+        90: 3.337,
+        95: 3.342,
+        97.5: 3.35,
+        99: 3.37,
+        100: 3.45,
+    }
+)
+"""Open-circuit voltages of typical cells against graphite [V]:
+
+layered oxides
+    A smooth curve. Its shape is within 19 mV (1–100 %) of the mean open-circuit voltage of three
+    published cells between 3.0 and 4.15 V: NMC811 (Chen et al. 2020, doi 10.1149/1945-7111/ab9050),
+    NMC532 (Mohtat et al. 2020, doi 10.1149/1945-7111/aba5d1) and a nickel-cobalt oxide (Ecker et
+    al. 2015, doi 10.1149/2.0551509jes).
+manganese spinel, blended with layered oxide
+    The published pseudo-OCV of the 2012 Leaf (`model.published`).
+iron phosphate
+    Within 12 mV (10–97.5 %) of LiFePO4 (Afshar et al. 2017, arXiv 1709.03970) against graphite
+    (Mohtat et al. 2020) at stoichiometries 0.97–0.03 and 0.01–0.80.
+"""
+
 CHEMISTRIES: Final[Mapping[ChemistryName, Chemistry]] = {
     "oxide": Chemistry(
         "oxide",
-        np.interp(
-            KNOTS_PCT,
-            [0, 2.5, 5, 10, 20, 30, 40, 50, 60, 70, 80, 90, 100],
-            [3.08, 3.255, 3.36, 3.465, 3.565, 3.625, 3.675, 3.735, 3.815, 3.895, 3.975, 4.055,
-             4.14],
-        ),
+        _LAYERED_V,
+        _SPINEL_V,
         slope_std=5e-4,
         soc_std_pct=0.3,
         level_std=0.0018,
@@ -131,12 +204,8 @@ CHEMISTRIES: Final[Mapping[ChemistryName, Chemistry]] = {
     ),
     "lfp": Chemistry(
         "lfp",
-        np.interp(
-            KNOTS_PCT,
-            [0, 1, 2.5, 5, 10, 20, 30, 40, 50, 60, 70, 80, 90, 95, 97.5, 99, 100],
-            [2.70, 2.90, 3.05, 3.13, 3.20, 3.25, 3.28, 3.29, 3.295, 3.305, 3.325, 3.333, 3.337,
-             3.342, 3.35, 3.37, 3.45],
-        ),
+        _PHOSPHATE_V,
+        _PHOSPHATE_V,
         slope_std=2e-4,
         soc_std_pct=3.0,
         level_std=0.008,
@@ -144,19 +213,8 @@ CHEMISTRIES: Final[Mapping[ChemistryName, Chemistry]] = {
         fast_factor=6.0,
         cold_exponent=0.0,
     ),
-}  # fmt: skip
-"""The chemistries that differ in shape: layered oxides and manganese spinel against graphite, and
-iron phosphate against graphite, whose plateau is flat. Sources of the typical cells:
-
-oxide
-    A smooth curve. Its shape is within 19 mV (1–100 %) of the mean open-circuit voltage of three
-    published graphite cells between 3.0 and 4.15 V: NMC811 (Chen et al. 2020,
-    doi 10.1149/1945-7111/ab9050), NMC532 (Mohtat et al. 2020, doi 10.1149/1945-7111/aba5d1) and a
-    nickel-cobalt oxide (Ecker et al. 2015, doi 10.1149/2.0551509jes).
-lfp
-    Within 12 mV (10–97.5 %) of LiFePO4 (Afshar et al. 2017, arXiv 1709.03970) against graphite
-    (Mohtat et al. 2020) at stoichiometries 0.97–0.03 and 0.01–0.80.
-"""
+}
+"""The chemistries that differ in shape: oxides, and iron phosphate, whose plateau is flat."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -188,50 +246,71 @@ class Distribution:
 
 
 @lru_cache(maxsize=256)
-def curve_covariance(start: float, chemistry: Chemistry) -> FloatArray:
-    """Return the covariance K of the knots relative to V0²: an integrated process of the slope.
+def shape_covariance(start: float, chemistry: Chemistry) -> FloatArray:
+    """Return the covariance of the knots relative to V0², without that of the level.
+
+    An integrated process of the slope, the knee, and an error of each knot on its own.
 
     Parameters
     ----------
     start : float
-        S0, a multiple of `GRID_PCT` [%].
+        SoC from which the slope counts, a multiple of `GRID_PCT` [%].
     chemistry : Chemistry
     """
-    grid = np.arange(0.5 * GRID_PCT, 100.0, GRID_PCT)
+    edges = np.arange(0.0, 100.0 + GRID_PCT, GRID_PCT)
+    grid = 0.5 * (edges[1:] + edges[:-1])
     gap = grid[:, None] - grid
-    slope = chemistry.slope_std**2 * np.exp(-0.5 * (gap / SLOPE_SPAN_PCT) ** 2)
+    away_v = np.interp(edges, KNOTS_PCT, chemistry.other_v - chemistry.curve_v)
+    between = np.diff(away_v) / GRID_PCT / np.interp(50.0, KNOTS_PCT, chemistry.curve_v)
+    slope = chemistry.slope_std**2 + np.outer(between, between) / 3.0
+    slope *= np.exp(-0.5 * (gap / SLOPE_SPAN_PCT) ** 2)
     slope += ROUGH_STD**2 * np.exp(-0.5 * (gap / ROUGH_SPAN_PCT) ** 2)
     above = (grid > start) & (grid < KNOTS_PCT[:, None])
     below = (grid < start) & (grid > KNOTS_PCT[:, None])
     integral = GRID_PCT * (above.astype(np.float64) - below)
     knee = KNEE_STD * np.exp(-KNOTS_PCT / KNEE_SPAN_PCT)
     nugget = np.eye(KNOTS_PCT.size) * NUGGET_STD**2
-    return np.asarray(integral @ slope @ integral.T + LEVEL_STD**2 + np.outer(knee, knee) + nugget)
+    return np.asarray(integral @ slope @ integral.T + np.outer(knee, knee) + nugget)
 
 
-def prior_of(
-    chemistry: Chemistry, mean_v: float, mean_soc_pct: float, capacity_ah: float
-) -> Distribution:
-    """Return the prior of a pack's coefficients.
+@dataclass(frozen=True, eq=False)
+class PackPrior:
+    """What is known of a pack without its logs.
 
     Parameters
     ----------
     chemistry : Chemistry
-    mean_v, mean_soc_pct : float
-        Mean voltage V0 [V] and SoC S0 [%] of the logs.
     capacity_ah : float
         [Ah].
+    cells : int, optional
+        Cells in series; None where unknown.
     """
-    typical = mean_v / np.interp(mean_soc_pct, KNOTS_PCT, chemistry.curve_v) * chemistry.curve_v
-    h_mean, h_std = np.array(RESISTANCE_H).T * mean_v / capacity_ah
-    n = KNOTS_PCT.size
-    std = np.r_[KT_STD * mean_v, h_std, B_STD]
-    covariance = np.zeros((n + std.size, n + std.size))
-    start = round(mean_soc_pct / GRID_PCT) * GRID_PCT
-    covariance[:n, :n] = curve_covariance(start, chemistry) * mean_v**2
-    covariance[n:, n:] = np.diag(std**2)
-    mean = np.r_[typical, 0.0, -h_mean, B_MEAN]
-    return Distribution(mean, covariance, -h_mean, RESIDUAL_STD * mean_v, mean_v, REFERENCE_C)
+
+    chemistry: Chemistry
+    capacity_ah: float
+    cells: int | None = None
+
+    def coefficients(self, mean_v: float, mean_soc_pct: float) -> Distribution:
+        """Return the distribution of the pack's coefficients.
+
+        Parameters
+        ----------
+        mean_v, mean_soc_pct : float
+            Mean voltage V0 [V] and SoC S0 [%] of the logs.
+        """
+        chemistry, n = self.chemistry, KNOTS_PCT.size
+        if self.cells is None:
+            cells = mean_v / float(np.interp(mean_soc_pct, KNOTS_PCT, chemistry.curve_v))
+            start, level_std = round(mean_soc_pct / GRID_PCT) * GRID_PCT, LEVEL_STD
+        else:
+            cells, start, level_std = self.cells, 100.0, FULL_STD
+        h_mean, h_std = np.array(RESISTANCE_H).T * mean_v / self.capacity_ah
+        std = np.r_[KT_STD * mean_v, h_std, B_STD]
+        covariance = np.zeros((n + std.size, n + std.size))
+        covariance[:n, :n] = (shape_covariance(start, chemistry) + level_std**2) * mean_v**2
+        covariance[n:, n:] = np.diag(std**2)
+        mean = np.r_[cells * chemistry.curve_v, 0.0, -h_mean, B_MEAN]
+        return Distribution(mean, covariance, -h_mean, RESIDUAL_STD * mean_v, mean_v, REFERENCE_C)
 
 
 def principal_functions(covariance: FloatArray, loads: FloatArray) -> FloatArray:

@@ -6,7 +6,12 @@ import math
 
 from cangauge.model.model_file import FunctionFields, Made, Model, Noise, Published, Ranges
 from cangauge.model.prior import BLOCK_S
-from cangauge.model.voltage_model import KNOTS_PCT, PublishedCurve, VoltageModel
+from cangauge.model.voltage_model import (
+    KNOTS_PCT,
+    LEAF_2012_OCV_V,
+    PublishedCurve,
+    VoltageModel,
+)
 
 CAPACITY_AH = 51.5
 """Charge from 100 to 0 % [Ah]."""
@@ -25,7 +30,7 @@ SOC_NEWTON_MAE_PCT = 2.5
 def leaf_2012_model() -> VoltageModel:
     """Return the published voltage model; temperatures are those of the test room, 20–26 °C."""
     return VoltageModel(
-        PublishedCurve((394.4, 48.89, -4.769, 0.2158, -0.003718, -54.59, 109.3, -3.141)),
+        PublishedCurve(LEAF_2012_OCV_V),
         kt_v_per_k=-0.7428,
         resistance_ohm=(-0.1032, -0.01501, -0.009697, -0.004652),
         temperature_range_c=(20.0, 26.0),

@@ -40,6 +40,11 @@ KNOTS_PCT: FloatArray = np.array(
 BASIS_NAMES = ("k0", "k1", "k2", "k3", "k4", "k5", "k6", "k7")
 """Coefficients of the published pseudo-OCV, in the order of the columns of `ocv_basis`."""
 
+LEAF_2012_OCV_V = (394.4, 48.89, -4.769, 0.2158, -0.003718, -54.59, 109.3, -3.141)
+"""Published k0 … k7 of a 2012 Nissan Leaf [V]."""
+LEAF_2012_CELLS = 96
+"""Its cells in series."""
+
 ACTIVATION_K = 3000.0
 """Activation temperature of the resistance [K]: 25 kJ/mol, that of charge transfer and electrolyte
 in lithium cells; Waldmann et al., J. Power Sources 262 (2014) 129."""
