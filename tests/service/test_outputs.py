@@ -15,7 +15,16 @@ def test_each_output_is_made_by_its_module() -> None:
 
 
 def test_a_service_without_outputs_needs_the_light_install_alone() -> None:
-    absent = ("bokeh", "jinja2", "matplotlib", "paho", "pyarrow", "threadpoolctl", "tornado")
+    absent = (
+        "bokeh",
+        "filterpy",
+        "jinja2",
+        "matplotlib",
+        "paho",
+        "pyarrow",
+        "threadpoolctl",
+        "tornado",
+    )
     code = (
         "import sys, cangauge.cli.run, cangauge.cli.status, cangauge.service.run\n"
         f"print([each for each in {absent} if each in sys.modules])"
