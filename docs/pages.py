@@ -35,8 +35,8 @@ OUTSIDE_LINK = re.compile(
 )
 """A link to a file of the repository that is no page of the site."""
 
-# A drive of half an hour with stops, regeneration and a rest; the equation itself as the plant.
-DRIVE: dict[str, Any] = {"seed": 5, "drive": 3, "hours": 0.5, "plant": "equation"}
+# A drive of half an hour with stops, regeneration and a rest.
+DRIVE: dict[str, Any] = {"seed": 4, "drive": 3, "hours": 0.5, "pack": "leaf40"}
 
 
 def write_pages(folder: Path) -> None:
