@@ -10,6 +10,7 @@ import can
 import numpy as np
 import pytest
 
+from cangauge.bus.captures import open_capture
 from cangauge.extras.discovery.candidate import SignalCandidate
 from cangauge.extras.discovery.search import search
 from live import in_process
@@ -136,3 +137,63 @@ def test_the_stated_voltage_decides_and_what_else_fits_is_listed() -> None:
     assert (sure.scale, sure.levels(373.0)) == (0.05, [])
     open_ = pack(350.0)
     assert len(open_.levels(350.0)) > 1
+
+
+def parked(folder: Path) -> Path:
+    """Write a capture of a parked car: a voltage and a current at rest, and what drifts."""
+    rng = np.random.default_rng(4)
+    rest = raw(rng.normal(0.4, 0.2, 10 * SECONDS), 0.1) & 0xFFFF
+    layout = {
+        0x100: [raw(370.0 + 0.02 * walk(5), 0.1), rest],
+        0x102: [raw(31_320.0 + 400.0 * walk(6), 1.0), np.arange(10 * SECONDS) % 256],
+    }
+    with can.CanutilsLogWriter(folder / "parked.log") as writer:
+        for message in frames(layout):
+            writer.on_message_received(message)
+    return folder / "parked.log"
+
+
+@pytest.mark.parametrize("choice", [(), ("--choose", "current=1", "--choose", "voltage=1")])
+def test_a_parked_car_gets_no_map(tmp_path: Path, choice: tuple[str, ...]) -> None:
+    path = parked(tmp_path)
+    done = in_process("init", path, "-o", tmp_path / "out", *choice)
+    assert done.code == 1
+    assert done.out.startswith("No map: no voltage follows a current in steps")
+    assert done.err.endswith(": record a drive\n")
+    assert not (tmp_path / "out").exists()
+    reached = [max(-each.low, each.high) for each in search(open_capture(path)).current]
+    assert max(reached, default=0.0) <= 1500.0
+
+
+@pytest.mark.parametrize(("volts", "is_pack"), [(40.0, True), (120.0, False)])
+def test_a_pack_sags_by_no_more_than_a_fifth(volts: float, is_pack: bool) -> None:
+    amps = load(1)
+    words = [raw(amps, 0.1, -500.0), raw(370.0 - volts / 150.0 * amps, 0.1)]
+    found = search(frames({0x100: words}))
+    assert ("0x100 16|16@1+" in {each.name for each in found.voltage}) == is_pack
+
+
+def test_few_steps_of_the_current_prove_nothing() -> None:
+    amps = np.where(np.arange(10 * SECONDS) < 5 * SECONDS, 1.0, 80.0)
+    amps += np.random.default_rng(3).normal(0.0, 0.3, len(amps))
+    found = search(frames({0x100: [raw(amps, 0.1, -500.0), raw(370.0 - 0.1 * amps, 0.1)]}))
+    assert not found.has_steps
+
+
+@pytest.mark.parametrize(("capacity_ah", "mark"), [(10.0, "1 ✓"), (5.0, "1 ?"), (None, "1 ?")])
+def test_a_soc_is_ticked_where_it_agrees_with_the_charge(
+    tmp_path: Path, capacity_ah: float | None, mark: str
+) -> None:
+    amps = load(1)
+    drawn_ah = np.cumsum(amps) * 0.1 / 3600.0
+    soc = 90.0 - 100.0 * drawn_ah / (capacity_ah or 10.0)
+    if capacity_ah is None:  # of something else: it falls with time
+        soc = 90.0 - np.linspace(0.0, 10.0, len(amps)) ** 2 / 10.0
+    words = [raw(amps, 0.1, -500.0), raw(370.0 - 0.1 * amps, 0.1), raw(soc, 0.1)]
+    signals = ["BMS", f"PackI {AMPS}", f"PackU {VOLTS}", 'SoC (0.1,0) [0|0] "%"']
+    write(tmp_path, frames({0x100: words}), {0x100: signals})
+    given = ("--dbc", tmp_path / "car.dbc", "-o", tmp_path / "out")
+    done = in_process("init", tmp_path / "d.log", *given)
+    assert done.code == 0, done.err
+    assert mark in done.out.partition("soc")[2].replace("  ", " ")
+    assert "SoC: " in done.err

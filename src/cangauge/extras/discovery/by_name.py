@@ -469,6 +469,10 @@ class _Names:
                 against.append("no word for a pack in its name")
         if other := self.others or (self.of & _PARTS if not self.own & _BATTERY else ()):
             against.append(f"of another value: {', '.join(sorted(other))}")
+        if self.role == "current" and self.unit:
+            most_a = self.unit[0] * max(-signal.low, signal.high)
+            if most_a > MOST_A:  # false for NaN
+                against.append(f"reaches {most_a:.4g} A")
         if self.role == "voltage" and self.unit:
             top_v = self.unit[0] * signal.holds[1] + self.unit[1]
             if top_v <= (nominal_v or _HIGH_V):
