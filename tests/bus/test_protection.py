@@ -253,3 +253,18 @@ def test_mistakes_in_protection_name_field_and_file(
         load(tmp_path, f"[messages.Fast]\n{more}\n")
     assert caught.value.field == f"messages.Fast.{field}"
     assert caught.value.source == str(tmp_path / "car.toml")
+
+
+@pytest.mark.parametrize("missing", [1, 15, 17, 31, 33])
+def test_losses_beyond_a_turn_of_the_counter_are_counted_by_the_stamps(missing: int) -> None:
+    checker = FrameChecker(GENERIC_RULE, period_s=0.01)
+    for number in (0, 1, 2 + missing):
+        frame = GENERIC_RULE.protect(bytes(8), number)
+        checker.check(frame, 0.01 * number)
+    assert checker.lost == missing
+
+
+def test_a_slower_sender_than_stated_loses_nothing() -> None:
+    checker = FrameChecker(LEAF_RULE, period_s=0.01)
+    for number in range(50):
+        assert checker.check(LEAF_RULE.protect(bytes(8), number), 0.1 * number) is Verdict.GOOD

@@ -98,6 +98,29 @@ def test_a_second_sender_is_reported_whatever_its_counter(
     assert math.isnan(decoder.health["current"].value_at(decoder.now_s))
 
 
+@pytest.mark.parametrize("begins", [0, FROM])
+@pytest.mark.parametrize("vehicle", [LEAF, GENERIC])
+@pytest.mark.parametrize(("times", "per"), [(2, 1), (5, 1), (10, 1), (1, 2), (1, 4), (1, 8)])
+def test_a_flood_and_single_false_frames_are_reported(
+    vehicle: Vehicle, times: int, per: int, begins: int
+) -> None:
+    period_s, rule, out, number = PERIODS_S[vehicle.name], rule_of(vehicle), [], 0
+    counter = 7
+    for frame in true_frames(vehicle):
+        out.append(frame)
+        number += frame.arbitration_id == vehicle.current.arbitration_id
+        if out[-1].arbitration_id != vehicle.current.arbitration_id or number % per:
+            continue
+        for place in range(times if number > begins else 0):
+            false = forged(frame, rule, 0, (place + 1) * period_s / (times + 1))
+            counter += 1
+            false.data[:] = rule.protect(bytearray(false.data), counter)
+            out.append(false)
+    decoder, first = decoded(vehicle, sorted(out, key=lambda each: each.timestamp))
+    assert begins <= first <= begins + 30 * (per + 1)
+    assert decoder.reasons(decoder.now_s) & Reason.DUPLICATE_SENDER
+
+
 def test_message_is_used_again_after_the_second_sender() -> None:
     frames = attacked(LEAF, 0, 0.3)
     last_s = frames[-1].timestamp
@@ -169,12 +192,26 @@ def in_bursts(seconds: float) -> Callable[[list[can.Message], Random], Iterator[
     return change
 
 
+def every(part: int, of: int) -> Callable[[list[can.Message], Random], Iterator[can.Message]]:
+    """Keep the first `part` of each `of` frames of a message: a queue that overflows."""
+
+    def change(frames: list[can.Message], _rng: Random) -> Iterator[can.Message]:
+        yield from (frame for place, frame in enumerate(frames) if place // 2 % of < part)
+
+    return change
+
+
 LAWFUL = {
     "identical copies": copies,
     "40 % lost": lossy,
     "damaged frames between": damaged,
     "restarted": restarted,
     "stuck counter": stuck,
+    **{
+        f"{part} of {of} kept": every(part, of)
+        for of in range(2, 10)
+        for part in {1, of // 2, of - 1}
+    },
     "bursts of 20 ms": in_bursts(0.02),
     "bursts of 0.5 s": in_bursts(0.5),
 }

@@ -94,5 +94,5 @@ def test_published_id_of_a_vehicle_signal_is_refused() -> None:
 def test_only_wanted_ids_pass_the_filters() -> None:
     settings = PipelineSettings(time_source="replay-clock")
     filters = Pipeline(Vehicle.load("leaf_aze0"), leaf_model(), settings).filters
-    assert {each["can_id"] for each in filters} == {0x1DB, 0x55B, 0x5C0, 0x5AF}
+    assert {each["can_id"] for each in filters} == {0x1DB, 0x55B, 0x5C0, 0x5AE, 0x5AF}
     assert all(each["can_mask"] == 0x7FF and each["extended"] is False for each in filters)

@@ -9,7 +9,17 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cangauge.bus.time_source import ClockFrames, ReceiveTime, ReplayClock, time_source
+from cangauge.bus.time_source import (
+    COUNT_EVERY,
+    ClockFrames,
+    ReceiveTime,
+    ReplayClock,
+    is_clock,
+    time_source,
+)
+from cangauge.bus.vehicle import Vehicle
+from cangauge.service.pipeline import Pipeline, PipelineSettings
+from live import leaf_model
 
 
 def frame(time_s: float = 0.0, frame_id: int = 0x401) -> can.Message:
@@ -74,3 +84,33 @@ def test_an_extended_frame_with_the_clocks_number_is_no_clock() -> None:
     assert clock.time_of(frame()) is None
     assert clock.time_of(ClockFrames(0x123).at(7)) is None
     assert clock.time_of(frame()) == pytest.approx(7e-6)
+
+
+def replayed(times: int) -> list[can.Message]:
+    """Return the frames of a replay's clock: a count at the start, after each 64, and the end."""
+    clock, frames = ClockFrames(), []
+    for sent in range(times):
+        frames += [clock.count(sent)] if sent % COUNT_EVERY == 0 else []
+        frames.append(clock.at(100_000 * sent))
+    return [*frames, clock.count(times)]
+
+
+@pytest.mark.parametrize("lost", [0, 1, 16, 160, 480])
+def test_lost_log_times_are_counted_also_in_whole_turns_of_counters(lost: int) -> None:
+    source, frames = ReplayClock(), replayed(500)
+    for frame in [*frames[:5], *frames[5 + lost :]]:
+        source.time_of(frame)
+    kept = sum(is_clock(frame) for frame in [*frames[:5], *frames[5 + lost :]])
+    assert source.lost == 500 - kept
+    for frame in replayed(100):  # another replay begins
+        source.time_of(frame)
+    assert source.lost == 500 - kept
+
+
+def test_the_service_counts_what_a_replay_lost() -> None:
+    settings = PipelineSettings(time_source="replay-clock")
+    pipeline = Pipeline(Vehicle.load("generic"), leaf_model(), settings)
+    for frame in replayed(500)[:1] + replayed(500)[-1:]:
+        pipeline.handle(frame)
+    assert pipeline.counts.lost == 500
+    assert pipeline.counts.untimed == 0

@@ -282,30 +282,28 @@ SILENCE_S: Final = 2.0
 WIDE: Final = 256
 """A counter with at least this many values does not wrap within a normal loss. If it steps back
 sooner, the sender restarted or frames came out of order: no loss is proven."""
-SOON: Final = 0.8
-"""A frame this soon after the one before [periods] is not the next one of the same sender: senders
-keep their period within some percent."""
-SUSPECTED_AT: Final = 8.0
-"""Frames out of sequence, repeated or too soon, from which a second sender is suspected: a sender
-that restarts makes one or two."""
-FORGIVEN: Final = 1.0 / 3.0
-"""Such frames forgiven by each frame in sequence: of two senders at least every second frame is out
-of sequence, of lost frames in bursts (stamps of a batch are equal) one in four or fewer."""
+TWO_SENDERS: Final = 12
+ONE_SENDER: Final = 3
+"""Frames out of sequence that go on with the sequence left before, too early for one sender, from
+which there are two senders; such frames that one out of sequence by itself outweighs. Where losses
+are random, one in `modulus` goes on by chance: with the shortest counter, of two bits, they reach
+12 with a probability of 7e-8 (Wald's bound, of θ = 3.95 from θ/4 + 3/(4 θ³) = 1)."""
 
 
 class FrameChecker:
     """Check the frames of one message in order of time.
 
     A repeated counter is no new frame, unless enough time has passed for the counter to wrap: on a
-    lossy bus one in `modulus` of the surviving frames looks like a repetition. Frames that repeat a
-    counter with another content, or come out of sequence too soon, are those of a second sender;
-    CAN itself repeats some frames after an error, which are identical. Without a period a repeated
-    counter is a repetition unless `SILENCE_S` passed without a frame.
+    lossy bus one in `modulus` of the surviving frames looks like a repetition. CAN itself repeats
+    some frames after an error, which are identical. Without a period a repeated counter is a
+    repetition unless `SILENCE_S` passed without a frame.
 
     Attributes
     ----------
     lost : int
-        Frames missing right before the latest accepted one, but for whole wraps of the counter.
+        Frames missing right before the latest accepted one. Where its counter proves a loss and the
+        period is known, whole wraps of the counter count too, but not in a silence of `SILENCE_S`:
+        the sender may have paused.
     learned_period_s : callable
         Returns the frame period [s] where none is stated; NaN while it is not known.
     """
@@ -316,7 +314,10 @@ class FrameChecker:
         wrap_s = 2.0 * SILENCE_S if period_s is None else period_s * min(rule.modulus, WIDE)
         self._half_wrap_s = wrap_s / 2
         self._last, self._last_s = -1, 0.0
-        self._refused, self._odd = 0, 0.0
+        self._refused = 0
+        self._other = -1  # counter of the sequence that was left for the present one
+        self._of_others = 0
+        self._step_s = math.inf  # between the latest two frames in sequence
         self._content: bytes | bytearray = b""
         self._is_repeated = False
         self.lost = 0
@@ -325,7 +326,7 @@ class FrameChecker:
     @property
     def suspects_second_sender(self) -> bool:
         """Whether the latest frames came from two senders."""
-        return self._odd >= SUSPECTED_AT
+        return self._of_others >= TWO_SENDERS
 
     def check(self, data: bytes | bytearray, time_s: float) -> Verdict:
         """Check a payload of the message's own length, received at bus time `time_s` [s]."""
@@ -341,25 +342,45 @@ class FrameChecker:
         self.lost = 0
         if steps == 1 or last < 0:
             self._is_repeated = False
-            if self._odd:
-                self._odd = max(self._odd - FORGIVEN, 0.0)
+            if last >= 0 and elapsed_s > 0.0:  # 0: delivered together
+                self._step_s = elapsed_s
         else:
-            period_s = self.learned_period_s() if self._period_s is None else self._period_s
-            is_soon = 0.0 <= elapsed_s < SOON * period_s
             was_repeated = self._is_repeated
             self._is_repeated = steps == 0 and elapsed_s <= self._half_wrap_s
-            # The second repetition in a row is a stuck counter.
-            is_odd = is_soon or (self._is_repeated and not was_repeated)
-            if is_odd and data != self._content:
-                self._odd = min(self._odd + 1.0, 2.0 * SUSPECTED_AT)
+            # One sender needs its period for each step. A stuck counter repeats itself on and on.
+            goes_on = counter == (self._other + 1) % modulus and self._other >= 0
+            period_s = self._least_period_s()
+            is_early = elapsed_s < ((steps or modulus) - 0.5) * period_s < math.inf
+            if not (steps == 0 and data == self._content):
+                is_other = goes_on or (self._is_repeated and not was_repeated)
+                score = 1 if is_other and is_early else -ONE_SENDER
+                self._of_others = max(self._of_others + score, 0)
             if self._is_repeated:
                 return Verdict.REPEATED
+            self._other = last
             if steps == 0:
                 steps = min(modulus, WIDE)
             elif modulus >= WIDE and steps > modulus // 2:
                 is_early = self._period_s is None or elapsed_s < self._period_s * steps / 2
                 steps = 1 if is_early else steps
-            # Damaged frames are counted as damaged, not as lost.
-            self.lost = max(steps - 1 - self._refused, 0)
+            self.lost = self._lost(steps, elapsed_s)
         self._last, self._refused, self._content = counter, 0, data
         return Verdict.AFTER_LOSS if self.lost else Verdict.GOOD
+
+    def _least_period_s(self) -> float:
+        """Return the shorter of the stated and the learned period [s]; infinite: none is known.
+
+        Where none is stated, that between the latest frames in sequence stands for it: with losses
+        too long a period may be learned.
+        """
+        given_s = self._step_s if self._period_s is None else self._period_s
+        return min(given_s, self.learned_period_s())
+
+    def _lost(self, steps: int, elapsed_s: float) -> int:
+        """Return the frames lost, from the counter's steps and the time since the frame before."""
+        period_s = self.learned_period_s() if self._period_s is None else self._period_s
+        if period_s > 0.0 and elapsed_s < SILENCE_S:
+            wraps = round((elapsed_s / period_s - steps) / self._modulus)
+            steps += max(wraps, 0) * self._modulus
+        # Damaged frames are counted as damaged, not as lost.
+        return max(steps - 1 - self._refused, 0)

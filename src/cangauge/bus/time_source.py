@@ -27,6 +27,10 @@ from cangauge.settings import REPLAY_CLOCK_ID, TimeSourceName
 MICROSECONDS: Final = 1e6
 """Unit of REPLAY_CLOCK [1/s]."""
 
+COUNT_BYTES: Final = 5
+"""Length of a REPLAY_COUNT: 32 bits and the CRC."""
+COUNT_EVERY: Final = 64
+"""Log times between two REPLAY_COUNT: less than 1 % more frames."""
 STEP_BACK_US: Final = 1_000_000
 """A larger step back in time [µs] means a clock that was set, or a new log; a smaller one is a
 matter of the order of writing."""
@@ -45,7 +49,7 @@ class ReceiveTime:
     """
 
     def __init__(self) -> None:
-        self.beginnings = 0
+        self.beginnings = self.lost = 0
         self._latest_us: int | None = None
         self._shift_us = 0
 
@@ -149,26 +153,39 @@ def steady_s() -> float:
 class ReplayClock:
     """Log time of a replay; a step back of more than `STEP_BACK_US` begins a new log.
 
-    `refused` counts clock frames with a wrong CRC or length.
+    `refused` counts clock frames with a wrong CRC or length; `lost` those that did not come, by the
+    counts that the replay sends among them.
     """
 
     def __init__(self, frame_id: int = REPLAY_CLOCK_ID) -> None:
-        self.beginnings = self.refused = 0
+        self.beginnings = self.refused = self.lost = 0
+        self._received = 0
+        self._sent: int | None = None  # by the latest count
         self._id = frame_id
         self._now_us: int | None = None
 
     def time_of(self, message: can.Message) -> float | None:
         """Return the log time of the latest REPLAY_CLOCK [s]; None before, and for the clock."""
         if not is_clock(message, self._id):
+            if is_count(message, self._id):
+                self._compare(int.from_bytes(message.data[:-1], "little"))
+                return None
             return None if self._now_us is None else self._now_us / MICROSECONDS
         now_us = log_time_us(message.data)
         if now_us is None:
             self.refused += 1
             return None
+        self._received += 1
         if self._now_us is not None and now_us < self._now_us - STEP_BACK_US:
             self.beginnings += 1
         self._now_us = now_us
         return None
+
+    def _compare(self, sent: int) -> None:
+        """Count the clock frames that have not come since the count before."""
+        if self._sent is not None and sent >= self._sent:  # else another replay has begun
+            self.lost += max(sent - self._sent - self._received, 0)
+        self._sent, self._received = sent, 0
 
     def resume(self, time_s: float) -> None:
         """Continue from a log time [s] after a restart: an earlier one begins a new log."""
@@ -176,8 +193,8 @@ class ReplayClock:
 
 
 TimeSource = ReceiveTime | ReplayClock
-"""Source of the bus time of each frame: `time_of`, and `beginnings`, the number of new logs after
-the first."""
+"""Source of the bus time of each frame: `time_of`, `beginnings`, the number of new logs after the
+first, and `lost`, the frames of a replay's clock that did not come."""
 
 
 def time_source(name: TimeSourceName, clock_id: int = REPLAY_CLOCK_ID) -> TimeSource:
@@ -196,6 +213,14 @@ def log_time_us(data: bytes | bytearray) -> int | None:
     """Return the time in the payload of a REPLAY_CLOCK [µs]; None for a wrong CRC or length."""
     is_whole = len(data) == 8 and CRC_ONLY_RULE.is_whole(data)
     return int(_clock_codec().decode(data)) if is_whole else None
+
+
+def is_count(message: can.Message, clock_id: int = REPLAY_CLOCK_ID) -> bool:
+    """Return whether a frame is a REPLAY_COUNT: how many REPLAY_CLOCK came before it."""
+    is_candidate = message.arbitration_id == clock_id - 1 and not message.is_extended_id
+    return (
+        is_candidate and len(message.data) == COUNT_BYTES and CRC_ONLY_RULE.is_whole(message.data)
+    )
 
 
 class RecordedTime:
@@ -229,8 +254,17 @@ class ClockFrames:
         """Return the frame of a log time [µs]."""
         payload = bytearray(8)
         self._codec.encode_into(payload, float(time_us))
+        return self._frame(self._id, payload)
+
+    def count(self, sent: int) -> can.Message:
+        """Return the REPLAY_COUNT after so many frames with log times."""
+        payload = (sent % (1 << 32)).to_bytes(COUNT_BYTES - 1, "little") + b"\0"
+        return self._frame(self._id - 1, payload)
+
+    @staticmethod
+    def _frame(frame_id: int, payload: bytes | bytearray) -> can.Message:
         data = CRC_ONLY_RULE.protect(payload, 0)
-        return can.Message(arbitration_id=self._id, is_extended_id=False, data=data)
+        return can.Message(arbitration_id=frame_id, is_extended_id=False, data=data)
 
 
 @lru_cache(maxsize=1)

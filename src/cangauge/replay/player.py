@@ -27,7 +27,7 @@ from cangauge.bus.publish import (
     SocEstimate,
     SocReader,
 )
-from cangauge.bus.time_source import MICROSECONDS, ClockFrames
+from cangauge.bus.time_source import COUNT_EVERY, MICROSECONDS, ClockFrames
 from cangauge.errors import CangaugeError, InputError
 from cangauge.replay.steps import Source, Step
 from cangauge.settings import FrameIds
@@ -82,15 +82,15 @@ class ReplayState:
     """Progress of a replay.
 
     `samples` are those that a receiver makes of the frames, where known; `acknowledged` those that
-    it has processed (None below full speed); `lost` those that never reached it; `soc` its latest
-    estimate.
+    it has processed, `lost` those that never reached it (both None below full speed, where only the
+    receiver knows); `soc` its latest estimate.
     """
 
     frames: int = 0
     clock_frames: int = 0
     samples: int = 0
     acknowledged: int | None = None
-    lost: int = 0
+    lost: int | None = None
     log_seconds: float = 0.0
     seconds: float = 0.0
     soc: SocEstimate | None = None
@@ -149,6 +149,7 @@ def play(
         if time.monotonic() >= show_s:
             show_s = time.monotonic() + SHOW_EVERY_S
             show(player.update(LISTEN_S))
+    player.send_count()
     if player.is_max:
         player.wait_until(lambda: not player.in_flight)
     show(player.update(LISTEN_AT_END_S))
@@ -200,7 +201,10 @@ class _Player:
         self.in_flight: deque[int] = deque()
         """Frames of each sample sent that is neither acknowledged nor lost."""
         self._incomplete = 0  # frames sent since the latest sample
-        self.state = ReplayState(acknowledged=0 if self.is_max else None)
+        self._lost = 0
+        self.state = ReplayState()
+        if self.is_max:
+            self.state.acknowledged = self.state.lost = 0
 
     def send(self, step: Step) -> None:
         """Send a step when it is due, or when the receiver has room."""
@@ -214,6 +218,8 @@ class _Player:
             self._first_us, self._began_s = step.time_us, time.monotonic()
         if self._clock is not None and step.is_wanted and step.time_us != self._clock_us:
             self._clock_us = step.time_us
+            if state.clock_frames % COUNT_EVERY == 0:
+                self.send_count()
             self._send(self._clock.at(step.time_us))
             state.clock_frames += 1
         for frame in step.frames:
@@ -224,6 +230,11 @@ class _Player:
             self._incomplete = 0
         state.samples = step.samples
         state.log_seconds = (step.time_us - self._first_us) / MICROSECONDS
+
+    def send_count(self) -> None:
+        """State how many log times were sent, so that the receiver finds what it has lost."""
+        if self._clock is not None:
+            self._send(self._clock.count(self.state.clock_frames))
 
     def update(self, listen_s: float) -> ReplayState:
         """Listen until the bus is quiet, for at most `listen_s` [s]; return the state.
@@ -271,7 +282,7 @@ class _Player:
             if state.acknowledged != before:
                 before, last_s = state.acknowledged, now_s
             elif state.acknowledged and self._heard_s - last_s > LOST_AFTER_S:
-                state.lost += len(self.in_flight)
+                state.lost = self._lost = self._lost + len(self.in_flight)
                 self.in_flight.clear()
                 self._incomplete = 0
                 text = f"{state.lost} samples lost so far; the replay continues"
@@ -300,13 +311,13 @@ class _Player:
             return
         more, state, sent = (count - before) % SAMPLES_MODULO, self.state, len(self.in_flight)
         late = max(more - sent, 0)  # counted as lost, but only slow
-        if late > state.lost:
+        if late > self._lost:
             raise self._error(
-                f"the receiver has processed {more} samples where {sent + state.lost} were in"
+                f"the receiver has processed {more} samples where {sent + self._lost} were in"
                 " flight: it was restarted, or another program sends or acknowledges on this bus"
                 " too"
             )
-        state.lost -= late
+        state.lost = self._lost = self._lost - late
         state.acknowledged = (state.acknowledged or 0) + more
         for _ in range(more - late):
             self.in_flight.popleft()

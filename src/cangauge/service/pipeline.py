@@ -16,7 +16,7 @@ from can.typechecking import CanFilter
 from cangauge.bus.decoder import FrameStatistics, SampleDecoder
 from cangauge.bus.plausibility import MISSED_AT_LEAST, MISSED_UNTIL_OLD, PackProperties
 from cangauge.bus.publish import ACKNOWLEDGE_EVERY, PackReport, SocPublisher, standard_filter
-from cangauge.bus.time_source import ReplayClock, is_clock, time_source
+from cangauge.bus.time_source import ReplayClock, is_clock, is_count, time_source
 from cangauge.bus.vehicle import Vehicle
 from cangauge.errors import InputError
 from cangauge.estimation.cells import CellEstimator
@@ -36,10 +36,11 @@ NOTHING_YET: Final = Estimate.unknown(Reason.NO_INITIAL_SOC | Reason.INPUT_STALE
 class FrameCounts:
     """Frames and values by outcome, over all logs of a run.
 
-    Wanted frames are lost by their alive counters, have a wrong CRC, repeat a counter or are too
-    short. Values are coded as not available, implausible (out of range, or changed too fast), of a
-    stuck signal, or held back until their signal has recovered. Untimed frames came before the
-    first REPLAY_CLOCK, where that is the time source; each new log is a beginning.
+    Frames are lost by their alive counters and by the counts of a replay's clock. Wanted frames
+    have a wrong CRC, repeat a counter or are too short. Values are coded as not available,
+    implausible (out of range, or changed too fast), of a stuck signal, or held back until their
+    signal has recovered. Untimed frames came before the first REPLAY_CLOCK, where that is the time
+    source; each new log is a beginning.
     """
 
     frames: int
@@ -150,7 +151,8 @@ class Pipeline:
         """
         time_s = self._time.time_of(message)
         if time_s is None:
-            self._untimed += not is_clock(message, self.settings.ids.replay_clock)
+            clock_id = self.settings.ids.replay_clock
+            self._untimed += not (is_clock(message, clock_id) or is_count(message, clock_id))
             return False
         if self._time.beginnings != self._beginnings:
             self._begin_log()
@@ -193,7 +195,7 @@ class Pipeline:
         return FrameCounts(
             frames=all_logs.frames,
             samples=all_logs.samples,
-            lost=all_logs.frames_lost,
+            lost=all_logs.frames_lost + self._time.lost,
             crc_errors=all_logs.crc_errors,
             repeated=all_logs.counter_repeats,
             short=all_logs.short,
@@ -285,7 +287,8 @@ class Pipeline:
     @property
     def filters(self) -> list[CanFilter]:
         """Filters for the vehicle's frames, and for REPLAY_CLOCK where that is the time source."""
-        clock = [standard_filter(self.settings.ids.replay_clock)]
+        clock_id = self.settings.ids.replay_clock
+        clock = [standard_filter(clock_id), standard_filter(clock_id - 1)]
         return [*self.vehicle.filters, *(clock if self.is_replay else [])]
 
     def acknowledgement(self, estimate: Estimate) -> list[can.Message]:

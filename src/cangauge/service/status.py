@@ -245,7 +245,7 @@ class Monitor:
                 "received": statistics.frames,
                 "wanted": statistics.wanted,
                 "used": statistics.wanted - rejected,
-                "lost": statistics.frames_lost,
+                "lost": pipeline.counts.lost,
             },
             "rejects": rejects,
             "stamps": port.capabilities.stamps,
