@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -98,3 +99,39 @@ def test_a_soc_above_full_is_remarked_and_no_start(tmp_path: Path) -> None:
 def test_rows_without_voltage_are_remarked(tmp_path: Path) -> None:
     log = read_log(written(tmp_path, [0.0] * 3 + [380.0] * 47, [50.0] * 50))
     assert log.remarks == ("0 V in 3 rows (the first is row 1): no voltage was read",)
+
+
+@pytest.mark.parametrize(
+    ("headings", "counts"),
+    [
+        ("Consumed Ah", lambda out, _: [-out]),
+        ("CurrTot [mAh]", lambda out, _: [1000.0 * (7.0 + out)]),
+        ("Charged Ah,Discharged Ah", lambda out, used: [used - out + 100.0, 50.0 + used]),
+    ],
+)
+def test_the_capacity_is_that_of_the_logs_own_counter(
+    tmp_path: Path, headings: str, counts: Callable[..., list[np.ndarray]]
+) -> None:
+    log = drive()
+    assert log.soc_pct is not None
+    step_ah = np.diff(log.time_s, prepend=0.0) * log.current_a / 3600.0
+    columns = counts(np.cumsum(step_ah), np.cumsum(np.maximum(step_ah, 0.0)))
+    table = np.column_stack([log.time_s, log.current_a, log.voltage_v, log.soc_pct, *columns])
+    rows = [",".join(f"{value:.4f}" for value in row) for row in table[::17]]
+    path = tmp_path / "log.csv"
+    path.write_text("\n".join([f"Time [s],Current [A],Voltage [V],SoC [%],{headings}", *rows, ""]))
+    read = read_log(path, temperature_c=20.0)
+    assert any("counted by" in remark for remark in read.remarks)
+    found = implied_capacity([read.rows(slice(3, None))])
+    assert found.capacity_ah == pytest.approx(CAPACITY_AH, rel=0.02)
+    assert found.std_ah < 0.02 * CAPACITY_AH
+
+
+def test_a_column_in_ah_that_counts_something_else_is_no_counter(tmp_path: Path) -> None:
+    log = drive()
+    assert log.soc_pct is not None
+    table = np.column_stack([log.time_s, log.current_a, log.voltage_v, log.soc_pct])
+    rows = [",".join(f"{value:.4f}" for value in row) + ",50.1" for row in table]
+    path = tmp_path / "log.csv"
+    path.write_text("\n".join(["Time [s],Current [A],Voltage [V],SoC [%],AHr", *rows, ""]))
+    assert read_log(path, temperature_c=20.0).counted_ah is None

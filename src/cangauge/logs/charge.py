@@ -7,9 +7,9 @@ standard deviation: sampling of the current, and resolution of the SoC.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
-from itertools import pairwise
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise, permutations
 from typing import Final
 
 import numpy as np
@@ -26,6 +26,8 @@ CONTRADICTION: Final = 2.0
 """Ratio of two capacities from which charge and SoC contradict each other [-]."""
 SURE: Final = 3.0
 """Standard deviations by which a contradiction exceeds the error by sampling [-]."""
+COUNTER_SHARE: Final = 0.02
+"""Difference of a counter from the charge of the current, by two sensors' gains [-]."""
 JUMP_PCT: Final = 3.0
 """Least step of a SoC that its gauge corrected [%]: no dashboard shows coarser steps …"""
 USUAL_STEPS: Final = 5.0
@@ -140,6 +142,37 @@ def refuse_contradictions(logs: Sequence[Log], capacity_ah: float | None = None)
             raise InputError(found, source=log.source or log.name, field="current_a", cure=cure)
 
 
+def with_own_count(log: Log, counters: Mapping[str, FloatArray]) -> Log:
+    """Return a log with the charge that its own counter states, if one of its columns is one.
+
+    A column, or the difference of two (discharged less charged), is the counter if it agrees with
+    the charge that the current gives, within the error of momentary currents.
+
+    Parameters
+    ----------
+    log : Log
+    counters : mapping
+        Columns in Ah by their headings, shape (n,).
+    """
+    out_ah = discharged_ah(log.time_s, log.current_a)
+    least_ah = SURE * _sampling_std_ah(log) + COUNTER_SHARE * float(np.ptp(out_ah))
+    counts = dict(counters)
+    for one, other in permutations(counters, 2):
+        counts[f"{one} − {other}"] = counters[one] - counters[other]
+    found, counted_ah = "", None
+    for label, count in counts.items():
+        gained_ah = count - count[0]
+        if np.sum(gained_ah * out_ah) < 0.0:
+            gained_ah = -gained_ah
+        apart_ah = float(np.max(np.abs(gained_ah - out_ah)))
+        if apart_ah <= least_ah and np.ptp(gained_ah) > 0.0:
+            found, counted_ah, least_ah = label, gained_ah, apart_ah
+    if counted_ah is None:
+        return log
+    remark = f'charge for the capacity: counted by "{found}"'
+    return replace(log, counted_ah=counted_ah, remarks=(*log.remarks, remark))
+
+
 def _per_100(capacity_ah: float) -> str:
     return f"{rounded(capacity_ah, 3)} Ah per 100 %"
 
@@ -175,8 +208,11 @@ def _counts(log: Log) -> Iterator[_Count]:
         if not np.any(steps > 0.0):
             continue
         step_pct = float(np.median(steps[steps > 0.0]))
-        out_ah = discharged_ah(piece.time_s, piece.current_a)[rows]
         known_pct = _without_jumps(soc_pct[rows], step_pct)
+        if piece.counted_ah is not None:
+            yield _Count(known_pct, piece.counted_ah[rows], 0.0, step_pct)
+            continue
+        out_ah = discharged_ah(piece.time_s, piece.current_a)[rows]
         yield _Count(known_pct, out_ah, _sampling_std_ah(piece), step_pct)
 
 

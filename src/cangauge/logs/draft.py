@@ -11,6 +11,7 @@ import numpy as np
 from cangauge._text import counted
 from cangauge._typing import BoolArray, FloatArray
 from cangauge.errors import InputError
+from cangauge.logs.charge import with_own_count
 from cangauge.logs.columns import shown_headings
 from cangauge.logs.headings import Rank, cell_number, meaning_of
 from cangauge.logs.log import Log
@@ -22,6 +23,8 @@ from cangauge.types import SOC_WITHIN_PCT
 Sign = Literal["charge", "discharge"]
 """What a positive current in the file does."""
 
+COUNTER: Final = "#"
+"""Begins the name of a value that may count the charge [Ah]; its heading follows."""
 MAX_INCOMPLETE: Final = 0.05
 """Largest fraction of incomplete rows that are dropped [-]: beyond it the export is damaged, or its
 rows hold only what changed."""
@@ -139,15 +142,22 @@ class DraftLog:
             in_seconds=self.in_seconds,
             stated=self.stated,
         )
+        channels = {name: each for name, each in self.values.items() if name[:1] != COUNTER}
         log = Log(
-            **self.values,
+            **channels,
             name=self.name,
             source=self.source,
             temperature_source=self.temperature_source,
             remarks=tuple(self.remarks),
             assumed=tuple(self.assumed),
         )
-        return resolve_sign(log, stored_sign_unknown=self.sign_unknown, is_stated=sign is not None)
+        log = resolve_sign(log, stored_sign_unknown=self.sign_unknown, is_stated=sign is not None)
+        counters = {
+            name[1:]: each
+            for name, each in self.values.items()
+            if name[:1] == COUNTER and np.isfinite(each).all()
+        }
+        return with_own_count(log, counters) if counters and log.soc_pct is not None else log
 
     def _remark_ignored(self) -> None:
         cells = [name for name in self.ignored if cell_number(name) is not None]

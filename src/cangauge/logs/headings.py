@@ -112,6 +112,16 @@ def cell_number(heading: str) -> tuple[int, float] | None:
     return int(match["number"]), 1e-3 if is_millivolts else 1.0
 
 
+def charge_scale(heading: str, unit_below: str = "") -> float | None:
+    """Return the factor to Ah of a column that counts charge, or None (`Consumed Ah`, `[mAh]`)."""
+    units = [unit.lower() for _, unit in names_and_units(heading, unit_below)]
+    words = _words_of(heading) if len(heading) <= LONGEST else []
+    if "mah" in units or "mah" in words:
+        return 1e-3
+    is_count = "ah" in units or not _SAYS["charge"].isdisjoint(words)
+    return 1.0 if is_count or ("amp" in words and "hours" in words) else None
+
+
 def names_and_units(heading: str, unit_below: str = "") -> list[tuple[str, str]]:
     """Return (name, unit) as a heading may be meant, the most explicit first, the whole last."""
     heading = heading.strip()

@@ -47,6 +47,8 @@ class Log(ArrowExport):
         Location of the temperature sensor.
     remarks : tuple of str
         Changes and findings of the reader ("12 duplicated time stamps dropped").
+    counted_ah : array of shape (n,), optional
+        Charge discharged by the log's own counter [Ah], from any zero.
     assumed : tuple of str
         How the columns of an arbitrary table were understood; empty where the format defines them.
 
@@ -83,6 +85,7 @@ class Log(ArrowExport):
     temperature_source: TemperatureSource = "unknown"
     remarks: tuple[str, ...] = field(default=())
     assumed: tuple[str, ...] = field(default=())
+    counted_ah: FloatArray | None = None
 
     def __post_init__(self) -> None:
         where = self.source or self.name
@@ -205,10 +208,12 @@ class Log(ArrowExport):
     def rows(self, keep: BoolArray | IntArray | slice) -> Self:
         """Return the log of the rows that `keep` selects (mask, indices or slice)."""
         kept: dict[str, Any] = {name: values[keep] for name, values in self._channels().items()}
+        if self.counted_ah is not None:
+            kept["counted_ah"] = self.counted_ah[keep]
         return replace(self, **kept)
 
     def _channels(self) -> dict[str, FloatArray]:
-        """Return the columns that the log has, by name."""
+        """Return the columns of the canonical log that this one has, by name."""
         channels = {name: getattr(self, name) for name in (*REQUIRED, "soc_pct")}
         return {name: values for name, values in channels.items() if values is not None}
 

@@ -12,6 +12,7 @@ import re
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
+from itertools import repeat
 from typing import Any, Final
 
 import numpy as np
@@ -28,8 +29,8 @@ from cangauge.logs.columns import (
     refuse_doubled,
     refuse_odd_names,
 )
-from cangauge.logs.draft import MAX_INCOMPLETE, DraftLog
-from cangauge.logs.headings import Rank
+from cangauge.logs.draft import COUNTER, MAX_INCOMPLETE, DraftLog
+from cangauge.logs.headings import Rank, charge_scale
 from cangauge.logs.stamps import is_clock, is_stamp, seconds_of
 from cangauge.logs.text import TextTable
 from cangauge.logs.units import (
@@ -42,6 +43,8 @@ from cangauge.logs.units import (
 )
 from cangauge.logs.values import first_text, is_number, numbers_of, present, with_decimal_points
 
+MAX_COUNTERS: Final = 6
+"""Most columns in Ah of which one is looked for that counts the charge [-]."""
 SOURCE: Final = "temperature_source"
 """Column or metadata of a canonical log: the location of the temperature sensor."""
 _HOLD_S: Final = 1.0
@@ -99,6 +102,8 @@ def draft_of_table(
     words = [k for k, text in enumerate(headings) if text.strip().lower() == SOURCE][:1]
     wanted = [place for column in chosen.values() for place in column.places]
     wanted += [place for place, _ in chosen["time"].others] + words
+    counters = _counters(table, wanted) if "soc" in chosen and not choice.is_canonical else {}
+    wanted += counters
     cells = with_decimal_points(table.columns([*dict.fromkeys(wanted)]))
     draft = DraftLog(name, source, headings=tuple(headings), remarks=[*table.remarks])
     time_s, unit_of_time, chosen["time"] = _time(cells, chosen["time"], headings, where)
@@ -115,6 +120,10 @@ def draft_of_table(
         shown = label if len(label) <= 80 else f"{label[:80]}…"
         if not choice.is_canonical:
             draft.assumed.append(f'{quantity} = "{shown}"{factor} [{unit}]')
+    for place, scale in counters.items():
+        with suppress(InputError):  # a column of words
+            count = numbers_of(cells[place], where, headings[place])[0]
+            draft.values[f"{COUNTER}{headings[place]}"] = count * scale
     used = {*words, *(place for column in chosen.values() for place in column.places)}
     draft.ignored = tuple(text for k, text in enumerate(headings) if text and k not in used)
     in_cells = _only_word(cells[words[0]], where) if words else ""
@@ -129,6 +138,17 @@ def draft_of_table(
             _sign_by_state(draft, table)
         _hold_changes(draft)
     return draft
+
+
+def _counters(table: TextTable | ArrowTable, taken: Sequence[int]) -> dict[int, float]:
+    """Return columns that may count the charge, with their factor to Ah; few, as pairs count."""
+    units = [*table.units, *repeat("", len(table.headings))]
+    found = {
+        place: scale
+        for place, heading in enumerate(table.headings)
+        if place not in taken and (scale := charge_scale(heading, units[place])) is not None
+    }
+    return found if len(found) <= MAX_COUNTERS else {}
 
 
 def _only_word(column: Any, where: str) -> str:
