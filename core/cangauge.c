@@ -16,7 +16,6 @@
 #define CAPACITY_STD 0.05
 #define MEAN_SQUARE_MEMORY_S 300.0
 #define HELD_S 5.0
-#define MEAN_MEMORY_S 60.0
 
 /* clock */
 #define LATEST_S 1e11
@@ -133,20 +132,12 @@ static charge_step count(cg_estimator *self, cg_time time_s, cg_real current_a)
     counter->current_a = current_a;
     if (isnan(last_s)) {
         counter->mean_square_a2 = current_a * current_a;
-        counter->mean_a = current_a;
         return step;
     }
     const cg_real seconds = (cg_real)(time_s - last_s);
     step.seconds = seconds;
-    cg_real across_a = R(0.5) * (current_a + last_a);
-    if (counter->is_restored && (seconds > gap_s)) {
-        const cg_real held = R(HELD_S) / seconds * -cg_expm1(R(-0.5) * seconds / R(HELD_S));
-        across_a = counter->mean_a + (held * (current_a + last_a - (R(2.0) * counter->mean_a)));
-    }
-    counter->is_restored = false;
-    cg_real kept = cg_exp(-seconds / R(MEAN_MEMORY_S));
-    counter->mean_a = (kept * counter->mean_a) + ((R(1.0) - kept) * current_a);
-    kept = cg_exp(-seconds / R(MEAN_SQUARE_MEMORY_S));
+    const cg_real across_a = R(0.5) * (current_a + last_a);
+    const cg_real kept = cg_exp(-seconds / R(MEAN_SQUARE_MEMORY_S));
     const cg_real square_a2 = counter->mean_square_a2;
     counter->mean_square_a2 = (kept * square_a2) + ((R(1.0) - kept) * (current_a * current_a));
     const cg_real per_as = cg_pct_per_as(model);
@@ -831,7 +822,6 @@ bool cg_restore(cg_estimator *self, const cg_state *state, cg_time age_s)
     self->state.is_pending = false; /* its delay line is gone */
     self->state.clock.age_s = age_s;
     self->state.clock.is_restored = true;
-    self->state.counter.is_restored = true;
     self->line.count = 0;
     return true;
 }

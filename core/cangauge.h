@@ -226,13 +226,11 @@ typedef struct {
     cg_time time_s;
     cg_real current_a;
     cg_real mean_square_a2;
-    cg_real mean_a;
     cg_real turned_a2; /* variance of the current between the last two samples */
     cg_sum discharged_pct;
     cg_sum moved_pct;
     cg_sum counted_s;
     cg_sum gap_var_pct2;
-    bool is_restored;
 } cg_counter;
 
 /* Sums of the rows of the open block: counted time, charge, voltage, temperature, drop, variance of the

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import math
+import subprocess
+import sys
 from collections.abc import Sequence
 from typing import Any
 
@@ -250,3 +252,35 @@ def test_readings_that_wait_are_in_order(change: Any) -> None:
     online = [state.online[0], change(state.online[1])]
     with pytest.raises(InputError, match=r"^effects\.0: the saved state is damaged"):
         Estimator(model).restore(state.model_copy(update={"online": online}))
+
+
+@pytest.mark.parametrize("away_s", [30.0, 86400.0])
+def test_a_restart_while_away_equals_no_restart(away_s: float) -> None:
+    """Two drives; between them the car is charged without a log."""
+    days = [
+        synthetic_log(hours=0.3, start_pct=start, end_pct=start - 6.0) for start in (80.0, 60.0)
+    ]
+    first, second = (list(samples_of(day)) for day in days)
+    later_s = first[-1].time_s + away_s - second[0].time_s
+    second = [sample._replace(time_s=sample.time_s + later_s) for sample in second]
+    carried = make_estimator(PLAIN)
+    for sample in first:
+        carried.step(sample)
+    restarted = make_estimator(PLAIN)
+    restarted.restore(through_json(carried.snapshot()))
+    again = [restarted.step(sample) for sample in second]
+    assert same(again, [carried.step(sample) for sample in second])
+
+
+def test_a_compiled_service_starts_without_filterpy() -> None:
+    code = (
+        "import sys; from cangauge.estimation.compiled import make_estimator;"
+        "from cangauge.model.published import leaf_2012_model_file;"
+        "from cangauge.types import Sample;"
+        "estimator = make_estimator(leaf_2012_model_file());"
+        "[estimator.step(Sample(float(k), 20.0 + k % 7, 385.0, 23.0)) for k in range(200)];"
+        "estimator.health, estimator.power(), estimator.snapshot();"
+        "print(estimator.core, 'filterpy' in sys.modules)"
+    )
+    found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert found.stdout.split() == ["compiled", "False"]

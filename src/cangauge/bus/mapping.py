@@ -28,7 +28,7 @@ from cangauge.bus.protection import (
 from cangauge.errors import InputError
 from cangauge.estimation.cells import CELLS_AT_MOST
 from cangauge.logs.column_map import ColumnMap
-from cangauge.settings import TemperatureSource
+from cangauge.settings import VOLTAGE_ACCURACY_PCT, TemperatureSource, VoltageAccuracyPct
 
 PAIR_WITHIN_S: Final = 0.020
 """Largest distance in bus time between paired current and voltage [s] (DESIGN: configurable)."""
@@ -67,6 +67,12 @@ class SignalMap(SignalChecks):
     def states_unit(self) -> bool:
         """Whether the map file states the conversion to the canonical unit."""
         return bool({"scale", "offset"} & self.model_fields_set)
+
+
+class VoltageMap(SignalMap):
+    """The voltage's signal, with the standard deviation of its sensor's lasting error [%]."""
+
+    accuracy_pct: VoltageAccuracyPct = VOLTAGE_ACCURACY_PCT
 
 
 class TemperatureMap(SignalMap):
@@ -238,7 +244,7 @@ class VehicleMap(_MapTable):
     name: str = "own map"
     dbc: tuple[str, ...] = ()
     current: SignalMap
-    voltage: SignalMap
+    voltage: VoltageMap
     temperature: TemperatureMap | None = None
     soc_reference: SignalMap | None = Field(
         default=None, validation_alias=AliasChoices("soc_reference", "soc")

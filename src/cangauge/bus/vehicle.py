@@ -33,7 +33,7 @@ from cangauge.bus.plausibility import SignalChecks
 from cangauge.bus.protection import Protection
 from cangauge.errors import InputError, closest, require_temperature
 from cangauge.logs.units import convert
-from cangauge.settings import TemperatureSource
+from cangauge.settings import VOLTAGE_ACCURACY_PCT, TemperatureSource
 
 _T = TypeVar("_T")
 Role = Literal["current", "voltage", "temperature", "soc_reference", "cells"]
@@ -120,6 +120,7 @@ class MessageProtection(NamedTuple):
 class Vehicle:
     """Signals of a vehicle, ready to decode and encode; None: the vehicle has none.
 
+    `voltage_accuracy_pct` is the standard deviation of the voltage sensor's lasting error [%].
     `fixed_temperature_c` is the temperature where no signal has it [°C]. `pair_within_s` is the
     largest distance in bus time between paired current and voltage [s]. `messages` has every
     message with a wanted signal, by key (id, plus `EXTENDED`). `remarks` say what of the DBC files
@@ -136,6 +137,7 @@ class Vehicle:
     pair_within_s: float
     messages: dict[int, MessageProtection]
     dbc_files: tuple[str, ...]
+    voltage_accuracy_pct: float = VOLTAGE_ACCURACY_PCT
     cells: CellSignals | None = None
     remarks: tuple[str, ...] = ()
 
@@ -287,6 +289,7 @@ class _Binder:
             name=mapping.name,
             current=self._signal("current", mapping.current),
             voltage=self._signal("voltage", mapping.voltage),
+            voltage_accuracy_pct=mapping.voltage.accuracy_pct,
             cells=None if mapping.cells is None else self._cells(mapping.cells),
             temperature=self._optional("temperature", temperature if fixed_c is None else None),
             soc_reference=self._optional("soc_reference", mapping.soc_reference),

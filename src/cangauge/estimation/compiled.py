@@ -219,7 +219,7 @@ class CompiledEstimator(Estimator):
         record, state, age_s = self._record, super().snapshot(), self._clock.age_s
         self._is_current = False
         _set(record["clock"], vars(state.clock), age_s=age_s or 0.0, is_restored=age_s is not None)
-        _set(record["counter"], vars(state.counter), is_restored=self._counter.is_restored)
+        _set(record["counter"], vars(state.counter))
         squares = state.memory.innovations
         _set(record["memory"], vars(state.memory), innovations=len(squares))
         record["memory"]["innovation2"][: len(squares)] = squares

@@ -86,8 +86,8 @@ STATE: Final = _structure(
     " b:is_refused u:implausible d:load[LOADS] d:load_v d:drop_v d:drive[EFFECTS]",
     clock=_structure("d:last_s d:shift_s l:behind d:behind_s d:age_s b:is_restored"),
     counter=_structure(
-        "d:time_s d:current_a d:mean_square_a2 d:mean_a d:turned_a2 d:discharged_pct d:moved_pct"
-        " d:counted_s d:gap_var_pct2 b:is_restored"
+        "d:time_s d:current_a d:mean_square_a2 d:turned_a2 d:discharged_pct d:moved_pct d:counted_s"
+        " d:gap_var_pct2"
     ),
     block=_structure("l:number i:rows b:is_broken d:sums[SUMS] d:drive[EFFECTS]"),
     filter=_structure("ekf:ekf[2] i:hypotheses i:decision d:prior_log_odds", ekf=_EKF),

@@ -6,8 +6,7 @@ have come at any time between them, the more so the longer they are apart: each 
     ½·((1 − exp(−Δt/HELD_S))·ΔI·Δt)²
 
 to the variance of the charge. Longer steps up to `BRIDGE_S` count as well, but their charge is
-uncertain by the whole recent current. Across a restart, the currents at both ends of the gap count
-for as long as a driver holds a current, and the mean of the last minute for the rest.
+uncertain by the whole recent current.
 
 A longer step is an *unobserved interval*: the bus was asleep, or the service not running. No charge
 is counted, and there are two hypotheses, as likely as each other. *Parked*: self-discharge and
@@ -46,9 +45,6 @@ MEAN_SQUARE_MEMORY_S = 300.0
 
 HELD_S = 5.0
 """How long a current stays similar while driving [s]."""
-
-MEAN_MEMORY_S = 60.0
-"""Memory of the mean current that is counted across a restart [s]."""
 
 
 def parked_std_pct(seconds: float, rms_pct_per_s: float) -> float:
@@ -119,8 +115,6 @@ class CoulombCounter:
     ----------
     state : CounterState
         Charge counted so far, and the last sample.
-    is_restored : bool
-        Whether no sample has come since the state was restored.
     """
 
     def __init__(self, capacity_ah: float, gap_s: float) -> None:
@@ -128,7 +122,6 @@ class CoulombCounter:
         self._gap_s = gap_s
         # Of a slow log the usual step may exceed a minute; as offline (`logs.gaps.bridge_s`).
         self._bridge_s = max(BRIDGE_S, gap_s)
-        self.is_restored = False
         self.state = CounterState()
 
     def step(self, time_s: float, current_a: float) -> ChargeStep:
@@ -138,16 +131,9 @@ class CoulombCounter:
         state.time_s, state.current_a = time_s, current_a
         if math.isnan(last_s):
             state.mean_square_a2 = current_a * current_a
-            state.mean_a = current_a
             return ChargeStep(0.0, 0.0)
         seconds = time_s - last_s
         across_a = 0.5 * (current_a + last_a)
-        if self.is_restored and seconds > self._gap_s:
-            held = HELD_S / seconds * -math.expm1(-0.5 * seconds / HELD_S)
-            across_a = state.mean_a + held * (current_a + last_a - 2.0 * state.mean_a)
-        self.is_restored = False
-        kept = math.exp(-seconds / MEAN_MEMORY_S)
-        state.mean_a = kept * state.mean_a + (1.0 - kept) * current_a
         kept = math.exp(-seconds / MEAN_SQUARE_MEMORY_S)
         # At the start of a drive the mean square lags: the currents at the ends of the gap bound it
         # from below.

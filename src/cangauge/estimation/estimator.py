@@ -584,7 +584,7 @@ class Estimator:
         Without an interruption `age_s` is None, and the stamps of the samples give the time.
         """
         self._clock.state, self._clock.age_s = replace(state.clock), age_s
-        self._counter.state, self._counter.is_restored = replace(state.counter), True
+        self._counter.state = replace(state.counter)
         self._memory = replace(state.memory, innovations=list(state.memory.innovations))
         reasons = Reason(state.reasons)
         self._latest = Estimate._make(

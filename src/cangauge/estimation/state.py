@@ -66,8 +66,6 @@ class CounterState:
     """Current of the last sample [A]."""
     mean_square_a2: _NotNegative = 0.0
     """Running mean square of the current [A²]."""
-    mean_a: _Finite = 0.0
-    """Running mean of the current [A]."""
     turned_a2: _NotNegative = 0.0
     """Variance of the current between the last two samples [A²]."""
     discharged_pct: _Finite = 0.0

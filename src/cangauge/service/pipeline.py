@@ -138,7 +138,7 @@ class Pipeline:
         self._estimate = NOTHING_YET  # after the latest sample, without the signals' health
         self._report: tuple[int, PackReport] | None = None
         self._findings: tuple[Reason, Reason, bool, bool] | None = None
-        self.estimator = make_estimator(model, _with_source(settings.estimator, vehicle))
+        self.estimator = make_estimator(model, _with_sensors(settings.estimator, vehicle))
         self._pack = _pack_of(self.estimator)
         self._begin_signals()
 
@@ -356,7 +356,7 @@ class Pipeline:
         if self._publisher is not None:
             _check_ids(vehicle, ids)
         chosen = replace(
-            _with_source(settings.estimator, vehicle),
+            _with_sensors(settings.estimator, vehicle),
             initial_soc_pct=before.settings.initial_soc_pct,
             initial_soc_std_pct=before.settings.initial_soc_std_pct,
         )
@@ -446,11 +446,14 @@ def _all_reasons(
     return reasons
 
 
-def _with_source(settings: EstimatorSettings, vehicle: Vehicle) -> EstimatorSettings:
-    """Return the settings with the vehicle's temperature source where theirs is unknown."""
-    if settings.temperature_source != "unknown":
-        return settings
-    return replace(settings, temperature_source=vehicle.temperature_source)
+def _with_sensors(settings: EstimatorSettings, vehicle: Vehicle) -> EstimatorSettings:
+    """Return the settings with the vehicle's sensors; a stated temperature source stays."""
+    source = settings.temperature_source
+    return replace(
+        settings,
+        temperature_source=vehicle.temperature_source if source == "unknown" else source,
+        voltage_accuracy_pct=vehicle.voltage_accuracy_pct,
+    )
 
 
 def _check_ids(vehicle: Vehicle, ids: FrameIds) -> None:
