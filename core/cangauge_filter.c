@@ -7,7 +7,7 @@
 
 #define OFFSET_STD_A 1.0
 #define LEVEL_TIME_S (4.0 * 3600.0)
-#define LEARNED_TIME_S (72.0 * 3600.0)
+#define FUNCTIONS_TIME_S (72.0 * 3600.0)
 #define DRIFT_PCT2_PER_S 1e-6
 #define OUTSIDE_PCT_PER_K 0.2
 #define LINEAR_PCT 1.0
@@ -49,8 +49,8 @@ static cg_real prior_var(const cg_model *model, int32_t k)
 /* Time constant with which a state returns to its prior. */
 static cg_real time_of(const cg_model *model, int32_t k)
 {
-    cg_real time_s = R(LEARNED_TIME_S);
-    if (k == CG_X_SOC) {
+    cg_real time_s = R(FUNCTIONS_TIME_S);
+    if (k <= CG_X_OFFSET) {
         time_s = R(INFINITY);
     } else if (k == CG_X_SLOW) {
         time_s = model->slow_time_s;
@@ -77,7 +77,8 @@ static cg_real offset_gain(const cg_model *model, cg_real seconds)
     return R(100.0) * seconds / (R(3600.0) * model->capacity_ah);
 }
 
-/* P <- F P F' + Q; V <- F V + G. The SoC takes up the offset; all others return to their priors. */
+/* P <- F P F' + Q; V <- F V + G. The SoC takes up the offset; the voltage's errors return to their
+ * priors. */
 static void ekf_predict(cg_ekf *ekf, const cg_model *model, const cg_passed *passed,
                         cg_real variance_pct2)
 {

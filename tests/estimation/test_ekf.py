@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from cangauge.estimation.ekf import (
-    LEARNED_TIME_S,
+    FUNCTIONS_TIME_S,
     LEVEL,
     LEVEL_TIME_S,
     OFFSET_STD_A,
@@ -74,13 +74,13 @@ def augmented(
 ) -> tuple[np.ndarray, np.ndarray, float]:
     """State, covariance and log-likelihood of the whole problem at once, by dense conditioning.
 
-    The unknowns are (S, o, w, c, c, g, r) after the last block. o, w and c are processes that
-    return to zero; each has a value at the start and at every block.
+    The unknowns are (S, o, w, c, c, g, r) after the last block. w and c are processes that return
+    to zero; o, w and c have a value at the start and at every block.
     """
     noise, count = LinearModel.noise, len(rows)
     times = np.arange(count + 1)
     gap = np.abs(np.subtract.outer(times, times))
-    time_s = [LEARNED_TIME_S, LEVEL_TIME_S, LEARNED_TIME_S, LEARNED_TIME_S]
+    time_s = [np.inf, LEVEL_TIME_S, FUNCTIONS_TIME_S, FUNCTIONS_TIME_S]
     sizes = [OFFSET_STD_A, 1.0, 1.0, 1.0]
     processes = [
         size**2 * np.exp(-30.0 / tau_s * gap) for size, tau_s in zip(sizes, time_s, strict=True)
@@ -195,10 +195,10 @@ def test_a_rejected_start_leaves_only_the_wide_hypothesis() -> None:
 def test_what_is_learned_returns_to_the_prior_while_the_car_is_away() -> None:
     filter_ = SocFilter(LinearModel(), 60.0, START_STD_PCT)
     run(filter_, voltages(25, 1))
-    filter_.predict(0.0, 0.0, away_s=30.0 * LEARNED_TIME_S)
+    filter_.predict(0.0, 0.0, away_s=30.0 * FUNCTIONS_TIME_S)
     fresh = SocFilter(LinearModel(), 60.0, START_STD_PCT)
-    np.testing.assert_allclose(filter_.x[1:], fresh.x[1:], atol=1e-9)
-    np.testing.assert_allclose(filter_.P[1:, 1:], fresh.P[1:, 1:], atol=1e-9)
+    np.testing.assert_allclose(filter_.x[2:], fresh.x[2:], atol=1e-9)
+    np.testing.assert_allclose(filter_.P[2:, 2:], fresh.P[2:, 2:], atol=1e-9)
 
 
 def test_an_unknown_temperature_and_one_outside_the_fit_widen_what_lasts() -> None:

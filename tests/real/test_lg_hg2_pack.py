@@ -78,11 +78,6 @@ def test_three_charges_correct_the_capacity_of_a_real_cell(learned: tuple[Health
     assert health.offset_a == pytest.approx(offset_a, abs=0.02)
 
 
-@pytest.mark.xfail(
-    strict=True,
-    reason="σ of capacity and resistance is 2.1 to 2.7 times too small: the filter takes the"
-    " voltage's level as one for all drives, so that drives average it",
-)
 def test_deviation_covers_capacity_and_resistance_of_a_real_cell(
     learned: tuple[Health, float],
 ) -> None:

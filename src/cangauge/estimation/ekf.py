@@ -9,8 +9,8 @@ State, with C the capacity:
     w  voltage error that lasts a drive (standard normal)
     c  principal functions of the fit's covariance (standard normal)
 
-Prediction over the time dt and the counted charge dq [% of C]. All but S return to their priors,
-each with its time constant τ, so that no drive teaches for ever:
+Prediction over the time dt and the counted charge dq [% of C]. The errors of the voltage, z, w and
+c, return to their priors with a time constant τ each, so that no drive teaches for ever:
 
     S ← S − dq + 100·o·dt/(3600 C),    xᵢ ← xᵢ·exp(−dt/τᵢ),    P ← F P Fᵀ + Q
     Qᵢᵢ = (1 − exp(−2 dt/τᵢ))·(prior variance of xᵢ)
@@ -49,9 +49,9 @@ LEVEL_TIME_S: Final = 4.0 * 3600.0
 """Time constant of the voltage error that lasts a drive [s]. From 4 to 24 h all are better than
 none on development months; the shortest is the least sure of itself."""
 
-LEARNED_TIME_S: Final = 72.0 * 3600.0
-"""Time constant of the offset and of the functions [s]: temperature and use of a car change within
-days, and with them the errors of its model. On development months 6 to 240 h are all better than
+FUNCTIONS_TIME_S: Final = 72.0 * 3600.0
+"""Time constant of the functions [s]: temperature and use of a car change within days, and with
+them the errors of its model. On development months 6 to 240 h are all better than
 none; this one has the fewest wrong valid estimates."""
 
 DRIFT_PCT2_PER_S: Final = 1e-6
@@ -112,8 +112,8 @@ class SocFilter:
     def __init__(self, model: OnlineModel, soc_pct: float, soc_std_pct: float) -> None:
         n = FUNCTIONS + model.functions.number
         self.model = model
-        self._time_s = np.full(n, LEARNED_TIME_S)
-        self._time_s[[SOC, SLOW, LEVEL]] = math.inf, model.noise.slow_time_s, LEVEL_TIME_S
+        self._time_s = np.full(n, FUNCTIONS_TIME_S)
+        self._time_s[:FUNCTIONS] = math.inf, math.inf, model.noise.slow_time_s, LEVEL_TIME_S
         self._prior_var = np.ones(n)
         self._prior_var[[OFFSET, SLOW]] = OFFSET_STD_A**2, model.noise.slow_std_v**2
         self.x = np.zeros(n)
