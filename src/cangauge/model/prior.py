@@ -88,7 +88,7 @@ FAST_FLOOR: Final = 0.0003
 """Least noise of a block's mean, relative to the mean voltage [-]: development packs."""
 
 FUNCTIONS: Final = 8
-"""Principal functions that a filter carries; eight leave 2.5 times as many starts astray."""
+"""Principal functions that a filter carries: twelve change no mean error by 0.1 % (development)."""
 TYPICAL_C_RATE: Final = 1.0 / 3.0
 """Current of a drive [1/h] by which the functions weigh errors of resistances: 20 A at 60 Ah."""
 TYPICAL_K: Final = 10.0
