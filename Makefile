@@ -15,7 +15,7 @@ help:
 	@echo "make demo      the whole job on the shipped log: fit, bus, service, report"
 	@echo "make test      the whole test suite"
 	@echo "make socketcan the tests that need a real SocketCAN interface"
-	@echo "make nightly   what is too long for the suite (PART=inputs|faults|grade|suite|tests|long|load, DATA=FOLDER)"
+	@echo "make nightly   what is too long for the suite (PART=inputs|faults|grade|suite|tests|lowest|long|load, DATA=FOLDER)"
 	@echo "make lint      ruff and mypy"
 	@echo "make coverage  the test suite with coverage"
 	@echo "make check     a small part of the withheld check of the diagnosis"
@@ -42,8 +42,9 @@ $(VENV)/installed-dev: $(VENV)/installed
 	$(call install,.[dev])
 	touch $@
 
-$(VENV)/installed-nightly: $(VENV)/installed-dev
-	$(call install,.[nightly])
+# Exactly the versions of .ci/nightly.txt, by their hashes (Python 3.11 on Linux, x86-64); elsewhere the latest.
+$(VENV)/installed-nightly: $(VENV)/installed-dev .ci/nightly.txt
+	.ci/pinned $(BIN)/python || { echo "NOT PINNED: .ci/nightly.txt is of another platform" >&2; $(BIN)/python -m pip install --quiet --editable '.[nightly]'; }
 	touch $@
 
 $(VENV)/installed-docs: $(VENV)/installed
@@ -62,9 +63,9 @@ test: export PYTHONDONTWRITEBYTECODE :=
 test: $(VENV)/installed-dev
 	$(BIN)/python -m pytest -n auto --dist loadfile --no-loadscope-reorder
 
-# On a kernel without CAN a guest is booted; without either these tests say that they are left out.
+# On a kernel without CAN a guest is booted. It says how many tests ran, and fails if none did.
 socketcan: $(VENV)/installed-dev
-	$(SOCKETCAN) $(BIN)/python -m pytest -rs -m socketcan tests/socketcan
+	.ci/socketcan $(BIN)/python $(SOCKETCAN)
 
 nightly: $(VENV)/installed-nightly
 	$(BIN)/python benchmarks/nightly.py $(PART) $(if $(DATA),--data "$(DATA)") $(if $(SOCKETCAN),--socketcan "$(SOCKETCAN) -t 3600 -m 2G")

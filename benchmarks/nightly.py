@@ -8,6 +8,7 @@ grade    the estimator on recorded packs, and the diagnosis on its frozen cases 
 suite    the score cards of three gauges: our service, a counter, filterpy's filter
 tests    what `make test` leaves out: tests marked nightly, and 300 examples of each property
          (20 there) that states no number of its own
+lowest   the lowest versions that pyproject.toml allows
 long     restarts by SIGKILL; load, timing and memory of the service; attacks on its page, status
          and MQTT
 load     half an hour at 12,000 frames/s, or what a bare loop carries here: no loss, memory flat
@@ -85,6 +86,7 @@ def commands(data: Path | None, socketcan: str) -> dict[str, list[list[str]] | s
             [python, "-m", "pytest", "-n", "auto", "--dist", "loadfile", "-m", "nightly", "tests"],
             [python, "-m", "pytest", "-m", "hypothesis", "--hypothesis-profile=nightly", "tests"],
         ],
+        "lowest": [[".ci/lowest"]],
         "long": [
             [python, "benchmarks/restarts.py"],
             [python, "benchmarks/bus_load.py"],

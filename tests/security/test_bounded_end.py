@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import fcntl
 import os
+import signal
 import subprocess
 import sys
 from contextlib import suppress
@@ -39,5 +40,28 @@ def test_a_stopped_reader_of_its_messages_stops_nothing(full_pipe: tuple[int, in
         assert waits(lambda: watcher.recv(0.1) is not None)
         service.terminate()
         assert service.wait(60.0) == 0
+    for each in full_pipe:
+        os.close(each)
+
+
+def test_a_second_sigterm_ends_a_service_that_cannot_end(full_pipe: tuple[int, int]) -> None:
+    bus = ("--interface", "virtual", "--channel", "second")
+    arguments = [str(each) for each in ("run", "-m", leaf_model_path(), *bus, "--json")]
+    service = subprocess.Popen(
+        [sys.executable, "-c", COMMAND, *arguments],
+        stdout=full_pipe[1],  # takes no result
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    assert service.stderr is not None
+    for line in service.stderr:
+        if "service.ready" in line:
+            service.terminate()
+        if "service.stopped" in line:
+            break
+    assert service.poll() is None
+    service.terminate()
+    assert service.wait(60.0) == -signal.SIGTERM
+    service.stderr.close()
     for each in full_pipe:
         os.close(each)

@@ -69,7 +69,9 @@ class Stored:
 
     def logs(self) -> list[Path]:
         """Return the logs in order of time."""
-        return sorted(self.folder.glob("*.parquet"))
+        found = self.folder.glob("*.parquet")
+        # A hidden one is what a killed service was writing.
+        return sorted(path for path in found if not path.name.startswith("."))
 
     def put(self, rows: list[tuple[float, ...]]) -> None:
         """Write rows of time, current, voltage, temperature and published SoC as a log."""

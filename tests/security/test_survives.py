@@ -1,0 +1,159 @@
+"""What was saved survives kill −9, full disks and wrong clocks; an error says what was not."""
+
+from __future__ import annotations
+
+import os
+import resource
+import signal
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from random import Random
+
+import pytest
+
+from cangauge._files import remove_parts, write_text_atomic
+from cangauge.bus.vehicle import Vehicle
+from cangauge.errors import CangaugeError
+from cangauge.estimation.offline import samples_of
+from cangauge.estimation.settings import EstimatorSettings
+from cangauge.extras.judge.live import Stored
+from cangauge.logs.read import open_log
+from cangauge.replay.encoder import FrameEncoder
+from cangauge.service.pipeline import Pipeline, PipelineSettings
+from cangauge.service.state import StateKeeper, read_state
+from cangauge.types import Sample, Status
+from live import LoggedLines, leaf_model, short_log
+
+pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="fork and signals of Unix")
+SEEDS = 20
+VEHICLE, MODEL = Vehicle.load("generic"), leaf_model()
+EPOCH_S = 1_700_000_000.0
+DRIVE = [each._replace(time_s=each.time_s + EPOCH_S) for each in samples_of(short_log(200.0))]
+HOUR_S, YEAR_S = 3600.0, 365.0 * 86400.0
+
+
+def killed(write: Callable[[int], object], folder: Path, after_s: float) -> int:
+    """Let a child write 0, 1, 2, … and kill it; return the last number that it had written."""
+    reader, writer = os.pipe()
+    child = os.fork()
+    if child == 0:
+        try:
+            os.close(reader)
+            for number in range(1 << 30):
+                write(number)
+                os.write(writer, number.to_bytes(4, "little"))
+        finally:
+            os._exit(9)
+    os.close(writer)
+    numbers = os.read(reader, 4)
+    time.sleep(after_s)
+    os.kill(child, signal.SIGKILL)
+    os.waitpid(child, 0)
+    while part := os.read(reader, 1 << 16):
+        numbers += part
+    os.close(reader)
+    assert folder.is_dir()
+    return int.from_bytes(numbers[len(numbers) // 4 * 4 - 4 :][:4], "little")
+
+
+def test_a_file_survives_a_kill_at_any_write(tmp_path: Path) -> None:
+    path = tmp_path / "state.json"
+    random = Random(0)  # noqa: S311 - repeatable
+    for _ in range(SEEDS):
+        last = killed(
+            lambda number: write_text_atomic(path, f"{number}\n" * 5_000),
+            tmp_path,
+            random.uniform(0.0, 0.02),
+        )
+        lines = path.read_text().splitlines()
+        assert len(lines) == 5_000
+        assert {*map(int, lines)} <= {last, last + 1}
+        remove_parts(path)
+        assert [each.name for each in tmp_path.iterdir()] == ["state.json"]
+
+
+def test_logs_of_the_judge_survive_a_kill_at_any_write(tmp_path: Path) -> None:
+    rows = [(float(row), 10.0, 380.0, 20.0, 50.0) for row in range(2_000)]
+    stored = Stored(tmp_path, keep=3, command=())
+    random = Random(1)  # noqa: S311 - repeatable
+    for _ in range(SEEDS):
+        killed(lambda _number: stored.put(rows), tmp_path, random.uniform(0.0, 0.02))
+        # As what it was writing when it was killed.
+        (tmp_path / ".20260101T000000.0123abcd.parquet").write_bytes(b"PAR1")
+        assert 1 <= len(stored.logs()) <= 4
+        for path in stored.logs():
+            assert len(open_log(path).read()) == len(rows)
+
+
+def test_a_full_disk_leaves_the_old_file_and_says_so(tmp_path: Path) -> None:
+    path, random = tmp_path / "state.json", Random(2)  # noqa: S311 - repeatable
+    write_text_atomic(path, "old")
+
+    def fill(limit: int) -> bool:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))
+        signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+        try:
+            write_text_atomic(path, "x" * 100_000)
+        except CangaugeError as error:
+            return "writing failed" in str(error) and "free some space" in str(error)
+        return False
+
+    for _ in range(SEEDS):
+        child = os.fork()
+        if child == 0:
+            os._exit(0 if fill(random.randrange(1, 100_000)) else 1)
+        random.random()
+        assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 0
+        assert path.read_text() == "old"
+        assert len(list(tmp_path.iterdir())) == 1
+
+
+@pytest.mark.skipif(sys.platform == "win32" or os.geteuid() != 0, reason="root drops its rights")
+def test_a_folder_that_became_read_only_is_reported(tmp_path: Path) -> None:
+    state = tmp_path / "state.json"
+    keeper, pipeline = begun(state, EPOCH_S, known=80.0)
+    with LoggedLines("cangauge.service.state") as logged:
+        tmp_path.chmod(0o555)
+        os.seteuid(65534)
+        try:
+            drive(pipeline, DRIVE[:100])
+            keeper.__exit__()
+        finally:
+            os.seteuid(0)
+    assert "state not written" in " ".join(logged.lines)
+
+
+def begun(path: Path, wall_s: float, known: float | None = None) -> tuple[StateKeeper, Pipeline]:
+    settings = PipelineSettings(EstimatorSettings(initial_soc_pct=known))
+    pipeline = Pipeline(VEHICLE, MODEL, settings)
+    keeper = StateKeeper(path, pipeline, "virtual x", 86400.0, wall_s=lambda: wall_s)
+    return keeper.__enter__(), pipeline
+
+
+def drive(pipeline: Pipeline, samples: list[Sample]) -> list[Status]:
+    encoder, found = FrameEncoder(VEHICLE), list[Status]()
+    for sample in samples:
+        for frame in encoder.encode(sample):
+            if pipeline.handle(frame):
+                found.append(pipeline.latest.status)
+    return found
+
+
+@pytest.mark.parametrize("off_s", [-2.0 * YEAR_S, -HOUR_S, HOUR_S, 2.0 * YEAR_S])
+def test_a_wrong_clock_makes_no_valid_soc_of_an_old_state(off_s: float, tmp_path: Path) -> None:
+    random = Random(3)  # noqa: S311 - repeatable
+    for seed in range(SEEDS):
+        path = tmp_path / f"{seed}.json"
+        keeper, pipeline = begun(path, EPOCH_S, known=80.0)
+        count = random.randrange(50, 900)
+        drive(pipeline, DRIVE[:count])
+        keeper.__exit__()
+        saved = read_state(path).estimator.soc_pct
+        _, again = begun(path, EPOCH_S + off_s)
+        found = drive(again, DRIVE[count : count + 20])
+        if off_s < 0.0 or off_s > 86400.0:  # its age is not known, or too old
+            assert Status.VALID not in found
+        if 0.0 < off_s < 86400.0:
+            assert again.latest.soc_pct == pytest.approx(saved, abs=1.0)
