@@ -16,13 +16,27 @@ SIGNALS: Final = {
 }
 """Column of a log and unit by role; the column names the signal in a DBC that is written."""
 VOLTAGE_SCALES: Final = {
-    0.1: 0.0, 0.5: -0.3, 0.25: -0.3, 0.01: -0.3, 0.125: -1.2, 0.05: -2.0, 0.02: -2.0, 1.0: -1.0,
+    0.1: 0.0,
+    0.5: -0.3,
+    0.25: -0.3,
+    0.01: -0.3,
+    0.125: -1.2,
+    0.05: -2.0,
+    0.02: -2.0,
+    1.0: -1.0,
     2.0: -3.0,
-}  # fmt: skip
+}
 CURRENT_SCALES: Final = {
-    0.1: 0.0, 0.5: -0.3, 0.25: -0.5, 0.01: -0.5, 0.05: -0.5, 1.0: -1.0, 0.025: -1.0, 0.125: -1.2,
+    0.1: 0.0,
+    0.5: -0.3,
+    0.25: -0.5,
+    0.01: -0.5,
+    0.05: -0.5,
+    1.0: -1.0,
+    0.025: -1.0,
+    0.125: -1.2,
     0.02: -1.5,
-}  # fmt: skip
+}
 """Usual scales [V, A] and their log priors [nats], by their frequency in public DBC files."""
 SOC_SCALES: Final = (0.1, 0.5, 0.01, 1.0, 0.05, 0.025, 0.02, 0.4)
 """Usual scales of a SoC [%]."""
@@ -206,8 +220,6 @@ class SignalCandidate:
     def comments(self, nominal_v: float | None) -> list[str]:
         """Return the lines that the map states of it: range, evidence, what decided its scale."""
         lines = [f"{self.name}: {self.range_text}, {self.steps} steps."]
-        if self.role == "temperature":
-            return ["A guess by range and slowness: compare it with the car's display.", *lines]
         lines.append(f"{self.facts[0].upper()}{self.facts[1:]}.")
         factor = f"Factor {self.scale:g} is the"
         if self.role == "current":

@@ -214,7 +214,7 @@ def _find(
         found = search(_joined(paths), nominal_v)
     clear = [role for role in _NEEDED if found.is_clear(role)]
     clear += ["soc_reference"] if found.soc_reference else []
-    candidates = {role: getattr(found, role) for role in _ROLES.values()}
+    candidates = {role: getattr(found, role) for role in (*_NEEDED, "soc_reference")}
     return Proposal(
         "physics",
         candidates,
@@ -327,8 +327,10 @@ def _prove(
     rows = (samples.time_s[good], amps[good], volts, np.zeros(len(volts)))
     sign = sign_of_current(Log(*rows, soc_pct=samples.soc_pct[good]))
     proposal.proof["sign"] = {
-        "sign": sign.sign, "confidence": sign.confidence, "text": sign.strongest.text,
-    }  # fmt: skip
+        "sign": sign.sign,
+        "confidence": sign.confidence,
+        "text": sign.strongest.text,
+    }
     if proposal.method == "dbc" and sign.sign == -1:  # the map says how its sign was found
         turned = [replace(each, sign=-1) for each in proposal.candidates["current"]]
         proposal.candidates["current"] = turned

@@ -269,11 +269,15 @@ def _demultiplexed(stream: Stream) -> list[Stream]:
     codes = _codes(bits, first, width)
     return [
         Stream(
-            stream.bus, stream.arbitration_id, stream.is_extended, stream.time_s[codes == value],
-            stream.payload[codes == value], Selector(first, width, int(value)),
+            stream.bus,
+            stream.arbitration_id,
+            stream.is_extended,
+            stream.time_s[codes == value],
+            stream.payload[codes == value],
+            Selector(first, width, int(value)),
         )
         for value in np.unique(codes)
-    ]  # fmt: skip
+    ]
 
 
 def _codes(bits: NDArray[np.uint8], first: int, width: int) -> NDArray[np.int64]:

@@ -192,9 +192,18 @@ class Row:
             is_signed = self.place.is_signed
             code = int(codes[counts.argmax()]) if is_signed else (1 << self.place.width) - 1
         return SignalCandidate(
-            role, self.field.stream, self.place, scale, offset, float(ends.min()),
-            float(ends.max()), self.steps, self.moves, code, **more,
-        )  # fmt: skip
+            role,
+            self.field.stream,
+            self.place,
+            scale,
+            offset,
+            float(ends.min()),
+            float(ends.max()),
+            self.steps,
+            self.moves,
+            code,
+            **more,
+        )
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""Current, voltage, SoC and temperature of a pack among the fields of a capture.
+"""Current, voltage and SoC of a pack among the fields of a capture.
 
 Every field is averaged on one grid of time; current and voltage are the best pair (`pairs`), SoC is
 what falls with the charge of that current.
@@ -7,7 +7,7 @@ what falls with the charge of that current.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from itertools import islice
 from typing import Final
@@ -61,8 +61,6 @@ AT_HALF: Final = 0.03
 AT_HALF_NATS: Final = 3.0
 """A number that rests at half its range, to this share, is a torque, a yaw rate or the like with
 an offset; a voltage is there by chance once in twenty or thirty."""
-ENOUGH_STEPS: Final = 50
-"""Fewest changes of a field that is taken without the user."""
 MOST_FRAMES: Final = 1_000_000
 """Frames that are looked at, all ids over one time: 5–15 minutes of a car, hours of a module."""
 
@@ -76,7 +74,7 @@ class Findings:
 
     Parameters
     ----------
-    current, voltage, soc_reference, temperature : list of SignalCandidate
+    current, voltage, soc_reference : list of SignalCandidate
     remarks : tuple of str
     streams, fields : int
         Number of ids and of numbers looked at.
@@ -86,7 +84,6 @@ class Findings:
     current: Candidates
     voltage: Candidates
     soc_reference: Candidates
-    temperature: Candidates
     remarks: tuple[str, ...]
     streams: int
     fields: int
@@ -96,12 +93,9 @@ class Findings:
     def comments(self) -> tuple[str, ...]:
         """What was looked at and not found, for the head of a map."""
         found = f"Found by physics in {self.duration_s:.0f} s of frames: {self.fields} numbers of"
-        hints = [f"{c.name} ({c.low:.3g} … {c.high:.3g} °C)" for c in self.temperature]
-        slow = [f"Slow and plausible as a temperature: {', '.join(hints)}."] if hints else []
         return (
             f"{found} {self.streams} ids.",
             *self.remarks,
-            *slow,
             "The bits do not determine the factors: compare voltage and current with a",
             "meter or the car's display, and correct factor and offset in the DBC.",
         )
@@ -114,9 +108,9 @@ class Findings:
     def is_clear(self, role: str) -> bool:
         """Whether the first candidate is certain enough to be taken without the user."""
         found: Candidates = getattr(self, role)
-        if not found or found[0].evidence < ENOUGH_NATS or found[0].steps < ENOUGH_STEPS:
+        if not found or not (found[0].evidence >= ENOUGH_NATS and found[0].is_repeated):
             return False
-        if not found[0].is_repeated:
+        if found[0].moves < MOVES:
             return False
         if any(each.evidence > RIVAL * found[0].evidence for each in found[1:]):
             return False  # the inverter's pair and the pack's: both obey the same physics
@@ -124,7 +118,7 @@ class Findings:
 
 
 def search(messages: Iterable[can.Message], nominal_v: float | None = None) -> Findings:
-    """Find current, voltage, SoC and temperature in the frames of a capture.
+    """Find current, voltage and SoC in the frames of a capture.
 
     Parameters
     ----------
@@ -145,10 +139,7 @@ def search(messages: Iterable[can.Message], nominal_v: float | None = None) -> F
         )
     fields, grid = fields_of(streams), Grid(streams, GRID_S)
     current, voltage, row = _pair(fields, grid, nominal_v)
-    soc: Candidates = []
-    temperature: Candidates = []
-    if row is not None:
-        soc, temperature = _slow(fields, grid, current[0], voltage[0], row)
+    soc = [] if row is None else _socs(fields, grid, current[0], voltage[0], row)
     remarks = []
     if not current:
         remarks.append("no field of this capture can be the current or the voltage of a pack")
@@ -159,14 +150,11 @@ def search(messages: Iterable[can.Message], nominal_v: float | None = None) -> F
         )
     if not soc:
         remarks.append("no field falls with the charge: record a longer drive to find the SoC")
-    if not temperature:
-        remarks.append("no slow field looks like a temperature")
     if next(frames, None) is not None:
         remarks.append(f"ranges and steps are those of the first {duration(grid.duration_s)}")
     return Findings(
-        current, voltage, soc, temperature, tuple(remarks), len(streams), len(fields),
-        grid.duration_s,
-    )  # fmt: skip
+        current, voltage, soc, tuple(remarks), len(streams), len(fields), grid.duration_s
+    )
 
 
 def _pair(
@@ -184,24 +172,21 @@ def _pair(
     return ([], [], None) if row is None else (current, voltage, row)
 
 
-def _slow(
+def _socs(
     fields: Sequence[Field],
     grid: Grid,
     current: SignalCandidate,
     voltage: SignalCandidate,
     row: Row,
-) -> tuple[Candidates, Candidates]:
-    """Return the candidates for SoC, by the charge of a current, and for temperature."""
+) -> Candidates:
+    """Return the candidates for SoC, by the charge of a current."""
     amps = current.sign * (current.scale * row.means_on(grid) + current.offset)
     span = grid.longest(0.5 * BETWEEN_S)
     drawn_ah = (np.cumsum(amps) * grid.step_s / 3600.0)[span]
-    buses = {current.stream.bus, voltage.stream.bus}
     least_ah = LEAST_HOURS * float(np.abs(amps).max())
-    socs = [made for field in fields if (made := _as_charge(field, grid, drawn_ah, span))]
-    socs = [each for each in socs if each.capacity_ah >= least_ah]
-    warm = [made for field in fields for made in _as_temperature(field, buses)]
-    taken = current.bits | voltage.bits
-    return _apart(socs, taken), _apart(warm, taken)
+    found = [made for field in fields if (made := _as_charge(field, grid, drawn_ah, span))]
+    possible = [each for each in found if each.capacity_ah >= least_ah]
+    return _apart(possible, current.bits | voltage.bits)
 
 
 def _as_current(field: Field) -> Row | None:
@@ -297,30 +282,16 @@ def _as_charge(
             score -= 0.5 if (1 << place.width) * scale > 300.0 and scale > 0.02 else 0.0
             if best is None or score > best.score:
                 best = row.candidate(
-                    "soc_reference", scale, 0.0, score=score, evidence=evidence, correlation=r,
-                    partner=f"{capacity_ah:.0f} Ah per 100 %", capacity_ah=capacity_ah,
-                )  # fmt: skip
+                    "soc_reference",
+                    scale,
+                    0.0,
+                    score=score,
+                    evidence=evidence,
+                    correlation=r,
+                    partner=f"{capacity_ah:.0f} Ah per 100 %",
+                    capacity_ah=capacity_ah,
+                )
     return best
-
-
-def _as_temperature(field: Field, buses: set[str]) -> Iterator[SignalCandidate]:
-    """Yield the extents of a slow field in a plausible range, those of the pack's bus likelier."""
-    seen = field.statistics
-    if seen.count > 12 or seen.largest_step > 4.0 or seen.steps > 0.1 * len(field.raw) + 4:
-        return
-    for place, nature, constant in field.extents:
-        row = Row(field, place, constant, field.missing)
-        for scale, offset, usual in (
-            (1.0, -40.0, 0.0), (0.5, -40.0, -0.3), (1.0, 0.0, -0.7), (1.0, -50.0, -0.7),
-            (0.1, 0.0, -0.7), (0.1, -40.0, -1.5),
-        ):  # fmt: skip
-            low, high = (scale * (end + constant) + offset for end in (seen.low, seen.high))
-            if low < -20.0 or high > 50.0 or (place.is_signed and offset != 0.0):
-                continue
-            score = nature + usual + (0.5 if field.stream.bus in buses else 0.0)
-            score -= 0.2 * (high - low) + 0.5 * (((low + high) / 2.0 - 20.0) / 15.0) ** 2
-            score -= 1.0 if place.width > 8 and scale == 1.0 else 0.0
-            yield row.candidate("temperature", scale, offset, score=score)
 
 
 def _rate_prior(stream: Stream) -> float:
