@@ -19,8 +19,8 @@ from cangauge.errors import CangaugeError, InputError
 if TYPE_CHECKING:
     import can
 
-    from cangauge._typing import FloatArray
     from cangauge.extras.discovery.proposal import Proposal
+    from cangauge.logs.log import Log
 
 _ROLES: Final = {
     "current": "current",
@@ -297,11 +297,8 @@ def _prove(
     InputError
         If the files do not decode the capture.
     """
-    import numpy as np
-
     from cangauge.bus.recording import capture_samples
     from cangauge.bus.vehicle import Vehicle
-    from cangauge.logs.log import Log
     from cangauge.logs.sign import sign_of_current
 
     if proposal.vehicle is not None:
@@ -314,64 +311,49 @@ def _prove(
         car = Vehicle.load(map=folder / "car.toml")
     if capture is None:
         return
-    samples = capture_samples(capture, car)
-    good = np.isfinite(samples.voltage_v) & (np.diff(samples.time_s, prepend=-np.inf) > 0.0)
-    amps, volts = samples.current_a, samples.voltage_v[good]
-    if len(volts) < 2:
+    log = capture_samples(capture, car).as_log()
+    if log is None:
         raise InputError(
             "current and voltage found do not make samples: their frames are too far apart",
             source=capture,
             cure="choose others by --choose",
         )
-    # The sign needs no temperature.
-    rows = (samples.time_s[good], amps[good], volts, np.zeros(len(volts)))
-    sign = sign_of_current(Log(*rows, soc_pct=samples.soc_pct[good]))
-    proposal.proof["sign"] = {
-        "sign": sign.sign,
-        "confidence": sign.confidence,
-        "text": sign.strongest.text,
-    }
+    sign = sign_of_current(log)
+    found = {"sign": sign.sign, "confidence": sign.confidence, "text": sign.strongest.text}
+    amps, volts = log.current_a, log.voltage_v
     if proposal.method == "dbc" and sign.sign == -1:  # the map says how its sign was found
         turned = [replace(each, sign=-1) for each in proposal.candidates["current"]]
         proposal.candidates["current"] = turned
         amps = -amps
     proposal.proof |= {
-        "soc": _soc_by_charge(samples.time_s, samples.soc_pct, sign.sign * samples.current_a),
-        "samples": len(samples),
+        "sign": found,
+        "soc": _soc_by_charge(log, sign.sign or 1),
+        "samples": len(log),
         "current_a": [float(amps.min()), float(amps.max())],
         "voltage_v": [float(volts.min()), float(volts.max())],
     }
 
 
-def _soc_by_charge(
-    time_s: FloatArray, soc_pct: FloatArray, current_a: FloatArray
-) -> dict[str, Any]:
+def _soc_by_charge(log: Log, sign: int) -> dict[str, Any]:
     """Return the capacity that SoC and charge have by each half [Ah], and whether they agree."""
-    import numpy as np
+    from cangauge.extras.discovery.candidate import LEAST_HOURS, SOC_AGREES, is_capacity
+    from cangauge.logs.charge import implied_capacity
 
-    from cangauge.extras.discovery.candidate import (
-        LEAST_HOURS,
-        SOC_AGREES,
-        is_capacity,
-    )
-    from cangauge.logs.gaps import discharged_ah
-
-    known = np.flatnonzero(np.isfinite(soc_pct))
-    if len(known) < 2:
+    if log.first_soc() is None:
         return {}
-    drawn_ah, fallen = discharged_ah(time_s, current_a)[known], -soc_pct[known]
-    ends = [0, len(known) // 2, len(known) - 1]
-    drawn_ah, fallen = np.diff(drawn_ah[ends]), np.diff(fallen[ends])
-    steps = np.abs(np.diff(soc_pct[known]))
-    step = float(steps[steps > 0.0].min(initial=100.0))
-    if (np.abs(fallen) * SOC_AGREES < step).any():
-        return {"agrees": False, "why": "it moves by too few steps to tell"}
-    by_half = [float(each) for each in 100.0 * drawn_ah / fallen]
-    least_ah = LEAST_HOURS * float(np.abs(current_a).max())
-    agrees = all(is_capacity(each) and each >= least_ah for each in by_half)
-    agrees &= max(by_half) <= (1.0 + SOC_AGREES) * min(by_half)
-    halves = " and ".join(f"{each:.3g}" for each in by_half)
-    return {"agrees": agrees, "why": f"by charge, 100 % are {halves} Ah in the two halves"}
+    middle = len(log) // 2
+    parts = log.rows(slice(None, middle)), log.rows(slice(middle, None))
+    try:
+        first, second = (implied_capacity([part], 0.0) for part in parts)
+    except InputError:
+        return {"agrees": False, "why": "it does not move, so that no charge proves it"}
+    halves_ah = sorted(sign * half.capacity_ah for half in (first, second))
+    std_ah = max(first.std_ah, second.std_ah)
+    least_ah = max(LEAST_HOURS * float(abs(log.current_a).max()), std_ah / SOC_AGREES)
+    agrees = halves_ah[0] >= least_ah and all(map(is_capacity, halves_ah))
+    agrees &= halves_ah[1] <= (1.0 + SOC_AGREES) * halves_ah[0]
+    why = f"by charge, 100 % are {halves_ah[0]:.3g} … {halves_ah[1]:.3g} Ah"
+    return {"agrees": bool(agrees), "why": f"{why} in the halves of the capture"}
 
 
 def _show_candidates(proposal: Proposal) -> None:
