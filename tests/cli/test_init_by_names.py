@@ -62,6 +62,18 @@ NONE: dict[str, tuple[dict[str, tuple[str, ...]], str]] = {
         )},
         "no word for a pack",
     ),
+    "fan": (
+        {"BMS": (PACK[0], 'SG_ FanCurrent : 16|16@1- (0.1,0) [0|0] "A"')},
+        "fan",
+    ),
+    "its supply": (
+        {"BMS": (PACK[1], 'SG_ BMS_supplyVoltage : 0|16@1+ (0.1,0) [0|0] "V"')},
+        "supply",
+    ),
+    "another thing": (
+        {"BMS": (PACK[0], 'SG_ GadgetCurrent : 16|16@1- (0.1,0) [0|0] "A"')},
+        "gadget",
+    ),
     "two sources": ({"HVB": (HV,), "LVB": (BATT_A,)}, "no current of its"),
     "loads": (
         {"HVEM_02": ('SG_ HVEM_IstStrom_HVVerbraucher : 0|12@1+ (0.1,-204.7) [0|0] "A"',),
@@ -109,6 +121,12 @@ TRUE = {
             'SG_ RdHVltBatPckVlt : 16|12@1+ (0.125,0) [0|0] "V"',
         ),
         "Battery_Voltage": ('SG_ BattCrntFltrd : 0|8@1- (0.5,0) [0|0] "A"',),
+    },
+    "of the message": {
+        "BMS_State": (
+            'SG_ ActualCurrent : 0|16@1- (0.1,0) [0|0] "A"',
+            'SG_ TotalVoltage : 16|16@1+ (0.1,0) [0|0] "V"',
+        ),
     },
     "two messages": {"BMS_1": (PACK[0],), "BMS_2": (PACK[1],)},
     "joined": {

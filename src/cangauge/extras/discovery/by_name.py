@@ -56,7 +56,8 @@ _BATTERY: Final = _ANY_BATTERY | _words(
 )
 _PARTS: Final = _words(
     "lv lo low aux charger chrg obc dcdc ldc apm motor mtr mcu inv inverter cabin ambient outside"
-    " air hvac cool cooling coolant inlet outlet heater compressor pump light gear"
+    " air hvac cool cooling coolant inlet outlet heater heating ptc compressor pump fan valve light"
+    " lamp gear relay contactor coil supply ignition module string"
 )
 """Other parts of a car, whose current, SoC and temperature are not the pack's."""
 _EXTREMES: Final = _words("max min cell cells")
@@ -64,11 +65,17 @@ _EXTREMES: Final = _words("max min cell cells")
 _LIMITS: Final = _EXTREMES | _words(
     "lim limit limits mx mn maximum minimum allow allowed req rq request requested target set"
     " setpoint soll dem demand cmd peak nom nominal nv rated rat avail available cap capacity err"
-    " error fault delta dev isol isolation pre precharge full remain remaining energy power est"
-    " pred draw"
+    " error fault warn warning alarm threshold flag valid status offset gain ref delta dev isol"
+    " isolation insulation leak leakage balance balancing pre precharge full remain remaining"
+    " energy power est pred draw"
 )
 """What is said of another value than the measured one."""
-_PIECES: Final = re.compile(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+|\d+")
+_NEUTRAL: Final = _words(
+    "total sum act actl actual ist real meas measured value val inst instant smooth filtered fltrd"
+    " avg average mean dc bus link hv main sensor shunt"
+)
+"""Words that a quantity may have whose message alone is the pack's."""
+_PIECES: Final = re.compile(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+")
 _RUNS: Final = re.compile(r"[a-z]+")
 _KNOWN: Final = re.compile(
     "|".join(
@@ -438,8 +445,12 @@ class _Names:
     @property
     def others(self) -> frozenset[str]:
         """Words of another value, or of another part, in the signal's name."""
-        extremes = _EXTREMES if self.role == "temperature" else frozenset[str]()
-        return self.own & ((_LIMITS | _PARTS) - extremes)
+        others = self.own & (_LIMITS | _PARTS)
+        if self.role == "temperature":
+            others -= _EXTREMES
+        elif self.role != "soc_reference" and not self.own & _BATTERY:
+            others |= self.own - _QUANTITIES[self.role][1] - _NEUTRAL
+        return others
 
     def score(self) -> float:
         """Return how well they fit, in matching words; 0 where they do not."""
