@@ -40,6 +40,8 @@ from cangauge.service.status import Monitor
 from cangauge.types import Estimate, Sample
 from synthetic import synthetic_log
 
+PATIENCE_S = 300.0
+"""Longest wait for what must happen [s]: only what never happens reaches it, beside any load."""
 COMMAND = "from cangauge.__main__ import main; main()"
 
 
@@ -145,12 +147,12 @@ class Service:
 
     def end(self) -> None:
         self._stop.set()
-        self._thread.join(10.0)
+        self._thread.join(PATIENCE_S)
         self._logged.__exit__()
         self.port.close()
         assert not self._thread.is_alive()
 
-    def join(self, seconds: float = 10.0) -> None:
+    def join(self, seconds: float = PATIENCE_S) -> None:
         self._thread.join(seconds)
         assert not self._thread.is_alive()
 
@@ -284,7 +286,7 @@ class Command:
         )
         self._stderr: list[str] = []
 
-    def wait_for(self, text: str, seconds: float = 60.0) -> None:
+    def wait_for(self, text: str, seconds: float = PATIENCE_S) -> None:
         """Wait for a text on stderr; a process that never writes it is killed."""
         assert self.process.stderr is not None
         deadline = threading.Timer(seconds, self.process.kill)
@@ -298,7 +300,7 @@ class Command:
             deadline.cancel()
         raise AssertionError(f"ended without {text!r}: {''.join(self._stderr)}")
 
-    def end(self, seconds: float = 60.0) -> Ended:
+    def end(self, seconds: float = PATIENCE_S) -> Ended:
         try:
             out, err = self.process.communicate(timeout=seconds)
         except subprocess.TimeoutExpired:
@@ -308,7 +310,7 @@ class Command:
         return Ended(self.process.returncode, out, "".join(self._stderr) + err)
 
 
-def run_to_end(*arguments: object, seconds: float = 60.0) -> Ended:
+def run_to_end(*arguments: object, seconds: float = PATIENCE_S) -> Ended:
     return Command(*arguments).end(seconds)
 
 
@@ -347,7 +349,7 @@ def refused(ended: Ended, *words: str) -> None:
         assert word in errors[0]
 
 
-def waits(condition: Callable[[], bool], seconds: float = 60.0) -> bool:
+def waits(condition: Callable[[], bool], seconds: float = PATIENCE_S) -> bool:
     """Return whether a condition becomes true in time."""
     until = time.monotonic() + seconds
     while not condition():

@@ -93,7 +93,7 @@ class RunningService:
         self._done.set()
         self.service.stop()
         for thread in self._threads:
-            thread.join(10.0)
+            thread.join()
 
     def _is_served(self) -> bool:
         try:

@@ -59,7 +59,7 @@ def browser() -> Iterator[Any]:
 def page(bench: Bench, browser: Any) -> Any:
     """The browser on a fresh page that shows values."""
     browser.get(bench.url)
-    assert waits(lambda: tile(browser, "Current") == f"{CURRENT_A:.2f} A", 20.0)
+    assert waits(lambda: tile(browser, "Current") == f"{CURRENT_A:.2f} A")
     return browser
 
 
@@ -141,7 +141,7 @@ def test_a_silent_bus_is_shown_within_a_second(bench: Bench, page: Any) -> None:
         assert first_s <= 1.0
     finally:
         bench.running.silent.clear()
-    assert waits(lambda: text(page, "troubles") == "", 10.0)
+    assert waits(lambda: text(page, "troubles") == "")
 
 
 @pytest.mark.parametrize(
@@ -166,7 +166,7 @@ def test_two_viewers_see_the_same(bench: Bench, page: Any) -> None:
     assert len(handles) == 2
     for handle in handles:
         page.switch_to.window(handle)
-        assert waits(lambda: tile(page, "Voltage") == f"{VOLTAGE_V:.2f} V", 20.0)
+        assert waits(lambda: tile(page, "Voltage") == f"{VOLTAGE_V:.2f} V")
     for handle in handles:
         page.switch_to.window(handle)
         if handle != first:
@@ -201,7 +201,7 @@ def test_no_error_and_no_request_leaves_the_machine(bench: Bench, page: Any) -> 
     """And reloading shows the page as at first, whatever a viewer has chosen."""
     assert [each for each in page.get_log("browser") if each["level"] == "SEVERE"] == []
     page.refresh()
-    assert waits(lambda: tile(page, "Voltage") == f"{VOLTAGE_V:.2f} V", 10.0)
+    assert waits(lambda: tile(page, "Voltage") == f"{VOLTAGE_V:.2f} V")
     found = [json.loads(each["message"])["message"] for each in page.get_log("performance")]
     asked = [
         each["params"].get("url") or each["params"]["request"]["url"]
@@ -220,7 +220,7 @@ def test_an_open_page_survives_a_restart(bench: Bench, page: Any) -> None:
     # Longer than the page draws a line over.
     assert is_shown(page, "The service does not answer for 3 s", 20.0)
     bench.start()
-    assert waits(lambda: text(page, "troubles") == "", 20.0)
+    assert waits(lambda: text(page, "troubles") == "")
     assert tile(page, "Current") == f"{CURRENT_A:.2f} A"
     assert waits(lambda: page.execute_script(TIMES_MS)[-1] > before[-1] + 500.0)
     after = page.execute_script(TIMES_MS)

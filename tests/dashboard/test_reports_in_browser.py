@@ -58,7 +58,7 @@ def page(reports: Path, browser: Any, request: pytest.FixtureRequest) -> Any:
     assert file.stat().st_size < MAX_PAGE_BYTES
     browser.get(file.as_uri())
     is_drawn = "return Bokeh.documents.length > 0 && Bokeh.documents.every(each => each.is_idle)"
-    assert waits(lambda: browser.execute_script(is_drawn), 20.0)
+    assert waits(lambda: browser.execute_script(is_drawn))
     return browser
 
 

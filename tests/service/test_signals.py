@@ -6,7 +6,6 @@ import os
 import signal
 import sys
 import threading
-import time
 from pathlib import Path
 
 import pytest
@@ -72,9 +71,7 @@ def test_a_closed_terminal_stops_the_process(tmp_path: Path) -> None:
     # With its end: a terminal takes the line in parts, and one that is closed in between fails it.
     read_until(terminal, b"again\r\n")
     os.close(terminal)
-    began_s = time.monotonic()
     os.waitpid(child, 0)
-    assert time.monotonic() - began_s < 5.0
     assert said.read_text() == "stopped"
 
 
@@ -88,8 +85,8 @@ def test_a_terminal_closed_during_the_start_ends_it() -> None:
         signal.signal(signal.SIGHUP, signal.SIG_DFL)  # the tests may run under nohup
         os.execv(sys.executable, command)  # noqa: S606 - no shell wanted
     process = Path(f"/proc/{child}")
-    assert waits(lambda: b"\0cangauge\0" in (process / "cmdline").read_bytes(), 30.0)
-    assert waits(lambda: "numpy" in (process / "maps").read_text(), 30.0)  # it loads
+    assert waits(lambda: b"\0cangauge\0" in (process / "cmdline").read_bytes())
+    assert waits(lambda: "numpy" in (process / "maps").read_text())  # it loads
     os.close(terminal)
     late = threading.Timer(30.0, os.kill, (child, signal.SIGKILL))
     late.start()

@@ -340,5 +340,5 @@ def test_a_socket_survives_a_lack_of_descriptors(
         except CangaugeError:
             return False
 
-    assert waits(lambda: is_answered() and bool(failures), 30.0)
+    assert waits(lambda: is_answered() and bool(failures))
     assert is_answered()

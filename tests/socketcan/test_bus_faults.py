@@ -340,7 +340,7 @@ def test_overflow_signals_and_a_bus_that_is_down(tmp_path: Path) -> None:
     time.sleep(0.5)
     began_s = time.monotonic()
     live.process.send_signal(signal.SIGTERM)
-    ended = live.end(10.0)
+    ended = live.end()
     assert time.monotonic() - began_s < 1.0
     assert ended.code == 0, ended.err
     result = ended.json

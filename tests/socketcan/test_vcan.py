@@ -198,7 +198,7 @@ def test_both_commands_until_the_bus_goes_down(tmp_path: Path) -> None:
     try:
         live.wait_for("bus.lost")
         live.process.terminate()
-        ended = live.end(20.0)
+        ended = live.end()
     finally:
         subprocess.run(["ip", "link", "set", "vcan0", "up"], check=True)
     assert ended.code == 0
