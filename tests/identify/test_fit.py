@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tracemalloc
 from dataclasses import replace
 from pathlib import Path
 
@@ -24,7 +25,7 @@ from cangauge.identify.least_squares import (
     solve,
     solve_scaled,
 )
-from cangauge.identify.rows import FitRows, fit_rows
+from cangauge.identify.rows import BLOCK, FitRows, fit_rows
 from cangauge.logs.log import Log
 from cangauge.model.coulomb_counting import (
     capacity_from_full_discharge,
@@ -98,10 +99,12 @@ def test_either_typical_cell_is_a_usual_one(curve_v: FloatArray, start_pct: floa
 
 def test_is_the_weighted_least_squares_of_all_rows() -> None:
     """The sums of the logs against one dense system with a column for the level of each log."""
-    rows = [fit_rows(log, CAPACITY_AH) for log in trips(3)]
+    long = synthetic_log(start_pct=92.0, end_pct=30.0, hours=6.0, model=CELLS)
+    rows = [fit_rows(log, CAPACITY_AH) for log in [*trips(2), long]]
+    assert len(rows[-1]) > BLOCK
     found = solve([log_sums(item, OXIDE) for item in rows], PACK)
     size, logs = found.coefficients.size, len(rows)
-    weight = np.concatenate([row_weights(r.soc_pct, r.seconds, OXIDE) for r in rows])
+    weight = np.concatenate([row_weights(r.soc_pct, r.row_s, OXIDE) for r in rows])
     columns = np.concatenate([row_features(r) @ found.select.T for r in rows])
     owner = np.repeat(np.arange(logs), [len(r) for r in rows])
     table = np.column_stack([columns, owner[:, None] == np.arange(logs)])
@@ -126,14 +129,13 @@ def test_is_the_weighted_least_squares_of_all_rows() -> None:
 
 def test_left_out_logs_widen_the_covariance() -> None:
     logs = trips(6)
-    rows = [fit_rows(log, CAPACITY_AH) for log in logs]
 
     def scale(levels_v: float) -> float:
         moved = [
-            replace(item, voltage_v=item.voltage_v + levels_v * (-1.0) ** k)
-            for k, item in enumerate(rows)
+            replace(log, voltage_v=log.voltage_v + levels_v * (-1.0) ** k)
+            for k, log in enumerate(logs)
         ]
-        sums = [log_sums(item, OXIDE) for item in moved]
+        sums = [log_sums(fit_rows(log, CAPACITY_AH), OXIDE) for log in moved]
         return solve_scaled(sums, PACK)[0].scale
 
     assert scale(0.0) == 1.0
@@ -144,12 +146,21 @@ def test_a_slow_log_weighs_by_its_time() -> None:
     log = synthetic_log(hours=2.0, start_pct=90.0, end_pct=40.0, model=CELLS, noise_v=0.2)
     fast = fit_rows(log, CAPACITY_AH)
     slow = fit_rows(log.rows(slice(None, None, 10)), CAPACITY_AH)
-    assert slow.seconds[0] == 10.0
+    assert slow.row_s == 10.0
 
     def total(rows: FitRows) -> float:
-        return float(row_weights(rows.soc_pct, rows.seconds, OXIDE).sum())
+        return float(row_weights(rows.soc_pct, rows.row_s, OXIDE).sum())
 
     assert total(slow) == pytest.approx(total(fast), rel=0.02)
+
+
+def test_a_long_log_needs_memory_for_few_numbers_a_row() -> None:
+    log = synthetic_log(start_pct=92.0, end_pct=30.0, hours=50.0, model=CELLS)
+    tracemalloc.start()
+    fit(log, capacity_ah=CAPACITY_AH)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 2000 * BLOCK + 80 * len(log)  # all columns of all rows would be 328 bytes a row
 
 
 def test_chemistry_is_given_guessed_or_assumed_and_said() -> None:

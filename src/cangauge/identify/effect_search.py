@@ -24,6 +24,7 @@ from cangauge.identify.least_squares import (
     LogSums,
     P,
     Solution,
+    features,
     load_features,
     log_sums,
     row_features,
@@ -200,8 +201,7 @@ class Linearized:
     Parameters
     ----------
     rows : FitRows
-        With the effects' signals and SoC; the voltage is that of the linear part plus the residual
-        once `with_voltage` has set it.
+        With the SoC that the effects give.
     features : array of shape (m, BASE)
         dU/d of knots, kt, resistances and their Arrhenius parts.
     columns : array of shape (m, e)
@@ -214,8 +214,8 @@ class Linearized:
     columns: FloatArray
     residual_v: FloatArray
 
-    def with_voltage(self, coefficients: FloatArray, amplitudes: FloatArray) -> Linearized:
-        """Return the same with the voltage that the linear equation has to explain.
+    def voltage_v(self, coefficients: FloatArray, amplitudes: FloatArray) -> FloatArray:
+        """Return the voltage that the linear equation has to explain [V], shape (m,).
 
         Parameters
         ----------
@@ -224,8 +224,7 @@ class Linearized:
         amplitudes : array of shape (e,)
             … of `columns`, about which the model is linearized.
         """
-        linear_v = self.features @ coefficients + self.columns @ amplitudes
-        return replace(self, rows=replace(self.rows, voltage_v=linear_v + self.residual_v))
+        return self.features @ coefficients + self.columns @ amplitudes + self.residual_v
 
 
 def linearize(
@@ -275,20 +274,15 @@ def linearize(
             raise ValueError("an effect of the voltage has a drive")
         return np.asarray(drive[rows.at] * effect.over_soc(soc, values, voltage))
 
-    at = replace(
-        rows,
-        soc_pct=soc,
-        currents_a=plain.currents_a,
-        dequantized_c=true.temperature_c[rows.at],
-    )
-    features, residual_v = row_features(at), plain.residual_v
+    base = features(soc, true.temperature_c[rows.at], plain.currents_a)
+    residual_v = plain.residual_v
     parts = None if amplitudes is None else _parts(chosen, amplitudes)
     columns = []
     for place, item in enumerate(chosen):
         effect = item.effect
         about = np.zeros(len(item.steps)) if parts is None else parts[place]
         if parts is not None and effect.adds_voltage:
-            features = features + _by_drop(effect, item.values(about), added_v, load, currents)
+            base = base + _by_drop(effect, item.values(about), added_v, load, currents)
         for number, step in enumerate(item.steps.tolist()):
             one = step * (np.arange(about.size) == number)
             if effect.adds_voltage:
@@ -300,7 +294,7 @@ def linearize(
                 change_v = plain.residual_v - predict(replace(model, effects=changed)).residual_v
             columns.append(change_v / step)
     table = np.column_stack(columns) if columns else np.empty((len(rows), 0))
-    return Linearized(at, features, table, residual_v)
+    return Linearized(replace(rows, soc_pct=soc), base, table, residual_v)
 
 
 def _by_drop(

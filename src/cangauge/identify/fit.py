@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import os
 from collections.abc import Iterable, Mapping, Sequence
+from functools import partial
 from typing import Any, Final, Literal, NamedTuple, get_args
 
 import numpy as np
@@ -307,9 +308,18 @@ class _Joint(NamedTuple):
     solution: Solution
     without: Sequence[Solution]
     rows: Sequence[FitRows]
-    columns: Sequence[FloatArray]
-    """Of the moments, on the rows of each log."""
+    columns: Sequence[FloatArray] = ()
+    voltage_v: Sequence[FloatArray] = ()
+    """With effects: columns of the moments, and what they explain, on the rows of each log."""
     effects: tuple[tuple[Effect, Values], ...] = ()
+
+    def error_v(self, number: int, other: Solution) -> FloatArray:
+        """Return the error of a log by a solution [V], shape (m,)."""
+        coefficients = other.select.T @ other.coefficients
+        if self.columns:
+            return self.voltage_v[number] - self.columns[number] @ coefficients
+        rows = self.rows[number]
+        return rows.voltage_v - rows.linear(row_features, coefficients)
 
 
 def _fit_knots(
@@ -325,7 +335,7 @@ def _fit_knots(
         fields = fields | {"published": published.fields(EPSILON, REFERENCE_C, DELAYS_S)}
     sums = [log_sums(item, pack.chemistry) for item in rows]
     solved = solve_scaled(sums, pack)
-    joint = _Joint(*solved, rows, [row_features(item) for item in rows])
+    joint = _Joint(*solved, rows)
     selected: Selected | None = None
     if effect_ids:
         search = Search(
@@ -338,8 +348,9 @@ def _fit_knots(
                 joint = with_effects
                 break
             search.refused += at_bound
-    others = [other.select.T @ other.coefficients for other in joint.without]
-    errors = _held_out(joint.rows, joint.columns, others)
+    errors = _held_out(
+        joint.rows, [joint.error_v(number, other) for number, other in enumerate(joint.without)]
+    )
     model = knots_file(
         joint.solution,
         fields | {"effects": effect_entries(joint.effects)},
@@ -362,15 +373,15 @@ def _with_effects(
     for _ in range(RELINEARIZED):
         coefficients = solution.select[:P, :BASE].T @ solution.coefficients[:P]
         about = [
-            linearize(extended, log, item, selected.chosen, amplitudes).with_voltage(
-                coefficients, np.zeros(std.size) if amplitudes is None else amplitudes
-            )
+            linearize(extended, log, item, selected.chosen, amplitudes)
             for log, item in zip(logs, plain.rows, strict=True)
         ]
+        at = np.zeros(std.size) if amplitudes is None else amplitudes
+        volts = [item.voltage_v(coefficients, at) for item in about]
         columns = [np.column_stack([item.features, item.columns]) for item in about]
         sums = [
-            log_sums(item.rows, pack.chemistry, table)
-            for item, table in zip(about, columns, strict=True)
+            log_sums(item.rows, pack.chemistry, table, volts_of_log)
+            for item, table, volts_of_log in zip(about, columns, volts, strict=True)
         ]
         solution, without = solve_scaled(sums, pack, std)
         solution = selected.clipped(solution)
@@ -379,7 +390,7 @@ def _with_effects(
         extended = ExtendedModel(
             knots_file(solution, fields).voltage_model(), pack.capacity_ah, effects
         )
-    return _Joint(solution, without, [item.rows for item in about], columns, effects)
+    return _Joint(solution, without, [item.rows for item in about], columns, volts, effects)
 
 
 def knots_file(
@@ -428,14 +439,14 @@ def _fit_published(
             value="published",
             cure="leave out --equation published, or give logs over more SoC",
         )
-    others = []
-    if len(rows) >= LOGS_AT_LEAST:
-        for number in range(len(rows)):
-            without = pooled(factors[:number] + factors[number + 1 :])
-            others.append(solve_published(without, epsilon).coefficients)
-    columns = [published_columns(item, len(delay_s), epsilon, t_ref_c) for item in rows]
-    errors = _held_out(rows, columns, others)
-    mean_v = float(np.concatenate([item.voltage_v for item in rows]).mean())
+    columns = partial(published_columns, delays=len(delay_s), epsilon=epsilon, t_ref_c=t_ref_c)
+    errors_v = []
+    for number, item in enumerate(rows if len(rows) >= LOGS_AT_LEAST else ()):
+        without = pooled(factors[:number] + factors[number + 1 :])
+        other = solve_published(without, epsilon).coefficients
+        errors_v.append(item.voltage_v - item.linear(columns, other))
+    errors = _held_out(rows, errors_v)
+    mean_v = sum(float(item.voltage_v.sum()) for item in rows) / sum(map(len, rows))
     judged = _judged(errors, rows, published.residual_v, mean_v)
     jacobian = published.jacobian(epsilon)
     model = Model(
@@ -451,26 +462,24 @@ def _fit_published(
     return _Fitted(model, published, errors, None)
 
 
-def _held_out(
-    rows: Sequence[FitRows], columns: Sequence[FloatArray], others: Sequence[FloatArray]
-) -> tuple[FloatArray, ...]:
+def _held_out(rows: Sequence[FitRows], errors_v: Sequence[FloatArray]) -> tuple[FloatArray, ...]:
     """Return the errors of each log by the other logs [V], NaN where these have no SoC.
 
     Parameters
     ----------
     rows : sequence of FitRows
-    columns : sequence of array of shape (m, k)
-        Of each log.
-    others : sequence of array of shape (k,)
-        Their coefficients by the other logs; none for too few logs.
+    errors_v : sequence of array of shape (m,)
+        Of each log by the others [V]; none for too few logs.
     """
-    errors = []
-    for number, coefficients in enumerate(others):
-        socs = [item.soc_pct for k, item in enumerate(rows) if k != number]
-        low, high = min(float(soc.min()) for soc in socs), max(float(soc.max()) for soc in socs)
-        soc, error_v = rows[number].soc_pct, rows[number].voltage_v - columns[number] @ coefficients
-        errors.append(np.where((soc >= low) & (soc <= high), error_v, np.nan))
-    return tuple(errors)
+    lows = [float(item.soc_pct.min()) for item in rows]
+    highs = [float(item.soc_pct.max()) for item in rows]
+    found = []
+    for number, error_v in enumerate(errors_v):
+        low = min(lows[:number] + lows[number + 1 :])
+        high = max(highs[:number] + highs[number + 1 :])
+        soc = rows[number].soc_pct
+        found.append(np.where((soc >= low) & (soc <= high), error_v, np.nan))
+    return tuple(found)
 
 
 def _judged(
@@ -499,13 +508,13 @@ def ranges_of(rows: Sequence[FitRows]) -> Ranges:
     """Return the ranges of SoC, temperature, current and voltage of some logs' rows."""
 
     def span(values: Iterable[FloatArray]) -> tuple[float, float]:
-        every = np.concatenate(list(values))
-        return float(every.min()), float(every.max())
+        ends = [(float(each.min()), float(each.max())) for each in values]
+        return min(low for low, _ in ends), max(high for _, high in ends)
 
     return Ranges(
         soc_pct=span(item.soc_pct for item in rows),
         temperature_c=span(item.temperature_c for item in rows),
-        current_a=span(item.currents_a[:, 0] for item in rows),
+        current_a=span(item.log.current_a[item.at] for item in rows),
         voltage_v=span(item.voltage_v for item in rows),
     )
 

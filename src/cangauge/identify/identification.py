@@ -17,6 +17,7 @@ from cangauge._typing import FloatArray
 from cangauge.identify.effect_search import Selected
 from cangauge.identify.published import PublishedFit
 from cangauge.identify.rows import (
+    BLOCK,
     SOC_SPAN_AT_LEAST_PCT,
     TEMPERATURE_SPAN_K,
     FitRows,
@@ -28,6 +29,7 @@ from cangauge.logs.log import Log
 from cangauge.model.coulomb_counting import difference_from_reference
 from cangauge.model.effects.base import Signals
 from cangauge.model.extended import ExtendedModel, newton_soc
+from cangauge.model.inverse import socs_from_ocv
 from cangauge.model.model_file import Model
 from cangauge.model.voltage_model import VoltageModel
 
@@ -71,12 +73,15 @@ def energy_balance(logs: Sequence[Log], slope_ohm: float) -> Energy:
     """
     driven = regenerated = square = 0.0
     for log in logs:
-        step_s = np.diff(log.time_s)
-        step_s[step_s > BRIDGE_S] = 0.0
-        power_w = log.voltage_v * log.current_a
-        driven += _integral(np.maximum(power_w, 0.0), step_s)
-        regenerated += _integral(np.maximum(-power_w, 0.0), step_s)
-        square += _integral(log.current_a**2, step_s)
+        for first in range(0, len(log) - 1, BLOCK):
+            part = slice(first, first + BLOCK + 1)  # with the first row of the next one
+            step_s = np.diff(log.time_s[part])
+            step_s[step_s > BRIDGE_S] = 0.0
+            current_a = log.current_a[part]
+            power_w = log.voltage_v[part] * current_a
+            driven += _integral(np.maximum(power_w, 0.0), step_s)
+            regenerated += _integral(np.maximum(-power_w, 0.0), step_s)
+            square += _integral(current_a**2, step_s)
     net = driven - regenerated
     heat = slope_ohm * square
     return Energy(
@@ -119,6 +124,11 @@ class LogFit:
 
 def evaluate(model: ExtendedModel, log: Log, rows: FitRows) -> LogFit:
     """Return the voltages and Newton inverse of a model on the rows of a log."""
+    if not model.effects:
+        columns = np.empty((3, len(rows)))
+        for part in rows.parts():
+            columns[:, part] = _predicted(model.model, rows.part(part))
+        return LogFit(rows, *columns)
     first = log.first_soc()
     if first is None:
         raise ValueError("a log of a fit has a start")
@@ -131,6 +141,15 @@ def evaluate(model: ExtendedModel, log: Log, rows: FitRows) -> LogFit:
         voltage_model_v=prediction.voltage_v,
         soc_newton_pct=newton_soc(model, prediction),
     )
+
+
+def _predicted(model: VoltageModel, rows: FitRows) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return pseudo-OCV and voltage [V], and the Newton inverse [%], without effects."""
+    currents_a = rows.currents_a[:, : len(model.resistance_ohm)]  # the published one: delayed only
+    load_v = model.load_columns(rows.temperature_c, currents_a) @ model.load_coefficients
+    voltage_v = model.pseudo_ocv(rows.soc_pct) + load_v
+    newton_pct = socs_from_ocv(model, rows.voltage_v - load_v)
+    return model.pseudo_ocv(rows.soc_pct, rows.temperature_c), voltage_v, newton_pct
 
 
 def slope_resistances(
@@ -147,15 +166,18 @@ def slope_resistances(
     resistance_ohm : sequence of float
         Rm of the first currents of the rows [Ω], negative.
     """
-    table = np.concatenate([
-        np.column_stack([
-            item.rows.currents_a[:, : len(resistance_ohm)],
-            item.rows.voltage_v - item.pseudo_ocv_v,
-        ])
-        for item in fits
-    ])  # fmt: skip
-    away = table - table.mean(axis=0)
-    slopes = away[:, 0] @ away / max(float(away[:, 0] @ away[:, 0]), 1e-300)
+    total: Any = 0.0
+    product: Any = 0.0
+    for item in fits:
+        for part in item.rows.parts():
+            block = item.rows.part(part)
+            drop_v = block.voltage_v - item.pseudo_ocv_v[part]
+            table = np.column_stack([block.currents_a[:, : len(resistance_ohm)], drop_v])
+            total = total + table.sum(axis=0)
+            product = product + table[:, 0] @ table
+    rows = sum(len(item.rows) for item in fits)
+    covariance = product / rows - total[0] / rows * (total / rows)
+    slopes = covariance / max(float(covariance[0]), 1e-300)
     return -float(slopes[-1]), -float(slopes[:-1] @ np.array(resistance_ohm))
 
 

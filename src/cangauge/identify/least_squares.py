@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 
@@ -96,25 +96,47 @@ def load_features(temperature_c: FloatArray, currents_a: FloatArray) -> FloatArr
     return np.concatenate([above, currents_a, colder * currents_a], axis=1)
 
 
-def row_weights(soc_pct: FloatArray, seconds: FloatArray, chemistry: Chemistry) -> FloatArray:
-    """Return the weight of each row of a log [s], shape (n,); 0 far outside 0–100 %."""
-    percent = np.clip(np.floor(soc_pct).astype(np.intp) + 1, 0, 102)
-    counted = np.minimum(seconds, SECONDS_PER_DATUM)
-    full = np.bincount(percent, counted, minlength=103)[percent]
+def row_weights(soc_pct: FloatArray, row_s: float, chemistry: Chemistry) -> FloatArray:
+    """Return the weight of each row of a log [s], shape (n,); 0 far outside 0–100 %.
+
+    Parameters
+    ----------
+    soc_pct : array of shape (n,)
+        [%].
+    row_s : float
+        Time that a row stands for [s].
+    chemistry : Chemistry
+    """
+    inside = (soc_pct > -1.0) & (soc_pct < 101.0)
+    percent = np.clip(np.floor(soc_pct) + 1.0, 0.0, 102.0).astype(np.uint8)
+    counted_s = min(row_s, SECONDS_PER_DATUM)
+    full_s = counted_s * np.bincount(percent, minlength=103)
+    share = np.minimum(1.0, SECONDS_PER_PERCENT / np.maximum(full_s, counted_s))
     curve = chemistry.curve_v / np.interp(50.0, KNOTS_PCT, chemistry.curve_v)
-    slope = np.interp(soc_pct, KNOTS_PCT, np.gradient(curve, KNOTS_PCT))
-    steep = 1.0 + (chemistry.soc_std_pct * slope / RESIDUAL_STD) ** 2
-    weight = counted * np.minimum(1.0, SECONDS_PER_PERCENT / full) / steep
-    return np.where((soc_pct > -1.0) & (soc_pct < 101.0), weight, 0.0)
+    steep = np.interp(soc_pct, KNOTS_PCT, np.gradient(curve, KNOTS_PCT))
+    steep *= chemistry.soc_std_pct / RESIDUAL_STD
+    steep *= steep
+    steep += 1.0
+    return np.asarray(counted_s * share[percent] * inside / steep)
+
+
+def features(soc_pct: FloatArray, temperature_c: FloatArray, currents_a: FloatArray) -> FloatArray:
+    """Return the columns of the moments before those of effects, shape (m, BASE)."""
+    loads = load_features(temperature_c, currents_a)
+    return np.concatenate([hermite_basis(soc_pct), loads], axis=1)
 
 
 def row_features(rows: FitRows) -> FloatArray:
-    """Return the columns of the moments before those of effects, shape (m, BASE)."""
-    loads = load_features(rows.dequantized_c, rows.currents_a)
-    return np.concatenate([hermite_basis(rows.soc_pct), loads], axis=1)
+    """Return `features` of the rows of a fit, shape (m, BASE)."""
+    return features(rows.soc_pct, rows.dequantized_c, rows.currents_a)
 
 
-def log_sums(rows: FitRows, chemistry: Chemistry, columns: FloatArray | None = None) -> LogSums:
+def log_sums(
+    rows: FitRows,
+    chemistry: Chemistry,
+    columns: FloatArray | None = None,
+    voltage_v: FloatArray | None = None,
+) -> LogSums:
     """Return the sums of a log.
 
     Parameters
@@ -123,13 +145,15 @@ def log_sums(rows: FitRows, chemistry: Chemistry, columns: FloatArray | None = N
     chemistry : Chemistry
     columns : array of shape (m, q − 2), optional
         Those of the moments before 1 and voltage; `row_features`, without effects, by default.
+    voltage_v : array of shape (m,), optional
+        By default the measured voltage [V].
 
     Raises
     ------
     InputError
         If every row lies so far outside 0–100 % that it has no weight.
     """
-    weight = row_weights(rows.soc_pct, rows.seconds, chemistry)
+    weight = row_weights(rows.soc_pct, rows.row_s, chemistry)
     total = float(weight.sum())
     if not total:
         low, high = float(rows.soc_pct.min()), float(rows.soc_pct.max())
@@ -139,11 +163,14 @@ def log_sums(rows: FitRows, chemistry: Chemistry, columns: FloatArray | None = N
             field="soc_pct",
             cure="check the SoC at the start (soc_pct, --initial-soc), or leave this log out",
         )
-    if columns is None:
-        columns = row_features(rows)
-    table = np.column_stack([columns, np.ones(len(rows)), rows.voltage_v])
-    mean_soc = float(weight @ rows.soc_pct) / total
-    return LogSums(table.T @ (table * weight[:, None]), total, mean_soc)
+    moments: Any = 0.0
+    for part in rows.parts():
+        block = rows.part(part)
+        left = row_features(block) if columns is None else columns[part]
+        volts = block.voltage_v if voltage_v is None else voltage_v[part]
+        table = np.column_stack([left, np.ones(len(block)), volts])
+        moments = moments + table.T @ (table * weight[part, None])
+    return LogSums(moments, total, float(weight @ rows.soc_pct) / total)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -60,11 +60,15 @@ def published_columns(rows: FitRows, delays: int, epsilon: float, t_ref_c: float
 
 def factor_of(rows: FitRows, delays: int, epsilon: float, t_ref_c: float) -> Factor:
     """Return the factor of a log's rows, of which the first currents are delayed ones."""
-    columns = published_columns(rows, delays, epsilon, t_ref_c)
-    table = np.column_stack([columns, rows.voltage_v])
-    root = np.linalg.qr(np.vstack([table, np.zeros((table.shape[1], table.shape[1]))])).R
+    size = len(BASIS_NAMES) + 1 + delays + 1
+    root = np.zeros((size, size))
+    for part in rows.parts():
+        block = rows.part(part)
+        columns = published_columns(block, delays, epsilon, t_ref_c)
+        table = np.column_stack([columns, block.voltage_v])
+        root = np.linalg.qr(np.vstack([root, table])).R
     range_pct = float(rows.soc_pct.min()), float(rows.soc_pct.max())
-    return Factor(root, len(rows), float(np.median(rows.seconds)), range_pct)
+    return Factor(root, len(rows), rows.row_s, range_pct)
 
 
 def pooled(factors: Sequence[Factor]) -> Factor:

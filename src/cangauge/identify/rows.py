@@ -13,7 +13,7 @@ Their quantized temperature is interpolated between its steps, which looks ahead
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -24,7 +24,7 @@ from cangauge.errors import InputError
 from cangauge.logs.gaps import usual_gap_s, usual_step_s
 from cangauge.logs.log import Log
 from cangauge.model.coulomb_counting import counted_soc_pct
-from cangauge.model.delay_line import filled_at
+from cangauge.model.delay_line import delayed_currents, filled_at
 from cangauge.model.prior import DELAYS_S, LOW_PASS_S
 from cangauge.model.voltage_model import BASIS_NAMES, past_currents
 from cangauge.settings import GAP_S
@@ -59,31 +59,92 @@ STEPPED_SHARE = 0.5
 """A temperature that changes at this fraction of the rows or more is not quantized [-]."""
 
 
+BLOCK = 16_384
+"""Rows of a block: its 41 columns have 5 MB, and stay in the cache of a core."""
+
+
 @dataclass(frozen=True, eq=False)
 class FitRows:
-    """Rows of one log, shape (m,) each; currents (m, M)."""
+    """Rows of one log, m of them. What is computed from the log needs memory only while it is used.
 
-    name: str
+    Parameters
+    ----------
+    log : Log
+    at : array of int, shape (m,)
+        Index of the rows in the log.
+    row_s : float
+        Time that each row stands for [s].
+    soc_pct : array of shape (m,)
+        Counted SoC [%].
+    dequantized_c : array of shape (m,)
+        Temperature, interpolated between the steps of the reports (`dequantize`) [°C].
+    low_passed_a : array of shape (m, number of low passes)
+        Low-passed currents [A].
+    delay_s : tuple of float
+        Delays of the current [s].
+    removed : dict
+        Number of rows removed by each rule.
+    """
+
+    log: Log
     at: NDArray[np.intp]
-    """Index of the rows in the log."""
-    time_s: FloatArray
-    seconds: FloatArray
-    """Time that each row stands for [s]."""
-    voltage_v: FloatArray
-    temperature_c: FloatArray
-    """As reported [°C]: the input of an estimator."""
-    dequantized_c: FloatArray
-    """Interpolated between the steps of the reports [°C] (`dequantize`)."""
+    row_s: float
     soc_pct: FloatArray
-    """Counted SoC [%]."""
-    currents_a: FloatArray
-    """I(t − dj), then the low-passed currents [A]; positive = discharge."""
+    dequantized_c: FloatArray
+    low_passed_a: FloatArray
+    delay_s: tuple[float, ...]
     removed: dict[str, int]
-    """Number of rows removed by each rule."""
 
     def __len__(self) -> int:
         """Return the number of rows."""
-        return int(self.time_s.size)
+        return int(self.at.size)
+
+    @property
+    def name(self) -> str:
+        """Name of the log."""
+        return self.log.name
+
+    @property
+    def time_s(self) -> FloatArray:
+        """Time [s], shape (m,)."""
+        return self.log.time_s[self.at]
+
+    @property
+    def voltage_v(self) -> FloatArray:
+        """Voltage [V], shape (m,)."""
+        return self.log.voltage_v[self.at]
+
+    @property
+    def temperature_c(self) -> FloatArray:
+        """Temperature as reported: the input of an estimator [°C], shape (m,)."""
+        return self.log.temperature_c[self.at]
+
+    @property
+    def currents_a(self) -> FloatArray:
+        """I(t − dj), then the low-passed currents; positive = discharge [A], shape (m, M)."""
+        log = self.log
+        delayed = delayed_currents(log.time_s, log.current_a, self.delay_s, self.time_s)
+        return np.concatenate([delayed, self.low_passed_a], axis=1)
+
+    def parts(self) -> list[slice]:
+        """Return the slices of all rows in blocks."""
+        return [slice(first, first + BLOCK) for first in range(0, len(self), BLOCK)]
+
+    def part(self, rows: slice) -> FitRows:
+        """Return some of the rows."""
+        return replace(
+            self,
+            at=self.at[rows],
+            soc_pct=self.soc_pct[rows],
+            dequantized_c=self.dequantized_c[rows],
+            low_passed_a=self.low_passed_a[rows],
+        )
+
+    def linear(
+        self, columns: Callable[[FitRows], FloatArray], coefficients: FloatArray
+    ) -> FloatArray:
+        """Return columns of the rows times coefficients, shape (m,), in blocks."""
+        return np.concatenate([columns(self.part(rows)) @ coefficients for rows in self.parts()])
 
 
 def fit_rows(
@@ -105,7 +166,7 @@ def fit_rows(
     rate_hz : float
         Rate to which the log is decimated [Hz].
     delay_s, low_pass_s : sequence of float
-        Columns of `currents_a` [s].
+        Delays and time constants of `currents_a` [s].
 
     Raises
     ------
@@ -132,17 +193,14 @@ def fit_rows(
             source=source,
             cure="give a longer log",
         )
-    time_s = log.time_s
     return FitRows(
-        name=log.name,
+        log=log,
         at=at,
-        time_s=time_s[at],
-        seconds=np.full(at.size, usual_step_s(time_s[at])),
-        voltage_v=log.voltage_v[at],
-        temperature_c=log.temperature_c[at],
-        dequantized_c=dequantize(log).temperature_c[at],
+        row_s=usual_step_s(log.time_s[at]),
         soc_pct=soc[at],
-        currents_a=past_currents(time_s, log.current_a, at, delay_s, low_pass_s),
+        dequantized_c=dequantize(log).temperature_c[at],
+        low_passed_a=past_currents(log.time_s, log.current_a, at, (), low_pass_s),
+        delay_s=tuple(delay_s),
         removed=removed,
     )
 

@@ -255,7 +255,7 @@ class _JointFit:
         def misfit(start_pct: float) -> float:
             at = self._at(number, start_pct)
             error = open_v - curve.values(at.soc_pct)
-            weight = row_weights(at.soc_pct, at.seconds, self._chemistry) + 1e-9
+            weight = row_weights(at.soc_pct, at.row_s, self._chemistry) + 1e-9
             mean = float(weight @ error / weight.sum())
             square = float(weight @ (error - mean) ** 2 / weight.sum())
             return square / (solution.residual_v**2 + 1e-12) + mean**2 / level2

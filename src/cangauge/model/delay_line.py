@@ -33,6 +33,12 @@ def delayed_currents(
     """
     at = np.asarray(at_s, dtype=np.float64)
     delayed = np.empty((at.size, len(delay_s)))
+    if not delayed.size:
+        return delayed
+    # np.interp copies the whole log, however few times are asked for.
+    first, last = np.searchsorted(time_s, [at.min() - max(delay_s), at.max()])
+    near = slice(max(first - 1, 0), last + 1)
+    time_s, current_a = time_s[near], current_a[near]
     for column, delay in zip(delayed.T, delay_s, strict=True):
         column[:] = np.interp(at - delay, time_s, current_a)
     return delayed
