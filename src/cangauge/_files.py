@@ -29,6 +29,7 @@ MIB: Final = 1 << 20
 MAX_LOG_BYTES: Final = 1024 * MIB
 """A log, unpacked: it is held in memory."""
 HEAD_BYTES: Final = 64 * 1024
+_PIECE_BYTES: Final = 64 * MIB
 _HEAD_LINES: Final = 160
 
 # --- Reading
@@ -101,18 +102,20 @@ def read_beginning(file: io.BufferedReader, size: int) -> bytes:
 
 def read_all(file: BinaryIO, path: str | PathLike[str], limit: int, what: str) -> bytes:
     """Return the rest of an open file; raise InputError if it has more than `limit` bytes."""
-    pieces, size_read = list[bytes](), 0
-    while size_read <= limit and (piece := file.read(MIB)):
-        pieces.append(piece)
-        size_read += len(piece)
-    if size_read > limit:
+    data = file.read(min(limit + 1, _PIECE_BYTES))
+    if len(data) == _PIECE_BYTES:  # else it is whole, and is not copied
+        pieces = [data]
+        while sum(map(len, pieces)) <= limit and (piece := file.read(_PIECE_BYTES)):
+            pieces.append(piece)
+        data = b"".join(pieces)
+    if len(data) > limit:
         size = f"{limit // MIB} MB" if limit >= MIB else f"{limit // 1024} kB"
         raise InputError(
             f"larger than the {size} that {what} may have",
             source=path,
             cure="check that this is the right file, or split it",
         )
-    return b"".join(pieces)
+    return data
 
 
 def read_bounded(path: str | PathLike[str], limit: int, what: str) -> bytes:
@@ -134,6 +137,8 @@ def as_utf8(data: bytes) -> bytes:
         zeros = halves.count(0)
         if 2 * zeros > len(halves) and data[:HEAD_BYTES].count(0) == zeros:
             return data.decode(codec, errors="replace").encode()
+    if data.isascii():
+        return data
     try:
         data.decode("utf-8")
     except UnicodeDecodeError:
