@@ -66,15 +66,19 @@ def wrapped_current(current_a: FloatArray, voltage_v: FloatArray) -> WrappedCurr
         return None
     is_high = readings > 0.5 * largest
     range_a = float(np.ptp(np.where(is_high, readings - largest, readings)))
-    fields = (
-        (bits, step_a)
+    fields = [
+        (2.0**bits * step_a, step_a, bits)
         for bits, step_a in _FIELDS
         if 0.0 <= 2.0**bits * step_a * (1.0 + 1e-9) - largest <= _HUGS * range_a
-    )
-    bits, step_a = next(fields, (0, 0.0))
-    if not bits:
+    ]
+    if not fields:
         return None
-    wraps_at_a = 2.0**bits * step_a
+    wraps_at_a, _, _ = min(fields)
+    _, step_a, bits = max(  # the coarsest step that the readings show
+        (_is_multiple(readings, step_a), step_a, bits)
+        for top_a, step_a, bits in fields
+        if top_a == wraps_at_a
+    )
     if passes_zero:
         unwrapped = np.where(is_high, readings - wraps_at_a, readings)
         moved_v = np.diff(voltage_v)
@@ -83,6 +87,12 @@ def wrapped_current(current_a: FloatArray, voltage_v: FloatArray) -> WrappedCurr
         is_wrapped = bits in _USUAL_BITS
     reading_a = -largest if is_negative else largest
     return WrappedCurrent(wraps_at_a, bits, step_a, reading_a) if is_wrapped else None
+
+
+def _is_multiple(values: FloatArray, step: float) -> bool:
+    """Return whether all values are multiples of a step."""
+    places = values / step
+    return bool(np.all(np.abs(places - np.rint(places)) < 0.01))
 
 
 def _explained(steps_a: FloatArray, moved_v: FloatArray) -> float:

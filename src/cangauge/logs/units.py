@@ -305,8 +305,8 @@ def _refuse_wrapped(current: FloatArray, voltage: FloatArray, source: object, la
     found = wrapped_current(current, voltage)
     if found is not None:
         field = f"{found.bits} bits unsigned of {found.step_a:g} A"
-        problem = f"the current wraps at {found.wraps_at_a:.7g} A ({field}): {WRAPPED}"
-        cure = f"read it as signed: {found.wraps_at_a:.7g} A less, from half of that on"
+        problem = f"the current wraps at {found.wraps_at_a:.10g} A ({field}): {WRAPPED}"
+        cure = f"read it as signed: {found.wraps_at_a:.10g} A less, from half of that on"
         value = found.reading_a
         raise InputError(problem, source=str(source), field=label, value=value, cure=cure)
 
