@@ -227,3 +227,14 @@ def test_samples_are_acknowledged_at_a_fixed_interval() -> None:
     assert told == list(range(1, 40, 4))
     # The next beat acknowledges the remaining samples; later beats have none.
     assert [len(publisher.beat(estimate(), 39, 0.0)) for _ in range(4)] == [2, 1, 1, 1]
+
+
+def test_no_pack_has_a_negative_capacity_resistance_or_energy() -> None:
+    wrong = PackReport(Health(-1885.0, 3.0, -0.11, 0.02, 0.5, 0.1), Power(10.0, energy_wh=-463e3))
+    shown = wrong.to_dict()
+    assert shown["health"]["capacity_ah"] is None
+    assert shown["health"]["capacity_std_ah"] is None
+    assert shown["health"]["resistance_ratio"] is None
+    assert shown["health"]["offset_a"] == 0.5
+    assert shown["power"]["energy_wh"] is None
+    assert shown["power"]["discharge_a"] == 10.0

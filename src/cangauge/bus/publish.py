@@ -136,11 +136,22 @@ class PackReport(NamedTuple):
         if cells is not None and cells["weakest"] < 0:
             cells["weakest"] = None
         return {
-            "health": plain(self.health._asdict()),
-            "power": plain(self.power._asdict()),
+            "health": plain(_possible(self.health._asdict(), _OF_HEALTH)),
+            "power": plain(_possible(self.power._asdict(), _OF_POWER)),
             "cells": cells and plain(cells),
             "notices": self.notices,
         }
+
+
+_OF_HEALTH: Final = {"capacity_ah": "capacity_std_ah", "resistance_ratio": "resistance_std"}
+_OF_POWER: Final = {"energy_wh": "energy_std_wh"}
+"""Values that are never negative, with their standard deviations."""
+
+
+def _possible(values: dict[str, float], never_negative: Mapping[str, str]) -> dict[str, float]:
+    """Return values, NaN for those that no pack can have: the current contradicts the voltage."""
+    impossible = {name: std for name, std in never_negative.items() if values[name] < 0.0}
+    return values | dict.fromkeys([*impossible, *impossible.values()], math.nan)
 
 
 NO_REPORT: Final[Mapping[str, Any]] = MappingProxyType(
