@@ -33,7 +33,7 @@ def inspect_page(found: LogInspection, log: Log) -> Page:
         tiles.append(Tile("The log's own SoC", ends, f"in {100.0 * soc.coverage:.1f} % of rows"))
     return Page(
         title=f"Inspection of {found.name}",
-        lead=inspect_verdict(found),
+        lead=f"{found.answer[0].upper()}{found.answer[1:]}.",
         subtitle=f"{duration(timing.duration_s)}, {found.rows:,} rows, {rate} ({regular}).",
         tiles=tiles,
         sections={
@@ -65,22 +65,3 @@ def channel_figures(log: Log) -> list[Figure]:
         soc = [(at, log.soc_pct)]
         figures.append(time.channel("state of charge", "%", soc, GREEN, "The log's own."))
     return figures
-
-
-def inspect_verdict(found: LogInspection) -> str:
-    """Return what the log can identify and what it cannot, with the first reason."""
-    names: dict[str, list[str]] = {"yes": [], "partly": [], "no": []}
-    for ability in found.abilities:
-        names[ability.verdict].append(ability.topic)
-    parts = [
-        words + ", ".join(names[verdict])
-        for verdict, words in (("yes", ""), ("partly", "in part "), ("no", "not "))
-        if names[verdict]
-    ]
-    text = "This log can identify " + "; ".join(parts)
-    if names["no"] and not names["yes"] and not names["partly"]:
-        text = f"This log cannot identify {', '.join(names['no'])}"
-    lacking = next((ability for ability in found.abilities if ability.verdict == "no"), None)
-    if lacking is None:
-        return f"{text}."
-    return f"{text}. {lacking.topic.capitalize()}: {lacking.text.rstrip('.')}."
