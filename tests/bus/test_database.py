@@ -334,3 +334,22 @@ def test_nested_multiplexers_take_bounded_time(tmp_path: Path, pages: int) -> No
         with pytest.raises(InputError, match="multiplexers select more than"):
             load_dbc(path)
     assert time.process_time() - began_s < 2.0
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        '"' + '\\"' * 400_000,
+        '"' + '\\"' * 400_000 + "\\",
+        "VAL_ 1 A 1 " * 90_000,
+        "SG_MUL_VAL_ 1 A B 1-2 " * 60_000,
+    ],
+    ids=["quotes", "backslash", "values", "ranges"],
+)
+def test_a_damaged_text_is_refused_in_linear_time(tmp_path: Path, text: str) -> None:
+    path = tmp_path / "x.dbc"
+    path.write_text(f"{PACK}{text}")
+    began_s = time.process_time()
+    with pytest.raises(InputError):
+        load_dbc(path)
+    assert time.process_time() - began_s < 4.0

@@ -26,7 +26,8 @@ _EXTENDED_FLAG: Final = 1 << 31
 _UNASSIGNED: Final = "VECTOR__INDEPENDENT_SIG_MSG"
 """Message of editors for signals that are in no message; cantools leaves it out."""
 
-_QUOTED: Final = re.compile(r'"(?:[^"\\]|\\.)*+"', re.DOTALL)
+# What is not closed goes on to the end: else each beginning would be searched to the end.
+_QUOTED: Final = re.compile(r'"(?:[^"\\]|\\.)*+(?:"|\\?\Z)', re.DOTALL)
 _LENGTH: Final = re.compile(r"\bBO_\s++\d++\s++\w++\s*+:\s*+\+?(\d++)")
 _BITS: Final = re.compile(r"(?<!\d)(\d++)\s*+\|\s*+\+?(\d++)\s*+@")
 """Start bit and length of a signal."""
@@ -37,7 +38,7 @@ _DEFINED: Final = re.compile(
     r"\bBO_\s++(?P<id>\d++)\s++(?P<message>\w++)\s*+:"
     r"|\bSG_\s++(?P<signal>\w++)\s*+(?P<mark>m\d++M?|M)?\s*+:"
 )
-_ABOUT: Final = re.compile(r"\b(VAL_|SIG_VALTYPE_)\s++(\d++)\s++(\w++)[^;]*+;")
+_ABOUT: Final = re.compile(r"\b(VAL_|SIG_VALTYPE_)\s++(\d++)\s++(\w++)[^;]*+(;|\Z)")
 _SELECTED: Final = re.compile(r"\bSG_MUL_VAL_\s++(\d++)\s++(\w++)\s++(\w++)\s++([^;]*+)")
 _RANGE: Final = re.compile(r"(?<!\d)(\d++)\s*+[-+](\d++)")
 
@@ -59,9 +60,9 @@ def prepared(text: str, path: Path) -> tuple[str, list[str]]:
     messages = _outline(bare)
     gone = []
     for match in _ABOUT.finditer(bare):
-        kind, number, name = match.groups()
+        kind, number, name, end = match.groups()
         if name not in messages.get(number, {}):
-            gone.append(match)
+            gone += [match] if end else []
         elif kind == "VAL_":
             messages[number][name].named = match[0].count('"') // 2
     _refuse_nesting(messages, bare, path)
