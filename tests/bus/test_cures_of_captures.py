@@ -74,14 +74,36 @@ def test_a_current_read_unsigned_is_named_with_its_cure(tmp_path: Path, bits: in
     assert log.current_a == pytest.approx(amps, abs=0.051)
 
 
-@pytest.mark.parametrize("offset", [0.0, 100.0])
-def test_a_current_that_is_unsigned_is_left_so(tmp_path: Path, offset: float) -> None:
-    current_a = np.abs(DRIVE_A) + offset
-    current_a[:3] = 6553.5  # not available: three frames of one code
-    write_drive(tmp_path, 16, current_a)
+def test_a_current_of_a_bit_less_than_its_signal_is_named(tmp_path: Path) -> None:
+    write_drive(tmp_path, 15, DRIVE_A)
+    dbc = (tmp_path / "a.dbc").read_text()
+    (tmp_path / "a.dbc").write_text(dbc.replace("0|15@1+", "0|16@1+"))
+    (tmp_path / "a.toml").write_text(
+        'dbc = "a.dbc"\ncurrent = "PackCurrent"\nvoltage = "PackVoltage"\n'
+    )
+    car = Vehicle.load(map=tmp_path / "a.toml", temperature_c=20.0)
+    with pytest.raises(InputError, match=r"just below 3276\.8 A.*a signed signal of 15 bits"):
+        capture_to_log(tmp_path / "a.log", car)
+
+
+PULSES_A = np.where(np.arange(600) % 40 < 20, 5.0, 350.0) + np.arange(600) % 7
+
+
+@pytest.mark.parametrize(
+    ("bits", "current_a"),
+    [(16, np.abs(DRIVE_A)), (16, np.abs(DRIVE_A) + 100.0), (12, PULSES_A)],
+    ids=["from zero", "above zero", "pulses"],
+)
+def test_a_current_that_is_unsigned_is_left_so(
+    tmp_path: Path, bits: int, current_a: np.ndarray
+) -> None:
+    code = (1 << bits) - 1
+    current_a = current_a.copy()
+    current_a[:3] = 0.1 * code  # not available: three frames of one code
+    write_drive(tmp_path, bits, current_a)
     (tmp_path / "a.toml").write_text(
         'dbc = "a.dbc"\nvoltage = "PackVoltage"\ntemperature.fixed_c = 20\n'
-        '[current]\nsignal = "PackCurrent"\nnot_available = [65535]\n'
+        f'[current]\nsignal = "PackCurrent"\nnot_available = [{code}]\n'
     )
     log = capture_to_log(tmp_path / "a.log", Vehicle.load(map=tmp_path / "a.toml"))
     assert log.current_a == pytest.approx(current_a[3:], abs=0.051)

@@ -224,21 +224,26 @@ class SignalCodec:
         raw: FloatArray = np.rint(((values - self.shift) / self.gain - self.offset) / self.factor)
         return raw
 
-    def is_wrapped(self, values: FloatArray) -> bool:
-        """Return whether values read as unsigned numbers are those of a signed signal.
+    def wrapped_bits(self, values: FloatArray) -> int | None:
+        """Return the bits of a signed number that these values are, if they are read unsigned.
 
-        They lie at both ends of its range, where negative ones wrap, and none in its middle half.
+        They lie at both ends of its range, where the number wraps at zero, and none in its middle
+        half. It may have a bit less than the signal.
         """
         if self.float_format or self.is_signed or self.offset:
-            return False
+            return None
         raw = self.raw_numbers(values[np.isfinite(values)])
-        quarter = 1 << self.field.width >> 2
-        negative = np.unique(raw[raw >= 3 * quarter])
-        return (
-            len(negative) >= _FEW_CODES
-            and bool((raw < quarter).any())
-            and bool(((raw < quarter) | (raw >= 3 * quarter)).all())
-        )
+        for bits in (self.field.width, self.field.width - 1):
+            top, quarter = 1 << bits, 1 << bits >> 2
+            negative = np.unique(raw[raw >= top - quarter])
+            is_apart = ((raw < quarter) | (raw >= top - quarter)).all() and (raw < quarter).any()
+            if (
+                is_apart
+                and len(negative) >= _FEW_CODES
+                and negative[-1] < top <= negative[-1] + top / 32
+            ):
+                return bits
+        return None
 
     @property
     def half_step(self) -> float:

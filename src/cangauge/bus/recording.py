@@ -316,12 +316,17 @@ def _without_current(
 def _refuse_wrapped(current_a: FloatArray, vehicle: Vehicle, path: str | PathLike[str]) -> None:
     """Raise InputError for a current whose negative numbers are read as large ones."""
     codec = vehicle.current.codec
-    if codec.is_wrapped(current_a):
-        top_a = (1 << codec.field.width) * abs(codec.gain * codec.factor)
+    bits = codec.wrapped_bits(current_a)
+    if bits is not None:
+        top_a = (1 << bits) * abs(codec.gain * codec.factor)
         wrapped = int((2.0 * np.abs(current_a) > top_a).sum())
-        problem = f"{wrapped} of {current_a.size} currents lie just below {top_a:.6g} A, where"
-        problem += f" negative ones of {codec.field.width} bits are that are read unsigned"
+        problem = (
+            f"read unsigned: {wrapped} of {current_a.size} values lie just below {top_a:.6g} A,"
+        )
+        problem += f" as negative ones of {bits} bits do"
         cure = "state signed = true under [current] of the map file"
+        if bits < codec.field.width:
+            cure = f"make it a signed signal of {bits} bits in the DBC"
         raise InputError(problem, source=path, field=codec.name, cure=cure)
 
 

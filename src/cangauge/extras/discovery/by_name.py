@@ -317,7 +317,7 @@ class _NamedFrames:
         bits = codec.field.width
         nothing = NamedSignal(message.name, signal.name, codec.unit, bits, (low, high))
         decoded = self._decoded(codec, message.length)
-        is_wrapped = codec.is_wrapped(decoded)
+        is_wrapped = codec.wrapped_bits(decoded) == bits
         if is_wrapped:
             codec = replace(codec, is_signed=True)
             decoded = self._decoded(codec, message.length)
