@@ -56,7 +56,7 @@ from peers import step_us
 ROUNDS = 7
 ROWS = 2000
 """Rows of a timed log: 200 s at 10 Hz."""
-FIT_ROWS = (100_000, 300_000, 1_000_000, 3_000_000, 5_000_000)
+FIT_ROWS = (100_000, 1_000_000, 5_000_000)
 ROWS_A_LOG = 50_000
 EFFECTS = (
     {"id": "fast_polarization", "parameters": {"ohm": 0.01, "tau_s": 3.0, "activation_k": 0.0}},
@@ -343,7 +343,8 @@ def main() -> None:
     for name in options.only or PARTS:
         sys.stderr.write(f"measuring: {name} …\n")
         found[name] = PARTS[name]()
-    publish("cost", tables_of(found), ["src/cangauge", "core"], keeps=options.keep)
+    name = "-".join(options.only or ["cost"])
+    publish(name, tables_of(found), ["src/cangauge", "core"], keeps=options.keep)
 
 
 if __name__ == "__main__":

@@ -46,7 +46,7 @@ def test_the_table_states_error_capacity_and_range(made: Path, output: tuple[str
         assert text in ran.out
     for text in ("held out", "effects"):  # one log is left out of none
         assert text not in ran.out
-    assert ran.err.index("note: chemistry taken as oxide") < ran.err.index("model: ")
+    assert ran.err.index("note: Assuming an oxide chemistry") < ran.err.index("model: ")
     assert str(output[1]) in ran.err
 
 

@@ -175,7 +175,7 @@ def test_chemistry_is_given_guessed_or_assumed_and_said() -> None:
     assert fit(whole, capacity_ah=CAPACITY_AH, cells=96).model.chemistry == "oxide"
     assumed = fit(log, capacity_ah=CAPACITY_AH)
     assert assumed.model.chemistry == "oxide"
-    assert any("taken as oxide: say lfp" in text for text in assumed.remarks)
+    assert any("Pass --cells N" in text for text in assumed.remarks)
 
 
 def test_published_equation_recovers_its_coefficients() -> None:

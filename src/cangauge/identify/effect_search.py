@@ -44,9 +44,16 @@ AUTO = "auto"
 NONE = "none"
 
 SEARCHED: Final = (
-    "resistance_soc", "resistance_asymmetry", "charge_transfer", "fast_polarization",
-    "slow_diffusion", "hysteresis", "entropic_coefficient", "temperature_lag", "core_temperature",
-)  # fmt: skip
+    "resistance_soc",
+    "resistance_asymmetry",
+    "charge_transfer",
+    "fast_polarization",
+    "slow_diffusion",
+    "hysteresis",
+    "entropic_coefficient",
+    "temperature_lag",
+    "core_temperature",
+)
 """Effects that `auto` tries: structure of a healthy pack that the equation lacks."""
 
 NOT_IDENTIFIABLE: Final[Mapping[str, str]] = {

@@ -59,10 +59,10 @@ from cangauge.model.model_file import (
     Information,
     Made,
     Model,
-    Noise,
     Ranges,
     SourceLog,
 )
+from cangauge.model.noise import Noise
 from cangauge.model.prior import CHEMISTRIES, DELAYS_S, ChemistryName, PackPrior, usual_loads
 from cangauge.model.voltage_model import KNOTS_PCT, REFERENCE_C, PublishedCurve
 
@@ -149,9 +149,11 @@ def fit(
         capacity_ah = capacity_from_reference(recorded)
     if not capacity_ah > 0.0:
         raise InputError(
-            "the capacity must be positive", field="capacity_ah", value=capacity_ah,
+            "the capacity must be positive",
+            field="capacity_ah",
+            value=capacity_ah,
             cure="check the sign of current: positive must discharge",
-        )  # fmt: skip
+        )
     effect_ids = _effect_ids(effects, equation)
     stated = [
         log if value is None else with_start(log, value)
@@ -277,8 +279,8 @@ def _likely_chemistry(
     """Return the chemistry whose typical cell has the logs' mean voltage, and a remark on it."""
     if cells is None:
         return "oxide", (
-            "chemistry taken as oxide: say lfp for iron phosphate, or give the number of cells, and"
-            " the volts per cell tell"
+            "Assuming an oxide chemistry. Pass --cells N: it detects the chemistry, and fixes the"
+            " curve beyond the logs. Or pass --chemistry lfp."
         )
     volts = float(np.mean(np.concatenate([log.voltage_v for log in logs]))) / cells
     socs = []

@@ -305,9 +305,11 @@ def start_by_model(log: Log, model: Model) -> Start:
     low, high = _limits(log, model.capacity_ah)
     voltage = extended.model
     rows = fit_rows(
-        with_start(log, 0.5 * (low + high)), model.capacity_ah,
-        delay_s=voltage.delay_s, low_pass_s=voltage.low_pass_s,
-    )  # fmt: skip
+        with_start(log, 0.5 * (low + high)),
+        model.capacity_ah,
+        delay_s=voltage.delay_s,
+        low_pass_s=voltage.low_pass_s,
+    )
     signals = Signals.of(log)
 
     def error_v(start: float) -> float:

@@ -12,7 +12,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import islice
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,11 +32,9 @@ from cangauge.model.effects.base import (
 from cangauge.model.effects.library import LIBRARY
 from cangauge.model.first_order import Lag
 from cangauge.model.inverse import socs_from_ocv
+from cangauge.model.noise import Noise
 from cangauge.model.voltage_model import SLOPE_AT_LEAST, Functions, VoltageModel
 from cangauge.settings import GAP_S
-
-if TYPE_CHECKING:
-    from cangauge.model.model_file import Noise
 
 LAG_NUMBERS = 3
 """Numbers of the state of a lag that has started."""

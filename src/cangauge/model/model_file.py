@@ -11,9 +11,6 @@ from typing import Annotated, Any, Final, Literal, Self
 
 import numpy as np
 from pydantic import (
-    AfterValidator,
-    BaseModel,
-    ConfigDict,
     Field,
     NonNegativeFloat,
     ValidationError,
@@ -29,15 +26,23 @@ from cangauge.logs.log import Log, as_log
 from cangauge.model.effects.base import Pack, Signals
 from cangauge.model.effects.library import parse_effects
 from cangauge.model.extended import ExtendedModel, OnlineModel, Prediction
+from cangauge.model.fields import (
+    Ampere,
+    Celsius,
+    Delays,
+    Fields,
+    Knots,
+    Seconds,
+    Soc,
+    Value,
+    Volts,
+)
+from cangauge.model.noise import Noise
 from cangauge.model.physics import check_physics
 from cangauge.model.prior import (
-    BLOCK_S,
     CHEMISTRIES,
     DELAYS_S,
-    FAST_FLOOR,
     LOW_PASS_S,
-    SLOW_S,
-    SLOW_SHARE,
     ChemistryName,
     Distribution,
     PackPrior,
@@ -53,7 +58,6 @@ from cangauge.model.voltage_model import (
     HermiteCurve,
     PublishedCurve,
     VoltageModel,
-    resistance_factor,
 )
 from cangauge.settings import GAP_S, VOLTAGE_ACCURACY_PCT, TemperatureSource
 
@@ -67,43 +71,21 @@ PRIOR_C_RATE: Final = 3.0
 _CURE: Final = "create the file with `cangauge fit`"
 
 
-def _increasing(values: list[float]) -> list[float]:
-    if any(high <= low for low, high in itertools.pairwise(values)):
-        raise ValueError("must increase")
-    return values
-
-
-# Wider than any pack needs, narrow enough that no voltage overflows.
-_Value = Annotated[float, Field(ge=-1e12, le=1e12)]
-_Soc = Annotated[float, Field(ge=-10, le=110)]
-_Celsius = Annotated[float, Field(ge=-273.15, le=1000)]
-_Ampere = Annotated[float, Field(ge=-1e6, le=1e6)]
-_Volts = Annotated[float, Field(ge=0, le=1e6)]
-_Seconds = Annotated[float, Field(gt=0, le=1e5)]
-_Delay = Annotated[float, Field(ge=0, le=3600)]
-_Delays = Annotated[list[_Delay], Field(min_length=1), AfterValidator(_increasing)]
-_Knots = Annotated[list[_Soc], Field(min_length=2), AfterValidator(_increasing)]
-
-
-class _Fields(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
-
-
-class Coefficient(_Fields):
+class Coefficient(Fields):
     """One coefficient of the published equation."""
 
-    value: _Value
+    value: Value
     std_error: NonNegativeFloat | None = None
     unit: Literal["V", "V/K", "ohm"]
 
 
-class Published(_Fields):
+class Published(Fields):
     """The published equation: k0 … k7, kt, R1 … Rn."""
 
     coefficients: dict[str, Coefficient]
     epsilon: Annotated[float, Field(ge=1e-4, lt=0.5)]
-    t_ref_c: _Celsius
-    delays_s: _Delays
+    t_ref_c: Celsius
+    delays_s: Delays
 
     @classmethod
     def of(
@@ -122,10 +104,14 @@ class Published(_Fields):
             name: {"value": value, "std_error": error, "unit": unit}
             for name, value, error, unit in zip(names, values, std, units, strict=False)
         }
-        return cls.model_validate({
-            "coefficients": coefficients, "epsilon": epsilon, "t_ref_c": t_ref_c,
-            "delays_s": list(delays_s),
-        })  # fmt: skip
+        return cls.model_validate(
+            {
+                "coefficients": coefficients,
+                "epsilon": epsilon,
+                "t_ref_c": t_ref_c,
+                "delays_s": list(delays_s),
+            }
+        )
 
     @model_validator(mode="after")
     def _complete(self) -> Self:
@@ -140,39 +126,31 @@ def _names(delays_s: Sequence[float]) -> list[str]:
     return [*BASIS_NAMES, "kt", *(f"R{k}" for k, _ in enumerate(delays_s, start=1))]
 
 
-class CurveKnots(_Fields):
+class CurveKnots(Fields):
     """Curve of a `knots` model."""
 
-    soc_pct: _Knots
-    voltage_v: list[_Value]
+    soc_pct: Knots
+    voltage_v: list[Value]
 
 
-class ArrheniusFields(_Fields):
-    """Change of the resistances with temperature (`voltage_model.Arrhenius`)."""
-
-    factor: _Value
-    resistance_ohm: list[_Value]
-    mean_c: _Celsius
-
-
-class Loads(_Fields):
+class Loads(Fields):
     """Temperature coefficient and resistances of a `knots` model."""
 
-    t_ref_c: _Celsius
-    kt_v_per_k: _Value
-    delays_s: _Delays
-    low_pass_s: list[_Seconds]
-    resistance_ohm: list[_Value]
-    arrhenius: ArrheniusFields
+    t_ref_c: Celsius
+    kt_v_per_k: Value
+    delays_s: Delays
+    low_pass_s: list[Seconds]
+    resistance_ohm: list[Value]
+    arrhenius: Arrhenius
 
 
-class FunctionFields(_Fields):
+class FunctionFields(Fields):
     """Joint principal functions of the coefficients' covariance, of standard deviation 1."""
 
-    soc_pct: _Knots
-    curve_v: list[list[_Value]]
+    soc_pct: Knots
+    curve_v: list[list[Value]]
     """Part of each function in the curve at `soc_pct` [V]."""
-    load: list[list[_Value]]
+    load: list[list[Value]]
     """Part of each function in the coefficients of the load columns."""
 
     @classmethod
@@ -183,70 +161,17 @@ class FunctionFields(_Fields):
         return cls(soc_pct=KNOTS_PCT.tolist(), curve_v=curve_v, load=load)
 
 
-class Noise(_Fields):
-    """Errors of the voltage that the coefficients do not explain."""
-
-    level_std_v: _Volts
-    """Lasts a whole log."""
-    slow_std_v: _Volts
-    slow_time_s: _Seconds = SLOW_S
-    fast_std_v: _Volts
-    """Of the mean of a block."""
-    block_s: _Seconds = BLOCK_S
-    soc_std_pct: Annotated[float, Field(ge=0, le=50)]
-    """δ: SoC against voltage (surface, hysteresis, reference), for a log and in each block."""
-    cold_exponent: Annotated[float, Field(ge=0, le=4)]
-    """The voltage errors grow with a(T) to this power below 20 °C."""
-    residual_std_v: _Volts
-    """Rms residual of the rows of the fit."""
-    left_out_scale: Annotated[float, Field(ge=1, le=1e6)] = 1.0
-    """κ²: `level_std_v` and the covariance of the coefficients contain it already."""
-    voltage_mae_pct: NonNegativeFloat
-    voltage_rmse_v: _Volts
-    """Errors of left-out logs."""
-    judged_on: str
-
-    @classmethod
-    def of(
-        cls,
-        chemistry: ChemistryName,
-        mean_v: float,
-        residual_v: float,
-        judged: Mapping[str, Any],
-        scale: float = 1.0,
-    ) -> Self:
-        """Return the errors of a chemistry, of mean voltage V0 [V] and rms residual [V].
-
-        `judged` holds `voltage_mae_pct`, `voltage_rmse_v` and `judged_on`; `scale` is κ².
-        """
-        typical = CHEMISTRIES[chemistry]
-        return cls(
-            level_std_v=typical.level_std * mean_v * scale**0.5,
-            slow_std_v=float(np.hypot(typical.slow_std * mean_v, SLOW_SHARE * residual_v)),
-            fast_std_v=float(np.hypot(typical.fast_factor * residual_v, FAST_FLOOR * mean_v)),
-            soc_std_pct=typical.soc_std_pct,
-            cold_exponent=typical.cold_exponent,
-            residual_std_v=residual_v,
-            left_out_scale=scale,
-            **judged,
-        )
-
-    def cold(self, temperature_c: float) -> float:
-        """Return the growth of the voltage errors in the cold [-], 1 or more."""
-        return float(max(1.0, float(resistance_factor(temperature_c))) ** self.cold_exponent)
-
-
-class Ranges(_Fields):
+class Ranges(Fields):
     """Identified ranges; an estimate outside is flagged."""
 
-    soc_pct: tuple[_Soc, _Soc]
-    temperature_c: tuple[_Celsius, _Celsius]
-    current_a: tuple[_Ampere, _Ampere]
-    voltage_v: tuple[_Volts, _Volts] | None = None
+    soc_pct: tuple[Soc, Soc]
+    temperature_c: tuple[Celsius, Celsius]
+    current_a: tuple[Ampere, Ampere]
+    voltage_v: tuple[Volts, Volts] | None = None
     """Lowest and highest voltage of the logs, under their currents."""
 
 
-class Information(_Fields):
+class Information(Fields):
     """Posterior of all coefficients: RᵀR is its precision, R·θ = `projected` its mean.
 
     The prior and the scale of left-out logs are in it. Rows of another log, divided by their noise,
@@ -254,11 +179,11 @@ class Information(_Fields):
     """
 
     columns: list[str]
-    root: list[list[_Value]]
-    projected: list[_Value]
+    root: list[list[Value]]
+    projected: list[Value]
 
 
-class SourceLog(_Fields):
+class SourceLog(Fields):
     """A log used for the identification."""
 
     name: str
@@ -266,7 +191,7 @@ class SourceLog(_Fields):
     sha256: str
 
 
-class Made(_Fields):
+class Made(Fields):
     """How the model was made."""
 
     by: str
@@ -275,7 +200,7 @@ class Made(_Fields):
     fingerprint: str
 
 
-class Model(_Fields):
+class Model(Fields):
     """A pack's identified model: coefficients, their covariance, effects, ranges and origin.
 
     Examples
@@ -299,7 +224,7 @@ class Model(_Fields):
     published: Published | None = None
     functions: FunctionFields
     noise: Noise
-    effects: list[dict[str, object]] = []
+    effects: list[dict[str, object]] = Field(default=[])
     range: Ranges
     information: Information | None = None
     made: Made
@@ -329,14 +254,16 @@ class Model(_Fields):
         cells = f", {self.cells} cells" if self.cells else ""
         effects = ", ".join(str(effect["id"]) for effect in self.effects) or "none"
         error = number(self.noise.voltage_mae_pct, 2, "%")
-        return "\n".join([
+        ranges = self.range
+        lines = (
             f"<Model {self.name!r}",
-            f"  {self.equation}, {self.chemistry}{cells}, {significant(self.capacity_ah, 4, 'Ah')}",
-            f"  identified at {span(*self.range.soc_pct, 0, '% SoC')},"
-            f" {span(*self.range.temperature_c, 0, '°C')}, {span(*self.range.current_a, 0, 'A')}",
-            f"  voltage error {error} on {self.noise.judged_on}",
-            f"  effects: {effects}>",
-        ])  # fmt: skip
+            f"{self.equation}, {self.chemistry}{cells}, {significant(self.capacity_ah, 4, 'Ah')}",
+            f"identified at {span(*ranges.soc_pct, 0, '% SoC')},"
+            f" {span(*ranges.temperature_c, 0, '°C')}, {span(*ranges.current_a, 0, 'A')}",
+            f"voltage error {error} on {self.noise.judged_on}",
+            f"effects: {effects}>",
+        )
+        return "\n  ".join(lines)
 
     @property
     def coefficients(self) -> dict[str, Coefficient]:
@@ -360,14 +287,13 @@ class Model(_Fields):
             "voltage_range_v": self.range.voltage_v,
         }
         if self.equation == "knots" and curve is not None and loads is not None:
-            colder = loads.arrhenius
             return VoltageModel(
                 HermiteCurve.rising(np.array(curve.soc_pct), np.array(curve.voltage_v)),
                 kt_v_per_k=loads.kt_v_per_k,
                 resistance_ohm=tuple(loads.resistance_ohm),
                 delay_s=tuple(loads.delays_s),
                 low_pass_s=tuple(loads.low_pass_s),
-                arrhenius=Arrhenius(colder.factor, tuple(colder.resistance_ohm), colder.mean_c),
+                arrhenius=loads.arrhenius,
                 t_ref_c=loads.t_ref_c,
                 **ranges,
             )
@@ -403,7 +329,7 @@ class Model(_Fields):
             parameter is out of bounds.
         """
         model = self.voltage_model()
-        check_physics(model, self)
+        check_physics(model, self.capacity_ah, self.noise)
         effects = parse_effects(self.effects, Pack.of(model, self.capacity_ah))
         return ExtendedModel(model, self.capacity_ah, tuple(effects))
 
@@ -539,9 +465,7 @@ class Model(_Fields):
                 delays_s=list(DELAYS_S),
                 low_pass_s=list(LOW_PASS_S),
                 resistance_ohm=ohm,
-                arrhenius=ArrheniusFields(
-                    factor=b, resistance_ohm=r0_ohm.tolist(), mean_c=known.mean_c
-                ),
+                arrhenius=Arrhenius(b, tuple(r0_ohm.tolist()), known.mean_c),
             ),
             functions=FunctionFields.of(known.covariance[:p, :p], loads),
             noise=Noise.of(

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 from cangauge.errors import InputError
 from cangauge.model.effects.base import RESISTANCE_AT_LEAST
-from cangauge.model.voltage_model import VoltageModel
-
-if TYPE_CHECKING:
-    from cangauge.model.model_file import Model
+from cangauge.model.noise import Noise
+from cangauge.model.voltage_model import HermiteCurve, VoltageModel
 
 HIGHEST_VOLTS: Final = 1e4
 """Largest pseudo-OCV [V]: electrical systems of vehicles and stores stay below 1.5 kV."""
@@ -24,9 +22,17 @@ SLOPE_BY_TEMPERATURE: Final = 0.01
 0.0003 by the entropy of the cells."""
 
 
-def check_physics(model: VoltageModel, file: Model) -> None:
-    """Raise InputError for voltages, resistances, kt or noise that no pack has."""
-    knots = file.equation == "knots"
+def check_physics(model: VoltageModel, capacity_ah: float, noise: Noise) -> None:
+    """Raise InputError for voltages, resistances, kt or noise that no pack has.
+
+    Parameters
+    ----------
+    model : VoltageModel
+    capacity_ah : float
+        [Ah].
+    noise : Noise
+    """
+    knots = isinstance(model.curve, HermiteCurve)
     prefix = "loads" if knots else "published.coefficients"
     middle = model.nominal_v
     ends = model.pseudo_ocv([*model.soc_range_pct]).tolist()
@@ -37,23 +43,25 @@ def check_physics(model: VoltageModel, file: Model) -> None:
             field="curve.voltage_v" if knots else prefix,
             cure="check its values and their unit (V), or create the file with `cangauge fit`",
         )
-    most_ohm, noise = DROP_AT_1C * middle / file.capacity_ah, file.noise
+    numbers = range(len(model.resistance_ohm))
+    names = [f"resistance_ohm.{k}" if knots else f"R{k + 1}" for k in numbers]
+    most_ohm = DROP_AT_1C * middle / capacity_ah
     limits = [
-        (f"{prefix}.resistance_ohm.{number}" if knots else f"{prefix}.R{number + 1}", ohm, most_ohm,
-         "ohm")
-        for number, ohm in enumerate(model.resistance_ohm)
-    ] + [
-        (f"{prefix}.{'kt_v_per_k' if knots else 'kt'}", model.kt_v_per_k,
-         SLOPE_BY_TEMPERATURE * middle, "V/K"),
+        (f"{prefix}.{name}", ohm, most_ohm, "ohm")
+        for name, ohm in zip(names, model.resistance_ohm, strict=True)
+    ]
+    kt = f"{prefix}.{'kt_v_per_k' if knots else 'kt'}"
+    limits.append((kt, model.kt_v_per_k, SLOPE_BY_TEMPERATURE * middle, "V/K"))
+    limits += [
         ("noise.level_std_v", noise.level_std_v, middle, "V"),
         ("noise.slow_std_v", noise.slow_std_v, middle, "V"),
         ("noise.fast_std_v", noise.fast_std_v, middle, "V"),
-    ]  # fmt: skip
+    ]
     for field, value, most, unit in limits:
         if abs(value) > most:
             raise InputError(
                 f"must lie within ±{most:.3g} {unit} for a pack of {middle:.4g} V and"
-                f" {file.capacity_ah:.4g} Ah",
+                f" {capacity_ah:.4g} Ah",
                 field=field,
                 value=value,
                 cure="check the value and its unit, or the capacity",

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 
-from cangauge.model.model_file import FunctionFields, Made, Model, Noise, Published, Ranges
+from cangauge.model.model_file import FunctionFields, Made, Model, Published, Ranges
+from cangauge.model.noise import Noise
 from cangauge.model.prior import BLOCK_S
 from cangauge.model.voltage_model import (
     KNOTS_PCT,

@@ -30,6 +30,7 @@ from cangauge._typing import FloatArray
 from cangauge.errors import InputError
 from cangauge.logs.gaps import BRIDGE_S
 from cangauge.model.delay_line import delayed_currents
+from cangauge.model.fields import Celsius, Value
 from cangauge.model.first_order import low_passed
 
 KNOTS_PCT: FloatArray = np.array(
@@ -392,7 +393,7 @@ def past_currents(
 
 @dataclass(frozen=True)
 class Arrhenius:
-    """Change of the resistances with temperature.
+    """Change of the resistances with temperature, as a model file holds it too.
 
     Parameters
     ----------
@@ -404,9 +405,9 @@ class Arrhenius:
         Temperature T̄ at which the resistances hold [°C].
     """
 
-    factor: float
-    resistance_ohm: tuple[float, ...]
-    mean_c: float
+    factor: Value
+    resistance_ohm: tuple[Value, ...]
+    mean_c: Celsius
 
 
 @dataclass(frozen=True, eq=False)

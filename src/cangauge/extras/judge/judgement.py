@@ -340,7 +340,7 @@ def narrowed(judgement: Judgement) -> Model:
         changed = {
             "kt_v_per_k": before.kt_v_per_k + float(change[0]),
             "resistance_ohm": (np.array(before.resistance_ohm) + change[1:last]).tolist(),
-            "arrhenius": before.arrhenius.model_copy(update={"factor": factor}),
+            "arrhenius": replace(before.arrhenius, factor=factor),
         }
         update["loads"] = before.model_copy(update=changed)
     return model.model_copy(update=update)
