@@ -84,7 +84,7 @@ _KNOWN: Final = re.compile(
         if len(word) > 1
     )
 )
-_JOINED: Final = re.compile(f"(?:{_KNOWN.pattern})+")
+_JOINED: Final = re.compile(f"(?:{_KNOWN.pattern})++")
 _RANGES: Final = {
     "current": (-MOST_A, MOST_A),
     "voltage": (30.0, 1000.0),
