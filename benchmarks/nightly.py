@@ -12,6 +12,7 @@ lowest   the lowest versions that pyproject.toml allows
 long     restarts by SIGKILL; load, timing and memory of the service; attacks on its page, status
          and MQTT
 load     half an hour at 12,000 frames/s, or what a bare loop carries here: no loss, memory flat
+vcan     ten minutes of the same on a real vcan0, directly or in a guest (needs --socketcan)
 
 Each part writes `out/nightly/PART.json`: state (passed, failed, skipped), reason, seconds and the
 last lines of each of its commands. Exit status 1 if a part failed.
@@ -38,6 +39,7 @@ OWN_GAUGE = (
     "run --interface {interface} --channel {channel} --bus-option port={port} -m {model}"
     " --initial-soc {soc} --time-source replay-clock"
 )
+VCAN = "--interface socketcan --channel vcan0 --minutes 10 --bare-minutes 1 --highest 12000"
 LOAD = "--only loss --wanted 0.05 --highest 12000 --minutes 29 --bare-minutes 1"
 
 console = Console(highlight=False)
@@ -95,6 +97,11 @@ def commands(data: Path | None, socketcan: str) -> dict[str, list[list[str]] | s
         "load": [
             [python, "benchmarks/latency.py", *LOAD.split()],
         ],
+        "vcan": [
+            [*socketcan.split(), python, "benchmarks/latency.py", *VCAN.split()],
+        ]
+        if socketcan
+        else "no command that provides SocketCAN: --socketcan COMMAND",
     }
 
 

@@ -313,8 +313,8 @@ def run_all(
     progress : callable
         Called with the name of each finished run.
     retry_if_disturbed : bool
-        Whether to repeat once a run that the machine delayed, and an undisturbed run that is
-        not valid.
+        Whether to repeat a run that the machine delayed, and an undisturbed run that is not valid:
+        one at a time, at most `REPEATS` times.
 
     Returns
     -------
@@ -336,15 +336,17 @@ def run_all(
 
     observed = _run_each(runs, one, jobs)
     references = _references(runs, observed)
-    # A busy machine disturbs runs too: repeat these once.
-    again = [
-        number
-        for number, fault in enumerate(runs)
-        if observed[number].late_s > MAX_SEND_DELAY_S
-        or (fault.name == UNDISTURBED and isinstance(references[fault.reference_key], str))
-    ]
-    if again and retry_if_disturbed:
-        repeated = _run_each([runs[number] for number in again], one, jobs)
+    # A busy machine disturbs runs too.
+    for _ in range(REPEATS if retry_if_disturbed else 0):
+        again = [
+            number
+            for number, fault in enumerate(runs)
+            if observed[number].late_s > MAX_SEND_DELAY_S
+            or (fault.name == UNDISTURBED and isinstance(references[fault.reference_key], str))
+        ]
+        if not again:
+            break
+        repeated = _run_each([runs[number] for number in again], one, Jobs(1, 1))
         observed = [*observed]
         for number, found in zip(again, repeated, strict=True):
             observed[number] = found
@@ -353,6 +355,10 @@ def run_all(
         _done(fault, observed[number], references[fault.reference_key])
         for number, fault in enumerate(runs)
     ]
+
+
+REPEATS = 5
+"""Repetitions of a run that the machine's other work made void."""
 
 
 def _run_each(
@@ -394,7 +400,9 @@ def _done(fault: Fault, observed: Observation, reference: Reference | str) -> Re
     if isinstance(reference, str):
         return Result(fault, None, reference)
     if observed.late_s > MAX_SEND_DELAY_S:
-        return Result(fault, None, f"the machine delayed frames by {observed.late_s:.1f} s, twice")
+        return Result(
+            fault, None, f"the machine delayed frames by {observed.late_s:.1f} s each time"
+        )
     verdict = judge(observed, reference, reports=fault.reports, recovers=fault.recovers)
     return Result(fault, verdict)
 

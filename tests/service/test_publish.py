@@ -111,7 +111,9 @@ def test_each_value_is_sent_clipped_and_read_as_the_dbc_decodes_it(values: list[
 
 def test_status_reasons_and_age() -> None:
     reasons = Reason.CURRENT_GAP | Reason.CURRENT_MISSING
-    first, _ = SocPublisher().beat(estimate(status=Status.DEGRADED, reasons=reasons), 1, 12.9)
+    first, _ = SocPublisher().publish_periodic(
+        estimate(status=Status.DEGRADED, reasons=reasons), 1, 12.9
+    )
     values = decoded(first)
     assert (values["status"], values["age_s"]) == (2, 12)
     assert values["reason"] == (1 << 1) | (1 << 15)
@@ -127,7 +129,7 @@ def test_unknown_values_have_the_codes_of_the_dbc() -> None:
     reader, publisher = SocReader(), SocPublisher()
     pack = publisher.report_frames(PackReport(Health(*[NAN] * 5), Power(), UNKNOWN))
     unknown = estimate(**dict.fromkeys(list(SENT)[:5], NAN))
-    frames = [*publisher.beat(unknown, 0, NAN), *pack]
+    frames = [*publisher.publish_periodic(unknown, 0, NAN), *pack]
     for message in frames:
         layout, content = (
             database().get_message_by_frame_id(message.arbitration_id),
@@ -172,7 +174,7 @@ def test_ids_are_configured_differ_and_are_protected() -> None:
     assert [each.arbitration_id for each in frames] == [0x10, 0x11, 0x13, 0x14, 0x15]
     assert SocReader().read(frames[0]) is None
     swapped = SocReader(FrameIds(soc_estimate=0x5A1, soc_detail=0x5A0))
-    for message in SocPublisher().beat(estimate(), 7, 0.0):
+    for message in SocPublisher().publish_periodic(estimate(), 7, 0.0):
         assert swapped.read(message) is None
     assert swapped.refused == 2
 
@@ -187,7 +189,7 @@ def test_each_beat_has_an_estimate_each_tenth_the_others() -> None:
         asked.append(1)
         return report()._replace(cells=None)
 
-    beats = [publisher.beat(estimate(), beat, 0.0, without_cells) for beat in range(30)]
+    beats = [publisher.publish_periodic(estimate(), beat, 0.0, without_cells) for beat in range(30)]
     assert all(frames[0].arbitration_id == 0x5A0 for frames in beats)
     assert [len(frames) for frames in beats] == ([4] + [1] * 9) * 3
     assert len(asked) == 3
@@ -226,7 +228,7 @@ def test_samples_are_acknowledged_at_a_fixed_interval() -> None:
     ]
     assert told == list(range(1, 40, 4))
     # The next beat acknowledges the remaining samples; later beats have none.
-    assert [len(publisher.beat(estimate(), 39, 0.0)) for _ in range(4)] == [2, 1, 1, 1]
+    assert [len(publisher.publish_periodic(estimate(), 39, 0.0)) for _ in range(4)] == [2, 1, 1, 1]
 
 
 def test_no_pack_has_a_negative_capacity_resistance_or_energy() -> None:

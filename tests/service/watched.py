@@ -54,4 +54,4 @@ class Watched:
 
     def turn(self, later_s: float = 1.0) -> None:
         self.now_s += later_s
-        self.monitor.turn(self.now_s)
+        self.monitor.update(self.now_s)

@@ -282,12 +282,12 @@ SILENCE_S: Final = 2.0
 WIDE: Final = 256
 """A counter with at least this many values does not wrap within a normal loss. If it steps back
 sooner, the sender restarted or frames came out of order: no loss is proven."""
-TWO_SENDERS: Final = 12
-ONE_SENDER: Final = 3
+TWO_SENDERS: Final = 12.0
 """Frames out of sequence that go on with the sequence left before, too early for one sender, from
-which there are two senders; such frames that one out of sequence by itself outweighs. Where losses
-are random, one in `modulus` goes on by chance: with the shortest counter, of two bits, they reach
-12 with a probability of 7e-8 (Wald's bound, of θ = 3.95 from θ/4 + 3/(4 θ³) = 1)."""
+which there are two senders. Any other frame out of sequence takes back 12 / `modulus` of them.
+Where losses are random, one in `modulus` goes on by chance; they then reach 12 with a probability
+of 7e-8 with a counter of two bits, less with a longer one (Wald's bound θ⁻¹², with θ from
+θ/m + (1 - 1/m) θ^(-12/m) = 1)."""
 
 
 class FrameChecker:
@@ -316,7 +316,7 @@ class FrameChecker:
         self._last, self._last_s = -1, 0.0
         self._refused = 0
         self._other = -1  # counter of the sequence that was left for the present one
-        self._of_others = 0
+        self._of_others = 0.0
         self._step_s = math.inf  # between the latest two frames in sequence
         self._content: bytes | bytearray = b""
         self._is_repeated = False
@@ -353,8 +353,8 @@ class FrameChecker:
             is_early = elapsed_s < ((steps or modulus) - 0.5) * period_s < math.inf
             if not (steps == 0 and data == self._content):
                 is_other = goes_on or (self._is_repeated and not was_repeated)
-                score = 1 if is_other and is_early else -ONE_SENDER
-                self._of_others = max(self._of_others + score, 0)
+                score = 1.0 if is_other and is_early else -TWO_SENDERS / modulus
+                self._of_others = max(self._of_others + score, 0.0)
             if self._is_repeated:
                 return Verdict.REPEATED
             self._other = last

@@ -1,7 +1,7 @@
 """Published frames: SOC_ESTIMATE, SOC_DETAIL, SOC_HEALTH, SOC_POWER, SOC_CELLS, made and read.
 
-Normally the clock of the loop sets the rate (`SocPublisher.beat`), with or without samples: a
-SOC_ESTIMATE at each beat, the others at every tenth; SOC_CELLS only where there are cells.
+The clock of the loop sets the rate (`SocPublisher.publish_periodic`), with or without samples: a
+SOC_ESTIMATE each time, the others every tenth time; SOC_CELLS only where there are cells.
 
 During a replay at another speed, log time sets the rate (`SocPublisher.publish`): SOC_ESTIMATE
 with the first sample of every 100 ms, the others with the first of every second. SOC_DETAIL is also
@@ -200,8 +200,8 @@ def _layouts() -> dict[str, _Layout]:
 class SocPublisher:
     """Encode estimates, health, power and cells as frames.
 
-    With `acknowledge_every`, SOC_DETAIL is sent after this number of samples, and at a beat with
-    unacknowledged ones.
+    With `acknowledge_every`, SOC_DETAIL is sent after this number of samples, and with the
+    periodic frames after fewer.
     """
 
     def __init__(self, ids: FrameIds | None = None, acknowledge_every: int | None = None) -> None:
@@ -212,14 +212,14 @@ class SocPublisher:
         self._beats = self._acknowledged = 0
         self._due_s = {ESTIMATE_EVERY_S: -math.inf, DETAIL_EVERY_S: -math.inf}
 
-    def beat(
+    def publish_periodic(
         self,
         estimate: Estimate,
         samples: int,
         age_s: float,
         report: Callable[[], PackReport] | None = None,
     ) -> list[can.Message]:
-        """Return the frames of one beat; due every `ESTIMATE_EVERY_S`.
+        """Return the periodic frames; due every `ESTIMATE_EVERY_S`.
 
         `samples` are those processed so far, including refused ones; `age_s` is the time since the
         latest that the estimator took [s], NaN without a sample. `report` is called where its
@@ -234,7 +234,7 @@ class SocPublisher:
     def publish(
         self, estimate: Estimate, samples: int, report: Callable[[], PackReport] | None = None
     ) -> list[can.Message]:
-        """Return the frames due with a sample of a replayed log; arguments as in `beat`."""
+        """Return the frames due with a sample of a replayed log; see `publish_periodic`."""
         frames = []
         if self._is_due(ESTIMATE_EVERY_S, estimate.time_s):
             frames.append(self.estimate_frame(estimate))
@@ -266,7 +266,7 @@ class SocPublisher:
         return frames + (self.report_frames(report()) if is_due and report is not None else [])
 
     def estimate_frame(self, estimate: Estimate, age_s: float = 0.0) -> can.Message:
-        """Return SOC_ESTIMATE with the next counter; arguments as in `beat`."""
+        """Return SOC_ESTIMATE with the next counter; arguments as in `publish_periodic`."""
         age_s = age_s if math.isnan(age_s) else math.floor(age_s)
         soc_pct, std_pct, reasons = estimate.soc_pct, estimate.soc_std_pct, estimate.reasons
         content = SocEstimate(soc_pct, std_pct, estimate.status, reason_bits(reasons), age_s)

@@ -197,7 +197,7 @@ class _Player:
         self._first_us: int | None = None
         self._began_s, self._clock_us = 0.0, -1
         self._count: int | None = None  # in the latest SOC_DETAIL
-        self._heard_s = -math.inf
+        self._reported_s = -math.inf
         self.in_flight: deque[int] = deque()
         """Frames of each sample sent that is neither acknowledged nor lost."""
         self._incomplete = 0  # frames sent since the latest sample
@@ -281,7 +281,7 @@ class _Player:
             now_s = time.monotonic()
             if state.acknowledged != before:
                 before, last_s = state.acknowledged, now_s
-            elif state.acknowledged and self._heard_s - last_s > LOST_AFTER_S:
+            elif state.acknowledged and self._reported_s - last_s > LOST_AFTER_S:
                 state.lost = self._lost = self._lost + len(self.in_flight)
                 self.in_flight.clear()
                 self._incomplete = 0
@@ -305,7 +305,7 @@ class _Player:
         return message is not None
 
     def _acknowledge(self, count: int) -> None:
-        self._heard_s = time.monotonic()
+        self._reported_s = time.monotonic()
         before, self._count = self._count, count
         if before is None or not self.state.samples:
             return

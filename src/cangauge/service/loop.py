@@ -41,7 +41,7 @@ _LOG = logging.getLogger(__name__)
 _warn = partial(emit, _LOG, logging.WARNING)
 
 LATE_S: Final = 0.01
-"""Longest delay of a heartbeat for a sample that is due, and shortest interval of housekeeping
+"""Longest delay of periodic frames for a sample that is due, and shortest interval of housekeeping
 under continuous traffic [s]."""
 LONGEST_WAIT_S: Final = 0.1
 """Longest wait for frames, and longest interval of housekeeping [s]."""
@@ -129,15 +129,15 @@ class Loop:
         if self._stamps_are_arrival:
             self._stamps = StampLimiter(KERNEL_TOLERANCE_S, time.time() - steady_s())
         self._shift_s = 0.0
-        # Beginning of the latest turn that emptied the receive queue, after which the frames of
-        # the next turn arrived; time at which the latest turn received.
+        # Start of the last iteration that drained the receive queue: later frames arrived after it.
+        # Time at which the latest iteration received.
         self._drained_s = self._received_s = steady_s()
         self._reported: set[str] = set()
         self._clock_was_seen = False
         self._drops = 0
         self._poller: Poller | None = None
         self._configure()
-        self._began_s = self._now_s = self._beat_s = self._keep_s = time.monotonic()
+        self._began_s = self._now_s = self._publish_s = self._keep_s = time.monotonic()
         self._save_s = self._began_s + min(FIRST_CHECKPOINT_S, self._settings.checkpoint_every_s)
         # Times at which the latest sample was processed and received. They differ while frames wait
         # in the socket, after the process was suspended or under load.
@@ -170,12 +170,12 @@ class Loop:
         """
         try:
             while not (stop() or self._is_over()):
-                self._turn()
+                self._iterate()
             if self._pipeline.finish():
                 self._give_sample(self._pipeline.latest)
             if self._pipeline.published_samples != self._pipeline.samples:
                 self._now_s = time.monotonic()
-                self._beat()  # a sample that waited counts as silence
+                self._publish_periodic()  # a sample that waited counts as silence
         finally:
             self._checkpoint()
 
@@ -185,9 +185,9 @@ class Loop:
         is_idle = idle_s is not None and self._now_s - self._sample_s >= idle_s
         return is_late or (is_idle and self._pipeline.samples > 0)
 
-    def _turn(self) -> None:
+    def _iterate(self) -> None:
         """Receive once, process the frames, and do what is due."""
-        left_s = self._beat_s + LATE_S - self._now_s
+        left_s = self._publish_s + LATE_S - self._now_s
         messages = self._port.receive_pending(min(max(left_s, 0.0), LONGEST_WAIT_S))
         # Reading the clock may be a system call: once per step, and again after samples.
         self._now_s, before, received_s = time.monotonic(), self._pipeline.samples, steady_s()
@@ -199,8 +199,8 @@ class Loop:
                 own.forget(self._received_s - ECHO_WITHIN_S)
         self._received_s = received_s
         late_s = 0.0 if self._pipeline.samples != before else LATE_S
-        if self._now_s >= self._beat_s + late_s:
-            self._beat()
+        if self._now_s >= self._publish_s + late_s:
+            self._publish_periodic()
         if self._poller is not None:
             self._ask(self._poller.due(self._now_s))
         if self._now_s >= self._keep_s:
@@ -227,7 +227,7 @@ class Loop:
                 self._give_sample(estimate)
                 if frames := pipeline.acknowledgement(estimate):
                     self._send(frames)
-                    self._beat_s = self._now_s + ESTIMATE_EVERY_S
+                    self._publish_s = self._now_s + ESTIMATE_EVERY_S
         if pipeline.samples != samples_before:
             self._sample_s = self._now_s
         if taken := pipeline.taken - taken_before:
@@ -272,12 +272,12 @@ class Loop:
             self._outputs = [each for each in self._outputs if each is not output]
             self._samplers = [each for each in self._samplers if each is not output]
 
-    def _beat(self) -> None:
+    def _publish_periodic(self) -> None:
         silent_s, reasons = self._now_s - self._came_s, self._report_findings()
         self._send(self._pipeline.heartbeat(silent_s, self._settings.timeout_s, reasons))
-        # Stay on the clock's grid; skip beats missed while the process was suspended.
-        missed = max(math.floor((self._now_s - self._beat_s) / ESTIMATE_EVERY_S), 0)
-        self._beat_s += (missed + 1) * ESTIMATE_EVERY_S
+        # Stay on the clock's grid; skip those missed while the process was suspended.
+        missed = max(math.floor((self._now_s - self._publish_s) / ESTIMATE_EVERY_S), 0)
+        self._publish_s += (missed + 1) * ESTIMATE_EVERY_S
 
     def _report_findings(self) -> Reason:
         """Log what is new about time and other senders; return the reasons to publish."""
@@ -349,7 +349,7 @@ class Loop:
             self._settings = settings
             self._save_s = min(self._save_s, now_s + settings.checkpoint_every_s)
             self._configure()
-        if self._monitor.turn(now_s):
+        if self._monitor.update(now_s):
             for output in self._outputs:
                 self._give(output, "on_snapshot", self._monitor.latest)
 

@@ -15,7 +15,7 @@ class Output:
 
     `trouble` is a sentence for the user, shown in the status; "" while nothing is wrong. The
     methods are called in the thread of the receive loop and must return at once. One that raises
-    is logged and told nothing more until `close`; the estimate continues.
+    is logged and called no more until `close`; the estimate continues.
     """
 
     trouble = ""

@@ -337,7 +337,7 @@ class Pipeline:
             estimate = estimate._replace(soc_std_pct=std_pct)
         self.published, self.published_samples = estimate, self.samples
         age_s = silent_s if self.taken else math.nan
-        return self._publisher.beat(estimate, self.samples, age_s, self.report)
+        return self._publisher.publish_periodic(estimate, self.samples, age_s, self.report)
 
     # --- reload and restart
 

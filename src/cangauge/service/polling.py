@@ -45,7 +45,7 @@ class PollCounts:
 
 
 @dataclass(slots=True)
-class _Turn:
+class _Poll:
     target: PollTarget
     due_s: float = -math.inf
     failures: int = 0
@@ -75,17 +75,17 @@ class Poller:
         every_s: float,
         asked_s: dict[int, float] | None = None,
     ) -> None:
-        self._turns = [_Turn(target) for target in targets]
+        self._polls = [_Poll(target) for target in targets]
         self._every_s = every_s
         self.asked_s = asked_s or {}
-        self._waiting: _Turn | None = None
+        self._waiting: _Poll | None = None
         self._give_up_s = self._exchange_ends_s = math.inf
         self._quiet_until_s = -math.inf
         self._may_continue = False
         self._reassembler = Reassembler()
         self.counts = PollCounts()
-        self.request_ids = frozenset(turn.target.request_id for turn in self._turns)
-        self.reply_ids = frozenset(turn.target.reply_id for turn in self._turns)
+        self.request_ids = frozenset(poll.target.request_id for poll in self._polls)
+        self.reply_ids = frozenset(poll.target.reply_id for poll in self._polls)
 
     def due(self, now_s: float) -> can.Message | None:
         """Return the request to send, if one is due."""
@@ -94,27 +94,27 @@ class Poller:
                 return None
             self.counts.unanswered += 1
             self._end(self._waiting, now_s, failed=True)
-        turn = min(self._turns, key=self._next_s)
-        if now_s < max(self._next_s(turn), self._quiet_until_s):
+        poll = min(self._polls, key=self._next_s)
+        if now_s < max(self._next_s(poll), self._quiet_until_s):
             return None
-        self.asked_s[turn.target.request_id] = now_s
-        self._waiting, self._give_up_s = turn, now_s + REPLY_WITHIN_S
+        self.asked_s[poll.target.request_id] = now_s
+        self._waiting, self._give_up_s = poll, now_s + REPLY_WITHIN_S
         self._exchange_ends_s, self._may_continue = now_s + EXCHANGE_WITHIN_S, True
         self._reassembler = Reassembler()
         self.counts.requests += 1
-        request = turn.target.request
-        return _frame(turn.target.request_id, bytes([len(request)]) + request)
+        request = poll.target.request
+        return _frame(poll.target.request_id, bytes([len(request)]) + request)
 
-    def _next_s(self, turn: _Turn) -> float:
-        last_s = self.asked_s.get(turn.target.request_id, -math.inf)
-        return max(turn.due_s, last_s + PER_NODE_S)
+    def _next_s(self, poll: _Poll) -> float:
+        last_s = self.asked_s.get(poll.target.request_id, -math.inf)
+        return max(poll.due_s, last_s + PER_NODE_S)
 
     def take(self, message: can.Message, now_s: float) -> can.Message | None:
         """Take a frame of a reply; return the flow control to send."""
-        turn = self._waiting
-        if turn is None or message.arbitration_id != turn.target.reply_id or not message.data:
+        poll = self._waiting
+        if poll is None or message.arbitration_id != poll.target.reply_id or not message.data:
             return None
-        target = turn.target
+        target = poll.target
         reply = self._reassembler.take(message.data, now_s)
         if reply is None:
             kind = message.data[0] >> 4
@@ -126,12 +126,12 @@ class Poller:
                 return _frame(target.request_id, _CONTINUE)
         elif reply.startswith(target.reply):
             self.counts.answers += 1
-            self._end(turn, now_s, failed=False)
+            self._end(poll, now_s, failed=False)
         elif reply[:3] == bytes([_NEGATIVE, target.request[0], _RESPONSE_PENDING]):
             self._give_up_s = self._exchange_ends_s
         elif reply[:2] == bytes([_NEGATIVE, target.request[0]]):
             self.counts.negative += 1
-            self._end(turn, now_s, failed=True)
+            self._end(poll, now_s, failed=True)
         return None
 
     def note_other_tester(self, now_s: float) -> None:
@@ -141,13 +141,13 @@ class Poller:
         if self._waiting is not None:
             self._end(self._waiting, now_s, failed=False)
 
-    def _end(self, turn: _Turn, now_s: float, *, failed: bool) -> None:
+    def _end(self, poll: _Poll, now_s: float, *, failed: bool) -> None:
         self._waiting = None
-        turn.failures = turn.failures + 1 if failed else 0
+        poll.failures = poll.failures + 1 if failed else 0
         # The exponent is bounded: 2 to the number of failures of a week is no float.
-        wait_s = self._every_s * 2.0 ** min(turn.failures, 16)
-        turn.due_s = now_s + min(wait_s, max(SLOWEST_S, self._every_s))
-        for each in self._turns:
+        wait_s = self._every_s * 2.0 ** min(poll.failures, 16)
+        poll.due_s = now_s + min(wait_s, max(SLOWEST_S, self._every_s))
+        for each in self._polls:
             each.due_s = max(each.due_s, now_s + BETWEEN_S)
 
 

@@ -178,8 +178,8 @@ class Monitor:
         refused = "" if problem is None else f"; new configuration REFUSED: {problem}"
         self._notifier.send(READY=1, STATUS=self._line() + refused)
 
-    def turn(self, now_s: float) -> bool:
-        """Record a turn of the loop (monotonic time [s]); return whether `latest` is new."""
+    def update(self, now_s: float) -> bool:
+        """Record an iteration of the loop (monotonic time [s]); return whether `latest` is new."""
         if now_s < self._due_s:
             return False
         self._due_s = now_s + SHOW_EVERY_S

@@ -138,12 +138,12 @@ class Gateway(Output):
         for field, step in fields:
             if field.shift + field.width <= 8 * len(data):  # older batteries have shorter frames
                 field.put(data, round(soc_pct / step))
-        told = copy(frame)
-        told.data = data
-        return told
+        replaced = copy(frame)
+        replaced.data = data
+        return replaced
 
     def _note(self, *, is_replaced: bool) -> None:
-        """Log and state a change of what the inverter is told."""
+        """Log and state a change of the SoC sent to the inverter."""
         if is_replaced is self._replaces:
             return
         self._replaces = is_replaced
