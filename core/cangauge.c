@@ -10,7 +10,6 @@
 #define USE_S 120.0
 #define DRAIN_PCT_PER_HOUR 0.05
 #define DRAIN_AT_MOST_PCT 5.0
-#define MOVED_PRIOR 0.5
 #define FASTEST_PCT_PER_HOUR 150.0
 #define OFFSET_STD_PER_AH 0.025
 #define CAPACITY_STD 0.05
@@ -33,7 +32,10 @@
 #define CONTRADICTED_S 300.0
 #define MISMATCH_S 600.0
 #define CURRENT_AT_MOST_A 5000.0
-#define SIGN_LOG_ODDS 13.815510557964274 /* ln 1e6 */
+#define STEP_C_RATE 0.05
+#define STEPS_MEMORY 10.0
+#define STEPS_AT_LEAST 6.0
+#define STEPS_CORRELATION 0.9
 
 /* Reasons that the standard deviation contains. */
 #define NOTES                                                                                      \
@@ -430,17 +432,28 @@ static cg_real unseen_v_per_a(const cg_model *model)
     return total;
 }
 
-/* Weigh a step of the voltage: it goes with that of the model, or against it. */
-static void watch_sign(const cg_model *model, cg_memory *memory, cg_real voltage_v, cg_real drop_v)
+/* Correlate the steps of voltage and current: of a battery they are opposite. */
+static void watch_sign(const cg_model *model, cg_memory *memory, const cg_sample *sample)
 {
-    const cg_real error_v2 = cg_square(model->residual_std_v) + cg_square(model->level_std_v);
-    const cg_real steps_v2 = (voltage_v - memory->row_v) * (drop_v - memory->row_drop_v);
-    memory->row_v = voltage_v;
-    memory->row_drop_v = drop_v;
-    if (!isnan(steps_v2)) {
-        const cg_real most = R(2.0 * SIGN_LOG_ODDS);
-        memory->sign_log_odds = cg_clip(
-            memory->sign_log_odds + (R(2.0) * steps_v2 / error_v2), -most, most);
+    const cg_real keep = R(1.0 - (1.0 / STEPS_MEMORY));
+    const cg_real step_v = sample->voltage_v - memory->row_v;
+    const cg_real step_a = sample->current_a - memory->row_a;
+    memory->row_v = sample->voltage_v;
+    memory->row_a = sample->current_a;
+    if (isnan(step_v) || (cg_fabs(step_a) < (R(STEP_C_RATE) * model->capacity_ah))) {
+        return;
+    }
+    memory->steps = (keep * memory->steps) + R(1.0);
+    memory->steps_v2 = (keep * memory->steps_v2) + (step_v * step_v);
+    memory->steps_a2 = (keep * memory->steps_a2) + (step_a * step_a);
+    memory->steps_va = (keep * memory->steps_va) + (step_v * step_a);
+    if (memory->steps_va < R(0.0)) {
+        memory->is_sign_wrong = false;
+    } else if ((memory->steps >= R(STEPS_AT_LEAST)) &&
+               (memory->steps_va >
+                (R(STEPS_CORRELATION) * cg_sqrt(memory->steps_v2 * memory->steps_a2)))) {
+        memory->is_sign_wrong = true;
+    } else { /* as before */
     }
 }
 
@@ -476,7 +489,7 @@ static void use_row(cg_estimator *self, const cg_sample *sample)
             state->block.drive[k] += (cg_sum)state->drive[k];
         }
         state->block.rows += 1;
-        watch_sign(model, memory, sample->voltage_v, state->drop_v);
+        watch_sign(model, memory, sample);
     }
     const cg_real soc_pct = soc_now(self, &std_pct);
     memory->voltage_model_v = CG_NAN;
@@ -500,9 +513,9 @@ static void follow(cg_estimator *self, const cg_sample *sample, const charge_ste
     if (charge->away_s != R(0.0)) {
         const cg_real std_pct = moved_std_pct(charge->away_s);
         propagate_to_now(self);
-        cg_filter_doubt(&self->state.filter, model, R(MOVED_PRIOR), std_pct, charge->away_s,
+        cg_filter_doubt(&self->state.filter, model, R(CG_WRONG_PRIOR), std_pct, charge->away_s,
                         charge->parked_std_pct);
-        memory->coulomb_var_pct2 += R(MOVED_PRIOR) * cg_square(std_pct);
+        memory->coulomb_var_pct2 += R(CG_WRONG_PRIOR) * cg_square(std_pct);
     }
     if (cg_fabs(sample->current_a) > (R(REST_CURRENT_C_RATE) * model->capacity_ah)) {
         memory->rest_since_s = (cg_time)NAN;
@@ -635,7 +648,7 @@ static uint32_t reasons_now(const cg_estimator *self, const cg_sample *sample, c
     reasons |= reason_if(!memory->newton_inside, CG_VOLTAGE_OUTSIDE_MODEL);
     reasons |= reason_if(time_s < memory->contradicted_until_s, CG_INNOVATION_LARGE);
     reasons |= reason_if(time_s < memory->mismatch_until_s, CG_MODEL_MISMATCH);
-    reasons |= reason_if(memory->sign_log_odds < -R(SIGN_LOG_ODDS), CG_SIGN_SUSPECT);
+    reasons |= reason_if(memory->is_sign_wrong, CG_SIGN_SUSPECT);
     reasons |= reason_if(is_outside(soc_pct, model->soc_range_pct), CG_SOC_OUTSIDE_MODEL);
     reasons |= reason_if(is_outside(sample->temperature_c, model->temperature_range_c),
                          CG_TEMPERATURE_OUTSIDE_MODEL);
@@ -711,7 +724,6 @@ static void forget(cg_state *state)
     state->memory.tick = -1;
     state->memory.temperature_c = nan;
     state->memory.row_v = nan;
-    state->memory.row_drop_v = nan;
     state->memory.newton_pct = nan;
     state->memory.newton_inside = true;
     state->memory.newton_std_pct = nan;

@@ -280,9 +280,13 @@ typedef struct {
     cg_time first_s;
     int64_t tick;
     cg_real temperature_c;
-    cg_real row_v; /* voltage of the last row, and its part over the resistances */
-    cg_real row_drop_v;
-    cg_real sign_log_odds; /* that positive current discharges */
+    cg_real row_v; /* of the last row; NAN after a gap */
+    cg_real row_a;
+    cg_real steps; /* weight of the latest steps of the current, and their sums */
+    cg_real steps_v2;
+    cg_real steps_a2;
+    cg_real steps_va;
+    bool is_sign_wrong;
     cg_real newton_pct;
     cg_real newton_std_pct;
     bool newton_inside;

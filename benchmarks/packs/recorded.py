@@ -166,7 +166,7 @@ def _as_pack(
 ) -> cangauge.Log:
     """Return the log of a cell as that of a pack of equal cells, its SoC counted from the start."""
     log = cangauge.read_log(path)
-    soc_pct = start_pct - 100.0 * counted_ah(log) / capacity_ah
+    soc_pct = np.clip(start_pct - 100.0 * counted_ah(log) / capacity_ah, 0.0, 100.0)
     return replace(
         log,
         current_a=parallel * log.current_a,

@@ -92,9 +92,9 @@ STATE: Final = _structure(
     block=_structure("l:number i:rows b:is_broken d:sums[SUMS] d:drive[EFFECTS]"),
     filter=_structure("ekf:ekf[2] i:hypotheses i:decision d:prior_log_odds", ekf=_EKF),
     memory=_structure(
-        "l:samples l:resets d:first_s l:tick d:temperature_c d:row_v d:row_drop_v"
-        " d:sign_log_odds d:newton_pct d:newton_std_pct b:newton_inside"
-        " d:voltage_model_v d:residual_v b:is_known d:filter_discharged_pct"
+        "l:samples l:resets d:first_s l:tick d:temperature_c d:row_v d:row_a d:steps"
+        " d:steps_v2 d:steps_a2 d:steps_va b:is_sign_wrong d:newton_pct d:newton_std_pct"
+        " b:newton_inside d:voltage_model_v d:residual_v b:is_known d:filter_discharged_pct"
         " d:filter_counted_s d:filter_gap_var_pct2 d:coulomb_start_pct d:coulomb_var_pct2"
         " d:coulomb_counted_s d:coulomb_moved_pct d:coulomb_gap_var_pct2 d:gap_until_s"
         " d:contradicted_until_s d:mismatch_until_s i:innovations d:innovation2[TESTED]"

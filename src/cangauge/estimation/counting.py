@@ -33,10 +33,6 @@ DRAIN_PCT_PER_HOUR = 0.05
 DRAIN_AT_MOST_PCT = 5.0
 """Self-discharge and consumers of a parked car [% per hour; %]: 1.2 % a day."""
 
-MOVED_PRIOR = 0.5
-"""Prior probability that the car was charged or driven in an unobserved interval: nothing is known
-of it, and the result is insensitive to it after a few voltages."""
-
 FASTEST_PCT_PER_HOUR = 150.0
 """Fastest unobserved change of SoC [% per hour]: a fast charger."""
 

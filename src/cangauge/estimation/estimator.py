@@ -19,7 +19,6 @@ from cangauge._typing import FloatArray
 from cangauge.errors import InputError
 from cangauge.estimation.cells import PackTick
 from cangauge.estimation.counting import (
-    MOVED_PRIOR,
     UNKNOWN_STD_PCT,
     ChargeStep,
     CoulombCounter,
@@ -71,11 +70,19 @@ MISMATCH_S: Final = 2.0 * SLOW_S
 estimate invalid [s]: twice the memory of the voltage's slow error."""
 
 ALARM: Final = 1e-6
-"""Probability of a failed test on a pack that agrees with its model and current."""
+"""Probability of a failed test on a pack that agrees with its model."""
 
-SIGN_LOG_ODDS: Final = -math.log(ALARM)
-"""Log-odds from which the current's sign counts as wrong. The sum stays within twice as much, so
-that a sign which turns is noticed after a few steps of the current."""
+STEP_C_RATE: Final = 0.05
+"""Least change of the current between rows that shows its sign [1/h]: 3 A at 60 Ah."""
+
+STEPS_MEMORY: Final = 10.0
+STEPS_AT_LEAST: Final = 6.0
+"""Steps over which voltage and current are correlated, and the weight from which that counts: some
+ten steps, or a minute of a drive."""
+
+STEPS_CORRELATION: Final = 0.9
+"""Correlation from which the current has the wrong sign [-]. With the right one it is −0.5 or less
+in all recorded drives; a skew of one to five seconds between both gives up to 0.9."""
 
 
 class Estimator:
@@ -289,8 +296,8 @@ class Estimator:
         if away_s > 0.0:
             self._predict_to_now()
             std_pct = moved_std_pct(away_s)
-            self.hypotheses.doubt(MOVED_PRIOR, std_pct, away_s, charge.parked_std_pct)
-            memory.coulomb_var_pct2 += MOVED_PRIOR * std_pct**2
+            self.hypotheses.doubt(WRONG_PRIOR, std_pct, away_s, charge.parked_std_pct)
+            memory.coulomb_var_pct2 += WRONG_PRIOR * std_pct**2
 
     def _use_row(self, sample: Sample) -> None:
         """Compare a row's voltage with the model, and add it to the open block."""
@@ -317,7 +324,7 @@ class Estimator:
                     online.drives,
                 )
             )
-            self._watch_sign(sample.voltage_v, drop_v)
+            self._watch_sign(sample)
         soc_pct = self._soc()[0]
         memory.voltage_model_v = math.nan
         if not math.isnan(soc_pct):
@@ -326,20 +333,23 @@ class Estimator:
         for reference in detect_references(self.settings, memory, sample):
             self._correct(reference)
 
-    def _watch_sign(self, voltage_v: float, drop_v: float) -> None:
-        """Weigh a step of the voltage: it goes with that of the model, or against it.
-
-        Under either sign the step is that of the model, with this sign, and an error no larger than
-        that of a voltage.
-        """
+    def _watch_sign(self, sample: Sample) -> None:
+        """Correlate the steps of voltage and current: of a battery they are opposite."""
         memory = self._memory
-        steps_v2 = (voltage_v - memory.row_v) * (drop_v - memory.row_drop_v)
-        memory.row_v, memory.row_drop_v = voltage_v, drop_v
-        if not math.isnan(steps_v2):
-            noise = self._online.noise
-            error_v2 = noise.residual_std_v**2 + noise.level_std_v**2
-            log_odds = memory.sign_log_odds + 2.0 * steps_v2 / error_v2
-            memory.sign_log_odds = min(max(log_odds, -2.0 * SIGN_LOG_ODDS), 2.0 * SIGN_LOG_ODDS)
+        step_v, step_a = sample.voltage_v - memory.row_v, sample.current_a - memory.row_a
+        memory.row_v, memory.row_a = sample.voltage_v, sample.current_a
+        if math.isnan(step_v) or abs(step_a) < STEP_C_RATE * self.capacity_ah:
+            return
+        keep = 1.0 - 1.0 / STEPS_MEMORY
+        memory.steps = keep * memory.steps + 1.0
+        memory.steps_v2 = keep * memory.steps_v2 + step_v * step_v
+        memory.steps_a2 = keep * memory.steps_a2 + step_a * step_a
+        memory.steps_va = keep * memory.steps_va + step_v * step_a
+        limit_va = STEPS_CORRELATION * math.sqrt(memory.steps_v2 * memory.steps_a2)
+        if memory.steps_va < 0.0:
+            memory.is_sign_wrong = False
+        elif memory.steps >= STEPS_AT_LEAST and memory.steps_va > limit_va:
+            memory.is_sign_wrong = True
 
     def _close_block(self, time_s: float) -> None:
         """Correct the filter by the open block, and test its innovation."""
@@ -485,7 +495,7 @@ class Estimator:
             (not memory.newton_inside, Reason.VOLTAGE_OUTSIDE_MODEL),
             (time_s < memory.contradicted_until_s, Reason.INNOVATION_LARGE),
             (time_s < memory.mismatch_until_s, Reason.MODEL_MISMATCH),
-            (memory.sign_log_odds < -SIGN_LOG_ODDS, Reason.SIGN_SUSPECT),
+            (memory.is_sign_wrong, Reason.SIGN_SUSPECT),
         ):
             if is_set:
                 bits |= int(reason)

@@ -198,10 +198,14 @@ class EstimatorMemory:
     temperature_c: _MaybeNan = math.nan
     """Last known temperature since the last unobserved interval [°C]."""
     row_v: _MaybeNan = math.nan
-    row_drop_v: _MaybeNan = math.nan
-    """Voltage of the last row, and its part over the resistances; NaN after a gap [V]."""
-    sign_log_odds: _Finite = 0.0
-    """Log-odds that positive current discharges, by the steps of the voltage."""
+    row_a: _Finite = 0.0
+    """Voltage and current of the last row; NaN after a gap [V, A]."""
+    steps: _NotNegative = 0.0
+    steps_v2: _NotNegative = 0.0
+    steps_a2: _NotNegative = 0.0
+    steps_va: _Finite = 0.0
+    """Weight of the latest steps of the current, and their sums [V², A², V·A]."""
+    is_sign_wrong: _Flag = False
     newton_pct: _MaybeNan = math.nan
     """SoC by inverse of the voltage model at the last row [%]."""
     newton_std_pct: _MaybeNan = math.nan

@@ -455,6 +455,7 @@ def _fit_published(
         equation="published",
         published=published.fields(epsilon, t_ref_c, delay_s),
         functions=FunctionFields.of(
+            fields["chemistry"],
             jacobian @ published.covariance @ jacobian.T,
             usual_loads(fields["capacity_ah"], len(delay_s)),
         ),

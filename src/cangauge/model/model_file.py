@@ -154,9 +154,10 @@ class FunctionFields(Fields):
     """Part of each function in the coefficients of the load columns."""
 
     @classmethod
-    def of(cls, covariance: FloatArray, loads: FloatArray) -> Self:
+    def of(cls, chemistry: ChemistryName, covariance: FloatArray, loads: FloatArray) -> Self:
         """Return a covariance of knots and load coefficients (`prior.principal_functions`)."""
-        functions, n = principal_functions(covariance, loads), KNOTS_PCT.size
+        number, n = CHEMISTRIES[chemistry].functions, KNOTS_PCT.size
+        functions = principal_functions(covariance, loads, number)
         curve_v, load = functions[:, :n].tolist(), functions[:, n:].tolist()
         return cls(soc_pct=KNOTS_PCT.tolist(), curve_v=curve_v, load=load)
 
@@ -467,7 +468,7 @@ class Model(Fields):
                 resistance_ohm=ohm,
                 arrhenius=Arrhenius(b, tuple(r0_ohm.tolist()), known.mean_c),
             ),
-            functions=FunctionFields.of(known.covariance[:p, :p], loads),
+            functions=FunctionFields.of(fields["chemistry"], known.covariance[:p, :p], loads),
             noise=Noise.of(
                 fields["chemistry"], known.mean_v, known.residual_v, judged, known.scale
             ),

@@ -87,8 +87,6 @@ SLOW_SHARE: Final = 0.4
 FAST_FLOOR: Final = 0.0003
 """Least noise of a block's mean, relative to the mean voltage [-]: development packs."""
 
-FUNCTIONS: Final = 8
-"""Principal functions that a filter carries: twelve change no mean error by 0.1 % (development)."""
 TYPICAL_C_RATE: Final = 1.0 / 3.0
 """Current of a drive [1/h] by which the functions weigh errors of resistances: 20 A at 60 Ah."""
 TYPICAL_K: Final = 10.0
@@ -116,6 +114,8 @@ class Chemistry:
         Voltage error that lasts a log, and 300 s, relative to V0.
     fast_factor : float
         Noise of a block's mean in units of the residuals of the fit.
+    functions : int
+        Principal functions that a filter carries: more change no mean error by 0.1 %.
     cold_exponent : float
         Level, slow and fast noise grow as max(1, a(T)) to this power below 20 °C: model errors are
         polarization, so they grow with the resistance.
@@ -129,6 +129,7 @@ class Chemistry:
     level_std: float
     slow_std: float
     fast_factor: float
+    functions: int
     cold_exponent: float
 
 
@@ -200,6 +201,7 @@ CHEMISTRIES: Final[Mapping[ChemistryName, Chemistry]] = {
         level_std=0.0018,
         slow_std=0.0014,
         fast_factor=1.0,
+        functions=8,
         cold_exponent=1.5,
     ),
     "lfp": Chemistry(
@@ -211,6 +213,7 @@ CHEMISTRIES: Final[Mapping[ChemistryName, Chemistry]] = {
         level_std=0.008,
         slow_std=0.006,
         fast_factor=6.0,
+        functions=12,
         cold_exponent=0.0,
     ),
 }
@@ -313,7 +316,7 @@ class PackPrior:
         return Distribution(mean, covariance, -h_mean, RESIDUAL_STD * mean_v, mean_v, REFERENCE_C)
 
 
-def principal_functions(covariance: FloatArray, loads: FloatArray) -> FloatArray:
+def principal_functions(covariance: FloatArray, loads: FloatArray, number: int) -> FloatArray:
     """Return the joint principal functions of the coefficients' covariance, shape (n, p).
 
     They explain most of the variance of the voltage, over all SoC and the loads of a usual drive.
@@ -324,6 +327,8 @@ def principal_functions(covariance: FloatArray, loads: FloatArray) -> FloatArray
         Of the knots and the coefficients of the load columns.
     loads : array of shape (k,)
         Usual sizes of the load columns (`usual_loads`).
+    number : int
+        n.
     """
     basis = hermite_basis(np.linspace(0.0, 100.0, 401))
     n = KNOTS_PCT.size
@@ -332,7 +337,7 @@ def principal_functions(covariance: FloatArray, loads: FloatArray) -> FloatArray
     weight[n:, n:] = np.diag(loads**2)
     root = np.linalg.cholesky(weight)
     variance, direction = np.linalg.eigh(root.T @ covariance @ root)
-    first = np.argsort(variance)[::-1][:FUNCTIONS]
+    first = np.argsort(variance)[::-1][:number]
     scaled = direction[:, first] * np.sqrt(np.maximum(variance[first], 0.0))
     return np.asarray(np.linalg.solve(root.T, scaled).T)
 
