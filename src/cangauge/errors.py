@@ -90,7 +90,7 @@ class InputError(CangaugeError):
         )
 
 
-_OPTION: Final = re.compile(r"--([a-z]+(?:-[a-z]+)*)( (?='))?")
+_OPTION: Final = re.compile(r"--([a-z]+(?:-[a-z]+)*)( (?=['\d]))?")
 _ARGUMENTS: Final = {
     "temperature": "temperature_c",
     "initial-soc": "initial_soc_pct",

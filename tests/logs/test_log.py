@@ -135,7 +135,7 @@ def table(**columns: object) -> pa.Table:
 @pytest.mark.parametrize(
     ("columns", "field", "words"),
     [
-        ({"temperature_c": None}, "temperature_c", "holds no temperature.*temperature_c 25$"),
+        ({"temperature_c": None}, "temperature_c", "holds no temperature.*temperature_c=25$"),
         ({"current_a": [1.0, None, 3.0]}, "current_a", "1 of 3 rows lack .*first is row 2"),
         ({"current_a": [True, False, True]}, "current_a", "does not hold numbers .got 'bool'"),
         ({"temperature_source": ["cell", "room", ""]}, "temperature_source", "one word"),
