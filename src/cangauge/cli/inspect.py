@@ -157,7 +157,7 @@ def _show_capture(found: CaptureInspection) -> None:
         gap = max(found.gaps, key=lambda gap: gap.length_s)
         others = f", the longest of {len(found.gaps)}" if len(found.gaps) > 1 else ""
         say(f"Silence of {gap.length_s:.3g} s after {gap.start_s - found.start_s:.1f} s{others}.")
-    for line in info.remarks:
+    for line in info.remarks if found.log is None else ():  # the log's hold them
         say(f"Remarks: {line}")
     if found.log is not None:
         _show_log(found.log)

@@ -377,7 +377,7 @@ def _show(proposal: Proposal, files: Sequence[str], reading: str, model: Path) -
     from cangauge.extras.discovery.by_name import NamedSignal
     from cangauge.extras.discovery.candidate import range_text
 
-    say(f"{proposal.answer}: wrote {' and '.join(files)}.")
+    say(f"{proposal.answer}: wrote {', '.join(files)}.")
     _show_candidates(proposal)
     if proposal.proof:
         amps, volts = proposal.proof["current_a"], proposal.proof["voltage_v"]
