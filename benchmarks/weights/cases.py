@@ -1,28 +1,29 @@
-"""Draw cases: which logs, which references, which effect at which size, all from one seed.
+"""Draw cases: which logs, which references, which fault at which size, all from one seed.
 
 A *split* is a choice of diagnosed logs and references of one pack. Its cases inject one effect each
 into those logs. The size of an effect is the RMS change of voltage that it makes, in floors; a
-floor is the RMS error of left-out references. Healthy cases are the logs as they are.
+floor is the RMS error of left-out references. Healthy cases are the logs as they are. A plan holds
+the sizes, so that a drawn case never depends on the engine that it tests.
 """
 
 from __future__ import annotations
 
 import pickle
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from benchmarks.pybamm_plant import draw_pybamm_plant
-from benchmarks.weights import engine, packs
+from benchmarks.weights import packs
 
+from cangauge._typing import FloatArray
 from cangauge.extras.validation.twin.drive import draw_drive
 from cangauge.extras.validation.twin.faults import Fault, fault_kind, fault_kinds
 from cangauge.extras.validation.twin.injection import fit_surrogate_pack, inject
 from cangauge.extras.validation.twin.pack import TwinPack, draw_pack
-from cangauge.extras.validation.twin.plant import Plant, TwinPlant
+from cangauge.extras.validation.twin.plant import TwinPlant
 from cangauge.extras.validation.twin.recording import record_drive, rms
 from cangauge.logs.log import Log
 
@@ -30,72 +31,101 @@ FLOORS = (0.4, 5.0)
 """Sizes are drawn uniformly in the logarithm between these [floors]."""
 LEAST_FLOORS = 0.3
 """A case whose physical limits allow less than this is not drawn."""
-EFFECTS = tuple(kind.id for kind in fault_kinds())
+EFFECTS: dict[str, tuple[str, ...]] = {
+    "voltage_reading": ("voltage_offset", "voltage_gain"),
+    "current_reading": ("current_offset", "current_gain"),
+    "start": ("initial_soc",),
+    "capacity": ("capacity", "coulombic_efficiency"),
+    "clock": ("time_skew",),
+    "temperature": (
+        "temperature_offset",
+        "temperature_lag",
+        "core_temperature",
+        "entropic_coefficient",
+    ),
+    "resistance": (
+        "resistance_growth",
+        "resistance_growth",
+        "resistance_step",
+        "resistance_temperature",
+        "resistance_soc",
+        "resistance_asymmetry",
+        "charge_transfer",
+        "fast_polarization",
+    ),
+    "slow_voltage": ("slow_diffusion", "hysteresis"),
+    "weak_cell": ("weak_cell",),
+}
+"""Fault → its effects, drawn alike; the commonest of all, a grown resistance, twice."""
 OUTSIDE = tuple(kind.id for kind in fault_kinds(outside=True))
+OUTSIDE_SHARE = 0.1
+COUNTS = (1, 1, 1, 2, 2, 3, 4, 6)
+"""Numbers of diagnosed logs."""
+REFERENCES = (3, 20)
 PER_SPLIT = 5
 NUMBERS = {
     "weights": {
-        "i3": (200, 60, 20), "i3_winter": (80, 16, 6), "lg_25": (80, 16, 8), "lg_cold": (80, 16, 8),
-        "car1": (120, 36, 12), "a123": (60, 18, 6), "leaf": (28, 8, 0), "simulated": (160, 40, 20),
-        "pybamm": (60, 16, 8),
+        "i3": 30, "i3_winter": 12, "lg_25": 8, "lg_cold": 12, "car1": 24, "a123": 12, "leaf": 4,
+        "simulated": 24,
     },
     "frozen": {
-        "i3": (60, 24, 6), "i3_winter": (20, 8, 0), "lg_25": (20, 8, 3), "lg_cold": (20, 10, 0),
-        "lg_40": (20, 8, 0), "car1": (40, 18, 3), "simulated": (60, 18, 8), "pybamm": (20, 8, 2),
+        "i3": 24, "i3_winter": 8, "lg_25": 6, "lg_cold": 10, "lg_40": 8, "car1": 16,
+        "simulated": 14,
     },
 }  # fmt: skip
-"""Cases of each data set: with an effect of the library, healthy, with an effect outside it."""
+"""Splits of each data set."""
+DRIVES = 24
+"""Drives of a simulated pack."""
 
 
-def plan(part: str, data: Path, seed: int) -> list[dict[str, Any]]:
-    """Draw the splits of a part with their cases: names and numbers only, as JSON."""
-    out = []
-    of_name = {x.name: x for x in packs.recorded(data, part)}
-    for name, (effects, healthy, outside) in NUMBERS[part].items():
-        rng = np.random.default_rng([seed, zlib.crc32(name.encode())])
-        causes: list[str | None] = [EFFECTS[k % len(EFFECTS)] for k in range(effects)]
-        causes += [str(x) for x in rng.choice(OUTSIDE, outside)]
-        causes = [causes[k] for k in rng.permutation(len(causes))]
-        splits = max(healthy, -(-len(causes) // PER_SPLIT))
-        for number in range(splits):
-            mine = causes[number::splits] + [None] * (number < healthy)
-            item: dict[str, Any] = {"pack": name, "seed": int(rng.integers(2**31))}
-            count = int(rng.choice([1, 1, 2]))
-            if name in of_name:
-                pack = of_name[name]
-                few, most = pack.references
-                order = [pack.logs[k].name for k in rng.permutation(len(pack.logs))]
-                count = min(count, len(order) - few)
-                refs = int(rng.integers(few, min(most, len(order) - count) + 1))
-                item |= {"logs": order[:count], "references": order[count : count + refs]}
-            else:
-                pool = (packs.SIMULATED if name == "simulated" else packs.PYBAMM)[part]
-                item |= {"plant": int(pool[number % len(pool)]), "logs": count, "references": 4}
-            item["cases"] = [_case(cause, rng) for cause in mine]
-            out.append(item)
-    return out
+@dataclass(frozen=True)
+class Injection:
+    """One effect of one size, as the twin or a sensor would show it."""
 
+    effect: str
+    size: float
+    shape: dict[str, float]
+    seed: int
 
-def _case(cause: str | None, rng: np.random.Generator) -> dict[str, Any]:
-    low, high = np.log(FLOORS)
-    floors, sign = float(np.exp(rng.uniform(low, high))), float(rng.choice([-1.0, 1.0]))
-    if cause is None:
-        return {"effect": None}
-    sign = sign if fault_kind(cause).signed else 1.0
-    return {
-        "effect": cause,
-        "floors": round(floors, 3),
-        "sign": sign,
-        "seed": int(rng.integers(2**31)),
-    }
+    def into(self, log: Log, pack: TwinPack) -> tuple[Log, FloatArray]:
+        """Return the log with the effect, and the gap that it opens [V]."""
+        if self.effect == "temperature_offset":
+            return self._warmer(log, pack)
+        if self.effect == "resistance_growth":
+            gap_v = -self.size * log.current_a
+            return replace(log, voltage_v=log.voltage_v + gap_v), gap_v
+        fault = Fault(self.effect, self.size, self.shape, self.seed)
+        injected = inject(log, [fault], pack)
+        changed = injected.log
+        if log.soc_pct is not None and np.isfinite(log.soc_pct).sum() > 1:
+            changed = replace(changed, soc_pct=log.soc_pct)
+        return changed, injected.gap_v
+
+    def _warmer(self, log: Log, pack: TwinPack) -> tuple[Log, FloatArray]:
+        """Return the log with a thermometer that reads too high."""
+        warmer = replace(log, temperature_c=log.temperature_c + self.size)
+        ohm = pack.resistance_ohm * packs.PER_K * self.size
+        return warmer, -ohm * log.current_a + packs.ENTROPY_PER_K * pack.nominal_v * self.size
+
+    def limits(self, pack: TwinPack) -> tuple[float, float]:
+        """Return the smallest and the largest physical size."""
+        if self.effect == "temperature_offset":
+            return 0.5, 15.0
+        if self.effect == "resistance_growth":
+            return 0.01 * pack.resistance_ohm, 2.0 * pack.resistance_ohm
+        return fault_kind(self.effect).limits(pack)
+
+    def is_signed(self) -> bool:
+        """Whether the size may be negative."""
+        if self.effect in ("temperature_offset", "resistance_growth"):
+            return self.effect == "temperature_offset"
+        return fault_kind(self.effect).signed
 
 
 @dataclass
 class Drawn:
     """One case, ready for a diagnosis."""
 
-    pack: str
-    world: str
     logs: list[Log]
     truth: dict[str, Any]
 
@@ -106,10 +136,110 @@ class Split:
 
     pack: str
     world: str
+    chemistry: str
+    cells: int
     capacity_ah: float
     floor_v: float
     references: list[Log]
     cases: list[Drawn]
+
+
+def plan(part: str, data: Path, folder: Path, seed: int, floor_of: Callable[..., float]) -> None:
+    """Draw the splits of a part with their cases, sized, one file each.
+
+    `floor_of` returns the RMS error of left-out references [V] of logs and a capacity.
+    """
+    of_name = {x.name: x for x in packs.recorded(data, part)}
+    folder.mkdir(parents=True, exist_ok=True)
+    number = 0
+    for name, splits in NUMBERS[part].items():
+        for k in range(splits):
+            number += 1
+            file = folder / f"{number:03d}_{name}.pkl"
+            if file.exists():
+                continue
+            rng = np.random.default_rng([seed, zlib.crc32(name.encode()), k])
+            if name in of_name:
+                pack, own = of_name[name], None
+            else:
+                seeds = packs.SIMULATED[part]
+                pack, own = made_pack(seeds[k % len(seeds)], folder)
+            split = _draw(pack, own, rng, floor_of)
+            file.write_bytes(pickle.dumps(split))
+            print(f"{number:3d} {name:10s} {len(split.cases)} cases", flush=True)
+
+
+def _draw(
+    pack: packs.PackLogs,
+    own: TwinPack | None,
+    rng: np.random.Generator,
+    floor_of: Callable[..., float],
+) -> Split:
+    order = [pack.logs[k] for k in rng.permutation(len(pack.logs))]
+    few = pack.references[0]
+    count = min(int(rng.choice(COUNTS)), len(order) - few)
+    most = min(REFERENCES[1], len(order) - count)
+    number = round(float(np.exp(rng.uniform(np.log(few), np.log(most + 0.49)))))
+    keeps_soc = bool(rng.random() < 0.5)
+    chosen = order if keeps_soc else [_start_alone(log) for log in order]
+    logs, references = chosen[:count], chosen[count : count + number]
+    surrogate = own or fit_surrogate_pack(
+        pack.logs, capacity_ah=pack.capacity_ah, cells=pack.cells, name=pack.name
+    )
+    floor_v = floor_of(references, pack.capacity_ah)
+    cases = [Drawn(logs, {"effect": None, "fault": "none"})]
+    for _ in range(PER_SPLIT):
+        drawn = _case(logs, surrogate, floor_v, rng)
+        if drawn is not None:
+            cases.append(drawn)
+    return Split(
+        pack.name,
+        pack.world,
+        "lfp" if pack.name == "a123" else "oxide",
+        pack.cells,
+        pack.capacity_ah,
+        floor_v,
+        references,
+        cases,
+    )
+
+
+def _start_alone(log: Log) -> Log:
+    row, start_pct = log.first_soc()
+    soc = np.full(len(log), np.nan)
+    soc[row] = start_pct
+    return replace(log, soc_pct=soc)
+
+
+def _case(
+    logs: Sequence[Log], pack: TwinPack, floor_v: float, rng: np.random.Generator
+) -> Drawn | None:
+    fault = str(rng.choice(list(EFFECTS)))
+    effect = str(rng.choice(EFFECTS[fault]))
+    if rng.random() < OUTSIDE_SHARE:
+        fault, effect = "unknown", str(rng.choice(OUTSIDE))
+    floors = float(np.exp(rng.uniform(*np.log(FLOORS))))
+    sign, seed = float(rng.choice([-1.0, 1.0])), int(rng.integers(2**31))
+    shape = {}
+    if effect == "resistance_step":
+        shortest_s = min(log.duration_s for log in logs)
+        shape = {"at_s": float(rng.uniform(0.2, 0.7)) * shortest_s}
+    unit = Injection(effect, 1.0, shape, seed)
+    if effect == "initial_soc" and max(log.first_soc()[1] for log in logs) > 80.0:
+        sign = -1.0  # a full pack cannot be fuller
+    sign = sign if unit.is_signed() else 1.0
+
+    def gap_of(size: float) -> float:
+        sized = replace(unit, size=sign * size)
+        return rms(np.concatenate([sized.into(log, pack)[1] for log in logs]))
+
+    size, gap = _sized(gap_of, unit.limits(pack), floors * floor_v)
+    if not gap >= LEAST_FLOORS * floor_v:
+        return None
+    found = replace(unit, size=sign * size)
+    changed = [found.into(log, pack)[0] for log in logs]
+    truth = {"effect": effect, "fault": fault, "size": found.size, "floors": gap / floor_v}
+    return Drawn(changed, truth | {"ohm": pack.resistance_ohm})
 
 
 def _sized(
@@ -118,102 +248,35 @@ def _sized(
     """Return size and gap [V]: secants in the logarithm, within limits, to 10 %."""
     low, high = limits
     size = float(np.sqrt(low * high))
-    best, slope, last = (size, gap_of(size)), 1.0, None
-    for _ in range(5):
-        gap = best[1] if last is None else last[1]
-        at = best[0] if last is None else last[0]
+    gap, slope = gap_of(size), 1.0
+    best = size, gap
+    for _ in range(4):
         if abs(np.log(gap / target_v)) < 0.1:
             break
-        new = float(np.clip(at * (target_v / max(gap, 1e-9)) ** (1 / slope), low, high))
-        if new == at:
+        new = float(np.clip(size * (target_v / max(gap, 1e-9)) ** (1 / slope), low, high))
+        if new == size:
             break
         found = gap_of(new)
-        if np.isfinite(found) and abs(np.log(new / at)) > 1e-3:
-            slope = float(
-                np.clip(np.log(max(found, 1e-9) / max(gap, 1e-9)) / np.log(new / at), 0.3, 4.0)
-            )
-        last = (new, found) if np.isfinite(found) else (float(np.sqrt(new * low)), gap)
-        if np.isfinite(found) and abs(np.log(max(found, 1e-9) / target_v)) < abs(
-            np.log(max(best[1], 1e-9) / target_v)
-        ):
-            best = (new, found)
+        if not np.isfinite(found):
+            break
+        if abs(np.log(new / size)) > 1e-3:
+            ratio = np.log(max(found, 1e-9) / max(gap, 1e-9)) / np.log(new / size)
+            slope = float(np.clip(ratio, 0.3, 4.0))
+        size, gap = new, found
+        if abs(np.log(max(gap, 1e-9) / target_v)) < abs(np.log(max(best[1], 1e-9) / target_v)):
+            best = size, gap
     return best
 
 
-def _fault(case: dict[str, Any], shortest_s: float, fullest_pct: float) -> Fault:
-    kind, sign = fault_kind(case["effect"]), case["sign"]
-    if kind.id == "initial_soc" and fullest_pct > 80.0:
-        sign = -1.0  # a full pack cannot be fuller
-    shape = {}
-    if "at_s" in kind.shape:
-        shape = {"at_s": (0.2 + 0.5 * np.random.default_rng(case["seed"]).random()) * shortest_s}
-    return Fault(kind.id, sign, shape, case["seed"])
-
-
-def _start(log: Log) -> float:
-    return float(log.soc_pct[np.flatnonzero(np.isfinite(log.soc_pct))[0]])
-
-
-def draw_recorded(item: dict[str, Any], pack: packs.PackLogs, own: TwinPack | None = None) -> Split:
-    """Inject the effects of a split into recorded logs."""
-    by_name = {log.name: log for log in pack.logs}
-    logs, references = ([by_name[x] for x in item[key]] for key in ("logs", "references"))
-    surrogate = own or fit_surrogate_pack(
-        pack.logs, capacity_ah=pack.capacity_ah, cells=pack.cells, name=pack.name
-    )
-    floor_v = engine.floor_v(references, pack.capacity_ah)
-    cases = []
-    for case in item["cases"]:
-        changed, truth = logs, dict(case)
-        if case["effect"] is not None:
-            unit = _fault(case, min(x.duration_s for x in logs), max(map(_start, logs)))
-
-            def gap_of(size: float, unit: Fault = unit) -> float:
-                faults = [unit.sized(np.sign(unit.size) * size)]
-                return rms(np.concatenate([inject(x, faults, surrogate).gap_v for x in logs]))
-
-            size, gap = _sized(gap_of, unit.kind.limits(surrogate), case["floors"] * floor_v)
-            if gap < LEAST_FLOORS * floor_v:
-                continue
-            fault = unit.sized(np.sign(unit.size) * size)
-            changed = [inject(x, [fault], surrogate).log for x in logs]
-            truth |= {"size": fault.size, "unit": fault.kind.unit, "reached": gap / floor_v}
-        cases.append(Drawn(pack.name, pack.world, [_thin(x) for x in changed], truth))
-    return Split(
-        pack.name, pack.world, pack.capacity_ah, floor_v, [_thin(x) for x in references], cases
-    )
-
-
-def _thin(log: Log) -> Log:
-    return packs.thinned(log, 1.0)
-
-
-def made_pack(plant_name: str, seed: int, folder: Path) -> tuple[packs.PackLogs, TwinPack | None]:
-    """Simulate ten healthy drives of a pack, once; they take faults as recorded logs do.
-
-    The faults of a twin's pack act on its own physics, those of a PyBaMM pack on a surrogate.
-    """
-    file = folder / f"{plant_name}_{seed}.pkl"
+def made_pack(seed: int, folder: Path) -> tuple[packs.PackLogs, TwinPack]:
+    """Simulate healthy drives of a pack, once; a fault acts on its own physics."""
+    file = folder / f"pack_{seed}.pickle"
     if not file.exists():
         rng = np.random.default_rng([seed, 1])
-        drawn = draw_pack(rng)
-        plant: Plant = TwinPlant(drawn)
-        if plant_name == "pybamm":
-            plant = draw_pybamm_plant(rng, drawn)
-        middle = 16.0 if plant_name == "pybamm" else rng.uniform(8.0, 25.0)
-        ambient = rng.permutation(np.linspace(middle - 9.0, middle + 9.0, 9))
+        plant = TwinPlant(draw_pack(rng))
+        middle_c = float(rng.uniform(8.0, 25.0))
+        ambient = rng.permutation(np.linspace(middle_c - 9.0, middle_c + 9.0, DRIVES))
         drives = [
-            draw_drive(
-                rng,
-                plant.pack,
-                hours=2.0,
-                ambient_c=float(middle),
-                start_soc=1.0,
-                end_soc=0.05,
-                discharge=True,
-            )
-        ]
-        drives += [
             draw_drive(rng, plant.pack, hours=float(rng.uniform(0.5, 1.2)), ambient_c=float(c))
             for c in ambient
         ]
@@ -224,34 +287,7 @@ def made_pack(plant_name: str, seed: int, folder: Path) -> tuple[packs.PackLogs,
         exact = replace(
             plant.pack.sensors, current_step_a=0.0, voltage_step_v=0.0, temperature_step_k=0.0
         )
-        own = replace(plant.pack, sensors=exact) if plant_name == "simulated" else None
+        own = replace(plant.pack, sensors=exact)
         file.write_bytes(pickle.dumps((logs, plant.pack.capacity_ah, plant.pack.cells, own)))
     logs, capacity_ah, cells, own = pickle.loads(file.read_bytes())
-    return packs.PackLogs(plant_name, plant_name, logs, capacity_ah, cells, (4, 4)), own
-
-
-def draw_one(items: list[dict[str, Any]], number: int, part: str, data: Path, folder: Path) -> None:
-    """Draw one split of a plan into a folder, once."""
-    folder.mkdir(parents=True, exist_ok=True)
-    of_name = {x.name: x for x in packs.recorded(data, part)}
-    item = items[number]
-    if not item["pack"]:
-        return
-    file = folder / f"{number:03d}_{item['pack']}.pkl"
-    if not file.exists():
-        if item["pack"] in of_name:
-            split = draw_recorded(item, of_name[item["pack"]])
-        else:
-            pack, own = made_pack(item["pack"], item["plant"], folder)
-            rng = np.random.default_rng([item["seed"], 3])
-            names = [
-                pack.logs[0].name,
-                *(pack.logs[k].name for k in 1 + rng.permutation(len(pack.logs) - 1)),
-            ]
-            few = item["references"]
-            split = draw_recorded(
-                {**item, "references": names[:few], "logs": names[few : few + item["logs"]]},
-                pack,
-                own,
-            )
-        file.write_bytes(pickle.dumps(split))
+    return packs.PackLogs("simulated", "simulated", logs, capacity_ah, cells, (3, 20)), own

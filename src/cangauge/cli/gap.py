@@ -6,6 +6,7 @@ import importlib
 import os
 import sys
 from collections.abc import Callable, Iterable, Mapping
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from runpy import run_path
@@ -31,13 +32,12 @@ from cangauge.errors import InputError
 if TYPE_CHECKING:
     from cangauge._typing import FloatArray
     from cangauge.diagnosis import Diagnosis
-    from cangauge.diagnosis.planner import Plan
     from cangauge.logs.log import Log
 
 
 @command()
 def gap_command(
-    logs: Annotated[list[Path], argument("LOG", "Logs to diagnose; one cause is sought for all.")],
+    logs: Annotated[list[Path], argument("LOG", "Logs to diagnose; one fault is sought for all.")],
     *,
     model: Annotated[
         Path | None, option("-m, --model", "MODEL", "Model file; not needed for a simulator.")
@@ -77,7 +77,7 @@ def gap_command(
         option(
             "--extended",
             "MODEL.json",
-            "Write the model, extended by the cause.",
+            "Write the corrected model.",
             suffixes=(".json",),
         ),
     ] = None,
@@ -130,13 +130,14 @@ def gap_command(
     report: Annotated[Path | None, REPORT] = None,
     json_output: Annotated[bool, JSON] = False,
 ) -> None:
-    """Diagnose the gap between a model and logs: how large, where, what to check first.
+    """Diagnose the gap between a model and logs: which of nine faults, how large, what to do.
 
-    The answer begins with the group of causes to look at, and names a single cause only where one
-    stands out. A gap is reported where the probability of none is at most --alarm. The
-    documentation states how often each answer is right. Give at least three references, better
-    more; without any, the error stated in the model file counts as normal. A log needs 10 minutes,
-    better an hour, with changing load and SoC. Positive current discharges.
+    Three lines answer: the fault, its size and likelihood; the error as it is, with the fault
+    corrected, and of healthy logs; and what to do first. Where the model misses the references
+    themselves, that comes before. A gap is reported where the probability of none is at most
+    --alarm. Give at least three references, better ten; without any, the error stated in the model
+    file counts as normal. A log needs 10 minutes, better an hour, with changing load and SoC; three
+    logs tell much more than one. Positive current discharges.
 
     Examples
     --------
@@ -150,7 +151,6 @@ def gap_command(
     --reference good2.csv --reference good3.csv`
     """
     from cangauge.diagnosis import diagnose
-    from cangauge.diagnosis.planner import plan as plan_next
     from cangauge.identify.starts import with_start
     from cangauge.model.model_file import Model
 
@@ -178,25 +178,23 @@ def gap_command(
             capacity_ah=capacity_ah,
             alarm=alarm,
         )
-        before = steps = None
+        before = None
         if added:
-            before = diagnose(found.logs[: len(logs)], found.model, found.known, alarm=alarm)
-        if plan:
-            steps = plan_next(found.known, found.columns, found.evidence, found.posterior)
+            before = diagnose(found.logs[: len(logs)], found.model, found.healthy, alarm=alarm)
     texts = {}
-    if extended is not None:
+    if extended is not None and found.is_written:
         texts[extended] = found.extended_model.to_json()
+        found = replace(found, correction_path=str(extended))
     if report is not None:
-        texts[report] = extra("report.diagnosis:gap_page")(found, model, steps).html()
+        texts[report] = extra("report.diagnosis:gap_page")(found, model).html()
     write_texts_atomic(texts)
-    result = found.to_json(None if extended is None else str(extended))
+    result = found.to_json()
     result["assumed"] = assumed_of(read)
     if before is not None:
         names = [log.name for log in read[len(logs) : len(paths)]]
-        result["added_test"] = {"logs": names, "before": dict(before.posterior.probabilities)}
-    if steps is not None:
-        result["plan"] = steps.to_dict()
-    finish(result, partial(_show, found, result, before, steps, texts), as_json=json_output)
+        probabilities = {"none": before.posterior.none, **before.posterior.faults}
+        result["added_test"] = {"logs": names, "before": probabilities}
+    finish(result, partial(_show, found, before, plan, texts), as_json=json_output)
 
 
 def _refuse(
@@ -280,39 +278,18 @@ def load_function(text: str) -> Callable[..., Any]:
     raise InputError(problem, field="--simulator", value=text, cure=cure)
 
 
-def _show(
-    found: Diagnosis,
-    result: Mapping[str, Any],
-    before: Diagnosis | None,
-    steps: Plan | None,
-    written: Iterable[Path],
-) -> None:
-    """Print the answer, the candidates, what the logs cannot show, and the next steps."""
-    from cangauge.diagnosis.sentences import SHOWN, candidate_rows, plan_rows
+def _show(found: Diagnosis, before: Diagnosis | None, plan: bool, written: Iterable[Path]) -> None:
+    """Print the answer, all faults, and what limits the answer."""
+    from cangauge.diagnosis.text import fault_rows, plan_text
 
     say(found.summary)
     if before is not None:
-        say(f"Without the added test: {before.headline}")
-    print_table("Causes", *candidate_rows(result, SHOWN))
-    if found.caveats:
-        say("\n- ".join(["What these logs cannot show:", *found.caveats]))
-    if steps is not None:
-        say(steps.sentence)
-        if steps.steps:
-            print_table("Possible next steps, best first", *plan_rows(steps))
-    held = _content(found)
+        say(f"Without the added test: {before.summary.splitlines()[0]}")
+    if plan:
+        say(plan_text(found))
+    print_table("Faults", *fault_rows(found))
+    say("\n- ".join(["What limits this answer:", *found.caveats]))
     for path in written:
-        note(f"wrote {path}{f': {held}' if str(path) == result['extended_model'] else ''}")
-
-
-def _content(found: Diagnosis) -> str:
-    """Return what the file of the extended model holds."""
-    from cangauge.diagnosis.extended import LOG_EFFECTS
-    from cangauge.diagnosis.sentences import percent
-
-    if (cause := found.accepted) is None:
-        return "the model as given, since no cause is accepted"
-    sure = f"{cause} (probability {percent(found.posterior.effects[cause])})"
-    if cause in LOG_EFFECTS:
-        return f"the model as given, since the cause, {sure}, is in these logs"
-    return f"the model with {sure}"
+        note(f"wrote {path}")
+    if found.correction_path is None and not found.is_written:
+        note(f"no corrected model: {found.why_not}")

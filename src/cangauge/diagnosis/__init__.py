@@ -1,4 +1,4 @@
-"""Diagnosis: size, place and cause of the gap between a model and logs.
+"""Diagnosis: size, place and fault of the gap between a model and logs.
 
     >>> from cangauge.diagnosis import diagnose
     >>> found = diagnose(logs, model, references)  # doctest: +SKIP
@@ -6,39 +6,41 @@
 
 Modules, from the bottom up:
 
-=========  ====================================================================================
-pack_fit   1 Hz signals; curve and structure of a pack by a ridge fit of the references
-trials     every effect: undone at a size, and as a column
-columns    columns of one log on the rows that count, and their products
-evidence   what references show; evidence, size and remaining error of every effect
-answer     one posterior of none, unknown and the library; groups, names, what to check
-extended   the cause as parameters of the model's effects; the extended model, judged
-where      shares of the error over SoC, current, temperature, time and time scale
-checks     logs that cannot be diagnosed
-sentences  what a user reads
-diagnose   `diagnose` and its result, `Diagnosis`
-simulator  the same for any simulator's voltage
-=========  ====================================================================================
+===========  ==================================================================================
+rows         a log at 1 Hz, and what a model with an effect misses on it
+shapes       every effect of the model library as columns
+pack         the healthy pack: the model corrected by references, and how healthy logs differ
+evidence     evidence, size and remaining error of every effect
+sizes        the same by simulation, and sizes found without the rows that are judged
+posterior    one calibrated posterior of none, unknown and nine faults
+where        excess of the error over SoC, temperature, current, rest and time
+faults       what a user reads of each fault, and the measurement to do first
+correction   the model with an effect, judged on left-out rows
+model_check  whether the model describes the healthy logs, and what it misses
+next_step    the measurement that settles the answer
+text         the answer in three lines
+checks       logs that cannot be diagnosed
+simulator    the same for any simulator's voltage
+diagnose     `diagnose` and its result, `Diagnosis`
+===========  ==================================================================================
 
 The method is described in docs/diagnosis.md.
 """
 
-from cangauge.diagnosis.answer import ALARM, GROUP_OF, GROUPS, NONE, UNKNOWN, Posterior
 from cangauge.diagnosis.diagnose import Diagnosis, diagnose, learn_references
-from cangauge.diagnosis.evidence import Evidence, References
+from cangauge.diagnosis.pack import Healthy
+from cangauge.diagnosis.posterior import ALARM, FAULTS, NONE, UNKNOWN, Posterior
 from cangauge.diagnosis.where import LogErrors
 
 __all__ = [
     "ALARM",
-    "GROUPS",
-    "GROUP_OF",
+    "FAULTS",
     "NONE",
     "UNKNOWN",
     "Diagnosis",
-    "Evidence",
+    "Healthy",
     "LogErrors",
     "Posterior",
-    "References",
     "diagnose",
     "learn_references",
 ]

@@ -1,10 +1,10 @@
-"""Diagnosis of the gap between a model and logs: size, place, cause, and what to do."""
+"""Diagnosis of the gap between a model and logs: size, place, fault, and what to do."""
 
 from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
@@ -14,32 +14,36 @@ from threadpoolctl import threadpool_limits
 
 from cangauge._extras import extra
 from cangauge._files import file_sha256, text_sha256
-from cangauge.diagnosis import sentences
-from cangauge.diagnosis.answer import ALARM, GROUP_OF, NONE, UNKNOWN, Posterior, answer
+from cangauge.diagnosis import text
 from cangauge.diagnosis.checks import check_logs
-from cangauge.diagnosis.columns import Columns
-from cangauge.diagnosis.evidence import Evidence, References, analyse, columns, learn
-from cangauge.diagnosis.extended import Extension, Quantity, residual_v
-from cangauge.diagnosis.pack_fit import Trace, trace
+from cangauge.diagnosis.correction import (
+    Correction,
+    errors_without,
+    model_file,
+    parameters_of,
+)
+from cangauge.diagnosis.evidence import EffectEvidence, Evidence, analyse, learn
+from cangauge.diagnosis.faults import FAULT, Quantity, sentence
+from cangauge.diagnosis.model_check import ModelCheck, check_model
+from cangauge.diagnosis.next_step import NextStep, next_step
+from cangauge.diagnosis.pack import Healthy, LogRows, log_rows
+from cangauge.diagnosis.posterior import ALARM, Posterior, posterior
+from cangauge.diagnosis.rows import Simulated, Trace, trace
 from cangauge.diagnosis.simulator import Simulation, SimulatorGap, simulator_gap
-from cangauge.diagnosis.where import LogErrors, closed_part, error_shares, rms
+from cangauge.diagnosis.sizes import HeldOut, simulated
+from cangauge.diagnosis.where import LogErrors, closed_part, excesses, rms
 from cangauge.errors import InputError
 from cangauge.estimation.offline import estimate
 from cangauge.identify.starts import start_by_model
 from cangauge.logs.log import Log, as_log
+from cangauge.model.extended import ExtendedModel
 from cangauge.model.model_file import Model, as_model
 
 _LOG = logging.getLogger(__name__)
 
-CROSS_VALIDATED = 5
-"""Number of effects, the most probable ones, whose errors are found on held-out rows."""
-
 WORSE_SOC_PCT = 0.25
-"""A cause is rejected if the SoC error of these logs grows by more with it [%]: on healthy trips of
-one car it scatters by as much."""
-
-PROVED_BY_SOC = 0.5
-"""A cause that does not stand out is accepted if it leaves at most this part of the SoC error."""
+"""A correction is refused if the SoC error of these logs grows by more with it [%]: on healthy
+trips of one car it scatters by as much."""
 
 SETTLING_S = 300.0
 """Start of a log, with withheld initial SoC, that the SoC error leaves out [s]."""
@@ -49,12 +53,12 @@ SETTLING_S = 300.0
 class Diagnosis:
     """Result of `diagnose`.
 
-    Errors are RMS errors of the voltage at 1 Hz, on rows that did not size the cause, where the
-    references cover the SoC; with a cause, on the rows among them that it can change.
+    Errors are RMS errors of the voltage at 1 Hz, where the references cover the SoC, and with a
+    correction on rows that did not size it: with two logs or more, on the log left out.
 
     See Also
     --------
-    Diagnosis.summary : The answer in a few lines.
+    Diagnosis.summary : The answer in three lines.
     Diagnosis.to_json : All results as one JSON object.
     """
 
@@ -64,213 +68,234 @@ class Diagnosis:
     """Reference logs, as given; empty where they were learned before."""
     model: Model
     """Diagnosed model."""
-    known: References = field(repr=False)
+    healthy: Healthy = field(repr=False)
     """What the references show."""
-    columns: tuple[Columns, ...] = field(repr=False)
+    rows: tuple[LogRows, ...] = field(repr=False)
     """Of each diagnosed log."""
     evidence: Evidence = field(repr=False)
     """Of every effect."""
     posterior: Posterior
-    """Probabilities of `none`, `unknown` and every effect, and what follows from them."""
+    """Probabilities of `none`, `unknown` and every fault, and what follows from them."""
+    model_check: ModelCheck | None = None
+    """Whether the model describes the references; None with fewer than two."""
     remarks: tuple[str, ...] = ()
     """What was assumed to diagnose these logs."""
     has_references: bool = True
     simulator: SimulatorGap | None = None
     """The simulator whose gap it is; None: the gap of `model`."""
-
-    @cached_property
-    def _extensions(self) -> dict[str, Extension]:
-        """The given model with each effect."""
-        model, before = self.model.extended_model(), [log.before_v for log in self._without]
-        return {
-            name: Extension(model, self.known, self.columns, before, self.evidence.effects[name])
-            for name in self.posterior.effects
-        }
-
-    @cached_property
-    def _without(self) -> list[LogErrors]:
-        """Errors of each log without a cause."""
-        errors, model = [], self.model.extended_model()
-        for log, of in zip(self.logs, self.columns, strict=True):
-            at, signals, every = of.rows, of.log, np.ones(len(of.rows), dtype=bool)
-            before_v, soc_pct = residual_v(model, signals)[at], self.known.pack.soc(signals)[at]
-            inputs = at.astype(np.float64), signals.current_a[at], signals.temperature_c[at]
-            errors.append(LogErrors(log.name, *inputs, soc_pct, before_v, before_v, every))
-        return errors
-
-    @cached_property
-    def _with(self) -> dict[str, list[LogErrors]]:
-        """Errors of each log with each of the most probable effects."""
-        found = {}
-        for name in {*list(self.posterior.effects)[:CROSS_VALIDATED], self.posterior.members[0]}:
-            judged = zip(self._without, *self._extensions[name].judge(), strict=True)
-            found[name] = [replace(log, after_v=after, judged=at) for log, after, at in judged]
-        return found
-
-    @cached_property
-    def likeliest(self) -> str | None:
-        """The effect that explains the gap best and makes held-out voltages better; or None.
-
-        A gap is reported, its cause is likelier in the library than outside, and with the effect
-        the error of held-out rows is smaller: of those that it can change, and of all.
-        """
-        if not self.posterior.detected or self.posterior.leading_group == UNKNOWN:
-            return None
-        errors = self._with[effect := self.posterior.members[0]]
-        every = [replace(log, judged=np.ones_like(log.judged)) for log in errors]
-        better = all(rms(some, after=True) < rms(some) for some in (errors, every))
-        return effect if better else None
+    correction_path: str | None = None
+    """File of the corrected model, as the text names it."""
 
     @property
-    def start_is_suspect(self) -> bool:
-        """Whether a gap is reported that a wrong start of these logs may explain."""
-        return self.posterior.detected and "initial_soc" in self.posterior.credible_set
+    def _misses(self) -> bool:
+        """Whether the model misses the healthy logs."""
+        return self.model_check is not None and not self.model_check.describes
+
+    @cached_property
+    def _given(self) -> ExtendedModel:
+        """The model that explains the healthy logs: the given one with what it misses there."""
+        if self.model_check is not None and self._misses:
+            return self.model_check.corrected
+        return self.model.extended_model()
+
+    @cached_property
+    def _without(self) -> tuple[list[Simulated], list[LogErrors]]:
+        """Each log by that model, and its errors."""
+        return errors_without(self._given, self.rows)
+
+    @cached_property
+    def _baseline(self) -> list[LogErrors]:
+        """Errors of each log by the model as given."""
+        if not self._misses:
+            return self._without[1]
+        return errors_without(self.model.extended_model(), self.rows)[1]
+
+    @cached_property
+    def corrections(self) -> dict[str, Correction]:
+        """Fault → its best effect, judged on rows that did not size it."""
+        held_out, (given, without) = HeldOut(self.healthy, self.rows), self._without
+        found = {}
+        for fault in self.posterior.faults:
+            of = self.best_of(fault)
+            found[fault] = Correction.of(held_out, self.rows, given, without, of)
+        return found
+
+    def best_of(self, fault: str) -> EffectEvidence:
+        """Return the evidence of the most probable effect of a fault."""
+        return self.evidence.effects[next(iter(self.posterior.effects(fault)))]
+
+    def parameters(self, fault: str) -> dict[str, Quantity]:
+        """Return the parameters of the best effect of a fault, with 95 % intervals."""
+        return parameters_of(self.best_of(fault), self.rows[0].trace.log.duration_s)
+
+    def sentence(self, fault: str) -> str:
+        """Return what a fault does and how much, without the end of the sentence."""
+        start_pct = self.rows[0].trace.start_pct
+        pack = self.healthy.linear.pack
+        return sentence(self.best_of(fault), self.parameters(fault), pack, start_pct)
+
+    @property
+    def missed_sentences(self) -> list[str]:
+        """What the model misses on the healthy logs, a sentence each without its end."""
+        if self.model_check is None:
+            return []
+        pack, start_pct = self.model.extended_model().pack, self.rows[0].trace.start_pct
+        return [
+            sentence(each.evidence.effects[each.effect], each.parameters, pack, start_pct)
+            for each in self.model_check.missed
+        ]
+
+    @cached_property
+    def correction(self) -> Correction | None:
+        """The correction by the stated fault that makes left-out errors smaller; or None."""
+        for fault in self.posterior.stated:
+            found = self.corrections[fault]
+            if found.is_better and (found.is_of_log or self._keeps_soc(found)):
+                return found
+        return None
+
+    @cached_property
+    def why_not(self) -> str | None:
+        """Why there is no correction to write; None where there is one."""
+        if self.correction is not None:
+            if not self.correction.is_of_log:
+                return None
+            return "a wrong start belongs to these logs and not to the model: pass --initial-soc"
+        if not self.posterior.stated:
+            return "no fault is stated"
+        if any(self.corrections[fault].is_better for fault in self.posterior.stated):
+            return "the SoC error of these logs would grow with it"
+        return "it does not make the error of left-out rows smaller"
+
+    @property
+    def is_written(self) -> bool:
+        """Whether the corrected model differs from the given one."""
+        return self._misses or (self.correction is not None and not self.correction.is_of_log)
 
     @cached_property
     def soc_errors_pct(self) -> tuple[float, float] | None:
-        """SoC errors of the estimator, initial SoC withheld: as given, and with `likeliest` [%].
+        """SoC errors of the estimator, initial SoC withheld: as given, and corrected [%].
 
-        None where no diagnosed log has a reference SoC, or its start may be the cause.
+        None where no diagnosed log has a reference SoC, or its start may be the fault.
         """
-        if self.start_is_suspect:
+        if "start" in self.posterior.stated:
             return None
-        if (before := self._soc_error_pct(self.model)) is None:
+        before = self._soc_error_pct(self.model)
+        if before is None:
             return None
-        if self.likeliest is None:
-            return before, before
-        after = self._soc_error_pct(self._extended(self.likeliest))
+        after = self._soc_error_pct(self.extended_model) if self.is_written else before
         return before, math.inf if after is None else after
 
-    @cached_property
-    def accepted(self) -> str | None:
-        """The effect that the extended model has; None without one.
+    def _keeps_soc(self, correction: Correction) -> bool:
+        """Whether the SoC error of these logs grows by no more than its scatter."""
+        before = self._soc_error_pct(self.model)
+        if before is None:
+            return True
+        after = self._soc_error_pct(self._file(correction))
+        return after is not None and after <= before + WORSE_SOC_PCT
 
-        It is `likeliest` if it stands out in its group and the SoC error of these logs grows by no
-        more than its scatter with it, or if it leaves at most `PROVED_BY_SOC` of that error.
-        """
-        stands_out = self.posterior.name is not None
-        if self.soc_errors_pct is None:
-            return self.likeliest if stands_out else None
-        before, after = self.soc_errors_pct
-        most = before + WORSE_SOC_PCT if stands_out else PROVED_BY_SOC * before
-        return self.likeliest if after <= most else None
+    def _soc_error_pct(self, model: Model) -> float | None:
+        """Return the mean absolute SoC error at 1 Hz of logs with reference SoC [%]; or None."""
+        errors = [np.zeros(0)]
+        for log, rows in zip(self.logs, self.rows, strict=True):
+            if log.soc_pct is None or np.isfinite(log.soc_pct).mean() < 0.5:
+                continue
+            finite, at_1_hz = np.isfinite(log.soc_pct), replace(rows.trace.log, soc_pct=None)
+            table = estimate(at_1_hz, model, initial_soc_pct="auto")
+            own = np.interp(table.time_s, log.time_s[finite], log.soc_pct[finite])
+            settled = table.time_s - table.time_s[0] >= SETTLING_S
+            errors.append(np.abs(table.soc_pct - own)[np.isfinite(table.soc_pct) & settled])
+        together = np.concatenate(errors)
+        return float(together.mean()) if together.size else None
 
     @property
     def log_errors(self) -> list[LogErrors]:
-        """Errors of each diagnosed log at 1 Hz, before and after."""
-        return self._without if self.accepted is None else self._with[self.accepted]
+        """Errors of each diagnosed log, before and after."""
+        if self.correction is None:
+            return self._baseline
+        return [
+            replace(before, after_v=log.after_v)
+            for before, log in zip(self._baseline, self.correction.errors, strict=True)
+        ]
 
     @property
     def baseline_rmse_v(self) -> float:
         """Error of the given model [V]."""
-        return rms(self.log_errors)
+        return rms(self._baseline)
 
     @property
     def extended_rmse_v(self) -> float:
-        """Error of the extended model on held-out rows [V]."""
+        """Error of the corrected model on rows that did not size the correction [V]."""
         return rms(self.log_errors, after=True)
 
     @property
     def healthy_rmse_v(self) -> float:
         """Error of a left-out reference log; without references, what the model file states [V]."""
-        return self.known.healthy_rmse_v
+        return self.healthy.rmse_v
 
-    @property
-    def closed_fraction(self) -> float | None:
-        """Closed part of the squared error above a healthy log's.
+    @cached_property
+    def closed(self) -> tuple[float | None, tuple[float, float] | None]:
+        """Closed part of the squared error above a healthy log's, and its 95 % interval.
 
-        None without a cause, or without a gap above the healthy error.
+        None without a correction, or without a gap above the healthy error.
         """
-        return None if self.accepted is None else self._closed(self.accepted)[0]
-
-    @property
-    def closed_fraction_ci(self) -> tuple[float, float] | None:
-        """95 % interval of the closed fraction."""
-        return None if self.accepted is None else self._closed(self.accepted)[1]
-
-    def _closed(self, effect: str) -> tuple[float | None, tuple[float, float] | None]:
-        return closed_part(self._with[effect], self.known.healthy_v2)
+        if self.correction is None:
+            return None, None
+        return closed_part(self.log_errors, self.healthy.healthy_v2)
 
     @cached_property
     def where(self) -> list[dict[str, Any]]:
-        """Shares of the given model's squared error over each axis, as in `gap --json`."""
-        return error_shares(self.log_errors, self.known.pack.capacity_ah)
+        """Excess of the given model's error over each axis, as in `gap --json`."""
+        return excesses(self._baseline, self.model.capacity_ah)
 
     @cached_property
-    def candidates(self) -> list[dict[str, Any]]:
-        """Every effect, most probable first, as in `gap --json`; error of the likeliest few."""
-        found = []
-        for name, p in self.posterior.effects.items():
-            rmse_v, closed, ci = None, None, None
-            if name in self._with:
-                rmse_v, (closed, ci) = rms(self._with[name], after=True), self._closed(name)
-            found.append({
-                "effect": name, "group": GROUP_OF[name], "probability": p, "rmse_v": rmse_v,
-                "closed_fraction": closed, "ci": ci and list(ci),
-                "parameters": {k: vars(item) for k, item in self.parameters[name].items()},
-            })  # fmt: skip
-        return found
+    def next_step(self) -> NextStep | None:
+        """The measurement that settles the fault; None where none is stated."""
+        return next_step(self.evidence, self.posterior)
 
-    @cached_property
-    def parameters(self) -> dict[str, dict[str, Quantity]]:
-        """Parameters of each effect with 95 % intervals."""
-        return {name: item.parameters for name, item in self._extensions.items()}
+    @property
+    def check_first(self) -> str:
+        """What to do first, in a sentence."""
+        if self.next_step is not None:
+            return self.next_step.instruction
+        if self.posterior.level == "none":
+            return "Nothing to do."
+        return (
+            "Check that the references are of this pack and without the fault; then look where the"
+            " error lies."
+        )
 
-    @cached_property
-    def visible_from(self) -> list[dict[str, Any]]:
-        """Smallest size of each effect that these logs would have shown; size None: none."""
-        sizes: list[dict[str, Any]] = []
-        for name, least in self.posterior.visible_from.items():
-            unit = self.evidence.effects[name].trial.unit
-            unit, factor = ("%", 100.0) if unit == "1" else (unit, 1.0)
-            sizes.append({"effect": name, "size": least and factor * least, "unit": unit})
-        return sizes
+    def visible_from(self, effect: str) -> tuple[float | None, str]:
+        """Return the smallest size of an effect that these logs would have shown, and its unit."""
+        of = self.evidence.effects[effect]
+        size, unit = of.visible, of.shape.unit
+        if effect == "resistance_growth":
+            size, unit = size * self.healthy.linear.pack.resistance_ohm, "Ω"
+        return (size if of.visible <= of.shape.bound else None), unit
 
     @cached_property
     def extended_model(self) -> Model:
-        """The model with the accepted cause, ready to save and run; the given one without."""
-        return self.model if self.accepted is None else self._extended(self.accepted)
+        """The corrected model, ready to save and run; the given one without a correction."""
+        if not self.is_written:
+            return self.model
+        return self._file(self.correction)
 
-    def _extended(self, effect: str) -> Model:
-        return self._extensions[effect].model_file(self.model, rms(self._with[effect], after=True))
-
-    def _soc_error_pct(self, model: Model) -> float | None:
-        """Return the mean absolute SoC error at 1 Hz of logs with reference SoC [%]; or None.
-
-        After a step of resistance, if that is the cause: the extended model has it throughout.
-        """
-        errors = [np.zeros(0)]
-        places: tuple[float | None, ...] = (0.0,) * len(self.logs)
-        if self.likeliest is not None:
-            places = self.evidence.effects[self.likeliest].in_logs or places
-        for log, of, place in zip(self.logs, self.columns, places, strict=True):
-            if place is None or log.soc_pct is None or np.isfinite(log.soc_pct).mean() < 0.5:
-                continue
-            signals, finite = of.log, np.isfinite(log.soc_pct)
-            time_s = np.arange(len(signals.current_a), dtype=np.float64)
-            first = round(place * len(time_s))
-            at_1_hz = Log(time_s, signals.current_a, signals.voltage_v, signals.temperature_c)
-            table = estimate(at_1_hz.rows(slice(first, None)), model, initial_soc_pct="auto")
-            own = np.interp(table.time_s, log.time_s[finite] - log.time_s[0], log.soc_pct[finite])
-            kept = np.isfinite(table.soc_pct) & (table.time_s - first >= SETTLING_S)
-            errors.append(np.abs(table.soc_pct - own)[kept & signals.measured[first:]])
-        together = np.concatenate(errors)
-        return float(together.mean()) if together.size else None
-
-    @property
-    def headline(self) -> str:
-        """Size, place and cause of the gap in one sentence."""
-        return sentences.headline(self)
+    def _file(self, correction: Correction | None) -> Model:
+        """Return the given model with a correction, as a file."""
+        given = self._given
+        if correction is None:
+            return model_file(self.model, given, rms(self._without[1]))
+        return model_file(self.model, correction.applied(given), correction.rmse_v)
 
     @property
     def summary(self) -> str:
-        """The answer in a few lines: what it is, how large, what to do, what is left open."""
-        return sentences.summary(self)
+        """The answer in three lines: what, how far and where, what to do."""
+        return text.answer(self)
 
     @property
     def caveats(self) -> list[str]:
         """What limits the answer, a sentence each."""
-        return sentences.caveats(self)
+        return text.caveats(self)
 
     def __repr__(self) -> str:
         """Return the answer, and the logs."""
@@ -278,64 +303,112 @@ class Diagnosis:
         return f"<Diagnosis of {names}>\n{self.summary}"
 
     def plot(self) -> Any:
-        """Return the probabilities of the causes as bars, for `bokeh.plotting.show`."""
+        """Return the probabilities of the faults as bars, for `bokeh.plotting.show`."""
         return extra("report.diagnosis:diagnosis_figure")(self)
 
     def _repr_html_(self) -> str:
         """Return the answer for a notebook."""
-        return sentences.diagnosis_html(self)
+        return text.html(self)
 
-    def to_json(self, extended_model: str | None = None) -> dict[str, Any]:
-        """Return the object that `cangauge gap --json` prints (schema 3).
-
-        Parameters
-        ----------
-        extended_model : str, optional
-            Path of the extended model's file, to be reported.
-        """
-        found, closed, ci = self.posterior, self.closed_fraction, self.closed_fraction_ci
+    def to_json(self) -> dict[str, Any]:
+        """Return the object that `cangauge gap --json` prints (schema 4)."""
+        closed, ci = self.closed
         before_pct, after_pct = self.soc_errors_pct or (None, None)
-        accepted = []
-        if self.accepted is not None:
-            values = {name: item.value for name, item in self.parameters[self.accepted].items()}
-            accepted = [{"effect": self.accepted, "parameters": values, "closed_fraction": closed}]
+        answer = self.posterior
         return {
-            "schema": 3,
+            "schema": 4,
+            "model": self._model_json(),
             "gap": {
                 "baseline_rmse_v": self.baseline_rmse_v,
                 "extended_rmse_v": self.extended_rmse_v,
                 "healthy_rmse_v": self.healthy_rmse_v,
                 "closed_fraction": closed,
                 "closed_fraction_ci": ci and list(ci),
+                "on": "left-out log" if len(self.logs) > 1 else "left-out rows",
                 "baseline_soc_mae_pct": before_pct,
-                "extended_soc_mae_pct": before_pct if self.accepted is None else after_pct,
+                "extended_soc_mae_pct": after_pct,
             },
             "where": self.where,
-            "cause": {
-                "detected": found.detected,
-                "probability_none": found.probabilities[NONE],
-                "probability_unknown": found.probabilities[UNKNOWN],
-                "groups": [{"group": g, "probability": p} for g, p in found.groups.items()],
-                "check_first": found.check_first,
-                "named": found.named,
-                "verdict": found.verdict,
-                "probability": found.probability,
-                "credible_set": list(found.credible_set),
-                "ambiguous_with": list(found.ambiguous_with),
-                "accepted": accepted,
-                "candidates": self.candidates,
-                "left_over": found.left_over,
+            "answer": {
+                "level": answer.level,
+                "probability_none": answer.none,
+                "probability_unknown": answer.unknown,
+                "stated": list(answer.stated),
+                "text": self.summary,
+                "check_first": self.check_first,
             },
-            "visible_from": self.visible_from,
-            "summary": self.summary,
-            "limits": self.caveats,
+            "faults": [self._fault_json(fault) for fault in answer.faults],
+            "next_step": None if self.next_step is None else self.next_step.to_dict(),
+            "correction": {
+                "accepted": self.is_written,
+                "why_not": None if self.is_written else self.why_not,
+                "path": self.correction_path if self.is_written else None,
+            },
+            "caveats": self.caveats,
             "inputs": {
-                "model": {"name": self.model.name, "sha256": text_sha256(self.model.to_json())},
+                "model": {
+                    "name": self.model.name,
+                    "sha256": text_sha256(self.model.to_json()),
+                },
                 "logs": _files(self.logs),
                 "references": _files(self.references),
             },
-            "extended_model": extended_model,
         }
+
+    def _model_json(self) -> dict[str, Any]:
+        check = self.model_check
+        if check is None:
+            return {
+                "describes_references": None,
+                "references_rmse_v": None,
+                "among_themselves_rmse_v": None,
+                "faults": [],
+            }
+        return {
+            "describes_references": check.describes,
+            "references_rmse_v": check.references_rmse_v,
+            "among_themselves_rmse_v": check.among_themselves_rmse_v,
+            "faults": [
+                {
+                    "fault": each.fault,
+                    "probability": each.posterior.faults[each.fault],
+                    "effect": each.effect,
+                    "effect_probability": each.posterior.probabilities[each.effect],
+                    "parameters": _plain(each.parameters),
+                    "rmse_v": each.rmse_v,
+                    "closed_fraction": None,
+                    "visible_from": {"size": None, "unit": _unit(each.parameters)},
+                }
+                for each in check.missed
+            ],
+        }
+
+    def _fault_json(self, fault: str) -> dict[str, Any]:
+        correction, effect = self.corrections[fault], self.best_of(fault).shape.effect.id
+        closed, _ = closed_part(correction.errors, self.healthy.healthy_v2)
+        size, unit = self.visible_from(effect)
+        return {
+            "fault": fault,
+            "title": FAULT[fault].title,
+            "probability": self.posterior.faults[fault],
+            "effect": effect,
+            "effect_probability": self.posterior.probabilities[effect],
+            "parameters": _plain(self.parameters(fault)),
+            "rmse_v": correction.rmse_v,
+            "closed_fraction": closed,
+            "visible_from": {"size": size, "unit": unit},
+        }
+
+
+def _plain(parameters: dict[str, Quantity]) -> dict[str, Any]:
+    return {
+        name: {"value": item.value, "ci": item.ci and list(item.ci), "unit": item.unit}
+        for name, item in parameters.items()
+    }
+
+
+def _unit(parameters: dict[str, Quantity]) -> str:
+    return next(item.unit for item in parameters.values() if item.ci is not None)
 
 
 def _files(logs: Sequence[Log]) -> list[dict[str, Any]]:
@@ -349,7 +422,6 @@ def diagnose(
     *,
     simulation: Simulation | None = None,
     capacity_ah: float | None = None,
-    without: Collection[str] = (),
     initial_soc_pct: float | None = None,
     alarm: float = ALARM,
 ) -> Diagnosis:
@@ -358,10 +430,10 @@ def diagnose(
     Parameters
     ----------
     logs : Log, path or DataFrame, or a sequence of these
-        Logs with a gap, which share one cause; at least 5 min each, better half an hour.
+        Logs with a gap, which share one fault; at least 5 min each, better half an hour.
     model : Model, path or result of `fit`, optional
         Model of this pack; not needed for a simulation.
-    references : sequence of Log, path or DataFrame; or References
+    references : sequence of Log, path or DataFrame; or Healthy
         Logs without the fault, at least three for reliable probabilities. For many diagnoses with
         the same references: what `learn_references` returns.
     simulation : function or pybamm.Simulation, optional
@@ -369,8 +441,6 @@ def diagnose(
         [°C] and SoC of the first row [%] that returns the voltage [V].
     capacity_ah : float, optional
         The simulator's charge from 100 to 0 % [Ah]; by default from a log from full to empty.
-    without : collection of str
-        Effects taken out of the library.
     initial_soc_pct : float, optional
         SoC at the first row of each diagnosed log, instead of the log's own [%]; where neither is
         known it is found from the voltage.
@@ -391,13 +461,13 @@ def diagnose(
     ...     model="pack.json",
     ...     references=["reference1.csv", "reference2.csv", "reference3.csv"],
     ... )  # doctest: +SKIP
-    >>> print(found.headline)  # doctest: +SKIP
-    The current reads 3.0 A (2.7 … 3.3) too high (current_offset, 71 %).
+    >>> print(found.summary)  # doctest: +SKIP
+    The current reads 3.0 A (2.7–3.3 A) too high. Likelihood: current reading 97 %.
     """
-    with threadpool_limits(1):  # systems of fifty unknowns gain nothing from more threads
+    with threadpool_limits(1):  # systems of a hundred unknowns gain nothing from more threads
         logs, simulator = _as_logs(logs), None
         model = None if model is None else as_model(model)
-        own = () if isinstance(references, References) else _as_logs(references)
+        own = () if isinstance(references, Healthy) else _as_logs(references)
         if simulation is not None:
             simulator = simulator_gap(logs, own, simulation, model, capacity_ah)
             logs, own, model = simulator.logs, simulator.references, simulator.model
@@ -406,45 +476,41 @@ def diagnose(
         check_logs(logs, own, model)
         _LOG.info("reading the logs")
         traces, remarks = _traces(logs, model, initial_soc_pct)
-        known = references
-        if not isinstance(references, References):
-            healthy, more = _traces(own, model)
+        if isinstance(references, Healthy):
+            healthy = references
+        else:
+            of_references, more = _traces(own, model)
             remarks += more
-            known = _learn(healthy or [_of_model(model, log) for log in traces], model)
+            healthy = learn(model, of_references)
         _LOG.info("comparing the effects")
-        of_logs = tuple(columns(known, log) for log in traces)
-        evidence = analyse(known, of_logs)
+        check = check_model(model, healthy) if len(healthy.references) > 1 else None
+        rows = tuple(
+            log_rows(healthy.linear, log, healthy.tried, healthy.visited) for log in traces
+        )
+        evidence = simulated(healthy, rows, analyse(healthy, rows))
         found = Diagnosis(
             logs=logs,
             references=own,
             model=model,
-            known=known,
-            columns=of_logs,
+            healthy=healthy,
+            rows=rows,
             evidence=evidence,
-            posterior=answer(known, evidence, without=without, alarm=alarm),
+            posterior=posterior(healthy, evidence, alarm),
+            model_check=check,
             remarks=tuple(remarks),
-            has_references=bool(own) or known is references,
+            has_references=bool(healthy.references),
             simulator=simulator,
         )
         _LOG.info("judging on held-out rows")
-        found.candidates  # noqa: B018 - computed here, on one thread
+        found.to_json()  # computed here, on one thread
         return found
 
 
-def learn_references(references: Sequence[Log], model: Model) -> References:
+def learn_references(references: Sequence[Log], model: Model) -> Healthy:
     """Learn what references, logs without a fault, show, for any number of diagnoses."""
     with threadpool_limits(1):
         check_logs(references, (), model)
-        return _learn(_traces(references, model)[0], model)
-
-
-def _learn(healthy: Sequence[Trace], model: Model) -> References:
-    return learn(healthy, model.capacity_ah, model.noise.voltage_rmse_v)
-
-
-def _of_model(model: Model, log: Trace) -> Trace:
-    """Return a log with the model's voltage: the reference where none is given."""
-    return replace(log, voltage_v=log.voltage_v - residual_v(model.extended_model(), log))
+        return learn(model, _traces(references, model)[0])
 
 
 def _as_logs(logs: Any) -> tuple[Log, ...]:
@@ -463,7 +529,7 @@ def _traces(
             start = by_voltage.soc_pct
             remarks.append(
                 f"{log.name} states no SoC: its start of {start:.1f} ±"
-                f" {by_voltage.std_pct or 0.0:.1f} % was found from the voltage. A cause that"
+                f" {by_voltage.std_pct or 0.0:.1f} % was found from the voltage. A fault that"
                 " shifts the voltage as a whole may hide in it; --initial-soc states the start."
             )
         traces.append(trace(log, model.capacity_ah, start))

@@ -16,7 +16,7 @@ import numpy as np
 
 from cangauge._text import significant
 from cangauge._typing import FloatArray
-from cangauge.diagnosis.extended import Quantity
+from cangauge.diagnosis.faults import Quantity
 from cangauge.errors import InputError
 from cangauge.identify.fit import fit
 from cangauge.logs.log import Log

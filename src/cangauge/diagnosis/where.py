@@ -1,4 +1,4 @@
-"""Where the error lies: its shares over SoC, temperature, current, rest, time and time scale."""
+"""Where the error lies: its excess over SoC, temperature, current, rest and time."""
 
 from __future__ import annotations
 
@@ -8,45 +8,56 @@ from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
-from scipy.ndimage import uniform_filter1d
 
+from cangauge._text import number
 from cangauge._typing import BoolArray, FloatArray, IntArray
-
-TIME_SCALES_S: Final = (0.0, 10.0, 100.0, 1000.0, 1e6)
-"""Edges of the time scales [s]: faster than 10 s, 10–100 s, …, slower than 1000 s."""
 
 REST_C_RATE: Final = 0.02
 """Current below which the pack rests [1/h]."""
+LONG_REST_S: Final = 300.0
+"""A rest from which on what comes after it counts as after a rest [s]."""
+AFTER_REST_MIN: Final = (0.0, 10.0, 30.0)
+"""Edges of the time since the last long rest [min]; the last interval is open."""
 
 PIECE_S: Final = 300
 """Length of the pieces that a bootstrap draws, beyond the correlation of errors [s]."""
-
 DRAWS: Final = 400
 """Draws of a bootstrap; its quantiles vary by one per cent."""
+LEAST_PIECES: Final = 3
+"""Pieces with rows in an interval from which on its error is told apart: two always agree."""
+DIFFERENT: Final = 1.3
+"""Excess from which a place is named, beside its interval: a third more error is seen in a plot."""
 
 
 @dataclass(frozen=True, eq=False)
 class LogErrors:
-    """Errors of one diagnosed log at 1 Hz; m rows that count."""
+    """Errors of one diagnosed log; m rows that count.
+
+    Parameters
+    ----------
+    name : str
+    time_s : array of shape (m,)
+        Since the first row of the log [s].
+    current_a, temperature_c, soc_pct : array of shape (m,)
+        As measured, and counted.
+    before_v : array of shape (m,)
+        Measured less given model [V].
+    after_v : array of shape (m,)
+        With the correction, sized without these rows; equal to `before_v` without one [V].
+    """
 
     name: str
     time_s: FloatArray
-    """Since the first row of the log, shape (m,) [s]."""
     current_a: FloatArray
     temperature_c: FloatArray
     soc_pct: FloatArray
-    """As counted."""
     before_v: FloatArray
-    """Measured less given model [V]."""
     after_v: FloatArray
-    """With the cause, sized without these rows; equal to `before_v` without a cause [V]."""
-    judged: BoolArray
-    """Rows that the cause can change; all without a cause."""
 
 
 def rms(logs: Sequence[LogErrors], *, after: bool = False) -> float:
-    """Return the RMS error of the judged rows of all logs, before or after [V]."""
-    errors = [(log.after_v if after else log.before_v)[log.judged] for log in logs]
+    """Return the RMS error of all logs, before or after [V]."""
+    errors = [log.after_v if after else log.before_v for log in logs]
     return float(np.sqrt(np.mean(np.concatenate(errors) ** 2)))
 
 
@@ -72,17 +83,16 @@ def closed_part(
 ) -> tuple[float | None, tuple[float, float] | None]:
     """Return the closed part of the squared error above a healthy log's, and its 95 % interval.
 
-    Of the judged rows, by a bootstrap over pieces. None without a gap above the healthy error.
+    By a bootstrap over pieces. None without a gap above the healthy error.
     """
-    weight = np.concatenate([log.judged for log in logs]).astype(np.float64)
-    before = np.concatenate([log.before_v for log in logs]) ** 2 * weight
-    after = np.concatenate([log.after_v for log in logs]) ** 2 * weight
-    gap = before.sum() / weight.sum() - healthy_v2
+    before = np.concatenate([log.before_v for log in logs]) ** 2
+    after = np.concatenate([log.after_v for log in logs]) ** 2
+    gap = before.mean() - healthy_v2
     if not gap > 0.0:
         return None, None
-    closed = min(float((before.sum() - after.sum()) / weight.sum() / gap), 1.0)
-    drawn_before, drawn_after, rows = drawn_sums(pieces(logs), before, after, weight)
-    rows = np.maximum(rows, 1.0)
+    closed = min(float((before.mean() - after.mean()) / gap), 1.0)
+    sums = drawn_sums(pieces(logs), before, after, np.ones(before.size))
+    drawn_before, drawn_after, rows = sums
     gaps = drawn_before / rows - healthy_v2
     usable = gaps > 0.0
     if usable.mean() < 0.9:
@@ -92,33 +102,74 @@ def closed_part(
     return closed, (float(low), float(high))
 
 
-def error_shares(logs: Sequence[LogErrors], capacity_ah: float) -> list[dict[str, Any]]:
-    """Return the shares of the given model's squared error; on each axis they sum to one.
+def excesses(logs: Sequence[LogErrors], capacity_ah: float) -> list[dict[str, Any]]:
+    """Return the error of the given model in each interval of each axis, over that of all rows.
 
-    Each with its RMS error within the interval and the 95 % interval of the share.
+    `excess` is a ratio of RMS errors, `ci` its 95 % interval.
     """
-    piece, shares = pieces(logs), []
+    piece = pieces(logs)
     square = np.concatenate([log.before_v for log in logs]) ** 2
-    parts = [
-        (axis, unit, limits, square * inside, square, inside)
-        for axis, unit, values, edges in _axes(logs, capacity_ah)
-        for limits in itertools.pairwise(edges.tolist())
-        if (inside := _inside(values, *limits, last=limits[1] >= edges[-1])).any()
-    ]
-    bands = [np.concatenate(each) ** 2 for each in zip(*map(_bands, logs), strict=True)]
-    every, total = np.ones(square.size, dtype=bool), np.sum(bands, axis=0)
-    parts += [
-        ("timescale", "s", limits, band, total, every)
-        for limits, band in zip(itertools.pairwise(TIME_SCALES_S), bands, strict=True)
-    ]
-    for axis, unit, limits, part, whole, rows in parts:
-        drawn_part, drawn_whole = drawn_sums(piece, part, whole)
-        ci = np.quantile(drawn_part / np.maximum(drawn_whole, 1e-12), [0.025, 0.975]).tolist()
-        share = float(part.sum() / max(float(whole.sum()), 1e-12))
-        rms_v = float(np.sqrt(part.sum() / rows.sum()))
-        shares.append({"axis": axis, "range": list(limits), "unit": unit, "share": share,
-                       "rmse_v": rms_v, "ci": ci})  # fmt: skip
-    return shares
+    every = np.ones(square.size)
+    found = []
+    for axis, unit, values, edges in _axes(logs, capacity_ah):
+        for low, high in itertools.pairwise(edges.tolist()):
+            inside = _inside(values, low, high, last=high >= edges[-1])
+            if np.unique(piece[inside]).size < LEAST_PIECES:
+                continue
+            part, rows, whole, all_rows = drawn_sums(
+                piece, square * inside, inside.astype(np.float64), square, every
+            )
+            usable = rows > 0.0
+            ratios = np.sqrt(part[usable] / rows[usable] * all_rows[usable] / whole[usable])
+            mean = float(square[inside].mean())
+            found.append({
+                "axis": axis,
+                "range": [low, high],
+                "unit": unit,
+                "excess": float(np.sqrt(mean / square.mean())),
+                "rmse_v": float(np.sqrt(mean)),
+                "ci": np.quantile(ratios, [0.025, 0.975]).tolist(),
+            })  # fmt: skip
+    return found
+
+
+def clause(where: Sequence[dict[str, Any]]) -> str:
+    """Return where the error is larger than elsewhere, in a clause."""
+    worst = [place for place in where if place["excess"] >= DIFFERENT and place["ci"][0] > 1.0]
+    if not worst:
+        return "everywhere alike"
+    place = max(worst, key=lambda place: place["ci"][0])
+    low, high = place["range"]
+    times = number(place["excess"], 1)
+    return f"{_place(place['axis'], low, high, where)} ({times} times that of all rows)"
+
+
+def _place(axis: str, low: float, high: float, where: Sequence[dict[str, Any]]) -> str:
+    of_axis = [place["range"] for place in where if place["axis"] == axis]
+    first, last = min(each[0] for each in of_axis), max(each[1] for each in of_axis)
+    if axis == "soc":
+        return _between(low, high, first, last, "% SoC")
+    if axis == "temperature":
+        return _between(low, high, first, last, "°C")
+    if axis == "current":
+        if high <= 0.0:
+            return f"while charging at {-high:.0f} to {-low:.0f} A"
+        return (
+            f"at rest ({low:.0f} to {high:.0f} A)" if low < 0.0 else f"at {low:.0f} to {high:.0f} A"
+        )
+    if axis == "rest":
+        return (
+            f"in the first {high:.0f} min after a rest"
+            if low == 0.0
+            else f"{low:.0f} min after a rest"
+        )
+    return f"in minutes {low / 60.0:.0f} to {high / 60.0:.0f}"
+
+
+def _between(low: float, high: float, first: float, last: float, unit: str) -> str:
+    if low == first:
+        return f"below {high:.0f} {unit}"
+    return f"above {low:.0f} {unit}" if high == last else f"at {low:.0f} to {high:.0f} {unit}"
 
 
 def _inside(values: FloatArray, low: float, high: float, *, last: bool) -> BoolArray:
@@ -138,16 +189,21 @@ def _axes(
     edges = capacity_ah * np.array([-0.5, -REST_C_RATE, REST_C_RATE, 0.5, 1.0, 2.0])
     inner = edges[(edges > current.min()) & (edges < current.max())]
     yield "current", "A", current, np.array([current.min(), *inner, current.max()])
-    resting = (np.abs(current) < REST_C_RATE * capacity_ah).astype(np.float64)
-    yield "rest", "1 = rest", resting, np.array([0.0, 0.5, 1.0])
+    since = np.concatenate([_since_rest(log, capacity_ah) for log in logs])
+    after = since[np.isfinite(since)]
+    if after.size:
+        edges = np.array([*AFTER_REST_MIN, max(float(after.max()), AFTER_REST_MIN[-1]) + 1.0])
+        yield "rest", "min", since, edges
     yield "time", "s", elapsed, np.linspace(0.0, float(elapsed.max()) + 1e-9, 6)
 
 
-def _bands(log: LogErrors) -> list[FloatArray]:
-    """Return a log's error in each band of time scales, by moving averages of its rows."""
-    bands, left = [], log.before_v
-    for width in TIME_SCALES_S[1:-1]:
-        smooth = uniform_filter1d(left, min(int(width), left.size), mode="nearest")
-        bands.append(left - smooth)
-        left = smooth
-    return [*bands, left]
+def _since_rest(log: LogErrors, capacity_ah: float) -> FloatArray:
+    """Return the time since the last long rest [min], shape (m,); NaN before one."""
+    moving = np.abs(log.current_a) >= REST_C_RATE * capacity_ah
+    last = np.maximum.accumulate(np.where(moving, log.time_s, -np.inf))
+    before = np.r_[-np.inf, last[:-1]]
+    rested_s = log.time_s - before
+    ends = moving & np.isfinite(before) & (rested_s >= LONG_REST_S)
+    ended = np.maximum.accumulate(np.where(ends, log.time_s, -np.inf))
+    minutes = (log.time_s - ended) / 60.0
+    return np.where(np.isfinite(ended), minutes, np.nan)

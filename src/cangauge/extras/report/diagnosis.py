@@ -1,4 +1,4 @@
-"""The page of `cangauge gap`: verdict, what to do, where the gap is, how far it shrinks."""
+"""The page of `cangauge gap`: the answer, where the gap is, how far it shrinks."""
 
 from __future__ import annotations
 
@@ -6,20 +6,11 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
-import numpy as np
-
 from cangauge._files import file_sha256
 from cangauge._text import NONE_KNOWN, number, span
-from cangauge.diagnosis import NONE, Diagnosis
-from cangauge.diagnosis.answer import TITLES
-from cangauge.diagnosis.planner import Plan
-from cangauge.diagnosis.sentences import (
-    EXPLAINED,
-    candidate_rows,
-    percent,
-    plan_rows,
-    visible_rows,
-)
+from cangauge.diagnosis import Diagnosis
+from cangauge.diagnosis.faults import FAULT
+from cangauge.diagnosis.text import fault_rows, percent, plan_text
 from cangauge.extras.report.charts import (
     BLUE,
     GREEN,
@@ -36,17 +27,12 @@ _AXES: Final = {
     "soc": "state of charge",
     "temperature": "temperature",
     "current": "current (positive: discharge)",
-    "rest": "rest and load",
+    "rest": "time since a rest",
     "time": "time since the start",
-    "timescale": "time scale of the error",
 }
-_SHOWN_SHARE: Final = 0.005
-"""Intervals with less of the squared error are left out."""
-_TIMESCALES: Final = ("under 10 s", "10 to 100 s", "100 to 1000 s", "over 1000 s")
-_SHOWN_CAUSES: Final = 8
 
 
-def gap_page(found: Diagnosis, model_path: Path | None = None, plan: Plan | None = None) -> Page:
+def gap_page(found: Diagnosis, model_path: Path | None = None) -> Page:
     """Return the page of a diagnosis.
 
     Parameters
@@ -54,35 +40,24 @@ def gap_page(found: Diagnosis, model_path: Path | None = None, plan: Plan | None
     found : Diagnosis
     model_path : Path, optional
         The model's file, to name it by its SHA-256.
-    plan : Plan, optional
-        The next step.
     """
-    result = found.to_json()
-    places = _places(result["where"])
-    first = places.pop(_widest(result["where"]))
-    verdict, *details = found.summary.splitlines()
-    next_words = [] if plan is None or not plan.between else [plan.sentence]
-    head, causes = candidate_rows(result)
-    explained = [[*row, EXPLAINED.get(row[0].replace(" ", "_"), "")] for row in causes]
-    signature = "A cause is a signature at the terminals, not proof of a mechanism."
-    unseen = f"{NONE_KNOWN}: no physical size would have been seen in these logs."
+    places = _places(found.where)
+    first = places.pop(_widest(found.where)) if places else None
+    answer, *details = found.summary.splitlines()
     names = joined([log.name for log in found.logs])
+    shown: list[Block] = [[_shrinks(found)] if first is None else [first, _shrinks(found)]]
     return Page(
         title=f"Diagnosis of {names} with model {found.model.name}",
-        lead=verdict,
-        subtitle=" ".join([*details, *next_words]),
+        lead=answer,
+        subtitle=" ".join(details),
         tiles=_tiles(found),
-        sections={"Where and how much": [[first, _shrinks(found)]]},
+        sections={"Where and how far": shown},
         folded={
-            "The next step": [] if plan is None else _next_step(plan),
-            "Every cause: probability and size": [
-                Table([*head, "what it means"], explained, signature)
-            ],
-            "What these logs would have shown": [Table(*visible_rows(result), unseen)],
+            "Every fault: probability and size": [Table(*fault_rows(found), plan_text(found))],
             "Where else the error lies": [list(places.values())],
             "Error over time": _over_time(found),
             "Logs and references": [_compared(found)],
-            "What these logs cannot show": [found.caveats] if found.caveats else [],
+            "What limits this answer": [found.caveats],
         },
         model=found.model,
         model_path=model_path,
@@ -91,25 +66,24 @@ def gap_page(found: Diagnosis, model_path: Path | None = None, plan: Plan | None
 
 
 def diagnosis_figure(found: Diagnosis) -> Plot:
-    """Return the probabilities of the causes as bars, the likeliest first, for a notebook."""
+    """Return the probabilities of the faults as bars, the likeliest first, for a notebook."""
     answer = found.posterior
-    ordered = sorted(answer.probabilities.items(), key=lambda item: -item[1])
     entries = [
-        (name, float(probability), BLUE if name == answer.verdict else GREY)
-        for name, probability in ordered[:_SHOWN_CAUSES]
+        (FAULT[fault].title, p, BLUE if fault in answer.stated else GREY)
+        for fault, p in answer.faults.items()
     ]
+    entries += [("no fault", answer.none, GREEN), ("none of these", answer.unknown, GREY)]
     return bars("", "probability", entries, "").plot
 
 
 def _tiles(found: Diagnosis) -> list[Tile]:
     answer = found.posterior
-    none = f"P(no fault) {percent(answer.probabilities[NONE])}"
-    verdict = "found" if answer.detected else "likely" if answer.likely else "not significant"
-    tiles = [Tile("Gap", verdict, none)]
-    if answer.likely:
-        group = answer.leading_group
-        probability = f"probability {percent(answer.groups[group])}"
-        tiles.append(Tile("Look first at", TITLES[group], probability))
+    verdict = {"gap": "found", "likely": "likely", "none": "not significant"}[answer.level]
+    tiles = [Tile("Gap", verdict, f"P(no fault) {percent(answer.none)}")]
+    if answer.stated:
+        fault = answer.stated[0]
+        p = f"probability {percent(answer.faults[fault])}"
+        tiles.append(Tile("Fault", " or ".join(FAULT[each].title for each in answer.stated), p))
     return [
         *tiles,
         Tile("Model's error", number(found.baseline_rmse_v, 2, "V"), "RMS, these logs"),
@@ -123,39 +97,34 @@ def _shrinks(found: Diagnosis) -> Figure:
         ("healthy logs", found.healthy_rmse_v, GREEN),
     ]
     title, caption = "Beside healthy logs", "RMS error of the voltage."
-    if found.accepted is not None:
-        cause = found.accepted.replace("_", " ")
-        entries.insert(1, (f"with {cause}", found.extended_rmse_v, BLUE))
+    if found.correction is not None:
+        entries.insert(1, ("corrected", found.extended_rmse_v, BLUE))
         title = "How far it shrinks"
-        caption = "RMS error of the voltage, on rows that did not size the cause."
-        if found.closed_fraction is not None:
-            closed = percent(found.closed_fraction)
-            caption += f" The cause closes {closed} of the squared gap above healthy logs."
+        left_out = "the log left out" if len(found.logs) > 1 else "rows that did not size it"
+        caption = f"RMS error of the voltage, corrected on {left_out}."
+        closed, _ = found.closed
+        if closed is not None:
+            caption += f" It closes {percent(closed)} of the squared gap above healthy logs."
+    if found.soc_errors_pct is not None:
+        before, after = (number(each, 2, "%") for each in found.soc_errors_pct)
+        caption += f" SoC error, start withheld: {before}, corrected {after}."
     return bars(title, "RMS error", entries, caption, unit="V")
 
 
-def _shown(where: Sequence[Mapping[str, Any]], axis: str) -> list[Mapping[str, Any]]:
-    return [place for place in where if place["axis"] == axis and place["share"] >= _SHOWN_SHARE]
-
-
 def _widest(where: Sequence[Mapping[str, Any]]) -> str:
-    """Return the axis along which the error differs most: its squares over their mean."""
-    spread = {}
-    for axis in ("soc", "current", "temperature", "time"):
-        squares = np.array([place["rmse_v"] ** 2 for place in _shown(where, axis)])
-        spread[axis] = float(np.std(squares) / np.mean(squares)) if squares.size else 0.0
-    return max(spread, key=lambda axis: spread[axis])
+    """Return the axis with the largest excess that is certain."""
+    return str(max(where, key=lambda place: place["ci"][0])["axis"])
 
 
 def _places(where: Sequence[Mapping[str, Any]]) -> dict[str, Figure]:
     """Return the error of the model along each axis."""
     figures = {}
     for axis in dict.fromkeys(place["axis"] for place in where):
-        shown = _shown(where, axis)
+        shown = [place for place in where if place["axis"] == axis]
         entries = [(_interval(place), place["rmse_v"], ORANGE) for place in shown]
-        largest = max(shown, key=lambda place: place["share"])
-        share = percent(largest["share"])
-        caption = f"{share} of the squared error lies at {_interval(largest)}."
+        largest = max(shown, key=lambda place: place["excess"])
+        times = number(largest["excess"], 1)
+        caption = f"{times} times the error of all rows at {_interval(largest)}."
         title = f"Where: {_AXES.get(axis, axis)}"
         figures[axis] = bars(title, "RMS error of the model", entries, caption, unit="V")
     return figures
@@ -163,19 +132,9 @@ def _places(where: Sequence[Mapping[str, Any]]) -> dict[str, Figure]:
 
 def _interval(place: Mapping[str, Any]) -> str:
     low, high = place["range"]
-    if place["axis"] == "timescale":
-        at = int(np.searchsorted([10.0, 100.0, 1000.0], low, side="right"))
-        return _TIMESCALES[at]
-    if place["axis"] == "rest":
-        return "rest" if low >= 0.5 else "load"
     if place["axis"] == "time":
         return span(low / 60.0, high / 60.0, 0, "min")
     return span(low, high, 0, place["unit"])
-
-
-def _next_step(plan: Plan) -> list[Block]:
-    note = "Optimistic: it assumes that the pack behaves as the references' model."
-    return [plan.sentence, Table(*plan_rows(plan), note)]
 
 
 def _compared(found: Diagnosis) -> Table:
@@ -202,7 +161,7 @@ def _over_time(found: Diagnosis) -> list[Block]:
     error = time.figure(title, "measured − model [V]", caption, height=260, names=True)
     for name, color, values in (
         ("model as given", ORANGE, [log.before_v for log in errors]),
-        ("with the cause", BLUE, [log.after_v for log in errors]),
+        ("corrected", BLUE, [log.after_v for log in errors]),
     ):
         pieces = list(zip((log.time_s for log in errors), values, strict=True))
         time.line(error, name, pieces, color, line_width=1.0, line_alpha=0.85)

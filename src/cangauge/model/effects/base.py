@@ -34,8 +34,18 @@ from cangauge.model.voltage_model import PLAUSIBLE_C, VoltageModel
 
 Scale = Literal["one", "capacity", "voltage", "resistance"]
 
-Group = Literal["sensors_and_count", "overpotential", "clock", "thermal", "weak_cell"]
-"""What an engineer would look at together."""
+FaultName = Literal[
+    "voltage_reading",
+    "current_reading",
+    "start",
+    "capacity",
+    "clock",
+    "temperature",
+    "resistance",
+    "slow_voltage",
+    "weak_cell",
+]
+"""What an engineer would repair; each shows as one of several effects."""
 
 Values = Mapping[str, float]
 """Parameter name → value, in the parameter's unit."""
@@ -99,6 +109,8 @@ class Parameter:
         Trial values of a shape; None for an amplitude.
     from_pack : {"temperature_c"}, optional
         Marks a constant: this size of the pack at the time the effect is added, fixed afterwards.
+    healthy_std : float
+        Standard deviation of an amplitude between logs of one healthy pack, in units of `scale`.
     """
 
     name: str
@@ -109,6 +121,7 @@ class Parameter:
     scale: Scale = "one"
     grid: tuple[float, ...] | None = None
     from_pack: Literal["temperature_c"] | None = None
+    healthy_std: float = 0.0
 
     def factor(self, pack: Pack) -> float:
         """Return the factor from units of `scale` to the parameter's unit."""
@@ -245,7 +258,8 @@ class Effect:
     Parameters
     ----------
     id : str
-    group : Group
+    fault : FaultName
+        The fault that it is a shape of.
     parameters : tuple of Parameter
     equation, source : str
     signature : str
@@ -270,10 +284,12 @@ class Effect:
         (values, model, pack) → form in the C core; None if it has none.
     scales_drop : bool
         Whether the added voltage follows the model's drop over the resistances.
+    moves_time : bool
+        Whether it moves samples in time, which means over seconds would blur.
     """
 
     id: str
-    group: Group
+    fault: FaultName
     parameters: tuple[Parameter, ...]
     equation: str
     source: str
@@ -287,6 +303,7 @@ class Effect:
     rc_tau_s: Callable[[Values], float | None] = _none
     core_form: Callable[[Values, VoltageModel, Pack], CoreForm | None] = _none
     scales_drop: bool = False
+    moves_time: bool = False
 
     @property
     def amplitudes(self) -> tuple[Parameter, ...]:

@@ -56,7 +56,7 @@ def _linear_sensor(
     is_offset = error == "offset"
     return Effect(
         id=f"{signal}_{error}",
-        group="sensors_and_count",
+        fault="current_reading" if signal == "current" else "voltage_reading",
         parameters=(parameter,),
         signature=signature,
         equation=f"{symbol} = {symbol}_measured " + ("− b" if is_offset else "/ (1 + g)"),
@@ -140,7 +140,7 @@ CORRECTIONS: Final = (
     # Or an unmeasured parasitic load (with opposite sign).
     _current(
         "offset",
-        Parameter("offset_a", "A", -0.15, 0.15, scale="capacity"),
+        Parameter("offset_a", "A", -0.15, 0.15, scale="capacity", healthy_std=0.002),
         signature="a constant R·b, and a slope over time as the count drifts: OCV′·b·t/C",
         separated_by=(
             "a long rest with the bus awake: the count drifts while no current flows. Not separable"
@@ -159,7 +159,7 @@ CORRECTIONS: Final = (
     ),
     _voltage(
         "offset",
-        Parameter("offset_v", "V", -0.04, 0.04, scale="voltage"),
+        Parameter("offset_v", "V", -0.04, 0.04, scale="voltage", healthy_std=8e-4),
         signature="a constant, at any current, SoC and temperature",
         separated_by=(
             "a log over much SoC: the error of an initial SoC shrinks where the OCV is flat, that"
@@ -182,10 +182,10 @@ CORRECTIONS: Final = (
     # current never arrives, use the last current.
     Effect(
         id="time_skew",
-        group="clock",
+        fault="clock",
         parameters=(
             Parameter(
-                "skew_s", "s", -4.0, 4.0,
+                "skew_s", "s", -4.0, 4.0, healthy_std=0.05,
                 grid=(-4.0, -3.0, -2.0, -1.5, -1.0, -0.7, -0.5, -0.35, -0.2, -0.1, 0.0,
                       0.1, 0.2, 0.35, 0.5, 0.7, 1.0, 1.5, 2.0, 3.0, 4.0),
             ),
@@ -200,11 +200,27 @@ CORRECTIONS: Final = (
         correct=_time_skew,
         memory=lambda v, _: (_Waiting(v["skew_s"]),) if v["skew_s"] else (),
         core_form=lambda v, *_: CoreForm("time_skew", (v["skew_s"],)) if v["skew_s"] else NO_FORM,
+        moves_time=True,
+    ),
+    # A constant error of the thermometer. Without it a warm reading looks like a low resistance.
+    Effect(
+        id="temperature_offset",
+        fault="temperature",
+        parameters=(Parameter("offset_k", "K", -20.0, 20.0, healthy_std=1.5),),
+        signature="kt·x and the drop over the resistance as if warmer, throughout the log",
+        equation="T = T_measured − x",
+        source="zero error, JCGM 200:2012 (VIM)",
+        separated_by=(
+            "a second thermometer; a resistance that has grown leaves the voltage at rest as it is"
+        ),
+        correct=lambda signals, v, *_: signals._replace(
+            temperature_c=signals.temperature_c - v["offset_k"]
+        ),
     ),
     # Undone with a causal smoothed derivative.
     Effect(
         id="temperature_lag",
-        group="thermal",
+        fault="temperature",
         parameters=(Parameter("tau_s", "s", 0.0, 2000.0),),
         signature="kt·τ·dT/dt: while the pack warms or cools, zero at constant temperature",
         equation="T = T_measured + τ·dT_measured/dt, the derivative smoothed over 200 s",
@@ -224,7 +240,7 @@ CORRECTIONS: Final = (
     # effect that uses the temperature.
     Effect(
         id="core_temperature",
-        group="thermal",
+        fault="temperature",
         parameters=(
             Parameter("rise_k", "K", 0.0, 25.0),
             Parameter("late", "1", 0.0, 1.0),
@@ -258,8 +274,8 @@ COUNTS: Final = (
     # By ageing, cold or a wrong data sheet.
     Effect(
         id="capacity",
-        group="sensors_and_count",
-        parameters=(Parameter("change_pct", "%", -35.0, 35.0),),
+        fault="capacity",
+        parameters=(Parameter("change_pct", "%", -35.0, 35.0, healthy_std=0.5),),
         signature="OCV′·(Ah since the start): a slope over charge, steep in the knee near empty",
         equation="S = S₀ − 100·∫I dt / (C·(1 + x))",
         source="Plett, Battery Management Systems vol. II, Artech House 2015, ch. 4",
@@ -276,8 +292,8 @@ COUNTS: Final = (
     # an initial SoC from the first voltage needs no correction.
     Effect(
         id="initial_soc",
-        group="sensors_and_count",
-        parameters=(Parameter("offset_pct", "%", -12.0, 12.0),),
+        fault="start",
+        parameters=(Parameter("offset_pct", "%", -15.0, 15.0, healthy_std=0.7),),
         signature="OCV′(S): larger where the OCV is steep, at any current and time",
         equation="S₀ = S₀_assumed + x",
         source="definition",
@@ -294,7 +310,7 @@ COUNTS: Final = (
     # charge that bypasses it, with the same signature.
     Effect(
         id="coulombic_efficiency",
-        group="sensors_and_count",
+        fault="capacity",
         parameters=(Parameter("efficiency", "1", 0.7, 1.0, neutral=1.0),),
         signature="OCV′·(Ah charged since the start): a drift that grows with regeneration only",
         equation="S = S₀ − 100·∫(I⁺ + η·I⁻)dt / C",

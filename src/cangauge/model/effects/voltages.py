@@ -38,6 +38,8 @@ BEND_ZERO_C_RATE: Final = 1.0
 pack already contains the mean slope over the currents of a drive."""
 ACTIVATION_K: Final = 5000.0
 """Usual activation of the exchange current [K], about 42 kJ/mol; `exchange_a` holds at 25 °C."""
+FLAT_PCT: Final = 1e30
+"""Width of a dependence on SoC that is none [%]: exp(−100/10³⁰) is 1 exactly."""
 
 
 def _of(values: Values, *names: str) -> tuple[float, ...]:
@@ -148,11 +150,26 @@ def _weak_less_healthy(soc_pct: FloatArray, values: Values, model: VoltageModel)
 
 
 VOLTAGES: Final = (
+    # Every resistance by one factor (ageing), or the present current's alone (a contact).
+    Effect(
+        id="resistance_growth",
+        fault="resistance",
+        parameters=(Parameter("share", "1", -0.8, 3.0, healthy_std=0.05), DELAYED),
+        signature="the drop over the resistance, larger from the first row on",
+        equation="ΔU = a·ΣRj·I(t − dj); or a·ΣRj·I in its place",
+        source="definition",
+        separated_by="the same pulse, warm and cold: a thermometer that reads too high grows both",
+        scales_drop=True,
+        drive=lambda load, v, at: v["share"] * load.scaled_drop_v(v["delayed"], at.pack),
+        core_form=lambda v, _, pack: CoreForm(
+            "resistance_soc", (v["share"], 0.0, FLAT_PCT, v["delayed"], pack.resistance_ohm)
+        ),
+    ),
     # Zero at `reference_c`, the middle of the identified temperature range when the effect was
     # added.
     Effect(
         id="resistance_temperature",
-        group="overpotential",
+        fault="resistance",
         parameters=(
             Parameter("share", "1", 0.0, 3.0),
             Parameter(
@@ -185,7 +202,7 @@ VOLTAGES: Final = (
     # Decays exponentially from empty and from full.
     Effect(
         id="resistance_soc",
-        group="overpotential",
+        fault="resistance",
         parameters=(
             Parameter("at_empty", "1", -0.4, 3.0),
             Parameter("at_full", "1", -0.4, 1.5),
@@ -210,7 +227,7 @@ VOLTAGES: Final = (
     # Additional (or missing) resistance to charging current.
     Effect(
         id="resistance_asymmetry",
-        group="overpotential",
+        fault="resistance",
         parameters=(Parameter("charging_ohm", "ohm", -0.6, 1.5, scale="resistance"),),
         signature="min(I, 0): only while charging, in step with the current",
         equation="ΔU = −r·min(I, 0)",
@@ -227,7 +244,7 @@ VOLTAGES: Final = (
     # drives has `start_s` = 0.
     Effect(
         id="resistance_step",
-        group="overpotential",
+        fault="resistance",
         parameters=(
             Parameter("step_ohm", "ohm", -0.4, 2.0, scale="resistance"),
             Parameter("start_s", "s", 0.0, 1e7, neutral=None, grid=(1800.0,)),
@@ -247,14 +264,14 @@ VOLTAGES: Final = (
     # per electrode (51 mV at 25 °C) times the cells in series; the bound allows two electrodes.
     Effect(
         id="charge_transfer",
-        group="overpotential",
+        fault="resistance",
         parameters=(
             Parameter("scale_v", "V", 0.0, 0.03, scale="voltage"),
             Parameter(
                 "exchange_a", "A", 0.01, 2.0, neutral=None, scale="capacity",
                 grid=(0.02, 0.05, 0.12, 0.3, 0.8),
             ),
-            Parameter("bend_only", "1", 0.0, 1.0, neutral=None, grid=(0.0, 1.0)),
+            Parameter("bend_only", "1", 0.0, 1.0, neutral=None, grid=(1.0, 0.0)),
             Parameter("activation_k", "K", 0.0, 10000.0, neutral=None, grid=(ACTIVATION_K,)),
         ),
         signature="I − c·asinh(I/2I₀): too much drop at small currents, too little at large ones",
@@ -272,7 +289,7 @@ VOLTAGES: Final = (
     # Double layer and charge transfer, faster than the model's first delay.
     Effect(
         id="fast_polarization",
-        group="overpotential",
+        fault="resistance",
         parameters=(
             Parameter("ohm", "ohm", 0.0, 1.0, scale="resistance"),
             Parameter("tau_s", "s", 0.3, 9.0, neutral=None, grid=(0.5, 1.0, 2.0, 3.5, 6.0, 9.0)),
@@ -290,7 +307,7 @@ VOLTAGES: Final = (
     # voltage (`by_slope` 1); diffusion in the electrolyte is the same at every SoC (0).
     Effect(
         id="slow_diffusion",
-        group="overpotential",
+        fault="slow_voltage",
         parameters=(
             Parameter("ohm", "ohm", 0.0, 1.5, scale="resistance"),
             Parameter(
@@ -317,7 +334,7 @@ VOLTAGES: Final = (
     # rest.
     Effect(
         id="hysteresis",
-        group="overpotential",
+        fault="slow_voltage",
         parameters=(
             Parameter("half_width_v", "V", 0.0, 0.01, scale="voltage"),
             Parameter("travel_pct", "%", 0.5, 12.0, neutral=None, grid=(1.0, 2.0, 4.0, 7.0, 11.0)),
@@ -343,7 +360,7 @@ VOLTAGES: Final = (
     # In addition to the model's kt. The bounds are ±0.4 mV/K per cell.
     Effect(
         id="entropic_coefficient",
-        group="thermal",
+        fault="temperature",
         parameters=(
             Parameter("level_v_per_k", "V/K", -1.1e-4, 1.1e-4, scale="voltage"),
             Parameter("slope_v_per_k", "V/K", -1.1e-4, 1.1e-4, scale="voltage"),
@@ -367,7 +384,7 @@ VOLTAGES: Final = (
     # extrapolation. A reversed cell falls faster, but a pack is switched off before that.
     Effect(
         id="weak_cell",
-        group="weak_cell",
+        fault="weak_cell",
         parameters=(
             Parameter("fraction", "1", 0.0, 0.15),
             Parameter(

@@ -1,0 +1,179 @@
+"""One calibrated posterior of `none`, `unknown` and nine faults.
+
+    u_k = w·ln(1 + n_k/o_k)          P(fault | gap) ∝ (mean over its effects of e^u_k)^γ
+
+with n_k/o_k the evidence of effect k over what healthy logs show of it. The faults compete with
+each other, and together with `none` and `unknown` (nested logit: Train, Discrete Choice Methods
+with Simulation, 2nd ed., 2009, ch. 4). w, γ and the weights of the outer features are fitted to
+labelled cases with packs held out (`benchmarks/weights`).
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cache, cached_property
+from importlib.resources import files
+from typing import Any, Final, get_args
+
+import numpy as np
+from scipy.special import logsumexp
+
+from cangauge._typing import FloatArray
+from cangauge.diagnosis.evidence import Evidence
+from cangauge.diagnosis.pack import Healthy
+from cangauge.model.effects.base import FaultName
+from cangauge.model.effects.library import LIBRARY
+
+NONE: Final = "none"
+UNKNOWN: Final = "unknown"
+
+FAULTS: Final[tuple[str, ...]] = get_args(FaultName)
+
+ALARM: Final = 0.05
+"""Probability of `none` up to which a gap is reported."""
+LIKELY: Final = 0.2
+"""Probability of `none` up to which a gap is called likely: odds of 4 to 1."""
+SHAPE: Final = 0.6
+"""Part of its fault from which a shape is named."""
+
+UNTESTED: Final = 3.0
+"""A healthy log may have this many times the error that a model file states: it is of other logs,
+and no left-out reference shows how much logs differ."""
+
+
+@cache
+def shipped_weights() -> Mapping[str, Any]:
+    """Return the weights in `weights.json`."""
+    content = files("cangauge.diagnosis").joinpath("weights.json").read_text("utf-8")
+    return dict(json.loads(content)["weights"])
+
+
+@dataclass(frozen=True, eq=False)
+class Features:
+    """What the posterior sees of a case.
+
+    Parameters
+    ----------
+    effects : dict of str to float
+        ln(1 + n_k/o_k) of each effect.
+    outer : array
+        ln(V_best/v + 0.1), ln(1 + max n/o), the same less that of healthy logs, ln(V/v), 1; V is
+        the mean square error, and v that of a healthy log at these SoC and temperatures.
+    """
+
+    effects: dict[str, float]
+    outer: FloatArray
+
+
+def features(healthy: Healthy, evidence: Evidence) -> Features:
+    """Return what the posterior sees of a case."""
+    v = healthy.healthy_v2 + max(evidence.open_v2 - healthy.known_v2, 0.0)
+    effects = {name: math.log1p(max(e.nats, 0.0)) for name, e in evidence.effects.items()}
+    best = max(
+        evidence.effects,
+        key=lambda name: effects[name] - math.log(v + evidence.effects[name].left_v2),
+    )
+    most = max(effects.values())
+    usual = float(np.mean(np.log1p(healthy.nats))) if healthy.nats else math.log1p(UNTESTED)
+    gap = math.log(evidence.gap_v2 / v) - (0.0 if healthy.nats else 2.0 * math.log(UNTESTED))
+    left = math.log(evidence.effects[best].left_v2 / v + 0.1)
+    return Features(effects, np.array([left, most, most - usual, gap, 1.0]))
+
+
+def probabilities(case: Features, by: Mapping[str, Any]) -> dict[str, float]:
+    """Return the probability of `none`, `unknown` and every effect; they sum to 1."""
+    inner, exponent = by["inner"], by["exponent"]
+    u = {
+        fault: np.array([inner * x for name, x in case.effects.items() if _is_of(name, fault)])
+        for fault in FAULTS
+    }
+    value = {
+        fault: exponent * (float(logsumexp(each)) - math.log(each.size))
+        for fault, each in u.items()
+    }
+    library, (slope, offset) = float(logsumexp(list(value.values()))), by["library"]
+    outer = np.array([case.outer @ by[NONE], case.outer @ by[UNKNOWN], slope * library + offset])
+    none, unknown, any_fault = np.exp(outer - logsumexp(outer)).tolist()
+    found = {NONE: none, UNKNOWN: unknown}
+    for fault in FAULTS:
+        p = any_fault * math.exp(value[fault] - library)
+        within = np.exp(u[fault] - logsumexp(u[fault])).tolist()
+        names = [name for name in case.effects if _is_of(name, fault)]
+        found |= {name: p * part for name, part in zip(names, within, strict=True)}
+    return found
+
+
+def _is_of(effect: str, fault: str) -> bool:
+    return LIBRARY[effect].fault == fault
+
+
+@dataclass(frozen=True, eq=False)
+class Posterior:
+    """Probability of `none`, `unknown` and every effect, and what follows from it.
+
+    Parameters
+    ----------
+    probabilities : dict of str to float
+        They sum to 1.
+    alarm : float
+        P(none) up to which a gap is reported.
+    stated : float
+        P(fault) within the gap from which it is stated alone.
+    """
+
+    probabilities: Mapping[str, float]
+    alarm: float
+    stated_from: float
+
+    @property
+    def none(self) -> float:
+        """Probability that these logs have no fault."""
+        return self.probabilities[NONE]
+
+    @property
+    def unknown(self) -> float:
+        """Probability of a fault that is none of the nine."""
+        return self.probabilities[UNKNOWN]
+
+    @cached_property
+    def faults(self) -> dict[str, float]:
+        """Probability of each fault, most probable first."""
+        sums = dict.fromkeys(FAULTS, 0.0)
+        for name, p in self.probabilities.items():
+            if name in LIBRARY:
+                sums[LIBRARY[name].fault] += p
+        return dict(sorted(sums.items(), key=lambda item: -item[1]))
+
+    def effects(self, fault: str) -> dict[str, float]:
+        """Return the probability of each effect of a fault, most probable first."""
+        mine = {name: p for name, p in self.probabilities.items() if name in LIBRARY}
+        mine = {name: p for name, p in mine.items() if LIBRARY[name].fault == fault}
+        return dict(sorted(mine.items(), key=lambda item: -item[1]))
+
+    @property
+    def level(self) -> str:
+        """`gap`, `likely` or `none`."""
+        if self.none <= self.alarm:
+            return "gap"
+        return "likely" if self.none <= max(self.alarm, LIKELY) else "none"
+
+    @cached_property
+    def stated(self) -> tuple[str, ...]:
+        """The fault that is stated; two where none is sure enough; none without a gap."""
+        if self.level == "none" or 2.0 * self.unknown > 1.0 - self.none:
+            return ()
+        first, second, *_ = self.faults
+        return (first,) if self.within_gap(first) >= self.stated_from else (first, second)
+
+    def within_gap(self, fault: str) -> float:
+        """Return the probability of a fault where there is a gap."""
+        return self.faults[fault] / max(1.0 - self.none, 1e-12)
+
+
+def posterior(healthy: Healthy, evidence: Evidence, alarm: float = ALARM) -> Posterior:
+    """Return the posterior of a case by the weights that ship."""
+    by = shipped_weights()
+    return Posterior(probabilities(features(healthy, evidence), by), alarm, by["stated"])

@@ -1,0 +1,187 @@
+"""What a user reads of a diagnosis: three lines, and what limits them."""
+
+from __future__ import annotations
+
+from html import escape
+from typing import TYPE_CHECKING, Final
+
+from cangauge._text import counted, number, significant
+from cangauge.diagnosis.faults import FAULT
+from cangauge.diagnosis.rows import COVER_PCT
+from cangauge.diagnosis.where import clause
+from cangauge.logs.gaps import bridge_s
+
+if TYPE_CHECKING:
+    from cangauge.diagnosis.diagnose import Diagnosis
+
+SHORT_S: Final = 600.0
+"""Duration below which slow effects hardly develop [s]."""
+LEAST_REFERENCES: Final = 3
+"""References from which on probabilities are reliable."""
+SHOWN_FROM: Final = 0.02
+"""Probability from which a fault is listed."""
+SHOWN_VISIBLE: Final = ("voltage_offset", "current_offset", "resistance_growth")
+"""Effects whose smallest visible size is told where there is no gap: what a user suspects first."""
+
+
+def percent(probability: float) -> str:
+    """Return a probability in per cent, never 0 or 100."""
+    if probability < 0.005:
+        return "under 1 %"
+    return "over 99 %" if probability > 0.995 else f"{100.0 * probability:.0f} %"
+
+
+def volts(value: float) -> str:
+    """Return a voltage error with two significant digits."""
+    return significant(value, 2, "V")
+
+
+def answer(found: Diagnosis) -> str:
+    """Return the answer in three lines: what, how far and where, what to do."""
+    lines = [_what(found), _how_far(found), _to_do(found)]
+    if found.model_check is not None and not found.model_check.describes:
+        lines = [*_model_lines(found), "These logs beyond that: " + lines[0]]
+    return "\n".join(lines)
+
+
+def _model_lines(found: Diagnosis) -> list[str]:
+    check = found.model_check
+    assert check is not None
+    size = f"{volts(check.references_rmse_v)} ({volts(check.among_themselves_rmse_v)} among themselves)"
+    missed = [_lower(text) for text in found.missed_sentences]
+    what = "; ".join(missed) or "none of the nine faults explains it"
+    lines = [f"The model misses the healthy logs by {size}: {what}."]
+    if check.missed:
+        after = volts(check.missed[-1].rmse_v)
+        lines.append(f"Error {volts(check.references_rmse_v)} → {after} with this corrected.")
+    path = found.correction_path
+    better = f", or take {path}" if path else ""
+    lines.append(f"Fit the model again on healthy logs{better}.")
+    return lines
+
+
+def _lower(text: str) -> str:
+    return text[0].lower() + text[1:]
+
+
+def _what(found: Diagnosis) -> str:
+    posterior = found.posterior
+    none = f"P(no fault) {percent(posterior.none)}"
+    if posterior.level == "none":
+        return f"No significant gap beyond that of healthy logs. {none}; a small fault is not excluded."
+    sure = "" if posterior.level == "gap" else f" Likely, not certain: {none}."
+    if not posterior.stated:
+        unknown = percent(posterior.unknown)
+        return f"There is a gap that none of the nine faults explains (likelihood {unknown}).{sure}"
+    texts = [found.sentence(fault) for fault in posterior.stated]
+    if len(texts) == 1:
+        what = f"{texts[0]}."
+    else:
+        what = f"{texts[0]}, or {_lower(texts[1])}."
+    shown = [
+        f"{FAULT[fault].title} {percent(p)}"
+        for fault, p in posterior.faults.items()
+        if p >= SHOWN_FROM or fault in posterior.stated
+    ]
+    return f"{what} Likelihood: {', '.join(shown[:3])}.{sure}"
+
+
+def _how_far(found: Diagnosis) -> str:
+    healthy = f"healthy logs of this pack have {volts(found.healthy_rmse_v)}"
+    if not found.has_references:
+        healthy = f"the model file states {volts(found.healthy_rmse_v)}"
+    where = clause(found.where)
+    place = f"{where[0].upper()}{where[1:]}."
+    before = volts(found.baseline_rmse_v)
+    if found.correction is None:
+        return f"Error {before}; {healthy}. {place}"
+    return (
+        f"Error {before} → {volts(found.extended_rmse_v)} with this corrected; {healthy}. {place}"
+    )
+
+
+def _to_do(found: Diagnosis) -> str:
+    if found.posterior.level == "none":
+        seen = [
+            f"{significant(size, 2, unit)} ({name.replace('_', ' ')})"
+            for name in SHOWN_VISIBLE
+            for size, unit in [found.visible_from(name)]
+            if size is not None
+        ]
+        shown = f" These logs would have shown {', '.join(seen)}." if seen else ""
+        return f"Nothing to do.{shown}"
+    text = found.check_first
+    if found.correction is None:
+        return f"{text} No correction: {found.why_not}."
+    if found.correction_path:
+        return f"{text} Corrected model: {found.correction_path}"
+    return f"{text} A corrected model is at hand (--extended MODEL)."
+
+
+def caveats(found: Diagnosis) -> list[str]:
+    """Return what limits the answer, a sentence each."""
+    remarks = list(found.remarks)
+    number_of = len(found.references)
+    if found.has_references and 0 < number_of < LEAST_REFERENCES:
+        remarks.append(
+            f"{counted(number_of, 'reference')} cannot show how much healthy logs differ: give"
+            f" {LEAST_REFERENCES} or more."
+        )
+    if not found.has_references:
+        remarks.append("Without references the error that the model file states counts as normal.")
+    for log, rows in zip(found.logs, found.rows, strict=True):
+        part = 1.0 - rows.kept.size / max(rows.trace.rows.size, 1)
+        if found.has_references and part > 0.05:
+            remarks.append(
+                f"{percent(part)} of {log.name} lies at SoC that no reference visits (within"
+                f" {COVER_PCT:.0f} %) and is left out."
+            )
+        if log.duration_s < SHORT_S:
+            minutes = number(log.duration_s / 60.0, 0, "min")
+            remarks.append(f"{log.name} lasts {minutes}: slow effects hardly develop in it.")
+        if rows.trace.has_gap(bridge_s(log.time_s)):
+            remarks.append(f"{log.name} has gaps; charge that flowed in them is not counted.")
+    if found.simulator is not None and found.simulator.remark:
+        remarks.append(found.simulator.remark)
+    remarks.append("A fault is a signature at the terminals, not proof of a mechanism.")
+    return remarks
+
+
+def fault_rows(found: Diagnosis) -> tuple[list[str], list[list[str]]]:
+    """Return headings and rows: each fault with its probability, size and remaining error."""
+    rows = [
+        [
+            FAULT[fault].title,
+            percent(p),
+            found.best_of(fault).shape.effect.id.replace("_", " "),
+            _amount(found, fault),
+            volts(found.corrections[fault].rmse_v),
+        ]
+        for fault, p in found.posterior.faults.items()
+    ]
+    return ["fault", "probability", "best shape", "size (95 %)", "error with it"], rows
+
+
+def _amount(found: Diagnosis, fault: str) -> str:
+    """Return the amplitude of a fault's best shape with its interval."""
+    of = next(item for item in found.parameters(fault).values() if item.ci is not None)
+    low, high = of.ci or (of.value, of.value)
+    unit = of.unit.replace("ohm", "Ω")
+    ends = f"{significant(low, 2)} … {significant(high, 2)}"
+    return f"{significant(of.value, 2, '' if unit == '1' else unit)} ({ends})"
+
+
+def plan_text(found: Diagnosis) -> str:
+    """Return what the next measurement is expected to bring, in a sentence."""
+    step = found.next_step
+    if step is None:
+        return "Next step: none; there is no fault to settle."
+    return (
+        f"Next step: {step.measurement}. The probability of the true fault would rise from"
+        f" {percent(step.before)} to {percent(step.after)}."
+    )
+
+
+def html(found: Diagnosis) -> str:
+    """Return the answer for a notebook."""
+    return "".join(f"<p>{escape(line)}</p>" for line in answer(found).splitlines())
