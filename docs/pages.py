@@ -155,11 +155,11 @@ def effects_page() -> str:
         " (discharge upwards), the voltage that the effect adds below, free of sensor noise."
         " `cangauge twin --effect ID` simulates it, `cangauge gap` looks for it.",
     ]
-    group = ""
-    for effect in sorted(LIBRARY.values(), key=lambda each: (each.group, each.id)):
-        if effect.group != group:
-            group = effect.group
-            parts.append(f"## {group.replace('_', ' ').capitalize()}")
+    fault = ""
+    for effect in sorted(LIBRARY.values(), key=lambda each: (each.fault, each.id)):
+        if effect.fault != fault:
+            fault = effect.fault
+            parts.append(f"## {fault.replace('_', ' ').capitalize()}")
         parts += [
             f"### {effect.id}",
             inspect.cleandoc(type(effect).__doc__ or ""),

@@ -20,7 +20,7 @@ from synthetic import synthetic_log
 
 HEATER_DROP = Effect(
     id="heater_drop",
-    group="sensors_and_count",
+    fault="voltage_reading",
     parameters=(Parameter("drop_v", "V", -0.04, 0.04, scale="voltage"),),
     signature="a constant",
     equation="U = OCV − drop",

@@ -3,123 +3,113 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from benchmarks.weights.engine import GROUP_OF
 from scipy.optimize import minimize
 from scipy.special import logsumexp
 
-PARTS = {"inner": 4, "library": 2, "none": 5, "unknown": 5}
-"""Numbers of each part, in one array: see `cangauge.diagnosis.answer.Features`."""
-INNER, LIBRARY, NONE, UNKNOWN = slice(0, 4), slice(4, 6), slice(6, 11), slice(11, 16)
-CENTRE = np.array([1.5, 0.5, 0.5, 0.0, 0.5, *[0.0] * 11])
-SPREAD = np.array([1.5, 1.0, 1.0, 1.0, 0.5, 3, 1, 1, 1, 1, 3, 1, 1, 1, 1, 3])
-"""Ridge: prior mean and deviation of each number."""
-CAUSE_OUT = 0.03
-"""Weight of a case whose own effect was taken out of the library; it moves the outer numbers. From
-a tenth on they are called `unknown`, but so are one in thirteen healthy logs."""
+from cangauge.diagnosis.posterior import FAULTS, NONE, UNKNOWN, Features, probabilities
+from cangauge.model.effects.library import LIBRARY
+
+CENTRE = np.array([0.7, 0.6, 1.5, 0.5, *[0.0] * 11])
+SPREAD = np.array([1.0, 1.0, 1.0, 0.5, 3.0, *[3.0, 1.0, 1.0, 1.0, 3.0] * 2])
+"""Ridge: prior mean and deviation of the two inner weights, the exponent, slope and offset of the
+library, and the outer weights of none and unknown."""
 
 
-@dataclass
+@dataclass(frozen=True, eq=False)
 class Example:
-    """One case with its features and truth."""
+    """One case: what the posterior sees of it, and the truth.
+
+    Parameters
+    ----------
+    pack : str
+    world : str
+    features : Features
+    truth : dict
+        As drawn; `fault` is a fault, none or unknown.
+    logs, references : int
+        Their number.
+    found : dict
+        What else a table reports.
+    """
 
     pack: str
     world: str
-    names: tuple[str, ...]
-    inner: np.ndarray
-    outer: np.ndarray
-    truth: str
-    """Effect id, none or unknown."""
-    floors: float
-    cause_out: bool = False
-    case: int = 0
-    more: dict[str, Any] = field(default_factory=dict)
+    features: Features
+    truth: dict[str, Any]
+    logs: int
+    references: int
+    found: dict[str, Any]
+
+    @property
+    def floors(self) -> float:
+        """Size [floors]; 0 of a healthy case."""
+        return float(self.truth.get("floors", 0.0))
 
 
-class Stack:
-    """Examples as arrays: effects of the library in one order, absent ones masked."""
-
-    def __init__(self, examples: Sequence[Example]) -> None:
-        self.order = list(GROUP_OF)
-        n, k = len(examples), len(self.order)
-        self.inner, self.absent = np.zeros((n, k, 4)), np.zeros((n, k))
-        self.outer = np.array([x.outer for x in examples])
-        for row, x in enumerate(examples):
-            at = [self.order.index(name) for name in x.names]
-            self.inner[row, at] = x.inner
-            self.absent[row, np.setdiff1d(np.arange(k), at)] = -1e9
-
-    def names(self, inner: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return ln P(name | library), shape (n, k), and the library's inclusive value, (n,)."""
-        u = self.inner @ inner + self.absent
-        value = logsumexp(u, axis=1)
-        return u - value[:, None], value
-
-    def parts(self, w: np.ndarray, value: np.ndarray) -> np.ndarray:
-        """Return ln P of library, none, unknown, shape (n, 3)."""
-        library = value * w[LIBRARY][0] + w[LIBRARY][1]
-        z = np.column_stack([library, self.outer @ w[NONE], self.outer @ w[UNKNOWN]])
-        return z - logsumexp(z, axis=1)[:, None]
+def _values(examples: Sequence[Example], inner: np.ndarray) -> np.ndarray:
+    """Return the mean of e^u over the effects of each fault, logarithm, shape (n, 9)."""
+    columns = []
+    for fault in FAULTS:
+        names = [name for name, effect in LIBRARY.items() if effect.fault == fault]
+        u = np.array([[x.features.effects[name] for name in names] for x in examples]) @ inner
+        columns.append(logsumexp(u, axis=1) - np.log(len(names)))
+    return np.column_stack(columns)
 
 
-def probabilities(w: np.ndarray, examples: Sequence[Example]) -> list[dict[str, float]]:
-    """Return the probability of none, unknown and every effect, for each example."""
-    stack = Stack(examples)
-    names, value = stack.names(w[INNER])
-    outer = stack.parts(w, value)
-    every = np.exp(outer[:, :1] + names)
-    return [
-        {"none": float(o[1]), "unknown": float(o[2])}
-        | {k: float(v) for k, v in zip(stack.order, row, strict=True) if k in x.names}
-        for o, row, x in zip(np.exp(outer), every, examples, strict=True)
-    ]
+def fit(examples: Sequence[Example]) -> dict[str, Any]:
+    """Return the weights: inner weight and exponent from known faults, then the outer ones."""
+    truth = [x.truth["fault"] for x in examples]
+    weight = _alike([x.pack for x in examples])
+    known = np.array([fault in FAULTS for fault in truth])
+    at = np.array([FAULTS.index(fault) for fault in truth if fault in FAULTS])
+    few = [x for x, is_known in zip(examples, known, strict=True) if is_known]
 
+    def ridge(v: np.ndarray, first: int) -> float:
+        part = slice(first, first + v.size)
+        return 0.5 * float(np.sum(((v - CENTRE[part]) / SPREAD[part]) ** 2))
 
-def fit(examples: Sequence[Example], cause_out: float = CAUSE_OUT) -> np.ndarray:
-    """Return the weights: the inner ones from effects in the library, then the outer ones."""
-    weight = np.array([cause_out if x.cause_out else 1.0 for x in examples])
-    pack = np.array([x.pack for x in examples])
+    def fault_loss(v: np.ndarray) -> float:
+        u = v[2] * _values(few, v[:2])
+        loss = u[np.arange(at.size), at] - logsumexp(u, axis=1)
+        return -float(weight[known] @ loss) + ridge(v, 0)
 
-    def alike(kept: np.ndarray) -> np.ndarray:
-        out = np.zeros(len(pack))
-        for p in set(pack[kept]):
-            mine = kept & (pack == p)
-            out[mine] = kept.sum() / len(set(pack[kept])) / mine.sum()
-        return out * weight
-
-    named = np.array([x.truth in x.names and not x.cause_out for x in examples])
-    stack = Stack(examples)
-    few = Stack([x for x, k in zip(examples, named, strict=True) if k])
-    at = np.array([few.order.index(x.truth) for x, k in zip(examples, named, strict=True) if k])
-    a = alike(named)[named]
-
-    def name_loss(v: np.ndarray) -> float:
-        loss = -float(a @ few.names(v)[0][np.arange(len(at)), at])
-        return loss + 0.5 * float(np.sum(((v - CENTRE[:4]) / SPREAD[:4]) ** 2))
-
-    inner = minimize(name_loss, CENTRE[:4], method="L-BFGS-B", bounds=[(0, None)] * 4).x
-    value = stack.names(inner)[1]
-    target = np.array(
-        [1 if x.truth == "none" else 2 if x.truth == "unknown" else 0 for x in examples]
-    )
-    b, rows = alike(np.ones(len(pack), bool)), np.arange(len(pack))
+    *inner, exponent = minimize(fault_loss, CENTRE[:3], method="L-BFGS-B").x
+    library = logsumexp(exponent * _values(examples, np.array(inner)), axis=1)
+    outer = np.array([x.features.outer for x in examples])
+    kind = np.array([0 if k else 1 if fault == NONE else 2
+                     for k, fault in zip(known, truth, strict=True)])  # fmt: skip
 
     def outer_loss(v: np.ndarray) -> float:
-        loss = -float(b @ stack.parts(np.concatenate([inner, v]), value)[rows, target])
-        return loss + 0.5 * float(np.sum(((v - CENTRE[4:]) / SPREAD[4:]) ** 2))
+        z = np.column_stack([v[0] * library + v[1], outer @ v[2:7], outer @ v[7:]])
+        loss = z[np.arange(kind.size), kind] - logsumexp(z, axis=1)
+        return -float(weight @ loss) + ridge(v, 3)
 
-    return np.concatenate([inner, minimize(outer_loss, CENTRE[4:], method="L-BFGS-B").x])
+    found = minimize(outer_loss, CENTRE[3:], method="L-BFGS-B").x.round(4).tolist()
+    return {
+        "inner": np.round(inner, 4).tolist(),
+        "exponent": round(float(exponent), 4),
+        "library": found[:2],
+        NONE: found[2:7],
+        UNKNOWN: found[7:],
+    }
 
 
-def held_out(examples: Sequence[Example], **options: Any) -> list[dict[str, float]]:
+def _alike(packs: Sequence[str]) -> np.ndarray:
+    """Return weights by which a data set counts as the root of its cases."""
+    weight = np.array([packs.count(pack) ** -0.5 for pack in packs])
+    return np.asarray(weight * len(packs) / weight.sum())
+
+
+def held_out(examples: Sequence[Example]) -> list[dict[str, float]]:
     """Return probabilities of every example by weights fitted without its data set."""
-    out: list[dict[str, float]] = [{} for _ in examples]
-    for p in {x.pack for x in examples}:
-        w = fit([x for x in examples if x.pack != p], **options)
-        at = [k for k, x in enumerate(examples) if x.pack == p]
-        for k, found in zip(at, probabilities(w, [examples[k] for k in at]), strict=True):
-            out[k] = found
-    return out
+    found: list[dict[str, float]] = [{} for _ in examples]
+    for pack in sorted({x.pack for x in examples}):
+        by = fit([x for x in examples if x.pack != pack])
+        for k, x in enumerate(examples):
+            if x.pack == pack:
+                found[k] = probabilities(x.features, by)
+    return found

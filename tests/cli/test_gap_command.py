@@ -45,75 +45,54 @@ def test_json_report_plan_and_a_model_that_runs(
     better, page = tmp_path / "better.json", tmp_path / "gap.html"
     options = ("--plan", "--extended", better, "--report", page, "--json")
     found = succeeds(*faulty, *options).json
-    assert found["schema"] == 3
-    assert found["cause"]["groups"][0]["group"] == "sensors_and_count"
-    assert found["extended_model"] == str(better)
-    plan = found["plan"]
-    gains = [step["gain"] for step in plan["steps"]]
-    assert gains == sorted(gains, reverse=True)
-    assert len(plan["between"]) == 2
-    assert all(0.0 <= step["after"] <= 1.0 for step in plan["steps"])
+    assert found["schema"] == 4
+    assert found["faults"][0]["fault"] == "voltage_reading"
+    assert found["correction"] == {"accepted": True, "why_not": None, "path": str(better)}
+    step = found["next_step"]
+    assert step["between"][0] == "voltage_reading"
+    assert 0.0 <= step["probability_now"] <= step["probability_after"] <= 1.0
     text = html.unescape(page.read_text(encoding="utf-8"))
-    assert found["summary"].splitlines()[0] in text
-    assert found["cause"]["check_first"] in text
+    answer = found["answer"]
+    assert answer["text"].splitlines()[0] in text
+    assert answer["check_first"] in answer["text"]
+    assert f"Corrected model: {better}" in answer["text"]
     assert "How far it shrinks" in text
-    assert plan["steps"][0]["name"] in text
     assert [entry["id"] for entry in Model.load(better).effects]
     succeeds("estimate", drives / "trip.csv", "-m", better, "-o", tmp_path / "soc.csv")
 
 
 def test_an_added_test_reports_its_change(faulty: list[object], tmp_path: Path) -> None:
-    write_log(drive(21, 85.0, 2.5), tmp_path / "trip.csv")
-    write_log(drive(22, 55.0, 2.5), tmp_path / "further.csv")
+    write_log(drive(21, 85.0, 4.0), tmp_path / "trip.csv")
+    write_log(drive(22, 84.0, 4.0), tmp_path / "further.csv")
     again = ("gap", tmp_path / "trip.csv", *faulty[2:])
     found = succeeds(*again, "--add-test", tmp_path / "further.csv", "--json").json
     assert found["added_test"]["logs"] == ["further"]
     assert [log["name"] for log in found["inputs"]["logs"]] == ["trip", "further"]
-    after = {item["effect"]: item["probability"] for item in found["cause"]["candidates"]}
+    assert found["gap"]["on"] == "left-out log"
+    assert found["faults"][0]["fault"] == "voltage_reading"
     before = found["added_test"]["before"]
-    sensing = ("voltage_offset", "voltage_gain")
-    assert sum(after[name] for name in sensing) > sum(before[name] for name in sensing)
+    assert set(before) == {"none", *(item["fault"] for item in found["faults"])}
+    assert before["voltage_reading"] == max(before.values())
 
 
-def test_a_cause_in_the_log_leaves_the_model_as_given(made: Path, tmp_path: Path) -> None:
-    def made_drive(seed: int, start_pct: float, end_pct: float) -> Log:
-        return synthetic_log(
-            hours=0.8, start_pct=start_pct, end_pct=end_pct, noise_v=0.5, seed=seed
-        )
-
-    given: list[object] = []
-    for seed, (start_pct, end_pct) in enumerate([(60.0, 30.0)] * 3 + [(90.0, 50.0), (50.0, 5.0)]):
-        path = tmp_path / f"good{seed}.csv"
-        write_log(made_drive(11 + seed, start_pct, end_pct), path)
-        given += ["--reference", path]
-    log = made_drive(20, 60.0, 30.0)
-    assert log.soc_pct is not None
-    write_log(replace(log, soc_pct=log.soc_pct - 14.0), tmp_path / "today.csv")
-    better = tmp_path / "better.json"
-    today = ("gap", tmp_path / "today.csv", "-m", made / "model.json", *given)
-    ran = succeeds(*today, "--extended", better)
-    assert "The assumed initial SoC is 1" in ran.out
-    assert "better.json: the model as given, since the cause, initial_soc (probability " in ran.err
-    assert "is in these logs" in ran.err
-    assert not Model.load(better).effects
-
-
-def test_text_begins_with_the_verdict(made: Path, drives: Path, tmp_path: Path) -> None:
+def test_text_begins_with_the_answer(made: Path, drives: Path, tmp_path: Path) -> None:
     given = (drives / "good11.parquet", "-m", made / "model.json")
     ran = succeeds("gap", *given, "--extended", tmp_path / "same.json")
-    assert "same.json: the model as given, since no cause is accepted" in ran.err
+    assert not (tmp_path / "same.json").exists()
+    assert "no corrected model: no fault is stated" in ran.err
     assert ran.out.startswith("No significant gap")
-    assert "P(no fault) = " in ran.out
-    assert "No reference log was given" in ran.out
+    assert "P(no fault) " in ran.out
+    assert "Without references" in ran.out
     table = {line.split()[0] for line in ran.out.splitlines() if line.strip()}
-    assert {"cause", "unknown", "none"} <= table
+    assert {"voltage", "current", "wrong", "capacity", "clock", "weak"} <= table
 
 
 def test_the_alarm_is_a_choice_of_the_user(made: Path, drives: Path) -> None:
     given = ("gap", drives / "good11.parquet", "-m", made / "model.json", "--json", "--alarm")
-    never, always = (succeeds(*given, alarm).json["cause"] for alarm in ("0", "1"))
-    assert (never["detected"], always["detected"]) == (False, True)
-    assert never["verdict"] == always["verdict"]
+    never, always = (succeeds(*given, alarm).json["answer"] for alarm in ("0", "1"))
+    assert never["level"] != "gap"
+    assert always["level"] == "gap"
+    assert never["probability_none"] == always["probability_none"]
     assert in_process(*given, "2").code == 2
 
 

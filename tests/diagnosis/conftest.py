@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 from days import day
 
-from cangauge.diagnosis import References, learn_references
+from cangauge.diagnosis import Healthy, learn_references
 from cangauge.identify.fit import fit
 from cangauge.logs.log import Log
 from cangauge.model.model_file import Model
@@ -26,6 +26,6 @@ def references() -> list[Log]:
 
 
 @pytest.fixture(scope="session")
-def known(references: list[Log], model: Model) -> References:
+def known(references: list[Log], model: Model) -> Healthy:
     """What the references show, learned once."""
     return learn_references(references, model)

@@ -62,12 +62,15 @@ def wrong_start(log: Log, percent: float) -> Log:
     return replace(log, soc_pct=log.soc_pct - percent)
 
 
+def warmer(log: Log, kelvin: float) -> Log:
+    """The thermometer reads too high."""
+    return replace(log, temperature_c=log.temperature_c + kelvin)
+
+
 FAULTS: dict[str, tuple[Fault, float]] = {
-    "current_offset": (more_amperes, 6.0),
-    "voltage_offset": (more_volts, 5.0),
-    "time_skew": (late, 2.0),
-    "resistance_step": (resistance_step, 0.08),
-    "resistance_asymmetry": (asymmetric, 0.12),
-    "initial_soc": (wrong_start, 8.0),
+    "current_reading": (more_amperes, 6.0),
+    "voltage_reading": (more_volts, 5.0),
+    "clock": (late, 2.0),
+    "resistance": (more_resistance, 0.08),
 }
-"""Effect → a fault of more than two floors, and its size."""
+"""Fault → a change of more than two floors, and its size."""

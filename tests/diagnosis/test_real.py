@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from cangauge.bus.recording import read_log
-from cangauge.diagnosis import Diagnosis, References, diagnose, learn_references
+from cangauge.diagnosis import Diagnosis, Healthy, diagnose, learn_references
 from cangauge.identify.fit import fit
 from cangauge.logs.log import Log
 from cangauge.model.model_file import Model
@@ -44,45 +44,45 @@ def model(references: list[Log]) -> Model:
 
 
 @pytest.fixture(scope="module")
-def known(references: list[Log], model: Model) -> References:
+def known(references: list[Log], model: Model) -> Healthy:
     return learn_references(references, model)
 
 
-def found_in(change: Callable[[Log], Log], model: Model, known: References) -> Diagnosis:
+def found_in(change: Callable[[Log], Log], model: Model, known: Healthy) -> Diagnosis:
     return diagnose([change(trip(number)) for number in (15, 17)], model, known)
 
 
 @pytest.mark.parametrize(
-    ("change", "group"),
+    ("change", "fault"),
     [
-        (lambda log: replace(log, voltage_v=1.02 * log.voltage_v), "sensors_and_count"),
+        (lambda log: replace(log, voltage_v=1.02 * log.voltage_v), "voltage_reading"),
         (lambda log: replace(log, current_a=np.interp(
             log.time_s - 0.5, log.time_s, log.current_a)), "clock"),
         (lambda log: replace(log, voltage_v=log.voltage_v - 0.05 * log.current_a),
-         "overpotential"),
+         "resistance"),
     ],
 )  # fmt: skip
-def test_a_fault_of_two_floors_is_in_the_first_group(
-    change: Callable[[Log], Log], group: str, model: Model, known: References
+def test_a_fault_of_two_floors_is_stated(
+    change: Callable[[Log], Log], fault: str, model: Model, known: Healthy
 ) -> None:
     found = found_in(change, model, known)
-    assert found.posterior.detected
-    assert found.posterior.stated_groups[0] == group
+    assert found.posterior.level != "none"
+    assert found.posterior.stated[0] == fault
 
 
-def test_a_late_current_is_named_and_sized(model: Model, known: References) -> None:
+def test_a_late_current_is_named_and_sized(model: Model, known: Healthy) -> None:
     found = found_in(
         lambda log: replace(log, current_a=np.interp(log.time_s - 0.5, log.time_s, log.current_a)),
         model,
         known,
     )
-    assert found.posterior.name == "time_skew"
-    ci = found.parameters["time_skew"]["skew_s"].ci
+    assert found.posterior.stated[0] == "clock"
+    ci = found.parameters("clock")["skew_s"].ci
     assert ci is not None
     assert ci[0] <= 0.5 <= ci[1]
-    assert found.accepted == "time_skew"
+    assert found.is_written
     assert found.extended_rmse_v < found.baseline_rmse_v
 
 
-def test_healthy_trips_give_no_alarm(model: Model, known: References) -> None:
-    assert not found_in(lambda log: log, model, known).posterior.detected
+def test_healthy_trips_give_no_alarm(model: Model, known: Healthy) -> None:
+    assert found_in(lambda log: log, model, known).posterior.level != "gap"

@@ -33,7 +33,7 @@ DESIGN_IDS = {
     "core_temperature", "time_skew", "capacity", "initial_soc", "coulombic_efficiency",
     "resistance_temperature", "resistance_soc", "resistance_asymmetry", "resistance_step",
     "charge_transfer", "fast_polarization", "slow_diffusion", "hysteresis",
-    "entropic_coefficient", "weak_cell",
+    "entropic_coefficient", "weak_cell", "temperature_offset", "resistance_growth",
 }  # fmt: skip
 ALL = [kind.id for kind in (*fault_kinds(), *fault_kinds(outside=True))]
 WANTED_V = 0.4

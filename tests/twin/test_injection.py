@@ -20,6 +20,7 @@ from cangauge.extras.validation.twin.injection import (
 from cangauge.extras.validation.twin.pack import TwinPack
 from cangauge.extras.validation.twin.recording import rms
 from cangauge.logs.log import Log
+from cangauge.model.effects.library import LIBRARY
 
 CAPACITY_AH = 60.0
 
@@ -84,21 +85,21 @@ def test_further_drives_stay_within_the_weather() -> None:
 
 def test_a_check_counts_what_was_found_at_each_size() -> None:
     def finding(effect: str | None, floors: float, *, right: bool) -> gap_check.Finding:
-        return gap_check.Finding(
-            "log", effect, floors, -2.0 * floors, "A", right, right, right, 0.5
-        )
+        fault = "none" if effect is None else LIBRARY[effect].fault
+        size = -2.0 * floors
+        return gap_check.Finding("log", effect, floors, size, "A", fault, right, right, right, 0.5)
 
     found = [finding("current_offset", floors, right=right)
              for floors, right in ((1.1, False), (0.9, True), (2.0, True))]  # fmt: skip
     result = gap_check.summarize([*found, finding(None, 0.0, right=False)])
     assert result["healthy"] == {"logs": 1, "alarms": 0, "probability_none": 0.5}
-    offset = next(item for item in result["effects"] if item["effect"] == "current_offset")
-    assert [(of["floors"], of["size"], of["group_right"], of["of"]) for of in offset["sizes"]] == [
-        (1.0, pytest.approx(2.0), 1, 2), (2.0, 4.0, 1, 1),
+    current = next(item for item in result["faults"] if item["fault"] == "current_reading")
+    assert [(of["floors"], of["first"], of["of"]) for of in current["sizes"]] == [
+        (1.0, 1, 2), (2.0, 1, 1),
     ]  # fmt: skip
     head, rows = gap_check.table(result)
-    assert head == ["effect", "1 floor", "2 floors", "4 floors"]
-    assert ["current_offset", "2.0 A: 1/2, 1/2", "4.0 A: 1/1, 1/1", "–"] in rows
+    assert head == ["fault", "1 floor", "2 floors", "4 floors"]
+    assert ["current reading", "1/2, 1/1", "1/1, 1/1", "–"] in rows
     assert "first in 67 % of 3 injected effects" in gap_check.summary(result)
     with pytest.raises(InputError, match="3 healthy logs are too few"):
         gap_check.CheckedPack.of_logs([simulate(seed=1, hours=0.1).log] * 3, 60.0, 96)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import importlib
 import os
 import sys
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -114,7 +114,7 @@ def gap_command(
         option(
             "--plan",
             "",
-            "Propose the drive or measurement that best separates the two likeliest causes.",
+            "Print what the next measurement is expected to bring.",
         ),
     ] = False,
     add_test: Annotated[
@@ -122,7 +122,7 @@ def gap_command(
         option(
             "--add-test",
             "LOG",
-            "Log of a further test of the same cause, beside the LOGs of the first diagnosis:"
+            "Log of a further test of the same fault, beside the LOGs of the first diagnosis:"
             " diagnoses both together and reports what the test changed; repeat the option.",
         ),
     ] = None,

@@ -96,7 +96,10 @@ class Correction:
         for number, (log, of, before) in enumerate(zip(logs, given, without, strict=True)):
             after_v = before.before_v.copy()
             shape = shape_in_log(evidence, number, log)
-            for size in np.unique(sizes[number]) if shape is not None else ():
+            if shape is None:
+                errors.append(before)
+                continue
+            for size in np.unique(sizes[number]):
                 mine = sizes[number] == size
                 found = of.with_effect(shape.effect, shape.values(float(size)))
                 after_v[mine] = found.residual_v[log.kept][mine]

@@ -7,8 +7,9 @@ from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 
-from cangauge._typing import FloatArray, IntArray
+from cangauge._typing import FloatArray
 from cangauge.diagnosis.pack import (
     RIDGE,
     SOC_STANDS_OUT,
@@ -66,7 +67,7 @@ class Trials:
     """What is tried on some logs: shapes, and the column of each in every log."""
 
     shapes: list[Shape]
-    at: IntArray
+    at: NDArray[np.intp]
     """Column of each shape in each log, −1 where it has none, shape (logs, k)."""
     places: list[tuple[float | None, ...]]
     low: FloatArray
@@ -118,9 +119,9 @@ def analyse(healthy: Healthy, logs: Sequence[LogRows]) -> Evidence:
     g, s = left[:, :-1].T @ left[:, -1], np.maximum(np.sum(left[:, :-1] ** 2, axis=0), 1e-9)
     size = np.clip(g / (s + RIDGE), trials.low, trials.high)
     gain = g * size - 0.5 * s * size**2
-    root = np.linalg.qr(rows.table[:, [*range(n), -1]], mode="r")
-    theta = np.linalg.solve(root[:n, :n], root[:n, n])
-    moved = _moved_by_shapes(rows, n)
+    triangular = np.asarray(np.linalg.qr(rows.table, mode="r"), dtype=np.float64)
+    solved = np.linalg.solve(triangular[:n, :n], triangular[:n, n:])
+    moved, theta = solved[:, :-1], solved[:, -1]
     over = np.array([healthy.excess_of(shape.effect.id) for shape in trials.shapes])
     seconds = sum(log.seconds for log in logs)
     effects = {}
@@ -152,12 +153,6 @@ def analyse(healthy: Healthy, logs: Sequence[LogRows]) -> Evidence:
     gap = sum(healthy.mean_square_v2(log, before) * log.seconds for log in logs) / seconds
     open_v2 = sum(healthy.open_v2(log) * log.seconds for log in logs) / seconds
     return Evidence(effects, gap, open_v2)
-
-
-def _moved_by_shapes(rows: Rows, n: int) -> FloatArray:
-    """Return the change of δ by a unit of each shape, with the opposite sign, shape (n, k)."""
-    root = np.linalg.qr(rows.table, mode="r")
-    return np.asarray(np.linalg.solve(root[:n, :n], root[:n, n:-1]))
 
 
 def soc_row(healthy: Healthy, log: LogRows, soc_pct: FloatArray) -> float:

@@ -154,7 +154,8 @@ def _capacity(p: Mapping[str, Quantity], pack: Pack, _: float) -> str:
     low, high = (pack.capacity_ah * (1.0 + end / 100.0) for end in item.ci or (item.value,) * 2)
     now = pack.capacity_ah * (1.0 + item.value / 100.0)
     ends = f"{significant(low, 3)}–{significant(high, 3, 'Ah')}"
-    return f"The capacity is {significant(now, 3, 'Ah')} ({ends}), not {significant(pack.capacity_ah, 3, 'Ah')}"
+    assumed = significant(pack.capacity_ah, 3, "Ah")
+    return f"The capacity is {significant(now, 3, 'Ah')} ({ends}), not {assumed}"
 
 
 def _efficiency(p: Mapping[str, Quantity], _: Pack, __: float) -> str:
@@ -186,7 +187,9 @@ def _core(p: Mapping[str, Quantity], _: Pack, __: float) -> str:
 def _entropic(p: Mapping[str, Quantity], _: Pack, __: float) -> str:
     names = ("level_v_per_k", "slope_v_per_k", "curve_v_per_k")
     item = max((p[name] for name in names), key=lambda item: abs(item.value))
-    return f"The voltage changes with temperature by {_between(item, 1e3, 'mV/K')}) more than the model's"
+    per_k = _between(item, 1e3, "mV/K")
+    more = _sign(item, "more", "less")
+    return f"The voltage changes with temperature by {per_k}) {more} than before"
 
 
 def _growth(p: Mapping[str, Quantity], pack: Pack, _: float) -> str:
@@ -204,7 +207,8 @@ def _step(p: Mapping[str, Quantity], _: Pack, __: float) -> str:
 
 
 def _cold(p: Mapping[str, Quantity], _: Pack, __: float) -> str:
-    return f"The resistance grows in the cold by {_between(p['share'], 100.0, '%')}) more than the model's"
+    share = _between(p["share"], 100.0, "%")
+    return f"The resistance grows more in the cold, {share}) of Arrhenius' law"
 
 
 def _over_soc(p: Mapping[str, Quantity], _: Pack, __: float) -> str:
@@ -221,16 +225,19 @@ def _charging(p: Mapping[str, Quantity], _: Pack, __: float) -> str:
 
 
 def _bend(p: Mapping[str, Quantity], _: Pack, __: float) -> str:
-    return f"The resistance at small currents is too high by {_between(p['scale_v'])} of charge transfer)"
+    scale = _between(p["scale_v"])
+    return f"The drop at small currents has grown by charge transfer, scale {scale})"
 
 
 def _tail(p: Mapping[str, Quantity], _: Pack, __: float) -> str:
-    return f"The resistance has grown by {_between(p['ohm'])}, with a tail of {p['tau_s'].value:.0f} s)"
+    tail = f"with a tail of {p['tau_s'].value:.0f} s"
+    return f"The resistance has grown by {_between(p['ohm'])}) {tail}"
 
 
 def _slow(p: Mapping[str, Quantity], _: Pack, __: float) -> str:
     minutes = p["tau_s"].value / 60.0
-    return f"A voltage of {_between(p['ohm'])} times the current) comes and goes over {minutes:.0f} min"
+    size = _between(p["ohm"])
+    return f"A voltage of {size}) times the current comes and goes over {minutes:.0f} min"
 
 
 def _memory(p: Mapping[str, Quantity], _: Pack, __: float) -> str:

@@ -9,14 +9,12 @@ import numpy as np
 
 from cangauge.diagnosis.evidence import Evidence
 from cangauge.diagnosis.faults import FAULT
-from cangauge.diagnosis.posterior import UNKNOWN, Posterior
+from cangauge.diagnosis.posterior import Posterior
 
 RESOLUTION: Final = 0.025
 """Resolution of a measurement without a healthy scatter, in bounds of the effect."""
 NODES: Final = 7
 """Readings over which an expectation is taken (Gauss–Hermite)."""
-UNKNOWN_SPREAD: Final = 10.0
-"""An unknown fault may make a measurement read this many times its resolution."""
 
 
 @dataclass(frozen=True)
@@ -77,23 +75,26 @@ def _expected(evidence: Evidence, posterior: Posterior, measured: str) -> tuple[
     after = []
     for fault in posterior.stated:
         mean, std = (of.size, spread) if fault == measured else (0.0, resolution)
-        readings = mean + std * nodes
-        settled = [_settled(posterior, measured, of.size, spread, resolution, x) for x in readings]
-        each = [found[fault] for found in settled]
+        each = []
+        for reading in (mean + std * nodes).tolist():
+            here = _density(reading, of.size, spread)
+            others = _density(reading, 0.0, resolution)
+            each.append(_settled(posterior, measured, here, others)[fault])
         after.append(float(weights @ each / weights.sum()))
     return float(now @ now / now.sum()), float(now @ after / now.sum())
 
 
-def _settled(
-    posterior: Posterior, measured: str, size: float, spread: float, resolution: float, x: float
-) -> dict[str, float]:
-    """Return the probability of each fault after a reading, by Bayes' rule."""
-    others = _density(x, 0.0, resolution)
+def _settled(posterior: Posterior, measured: str, here: float, others: float) -> dict[str, float]:
+    """Return the probability of each fault after a reading, by Bayes' rule.
+
+    `here` and `others` are the densities of the reading with the measured fault and without; an
+    unknown fault may have either.
+    """
     found = {fault: p * others for fault, p in posterior.faults.items()}
-    found[measured] = posterior.faults[measured] * _density(x, size, spread)
-    unknown = 0.5 * (others + _density(x, 0.0, UNKNOWN_SPREAD * resolution))
-    total = sum(found.values()) + posterior.none * others + posterior.unknown * unknown
-    return {fault: p / total for fault, p in found.items()} | {UNKNOWN: posterior.unknown}
+    found[measured] = posterior.faults[measured] * here
+    unknown = posterior.unknown * 0.5 * (here + others)
+    total = sum(found.values()) + posterior.none * others + unknown
+    return {fault: p / total for fault, p in found.items()}
 
 
 def _density(x: float, mean: float, std: float) -> float:

@@ -52,7 +52,7 @@ CURVES: Final = (0.1, 0.3, 1.0)
 
 UNSETTLED_S: Final = (150.0, 1200.0)
 """Times over which a pack settles after the start of a log [s]; …"""
-UNSETTLED: Final = 0.1
+UNSETTLED: Final = 0.03
 """… its voltage differs by this part of the drop at 1 C."""
 KNEE: Final = 0.003
 """Usual error of the knee near empty, relative to the voltage; …"""
@@ -133,7 +133,9 @@ class Linear:
             colder * (currents @ self.ohm),
         ])  # fmt: skip
 
-    def prior(self, model: Model, mean_v: float, mean_soc_pct: float) -> tuple[FloatArray, ...]:
+    def prior(
+        self, model: Model, mean_v: float, mean_soc_pct: float
+    ) -> tuple[FloatArray, FloatArray]:
         """Return mean and covariance of the change of the coefficients by the chemistry's prior."""
         voltage = self.model.model
         known = prior_of(CHEMISTRIES[model.chemistry], mean_v, mean_soc_pct, model.capacity_ah)
@@ -222,7 +224,7 @@ class SocCount:
 def log_rows(
     linear: Linear, log: Trace, tried: Sequence[Shape], others: list[FloatArray]
 ) -> LogRows:
-    """Return a log on the rows whose SoC others visit; on all without others, or if they are few."""
+    """Return a log on the rows whose SoC others visit; on all if these are few."""
     of = Simulated(linear.model, log)
     soc, residual_v = of.plain.soc_pct[log.rows], of.plain.residual_v
     near = covered(soc, others)
@@ -297,7 +299,7 @@ class Healthy:
     @property
     def size(self) -> int:
         """Number of δ."""
-        return self.known.table.shape[1] - 1
+        return int(self.known.table.shape[1]) - 1
 
     def mean_square_v2(
         self, log: LogRows, delta: FloatArray, column: int = -1, size: float = 0.0
@@ -348,7 +350,7 @@ class Healthy:
 
 
 def _own(tried: Sequence[Shape]) -> tuple[IntArray, FloatArray]:
-    """Return the shapes that a healthy log may differ by, and their standard deviations [bounds]."""
+    """Return the shapes that a healthy log may differ by, and how far in bounds (1 σ)."""
     chosen = [k for k, shape in enumerate(tried) if shape.healthy_std > 0.0]
     return np.array(chosen, dtype=np.intp), np.array([tried[k].healthy_std for k in chosen])
 

@@ -1,8 +1,10 @@
 """One calibrated posterior of `none`, `unknown` and nine faults.
 
-    u_k = w·ln(1 + n_k/o_k)          P(fault | gap) ∝ (mean over its effects of e^u_k)^γ
+    u_k = w₁·ln(1 + n_k/o_k) − w₂·ln(1 + V_k/v)
+    P(fault | gap) ∝ (mean over its effects of e^u_k)^γ
 
-with n_k/o_k the evidence of effect k over what healthy logs show of it. The faults compete with
+with n_k/o_k the evidence of effect k over what healthy logs show of it, and V_k the mean square
+error that it leaves, v that of a healthy log. The faults compete with
 each other, and together with `none` and `unknown` (nested logit: Train, Discrete Choice Methods
 with Simulation, 2nd ed., 2009, ch. 4). w, γ and the weights of the outer features are fitted to
 labelled cases with packs held out (`benchmarks/weights`).
@@ -57,26 +59,26 @@ class Features:
 
     Parameters
     ----------
-    effects : dict of str to float
-        ln(1 + n_k/o_k) of each effect.
+    effects : dict of str to (float, float)
+        ln(1 + n_k/o_k) and −ln(1 + V_k/v) of each effect.
     outer : array
         ln(V_best/v + 0.1), ln(1 + max n/o), the same less that of healthy logs, ln(V/v), 1; V is
         the mean square error, and v that of a healthy log at these SoC and temperatures.
     """
 
-    effects: dict[str, float]
+    effects: dict[str, tuple[float, float]]
     outer: FloatArray
 
 
 def features(healthy: Healthy, evidence: Evidence) -> Features:
     """Return what the posterior sees of a case."""
     v = healthy.healthy_v2 + max(evidence.open_v2 - healthy.known_v2, 0.0)
-    effects = {name: math.log1p(max(e.nats, 0.0)) for name, e in evidence.effects.items()}
-    best = max(
-        evidence.effects,
-        key=lambda name: effects[name] - math.log(v + evidence.effects[name].left_v2),
-    )
-    most = max(effects.values())
+    effects = {
+        name: (math.log1p(max(e.nats, 0.0)), -math.log1p(e.left_v2 / v))
+        for name, e in evidence.effects.items()
+    }
+    best = max(effects, key=lambda name: sum(effects[name]))
+    most = max(gain for gain, _ in effects.values())
     usual = float(np.mean(np.log1p(healthy.nats))) if healthy.nats else math.log1p(UNTESTED)
     gap = math.log(evidence.gap_v2 / v) - (0.0 if healthy.nats else 2.0 * math.log(UNTESTED))
     left = math.log(evidence.effects[best].left_v2 / v + 0.1)
@@ -87,7 +89,9 @@ def probabilities(case: Features, by: Mapping[str, Any]) -> dict[str, float]:
     """Return the probability of `none`, `unknown` and every effect; they sum to 1."""
     inner, exponent = by["inner"], by["exponent"]
     u = {
-        fault: np.array([inner * x for name, x in case.effects.items() if _is_of(name, fault)])
+        fault: np.array(
+            [np.dot(inner, x) for name, x in case.effects.items() if _is_of(name, fault)]
+        )
         for fault in FAULTS
     }
     value = {

@@ -15,7 +15,7 @@ from cangauge.logs.log import Log
 from cangauge.model.coulomb_counting import soc_at_first_row
 from cangauge.model.effects.base import Effect, Signals, Values
 from cangauge.model.effects.library import shape_key
-from cangauge.model.extended import ExtendedModel
+from cangauge.model.extended import ExtendedModel, Prediction
 from cangauge.model.prior import DELAYS_S
 
 STEP_S: Final = 0.9
@@ -141,7 +141,7 @@ class Simulated:
         self._currents = model.model.currents(of.log.time_s, of.log.current_a, every)
         self.plain = self._predict(model, self.signals)
 
-    def _predict(self, model: ExtendedModel, signals: Signals):  # type: ignore[no-untyped-def]
+    def _predict(self, model: ExtendedModel, signals: Signals) -> Prediction:
         kept = signals.current_a is self.signals.current_a
         return model.predict(
             signals,
@@ -150,7 +150,7 @@ class Simulated:
             currents_a=self._currents if kept else None,
         )
 
-    def with_effect(self, effect: Effect, values: Values):  # type: ignore[no-untyped-def]
+    def with_effect(self, effect: Effect, values: Values) -> Prediction:
         """Return the prediction by the model with one more effect."""
         if effect.moves_time:
             context = effect.context(values, self.model.model, self.model.pack)

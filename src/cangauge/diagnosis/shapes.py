@@ -166,13 +166,13 @@ def columns(of: Simulated, tried: Sequence[Shape]) -> FloatArray:
     soc = plain.soc_pct[rows]
     found = np.empty((rows.size, len(tried)))
     duration_s = of.of.log.duration_s
-    for k, shape in enumerate(tried):
-        if shape.place is not None:
-            shape = shape.at(shape.place, duration_s)
+    for k, each in enumerate(tried):
+        shape = each if each.place is None else each.at(each.place, duration_s)
         effect, values = shape.effect, shape.values(shape.about)
         if effect.adds_voltage:
             drive = effect.drive(load, values, effect.context(values, model.model, pack))
-            assert drive is not None
+            if drive is None:
+                raise ValueError("an effect of the voltage has a drive")
             changed = drive[rows] * effect.over_soc(soc, values, model.model)
         else:
             changed = plain.residual_v - of.with_effect(effect, values).residual_v

@@ -21,6 +21,9 @@ SIMULATED_PART: Final = 0.15
 """Effects that change signals or the count are simulated from this part of the best one's
 evidence: beyond a bend of the curve, a column at zero misjudges them."""
 
+MOVE_SOC: Final = ("start", "capacity", "current_reading")
+"""Faults that move the SoC: their effects are simulated always."""
+
 START_PARTS: Final = (0.5, 1.0)
 """Parts of its bounds from which a wrong start is simulated: it moves all rows at once, beyond a
 bend of the curve."""
@@ -58,6 +61,11 @@ class _Block:
         of_own = np.linalg.solve(self._root, self._own.T @ v)
         return v.T @ v - of_own.T @ of_own, self._delta.T @ v - self._of_delta.T @ of_own
 
+    def square(self, residual_v: FloatArray, delta: FloatArray) -> float:
+        """Return the sum of squares of a residual less δ, in noise variances."""
+        left = residual_v[self.inside] * self._weight - self._delta @ delta
+        return float(left @ left)
+
 
 @dataclass(frozen=True)
 class _About:
@@ -66,6 +74,8 @@ class _About:
     chi2: float
     gradient: float
     curvature: float
+    delta: FloatArray
+    residuals: list[FloatArray]
 
 
 class Profile:
@@ -101,6 +111,7 @@ class Profile:
     def about(self, evidence: EffectEvidence, size: float) -> _About:
         """Return the likelihood about a size [bounds]."""
         products, right = np.zeros((2, 2)), np.zeros((self._right.size, 2))
+        residuals = []
         right[:, 1] = self._right
         for number, block in zip(self._numbers, self._blocks, strict=True):
             shape = shape_in_log(evidence, number, block.log)
@@ -108,9 +119,23 @@ class Profile:
             own, delta = block.products(vectors)
             products += own + np.outer(row, row)
             right += delta
+            residuals.append(vectors[:, 1])
         half = np.linalg.solve(self._root, right)
         left = products - half.T @ half
-        return _About(float(left[1, 1]), float(left[0, 1]), max(float(left[0, 0]), 1e-9))
+        return _About(
+            float(left[1, 1]),
+            float(left[0, 1]),
+            max(float(left[0, 0]), 1e-9),
+            np.linalg.solve(self._root.T, half[:, 1]),
+            residuals,
+        )
+
+    def left_v2(self, at: _About) -> float:
+        """Return the mean square error that remains about a size [V²]."""
+        blocks = zip(self._blocks, at.residuals, strict=True)
+        square = sum(block.square(residual_v, at.delta) for block, residual_v in blocks)
+        seconds = sum(block.log.seconds for block in self._blocks)
+        return square * self._healthy.s2 / seconds
 
     def newton(self, evidence: EffectEvidence, size: float) -> float:
         """Return the size after one step from a size found with all rows [bounds]."""
@@ -173,17 +198,17 @@ def simulated(healthy: Healthy, logs: Sequence[LogRows], evidence: Evidence) -> 
     profile, found = None, dict(evidence.effects)
     for name, e in evidence.effects.items():
         over = healthy.excess_of(name)
-        if e.shape.effect.adds_voltage or e.nats * over <= max(SIMULATED_PART * best, 1.0):
+        effect = e.shape.effect
+        likely = e.nats * over > SIMULATED_PART * best
+        if effect.adds_voltage or not (likely or effect.fault in MOVE_SOC):
             continue
         if profile is None:
             profile = Profile(healthy, logs, range(len(logs)))
-        found[name] = _simulated(profile, e, over, evidence.gap_v2)
+        found[name] = _simulated(profile, e, over)
     return replace(evidence, effects=found)
 
 
-def _simulated(
-    profile: Profile, evidence: EffectEvidence, over: float, gap_v2: float
-) -> EffectEvidence:
+def _simulated(profile: Profile, evidence: EffectEvidence, over: float) -> EffectEvidence:
     bound = evidence.shape.bound
     low, high = evidence.bounds
     starts = [evidence.size / bound]
@@ -199,6 +224,7 @@ def _simulated(
         size=size * bound,
         std=float(np.sqrt(over / (at.curvature + RIDGE))) * bound,
         nats=nats / over,
+        left_v2=profile.left_v2(at),
     )
 
 

@@ -8,11 +8,13 @@ from typing import TYPE_CHECKING, Final
 from cangauge._text import counted, number, significant
 from cangauge.diagnosis.faults import FAULT
 from cangauge.diagnosis.rows import COVER_PCT
+from cangauge.diagnosis.simulator import correction
 from cangauge.diagnosis.where import clause
 from cangauge.logs.gaps import bridge_s
 
 if TYPE_CHECKING:
     from cangauge.diagnosis.diagnose import Diagnosis
+    from cangauge.diagnosis.model_check import ModelCheck
 
 SHORT_S: Final = 600.0
 """Duration below which slow effects hardly develop [s]."""
@@ -39,15 +41,21 @@ def volts(value: float) -> str:
 def answer(found: Diagnosis) -> str:
     """Return the answer in three lines: what, how far and where, what to do."""
     lines = [_what(found), _how_far(found), _to_do(found)]
-    if found.model_check is not None and not found.model_check.describes:
-        lines = [*_model_lines(found), "These logs beyond that: " + lines[0]]
+    if found.simulator is not None:
+        if found.simulator.remark:
+            lines.insert(0, found.simulator.remark)
+        if found.correction is not None:
+            effect = found.correction.evidence.shape.effect
+            lines.append(correction(effect.id, found.parameters(effect.fault)))
+    check = found.model_check
+    if check is not None and not check.describes:
+        lines = [*_model_lines(found, check), f"These logs beyond that: {lines[0]}"]
     return "\n".join(lines)
 
 
-def _model_lines(found: Diagnosis) -> list[str]:
-    check = found.model_check
-    assert check is not None
-    size = f"{volts(check.references_rmse_v)} ({volts(check.among_themselves_rmse_v)} among themselves)"
+def _model_lines(found: Diagnosis, check: ModelCheck) -> list[str]:
+    among = f"{volts(check.among_themselves_rmse_v)} among themselves"
+    size = f"{volts(check.references_rmse_v)} ({among})"
     missed = [_lower(text) for text in found.missed_sentences]
     what = "; ".join(missed) or "none of the nine faults explains it"
     lines = [f"The model misses the healthy logs by {size}: {what}."]
@@ -68,16 +76,13 @@ def _what(found: Diagnosis) -> str:
     posterior = found.posterior
     none = f"P(no fault) {percent(posterior.none)}"
     if posterior.level == "none":
-        return f"No significant gap beyond that of healthy logs. {none}; a small fault is not excluded."
+        return f"No significant gap beyond that of healthy logs: {none}."
     sure = "" if posterior.level == "gap" else f" Likely, not certain: {none}."
     if not posterior.stated:
         unknown = percent(posterior.unknown)
         return f"There is a gap that none of the nine faults explains (likelihood {unknown}).{sure}"
     texts = [found.sentence(fault) for fault in posterior.stated]
-    if len(texts) == 1:
-        what = f"{texts[0]}."
-    else:
-        what = f"{texts[0]}, or {_lower(texts[1])}."
+    what = ", or ".join([texts[0], *map(_lower, texts[1:])]) + "."
     shown = [
         f"{FAULT[fault].title} {percent(p)}"
         for fault, p in posterior.faults.items()
@@ -111,7 +116,7 @@ def _to_do(found: Diagnosis) -> str:
         shown = f" These logs would have shown {', '.join(seen)}." if seen else ""
         return f"Nothing to do.{shown}"
     text = found.check_first
-    if found.correction is None:
+    if found.why_not is not None:
         return f"{text} No correction: {found.why_not}."
     if found.correction_path:
         return f"{text} Corrected model: {found.correction_path}"
@@ -141,8 +146,6 @@ def caveats(found: Diagnosis) -> list[str]:
             remarks.append(f"{log.name} lasts {minutes}: slow effects hardly develop in it.")
         if rows.trace.has_gap(bridge_s(log.time_s)):
             remarks.append(f"{log.name} has gaps; charge that flowed in them is not counted.")
-    if found.simulator is not None and found.simulator.remark:
-        remarks.append(found.simulator.remark)
     remarks.append("A fault is a signature at the terminals, not proof of a mechanism.")
     return remarks
 

@@ -64,6 +64,8 @@ NOT_IDENTIFIABLE: Final[Mapping[str, str]] = {
     "voltage_offset": "the curve absorbs it",
     "voltage_gain": "the coefficients absorb it",
     "resistance_temperature": "the equation has it (b)",
+    "resistance_growth": "the resistances absorb it",
+    "temperature_offset": "temperature coefficient and resistances absorb it",
 }
 """Effects that a fit cannot separate from its own coefficients, and why."""
 

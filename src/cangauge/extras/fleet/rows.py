@@ -24,7 +24,7 @@ from cangauge.cli.options import ReadingOptions
 from cangauge.errors import InputError
 
 if TYPE_CHECKING:
-    from cangauge.diagnosis import References
+    from cangauge.diagnosis import Healthy
     from cangauge.model.model_file import Model
 
 Answer = Literal["estimate", "gap", "judge"]
@@ -112,7 +112,7 @@ def _model(path: Path) -> Model:
 
 
 @lru_cache(maxsize=1)
-def _learned(job: FleetJob) -> References | tuple[()]:
+def _learned(job: FleetJob) -> Healthy | tuple[()]:
     """Return what the references show, learned once by each process."""
     from cangauge.diagnosis import learn_references
 

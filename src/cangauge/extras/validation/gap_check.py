@@ -1,9 +1,9 @@
 """What the diagnosis would find on a pack: every effect injected into healthy logs of it.
 
-Each log is left out in turn and diagnosed with the others as references: as recorded, and with
-every effect of the twin at three sizes. A size is the RMS change of voltage that it makes, in
-floors: a floor is the RMS error of left-out references. The logs are one's own, or those of a
-simulated pack.
+Each log is left out in turn and diagnosed with the others as references, by a model fitted to
+them: as recorded, and with every effect of the twin at three sizes. A size is the RMS change of
+voltage that it makes, in floors: a floor is the RMS error of left-out references. The logs are
+one's own, or those of a simulated pack.
 """
 
 from __future__ import annotations
@@ -14,10 +14,9 @@ from typing import Any, Final
 
 import numpy as np
 
-from cangauge._text import NONE_KNOWN, number, significant
-from cangauge.diagnosis.answer import GROUP_OF, NONE, answer
-from cangauge.diagnosis.evidence import analyse, columns, learn
-from cangauge.diagnosis.pack_fit import trace
+from cangauge._text import NONE_KNOWN, number
+from cangauge.diagnosis import FAULTS, NONE, diagnose, learn_references
+from cangauge.diagnosis.faults import FAULT
 from cangauge.errors import InputError
 from cangauge.extras.validation.twin.drive import draw_drive
 from cangauge.extras.validation.twin.faults import Fault, fault_kinds
@@ -25,14 +24,16 @@ from cangauge.extras.validation.twin.injection import fit_surrogate_pack, inject
 from cangauge.extras.validation.twin.pack import TwinPack
 from cangauge.extras.validation.twin.recording import record_drive
 from cangauge.extras.validation.twin.simulation import draw_plant
+from cangauge.identify.fit import fit
 from cangauge.logs.log import Log
+from cangauge.model.effects.library import LIBRARY
 
 FLOORS: Final = (1.0, 2.0, 4.0)
 """Injected sizes [floors]."""
 LEAST_LOGS: Final = 4
 """One is diagnosed, three are its references, as `gap` asks for."""
 SIMULATED_LOGS: Final = 6
-SCHEMA: Final = 2
+SCHEMA: Final = 3
 _REACHED: Final = 0.8
 """Part of the wanted size below which the physical limits of an effect count as reached."""
 
@@ -48,10 +49,12 @@ class Finding:
     """Size reached [floors]."""
     size: float
     unit: str
-    group_right: bool
-    """Whether the likeliest group is that of the effect."""
-    name_right: bool
-    """Whether the most probable answer is the effect, or `none`."""
+    fault: str
+    """Injected fault, or `none`."""
+    first: bool
+    """Whether the likeliest fault is the injected one."""
+    stated: bool
+    """Whether one fault was stated."""
     detected: bool
     probability: float
     """Of the truth."""
@@ -123,22 +126,23 @@ class CheckedPack:
         for place in np.linspace(0.0, len(self.logs) - 1.0, count):
             k = round(float(place))
             others = [*self.logs[:k], *self.logs[k + 1 :]]
-            known = learn([trace(log, self.capacity_ah) for log in others], self.capacity_ah)
-            for log, fault, floors in self._cases(self.logs[k], known.healthy_v2**0.5):
-                found = answer(
-                    known, analyse(known, [columns(known, trace(log, self.capacity_ah))])
-                )
-                truth = NONE if fault is None else fault.id
+            model = fit(others, capacity_ah=self.capacity_ah).model
+            known = learn_references(others, model)
+            for log, fault, floors in self._cases(self.logs[k], known.rmse_v):
+                found = diagnose(log, model, known).posterior
+                truth = NONE if fault is None else LIBRARY[fault.id].fault
+                p = {NONE: found.none, **found.faults}
                 yield Finding(
                     log=log.name,
                     effect=None if fault is None else fault.id,
                     floors=floors,
                     size=0.0 if fault is None else fault.size,
                     unit="" if fault is None else fault.kind.unit,
-                    group_right=found.stated_groups[0] == GROUP_OF.get(truth),
-                    name_right=found.verdict == truth,
-                    detected=found.detected,
-                    probability=found.probabilities[truth],
+                    fault=truth,
+                    first=next(iter(found.faults)) == truth,
+                    stated=len(found.stated) == 1,
+                    detected=found.level == "gap",
+                    probability=p[truth],
                 )
 
     def _cases(self, log: Log, floor_v: float) -> Iterator[tuple[Log, Fault | None, float]]:
@@ -169,28 +173,26 @@ def summarize(findings: Sequence[Finding]) -> dict[str, Any]:
             "alarms": sum(item.detected for item in healthy),
             "probability_none": float(np.mean([item.probability for item in healthy])),
         },
-        "effects": [
+        "faults": [
             {
-                "effect": kind.id,
-                "group": GROUP_OF[kind.id],
-                "unit": kind.unit,
-                "sizes": _sizes([item for item in findings if item.effect == kind.id]),
+                "fault": fault,
+                "sizes": _sizes([item for item in findings if item.fault == fault]),
             }
-            for kind in fault_kinds()
+            for fault in FAULTS
         ],
         "cases": [asdict(item) for item in findings],
     }
 
 
 def _sizes(findings: Sequence[Finding]) -> list[dict[str, Any]]:
-    """Return how often an effect was found at each size at which it was injected."""
+    """Return how often a fault was found at each size at which it was injected."""
     return [
         {
             "floors": floors,
-            "size": float(np.mean([abs(item.size) for item in of])),
             "of": len(of),
-            "group_right": sum(item.group_right for item in of),
-            "named": sum(item.name_right for item in of),
+            "first": sum(item.first for item in of),
+            "stated": sum(item.stated for item in of),
+            "stated_right": sum(item.stated and item.first for item in of),
             "detected": sum(item.detected for item in of),
             "probability": float(np.mean([item.probability for item in of])),
         }
@@ -200,30 +202,30 @@ def _sizes(findings: Sequence[Finding]) -> list[dict[str, Any]]:
 
 
 def table(result: dict[str, Any]) -> tuple[list[str], list[list[str]]]:
-    """Return headings and rows: how often the group and the name of each effect are right."""
+    """Return headings and rows: how often each fault comes first, and is stated alone."""
     rows = []
-    for item in result["effects"]:
-        unit, by_floors = item["unit"].replace("-", ""), {of["floors"]: of for of in item["sizes"]}
+    for item in result["faults"]:
+        by_floors = {of["floors"]: of for of in item["sizes"]}
         cells = [
-            f"{significant(of['size'], 2, unit)}: {of['group_right']}/{of['of']},"
-            f" {of['named']}/{of['of']}"
+            f"{of['first']}/{of['of']}, {of['stated_right']}/{of['stated']}"
             if (of := by_floors.get(floors))
             else NONE_KNOWN
             for floors in FLOORS
         ]
-        rows.append([item["effect"], *cells])
-    return ["effect", *(f"{floors:g} floor{'s' * (floors > 1)}" for floors in FLOORS)], rows
+        rows.append([FAULT[item["fault"]].title, *cells])
+    return ["fault", *(f"{floors:g} floor{'s' * (floors > 1)}" for floors in FLOORS)], rows
 
 
 def summary(result: dict[str, Any]) -> str:
     """Return what this diagnosis would find, in a sentence or two."""
-    sizes = [each for item in result["effects"] for each in item["sizes"]]
+    sizes = [each for item in result["faults"] for each in item["sizes"]]
     of = max(sum(each["of"] for each in sizes), 1)
-    group = sum(each["group_right"] for each in sizes) / of
-    name = sum(each["named"] for each in sizes) / of
+    first = sum(each["first"] for each in sizes) / of
+    stated = sum(each["stated"] for each in sizes)
+    right = sum(each["stated_right"] for each in sizes)
     healthy = result["healthy"]
     return (
-        f"The right group came first in {number(100.0 * group, 0, '%')} of {of} injected effects,"
-        f" the right name in {number(100.0 * name, 0, '%')}. False alarms:"
-        f" {healthy['alarms']} of {healthy['logs']} healthy logs."
+        f"The right fault came first in {number(100.0 * first, 0, '%')} of {of} injected effects;"
+        f" one fault was stated in {number(100.0 * stated / of, 0, '%')}, right in {right} of"
+        f" {stated}. False alarms: {healthy['alarms']} of {healthy['logs']} healthy logs."
     )

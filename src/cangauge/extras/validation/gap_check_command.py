@@ -47,8 +47,8 @@ def gap_check_command(
     """Measure what `gap` would find: every effect injected into healthy logs of a pack.
 
     Each log is left out in turn and diagnosed with the others as references: as it is, and with
-    every effect at one, two and four times the error of left-out references. The table has the
-    injected size, how often the right group came first, and how often the right name did.
+    every effect at one, two and four times the error of left-out references. The table has how
+    often the right one of the nine faults came first, and how often one stated alone was right.
 
     Examples
     --------
@@ -84,6 +84,6 @@ def gap_check_command(
 
     def show() -> None:
         typer.echo(summary(result))
-        print_table("Injected size: right group first, right name first", *table(result))
+        print_table("Right fault first, stated alone and right", *table(result))
 
     finish(result | {"assumed": assumed_of(read)}, show, as_json=json_output)

@@ -154,7 +154,7 @@ VOLTAGES: Final = (
     Effect(
         id="resistance_growth",
         fault="resistance",
-        parameters=(Parameter("share", "1", -0.8, 3.0, healthy_std=0.05), DELAYED),
+        parameters=(Parameter("share", "1", -0.8, 3.0, healthy_std=0.025), DELAYED),
         signature="the drop over the resistance, larger from the first row on",
         equation="ΔU = a·ΣRj·I(t − dj); or a·ΣRj·I in its place",
         source="definition",
@@ -386,7 +386,7 @@ VOLTAGES: Final = (
         id="weak_cell",
         fault="weak_cell",
         parameters=(
-            Parameter("fraction", "1", 0.0, 0.15),
+            Parameter("fraction", "1", 0.0, 0.06),
             Parameter(
                 "deficit_pct", "%", 2.0, 65.0, neutral=None,
                 grid=(4.0, 7.0, 11.0, 16.0, 23.0, 33.0, 48.0),

@@ -136,6 +136,8 @@ class Condition:
         Saturation of the current sensor, relative to the largest current [-].
     remanence_a : float
         Magnetic remanence of the current sensor [A].
+    temperature_offset_k : float
+        Error of the temperature sensor [K].
     temperature_hold : float
         0: the temperature sensor follows, 1: it is stuck [-].
 
@@ -177,6 +179,7 @@ class Condition:
     ripple_phase: float = 0.0
     clip_share: float = 1.0
     remanence_a: float = 0.0
+    temperature_offset_k: float = 0.0
     temperature_hold: float = 0.0
 
     def current_through_cells(self, time_s: FloatArray, current_a: FloatArray) -> FloatArray:

@@ -1,4 +1,4 @@
-"""Faults of a simulated pack: twenty with a counterpart in the effects library, nine without.
+"""Faults of a simulated pack: twenty-two with a counterpart in the effects library, nine without.
 
 A fault has one size, whose unit and physical limits its kind states, and shape parameters (where,
 when, how fast) that are given or drawn from a seed. As text it is `ID`, `ID:parameter=value` or
@@ -262,6 +262,11 @@ _IN_LIBRARY: Final = (
     ),
     # The voltage sensor reads (1 + x) times the voltage.
     FaultKind("voltage_gain", "gain", "-", _span(1e-4, 0.03), _sets("voltage_gain"), signed=True),
+    # The temperature sensor reads x K too high.
+    FaultKind(
+        "temperature_offset", "offset_k", "K", _span(0.1, 15.0), _sets("temperature_offset_k"),
+        signed=True,
+    ),
     # The temperature sensor lags by x s (two lags of x/2 in series).
     FaultKind("temperature_lag", "lag_s", "s", _span(40.0, 2000.0), _sets("temperature_lag_s")),
     # The thermal resistance between core and sensor grows by the factor 1 + x.
@@ -292,6 +297,8 @@ _IN_LIBRARY: Final = (
     ),
     # x Ω more resistance during charge.
     FaultKind("resistance_asymmetry", "charging_ohm", "Ω", _ohms(0.01, 1.5), _sets("charging_ohm")),
+    # x Ω more resistance from the first row on.
+    FaultKind("resistance_growth", "grown_ohm", "Ω", _ohms(0.01, 2.0), _sets("step_ohm")),
     # x Ω more resistance from the time at_s on.
     FaultKind(
         "resistance_step", "step_ohm", "Ω", _ohms(0.005, 1.0), _step,

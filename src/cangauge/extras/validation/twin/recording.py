@@ -285,7 +285,7 @@ def measured_temperature(
         measured = lagged(measured, drive.step_s, 0.5 * condition.temperature_lag_s)
     if condition.temperature_hold:
         measured = measured + condition.temperature_hold * (measured[0] - measured)
-    return measured
+    return measured + condition.temperature_offset_k
 
 
 def _stop(signal: FloatArray, reach: float) -> FloatArray:
