@@ -31,7 +31,7 @@ from cangauge.model.effects.base import Pack
 from cangauge.model.extended import ExtendedModel
 from cangauge.model.gaussian import Rows
 from cangauge.model.model_file import Model
-from cangauge.model.prior import CHEMISTRIES, LOW_PASS_S, prior_of
+from cangauge.model.prior import CHEMISTRIES, LOW_PASS_S, PackPrior
 from cangauge.model.voltage_model import (
     KNOTS_PCT,
     Arrhenius,
@@ -138,7 +138,8 @@ class Linear:
     ) -> tuple[FloatArray, FloatArray]:
         """Return mean and covariance of the change of the coefficients by the chemistry's prior."""
         voltage = self.model.model
-        known = prior_of(CHEMISTRIES[model.chemistry], mean_v, mean_soc_pct, model.capacity_ah)
+        pack = PackPrior(CHEMISTRIES[model.chemistry], model.capacity_ah)
+        known = pack.coefficients(mean_v, mean_soc_pct)
         number = self.ohm.size
         first = N + 1
         kept = [*range(first + 1), *[first + 1] * (number - 1), known.coefficients.size - 1]
