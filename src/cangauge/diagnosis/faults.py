@@ -33,7 +33,7 @@ Sized = Callable[[Mapping[str, Quantity], Pack, float], str]
 
 
 @dataclass(frozen=True)
-class Fault:
+class FaultWords:
     """What an engineer would repair.
 
     Parameters
@@ -51,46 +51,46 @@ class Fault:
     instruction: str
 
 
-FAULT: Final[Mapping[str, Fault]] = {
-    "voltage_reading": Fault(
+FAULT: Final[Mapping[str, FaultWords]] = {
+    "voltage_reading": FaultWords(
         "voltage reading",
         "a meter on the terminals",
         "Put a meter on the pack's terminals and compare.",
     ),
-    "current_reading": Fault(
+    "current_reading": FaultWords(
         "current reading",
         "a clamp meter",
         "Compare with a clamp meter, and read the sensor at open contactors.",
     ),
-    "start": Fault(
+    "start": FaultWords(
         "wrong start",
         "a rest of an hour before the start",
         "Rest the pack for an hour, or charge it fully, before the next log.",
     ),
-    "capacity": Fault(
+    "capacity": FaultWords(
         "capacity",
         "a counted discharge",
         "Count a discharge from full to empty, and the charge back.",
     ),
-    "clock": Fault(
+    "clock": FaultWords(
         "clock",
         "the time stamps of a sharp pulse",
         "Compare the time stamps of current and voltage on a sharp pulse.",
     ),
-    "temperature": Fault(
+    "temperature": FaultWords(
         "temperature", "a second thermometer", "Compare with a second thermometer on the cells."
     ),
-    "resistance": Fault(
+    "resistance": FaultWords(
         "resistance",
         "the same pulse, warm and cold",
         "Repeat one pulse at the same SoC, warm and cold, and check the contacts.",
     ),
-    "slow_voltage": Fault(
+    "slow_voltage": FaultWords(
         "slow voltage",
         "rests of an hour after discharge and after charge",
         "Rest for an hour after a discharge and after a charge to the same SoC.",
     ),
-    "weak_cell": Fault(
+    "weak_cell": FaultWords(
         "weak cell",
         "the cell voltages near empty",
         "Read the voltages of the single cells near empty.",

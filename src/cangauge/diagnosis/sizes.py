@@ -78,7 +78,7 @@ class _About:
     residuals: list[FloatArray]
 
 
-class Profile:
+class SizeProfile:
     """Likelihood of the size of one effect in some logs, everything else integrated out.
 
     Parameters
@@ -203,12 +203,12 @@ def simulated(healthy: Healthy, logs: Sequence[LogRows], evidence: Evidence) -> 
         if effect.adds_voltage or not (likely or effect.fault in MOVE_SOC):
             continue
         if profile is None:
-            profile = Profile(healthy, logs, range(len(logs)))
+            profile = SizeProfile(healthy, logs, range(len(logs)))
         found[name] = _simulated(profile, e, over)
     return replace(evidence, effects=found)
 
 
-def _simulated(profile: Profile, evidence: EffectEvidence, over: float) -> EffectEvidence:
+def _simulated(profile: SizeProfile, evidence: EffectEvidence, over: float) -> EffectEvidence:
     bound = evidence.shape.bound
     low, high = evidence.bounds
     starts = [evidence.size / bound]
@@ -240,14 +240,14 @@ class HeldOut:
         if len(logs) > 1:
             self._parts = [np.full(log.kept.size, k) for k, log in enumerate(logs)]
             self._without = [
-                Profile(healthy, logs, [k for k in numbers if k != left]) for left in numbers
+                SizeProfile(healthy, logs, [k for k in numbers if k != left]) for left in numbers
             ]
             return
         (log,) = logs
         time_s = log.trace.log.time_s[log.trace.rows][log.kept]
         fold = ((time_s - time_s[0]) // BLOCK_S).astype(np.intp) % FOLDS
         self._parts = [fold]
-        self._without = [Profile(healthy, logs, [0], [fold != k]) for k in range(FOLDS)]
+        self._without = [SizeProfile(healthy, logs, [0], [fold != k]) for k in range(FOLDS)]
 
     def sizes(self, evidence: EffectEvidence) -> list[FloatArray]:
         """Return the size of an effect for each row that counts of each log."""
