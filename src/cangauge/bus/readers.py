@@ -51,6 +51,8 @@ STALE_S: Final = 86400.0
 """First frames that a logger's buffer may have kept from before, and the least time before [s]."""
 PAUSE_S: Final = 100.0
 """Pause that is put between sessions in one file [s]: no charge is counted over it."""
+FIRST_DATE_S: Final = 1e9
+"""Stamps from here on are dates [s since 1970]: the year 2001."""
 MOST_BUSES: Final = 64
 """Most buses in a file, each of which has its own decoder; frames of further ones are malformed."""
 MAX_ID: Final = 0x1FFFFFFF
@@ -79,6 +81,9 @@ class CaptureReader(MessageReader, ABC):
     ----------
     name, unit : str
         Of the format, and of what is malformed, for messages.
+    keeps_dates : bool
+        Stamps that are dates are those of the bus, also where its clock was set: the service's own
+        recordings give its numbers again.
     stamps : {"us", "ms", "none"}
     frames, malformed, first_malformed : int
         Frames read, and lines or frames skipped as malformed, so far; number of the first, from 1.
@@ -92,6 +97,7 @@ class CaptureReader(MessageReader, ABC):
 
     name: ClassVar[str]
     unit: ClassVar[str] = "frames"
+    keeps_dates: ClassVar[bool] = False
     stamps: Stamps = "us"
 
     def __init__(self, file: StringPathLike | IO[Any], **_options: object) -> None:
@@ -103,6 +109,7 @@ class CaptureReader(MessageReader, ABC):
         self.cut_off = False
         self.damage: str | None = None
         self.remarks: list[str] = []
+        self._is_bus_time = False
 
     def stop(self) -> None:
         """Close the file."""
@@ -125,11 +132,12 @@ class CaptureReader(MessageReader, ABC):
         """
         buses, clock = set[Any](), _Clock()
         try:
-            for message in self._current(self.read()):
+            for message in self._frames():
                 is_known = message.channel in buses or len(buses) < MOST_BUSES
                 if is_known and abs(message.timestamp) <= MAX_STAMP_S:  # false for NaN
                     buses.add(message.channel)
-                    message.timestamp = clock.running_s(message.channel, message.timestamp)
+                    if not self._is_bus_time:
+                        message.timestamp = clock.running_s(message.channel, message.timestamp)
                     self.frames += 1
                     yield message
                 else:
@@ -138,6 +146,14 @@ class CaptureReader(MessageReader, ABC):
             self.cut_off = True
             self.damage = f"{type(error).__name__}: {error}"
         self.remarks += clock.remarks()
+
+    def _frames(self) -> Iterator[can.Message]:
+        """Return the frames that are read, without stale ones where the clock is the logger's."""
+        frames = self.read()
+        if self.keeps_dates and (first := next(frames, None)) is not None:
+            self._is_bus_time = first.timestamp >= FIRST_DATE_S
+            frames = chain([first], frames)
+        return frames if self._is_bus_time else self._current(frames)
 
     def _current(self, frames: Iterator[can.Message]) -> Iterator[can.Message]:
         """Yield frames without those at the head that a logger's buffer has kept from before."""
@@ -388,6 +404,7 @@ class CandumpLogReader(PatternReader):
 
     name = "candump log"
     states_length = False
+    keeps_dates = True
     # (1436509052.249713) vcan0 044#2A366C2BBA
     pattern = re.compile(
         r"\((\d+\.\d+)\) (\S+) ([0-9A-Fa-f]{3}|[0-9A-Fa-f]{8})#"
