@@ -65,11 +65,11 @@ def test_options_go_into_the_model_file(made: Path, output: tuple[str, Path]) ->
 
 
 def test_chemistry_and_cells_go_into_the_model_file(made: Path, output: tuple[str, Path]) -> None:
-    given = ("fit", made / "full.parquet", *output, "--cells", "96")
-    succeeds(*given, "--chemistry", "lfp")
+    given = ("fit", made / "full.parquet", *output, "--cells")
+    succeeds(*given, "115", "--chemistry", "lfp")
     model = Model.load(output[1])
-    assert (model.equation, model.chemistry, model.cells) == ("knots", "lfp", 96)
-    found = succeeds(*given, "--json").json
+    assert (model.equation, model.chemistry, model.cells) == ("knots", "lfp", 115)
+    found = succeeds(*given, "96", "--json").json
     assert found["chemistry"] == "oxide"
     assert any("V per cell" in text for text in found["remarks"])
 

@@ -32,7 +32,7 @@ from cangauge.model.coulomb_counting import (
     capacity_from_reference,
     discharged_ah,
 )
-from cangauge.model.prior import CHEMISTRIES, PackPrior
+from cangauge.model.prior import CHEMISTRIES, ChemistryName, PackPrior
 from cangauge.model.published import CAPACITY_AH, leaf_2012_model
 from cangauge.model.voltage_model import KNOTS_PCT, HermiteCurve, VoltageModel
 from synthetic import synthetic_log
@@ -176,6 +176,15 @@ def test_chemistry_is_given_guessed_or_assumed_and_said() -> None:
     assumed = fit(log, capacity_ah=CAPACITY_AH)
     assert assumed.model.chemistry == "oxide"
     assert any("Pass --cells N" in text for text in assumed.remarks)
+
+
+@pytest.mark.parametrize(("cells", "chemistry"), [(72, None), (115, "oxide"), (96, "lfp")])
+def test_a_number_of_cells_that_the_voltage_denies_is_refused(
+    cells: int, chemistry: ChemistryName | None
+) -> None:
+    with pytest.raises(InputError, match=r"no (oxide|lfp) cell has") as caught:
+        fit(trips(1), capacity_ah=CAPACITY_AH, cells=cells, chemistry=chemistry)
+    assert caught.value.field == "cells"
 
 
 def test_published_equation_recovers_its_coefficients() -> None:

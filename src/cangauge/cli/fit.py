@@ -87,7 +87,8 @@ def fit_command(
         option(
             "--cells",
             "N",
-            "Cells in series. Default: the columns of cells of the first log, if it has all.",
+            "Cells in series: they detect the chemistry and fix the curve beyond the logs. Default:"
+            " the columns of cells of the first log, if it has all.",
             within=(1, 2000),
         ),
     ] = None,

@@ -75,6 +75,11 @@ RELINEARIZED: Final = 4
 """Linearizations about the fitted effects: products of effects and resistances have converged."""
 
 
+CELLS_TOLERANCE: Final = 0.1
+"""Voltage of a cell relative to the nearer typical one, from which the number of cells must be
+wrong [-]: five standard deviations (`prior.FULL_STD`)."""
+
+
 def fit(
     logs: Any,
     *,
@@ -159,10 +164,7 @@ def fit(
         log if value is None else with_start(log, value)
         for log, value in zip(recorded, stated_pct, strict=True)
     ]
-    remarks: list[str] = []
-    if chemistry is None:
-        chemistry, remark = _likely_chemistry(stated, cells, capacity_ah)
-        remarks.append(remark)
+    chemistry, remark = _chemistry_of(stated, chemistry, cells, capacity_ah)
     with threadpool_limits(limits=1):  # 40 columns: threads only wait for each other
         pack = PackPrior(CHEMISTRIES[chemistry], capacity_ah, cells)
         starts = find_starts(recorded, stated_pct, pack)
@@ -223,7 +225,7 @@ def fit(
         slope_ohm=slope,
         slope_expected_ohm=expected,
         remarks=(
-            *remarks,
+            *([remark] if remark else []),
             *remarks_on_logs(rows, starts, recorded, delay_s, capacity_ah),
             *remarks_on_effects(fitted.effects, fitted.model),
         ),
@@ -273,28 +275,48 @@ def _effect_ids(effects: str | Sequence[str] | None, equation: Equation) -> tupl
     return ids
 
 
-def _likely_chemistry(
-    logs: Sequence[Log], cells: int | None, capacity_ah: float
-) -> tuple[ChemistryName, str]:
-    """Return the chemistry whose typical cell has the logs' mean voltage, and a remark on it."""
+def _chemistry_of(
+    logs: Sequence[Log], stated: ChemistryName | None, cells: int | None, capacity_ah: float
+) -> tuple[ChemistryName, str | None]:
+    """Return the chemistry, stated or by the volts per cell, and a remark where it was not stated.
+
+    Raises
+    ------
+    InputError
+        If no such cell has the volts per cell.
+    """
     if cells is None:
-        return "oxide", (
+        remark = (
             "Assuming an oxide chemistry. Pass --cells N: it detects the chemistry, and fixes the"
             " curve beyond the logs. Or pass --chemistry lfp."
         )
-    volts = float(np.mean(np.concatenate([log.voltage_v for log in logs]))) / cells
-    socs = []
+        return stated or "oxide", None if stated else remark
+    rows = sum(map(len, logs))
+    volts = sum(float(log.voltage_v.sum()) for log in logs) / rows / cells
+    total_pct = 0.0
     for log in logs:
         out_pct = 100.0 * discharged_ah(log.time_s, log.current_a) / capacity_ah
         row, start_pct = log.first_soc() or (0, 50.0 + float(out_pct.mean()))
-        socs.append(np.clip(start_pct + out_pct[row] - out_pct, 0.0, 100.0))
-    mean_pct = float(np.mean(np.concatenate(socs)))
+        total_pct += float(np.clip(start_pct + out_pct[row] - out_pct, 0.0, 100.0).sum())
 
-    def distance_v(name: ChemistryName) -> float:
-        return abs(volts - float(np.interp(mean_pct, KNOTS_PCT, CHEMISTRIES[name].curve_v)))
+    def away(name: ChemistryName) -> float:
+        kind = CHEMISTRIES[name]
+        typical = [
+            float(np.interp(total_pct / rows, KNOTS_PCT, curve_v))
+            for curve_v in (kind.curve_v, kind.other_v)
+        ]
+        return min(abs(volts / each - 1.0) for each in typical)
 
-    name = min(CHEMISTRIES, key=distance_v)
-    return name, f"chemistry {name} by {volts:.2f} V per cell, of {cells} cells"
+    name = min(CHEMISTRIES, key=away) if stated is None else stated
+    if away(name) > CELLS_TOLERANCE:
+        raise InputError(
+            f"{cells} cells would have {volts:.2f} V each at {total_pct / rows:.0f} % SoC, which no"
+            f" {name} cell has",
+            field="cells",
+            value=cells,
+            cure="check the number of cells in series, and the chemistry",
+        )
+    return name, None if stated else f"chemistry {name} by {volts:.2f} V per cell, of {cells} cells"
 
 
 class _Fitted(NamedTuple):
