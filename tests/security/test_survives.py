@@ -24,7 +24,7 @@ from cangauge.replay.encoder import FrameEncoder
 from cangauge.service.pipeline import Pipeline, PipelineSettings
 from cangauge.service.state import StateKeeper, read_state
 from cangauge.types import Sample, Status
-from live import LoggedLines, leaf_model, short_log
+from live import LoggedLines, in_process, leaf_model, short_log
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="fork and signals of Unix")
 SEEDS = 20
@@ -157,3 +157,15 @@ def test_a_wrong_clock_makes_no_valid_soc_of_an_old_state(off_s: float, tmp_path
             assert Status.VALID not in found
         if 0.0 < off_s < 86400.0:
             assert again.latest.soc_pct == pytest.approx(saved, abs=1.0)
+
+
+def test_a_reached_memory_limit_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    def exhausted(**_: object) -> None:
+        raise MemoryError
+
+    monkeypatch.setattr("cangauge.cli.app.app", exhausted)
+    ended = in_process("status")
+    assert (ended.code, ended.out) == (1, "")
+    assert ended.err.splitlines() == [
+        "error: the memory limit is reached; raise it (ulimit -v, MemoryMax=)"
+    ]
