@@ -52,9 +52,9 @@ CURVES: Final = (0.1, 0.3, 1.0)
 
 UNSETTLED_S: Final = (150.0, 1200.0)
 """Times over which a pack settles after the start of a log [s]; …"""
-UNSETTLED: Final = 0.03
+UNSETTLED: Final = 0.01
 """… its voltage differs by this part of the drop at 1 C."""
-KNEE: Final = 0.003
+KNEE: Final = 0.0015
 """Usual error of the knee near empty, relative to the voltage; …"""
 KNEE_PCT: Final = 4.0
 """… it decays over this SoC [%]."""

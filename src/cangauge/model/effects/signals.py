@@ -140,7 +140,7 @@ CORRECTIONS: Final = (
     # Or an unmeasured parasitic load (with opposite sign).
     _current(
         "offset",
-        Parameter("offset_a", "A", -0.15, 0.15, scale="capacity", healthy_std=0.001),
+        Parameter("offset_a", "A", -0.15, 0.15, scale="capacity", healthy_std=5e-4),
         signature="a constant R·b, and a slope over time as the count drifts: OCV′·b·t/C",
         separated_by=(
             "a long rest with the bus awake: the count drifts while no current flows. Not separable"
@@ -159,7 +159,7 @@ CORRECTIONS: Final = (
     ),
     _voltage(
         "offset",
-        Parameter("offset_v", "V", -0.04, 0.04, scale="voltage", healthy_std=4e-4),
+        Parameter("offset_v", "V", -0.04, 0.04, scale="voltage", healthy_std=2e-4),
         signature="a constant, at any current, SoC and temperature",
         separated_by=(
             "a log over much SoC: the error of an initial SoC shrinks where the OCV is flat, that"
@@ -185,7 +185,7 @@ CORRECTIONS: Final = (
         fault="clock",
         parameters=(
             Parameter(
-                "skew_s", "s", -4.0, 4.0, healthy_std=0.025,
+                "skew_s", "s", -4.0, 4.0, healthy_std=0.0125,
                 grid=(-4.0, -3.0, -2.0, -1.5, -1.0, -0.7, -0.5, -0.35, -0.2, -0.1, 0.0,
                       0.1, 0.2, 0.35, 0.5, 0.7, 1.0, 1.5, 2.0, 3.0, 4.0),
             ),
@@ -206,7 +206,7 @@ CORRECTIONS: Final = (
     Effect(
         id="temperature_offset",
         fault="temperature",
-        parameters=(Parameter("offset_k", "K", -20.0, 20.0, healthy_std=0.75),),
+        parameters=(Parameter("offset_k", "K", -20.0, 20.0, healthy_std=0.375),),
         signature="kt·x and the drop over the resistance as if warmer, throughout the log",
         equation="T = T_measured − x",
         source="zero error, JCGM 200:2012 (VIM)",
@@ -275,7 +275,7 @@ COUNTS: Final = (
     Effect(
         id="capacity",
         fault="capacity",
-        parameters=(Parameter("change_pct", "%", -35.0, 35.0, healthy_std=0.25),),
+        parameters=(Parameter("change_pct", "%", -35.0, 35.0, healthy_std=0.125),),
         signature="OCV′·(Ah since the start): a slope over charge, steep in the knee near empty",
         equation="S = S₀ − 100·∫I dt / (C·(1 + x))",
         source="Plett, Battery Management Systems vol. II, Artech House 2015, ch. 4",
@@ -293,7 +293,7 @@ COUNTS: Final = (
     Effect(
         id="initial_soc",
         fault="start",
-        parameters=(Parameter("offset_pct", "%", -15.0, 15.0, healthy_std=0.35),),
+        parameters=(Parameter("offset_pct", "%", -15.0, 15.0, healthy_std=0.175),),
         signature="OCV′(S): larger where the OCV is steep, at any current and time",
         equation="S₀ = S₀_assumed + x",
         source="definition",

@@ -154,7 +154,7 @@ VOLTAGES: Final = (
     Effect(
         id="resistance_growth",
         fault="resistance",
-        parameters=(Parameter("share", "1", -0.8, 3.0, healthy_std=0.025), DELAYED),
+        parameters=(Parameter("share", "1", -0.8, 3.0, healthy_std=0.0125), DELAYED),
         signature="the drop over the resistance, larger from the first row on",
         equation="ΔU = a·ΣRj·I(t − dj); or a·ΣRj·I in its place",
         source="definition",
