@@ -85,6 +85,26 @@ def test_only_the_soc_of_recorded_frames_is_replaced(
         assert rest == list(struct.unpack(f"<{len(rest)}H", bytes.fromhex(data)[2:]))
 
 
+def test_the_soc_of_a_high_voltage_battery_is_replaced(pylon: Gateway) -> None:
+    confirm(pylon, 71.6)
+    data = bytes.fromhex("A00F30754C04585E")
+    own = can.Message(arbitration_id=0x4210, is_extended_id=True, data=data)
+    told = pylon.replaced(own, time.monotonic())
+    assert (told.arbitration_id, told.is_extended_id) == (0x4210, True)
+    assert bytes(told.data) == data[:6] + bytes([72]) + data[7:]
+    short = frame(0x210, data)
+    assert pylon.replaced(short, time.monotonic()).data == data
+
+
+@pytest.mark.parametrize(
+    ("soc_pct", "told_pct"), [(99.4, 99), (99.5, 99), (99.99, 99), (100.0, 100)]
+)
+def test_rounding_does_not_end_a_charge(pylon: Gateway, soc_pct: float, told_pct: int) -> None:
+    confirm(pylon, soc_pct)
+    told = pylon.replaced(frame(0x355, V12[0x355]), time.monotonic())
+    assert struct.unpack("<2H", bytes(told.data)) == (told_pct, 94)
+
+
 def test_a_gx_gets_the_fine_soc_where_the_frame_holds_it() -> None:
     with closing(gateway("gx", "victron")) as found:
         confirm(found, 71.64)

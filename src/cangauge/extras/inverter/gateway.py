@@ -40,16 +40,22 @@ DOUBT_S: Final = 0.5
 POLL_S: Final = 0.005
 """Longest wait on either bus [s]: what a frame is late on the other."""
 CLOSE_WITHIN_S: Final = 1.0
+FULL_PCT: Final = 100.0
+"""SoC at which an inverter ends the charge [%]."""
 _SOC: Final = "soc_pct"
 """Beginning of the names of the signals that hold the SoC, in a profile's DBC."""
 
 _LOG = logging.getLogger(__name__)
 
 
-def soc_fields(profile: str) -> dict[int, list[tuple[BitField, float]]]:
+FrameId = tuple[int, bool]
+"""Id, and whether it is an extended one."""
+
+
+def soc_fields(profile: str) -> dict[FrameId, list[tuple[BitField, float]]]:
     """Return bits and step [%] of the SoC in the frames of a profile, by id."""
     database = load_dbc(shared_file("dbc", f"inverter_{profile}.dbc"))
-    found: dict[int, list[tuple[BitField, float]]] = {}
+    found: dict[FrameId, list[tuple[BitField, float]]] = {}
     for message in database.messages:
         fields = [
             (BitField.of(signal, message.length), float(signal.scale))
@@ -57,7 +63,7 @@ def soc_fields(profile: str) -> dict[int, list[tuple[BitField, float]]]:
             if signal.name.startswith(_SOC)
         ]
         if fields:
-            found[message.frame_id] = fields
+            found[message.frame_id, message.is_extended_frame] = fields
     return found
 
 
@@ -78,7 +84,7 @@ class Gateway(Output):
         self,
         battery: ReconnectingBus,
         inverter: ReconnectingBus,
-        fields: Mapping[int, list[tuple[BitField, float]]],
+        fields: Mapping[FrameId, list[tuple[BitField, float]]],
         own_ids: Callable[[], frozenset[int]] = frozenset,
     ) -> None:
         self._battery, self._inverter = battery, inverter
@@ -127,8 +133,8 @@ class Gateway(Output):
 
     def replaced(self, frame: can.Message, now_s: float) -> can.Message:
         """Return a frame of the battery as the inverter gets it."""
-        fields = self._fields.get(frame.arbitration_id)
-        if fields is None or frame.is_extended_id or frame.is_remote_frame:
+        fields = self._fields.get((frame.arbitration_id, frame.is_extended_id))
+        if fields is None or frame.is_remote_frame:
             return frame
         soc_pct = self.soc_pct(now_s)
         self._note(is_replaced=soc_pct is not None)
@@ -137,7 +143,10 @@ class Gateway(Output):
         data = bytearray(frame.data)
         for field, step in fields:
             if field.shift + field.width <= 8 * len(data):  # older batteries have shorter frames
-                field.put(data, round(soc_pct / step))
+                steps = round(soc_pct / step)
+                if steps * step >= FULL_PCT > soc_pct:
+                    steps -= 1  # rounding ends no charge
+                field.put(data, steps)
         replaced = copy(frame)
         replaced.data = data
         return replaced
