@@ -28,13 +28,15 @@ DAY_S = 86400.0
 
 
 JUDGE = (sys.executable, "-m", "cangauge", "judge", "-m", str(leaf_model_path()))
-OPINION = {"gauge": {"verdict": "agrees", "error_pct": 0.4, "error_std_pct": 1.0},
-           "cause": {"verdict": "none"}, "next_step": ""}  # fmt: skip
+OPINION = {
+    "now": {"verdict": "agrees", "error_pct": 0.4, "sigma_pct": 1.0},
+    "text": "The gauge is right now: +0.4 ± 1.0 % SoC.\nNothing to do.",
+}
 
 
 def printing(answer: dict[str, object], code: int = 0) -> tuple[str, ...]:
     """Return a command that prints an answer in place of `cangauge judge`."""
-    return ("/bin/sh", "-c", f"echo '{json.dumps(answer)}'; exit {code}")
+    return ("/bin/sh", "-c", f"printf %s '{json.dumps(answer)}'; exit {code}")
 
 
 def day(number: int) -> Log:
@@ -64,9 +66,9 @@ def test_a_gauge_that_is_off_is_said_after_the_drive(tmp_path: Path) -> None:
         judge._came_s -= 601.0  # ten minutes of silence
         judge.on_snapshot(Snapshot(judge._came_s + 601.0, {}))
         assert waits(lambda: bool(judge.trouble), 60.0), lines.lines
-        assert "off, +" in judge.trouble
+        assert "% SoC too high now." in judge.trouble
     result = json.loads((stored.folder / RESULT).read_text())
-    assert result["gauge"]["error_pct"] == pytest.approx(15.0, abs=3.0)
+    assert result["now"]["error_pct"] == pytest.approx(15.0, abs=3.0)
     assert "judge" in (stored.folder / PAGE).read_text()
     (path,) = stored.logs()
     kept = read_log(path)
@@ -99,19 +101,21 @@ def test_a_gauge_that_is_right_is_no_trouble_and_logs_outlive_a_restart(
     assert not old.exists()
 
 
-def test_a_right_gauge_of_an_aged_pack_is_no_trouble_and_its_capacity_is_said(
-    tmp_path: Path,
-) -> None:
-    aged = OPINION | {"cause": {"verdict": "model_capacity"}, "next_step": "Fit a new model."}
+def test_what_is_known_outlives_a_stop_and_says_since_when(tmp_path: Path) -> None:
+    text = "The gauge stands still at 61.0 % since Sat 18 Nov 06:24 UTC.\nSee whether it does."
+    off = OPINION | {"now": {"verdict": "off"}, "text": text}
+    stored = Stored(tmp_path, 2, printing(off))
     with (
         LoggedLines("cangauge.extras.judge") as lines,
-        closing(LiveJudge(Stored(tmp_path, 2, printing(aged)), lambda: 50.0)) as judge,
+        closing(LiveJudge(stored, lambda: 50.0)) as judge,
     ):
         drive(judge, {"soc": 50.0}, 1, 0.0)
         judge._end_stretch()
-        assert waits(lambda: any("second opinion" in line for line in lines.lines))
-        assert judge.trouble == ""
-    assert any("model capacity. Fit a new model." in line for line in lines.lines)
+        assert waits(lambda: bool(judge.trouble))
+        drive(judge, {"soc": 50.0}, 2, 0.0)
+    assert json.loads((tmp_path / RESULT).read_text()) == off  # the second log is judged next time
+    assert any("since Sat 18 Nov 06:24 UTC. See whether" in line for line in lines.lines)
+    assert not stored.is_judged()
 
 
 def test_a_judgement_that_fails_says_why(tmp_path: Path) -> None:

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from cangauge.errors import CangaugeError
+from cangauge.extras.judge import suite
 from cangauge.extras.judge.suite import FAULTS, PlayedDrive, run_suite
 from live import in_process, leaf_model
 from synthetic import synthetic_log
@@ -50,6 +51,28 @@ def test_a_filter_recovers_and_states_its_error(drive: PlayedDrive) -> None:
     assert none.mae_pct < 3.0
     assert start.recovery_s < drive.log.duration_s
     assert start.cover_2sigma is not None
+
+
+MUTE = """
+import can, sys, time
+interface, channel, port = sys.argv[1:]
+options = {} if interface == "socketcan" else {"port": int(port)}
+with can.Bus(interface=interface, channel=channel, **options) as bus:
+    for _ in range(600):
+        bus.send(can.Message(arbitration_id=0x5A0, is_extended_id=False, data=bytes(8)))
+        bus.recv(0.1)
+        while bus.recv(1.0) is None:
+            bus.send(can.Message(arbitration_id=0x5A0, is_extended_id=False, data=bytes(8)))
+        time.sleep(60.0)
+"""
+
+
+def test_a_mute_gauge_scores_nothing(drive: PlayedDrive, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(suite, "ANSWER_WITHIN_S", 1.0)
+    command = [sys.executable, "-c", MUTE, "{interface}", "{channel}", "{port}"]
+    (none,) = run_suite(command, [drive], FAULTS[:1])
+    assert none.silent > 0.9
+    assert none.recovery_s == np.inf
 
 
 def test_a_program_that_says_nothing_is_named(drive: PlayedDrive) -> None:

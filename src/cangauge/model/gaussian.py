@@ -64,12 +64,15 @@ class Added:
 
     Parameters
     ----------
+    log_evidence : float
+        Of the model without any of them.
     log_factor : array
-        Gain of log evidence (log Bayes factor against the model without the column).
+        Gain of log evidence (log Bayes factor against that model).
     mean, std : array
         GaussianPosterior of its coefficient.
     """
 
+    log_evidence: float
     log_factor: FloatArray
     mean: FloatArray
     std: FloatArray
@@ -178,12 +181,14 @@ class Rows:
         std : array of shape (k,)
             Prior standard deviations of the coefficients of the others, each of mean 0.
         """
-        table = self.eliminated(columns).table
+        left = self.eliminated(columns)
+        table = left.table
         X, y = table[:, :-1], table[:, -1]
         precision = np.sum(X**2, axis=0) + std**-2.0
         mean = y @ X / precision
         log_factor = 0.5 * (mean**2 * precision - np.log(precision * std**2))
-        return Added(log_factor, mean, precision**-0.5)
+        log_evidence = left.log_norm - 0.5 * float(y @ y)
+        return Added(log_evidence, log_factor, mean, precision**-0.5)
 
 
 def _triangular(table: FloatArray) -> FloatArray:

@@ -93,9 +93,9 @@ def judge_command(
     """Judge the SoC that a battery gauge publishes: is it right, since when not, and why.
 
     The logs are of one pack, best of several days, with the published SoC as soc_pct. What happened
-    between two logs need not be known. The answer states by how much the gauge is off at the end,
-    since when, the cause with its size, and the next step that would settle it. Where the logs
-    cannot tell, it says so. Positive current discharges.
+    between two logs need not be known. Three lines answer: by how much the gauge is off now, what
+    happened before and why, and what to do next. Where the logs cannot tell, it says so. Positive
+    current discharges.
 
     FILE has one row per sample: log, time_s [s], published_pct, corrected_pct and
     corrected_std_pct [%].
@@ -212,10 +212,6 @@ def _write_corrected(path: Path, judgement: Judgement) -> None:
 
 
 def _show(judgement: Judgement, written: Sequence[Path]) -> None:
-    typer.echo(printable(judgement.headline))
-    typer.echo(printable(f"Next step: {judgement.next_step}"))
-    print_table("Answers", *judgement.answer_rows())
-    if judgement.jumps:
-        print_table("Jumps that the charge does not explain", *judgement.jump_rows())
+    typer.echo(printable(judgement.text))
     for path in written:
         note(f"wrote {path}")

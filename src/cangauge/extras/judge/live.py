@@ -73,6 +73,12 @@ class Stored:
         # A hidden one is what a killed service was writing.
         return sorted(path for path in found if not path.name.startswith("."))
 
+    def is_judged(self) -> bool:
+        """Return whether the result is younger than the newest log."""
+        result = self.folder / RESULT
+        newest_s = max((log.stat().st_mtime for log in self.logs()), default=0.0)
+        return newest_s <= (result.stat().st_mtime if result.is_file() else 0.0)
+
     def put(self, rows: list[tuple[float, ...]]) -> None:
         """Write rows of time, current, voltage, temperature and published SoC as a log."""
         time_s, current_a, voltage_v, temperature_c, soc_pct = np.array(rows).T
@@ -113,7 +119,7 @@ class LiveJudge(Output):
         self._rows: list[tuple[float, ...]] = []
         self._came_s = math.inf
         self._worker = Worker("cangauge-judge", self._failed, jobs_at_most=2)
-        if stored.logs() and not (stored.folder / RESULT).is_file():
+        if not stored.is_judged():
             self._worker.submit(self._judge)
 
     def on_sample(self, sample: Sample, estimate: Estimate) -> None:
@@ -137,7 +143,7 @@ class LiveJudge(Output):
             self._end_stretch()
 
     def close(self) -> None:
-        """Write what is kept; it is judged after the next stretch."""
+        """Write what is kept; it is judged at the next start, and the last result stays."""
         self._end_stretch(is_judged=False)
         self._worker.close(CLOSE_WITHIN_S)
 
@@ -148,7 +154,6 @@ class LiveJudge(Output):
 
         def work() -> None:
             self._stored.put(rows)
-            (self._stored.folder / RESULT).unlink(missing_ok=True)
             if is_judged:
                 self._judge()
 
@@ -156,14 +161,8 @@ class LiveJudge(Output):
 
     def _judge(self) -> None:
         result = self._stored.judge()
-        gauge, cause = result["gauge"], result["cause"]["verdict"]
-        text = (
-            f"second opinion on the battery's own SoC: {gauge['verdict'].replace('_', ' ')},"
-            f" {gauge['error_pct']:+.1f} ± {gauge['error_std_pct']:.1f} %"
-        )
-        is_off = gauge["verdict"] == "off"
-        if is_off or cause == "model_capacity":
-            text += f", cause: {cause.replace('_', ' ')}. {result['next_step']}"
+        text = "second opinion on the battery's own SoC: " + result["text"].replace("\n", " ")
+        is_off = result["now"]["verdict"] == "off"
         self.trouble = text if is_off else ""
         emit(_LOG, logging.WARNING if is_off else logging.INFO, "judge.result", text)
 

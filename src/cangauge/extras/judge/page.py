@@ -6,8 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from cangauge._text import number
-from cangauge.extras.judge.causes import RIGHT
+from cangauge._text import counted, number
 from cangauge.extras.judge.result import Judgement
 from cangauge.extras.report.charts import BLACK, BLUE, ORANGE, Figure, TimeFigures
 from cangauge.extras.report.page import Page, Table, Tile, joined
@@ -23,25 +22,23 @@ def judge_page(judgement: Judgement, model_path: Path | None = None) -> Page:
         The model's file, to name it by its SHA-256.
     """
     logs = judgement.logs
-    jumps = [Table(*judgement.jump_rows())] if judgement.jumps else []
+    first, *rest = judgement.text.split("\n")
     std = number(judgement.error_std_pct, 1, "%")
-    right = number(100.0 * sum(judgement.probabilities[name] for name in RIGHT), 0, "%")
+    days = counted(judgement.days, "day")
+    faults = [Table(*judgement.fault_rows())] if judgement.faults else []
     return Page(
         title=f"Second opinion on the gauge of {joined([log.name for log in logs])}",
-        lead=judgement.headline,
-        subtitle=f"{judgement.extent}, judged by {judgement.model.name}.",
+        lead=first,
+        subtitle=f"{counted(len(logs), 'log')}, {days}, judged by {judgement.model.name}.",
         tiles=[
-            Tile("Verdict", judgement.verdict.replace("_", " "), judgement.extent),
-            Tile("Error at the end", number(judgement.error_pct, 1, "% SoC"), f"σ {std}"),
-            Tile("Largest error", number(judgement.worst_pct, 1, "% SoC"), "relative to its σ"),
-            Tile("P(the gauge is right)", right, "off from 5 % down"),
+            Tile("Verdict now", judgement.verdict.replace("_", " ")),
+            Tile("Error now", number(judgement.error_pct, 1, "% SoC"), f"σ {std}"),
         ],
         sections={
+            "Why, and what next": [[text] for text in rest],
             "Both states of charge": [_figure(judgement)],
-            "What next": [[judgement.next_step]],
-            "All answers": [Table(*judgement.answer_rows())],
-            "Jumps that the charge does not explain": jumps,
         },
+        folded={"Faults": faults, "Pieces": [Table(*judgement.piece_rows())]},
         model=judgement.model,
         model_path=model_path,
         logs=logs,
@@ -56,8 +53,8 @@ def _figure(judgement: Judgement) -> Figure:
     figure = time.figure(
         "Published and corrected state of charge",
         "state of charge [%]",
-        "The published SoC should lie inside the band. A dashed line marks a moment at which the"
-        " two part: a jump, or where the error began.",
+        "The published SoC should lie inside the band (2σ). A dashed line marks a jump of the"
+        " gauge, or where it began to stand still.",
         height=400,
     )
     bands = [
@@ -68,10 +65,7 @@ def _figure(judgement: Judgement) -> Figure:
     corrected = [(log.time_s, soc) for log, soc, _ in pieces]
     time.line(figure, "corrected", corrected, BLUE, line_width=2.0)
     time.line(figure, "published", list(published), BLACK, line_width=2.0)
-    moments = [(jump.log, jump.time_s) for jump in judgement.jumps]
-    if judgement.onset is not None:
-        moments.append(judgement.onset)
-    for log_number, time_s in moments:
-        at = float(time.at(log_number, np.array([time_s]))[0])
+    for piece in judgement.pieces[1:]:
+        at = float(time.at(piece.begin.log, np.array([piece.begin.time_s]))[0])
         figure.mark("height", at, ORANGE, line_dash="dashed", line_width=2)
     return figure

@@ -1,408 +1,393 @@
-"""What a judgement holds, its sentences and its JSON."""
+"""What a judgement holds, its three lines and its JSON."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from datetime import UTC, datetime
+from functools import cached_property
 from typing import Any, Final, Literal, NamedTuple
 
 import numpy as np
 
-from cangauge._text import counted, duration, number, rounded
+from cangauge._text import duration, number, rounded
 from cangauge._typing import FloatArray
-from cangauge.extras.judge.causes import RIGHT, Explanation
-from cangauge.extras.judge.causes import UNITS as PACK_UNITS
-from cangauge.extras.judge.chain import HELD_PCT, Stretch, count_changes, published_pct
+from cangauge.extras.judge.chain import Chain
+from cangauge.extras.judge.faults import Fitted
 from cangauge.extras.judge.weak import WeakestCell
 from cangauge.logs.log import Log
 from cangauge.model.model_file import PRIOR_MADE_BY, Model
 
 Verdict = Literal["agrees", "off", "cannot_tell"]
 
-UNITS: Final = {**PACK_UNITS, "weak_cell": "%"}
-"""Units of the sizes of all causes."""
-USEFUL_PCT: Final = 5.0
-"""A gauge agrees only where an error of this size would have been seen [% SoC]."""
-JUMP_PCT: Final = 1.0
-"""Least jump of the published SoC against the charge that is listed [%]: a dashboard shows it."""
-SEVERAL: Final = 6.0
-"""A jump is also this many times the usual change against the charge."""
-DAY_S: Final = 86400.0
+OFF_PCT: Final = 3.0
+"""Error from which a gauge is off [% SoC]."""
+STOOD_PCT: Final = 5.0
+"""Charge from which it is told that a gauge stood still before [%]."""
+SURE: Final = 1.96
+"""Half width of an interval of 95 % in standard deviations."""
 EPOCH_S: Final = 1e8
 """Stamps from here on are absolute [s since 1970]; smaller ones count from the log's own start."""
+DAY_S: Final = 86400.0
 
-_WORDS: Final = {
-    "none": "the gauge is right",
-    "current_offset": "offset of the current",
-    "count_scale": "the gauge counts with a wrong scale",
-    "pack_capacity": "the pack has another capacity than the gauge counts with",
+FAULTS: Final = {
     "start_or_reset": "wrong start or reset",
-    "voltage_sensor": "voltage sensor",
-    "model_capacity": "the gauge is right, and the pack has another capacity than the model",
+    "current_offset": "current offset",
+    "count_scale": "the gauge counts with a wrong scale:",
+    "pack_capacity": "the pack has another capacity than the gauge counts with:",
+    "model_capacity": "the pack has another capacity than the model, and the gauge knows it:",
+    "voltage_sensor": "the logged voltage reads wrong:",
+    "voltage_table": "the gauge follows the voltage under load:",
+    "late": "the gauge is late by",
     "weak_cell": "weak cell",
-    "unknown": "another cause, or several",
+    "stands_still": "the gauge stands still",
 }
-_NEXT: Final = {
-    "none": "Nothing. Judge again after a full charge or a drive of 40 % or more.",
-    "current_offset": "Read the current with contactors open or everything off: what it then shows"
-    " is the offset. Log one hour of it: that settles it.",
-    "count_scale": "Compare the capacity in the gauge's configuration with the pack's, and the"
-    " current with a clamp meter under load. A log of one drive of 40 % settles it. A gauge that"
-    " shows the usable part of the cells as 0 to 100 % also moves more than the cells do: then"
-    " nothing is wrong.",
-    "pack_capacity": "Log one full discharge or charge, or a drive of 40 % or more that ends with"
-    " an hour of rest: charge over SoC then gives the capacity.",
-    "start_or_reset": "Charge until full once, so that the gauge resets itself, and judge again:"
-    " if the error is gone it was the start.",
-    "voltage_sensor": "Put a meter on the pack's terminals at rest and compare with the logged"
-    " voltage. Until then the published SoC may be the right one.",
-    "weak_cell": "Log one full charge and discharge with cell voltages, and balance the pack.",
+NEXT: Final = {
+    "start_or_reset": "Charge until full once, so that the gauge resets itself, and judge again.",
+    "reset_at_full": "The pack was charged full in these logs: check at which voltage and current"
+    " the gauge sets itself to 100 %.",
     "unknown": "Log one hour of rest and one full charge until its end: they settle whether the"
     " SoC, the current or the voltage is wrong.",
+    "current_offset": "Read the current with everything off: what it shows is the offset."
+    " Calibrate its zero, or let the gauge reach a full charge more often.",
+    "count_scale": "Compare the capacity in the gauge's configuration with the pack's, and the"
+    " current with a clamp meter under load.",
+    "pack_capacity": "Log one full discharge or charge: it gives the capacity. Then state it in the"
+    " gauge.",
+    "model_capacity": "Fit a new model to logs of these days.",
+    "voltage_sensor": "Put a meter on the pack's terminals at rest and compare with the log.",
+    "voltage_table": "Read the gauge at rest only, or use one that counts charge.",
+    "late": "Compare the time stamps of SoC and current: the gauge, or what carries it, buffers.",
+    "weak_cell": "Log one full charge and discharge with cell voltages, and balance the pack.",
+    "stands_still": "See whether the gauge itself stands still, or only what is logged of it, and"
+    " judge again by a log in which its SoC moves.",
 }
 
 
-class Jump(NamedTuple):
-    """A jump of the published SoC that the charge does not explain."""
+class Moment(NamedTuple):
+    """A row of a log."""
 
     log: int
     time_s: float
-    since_start_s: float
-    size_pct: float
 
 
-class Size(NamedTuple):
-    """Size of a cause with its interval of 95 %."""
+class Piece(NamedTuple):
+    """What the gauge did between two jumps, or while it stood still."""
 
-    value: float
-    ci: tuple[float, float]
-    unit: str
+    begin: Moment
+    end: Moment
+    error_pct: float
+    """Published minus corrected SoC at its end [% SoC], and its σ."""
+    std_pct: float
+    stands_at_pct: float | None
+    """SoC at which it stood still; None where it moved."""
+    moved_pct: float
+    """Charge that moved while it stood still [%]."""
 
 
-class Cause(NamedTuple):
-    """The most probable reason of a gauge's error."""
+class Fault(NamedTuple):
+    """Something that is wrong."""
 
-    verdict: str
-    """`current_offset`, `count_scale`, `pack_capacity`, `start_or_reset`, `voltage_sensor`,
-    `model_capacity`, `weak_cell`, `none` or `unknown`."""
+    name: str
+    """`start_or_reset`, `current_offset`, `count_scale`, `pack_capacity`, `model_capacity`,
+    `voltage_sensor`, `voltage_table`, `late`, `weak_cell` or `stands_still`."""
     probability: float
-    size: Size | None = None
-    onset: int = 0
-    """Stretch with which it begins; the first one: before all."""
-    earliest: int = 0
-    latest: int = 0
-    """First and last stretch with which it may have begun (90 %)."""
-    inside: bool = False
-    """Whether it begins at the step within that stretch, not before it."""
-
-
-def standing(chain: Sequence[Stretch]) -> Stretch | None:
-    """Return the stretch that ends with a published SoC that stands still while charge flows.
-
-    Of several, that with the most charge; None without any.
-    """
-    stands = [part for part in chain if part.held_pct >= max(HELD_PCT, 2.0 * part.soc_step_pct)]
-    return max(stands, key=lambda part: part.held_pct, default=None)
+    size: float
+    interval: tuple[float, float]
+    """Of 95 %."""
+    unit: str
+    since: Moment | None
+    """None: since before the first log."""
 
 
 @dataclass(frozen=True, eq=False)
 class Judgement:
-    """A second opinion on a gauge.
+    """A second opinion on a gauge; all that it says follows from one residual over all rows.
 
     Attributes
     ----------
     logs : tuple of Log
         In order of time.
     model : Model
-    error_pct, error_std_pct : float
-        Published SoC minus the SoC that all logs imply, at the end, and its σ with that of the
-        gauge's own zero [% SoC].
-    worst_pct : float
-        The largest such difference, relative to its σ [% SoC].
+    chain : Chain
+    fits : list of Fitted
+        Sets of faults that explain the logs, the most probable first.
+    published_pct, corrected_pct, corrected_std_pct : list of array
+        Published SoC, the one that all logs imply on the gauge's scale, and its σ, at each row of
+        each log [%]; NaN where not known.
     verdict : {"agrees", "off", "cannot_tell"}
-    cause : Cause
-    probabilities : dict
-        Of `none`, `unknown` and each cause.
-    corrected_pct, corrected_std_pct : list of array
-        Corrected SoC and its σ at each row of each log, with that of the gauge's own zero [%]; NaN
-        where not known.
-    chain : list of Stretch
-    explanations : list of Explanation
-        All answers, the most probable first.
+    error_pct, error_std_pct : float
+        Published minus corrected SoC at the last published row, and its σ [% SoC].
+    pieces : list of Piece
+    faults : list of Fault
+        The most probable first.
+    ratio : float, optional
+        Charge over what the published SoC moves by, where that is no gauge's error.
     weakest : WeakestCell, optional
     """
 
     logs: tuple[Log, ...]
     model: Model
-    error_pct: float
-    error_std_pct: float
-    worst_pct: float
-    verdict: Verdict
-    cause: Cause
-    probabilities: dict[str, float]
+    chain: Chain
+    fits: list[Fitted]
+    published_pct: list[FloatArray]
     corrected_pct: list[FloatArray]
     corrected_std_pct: list[FloatArray]
-    chain: list[Stretch]
-    explanations: list[Explanation]
+    verdict: Verdict
+    error_pct: float
+    error_std_pct: float
+    pieces: list[Piece]
+    faults: list[Fault]
+    ratio: float | None = None
     weakest: WeakestCell | None = None
 
     @property
-    def published_pct(self) -> list[FloatArray]:
-        """Published SoC at each row of each log [%]; NaN where a log has none."""
-        return [published_pct(log) for log in self.logs]
+    def text(self) -> str:
+        """The answer in up to three lines: the present error, history and causes, what to do."""
+        past = " ".join(filter(None, [_above(self), _history(self), _causes(self)]))
+        return "\n".join(filter(None, [_now(self), past, self.next_step]))
 
     @property
-    def jumps(self) -> list[Jump]:
-        """Jumps of the published SoC within stretches that the charge does not explain."""
-        result = []
-        for part in self.chain:
-            at, change = count_changes(part.published_pct, part.drawn_pct)
-            if not change.size:
-                continue
-            _, moved = count_changes(part.published_pct, np.zeros_like(part.drawn_pct))
-            usual = 1.5 * float(np.median(np.abs(change)))
-            least = max(JUMP_PCT, SEVERAL * usual, 2.0 * part.soc_step_pct)
-            for k in np.flatnonzero(np.minimum(np.abs(change), np.abs(moved)) >= least):
-                time_s = float(part.time_s[at[k]])
-                since_s = self.elapsed_s(part.log, time_s)
-                result.append(Jump(part.log, time_s, since_s, float(change[k])))
-        return result
+    def headline(self) -> str:
+        """The first line."""
+        return _now(self)
+
+    @property
+    def next_step(self) -> str:
+        """What to do next."""
+        return _next_step(self)
+
+    def piece_rows(self) -> tuple[list[str], list[list[str]]]:
+        """Return head and rows of the table of pieces."""
+        rows = [
+            [
+                moment(self, piece.begin),
+                moment(self, piece.end),
+                _signed(piece.error_pct),
+                number(piece.std_pct, 1),
+                "" if piece.stands_at_pct is None else f"at {number(piece.stands_at_pct, 1)} %",
+            ]
+            for piece in self.pieces
+        ]
+        return ["from", "until", "error at its end [% SoC]", "σ", "stands still"], rows
+
+    def fault_rows(self) -> tuple[list[str], list[list[str]]]:
+        """Return head and rows of the table of faults, the most probable first."""
+        rows = [
+            [
+                FAULTS[fault.name].rstrip(":"),
+                number(100.0 * fault.probability, 0),
+                f"{_signed(fault.size, 2)} {fault.unit}",
+                f"{_signed(fault.interval[0], 2)} … {_signed(fault.interval[1], 2)}",
+                "before the first log" if fault.since is None else moment(self, fault.since),
+            ]
+            for fault in self.faults
+        ]
+        return ["fault", "probability [%]", "size", "95 %", "since"], rows
 
     @property
     def days(self) -> int:
         """Days with logs: by their stamps, or one for each log."""
-        if any(log.time_s[0] < EPOCH_S for log in self.logs):
+        if not is_dated(self.logs):
             return len(self.logs)
         stamps = np.concatenate([log.time_s for log in self.logs])
         return int(np.unique(np.floor(stamps / DAY_S)).size)
 
-    @property
-    def extent(self) -> str:
-        """How much was judged."""
-        hours = duration(sum(log.duration_s for log in self.logs))
-        return f"{counted(len(self.logs), 'log')}, {counted(self.days, 'day')}, {hours}"
+    @cached_property
+    def _begins_s(self) -> list[float]:
+        """Time since the first row at which each log begins; without dates they follow."""
+        if is_dated(self.logs):
+            return [float(log.time_s[0] - self.logs[0].time_s[0]) for log in self.logs]
+        return [sum(log.duration_s for log in self.logs[:k]) for k in range(len(self.logs))]
 
-    def elapsed_s(self, log: int, time_s: float) -> float:
-        """Return the time since the first row of the first log [s].
-
-        Logs without absolute stamps follow one another without a pause.
-        """
-        if self.logs[0].time_s[0] >= EPOCH_S and self.logs[log].time_s[0] >= EPOCH_S:
-            return float(time_s - self.logs[0].time_s[0])
-        before = sum(earlier.duration_s for earlier in self.logs[:log])
-        return float(before + time_s - self.logs[log].time_s[0])
-
-    @property
-    def onset(self) -> tuple[int, float] | None:
-        """Log and stamp [s] with which the cause begins; None: before the first log, or unknown."""
-        cause = self.cause
-        if cause.onset == 0 and not cause.inside:
-            return None
-        part = self.chain[cause.onset]
-        return part.log, float(part.time_s[part.step_at if cause.inside else 0])
-
-    @property
-    def since_s(self) -> float | None:
-        """Moment from which on a cause holds, since the first row [s]; None without a cause."""
-        if self.cause.size is None:
-            return None
-        return 0.0 if self.onset is None else self.elapsed_s(*self.onset)
+    def since_first_s(self, moment: Moment) -> float:
+        """Return the time since the first row of the first log [s]."""
+        own_s = moment.time_s - float(self.logs[moment.log].time_s[0])
+        return self._begins_s[moment.log] + own_s
 
     def to_dict(self, corrected: str | None = None) -> dict[str, Any]:
-        """Return the object of `--json`, schema 1."""
-        size = self.cause.size
+        """Return the object of `--json`, schema 2."""
         return {
-            "schema": 1,
-            "gauge": {
+            "schema": 2,
+            "text": self.text,
+            "now": {
                 "error_pct": self.error_pct,
-                "error_std_pct": self.error_std_pct,
+                "sigma_pct": self.error_std_pct,
                 "verdict": self.verdict,
-                "since_s": self.since_s,
-                "worst_pct": self.worst_pct,
-                "jumps": [
-                    {
-                        "log": self.logs[jump.log].name,
-                        "since_s": jump.since_start_s,
-                        "size_pct": jump.size_pct,
-                    }
-                    for jump in self.jumps
-                ],
             },
-            "cause": {
-                "verdict": self.cause.verdict,
-                "probability": self.cause.probability,
-                "size": None if size is None else size._asdict() | {"ci": list(size.ci)},
-            },
+            "pieces": [
+                {
+                    "from_s": self.since_first_s(piece.begin),
+                    "until_s": self.since_first_s(piece.end),
+                    "from_log": self.logs[piece.begin.log].name,
+                    "until_log": self.logs[piece.end.log].name,
+                    "error_pct": piece.error_pct,
+                    "sigma_pct": piece.std_pct,
+                    "stands_at_pct": piece.stands_at_pct,
+                }
+                for piece in self.pieces
+            ],
+            "faults": [
+                {
+                    "fault": fault.name,
+                    "probability": fault.probability,
+                    "size": fault.size,
+                    "interval": list(fault.interval),
+                    "unit": fault.unit,
+                    "since_s": None if fault.since is None else self.since_first_s(fault.since),
+                }
+                for fault in self.faults
+            ],
             "next_step": self.next_step,
-            "days": self.days,
             "corrected": corrected,
         }
 
-    @property
-    def headline(self) -> str:
-        """The answer in a few sentences."""
-        reason = "" if self.cause.verdict in RIGHT else self.reason
-        return " ".join(filter(None, [self._found, self.aged, self.stands, reason]))
 
-    @property
-    def _found(self) -> str:
-        """The verdict with the error, as a sentence."""
-        std = number(self.error_std_pct, 1)
-        error = f"{_signed(self.error_pct)} ± {std} % SoC"
-        if self.verdict == "agrees":
-            return f"The gauge agrees with voltage and charge: difference {error} (1σ)."
-        if self.verdict == "cannot_tell":
-            open_ = f"and the logs do not settle whether its error is below {USEFUL_PCT:g} %"
-            if self.cause.verdict == "unknown":
-                open_ = (
-                    "and either it is wrong, or it is right and the pack has another capacity than"
-                    " assumed"
-                )
-            return (
-                f"Cannot tell: the gauge differs by {error} from the SoC that voltage and charge"
-                f" imply, {open_}."
-            )
-        if self.cause.verdict == "voltage_sensor":
-            return "The gauge and the logged voltage contradict each other."
-        if self.cause.verdict == "weak_cell":
-            return "The gauge holds for the mean cell, not for the weakest."
-        if abs(self.error_pct) > 2.0 * self.error_std_pct:
-            high = "too high" if self.error_pct > 0.0 else "too low"
-            return f"The gauge reads {number(abs(self.error_pct), 1)} ± {std} % SoC {high}."
-        return f"The gauge is not right, though its SoC at the end may be ({error})."
+def is_dated(logs: Sequence[Log]) -> bool:
+    """Return whether all stamps are absolute."""
+    return all(log.time_s[0] >= EPOCH_S for log in logs)
 
-    @property
-    def pack_ah(self) -> float | None:
-        """Capacity that the pack has where it is not the model's [Ah]; None where it is."""
-        if self.cause.verdict != "model_capacity" or self.cause.size is None:
-            return None
-        return self.model.capacity_ah / (1.0 - self.cause.size.value / 100.0)
 
-    @property
-    def aged(self) -> str:
-        """That the pack has another capacity than the model, as a sentence; empty if not."""
-        if self.pack_ah is None:
-            return ""
-        has, model = (rounded(ah) for ah in (self.pack_ah, self.model.capacity_ah))
-        percent = number(100.0 * self.cause.probability, 0, "%")
-        return f"The pack has {has} Ah, as the gauge counts; the model has {model} Ah ({percent})."
-
-    @property
-    def stands(self) -> str:
-        """Where the published SoC stands or stood still, as a sentence; empty if it does not."""
-        part = standing(self.chain)
-        if part is None or part.end is None:
-            stood = [(each, part.log) for part in self.chain for each in part.stood]
-            if not stood:
-                return ""
-            longest, log = max(stood, key=lambda found: found[0].flowed_pct)
-            return (
-                f"The published SoC stood at {number(longest.shown_pct, 1, '%')} for"
-                f" {duration(longest.until_s - longest.since_s)} from"
-                f" {self._moment(log, longest.since_s)} on, while"
-                f" {number(longest.flowed_pct, 1, '%')} of the charge flowed, and then jumped to"
-                " what it had missed."
-            )
-        at = number(float(part.shown_pct[part.end]), 1, "%")
+def _next_step(judgement: Judgement) -> str:
+    """Return what to do next."""
+    if judgement.ratio is not None:
         return (
-            f"The published SoC stands at {at} from {self._moment(part.log, part.held_since_s)} on,"
-            f" while {number(part.held_pct, 1, '%')} of the charge flowed."
+            "Check unit, sign and width of the current and of the SoC: one of the two is decoded"
+            " wrongly."
         )
+    if judgement.pieces[-1].stands_at_pct is not None:
+        return NEXT["stands_still"]
+    if judgement.verdict == "cannot_tell":
+        return _telling(judgement)
+    names = [fault.name for fault in judgement.faults if fault.name != "stands_still"]
+    if judgement.verdict == "agrees" and set(names) <= {"start_or_reset"}:
+        return "Nothing to do."
+    first = names[0] if names else "unknown"
+    if first == "start_or_reset" and any(
+        part.full_hours.size for part in judgement.chain.stretches
+    ):
+        first = "reset_at_full"
+    return NEXT[first]
 
-    @property
-    def reason(self) -> str:
-        """Cause, size and moment as sentences."""
-        cause = self.cause
-        if cause.size is None:
-            likely = ", ".join(
-                f"{_WORDS[name]} {number(100.0 * share, 0, '%')}"
-                for name, share in sorted(self.probabilities.items(), key=lambda item: -item[1])
-                if name in UNITS and share >= 0.05
-            )
-            return f"The cause is not known{f' (possible: {likely})' if likely else ''}."
-        value, (low, high), unit = cause.size
-        digits = _digits(unit)
-        words = _WORDS[cause.verdict]
-        if cause.verdict == "weak_cell" and self.weakest is not None:
-            words = f"weak cell, number {self.weakest.number}"
-        percent = number(100.0 * cause.probability, 0, "%")
-        text = f"Cause: {words} ({percent}), {_signed(value, digits)} {unit}"
-        text += f" ({_signed(low, digits)} … {_signed(high, digits)} {unit}, 95 %)"
-        return f"{text}, {self.since}."
 
-    @property
-    def since(self) -> str:
-        """Since when, with its interval."""
-        begin = "since before the first log"
-        if self.onset is not None:
-            log, time_s = self.onset
-            begin = f"since {self._moment(log, time_s)}"
-        if self.cause.earliest == self.cause.latest:
-            return begin
-        first = self.logs[self.chain[self.cause.earliest].log].name
-        last = self.logs[self.chain[self.cause.latest].log].name
-        return f"{begin} (it may have begun between {first} and {last})"
-
-    def _moment(self, log: int, time_s: float) -> str:
-        """Return a stamp [s] as the time into its log."""
-        after_s = time_s - self.logs[log].time_s[0]
-        where = f"{duration(after_s)} into" if after_s > 60.0 else "the start of"
-        return f"{where} {self.logs[log].name}"
-
-    @property
-    def next_step(self) -> str:
-        """What to do next, and what it settles."""
-        is_open = self.cause.size is None and self.verdict != "cannot_tell"
-        if standing(self.chain) is not None and is_open:
-            return (
-                "See whether the gauge itself stands still, or only what is logged of it, and judge"
-                " again by a log in which its SoC moves."
-            )
-        if self.verdict == "cannot_tell" and self.cause.verdict == "unknown":
-            return _NEXT["pack_capacity"]
-        if self.pack_ah is not None:
-            return (
-                f"Judge again with the pack's capacity (--capacity-ah {rounded(self.pack_ah)};"
-                " of a service: capacity_ah), and fit a new model to logs of these days."
-            )
-        if self.verdict != "cannot_tell":
-            return _NEXT[self.cause.verdict]
-        if self.model.chemistry == "lfp":
-            return (
-                "Add a log of one full charge until its end: between the knees the voltage of an"
-                " LFP cell says nothing, at full it settles the SoC."
-            )
-        zero = ", but for the zero of the gauge: that needs a model (-m)"
+def _telling(judgement: Judgement) -> str:
+    """Return the one log that would tell."""
+    offset = sum(
+        fit.share
+        for fit in judgement.fits
+        if any(fault.name == "current_offset" for fault in fit.faults)
+    )
+    doubt = " It also shows whether the current sensor is off." if offset > 0.1 else ""
+    if judgement.model.chemistry == "lfp":
         return (
-            "Add a log with an hour of rest after a drive of 40 % or more, or of one full charge"
-            " until its end: it settles the SoC to about 2 %"
-            f"{zero if self.model.made.by == PRIOR_MADE_BY else ''}."
+            "Add a log of one full charge until its end: it settles the SoC, which the flat"
+            f" voltage of LFP cells does not.{doubt}"
         )
-
-    def answer_rows(self) -> tuple[list[str], list[list[str]]]:
-        """Return head and rows of the table of all answers, the most probable first."""
-        rows = []
-        for answer in self.explanations:
-            size, unit = "–", UNITS.get(answer.name)
-            if unit is not None:
-                value, std = float(answer.size[answer.best]), float(answer.std[answer.best])
-                size = f"{_signed(value, _digits(unit))} ± {number(std, _digits(unit))} {unit}"
-            share = number(100.0 * self.probabilities[answer.name], 1, "%")
-            rows.append([_WORDS[answer.name], share, size])
-        return ["answer", "probability", "size (±1σ)"], rows
-
-    def jump_rows(self) -> tuple[list[str], list[list[str]]]:
-        """Return head and rows of the table of jumps."""
-        rows = [
-            [self._moment(jump.log, jump.time_s), number(jump.size_pct, 1)] for jump in self.jumps
-        ]
-        return ["moment", "% SoC"], rows
+    if judgement.model.made.by == PRIOR_MADE_BY:
+        return (
+            "Fit a model of the pack (`cangauge fit`) to drives whose SoC is known, and judge with"
+            f" -m: a typical cell leaves the SoC open by several percent.{doubt}"
+        )
+    return (
+        "Add a log with an hour of rest after a drive of 40 % or more, or of one full charge until"
+        f" its end: it settles the SoC.{doubt}"
+    )
 
 
-def _digits(unit: str) -> int:
-    return 2 if unit == "A" else 1
+def _now(judgement: Judgement) -> str:
+    error, std = judgement.error_pct, number(judgement.error_std_pct, 1)
+    if judgement.ratio is not None:
+        times = rounded(max(abs(judgement.ratio), 1.0 / max(abs(judgement.ratio), 1e-9)))
+        larger = "charge is" if abs(judgement.ratio) > 1.0 else "published SoC moves by"
+        return (
+            f"Cannot tell: the {larger} {times} times what the other shows, so that one of the two"
+            " signals is not what it is taken for."
+        )
+    last = judgement.pieces[-1] if judgement.pieces else None
+    if last is not None and last.stands_at_pct is not None:
+        return (
+            f"The gauge stands still at {number(last.stands_at_pct, 1)} % since"
+            f" {moment(judgement, last.begin)}, while {number(last.moved_pct, 0)} % of the charge"
+            f" moved: its error is {_signed(error)} ± {std} % SoC now."
+        )
+    if judgement.verdict == "agrees":
+        return f"The gauge is right now: {_signed(error)} ± {std} % SoC."
+    if judgement.verdict == "off":
+        return f"The gauge reads {_wrong(error, judgement.error_std_pct)} now."
+    return (
+        f"Cannot tell whether the gauge is right now: it differs by {_signed(error)} ± {std} % SoC"
+        " from what voltage and charge imply."
+    )
+
+
+def _wrong(error_pct: float, std_pct: float) -> str:
+    side = "too high" if error_pct > 0.0 else "too low"
+    return f"{number(abs(error_pct), 1)} ± {number(std_pct, 1)} % SoC {side}"
+
+
+def _above(judgement: Judgement) -> str:
+    most = max(float(np.nanmax(np.r_[-1.0, each])) for each in judgement.published_pct)
+    return "" if most <= 100.05 else f"It published up to {number(most, 1)} %."
+
+
+def _history(judgement: Judgement) -> str:
+    """Return what the gauge did before, where it was not as it is now."""
+    wrong = [piece for piece in judgement.pieces[:-1] if _was_other(judgement, piece)]
+    if not wrong:
+        return ""
+    last = wrong[-1]
+    begin, until = moment(judgement, last.begin), moment(judgement, last.end)
+    if last.stands_at_pct is not None:
+        return (
+            f"It stood at {number(last.stands_at_pct, 1)} % from {begin} until {until}, while"
+            f" {number(last.moved_pct, 0)} % of the charge moved."
+        )
+    after = judgement.pieces[judgement.pieces.index(last) + 1]
+    jump = "" if after.stands_at_pct is not None else ", when it set itself"
+    return f"It was {_wrong(last.error_pct, last.std_pct)} until {until}{jump}."
+
+
+def _was_other(judgement: Judgement, piece: Piece) -> bool:
+    """Return whether a piece was wrong in another way than the gauge is now."""
+    if piece.stands_at_pct is not None:
+        return piece.moved_pct > STOOD_PCT
+    is_wrong = abs(piece.error_pct) > OFF_PCT + piece.std_pct
+    return is_wrong and abs(piece.error_pct - judgement.error_pct) > OFF_PCT
+
+
+def _causes(judgement: Judgement) -> str:
+    texts = [_cause(judgement, fault) for fault in judgement.faults if fault.name != "stands_still"]
+    if texts:
+        return f"Cause: {'; '.join(texts)}."
+    return "The cause is not known." if judgement.verdict == "off" and not judgement.faults else ""
+
+
+def _cause(judgement: Judgement, fault: Fault) -> str:
+    words = FAULTS[fault.name]
+    if fault.name == "weak_cell" and judgement.weakest is not None:
+        words = f"weak cell, number {judgement.weakest.number}, which lacks capacity:"
+    digits = {"A": 2, "s": 0}.get(fault.unit, 1)
+    std = number((fault.interval[1] - fault.interval[0]) / (2.0 * SURE), digits)
+    size = (
+        number(fault.size, digits)
+        if fault.name in {"late", "weak_cell"}
+        else _signed(fault.size, digits)
+    )
+    percent = number(100.0 * fault.probability, 0)
+    since = "" if fault.since is None else f" since {moment(judgement, fault.since)}"
+    return f"{words} {size} ± {std} {fault.unit}{since} ({percent} %)"
+
+
+def moment(judgement: Judgement, at: Moment) -> str:
+    """Return a moment as a date, or as the time into its log."""
+    log = judgement.logs[at.log]
+    if at.time_s >= EPOCH_S:
+        return datetime.fromtimestamp(at.time_s, UTC).strftime("%a %d %b %H:%M UTC")
+    after_s = at.time_s - float(log.time_s[0])
+    return f"{duration(after_s)} into {log.name}" if after_s > 60.0 else f"the start of {log.name}"
 
 
 def _signed(value: float, digits: int = 1) -> str:
+    """Return a number with its sign."""
     text = number(value, digits)
     return text if value < 0.0 else f"+{text}"

@@ -45,12 +45,9 @@ HOURS: Final = 0.5
 ANSWER_EVERY_S: Final = 20.0
 """Log time between two readings of the gauge [s]: as often it is compared with the truth."""
 QUIET_S: Final = 0.02
-"""Time without a frame after which a gauge has answered [s]: a sample takes it a tenth of that, and
-what it sends in silence comes more seldom."""
-SILENT_S: Final = 0.25
-"""Time without a frame after which a gauge has no answer, where it owes one [s]."""
-ANSWER_WITHIN_S: Final = 5.0
-"""Longest wait for an answer [s], also where other frames never end."""
+"""Time without a frame after which a gauge that owes no answer has none under way [s]."""
+ANSWER_WITHIN_S: Final = 10.0
+"""Longest wait for an answer that a gauge owes [s]: a busy machine changes no score."""
 READY_WITHIN_S: Final = 30.0
 SILENT_AT_MOST: Final = 30
 """Readings without an answer after which a gauge counts as dead."""
@@ -252,6 +249,7 @@ class _Gauge:
         ]
         self._vehicle, self._clock = Vehicle.load("generic"), ClockFrames()
         self._was_ready = False
+        self._answers_a_sample = 1.0
 
     def play(self, drive: PlayedDrive, fault: CountFault) -> Reading:
         """Play a drive to a new gauge."""
@@ -323,19 +321,27 @@ class _Gauge:
         return ends, readings[:, 0], readings[:, 1]
 
     def _answer(self, samples: int) -> tuple[float, float]:
-        """Return SoC and σ after so many samples; NaN if the gauge said nothing."""
-        found, until_s = (math.nan, math.nan), time.monotonic() + ANSWER_WITHIN_S
+        """Return SoC and σ after so many samples; NaN if the gauge said nothing.
+
+        It owes as many answers as its samples: the clock of the samples is that of the bus. One
+        that has sent fewer is not waited for as long again.
+        """
+        found, got = (math.nan, math.nan), 0
         if not samples:
             return found
+        owed = math.ceil(samples * self._answers_a_sample)
+        until_s = time.monotonic() + ANSWER_WITHIN_S
         while time.monotonic() < until_s:
             # What it sends by its own clock counts too: listen on until it is quiet.
-            message = self._bus.receive(SILENT_S if samples > 0 else QUIET_S)
+            message = self._bus.receive(until_s - time.monotonic() if got < owed else QUIET_S)
             if message is None:
                 break
             if message.arbitration_id == self._id and len(message.data) == 8:
-                samples -= 1
+                got += 1
                 soc_pct, std_pct = (codec.decode(message.data) for codec in self._codecs)
                 found = soc_pct, std_pct
+        if got < owed:
+            self._answers_a_sample = got / samples
         return found
 
 
@@ -354,7 +360,7 @@ def _score(fault: CountFault, drives: Sequence[PlayedDrive], runs: Sequence[Read
         known = np.isfinite(error)
         errors.append(error[known])
         since_s = drive.log.time_s[at] - drive.log.time_s[0]
-        bad = np.flatnonzero(np.abs(error) >= RECOVERED_PCT)
+        bad = np.flatnonzero(~(np.abs(error) < RECOVERED_PCT))  # silence is no recovery
         recoveries.append(
             0.0 if not bad.size else math.inf if bad[-1] == at.size - 1 else since_s[bad[-1]]
         )
@@ -369,7 +375,7 @@ def _score(fault: CountFault, drives: Sequence[PlayedDrive], runs: Sequence[Read
         fault=fault.name,
         mae_pct=float(every.mean()) if every.size else math.nan,
         worst_pct=float(every.max()) if every.size else math.nan,
-        jumps_per_h=jumps / hours,
+        jumps_per_h=jumps / hours if every.size else math.nan,
         recovery_s=float(np.median(recoveries)),
         cover_2sigma=float(within.mean()) if within.size else None,
         silent=float(silent.mean()),

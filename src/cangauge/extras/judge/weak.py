@@ -1,9 +1,10 @@
 """A weak cell, from the cell voltages beside the logs.
 
-A cell whose capacity is smaller by w falls behind the others by w·Q while the charge Q is drawn.
-With u′ the slope of a cell's curve and I the current, its voltage less the median cell's is
+Each cell's SoC follows from the median cell's: S′ = U⁻¹(v − v_median + U(S)), U being the curve of
+a cell and S the SoC of the pack; beyond a bend the curve is not its slope. A cell whose capacity
+is smaller by w falls behind the others while the charge is drawn:
 
-    d = u′(S)·(a + w·(S − 100)/100) − r·I
+    S′ − S = a − w·(100 − S)/(100 − w) + r·I/U′
 
 a (balance) and r (resistance) are free. The w of the other cells show how well w is known.
 """
@@ -25,6 +26,8 @@ LEAST_SPAN_PCT: Final = 10.0
 """Least span of SoC over all logs from which capacities are compared [%]."""
 MAD: Final = 1.4826
 """Standard deviation over median absolute deviation of a normal distribution."""
+CURVE_PCT: Final = np.linspace(-20.0, 110.0, 1301)
+"""SoC at which the curve is inverted [%]."""
 
 
 class WeakestCell(NamedTuple):
@@ -34,16 +37,20 @@ class WeakestCell(NamedTuple):
     """From the number of the first cell."""
     log_factor: float
     """ln of the Bayes factor of one weak cell, any of them, against none."""
-    size_pct: float
+    lack_pct: float
     """Capacity that it lacks [%], and its σ."""
     std_pct: float
+
+    def behind_pct(self, soc_pct: FloatArray) -> FloatArray:
+        """Return by how much the cell is behind a pack that was full [% SoC]."""
+        return self.lack_pct * (100.0 - soc_pct) / (100.0 - self.lack_pct)
 
 
 def weak_cell(
     volts: Sequence[FloatArray],
     soc_pct: Sequence[FloatArray],
-    slope_v: Sequence[FloatArray],
     current_a: Sequence[FloatArray],
+    curve_v: FloatArray,
     first: int = 1,
 ) -> WeakestCell | None:
     """Return the weakest cell; None where the logs do not compare capacities.
@@ -52,20 +59,30 @@ def weak_cell(
     ----------
     volts : sequence of array of shape (n, cells)
         Cell voltages of each stretch [V].
-    soc_pct, slope_v, current_a : sequence of array of shape (n,)
-        SoC of the pack [%], slope of a cell's curve [V/%] and current [A].
+    soc_pct, current_a : sequence of array of shape (n,)
+        SoC of the pack [%] and current [A].
+    curve_v : array of shape (1301,)
+        A cell's open-circuit voltage at `CURVE_PCT` [V].
     first : int
         Number of the first cell.
-    """  # fmt: skip
+    """
     cells = np.concatenate(volts)
-    S, slope, amps = (np.concatenate(each) for each in (soc_pct, slope_v, current_a))
+    S, amps = (np.concatenate(each) for each in (soc_pct, current_a))
     has = np.isfinite(cells).all(axis=1) & np.isfinite(S)
     if has.sum() < 4 or cells.shape[1] < 3 or np.ptp(S[has]) < LEAST_SPAN_PCT:
         return None
-    cells, S, slope, amps = cells[has], S[has], slope[has], amps[has]
-    X = np.column_stack([slope, -slope * (S - 100.0) / 100.0, -amps])
-    d = cells - np.median(cells, axis=1, keepdims=True)
-    lack = -np.linalg.lstsq(X, d, rcond=None)[0][1]
+    cells, S, amps = cells[has], S[has], amps[has]
+    rising_v = np.maximum.accumulate(curve_v) + 1e-9 * np.arange(curve_v.size)
+    at_v = np.interp(S, CURVE_PCT, rising_v)
+    slope = np.gradient(rising_v, CURVE_PCT)
+    median = np.median(cells, axis=1, keepdims=True)
+    theirs = np.interp(cells - median + at_v[:, None], rising_v, CURVE_PCT)
+    lack = np.empty(cells.shape[1])
+    for k in range(lack.size):  # a voltage says as much of a SoC as the curve is steep
+        steep = np.interp(0.5 * (S + theirs[:, k]), CURVE_PCT, slope)
+        X = np.column_stack([np.ones_like(S), (S - 100.0) / 100.0, amps / steep])
+        a = np.linalg.lstsq(X * steep[:, None], (theirs[:, k] - S) * steep, rcond=None)[0][1]
+        lack[k] = 100.0 * a / (100.0 + a)
     lack = lack - np.median(lack)
     spread = max(LEAST_STD_PCT, MAD * float(np.median(np.abs(lack))))
     wide = np.hypot(spread, WEAK_STD_PCT)
