@@ -43,7 +43,7 @@ if TYPE_CHECKING:
     from cangauge.estimation.estimator import Estimator as Estimator
     from cangauge.estimation.offline import EstimateTable as EstimateTable
     from cangauge.estimation.offline import estimate as estimate
-    from cangauge.extras.judge.judgement import Judgement as Judgement
+    from cangauge.extras.judge.result import Judgement as Judgement
     from cangauge.extras.judge.judgement import judge as judge
     from cangauge.extras.validation import Simulation as Simulation
     from cangauge.extras.validation import simulate as simulate
@@ -63,7 +63,7 @@ _PLACES: Final = {
     "Estimator": "estimation.estimator",
     "Identification": "identify.fit",
     "InputError": "errors",
-    "Judgement": "extras.judge.judgement",
+    "Judgement": "extras.judge.result",
     "Log": "logs.log",
     "Model": "model.model_file",
     "Sample": "types",
