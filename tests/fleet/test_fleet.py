@@ -88,7 +88,7 @@ def test_judgements_are_those_of_each_log_alone(folder: Path) -> None:
     path = drives(folder)[3]
     table = table_of(folder, "judge", [path])
     alone = judge([path], folder / "type.json").to_dict()
-    assert table["gauge.error_pct"] == [alone["gauge"]["error_pct"]]
+    assert table["now.error_pct"] == [alone["now"]["error_pct"]]
 
 
 def test_a_dask_scheduler_gives_the_same_rows(folder: Path) -> None:

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 _SHOWN: Final = {
     "estimate": ("soc_mae_pct", "voltage_mae_pct", "valid_fraction"),
     "gap": ("cause.verdict", "cause.probability", "cause.probability_none"),
-    "judge": ("gauge.verdict", "gauge.error_pct", "gauge.error_std_pct", "cause.verdict"),
+    "judge": ("now.verdict", "now.error_pct", "now.sigma_pct", "next_step"),
 }
 """Columns that are printed; the table has all."""
 _SHOWN_ROWS: Final = 20
