@@ -43,8 +43,8 @@ if TYPE_CHECKING:
     from cangauge.estimation.estimator import Estimator as Estimator
     from cangauge.estimation.offline import EstimateTable as EstimateTable
     from cangauge.estimation.offline import estimate as estimate
-    from cangauge.extras.judge.result import Judgement as Judgement
     from cangauge.extras.judge.judgement import judge as judge
+    from cangauge.extras.judge.result import Judgement as Judgement
     from cangauge.extras.validation import Simulation as Simulation
     from cangauge.extras.validation import simulate as simulate
     from cangauge.identify.fit import fit as fit
