@@ -20,7 +20,7 @@ import numpy as np
 
 from cangauge._typing import FloatArray, IntArray
 from cangauge.extras.judge.gauge import (
-    Published,
+    GaugeRecord,
     is_limit,
     published_pct,
     read_published,
@@ -86,7 +86,7 @@ class Stretch:
         Means; NaN where not used.
     count_pct, piece : array
         y + Q at the blocks where y is a count [%], NaN elsewhere, and the number of its piece.
-    published : Published
+    published : GaugeRecord
         Of each row, whose stamps, hours and Q are `row_time_s`, `row_hours` and `row_drawn_pct`.
     full_hours, full_drawn_pct : array of shape (charges,)
         h and Q where a charge ended full.
@@ -114,7 +114,7 @@ class Stretch:
     voltage_v: FloatArray
     count_pct: FloatArray
     piece: IntArray
-    published: Published
+    published: GaugeRecord
     row_time_s: FloatArray
     row_hours: FloatArray
     row_drawn_pct: FloatArray
@@ -279,7 +279,7 @@ def _stretch(number: int, whole: Log, rows: slice, model: Model, step_pct: float
     )
 
 
-def _of_windows(published: Published, edges: Sequence[int]) -> tuple[FloatArray, IntArray]:
+def _of_windows(published: GaugeRecord, edges: Sequence[int]) -> tuple[FloatArray, IntArray]:
     """Return mean count and piece of the rows from each edge to the next.
 
     Of two pieces in a window it is the one with more rows.

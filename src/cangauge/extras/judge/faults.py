@@ -96,7 +96,7 @@ Noise = tuple[int, int]
 """Sizes of the noise of voltage and gauge: places in `VOLTAGE_SCALES` and `GAUGES`."""
 
 
-class Block(NamedTuple):
+class Contribution(NamedTuple):
     """What one unit of a term adds in a stretch; arrays of shape (n,), or 0."""
 
     soc: FloatArray | float = 0.0
@@ -135,7 +135,7 @@ class Term:
     name: str
     unit: str
     std: float
-    blocks: dict[int, Block]
+    blocks: dict[int, Contribution]
     log_prior: float = 0.0
     piece: int = -1
     since: int = 0
@@ -195,19 +195,23 @@ def healthy_terms(chain: Chain, priors: Priors, soc_pct: Sequence[FloatArray]) -
     """Return what a healthy pack and gauge show; first the start of each stretch, then the zero."""
     parts, per_ah = chain.stretches, 100.0 / priors.capacity_ah
     terms = [
-        Term("start", "%", FREE_PCT, {k: Block(1.0, 1.0, at_full=1.0, at_end=1.0)})
+        Term("start", "%", FREE_PCT, {k: Contribution(1.0, 1.0, at_full=1.0, at_end=1.0)})
         for k in range(len(parts))
     ]
-    terms.append(Term("zero", "%", priors.zero_std_pct, _each(parts, lambda _: Block(shown=1.0))))
+    terms.append(
+        Term("zero", "%", priors.zero_std_pct, _each(parts, lambda _: Contribution(shown=1.0)))
+    )
     functions = [
         chain.function_columns(part, soc) for part, soc in zip(parts, soc_pct, strict=True)
     ]
     terms += [
-        Term("curve", "-", 1.0, {k: Block(volts=of[:, j]) for k, of in enumerate(functions)})
+        Term("curve", "-", 1.0, {k: Contribution(volts=of[:, j]) for k, of in enumerate(functions)})
         for j in range(chain.functions.number)
     ]
-    terms.append(Term("level", "-", SHARED, _each(parts, lambda part: Block(volts=part.level_v))))
-    volts = _each(parts, lambda part: Block(volts=np.nan_to_num(part.voltage_v) / 100.0))
+    terms.append(
+        Term("level", "-", SHARED, _each(parts, lambda part: Contribution(volts=part.level_v)))
+    )
+    volts = _each(parts, lambda part: Contribution(volts=np.nan_to_num(part.voltage_v) / 100.0))
     terms.append(Term("voltage", "%", priors.voltage_std_pct, volts))
     offset = _each(parts, lambda part: _of_hours(part, per_ah))
     terms.append(Term("offset", "A", priors.capacity_ah / 400.0, offset))
@@ -217,22 +221,24 @@ def healthy_terms(chain: Chain, priors: Priors, soc_pct: Sequence[FloatArray]) -
     return terms
 
 
-def _each(parts: Sequence[Stretch], of: Callable[[Stretch], Block]) -> dict[int, Block]:
+def _each(
+    parts: Sequence[Stretch], of: Callable[[Stretch], Contribution]
+) -> dict[int, Contribution]:
     return {k: of(part) for k, part in enumerate(parts)}
 
 
-def _of_hours(part: Stretch, per_ah: float) -> Block:
+def _of_hours(part: Stretch, per_ah: float) -> Contribution:
     """Return an offset of the sensor of 1 A, which the gauge counts with."""
-    return Block(
+    return Contribution(
         soc=per_ah * part.hours,
         at_full=per_ah * part.full_hours,
         at_end=per_ah * float(part.row_hours[-1]),
     )
 
 
-def _of_charge(part: Stretch) -> Block:
+def _of_charge(part: Stretch) -> Contribution:
     """Return a surplus of capacity of 1 %, which the gauge does not know."""
-    return Block(
+    return Contribution(
         soc=part.drawn_pct / 100.0,
         at_full=part.full_drawn_pct / 100.0,
         at_end=float(part.row_drawn_pct[-1]) / 100.0,
@@ -270,7 +276,9 @@ def _shapes(
         k: _of_charge(part)._replace(shown=part.drawn_pct / 100.0) for k, part in enumerate(parts)
     }
     yield [Term("model_capacity", "%", SCALE_PCT, aged)], P_SELDOM
-    volts = {k: Block(volts=np.nan_to_num(part.voltage_v) / 100.0) for k, part in enumerate(parts)}
+    volts = {
+        k: Contribution(volts=np.nan_to_num(part.voltage_v) / 100.0) for k, part in enumerate(parts)
+    }
     yield (
         [
             Term(
@@ -284,7 +292,7 @@ def _shapes(
     under_load = {}
     for k, (part, soc) in enumerate(zip(parts, soc_pct, strict=True)):
         slope = np.maximum(chain.slope(part, soc), LEAST_SLOPE * mean_slope)
-        under_load[k] = Block(shown=part.load_v / slope)
+        under_load[k] = Contribution(shown=part.load_v / slope)
     yield [Term("voltage_table", "-", 1.0, under_load, is_positive=True)], P_FAULT
     yield [_late(parts, seconds) for seconds in LATE_S], P_FAULT
 
@@ -330,10 +338,10 @@ def _in_pauses(parts: Sequence[Stretch], pieces: Mapping[int, list[int]]) -> Ite
                     yield Term("start_or_reset", "%", LEVEL_PCT, part, piece=number, since=at)
 
 
-def _shown_in(parts: Sequence[Stretch], numbers: Sequence[int]) -> dict[int, Block]:
+def _shown_in(parts: Sequence[Stretch], numbers: Sequence[int]) -> dict[int, Contribution]:
     """Return a published SoC that is 1 % higher in some pieces."""
     return {
-        k: Block(shown=np.isin(part.piece, numbers).astype(np.float64))
+        k: Contribution(shown=np.isin(part.piece, numbers).astype(np.float64))
         for k, part in enumerate(parts)
         if np.isin(part.piece, numbers).any()
     }
@@ -342,7 +350,7 @@ def _shown_in(parts: Sequence[Stretch], numbers: Sequence[int]) -> dict[int, Blo
 def _late(parts: Sequence[Stretch], seconds: float) -> Term:
     """Return a published SoC that is late."""
     blocks = {
-        k: Block(shown=part.drawn_pct - part.drawn_before_pct(seconds))
+        k: Contribution(shown=part.drawn_pct - part.drawn_before_pct(seconds))
         for k, part in enumerate(parts)
     }
     return Term("late", "s", 1.0, blocks, per_unit=seconds, is_positive=True)
@@ -373,7 +381,7 @@ def _offsets(
                         if in_sensor:
                             blocks[k] = _of_hours(part, per_ah)._replace(shown=shown)
                         else:
-                            blocks[k] = Block(shown=shown - per_ah * part.hours)
+                            blocks[k] = Contribution(shown=shown - per_ah * part.hours)
                     yield Term("current_offset", "A", std, blocks, since=since)
 
 
@@ -399,7 +407,7 @@ def _scales(
                     if reference == "piece" or hours >= axis.hours[k]:
                         zero[part.piece == n] = at_pct
             if gauge:
-                blocks[k] = Block(shown=(soc - zero) / 100.0)
+                blocks[k] = Contribution(shown=(soc - zero) / 100.0)
             else:
                 blocks[k] = _of_charge(part)._replace(shown=(axis.start_pct[k] - zero) / 100.0)
         if gauge:
@@ -546,7 +554,7 @@ class Linearised:
         X, y, std = list[FloatArray](), list[float](), list[float]()
         for k, part in enumerate(self.chain.stretches):
             start = float(self.soc_pct[k][0] + part.drawn_pct[0])
-            of = [term.blocks.get(k, Block()) for term in self.terms]
+            of = [term.blocks.get(k, Contribution()) for term in self.terms]
             for c in range(part.full_hours.size):
                 at_full = [np.broadcast_to(b.at_full, part.full_hours.shape)[c] for b in of]
                 X.append(np.array(at_full, dtype=np.float64))
@@ -554,7 +562,7 @@ class Linearised:
                 std.append(FULL_STD_PCT)
             if part.continues:
                 before = self.chain.stretches[k - 1]
-                was = [term.blocks.get(k - 1, Block()).at_end for term in self.terms]
+                was = [term.blocks.get(k - 1, Contribution()).at_end for term in self.terms]
                 own = [1.0 if j == k else 0.0 for j in range(len(self.terms))]
                 X.append(np.array(own) - np.array(was))
                 begin = float(self.soc_pct[k - 1][0] + before.drawn_pct[0])

@@ -41,7 +41,7 @@ class Stand(NamedTuple):
     """Charge that moved, in either direction [%]."""
 
 
-class Published(NamedTuple):
+class GaugeRecord(NamedTuple):
     """What a gauge published; arrays of shape (rows,)."""
 
     shown_pct: FloatArray
@@ -69,7 +69,7 @@ def resolution_pct(log: Log) -> float:
 
 def read_published(
     time_s: FloatArray, shown_pct: FloatArray, drawn_pct: FloatArray, step_pct: float
-) -> Published:
+) -> GaugeRecord:
     """Cut what a gauge published into pieces.
 
     Parameters
@@ -97,7 +97,7 @@ def read_published(
         if blank[before + 1 : after].any():
             cut[after] |= abs(count[after] - count[before]) >= least
     piece = np.where(np.isfinite(count), np.cumsum(cut), -1)
-    return Published(shown_pct, count, piece, stands, step_pct)
+    return GaugeRecord(shown_pct, count, piece, stands, step_pct)
 
 
 def is_limit(shown_pct: FloatArray) -> BoolArray:

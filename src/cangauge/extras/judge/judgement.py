@@ -20,7 +20,7 @@ from cangauge.extras.judge.gauge import is_limit, published_pct
 from cangauge.extras.judge.result import (
     OFF_PCT,
     SURE,
-    Fault,
+    FoundFault,
     Judgement,
     Moment,
     Piece,
@@ -265,7 +265,7 @@ def _judgement(
     if weakest is not None:
         size, half = weakest.lack_pct, SURE * weakest.std_pct
         interval = (size - half, size + half)
-        faults.append(Fault("weak_cell", _p_weak(weakest), size, interval, "%", None))
+        faults.append(FoundFault("weak_cell", _p_weak(weakest), size, interval, "%", None))
     ratio = _contradiction(chain)
     verdict: Verdict = "cannot_tell"
     if ratio is None:
@@ -364,7 +364,7 @@ def _pieces(chain: Chain, fits: Sequence[Fitted], corrected: Sequence[_Residual]
     return found
 
 
-def _faults(chain: Chain, fits: Sequence[Fitted], pieces: Sequence[Piece]) -> list[Fault]:
+def _faults(chain: Chain, fits: Sequence[Fitted], pieces: Sequence[Piece]) -> list[FoundFault]:
     """Return the faults that are probable, of a possible size, and matter."""
     by_place = dict[tuple[str, int, int], list[tuple[float, Term, float, float]]]()
     for fit in fits:
@@ -389,7 +389,7 @@ def _faults(chain: Chain, fits: Sequence[Fitted], pieces: Sequence[Piece]) -> li
             at = np.flatnonzero(part.published.piece == term.piece)
             since = Moment(part.log, float(part.row_time_s[int(at[0]) if at.size else 0]))
         interval = (size - SURE * std, size + SURE * std)
-        found.append(Fault(name, min(probability, 1.0), size, interval, term.unit, since))
+        found.append(FoundFault(name, min(probability, 1.0), size, interval, term.unit, since))
     # At a limit a gauge may count on unseen, unless it never leaves it.
     stands = [
         piece
@@ -400,7 +400,7 @@ def _faults(chain: Chain, fits: Sequence[Fitted], pieces: Sequence[Piece]) -> li
     if stands:
         longest = max(stands, key=lambda piece: piece.moved_pct)
         moved = longest.moved_pct
-        found.append(Fault("stands_still", 1.0, moved, (moved, moved), "%", longest.begin))
+        found.append(FoundFault("stands_still", 1.0, moved, (moved, moved), "%", longest.begin))
     return found
 
 

@@ -85,7 +85,7 @@ class Piece(NamedTuple):
     """Charge that moved while it stood still [%]."""
 
 
-class Fault(NamedTuple):
+class FoundFault(NamedTuple):
     """Something that is wrong."""
 
     name: str
@@ -119,7 +119,7 @@ class Judgement:
     error_pct, error_std_pct : float
         Published minus corrected SoC at the last published row, and its σ [% SoC].
     pieces : list of Piece
-    faults : list of Fault
+    faults : list of FoundFault
         The most probable first.
     ratio : float, optional
         Charge over what the published SoC moves by, where that is no gauge's error.
@@ -137,7 +137,7 @@ class Judgement:
     error_pct: float
     error_std_pct: float
     pieces: list[Piece]
-    faults: list[Fault]
+    faults: list[FoundFault]
     ratio: float | None = None
     weakest: WeakestCell | None = None
 
@@ -362,7 +362,7 @@ def _causes(judgement: Judgement) -> str:
     return "The cause is not known." if judgement.verdict == "off" and not judgement.faults else ""
 
 
-def _cause(judgement: Judgement, fault: Fault) -> str:
+def _cause(judgement: Judgement, fault: FoundFault) -> str:
     words = FAULTS[fault.name]
     if fault.name == "weak_cell" and judgement.weakest is not None:
         words = f"weak cell, number {judgement.weakest.number}, which lacks capacity:"
