@@ -8,7 +8,7 @@ import pytest
 
 import cangauge
 from cangauge.bus.decoder import SampleDecoder
-from cangauge.bus.mapping import SignalMap, TemperatureMap, VehicleMap
+from cangauge.bus.mapping import SignalMap, TemperatureMap, VehicleMap, VoltageMap
 from cangauge.bus.vehicle import PRESETS, Preset, Vehicle
 from cangauge.extras.report.charts import BLUE, Figure
 from cangauge.extras.report.page import Page, Tile
@@ -48,7 +48,7 @@ def test_a_preset_of_your_own_decodes(monkeypatch: pytest.MonkeyPatch) -> None:
         mapping=VehicleMap(
             name="mine",
             current=SignalMap(signal="current_a", sign=-1),
-            voltage=SignalMap(signal="voltage_v"),
+            voltage=VoltageMap(signal="voltage_v"),
             temperature=TemperatureMap(signal="temperature_c"),
         ),
     )
