@@ -40,9 +40,22 @@ _UTF16: Final = (b"\xff\xfe", b"\xfe\xff")
 _D3_MEMBER: Final = "test data.txt"
 _SUFFIXES: Final = frozenset(
     f".{suffix}"
-    for suffix in ("gz", "bz2", "zip", "csv", "txt", "tsv", "parquet", "pq", "dat", "xlsx", "mpt",
-                   "bdf", "mf4")
-)  # fmt: skip
+    for suffix in (
+        "gz",
+        "bz2",
+        "zip",
+        "csv",
+        "txt",
+        "tsv",
+        "parquet",
+        "pq",
+        "dat",
+        "xlsx",
+        "mpt",
+        "bdf",
+        "mf4",
+    )
+)
 
 
 def as_path(path: object) -> Path:

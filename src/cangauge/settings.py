@@ -114,23 +114,34 @@ StartPct = Annotated[
     FiniteFloat,
     setting(
         "SoC at the first sample, or auto: by the first voltages.",
-        option="--initial-soc", metavar="P|auto", unit="%", default_text="auto", ge=0.0, le=100.0,
+        option="--initial-soc",
+        metavar="P|auto",
+        unit="%",
+        default_text="auto",
+        ge=0.0,
+        le=100.0,
     ),
-]  # fmt: skip
+]
 StartStdPct = Annotated[
     FiniteFloat,
     setting(
         "Standard deviation of the initial SoC.",
-        option="--initial-soc-std", metavar="X", unit="%", ge=0.0, le=100.0,
+        option="--initial-soc-std",
+        metavar="X",
+        unit="%",
+        ge=0.0,
+        le=100.0,
     ),
-]  # fmt: skip
+]
 ValidStdPct = Annotated[
     FiniteFloat,
     setting(
         "Standard deviation above which the SoC is published as degraded.",
-        unit="%", ge=0.01, le=100.0,
+        unit="%",
+        ge=0.01,
+        le=100.0,
     ),
-]  # fmt: skip
+]
 CapacityAh = Annotated[
     FiniteFloat,
     setting("Capacity.", unit="Ah", default_text="the model's", ge=1e-3, le=1e5),
@@ -139,9 +150,11 @@ VoltageAccuracyPct = Annotated[
     FiniteFloat,
     setting(
         "Standard deviation of the voltage sensor's lasting error, of the voltage.",
-        unit="%", ge=0.0, le=10.0,
+        unit="%",
+        ge=0.0,
+        le=10.0,
     ),
-]  # fmt: skip
+]
 GapSeconds = Annotated[
     FiniteFloat,
     setting("Longest step between samples that is not a gap.", unit="s", ge=1e-3, le=3600.0),
@@ -243,9 +256,11 @@ class PackLimits:
         FiniteFloat | None,
         _limit(
             "SoC at which the energy ends; it also ends at the lowest voltage.",
-            "the lower end of the identified SoC", "%", 100.0,
+            "the lower end of the identified SoC",
+            "%",
+            100.0,
         ),
-    ] = None  # fmt: skip
+    ] = None
 
     def __post_init__(self) -> None:
         check_settings(self, "limits")

@@ -36,15 +36,25 @@ _POSTED_RETRY_S: Final = 0.005
 _QUEUE_FULL: Final = {errno.ENOBUFS, errno.EAGAIN}
 
 _CLASSES: Final = {
-    0x001: "transmit_timeout", 0x002: "arbitration_lost", 0x008: "protocol", 0x010: "transceiver",
-    0x020: "no_acknowledge", 0x040: "bus_off", 0x080: "bus_error", 0x100: "restarted",
-}  # fmt: skip
+    0x001: "transmit_timeout",
+    0x002: "arbitration_lost",
+    0x008: "protocol",
+    0x010: "transceiver",
+    0x020: "no_acknowledge",
+    0x040: "bus_off",
+    0x080: "bus_error",
+    0x100: "restarted",
+}
 _CONTROLLER: Final = 0x004
 _CONTROLLER_STATES: Final = {
-    0x01: "controller_receive_overflow", 0x02: "controller_transmit_overflow",
-    0x04: "receive_warning", 0x08: "transmit_warning", 0x10: "receive_passive",
-    0x20: "transmit_passive", 0x40: "error_active",
-}  # fmt: skip
+    0x01: "controller_receive_overflow",
+    0x02: "controller_transmit_overflow",
+    0x04: "receive_warning",
+    0x08: "transmit_warning",
+    0x10: "receive_passive",
+    0x20: "transmit_passive",
+    0x40: "error_active",
+}
 
 
 class BusError(CangaugeError):

@@ -407,10 +407,15 @@ def load_dbc(path: str | PathLike[str], remarks: list[str] | None = None) -> Dat
             raise ValueError("it has no message (BO_)")  # noqa: TRY301 - reported as others are
         database = cantools.database.load_string(text, "dbc", strict=False)
     except (
-        cantools.Error, LookupError, ValueError, TypeError, ArithmeticError, AttributeError,
+        cantools.Error,
+        LookupError,
+        ValueError,
+        TypeError,
+        ArithmeticError,
+        AttributeError,
         AssertionError,  # a multiplexed signal without a multiplexer
         RecursionError,  # signals multiplexed in a circle
-    ) as error:  # fmt: skip
+    ) as error:
         words = " ".join((str(error) or type(error).__name__).split())[:160]
         problem = f"not a DBC file that can be read: {words}"
         cure = "open it in a DBC editor, which names the error"

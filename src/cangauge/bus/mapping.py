@@ -228,8 +228,12 @@ class MessageMap(_MapTable):
 
 _FIELDS_OF_COUNTER: Final = ("counter", "counter_modulus")
 _FIELDS_OF_PROFILES: Final = (
-    "data_id", "data_id_list", "data_id_mode", "header_byte", "protected_bytes",
-)  # fmt: skip
+    "data_id",
+    "data_id_list",
+    "data_id_mode",
+    "header_byte",
+    "protected_bytes",
+)
 
 
 class VehicleMap(_MapTable):

@@ -39,20 +39,29 @@ CAP_NET_ADMIN the system limits it to net.core.rmem_max."""
 
 _SO_RCVBUFFORCE: Final = 33  # Linux; not in Python's socket module, as the two below
 _OWN_GROUP_ONLY: Final = {
-    socket.AF_INET: (socket.IPPROTO_IP, 49), socket.AF_INET6: (socket.IPPROTO_IPV6, 29),
-}  # fmt: skip
+    socket.AF_INET: (socket.IPPROTO_IP, 49),
+    socket.AF_INET6: (socket.IPPROTO_IPV6, 29),
+}
 """IP_MULTICAST_ALL and IPV6_MULTICAST_ALL: while set, as by default, a socket receives the packets
 of every group that any program of the machine has joined. Other systems have no such option."""
 _DEFAULT_CHANNELS: Final = {
-    "socketcan": "vcan0", "udp_multicast": MULTICAST_CHANNEL, "virtual": "cangauge",
-}  # fmt: skip
+    "socketcan": "vcan0",
+    "udp_multicast": MULTICAST_CHANNEL,
+    "virtual": "cangauge",
+}
 _ON_SOCKETS: Final = {"socketcan", "udp_multicast"}
 
 # Those of a missing library or a wrong option too (NameError: kvaser without canlib).
 _DRIVER_ERRORS: Final = (
-    can.CanError, OSError, ValueError, TypeError, NotImplementedError, NameError, AttributeError,
+    can.CanError,
+    OSError,
+    ValueError,
+    TypeError,
+    NotImplementedError,
+    NameError,
+    AttributeError,
     ImportError,
-)  # fmt: skip
+)
 
 
 class DriverMissingError(InputError):
@@ -285,10 +294,16 @@ def backend_capabilities(address: BusAddress) -> BackendCapabilities:
 # types then fail later, in the filters.
 
 _TYPES: Final[dict[str, type]] = {
-    "arbitration_id": int, "dlc": int, "data": bytes,
-    "is_extended_id": bool, "is_remote_frame": bool, "is_error_frame": bool, "is_fd": bool,
-    "bitrate_switch": bool, "error_state_indicator": bool,
-}  # fmt: skip
+    "arbitration_id": int,
+    "dlc": int,
+    "data": bytes,
+    "is_extended_id": bool,
+    "is_remote_frame": bool,
+    "is_error_frame": bool,
+    "is_fd": bool,
+    "bitrate_switch": bool,
+    "error_state_indicator": bool,
+}
 MOST_UNWANTED: Final = 1024
 """Most packets that are read for one frame: about 15 ms."""
 _MAX_CHANNEL: Final = 64

@@ -114,8 +114,12 @@ class SignalChecks(BaseModel):
             limits = {"lowest": low * pack.usual_v, "highest": high * pack.usual_v}
         elif role == "temperature":
             low, high = TEMPERATURE_WITHIN_C
-            limits = {"lowest": low, "highest": high, "max_jump": TEMPERATURE_JUMP_K,
-                      "max_rate_per_s": TEMPERATURE_RATE_K_PER_S}  # fmt: skip
+            limits = {
+                "lowest": low,
+                "highest": high,
+                "max_jump": TEMPERATURE_JUMP_K,
+                "max_rate_per_s": TEMPERATURE_RATE_K_PER_S,
+            }
         return self.model_copy(update={**limits, **self.model_dump(exclude_unset=True)})
 
 

@@ -165,8 +165,12 @@ class Profile(NamedTuple):
     protect: Callable[..., None]
 
 
-_MODES_01: Final = {"both": p01.E2E_P01_DATAID_BOTH, "alternating": p01.E2E_P01_DATAID_ALT,
-                    "low": p01.E2E_P01_DATAID_LOW, "nibble": p01.E2E_P01_DATAID_NIBBLE}  # fmt: skip
+_MODES_01: Final = {
+    "both": p01.E2E_P01_DATAID_BOTH,
+    "alternating": p01.E2E_P01_DATAID_ALT,
+    "low": p01.E2E_P01_DATAID_LOW,
+    "nibble": p01.E2E_P01_DATAID_NIBBLE,
+}
 _MODES_11: Final = {"both": p11.E2E_P11_DATAID_BOTH, "nibble": p11.E2E_P11_DATAID_NIBBLE}
 PROFILES: Final = {
     "e2e_01": Profile(2, 1, 15, 16, _MODES_01, p01.e2e_p01_check, p01.e2e_p01_protect),

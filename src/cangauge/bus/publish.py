@@ -103,12 +103,17 @@ class SocCells(NamedTuple):
 
 SocContent = SocEstimate | SocDetail | SocHealth | SocPower | SocCells
 _CONTENTS: Final[dict[str, Callable[..., SocContent]]] = {
-    "soc_estimate": SocEstimate, "soc_detail": SocDetail, "soc_health": SocHealth,
-    "soc_power": SocPower, "soc_cells": SocCells,
-}  # fmt: skip
+    "soc_estimate": SocEstimate,
+    "soc_detail": SocDetail,
+    "soc_health": SocHealth,
+    "soc_power": SocPower,
+    "soc_cells": SocCells,
+}
 _KINDS: Final[dict[str, Callable[[int], int]]] = {
-    "status": Status, "reasons": Reason, "samples": int,
-}  # fmt: skip
+    "status": Status,
+    "reasons": Reason,
+    "samples": int,
+}
 """Fields that are not floats."""
 
 

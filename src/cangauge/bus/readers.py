@@ -64,9 +64,16 @@ Stamps = Literal["us", "ms", "none"]
 """Resolution of time stamps: microseconds or finer, whole milliseconds, or no stamps."""
 
 DAMAGE: Final = (
-    ValueError, LookupError, TypeError, ArithmeticError, EOFError, OSError, struct.error,
-    zlib.error, BLFParseError,
-)  # fmt: skip
+    ValueError,
+    LookupError,
+    TypeError,
+    ArithmeticError,
+    EOFError,
+    OSError,
+    struct.error,
+    zlib.error,
+    BLFParseError,
+)
 """Errors of readers on damaged files."""
 
 
@@ -376,9 +383,15 @@ def candump_frame(
     bits, is_extended = int(number, 16), len(number) == 8
     is_error = is_extended and bool(bits & ERROR_FLAG)
     return frame(
-        time, bits & MAX_ID, data, length,
-        is_extended=is_extended, is_error_frame=is_error, channel=channel, **more,
-    )  # fmt: skip
+        time,
+        bits & MAX_ID,
+        data,
+        length,
+        is_extended=is_extended,
+        is_error_frame=is_error,
+        channel=channel,
+        **more,
+    )
 
 
 class PatternReader(LineReader):
@@ -415,10 +428,16 @@ class CandumpLogReader(PatternReader):
         time, channel, number, fd_flags, data, remote, way = groups
         flags = int(fd_flags[1], 16) if fd_flags else 0
         return candump_frame(
-            time, channel, number, data and data.replace(".", ""), remote,
-            is_fd=fd_flags is not None, bitrate_switch=bool(flags & 1),
-            error_state_indicator=bool(flags & 2), is_rx=way != "T",
-        )  # fmt: skip
+            time,
+            channel,
+            number,
+            data and data.replace(".", ""),
+            remote,
+            is_fd=fd_flags is not None,
+            bitrate_switch=bool(flags & 1),
+            error_state_indicator=bool(flags & 2),
+            is_rx=way != "T",
+        )
 
 
 @cache

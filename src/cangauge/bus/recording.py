@@ -289,9 +289,17 @@ def capture_samples(path: str | PathLike[str], vehicle: Vehicle) -> CaptureSampl
     time_s, current_a, voltage_v, temperature_c, soc_pct = np.array(values).reshape(-1, 5).T
     _refuse_wrapped(current_a, vehicle, path)
     return CaptureSamples(
-        time_s, current_a, voltage_v, temperature_c, soc_pct, str(path), vehicle.temperature_source,
-        statistics, capture.info, tuple(remarks),
-    )  # fmt: skip
+        time_s,
+        current_a,
+        voltage_v,
+        temperature_c,
+        soc_pct,
+        str(path),
+        vehicle.temperature_source,
+        statistics,
+        capture.info,
+        tuple(remarks),
+    )
 
 
 def _keep(sample: Sample | None, decoder: SampleDecoder, values: array[float]) -> None:

@@ -38,9 +38,12 @@ from cangauge.settings import VOLTAGE_ACCURACY_PCT, TemperatureSource
 _T = TypeVar("_T")
 Role = Literal["current", "voltage", "temperature", "soc_reference", "cells"]
 LOG_COLUMNS: Final = {
-    "current": "current_a", "voltage": "voltage_v", "temperature": "temperature_c",
-    "soc_reference": "soc_pct", "cells": "voltage_v",
-}  # fmt: skip
+    "current": "current_a",
+    "voltage": "voltage_v",
+    "temperature": "temperature_c",
+    "soc_reference": "soc_pct",
+    "cells": "voltage_v",
+}
 """Column of the canonical log by role."""
 
 EXTENDED: Final = 1 << 31
@@ -259,9 +262,10 @@ class Vehicle:
 
 
 _EXTENDED_KINDS: Final = {
-    "j1939": "0x18F08AF3", "isotp": "0x7BB6104 for 61 04 on 0x7BB",
+    "j1939": "0x18F08AF3",
+    "isotp": "0x7BB6104 for 61 04 on 0x7BB",
     "uds": "0x7EC0101 for 62 01 01 on 0x7EC",
-}  # fmt: skip
+}
 
 
 class _Binder:
@@ -311,9 +315,15 @@ class _Binder:
             numbering = SignalMap(message=wanted.message, signal=wanted.index, scale=1.0)
             index = self._signal("cells", numbering).codec.field
         return CellSignals(
-            wanted.count, wanted.first, cells, index, wanted.first_index,
-            wanted.lowest, wanted.highest, wanted.timeout_s,
-        )  # fmt: skip
+            wanted.count,
+            wanted.first,
+            cells,
+            index,
+            wanted.first_index,
+            wanted.lowest,
+            wanted.highest,
+            wanted.timeout_s,
+        )
 
     def _in_first(self, find: Callable[[Database, Path], _T]) -> tuple[_T, Path]:
         """Return what `find` gives in the first DBC that has it; raise the first DBC's error."""
@@ -335,9 +345,14 @@ class _Binder:
             )
         )
         codec = signal_codec(
-            message, signal, source=file, field=role,
-            not_available=wanted.not_available, when=wanted.when, signed=wanted.signed,
-        )  # fmt: skip
+            message,
+            signal,
+            source=file,
+            field=role,
+            not_available=wanted.not_available,
+            when=wanted.when,
+            signed=wanted.signed,
+        )
         key = _key(message)
         self._messages[key] = message
         factor, offset = (1.0, 0.0) if wanted.states_unit else self._unit(role, codec)
@@ -394,18 +409,24 @@ class _Binder:
                 problem = f"{kind} needs an extended id"
                 cure = f"give it that number in the DBC, as {example}"
                 raise InputError(
-                    problem, source=self._source, field=f"{where}.{kind}",
-                    value=f"0x{number:X}", cure=cure,
-                )  # fmt: skip
+                    problem,
+                    source=self._source,
+                    field=f"{where}.{kind}",
+                    value=f"0x{number:X}",
+                    cure=cure,
+                )
         if stated.isotp and not stated.uds and number >> 8 & 0xFF == READ_BY_IDENTIFIER:
             sender = f"0x{reply_id(number):X}"
             problem = "replies that begin with 62 differ in two further bytes"
             cure = f"state uds = true, and number it {sender} and both bytes: {sender}0101 for"
             cure += " 62 01 01"
             raise InputError(
-                problem, source=self._source, field=f"{where}.isotp",
-                value=f"0x{number:X}", cure=cure,
-            )  # fmt: skip
+                problem,
+                source=self._source,
+                field=f"{where}.isotp",
+                value=f"0x{number:X}",
+                cure=cure,
+            )
 
     def _message_key(self, name: str) -> int:
         """Return the key of the message for a name or id in [messages]."""

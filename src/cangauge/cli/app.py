@@ -25,8 +25,17 @@ from cangauge.cli.output import emit_json, hold_remarks, note, print_remarks
 from cangauge.errors import CangaugeError, closest
 
 FIRST: Final = (
-    "demo", "init", "inspect", "fit", "estimate", "gap", "check", "run", "status", "replay",
-)  # fmt: skip
+    "demo",
+    "init",
+    "inspect",
+    "fit",
+    "estimate",
+    "gap",
+    "check",
+    "run",
+    "status",
+    "replay",
+)
 """Commands of the main job, in its order; the others follow by name."""
 
 

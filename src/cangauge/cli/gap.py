@@ -252,8 +252,11 @@ def _column_of(log: Log, heading: str, reading: ReadingOptions) -> FloatArray:
     if not np.array_equal(simulated.time_s, log.time_s):
         raise InputError(
             f"{len(simulated)} rows have a simulated voltage, {len(log)} a measured one",
-            source=log.source, field="--simulated", value=heading, cure="give both for every row",
-        )  # fmt: skip
+            source=log.source,
+            field="--simulated",
+            value=heading,
+            cure="give both for every row",
+        )
     return simulated.voltage_v
 
 

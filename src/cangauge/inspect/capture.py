@@ -154,13 +154,19 @@ def inspect_capture(
     of_buses = buses.values() or [buses[""]]
     best = [max(trials, key=len) for trials in zip(*of_buses, strict=True)]
     return CaptureInspection(
-        path.name, str(path), capture.info, start_s, duration_s, error_frames, remote_frames,
+        path.name,
+        str(path),
+        capture.info,
+        start_s,
+        duration_s,
+        error_frames,
+        remote_frames,
         time_reversals=int((steps_s < 0.0).sum()),
         ids=summaries,
         gaps=tuple(Gap(stamps_s[at], float(steps_s[at])) for at in gaps),
         presets=_without_cold_relatives(trial.match(summaries, duration_s) for trial in best),
         log=None if vehicle is None else inspect_log(capture_to_log(path, vehicle)),
-    )  # fmt: skip
+    )
 
 
 # --- Frames by id
@@ -251,9 +257,12 @@ def _by_rule(
 
 
 def _counts_by(
-    rule: Protection, name: str, payloads: list[bytearray], stamps_s: array[float],
+    rule: Protection,
+    name: str,
+    payloads: list[bytearray],
+    stamps_s: array[float],
     period_s: float | None,
-) -> dict[str, Any]:  # fmt: skip
+) -> dict[str, Any]:
     checker, lost, two_senders = FrameChecker(rule, period_s), 0, False
     verdicts = dict.fromkeys(Verdict, 0)
     for data, time_s in zip(payloads, stamps_s, strict=True):

@@ -203,9 +203,21 @@ def inspect_log(log: Log) -> LogInspection:
     }
     abilities = tuple(Ability(topic, *each) for topic, each in assessed.items())
     return LogInspection(
-        log.name, log.source, log.temperature_source, len(log), timing, channels, charge, soc,
-        resistance, sign, contradicts, abilities, log.remarks, warnings,
-    )  # fmt: skip
+        log.name,
+        log.source,
+        log.temperature_source,
+        len(log),
+        timing,
+        channels,
+        charge,
+        soc,
+        resistance,
+        sign,
+        contradicts,
+        abilities,
+        log.remarks,
+        warnings,
+    )
 
 
 def channel_rows(found: LogInspection) -> tuple[list[str], list[list[str]]]:
@@ -232,20 +244,31 @@ def _timing(log: Log) -> Timing:
     median = float(np.median(step)) if step.size else None
     is_regular = bool(median and np.mean(np.abs(step - median) <= 0.1 * median) >= 0.99)
     return Timing(
-        float(time_s[0]), log.duration_s, median, float(step.max()) if step.size else None,
-        1.0 / median if median else None, is_regular, limit_s, int(gaps.size),
-        float(step[gaps].sum()), tuple(Gap(float(time_s[i]), float(step[i])) for i in longest),
-    )  # fmt: skip
+        float(time_s[0]),
+        log.duration_s,
+        median,
+        float(step.max()) if step.size else None,
+        1.0 / median if median else None,
+        is_regular,
+        limit_s,
+        int(gaps.size),
+        float(step[gaps].sum()),
+        tuple(Gap(float(time_s[i]), float(step[i])) for i in longest),
+    )
 
 
 def _charge(log: Log, gap_limit_s: float) -> Charge:
     state, step = discharged_ah(log.time_s, log.current_a), np.diff(log.time_s)
     part, uncounted = np.diff(state), uncounted_gaps(log.time_s)
     return Charge(
-        float(part[part > 0.0].sum()), float(np.abs(part[part < 0.0]).sum()),
-        float(state[-1]), float(np.ptp(state)), float(np.abs(part[step > gap_limit_s]).sum()),
-        int(uncounted.size), float(step[uncounted].sum()),
-    )  # fmt: skip
+        float(part[part > 0.0].sum()),
+        float(np.abs(part[part < 0.0]).sum()),
+        float(state[-1]),
+        float(np.ptp(state)),
+        float(np.abs(part[step > gap_limit_s]).sum()),
+        int(uncounted.size),
+        float(step[uncounted].sum()),
+    )
 
 
 def _soc(log: Log, sign: SignFinding, contradicts: str | None) -> Soc | None:

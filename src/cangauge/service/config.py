@@ -83,8 +83,10 @@ class PollConfig(Strict):
         10.0,
         "Interval between requests for the same reply. One is sent at a time; without an answer"
         " the interval doubles, up to a minute; while another tester asks, none is sent.",
-        unit="s", ge=1.0, le=3600.0,
-    )  # fmt: skip
+        unit="s",
+        ge=1.0,
+        le=3600.0,
+    )
 
 
 _TOPIC: Final = r"^[^/+#\s\x00]+(/[^/+#\s\x00]+)*$"
@@ -94,33 +96,41 @@ _TOPIC: Final = r"^[^/+#\s\x00]+(/[^/+#\s\x00]+)*$"
 class MqttConfig(Strict):
     """MQTT broker that takes the state."""
 
-    broker: str = key(
-        ..., "Host name or address of the MQTT broker.", restart=True, min_length=1
-    )  # fmt: skip
+    broker: str = key(..., "Host name or address of the MQTT broker.", restart=True, min_length=1)
     port: int | None = key(
         None, "Its port.", default_text="1883, with TLS 8883", restart=True, ge=1, le=65535
     )
     tls: StrictBool = key(False, "Encrypt, and check its certificate.", restart=True)
     ca_file: str | None = key(
-        None, "PEM file of the authority that signed it.",
-        default_text="the system's", restart=True, is_path=True,
-    )  # fmt: skip
+        None,
+        "PEM file of the authority that signed it.",
+        default_text="the system's",
+        restart=True,
+        is_path=True,
+    )
     user: str | None = key(None, "User name.", restart=True)
     password_file: str | None = key(
         None, "File with the password; or in CANGAUGE_MQTT_PASSWORD.", restart=True, is_path=True
     )
     topic_prefix: str = key(
-        "cangauge", "Topics are PREFIX/DEVICE/state and PREFIX/DEVICE/availability.",
-        restart=True, pattern=_TOPIC,
-    )  # fmt: skip
+        "cangauge",
+        "Topics are PREFIX/DEVICE/state and PREFIX/DEVICE/availability.",
+        restart=True,
+        pattern=_TOPIC,
+    )
     discovery_prefix: str = key(
-        "homeassistant", 'Home Assistant\'s prefix of discovery; "" without discovery.',
-        restart=True, pattern=f"{_TOPIC}|^$",
-    )  # fmt: skip
+        "homeassistant",
+        'Home Assistant\'s prefix of discovery; "" without discovery.',
+        restart=True,
+        pattern=f"{_TOPIC}|^$",
+    )
     device: str | None = key(
-        None, "Name of this service among those of the broker.",
-        default_text="cangauge_HOST_CHANNEL", restart=True, pattern=r"^[A-Za-z0-9_-]{1,64}$",
-    )  # fmt: skip
+        None,
+        "Name of this service among those of the broker.",
+        default_text="cangauge_HOST_CHANNEL",
+        restart=True,
+        pattern=r"^[A-Za-z0-9_-]{1,64}$",
+    )
     every_s: FiniteFloat = key(
         1.0, "Interval of the states.", unit="s", restart=True, ge=0.1, le=3600.0
     )
@@ -142,9 +152,11 @@ class PublishConfig(Strict):
         ..., "Layout of the frame with the SoC.", restart=True
     )
     interface: str | None = key(
-        None, "Driver of the inverter's bus, e.g. socketcan.",
-        default_text="as without `interface`", restart=True,
-    )  # fmt: skip
+        None,
+        "Driver of the inverter's bus, e.g. socketcan.",
+        default_text="as without `interface`",
+        restart=True,
+    )
     channel: str = key(..., "The inverter's bus, e.g. can1; not the battery's.", restart=True)
     bus_options: dict[str, StrictBool | int | float | str] = key(
         {}, "Further arguments of its driver.", restart=True
@@ -173,26 +185,38 @@ class RunConfig(Strict):
         None,
         "python-can interface: socketcan, udp_multicast, pcan, slcan and others. On udp_multicast"
         " whoever reaches its port may send; only the default bus drops what other machines send.",
-        "--interface", "I", restart=True,
+        "--interface",
+        "I",
+        restart=True,
         default_text="socketcan if there is a vcan0, else udp_multicast on this machine",
-    )  # fmt: skip
+    )
     channel: str | None = key(
-        None, "Channel, e.g. can0.", "--channel", "C",
-        default_text="vcan0, or 239.74.163.2", restart=True,
-    )  # fmt: skip
+        None,
+        "Channel, e.g. can0.",
+        "--channel",
+        "C",
+        default_text="vcan0, or 239.74.163.2",
+        restart=True,
+    )
     bus_options: dict[str, StrictBool | int | float | str] = key(
-        {}, "Further argument of the bus driver, e.g. bitrate=500000.",
-        "--bus-option", "K=V", restart=True,
-    )  # fmt: skip
+        {},
+        "Further argument of the bus driver, e.g. bitrate=500000.",
+        "--bus-option",
+        "K=V",
+        restart=True,
+    )
     wait_for_bus: StrictBool = key(
         False,
         "Start even if the bus is not available yet. A bus lost later is always reconnected.",
         restart=True,
     )
     vehicle: str | None = key(
-        None, f"Vehicle preset: {_PRESETS}.", "--vehicle", "PRESET",
+        None,
+        f"Vehicle preset: {_PRESETS}.",
+        "--vehicle",
+        "PRESET",
         default_text=f"{DEFAULT_VEHICLE}, without a map",
-    )  # fmt: skip
+    )
     dbc: str | None = key(
         None,
         "DBC file of another vehicle, searched before those that its map names.",
@@ -204,12 +228,19 @@ class RunConfig(Strict):
         None,
         "TOML file of another vehicle: its DBC, and which signals are current, voltage and"
         " temperature, with sign and scale.",
-        "--map", "FILE", is_path=True,
-    )  # fmt: skip
+        "--map",
+        "FILE",
+        is_path=True,
+    )
     temperature: FiniteFloat | None = key(
-        None, "Constant temperature, instead of the bus's.", "--temperature", "C",
-        unit="°C", ge=-60.0, le=120.0,
-    )  # fmt: skip
+        None,
+        "Constant temperature, instead of the bus's.",
+        "--temperature",
+        "C",
+        unit="°C",
+        ge=-60.0,
+        le=120.0,
+    )
     temperature_source: TemperatureSource | None = key(
         None,
         "Location of the temperature sensor, if the vehicle does not define it:"
@@ -219,23 +250,30 @@ class RunConfig(Strict):
         "ekf",
         "Published SoC: fusion (ekf), the inverse of the voltage model (newton), or Coulomb"
         " counting (coulomb).",
-        "--method", "ekf|newton|coulomb",
-    )  # fmt: skip
+        "--method",
+        "ekf|newton|coulomb",
+    )
     initial_soc: Annotated[StartPct | None, BeforeValidator(_none_for_auto)] = None
     initial_soc_std: StartStdPct = START_STD_PCT
     valid_std: ValidStdPct = VALID_STD_PCT
     capacity_ah: CapacityAh | None = None
     max_gap_s: GapSeconds = GAP_S
     pair_within_s: FiniteFloat | None = key(
-        None, "Largest time between current and voltage of one sample.",
-        unit="s", default_text="0.02", ge=0.0, le=1.0,
-    )  # fmt: skip
+        None,
+        "Largest time between current and voltage of one sample.",
+        unit="s",
+        default_text="0.02",
+        ge=0.0,
+        le=1.0,
+    )
     time_source: TimeSourceName = key(
         "receive",
         "Bus time: the receive stamps of the frames, or the log time that `cangauge replay` sends"
         " at speeds other than 1.",
-        "--time-source", "receive|replay-clock", restart=True,
-    )  # fmt: skip
+        "--time-source",
+        "receive|replay-clock",
+        restart=True,
+    )
     timeout_s: FiniteFloat = key(
         2.0, "Time without a sample after which the input is stale.", unit="s", gt=0.0, le=1e9
     )
@@ -247,32 +285,53 @@ class RunConfig(Strict):
         " defaults (docs/service.md). A kill loses the last half second. A full disk costs"
         " frames of the recording, never the estimate. An existing recording is kept: the next run"
         " is FILE-0001, FILE-0002, …",
-        "--record", "FILE", restart=True, is_path=True,
-    )  # fmt: skip
+        "--record",
+        "FILE",
+        restart=True,
+        is_path=True,
+    )
     record_part_mb: FiniteFloat | None = key(
-        None, "Size of a part of the recording: NAME-RUN-PART. NAME-RUN denotes all its parts.",
-        unit="MB", restart=True, gt=0.0, le=1e9,
-    )  # fmt: skip
+        None,
+        "Size of a part of the recording: NAME-RUN-PART. NAME-RUN denotes all its parts.",
+        unit="MB",
+        restart=True,
+        gt=0.0,
+        le=1e9,
+    )
     record_keep_mb: FiniteFloat | None = key(
-        None, "Total size of the recording; the oldest files are removed.",
-        unit="MB", restart=True, gt=0.0, le=1e9,
-    )  # fmt: skip
+        None,
+        "Total size of the recording; the oldest files are removed.",
+        unit="MB",
+        restart=True,
+        gt=0.0,
+        le=1e9,
+    )
     duration_s: FiniteFloat | None = key(None, "Stop after this time.", unit="s", gt=0.0, le=1e9)
     until_idle_s: FiniteFloat | None = key(
-        None, "Stop when no sample came for this time, after the first.",
-        unit="s", gt=0.0, le=1e9,
-    )  # fmt: skip
+        None,
+        "Stop when no sample came for this time, after the first.",
+        unit="s",
+        gt=0.0,
+        le=1e9,
+    )
     state: str | None = key(
         None,
         "Keep SoC, its uncertainty and the delay line over restarts in this file, or in a file in"
         " this folder.",
-        "--state", "FILE", restart=True, is_path=True,
+        "--state",
+        "FILE",
+        restart=True,
+        is_path=True,
         default_text="systemd's StateDirectory, if there is one",
-    )  # fmt: skip
+    )
     state_max_age_s: FiniteFloat = key(
-        7.0 * 86400.0, "Age above which the state is refused.",
-        unit="s", restart=True, gt=0.0, le=1e9,
-    )  # fmt: skip
+        7.0 * 86400.0,
+        "Age above which the state is refused.",
+        unit="s",
+        restart=True,
+        gt=0.0,
+        le=1e9,
+    )
     state_every_s: FiniteFloat = key(
         10.0, "Interval between writes of the state.", unit="s", ge=0.1, le=86400.0
     )
@@ -292,19 +351,25 @@ class RunConfig(Strict):
         None,
         "Serve /status, /healthz and /metrics there (extra `metrics`), e.g. 127.0.0.1:9464. An"
         " address beyond loopback needs a token.",
-        "--http", "HOST:PORT", restart=True,
-    )  # fmt: skip
+        "--http",
+        "HOST:PORT",
+        restart=True,
+    )
     http_token_file: str | None = key(
-        None, "File with the bearer token that requests need; or in CANGAUGE_HTTP_TOKEN.",
-        restart=True, is_path=True,
-    )  # fmt: skip
+        None,
+        "File with the bearer token that requests need; or in CANGAUGE_HTTP_TOKEN.",
+        restart=True,
+        is_path=True,
+    )
     mqtt: MqttConfig | None = key(None, "MQTT broker that takes the state (extra `mqtt`).")
     dashboard: str | None = key(
         None,
         "Address of the live page (extra `live`). A port alone, such as 8642, serves this machine"
         " only. One beyond loopback needs a token, as with --http.",
-        "--dashboard", "HOST:PORT", restart=True,
-    )  # fmt: skip
+        "--dashboard",
+        "HOST:PORT",
+        restart=True,
+    )
     live: Literal["child", "unit"] = key(
         "child",
         "What serves `dashboard`, `http` and `mqtt`: a child process of the service, or `cangauge"
@@ -312,9 +377,12 @@ class RunConfig(Strict):
         restart=True,
     )
     status_socket: str = key(
-        "auto", "Unix socket for `cangauge status`; auto: in the user's runtime folder.",
-        "--status-socket", "PATH|auto|off", restart=True,
-    )  # fmt: skip
+        "auto",
+        "Unix socket for `cangauge status`; auto: in the user's runtime folder.",
+        "--status-socket",
+        "PATH|auto|off",
+        restart=True,
+    )
     log_format: LogFormat = key("text", "Format of the events on stderr, one a line.", restart=True)
     log_level: LogLevel = key("info", "Lowest level of the events.", restart=True)
     _file: str = PrivateAttr(_NO_FILE)
@@ -431,8 +499,11 @@ class ConfigKey:
 
 
 _KINDS: Final = {
-    "boolean": "true or false", "number": "number", "integer": "whole number", "string": "text"
-}  # fmt: skip
+    "boolean": "true or false",
+    "number": "number",
+    "integer": "whole number",
+    "string": "text",
+}
 _BOUNDS: Final = {"exclusiveMinimum": ">", "minimum": "≥", "maximum": "≤"}
 
 

@@ -113,8 +113,10 @@ def logging_to(
     handler.setFormatter(_JsonFormat() if log_format == "json" else _TextFormat())
     # python-can logs and raises the same error, at each attempt to open a missing bus.
     levels: dict[str, int | str] = {
-        "": logging.ERROR, "cangauge": level.upper(), "can": logging.CRITICAL
-    }  # fmt: skip
+        "": logging.ERROR,
+        "cangauge": level.upper(),
+        "can": logging.CRITICAL,
+    }
     if level == "debug":
         levels |= {"": logging.DEBUG, "can": logging.NOTSET}
     loggers = {logging.getLogger(name): least for name, least in levels.items()}

@@ -193,9 +193,11 @@ class RecordedEstimate:
     def to_dict(self) -> dict[str, Any]:
         """Return the object that `cangauge estimate --json` prints, without the file names."""
         settings = self.settings
-        of_capture = {} if self.counts is None else {
-            "time_source": self.time_source, "frames": asdict(self.counts)
-        }  # fmt: skip
+        of_capture = (
+            {}
+            if self.counts is None
+            else {"time_source": self.time_source, "frames": asdict(self.counts)}
+        )
         return {
             **vars(self.scores),
             "method": settings.method,
@@ -345,10 +347,17 @@ def estimate_capture(
     unseen = pipeline.decoder.never_decoded
     remarks = _remarks(recorded_time.name, counts, statistics.two_senders, len(found))
     recorded = CaptureSamples(
-        time_s, current_a, voltage_v, temperature_c, soc_pct, str(path),
-        settings.temperature_source, statistics, capture.info,
+        time_s,
+        current_a,
+        voltage_v,
+        temperature_c,
+        soc_pct,
+        str(path),
+        settings.temperature_source,
+        statistics,
+        capture.info,
         (*vehicle.remarks, *capture.info.remarks, *remarks, *unseen.values()),
-    )  # fmt: skip
+    )
     # With a model, another pack's voltage is implausible, and a current that wraps.
     wraps = statistics.messages[vehicle.current.key].implausible > 0
     is_known = np.isfinite(recorded.voltage_v).any() and not wraps

@@ -256,10 +256,8 @@ class Monitor:
             "config": self._config,
             "latency": self._latency.to_dict(),
             "step": self._step.to_dict(),
-            "record": None
-            if record is None
-            else asdict(record) | {"path": _as_utf8(record.path)},
-        }  # fmt: skip
+            "record": None if record is None else asdict(record) | {"path": _as_utf8(record.path)},
+        }
 
     def _line(self) -> str:
         """Return the status in one line, such as "SoC 71.2 ± 0.8 %, valid, 10.0 samples/s"."""

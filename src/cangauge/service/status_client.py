@@ -30,9 +30,24 @@ SHOW_EVERY_S: Final = 0.1
 STUCK_S: Final = 2.0
 """Age of a snapshot above which the receive loop counts as stuck, and its SoC as stale [s]."""
 BOUNDS_S: Final = (
-    5e-6, 1e-5, 2e-5, 5e-5, 1e-4, 2e-4, 5e-4,
-    1e-3, 2e-3, 5e-3, 1e-2, 2e-2, 5e-2, 0.1, 0.2, 0.5, 1.0,
-)  # fmt: skip
+    5e-6,
+    1e-5,
+    2e-5,
+    5e-5,
+    1e-4,
+    2e-4,
+    5e-4,
+    1e-3,
+    2e-3,
+    5e-3,
+    1e-2,
+    2e-2,
+    5e-2,
+    0.1,
+    0.2,
+    0.5,
+    1.0,
+)
 """Upper bounds of the buckets of a histogram [s]; one more bucket holds larger values."""
 ANSWER_WITHIN_S: Final = 3.0
 """Longest wait for a part of the answer [s]."""

@@ -174,9 +174,11 @@ def _pool(scheduler: str | None, logs: int) -> Iterator[Executor]:
         client = Client(scheduler, timeout=CONNECT_S, set_as_default=False)
     except (OSError, ValueError) as error:
         raise InputError(
-            f"does not answer: {error}", field="--scheduler", value=scheduler,
+            f"does not answer: {error}",
+            field="--scheduler",
+            value=scheduler,
             cure="start `dask scheduler` and `dask worker`, and give its address",
-        ) from error  # fmt: skip
+        ) from error
     with client:
         yield client.get_executor(pure=False)
 

@@ -57,9 +57,13 @@ class _Text:
     """Wanted columns of a delimited text by name, and the draft that they fill."""
 
     def __init__(
-        self, head: Head, delimiter: str, header: Sequence[str], skip_lines: int,
+        self,
+        head: Head,
+        delimiter: str,
+        header: Sequence[str],
+        skip_lines: int,
         wanted: Mapping[str, _Column | None],
-    ) -> None:  # fmt: skip
+    ) -> None:
         table = TextTable(head, delimiter, header, (), skip_lines, [])
         self.wanted = {name: column for name, column in wanted.items() if column is not None}
         self._cells = table.columns([column.place for column in self.wanted.values()])
@@ -256,9 +260,12 @@ class CyclerExport:
         header, skip_lines = self._header(head) or ([], 0)
         columns = [_Column(k, text, text.lower(), "") for k, text in enumerate(header)]
         names = {
-            "time_s": self.time, "current_a": self.current, "voltage_v": self.voltage,
-            "ambient": self.ambient, "exclude": self.bare and "exclude",
-        }  # fmt: skip
+            "time_s": self.time,
+            "current_a": self.current,
+            "voltage_v": self.voltage,
+            "ambient": self.ambient,
+            "exclude": self.bare and "exclude",
+        }
         wanted = {
             field: next((column for column in columns if name and column.simple == name), None)
             for field, name in names.items()
@@ -312,15 +319,29 @@ READERS: Final = (
     BmwI3Trip(),
     D3Test(),
     CyclerExport(
-        "Arbin", "test_time(s)", "current(a)", "voltage(v)", "step_index",
-        set_point=_SIGNED, sensors="aux_temperature",
+        "Arbin",
+        "test_time(s)",
+        "current(a)",
+        "voltage(v)",
+        "step_index",
+        set_point=_SIGNED,
+        sensors="aux_temperature",
     ),
     CyclerExport(
-        "ESC dynamic test", "time", "current", "voltage", "disah", charges=False,
+        "ESC dynamic test",
+        "time",
+        "current",
+        "voltage",
+        "disah",
+        charges=False,
         set_point=_SIGNED,
     ),
     CyclerExport(
-        "Bitrode", "time(s)", "current(a)", "voltage(v)", "exclude",
+        "Bitrode",
+        "time(s)",
+        "current(a)",
+        "voltage(v)",
+        "exclude",
         set_point=r"HPPC-(?P<value>\d+)C(?=[-_.])",
         bare="exclude,time(s),cycle,loop,loop,loop,step,steptime(s),current(a),voltage(v),"
         "power(w),capacity(ah),energy(wh),mode,data",
@@ -333,15 +354,27 @@ READERS: Final = (
     # not state the sign: its net capacity is charge less discharge, so that positive charges, as
     # in the latter. All columns but three are optional, and may be empty.
     CyclerExport(
-        _BDF, "test time / s", "current / a", "voltage / v",
-        sensors="surface temperature t", ambient="ambient temperature / degc",
+        _BDF,
+        "test time / s",
+        "current / a",
+        "voltage / v",
+        sensors="surface temperature t",
+        ambient="ambient temperature / degc",
     ),
     CyclerExport(
-        _BDF, "test_time_second", "current_ampere", "voltage_volt",
-        sensors="temperature_t", ambient="ambient_temperature_celsius",
+        _BDF,
+        "test_time_second",
+        "current_ampere",
+        "voltage_volt",
+        sensors="temperature_t",
+        ambient="ambient_temperature_celsius",
     ),
     CyclerExport(
-        "battery-data-standard", "test_time_s", "current_a", "voltage_v",
-        sensors="temperature_t", ambient="ambient_temperature_deg_c",
+        "battery-data-standard",
+        "test_time_s",
+        "current_a",
+        "voltage_v",
+        sensors="temperature_t",
+        ambient="ambient_temperature_deg_c",
     ),
-)  # fmt: skip
+)

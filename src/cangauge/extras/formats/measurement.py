@@ -57,8 +57,12 @@ def _draft_of_channels(
     choice = choose_columns(names, (), given)
     if not choice.is_complete:
         raise UnknownColumnsError(source, names, choice, given)
-    held = {names[p] for q in ("temperature", "soc") if q in choice.chosen
-            for p in choice.chosen[q].places}  # fmt: skip
+    held = {
+        names[p]
+        for q in ("temperature", "soc")
+        if q in choice.chosen
+        for p in choice.chosen[q].places
+    }
     current = names[choice.chosen["current"].places[0]]
     notes: list[str] = []
 

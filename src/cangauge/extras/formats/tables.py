@@ -65,8 +65,11 @@ class _SheetText(Head):
         self.path, self.name = head.path, head.name
         sheets = _sheets(head)
         longest, rows = max(sheets.items(), key=lambda sheet: len(sheet[1]), default=("", []))
-        others = [f"{title!r} ({len(each)} rows)" for title, each in sheets.items()
-                  if each and title != longest]  # fmt: skip
+        others = [
+            f"{title!r} ({len(each)} rows)"
+            for title, each in sheets.items()
+            if each and title != longest
+        ]
         remark = f"sheet {longest!r} is read, the longest; not read: {', '.join(others)}"
         self.remarks = [remark] if others else []
         self._text = "\n".join([*rows, ""]).encode()

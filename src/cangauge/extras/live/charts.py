@@ -68,9 +68,7 @@ CHARTS: Final = {
     "residual": Chart(
         "Residual, measured − model [mV]", (Line("residual_mv"),), "@residual_mv{0} mV"
     ),
-    "temperature": Chart(
-        "Temperature [°C]", (Line("temperature_c"),), "@temperature_c{0.0} °C"
-    ),
+    "temperature": Chart("Temperature [°C]", (Line("temperature_c"),), "@temperature_c{0.0} °C"),
     "rates": Chart(
         "Frames and rejects [1/s]",
         (Line("frames_per_s", "frames"), Line("rejects_per_s", "rejects", ORANGE, "dashed")),
@@ -81,7 +79,7 @@ CHARTS: Final = {
         (Line("latency_ms"),),
         "@latency_ms{0.00} ms",
     ),
-}  # fmt: skip
+}
 
 
 WIDE: Final = frozenset({"soc", "status"})
@@ -97,9 +95,14 @@ def chart_parts() -> tuple[str, dict[str, str]]:
     shared = Range1d(0.0, 1.0, name="time")
     figures = {name: _figure(name, chart, rows, shared) for name, chart in CHARTS.items()}
     figures["soc"].varea(
-        "time_ms", "soc_low_pct", "soc_high_pct",
-        source=rows, fill_color=BLUE, fill_alpha=0.22, level="underlay",
-    )  # fmt: skip
+        "time_ms",
+        "soc_low_pct",
+        "soc_high_pct",
+        source=rows,
+        fill_color=BLUE,
+        fill_alpha=0.22,
+        level="underlay",
+    )
     figures["status"] = _timeline(runs, shared)
     script, elements = components(figures, wrap_script=False)
     return script, elements
@@ -107,11 +110,19 @@ def chart_parts() -> tuple[str, dict[str, str]]:
 
 def _plot(name: str, height: int, shared: Range1d, **options: Any) -> Any:
     plot = figure(
-        name=name, height=height, sizing_mode="stretch_width", x_axis_type="datetime",
-        x_range=shared, tools="", toolbar_location=None, background_fill_color=None,
-        border_fill_color=None, min_border_left=88 if name in WIDE else 60, min_border_right=12,
+        name=name,
+        height=height,
+        sizing_mode="stretch_width",
+        x_axis_type="datetime",
+        x_range=shared,
+        tools="",
+        toolbar_location=None,
+        background_fill_color=None,
+        border_fill_color=None,
+        min_border_left=88 if name in WIDE else 60,
+        min_border_right=12,
         **options,
-    )  # fmt: skip
+    )
     plot.xaxis.formatter = DatetimeTickFormatter(
         seconds=_CLOCK, minsec=_CLOCK, minutes="%H:%M", hourmin="%H:%M", hours="%H:%M"
     )
@@ -129,9 +140,14 @@ def _figure(name: str, chart: Chart, rows: ColumnDataSource, shared: Range1d) ->
     for line in chart.lines:
         label = {"legend_label": line.name} if line.name else {}
         drawn = plot.line(
-            "time_ms", line.column, source=rows,
-            line_color=line.color, line_dash=line.dash, line_width=1.8, **label,
-        )  # fmt: skip
+            "time_ms",
+            line.column,
+            source=rows,
+            line_color=line.color,
+            line_dash=line.dash,
+            line_width=1.8,
+            **label,
+        )
     plot.add_tools(
         HoverTool(
             renderers=[drawn],
@@ -153,9 +169,14 @@ def _timeline(runs: ColumnDataSource, shared: Range1d) -> Any:
     worst_first = list(STATUS_COLOURS)[::-1]
     plot = _plot("status", 150, shared, y_range=FactorRange(factors=worst_first))
     plot.hbar(
-        y="status", left="left", right="right", height=0.7, source=runs,
-        fill_color="colour", line_color="colour",
-    )  # fmt: skip
+        y="status",
+        left="left",
+        right="right",
+        height=0.7,
+        source=runs,
+        fill_color="colour",
+        line_color="colour",
+    )
     plot.add_tools(HoverTool(tooltips="@status: @words", mode="mouse"))
     return plot
 

@@ -44,7 +44,8 @@ _GAUGES: Final = {
     "health.resistance_ratio": ("resistance_ratio", "Resistance relative to the model's."),
     "health.resistance_std": ("resistance_std", "Standard deviation of that ratio."),
     "health.offset_a": (
-        "current_offset_amperes", "Offset of the current sensor, measured minus true.",
+        "current_offset_amperes",
+        "Offset of the current sensor, measured minus true.",
     ),
     "power.discharge_a": ("discharge_amperes", "Discharge current possible for 10 s."),
     "power.discharge_std_a": ("discharge_std_amperes", "Its standard deviation."),
@@ -57,13 +58,15 @@ _GAUGES: Final = {
     "cells.soc_pct": ("weakest_soc_percent", "Its state of charge [%]."),
     "cells.soc_std_pct": ("weakest_soc_std_percent", "Standard deviation of that [%]."),
     "cells.spread_pct": (
-        "cell_spread_percent", "SoC of the strongest cell less that of the weakest [%].",
+        "cell_spread_percent",
+        "SoC of the strongest cell less that of the weakest [%].",
     ),
     "cells.sum_error_v": ("cell_sum_error_volts", "Pack voltage less the sum of the cells."),
     "cells.is_sum_wrong": (
-        "cell_sum_differs", "1 while they differ by more than both sensors allow.",
+        "cell_sum_differs",
+        "1 while they differ by more than both sensors allow.",
     ),
-}  # fmt: skip
+}
 _COUNTERS: Final = {
     "frames.received": ("frames_received", "Frames that passed the filters."),
     "frames.wanted": ("frames_wanted", "Frames with an expected id."),
@@ -73,21 +76,25 @@ _COUNTERS: Final = {
     "bus_counts.garbled": ("bus_garbled", "Packets that are not CAN frames."),
     "bus_counts.error_frames": ("bus_error_frames", "Error frames of the controller."),
     "bus_counts.unsent": (
-        "bus_unsent", "Frames dropped since the transmit queue stayed full.",
+        "bus_unsent",
+        "Frames dropped since the transmit queue stayed full.",
     ),
     "bus_counts.queue_drops": (
-        "bus_queue_drops", "Frames that the kernel dropped since the receive queue was full.",
+        "bus_queue_drops",
+        "Frames that the kernel dropped since the receive queue was full.",
     ),
     "bus_counts.losses": (
-        "bus_losses", "Losses of the bus; each is followed by reconnecting.",
+        "bus_losses",
+        "Losses of the bus; each is followed by reconnecting.",
     ),
     "bus_counts.foreign": (
-        "bus_foreign", "Frames from another sender with ids that this service sends.",
+        "bus_foreign",
+        "Frames from another sender with ids that this service sends.",
     ),
     "record.frames": ("record_frames", "Frames recorded."),
     "record.lost_frames": ("record_lost_frames", "Frames that could not be written."),
     "record.written_bytes": ("record_written_bytes", "Bytes written."),
-}  # fmt: skip
+}
 _HISTOGRAMS: Final = {
     "latency": (
         "latency_seconds",
@@ -121,17 +128,28 @@ class _Status(Collector):
         yield build
         age_s = None if status["sample"] is None else status["sample"]["age_s"]
         for name, text, value in (
-            ("start_time_seconds", "Start time, seconds since 1970.",
-             time.time() - status["uptime_s"]),
-            ("config_last_reload_successful",
-             "0 if the latest configuration was refused and the one before it is in use.",
-             status["config"]["problem"] is None),
-            ("loop_age_seconds", "Time since the latest turn of the receive loop.",
-             status["loop_age_s"]),
+            (
+                "start_time_seconds",
+                "Start time, seconds since 1970.",
+                time.time() - status["uptime_s"],
+            ),
+            (
+                "config_last_reload_successful",
+                "0 if the latest configuration was refused and the one before it is in use.",
+                status["config"]["problem"] is None,
+            ),
+            (
+                "loop_age_seconds",
+                "Time since the latest turn of the receive loop.",
+                status["loop_age_s"],
+            ),
             ("bus_up", "0 while the bus is lost or its controller is bus-off.", status["bus_up"]),
-            ("sample_age_seconds", "Age of the latest sample; infinite before the first.",
-             math.inf if age_s is None else age_s),
-        ):  # fmt: skip
+            (
+                "sample_age_seconds",
+                "Age of the latest sample; infinite before the first.",
+                math.inf if age_s is None else age_s,
+            ),
+        ):
             yield GaugeMetricFamily(f"cangauge_{name}", text, value)
         for key, (name, text) in _GAUGES.items():
             if status[key.partition(".")[0]] is not None:

@@ -52,26 +52,42 @@ class _Sensor:
 _SENSORS: Final = (
     _Sensor("soc_pct", "estimate.soc_pct", "State of charge", "%", "battery", 1, needs_soc=True),
     # A class "battery" of the same unit would make two batteries of one pack.
-    _Sensor("soc_std_pct", "estimate.soc_std_pct", "State of charge, standard deviation", "%",
-            None, 2, needs_soc=True),
+    _Sensor(
+        "soc_std_pct",
+        "estimate.soc_std_pct",
+        "State of charge, standard deviation",
+        "%",
+        None,
+        2,
+        needs_soc=True,
+    ),
     _Sensor("status", "status", "Status", None, "enum"),
     _Sensor("current_a", "sample.current_a", "Current", "A", "current", 1),
     _Sensor("voltage_v", "sample.voltage_v", "Voltage", "V", "voltage", 1),
-    _Sensor("residual_v", "estimate.residual_v", "Voltage, measured less modelled", "V",
-            "voltage", 3),
+    _Sensor(
+        "residual_v", "estimate.residual_v", "Voltage, measured less modelled", "V", "voltage", 3
+    ),
     _Sensor("temperature_c", "sample.temperature_c", "Temperature", "°C", "temperature", 1),
     _Sensor("capacity_ah", "health.capacity_ah", "Capacity", "Ah", None, 1),
-    _Sensor("resistance_ratio", "health.resistance_ratio", "Resistance relative to the model's",
-            None, None, 2),
+    _Sensor(
+        "resistance_ratio",
+        "health.resistance_ratio",
+        "Resistance relative to the model's",
+        None,
+        None,
+        2,
+    ),
     _Sensor("current_offset_a", "health.offset_a", "Current sensor offset", "A", "current", 2),
-    _Sensor("discharge_a", "power.discharge_a", "Discharge current possible for 10 s", "A",
-            "current", 0),
+    _Sensor(
+        "discharge_a", "power.discharge_a", "Discharge current possible for 10 s", "A", "current", 0
+    ),
     _Sensor("charge_a", "power.charge_a", "Charge current possible for 10 s", "A", "current", 0),
     _Sensor("energy_kwh", "power.energy_wh", "Energy left", "kWh", "energy_storage", 2),
     _Sensor("weakest_cell", "cells.weakest", "Weakest cell"),
-    _Sensor("weakest_soc_pct", "cells.soc_pct", "State of charge of the weakest cell", "%",
-            None, 1),
-)  # fmt: skip
+    _Sensor(
+        "weakest_soc_pct", "cells.soc_pct", "State of charge of the weakest cell", "%", None, 1
+    ),
+)
 
 
 def state(status: Mapping[str, Any]) -> dict[str, Any]:

@@ -236,9 +236,14 @@ def bars(
     source = models.ColumnDataSource(columns | {"text": [f" {text}" for text in texts]})
     shown.plot.hbar(y="name", right="value", height=0.6, color="color", source=source)
     shown.plot.text(
-        x="value", y="name", text="text", source=source, text_baseline="middle",
-        text_font_size="12px", text_color="#1c2430",
-    )  # fmt: skip
+        x="value",
+        y="name",
+        text="text",
+        source=source,
+        text_baseline="middle",
+        text_font_size="12px",
+        text_color="#1c2430",
+    )
     shown.plot.ygrid.grid_line_color = None
     return shown
 

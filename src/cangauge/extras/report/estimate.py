@@ -327,9 +327,14 @@ def _status_figure(log: Log | CaptureSamples, table: EstimateTable, time: TimeFi
     columns = zip(("row", "what", "left", "right", "color"), zip(*spans, strict=True), strict=True)
     # An outline keeps a single sample visible.
     figure.plot.hbar(
-        y="row", left="left", right="right", height=0.62, fill_color="color", line_color="color",
+        y="row",
+        left="left",
+        right="right",
+        height=0.62,
+        fill_color="color",
+        line_color="color",
         source=ColumnDataSource(dict(columns)),
-    )  # fmt: skip
+    )
     figure.plot.ygrid.grid_line_color = None
     return figure
 

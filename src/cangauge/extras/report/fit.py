@@ -219,13 +219,25 @@ def _error_table(result: Identification) -> Table:
         ["MAE of the error model", number(noise.voltage_mae_pct), "%", noise.judged_on],
         ["RMSE of the error model", significant(noise.voltage_rmse_v, 3), "V", noise.judged_on],
         ["of a 30 s mean (σ)", significant(noise.fast_std_v, 3), "V", "new in each block"],
-        ["slow part (σ)", significant(noise.slow_std_v, 3), "V",
-         f"correlated over {number(noise.slow_time_s, 0, 's')}"],
-        ["level (σ)", significant(noise.level_std_v, 3), "V",
-         "constant over a log: does not average out"],
-        ["SoC against voltage (σ)", number(noise.soc_std_pct, 1), "%",
-         "times the slope of the curve, a further error of the voltage"],
-    ]  # fmt: skip
+        [
+            "slow part (σ)",
+            significant(noise.slow_std_v, 3),
+            "V",
+            f"correlated over {number(noise.slow_time_s, 0, 's')}",
+        ],
+        [
+            "level (σ)",
+            significant(noise.level_std_v, 3),
+            "V",
+            "constant over a log: does not average out",
+        ],
+        [
+            "SoC against voltage (σ)",
+            number(noise.soc_std_pct, 1),
+            "%",
+            "times the slope of the curve, a further error of the voltage",
+        ],
+    ]
     return Table(
         ["voltage error", "value", "unit", "meaning"],
         rows,
@@ -283,10 +295,14 @@ def _energy(result: Identification) -> Table:
         ["driven", significant(energy.driven_kwh, 3), "", "∫U·I over I > 0"],
         ["regenerated", significant(energy.regenerated_kwh, 3), regenerated, "∫U·I over I < 0"],
         ["net", significant(energy.net_kwh, 3), "", "driven − regenerated"],
-        ["Joule heat", significant(energy.heat_kwh, 3), share(energy.heat_kwh, energy.net_kwh),
-         "slope resistance × ∫I²"],
+        [
+            "Joule heat",
+            significant(energy.heat_kwh, 3),
+            share(energy.heat_kwh, energy.net_kwh),
+            "slope resistance × ∫I²",
+        ],
         ["efficiency", "", number(energy.efficiency_pct, 1, "%"), "net / (net + heat)"],
-    ]  # fmt: skip
+    ]
     return Table(["energy at the terminals", "kWh", "share", "definition"], rows)
 
 
@@ -341,9 +357,16 @@ def coefficient_tables(model: Model, condition_number: float) -> list[Block]:
 
 def _published_table(model: Published, condition_number: float) -> Table:
     factors = {
-        "k0": "1", "k1": "1/s", "k2": "1/s²", "k3": "1/s³", "k4": "1/s⁴", "k5": "s",
-        "k6": "ln s", "k7": "ln(1 − s)", "kt": f"T − {model.t_ref_c:g} °C",
-    }  # fmt: skip
+        "k0": "1",
+        "k1": "1/s",
+        "k2": "1/s²",
+        "k3": "1/s³",
+        "k4": "1/s⁴",
+        "k5": "s",
+        "k6": "ln s",
+        "k7": "ln(1 − s)",
+        "kt": f"T − {model.t_ref_c:g} °C",
+    }
     for place, delay_s in enumerate(model.delays_s, start=1):
         factors[f"R{place}"] = f"current {delay_s:g} s ago" if delay_s else "current"
     rows = []

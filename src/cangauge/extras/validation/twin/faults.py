@@ -250,21 +250,33 @@ def _ripple(fault: Fault, pack: TwinPack) -> dict[str, Any]:
 _IN_LIBRARY: Final = (
     # The current sensor reads x A too high.
     FaultKind(
-        "current_offset", "offset_a", "A", _amperes(1e-4, 0.15), _sets("current_offset_a"),
+        "current_offset",
+        "offset_a",
+        "A",
+        _amperes(1e-4, 0.15),
+        _sets("current_offset_a"),
         signed=True,
     ),
     # The current sensor reads (1 + x) times the current.
     FaultKind("current_gain", "gain", "-", _span(1e-3, 0.10), _sets("current_gain"), signed=True),
     # The voltage sensor reads x V too high.
     FaultKind(
-        "voltage_offset", "offset_v", "V", _volts(1e-4, 0.03), _sets("voltage_offset_v"),
+        "voltage_offset",
+        "offset_v",
+        "V",
+        _volts(1e-4, 0.03),
+        _sets("voltage_offset_v"),
         signed=True,
     ),
     # The voltage sensor reads (1 + x) times the voltage.
     FaultKind("voltage_gain", "gain", "-", _span(1e-4, 0.03), _sets("voltage_gain"), signed=True),
     # The temperature sensor reads x K too high.
     FaultKind(
-        "temperature_offset", "offset_k", "K", _span(0.1, 15.0), _sets("temperature_offset_k"),
+        "temperature_offset",
+        "offset_k",
+        "K",
+        _span(0.1, 15.0),
+        _sets("temperature_offset_k"),
         signed=True,
     ),
     # The temperature sensor lags by x s (two lags of x/2 in series).
@@ -275,25 +287,44 @@ _IN_LIBRARY: Final = (
     FaultKind("time_skew", "skew_s", "s", _span(0.01, 4.0), _sets("current_skew_s"), signed=True),
     # The true capacity is (1 − x) times the assumed one.
     FaultKind(
-        "capacity", "loss", "-", _span(2e-3, 0.35), _sets("capacity_factor", lambda x: 1.0 - x),
+        "capacity",
+        "loss",
+        "-",
+        _span(2e-3, 0.35),
+        _sets("capacity_factor", lambda x: 1.0 - x),
         signed=True,
     ),
     # The true initial SoC is x % above the assumed one.
     FaultKind(
-        "initial_soc", "shift_pct", "%", _span(0.05, 12.0),
-        _sets("start_soc_shift", lambda x: x / 100.0), signed=True,
+        "initial_soc",
+        "shift_pct",
+        "%",
+        _span(0.05, 12.0),
+        _sets("start_soc_shift", lambda x: x / 100.0),
+        signed=True,
     ),
     # The fraction x of the charge put in cannot be taken out again.
     FaultKind("coulombic_efficiency", "loss", "-", _span(2e-3, 0.10), _sets("charge_loss")),
     # Resistance is multiplied by exp(x/(T − 230 K)), relative to 25 °C.
     FaultKind(
-        "resistance_temperature", "stiffness_k", "K", _span(1.0, 150.0), _sets("cold_resistance_k"),
+        "resistance_temperature",
+        "stiffness_k",
+        "K",
+        _span(1.0, 150.0),
+        _sets("cold_resistance_k"),
     ),
     # The ohmic resistance rises by x along a logistic curve towards empty (or full).
     FaultKind(
-        "resistance_soc", "rise", "-", _span(0.02, 4.0), _soc_rise,
-        shape={"centre": ShapeRange(0.15, 0.65), "width": ShapeRange(0.02, 0.10),
-               "towards_full": ShapeRange(0.0, 1.0)},
+        "resistance_soc",
+        "rise",
+        "-",
+        _span(0.02, 4.0),
+        _soc_rise,
+        shape={
+            "centre": ShapeRange(0.15, 0.65),
+            "width": ShapeRange(0.02, 0.10),
+            "towards_full": ShapeRange(0.0, 1.0),
+        },
     ),
     # x Ω more resistance during charge.
     FaultKind("resistance_asymmetry", "charging_ohm", "Ω", _ohms(0.01, 1.5), _sets("charging_ohm")),
@@ -301,74 +332,122 @@ _IN_LIBRARY: Final = (
     FaultKind("resistance_growth", "grown_ohm", "Ω", _ohms(0.01, 2.0), _sets("step_ohm")),
     # x Ω more resistance from the time at_s on.
     FaultKind(
-        "resistance_step", "step_ohm", "Ω", _ohms(0.005, 1.0), _step,
+        "resistance_step",
+        "step_ohm",
+        "Ω",
+        _ohms(0.005, 1.0),
+        _step,
         shape={"at_s": ShapeRange(500.0, 3000.0, accepted=(0.0, 86400.0))},
     ),
     # The exchange current of the electrodes falls to 1/(1 + x).
     FaultKind("charge_transfer", "slowdown", "-", _span(0.05, 80.0), _sets("transfer_slowdown")),
     # A Cole–Cole element of x Ω with a time constant of seconds.
     FaultKind(
-        "fast_polarization", "added_ohm", "Ω", _ohms(0.01, 1.0), _fast,
+        "fast_polarization",
+        "added_ohm",
+        "Ω",
+        _ohms(0.01, 1.0),
+        _fast,
         shape={"tau_s": ShapeRange(0.8, 6.0, logarithmic=True), "alpha": ShapeRange(0.75, 0.97)},
     ),
     # A finite Warburg element of x Ω with a time constant of minutes.
     FaultKind(
-        "slow_diffusion", "added_ohm", "Ω", _ohms(0.01, 1.5), _slow,
+        "slow_diffusion",
+        "added_ohm",
+        "Ω",
+        _ohms(0.01, 1.5),
+        _slow,
         shape={"tau_s": ShapeRange(150.0, 1800.0, logarithmic=True)},
     ),
     # The open-circuit voltage is x V lower after discharge, x V higher after charge.
     FaultKind(
-        "hysteresis", "half_width_v", "V", _volts(2e-4, 0.01), _hysteresis,
+        "hysteresis",
+        "half_width_v",
+        "V",
+        _volts(2e-4, 0.01),
+        _hysteresis,
         shape={"reach": ShapeRange(0.005, 0.08, logarithmic=True)},
     ),
     # dU/dT of a cell changes by a smooth curve over the SoC, of RMS x.
     FaultKind("entropic_coefficient", "bend_mv_k", "mV/K", _span(0.01, 0.5), _entropy),
     # One to three cells lack the fraction x of their capacity.
     FaultKind(
-        "weak_cell", "loss", "-", _span(0.02, 0.65), _weak,
+        "weak_cell",
+        "loss",
+        "-",
+        _span(0.02, 0.65),
+        _weak,
         shape={"count": ShapeRange(1, 3, whole=True), "deficit": ShapeRange(0.0, 0.3)},
     ),
-)  # fmt: skip
+)
 _OUTSIDE: Final = (
     # Integral nonlinearity of the voltage sensor, a sine of x V.
     FaultKind(
-        "voltage_nonlinearity", "ripple_v", "V", _volts(2e-4, 0.02), _ripple,
+        "voltage_nonlinearity",
+        "ripple_v",
+        "V",
+        _volts(2e-4, 0.02),
+        _ripple,
         shape={"period_share": ShapeRange(0.02, 0.05), "phase": ShapeRange(0.0, 6.28)},
     ),
     # The current sensor saturates at (1 − x) times the largest current.
     FaultKind(
-        "current_clipping", "cut", "-", _span(0.1, 0.9), _sets("clip_share", lambda x: 1.0 - x),
+        "current_clipping",
+        "cut",
+        "-",
+        _span(0.1, 0.9),
+        _sets("clip_share", lambda x: 1.0 - x),
     ),
     # Magnetic remanence of x A in the current sensor.
     FaultKind("current_remanence", "remanence_a", "A", _amperes(1e-3, 0.25), _sets("remanence_a")),
     # A parallel string drops out at times: overpotentials rise by the factor 1 + x.
     FaultKind(
-        "string_dropout", "rise", "-", _span(0.02, 3.0), _intermittent("string_loss"),
+        "string_dropout",
+        "rise",
+        "-",
+        _span(0.02, 3.0),
+        _intermittent("string_loss"),
         shape={"on_s": ShapeRange(60.0, 400.0), "off_s": ShapeRange(150.0, 900.0)},
     ),
     # A load of x A, not measured by the current sensor, switches on and off.
     FaultKind(
-        "parasitic_switching", "load_a", "A", _amperes(2e-3, 0.3), _intermittent("hidden_load"),
+        "parasitic_switching",
+        "load_a",
+        "A",
+        _amperes(2e-3, 0.3),
+        _intermittent("hidden_load"),
         shape={"on_s": ShapeRange(60.0, 500.0), "off_s": ShapeRange(100.0, 700.0)},
     ),
     # Bursts of noise of x V on the voltage.
     FaultKind(
-        "noise_bursts", "noise_v", "V", _volts(2e-4, 0.04), _intermittent("bursts"),
+        "noise_bursts",
+        "noise_v",
+        "V",
+        _volts(2e-4, 0.04),
+        _intermittent("bursts"),
         shape={"on_s": ShapeRange(2.0, 40.0), "off_s": ShapeRange(20.0, 120.0)},
     ),
     # An intermittent contact: x Ω more for some seconds at a time.
     FaultKind(
-        "contact_flicker", "contact_ohm", "Ω", _ohms(0.02, 3.0), _intermittent("flicker"),
+        "contact_flicker",
+        "contact_ohm",
+        "Ω",
+        _ohms(0.02, 3.0),
+        _intermittent("flicker"),
         shape={"on_s": ShapeRange(2.0, 25.0), "off_s": ShapeRange(8.0, 60.0)},
     ),
     # The voltage repeats its last value for about x s at a time.
     FaultKind(
-        "stale_frames", "hold_s", "s", _span(0.5, 200.0), _stale,
+        "stale_frames",
+        "hold_s",
+        "s",
+        _span(0.5, 200.0),
+        _stale,
         shape={"off_s": ShapeRange(15.0, 90.0)},
     ),
     # The temperature sensor follows by the fraction 1 − x.
     FaultKind("temperature_stuck", "hold", "-", _span(0.1, 1.0), _sets("temperature_hold")),
-)  # fmt: skip
+)
 _KINDS: Final[dict[str, FaultKind]] = {kind.id: kind for kind in (*_IN_LIBRARY, *_OUTSIDE)}
 
 

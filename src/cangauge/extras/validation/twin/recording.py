@@ -203,9 +203,14 @@ def record_drive(
     soc_pct = np.full(sampling.time_s.size, np.nan)
     soc_pct[0] = assumed_pct
     log = Log(
-        sampling.time_s, current, voltage, temperature, soc_pct,
-        name=name, temperature_source="pack",
-    )  # fmt: skip
+        sampling.time_s,
+        current,
+        voltage,
+        temperature,
+        soc_pct,
+        name=name,
+        temperature_source="pack",
+    )
     kelvin = sampling.at(truth.core_c) + KELVIN
     resistance = pack.resistance_ohm * ohmic_factor(pack, kelvin)
     true_soc = sampling.at(true_soc_pct(pack, drive, truth, condition))
