@@ -56,7 +56,7 @@ static inline cg_real cg_square(cg_real value) { return value * value; }
 
 #define CG_UNKNOWN_VAR_PCT2 2000.0 /* of an unknown SoC */
 #define CG_WRONG_STD_PCT 25.0 /* of a given start that is wrong */
-#define CG_WRONG_PRIOR 0.5
+#define CG_WRONG_PRIOR 0.3
 #define CG_LEAST_SLOPE 1e-3
 
 static inline cg_real cg_pct_per_as(const cg_model *model)

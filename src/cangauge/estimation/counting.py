@@ -9,7 +9,7 @@ to the variance of the charge. Longer steps up to `BRIDGE_S` count as well, but 
 uncertain by the whole recent current.
 
 A longer step is an *unobserved interval*: the bus was asleep, or the service not running. No charge
-is counted, and there are two hypotheses, as likely as each other. *Parked*: self-discharge and
+is counted, and there are two hypotheses. *Parked*: self-discharge and
 small consumers only, so the SoC has hardly changed. *Moved*: the car was charged or driven, by at
 most the rate of a fast charger. The voltages after the interval test both (see `start`).
 """

@@ -36,10 +36,10 @@ UNKNOWN_PCT: Final = 50.0
 WRONG_STD_PCT: Final = 25.0
 """Standard deviation of a given start that is wrong [%]: about that of any SoC."""
 
-WRONG_PRIOR: Final = 0.5
+WRONG_PRIOR: Final = 0.3
 """Prior probability that the SoC is not the stated one, because a given start is wrong or the car
-was charged or driven unobserved: nothing is known of either. From 0.2 to 0.5 the mean error of
-right starts grows by 0.1 %, and that of starts 20 % too low falls by 0.3 % (development packs)."""
+was charged or driven unobserved. From 0.2 to 0.5 the mean error of right starts grows by 0.1 %, and
+that of starts 20 % too low falls by 0.3 % (development packs)."""
 
 FOUND_STD_PCT: Final = 3.0
 """Standard deviation of the wide hypothesis up to which its evidence can prove the narrow one right
