@@ -57,8 +57,10 @@ typedef enum {
     CG_CURRENT_SENSOR, /* offset, gain */
     CG_VOLTAGE_SENSOR, /* offset, gain */
     CG_TIME_SKEW, /* `skew_s` of the model */
+    CG_TEMPERATURE_SENSOR, /* offset */
     CG_TEMPERATURE_LAG, /* ahead; lag: smoothing */
     CG_CORE_TEMPERATURE, /* rise_k, late, capacity_ah; lags: Joule heat, temperature */
+    CG_RESISTANCE_GROWTH, /* share, delayed, ohm */
     CG_RESISTANCE_TEMPERATURE, /* share, activation_k, delayed, reference_per_k, ohm */
     CG_RESISTANCE_SOC, /* at_empty, at_full, width_pct, delayed, ohm */
     CG_RESISTANCE_ASYMMETRY, /* charging_ohm */

@@ -376,6 +376,9 @@ void cg_correct(cg_estimator *self, cg_sample *sample, int32_t from, int32_t to)
         case CG_VOLTAGE_SENSOR:
             sample->voltage_v = (sample->voltage_v - effect->value[0]) / effect->value[1];
             break;
+        case CG_TEMPERATURE_SENSOR:
+            sample->temperature_c -= effect->value[0];
+            break;
         case CG_TEMPERATURE_LAG:
             if (!isnan(sample->temperature_c)) {
                 const cg_real smooth = lag_from(&state->lag[0], effect->tau_s[0], sample->time_s,
@@ -494,6 +497,9 @@ static cg_real advance_effect(const cg_effect *effect, cg_effect_state *state,
     cg_lag *lag = &state->lag[0];
     cg_real drive = R(0.0);
     switch (effect->kind) {
+    case CG_RESISTANCE_GROWTH:
+        drive = value[0] * scaled_drop(drop_v, current_a, value[1], value[2]);
+        break;
     case CG_RESISTANCE_TEMPERATURE:
         drive = value[0] * scaled_drop(drop_v, current_a, value[2], value[4]) *
                 cg_expm1(value[1] * (inverse_k(temperature_c) - value[3]));

@@ -27,9 +27,10 @@ SUMS: Final = LOADS + 6
 """Upper limits of a model, as in the header."""
 
 KINDS: Final = (
-    "no_effect", "current_sensor", "voltage_sensor", "time_skew", "temperature_lag",
-    "core_temperature", "resistance_temperature", "resistance_soc", "resistance_asymmetry",
-    "resistance_step", "charge_transfer", "rc", "hysteresis", "entropic", "weak_cell",
+    "no_effect", "current_sensor", "voltage_sensor", "time_skew", "temperature_sensor",
+    "temperature_lag", "core_temperature", "resistance_growth",
+    "resistance_temperature", "resistance_soc", "resistance_asymmetry", "resistance_step",
+    "charge_transfer", "rc", "hysteresis", "entropic", "weak_cell",
 )  # fmt: skip
 """Kinds of effects, in the order of `cg_effect_kind`."""
 METHODS: Final = ("ekf", "newton", "coulomb")

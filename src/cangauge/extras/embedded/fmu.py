@@ -61,6 +61,7 @@ PLATFORMS: Final = {
 VALUES: Final = {
     "temperature_lag": ("ahead",),
     "core_temperature": ("rise_k", "late", "capacity_ah"),
+    "resistance_growth": ("share", "delayed", "ohm"),
     "resistance_temperature": ("share", "activation_k", "delayed", "reference_per_k", "ohm"),
     "resistance_soc": ("at_empty", "at_full", "width_pct", "delayed", "ohm"),
     "resistance_asymmetry": ("charging_ohm",),
@@ -72,7 +73,7 @@ VALUES: Final = {
     "weak_cell": ("fraction", "ahead"),
 }
 """Kind of effect → names of its values, in the order of `cg_effect_kind`."""
-SENSORS: Final = ("current_sensor", "voltage_sensor", "time_skew")
+SENSORS: Final = ("current_sensor", "voltage_sensor", "time_skew", "temperature_sensor")
 """Kinds that change what is measured, not the pack."""
 LONGEST_NAME: Final = 60
 """Characters of a unit's name, a C identifier and the name of its binary."""

@@ -216,6 +216,7 @@ CORRECTIONS: Final = (
         correct=lambda signals, v, *_: signals._replace(
             temperature_c=signals.temperature_c - v["offset_k"]
         ),
+        core_form=lambda v, *_: CoreForm("temperature_sensor", (v["offset_k"],)),
     ),
     # Undone with a causal smoothed derivative.
     Effect(

@@ -38,8 +38,6 @@ BEND_ZERO_C_RATE: Final = 1.0
 pack already contains the mean slope over the currents of a drive."""
 ACTIVATION_K: Final = 5000.0
 """Usual activation of the exchange current [K], about 42 kJ/mol; `exchange_a` holds at 25 °C."""
-FLAT_PCT: Final = 1e30
-"""Width of a dependence on SoC that is none [%]: exp(−100/10³⁰) is 1 exactly."""
 
 
 def _of(values: Values, *names: str) -> tuple[float, ...]:
@@ -162,7 +160,7 @@ VOLTAGES: Final = (
         scales_drop=True,
         drive=lambda load, v, at: v["share"] * load.scaled_drop_v(v["delayed"], at.pack),
         core_form=lambda v, _, pack: CoreForm(
-            "resistance_soc", (v["share"], 0.0, FLAT_PCT, v["delayed"], pack.resistance_ohm)
+            "resistance_growth", (v["share"], v["delayed"], pack.resistance_ohm)
         ),
     ),
     # Zero at `reference_c`, the middle of the identified temperature range when the effect was
