@@ -44,12 +44,30 @@
 
 /* ------------------------------------------------------------------ clock */
 
+cg_time cg_time_of_s(double time_s)
+{
+#if CG_HAS_FLOATS
+    return (fabs(time_s) <= LATEST_S) ? (cg_time)llrint(time_s * CG_TICKS_PER_S) : CG_NO_TIME;
+#else
+    return time_s;
+#endif
+}
+
+double cg_s_of_time(cg_time time_s)
+{
+#if CG_HAS_FLOATS
+    return cg_is_time(time_s) ? ((double)time_s / CG_TICKS_PER_S) : (double)NAN;
+#else
+    return time_s;
+#endif
+}
+
 static bool is_set_back(cg_clock *clock, cg_time stamp_s, cg_time step_s)
 {
-    if (step_s > -SET_BACK_S) {
+    if (step_s > -cg_span(R(SET_BACK_S))) {
         return false;
     }
-    if ((stamp_s - clock->behind_s) < SHORTEST_STEP_S) {
+    if (cg_is_time(clock->behind_s) && ((stamp_s - clock->behind_s) < cg_span(R(SHORTEST_STEP_S)))) {
         clock->behind = 0;
     }
     if ((clock->behind + 1) >= SET_BACK_SAMPLES) {
@@ -63,11 +81,13 @@ static bool is_set_back(cg_clock *clock, cg_time stamp_s, cg_time step_s)
 /* A stamp's time, later than the last. False: refuse the sample. */
 static bool clock_time(cg_clock *clock, cg_time stamp_s, cg_time *time_s)
 {
-    if (!(fabs(stamp_s) <= LATEST_S)) {
+    const cg_time latest_s = cg_span(R(LATEST_S));
+    const cg_time shortest_s = cg_span(R(SHORTEST_STEP_S));
+    if (!((-latest_s <= stamp_s) && (stamp_s <= latest_s))) {
         return false;
     }
     const bool was_restored = clock->is_restored;
-    if (isnan(clock->last_s)) {
+    if (!cg_is_time(clock->last_s)) {
         clock->last_s = stamp_s;
         clock->is_restored = false;
         *time_s = stamp_s;
@@ -75,32 +95,29 @@ static bool clock_time(cg_clock *clock, cg_time stamp_s, cg_time *time_s)
     }
     cg_time shift_s = clock->shift_s;
     const cg_time step_s = stamp_s + shift_s - clock->last_s;
-    const cg_time age_s = clock->age_s;
+    const cg_real age_s = clock->age_s;
     const bool is_unknown = isnan(age_s) != 0;
     clock->is_restored = false;
-    cg_time least_s = (is_unknown ? UNKNOWN_INTERRUPTION_S : age_s) - EARLY_S;
-    least_s = (SHORTEST_STEP_S > least_s) ? SHORTEST_STEP_S : least_s;
-    if (was_restored && !(step_s >= least_s)) {
-        cg_time passed_s = UNKNOWN_INTERRUPTION_S;
-        if (!is_unknown) {
-            passed_s = (SHORTEST_INTERRUPTION_S > age_s) ? SHORTEST_INTERRUPTION_S : age_s;
-        }
-        shift_s += passed_s - step_s;
-    } else if (step_s < SHORTEST_STEP_S) {
+    const cg_real passed_s =
+        is_unknown ? R(UNKNOWN_INTERRUPTION_S) : cg_max(R(SHORTEST_INTERRUPTION_S), age_s);
+    const cg_real least_s = cg_max(R(SHORTEST_STEP_S), passed_s - R(EARLY_S));
+    if (was_restored && !(step_s >= cg_span(least_s))) {
+        shift_s += cg_span(passed_s) - step_s;
+    } else if (step_s < shortest_s) {
         if (!is_set_back(clock, stamp_s, step_s)) {
             return false;
         }
         shift_s += stamp_s - clock->behind_s - step_s;
-    } else if (step_s > LONGEST_INTERRUPTION_S) {
-        shift_s += LONGEST_INTERRUPTION_S - step_s;
+    } else if (step_s > cg_span(R(LONGEST_INTERRUPTION_S))) {
+        shift_s += cg_span(R(LONGEST_INTERRUPTION_S)) - step_s;
     }
     *time_s = stamp_s + shift_s;
-    if ((*time_s - clock->last_s) < SHORTEST_STEP_S) {
+    if ((*time_s - clock->last_s) < shortest_s) {
         return false;
     }
     clock->shift_s = shift_s;
     clock->behind = 0;
-    clock->behind_s = (cg_time)NAN;
+    clock->behind_s = CG_NO_TIME;
     clock->last_s = *time_s;
     return true;
 }
@@ -132,11 +149,11 @@ static charge_step count(cg_estimator *self, cg_time time_s, cg_real current_a)
     charge_step step = {R(0.0), R(0.0), R(0.0)};
     counter->time_s = time_s;
     counter->current_a = current_a;
-    if (isnan(last_s)) {
+    if (!cg_is_time(last_s)) {
         counter->mean_square_a2 = current_a * current_a;
         return step;
     }
-    const cg_real seconds = (cg_real)(time_s - last_s);
+    const cg_real seconds = cg_seconds(time_s - last_s);
     step.seconds = seconds;
     const cg_real across_a = R(0.5) * (current_a + last_a);
     const cg_real kept = cg_exp(-seconds / R(MEAN_SQUARE_MEMORY_S));
@@ -149,25 +166,26 @@ static charge_step count(cg_estimator *self, cg_time time_s, cg_real current_a)
         step.parked_std_pct = parked_std_pct(seconds, rms_a * per_as);
         return step;
     }
-    counter->counted_s += (cg_sum)seconds;
+    counter->counted_s = cg_plus(counter->counted_s, seconds);
     const cg_real out_pct = across_a * seconds * per_as;
-    counter->discharged_pct += (cg_sum)out_pct;
-    counter->moved_pct += (cg_sum)cg_fabs(out_pct);
+    counter->discharged_pct = cg_plus(counter->discharged_pct, out_pct);
+    counter->moved_pct = cg_plus(counter->moved_pct, cg_fabs(out_pct));
     const cg_real turned_a = cg_expm1(-seconds / R(HELD_S)) * (current_a - last_a);
     counter->turned_a2 = R(0.5) * cg_square(turned_a);
-    counter->gap_var_pct2 += (cg_sum)(counter->turned_a2 * cg_square(seconds * per_as));
+    cg_real var_pct2 = counter->turned_a2 * cg_square(seconds * per_as);
     if (seconds > gap_s) {
         const cg_real ends_a2 = R(0.5) * ((current_a * current_a) + (last_a * last_a));
         const cg_real gap_pct = cg_sqrt(cg_max(square_a2, ends_a2)) * seconds * per_as;
-        counter->gap_var_pct2 += (cg_sum)cg_square(gap_pct);
+        var_pct2 += cg_square(gap_pct);
     }
+    counter->gap_var_pct2 = cg_plus(counter->gap_var_pct2, var_pct2);
     return step;
 }
 
 cg_real cg_uncounted_std_pct(const cg_estimator *self, cg_real seconds)
 {
     const cg_counter *counter = &self->state.counter;
-    if (isnan(counter->time_s)) {
+    if (!cg_is_time(counter->time_s)) {
         return R(0.0);
     }
     const cg_real rms_a = cg_sqrt(cg_max(counter->mean_square_a2, cg_square(counter->current_a)));
@@ -183,16 +201,16 @@ static cg_real moved_std_pct(cg_real seconds)
 
 static cg_real coulomb_pct(const cg_state *state)
 {
-    return (cg_real)(state->memory.coulomb_start_pct - state->counter.discharged_pct);
+    return cg_minus(state->memory.coulomb_start_pct, state->counter.discharged_pct);
 }
 
 static cg_real coulomb_std_pct(const cg_state *state)
 {
     const cg_memory *memory = &state->memory;
     const cg_counter *counter = &state->counter;
-    const cg_real seconds = (cg_real)(counter->counted_s - memory->coulomb_counted_s);
-    const cg_real moved_pct = (cg_real)(counter->moved_pct - memory->coulomb_moved_pct);
-    const cg_real gap_pct2 = (cg_real)(counter->gap_var_pct2 - memory->coulomb_gap_var_pct2);
+    const cg_real seconds = cg_minus(counter->counted_s, memory->coulomb_counted_s);
+    const cg_real moved_pct = cg_minus(counter->moved_pct, memory->coulomb_moved_pct);
+    const cg_real gap_pct2 = cg_minus(counter->gap_var_pct2, memory->coulomb_gap_var_pct2);
     const cg_real offset_pct = R(OFFSET_STD_PER_AH) * seconds * R(100.0) / R(3600.0);
     const cg_real capacity_pct = R(CAPACITY_STD) * moved_pct;
     return cg_sqrt(memory->coulomb_var_pct2 + gap_pct2 + cg_square(offset_pct) +
@@ -204,9 +222,9 @@ static cg_passed since_filter(const cg_state *state, cg_sum counted_s, cg_sum di
 {
     const cg_memory *memory = &state->memory;
     const cg_passed passed = {
-        (cg_real)(counted_s - memory->filter_counted_s),
-        (cg_real)(discharged_pct - memory->filter_discharged_pct),
-        (cg_real)(state->counter.gap_var_pct2 - memory->filter_gap_var_pct2),
+        cg_minus(counted_s, memory->filter_counted_s),
+        cg_minus(discharged_pct, memory->filter_discharged_pct),
+        cg_minus(state->counter.gap_var_pct2, memory->filter_gap_var_pct2),
         R(0.0),
     };
     return passed;
@@ -242,7 +260,7 @@ static cg_real soc_now(const cg_estimator *self, cg_real *std_pct)
 
 static void start_count(cg_state *state, cg_real soc_pct, cg_real std_pct)
 {
-    state->memory.coulomb_start_pct = (cg_sum)soc_pct + state->counter.discharged_pct;
+    state->memory.coulomb_start_pct = cg_plus(state->counter.discharged_pct, soc_pct);
     state->memory.coulomb_var_pct2 = cg_square(std_pct);
     state->memory.coulomb_counted_s = state->counter.counted_s;
     state->memory.coulomb_moved_pct = state->counter.moved_pct;
@@ -292,7 +310,7 @@ static void test_model(cg_estimator *self, cg_time time_s)
     }
     const bool is_lasting = total > model->innovations_at_most;
     if (is_lasting || (cg_strain(likelier, model) > model->strain_at_most)) {
-        memory->mismatch_until_s = time_s + MISMATCH_S;
+        memory->mismatch_until_s = time_s + cg_span(R(MISMATCH_S));
     }
     if (is_lasting) {
         memory->innovations = 0;
@@ -308,22 +326,22 @@ static void close_block(cg_estimator *self, cg_time time_s)
     cg_memory *memory = &self->state.memory;
     cg_filter *filter = &self->state.filter;
     const cg_block *block = &self->state.block;
-    const cg_sum rows = (cg_sum)block->rows;
+    const cg_real rows = (cg_real)block->rows;
     cg_means means;
     if (block->is_broken || (block->rows == 0)) {
         return;
     }
-    means.counted_s = block->sums[0] / rows;
-    means.discharged_pct = block->sums[1] / rows;
-    means.voltage_v = (cg_real)(block->sums[2] / rows);
-    means.temperature_c = (cg_real)(block->sums[3] / rows);
-    means.drop_v = (cg_real)(block->sums[4] / rows);
-    means.unseen_v2 = (cg_real)(block->sums[5] / rows);
+    means.counted_s = cg_mean(block->sums[0], rows);
+    means.discharged_pct = cg_mean(block->sums[1], rows);
+    means.voltage_v = (cg_value(block->sums[2]) / rows);
+    means.temperature_c = (cg_value(block->sums[3]) / rows);
+    means.drop_v = (cg_value(block->sums[4]) / rows);
+    means.unseen_v2 = (cg_value(block->sums[5]) / rows);
     for (int32_t k = 0; k < cg_loads(model); ++k) {
-        means.load[k] = (cg_real)(block->sums[6 + k] / rows);
+        means.load[k] = (cg_value(block->sums[6 + k]) / rows);
     }
     for (int32_t k = 0; k < model->effects; ++k) {
-        means.drive[k] = (cg_real)(block->drive[k] / rows);
+        means.drive[k] = (cg_value(block->drive[k]) / rows);
     }
     propagate(self, means.counted_s, means.discharged_pct);
     const bool was_rejected = cg_filter_is_rejected(filter, model);
@@ -331,13 +349,13 @@ static void close_block(cg_estimator *self, cg_time time_s)
     if (!cg_filter_is_valid(filter, model)) {
         cg_filter_start(filter, model, CG_NAN, R(0.0), false);
         memory->resets += 1;
-        memory->contradicted_until_s = time_s + CONTRADICTED_S;
+        memory->contradicted_until_s = time_s + cg_span(R(CONTRADICTED_S));
     } else if (cg_filter_is_rejected(filter, model) && !was_rejected) {
-        memory->contradicted_until_s = time_s + CONTRADICTED_S;
+        memory->contradicted_until_s = time_s + cg_span(R(CONTRADICTED_S));
     }
     memory->is_known = true;
     test_model(self, time_s);
-    if (isnan(memory->coulomb_start_pct)) {
+    if (isnan(coulomb_pct(&self->state))) {
         cg_real std_pct;
         const cg_real soc_pct = filter_soc(self, &std_pct);
         start_count(&self->state, soc_pct, std_pct);
@@ -351,7 +369,7 @@ static void correct(cg_estimator *self, cg_real soc_pct, cg_real std_pct)
     propagate_to_now(self);
     cg_filter_correct(&state->filter, self->model, soc_pct, std_pct);
     state->memory.is_known = true;
-    if (isnan(state->memory.coulomb_start_pct)) {
+    if (isnan(coulomb_pct(state))) {
         start_count(state, soc_pct, std_pct);
         return;
     }
@@ -369,16 +387,16 @@ static bool becomes_full(cg_estimator *self, const cg_sample *sample)
     if (!((sample->voltage_v >= rule->full_voltage_v) &&
           (cg_fabs(sample->current_a) <= rule->full_current_a))) {
         if (!isnan(sample->voltage_v)) {
-            memory->full_since_s = (cg_time)NAN;
+            memory->full_since_s = CG_NO_TIME;
             memory->is_full = false;
         }
         return false;
     }
-    if (isnan(memory->full_since_s)) {
+    if (!cg_is_time(memory->full_since_s)) {
         memory->full_since_s = sample->time_s;
     }
     const bool was_full = memory->is_full;
-    memory->is_full = (sample->time_s - memory->full_since_s) >= (cg_time)rule->full_hold_s;
+    memory->is_full = cg_seconds(sample->time_s - memory->full_since_s) >= rule->full_hold_s;
     return memory->is_full && !was_full;
 }
 
@@ -392,7 +410,8 @@ static void use_references(cg_estimator *self, const cg_sample *sample)
     if (!isnan(rule->rest_after_s) && !isnan(newton_pct)) {
         const bool was_rested = memory->is_rested;
         memory->is_rested =
-            (sample->time_s - memory->rest_since_s) >= (cg_time)rule->rest_after_s;
+            cg_is_time(memory->rest_since_s) &&
+            (cg_seconds(sample->time_s - memory->rest_since_s) >= rule->rest_after_s);
         becomes_rested = memory->is_rested && !was_rested;
     }
     if (is_full) {
@@ -407,11 +426,13 @@ static void use_references(cg_estimator *self, const cg_sample *sample)
 static cg_real inverse_std_pct(const cg_estimator *self, cg_real soc_pct, cg_real temperature_c)
 {
     const cg_model *model = self->model;
+    cg_real of_load[CG_FUNCTIONS];
     cg_real row[CG_FUNCTIONS];
     cg_real slope;
     (void)cg_pseudo_ocv(self, soc_pct, &slope);
     slope = cg_max(slope, R(CG_LEAST_SLOPE));
-    cg_functions_row(model, soc_pct, self->state.load, row);
+    cg_functions_of_load(model, self->state.load, of_load);
+    cg_functions_row(model, soc_pct, of_load, row);
     const cg_real variance =
         cg_dot(row, row, model->functions) +
         (cg_square(cg_cold(model, temperature_c)) *
@@ -457,6 +478,13 @@ static void watch_sign(const cg_model *model, cg_memory *memory, const cg_sample
     }
 }
 
+static void add(cg_sum *sums, const cg_real *values, int32_t number)
+{
+    for (int32_t k = 0; k < number; ++k) {
+        sums[k] = cg_plus(sums[k], values[k]);
+    }
+}
+
 /* Compare a row's voltage with the model, and add it to the open block. */
 static void use_row(cg_estimator *self, const cg_sample *sample)
 {
@@ -476,18 +504,15 @@ static void use_row(cg_estimator *self, const cg_sample *sample)
         memory->newton_pct = cg_newton(self, sample->voltage_v - state->load_v, guess_pct,
                                        &memory->newton_inside);
         memory->newton_std_pct = inverse_std_pct(self, memory->newton_pct, temperature_c);
-        sums[0] += state->counter.counted_s;
-        sums[1] += state->counter.discharged_pct;
-        sums[2] += (cg_sum)sample->voltage_v;
-        sums[3] += (cg_sum)memory->temperature_c;
-        sums[4] += (cg_sum)state->drop_v;
-        sums[5] += (cg_sum)(cg_square(unseen_v_per_a(model)) * state->counter.turned_a2);
-        for (int32_t k = 0; k < cg_loads(model); ++k) {
-            sums[6 + k] += (cg_sum)state->load[k];
-        }
-        for (int32_t k = 0; k < model->effects; ++k) {
-            state->block.drive[k] += (cg_sum)state->drive[k];
-        }
+        const cg_real unseen_v2 = cg_square(unseen_v_per_a(model)) * state->counter.turned_a2;
+        sums[0] = cg_plus_sum(sums[0], state->counter.counted_s);
+        sums[1] = cg_plus_sum(sums[1], state->counter.discharged_pct);
+        add(&sums[2], &sample->voltage_v, 1);
+        add(&sums[3], &memory->temperature_c, 1);
+        add(&sums[4], &state->drop_v, 1);
+        add(&sums[5], &unseen_v2, 1);
+        add(&sums[6], state->load, cg_loads(model));
+        add(state->block.drive, state->drive, model->effects);
         state->block.rows += 1;
         watch_sign(model, memory, sample);
     }
@@ -508,7 +533,7 @@ static void follow(cg_estimator *self, const cg_sample *sample, const charge_ste
     if (charge->seconds > self->settings.gap_s) {
         self->state.block.is_broken = true;
         memory->row_v = CG_NAN;
-        memory->gap_until_s = sample->time_s + (cg_time)model->delay_s[model->delays - 1];
+        memory->gap_until_s = sample->time_s + cg_span(model->delay_s[model->delays - 1]);
     }
     if (charge->away_s != R(0.0)) {
         const cg_real std_pct = moved_std_pct(charge->away_s);
@@ -518,12 +543,12 @@ static void follow(cg_estimator *self, const cg_sample *sample, const charge_ste
         memory->coulomb_var_pct2 += R(CG_WRONG_PRIOR) * cg_square(std_pct);
     }
     if (cg_fabs(sample->current_a) > (R(REST_CURRENT_C_RATE) * model->capacity_ah)) {
-        memory->rest_since_s = (cg_time)NAN;
-    } else if (isnan(memory->rest_since_s)) {
+        memory->rest_since_s = CG_NO_TIME;
+    } else if (!cg_is_time(memory->rest_since_s)) {
         memory->rest_since_s = sample->time_s;
     }
     if (charge->seconds > R(REST_S)) {
-        memory->rest_since_s = sample->time_s - (cg_time)charge->seconds;
+        memory->rest_since_s = sample->time_s - cg_span(charge->seconds);
     }
 }
 
@@ -533,7 +558,7 @@ static void process(cg_estimator *self, const cg_sample *sample)
     cg_memory *memory = &self->state.memory;
     cg_block *block = &self->state.block;
     const cg_time since_s = sample->time_s - memory->first_s;
-    const int64_t number = (int64_t)floor((since_s / (cg_time)model->block_s) + 1e-9);
+    const int64_t number = cg_periods(since_s, model->block_s, R(1e-9));
     if (number > block->number) {
         close_block(self, sample->time_s);
         *block = (cg_block){0};
@@ -552,7 +577,7 @@ static void process(cg_estimator *self, const cg_sample *sample)
     }
     cg_advance(self, sample, memory->temperature_c, charge.seconds > self->settings.gap_s);
     follow(self, sample, &charge);
-    const int64_t tick = (int64_t)floor((since_s * (cg_time)model->rate_hz) + 1e-6);
+    const int64_t tick = cg_periods(since_s, R(1.0) / model->rate_hz, R(1e-6));
     if (tick > memory->tick) {
         memory->tick = tick;
         use_row(self, sample);
@@ -636,7 +661,7 @@ static uint32_t reasons_now(const cg_estimator *self, const cg_sample *sample, c
 {
     const cg_model *model = self->model;
     const cg_memory *memory = &self->state.memory;
-    const cg_time longest_s = (cg_time)model->delay_s[model->delays - 1];
+    const cg_time longest_s = cg_span(model->delay_s[model->delays - 1]);
     const cg_time time_s = sample->time_s;
     uint32_t reasons = self->settings.reasons | self->state.implausible;
     reasons |= reason_if(isnan(soc_pct) != 0, CG_NO_INITIAL_SOC);
@@ -717,10 +742,10 @@ static void forget(cg_state *state)
 {
     const cg_real nan = CG_NAN;
     *state = (cg_state){0};
-    state->clock.last_s = (cg_time)NAN;
-    state->clock.behind_s = (cg_time)NAN;
-    state->counter.time_s = (cg_time)NAN;
-    state->memory.first_s = (cg_time)NAN;
+    state->clock.last_s = CG_NO_TIME;
+    state->clock.behind_s = CG_NO_TIME;
+    state->counter.time_s = CG_NO_TIME;
+    state->memory.first_s = CG_NO_TIME;
     state->memory.tick = -1;
     state->memory.temperature_c = nan;
     state->memory.row_v = nan;
@@ -729,14 +754,14 @@ static void forget(cg_state *state)
     state->memory.newton_std_pct = nan;
     state->memory.voltage_model_v = nan;
     state->memory.residual_v = nan;
-    state->memory.coulomb_start_pct = (cg_sum)NAN;
+    state->memory.coulomb_start_pct = cg_sum_of(CG_NAN);
     state->memory.coulomb_var_pct2 = nan;
-    state->memory.gap_until_s = (cg_time)NAN;
-    state->memory.contradicted_until_s = (cg_time)NAN;
-    state->memory.mismatch_until_s = (cg_time)NAN;
-    state->memory.rest_since_s = (cg_time)NAN;
-    state->memory.full_since_s = (cg_time)NAN;
-    state->latest = (cg_estimate){(cg_time)NAN, nan, nan, nan, nan, nan, nan,
+    state->memory.gap_until_s = CG_NO_TIME;
+    state->memory.contradicted_until_s = CG_NO_TIME;
+    state->memory.mismatch_until_s = CG_NO_TIME;
+    state->memory.rest_since_s = CG_NO_TIME;
+    state->memory.full_since_s = CG_NO_TIME;
+    state->latest = (cg_estimate){CG_NO_TIME, nan, nan, nan, nan, nan, nan,
                                   (int32_t)CG_INITIALISING, CG_NO_INITIAL_SOC, 0};
 }
 
@@ -806,7 +831,7 @@ void cg_set_table(cg_estimator *self, const cg_model *model)
     self->model = model;
     set_filter_time(state, state->counter.counted_s, state->counter.discharged_pct);
     state->block.is_broken = true;
-    memory->mismatch_until_s = (cg_time)NAN;
+    memory->mismatch_until_s = CG_NO_TIME;
     memory->innovations = 0;
     memory->is_known = !isnan(soc_pct);
     cg_filter_take_over(&state->filter, model, before, soc_pct, std_pct);
@@ -821,11 +846,11 @@ static bool is_plausible(const cg_state *state, const cg_model *model)
     const cg_filter *filter = &state->filter;
     return (memory->samples >= 0) && (memory->innovations >= 0) &&
            (memory->innovations <= model->tested_blocks) && (filter->hypotheses >= 1) &&
-           (filter->hypotheses <= 2) && isfinite(state->counter.discharged_pct) &&
-           isfinite(state->counter.counted_s) && cg_filter_is_valid(filter, model);
+           (filter->hypotheses <= 2) && isfinite(cg_value(state->counter.discharged_pct)) &&
+           isfinite(cg_value(state->counter.counted_s)) && cg_filter_is_valid(filter, model);
 }
 
-bool cg_restore(cg_estimator *self, const cg_state *state, cg_time age_s)
+bool cg_restore(cg_estimator *self, const cg_state *state, cg_real age_s)
 {
     if (!is_plausible(state, self->model)) {
         return false;

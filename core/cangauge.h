@@ -23,10 +23,27 @@
 #define CANGAUGE_REAL double
 #endif
 typedef CANGAUGE_REAL cg_real;
-/* What would lose its digits as float: times, running sums, and the coefficients of the pseudo-OCV,
- * whose terms of up to 1e8 V cancel. */
+#define CG_REAL_IS_double 0
+#define CG_REAL_IS_float 1
+#define CG_JOIN_(a, b) a##b
+#define CG_JOIN(a, b) CG_JOIN_(a, b)
+#define CG_HAS_FLOATS CG_JOIN(CG_REAL_IS_, CANGAUGE_REAL)
+
+/* What would lose its digits as float. Time: seconds as double; with floats an integer of 0.1 us, as a
+ * timer counts. Running sum: a double, or a float with what its additions lost. Coefficients of the
+ * pseudo-OCV, whose terms of up to 1e8 V cancel: doubles, which an exported model does not need. */
+#if CG_HAS_FLOATS
+#define CG_TICKS_PER_S 10000000
+#define CG_NO_TIME INT64_MIN
+typedef int64_t cg_time;
+typedef struct {
+    cg_real high;
+    cg_real low;
+} cg_sum;
+#else
 typedef double cg_time;
 typedef double cg_sum;
+#endif
 typedef double cg_wide;
 
 /* Upper limits of a model; an exported model states its own, which are smaller. */
@@ -136,7 +153,7 @@ typedef struct {
     /* effects, in the order of their application */
     int32_t effects;
     cg_effect effect[CG_EFFECTS];
-    cg_time skew_s; /* of CG_TIME_SKEW: how late the time stamps of the current are */
+    cg_real skew_s; /* of CG_TIME_SKEW: how late the time stamps of the current are */
 } cg_model;
 
 /* ------------------------------------------------------------------ settings */
@@ -220,7 +237,7 @@ typedef struct {
     cg_time shift_s; /* time minus stamp */
     int64_t behind; /* consecutive samples stamped before the last accepted one */
     cg_time behind_s;
-    cg_time age_s; /* least age of a restored state; NAN: no clock measured it */
+    cg_real age_s; /* least age of a restored state; NAN: no clock measured it */
     bool is_restored;
 } cg_clock;
 
@@ -262,7 +279,7 @@ typedef struct {
     cg_ekf ekf[2]; /* narrow, wide */
     int32_t hypotheses;
     int32_t decision; /* -1 narrow, 0 open, 1 wide */
-    cg_sum prior_log_odds;
+    cg_real prior_log_odds;
 } cg_filter;
 
 typedef struct {
@@ -374,10 +391,15 @@ typedef struct {
 
 /* ------------------------------------------------------------------ functions */
 
+/* Time of a number of seconds, and back. Costs software doubles where the processor has floats only: there a
+ * timer's count is better scaled to CG_TICKS_PER_S. */
+cg_time cg_time_of_s(double time_s);
+double cg_s_of_time(cg_time time_s);
+
 /* Storage for the delay line at samples `spacing_s` apart; for static arrays. Rounded up. */
 #define CG_LINE_SIZE(longest_s, spacing_s) ((int32_t)(2.0 * (longest_s) / (spacing_s)) + 9)
 /* An empty delay line in an array of a size. */
-#define CG_LINE(array, size, spacing_s) {(array), (size), 0, 0, 0, (cg_real)(spacing_s), 0.0, 0.0}
+#define CG_LINE(array, size, spacing_s) {(array), (size), 0, 0, 0, (cg_real)(spacing_s), 0, 0}
 
 /* Begin, with memory for the delay line (CG_LINE_SIZE) and, for a model with `time_skew`, for the
  * samples that it holds back. */
@@ -387,7 +409,7 @@ void cg_init(cg_estimator *self, const cg_model *model, const cg_settings *setti
 /* Continue from a state that was copied, after cg_evaluate. `age_s`: least time since then by
  * another clock; NAN: none measured it. False: impossible numbers, nothing is changed; against a
  * copy that was torn or lost a bit the caller keeps a checksum. */
-bool cg_restore(cg_estimator *self, const cg_state *state, cg_time age_s);
+bool cg_restore(cg_estimator *self, const cg_state *state, cg_real age_s);
 
 /* Continue with the constants of another model, as one that was fitted to the pack later. SoC, offset
  * of the current, learned capacity and delay line are kept; what the voltage taught is not. The sizes

@@ -129,13 +129,14 @@ static void weigh(linear *at, const cg_ekf *ekf, int32_t size, cg_real noise)
 {
     const cg_real *p = ekf->p;
     for (int32_t i = 0; i < size; ++i) {
-        at->spread[i] = R(0.0);
-        for (int32_t j = 0; j < i; ++j, ++p) {
-            at->spread[i] += *p * at->h[j];
-            at->spread[j] += *p * at->h[i];
+        const cg_real h = at->h[i];
+        cg_real total = R(0.0);
+        for (int32_t j = 0; j < i; ++j) {
+            const cg_real covariance = *p++;
+            total += covariance * at->h[j];
+            at->spread[j] += covariance * h;
         }
-        at->spread[i] += *p * at->h[i];
-        ++p;
+        at->spread[i] = total + (*p++ * h);
     }
     at->variance = cg_dot(at->h, at->spread, size) + noise;
     for (int32_t k = 0; k < size; ++k) {
@@ -149,9 +150,7 @@ static void condition(cg_ekf *ekf, const linear *at, int32_t size, cg_real drop_
     cg_real *p = ekf->p;
     for (int32_t i = 0; i < size; ++i) {
         for (int32_t j = 0; j <= i; ++j, ++p) {
-            const cg_real one = *p - (at->gain[i] * at->spread[j]);
-            const cg_real other = *p - (at->gain[j] * at->spread[i]);
-            *p = R(0.5) * (one + other);
+            *p -= at->gain[i] * at->spread[j];
         }
     }
     cg_real t[2] = {R(0.0), drop_v};
@@ -176,37 +175,56 @@ static void condition(cg_ekf *ekf, const linear *at, int32_t size, cg_real drop_
     ekf->b_p[1][0] = ekf->b_p[0][1];
 }
 
-/* Voltage at a state, its gradient and the variance of the measurement. */
-static cg_real measurement(const cg_model *model, const cg_real *x, const cg_means *block,
-                           cg_real *h, cg_real *noise)
+/* What the measurement by a block has the same at every SoC. */
+typedef struct {
+    const cg_means *block;
+    cg_real load_v;
+    cg_real cold;
+    cg_real level_v2;
+    cg_real outside_pct2; /* level's variance by the square of the curve's slope */
+    cg_real noise_v2;
+    cg_real functions_v[CG_FUNCTIONS];
+} observed;
+
+static observed observe(const cg_model *model, const cg_means *block)
 {
     const bool is_missing = isnan(block->temperature_c) != 0;
     const cg_real temperature_c = is_missing ? model->usual_c : block->temperature_c;
-    const cg_real cold = cg_cold(model, temperature_c);
-    const int32_t size = cg_states(model);
-    cg_real slope;
-    cg_real volts = cg_curve_at(model, block->drive, x[CG_X_SOC], &slope);
-    slope = cg_max(slope, R(CG_LEAST_SLOPE));
-    const cg_real axis_v = model->soc_std_pct * slope;
-    h[CG_X_SOC] = slope;
-    h[CG_X_OFFSET] = R(0.0);
-    h[CG_X_SLOW] = cold;
     const cg_real *range = model->temperature_range_c;
     const cg_real outside_k =
         cg_max(cg_max(range[0] - temperature_c, temperature_c - range[1]), R(0.0));
     const cg_real unknown_v = is_missing ? cg_unknown_temperature_v(model, block->load) : R(0.0);
-    h[CG_X_LEVEL] = cg_sqrt(cg_square(cold * model->level_std_v) + cg_square(axis_v) +
-                            cg_square(R(OUTSIDE_PCT_PER_K) * outside_k * slope) +
-                            cg_square(unknown_v));
-    cg_functions_row(model, x[CG_X_SOC], block->load, &h[CG_X_FUNCTIONS]);
-    volts += cg_dot(block->load, model->load, cg_loads(model));
-    volts += cg_dot(&h[CG_X_SLOW], &x[CG_X_SLOW], size - CG_X_SLOW);
-    *noise = cg_square(cold * model->fast_std_v) + cg_square(axis_v) + block->unseen_v2;
+    observed of;
+    of.block = block;
+    of.load_v = cg_dot(block->load, model->load, cg_loads(model));
+    of.cold = cg_cold(model, temperature_c);
+    of.level_v2 = cg_square(of.cold * model->level_std_v) + cg_square(unknown_v);
+    of.outside_pct2 = cg_square(model->soc_std_pct) + cg_square(R(OUTSIDE_PCT_PER_K) * outside_k);
+    of.noise_v2 = cg_square(of.cold * model->fast_std_v) + block->unseen_v2;
+    cg_functions_of_load(model, block->load, of.functions_v);
+    return of;
+}
+
+/* Voltage at a state, its gradient and the variance of the measurement. */
+static cg_real measurement(const cg_model *model, const cg_real *x, const observed *of, cg_real *h,
+                           cg_real *noise)
+{
+    cg_real slope;
+    cg_real volts = cg_curve_at(model, of->block->drive, x[CG_X_SOC], &slope);
+    slope = cg_max(slope, R(CG_LEAST_SLOPE));
+    h[CG_X_SOC] = slope;
+    h[CG_X_OFFSET] = R(0.0);
+    h[CG_X_SLOW] = of->cold;
+    h[CG_X_LEVEL] = cg_sqrt(of->level_v2 + (of->outside_pct2 * cg_square(slope)));
+    cg_functions_row(model, x[CG_X_SOC], of->functions_v, &h[CG_X_FUNCTIONS]);
+    volts += of->load_v;
+    volts += cg_dot(&h[CG_X_SLOW], &x[CG_X_SLOW], cg_states(model) - CG_X_SLOW);
+    *noise = of->noise_v2 + cg_square(model->soc_std_pct * slope);
     return volts;
 }
 
 /* Update with the mean voltage of a block; iterated while the SoC is uncertain. */
-static void ekf_update(const cg_model *model, cg_ekf *ekf, const cg_means *block)
+static void ekf_update(const cg_model *model, cg_ekf *ekf, const observed *of)
 {
     const int32_t size = cg_states(model);
     const bool is_wide = var_of(ekf, CG_X_SOC) > cg_square(R(LINEAR_PCT));
@@ -220,9 +238,9 @@ static void ekf_update(const cg_model *model, cg_ekf *ekf, const cg_means *block
     cg_real last_pct = R(0.0);
     for (int32_t step = 0; (step < (is_wide ? ITERATIONS_AT_MOST : 1)) && !is_close; ++step) {
         cg_real noise;
-        const cg_real voltage_v = measurement(model, x, block, at.h, &noise);
+        const cg_real voltage_v = measurement(model, x, of, at.h, &noise);
         weigh(&at, ekf, size, noise);
-        at.innovation = block->voltage_v - voltage_v;
+        at.innovation = of->block->voltage_v - voltage_v;
         for (int32_t k = 0; k < size; ++k) {
             at.innovation -= at.h[k] * (ekf->x[k] - x[k]);
         }
@@ -242,9 +260,9 @@ static void ekf_update(const cg_model *model, cg_ekf *ekf, const cg_means *block
     for (int32_t k = 0; k < size; ++k) {
         ekf->x[k] = x[k];
     }
-    condition(ekf, &at, size, block->drop_v);
+    condition(ekf, &at, size, of->block->drop_v);
     ekf->innovation2 = cg_square(at.innovation) / at.variance;
-    ekf->evidence -= 0.5 * ((cg_sum)ekf->innovation2 + log((cg_sum)at.variance));
+    ekf->evidence = cg_plus(ekf->evidence, R(-0.5) * (ekf->innovation2 + cg_log(at.variance)));
 }
 
 /* Correct by a SoC that is known otherwise. */
@@ -283,35 +301,38 @@ cg_real cg_strain(const cg_ekf *ekf, const cg_model *model)
 
 /* ------------------------------------------------------------------ hypotheses */
 
-static cg_sum log_odds_of(cg_sum probability) { return log(probability / (1.0 - probability)); }
+static cg_real log_odds_of(cg_real probability)
+{
+    return cg_log(probability / (R(1.0) - probability));
+}
 
 /* Of the wide hypothesis: on a plateau not below the prior ones until it has found the SoC. */
-static cg_sum log_odds(const cg_filter *filter, const cg_model *model)
+static cg_real log_odds(const cg_filter *filter, const cg_model *model)
 {
     if (filter->hypotheses == 1) {
-        return -(cg_sum)INFINITY;
+        return R(-INFINITY);
     }
-    cg_sum gained = filter->ekf[1].evidence - filter->ekf[0].evidence;
-    if ((gained < 0.0) && (model->soc_std_pct > R(LINEAR_PCT)) &&
+    cg_real gained = cg_minus(filter->ekf[1].evidence, filter->ekf[0].evidence);
+    if ((gained < R(0.0)) && (model->soc_std_pct > R(LINEAR_PCT)) &&
         (var_of(&filter->ekf[1], CG_X_SOC) > cg_square(R(FOUND_STD_PCT)))) {
-        gained = 0.0;
+        gained = R(0.0);
     }
     return filter->prior_log_odds + gained;
 }
 
 const cg_ekf *cg_likelier(const cg_filter *filter, const cg_model *model)
 {
-    return &filter->ekf[(log_odds(filter, model) > 0.0) ? 1 : 0];
+    return &filter->ekf[(log_odds(filter, model) > R(0.0)) ? 1 : 0];
 }
 
 bool cg_filter_is_rejected(const cg_filter *filter, const cg_model *model)
 {
-    return (filter->hypotheses == 2) ? (log_odds(filter, model) > 0.0) : (filter->decision > 0);
+    return (filter->hypotheses == 2) ? (log_odds(filter, model) > R(0.0)) : (filter->decision > 0);
 }
 
 static void keep_likelier(cg_filter *filter, const cg_model *model)
 {
-    if (log_odds(filter, model) > 0.0) {
+    if (log_odds(filter, model) > R(0.0)) {
         filter->ekf[0] = filter->ekf[1];
     }
     filter->hypotheses = 1;
@@ -321,7 +342,7 @@ static void keep_likelier(cg_filter *filter, const cg_model *model)
 void cg_filter_start(cg_filter *filter, const cg_model *model, cg_real soc_pct, cg_real std_pct,
                      bool is_doubtful)
 {
-    filter->prior_log_odds = 0.0;
+    filter->prior_log_odds = R(0.0);
     filter->decision = 0;
     filter->hypotheses = 1;
     if (isnan(soc_pct)) {
@@ -332,7 +353,7 @@ void cg_filter_start(cg_filter *filter, const cg_model *model, cg_real soc_pct, 
     if (is_doubtful && (std_pct < R(CG_WRONG_STD_PCT))) {
         ekf_start(&filter->ekf[1], model, soc_pct, cg_square(R(CG_WRONG_STD_PCT)));
         filter->hypotheses = 2;
-        filter->prior_log_odds = log_odds_of(CG_WRONG_PRIOR);
+        filter->prior_log_odds = log_odds_of(R(CG_WRONG_PRIOR));
     }
 }
 
@@ -365,12 +386,13 @@ void cg_filter_predict(cg_filter *filter, const cg_model *model, const cg_passed
 
 void cg_filter_update(cg_filter *filter, const cg_model *model, const cg_means *block)
 {
+    const observed of = observe(model, block);
     for (int32_t k = 0; k < filter->hypotheses; ++k) {
-        ekf_update(model, &filter->ekf[k], block);
+        ekf_update(model, &filter->ekf[k], &of);
     }
-    if ((filter->hypotheses == 2) && (fabs(log_odds(filter, model)) > CLEAR_LOG_ODDS)) {
-        filter->decision = (log_odds(filter, model) > 0.0) ? 1 : -1;
-        if (fabs(log_odds(filter, model)) > DROPPED_LOG_ODDS) {
+    if ((filter->hypotheses == 2) && (cg_fabs(log_odds(filter, model)) > R(CLEAR_LOG_ODDS))) {
+        filter->decision = (log_odds(filter, model) > R(0.0)) ? 1 : -1;
+        if (cg_fabs(log_odds(filter, model)) > R(DROPPED_LOG_ODDS)) {
             keep_likelier(filter, model);
         }
     }
@@ -387,17 +409,17 @@ void cg_filter_doubt(cg_filter *filter, const cg_model *model, cg_real probabili
                      cg_real std_pct, cg_real away_s, cg_real parked_std_pct)
 {
     const cg_passed passed = {R(0.0), R(0.0), R(0.0), away_s};
-    const cg_sum now = log_odds(filter, model);
-    if ((filter->hypotheses == 2) && (fabs(now) < CLEAR_LOG_ODDS)) {
-        const cg_sum before = 1.0 / (1.0 + exp(-now));
+    const cg_real now = log_odds(filter, model);
+    if ((filter->hypotheses == 2) && (cg_fabs(now) < R(CLEAR_LOG_ODDS))) {
+        const cg_real before = R(1.0) / (R(1.0) + cg_exp(-now));
         filter->prior_log_odds =
-            log_odds_of(1.0 - ((1.0 - before) * (1.0 - (cg_sum)probability)));
+            log_odds_of(R(1.0) - ((R(1.0) - before) * (R(1.0) - probability)));
         filter->ekf[1].evidence = filter->ekf[0].evidence; /* it is in the prior now */
     } else {
         keep_likelier(filter, model);
         filter->ekf[1] = filter->ekf[0];
         filter->hypotheses = 2;
-        filter->prior_log_odds = log_odds_of((cg_sum)probability);
+        filter->prior_log_odds = log_odds_of(probability);
     }
     filter->decision = 0;
     ekf_predict(&filter->ekf[0], model, &passed, cg_square(parked_std_pct));
@@ -413,7 +435,7 @@ cg_real cg_filter_soc(const cg_filter *filter, const cg_model *model, const cg_p
     if (filter->hypotheses == 2) {
         cg_real wide_var;
         const cg_real wide_pct = soc_after(&filter->ekf[1], model, passed, &wide_var);
-        const cg_real p = (cg_real)(1.0 / (1.0 + exp(-log_odds(filter, model))));
+        const cg_real p = R(1.0) / (R(1.0) + cg_exp(-log_odds(filter, model)));
         const cg_real mean_pct = ((R(1.0) - p) * soc_pct) + (p * wide_pct);
         variance = ((R(1.0) - p) * (variance + cg_square(soc_pct - mean_pct))) +
                    (p * (wide_var + cg_square(wide_pct - mean_pct)));
@@ -430,7 +452,7 @@ bool cg_filter_is_valid(const cg_filter *filter, const cg_model *model)
     bool is_valid = true;
     for (int32_t i = 0; i < filter->hypotheses; ++i) {
         const cg_ekf *ekf = &filter->ekf[i];
-        is_valid = is_valid && isfinite(ekf->evidence);
+        is_valid = is_valid && isfinite(cg_value(ekf->evidence));
         for (int32_t k = 0; k < size; ++k) {
             is_valid = is_valid && isfinite(ekf->x[k]) && (var_of(ekf, k) > R(0.0));
             for (int32_t j = 0; j <= k; ++j) {

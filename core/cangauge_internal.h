@@ -7,12 +7,7 @@
 #include <math.h>
 #include <stddef.h>
 
-#define CG_REAL_IS_double 0
-#define CG_REAL_IS_float 1
-#define CG_JOIN_(a, b) a##b
-#define CG_JOIN(a, b) CG_JOIN_(a, b)
-
-#if CG_JOIN(CG_REAL_IS_, CANGAUGE_REAL)
+#if CG_HAS_FLOATS
 #define CG_CLOSE_PCT 1e-4 /* where an iteration on a SoC stops */
 #define CG_REBASE_S 128.0 /* age of the delay line's base at which floats need another one */
 #define cg_exp expf
@@ -21,6 +16,7 @@
 #define cg_sqrt sqrtf
 #define cg_asinh asinhf
 #define cg_fabs fabsf
+#define cg_log logf
 #else
 #define CG_CLOSE_PCT 1e-9
 #define CG_REBASE_S INFINITY
@@ -30,6 +26,7 @@
 #define cg_sqrt sqrt
 #define cg_asinh asinh
 #define cg_fabs fabs
+#define cg_log log
 #endif
 
 /* A constant in the type of the numbers. */
@@ -44,6 +41,69 @@ static inline cg_real cg_clip(cg_real value, cg_real low, cg_real high)
     return cg_min(cg_max(value, low), high);
 }
 static inline cg_real cg_square(cg_real value) { return value * value; }
+
+#if CG_HAS_FLOATS
+/* Time of a number of seconds, to the nearest tick, and back. */
+static inline cg_time cg_span(cg_real seconds)
+{
+    const cg_real ticks = seconds * R(CG_TICKS_PER_S);
+    return (cg_time)(ticks + ((ticks < R(0.0)) ? R(-0.5) : R(0.5)));
+}
+static inline cg_real cg_seconds(cg_time span) { return (cg_real)span * R(1.0 / CG_TICKS_PER_S); }
+static inline bool cg_is_time(cg_time time_s) { return time_s != CG_NO_TIME; }
+/* Number of whole periods in a time; within a part of one of the next it is the next. */
+static inline int64_t cg_periods(cg_time span, cg_real period_s, cg_real part)
+{
+    return (span + cg_span(part * period_s)) / cg_span(period_s);
+}
+/* Where the times of a delay line count from: near its entries, so that floats keep their digits. */
+static inline cg_time cg_base_of(cg_time time_s) { return time_s; }
+
+/* A sum as two floats (Knuth's TwoSum, Dekker's FastTwoSum): some 48 bits. */
+static inline cg_sum cg_plus(cg_sum sum, cg_real value)
+{
+    const cg_real total = sum.high + value;
+    const cg_real part = total - sum.high;
+    const cg_real lost = (sum.high - (total - part)) + (value - part) + sum.low;
+    const cg_real high = total + lost;
+    const cg_sum found = {high, lost - (high - total)};
+    return found;
+}
+static inline cg_sum cg_plus_sum(cg_sum a, cg_sum b) { return cg_plus(cg_plus(a, b.high), b.low); }
+static inline cg_real cg_minus(cg_sum a, cg_sum b) { return (a.high - b.high) + (a.low - b.low); }
+static inline cg_real cg_value(cg_sum sum) { return sum.high + sum.low; }
+static inline cg_sum cg_sum_of(cg_real value)
+{
+    const cg_sum found = {value, R(0.0)};
+    return found;
+}
+static inline cg_sum cg_mean(cg_sum sum, cg_real number)
+{
+    const cg_real high = sum.high / number;
+    const cg_sum found = {high, (fmaf(-high, number, sum.high) + sum.low) / number};
+    return found;
+}
+#else
+#define CG_NO_TIME ((cg_time)NAN)
+static inline cg_time cg_span(cg_real seconds) { return seconds; }
+static inline cg_real cg_seconds(cg_time span) { return span; }
+static inline bool cg_is_time(cg_time time_s) { return isnan(time_s) == 0; }
+static inline int64_t cg_periods(cg_time span, cg_real period_s, cg_real part)
+{
+    return (int64_t)floor((span / period_s) + part);
+}
+static inline cg_time cg_base_of(cg_time time_s)
+{
+    (void)time_s;
+    return 0.0;
+}
+static inline cg_sum cg_plus(cg_sum sum, cg_real value) { return sum + value; }
+static inline cg_sum cg_plus_sum(cg_sum a, cg_sum b) { return a + b; }
+static inline cg_real cg_minus(cg_sum a, cg_sum b) { return a - b; }
+static inline cg_real cg_value(cg_sum sum) { return sum; }
+static inline cg_sum cg_sum_of(cg_real value) { return value; }
+static inline cg_sum cg_mean(cg_sum sum, cg_real number) { return sum / number; }
+#endif
 
 /* States of the filter; the functions follow. Biases. */
 #define CG_X_SOC 0
@@ -92,7 +152,8 @@ void cg_line_lengthen(cg_line *line);
 
 /* voltage model */
 cg_real cg_cold(const cg_model *model, cg_real temperature_c);
-void cg_functions_row(const cg_model *model, cg_real soc_pct, const cg_real *load, cg_real *row);
+void cg_functions_of_load(const cg_model *model, const cg_real *load, cg_real *row);
+void cg_functions_row(const cg_model *model, cg_real soc_pct, const cg_real *of_load, cg_real *row);
 cg_real cg_unknown_temperature_v(const cg_model *model, const cg_real *load);
 cg_real cg_curve_at(const cg_model *model, const cg_real *drive, cg_real soc_pct, cg_real *slope);
 cg_real cg_newton(const cg_estimator *self, cg_real ocv_v, cg_real guess_pct, bool *inside);
@@ -101,7 +162,7 @@ cg_real cg_newton(const cg_estimator *self, cg_real ocv_v, cg_real guess_pct, bo
 int32_t cg_skew_of(const cg_model *model);
 void cg_correct(cg_estimator *self, cg_sample *sample, int32_t from, int32_t to);
 void cg_skew_push(cg_skew *skew, const cg_sample *sample);
-bool cg_skew_pop(cg_skew *skew, cg_time skew_s, cg_time now_s, cg_sample *sample);
+bool cg_skew_pop(cg_skew *skew, cg_real skew_s, cg_time now_s, cg_sample *sample);
 void cg_advance(cg_estimator *self, const cg_sample *sample, cg_real temperature_c,
                 bool is_gap);
 

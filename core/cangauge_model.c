@@ -60,7 +60,7 @@ static void line_rebase(cg_line *line)
     for (int32_t k = 0; k < line->count; ++k) {
         line_entry(line, k)->time_s -= later_s;
     }
-    line->base_s += (cg_time)later_s;
+    line->base_s += cg_span(later_s);
 }
 
 void cg_line_push(cg_line *line, cg_real longest_s, bool is_gap, cg_time time_s,
@@ -69,11 +69,11 @@ void cg_line_push(cg_line *line, cg_real longest_s, bool is_gap, cg_time time_s,
     if ((line->count == 0) || is_gap) {
         line->count = 0;
         line->since_s = time_s;
-        line->base_s = isinf(CG_REBASE_S) ? 0.0 : time_s;
+        line->base_s = cg_base_of(time_s);
     } else if (line_entry(line, 0)->time_s >= R(CG_REBASE_S)) {
         line_rebase(line);
     }
-    const cg_real now_s = (cg_real)(time_s - line->base_s);
+    const cg_real now_s = cg_seconds(time_s - line->base_s);
     if ((line->count > 1) &&
         ((now_s - line_entry(line, line->count - 2)->time_s) < line->spacing_s)) {
         line->count -= 1;
@@ -95,7 +95,7 @@ void cg_line_push(cg_line *line, cg_real longest_s, bool is_gap, cg_time time_s,
 void cg_line_lengthen(cg_line *line)
 {
     if (line->count > 0) {
-        const cg_time oldest_s = line->base_s + (cg_time)line_entry(line, 0)->time_s;
+        const cg_time oldest_s = line->base_s + cg_span(line_entry(line, 0)->time_s);
         line->since_s = (oldest_s > line->since_s) ? oldest_s : line->since_s;
     }
 }
@@ -103,9 +103,9 @@ void cg_line_lengthen(cg_line *line)
 cg_time cg_line_filled_s(const cg_line *line)
 {
     if (line->count == 0) {
-        return 0.0;
+        return cg_span(R(0.0));
     }
-    return (cg_time)line_entry(line, line->count - 1)->time_s + line->base_s - line->since_s;
+    return cg_span(line_entry(line, line->count - 1)->time_s) + line->base_s - line->since_s;
 }
 
 /* Current between two samples. */
@@ -231,19 +231,31 @@ cg_real cg_cold(const cg_model *model, cg_real temperature_c)
     return cg_pow(cg_max(R(1.0), resistance_factor(temperature_c)), model->cold_exponent);
 }
 
-/* Change of the voltage by each principal function. */
-void cg_functions_row(const cg_model *model, cg_real soc_pct, const cg_real *load, cg_real *row)
+/* Change of the voltage by each principal function through the load columns. */
+void cg_functions_of_load(const cg_model *model, const cg_real *load, cg_real *row)
+{
+    const int32_t loads = cg_loads(model);
+    for (int32_t j = 0; j < model->functions; ++j) {
+        cg_real total = R(0.0);
+        for (int32_t k = 0; k < loads; ++k) {
+            total += load[k] * model->function_load[k][j];
+        }
+        row[j] = total;
+    }
+}
+
+/* The same with that through the curve. */
+void cg_functions_row(const cg_model *model, cg_real soc_pct, const cg_real *of_load, cg_real *row)
 {
     if (model->functions > 0) {
         const cg_place at = place_of(model->function_pct, model->function_knots, soc_pct);
+        const cg_real *left_v = model->function_v[at.left];
+        const cg_real *left_slope = model->function_slope[at.left];
+        const cg_real *right_v = model->function_v[at.left + 1];
+        const cg_real *right_slope = model->function_slope[at.left + 1];
         for (int32_t j = 0; j < model->functions; ++j) {
-            row[j] = (at.value[0] * model->function_v[at.left][j]) +
-                     (at.value[1] * model->function_slope[at.left][j]) +
-                     (at.value[2] * model->function_v[at.left + 1][j]) +
-                     (at.value[3] * model->function_slope[at.left + 1][j]);
-            for (int32_t k = 0; k < cg_loads(model); ++k) {
-                row[j] += load[k] * model->function_load[k][j];
-            }
+            row[j] = (at.value[0] * left_v[j]) + (at.value[1] * left_slope[j]) +
+                     (at.value[2] * right_v[j]) + (at.value[3] * right_slope[j]) + of_load[j];
         }
     }
 }
@@ -284,7 +296,7 @@ cg_real cg_unknown_temperature_v(const cg_model *model, const cg_real *load)
 
 static cg_real lag_step(cg_lag *lag, cg_real tau_s, cg_real rest_s, cg_time time_s, cg_real input)
 {
-    const cg_real seconds = (cg_real)(time_s - lag->time_s);
+    const cg_real seconds = cg_seconds(time_s - lag->time_s);
     const cg_real step = seconds / tau_s;
     const cg_real a = cg_exp(-step);
     lag->value *= a;
@@ -427,11 +439,11 @@ static int64_t skew_after(cg_skew *skew, cg_time time_s)
 }
 
 /* Take the oldest sample if its current is known, which it then has. */
-bool cg_skew_pop(cg_skew *skew, cg_time skew_s, cg_time now_s, cg_sample *sample)
+bool cg_skew_pop(cg_skew *skew, cg_real skew_s, cg_time now_s, cg_sample *sample)
 {
     const bool is_waiting = skew->waiting < skew->count;
     const cg_time upcoming_s = is_waiting ? skew_entry(skew, skew->waiting)->time_s : now_s;
-    const cg_time at_s = upcoming_s + skew_s;
+    const cg_time at_s = upcoming_s + cg_span(skew_s);
     const int64_t right = skew_after(skew, at_s);
     if (!is_waiting || (at_s > now_s)) {
         const int64_t stale = right - 1 - skew->first;
@@ -449,15 +461,15 @@ bool cg_skew_pop(cg_skew *skew, cg_time skew_s, cg_time now_s, cg_sample *sample
     sample->current_a = before->current_a;
     if (right < skew->count) {
         sample->current_a = between(before->current_a, after->current_a,
-                                    (cg_real)(at_s - before->time_s),
-                                    (cg_real)(after->time_s - before->time_s));
+                                    cg_seconds(at_s - before->time_s),
+                                    cg_seconds(after->time_s - before->time_s));
     }
     return true;
 }
 
 static void advance_hysteresis(const cg_effect *effect, cg_lag *lag, const cg_sample *sample)
 {
-    const cg_real seconds = (cg_real)(sample->time_s - lag->time_s);
+    const cg_real seconds = cg_seconds(sample->time_s - lag->time_s);
     if (lag->is_started && (seconds <= R(BRIDGE_S))) {
         const cg_real mean = R(0.5) * (sample->current_a + lag->input);
         const cg_real decay = cg_fabs(mean) * seconds / effect->value[1];
@@ -515,7 +527,7 @@ static cg_real advance_effect(const cg_effect *effect, cg_effect_state *state,
             lag->is_started = true;
             lag->time_s = sample->time_s;
         }
-        drive = ((sample->time_s - lag->time_s) >= (cg_time)value[1])
+        drive = (cg_seconds(sample->time_s - lag->time_s) >= value[1])
                            ? (-value[0] * current_a)
                            : R(0.0);
         break;

@@ -34,7 +34,7 @@ int main(void)
             continue;
         }
         samples++;
-        const cg_sample sample = {time_s, (cg_real)current_a, (cg_real)voltage_v,
+        const cg_sample sample = {cg_time_of_s(time_s), (cg_real)current_a, (cg_real)voltage_v,
                                   (cg_real)temperature_c};
         uint8_t data[8];
         cg_estimate estimate;
@@ -42,7 +42,7 @@ int main(void)
         estimate = cg_evaluate(&pack);
         frames_soc_estimate(&estimate, 0, counter, data);
         counter = (uint8_t)((counter + 1U) & 0xFU);
-        printf("%.3f %.4f +- %.4f %%, status %d, reasons %05lx,", estimate.time_s,
+        printf("%.3f %.4f +- %.4f %%, status %d, reasons %05lx,", cg_s_of_time(estimate.time_s),
                (double)estimate.soc_pct, (double)estimate.soc_std_pct, (int)estimate.status,
                (unsigned long)estimate.reasons);
         for (int k = 0; k < 8; ++k) {

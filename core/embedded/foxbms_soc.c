@@ -90,7 +90,7 @@ void SE_InitializeStateOfCharge(DATA_BLOCK_SOC_s *pSocValues, bool ccPresent, ui
     if ((FRAM_ReadData(CANGAUGE_FRAM_BLOCK) == FRAM_ACCESS_OK) &&
         (cangauge_fram.model_id[stringNumber] == PACK_MODEL_ID)) {
         /* No clock measures how long the processor was off. False: it begins with the SoC. */
-        (void)cg_restore(&string->estimator, &cangauge_fram.state[stringNumber], (cg_time)NAN);
+        (void)cg_restore(&string->estimator, &cangauge_fram.state[stringNumber], (cg_real)NAN);
     }
 #endif
 }
@@ -98,8 +98,8 @@ void SE_InitializeStateOfCharge(DATA_BLOCK_SOC_s *pSocValues, bool ccPresent, ui
 /* The latest values of the database as a sample. */
 static cg_sample sample_of(const string_s *string, uint8_t s)
 {
-    cg_sample sample = {(cg_time)string->elapsed_ms / MILLI, (cg_real)NAN, (cg_real)NAN,
-                        (cg_real)NAN};
+    cg_sample sample = {cg_time_of_s((double)string->elapsed_ms / MILLI), (cg_real)NAN,
+                        (cg_real)NAN, (cg_real)NAN};
     if (current_table.invalidCurrentMeasurement[s] == 0U) {
         const double current_a = (double)current_table.current_mA[s] / MILLI;
 #if BS_POSITIVE_DISCHARGE_CURRENT == true

@@ -45,11 +45,11 @@ static double apart(double expected, double found)
     return isnan(found - expected) ? INFINITY : fabs(found - expected);
 }
 
-static void update(const golden *each)
+static cg_sample sample_of(const golden *each)
 {
-    const cg_sample sample = {each->time_s, (cg_real)each->current_a, (cg_real)each->voltage_v,
-                              (cg_real)each->temperature_c};
-    (void)cg_update(&pack, &sample);
+    const cg_sample sample = {cg_time_of_s(each->time_s), (cg_real)each->current_a,
+                              (cg_real)each->voltage_v, (cg_real)each->temperature_c};
+    return sample;
 }
 
 static void check(const char *what, double error, double at_most)
@@ -81,28 +81,30 @@ static void test_reset(const cg_settings *settings, const cg_line *line)
     const int at = GOLDEN_SAMPLES / 4;
     cg_init(&pack, &pack_model, settings, line, &skew);
     for (int k = 0; k < at; ++k) {
-        update(&golden_samples[k]);
+        const cg_sample sample = sample_of(&golden_samples[k]);
+        (void)cg_update(&pack, &sample);
     }
     kept = pack.state; /* its last sample is pending */
     const double before_pct = (double)cg_evaluate(&pack).soc_pct;
     const cg_state evaluated = pack.state;
     cg_init(&pack, &pack_model, settings, line, &skew);
-    check("refused: a sound state", cg_restore(&pack, &kept, 1.0) ? 0.0 : 1.0, 0.0);
+    check("refused: a sound state", cg_restore(&pack, &kept, (cg_real)1.0) ? 0.0 : 1.0, 0.0);
     (void)cg_evaluate(&pack);
-    check("refused: one evaluated", cg_restore(&pack, &evaluated, 1.0) ? 0.0 : 1.0, 0.0);
+    check("refused: one evaluated", cg_restore(&pack, &evaluated, (cg_real)1.0) ? 0.0 : 1.0, 0.0);
     check("SoC after a reset [%]", apart(before_pct, (double)cg_evaluate(&pack).soc_pct), 0.0);
-    update(&golden_samples[at]);
+    const cg_sample next = sample_of(&golden_samples[at]);
+    (void)cg_update(&pack, &next);
     /* Charge between the two samples. */
     check("SoC goes on [%]", apart(before_pct, (double)cg_evaluate(&pack).soc_pct), 2.0);
     broken = evaluated;
     broken.filter.hypotheses = 1000;
-    check("accepted: hypotheses", cg_restore(&pack, &broken, 1.0) ? 1.0 : 0.0, 0.0);
+    check("accepted: hypotheses", cg_restore(&pack, &broken, (cg_real)1.0) ? 1.0 : 0.0, 0.0);
     broken = evaluated;
     broken.filter.ekf[0].x[0] = (cg_real)NAN;
-    check("accepted: a SoC of NAN", cg_restore(&pack, &broken, 1.0) ? 1.0 : 0.0, 0.0);
+    check("accepted: a SoC of NAN", cg_restore(&pack, &broken, (cg_real)1.0) ? 1.0 : 0.0, 0.0);
     broken = evaluated;
     broken.memory.samples = -1;
-    check("accepted: a negative count", cg_restore(&pack, &broken, 1.0) ? 1.0 : 0.0, 0.0);
+    check("accepted: a negative count", cg_restore(&pack, &broken, (cg_real)1.0) ? 1.0 : 0.0, 0.0);
 }
 
 int main(void)
@@ -116,8 +118,9 @@ int main(void)
     for (int k = 0; k < GOLDEN_SAMPLES; ++k) {
         const golden *each = &golden_samples[k];
         const int64_t tick = pack.state.memory.tick;
+        const cg_sample sample = sample_of(each);
         const unsigned long before = instructions();
-        update(each);
+        (void)cg_update(&pack, &sample);
         const cg_estimate found = cg_evaluate(&pack);
         const unsigned long taken = instructions() - before;
         const double number[4] = {(double)found.soc_pct, (double)found.soc_std_pct,

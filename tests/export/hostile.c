@@ -36,7 +36,7 @@ int main(void)
             time_s += (double)(draw() % 200U) / 100.0;
             const bool is_odd = (run % 2) == 1;
             const cg_sample sample = {
-                (is_odd && (draw() % 8U) == 0U) ? odd(time_s) : time_s,
+                cg_time_of_s((is_odd && (draw() % 8U) == 0U) ? odd(time_s) : time_s),
                 (cg_real)(is_odd ? odd(10.0) : 10.0), (cg_real)(is_odd ? odd(380.0) : 380.0),
                 (cg_real)(is_odd ? odd(20.0) : 20.0)};
             (void)cg_update(&pack, &sample);

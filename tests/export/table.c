@@ -15,7 +15,7 @@ int main(int count, char **argument)
     double time_s, current_a, voltage_v, temperature_c;
     cg_init(&pack, &pack_model, &settings, &line, NULL);
     for (int k = 0; scanf("%lf,%lf,%lf,%lf", &time_s, &current_a, &voltage_v, &temperature_c) == 4; ++k) {
-        const cg_sample sample = {time_s, (cg_real)current_a, (cg_real)voltage_v, (cg_real)temperature_c};
+        const cg_sample sample = {cg_time_of_s(time_s), (cg_real)current_a, (cg_real)voltage_v, (cg_real)temperature_c};
         if (k == at) {
             cg_set_table(&pack, &later_model);
         }

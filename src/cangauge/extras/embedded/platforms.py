@@ -38,7 +38,7 @@ static void gauge_begin(void)
 
 static cg_estimate gauge_at(double time_s)
 {
-    const cg_sample sample = {time_s, current_a(), voltage_v(), temperature_c()};
+    const cg_sample sample = {cg_time_of_s(time_s), current_a(), voltage_v(), temperature_c()};
     (void)cg_update(&pack, &sample);
     return cg_evaluate(&pack);
 }
