@@ -86,8 +86,8 @@ def _wrong_models(model: Model) -> dict[str, Model]:
     loads, curve = model.loads, model.curve
     tripled = [3.0 * ohm for ohm in loads.resistance_ohm]
     three = [3.0 * ohm for ohm in loads.arrhenius.resistance_ohm]
-    scaled = loads.arrhenius.model_copy(update={"resistance_ohm": three})
-    flat = loads.arrhenius.model_copy(update={"factor": 0.0})
+    scaled = replace(loads.arrhenius, resistance_ohm=tuple(three))
+    flat = replace(loads.arrhenius, factor=0.0)
     higher = [volts + 8.0 for volts in curve.voltage_v]
     return {
         "as fitted": model,

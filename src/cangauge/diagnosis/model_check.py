@@ -15,7 +15,7 @@ from cangauge.diagnosis.pack import Healthy, log_rows, of_model
 from cangauge.diagnosis.posterior import Posterior, posterior
 from cangauge.diagnosis.rows import Simulated, Trace, added
 from cangauge.diagnosis.sizes import simulated
-from cangauge.model.effects.library import effect_entries
+from cangauge.model.effects.library import LIBRARY, effect_entries
 from cangauge.model.extended import ExtendedModel
 from cangauge.model.model_file import Model
 
@@ -85,14 +85,17 @@ def check_model(model: Model, healthy: Healthy) -> ModelCheck:
         logs = [log_rows(alone.linear, log, alone.tried, []) for log in references]
         evidence = simulated(alone, logs, analyse(alone, logs))
         answer = posterior(alone, evidence)
-        tried = [e for e in evidence.effects.values() if e.shape.effect.fault not in OF_LOGS]
-        of = min(tried, key=lambda e: e.left_v2)  # a gross error: what closes most
-        effect, fault = of.shape.effect.id, of.shape.effect.fault
-        changed = added(extended, of.shape.effect, of.shape.values(of.size))
-        now = now.model_copy(update={"effects": effect_entries(changed.effects)})
-        with_it_v = _rmse_v(changed, references)
+        # What closes most: the model's error is gross, and its likelihood is not calibrated there.
+        tried = []
+        for name, of in evidence.effects.items():
+            if of.shape.effect.fault not in OF_LOGS:
+                with_it = added(extended, of.shape.effect, of.shape.values(of.size))
+                tried.append((_rmse_v(with_it, references), name, with_it))
+        with_it_v, effect, changed = min(tried, key=lambda each: each[0])
+        of, fault = evidence.effects[effect], LIBRARY[effect].fault
         if with_it_v >= rmse_v:
             break
+        now = now.model_copy(update={"effects": effect_entries(changed.effects)})
         parameters = parameters_of(of, references[0].log.duration_s)
         found.append(Missed(evidence, answer, fault, effect, parameters, with_it_v))
         extended, rmse_v = changed, with_it_v
