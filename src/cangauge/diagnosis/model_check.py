@@ -85,13 +85,18 @@ def check_model(model: Model, healthy: Healthy) -> ModelCheck:
         logs = [log_rows(alone.linear, log, alone.tried, []) for log in references]
         evidence = simulated(alone, logs, analyse(alone, logs))
         answer = posterior(alone, evidence)
-        # What closes most: the model's error is gross, and its likelihood is not calibrated there.
-        tried = []
+        tried = {}
         for name, of in evidence.effects.items():
             if of.shape.effect.fault not in OF_LOGS:
                 with_it = added(extended, of.shape.effect, of.shape.values(of.size))
-                tried.append((_rmse_v(with_it, references), name, with_it))
-        with_it_v, effect, changed = min(tried, key=lambda each: each[0])
+                tried[name] = _rmse_v(with_it, references), with_it
+        # Of those that suffice the most probable; else what closes most.
+        enough = {name for name, (left_v, _) in tried.items() if left_v <= BEYOND * expected_v}
+        if enough:
+            effect = max(enough, key=lambda name: answer.probabilities[name])
+        else:
+            effect = min(tried, key=lambda name: tried[name][0])
+        with_it_v, changed = tried[effect]
         of, fault = evidence.effects[effect], LIBRARY[effect].fault
         if with_it_v >= rmse_v:
             break
