@@ -312,7 +312,7 @@ COUNTS: Final = (
     Effect(
         id="coulombic_efficiency",
         fault="capacity",
-        parameters=(Parameter("efficiency", "1", 0.7, 1.0, neutral=1.0),),
+        parameters=(Parameter("efficiency", "1", 0.85, 1.0, neutral=1.0),),
         signature="OCV′·(Ah charged since the start): a drift that grows with regeneration only",
         equation="S = S₀ − 100·∫(I⁺ + η·I⁻)dt / C",
         source="Plett, Battery Management Systems vol. II, Artech House 2015, ch. 1",
