@@ -109,6 +109,13 @@ static void step(ekf_t *ekf, const cg_model *model, const cg_passed *passed, con
     for (int i = 0; i < N; ++i) {
         fx[i] = ekf->x[i];
     }
+    for (int i = CG_X_LEVEL; i < N; ++i) { /* back to their priors */
+        const cg_real hours = (i == CG_X_LEVEL) ? R(4.0) : R(72.0);
+        const cg_real kept = cg_exp(-passed->seconds / (hours * R(3600.0)));
+        ekf->F[(i * N) + i] = kept;
+        ekf->Q[(i * N) + i] = R(1.0) - cg_square(kept);
+        fx[i] *= kept;
+    }
     fx[CG_X_SOC] += (gain * fx[CG_X_OFFSET]) - passed->discharged_pct;
     fx[CG_X_SLOW] *= keep;
     ekf_predict(ekf, fx);
@@ -119,7 +126,11 @@ static void step(ekf_t *ekf, const cg_model *model, const cg_passed *passed, con
     const cg_real axis_v = model->soc_std_pct * slope;
     ekf->H[CG_X_SOC] = slope;
     ekf->H[CG_X_SLOW] = cold;
-    ekf->H[CG_X_LEVEL] = cg_sqrt(cg_square(cold * model->level_std_v) + cg_square(axis_v));
+    const cg_real *range = model->temperature_range_c;
+    const cg_real outside_k = cg_max(
+        cg_max(range[0] - block->temperature_c, block->temperature_c - range[1]), R(0.0));
+    ekf->H[CG_X_LEVEL] = cg_sqrt(cg_square(cold * model->level_std_v) + cg_square(axis_v) +
+                                 cg_square(R(0.2) * outside_k * slope));
     cg_functions_row(model, ekf->x[CG_X_SOC], block->load, &ekf->H[CG_X_FUNCTIONS]);
     hx += cg_dot(block->load, model->load, cg_loads(model));
     hx += cg_dot(&ekf->H[CG_X_SLOW], &ekf->x[CG_X_SLOW], N - CG_X_SLOW);
