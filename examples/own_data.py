@@ -4,8 +4,8 @@
     python examples/own_data.py FOLDER
 
 Makes each file by a tool of its kind, where that is installed, and takes one real export from the
-source package of battery-data-toolkit. Runs the commands of `docs/own-data.md` and prints what each
-gave. `--kind NAME` runs one kind, `--hours H` shortens the drives.
+source package of battery-data-toolkit. Runs the commands of `docs/logs.md` and `docs/captures.md`,
+and prints what each gave. `--kind NAME` runs one kind, `--hours H` shortens the drives.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The script behind docs/own-data.md: one kind of log and one of capture, with short drives."""
+"""The script behind the measured tables of docs/logs.md and docs/captures.md, on short drives."""
 
 from __future__ import annotations
 
