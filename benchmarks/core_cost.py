@@ -1,14 +1,14 @@
 """Cost of the estimator's core: step in Python and compiled, and on a Cortex-M4F.
 
-    python benchmarks/core_cost.py [--bits FOLDER] [--json]
+    python benchmarks/core_cost.py [--data FOLDER] [--keep]
 
 step    processor time of a step, at 10 Hz and at 1 Hz (at 1 Hz every step uses a voltage), of the
         published Leaf model: the reference in Python, the compiled one sample by sample as in the
         service, and over columns as offline. Median of five interleaved rounds.
 target  flash of core, model and frames, memory, and instructions of a step with floats, from the
         exported sources on QEMU's mps2-an386, of a curve of knots as `fit` writes it and of the
-        published equation. `filter`: prediction and update by one voltage, beside the same filter
-        in generic matrix code (matrix_ekf.c). Left out without gcc-arm-none-eabi or QEMU.
+        published equation; beside them a plain filter (plain_ekf.c). Left out without
+        gcc-arm-none-eabi or QEMU.
 bits    estimates of every judged log of the recorded packs in a folder, by Python, by the compiled
         step (numbers that differ by more than 1e-9) and by the exported sources with floats
         (largest difference of the SoC [%]).
@@ -19,7 +19,6 @@ line    the same difference on trips of the i3 at 10 Hz, by the period that the 
 from __future__ import annotations
 
 import argparse
-import json
 import re
 import shutil
 import statistics
@@ -31,7 +30,6 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-from rich.console import Console
 from rich.table import Table
 
 from cangauge.bus.recording import read_log
@@ -46,6 +44,7 @@ from cangauge.logs.log import Log
 from cangauge.model.model_file import Model
 from cangauge.model.published import leaf_2012_model_file
 from cangauge.types import Sample
+from figures import publish
 from packs.recorded import Pack, load
 
 MODEL: Final = leaf_2012_model_file()
@@ -101,43 +100,66 @@ def step_costs() -> list[dict[str, Any]]:
     return found
 
 
-def target_costs(model: Model) -> dict[str, Any]:
-    """Measure flash, memory [B] and instructions on a Cortex-M4F."""
+def run_arm(folder: Path) -> str:
+    """Build an export for the Cortex-M4F, run it, and return what it prints."""
+    done = subprocess.run(
+        ["make", "arm"],  # noqa: S607
+        cwd=folder, capture_output=True, text=True, check=True,
+    )  # fmt: skip
+    return done.stdout
 
-    def make_arm() -> str:
-        done = subprocess.run(
-            ["make", "arm"],  # noqa: S607
-            cwd=folder, capture_output=True, text=True, check=True,
-        )  # fmt: skip
-        return done.stdout
 
+def target_costs(model: Model) -> list[int]:
+    """Measure an export: bytes of flash and memory, and instructions; see `TARGET`."""
     with tempfile.TemporaryDirectory() as folder:
         export_c(model, Path(folder))
-        output = make_arm()
-        of_filter = {}
-        if model.equation == "knots":  # the published equation has no states of its curve
-            shutil.copy(Path(__file__).with_name("matrix_ekf.c"), Path(folder, "test.c"))
-            numbers = re.findall(r"filter .*: core (\d+), matrices (\d+)", make_arm())
-            names = ("filter_instructions", "filter_bytes")
-            of_filter = {
-                name: f"{a}, matrices {b}" for name, (a, b) in zip(names, numbers, strict=True)
-            }
+        output = run_arm(Path(folder))
     sizes = re.findall(r"^ *(\d+)(?:\s+\w+){4}\s+(\w+)\.o$", output, re.MULTILINE)
     text = {name: int(size) for size, name in sizes}
     parts = dict(re.findall(r"(state|delay line|constants) (\d+)", output))
     steps = re.search(r"instructions: (\d+) a sample, (\d+) .* most (\d+)", output)
     assert steps is not None  # noqa: S101
-    return {
-        "flash_core": sum(text[name] for name in text if name.startswith("cangauge")),
-        "flash_model": text["pack_model"],
-        "flash_frames": text["frames"],
-        "ram_state": int(parts["state"]),
-        "ram_delay_line": int(parts["delay line"]),
-        "instructions_sample": int(steps[1]),
-        "instructions_voltage": int(steps[2]),
-        "instructions_at_most": int(steps[3]),
-        **of_filter,
-    }  # fmt: skip
+    core = sum(text[name] for name in text if name.startswith("cangauge"))
+    flash = [core, text["pack_model"], text["frames"]]
+    memory = [int(parts["state"]), int(parts["delay line"])]
+    return [*flash, *memory, *map(int, steps.groups())]
+
+
+def plain_costs(model: Model) -> list[int]:
+    """Measure the plain filter: memory [B], mean and largest number of instructions."""
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        export_c(model, folder)
+        shutil.copy(Path(__file__).with_name("plain_ekf.c"), folder / "test.c")
+        output = run_arm(folder)
+    found = re.search(r"plain filter: (\d+) instructions, at most (\d+); (\d+) bytes", output)
+    assert found is not None  # noqa: S101
+    mean, most, size = map(int, found.groups())
+    return [size, mean, most]
+
+
+TARGET: Final = (
+    "flash of the core [B]",
+    "flash of the model's constants [B]",
+    "flash of the frame [B]",
+    "memory of the state [B]",
+    "memory of the delay line [B]",
+    "instructions of a sample",
+    "instructions of a sample whose voltage is used (one a second)",
+    "instructions of the largest sample",
+)
+
+
+def target_table() -> Table:
+    """Measure on the Cortex-M4F."""
+    typical = Model.prior("oxide", 96, 60.0)
+    knots, published = target_costs(typical), target_costs(MODEL)
+    size, mean, most = plain_costs(typical)
+    plain = ["", "", "", f"{size:,}", "", f"{mean:,}", f"{mean:,}", f"{most:,}"]
+    table = Table("", "curve of knots", "published equation", "plain filter", title="Cortex-M4F")
+    for name, a, b, c in zip(TARGET, knots, published, plain, strict=True):
+        table.add_row(name, f"{a:,}", f"{b:,}", c)
+    return table
 
 
 def fitted(pack: Pack) -> Model:
@@ -202,30 +224,28 @@ def differing_bits(folder: Path) -> dict[str, dict[str, Any]]:
 def main() -> None:
     """Print the tables."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--bits", type=Path, metavar="FOLDER", help="recorded packs to compare on")
-    parser.add_argument("--json", action="store_true", help="print JSON")
+    parser.add_argument("--data", type=Path, metavar="FOLDER", help="recorded packs to compare on")
+    parser.add_argument("--keep", action="store_true", help="keep the figures for the documents")
     given = parser.parse_args()
-    result: dict[str, Any] = {"step": step_costs()}
+    tables = []
     if shutil.which("arm-none-eabi-gcc") and shutil.which("qemu-system-arm"):
-        result["knots"] = target_costs(Model.prior("oxide", 96, 60.0))
-        result["published"] = target_costs(MODEL)
-    if given.bits is not None:
-        result["line"] = line_errors(given.bits)
-        result["bits"] = differing_bits(given.bits)
-    if given.json:
-        print(json.dumps(result, indent=1))
-        return
-    console = Console()
-    table = Table("rate [Hz]", "step", "µs", title="Processor time of a step")
-    for row in result["step"]:
-        table.add_row(f"{row['rate_hz']:g}", row["way"], f"{row['us']:.2f}")
-    console.print(table)
-    for name in ("knots", "published", "line", "bits"):
-        if result.get(name):
-            table = Table(name, "", title=name)
-            for key, value in result[name].items():
-                table.add_row(key, str(value))
-            console.print(table)
+        tables.append(target_table())
+    steps = Table("rate [Hz]", "step", "µs", title="Processor time of a step")
+    for row in step_costs():
+        steps.add_row(f"{row['rate_hz']:g}", row["way"], f"{row['us']:.2f}")
+    tables.append(steps)
+    if given.data is not None:
+        lines = Table(
+            "memory for a sample in", "SoC [%]", title="Floats against Python, i3 at 10 Hz"
+        )
+        for period, error_pct in line_errors(given.data).items():
+            lines.add_row(period, f"{error_pct:.4f}")
+        bits = Table("pack", "numbers", "differ by 1e-9", "floats, SoC [%]", title="Against Python")
+        for pack, found in differing_bits(given.data).items():
+            error = found.get("failed") or f"{found['float_pct']:.4f}"
+            bits.add_row(pack, f"{found['numbers']:,}", str(found["differ"]), error)
+        tables += [lines, bits]
+    publish("core-cost", tables, ["core"], keeps=given.keep)
 
 
 if __name__ == "__main__":

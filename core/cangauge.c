@@ -81,7 +81,7 @@ static bool is_set_back(cg_clock *clock, cg_time stamp_s, cg_time step_s)
 /* A stamp's time, later than the last. False: refuse the sample. */
 static bool clock_time(cg_clock *clock, cg_time stamp_s, cg_time *time_s)
 {
-    const cg_time latest_s = cg_span(R(LATEST_S));
+    const cg_time latest_s = (cg_time)LATEST_S * CG_SECOND;
     const cg_time shortest_s = cg_span(R(SHORTEST_STEP_S));
     if (!((-latest_s <= stamp_s) && (stamp_s <= latest_s))) {
         return false;
@@ -843,11 +843,11 @@ void cg_set_table(cg_estimator *self, const cg_model *model)
 static bool is_plausible(const cg_state *state, const cg_model *model)
 {
     const cg_memory *memory = &state->memory;
-    const cg_filter *filter = &state->filter;
     return (memory->samples >= 0) && (memory->innovations >= 0) &&
-           (memory->innovations <= model->tested_blocks) && (filter->hypotheses >= 1) &&
-           (filter->hypotheses <= 2) && isfinite(cg_value(state->counter.discharged_pct)) &&
-           isfinite(cg_value(state->counter.counted_s)) && cg_filter_is_valid(filter, model);
+           (memory->innovations <= model->tested_blocks) &&
+           isfinite(cg_value(state->counter.discharged_pct)) &&
+           isfinite(cg_value(state->counter.counted_s)) &&
+           cg_filter_is_plausible(&state->filter, model);
 }
 
 bool cg_restore(cg_estimator *self, const cg_state *state, cg_real age_s)

@@ -46,18 +46,17 @@ static cg_real prior_var(const cg_model *model, int32_t k)
     return variance;
 }
 
-/* Time constant with which a state returns to its prior. */
-static cg_real time_of(const cg_model *model, int32_t k)
+/* What is left of each state's distance from its prior after a time. */
+static void remainders(const cg_model *model, cg_real seconds, cg_real *keep)
 {
-    cg_real time_s = R(FUNCTIONS_TIME_S);
-    if (k <= CG_X_OFFSET) {
-        time_s = R(INFINITY);
-    } else if (k == CG_X_SLOW) {
-        time_s = model->slow_time_s;
-    } else if (k == CG_X_LEVEL) {
-        time_s = R(LEVEL_TIME_S);
+    const cg_real of_functions = cg_exp(-seconds / R(FUNCTIONS_TIME_S));
+    keep[CG_X_SOC] = R(1.0);
+    keep[CG_X_OFFSET] = R(1.0);
+    keep[CG_X_SLOW] = cg_exp(-seconds / model->slow_time_s);
+    keep[CG_X_LEVEL] = cg_exp(-seconds / R(LEVEL_TIME_S));
+    for (int32_t k = CG_X_FUNCTIONS; k < cg_states(model); ++k) {
+        keep[k] = of_functions;
     }
-    return time_s;
 }
 
 static void ekf_start(cg_ekf *ekf, const cg_model *model, cg_real soc_pct, cg_real var_pct2)
@@ -95,12 +94,13 @@ static void ekf_predict(cg_ekf *ekf, const cg_model *model, const cg_passed *pas
     for (int32_t i = CG_X_SLOW; i < size; ++i) {
         ekf->p[pair(i, CG_X_SOC)] += gain * ekf->p[pair(i, CG_X_OFFSET)];
     }
+    remainders(model, all_s, keep);
     for (int32_t i = 0; i < size; ++i) {
-        keep[i] = cg_exp(-all_s / time_of(model, i));
+        const cg_real kept = keep[i];
         for (int32_t j = 0; j <= i; ++j, ++p) {
-            *p *= keep[i] * keep[j];
+            *p *= kept * keep[j];
         }
-        p[-1] += (R(1.0) - cg_square(keep[i])) * prior_var(model, i);
+        p[-1] += (R(1.0) - cg_square(kept)) * prior_var(model, i);
         ekf->x[i] *= keep[i];
     }
     ekf->p[pair(CG_X_SOC, CG_X_SOC)] += (R(DRIFT_PCT2_PER_S) * passed->seconds) + variance_pct2;
@@ -149,8 +149,9 @@ static void condition(cg_ekf *ekf, const linear *at, int32_t size, cg_real drop_
 {
     cg_real *p = ekf->p;
     for (int32_t i = 0; i < size; ++i) {
+        const cg_real gain_i = at->gain[i];
         for (int32_t j = 0; j <= i; ++j, ++p) {
-            *p -= at->gain[i] * at->spread[j];
+            *p -= gain_i * at->spread[j];
         }
     }
     cg_real t[2] = {R(0.0), drop_v};
@@ -250,10 +251,10 @@ static void ekf_update(const cg_model *model, cg_ekf *ekf, const observed *of)
         /* Damp: full Newton steps oscillate across a kink. */
         part *= ((step_pct * last_pct) < (R(-0.5) * cg_square(last_pct))) ? R(0.5) : R(1.0);
         last_pct = step_pct;
-        for (int32_t k = 0; k < size; ++k) {
-            const cg_real to =
-                (k == CG_X_SOC) ? to_pct : (ekf->x[k] + (at.gain[k] * at.innovation));
-            x[k] = (part == R(1.0)) ? to : (x[k] + (part * (to - x[k])));
+        x[CG_X_SOC] += part * step_pct;
+        for (int32_t k = CG_X_OFFSET; k < size; ++k) {
+            const cg_real step_k = ekf->x[k] + (at.gain[k] * at.innovation) - x[k];
+            x[k] += part * step_k;
         }
         is_close = cg_fabs(step_pct) < R(CLOSE_PCT);
     }
@@ -445,7 +446,8 @@ cg_real cg_filter_soc(const cg_filter *filter, const cg_model *model, const cg_p
     return soc_pct;
 }
 
-/* Whether states and variances are usable numbers. */
+/* Whether states and variances are usable numbers. A covariance that an update makes infinite does
+ * so to its two variances. */
 bool cg_filter_is_valid(const cg_filter *filter, const cg_model *model)
 {
     const int32_t size = cg_states(model);
@@ -454,11 +456,22 @@ bool cg_filter_is_valid(const cg_filter *filter, const cg_model *model)
         const cg_ekf *ekf = &filter->ekf[i];
         is_valid = is_valid && isfinite(cg_value(ekf->evidence));
         for (int32_t k = 0; k < size; ++k) {
-            is_valid = is_valid && isfinite(ekf->x[k]) && (var_of(ekf, k) > R(0.0));
-            for (int32_t j = 0; j <= k; ++j) {
-                is_valid = is_valid && isfinite(ekf->p[pair(k, j)]);
-            }
+            const cg_real variance = var_of(ekf, k);
+            is_valid = is_valid && isfinite(ekf->x[k]) && isfinite(variance) && (variance > R(0.0));
         }
     }
     return is_valid;
+}
+
+/* The same of a state that was kept elsewhere, with its covariances. */
+bool cg_filter_is_plausible(const cg_filter *filter, const cg_model *model)
+{
+    const bool has_number = (filter->hypotheses == 1) || (filter->hypotheses == 2);
+    bool is_plausible = has_number && cg_filter_is_valid(filter, model);
+    for (int32_t i = 0; is_plausible && (i < filter->hypotheses); ++i) {
+        for (int32_t k = 0; k < pair(cg_states(model), 0); ++k) {
+            is_plausible = is_plausible && isfinite(filter->ekf[i].p[k]);
+        }
+    }
+    return is_plausible;
 }

@@ -43,11 +43,17 @@ static inline cg_real cg_clip(cg_real value, cg_real low, cg_real high)
 static inline cg_real cg_square(cg_real value) { return value * value; }
 
 #if CG_HAS_FLOATS
-/* Time of a number of seconds, to the nearest tick, and back. */
+#define CG_SECOND ((cg_time)CG_TICKS_PER_S)
+#define CG_LONGEST_S 2e9 /* that an int32_t holds */
+/* Time of a number of seconds, to the nearest tick, and back. The conversion of a float to 64 bits
+ * would go through doubles: whole seconds and the rest are converted to 32 bits. */
 static inline cg_time cg_span(cg_real seconds)
 {
-    const cg_real ticks = seconds * R(CG_TICKS_PER_S);
-    return (cg_time)(ticks + ((ticks < R(0.0)) ? R(-0.5) : R(0.5)));
+    const cg_real within_s = cg_clip(seconds, R(-CG_LONGEST_S), R(CG_LONGEST_S));
+    const int32_t whole_s = (int32_t)within_s;
+    const cg_real ticks = (within_s - (cg_real)whole_s) * R(CG_TICKS_PER_S);
+    const int32_t rest = (int32_t)(ticks + ((ticks < R(0.0)) ? R(-0.5) : R(0.5)));
+    return ((cg_time)whole_s * CG_TICKS_PER_S) + rest;
 }
 static inline cg_real cg_seconds(cg_time span) { return (cg_real)span * R(1.0 / CG_TICKS_PER_S); }
 static inline bool cg_is_time(cg_time time_s) { return time_s != CG_NO_TIME; }
@@ -85,6 +91,7 @@ static inline cg_sum cg_mean(cg_sum sum, cg_real number)
 }
 #else
 #define CG_NO_TIME ((cg_time)NAN)
+#define CG_SECOND ((cg_time)1)
 static inline cg_time cg_span(cg_real seconds) { return seconds; }
 static inline cg_real cg_seconds(cg_time span) { return span; }
 static inline bool cg_is_time(cg_time time_s) { return isnan(time_s) == 0; }
@@ -197,6 +204,7 @@ void cg_filter_correct(cg_filter *filter, const cg_model *model, cg_real soc_pct
 void cg_filter_doubt(cg_filter *filter, const cg_model *model, cg_real probability,
                      cg_real std_pct, cg_real away_s, cg_real parked_std_pct);
 bool cg_filter_is_valid(const cg_filter *filter, const cg_model *model);
+bool cg_filter_is_plausible(const cg_filter *filter, const cg_model *model);
 bool cg_filter_is_rejected(const cg_filter *filter, const cg_model *model);
 cg_real cg_filter_soc(const cg_filter *filter, const cg_model *model, const cg_passed *passed,
                       cg_real *std_pct);
