@@ -43,7 +43,7 @@ FOXBMS: Final = ("foxbms_soc.c", "foxbms_soc.h")
 
 PERIOD_S: Final = 0.5
 """Time between two samples that the delay line has memory for [s]: of five drives at 10 Hz the SoC
-then differs by at most 0.005 % from that with every sample (at 1 s by 0.019 %)."""
+then differs by at most 0.009 % from that with every sample (at 1 s by 0.015 %)."""
 
 JITTER: Final = 0.9
 """Part of the period from which a sample is kept: a task's jitter stays within a tenth of it."""
