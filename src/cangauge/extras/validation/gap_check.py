@@ -26,7 +26,6 @@ from cangauge.extras.validation.twin.recording import record_drive
 from cangauge.extras.validation.twin.simulation import draw_plant
 from cangauge.identify.fit import fit
 from cangauge.logs.log import Log
-from cangauge.model.effects.library import LIBRARY
 
 FLOORS: Final = (1.0, 2.0, 4.0)
 """Injected sizes [floors]."""
@@ -130,7 +129,9 @@ class CheckedPack:
             known = learn_references(others, model)
             for log, fault, floors in self._cases(self.logs[k], known.rmse_v):
                 found = diagnose(log, model, known).posterior
-                truth = NONE if fault is None else LIBRARY[fault.id].fault
+                truth = NONE
+                if fault is not None:
+                    truth = next(k for k in found.faults if fault.id in found.effects(k))
                 p = {NONE: found.none, **found.faults}
                 yield Finding(
                     log=log.name,
