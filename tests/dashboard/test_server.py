@@ -26,7 +26,7 @@ from cangauge.extras.live.serve import Offer, to_json
 from cangauge.service.pipeline import Pipeline
 from cangauge.service.status import Monitor
 from cangauge.service.status_client import Snapshot, StatusSocket
-from live import LoggedLines, leaf_model, leaf_model_path, waits
+from live import LoggedLines, in_process, leaf_model, leaf_model_path, waits
 from running import free_port
 from served import Served
 
@@ -322,3 +322,19 @@ def test_guesses_of_the_token_are_slowed_down(both: Served) -> None:
 def test_an_origin_that_is_no_address_is_a_bad_request(page: Served, origin: str) -> None:
     assert get(page, "/stream", headers=UPGRADE | {"Origin": origin})[0] == 400
     assert get(page, "/rows", headers={"Origin": origin})[0] == 400
+
+
+@pytest.mark.parametrize("states_socket", [True, False])
+def test_the_live_command_finds_the_service_of_its_configuration(
+    states_socket: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("RUNTIME_DIRECTORY", str(tmp_path / "run"))
+    endpoint = tmp_path / "own.sock" if states_socket else tmp_path / "run" / "virtual-x.sock"
+    line = f'status_socket = "{endpoint}"\n' if states_socket else ""
+    config = tmp_path / "car.toml"
+    config.write_text(f'model = "{leaf_model_path()}"\nhttp = "0"\n{line}')
+    found: list[Path] = []
+    monkeypatch.setattr("cangauge.extras.live.serve.serve", lambda path, _offer: found.append(path))
+    with closing(StatusSocket(endpoint, lambda: snapshot().status)):
+        assert in_process("live", config).code == 0
+    assert found == [endpoint]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -89,6 +90,25 @@ def test_judgements_are_those_of_each_log_alone(folder: Path) -> None:
     table = table_of(folder, "judge", [path])
     alone = judge([path], folder / "type.json").to_dict()
     assert table["now.error_pct"] == [alone["now"]["error_pct"]]
+
+
+@pytest.mark.parametrize(
+    ("answer", "shown"),
+    [("estimate", "soc_mae_pct"), ("gap", "answer.level"), ("judge", "now.verdict")],
+)
+def test_what_a_command_refuses_is_a_row_with_its_error(
+    folder: Path, answer: str, shown: str
+) -> None:
+    drive = cangauge.read_log(drives(folder)[0])
+    write_log(
+        replace(drive, current_a=4.0 * drive.current_a), folder / "contradictory.parquet"
+    )
+    ended = in_process(
+        "fleet", answer, drives(folder)[0], folder / "contradictory.parquet",
+        "-m", folder / "type.json", "-o", folder / "some.parquet",
+    )  # fmt: skip
+    assert shown in ended.out
+    assert "failed: 1 × current_a: charge and SoC contradict each other" in ended.err
 
 
 def test_a_dask_scheduler_gives_the_same_rows(folder: Path) -> None:

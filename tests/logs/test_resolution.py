@@ -66,6 +66,14 @@ def test_no_current_of_one_sign_wraps(seed: int) -> None:
     assert wrapped_current(constant, 3.6 - 0.002 * constant) is None
 
 
+@pytest.mark.parametrize("wraps_at_a", [32.768, 65.536, 655.36])
+def test_a_load_that_only_comes_near_a_fields_end_does_not_wrap(wraps_at_a: float) -> None:
+    current = np.random.default_rng(4).uniform(0.55 * wraps_at_a, 0.99 * wraps_at_a, ROWS)
+    assert wrapped_current(current, 3.6 - 0.002 * current) is None
+    charge = np.mod(-np.round(current[::-1] - 0.54 * wraps_at_a, 2), 655.36)
+    assert wrapped_current(charge, 3.6 + 0.002 * current) is not None
+
+
 def test_a_table_whose_current_wraps_is_refused(tmp_path: Path) -> None:
     current, voltage = drive(1, -150.0, 60.0)
     rows = zip(wrapped(current, 16, 0.1), voltage, strict=True)

@@ -120,7 +120,6 @@ def estimate_command(
     from cangauge.estimation.settings import EstimatorSettings
     from cangauge.logs.canonical import write_table
     from cangauge.logs.log import Log
-    from cangauge.logs.read import LogFile
     from cangauge.model.model_file import Model
 
     settings = EstimatorSettings(
@@ -132,9 +131,14 @@ def estimate_command(
     files = {"output": output, "pack": pack, "report": report}
     check_outputs(files.values(), [log_path, model])
     pack_model = Model.load(model)
-    is_log = isinstance(reading.open(log_path), LogFile)
-    estimate = partial(_of_log, soc_from_log=initial_soc is None) if is_log else _of_capture
-    done = estimate(log_path, pack_model, settings, reading, keeps_pack=pack is not None)
+    done = estimate_file(
+        log_path,
+        pack_model,
+        settings,
+        reading,
+        soc_from_log=initial_soc is None,
+        keeps_pack=pack is not None,
+    )
     page = extra("report.estimate:estimate_page")(done, model).html() if report else ""
     with ExitStack() as all_of_them:
         parts = {what: all_of_them.enter_context(atomic_path(p)) for what, p in files.items() if p}
@@ -149,6 +153,23 @@ def estimate_command(
     found = done.to_dict() | {"assumed": assumed_of(logs)}
     show = partial(_show, done.recorded.name, found, done.table)
     finish(found, show, files, as_json=json_output)
+
+
+def estimate_file(
+    path: Path,
+    model: Model,
+    settings: EstimatorSettings,
+    reading: ReadingOptions,
+    *,
+    soc_from_log: bool = True,
+    keeps_pack: bool = False,
+) -> RecordedEstimate:
+    """Estimate a log or capture as the command does; InputError for what the command refuses."""
+    from cangauge.logs.read import LogFile
+
+    is_log = isinstance(reading.open(path), LogFile)
+    estimate = partial(_of_log, soc_from_log=soc_from_log) if is_log else _of_capture
+    return estimate(path, model, settings, reading, keeps_pack=keeps_pack)
 
 
 def write_estimates(path: Path, time_s: FloatArray, table: EstimateTable) -> None:

@@ -48,7 +48,8 @@ def wrapped_current(current_a: FloatArray, voltage_v: FloatArray) -> WrappedCurr
 
     The readings have one sign. Less `wraps_at_a` where they exceed its half, some come near zero,
     and the voltage follows their steps better than those of the readings: it does not move where
-    a current passes zero, which is a step of `wraps_at_a` in the readings.
+    a current passes zero, which is a step of `wraps_at_a` in the readings. Readings without such a
+    step must be multiples of the field's.
 
     Parameters
     ----------
@@ -74,7 +75,7 @@ def wrapped_current(current_a: FloatArray, voltage_v: FloatArray) -> WrappedCurr
     if not fields:
         return None
     wraps_at_a, _, _ = min(fields)
-    _, step_a, bits = max(  # the coarsest step that the readings show
+    shows_step, step_a, bits = max(  # the coarsest step that the readings show
         (_is_multiple(readings, step_a), step_a, bits)
         for top_a, step_a, bits in fields
         if top_a == wraps_at_a
@@ -84,7 +85,7 @@ def wrapped_current(current_a: FloatArray, voltage_v: FloatArray) -> WrappedCurr
         moved_v = np.diff(voltage_v)
         is_wrapped = _explained(np.diff(unwrapped), moved_v) > _explained(steps, moved_v)
     else:
-        is_wrapped = bits in _USUAL_BITS
+        is_wrapped = shows_step and bits in _USUAL_BITS
     reading_a = -largest if is_negative else largest
     return WrappedCurrent(wraps_at_a, bits, step_a, reading_a) if is_wrapped else None
 

@@ -109,8 +109,10 @@ def draft_of_table(
     time_s, unit_of_time, chosen["time"] = _time(cells, chosen["time"], headings, where)
     draft.values["time_s"] = time_s
     draft.stated = {FIELDS[quantity] for quantity, column in chosen.items() if column.is_stated}
-    if unit_of_time == "s, assumed" and "time_s" not in draft.stated:
-        draft.in_seconds = None
+    if unit_of_time == "s, assumed":
+        draft.in_seconds = False if "time_s" in draft.stated else None
+    elif unit_of("time_s", unit_of_time) is None:  # dates, clock times, ticks since a date
+        draft.in_seconds = True
     for quantity, column in chosen.items():
         joint = " − " if quantity == "current" else " + "
         label = joint.join(headings[place] for place in column.places)

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 _SHOWN: Final = {
     "estimate": ("soc_mae_pct", "voltage_mae_pct", "valid_fraction"),
-    "gap": ("cause.verdict", "cause.probability", "cause.probability_none"),
+    "gap": ("answer.level", "answer.stated", "answer.probability_none", "answer.check_first"),
     "judge": ("now.verdict", "now.error_pct", "now.sigma_pct", "next_step"),
 }
 """Columns that are printed; the table has all."""

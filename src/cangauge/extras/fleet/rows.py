@@ -25,6 +25,7 @@ from cangauge.errors import InputError
 
 if TYPE_CHECKING:
     from cangauge.diagnosis import Healthy
+    from cangauge.logs.log import Log
     from cangauge.model.model_file import Model
 
 Answer = Literal["estimate", "gap", "judge"]
@@ -80,28 +81,33 @@ class FleetJob:
 
 
 def _estimated(job: FleetJob, path: Path) -> Mapping[str, Any]:
+    from cangauge.cli.estimate import estimate_file
     from cangauge.estimation.settings import EstimatorSettings
-    from cangauge.logs.read import LogFile
-    from cangauge.service.offline import estimate_capture, estimate_recorded_log
 
-    model, settings = _model(job.model), EstimatorSettings()
-    if isinstance(job.reading.open(path), LogFile):
-        return estimate_recorded_log(job.reading.load(path), model, settings).to_dict()
-    return estimate_capture(path, job.reading.car_of(path), model, settings).to_dict()
+    return estimate_file(path, _model(job.model), EstimatorSettings(), job.reading).to_dict()
 
 
 def _diagnosed(job: FleetJob, path: Path) -> Mapping[str, Any]:
     from cangauge.diagnosis import diagnose
 
-    return diagnose([job.reading.load(path)], _model(job.model), _learned(job)).to_json()
+    return diagnose([_log(job, path)], _model(job.model), _learned(job)).to_json()
 
 
 def _judged(job: FleetJob, path: Path) -> Mapping[str, Any]:
     from cangauge.extras.judge.judgement import judge
 
-    log = job.reading.load(path)
+    log = _log(job, path)
     cells = [job.reading.cells_of(log)]
     return judge([log], _model(job.model), cell_voltages=cells).to_dict()
+
+
+def _log(job: FleetJob, path: Path) -> Log:
+    """Return a log; InputError where its charge and SoC contradict each other, as the commands."""
+    from cangauge.logs.charge import refuse_contradictions
+
+    log = job.reading.load(path)
+    refuse_contradictions([log], _model(job.model).capacity_ah)
+    return log
 
 
 @lru_cache(maxsize=1)

@@ -43,4 +43,6 @@ def live_command(
         raise InputError("serves nothing", source=config, cure=cure)
     with logging_to(loaded.log_format, loaded.log_level), loaded.naming_keys():
         offer = offer_of(loaded)
-        serve(endpoint or find_socket(), offer)
+        is_auto = loaded.status_socket == "auto"
+        own = find_socket() if is_auto else Path(loaded.status_socket)
+        serve(endpoint or own, offer)
