@@ -100,9 +100,7 @@ def test_what_a_command_refuses_is_a_row_with_its_error(
     folder: Path, answer: str, shown: str
 ) -> None:
     drive = cangauge.read_log(drives(folder)[0])
-    write_log(
-        replace(drive, current_a=4.0 * drive.current_a), folder / "contradictory.parquet"
-    )
+    write_log(replace(drive, current_a=4.0 * drive.current_a), folder / "contradictory.parquet")
     ended = in_process(
         "fleet", answer, drives(folder)[0], folder / "contradictory.parquet",
         "-m", folder / "type.json", "-o", folder / "some.parquet",

@@ -135,3 +135,14 @@ def test_a_column_in_ah_that_counts_something_else_is_no_counter(tmp_path: Path)
     path = tmp_path / "log.csv"
     path.write_text("\n".join(["Time [s],Current [A],Voltage [V],SoC [%],AHr", *rows, ""]))
     assert read_log(path, temperature_c=20.0).counted_ah is None
+
+
+@pytest.mark.parametrize("off_pct", [10.0, 22.0, 30.0])
+def test_a_gauge_that_stands_at_its_end_is_off_and_no_contradiction(off_pct: float) -> None:
+    log = drive(hours=2.0)
+    assert log.soc_pct is not None
+    stands_pct = np.minimum(log.soc_pct + 10.0 + off_pct, 100.0)
+    too_high = replace(log, soc_pct=stands_pct)
+    assert contradiction(too_high, CAPACITY_AH) is None
+    too_low = replace(log, current_a=-log.current_a, soc_pct=100.0 - stands_pct)
+    assert contradiction(too_low, CAPACITY_AH) is None

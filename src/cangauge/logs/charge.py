@@ -114,7 +114,7 @@ def contradiction(log: Log, capacity_ah: float | None = None) -> str | None:
     capacity_ah : float, optional
         Capacity of the pack [Ah]. Without it, the parts of the log are compared with each other.
     """
-    counts = [each for each in _counts(log) if each.span_pct >= MIN_SPAN_PCT]
+    counts = [each for each in _counts(log, at_ends=False) if each.span_pct >= MIN_SPAN_PCT]
     whole = _implied(counts)
     if whole is None:
         return None
@@ -199,8 +199,12 @@ def _implied(counts: Sequence[_Count]) -> ImpliedCapacity | None:
     return ImpliedCapacity(capacity_ah, abs(capacity_ah) * float(share))
 
 
-def _counts(log: Log) -> Iterator[_Count]:
-    """Yield the count of each piece of a log with a SoC that moves."""
+def _counts(log: Log, *, at_ends: bool = True) -> Iterator[_Count]:
+    """Yield the count of each piece of a log with a SoC that moves.
+
+    Without `at_ends` charge that moves while the SoC stands at 0 or 100 % is left out: a gauge that
+    is off stands there.
+    """
     for piece in split_where_moved(log):
         soc_pct = np.full(len(piece), np.nan) if piece.soc_pct is None else piece.soc_pct
         rows = np.isfinite(soc_pct)
@@ -210,10 +214,15 @@ def _counts(log: Log) -> Iterator[_Count]:
         step_pct = float(np.median(steps[steps > 0.0]))
         known_pct = _without_jumps(soc_pct[rows], step_pct)
         if piece.counted_ah is not None:
-            yield _Count(known_pct, piece.counted_ah[rows], 0.0, step_pct)
-            continue
-        out_ah = discharged_ah(piece.time_s, piece.current_a)[rows]
-        yield _Count(known_pct, out_ah, _sampling_std_ah(piece), step_pct)
+            out_ah, std_ah = piece.counted_ah[rows], 0.0
+        else:
+            out_ah = discharged_ah(piece.time_s, piece.current_a)[rows]
+            std_ah = _sampling_std_ah(piece)
+        if not at_ends:
+            is_end = (soc_pct[rows][1:] <= 0.0) | (soc_pct[rows][1:] >= 100.0)
+            out_ah = np.cumsum(np.where(is_end & (steps == 0.0), 0.0, np.diff(out_ah)))
+            out_ah = np.concatenate([[0.0], out_ah])
+        yield _Count(known_pct, out_ah, std_ah, step_pct)
 
 
 def _without_jumps(soc_pct: FloatArray, usual_pct: float) -> FloatArray:

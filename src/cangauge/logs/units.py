@@ -166,8 +166,8 @@ def refuse_wrong_units(
     source : object
         File, for messages.
     in_seconds : bool, optional
-        Whether the unit of time is fixed, by the format, as a capture's, or as the stamps are dates:
-        rows may then be as close as an accelerated replay makes them. None: nothing states it.
+        Whether the unit of time is fixed, as that of a capture or of dates: rows may then be as
+        close as an accelerated replay makes them. None: nothing states it.
     stated : collection of str
         Columns whose unit the user states.
     """
@@ -238,7 +238,8 @@ def _wrong_time(values: dict[str, FloatArray], *, in_seconds: bool | None) -> It
     if interval > _MAX_INTERVAL_S:
         too_slow = "a log with a row every 90 s or more cannot be used"
         if in_seconds:
-            yield interval, f"rows are {interval:g} s apart: {too_slow}", "export a row each minute", []
+            problem = f"rows are {interval:g} s apart: {too_slow}"
+            yield interval, problem, "export a row each minute", []
         problem = f"{apart}: time looks like {words[0] or 'another unit'}"
         yield interval, problem, f"convert it to seconds ({too_slow})", finer
     if not in_seconds and 0.0 < interval < 1.0 / _MAX_RATE_HZ:
