@@ -12,6 +12,8 @@ from days import FAULTS, day, more_amperes, more_resistance, more_volts, scaled_
 
 from cangauge.diagnosis import FAULTS as NINE
 from cangauge.diagnosis import Diagnosis, Healthy, Posterior, diagnose
+from cangauge.diagnosis.correction import parameters_of
+from cangauge.diagnosis.faults import Began, sentence
 from cangauge.errors import InputError
 from cangauge.logs.canonical import write_log
 from cangauge.logs.log import Log
@@ -30,6 +32,12 @@ def faulty(request: pytest.FixtureRequest, known: Healthy, model: Model) -> Diag
     fault, size = FAULTS[request.param]
     logs = [replace(fault(day(seed), size), name=request.param) for seed in (20, 21)]
     return diagnose(logs, model, known)
+
+
+def judged(found: Diagnosis, none: float = 0.0, **effects: float) -> Diagnosis:
+    """The same evidence with given probabilities; a fault is stated alone from 0.9."""
+    every = dict.fromkeys(LIBRARY, 0.0) | {"none": none, "unknown": 0.0} | effects
+    return replace(found, posterior=Posterior(every, alarm=0.05, stated_from=0.9))
 
 
 def test_a_fault_of_two_floors_is_stated(faulty: Diagnosis) -> None:
@@ -150,6 +158,10 @@ def test_a_model_with_a_wrong_level_is_told_first(references: list[Log], model: 
     assert found.model_check is not None
     assert [each.fault for each in found.model_check.missed] == ["voltage_reading"]
     assert found.is_written
+    assert "to it they look as if the pack voltage reads" in found.summary
+    assert "with the model corrected" in found.summary
+    assert found.extended_rmse_v < 0.3 * found.baseline_rmse_v
+    assert judged(found, initial_soc=1.0).why_not is None
 
 
 def test_the_model_as_fitted_describes_the_references(references: list[Log], model: Model) -> None:
@@ -188,14 +200,9 @@ def test_an_effect_of_your_own_reaches_the_diagnosis(
 
 def test_a_wrong_start_belongs_to_the_log(known: Healthy, model: Model) -> None:
     found = diagnose([wrong_start(day(seed), 8.0) for seed in (20, 21)], model, known)
-    sure = Posterior({"none": 0.0, "unknown": 0.0, "initial_soc": 1.0}, 0.05, 0.5)
-    stated = replace(
-        found,
-        posterior=replace(sure, probabilities=dict.fromkeys(LIBRARY, 0.0) | sure.probabilities),
-    )
+    stated = judged(found, initial_soc=1.0)
     assert found.evidence.effects["initial_soc"].size == pytest.approx(8.0, abs=3.0)
-    assert found.evidence.effects["initial_soc"].size == pytest.approx(8.0, abs=3.0)
-    assert "The log began at 8" in stated.summary
+    assert "The first log began at 8" in stated.summary
     assert "pass --initial-soc" in stated.summary
     assert not stated.is_written
     assert stated.extended_model == model
@@ -211,6 +218,34 @@ def test_a_correction_that_makes_the_soc_worse_is_refused(
     assert not found.is_written
     assert found.why_not is not None
     assert found.why_not in found.summary
+
+
+def test_of_two_stated_faults_the_one_with_the_smaller_error_corrects(
+    known: Healthy, model: Model
+) -> None:
+    found = diagnose([more_volts(day(seed), 5.0) for seed in (20, 21)], model, known)
+    both = judged(found, initial_soc=0.55, voltage_offset=0.45)
+    assert both.posterior.stated == ("start", "voltage_reading")
+    assert both.correction is not None
+    assert both.correction.fault == "voltage_reading"
+    assert both.extended_rmse_v == min(both.corrections[k].rmse_v for k in both.posterior.stated)
+    assert "with the voltage reading corrected" in both.summary
+
+
+def test_a_likely_fault_that_is_not_stated_is_named(healthy: Diagnosis) -> None:
+    leaning = judged(healthy, none=0.3, resistance_growth=0.7)
+    assert leaning.posterior.level == "none"
+    assert "P(no fault) 30 %, resistance 70 %." in leaning.summary
+    assert "Nothing to do" not in leaning.summary
+    assert "Nothing to do" in judged(healthy, none=0.7, resistance_growth=0.3).summary
+
+
+def test_a_sentence_has_the_sign_of_its_unit(healthy: Diagnosis) -> None:
+    evidence, pack, began = healthy.evidence.effects, healthy.healthy.linear.pack, Began("It", 80.0)
+    for of in evidence.values():
+        said = sentence(of, parameters_of(of, 3000.0), pack, began)
+        assert "ohm" not in said
+        assert " 1 (" not in said
 
 
 def test_no_sentence_contradicts_the_alarm(faulty: Diagnosis, healthy: Diagnosis) -> None:

@@ -117,9 +117,14 @@ class Correction:
         return self.rmse_v < rms(self.errors)
 
     @property
+    def fault(self) -> str:
+        """The fault that it corrects."""
+        return self.evidence.shape.effect.fault
+
+    @property
     def is_of_log(self) -> bool:
         """Whether it belongs to these logs and not to the pack."""
-        return self.evidence.shape.effect.fault == "start"
+        return self.fault == "start"
 
     def applied(self, given: ExtendedModel) -> ExtendedModel:
         """Return the model for later logs: a step that has happened persists."""

@@ -23,7 +23,7 @@ from cangauge.diagnosis.correction import (
     parameters_of,
 )
 from cangauge.diagnosis.evidence import EffectEvidence, Evidence, analyse, learn
-from cangauge.diagnosis.faults import FAULT, Quantity, sentence
+from cangauge.diagnosis.faults import FAULT, Began, Quantity, sentence
 from cangauge.diagnosis.model_check import ModelCheck, check_model
 from cangauge.diagnosis.next_step import NextStep, next_step
 from cangauge.diagnosis.pack import Healthy, LogRows, log_rows
@@ -87,14 +87,14 @@ class Diagnosis:
     """File of the corrected model, as the text names it."""
 
     @property
-    def _misses(self) -> bool:
-        """Whether the model misses the healthy logs."""
-        return self.model_check is not None and not self.model_check.describes
+    def lacks(self) -> bool:
+        """Whether effects are known that the model lacks on the healthy logs."""
+        return self.model_check is not None and bool(self.model_check.missed)
 
     @cached_property
     def _given(self) -> ExtendedModel:
         """The model that explains the healthy logs: the given one with what it misses there."""
-        if self.model_check is not None and self._misses:
+        if self.model_check is not None and self.lacks:
             return self.model_check.corrected
         return self.model.extended_model()
 
@@ -106,7 +106,7 @@ class Diagnosis:
     @cached_property
     def _baseline(self) -> list[LogErrors]:
         """Errors of each log by the model as given."""
-        if not self._misses:
+        if not self.lacks:
             return self._without[1]
         return errors_without(self.model.extended_model(), self.rows)[1]
 
@@ -130,26 +130,30 @@ class Diagnosis:
 
     def sentence(self, fault: str) -> str:
         """Return what a fault does and how much, without the end of the sentence."""
-        start_pct = self.rows[0].trace.start_pct
         pack = self.healthy.linear.pack
-        return sentence(self.best_of(fault), self.parameters(fault), pack, start_pct)
+        return sentence(self.best_of(fault), self.parameters(fault), pack, self._began)
+
+    @property
+    def _began(self) -> Began:
+        log = "The log" if len(self.rows) == 1 else "The first log"
+        return Began(log, self.rows[0].trace.start_pct)
 
     @property
     def missed_sentences(self) -> list[str]:
         """What the model misses on the healthy logs, a sentence each without its end."""
         if self.model_check is None:
             return []
-        pack, start_pct = self.model.extended_model().pack, self.rows[0].trace.start_pct
+        pack = self.model.extended_model().pack
         return [
-            sentence(each.evidence.effects[each.effect], each.parameters, pack, start_pct)
+            sentence(each.evidence.effects[each.effect], each.parameters, pack, self._began)
             for each in self.model_check.missed
         ]
 
     @cached_property
     def correction(self) -> Correction | None:
-        """The correction by the stated fault that makes left-out errors smaller; or None."""
-        for fault in self.posterior.stated:
-            found = self.corrections[fault]
+        """The correction by the stated fault that leaves the smallest left-out error; or None."""
+        stated = [self.corrections[fault] for fault in self.posterior.stated]
+        for found in sorted(stated, key=lambda each: each.rmse_v):
             if found.is_better and (found.is_of_log or self._keeps_soc(found)):
                 return found
         return None
@@ -157,9 +161,9 @@ class Diagnosis:
     @cached_property
     def why_not(self) -> str | None:
         """Why there is no correction to write; None where there is one."""
+        if self.is_written:
+            return None
         if self.correction is not None:
-            if not self.correction.is_of_log:
-                return None
             return "a wrong start belongs to these logs and not to the model: pass --initial-soc"
         if not self.posterior.stated:
             return "no fault is stated"
@@ -170,7 +174,12 @@ class Diagnosis:
     @property
     def is_written(self) -> bool:
         """Whether the corrected model differs from the given one."""
-        return self._misses or (self.correction is not None and not self.correction.is_of_log)
+        return self.lacks or (self.correction is not None and not self.correction.is_of_log)
+
+    @property
+    def is_corrected(self) -> bool:
+        """Whether `extended_rmse_v` is of another model or start than the given one."""
+        return self.lacks or self.correction is not None
 
     @cached_property
     def soc_errors_pct(self) -> tuple[float, float] | None:
@@ -193,7 +202,7 @@ class Diagnosis:
         """
         if correction.evidence.shape.place is not None:
             return True
-        before = self._soc_error_pct(self.model)
+        before = self._soc_error_pct(self._healthy_model)
         if before is None:
             return True
         after = self._soc_error_pct(self._file(correction))
@@ -216,11 +225,10 @@ class Diagnosis:
     @property
     def log_errors(self) -> list[LogErrors]:
         """Errors of each diagnosed log, before and after."""
-        if self.correction is None:
-            return self._baseline
+        corrected = self._without[1] if self.correction is None else self.correction.errors
         return [
             replace(before, after_v=log.after_v)
-            for before, log in zip(self._baseline, self.correction.errors, strict=True)
+            for before, log in zip(self._baseline, corrected, strict=True)
         ]
 
     @property
@@ -242,9 +250,9 @@ class Diagnosis:
     def closed(self) -> tuple[float | None, tuple[float, float] | None]:
         """Closed part of the squared error above a healthy log's, and its 95 % interval.
 
-        None without a correction, or without a gap above the healthy error.
+        None where nothing is corrected, or without a gap above the healthy error.
         """
-        if self.correction is None:
+        if not self.is_corrected:
             return None, None
         return closed_part(self.log_errors, self.healthy.healthy_v2)
 
@@ -264,6 +272,8 @@ class Diagnosis:
         if self.next_step is not None:
             return self.next_step.instruction
         if self.posterior.level == "none":
+            if self.posterior.leans_to_fault:
+                return "Nothing to repair yet: diagnose one more log like these with them."
             return "Nothing to do."
         return (
             "Check that the references are of this pack and without the fault; then look where the"
@@ -275,22 +285,26 @@ class Diagnosis:
         of = self.evidence.effects[effect]
         size, unit = of.visible, of.shape.unit
         if effect == "resistance_growth":
-            size, unit = size * self.healthy.linear.pack.resistance_ohm, "Ω"
+            size, unit = size * self.healthy.linear.pack.resistance_ohm, "ohm"
         return (size if of.visible <= of.shape.bound else None), unit
 
     @cached_property
     def extended_model(self) -> Model:
         """The corrected model, ready to save and run; the given one without a correction."""
-        if not self.is_written:
-            return self.model
+        if self.correction is None or self.correction.is_of_log:
+            return self._healthy_model
         return self._file(self.correction)
 
-    def _file(self, correction: Correction | None) -> Model:
-        """Return the given model with a correction, as a file."""
-        given = self._given
-        if correction is None:
-            return model_file(self.model, given, rms(self._without[1]))
-        return model_file(self.model, correction.applied(given), correction.rmse_v)
+    @cached_property
+    def _healthy_model(self) -> Model:
+        """The model that describes the healthy logs: the given one where nothing is missed."""
+        if not self.lacks:
+            return self.model
+        return model_file(self.model, self._given, rms(self._without[1]))
+
+    def _file(self, correction: Correction) -> Model:
+        """Return the model of the healthy logs with a correction."""
+        return model_file(self.model, correction.applied(self._given), correction.rmse_v)
 
     @property
     def summary(self) -> str:
@@ -346,7 +360,7 @@ class Diagnosis:
             "next_step": None if self.next_step is None else self.next_step.to_dict(),
             "correction": {
                 "accepted": self.is_written,
-                "why_not": None if self.is_written else self.why_not,
+                "why_not": self.why_not,
                 "path": self.correction_path if self.is_written else None,
             },
             "caveats": self.caveats,

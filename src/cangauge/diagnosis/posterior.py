@@ -164,6 +164,11 @@ class Posterior:
             return "gap"
         return "likely" if self.none <= max(self.alarm, LIKELY) else "none"
 
+    @property
+    def leans_to_fault(self) -> bool:
+        """Whether a fault is likelier than none."""
+        return self.none < 0.5
+
     @cached_property
     def stated(self) -> tuple[str, ...]:
         """The fault that is stated; two where none is sure enough; none without a gap."""

@@ -6,7 +6,7 @@ from html import escape
 from typing import TYPE_CHECKING, Final
 
 from cangauge._text import counted, number, significant
-from cangauge.diagnosis.faults import FAULT
+from cangauge.diagnosis.faults import FAULT, shown_unit
 from cangauge.diagnosis.rows import COVER_PCT
 from cangauge.diagnosis.simulator import correction
 from cangauge.diagnosis.where import clause
@@ -22,6 +22,8 @@ LEAST_REFERENCES: Final = 3
 """References from which on probabilities are reliable."""
 SHOWN_FROM: Final = 0.02
 """Probability from which a fault is listed."""
+MOST_SHOWN: Final = 3
+"""Faults that a sentence lists."""
 SHOWN_VISIBLE: Final = ("voltage_offset", "current_offset", "resistance_growth")
 """Effects whose smallest visible size is told where there is no gap: what a user suspects first."""
 
@@ -49,7 +51,7 @@ def answer(found: Diagnosis) -> str:
             lines.append(correction(effect.id, found.parameters(effect.fault)))
     check = found.model_check
     if check is not None and not check.describes:
-        lines = [*_model_lines(found, check), f"These logs beyond that: {lines[0]}"]
+        lines = [*_model_lines(found, check), f"These logs: {_lower(lines[0])}", *lines[1:]]
     return "\n".join(lines)
 
 
@@ -57,7 +59,9 @@ def _model_lines(found: Diagnosis, check: ModelCheck) -> list[str]:
     among = f"{volts(check.among_themselves_rmse_v)} among themselves"
     size = f"{volts(check.references_rmse_v)} ({among})"
     missed = [_lower(text) for text in found.missed_sentences]
-    what = "; ".join(missed) or "none of the nine faults explains it"
+    what = "none of the nine faults explains it"
+    if missed:
+        what = f"to it they look as if {'; '.join(missed)}"
     lines = [f"The model misses the healthy logs by {size}: {what}."]
     if check.missed:
         after = volts(check.missed[-1].rmse_v)
@@ -76,19 +80,26 @@ def _what(found: Diagnosis) -> str:
     posterior = found.posterior
     none = f"P(no fault) {percent(posterior.none)}"
     if posterior.level == "none":
-        return f"No significant gap beyond that of healthy logs: {none}."
+        rest = f", {_likeliest(found)}" if posterior.leans_to_fault else ""
+        return f"No significant gap beyond that of healthy logs: {none}{rest}."
     sure = "" if posterior.level == "gap" else f" Likely, not certain: {none}."
     if not posterior.stated:
         unknown = percent(posterior.unknown)
         return f"There is a gap that none of the nine faults explains (likelihood {unknown}).{sure}"
     texts = [found.sentence(fault) for fault in posterior.stated]
     what = ", or ".join([texts[0], *map(_lower, texts[1:])]) + "."
+    return f"{what} Likelihood: {_likeliest(found)}.{sure}"
+
+
+def _likeliest(found: Diagnosis) -> str:
+    """Return the most probable faults with their probabilities, in order."""
+    posterior = found.posterior
     shown = [
         f"{FAULT[fault].title} {percent(p)}"
         for fault, p in posterior.faults.items()
         if p >= SHOWN_FROM or fault in posterior.stated
     ]
-    return f"{what} Likelihood: {', '.join(shown[:3])}.{sure}"
+    return ", ".join(shown[:MOST_SHOWN])
 
 
 def _how_far(found: Diagnosis) -> str:
@@ -98,23 +109,32 @@ def _how_far(found: Diagnosis) -> str:
     where = clause(found.where)
     place = f"{where[0].upper()}{where[1:]}."
     before = volts(found.baseline_rmse_v)
-    if found.correction is None:
+    if not found.is_corrected:
         return f"Error {before}; {healthy}. {place}"
-    return (
-        f"Error {before} → {volts(found.extended_rmse_v)} with this corrected; {healthy}. {place}"
-    )
+    after = f"{volts(found.extended_rmse_v)} with {_corrected(found)} corrected"
+    return f"Error {before} → {after}; {healthy}. {place}"
+
+
+def _corrected(found: Diagnosis) -> str:
+    """Return what a smaller error is owed to."""
+    if found.correction is None:
+        return "the model"
+    what = "this"
+    if len(found.posterior.stated) > 1:
+        what = f"the {FAULT[found.correction.fault].title}"
+    return f"the model and {what}" if found.lacks else what
 
 
 def _to_do(found: Diagnosis) -> str:
     if found.posterior.level == "none":
         seen = [
-            f"{significant(size, 2, unit)} ({name.replace('_', ' ')})"
+            f"{significant(size, 2, shown_unit(unit))} ({name.replace('_', ' ')})"
             for name in SHOWN_VISIBLE
             for size, unit in [found.visible_from(name)]
             if size is not None
         ]
         shown = f" These logs would have shown {', '.join(seen)}." if seen else ""
-        return f"Nothing to do.{shown}"
+        return f"{found.check_first}{shown}"
     text = found.check_first
     if found.why_not is not None:
         return f"{text} No correction: {found.why_not}."
@@ -169,9 +189,8 @@ def _amount(found: Diagnosis, fault: str) -> str:
     """Return the amplitude of a fault's best shape with its interval."""
     of = next(item for item in found.parameters(fault).values() if item.ci is not None)
     low, high = of.ci or (of.value, of.value)
-    unit = of.unit.replace("ohm", "Ω")
     ends = f"{significant(low, 2)} … {significant(high, 2)}"
-    return f"{significant(of.value, 2, '' if unit == '1' else unit)} ({ends})"
+    return f"{significant(of.value, 2, shown_unit(of.unit))} ({ends})"
 
 
 def plan_text(found: Diagnosis) -> str:

@@ -81,8 +81,8 @@ def _tiles(found: Diagnosis) -> list[Tile]:
     verdict = {"gap": "found", "likely": "likely", "none": "not significant"}[answer.level]
     tiles = [Tile("Gap", verdict, f"P(no fault) {percent(answer.none)}")]
     if answer.stated:
-        fault = answer.stated[0]
-        p = f"probability {percent(answer.faults[fault])}"
+        each_p = " or ".join(percent(answer.faults[fault]) for fault in answer.stated)
+        p = f"probability {each_p}"
         tiles.append(Tile("Fault", " or ".join(FAULT[each].title for each in answer.stated), p))
     return [
         *tiles,
@@ -97,7 +97,7 @@ def _shrinks(found: Diagnosis) -> Figure:
         ("healthy logs", found.healthy_rmse_v, GREEN),
     ]
     title, caption = "Beside healthy logs", "RMS error of the voltage."
-    if found.correction is not None:
+    if found.is_corrected:
         entries.insert(1, ("corrected", found.extended_rmse_v, BLUE))
         title = "How far it shrinks"
         left_out = "the log left out" if len(found.logs) > 1 else "rows that did not size it"
