@@ -14,6 +14,7 @@ import pytest
 
 import cangauge
 from cangauge.__main__ import main
+from cangauge.extras.judge.weak import CURVE_PCT, weak_cell
 from cangauge.logs.canonical import write_table
 from cangauge.logs.read import CellColumns
 
@@ -190,6 +191,15 @@ def test_a_gauge_that_stands_still_never_agrees(pack: Pack, change) -> None:
     assert "stands still at" in judgement.text
 
 
+def test_a_gauge_that_may_stand_still_does_not_agree(pack: Pack) -> None:
+    model, logs = pack
+    left_pct = 100.0 * (drawn_ah(logs[4])[-1] - drawn_ah(logs[4])) / model.capacity_ah
+    row = int(np.flatnonzero(left_pct > 1.6)[-1])
+    judgement = cangauge.judge([*logs[:4], stuck(logs[4], 0.1, row)], model)
+    assert (judgement.verdict, names(judgement)) == ("cannot_tell", [])
+    assert cangauge.judge([*logs[:4], stuck(logs[4], 0.1, -20)], model).verdict == "agrees"
+
+
 def test_a_stand_is_seen_by_charge_in_either_direction() -> None:
     hours = np.arange(0.0, 24.0, 1.0 / 60.0)
     amps = 15.0 * np.sin(2.0 * np.pi * hours / 24.0)  # net zero over the day
@@ -278,6 +288,20 @@ def test_a_weak_cell_is_named_and_the_pack_is_as_empty_as_it(pack: Pack, lack_pc
     assert low < lack_pct < high
     behind = lack_pct * (100.0 - logs[1].soc_pct[-1]) / (100.0 - lack_pct)
     assert judgement.error_pct == pytest.approx(behind, abs=3.0 * judgement.error_std_pct)
+
+
+def test_a_weak_cell_is_not_read_below_its_empty(pack: Pack) -> None:
+    model, _ = pack
+    rng = np.random.default_rng(2)
+    soc = np.linspace(100.0, 0.0, 400)
+    lack = np.r_[18.0, rng.normal(0.0, 0.5, 11)]
+    curve_v = model.voltage_model().pseudo_ocv(CURVE_PCT) / 12.0
+    theirs = np.maximum(100.0 - (100.0 - soc[:, None]) / (1.0 - lack / 100.0), -5.0)
+    volts = np.interp(theirs, CURVE_PCT, curve_v) + rng.normal(0.0, 0.002, theirs.shape)
+    found = weak_cell([volts], [soc], [np.full(soc.size, 10.0)], curve_v)
+    assert found is not None
+    assert found.number == 1
+    assert abs(found.lack_pct - 18.0) < 2.0 * found.std_pct
 
 
 def test_the_gauges_own_count_gives_the_capacity(pack: Pack) -> None:

@@ -279,15 +279,11 @@ def _shapes(
     volts = {
         k: Contribution(volts=np.nan_to_num(part.voltage_v) / 100.0) for k, part in enumerate(parts)
     }
-    yield (
-        [
-            Term(
-                "voltage_sensor", "%", 1.5, {k: volts[k] for k in volts if k >= since}, since=since
-            )
-            for since in range(len(parts))
-        ],
-        P_FAULT,
-    )
+    sensors = [
+        Term("voltage_sensor", "%", 1.5, {k: volts[k] for k in volts if k >= since}, since=since)
+        for since in range(len(parts))
+    ]
+    yield sensors, P_SELDOM
     mean_slope = float(np.ptp(chain.extended.model.pseudo_ocv([5.0, 95.0]))) / 90.0
     under_load = {}
     for k, (part, soc) in enumerate(zip(parts, soc_pct, strict=True)):

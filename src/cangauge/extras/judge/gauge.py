@@ -51,6 +51,8 @@ class GaugeRecord(NamedTuple):
     piece: IntArray
     """Number of the piece, from 0; −1 outside."""
     stands: list[Stand]
+    held_pct: float
+    """Charge that moved at the end while y did not [%]."""
     step_pct: float
     """Resolution [%]."""
 
@@ -79,7 +81,8 @@ def read_published(
     step_pct : float
         Resolution of y [%].
     """
-    stands = _stands(shown_pct, drawn_pct, step_pct)
+    held = _held(shown_pct, drawn_pct)
+    stands = [each for each in held if each.moved_pct >= STAND_PCT + 2.0 * step_pct]
     moving = shown_pct.copy()
     for stand in stands:
         moving[stand.first : stand.last + 1] = np.nan
@@ -97,7 +100,8 @@ def read_published(
         if blank[before + 1 : after].any():
             cut[after] |= abs(count[after] - count[before]) >= least
     piece = np.where(np.isfinite(count), np.cumsum(cut), -1)
-    return GaugeRecord(shown_pct, count, piece, stands, step_pct)
+    held_pct = held[-1].moved_pct if held else 0.0
+    return GaugeRecord(shown_pct, count, piece, stands, held_pct, step_pct)
 
 
 def is_limit(shown_pct: FloatArray) -> BoolArray:
@@ -105,26 +109,22 @@ def is_limit(shown_pct: FloatArray) -> BoolArray:
     return (np.abs(shown_pct) <= LIMIT_PCT) | (np.abs(shown_pct - 100.0) <= LIMIT_PCT)
 
 
-def _stands(shown: FloatArray, drawn: FloatArray, step_pct: float) -> list[Stand]:
-    """Return where the published SoC stands still; at a limit only charge away from it counts."""
+def _held(shown: FloatArray, drawn: FloatArray) -> list[Stand]:
+    """Return where each value is held, and the charge that moves; at a limit, away from it."""
     known = np.flatnonzero(np.isfinite(shown))
     if not known.size:
         return []
     value, charge = shown[known], drawn[known]
     first = np.flatnonzero(np.diff(value, prepend=np.nan) != 0.0)
-    last = np.r_[first[1:], len(value)] - 1
-    moved = np.maximum.reduceat(charge, first) - np.minimum.reduceat(charge, first)
     result = []
-    for k in np.flatnonzero(moved >= STAND_PCT + 2.0 * step_pct):
-        part = charge[first[k] : last[k] + 1]
-        away = float(moved[k])
-        if value[first[k]] <= LIMIT_PCT:
-            away = float(np.max(np.maximum.accumulate(part) - part))
-        elif value[first[k]] >= 100.0 - LIMIT_PCT:
-            away = float(np.max(part - np.minimum.accumulate(part)))
-        if away >= STAND_PCT + 2.0 * step_pct:
-            rows = known[first[k]], known[last[k]]
-            result.append(Stand(int(rows[0]), int(rows[1]), float(value[first[k]]), away))
+    for low, high in zip(first, [*first[1:], len(value)], strict=True):
+        part = charge[low:high]
+        moved = float(np.ptp(part))
+        if value[low] <= LIMIT_PCT:
+            moved = float(np.max(np.maximum.accumulate(part) - part))
+        elif value[low] >= 100.0 - LIMIT_PCT:
+            moved = float(np.max(part - np.minimum.accumulate(part)))
+        result.append(Stand(int(known[low]), int(known[high - 1]), float(value[low]), moved))
     return result
 
 

@@ -14,9 +14,9 @@ from cangauge._text import number
 from cangauge._typing import FloatArray
 from cangauge.diagnosis.checks import check_given_once
 from cangauge.errors import InputError
-from cangauge.extras.judge.chain import SHORTEST_S, Chain
+from cangauge.extras.judge.chain import SHORTEST_S, Chain, Stretch
 from cangauge.extras.judge.faults import BEYOND, P_FAULT, Fitted, Priors, Term, explain
-from cangauge.extras.judge.gauge import is_limit, published_pct
+from cangauge.extras.judge.gauge import JUMP_PCT, is_limit, published_pct
 from cangauge.extras.judge.result import (
     OFF_PCT,
     SURE,
@@ -39,17 +39,18 @@ OFF_FROM: Final = 0.95
 AGREES_PCT: Final = 5.0
 AGREES_FROM: Final = 0.9
 """… and agrees where it is below `AGREES_PCT` [%] with this one."""
-NAMED: Final = 0.6
-"""A fault is named from this probability, as in `gap`, …"""
+NAMED: Final = 0.9
+"""A fault is named from this probability, …"""
 MATERIAL_PCT: Final = 2.0
 """… where it moves the published SoC by this somewhere: less is the gauge's resolution."""
 CONTRADICTION: Final = 2.0
 """Where charge and published SoC differ by this factor, one of the two is no such signal."""
 LEAST_MOVED_PCT: Final = 3.0
 """Least movement of both from which that can be seen [%]."""
-FITTED: Final = (1.5, 0.5, 0.25)
-"""Standard deviations of a fitted model's capacity [%], of the gauge's zero beside it [%], and of
-the voltage sensor, as its class [%]."""
+FITTED: Final = (1.5, 0.75, 0.25)
+"""Standard deviations of a fitted model's capacity [%], of the gauge's zero beside it [%], half of
+that of a full charge, since both call much the same full, and of the voltage sensor, its class
+[%]."""
 TYPICAL: Final = (3.0, 5.0, 5.0)
 """The same of a typical cell with a stated capacity. A car shows the usable part of its cells,
 which leaves up to a tenth of the charge at either end; cells of one chemistry differ by 5 %."""
@@ -271,7 +272,7 @@ def _judgement(
     if ratio is None:
         if (pieces and pieces[-1].stands_at_pct is not None) or 1.0 - within_off >= OFF_FROM:
             verdict = "off"
-        elif within_agrees >= AGREES_FROM:
+        elif within_agrees >= AGREES_FROM and not _may_stand(chain.stretches[: last + 1]):
             verdict = "agrees"
     else:
         faults = []
@@ -291,6 +292,19 @@ def _judgement(
         ratio,
         weakest,
     )
+
+
+def _may_stand(parts: Sequence[Stretch]) -> bool:
+    """Return whether the gauge has not moved at the end where a dashboard would have shown it."""
+    held_pct, end_pct = 0.0, np.nan
+    for part in reversed(parts):
+        shown = part.published.shown_pct[np.isfinite(part.published.shown_pct)]
+        if not shown.size or (held_pct and shown[-1] != end_pct):
+            break
+        held_pct, end_pct = held_pct + part.published.held_pct, shown[-1]
+        if np.ptp(shown) > 0.0:
+            break
+    return held_pct >= JUMP_PCT + 2.0 * parts[-1].published.step_pct
 
 
 def _within(

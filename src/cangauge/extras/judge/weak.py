@@ -80,8 +80,9 @@ def weak_cell(
     lack = np.empty(cells.shape[1])
     for k in range(lack.size):  # a voltage says as much of a SoC as the curve is steep
         steep = np.interp(0.5 * (S + theirs[:, k]), CURVE_PCT, slope)
-        X = np.column_stack([np.ones_like(S), (S - 100.0) / 100.0, amps / steep])
-        a = np.linalg.lstsq(X * steep[:, None], (theirs[:, k] - S) * steep, rcond=None)[0][1]
+        steep[(theirs[:, k] < 0.0) | (theirs[:, k] > 100.0)] = 0.0  # beyond it nobody knows it
+        X = np.column_stack([steep, steep * (S - 100.0) / 100.0, amps * (steep > 0.0)])
+        a = np.linalg.lstsq(X, (theirs[:, k] - S) * steep, rcond=None)[0][1]
         lack[k] = 100.0 * a / (100.0 + a)
     lack = lack - np.median(lack)
     spread = max(LEAST_STD_PCT, MAD * float(np.median(np.abs(lack))))
