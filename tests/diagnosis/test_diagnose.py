@@ -14,6 +14,7 @@ from cangauge.diagnosis import FAULTS as NINE
 from cangauge.diagnosis import Diagnosis, Healthy, Posterior, diagnose
 from cangauge.diagnosis.correction import parameters_of
 from cangauge.diagnosis.faults import Began, sentence
+from cangauge.diagnosis.model_check import ModelCheck
 from cangauge.errors import InputError
 from cangauge.logs.canonical import write_log
 from cangauge.logs.log import Log
@@ -170,6 +171,22 @@ def test_the_model_as_fitted_describes_the_references(references: list[Log], mod
     assert found.to_json()["model"]["faults"] == []
 
 
+def test_a_model_that_only_its_uncertainty_excuses_is_told(healthy: Diagnosis) -> None:
+    check = ModelCheck(2.0, 0.4, 1.5, (), healthy.model.extended_model())
+    assert check.describes
+    assert "misses the healthy logs by 2.0 V" in replace(healthy, model_check=check).summary
+    known = replace(check, references_rmse_v=0.5)
+    assert "misses" not in replace(healthy, model_check=known).summary
+
+
+def test_rows_that_do_not_follow_the_load_are_said(known: Healthy, model: Model) -> None:
+    log = day(20)
+    sparse = {name: getattr(log, name)[::60] for name in ("time_s", "current_a", "voltage_v")}
+    slow = replace(log, **sparse, temperature_c=log.temperature_c[::60], soc_pct=None)
+    found = diagnose([slow], model, known)
+    assert "a row every 60 s" in " ".join(found.caveats)
+
+
 def test_an_effect_of_your_own_reaches_the_diagnosis(
     references: list[Log], model: Model, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -229,7 +246,8 @@ def test_of_two_stated_faults_the_one_with_the_smaller_error_corrects(
     assert both.correction is not None
     assert both.correction.fault == "voltage_reading"
     assert both.extended_rmse_v == min(both.corrections[k].rmse_v for k in both.posterior.stated)
-    assert "with the voltage reading corrected" in both.summary
+    assert "with the voltage reading corrected (" in both.summary
+    assert "with the wrong start)" in both.summary
 
 
 def test_a_likely_fault_that_is_not_stated_is_named(healthy: Diagnosis) -> None:

@@ -67,6 +67,11 @@ class ModelCheck:
         """Whether the model describes the healthy logs."""
         return self.references_rmse_v <= BEYOND * self.expected_rmse_v
 
+    @property
+    def is_uncertain(self) -> bool:
+        """Whether only the uncertainty that the model states explains what it misses."""
+        return self.references_rmse_v > BEYOND * self.among_themselves_rmse_v
+
 
 def check_model(model: Model, healthy: Healthy) -> ModelCheck:
     """Return what a model misses on references, two at least."""

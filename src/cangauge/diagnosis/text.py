@@ -5,6 +5,8 @@ from __future__ import annotations
 from html import escape
 from typing import TYPE_CHECKING, Final
 
+import numpy as np
+
 from cangauge._text import counted, number, significant
 from cangauge.diagnosis.faults import FAULT, shown_unit
 from cangauge.diagnosis.rows import COVER_PCT
@@ -16,6 +18,8 @@ if TYPE_CHECKING:
     from cangauge.diagnosis.diagnose import Diagnosis
     from cangauge.diagnosis.model_check import ModelCheck
 
+SLOW_S: Final = 10.0
+"""Interval of rows that no longer follow the load: the shortest memory of both equations [s]."""
 SHORT_S: Final = 600.0
 """Duration below which slow effects hardly develop [s]."""
 LEAST_REFERENCES: Final = 3
@@ -107,12 +111,23 @@ def _how_far(found: Diagnosis) -> str:
     if not found.has_references:
         healthy = f"the model file states {volts(found.healthy_rmse_v)}"
     where = clause(found.where)
-    place = f"{where[0].upper()}{where[1:]}."
+    place = f"{where[0].upper()}{where[1:]}.{_uncertain(found)}"
     before = volts(found.baseline_rmse_v)
     if not found.is_corrected:
         return f"Error {before}; {healthy}. {place}"
-    after = f"{volts(found.extended_rmse_v)} with {_corrected(found)} corrected"
+    after = f"{volts(found.extended_rmse_v)} with {_corrected(found)} corrected{_other(found)}"
     return f"Error {before} → {after}; {healthy}. {place}"
+
+
+def _uncertain(found: Diagnosis) -> str:
+    """Return that the model knows the healthy logs badly, where no fault of it is sure."""
+    check = found.model_check
+    if check is None or not (check.describes and check.is_uncertain):
+        return ""
+    return (
+        f" The model itself is uncertain here: it misses the healthy logs by"
+        f" {volts(check.references_rmse_v)}; fit it again with them."
+    )
 
 
 def _corrected(found: Diagnosis) -> str:
@@ -123,6 +138,15 @@ def _corrected(found: Diagnosis) -> str:
     if len(found.posterior.stated) > 1:
         what = f"the {FAULT[found.correction.fault].title}"
     return f"the model and {what}" if found.lacks else what
+
+
+def _other(found: Diagnosis) -> str:
+    """Return the error with the other of two stated faults corrected."""
+    return "".join(
+        f" ({volts(found.corrections[fault].rmse_v)} with the {FAULT[fault].title})"
+        for fault in found.posterior.stated
+        if found.correction is not None and fault != found.correction.fault
+    )
 
 
 def _to_do(found: Diagnosis) -> str:
@@ -160,6 +184,13 @@ def caveats(found: Diagnosis) -> list[str]:
             remarks.append(
                 f"{percent(part)} of {log.name} lies at SoC that no reference visits (within"
                 f" {COVER_PCT:.0f} %) and is left out."
+            )
+        interval_s = float(np.median(np.diff(log.time_s)))
+        if interval_s >= SLOW_S:
+            remarks.append(
+                f"{log.name} has a row every {number(interval_s, 0, 's')}: what the current did"
+                " between them is not known, and may look like a fault of clock, resistance or"
+                " current."
             )
         if log.duration_s < SHORT_S:
             minutes = number(log.duration_s / 60.0, 0, "min")
