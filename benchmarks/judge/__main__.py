@@ -1,7 +1,7 @@
 """Chains of days with a faulty gauge: what the second opinion finds, and false alarms.
 
     cd benchmarks && python -m judge --seed 1 [--chains 10] [--faults …] [--data FOLDER] > lines
-    python -m judge --table lines
+    python -m judge --table lines [--keep]
 
 Each fault is drawn on `--chains` chains of recorded trips, cells and simulated storage, in equal
 parts, and judged with a model of other logs of the pack and without one. Prints a line of JSON for
@@ -18,8 +18,12 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from rich import box
+from rich.console import Console
+from rich.table import Table
 
 import cangauge
+from figures import publish
 from judge.chains import FAULTS, HEALTHY, PACKS, Chain, healthy_chains
 
 DATA = Path(__file__).resolve().parents[3] / "shared" / "data"
@@ -79,28 +83,62 @@ def share(values: Sequence[bool]) -> str:
     return f"{sum(values)} of {len(values)}"
 
 
-def table(path: Path) -> None:
-    """Print the tables of the lines of a run."""
-    lines = [json.loads(line) for line in path.read_text().splitlines()]
-    for with_model in (True, False):
-        some = [line for line in lines if line["model"] == with_model]
-        print(f"\n{'With' if with_model else 'Without'} a model\n")
-        head = ["fault", "off", "agrees", "within 2σ", "above 5 %: off", "named", "right"]
-        print("| " + " | ".join(head) + " |\n|" + "---|" * len(head))
+def summary(lines: Sequence[dict]) -> Table:
+    """Return what is found, with a model of the pack and without."""
+    table = Table(box=box.SIMPLE)
+    for head in ("", "with a model", "without"):
+        table.add_column(head)
+    both = [[line for line in lines if line["model"] == of] for of in (True, False)]
+    rows = [numbers(some) for some in both]
+    for name in rows[0]:
+        table.add_row(name, *(row[name] for row in rows))
+    return table
+
+
+def numbers(lines: Sequence[dict]) -> dict[str, str]:
+    """Return the numbers of some lines."""
+    healthy = [line for line in lines if line["fault"] in HEALTHY]
+    large = [line for line in lines if abs(line["true_pct"]) > LARGE_PCT]
+    small = [line for line in lines if abs(line["true_pct"]) < SMALL_PCT]
+    _, _, within, found, _, right = row(lines)
+    faulty = [bool(line["faults"]) for line in lines if line["causes"]]
+    resets = [line for line in lines if line["fault"].startswith("self_reset")]
+    weak = [line for line in lines if line["lack_pct"]]
+    cpu_s = [line["cpu_s"] for line in lines]
+    return {
+        "Alarms on healthy chains": share([is_verdict(line, "off") for line in healthy]),
+        '"off" where the error is below 3 %': share([is_verdict(line, "off") for line in small]),
+        '"agrees" where it is above 5 %': share([is_verdict(line, "agrees") for line in large]),
+        '"off" where it is above 5 %': found,
+        "Error within 2σ": within,
+        "A cause named, of faulty gauges": share(faulty),
+        "All faults named and no other, of those named": right,
+        "Size of a weak cell inside its interval": share([is_inside(line) for line in weak]),
+        "Moment of a self-reset within ten minutes": share(
+            [line["reset_off_s"][0] <= 600.0 for line in resets]
+        ),
+        "CPU of a chain: mean, most": f"{np.mean(cpu_s):.1f} s, {max(cpu_s):.1f} s",
+    }
+
+
+def by_fault(lines: Sequence[dict]) -> list[Table]:
+    """Return a table of all faults with a model of the pack, and one without."""
+    tables = []
+    for title, of in (("With a model", True), ("Without a model", False)):
+        table = Table(title=title, box=box.SIMPLE)
+        for head in ("fault", "off", "agrees", "within 2σ", "above 5 %: off", "named", "right"):
+            table.add_column(head)
+        some = [line for line in lines if line["model"] == of]
         for fault in dict.fromkeys(line["fault"] for line in some):
-            print("| " + " | ".join([fault, *row([x for x in some if x["fault"] == fault])]) + " |")
-        print("| " + " | ".join(["all", *row(some)]) + " |\n")
-        healthy = [line for line in some if line["fault"] in HEALTHY]
-        large = [line for line in some if abs(line["true_pct"]) > LARGE_PCT]
-        small = [line for line in some if abs(line["true_pct"]) < SMALL_PCT]
-        print(f"- Alarms on healthy chains: {share([is_verdict(x, 'off') for x in healthy])}")
-        print(f"- Off below 3 %: {share([is_verdict(x, 'off') for x in small])}")
-        print(f"- Agrees above 5 %: {share([is_verdict(x, 'agrees') for x in large])}")
-        resets = [x for x in some if x["fault"].startswith("self_reset")]
-        near = [x["reset_off_s"][0] <= 600.0 for x in resets]
-        print(f"- Moment of a self-reset within ten minutes: {share(near)}")
-        print(f"- CPU of a chain: mean {np.mean([x['cpu_s'] for x in some]):.1f} s,", end=" ")
-        print(f"most {max(x['cpu_s'] for x in some):.1f} s")
+            table.add_row(fault, *row([line for line in some if line["fault"] == fault]))
+        tables.append(table)
+    return tables
+
+
+def is_inside(line: dict) -> bool:
+    """Return whether a weak cell is found, and its size inside its interval."""
+    found = [fault["interval"] for fault in line["faults"] if fault["fault"] == "weak_cell"]
+    return any(low <= line["lack_pct"] <= high for low, high in found)
 
 
 def is_verdict(line: dict, verdict: str) -> bool:
@@ -140,10 +178,15 @@ def main() -> None:
     parser.add_argument("--chains", type=int, default=10, help="of each fault, over all packs")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--data", type=Path, default=DATA)
-    parser.add_argument("--table", type=Path)
+    parser.add_argument("--table", type=Path, help="lines of a run")
+    parser.add_argument("--keep", action="store_true", help="keep the first table as the page's")
     arguments = parser.parse_args()
     if arguments.table:
-        table(arguments.table)
+        lines = [json.loads(line) for line in arguments.table.read_text().splitlines()]
+        for each in by_fault(lines):
+            Console(width=130).print(each)
+        describes = ["src/cangauge/extras/judge", "benchmarks/judge"]
+        publish("judge", [summary(lines)], describes, keeps=arguments.keep)
     else:
         run(arguments)
 
