@@ -42,6 +42,7 @@ def test_a_simulator_that_is_off_everywhere_is_told_first(logs: list[Log], model
     first = found.summary.splitlines()[0]
     assert "6.0 V too high everywhere" in first
     assert "Correct its level first" in first
+    assert "Nothing to do" not in found.summary
 
 
 def test_a_corrected_simulator_is_better(logs: list[Log], model: Model) -> None:

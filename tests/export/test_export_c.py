@@ -21,7 +21,7 @@ from cangauge.estimation.estimator import Estimator
 from cangauge.estimation.offline import run_estimator, samples_of
 from cangauge.estimation.settings import EstimatorSettings
 from cangauge.extras.embedded.c_source import CORE_HEADERS, CORE_SOURCES, TabulatedModel
-from cangauge.extras.embedded.embedded import drive_with_events, export_c
+from cangauge.extras.embedded.embedded import drive_with_events, export_c, std_at_rest_pct
 from cangauge.identify.fit import fit
 from cangauge.model.model_file import Model
 from cangauge.model.published import leaf_2012_model_file
@@ -340,3 +340,7 @@ def test_period_out_of_range_is_refused(tmp_path: Path) -> None:
     pack = ("--cells", "16", "--capacity-ah", "60")
     told = in_process("export-c", *pack, "-o", tmp_path / "c", "--period", "0")
     assert (told.code, "--period: must lie within 0.001" in told.err) == (2, True)
+
+
+def test_a_model_with_a_time_skew_states_its_uncertainty_at_rest() -> None:
+    assert std_at_rest_pct(extended_by(["time_skew"])) == pytest.approx(std_at_rest_pct(PLAIN))

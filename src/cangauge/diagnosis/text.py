@@ -48,8 +48,8 @@ def answer(found: Diagnosis) -> str:
     """Return the answer in three lines: what, how far and where, what to do."""
     lines = [_what(found), _how_far(found), _to_do(found)]
     if found.simulator is not None:
-        if found.simulator.remark:
-            lines.insert(0, found.simulator.remark)
+        if found.simulator.remark:  # it says itself what to do
+            lines = [found.simulator.remark, *(lines if found.posterior.stated else lines[:2])]
         if found.correction is not None:
             effect = found.correction.evidence.shape.effect
             lines.append(correction(effect.id, found.parameters(effect.fault)))

@@ -129,9 +129,11 @@ def export_c(
 def std_at_rest_pct(model: Model) -> float:
     """Return the deviation of a SoC near 50 % that the voltage of a rest gives [%]."""
     estimator, voltage = Estimator(model, EstimatorSettings()), model.voltage_model()
-    for second in range(round(model.noise.block_s) + 1):
+    std_pct, second = math.nan, 0
+    while second <= model.noise.block_s or math.isnan(std_pct):  # a time skew ends a block later
         estimator.update(Sample(float(second), 0.0, voltage.nominal_v, voltage.t_ref_c))
-    return estimator.estimate.soc_std_pct
+        std_pct, second = estimator.estimate.soc_std_pct, second + 1
+    return std_pct
 
 
 def _refuse_foreign_names(folder: Path, names: Iterable[str]) -> None:
