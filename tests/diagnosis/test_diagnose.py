@@ -21,6 +21,7 @@ from cangauge.logs.log import Log
 from cangauge.model.effects.base import Effect, Parameter
 from cangauge.model.effects.library import LIBRARY
 from cangauge.model.model_file import Model
+from cangauge.model.published import leaf_2012_model_file
 
 
 @pytest.fixture(scope="module")
@@ -177,6 +178,12 @@ def test_a_model_that_only_its_uncertainty_excuses_is_told(healthy: Diagnosis) -
     assert "misses the healthy logs by 2.0 V" in replace(healthy, model_check=check).summary
     known = replace(check, references_rmse_v=0.5)
     assert "misses" not in replace(healthy, model_check=known).summary
+
+
+def test_a_published_equation_without_functions_is_diagnosed(references: list[Log]) -> None:
+    found = diagnose([more_volts(day(20), 5.0)], leaf_2012_model_file(), references)
+    assert "voltage_reading" in found.posterior.stated
+    json.dumps(found.to_json(), allow_nan=False)
 
 
 def test_rows_that_do_not_follow_the_load_are_said(known: Healthy, model: Model) -> None:

@@ -384,7 +384,8 @@ def of_model(model: Model, stated_v: float | None = None) -> Healthy:
 
 
 def _at_knots(soc_pct: FloatArray, values: FloatArray) -> FloatArray:
-    return np.column_stack([np.interp(KNOTS_PCT, soc_pct, each) for each in values.T])
+    found = [np.interp(KNOTS_PCT, soc_pct, each) for each in values.T]
+    return np.array(found).reshape(-1, KNOTS_PCT.size).T
 
 
 def _tried(linear: Linear) -> tuple[Shape, ...]:
