@@ -17,9 +17,6 @@ CENTRE = np.array([0.7, 0.6, 1.5, 0.5, *[0.0] * 11])
 SPREAD = np.array([1.0, 1.0, 1.0, 0.5, 3.0, *[3.0, 1.0, 1.0, 1.0, 3.0] * 2])
 """Ridge: prior mean and deviation of the two inner weights, the exponent, slope and offset of the
 library, and the outer weights of none and unknown."""
-FALSE_ALARM = 2.0
-"""Weight of a healthy case: most logs that are diagnosed have no fault, and of drawn cases one in
-six."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,12 +83,10 @@ def fit(examples: Sequence[Example]) -> dict[str, Any]:
     kind = np.array([0 if k else 1 if fault == NONE else 2
                      for k, fault in zip(known, truth, strict=True)])  # fmt: skip
 
-    cost = np.where(kind == 1, FALSE_ALARM, 1.0) * weight
-
     def outer_loss(v: np.ndarray) -> float:
         z = np.column_stack([v[0] * library + v[1], outer @ v[2:7], outer @ v[7:]])
         loss = z[np.arange(kind.size), kind] - logsumexp(z, axis=1)
-        return -float(cost @ loss) + ridge(v, 3)
+        return -float(weight @ loss) + ridge(v, 3)
 
     found = minimize(outer_loss, CENTRE[3:], method="L-BFGS-B").x.round(4).tolist()
     return {

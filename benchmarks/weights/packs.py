@@ -167,7 +167,7 @@ def _a123(data: Path) -> PackLogs:
 def _leaf(data: Path) -> PackLogs:
     paths = sorted((data / "leaf_module_ornl").glob("module123-*.csv.gz"))
     logs = [as_pack(read_log(x), MODULES, 1, 100.0) for x in paths]
-    return PackLogs("leaf", "cells", logs, MODULE_AH, MODULES * 3, (3, 20))
+    return PackLogs("leaf", "cells", logs, MODULE_AH, MODULES * 6, (3, 20))
 
 
 CAR1 = {"weights": ("02", "03", "05"), "frozen": ("07", "08")}
