@@ -244,17 +244,20 @@ def test_a_correction_that_makes_the_soc_worse_is_refused(
     assert found.why_not in found.summary
 
 
-def test_of_two_stated_faults_the_one_with_the_smaller_error_corrects(
-    known: Healthy, model: Model
+@pytest.mark.parametrize(
+    ("likelier", "other"), [("initial_soc", "voltage_offset"), ("voltage_offset", "initial_soc")]
+)
+def test_of_two_stated_faults_the_likelier_corrects(
+    known: Healthy, model: Model, likelier: str, other: str
 ) -> None:
     found = diagnose([more_volts(day(seed), 5.0) for seed in (20, 21)], model, known)
-    both = judged(found, initial_soc=0.55, voltage_offset=0.45)
-    assert both.posterior.stated == ("start", "voltage_reading")
+    both = judged(found, **{likelier: 0.55, other: 0.45})
     assert both.correction is not None
-    assert both.correction.fault == "voltage_reading"
-    assert both.extended_rmse_v == min(both.corrections[k].rmse_v for k in both.posterior.stated)
-    assert "with the voltage reading corrected (" in both.summary
-    assert "with the wrong start)" in both.summary
+    assert both.correction.fault == both.posterior.stated[0]
+    assert both.extended_rmse_v == both.corrections[both.correction.fault].rmse_v
+    words = {"initial_soc": "wrong start", "voltage_offset": "voltage reading"}
+    assert f"with the {words[likelier]} corrected (" in both.summary
+    assert f"with the {words[other]})" in both.summary
 
 
 def test_a_likely_fault_that_is_not_stated_is_named(healthy: Diagnosis) -> None:

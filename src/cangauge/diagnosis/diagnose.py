@@ -31,7 +31,7 @@ from cangauge.diagnosis.posterior import ALARM, Posterior, posterior
 from cangauge.diagnosis.rows import Simulated, Trace, trace
 from cangauge.diagnosis.simulator import Simulation, SimulatorGap, simulator_gap
 from cangauge.diagnosis.sizes import HeldOut, simulated
-from cangauge.diagnosis.where import DIFFERENT, LogErrors, closed_part, excesses, rms
+from cangauge.diagnosis.where import LogErrors, closed_part, excesses, rms
 from cangauge.errors import InputError
 from cangauge.estimation.offline import estimate
 from cangauge.identify.starts import start_by_model
@@ -151,17 +151,12 @@ class Diagnosis:
 
     @cached_property
     def correction(self) -> Correction | None:
-        """The correction by the most probable stated fault that makes left-out errors smaller.
-
-        By the other of two where that leaves a clearly smaller error; None where neither does.
-        """
-        best = None
+        """The correction by the most probable stated fault that makes left-out errors smaller."""
         for fault in self.posterior.stated:
             found = self.corrections[fault]
-            clear = best is None or best.rmse_v > DIFFERENT * found.rmse_v
-            if clear and found.is_better and (found.is_of_log or self._keeps_soc(found)):
-                best = found
-        return best
+            if found.is_better and (found.is_of_log or self._keeps_soc(found)):
+                return found
+        return None
 
     @cached_property
     def why_not(self) -> str | None:
