@@ -51,16 +51,20 @@ def check_logs(logs: Sequence[Log], references: Sequence[Log], model: Model) -> 
             if np.ptp(values) == 0.0:
                 raise InputError(
                     f"constant for {log.duration_s / 60.0:.0f} min: no diagnosis is possible",
-                    source=where, field=channel, value=f"{values[0]:g} {unit}",
+                    source=where,
+                    field=channel,
+                    value=f"{values[0]:g} {unit}",
                     cure="check the signal, or give a log in which the pack is used",
-                )  # fmt: skip
+                )
         median = float(np.median(log.voltage_v))
         if not LEAST_PART * usual <= median <= MOST_PART * usual:
             raise InputError(
                 f"this log is of another pack: the model's has about {usual:.3g} V",
-                source=where, field="voltage_v", value=round(median, 1),
+                source=where,
+                field="voltage_v",
+                value=round(median, 1),
                 cure="use the model of this pack",
-            )  # fmt: skip
+            )
         _check_count(log, model.capacity_ah)
     check_given_once((*logs, *references), cure="give each log once, either as LOG or as reference")
 

@@ -126,12 +126,14 @@ class Linear:
         currents = past_currents(true.time_s, true.current_a, rows, delays, self.low_pass_s)
         celsius = true.temperature_c[rows]
         colder = resistance_factor(celsius) / resistance_factor(self.mean_c) - 1.0
-        return np.column_stack([
-            hermite_basis(of.plain.soc_pct[rows]),
-            celsius - self.model.model.t_ref_c,
-            currents,
-            colder * (currents @ self.ohm),
-        ])  # fmt: skip
+        return np.column_stack(
+            [
+                hermite_basis(of.plain.soc_pct[rows]),
+                celsius - self.model.model.t_ref_c,
+                currents,
+                colder * (currents @ self.ohm),
+            ]
+        )
 
     def prior(
         self, model: Model, mean_v: float, mean_soc_pct: float

@@ -122,14 +122,16 @@ def excesses(logs: Sequence[LogErrors], capacity_ah: float) -> list[dict[str, An
             usable = rows > 0.0
             ratios = np.sqrt(part[usable] / rows[usable] * all_rows[usable] / whole[usable])
             mean = float(square[inside].mean())
-            found.append({
-                "axis": axis,
-                "range": [low, high],
-                "unit": unit,
-                "excess": float(np.sqrt(mean / square.mean())),
-                "rmse_v": float(np.sqrt(mean)),
-                "ci": np.quantile(ratios, [0.025, 0.975]).tolist(),
-            })  # fmt: skip
+            found.append(
+                {
+                    "axis": axis,
+                    "range": [low, high],
+                    "unit": unit,
+                    "excess": float(np.sqrt(mean / square.mean())),
+                    "rmse_v": float(np.sqrt(mean)),
+                    "ci": np.quantile(ratios, [0.025, 0.975]).tolist(),
+                }
+            )
     return found
 
 

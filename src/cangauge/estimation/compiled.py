@@ -57,10 +57,12 @@ def _load(root: Path) -> Any:
         getattr(layout, name.upper()).itemsize != size for name, size in core.SIZES.items()
     ):
         emit(
-            _LOG, logging.WARNING, "core.stale",
+            _LOG,
+            logging.WARNING,
+            "core.stale",
             "the compiled core is not of these sources: continuing in Python; "
             "compile it by `python hatch_build.py`",
-        )  # fmt: skip
+        )
         return None
     return core
 

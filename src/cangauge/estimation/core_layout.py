@@ -27,11 +27,24 @@ SUMS: Final = LOADS + 6
 """Upper limits of a model, as in the header."""
 
 KINDS: Final = (
-    "no_effect", "current_sensor", "voltage_sensor", "time_skew", "temperature_sensor",
-    "temperature_lag", "core_temperature", "resistance_growth",
-    "resistance_temperature", "resistance_soc", "resistance_asymmetry", "resistance_step",
-    "charge_transfer", "rc", "hysteresis", "entropic", "weak_cell",
-)  # fmt: skip
+    "no_effect",
+    "current_sensor",
+    "voltage_sensor",
+    "time_skew",
+    "temperature_sensor",
+    "temperature_lag",
+    "core_temperature",
+    "resistance_growth",
+    "resistance_temperature",
+    "resistance_soc",
+    "resistance_asymmetry",
+    "resistance_step",
+    "charge_transfer",
+    "rc",
+    "hysteresis",
+    "entropic",
+    "weak_cell",
+)
 """Kinds of effects, in the order of `cg_effect_kind`."""
 METHODS: Final = ("ekf", "newton", "coulomb")
 """Methods, in the order of `cg_method`."""
@@ -75,8 +88,7 @@ SETTINGS: Final = _structure(
 SAMPLE: Final = _structure("d:time_s d:current_a d:voltage_v d:temperature_c")
 CURRENT: Final = _structure("d:time_s d:current_a")
 LINE: Final = _structure("l:at i:size i:first i:count i:block d:spacing_s d:since_s d:base_s")
-SKEW: Final = _structure(
-"sample:at[WAITING] l:first l:waiting l:count", sample=SAMPLE)  # fmt: skip
+SKEW: Final = _structure("sample:at[WAITING] l:first l:waiting l:count", sample=SAMPLE)
 LAG: Final = _structure("d:time_s d:input d:value b:is_started")
 _EKF: Final = _structure(
     "d:x[STATES] d:p[PAIRS] d:evidence d:b[2] d:b_p[2,2] d:b_v[STATES,2] d:innovation2"
@@ -166,10 +178,15 @@ def model_constants(
         _fill(of, arrhenius_ohm=arrhenius.resistance_ohm)
     of["delays"], of["low_passes"] = len(voltage.delay_s), len(voltage.low_pass_s)
     _fill(
-        of, delay_s=voltage.delay_s, low_pass_s=voltage.low_pass_s,
-        load=voltage.load_coefficients, function_pct=functions.soc_pct,
-        function_v=functions.value, function_slope=functions.slope, function_load=functions.load,
-    )  # fmt: skip
+        of,
+        delay_s=voltage.delay_s,
+        low_pass_s=voltage.low_pass_s,
+        load=voltage.load_coefficients,
+        function_pct=functions.soc_pct,
+        function_v=functions.value,
+        function_slope=functions.slope,
+        function_load=functions.load,
+    )
     for name in (
         "t_ref_c",
         "usual_c",
@@ -180,8 +197,16 @@ def model_constants(
         "nominal_v",
     ):
         of[name] = getattr(voltage, name)
-    for name in ("level_std_v", "slow_std_v", "slow_time_s", "fast_std_v", "soc_std_pct",
-                 "cold_exponent", "residual_std_v", "block_s"):  # fmt: skip
+    for name in (
+        "level_std_v",
+        "slow_std_v",
+        "slow_time_s",
+        "fast_std_v",
+        "soc_std_pct",
+        "cold_exponent",
+        "residual_std_v",
+        "block_s",
+    ):
         of[name] = getattr(noise, name)
     of["rate_hz"], of["capacity_ah"] = model.rate_hz, online.capacity_ah
     of["charge_efficiency"] = counting.charge_efficiency

@@ -37,8 +37,15 @@ from cangauge.model.model_file import Model
 from cangauge.types import Sample
 
 EMBEDDED: Final = (
-    "Makefile", "frames.c", "frames.h", "example.c", "test.c", "clock.h", "startup.c", "mps2.ld",
-)  # fmt: skip
+    "Makefile",
+    "frames.c",
+    "frames.h",
+    "example.c",
+    "test.c",
+    "clock.h",
+    "startup.c",
+    "mps2.ld",
+)
 FOXBMS: Final = ("foxbms_soc.c", "foxbms_soc.h")
 
 PERIOD_S: Final = 0.5

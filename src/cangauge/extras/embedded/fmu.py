@@ -179,9 +179,13 @@ class _Unit:
         name = re.sub(r"\W+", "_", f"{kind} {model.name}", flags=re.ASCII).rstrip("_")
         token = hashlib.sha256(f"{kind} {__version__} {model.to_json()}".encode())
         return cls(
-            name[:LONGEST_NAME], kind, constants, tuple(variables), tuple(parameters),
+            name[:LONGEST_NAME],
+            kind,
+            constants,
+            tuple(variables),
+            tuple(parameters),
             token.hexdigest(),
-        )  # fmt: skip
+        )
 
     @property
     def sources(self) -> list[str]:
@@ -247,13 +251,14 @@ class _Unit:
             },
         )
         interface = ET.SubElement(
-            root, "CoSimulation",
+            root,
+            "CoSimulation",
             {
                 "modelIdentifier": self.identifier,
                 "canHandleVariableCommunicationStepSize": "true",
                 "canGetAndSetFMUstate": "true",
             },
-        )  # fmt: skip
+        )
         files = ET.SubElement(interface, "SourceFiles")
         for name in self.sources:
             ET.SubElement(files, "File", name=name)
@@ -285,14 +290,22 @@ def _pack_variables(model: Model) -> tuple[Variable, ...]:
         Variable("voltage_v", "output", "V", None, "voltage at the terminals"),
         Variable("soc_pct", "output", "%", None, "state of charge"),
         Variable(
-            "initial_soc_pct", "parameter", "%", 50.0, "state of charge at the start",
+            "initial_soc_pct",
+            "parameter",
+            "%",
+            50.0,
+            "state of charge at the start",
             range=(0.0, 100.0),
         ),
         Variable(
-            "capacity_ah", "parameter", "A.h", model.extended_model().counting(50.0).capacity_ah,
-            "charge from full to empty", range=AMPERE_HOURS,
+            "capacity_ah",
+            "parameter",
+            "A.h",
+            model.extended_model().counting(50.0).capacity_ah,
+            "charge from full to empty",
+            range=AMPERE_HOURS,
         ),
-    )  # fmt: skip
+    )
 
 
 def _estimator_variables() -> tuple[Variable, ...]:
@@ -303,7 +316,10 @@ def _estimator_variables() -> tuple[Variable, ...]:
         Variable("voltage_v", "input", "V", 0.0, "measured voltage"),
         Variable("soc_pct", "output", "%", None, "state of charge"),
         Variable(
-            "initial_soc_pct", "parameter", "%", -1.0,
+            "initial_soc_pct",
+            "parameter",
+            "%",
+            -1.0,
             "state of charge at the start; negative: found from the first voltages",
             range=(-1.0, 100.0),
         ),
@@ -315,7 +331,7 @@ def _estimator_variables() -> tuple[Variable, ...]:
         Variable("soc_newton_pct", "output", "%", None, "by the voltage model alone"),
         Variable("soc_coulomb_pct", "output", "%", None, "by counting alone"),
         Variable("voltage_model_v", "output", "V", None, "predicted voltage"),
-    )  # fmt: skip
+    )
 
 
 def _effect_parameters(
@@ -345,9 +361,12 @@ def _add(parent: ET.Element, reference: int, item: Variable) -> None:
     )
     initial = {"output": "calculated", "parameter": "exact"}.get(item.causality)
     attributes = {
-        "name": item.name, "valueReference": str(reference), "causality": item.causality,
-        "variability": variability, "description": item.description,
-    }  # fmt: skip
+        "name": item.name,
+        "valueReference": str(reference),
+        "causality": item.causality,
+        "variability": variability,
+        "description": item.description,
+    }
     attributes |= {} if initial is None else {"initial": initial}
     outer = ET.SubElement(parent, "ScalarVariable", attributes)
     limits = zip(("min", "max"), item.range or FINITE, FINITE, strict=True)

@@ -182,9 +182,14 @@ def _suite(
         for score in scores
     ]
     head = [
-        "fault", "MAE [%]", "worst [%]", "jumps/h", "within 5 % after [min]", "within 2σ [%]",
+        "fault",
+        "MAE [%]",
+        "worst [%]",
+        "jumps/h",
+        "within 5 % after [min]",
+        "within 2σ [%]",
         "silent [%]",
-    ]  # fmt: skip
+    ]
     result = {
         "schema": 1,
         "gauge": " ".join(started_by),

@@ -258,10 +258,13 @@ class _Gauge:
         drive.model.save(model)
         start_pct = min(max(float(drive.true_pct[0]) + fault.start_pct, 0.0), 100.0)
         places = {
-            "interface": self._address.interface, "channel": self._address.channel,
+            "interface": self._address.interface,
+            "channel": self._address.channel,
             "port": self._address.options["port"],
-            "model": model, "capacity_ah": f"{capacity_ah:g}", "soc": f"{start_pct:.2f}",
-        }  # fmt: skip
+            "model": model,
+            "capacity_ah": f"{capacity_ah:g}",
+            "soc": f"{start_pct:.2f}",
+        }
         command = [_filled(word, places) for word in self._command]
         with (self._folder / "gauge.log").open("wb") as log:
             try:

@@ -99,10 +99,15 @@ class CheckedPack:
         pack, ambient_c = plant.pack, float(rng.uniform(8.0, 25.0))
         drives = [
             draw_drive(
-                rng, pack, hours=2.0, ambient_c=ambient_c, start_soc=1.0, end_soc=0.05,
+                rng,
+                pack,
+                hours=2.0,
+                ambient_c=ambient_c,
+                start_soc=1.0,
+                end_soc=0.05,
                 discharge=True,
             )
-        ]  # fmt: skip
+        ]
         drives += [
             draw_drive(rng, pack, hours=0.8, ambient_c=float(ambient_c + away))
             for away in np.linspace(-7.0, 7.0, SIMULATED_LOGS - 1)

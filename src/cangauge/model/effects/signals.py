@@ -185,9 +185,34 @@ CORRECTIONS: Final = (
         fault="clock",
         parameters=(
             Parameter(
-                "skew_s", "s", -4.0, 4.0, healthy_std=0.0125,
-                grid=(-4.0, -3.0, -2.0, -1.5, -1.0, -0.7, -0.5, -0.35, -0.2, -0.1, 0.0,
-                      0.1, 0.2, 0.35, 0.5, 0.7, 1.0, 1.5, 2.0, 3.0, 4.0),
+                "skew_s",
+                "s",
+                -4.0,
+                4.0,
+                healthy_std=0.0125,
+                grid=(
+                    -4.0,
+                    -3.0,
+                    -2.0,
+                    -1.5,
+                    -1.0,
+                    -0.7,
+                    -0.5,
+                    -0.35,
+                    -0.2,
+                    -0.1,
+                    0.0,
+                    0.1,
+                    0.2,
+                    0.35,
+                    0.5,
+                    0.7,
+                    1.0,
+                    1.5,
+                    2.0,
+                    3.0,
+                    4.0,
+                ),
             ),
         ),
         signature="∝ R·dI/dt: spikes of either sign at every change of load",
@@ -246,7 +271,11 @@ CORRECTIONS: Final = (
             Parameter("rise_k", "K", 0.0, 25.0),
             Parameter("late", "1", 0.0, 1.0),
             Parameter(
-                "tau_s", "s", 150.0, 4000.0, neutral=None,
+                "tau_s",
+                "s",
+                150.0,
+                4000.0,
+                neutral=None,
                 grid=(200.0, 500.0, 1000.0, 2000.0, 3500.0),
             ),
         ),
@@ -269,7 +298,7 @@ CORRECTIONS: Final = (
             "core_temperature", (v["rise_k"], v["late"], pack.capacity_ah), (v["tau_s"],) * 2
         ),
     ),
-)  # fmt: skip
+)
 
 COUNTS: Final = (
     # By ageing, cold or a wrong data sheet.

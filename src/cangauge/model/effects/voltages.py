@@ -266,7 +266,12 @@ VOLTAGES: Final = (
         parameters=(
             Parameter("scale_v", "V", 0.0, 0.03, scale="voltage"),
             Parameter(
-                "exchange_a", "A", 0.01, 2.0, neutral=None, scale="capacity",
+                "exchange_a",
+                "A",
+                0.01,
+                2.0,
+                neutral=None,
+                scale="capacity",
                 grid=(0.02, 0.05, 0.12, 0.3, 0.8),
             ),
             Parameter("bend_only", "1", 0.0, 1.0, neutral=None, grid=(1.0, 0.0)),
@@ -309,7 +314,11 @@ VOLTAGES: Final = (
         parameters=(
             Parameter("ohm", "ohm", 0.0, 1.5, scale="resistance"),
             Parameter(
-                "tau_s", "s", 70.0, 2500.0, neutral=None,
+                "tau_s",
+                "s",
+                70.0,
+                2500.0,
+                neutral=None,
                 grid=(80.0, 130.0, 220.0, 400.0, 750.0, 1400.0, 2400.0),
             ),
             ACTIVATION,
@@ -338,8 +347,7 @@ VOLTAGES: Final = (
             Parameter("travel_pct", "%", 0.5, 12.0, neutral=None, grid=(1.0, 2.0, 4.0, 7.0, 11.0)),
         ),
         signature=(
-            "memory of sign(I) over Ah: reverses with lasting charge or discharge, persists at"
-            " rest"
+            "memory of sign(I) over Ah: reverses with lasting charge or discharge, persists at rest"
         ),
         equation="ΔU = M·h, dh/dt = |I|/(γ·C)·(−sign(I) − h)",
         source="one-state model, Plett, J. Power Sources 134 (2004) 262",
@@ -386,7 +394,11 @@ VOLTAGES: Final = (
         parameters=(
             Parameter("fraction", "1", 0.0, 0.06),
             Parameter(
-                "deficit_pct", "%", 2.0, 65.0, neutral=None,
+                "deficit_pct",
+                "%",
+                2.0,
+                65.0,
+                neutral=None,
                 grid=(4.0, 7.0, 11.0, 16.0, 23.0, 33.0, 48.0),
             ),
         ),
@@ -401,4 +413,4 @@ VOLTAGES: Final = (
         over_soc=_weak_less_healthy,
         core_form=lambda v, *_: CoreForm("weak_cell", (v["fraction"], _ahead(v))),
     ),
-)  # fmt: skip
+)
