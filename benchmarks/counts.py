@@ -25,8 +25,18 @@ from tempfile import TemporaryDirectory
 from typing import Final
 
 import can
+import numpy as np
 from rich.table import Table
 
+from cangauge._resources import shared_file
+from cangauge.bus.vehicle import Vehicle
+from cangauge.estimation.offline import run_estimator, samples_of
+from cangauge.estimation.settings import EstimatorSettings
+from cangauge.logs.canonical import write_log
+from cangauge.logs.log import Log
+from cangauge.model.model_file import Model
+from cangauge.replay.encoder import FrameEncoder
+from cangauge.service.pipeline import Pipeline
 from figures import publish
 
 HERE: Final = Path(__file__).parent
@@ -43,22 +53,25 @@ PEAK: Final = "\nprint([x for x in open('/proc/self/status') if 'VmHWM' in x][0]
 MODULES: Final = "\nimport sys; print(len(sys.modules))"
 
 
+def drive(rows: int) -> Log:
+    """Return a drive at 10 Hz."""
+    time_s = 0.1 * np.arange(float(rows))
+    current_a = 20.0 + 10.0 * np.sin(time_s)
+    return Log(time_s, current_a, 380.0 - 0.1 * current_a, np.full(rows, 23.0))
+
+
 def work(name: str, times: int) -> None:
     """Do a work so many times, after a preparation that is the same for all works."""
-    from cangauge.bus.vehicle import Vehicle  # noqa: PLC0415 - counted where it is called
-    from cangauge.estimation.offline import run_estimator  # noqa: PLC0415
-    from cangauge.estimation.settings import EstimatorSettings  # noqa: PLC0415
-    from cangauge.service.pipeline import Pipeline  # noqa: PLC0415
-    from cost import drive, model, wanted_frames  # noqa: PLC0415
-
-    frames = wanted_frames(TIMES)
+    encoder = FrameEncoder(Vehicle.load("generic"))
+    frames = [frame for sample in samples_of(drive(TIMES)) for frame in encoder.encode(sample)]
     other = can.Message(arbitration_id=0x7A5, is_extended_id=False, data=bytes(8))
-    known, log = model(), drive(10)
-    pipeline = Pipeline(Vehicle.load("generic"), known)
-    pipeline.handle(frames[0])
+    model = Model.load(shared_file("replay", "leaf2012_published_model.json"))
+    log = drive(TIMES)
+    pipeline = Pipeline(Vehicle.load("generic"), model)
+    for frame in frames[:3]:
+        pipeline.handle(frame)
     if name == "row offline":
-        run_estimator(log.rows(slice(0, max(times, 2))), known, EstimatorSettings())
-        return
+        run_estimator(log.rows(slice(0, max(times, 2))), model, EstimatorSettings())
     for place in range(times):
         if name == "wanted frame":
             pipeline.handle(frames[place])
@@ -88,15 +101,13 @@ def instructions() -> dict[str, int]:
     """Return instructions by work and by start."""
     code = "import sys, counts; counts.work(sys.argv[1], int(sys.argv[2]))"
     with ThreadPoolExecutor(os.cpu_count()) as pool:
-        before = pool.submit(callgrind, code, "nothing", "0")
-        few = pool.submit(callgrind, code, "row offline", "2")
+        before = pool.submit(callgrind, code, "row offline", "2")
         after = {name: pool.submit(callgrind, code, name, str(TIMES)) for name in WORKS}
         starts = {
             f"start of cangauge {name}": pool.submit(callgrind, START, *name.split())
             for name in ("--help", "run --help")
         }
-    base = {name: few if name == "row offline" else before for name in WORKS}
-    found = {name: (after[name].result() - base[name].result()) // TIMES for name in WORKS}
+    found = {name: (after[name].result() - before.result()) // TIMES for name in WORKS}
     return found | {name: start.result() for name, start in starts.items()}
 
 
@@ -109,14 +120,11 @@ def printed(code: str, *arguments: str) -> int:
 
 def others() -> dict[str, int]:
     """Return memory [MiB] and modules."""
-    from cangauge.logs.canonical import write_log  # noqa: PLC0415
-    from cost import drive  # noqa: PLC0415 - imports the package
-
     whole = f"import atexit\natexit.register(lambda: exec({PEAK!r}))\n{START}"
     modules = f"import atexit\natexit.register(lambda: exec({MODULES!r}))\n{START}"
     with TemporaryDirectory() as folder:
         log = Path(folder, "log.csv")
-        write_log(drive(10).rows(slice(0, 200)), log)
+        write_log(drive(200), log)
         inspect = ("inspect", str(log))
         return {
             "memory of importing the service [MiB]": printed(SERVICE + PEAK) // 1024,
