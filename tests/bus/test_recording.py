@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from cangauge.bus.recording import capture_samples, capture_to_log, open_recording, read_log
+from cangauge.bus.readers import PAUSE_S
 from cangauge.bus.time_source import ClockFrames
 from cangauge.bus.vehicle import Vehicle
 from cangauge.errors import InputError
@@ -207,6 +208,27 @@ def test_losses_refusals_and_late_stamps_are_remarks(tmp_path: Path, generic: Ve
         frame.timestamp = 5.0
     with pytest.raises(InputError, match="does not advance"):
         capture_to_log(record(tmp_path / "x.log", frames), generic)
+
+
+def test_sessions_pasted_together_are_said_and_kept_apart(tmp_path: Path, generic: Vehicle) -> None:
+    (tmp_path / "x.log").write_bytes(b"".join(dated(generic, start) for start in (5000, 1000)))
+    log = capture_to_log(tmp_path / "x.log", generic)
+    assert "the stamps start again: 2 sessions in one file" in log.remarks
+    assert len(log) == 400
+    assert np.diff(log.time_s).max() == pytest.approx(PAUSE_S, abs=0.2)
+    estimated = estimate_capture(tmp_path / "x.log", generic, leaf_2012_model_file())
+    assert any(
+        "2 sessions in one file, estimated as one" in each for each in estimated.recorded.remarks
+    )
+
+
+def dated(vehicle: Vehicle, start_s: float) -> bytes:
+    """Return a candump log of a drive; python-can writes no stamp that steps back."""
+    lines = (
+        f"({frame.timestamp:.6f}) can0 {frame.arbitration_id:03X}#{bytes(frame.data).hex()}\n"
+        for frame in drive(vehicle, start_s=1.7e9 + start_s)
+    )
+    return "".join(lines).encode()
 
 
 def test_of_several_buses_the_one_with_most_samples_is_taken(

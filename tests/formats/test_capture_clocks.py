@@ -201,3 +201,19 @@ def test_lines_that_python_can_leaves_out_are_said(tmp_path: Path) -> None:
     frames, capture = read(tmp_path / "x.trc")
     assert len(frames) == 3
     assert "2 lines left out, which python-can does not read" in capture.info.remarks
+
+
+CSV = (
+    "timestamp,arbitration_id,extended,remote,error,dlc,data\n1.0,0x356,0,0,0,2,AQI=\n"
+    "2.0,0x3Z6,0,0,0,2,AQI=\n3.0,0x356,0,0,0,2,AQI=\n4.0,0x356,0\n5.0,0x356,0,0,0,2,AQI=\n"
+)
+
+
+@pytest.mark.parametrize("text", [TRC.replace("0040", "00").replace("Error      ", "Rx  x"), CSV])
+def test_a_malformed_line_does_not_end_what_python_can_reads(tmp_path: Path, text: str) -> None:
+    (tmp_path / "x.csv").write_text(text)
+    frames, capture = read(tmp_path / "x.csv")
+    assert len(frames) == 3
+    assert not capture.info.cut_off
+    said = [int(remark.split()[0]) for remark in capture.info.remarks]
+    assert sum(said) == 2

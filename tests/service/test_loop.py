@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import itertools
+from pathlib import Path
 
 import can
 import numpy as np
 import pytest
-from simulated import EPOCH_S, SimulatedPort, frames_every, simulate
+from simulated import EPOCH_S, GIVEN, SimulatedPort, frames_every, simulate
 
 from cangauge.bus.connection import BusConnection, BusError
 from cangauge.bus.open import BackendCapabilities, Stamps
@@ -183,6 +184,35 @@ def test_a_signal_that_never_comes_is_logged_after_a_minute(
         said = [each for each in caplog.records if "never" in each.getMessage()]
         assert len(said) == count
     assert said[0].getMessage() == "soc: PACK_SOC was never seen: no frames of 0x403"
+
+
+UNSIGNED = """BO_ 256 BMS: 4 X
+ SG_ PackCurrent : 0|16@1+ (0.01,0) [0|0] "A" X
+ SG_ PackVoltage : 16|16@1+ (0.1,0) [0|0] "V" X
+"""
+
+
+def test_a_current_read_unsigned_is_named_with_its_cure(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    (tmp_path / "a.dbc").write_text(UNSIGNED)
+    text = 'dbc = "a.dbc"\ncurrent = "PackCurrent"\nvoltage = "PackVoltage"\n'
+    (tmp_path / "a.toml").write_text(text + "temperature.fixed_c = 20\n")
+    pipeline = Pipeline(Vehicle.load(map=tmp_path / "a.toml"), leaf_model(), GIVEN)
+    frames = []
+    for row in range(100):
+        number = 100 * (row % 15 - 7) % 65536  # −7 … 7 A
+        data = number.to_bytes(2, "little") + (3700).to_bytes(2, "little")
+        frame = can.Message(
+            EPOCH_S + 0.1 * row, arbitration_id=256, data=data, is_extended_id=False
+        )
+        frames.append((0.1 * row, frame))
+    port = simulate(SimulatedPort(frames), 10.0, pipeline)
+    said = [each.getMessage() for each in caplog.records if "unsigned" in each.getMessage()]
+    assert len(said) == 1
+    assert "just below 655.36 A" in said[0]
+    assert "state signed = true under [current] of the map file" in said[0]
+    assert port.published[-1][1].reasons & Reason.IMPLAUSIBLE_INPUT
 
 
 @pytest.mark.parametrize(

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import math
+from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Final, NamedTuple
 
 import can
+import numpy as np
 
+from cangauge._typing import FloatArray
 from cangauge.bus.database import SignalCodec
 from cangauge.bus.isotp import READ_BY_IDENTIFIER, Reassembler, reply_id
 from cangauge.bus.plausibility import (
@@ -33,6 +36,8 @@ _DUPLICATE, _NO_REASON, _GOOD = Reason.DUPLICATE_SENDER, Reason.NONE, Verdict.GO
 SUSPECTED_FOR_S: Final = 10.0
 """Time after the last sign of a second sender for which a message is refused [s]: longer than an
 attacker's pause between two tries, well below the longest gap over which charge is counted."""
+_LATEST: Final = 1000
+"""Currents by which a signed number that is read unsigned is found: 10 s of a fast message."""
 
 
 @dataclass(slots=True)
@@ -215,6 +220,20 @@ class _Route:
             signal.health.fail(reason, is_repeated=is_repeated)
 
 
+def unsigned_reading(codec: SignalCodec, current_a: FloatArray) -> tuple[str, str] | None:
+    """Return problem and cure if negative currents [A] are read as large ones; else None."""
+    bits = codec.wrapped_bits(current_a)
+    if bits is None:
+        return None
+    top_a = (1 << bits) * abs(codec.gain * codec.factor)
+    wrapped = int((2.0 * np.abs(current_a) > top_a).sum())
+    problem = f"read unsigned: {wrapped} of {current_a.size} values lie just below {top_a:.6g} A,"
+    cure = "state signed = true under [current] of the map file"
+    if bits < codec.field.width:
+        cure = f"make it a signed signal of {bits} bits in the DBC"
+    return f"{problem} as negative ones of {bits} bits do", cure
+
+
 class SampleDecoder:
     """Decode a vehicle's frames to samples; a pure function of frames and time stamps.
 
@@ -278,6 +297,7 @@ class SampleDecoder:
             for place, cell in enumerate(vehicle.cells.cells):
                 self._route(cell).cells.append((place, cell.codec))
         self._current, self._voltage = self.health["current"], self.health["voltage"]
+        self._latest_a: deque[float] = deque(maxlen=_LATEST)
         self._temperature = self.health.get("temperature")
         health = self.health
         self._needed = [(health[role], why) for role, why in _MISSING.items() if role in health]
@@ -354,9 +374,11 @@ class SampleDecoder:
         for decode, is_present, health in route.inputs:
             if is_present is not None and not is_present(payload):
                 continue
-            value = health.update(decode(payload), time_s)
+            decoded = decode(payload)
+            value = health.update(decoded, time_s)
             if health is self._current:
                 current_a = value
+                self._latest_a.append(decoded)
             elif health is self._voltage:
                 voltage_v = value
         sample: Sample | None = None
@@ -396,6 +418,13 @@ class SampleDecoder:
     def is_voltage_implausible(self) -> bool:
         """Whether the newest voltage was refused as implausible."""
         return self._voltage.is_implausible
+
+    @property
+    def unsigned_current(self) -> str | None:
+        """Problem and cure where the latest currents are signed numbers read unsigned."""
+        codec = self.vehicle.current.codec
+        found = unsigned_reading(codec, np.array(self._latest_a))
+        return None if found is None else f"{codec.name}: {'; '.join(found)}"
 
     @property
     def two_sender_messages(self) -> tuple[str, ...]:

@@ -7,6 +7,7 @@ samples lack.
 from __future__ import annotations
 
 from array import array
+from collections import defaultdict
 from collections.abc import Mapping, Sized
 from dataclasses import dataclass, replace
 from os import PathLike
@@ -26,7 +27,8 @@ from cangauge.bus.captures import (
     open_capture,
     parts_of_run,
 )
-from cangauge.bus.decoder import FrameStatistics, SampleDecoder
+from cangauge.bus.decoder import FrameStatistics, SampleDecoder, unsigned_reading
+from cangauge.bus.readers import PAUSE_S
 from cangauge.bus.time_source import RecordedTime, TimeSource, time_source
 from cangauge.bus.vehicle import LOG_COLUMNS, Vehicle
 from cangauge.errors import InputError, require_temperature
@@ -197,7 +199,8 @@ class CaptureSamples:
 
     Times are bus times, `soc_pct` is the car's own SoC when the sample was made. Without a model no
     value is refused as impossible for the pack, but a SoC outside 0–100 % is. `statistics` are
-    those of the chosen bus, `remarks` losses and refusals, for the user.
+    those of the chosen bus, `remarks` losses and refusals, for the user; `sessions` are the samples
+    at which the stamps start again.
     """
 
     time_s: FloatArray
@@ -210,6 +213,7 @@ class CaptureSamples:
     statistics: FrameStatistics
     info: CaptureInfo
     remarks: tuple[str, ...]
+    sessions: tuple[int, ...] = ()
 
     def __len__(self) -> int:
         """Return the number of samples."""
@@ -261,6 +265,7 @@ def capture_samples(path: str | PathLike[str], vehicle: Vehicle) -> CaptureSampl
     capture, recorded = open_vehicle_capture(path, vehicle), RecordedTime()
     # Of each bus: its time (stamps of two buses can be of two adapters), decoder, and values.
     buses: dict[Any, tuple[TimeSource, SampleDecoder, array[float]]] = {}
+    sessions: defaultdict[Any, list[int]] = defaultdict(list)
     for message in capture:
         if recorded.begins_replay(message):
             buses.clear()
@@ -270,6 +275,8 @@ def capture_samples(path: str | PathLike[str], vehicle: Vehicle) -> CaptureSampl
         own, decoder, values = buses[message.channel]
         if (now_s := own.time_of(message)) is not None:
             message.timestamp = now_s
+            if own.steps_back > len(sessions[message.channel]):
+                sessions[message.channel].append(len(values) // 5)
             _keep(decoder.handle(message), decoder, values)
     for _, decoder, values in buses.values():
         _keep(decoder.flush(), decoder, values)
@@ -284,6 +291,8 @@ def capture_samples(path: str | PathLike[str], vehicle: Vehicle) -> CaptureSampl
         remarks.append(f"several buses carry the frames; bus {channel} is used: most samples")
     if recorded.name == "replay-clock":
         remarks.append("a recorded replay: time is its log's (REPLAY_CLOCK)")
+    if sessions[channel]:
+        remarks.append(f"the stamps start again: {len(sessions[channel]) + 1} sessions in one file")
     if own.beginnings:
         remarks.append(f"the replay clock starts again {own.beginnings} times")
     time_s, current_a, voltage_v, temperature_c, soc_pct = np.array(values).reshape(-1, 5).T
@@ -299,6 +308,7 @@ def capture_samples(path: str | PathLike[str], vehicle: Vehicle) -> CaptureSampl
         statistics,
         capture.info,
         tuple(remarks),
+        tuple(sessions[channel]),
     )
 
 
@@ -323,19 +333,10 @@ def _without_current(
 
 def _refuse_wrapped(current_a: FloatArray, vehicle: Vehicle, path: str | PathLike[str]) -> None:
     """Raise InputError for a current whose negative numbers are read as large ones."""
-    codec = vehicle.current.codec
-    bits = codec.wrapped_bits(current_a)
-    if bits is not None:
-        top_a = (1 << bits) * abs(codec.gain * codec.factor)
-        wrapped = int((2.0 * np.abs(current_a) > top_a).sum())
-        problem = (
-            f"read unsigned: {wrapped} of {current_a.size} values lie just below {top_a:.6g} A,"
-        )
-        problem += f" as negative ones of {bits} bits do"
-        cure = "state signed = true under [current] of the map file"
-        if bits < codec.field.width:
-            cure = f"make it a signed signal of {bits} bits in the DBC"
-        raise InputError(problem, source=path, field=codec.name, cure=cure)
+    found = unsigned_reading(vehicle.current.codec, current_a)
+    if found is not None:
+        problem, cure = found
+        raise InputError(problem, source=path, field=vehicle.current.codec.name, cure=cure)
 
 
 def _losses(statistics: FrameStatistics) -> list[str]:
@@ -361,6 +362,9 @@ def capture_to_log(path: str | PathLike[str], vehicle: Vehicle) -> Log:
     """
     samples, path = capture_samples(path, vehicle), Path(path)
     remarks, time_s = list(samples.remarks), samples.time_s
+    begins = np.zeros(time_s.size)
+    np.add.at(begins, list(samples.sessions), PAUSE_S)  # no charge is counted over it
+    time_s = time_s + np.cumsum(begins)
     keep = time_s > np.concatenate([[-np.inf], np.maximum.accumulate(time_s)[:-1]])
     dropped = np.count_nonzero(~keep)
     if dropped > 0.5 * keep.size:
@@ -369,7 +373,8 @@ def capture_to_log(path: str | PathLike[str], vehicle: Vehicle) -> Log:
         raise InputError(problem, source=path, cure=cure)
     if dropped:
         remarks.append(f"{dropped} samples dropped whose time does not advance")
-    values = {name: getattr(samples, name)[keep] for name in ("time_s", *LOG_COLUMNS.values())}
+    values = {name: getattr(samples, name)[keep] for name in LOG_COLUMNS.values()}
+    values["time_s"] = time_s[keep]
     time_s, voltage_v, temperature_c = (
         values[name] for name in ("time_s", "voltage_v", "temperature_c")
     )

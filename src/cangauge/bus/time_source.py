@@ -49,7 +49,7 @@ class ReceiveTime:
     """
 
     def __init__(self) -> None:
-        self.beginnings = self.lost = 0
+        self.beginnings = self.lost = self.steps_back = 0
         self._latest_us: int | None = None
         self._shift_us = 0
 
@@ -65,6 +65,7 @@ class ReceiveTime:
         elif latest_us - now_us > STEP_BACK_US:
             self._shift_us += latest_us - now_us
             now_us = latest_us
+            self.steps_back += 1
         return now_us / MICROSECONDS
 
 
@@ -158,7 +159,7 @@ class ReplayClock:
     """
 
     def __init__(self, frame_id: int = REPLAY_CLOCK_ID) -> None:
-        self.beginnings = self.refused = self.lost = 0
+        self.beginnings = self.refused = self.lost = self.steps_back = 0
         self._received = 0
         self._sent: int | None = None  # by the latest count
         self._id = frame_id
@@ -194,7 +195,8 @@ class ReplayClock:
 
 TimeSource = ReceiveTime | ReplayClock
 """Source of the bus time of each frame: `time_of`, `beginnings`, the number of new logs after the
-first, and `lost`, the frames of a replay's clock that did not come."""
+first, `steps_back` of receive stamps, and `lost`, the frames of a replay's clock that did not
+come."""
 
 
 def time_source(name: TimeSourceName, clock_id: int = REPLAY_CLOCK_ID) -> TimeSource:

@@ -307,6 +307,9 @@ class Loop:
                 f"voltages come, but not within {within_s:g} s of a current: they are not used;"
                 " give a longer pair_within_s in the map file"
             )
+        if (unsigned := self._pipeline.decoder.unsigned_current) is not None:
+            reasons |= Reason.IMPLAUSIBLE_INPUT
+            found["bus.unsigned_current"] = unsigned
         found |= self._of_signals()
         for event in found.keys() - self._reported:
             _warn(event.split()[0], found[event], limit=event)

@@ -405,6 +405,9 @@ def _remarks(
         remarks.append("a recorded replay: time is its log's (REPLAY_CLOCK)")
     if counts.beginnings:
         remarks.append(f"{counts.beginnings + 1} logs were replayed; each is estimated separately")
+    if counts.steps_back:
+        sessions = f"the stamps start again: {counts.steps_back + 1} sessions in one file"
+        remarks.append(f"{sessions}, estimated as one: split it there")
     if counts.crc_errors:
         remarks.append(f"{counts.crc_errors} frames refused: wrong CRC")
     if counts.lost:

@@ -40,7 +40,7 @@ class FrameCounts:
     have a wrong CRC, repeat a counter or are too short. Values are coded as not available,
     implausible (out of range, or changed too fast), of a stuck signal, or held back until their
     signal has recovered. Untimed frames came before the first REPLAY_CLOCK, where that is the time
-    source; each new log is a beginning.
+    source; each new log is a beginning. Receive stamps step back where a clock was set.
     """
 
     frames: int
@@ -55,6 +55,7 @@ class FrameCounts:
     held_back: int
     untimed: int
     beginnings: int
+    steps_back: int
 
 
 @dataclass(frozen=True)
@@ -205,6 +206,7 @@ class Pipeline:
             held_back=all_logs.held_back,
             untimed=self._untimed,
             beginnings=self._time.beginnings,
+            steps_back=self._time.steps_back,
         )
 
     def _estimate_after(self, sample: Sample) -> None:

@@ -6,6 +6,7 @@ import io
 import struct
 from collections.abc import Callable, Iterator
 from importlib.util import find_spec
+from itertools import chain
 from typing import Any, ClassVar, Final
 
 import can
@@ -40,7 +41,7 @@ class LibraryReader(BinaryReader):
     is_text: ClassVar[bool] = True
     marks: ClassVar[tuple[bytes, ...]]
     comments: ClassVar[tuple[str, ...]] = (";",)
-    given = 0
+    given = _unread = 0
 
     @classmethod
     def matches(cls, head: bytes) -> bool:
@@ -61,9 +62,30 @@ class LibraryReader(BinaryReader):
             self.given += not line.isspace() and not line.startswith(self.comments)
             yield line
 
+    def _of_text(self) -> Iterator[can.Message]:
+        """Yield the frames; python-can breaks off at a malformed line, and begins again after it."""
+        lines, head = self.content(), list[str]()
+        for line in lines:
+            if not line.startswith(self.comments):
+                lines = chain([line], lines)
+                break
+            head.append(line)
+        while True:
+            before = self.given
+            try:
+                whole = (line for part in (head, lines) for line in part)
+                yield from type(self).library(whole)
+                return
+            except (ValueError, LookupError):
+                if self.given == before:
+                    raise
+                self._unread += 1
+                self.skip(None)
+
     def read(self) -> Iterator[can.Message]:
         """Yield the frames, without those whose length contradicts their DLC."""
-        source, taken = type(self).library(self.content()), 0
+        source = self._of_text() if self.is_text else type(self).library(self.content())
+        taken = 0
         for message in source:
             taken += 1
             is_whole = message.is_remote_frame or len(message.data) == message.dlc
@@ -71,7 +93,7 @@ class LibraryReader(BinaryReader):
                 yield message
             else:
                 self.skip(None)
-        left_out = getattr(source, "objects", self.given) - taken
+        left_out = getattr(source, "objects", self.given) - taken - self._unread
         if left_out > 0:
             what = "line" if self.is_text else "object"
             self.remarks.append(
