@@ -10,8 +10,8 @@ import can
 import numpy as np
 import pytest
 
-from cangauge.bus.recording import capture_samples, capture_to_log, open_recording, read_log
 from cangauge.bus.readers import PAUSE_S
+from cangauge.bus.recording import capture_samples, capture_to_log, open_recording, read_log
 from cangauge.bus.time_source import ClockFrames
 from cangauge.bus.vehicle import Vehicle
 from cangauge.errors import InputError

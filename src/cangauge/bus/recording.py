@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from array import array
 from collections import defaultdict
-from collections.abc import Mapping, Sized
+from collections.abc import Iterator, Mapping, Sized
 from dataclasses import dataclass, replace
 from os import PathLike
 from pathlib import Path
@@ -42,7 +42,7 @@ from cangauge.logs.units import (
     known_temperature_source,
     refuse_wrong_units,
 )
-from cangauge.settings import TemperatureSource
+from cangauge.settings import TemperatureSource, TimeSourceName
 from cangauge.types import Sample
 
 VOLTAGE_FILL_S: Final = 1.0
@@ -269,6 +269,7 @@ def capture_samples(path: str | PathLike[str], vehicle: Vehicle) -> CaptureSampl
     for message in capture:
         if recorded.begins_replay(message):
             buses.clear()
+            sessions.clear()
         if message.channel not in buses:
             own = time_source(recorded.name)
             buses[message.channel] = own, SampleDecoder(vehicle), array("d")
@@ -289,12 +290,7 @@ def capture_samples(path: str | PathLike[str], vehicle: Vehicle) -> CaptureSampl
     remarks += decoder.never_decoded.values()
     if sum(bool(each[2]) for each in buses.values()) > 1:
         remarks.append(f"several buses carry the frames; bus {channel} is used: most samples")
-    if recorded.name == "replay-clock":
-        remarks.append("a recorded replay: time is its log's (REPLAY_CLOCK)")
-    if sessions[channel]:
-        remarks.append(f"the stamps start again: {len(sessions[channel]) + 1} sessions in one file")
-    if own.beginnings:
-        remarks.append(f"the replay clock starts again {own.beginnings} times")
+    remarks += _of_time(recorded.name, own, len(sessions[channel]))
     time_s, current_a, voltage_v, temperature_c, soc_pct = np.array(values).reshape(-1, 5).T
     _refuse_wrapped(current_a, vehicle, path)
     return CaptureSamples(
@@ -315,6 +311,16 @@ def capture_samples(path: str | PathLike[str], vehicle: Vehicle) -> CaptureSampl
 def _keep(sample: Sample | None, decoder: SampleDecoder, values: array[float]) -> None:
     if sample is not None:
         values.extend((*sample, decoder.reference_soc_pct))
+
+
+def _of_time(name: TimeSourceName, source: TimeSource, steps_back: int) -> Iterator[str]:
+    """Yield what the stamps of a capture are, and whether they start again."""
+    if name == "replay-clock":
+        yield "a recorded replay: time is its log's (REPLAY_CLOCK)"
+    if source.beginnings:
+        yield f"the replay clock starts again {source.beginnings} times"
+    if steps_back:
+        yield f"the stamps start again: {steps_back + 1} sessions in one file"
 
 
 def _without_current(
@@ -362,9 +368,8 @@ def capture_to_log(path: str | PathLike[str], vehicle: Vehicle) -> Log:
     """
     samples, path = capture_samples(path, vehicle), Path(path)
     remarks, time_s = list(samples.remarks), samples.time_s
-    begins = np.zeros(time_s.size)
-    np.add.at(begins, list(samples.sessions), PAUSE_S)  # no charge is counted over it
-    time_s = time_s + np.cumsum(begins)
+    begun = np.searchsorted(samples.sessions, np.arange(time_s.size), side="right")
+    time_s = time_s + PAUSE_S * begun  # no charge is counted over it
     keep = time_s > np.concatenate([[-np.inf], np.maximum.accumulate(time_s)[:-1]])
     dropped = np.count_nonzero(~keep)
     if dropped > 0.5 * keep.size:

@@ -63,19 +63,19 @@ class LibraryReader(BinaryReader):
             yield line
 
     def _of_text(self) -> Iterator[can.Message]:
-        """Yield the frames; python-can breaks off at a malformed line, and begins again after it."""
+        """Yield the frames; python-can stops at a malformed line, and is begun again after it."""
         lines, head = self.content(), list[str]()
         for line in lines:
             if not line.startswith(self.comments):
                 lines = chain([line], lines)
                 break
             head.append(line)
-        while True:
+        is_whole = False
+        while not is_whole:
             before = self.given
             try:
-                whole = (line for part in (head, lines) for line in part)
-                yield from type(self).library(whole)
-                return
+                yield from type(self).library(line for part in (head, lines) for line in part)
+                is_whole = True
             except (ValueError, LookupError):
                 if self.given == before:
                     raise
