@@ -60,7 +60,7 @@ def drive(step_s: float) -> list[Sample]:
     voltage = MODEL.voltage_model()
     current = np.repeat(rng.uniform(-40.0, 60.0, SAMPLES // 50 + 1), 50)[:SAMPLES]
     soc = np.linspace(80.0, 20.0, SAMPLES)
-    volts = voltage.pseudo_ocv(soc) + sum(voltage.resistance_ohm) * current
+    volts = voltage.pseudo_ocv(soc) + sum(voltage.loads.resistance_ohm) * current
     volts += rng.normal(0.0, 0.5, SAMPLES)
     rows = zip(step_s * np.arange(SAMPLES), current, volts, np.full(SAMPLES, 22.0), strict=True)
     return [Sample(*map(float, row)) for row in rows]

@@ -265,7 +265,9 @@ def _long_logs(number: int, rows: int) -> Iterator[Log]:
         current_a = 60.0 * 3600.0 * 0.9 / rows + pairs_a
         soc_pct = 95.0 - np.cumsum(current_a) / 36.0 / 60.0
         temperature_c = 23.0 + 2.0 * np.sin(time_s / 700.0)
-        delayed = np.column_stack([np.interp(time_s - d, time_s, current_a) for d in known.delay_s])
+        delayed = np.column_stack(
+            [np.interp(time_s - d, time_s, current_a) for d in known.loads.delays_s]
+        )
         volts = known.voltage(soc_pct, temperature_c, delayed) + rng.normal(0.0, 0.5, time_s.size)
         yield Log(time_s, current_a, volts, temperature_c, soc_pct, name=f"log {seed}")
 

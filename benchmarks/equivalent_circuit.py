@@ -77,11 +77,11 @@ def equivalent_circuit(model: Model) -> dict[str, Any]:
     half_c = max(0.5 * (high_c - low_c), 0.5 * NARROWEST_C)
     temperatures = 0.5 * (low_c + high_c) + half_c * np.linspace(-1.0, 1.0, TEMPERATURES)
     is_plain = not extended.effects
-    if is_plain and extended.model.arrhenius is None:
+    if is_plain and extended.model.loads.arrhenius is None:
         temperatures = temperatures[[0, -1]]
     curve_soc = np.linspace(0.0, 100.0, CURVE_POINTS)
     response = _StepResponse(extended)
-    usual = response.at(50.0, extended.model.t_ref_c, USUAL_C_RATE * extended.capacity_ah)
+    usual = response.at(50.0, extended.model.loads.t_ref_c, USUAL_C_RATE * extended.capacity_ah)
     tau_s = response.time_constants(usual)
     _, error_ohm = response.resistances(usual, tau_s)
     amperes, socs = np.array(C_RATES) * extended.capacity_ah, np.array(RESISTANCE_SOC_PCT)
@@ -122,9 +122,9 @@ class _StepResponse:
     def __init__(self, extended: ExtendedModel) -> None:
         self._extended = extended
         of_effects = (effect.rc_tau_s(values) for effect, values in extended.effects)
-        own = {*(tau for tau in of_effects if tau is not None), *extended.model.low_pass_s}
+        own = {*(tau for tau in of_effects if tau is not None), *extended.model.loads.low_pass_s}
         self._own_tau_s = sorted(tau for tau in own if tau >= FASTEST_S)
-        delays = [delay for delay in extended.model.delay_s if delay > 0.0]
+        delays = [delay for delay in extended.model.loads.delays_s if delay > 0.0]
         self._last_s = LASTING * max([FASTEST_S, *delays, *self._own_tau_s])
         edges = np.union1d([0.0, *delays], np.geomspace(0.1 * FASTEST_S, self._last_s, TIMES))
         self.time_s = 0.5 * (edges[1:] + edges[:-1])
@@ -135,8 +135,8 @@ class _StepResponse:
         time_s = np.concatenate(([0.0], self.time_s))
         one = np.ones_like(time_s)
         model = self._extended.model
-        flows = [time_s >= delay for delay in model.delay_s]
-        smooth = [-np.expm1(-time_s / tau) for tau in model.low_pass_s]
+        flows = [time_s >= delay for delay in model.loads.delays_s]
+        smooth = [-np.expm1(-time_s / tau) for tau in model.loads.low_pass_s]
         currents = np.column_stack([*flows, *smooth]).astype(np.float64)
         columns = model.load_columns(temperature_c * one, currents)[:, 1:]
         unit_v = columns @ model.load_coefficients[1:]

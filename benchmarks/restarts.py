@@ -116,7 +116,7 @@ def drive(seconds: float, model: Model, seed: int) -> list[Sample]:
     soc_pct = BEGIN_PCT - out_pct * 100.0 / (3600.0 * RATE_HZ * model.capacity_ah)
     voltage_model = model.voltage_model()
     delayed = np.column_stack(
-        [np.interp(time_s - delay, time_s, current_a) for delay in voltage_model.delay_s]
+        [np.interp(time_s - delay, time_s, current_a) for delay in voltage_model.loads.delays_s]
     )
     temperature_c = 23.0 + 2.0 * np.sin(time_s / 2000.0)
     voltage_v = voltage_model.voltage(np.clip(soc_pct, 5.0, 98.0), temperature_c, delayed)

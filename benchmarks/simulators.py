@@ -78,7 +78,7 @@ def fitted_thevenin(training: list[Log]) -> Simulator:
     model = fit(training, capacity_ah=CAPACITY_AH).voltage_model
     soc = np.linspace(0.0, 100.0, 201)
     curve_v = model.pseudo_ocv(soc)
-    late_ohm = -sum(model.resistance_ohm[1:])
+    late_ohm = -sum(model.loads.resistance_ohm[1:])
 
     def simulate(log: Log, start_pct: float, capacity_factor: float) -> np.ndarray:
         import thevenin  # noqa: PLC0415
@@ -92,7 +92,7 @@ def fitted_thevenin(training: list[Log]) -> Simulator:
                 "h_therm": 10.0, "A_therm": 1.0,
                 "ocv": lambda part: np.interp(100.0 * part, soc, curve_v),
                 "M_hyst": lambda part: 0.0 * part,
-                "R0": lambda part, _kelvin: -model.resistance_ohm[0] + 0.0 * part,
+                "R0": lambda part, _kelvin: -model.loads.resistance_ohm[0] + 0.0 * part,
                 "R1": lambda part, _kelvin: late_ohm + 0.0 * part,
                 "C1": lambda part, _kelvin: RC_TIME_S / late_ohm + 0.0 * part,
             }

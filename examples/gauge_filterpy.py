@@ -17,7 +17,8 @@ from cangauge._resources import shared_file
 interface, channel, port, path, start = sys.argv[1:6]
 model = Model.load(path)
 curve = model.voltage_model()
-ohm = -np.array(curve.resistance_ohm)  # the model: U = OCV + Σ R·I
+loads = curve.loads
+ohm = -np.array(loads.resistance_ohm)  # the model: U = OCV + Σ R·I
 R0, R1, TAU_S = ohm[0], ohm[1:].sum(), 60.0
 pack = cantools.database.load_file(shared_file("dbc", "generic_pack.dbc"))
 ours = cantools.database.load_file(shared_file("dbc", "soc_estimate.dbc"))
@@ -37,7 +38,7 @@ def slope(x: np.ndarray) -> np.ndarray:
 
 def voltage(x: np.ndarray) -> np.ndarray:
     """Return the terminal voltage."""
-    warm_v = curve.kt_v_per_k * (temperature_c - curve.t_ref_c)
+    warm_v = loads.kt_v_per_k * (temperature_c - loads.t_ref_c)
     return np.array([curve.pseudo_ocv(x[0]) + warm_v - R0 * current_a - x[1, 0]])
 
 
@@ -60,7 +61,7 @@ def publish() -> None:
 
 
 current_a = now_s = before_s = 0.0
-temperature_c = curve.t_ref_c
+temperature_c = loads.t_ref_c
 with can.Bus(interface=interface, channel=channel, port=int(port)) as bus:
     publish()
     for frame in bus:

@@ -203,9 +203,9 @@ def battery_current(
     Solves U·I = P with U = E + R1·I, where E is the published voltage without the present current.
     """
     model = leaf_2012_model()
-    r1, *r_past = model.resistance_ohm
-    back = [round(delay * RATE_HZ) for delay in model.delay_s[1:]]
-    offset = (model.kt_v_per_k * (temperature_c - model.t_ref_c)).tolist()
+    r1, *r_past = model.loads.resistance_ohm
+    back = [round(delay * RATE_HZ) for delay in model.loads.delays_s[1:]]
+    offset = (model.loads.kt_v_per_k * (temperature_c - model.loads.t_ref_c)).tolist()
     current: list[float] = []
     charge_as = 0.0
     for k, (power, on) in enumerate(zip(power_w.tolist(), closed.tolist(), strict=True)):
@@ -234,7 +234,7 @@ def true_voltage(
     """Return SoC [%] and the error-free voltage behind the contactor [V]."""
     model = leaf_2012_model()
     soc = 100.0 * (1.0 - discharged_ah(time_s, current_a) / CAPACITY_AH)
-    delayed = delayed_currents(time_s, current_a, model.delay_s, time_s)
+    delayed = delayed_currents(time_s, current_a, model.loads.delays_s, time_s)
     pack = model.voltage(soc, temperature_c, delayed)
     link = pack.copy()
     edges = np.flatnonzero(np.diff(closed.astype(int))) + 1

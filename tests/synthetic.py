@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
 import numpy as np
 
 from cangauge.logs.gaps import discharged_ah
 from cangauge.logs.log import Log
 from cangauge.model.delay_line import delayed_currents
 from cangauge.model.published import CAPACITY_AH, leaf_2012_model
-from cangauge.model.voltage_model import VoltageModel
+from cangauge.model.voltage_model import Curve, Loads, Ranges, VoltageModel
 
 
 def drive_current(time_s: np.ndarray, mean_a: float, seed: int) -> np.ndarray:
@@ -42,9 +46,34 @@ def synthetic_log(
     temperature_c = 23.0 + 2.0 * np.sin(time_s / 700.0) + 0.5 * np.sin(time_s / 130.0)
     voltage_v = (
         model.voltage(
-            soc_pct, temperature_c, delayed_currents(time_s, current_a, model.delay_s, time_s)
+            soc_pct,
+            temperature_c,
+            delayed_currents(time_s, current_a, model.loads.delays_s, time_s),
         )
         + rng.normal(0.0, 1.0, time_s.size) * noise_v
     )
     return Log(time_s, current_a, voltage_v, temperature_c, soc_pct, name=name,
                temperature_source="room")  # fmt: skip
+
+
+RANGES = Ranges(soc_pct=(0.0, 100.0), temperature_c=(-40.0, 80.0), current_a=(-1e3, 1e3))
+
+
+def voltage_model(
+    curve: Curve,
+    kt_v_per_k: float,
+    resistance_ohm: Sequence[float],
+    *,
+    temperature_c: tuple[float, float] = RANGES.temperature_c,
+    **loads: Any,
+) -> VoltageModel:
+    """A voltage model of a curve and loads, for all SoC."""
+    known = RANGES.model_copy(update={"temperature_c": temperature_c})
+    return VoltageModel(
+        curve, Loads(kt_v_per_k=kt_v_per_k, resistance_ohm=resistance_ohm, **loads), known
+    )
+
+
+def within_c(model: VoltageModel, low_c: float, high_c: float) -> VoltageModel:
+    """The same model, identified within other temperatures [°C]."""
+    return replace(model, range=model.range.model_copy(update={"temperature_c": (low_c, high_c)}))

@@ -92,9 +92,9 @@ def _wrong_models(model: Model) -> dict[str, Model]:
     return {
         "as fitted": model,
         "resistances × 3": model.model_copy(update={"loads": loads.model_copy(
-            update={"resistance_ohm": tripled, "arrhenius": scaled})}),
+            update={"resistance_ohm": tuple(tripled), "arrhenius": scaled})}),
         "+ 8 V": model.model_copy(
-            update={"curve": curve.model_copy(update={"voltage_v": higher})}),
+            update={"curve": curve.model_copy(update={"voltage_v": tuple(higher)})}),
         "without R(T)": model.model_copy(
             update={"loads": loads.model_copy(update={"arrhenius": flat})}),
         "capacity × 1.25": model.model_copy(update={"capacity_ah": 1.25 * model.capacity_ah}),

@@ -49,7 +49,7 @@ def test_resistances_add_up_to_the_lasting_one() -> None:
     model = leaf_2012_model_file()
     circuit = equivalent_circuit(model)
     total = np.array(circuit["series_ohm"]) + np.sum(circuit["pair_ohm"], axis=0)
-    assert total == pytest.approx(-sum(model.voltage_model().resistance_ohm), rel=0.02)
+    assert total == pytest.approx(-sum(model.voltage_model().loads.resistance_ohm), rel=0.02)
     assert 0.0 < circuit["step_error_pct"] < 2.0
 
 

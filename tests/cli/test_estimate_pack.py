@@ -74,7 +74,7 @@ def test_pack_rows_are_those_of_the_estimator(made: Path, minutes: Log, tmp_path
     pack = tmp_path / "pack.csv"
     write_log(minutes, tmp_path / "part.parquet")
     options = ("-m", made / "model.json", "-o", tmp_path / "soc.csv", "--pack", pack)
-    low_pct = Model.load(made / "model.json").voltage_model().soc_range_pct[0]
+    low_pct = Model.load(made / "model.json").voltage_model().range.soc_pct[0]
     out = succeeds("estimate", tmp_path / "part.parquet", *options).out
     assert re.search(rf"energy left .* to {low_pct:.0f} % SoC", out)
     table = pa.csv.read_csv(pack)

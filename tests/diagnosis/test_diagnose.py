@@ -139,7 +139,7 @@ def test_where_is_an_excess(known: Healthy, model: Model) -> None:
 
 def test_a_model_of_another_resistance_is_told_first(references: list[Log], model: Model) -> None:
     assert model.loads is not None
-    tripled = [3.0 * ohm for ohm in model.loads.resistance_ohm]
+    tripled = tuple(3.0 * ohm for ohm in model.loads.resistance_ohm)
     loads = model.loads.model_copy(update={"resistance_ohm": tripled})
     found = diagnose([day(20)], model.model_copy(update={"loads": loads}), references)
     check = found.model_check
@@ -154,7 +154,7 @@ def test_a_model_of_another_resistance_is_told_first(references: list[Log], mode
 
 def test_a_model_with_a_wrong_level_is_told_first(references: list[Log], model: Model) -> None:
     assert model.curve is not None
-    higher = [volts - 8.0 for volts in model.curve.voltage_v]
+    higher = tuple(volts - 8.0 for volts in model.curve.voltage_v)
     curve = model.curve.model_copy(update={"voltage_v": higher})
     found = diagnose([day(20)], model.model_copy(update={"curve": curve}), references)
     assert found.model_check is not None

@@ -53,7 +53,9 @@ def simulated_pack(
     capacities[weak] = capacity
     soc_pct = 95.0 + 0.5 * rng.normal(size=CELLS) - used_pct[:, None] / capacities
     resistances = 1.0 + 0.05 * rng.normal(size=CELLS)
-    drop_v = delayed_currents(time_s, current_a, PACK.delay_s, time_s) @ PACK.resistance_ohm
+    drop_v = (
+        delayed_currents(time_s, current_a, PACK.loads.delays_s, time_s) @ PACK.loads.resistance_ohm
+    )
     volts = PACK.pseudo_ocv(soc_pct.ravel(), 23.0).reshape(soc_pct.shape)
     volts = (volts + drop_v[:, None] * resistances) / CELLS
     pack_v = sensor * volts.sum(axis=1)

@@ -33,7 +33,7 @@ class LinearModel:
     """A voltage model that is linear in the SoC and in two functions."""
 
     capacity_ah = CAPACITY_AH
-    model = SimpleNamespace(usual_c=20.0, temperature_range_c=(10.0, 30.0))
+    model = SimpleNamespace(usual_c=20.0, range=SimpleNamespace(temperature_c=(10.0, 30.0)))
     functions = SimpleNamespace(number=2, row=lambda _, load: np.array([0.9, 0.01 * load[1]]))
     load_coefficients = LOAD_COEFFICIENTS
     noise = SimpleNamespace(

@@ -66,7 +66,9 @@ def samples_of_pack(
     time_s = STEP_S * np.arange(current_a.size, dtype=float)
     steps_ah = 0.5 * (current_a[1:] + current_a[:-1]) * STEP_S / 3600.0
     soc_pct = HIGH_PCT - 100.0 / CAPACITY_AH * np.concatenate(([0.0], np.cumsum(steps_ah)))
-    drop_v = delayed_currents(time_s, current_a, PACK.delay_s, time_s) @ PACK.resistance_ohm
+    drop_v = (
+        delayed_currents(time_s, current_a, PACK.loads.delays_s, time_s) @ PACK.loads.resistance_ohm
+    )
     error_v = 0.3 * wander(time_s.size, STEP_S / 300.0, rng) + 0.2 * rng.normal(size=time_s.size)
     voltage_v = PACK.pseudo_ocv(soc_pct, 23.0) + resistance * drop_v + error_v
     rows = zip(time_s.tolist(), (current_a + offset_a).tolist(), voltage_v.tolist(), strict=True)

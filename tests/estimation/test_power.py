@@ -49,13 +49,13 @@ def true_voltages(row: int, current_a: float) -> np.ndarray:
     current = np.concatenate((LOG.current_a[: row + 1], np.full(11, current_a)))
     assert LOG.soc_pct is not None
     soc_pct = LOG.soc_pct[row] - 100.0 / 3600.0 / CAPACITY_AH * current_a * np.arange(11.0)
-    delayed = delayed_currents(time_s, current, PACK.delay_s, time_s)[-11:]
+    delayed = delayed_currents(time_s, current, PACK.loads.delays_s, time_s)[-11:]
     return PACK.voltage(soc_pct, np.full(11, LOG.temperature_c[row]), delayed)
 
 
 @pytest.mark.parametrize("direction", ["discharge", "charge"])
 def test_the_voltage_touches_the_limit_within_the_deviation(direction: str) -> None:
-    ohm = abs(PACK.resistance_ohm[0] + PACK.resistance_ohm[1])
+    ohm = abs(PACK.loads.resistance_ohm[0] + PACK.loads.resistance_ohm[1])
     apart = []
     for row, power in powers().items():
         if direction == "discharge":
@@ -88,7 +88,9 @@ def test_a_pulse_just_before_lowers_what_is_possible() -> None:
         estimator = make_estimator(leaf_2012_model_file(), EstimatorSettings(limits=LIMITS))
         current = np.where((np.arange(200) >= 160) & (np.arange(200) < 190), pulse_a, 0.0)
         rows = np.arange(200.0)
-        drops = delayed_currents(rows, current, PACK.delay_s, rows) @ PACK.resistance_ohm
+        drops = (
+            delayed_currents(rows, current, PACK.loads.delays_s, rows) @ PACK.loads.resistance_ohm
+        )
         volts = PACK.pseudo_ocv(np.full(200, 60.0), 23.0) + drops
         for time_s, amperes, voltage in zip(rows, current, volts, strict=True):
             estimator.update(Sample(float(time_s), float(amperes), float(voltage), 23.0))
@@ -150,7 +152,7 @@ def test_a_voltage_that_rises_with_the_current_limits_nothing(is_constant: bool)
     estimator = make_estimator(model, EstimatorSettings(limits=LIMITS))
     rows = LOG.rows(slice(0, 600))
     if is_constant:
-        drop_v = 20.0 * sum(PACK.resistance_ohm)
+        drop_v = 20.0 * sum(PACK.loads.resistance_ohm)
         volts = PACK.pseudo_ocv(np.asarray(rows.soc_pct), 23.0) + drop_v
         rows = replace(rows, current_a=np.full(600, 20.0), voltage_v=volts)
     for sample in samples_of(rows):

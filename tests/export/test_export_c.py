@@ -170,7 +170,7 @@ def test_a_table_with_longer_delays_fills_its_delay_line(tmp_path: Path) -> None
     reasons = switched(tmp_path, short, long, "double")[:, 4].astype(int)
     is_filling = reasons & int(Reason.DELAY_LINE_FILLING) != 0
     time_s = np.array([sample.time_s for sample in EVENTFUL])
-    filled_s = long.voltage_model().delay_s[-1]
+    filled_s = long.voltage_model().loads.delays_s[-1]
     assert not is_filling[AT - 1]
     after = (time_s >= time_s[AT]) & (time_s < time_s[AT] + filled_s - 4.0)
     assert is_filling[after].all()

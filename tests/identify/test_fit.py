@@ -35,16 +35,15 @@ from cangauge.model.coulomb_counting import (
 from cangauge.model.prior import CHEMISTRIES, ChemistryName, PackPrior
 from cangauge.model.published import CAPACITY_AH, leaf_2012_model
 from cangauge.model.voltage_model import KNOTS_PCT, HermiteCurve, VoltageModel
-from synthetic import synthetic_log
+from synthetic import synthetic_log, voltage_model
 
 TRUTH = leaf_2012_model()
 OXIDE = CHEMISTRIES["oxide"]
 PACK = PackPrior(OXIDE, CAPACITY_AH)
 
-CELLS = VoltageModel(
-    HermiteCurve.rising(KNOTS_PCT, 96.0 * OXIDE.curve_v), kt_v_per_k=-0.02,
-    resistance_ohm=(-0.07, -0.01, -0.01, -0.005), delay_s=(0.0, 10.0, 30.0, 70.0),
-)  # fmt: skip
+CELLS = voltage_model(
+    HermiteCurve.rising(KNOTS_PCT, 96.0 * OXIDE.curve_v), -0.02, (-0.07, -0.01, -0.01, -0.005)
+)
 """A pack of typical cells."""
 
 
@@ -62,7 +61,7 @@ def test_recovers_curve_and_resistance_of_a_pack() -> None:
     found = fit(trips(4), capacity_ah=CAPACITY_AH)
     soc = np.linspace(45.0, 92.0, 50)
     assert found.voltage_model.pseudo_ocv(soc) == pytest.approx(CELLS.pseudo_ocv(soc), abs=0.3)
-    assert sum(found.voltage_model.resistance_ohm) == pytest.approx(-0.095, rel=0.05)
+    assert sum(found.voltage_model.loads.resistance_ohm) == pytest.approx(-0.095, rel=0.05)
     assert found.voltage_rmse_v == pytest.approx(0.3, rel=0.05)
     assert found.model.noise.judged_on == "whole logs left out in turn"
     assert found.model.noise.voltage_rmse_v == pytest.approx(0.3, rel=0.1)
@@ -190,10 +189,10 @@ def test_a_number_of_cells_that_the_voltage_denies_is_refused(
 def test_published_equation_recovers_its_coefficients() -> None:
     found = fit([synthetic_log()], equation="published")
     model = found.voltage_model
-    soc = np.linspace(*model.soc_range_pct, 200)
+    soc = np.linspace(*model.range.soc_pct, 200)
     assert model.pseudo_ocv(soc) == pytest.approx(TRUTH.pseudo_ocv(soc), abs=1e-4)
-    assert model.resistance_ohm == pytest.approx(TRUTH.resistance_ohm, abs=1e-6)
-    assert model.kt_v_per_k == pytest.approx(TRUTH.kt_v_per_k, abs=1e-5)
+    assert model.loads.resistance_ohm == pytest.approx(TRUTH.loads.resistance_ohm, abs=1e-6)
+    assert model.loads.kt_v_per_k == pytest.approx(TRUTH.loads.kt_v_per_k, abs=1e-5)
     assert found.soc_newton_mae_pct < 1e-3
     assert found.model.capacity_ah == pytest.approx(CAPACITY_AH, rel=1e-3)
 
@@ -211,7 +210,7 @@ def test_published_coefficients_come_with_every_fit_that_identifies_them() -> No
 
 
 def test_standard_errors_cover_the_truth() -> None:
-    truth = np.array([TRUTH.kt_v_per_k, *TRUTH.resistance_ohm])
+    truth = np.array([TRUTH.loads.kt_v_per_k, *TRUTH.loads.resistance_ohm])
     inside = []
     for seed in range(10):
         log = synthetic_log(noise_v=1.0, seed=seed, hours=1.5)
@@ -224,11 +223,12 @@ def test_standard_errors_cover_the_truth() -> None:
 
 
 def test_published_options_move_with_the_equation() -> None:
-    truth = replace(TRUTH, resistance_ohm=(-0.1, -0.03, -0.03), delay_s=(0.0, 20.0, 100.0))
+    changed = {"resistance_ohm": (-0.1, -0.03, -0.03), "delays_s": (0.0, 20.0, 100.0)}
+    truth = replace(TRUTH, loads=TRUTH.loads.model_copy(update=changed))
     log = synthetic_log(model=truth, noise_v=0.1)
     found = fit([log], equation="published", delay_s=(0.0, 20.0, 100.0), t_ref_c=15.0)
-    assert found.voltage_model.resistance_ohm == pytest.approx((-0.1, -0.03, -0.03), rel=0.02)
-    assert found.voltage_model.t_ref_c == 15.0
+    assert found.voltage_model.loads.resistance_ohm == pytest.approx((-0.1, -0.03, -0.03), rel=0.02)
+    assert found.voltage_model.loads.t_ref_c == 15.0
 
 
 def test_falling_published_curve_is_refused() -> None:
@@ -360,7 +360,7 @@ def test_a_log_that_leaves_the_sign_of_the_resistance_open_is_fitted(
     log = read_log(shared_data / "a123_lfp" / "A123_DYN_50_P25_s3.csv.gz")
     capacity_ah = float(np.ptp(discharged_ah(log.time_s, log.current_a)))
     found = cangauge.fit(log, capacity_ah=capacity_ah, initial_soc_pct=0.0, chemistry="lfp")
-    assert sum(found.voltage_model.resistance_ohm) > 0.0
+    assert sum(found.voltage_model.loads.resistance_ohm) > 0.0
     found.model.save(tmp_path / "m.json")
     table = cangauge.estimate(log, cangauge.Model.load(tmp_path / "m.json"))
     assert table.soc_pct[-1] == pytest.approx(100.0, abs=5.0)

@@ -66,8 +66,8 @@ def test_unknown_start_is_estimated_with_the_curve() -> None:
     assert start.std_pct < 3.0
     exact = fit([known, other], capacity_ah=CAPACITY_AH)
     assert found.voltage_mae_pct == pytest.approx(exact.voltage_mae_pct, rel=0.05)
-    assert sum(found.voltage_model.resistance_ohm) == pytest.approx(
-        sum(exact.voltage_model.resistance_ohm), rel=0.05
+    assert sum(found.voltage_model.loads.resistance_ohm) == pytest.approx(
+        sum(exact.voltage_model.loads.resistance_ohm), rel=0.05
     )
     assert any("start estimated together with the curve: t2 starts" in r for r in found.remarks)
     of_logs = found.to_dict()["logs"]

@@ -24,7 +24,7 @@ def slow_drive(start_pct: float, seed: int, *, step_s: float = 30.0, hours: floa
     current_a = np.maximum(rng.normal(6.0, 10.0, time_s.size), -20.0)
     soc_pct = start_pct - 100.0 * discharged_ah(time_s, current_a) / CAPACITY_AH
     temperature_c = 20.0 + 3.0 * np.sin(time_s / 900.0)
-    delayed = delayed_currents(time_s, current_a, model.delay_s, time_s)
+    delayed = delayed_currents(time_s, current_a, model.loads.delays_s, time_s)
     voltage_v = model.voltage(soc_pct, temperature_c, delayed) + rng.normal(0.0, 0.3, time_s.size)
     return Log(time_s, current_a, voltage_v, temperature_c, soc_pct, name="slow",
                temperature_source="pack")  # fmt: skip
@@ -95,7 +95,7 @@ def test_fit_leaves_out_the_delays_that_inspect_calls_too_short(
 ) -> None:
     log = slow_drive(95.0, 1, step_s=step_s, hours=3.0 if step_s < 30.0 else 6.0)
     found = fit([log], capacity_ah=CAPACITY_AH, equation="published")
-    assert list(found.model.voltage_model().delay_s) == kept
+    assert list(found.model.voltage_model().loads.delays_s) == kept
     verdict, text = ability(inspect_log(log), "delayed current terms")
     shown = ", ".join(str(delay) for delay in kept)
     assert (verdict == "yes") == (len(kept) == 4)

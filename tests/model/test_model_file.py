@@ -120,6 +120,7 @@ def test_prediction_is_anchored_at_the_first_known_soc(model: Model, log: Log) -
         (lambda raw: raw["loads"].update(resistance_ohm=[9.0] * 6), "loads.resistance_ohm.0"),
         (lambda raw: raw["loads"]["arrhenius"].update(factor=1e300), "loads.arrhenius.factor"),
         (lambda raw: raw["loads"]["arrhenius"].update(more=1), "loads.arrhenius.more"),
+        (lambda raw: raw["range"].update(temperature_c=[50.0, 20.0]), "range.temperature_c"),
         (lambda raw: raw["noise"].update(level_std_v=-1.0), "noise.level_std_v"),
         (lambda raw: raw["functions"]["load"].pop(), "functions.load"),
         (lambda raw: raw.update(effects=[{"id": "hysteresis"}]), "effects.0"),

@@ -18,9 +18,9 @@ from cangauge.model.voltage_model import (
     Arrhenius,
     HermiteCurve,
     PublishedCurve,
-    VoltageModel,
     hermite_basis,
 )
+from synthetic import voltage_model
 
 MODEL = leaf_2012_model()
 K = (394.4, 48.89, -4.769, 0.2158, -0.003718, -54.59, 109.3, -3.141)
@@ -61,7 +61,8 @@ def test_slope_is_the_derivative(soc: float) -> None:
 
 
 def test_rises_and_stays_bounded_outside_the_identified_soc() -> None:
-    narrow = VoltageModel(PublishedCurve(K, soc_range_pct=(40.0, 80.0)), -0.74, (-0.1,), (0.0,))
+    curve = PublishedCurve(K, soc_range_pct=(40.0, 80.0))
+    narrow = voltage_model(curve, -0.74, (-0.1,), delays_s=(0.0,))
     soc = np.linspace(-10.0, 110.0, 500)
     volts = narrow.pseudo_ocv(soc)
     assert np.all(np.diff(volts) > 0.0)
@@ -77,28 +78,6 @@ def test_temperature_is_limited_to_its_range() -> None:
 def test_refuses_a_falling_pseudo_ocv() -> None:
     with pytest.raises(InputError, match="falls with SoC"):
         PublishedCurve((350.0, 0, 0, 0, 0, -20.0, 0, 0))
-
-
-@pytest.mark.parametrize(
-    ("change", "field"),
-    [
-        ({"delay_s": (0.0, 30.0, 10.0, 70.0)}, "delays_s"),
-        ({"resistance_ohm": (-0.1,)}, "resistance_ohm"),
-        ({"low_pass_s": (10.0,)}, "resistance_ohm"),
-        ({"kt_v_per_k": math.nan}, "coefficients"),
-        ({"temperature_range_c": (50.0, 20.0)}, "temperature_range_c"),
-    ],
-)
-def test_names_the_invalid_field(change: dict[str, object], field: str) -> None:
-    good = {
-        "curve": PublishedCurve(K),
-        "kt_v_per_k": -0.74,
-        "resistance_ohm": (-0.1, -0.01, -0.01, -0.01),
-        "delay_s": (0.0, 10.0, 30.0, 70.0),
-    }
-    with pytest.raises(InputError) as error:
-        VoltageModel(**(good | change))
-    assert error.value.field == field
 
 
 @pytest.mark.parametrize(
@@ -156,10 +135,14 @@ def test_a_curve_rises_between_its_knots_too(seed: int) -> None:
 
 
 def test_load_columns_are_the_equation() -> None:
-    model = VoltageModel(
-        HermiteCurve.rising(KNOTS_PCT, VOLTS), -0.02, (-0.06, -0.01, -0.02), (0.0, 10.0), (140.0,),
-        Arrhenius(0.9, (-0.05, -0.01, -0.02), 15.0),
-    )  # fmt: skip
+    model = voltage_model(
+        HermiteCurve.rising(KNOTS_PCT, VOLTS),
+        -0.02,
+        (-0.06, -0.01, -0.02),
+        delays_s=(0.0, 10.0),
+        low_pass_s=(140.0,),
+        arrhenius=Arrhenius(0.9, (-0.05, -0.01, -0.02), 15.0),
+    )
     current, celsius = np.array([[40.0, 30.0, 12.0]]), -5.0
     factor = math.exp(3000.0 * (1.0 / 268.15 - 1.0 / 288.15)) - 1.0
     expected = -0.02 * (celsius - 20.0) + current[0] @ [-0.06, -0.01, -0.02]
@@ -169,7 +152,8 @@ def test_load_columns_are_the_equation() -> None:
 
 
 def test_low_passed_currents_start_at_rest() -> None:
-    model = VoltageModel(PublishedCurve(K), 0.0, (-0.1, -0.1), (0.0,), (10.0,))
+    curve = PublishedCurve(K)
+    model = voltage_model(curve, 0.0, (-0.1, -0.1), delays_s=(0.0,), low_pass_s=(10.0,))
     time_s = np.arange(0.0, 100.0)
     currents = model.currents(time_s, np.full(100, 50.0), slice(None))
     assert currents[:, 0].tolist() == [50.0] * 100
@@ -215,6 +199,7 @@ def test_memory_is_bounded_at_any_rate() -> None:
 
 @given(st.lists(st.floats(200.0, 500.0), max_size=40))
 def test_voltages_are_inverted_together_as_one_by_one(volts: list[float]) -> None:
-    for model in (MODEL, VoltageModel(HermiteCurve.rising(KNOTS_PCT, VOLTS), 0.0, (0.0,), (0.0,))):
+    knots = HermiteCurve.rising(KNOTS_PCT, VOLTS)
+    for model in (MODEL, voltage_model(knots, 0.0, (0.0,), delays_s=(0.0,))):
         expected = [soc_from_ocv(model, value).soc_pct for value in volts]
         assert socs_from_ocv(model, np.array(volts)) == pytest.approx(expected, abs=1e-6)

@@ -38,14 +38,14 @@ def test_fit_of_knots_prints_the_same_coefficients() -> None:
 
 
 def test_white_reproduces_r1() -> None:
-    r1 = fitted("white").voltage_model.resistance_ohm[0]
-    assert r1 == pytest.approx(MODEL.resistance_ohm[0], rel=0.02)
+    r1 = fitted("white").voltage_model.loads.resistance_ohm[0]
+    assert r1 == pytest.approx(MODEL.loads.resistance_ohm[0], rel=0.02)
 
 
 def test_white_reproduces_coefficients_within_standard_errors() -> None:
     coefficients = fitted("white").model.coefficients
-    published_values = {"kt": MODEL.kt_v_per_k} | {
-        f"R{j}": value for j, value in enumerate(MODEL.resistance_ohm, start=1)
+    published_values = {"kt": MODEL.loads.kt_v_per_k} | {
+        f"R{j}": value for j, value in enumerate(MODEL.loads.resistance_ohm, start=1)
     }
     for name, value in published_values.items():
         found = coefficients[name]

@@ -36,6 +36,7 @@ from cangauge.model.voltage_model import (
     KNOTS_PCT,
     Arrhenius,
     HermiteCurve,
+    Loads,
     hermite_basis,
     past_currents,
     resistance_factor,
@@ -100,13 +101,13 @@ class Linear:
     def of(cls, model: Model) -> Linear:
         """Return the given model."""
         extended = model.extended_model()
-        voltage = extended.model
-        low_pass_s = tuple(voltage.low_pass_s) or LOW_PASS_S
-        ohm = np.zeros(len(voltage.delay_s) + len(low_pass_s))
-        ohm[: len(voltage.resistance_ohm)] = voltage.resistance_ohm
-        mean_c = 0.5 * sum(voltage.temperature_range_c)
-        if voltage.arrhenius is not None:
-            ohm, mean_c = np.array(voltage.arrhenius.resistance_ohm), voltage.arrhenius.mean_c
+        loads = extended.model.loads
+        low_pass_s = loads.low_pass_s or LOW_PASS_S
+        ohm = np.zeros(len(loads.delays_s) + len(low_pass_s))
+        ohm[: len(loads.resistance_ohm)] = loads.resistance_ohm
+        mean_c = 0.5 * sum(extended.model.range.temperature_c)
+        if loads.arrhenius is not None:
+            ohm, mean_c = np.array(loads.arrhenius.resistance_ohm), loads.arrhenius.mean_c
         return cls(extended, ohm, mean_c, low_pass_s)
 
     @property
@@ -122,14 +123,14 @@ class Linear:
     def columns(self, of: Simulated) -> FloatArray:
         """Return the change of voltage by each coefficient on the rows of a log, shape (m, p)."""
         true, rows = of.plain.signals, of.of.rows
-        delays = self.model.model.delay_s
+        delays = self.model.model.loads.delays_s
         currents = past_currents(true.time_s, true.current_a, rows, delays, self.low_pass_s)
         celsius = true.temperature_c[rows]
         colder = resistance_factor(celsius) / resistance_factor(self.mean_c) - 1.0
         return np.column_stack(
             [
                 hermite_basis(of.plain.soc_pct[rows]),
-                celsius - self.model.model.t_ref_c,
+                celsius - self.model.model.loads.t_ref_c,
                 currents,
                 colder * (currents @ self.ohm),
             ]
@@ -150,26 +151,29 @@ class Linear:
         covariance[later, later] = np.diag(np.diag(covariance[later, later]))
         now = np.zeros_like(mean)
         now[:N] = voltage.curve.values(KNOTS_PCT)
-        now[N] = voltage.kt_v_per_k
-        now[first : first + len(voltage.resistance_ohm)] = voltage.resistance_ohm
-        now[-1] = 0.0 if voltage.arrhenius is None else voltage.arrhenius.factor
+        loads = voltage.loads
+        now[N] = loads.kt_v_per_k
+        now[first : first + len(loads.resistance_ohm)] = loads.resistance_ohm
+        now[-1] = 0.0 if loads.arrhenius is None else loads.arrhenius.factor
         return mean - now, covariance
 
     def moved(self, change: FloatArray) -> Linear:
         """Return the model with other coefficients."""
-        voltage = self.model.model
+        voltage, loads = self.model.model, self.model.model.loads
         ohm = np.zeros(self.ohm.size)
-        ohm[: len(voltage.resistance_ohm)] = voltage.resistance_ohm
+        ohm[: len(loads.resistance_ohm)] = loads.resistance_ohm
         values = voltage.curve.values(KNOTS_PCT) + change[:N]
-        factor = 0.0 if voltage.arrhenius is None else voltage.arrhenius.factor
-        corrected = replace(
-            voltage,
-            curve=HermiteCurve.rising(KNOTS_PCT, values),
-            kt_v_per_k=float(voltage.kt_v_per_k + change[N]),
-            resistance_ohm=tuple((ohm + change[N + 1 : -1]).tolist()),
+        factor = 0.0 if loads.arrhenius is None else loads.arrhenius.factor
+        changed = Loads(
+            t_ref_c=loads.t_ref_c,
+            kt_v_per_k=float(loads.kt_v_per_k + change[N]),
+            delays_s=loads.delays_s,
             low_pass_s=self.low_pass_s,
+            resistance_ohm=tuple((ohm + change[N + 1 : -1]).tolist()),
             arrhenius=Arrhenius(float(factor + change[-1]), tuple(self.ohm.tolist()), self.mean_c),
         )
+        curve = HermiteCurve.rising(KNOTS_PCT, values)
+        corrected = replace(voltage, curve=curve, loads=changed)
         return replace(self, model=replace(self.model, model=corrected))
 
 
@@ -372,7 +376,7 @@ def of_model(model: Model, stated_v: float | None = None) -> Healthy:
     change = np.zeros((number, functions.number))
     change[:N] = _at_knots(functions.soc_pct, functions.value)
     load = functions.load
-    ohms = len(linear.model.model.resistance_ohm)
+    ohms = len(linear.model.model.loads.resistance_ohm)
     change[N : N + 1 + ohms] = load[: 1 + ohms]
     if load.shape[0] > 1 + ohms:
         change[-1] = load[1 + ohms]

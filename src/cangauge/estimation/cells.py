@@ -130,7 +130,7 @@ class CellEstimator:
         """
         # The resistance without delay carries a voltage from the cell's time to the sample's.
         volts = np.asarray(voltage_v, dtype=np.float64)
-        per_cell_ohm = self._model.resistance_ohm[0] / self._count
+        per_cell_ohm = self._model.loads.resistance_ohm[0] / self._count
         volts = volts + per_cell_ohm * np.asarray(current_change_a, dtype=np.float64)
         last, self._last = self._last, tick
         if last is not None and tick.time_s > last.time_s:

@@ -136,8 +136,8 @@ def core_forms(model: OnlineModel) -> list[CoreForm] | None:
     voltage = model.model
     sizes = (
         (len(known), EFFECTS),
-        (len(voltage.delay_s), DELAYS),
-        (len(voltage.low_pass_s), LOW_PASSES),
+        (len(voltage.loads.delays_s), DELAYS),
+        (len(voltage.loads.low_pass_s), LOW_PASSES),
         (model.functions.number, FUNCTIONS),
         (model.functions.soc_pct.size, KNOTS),
     )
@@ -163,7 +163,7 @@ def model_constants(
         Number of blocks that are tested together, and the limits of innovations and strain.
     """
     voltage, noise, functions = online.model, online.noise, online.functions
-    counting, arrhenius = online.extended.counting(0.0), online.model.arrhenius
+    counting, arrhenius = online.extended.counting(0.0), online.model.loads.arrhenius
     record = np.zeros(1, MODEL)
     of = record[0]
     curve = voltage.curve
@@ -176,11 +176,11 @@ def model_constants(
         of["has_arrhenius"] = 1
         of["arrhenius_mean"] = resistance_factor(arrhenius.mean_c)
         _fill(of, arrhenius_ohm=arrhenius.resistance_ohm)
-    of["delays"], of["low_passes"] = len(voltage.delay_s), len(voltage.low_pass_s)
+    of["delays"], of["low_passes"] = len(voltage.loads.delays_s), len(voltage.loads.low_pass_s)
     _fill(
         of,
-        delay_s=voltage.delay_s,
-        low_pass_s=voltage.low_pass_s,
+        delay_s=voltage.loads.delays_s,
+        low_pass_s=voltage.loads.low_pass_s,
         load=voltage.load_coefficients,
         function_pct=functions.soc_pct,
         function_v=functions.value,
@@ -188,15 +188,14 @@ def model_constants(
         function_load=functions.load,
     )
     for name in (
-        "t_ref_c",
         "usual_c",
         "temperature_limits_c",
-        "soc_range_pct",
-        "temperature_range_c",
-        "current_range_a",
         "nominal_v",
     ):
         of[name] = getattr(voltage, name)
+    of["t_ref_c"], known = voltage.loads.t_ref_c, voltage.range
+    of["soc_range_pct"], of["current_range_a"] = known.soc_pct, known.current_a
+    of["temperature_range_c"] = known.temperature_c
     for name in (
         "level_std_v",
         "slow_std_v",

@@ -209,7 +209,7 @@ class SocFilter:
         volts, slope = model.pseudo_ocv_at(float(x[SOC]), block.drives)
         slope = max(slope, LEAST_SLOPE)
         axis_v = noise.soc_std_pct * slope
-        low_c, high_c = model.model.temperature_range_c
+        low_c, high_c = model.model.range.temperature_c
         outside_k = max(low_c - temperature_c, temperature_c - high_c, 0.0)
         lasting_v = (
             A * noise.level_std_v,

@@ -130,7 +130,7 @@ def health_of(filter_: SocFilter, temperature_c: float) -> Health:
     """
     model, bias = filter_.model, filter_.bias
     x, P = filter_.joint()
-    count = len(model.model.resistance_ohm)
+    count = len(model.model.loads.resistance_ohm)
     rest = model.load_at(temperature_c, np.zeros(count))
     lasting = model.load_at(temperature_c, np.ones(count))
     functions = model.functions.row(50.0, lasting) - model.functions.row(50.0, rest)

@@ -60,12 +60,13 @@ class KnownLimits(NamedTuple):
         InputError
             If a stated voltage contradicts the model's other end.
         """
-        low_pct, high_pct = model.soc_range_pct
-        low_a, high_a = model.current_range_a
+        ranges = model.range
+        low_pct, high_pct = ranges.soc_pct
+        low_a, high_a = ranges.current_a
         low_v, high_v = model.pseudo_ocv_at(low_pct)[0], model.pseudo_ocv_at(high_pct)[0]
-        if model.voltage_range_v is not None:
-            low_v = min(low_v, model.voltage_range_v[0])
-            high_v = max(high_v, model.voltage_range_v[1])
+        if ranges.voltage_v is not None:
+            low_v = min(low_v, ranges.voltage_v[0])
+            high_v = max(high_v, ranges.voltage_v[1])
         known = cls(
             _or(stated.min_voltage_v, low_v),
             _or(stated.max_voltage_v, high_v),
@@ -200,15 +201,15 @@ class _Ahead:
     def moment(self, seconds: float) -> _Moment:
         """Return the effect of a current after a time [s]."""
         model = self._model
-        voltage, line = model.model, model.delay_line
+        loads, line = model.model.loads, model.delay_line
         past, share, unknown_v = [], [], 0.0
-        for delay_s, ohm in zip(voltage.delay_s, voltage.resistance_ohm, strict=False):
+        for delay_s, ohm in zip(loads.delays_s, loads.resistance_ohm, strict=False):
             is_ahead = delay_s <= seconds
             past.append(0.0 if is_ahead else line.current_at(delay_s - seconds))
             share.append(1.0 if is_ahead else 0.0)
             if delay_s - seconds > line.filled_s:
                 unknown_v += abs(ohm) * ENERGY_C_RATE * self.health.capacity_ah
-        for tau_s, lag in zip(voltage.low_pass_s, model.lags, strict=True):
+        for tau_s, lag in zip(loads.low_pass_s, model.lags, strict=True):
             keep = math.exp(-seconds / tau_s)
             past.append(keep * lag.value)
             share.append(1.0 - keep)
@@ -253,7 +254,7 @@ class _Ahead:
 
     def lasting_v(self, soc_pct: FloatArray, current_a: float) -> FloatArray:
         """Return the voltages [V] of a lasting current at SoC [%] of shape (n,)."""
-        lasting = np.full(len(self._model.model.resistance_ohm), current_a)
+        lasting = np.full(len(self._model.model.loads.resistance_ohm), current_a)
         load_v = float(self._model.load_at(self._temperature_c, lasting) @ self._theta)
         curve_v = self._model.curve_values(soc_pct) + self._learned.values(soc_pct)
         return curve_v + (load_v + self._fixed_v)

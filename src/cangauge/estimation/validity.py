@@ -33,9 +33,9 @@ def outside_model(model: VoltageModel, soc_pct: float, sample: Sample) -> Reason
     """Return which of SoC, temperature and current the model was not identified at (NaN: none)."""
     reasons = _NO_REASON
     for value, (low, high), reason in (
-        (soc_pct, model.soc_range_pct, Reason.SOC_OUTSIDE_MODEL),
-        (sample.temperature_c, model.temperature_range_c, Reason.TEMPERATURE_OUTSIDE_MODEL),
-        (sample.current_a, model.current_range_a, Reason.CURRENT_OUTSIDE_MODEL),
+        (soc_pct, model.range.soc_pct, Reason.SOC_OUTSIDE_MODEL),
+        (sample.temperature_c, model.range.temperature_c, Reason.TEMPERATURE_OUTSIDE_MODEL),
+        (sample.current_a, model.range.current_a, Reason.CURRENT_OUTSIDE_MODEL),
     ):
         if value < low or value > high:
             reasons |= reason

@@ -59,12 +59,11 @@ from cangauge.model.model_file import (
     Information,
     Made,
     Model,
-    Ranges,
     SourceLog,
 )
 from cangauge.model.noise import Noise
 from cangauge.model.prior import CHEMISTRIES, DELAYS_S, ChemistryName, PackPrior, usual_loads
-from cangauge.model.voltage_model import KNOTS_PCT, REFERENCE_C, PublishedCurve
+from cangauge.model.voltage_model import KNOTS_PCT, REFERENCE_C, PublishedCurve, Ranges
 
 Equation = Literal["knots", "published"]
 
@@ -214,7 +213,7 @@ def fit(
         fits = tuple(
             evaluate(extended, log, item) for log, item in zip(starts.logs, rows, strict=True)
         )
-    slope, expected = slope_resistances(fits, extended.model.resistance_ohm)
+    slope, expected = slope_resistances(fits, extended.model.loads.resistance_ohm)
     return Identification(
         model=fitted.model,
         logs=starts.logs,

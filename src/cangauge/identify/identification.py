@@ -145,7 +145,9 @@ def evaluate(model: ExtendedModel, log: Log, rows: FitRows) -> LogFit:
 
 def _predicted(model: VoltageModel, rows: FitRows) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return pseudo-OCV and voltage [V], and the Newton inverse [%], without effects."""
-    currents_a = rows.currents_a[:, : len(model.resistance_ohm)]  # the published one: delayed only
+    currents_a = rows.currents_a[
+        :, : len(model.loads.resistance_ohm)
+    ]  # the published one: delayed only
     load_v = model.load_columns(rows.temperature_c, currents_a) @ model.load_coefficients
     voltage_v = model.pseudo_ocv(rows.soc_pct) + load_v
     newton_pct = socs_from_ocv(model, rows.voltage_v - load_v)

@@ -307,8 +307,8 @@ def start_by_model(log: Log, model: Model) -> Start:
     rows = fit_rows(
         with_start(log, 0.5 * (low + high)),
         model.capacity_ah,
-        delay_s=voltage.delay_s,
-        low_pass_s=voltage.low_pass_s,
+        delay_s=voltage.loads.delays_s,
+        low_pass_s=voltage.loads.low_pass_s,
     )
     signals = Signals.of(log)
 

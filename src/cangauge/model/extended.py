@@ -262,15 +262,15 @@ class OnlineModel:
         self._counting = extended.counting(50.0)
         self.capacity_ah = capacity_ah or self._counting.capacity_ah
         """Capacity for the Coulomb counter [Ah]."""
-        self.delay_line = DelayLine(self.model.delay_s, gap_s=gap_s)
-        self.lags = [Lag(tau_s, 0.0, rest_s=BRIDGE_S) for tau_s in self.model.low_pass_s]
+        self.delay_line = DelayLine(self.model.loads.delays_s, gap_s=gap_s)
+        self.lags = [Lag(tau_s, 0.0, rest_s=BRIDGE_S) for tau_s in self.model.loads.low_pass_s]
         self._contexts = [
             effect.context(values, self.model, extended.pack) for effect, values in extended.effects
         ]
         self._corrects = any(effect.corrects for effect, _ in extended.effects)
         self.load_coefficients = self.model.load_coefficients
         """Coefficients of the load columns, shape (k,)."""
-        currents = len(self.model.delay_s) + len(self.model.low_pass_s)
+        currents = len(self.model.loads.delays_s) + len(self.model.loads.low_pass_s)
         self.unseen_v_per_a = float(np.sum(self.load_coefficients[2 : 1 + currents]))
         """Voltage by earlier currents, which a slow log shows in part [V/A]."""
         self.load = np.empty(0)
@@ -343,7 +343,7 @@ class OnlineModel:
         load : array of shape (k,)
             Load row at the usual temperature.
         """
-        currents = load[1 : 1 + len(self.model.delay_s) + len(self.model.low_pass_s)]
+        currents = load[1 : 1 + len(self.model.loads.delays_s) + len(self.model.loads.low_pass_s)]
         change = self.load_at(self.model.usual_c + UNKNOWN_STD_K, currents) - load
         by_functions = change @ self.functions.load
         return math.hypot(float(change @ self.load_coefficients), *by_functions.tolist())

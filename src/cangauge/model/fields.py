@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import itertools
-from typing import Annotated
+from collections.abc import Sequence
+from typing import Annotated, Any
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 
+from cangauge.errors import InputError
 
-def increasing(values: list[float]) -> list[float]:
+
+def increasing(values: tuple[float, ...]) -> tuple[float, ...]:
     """Return increasing values; raise ValueError for others."""
     if any(high <= low for low, high in itertools.pairwise(values)):
         raise ValueError("must increase")
@@ -23,11 +26,19 @@ Ampere = Annotated[float, Field(ge=-1e6, le=1e6)]
 Volts = Annotated[float, Field(ge=0, le=1e6)]
 Seconds = Annotated[float, Field(gt=0, le=1e5)]
 Delay = Annotated[float, Field(ge=0, le=3600)]
-Delays = Annotated[list[Delay], Field(min_length=1), AfterValidator(increasing)]
-Knots = Annotated[list[Soc], Field(min_length=2), AfterValidator(increasing)]
+Delays = Annotated[tuple[Delay, ...], Field(min_length=1), AfterValidator(increasing)]
+Knots = Annotated[tuple[Soc, ...], Field(min_length=2), AfterValidator(increasing)]
 
 
 class Fields(BaseModel):
     """Part of a model file: no further fields, no change, no infinite number."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+def check_shape(field: str, values: Sequence[Any], number: int, *inner: int) -> None:
+    """Raise InputError, with the field, if nested values have another shape."""
+    if len(values) != number:
+        raise InputError(f"needs {number} values", field=field, value=len(values))
+    for place, row in enumerate(values) if inner else ():
+        check_shape(f"{field}.{place}", row, *inner)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import json
 from collections.abc import Iterable, Mapping, Sequence
 from os import PathLike
@@ -27,21 +26,17 @@ from cangauge.model.effects.base import Pack, Signals
 from cangauge.model.effects.library import parse_effects
 from cangauge.model.extended import ExtendedModel, OnlineModel, Prediction
 from cangauge.model.fields import (
-    Ampere,
     Celsius,
     Delays,
     Fields,
     Knots,
-    Seconds,
-    Soc,
     Value,
-    Volts,
+    check_shape,
 )
 from cangauge.model.noise import Noise
 from cangauge.model.physics import check_physics
 from cangauge.model.prior import (
     CHEMISTRIES,
-    DELAYS_S,
     LOW_PASS_S,
     ChemistryName,
     Distribution,
@@ -52,11 +47,12 @@ from cangauge.model.prior import (
 from cangauge.model.voltage_model import (
     BASIS_NAMES,
     KNOTS_PCT,
-    REFERENCE_C,
     Arrhenius,
     Functions,
     HermiteCurve,
+    Loads,
     PublishedCurve,
+    Ranges,
     VoltageModel,
 )
 from cangauge.settings import GAP_S, VOLTAGE_ACCURACY_PCT, TemperatureSource
@@ -91,27 +87,40 @@ class Published(Fields):
     def of(
         cls,
         values: Iterable[float],
-        std: Iterable[float | None] = itertools.repeat(None),
+        std: Iterable[float],
         *,
         epsilon: float,
         t_ref_c: float,
         delays_s: Sequence[float],
     ) -> Self:
         """Return the equation of the values k0 … k7, kt, R1 … Rn and their standard errors."""
-        names, n = _names(delays_s), len(BASIS_NAMES)
-        units = ["V"] * n + ["V/K"] + ["ohm"] * len(delays_s)
         coefficients = {
-            name: {"value": value, "std_error": error, "unit": unit}
-            for name, value, error, unit in zip(names, values, std, units, strict=False)
+            name: Coefficient(
+                value=value,
+                std_error=error,
+                unit="V/K" if name == "kt" else "ohm" if name.startswith("R") else "V",
+            )
+            for name, value, error in zip(_names(delays_s), values, std, strict=True)
         }
-        return cls.model_validate(
-            {
-                "coefficients": coefficients,
-                "epsilon": epsilon,
-                "t_ref_c": t_ref_c,
-                "delays_s": list(delays_s),
-            }
+        return cls(
+            coefficients=coefficients,
+            epsilon=epsilon,
+            t_ref_c=t_ref_c,
+            delays_s=tuple(delays_s),
         )
+
+    def voltage_model(self, known: Ranges) -> VoltageModel:
+        """Return the voltage model, identified within some ranges."""
+        n = len(BASIS_NAMES)
+        values = [self.coefficients[name].value for name in _names(self.delays_s)]
+        loads = Loads(
+            t_ref_c=self.t_ref_c,
+            kt_v_per_k=values[n],
+            delays_s=self.delays_s,
+            resistance_ohm=tuple(values[n + 1 :]),
+        )
+        curve = PublishedCurve(tuple(values[:n]), self.epsilon, known.soc_pct)
+        return VoltageModel(curve, loads, known)
 
     @model_validator(mode="after")
     def _complete(self) -> Self:
@@ -130,18 +139,7 @@ class CurveKnots(Fields):
     """Curve of a `knots` model."""
 
     soc_pct: Knots
-    voltage_v: list[Value]
-
-
-class Loads(Fields):
-    """Temperature coefficient and resistances of a `knots` model."""
-
-    t_ref_c: Celsius
-    kt_v_per_k: Value
-    delays_s: Delays
-    low_pass_s: list[Seconds]
-    resistance_ohm: list[Value]
-    arrhenius: Arrhenius
+    voltage_v: tuple[Value, ...]
 
 
 class FunctionFields(Fields):
@@ -160,16 +158,6 @@ class FunctionFields(Fields):
         functions = principal_functions(covariance, loads, number)
         curve_v, load = functions[:, :n].tolist(), functions[:, n:].tolist()
         return cls(soc_pct=KNOTS_PCT.tolist(), curve_v=curve_v, load=load)
-
-
-class Ranges(Fields):
-    """Identified ranges; an estimate outside is flagged."""
-
-    soc_pct: tuple[Soc, Soc]
-    temperature_c: tuple[Celsius, Celsius]
-    current_a: tuple[Ampere, Ampere]
-    voltage_v: tuple[Volts, Volts] | None = None
-    """Lowest and highest voltage of the logs, under their currents."""
 
 
 class Information(Fields):
@@ -233,19 +221,15 @@ class Model(Fields):
     @model_validator(mode="after")
     def _sizes_agree(self) -> Self:
         if (curve := self.curve) is not None:
-            _check_shape("curve.voltage_v", curve.voltage_v, len(curve.soc_pct))
-        if (loads := self.loads) is not None:
-            M = len(loads.delays_s) + len(loads.low_pass_s)
-            _check_shape("loads.resistance_ohm", loads.resistance_ohm, M)
-            _check_shape("loads.arrhenius.resistance_ohm", loads.arrhenius.resistance_ohm, M)
+            check_shape("curve.voltage_v", curve.voltage_v, len(curve.soc_pct))
         functions, columns = self.functions, self.voltage_model().load_coefficients.size
         number = len(functions.curve_v)
-        _check_shape("functions.curve_v", functions.curve_v, number, len(functions.soc_pct))
-        _check_shape("functions.load", functions.load, number, columns)
+        check_shape("functions.curve_v", functions.curve_v, number, len(functions.soc_pct))
+        check_shape("functions.load", functions.load, number, columns)
         if (information := self.information) is not None:
             p = len(information.columns)
-            _check_shape("information.root", information.root, p, p)
-            _check_shape("information.projected", information.projected, p)
+            check_shape("information.root", information.root, p, p)
+            check_shape("information.projected", information.projected, p)
             if np.any(np.tril(information.root, -1)):
                 raise InputError("must be upper triangular", field="information.root")
         return self
@@ -280,35 +264,11 @@ class Model(Fields):
             If the fields of the equation are missing, or the pseudo-OCV of a published equation
             does not rise with SoC.
         """
-        curve, loads, published = self.curve, self.loads, self.published
-        ranges: dict[str, Any] = {
-            "soc_range_pct": self.range.soc_pct,
-            "temperature_range_c": self.range.temperature_c,
-            "current_range_a": self.range.current_a,
-            "voltage_range_v": self.range.voltage_v,
-        }
-        if self.equation == "knots" and curve is not None and loads is not None:
-            return VoltageModel(
-                HermiteCurve.rising(np.array(curve.soc_pct), np.array(curve.voltage_v)),
-                kt_v_per_k=loads.kt_v_per_k,
-                resistance_ohm=tuple(loads.resistance_ohm),
-                delay_s=tuple(loads.delays_s),
-                low_pass_s=tuple(loads.low_pass_s),
-                arrhenius=loads.arrhenius,
-                t_ref_c=loads.t_ref_c,
-                **ranges,
-            )
-        if self.equation == "published" and published is not None:
-            names, n = _names(published.delays_s), len(BASIS_NAMES)
-            values = [published.coefficients[name].value for name in names]
-            return VoltageModel(
-                PublishedCurve(tuple(values[:n]), published.epsilon, self.range.soc_pct),
-                kt_v_per_k=values[n],
-                resistance_ohm=tuple(values[n + 1 :]),
-                delay_s=tuple(published.delays_s),
-                t_ref_c=published.t_ref_c,
-                **ranges,
-            )
+        if self.equation == "knots" and self.curve is not None and self.loads is not None:
+            knots = np.array(self.curve.soc_pct), np.array(self.curve.voltage_v)
+            return VoltageModel(HermiteCurve.rising(*knots), self.loads, self.range)
+        if self.equation == "published" and self.published is not None:
+            return self.published.voltage_model(self.range)
         lacking = "published" if self.equation == "published" else "curve, loads"
         raise InputError(f"missing, though the equation is {self.equation}", field=lacking)
 
@@ -459,13 +419,13 @@ class Model(Fields):
         loads = usual_loads(fields["capacity_ah"], len(ohm), r0_ohm)
         return cls(
             equation="knots",
-            curve=CurveKnots(soc_pct=KNOTS_PCT.tolist(), voltage_v=known.coefficients[:n].tolist()),
+            curve=CurveKnots(
+                soc_pct=tuple(KNOTS_PCT.tolist()), voltage_v=tuple(known.coefficients[:n].tolist())
+            ),
             loads=Loads(
-                t_ref_c=REFERENCE_C,
                 kt_v_per_k=kt,
-                delays_s=list(DELAYS_S),
-                low_pass_s=list(LOW_PASS_S),
-                resistance_ohm=ohm,
+                low_pass_s=LOW_PASS_S,
+                resistance_ohm=tuple(ohm),
                 arrhenius=Arrhenius(b, tuple(r0_ohm.tolist()), known.mean_c),
             ),
             functions=FunctionFields.of(fields["chemistry"], known.covariance[:p, :p], loads),
@@ -514,13 +474,6 @@ class Model(Fields):
             ),
             made=Made(by=PRIOR_MADE_BY, options={}, logs=[], fingerprint="prior"),
         )
-
-
-def _check_shape(field: str, values: Sequence[Any], number: int, *inner: int) -> None:
-    if len(values) != number:
-        raise InputError(f"needs {number} values", field=field, value=len(values))
-    for place, row in enumerate(values) if inner else ():
-        _check_shape(f"{field}.{place}", row, *inner)
 
 
 def _refuse_constant(name: str) -> float:

@@ -35,7 +35,7 @@ def check_physics(model: VoltageModel, capacity_ah: float, noise: Noise) -> None
     knots = isinstance(model.curve, HermiteCurve)
     prefix = "loads" if knots else "published.coefficients"
     middle = model.nominal_v
-    ends = model.pseudo_ocv([*model.soc_range_pct]).tolist()
+    ends = model.pseudo_ocv([*model.range.soc_pct]).tolist()
     low, high = min(*ends, middle), max(*ends, middle)
     if not (low > 0.0 and high <= min(HIGHEST_VOLTS, VOLTAGE_RATIO * low)):
         raise InputError(
@@ -43,15 +43,15 @@ def check_physics(model: VoltageModel, capacity_ah: float, noise: Noise) -> None
             field="curve.voltage_v" if knots else prefix,
             cure="check its values and their unit (V), or create the file with `cangauge fit`",
         )
-    numbers = range(len(model.resistance_ohm))
+    numbers = range(len(model.loads.resistance_ohm))
     names = [f"resistance_ohm.{k}" if knots else f"R{k + 1}" for k in numbers]
     most_ohm = DROP_AT_1C * middle / capacity_ah
     limits = [
         (f"{prefix}.{name}", ohm, most_ohm, "ohm")
-        for name, ohm in zip(names, model.resistance_ohm, strict=True)
+        for name, ohm in zip(names, model.loads.resistance_ohm, strict=True)
     ]
     kt = f"{prefix}.{'kt_v_per_k' if knots else 'kt'}"
-    limits.append((kt, model.kt_v_per_k, SLOPE_BY_TEMPERATURE * middle, "V/K"))
+    limits.append((kt, model.loads.kt_v_per_k, SLOPE_BY_TEMPERATURE * middle, "V/K"))
     limits += [
         ("noise.level_std_v", noise.level_std_v, middle, "V"),
         ("noise.slow_std_v", noise.slow_std_v, middle, "V"),
@@ -68,7 +68,7 @@ def check_physics(model: VoltageModel, capacity_ah: float, noise: Noise) -> None
             )
     # A log of constant current leaves the sign open, and there the resistances cancel. Knots have
     # the spread of their resistances in the covariance, so that a wrong sign is within it.
-    (low_a, high_a), lasting_ohm = model.current_range_a, sum(model.resistance_ohm)
+    (low_a, high_a), lasting_ohm = model.range.current_a, sum(model.loads.resistance_ohm)
     if not knots and lasting_ohm * (high_a - low_a) > RESISTANCE_AT_LEAST * middle:
         raise InputError(
             "the sum of the resistances is positive, so that discharging would raise the voltage",

@@ -30,14 +30,14 @@ from cangauge.model.voltage_model import (
     LEAF_2012_CELLS,
     LEAF_2012_OCV_V,
     REFERENCE_C,
+    Loads,
     PublishedCurve,
-    VoltageModel,
     hermite_basis,
 )
 
 ChemistryName = Literal["oxide", "lfp"]
 
-DELAYS_S: Final = VoltageModel.delay_s
+DELAYS_S: Final[tuple[float, ...]] = Loads.model_fields["delays_s"].default
 """The published delays of the current [s]."""
 LOW_PASS_S: Final = (10.0, 140.0)
 """Time constants of the low-passed currents [s]: the polarization of a drive has seconds to

@@ -21,16 +21,27 @@ from bisect import bisect_right
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from pydantic import model_validator
 
 from cangauge._typing import FloatArray
 from cangauge.errors import InputError
 from cangauge.logs.gaps import BRIDGE_S
 from cangauge.model.delay_line import delayed_currents
-from cangauge.model.fields import Celsius, Value
+from cangauge.model.fields import (
+    Ampere,
+    Celsius,
+    Delays,
+    Fields,
+    Seconds,
+    Soc,
+    Value,
+    Volts,
+    check_shape,
+)
 from cangauge.model.first_order import low_passed
 
 KNOTS_PCT: FloatArray = np.array(
@@ -393,7 +404,7 @@ def past_currents(
 
 @dataclass(frozen=True)
 class Arrhenius:
-    """Change of the resistances with temperature, as a model file holds it too.
+    """Change of the resistances with temperature.
 
     Parameters
     ----------
@@ -410,6 +421,48 @@ class Arrhenius:
     mean_c: Celsius
 
 
+class Loads(Fields):
+    """Temperature coefficient and resistances of a voltage model, as its file states them."""
+
+    t_ref_c: Celsius = REFERENCE_C
+    """Reference temperature T_r [°C]."""
+    kt_v_per_k: Value
+    """Temperature coefficient [V/K]."""
+    delays_s: Delays = (0.0, 10.0, 30.0, 70.0)
+    """Delays of the current [s]: by default the published ones."""
+    low_pass_s: tuple[Seconds, ...] = ()
+    """Time constants of the low-passed currents [s]."""
+    resistance_ohm: tuple[Value, ...]
+    """Rm on the current at each delay, then on each low-passed current [Ω]; negative."""
+    arrhenius: Arrhenius | None = None
+    """None for constant resistances."""
+
+    @model_validator(mode="after")
+    def _a_resistance_for_each_current(self) -> Self:
+        M = len(self.delays_s) + len(self.low_pass_s)
+        check_shape("loads.resistance_ohm", self.resistance_ohm, M)
+        if self.arrhenius is not None:
+            check_shape("loads.arrhenius.resistance_ohm", self.arrhenius.resistance_ohm, M)
+        return self
+
+
+class Ranges(Fields):
+    """Identified ranges; an estimate outside is flagged."""
+
+    soc_pct: tuple[Soc, Soc]
+    temperature_c: tuple[Celsius, Celsius]
+    current_a: tuple[Ampere, Ampere]
+    voltage_v: tuple[Volts, Volts] | None = None
+    """Lowest and highest voltage of the logs, under their currents."""
+
+    @model_validator(mode="after")
+    def _not_empty(self) -> Self:
+        for name, span in self:
+            if span is not None and span[1] < span[0]:
+                raise InputError("the range is empty", field=f"range.{name}", value=span)
+        return self
+
+
 @dataclass(frozen=True, eq=False)
 class VoltageModel:
     """Pack voltage as a function of SoC, temperature and the history of the current.
@@ -417,62 +470,15 @@ class VoltageModel:
     Parameters
     ----------
     curve : Curve
-        Pseudo-OCV at `t_ref_c`.
-    kt_v_per_k : float
-        Temperature coefficient [V/K].
-    resistance_ohm : tuple of float
-        Rm on the current at each delay, then on each low-passed current [Ω]; negative.
-    delay_s : tuple of float
-        Delays [s], increasing, not negative.
-    low_pass_s : tuple of float
-        Time constants of the low-passed currents [s].
-    arrhenius : Arrhenius, optional
-        None for constant resistances.
-    t_ref_c : float
-        Reference temperature T_r [°C].
-    soc_range_pct, temperature_range_c, current_range_a, voltage_range_v : pairs of floats
-        Ranges of the logs [%, °C, A, V].
-
-    Raises
-    ------
-    InputError
-        If shapes differ, delays do not increase, a number is not finite or a range is empty.
+        Pseudo-OCV at `loads.t_ref_c`.
+    loads : Loads
+    range : Ranges
+        Of the logs.
     """
 
     curve: Curve
-    kt_v_per_k: float
-    resistance_ohm: tuple[float, ...]
-    delay_s: tuple[float, ...] = (0.0, 10.0, 30.0, 70.0)
-    low_pass_s: tuple[float, ...] = ()
-    arrhenius: Arrhenius | None = None
-    t_ref_c: float = REFERENCE_C
-    soc_range_pct: tuple[float, float] = (0.0, 100.0)
-    temperature_range_c: tuple[float, float] = (-40.0, 80.0)
-    current_range_a: tuple[float, float] = (-math.inf, math.inf)
-    voltage_range_v: tuple[float, float] | None = None
-
-    def __post_init__(self) -> None:
-        delays = np.array(self.delay_s)
-        if delays.size == 0 or delays[0] < 0.0 or np.any(np.diff(delays) <= 0.0):
-            raise InputError(
-                "delays must increase from 0 or more",
-                field="delays_s",
-                value=list(self.delay_s),
-                cure="give them as 0,10,30,70",
-            )
-        number = delays.size + len(self.low_pass_s)
-        if len(self.resistance_ohm) != number:
-            raise InputError(
-                f"{number} currents need as many resistances",
-                field="resistance_ohm",
-                value=len(self.resistance_ohm),
-            )
-        if not all(map(math.isfinite, [self.kt_v_per_k, self.t_ref_c, *self.resistance_ohm])):
-            raise InputError("a coefficient is not finite", field="coefficients")
-        for name in ("soc_range_pct", "temperature_range_c", "current_range_a"):
-            low, high = getattr(self, name)
-            if not high >= low:
-                raise InputError("the range is empty", field=name, value=(low, high))
+    loads: Loads
+    range: Ranges
 
     @cached_property
     def nominal_v(self) -> float:
@@ -482,27 +488,29 @@ class VoltageModel:
     @property
     def usual_c(self) -> float:
         """Temperature where none is known [°C]: the mean of the logs, or T_r."""
-        return self.t_ref_c if self.arrhenius is None else self.arrhenius.mean_c
+        loads = self.loads
+        return loads.t_ref_c if loads.arrhenius is None else loads.arrhenius.mean_c
 
     @cached_property
     def temperature_limits_c(self) -> tuple[float, float]:
         """Temperatures beyond which the load columns are constant [°C]."""
-        if self.arrhenius is not None:
+        if self.loads.arrhenius is not None:
             return PLAUSIBLE_C
-        low, high = self.temperature_range_c
+        low, high = self.range.temperature_c
         return low - TEMPERATURE_MARGIN_K, high + TEMPERATURE_MARGIN_K
 
     @cached_property
     def load_coefficients(self) -> FloatArray:
         """Coefficients kt [V/K], R1 … RM [Ω] and, with `arrhenius`, b: shape (k,)."""
-        factor = () if self.arrhenius is None else (self.arrhenius.factor,)
-        return np.array([self.kt_v_per_k, *self.resistance_ohm, *factor])
+        loads = self.loads
+        factor = () if loads.arrhenius is None else (loads.arrhenius.factor,)
+        return np.array([loads.kt_v_per_k, *loads.resistance_ohm, *factor])
 
     def currents(
         self, time_s: FloatArray, current_a: FloatArray, rows: NDArray[np.intp] | slice
     ) -> FloatArray:
         """Return `past_currents` with the model's delays and time constants [A], shape (m, M)."""
-        return past_currents(time_s, current_a, rows, self.delay_s, self.low_pass_s)
+        return past_currents(time_s, current_a, rows, self.loads.delays_s, self.loads.low_pass_s)
 
     def load_columns(self, temperature_c: ArrayLike, currents_a: FloatArray) -> FloatArray:
         """Return the columns of `load_coefficients`, shape (n, k).
@@ -514,10 +522,10 @@ class VoltageModel:
             As of `currents`.
         """
         bounded = np.clip(np.asarray(temperature_c, dtype=np.float64), *self.temperature_limits_c)
-        columns = [np.atleast_1d(bounded)[:, None] - self.t_ref_c, currents_a]
-        if self.arrhenius is not None:
-            colder = resistance_factor(bounded) / resistance_factor(self.arrhenius.mean_c) - 1.0
-            drop = currents_a @ np.array(self.arrhenius.resistance_ohm)
+        columns = [np.atleast_1d(bounded)[:, None] - self.loads.t_ref_c, currents_a]
+        if (arrhenius := self.loads.arrhenius) is not None:
+            colder = resistance_factor(bounded) / resistance_factor(arrhenius.mean_c) - 1.0
+            drop = currents_a @ np.array(arrhenius.resistance_ohm)
             columns.append((colder * drop)[:, None])
         return np.concatenate(columns, axis=1)
 
@@ -529,20 +537,20 @@ class VoltageModel:
         soc_pct : array_like of shape (n,)
             State of charge [%].
         temperature_c : array_like of shape (n,), optional
-            Temperature [°C]; `t_ref_c` if left out.
+            Temperature [°C]; `loads.t_ref_c` if left out.
         """
         volts = self.curve.values(np.atleast_1d(np.asarray(soc_pct, dtype=np.float64)))
         if temperature_c is None:
             return volts
         bounded = np.clip(np.asarray(temperature_c, dtype=np.float64), *self.temperature_limits_c)
-        return np.asarray(volts + self.kt_v_per_k * (bounded - self.t_ref_c))
+        return np.asarray(volts + self.loads.kt_v_per_k * (bounded - self.loads.t_ref_c))
 
     def pseudo_ocv_slope(self, soc_pct: ArrayLike) -> FloatArray:
         """Return dU/dS of the pseudo-OCV [V per % SoC], shape (n,)."""
         return self.curve.slopes(np.atleast_1d(np.asarray(soc_pct, dtype=np.float64)))
 
     def pseudo_ocv_at(self, soc_pct: float) -> tuple[float, float]:
-        """Return pseudo-OCV at `t_ref_c` [V] and its slope [V per %] at one SoC [%]."""
+        """Return pseudo-OCV at `loads.t_ref_c` [V] and its slope [V per %] at one SoC [%]."""
         return self.curve.at(soc_pct)
 
     def voltage(

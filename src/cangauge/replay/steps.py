@@ -199,8 +199,8 @@ def quantization_bound(
     coulomb = pct_per_as * (current_a * log.duration_s + time_s * float(steps_a.sum()))
     # Without a temperature signal the temperature is another one: not bounded here.
     temperature_k = step.get("temperature_c", 0.0)
-    resistance = sum(abs(each) for each in voltage_model.resistance_ohm)
-    volts = step["voltage_v"] + abs(voltage_model.kt_v_per_k) * temperature_k
+    resistance = sum(abs(each) for each in voltage_model.loads.resistance_ohm)
+    volts = step["voltage_v"] + abs(voltage_model.loads.kt_v_per_k) * temperature_k
     volts += resistance * (current_a + time_s * slew)
     slope = min(voltage_model.pseudo_ocv_at(soc)[1] for soc in np.linspace(0.0, 100.0, 1001))
     return QuantizationBound(coulomb, volts / slope)

@@ -420,7 +420,7 @@ def _pack_of(estimator: Estimator) -> PackProperties:
     """Return the pack's properties by which its signals are judged."""
     voltage, stated_ah = estimator.voltage_model, estimator.settings.capacity_ah
     return PackProperties(
-        resistance_ohm=abs(voltage.resistance_ohm[0]) if voltage.resistance_ohm else 0.0,
+        resistance_ohm=abs(voltage.loads.resistance_ohm[0]),
         error_std_v=estimator.model.noise.residual_std_v,
         capacity_ah=estimator.model.capacity_ah if stated_ah is None else stated_ah,
         usual_v=voltage.pseudo_ocv_at(50.0)[0],

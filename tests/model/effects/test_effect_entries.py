@@ -17,6 +17,7 @@ from cangauge.model.effects.base import BOUND_MARGIN, Effect, Pack
 from cangauge.model.effects.library import LIBRARY, effect_entries, effect_of, parse_effects
 from cangauge.model.extended import ExtendedModel
 from cangauge.model.published import CAPACITY_AH
+from synthetic import within_c
 
 OFFSET = {"id": "current_offset", "parameters": {"offset_a": 1.5}}
 
@@ -129,8 +130,8 @@ def test_an_effect_does_not_depend_on_the_temperature_range(
     """The diagnosis widens the range to its logs; learned effects must not change with it."""
     values = middle(effect)
     signals = irregular_signals(400)
-    model = replace(MODEL, temperature_range_c=(0.0, 30.0))
-    wider = replace(MODEL, temperature_range_c=(-30.0, 30.0))
+    model = within_c(MODEL, 0.0, 30.0)
+    wider = within_c(MODEL, -30.0, 30.0)
     assert Pack.of(wider, CAPACITY_AH).temperature_c == 0.0
     rows = np.arange(400)
     found = [

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import time
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -25,17 +24,21 @@ from cangauge.model.effects.base import Effect, Pack, Reading, Signals
 from cangauge.model.effects.library import LIBRARY
 from cangauge.model.extended import ExtendedModel
 from cangauge.model.published import CAPACITY_AH
-from cangauge.model.voltage_model import PublishedCurve, VoltageModel
+from cangauge.model.voltage_model import PublishedCurve
 from selection import nightly_except
-from synthetic import synthetic_log
+from synthetic import synthetic_log, voltage_model, within_c
 
 each_effect = pytest.mark.parametrize("effect", EFFECTS, ids=lambda effect: effect.id)
 
 CELL_OCV_V = (3.2, 0.0, 0.0, 0.0, 0.0, 0.9, 0.0, 0.0)
-CELL = VoltageModel(
-    PublishedCurve(CELL_OCV_V), 0.0005, (-0.02, -0.01), (0.0, 10.0), t_ref_c=25.0,
-    temperature_range_c=(0.0, 40.0),
-)  # fmt: skip
+CELL = voltage_model(
+    PublishedCurve(CELL_OCV_V),
+    0.0005,
+    (-0.02, -0.01),
+    delays_s=(0.0, 10.0),
+    t_ref_c=25.0,
+    temperature_c=(0.0, 40.0),
+)
 
 
 @each_effect
@@ -111,7 +114,7 @@ def test_mid_range_is_visible_on_a_drive(effect: Effect) -> None:
     warming_c = log.temperature_c - 15.0 + np.linspace(0.0, 8.0, log.time_s.size)
     signals = Signals(log.time_s, log.current_a, log.voltage_v, warming_c)
     rows = np.arange(70, log.time_s.size)
-    base = ExtendedModel(replace(MODEL, temperature_range_c=(-20.0, 60.0)), CAPACITY_AH)
+    base = ExtendedModel(within_c(MODEL, -20.0, 60.0), CAPACITY_AH)
     plain = base.predict(signals, 90.0, rows).residual_v
     changed = base.with_effect(effect, middle(effect)).predict(signals, 90.0, rows).residual_v
     assert np.sqrt(np.mean((changed - plain) ** 2)) > 0.1
@@ -156,11 +159,15 @@ def test_bounds_scale_with_the_pack(effect: Effect) -> None:
 def test_effects_scale_from_cell_to_pack(effect: Effect) -> None:
     """At equal fractions of the bounds and equal C-rates, the relative effect is equal."""
     many = 96.0
-    pack_model = VoltageModel(
-        PublishedCurve(tuple(many * k for k in CELL_OCV_V)), many * CELL.kt_v_per_k,
-        tuple(many / 20.0 * r for r in CELL.resistance_ohm), CELL.delay_s,
-        t_ref_c=CELL.t_ref_c, temperature_range_c=CELL.temperature_range_c,
-    )  # fmt: skip
+    loads = CELL.loads
+    pack_model = voltage_model(
+        PublishedCurve(tuple(many * k for k in CELL_OCV_V)),
+        many * loads.kt_v_per_k,
+        tuple(many / 20.0 * r for r in loads.resistance_ohm),
+        delays_s=loads.delays_s,
+        t_ref_c=loads.t_ref_c,
+        temperature_c=CELL.range.temperature_c,
+    )
     big = irregular_signals(800)
     small = Signals(big.time_s, big.current_a / 20.0, big.voltage_v / many, big.temperature_c)
     rows = np.arange(800)

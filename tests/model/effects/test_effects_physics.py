@@ -44,7 +44,7 @@ def steady(
     """A constant current from 0 s on, at 1 Hz, at one SoC."""
     time_s = np.arange(0.0, seconds + 1.0)
     current = np.full_like(time_s, current_a)
-    drop = current * sum(MODEL.resistance_ohm)
+    drop = current * sum(MODEL.loads.resistance_ohm)
     return PackState(
         time_s, current, np.full_like(time_s, temperature_c), np.full_like(time_s, soc_pct), drop
     )
@@ -61,7 +61,7 @@ def extra(effect_id: str, state: PackState, values: Values) -> np.ndarray:
 
 
 def with_current(state: PackState, current_a: np.ndarray) -> PackState:
-    return replace(state, current_a=current_a, drop_v=current_a * sum(MODEL.resistance_ohm))
+    return replace(state, current_a=current_a, drop_v=current_a * sum(MODEL.loads.resistance_ohm))
 
 
 @pytest.mark.parametrize(
@@ -215,7 +215,7 @@ def test_an_undelayed_effect_scales_current_times_all_resistance(
 ) -> None:
     """For a current that has just started, a delayed effect scales only the drop so far."""
     state = at_onset(50.0, soc_pct=10.0, temperature_c=5.0)
-    whole_v = sum(MODEL.resistance_ohm) * 50.0
+    whole_v = sum(MODEL.loads.resistance_ohm) * 50.0
     assert whole_v < 0.0
     for delayed, part in ((0.0, 1.0), (1.0, 0.4), (0.25, 0.85)):
         found = extra(effect_id, state, {**values, "delayed": delayed})
@@ -348,7 +348,7 @@ def test_entropy_bounds_are_tenths_of_a_mv_per_k_and_cell() -> None:
         low, high = parameter.bounds(PACK)
         assert -low == high
         assert 1e-4 < high / 100.0 < 5e-4
-    warm = steady(3.0, 0.0, soc_pct=100.0, temperature_c=MODEL.t_ref_c + 10.0)
+    warm = steady(3.0, 0.0, soc_pct=100.0, temperature_c=MODEL.loads.t_ref_c + 10.0)
     found = extra(
         "entropic_coefficient",
         warm,
@@ -361,7 +361,7 @@ def test_the_entropic_level_is_constant_over_soc() -> None:
     values = {"level_v_per_k": 0.02, "slope_v_per_k": 0.0, "curve_v_per_k": 0.0}
     for soc_pct in (0.0, 37.0, 100.0):
         for kelvin in (-12.0, 0.0, 10.0):
-            state = steady(3.0, 60.0, soc_pct=soc_pct, temperature_c=MODEL.t_ref_c + kelvin)
+            state = steady(3.0, 60.0, soc_pct=soc_pct, temperature_c=MODEL.loads.t_ref_c + kelvin)
             found = extra("entropic_coefficient", state, values)
             np.testing.assert_allclose(found, 0.02 * kelvin, rtol=1e-12, atol=1e-15)
 
@@ -369,7 +369,7 @@ def test_the_entropic_level_is_constant_over_soc() -> None:
 def test_entropic_slope_and_curve_average_to_zero_over_soc() -> None:
     """Legendre polynomials: the level alone is the mean over SoC."""
     soc = np.linspace(0.0, 100.0, 2001)
-    state = replace(steady(2000.0, 0.0, temperature_c=MODEL.t_ref_c + 10.0), soc_pct=soc)
+    state = replace(steady(2000.0, 0.0, temperature_c=MODEL.loads.t_ref_c + 10.0), soc_pct=soc)
     for name in ("slope_v_per_k", "curve_v_per_k"):
         values = dict.fromkeys(("level_v_per_k", "slope_v_per_k", "curve_v_per_k"), 0.0)
         found = extra("entropic_coefficient", state, values | {name: 0.02})
@@ -379,7 +379,9 @@ def test_entropic_slope_and_curve_average_to_zero_over_soc() -> None:
 
 def test_weak_cells_advance_the_knee_of_a_rising_ocv() -> None:
     soc = np.linspace(0.0, 100.0, 1001)
-    state = replace(steady(1000.0, 0.0), soc_pct=soc, temperature_c=np.full(1001, MODEL.t_ref_c))
+    state = replace(
+        steady(1000.0, 0.0), soc_pct=soc, temperature_c=np.full(1001, MODEL.loads.t_ref_c)
+    )
     found = extra("weak_cell", state, {"fraction": 0.1, "deficit_pct": 15.0})
     assert found[-1] == 0.0
     assert np.all(found <= 0.0)

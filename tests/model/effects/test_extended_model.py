@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -20,7 +19,7 @@ from cangauge.model.effects.library import LIBRARY
 from cangauge.model.extended import ExtendedModel
 from cangauge.model.inverse import soc_from_ocv
 from cangauge.model.published import CAPACITY_AH
-from synthetic import synthetic_log
+from synthetic import synthetic_log, within_c
 
 ALL = tuple((effect, middle(effect)) for effect in EFFECTS)
 
@@ -141,7 +140,7 @@ def test_newton_finds_a_root_with_all_effects(
     effects = tuple(
         (effect, values if effect.id == "resistance_soc" else middle(effect)) for effect in EFFECTS
     )
-    wide = replace(MODEL, temperature_range_c=(-30.0, 50.0))
+    wide = within_c(MODEL, -30.0, 50.0)
     online = online_of(ExtendedModel(wide, 51.5, effects))
     online.advance(0.0, current, temperature)
     wanted = online.pseudo_ocv_at(soc)[0]

@@ -45,7 +45,7 @@ class TabulatedModel(Model):
         curve = voltage.curve
         if not isinstance(curve, PublishedCurve):
             return voltage
-        low, high = voltage.soc_range_pct
+        low, high = voltage.range.soc_pct
         inside = np.linspace(low, high, layout.KNOTS - 2)
         soc_pct = np.r_[low - EDGE_PCT, inside, high + EDGE_PCT]
         slope = np.r_[curve.beyond[0], curve.slopes(inside), curve.beyond[1]]

@@ -138,7 +138,7 @@ def std_at_rest_pct(model: Model) -> float:
     estimator, voltage = Estimator(model, EstimatorSettings()), model.voltage_model()
     std_pct, second = math.nan, 0
     while second <= model.noise.block_s or math.isnan(std_pct):  # a time skew ends a block later
-        estimator.update(Sample(float(second), 0.0, voltage.nominal_v, voltage.t_ref_c))
+        estimator.update(Sample(float(second), 0.0, voltage.nominal_v, voltage.loads.t_ref_c))
         std_pct, second = estimator.estimate.soc_std_pct, second + 1
     return std_pct
 
@@ -217,7 +217,7 @@ def drive_with_events(model: Model, period_s: float) -> Iterator[Sample]:
     Numbers are those of a float, so that both precisions of the core read the same.
     """
     voltage = model.voltage_model()
-    low, high = voltage.soc_range_pct
+    low, high = voltage.range.soc_pct
     soc_pct, capacity_ah = 0.25 * low + 0.75 * high, model.capacity_ah
     usual_s = max(period_s, 1.0 / model.rate_hz)
     steps = int(GOLDEN_S / usual_s)
@@ -233,8 +233,8 @@ def drive_with_events(model: Model, period_s: float) -> Iterator[Sample]:
         soc_pct -= 100.0 * current_a * spacing_s / (3600.0 * capacity_ah)
         error_v = 5e-4 * voltage.nominal_v * math.sin(0.7 * k)
         volts = voltage.pseudo_ocv_at(soc_pct)[0] + error_v
-        volts += sum(voltage.resistance_ohm) * current_a
-        temperature_c = voltage.t_ref_c + 3.0 * math.sin(k / 400.0)
+        volts += sum(voltage.loads.resistance_ohm) * current_a
+        temperature_c = voltage.loads.t_ref_c + 3.0 * math.sin(k / 400.0)
         if k % 97 == 5:
             volts = math.nan
         if k % 61 == 3:

@@ -285,7 +285,11 @@ def _pack_variables(model: Model) -> tuple[Variable, ...]:
         Variable("time", "independent", "s", None, "time"),
         Variable("current_a", "input", "A", 0.0, "current, positive = discharge"),
         Variable(
-            "temperature_c", "input", "degC", model.voltage_model().t_ref_c, "measured temperature"
+            "temperature_c",
+            "input",
+            "degC",
+            model.voltage_model().loads.t_ref_c,
+            "measured temperature",
         ),
         Variable("voltage_v", "output", "V", None, "voltage at the terminals"),
         Variable("soc_pct", "output", "%", None, "state of charge"),

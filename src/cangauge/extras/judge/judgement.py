@@ -465,18 +465,19 @@ def narrowed(judgement: Judgement) -> Model:
         soc_pct=fields.soc_pct, curve_v=(curve @ root).T.tolist(), load=(loads @ root).T.tolist()
     )
     update: dict[str, Any] = {"functions": functions, "name": f"{model.name}, narrowed"}
-    if model.curve is not None and model.loads is not None:
-        at_pct, before = model.curve.soc_pct, model.loads
+    before = model.loads
+    if model.curve is not None and before is not None and before.arrhenius is not None:
+        at_pct = model.curve.soc_pct
         volts = np.array(model.curve.voltage_v)
         volts += np.interp(at_pct, fields.soc_pct, curve @ best.functions)
         rising = np.maximum.accumulate(volts).tolist()
-        update["curve"] = model.curve.model_copy(update={"voltage_v": rising})
+        update["curve"] = model.curve.model_copy(update={"voltage_v": tuple(rising)})
         change = loads @ best.functions
         last = 1 + len(before.resistance_ohm)  # kt and the resistances, then b
         factor = before.arrhenius.factor + float(change[last])
         changed = {
             "kt_v_per_k": before.kt_v_per_k + float(change[0]),
-            "resistance_ohm": (np.array(before.resistance_ohm) + change[1:last]).tolist(),
+            "resistance_ohm": tuple((np.array(before.resistance_ohm) + change[1:last]).tolist()),
             "arrhenius": replace(before.arrhenius, factor=factor),
         }
         update["loads"] = before.model_copy(update=changed)

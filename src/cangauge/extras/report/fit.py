@@ -133,7 +133,7 @@ def _ocv_figure(result: Identification) -> Figure:
     effects = ", effects" if result.model.effects else ""
     caption = (
         f"Dots: the measured voltage minus the model's resistances{effects} and temperature term."
-        f" The logs cover {span(*model.soc_range_pct, 1, '%')}; in the shaded part the curve"
+        f" The logs cover {span(*model.range.soc_pct, 1, '%')}; in the shaded part the curve"
         f" {result.beyond}."
     )
     soc = np.concatenate([item.rows.soc_pct for item in result.fits])
@@ -160,7 +160,7 @@ def curve_figure(
         low, high = min(low, soc.min()), max(high, soc.max())
     grid = np.linspace(low, high, 401)
     figure.line("pseudo-OCV", grid, model.pseudo_ocv(grid), BLUE, line_width=2.2)
-    figure.shade_outside(*model.soc_range_pct)
+    figure.shade_outside(*model.range.soc_pct)
     return figure
 
 
@@ -176,8 +176,8 @@ def slope_figure(model: VoltageModel, caption: str) -> Figure:
     )
     grid = np.linspace(0.0, 100.0, 401)
     figure.line("slope", grid, model.pseudo_ocv_slope(grid), BLUE, line_width=2.0)
-    figure.shade_outside(*model.soc_range_pct)
-    inside = model.pseudo_ocv_slope(np.linspace(*model.soc_range_pct, 201))
+    figure.shade_outside(*model.range.soc_pct)
+    inside = model.pseudo_ocv_slope(np.linspace(*model.range.soc_pct, 201))
     # The slope rises tenfold at the ends; the middle matters.
     figure.plot.y_range.end = float(min(inside.max(), 4.0 * np.median(inside))) * 1.1
     figure.plot.y_range.start = 0.0
@@ -264,7 +264,7 @@ def _newton_figure(result: Identification, time: TimeFigures) -> Figure:
 
 def _resistance_figure(result: Identification) -> Figure:
     slope = significant(result.slope_ohm, 3, "Ω")
-    delay_s = result.voltage_model.delay_s[0]
+    delay_s = result.voltage_model.loads.delays_s[0]
     figure = Figure(
         "Voltage drop against current",
         f"current {delay_s:g} s ago [A]" if delay_s else "current [A]",
@@ -343,8 +343,9 @@ def coefficient_tables(model: Model, condition_number: float) -> list[Block]:
             [f"resistance: {name}", significant(ohm, 3), "Ω"]
             for name, ohm in zip(names, loads.resistance_ohm, strict=True)
         ]
-        arrhenius = number(loads.arrhenius.factor, 2)
-        rows.append(["part of the resistance that follows Arrhenius", arrhenius, ""])
+        if loads.arrhenius is not None:
+            part = number(loads.arrhenius.factor, 2)
+            rows.append(["part of the resistance that follows Arrhenius", part, ""])
         note = (
             "U = g(S) + kt·(T − Tr) + Σ Rm·Im + b·(a(T)/a(mean T) − 1)·Σ Rm·Im, with g the curve"
             " through knots."

@@ -87,8 +87,8 @@ class Pack:
         return cls(
             voltage_v=volts,
             capacity_ah=capacity_ah,
-            resistance_ohm=max(abs(sum(model.resistance_ohm)), least_ohm),
-            temperature_c=float(np.clip(0.5 * sum(model.temperature_range_c), *PLAUSIBLE_C)),
+            resistance_ohm=max(abs(sum(model.loads.resistance_ohm)), least_ohm),
+            temperature_c=float(np.clip(0.5 * sum(model.range.temperature_c), *PLAUSIBLE_C)),
         )
 
 

@@ -129,7 +129,7 @@ def _travel_as(values: Values, pack: Pack) -> float:
 
 
 def _entropic_drive(load: Load, _: Values, at: Context) -> FloatArray:
-    return np.asarray(np.clip(load.temperature_c, *PLAUSIBLE_C) - at.model.t_ref_c)
+    return np.asarray(np.clip(load.temperature_c, *PLAUSIBLE_C) - at.model.loads.t_ref_c)
 
 
 def _entropic_shape(soc_pct: FloatArray, values: Values, *_: object) -> FloatArray:
@@ -383,7 +383,7 @@ VOLTAGES: Final = (
         over_soc=_entropic_shape,
         core_form=lambda v, model, _: CoreForm(
             "entropic",
-            (*_of(v, "level_v_per_k", "slope_v_per_k", "curve_v_per_k"), model.t_ref_c),
+            (*_of(v, "level_v_per_k", "slope_v_per_k", "curve_v_per_k"), model.loads.t_ref_c),
         ),
     ),
     # From full the SoC of the weak cells falls faster. Below empty they follow the model's linear
