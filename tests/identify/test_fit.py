@@ -256,8 +256,9 @@ def test_capacity_needs_a_log_from_full_to_empty() -> None:
     whole = replace(synthetic_log(end_pct=0.0), soc_pct=None)
     assert capacity_from_full_discharge([whole], [100.0]) == pytest.approx(CAPACITY_AH, rel=0.005)
     part = replace(synthetic_log(end_pct=30.0), soc_pct=None)
-    with pytest.raises(InputError, match="full to empty"):
+    with pytest.raises(InputError, match="full to empty") as caught:
         capacity_from_full_discharge([part], [100.0])
+    assert caught.value.cure == "give --capacity-ah A"  # no SoC that could give it
     referenced = synthetic_log(start_pct=90.0, end_pct=30.0)
     with pytest.raises(InputError, match="--capacity-ah"):
         fit([referenced])
@@ -271,7 +272,7 @@ def test_capacity_needs_a_log_from_full_to_empty() -> None:
     ("log", "words"),
     [
         (synthetic_log(hours=0.015, end_pct=99.0), "no rows are left"),
-        (replace(synthetic_log(), current_a=-synthetic_log().current_a), "sign of current"),
+        (replace(synthetic_log(), current_a=-synthetic_log().current_a), "sign of the current"),
     ],
 )
 def test_names_the_reason_why_a_log_identifies_nothing(log: Log, words: str) -> None:

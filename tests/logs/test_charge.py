@@ -137,6 +137,21 @@ def test_a_column_in_ah_that_counts_something_else_is_no_counter(tmp_path: Path)
     assert read_log(path, temperature_c=20.0).counted_ah is None
 
 
+def test_columns_in_ah_that_all_miss_are_said(tmp_path: Path) -> None:
+    log = drive()
+    assert log.soc_pct is not None
+    halved_ah = 0.5 * np.cumsum(np.diff(log.time_s, prepend=0.0) * log.current_a) / 3600.0
+    table = np.column_stack([log.time_s, log.current_a, log.voltage_v, log.soc_pct, halved_ah])
+    rows = [",".join(f"{value:.4f}" for value in row) for row in table]
+    path = tmp_path / "log.csv"
+    path.write_text("\n".join(["Time [s],Current [A],Voltage [V],SoC [%],Ah out", *rows, ""]))
+    read = read_log(path, temperature_c=20.0)
+    assert read.counted_ah is None
+    assert [
+        text for text in read.remarks if "no column in Ah counts this current: the near" in text
+    ]
+
+
 @pytest.mark.parametrize("off_pct", [10.0, 22.0, 30.0])
 def test_a_gauge_that_stands_at_its_end_is_off_and_no_contradiction(off_pct: float) -> None:
     log = drive(hours=2.0)

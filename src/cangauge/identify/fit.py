@@ -48,6 +48,7 @@ from cangauge.identify.published import (
 )
 from cangauge.identify.rows import LEAST_ROWS, FitRows, fit_rows, usable_delays
 from cangauge.identify.starts import find_starts, given_starts, with_start
+from cangauge.logs.charge import refuse_contradictions
 from cangauge.logs.gaps import discharged_ah
 from cangauge.logs.log import Log, as_log
 from cangauge.model.coulomb_counting import capacity_from_full_discharge, capacity_from_reference
@@ -158,6 +159,8 @@ def fit(
             value=capacity_ah,
             cure="check the sign of current: positive must discharge",
         )
+    unstated = [log for log, start in zip(recorded, stated_pct, strict=True) if start is None]
+    refuse_contradictions(unstated, capacity_ah)  # a stated start needs no SoC of the log
     effect_ids = _effect_ids(effects, equation)
     stated = [
         log if value is None else with_start(log, value)

@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise, permutations
+from operator import itemgetter
 from typing import Final
 
 import numpy as np
@@ -159,18 +160,24 @@ def with_own_count(log: Log, counters: Mapping[str, FloatArray]) -> Log:
     counts = dict(counters)
     for one, other in permutations(counters, 2):
         counts[f"{one} − {other}"] = counters[one] - counters[other]
-    found, counted_ah = "", None
+    moved: list[tuple[float, str, FloatArray]] = []
     for label, count in counts.items():
         gained_ah = count - count[0]
         if np.sum(gained_ah * out_ah) < 0.0:
             gained_ah = -gained_ah
-        apart_ah = float(np.max(np.abs(gained_ah - out_ah)))
-        if apart_ah <= least_ah and np.ptp(gained_ah) > 0.0:
-            found, counted_ah, least_ah = label, gained_ah, apart_ah
-    if counted_ah is None:
+        if np.ptp(gained_ah) > 0.0:
+            moved.append((float(np.max(np.abs(gained_ah - out_ah))), label, gained_ah))
+    if not moved:
         return log
-    remark = f'charge for the capacity: counted by "{found}"'
-    return replace(log, counted_ah=counted_ah, remarks=(*log.remarks, remark))
+    apart_ah, label, counted_ah = min(moved, key=itemgetter(0))
+    if apart_ah <= least_ah:
+        remark = f'charge for the capacity: counted by "{label}"'
+        return replace(log, counted_ah=counted_ah, remarks=(*log.remarks, remark))
+    remark = (
+        f'no column in Ah counts this current: the nearest, "{label}", is up to'
+        f" {rounded(apart_ah, 2)} Ah off, and the current moves {rounded(np.ptp(out_ah), 3)} Ah"
+    )
+    return replace(log, remarks=(*log.remarks, remark))
 
 
 def _per_100(capacity_ah: float) -> str:

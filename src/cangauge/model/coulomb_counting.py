@@ -155,14 +155,15 @@ def capacity_from_full_discharge(logs: Sequence[Log], starts_pct: Sequence[float
             capacity_ah = _whole_capacity_ah(piece, stated_pct)
             if capacity_ah is not None:
                 return capacity_ah
+    nearest = _nearest(logs)
+    from_soc = ", or --capacity-ah from-soc for the charge per 100 % of the logs' soc_pct"
     raise InputError(
         f"unknown capacity: no log is proven to run from full to empty (its own SoC from"
         f" {FULL_PCT:.0f} % or more to {EMPTY_PCT:.0f} % or less; or --initial-soc of"
-        f" {FULL_PCT:.0f} % or more, and a voltage that ends in the knee){_nearest(logs)}",
+        f" {FULL_PCT:.0f} % or more, and a voltage that ends in the knee){nearest}",
         source=logs[0].source or logs[0].name,
         field="capacity_ah",
-        cure="give --capacity-ah A, or --capacity-ah from-soc for the charge per 100 % of the logs'"
-        " soc_pct",
+        cure=f"give --capacity-ah A{from_soc if nearest else ''}",
     )
 
 
