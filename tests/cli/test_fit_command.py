@@ -59,7 +59,7 @@ def test_options_go_into_the_model_file(made: Path, output: tuple[str, Path]) ->
     model = Model.load(output[1])
     assert (model.capacity_ah, model.rate_hz) == (51.0, 0.5)
     assert model.published is not None
-    assert model.published.delays_s == [0.0, 20.0]
+    assert [*model.published.delays_s] == [0.0, 20.0]
     assert (model.published.epsilon, model.published.t_ref_c) == (0.04, 25.0)
     assert model.made.options["initial_soc_pct"] == 99.5
 
