@@ -121,8 +121,8 @@ class _StepResponse:
 
     def __init__(self, extended: ExtendedModel) -> None:
         self._extended = extended
-        of_effects = (effect.rc_tau_s(values) for effect, values in extended.effects)
-        own = {*(tau for tau in of_effects if tau is not None), *extended.model.loads.low_pass_s}
+        of_effects = {values["tau_s"] for effect, values in extended.effects if effect.is_rc}
+        own = {*of_effects, *extended.model.loads.low_pass_s}
         self._own_tau_s = sorted(tau for tau in own if tau >= FASTEST_S)
         delays = [delay for delay in extended.model.loads.delays_s if delay > 0.0]
         self._last_s = LASTING * max([FASTEST_S, *delays, *self._own_tau_s])

@@ -335,9 +335,9 @@ def offered(effect_ids: Sequence[str], model: ExtendedModel) -> list[EffectCandi
 
 
 def _repeats_a_low_pass(item: EffectCandidate) -> bool:
-    own_s = item.effect.rc_tau_s(item.values(item.steps))
-    return own_s is not None and any(
-        max(own_s / tau_s, tau_s / own_s) <= TAU_RATIO for tau_s in LOW_PASS_S
+    return item.effect.is_rc and any(
+        max(item.shape["tau_s"] / tau_s, tau_s / item.shape["tau_s"]) <= TAU_RATIO
+        for tau_s in LOW_PASS_S
     )
 
 

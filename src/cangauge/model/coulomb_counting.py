@@ -169,16 +169,16 @@ def capacity_from_full_discharge(logs: Sequence[Log], starts_pct: Sequence[float
 
 def _nearest(logs: Sequence[Log]) -> str:
     """Return the log whose own SoC spans most, and the charge per 100 % that it implies."""
-    socs = [(_readings(log)[0], log) for log in logs]
-    spans = [(float(soc.min()), float(soc.max()), log) for soc, log in socs if soc.size]
-    if not spans:
-        return ""
-    low, high, log = max(spans, key=lambda span: span[1] - span[0])
+    socs = [_readings(log)[0] for log in logs]
+    spans_pct = [float(np.ptp(soc)) if soc.size else 0.0 for soc in socs]
+    place = int(np.argmax(spans_pct))
+    log, soc = logs[place], socs[place]
     try:
         per_100_ah = rounded(abs(capacity_from_reference([log])), 4)
     except InputError:
         return ""
-    return f"; nearest is {log.name}: {low:.1f} … {high:.1f} %, {per_100_ah} Ah per 100 %"
+    ends = f"{soc.min():.1f} … {soc.max():.1f} %"
+    return f"; nearest is {log.name}: {ends}, {per_100_ah} Ah per 100 %"
 
 
 def _whole_capacity_ah(log: Log, stated_pct: float | None) -> float | None:

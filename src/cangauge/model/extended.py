@@ -49,6 +49,11 @@ SLOPE_STEP_PCT = 0.05
 _ORDER = {effect_id: number for number, effect_id in enumerate(LIBRARY)}
 
 
+def _place(item: tuple[Effect, Values]) -> int:
+    """Return the place of an effect in the library's order; the last for one of the user's own."""
+    return _ORDER.get(item[0].id, len(_ORDER))
+
+
 @dataclass(frozen=True, eq=False)
 class Prediction:
     """Prediction of the extended model for a log."""
@@ -92,9 +97,7 @@ class ExtendedModel:
     effects: tuple[tuple[Effect, Values], ...] = ()
 
     def __post_init__(self) -> None:
-        last = len(_ORDER)
-        ordered = sorted(self.effects, key=lambda item: _ORDER.get(item[0].id, last))
-        object.__setattr__(self, "effects", tuple(ordered))
+        object.__setattr__(self, "effects", tuple(sorted(self.effects, key=_place)))
 
     @cached_property
     def pack(self) -> Pack:

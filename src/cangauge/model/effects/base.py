@@ -224,10 +224,6 @@ class CoreForm(NamedTuple):
     """Time constants of its lags [s]."""
 
 
-NO_FORM = CoreForm("no_effect")
-"""Of an effect that the core applies elsewhere: in the count."""
-
-
 class Context(NamedTuple):
     """What an effect works with."""
 
@@ -239,15 +235,35 @@ class Context(NamedTuple):
     """Whether a call gets a whole log, after which no sample comes."""
 
 
-def _same(signals: Signals, *_: object) -> Signals:
+def core_values(
+    kind: str, names: Sequence[str], values: Values, _: VoltageModel, pack: Pack
+) -> CoreForm:
+    """Return a form in the C core whose constants are parameters, or sizes of the pack."""
+    known = {**vars(pack), **values}
+    return CoreForm(kind, tuple(known[name] for name in names))
+
+
+def same_signals(signals: Signals, *_: object) -> Signals:
+    """Return the signals: the effect corrects none."""
     return signals
 
 
-def _none(*_: object) -> None:
-    return None
+def same_count(counting: Counting, *_: object) -> Counting:
+    """Return the counting: the effect does not change it."""
+    return counting
 
 
-def _at_every_soc(*_: object) -> float:
+def no_memory(*_: object) -> Memories:
+    """Return nothing: the effect carries nothing from sample to sample."""
+    return ()
+
+
+def none(*_: object) -> None:
+    """Return nothing: no added voltage, or no form in the C core."""
+
+
+def at_every_soc(*_: object) -> float:
+    """Return 1: the added voltage does not depend on the SoC."""
     return 1.0
 
 
@@ -278,10 +294,10 @@ class Effect:
         (soc_pct, values, model) → factor on `drive` at SoC [%] of shape (n,).
     memory : callable
         (values, pack) → what is carried from sample to sample, before the first one.
-    rc_tau_s : callable
-        (values) → time constant of an RC element [s]; None if it is none.
     core_form : callable
         (values, model, pack) → form in the C core; None if it has none.
+    is_rc : bool
+        Whether it is an RC element, of time constant `tau_s`.
     scales_drop : bool
         Whether the added voltage follows the model's drop over the resistances.
     moves_time : bool
@@ -295,13 +311,13 @@ class Effect:
     source: str
     signature: str
     separated_by: str
-    correct: Callable[[Signals, Values, Context], Signals] = _same
-    count: Callable[[Counting, Values], Counting] = lambda counting, _: counting
-    drive: Callable[[Load, Values, Context], FloatArray | None] = _none
-    over_soc: Callable[[FloatArray, Values, VoltageModel], FloatArray | float] = _at_every_soc
-    memory: Callable[[Values, Pack], Memories] = lambda *_: ()
-    rc_tau_s: Callable[[Values], float | None] = _none
-    core_form: Callable[[Values, VoltageModel, Pack], CoreForm | None] = _none
+    correct: Callable[[Signals, Values, Context], Signals] = same_signals
+    count: Callable[[Counting, Values], Counting] = same_count
+    drive: Callable[[Load, Values, Context], FloatArray | None] = none
+    over_soc: Callable[[FloatArray, Values, VoltageModel], FloatArray | float] = at_every_soc
+    memory: Callable[[Values, Pack], Memories] = no_memory
+    core_form: Callable[[Values, VoltageModel, Pack], CoreForm | None] = none
+    is_rc: bool = False
     scales_drop: bool = False
     moves_time: bool = False
 
@@ -322,17 +338,17 @@ class Effect:
     @property
     def corrects(self) -> bool:
         """Whether it changes the measured signals."""
-        return self.correct is not _same
+        return self.correct is not same_signals
 
     @property
     def adds_voltage(self) -> bool:
         """Whether it adds a voltage, and changes neither signals nor count."""
-        return self.drive is not _none
+        return self.drive is not none
 
     @property
     def uses_soc(self) -> bool:
         """Whether the added voltage depends on the SoC."""
-        return self.over_soc is not _at_every_soc
+        return self.over_soc is not at_every_soc
 
     def constants(self, pack: Pack) -> dict[str, float]:
         """Return the parameters that are taken from the pack when the effect is added to it."""

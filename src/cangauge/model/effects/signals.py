@@ -8,22 +8,24 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
-from typing import Final, Literal
+from typing import Final
 
 import numpy as np
 
 from cangauge.logs.gaps import BRIDGE_S
 from cangauge.model.effects.base import (
-    NO_FORM,
     Context,
     CoreForm,
+    Counting,
     Effect,
     Memories,
+    Pack,
     Parameter,
     Signals,
     Values,
 )
 from cangauge.model.first_order import Lag, finite
+from cangauge.model.voltage_model import VoltageModel
 
 SMOOTHING_S: Final = 200.0
 """Time constant of the smoothed derivative [s]: short against the warming of a pack, long against
@@ -34,37 +36,26 @@ STALE: Final = 64
 """Currents that are not needed any more are dropped from this number on."""
 
 
-def _linear_sensor(
-    signal: Literal["current", "voltage"],
-    error: Literal["offset", "gain"],
-    parameter: Parameter,
-    signature: str,
-    separated_by: str,
-) -> Effect:
-    """Return a sensor's error, measured = gain·true + offset, undone."""
-    field = {"current": "current_a", "voltage": "voltage_v"}[signal]
-    symbol = {"current": "I", "voltage": "U"}[signal]
+def offset_and_gain(values: Values) -> tuple[float, float]:
+    """Return the error of a sensor, measured = gain·true + offset, by its only parameter."""
+    ((name, value),) = values.items()
+    return (0.0, 1.0 + value / 100.0) if name == "gain_pct" else (value, 1.0)
 
-    def offset_and_gain(values: Values) -> tuple[float, float]:
-        value = values[parameter.name]
-        return (value, 1.0) if error == "offset" else (0.0, 1.0 + value / 100.0)
 
-    def correct(signals: Signals, values: Values, *_: object) -> Signals:
-        offset, gain = offset_and_gain(values)
-        return signals._replace(**{field: (getattr(signals, field) - offset) / gain})
+def true_signals(field: str, signals: Signals, values: Values, _: Context) -> Signals:
+    """Return the signals without the error of one sensor."""
+    offset, gain = offset_and_gain(values)
+    return signals._replace(**{field: (getattr(signals, field) - offset) / gain})
 
-    is_offset = error == "offset"
-    return Effect(
-        id=f"{signal}_{error}",
-        fault="current_reading" if signal == "current" else "voltage_reading",
-        parameters=(parameter,),
-        signature=signature,
-        equation=f"{symbol} = {symbol}_measured " + ("− b" if is_offset else "/ (1 + g)"),
-        source=f"{'zero' if is_offset else 'sensitivity'} error, JCGM 200:2012 (VIM)",
-        separated_by=separated_by,
-        correct=correct,
-        core_form=lambda values, *_: CoreForm(f"{signal}_sensor", offset_and_gain(values)),
-    )
+
+def sensor_form(kind: str, values: Values, *_: object) -> CoreForm:
+    """Return the error of a sensor in the C core."""
+    return CoreForm(kind, offset_and_gain(values))
+
+
+def counted_form(*_: object) -> CoreForm:
+    """Return the form of an effect that the C core applies in the count."""
+    return CoreForm("no_effect")
 
 
 class _Waiting:
@@ -109,18 +100,41 @@ class _Waiting:
         self._waiting, self._currents = readings.T, currents
 
 
-def _time_skew(signals: Signals, _: Values, at: Context) -> Signals:
+def skewed_current(signals: Signals, _: Values, at: Context) -> Signals:
+    """Return the signals with the current of the moment of their voltage."""
     return at.memory[0].step(signals, is_last=at.is_whole) if at.memory else signals
 
 
-def _temperature_lag(signals: Signals, values: Values, at: Context) -> Signals:
+def skew_memory(values: Values, _: Pack) -> Memories:
+    """Return the rows that wait; none without a skew."""
+    return (_Waiting(values["skew_s"]),) if values["skew_s"] else ()
+
+
+def skew_form(values: Values, *_: object) -> CoreForm:
+    """Return the skew in the C core, which delays every sample where it is not 0."""
+    return CoreForm("time_skew", (values["skew_s"],)) if values["skew_s"] else counted_form()
+
+
+def ahead_of_lag(signals: Signals, values: Values, at: Context) -> Signals:
+    """Return the signals with the temperature ahead of a slow sensor."""
     measured = signals.temperature_c
     ahead = values["tau_s"] / SMOOTHING_S
     smooth = at.memory[0].step(signals.time_s, measured)
     return signals._replace(temperature_c=measured + ahead * (measured - smooth))
 
 
-def _core_temperature(signals: Signals, values: Values, at: Context) -> Signals:
+def lag_memory(*_: object) -> Memories:
+    """Return the smoothed temperature."""
+    return (Lag(SMOOTHING_S),)
+
+
+def lag_form(values: Values, *_: object) -> CoreForm:
+    """Return the lag in the C core."""
+    return CoreForm("temperature_lag", (values["tau_s"] / SMOOTHING_S,), (SMOOTHING_S,))
+
+
+def core_temperature(signals: Signals, values: Values, at: Context) -> Signals:
+    """Return the signals with the temperature of the core."""
     time_s, current_a, _, outside = signals
     heat = at.memory[0].step(time_s, (current_a / at.pack.capacity_ah) ** 2)
     core = outside + values["rise_k"] * heat
@@ -129,52 +143,94 @@ def _core_temperature(signals: Signals, values: Values, at: Context) -> Signals:
     return signals._replace(temperature_c=core)
 
 
-def _core_memory(values: Values, *_: object) -> Memories:
+def core_temperature_memory(values: Values, _: Pack) -> Memories:
+    """Return the heat, and where the core is late, the outside temperature."""
     heat = Lag(values["tau_s"], 0.0, rest_s=BRIDGE_S)
     return (heat, Lag(values["tau_s"])) if values["late"] else (heat,)
 
 
-_current, _voltage = partial(_linear_sensor, "current"), partial(_linear_sensor, "voltage")
+def core_temperature_form(values: Values, _: VoltageModel, pack: Pack) -> CoreForm:
+    """Return the thermal model in the C core."""
+    constants = (values["rise_k"], values["late"], pack.capacity_ah)
+    return CoreForm("core_temperature", constants, (values["tau_s"],) * 2)
+
+
+def changed_capacity(counting: Counting, values: Values) -> Counting:
+    """Return the count with another capacity."""
+    capacity_ah = counting.capacity_ah * (1.0 + values["change_pct"] / 100.0)
+    return replace(counting, capacity_ah=capacity_ah)
+
+
+def changed_start(counting: Counting, values: Values) -> Counting:
+    """Return the count from another start."""
+    return replace(counting, initial_soc_pct=counting.initial_soc_pct + values["offset_pct"])
+
+
+def changed_efficiency(counting: Counting, values: Values) -> Counting:
+    """Return the count with a loss while charging."""
+    efficiency = counting.charge_efficiency * values["efficiency"]
+    return replace(counting, charge_efficiency=efficiency)
+
 
 CORRECTIONS: Final = (
     # Or an unmeasured parasitic load (with opposite sign).
-    _current(
-        "offset",
-        Parameter("offset_a", "A", -0.15, 0.15, scale="capacity", healthy_std=5e-4),
+    Effect(
+        id="current_offset",
+        fault="current_reading",
+        parameters=(Parameter("offset_a", "A", -0.15, 0.15, scale="capacity", healthy_std=5e-4),),
         signature="a constant R·b, and a slope over time as the count drifts: OCV′·b·t/C",
+        equation="I = I_measured − b",
+        source="zero error, JCGM 200:2012 (VIM)",
         separated_by=(
             "a long rest with the bus awake: the count drifts while no current flows. Not separable"
             " from a load that bypasses the sensor; from capacity by alternating driving and"
             " resting"
         ),
+        correct=partial(true_signals, "current_a"),
+        core_form=partial(sensor_form, "current_sensor"),
     ),
-    _current(
-        "gain",
-        Parameter("gain_pct", "%", -10.0, 10.0),
+    Effect(
+        id="current_gain",
+        fault="current_reading",
+        parameters=(Parameter("gain_pct", "%", -10.0, 10.0),),
         signature="a scaled drop over the resistance, and a slope over SoC as the count is scaled",
+        equation="I = I_measured / (1 + g)",
+        source="sensitivity error, JCGM 200:2012 (VIM)",
         separated_by=(
             "a drive at high current over little SoC (drop) against a long gentle one (count);"
             " not separable from a joint change of capacity and resistance"
         ),
+        correct=partial(true_signals, "current_a"),
+        core_form=partial(sensor_form, "current_sensor"),
     ),
-    _voltage(
-        "offset",
-        Parameter("offset_v", "V", -0.04, 0.04, scale="voltage", healthy_std=2e-4),
+    Effect(
+        id="voltage_offset",
+        fault="voltage_reading",
+        parameters=(Parameter("offset_v", "V", -0.04, 0.04, scale="voltage", healthy_std=2e-4),),
         signature="a constant, at any current, SoC and temperature",
+        equation="U = U_measured − b",
+        source="zero error, JCGM 200:2012 (VIM)",
         separated_by=(
             "a log over much SoC: the error of an initial SoC shrinks where the OCV is flat, that"
             " of a gain follows the voltage, this one is constant; or the voltage with open"
             " contactors"
         ),
+        correct=partial(true_signals, "voltage_v"),
+        core_form=partial(sensor_form, "voltage_sensor"),
     ),
-    _voltage(
-        "gain",
-        Parameter("gain_pct", "%", -4.0, 4.0),
+    Effect(
+        id="voltage_gain",
+        fault="voltage_reading",
+        parameters=(Parameter("gain_pct", "%", -4.0, 4.0),),
         signature="in proportion to the voltage: nearly constant, a little smaller near empty",
+        equation="U = U_measured / (1 + g)",
+        source="sensitivity error, JCGM 200:2012 (VIM)",
         separated_by=(
             "a log from full to empty: at one SoC it is not separable from voltage_offset, since"
             " the voltage of a pack varies by only a fifth"
         ),
+        correct=partial(true_signals, "voltage_v"),
+        core_form=partial(sensor_form, "voltage_sensor"),
     ),
     # The current is interpolated, never the voltage: averaging neighbouring voltages would reduce
     # their noise and look like an improvement. Online, with a positive skew, a voltage is held
@@ -222,9 +278,9 @@ CORRECTIONS: Final = (
             "a log at 10 Hz or faster: a skew gives spikes of both signs and the same area at both"
             " ends of a pulse, fast_polarization a tail after each"
         ),
-        correct=_time_skew,
-        memory=lambda v, _: (_Waiting(v["skew_s"]),) if v["skew_s"] else (),
-        core_form=lambda v, *_: CoreForm("time_skew", (v["skew_s"],)) if v["skew_s"] else NO_FORM,
+        correct=skewed_current,
+        memory=skew_memory,
+        core_form=skew_form,
         moves_time=True,
     ),
     # A constant error of the thermometer. Without it a warm reading looks like a low resistance.
@@ -238,10 +294,8 @@ CORRECTIONS: Final = (
         separated_by=(
             "a second thermometer; a resistance that has grown leaves the voltage at rest as it is"
         ),
-        correct=lambda signals, v, *_: signals._replace(
-            temperature_c=signals.temperature_c - v["offset_k"]
-        ),
-        core_form=lambda v, *_: CoreForm("temperature_sensor", (v["offset_k"],)),
+        correct=partial(true_signals, "temperature_c"),
+        core_form=partial(sensor_form, "temperature_sensor"),
     ),
     # Undone with a causal smoothed derivative.
     Effect(
@@ -254,11 +308,9 @@ CORRECTIONS: Final = (
         separated_by=(
             "warming or cooling from outside without current: core_temperature needs current"
         ),
-        correct=_temperature_lag,
-        memory=lambda *_: (Lag(SMOOTHING_S),),
-        core_form=lambda v, *_: CoreForm(
-            "temperature_lag", (v["tau_s"] / SMOOTHING_S,), (SMOOTHING_S,)
-        ),
+        correct=ahead_of_lag,
+        memory=lag_memory,
+        core_form=lag_form,
     ),
     # The thermal insulation also delays changes of the ambient temperature, with the same time
     # constant: `late` is the fraction of them that the core follows with the lag (1: the whole cell
@@ -292,11 +344,9 @@ CORRECTIONS: Final = (
             "high current of alternating sign at constant SoC: slow_diffusion, linear in I,"
             " cancels; temperature_lag follows the sensor and not the current"
         ),
-        correct=_core_temperature,
-        memory=_core_memory,
-        core_form=lambda v, _, pack: CoreForm(
-            "core_temperature", (v["rise_k"], v["late"], pack.capacity_ah), (v["tau_s"],) * 2
-        ),
+        correct=core_temperature,
+        memory=core_temperature_memory,
+        core_form=core_temperature_form,
     ),
 )
 
@@ -313,10 +363,8 @@ COUNTS: Final = (
             "a discharge from full to the knee at steady temperature; from current_offset by"
             " alternating driving and resting, from current_gain by the drop over the resistance"
         ),
-        count=lambda counting, v: replace(
-            counting, capacity_ah=counting.capacity_ah * (1.0 + v["change_pct"] / 100.0)
-        ),
-        core_form=lambda *_: NO_FORM,
+        count=changed_capacity,
+        core_form=counted_form,
     ),
     # A property of a log, not of a pack. Online it is added to the initial SoC given by the user;
     # an initial SoC from the first voltage needs no correction.
@@ -331,10 +379,8 @@ COUNTS: Final = (
             "a long rest before the start (the first voltage is then the OCV), or a log that"
             " reaches the steep ends of the OCV, where it grows and voltage_offset does not"
         ),
-        count=lambda counting, v: replace(
-            counting, initial_soc_pct=counting.initial_soc_pct + v["offset_pct"]
-        ),
-        core_form=lambda *_: NO_FORM,
+        count=changed_start,
+        core_form=counted_form,
     ),
     # Cells lose less than a tenth. A larger loss is a sensor that reads charging too high, or
     # charge that bypasses it, with the same signature.
@@ -349,9 +395,7 @@ COUNTS: Final = (
             "logs with much and with little regeneration over the same discharge, or a full charge"
             " within the log; not separable from capacity and current_offset in a plain drive"
         ),
-        count=lambda counting, v: replace(
-            counting, charge_efficiency=counting.charge_efficiency * v["efficiency"]
-        ),
-        core_form=lambda *_: NO_FORM,
+        count=changed_efficiency,
+        core_form=counted_form,
     ),
 )

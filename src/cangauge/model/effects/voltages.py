@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any, Final
+from functools import partial
+from typing import Final
 
 import numpy as np
 
@@ -15,9 +15,11 @@ from cangauge.model.effects.base import (
     CoreForm,
     Effect,
     Load,
+    Memories,
     Pack,
     Parameter,
     Values,
+    core_values,
 )
 from cangauge.model.first_order import First, Lag, Turned
 from cangauge.model.voltage_model import PLAUSIBLE_C, VoltageModel, inverse_k
@@ -40,10 +42,6 @@ ACTIVATION_K: Final = 5000.0
 """Usual activation of the exchange current [K], about 42 kJ/mol; `exchange_a` holds at 25 °C."""
 
 
-def _of(values: Values, *names: str) -> tuple[float, ...]:
-    return tuple(values[name] for name in names)
-
-
 # --- resistance
 
 
@@ -52,19 +50,48 @@ def arrhenius(temperature_c: FloatArray, activation_k: float) -> FloatArray:
     return np.asarray(np.exp(activation_k * (inverse_k(temperature_c) - inverse_k(REFERENCE_C))))
 
 
-def _colder_drop(load: Load, values: Values, at: Context) -> FloatArray:
+def drop(load: Load, values: Values, at: Context) -> FloatArray:
+    """Return the drop over the resistance."""
+    return load.scaled_drop_v(values["delayed"], at.pack)
+
+
+def grown_drop(load: Load, values: Values, at: Context) -> FloatArray:
+    """Return a share of the drop."""
+    return values["share"] * drop(load, values, at)
+
+
+def colder_drop(load: Load, values: Values, at: Context) -> FloatArray:
+    """Return the drop's growth in the cold."""
     colder = inverse_k(load.temperature_c) - inverse_k(values["reference_c"])
-    scaled_v = load.scaled_drop_v(values["delayed"], at.pack)
-    return np.asarray(values["share"] * scaled_v * np.expm1(values["activation_k"] * colder))
+    return grown_drop(load, values, at) * np.expm1(values["activation_k"] * colder)
 
 
-def _ends_of_soc(soc_pct: FloatArray, values: Values, *_: object) -> FloatArray:
+def colder_form(values: Values, _: VoltageModel, pack: Pack) -> CoreForm:
+    """Return the growth in the C core, which takes 1/T₀."""
+    reference = float(inverse_k(values["reference_c"]))
+    constants = values["share"], values["activation_k"], values["delayed"], reference
+    return CoreForm("resistance_temperature", (*constants, pack.resistance_ohm))
+
+
+def ends_of_soc(soc_pct: FloatArray, values: Values, _: VoltageModel) -> FloatArray:
+    """Return the decay from empty and from full."""
     soc, width = np.clip(soc_pct, 0.0, 100.0), values["width_pct"]
     rise = values["at_empty"] * np.exp(-soc / width)
     return np.asarray(rise + values["at_full"] * np.exp((soc - 100.0) / width))
 
 
-def _step(load: Load, values: Values, at: Context) -> FloatArray:
+def drop_while_charging(load: Load, values: Values, _: Context) -> FloatArray:
+    """Return the drop of charging current over a resistance."""
+    return -values["charging_ohm"] * np.minimum(load.current_a, 0.0)
+
+
+def first_time(*_: object) -> Memories:
+    """Return the time of the first sample."""
+    return (First(),)
+
+
+def drop_after_step(load: Load, values: Values, at: Context) -> FloatArray:
+    """Return the drop over a resistance that is added at a moment."""
     after = load.time_s - at.memory[0].of(load.time_s) >= values["start_s"]
     return np.where(after, -values["step_ohm"] * load.current_a, 0.0)
 
@@ -72,79 +99,116 @@ def _step(load: Load, values: Values, at: Context) -> FloatArray:
 # --- dynamics
 
 
-def _bend(load: Load, values: Values, at: Context) -> FloatArray:
+def bend(load: Load, values: Values, at: Context) -> FloatArray:
+    """Return the bent part of charge transfer."""
     per_a = 0.5 / values["exchange_a"] * arrhenius(load.temperature_c, values["activation_k"])
     zero_a = BEND_ZERO_C_RATE * at.pack.capacity_ah
     slope = values["bend_only"] * np.arcsinh(zero_a * per_a) / zero_a
-    bend = np.arcsinh(load.current_a * per_a) - slope * load.current_a
-    return np.asarray(-values["scale_v"] * bend)
+    bent = np.arcsinh(load.current_a * per_a) - slope * load.current_a
+    return np.asarray(-values["scale_v"] * bent)
 
 
-def _bend_form(values: Values, _: VoltageModel, pack: Pack) -> CoreForm:
+def bend_form(values: Values, _: VoltageModel, pack: Pack) -> CoreForm:
+    """Return charge transfer in the C core."""
     rest = values["bend_only"], values["activation_k"], BEND_ZERO_C_RATE * pack.capacity_ah
     return CoreForm("charge_transfer", (values["scale_v"], 0.5 / values["exchange_a"], *rest))
 
 
-def _rc_voltage(load: Load, values: Values, at: Context) -> FloatArray:
+def rc_memory(values: Values, _: Pack) -> Memories:
+    """Return the current through the resistance, at rest before the first sample."""
+    return (Lag(values["tau_s"], 0.0, rest_s=BRIDGE_S),)
+
+
+def rc_voltage(load: Load, values: Values, at: Context) -> FloatArray:
+    """Return the voltage of an RC element."""
     volts = -values["ohm"] * at.memory[0].step(load.time_s, load.current_a)
     return np.asarray(volts * arrhenius(load.temperature_c, values["activation_k"]))
 
 
-def _rc_form(values: Values, model: VoltageModel, _: Pack) -> CoreForm:
+def rc_form(values: Values, model: VoltageModel, _: Pack) -> CoreForm:
+    """Return an RC element in the C core."""
     by_slope = values.get("by_slope", 0.0)
-    mean_slope = _mean_slope(model) if by_slope else 1.0
-    constants = (values["activation_k"], by_slope, mean_slope, values["ohm"])
+    slope = mean_slope(model) if by_slope else 1.0
+    constants = (values["activation_k"], by_slope, slope, values["ohm"])
     return CoreForm("rc", constants, (values["tau_s"],))
 
 
-_RC: Final[Mapping[str, Any]] = {
-    "memory": lambda v, _: (Lag(v["tau_s"], 0.0, rest_s=BRIDGE_S),),
-    "rc_tau_s": lambda v: v["tau_s"],
-    "drive": _rc_voltage,
-    "core_form": _rc_form,
-}
-"""An RC element on the current, at rest before the first sample."""
-
-
-def _mean_slope(model: VoltageModel) -> float:
+def mean_slope(model: VoltageModel) -> float:
     """Return the mean slope of the pseudo-OCV [V per % SoC], positive."""
     low, high = MEAN_SLOPE_PCT
     rise_v = model.pseudo_ocv_at(high)[0] - model.pseudo_ocv_at(low)[0]
     return rise_v / (high - low)
 
 
-def _steepness(soc_pct: FloatArray, values: Values, model: VoltageModel) -> FloatArray | float:
+def steepness(soc_pct: FloatArray, values: Values, model: VoltageModel) -> FloatArray | float:
+    """Return the slope of the pseudo-OCV relative to its mean, as far as the effect follows it."""
     if not values["by_slope"]:
         return 1.0
-    steepness = model.pseudo_ocv_slope(soc_pct) / _mean_slope(model)
-    limited = np.clip(steepness, 0.0, STEEPNESS_AT_MOST)
+    relative = model.pseudo_ocv_slope(soc_pct) / mean_slope(model)
+    limited = np.clip(relative, 0.0, STEEPNESS_AT_MOST)
     return np.asarray(1.0 + values["by_slope"] * (limited - 1.0))
 
 
 # --- open-circuit voltage
 
 
-def _travel_as(values: Values, pack: Pack) -> float:
+def travel_as(values: Values, pack: Pack) -> float:
+    """Return the charge that turns the hysteresis [As]."""
     return 36.0 * pack.capacity_ah * values["travel_pct"]
 
 
-def _entropic_drive(load: Load, _: Values, at: Context) -> FloatArray:
+def hysteresis_memory(values: Values, pack: Pack) -> Memories:
+    """Return the state between −1 and 1, which charge turns."""
+    return (Turned(travel_as(values, pack)),)
+
+
+def hysteresis_voltage(load: Load, values: Values, at: Context) -> FloatArray:
+    """Return the half width times the state."""
+    return np.asarray(values["half_width_v"] * at.memory[0].step(load.time_s, load.current_a))
+
+
+def hysteresis_form(values: Values, _: VoltageModel, pack: Pack) -> CoreForm:
+    """Return the hysteresis in the C core."""
+    return CoreForm("hysteresis", (values["half_width_v"], travel_as(values, pack)))
+
+
+def warmer_k(load: Load, _: Values, at: Context) -> FloatArray:
+    """Return the temperature above T_r [K]."""
     return np.asarray(np.clip(load.temperature_c, *PLAUSIBLE_C) - at.model.loads.t_ref_c)
 
 
-def _entropic_shape(soc_pct: FloatArray, values: Values, *_: object) -> FloatArray:
+def entropic_v_per_k(soc_pct: FloatArray, values: Values, _: VoltageModel) -> FloatArray:
+    """Return the entropic coefficient over SoC [V/K]: Legendre polynomials."""
     x = np.clip(soc_pct, 0.0, 100.0) / 50.0 - 1.0
     shape = values["level_v_per_k"] + values["slope_v_per_k"] * x
     return np.asarray(shape + values["curve_v_per_k"] * (1.5 * x * x - 0.5))
 
 
-def _ahead(values: Values) -> float:
+def entropic_form(values: Values, model: VoltageModel, _: Pack) -> CoreForm:
+    """Return the entropic coefficient in the C core."""
+    level, slope, curve = (values[f"{name}_v_per_k"] for name in ("level", "slope", "curve"))
+    return CoreForm("entropic", (level, slope, curve, model.loads.t_ref_c))
+
+
+def fraction(load: Load, values: Values, _: Context) -> FloatArray:
+    """Return the fraction of weak cells, at every row."""
+    return np.full_like(load.current_a, values["fraction"])
+
+
+def ahead(values: Values) -> float:
+    """Return how much faster the SoC of weak cells falls."""
     return 1.0 / (1.0 - values["deficit_pct"] / 100.0)
 
 
-def _weak_less_healthy(soc_pct: FloatArray, values: Values, model: VoltageModel) -> FloatArray:
-    weak = 100.0 - (100.0 - soc_pct) * _ahead(values)
+def weak_less_healthy(soc_pct: FloatArray, values: Values, model: VoltageModel) -> FloatArray:
+    """Return the pseudo-OCV of a pack of weak cells minus that of healthy ones [V]."""
+    weak = 100.0 - (100.0 - soc_pct) * ahead(values)
     return model.pseudo_ocv(weak) - model.pseudo_ocv(soc_pct)
+
+
+def weak_form(values: Values, *_: object) -> CoreForm:
+    """Return the weak cells in the C core."""
+    return CoreForm("weak_cell", (values["fraction"], ahead(values)))
 
 
 VOLTAGES: Final = (
@@ -158,10 +222,8 @@ VOLTAGES: Final = (
         source="definition",
         separated_by="the same pulse, warm and cold: a thermometer that reads too high grows both",
         scales_drop=True,
-        drive=lambda load, v, at: v["share"] * load.scaled_drop_v(v["delayed"], at.pack),
-        core_form=lambda v, _, pack: CoreForm(
-            "resistance_growth", (v["share"], v["delayed"], pack.resistance_ohm)
-        ),
+        drive=grown_drop,
+        core_form=partial(core_values, "resistance_growth", ("share", "delayed", "resistance_ohm")),
     ),
     # Zero at `reference_c`, the middle of the identified temperature range when the effect was
     # added.
@@ -187,15 +249,8 @@ VOLTAGES: Final = (
             " together it is not separable from resistance_soc"
         ),
         scales_drop=True,
-        drive=_colder_drop,
-        core_form=lambda v, _, pack: CoreForm(
-            "resistance_temperature",
-            (
-                *_of(v, "share", "activation_k", "delayed"),
-                float(inverse_k(v["reference_c"])),
-                pack.resistance_ohm,
-            ),
-        ),
+        drive=colder_drop,
+        core_form=colder_form,
     ),
     # Decays exponentially from empty and from full.
     Effect(
@@ -215,11 +270,12 @@ VOLTAGES: Final = (
             " and it is not separable from resistance_temperature"
         ),
         scales_drop=True,
-        drive=lambda load, v, at: load.scaled_drop_v(v["delayed"], at.pack),
-        over_soc=_ends_of_soc,
-        core_form=lambda v, _, pack: CoreForm(
+        drive=drop,
+        over_soc=ends_of_soc,
+        core_form=partial(
+            core_values,
             "resistance_soc",
-            (*_of(v, "at_empty", "at_full", "width_pct", "delayed"), pack.resistance_ohm),
+            ("at_empty", "at_full", "width_pct", "delayed", "resistance_ohm"),
         ),
     ),
     # Additional (or missing) resistance to charging current.
@@ -234,8 +290,8 @@ VOLTAGES: Final = (
             "charging and discharging pulses of several sizes: charge_transfer bends with the size"
             " of the current, equally in both directions"
         ),
-        drive=lambda load, v, *_: -v["charging_ohm"] * np.minimum(load.current_a, 0.0),
-        core_form=lambda v, *_: CoreForm("resistance_asymmetry", (v["charging_ohm"],)),
+        drive=drop_while_charging,
+        core_form=partial(core_values, "resistance_asymmetry", ("charging_ohm",)),
     ),
     # A contact works loose, or is repaired. The time counts from the log's first sample, online
     # from the service's first sample. A step that has happened persists, so a model for later
@@ -254,9 +310,9 @@ VOLTAGES: Final = (
             "the same load before and after at the same SoC and temperature:"
             " resistance_temperature and resistance_soc revert, a step does not"
         ),
-        memory=lambda *_: (First(),),
-        drive=_step,
-        core_form=lambda v, *_: CoreForm("resistance_step", _of(v, "step_ohm", "start_s")),
+        memory=first_time,
+        drive=drop_after_step,
+        core_form=partial(core_values, "resistance_step", ("step_ohm", "start_s")),
     ),
     # Butler–Volmer. With `bend_only` the line through 0 and ±1 C is subtracted. `scale_v` is 2RT/F
     # per electrode (51 mV at 25 °C) times the cells in series; the bound allows two electrodes.
@@ -286,8 +342,8 @@ VOLTAGES: Final = (
             "pulses of several sizes in both directions; resistance_asymmetry is straight on each"
             " side of zero"
         ),
-        drive=_bend,
-        core_form=_bend_form,
+        drive=bend,
+        core_form=bend_form,
     ),
     # Double layer and charge transfer, faster than the model's first delay.
     Effect(
@@ -304,7 +360,10 @@ VOLTAGES: Final = (
         separated_by=(
             "a log at 10 Hz or faster with sharp pulses: time_skew gives spikes without tails"
         ),
-        **_RC,
+        memory=rc_memory,
+        drive=rc_voltage,
+        core_form=rc_form,
+        is_rc=True,
     ),
     # In the particles charge diffuses, and its voltage follows the slope of the open-circuit
     # voltage (`by_slope` 1); diffusion in the electrolyte is the same at every SoC (0).
@@ -334,8 +393,11 @@ VOLTAGES: Final = (
             "a rest of an hour after a drive: hysteresis persists, this decays;"
             " core_temperature is even in the current"
         ),
-        over_soc=_steepness,
-        **_RC,
+        over_soc=steepness,
+        memory=rc_memory,
+        drive=rc_voltage,
+        core_form=rc_form,
+        is_rc=True,
     ),
     # The state starts at 0, since the charge before a log is unknown, and persists through any
     # rest.
@@ -355,13 +417,9 @@ VOLTAGES: Final = (
             "rests of an hour after a discharge and after a charge to the same SoC:"
             " slow_diffusion decays, this persists"
         ),
-        memory=lambda v, pack: (Turned(_travel_as(v, pack)),),
-        drive=lambda load, v, at: (
-            v["half_width_v"] * at.memory[0].step(load.time_s, load.current_a)
-        ),
-        core_form=lambda v, _, pack: CoreForm(
-            "hysteresis", (v["half_width_v"], _travel_as(v, pack))
-        ),
+        memory=hysteresis_memory,
+        drive=hysteresis_voltage,
+        core_form=hysteresis_form,
     ),
     # In addition to the model's kt. The bounds are ±0.4 mV/K per cell.
     Effect(
@@ -379,12 +437,9 @@ VOLTAGES: Final = (
             "the same SoC, rested, at two temperatures; at one temperature it is not separable from"
             " any other change of the OCV with SoC"
         ),
-        drive=_entropic_drive,
-        over_soc=_entropic_shape,
-        core_form=lambda v, model, _: CoreForm(
-            "entropic",
-            (*_of(v, "level_v_per_k", "slope_v_per_k", "curve_v_per_k"), model.loads.t_ref_c),
-        ),
+        drive=warmer_k,
+        over_soc=entropic_v_per_k,
+        core_form=entropic_form,
     ),
     # From full the SoC of the weak cells falls faster. Below empty they follow the model's linear
     # extrapolation. A reversed cell falls faster, but a pack is switched off before that.
@@ -409,8 +464,8 @@ VOLTAGES: Final = (
             "a discharge to below 10 %: a lost capacity of all cells brings the whole knee forward,"
             " weak cells a small one; or the cells' own voltages"
         ),
-        drive=lambda load, v, *_: np.full_like(load.current_a, v["fraction"]),
-        over_soc=_weak_less_healthy,
-        core_form=lambda v, *_: CoreForm("weak_cell", (v["fraction"], _ahead(v))),
+        drive=fraction,
+        over_soc=weak_less_healthy,
+        core_form=weak_form,
     ),
 )
