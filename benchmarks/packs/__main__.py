@@ -1,7 +1,7 @@
 """SoC errors on recorded packs, with models from few logs.
 
     make packs DATA=FOLDER                                     # or, in benchmarks/
-    python -m packs --data FOLDER [--pack NAME]… [--case NAME]… [--draws 10] [--json FILE]
+    python -m packs --data FOLDER [--pack NAME]… [--case NAME]… [--draws 10] [--keep]
     python -m packs --data FOLDER --months
 
 Models are fitted to 1, 2, 3, 5 and 10 logs of a pack, drawn with fixed seeds; they estimate the
@@ -18,21 +18,23 @@ from __future__ import annotations
 import argparse
 import importlib
 import itertools
-import json
-import math
 import sys
-import time
 from collections import defaultdict
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from operator import attrgetter
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from rich.table import Table
 
 import cangauge
+from figures import publish
 
 from .estimators import ESTIMATORS, Estimated, Told
 from .recorded import MONTHS, PACKS, counted_ah, first_of_each, load, on_one_clock
-from .scores import LATE_S, SETTLED_S, Row, judge, pool, score
+from .scores import COVER, LATE_S, SETTLED_S, Row, pool, score
 
 
 @dataclass(frozen=True)
@@ -65,6 +67,15 @@ class Case:
             current_a=self.current_factor * log.current_a + self.offset_a,
             voltage_v=log.voltage_v * self.voltage_factor,
         )
+
+
+DESCRIBES = (
+    "src/cangauge/model",
+    "src/cangauge/identify",
+    "src/cangauge/estimation",
+    "core",
+    "benchmarks/packs",
+)
 
 
 CASES = (
@@ -103,15 +114,13 @@ def run(packs, estimators, cases, *, sizes, draws: int, seed: int) -> list[Row]:
         ]  # fmt: skip
         for size in [size for size in pack.sizes if not sizes or size in sizes]:
             for name, estimator in estimators.items():
-                began = time.perf_counter()
-                scores, failures = defaultdict(list), 0
+                scores = defaultdict(list)
                 for _, training, judged in pack.draws(size, draws, seed):
                     told = Told(pack.chemistry, pack.cells, pack.capacity_of(training))
                     try:
                         model = estimator.fit(training, told)
                     except cangauge.InputError as error:
                         sys.stderr.write(f"{pack.name} {size} {name}: {error}\n")
-                        failures += 1
                         continue
                     for case in cases:
                         logs = foreign if case.is_foreign else filter(case.suits, judged)
@@ -119,15 +128,9 @@ def run(packs, estimators, cases, *, sizes, draws: int, seed: int) -> list[Row]:
                             found = _score(estimator, model, told, case, log)
                             scores[case].append(found)
                 for case, found in scores.items():
-                    row = pool(
-                        found, estimator=name, pack=pack.name, role=pack.role,
-                        chemistry=pack.chemistry, size=size, case=case.name, draws=draws,
-                    )  # fmt: skip
-                    row.failures = failures
-                    row.seconds = time.perf_counter() - began
-                    judge(row, counting_is_reference=_counts_reference(case))
+                    row = pool(found, estimator=name, pack=pack.name, size=size, case=case.name)
                     rows.append(row)
-                    _print(row)
+                    _show(row)
     return rows
 
 
@@ -143,7 +146,6 @@ def run_months(packs, estimators, *, sizes, draws: int, seed: int) -> list[Row]:
         judged = {log.name for log in pack.judged}
         told = Told(pack.chemistry, pack.cells, pack.capacity_of(training))
         for name, estimator in estimators.items():
-            began = time.perf_counter()
             model = estimator.fit(training, told)
             scores = defaultdict(list)
             for draw in range(draws):
@@ -165,13 +167,9 @@ def run_months(packs, estimators, *, sizes, draws: int, seed: int) -> list[Row]:
                     found = estimator.estimate(blind, model, None, told.capacity_ah)
                     scores["anew"].append(_compare(day, found, None, told.capacity_ah))
             for case, found in scores.items():
-                row = pool(
-                    found, estimator=name, pack=pack.name, role=pack.role,
-                    chemistry=pack.chemistry, size=len(training), case=case, draws=draws,
-                )  # fmt: skip
-                row.seconds = time.perf_counter() - began
+                row = pool(found, estimator=name, pack=pack.name, size=len(training), case=case)
                 rows.append(row)
-                _print(row)
+                _show(row)
     return rows
 
 
@@ -199,57 +197,64 @@ def _compare(log, found: Estimated, start_pct, capacity_ah: float, after_s: floa
     )  # fmt: skip
 
 
-def _counts_reference(case: Case) -> bool:
-    """Whether counting repeats the reference, which is counted too, and cannot be beaten."""
-    return (
-        case.start_error_pct == 0.0
-        and not case.offset_a
-        and case.capacity_factor == case.current_factor == 1.0
+def _show(row: Row) -> None:
+    """Report a row as soon as it is measured."""
+    sys.stderr.write(
+        f"{row.estimator} {row.pack} {row.size} {row.case}: MAE {row.mae:.2f} %, by voltage alone "
+        f"{row.newton:.2f} %, by counting {row.counting:.2f} %\n"
     )
 
 
-HEADING = (
-    f"{'estimator':12} {'pack':15} {'logs':>4} {'case':16} {'MAE':>6} {'median':>6} {'Newton':>6} "
-    f"{'count':>6} {'2σ %':>5} {'σ':>5} {'σ/RMSE':>6} {'astray':>11} {'VALID':>5} {'wrong':>6} "
-    f"{'right':>5}  missed"
-)
+def by_case(rows: Sequence[Row], title: str = "") -> Table:
+    """Return the means of each case over packs and numbers of logs."""
+    table = Table(
+        "case", "rows", "MAE [%]", "median [%]", "within 2σ", "rows with 2σ ≥ 88 %", "VALID",
+        "wrong and VALID", "right and not VALID", "astray",
+        title=title,
+    )  # fmt: skip
+    for case, group in grouped(rows, "case"):
+        enough = sum(row.cover >= COVER for row in group)
+        table.add_row(
+            case,
+            str(len(group)),
+            f"{_mean(group, 'mae'):.2f}",
+            f"{_mean(group, 'median'):.2f}",
+            f"{_mean(group, 'cover'):.0%}",
+            f"{enough} of {len(group)}",
+            f"{_mean(group, 'valid'):.0%}",
+            f"{_mean(group, 'valid_wrong'):.1%}",
+            f"{_mean(group, 'right_not_valid'):.0%}",
+            f"{sum(row.astray for row in group)} of {sum(row.logs for row in group)}",
+        )
+    return table
 
 
-def _print(row) -> None:
-    missed = [name for name, met in row.targets.items() if not met]
-    print(
-        f"{row.estimator:12} {row.pack:15} {row.size:4d} {row.case:16} {row.mae:6.2f} "
-        f"{row.median:6.2f} {row.newton:6.2f} {row.counting:6.2f} {100 * row.cover:5.0f} "
-        f"{row.std:5.2f} {row.std / max(row.rmse, 1e-9):6.2f} {row.astray:4d} of {row.logs:<4d} "
-        f"{100 * row.valid:5.0f} {100 * row.valid_wrong:6.1f} {100 * row.right_not_valid:5.0f}  "
-        f"{', '.join(missed)}",
-        flush=True,
-    )
+def by_pack(rows: Sequence[Row]) -> Table:
+    """Return the MAE [%] of each pack and number of logs in each case."""
+    cases = list(dict.fromkeys(row.case for row in rows))
+    table = Table("pack", "logs", *cases, "most wrong and VALID")
+    for (pack, size), group in grouped(rows, "pack", "size"):
+        mae = {row.case: f"{row.mae:.2f}" for row in group}
+        worst = max(group, key=lambda row: row.valid_wrong)
+        wrong = f"{worst.valid_wrong:.1%} ({worst.case})" if worst.valid_wrong else "none"
+        table.add_row(pack, str(size), *(mae.get(case, "") for case in cases), wrong)
+    return table
 
 
-def _summary(rows: list) -> None:
-    """Print how many rows meet each target, judged packs apart from development."""
+def grouped(rows: Sequence[Row], *names: str) -> list[tuple[Any, list[Row]]]:
+    """Return the rows with equal fields, in the order of their first."""
     groups = defaultdict(list)
     for row in rows:
-        if row.targets:
-            kind = row.role + (", LFP" if row.chemistry == "lfp" else "")
-            groups[row.estimator, kind].append(row)
-    for (estimator, kind), group in groups.items():
-        names = dict.fromkeys(name for row in group for name in row.targets)
-        parts = [
-            f"{name}: {sum(row.targets.get(name, False) for row in group)}"
-            f" of {sum(name in row.targets for row in group)}"
-            for name in names
-        ]
-        logs, astray = sum(row.logs for row in group), sum(row.astray for row in group)
-        withheld = [row.std / row.rmse for row in group if row.case == "withheld" and row.rmse]
-        median = float(np.median(withheld)) if withheld else math.nan
-        print(f"{estimator}, {kind}, {len(group)} rows: {'; '.join(parts)};"
-              f" astray {astray} of {logs} logs; median σ/RMSE withheld {median:.2f}")  # fmt: skip
+        groups[attrgetter(*names)(row)].append(row)
+    return list(groups.items())
+
+
+def _mean(rows: Sequence[Row], name: str) -> float:
+    return float(np.mean([getattr(row, name) for row in rows]))
 
 
 def main() -> None:
-    """Run, print, and keep as JSON."""
+    """Run, print, and keep the figures."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawTextHelpFormatter
     )
@@ -263,7 +268,7 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=1, metavar="N", help="of the draws")
     parser.add_argument("--estimator", action="append", metavar="NAME|MODULE:CLASS",
                         help=f"{', '.join(ESTIMATORS)}, or a class; default: cangauge")  # fmt: skip
-    parser.add_argument("--json", type=Path, metavar="FILE", help="write the rows here too")
+    parser.add_argument("--keep", action="store_true", help="keep the figures of docs/results.md")
     options = parser.parse_args()
     names = options.pack or [
         name for name in (MONTHS if options.months else PACKS)
@@ -275,21 +280,21 @@ def main() -> None:
         module, _, kind = name.rpartition(":")
         made = getattr(importlib.import_module(module), kind) if module else ESTIMATORS[name]
         estimators[name] = made()
-    began = time.perf_counter()
-    print(HEADING)
     packs = load(options.data, names)
     drawn = {"sizes": options.logs, "draws": options.draws, "seed": options.seed}
-    if options.months:
-        rows = run_months(packs, estimators, **drawn)
-    else:
-        rows = run(packs, estimators, cases, **drawn)
-        _summary(rows)
-    if options.json:
-        result = {
-            "schema": 1, "draws": options.draws, "seed": options.seed,
-            "seconds": time.perf_counter() - began, "rows": [row.to_dict() for row in rows],
-        }  # fmt: skip
-        options.json.write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
+    rows = (
+        run_months(packs, estimators, **drawn)
+        if options.months
+        else run(packs, estimators, cases, **drawn)
+    )
+    for estimator, group in grouped(rows, "estimator"):
+        if options.months:
+            name = f"months-{estimator}"
+            tables = [by_case(each, pack) for pack, each in grouped(group, "pack")]
+        else:
+            name = f"packs-{estimator}"
+            tables = [by_case(group), by_pack(group)]
+        publish(name, tables, DESCRIBES, keeps=options.keep)
 
 
 if __name__ == "__main__":

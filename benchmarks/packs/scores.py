@@ -1,4 +1,4 @@
-"""Errors of SoC estimates: scored log by log, pooled to rows, judged by targets.
+"""Errors of SoC estimates: scored log by log, pooled to rows.
 
 A log counts by its samples. Errors are of the SoC [%] against the log's reference.
 """
@@ -6,7 +6,7 @@ A log counts by its samples. Errors are of the SoC [%] against the log's referen
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -17,6 +17,8 @@ SETTLED_S = 300.0
 """An unknown start is scored after five minutes [s]."""
 LATE_S = 600.0
 """A wrong start is scored after ten minutes; a log is astray by what follows [s]."""
+COVER = 0.88
+"""Least share of the time within 2σ."""
 ASTRAY_PCT, ASTRAY_STD = 3.0, 3.0
 """A sample is wrong if off by more than this [% SoC] and by more than so many σ."""
 
@@ -85,11 +87,8 @@ class Row:
 
     estimator: str
     pack: str
-    role: str
-    chemistry: str
     size: int
     case: str
-    draws: int
     logs: int
     mae: float
     median: float
@@ -104,13 +103,6 @@ class Row:
     """Share of all samples, as the two that follow."""
     valid_wrong: float
     right_not_valid: float
-    failures: int = 0
-    seconds: float = 0.0
-    targets: dict[str, bool] = field(default_factory=dict)
-
-    def to_dict(self) -> dict:
-        """Return the row for JSON."""
-        return asdict(self)
 
 
 def pool(scores: Iterable[LogScore], **names) -> Row:
@@ -136,35 +128,3 @@ def pool(scores: Iterable[LogScore], **names) -> Row:
         valid=share("valid"), valid_wrong=share("valid_wrong"),
         right_not_valid=share("right_not_valid"),
     )  # fmt: skip
-
-
-LIMITS_PCT = {
-    "i3": {3: 1.1, 5: 1.0, 10: 0.8},
-    "i3_winter": {3: 3.0, 5: 3.0, 10: 3.0},
-    "car1": {3: 2.1, 5: 1.1, 10: 0.85},
-    "lg_hg2": {3: 0.55, 5: 0.45},
-    "a123_lfp": {3: 2.0, 5: 2.2},
-    "lg_split_25c": {19: 0.7},
-    "lg_split_40c": {19: 0.7},
-    "lg_split_0c": {19: 1.2},
-    "lg_split_10c": {19: 1.2},
-}
-"""Pack and number of logs → largest MAE with the start withheld [% SoC]; the split given too."""
-COVER, STD_RATIO = 0.88, (0.7, 2.0)
-
-
-def judge(row: Row, *, counting_is_reference: bool) -> None:
-    """Enter the targets that apply to a row."""
-    if row.case == "foreign model":
-        return
-    best = row.newton if counting_is_reference else min(row.newton, row.counting)
-    row.targets["inputs"] = row.mae <= 1.1 * best + 0.3
-    row.targets["2σ ≥ 88 %"] = row.cover >= COVER
-    row.targets["2σ ≥ 90 %"] = row.cover >= 0.9
-    row.targets["2σ 90–99 %"] = 0.9 <= row.cover <= 0.99
-    row.targets["σ/RMSE .7–1.5"] = 0.7 <= row.std / max(row.rmse, 1e-9) <= 1.5
-    if row.case == "withheld":
-        row.targets["σ/RMSE .7–2"] = STD_RATIO[0] <= row.std / max(row.rmse, 1e-9) <= STD_RATIO[1]
-    limit = LIMITS_PCT.get(row.pack, {}).get(row.size)
-    if limit and (row.case == "withheld" or (row.case == "given" and row.size == 19)):
-        row.targets["limit"] = row.mae <= limit
