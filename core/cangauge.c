@@ -130,10 +130,15 @@ typedef struct {
     cg_real parked_std_pct;
 } charge_step;
 
+/* Self-discharge and consumers of a parked car. */
+static cg_real drain_pct_of(cg_real seconds)
+{
+    return cg_min(R(DRAIN_PCT_PER_HOUR) * seconds / R(3600.0), R(DRAIN_AT_MOST_PCT));
+}
+
 static cg_real parked_std_pct(cg_real seconds, cg_real rms_pct_per_s)
 {
-    const cg_real drain_pct =
-        cg_min(R(DRAIN_PCT_PER_HOUR) * seconds / R(3600.0), R(DRAIN_AT_MOST_PCT));
+    const cg_real drain_pct = drain_pct_of(seconds);
     const cg_real use_pct =
         cg_min(rms_pct_per_s * cg_min(seconds, R(USE_S)), cg_sqrt(R(CG_UNKNOWN_VAR_PCT2)));
     return cg_sqrt(cg_square(drain_pct) + cg_square(use_pct));
@@ -267,6 +272,22 @@ static void start_count(cg_state *state, cg_real soc_pct, cg_real std_pct)
     state->memory.coulomb_gap_var_pct2 = state->counter.gap_var_pct2;
 }
 
+static void start(cg_estimator *self, cg_real soc_pct, cg_real std_pct, bool is_doubtful)
+{
+    cg_filter_start(&self->state.filter, self->model, soc_pct, std_pct, is_doubtful);
+    self->state.memory.is_known = true;
+    start_count(&self->state, soc_pct, std_pct);
+}
+
+/* After an unobserved interval the car is parked still, or was charged or driven. */
+static void be_away(cg_estimator *self, cg_real away_s, cg_real parked_pct)
+{
+    const cg_real moved_pct = moved_std_pct(away_s);
+    cg_filter_doubt(&self->state.filter, self->model, R(CG_WRONG_PRIOR), moved_pct, away_s,
+                    parked_pct);
+    self->state.memory.coulomb_var_pct2 += R(CG_WRONG_PRIOR) * cg_square(moved_pct);
+}
+
 /* ------------------------------------------------------------------ step */
 
 static void set_filter_time(cg_state *state, cg_sum counted_s, cg_sum discharged_pct)
@@ -319,6 +340,13 @@ static void test_model(cg_estimator *self, cg_time time_s)
     }
 }
 
+static void average(const cg_sum *sums, cg_real rows, int32_t number, cg_real *means)
+{
+    for (int32_t k = 0; k < number; ++k) {
+        means[k] = cg_value(sums[k]) / rows;
+    }
+}
+
 /* Correct the filter by the open block, and test its innovation. */
 static void close_block(cg_estimator *self, cg_time time_s)
 {
@@ -328,27 +356,24 @@ static void close_block(cg_estimator *self, cg_time time_s)
     const cg_block *block = &self->state.block;
     const cg_real rows = (cg_real)block->rows;
     cg_means means;
+    cg_real scalars[4];
     if (block->is_broken || (block->rows == 0)) {
         return;
     }
     means.counted_s = cg_mean(block->sums[0], rows);
     means.discharged_pct = cg_mean(block->sums[1], rows);
-    means.voltage_v = (cg_value(block->sums[2]) / rows);
-    means.temperature_c = (cg_value(block->sums[3]) / rows);
-    means.drop_v = (cg_value(block->sums[4]) / rows);
-    means.unseen_v2 = (cg_value(block->sums[5]) / rows);
-    for (int32_t k = 0; k < cg_loads(model); ++k) {
-        means.load[k] = (cg_value(block->sums[6 + k]) / rows);
-    }
-    for (int32_t k = 0; k < model->effects; ++k) {
-        means.drive[k] = (cg_value(block->drive[k]) / rows);
-    }
+    average(&block->sums[2], rows, 4, scalars);
+    means.voltage_v = scalars[0];
+    means.temperature_c = scalars[1];
+    means.drop_v = scalars[2];
+    means.unseen_v2 = scalars[3];
+    average(&block->sums[6], rows, cg_loads(model), means.load);
+    average(block->drive, rows, model->effects, means.drive);
     propagate(self, means.counted_s, means.discharged_pct);
     const bool was_rejected = cg_filter_is_rejected(filter, model);
     cg_filter_update(filter, model, &means);
     if (!cg_filter_is_valid(filter, model)) {
         cg_filter_start(filter, model, CG_NAN, R(0.0), false);
-        memory->resets += 1;
         memory->contradicted_until_s = time_s + cg_span(R(CONTRADICTED_S));
     } else if (cg_filter_is_rejected(filter, model) && !was_rejected) {
         memory->contradicted_until_s = time_s + cg_span(R(CONTRADICTED_S));
@@ -504,13 +529,13 @@ static void use_row(cg_estimator *self, const cg_sample *sample)
         memory->newton_pct = cg_newton(self, sample->voltage_v - state->load_v, guess_pct,
                                        &memory->newton_inside);
         memory->newton_std_pct = inverse_std_pct(self, memory->newton_pct, temperature_c);
-        const cg_real unseen_v2 = cg_square(unseen_v_per_a(model)) * state->counter.turned_a2;
+        const cg_real scalars[4] = {
+            sample->voltage_v, memory->temperature_c, state->drop_v,
+            cg_square(unseen_v_per_a(model)) * state->counter.turned_a2,
+        };
         sums[0] = cg_plus_sum(sums[0], state->counter.counted_s);
         sums[1] = cg_plus_sum(sums[1], state->counter.discharged_pct);
-        add(&sums[2], &sample->voltage_v, 1);
-        add(&sums[3], &memory->temperature_c, 1);
-        add(&sums[4], &state->drop_v, 1);
-        add(&sums[5], &unseen_v2, 1);
+        add(&sums[2], scalars, 4);
         add(&sums[6], state->load, cg_loads(model));
         add(state->block.drive, state->drive, model->effects);
         state->block.rows += 1;
@@ -536,11 +561,8 @@ static void follow(cg_estimator *self, const cg_sample *sample, const charge_ste
         memory->gap_until_s = sample->time_s + cg_span(model->delay_s[model->delays - 1]);
     }
     if (charge->away_s != R(0.0)) {
-        const cg_real std_pct = moved_std_pct(charge->away_s);
         propagate_to_now(self);
-        cg_filter_doubt(&self->state.filter, model, R(CG_WRONG_PRIOR), std_pct, charge->away_s,
-                        charge->parked_std_pct);
-        memory->coulomb_var_pct2 += R(CG_WRONG_PRIOR) * cg_square(std_pct);
+        be_away(self, charge->away_s, charge->parked_std_pct);
     }
     if (cg_fabs(sample->current_a) > (R(REST_CURRENT_C_RATE) * model->capacity_ah)) {
         memory->rest_since_s = CG_NO_TIME;
@@ -789,10 +811,16 @@ void cg_init(cg_estimator *self, const cg_model *model, const cg_settings *setti
     forget(state);
     cg_filter_start(&state->filter, model, CG_NAN, R(0.0), false);
     if (!isnan(given_pct)) {
-        const cg_real soc_pct = cg_clip_soc(given_pct + model->initial_offset_pct);
-        cg_filter_start(&state->filter, model, soc_pct, settings->initial_soc_std_pct, true);
-        state->memory.is_known = true;
-        start_count(state, soc_pct, settings->initial_soc_std_pct);
+        start(self, cg_clip_soc(given_pct + model->initial_offset_pct),
+              settings->initial_soc_std_pct, true);
+    }
+}
+
+void cg_start_from(cg_estimator *self, cg_real soc_pct, cg_real std_pct, cg_real away_s)
+{
+    start(self, soc_pct, std_pct, false);
+    if (away_s > R(0.0)) {
+        be_away(self, away_s, drain_pct_of(away_s));
     }
 }
 
@@ -857,6 +885,7 @@ bool cg_restore(cg_estimator *self, const cg_state *state, cg_real age_s)
     }
     self->state = *state;
     self->state.is_pending = false; /* its delay line is gone */
+    self->state.is_refused = false;
     self->state.clock.age_s = age_s;
     self->state.clock.is_restored = true;
     self->line.count = 0;

@@ -295,7 +295,6 @@ typedef struct {
 
 typedef struct {
     int64_t samples;
-    int64_t resets;
     cg_time first_s;
     int64_t tick;
     cg_real temperature_c;
@@ -405,6 +404,10 @@ double cg_s_of_time(cg_time time_s);
  * samples that it holds back. */
 void cg_init(cg_estimator *self, const cg_model *model, const cg_settings *settings,
              const cg_line *line, cg_skew *skew);
+
+/* After cg_init: start from the SoC of an estimator that ended `away_s` ago, with its standard
+ * deviation [%], where its state cannot be restored: it is of an earlier core or model. */
+void cg_start_from(cg_estimator *self, cg_real soc_pct, cg_real std_pct, cg_real away_s);
 
 /* Continue from a state that was copied, after cg_evaluate. `age_s`: least time since then by
  * another clock; NAN: none measured it. False: impossible numbers, nothing is changed; against a

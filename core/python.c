@@ -1,7 +1,7 @@
 /* python.c - the core as the extension module `cangauge._core`.
  *
- * Structures cross as bytes in the layout of cangauge.h; estimation/core_layout.py names the same
- * fields as data types of NumPy, and SIZES proves that both agree.
+ * A model and settings come in as bytes in the layout of cangauge.h: estimation/core_layout.py names
+ * their fields, and SIZES proves that both agree. The state is known to C alone.
  */
 #define PY_SSIZE_T_CLEAN
 #include <Python.h>
@@ -196,31 +196,187 @@ static PyObject *Core_uncounted_std_pct(Core *self, PyObject *seconds)
                             : PyFloat_FromDouble(cg_uncounted_std_pct(&self->estimator, given));
 }
 
-/* Memory of a part, which stays valid as long as the object. */
-static PyObject *Core_memory(Core *self, PyObject *args)
+/* ------------------------------------------------------------------ state */
+
+/* A state as bytes: this, then `currents` of the delay line and the samples from the oldest to `count`
+ * that `time_skew` keeps. Only a core of the same sources reads it. */
+typedef struct {
+    cg_state state;
+    cg_time since_s;
+    int64_t currents;
+    int64_t oldest;
+    int64_t first;
+    int64_t waiting;
+    int64_t count;
+} saved_head;
+
+static cg_current *current_of(const cg_line *line, int64_t index)
 {
-    const char *name;
-    if (!PyArg_ParseTuple(args, "s", &name)) {
+    return &line->at[(line->first + index) % line->size];
+}
+
+static PyObject *Core_state(Core *self, PyObject *stamp_shift_s)
+{
+    const double shift_s = PyFloat_AsDouble(stamp_shift_s);
+    const cg_line *line = &self->estimator.line;
+    cg_skew *skew = self->skew;
+    saved_head head = {0};
+    if (PyErr_Occurred()) {
+        return NULL;
+    }
+    (void)cg_evaluate(&self->estimator);
+    head.state = self->estimator.state;
+    head.state.clock.shift_s += shift_s;
+    head.since_s = line->since_s;
+    head.currents = line->count;
+    if (skew != NULL) {
+        head.first = skew->first;
+        head.waiting = skew->waiting;
+        head.count = skew->count;
+        head.oldest = (skew->first < skew->waiting) ? skew->first : skew->waiting;
+    }
+    const size_t currents = (size_t)head.currents * sizeof(cg_current);
+    const size_t samples = (size_t)(head.count - head.oldest) * sizeof(cg_sample);
+    PyObject *bytes =
+        PyBytes_FromStringAndSize(NULL, (Py_ssize_t)(sizeof(head) + currents + samples));
+    if (bytes == NULL) {
+        return NULL;
+    }
+    char *at = PyBytes_AS_STRING(bytes);
+    memcpy(at, &head, sizeof(head));
+    at += sizeof(head);
+    for (int64_t k = 0; k < head.currents; ++k, at += sizeof(cg_current)) {
+        memcpy(at, current_of(line, k), sizeof(cg_current));
+    }
+    for (int64_t k = head.oldest; k < head.count; ++k, at += sizeof(cg_sample)) {
+        memcpy(at, &skew->at[k % CG_WAITING], sizeof(cg_sample));
+    }
+    return bytes;
+}
+
+/* Whether the lengths in a state are within the memory here, and those of its bytes. */
+static bool fits(const Core *self, const saved_head *head, Py_ssize_t length)
+{
+    const int64_t samples = head->count - head->oldest;
+    const int64_t samples_at_most = (self->skew == NULL) ? 0 : CG_WAITING;
+    const bool is_within = (head->currents >= 0) && (head->currents <= self->estimator.line.size) &&
+                           (head->oldest >= 0) && (samples >= 0) && (samples <= samples_at_most) &&
+                           (head->first >= head->oldest) && (head->first <= head->count) &&
+                           (head->waiting >= head->oldest) && (head->waiting <= head->count);
+    return is_within && (length == (Py_ssize_t)(sizeof(*head) +
+                                                ((size_t)head->currents * sizeof(cg_current)) +
+                                                ((size_t)samples * sizeof(cg_sample))));
+}
+
+static PyObject *Core_restore(Core *self, PyObject *args)
+{
+    const char *at;
+    Py_ssize_t length;
+    double age_s;
+    saved_head head;
+    if (!PyArg_ParseTuple(args, "y#d", &at, &length, &age_s)) {
+        return NULL;
+    }
+    if (length >= (Py_ssize_t)sizeof(head)) {
+        memcpy(&head, at, sizeof(head));
+    }
+    if ((length < (Py_ssize_t)sizeof(head)) || !fits(self, &head, length) ||
+        !cg_restore(&self->estimator, &head.state, age_s)) {
+        PyErr_SetString(PyExc_ValueError, "not a state of this core");
         return NULL;
     }
     cg_line *line = &self->estimator.line;
-    const struct {
-        const char *name;
-        void *at;
-        size_t size;
-    } part[] = {
-        {"state", &self->estimator.state, sizeof(cg_state)},
-        {"line", line, sizeof(cg_line)},
-        {"currents", line->at, (size_t)line->size * sizeof(cg_current)},
-        {"skew", self->skew, sizeof(cg_skew)},
-    };
-    for (size_t k = 0; k < sizeof(part) / sizeof(part[0]); ++k) {
-        if ((strcmp(part[k].name, name) == 0) && (part[k].at != NULL)) {
-            return PyMemoryView_FromMemory(part[k].at, (Py_ssize_t)part[k].size, PyBUF_WRITE);
+    at += sizeof(head);
+    line->first = 0;
+    line->count = (int32_t)head.currents;
+    line->since_s = head.since_s;
+    memcpy(line->at, at, (size_t)head.currents * sizeof(cg_current));
+    at += (size_t)head.currents * sizeof(cg_current);
+    if (self->skew != NULL) {
+        self->skew->first = head.first;
+        self->skew->waiting = head.waiting;
+        self->skew->count = head.count;
+        for (int64_t k = head.oldest; k < head.count; ++k, at += sizeof(cg_sample)) {
+            memcpy(&self->skew->at[k % CG_WAITING], at, sizeof(cg_sample));
         }
     }
-    PyErr_SetString(PyExc_KeyError, name);
-    return NULL;
+    Py_RETURN_NONE;
+}
+
+static PyObject *Core_take_over(Core *self, PyObject *other)
+{
+    if (!Py_IS_TYPE(other, Py_TYPE(self)) || (other == (PyObject *)self)) {
+        PyErr_SetString(PyExc_TypeError, "another Core is needed");
+        return NULL;
+    }
+    cg_estimator *to = &self->estimator;
+    cg_estimator *from = &((Core *)other)->estimator;
+    cg_line *line = &to->line;
+    (void)cg_evaluate(from);
+    to->state = from->state;
+    to->state.is_refused = false;
+    line->first = 0;
+    line->count = (from->line.count < line->size) ? from->line.count : line->size;
+    line->since_s = from->line.since_s;
+    for (int32_t k = 0; k < line->count; ++k) {
+        line->at[k] = *current_of(&from->line, (from->line.count - line->count) + k);
+    }
+    to->model = from->model;
+    cg_set_table(to, &self->model);
+    Py_RETURN_NONE;
+}
+
+static PyObject *Core_start_from(Core *self, PyObject *args)
+{
+    double soc_pct;
+    double std_pct;
+    double away_s;
+    if (!PyArg_ParseTuple(args, "ddd", &soc_pct, &std_pct, &away_s)) {
+        return NULL;
+    }
+    cg_start_from(&self->estimator, soc_pct, std_pct, away_s);
+    Py_RETURN_NONE;
+}
+
+/* ------------------------------------------------------------------ what the reference computes from */
+
+static PyObject *Core_row(Core *self, PyObject *Py_UNUSED(none))
+{
+    return PyLong_FromLongLong((long long)self->estimator.state.memory.tick);
+}
+
+static PyObject *Core_filled_s(Core *self, PyObject *Py_UNUSED(none))
+{
+    return PyFloat_FromDouble(cg_line_filled_s(&self->estimator.line));
+}
+
+static PyObject *Core_current_at(Core *self, PyObject *ago_s)
+{
+    const double given_s = PyFloat_AsDouble(ago_s);
+    return PyErr_Occurred() ? NULL : PyFloat_FromDouble(cg_line_at(&self->estimator.line, given_s));
+}
+
+#define DOUBLES(array, number) (const char *)(array), (Py_ssize_t)((size_t)(number) * sizeof(double))
+
+/* Likelier filter, counted charge and voltages at the latest sample; arrays as bytes. */
+static PyObject *Core_view(Core *self, PyObject *Py_UNUSED(none))
+{
+    const cg_model *model = &self->model;
+    const cg_state *state = &self->estimator.state;
+    const cg_ekf *ekf = cg_likelier(&state->filter, model);
+    const int32_t size = cg_states(model);
+    double low_passed[CG_LOW_PASSES];
+    for (int32_t k = 0; k < model->low_passes; ++k) {
+        low_passed[k] = state->low_pass[k].value;
+    }
+    return Py_BuildValue(
+        "{s:y#,s:y#,s:y#,s:y#,s:y#,s:y#,s:y#,s:y#,s:d,s:d,s:d}",
+        "x", DOUBLES(ekf->x, size), "pairs", DOUBLES(ekf->p, size * (size + 1) / 2),
+        "b", DOUBLES(ekf->b, 2), "b_P", DOUBLES(ekf->b_p, 4), "b_V", DOUBLES(ekf->b_v, size * 2),
+        "load", DOUBLES(state->load, cg_loads(model)), "drives", DOUBLES(state->drive, model->effects),
+        "low_passed", DOUBLES(low_passed, model->low_passes),
+        "time_s", state->counter.time_s, "moved_pct", state->counter.moved_pct,
+        "temperature_c", state->memory.temperature_c);
 }
 
 static PyMethodDef METHODS[] = {
@@ -228,7 +384,14 @@ static PyMethodDef METHODS[] = {
     {"estimate", (PyCFunction)Core_estimate, METH_NOARGS, "Return the latest estimate."},
     {"run", (PyCFunction)Core_run, METH_O, "Step over columns: 4 in, 7 + 2 out."},
     {"uncounted_std_pct", (PyCFunction)Core_uncounted_std_pct, METH_O, "After a silence [%]."},
-    {"memory", (PyCFunction)Core_memory, METH_VARARGS, "Return the memory of a part."},
+    {"state", (PyCFunction)Core_state, METH_O, "Return the state as bytes, with a shift of stamps."},
+    {"restore", (PyCFunction)Core_restore, METH_VARARGS, "Continue from such bytes, of an age [s]."},
+    {"take_over", (PyCFunction)Core_take_over, METH_O, "Continue from a core of another model."},
+    {"start_from", (PyCFunction)Core_start_from, METH_VARARGS, "Start from a SoC, its deviation [%] and age [s]."},
+    {"row", (PyCFunction)Core_row, METH_NOARGS, "Return the number of the latest row."},
+    {"filled_s", (PyCFunction)Core_filled_s, METH_NOARGS, "Return the delay line's time [s]."},
+    {"current_at", (PyCFunction)Core_current_at, METH_O, "Return the current some time ago [A]."},
+    {"view", (PyCFunction)Core_view, METH_NOARGS, "Return what health and power need."},
     {NULL, NULL, 0, NULL},
 };
 
@@ -254,9 +417,8 @@ PyMODINIT_FUNC PyInit__core(void)
         return NULL;
     }
     PyObject *module = PyModule_Create(&MODULE);
-    PyObject *sizes = Py_BuildValue(
-        "{s:n,s:n,s:n,s:n,s:n}", "model", sizeof(cg_model), "settings", sizeof(cg_settings),
-        "state", sizeof(cg_state), "line", sizeof(cg_line), "skew", sizeof(cg_skew));
+    PyObject *sizes = Py_BuildValue("{s:n,s:n}", "model", sizeof(cg_model), "settings",
+                                    sizeof(cg_settings));
     if ((module == NULL) || (sizes == NULL) ||
         (PyModule_AddObjectRef(module, "Core", (PyObject *)&CoreType) < 0) ||
         (PyModule_AddObjectRef(module, "SIZES", sizes) < 0) ||

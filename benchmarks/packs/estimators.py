@@ -94,7 +94,7 @@ class Cangauge:
         for day in days:
             before = estimator.snapshot()
             estimator = make_estimator(model, settings)
-            if before.memory.samples:
+            if before.samples:
                 estimator.restore(before)
             tables.append(_estimated(step_all(estimator, day)))
         *columns, mismatches = zip(*tables, strict=True)

@@ -12,7 +12,6 @@ from hypothesis import strategies as st
 
 from cangauge.estimation.estimator import Estimator
 from cangauge.estimation.settings import EstimatorSettings
-from cangauge.estimation.state import EstimatorState
 from cangauge.model.effects.library import LIBRARY
 from cangauge.model.model_file import Model
 from cangauge.model.published import leaf_2012_model_file
@@ -98,7 +97,7 @@ def run(model: Model, chosen: EstimatorSettings, samples: list[Sample]) -> None:
         assert all(math.isfinite(each) for each in estimator.health)
     # Its state can be restored.
     again = Estimator(model, chosen)
-    again.restore(EstimatorState.model_validate(estimator.snapshot().model_dump(mode="json")))
+    again.restore(estimator.snapshot())
 
 
 METHODS = ("ekf", "newton", "coulomb")

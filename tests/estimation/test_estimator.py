@@ -58,10 +58,10 @@ def test_counter_integrates_irregular_steps_and_limits_gaps() -> None:
     assert counter.step(1.0, 36.0).discharged_pct == pytest.approx(18.0 / 36000.0 * 100.0)
     bridged = counter.step(21.0, 36.0)
     assert bridged.discharged_pct == pytest.approx(36.0 * 20.0 / 36000.0 * 100.0)
-    assert counter.state.gap_var_pct2 > 0.0
-    before = counter.state.discharged_pct
+    assert counter.gap_var_pct2 > 0.0
+    before = counter.discharged_pct
     away = counter.step(21.0 + 8 * 3600.0, 36.0)
-    assert counter.state.discharged_pct == before
+    assert counter.discharged_pct == before
     assert away.away_s == 8 * 3600.0
 
 
@@ -290,7 +290,7 @@ def test_gap_uncertainty_includes_current_at_its_ends() -> None:
         counter.step(float(second), 0.0)
     counter.step(60.0, 30.0)
     counter.step(90.0, 30.0)
-    gap_pct = math.sqrt(counter.state.gap_var_pct2)
+    gap_pct = math.sqrt(counter.gap_var_pct2)
     assert gap_pct == pytest.approx(100.0 * 30.0 * 30.0 / 36000.0, rel=1e-4)
     away = counter.step(190.0, 0.0)
     assert away.parked_std_pct > 100.0 * 30.0 * 100.0 / 36000.0 - 0.1

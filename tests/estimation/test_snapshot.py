@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import json
 import math
 import subprocess
 import sys
-from collections.abc import Sequence
+from base64 import b64decode, b64encode
 from typing import Any
 
 import numpy as np
@@ -17,7 +16,6 @@ from cangauge.estimation.compiled import make_estimator
 from cangauge.estimation.estimator import Estimator
 from cangauge.estimation.offline import samples_of
 from cangauge.estimation.settings import EstimatorSettings
-from cangauge.estimation.state import EstimatorState
 from cangauge.model.effects.base import Effect, Pack
 from cangauge.model.effects.library import LIBRARY, effect_entries
 from cangauge.model.model_file import Model
@@ -71,30 +69,30 @@ def eventful_samples() -> list[Sample]:
 EVENTFUL = eventful_samples()
 
 
-def through_json(state: EstimatorState) -> EstimatorState:
-    text = json.dumps(state.model_dump(mode="json"), allow_nan=False)
-    return EstimatorState.model_validate(json.loads(text))
-
-
 def same(first: list[Estimate], again: list[Estimate]) -> bool:
     return np.array_equal(np.array(first, float), np.array(again, float), equal_nan=True)
 
 
-def check_continues(model: Model, chosen: EstimatorSettings, at: int) -> None:
-    whole = Estimator(model, chosen)
+def check_continues(make: Any, model: Model, chosen: EstimatorSettings, at: int) -> None:
+    whole = make(model, chosen)
     for sample in EVENTFUL[:at]:
         whole.step(sample)
-    state = through_json(whole.snapshot())
-    after = Estimator(model, chosen)
+    state = whole.snapshot()
+    after = make(model, chosen)
     after.restore(state)
     rest = EVENTFUL[at:]
     assert same([after.step(each) for each in rest], [whole.step(each) for each in rest])
-    assert after.snapshot().model_dump_json() == whole.snapshot().model_dump_json()
+    assert after.snapshot() == whole.snapshot()
+    assert after.power() == whole.power()
 
 
 MOMENTS = [0, 1, 3, 201, 310, 455, 850, 910]
 
 
+BOTH = pytest.mark.parametrize("make", [Estimator, make_estimator])
+
+
+@BOTH
 @pytest.mark.parametrize(
     ("method", "at"),
     nightly_except(
@@ -102,10 +100,11 @@ MOMENTS = [0, 1, 3, 201, 310, 455, 850, 910]
         [*(("ekf", at) for at in MOMENTS), *((each, 310) for each in ("newton", "coulomb"))],
     ),
 )
-def test_continues_bit_for_bit(method: Any, at: int) -> None:
-    check_continues(PLAIN, EstimatorSettings(method=method, **RULES), at)
+def test_continues_bit_for_bit(make: Any, method: Any, at: int) -> None:
+    check_continues(make, PLAIN, EstimatorSettings(method=method, **RULES), at)
 
 
+@BOTH
 @pytest.mark.parametrize(
     ("start_pct", "at"),
     nightly_except(
@@ -113,25 +112,30 @@ def test_continues_bit_for_bit(method: Any, at: int) -> None:
         [(start_pct, at) for start_pct in (80.0, 65.0) for at in (0, 1, 3, 40, 201)],
     ),
 )
-def test_continues_bit_for_bit_with_untested_initial_soc(start_pct: float, at: int) -> None:
-    check_continues(PLAIN, EstimatorSettings(initial_soc_pct=start_pct), at)
+def test_continues_bit_for_bit_with_untested_initial_soc(
+    make: Any, start_pct: float, at: int
+) -> None:
+    check_continues(make, PLAIN, EstimatorSettings(initial_soc_pct=start_pct), at)
 
 
 # Of those with a memory, the suite has the others together below.
+@BOTH
 @pytest.mark.parametrize("effect_id", nightly_except(("weak_cell", "charge_transfer"), LIBRARY))
-def test_continues_bit_for_bit_with_each_effect(effect_id: str) -> None:
-    check_continues(extended_by([effect_id]), EstimatorSettings(initial_soc_pct=80.0), 465)
+def test_continues_bit_for_bit_with_each_effect(make: Any, effect_id: str) -> None:
+    check_continues(make, extended_by([effect_id]), EstimatorSettings(initial_soc_pct=80.0), 465)
 
 
+@BOTH
 @pytest.mark.parametrize("at", nightly_except((310, 910), (3, 310, 455, 910)))
-def test_continues_bit_for_bit_with_many_effects(at: int) -> None:
+def test_continues_bit_for_bit_with_many_effects(make: Any, at: int) -> None:
     ids = ["time_skew", "temperature_lag", "core_temperature", "fast_polarization",
            "slow_diffusion", "hysteresis", "resistance_step", "entropic_coefficient"]  # fmt: skip
-    check_continues(extended_by(ids), EstimatorSettings(), at)
+    check_continues(make, extended_by(ids), EstimatorSettings(), at)
 
 
-def test_snapshot_is_a_copy() -> None:
-    estimator = Estimator(extended_by(["time_skew", "hysteresis"]))
+@BOTH
+def test_snapshot_is_a_copy(make: Any) -> None:
+    estimator = make(extended_by(["time_skew", "hysteresis"]))
     for sample in EVENTFUL[:475]:
         estimator.step(sample)
     state = estimator.snapshot()
@@ -141,117 +145,63 @@ def test_snapshot_is_a_copy() -> None:
     assert state.model_dump_json() == before
 
 
+def after_drive(make: Any, model: Model, **chosen: Any) -> Estimator:
+    """Return an estimator after part of the drive."""
+    estimator: Estimator = make(model, EstimatorSettings(initial_soc_pct=80.0, **chosen))
+    for sample in EVENTFUL[:300]:
+        estimator.step(sample)
+    return estimator
+
+
+@BOTH
 @pytest.mark.parametrize(
     "change", [{"method": "coulomb"}, {"capacity_ah": 45.0}, {"method": "ekf", "capacity_ah": 60.0}]
 )
-def test_soc_is_kept_with_other_settings(change: dict[str, Any]) -> None:
-    before = Estimator(PLAIN, EstimatorSettings(initial_soc_pct=80.0))
-    for sample in EVENTFUL[:300]:
-        last = before.step(sample)
-    after = Estimator(PLAIN, EstimatorSettings(**change))
-    after.restore(through_json(before.snapshot()))
-    found = after.step(EVENTFUL[300])
+def test_soc_is_kept_with_other_settings(make: Any, change: dict[str, Any]) -> None:
+    before = after_drive(make, PLAIN)
+    after = make(PLAIN, EstimatorSettings(**change))
+    after.restore(before.snapshot())
+    found, last = after.step(EVENTFUL[300]), before.estimate
     assert found.soc_pct == pytest.approx(last.soc_pct, abs=0.05)
     assert found.soc_std_pct == pytest.approx(last.soc_std_pct, abs=0.2)
 
 
-def test_state_of_another_model_is_refused() -> None:
-    estimator = Estimator(extended_by(["hysteresis", "fast_polarization"]))
-    for sample in EVENTFUL[:100]:
-        estimator.step(sample)
-    state = estimator.snapshot()
-    with pytest.raises(InputError, match="effects"):
-        Estimator(PLAIN).restore(state)
-    with pytest.raises(InputError, match="effects"):
-        Estimator(extended_by(["current_offset", "fast_polarization"])).restore(state)
+@pytest.mark.parametrize("makes", [(Estimator, make_estimator), (make_estimator, Estimator)])
+@pytest.mark.parametrize("age_s", [30.0, 86400.0, math.nan])
+def test_state_of_another_release_gives_its_soc(makes: tuple[Any, Any], age_s: float) -> None:
+    """The two implementations stand for two releases: neither reads the other's block."""
+    write, read = makes
+    state = after_drive(write, PLAIN).snapshot()
+    after = read(PLAIN, EstimatorSettings(initial_soc_pct=20.0))
+    latest = after.restore(state, age_s)
+    assert (latest.time_s, latest.soc_pct) == (state.time_s, state.soc_pct)
+    found = [after.step(each) for each in EVENTFUL[300:900]]
+    assert found[0].soc_pct == pytest.approx(state.soc_pct, abs=0.2)
+    assert (found[0].soc_std_pct < 1.5) is (age_s == 30.0)  # else charged or driven unseen
+    assert found[-1].soc_pct == pytest.approx(before_end(), abs=3.0)
 
 
-@pytest.mark.parametrize(
-    ("part", "value"),
-    [
-        (("hypotheses", "filters", 0, "x"), [50.0, 0.0]),
-        (("hypotheses", "filters", 0, "p"), [[1.0]]),
-        (("hypotheses", "filters", 0, "bias", "v"), [[0.0, 0.0]]),
-        (("hypotheses", "filters", 0, "x", 0), "nan"),
-        (("counter", "discharged_pct"), None),
-        (("memory", "tick"), "noon"),
-        (("memory", "weather"), "rain"),
-        (("memory", "first_s"), None),
-        (("estimate", 1), 100.1),
-        (("estimate", 2), -1.0),
-        (("line", "current_a"), [1.0]),
-        (("reasons",), -1),
-        (("estimate",), [0.0]),
-        (("more",), 1),
-    ],
-)
-def test_state_of_another_shape_is_refused(part: tuple[Any, ...], value: object) -> None:
-    estimator = Estimator(PLAIN, EstimatorSettings(initial_soc_pct=80.0))
-    for sample in EVENTFUL[:300]:
-        estimator.step(sample)
-    data = json.loads(estimator.snapshot().model_dump_json())
-    at = data
-    for key in part[:-1]:
-        at = at[key]
-    at[part[-1]] = value
-    with pytest.raises((InputError, ValueError)):
-        Estimator(PLAIN).restore(EstimatorState.model_validate(data))
+def before_end() -> float:
+    """Return the SoC of one estimator over the same samples."""
+    estimator = after_drive(make_estimator, PLAIN)
+    return [estimator.step(each) for each in EVENTFUL[300:900]][-1].soc_pct
 
 
-@pytest.mark.parametrize("make", [Estimator, make_estimator])
-@pytest.mark.parametrize(
-    ("effect_id", "places"),
-    [
-        ("time_skew", (0, 1, 3, -1)),  # the number of readings that wait, a time, a voltage
-        ("core_temperature", (0, 1, 5)),
-        ("hysteresis", (0, 2)),
-        ("resistance_step", (0,)),
-    ],
-)
-def test_damaged_state_of_an_effect_is_refused(
-    make: Any, effect_id: str, places: Sequence[int]
-) -> None:
-    model = extended_by([effect_id])
-    estimator = make(model)
-    for sample in EVENTFUL[:300]:
-        estimator.step(sample)
-    state = estimator.snapshot()
-    currents, numbers = state.online
-    damaged = [[*numbers, 1.0]]
-    for place in places:
-        damaged.append(list(numbers))
-        damaged[-1][place] = math.inf
-    damaged.append([math.nan, *numbers[1:]])
-    for each in damaged:
-        with pytest.raises(InputError, match=r"^effects\.0: the saved state is "):
-            make(model).restore(state.model_copy(update={"online": [currents, each]}))
+@BOTH
+def test_state_of_another_model_is_refused(make: Any) -> None:
+    state = after_drive(make, extended_by(["time_skew", "hysteresis"])).snapshot()
+    with pytest.raises(InputError, match="another model"):
+        make(extended_by(["current_offset"])).restore(state)
 
 
-@pytest.mark.parametrize(
-    "change",
-    [
-        lambda numbers: [numbers[0] + 1.0, *numbers[1:]],
-        lambda numbers: [numbers[0], numbers[1] + 1e6, *numbers[2:]],
-        lambda numbers: [*numbers[:5], numbers[5] + 0.01, *numbers[6:]],
-        lambda numbers: [*numbers[:9], numbers[9] + 1e6, *numbers[10:]],
-    ],
-    ids=[
-        "another number waits",
-        "waiting times turn",
-        "the last has no current",
-        "times of currents turn",
-    ],
-)
-def test_readings_that_wait_are_in_order(change: Any) -> None:
-    model = extended_by(["time_skew"])
-    estimator = Estimator(model)
-    for sample in EVENTFUL[:300]:
-        estimator.step(sample)
-    state = estimator.snapshot()
-    assert state.online[1][0] == 2.0
-    online = [state.online[0], change(state.online[1])]
-    with pytest.raises(InputError, match=r"^effects\.0: the saved state is damaged"):
-        Estimator(model).restore(state.model_copy(update={"online": online}))
+@BOTH
+def test_damaged_block_is_refused(make: Any) -> None:
+    state = after_drive(make, extended_by(["time_skew"])).snapshot()
+    whole = b64decode(state.block)
+    for size in (0, 1, len(whole) // 2, len(whole) - 1):
+        part = state.model_copy(update={"block": b64encode(whole[:size]).decode()})
+        with pytest.raises(InputError, match=r"^estimator\.block: damaged"):
+            make(extended_by(["time_skew"])).restore(part)
 
 
 @pytest.mark.parametrize("away_s", [30.0, 86400.0])
@@ -267,7 +217,7 @@ def test_a_restart_while_away_equals_no_restart(away_s: float) -> None:
     for sample in first:
         carried.step(sample)
     restarted = make_estimator(PLAIN)
-    restarted.restore(through_json(carried.snapshot()))
+    restarted.restore(carried.snapshot())
     again = [restarted.step(sample) for sample in second]
     assert same(again, [carried.step(sample) for sample in second])
 

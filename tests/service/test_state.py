@@ -132,7 +132,7 @@ def test_the_state_is_written_only_after_new_samples(machine: Machine) -> None:
     machine.wall_s += 3600.0
     machine.stop()
     assert machine.path.read_bytes() == first
-    assert read_state(machine.path).estimator.estimate[1] == machine.pipeline.latest.soc_pct
+    assert read_state(machine.path).estimator.soc_pct == machine.pipeline.latest.soc_pct
 
 
 @pytest.mark.parametrize(
@@ -162,8 +162,19 @@ def test_after_a_reboot_the_pause_may_have_been_long(machine: Machine) -> None:
     rewritten(machine.path, lambda content: content.update(boot_id="another"))
     machine.start().drive(DRIVE[1000:1001])
     assert machine.pipeline.latest.soc_std_pct >= same
-    hypotheses = machine.pipeline.estimator.snapshot().hypotheses
-    assert (len(hypotheses.filters), hypotheses.decision) == (2, 0)
+    assert machine.pipeline.latest.soc_std_pct > 5.0
+
+
+def test_a_state_of_another_release_gives_its_soc(machine: Machine) -> None:
+    last = kept(machine)[-1]
+    rewritten(machine.path, lambda content: content["estimator"].update(writer="later", block=""))
+    machine.start()
+    assert machine.keeper.restored
+    assert "of another release, method or capacity, of which the SoC alone is kept" in machine.text
+    latest = machine.pipeline.latest
+    assert (latest.soc_pct, latest.status) == (last.soc_pct, Status.INVALID)
+    found = machine.drive(DRIVE[1000:])
+    assert found[-1].soc_pct == pytest.approx(last.soc_pct - 1.0, abs=1.0)
 
 
 def test_a_replayed_log_goes_on_and_another_one_begins_anew(machine: Machine) -> None:
@@ -243,9 +254,9 @@ DAMAGE: dict[str, tuple[Callable[[Path], object], str]] = {
     "hash": (lambda path: path.write_text(path.read_text().replace('"sha256": "', '"sha256": "0')),
              "damaged"),
     "unknown key": (edited("more", value=1), "more"),
-    "no soc": (edited("estimator", "estimate", 1, value=None), "has no SoC"),
-    "a negative deviation": (edited("estimator", "estimate", 2, value=-1.0), "is negative"),
-    "a word": (edited("estimator", "memory", value="many"), "estimator"),
+    "no soc": (edited("estimator", "soc_pct", value=None), "soc_pct"),
+    "a negative deviation": (edited("estimator", "soc_std_pct", value=-1.0), "soc_std_pct"),
+    "a word": (edited("estimator", "block", value="many"), "estimator.block"),
 }  # fmt: skip
 
 

@@ -42,7 +42,7 @@ def run(path: Path) -> Command:
 
 
 def samples_kept(path: Path) -> int:
-    return read_state(path).estimator.memory.samples if path.exists() else 0
+    return read_state(path).estimator.samples if path.exists() else 0
 
 
 def test_killed_started_again_and_stopped(tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""The C core's structures (`core/cangauge.h`) as NumPy data types, and a model as its constants.
+"""A model and settings as constants of the C core: structures of `core/cangauge.h`.
 
 Names, order and types are those of the header; `compiled` proves that sizes agree.
 """
@@ -17,13 +17,10 @@ from cangauge.model.extended import OnlineModel
 from cangauge.model.model_file import Model
 from cangauge.model.voltage_model import HermiteCurve, PublishedCurve, resistance_factor
 
-DELAYS, LOW_PASSES, KNOTS, FUNCTIONS, EFFECTS, WAITING = 64, 4, 201, 16, 32, 8192
-OCV, LAGS, VALUES, TESTED = 8, 2, 5, 64
+DELAYS, LOW_PASSES, KNOTS, FUNCTIONS, EFFECTS = 64, 4, 201, 16, 32
+OCV, LAGS, VALUES = 8, 2, 5
 CURRENTS: Final = DELAYS + LOW_PASSES
 LOADS: Final = CURRENTS + 2
-STATES: Final = FUNCTIONS + 4
-PAIRS: Final = STATES * (STATES + 1) // 2
-SUMS: Final = LOADS + 6
 """Upper limits of a model, as in the header."""
 
 KINDS: Final = (
@@ -50,7 +47,7 @@ METHODS: Final = ("ekf", "newton", "coulomb")
 """Methods, in the order of `cg_method`."""
 
 
-_TYPES: Final = {"d": "f8", "i": "i4", "u": "u4", "l": "i8", "b": "?"}
+_TYPES: Final = {"d": "f8", "i": "i4", "u": "u4"}
 _SIZES: Final = {name: value for name, value in globals().items() if isinstance(value, int)}
 
 
@@ -84,42 +81,6 @@ SETTINGS: Final = _structure(
     "i:method d:initial_soc_pct d:initial_soc_std_pct d:valid_std_pct d:gap_s u:reasons"
     " d:full_voltage_v d:full_current_a d:full_hold_s d:full_soc_pct d:full_soc_std_pct"
     " d:rest_after_s d:rest_soc_std_pct"
-)
-SAMPLE: Final = _structure("d:time_s d:current_a d:voltage_v d:temperature_c")
-CURRENT: Final = _structure("d:time_s d:current_a")
-LINE: Final = _structure("l:at i:size i:first i:count i:block d:spacing_s d:since_s d:base_s")
-SKEW: Final = _structure("sample:at[WAITING] l:first l:waiting l:count", sample=SAMPLE)
-LAG: Final = _structure("d:time_s d:input d:value b:is_started")
-_EKF: Final = _structure(
-    "d:x[STATES] d:p[PAIRS] d:evidence d:b[2] d:b_p[2,2] d:b_v[STATES,2] d:innovation2"
-)
-STATE: Final = _structure(
-    "clock:clock counter:counter block:block filter:filter memory:memory lag:low_pass[LOW_PASSES]"
-    " effect:effect[EFFECTS] latest:latest sample:pending d:pending_stamp_s b:is_pending"
-    " b:is_refused u:implausible d:load[LOADS] d:load_v d:drop_v d:drive[EFFECTS]",
-    clock=_structure("d:last_s d:shift_s l:behind d:behind_s d:age_s b:is_restored"),
-    counter=_structure(
-        "d:time_s d:current_a d:mean_square_a2 d:turned_a2 d:discharged_pct d:moved_pct d:counted_s"
-        " d:gap_var_pct2"
-    ),
-    block=_structure("l:number i:rows b:is_broken d:sums[SUMS] d:drive[EFFECTS]"),
-    filter=_structure("ekf:ekf[2] i:hypotheses i:decision d:prior_log_odds", ekf=_EKF),
-    memory=_structure(
-        "l:samples l:resets d:first_s l:tick d:temperature_c d:row_v d:row_a d:steps"
-        " d:steps_v2 d:steps_a2 d:steps_va b:is_sign_wrong d:newton_pct d:newton_std_pct"
-        " b:newton_inside d:voltage_model_v d:residual_v b:is_known d:filter_discharged_pct"
-        " d:filter_counted_s d:filter_gap_var_pct2 d:coulomb_start_pct d:coulomb_var_pct2"
-        " d:coulomb_counted_s d:coulomb_moved_pct d:coulomb_gap_var_pct2 d:gap_until_s"
-        " d:contradicted_until_s d:mismatch_until_s i:innovations d:innovation2[TESTED]"
-        " d:rest_since_s d:full_since_s b:is_full b:is_rested"
-    ),
-    lag=LAG,
-    effect=_structure("lag:lag[LAGS]", lag=LAG),
-    latest=_structure(
-        "d:time_s d:soc_pct d:soc_std_pct d:soc_newton_pct d:soc_coulomb_pct d:voltage_model_v"
-        " d:residual_v i:status u:reasons l:samples"
-    ),
-    sample=SAMPLE,
 )
 
 Record = Any

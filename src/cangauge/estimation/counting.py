@@ -17,9 +17,9 @@ most the rate of a fast charger. The voltages after the interval test both (see 
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from typing import Final, NamedTuple
 
-from cangauge.estimation.state import ClockState, CounterState
 from cangauge.logs.gaps import BRIDGE_S
 
 USE_S = 120.0
@@ -97,6 +97,7 @@ class ChargeStep(NamedTuple):
     """Standard deviation of its charge if the car was parked [%]."""
 
 
+@dataclass
 class CoulombCounter:
     """Charge since the first sample, in % of capacity.
 
@@ -106,58 +107,68 @@ class CoulombCounter:
         Charge from 100 to 0 % [Ah].
     gap_s : float
         Longer steps between samples are gaps [s].
-
-    Attributes
-    ----------
-    state : CounterState
-        Charge counted so far, and the last sample.
     """
 
-    def __init__(self, capacity_ah: float, gap_s: float) -> None:
-        self._pct_per_as = 100.0 / (3600.0 * capacity_ah)
-        self._gap_s = gap_s
-        # Of a slow log the usual step may exceed a minute; as offline (`logs.gaps.bridge_s`).
-        self._bridge_s = max(BRIDGE_S, gap_s)
-        self.state = CounterState()
+    capacity_ah: float
+    gap_s: float
+    time_s: float = math.nan
+    """Time of the last sample [s]; NaN before the first."""
+    current_a: float = 0.0
+    """Current of the last sample [A]."""
+    mean_square_a2: float = 0.0
+    """Running mean square of the current [A²]."""
+    turned_a2: float = 0.0
+    """Variance of the current between the last two samples [A²]."""
+    discharged_pct: float = 0.0
+    """Net charge taken out since the first sample [% of capacity]."""
+    moved_pct: float = 0.0
+    """Charge moved in either direction since the first sample [% of capacity]."""
+    counted_s: float = 0.0
+    """Time since the first sample in which charge was counted [s]."""
+    gap_var_pct2: float = 0.0
+    """Variance of the charge between samples since the first [%²]."""
+
+    @property
+    def pct_per_as(self) -> float:
+        """Change of the SoC by a charge [% per As]."""
+        return 100.0 / (3600.0 * self.capacity_ah)
 
     def step(self, time_s: float, current_a: float) -> ChargeStep:
         """Count one sample, later than the last one [s]; positive current discharges [A]."""
-        state = self.state
-        last_s, last_a = state.time_s, state.current_a
-        state.time_s, state.current_a = time_s, current_a
+        last_s, last_a = self.time_s, self.current_a
+        self.time_s, self.current_a = time_s, current_a
         if math.isnan(last_s):
-            state.mean_square_a2 = current_a * current_a
+            self.mean_square_a2 = current_a * current_a
             return ChargeStep(0.0, 0.0)
-        seconds = time_s - last_s
+        seconds, pct_per_as = time_s - last_s, self.pct_per_as
         across_a = 0.5 * (current_a + last_a)
         kept = math.exp(-seconds / MEAN_SQUARE_MEMORY_S)
         # At the start of a drive the mean square lags: the currents at the ends of the gap bound it
         # from below.
-        mean_square_a2 = state.mean_square_a2
-        state.mean_square_a2 = kept * state.mean_square_a2 + (1.0 - kept) * (current_a * current_a)
-        if seconds > self._bridge_s:
+        mean_square_a2 = self.mean_square_a2
+        self.mean_square_a2 = kept * mean_square_a2 + (1.0 - kept) * (current_a * current_a)
+        # Of a slow log the usual step may exceed a minute; as offline (`logs.gaps.bridge_s`).
+        if seconds > max(BRIDGE_S, self.gap_s):
             rms_a = math.sqrt(max(mean_square_a2, last_a * last_a))
-            parked_pct = parked_std_pct(seconds, rms_a * self._pct_per_as)
-            return ChargeStep(seconds, 0.0, seconds, parked_pct)
-        state.counted_s += seconds
-        out_pct = across_a * seconds * self._pct_per_as
-        state.discharged_pct += out_pct
-        state.moved_pct += abs(out_pct)
-        state.turned_a2 = 0.5 * (-math.expm1(-seconds / HELD_S) * (current_a - last_a)) ** 2
-        state.gap_var_pct2 += state.turned_a2 * (seconds * self._pct_per_as) ** 2
-        if seconds > self._gap_s:
+            return ChargeStep(seconds, 0.0, seconds, parked_std_pct(seconds, rms_a * pct_per_as))
+        self.counted_s += seconds
+        out_pct = across_a * seconds * pct_per_as
+        self.discharged_pct += out_pct
+        self.moved_pct += abs(out_pct)
+        self.turned_a2 = 0.5 * (-math.expm1(-seconds / HELD_S) * (current_a - last_a)) ** 2
+        self.gap_var_pct2 += self.turned_a2 * (seconds * pct_per_as) ** 2
+        if seconds > self.gap_s:
             across_a2 = 0.5 * (current_a * current_a + last_a * last_a)
-            gap_pct = math.sqrt(max(mean_square_a2, across_a2)) * seconds * self._pct_per_as
-            state.gap_var_pct2 += gap_pct * gap_pct
+            gap_pct = math.sqrt(max(mean_square_a2, across_a2)) * seconds * pct_per_as
+            self.gap_var_pct2 += gap_pct * gap_pct
         return ChargeStep(seconds, out_pct)
 
     def uncounted_std_pct(self, seconds: float) -> float:
         """Return the standard deviation of the charge since the last sample [%]."""
-        state = self.state
-        if math.isnan(state.time_s):
+        if math.isnan(self.time_s):
             return 0.0
-        rms_a = math.sqrt(max(state.mean_square_a2, state.current_a * state.current_a))
-        return min(rms_a * seconds * self._pct_per_as, UNKNOWN_STD_PCT)
+        rms_a = math.sqrt(max(self.mean_square_a2, self.current_a * self.current_a))
+        return min(rms_a * seconds * self.pct_per_as, UNKNOWN_STD_PCT)
 
 
 LATEST_S = 1e11
@@ -184,32 +195,32 @@ UNKNOWN_INTERRUPTION_S = 86400.0
 """Assumed length of an interruption that no clock measured [s]."""
 
 
+@dataclass
 class EstimatorClock:
-    """Maps the samples' stamps to a time that always increases.
+    """Maps the samples' stamps to a time that always increases."""
 
-    Attributes
-    ----------
-    state : ClockState
-    age_s : float or None
-        Of a restored state, until the first sample: its minimum age [s], which overrides stamps
-        that show less; NaN if no clock measured it, None without an interruption.
-    """
-
-    def __init__(self) -> None:
-        self.state = ClockState()
-        self.age_s: float | None = None
+    last_s: float = math.nan
+    """Time of the last accepted sample [s]; NaN before the first."""
+    shift_s: float = 0.0
+    """Time minus stamp [s]."""
+    behind: int = 0
+    """Consecutive samples stamped before the last accepted one."""
+    behind_s: float = math.nan
+    """Stamp of the latest of these [s]."""
+    age_s: float | None = None
+    """Of a restored state, until the first sample: its minimum age [s], which overrides stamps that
+    show less; NaN if no clock measured it, None without an interruption."""
 
     def time_of(self, stamp_s: float) -> float | None:
         """Return a stamp's time [s], later than the last; None to refuse the sample."""
         if not abs(stamp_s) <= LATEST_S:  # NaN too
             return None
-        state = self.state
-        if math.isnan(state.last_s):
-            state.last_s, self.age_s = stamp_s, None
-            return stamp_s
-        shift_s = state.shift_s
-        step_s = stamp_s + shift_s - state.last_s
         age_s, self.age_s = self.age_s, None
+        if math.isnan(self.last_s):
+            self.last_s = stamp_s
+            return stamp_s
+        shift_s = self.shift_s
+        step_s = stamp_s + shift_s - self.last_s
         if age_s is not None and not step_s >= _least_step_s(age_s):
             # The stamps restarted, or their clock was set back or stopped.
             is_unknown = math.isnan(age_s)
@@ -218,27 +229,26 @@ class EstimatorClock:
         elif step_s < SHORTEST_STEP_S:
             if not self._is_set_back(stamp_s, step_s):
                 return None
-            shift_s += stamp_s - state.behind_s - step_s
+            shift_s += stamp_s - self.behind_s - step_s
         elif step_s > LONGEST_INTERRUPTION_S:
             shift_s += LONGEST_INTERRUPTION_S - step_s
         time_s = stamp_s + shift_s
-        if time_s - state.last_s < SHORTEST_STEP_S:
+        if time_s - self.last_s < SHORTEST_STEP_S:
             return None
-        state.shift_s = shift_s
-        state.behind, state.behind_s = 0, math.nan
-        state.last_s = time_s
+        self.shift_s = shift_s
+        self.behind, self.behind_s = 0, math.nan
+        self.last_s = time_s
         return time_s
 
     def _is_set_back(self, stamp_s: float, step_s: float) -> bool:
-        state = self.state
         if step_s > -SET_BACK_S:
             return False
-        if stamp_s - state.behind_s < SHORTEST_STEP_S:
-            state.behind = 0
-        if state.behind + 1 >= SET_BACK_SAMPLES:
+        if stamp_s - self.behind_s < SHORTEST_STEP_S:
+            self.behind = 0
+        if self.behind + 1 >= SET_BACK_SAMPLES:
             return True
-        state.behind += 1
-        state.behind_s = stamp_s
+        self.behind += 1
+        self.behind_s = stamp_s
         return False
 
 

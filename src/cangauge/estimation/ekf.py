@@ -30,15 +30,17 @@ Kalman filter; Jazwinski, Stochastic Processes and Filtering Theory, 1970, ch. 8
 from __future__ import annotations
 
 import math
+from copy import copy
 from functools import cached_property
 from typing import Any, Final, Self
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from cangauge._typing import FloatArray
 from cangauge.estimation.counting import UNKNOWN_STD_PCT
 from cangauge.estimation.health import SeparateBias
-from cangauge.estimation.state import Block, FilterState
+from cangauge.estimation.state import Block
 from cangauge.model.extended import OnlineModel
 
 OFFSET_STD_A: Final = 1.0
@@ -266,17 +268,31 @@ class SocFilter:
         x = np.concatenate((self.x + V @ b, b))
         return x, np.block([[self.P + V @ Pb @ V.T, V @ Pb], [Pb @ V.T, Pb]])
 
-    def snapshot(self) -> FilterState:
-        """Return a copy of everything needed to continue."""
-        return FilterState(
-            x=self.x.tolist(), p=self.P.tolist(), evidence=self.evidence, bias=self.bias.snapshot()
-        )
+    def copy(self) -> Self:
+        """Return a copy, which goes on by itself."""
+        other = copy(self)
+        other.bias = copy(self.bias)
+        return other
 
-    def restore(self, state: FilterState) -> Self:
-        """Continue from a state of the same model; return self."""
-        self.x, self.P = np.array(state.x), np.array(state.p)
-        self.evidence = state.evidence
-        self.bias.restore(state.bias)
+    def state(self) -> dict[str, Any]:
+        """Return a copy of everything needed to continue, as plain numbers."""
+        bias = self.bias
+        arrays = {"x": self.x, "P": self.P, "b": bias.b, "b_P": bias.P, "b_V": bias.V}
+        return {name: each.tolist() for name, each in arrays.items()} | {"evidence": self.evidence}
+
+    def resume(
+        self,
+        *,
+        x: ArrayLike,
+        P: ArrayLike,
+        b: ArrayLike,
+        b_P: ArrayLike,
+        b_V: ArrayLike,
+        evidence: float = 0.0,
+    ) -> Self:
+        """Continue from a `state` of the same model; return self."""
+        self.x, self.P, self.evidence = np.array(x), np.array(P), evidence
+        self.bias.b, self.bias.P, self.bias.V = np.array(b), np.array(b_P), np.array(b_V)
         return self
 
     def take_over(self, before: SocFilter) -> None:

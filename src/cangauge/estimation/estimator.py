@@ -8,37 +8,35 @@ offline.
 
 from __future__ import annotations
 
+import json
 import math
+from base64 import b64decode, b64encode
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import asdict, replace
 from typing import Any, ClassVar, Final
 
 from scipy.special import chdtri
 
 from cangauge._typing import FloatArray
+from cangauge._version import __version__
 from cangauge.errors import InputError
 from cangauge.estimation.cells import PackTick
 from cangauge.estimation.counting import (
+    UNKNOWN_INTERRUPTION_S,
     UNKNOWN_STD_PCT,
     ChargeStep,
     CoulombCounter,
     EstimatorClock,
     count_std_pct,
     moved_std_pct,
+    parked_std_pct,
 )
 from cangauge.estimation.ekf import inverse_std_pct
 from cangauge.estimation.health import health_of
 from cangauge.estimation.power import PowerModel
 from cangauge.estimation.settings import EstimatorSettings, SocReference, detect_references
 from cangauge.estimation.start import WRONG_PRIOR, WRONG_STD_PCT, Hypotheses
-from cangauge.estimation.state import (
-    SCALARS,
-    Block,
-    BlockState,
-    DelayLineState,
-    EstimatorMemory,
-    EstimatorState,
-)
+from cangauge.estimation.state import Block, BlockState, EstimatorMemory, EstimatorState
 from cangauge.estimation.validity import drop_implausible, outside_model, temperature_mismatch
 from cangauge.model.effects.base import Reading
 from cangauge.model.inverse import soc_from_ocv
@@ -53,6 +51,7 @@ from cangauge.types import (
     Power,
     Reason,
     Sample,
+    Status,
     status_of,
 )
 
@@ -122,6 +121,8 @@ class Estimator:
 
     core: ClassVar[str] = "python"
     """Implementation of the step: "python", or "compiled" (`compiled`)."""
+    _release: ClassVar[str] = __version__
+    """Release of the implementation, whose estimators read each other's states."""
 
     def __init__(self, model: Model | Any, settings: EstimatorSettings | None = None) -> None:
         self.model: Model = as_model(model)
@@ -219,7 +220,7 @@ class Estimator:
         """Return the currents possible for 10 s and the energy left, after the latest sample."""
         self._refresh()
         soc_pct, std_pct = self._soc()
-        if math.isnan(soc_pct) or math.isnan(self._counter.state.time_s):
+        if math.isnan(soc_pct) or math.isnan(self._counter.time_s):
             return Power()
         return self._power.at(self.hypotheses.likelier, soc_pct, std_pct, self._temperature_c)
 
@@ -230,7 +231,7 @@ class Estimator:
     def pack_tick(self, sample: Sample) -> PackTick:
         """Return what is known of the pack after its latest sample, for its cells."""
         self._refresh()
-        counter, (soc_pct, std_pct) = self._counter.state, self._soc()
+        counter, (soc_pct, std_pct) = self._counter, self._soc()
         is_counting = not math.isnan(counter.time_s)
         _, load_v, drop_v = self._load() if is_counting else (None, math.nan, math.nan)
         return PackTick(
@@ -246,7 +247,7 @@ class Estimator:
     def current_changes(self, time_s: float, stamps_s: Sequence[float]) -> list[float]:
         """Return the current at a sample's time less that at other stamps [A]; NaN for NaN."""
         self._refresh()
-        if math.isnan(self._counter.state.time_s):
+        if math.isnan(self._counter.time_s):
             return [math.nan] * len(stamps_s)
         at = self._online.delay_line.current_at
         now_a = at(0.0)
@@ -295,13 +296,17 @@ class Estimator:
         memory.gap_until_s = time_s + self._online.delay_line.longest_s
         if away_s > 0.0:
             self._predict_to_now()
-            std_pct = moved_std_pct(away_s)
-            self.hypotheses.doubt(WRONG_PRIOR, std_pct, away_s, charge.parked_std_pct)
-            memory.coulomb_var_pct2 += WRONG_PRIOR * std_pct**2
+            self._be_away(away_s, charge.parked_std_pct)
+
+    def _be_away(self, away_s: float, parked_pct: float) -> None:
+        """Allow for a car that was charged or driven in an unobserved interval [s, %]."""
+        moved_pct = moved_std_pct(away_s)
+        self.hypotheses.doubt(WRONG_PRIOR, moved_pct, away_s, parked_pct)
+        self._memory.coulomb_var_pct2 += WRONG_PRIOR * moved_pct**2
 
     def _use_row(self, sample: Sample) -> None:
         """Compare a row's voltage with the model, and add it to the open block."""
-        memory, online, counter = self._memory, self._online, self._counter.state
+        memory, online, counter = self._memory, self._online, self._counter
         load, load_v, drop_v = self._load()
         guess_pct = 50.0 if math.isnan(memory.newton_pct) else memory.newton_pct
         memory.newton_pct = memory.newton_std_pct = math.nan
@@ -362,7 +367,6 @@ class Estimator:
         hypotheses.update(block)
         if not hypotheses.is_valid():
             self.hypotheses = Hypotheses(self._online)
-            memory.resets += 1
             memory.contradicted_until_s = time_s + CONTRADICTED_S
         elif hypotheses.is_rejected and not was_rejected:
             memory.contradicted_until_s = time_s + CONTRADICTED_S
@@ -391,7 +395,7 @@ class Estimator:
 
     def _predict(self, counted_s: float, discharged_pct: float) -> None:
         """Predict the filter to a count of time [s] and charge [%]."""
-        memory, gap_var_pct2 = self._memory, self._counter.state.gap_var_pct2
+        memory, gap_var_pct2 = self._memory, self._counter.gap_var_pct2
         self.hypotheses.predict(
             counted_s - memory.filter_counted_s,
             discharged_pct - memory.filter_discharged_pct,
@@ -403,7 +407,7 @@ class Estimator:
 
     def _predict_to_now(self) -> None:
         """Predict the filter to the latest sample; the open block lies in part before it."""
-        self._predict(self._counter.state.counted_s, self._counter.state.discharged_pct)
+        self._predict(self._counter.counted_s, self._counter.discharged_pct)
         self._block.is_broken = True
 
     def _correct(self, reference: SocReference) -> None:
@@ -427,7 +431,7 @@ class Estimator:
         self._start_count(soc_pct, std_pct)
 
     def _start_count(self, soc_pct: float, std_pct: float) -> None:
-        memory, counter = self._memory, self._counter.state
+        memory, counter = self._memory, self._counter
         memory.coulomb_start_pct = soc_pct + counter.discharged_pct
         memory.coulomb_var_pct2 = std_pct**2
         memory.coulomb_counted_s = counter.counted_s
@@ -458,7 +462,7 @@ class Estimator:
 
     def _filter_soc(self) -> tuple[float, float]:
         """Return SoC and standard deviation of the filter, counted to the latest sample [%]."""
-        memory, counter = self._memory, self._counter.state
+        memory, counter = self._memory, self._counter
         soc_pct, std_pct = self.hypotheses.soc_after(
             counter.counted_s - memory.filter_counted_s,
             counter.discharged_pct - memory.filter_discharged_pct,
@@ -468,7 +472,7 @@ class Estimator:
 
     def _coulomb_soc(self) -> tuple[float, float]:
         """Return SoC and standard deviation by counting alone [%]; NaN until it has started."""
-        memory, counter = self._memory, self._counter.state
+        memory, counter = self._memory, self._counter
         std_pct = count_std_pct(
             memory.coulomb_var_pct2 + counter.gap_var_pct2 - memory.coulomb_gap_var_pct2,
             counter.counted_s - memory.coulomb_counted_s,
@@ -516,28 +520,35 @@ class Estimator:
 
     # --- restart, and another model
 
-    def snapshot(self) -> EstimatorState:
-        """Return a copy of everything needed to continue as if not interrupted."""
-        latest = self._evaluate()
+    @property
+    def writer(self) -> str:
+        """Name of the estimators that read each other's states: release, method and capacity."""
+        implementation = f"{self.core} {self._release}"
+        return f"{implementation}, {self.settings.method}, {self.capacity_ah!r} Ah"
+
+    def snapshot(self, stamp_shift_s: float = 0.0) -> EstimatorState:
+        """Return a copy of everything needed to continue as if not interrupted.
+
+        Parameters
+        ----------
+        stamp_shift_s : float
+            Part of the latest stamps that those after the restart will not have [s].
+        """
+        latest = self.estimate
         return EstimatorState.model_construct(
-            method=self.settings.method,
-            capacity_ah=self.capacity_ah,
-            clock=replace(self._clock.state),
-            counter=replace(self._counter.state),
-            line=DelayLineState(*self._online.delay_line.contents),
-            online=self._online.state(),
-            block=replace(self._block, sums=list(self._block.sums)),
-            hypotheses=self.hypotheses.snapshot(),
-            memory=replace(self._memory, innovations=list(self._memory.innovations)),
-            estimate=list(latest[:7]),
-            reasons=int(latest.reasons),
+            writer=self.writer,
+            samples=latest.samples,
+            time_s=latest.time_s,
+            soc_pct=latest.soc_pct,
+            soc_std_pct=latest.soc_std_pct,
+            block=b64encode(self._packed(stamp_shift_s)).decode(),
         )
 
     def restore(self, state: EstimatorState, age_s: float = 0.0) -> Estimate:
         """Continue from a state of the same model, and return its last estimate.
 
-        With the state's method and capacity, the next sample continues bit for bit. With another
-        method or capacity, the filter starts from the state's SoC and standard deviation.
+        A state of the same release, method and capacity continues bit for bit. From any other one
+        the SoC is kept, with a standard deviation for the age.
 
         Parameters
         ----------
@@ -553,68 +564,89 @@ class Estimator:
         Raises
         ------
         InputError
-            If the state does not fit the model; the estimator must then not be used.
+            If the state is damaged, or of another model; the estimator must then not be used.
         """
-        self._continue(state, age_s)
-        return self._latest
+        if state.writer != self.writer:
+            away_s = UNKNOWN_INTERRUPTION_S if math.isnan(age_s) else age_s
+            self.start_from(state.soc_pct, state.soc_std_pct, away_s)
+            return Estimate.unknown(Reason.INPUT_STALE)._replace(
+                time_s=state.time_s, soc_pct=state.soc_pct, soc_std_pct=state.soc_std_pct
+            )
+        try:
+            self._unpack(b64decode(state.block), age_s)
+        except (InputError, ValueError, TypeError, KeyError, IndexError) as error:
+            raise InputError("damaged, or of another model", field="estimator.block") from error
+        return self.estimate
 
-    def _continue(self, state: EstimatorState, age_s: float | None) -> None:
-        """Continue from a state; without an interruption its age is None."""
-        self._resume(state, age_s)
-        line = state.line
-        self._online.delay_line.fill(line.time_s, line.current_a, line.since_s)
-        self._online.restore(state.online)
-        if (state.method, state.capacity_ah) == (self.settings.method, self.capacity_ah):
-            columns = self._online.load_coefficients.size
-            sums = SCALARS + columns + self._online.drives.size
-            if state.block.rows and (state.block.columns, len(state.block.sums)) != (columns, sums):
-                raise InputError(f"the model's blocks have {sums} sums", field="block.sums")
-            self._block = replace(state.block, sums=list(state.block.sums))
-            self.hypotheses.restore(state.hypotheses)
-        else:
-            self._start_from(state)
+    def start_from(self, soc_pct: float, soc_std_pct: float, away_s: float) -> None:
+        """Start from the SoC of an estimator that ended `away_s` ago, and its deviation [%]."""
+        self._start(soc_pct, soc_std_pct, is_doubtful=False)
+        if away_s > 0.0:
+            self._be_away(away_s, parked_std_pct(away_s, 0.0))
 
     def take_over(self, before: Estimator) -> None:
         """Continue from another estimator, of another model or with other settings.
 
         SoC and standard deviation, the delay line, the last sample (so that counting continues),
         the ends of gaps, the learned capacity and the current's offset are carried over. What the
-        filter has learned of the other model's voltage is not. An unknown SoC stays unknown.
+        filter has learned of the other model's voltage is not. An unknown SoC stays unknown. From
+        an estimator of the other implementation only the SoC is.
         """
-        before._refresh()
-        state = before.snapshot()
-        self._resume(state, before._clock.age_s)
-        self._online.take_over(before._online)
-        self._start_from(state)
-        self.hypotheses.take_over(before.hypotheses)
+        latest = before.estimate
+        if before.core != self.core:
+            if not math.isnan(latest.soc_pct):
+                self.start_from(latest.soc_pct, latest.soc_std_pct, 0.0)
+            return
+        self._follow(before)
 
-    def _resume(self, state: EstimatorState, age_s: float | None) -> None:
-        """Copy from a state what depends on neither model nor settings.
-
-        Without an interruption `age_s` is None, and the stamps of the samples give the time.
-        """
-        self._clock.state, self._clock.age_s = replace(state.clock), age_s
-        self._counter.state = replace(state.counter)
-        self._memory = replace(state.memory, innovations=list(state.memory.innovations))
-        reasons = Reason(state.reasons)
-        self._latest = Estimate._make(
-            [*state.estimate, status_of(reasons), reasons, state.memory.samples]
-        )
-        self._pending, self.is_refused = None, False
-
-    def _start_from(self, state: EstimatorState) -> None:
-        """Start from the SoC of another estimator, if it knew one."""
-        memory, counter = self._memory, self._counter.state
-        memory.mismatch_until_s, memory.innovations = math.nan, []
+    def _follow(self, before: Estimator) -> None:
+        """Take over from another estimator of this implementation."""
+        counter, latest = before._counter, before._evaluate()
+        self._clock = replace(before._clock)
+        self._counter = replace(counter, capacity_ah=self.capacity_ah, gap_s=self.settings.gap_s)
+        self._memory = memory = replace(before._memory, innovations=[])
+        memory.mismatch_until_s = memory.coulomb_start_pct = math.nan
         memory.filter_counted_s = counter.counted_s
         memory.filter_discharged_pct = counter.discharged_pct
         memory.filter_gap_var_pct2 = counter.gap_var_pct2
-        self._block = BlockState(state.block.number, is_broken=True)
-        memory.is_known, memory.coulomb_start_pct = False, math.nan
-        if not math.isnan(state.soc_pct):
-            self._start(state.soc_pct, state.soc_std_pct, is_doubtful=False)
-        elif not math.isnan(state.estimate[4]):  # counting has a SoC where the inverse has none
-            self._start(state.estimate[4], UNKNOWN_STD_PCT, is_doubtful=False)
+        memory.is_known = False
+        self._block = BlockState(before._block.number, is_broken=True)
+        self._latest, self._pending, self.is_refused = latest, None, False
+        self._online.take_over(before._online)
+        if not math.isnan(latest.soc_pct):
+            self._start(latest.soc_pct, latest.soc_std_pct, is_doubtful=False)
+        elif not math.isnan(latest.soc_coulomb_pct):  # the inverse has none without a voltage
+            self._start(latest.soc_coulomb_pct, UNKNOWN_STD_PCT, is_doubtful=False)
+        self.hypotheses.take_over(before.hypotheses)
+
+    def _packed(self, stamp_shift_s: float) -> bytes:
+        """Return the whole state as bytes."""
+        clock = replace(self._clock, shift_s=self._clock.shift_s + stamp_shift_s)
+        parts = {
+            "clock": asdict(clock),
+            "counter": asdict(self._counter),
+            "block": asdict(self._block),
+            "memory": asdict(self._memory),
+            "hypotheses": self.hypotheses.state(),
+            "line": self._online.delay_line.contents,
+            "online": self._online.state(),
+            "latest": self._evaluate(),
+        }
+        return json.dumps(parts).encode()
+
+    def _unpack(self, packed: bytes, age_s: float) -> None:
+        """Continue from the bytes of an equal estimator, of an age [s]."""
+        parts = json.loads(packed)
+        self._clock = EstimatorClock(**parts["clock"] | {"age_s": age_s})
+        self._counter = CoulombCounter(**parts["counter"] | {"gap_s": self.settings.gap_s})
+        self._block = BlockState(**parts["block"])
+        self._memory = EstimatorMemory(**parts["memory"])
+        self.hypotheses.resume(**parts["hypotheses"])
+        self._online.delay_line.fill(*parts["line"])
+        self._online.restore(parts["online"])
+        *numbers, status, reasons, samples = parts["latest"]
+        self._latest = Estimate._make([*numbers, Status(status), Reason(reasons), samples])
+        self._pending, self.is_refused = None, False
 
 
 def _clip(soc_pct: float) -> float:

@@ -27,7 +27,6 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from cangauge._typing import FloatArray
-from cangauge.estimation.state import BiasState
 from cangauge.types import Health
 
 if TYPE_CHECKING:
@@ -113,14 +112,6 @@ class SeparateBias:
         """Keep the capacity learned with another reference capacity, `ratio` times as large."""
         self.b[G] = (1.0 + before.b[G]) * ratio - 1.0
         self.P[G, G] = before.P[G, G] * ratio**2
-
-    def snapshot(self) -> BiasState:
-        """Return a copy of the state."""
-        return BiasState(b=self.b.tolist(), p=self.P.tolist(), v=self.V.tolist())
-
-    def restore(self, state: BiasState) -> None:
-        """Continue from a state."""
-        self.b, self.P, self.V = np.array(state.b), np.array(state.p), np.array(state.v)
 
 
 def health_of(filter_: SocFilter, temperature_c: float) -> Health:

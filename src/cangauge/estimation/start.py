@@ -20,14 +20,11 @@ against the narrow one counts as soon as it prevails.
 from __future__ import annotations
 
 import math
-from typing import Final
+from typing import Any, Final
 
-import numpy as np
-
-from cangauge.errors import InputError
 from cangauge.estimation.counting import UNKNOWN_STD_PCT
 from cangauge.estimation.ekf import LINEAR_PCT, SOC, SocFilter
-from cangauge.estimation.state import Block, HypothesesState
+from cangauge.estimation.state import Block
 from cangauge.model.extended import OnlineModel
 
 UNKNOWN_PCT: Final = 50.0
@@ -157,8 +154,7 @@ class Hypotheses:
             self.prior_log_odds = _log_odds(1.0 - (1.0 - before) * (1.0 - probability))
             self.filters[1].evidence = self.filters[0].evidence  # it is in the prior now
         else:
-            wide = SocFilter(self.model, UNKNOWN_PCT, UNKNOWN_STD_PCT)
-            self.filters = [self.likelier, wide.restore(self.likelier.snapshot())]
+            self.filters = [self.likelier, self.likelier.copy()]
             self.prior_log_odds = _log_odds(probability)
         self.decision = 0
         narrow, wide = self.filters
@@ -184,30 +180,17 @@ class Hypotheses:
         """Return whether all filters hold usable numbers."""
         return all(each.is_valid() for each in self.filters)
 
-    def snapshot(self) -> HypothesesState:
-        """Return a copy of everything needed to continue."""
-        filters = [each.snapshot() for each in self.filters]
-        return HypothesesState(filters, self.prior_log_odds, self.decision)
+    def state(self) -> dict[str, Any]:
+        """Return a copy of everything needed to continue, as plain numbers."""
+        filters = [each.state() for each in self.filters]
+        odds = {"prior_log_odds": self.prior_log_odds, "decision": self.decision}
+        return {"filters": filters, **odds}
 
-    def restore(self, state: HypothesesState) -> None:
-        """Continue from a state of the same model.
-
-        Raises
-        ------
-        InputError
-            If it has another number of states.
-        """
-        n = self.filters[0].x.size
-        for each in state.filters:
-            bias = each.bias
-            shapes = [np.shape(part) for part in (each.x, each.p, bias.b, bias.p, bias.v)]
-            if shapes != [(n,), (n, n), (2,), (2, 2), (n, 2)]:
-                raise InputError(f"the model's filter has {n} states", field="hypotheses.filters")
-        self.filters = [
-            SocFilter(self.model, UNKNOWN_PCT, UNKNOWN_STD_PCT).restore(each)
-            for each in state.filters
-        ]
-        self.prior_log_odds, self.decision = state.prior_log_odds, state.decision
+    def resume(self, filters: list[dict[str, Any]], prior_log_odds: float, decision: int) -> None:
+        """Continue from a `state` of the same model."""
+        new = SocFilter(self.model, UNKNOWN_PCT, UNKNOWN_STD_PCT)
+        self.filters = [new.copy().resume(**each) for each in filters]
+        self.prior_log_odds, self.decision = prior_log_odds, decision
 
     def take_over(self, before: Hypotheses) -> None:
         """Take over offset and capacity from the filter of another model, before any update."""

@@ -392,9 +392,19 @@ class OnlineModel:
         for lag in self.lags:
             lag.restore(known.get(lag.tau_s, []))
 
-    def resume(self, load: FloatArray, drives: FloatArray) -> None:
-        """Continue after a reading that was advanced to elsewhere, given its `load`, `drives`."""
+    def resume(self, load: FloatArray, drives: FloatArray, low_passed_a: Sequence[float]) -> None:
+        """Describe a reading that was advanced to elsewhere.
+
+        Parameters
+        ----------
+        load, drives : array
+            As the attributes.
+        low_passed_a : sequence of floats
+            Outputs of `lags` [A].
+        """
         self.load, self.drives = load, drives
+        for lag, value in zip(self.lags, low_passed_a, strict=True):
+            lag.restore([0.0, 0.0, value])
 
     def state(self) -> list[list[float]]:
         """Return the low-passed currents' state, then that of each effect, for `restore`."""

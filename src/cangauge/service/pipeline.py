@@ -386,9 +386,7 @@ class Pipeline:
         """
         if not math.isfinite(self._estimate.soc_pct):
             return None
-        state = self.estimator.snapshot()
-        state.clock.shift_s += self.stamp_shift_s
-        return state
+        return self.estimator.snapshot(self.stamp_shift_s)
 
     def restore(self, state: EstimatorState, age_s: float = 0.0) -> Estimate:
         """Continue from a state (see `Estimator.restore`); it is stale until a sample comes.

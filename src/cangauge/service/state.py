@@ -1,6 +1,6 @@
 """The service's state across restarts: restored at the start, saved while it runs.
 
-    {"format": "cangauge-state", "version": 5, "sha256": "…", "content": {…}}
+    {"format": "cangauge-state", "version": 6, "sha256": "…", "content": {…}}
 
 The hash is that of the content, written without spaces and with sorted keys. A file that cannot be
 used is set aside; one that cannot be written never stops the estimator.
@@ -37,7 +37,7 @@ from cangauge.service.pipeline import Pipeline
 from cangauge.service.worker import Worker
 
 STATE_FORMAT: Final = "cangauge-state"
-STATE_VERSION: Final = 5
+STATE_VERSION: Final = 6
 """To be increased with every change of the content."""
 LARGEST_BYTES: Final = 8 << 20
 """Largest state file that is read [bytes]; a full delay line takes 0.3 MB."""
@@ -148,6 +148,8 @@ class StateKeeper:
             return self
         self.restored = True
         ago = "of unknown age" if math.isnan(age_s) else f"saved {duration(age_s)} ago"
+        if content.estimator.writer != self._pipeline.estimator.writer:
+            ago += ", of another release, method or capacity, of which the SoC alone is kept"
         soc = f"{number(latest.soc_pct, 2)} ± {number(latest.soc_std_pct, 2, '%')}"
         text = f"{self._path}: continuing from a state {ago}: SoC {soc}"
         emit(_LOG, logging.INFO, "state.restored", text)
@@ -194,8 +196,6 @@ class StateKeeper:
             if (owner := getattr(content, field)) != wanted:
                 text = f"of another {field.replace('_', ' ')} ({names.get(field, owner)})"
                 raise InputError(text, source=path, field=field)
-        if math.isnan(content.estimator.soc_pct):
-            raise InputError("has no SoC", source=path, field="estimator")
         if content.time_source == "replay-clock":
             return 0.0
         age_s, limit_s = self._wall_s() - content.saved_s, self._max_age_s
