@@ -12,6 +12,7 @@ from cangauge.errors import InputError
 from cangauge.identify.effect_search import (
     NOT_IDENTIFIABLE,
     SEARCHED,
+    Selected,
     linearize,
     offered,
     parse_effect_ids,
@@ -94,7 +95,8 @@ def test_columns_are_the_derivative_of_the_voltage() -> None:
     rows = fit_rows(log, CAPACITY_AH, low_pass_s=())
     effect_ids = [effect_id for effect_id in LIBRARY if effect_id not in NOT_IDENTIFIABLE]
     chosen = offered(effect_ids, BASE)
-    linear = linearize(BASE, log, rows, chosen)
+    count = sum(len(item.amplitudes) for item in chosen)
+    linear = linearize(BASE, log, rows, Selected(tuple(chosen)), np.zeros(count))
     signals = Signals.of(log)
     start = log.first_soc()
     assert start is not None
@@ -110,7 +112,7 @@ def test_columns_are_the_derivative_of_the_voltage() -> None:
             found = linear.columns[:, column] * step
             assert found == pytest.approx(change, abs=1e-6 + 1e-6 * np.abs(change).max())
             column += 1
-    assert column == linear.columns.shape[1]
+    assert column == count
 
 
 def test_columns_of_the_equation_are_not_offered() -> None:

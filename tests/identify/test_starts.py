@@ -93,9 +93,9 @@ def test_a_stated_start_is_that_of_the_first_piece_alone() -> None:
     charged_s = first.time_s[-1] - later.time_s[0] + 7200.0
     log = joined(first, replace(later, time_s=later.time_s + charged_s))
     found = find_starts([log], [88.0], PackPrior(CHEMISTRIES["oxide"], CAPACITY_AH))
-    assert [piece.name for piece in found.pieces] == ["t1 part 1", "t1 part 2"]
-    assert [start.origin for start in found.starts] == ["given", "log"]
-    assert [start.soc_pct for start in found.starts] == pytest.approx([88.0, 80.0], abs=0.1)
+    assert [start.log.name for start in found] == ["t1 part 1", "t1 part 2"]
+    assert [start.origin for start in found] == ["given", "log"]
+    assert [start.soc_pct for start in found] == pytest.approx([88.0, 80.0], abs=0.1)
 
 
 def test_partial_trip_is_no_full_discharge() -> None:

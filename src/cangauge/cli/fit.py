@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from cangauge._extras import extra
 from cangauge._files import write_texts_atomic
-from cangauge._text import NONE_KNOWN, number, significant, span
 from cangauge.cli.options import (
     JSON,
     REPORT,
@@ -233,22 +232,7 @@ def _delays_s(given: str) -> tuple[float, ...]:
 
 def _show(result: Identification) -> None:
     """Print how well the model fits, and where it holds; the report has the coefficients."""
-    model = result.model
     say(result.verdict)
     for text in result.remarks:
         remark(f"note: {text}")
-    held_out = number(model.noise.voltage_mae_pct, 3, "%") if result.is_held_out else NONE_KNOWN
-    print_values(
-        f"Model {model.name}",
-        {
-            "voltage error, MAE": number(result.voltage_mae_pct, 3, "%"),
-            "voltage error, RMSE": significant(result.voltage_rmse_v, 3, "V"),
-            "voltage error held out, MAE": held_out,
-            "SoC from voltage, MAE": number(result.soc_newton_mae_pct, 2, "%"),
-            "capacity": number(model.capacity_ah, 2, "Ah"),
-            "effects": ", ".join(str(effect["id"]) for effect in model.effects) or NONE_KNOWN,
-            "identified at SoC": span(*model.range.soc_pct, 1, "%"),
-            "identified at temperature": span(*model.range.temperature_c, 1, "°C"),
-            "rows used": str(sum(len(item.rows) for item in result.fits)),
-        },
-    )
+    print_values(f"Model {result.model.name}", result.summary())

@@ -9,17 +9,17 @@ gain is significant and worthwhile.
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy import stats
 
 from cangauge._typing import FloatArray
 from cangauge.errors import InputError
 from cangauge.identify.least_squares import (
-    BASE,
     LOGS_AT_LEAST,
     LogSums,
     P,
@@ -27,11 +27,10 @@ from cangauge.identify.least_squares import (
     features,
     load_features,
     log_sums,
-    row_features,
     solve,
     solve_without,
 )
-from cangauge.identify.rows import FitRows, dequantize
+from cangauge.identify.rows import FitRows, dequantize, start_of
 from cangauge.logs.log import Log
 from cangauge.model.effects.base import Effect, Load, Signals, Values
 from cangauge.model.effects.library import LIBRARY, EffectCandidate, candidates, effect_of
@@ -91,11 +90,9 @@ def parse_effect_ids(given: Sequence[str]) -> tuple[str, ...]:
     InputError
         If an id is unknown, not identifiable by a fit, repeated, or combined with `auto`.
     """
-    ids = [part.strip() for text in given for part in text.split(",")]
-    if ids == [NONE]:
-        return ()
-    if ids == [AUTO]:
-        return (AUTO,)
+    ids = tuple(part.strip() for text in given for part in text.split(","))
+    if ids in {(AUTO,), (NONE,)}:
+        return () if ids == (NONE,) else ids
     for effect_id in ids:
         if effect_id in {AUTO, NONE} or ids.count(effect_id) > 1:
             raise InputError(
@@ -112,7 +109,7 @@ def parse_effect_ids(given: Sequence[str]) -> tuple[str, ...]:
                 value=effect_id,
                 cure=NOT_IDENTIFIABLE[effect_id],
             )
-    return tuple(ids)
+    return ids
 
 
 @dataclass(frozen=True)
@@ -167,40 +164,42 @@ class Selected:
     """
 
     chosen: tuple[EffectCandidate, ...]
-    steps: tuple[SearchStep, ...]
+    steps: tuple[SearchStep, ...] = ()
+
+    @property
+    def bounds(self) -> FloatArray:
+        """Bounds of all amplitudes, shape (e, 2)."""
+        return np.concatenate([np.empty((0, 2)), *(item.bounds for item in self.chosen)])
 
     @property
     def amplitude_std(self) -> FloatArray:
         """Prior standard deviation of each amplitude: its widest bound."""
-        return np.array([float(np.abs(b).max()) for c in self.chosen for b in c.bounds])
+        return np.asarray(np.abs(self.bounds).max(axis=1))
+
+    def with_parts(
+        self, of_amplitudes: NDArray[Any]
+    ) -> Iterator[tuple[EffectCandidate, NDArray[Any]]]:
+        """Yield each effect with its part of an array over all amplitudes, shape (e,)."""
+        end = 0
+        for item in self.chosen:
+            first, end = end, end + len(item.amplitudes)
+            yield item, of_amplitudes[first:end]
 
     def clipped(self, solution: Solution) -> Solution:
         """Return the solution with the amplitudes within their physical bounds."""
-        low, high = np.concatenate([item.bounds for item in self.chosen]).T
-        amplitudes = np.clip(solution.coefficients[P:], low, high)
+        amplitudes = np.clip(solution.coefficients[P:], *self.bounds.T)
         return replace(solution, coefficients=np.r_[solution.coefficients[:P], amplitudes])
 
     def at_bound(self, solution: Solution) -> list[EffectCandidate]:
         """Return the effects with an amplitude at or beyond a bound other than neutral."""
-        found = []
-        parts = _parts(self.chosen, solution.coefficients[P:])
-        for item, part in zip(self.chosen, parts, strict=True):
-            low, high = item.bounds.T
-            if np.any(((part <= low) & (low < 0.0)) | (part < low) | (part >= high)):
-                found.append(item)
-        return found
+        (low, high), amplitudes = self.bounds.T, solution.coefficients[P:]
+        reached = ((amplitudes <= low) & (low < 0.0)) | (amplitudes < low) | (amplitudes >= high)
+        return [item for item, part in self.with_parts(reached) if part.any()]
 
     def effects(self, solution: Solution) -> tuple[tuple[Effect, Values], ...]:
         """Return the effects with the amplitudes of a solution."""
-        parts = _parts(self.chosen, solution.coefficients[P:])
-        return tuple(
-            (item.effect, item.values(part)) for item, part in zip(self.chosen, parts, strict=True)
-        )
-
-
-def _parts(chosen: Sequence[EffectCandidate], amplitudes: FloatArray) -> list[FloatArray]:
-    ends = np.cumsum([len(item.amplitudes) for item in chosen]).tolist()
-    return [amplitudes[end - len(c.amplitudes) : end] for c, end in zip(chosen, ends, strict=True)]
+        parts = self.with_parts(solution.coefficients[P:])
+        return tuple((item.effect, item.values(part)) for item, part in parts)
 
 
 @dataclass(frozen=True, eq=False)
@@ -223,51 +222,36 @@ class Linearized:
     columns: FloatArray
     residual_v: FloatArray
 
-    def voltage_v(self, coefficients: FloatArray, amplitudes: FloatArray) -> FloatArray:
-        """Return the voltage that the linear equation has to explain [V], shape (m,).
-
-        Parameters
-        ----------
-        coefficients : array of shape (BASE,)
-            Of `features`, and …
-        amplitudes : array of shape (e,)
-            … of `columns`, about which the model is linearized.
-        """
-        return self.features @ coefficients + self.columns @ amplitudes + self.residual_v
+    @property
+    def table(self) -> FloatArray:
+        """All columns, shape (m, BASE + e)."""
+        return np.column_stack([self.features, self.columns])
 
 
 def linearize(
-    model: ExtendedModel,
-    log: Log,
-    rows: FitRows,
-    chosen: Sequence[EffectCandidate],
-    amplitudes: FloatArray | None = None,
+    model: ExtendedModel, log: Log, rows: FitRows, selected: Selected, amplitudes: FloatArray
 ) -> Linearized:
     """Return the model's prediction of a log and its derivatives on the rows of the fit.
 
     Parameters
     ----------
     model : ExtendedModel
-        Without effects, or with those of `chosen`.
+        Without effects, or with the selected ones.
     log : Log
     rows : FitRows
-    chosen : sequence of EffectCandidate
-    amplitudes : array of shape (e,), optional
-        Of the model's effects, relative to neutral; neutral by default.
+    selected : Selected
+    amplitudes : array of shape (e,)
+        Of the model's effects, relative to neutral; 0 without.
     """
     voltage, pack = model.model, model.pack
-    first = log.first_soc()
-    if first is None:
-        raise ValueError("a log of a fit has a start")
-    row, start_pct = first
+    row, start_pct = start_of(log)
     signals = Signals.of(dequantize(log))
     currents = voltage.currents(log.time_s, log.current_a, slice(None))
     # Added voltages are linear in their amplitudes, so their columns give them too.
-    correcting = replace(
-        model, effects=tuple(item for item in model.effects if not item[0].adds_voltage)
-    )
+    correcting = tuple(item for item in model.effects if not item[0].adds_voltage)
 
-    def predict(changed: ExtendedModel) -> Prediction:
+    def predict(effects: tuple[tuple[Effect, Values], ...]) -> Prediction:
+        changed = replace(model, effects=effects)
         return changed.predict(signals, start_pct, rows.at, initial_row=row, currents_a=currents)
 
     plain = predict(correcting)
@@ -277,55 +261,36 @@ def linearize(
     load = Load(true.time_s, true.current_a, true.temperature_c, drop_v)
     soc = plain.soc_pct[rows.at]
 
-    def added_v(effect: Effect, values: Values, at_load: Load = load) -> FloatArray:
-        drive = effect.drive(at_load, values, effect.context(values, voltage, pack))
-        if drive is None:
-            raise ValueError("an effect of the voltage has a drive")
+    def added_v(effect: Effect, values: Values, drop_v: FloatArray = load.drop_v) -> FloatArray:
+        at_load, context = load._replace(drop_v=drop_v), effect.context(values, voltage, pack)
+        drive = effect.voltage_drive(at_load, values, context)
         return np.asarray(drive[rows.at] * effect.over_soc(soc, values, voltage))
 
-    base = features(soc, true.temperature_c[rows.at], plain.currents_a)
+    features_at = features(soc, true.temperature_c[rows.at], plain.currents_a)
     residual_v = plain.residual_v
-    parts = None if amplitudes is None else _parts(chosen, amplitudes)
-    columns = []
-    for place, item in enumerate(chosen):
+    columns = [np.empty((len(rows), 0))]
+    for item, about in selected.with_parts(amplitudes):
         effect = item.effect
-        about = np.zeros(len(item.steps)) if parts is None else parts[place]
-        if parts is not None and effect.adds_voltage:
-            base = base + _by_drop(effect, item.values(about), added_v, load, currents)
+        if effect.scales_drop and about.any():
+            # Linear in the drop: the response to each current is that to a drop of 1 Ω.
+            values = item.values(about)
+            nothing = added_v(effect, values, np.zeros_like(load.drop_v))
+            loads = load_features(load.temperature_c, currents)
+            for place in range(1, loads.shape[1]):
+                response = added_v(effect, values, loads[:, place])
+                features_at[:, place - loads.shape[1]] += response - nothing
         for number, step in enumerate(item.steps.tolist()):
             one = step * (np.arange(about.size) == number)
             if effect.adds_voltage:
                 change_v = added_v(effect, item.values(one))
                 residual_v = residual_v - change_v * (about[number] / step)
             else:
-                others = tuple(other for other in correcting.effects if other[0] is not effect)
+                others = tuple(other for other in correcting if other[0] is not effect)
                 changed = (*others, (effect, item.values(about + one)))
-                change_v = plain.residual_v - predict(replace(model, effects=changed)).residual_v
+                change_v = plain.residual_v - predict(changed).residual_v
             columns.append(change_v / step)
-    table = np.column_stack(columns) if columns else np.empty((len(rows), 0))
-    return Linearized(replace(rows, soc_pct=soc), base, table, residual_v)
-
-
-def _by_drop(
-    effect: Effect,
-    values: Values,
-    added_v: Callable[[Effect, Values, Load], FloatArray],
-    load: Load,
-    currents: FloatArray,
-) -> FloatArray:
-    """Return what an effect adds to the derivatives by the resistances, shape (m, BASE).
-
-    An effect of the drop is linear in it: its response to each current is that to a drop of 1 Ω.
-    """
-    if not effect.scales_drop:
-        return np.zeros((1, BASE))
-    nothing = added_v(effect, values, load._replace(drop_v=np.zeros_like(load.drop_v)))
-    added = np.zeros((nothing.size, BASE))
-    both = load_features(load.temperature_c, currents)[:, 1:]
-    for place, drop_v in enumerate(both.T):
-        response = added_v(effect, values, load._replace(drop_v=drop_v))
-        added[:, BASE - both.shape[1] + place] = response - nothing
-    return added
+    table = np.column_stack(columns)
+    return Linearized(replace(rows, soc_pct=soc), features_at, table, residual_v)
 
 
 def offered(effect_ids: Sequence[str], model: ExtendedModel) -> list[EffectCandidate]:
@@ -363,37 +328,31 @@ class Search:
         effect_ids: Sequence[str],
     ) -> None:
         self._is_auto = tuple(effect_ids) == (AUTO,)
+        self._at_most = EFFECTS_AT_MOST if self._is_auto else len(effect_ids)
         self._pack = pack
-        ids = SEARCHED if self._is_auto else effect_ids
-        self._wanted = list(ids)
-        self._offered = offered(ids, model)
+        self._offered = offered(SEARCHED if self._is_auto else effect_ids, model)
         chance = SIGNIFICANCE / max(len({item.effect.id for item in self._offered}), 1)
         self._t_needed = float(stats.t.isf(chance, max(len(logs) - 1, 1)))
-        widths = [len(item.amplitudes) for item in self._offered]
-        ends = np.cumsum(widths)
-        self._places = [
-            list(range(end - width, end)) for end, width in zip(ends.tolist(), widths, strict=True)
-        ]
+        every = Selected(tuple(self._offered))
+        self._places = [part.tolist() for _, part in every.with_parts(np.arange(len(every.bounds)))]
         self.refused: list[EffectCandidate] = []
         """Candidates that are not offered any more."""
         self._sums: list[LogSums] = []
         for number, (log, of_log) in enumerate(zip(logs, rows, strict=True), start=1):
             _LOG.debug("columns of the effects: log %d of %d", number, len(logs))
-            linear = linearize(model, log, of_log, self._offered)
-            columns = np.column_stack([row_features(of_log), linear.columns])
-            self._sums.append(log_sums(of_log, pack.chemistry, columns))
+            linear = linearize(model, log, of_log, every, np.zeros(len(every.bounds)))
+            self._sums.append(log_sums(of_log, pack.chemistry, linear.table))
 
     def select(self) -> Selected:
         """Return the effects; those asked for by id are all taken, in their best shapes."""
         chosen: list[int] = []
         steps: list[SearchStep] = []
-        at_most = EFFECTS_AT_MOST if self._is_auto else len(self._wanted)
         if self._is_auto and len(self._sums) < LOGS_AT_LEAST:
-            return Selected((), ())
+            return Selected(())
         before = self._left_out(chosen)
-        while len(chosen) < at_most:
+        while len(chosen) < self._at_most:
             compared = self._compared(chosen, before)
-            worth = [item for item in compared if item[1].is_worth] if self._is_auto else compared
+            worth = [item for item in compared if item[1].is_worth or not self._is_auto]
             if not worth:
                 steps += [step for _, step, _ in compared[:1]]
                 break
@@ -401,14 +360,16 @@ class Search:
             steps.append(replace(step, what="added"))
             _LOG.info("effect %s: left-out error %.4g V", step.effect_id, step.after_rmse_v)
             chosen.append(number)
-        return Selected(tuple(self._offered[number] for number in chosen), tuple(steps))
+        return replace(self._selected(chosen), steps=tuple(steps))
+
+    def _selected(self, chosen: Sequence[int]) -> Selected:
+        return Selected(tuple(self._offered[number] for number in chosen))
 
     def _of(self, chosen: Sequence[int]) -> tuple[list[LogSums], PackPrior, FloatArray]:
         """Return the arguments of `solve` for some candidates."""
         columns = [place for number in chosen for place in self._places[number]]
-        items = [self._offered[number] for number in chosen]
         sums = [item.with_columns(columns) for item in self._sums]
-        return sums, self._pack, Selected(tuple(items), ()).amplitude_std
+        return sums, self._pack, self._selected(chosen).amplitude_std
 
     def _left_out(self, chosen: Sequence[int]) -> FloatArray:
         """Return the mean square error of each left-out log [V²]; of the fit for too few logs."""
@@ -428,8 +389,7 @@ class Search:
             if item.effect.id in taken or item in self.refused:
                 continue
             solution = solve(*self._of([*chosen, number]))
-            chosen_now = tuple(self._offered[place] for place in [*chosen, number])
-            if not Selected(chosen_now, ()).at_bound(solution):
+            if not self._selected([*chosen, number]).at_bound(solution):
                 fits.append((solution.residual_v, number))
         found = []
         for _, number in sorted(fits)[:COMPARED]:
@@ -446,4 +406,8 @@ class Search:
                 self._t_needed,
             )
             found.append((number, step, after))
-        return sorted(found, key=lambda item: -item[1].gain)
+        return sorted(found, key=_gain, reverse=True)
+
+
+def _gain(compared: tuple[int, SearchStep, FloatArray]) -> float:
+    return compared[1].gain

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import os
-from collections.abc import Iterable, Mapping, Sequence
-from functools import partial
+from collections.abc import Iterable, Sequence
 from typing import Any, Final, Literal, NamedTuple, get_args
 
 import numpy as np
@@ -40,11 +39,8 @@ from cangauge.identify.least_squares import (
     solve_scaled,
 )
 from cangauge.identify.published import (
+    PublishedEquation,
     PublishedFit,
-    factor_of,
-    pooled,
-    published_columns,
-    solve_published,
 )
 from cangauge.identify.rows import LEAST_ROWS, FitRows, fit_rows, usable_delays
 from cangauge.identify.starts import find_starts, given_starts, with_start
@@ -64,12 +60,9 @@ from cangauge.model.model_file import (
 )
 from cangauge.model.noise import Noise
 from cangauge.model.prior import CHEMISTRIES, DELAYS_S, ChemistryName, PackPrior, usual_loads
-from cangauge.model.voltage_model import KNOTS_PCT, REFERENCE_C, PublishedCurve, Ranges
+from cangauge.model.voltage_model import KNOTS_PCT, Ranges
 
 Equation = Literal["knots", "published"]
-
-EPSILON: Final = PublishedCurve.epsilon
-"""Published margin of the scaled SoC [-]."""
 
 RELINEARIZED: Final = 4
 """Linearizations about the fitted effects: products of effects and resistances have converged."""
@@ -90,8 +83,8 @@ def fit(
     cells: int | None = None,
     rate_hz: float = 1.0,
     delay_s: Sequence[float] = DELAYS_S,
-    epsilon: float = EPSILON,
-    t_ref_c: float = REFERENCE_C,
+    epsilon: float = PublishedEquation.epsilon,
+    t_ref_c: float = PublishedEquation.t_ref_c,
     effects: str | Sequence[str] | None = None,
 ) -> Identification:
     """Identify the model of a pack from one or more logs.
@@ -170,9 +163,10 @@ def fit(
     with threadpool_limits(limits=1):  # 40 columns: threads only wait for each other
         pack = PackPrior(CHEMISTRIES[chemistry], capacity_ah, cells)
         starts = find_starts(recorded, stated_pct, pack)
+        known = [start.log for start in starts]
         knots = equation == "knots"
-        delays = DELAYS_S if knots else usable_delays(starts.logs, delay_s)
-        rows = [fit_rows(log, capacity_ah, rate_hz=rate_hz, delay_s=delays) for log in starts.logs]
+        delays = DELAYS_S if knots else usable_delays(known, delay_s)
+        rows = [fit_rows(log, capacity_ah, rate_hz=rate_hz, delay_s=delays) for log in known]
         if (number := sum(map(len, rows))) < LEAST_ROWS:
             raise InputError(
                 f"only {number} rows can be used, and a fit needs {LEAST_ROWS}",
@@ -180,7 +174,7 @@ def fit(
                 cure="give logs of drives over some hours and much of the SoC; `cangauge inspect`"
                 " lists what a log can identify",
             )
-        hashes = [log_sha256(log) for log in starts.logs]
+        hashes = [log_sha256(log) for log in known]
         listed = [
             SourceLog(name=item.name, rows=len(item), sha256=digest)
             for item, digest in zip(rows, hashes, strict=True)
@@ -209,21 +203,19 @@ def fit(
             "made": made,
         }
         if knots:
-            fitted = _fit_knots(starts.logs, rows, pack, effect_ids, fields)
+            fitted = _fit_knots(known, rows, pack, effect_ids, fields)
         else:
-            fitted = _fit_published(rows, epsilon, t_ref_c, delays, fields)
+            fitted = _fit_published(rows, PublishedEquation(epsilon, t_ref_c, delays), fields)
         extended = fitted.model.extended_model()
-        fits = tuple(
-            evaluate(extended, log, item) for log, item in zip(starts.logs, rows, strict=True)
-        )
+        fits = tuple(evaluate(extended, log, item) for log, item in zip(known, rows, strict=True))
     slope, expected = slope_resistances(fits, extended.model.loads.resistance_ohm)
     return Identification(
         model=fitted.model,
-        logs=starts.logs,
+        starts=tuple(starts),
         fits=fits,
         held_out_error_v=fitted.held_out_error_v,
         published=fitted.published,
-        energy=energy_balance(starts.logs, slope),
+        energy=energy_balance(known, slope),
         slope_ohm=slope,
         slope_expected_ohm=expected,
         remarks=(
@@ -232,7 +224,6 @@ def fit(
             *remarks_on_effects(fitted.effects, fitted.model),
         ),
         effects=fitted.effects,
-        starts=starts.starts,
     )
 
 
@@ -334,18 +325,22 @@ class _Joint(NamedTuple):
     solution: Solution
     without: Sequence[Solution]
     rows: Sequence[FitRows]
-    columns: Sequence[FloatArray] = ()
+    tables: Sequence[FloatArray] = ()
     voltage_v: Sequence[FloatArray] = ()
     """With effects: columns of the moments, and what they explain, on the rows of each log."""
     effects: tuple[tuple[Effect, Values], ...] = ()
 
-    def error_v(self, number: int, other: Solution) -> FloatArray:
-        """Return the error of a log by a solution [V], shape (m,)."""
-        coefficients = other.select.T @ other.coefficients
-        if self.columns:
-            return self.voltage_v[number] - self.columns[number] @ coefficients
-        rows = self.rows[number]
-        return rows.voltage_v - rows.linear(row_features, coefficients)
+    def held_out_v(self) -> tuple[FloatArray, ...]:
+        """Return the error of each log by the solution without it [V]; see `_held_out`."""
+        errors_v = []
+        for number, other in enumerate(self.without):
+            coefficients, rows = other.select.T @ other.coefficients, self.rows[number]
+            if self.tables:
+                error_v = self.voltage_v[number] - self.tables[number] @ coefficients
+            else:
+                error_v = rows.voltage_v - rows.linear(row_features, coefficients)
+            errors_v.append(error_v)
+        return _held_out(self.rows, errors_v)
 
 
 def _fit_knots(
@@ -355,18 +350,16 @@ def _fit_knots(
     effect_ids: Sequence[str],
     fields: dict[str, Any],
 ) -> _Fitted:
-    factors = [factor_of(item, len(DELAYS_S), EPSILON, REFERENCE_C) for item in rows]
-    published = solve_published(pooled(factors), EPSILON)
+    equation = PublishedEquation()
+    published = equation.fit(rows, [equation.root(item) for item in rows])
     if usable_delays(logs, DELAYS_S) == DELAYS_S and published.identified:
-        fields = fields | {"published": published.fields(EPSILON, REFERENCE_C, DELAYS_S)}
+        fields = fields | {"published": published.fields()}
     sums = [log_sums(item, pack.chemistry) for item in rows]
-    solved = solve_scaled(sums, pack)
-    joint = _Joint(*solved, rows)
+    joint = _Joint(*solve_scaled(sums, pack), rows)
     selected: Selected | None = None
     if effect_ids:
-        search = Search(
-            knots_file(joint.solution, fields).extended_model(), logs, rows, pack, effect_ids
-        )
+        plain = knots_file(joint.solution, fields).extended_model()
+        search = Search(plain, logs, rows, pack, effect_ids)
         while (selected := search.select()).chosen:
             with_effects = _with_effects(joint, selected, logs, pack, fields)
             at_bound = selected.at_bound(with_effects.solution)
@@ -374,15 +367,10 @@ def _fit_knots(
                 joint = with_effects
                 break
             search.refused += at_bound
-    errors = _held_out(
-        joint.rows, [joint.error_v(number, other) for number, other in enumerate(joint.without)]
-    )
-    model = knots_file(
-        joint.solution,
-        fields | {"effects": effect_entries(joint.effects)},
-        _judged(errors, joint.rows, joint.solution.residual_v, joint.solution.mean_v),
-    )
-    return _Fitted(model, published, errors, selected)
+    errors_v = joint.held_out_v()
+    fields = fields | {"effects": effect_entries(joint.effects)}
+    model = knots_file(joint.solution, fields, errors_v, joint.rows)
+    return _Fitted(model, published, errors_v, selected)
 
 
 def _with_effects(
@@ -395,32 +383,36 @@ def _with_effects(
     """Return the fit with the selected effects: Gauss–Newton from `plain`, without effects."""
     solution, std = plain.solution, selected.amplitude_std
     extended = knots_file(solution, fields).extended_model()
-    amplitudes: FloatArray | None = None
+    amplitudes = np.zeros(std.size)
     for _ in range(RELINEARIZED):
         coefficients = solution.select[:P, :BASE].T @ solution.coefficients[:P]
         about = [
-            linearize(extended, log, item, selected.chosen, amplitudes)
+            linearize(extended, log, item, selected, amplitudes)
             for log, item in zip(logs, plain.rows, strict=True)
         ]
-        at = np.zeros(std.size) if amplitudes is None else amplitudes
-        volts = [item.voltage_v(coefficients, at) for item in about]
-        columns = [np.column_stack([item.features, item.columns]) for item in about]
+        volts = [
+            item.features @ coefficients + item.columns @ amplitudes + item.residual_v
+            for item in about
+        ]
+        tables = [item.table for item in about]
         sums = [
             log_sums(item.rows, pack.chemistry, table, volts_of_log)
-            for item, table, volts_of_log in zip(about, columns, volts, strict=True)
+            for item, table, volts_of_log in zip(about, tables, volts, strict=True)
         ]
         solution, without = solve_scaled(sums, pack, std)
         solution = selected.clipped(solution)
         amplitudes = solution.coefficients[P:]
         effects = selected.effects(solution)
-        extended = ExtendedModel(
-            knots_file(solution, fields).voltage_model(), pack.capacity_ah, effects
-        )
-    return _Joint(solution, without, [item.rows for item in about], columns, volts, effects)
+        voltage = knots_file(solution, fields).voltage_model()
+        extended = ExtendedModel(voltage, pack.capacity_ah, effects)
+    return _Joint(solution, without, [item.rows for item in about], tables, volts, effects)
 
 
 def knots_file(
-    solution: Solution, fields: dict[str, Any], judged: Mapping[str, Any] | None = None
+    solution: Solution,
+    fields: dict[str, Any],
+    held_out_v: Sequence[FloatArray] = (),
+    rows: Sequence[FitRows] = (),
 ) -> Model:
     """Return the model file of a solution.
 
@@ -430,8 +422,10 @@ def knots_file(
         Its covariance and scale are final.
     fields : dict
         The other fields of `Model`.
-    judged : dict, optional
-        Errors of left-out logs (`Noise`); those of the fit itself by default.
+    held_out_v : sequence of array of shape (m,)
+        Errors of left-out logs [V]; the model states those of the fit itself by default.
+    rows : sequence of FitRows
+        Theirs.
     """
     # The square root of the precision, and the names of its columns.
     root = np.linalg.cholesky(np.linalg.inv(solution.covariance)).T
@@ -443,20 +437,15 @@ def knots_file(
         root=np.triu(root).tolist(),
         projected=(root @ solution.coefficients).tolist(),
     )
-    if judged is None:
-        judged = _judged((), (), solution.residual_v, solution.mean_v)
+    judged = _judged(held_out_v, rows, solution.residual_v, solution.mean_v)
     return Model.of_knots(solution, judged, information=information, **fields)
 
 
 def _fit_published(
-    rows: Sequence[FitRows],
-    epsilon: float,
-    t_ref_c: float,
-    delay_s: Sequence[float],
-    fields: dict[str, Any],
+    rows: Sequence[FitRows], equation: PublishedEquation, fields: dict[str, Any]
 ) -> _Fitted:
-    factors = [factor_of(item, len(delay_s), epsilon, t_ref_c) for item in rows]
-    published = solve_published(pooled(factors), epsilon)
+    roots = [equation.root(item) for item in rows]
+    published = equation.fit(rows, roots)
     if not published.identified:
         raise InputError(
             "the logs do not identify the published equation: too little SoC, too few rows, or a"
@@ -465,23 +454,22 @@ def _fit_published(
             value="published",
             cure="leave out --equation published, or give logs over more SoC",
         )
-    columns = partial(published_columns, delays=len(delay_s), epsilon=epsilon, t_ref_c=t_ref_c)
     errors_v = []
     for number, item in enumerate(rows if len(rows) >= LOGS_AT_LEAST else ()):
-        without = pooled(factors[:number] + factors[number + 1 :])
-        other = solve_published(without, epsilon).coefficients
-        errors_v.append(item.voltage_v - item.linear(columns, other))
+        others = [place for place in range(len(rows)) if place != number]
+        without = equation.fit([rows[k] for k in others], [roots[k] for k in others])
+        errors_v.append(item.voltage_v - item.linear(equation.columns, without.coefficients))
     errors = _held_out(rows, errors_v)
     mean_v = sum(float(item.voltage_v.sum()) for item in rows) / sum(map(len, rows))
     judged = _judged(errors, rows, published.residual_v, mean_v)
-    jacobian = published.jacobian(epsilon)
+    jacobian = published.jacobian()
     model = Model(
         equation="published",
-        published=published.fields(epsilon, t_ref_c, delay_s),
+        published=published.fields(),
         functions=FunctionFields.of(
             fields["chemistry"],
             jacobian @ published.covariance @ jacobian.T,
-            usual_loads(fields["capacity_ah"], len(delay_s)),
+            usual_loads(fields["capacity_ah"], len(equation.delay_s)),
         ),
         noise=Noise.of(fields["chemistry"], mean_v, published.residual_v, judged),
         **fields,

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -21,10 +20,17 @@ from cangauge.identify.rows import (
     SOC_SPAN_AT_LEAST_PCT,
     TEMPERATURE_SPAN_K,
     FitRows,
+    start_of,
     usable_delays,
 )
-from cangauge.identify.starts import Start, Starts
-from cangauge.logs.gaps import BRIDGE_S, bridge_s, uncounted_gaps, usual_step_s
+from cangauge.identify.starts import Start
+from cangauge.logs.gaps import (
+    BRIDGE_S,
+    bridge_s,
+    split_where_moved,
+    uncounted_gaps,
+    usual_step_s,
+)
 from cangauge.logs.log import Log
 from cangauge.model.coulomb_counting import difference_from_reference
 from cangauge.model.effects.base import Signals
@@ -38,13 +44,8 @@ JOULE_PER_KWH = 3.6e6
 NEAR_AN_END_PCT: Final = 10.0
 """Rest of the SoC beyond the logs that is not worth another drive [%]."""
 
-OWN_NOISE: Final = 2.0
-"""Standard errors within which a coefficient may as well be zero [-]: 95 %."""
-
 AT_REST: Final = 0.1
 """Change of the current, over the capacity, below which the logs show no resistance [1/h]."""
-
-Rows = list[list[str]]
 
 
 @dataclass(frozen=True)
@@ -129,10 +130,7 @@ def evaluate(model: ExtendedModel, log: Log, rows: FitRows) -> LogFit:
         for part in rows.parts():
             columns[:, part] = _predicted(model.model, rows.part(part))
         return LogFit(rows, *columns)
-    first = log.first_soc()
-    if first is None:
-        raise ValueError("a log of a fit has a start")
-    row, soc_pct = first
+    row, soc_pct = start_of(log)
     prediction = model.predict(Signals.of(log), soc_pct, rows.at, initial_row=row)
     temperature_c = prediction.signals.temperature_c[rows.at]
     return LogFit(
@@ -188,7 +186,8 @@ class Identification:
     """A fitted model with its figures."""
 
     model: Model
-    logs: tuple[Log, ...]
+    starts: tuple[Start, ...]
+    """The logs, their SoC at the start, and how it is known."""
     fits: tuple[LogFit, ...] = field(repr=False)
     """Model and measurement of each log, on the rows of the fit."""
     held_out_error_v: tuple[FloatArray, ...] = field(repr=False)
@@ -204,8 +203,11 @@ class Identification:
     remarks: tuple[str, ...] = ()
     effects: Selected | None = None
     """Selected effects; None if none were asked for."""
-    starts: tuple[Start, ...] = ()
-    """SoC at the start of each log, and how it is known."""
+
+    @property
+    def logs(self) -> tuple[Log, ...]:
+        """The logs of the fit; counting starts from their first finite SoC."""
+        return tuple(start.log for start in self.starts)
 
     @cached_property
     def voltage_model(self) -> VoltageModel:
@@ -268,35 +270,32 @@ class Identification:
         """Mean absolute error of the SoC from voltage on the rows of the fit [%]."""
         return self._mean(np.abs(f.soc_newton_pct - f.rows.soc_pct) for f in self.fits)
 
-    def _summary(self) -> list[tuple[str, str]]:
-        """Return what a fit is good for, by name."""
-        model, noise = self.model, self.model.noise
-        cells = f", {model.cells} cells" if model.cells else ""
-        names = ", ".join(log.name for log in self.logs[:3])
-        more = f" and {len(self.logs) - 3} more" if len(self.logs) > 3 else ""
-        error = number(noise.voltage_mae_pct, 2, "%")
-        effects = ", ".join(str(effect["id"]) for effect in model.effects)
-        return [
-            ("model", f"{model.equation}, {model.chemistry}{cells}"),
-            ("logs", f"{names}{more}; {sum(len(item.rows) for item in self.fits):,} rows"),
-            ("good from", f"{span(*model.range.soc_pct, 0, '% SoC')}"),
-            ("voltage error", f"{error} on {noise.judged_on}"),
-            ("of the fit", f"{number(self.voltage_mae_pct, 2, '%')}"),
-            ("SoC by voltage", f"{number(self.soc_newton_mae_pct, 1, '%')} off the counted SoC"),
-            ("capacity", significant(model.capacity_ah, 4, "Ah")),
-            ("resistance", significant(self.slope_ohm, 3, "Ω")),
-            *([("effects", effects)] if effects else []),
-        ]
+    def summary(self) -> dict[str, str]:
+        """Return what the fit is good for, by name: the table of `cangauge fit`."""
+        model, ranges = self.model, self.model.range
+        held_out = number(model.noise.voltage_mae_pct, 3, "%") if self.is_held_out else NONE_KNOWN
+        return {
+            "voltage error, MAE": number(self.voltage_mae_pct, 3, "%"),
+            "voltage error, RMSE": significant(self.voltage_rmse_v, 3, "V"),
+            "voltage error held out, MAE": held_out,
+            "SoC from voltage, MAE": number(self.soc_newton_mae_pct, 2, "%"),
+            "capacity": number(model.capacity_ah, 2, "Ah"),
+            "effects": ", ".join(str(effect["id"]) for effect in model.effects) or NONE_KNOWN,
+            "identified at SoC": span(*ranges.soc_pct, 1, "%"),
+            "identified at temperature": span(*ranges.temperature_c, 1, "°C"),
+            "rows used": str(sum(len(item.rows) for item in self.fits)),
+        }
 
     def __repr__(self) -> str:
         """Return ten lines on what the fit is good for."""
-        lines = [f"  {name:15}{text}" for name, text in self._summary()]
+        lines = [f"  {name:28}{text}" for name, text in self.summary().items()]
         return "\n".join([f"<Identification {self.model.name!r}", *lines]) + ">"
 
     def _repr_html_(self) -> str:
         """Return the same as a table, for notebooks."""
         rows = "".join(
-            f"<tr><th>{name}</th><td>{escape(text)}</td></tr>" for name, text in self._summary()
+            f"<tr><th>{name}</th><td>{escape(text)}</td></tr>"
+            for name, text in self.summary().items()
         )
         return f"<table><caption>{escape(self.model.name)}</caption>{rows}</table>"
 
@@ -349,52 +348,9 @@ class Identification:
         }
 
 
-def rounded(value: float, std_error: float | None) -> tuple[str, str]:
-    """Return a value rounded to its standard error, and the error with two digits.
-
-    A value that is its own noise is a dash.
-    """
-    if not std_error or not math.isfinite(std_error):
-        return significant(value, 3), significant(std_error, 2)
-    if abs(value) < OWN_NOISE * std_error:
-        return NONE_KNOWN, significant(std_error, 2)
-    decimals = max(0, 1 - math.floor(math.log10(std_error)))
-    return number(value, decimals), significant(std_error, 2)
-
-
-def effect_rows(result: Identification) -> tuple[list[str], Rows]:
-    """Return headings and rows: every parameter of the fitted effects."""
-    rows = [
-        [
-            effect.id if k == 0 else "",
-            parameter.name,
-            significant(values[parameter.name], 4),
-            "" if parameter.unit == "1" else parameter.unit.replace("ohm", "Ω"),
-        ]
-        for effect, values in result.model.extended_model().effects
-        for k, parameter in enumerate(effect.parameters)
-    ]
-    return ["effect", "parameter", "value", "unit"], rows
-
-
-def search_rows(found: Selected) -> tuple[list[str], Rows]:
-    """Return headings and rows: the steps of the effect search with their left-out errors."""
-    rows = [
-        [
-            step.effect_id,
-            step.what,
-            significant(step.before_rmse_v, 3),
-            significant(step.after_rmse_v, 3),
-            number(step.t_value, 1),
-        ]
-        for step in found.steps
-    ]
-    return ["effect", "step", "left out without [V]", "with [V]", "t"], rows
-
-
 def remarks_on_logs(
     rows: Sequence[FitRows],
-    starts: Starts,
+    starts: Sequence[Start],
     recorded: Sequence[Log],
     delay_s: Sequence[float],
     capacity_ah: float,
@@ -418,8 +374,15 @@ def remarks_on_logs(
                 f" {bridge_s(log.time_s):.0f} s, the longest {duration(longest)}: no charge is"
                 " counted over them (a rest); split the log there if the pack was used"
             )
-    differences = (difference_from_reference(log, capacity_ah) for log in starts.pieces)
-    return [*found, *starts.remarks(), *(text for text in differences if text is not None)]
+    estimated = [str(start) for start in starts if start.origin == "estimated"]
+    if estimated:
+        found.append(f"start estimated together with the curve: {'; '.join(estimated)}")
+    pieces = [piece for log in recorded for piece in split_where_moved(log)]
+    if len(pieces) > len(recorded):
+        parts = ", ".join(piece.name for piece in pieces if " part " in piece.name)
+        found.append(f"split where the pack was used in a gap: {parts}")
+    differences = (difference_from_reference(piece, capacity_ah) for piece in pieces)
+    return [*found, *(text for text in differences if text is not None)]
 
 
 def remarks_on_effects(selected: Selected | None, model: Model) -> list[str]:

@@ -205,6 +205,14 @@ def fit_rows(
     )
 
 
+def start_of(log: Log) -> tuple[int, float]:
+    """Return row and value of the first known SoC of a log of a fit [%]: every one has it."""
+    start = log.first_soc()
+    if start is None:
+        raise ValueError("a log of a fit has a start")
+    return start
+
+
 def decimate(time_s: FloatArray, rate_hz: float) -> NDArray[np.intp]:
     """Return the index of the first sample at or after each tick of `rate_hz`."""
     tick = np.floor((time_s - time_s[0]) * rate_hz + 1e-6)

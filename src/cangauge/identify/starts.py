@@ -53,58 +53,30 @@ SEARCH_STEP_PCT: Final = 1.0
 """Grid of the search for a start [%]."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class Start:
     """SoC at the first row of a log.
 
     Parameters
     ----------
-    name : str
-        Of the log.
+    log : Log
+        Its first finite `soc_pct` is where counting starts.
     soc_pct : float
         [%].
+    origin : {"given", "log", "estimated"}
     std_pct : float or None
         Standard deviation, if it was estimated [%].
-    origin : {"given", "log", "estimated"}
     """
 
-    name: str
+    log: Log
     soc_pct: float
-    std_pct: float | None
     origin: Origin
+    std_pct: float | None = None
 
     def __str__(self) -> str:
         """Return the start of the log in a phrase."""
         std = "" if self.std_pct is None else f" ± {significant(self.std_pct, 2)}"
-        return f"{self.name} starts at {self.soc_pct:.1f}{std} %"
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Starts:
-    """Logs of which the start is known, and how.
-
-    Parameters
-    ----------
-    logs : tuple of Log
-        The first finite `soc_pct` of each is where counting starts. A log that was charged or
-        driven in a gap is split there.
-    pieces : tuple of Log
-        The same with their own SoC.
-    starts : tuple of Start
-    """
-
-    logs: tuple[Log, ...]
-    pieces: tuple[Log, ...]
-    starts: tuple[Start, ...]
-
-    def remarks(self) -> list[str]:
-        """Return remarks on starts that were estimated, and logs that were split."""
-        found = [str(start) for start in self.starts if start.origin == "estimated"]
-        remarks = [f"start estimated together with the curve: {'; '.join(found)}"] if found else []
-        parts = [log.name for log in self.logs if " part " in log.name]
-        if parts:
-            remarks.append(f"split where the pack was used in a gap: {', '.join(parts)}")
-        return remarks
+        return f"{self.log.name} starts at {self.soc_pct:.1f}{std} %"
 
 
 def with_start(log: Log, soc_pct: float) -> Log:
@@ -140,8 +112,10 @@ def given_starts(
     return given
 
 
-def find_starts(logs: Sequence[Log], given: Sequence[float | None], pack: PackPrior) -> Starts:
+def find_starts(logs: Sequence[Log], given: Sequence[float | None], pack: PackPrior) -> list[Start]:
     """Return the logs with a known start: given, their own, or estimated with the curve.
+
+    A log that was charged or driven in a gap is split there.
 
     Parameters
     ----------
@@ -155,41 +129,22 @@ def find_starts(logs: Sequence[Log], given: Sequence[float | None], pack: PackPr
     InputError
         If no log pins the curve, or a start is not determined.
     """
-    stated = [
-        (piece, soc_pct if number == 0 else None)
-        for log, soc_pct in zip(logs, given, strict=True)
-        for number, piece in enumerate(split_where_moved(log))
-    ]
-    pieces = [piece for piece, _ in stated]
-    known, starts, unknown = [], [], []
-    for place, (log, soc_pct) in enumerate(stated):
-        own_pct = soc_at_first_row(log, pack.capacity_ah)
-        known.append(log if soc_pct is None else with_start(log, soc_pct))
-        if soc_pct is not None:
-            starts.append(Start(log.name, soc_pct, None, "given"))
-        elif own_pct is not None:
-            starts.append(Start(log.name, own_pct, None, "log"))
-        else:
-            starts.append(Start(log.name, float("nan"), None, "estimated"))
-            unknown.append(place)
-    if len(unknown) == len(pieces):
+    pieces: list[Log] = []
+    starts: list[Start | None] = []
+    for whole, given_pct in zip(logs, given, strict=True):
+        for number, log in enumerate(split_where_moved(whole)):
+            own_pct = soc_at_first_row(log, pack.capacity_ah)
+            pieces.append(log)
+            if given_pct is not None and number == 0:
+                starts.append(Start(with_start(log, given_pct), given_pct, "given"))
+            else:
+                starts.append(None if own_pct is None else Start(log, own_pct, "log"))
+    known = [start.log for start in starts if start is not None]
+    if not known:
         raise unknown_start(pieces[0], others=len(pieces) > 1)
-    if unknown:
-        pinned = [log for place, log in enumerate(known) if place not in unknown]
-        joint = _JointFit(pinned, [pieces[place] for place in unknown], pack)
-        for place, start in zip(unknown, joint.solve(), strict=True):
-            log, starts[place] = pieces[place], start
-            if start.std_pct is None or not start.std_pct <= STD_AT_MOST_PCT:
-                raise InputError(
-                    "the SoC at the start is unknown, and the voltage determines it to"
-                    f" ±{start.std_pct:.0f} % only",
-                    source=log.source or log.name,
-                    field="soc_pct",
-                    cure="give --initial-soc for this log, or logs whose SoC overlaps with it",
-                )
-            known[place] = with_start(log, start.soc_pct)
-            _LOG.info("%s", start)
-    return Starts(tuple(known), tuple(pieces), tuple(starts))
+    unknown = [log for log, start in zip(pieces, starts, strict=True) if start is None]
+    estimated = iter(_JointFit(known, unknown, pack).solve() if unknown else ())
+    return [start or next(estimated) for start in starts]
 
 
 def unknown_start(log: Log, *, others: bool) -> InputError:
@@ -234,12 +189,24 @@ class _JointFit:
             if np.all(moved < CONVERGED_PCT):
                 break
         pinned = solve(self._pinned, self._pack)
+        of_unknown = sums[len(self._pinned) :]
         return [
-            Start(log.name, value, self._std_pct(of_log, pinned), "estimated")
-            for log, value, of_log in zip(
-                self._logs, values, sums[len(self._pinned) :], strict=True
-            )
+            self._start(log, value, self._std_pct(of_log, pinned))
+            for log, value, of_log in zip(self._logs, values, of_unknown, strict=True)
         ]
+
+    def _start(self, log: Log, soc_pct: float, std_pct: float) -> Start:
+        if not std_pct <= STD_AT_MOST_PCT:
+            raise InputError(
+                "the SoC at the start is unknown, and the voltage determines it to"
+                f" ±{std_pct:.0f} % only",
+                source=log.source or log.name,
+                field="soc_pct",
+                cure="give --initial-soc for this log, or logs whose SoC overlaps with it",
+            )
+        start = Start(with_start(log, soc_pct), soc_pct, "estimated", std_pct)
+        _LOG.info("%s", start)
+        return start
 
     def _at(self, number: int, start_pct: float) -> FitRows:
         rows = self._rows[number]
@@ -324,4 +291,4 @@ def start_by_model(log: Log, model: Model) -> Start:
     variance = float(np.sum(functions.row(middle, columns) ** 2)) + noise.level_std_v**2
     slope = max(float(np.mean(voltage.pseudo_ocv_slope(soc))), SLOPE_AT_LEAST * voltage.nominal_v)
     std_pct = float(np.hypot(variance**0.5 / slope, chemistry.soc_std_pct))
-    return Start(log.name, best, std_pct, "estimated")
+    return Start(log, best, "estimated", std_pct)

@@ -9,7 +9,7 @@ from typing import Final
 
 import numpy as np
 
-from cangauge._text import duration, number, significant, span
+from cangauge._text import NONE_KNOWN, duration, number, significant, span
 from cangauge._typing import FloatArray
 from cangauge.extras.report.charts import (
     BLACK,
@@ -23,18 +23,14 @@ from cangauge.extras.report.charts import (
     stacked,
 )
 from cangauge.extras.report.page import Block, Page, Table, Tile, joined, range_rows
-from cangauge.identify.identification import (
-    Identification,
-    LogFit,
-    effect_rows,
-    rounded,
-    search_rows,
-)
+from cangauge.identify.identification import Identification, LogFit
 from cangauge.identify.rows import running_rows
 from cangauge.model.effects.library import LIBRARY
 from cangauge.model.model_file import Model, Published
 from cangauge.model.voltage_model import VoltageModel
 
+OWN_NOISE: Final = 2.0
+"""Standard errors within which a coefficient may as well be zero [-]: 95 %."""
 _UNITS: Final = {"V": "V", "V/K": "V/K", "ohm": "Ω"}
 _REMOVED_BY: Final = {
     "decimation": "not on the model's rate",
@@ -356,6 +352,19 @@ def coefficient_tables(model: Model, condition_number: float) -> list[Block]:
     return blocks
 
 
+def _with_error(value: float, std_error: float | None) -> tuple[str, str]:
+    """Return a value rounded to its standard error, and the error with two digits.
+
+    A value that is its own noise is a dash.
+    """
+    if not std_error or not math.isfinite(std_error):
+        return significant(value, 3), significant(std_error, 2)
+    if abs(value) < OWN_NOISE * std_error:
+        return NONE_KNOWN, significant(std_error, 2)
+    decimals = max(0, 1 - math.floor(math.log10(std_error)))
+    return number(value, decimals), significant(std_error, 2)
+
+
 def _published_table(model: Published, condition_number: float) -> Table:
     factors = {
         "k0": "1",
@@ -373,7 +382,7 @@ def _published_table(model: Published, condition_number: float) -> Table:
     rows = []
     for name, item in model.coefficients.items():
         ratio = abs(item.value) / item.std_error if item.std_error else math.nan
-        value = rounded(item.value, item.std_error)
+        value = _with_error(item.value, item.std_error)
         rows.append([name, *value, number(ratio, 1), _UNITS[item.unit], factors[name]])
     return Table(
         ["published coefficient", "value", "std. error", "|value| / error", "unit", "multiplies"],
@@ -395,15 +404,33 @@ def _effects(result: Identification) -> list[Block]:
     if ids:
         note = "; ".join(f"{effect_id}: {LIBRARY[effect_id].equation}" for effect_id in ids)
         note += ". An effect is a signature at the terminals, not proof of a mechanism."
-    return [
-        Table(*effect_rows(result), note),
-        Table(
-            *search_rows(result.effects),
-            "Errors of left-out logs. An effect is added if the mean logarithm of the error ratio,"
-            " log by log, is significantly above zero (t of 2 or more) and worth at least 3 %. The"
-            " same data selected the effects, so the last figure is slightly optimistic.",
-        ),
+    parameters = [
+        {
+            "effect": effect.id,
+            "parameter": parameter.name,
+            "value": significant(values[parameter.name], 4),
+            "unit": "" if parameter.unit == "1" else parameter.unit.replace("ohm", "Ω"),
+        }
+        for effect, values in result.model.extended_model().effects
+        for parameter in effect.parameters
     ]
+    steps = [
+        {
+            "effect": step.effect_id,
+            "step": step.what,
+            "left out without [V]": significant(step.before_rmse_v, 3),
+            "with [V]": significant(step.after_rmse_v, 3),
+            "t": number(step.t_value, 1),
+        }
+        for step in result.effects.steps
+    ]
+    searched = Table.of(
+        steps,
+        "Errors of left-out logs. An effect is added if the mean logarithm of the error ratio, log"
+        " by log, is significantly above zero (t of 2 or more) and worth at least 3 %. The same"
+        " data selected the effects, so the last figure is slightly optimistic.",
+    )
+    return [Table.of(parameters, note) if parameters else note, *([searched] if steps else [])]
 
 
 def settings_table(model: Model) -> Table:

@@ -350,6 +350,13 @@ class Effect:
         """Whether the added voltage depends on the SoC."""
         return self.over_soc is not at_every_soc
 
+    def voltage_drive(self, load: Load, values: Values, context: Context) -> FloatArray:
+        """Return `drive` of an effect that adds a voltage."""
+        drive = self.drive(load, values, context)
+        if drive is None:
+            raise ValueError(f"{self.id} adds no voltage")
+        return drive
+
     def constants(self, pack: Pack) -> dict[str, float]:
         """Return the parameters that are taken from the pack when the effect is added to it."""
         return {
