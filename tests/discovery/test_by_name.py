@@ -6,6 +6,7 @@ import time
 from pathlib import Path
 
 import can
+import numpy as np
 import pytest
 
 from cangauge.bus.database import load_dbc
@@ -83,6 +84,21 @@ def test_a_temperature_is_found_by_its_unit(tmp_path: Path) -> None:
     found = named_signals(load_dbc(tmp_path / "car.dbc"), frames)["temperature"]
     assert [each.signal for each in found] == ["TModMax", "TModMin"]
     assert (found[0].low, found[0].high) == (25.0, 31.0)  # of the whole capture
+
+
+def test_milliamperes_are_found_with_their_sign(tmp_path: Path) -> None:
+    (tmp_path / "bench.dbc").write_text(
+        'VERSION "1"\nNS_ :\nBS_:\nBU_: V\nBO_ 2566869221 PackMeas: 8 V\n'
+        ' SG_ I_mod : 7|32@0- (1,0) [0|0] "mA" V\n SG_ U_mod : 39|32@0+ (1,0) [0|0] "mV" V\n'
+    )
+    frames = []
+    for row, amps in enumerate(np.repeat([5, 40, -20, 0, 30, 10, -5, 20] * 5, 20).tolist()):
+        data = (-1000 * amps).to_bytes(4, "big", signed=True)  # positive charges
+        data += (52_000 - 30 * amps).to_bytes(4, "big")
+        frames.append(can.Message(0.1 * row, arbitration_id=0x18FF50E5, data=data))
+    found = named_signals(load_dbc(tmp_path / "bench.dbc"), frames)
+    assert [found[role][0].signal for role in ("current", "voltage")] == ["I_mod", "U_mod"]
+    assert found["current"][0].is_followed
 
 
 def test_a_long_name_takes_no_longer_than_its_letters(tmp_path: Path) -> None:

@@ -13,6 +13,7 @@ from cangauge.bus.recording import read_log
 from cangauge.errors import InputError
 from cangauge.logs.charge import contradiction, implied_capacity, refuse_contradictions
 from cangauge.logs.log import Log
+from cangauge.model.coulomb_counting import difference_from_reference
 
 CAPACITY_AH = 60.0
 
@@ -150,6 +151,23 @@ def test_columns_in_ah_that_all_miss_are_said(tmp_path: Path) -> None:
     assert [
         text for text in read.remarks if "no column in Ah counts this current: the near" in text
     ]
+
+
+def test_an_offset_over_months_contradicts_no_charge() -> None:
+    days, soc_pct, current_a = 60, 50.0, []
+    soc = []
+    for minute in range(days * 1440):
+        amps = 12.0 if minute % 1440 < 720 else -12.0
+        soc_pct -= (amps - 0.3) / 60.0
+        soc_pct = 90.0 if soc_pct > 100.0 else soc_pct  # corrected by its gauge
+        current_a.append(amps)
+        soc.append(soc_pct)
+    minutes = np.arange(days * 1440.0)
+    log = Log(60.0 * minutes, current_a, 52.0 + 0.0 * minutes, 20.0 + 0.0 * minutes, soc)
+    assert contradiction(log, 100.0) is None
+    assert contradiction(log) is None
+    assert implied_capacity([log]).capacity_ah == pytest.approx(100.0, rel=0.05)
+    assert difference_from_reference(log, 100.0) is None
 
 
 @pytest.mark.parametrize("off_pct", [10.0, 22.0, 30.0])

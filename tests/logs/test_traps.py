@@ -466,6 +466,23 @@ def test_a_history_may_have_rows_without_an_entity(tmp_path: Path) -> None:
     assert len(read(tmp_path, "entity_id,state,last_changed", rows)) == 60
 
 
+def test_values_of_a_history_hold_until_they_change_while_it_is_recorded(tmp_path: Path) -> None:
+    rows = ["battery_temperature,20,2024-03-01T00:00:00Z"]
+    for k in range(60 * 12):
+        if 200 <= k < 420:
+            continue  # the recorder was off
+        stamp = f"2024-03-01T{k // 60:02d}:{k % 60:02d}:00Z"
+        rows.append(f"battery_voltage,{52 + k % 3},{stamp}")
+        if k % 50 == 0:
+            rows.append(f"battery_current,{10 + k % 100},{stamp}")
+        if k == 570:
+            rows.append(f"battery_current,unavailable,{stamp}")
+    log = read(tmp_path, "entity_id,state,last_changed", rows)
+    minutes = np.round((log.time_s - log.time_s[0]) / 60.0).astype(int)
+    assert minutes.tolist() == [*range(200), *range(450, 570), *range(600, 720)]
+    assert log.current_a[49:51].tolist() == [10.0, 60.0]
+
+
 # ---- zones
 
 

@@ -7,6 +7,7 @@ standard deviation: sampling of the current, and resolution of the SoC.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise, permutations
@@ -29,6 +30,9 @@ SURE: Final = 3.0
 """Standard deviations by which a contradiction exceeds the error by sampling [-]."""
 COUNTER_SHARE: Final = 0.02
 """Difference of a counter from the charge of the current, by two sensors' gains [-]."""
+DAY_S: Final = 86400.0
+"""Longest time over which charge is compared with a SoC [s]: a battery at home makes a cycle in it,
+and 0.1 A of offset move 2.4 Ah."""
 JUMP_PCT: Final = 3.0
 """Least step of a SoC that its gauge corrected [%]: no dashboard shows coarser steps …"""
 USUAL_STEPS: Final = 5.0
@@ -72,12 +76,12 @@ class _Count:
         """Return the parts before and after half of the movement of the SoC."""
         moved_pct = np.cumsum(np.abs(np.diff(self.soc_pct)))
         middle = 1 + int(np.searchsorted(moved_pct, 0.5 * moved_pct[-1]))
-        parts = slice(None, middle + 1), slice(middle, None)
-        first, second = (
-            _Count(self.soc_pct[part], self.out_ah[part], self.std_ah, self.step_pct)
-            for part in parts
-        )
-        return first, second
+        return self.part(0, middle + 1), self.part(middle, len(self.soc_pct))
+
+    def part(self, first: int, end: int) -> _Count:
+        """Return the rows from `first` to the one before `end`."""
+        rows = slice(first, end)
+        return _Count(self.soc_pct[rows], self.out_ah[rows], self.std_ah, self.step_pct)
 
 
 def implied_capacity(logs: Sequence[Log], least_pct: float = MIN_SPAN_PCT) -> ImpliedCapacity:
@@ -95,8 +99,7 @@ def implied_capacity(logs: Sequence[Log], least_pct: float = MIN_SPAN_PCT) -> Im
     InputError
         If no log has a reference SoC with this span.
     """
-    counts = [each for log in logs for each in _counts(log) if each.span_pct >= least_pct]
-    found = _implied(counts)
+    found = _implied([count for log in logs for count in _counts(log, least_pct)])
     if found is None:
         raise InputError(
             f"no log has a reference SoC that moves by {least_pct:g} % or more",
@@ -115,7 +118,7 @@ def contradiction(log: Log, capacity_ah: float | None = None) -> str | None:
     capacity_ah : float, optional
         Capacity of the pack [Ah]. Without it, the parts of the log are compared with each other.
     """
-    counts = [each for each in _counts(log, at_ends=False) if each.span_pct >= MIN_SPAN_PCT]
+    counts = [*_counts(log, MIN_SPAN_PCT, at_ends=False)]
     whole = _implied(counts)
     if whole is None:
         return None
@@ -124,7 +127,9 @@ def contradiction(log: Log, capacity_ah: float | None = None) -> str | None:
         stated = f"the pack has {rounded(capacity_ah, 3)} Ah"
         return f"{begins}: {_per_100(whole.capacity_ah)}; {stated}"
     halves = [half for count in counts for half in count.halves() if half.span_pct >= MIN_SPAN_PCT]
-    parts = [found for half in halves if (found := _implied([half])) is not None]
+    moved_pct = np.cumsum([half.span_pct for half in halves])
+    middle = min(int(np.sum(moved_pct < 0.5 * moved_pct[-1:])) + 1, len(halves) - 1)
+    parts = [found for half in (halves[:middle], halves[middle:]) if (found := _implied(half))]
     for first, second in pairwise(parts):
         if _contradict(first, second.capacity_ah) and _contradict(second, first.capacity_ah):
             return (
@@ -206,11 +211,12 @@ def _implied(counts: Sequence[_Count]) -> ImpliedCapacity | None:
     return ImpliedCapacity(capacity_ah, abs(capacity_ah) * float(share))
 
 
-def _counts(log: Log, *, at_ends: bool = True) -> Iterator[_Count]:
-    """Yield the count of each piece of a log with a SoC that moves.
+def _counts(log: Log, least_pct: float, *, at_ends: bool = True) -> Iterator[_Count]:
+    """Yield the counts of a log over which the SoC moves by `least_pct` or more [%].
 
-    Without `at_ends` charge that moves while the SoC stands at 0 or 100 % is left out: a gauge that
-    is off stands there.
+    Each is of a day at most, if the SoC moves so far in one: over weeks an offset moves more charge
+    than the pack holds. Without `at_ends` charge that moves while the SoC stands at 0 or 100 % is
+    left out: a gauge that is off stands there.
     """
     for piece in split_where_moved(log):
         soc_pct = np.full(len(piece), np.nan) if piece.soc_pct is None else piece.soc_pct
@@ -229,7 +235,15 @@ def _counts(log: Log, *, at_ends: bool = True) -> Iterator[_Count]:
             is_end = (soc_pct[rows][1:] <= 0.0) | (soc_pct[rows][1:] >= 100.0)
             out_ah = np.cumsum(np.where(is_end & (steps == 0.0), 0.0, np.diff(out_ah)))
             out_ah = np.concatenate([[0.0], out_ah])
-        yield _Count(known_pct, out_ah, std_ah, step_pct)
+        whole = _Count(known_pct, out_ah, std_ah, step_pct)
+        days = np.unique((piece.time_s[rows] - piece.time_s[0]) // DAY_S, return_index=True)[1]
+        parts = [whole.part(*ends) for ends in pairwise([*days.tolist(), len(known_pct)])]
+        moved = [part for part in parts if part.span_pct >= least_pct]
+        if len(parts) > 1 and moved:
+            share = math.sqrt(1.0 / len(parts))
+            yield from (replace(part, std_ah=share * std_ah) for part in moved)
+        elif whole.span_pct >= least_pct:
+            yield whole
 
 
 def _without_jumps(soc_pct: FloatArray, usual_pct: float) -> FloatArray:

@@ -103,13 +103,17 @@ def difference_from_reference(log: Log, capacity_ah: float) -> str | None:
             f"{log.name}: its own SoC stays at {soc_pct[0]:g} % while {counted_pct:.1f} % is"
             " counted: a column that is not updated; state the start with --initial-soc"
         )
-    charge_ah = float(out_ah[np.argmin(soc_pct)] - out_ah[np.argmax(soc_pct)])
-    difference_pct = 100.0 * charge_ah / capacity_ah - moved_pct
-    if moved_pct < DIFFERENT_PCT or abs(difference_pct) < DIFFERENT_PCT:
+    if moved_pct < DIFFERENT_PCT:
+        return None
+    try:
+        implied_ah = implied_capacity([log], 0.0).capacity_ah
+    except InputError:  # it only jumps
+        return None
+    if moved_pct * abs(implied_ah / capacity_ah - 1.0) < DIFFERENT_PCT:
         return None
     return (
         f"{log.name}: the counted charge and the log's own SoC imply a capacity of"
-        f" {100.0 * charge_ah / moved_pct:.1f} Ah; {capacity_ah:.1f} Ah is used."
+        f" {implied_ah:.1f} Ah; {capacity_ah:.1f} Ah is used."
         " Check the capacity and the current sensor"
     )
 

@@ -497,7 +497,9 @@ def _judged(role: str, signal: NamedSignal, nominal_v: float | None) -> NamedSig
     unit = unit_of(column, signal.unit) if signal.unit else None
     names = _Names(role, _words_of(signal.signal), _words_of(signal.message), unit)
     lowest, highest = _RANGES[role]
-    is_possible = not len(signal.value) or lowest <= median(np.unique(signal.value)) <= highest
+    scale, offset = unit or (1.0, 0.0)
+    middle = median(scale * np.unique(signal.value) + offset) if len(signal.value) else lowest
+    is_possible = lowest <= middle <= highest
     is_known = unit is not None or (not signal.unit and names.is_named)
     if not (is_known and is_possible and names.score() > 0.0):
         return None

@@ -12,11 +12,12 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from cangauge._files import Head
-from cangauge._typing import FloatArray
+from cangauge._typing import FloatArray, IntArray
 from cangauge.errors import InputError
 from cangauge.logs.column_map import ColumnMap
 from cangauge.logs.columns import UnknownColumnsError, choose_columns
 from cangauge.logs.draft import DraftLog
+from cangauge.logs.gaps import BRIDGE_S, usual_step_s
 from cangauge.logs.headings import meaning_of
 from cangauge.logs.read import LogTableReader
 from cangauge.logs.stamps import over_midnight, seconds_of
@@ -24,9 +25,9 @@ from cangauge.logs.table import ArrowTable, draft_of_table
 from cangauge.logs.text import MAX_ROWS, TextTable, headed
 from cangauge.logs.values import is_text
 
-HOLD_S: Final = 60.0
-"""Longest time that a current or voltage is held [s], as long as charge is counted over a gap: a
-recorder stores a value when it changes."""
+HELD_S: Final = 3600.0
+"""Longest silence of all series over which a value holds [s]: a recorder stores a value when it
+changes, and a pack's voltage or temperature moves within an hour."""
 POLLED_SHARE: Final = 0.1
 """Share of values that repeat the one before from which they are polled, not stored on change [-]:
 of many series some, such as the temperature, hardly move."""
@@ -144,15 +145,18 @@ class LongTable:
             [headings[place] for place in choice.chosen[quantity].places]
             for quantity in ("current", "voltage")
         )
-        rows_s = series.stamps_of(current if series.is_polled else [*current, *voltage])
+        rows_s = series.stamps_of(current)
+        if not series.is_polled:
+            rows_s = series.rows_of([*current, *voltage])
 
         def read(wanted: list[str]) -> Any:
             at_rows = series.nearest if series.is_polled else series.latest
             table = {}
             for name in wanted:
                 is_driving = name in current or name in voltage
-                longest_s = HOLD_S if is_driving else np.inf
-                table[name] = rows_s if name == _TIME else at_rows(name, rows_s, longest_s)
+                table[name] = rows_s
+                if name != _TIME:
+                    table[name] = at_rows(name, rows_s, is_driving=is_driving)
             return pa.table(table)
 
         draft = draft_of_table(
@@ -183,9 +187,10 @@ class LongTable:
         units = [place for place, name in enumerate(lower) if name in self._UNITS]
         time = text.headings.index(_time_of(text))
         cells = text.columns([value, time, *named, *units])
-        # Rows of words ("unavailable"), and headers that are repeated for each table.
+        # Words ("unavailable") end a value; headers are repeated for each table.
         values = _as_numbers(cells[value])
-        known = pc.and_(pc.is_finite(values), pc.is_valid(cells[time]))
+        is_header = pc.equal(cells[time].cast(pa.string()), text.headings[time])
+        known = pc.and_(pc.invert(pc.fill_null(is_header, True)), pc.is_valid(cells[time]))
         cells = {place: column.filter(known) for place, column in cells.items()}
         words = {place: cells[place].cast(pa.string()) for place in [*named, *units]}
         varying = [place for place in named if len(pc.unique(words[place])) > 1]
@@ -218,7 +223,7 @@ def _by_name(
     ends = np.cumsum(np.bincount(codes))
     parts = zip(np.split(stamps_s[order], ends), np.split(values[order], ends), strict=True)
     named = zip(names.dictionary.to_pylist(), parts, strict=False)  # the last part is empty
-    return {name: part for name, part in named if name}
+    return {name: part for name, part in named if name and np.isfinite(part[1]).any()}
 
 
 @dataclass(frozen=True, slots=True)
@@ -248,25 +253,43 @@ class _Series:
         """Return the times of all values of some series [s]."""
         return np.unique(np.concatenate([self.by_name[name][0] for name in names]))
 
-    def latest(self, name: str, at_s: FloatArray, longest_s: float) -> FloatArray:
-        """Return the latest value at some times, NaN where it is older than `longest_s`.
+    def rows_of(self, names: Sequence[str]) -> FloatArray:
+        """Return the times of all values of some series [s], and as many between as are usual."""
+        stamps_s = self.stamps_of(names)
+        step_s = max(usual_step_s(stamps_s), 1.0)
+        more = np.maximum(np.ceil(np.diff(stamps_s) / step_s).astype(int) - 1, 0)
+        more[np.diff(self._session(stamps_s)) > 0] = 0
+        number = np.arange(1, more.sum() + 1) - np.repeat(np.cumsum(more) - more, more)
+        return np.union1d(stamps_s, np.repeat(stamps_s[:-1], more) + step_s * number)
 
-        Without such a limit the first value also holds before it.
+    def _session(self, at_s: FloatArray) -> IntArray:
+        """Return by time the number of silences of all series before it."""
+        all_s = self.stamps_of(self.headings)
+        ends_s = all_s[1:][np.diff(all_s) > HELD_S]
+        return np.searchsorted(ends_s, at_s, side="right")
+
+    def latest(self, name: str, at_s: FloatArray, *, is_driving: bool) -> FloatArray:
+        """Return the latest value at some times; of current and voltage only those that hold.
+
+        Of others the first value also holds before it.
         """
         stamps_s, values = self.by_name[name]
+        if not is_driving:
+            known = np.isfinite(values)
+            stamps_s, values = stamps_s[known], values[known]
         place = np.maximum(np.searchsorted(stamps_s, at_s, side="right") - 1, 0)
-        age_s = at_s - stamps_s[place]
-        is_known = (age_s >= 0.0) & (age_s <= longest_s)
-        return np.where(is_known | np.isinf(longest_s), values[place], np.nan)
+        holds = (at_s >= stamps_s[place]) & (self._session(at_s) == self._session(stamps_s)[place])
+        return values[place] if not is_driving else np.where(holds, values[place], np.nan)
 
-    def nearest(self, name: str, at_s: FloatArray, longest_s: float) -> FloatArray:
-        """Return the value nearest to some times, NaN where it is farther than `longest_s`."""
+    def nearest(self, name: str, at_s: FloatArray, *, is_driving: bool) -> FloatArray:
+        """Return the value nearest to some times; of current and voltage only if it is near."""
         stamps_s, values = self.by_name[name]
         after = np.clip(np.searchsorted(stamps_s, at_s), 0, stamps_s.size - 1)
         before = np.maximum(after - 1, 0)
         is_before = np.abs(at_s - stamps_s[before]) <= np.abs(stamps_s[after] - at_s)
         place = np.where(is_before, before, after)
-        return np.where(np.abs(stamps_s[place] - at_s) <= longest_s, values[place], np.nan)
+        is_near = np.abs(stamps_s[place] - at_s) <= BRIDGE_S
+        return np.where(is_near | (not is_driving), values[place], np.nan)
 
 
 def _time_of(text: TextTable) -> str:
